@@ -1,0 +1,1 @@
+//! Robot model, dynamics, limits and the projector.

@@ -1,0 +1,1 @@
+//! Snapshot, networks, controller, real-time loop and links.

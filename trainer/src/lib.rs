@@ -1,0 +1,1 @@
+//! MuJoCo environments, constrained rollouts and the PID^2 learner.
