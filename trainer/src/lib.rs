@@ -1,1 +1,3 @@
 //! MuJoCo environments, constrained rollouts and the PID^2 learner.
+
+pub mod mj;
