@@ -1,3 +1,4 @@
 //! MuJoCo environments, constrained rollouts and the PID^2 learner.
 
+pub mod env;
 pub mod mj;

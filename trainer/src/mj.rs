@@ -137,7 +137,7 @@ impl Model {
             ModelFormat::Urdf => keep_fixed_links(text),
         };
         let loaded = guard::counting_warnings(|| MjModel::from_xml_string(&text));
-        let mut model = loaded.map_err(|e| MjError::Load(e.to_string()))?;
+        let mut model = loaded.map_err(|e| MjError::Load(guard::one_line(&e.to_string())))?;
         let opt = model.opt_mut();
         if let Some(sim_dt) = options.sim_dt {
             opt.timestep = sim_dt;

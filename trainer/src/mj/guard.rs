@@ -103,8 +103,14 @@ fn count(message: &MjLogMessage) {
 }
 
 fn text(message: &MjLogMessage) -> String {
+    let subject = one_line(message.subject());
     match message.func() {
-        Some(function) if !function.is_empty() => format!("{function}: {}", message.subject()),
-        _ => message.subject().to_owned(),
+        Some(function) if !function.is_empty() => format!("{function}: {subject}"),
+        _ => subject,
     }
+}
+
+/// MuJoCo's words without its line breaks.
+pub(super) fn one_line(words: &str) -> String {
+    words.split_whitespace().collect::<Vec<_>>().join(" ")
 }

@@ -127,9 +127,11 @@ impl Sim {
     pub fn take_unstable(&mut self) -> bool {
         // SAFETY: only counters are written.
         let counters = unsafe { &mut self.state.ffi_mut().warning };
-        let bad = [MjtWarning::mjWARN_BADQPOS, MjtWarning::mjWARN_BADQVEL, MjtWarning::mjWARN_BADQACC];
-        bad.into_iter()
-            .fold(false, |seen, kind| std::mem::take(&mut counters[kind as usize].number) > 0 || seen)
+        let mut unstable = false;
+        for kind in [MjtWarning::mjWARN_BADQPOS, MjtWarning::mjWARN_BADQVEL, MjtWarning::mjWARN_BADQACC] {
+            unstable |= std::mem::take(&mut counters[kind as usize].number) > 0;
+        }
+        unstable
     }
 
     /// Configuration (nq), MuJoCo's convention.
