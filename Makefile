@@ -24,3 +24,4 @@ $(STAMP): | $(VENV)/bin/python
 $(LINKS): | $(STAMP)
 	@mkdir -p $(@D)
 	ln -sfn ../$(MUJOCO) $@
+	@test -e $@ || { rm -f $@; echo "$(VENV)/$(MUJOCO) is missing: does python/requirements.txt still say mujoco==3.17.0?" >&2; exit 1; }

@@ -6,23 +6,24 @@
 //!
 //! A new task is one file with an `impl` of `Rules` and one line in [`REGISTRY`].
 
+pub mod bench;
+
 mod ant;
-mod bench;
 mod half_cheetah;
 mod hopper;
 mod meter;
+mod panda_reach;
 mod planar;
 mod rules;
 mod simulated;
 mod spec;
 mod walker2d;
 
-use rand_chacha::ChaCha8Rng;
-
 use crate::mj::{MjError, ModelFormat, Sim};
 
-pub use bench::{Physics, physics};
 pub use meter::{Excess, LimitError, Limits, Meter, Worst};
+pub use rand_chacha::ChaCha8Rng;
+pub use rand_chacha::rand_core::SeedableRng;
 pub use spec::Spec;
 
 /// What one control period gave.
@@ -43,7 +44,8 @@ pub enum Fault {
     None,
     /// The action held NaN or infinity; nothing was simulated.
     Action,
-    /// The state became non-finite or huge; MuJoCo put the robot back to its initial configuration.
+    /// The state became non-finite or huge; MuJoCo put the robot back to its initial configuration (from where Gymnasium
+    /// would go on in silence).
     Unstable,
     /// MuJoCo stopped with an error ([`Env::last_error`] has its words); the robot is back at its initial configuration.
     Engine,
@@ -64,9 +66,9 @@ pub struct Counters {
 ///
 /// # Example
 /// ```no_run
-/// use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
-/// # fn main() -> Result<(), nearl_trainer::env::EnvError> {
-/// let mut env = nearl_trainer::env::make("HalfCheetah-v5")?;
+/// use nearl_trainer::env::{self, ChaCha8Rng, SeedableRng};
+/// # fn main() -> Result<(), env::EnvError> {
+/// let mut env = env::make("HalfCheetah-v5")?;
 /// let mut obs = vec![0.0; env.spec().n_obs()];
 /// env.reset(&mut ChaCha8Rng::seed_from_u64(0))?;
 /// for _ in 0..env.spec().max_episode_steps {
@@ -202,6 +204,7 @@ pub const REGISTRY: &[Entry] = &[
     Entry { name: hopper::NAME, about: hopper::ABOUT, build: hopper::build },
     Entry { name: walker2d::NAME, about: walker2d::ABOUT, build: walker2d::build },
     Entry { name: ant::NAME, about: ant::ABOUT, build: ant::build },
+    Entry { name: panda_reach::NAME, about: panda_reach::ABOUT, build: panda_reach::build },
 ];
 
 /// Names of all tasks.

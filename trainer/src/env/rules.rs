@@ -28,8 +28,7 @@ pub(super) trait Rules: Clone + Send + 'static {
     ) -> Result<(), MjError>;
 
     /// Hands the action (n_act) to the plant.
-    fn actuate(&self, spec: &Spec, sim: &mut Sim, action: &[f64]) {
-        let _ = spec;
+    fn actuate(&self, _spec: &Spec, sim: &mut Sim, action: &[f64]) {
         // Not clamped here: MuJoCo does it by `ctrlrange`.
         sim.ctrl_mut().copy_from_slice(action);
     }
@@ -38,8 +37,7 @@ pub(super) trait Rules: Clone + Send + 'static {
     fn progress(&self, sim: &Sim) -> f64;
 
     /// Finishes what a step computes (contact forces where they are observed).
-    fn finish(&self, sim: &mut Sim) -> Result<(), MjError> {
-        let _ = sim;
+    fn finish(&self, _sim: &mut Sim) -> Result<(), MjError> {
         Ok(())
     }
 
