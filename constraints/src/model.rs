@@ -198,6 +198,10 @@ impl Model {
         &self.0.notes
     }
 
+    pub(crate) fn raw_neutral(&self) -> &[f64] {
+        &self.0.neutral
+    }
+
     pub(crate) fn raw(&self) -> &RawModel {
         &self.0.raw
     }
