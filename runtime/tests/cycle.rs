@@ -178,3 +178,64 @@ fn bad_snapshots_get_a_reason_and_the_loop_keeps_running() {
     assert_eq!(report.counters.stale, 0);
     assert_eq!(report.refusals.len(), 5);
 }
+
+#[test]
+fn a_runtime_that_ends_in_order_does_not_trip_the_watchdog() {
+    let name = Name::new("farewell");
+    let start = PointMass { q: 1.0, v: 1.0, ..PointMass::default() };
+    // A watchdog of an hour: only the farewell can make the plant brake by itself.
+    let settings = PlantSettings { watchdog: 3600.0, ..PlantSettings::real_time(DT) };
+    let plant = PlantThread::start(&name, start, settings);
+    let report = LoopThread::start(&name, limited(50), |_| {}).join();
+    let mut viewer = TrainerLink::open(&name.0).unwrap();
+    let state = |viewer: &mut TrainerLink| loop {
+        if let Some(state) = viewer.state() {
+            return state;
+        }
+    };
+    let first = state(&mut viewer).tick;
+    while state(&mut viewer).tick < first + 20 {}
+    let (body, counted) = plant.end();
+    assert_eq!(report.last_mode, Mode::Braking);
+    assert_eq!((counted.watchdog, body.v), (0, 0.0));
+    assert!(counted.braked > 0);
+}
+
+#[test]
+fn states_of_the_wrong_size_are_refused_and_counted() {
+    struct Liar(PointMass);
+    impl Plant for Liar {
+        fn observe(&mut self, state: &mut StateMessage) {
+            self.0.observe(state);
+            if self.0.tick > 10 {
+                state.nq = 4_000_000_000;
+            }
+        }
+        fn apply(&mut self, action: &ActionMessage) {
+            self.0.apply(action);
+        }
+        fn brake(&mut self) {
+            self.0.brake();
+        }
+    }
+    let name = Name::new("liar");
+    let link = PlantLink::open(&name.0, &robot(false)).unwrap();
+    let stop = Stop::new();
+    let plant = std::thread::spawn({
+        let stop = stop.clone();
+        move || {
+            let runner = PlantRunner::new(link, PlantSettings::real_time(DT)).unwrap();
+            runner.run(&mut Liar(PointMass::default()), &stop)
+        }
+    });
+    let running = LoopThread::start(&name, settings(), |_| {});
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    while trainer.health().is_none_or(|health| health.refused_states == 0) {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let report = running.end();
+    stop.request();
+    plant.join().unwrap();
+    assert!(report.refused_states > 0);
+    assert_ne!(report.last_mode, Mode::Active);
+}

@@ -47,6 +47,18 @@ impl StateMessage {
     }
 }
 
+impl ActionMessage {
+    /// The last message of a runtime that ends in order: the plant keeps itself still from now on.
+    pub fn farewell() -> ActionMessage {
+        <ActionMessage as super::Message>::zeroed()
+    }
+
+    /// True for [`ActionMessage::farewell`]; states are numbered from 1.
+    pub fn is_farewell(&self) -> bool {
+        (self.state_seq, self.state_epoch, self.nu) == (0, 0, 0)
+    }
+}
+
 impl RobotMessage {
     /// Joint names in order; those beyond the capacity are missing (the hash covers all).
     pub fn joint_names(&self) -> Vec<String> {

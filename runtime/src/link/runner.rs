@@ -127,7 +127,7 @@ impl PlantRunner {
 
     /// Runs until `stop`, or for the number of ticks of the settings.
     pub fn run(mut self, plant: &mut impl Plant, stop: &Stop) -> PlantReport {
-        let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
+        crate::rt::thread::be_prompt();
         let period = clock::nanoseconds(self.settings.dt);
         let mut grid = Grid::new(clock::now() + period, period);
         while !stop.is_requested() && self.settings.ticks.is_none_or(|n| self.report.ticks < n) {
@@ -157,7 +157,9 @@ impl PlantRunner {
         let sent = self.state.header.stamp;
         match self.wait(due, stop) {
             Some(action) => {
-                self.round_trip.saturating_record(clock::now() - sent);
+                if self.is_attached {
+                    self.round_trip.saturating_record(clock::now() - sent);
+                }
                 self.last_fresh = clock::now();
                 self.is_attached = true;
                 self.last = action;
@@ -206,10 +208,13 @@ impl PlantRunner {
         let mut resend = clock::now() + RESEND;
         loop {
             let header = self.state.header;
-            if let Some(action) = self.link.newest_action()
-                && (action.state_epoch, action.state_seq) == (header.epoch, header.seq)
-            {
-                return Some(action);
+            match self.link.newest_action() {
+                Some(action) if (action.state_epoch, action.state_seq) == (header.epoch, header.seq) => {
+                    return Some(action);
+                }
+                // The runtime ended in order: the plant is on its own at once, without the watchdog.
+                Some(action) if action.is_farewell() => self.is_attached = false,
+                _ => {}
             }
             let now = clock::now();
             match self.settings.pace {

@@ -63,7 +63,7 @@ pub(crate) struct Traffic {
 impl<B: Build> Io<B> {
     /// Runs until `over` is set and nothing is left to move; returns itself for the report.
     pub(crate) fn run(mut self, over: &AtomicBool) -> Io<B> {
-        crate::rt::thread::exact_timers();
+        crate::rt::thread::be_prompt();
         loop {
             let is_over = over.load(Ordering::Acquire);
             let moved = self.move_states() | self.move_actions() | self.move_records();
@@ -73,6 +73,7 @@ impl<B: Build> Io<B> {
             if !moved {
                 if is_over {
                     self.attend();
+                    self.link.send_action(&mut ActionMessage::farewell());
                     return self;
                 }
                 self.idle();
