@@ -1,6 +1,7 @@
 //! The plant's ends of the links.
 
-use super::service::{Bus, Inbox, Outbox};
+use super::port::{Inbox, Outbox};
+use super::service::Bus;
 use super::*;
 
 /// What a plant is; checked against the message capacities when the link opens.

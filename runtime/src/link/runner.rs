@@ -40,7 +40,7 @@ pub struct PlantSettings {
     pub dt: f64,
     /// Who waits for whom.
     pub pace: Pace,
-    /// The action must come within this fraction of the period, 0 to 1.
+    /// The action must come within this fraction of the period; above 1 the plant's time may stretch.
     pub deadline: f64,
     /// Time without a fresh action after which the plant brakes [s].
     pub watchdog: f64,
@@ -53,6 +53,13 @@ impl PlantSettings {
     pub fn real_time(dt: f64) -> PlantSettings {
         let watchdog = (5.0 * dt).max(0.02);
         PlantSettings { dt, pace: Pace::RealTime, deadline: 0.6, watchdog, ticks: None }
+    }
+
+    /// Real time for a simulator, whose time may stretch: rather than holding an old action it waits up to 15 ms (at
+    /// least 0.6 periods) for the right one and falls behind its grid, which is counted as an overrun.
+    pub fn simulator(dt: f64) -> PlantSettings {
+        let wait = (0.6 * dt).max(0.015);
+        PlantSettings { deadline: wait / dt, watchdog: (5.0 * dt).max(0.05), ..PlantSettings::real_time(dt) }
     }
 
     /// Lockstep.

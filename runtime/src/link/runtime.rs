@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use super::service::{Bus, BytesInbox, Inbox, Outbox, SnapshotBytes};
+use super::port::{BytesInbox, Inbox, Outbox};
+use super::service::Bus;
 use super::*;
 
 /// Everything the runtime sends and receives for one robot.

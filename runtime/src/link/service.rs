@@ -4,13 +4,11 @@
 //! not matter. `max_publishers(1)` makes the publisher's place the single-owner lock of plant, runtime and trainer; a
 //! killed owner's place is freed when the next node cleans up after dead ones.
 
-use std::marker::PhantomData;
 use std::time::Duration;
 
 use iceoryx2::node::NodeCreationFailure;
-use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
-use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
-use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::port::publisher::PublisherCreateError;
+use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::prelude::*;
 use iceoryx2::service::builder::publish_subscribe::{
     Builder, PublishSubscribeCreateError as Create, PublishSubscribeOpenError as Open,
@@ -18,6 +16,7 @@ use iceoryx2::service::builder::publish_subscribe::{
 };
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
+use super::port::{BytesInbox, BytesOutbox, Inbox, Outbox};
 use super::schema::Message;
 use super::{LinkError, RobotName, SnapshotHeader, memory};
 use crate::rt::clock;
@@ -92,14 +91,14 @@ impl Bus {
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|e| self.publisher_error(M::TOPIC, role, e))?;
-        Ok(Outbox { port, epoch: self.epoch, seq: 0 })
+        Ok(Outbox::new(port, self.epoch))
     }
 
     /// A subscriber of `M`.
     pub(crate) fn inbox<M: Message + ZeroCopySend>(&self) -> Result<Inbox<M>, LinkError> {
         let service = self.service::<M>()?;
         let port = service.subscriber_builder().create().map_err(|e| self.subscriber_error(M::TOPIC, e))?;
-        Ok(Inbox { port, last: (0, 0), lost: 0, refused: 0, message: PhantomData })
+        Ok(Inbox::new(port))
     }
 
     fn bytes(&self) -> Result<PortFactory<Ipc, [u8], SnapshotHeader>, LinkError> {
@@ -124,7 +123,7 @@ impl Bus {
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .create()
             .map_err(|e| self.publisher_error(SnapshotHeader::TOPIC, "trainer", e))?;
-        Ok(BytesOutbox { port, name: self.name.clone(), epoch: self.epoch, seq: 0 })
+        Ok(BytesOutbox::new(port, self.name.clone(), self.epoch))
     }
 
     /// A subscriber of snapshots.
@@ -134,7 +133,7 @@ impl Bus {
             .subscriber_builder()
             .create()
             .map_err(|e| self.subscriber_error(SnapshotHeader::TOPIC, e))?;
-        Ok(BytesInbox { port, refused: 0 })
+        Ok(BytesInbox::new(port))
     }
 
     fn topic(&self, topic: &str) -> Result<ServiceName, LinkError> {
@@ -205,130 +204,4 @@ fn retry<T, E>(mut attempt: impl FnMut() -> Result<T, E>, is_passing: impl Fn(&E
         }
     }
     attempt()
-}
-
-/// Sending end of a topic. One heap allocation per message inside iceoryx2: not for the real-time thread.
-pub(crate) struct Outbox<M: Message + ZeroCopySend> {
-    port: Publisher<Ipc, M, ()>,
-    epoch: u64,
-    seq: u64,
-}
-
-impl<M: Message + ZeroCopySend> Outbox<M> {
-    /// Numbers, stamps and sends `message`; false if it could not be sent.
-    pub(crate) fn send(&mut self, message: &mut M) -> bool {
-        self.seq += 1;
-        *message.header_mut() =
-            super::Header { schema: M::SCHEMA, epoch: self.epoch, seq: self.seq, stamp: clock::now() };
-        match self.port.loan_uninit() {
-            Ok(sample) => sample.write_payload(*message).send().is_ok(),
-            Err(_) => false,
-        }
-    }
-}
-
-/// Receiving end of a topic.
-pub(crate) struct Inbox<M: Message + ZeroCopySend> {
-    port: Subscriber<Ipc, M, ()>,
-    last: (u64, u64),
-    /// Messages the sender numbered but that never arrived.
-    pub(crate) lost: u64,
-    /// Messages with another schema hash.
-    pub(crate) refused: u64,
-    message: PhantomData<M>,
-}
-
-impl<M: Message + ZeroCopySend> Inbox<M> {
-    /// The next message in order; duplicates and foreign schemas are left out.
-    pub(crate) fn next(&mut self) -> Option<M> {
-        while let Ok(Some(sample)) = self.port.receive() {
-            let header = *sample.payload().header();
-            if header.schema != M::SCHEMA {
-                self.refused += 1;
-                continue;
-            }
-            let (epoch, seq) = self.last;
-            if header.epoch == epoch {
-                if header.seq <= seq {
-                    continue;
-                }
-                self.lost += header.seq - seq - 1;
-            }
-            self.last = (header.epoch, header.seq);
-            return Some(*sample.payload());
-        }
-        None
-    }
-
-    /// The newest message; older unread ones are left out.
-    pub(crate) fn newest(&mut self) -> Option<M> {
-        std::iter::from_fn(|| self.next()).last()
-    }
-}
-
-/// Bytes of one snapshot as received.
-#[derive(Clone, Debug)]
-pub struct SnapshotBytes {
-    /// Version and sender.
-    pub header: SnapshotHeader,
-    /// The file's content.
-    pub bytes: Vec<u8>,
-}
-
-/// Sending end of the snapshot topic.
-pub(crate) struct BytesOutbox {
-    port: Publisher<Ipc, [u8], SnapshotHeader>,
-    name: RobotName,
-    epoch: u64,
-    seq: u64,
-}
-
-impl BytesOutbox {
-    pub(crate) fn send(&mut self, version: u64, bytes: &[u8]) -> Result<(), LinkError> {
-        // The segment may grow to the next power of two and is written at once: check before the first write.
-        memory::check(&self.name, 4 * bytes.len().next_power_of_two() as u64)?;
-        let failed = |e: String| self.name.transport("send a snapshot", e);
-        let mut sample = self.port.loan_slice_uninit(bytes.len()).map_err(|e| failed(format!("{e:?}")))?;
-        self.seq += 1;
-        let header = sample.user_header_mut();
-        header.header = super::Header {
-            schema: SnapshotHeader::SCHEMA,
-            epoch: self.epoch,
-            seq: self.seq,
-            stamp: clock::now(),
-        };
-        header.version = version;
-        header.length = bytes.len() as u64;
-        sample.write_from_slice(bytes).send().map_err(|e| failed(format!("{e:?}")))?;
-        Ok(())
-    }
-
-    /// Delivers the last snapshot to runtimes that came later.
-    pub(crate) fn attend(&self) {
-        let _ = self.port.update_connections();
-    }
-}
-
-/// Receiving end of the snapshot topic.
-pub(crate) struct BytesInbox {
-    port: Subscriber<Ipc, [u8], SnapshotHeader>,
-    pub(crate) refused: u64,
-}
-
-impl BytesInbox {
-    /// The newest snapshot not yet read.
-    pub(crate) fn newest(&mut self) -> Option<SnapshotBytes> {
-        let mut newest = None;
-        while let Ok(Some(sample)) = self.port.receive() {
-            let header = *sample.user_header();
-            if header.header.schema != SnapshotHeader::SCHEMA
-                || header.length != sample.payload().len() as u64
-            {
-                self.refused += 1;
-                continue;
-            }
-            newest = Some(SnapshotBytes { header, bytes: sample.payload().to_vec() });
-        }
-        newest
-    }
 }

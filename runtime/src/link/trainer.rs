@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
+use super::port::{BytesOutbox, Inbox};
 use super::runtime::poll_for;
-use super::service::{Bus, BytesOutbox, Inbox};
+use super::service::Bus;
 use super::*;
 
 /// Reads states, transitions, receipts and health of one robot, and pushes snapshots.

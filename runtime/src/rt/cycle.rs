@@ -37,6 +37,8 @@ pub(crate) struct CycleSettings {
     pub(crate) sync: Sync,
     /// A state older than this is stale.
     pub(crate) age_limit: u64,
+    /// So long before and after the moment a state is due, the thread polls instead of sleeping.
+    pub(crate) spin: u64,
     /// The plant keeps real time: a tick longer than the period is an overrun.
     pub(crate) real_time: bool,
     /// Ticks until the loop stops by itself.
@@ -140,18 +142,31 @@ impl<T: Tick> Cycle<T> {
                 clock::sleep_until(self.grid.due());
                 self.record.due = self.grid.due();
             }
-            Sync::Plant => {
-                let until = clock::now() + self.settings.age_limit;
-                loop {
-                    let seen = self.ends.bell.seen();
-                    if !self.ends.states.is_empty() || clock::now() >= until {
-                        break;
-                    }
-                    self.ends.bell.wait(seen, until);
-                }
-            }
+            Sync::Plant => self.wait_for_state(),
         }
         self.record.begin = clock::now();
+    }
+
+    /// Sleeps on the bell, but is awake around the moment the state is due: waking an idle core costs more than the
+    /// whole exchange.
+    fn wait_for_state(&mut self) {
+        let last = clock::now() + self.settings.age_limit;
+        let expected = self.record.state.header.stamp + self.settings.period;
+        let awake = expected.saturating_sub(self.settings.spin)..expected + self.settings.spin;
+        loop {
+            let seen = self.ends.bell.seen();
+            let now = clock::now();
+            if !self.ends.states.is_empty() || now >= last {
+                return;
+            }
+            if awake.contains(&now) {
+                std::thread::yield_now();
+            } else if now < awake.start {
+                self.ends.bell.wait(seen, awake.start.min(last));
+            } else {
+                self.ends.bell.wait(seen, last);
+            }
+        }
     }
 
     /// Takes a new controller if one waits: always between two ticks.

@@ -32,6 +32,8 @@ pub struct RunSettings {
     pub sync: Sync,
     /// Age at which a state is stale [s]; the default is 5 periods, at least 20 ms.
     pub age_limit: Option<f64>,
+    /// So long before and after a state is due, the real-time thread polls instead of sleeping [s].
+    pub spin: f64,
     /// Ticks until the loop stops by itself.
     pub ticks: Option<u64>,
     /// How long to wait for the plant at start [s].
@@ -57,6 +59,7 @@ impl Default for RunSettings {
         RunSettings {
             sync: Sync::Plant,
             age_limit: None,
+            spin: 50e-6,
             ticks: None,
             patience: 5.0,
             stop_speed: 1e-2,
@@ -176,6 +179,7 @@ fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings
         period: clock::nanoseconds(robot.dt),
         sync: settings.sync,
         age_limit: clock::nanoseconds(age_limit),
+        spin: if robot.is_lockstep() { 0 } else { clock::nanoseconds(settings.spin) },
         real_time: !robot.is_lockstep(),
         ticks: settings.ticks,
         stop_speed: settings.stop_speed,
