@@ -66,6 +66,18 @@ fn own_clock_accounts_for_every_slot() {
 }
 
 #[test]
+fn each_episode_begins_with_a_reset() {
+    let name = Name::new("episodes");
+    let start = PointMass { q: 1.0, episode_ticks: 100, ..PointMass::default() };
+    let plant = PlantThread::start(&name, start, PlantSettings::lockstep(DT));
+    let mut resets = Default::default();
+    let running = LoopThread::start(&name, limited(450), |spring| resets = spring.resets.clone());
+    running.join();
+    plant.end();
+    assert_eq!(resets.load(std::sync::atomic::Ordering::Relaxed), 5, "the first state and four new episodes");
+}
+
+#[test]
 fn a_silent_plant_makes_the_loop_brake_and_come_back() {
     let name = Name::new("stale");
     let frozen =

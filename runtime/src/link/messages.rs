@@ -21,7 +21,7 @@ pub const MAX_NAMES: usize = 2048;
 /// Capacity of the text in a [`ReceiptMessage`] [bytes].
 pub const MAX_TEXT: usize = 256;
 
-/// The plant began a new episode with this state: drop what was remembered.
+/// This state begins an episode. For learning; the loop goes by the episode's number.
 pub const STATE_RESET: u32 = 1;
 /// The episode ended in a terminal state.
 pub const STATE_TERMINATED: u32 = 2;

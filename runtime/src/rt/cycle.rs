@@ -13,7 +13,7 @@ use std::sync::Arc;
 use hdrhistogram::Histogram;
 use rtrb::{Consumer, Producer};
 
-use crate::link::{ActionMessage, Message, STATE_RESET, StateMessage};
+use crate::link::{ActionMessage, Message, StateMessage};
 use crate::rt::clock::{self, Bell};
 use crate::rt::mode::{Event, Mode, ModeLimits, Modes};
 use crate::rt::swap::Slot;
@@ -182,11 +182,9 @@ impl<T: Tick> Cycle<T> {
 
     /// Takes the newest state and says what it is worth.
     fn sense(&mut self) -> Event {
-        let known = self.record.state.header;
-        let mut resets = 0;
+        let (known, episode) = (self.record.state.header, self.record.state.episode);
         self.record.fresh = false;
         while let Ok(state) = self.ends.states.pop() {
-            resets |= state.bits & STATE_RESET;
             self.record.state = state;
             self.record.fresh = true;
         }
@@ -196,7 +194,8 @@ impl<T: Tick> Cycle<T> {
             let is_next = state.header.epoch == known.epoch && state.header.seq > known.seq;
             let lost = if is_next { state.header.seq - known.seq - 1 } else { 0 };
             self.record.counters.lost_states += lost;
-            if !is_next || resets != 0 {
+            // By its number: the state that began the episode may be among the lost ones.
+            if !is_next || state.episode != episode {
                 self.controller.reset();
             }
             if self.settings.sync == Sync::Plant {

@@ -1,6 +1,8 @@
 //! A point mass as plant and a trivial controller, shared by the loop tests.
 #![allow(dead_code, unreachable_pub)] // each test binary uses a part of it
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::{JoinHandle, ThreadId};
 
@@ -17,6 +19,8 @@ pub struct PointMass {
     pub applied: Vec<f64>,
     pub versions: Vec<u64>,
     pub braked: u64,
+    /// Ticks of an episode; 0 is one without end.
+    pub episode_ticks: u64,
     /// Observes NaN from this tick on, for that many ticks.
     pub nan: Option<(u64, u64)>,
     /// Stops publishing new numbers and sleeps this long at this tick.
@@ -34,6 +38,10 @@ impl Plant for PointMass {
         }
         (state.nq, state.nv, state.nu, state.n_obs) = (1, 1, 1, 1);
         state.time = self.tick as f64 * DT;
+        if self.episode_ticks > 0 && self.tick > 0 && self.tick % self.episode_ticks == 0 {
+            (self.q, self.v) = (1.0, 0.0);
+        }
+        state.episode = self.tick.checked_div(self.episode_ticks).unwrap_or(0);
         state.q[0] = self.q;
         state.v[0] = self.v;
         state.obs[0] = self.q;
@@ -64,6 +72,7 @@ pub struct Spring {
     pub drops: Sender<(u64, ThreadId)>,
     pub panics_at: Option<u64>,
     pub ticks: u64,
+    pub resets: Arc<AtomicU64>,
 }
 
 impl Tick for Spring {
@@ -89,7 +98,9 @@ impl Tick for Spring {
         Outcome::Acted
     }
 
-    fn reset(&mut self) {}
+    fn reset(&mut self) {
+        self.resets.fetch_add(1, Ordering::Relaxed);
+    }
 }
 
 impl Drop for Spring {
@@ -119,7 +130,7 @@ impl Build for SpringBuilder {
 }
 
 pub fn spring(version: u64, drops: &Sender<(u64, ThreadId)>) -> Spring {
-    Spring { version, drops: drops.clone(), panics_at: None, ticks: 0 }
+    Spring { version, drops: drops.clone(), panics_at: None, ticks: 0, resets: Arc::default() }
 }
 
 pub fn robot(lockstep: bool) -> Robot {
