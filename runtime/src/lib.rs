@@ -4,8 +4,11 @@
 
 pub mod controller;
 pub mod idm;
+pub mod link;
+pub mod log;
 pub mod net;
 pub mod normaliser;
+pub mod rt;
 pub mod snapshot;
 pub mod task;
 
