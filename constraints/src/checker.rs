@@ -98,7 +98,7 @@ impl Checker {
         let (t, tau) = (self.period.dt, self.period.tau);
         // A whole period of braking from standstill must not carry the dof beyond the limits on the other side.
         let room = (high - low) / (self.period.kappa * t * t + 0.5 * (t - 0.5 * tau).powi(2));
-        let a_max = self.limits.acceleration[i].min(self.limits.velocity[i] / t).min(room);
+        let a_max = self.limits.braking[i].min(self.limits.velocity[i] / t).min(room);
         let (mut highest, mut lowest) = (next.0, next.0);
         if kinematic {
             let (mut q, mut v) = now;

@@ -12,6 +12,8 @@
 //! Control of Robot Manipulators", RA-L 2018. The familiar `v' <= sqrt(2 A d)` is the same parabola at the wrong end
 //! of the step, and conflicts with the acceleration limit near the position limit.
 
+use crate::LimitSet;
+
 /// What set a bound, or what a violation violates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u8)]
@@ -61,21 +63,30 @@ pub struct Dof {
     pub velocity: f64,
     /// Largest acceleration A [rad/s² or m/s²].
     pub acceleration: f64,
+    /// Deceleration that braking may count on, at most A [rad/s² or m/s²].
+    pub deceleration: f64,
 }
 
 impl Dof {
-    /// The deceleration that braking counts on: `A`, or less where a whole period of it would turn the dof round and
+    /// The limits of dof `i` of a set.
+    pub fn of(limits: &LimitSet, i: usize) -> Dof {
+        let (lower, upper) = (limits.q_lower[i], limits.q_upper[i]);
+        let (acceleration, deceleration) = (limits.acceleration[i], limits.braking[i]);
+        Dof { lower, upper, velocity: limits.velocity[i], acceleration, deceleration }
+    }
+
+    /// The deceleration that braking counts on: the one stated, or less where a whole period of it would turn the dof round and
     /// carry it beyond a limit on the other side,
     ///
     /// ```text
-    ///     A_b = min(A, V / T, (q_max - q_min) / (kappa T^2 + (T - tau / 2)^2 / 2))
+    ///     A_b = min(deceleration, V / T, (q_max - q_min) / (kappa T^2 + (T - tau / 2)^2 / 2))
     /// ```
     ///
     /// The set of the module's head is invariant for `A_b`; with `A T > V` it is not for `A`.
     pub fn braking(&self, period: &Period) -> f64 {
         let (t, half) = (period.dt, period.dt - 0.5 * period.tau);
         let room = (self.upper - self.lower) / (period.kappa * t * t + 0.5 * half * half);
-        self.acceleration.min(self.velocity / t).min(room)
+        self.deceleration.min(self.acceleration).min(self.velocity / t).min(room)
     }
 }
 
@@ -226,7 +237,7 @@ mod tests {
 
     #[test]
     fn far_from_everything_the_box_is_the_acceleration_limit() {
-        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0 };
+        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0 };
         let i = interval(&dof, 0.0, 0.0, &Period::new(0.01, 5));
         assert_eq!((i.lower, i.upper, i.outside), (-20.0, 20.0, None));
     }
@@ -234,7 +245,13 @@ mod tests {
     #[test]
     fn hand_computed_parabola() {
         // tau = 0, T = 0.1, A = 2, v = 1, d = 0.3: 0.01 a^2 + 0.22 a + 0.2 = 0 with c = 1 - 4 * 0.2
-        let dof = Dof { lower: f64::NEG_INFINITY, upper: 0.3, velocity: 10.0, acceleration: 2.0 };
+        let dof = Dof {
+            lower: f64::NEG_INFINITY,
+            upper: 0.3,
+            velocity: 10.0,
+            acceleration: 2.0,
+            deceleration: 2.0,
+        };
         let i = interval(&dof, 0.0, 1.0, &Period::new(0.1, 0));
         let root = (-0.22 + (0.22f64 * 0.22 - 4.0 * 0.01 * 0.2).sqrt()) / 0.02;
         assert!((i.upper - root).abs() < 1e-12 && i.upper_kind == Kind::Viability, "{i:?} {root}");
@@ -244,7 +261,7 @@ mod tests {
 
     #[test]
     fn beyond_the_limit_it_may_only_return() {
-        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0 };
+        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0 };
         let p = Period::new(0.01, 1);
         let still = interval(&dof, 1.2, 0.0, &p);
         assert_eq!((still.lower, still.upper, still.outside), (-20.0, 0.0, Some(Kind::Position)));

@@ -70,7 +70,7 @@ const SUB_STEPS: [u32; 5] = [0, 1, 2, 5, 10];
 
 #[test]
 fn one_joint_never_leaves_its_set() {
-    let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0 };
+    let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0 };
     for dt in PERIODS {
         for n in SUB_STEPS {
             let (outside, violation) = attack(&dof, &Period::new(dt, n), 100_000, &mut Random(7));
@@ -91,11 +91,13 @@ fn many_joints_never_leave_their_sets() {
             for _ in 0..40 {
                 let center = random.between(-3.0, 3.0);
                 let half = 10f64.powf(random.between(-2.0, 0.6));
+                let a_max = 10f64.powf(random.between(0.0, 3.0));
                 let dof = Dof {
                     lower: center - half,
                     upper: center + half,
                     velocity: 10f64.powf(random.between(-1.0, 1.3)),
-                    acceleration: 10f64.powf(random.between(0.0, 3.0)),
+                    acceleration: a_max,
+                    deceleration: a_max * random.between(0.1, 1.5).min(1.0),
                 };
                 let (outside, violation) = attack(&dof, &Period::new(dt, n), 2_500, &mut random);
                 assert!(
@@ -114,7 +116,7 @@ fn braking_from_any_admissible_state_stops_inside() {
     for dt in PERIODS {
         for n in SUB_STEPS {
             let p = Period::new(dt, n);
-            let dof = Dof { lower: -0.7, upper: 0.4, velocity: 4.0, acceleration: 15.0 };
+            let dof = Dof { lower: -0.7, upper: 0.4, velocity: 4.0, acceleration: 15.0, deceleration: 15.0 };
             let (mut q, mut v) = (0.0, 0.0);
             for _ in 0..300 {
                 for _ in 0..random.between(1.0, 30.0) as usize {
