@@ -1,0 +1,27 @@
+# NEARL: set-up of a checkout. `make setup` may be run any number of times.
+
+PYTHON ?= python3.11
+VENV := .venv
+MUJOCO := lib/python3.11/site-packages/mujoco/libmujoco.so.3.17.0
+# The stamp carries the digest of the requirements, so a changed list installs again and an old one does not.
+STAMP := $(VENV)/.requirements-$(shell sha256sum python/requirements.txt | cut -c1-16)
+LINKS := $(VENV)/mujoco-link/libmujoco.so $(VENV)/mujoco-link/libmujoco.so.3.17.0
+
+.PHONY: setup
+setup: $(LINKS)
+
+$(VENV)/bin/python:
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) was not found: install Python 3.11 or say 'make setup PYTHON=/path/to/python3.11'" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	@test -d $(VENV)/lib/python3.11 || { rm -rf $(VENV); echo "$(PYTHON) is not Python 3.11, which .cargo/config.toml expects: say 'make setup PYTHON=/path/to/python3.11'" >&2; exit 1; }
+
+$(STAMP): | $(VENV)/bin/python
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --requirement python/requirements.txt
+	@rm -f $(VENV)/.requirements-*
+	@touch $@
+
+# The wheel ships the library under its full version only; linkers ask for libmujoco.so, programs for the full name.
+$(LINKS): | $(STAMP)
+	@mkdir -p $(@D)
+	ln -sfn ../$(MUJOCO) $@
+	@test -e $@ || { rm -f $@; echo "$(VENV)/$(MUJOCO) is missing: does python/requirements.txt still say mujoco==3.17.0?" >&2; exit 1; }

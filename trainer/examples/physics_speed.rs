@@ -1,0 +1,19 @@
+//! Prints how many control periods per second the physics of each task makes, without any learning.
+//!
+//! `cargo run --release -p nearl-trainer --example physics_speed -- [seconds per measurement]`
+
+use std::time::Duration;
+
+use nearl_trainer::env;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let seconds: f64 = std::env::args().nth(1).map_or(Ok(2.0), |text| text.parse())?;
+    let cores = std::thread::available_parallelism()?.get();
+    println!("{:<16} {:>12} {:>12}", "task", "1 thread", format!("{cores} threads"));
+    for task in env::names() {
+        let speed = |threads| env::bench::physics(task, threads, Duration::from_secs_f64(seconds));
+        let (one, all) = (speed(1)?.steps_per_second(), speed(cores)?.steps_per_second());
+        println!("{task:<16} {one:>12.0} {all:>12.0}");
+    }
+    Ok(())
+}

@@ -1,0 +1,232 @@
+//! Tasks: a robot in MuJoCo, what it observes, what it is rewarded for.
+//!
+//! [`make`] builds one by name. The four locomotion tasks equal Gymnasium 1.4.0's v5 environments step for step (bit-equal
+//! states, rewards to rounding) on MuJoCo 3.17.0. A time limit is no termination: the caller counts steps against
+//! [`Spec::max_episode_steps`] and keeps the two apart.
+//!
+//! A new task is one file with an `impl` of `Rules` and one line in [`REGISTRY`].
+
+pub mod bench;
+
+mod ant;
+mod half_cheetah;
+mod hopper;
+mod meter;
+mod panda_reach;
+mod planar;
+mod rules;
+mod simulated;
+mod spec;
+mod walker2d;
+
+use crate::mj::{MjError, ModelFormat, Sim};
+
+pub use meter::{Excess, LimitError, Limits, Meter, Worst};
+pub use rand_chacha::ChaCha8Rng;
+pub use rand_chacha::rand_core::SeedableRng;
+pub use spec::Spec;
+
+/// What one control period gave.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Step {
+    /// Reward of the period; 0 where `fault` is not [`Fault::None`].
+    pub reward: f64,
+    /// The episode ended in this state: no value is to be bootstrapped from it. True at every fault.
+    pub terminated: bool,
+    /// Whether the physics can be believed.
+    pub fault: Fault,
+}
+
+/// Why a control period is not to be believed. The robot then needs [`Env::reset`] or [`Env::set_state`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    /// All is well.
+    None,
+    /// The action held NaN or infinity; nothing was simulated.
+    Action,
+    /// The state became non-finite or huge; MuJoCo put the robot back to its initial configuration (from where Gymnasium
+    /// would go on in silence).
+    Unstable,
+    /// MuJoCo stopped with an error ([`Env::last_error`] has its words); the robot is back at its initial configuration.
+    Engine,
+}
+
+/// Counts since the environment was made.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Control periods simulated.
+    pub steps: u64,
+    /// Action entries outside their range, hence clamped by the plant.
+    pub saturations: u64,
+    /// Periods with a [`Fault`].
+    pub faults: u64,
+}
+
+/// A task on one simulated robot. One thread at a time; give each thread its own.
+///
+/// # Example
+/// ```no_run
+/// use nearl_trainer::env::{self, ChaCha8Rng, SeedableRng};
+/// # fn main() -> Result<(), env::EnvError> {
+/// let mut env = env::make("HalfCheetah-v5")?;
+/// let mut obs = vec![0.0; env.spec().n_obs()];
+/// env.reset(&mut ChaCha8Rng::seed_from_u64(0))?;
+/// for _ in 0..env.spec().max_episode_steps {
+///     env.observe(&mut obs);
+///     let step = env.step(&[0.1; 6]);
+///     println!("{} {}", step.reward, step.terminated);
+/// }
+/// # Ok(()) }
+/// ```
+pub trait Env: Send {
+    /// Names, sizes, times and ranges.
+    fn spec(&self) -> &Spec;
+
+    /// Starts an episode from the task's own distribution.
+    ///
+    /// # Errors
+    /// [`EnvError::Physics`] when MuJoCo cannot evaluate the state.
+    fn reset(&mut self, rng: &mut ChaCha8Rng) -> Result<(), EnvError>;
+
+    /// Starts an episode from `qpos` (nq) and `qvel` (nv) in MuJoCo's convention. What follows depends on these, the goal
+    /// and the actions alone.
+    ///
+    /// # Errors
+    /// [`EnvError::Physics`] for a wrong length or an entry that is not finite (the state is then unchanged).
+    fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError>;
+
+    /// Simulates one control period ([`Spec::dt`]) under `action` (n_act), held constant and clamped to its range by the
+    /// plant.
+    ///
+    /// # Panics
+    /// When `action` has not [`Spec::n_act`] entries.
+    fn step(&mut self, action: &[f64]) -> Step;
+
+    /// Writes the observation (n_obs), in the order of [`Spec::obs`].
+    fn observe(&self, obs: &mut [f64]);
+
+    /// Writes `q` (nq) and `v` (nv) in Pinocchio's convention, joints in MuJoCo's order ([`Spec::joints`]): equal to
+    /// [`Env::qpos`] and [`Env::qvel`] but for a free joint, whose quaternion is `x y z w` (and of unit length) and whose
+    /// linear velocity is in the body's frame.
+    fn state(&self, q: &mut [f64], v: &mut [f64]);
+
+    /// Configuration (nq), MuJoCo's convention.
+    fn qpos(&self) -> &[f64] {
+        self.sim().qpos()
+    }
+
+    /// Velocity (nv), MuJoCo's convention.
+    fn qvel(&self) -> &[f64] {
+        self.sim().qvel()
+    }
+
+    /// The simulation, for those who watch it: the plant process, the limit meter, tests.
+    fn sim(&self) -> &Sim;
+
+    /// What the task asks for (empty where it has no goal). With `qpos` and `qvel` it makes an episode repeatable.
+    fn goal(&self) -> &[f64];
+
+    /// Sets the goal.
+    ///
+    /// # Errors
+    /// [`EnvError::Goal`] when the task has none or one of another length; [`EnvError::Physics`] when it is not finite.
+    fn set_goal(&mut self, goal: &[f64]) -> Result<(), EnvError>;
+
+    /// Counts since the environment was made.
+    fn counters(&self) -> Counters;
+
+    /// MuJoCo's words at the last [`Fault::Engine`].
+    fn last_error(&self) -> Option<&MjError>;
+
+    /// The robot file's text, so that a snapshot can carry it.
+    fn model_text(&self) -> &'static str;
+
+    /// The robot file's language.
+    fn model_format(&self) -> ModelFormat;
+
+    /// The same task once more, sharing the compiled robot: cheaper than [`make`].
+    ///
+    /// # Errors
+    /// [`EnvError::Physics`] when there is no memory for it.
+    fn another(&self) -> Result<Box<dyn Env>, EnvError>;
+}
+
+/// Why a task could not be made or set.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum EnvError {
+    /// No task of this name.
+    #[error("there is no task '{name}': {}", nearest(near))]
+    Unknown {
+        /// What was asked for.
+        name: String,
+        /// Names like it, the most alike first.
+        near: Vec<&'static str>,
+    },
+    /// The robot file or the state is not acceptable to MuJoCo.
+    #[error("task '{task}': {source}")]
+    Physics {
+        /// The task.
+        task: &'static str,
+        /// MuJoCo's side of it.
+        source: MjError,
+    },
+    /// A goal the task cannot have.
+    #[error("task '{task}' has a goal of {expected} entries, not {got}")]
+    Goal {
+        /// The task.
+        task: &'static str,
+        /// Entries of its goal, 0 when it has none.
+        expected: usize,
+        /// Entries given.
+        got: usize,
+    },
+}
+
+fn nearest(near: &[&str]) -> String {
+    match near {
+        [] => format!("it is one of {}", names().collect::<Vec<_>>().join(", ")),
+        near => format!("did you mean '{}'?", near.join("' or '")),
+    }
+}
+
+/// A task that can be made by name.
+pub struct Entry {
+    /// Its name.
+    pub name: &'static str,
+    /// What it is, in one line.
+    pub about: &'static str,
+    build: fn() -> Result<Box<dyn Env>, EnvError>,
+}
+
+/// Every task.
+pub const REGISTRY: &[Entry] = &[
+    Entry { name: half_cheetah::NAME, about: half_cheetah::ABOUT, build: half_cheetah::build },
+    Entry { name: hopper::NAME, about: hopper::ABOUT, build: hopper::build },
+    Entry { name: walker2d::NAME, about: walker2d::ABOUT, build: walker2d::build },
+    Entry { name: ant::NAME, about: ant::ABOUT, build: ant::build },
+    Entry { name: panda_reach::NAME, about: panda_reach::ABOUT, build: panda_reach::build },
+];
+
+/// Names of all tasks.
+pub fn names() -> impl Iterator<Item = &'static str> {
+    REGISTRY.iter().map(|entry| entry.name)
+}
+
+/// Makes a task. Its state is the robot's initial configuration until [`Env::reset`] or [`Env::set_state`].
+///
+/// # Errors
+/// [`EnvError::Unknown`] with the names that look alike; [`EnvError::Physics`] when its robot does not compile.
+pub fn make(name: &str) -> Result<Box<dyn Env>, EnvError> {
+    match REGISTRY.iter().find(|entry| entry.name == name) {
+        Some(entry) => (entry.build)(),
+        None => Err(EnvError::Unknown { name: name.to_owned(), near: near_names(name) }),
+    }
+}
+
+fn near_names(name: &str) -> Vec<&'static str> {
+    let asked = name.to_lowercase();
+    let mut scored: Vec<_> = names().map(|n| (strsim::jaro_winkler(&asked, &n.to_lowercase()), n)).collect();
+    scored.retain(|(score, _)| *score > 0.75);
+    scored.sort_by(|a, b| b.0.total_cmp(&a.0));
+    scored.into_iter().map(|(_, n)| n).take(2).collect()
+}

@@ -1,0 +1,89 @@
+//! What a task adds to a simulated robot: the extension point of this folder.
+
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::mj::{MjError, Model, ModelFormat, Sim};
+
+use super::spec::Spec;
+
+/// A robot file and how a task simulates it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Robot {
+    pub(super) text: &'static str,
+    pub(super) format: ModelFormat,
+}
+
+/// Start, observation, reward and termination of a task.
+pub(super) trait Rules: Clone + Send + 'static {
+    /// Turns `qpos` and `qvel` (on entry: the robot's initial configuration at rest) into the start of an episode, and
+    /// draws a new goal where there is one. `sim` may be moved about; its state is set afterwards.
+    fn start(
+        &mut self,
+        rng: &mut ChaCha8Rng,
+        sim: &mut Sim,
+        qpos: &mut [f64],
+        qvel: &mut [f64],
+    ) -> Result<(), MjError>;
+
+    /// Hands the action (n_act) to the plant.
+    fn actuate(&self, _spec: &Spec, sim: &mut Sim, action: &[f64]) {
+        // Not clamped here: MuJoCo does it by `ctrlrange`.
+        sim.ctrl_mut().copy_from_slice(action);
+    }
+
+    /// What is compared before and after the period, as the distance travelled \[m\].
+    fn progress(&self, sim: &Sim) -> f64;
+
+    /// Finishes what a step computes (contact forces where they are observed).
+    fn finish(&self, _sim: &mut Sim) -> Result<(), MjError> {
+        Ok(())
+    }
+
+    /// Reward of the period that ends in `sim`'s state, and whether the episode ends there. `before` is what
+    /// [`Rules::progress`] was when it began.
+    fn judge(&self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool);
+
+    /// Writes the observation.
+    fn observe(&self, sim: &Sim, obs: &mut [f64]);
+
+    /// The goal, empty where there is none.
+    fn goal(&self) -> &[f64] {
+        &[]
+    }
+
+    /// Where to write a new goal.
+    fn goal_mut(&mut self) -> &mut [f64] {
+        &mut []
+    }
+}
+
+/// `sum(action^2)`, on the action as it was asked for, not as it was clamped.
+///
+/// Gymnasium sums in the action's own type; its float32 actions give a cost that differs in the eighth digit from this one.
+pub(super) fn squared(action: &[f64]) -> f64 {
+    action.iter().map(|a| a * a).sum()
+}
+
+/// Adds noise uniform in `[-scale, scale)` to each entry.
+pub(super) fn add_uniform(rng: &mut ChaCha8Rng, scale: f64, entries: &mut [f64]) {
+    for x in entries {
+        *x += rng.random_range(-scale..scale);
+    }
+}
+
+/// Adds Gaussian noise of standard deviation `scale` to each entry.
+pub(super) fn add_normal(rng: &mut ChaCha8Rng, scale: f64, entries: &mut [f64]) {
+    for x in entries {
+        let noise: f64 = StandardNormal.sample(rng);
+        *x += scale * noise;
+    }
+}
+
+/// `q.<joint>` for every one-dof joint from the `skip`-th on, then `v.<joint>` for all.
+pub(super) fn joint_names(model: &Model, skip: usize) -> Vec<String> {
+    let joints = model.joints();
+    let positions = joints[skip..].iter().map(|j| format!("q.{}", j.name));
+    positions.chain(joints.iter().map(|j| format!("v.{}", j.name))).collect()
+}

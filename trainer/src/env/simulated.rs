@@ -1,0 +1,173 @@
+//! A task from its rules: everything the tasks of this folder have in common.
+
+use rand_chacha::ChaCha8Rng;
+
+use super::rules::{Robot, Rules};
+use super::{Counters, Env, EnvError, Fault, Spec, Step};
+use crate::mj::{JointKind, MjError, ModelFormat, Sim};
+
+/// A robot, its simulation and a task's rules.
+pub(super) struct Simulated<R> {
+    spec: Spec,
+    robot: Robot,
+    rules: R,
+    sim: Sim,
+    start: (Vec<f64>, Vec<f64>),
+    counters: Counters,
+    last_error: Option<MjError>,
+}
+
+impl<R: Rules> Simulated<R> {
+    /// Boxes a task whose robot was compiled into `sim`.
+    pub(super) fn boxed(spec: Spec, robot: Robot, rules: R, sim: Sim) -> Box<dyn Env> {
+        let start = (vec![0.0; spec.nq], vec![0.0; spec.nv]);
+        Box::new(Simulated {
+            spec,
+            robot,
+            rules,
+            sim,
+            start,
+            counters: Counters::default(),
+            last_error: None,
+        })
+    }
+
+    fn physics(&self) -> impl Fn(MjError) -> EnvError + use<R> {
+        let task = self.spec.name;
+        move |source| EnvError::Physics { task, source }
+    }
+
+    fn faulty(&mut self, fault: Fault) -> Step {
+        self.counters.faults += 1;
+        Step { reward: 0.0, terminated: true, fault }
+    }
+
+    fn simulate(&mut self, action: &[f64]) -> Result<(), MjError> {
+        self.rules.actuate(&self.spec, &mut self.sim, action);
+        self.sim.step(self.spec.sub_steps)?;
+        self.rules.finish(&mut self.sim)
+    }
+}
+
+impl<R: Rules> Env for Simulated<R> {
+    fn spec(&self) -> &Spec {
+        &self.spec
+    }
+
+    fn reset(&mut self, rng: &mut ChaCha8Rng) -> Result<(), EnvError> {
+        let (qpos, qvel) = &mut self.start;
+        qpos.copy_from_slice(self.sim.model().qpos0());
+        qvel.fill(0.0);
+        let started = self.rules.start(rng, &mut self.sim, qpos, qvel);
+        started.and_then(|()| self.sim.set_state(qpos, qvel)).map_err(self.physics())
+    }
+
+    fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError> {
+        self.sim.set_state(qpos, qvel).map_err(self.physics())
+    }
+
+    fn step(&mut self, action: &[f64]) -> Step {
+        assert_eq!(action.len(), self.spec.n_act(), "the action of '{}' has another length", self.spec.name);
+        if action.iter().any(|a| !a.is_finite()) {
+            return self.faulty(Fault::Action);
+        }
+        self.counters.steps += 1;
+        let outside = action.iter().zip(&self.spec.actuators).filter(|(a, of)| **a < of.low || **a > of.high);
+        self.counters.saturations += outside.count() as u64;
+
+        let before = self.rules.progress(&self.sim);
+        if let Err(error) = self.simulate(action) {
+            self.last_error = Some(error);
+            return self.faulty(Fault::Engine);
+        }
+        if self.sim.take_unstable() {
+            return self.faulty(Fault::Unstable);
+        }
+        let (reward, terminated) = self.rules.judge(&self.spec, &self.sim, before, action);
+        Step { reward, terminated, fault: Fault::None }
+    }
+
+    fn observe(&self, obs: &mut [f64]) {
+        self.rules.observe(&self.sim, obs);
+    }
+
+    fn state(&self, q: &mut [f64], v: &mut [f64]) {
+        q.copy_from_slice(self.sim.qpos());
+        v.copy_from_slice(self.sim.qvel());
+        for joint in &self.spec.joints {
+            match joint.kind {
+                JointKind::Slide | JointKind::Hinge => {}
+                JointKind::Ball => rotate_left(&mut q[joint.idx_q..][..4]),
+                JointKind::Free => {
+                    let quaternion = &mut q[joint.idx_q + 3..][..4];
+                    rotate_left(quaternion);
+                    to_body(quaternion, &mut v[joint.idx_v..][..3]);
+                }
+            }
+        }
+    }
+
+    fn sim(&self) -> &Sim {
+        &self.sim
+    }
+
+    fn goal(&self) -> &[f64] {
+        self.rules.goal()
+    }
+
+    fn set_goal(&mut self, goal: &[f64]) -> Result<(), EnvError> {
+        let task = self.spec.name;
+        let kept = self.rules.goal_mut();
+        if kept.len() != goal.len() || goal.is_empty() {
+            return Err(EnvError::Goal { task, expected: kept.len(), got: goal.len() });
+        }
+        if let Some(index) = goal.iter().position(|g| !g.is_finite()) {
+            let source = MjError::NotFinite { what: "goal", index, value: goal[index] };
+            return Err(EnvError::Physics { task, source });
+        }
+        kept.copy_from_slice(goal);
+        Ok(())
+    }
+
+    fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    fn last_error(&self) -> Option<&MjError> {
+        self.last_error.as_ref()
+    }
+
+    fn model_text(&self) -> &'static str {
+        self.robot.text
+    }
+
+    fn model_format(&self) -> ModelFormat {
+        self.robot.format
+    }
+
+    fn another(&self) -> Result<Box<dyn Env>, EnvError> {
+        let sim = Sim::new(self.sim.model()).map_err(self.physics())?;
+        Ok(Simulated::boxed(self.spec.clone(), self.robot, self.rules.clone(), sim))
+    }
+}
+
+/// `w x y z` (of any length) to `x y z w` (of length one).
+fn rotate_left(quaternion: &mut [f64]) {
+    quaternion.rotate_left(1);
+    let length = quaternion.iter().map(|c| c * c).sum::<f64>().sqrt();
+    quaternion.iter_mut().for_each(|c| *c /= length);
+}
+
+/// `v <- R' v` for the rotation `R` (body to world) of the unit quaternion `x y z w`:
+/// `R' v = v - 2 w (u x v) + 2 u x (u x v)` with `u = (x, y, z)`.
+fn to_body(quaternion: &[f64], v: &mut [f64]) {
+    let (u, w) = ([quaternion[0], quaternion[1], quaternion[2]], quaternion[3]);
+    let cross = |a: [f64; 3], b: [f64; 3]| {
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    };
+    let uv = cross(u, [v[0], v[1], v[2]]);
+    let uuv = cross(u, uv);
+    for i in 0..3 {
+        v[i] += 2.0 * (uuv[i] - w * uv[i]);
+    }
+}

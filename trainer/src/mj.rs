@@ -1,0 +1,278 @@
+//! MuJoCo 3.17.0: the only module of the project that calls it.
+//!
+//! [`Model`] is the compiled robot (immutable, shared between threads), [`Sim`] the state of one simulation.
+//! MuJoCo's fatal errors arrive as [`MjError::Engine`], its warnings are counted ([`warnings`]) and never written to a
+//! file. A newer MuJoCo is a change of this module and of a version number.
+
+mod guard;
+mod sim;
+
+use std::sync::Arc;
+
+use mujoco_rs::wrappers::mj_model::{MjModel, MjtJoint, MjtObjBase};
+
+pub use guard::{last_warning, warnings};
+pub use sim::Sim;
+
+/// Why MuJoCo could not do what was asked.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum MjError {
+    /// The robot file does not compile.
+    #[error("MuJoCo cannot load the robot file: {0}")]
+    Load(String),
+    /// MuJoCo gave up inside a computation; the simulation was put back to its initial state.
+    #[error("MuJoCo stopped with an error and the simulation was reset: {0}")]
+    Engine(String),
+    /// A state of the wrong length.
+    #[error("{what} has {got} entries, the robot has {expected}")]
+    Length {
+        /// Which vector.
+        what: &'static str,
+        /// What the robot has.
+        expected: usize,
+        /// What was given.
+        got: usize,
+    },
+    /// A state with NaN or infinity in it.
+    #[error("{what}[{index}] is {value}: every entry must be finite")]
+    NotFinite {
+        /// Which vector.
+        what: &'static str,
+        /// Which entry.
+        index: usize,
+        /// What was given.
+        value: f64,
+    },
+    /// The robot file has no such body.
+    #[error("the robot has no body '{0}'")]
+    NoBody(String),
+}
+
+/// Language of a robot file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ModelFormat {
+    /// MuJoCo's own XML.
+    Mjcf,
+    /// Unified Robot Description Format.
+    Urdf,
+}
+
+/// What of a robot file's simulation settings to replace. The default replaces nothing.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Options {
+    /// Physics step \[s\].
+    pub sim_dt: Option<f64>,
+    /// Leave contacts out.
+    pub without_contacts: bool,
+    /// Integrate joint damping explicitly, so that Euler's step is `v' = v + sim_dt * a` to the last bit.
+    pub explicit_damping: bool,
+}
+
+/// Kind of a joint.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum JointKind {
+    /// Six degrees of freedom, seven entries: position \[m\] and unit quaternion.
+    Free,
+    /// Three degrees of freedom, four entries: unit quaternion.
+    Ball,
+    /// One translation \[m\].
+    Slide,
+    /// One rotation \[rad\].
+    Hinge,
+}
+
+/// A joint and where its entries are in `qpos` and `qvel`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Joint {
+    /// Name in the robot file (`joint<id>` where the file gives none).
+    pub name: String,
+    /// What it lets move.
+    pub kind: JointKind,
+    /// First entry in `qpos`.
+    pub idx_q: usize,
+    /// Number of entries in `qpos`.
+    pub nq: usize,
+    /// First entry in `qvel`.
+    pub idx_v: usize,
+    /// Number of entries in `qvel`.
+    pub nv: usize,
+    /// Range of a slide or hinge \[m or rad\]; infinite where the file sets none.
+    pub range: [f64; 2],
+    /// Force or torque limit \[N or N·m\] a URDF gives as `effort`; infinite where the file sets none.
+    pub effort: f64,
+}
+
+/// One entry of the action: what moves which degree of freedom.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Actuator {
+    /// Name of the actuator, or of its joint where the file gives none.
+    pub name: String,
+    /// Joint it moves.
+    pub joint: String,
+    /// Degree of freedom it moves (index into `qvel`).
+    pub dof: usize,
+    /// Joint force or torque per unit of action \[N or N·m\].
+    pub gear: f64,
+    /// Smallest action that has an effect of its own.
+    pub low: f64,
+    /// Largest action that has an effect of its own.
+    pub high: f64,
+}
+
+/// A compiled robot. Cloning shares it.
+#[derive(Debug, Clone)]
+pub struct Model(Arc<MjModel>);
+
+impl Model {
+    /// Compiles a robot from its text.
+    ///
+    /// A URDF keeps its fixed links as bodies (MuJoCo would merge them and lose a tool frame's name), unless the file
+    /// brings its own `<mujoco>` settings.
+    ///
+    /// # Errors
+    /// [`MjError::Load`] with MuJoCo's own explanation.
+    pub fn from_text(text: &str, format: ModelFormat, options: Options) -> Result<Model, MjError> {
+        let text = match format {
+            ModelFormat::Mjcf => text.to_owned(),
+            ModelFormat::Urdf => keep_fixed_links(text),
+        };
+        let loaded = guard::counting_warnings(|| MjModel::from_xml_string(&text));
+        let mut model = loaded.map_err(|e| MjError::Load(guard::one_line(&e.to_string())))?;
+        let opt = model.opt_mut();
+        if let Some(sim_dt) = options.sim_dt {
+            opt.timestep = sim_dt;
+        }
+        use mujoco_rs::mujoco_c::mjtDisableBit::{mjDSBL_CONTACT, mjDSBL_EULERDAMP};
+        if options.without_contacts {
+            opt.disableflags |= mjDSBL_CONTACT as i32;
+        }
+        if options.explicit_damping {
+            opt.disableflags |= mjDSBL_EULERDAMP as i32;
+        }
+        Ok(Model(Arc::new(model)))
+    }
+
+    /// Entries of a configuration.
+    pub fn nq(&self) -> usize {
+        self.0.nq() as usize
+    }
+
+    /// Degrees of freedom.
+    pub fn nv(&self) -> usize {
+        self.0.nv() as usize
+    }
+
+    /// Controls.
+    pub fn nu(&self) -> usize {
+        self.0.nu() as usize
+    }
+
+    /// Bodies, the world included.
+    pub fn n_bodies(&self) -> usize {
+        self.0.nbody() as usize
+    }
+
+    /// Physics step \[s\].
+    pub fn sim_dt(&self) -> f64 {
+        self.0.opt().timestep
+    }
+
+    /// Whether a physics step is MuJoCo's Euler (velocity first, then position with the new velocity).
+    pub fn is_euler(&self) -> bool {
+        self.0.opt().integrator == mujoco_rs::mujoco_c::mjtIntegrator::mjINT_EULER as i32
+    }
+
+    /// Mass of all bodies \[kg\].
+    pub fn total_mass(&self) -> f64 {
+        self.0.totalmass()
+    }
+
+    /// Initial configuration of the file (nq).
+    pub fn qpos0(&self) -> &[f64] {
+        self.0.qpos0()
+    }
+
+    /// Number of a body.
+    ///
+    /// # Errors
+    /// [`MjError::NoBody`].
+    pub fn body(&self, name: &str) -> Result<usize, MjError> {
+        self.0.name_to_id(MjtObjBase::mjOBJ_BODY, name).ok_or_else(|| MjError::NoBody(name.to_owned()))
+    }
+
+    /// Name of a body; a nameless one takes the name of its first joint, else `body<id>`.
+    pub fn body_name(&self, body: usize) -> String {
+        if let Some(name) = self.name(MjtObjBase::mjOBJ_BODY, body) {
+            return name;
+        }
+        let first = self.0.jnt_bodyid().iter().position(|&b| b as usize == body);
+        first.map_or_else(|| format!("body{body}"), |joint| self.joint_name(joint))
+    }
+
+    /// Joints in MuJoCo's order.
+    pub fn joints(&self) -> Vec<Joint> {
+        (0..self.0.jnt_type().len()).map(|id| self.joint(id)).collect()
+    }
+
+    /// Actuators that drive a joint, in the order of the action.
+    pub fn actuators(&self) -> Vec<Actuator> {
+        (0..self.nu())
+            .map(|id| {
+                let joint = self.0.actuator_trnid()[id][0] as usize;
+                let [low, high] = self.0.actuator_ctrlrange()[id];
+                Actuator {
+                    name: self.name(MjtObjBase::mjOBJ_ACTUATOR, id).unwrap_or_else(|| self.joint_name(joint)),
+                    joint: self.joint_name(joint),
+                    dof: self.0.jnt_dofadr()[joint] as usize,
+                    gear: self.0.actuator_gear()[id][0],
+                    low,
+                    high,
+                }
+            })
+            .collect()
+    }
+
+    fn joint(&self, id: usize) -> Joint {
+        let (kind, nq, nv) = match self.0.jnt_type()[id] {
+            MjtJoint::mjJNT_FREE => (JointKind::Free, 7, 6),
+            MjtJoint::mjJNT_BALL => (JointKind::Ball, 4, 3),
+            MjtJoint::mjJNT_SLIDE => (JointKind::Slide, 1, 1),
+            MjtJoint::mjJNT_HINGE => (JointKind::Hinge, 1, 1),
+        };
+        let limited = self.0.jnt_limited()[id] && nv == 1;
+        Joint {
+            name: self.joint_name(id),
+            kind,
+            idx_q: self.0.jnt_qposadr()[id] as usize,
+            nq,
+            idx_v: self.0.jnt_dofadr()[id] as usize,
+            nv,
+            range: if limited { self.0.jnt_range()[id] } else { [f64::NEG_INFINITY, f64::INFINITY] },
+            effort: if self.0.jnt_actfrclimited()[id] {
+                self.0.jnt_actfrcrange()[id][1]
+            } else {
+                f64::INFINITY
+            },
+        }
+    }
+
+    fn joint_name(&self, id: usize) -> String {
+        self.name(MjtObjBase::mjOBJ_JOINT, id).unwrap_or_else(|| format!("joint{id}"))
+    }
+
+    fn name(&self, kind: MjtObjBase, id: usize) -> Option<String> {
+        self.0.id_to_name(kind, id).filter(|name| !name.is_empty()).map(str::to_owned)
+    }
+}
+
+/// Adds MuJoCo's setting that keeps fixed links after the opening `<robot ...>`.
+fn keep_fixed_links(urdf: &str) -> String {
+    let opening = urdf.find("<robot").and_then(|at| urdf[at..].find('>').map(|end| at + end + 1));
+    match opening {
+        Some(at) if !urdf.contains("<mujoco") => {
+            let (head, rest) = urdf.split_at(at);
+            format!("{head}<mujoco><compiler fusestatic=\"false\"/></mujoco>{rest}")
+        }
+        _ => urdf.to_owned(),
+    }
+}
