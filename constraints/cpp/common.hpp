@@ -1,0 +1,47 @@
+#pragma once
+#include "shim.h"
+#include <pinocchio/multibody.hpp>
+#include <exception>
+#include <string>
+
+#if defined(__AVX__) || EIGEN_DEFAULT_ALIGN_BYTES != 16 || !_GLIBCXX_USE_CXX11_ABI
+#error "the wheel is plain SSE2 with 16-byte Eigen alignment and the C++11 ABI: take -march and -mavx out of CXXFLAGS"
+#endif
+#ifndef PINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION
+#error "the compile definitions must come from the wheel's pinocchioTargets.cmake"
+#endif
+
+namespace pin = pinocchio;
+using Vector = Eigen::VectorXd;
+using VectorMap = Eigen::Map<Vector>;
+using MatrixMap = Eigen::Map<Eigen::MatrixXd>;
+
+// The wheel instantiates its algorithms for exactly this type, and it copies nothing; with a bare Map the compiler
+// instantiates them here again (50 s each).
+using Input = Eigen::Ref<const Vector>;
+static inline Input input(const double *p, Eigen::Index n) { return Input(Eigen::Map<const Vector>(p, n)); }
+
+struct nc_model {
+  pin::Model model;
+};
+
+struct nc_data {
+  pin::Data data;
+  Vector q0, q1, dq; // integrate and difference are instantiated for plain vectors only
+  explicit nc_data(const pin::Model &m) : data(m), q0(m.nq), q1(m.nq), dq(m.nv) {}
+};
+
+extern thread_local std::string nc_error;
+
+// No exception may cross into Rust.
+template <class F> static int guard(F &&f) noexcept {
+  try {
+    f();
+    return 0;
+  } catch (const std::exception &e) {
+    nc_error = e.what();
+  } catch (...) {
+    nc_error = "unknown C++ exception";
+  }
+  return -1;
+}

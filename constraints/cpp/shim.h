@@ -1,0 +1,44 @@
+// C functions over Pinocchio. Matrices are column-major, every buffer belongs to the caller.
+// Functions returning int: 0 is success, -1 an exception whose text nc_last_error() returns (same thread).
+#pragma once
+#include <stddef.h>
+#ifdef __cplusplus
+extern "C" {
+#endif
+typedef struct nc_model nc_model; // constants: immutable once built, shared between threads
+typedef struct nc_data nc_data;   // scratch: one per thread
+
+const char *nc_last_error(void);
+
+// -- building (load.cpp) --
+nc_model *nc_model_from_urdf_text(const char *xml);
+nc_model *nc_model_from_mjcf_file(const char *path);
+void nc_model_free(nc_model *);
+int nc_model_nq(const nc_model *);
+int nc_model_nv(const nc_model *);
+int nc_model_njoints(const nc_model *); // without the universe
+// joint 0 is the first after the universe; *type: the letters Pinocchio names the joint with
+int nc_model_joint(const nc_model *, int joint, char *name, size_t name_cap, char *type, size_t type_cap,
+                   int *idx_q, int *nq, int *idx_v, int *nv);
+// lower and upper hold nq numbers, the others nv
+int nc_model_limits(const nc_model *, double *lower, double *upper, double *velocity, double *effort,
+                    double *damping, double *friction);
+double nc_model_mass(const nc_model *);
+double nc_model_joint_mass(const nc_model *, int joint);
+int nc_model_scale_mass(nc_model *, double factor);
+int nc_model_set_gravity(nc_model *, const double gravity[3]);
+int nc_model_set_armature(nc_model *, const double *armature);
+int nc_model_neutral(const nc_model *, double *q);
+
+// -- evaluating (dynamics.cpp): none of these allocates --
+nc_data *nc_data_new(const nc_model *);
+void nc_data_free(nc_data *);
+int nc_rnea(const nc_model *, nc_data *, const double *q, const double *v, const double *a, double *tau);
+int nc_mass(const nc_model *, nc_data *, const double *q, double *mass);
+int nc_nle(const nc_model *, nc_data *, const double *q, const double *v, double *nle);
+int nc_aba(const nc_model *, nc_data *, const double *q, const double *v, const double *tau, double *a);
+int nc_integrate(const nc_model *, nc_data *, const double *q, const double *dq, double *out);
+int nc_difference(const nc_model *, nc_data *, const double *q0, const double *q1, double *dq);
+#ifdef __cplusplus
+}
+#endif

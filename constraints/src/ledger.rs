@@ -1,0 +1,167 @@
+//! What the projector reports about a tick. Training, the flight log and the operator read the same ledger.
+
+use crate::viability::Kind;
+
+/// How a tick ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Status {
+    /// The proposal obeys everything and is returned bit for bit.
+    Unchanged,
+    /// Made consistent or clamped to the box; exact.
+    Clamped,
+    /// Coupled rows were active; the nearest allowed state was solved for and checked.
+    Solved,
+    /// A joint is outside its limits: it may only return or brake, the others follow the proposal.
+    Recovering,
+    /// The proposal was not used: every controllable joint brakes.
+    Braked(BrakeReason),
+    /// The target must not be used, though it is finite: it stands still at the measured or neutral position.
+    Refused(RefuseReason),
+}
+
+impl Status {
+    /// True when the target is the nearest allowed state to the proposal.
+    pub fn is_ok(&self) -> bool {
+        !matches!(self, Status::Braked(_) | Status::Refused(_))
+    }
+}
+
+/// Why the joints brake.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BrakeReason {
+    /// The proposal holds NaN or infinity.
+    NonFiniteProposal,
+    /// No answer passed the checker: the coupled rows leave nothing, or the solver failed.
+    NoCertifiedAnswer,
+    /// The dynamics came out as NaN or infinity.
+    NonFiniteDynamics,
+}
+
+/// Why the tick was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RefuseReason {
+    /// The measured state holds NaN or infinity.
+    NonFiniteState,
+    /// A slice does not have nq or nv numbers; nothing was written.
+    WrongLength,
+}
+
+/// Which stage gave the answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rung {
+    /// Per-joint clamp.
+    ClosedForm,
+    /// Exact active-set stage.
+    ActiveSet,
+    /// Clarabel.
+    Clarabel,
+    /// Per-joint brake.
+    Brake,
+}
+
+/// Which bound of a row is active.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Side {
+    /// The lower bound.
+    Lower,
+    /// The upper bound.
+    Upper,
+}
+
+/// A row that holds the target back.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ActiveRow {
+    /// What the row stands for.
+    pub kind: Kind,
+    /// Its dof.
+    pub dof: usize,
+    /// Its active bound.
+    pub side: Side,
+    /// How hard it is leaned on, at least 0: derivative of the weighted squared distance with respect to the bound.
+    /// Box rows [weight² rad/s], torque rows [weight² (rad/s)² / N·m].
+    pub multiplier: f64,
+}
+
+/// Number of violated limits by kind.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Position limits.
+    pub position: u32,
+    /// Velocity limits.
+    pub velocity: u32,
+    /// Acceleration limits.
+    pub acceleration: u32,
+    /// States from which braking comes too late.
+    pub viability: u32,
+    /// Motor force limits.
+    pub torque: u32,
+}
+
+impl Counts {
+    /// All of them.
+    pub fn total(&self) -> u32 {
+        self.position + self.velocity + self.acceleration + self.viability + self.torque
+    }
+
+    pub(crate) fn add(&mut self, kind: Kind) {
+        *match kind {
+            Kind::Position => &mut self.position,
+            Kind::Velocity => &mut self.velocity,
+            Kind::Acceleration => &mut self.acceleration,
+            Kind::Viability => &mut self.viability,
+            Kind::Torque => &mut self.torque,
+        } += 1;
+    }
+}
+
+/// The report of one tick.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ledger {
+    /// How the tick ended.
+    pub status: Status,
+    /// Which stage gave the answer.
+    pub rung: Rung,
+    /// Rows that hold the target back, in the order of dofs, box before torque.
+    pub active: Vec<ActiveRow>,
+    /// Weighted distance between proposal and target [weight rad/s].
+    pub moved: f64,
+    /// Largest violation left by the target, as a share of its limit; 0 unless braking or recovering.
+    pub slack: f64,
+    /// Iterations of the active-set stage and of Clarabel.
+    pub iterations: u32,
+    /// Largest violation of the optimality conditions [weight² rad/s]; 0 for the closed form.
+    pub residual: f64,
+    /// Time the projection took [ns].
+    pub duration_ns: u64,
+    /// What the raw proposal would have violated.
+    pub raw_violations: Counts,
+    /// What the target violates, by the independent checker; zero unless braking or recovering.
+    pub violations: Counts,
+    /// Number of dofs that are outside their limits already.
+    pub outside: u32,
+}
+
+impl Ledger {
+    pub(crate) fn new(nv: usize) -> Ledger {
+        Ledger {
+            status: Status::Unchanged,
+            rung: Rung::ClosedForm,
+            active: Vec::with_capacity(3 * nv),
+            moved: 0.0,
+            slack: 0.0,
+            iterations: 0,
+            residual: 0.0,
+            duration_ns: 0,
+            raw_violations: Counts::default(),
+            violations: Counts::default(),
+            outside: 0,
+        }
+    }
+
+    /// Empties the report, keeping the memory.
+    pub(crate) fn reset(&mut self) {
+        let mut active = std::mem::take(&mut self.active);
+        active.clear();
+        *self = Ledger { active, ..Ledger::new(0) };
+    }
+}

@@ -1,0 +1,49 @@
+//! Acceleration limits, which are also what braking counts on.
+
+use super::{Limit, LimitSet, PerJoint};
+use crate::{LimitError, Model};
+use serde::{Deserialize, Serialize};
+
+/// `acceleration = { limit }`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AccelerationSettings {
+    /// Largest acceleration A [rad/s² or m/s²].
+    pub limit: PerJoint,
+}
+
+/// `|a| <= A`, and every position limit is approached so that braking with A still stops in front of it.
+///
+/// With torque limits, A must be an acceleration the motors can always give:
+/// [`certify_braking`](crate::certify_braking) says whether it is.
+#[derive(Debug, Clone)]
+pub struct AccelerationLimit {
+    settings: AccelerationSettings,
+}
+
+impl AccelerationLimit {
+    /// From the task file's settings.
+    pub fn new(settings: AccelerationSettings) -> AccelerationLimit {
+        AccelerationLimit { settings }
+    }
+
+    /// The same limit [rad/s² or m/s²] for every joint.
+    pub fn uniform(a_max: f64) -> AccelerationLimit {
+        AccelerationLimit { settings: AccelerationSettings { limit: PerJoint::All(a_max) } }
+    }
+}
+
+impl Limit for AccelerationLimit {
+    fn name(&self) -> &'static str {
+        "acceleration"
+    }
+
+    fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
+        let domain = "above 0 rad/s² or m/s²";
+        let values = self.settings.limit.values(model, "acceleration limit", |x| x > 0.0, domain)?;
+        for &i in controllable {
+            set.acceleration[i] = set.acceleration[i].min(values[i].unwrap_or(f64::INFINITY));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,65 @@
+//! Position limits of the robot file.
+
+use super::{Limit, LimitSet, PerJoint, quoted};
+use crate::{LimitError, Model};
+use serde::{Deserialize, Serialize};
+
+/// `position = { margin }`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PositionSettings {
+    /// Distance kept from both limits [rad or m].
+    pub margin: PerJoint,
+}
+
+impl Default for PositionSettings {
+    fn default() -> Self {
+        PositionSettings { margin: PerJoint::All(0.0) }
+    }
+}
+
+/// `lower + margin <= q <= upper - margin`.
+///
+/// Continuous joints, joints the file declares unlimited, and joints with several dofs have no position limit.
+#[derive(Debug, Clone, Default)]
+pub struct PositionLimit {
+    settings: PositionSettings,
+}
+
+impl PositionLimit {
+    /// From the task file's settings.
+    pub fn new(settings: PositionSettings) -> PositionLimit {
+        PositionLimit { settings }
+    }
+
+    /// The same margin [rad or m] for every joint.
+    pub fn with_margin(margin: f64) -> PositionLimit {
+        PositionLimit { settings: PositionSettings { margin: PerJoint::All(margin) } }
+    }
+}
+
+impl Limit for PositionLimit {
+    fn name(&self) -> &'static str {
+        "position"
+    }
+
+    fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
+        let margin =
+            self.settings.margin.values(model, "position margin", |x| x >= 0.0, "at least 0 rad or m")?;
+        let missing: Vec<usize> =
+            controllable.iter().copied().filter(|i| model.position_limit_missing(*i)).collect();
+        if !missing.is_empty() {
+            let next = "write lower and upper into it, or declare the joint continuous";
+            return Err(LimitError::Missing { limit: "position", joints: quoted(model, &missing), next });
+        }
+        for &i in controllable {
+            let joint = model.joint_of_dof(i);
+            if joint.nq == 1 && joint.nv == 1 {
+                let m = margin[i].unwrap_or(0.0);
+                set.q_lower[i] = set.q_lower[i].max(model.lower_position_limit()[joint.idx_q] + m);
+                set.q_upper[i] = set.q_upper[i].min(model.upper_position_limit()[joint.idx_q] - m);
+            }
+        }
+        Ok(())
+    }
+}

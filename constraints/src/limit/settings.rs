@@ -1,0 +1,70 @@
+//! The `[constraints]` section of a task file.
+
+use super::{AccelerationSettings, PositionSettings, TorqueSettings, VelocitySettings};
+use crate::{Consistency, LimitError, Model, Solver};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// `[constraints]`: how proposals are made consistent and which limits hold. A limit that is not named does not hold.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ConstraintSettings {
+    /// `"kinematic"` (default) or `"free"`.
+    pub consistency: Consistency,
+    /// `"ladder"` (default) or `"clarabel"`.
+    pub solver: Solver,
+    /// `position = { margin = 0.01 }`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub position: Option<PositionSettings>,
+    /// `velocity = { scale = 0.8 }` or `velocity = { limit = 2.0 }`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub velocity: Option<VelocitySettings>,
+    /// `acceleration = { limit = 10.0 }` or `acceleration = { limit = { elbow = 10.0 } }`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub acceleration: Option<AccelerationSettings>,
+    /// `torque = { scale = 0.9 }`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub torque: Option<TorqueSettings>,
+}
+
+/// One number for every joint, or numbers by joint name.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum PerJoint {
+    /// The same for all joints.
+    All(f64),
+    /// By joint; joints that are not named get nothing from it.
+    Joints(BTreeMap<String, f64>),
+}
+
+impl PerJoint {
+    /// One value per dof (nv), `None` where nothing is said.
+    ///
+    /// # Errors
+    /// A joint the model does not have, or a value outside the domain (`allowed`, described by `domain`).
+    pub(super) fn values(
+        &self,
+        model: &Model,
+        limit: &'static str,
+        allowed: fn(f64) -> bool,
+        domain: &'static str,
+    ) -> Result<Vec<Option<f64>>, LimitError> {
+        let checked = |what: String, value: f64| match value.is_finite() && allowed(value) {
+            true => Ok(value),
+            false => Err(LimitError::BadValue { what, value, domain }),
+        };
+        let mut values = vec![None; model.nv()];
+        match self {
+            PerJoint::All(value) => values.fill(Some(checked(limit.to_string(), *value)?)),
+            PerJoint::Joints(map) => {
+                for (name, value) in map {
+                    let unknown = |near| LimitError::UnknownJoint { limit, name: name.clone(), near };
+                    let joint = model.find(name).map_err(unknown)?;
+                    let value = checked(format!("{limit} of joint '{name}'"), *value)?;
+                    values[joint.idx_v..joint.idx_v + joint.nv].fill(Some(value));
+                }
+            }
+        }
+        Ok(values)
+    }
+}

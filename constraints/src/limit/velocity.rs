@@ -1,0 +1,83 @@
+//! Speed limits: the robot file's, scaled, or the task file's own.
+
+use super::{Limit, LimitSet, PerJoint, quoted};
+use crate::{LimitError, Model};
+use serde::{Deserialize, Serialize};
+
+/// `velocity = { scale }` or `velocity = { limit }`; with both, the smaller holds; with none, `scale = 1`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct VelocitySettings {
+    /// Share of the robot file's limit, in (0, 1].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scale: Option<f64>,
+    /// Own limits [rad/s or m/s].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub limit: Option<PerJoint>,
+}
+
+/// `|v'| <= V`.
+#[derive(Debug, Clone, Default)]
+pub struct VelocityLimit {
+    settings: VelocitySettings,
+}
+
+impl VelocityLimit {
+    /// From the task file's settings.
+    pub fn new(settings: VelocitySettings) -> VelocityLimit {
+        VelocityLimit { settings }
+    }
+
+    /// A share in (0, 1] of the robot file's limits.
+    pub fn scaled(scale: f64) -> VelocityLimit {
+        VelocityLimit { settings: VelocitySettings { scale: Some(scale), limit: None } }
+    }
+
+    /// Own limits [rad/s or m/s].
+    pub fn values(limit: PerJoint) -> VelocityLimit {
+        VelocityLimit { settings: VelocitySettings { scale: None, limit: Some(limit) } }
+    }
+
+    fn from_file(
+        &self,
+        scale: f64,
+        model: &Model,
+        controllable: &[usize],
+        set: &mut LimitSet,
+    ) -> Result<(), LimitError> {
+        if !(scale > 0.0 && scale <= 1.0) {
+            let domain = "above 0 and at most 1";
+            return Err(LimitError::BadValue { what: "velocity scale".to_string(), value: scale, domain });
+        }
+        let stated = model.velocity_limit();
+        let missing: Vec<usize> = controllable.iter().copied().filter(|i| stated[*i].is_infinite()).collect();
+        if !missing.is_empty() {
+            let next =
+                "give them in the task file: velocity = { limit = 3.0 } or { limit = { joint = 3.0 } }";
+            return Err(LimitError::Missing { limit: "velocity", joints: quoted(model, &missing), next });
+        }
+        for &i in controllable {
+            set.velocity[i] = set.velocity[i].min(scale * stated[i]);
+        }
+        Ok(())
+    }
+}
+
+impl Limit for VelocityLimit {
+    fn name(&self) -> &'static str {
+        "velocity"
+    }
+
+    fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
+        if let Some(limit) = &self.settings.limit {
+            let values = limit.values(model, "velocity limit", |x| x > 0.0, "above 0 rad/s or m/s")?;
+            for &i in controllable {
+                set.velocity[i] = set.velocity[i].min(values[i].unwrap_or(f64::INFINITY));
+            }
+        }
+        match (self.settings.scale, &self.settings.limit) {
+            (None, Some(_)) => Ok(()),
+            (scale, _) => self.from_file(scale.unwrap_or(1.0), model, controllable, set),
+        }
+    }
+}

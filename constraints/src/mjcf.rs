@@ -1,0 +1,372 @@
+//! What Pinocchio's MJCF reader leaves out, read from the XML: units, defaults, ranges, springs, dampers, armature,
+//! motor strength, gravity, total mass. What would be read wrongly is refused.
+
+use crate::ModelError;
+use roxmltree::{Document, Node};
+
+/// One joint of the file; angles in rad.
+#[derive(Debug, Clone)]
+pub(crate) struct MjcfJoint {
+    pub(crate) name: String,
+    pub(crate) kind: MjcfKind,
+    /// `None`: declared unlimited.
+    pub(crate) range: Option<(f64, f64)>,
+    pub(crate) stiffness: f64,
+    pub(crate) spring_reference: f64,
+    pub(crate) damping: f64,
+    pub(crate) armature: f64,
+    /// Largest generalised force of the motors on this joint, infinite when no motor states one.
+    pub(crate) effort: f64,
+}
+
+/// Joint types of MJCF.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum MjcfKind {
+    Free,
+    Ball,
+    Slide,
+    Hinge,
+}
+
+impl MjcfKind {
+    /// Number of configuration and velocity entries.
+    pub(crate) fn size(self) -> (usize, usize) {
+        match self {
+            MjcfKind::Free => (7, 6),
+            MjcfKind::Ball => (4, 3),
+            MjcfKind::Slide | MjcfKind::Hinge => (1, 1),
+        }
+    }
+}
+
+/// The corrections of a file. Joints stand in the order of MuJoCo's `qpos`, grouped by body.
+#[derive(Debug)]
+pub(crate) struct Mjcf {
+    pub(crate) gravity: [f64; 3],
+    pub(crate) total_mass: Option<f64>,
+    pub(crate) bodies: Vec<Vec<MjcfJoint>>,
+    pub(crate) notes: Vec<String>,
+}
+
+/// Reads the corrections from the text of a file named `file` in messages.
+pub(crate) fn read(xml: &str, file: &str) -> Result<Mjcf, ModelError> {
+    let malformed = |reason: String| ModelError::Malformed { file: file.to_string(), format: "MJCF", reason };
+    let document = Document::parse(xml).map_err(|e| malformed(e.to_string()))?;
+    let root = document.root_element();
+    if !root.has_tag_name("mujoco") {
+        return Err(malformed(format!("its root element is <{}>, not <mujoco>", root.tag_name().name())));
+    }
+    let reader = Reader { root, file, degrees: compiler(root, "angle") != Some("radian") };
+    reader.refuse_unsupported()?;
+    let mut mjcf = Mjcf {
+        gravity: reader.gravity()?,
+        total_mass: reader.total_mass()?,
+        bodies: Vec::new(),
+        notes: reader.notes(),
+    };
+    for body in children(root, "worldbody").flat_map(|w| children(w, "body")) {
+        reader.body(body, None, &mut mjcf.bodies)?;
+    }
+    reader.motors(&mut mjcf)?;
+    Ok(mjcf)
+}
+
+struct Reader<'a, 'i: 'a> {
+    root: Node<'a, 'i>,
+    file: &'a str,
+    degrees: bool,
+}
+
+impl<'a, 'i: 'a> Reader<'a, 'i> {
+    fn unsupported(&self, feature: &str, next: &'static str) -> ModelError {
+        ModelError::Unsupported { file: self.file.to_string(), feature: feature.to_string(), next }
+    }
+
+    /// Everything that would give a wrong mass matrix without a word.
+    fn refuse_unsupported(&self) -> Result<(), ModelError> {
+        let expand = "load it in MuJoCo and save the expanded model with mj_saveLastXML";
+        for tag in ["include", "replicate", "attach", "frame", "composite", "flexcomp"] {
+            if self.root.descendants().any(|n| n.has_tag_name(tag)) {
+                return Err(self.unsupported(&format!("<{tag}>"), expand));
+            }
+        }
+        for key in ["inertiagrouprange", "boundmass", "boundinertia", "balanceinertia"] {
+            if compiler(self.root, key).is_some() {
+                return Err(
+                    self.unsupported(&format!("compiler {key}"), "write explicit <inertial> elements")
+                );
+            }
+        }
+        for node in self.root.descendants() {
+            let Some(text) = node.attribute("axisangle") else { continue };
+            let axis = self.numbers(text, "axisangle")?;
+            let length = axis.iter().take(3).map(|x| x * x).sum::<f64>().sqrt();
+            if (length - 1.0).abs() > 1e-9 {
+                let next = "divide the axis by its length, the reader takes it as it is";
+                return Err(
+                    self.unsupported(&format!("axisangle '{text}' with an axis of length {length}"), next)
+                );
+            }
+        }
+        let top = children(self.root, "worldbody").flat_map(|w| children(w, "body"));
+        let massive = top.filter(|b| b.descendants().any(|n| is_joint(n) || n.has_tag_name("geom")));
+        if massive.count() > 1 {
+            let next = "keep one tree below <worldbody>, the reader would drop the others";
+            return Err(self.unsupported("several top-level bodies", next));
+        }
+        let from_geoms = compiler(self.root, "inertiafromgeom");
+        for geom in self.root.descendants().filter(|n| n.has_tag_name("geom")) {
+            let Some(body) = geom.parent_element().filter(|p| p.has_tag_name("body")) else { continue };
+            let from_inertial = from_geoms != Some("true") && children(body, "inertial").next().is_some();
+            let bodiless = [("contype", "1"), ("conaffinity", "1")]
+                .iter()
+                .all(|(key, default)| self.attribute(geom, key).unwrap_or(default).trim() == "0");
+            if bodiless && !from_inertial && self.attribute(geom, "mass") != Some("0") {
+                let next = "give its body an <inertial>, the reader would take it for massless";
+                return Err(self.unsupported("a geom without collision (contype and conaffinity 0)", next));
+            }
+        }
+        Ok(())
+    }
+
+    fn gravity(&self) -> Result<[f64; 3], ModelError> {
+        let options = || children(self.root, "option");
+        let off =
+            options().flat_map(|o| children(o, "flag")).any(|f| f.attribute("gravity") == Some("disable"));
+        if off {
+            return Ok([0.0; 3]);
+        }
+        let Some(text) = options().filter_map(|o| o.attribute("gravity")).last() else {
+            return Ok([0.0, 0.0, -9.81]);
+        };
+        let g = self.numbers(text, "option gravity")?;
+        <[f64; 3]>::try_from(g)
+            .map_err(|g| self.impossible(format!("option gravity has {} numbers", g.len())))
+    }
+
+    fn total_mass(&self) -> Result<Option<f64>, ModelError> {
+        let Some(text) = compiler(self.root, "settotalmass") else { return Ok(None) };
+        let mass = self.number(text, "compiler settotalmass")?;
+        Ok((mass > 0.0).then_some(mass)) // MuJoCo: negative means off
+    }
+
+    /// Forces of the file that are not part of the equations of motion here.
+    fn notes(&self) -> Vec<String> {
+        let mut notes = Vec::new();
+        let mut note = |present: bool, text: &str| {
+            if present {
+                notes.push(text.to_string());
+            }
+        };
+        let has = |tag: &str| self.root.children().any(|n| n.has_tag_name(tag) && n.has_children());
+        note(has("equality"), "equality constraints are not modelled");
+        note(has("tendon"), "tendons are not modelled");
+        let joints = || self.root.descendants().filter(|n| is_joint(*n));
+        let friction = |n: Node| self.attribute(n, "frictionloss").is_some_and(|x| x.trim() != "0");
+        note(joints().any(friction), "joint frictionloss is not modelled");
+        let fluid = ["density", "viscosity", "wind"];
+        let air = children(self.root, "option").any(|o| fluid.iter().any(|k| o.attribute(*k).is_some()));
+        note(air, "fluid forces are not modelled");
+        notes
+    }
+
+    fn body(
+        &self,
+        body: Node<'a, 'i>,
+        class: Option<&'a str>,
+        out: &mut Vec<Vec<MjcfJoint>>,
+    ) -> Result<(), ModelError> {
+        let class = body.attribute("childclass").or(class);
+        let joints: Vec<MjcfJoint> =
+            body.children().filter(|n| is_joint(*n)).map(|n| self.joint(n)).collect::<Result<_, _>>()?;
+        if !joints.is_empty() {
+            out.push(joints);
+        }
+        for child in children(body, "body") {
+            self.body(child, class, out)?;
+        }
+        Ok(())
+    }
+
+    fn joint(&self, node: Node<'a, 'i>) -> Result<MjcfJoint, ModelError> {
+        let name = node.attribute("name").unwrap_or_default().to_string();
+        let kind = match self.attribute(node, "type") {
+            _ if node.has_tag_name("freejoint") => MjcfKind::Free,
+            None | Some("hinge") => MjcfKind::Hinge,
+            Some("slide") => MjcfKind::Slide,
+            Some("ball") => MjcfKind::Ball,
+            Some("free") => MjcfKind::Free,
+            Some(other) => return Err(self.impossible(format!("joint '{name}' has type '{other}'"))),
+        };
+        let angle = if self.degrees && matches!(kind, MjcfKind::Hinge | MjcfKind::Ball) { RAD } else { 1.0 };
+        let value = |key: &str| match self.attribute(node, key) {
+            Some(text) => self.number(text, &format!("joint '{name}' {key}")),
+            None => Ok(0.0),
+        };
+        if kind.size().1 > 1 && value("stiffness")? != 0.0 {
+            let next = "set its stiffness to 0";
+            return Err(self.unsupported(&format!("a spring on the {kind:?} joint '{name}'"), next));
+        }
+        let range = match self.limited(node, "limited", "range") {
+            true if kind.size().1 == 1 => Some(self.range(node, "range", angle, &name)?),
+            _ => None,
+        };
+        let effort = match self.limited(node, "actuatorfrclimited", "actuatorfrcrange") {
+            true => symmetric(self.range(node, "actuatorfrcrange", 1.0, &name)?),
+            false => f64::INFINITY,
+        };
+        Ok(MjcfJoint {
+            kind,
+            range,
+            effort,
+            stiffness: value("stiffness")?,
+            spring_reference: value("springref")? * angle,
+            damping: value("damping")?,
+            armature: value("armature")?,
+            name,
+        })
+    }
+
+    /// Effort limit of each joint: the sum of its motors' `gear * ctrlrange * gain`, or less where a force range says so.
+    fn motors(&self, mjcf: &mut Mjcf) -> Result<(), ModelError> {
+        let mut sums: Vec<(String, f64)> = Vec::new();
+        for node in children(self.root, "actuator").flat_map(|a| a.children()).filter(Node::is_element) {
+            let Some(joint) = self.attribute(node, "joint").or_else(|| self.attribute(node, "jointinparent"))
+            else {
+                mjcf.notes
+                    .push(format!("actuator <{}> without a joint is not modelled", node.tag_name().name()));
+                continue;
+            };
+            let strength = self.motor(node, joint)?;
+            match sums.iter_mut().find(|(name, _)| name == joint) {
+                Some((_, sum)) => *sum += strength,
+                None => sums.push((joint.to_string(), strength)),
+            }
+        }
+        for joint in mjcf.bodies.iter_mut().flatten() {
+            if let Some((_, sum)) = sums.iter().find(|(name, _)| *name == joint.name) {
+                joint.effort = joint.effort.min(*sum);
+            }
+        }
+        Ok(())
+    }
+
+    /// `|gear| * min(|gain| * ctrlrange, forcerange)` of one motor, infinite when neither range is stated.
+    fn motor(&self, node: Node<'a, 'i>, joint: &str) -> Result<f64, ModelError> {
+        let first = |key: &str| match self.attribute(node, key) {
+            Some(text) => {
+                let numbers = self.numbers(text, &format!("actuator of '{joint}' {key}"))?;
+                Ok(numbers.first().copied())
+            }
+            None => Ok(None),
+        };
+        let gear = first("gear")?.unwrap_or(1.0).abs();
+        let direct = match node.tag_name().name() {
+            "motor" => Some(1.0),
+            "general" if self.attribute(node, "biastype").is_none_or(|b| b == "none") => {
+                Some(first("gainprm")?.unwrap_or(1.0).abs())
+            }
+            _ => None,
+        };
+        let mut force = f64::INFINITY;
+        if let (Some(gain), true) = (direct, self.limited(node, "ctrllimited", "ctrlrange")) {
+            force = gain * symmetric(self.range(node, "ctrlrange", 1.0, joint)?);
+        }
+        if self.limited(node, "forcelimited", "forcerange") {
+            force = force.min(symmetric(self.range(node, "forcerange", 1.0, joint)?));
+        }
+        Ok(gear * force)
+    }
+
+    /// MuJoCo's tristate: stated, else true when the range is there (and `autolimits` is not off).
+    fn limited(&self, node: Node<'a, 'i>, key: &str, range: &str) -> bool {
+        match self.attribute(node, key) {
+            Some("true") => true,
+            Some("false") => false,
+            _ => compiler(self.root, "autolimits") != Some("false") && self.attribute(node, range).is_some(),
+        }
+    }
+
+    fn range(&self, node: Node<'a, 'i>, key: &str, unit: f64, joint: &str) -> Result<(f64, f64), ModelError> {
+        let numbers =
+            self.numbers(self.attribute(node, key).unwrap_or("0 0"), &format!("'{joint}' {key}"))?;
+        match numbers[..] {
+            [low, high] if low <= high => Ok((low * unit, high * unit)),
+            [low, high] => {
+                Err(self.impossible(format!("'{joint}' {key} has lower {low} above upper {high}")))
+            }
+            _ => Err(self.impossible(format!("'{joint}' {key} has {} numbers instead of 2", numbers.len()))),
+        }
+    }
+
+    /// An attribute of `node`: its own, else that of its default class and the classes around it.
+    fn attribute(&self, node: Node<'a, 'i>, key: &str) -> Option<&'a str> {
+        if let Some(own) = node.attribute(key) {
+            return Some(own);
+        }
+        let tag = node.tag_name().name();
+        if tag == "freejoint" {
+            return None; // free joints of this form take no defaults
+        }
+        let class = node.attribute("class").or_else(|| {
+            node.ancestors()
+                .skip(1)
+                .filter(|n| n.has_tag_name("body"))
+                .find_map(|n| n.attribute("childclass"))
+        });
+        let mut at = self.default_class(class.unwrap_or("main"));
+        while let Some(default) = at {
+            // A general actuator's attributes may be set through <general> for any actuator kind.
+            let found = children(default, tag).filter_map(|n| n.attribute(key)).last();
+            if found.is_some() {
+                return found;
+            }
+            at = default.parent_element().filter(|p| p.has_tag_name("default"));
+        }
+        None
+    }
+
+    fn default_class(&self, class: &str) -> Option<Node<'a, 'i>> {
+        let mut all = self.root.descendants().filter(|n| n.has_tag_name("default"));
+        all.find(|n| n.attribute("class").unwrap_or("main") == class)
+    }
+
+    fn impossible(&self, list: String) -> ModelError {
+        ModelError::Impossible { file: self.file.to_string(), list }
+    }
+
+    fn number(&self, text: &str, what: &str) -> Result<f64, ModelError> {
+        match self.numbers(text, what)?[..] {
+            [x] => Ok(x),
+            _ => Err(self.impossible(format!("{what} is '{text}', not one number"))),
+        }
+    }
+
+    fn numbers(&self, text: &str, what: &str) -> Result<Vec<f64>, ModelError> {
+        let parse = |word: &str| word.parse::<f64>().ok().filter(|x| x.is_finite());
+        text.split_whitespace()
+            .map(|word| parse(word).ok_or_else(|| self.impossible(format!("{what} is '{text}'"))))
+            .collect()
+    }
+}
+
+const RAD: f64 = std::f64::consts::PI / 180.0;
+
+/// The force available in both directions.
+fn symmetric((low, high): (f64, f64)) -> f64 {
+    (-low).min(high).max(0.0)
+}
+
+fn is_joint(node: Node) -> bool {
+    let in_body = node.parent_element().is_some_and(|p| p.has_tag_name("body"));
+    in_body && (node.has_tag_name("joint") || node.has_tag_name("freejoint"))
+}
+
+fn children<'a, 'i: 'a>(node: Node<'a, 'i>, tag: &'a str) -> impl Iterator<Item = Node<'a, 'i>> {
+    node.children().filter(move |n| n.has_tag_name(tag))
+}
+
+/// The last value of an attribute over all <compiler> elements.
+fn compiler<'a>(root: Node<'a, '_>, key: &str) -> Option<&'a str> {
+    root.children().filter(|n| n.has_tag_name("compiler")).filter_map(|n| n.attribute(key)).last()
+}

@@ -1,0 +1,167 @@
+//! Building a projector: everything that can be wrong is found here.
+
+use super::active_set::ActiveSet;
+use super::conic::Conic;
+use super::coupled::Coupled;
+use super::{Dofs, Projector, Stages};
+use crate::checker::Checker;
+use crate::target::{Bounds, Consistency, Settings, Solver};
+use crate::viability::{Interval, Kind, Period};
+use crate::{Dynamics, Limit, LimitError, LimitSet, Model};
+
+impl Projector {
+    /// A projector that moves the `controllable` dofs (indices into a velocity, any order) of `model` within `limits`.
+    ///
+    /// # Errors
+    /// Settings out of their domain, dofs that do not exist, limits the robot file lacks or that contradict each other,
+    /// position limits without an acceleration to brake with, torque limits in free mode. Every joint is named.
+    pub fn new(
+        model: &Model,
+        limits: &[Box<dyn Limit>],
+        controllable: &[usize],
+        settings: Settings,
+    ) -> Result<Projector, LimitError> {
+        let nv = model.nv();
+        settings.validate(nv)?;
+        let dofs = Dofs::new(model, controllable, settings.consistency)?;
+        let limits = LimitSet::collect(model, limits, &dofs.controllable)?;
+        check_combination(model, &limits, &dofs, settings.consistency)?;
+        let period = Period::new(settings.dt, settings.sub_steps);
+        let weight: Vec<f64> = match &settings.velocity_weight {
+            Some(w) => w.iter().map(|w| w * w).collect(),
+            None => vec![1.0; nv],
+        };
+        let none = Interval {
+            lower: f64::NEG_INFINITY,
+            upper: f64::INFINITY,
+            lower_kind: Kind::Acceleration,
+            upper_kind: Kind::Acceleration,
+            outside: None,
+        };
+        let zero = || vec![0.0; nv];
+        Ok(Projector {
+            dynamics: Dynamics::new(model),
+            checker: Checker::new(model, &limits, &dofs.controllable, period, settings.consistency),
+            coupled: stages(model, &limits, &dofs, &weight, &settings)?,
+            bounds: Bounds::new(nv),
+            intervals: vec![none; nv],
+            displacement: zero(),
+            goal: zero(),
+            v_next: zero(),
+            consistent: vec![false; nv],
+            tangent: zero(),
+            integrated: model.neutral(),
+            model: model.clone(),
+            limits,
+            dofs,
+            settings,
+            period,
+            weight,
+        })
+    }
+}
+
+impl Dofs {
+    fn new(model: &Model, controllable: &[usize], consistency: Consistency) -> Result<Dofs, LimitError> {
+        let nv = model.nv();
+        let mut sorted = controllable.to_vec();
+        sorted.sort_unstable();
+        if let Some(i) = sorted.iter().find(|i| **i >= nv) {
+            let what = "controllable dof".to_string();
+            return Err(LimitError::BadValue { what, value: *i as f64, domain: "below the model's nv" });
+        }
+        if let Some(pair) = sorted.windows(2).find(|w| w[0] == w[1]) {
+            let what = format!("joint '{}' is controllable twice", model.dof_name(pair[0]));
+            return Err(LimitError::Unusable { what, next: "name it once" });
+        }
+        let has = |i: usize| sorted.binary_search(&i).is_ok();
+        for joint in model.joints().iter().filter(|_| consistency == Consistency::Kinematic) {
+            let count = (joint.idx_v..joint.idx_v + joint.nv).filter(|i| has(*i)).count();
+            if count != 0 && count != joint.nv {
+                let what = format!(
+                    "only {count} of the {} dofs of joint '{}' are controllable",
+                    joint.nv, joint.name
+                );
+                return Err(LimitError::Unusable { what, next: "control all of them or none" });
+            }
+        }
+        let single = (0..nv).map(|i| {
+            let joint = model.joint_of_dof(i);
+            (joint.nq == 1 && joint.nv == 1).then_some(joint.idx_q)
+        });
+        let single: Vec<Option<usize>> = single.collect();
+        let curved = single.iter().any(Option::is_none);
+        Ok(Dofs { fixed: (0..nv).filter(|i| !has(*i)).collect(), controllable: sorted, single, curved })
+    }
+}
+
+/// Limits that make no sense together.
+fn check_combination(
+    model: &Model,
+    limits: &LimitSet,
+    dofs: &Dofs,
+    consistency: Consistency,
+) -> Result<(), LimitError> {
+    let names = |wrong: &dyn Fn(usize) -> bool| -> String {
+        let list = dofs.controllable.iter().filter(|i| wrong(**i));
+        list.map(|i| format!("'{}'", model.dof_name(*i))).collect::<Vec<_>>().join(", ")
+    };
+    match consistency {
+        Consistency::Kinematic => {
+            let joints = names(&|i| limits.has_position(i) && limits.acceleration[i].is_infinite());
+            if !joints.is_empty() {
+                let next = "add acceleration = { limit = ... }, the deceleration their braking may count on";
+                let limit = "position without acceleration";
+                return Err(LimitError::Missing { limit, joints, next });
+            }
+        }
+        Consistency::Free => {
+            let joints = names(&|i| limits.effort[i].is_finite());
+            if !joints.is_empty() {
+                let what =
+                    format!("torque limits on {joints} in free mode, where no acceleration is decided");
+                return Err(LimitError::Unusable {
+                    what,
+                    next: "set consistency = \"kinematic\" or drop torque",
+                });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The stages for coupled rows, when there are any.
+fn stages(
+    model: &Model,
+    limits: &LimitSet,
+    dofs: &Dofs,
+    weight: &[f64],
+    settings: &Settings,
+) -> Result<Option<Stages>, LimitError> {
+    let hessian: Vec<f64> = dofs.controllable.iter().map(|i| 2.0 * weight[*i]).collect();
+    let mut problem = Coupled::new(model, limits, dofs, hessian);
+    let wanted = problem.m > 0 || settings.solver == Solver::Clarabel;
+    if !wanted || problem.n == 0 || settings.consistency == Consistency::Free {
+        return Ok(None);
+    }
+    let sigma: Vec<f64> = dofs.controllable.iter().map(|i| typical_change(limits, *i, settings.dt)).collect();
+    for k in 0..problem.n {
+        (problem.lower[k], problem.upper[k]) = (-sigma[k], sigma[k]);
+    }
+    let zero = vec![0.0; model.nv()];
+    let mut dynamics = Dynamics::new(model);
+    problem.linearise(&mut dynamics, &model.neutral(), &zero, dofs, &zero, settings.dt);
+    let conic = Conic::new(&problem, sigma, settings.max_iter)?;
+    let (n, m) = (problem.n, problem.m);
+    Ok(Some(Stages { problem, active_set: ActiveSet::new(n, m), conic, y: vec![0.0; n] }))
+}
+
+/// A velocity change of the size to expect in one period [rad/s or m/s].
+fn typical_change(limits: &LimitSet, dof: usize, dt: f64) -> f64 {
+    let (a, v) = (limits.acceleration[dof], limits.velocity[dof]);
+    match (a.is_finite(), v.is_finite()) {
+        (true, _) => a * dt,
+        (false, true) => v,
+        (false, false) => 1.0,
+    }
+}

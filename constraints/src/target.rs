@@ -1,0 +1,141 @@
+//! What goes into a projection and what comes out of it. Units: rad or m, and per s, s².
+
+use crate::ledger::Ledger;
+use crate::{LimitError, Model};
+use serde::{Deserialize, Serialize};
+
+/// The raw next state a policy asks for. It is not a [`Target`] and cannot be sent to a robot.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Proposal {
+    /// Configuration at the end of the period (nq).
+    pub q: Vec<f64>,
+    /// Velocity at the end of the period (nv).
+    pub v: Vec<f64>,
+}
+
+impl Proposal {
+    /// The neutral configuration at rest, to be overwritten.
+    pub fn new(model: &Model) -> Proposal {
+        Proposal { q: model.neutral(), v: vec![0.0; model.nv()] }
+    }
+}
+
+/// The nearest next state that every limit allows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Target {
+    /// Configuration at the end of the period (nq).
+    pub q: Vec<f64>,
+    /// Velocity at the end of the period (nv).
+    pub v: Vec<f64>,
+    /// `(v' - v) / T` (nv): what inverse dynamics is asked for.
+    pub acceleration: Vec<f64>,
+    /// The report of the tick.
+    pub ledger: Ledger,
+}
+
+impl Target {
+    /// Memory for targets of `model`.
+    pub fn new(model: &Model) -> Target {
+        let zero = vec![0.0; model.nv()];
+        let ledger = Ledger::new(model.nv());
+        Target { q: model.neutral(), v: zero.clone(), acceleration: zero, ledger }
+    }
+}
+
+/// The box of the next state, per dof (nv). Infinite where nothing bounds it and for positions of joints with several
+/// dofs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bounds {
+    /// Lowest next position.
+    pub q_lower: Vec<f64>,
+    /// Highest next position.
+    pub q_upper: Vec<f64>,
+    /// Lowest next velocity.
+    pub v_lower: Vec<f64>,
+    /// Highest next velocity.
+    pub v_upper: Vec<f64>,
+}
+
+impl Bounds {
+    pub(crate) fn new(nv: usize) -> Bounds {
+        let (low, high) = (vec![f64::NEG_INFINITY; nv], vec![f64::INFINITY; nv]);
+        Bounds { q_lower: low.clone(), q_upper: high.clone(), v_lower: low, v_upper: high }
+    }
+}
+
+/// How the 2 n numbers of a proposal meet n dofs.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Consistency {
+    /// One acceleration per dof decides position and velocity: robots with analytic inverse dynamics.
+    #[default]
+    Kinematic,
+    /// Position and velocity are projected apart: learned inverse dynamics, long periods.
+    Free,
+}
+
+/// Which stages may solve coupled rows.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Solver {
+    /// Closed form, exact active set, Clarabel.
+    #[default]
+    Ladder,
+    /// Closed form for feasible proposals, otherwise Clarabel.
+    Clarabel,
+}
+
+/// Settings of a projector.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Control period T [s].
+    pub dt: f64,
+    /// Semi-implicit Euler sub-steps of the plant in one period; 0 for constant acceleration or Runge-Kutta.
+    pub sub_steps: u32,
+    /// How the proposal is made consistent.
+    pub consistency: Consistency,
+    /// Which stages solve coupled rows.
+    pub solver: Solver,
+    /// Weight of each dof in the distance (nv); `None` is 1 for all.
+    pub velocity_weight: Option<Vec<f64>>,
+    /// Iterations allowed to Clarabel.
+    pub max_iter: u32,
+}
+
+impl Settings {
+    /// Kinematic, ladder, unit weights.
+    pub fn new(dt: f64, sub_steps: u32) -> Settings {
+        Settings {
+            dt,
+            sub_steps,
+            consistency: Consistency::Kinematic,
+            solver: Solver::Ladder,
+            velocity_weight: None,
+            max_iter: 50,
+        }
+    }
+
+    /// Refuses what no projection could be made with.
+    pub(crate) fn validate(&self, nv: usize) -> Result<(), LimitError> {
+        let bad = |what: &str, value: f64, domain| {
+            Err(LimitError::BadValue { what: what.to_string(), value, domain })
+        };
+        if !(self.dt.is_finite() && self.dt > 0.0) {
+            return bad("control period dt", self.dt, "above 0 s");
+        }
+        if self.sub_steps > 1000 {
+            return bad("sub_steps", f64::from(self.sub_steps), "at most 1000");
+        }
+        if self.max_iter == 0 {
+            return bad("max_iter", 0.0, "at least 1");
+        }
+        let Some(weights) = &self.velocity_weight else { return Ok(()) };
+        if weights.len() != nv {
+            return bad("length of velocity_weight", weights.len() as f64, "nv, one weight per dof");
+        }
+        match weights.iter().find(|w| !(**w >= 1e-3 && **w <= 1e3)) {
+            Some(w) => bad("velocity_weight", *w, "between 0.001 and 1000"),
+            None => Ok(()),
+        }
+    }
+}

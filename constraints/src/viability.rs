@@ -1,0 +1,228 @@
+//! The box of accelerations from which a joint can always still stop in front of its position limits.
+//!
+//! With `d = q_max - q` and sub-steps of length `tau`, the set
+//!
+//! ```text
+//!     d >= 0   and   (v - A tau / 2)_+^2 <= 2 A d
+//! ```
+//!
+//! is invariant: one braking sub-step `v' = v - A tau`, `d' = d - tau v'` keeps
+//! `d' - (v' - A tau / 2)^2 / (2 A) = d - (v - A tau / 2)^2 / (2 A)`.
+//! With `tau = 0` it is the set of Del Prete, "Joint Position and Velocity Bounds in Discrete-Time Acceleration/Torque
+//! Control of Robot Manipulators", RA-L 2018. The familiar `v' <= sqrt(2 A d)` is the same parabola at the wrong end
+//! of the step, and conflicts with the acceleration limit near the position limit.
+
+/// What set a bound, or what a violation violates.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum Kind {
+    /// Position limit within the period.
+    Position,
+    /// Velocity limit.
+    Velocity,
+    /// Acceleration limit.
+    Acceleration,
+    /// Braking in front of a position limit.
+    Viability,
+    /// Motor force limit.
+    Torque,
+}
+
+/// How the plant moves during one control period.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Period {
+    /// Control period T [s].
+    pub dt: f64,
+    /// Number n of semi-implicit Euler sub-steps; 0 for a plant that moves with constant acceleration (or Runge-Kutta).
+    pub sub_steps: u32,
+    /// Sub-step length `tau = T / n` [s]; 0 when there are none.
+    pub tau: f64,
+    /// `q' = q + T v + kappa T y`: `(n + 1) / (2 n)`, or 1/2.
+    pub kappa: f64,
+}
+
+impl Period {
+    /// A period of `dt` seconds in `sub_steps` sub-steps.
+    pub fn new(dt: f64, sub_steps: u32) -> Period {
+        let n = f64::from(sub_steps);
+        let (tau, kappa) = if sub_steps == 0 { (0.0, 0.5) } else { (dt / n, (n + 1.0) / (2.0 * n)) };
+        Period { dt, sub_steps, tau, kappa }
+    }
+}
+
+/// Limits of one dof; infinite is none. A position limit needs a finite `acceleration`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Dof {
+    /// Lowest position [rad or m].
+    pub lower: f64,
+    /// Highest position [rad or m].
+    pub upper: f64,
+    /// Largest speed V [rad/s or m/s].
+    pub velocity: f64,
+    /// Largest acceleration A [rad/s² or m/s²].
+    pub acceleration: f64,
+}
+
+/// Accelerations allowed to one dof for one period [rad/s² or m/s²]; never empty.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Interval {
+    /// Lower bound.
+    pub lower: f64,
+    /// Upper bound.
+    pub upper: f64,
+    /// What set the lower bound.
+    pub lower_kind: Kind,
+    /// What set the upper bound.
+    pub upper_kind: Kind,
+    /// `Some` when the state is outside the viable set: beyond the limit named. The interval then holds what returns
+    /// or brakes.
+    pub outside: Option<Kind>,
+}
+
+/// Positions this far beyond a limit are rounding [rad or m].
+pub const POSITION_TOLERANCE: f64 = 1e-9;
+
+/// Bounds that cross by less than this share of A are rounding.
+const CROSSING: f64 = 1e-6;
+
+/// The box of one dof at position `q` [rad or m] and velocity `v` [rad/s or m/s].
+pub fn interval(dof: &Dof, q: f64, v: f64, period: &Period) -> Interval {
+    let (above, below) = (q > dof.upper + POSITION_TOLERANCE, q < dof.lower - POSITION_TOLERANCE);
+    let (mut upper, upper_kind) = match above {
+        true => returning(dof, v, period),
+        false => upper_bound(dof, dof.upper - q, v, period),
+    };
+    let (mut lower, lower_kind) = match below {
+        true => returning(dof, -v, period),
+        false => upper_bound(dof, q - dof.lower, -v, period),
+    };
+    lower = -lower;
+    let mut outside = (above || below).then_some(Kind::Position);
+    if lower > upper {
+        if lower - upper > CROSSING * dof.acceleration {
+            let beyond = if v.abs() > dof.velocity { Kind::Velocity } else { Kind::Viability };
+            outside = outside.or(Some(beyond));
+            (lower, upper) = (brake(dof, v, period), brake(dof, v, period));
+        } else {
+            lower = upper;
+        }
+    }
+    Interval { lower, upper, lower_kind, upper_kind, outside }
+}
+
+/// The deceleration that stops the dof soonest: `-sgn(v) min(A, |v| / T)`.
+pub fn brake(dof: &Dof, v: f64, period: &Period) -> f64 {
+    -v.signum() * dof.acceleration.min(v.abs() / period.dt)
+}
+
+/// Beyond the upper limit only `v' <= 0` is allowed.
+fn returning(dof: &Dof, v: f64, period: &Period) -> (f64, Kind) {
+    smaller((dof.acceleration, Kind::Acceleration), (-v / period.dt, Kind::Position))
+}
+
+/// Upper bound of the acceleration at distance `d` below the upper limit: the smallest of
+///
+/// 1. `A`
+/// 2. `(V - v) / T`
+/// 3. positions within the period
+/// 4. braking after it.
+fn upper_bound(dof: &Dof, d: f64, v: f64, p: &Period) -> (f64, Kind) {
+    let a = dof.acceleration;
+    let mut bound = smaller((a, Kind::Acceleration), ((dof.velocity - v) / p.dt, Kind::Velocity));
+    if d == f64::INFINITY || a == f64::INFINITY {
+        return bound;
+    }
+    if d < p.dt * v.max(0.0) + a * p.dt * p.dt {
+        bound = smaller(bound, (position_bound(d, v, a, p), Kind::Position));
+    }
+    // Where even full acceleration leaves room to brake, the parabola does not bind.
+    let (v_next, d_next) = (v + a * p.dt - 0.5 * a * p.tau, d - p.dt * v - p.kappa * p.dt * p.dt * a);
+    if v_next > 0.0 && v_next * v_next > 2.0 * a * d_next || d_next < 0.0 {
+        bound = smaller(bound, (braking_bound(d, v, a, p), Kind::Viability));
+    }
+    bound
+}
+
+/// Positions at the end of each sub-step, `d - j tau v - tau^2 j (j + 1) / 2 a >= 0`:
+///
+/// ```text
+///     a <= 2 (d - j tau v) / (tau^2 j (j + 1)),   j = 1..n
+/// ```
+///
+/// Without sub-steps, the end of the period or the turning point inside it:
+/// `a3 = 2 (d - T v) / T^2` if `v <= 0` or `a3 > -v / T`, else `min(-v^2 / 2 d, -v / T)`.
+fn position_bound(d: f64, v: f64, a_max: f64, p: &Period) -> f64 {
+    if p.sub_steps == 0 {
+        let a3 = 2.0 * (d - p.dt * v) / (p.dt * p.dt);
+        return match v <= 0.0 || a3 > -v / p.dt {
+            true => a3,
+            false if d > 0.0 => (-v * v / (2.0 * d)).min(-v / p.dt),
+            false => -a_max,
+        };
+    }
+    let mut bound = f64::INFINITY;
+    for j in 1..=p.sub_steps {
+        let j = f64::from(j);
+        bound = bound.min(2.0 * (d - j * p.tau * v) / (p.tau * p.tau * j * (j + 1.0)));
+    }
+    bound
+}
+
+/// The largest `a` after which the state is in the set. With `w = v - A tau / 2`, `v' = v + T a` and
+/// `d' = d - T v - kappa T^2 a`, `(w + T a)^2 = 2 A d'` is
+///
+/// ```text
+///     T^2 a^2 + b a + c = 0,   b = 2 w T + 2 A kappa T^2,   c = w^2 - 2 A (d - T v)
+/// ```
+///
+/// and below `a = -w / T` the velocity term is zero.
+fn braking_bound(d: f64, v: f64, a_max: f64, p: &Period) -> f64 {
+    let t = p.dt;
+    let w = v - 0.5 * a_max * p.tau;
+    let b = 2.0 * w * t + 2.0 * a_max * p.kappa * t * t;
+    let c = w * w - 2.0 * a_max * (d - t * v);
+    let discriminant = b * b - 4.0 * t * t * c;
+    if discriminant < 0.0 {
+        return -w / t;
+    }
+    ((-b + discriminant.sqrt()) / (2.0 * t * t)).max(-w / t)
+}
+
+fn smaller(x: (f64, Kind), y: (f64, Kind)) -> (f64, Kind) {
+    if y.0 < x.0 { y } else { x }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn far_from_everything_the_box_is_the_acceleration_limit() {
+        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0 };
+        let i = interval(&dof, 0.0, 0.0, &Period::new(0.01, 5));
+        assert_eq!((i.lower, i.upper, i.outside), (-20.0, 20.0, None));
+    }
+
+    #[test]
+    fn hand_computed_parabola() {
+        // tau = 0, T = 0.1, A = 2, v = 1, d = 0.3: 0.01 a^2 + 0.22 a + 0.2 = 0 with c = 1 - 4 * 0.2
+        let dof = Dof { lower: f64::NEG_INFINITY, upper: 0.3, velocity: 10.0, acceleration: 2.0 };
+        let i = interval(&dof, 0.0, 1.0, &Period::new(0.1, 0));
+        let root = (-0.22 + (0.22f64 * 0.22 - 4.0 * 0.01 * 0.2).sqrt()) / 0.02;
+        assert!((i.upper - root).abs() < 1e-12 && i.upper_kind == Kind::Viability, "{i:?} {root}");
+        let (v, d) = (1.0 + 0.1 * i.upper, 0.3 - 0.1 - 0.005 * i.upper);
+        assert!((v * v - 4.0 * d).abs() < 1e-12);
+    }
+
+    #[test]
+    fn beyond_the_limit_it_may_only_return() {
+        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0 };
+        let p = Period::new(0.01, 1);
+        let still = interval(&dof, 1.2, 0.0, &p);
+        assert_eq!((still.lower, still.upper, still.outside), (-20.0, 0.0, Some(Kind::Position)));
+        let leaving = interval(&dof, 1.2, 3.0, &p);
+        assert_eq!((leaving.lower, leaving.upper), (-20.0, -20.0));
+        let fast = interval(&dof, 0.0, 9.0, &p);
+        assert_eq!((fast.lower, fast.upper, fast.outside), (-20.0, -20.0, Some(Kind::Velocity)));
+    }
+}
