@@ -19,14 +19,10 @@ pub(crate) fn fault_name(fault: Fault) -> Option<&'static str> {
     }
 }
 
-/// Names of the tasks that [`Env`] can make, with a line about each and their time limit in control periods.
-///
-/// # Errors
-/// `ValueError` when a robot does not compile: the installation is broken.
+/// Names of the tasks that [`Env`] can make, with a line about each.
 #[pyfunction]
-pub(crate) fn tasks() -> PyResult<Vec<(&'static str, &'static str, usize)>> {
-    let limit = |name| env::make(name).map(|e| e.spec().max_episode_steps).map_err(errors::value);
-    env::REGISTRY.iter().map(|entry| Ok((entry.name, entry.about, limit(entry.name)?))).collect()
+pub(crate) fn tasks() -> Vec<(&'static str, &'static str)> {
+    env::REGISTRY.iter().map(|entry| (entry.name, entry.about)).collect()
 }
 
 struct Inner {

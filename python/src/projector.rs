@@ -115,7 +115,13 @@ impl Projector {
         v_proposal: &Bound<'py, PyAny>,
     ) -> PyResult<Problem<'py>> {
         let (state, py) = (self.state(q, v, q_proposal, v_proposal)?, q.py());
-        let problem = self.with(py, |projector, _| projector.problem(&state.0, &state.1, &state.2));
+        let problem = self.with(py, |projector, model| {
+            projector.project(&state.0, &state.1, &state.2, &mut constraints::Target::new(model));
+            projector.problem()
+        });
+        let problem = problem.ok_or_else(|| {
+            errors::value("this projector has no coupled rows, so a projection is a clamp of each dof; add a TorqueLimit for a problem")
+        })?;
         let n = problem.c.len();
         Ok((
             array2(py, problem.hessian, n)?,

@@ -193,9 +193,8 @@ impl Target {
         self.ledger.bind(py).getattr(name)
     }
 
-    fn __repr__(&self, py: Python<'_>) -> String {
-        let words = words(self.ledger.get().ledger.status).0;
-        let _ = py;
+    fn __repr__(&self) -> String {
+        let words = words(self.target.ledger.status).0;
         format!("Target('{words}', q={:?}, v={:?})", self.target.q, self.target.v)
     }
 }
