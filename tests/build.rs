@@ -6,4 +6,8 @@ fn main() {
         Ok(folder) => println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}"),
         Err(_) => println!("cargo::error=MUJOCO_DYNAMIC_LINK_DIR is not set: run cargo inside the checkout"),
     }
+    println!("cargo::rerun-if-env-changed=NEARL_SITE_PACKAGES");
+    if let Ok(site) = std::env::var("NEARL_SITE_PACKAGES") {
+        println!("cargo::rustc-link-arg=-Wl,-rpath,{site}/cmeel.prefix/lib");
+    }
 }

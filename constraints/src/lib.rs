@@ -4,6 +4,7 @@ pub mod checker;
 pub mod convention;
 mod dynamics;
 mod error;
+mod layout;
 pub mod ledger;
 pub mod limit;
 mod mjcf;
@@ -16,6 +17,7 @@ pub mod viability;
 
 pub use dynamics::Dynamics;
 pub use error::{LimitError, ModelError};
+pub use layout::{Entry, LayoutError, StateLayout};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};
 pub use limit::{
     AccelerationLimit, ConstraintSettings, Limit, LimitSet, PerJoint, PositionLimit, TorqueLimit,

@@ -1,1 +1,17 @@
-//! Snapshot, networks, controller, real-time loop and links.
+//! Snapshot, networks, controller, real-time loop and links: all a robot needs.
+//!
+//! Read [`controller`] first: the one data path is on that page.
+
+pub mod controller;
+pub mod idm;
+pub mod link;
+pub mod log;
+pub mod net;
+pub mod normaliser;
+pub mod rt;
+pub mod snapshot;
+pub mod task;
+
+pub use controller::{Controller, Noise, Output, State};
+pub use snapshot::{Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
+pub use task::Task;

@@ -1,4 +1,15 @@
 //! MuJoCo environments, constrained rollouts and the PID^2 learner.
+//!
+//! [`train`] is the loop of every algorithm; [`learn::pid2`] is the paper's.
 
+pub mod cli;
 pub mod env;
+pub mod evaluate;
+pub mod learn;
 pub mod mj;
+pub mod rollout;
+pub mod run_folder;
+pub mod settings;
+pub mod stats;
+pub mod tasks;
+pub mod train;

@@ -1,0 +1,555 @@
+//! The controller: the page to read.
+//!
+//! ```text
+//! state -> propose -> project -> inverse dynamics -> action
+//! ```
+//!
+//! Training, evaluation, the real-time loop and replay all call [`Controller::update`]. Noise is an
+//! input: zero on the robot. Nothing is allocated after [`Controller::new`] but Clarabel's one block.
+
+use crate::idm::{AnalyticIdm, LearnedIdm};
+use crate::net::Forward;
+use crate::normaliser::Normaliser;
+use crate::snapshot::{Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
+use crate::task::{IdmInput, IdmKind};
+use nearl_constraints::{
+    Entry, LimitSet, Model, Projector, Proposal, RefuseReason, Settings, StateLayout, Status, Target,
+    build_limits,
+};
+use std::time::Instant;
+
+/// What is measured at the start of a tick.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct State {
+    /// Configuration (nq).
+    pub q: Vec<f64>,
+    /// Velocity (nv).
+    pub v: Vec<f64>,
+    /// Observation (n_obs).
+    pub obs: Vec<f64>,
+}
+
+/// Standard normal numbers of the tick; zero for deterministic behaviour.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Noise {
+    /// Noise of a stochastic proposal (n_state).
+    pub proposal: Vec<f32>,
+    /// Noise of the action (n_act).
+    pub action: Vec<f32>,
+}
+
+/// Everything a tick produced: what the rollout buffer stores, the log records and the link sends.
+#[derive(Clone, Debug)]
+pub struct Output {
+    /// Network input (n_obs).
+    pub x: Vec<f32>,
+    /// Proposed normalised change (n_state), as sampled.
+    pub change: Vec<f32>,
+    /// Proposed state at the end of the policy period (n_state).
+    pub proposal: Vec<f64>,
+    /// Projected state at the end of the tick (n_state).
+    pub target: Vec<f64>,
+    /// Projected normalised change (n_state).
+    pub target_change: Vec<f32>,
+    /// Lowest and highest normalised change the projection lets through (n_state); infinite where free.
+    pub lower: Vec<f32>,
+    /// See `lower`.
+    pub upper: Vec<f32>,
+    /// Action before the actuators' range (n_act).
+    pub sampled: Vec<f32>,
+    /// Action (n_act), always finite and within the actuators' range.
+    pub action: Vec<f64>,
+    /// log pi(proposal | s); 0 for a deterministic policy.
+    pub log_prob_proposal: f64,
+    /// log I(a | s_c, s'_c), or log pi(a | s) for a direct policy; 0 for analytic inverse dynamics.
+    pub log_prob_action: f64,
+    /// Projected configuration and velocity with the ledger of the tick.
+    pub next: Target,
+    /// Whether the policy ran in this tick.
+    pub policy_tick: bool,
+    /// Duration of the update in [ns].
+    pub duration_ns: u64,
+}
+
+enum Inverse {
+    /// A direct policy has no inverse model: its output is the mean action.
+    Direct,
+    Learned(LearnedIdm),
+    Analytic(AnalyticIdm),
+}
+
+/// Propose, project, invert.
+pub struct Controller {
+    model: Model,
+    layout: StateLayout,
+    kind: PolicyKind,
+    normaliser: Normaliser,
+    policy: Forward,
+    policy_log_std: Vec<f32>,
+    action_log_std: Vec<f32>,
+    projector: Projector,
+    inverse: Inverse,
+    action_range: Vec<(f64, f64)>,
+    dt: f64,
+    policy_every: usize,
+    projection: bool,
+    limits: LimitSet,
+    /// Configuration index of each one-dof joint, by degree of freedom.
+    idx_q: Vec<usize>,
+    tick: usize,
+    version: u64,
+    mean: Vec<f32>,
+    held: State,
+    goal: Proposal,
+    proposal: Proposal,
+    start: State,
+}
+
+impl Controller {
+    /// Builds and validates everything: robot, layout, limits, networks, and one canary inference.
+    ///
+    /// # Errors
+    /// [`SnapshotError`] with the sentence of the layer that refused.
+    pub fn new(snapshot: &Snapshot) -> Result<Self, SnapshotError> {
+        let Parts { model, layout, projector, limits } = Parts::new(&snapshot.manifest)?;
+        let (m, n) = (&snapshot.manifest, &snapshot.networks);
+        let n_act = m.action_lower.len();
+        let kind = m.policy;
+        check_sizes(m, n, &layout)?;
+        let (inverse, action_log_std) = match (kind, m.task.idm.kind, &n.idm) {
+            (PolicyKind::Direct, ..) => (Inverse::Direct, n.policy_log_std.clone()),
+            (_, IdmKind::Pinocchio, _) => {
+                (Inverse::Analytic(AnalyticIdm::new(&model, layout.controllable())), vec![0.0; n_act])
+            }
+            (_, IdmKind::Learned, Some((net, log_std))) => {
+                let seen = seen_entries(m, &layout)?;
+                (Inverse::Learned(LearnedIdm::new(Forward::from_dense(net), &layout, &seen)), log_std.clone())
+            }
+            (_, IdmKind::Learned, None) => {
+                return Err(SnapshotError::MissingTensor { name: "idm.0.weight".into() });
+            }
+        };
+        let zero = |n| vec![0.0; n];
+        let rest = State { q: model.neutral(), v: zero(model.nv()), obs: zero(layout.n_obs()) };
+        let proposal = Proposal { q: model.neutral(), v: zero(model.nv()) };
+        let mut controller = Self {
+            kind,
+            normaliser: n.normaliser.clone(),
+            policy: Forward::from_dense(&n.policy),
+            policy_log_std: n.policy_log_std.clone(),
+            action_log_std,
+            projector,
+            inverse,
+            action_range: m.action_lower.iter().copied().zip(m.action_upper.iter().copied()).collect(),
+            dt: m.task.time.dt,
+            policy_every: m.task.time.policy_every,
+            projection: true,
+            limits,
+            idx_q: idx_q(&model),
+            tick: 0,
+            version: m.version,
+            mean: vec![0.0; layout.n_state().max(n_act)],
+            held: rest.clone(),
+            goal: proposal.clone(),
+            proposal,
+            start: rest,
+            layout,
+            model,
+        };
+        controller.canary()?;
+        Ok(controller)
+    }
+
+    /// One control tick. The same state, noise and history of ticks since [`Controller::reset`] give the same bits.
+    ///
+    /// A state that is not finite is replaced by the last finite one and reported as such.
+    pub fn update(&mut self, state: &State, noise: &Noise, out: &mut Output) -> Status {
+        let begin = Instant::now();
+        let held = self.hold_last_finite(state);
+        self.propose(noise, out);
+        self.project(out);
+        self.invert(noise, out);
+        self.tick += 1;
+        out.duration_ns = begin.elapsed().as_nanos() as u64;
+        if held {
+            out.next.ledger.status = Status::Refused(RefuseReason::NonFiniteState);
+        }
+        out.next.ledger.status
+    }
+
+    /// Copies the state in; a state with NaN or infinity is not, and the last finite one stays.
+    fn hold_last_finite(&mut self, state: &State) -> bool {
+        let finite = |x: &[f64]| x.iter().all(|v| v.is_finite());
+        if !(finite(&state.q) && finite(&state.v) && finite(&state.obs)) {
+            return true;
+        }
+        self.held.q.copy_from_slice(&state.q);
+        self.held.v.copy_from_slice(&state.v);
+        self.held.obs.copy_from_slice(&state.obs);
+        false
+    }
+
+    /// The policy's next state: `proposal_k = s_k + scale_k u_k`, with `u = pi(x) (+ sigma noise)`.
+    fn propose(&mut self, noise: &Noise, out: &mut Output) {
+        out.policy_tick = self.tick.is_multiple_of(self.policy_every);
+        if !out.policy_tick {
+            return;
+        }
+        self.normaliser.observation(&self.held.obs, &mut out.x);
+        let mean = self.policy.forward(&out.x);
+        self.mean[..mean.len()].copy_from_slice(mean);
+        out.log_prob_proposal = 0.0;
+        if self.kind == PolicyKind::Direct {
+            return;
+        }
+        let n = self.layout.n_state();
+        out.change.copy_from_slice(&self.mean[..n]);
+        if self.kind == PolicyKind::Stochastic {
+            out.log_prob_proposal =
+                sample(&self.mean[..n], &self.policy_log_std, &noise.proposal, &mut out.change);
+        }
+        for k in 0..n {
+            let s = self.held.obs[self.layout.state()[k]];
+            out.proposal[k] = s + self.normaliser.scale[k] * f64::from(out.change[k]);
+        }
+        self.set_goal(out);
+    }
+
+    /// Scatters the proposed entries into configuration and velocity; what is not proposed stays as it is.
+    fn set_goal(&mut self, out: &Output) {
+        self.start.q.copy_from_slice(&self.held.q);
+        self.start.v.copy_from_slice(&self.held.v);
+        self.goal.q.copy_from_slice(&self.held.q);
+        self.goal.v.copy_from_slice(&self.held.v);
+        for k in 0..self.layout.n_state() {
+            match self.layout.state_entry(k) {
+                Entry::Position { idx_q, .. } => self.goal.q[idx_q] = out.proposal[k],
+                Entry::Velocity { dof } => self.goal.v[dof] = out.proposal[k],
+                Entry::Other => {}
+            }
+        }
+    }
+
+    /// The nearest state that every hard constraint allows at the end of this tick.
+    fn project(&mut self, out: &mut Output) {
+        if self.kind == PolicyKind::Direct {
+            out.next.ledger.status = Status::Unchanged;
+            return;
+        }
+        self.interpolate();
+        self.projector.project(&self.held.q, &self.held.v, &self.proposal, &mut out.next);
+        if !self.projection {
+            self.pass_raw(&mut out.next);
+        }
+        for k in 0..self.layout.n_state() {
+            let s = self.held.obs[self.layout.state()[k]];
+            let scale = self.normaliser.scale[k];
+            (out.target[k], out.lower[k], out.upper[k]) = (out.proposal[k], f32::NEG_INFINITY, f32::INFINITY);
+            let bounds = self.projector.bounds();
+            let (target, lower, upper) = match self.layout.state_entry(k) {
+                Entry::Position { idx_q, dof } => {
+                    (out.next.q[idx_q], bounds.q_lower[dof], bounds.q_upper[dof])
+                }
+                Entry::Velocity { dof } => (out.next.v[dof], bounds.v_lower[dof], bounds.v_upper[dof]),
+                Entry::Other => (out.proposal[k], f64::NEG_INFINITY, f64::INFINITY),
+            };
+            out.target[k] = target;
+            out.target_change[k] = ((target - s) / scale) as f32;
+            if self.projection {
+                out.lower[k] = ((lower - s) / scale) as f32;
+                out.upper[k] = ((upper - s) / scale) as f32;
+            }
+        }
+    }
+
+    /// The raw proposal as target; what it breaks stays in the ledger.
+    fn pass_raw(&self, next: &mut Target) {
+        next.q.copy_from_slice(&self.proposal.q);
+        next.v.copy_from_slice(&self.proposal.v);
+        for (a, (&to, &from)) in next.acceleration.iter_mut().zip(self.proposal.v.iter().zip(&self.held.v)) {
+            *a = (to - from) / self.dt;
+        }
+        next.ledger.violations = next.ledger.raw_violations;
+        next.ledger.moved = 0.0;
+    }
+
+    /// Where the proposal wants the robot at the end of this tick: on the cubic from the state at the
+    /// policy tick to the proposed state, `tick % policy_every + 1` control periods along.
+    fn interpolate(&mut self) {
+        let k = self.policy_every;
+        let j = self.tick % k + 1;
+        if j == k {
+            self.proposal.q.copy_from_slice(&self.goal.q);
+            self.proposal.v.copy_from_slice(&self.goal.v);
+            return;
+        }
+        let (s, period) = (j as f64 / k as f64, k as f64 * self.dt);
+        self.proposal.q.copy_from_slice(&self.held.q);
+        self.proposal.v.copy_from_slice(&self.held.v);
+        for &dof in self.layout.controllable() {
+            let idx_q = self.idx_q[dof];
+            let (q0, q1) = (self.start.q[idx_q], self.goal.q[idx_q]);
+            let (v0, v1) = (self.start.v[dof] * period, self.goal.v[dof] * period);
+            (self.proposal.q[idx_q], self.proposal.v[dof]) = {
+                let (q, v) = hermite(s, q0, v0, q1, v1);
+                (q, v / period)
+            };
+        }
+    }
+
+    /// The action that takes the robot to the target.
+    fn invert(&mut self, noise: &Noise, out: &mut Output) {
+        let n = out.action.len();
+        match &mut self.inverse {
+            Inverse::Direct => {
+                out.log_prob_action =
+                    sample(&self.mean[..n], &self.action_log_std, &noise.action, &mut out.sampled);
+            }
+            Inverse::Learned(idm) => {
+                let mean = idm.mean(&out.x, &out.target_change);
+                out.log_prob_action = sample(mean, &self.action_log_std, &noise.action, &mut out.sampled);
+            }
+            Inverse::Analytic(idm) => {
+                out.log_prob_action = 0.0;
+                idm.torque(&self.held.q, &self.held.v, &out.next, &mut out.action);
+            }
+        }
+        for (i, (a, &(lower, upper))) in out.action.iter_mut().zip(&self.action_range).enumerate() {
+            if !matches!(self.inverse, Inverse::Analytic(_)) {
+                *a = f64::from(out.sampled[i]);
+            }
+            *a = if a.is_finite() { a.clamp(lower, upper) } else { 0.0 };
+        }
+    }
+
+    /// One inference at rest must give numbers.
+    fn canary(&mut self) -> Result<(), SnapshotError> {
+        let mut out = self.output();
+        let (state, noise) = (self.held.clone(), self.noise());
+        self.update(&state, &noise, &mut out);
+        self.reset();
+        let values =
+            out.change.iter().chain(&out.sampled).map(|&x| f64::from(x)).chain(out.action.iter().copied());
+        match values.enumerate().find(|(_, v)| !v.is_finite()) {
+            Some((index, value)) => Err(SnapshotError::Canary { index, value }),
+            None => Ok(()),
+        }
+    }
+
+    /// Starts a new episode: the next tick is a policy tick.
+    pub fn reset(&mut self) {
+        self.tick = 0;
+    }
+
+    /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.
+    pub fn set_networks(&mut self, networks: &Networks) {
+        self.normaliser = networks.normaliser.clone();
+        self.policy = Forward::from_dense(&networks.policy);
+        self.policy_log_std.clone_from(&networks.policy_log_std);
+        match (&mut self.inverse, &networks.idm) {
+            (Inverse::Learned(idm), Some((net, log_std))) => {
+                idm.set_net(Forward::from_dense(net));
+                self.action_log_std.clone_from(log_std);
+            }
+            (Inverse::Direct, _) => self.action_log_std.clone_from(&networks.policy_log_std),
+            _ => {}
+        }
+    }
+
+    /// Switches the projection off (or on again): the raw proposal becomes the target. For comparisons only.
+    pub fn set_projection(&mut self, on: bool) {
+        self.projection = on;
+    }
+    /// Whether `state` is outside a position or velocity limit of a controllable joint by more than 1e-9.
+    pub fn breaks_limits(&self, state: &State) -> bool {
+        self.layout.controllable().iter().any(|&dof| {
+            let (q, v, l) = (state.q[self.idx_q[dof]], state.v[dof], &self.limits);
+            let position = q < l.q_lower[dof] - 1e-9 || q > l.q_upper[dof] + 1e-9;
+            position || v.abs() > l.velocity[dof] + 1e-9
+        })
+    }
+    /// Limits by degree of freedom.
+    pub fn limits(&self) -> &LimitSet {
+        &self.limits
+    }
+    /// Robot model.
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+    /// State layout.
+    pub fn layout(&self) -> &StateLayout {
+        &self.layout
+    }
+    /// Observation normaliser and scale of change.
+    pub fn normaliser(&self) -> &Normaliser {
+        &self.normaliser
+    }
+    /// Version of the snapshot the networks came from.
+    pub fn version(&self) -> u64 {
+        self.version
+    }
+    /// Control period in [s].
+    pub fn dt(&self) -> f64 {
+        self.dt
+    }
+    /// Control ticks in one policy period.
+    pub fn policy_every(&self) -> usize {
+        self.policy_every
+    }
+    /// Size of the action.
+    pub fn n_act(&self) -> usize {
+        self.action_range.len()
+    }
+    /// A state of the right sizes, at rest in the neutral configuration.
+    pub fn state(&self) -> State {
+        State { q: self.model.neutral(), v: vec![0.0; self.model.nv()], obs: vec![0.0; self.layout.n_obs()] }
+    }
+    /// Zero noise of the right sizes.
+    pub fn noise(&self) -> Noise {
+        Noise { proposal: vec![0.0; self.layout.n_state()], action: vec![0.0; self.n_act()] }
+    }
+    /// An output of the right sizes.
+    pub fn output(&self) -> Output {
+        let (o, s, a) = (self.layout.n_obs(), self.layout.n_state(), self.n_act());
+        Output {
+            x: vec![0.0; o],
+            change: vec![0.0; s],
+            proposal: vec![0.0; s],
+            target: vec![0.0; s],
+            target_change: vec![0.0; s],
+            lower: vec![f32::NEG_INFINITY; s],
+            upper: vec![f32::INFINITY; s],
+            sampled: vec![0.0; a],
+            action: vec![0.0; a],
+            log_prob_proposal: 0.0,
+            log_prob_action: 0.0,
+            next: Target::new(&self.model),
+            policy_tick: true,
+            duration_ns: 0,
+        }
+    }
+}
+
+/// Robot, layout and projector of a task: what a controller needs beside its networks.
+pub struct Parts {
+    /// Robot model.
+    pub model: Model,
+    /// State layout.
+    pub layout: StateLayout,
+    /// Projector of the task's constraints.
+    pub projector: Projector,
+    /// The limits behind it, by degree of freedom.
+    pub limits: LimitSet,
+}
+
+impl Parts {
+    /// Builds and validates the three.
+    ///
+    /// # Errors
+    /// [`SnapshotError::Unusable`] with the sentence of the layer that refused.
+    pub fn new(m: &Manifest) -> Result<Self, SnapshotError> {
+        use crate::snapshot::ModelFormat;
+        let unusable = |reason: String| SnapshotError::Unusable { reason };
+        let model = match m.model_format {
+            ModelFormat::Urdf => Model::from_urdf_text(&m.model),
+            ModelFormat::Mjcf => Model::from_mjcf_text(&m.model),
+        }
+        .map_err(|e| unusable(e.to_string()))?;
+        let s = &m.task.state;
+        let layout =
+            StateLayout::new(&model, &s.observation, s.propose.as_deref(), s.controllable.as_deref())
+                .map_err(|e| unusable(e.to_string()))?;
+        let limits = build_limits(&m.task.constraints, &model).map_err(|e| unusable(e.to_string()))?;
+        let settings = Settings {
+            consistency: m.task.constraints.consistency,
+            solver: m.task.constraints.solver,
+            ..Settings::new(m.task.time.dt, m.task.sub_steps() as u32)
+        };
+        let projector = Projector::new(&model, &limits, layout.controllable(), settings)
+            .map_err(|e| unusable(e.to_string()))?;
+        let limits =
+            LimitSet::collect(&model, &limits, layout.controllable()).map_err(|e| unusable(e.to_string()))?;
+        Ok(Self { model, layout, projector, limits })
+    }
+}
+
+/// Configuration index of each degree of freedom that belongs to a one-dof joint; 0 elsewhere (never read).
+fn idx_q(model: &Model) -> Vec<usize> {
+    let mut idx = vec![0; model.nv()];
+    for j in model.joints().iter().filter(|j| j.nv == 1) {
+        idx[j.idx_v] = j.idx_q;
+    }
+    idx
+}
+
+/// The entries of the proposed state that a learned inverse model sees.
+///
+/// # Errors
+/// [`SnapshotError::Unusable`] for a name that is not proposed.
+pub fn seen_entries(m: &Manifest, layout: &StateLayout) -> Result<Vec<usize>, SnapshotError> {
+    match &m.task.idm.input {
+        IdmInput::Controllable => Ok(layout.controllable_state().to_vec()),
+        IdmInput::Full => Ok((0..layout.n_state()).collect()),
+        IdmInput::Names(names) => names
+            .iter()
+            .map(|name| {
+                (0..layout.n_state()).find(|&k| layout.state_name(k) == name).ok_or_else(|| SnapshotError::Unusable {
+                    reason: format!("idm.input names '{name}', which is not a proposed entry; name entries of state.propose"),
+                })
+            })
+            .collect(),
+    }
+}
+
+fn check_sizes(m: &Manifest, n: &Networks, layout: &StateLayout) -> Result<(), SnapshotError> {
+    let (o, s, a) = (layout.n_obs(), layout.n_state(), m.action_lower.len());
+    let direct = m.policy == PolicyKind::Direct;
+    let out = if direct { a } else { s };
+    let mut want = vec![
+        ("normaliser.mean", n.normaliser.mean.len(), o),
+        ("normaliser.std", n.normaliser.std.len(), o),
+        ("normaliser.scale", n.normaliser.scale.len(), s),
+        ("policy.0.weight (inputs)", n.policy.n_in(), o),
+        ("policy (outputs)", n.policy.n_out(), out),
+        (
+            "policy.log_std",
+            n.policy_log_std.len(),
+            if m.policy == PolicyKind::Deterministic { 0 } else { out },
+        ),
+        ("action_upper", m.action_upper.len(), a),
+    ];
+    if m.task.idm.kind == IdmKind::Pinocchio && !direct {
+        want.push(("action_lower (one torque a controllable joint)", a, layout.controllable().len()));
+    } else if let Some((net, log_std)) = &n.idm {
+        want.push(("idm.0.weight (inputs)", net.n_in(), 2 * seen_entries(m, layout)?.len()));
+        want.push(("idm (outputs)", net.n_out(), a));
+        want.push(("idm.log_std", log_std.len(), a));
+    }
+    match want.into_iter().find(|(_, have, need)| have != need) {
+        Some((name, have, need)) => Err(SnapshotError::Shape {
+            name: name.into(),
+            expected: format!("{need} wide"),
+            actual: format!("{have} wide"),
+        }),
+        None => Ok(()),
+    }
+}
+
+/// Draws `x = mean + exp(log_std) noise` and returns `log N(x; mean, exp(log_std)^2)`, summed in f64.
+fn sample(mean: &[f32], log_std: &[f32], noise: &[f32], x: &mut [f32]) -> f64 {
+    let mut log_prob = 0.0;
+    for i in 0..x.len() {
+        let (s, z) = (log_std[i], noise[i]);
+        x[i] = s.exp().mul_add(z, mean[i]);
+        let z = f64::from(z);
+        log_prob -= 0.5 * z * z + f64::from(s) + 0.918_938_533_204_672_7;
+    }
+    log_prob
+}
+
+/// Cubic through (q0, v0) at s = 0 and (q1, v1) at s = 1, velocities per unit of s: position and velocity at s.
+fn hermite(s: f64, q0: f64, v0: f64, q1: f64, v1: f64) -> (f64, f64) {
+    let d = q1 - q0;
+    let (a, b) = (v0 + v1 - 2.0 * d, 3.0 * d - 2.0 * v0 - v1);
+    (q0 + s * (v0 + s * (b + s * a)), v0 + s * (2.0 * b + 3.0 * a * s))
+}

@@ -1,0 +1,200 @@
+//! Slices and texts of messages. A peer may send any number as a length, so every length is clamped to the capacity.
+
+use super::messages::*;
+
+macro_rules! slices {
+    ($message:ident { $($get:ident, $get_mut:ident : $field:ident [$count:ident];)* }) => {
+        impl $message {
+            $(
+                #[doc = concat!("The used entries of `", stringify!($field), "`.")]
+                pub fn $get(&self) -> &[f64] {
+                    let count = (self.$count as usize).min(self.$field.len());
+                    &self.$field[..count]
+                }
+                #[doc = concat!("The used entries of `", stringify!($field), "`, to be written.")]
+                pub fn $get_mut(&mut self) -> &mut [f64] {
+                    let count = (self.$count as usize).min(self.$field.len());
+                    &mut self.$field[..count]
+                }
+            )*
+        }
+    };
+}
+
+slices!(StateMessage {
+    q, q_mut: q[nq];
+    v, v_mut: v[nv];
+    obs, obs_mut: obs[n_obs];
+    applied, applied_mut: applied[nu];
+});
+slices!(ActionMessage { action, action_mut: action[nu]; });
+slices!(TransitionMessage {
+    q, q_mut: q[nq];
+    v, v_mut: v[nv];
+    obs, obs_mut: obs[n_obs];
+    proposal_q, proposal_q_mut: proposal_q[nq];
+    proposal_v, proposal_v_mut: proposal_v[nv];
+    target_q, target_q_mut: target_q[nq];
+    target_v, target_v_mut: target_v[nv];
+    action, action_mut: action[nu];
+});
+
+impl StateMessage {
+    /// True if all used numbers are finite.
+    pub fn is_finite(&self) -> bool {
+        let all = |x: &[f64]| x.iter().all(|x| x.is_finite());
+        all(self.q()) && all(self.v()) && all(self.obs()) && self.time.is_finite()
+    }
+}
+
+impl ActionMessage {
+    /// The last message of a runtime that ends in order: the plant keeps itself still from now on.
+    pub fn farewell() -> ActionMessage {
+        <ActionMessage as super::Message>::zeroed()
+    }
+
+    /// True for [`ActionMessage::farewell`]; states are numbered from 1.
+    pub fn is_farewell(&self) -> bool {
+        (self.state_seq, self.state_epoch, self.nu) == (0, 0, 0)
+    }
+}
+
+impl RobotMessage {
+    /// Joint names in order; those beyond the capacity are missing (the hash covers all).
+    pub fn joint_names(&self) -> Vec<String> {
+        let end = self.names.iter().rposition(|&b| b == b'\n').unwrap_or(0);
+        let text = String::from_utf8_lossy(&self.names[..end]);
+        if text.is_empty() { Vec::new() } else { text.split('\n').map(str::to_owned).collect() }
+    }
+
+    /// Writes the joint names and their hash.
+    pub fn set_joint_names<S: AsRef<str>>(&mut self, names: &[S]) {
+        self.joints = super::hash_names(names);
+        self.names = [0; MAX_NAMES];
+        let mut at = 0;
+        for name in names.iter().map(AsRef::as_ref) {
+            if at + name.len() + 1 > MAX_NAMES {
+                break;
+            }
+            self.names[at..at + name.len()].copy_from_slice(name.as_bytes());
+            self.names[at + name.len()] = b'\n';
+            at += name.len() + 1;
+        }
+    }
+
+    /// True if the plant waits for the action of every state.
+    pub fn is_lockstep(&self) -> bool {
+        self.bits & ROBOT_LOCKSTEP != 0
+    }
+}
+
+/// Answer to a snapshot, by reason.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// In use from the tick named in the receipt.
+    Accepted,
+    /// Not a snapshot, truncated, or the digest does not match the bytes.
+    Corrupt,
+    /// Made for other joints.
+    ForeignRobot,
+    /// Made for another observation, other sizes or another layout.
+    ForeignShape,
+    /// Made for another control period.
+    ForeignPeriod,
+    /// Holds numbers that are not finite, or gave such an answer on a trial state.
+    NotFinite,
+    /// Older than or as old as the one in use.
+    Outdated,
+    /// A newer one came before this one was taken into use.
+    Superseded,
+    /// Refused for the reason in the text.
+    Other,
+}
+
+const VERDICTS: [Verdict; 9] = [
+    Verdict::Accepted,
+    Verdict::Corrupt,
+    Verdict::ForeignRobot,
+    Verdict::ForeignShape,
+    Verdict::ForeignPeriod,
+    Verdict::NotFinite,
+    Verdict::Outdated,
+    Verdict::Superseded,
+    Verdict::Other,
+];
+
+impl Verdict {
+    /// The number in a message.
+    pub fn code(self) -> u32 {
+        self as u32
+    }
+
+    /// The verdict of a message; numbers this build does not know are `Other`.
+    pub fn from_code(code: u32) -> Verdict {
+        VERDICTS.get(code as usize).copied().unwrap_or(Verdict::Other)
+    }
+}
+
+impl ReceiptMessage {
+    /// The verdict.
+    pub fn verdict(&self) -> Verdict {
+        Verdict::from_code(self.verdict)
+    }
+
+    /// The sentence.
+    pub fn text(&self) -> String {
+        let length = (self.length as usize).min(MAX_TEXT);
+        String::from_utf8_lossy(&self.text[..length]).into_owned()
+    }
+
+    /// Writes verdict and sentence; a sentence beyond the capacity is cut at a character.
+    pub fn set(&mut self, verdict: Verdict, text: &str) {
+        let mut length = text.len().min(MAX_TEXT);
+        while !text.is_char_boundary(length) {
+            length -= 1;
+        }
+        self.verdict = verdict.code();
+        self.length = length as u32;
+        self.text = [0; MAX_TEXT];
+        self.text[..length].copy_from_slice(&text.as_bytes()[..length]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Message;
+    use super::*;
+
+    #[test]
+    fn lying_lengths_stay_inside() {
+        let mut state = StateMessage::zeroed();
+        state.nq = u32::MAX;
+        state.n_obs = 1_000_000;
+        assert_eq!(state.q().len(), MAX_JOINTS);
+        assert_eq!(state.obs().len(), MAX_OBS);
+        let mut receipt = ReceiptMessage::zeroed();
+        receipt.length = u32::MAX;
+        assert_eq!(receipt.text().len(), MAX_TEXT);
+    }
+
+    #[test]
+    fn names_and_texts_survive_the_message() {
+        let mut robot = RobotMessage::zeroed();
+        assert!(robot.joint_names().is_empty());
+        robot.set_joint_names(&["hip", "knee"]);
+        assert_eq!(robot.joint_names(), ["hip", "knee"]);
+        let mut receipt = ReceiptMessage::zeroed();
+        receipt.set(Verdict::Corrupt, &"\u{e9}".repeat(200));
+        assert_eq!(receipt.text(), "\u{e9}".repeat(128));
+        assert_eq!(receipt.verdict(), Verdict::Corrupt);
+    }
+
+    #[test]
+    fn verdict_codes_are_their_index() {
+        for (i, verdict) in VERDICTS.iter().enumerate() {
+            assert_eq!(verdict.code() as usize, i);
+        }
+        assert_eq!(Verdict::from_code(99), Verdict::Other);
+    }
+}

@@ -1,0 +1,102 @@
+//! What can go wrong while connecting or sending: one sentence each, with the next step.
+
+use super::RobotName;
+
+/// Failure of a link call.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum LinkError {
+    /// The name cannot be used in file names.
+    #[error(
+        "robot name `{0}` is not usable: take 1 to 32 letters, digits, `-` or `_`, beginning with a letter or digit"
+    )]
+    Name(String),
+    /// A vector does not fit into the messages.
+    #[error(
+        "robot `{name}` has {count} {what}, but a message holds {limit}: raise the capacity in link/messages.rs and rebuild both ends"
+    )]
+    Capacity {
+        /// Robot.
+        name: RobotName,
+        /// What is counted.
+        what: &'static str,
+        /// How many there are.
+        count: usize,
+        /// How many fit.
+        limit: usize,
+    },
+    /// Nobody publishes as this plant.
+    #[error(
+        "no plant named `{0}` answers on this machine: start `nearl plant TASK --name {0}` first, or correct --plant"
+    )]
+    NoPlant(RobotName),
+    /// Nobody runs the loop.
+    #[error("no runtime for `{0}` answers on this machine: start `nearl run SNAPSHOT --plant {0}` first")]
+    NoRuntime(RobotName),
+    /// The single owner of a topic exists already.
+    #[error("robot `{name}` already has a {role}: stop that process first, or use another --name")]
+    Taken {
+        /// Robot.
+        name: RobotName,
+        /// `plant`, `runtime` or `trainer`.
+        role: &'static str,
+    },
+    /// Too many readers.
+    #[error(
+        "robot `{name}` has no free place for another reader of `{topic}`: close a viewer or log reader first"
+    )]
+    Full {
+        /// Robot.
+        name: RobotName,
+        /// Topic.
+        topic: &'static str,
+    },
+    /// The other end was built from other sources.
+    #[error(
+        "`{topic}` of robot `{name}` is already in use with another message layout: run plant, runtime and trainer from the same nearl build"
+    )]
+    Schema {
+        /// Robot.
+        name: RobotName,
+        /// Topic.
+        topic: &'static str,
+    },
+    /// Shared memory cannot take the segments.
+    #[error(
+        "shared memory {path} has {available} MB free, the links of `{name}` need {needed} MB: free space there or remount it larger"
+    )]
+    Memory {
+        /// Robot.
+        name: RobotName,
+        /// Folder.
+        path: &'static str,
+        /// Free [MB].
+        available: u64,
+        /// Needed [MB].
+        needed: u64,
+    },
+    /// Shared memory cannot be written.
+    #[error("shared memory {path} cannot be used for `{name}` ({reason}): mount a writable tmpfs there")]
+    MemoryMissing {
+        /// Robot.
+        name: RobotName,
+        /// Folder.
+        path: &'static str,
+        /// The system's reason.
+        reason: String,
+    },
+    /// iceoryx2 failed for another reason.
+    #[error(
+        "the link of `{name}` could not {action} ({reason}): if no nearl process for it is alive, delete {files} and try again"
+    )]
+    Transport {
+        /// Robot.
+        name: RobotName,
+        /// What was tried.
+        action: String,
+        /// The library's reason.
+        reason: String,
+        /// Files of the link.
+        files: String,
+    },
+}

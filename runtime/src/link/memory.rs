@@ -1,0 +1,79 @@
+//! Shared memory is checked and reserved before the first message: a full tmpfs otherwise kills the writer with SIGBUS.
+
+use std::fs::{File, OpenOptions, read_dir};
+use std::os::unix::fs::OpenOptionsExt;
+
+use rustix::fs::{FallocateFlags, fallocate, statvfs};
+use rustix::io::Errno;
+
+use super::{LinkError, RobotName};
+
+const FOLDER: &str = "/dev/shm";
+const MEGABYTE: u64 = 1 << 20;
+
+/// Checks that `bytes` can really be written to shared memory: free blocks first, then a reserved probe file.
+pub(crate) fn check(name: &RobotName, bytes: u64) -> Result<(), LinkError> {
+    let missing = |reason: String| LinkError::MemoryMissing { name: name.clone(), path: FOLDER, reason };
+    let space = statvfs(FOLDER).map_err(|e| missing(e.to_string()))?;
+    let available = space.f_bavail * space.f_frsize;
+    if available < bytes {
+        return Err(too_small(name, available, bytes));
+    }
+    let path = format!("{FOLDER}/{}probe{}", name.prefix(), std::process::id());
+    let mut options = OpenOptions::new();
+    let probe = options.write(true).create(true).truncate(true).mode(0o600).open(&path);
+    let reserved = probe.map_err(|e| missing(e.to_string())).and_then(|file| {
+        fallocate(&file, FallocateFlags::empty(), 0, bytes).map_err(|e| match e {
+            Errno::NOSPC => too_small(name, available, bytes),
+            other => missing(other.to_string()),
+        })
+    });
+    let _ = std::fs::remove_file(&path);
+    reserved
+}
+
+fn too_small(name: &RobotName, available: u64, bytes: u64) -> LinkError {
+    let (available, needed) = (available / MEGABYTE, bytes.div_ceil(MEGABYTE));
+    LinkError::Memory { name: name.clone(), path: FOLDER, available, needed }
+}
+
+/// Reserves every page of the segments this robot has now, so that no later write meets a full tmpfs.
+pub(crate) fn reserve(name: &RobotName) -> Result<(), LinkError> {
+    let prefix = name.prefix();
+    for entry in read_dir(FOLDER).into_iter().flatten().flatten() {
+        if !entry.file_name().to_string_lossy().starts_with(&prefix) {
+            continue;
+        }
+        // A segment may vanish or belong to a peer that is starting: only a full tmpfs matters here.
+        let Ok(file) = File::options().write(true).open(entry.path()) else { continue };
+        let Ok(length) = file.metadata().map(|m| m.len()) else { continue };
+        if length > 0 && fallocate(&file, FallocateFlags::KEEP_SIZE, 0, length) == Err(Errno::NOSPC) {
+            return Err(too_small(name, 0, length));
+        }
+    }
+    Ok(())
+}
+
+/// Removes what a robot name left behind. Only for names no process uses any more (tests, `nearl doctor`).
+pub fn remove_files(name: &RobotName) {
+    let prefix = name.prefix();
+    for entry in read_dir(FOLDER).into_iter().flatten().flatten() {
+        if entry.file_name().to_string_lossy().starts_with(&prefix) {
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+    let _ = std::fs::remove_dir_all(name.folder());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_than_the_tmpfs_holds_is_refused_with_both_numbers() {
+        let name = RobotName::new("memory-check").unwrap();
+        check(&name, MEGABYTE).unwrap();
+        let error = check(&name, 1 << 60).unwrap_err();
+        assert!(matches!(error, LinkError::Memory { needed, .. } if needed == 1 << 40), "{error}");
+    }
+}

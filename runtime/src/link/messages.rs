@@ -1,0 +1,286 @@
+//! What crosses between plant, runtime and trainer: plain numbers with a capacity fixed at compile time.
+//!
+//! | topic | from -> to | type |
+//! |---|---|---|
+//! | `robot` | plant -> all | [`RobotMessage`] |
+//! | `state` | plant -> runtime | [`StateMessage`] |
+//! | `action` | runtime -> plant | [`ActionMessage`] |
+//! | `transition` | runtime -> trainer | [`TransitionMessage`] |
+//! | `snapshot` | trainer -> runtime | bytes with [`SnapshotHeader`] |
+//! | `receipt` | runtime -> trainer | [`ReceiptMessage`] |
+//! | `health` | runtime -> anyone | [`HealthMessage`] |
+
+use super::schema::message;
+
+/// Capacity of q, v and the action vector in a message.
+pub const MAX_JOINTS: usize = 64;
+/// Capacity of the observation vector in a message.
+pub const MAX_OBS: usize = 128;
+/// Capacity of the joint name list in [`RobotMessage`] [bytes].
+pub const MAX_NAMES: usize = 2048;
+/// Capacity of the text in a [`ReceiptMessage`] [bytes].
+pub const MAX_TEXT: usize = 256;
+
+/// This state begins an episode. For learning; the loop goes by the episode's number.
+pub const STATE_RESET: u32 = 1;
+/// The episode ended in a terminal state.
+pub const STATE_TERMINATED: u32 = 2;
+/// The episode was cut by a time limit.
+pub const STATE_TRUNCATED: u32 = 4;
+/// The plant waits for the action of every state (no real-time grid).
+pub const ROBOT_LOCKSTEP: u32 = 1;
+
+/// Limit meters of the plant, by index: position, velocity, acceleration, torque.
+pub const METERS: [&str; 4] = ["position", "velocity", "acceleration", "torque"];
+
+message! {
+    /// One sample of the plant, published on its time grid.
+    StateMessage, "state", version 1, buffer 8, history 0, subscribers 4 {
+        /// Tick of the plant since its start.
+        tick: u64,
+        /// Grid time of the tick, monotonic [ns].
+        due: u64,
+        /// Time of the plant's own clock (simulated time in MuJoCo) [s].
+        time: f64,
+        /// Entries used in `q`.
+        nq: u32,
+        /// Entries used in `v`.
+        nv: u32,
+        /// Entries used in `applied`.
+        nu: u32,
+        /// Entries used in `obs`.
+        n_obs: u32,
+        /// Number of the episode, from 0.
+        episode: u64,
+        /// Tick within the episode.
+        episode_tick: u64,
+        /// Bits `STATE_*`.
+        bits: u32,
+        /// Entries of the last action the plant had to saturate.
+        saturated: u32,
+        /// Reward of the step that led here.
+        reward: f64,
+        /// Sum of rewards of the running episode.
+        episode_return: f64,
+        /// Return of the last finished episode, 0 before the first.
+        last_return: f64,
+        /// Episodes finished.
+        episodes: u64,
+        /// Ticks the plant held the last action because none came in time.
+        late: u64,
+        /// Times the plant's watchdog braked.
+        watchdog: u64,
+        /// Ticks that broke a limit, measured by the plant, by `METERS`.
+        violations: [u64; 4],
+        /// Largest excess over a limit seen so far [rad or m, 1/s, 1/s2, N m], by `METERS`.
+        worst: [f64; 4],
+        /// Configuration.
+        q: [f64; MAX_JOINTS],
+        /// Velocity.
+        v: [f64; MAX_JOINTS],
+        /// Action the plant applied in the last step, after saturation.
+        applied: [f64; MAX_JOINTS],
+        /// Observation of the policy.
+        obs: [f64; MAX_OBS],
+    }
+}
+
+message! {
+    /// The action for one state.
+    ActionMessage, "action", version 1, buffer 4, history 0, subscribers 4 {
+        /// Tick of the runtime.
+        tick: u64,
+        /// `header.seq` of the state it was computed from.
+        state_seq: u64,
+        /// `header.epoch` of that state.
+        state_epoch: u64,
+        /// [`crate::rt::Mode`] as a number.
+        mode: u32,
+        /// Entries used in `action`; 0 in Hold, Braking and Fault: the plant brakes by itself.
+        nu: u32,
+        /// Version of the snapshot that computed it.
+        policy_version: u64,
+        /// Action in the plant's units.
+        action: [f64; MAX_JOINTS],
+    }
+}
+
+message! {
+    /// What the plant is; a snapshot for another robot is refused against it.
+    RobotMessage, "robot", version 1, buffer 1, history 1, subscribers 16 {
+        /// Hash of the joint names in order, see [`crate::link::hash_names`].
+        joints: u64,
+        /// Hash of the observation entry names in order.
+        observation: u64,
+        /// Hash of the limits the plant enforces.
+        limits: u64,
+        /// Control period [s].
+        dt: f64,
+        /// Number of configuration entries.
+        nq: u32,
+        /// Number of velocity entries.
+        nv: u32,
+        /// Number of action entries.
+        nu: u32,
+        /// Number of observation entries.
+        n_obs: u32,
+        /// Bits `ROBOT_*`.
+        bits: u32,
+        /// Process that runs the plant.
+        pid: u32,
+        /// Joint names, each followed by a line break, as UTF-8, zero padded.
+        names: [u8; MAX_NAMES],
+    }
+}
+
+/// What the ledger of a tick says, as plain numbers.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LedgerNumbers {
+    /// Status code of the projection.
+    pub status: u32,
+    /// Rung of the ladder that answered.
+    pub rung: u32,
+    /// Active rows.
+    pub active: u32,
+    /// Solver iterations.
+    pub iterations: u32,
+    /// Limits the raw proposal broke.
+    pub raw_violations: u32,
+    /// Limits the projected target breaks, by the independent check.
+    pub projected_violations: u32,
+    /// Weighted distance between proposal and target.
+    pub moved: f64,
+    /// Largest slack of a soft row.
+    pub slack: f64,
+    /// Residual of the independent check.
+    pub residual: f64,
+    /// Time of the projection [ns].
+    pub duration: u64,
+}
+
+message! {
+    /// One tick as the trainer learns from it.
+    TransitionMessage, "transition", version 1, buffer 1024, history 0, subscribers 2 {
+        /// Tick of the runtime.
+        tick: u64,
+        /// `header.epoch` of the plant.
+        state_epoch: u64,
+        /// `header.seq` of the state.
+        state_seq: u64,
+        /// `header.seq` of the state that followed; more than one ahead means states were missed.
+        next_state_seq: u64,
+        /// Version of the snapshot that acted.
+        policy_version: u64,
+        /// Number of the episode.
+        episode: u64,
+        /// Bits `STATE_*` of the next state.
+        next_bits: u32,
+        /// [`crate::rt::Mode`] as a number.
+        mode: u32,
+        /// Entries used in q.
+        nq: u32,
+        /// Entries used in v.
+        nv: u32,
+        /// Entries used in `action`.
+        nu: u32,
+        /// Entries used in `obs`.
+        n_obs: u32,
+        /// Reward reported with the next state.
+        reward: f64,
+        /// Log probability of the proposal.
+        log_prob_proposal: f64,
+        /// Log probability of the action.
+        log_prob_action: f64,
+        /// Projection of the tick.
+        ledger: LedgerNumbers,
+        /// Configuration.
+        q: [f64; MAX_JOINTS],
+        /// Velocity.
+        v: [f64; MAX_JOINTS],
+        /// Proposed configuration.
+        proposal_q: [f64; MAX_JOINTS],
+        /// Proposed velocity.
+        proposal_v: [f64; MAX_JOINTS],
+        /// Projected configuration.
+        target_q: [f64; MAX_JOINTS],
+        /// Projected velocity.
+        target_v: [f64; MAX_JOINTS],
+        /// Action.
+        action: [f64; MAX_JOINTS],
+        /// Observation.
+        obs: [f64; MAX_OBS],
+    }
+}
+
+message! {
+    /// Header that travels with the bytes of a snapshot.
+    SnapshotHeader, "snapshot", version 1, buffer 1, history 1, subscribers 4 {
+        /// Version given by the trainer; must grow.
+        version: u64,
+        /// Number of bytes.
+        length: u64,
+    }
+}
+
+impl Default for SnapshotHeader {
+    fn default() -> Self {
+        <Self as super::Message>::zeroed()
+    }
+}
+
+message! {
+    /// The runtime's reply to one snapshot.
+    ReceiptMessage, "receipt", version 1, buffer 8, history 1, subscribers 8 {
+        /// `header.epoch` of the trainer that sent the snapshot.
+        trainer_epoch: u64,
+        /// Version of the snapshot replied to.
+        version: u64,
+        /// First tick of the new controller if accepted.
+        tick: u64,
+        /// [`crate::link::Verdict`] as a number.
+        verdict: u32,
+        /// Bytes used in `text`.
+        length: u32,
+        /// One sentence.
+        text: [u8; MAX_TEXT],
+    }
+}
+
+message! {
+    /// How the loop is doing, about ten times a second.
+    HealthMessage, "health", version 1, buffer 2, history 1, subscribers 8 {
+        /// Ticks so far.
+        tick: u64,
+        /// [`crate::rt::Mode`] as a number.
+        mode: u32,
+        /// Process of the runtime.
+        pid: u32,
+        /// Version of the snapshot in use.
+        policy_version: u64,
+        /// Ticks that ended after the next slot was due.
+        overruns: u64,
+        /// Slots left out because of overruns.
+        skipped: u64,
+        /// Ticks without a fresh state.
+        stale: u64,
+        /// States refused (not finite, wrong sizes).
+        refused_states: u64,
+        /// States lost between plant and loop.
+        lost_states: u64,
+        /// Controllers swapped in.
+        swaps: u64,
+        /// Snapshots refused.
+        refused_snapshots: u64,
+        /// Flight log records dropped.
+        log_drops: u64,
+        /// Limits the raw proposals broke.
+        raw_violations: u64,
+        /// Limits the projected targets broke.
+        projected_violations: u64,
+        /// Wake-up latency p50, p99, p99.9, max [ns].
+        wake: [u64; 4],
+        /// Compute time p50, p99, p99.9, max [ns].
+        compute: [u64; 4],
+    }
+}

@@ -1,0 +1,35 @@
+//! Links between plant, runtime and trainer: iceoryx2 publish-subscribe over shared memory.
+//!
+//! Every robot name has its own segments and files, so robots (and tests) never meet. Messages are plain numbers with
+//! a capacity fixed at compile time ([`MAX_JOINTS`], [`MAX_OBS`]); a robot that does not fit is refused at start with
+//! the number. A message's layout is part of its type name, so ends from different builds refuse each other.
+//!
+//! None of the calls here belongs into the real-time thread: they allocate and may attach to new peers. The
+//! [`crate::rt`] loop moves messages through rings instead.
+
+mod access;
+mod bench;
+mod error;
+mod memory;
+mod messages;
+mod name;
+mod plant;
+mod port;
+mod runner;
+mod runtime;
+pub(crate) mod schema;
+mod service;
+mod trainer;
+
+pub use access::Verdict;
+pub use bench::{RoundTrip, bench_round_trip};
+pub use error::LinkError;
+pub use memory::remove_files;
+pub use messages::*;
+pub use name::RobotName;
+pub use plant::{PlantLink, Robot};
+pub use port::SnapshotBytes;
+pub use runner::{Pace, Plant, PlantReport, PlantRunner, PlantSettings};
+pub use runtime::RuntimeLink;
+pub use schema::{Header, Message, hash_names};
+pub use trainer::TrainerLink;

@@ -1,0 +1,100 @@
+//! The plant's ends of the links.
+
+use super::port::{Inbox, Outbox};
+use super::service::Bus;
+use super::*;
+
+/// What a plant is; checked against the message capacities when the link opens.
+#[derive(Clone, Debug)]
+pub struct Robot {
+    /// Joint names in the order of v.
+    pub joints: Vec<String>,
+    /// Names of the observation entries.
+    pub observation: Vec<String>,
+    /// Hash of the limits the plant enforces, 0 if it enforces none.
+    pub limits: u64,
+    /// Number of configuration entries.
+    pub nq: usize,
+    /// Number of velocity entries.
+    pub nv: usize,
+    /// Number of action entries.
+    pub nu: usize,
+    /// Control period [s].
+    pub dt: f64,
+    /// The plant waits for the action of every state instead of keeping real time.
+    pub lockstep: bool,
+}
+
+impl Robot {
+    /// The message, or the number that does not fit.
+    pub fn message(&self, name: &RobotName) -> Result<RobotMessage, LinkError> {
+        let sizes = [
+            ("configuration entries", self.nq, MAX_JOINTS),
+            ("velocity entries", self.nv, MAX_JOINTS),
+            ("action entries", self.nu, MAX_JOINTS),
+            ("observation entries", self.observation.len(), MAX_OBS),
+        ];
+        for (what, count, limit) in sizes {
+            if count > limit {
+                return Err(LinkError::Capacity { name: name.clone(), what, count, limit });
+            }
+        }
+        let mut message = RobotMessage::zeroed();
+        message.set_joint_names(&self.joints);
+        message.observation = hash_names(&self.observation);
+        message.limits = self.limits;
+        message.dt = self.dt;
+        (message.nq, message.nv, message.nu) = (self.nq as u32, self.nv as u32, self.nu as u32);
+        message.n_obs = self.observation.len() as u32;
+        message.bits = if self.lockstep { ROBOT_LOCKSTEP } else { 0 };
+        message.pid = std::process::id();
+        Ok(message)
+    }
+}
+
+/// Sends states, receives actions, and says what the plant is.
+pub struct PlantLink {
+    action: Inbox<ActionMessage>,
+    state: Outbox<StateMessage>,
+    robot: Outbox<RobotMessage>,
+    hello: RobotMessage,
+    bus: Bus,
+}
+
+impl PlantLink {
+    /// Opens the plant's topics and announces `robot`; a second plant of the same name is refused.
+    pub fn open(name: &RobotName, robot: &Robot) -> Result<PlantLink, LinkError> {
+        let hello = robot.message(name)?;
+        let bus = Bus::join(name)?;
+        let mut link = PlantLink {
+            state: bus.outbox("plant")?,
+            robot: bus.outbox("plant")?,
+            action: bus.inbox()?,
+            hello,
+            bus,
+        };
+        link.bus.reserve()?;
+        link.announce();
+        Ok(link)
+    }
+
+    /// Announces the plant again, for readers that came later.
+    pub fn announce(&mut self) -> bool {
+        self.robot.send(&mut self.hello)
+    }
+
+    /// Sends a state; its number is in `message.header.seq` afterwards.
+    pub fn send_state(&mut self, message: &mut StateMessage) -> bool {
+        self.state.send(message)
+    }
+
+    /// The newest action not yet read.
+    pub fn newest_action(&mut self) -> Option<ActionMessage> {
+        self.action.newest()
+    }
+
+    /// The robot's name.
+    pub fn name(&self) -> &RobotName {
+        self.bus.name()
+    }
+}

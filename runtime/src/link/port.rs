@@ -1,0 +1,155 @@
+//! The two ends of a topic: numbering, stamping and checking what passes.
+
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::ZeroCopySend;
+
+use super::service::Ipc;
+use super::{LinkError, Message, RobotName, SnapshotHeader, memory};
+use crate::rt::clock;
+
+/// Sending end of a topic. One heap allocation per message inside iceoryx2: not for the real-time thread.
+pub(crate) struct Outbox<M: Message + ZeroCopySend> {
+    port: Publisher<Ipc, M, ()>,
+    epoch: u64,
+    seq: u64,
+}
+
+impl<M: Message + ZeroCopySend> Outbox<M> {
+    pub(crate) fn new(port: Publisher<Ipc, M, ()>, epoch: u64) -> Outbox<M> {
+        Outbox { port, epoch, seq: 0 }
+    }
+
+    /// Numbers, stamps and sends `message`; false if it could not be sent.
+    pub(crate) fn send(&mut self, message: &mut M) -> bool {
+        self.seq += 1;
+        *message.header_mut() =
+            super::Header { schema: M::SCHEMA, epoch: self.epoch, seq: self.seq, stamp: clock::now() };
+        match self.port.loan_uninit() {
+            Ok(sample) => sample.write_payload(*message).send().is_ok(),
+            Err(_) => false,
+        }
+    }
+}
+
+/// Receiving end of a topic.
+pub(crate) struct Inbox<M: Message + ZeroCopySend> {
+    port: Subscriber<Ipc, M, ()>,
+    last: (u64, u64),
+    /// Messages the sender numbered but that never arrived.
+    pub(crate) lost: u64,
+    /// Messages with another schema hash.
+    pub(crate) refused: u64,
+}
+
+impl<M: Message + ZeroCopySend> Inbox<M> {
+    pub(crate) fn new(port: Subscriber<Ipc, M, ()>) -> Inbox<M> {
+        Inbox { port, last: (0, 0), lost: 0, refused: 0 }
+    }
+
+    /// The next message in order; duplicates and foreign schemas are left out.
+    pub(crate) fn next(&mut self) -> Option<M> {
+        while let Ok(Some(sample)) = self.port.receive() {
+            let header = *sample.payload().header();
+            if header.schema != M::SCHEMA {
+                self.refused += 1;
+                continue;
+            }
+            let (epoch, seq) = self.last;
+            if header.epoch == epoch {
+                if header.seq <= seq {
+                    continue;
+                }
+                self.lost += header.seq - seq - 1;
+            }
+            self.last = (header.epoch, header.seq);
+            return Some(*sample.payload());
+        }
+        None
+    }
+
+    /// The newest message; older unread ones are left out.
+    pub(crate) fn newest(&mut self) -> Option<M> {
+        std::iter::from_fn(|| self.next()).last()
+    }
+}
+
+/// Bytes of one snapshot as received.
+#[derive(Clone, Debug)]
+pub struct SnapshotBytes {
+    /// Version and sender.
+    pub header: SnapshotHeader,
+    /// The file's content.
+    pub bytes: Vec<u8>,
+}
+
+/// Sending end of the snapshot topic.
+pub(crate) struct BytesOutbox {
+    port: Publisher<Ipc, [u8], SnapshotHeader>,
+    name: RobotName,
+    epoch: u64,
+    seq: u64,
+}
+
+impl BytesOutbox {
+    pub(crate) fn new(
+        port: Publisher<Ipc, [u8], SnapshotHeader>,
+        name: RobotName,
+        epoch: u64,
+    ) -> BytesOutbox {
+        BytesOutbox { port, name, epoch, seq: 0 }
+    }
+
+    pub(crate) fn send(&mut self, version: u64, bytes: &[u8]) -> Result<(), LinkError> {
+        // The segment may grow to the next power of two and is written at once: check before the first write.
+        memory::check(&self.name, 4 * bytes.len().next_power_of_two() as u64)?;
+        let failed = |e: String| self.name.transport("send a snapshot", e);
+        let mut sample = self.port.loan_slice_uninit(bytes.len()).map_err(|e| failed(format!("{e:?}")))?;
+        self.seq += 1;
+        let header = sample.user_header_mut();
+        header.header = super::Header {
+            schema: SnapshotHeader::SCHEMA,
+            epoch: self.epoch,
+            seq: self.seq,
+            stamp: clock::now(),
+        };
+        header.version = version;
+        header.length = bytes.len() as u64;
+        sample.write_from_slice(bytes).send().map_err(|e| failed(format!("{e:?}")))?;
+        Ok(())
+    }
+
+    /// Delivers the last snapshot to runtimes that came later.
+    pub(crate) fn attend(&self) {
+        let _ = self.port.update_connections();
+    }
+}
+
+/// Receiving end of the snapshot topic.
+pub(crate) struct BytesInbox {
+    port: Subscriber<Ipc, [u8], SnapshotHeader>,
+    pub(crate) refused: u64,
+}
+
+impl BytesInbox {
+    pub(crate) fn new(port: Subscriber<Ipc, [u8], SnapshotHeader>) -> BytesInbox {
+        BytesInbox { port, refused: 0 }
+    }
+
+    /// The newest snapshot not yet read.
+    pub(crate) fn newest(&mut self) -> Option<SnapshotBytes> {
+        let mut newest = None;
+        while let Ok(Some(sample)) = self.port.receive() {
+            let header = *sample.user_header();
+            if header.header.schema != SnapshotHeader::SCHEMA
+                || header.length != sample.payload().len() as u64
+            {
+                self.refused += 1;
+                continue;
+            }
+            newest = Some(SnapshotBytes { header, bytes: sample.payload().to_vec() });
+        }
+        newest
+    }
+}

@@ -1,0 +1,244 @@
+//! The plant's side of a tick, for simulators and drivers alike.
+//!
+//! Real time: at each slot of its own absolute grid the plant publishes its state, waits for the action computed from
+//! exactly that state until the deadline (a fraction of the period), applies it and advances one period. If the
+//! action is late, the last one is held and counted; after the watchdog's time without a fresh action the plant brakes
+//! by itself, whatever the runtime does.
+//!
+//! Lockstep: no grid; the plant waits for the action of every state. Time stands still meanwhile, so there is nothing
+//! to brake. For tests and for running faster than real time.
+
+use serde::Serialize;
+
+use super::{ActionMessage, LinkError, Message, PlantLink, RobotName, StateMessage};
+use crate::rt::{Grid, Percentiles, Stop, clock};
+
+/// A robot or its simulator.
+pub trait Plant {
+    /// Writes the measured state; numbers of the link (header, tick, due, late, watchdog) are filled by the runner.
+    fn observe(&mut self, state: &mut StateMessage);
+    /// Applies `action` for one control period.
+    fn apply(&mut self, action: &ActionMessage);
+    /// Advances one control period while bringing the velocity to zero, or keeping it there.
+    fn brake(&mut self);
+}
+
+/// Who waits for whom.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Pace {
+    /// The plant keeps its own time grid.
+    RealTime,
+    /// The plant waits for every action.
+    Lockstep,
+}
+
+/// Settings of a plant process.
+#[derive(Clone, Copy, Debug)]
+pub struct PlantSettings {
+    /// Control period [s].
+    pub dt: f64,
+    /// Who waits for whom.
+    pub pace: Pace,
+    /// The action must come within this fraction of the period; above 1 the plant's time may stretch.
+    pub deadline: f64,
+    /// Time without a fresh action after which the plant brakes [s].
+    pub watchdog: f64,
+    /// Ticks until the plant stops by itself.
+    pub ticks: Option<u64>,
+}
+
+impl PlantSettings {
+    /// Real time with a deadline of 0.6 periods and a watchdog of 5 periods, but at least 20 ms.
+    pub fn real_time(dt: f64) -> PlantSettings {
+        let watchdog = (5.0 * dt).max(0.02);
+        PlantSettings { dt, pace: Pace::RealTime, deadline: 0.6, watchdog, ticks: None }
+    }
+
+    /// Real time for a simulator, whose time may stretch: rather than holding an old action it waits up to 15 ms (at
+    /// least 0.6 periods) for the right one and falls behind its grid, which is counted as an overrun.
+    pub fn simulator(dt: f64) -> PlantSettings {
+        let wait = (0.6 * dt).max(0.015);
+        PlantSettings { deadline: wait / dt, watchdog: (5.0 * dt).max(0.05), ..PlantSettings::real_time(dt) }
+    }
+
+    /// Lockstep.
+    pub fn lockstep(dt: f64) -> PlantSettings {
+        PlantSettings { pace: Pace::Lockstep, ..PlantSettings::real_time(dt) }
+    }
+}
+
+/// What the plant counted.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct PlantReport {
+    /// Ticks.
+    pub ticks: u64,
+    /// Ticks that applied a fresh action.
+    pub fresh: u64,
+    /// Ticks that held the last action.
+    pub late: u64,
+    /// Ticks braked: no runtime, the watchdog, or because the runtime asked for it.
+    pub braked: u64,
+    /// Times the watchdog took over.
+    pub watchdog: u64,
+    /// Ticks that ended after the next slot was due.
+    pub overruns: u64,
+    /// Slots left out.
+    pub skipped: u64,
+    /// From sending the state to having its action.
+    pub round_trip: Percentiles,
+}
+
+/// Polls between looks at the clock while no runtime is attached [ns].
+const SLOW_POLL: u64 = 30_000;
+/// The plant announces itself this often [ns].
+const ANNOUNCE: u64 = 100_000_000;
+/// In lockstep, a state without an answer is sent again after this time [ns]: a runtime may have come late.
+const RESEND: u64 = 250_000_000;
+
+/// Drives a [`Plant`] over a [`PlantLink`].
+pub struct PlantRunner {
+    link: PlantLink,
+    settings: PlantSettings,
+    state: StateMessage,
+    last: ActionMessage,
+    last_fresh: u64,
+    is_attached: bool,
+    next_announce: u64,
+    report: PlantReport,
+    round_trip: hdrhistogram::Histogram<u64>,
+}
+
+impl PlantRunner {
+    /// Takes over an open link.
+    pub fn new(link: PlantLink, settings: PlantSettings) -> Result<PlantRunner, LinkError> {
+        let round_trip = hdrhistogram::Histogram::new_with_bounds(1, 100_000_000_000, 3)
+            .map_err(|e| link.name().transport("measure", e.to_string()))?;
+        Ok(PlantRunner {
+            link,
+            settings,
+            state: StateMessage::zeroed(),
+            last: ActionMessage::zeroed(),
+            last_fresh: 0,
+            is_attached: false,
+            next_announce: 0,
+            report: PlantReport::default(),
+            round_trip,
+        })
+    }
+
+    /// The robot's name.
+    pub fn name(&self) -> &RobotName {
+        self.link.name()
+    }
+
+    /// Runs until `stop`, or for the number of ticks of the settings.
+    pub fn run(mut self, plant: &mut impl Plant, stop: &Stop) -> PlantReport {
+        crate::rt::thread::be_prompt();
+        let period = clock::nanoseconds(self.settings.dt);
+        let mut grid = Grid::new(clock::now() + period, period);
+        while !stop.is_requested() && self.settings.ticks.is_none_or(|n| self.report.ticks < n) {
+            let due = match self.settings.pace {
+                Pace::RealTime => grid.due(),
+                Pace::Lockstep => clock::now(),
+            };
+            if self.settings.pace == Pace::RealTime {
+                clock::sleep_until(due);
+            }
+            self.tick(plant, due, stop);
+            if self.settings.pace == Pace::RealTime {
+                grid.finish(clock::now());
+            }
+        }
+        (self.report.overruns, self.report.skipped) = (grid.overruns(), grid.skipped());
+        self.report.round_trip = crate::rt::percentiles(&self.round_trip);
+        self.report
+    }
+
+    fn tick(&mut self, plant: &mut impl Plant, due: u64, stop: &Stop) {
+        plant.observe(&mut self.state);
+        self.state.tick = self.report.ticks;
+        self.state.due = due;
+        (self.state.late, self.state.watchdog) = (self.report.late, self.report.watchdog);
+        self.link.send_state(&mut self.state);
+        let sent = self.state.header.stamp;
+        match self.wait(due, stop) {
+            Some(action) => {
+                if self.is_attached {
+                    self.round_trip.saturating_record(clock::now() - sent);
+                }
+                self.last_fresh = clock::now();
+                self.is_attached = true;
+                self.last = action;
+                self.report.fresh += 1;
+                self.advance(plant);
+            }
+            // Stopped while time stood still: the state stays as it is.
+            None if self.settings.pace == Pace::Lockstep => return,
+            None => self.miss(plant),
+        }
+        self.report.ticks += 1;
+        if due >= self.next_announce {
+            self.link.announce();
+            self.next_announce = due + ANNOUNCE;
+        }
+    }
+
+    /// Applies the last action, or brakes if the runtime left that to the plant.
+    fn advance(&mut self, plant: &mut impl Plant) {
+        if self.last.nu > 0 {
+            plant.apply(&self.last);
+        } else {
+            self.report.braked += 1;
+            plant.brake();
+        }
+    }
+
+    /// No action came in time: hold the last one, or brake once the watchdog's time is over.
+    fn miss(&mut self, plant: &mut impl Plant) {
+        let is_alive = clock::now() < self.last_fresh + clock::nanoseconds(self.settings.watchdog);
+        if self.is_attached && is_alive {
+            self.report.late += 1;
+            return self.advance(plant);
+        }
+        if self.is_attached {
+            self.is_attached = false;
+            self.report.watchdog += 1;
+        }
+        self.report.braked += 1;
+        plant.brake();
+    }
+
+    /// The action for the state just sent, if it comes in time.
+    fn wait(&mut self, due: u64, stop: &Stop) -> Option<ActionMessage> {
+        let until = due + clock::nanoseconds(self.settings.dt * self.settings.deadline);
+        let mut resend = clock::now() + RESEND;
+        loop {
+            let header = self.state.header;
+            match self.link.newest_action() {
+                Some(action) if (action.state_epoch, action.state_seq) == (header.epoch, header.seq) => {
+                    return Some(action);
+                }
+                // The runtime ended in order: the plant is on its own at once, without the watchdog.
+                Some(action) if action.is_farewell() => self.is_attached = false,
+                _ => {}
+            }
+            let now = clock::now();
+            match self.settings.pace {
+                Pace::RealTime if now >= until => return None,
+                Pace::Lockstep if stop.is_requested() => return None,
+                Pace::Lockstep if now >= resend => {
+                    self.link.announce();
+                    self.link.send_state(&mut self.state);
+                    resend = now + RESEND;
+                }
+                _ => {}
+            }
+            if self.is_attached {
+                std::thread::yield_now();
+            } else {
+                clock::sleep_until(now + SLOW_POLL);
+            }
+        }
+    }
+}

@@ -1,0 +1,111 @@
+//! The runtime's ends of the links. All calls belong to the I/O thread.
+
+use std::time::Duration;
+
+use super::port::{BytesInbox, Inbox, Outbox};
+use super::service::Bus;
+use super::*;
+
+/// Everything the runtime sends and receives for one robot.
+pub struct RuntimeLink {
+    state: Inbox<StateMessage>,
+    robot: Inbox<RobotMessage>,
+    snapshot: BytesInbox,
+    action: Outbox<ActionMessage>,
+    transition: Outbox<TransitionMessage>,
+    receipt: Outbox<ReceiptMessage>,
+    health: Outbox<HealthMessage>,
+    bus: Bus,
+}
+
+impl RuntimeLink {
+    /// Opens all topics; a second runtime of the same robot is refused.
+    pub fn open(name: &RobotName) -> Result<RuntimeLink, LinkError> {
+        let bus = Bus::join(name)?;
+        let link = RuntimeLink {
+            action: bus.outbox("runtime")?,
+            transition: bus.outbox("runtime")?,
+            receipt: bus.outbox("runtime")?,
+            health: bus.outbox("runtime")?,
+            state: bus.inbox()?,
+            robot: bus.inbox()?,
+            snapshot: bus.bytes_inbox()?,
+            bus,
+        };
+        link.bus.reserve()?;
+        Ok(link)
+    }
+
+    /// Waits for the plant to say what it is.
+    pub fn wait_for_plant(&mut self, patience: Duration) -> Result<RobotMessage, LinkError> {
+        let robot = &mut self.robot;
+        poll_for(patience, || robot.newest()).ok_or_else(|| LinkError::NoPlant(self.bus.name().clone()))
+    }
+
+    /// The robot's name.
+    pub fn name(&self) -> &RobotName {
+        self.bus.name()
+    }
+
+    /// Epoch in the headers of what this runtime sends.
+    pub fn epoch(&self) -> u64 {
+        self.bus.epoch()
+    }
+
+    /// The plant's description if it was sent again (a plant restarted).
+    pub fn robot(&mut self) -> Option<RobotMessage> {
+        self.robot.newest()
+    }
+
+    /// The newest state not yet read.
+    pub fn newest_state(&mut self) -> Option<StateMessage> {
+        self.state.newest()
+    }
+
+    /// States lost on the way, and states of another schema.
+    pub fn state_counts(&self) -> (u64, u64) {
+        (self.state.lost, self.state.refused)
+    }
+
+    /// The newest snapshot not yet read.
+    pub fn newest_snapshot(&mut self) -> Option<SnapshotBytes> {
+        self.snapshot.newest()
+    }
+
+    /// Snapshots whose header did not fit their bytes.
+    pub fn refused_snapshots(&self) -> u64 {
+        self.snapshot.refused
+    }
+
+    /// Sends the action of a tick.
+    pub fn send_action(&mut self, message: &mut ActionMessage) -> bool {
+        self.action.send(message)
+    }
+
+    /// Sends a transition.
+    pub fn send_transition(&mut self, message: &mut TransitionMessage) -> bool {
+        self.transition.send(message)
+    }
+
+    /// Answers a snapshot.
+    pub fn send_receipt(&mut self, message: &mut ReceiptMessage) -> bool {
+        self.receipt.send(message)
+    }
+
+    /// Sends the health of the loop.
+    pub fn send_health(&mut self, message: &mut HealthMessage) -> bool {
+        self.health.send(message)
+    }
+}
+
+/// Polls every 2 ms until `take` answers or `patience` is over.
+pub(crate) fn poll_for<T>(patience: Duration, mut take: impl FnMut() -> Option<T>) -> Option<T> {
+    let end = std::time::Instant::now() + patience;
+    loop {
+        match take() {
+            Some(value) => return Some(value),
+            None if std::time::Instant::now() >= end => return None,
+            None => std::thread::sleep(Duration::from_millis(2)),
+        }
+    }
+}

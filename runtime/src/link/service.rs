@@ -1,0 +1,207 @@
+//! Opening iceoryx2 services with the same settings on every end.
+//!
+//! Only publish-subscribe is used. Whoever starts first creates the service, the others open it, so start order does
+//! not matter. `max_publishers(1)` makes the publisher's place the single-owner lock of plant, runtime and trainer; a
+//! killed owner's place is freed when the next node cleans up after dead ones.
+
+use std::time::Duration;
+
+use iceoryx2::node::NodeCreationFailure;
+use iceoryx2::port::publisher::PublisherCreateError;
+use iceoryx2::port::subscriber::SubscriberCreateError;
+use iceoryx2::prelude::*;
+use iceoryx2::service::builder::publish_subscribe::{
+    Builder, PublishSubscribeCreateError as Create, PublishSubscribeOpenError as Open,
+    PublishSubscribeOpenOrCreateError as Failure,
+};
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+
+use super::port::{BytesInbox, BytesOutbox, Inbox, Outbox};
+use super::schema::Message;
+use super::{LinkError, RobotName, SnapshotHeader, memory};
+use crate::rt::clock;
+
+pub(crate) type Ipc = ipc_threadsafe::Service;
+
+/// Waits between attempts at a service that another process may be creating, or died creating [ms].
+const BACK_OFF: [u64; 5] = [20, 60, 180, 540, 1000];
+/// What the links of one robot may occupy in shared memory [bytes].
+const SHARED_MEMORY: u64 = 24 << 20;
+
+/// One process's membership in the links of a robot.
+pub(crate) struct Bus {
+    node: Node<Ipc>,
+    name: RobotName,
+    epoch: u64,
+}
+
+impl Bus {
+    /// Checks shared memory, joins, and removes what dead processes left.
+    pub(crate) fn join(name: &RobotName) -> Result<Bus, LinkError> {
+        set_log_level_from_env_or(LogLevel::Fatal);
+        memory::check(name, SHARED_MEMORY)?;
+        let config = name.config()?;
+        let node = retry(
+            || {
+                NodeBuilder::new()
+                    .config(&config)
+                    .signal_handling_mode(SignalHandlingMode::Disabled)
+                    .create::<Ipc>()
+            },
+            |e| matches!(e, NodeCreationFailure::InternalError | NodeCreationFailure::SystemCorrupted),
+        )
+        .map_err(|e| name.transport("start", format!("{e:?}")))?;
+        node.try_cleanup_dead_nodes();
+        let epoch = clock::now() ^ (u64::from(std::process::id()) << 40);
+        Ok(Bus { node, name: name.clone(), epoch })
+    }
+
+    pub(crate) fn name(&self) -> &RobotName {
+        &self.name
+    }
+
+    pub(crate) fn epoch(&self) -> u64 {
+        self.epoch
+    }
+
+    /// Reserves the memory of all segments opened so far.
+    pub(crate) fn reserve(&self) -> Result<(), LinkError> {
+        memory::reserve(&self.name)
+    }
+
+    fn service<M: Message + ZeroCopySend>(&self) -> Result<PortFactory<Ipc, M, ()>, LinkError> {
+        let topic = self.topic(M::TOPIC)?;
+        let build = || {
+            settings(self.node.service_builder(&topic).publish_subscribe::<M>(), M::BUFFER, M::HISTORY)
+                .max_subscribers(M::SUBSCRIBERS)
+                .open_or_create()
+        };
+        retry(build, is_passing).map_err(|e| self.open_error(M::TOPIC, &e))
+    }
+
+    /// The only publisher of `M`; `role` names the owner in the error of a second one.
+    pub(crate) fn outbox<M: Message + ZeroCopySend>(
+        &self,
+        role: &'static str,
+    ) -> Result<Outbox<M>, LinkError> {
+        let service = self.service::<M>()?;
+        let port = service
+            .publisher_builder()
+            .max_loaned_samples(1)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .create()
+            .map_err(|e| self.publisher_error(M::TOPIC, role, e))?;
+        Ok(Outbox::new(port, self.epoch))
+    }
+
+    /// A subscriber of `M`.
+    pub(crate) fn inbox<M: Message + ZeroCopySend>(&self) -> Result<Inbox<M>, LinkError> {
+        let service = self.service::<M>()?;
+        let port = service.subscriber_builder().create().map_err(|e| self.subscriber_error(M::TOPIC, e))?;
+        Ok(Inbox::new(port))
+    }
+
+    fn bytes(&self) -> Result<PortFactory<Ipc, [u8], SnapshotHeader>, LinkError> {
+        let topic = self.topic(SnapshotHeader::TOPIC)?;
+        let build = || {
+            let service = self.node.service_builder(&topic).publish_subscribe::<[u8]>();
+            settings(service.user_header::<SnapshotHeader>(), SnapshotHeader::BUFFER, SnapshotHeader::HISTORY)
+                .max_subscribers(SnapshotHeader::SUBSCRIBERS)
+                .open_or_create()
+        };
+        retry(build, is_passing).map_err(|e| self.open_error(SnapshotHeader::TOPIC, &e))
+    }
+
+    /// The only publisher of snapshots.
+    pub(crate) fn bytes_outbox(&self) -> Result<BytesOutbox, LinkError> {
+        let port = self
+            .bytes()?
+            .publisher_builder()
+            .max_loaned_samples(1)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .initial_max_slice_len(1 << 16)
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .create()
+            .map_err(|e| self.publisher_error(SnapshotHeader::TOPIC, "trainer", e))?;
+        Ok(BytesOutbox::new(port, self.name.clone(), self.epoch))
+    }
+
+    /// A subscriber of snapshots.
+    pub(crate) fn bytes_inbox(&self) -> Result<BytesInbox, LinkError> {
+        let port = self
+            .bytes()?
+            .subscriber_builder()
+            .create()
+            .map_err(|e| self.subscriber_error(SnapshotHeader::TOPIC, e))?;
+        Ok(BytesInbox::new(port))
+    }
+
+    fn topic(&self, topic: &str) -> Result<ServiceName, LinkError> {
+        let name = format!("nearl/{}/{topic}", self.name);
+        ServiceName::new(&name).map_err(|e| self.name.transport(format!("name `{topic}`"), format!("{e:?}")))
+    }
+
+    fn open_error(&self, topic: &'static str, error: &Failure) -> LinkError {
+        match error {
+            Failure::PublishSubscribeOpenError(Open::IncompatibleTypes | Open::VersionMismatch) => {
+                LinkError::Schema { name: self.name.clone(), topic }
+            }
+            other => self.name.transport(format!("open `{topic}`"), format!("{other:?}")),
+        }
+    }
+
+    fn publisher_error(&self, topic: &str, role: &'static str, error: PublisherCreateError) -> LinkError {
+        match error {
+            PublisherCreateError::ExceedsMaxSupportedPublishers => {
+                LinkError::Taken { name: self.name.clone(), role }
+            }
+            other => self.name.transport(format!("publish `{topic}`"), format!("{other:?}")),
+        }
+    }
+
+    fn subscriber_error(&self, topic: &'static str, error: SubscriberCreateError) -> LinkError {
+        match error {
+            SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
+                LinkError::Full { name: self.name.clone(), topic }
+            }
+            other => self.name.transport(format!("read `{topic}`"), format!("{other:?}")),
+        }
+    }
+}
+
+fn settings<P, H>(builder: Builder<P, H, Ipc>, buffer: usize, history: usize) -> Builder<P, H, Ipc>
+where
+    P: std::fmt::Debug + ?Sized + IceoryxSend,
+    H: std::fmt::Debug + ZeroCopySend,
+{
+    builder
+        .max_publishers(1)
+        .max_nodes(24)
+        .subscriber_max_buffer_size(buffer)
+        .subscriber_max_borrowed_samples(1)
+        .history_size(history)
+        .enable_safe_overflow(true)
+}
+
+/// Failures that go away once another process has finished creating, removing or dying.
+fn is_passing(error: &Failure) -> bool {
+    use Failure::{PublishSubscribeCreateError as C, PublishSubscribeOpenError as O};
+    matches!(
+        error,
+        Failure::SystemInFlux
+            | O(Open::HangsInCreation | Open::IsMarkedForDestruction | Open::DoesNotExist)
+            | O(Open::ServiceInCorruptedState | Open::InternalFailure)
+            | C(Create::HangsInCreation | Create::IsBeingCreatedByAnotherInstance | Create::AlreadyExists)
+            | C(Create::ServiceInCorruptedState | Create::InternalFailure)
+    )
+}
+
+fn retry<T, E>(mut attempt: impl FnMut() -> Result<T, E>, is_passing: impl Fn(&E) -> bool) -> Result<T, E> {
+    for wait in BACK_OFF {
+        match attempt() {
+            Err(error) if is_passing(&error) => std::thread::sleep(Duration::from_millis(wait)),
+            other => return other,
+        }
+    }
+    attempt()
+}

@@ -1,0 +1,108 @@
+//! The trainer's ends of the links; also for viewers, which only read.
+
+use std::time::Duration;
+
+use super::port::{BytesOutbox, Inbox};
+use super::runtime::poll_for;
+use super::service::Bus;
+use super::*;
+
+/// Reads states, transitions, receipts and health of one robot, and pushes snapshots.
+pub struct TrainerLink {
+    state: Inbox<StateMessage>,
+    transition: Inbox<TransitionMessage>,
+    receipt: Inbox<ReceiptMessage>,
+    health: Inbox<HealthMessage>,
+    robot: Inbox<RobotMessage>,
+    snapshot: Option<BytesOutbox>,
+    bus: Bus,
+}
+
+impl TrainerLink {
+    /// Opens all topics for reading. The right to push is taken with the first [`TrainerLink::push`].
+    pub fn open(name: &RobotName) -> Result<TrainerLink, LinkError> {
+        let bus = Bus::join(name)?;
+        let link = TrainerLink {
+            state: bus.inbox()?,
+            transition: bus.inbox()?,
+            receipt: bus.inbox()?,
+            health: bus.inbox()?,
+            robot: bus.inbox()?,
+            snapshot: None,
+            bus,
+        };
+        link.bus.reserve()?;
+        Ok(link)
+    }
+
+    /// Waits for the runtime's first sign of health.
+    pub fn wait_for_runtime(&mut self, patience: Duration) -> Result<HealthMessage, LinkError> {
+        let health = &mut self.health;
+        poll_for(patience, || health.newest()).ok_or_else(|| LinkError::NoRuntime(self.bus.name().clone()))
+    }
+
+    /// Sends the bytes of a snapshot file as `version`; a second trainer of the same robot is refused.
+    pub fn push(&mut self, version: u64, bytes: &[u8]) -> Result<(), LinkError> {
+        if self.snapshot.is_none() {
+            self.snapshot = Some(self.bus.bytes_outbox()?);
+        }
+        match &mut self.snapshot {
+            Some(outbox) => outbox.send(version, bytes),
+            None => Ok(()),
+        }
+    }
+
+    /// Waits for the receipt of `version`; calls in between keep late runtimes served.
+    pub fn wait_for_receipt(
+        &mut self,
+        version: u64,
+        patience: Duration,
+    ) -> Result<ReceiptMessage, LinkError> {
+        let (receipt, snapshot, epoch) = (&mut self.receipt, &self.snapshot, self.bus.epoch());
+        poll_for(patience, || {
+            snapshot.iter().for_each(BytesOutbox::attend);
+            std::iter::from_fn(|| receipt.next()).find(|r| r.trainer_epoch == epoch && r.version == version)
+        })
+        .ok_or_else(|| LinkError::NoRuntime(self.bus.name().clone()))
+    }
+
+    /// Keeps late runtimes served with the last snapshot; call now and then while not pushing.
+    pub fn attend(&self) {
+        self.snapshot.iter().for_each(BytesOutbox::attend);
+    }
+
+    /// The next transition in order.
+    pub fn transition(&mut self) -> Option<TransitionMessage> {
+        self.transition.next()
+    }
+
+    /// Transitions lost because they were not read in time.
+    pub fn lost_transitions(&self) -> u64 {
+        self.transition.lost
+    }
+
+    /// The next receipt in order.
+    pub fn receipt(&mut self) -> Option<ReceiptMessage> {
+        self.receipt.next()
+    }
+
+    /// The newest state not yet read.
+    pub fn state(&mut self) -> Option<StateMessage> {
+        self.state.newest()
+    }
+
+    /// The newest health message not yet read.
+    pub fn health(&mut self) -> Option<HealthMessage> {
+        self.health.newest()
+    }
+
+    /// The plant's description, if it was sent since the last call.
+    pub fn robot(&mut self) -> Option<RobotMessage> {
+        self.robot.newest()
+    }
+
+    /// The robot's name.
+    pub fn name(&self) -> &RobotName {
+        self.bus.name()
+    }
+}

@@ -1,0 +1,11 @@
+//! Small tanh networks: padded f32 kernels, shapes, and a forward pass of one sample without allocation.
+
+pub mod kernel;
+
+mod dense;
+mod forward;
+mod mlp;
+
+pub use dense::{Dense, DenseLayer};
+pub use forward::Forward;
+pub use mlp::{Layer, Mlp};

@@ -1,0 +1,109 @@
+//! Where the layers of a network lie in one flat, padded parameter vector.
+
+use super::dense::{Dense, DenseLayer};
+use super::kernel::{LANES, V, scalars, scalars_mut};
+
+/// One affine layer: input k, output n; weight as k rows (padded to 8) of n lanes (padded to 16), then the bias.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Layer {
+    /// Inputs.
+    pub k: usize,
+    /// Outputs.
+    pub n: usize,
+    /// Where the weight starts, in vectors.
+    pub w: usize,
+    /// Where the bias starts, in vectors.
+    pub b: usize,
+}
+
+impl Layer {
+    /// Rows of the weight with padding.
+    pub fn k_padded(&self) -> usize {
+        self.k.next_multiple_of(8)
+    }
+    /// Vectors of an output row.
+    pub fn n_vectors(&self) -> usize {
+        self.n.div_ceil(LANES)
+    }
+    /// Vectors of an input row.
+    pub fn k_vectors(&self) -> usize {
+        self.k.div_ceil(LANES)
+    }
+    /// Vectors of the layer.
+    pub fn len(&self) -> usize {
+        self.k_padded() * self.n_vectors() + self.n_vectors()
+    }
+    /// Whether the layer has no parameters.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// Shapes and offsets of a network with tanh between its layers.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Mlp {
+    /// First to last.
+    pub layers: Vec<Layer>,
+    /// Whether the last layer has tanh too.
+    pub tanh_last: bool,
+}
+
+impl Mlp {
+    /// `widths` from input to output; `at` is the running length of the parameter vector, in vectors.
+    pub fn new(widths: &[usize], tanh_last: bool, at: &mut usize) -> Self {
+        let layers = widths
+            .windows(2)
+            .map(|d| {
+                let mut layer = Layer { k: d[0], n: d[1], w: *at, b: 0 };
+                layer.b = layer.w + layer.k_padded() * layer.n_vectors();
+                *at += layer.len();
+                layer
+            })
+            .collect();
+        Self { layers, tanh_last }
+    }
+
+    /// Inputs.
+    pub fn n_in(&self) -> usize {
+        self.layers[0].k
+    }
+    /// Outputs.
+    pub fn n_out(&self) -> usize {
+        self.layers[self.layers.len() - 1].n
+    }
+    /// Widths from the input to the output.
+    pub fn widths(&self) -> Vec<usize> {
+        std::iter::once(self.n_in()).chain(self.layers.iter().map(|l| l.n)).collect()
+    }
+
+    /// Reads the network out of the parameter vector `p`.
+    pub fn to_dense(&self, p: &[V]) -> Dense {
+        let layers = self.layers.iter().map(|l| {
+            let (w, b) = (scalars(&p[l.w..l.b]), scalars(&p[l.b..l.b + l.n_vectors()]));
+            let row = l.n_vectors() * LANES;
+            let weight = (0..l.n).flat_map(|n| (0..l.k).map(move |k| w[k * row + n])).collect();
+            DenseLayer { n_in: l.k, n_out: l.n, weight, bias: b[..l.n].to_vec() }
+        });
+        Dense { layers: layers.collect() }
+    }
+
+    /// Writes a network of the same widths into the parameter vector `p`; padding becomes zero.
+    ///
+    /// # Panics
+    /// When the widths differ.
+    pub fn write_dense(&self, dense: &Dense, p: &mut [V]) {
+        assert_eq!(self.widths(), dense.widths(), "the network has other widths");
+        for (l, d) in self.layers.iter().zip(&dense.layers) {
+            let row = l.n_vectors() * LANES;
+            let lanes = scalars_mut(&mut p[l.w..l.w + l.len()]);
+            lanes.fill(0.0);
+            let (w, b) = lanes.split_at_mut(l.k_padded() * row);
+            for n in 0..l.n {
+                for k in 0..l.k {
+                    w[k * row + n] = d.weight[n * l.k + k];
+                }
+            }
+            b[..l.n].copy_from_slice(&d.bias);
+        }
+    }
+}

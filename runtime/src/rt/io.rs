@@ -1,0 +1,245 @@
+//! The I/O thread: moves messages between the links and the rings of the real-time thread.
+//!
+//! It polls. Around the moment a state or an action is due it yields instead of sleeping, so that the exchange of a
+//! tick costs microseconds; the rest of the period it sleeps, so that two cores are enough for plant, loop and this.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use hdrhistogram::Histogram;
+use rtrb::{Consumer, Producer};
+
+use crate::link::{
+    ActionMessage, HealthMessage, Message, RobotMessage, RuntimeLink, StateMessage, TransitionMessage,
+};
+use crate::log::LogQueue;
+use crate::rt::clock::{self, Bell};
+use crate::rt::inbox::SnapshotInbox;
+use crate::rt::report::percentiles;
+use crate::rt::tick::{Build, Record};
+
+/// Before a state is due, this thread is awake so much earlier [ns].
+const LEAD: u64 = 120_000;
+/// Longest sleep [ns].
+const NAP: u64 = 500_000;
+/// After so long without a state the plant counts as silent and polling slows down [ns].
+const SILENT: u64 = 5_000_000;
+/// Least time between two looks at what is not part of a tick [ns].
+const ATTEND: u64 = 500_000;
+/// Period of the health message [ns].
+const HEALTH: u64 = 100_000_000;
+
+/// The I/O thread's state.
+pub(crate) struct Io<B: Build> {
+    pub(crate) link: RuntimeLink,
+    pub(crate) robot: RobotMessage,
+    pub(crate) states: Producer<StateMessage>,
+    pub(crate) actions: Consumer<ActionMessage>,
+    pub(crate) records: Consumer<Record>,
+    pub(crate) bell: Arc<Bell>,
+    pub(crate) snapshots: SnapshotInbox<B>,
+    pub(crate) log: Option<LogQueue>,
+    pub(crate) period: u64,
+    pub(crate) polls_always: bool,
+    pub(crate) health: Health,
+    pub(crate) traffic: Traffic,
+}
+
+/// What this thread counts and remembers.
+#[derive(Default)]
+pub(crate) struct Traffic {
+    /// States of the wrong size or from a plant that is not the announced one.
+    pub(crate) refused_states: u64,
+    /// States that found the ring full.
+    pub(crate) dropped_states: u64,
+    last_state: u64,
+    last_due: u64,
+    waits_for_action: bool,
+    next_attend: u64,
+    previous: Option<Box<Record>>,
+    pub(crate) tick: u64,
+}
+
+impl<B: Build> Io<B> {
+    /// Runs until `over` is set and nothing is left to move; returns itself for the report.
+    pub(crate) fn run(mut self, over: &AtomicBool) -> Io<B> {
+        crate::rt::thread::be_prompt();
+        loop {
+            let is_over = over.load(Ordering::Acquire);
+            let moved = self.move_states() | self.move_actions() | self.move_records();
+            if self.has_time() {
+                self.attend();
+            }
+            if !moved {
+                if is_over {
+                    self.attend();
+                    self.link.send_action(&mut ActionMessage::farewell());
+                    return self;
+                }
+                self.idle();
+            }
+        }
+    }
+
+    fn move_states(&mut self) -> bool {
+        let Some(state) = self.link.newest_state() else { return false };
+        if !self.fits(&state) {
+            self.traffic.refused_states += 1;
+            return true;
+        }
+        self.traffic.last_state = clock::now();
+        self.traffic.last_due = state.header.stamp;
+        match self.states.push(state) {
+            Ok(()) => self.traffic.waits_for_action = true,
+            Err(_) => self.traffic.dropped_states += 1,
+        }
+        self.bell.ring();
+        true
+    }
+
+    fn fits(&self, state: &StateMessage) -> bool {
+        let robot = &self.robot;
+        state.header.epoch == robot.header.epoch
+            && (state.nq, state.nv, state.n_obs) == (robot.nq, robot.nv, robot.n_obs)
+    }
+
+    fn move_actions(&mut self) -> bool {
+        let Ok(mut action) = self.actions.pop() else { return false };
+        self.traffic.waits_for_action = false;
+        self.link.send_action(&mut action);
+        true
+    }
+
+    fn move_records(&mut self) -> bool {
+        let Ok(record) = self.records.peek() else { return false };
+        self.traffic.tick = record.tick;
+        self.health.take(record);
+        if let Some(log) = &mut self.log {
+            log.push(record);
+        }
+        if record.fresh {
+            if let Some(previous) = self.traffic.previous.as_deref()
+                && previous.step.nu > 0
+            {
+                self.link.send_transition(&mut transition(previous, &record.state));
+            }
+            match &mut self.traffic.previous {
+                Some(previous) => **previous = *record,
+                none => *none = Some(Box::new(*record)),
+            }
+        }
+        let _ = self.records.pop();
+        true
+    }
+
+    /// True when nothing urgent is expected soon.
+    fn has_time(&self) -> bool {
+        let now = clock::now();
+        if now < self.traffic.next_attend || self.traffic.waits_for_action {
+            return false;
+        }
+        let next = self.traffic.last_due + self.period;
+        let is_far = now + 2 * LEAD < next || now > next + SILENT;
+        is_far || self.polls_always || self.period < 4 * LEAD
+    }
+
+    /// Everything that is not part of a tick: the plant's description, snapshots, health.
+    fn attend(&mut self) {
+        self.traffic.next_attend = clock::now() + ATTEND;
+        if let Some(robot) = self.link.robot() {
+            let known = &self.robot;
+            let is_same = (robot.joints, robot.observation, robot.nq, robot.nv, robot.nu, robot.n_obs)
+                == (known.joints, known.observation, known.nq, known.nv, known.nu, known.n_obs);
+            // A plant that came back as another robot gets no action: its states are refused by their epoch.
+            if is_same && robot.dt == known.dt && robot.limits == known.limits {
+                self.robot = robot;
+            }
+        }
+        self.snapshots.pump(&mut self.link, &self.robot, self.traffic.tick);
+        let now = clock::now();
+        if now >= self.health.next {
+            self.health.next = now + HEALTH;
+            let mut message = self.health.message();
+            message.refused_states = self.traffic.refused_states + self.link.state_counts().1;
+            message.refused_snapshots = self.snapshots.refused + self.link.refused_snapshots();
+            message.log_drops = self.log.as_ref().map_or(0, LogQueue::dropped);
+            self.link.send_health(&mut message);
+        }
+    }
+
+    fn idle(&self) {
+        let now = clock::now();
+        let next = self.traffic.last_due + self.period;
+        if now > self.traffic.last_state + self.period + SILENT {
+            return clock::sleep_until(now + NAP);
+        }
+        if self.polls_always || self.traffic.waits_for_action || now + LEAD >= next {
+            return std::thread::yield_now();
+        }
+        clock::sleep_until((next - LEAD).min(now + NAP));
+    }
+}
+
+/// The transition from one record to the state that followed it.
+fn transition(record: &Record, next: &StateMessage) -> TransitionMessage {
+    let mut m = TransitionMessage::zeroed();
+    let (state, step) = (&record.state, &record.step);
+    m.tick = record.tick;
+    m.state_epoch = state.header.epoch;
+    m.state_seq = state.header.seq;
+    m.next_state_seq = next.header.seq;
+    m.policy_version = record.policy_version;
+    m.episode = state.episode;
+    m.next_bits = next.bits;
+    m.mode = record.mode.code();
+    (m.nq, m.nv, m.nu, m.n_obs) = (state.nq, state.nv, step.nu, state.n_obs);
+    m.reward = next.reward;
+    (m.log_prob_proposal, m.log_prob_action) = (step.log_prob_proposal, step.log_prob_action);
+    m.ledger = step.ledger;
+    (m.q, m.v, m.obs) = (state.q, state.v, state.obs);
+    (m.proposal_q, m.proposal_v) = (step.proposal_q, step.proposal_v);
+    (m.target_q, m.target_v) = (step.target_q, step.target_v);
+    m.action = step.action;
+    m
+}
+
+/// What the health message says.
+pub(crate) struct Health {
+    next: u64,
+    last: HealthMessage,
+    wake: Histogram<u64>,
+    compute: Histogram<u64>,
+}
+
+impl Health {
+    pub(crate) fn new() -> Result<Health, hdrhistogram::CreationError> {
+        let histogram = || Histogram::new_with_bounds(1, 100_000_000_000, 2);
+        let mut last = HealthMessage::zeroed();
+        last.pid = std::process::id();
+        Ok(Health { next: 0, last, wake: histogram()?, compute: histogram()? })
+    }
+
+    fn take(&mut self, record: &Record) {
+        let (last, counters) = (&mut self.last, &record.counters);
+        last.tick = record.tick;
+        last.mode = record.mode.code();
+        last.policy_version = record.policy_version;
+        (last.overruns, last.skipped) = (counters.overruns, counters.skipped);
+        (last.stale, last.swaps) = (counters.stale, counters.swaps);
+        last.lost_states = counters.lost_states;
+        last.raw_violations = counters.raw_violations;
+        last.projected_violations = counters.projected_violations;
+        if record.fresh {
+            self.wake.saturating_record(record.begin.saturating_sub(record.due));
+            self.compute.saturating_record(record.end - record.begin);
+        }
+    }
+
+    fn message(&self) -> HealthMessage {
+        let four = |h| {
+            let p = percentiles(h);
+            [p.p50, p.p99, p.p999, p.max]
+        };
+        HealthMessage { wake: four(&self.wake), compute: four(&self.compute), ..self.last }
+    }
+}

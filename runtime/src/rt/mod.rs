@@ -1,0 +1,35 @@
+//! The real-time loop: one thread that computes, one that talks, one that builds, one that logs.
+//!
+//! ```text
+//! plant ──state──> I/O thread ──ring, bell──> real-time thread: wait, swap, sense, decide, act, send, account
+//!       <─action──            <──ring────────
+//! trainer ──snapshot──> I/O ──> builder ──> I/O ──slot──> real-time thread ──old controller──> I/O (dropped there)
+//! ```
+//!
+//! The page to read is `cycle.rs`. A run is [`connect`] then [`run_loop`].
+
+mod bench;
+mod build;
+pub mod clock;
+mod cycle;
+mod grid;
+mod inbox;
+mod io;
+mod mode;
+mod report;
+mod run;
+mod stop;
+pub mod swap;
+pub(crate) mod thread;
+mod tick;
+
+pub use bench::bench_wake;
+pub use cycle::Sync;
+pub use grid::Grid;
+pub use mode::{Event, Mode, ModeLimits, Modes, Reason};
+pub(crate) use report::percentiles;
+pub use report::{Percentiles, PlantSummary, RunReport};
+pub use run::{RunError, RunSettings, connect, run_loop};
+pub use stop::Stop;
+pub use thread::{ThreadSettings, prepare};
+pub use tick::{Build, Counters, Outcome, Record, Refusal, Step, Tick};

@@ -1,0 +1,96 @@
+//! What a run leaves behind.
+
+use std::collections::BTreeMap;
+
+use hdrhistogram::Histogram;
+use serde::Serialize;
+
+use crate::rt::tick::Counters;
+use crate::rt::{Mode, Reason, Sync};
+
+/// Percentiles of a time [ns].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Percentiles {
+    /// Number of samples.
+    pub count: u64,
+    /// Median.
+    pub p50: u64,
+    /// 99 of 100 are below.
+    pub p99: u64,
+    /// 999 of 1000 are below.
+    pub p999: u64,
+    /// Largest.
+    pub max: u64,
+}
+
+pub(crate) fn percentiles(histogram: &Histogram<u64>) -> Percentiles {
+    Percentiles {
+        count: histogram.len(),
+        p50: histogram.value_at_quantile(0.5),
+        p99: histogram.value_at_quantile(0.99),
+        p999: histogram.value_at_quantile(0.999),
+        max: histogram.max(),
+    }
+}
+
+/// What the plant said about itself in its last state.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct PlantSummary {
+    /// Ticks the plant held the last action because none came in time.
+    pub late: u64,
+    /// Times its watchdog braked.
+    pub watchdog: u64,
+    /// Ticks that broke a limit in the plant itself, by kind.
+    pub violations: BTreeMap<&'static str, u64>,
+    /// Largest excess over a limit, by kind.
+    pub worst: BTreeMap<&'static str, f64>,
+    /// Episodes finished.
+    pub episodes: u64,
+    /// Return of the last finished episode.
+    pub last_return: f64,
+    /// Return of the running episode.
+    pub episode_return: f64,
+}
+
+/// What happened between start and stop.
+#[derive(Clone, Debug, Serialize)]
+pub struct RunReport {
+    /// Robot.
+    pub robot: String,
+    /// Who kept time.
+    pub sync: Sync,
+    /// Control period [s].
+    pub dt: f64,
+    /// Duration [s].
+    pub seconds: f64,
+    /// Ticks.
+    pub ticks: u64,
+    /// Mode of the last tick.
+    pub last_mode: Mode,
+    /// Why it was not Active.
+    pub reason: Reason,
+    /// Ticks in each mode.
+    pub modes: BTreeMap<&'static str, u64>,
+    /// Counts of the loop: overruns, skipped slots, swaps, violations raw and projected, and so on.
+    pub counters: Counters,
+    /// States refused for their sizes, their sender or their schema.
+    pub refused_states: u64,
+    /// From due to begin of the tick.
+    pub wake: Percentiles,
+    /// From begin of the tick to the action.
+    pub compute: Percentiles,
+    /// Versions in use: (first tick at the latest, version).
+    pub versions: Vec<(u64, u64)>,
+    /// Snapshots refused, with the first sentences.
+    pub refused_snapshots: u64,
+    /// Why they were refused.
+    pub refusals: Vec<String>,
+    /// Records the flight log lost.
+    pub log_drops: u64,
+    /// Why the flight log stopped, if it did.
+    pub log_error: Option<String>,
+    /// What the operating system refused: priority, memory, core.
+    pub warnings: Vec<String>,
+    /// The plant's own account.
+    pub plant: PlantSummary,
+}

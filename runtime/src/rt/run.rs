@@ -1,0 +1,269 @@
+//! Putting the threads together: loop, I/O, builder and log, from the first state to the report.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::sync_channel;
+use std::time::Duration;
+
+use rtrb::RingBuffer;
+
+use crate::link::{LinkError, METERS, RobotMessage, RobotName, RuntimeLink, StateMessage};
+use crate::log::{LogError, LogQueue, LogSummary};
+use crate::rt::build::Builder;
+use crate::rt::clock::{self, Bell};
+use crate::rt::cycle::{Cycle, CycleEnd, CycleSettings, Ends, Sync};
+use crate::rt::inbox::SnapshotInbox;
+use crate::rt::io::{Health, Io, Traffic};
+use crate::rt::mode::ModeLimits;
+use crate::rt::report::{PlantSummary, RunReport, percentiles};
+use crate::rt::thread::{ThreadSettings, prepare};
+use crate::rt::tick::{Build, Tick};
+use crate::rt::{Mode, Reason, Stop, swap};
+
+/// Records between loop and I/O thread.
+const RECORDS: usize = 256;
+
+/// Settings of a run.
+#[derive(Clone, Debug)]
+pub struct RunSettings {
+    /// Who keeps time.
+    pub sync: Sync,
+    /// Age at which a state is stale [s]; the default is 5 periods, at least 20 ms.
+    pub age_limit: Option<f64>,
+    /// So long before and after a state is due, the real-time thread polls instead of sleeping [s].
+    pub spin: f64,
+    /// Ticks until the loop stops by itself.
+    pub ticks: Option<u64>,
+    /// How long to wait for the plant at start [s].
+    pub patience: f64,
+    /// Largest speed entry that counts as standing still [rad/s or m/s].
+    pub stop_speed: f64,
+    /// Longest braking before the loop ends anyway [s].
+    pub stop_patience: f64,
+    /// When to brake and when to come back.
+    pub modes: ModeLimits,
+    /// Wishes for the real-time thread.
+    pub thread: ThreadSettings,
+    /// A wish that is refused is an error.
+    pub strict: bool,
+    /// Flight log file.
+    pub log: Option<PathBuf>,
+    /// Facts written into the flight log (snapshot digest, command).
+    pub metadata: BTreeMap<String, String>,
+}
+
+impl Default for RunSettings {
+    fn default() -> Self {
+        RunSettings {
+            sync: Sync::Plant,
+            age_limit: None,
+            spin: 50e-6,
+            ticks: None,
+            patience: 5.0,
+            stop_speed: 1e-2,
+            stop_patience: 1.0,
+            modes: ModeLimits::default(),
+            thread: ThreadSettings { priority: Some(40), cpu: None, lock_memory: true },
+            strict: false,
+            log: None,
+            metadata: BTreeMap::new(),
+        }
+    }
+}
+
+/// Why a run could not start.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// The link.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+    /// The flight log.
+    #[error(transparent)]
+    Log(#[from] LogError),
+    /// The first snapshot does not fit the plant.
+    #[error("{0}")]
+    Snapshot(String),
+    /// Strict mode.
+    #[error("--strict: {0}")]
+    Strict(String),
+    /// A thread.
+    #[error("thread `{name}` could not be started ({reason}): close other programs or raise `ulimit -u`")]
+    Thread {
+        /// Thread.
+        name: &'static str,
+        /// The system's reason.
+        reason: String,
+    },
+    /// A bug in the loop itself.
+    #[error("thread `{0}` panicked: report it with the message above")]
+    Panicked(&'static str),
+}
+
+/// Opens the link of `name` and waits for its plant.
+pub fn connect(name: &RobotName, patience: f64) -> Result<(RuntimeLink, RobotMessage), LinkError> {
+    let mut link = RuntimeLink::open(name)?;
+    let robot = link.wait_for_plant(Duration::from_secs_f64(patience.max(0.0)))?;
+    Ok((link, robot))
+}
+
+/// Runs `first` on the plant behind `link` until `stop` (or the settings' ticks), taking in new snapshots through
+/// `build`. Brakes to zero velocity before it returns.
+pub fn run_loop<B: Build>(
+    link: RuntimeLink,
+    robot: RobotMessage,
+    first: B::Controller,
+    build: B,
+    settings: &RunSettings,
+    stop: &Stop,
+) -> Result<RunReport, RunError> {
+    let begin = clock::now();
+    let version = first.version();
+    let name = link.name().to_string();
+    let (cycle, io) = assemble(link, robot, first, build, settings, stop)?;
+    let over = Arc::new(AtomicBool::new(false));
+    let io_thread = spawn("nearl-io", {
+        let over = Arc::clone(&over);
+        move || io.run(&over)
+    })?;
+    let end = start_cycle(cycle, settings);
+    over.store(true, Ordering::Release);
+    let io = io_thread.join().map_err(|_| RunError::Panicked("nearl-io"))?;
+    let (end, warnings) = end?;
+    Ok(report(name, &robot, settings.sync, begin, version, end, io, warnings))
+}
+
+/// Every ring and every thread's half of it.
+fn assemble<B: Build>(
+    link: RuntimeLink,
+    robot: RobotMessage,
+    first: B::Controller,
+    build: B,
+    settings: &RunSettings,
+    stop: &Stop,
+) -> Result<(Cycle<B::Controller>, Io<B>), RunError> {
+    let log = settings.log.as_deref().map(|path| LogQueue::create(path, &settings.metadata)).transpose()?;
+    let thread_error = |name| move |e: std::io::Error| RunError::Thread { name, reason: e.to_string() };
+    let builder = Builder::start(build).map_err(thread_error("nearl-build"))?;
+    let (states_in, states) = RingBuffer::new(8);
+    let (actions, actions_out) = RingBuffer::new(8);
+    let (records, records_out) = RingBuffer::new(RECORDS);
+    let (swap, slot) = swap::slot();
+    let bell = Arc::new(Bell::default());
+    let ends = Ends { states, actions, records, slot, bell: Arc::clone(&bell) };
+    let cycle = Cycle::new(cycle_settings(&robot, settings), Box::new(first), ends, stop.clone());
+    let health = Health::new().map_err(|e| RunError::Snapshot(e.to_string()))?;
+    let io = Io {
+        link,
+        period: clock::nanoseconds(robot.dt),
+        polls_always: robot.is_lockstep() || settings.sync == Sync::Clock,
+        robot,
+        states: states_in,
+        actions: actions_out,
+        records: records_out,
+        bell,
+        snapshots: SnapshotInbox::new(builder, swap),
+        log,
+        health,
+        traffic: Traffic::default(),
+    };
+    Ok((cycle, io))
+}
+
+fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings {
+    // A lockstep plant may take its time between states (a reset, a reader that stops it).
+    let shortest = if robot.is_lockstep() { 1.0 } else { 0.02 };
+    let age_limit = settings.age_limit.unwrap_or_else(|| (5.0 * robot.dt).max(shortest));
+    CycleSettings {
+        period: clock::nanoseconds(robot.dt),
+        sync: settings.sync,
+        age_limit: clock::nanoseconds(age_limit),
+        spin: if robot.is_lockstep() { 0 } else { clock::nanoseconds(settings.spin) },
+        real_time: !robot.is_lockstep(),
+        ticks: settings.ticks,
+        stop_speed: settings.stop_speed,
+        stop_ticks: (settings.stop_patience / robot.dt).ceil() as u64,
+        modes: settings.modes,
+    }
+}
+
+/// Starts the real-time thread and waits for its end.
+fn start_cycle<T: Tick>(
+    cycle: Cycle<T>,
+    settings: &RunSettings,
+) -> Result<(CycleEnd<T>, Vec<String>), RunError> {
+    let (tell, told) = sync_channel(1);
+    let (wishes, strict) = (settings.thread, settings.strict);
+    let thread = spawn("nearl-rt", move || {
+        let warnings = prepare(&wishes);
+        let refused = strict && !warnings.is_empty();
+        let _ = tell.send(warnings);
+        if refused { None } else { Some(cycle.run()) }
+    })?;
+    let warnings = told.recv().unwrap_or_default();
+    match thread.join() {
+        Ok(Some(end)) => Ok((end, warnings)),
+        Ok(None) => Err(RunError::Strict(warnings.join("; "))),
+        Err(_) => Err(RunError::Panicked("nearl-rt")),
+    }
+}
+
+fn spawn<R: Send + 'static>(
+    name: &'static str,
+    body: impl FnOnce() -> R + Send + 'static,
+) -> Result<std::thread::JoinHandle<R>, RunError> {
+    std::thread::Builder::new()
+        .name(name.into())
+        .spawn(body)
+        .map_err(|e| RunError::Thread { name, reason: e.to_string() })
+}
+
+fn report<B: Build>(
+    robot_name: String,
+    robot: &RobotMessage,
+    sync: Sync,
+    begin: u64,
+    version: u64,
+    end: CycleEnd<B::Controller>,
+    mut io: Io<B>,
+    warnings: Vec<String>,
+) -> RunReport {
+    let seconds = (clock::now() - begin) as f64 * 1e-9;
+    let log = io.log.take().map_or_else(LogSummary::default, LogQueue::finish);
+    let counters = end.last.counters;
+    let mode_count = |mode: Mode| (mode.name(), counters.mode_ticks[mode.code() as usize]);
+    RunReport {
+        robot: robot_name,
+        sync,
+        dt: robot.dt,
+        seconds,
+        ticks: end.last.tick,
+        last_mode: end.last.mode,
+        reason: if end.last.tick == 0 { Reason::Stop } else { end.last.reason },
+        modes: Mode::ALL.into_iter().map(mode_count).collect(),
+        counters,
+        refused_states: io.traffic.refused_states + io.link.state_counts().1,
+        wake: percentiles(&end.wake),
+        compute: percentiles(&end.compute),
+        versions: std::iter::once((0, version)).chain(io.snapshots.accepted).collect(),
+        refused_snapshots: io.snapshots.refused,
+        refusals: io.snapshots.refusals,
+        log_drops: log.dropped,
+        log_error: log.error,
+        warnings,
+        plant: plant_summary(&end.last.state),
+    }
+}
+
+fn plant_summary(state: &StateMessage) -> PlantSummary {
+    PlantSummary {
+        late: state.late,
+        watchdog: state.watchdog,
+        violations: METERS.into_iter().zip(state.violations).collect(),
+        worst: METERS.into_iter().zip(state.worst).collect(),
+        episodes: state.episodes,
+        last_return: state.last_return,
+        episode_return: state.episode_return,
+    }
+}

@@ -1,0 +1,91 @@
+//! What the operating system is asked for: priority, core, locked memory, exact timers. Best effort by default, with
+//! the reason of each refusal; in strict mode a refusal is an error.
+
+use std::num::NonZeroU64;
+
+/// Wishes for one thread and its process.
+#[derive(Clone, Copy, Debug)]
+pub struct ThreadSettings {
+    /// SCHED_FIFO priority, 1 to 99; none keeps the normal scheduler.
+    pub priority: Option<i32>,
+    /// Core to stay on.
+    pub cpu: Option<usize>,
+    /// Lock all memory of the process.
+    pub lock_memory: bool,
+}
+
+/// Asks for `settings` on the calling thread; returns one sentence for each refusal.
+pub fn prepare(settings: &ThreadSettings) -> Vec<String> {
+    // Sleeps of normal threads are rounded up by 50 us unless asked otherwise.
+    let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(1));
+    let results =
+        [settings.lock_memory.then(lock_memory), settings.cpu.map(stay_on), settings.priority.map(be_first)];
+    touch_stack();
+    results.into_iter().flatten().filter_map(Result::err).collect()
+}
+
+/// For the threads that exchange messages in each tick: exact timers, and ahead of ordinary work if that is allowed.
+pub(crate) fn be_prompt() {
+    let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(1));
+    // SAFETY: plain call; on Linux it changes the calling thread only. Without the right it changes nothing.
+    unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, -15) };
+}
+
+fn lock_memory() -> Result<(), String> {
+    use rustix::process::{Resource, getrlimit};
+    // With a limit, locking all future memory would make later allocations fail: worse than a page fault.
+    if let Some(limit) = getrlimit(Resource::Memlock).current
+        && !rustix::process::geteuid().is_root()
+    {
+        return Err(format!(
+            "memory is not locked: the limit is {} kB; raise it with `ulimit -l unlimited`",
+            limit / 1024
+        ));
+    }
+    let all = rustix::mm::MlockAllFlags::CURRENT | rustix::mm::MlockAllFlags::FUTURE;
+    rustix::mm::mlockall(all)
+        .map_err(|e| format!("memory is not locked ({e}): raise the limit with `ulimit -l unlimited`"))
+}
+
+fn stay_on(cpu: usize) -> Result<(), String> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let refused =
+        |reason: String| format!("the loop is not bound to core {cpu} ({reason}): choose another core");
+    if cpu >= rustix::thread::CpuSet::MAX_CPU {
+        return Err(refused(format!("this process may use {cores} cores")));
+    }
+    let mut set = rustix::thread::CpuSet::new();
+    set.set(cpu);
+    rustix::thread::sched_setaffinity(None, &set).map_err(|e| refused(e.to_string()))
+}
+
+fn be_first(priority: i32) -> Result<(), String> {
+    let parameters = libc::sched_param { sched_priority: priority };
+    // SAFETY: plain call with a valid struct; thread 0 is the caller.
+    if unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &parameters) } == 0 {
+        return Ok(());
+    }
+    let reason = std::io::Error::last_os_error();
+    Err(format!(
+        "no real-time priority {priority} ({reason}): run with CAP_SYS_NICE or an rtprio limit of {priority}"
+    ))
+}
+
+/// Lets the builder of controllers run only when nothing else wants the core.
+pub(crate) fn be_last() {
+    let parameters = libc::sched_param { sched_priority: 0 };
+    // SAFETY: as above. A refusal only means the normal scheduler.
+    unsafe { libc::sched_setscheduler(0, libc::SCHED_BATCH, &parameters) };
+    // SAFETY: on Linux the call changes the calling thread only.
+    unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, 19) };
+}
+
+/// Touches 256 kB of stack so that no tick meets a page fault there.
+#[inline(never)]
+fn touch_stack() {
+    let mut stack = [0_u8; 256 << 10];
+    for page in stack.iter_mut().step_by(4096) {
+        // SAFETY: a valid place of our own array; volatile so that it is not left out.
+        unsafe { std::ptr::write_volatile(page, 1) };
+    }
+}

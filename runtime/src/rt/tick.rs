@@ -1,0 +1,163 @@
+//! What the loop needs from a controller, and the record it leaves of each tick.
+
+use crate::link::{LedgerNumbers, MAX_JOINTS, Message, RobotMessage, SnapshotBytes, StateMessage, Verdict};
+use crate::rt::{Mode, Reason};
+
+/// A controller as the loop sees it. `tick`, `brake` and `reset` run in the real-time thread: no allocation beyond
+/// what the solver cannot avoid, no lock, no system call.
+pub trait Tick: Send + 'static {
+    /// Version of the snapshot behind it.
+    fn version(&self) -> u64;
+    /// Computes the action for `state`.
+    fn tick(&mut self, state: &StateMessage, step: &mut Step) -> Outcome;
+    /// Computes an action that brings the velocity to zero; [`Outcome::Refused`] leaves braking to the plant.
+    fn brake(&mut self, state: &StateMessage, step: &mut Step) -> Outcome;
+    /// The next state begins a new episode, or follows a gap.
+    fn reset(&mut self);
+}
+
+/// How a tick of the controller ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// `step.action` is checked and may be applied.
+    Acted,
+    /// There is no checked action: the loop brakes.
+    Refused,
+}
+
+/// Builds controllers from snapshot bytes; runs on a thread of its own, so it may take its time.
+pub trait Build: Send + 'static {
+    /// What it builds.
+    type Controller: Tick;
+    /// Validates everything (digest, names, shapes, finite numbers, period, a trial tick) against `robot`.
+    fn build(&mut self, snapshot: &SnapshotBytes, robot: &RobotMessage) -> Result<Self::Controller, Refusal>;
+}
+
+/// Why a snapshot was not taken.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Refusal {
+    /// By reason.
+    pub verdict: Verdict,
+    /// One sentence: the thing, the values, the next step.
+    pub text: String,
+}
+
+/// A controller's answer to one state. Vectors hold as many entries as the state says (nq, nv) and `nu` actions.
+#[derive(Clone, Copy, Debug)]
+pub struct Step {
+    /// Entries used in `action`.
+    pub nu: u32,
+    /// Proposed configuration (nq).
+    pub proposal_q: [f64; MAX_JOINTS],
+    /// Proposed velocity (nv).
+    pub proposal_v: [f64; MAX_JOINTS],
+    /// Projected configuration (nq).
+    pub target_q: [f64; MAX_JOINTS],
+    /// Projected velocity (nv).
+    pub target_v: [f64; MAX_JOINTS],
+    /// Action in the plant's units (nu).
+    pub action: [f64; MAX_JOINTS],
+    /// Log probability of the proposal.
+    pub log_prob_proposal: f64,
+    /// Log probability of the action.
+    pub log_prob_action: f64,
+    /// What the projection did.
+    pub ledger: LedgerNumbers,
+}
+
+impl Step {
+    /// All numbers zero.
+    pub fn zeroed() -> Step {
+        let zero = [0.0; MAX_JOINTS];
+        Step {
+            nu: 0,
+            proposal_q: zero,
+            proposal_v: zero,
+            target_q: zero,
+            target_v: zero,
+            action: zero,
+            log_prob_proposal: 0.0,
+            log_prob_action: 0.0,
+            ledger: LedgerNumbers::default(),
+        }
+    }
+}
+
+/// Counts of the loop since its start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct Counters {
+    /// Ticks that ended after the next slot was due.
+    pub overruns: u64,
+    /// Slots left out because of overruns.
+    pub skipped: u64,
+    /// Ticks without a fresh state within the age limit.
+    pub stale: u64,
+    /// Ticks that used a state a second time (own clock only).
+    pub repeated: u64,
+    /// States the loop never saw.
+    pub lost_states: u64,
+    /// States with numbers that are not finite.
+    pub bad_states: u64,
+    /// Ticks the controller refused.
+    pub refused: u64,
+    /// Controllers swapped in.
+    pub swaps: u64,
+    /// Actions that found the ring full.
+    pub dropped_actions: u64,
+    /// Records that found the ring full.
+    pub dropped_records: u64,
+    /// Limits the raw proposals broke, summed over ticks.
+    pub raw_violations: u64,
+    /// Limits the projected targets broke, summed over ticks.
+    pub projected_violations: u64,
+    /// Ticks in each mode, by code.
+    pub mode_ticks: [u64; 4],
+}
+
+/// Everything about one tick. Passed by value through a ring; about 5 kB.
+#[derive(Clone, Copy, Debug)]
+pub struct Record {
+    /// Tick of the runtime, from 1.
+    pub tick: u64,
+    /// When the tick was due: the grid slot, or the stamp of the state it waited for [ns].
+    pub due: u64,
+    /// When it began [ns].
+    pub begin: u64,
+    /// When the action was handed over [ns].
+    pub end: u64,
+    /// Mode of the tick.
+    pub mode: Mode,
+    /// Why it is not Active.
+    pub reason: Reason,
+    /// Version of the snapshot in use.
+    pub policy_version: u64,
+    /// `state` is new in this tick.
+    pub fresh: bool,
+    /// A controller was swapped in before this tick.
+    pub swapped: bool,
+    /// The state acted upon.
+    pub state: StateMessage,
+    /// The controller's answer; meaningless if `step.nu` is 0.
+    pub step: Step,
+    /// Counts up to and with this tick.
+    pub counters: Counters,
+}
+
+impl Record {
+    pub(crate) fn new() -> Record {
+        Record {
+            tick: 0,
+            due: 0,
+            begin: 0,
+            end: 0,
+            mode: Mode::Hold,
+            reason: Reason::None,
+            policy_version: 0,
+            fresh: false,
+            swapped: false,
+            state: StateMessage::zeroed(),
+            step: Step::zeroed(),
+            counters: Counters::default(),
+        }
+    }
+}

@@ -1,0 +1,417 @@
+//! The snapshot: policy, inverse model, normaliser, constraints, layout and robot in one safetensors file.
+//!
+//! The file's metadata has one key, `nearl`: the blake3 digest in hex, a line break, the manifest as JSON.
+//! The digest covers the manifest text and every tensor (name, shape, bytes), so any changed bit is refused.
+
+use crate::net::Dense;
+use crate::normaliser::Normaliser;
+use crate::task::Task;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::io::Write;
+use std::path::Path;
+
+/// Version of the file format.
+pub const FORMAT: u32 = 1;
+/// Larger files are refused before they are read, in [byte].
+pub const MAX_BYTES: u64 = 256 << 20;
+const KEY: &str = "nearl";
+
+/// How the networks are read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PolicyKind {
+    /// The policy's output is the mean action; nothing is proposed or projected (plain PPO).
+    Direct,
+    /// The policy's output is the proposal; exploration is in the action (LEARNING, Eq. 1 of the paper).
+    Deterministic,
+    /// The proposal is Gaussian; exploration is in the proposal.
+    Stochastic,
+}
+
+/// Format of the robot file inside the snapshot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ModelFormat {
+    /// URDF.
+    Urdf,
+    /// MuJoCo's MJCF.
+    Mjcf,
+}
+
+/// Everything but the numbers.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// Version of the file format, [`FORMAT`].
+    pub format: u32,
+    /// The effective task file.
+    pub task: Task,
+    /// Format of `model`.
+    pub model_format: ModelFormat,
+    /// Text of the robot file.
+    pub model: String,
+    /// Algorithm that made the weights, e.g. `pid2-ib`.
+    pub algo: String,
+    /// How the networks are read.
+    pub policy: PolicyKind,
+    /// Counts the snapshots of one run upwards; 0 for a file made by hand.
+    pub version: u64,
+    /// Environment steps seen by the learner.
+    pub steps: u64,
+    /// Lowest action the actuators take (n_act).
+    pub action_lower: Vec<f64>,
+    /// Highest action the actuators take (n_act).
+    pub action_upper: Vec<f64>,
+}
+
+/// The numbers of a policy, as the learner hands them to a controller.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Networks {
+    /// Observation normaliser and scale of change.
+    pub normaliser: Normaliser,
+    /// Meta policy (n_obs -> n_state), or n_obs -> n_act for [`PolicyKind::Direct`].
+    pub policy: Dense,
+    /// Log standard deviation of the policy's Gaussian; empty when deterministic.
+    pub policy_log_std: Vec<f32>,
+    /// Learned inverse dynamics (n_input -> n_act) and its log standard deviation.
+    pub idm: Option<(Dense, Vec<f32>)>,
+}
+
+/// What a controller is built from.
+#[derive(Clone, Debug)]
+pub struct Snapshot {
+    /// Everything but the numbers.
+    pub manifest: Manifest,
+    /// The numbers.
+    pub networks: Networks,
+}
+
+/// Why a snapshot was refused. [`SnapshotError::code`] is the stable name of the reason.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SnapshotError {
+    /// Missing, unreadable, not a regular file, or too large.
+    #[error("cannot read snapshot '{file}': {reason}; give a .safetensors file written by 'nearl train'")]
+    Unreadable {
+        /// Path as given.
+        file: String,
+        /// One sentence.
+        reason: String,
+    },
+    /// Not a safetensors file, or cut short.
+    #[error("snapshot is not a safetensors file: {reason}; it may be cut short: copy it again")]
+    Malformed {
+        /// What the reader said.
+        reason: String,
+    },
+    /// The manifest is missing or not ours.
+    #[error("snapshot has no manifest of this program: {reason}; write it with 'nearl train'")]
+    Foreign {
+        /// One sentence.
+        reason: String,
+    },
+    /// The digest does not match.
+    #[error(
+        "snapshot digest mismatch: the file says {expected}, its content gives {actual}; it was changed or damaged: copy it again"
+    )]
+    Digest {
+        /// Digest in the file.
+        expected: String,
+        /// Digest of the content.
+        actual: String,
+    },
+    /// A tensor that must be there is not.
+    #[error(
+        "snapshot has no tensor '{name}'; it was written by another version or cut: train again or convert it"
+    )]
+    MissingTensor {
+        /// Name of the tensor.
+        name: String,
+    },
+    /// A tensor of the wrong type or shape.
+    #[error(
+        "tensor '{name}' is {actual}, but the task needs {expected}; the snapshot belongs to another task"
+    )]
+    Shape {
+        /// Name of the tensor.
+        name: String,
+        /// Shape needed.
+        expected: String,
+        /// Shape found.
+        actual: String,
+    },
+    /// A value that is NaN, infinite, huge, or a standard deviation that is not positive.
+    #[error("tensor '{name}' has {value} at index {index}; the training diverged: use an earlier snapshot")]
+    Value {
+        /// Name of the tensor.
+        name: String,
+        /// Where.
+        index: usize,
+        /// The value.
+        value: f64,
+    },
+    /// The robot, layout or limits inside the snapshot are refused.
+    #[error("snapshot cannot be used: {reason}")]
+    Unusable {
+        /// One sentence from the layer that refused.
+        reason: String,
+    },
+    /// Canary inference gave something that is not a number.
+    #[error(
+        "canary inference gave {value} for action {index}; the weights are unusable: use an earlier snapshot"
+    )]
+    Canary {
+        /// Action entry.
+        index: usize,
+        /// The value.
+        value: f64,
+    },
+}
+
+impl SnapshotError {
+    /// Stable name of the reason, for logs, replies and `nearl explain`.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::Unreadable { .. } => "snapshot-unreadable",
+            Self::Malformed { .. } => "snapshot-malformed",
+            Self::Foreign { .. } => "snapshot-foreign",
+            Self::Digest { .. } => "snapshot-digest",
+            Self::MissingTensor { .. } => "snapshot-missing-tensor",
+            Self::Shape { .. } => "snapshot-shape",
+            Self::Value { .. } => "snapshot-value",
+            Self::Unusable { .. } => "snapshot-unusable",
+            Self::Canary { .. } => "snapshot-canary",
+        }
+    }
+}
+
+impl Snapshot {
+    /// Reads and validates a file.
+    ///
+    /// # Errors
+    /// [`SnapshotError`]; links, pipes, devices and folders are refused without opening them.
+    pub fn load(path: &Path) -> Result<Self, SnapshotError> {
+        let unreadable =
+            |reason: String| SnapshotError::Unreadable { file: path.display().to_string(), reason };
+        let meta = std::fs::symlink_metadata(path).map_err(|e| unreadable(e.to_string()))?;
+        if !meta.is_file() {
+            return Err(unreadable("it is not a regular file".into()));
+        }
+        if meta.len() > MAX_BYTES {
+            return Err(unreadable(format!(
+                "it has {} bytes, more than the limit of {MAX_BYTES}",
+                meta.len()
+            )));
+        }
+        Self::from_bytes(&std::fs::read(path).map_err(|e| unreadable(e.to_string()))?)
+    }
+
+    /// Writes the file whole: to a name beside it, then renamed.
+    ///
+    /// # Errors
+    /// [`SnapshotError::Unreadable`] with what the system said.
+    pub fn save(&self, path: &Path) -> Result<(), SnapshotError> {
+        let bytes = self.to_bytes();
+        let beside = path.with_extension(format!("part{}", std::process::id()));
+        let write = || -> std::io::Result<()> {
+            let mut file = std::fs::File::create(&beside)?;
+            file.write_all(&bytes)?;
+            file.sync_all()?;
+            std::fs::rename(&beside, path)
+        };
+        write().map_err(|e| SnapshotError::Unreadable {
+            file: path.display().to_string(),
+            reason: e.to_string(),
+        })
+    }
+
+    /// The file's bytes; equal snapshots give equal bytes.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let tensors = self.networks.tensors();
+        let views: Vec<(String, TensorView<'_>)> = tensors
+            .iter()
+            .map(|t| {
+                let view = TensorView::new(t.dtype, t.shape.clone(), &t.bytes);
+                (t.name.clone(), view.unwrap_or_else(|e| unreachable!("tensor '{}': {e}", t.name)))
+            })
+            .collect();
+        let manifest =
+            serde_json::to_string(&self.manifest).unwrap_or_else(|e| unreachable!("manifest: {e}"));
+        let parsed = views.iter().map(|(n, v)| (n.as_str(), v.shape(), v.data()));
+        let header = format!("{}\n{manifest}", digest(&manifest, parsed));
+        safetensors::serialize(views, Some(HashMap::from([(KEY.to_string(), header)])))
+            .unwrap_or_else(|e| unreachable!("safetensors: {e}"))
+    }
+
+    /// Reads and validates the bytes of a file.
+    ///
+    /// # Errors
+    /// [`SnapshotError`].
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
+        let malformed = |e: safetensors::SafeTensorError| SnapshotError::Malformed { reason: e.to_string() };
+        let foreign = |reason: String| SnapshotError::Foreign { reason };
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(malformed)?;
+        let file = SafeTensors::deserialize(bytes).map_err(malformed)?;
+        let text = header
+            .metadata()
+            .as_ref()
+            .and_then(|m| m.get(KEY))
+            .ok_or_else(|| foreign(format!("no metadata key '{KEY}'")))?;
+        let (expected, manifest) =
+            text.split_once('\n').ok_or_else(|| foreign("the digest line is missing".into()))?;
+        let mut views: Vec<(String, TensorView<'_>)> = file.tensors();
+        views.sort_by(|a, b| a.0.cmp(&b.0));
+        let actual = digest(manifest, views.iter().map(|(n, v)| (n.as_str(), v.shape(), v.data())));
+        if actual != expected {
+            return Err(SnapshotError::Digest { expected: expected.into(), actual });
+        }
+        let manifest: Manifest = serde_json::from_str(manifest).map_err(|e| foreign(e.to_string()))?;
+        if manifest.format != FORMAT {
+            return Err(foreign(format!("format {} where this program reads {FORMAT}", manifest.format)));
+        }
+        let networks = Networks::read(&views, manifest.policy)?;
+        Ok(Self { manifest, networks })
+    }
+
+    /// Digest of the content in hex; two snapshots with the same digest behave the same.
+    pub fn digest(&self) -> String {
+        let bytes = self.to_bytes();
+        blake3::hash(&bytes).to_hex()[..16].to_string()
+    }
+}
+
+fn digest<'a>(manifest: &str, tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [u8])>) -> String {
+    let mut hash = blake3::Hasher::new();
+    hash.update(manifest.as_bytes());
+    let mut sorted: Vec<_> = tensors.collect();
+    sorted.sort_by(|a, b| a.0.cmp(b.0));
+    for (name, shape, data) in sorted {
+        hash.update(name.as_bytes()).update(format!("{shape:?}").as_bytes()).update(data);
+    }
+    hash.finalize().to_hex().to_string()
+}
+
+struct Tensor {
+    name: String,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: Vec<u8>,
+}
+
+fn f32s(name: String, shape: Vec<usize>, values: &[f32]) -> Tensor {
+    Tensor { name, dtype: Dtype::F32, shape, bytes: values.iter().flat_map(|v| v.to_le_bytes()).collect() }
+}
+fn f64s(name: &str, values: &[f64]) -> Tensor {
+    let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+    Tensor { name: name.into(), dtype: Dtype::F64, shape: vec![values.len()], bytes }
+}
+
+impl Networks {
+    fn tensors(&self) -> Vec<Tensor> {
+        let mut out = vec![
+            f64s("normaliser.mean", &self.normaliser.mean),
+            f64s("normaliser.std", &self.normaliser.std),
+            f64s("normaliser.scale", &self.normaliser.scale),
+        ];
+        let mut net = |prefix: &str, dense: &Dense, log_std: &[f32]| {
+            for (i, l) in dense.layers.iter().enumerate() {
+                out.push(f32s(format!("{prefix}.{i}.weight"), vec![l.n_out, l.n_in], &l.weight));
+                out.push(f32s(format!("{prefix}.{i}.bias"), vec![l.n_out], &l.bias));
+            }
+            out.push(f32s(format!("{prefix}.log_std"), vec![log_std.len()], log_std));
+        };
+        net("policy", &self.policy, &self.policy_log_std);
+        if let Some((dense, log_std)) = &self.idm {
+            net("idm", dense, log_std);
+        }
+        out
+    }
+
+    fn read(views: &[(String, TensorView<'_>)], policy: PolicyKind) -> Result<Self, SnapshotError> {
+        let normaliser = Normaliser {
+            mean: read_f64(views, "normaliser.mean")?,
+            std: read_f64(views, "normaliser.std")?,
+            scale: read_f64(views, "normaliser.scale")?,
+        };
+        for (name, values) in [("normaliser.std", &normaliser.std), ("normaliser.scale", &normaliser.scale)] {
+            if let Some((index, &value)) = values.iter().enumerate().find(|(_, v)| **v <= 0.0) {
+                return Err(SnapshotError::Value { name: name.into(), index, value });
+            }
+        }
+        let (policy_net, policy_log_std) = read_net(views, "policy")?;
+        let has_idm = views.iter().any(|(n, _)| n.starts_with("idm."));
+        let idm = if has_idm && policy != PolicyKind::Direct { Some(read_net(views, "idm")?) } else { None };
+        Ok(Self { normaliser, policy: policy_net, policy_log_std, idm })
+    }
+}
+
+/// Weights beyond this are refused: no trained network of this kind has them.
+const HUGE: f64 = 1e6;
+
+fn find<'a, 'b>(
+    views: &'a [(String, TensorView<'b>)],
+    name: &str,
+    dtype: Dtype,
+    rank: usize,
+) -> Result<&'a TensorView<'b>, SnapshotError> {
+    let view = &views
+        .iter()
+        .find(|(n, _)| n == name)
+        .ok_or_else(|| SnapshotError::MissingTensor { name: name.into() })?
+        .1;
+    if view.dtype() != dtype || view.shape().len() != rank {
+        return Err(SnapshotError::Shape {
+            name: name.into(),
+            expected: format!("{dtype:?} with {rank} dimension(s)"),
+            actual: format!("{:?} {:?}", view.dtype(), view.shape()),
+        });
+    }
+    Ok(view)
+}
+
+fn checked<T: Copy + Into<f64>>(name: &str, values: Vec<T>) -> Result<Vec<T>, SnapshotError> {
+    match values
+        .iter()
+        .enumerate()
+        .map(|(i, &v)| (i, v.into()))
+        .find(|(_, v)| !v.is_finite() || v.abs() > HUGE)
+    {
+        Some((index, value)) => Err(SnapshotError::Value { name: name.into(), index, value }),
+        None => Ok(values),
+    }
+}
+
+fn read_f64(views: &[(String, TensorView<'_>)], name: &str) -> Result<Vec<f64>, SnapshotError> {
+    let view = find(views, name, Dtype::F64, 1)?;
+    checked(name, view.data().as_chunks::<8>().0.iter().map(|c| f64::from_le_bytes(*c)).collect())
+}
+
+fn read_f32(
+    views: &[(String, TensorView<'_>)],
+    name: &str,
+    rank: usize,
+) -> Result<(Vec<f32>, Vec<usize>), SnapshotError> {
+    let view = find(views, name, Dtype::F32, rank)?;
+    let values = view.data().as_chunks::<4>().0.iter().map(|c| f32::from_le_bytes(*c)).collect();
+    Ok((checked(name, values)?, view.shape().to_vec()))
+}
+
+fn read_net(views: &[(String, TensorView<'_>)], prefix: &str) -> Result<(Dense, Vec<f32>), SnapshotError> {
+    let mut layers = Vec::new();
+    let count = views.iter().filter(|(n, _)| n.starts_with(prefix) && n.ends_with(".weight")).count();
+    for i in 0..count.max(1) {
+        let (weight, shape) = read_f32(views, &format!("{prefix}.{i}.weight"), 2)?;
+        let (bias, bias_shape) = read_f32(views, &format!("{prefix}.{i}.bias"), 1)?;
+        let n_in = layers.last().map_or(shape[1], |l: &crate::net::DenseLayer| l.n_out);
+        if shape[1] != n_in || bias_shape[0] != shape[0] || shape[0] == 0 || n_in == 0 {
+            return Err(SnapshotError::Shape {
+                name: format!("{prefix}.{i}.weight"),
+                expected: format!("[{}, {n_in}]", bias_shape[0]),
+                actual: format!("{shape:?}"),
+            });
+        }
+        layers.push(crate::net::DenseLayer { n_in, n_out: shape[0], weight, bias });
+    }
+    Ok((Dense { layers }, read_f32(views, &format!("{prefix}.log_std"), 1)?.0))
+}

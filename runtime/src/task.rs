@@ -1,0 +1,278 @@
+//! The task file: robot, time, state, constraints, inverse dynamics. `[train]` is kept for the trainer.
+//!
+//! An unknown key, a wrong type or a value out of range is one sentence with file, line and key.
+
+use nearl_constraints::ConstraintSettings;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// The whole task file.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct Task {
+    /// Name of the environment that plays the robot in simulation, e.g. `HalfCheetah-v5`.
+    pub name: String,
+    /// The robot file.
+    pub model: ModelSection,
+    /// Periods.
+    pub time: TimeSection,
+    /// Observation, proposal and controllable subset.
+    pub state: StateSection,
+    /// Prior constraints.
+    pub constraints: ConstraintSettings,
+    /// Inverse dynamics.
+    pub idm: IdmSection,
+    /// Settings of the learner; the trainer reads and checks them.
+    #[serde(default)]
+    pub train: toml::Table,
+}
+
+/// `[model]`: exactly one of `urdf` and `mjcf`.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelSection {
+    /// URDF file, relative to the task file, or the name of a bundled robot.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub urdf: Option<String>,
+    /// MJCF file, relative to the task file, or the name of a bundled robot.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mjcf: Option<String>,
+}
+
+/// `[time]`.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct TimeSection {
+    /// Control period in [s].
+    pub dt: f64,
+    /// The policy proposes every k-th control tick; its proposal is for the end of those k ticks.
+    #[serde(default = "one")]
+    pub policy_every: usize,
+    /// Physics step of the plant in [s]; 0 for a zero-order-hold plant (a robot, or RK4).
+    pub sim_dt: f64,
+}
+
+/// `[state]`: entries by name, see [`nearl_constraints::StateLayout`].
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct StateSection {
+    /// Every observation entry, in the environment's order; the environment's own names when absent.
+    #[serde(default)]
+    pub observation: Vec<String>,
+    /// Entries the policy proposes; all when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub propose: Option<Vec<String>>,
+    /// Joints the projector may move; all proposed joints when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub controllable: Option<Vec<String>>,
+}
+
+/// `[idm]`.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct IdmSection {
+    /// Where the action comes from.
+    pub kind: IdmKind,
+    /// What a learned model sees.
+    #[serde(default)]
+    pub input: IdmInput,
+}
+
+/// Kinds of inverse dynamics.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum IdmKind {
+    /// A Gaussian network I(a | s_c, s'_c).
+    Learned,
+    /// Recursive Newton-Euler on the robot model: torque for the projected acceleration.
+    Pinocchio,
+}
+
+/// Entries of state and target that a learned inverse model sees.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum IdmInput {
+    /// The controllable subset S_c.
+    #[default]
+    Controllable,
+    /// Every proposed entry.
+    Full,
+    /// Entries by name.
+    #[serde(untagged)]
+    Names(Vec<String>),
+}
+
+/// Why a task file was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum TaskError {
+    /// The file cannot be read.
+    #[error("cannot read task file '{file}': {reason}; give a task name (see 'nearl tasks') or a TOML file")]
+    Unreadable {
+        /// Path as given.
+        file: String,
+        /// What the system said.
+        reason: String,
+    },
+    /// The text is not a task.
+    #[error("{file}{place}: {reason}")]
+    Invalid {
+        /// Path or task name.
+        file: String,
+        /// `:line` and key where known.
+        place: String,
+        /// One sentence.
+        reason: String,
+    },
+    /// A `--set` that cannot be applied.
+    #[error("--set {set}: {reason}")]
+    Override {
+        /// As written.
+        set: String,
+        /// One sentence.
+        reason: String,
+    },
+}
+
+impl Task {
+    /// Reads `path` and applies `overrides` (`constraints.velocity.scale=0.8`).
+    ///
+    /// # Errors
+    /// [`TaskError`] naming file, line and key.
+    pub fn read(path: &Path, overrides: &[String]) -> Result<Self, TaskError> {
+        let file = path.display().to_string();
+        let text = std::fs::read_to_string(path)
+            .map_err(|e| TaskError::Unreadable { file: file.clone(), reason: e.to_string() })?;
+        Self::parse(&file, &text, overrides)
+    }
+
+    /// The same from text; `file` is the name used in messages.
+    ///
+    /// # Errors
+    /// As [`Task::read`].
+    pub fn parse(file: &str, text: &str, overrides: &[String]) -> Result<Self, TaskError> {
+        let at = |place, reason| TaskError::Invalid { file: file.into(), place, reason };
+        let mut table: toml::Table =
+            toml::from_str(text).map_err(|e| at(line_of(text, e.span()), first_line(e.message())))?;
+        if overrides.is_empty() {
+            // read from the text, not from the table, so that the message can name the line
+            let de = toml::Deserializer::parse(text)
+                .map_err(|e| at(line_of(text, e.span()), first_line(e.message())))?;
+            let task: Task = serde_path_to_error::deserialize(de).map_err(|e| {
+                let (key, inner) = (e.path().to_string(), e.into_inner());
+                at(format!("{} [{key}]", line_of(text, inner.span())), suggest(inner.message()))
+            })?;
+            return task.checked(file);
+        }
+        for set in overrides {
+            apply(&mut table, set)?;
+        }
+        let task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
+            let key = e.path().to_string();
+            at(format!(" [{key}]"), suggest(e.into_inner().message()))
+        })?;
+        task.checked(file)
+    }
+
+    /// The effective file as TOML, for the run folder.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).unwrap_or_else(|e| format!("# cannot be written as TOML: {e}\n"))
+    }
+
+    /// Physics sub-steps in one control period; 0 for a zero-order-hold plant.
+    pub fn sub_steps(&self) -> usize {
+        if self.time.sim_dt == 0.0 { 0 } else { (self.time.dt / self.time.sim_dt).round() as usize }
+    }
+
+    fn checked(self, file: &str) -> Result<Self, TaskError> {
+        let refuse = |key: &str, reason: String| {
+            Err(TaskError::Invalid { file: file.into(), place: format!(" [{key}]"), reason })
+        };
+        let t = &self.time;
+        if !(t.dt.is_finite() && t.dt > 0.0) {
+            return refuse(
+                "time.dt",
+                format!("{} s is not a control period; give a positive number of seconds", t.dt),
+            );
+        }
+        if !(t.sim_dt.is_finite() && t.sim_dt >= 0.0) {
+            return refuse(
+                "time.sim_dt",
+                format!(
+                    "{} s is not a physics step; give seconds, or 0 for a zero-order-hold plant",
+                    t.sim_dt
+                ),
+            );
+        }
+        if t.sim_dt > 0.0 && (t.dt / t.sim_dt - (t.dt / t.sim_dt).round()).abs() > 1e-9 {
+            return refuse(
+                "time.sim_dt",
+                format!("dt = {} s is not a whole number of physics steps of {} s", t.dt, t.sim_dt),
+            );
+        }
+        if t.policy_every == 0 {
+            return refuse("time.policy_every", "0 ticks; the policy needs at least every tick = 1".into());
+        }
+        if self.idm.kind == IdmKind::Learned && t.policy_every != 1 {
+            return refuse(
+                "time.policy_every",
+                format!(
+                    "{} ticks, but a learned inverse model answers each proposal with one action; use 1",
+                    t.policy_every
+                ),
+            );
+        }
+        if self.model.urdf.is_some() == self.model.mjcf.is_some() {
+            return refuse("model", "give exactly one of 'urdf' and 'mjcf'".into());
+        }
+        Ok(self)
+    }
+}
+
+fn one() -> usize {
+    1
+}
+
+fn first_line(s: &str) -> String {
+    s.lines().next().unwrap_or_default().to_string()
+}
+
+fn line_of(text: &str, span: Option<std::ops::Range<usize>>) -> String {
+    span.map_or(String::new(), |s| format!(":{}", 1 + text[..s.start.min(text.len())].matches('\n').count()))
+}
+
+/// `unknown field 'velocty', expected ...` gains the nearest key.
+fn suggest(message: &str) -> String {
+    let message = first_line(message);
+    let mut quoted = message.split('`').skip(1).step_by(2);
+    let Some(unknown) = quoted.next().filter(|_| message.starts_with("unknown ")) else { return message };
+    let near = quoted.map(|k| (strsim::jaro_winkler(unknown, k), k)).max_by(|a, b| a.0.total_cmp(&b.0));
+    match near {
+        Some((score, key)) if score > 0.7 => format!("{message}; did you mean '{key}'?"),
+        _ => message,
+    }
+}
+
+/// `a.b.c=value`: the value is TOML, or a bare string.
+fn apply(table: &mut toml::Table, set: &str) -> Result<(), TaskError> {
+    let refuse = |reason: String| TaskError::Override { set: set.into(), reason };
+    let (key, value) = set
+        .split_once('=')
+        .ok_or_else(|| refuse("write key=value, for example constraints.velocity.scale=0.8".into()))?;
+    let value = toml::from_str::<toml::Table>(&format!("x = {value}"))
+        .ok()
+        .and_then(|mut t| t.remove("x"))
+        .unwrap_or_else(|| toml::Value::String(value.into()));
+    let path: Vec<&str> = key.trim().split('.').collect();
+    let (last, parents) =
+        path.split_last().filter(|(l, _)| !l.is_empty()).ok_or_else(|| refuse("the key is empty".into()))?;
+    let mut here = table;
+    for part in parents {
+        here = here
+            .entry((*part).to_string())
+            .or_insert_with(|| toml::Value::Table(toml::Table::new()))
+            .as_table_mut()
+            .ok_or_else(|| refuse(format!("'{part}' is a value, not a section")))?;
+    }
+    here.insert((*last).to_string(), value);
+    Ok(())
+}

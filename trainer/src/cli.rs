@@ -1,0 +1,63 @@
+//! The `nearl` command line: one file a subcommand.
+
+mod bench;
+mod eval;
+mod project;
+mod tasks;
+mod train;
+
+use clap::{Parser, Subcommand};
+
+/// Any failure, as one sentence.
+pub type Failure = Box<dyn std::error::Error + Send + Sync>;
+
+/// Let a learned policy move a robot without ever breaking its limits.
+#[derive(Parser)]
+#[command(name = "nearl", version, about, propagate_version = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Train a policy on MuJoCo.
+    Train(train::Train),
+    /// Run episodes without noise, raw and projected.
+    Eval(eval::Eval),
+    /// Project proposals read as JSON lines.
+    Project(project::Project),
+    /// Measure this machine.
+    Bench(bench::Bench),
+    /// List the bundled tasks.
+    Tasks(tasks::Tasks),
+}
+
+impl Cli {
+    /// Runs the subcommand.
+    ///
+    /// # Errors
+    /// One sentence naming the thing and the next step.
+    pub fn run(self) -> Result<(), Failure> {
+        match self.command {
+            Command::Train(c) => c.run(),
+            Command::Eval(c) => c.run(),
+            Command::Project(c) => c.run(),
+            Command::Bench(c) => c.run(),
+            Command::Tasks(c) => c.run(),
+        }
+    }
+}
+
+/// Cores of this machine.
+pub(crate) fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+/// Prints a line; a closed pipe ends the program quietly, as other commands do.
+pub(crate) fn say(line: impl std::fmt::Display) {
+    use std::io::Write;
+    if writeln!(std::io::stdout().lock(), "{line}").is_err() {
+        std::process::exit(0);
+    }
+}

@@ -1,0 +1,197 @@
+//! `nearl bench`: latency and throughput, each beside its own floor measured in the same run.
+
+use super::{Failure, cores, say};
+use crate::rollout::{make_env, stream};
+use crate::train::{Request, Training, complete};
+use crate::{env, tasks};
+use clap::{Args, Subcommand};
+use hdrhistogram::Histogram;
+use nearl_runtime::{Controller, Snapshot};
+use rand_distr::{Distribution, StandardNormal};
+use std::time::{Duration, Instant};
+
+#[derive(Args)]
+pub(super) struct Bench {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand)]
+enum What {
+    /// Training steps per second, beside the physics alone.
+    Train(TrainBench),
+    /// One controller update: percentiles beside an empty timer.
+    Update(Ticks),
+    /// One projection: percentiles beside an empty timer.
+    Projection(Ticks),
+}
+
+#[derive(Args)]
+struct TrainBench {
+    /// Task.
+    #[arg(default_value = "HalfCheetah-v5")]
+    task: String,
+    /// Algorithm.
+    #[arg(long, default_value = "pid2-ib")]
+    algo: String,
+    /// Seconds of training in each repetition.
+    #[arg(long, default_value_t = 5.0)]
+    seconds: f64,
+    /// Repetitions, alternating with the physics.
+    #[arg(long, default_value_t = 3)]
+    repeat: usize,
+    /// Overrides of the task file, e.g. `train.ppo.batch_size=2048`.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Args)]
+struct Ticks {
+    /// Task.
+    #[arg(default_value = "HalfCheetah-v5")]
+    task: String,
+    /// Ticks.
+    #[arg(long, default_value_t = 100_000)]
+    ticks: usize,
+    /// Overrides of the task file.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Bench {
+    pub(super) fn run(self) -> Result<(), Failure> {
+        match self.what {
+            What::Train(b) => b.run(),
+            What::Update(b) => b.run(true),
+            What::Projection(b) => b.run(false),
+        }
+    }
+}
+
+fn request(task: &str, algo: &str, set: &[String]) -> Result<Request, Failure> {
+    let mut manifest = tasks::load(task, set)?;
+    complete(&mut manifest)?;
+    Ok(Request { manifest, algo: algo.into(), steps: u64::MAX, seed: 0, threads: cores() })
+}
+
+impl TrainBench {
+    fn run(self) -> Result<(), Failure> {
+        let request = request(&self.task, &self.algo, &self.set)?;
+        let ticks = request.manifest.task.time.policy_every as f64;
+        let (mut rates, mut ceilings, mut shares) = (Vec::new(), Vec::new(), Vec::new());
+        for _ in 0..self.repeat.max(1) {
+            let mut training = Training::new(&request)?;
+            training.iterate();
+            let (start, from) = (Instant::now(), training.snapshot().manifest.steps);
+            while start.elapsed().as_secs_f64() < self.seconds {
+                training.iterate();
+            }
+            let seconds = start.elapsed().as_secs_f64();
+            rates.push((training.snapshot().manifest.steps - from) as f64 / seconds);
+            shares.push(training.learning_seconds() / seconds);
+            let physics = env::bench::physics(
+                &request.manifest.task.name,
+                cores(),
+                Duration::from_secs_f64(self.seconds.min(3.0)),
+            )?;
+            ceilings.push(physics.steps_per_second() / ticks);
+        }
+        let median = |x: &mut Vec<f64>| {
+            x.sort_by(f64::total_cmp);
+            x[x.len() / 2]
+        };
+        let (rate, ceiling, share) = (median(&mut rates), median(&mut ceilings), median(&mut shares));
+        if self.json {
+            say(
+                serde_json::json!({ "task": self.task, "algo": self.algo, "threads": cores(), "steps_per_s": rate,
+                "physics_steps_per_s": ceiling, "fraction": rate / ceiling, "update_share": share }),
+            );
+        } else {
+            say(format!(
+                "{} {} on {} threads: {rate:.0} steps/s, {:.0} % of the physics alone ({ceiling:.0} steps/s), updates take {:.0} % of the time",
+                self.task,
+                self.algo,
+                cores(),
+                100.0 * rate / ceiling,
+                100.0 * share
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl Ticks {
+    fn run(self, whole: bool) -> Result<(), Failure> {
+        let algo = "pid2-ib";
+        let training = Training::new(&request(&self.task, algo, &self.set)?)?;
+        let snapshot = training.snapshot().clone();
+        let (update, projection) = measure(&snapshot, self.ticks)?;
+        let floor = timer(self.ticks);
+        let h = if whole { &update } else { &projection };
+        let what = if whole { "update" } else { "projection" };
+        let p = |h: &Histogram<u64>, q: f64| h.value_at_quantile(q) as f64 / 1e3;
+        if self.json {
+            say(
+                serde_json::json!({ "task": self.task, "what": what, "unit": "us", "p50": p(h, 0.5), "p99": p(h, 0.99),
+                "p999": p(h, 0.999), "max": p(h, 1.0), "timer_p50": p(&floor, 0.5) }),
+            );
+        } else {
+            say(format!("{} {what}, {} ticks [us]", self.task, self.ticks));
+            for (name, h) in [(what, h), ("empty timer", &floor)] {
+                say(format!(
+                    "{name:<12} p50 {:.2}  p99 {:.2}  p99.9 {:.2}  max {:.1}",
+                    p(h, 0.5),
+                    p(h, 0.99),
+                    p(h, 0.999),
+                    p(h, 1.0)
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn histogram() -> Result<Histogram<u64>, Failure> {
+    Ok(Histogram::new_with_bounds(1, 10_000_000_000, 3)?)
+}
+
+/// Closed loop with the task's environment; the policy is fresh, its exploration on.
+fn measure(snapshot: &Snapshot, ticks: usize) -> Result<(Histogram<u64>, Histogram<u64>), Failure> {
+    let (mut env, mut controller) = (make_env(snapshot)?, Controller::new(snapshot)?);
+    let (mut state, mut noise, mut out) = (controller.state(), controller.noise(), controller.output());
+    let (mut update, mut projection) = (histogram()?, histogram()?);
+    let mut rng = stream(0, 0);
+    env.reset(&mut rng)?;
+    let mut since_reset = 0;
+    for _ in 0..ticks {
+        env.observe(&mut state.obs);
+        env.state(&mut state.q, &mut state.v);
+        noise.proposal.fill_with(|| StandardNormal.sample(&mut rng));
+        noise.action.fill_with(|| StandardNormal.sample(&mut rng));
+        controller.update(&state, &noise, &mut out);
+        update.saturating_record(out.duration_ns);
+        projection.saturating_record(out.next.ledger.duration_ns);
+        since_reset += 1;
+        if env.step(&out.action).terminated || since_reset >= env.spec().max_episode_steps {
+            env.reset(&mut rng)?;
+            controller.reset();
+            since_reset = 0;
+        }
+    }
+    Ok((update, projection))
+}
+
+fn timer(n: usize) -> Histogram<u64> {
+    let mut h = histogram().unwrap_or_else(|e| unreachable!("{e}"));
+    for _ in 0..n {
+        let start = Instant::now();
+        h.saturating_record(std::hint::black_box(start).elapsed().as_nanos() as u64);
+    }
+    h
+}

@@ -1,0 +1,57 @@
+//! `nearl eval`.
+
+use super::{Failure, say};
+use crate::evaluate::evaluate;
+use crate::run_folder;
+use clap::Args;
+use nearl_runtime::Snapshot;
+use std::path::PathBuf;
+
+#[derive(Args)]
+pub(super) struct Eval {
+    /// Run folder or snapshot file.
+    run: PathBuf,
+    /// Episodes.
+    #[arg(long, default_value_t = 10)]
+    episodes: usize,
+    /// Modes, separated by commas: `raw` takes the proposal as the target, `projected` projects it.
+    #[arg(long, default_value = "projected", value_delimiter = ',', value_parser = ["raw", "projected"])]
+    compare: Vec<String>,
+    /// Seed of the initial states.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Eval {
+    pub(super) fn run(self) -> Result<(), Failure> {
+        let snapshot = Snapshot::load(&run_folder::snapshot_of(&self.run)?)?;
+        let results = self
+            .compare
+            .iter()
+            .map(|mode| evaluate(&snapshot, self.episodes, self.seed, mode == "projected"))
+            .collect::<Result<Vec<_>, _>>()?;
+        if self.json {
+            say(serde_json::to_string_pretty(&results)?);
+            return Ok(());
+        }
+        say(format!("{}, {} episodes", snapshot.manifest.task.name, self.episodes));
+        say("mode        return   raw proposals   targets   reached states   |reached - target|");
+        say("                     outside         outside   outside          [std of change]");
+        for e in &results {
+            let percent = |n: u64| 100.0 * n as f64 / e.ticks.max(1) as f64;
+            say(format!(
+                "{:<10}{:>8.1}{:>14.2} %{:>8.2} %{:>15.2} %{:>18.3}",
+                e.mode,
+                e.mean_return(),
+                percent(e.raw_violations),
+                percent(e.target_violations),
+                percent(e.reached_violations),
+                e.residual
+            ));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,71 @@
+//! `nearl eval`: episodes without noise, raw and projected.
+
+use crate::rollout::{RolloutError, Worker, make_env, stream};
+use nearl_runtime::Snapshot;
+use serde::Serialize;
+
+/// Mean results of some episodes.
+#[derive(Clone, Debug, Serialize)]
+pub struct Evaluation {
+    /// `projected` or `raw`.
+    pub mode: &'static str,
+    /// Return of each episode.
+    pub returns: Vec<f64>,
+    /// Length of each episode in policy steps.
+    pub lengths: Vec<usize>,
+    /// Control ticks.
+    pub ticks: u64,
+    /// Ticks whose raw proposal broke a constraint.
+    pub raw_violations: u64,
+    /// Ticks whose target broke a constraint.
+    pub target_violations: u64,
+    /// Ticks whose state, as the simulator has it afterwards, broke a position or velocity limit.
+    pub reached_violations: u64,
+    /// Mean over ticks and controllable entries of |reached - target|, in standard deviations of change.
+    pub residual: f64,
+}
+
+impl Evaluation {
+    /// Mean return.
+    pub fn mean_return(&self) -> f64 {
+        self.returns.iter().sum::<f64>() / self.returns.len().max(1) as f64
+    }
+}
+
+/// Runs `episodes` without noise; `projection` off makes the raw proposal the target.
+///
+/// # Errors
+/// [`RolloutError`].
+pub fn evaluate(
+    snapshot: &Snapshot,
+    episodes: usize,
+    seed: u64,
+    projection: bool,
+) -> Result<Evaluation, RolloutError> {
+    let mut worker = Worker::new(make_env(snapshot)?, snapshot, 1.0, stream(seed, 0))?;
+    worker.set_projection(projection);
+    let mode = if projection { "projected" } else { "raw" };
+    let mut e = Evaluation {
+        mode,
+        returns: Vec::new(),
+        lengths: Vec::new(),
+        ticks: 0,
+        raw_violations: 0,
+        target_violations: 0,
+        reached_violations: 0,
+        residual: 0.0,
+    };
+    for _ in 0..episodes {
+        let (ret, length) = worker.evaluate();
+        let t = &worker.tally;
+        e.returns.push(ret);
+        e.lengths.push(length);
+        e.ticks += t.ticks;
+        e.raw_violations += t.raw_violations;
+        e.target_violations += t.projected_violations;
+        e.reached_violations += t.reached_violations;
+        e.residual += t.residual;
+    }
+    e.residual /= e.ticks.max(1) as f64;
+    Ok(e)
+}

@@ -1,0 +1,56 @@
+//! The learner: networks with hand-written gradients, PPO, and the paper's PID^2.
+//!
+//! Read [`pid2`] for the method; [`optimise`] runs its phases over minibatches on all cores, with the same
+//! bits for any number of threads.
+
+mod adam;
+mod batch;
+mod discriminator;
+mod gae;
+mod gaussian;
+mod init;
+mod inverse;
+mod net;
+pub mod optimise;
+pub mod pid2;
+pub mod ppo;
+
+pub use adam::Adam;
+pub use batch::Batch;
+pub use gae::{Advantages, advantages};
+pub use net::{Net, Tape};
+pub use optimise::Schedule;
+pub use pid2::{Pid2, Pid2Settings};
+pub use ppo::{Ppo, PpoSettings};
+
+use nearl_runtime::Networks;
+use nearl_runtime::normaliser::Normaliser;
+use rand_chacha::ChaCha8Rng;
+
+/// Sizes of a task in network space.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Dims {
+    /// Observation entries.
+    pub n_obs: usize,
+    /// Proposed entries.
+    pub n_state: usize,
+    /// Action entries.
+    pub n_act: usize,
+    /// Observation index of each entry the inverse model sees.
+    pub seen_obs: Vec<usize>,
+    /// Index into the proposed state of each entry the inverse model sees.
+    pub seen_state: Vec<usize>,
+}
+
+/// Named numbers of one update, with SB3's tags where they exist.
+pub type Metrics = Vec<(&'static str, f64)>;
+
+/// An algorithm as the training loop sees it.
+pub trait Learner: Send {
+    /// The current networks for a controller.
+    fn networks(&self, normaliser: &Normaliser) -> Networks;
+    /// Value of each row of `x` (n x n_obs).
+    fn values(&mut self, x: &[f32]) -> Vec<f32>;
+    /// Learns from a batch; `rate` scales every learning rate, `rng` orders the minibatches and draws latent noise.
+    fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics;
+}

@@ -1,0 +1,142 @@
+//! The variational discriminator bottleneck (Peng et al. 2019; Eq. 2 of the paper): an encoder `E(z | s, s')`, a decoder
+//! `D(z)`, and the information they may pass.
+
+use super::gaussian::{heads, set_heads, sigmoid};
+use super::init;
+use super::net::{Net, Tape};
+use super::optimise::TILE;
+use super::ppo::widths;
+use nearl_runtime::net::kernel::{LANES, V, ZERO, exp};
+use rand_chacha::ChaCha8Rng;
+
+/// Size of the latent z.
+pub const LATENT: usize = LANES;
+
+/// Encoder (`n_obs + n_state -> 2 LATENT`: mean and log variance) and decoder (`LATENT -> 1`: logit of being real).
+pub struct Discriminator {
+    encoder: Net,
+    decoder: Net,
+    bottleneck: bool,
+    /// Vectors of its parameters.
+    pub len: usize,
+    /// Vectors of its transposed weights.
+    pub transposed: usize,
+}
+
+/// Buffers of one thread.
+pub struct DiscriminatorWork {
+    encoder: Tape,
+    decoder: Tape,
+    /// Input rows `[x, change]`.
+    pub input: Vec<V>,
+    /// Latent noise rows.
+    pub noise: Vec<V>,
+    z: Vec<V>,
+    d_code: Vec<V>,
+    d_logit: Vec<V>,
+    /// Logit of each row, densely; the caller replaces it by `dL / d logit`.
+    pub logit: Vec<V>,
+}
+
+impl Discriminator {
+    /// One hidden layer of each width in `hidden`: the first for the encoder, the last for the decoder.
+    pub fn new(n_in: usize, hidden: &[usize], bottleneck: bool) -> Self {
+        let (mut at, mut transposed) = (0, 0);
+        let ends = (&hidden[..1], &hidden[hidden.len() - 1..]);
+        let encoder = Net::new(&widths(n_in, ends.0, 2 * LATENT), true, &mut at, &mut transposed);
+        let decoder = Net::new(&widths(LATENT, ends.1, 1), true, &mut at, &mut transposed);
+        Self { encoder, decoder, bottleneck, len: at, transposed }
+    }
+
+    /// Orthogonal weights.
+    pub fn init(&self, p: &mut [V], rng: &mut ChaCha8Rng) {
+        for net in [&self.encoder, &self.decoder] {
+            net.mlp.write_dense(&init::orthogonal(&net.mlp.widths(), 1.0, rng), p);
+        }
+    }
+
+    /// Refreshes the transposed weights.
+    pub fn refresh(&self, p: &[V], transposed: &mut [V]) {
+        self.encoder.transpose(p, transposed);
+        self.decoder.transpose(p, transposed);
+    }
+
+    /// Buffers for a tile.
+    pub fn work(&self) -> DiscriminatorWork {
+        let n_in = self.encoder.mlp.n_in().div_ceil(LANES);
+        DiscriminatorWork {
+            encoder: self.encoder.tape(TILE),
+            decoder: self.decoder.tape(TILE),
+            input: vec![ZERO; TILE * n_in],
+            noise: vec![ZERO; TILE],
+            z: vec![ZERO; TILE],
+            d_code: vec![ZERO; 2 * TILE],
+            d_logit: vec![ZERO; TILE],
+            logit: vec![ZERO; TILE / LANES],
+        }
+    }
+
+    /// `z = mu + sigma noise`, then the decoder; logits are in `w.logit`. Returns the sum of KL[E || N(0, 1)] over rows:
+    /// `sum (sigma^2 + mu^2 - 1) / 2 - log sigma`.
+    #[inline(always)]
+    pub fn forward(&self, p: &[V], w: &mut DiscriminatorWork) -> f32 {
+        let code = self.encoder.forward(p, &w.input, &mut w.encoder);
+        let mut kl = ZERO;
+        for ((z, c), &noise) in w.z.iter_mut().zip(code.chunks_exact(2)).zip(&w.noise) {
+            let (mean, log_var) = (c[0], c[1]);
+            if self.bottleneck {
+                *z = mean + exp(log_var * V::splat(0.5)) * noise;
+                kl = kl + (exp(log_var) + mean * mean - V::splat(1.0) - log_var) * V::splat(0.5);
+            } else {
+                *z = mean;
+            }
+        }
+        heads(&mut w.logit, self.decoder.forward(p, &w.z, &mut w.decoder));
+        kl.sum()
+    }
+
+    /// From `dL / d logit` in `w.logit` and a weight on the KL: adds the parameters' gradient to `grad` if given; returns
+    /// the input's gradient if `input`.
+    #[inline(always)]
+    pub fn backward<'w>(
+        &self,
+        transposed: &[V],
+        w: &'w mut DiscriminatorWork,
+        kl_weight: f32,
+        mut grad: Option<&mut [V]>,
+        input: bool,
+    ) -> &'w [V] {
+        set_heads(&mut w.d_logit, &w.logit);
+        let dz =
+            self.decoder.backward(transposed, &w.z, &w.d_logit, &mut w.decoder, grad.as_deref_mut(), true);
+        let (code, k, half) = (w.encoder.output(), V::splat(kl_weight), V::splat(0.5));
+        for (i, dz) in dz.iter().enumerate() {
+            let (mean, log_var) = (code[2 * i], code[2 * i + 1]);
+            (w.d_code[2 * i], w.d_code[2 * i + 1]) = if self.bottleneck {
+                let spread = *dz * (w.z[i] - mean) + k * (exp(log_var) - V::splat(1.0));
+                (*dz + k * mean, spread * half)
+            } else {
+                (*dz, ZERO)
+            };
+        }
+        self.encoder.backward(transposed, &w.input, &w.d_code, &mut w.encoder, grad, input)
+    }
+}
+
+/// `-log sigmoid(x)` summed over lanes, for reports.
+#[inline(always)]
+pub fn softplus_sum(logits: &[V], sign: f32) -> f32 {
+    logits.iter().map(|l| l.0.iter().map(|&x| softplus(-sign * x)).sum::<f32>()).sum()
+}
+
+fn softplus(x: f32) -> f32 {
+    x.max(0.0) + (-x.abs()).exp().ln_1p()
+}
+
+/// `d/dx -log sigmoid(sign x)`.
+#[inline(always)]
+pub fn logit_slope(logits: &mut [V], sign: f32, weight: f32) {
+    for l in logits {
+        *l = sigmoid(*l * V::splat(-sign)) * V::splat(-sign * weight);
+    }
+}

@@ -1,0 +1,160 @@
+//! The inverse dynamics model I(a | s_c, s'_c) as a network over tiles.
+
+use super::Dims;
+use super::batch::Batch;
+use super::gaussian::gather;
+use super::init;
+use super::net::{Net, Tape};
+use super::optimise::{Group, TILE, Tile, add_sums};
+use super::ppo::widths;
+use nearl_runtime::multiversion;
+use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars_mut};
+use rand_chacha::ChaCha8Rng;
+use std::ops::Range;
+
+/// Network inputs beyond this many standard deviations are clipped, as in the controller.
+pub const CLIP: f32 = nearl_runtime::normaliser::CLIP as f32;
+
+/// Mean of I: `[x_c, w_c] -> a`, and where it lies in its parameter group.
+pub struct InverseModel {
+    /// The network.
+    pub net: Net,
+    start: usize,
+    end: usize,
+}
+
+/// Buffers of one thread.
+pub struct InverseWork {
+    /// Activations.
+    pub tape: Tape,
+    /// Input rows.
+    pub input: Vec<V>,
+    /// Action rows.
+    pub action: Vec<V>,
+    /// Gradient of the output.
+    pub slope: Vec<V>,
+}
+
+impl InverseModel {
+    /// Places the network at `at`; `log_std` vectors behind it are the caller's.
+    pub fn new(dims: &Dims, hidden: &[usize], at: &mut usize, transposed: &mut usize) -> Self {
+        let start = *at;
+        let net = Net::new(&widths(2 * dims.seen_obs.len(), hidden, dims.n_act), true, at, transposed);
+        Self { net, start, end: *at }
+    }
+
+    /// A model in a group of its own.
+    pub fn alone(dims: &Dims, hidden: &[usize], rng: &mut ChaCha8Rng) -> (Self, Group) {
+        let (mut at, mut transposed) = (0, 0);
+        let model = Self::new(dims, hidden, &mut at, &mut transposed);
+        let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
+        model.init(dims, hidden, &mut group.p, rng);
+        (model, group)
+    }
+
+    /// Orthogonal weights; the first mean action is near zero.
+    pub fn init(&self, dims: &Dims, hidden: &[usize], p: &mut [V], rng: &mut ChaCha8Rng) {
+        let dense = init::orthogonal(&widths(2 * dims.seen_obs.len(), hidden, dims.n_act), 0.01, rng);
+        self.net.mlp.write_dense(&dense, p);
+    }
+
+    /// Where its parameters lie.
+    pub fn range(&self) -> Range<usize> {
+        self.start..self.end
+    }
+
+    /// Buffers for a tile.
+    pub fn work(&self) -> InverseWork {
+        let (n_in, n_out) = (self.net.mlp.n_in().div_ceil(LANES), self.net.mlp.n_out().div_ceil(LANES));
+        InverseWork {
+            tape: self.net.tape(TILE),
+            input: vec![ZERO; TILE * n_in],
+            action: vec![ZERO; TILE * n_out],
+            slope: vec![ZERO; TILE * n_out],
+        }
+    }
+
+    /// `L_I = sum |a - I(s_c, s'_c)|^2 / 2` on reached transitions (Eq. 4 of the paper for the mean of the Gaussian; its
+    /// spread is left to the policy gradient, which needs it to explore).
+    pub fn tile(&self, group: &Group, t: &Tile<'_>, dims: &Dims, w: &mut InverseWork, grad: &mut [V]) {
+        supervised(self, group, t, dims, w, grad);
+    }
+
+    /// Mean squared error of the mean action over a batch, per action entry.
+    pub fn error(&self, p: &[V], batch: &Batch, dims: &Dims) -> f64 {
+        let mut w = self.work();
+        let (mut sum, mut idx) = (0.0f64, [0u32; TILE]);
+        for start in (0..batch.n).step_by(TILE) {
+            for (k, i) in idx.iter_mut().enumerate() {
+                *i = (start + k).min(batch.n - 1) as u32;
+            }
+            let mut part = 0.0;
+            squared_error(self, p, batch, &idx, dims, &mut w, TILE.min(batch.n - start), &mut part);
+            sum += f64::from(part);
+        }
+        sum / (batch.n * dims.n_act) as f64
+    }
+}
+
+/// Input rows `[x_c, change_c]`.
+#[inline(always)]
+fn gather_input(to: &mut [V], batch: &Batch, change: &[f32], idx: &[u32], dims: &Dims) {
+    let (n, vectors) = (dims.seen_obs.len(), (2 * dims.seen_obs.len()).div_ceil(LANES));
+    let lanes = scalars_mut(to);
+    for (r, &i) in idx.iter().enumerate() {
+        let row = &mut lanes[r * vectors * LANES..][..2 * n];
+        let obs = &batch.obs[i as usize * dims.n_obs..][..dims.n_obs];
+        let change = &change[i as usize * dims.n_state..][..dims.n_state];
+        for j in 0..n {
+            row[j] = obs[dims.seen_obs[j]];
+            row[n + j] = change[dims.seen_state[j]].clamp(-CLIP, CLIP);
+        }
+    }
+}
+
+#[inline(always)]
+fn supervised_body(
+    m: &InverseModel,
+    group: &Group,
+    t: &Tile<'_>,
+    dims: &Dims,
+    w: &mut InverseWork,
+    grad: &mut [V],
+) {
+    let vectors = dims.n_act.div_ceil(LANES);
+    gather_input(&mut w.input, t.batch, &t.batch.reached, t.idx, dims);
+    gather(&mut w.action, vectors, 0, &t.batch.action, dims.n_act, t.idx);
+    let mean = m.net.forward(&group.p, &w.input, &mut w.tape);
+    let mut sum = ZERO;
+    for ((d, &y), &a) in w.slope.iter_mut().zip(mean).zip(&w.action) {
+        let e = y - a;
+        sum = sum.fma(e, e);
+        *d = e * V::splat(t.scale);
+    }
+    m.net.backward(&group.transposed, &w.input, &w.slope, &mut w.tape, Some(grad), false);
+    add_sums(grad, &[sum.sum()]);
+}
+multiversion!(fn supervised(m: &InverseModel, group: &Group, t: &Tile<'_>, dims: &Dims, w: &mut InverseWork, grad: &mut [V]) = supervised_body);
+
+#[inline(always)]
+fn error_body(
+    m: &InverseModel,
+    p: &[V],
+    b: &Batch,
+    idx: &[u32],
+    dims: &Dims,
+    w: &mut InverseWork,
+    n: usize,
+    out: &mut f32,
+) {
+    let vectors = dims.n_act.div_ceil(LANES);
+    gather_input(&mut w.input, b, &b.reached, idx, dims);
+    gather(&mut w.action, vectors, 0, &b.action, dims.n_act, idx);
+    let mean = m.net.forward(p, &w.input, &mut w.tape);
+    let mut sum = ZERO;
+    for (&y, &a) in mean[..n * vectors].iter().zip(&w.action) {
+        sum = sum.fma(y - a, y - a);
+    }
+    *out = sum.sum();
+}
+multiversion!(fn squared_error(m: &InverseModel, p: &[V], b: &Batch, idx: &[u32], dims: &Dims, w: &mut InverseWork, n: usize, out: &mut f32) = error_body);

@@ -1,0 +1,162 @@
+//! A network over tiles of rows: forward with a tape, backward to parameters and inputs.
+
+use nearl_runtime::multiversion;
+use nearl_runtime::net::kernel::{Gemm, LANES, Out, V, ZERO, gemm, scalars, scalars_mut};
+use nearl_runtime::net::{Layer, Mlp};
+
+/// Shapes of a network, and where its transposed weights lie (the backward pass reads them).
+#[derive(Clone, Debug)]
+pub struct Net {
+    /// Shapes and offsets in the parameter vector.
+    pub mlp: Mlp,
+    transposed: Vec<Option<usize>>,
+}
+
+/// Activations of one tile of rows.
+#[derive(Clone, Debug)]
+pub struct Tape {
+    rows: usize,
+    outputs: Vec<Vec<V>>,
+    grads: [Vec<V>; 2],
+}
+
+impl Tape {
+    /// The network's output, row by row.
+    pub fn output(&self) -> &[V] {
+        &self.outputs[self.outputs.len() - 1]
+    }
+}
+
+impl Net {
+    /// `at` and `transposed_at` are running lengths in vectors; `input_grad`: the input's gradient is wanted.
+    pub fn new(widths: &[usize], input_grad: bool, at: &mut usize, transposed_at: &mut usize) -> Self {
+        let mlp = Mlp::new(widths, false, at);
+        let place = |(i, l): (usize, &Layer)| {
+            (i > 0 || input_grad).then(|| {
+                let here = *transposed_at;
+                *transposed_at += l.n_vectors() * LANES * l.k_vectors();
+                here
+            })
+        };
+        let transposed = mlp.layers.iter().enumerate().map(place).collect();
+        Self { mlp, transposed }
+    }
+
+    /// Buffers for `rows` rows, a multiple of 8.
+    pub fn tape(&self, rows: usize) -> Tape {
+        let widest = self.mlp.layers.iter().map(|l| l.n_vectors().max(l.k_vectors())).max().unwrap_or(0);
+        let outputs = self.mlp.layers.iter().map(|l| vec![ZERO; rows * l.n_vectors()]).collect();
+        Tape { rows, outputs, grads: [vec![ZERO; rows * widest], vec![ZERO; rows * widest]] }
+    }
+
+    /// Refreshes the transposed weights; call after each change of the parameters `p`.
+    pub fn transpose(&self, p: &[V], transposed: &mut [V]) {
+        for (l, at) in self.mlp.layers.iter().zip(&self.transposed) {
+            let Some(at) = *at else { continue };
+            let (row, t_row) = (l.n_vectors() * LANES, l.k_vectors() * LANES);
+            let t = scalars_mut(&mut transposed[at..at + row * l.k_vectors()]);
+            let w = scalars(&p[l.w..l.b]);
+            for k in 0..l.k {
+                for n in 0..l.n {
+                    t[n * t_row + k] = w[k * row + n];
+                }
+            }
+        }
+    }
+
+    /// Output rows for the input rows `x` (padded with zeros).
+    pub fn forward<'t>(&self, p: &[V], x: &[V], tape: &'t mut Tape) -> &'t [V] {
+        let last = self.mlp.layers.len() - 1;
+        for (i, l) in self.mlp.layers.iter().enumerate() {
+            let (before, after) = tape.outputs.split_at_mut(i);
+            let input = if i == 0 { x } else { &before[i - 1] };
+            let bias = &p[l.b..l.b + l.n_vectors()];
+            let product = Gemm {
+                m: tape.rows,
+                k: l.k,
+                n: l.n_vectors(),
+                a: scalars(input),
+                rs: l.k_vectors() * LANES,
+                cs: 1,
+                b: &p[l.w..],
+                ldb: l.n_vectors(),
+                ldc: l.n_vectors(),
+                out: if i < last { Out::BiasTanh(bias) } else { Out::Bias(bias) },
+            };
+            gemm(&product, &mut after[0]);
+        }
+        &tape.outputs[last]
+    }
+
+    /// From the output's gradient `dy` (padding zero): adds the parameters' gradient to `grad` if given; returns the
+    /// input's gradient if `input` (empty otherwise; the net must have been made for it).
+    pub fn backward<'t>(
+        &self,
+        transposed: &[V],
+        x: &[V],
+        dy: &[V],
+        tape: &'t mut Tape,
+        mut grad: Option<&mut [V]>,
+        input: bool,
+    ) -> &'t [V] {
+        let rows = tape.rows;
+        let [mut current, mut next] = std::mem::take(&mut tape.grads);
+        let last = self.mlp.layers.len() - 1;
+        for (i, l) in self.mlp.layers.iter().enumerate().rev() {
+            let (n, k) = (l.n_vectors(), l.k_vectors());
+            let source = if i == 0 { x } else { &tape.outputs[i - 1] };
+            let d = if i == last { &dy[..rows * n] } else { &current[..rows * n] };
+            if let Some(g) = grad.as_deref_mut() {
+                let product = Gemm {
+                    m: l.k_padded(),
+                    k: rows,
+                    n,
+                    a: scalars(source),
+                    rs: 1,
+                    cs: k * LANES,
+                    b: d,
+                    ldb: n,
+                    ldc: n,
+                    out: Out::Accumulate,
+                };
+                gemm(&product, &mut g[l.w..l.b]);
+                column_sums(d, n, &mut g[l.b..l.b + n]);
+            }
+            if let Some(at) = self.transposed[i].filter(|_| i > 0 || input) {
+                let product = Gemm {
+                    m: rows,
+                    k: l.n,
+                    n: k,
+                    a: scalars(d),
+                    rs: n * LANES,
+                    cs: 1,
+                    b: &transposed[at..],
+                    ldb: k,
+                    ldc: k,
+                    out: if i > 0 { Out::TimesDtanh(source) } else { Out::Store },
+                };
+                gemm(&product, &mut next);
+                std::mem::swap(&mut current, &mut next);
+            }
+        }
+        tape.grads = [current, next];
+        &tape.grads[0][..if input { rows * self.mlp.layers[0].k_vectors() } else { 0 }]
+    }
+}
+
+#[inline(always)]
+fn sums(d: &[V], n: usize, out: &mut [V]) {
+    for (j, out) in out.iter_mut().enumerate() {
+        let mut acc = [ZERO; 4];
+        for rows in d.chunks_exact(4 * n) {
+            for c in 0..4 {
+                acc[c] = acc[c] + rows[c * n + j];
+            }
+        }
+        *out = *out + ((acc[0] + acc[1]) + (acc[2] + acc[3]));
+    }
+}
+multiversion!(
+    /// Adds the sum of the rows of `d` (n vectors each, a multiple of 4 rows) to `out` (n vectors).
+    fn column_sums(d: &[V], n: usize, out: &mut [V]) = sums
+);

@@ -1,0 +1,275 @@
+//! Runs the phases of an algorithm over minibatches, on several threads, with the same bits for any number of them.
+//!
+//! A minibatch is cut into a number of shards that depends on its size alone. Each thread computes some shards; after a
+//! barrier every thread adds all shards in order and applies the same step to its own replica of the parameters. Nothing
+//! is allocated per minibatch.
+
+use super::adam::{Adam, norm};
+use super::batch::Batch;
+use nearl_runtime::net::kernel::{LANES, V, ZERO};
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use std::ops::Range;
+use std::sync::RwLock;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Rows computed at a time by one thread.
+pub const TILE: usize = 32;
+/// Rows of a shard, where the minibatch allows.
+const SHARD: usize = 256;
+
+/// One vector of parameters with the transposed weights its networks read backwards.
+#[derive(Clone, Debug)]
+pub struct Group {
+    /// Parameters.
+    pub p: Vec<V>,
+    /// Transposed weights.
+    pub transposed: Vec<V>,
+}
+
+/// What the phases of an algorithm read and change.
+#[derive(Clone, Debug)]
+pub struct Params {
+    /// Parameter groups.
+    pub groups: Vec<Group>,
+    /// One optimiser a phase.
+    pub adam: Vec<Adam>,
+    /// Multiplier of the information bottleneck.
+    pub beta: f32,
+}
+
+/// What a tile of rows needs: the batch, the rows, and numbers of the whole minibatch.
+#[derive(Clone, Copy)]
+pub struct Tile<'a> {
+    /// Experience.
+    pub batch: &'a Batch,
+    /// Rows, [`TILE`] of them.
+    pub idx: &'a [u32],
+    /// `1 / minibatch`.
+    pub scale: f32,
+    /// Mean and inverse standard deviation of the minibatch's advantages.
+    pub advantage: (f32, f32),
+}
+
+/// Sums over rows that a phase reports, beside its gradient: lanes of one vector.
+pub const SUMS: usize = LANES;
+
+/// An algorithm as its phases. Phases run in order on each minibatch.
+pub trait Phases: Sync {
+    /// Buffers of one thread.
+    type Work;
+    /// Buffers for tiles of [`TILE`] rows.
+    fn work(&self) -> Self::Work;
+    /// Parameter group that phase `k` changes.
+    fn group(&self, phase: usize) -> usize;
+    /// Part of the group that phase `k` changes.
+    fn range(&self, phase: usize) -> Range<usize>;
+    /// Adds the gradient of a tile to `grad` (of the whole group) and its sums to the last vector of `grad`.
+    fn tile(&self, phase: usize, params: &Params, tile: Tile<'_>, work: &mut Self::Work, grad: &mut [V]);
+    /// Refreshes transposed weights after phase `k` changed its parameters.
+    fn refresh(&self, phase: usize, params: &mut Params);
+    /// Largest norm of the gradient of phase `k`.
+    fn max_norm(&self, phase: usize) -> f32;
+    /// Changes what is not a parameter (the bottleneck's multiplier) from the sums of phase `k`, averaged over rows.
+    fn after(&self, _phase: usize, _mean: &[f32; SUMS], _params: &mut Params) {}
+}
+
+/// How often and in what portions a batch is used.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Schedule {
+    /// Passes over the batch.
+    pub epochs: usize,
+    /// Rows of a minibatch: a multiple of [`TILE`] that divides the batch.
+    pub minibatch: usize,
+    /// Threads.
+    pub threads: usize,
+    /// Factor on every learning rate.
+    pub rate: f32,
+}
+
+/// What a phase reported, averaged over all minibatches.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct PhaseReport {
+    /// Sums of the phase per row.
+    pub mean: [f64; SUMS],
+    /// Gradient norm before clipping.
+    pub norm: f64,
+}
+
+/// Counts the threads that arrived; each round needs all of them.
+struct Barrier {
+    threads: usize,
+    arrived: AtomicUsize,
+}
+
+impl Barrier {
+    fn wait(&self, round: usize) {
+        self.arrived.fetch_add(1, Ordering::AcqRel);
+        let mut spins = 0u32;
+        while self.arrived.load(Ordering::Acquire) < self.threads * round {
+            spins += 1;
+            if spins < 4000 { std::hint::spin_loop() } else { std::thread::yield_now() }
+        }
+    }
+}
+
+/// Runs `phases` (indices) over every minibatch of every epoch and returns what each reported.
+///
+/// # Panics
+/// When the minibatch is not a multiple of [`TILE`] that divides the batch; settings are checked before.
+pub fn optimise<P: Phases>(
+    algorithm: &P,
+    params: &mut Params,
+    batch: &Batch,
+    phases: &[usize],
+    schedule: Schedule,
+    rng: &mut ChaCha8Rng,
+) -> Vec<PhaseReport> {
+    let mb = schedule.minibatch;
+    assert!(
+        mb.is_multiple_of(TILE) && mb > 0 && batch.n.is_multiple_of(mb),
+        "minibatch {mb} of batch {}",
+        batch.n
+    );
+    let orders: Vec<Vec<u32>> = (0..schedule.epochs).map(|_| shuffled(batch.n, rng)).collect();
+    let shards = if mb.is_multiple_of(SHARD) { mb / SHARD } else { 1 };
+    let longest = params.groups.iter().map(|g| g.p.len()).max().unwrap_or(0) + 1;
+    let threads = schedule.threads.clamp(1, shards);
+    let run = Run {
+        algorithm,
+        batch,
+        phases,
+        schedule,
+        orders: &orders,
+        shards,
+        threads,
+        // two buffers a shard: one barrier an optimiser step
+        gradients: (0..shards).map(|_| std::array::from_fn(|_| RwLock::new(vec![ZERO; longest]))).collect(),
+        barrier: Barrier { threads, arrived: AtomicUsize::new(0) },
+    };
+    std::thread::scope(|scope| {
+        for t in 1..threads {
+            let mut replica = params.clone();
+            let run = &run;
+            scope.spawn(move || run.worker(t, &mut replica));
+        }
+        run.worker(0, params)
+    })
+}
+
+struct Run<'a, P: Phases> {
+    algorithm: &'a P,
+    batch: &'a Batch,
+    phases: &'a [usize],
+    schedule: Schedule,
+    orders: &'a [Vec<u32>],
+    shards: usize,
+    threads: usize,
+    gradients: Vec<[RwLock<Vec<V>>; 2]>,
+    barrier: Barrier,
+}
+
+impl<P: Phases> Run<'_, P> {
+    fn worker(&self, thread: usize, params: &mut Params) -> Vec<PhaseReport> {
+        let mut work = self.algorithm.work();
+        let longest = params.groups.iter().map(|g| g.p.len()).max().unwrap_or(0) + 1;
+        let (mut sum, mut round, mut steps) = (vec![ZERO; longest], 0, 0.0);
+        let mut reports = vec![PhaseReport::default(); self.phases.len()];
+        for idx in self.orders.iter().flat_map(|o| o.chunks_exact(self.schedule.minibatch)) {
+            let advantage = moments(self.batch, idx);
+            for (report, &phase) in reports.iter_mut().zip(self.phases) {
+                let len = params.groups[self.algorithm.group(phase)].p.len() + 1;
+                for s in (thread..self.shards).step_by(self.threads) {
+                    self.shard(s, phase, idx, advantage, params, &mut work, round % 2, len);
+                }
+                let odd = round % 2;
+                round += 1;
+                if self.threads > 1 {
+                    self.barrier.wait(round);
+                }
+                self.gather(&mut sum[..len], odd);
+                self.step(phase, &mut sum[..len], params, report);
+            }
+            steps += 1.0;
+        }
+        for r in &mut reports {
+            r.mean.iter_mut().for_each(|m| *m /= steps);
+            r.norm /= steps;
+        }
+        reports
+    }
+
+    fn shard(
+        &self,
+        s: usize,
+        phase: usize,
+        idx: &[u32],
+        advantage: (f32, f32),
+        params: &Params,
+        work: &mut P::Work,
+        odd: usize,
+        len: usize,
+    ) {
+        let rows = idx.len() / self.shards;
+        let mut grad = self.gradients[s][odd].write().unwrap_or_else(std::sync::PoisonError::into_inner);
+        grad[..len].fill(ZERO);
+        for idx in idx[s * rows..][..rows].chunks_exact(TILE) {
+            let tile =
+                Tile { batch: self.batch, idx, scale: 1.0 / self.schedule.minibatch as f32, advantage };
+            self.algorithm.tile(phase, params, tile, work, &mut grad[..len]);
+        }
+    }
+
+    fn gather(&self, sum: &mut [V], odd: usize) {
+        let read =
+            |s: usize| self.gradients[s][odd].read().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let n = sum.len();
+        sum.copy_from_slice(&read(0)[..n]);
+        for s in 1..self.shards {
+            for (a, &x) in sum.iter_mut().zip(read(s).iter()) {
+                *a = *a + x;
+            }
+        }
+    }
+
+    fn step(&self, phase: usize, sum: &mut [V], params: &mut Params, report: &mut PhaseReport) {
+        let (grad, sums) = sum.split_at(sum.len() - 1);
+        let mean = sums[0].0.map(|x| x / self.schedule.minibatch as f32);
+        let range = self.algorithm.range(phase);
+        let grad = &grad[range.clone()];
+        let (length, limit) = (norm(grad), self.algorithm.max_norm(phase));
+        let scale = if length > limit { limit / length } else { 1.0 };
+        let group = &mut params.groups[self.algorithm.group(phase)];
+        params.adam[phase].step(&mut group.p[range], grad, scale, self.schedule.rate);
+        self.algorithm.refresh(phase, params);
+        self.algorithm.after(phase, &mean, params);
+        report.norm += f64::from(length);
+        report.mean.iter_mut().zip(mean).for_each(|(r, m)| *r += f64::from(m));
+    }
+}
+
+/// Mean and inverse standard deviation of the advantages of a minibatch.
+fn moments(batch: &Batch, idx: &[u32]) -> (f32, f32) {
+    let n = idx.len() as f64;
+    let at = |&i: &u32| f64::from(batch.advantage[i as usize]);
+    let mean = idx.iter().map(at).sum::<f64>() / n;
+    let variance = idx.iter().map(|i| (at(i) - mean).powi(2)).sum::<f64>() / n;
+    (mean as f32, (1.0 / (variance.sqrt() + 1e-8)) as f32)
+}
+
+fn shuffled(n: usize, rng: &mut ChaCha8Rng) -> Vec<u32> {
+    let mut order: Vec<u32> = (0..n as u32).collect();
+    for i in (1..n).rev() {
+        order.swap(i, rng.random_range(0..=i));
+    }
+    order
+}
+
+/// Adds `values` to the sums in the last vector of `grad`.
+#[inline(always)]
+pub fn add_sums(grad: &mut [V], values: &[f32]) {
+    let last = grad.len() - 1;
+    for (lane, v) in grad[last].0.iter_mut().zip(values) {
+        *lane += v;
+    }
+}

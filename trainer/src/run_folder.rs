@@ -1,0 +1,120 @@
+//! The run folder: `task.toml metrics.csv env.json checkpoints/` of one training.
+
+use nearl_runtime::{Manifest, Snapshot, SnapshotError};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+/// Why a run folder cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// Creating or writing.
+    #[error("cannot write '{path}': {reason}; give another folder with --out")]
+    Write {
+        /// File or folder.
+        path: String,
+        /// What the system said.
+        reason: String,
+    },
+    /// A run is already there.
+    #[error("'{path}' already holds a run; give another folder with --out or remove it")]
+    Exists {
+        /// Folder.
+        path: String,
+    },
+    /// Reading.
+    #[error("'{path}' is not a run folder: {reason}; give a folder written by 'nearl train'")]
+    Read {
+        /// Folder.
+        path: String,
+        /// What is missing.
+        reason: String,
+    },
+}
+
+/// Writes one training to disk.
+pub struct RunFolder {
+    path: PathBuf,
+    metrics: BufWriter<File>,
+    columns: usize,
+}
+
+impl RunFolder {
+    /// Creates the folder with `task.toml`, `env.json` and an empty `metrics.csv` with `columns`.
+    ///
+    /// # Errors
+    /// [`RunError`]; a folder that already holds a run is never overwritten.
+    pub fn create(path: &Path, manifest: &Manifest, seed: u64, columns: &[&str]) -> Result<Self, RunError> {
+        let write = |p: &Path, e: std::io::Error| RunError::Write {
+            path: p.display().to_string(),
+            reason: e.to_string(),
+        };
+        if path.join("metrics.csv").exists() {
+            return Err(RunError::Exists { path: path.display().to_string() });
+        }
+        let checkpoints = path.join("checkpoints");
+        std::fs::create_dir_all(&checkpoints).map_err(|e| write(&checkpoints, e))?;
+        let put = |name: &str, text: &str| {
+            let file = path.join(name);
+            std::fs::write(&file, text).map_err(|e| write(&file, e))
+        };
+        put("task.toml", &manifest.task.to_toml())?;
+        let host = serde_json::json!({
+            "algo": manifest.algo, "seed": seed, "version": env!("CARGO_PKG_VERSION"),
+            "mujoco": "3.17.0", "pinocchio": "4.1.0", "isa": nearl_runtime::net::kernel::isa(),
+            "cores": std::thread::available_parallelism().map_or(1, usize::from), "os": std::env::consts::OS, "arch": std::env::consts::ARCH,
+        });
+        put("env.json", &format!("{host:#}\n"))?;
+        let file = path.join("metrics.csv");
+        let mut metrics = BufWriter::new(File::create(&file).map_err(|e| write(&file, e))?);
+        writeln!(metrics, "{}", columns.join(",")).map_err(|e| write(&file, e))?;
+        Ok(Self { path: path.into(), metrics, columns: columns.len() })
+    }
+
+    /// Appends one row of metrics; numbers that do not exist are empty cells.
+    ///
+    /// # Errors
+    /// [`RunError::Write`].
+    pub fn row(&mut self, values: &[f64]) -> Result<(), RunError> {
+        assert_eq!(values.len(), self.columns, "one value a column");
+        let cell = |v: &f64| if v.is_finite() { v.to_string() } else { String::new() };
+        let line = values.iter().map(cell).collect::<Vec<_>>().join(",");
+        let file = self.path.join("metrics.csv");
+        writeln!(self.metrics, "{line}")
+            .and_then(|()| self.metrics.flush())
+            .map_err(|e| RunError::Write { path: file.display().to_string(), reason: e.to_string() })
+    }
+
+    /// Writes `checkpoints/<name>.safetensors` whole.
+    ///
+    /// # Errors
+    /// [`SnapshotError`] with what the system said.
+    pub fn save(&self, name: &str, snapshot: &Snapshot) -> Result<PathBuf, SnapshotError> {
+        let path = self.path.join("checkpoints").join(format!("{name}.safetensors"));
+        snapshot.save(&path)?;
+        Ok(path)
+    }
+
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+}
+
+/// The snapshot of a run folder (its final one, else its latest), or of a snapshot file.
+///
+/// # Errors
+/// [`RunError::Read`] naming what is missing.
+pub fn snapshot_of(run: &Path) -> Result<PathBuf, RunError> {
+    if run.is_file() {
+        return Ok(run.into());
+    }
+    ["final", "latest"]
+        .iter()
+        .map(|n| run.join("checkpoints").join(format!("{n}.safetensors")))
+        .find(|p| p.is_file())
+        .ok_or_else(|| RunError::Read {
+            path: run.display().to_string(),
+            reason: "it has no checkpoints/final.safetensors or latest.safetensors".into(),
+        })
+}

@@ -1,0 +1,93 @@
+//! `[train]` of the task file: how experience is collected, and the learner's own sections.
+
+use crate::learn::{Pid2Settings, PpoSettings};
+use serde::{Deserialize, Serialize};
+
+/// How the unit of a proposed change is chosen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ChangeScale {
+    /// Standard deviation of the observed changes of state.
+    #[default]
+    Running,
+    /// What the limits allow in one policy period: `a_max T` for velocities, `v_max T` for positions.
+    Limits,
+}
+
+/// Whether the meta policy's proposal or the inverse model's action is Gaussian.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Exploration {
+    /// Deterministic proposal, Gaussian action (Eq. 1 of the paper); needs a learned inverse model.
+    #[default]
+    Action,
+    /// Gaussian proposal; the only choice with analytic inverse dynamics.
+    Proposal,
+}
+
+/// `[train]`. Unknown keys are errors.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainSettings {
+    /// Parallel environments.
+    pub n_envs: usize,
+    /// Policy steps each environment collects before an update; the batch is `n_envs n_steps`.
+    pub n_steps: usize,
+    /// Discount per policy step.
+    pub gamma: f64,
+    /// Lambda of generalised advantage estimation.
+    pub gae_lambda: f64,
+    /// Divide rewards by the running standard deviation of the discounted return.
+    pub scale_reward: bool,
+    /// Lower the learning rate linearly to zero over the run.
+    pub anneal: bool,
+    /// Unit of a proposed change.
+    pub change_scale: ChangeScale,
+    /// What is Gaussian.
+    pub exploration: Exploration,
+    /// Project while collecting (Algorithm 2, line 8); off: constraints act in deployment only.
+    pub project: bool,
+    /// Settings of `ppo`.
+    pub ppo: PpoSettings,
+    /// Settings of `pid2-ib`, `pid2-gan` and `nearl`.
+    pub pid2: Pid2Settings,
+}
+
+impl Default for TrainSettings {
+    fn default() -> Self {
+        Self {
+            n_envs: 16,
+            n_steps: 128,
+            gamma: 0.99,
+            gae_lambda: 0.95,
+            scale_reward: true,
+            anneal: true,
+            change_scale: ChangeScale::default(),
+            exploration: Exploration::default(),
+            project: true,
+            ppo: PpoSettings::default(),
+            pid2: Pid2Settings::default(),
+        }
+    }
+}
+
+impl TrainSettings {
+    /// Reads the section.
+    ///
+    /// # Errors
+    /// One sentence naming the key.
+    pub fn read(table: &toml::Table) -> Result<Self, String> {
+        let settings: Self = serde_path_to_error::deserialize(table.clone())
+            .map_err(|e| format!("[train.{}]: {}", e.path(), e.inner().message()))?;
+        let positive = [("n_envs", settings.n_envs), ("n_steps", settings.n_steps)];
+        if let Some((key, _)) = positive.iter().find(|(_, v)| *v == 0) {
+            return Err(format!("[train.{key}]: 0 collects nothing; give at least 1"));
+        }
+        for (key, v) in [("gamma", settings.gamma), ("gae_lambda", settings.gae_lambda)] {
+            if !(0.0..=1.0).contains(&v) {
+                return Err(format!("[train.{key}]: {v} is outside [0, 1]"));
+            }
+        }
+        Ok(settings)
+    }
+}

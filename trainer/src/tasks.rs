@@ -1,0 +1,113 @@
+//! Bundled tasks and robots, and how a task name or file becomes a manifest.
+
+use nearl_runtime::snapshot::{FORMAT, ModelFormat};
+use nearl_runtime::task::{Task, TaskError};
+use nearl_runtime::{Manifest, PolicyKind};
+use std::path::Path;
+
+macro_rules! bundled {
+    ($folder:literal: $($name:literal),* $(,)?) => {
+        &[$(($name, include_str!(concat!("../../examples/", $folder, "/", $name)))),*]
+    };
+}
+
+/// Task files by name (with `.toml`).
+const TASKS: &[(&str, &str)] = bundled!("tasks": "HalfCheetah-v5.toml", "Hopper-v5.toml", "Walker2d-v5.toml", "Ant-v5.toml", "Panda-reach.toml");
+
+/// Robot files by name.
+const ROBOTS: &[(&str, &str)] = bundled!("robots": "gymnasium/half_cheetah.xml", "gymnasium/hopper.xml",
+    "gymnasium/walker2d_v5.xml", "gymnasium/ant.xml", "panda/panda.urdf");
+
+/// Why a task could not be used.
+#[derive(Debug, thiserror::Error)]
+pub enum TaskLoadError {
+    /// The file itself.
+    #[error(transparent)]
+    Task(#[from] TaskError),
+    /// A name that is neither bundled nor a file.
+    #[error("no task '{name}'{near}; give one of {all} or a TOML file")]
+    Unknown {
+        /// As given.
+        name: String,
+        /// `; did you mean ...`.
+        near: String,
+        /// Bundled names.
+        all: String,
+    },
+    /// The robot file of the task.
+    #[error(
+        "task '{task}' names the robot file '{robot}', which cannot be read: {reason}; give a path relative to the task file"
+    )]
+    Robot {
+        /// Task name.
+        task: String,
+        /// As written.
+        robot: String,
+        /// What the system said.
+        reason: String,
+    },
+}
+
+/// Names of the bundled tasks.
+pub fn names() -> Vec<&'static str> {
+    TASKS.iter().map(|(n, _)| n.trim_end_matches(".toml")).collect()
+}
+
+/// Text of a bundled robot file, by its path or file name under `examples/robots`.
+pub fn robot(name: &str) -> Option<&'static str> {
+    ROBOTS.iter().find(|(n, _)| *n == name || n.rsplit('/').next() == Some(name)).map(|(_, t)| *t)
+}
+
+/// Reads a bundled task by name, or a TOML file, with `--set` overrides, and finds its robot.
+///
+/// The returned manifest has no action range yet: the environment or the robot's limits give it.
+///
+/// # Errors
+/// [`TaskLoadError`] in one sentence.
+pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError> {
+    let path = Path::new(task);
+    let bundled = TASKS.iter().find(|(n, _)| n.trim_end_matches(".toml") == task);
+    let parsed = match bundled {
+        Some((name, text)) => Task::parse(name, text, overrides)?,
+        None if path.extension().is_some_and(|e| e == "toml") || path.exists() => {
+            Task::read(path, overrides)?
+        }
+        None => return Err(unknown(task)),
+    };
+    let (file, model_format) = match (&parsed.model.urdf, &parsed.model.mjcf) {
+        (Some(f), _) => (f.clone(), ModelFormat::Urdf),
+        (None, Some(f)) => (f.clone(), ModelFormat::Mjcf),
+        (None, None) => unreachable!("Task::parse requires one of them"),
+    };
+    let beside = path.parent().unwrap_or(Path::new(".")).join(&file);
+    let model = match robot(&file) {
+        Some(text) if bundled.is_some() || !beside.exists() => text.to_string(),
+        _ => std::fs::read_to_string(&beside).map_err(|e| TaskLoadError::Robot {
+            task: parsed.name.clone(),
+            robot: beside.display().to_string(),
+            reason: e.to_string(),
+        })?,
+    };
+    Ok(Manifest {
+        format: FORMAT,
+        task: parsed,
+        model_format,
+        model,
+        algo: String::new(),
+        policy: PolicyKind::Deterministic,
+        version: 0,
+        steps: 0,
+        action_lower: Vec::new(),
+        action_upper: Vec::new(),
+    })
+}
+
+fn unknown(task: &str) -> TaskLoadError {
+    let near = names()
+        .into_iter()
+        .map(|n| (strsim::jaro_winkler(&n.to_lowercase(), &task.to_lowercase()), n))
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .filter(|(score, _)| *score > 0.7)
+        .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));
+    TaskLoadError::Unknown { name: task.into(), near, all: names().join(", ") }
+}
