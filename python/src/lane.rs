@@ -159,8 +159,8 @@ impl Proposing {
         env.state(&mut self.state.q, &mut self.state.v);
         self.controller.update(&self.state, &self.noise, &mut self.out);
         let ledger = &self.out.next.ledger;
-        projected.raw_violations += u32::from(ledger.raw_violations > 0);
-        projected.target_violations += u32::from(ledger.violations > 0);
+        projected.raw_violations += u32::from(ledger.raw_violations.total() > 0);
+        projected.target_violations += u32::from(ledger.violations.total() > 0);
         projected.moved = projected.moved.max(ledger.moved);
         env.step(&self.out.action)
     }

@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use nearl_constraints::{self as constraints, Limit, LimitSet, PerJoint, VelocitySettings};
+use nearl_constraints::limit::{AccelerationSettings, PositionSettings, VelocitySettings};
+use nearl_constraints::{self as constraints, Limit, LimitSet, PerJoint};
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 
@@ -41,7 +42,7 @@ impl PositionLimit {
     #[new]
     #[pyo3(signature = (model, margin=Values::All(0.0)))]
     fn new(model: &Model, margin: Values) -> PyResult<Self> {
-        let settings = constraints::PositionSettings { margin: margin.per_joint() };
+        let settings = PositionSettings { margin: margin.per_joint() };
         checked(model, constraints::PositionLimit::new(settings)).map(Self)
     }
 
@@ -76,7 +77,7 @@ pub(crate) struct AccelerationLimit(constraints::AccelerationLimit);
 impl AccelerationLimit {
     #[new]
     fn new(model: &Model, limit: Values) -> PyResult<Self> {
-        let settings = constraints::AccelerationSettings { limit: limit.per_joint() };
+        let settings = AccelerationSettings { limit: limit.per_joint() };
         checked(model, constraints::AccelerationLimit::new(settings)).map(Self)
     }
 

@@ -8,8 +8,8 @@ use nearl_runtime::net::{Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot};
-use nearl_trainer::env::{self, ChaCha8Rng, Env, SeedableRng};
-use nearl_trainer::tasks;
+use nearl_trainer::env::{self, ChaCha8Rng, SeedableRng};
+use nearl_trainer::{tasks, train};
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -62,7 +62,7 @@ impl VecEnv {
             let first = env::make(task).map_err(errors::value)?;
             let open = match constraints.as_deref() {
                 None => None,
-                Some("task") => Some(task_snapshot(task, &*first)?),
+                Some("task") => Some(task_snapshot(task)?),
                 Some(file) => Some(agent_snapshot(task, file)?),
             };
             let spec = first.spec().clone();
@@ -271,7 +271,7 @@ fn range(model: &Model, layout: &StateLayout, k: usize) -> (f64, f64) {
 }
 
 /// A snapshot of the task alone: its inverse dynamics needs no learning.
-fn task_snapshot(task: &str, env: &dyn Env) -> PyResult<Snapshot> {
+fn task_snapshot(task: &str) -> PyResult<Snapshot> {
     let mut manifest = tasks::load(task, &[]).map_err(errors::value)?;
     if manifest.task.idm.kind == IdmKind::Learned {
         return Err(errors::value(format!(
@@ -279,10 +279,8 @@ fn task_snapshot(task: &str, env: &dyn Env) -> PyResult<Snapshot> {
              give the snapshot of a trained agent: constraints=\"runs/{task}/.../checkpoints/final.safetensors\""
         )));
     }
-    manifest.task.state.observation.clone_from(&env.spec().obs);
-    manifest.action_lower = env.spec().action_low().collect();
-    manifest.action_upper = env.spec().action_high().collect();
-    let n_obs = env.spec().n_obs();
+    train::complete(&mut manifest).map_err(errors::value)?;
+    let n_obs = manifest.task.state.observation.len();
     let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
     let normaliser = Normaliser::identity(n_obs, n_state);
     Ok(open(Snapshot { networks: Networks { normaliser, policy: Dense { layers: Vec::new() }, policy_log_std: Vec::new(), idm: None }, manifest }))
