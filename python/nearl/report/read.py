@@ -1,8 +1,10 @@
 """Run folders, flight logs and JSON summaries as arrays."""
 
 import csv
+import io
 import json
 import re
+import struct
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -133,14 +135,14 @@ def read_log(path: Path) -> Log:
         from mcap.reader import make_reader
     except ImportError as error:
         raise ReadError("reading a flight log needs the mcap package: pip install 'nearl[viz]'") from error
-    ticks, metadata = [], {}
+    stream = io.BytesIO(path.read_bytes())  # so that what fails below is the content
+    metadata: dict[str, str] = {}
     try:
-        with path.open("rb") as stream:
-            reader = make_reader(stream)
-            ticks = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=["tick"])]
-            for record in reader.iter_metadata():
-                metadata.update(record.metadata)
-    except (McapError, ValueError, EOFError) as error:
+        reader = make_reader(stream)
+        ticks = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=["tick"])]
+        for record in reader.iter_metadata():
+            metadata.update(record.metadata)
+    except (McapError, ValueError, OSError, EOFError, struct.error) as error:
         raise ReadError(f"'{path}' is not a flight log that can be read ({error}); give a file written by 'nearl run --log'") from error
     if not ticks:
         raise ReadError(f"'{path}' holds no ticks; the loop never ran")
