@@ -94,7 +94,11 @@ impl Checker {
     /// Next position inside both limits, sub-step positions inside, room to brake.
     fn positions(&self, i: usize, now: (f64, f64), next: (f64, f64), verdict: &mut Verdict) {
         let (low, high) = (self.limits.q_lower[i], self.limits.q_upper[i]);
-        let (a_max, kinematic) = (self.limits.acceleration[i], self.consistency == Consistency::Kinematic);
+        let kinematic = self.consistency == Consistency::Kinematic;
+        let (t, tau) = (self.period.dt, self.period.tau);
+        // A whole period of braking from standstill must not carry the dof beyond the limits on the other side.
+        let room = (high - low) / (self.period.kappa * t * t + 0.5 * (t - 0.5 * tau).powi(2));
+        let a_max = self.limits.braking[i].min(self.limits.velocity[i] / t).min(room);
         let (mut highest, mut lowest) = (next.0, next.0);
         if kinematic {
             let (mut q, mut v) = now;
@@ -113,7 +117,7 @@ impl Checker {
         verdict.see(Kind::Position, i, highest, high);
         verdict.see(Kind::Position, i, -lowest, -low);
         if kinematic && a_max.is_finite() {
-            let half = 0.5 * a_max * self.period.tau;
+            let half = 0.5 * a_max * tau;
             let stop = |speed: f64| (speed - half).max(0.0).powi(2) / (2.0 * a_max); // braking distance
             verdict.see(Kind::Viability, i, next.0 + stop(next.1), high.max(next.0));
             verdict.see(Kind::Viability, i, stop(-next.1) - next.0, (-low).max(-next.0));

@@ -1,5 +1,53 @@
-//! Robot model, dynamics, limits and the projector.
+//! Robot model, dynamics, limits, and the projector: from the next state a policy proposes to the nearest one that
+//! every limit allows.
+//!
+//! ```no_run
+//! use nearl_constraints::*;
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let model = Model::from_urdf("examples/robots/panda/panda.urdf".as_ref())?;
+//! let limits: Vec<Box<dyn Limit>> = vec![
+//!     Box::new(PositionLimit::with_margin(0.01)),
+//!     Box::new(VelocityLimit::scaled(0.6)),
+//!     Box::new(AccelerationLimit::uniform(2.0)),
+//!     Box::new(TorqueLimit::default()),
+//! ];
+//! let mut projector = Projector::new(&model, &limits, &[0, 1, 2, 3, 4, 5, 6], Settings::new(1e-3, 1))?;
+//! let (q, v) = (model.neutral(), vec![0.0; model.nv()]); // measured
+//! let (proposal, mut target) = (Proposal::new(&model), Target::new(&model));
+//! let status = projector.project(&q, &v, &proposal, &mut target);
+//! println!("{status:?} {:?} {:?}", target.acceleration, target.ledger.active);
+//! # Ok(()) }
+//! ```
+//!
+//! # What to read, in this order
+//!
+//! 1. [`viability`]: why position, velocity and acceleration limits never contradict each other;
+//! 2. [`limit`]: what a limit is and how to add one;
+//! 3. [`Projector`] (`projector/mod.rs`): the tick; then `projector/coupled.rs` (the rows), `active_set.rs`, `conic.rs`;
+//! 4. [`checker`]: the judge that shares no code with the above; [`certify_braking`]: whether the motors can brake;
+//! 5. [`Model`], [`Dynamics`], [`convention`]: the robot, and how it meets MuJoCo.
+//!
+//! # What is promised
+//!
+//! With analytic inverse dynamics, a fully actuated robot and a model that is right, the reached state obeys position,
+//! velocity, acceleration and torque limits for any proposal, as long as the braking holds by [`certify_braking`]. Torque
+//! rows are evaluated at the start of the period. Contact forces are not modelled. Of a floating base, the rows hold the
+//! proposed motion constant.
+//!
+//! # Linking
+//!
+//! The shared libraries of Pinocchio are in the Python wheels. A crate that links a binary, a test or an extension
+//! with this one needs them in its run path, through a `build.rs` of its own and this crate as a dependency:
+//!
+//! ```
+//! fn main() {
+//!     if let Ok(lib) = std::env::var("DEP_NEARL_PINOCCHIO_LIB") {
+//!         println!("cargo:rustc-link-arg=-Wl,-rpath,{lib}");
+//!     }
+//! }
+//! ```
 
+mod certify;
 pub mod checker;
 pub mod convention;
 mod dynamics;
@@ -15,6 +63,7 @@ mod target;
 mod urdf;
 pub mod viability;
 
+pub use certify::{Certificate, certify_braking};
 pub use dynamics::Dynamics;
 pub use error::{LimitError, ModelError};
 pub use layout::{Entry, LayoutError, StateLayout};

@@ -8,9 +8,11 @@
 //!
 //! is invariant: one braking sub-step `v' = v - A tau`, `d' = d - tau v'` keeps
 //! `d' - (v' - A tau / 2)^2 / (2 A) = d - (v - A tau / 2)^2 / (2 A)`.
-//! With `tau = 0` it is the set of Del Prete, "Joint Position and Velocity Bounds in Discrete-Time Acceleration/Torque
+//! (`A` here is [`Dof::braking`].) With `tau = 0` it is the set of Del Prete, "Joint Position and Velocity Bounds in Discrete-Time Acceleration/Torque
 //! Control of Robot Manipulators", RA-L 2018. The familiar `v' <= sqrt(2 A d)` is the same parabola at the wrong end
 //! of the step, and conflicts with the acceleration limit near the position limit.
+
+use crate::LimitSet;
 
 /// What set a bound, or what a violation violates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -61,6 +63,31 @@ pub struct Dof {
     pub velocity: f64,
     /// Largest acceleration A [rad/s² or m/s²].
     pub acceleration: f64,
+    /// Deceleration that braking may count on, at most A [rad/s² or m/s²].
+    pub deceleration: f64,
+}
+
+impl Dof {
+    /// The limits of dof `i` of a set.
+    pub fn of(limits: &LimitSet, i: usize) -> Dof {
+        let (lower, upper) = (limits.q_lower[i], limits.q_upper[i]);
+        let (acceleration, deceleration) = (limits.acceleration[i], limits.braking[i]);
+        Dof { lower, upper, velocity: limits.velocity[i], acceleration, deceleration }
+    }
+
+    /// The deceleration that braking counts on: the one stated, or less where a whole period of it would turn the dof round and
+    /// carry it beyond a limit on the other side,
+    ///
+    /// ```text
+    ///     A_b = min(deceleration, V / T, (q_max - q_min) / (kappa T^2 + (T - tau / 2)^2 / 2))
+    /// ```
+    ///
+    /// The set of the module's head is invariant for `A_b`; with `A T > V` it is not for `A`.
+    pub fn braking(&self, period: &Period) -> f64 {
+        let (t, half) = (period.dt, period.dt - 0.5 * period.tau);
+        let room = (self.upper - self.lower) / (period.kappa * t * t + 0.5 * half * half);
+        self.deceleration.min(self.acceleration).min(self.velocity / t).min(room)
+    }
 }
 
 /// Accelerations allowed to one dof for one period [rad/s² or m/s²]; never empty.
@@ -82,24 +109,28 @@ pub struct Interval {
 /// Positions this far beyond a limit are rounding [rad or m].
 pub const POSITION_TOLERANCE: f64 = 1e-9;
 
+/// A state this far outside the set is inside [rad or m].
+const ROUNDING: f64 = 1e-10;
+
 /// Bounds that cross by less than this share of A are rounding.
 const CROSSING: f64 = 1e-6;
 
 /// The box of one dof at position `q` [rad or m] and velocity `v` [rad/s or m/s].
 pub fn interval(dof: &Dof, q: f64, v: f64, period: &Period) -> Interval {
+    let a = dof.braking(period);
     let (above, below) = (q > dof.upper + POSITION_TOLERANCE, q < dof.lower - POSITION_TOLERANCE);
     let (mut upper, upper_kind) = match above {
         true => returning(dof, v, period),
-        false => upper_bound(dof, dof.upper - q, v, period),
+        false => upper_bound(dof, a, dof.upper - q, v, period),
     };
     let (mut lower, lower_kind) = match below {
         true => returning(dof, -v, period),
-        false => upper_bound(dof, q - dof.lower, -v, period),
+        false => upper_bound(dof, a, q - dof.lower, -v, period),
     };
     lower = -lower;
     let mut outside = (above || below).then_some(Kind::Position);
     if lower > upper {
-        if lower - upper > CROSSING * dof.acceleration {
+        if lower - upper > CROSSING * a {
             let beyond = if v.abs() > dof.velocity { Kind::Velocity } else { Kind::Viability };
             outside = outside.or(Some(beyond));
             (lower, upper) = (brake(dof, v, period), brake(dof, v, period));
@@ -110,9 +141,9 @@ pub fn interval(dof: &Dof, q: f64, v: f64, period: &Period) -> Interval {
     Interval { lower, upper, lower_kind, upper_kind, outside }
 }
 
-/// The deceleration that stops the dof soonest: `-sgn(v) min(A, |v| / T)`.
+/// The deceleration that stops the dof: `-sgn(v) min(A_b, |v| / T)`.
 pub fn brake(dof: &Dof, v: f64, period: &Period) -> f64 {
-    -v.signum() * dof.acceleration.min(v.abs() / period.dt)
+    -v.signum() * dof.braking(period).min(v.abs() / period.dt)
 }
 
 /// Beyond the upper limit only `v' <= 0` is allowed.
@@ -120,27 +151,35 @@ fn returning(dof: &Dof, v: f64, period: &Period) -> (f64, Kind) {
     smaller((dof.acceleration, Kind::Acceleration), (-v / period.dt, Kind::Position))
 }
 
-/// Upper bound of the acceleration at distance `d` below the upper limit: the smallest of
+/// Upper bound of the acceleration at distance `d` below the upper limit, with braking deceleration `a`: the smallest of
 ///
 /// 1. `A`
 /// 2. `(V - v) / T`
 /// 3. positions within the period
 /// 4. braking after it.
-fn upper_bound(dof: &Dof, d: f64, v: f64, p: &Period) -> (f64, Kind) {
-    let a = dof.acceleration;
-    let mut bound = smaller((a, Kind::Acceleration), ((dof.velocity - v) / p.dt, Kind::Velocity));
-    if d == f64::INFINITY || a == f64::INFINITY {
+fn upper_bound(dof: &Dof, a: f64, d: f64, v: f64, p: &Period) -> (f64, Kind) {
+    let a_max = dof.acceleration;
+    let mut bound = smaller((a_max, Kind::Acceleration), ((dof.velocity - v) / p.dt, Kind::Velocity));
+    if d == f64::INFINITY || a_max == f64::INFINITY {
         return bound;
     }
-    if d < p.dt * v.max(0.0) + a * p.dt * p.dt {
-        bound = smaller(bound, (position_bound(d, v, a, p), Kind::Position));
+    if d < p.dt * v.max(0.0) + a_max * p.dt * p.dt {
+        bound = smaller(bound, (floor(position_bound(d, v, a, p), d, v, a, p), Kind::Position));
     }
     // Where even full acceleration leaves room to brake, the parabola does not bind.
-    let (v_next, d_next) = (v + a * p.dt - 0.5 * a * p.tau, d - p.dt * v - p.kappa * p.dt * p.dt * a);
-    if v_next > 0.0 && v_next * v_next > 2.0 * a * d_next || d_next < 0.0 {
-        bound = smaller(bound, (braking_bound(d, v, a, p), Kind::Viability));
+    let (v_next, d_next) = (v + a_max * p.dt - 0.5 * a * p.tau, d - p.dt * v - p.kappa * p.dt * p.dt * a_max);
+    if (v_next > 0.0 && v_next * v_next > 2.0 * a * d_next) || d_next < 0.0 {
+        bound = smaller(bound, (floor(braking_bound(d, v, a, p), d, v, a, p), Kind::Viability));
     }
     bound
+}
+
+/// From inside the set, braking with `A` is always allowed. Close to the limit the formulas lose that to rounding: with
+/// `d = 1e-11` the last bits of `q` are 1e-5 of `-v^2 / 2 d`.
+fn floor(bound: f64, d: f64, v: f64, a: f64, p: &Period) -> f64 {
+    let w = (v - 0.5 * a * p.tau).max(0.0);
+    let inside = w * w <= 2.0 * a * (d + ROUNDING);
+    if inside { bound.max(-a) } else { bound }
 }
 
 /// Positions at the end of each sub-step, `d - j tau v - tau^2 j (j + 1) / 2 a >= 0`:
@@ -151,13 +190,13 @@ fn upper_bound(dof: &Dof, d: f64, v: f64, p: &Period) -> (f64, Kind) {
 ///
 /// Without sub-steps, the end of the period or the turning point inside it:
 /// `a3 = 2 (d - T v) / T^2` if `v <= 0` or `a3 > -v / T`, else `min(-v^2 / 2 d, -v / T)`.
-fn position_bound(d: f64, v: f64, a_max: f64, p: &Period) -> f64 {
+fn position_bound(d: f64, v: f64, a: f64, p: &Period) -> f64 {
     if p.sub_steps == 0 {
         let a3 = 2.0 * (d - p.dt * v) / (p.dt * p.dt);
         return match v <= 0.0 || a3 > -v / p.dt {
             true => a3,
             false if d > 0.0 => (-v * v / (2.0 * d)).min(-v / p.dt),
-            false => -a_max,
+            false => -a,
         };
     }
     let mut bound = f64::INFINITY;
@@ -176,11 +215,11 @@ fn position_bound(d: f64, v: f64, a_max: f64, p: &Period) -> f64 {
 /// ```
 ///
 /// and below `a = -w / T` the velocity term is zero.
-fn braking_bound(d: f64, v: f64, a_max: f64, p: &Period) -> f64 {
+fn braking_bound(d: f64, v: f64, a: f64, p: &Period) -> f64 {
     let t = p.dt;
-    let w = v - 0.5 * a_max * p.tau;
-    let b = 2.0 * w * t + 2.0 * a_max * p.kappa * t * t;
-    let c = w * w - 2.0 * a_max * (d - t * v);
+    let w = v - 0.5 * a * p.tau;
+    let b = 2.0 * w * t + 2.0 * a * p.kappa * t * t;
+    let c = w * w - 2.0 * a * (d - t * v);
     let discriminant = b * b - 4.0 * t * t * c;
     if discriminant < 0.0 {
         return -w / t;
@@ -198,7 +237,7 @@ mod tests {
 
     #[test]
     fn far_from_everything_the_box_is_the_acceleration_limit() {
-        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0 };
+        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0 };
         let i = interval(&dof, 0.0, 0.0, &Period::new(0.01, 5));
         assert_eq!((i.lower, i.upper, i.outside), (-20.0, 20.0, None));
     }
@@ -206,7 +245,13 @@ mod tests {
     #[test]
     fn hand_computed_parabola() {
         // tau = 0, T = 0.1, A = 2, v = 1, d = 0.3: 0.01 a^2 + 0.22 a + 0.2 = 0 with c = 1 - 4 * 0.2
-        let dof = Dof { lower: f64::NEG_INFINITY, upper: 0.3, velocity: 10.0, acceleration: 2.0 };
+        let dof = Dof {
+            lower: f64::NEG_INFINITY,
+            upper: 0.3,
+            velocity: 10.0,
+            acceleration: 2.0,
+            deceleration: 2.0,
+        };
         let i = interval(&dof, 0.0, 1.0, &Period::new(0.1, 0));
         let root = (-0.22 + (0.22f64 * 0.22 - 4.0 * 0.01 * 0.2).sqrt()) / 0.02;
         assert!((i.upper - root).abs() < 1e-12 && i.upper_kind == Kind::Viability, "{i:?} {root}");
@@ -216,7 +261,7 @@ mod tests {
 
     #[test]
     fn beyond_the_limit_it_may_only_return() {
-        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0 };
+        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0 };
         let p = Period::new(0.01, 1);
         let still = interval(&dof, 1.2, 0.0, &p);
         assert_eq!((still.lower, still.upper, still.outside), (-20.0, 0.0, Some(Kind::Position)));

@@ -78,6 +78,13 @@ enum Inverse {
     Analytic(AnalyticIdm),
 }
 
+/// The half of a joint's state that is proposed alone.
+#[derive(Clone, Copy)]
+enum Half {
+    Position,
+    Velocity,
+}
+
 /// Propose, project, invert.
 pub struct Controller {
     model: Model,
@@ -96,6 +103,7 @@ pub struct Controller {
     limits: LimitSet,
     /// Configuration index of each one-dof joint, by degree of freedom.
     idx_q: Vec<usize>,
+    halves: Vec<(usize, Half)>,
     tick: usize,
     version: u64,
     mean: Vec<f32>,
@@ -146,6 +154,7 @@ impl Controller {
             projection: true,
             limits,
             idx_q: idx_q(&model),
+            halves: halves(&layout),
             tick: 0,
             version: m.version,
             mean: vec![0.0; layout.n_state().max(n_act)],
@@ -215,7 +224,8 @@ impl Controller {
         self.set_goal(out);
     }
 
-    /// Scatters the proposed entries into configuration and velocity; what is not proposed stays as it is.
+    /// Scatters the proposed entries into configuration and velocity. Of a controllable joint with one half proposed the
+    /// other follows at constant acceleration: `q' = q + T (v + v') / 2`. Whatever else is not proposed stays.
     fn set_goal(&mut self, out: &Output) {
         self.start.q.copy_from_slice(&self.held.q);
         self.start.v.copy_from_slice(&self.held.v);
@@ -226,6 +236,14 @@ impl Controller {
                 Entry::Position { idx_q, .. } => self.goal.q[idx_q] = out.proposal[k],
                 Entry::Velocity { dof } => self.goal.v[dof] = out.proposal[k],
                 Entry::Other => {}
+            }
+        }
+        let period = self.policy_every as f64 * self.dt;
+        for &(dof, half) in &self.halves {
+            let (iq, v) = (self.idx_q[dof], self.start.v[dof]);
+            match half {
+                Half::Velocity => self.goal.q[iq] = self.start.q[iq] + 0.5 * period * (v + self.goal.v[dof]),
+                Half::Position => self.goal.v[dof] = 2.0 * (self.goal.q[iq] - self.start.q[iq]) / period - v,
             }
         }
     }
@@ -471,6 +489,24 @@ impl Parts {
             LimitSet::collect(&model, &limits, layout.controllable()).map_err(|e| unusable(e.to_string()))?;
         Ok(Self { model, layout, projector, limits })
     }
+}
+
+/// Controllable joints of which only one half is proposed.
+fn halves(layout: &StateLayout) -> Vec<(usize, Half)> {
+    let mut found = Vec::new();
+    for &dof in layout.controllable() {
+        let is = |want: fn(Entry) -> Option<usize>| {
+            (0..layout.n_state()).any(|k| want(layout.state_entry(k)) == Some(dof))
+        };
+        let position = is(|e| if let Entry::Position { dof, .. } = e { Some(dof) } else { None });
+        let velocity = is(|e| if let Entry::Velocity { dof } = e { Some(dof) } else { None });
+        match (position, velocity) {
+            (true, false) => found.push((dof, Half::Position)),
+            (false, true) => found.push((dof, Half::Velocity)),
+            _ => {}
+        }
+    }
+    found
 }
 
 /// Configuration index of each degree of freedom that belongs to a one-dof joint; 0 elsewhere (never read).

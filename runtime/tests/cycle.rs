@@ -115,12 +115,14 @@ fn bad_states_brake_and_then_latch() {
 #[test]
 fn a_panic_in_the_controller_is_a_latched_fault() {
     let name = Name::new("panic");
-    let plant = PlantThread::start(&name, PointMass::default(), PlantSettings::lockstep(DT));
+    let start = PointMass { q: 1.0, ..PointMass::default() };
+    let plant = PlantThread::start(&name, start, PlantSettings::lockstep(DT));
     let report = LoopThread::start(&name, limited(100), |spring| spring.panics_at = Some(30)).join();
     let (body, _) = plant.end();
     assert_eq!((report.last_mode, report.reason), (Mode::Fault, Reason::Panic));
-    assert_eq!(body.applied.len(), 29);
-    assert!(body.braked > 0);
+    // 29 actions of the controller, then braking, which does not depend on what panicked.
+    assert!(body.applied.len() > 29);
+    assert_eq!(body.v, 0.0);
 }
 
 #[test]

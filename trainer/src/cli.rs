@@ -2,6 +2,7 @@
 
 mod bench;
 mod eval;
+mod plant;
 mod project;
 mod tasks;
 mod train;
@@ -29,6 +30,8 @@ enum Command {
     Project(project::Project),
     /// Measure this machine.
     Bench(bench::Bench),
+    /// MuJoCo as the robot, in real time, over shared memory.
+    Plant(plant::PlantCommand),
     /// List the bundled tasks.
     Tasks(tasks::Tasks),
 }
@@ -44,6 +47,7 @@ impl Cli {
             Command::Eval(c) => c.run(),
             Command::Project(c) => c.run(),
             Command::Bench(c) => c.run(),
+            Command::Plant(c) => c.run(),
             Command::Tasks(c) => c.run(),
         }
     }

@@ -7,6 +7,7 @@ pub mod env;
 pub mod evaluate;
 pub mod learn;
 pub mod mj;
+pub mod plant;
 pub mod rollout;
 pub mod run_folder;
 pub mod settings;

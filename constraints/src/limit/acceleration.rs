@@ -4,18 +4,22 @@ use super::{Limit, LimitSet, PerJoint};
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
 
-/// `acceleration = { limit }`.
+/// `acceleration = { limit }` or `acceleration = { limit, braking }`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AccelerationSettings {
     /// Largest acceleration A [rad/s² or m/s²].
     pub limit: PerJoint,
+    /// Deceleration that braking in front of position limits counts on, at most A, which is also its default
+    /// [rad/s² or m/s²].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub braking: Option<PerJoint>,
 }
 
-/// `|a| <= A`, and every position limit is approached so that braking with A still stops in front of it.
+/// `|a| <= A`, and every position limit is approached so that `braking` still stops in front of it.
 ///
-/// With torque limits, A must be an acceleration the motors can always give:
-/// [`certify_braking`](crate::certify_braking) says whether it is.
+/// With torque limits, `braking` must be a deceleration the motors can always give:
+/// [`certify_braking`](crate::certify_braking) says whether it is. A itself may be larger, the torque rows hold it back.
 #[derive(Debug, Clone)]
 pub struct AccelerationLimit {
     settings: AccelerationSettings,
@@ -29,7 +33,7 @@ impl AccelerationLimit {
 
     /// The same limit [rad/s² or m/s²] for every joint.
     pub fn uniform(a_max: f64) -> AccelerationLimit {
-        AccelerationLimit { settings: AccelerationSettings { limit: PerJoint::All(a_max) } }
+        AccelerationLimit { settings: AccelerationSettings { limit: PerJoint::All(a_max), braking: None } }
     }
 }
 
@@ -43,6 +47,12 @@ impl Limit for AccelerationLimit {
         let values = self.settings.limit.values(model, "acceleration limit", |x| x > 0.0, domain)?;
         for &i in controllable {
             set.acceleration[i] = set.acceleration[i].min(values[i].unwrap_or(f64::INFINITY));
+            set.braking[i] = set.braking[i].min(set.acceleration[i]);
+        }
+        let Some(braking) = &self.settings.braking else { return Ok(()) };
+        let values = braking.values(model, "acceleration braking", |x| x > 0.0, domain)?;
+        for &i in controllable {
+            set.braking[i] = set.braking[i].min(values[i].unwrap_or(f64::INFINITY));
         }
         Ok(())
     }

@@ -38,8 +38,10 @@ pub struct LimitSet {
     pub q_upper: Vec<f64>,
     /// Largest speed V [rad/s or m/s].
     pub velocity: Vec<f64>,
-    /// Largest acceleration A, which braking may count on [rad/s² or m/s²].
+    /// Largest acceleration A [rad/s² or m/s²].
     pub acceleration: Vec<f64>,
+    /// Deceleration braking may count on, at most A [rad/s² or m/s²].
+    pub braking: Vec<f64>,
     /// Largest motor force [N·m or N].
     pub effort: Vec<f64>,
 }
@@ -53,6 +55,7 @@ impl LimitSet {
             q_upper: none.clone(),
             velocity: none.clone(),
             acceleration: none.clone(),
+            braking: none.clone(),
             effort: none,
         }
     }

@@ -1,16 +1,24 @@
-//! Exact stage: guesses which bounds are active, solves the equations that follow, corrects the guess.
+//! Exact stage: the dual active-set method of Goldfarb and Idnani ("A numerically stable dual method for solving
+//! strictly convex quadratic programs", 1983), written for a diagonal Hessian and a box.
 //!
-//! With bounds fixed for the dofs in B and rows R held at their bound, the optimality conditions of
-//! [`Coupled`] are
+//! It starts at the optimum of the box alone and adds the most violated bound or row, one at a time. With rows R and
+//! bounds B held, F the free dofs and g the gradient of the violated constraint `g'y <= h`, the direction that gives in to
+//! it while the held ones stay held is
 //!
 //! ```text
-//!     S lambda = G_R y0 - row_bound,   S = G_RF H_F^-1 G_RF',   y0 = goal on F, bound on B
+//!     S r = G_RF H_F^-1 g_F,   S = G_RF H_F^-1 G_RF',   z_F = -H_F^-1 (g_F - G_RF' r),   z_B = 0
+//! ```
+//!
+//! and multipliers move by `-r` for rows and `-s_k (g_k - (G_R' r)_k)` for bounds of sign `s_k`; one that would become
+//! negative is released first. At the end the answer is computed again from the active set alone,
+//!
+//! ```text
+//!     S lambda = G_R y0 - row_bound,   y0 = goal on F, bound on B
 //!     y_F = goal_F - H_F^-1 G_RF' lambda,   mu_B = H_B (goal_B - y_B) - G_RB' lambda
 //! ```
 //!
-//! A wrong sign of a multiplier releases its bound, a violated bound becomes active (primal-dual active set,
-//! Hintermueller, Ito and Kunisch 2003). When nothing changes, all conditions hold: the answer is exact. It starts from the
-//! problem alone, so the same input gives the same bits; when it does not settle, Clarabel is asked.
+//! and every optimality condition is checked. It starts from the problem alone, so the same input gives the same
+//! bits; without an answer, Clarabel is asked.
 
 use super::coupled::Coupled;
 use crate::ledger::Side;
@@ -20,70 +28,238 @@ use crate::ledger::Side;
 pub(crate) struct ActiveSet {
     /// Answer (n).
     pub(crate) y: Vec<f64>,
-    /// Active bound of each dof (n).
-    pub(crate) box_side: Vec<Option<Side>>,
-    /// Active bound of each row (m).
-    pub(crate) row_side: Vec<Option<Side>>,
     /// Signed multipliers of the box (n): positive at an upper bound.
     pub(crate) mu: Vec<f64>,
     /// Signed multipliers of the rows (m).
     pub(crate) lambda: Vec<f64>,
-    /// Iterations of the last call.
+    /// Steps of the last call.
     pub(crate) iterations: u32,
-    schur: Vec<f64>,
+    /// Held bound of each dof (n).
+    box_side: Vec<Option<Side>>,
+    /// Held bound of each row (m).
+    row_side: Vec<Option<Side>>,
+    /// Rows held, ascending.
     held: Vec<usize>,
-    rhs: Vec<f64>,
+    schur: Vec<f64>,
+    r: Vec<f64>,
+    /// `g - G_R' r` (n).
+    rest: Vec<f64>,
 }
 
-const MAX_ITERATIONS: u32 = 25;
+/// A bound of a dof or of a row.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Constraint {
+    Box(usize, Side),
+    Row(usize, Side),
+}
 
 /// Rows and bounds may be exceeded by this share of their size.
-const EXACT: f64 = 1e-11;
+const EXACT: f64 = 1e-12;
+
+/// Conditions of the final answer hold to this share.
+const FINAL: f64 = 1e-11;
 
 impl ActiveSet {
     pub(crate) fn new(n: usize, m: usize) -> ActiveSet {
         ActiveSet {
             y: vec![0.0; n],
-            box_side: vec![None; n],
-            row_side: vec![None; m],
             mu: vec![0.0; n],
             lambda: vec![0.0; m],
             iterations: 0,
-            schur: vec![0.0; m * m],
+            box_side: vec![None; n],
+            row_side: vec![None; m],
             held: Vec::with_capacity(m),
-            rhs: vec![0.0; m],
+            schur: vec![0.0; m * m],
+            r: vec![0.0; m],
+            rest: vec![0.0; n],
         }
     }
 
-    /// True when the optimum was found; then `y`, the sides and the multipliers hold it.
+    /// True when the optimum was found; then `y` and the multipliers hold it.
     pub(crate) fn solve(&mut self, p: &Coupled) -> bool {
         self.start(p);
-        for iteration in 1..=MAX_ITERATIONS {
-            self.iterations = iteration;
-            if !self.solve_equations(p) {
+        let most = 10 * (p.n + p.m) as u32 + 10;
+        while self.iterations < most {
+            let Some(violated) = self.most_violated(p) else {
+                return self.solve_equations(p) && self.is_optimal(p);
+            };
+            if !self.add(p, violated, most) {
                 return false;
-            }
-            if !self.correct(p) {
-                for k in 0..p.n {
-                    self.y[k] = self.y[k].clamp(p.lower[k], p.upper[k]);
-                }
-                return true;
             }
         }
         false
     }
 
-    /// First guess: the box alone, then the rows its answer violates.
+    /// The optimum of the box alone.
     fn start(&mut self, p: &Coupled) {
+        self.iterations = 0;
+        self.held.clear();
+        self.row_side.fill(None);
+        self.lambda.fill(0.0);
         for k in 0..p.n {
             self.y[k] = p.goal[k].clamp(p.lower[k], p.upper[k]);
-            self.box_side[k] = beyond(p.goal[k], p.lower[k], p.upper[k], 0.0);
-        }
-        for r in 0..p.m {
-            self.row_side[r] = beyond(p.row(r, &self.y), p.row_lower[r], p.row_upper[r], 0.0);
+            self.mu[k] = p.hessian[k] * (p.goal[k] - self.y[k]);
+            self.box_side[k] = match self.mu[k] {
+                mu if mu > 0.0 => Some(Side::Upper),
+                mu if mu < 0.0 => Some(Side::Lower),
+                _ => None,
+            };
         }
     }
 
+    fn most_violated(&self, p: &Coupled) -> Option<Constraint> {
+        let (mut worst, mut found) = (EXACT, None);
+        let mut see = |excess: f64, constraint: Constraint| {
+            if excess > worst {
+                (worst, found) = (excess, Some(constraint));
+            }
+        };
+        for r in (0..p.m).filter(|r| self.row_side[*r].is_none()) {
+            let value = p.row(r, &self.y);
+            see((value - p.row_upper[r]) / p.row_size[r], Constraint::Row(r, Side::Upper));
+            see((p.row_lower[r] - value) / p.row_size[r], Constraint::Row(r, Side::Lower));
+        }
+        for k in (0..p.n).filter(|k| self.box_side[*k].is_none()) {
+            let size = (p.upper[k] - p.lower[k]).clamp(1e-3, 1e3);
+            see((self.y[k] - p.upper[k]) / size, Constraint::Box(k, Side::Upper));
+            see((p.lower[k] - self.y[k]) / size, Constraint::Box(k, Side::Lower));
+        }
+        found
+    }
+
+    /// Gives in to `violated`, releasing what has to be released; false when the constraints leave nothing.
+    fn add(&mut self, p: &Coupled, violated: Constraint, most: u32) -> bool {
+        let mut own = 0.0; // multiplier of the violated constraint
+        while self.iterations < most {
+            self.iterations += 1;
+            if !self.direction(p, violated) {
+                return false;
+            }
+            let slope: f64 =
+                self.free(p).map(|k| gradient(p, violated, k) * self.rest[k] / p.hessian[k]).sum();
+            let size: f64 = (0..p.n).map(|k| gradient(p, violated, k).powi(2) / p.hessian[k]).sum();
+            let (blocked, blocking) = self.first_to_release(p);
+            let full = if slope > 1e-13 * size { self.excess(p, violated) / slope } else { f64::INFINITY };
+            let step = blocked.min(full);
+            if step.is_infinite() {
+                return false;
+            }
+            if full.is_finite() {
+                for k in 0..p.n {
+                    if self.box_side[k].is_none() {
+                        self.y[k] -= step * self.rest[k] / p.hessian[k];
+                    }
+                }
+            }
+            self.move_multipliers(p, step);
+            own += step;
+            match blocking.filter(|_| blocked < full) {
+                Some(released) => self.release(released),
+                None => {
+                    self.hold(violated, own);
+                    return true;
+                }
+            }
+        }
+        false
+    }
+
+    /// `r` and `g - G_R' r` for the gradient g of `violated`.
+    fn direction(&mut self, p: &Coupled, violated: Constraint) -> bool {
+        for (a, &row) in self.held.iter().enumerate() {
+            self.r[a] =
+                self.free(p).map(|k| p.rows[row * p.n + k] * gradient(p, violated, k) / p.hessian[k]).sum();
+        }
+        if !self.solve_schur(p) {
+            return false;
+        }
+        for k in 0..p.n {
+            let pull: f64 = self.held.iter().zip(&self.r).map(|(row, r)| r * p.rows[row * p.n + k]).sum();
+            self.rest[k] = gradient(p, violated, k) - pull;
+        }
+        true
+    }
+
+    /// Multiplier that reaches zero first, and the step at which it does.
+    fn first_to_release(&self, p: &Coupled) -> (f64, Option<Constraint>) {
+        let (mut least, mut found) = (f64::INFINITY, None);
+        let mut see = |multiplier: f64, rate: f64, constraint: Constraint| {
+            if rate > 0.0 && multiplier.max(0.0) / rate < least {
+                (least, found) = (multiplier.max(0.0) / rate, Some(constraint));
+            }
+        };
+        for (a, &row) in self.held.iter().enumerate() {
+            if let Some(side) = self.row_side[row] {
+                see(sign(side) * self.lambda[row], sign(side) * self.r[a], Constraint::Row(row, side));
+            }
+        }
+        for k in 0..p.n {
+            if let Some(side) = self.box_side[k] {
+                see(sign(side) * self.mu[k], sign(side) * self.rest[k], Constraint::Box(k, side));
+            }
+        }
+        (least, found)
+    }
+
+    fn move_multipliers(&mut self, p: &Coupled, step: f64) {
+        for (a, &row) in self.held.iter().enumerate() {
+            self.lambda[row] -= step * self.r[a];
+        }
+        for k in (0..p.n).filter(|k| self.box_side[*k].is_some()) {
+            self.mu[k] -= step * self.rest[k];
+        }
+    }
+
+    fn hold(&mut self, constraint: Constraint, multiplier: f64) {
+        match constraint {
+            Constraint::Box(k, side) => {
+                (self.box_side[k], self.mu[k]) = (Some(side), sign(side) * multiplier)
+            }
+            Constraint::Row(row, side) => {
+                (self.row_side[row], self.lambda[row]) = (Some(side), sign(side) * multiplier);
+                let at = self.held.partition_point(|r| *r < row);
+                self.held.insert(at, row);
+            }
+        }
+    }
+
+    fn release(&mut self, constraint: Constraint) {
+        match constraint {
+            Constraint::Box(k, _) => (self.box_side[k], self.mu[k]) = (None, 0.0),
+            Constraint::Row(row, _) => {
+                (self.row_side[row], self.lambda[row]) = (None, 0.0);
+                self.held.retain(|r| *r != row);
+            }
+        }
+    }
+
+    fn excess(&self, p: &Coupled, constraint: Constraint) -> f64 {
+        match constraint {
+            Constraint::Box(k, Side::Upper) => self.y[k] - p.upper[k],
+            Constraint::Box(k, Side::Lower) => p.lower[k] - self.y[k],
+            Constraint::Row(r, Side::Upper) => p.row(r, &self.y) - p.row_upper[r],
+            Constraint::Row(r, Side::Lower) => p.row_lower[r] - p.row(r, &self.y),
+        }
+    }
+
+    fn free<'a>(&'a self, p: &Coupled) -> impl Iterator<Item = usize> + 'a {
+        (0..p.n).filter(|k| self.box_side[*k].is_none())
+    }
+
+    /// Solves `S x = r` in place of `r`; false when the held rows depend on each other.
+    fn solve_schur(&mut self, p: &Coupled) -> bool {
+        let size = self.held.len();
+        for a in 0..size {
+            for b in 0..=a {
+                let (ga, gb) = (&p.rows[self.held[a] * p.n..], &p.rows[self.held[b] * p.n..]);
+                let sum = self.free(p).map(|k| ga[k] * gb[k] / p.hessian[k]).sum();
+                self.schur[a * size + b] = sum;
+            }
+        }
+        cholesky_solve(&mut self.schur, &mut self.r, size)
+    }
+
+    /// The answer that follows from the active set alone.
     fn solve_equations(&mut self, p: &Coupled) -> bool {
         for k in 0..p.n {
             self.y[k] = match self.box_side[k] {
@@ -92,78 +268,61 @@ impl ActiveSet {
                 Some(Side::Upper) => p.upper[k],
             };
         }
-        self.held.clear();
-        self.lambda.fill(0.0);
-        for r in 0..p.m {
-            if let Some(side) = self.row_side[r] {
-                let bound = if side == Side::Lower { p.row_lower[r] } else { p.row_upper[r] };
-                self.rhs[self.held.len()] = p.row(r, &self.y) - bound;
-                self.held.push(r);
-            }
+        for (a, &row) in self.held.iter().enumerate() {
+            let lower = self.row_side[row] == Some(Side::Lower);
+            self.r[a] = p.row(row, &self.y) - if lower { p.row_lower[row] } else { p.row_upper[row] };
         }
-        let free = |k: &usize| self.box_side[*k].is_none();
-        let size = self.held.len();
-        for a in 0..size {
-            for b in 0..=a {
-                let (ga, gb) = (&p.rows[self.held[a] * p.n..], &p.rows[self.held[b] * p.n..]);
-                self.schur[a * size + b] = (0..p.n).filter(free).map(|k| ga[k] * gb[k] / p.hessian[k]).sum();
-            }
-        }
-        if !cholesky_solve(&mut self.schur, &mut self.rhs, size) {
+        if !self.solve_schur(p) {
             return false;
         }
-        for (a, &r) in self.held.iter().enumerate() {
-            self.lambda[r] = self.rhs[a];
+        self.lambda.fill(0.0);
+        for (a, &row) in self.held.iter().enumerate() {
+            self.lambda[row] = self.r[a];
         }
         for k in 0..p.n {
-            let pull: f64 = self.held.iter().map(|r| self.lambda[*r] * p.rows[r * p.n + k]).sum();
+            let pull: f64 = self.held.iter().map(|row| self.lambda[*row] * p.rows[row * p.n + k]).sum();
             match self.box_side[k] {
                 None => (self.y[k], self.mu[k]) = (p.goal[k] - pull / p.hessian[k], 0.0),
                 Some(_) => self.mu[k] = p.hessian[k] * (p.goal[k] - self.y[k]) - pull,
             }
         }
-        self.y.iter().all(|y| y.is_finite())
+        true
     }
 
-    /// Corrects the guess; true when something changed.
-    fn correct(&mut self, p: &Coupled) -> bool {
-        let mut changed = false;
+    /// Primal and dual feasibility of the final answer; stationarity holds by construction.
+    fn is_optimal(&mut self, p: &Coupled) -> bool {
+        let mut good = p.violation(&self.y) <= FINAL && self.y.iter().all(|y| y.is_finite());
         for k in 0..p.n {
-            let new = match self.box_side[k] {
-                None => beyond(self.y[k], p.lower[k], p.upper[k], EXACT * (1.0 + self.y[k].abs())),
-                held => held.filter(|side| leans(*side, self.mu[k])),
-            };
-            changed |= new != self.box_side[k];
-            self.box_side[k] = new;
+            let size = FINAL * (1.0 + self.y[k].abs());
+            good &= self.y[k] >= p.lower[k] - size && self.y[k] <= p.upper[k] + size;
+            self.y[k] = self.y[k].clamp(p.lower[k], p.upper[k]);
+            let scale = p.hessian[k] * (1.0 + p.goal[k].abs() + self.y[k].abs());
+            good &= self.box_side[k].is_none_or(|side| sign(side) * self.mu[k] >= -FINAL * scale);
         }
+        let largest = self.lambda.iter().fold(0.0, |m: f64, x| m.max(x.abs()));
         for r in 0..p.m {
-            let new = match self.row_side[r] {
-                None => {
-                    beyond(p.row(r, &self.y), p.row_lower[r], p.row_upper[r], EXACT * p.row_size[r].max(1.0))
-                }
-                held => held.filter(|side| leans(*side, self.lambda[r])),
-            };
-            changed |= new != self.row_side[r];
-            self.row_side[r] = new;
+            good &= self.row_side[r].is_none_or(|side| sign(side) * self.lambda[r] >= -FINAL * largest);
         }
-        changed
+        good
     }
 }
 
-fn beyond(x: f64, lower: f64, upper: f64, tolerance: f64) -> Option<Side> {
-    match x {
-        x if x > upper + tolerance => Some(Side::Upper),
-        x if x < lower - tolerance => Some(Side::Lower),
-        _ => None,
+/// Entry k of the gradient of a constraint written `g'y <= h`.
+fn gradient(p: &Coupled, constraint: Constraint, k: usize) -> f64 {
+    match constraint {
+        Constraint::Box(j, side) => {
+            if j == k {
+                sign(side)
+            } else {
+                0.0
+            }
+        }
+        Constraint::Row(r, side) => sign(side) * p.rows[r * p.n + k],
     }
 }
 
-/// True when the sign of a multiplier keeps its bound active.
-fn leans(side: Side, multiplier: f64) -> bool {
-    match side {
-        Side::Lower => multiplier <= 0.0,
-        Side::Upper => multiplier >= 0.0,
-    }
+fn sign(side: Side) -> f64 {
+    if side == Side::Upper { 1.0 } else { -1.0 }
 }
 
 /// Solves `S x = b` in place for the lower triangle of a symmetric S (row-major); false when S is not positive definite.

@@ -6,7 +6,7 @@ use super::coupled::Coupled;
 use super::{Dofs, Projector, Stages};
 use crate::checker::Checker;
 use crate::target::{Bounds, Consistency, Settings, Solver};
-use crate::viability::{Interval, Kind, Period};
+use crate::viability::{Dof, Interval, Kind, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model};
 
 impl Projector {
@@ -43,6 +43,7 @@ impl Projector {
             dynamics: Dynamics::new(model),
             checker: Checker::new(model, &limits, &dofs.controllable, period, settings.consistency),
             coupled: stages(model, &limits, &dofs, &weight, &settings)?,
+            braking: (0..nv).map(|i| Dof::of(&limits, i).braking(&period)).collect(),
             bounds: Bounds::new(nv),
             intervals: vec![none; nv],
             displacement: zero(),

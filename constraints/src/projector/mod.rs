@@ -44,6 +44,8 @@ pub struct Projector {
     period: Period,
     /// `w_i^2` for each dof (nv).
     weight: Vec<f64>,
+    /// Deceleration each dof brakes with (nv).
+    braking: Vec<f64>,
     bounds: Bounds,
     intervals: Vec<Interval>,
     checker: Checker,
@@ -158,12 +160,11 @@ impl Projector {
         let (t, kappa) = (self.period.dt, self.period.kappa);
         let free = self.settings.consistency == Consistency::Free;
         for &i in &self.dofs.controllable {
-            let a = self.limits.acceleration[i];
-            let (mut low, mut high) = (self.limits.q_lower[i], self.limits.q_upper[i]);
-            if a.is_infinite() {
-                (low, high) = (f64::NEG_INFINITY, f64::INFINITY); // free mode: the cut below is all there is
+            let mut dof = Dof::of(&self.limits, i);
+            if dof.acceleration.is_infinite() {
+                // Free mode without braking: the cut below is all there is.
+                (dof.lower, dof.upper) = (f64::NEG_INFINITY, f64::INFINITY);
             }
-            let dof = Dof { lower: low, upper: high, velocity: self.limits.velocity[i], acceleration: a };
             let x = interval(&dof, self.dofs.single[i].map_or(0.0, |iq| q[iq]), v[i], &self.period);
             let exact =
                 |kind: Kind, bound: f64, v_max: f64| match kind == Kind::Velocity && x.outside.is_none() {
@@ -352,7 +353,7 @@ impl Projector {
         self.brake(q, v, Some(proposal), target, BrakeReason::NoCertifiedAnswer)
     }
 
-    /// Last rung: every controllable dof takes `-sgn(v) min(A, |v| / T)`, inside its box.
+    /// Last rung: every controllable dof takes `-sgn(v) min(A_b, |v| / T)`, inside its box.
     fn brake(
         &mut self,
         q: &[f64],
@@ -364,7 +365,7 @@ impl Projector {
         self.v_next.copy_from_slice(proposal.map_or(v, |p| &p.v));
         self.consistent.fill(false);
         for &i in &self.dofs.controllable {
-            let stop = v[i] - v[i].signum() * (self.limits.acceleration[i] * self.period.dt).min(v[i].abs());
+            let stop = v[i] - v[i].signum() * (self.braking[i] * self.period.dt).min(v[i].abs());
             self.v_next[i] = stop.clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
         }
         target.ledger.active.clear();

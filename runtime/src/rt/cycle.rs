@@ -71,7 +71,8 @@ pub(crate) struct Cycle<T: Tick> {
     action: ActionMessage,
     overran: bool,
     usable: bool,
-    panicked: bool,
+    /// `brake` panicked: it is not called again on this controller. A panic of `tick` latches Fault.
+    brake_broken: bool,
     stopping: u64,
     pub(crate) wake: Histogram<u64>,
     pub(crate) compute: Histogram<u64>,
@@ -95,7 +96,7 @@ impl<T: Tick> Cycle<T> {
             action: ActionMessage::zeroed(),
             overran: false,
             usable: false,
-            panicked: false,
+            brake_broken: false,
             stopping: 0,
             wake: histogram(),
             compute: histogram(),
@@ -174,7 +175,7 @@ impl<T: Tick> Cycle<T> {
         self.record.swapped = self.ends.slot.swap(&mut self.controller);
         if self.record.swapped {
             self.controller.reset();
-            self.panicked = false;
+            self.brake_broken = false;
             self.record.counters.swaps += 1;
         }
         self.record.policy_version = self.controller.version();
@@ -228,27 +229,29 @@ impl<T: Tick> Cycle<T> {
     /// Lets the controller act or brake; without an answer `nu` is 0 and the plant brakes by itself.
     fn act(&mut self) {
         self.record.step.nu = 0;
-        if self.record.mode == Mode::Active && self.call(T::tick) == Some(Outcome::Refused) {
-            self.record.counters.refused += 1;
-            self.record.mode = self.modes.update(Event::Refused, false, self.is_stopping());
+        if self.record.mode == Mode::Active {
+            match self.call(T::tick) {
+                Some(Outcome::Acted) => {}
+                Some(Outcome::Refused) => {
+                    self.record.counters.refused += 1;
+                    self.record.mode = self.modes.update(Event::Refused, false, self.is_stopping());
+                }
+                None => self.record.mode = self.modes.update(Event::Panicked, false, false),
+            }
         }
-        if matches!(self.record.mode, Mode::Braking | Mode::Fault) && self.usable {
-            self.call(T::brake);
+        let brakes = matches!(self.record.mode, Mode::Braking | Mode::Fault) && self.usable;
+        if brakes && !self.brake_broken && self.call(T::brake).is_none() {
+            self.brake_broken = true;
+            self.record.mode = self.modes.update(Event::Panicked, false, false);
         }
         self.record.reason = self.modes.reason();
     }
 
+    /// Calls a verb of the controller; `None` if it panicked.
     fn call(&mut self, verb: fn(&mut T, &StateMessage, &mut Step) -> Outcome) -> Option<Outcome> {
-        if self.panicked {
-            return None;
-        }
         let (controller, record) = (&mut self.controller, &mut self.record);
         let called = catch_unwind(AssertUnwindSafe(|| verb(controller, &record.state, &mut record.step)));
         let outcome = called.ok();
-        if outcome.is_none() {
-            self.panicked = true;
-            self.record.mode = self.modes.update(Event::Panicked, false, false);
-        }
         if outcome != Some(Outcome::Acted) {
             self.record.step.nu = 0;
         }

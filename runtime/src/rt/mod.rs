@@ -6,9 +6,10 @@
 //! trainer ──snapshot──> I/O ──> builder ──> I/O ──slot──> real-time thread ──old controller──> I/O (dropped there)
 //! ```
 //!
-//! The page to read is `cycle.rs`. A run is [`connect`] then [`run_loop`].
+//! The page to read is `cycle.rs`. A run is [`run`]: a snapshot file on a plant by name.
 
 mod bench;
+mod brake;
 mod build;
 pub mod clock;
 mod cycle;
@@ -16,6 +17,7 @@ mod grid;
 mod inbox;
 mod io;
 mod mode;
+mod pilot;
 mod report;
 mod run;
 mod stop;
@@ -27,9 +29,10 @@ pub use bench::bench_wake;
 pub use cycle::Sync;
 pub use grid::Grid;
 pub use mode::{Event, Mode, ModeLimits, Modes, Reason};
+pub use pilot::{Pilot, PilotBuilder, describe, numbers};
 pub(crate) use report::percentiles;
 pub use report::{Percentiles, PlantSummary, RunReport};
-pub use run::{RunError, RunSettings, connect, run_loop};
+pub use run::{RunError, RunSettings, connect, run, run_loop};
 pub use stop::Stop;
 pub use thread::{ThreadSettings, prepare};
 pub use tick::{Build, Counters, Outcome, Record, Refusal, Step, Tick};

@@ -1,6 +1,7 @@
 //! What a run leaves behind.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 use hdrhistogram::Histogram;
 use serde::Serialize;
@@ -21,6 +22,18 @@ pub struct Percentiles {
     pub p999: u64,
     /// Largest.
     pub max: u64,
+}
+
+impl fmt::Display for Percentiles {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let us = |ns: u64| ns as f64 * 1e-3;
+        let (p50, p99, p999, max) = (us(self.p50), us(self.p99), us(self.p999), us(self.max));
+        write!(
+            f,
+            "p50 {p50:>8.1}  p99 {p99:>8.1}  p99.9 {p999:>8.1}  max {max:>9.1} us  ({} samples)",
+            self.count
+        )
+    }
 }
 
 pub(crate) fn percentiles(histogram: &Histogram<u64>) -> Percentiles {
@@ -93,4 +106,39 @@ pub struct RunReport {
     pub warnings: Vec<String>,
     /// The plant's own account.
     pub plant: PlantSummary,
+}
+
+impl fmt::Display for RunReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let c = &self.counters;
+        writeln!(f, "{}: {} ticks of {} s in {:.1} s", self.robot, self.ticks, self.dt, self.seconds)?;
+        let modes: Vec<String> = self.modes.iter().map(|(mode, n)| format!("{mode} {n}")).collect();
+        writeln!(f, "  modes            {}; ended in {}", modes.join(", "), self.last_mode.name())?;
+        writeln!(f, "  wake-up          {}", self.wake)?;
+        writeln!(f, "  compute          {}", self.compute)?;
+        writeln!(
+            f,
+            "  timing           overruns {}, skipped {}, late {}, stale {}, states lost {}",
+            c.overruns, c.skipped, self.plant.late, c.stale, c.lost_states
+        )?;
+        writeln!(
+            f,
+            "  limits broken    raw proposal {}, projected {}",
+            c.raw_violations, c.projected_violations
+        )?;
+        let plant: Vec<String> =
+            self.plant.violations.iter().map(|(kind, n)| format!("{kind} {n}")).collect();
+        writeln!(f, "  on the plant     {}", plant.join(", "))?;
+        let versions: Vec<String> = self.versions.iter().map(|(_, version)| version.to_string()).collect();
+        writeln!(
+            f,
+            "  snapshots        versions {}; refused {}",
+            versions.join(" "),
+            self.refused_snapshots
+        )?;
+        for text in self.refusals.iter().chain(&self.warnings).chain(&self.log_error) {
+            writeln!(f, "  note             {text}")?;
+        }
+        Ok(())
+    }
 }

@@ -1,7 +1,7 @@
 //! Putting the threads together: loop, I/O, builder and log, from the first state to the report.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::sync_channel;
@@ -17,10 +17,12 @@ use crate::rt::cycle::{Cycle, CycleEnd, CycleSettings, Ends, Sync};
 use crate::rt::inbox::SnapshotInbox;
 use crate::rt::io::{Health, Io, Traffic};
 use crate::rt::mode::ModeLimits;
+use crate::rt::pilot::{Pilot, PilotBuilder};
 use crate::rt::report::{PlantSummary, RunReport, percentiles};
 use crate::rt::thread::{ThreadSettings, prepare};
 use crate::rt::tick::{Build, Tick};
 use crate::rt::{Mode, Reason, Stop, swap};
+use crate::snapshot::Snapshot;
 
 /// Records between loop and I/O thread.
 const RECORDS: usize = 256;
@@ -30,10 +32,14 @@ const RECORDS: usize = 256;
 pub struct RunSettings {
     /// Who keeps time.
     pub sync: Sync,
+    /// The loop's own rate [Hz]; it must be the plant's and makes the loop keep its own time ([`run`] only).
+    pub rate: Option<f64>,
     /// Age at which a state is stale [s]; the default is 5 periods, at least 20 ms.
     pub age_limit: Option<f64>,
     /// So long before and after a state is due, the real-time thread polls instead of sleeping [s].
     pub spin: f64,
+    /// Seconds of ticks until the loop stops by itself, if `ticks` is not given.
+    pub seconds: Option<f64>,
     /// Ticks until the loop stops by itself.
     pub ticks: Option<u64>,
     /// How long to wait for the plant at start [s].
@@ -58,8 +64,10 @@ impl Default for RunSettings {
     fn default() -> Self {
         RunSettings {
             sync: Sync::Plant,
+            rate: None,
             age_limit: None,
             spin: 50e-6,
+            seconds: None,
             ticks: None,
             patience: 5.0,
             stop_speed: 1e-2,
@@ -85,6 +93,16 @@ pub enum RunError {
     /// The first snapshot does not fit the plant.
     #[error("{0}")]
     Snapshot(String),
+    /// The asked rate is not the snapshot's.
+    #[error(
+        "--rate {rate} Hz, but snapshot and plant run at {own} Hz: leave --rate out to follow the plant, or give {own}"
+    )]
+    Rate {
+        /// As asked [Hz].
+        rate: f64,
+        /// Of snapshot and plant [Hz].
+        own: f64,
+    },
     /// Strict mode.
     #[error("--strict: {0}")]
     Strict(String),
@@ -106,6 +124,35 @@ pub fn connect(name: &RobotName, patience: f64) -> Result<(RuntimeLink, RobotMes
     let mut link = RuntimeLink::open(name)?;
     let robot = link.wait_for_plant(Duration::from_secs_f64(patience.max(0.0)))?;
     Ok((link, robot))
+}
+
+/// Runs the snapshot in `file` on the plant named `plant` until `stop`: what `nearl run` does.
+pub fn run(
+    settings: &RunSettings,
+    file: &Path,
+    plant: &RobotName,
+    stop: &Stop,
+) -> Result<RunReport, RunError> {
+    let refused = |text: String| RunError::Snapshot(format!("{}: {text}", file.display()));
+    let snapshot = Snapshot::load(file).map_err(|e| refused(e.to_string()))?;
+    let (link, robot) = connect(plant, settings.patience)?;
+    let first = Pilot::new(&snapshot, &robot).map_err(|e| refused(e.text))?;
+    let mut settings = settings.clone();
+    if let Some(rate) = settings.rate {
+        if (rate * robot.dt - 1.0).abs() > 1e-6 {
+            let own = 1.0 / robot.dt;
+            return Err(RunError::Rate { rate, own });
+        }
+        settings.sync = Sync::Clock;
+    }
+    let facts = [
+        ("digest", snapshot.digest()),
+        ("task", snapshot.manifest.task.name.clone()),
+        ("snapshot", file.display().to_string()),
+        ("version", snapshot.manifest.version.to_string()),
+    ];
+    settings.metadata.extend(facts.map(|(key, value)| (key.to_owned(), value)));
+    run_loop(link, robot, first, PilotBuilder, &settings, stop)
 }
 
 /// Runs `first` on the plant behind `link` until `stop` (or the settings' ticks), taking in new snapshots through
@@ -181,7 +228,7 @@ fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings
         age_limit: clock::nanoseconds(age_limit),
         spin: if robot.is_lockstep() { 0 } else { clock::nanoseconds(settings.spin) },
         real_time: !robot.is_lockstep(),
-        ticks: settings.ticks,
+        ticks: settings.ticks.or(settings.seconds.map(|s| (s / robot.dt).round() as u64)),
         stop_speed: settings.stop_speed,
         stop_ticks: (settings.stop_patience / robot.dt).ceil() as u64,
         modes: settings.modes,

@@ -10,7 +10,8 @@ pub trait Tick: Send + 'static {
     fn version(&self) -> u64;
     /// Computes the action for `state`.
     fn tick(&mut self, state: &StateMessage, step: &mut Step) -> Outcome;
-    /// Computes an action that brings the velocity to zero; [`Outcome::Refused`] leaves braking to the plant.
+    /// Computes an action that brings the velocity to zero; [`Outcome::Refused`] leaves braking to the plant. Also
+    /// called after a panic in `tick`: it must not rely on what `tick` may have left half done.
     fn brake(&mut self, state: &StateMessage, step: &mut Step) -> Outcome;
     /// The next state begins a new episode, or follows a gap.
     fn reset(&mut self);

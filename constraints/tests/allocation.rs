@@ -1,0 +1,62 @@
+//! A tick allocates nothing, except one buffer inside each Clarabel solve.
+
+mod common;
+
+use common::*;
+use nearl_constraints::*;
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+struct Counting;
+
+static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: forwards to the system allocator.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promise.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+/// Ticks by rung, allocations by rung.
+fn count(projector: &mut Projector, size: f64) -> ([usize; 4], [usize; 4]) {
+    let (mut random, mut target) = (Random(1), Target::new(projector.model()));
+    let (mut ticks, mut allocations) = ([0; 4], [0; 4]);
+    for _ in 0..2000 {
+        let (q, v) = inner_state(projector, &mut random);
+        let raw = proposal(projector, &q, &v, size, &mut random);
+        let before = ALLOCATIONS.load(Ordering::Relaxed);
+        projector.project(&q, &v, &raw, &mut target);
+        let rung = target.ledger.rung as usize;
+        ticks[rung] += 1;
+        allocations[rung] += ALLOCATIONS.load(Ordering::Relaxed) - before;
+    }
+    (ticks, allocations)
+}
+
+#[test]
+fn ticks_do_not_allocate() {
+    let settings = |solver| Settings { solver, ..Settings::new(0.001, 1) };
+    for (torque, solver, size) in
+        [(None, Solver::Ladder, 3.0), (Some(0.8), Solver::Ladder, 3.0), (Some(0.8), Solver::Clarabel, 3.0)]
+    {
+        let mut projector = panda_projector(torque, settings(solver));
+        let (ticks, allocations) = count(&mut projector, size);
+        println!("{torque:?} {solver:?}: ticks {ticks:?}, allocations {allocations:?}");
+        let [closed, exact, clarabel, _] = allocations;
+        assert_eq!((closed, exact), (0, 0));
+        assert!(clarabel <= ticks[Rung::Clarabel as usize], "{clarabel}");
+    }
+    let free = Settings { consistency: Consistency::Free, ..settings(Solver::Ladder) };
+    assert_eq!(count(&mut panda_projector(None, free), 3.0).1, [0; 4]);
+}

@@ -1,0 +1,97 @@
+//! What the tests of the projector share.
+#![allow(dead_code, unreachable_pub)]
+
+use nearl_constraints::*;
+use std::path::Path;
+
+/// Seeded uniform numbers (splitmix64).
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    pub fn between(&mut self, low: f64, high: f64) -> f64 {
+        low + (high - low) * self.next()
+    }
+}
+
+pub fn robot(file: &str) -> Model {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/robots").join(file);
+    match file.ends_with("urdf") {
+        true => Model::from_urdf(&path).unwrap(),
+        false => Model::from_mjcf(&path).unwrap(),
+    }
+}
+
+pub fn panda() -> Model {
+    robot("panda/panda.urdf")
+}
+
+/// The maker's acceleration limits [rad/s²].
+pub const PANDA_ACCELERATION: [f64; 7] = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0];
+
+/// Decelerations the motors can give in every state at 60 % of the speed: see `certify.rs` [rad/s²].
+pub const PANDA_BRAKING: [f64; 7] = [4.0, 2.0, 4.0, 4.0, 6.0, 6.0, 10.0];
+
+pub fn panda_joints(values: [f64; 7]) -> PerJoint {
+    PerJoint::Joints((0..7).map(|k| (format!("panda_joint{}", k + 1), values[k])).collect())
+}
+
+/// Position, velocity (60 %) and acceleration limits, torque limits if asked for.
+pub fn panda_limits(torque: Option<f64>) -> Vec<Box<dyn Limit>> {
+    let (limit, braking) = (panda_joints(PANDA_ACCELERATION), Some(panda_joints(PANDA_BRAKING)));
+    let mut limits: Vec<Box<dyn Limit>> = vec![
+        Box::new(PositionLimit::default()),
+        Box::new(VelocityLimit::scaled(0.6)),
+        Box::new(AccelerationLimit::new(limit::AccelerationSettings { limit, braking })),
+    ];
+    if let Some(scale) = torque {
+        limits.push(Box::new(TorqueLimit::scaled(scale)));
+    }
+    limits
+}
+
+pub fn panda_projector(torque: Option<f64>, settings: Settings) -> Projector {
+    Projector::new(&panda(), &panda_limits(torque), &[0, 1, 2, 3, 4, 5, 6], settings).unwrap()
+}
+
+/// A state inside all limits with room to brake.
+pub fn inner_state(projector: &Projector, random: &mut Random) -> (Vec<f64>, Vec<f64>) {
+    let (l, dt) = (projector.limits(), projector.settings().dt);
+    let n = projector.model().nv();
+    let q: Vec<f64> = (0..n).map(|i| random.between(l.q_lower[i], l.q_upper[i])).collect();
+    let v = (0..n)
+        .map(|i| {
+            let room = (l.q_upper[i] - q[i]).min(q[i] - l.q_lower[i]);
+            let most = (l.braking[i] * room).sqrt().min(l.velocity[i]) - l.acceleration[i] * dt;
+            most.max(0.0) * random.between(-1.0, 1.0)
+        })
+        .collect();
+    (q, v)
+}
+
+/// A proposal around the state; `size` 1 is about one period of full acceleration.
+pub fn proposal(projector: &Projector, q: &[f64], v: &[f64], size: f64, random: &mut Random) -> Proposal {
+    let (l, dt) = (projector.limits(), projector.settings().dt);
+    let wish: Vec<f64> =
+        (0..v.len()).map(|i| size * l.acceleration[i] * dt * random.between(-1.0, 1.0)).collect();
+    Proposal {
+        q: (0..q.len()).map(|i| q[i] + dt * (v[i] + wish[i] * random.next())).collect(),
+        v: (0..v.len()).map(|i| v[i] + wish[i]).collect(),
+    }
+}
+
+/// A proposal whose position and velocity belong together.
+pub fn consistent(projector: &Projector, q: &[f64], v: &[f64], y: &[f64]) -> Proposal {
+    let p = Period::new(projector.settings().dt, projector.settings().sub_steps);
+    Proposal {
+        q: (0..v.len()).map(|i| q[i] + (p.dt * v[i] + p.kappa * p.dt * y[i])).collect(),
+        v: (0..v.len()).map(|i| v[i] + y[i]).collect(),
+    }
+}

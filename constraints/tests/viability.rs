@@ -1,0 +1,143 @@
+//! Closed loop against an adversarial policy: the box is never empty and no position, sub-step positions included, is
+//! beyond its limit.
+
+use nearl_constraints::viability::{Dof, Period, interval};
+
+/// Seeded uniform numbers (splitmix64).
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    fn between(&mut self, low: f64, high: f64) -> f64 {
+        low + (high - low) * self.next()
+    }
+}
+
+/// Moves one period with constant acceleration; returns the state and the extreme positions on the way.
+fn advance(q: f64, v: f64, a: f64, p: &Period) -> (f64, f64, f64, f64) {
+    let (mut x, mut w, mut low, mut high) = (q, v, q, q);
+    if p.sub_steps == 0 {
+        let (end, turn) = (q + p.dt * v + 0.5 * p.dt * p.dt * a, -v / a);
+        (low, high) = (low.min(end), high.max(end));
+        if turn > 0.0 && turn < p.dt {
+            let extreme = q + v * turn + 0.5 * a * turn * turn;
+            (low, high) = (low.min(extreme), high.max(extreme));
+        }
+        return (end, v + p.dt * a, low, high);
+    }
+    for _ in 0..p.sub_steps {
+        w += p.tau * a;
+        x += p.tau * w;
+        (low, high) = (low.min(x), high.max(x));
+    }
+    (x, w, low, high)
+}
+
+/// Runs `steps` periods on one dof: presses against one side most of the time, changes its mind now and then, asks for
+/// random accelerations otherwise. Returns (states outside the set, largest violation).
+fn attack(dof: &Dof, p: &Period, steps: usize, random: &mut Random) -> (usize, f64) {
+    let (mut q, mut v, mut side) = (0.5 * (dof.lower + dof.upper), 0.0, 1.0);
+    let (mut outside, mut violation) = (0, 0.0f64);
+    for _ in 0..steps {
+        let i = interval(dof, q, v, p);
+        assert!(i.lower <= i.upper && i.lower.is_finite() && i.upper.is_finite());
+        outside += usize::from(i.outside.is_some());
+        if random.next() < 0.02 {
+            side = if random.next() < 0.5 { -1.0 } else { 1.0 };
+        }
+        let a_max = dof.acceleration;
+        let wish = match random.next() {
+            x if x < 0.8 => side * 1e3 * a_max,
+            x if x < 0.9 => random.between(-a_max, a_max),
+            _ => random.between(i.lower, i.upper),
+        };
+        let (low, high);
+        (q, v, low, high) = advance(q, v, wish.clamp(i.lower, i.upper), p);
+        violation = violation.max(high - dof.upper).max(dof.lower - low).max(v.abs() - dof.velocity);
+    }
+    (outside, violation)
+}
+
+const PERIODS: [f64; 3] = [0.001, 0.01, 0.05];
+const SUB_STEPS: [u32; 5] = [0, 1, 2, 5, 10];
+
+#[test]
+fn one_joint_never_leaves_its_set() {
+    let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0 };
+    for dt in PERIODS {
+        for n in SUB_STEPS {
+            let (outside, violation) = attack(&dof, &Period::new(dt, n), 100_000, &mut Random(7));
+            println!("T {dt} n {n}: outside {outside}, violation {violation:.1e}");
+            assert!(
+                outside == 0 && violation <= 1e-9,
+                "T {dt}, n {n}: {outside} outside, {violation:e} beyond"
+            );
+        }
+    }
+}
+
+#[test]
+fn many_joints_never_leave_their_sets() {
+    let mut random = Random(11);
+    for dt in PERIODS {
+        for n in SUB_STEPS {
+            for _ in 0..40 {
+                let center = random.between(-3.0, 3.0);
+                let half = 10f64.powf(random.between(-2.0, 0.6));
+                let a_max = 10f64.powf(random.between(0.0, 3.0));
+                let dof = Dof {
+                    lower: center - half,
+                    upper: center + half,
+                    velocity: 10f64.powf(random.between(-1.0, 1.3)),
+                    acceleration: a_max,
+                    deceleration: a_max * random.between(0.1, 1.5).min(1.0),
+                };
+                let (outside, violation) = attack(&dof, &Period::new(dt, n), 2_500, &mut random);
+                assert!(
+                    outside == 0 && violation <= 1e-9,
+                    "T {dt}, n {n}, {dof:?}: {outside} outside, {violation:e} beyond"
+                );
+            }
+        }
+    }
+}
+
+/// Braking with all there is, from any state the box leads to, stops inside the limits.
+#[test]
+fn braking_from_any_admissible_state_stops_inside() {
+    let mut random = Random(3);
+    for dt in PERIODS {
+        for n in SUB_STEPS {
+            let p = Period::new(dt, n);
+            let dof = Dof { lower: -0.7, upper: 0.4, velocity: 4.0, acceleration: 15.0, deceleration: 15.0 };
+            let (mut q, mut v) = (0.0, 0.0);
+            for _ in 0..300 {
+                for _ in 0..random.between(1.0, 30.0) as usize {
+                    let i = interval(&dof, q, v, &p);
+                    let a =
+                        if random.next() < 0.7 { 1e9f64.copysign(v) } else { random.between(-15.0, 15.0) };
+                    (q, v, _, _) = advance(q, v, a.clamp(i.lower, i.upper), &p);
+                }
+                let (mut qb, mut vb) = (q, v);
+                for _ in 0..(4.0 / 15.0 / dt) as usize + 4 {
+                    let i = interval(&dof, qb, vb, &p);
+                    let a = nearl_constraints::viability::brake(&dof, vb, &p).clamp(i.lower, i.upper);
+                    let (low, high);
+                    (qb, vb, low, high) = advance(qb, vb, a, &p);
+                    assert!(high <= 0.4 + 1e-9 && low >= -0.7 - 1e-9, "T {dt} n {n}: {low} {high}");
+                }
+                assert!(
+                    vb.abs() < 1e-6 * 4.0 || vb.abs() < 15.0 * dt * 0.5,
+                    "T {dt} n {n}: still moving at {vb}"
+                );
+            }
+        }
+    }
+}

@@ -1,0 +1,63 @@
+//! Braking on the robot model alone: projector and analytic inverse dynamics, no network.
+//!
+//! It shares nothing with the controller, so whatever failed there (weights, a solver, a panic) leaves it intact.
+
+use nearl_constraints::{Period, Projector, Proposal, Status, Target};
+
+use crate::controller::Parts;
+use crate::idm::AnalyticIdm;
+use crate::snapshot::{Manifest, PolicyKind, SnapshotError};
+use crate::task::IdmKind;
+
+/// Brings the controllable joints to rest as fast as every limit allows.
+pub(crate) struct Brake {
+    projector: Projector,
+    idm: AnalyticIdm,
+    proposal: Proposal,
+    pub(crate) target: Target,
+    /// Degree of freedom and configuration index of each controllable joint.
+    joints: Vec<(usize, usize)>,
+    range: Vec<(f64, f64)>,
+    period: Period,
+    action: Vec<f64>,
+}
+
+impl Brake {
+    /// `None` where no analytic inverse dynamics knows the action that stops the robot.
+    pub(crate) fn new(manifest: &Manifest) -> Result<Option<Brake>, SnapshotError> {
+        if manifest.task.idm.kind != IdmKind::Pinocchio || manifest.policy == PolicyKind::Direct {
+            return Ok(None);
+        }
+        let Parts { model, layout, projector, .. } = Parts::new(manifest)?;
+        let controllable = layout.controllable();
+        let joints = model.joints().iter().filter(|j| j.nv == 1 && controllable.contains(&j.idx_v));
+        Ok(Some(Brake {
+            idm: AnalyticIdm::new(&model, controllable),
+            proposal: Proposal::new(&model),
+            target: Target::new(&model),
+            joints: joints.map(|j| (j.idx_v, j.idx_q)).collect(),
+            range: manifest.action_lower.iter().copied().zip(manifest.action_upper.iter().copied()).collect(),
+            period: Period::new(manifest.task.time.dt, manifest.task.sub_steps() as u32),
+            action: vec![0.0; manifest.action_lower.len()],
+            projector,
+        }))
+    }
+
+    /// Proposes rest, `v' = 0` and `q' = q + T v - kappa T v`, and returns the torque [N m] for the nearest allowed
+    /// state. Joints that are not controllable keep their velocity.
+    pub(crate) fn update(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
+        let Period { dt, kappa, .. } = self.period;
+        self.proposal.q.copy_from_slice(q);
+        self.proposal.v.copy_from_slice(v);
+        for &(dof, idx_q) in &self.joints {
+            self.proposal.v[dof] = 0.0;
+            self.proposal.q[idx_q] = q[idx_q] + dt * v[dof] - kappa * dt * v[dof];
+        }
+        let status = self.projector.project(q, v, &self.proposal, &mut self.target);
+        self.idm.torque(q, v, &self.target, &mut self.action);
+        for (action, &(lower, upper)) in self.action.iter_mut().zip(&self.range) {
+            *action = if action.is_finite() { action.clamp(lower, upper) } else { 0.0 };
+        }
+        (status, &self.action)
+    }
+}

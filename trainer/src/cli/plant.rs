@@ -1,0 +1,80 @@
+//! `nearl plant`: MuJoCo as the robot, over shared memory.
+
+use super::{Failure, say};
+use crate::plant::{MujocoPlant, PlantLimits};
+use crate::train::complete;
+use crate::{env, tasks};
+use clap::Args;
+use nearl_runtime::controller::Parts;
+use nearl_runtime::link::{PlantLink, PlantRunner, PlantSettings, RobotName};
+use nearl_runtime::rt::Stop;
+
+#[derive(Args)]
+pub(super) struct PlantCommand {
+    /// Task name (see `nearl tasks`) or TOML file.
+    task: String,
+    /// Name of the robot; the runtime says the same with `--plant`.
+    #[arg(long)]
+    name: String,
+    /// Stop by itself after this time in [s].
+    #[arg(long)]
+    seconds: Option<f64>,
+    /// Wait for the action of every state instead of keeping real time.
+    #[arg(long)]
+    lockstep: bool,
+    /// Let the robot go on instead of starting episodes anew.
+    #[arg(long)]
+    endless: bool,
+    /// Seed of the initial states.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Overrides of the task file.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl PlantCommand {
+    pub(super) fn run(self) -> Result<(), Failure> {
+        let mut manifest = tasks::load(&self.task, &self.set)?;
+        complete(&mut manifest)?;
+        let Parts { model, projector, .. } = Parts::new(&manifest)?;
+        let environment = env::make(&manifest.task.name)?;
+        let dt = environment.spec().dt;
+        let limits = PlantLimits::new(environment.as_ref(), &model, projector.limits());
+        let mut plant = MujocoPlant::new(environment, &model, limits, self.seed, !self.endless)?;
+        let name = RobotName::new(&self.name)?;
+        let link = PlantLink::open(&name, &plant.robot(self.lockstep))?;
+        let mut settings =
+            if self.lockstep { PlantSettings::lockstep(dt) } else { PlantSettings::real_time(dt) };
+        settings.ticks = self.seconds.map(|s| (s / dt).round() as u64);
+        let stop = Stop::on_signals()?;
+        if !self.json {
+            say(format!(
+                "{} as '{name}', {:.0} Hz; start the runtime with --plant {name}",
+                self.task,
+                1.0 / dt
+            ));
+        }
+        let report = PlantRunner::new(link, settings)?.run(&mut plant, &stop);
+        let m = plant.meter();
+        let (p, v, t) = (m.position(), m.velocity(), m.effort());
+        if self.json {
+            say(
+                serde_json::json!({ "report": report, "violations": { "position": p.states, "velocity": v.states, "torque": t.states },
+                "worst": { "position": p.excess, "velocity": v.excess, "torque": t.excess } }),
+            );
+            return Ok(());
+        }
+        say(format!(
+            "{} ticks, {} late, {} braked, watchdog {}",
+            report.ticks, report.late, report.braked, report.watchdog
+        ));
+        for (what, unit, w) in [("position", "rad", p), ("velocity", "rad/s", v), ("torque", "N m", t)] {
+            say(format!("{what:<9} limit broken in {} ticks, by at most {:.3e} {unit}", w.states, w.excess));
+        }
+        Ok(())
+    }
+}
