@@ -1,1 +1,41 @@
-//! The extension module `nearl._core`.
+//! The extension module `nearl._core`: Rust objects for Python, nothing computed here.
+//!
+//! Arrays come in as anything NumPy accepts and go out as float64. Whatever takes longer than a few microseconds runs with
+//! the interpreter released. Errors are the Rust sentence: `OSError` for files that cannot be read, `ValueError` otherwise.
+
+mod arrays;
+mod controller;
+mod env;
+mod errors;
+mod lane;
+mod limits;
+mod model;
+mod pool;
+mod projector;
+mod target;
+mod vec_env;
+
+use pyo3::prelude::*;
+
+#[pymodule]
+mod _core {
+    #[pymodule_export]
+    use super::controller::Controller;
+    #[pymodule_export]
+    use super::env::{Env, tasks};
+    #[pymodule_export]
+    use super::limits::{AccelerationLimit, PositionLimit, TorqueLimit, VelocityLimit};
+    #[pymodule_export]
+    use super::model::Model;
+    #[pymodule_export]
+    use super::projector::Projector;
+    #[pymodule_export]
+    use super::target::{Ledger, Target, Targets};
+    #[pymodule_export]
+    use super::vec_env::VecEnv;
+
+    /// Version of the package.
+    #[pymodule_export]
+    #[allow(non_upper_case_globals)]
+    const __version__: &str = env!("CARGO_PKG_VERSION");
+}

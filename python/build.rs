@@ -1,0 +1,26 @@
+//! Tells the extension where MuJoCo's and Pinocchio's libraries are at run time.
+//!
+//! Installed, `nearl/_core.abi3.so` lies beside the Python packages that carry them (`mujoco/` and `cmeel.prefix/lib/`), so
+//! both are found relative to it, one mapped copy each, whether or not `import mujoco` came first. In a source tree
+//! (`maturin develop`) they are not beside it: the last entry is where they were when it was built.
+
+fn main() {
+    println!("cargo::rerun-if-env-changed=NEARL_SITE_PACKAGES");
+    let Ok(site_packages) = std::env::var("NEARL_SITE_PACKAGES") else {
+        println!(
+            "cargo::error=NEARL_SITE_PACKAGES is not set: build inside the checkout, where .cargo/config.toml sets it"
+        );
+        return;
+    };
+    for (installed, package) in [("mujoco", "mujoco==3.17.0"), ("cmeel.prefix/lib", "libpinocchio==4.1.0")] {
+        let here = format!("{site_packages}/{installed}");
+        if !std::path::Path::new(&here).is_dir() {
+            println!("cargo::error={here} is missing (Python package {package}): run `make setup` first");
+        }
+        println!("cargo::rustc-link-arg=-Wl,-rpath,$ORIGIN/../{installed}");
+        println!("cargo::rustc-link-arg=-Wl,-rpath-link,{here}");
+    }
+    for installed in ["mujoco", "cmeel.prefix/lib"] {
+        println!("cargo::rustc-link-arg=-Wl,-rpath,{site_packages}/{installed}");
+    }
+}

@@ -1,0 +1,57 @@
+"""NEARL: a policy proposes a next state, a projector makes it safe, inverse dynamics makes it happen.
+
+    import nearl
+
+    model = nearl.Model.from_urdf("panda.urdf")
+    limits = [nearl.PositionLimit(model), nearl.VelocityLimit(model), nearl.AccelerationLimit(model, 10.0)]
+    projector = nearl.Projector(model, limits, dt=1e-3)
+    target = projector.project(q, v, q_proposal, v_proposal)
+
+With Gymnasium installed, importing this module registers ``nearl/HalfCheetah-v5`` and its like, and ``nearl.make_vec`` makes
+vectors of them.
+"""
+
+from nearl._core import (
+    AccelerationLimit,
+    Controller,
+    Ledger,
+    Model,
+    PositionLimit,
+    Projector,
+    Target,
+    Targets,
+    TorqueLimit,
+    VelocityLimit,
+    __version__,
+    tasks,
+)
+
+__all__ = [
+    "AccelerationLimit",
+    "Controller",
+    "Ledger",
+    "Model",
+    "PositionLimit",
+    "Projector",
+    "Target",
+    "Targets",
+    "TorqueLimit",
+    "VelocityLimit",
+    "__version__",
+    "tasks",
+]
+
+try:
+    import gymnasium as _gymnasium  # noqa: F401
+except ImportError:  # the extra [train] is not installed
+    def __getattr__(name: str):
+        if name in ("Env", "VecEnv", "make_vec", "register"):
+            raise ImportError(f"nearl.{name} needs Gymnasium: pip install 'nearl[train]'")
+        raise AttributeError(f"module 'nearl' has no attribute '{name}'")
+else:
+    from nearl.env import Env
+    from nearl.registration import register
+    from nearl.vector import VecEnv, make_vec
+
+    __all__ += ["Env", "VecEnv", "make_vec", "register"]
+    register()

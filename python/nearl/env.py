@@ -1,0 +1,99 @@
+"""One environment, as Gymnasium wants it."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nearl import _core
+
+
+class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
+    """A task on one simulated robot.
+
+    Same spaces, observations, rewards and terminations as Gymnasium's environment of the same name (``Panda-reach`` is our own).
+    The time limit is Gymnasium's wrapper, which ``gymnasium.make("nearl/...")`` adds.
+
+    Args:
+        task: Name of the task, one of ``nearl.tasks()``.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, task: str, render_mode: str | None = None):
+        if render_mode is not None:
+            raise ValueError(f"render_mode is '{render_mode}', but these environments do not render; leave it out")
+        self._native = _core.Env(task)
+        self._seeded = False
+        low = self._native.action_low.astype(np.float32)
+        high = self._native.action_high.astype(np.float32)
+        self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
+        n_obs = len(self._native.obs_names)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (n_obs,), np.float64)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self._native.dt)}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        """Begins an episode.
+
+        Args:
+            seed: Restarts the random stream.
+            options: ``qpos`` and ``qvel`` (MuJoCo's convention), or ``goal``, replace what would be drawn.
+
+        Returns:
+            Observation (n_obs) and an empty ``info``.
+        """
+        super().reset(seed=seed)
+        if seed is None and not self._seeded:
+            seed = int(self.np_random.integers(2**63))
+        self._seeded = True
+        obs = self._native.reset(seed)
+        return (self._start(dict(options), obs) if options else obs), {}
+
+    def _start(self, options: dict[str, Any], obs: NDArray[np.float64]) -> NDArray[np.float64]:
+        unknown = options.keys() - {"qpos", "qvel", "goal"}
+        if unknown:
+            raise ValueError(f"reset options {sorted(unknown)} are not known; use 'qpos', 'qvel' or 'goal'")
+        if "goal" in options:
+            self._native.goal = options["goal"]
+            obs = self._native.observe()
+        if "qpos" in options or "qvel" in options:
+            qpos = options.get("qpos", self._native.qpos)
+            obs = self._native.set_state(qpos, options.get("qvel", self._native.qvel))
+        return obs
+
+    def step(self, action: ArrayLike) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        """Simulates one control period. ``info["fault"]`` is there only if the physics could not be believed."""
+        obs, reward, terminated, fault = self._native.step(action)
+        return obs, reward, terminated, False, {} if fault is None else {"fault": fault}
+
+    def set_state(self, qpos: ArrayLike, qvel: ArrayLike) -> NDArray[np.float64]:
+        """Begins an episode at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention; returns the observation."""
+        return self._native.set_state(qpos, qvel)
+
+    @property
+    def state(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """``q`` (nq) and ``v`` (nv) in Pinocchio's convention, as ``Projector`` and ``Controller`` take them."""
+        return self._native.state()
+
+    @property
+    def native(self) -> _core.Env:
+        """The Rust environment: names, ranges, state."""
+        return self._native
+
+    @property
+    def qpos(self) -> NDArray[np.float64]:
+        """Configuration (nq), MuJoCo's convention."""
+        return self._native.qpos
+
+    @property
+    def qvel(self) -> NDArray[np.float64]:
+        """Velocity (nv), MuJoCo's convention."""
+        return self._native.qvel
+
+    @property
+    def dt(self) -> float:
+        """Control period [s]."""
+        return self._native.dt

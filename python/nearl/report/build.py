@@ -1,0 +1,190 @@
+"""The page: tables and figures in order, a sentence where there is nothing to show."""
+
+import html
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nearl._core import __version__
+from nearl.report import flight, training
+from nearl.report.read import Log, ReadError, Run, read_evaluations, read_log, read_run, read_summaries
+
+Paths = Iterable[str | Path]
+
+CSS = """
+:root { color-scheme: light; }
+body { font: 15px/1.55 system-ui, "Segoe UI", Roboto, sans-serif; color: #1d2939; background: #f9fafb; margin: 0; }
+main { max-width: 1040px; margin: 0 auto; padding: 2.2rem 1.4rem 4rem; }
+h1 { font-size: 1.7rem; margin: 0 0 .2rem; } h2 { font-size: 1.2rem; margin: 2.4rem 0 .6rem; }
+h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; color: #475467; }
+p.lead, figcaption { color: #475467; } p.none { color: #667085; font-style: italic; }
+figure { margin: .8rem 0 1.4rem; background: #fff; border: 1px solid #e4e7ec; border-radius: 8px; padding: .8rem; }
+figure img { max-width: 100%; height: auto; display: block; margin: 0 auto; } figcaption { font-size: .87rem; margin-top: .5rem; }
+.scroll { overflow-x: auto; } table { border-collapse: collapse; background: #fff; font-variant-numeric: tabular-nums; font-size: .92rem; }
+th, td { padding: .38rem .8rem; border-bottom: 1px solid #e4e7ec; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; } th { color: #475467; font-weight: 600; border-bottom: 2px solid #d0d5dd; }
+"""
+
+
+def build(
+    out: str | Path,
+    *,
+    runs: Paths = (),
+    logs: Paths = (),
+    evals: Paths = (),
+    summaries: Paths = (),
+    title: str = "NEARL report",
+) -> Path:
+    """Writes the report.
+
+    Args:
+        out: HTML file to write.
+        runs: Run folders of ``nearl train``.
+        logs: Flight logs of ``nearl run --log``.
+        evals: Output files of ``nearl eval --json``.
+        summaries: Output files of ``nearl run --json``.
+        title: Heading.
+
+    Raises:
+        ReadError: an input is not what it was given as.
+        OSError: an input cannot be read or ``out`` not written.
+    """
+    trained = [read_run(Path(p)) for p in runs]
+    flights = [read_log(Path(p)) for p in logs]
+    evaluations = [found for p in evals for found in read_evaluations(Path(p))]
+    loops = [found for p in summaries for found in read_summaries(Path(p))]
+    if not (trained or flights or evaluations or loops):
+        raise ReadError("there is nothing to report; give at least one of --run, --log, --eval and --summary")
+    sections = [
+        ("Results", _results(trained, evaluations, loops, flights)),
+        ("Learning", _or_sentence(training.learning_curves(trained), trained, "No run folder was given (--run).", "The runs given have no finished episodes.")),
+        ("Inverse dynamics", _or_sentence(training.idm_loss(trained), trained, "No run folder was given (--run).", "The runs given learned no inverse model.")),
+        ("Constraints while training", _or_sentence(training.violations(trained), trained, "No run folder was given (--run).", "The runs given project nothing.")),
+        *_flights(flights),
+    ]
+    body = "".join(f"<section><h2>{html.escape(name)}</h2>{content}</section>" for name, content in sections)
+    page = (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<title>{html.escape(title)}</title><style>{CSS}</style></head><body><main><h1>{html.escape(title)}</h1>"
+        f'<p class="lead">{html.escape(_about(trained, flights))}</p>{body}</main></body></html>\n'
+    )
+    out = Path(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(page, encoding="utf-8")
+    return out
+
+
+def _about(runs: list[Run], logs: list[Log]) -> str:
+    parts = []
+    if runs:
+        names = sorted({f"{r.task} with {r.algo}" for r in runs})
+        parts.append(f"{len(runs)} training{'s' if len(runs) > 1 else ''}: {', '.join(names)}.")
+    for log in logs:
+        parts.append(f"{log.path.name}: {len(log)} ticks of {1e3 * log.dt:g} ms.")
+    return " ".join(parts) + f" nearl {__version__}."
+
+
+def _or_sentence(figures: list[str], given: list[Any], none: str, empty: str) -> str:
+    return "".join(figures) or _none(empty if given else none)
+
+
+def _none(sentence: str) -> str:
+    return f'<p class="none">{html.escape(sentence)}</p>'
+
+
+def _results(
+    runs: list[Run],
+    evaluations: list[tuple[str, dict[str, Any]]],
+    loops: list[tuple[str, dict[str, Any]]],
+    logs: list[Log],
+) -> str:
+    parts = []
+    if evaluations:
+        head = ["evaluation", "mode", "return", "episodes", "raw proposals outside", "targets outside", "reached outside"]
+        parts.append(_table("Episodes without exploration", head, [_evaluation_row(*e) for e in evaluations]))
+    if runs:
+        head = ["training", "seed", "steps", "return at the end", "raw proposals outside", "targets outside", "steps/s"]
+        parts.append(_table("Trainings", head, [_run_row(run) for run in runs]))
+    loop_head = ["loop", "ticks", "raw proposals outside", "targets outside", "compute p50", "p99", "p99.9", "max", "late wake p99", "overruns"]
+    rows = [_loop_row(*s) for s in loops] or [_log_row(log) for log in logs]
+    if rows:
+        parts.append(_table("Real-time loop [µs]", loop_head, rows))
+    return "".join(parts)
+
+
+def _evaluation_row(name: str, e: dict[str, Any]) -> list[str]:
+    returns = np.asarray(e["returns"], float)
+    spread = f" ± {returns.std():.1f}" if len(returns) > 1 else ""
+    mean = f"{returns.mean():.1f}{spread}" if len(returns) else "–"
+    return [name, str(e["mode"]), mean, str(len(returns)), *(_share(e.get(k), e.get("ticks")) for k in ("raw_violations", "target_violations", "reached_violations"))]
+
+
+def _run_row(run: Run) -> list[str]:
+    def last(column: str) -> float | None:
+        found = run.column(column)
+        return None if found is None else float(np.mean(found[1][-10:]))
+
+    end = training.final_return(run)
+    raw, target, fps = last("constraints/raw_violations"), last("constraints/target_violations"), last("time/fps")
+    return [
+        f"{run.task}, {run.algo}",
+        "–" if run.seed is None else str(run.seed),
+        "–" if end is None else f"{end[1]:,.0f}",
+        "–" if end is None else f"{end[0]:.1f}",
+        *("–" if x is None else f"{100 * x:.2f} %" for x in (raw, target)),
+        "–" if fps is None else f"{fps:,.0f}",
+    ]
+
+
+def _loop_row(name: str, s: dict[str, Any]) -> list[str]:
+    counters = s.get("counters", {})
+    us = [f"{s['compute'][p] * 1e-3:.1f}" for p in ("p50", "p99", "p999", "max")]
+    return [
+        name,
+        f"{s['ticks']:,}",
+        _count(counters.get("raw_violations")),
+        _count(counters.get("projected_violations")),
+        *us,
+        f"{s['wake']['p99'] * 1e-3:.1f}",
+        _count(counters.get("overruns")),
+    ]
+
+
+def _log_row(log: Log) -> list[str]:
+    c = log.columns
+    us = [f"{p:.1f}" for p in flight.percentiles((c["end_ns"] - c["begin_ns"]) * 1e-3)]
+    wake = flight.percentiles((c["begin_ns"] - c["due_ns"]) * 1e-3)[1]
+    outside = [_share(int(np.nansum(c[k] > 0)), len(log)) for k in ("raw_violations", "target_violations")]
+    return [log.path.stem, f"{len(log):,}", *outside, *us, f"{wake:.1f}", _count(np.nanmax(c["overruns"]))]
+
+
+def _share(part: float | None, whole: float | None) -> str:
+    return "–" if part is None or not whole else f"{100 * part / whole:.2f} %"
+
+
+def _count(n: float | None) -> str:
+    return "–" if n is None or not np.isfinite(n) else f"{int(n):,}"
+
+
+def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    cells = "".join(f"<th>{html.escape(h)}</th>" for h in head)
+    lines = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
+    return f'<h3>{html.escape(caption)}</h3><div class="scroll"><table><thead><tr>{cells}</tr></thead><tbody>{lines}</tbody></table></div>'
+
+
+def _flights(logs: list[Log]) -> list[tuple[str, str]]:
+    if not logs:
+        return [("Flight", _none("No flight log was given (--log): no constraint timeline, no states, no latency."))]
+    sections = []
+    for log in logs:
+        picture, sentence = flight.timeline(log)
+        parts = [picture or _none(sentence), flight.states(log) or _none("No tick of this flight had a target."), flight.latency(log)]
+        modes = {mode: log.mode.count(mode) for mode in sorted(set(log.mode))}
+        words = ", ".join(f"{n:,} {mode}" for mode, n in modes.items())
+        metadata = f" Metadata: {json.dumps(log.metadata, ensure_ascii=False)[:400]}" if log.metadata else ""
+        lead = f'<p class="lead">{html.escape(f"Ticks by mode: {words}.{metadata}")}</p>'
+        sections.append((f"Flight {log.path.name}", lead + "".join(parts)))
+    return sections

@@ -1,0 +1,204 @@
+"""Run folders, flight logs and JSON summaries as arrays."""
+
+import csv
+import io
+import json
+import re
+import struct
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class ReadError(ValueError):
+    """A file that is not what it was given as."""
+
+
+@dataclass
+class Run:
+    """One training."""
+
+    path: Path
+    task: str
+    algo: str
+    seed: int | None
+    metrics: dict[str, Floats]
+
+    def column(self, name: str) -> tuple[Floats, Floats] | None:
+        """Steps and values of a metric where it has values; None where it has none."""
+        steps, values = self.metrics.get("time/total_timesteps"), self.metrics.get(name)
+        if steps is None or values is None:
+            return None
+        good = np.isfinite(steps) & np.isfinite(values)
+        return (steps[good], values[good]) if good.any() else None
+
+
+def read_run(path: Path) -> Run:
+    """``task.toml``, ``env.json`` and ``metrics.csv`` of a run folder; the first two may be missing."""
+    file = path / "metrics.csv"
+    if not file.is_file():
+        raise ReadError(f"'{path}' is not a run folder: it has no metrics.csv; give a folder written by 'nearl train'")
+    with file.open(newline="") as text:
+        rows = list(csv.reader(text))
+    if not rows or not rows[0]:
+        raise ReadError(f"'{file}' is empty; the training stopped before its first update")
+    header, rows = rows[0], [row for row in rows[1:] if len(row) == len(rows[0])]  # the last row may be half written
+    metrics = {name: np.array([_number(row[i]) for row in rows]) for i, name in enumerate(header)}
+    host = _json(path / "env.json") if (path / "env.json").is_file() else {}
+    task = path.parent.name
+    if (path / "task.toml").is_file():
+        task = tomllib.loads((path / "task.toml").read_text()).get("name", task)
+    named = re.fullmatch(r"(.+)_(\d+)", path.name)
+    algo = host.get("algo") or (named[1] if named else path.name)
+    seed = host.get("seed", int(named[2]) if named else None)
+    return Run(path, task or "task", algo, seed, metrics)
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return float("nan")
+
+
+@dataclass
+class Log:
+    """One flight, tick by tick (n). Rows of ticks without an action are NaN in proposal, target and action."""
+
+    path: Path
+    metadata: dict[str, str]
+    columns: dict[str, Floats]
+    q: Floats
+    v: Floats
+    proposal_q: Floats
+    proposal_v: Floats
+    target_q: Floats
+    target_v: Floats
+    mode: list[str]
+    active: list[list[dict[str, Any]]] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.mode)
+
+    @property
+    def time(self) -> Floats:
+        """Seconds since the first tick was due."""
+        due = self.columns["due_ns"]
+        return (due - due[0]) * 1e-9
+
+    @property
+    def dt(self) -> float:
+        """Control period [s]: the metadata's, else the median distance of ticks."""
+        if "dt" in self.metadata:
+            return float(self.metadata["dt"])
+        gaps = np.diff(self.columns["due_ns"])
+        return float(np.median(gaps)) * 1e-9 if len(gaps) else float("nan")
+
+    def names(self, n: int) -> list[str]:
+        """Names of the degrees of freedom: the metadata's ``joints``, else numbers."""
+        text = self.metadata.get("joints", "")
+        given = json.loads(text) if text.startswith("[") else [x for x in re.split(r"[,\s]+", text) if x]
+        return given if len(given) == n else [f"joint {i}" for i in range(n)]
+
+
+_NUMBERS = {
+    "tick": ("tick",),
+    "due_ns": ("due_ns",),
+    "begin_ns": ("begin_ns",),
+    "end_ns": ("end_ns",),
+    "overruns": ("overruns",),
+    "stale": ("stale",),
+    "policy_version": ("policy_version",),
+    "seq": ("state", "seq"),
+    "episode": ("state", "episode"),
+    "reward": ("state", "reward"),
+    "raw_violations": ("ledger", "raw_violations"),
+    "target_violations": ("ledger", "projected_violations"),
+    "moved": ("ledger", "moved"),
+    "active": ("ledger", "active"),
+    "iterations": ("ledger", "iterations"),
+    "projection_ns": ("ledger", "duration_ns"),
+}
+
+
+def read_log(path: Path) -> Log:
+    """A flight log (MCAP, topic ``tick``, JSON messages)."""
+    try:
+        from mcap.exceptions import McapError
+        from mcap.reader import make_reader
+    except ImportError as error:
+        raise ReadError("reading a flight log needs the mcap package: pip install 'nearl[viz]'") from error
+    stream = io.BytesIO(path.read_bytes())  # so that what fails below is the content
+    metadata: dict[str, str] = {}
+    try:
+        reader = make_reader(stream)
+        ticks = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=["tick"])]
+        for record in reader.iter_metadata():
+            metadata.update(record.metadata)
+    except (McapError, ValueError, OSError, EOFError, struct.error) as error:
+        raise ReadError(f"'{path}' is not a flight log that can be read ({error}); give a file written by 'nearl run --log'") from error
+    if not ticks:
+        raise ReadError(f"'{path}' holds no ticks; the loop never ran")
+    columns = {name: np.array([_at(tick, keys) for tick in ticks]) for name, keys in _NUMBERS.items()}
+    table = {key: _table([tick.get(key) for tick in ticks]) for key in ("proposal_q", "proposal_v", "target_q", "target_v")}
+    state = {key: _table([tick.get("state", {}).get(key) for tick in ticks]) for key in ("q", "v")}
+    active = [tick.get("ledger", {}).get("active_rows") or [] for tick in ticks]
+    return Log(path, metadata, columns, **state, **table, mode=[str(tick.get("mode")) for tick in ticks], active=active)
+
+
+def _at(tick: dict[str, Any], keys: tuple[str, ...]) -> float:
+    value: Any = tick
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return float("nan") if value is None else float(value)
+
+
+def _table(rows: list[list[float] | None]) -> Floats:
+    width = max((len(row) for row in rows if row), default=0)
+    table = np.full((len(rows), width), np.nan)
+    for i, row in enumerate(rows):
+        if row and len(row) == width:
+            table[i] = [np.nan if x is None else x for x in row]
+    return table
+
+
+def read_evaluations(path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Every evaluation (``nearl eval --json``) in a JSON file, whatever it is wrapped in, with a name."""
+    found = list(_find(_json(path), {"mode", "returns"}, path.stem))
+    if not found:
+        raise ReadError(f"'{path}' holds no evaluation; give the output of 'nearl eval --json'")
+    return found
+
+
+def read_summaries(path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Every loop report (``nearl run --json``) in a JSON file, whatever it is wrapped in, with a name."""
+    found = list(_find(_json(path), {"compute", "wake", "ticks"}, path.stem))
+    if not found:
+        raise ReadError(f"'{path}' holds no report of a loop; give the output of 'nearl run --json'")
+    return found
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ReadError(f"'{path}' is not JSON: {error}") from error
+
+
+def _find(node: Any, keys: set[str], name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    if isinstance(node, dict):
+        if keys <= node.keys():
+            yield node.get("robot") or name, node
+            return
+        for key, child in node.items():
+            yield from _find(child, keys, key)
+    elif isinstance(node, list):
+        for child in node:
+            yield from _find(child, keys, name)

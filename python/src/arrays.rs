@@ -1,0 +1,70 @@
+//! Numbers in and out.
+
+use numpy::{AllowTypeChange, PyArray1, PyArray2, PyArrayLikeDyn, PyArrayMethods, PyUntypedArrayMethods};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+/// A vector of `expected` numbers; `name` is what the message calls it.
+pub(crate) fn vector(name: &str, value: &Bound<'_, PyAny>, expected: usize) -> PyResult<Vec<f64>> {
+    let array = numbers(name, value)?;
+    if array.shape() != [expected] {
+        return Err(shape(name, array.shape(), &format!("({expected},)")));
+    }
+    values(&array)
+}
+
+/// Rows of `columns` numbers each, row by row, and how many there are.
+pub(crate) fn rows(name: &str, value: &Bound<'_, PyAny>, columns: usize) -> PyResult<(Vec<f64>, usize)> {
+    let array = numbers(name, value)?;
+    match array.shape() {
+        [n, width] if *width == columns => Ok((values(&array)?, *n)),
+        other => Err(shape(name, other, &format!("(n, {columns})"))),
+    }
+}
+
+/// The same where the number of rows is known.
+pub(crate) fn matrix(name: &str, value: &Bound<'_, PyAny>, n: usize, columns: usize) -> PyResult<Vec<f64>> {
+    let (values, given) = rows(name, value, columns)?;
+    if given == n { Ok(values) } else { Err(shape(name, &[given, columns], &format!("({n}, {columns})"))) }
+}
+
+fn numbers<'py>(
+    name: &str,
+    value: &Bound<'py, PyAny>,
+) -> PyResult<PyArrayLikeDyn<'py, f64, AllowTypeChange>> {
+    value.extract().map_err(|_| {
+        let kind = value.get_type().to_string();
+        PyValueError::new_err(format!("{name} is not an array of numbers but {kind}; pass a NumPy array"))
+    })
+}
+
+/// In C order, whatever the strides were.
+fn values(array: &PyArrayLikeDyn<'_, f64, AllowTypeChange>) -> PyResult<Vec<f64>> {
+    Ok(match array.as_slice() {
+        Ok(slice) => slice.to_vec(),
+        Err(_) => array.as_array().iter().copied().collect(),
+    })
+}
+
+fn shape(name: &str, given: &[usize], expected: &str) -> PyErr {
+    let given = match given {
+        [n] => format!("({n},)"),
+        _ => format!("({})", given.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")),
+    };
+    PyValueError::new_err(format!("{name} has shape {given}, expected {expected}"))
+}
+
+/// A NumPy vector.
+pub(crate) fn array<'py>(py: Python<'py>, values: &[f64]) -> Bound<'py, PyArray1<f64>> {
+    PyArray1::from_slice(py, values)
+}
+
+/// A NumPy matrix from its rows.
+pub(crate) fn array2<'py>(
+    py: Python<'py>,
+    values: Vec<f64>,
+    columns: usize,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let n = values.len().checked_div(columns).unwrap_or(0);
+    PyArray1::from_vec(py, values).reshape([n, columns])
+}

@@ -1,0 +1,210 @@
+//! One native environment.
+
+use std::sync::Mutex;
+
+use nearl_trainer::env::{self, ChaCha8Rng, Fault, SeedableRng};
+use numpy::PyArray1;
+use pyo3::prelude::*;
+
+use crate::arrays::{array, vector};
+use crate::errors;
+
+/// What is wrong with a period, for `info`; none when nothing is.
+pub(crate) fn fault_name(fault: Fault) -> Option<&'static str> {
+    match fault {
+        Fault::None => None,
+        Fault::Action => Some("action not finite"),
+        Fault::Unstable => Some("simulation unstable"),
+        Fault::Engine => Some("MuJoCo error"),
+    }
+}
+
+/// Names of the tasks that [`Env`] can make, with a line about each.
+#[pyfunction]
+pub(crate) fn tasks() -> Vec<(&'static str, &'static str)> {
+    env::REGISTRY.iter().map(|entry| (entry.name, entry.about)).collect()
+}
+
+struct Inner {
+    env: Box<dyn env::Env>,
+    rng: ChaCha8Rng,
+}
+
+impl Inner {
+    fn observation(&self) -> Vec<f64> {
+        let mut obs = vec![0.0; self.env.spec().n_obs()];
+        self.env.observe(&mut obs);
+        obs
+    }
+}
+
+/// A task on one simulated robot, without Gymnasium's ceremony (see `nearl.Env`).
+#[pyclass(module = "nearl._core", frozen)]
+pub(crate) struct Env {
+    inner: Mutex<Inner>,
+    spec: env::Spec,
+}
+
+type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, bool, Option<&'static str>);
+
+#[pymethods]
+impl Env {
+    #[new]
+    fn new(py: Python<'_>, task: &str) -> PyResult<Env> {
+        let env = py.detach(|| env::make(task)).map_err(errors::value)?;
+        let spec = env.spec().clone();
+        Ok(Env { inner: Mutex::new(Inner { env, rng: ChaCha8Rng::seed_from_u64(0) }), spec })
+    }
+
+    /// Starts an episode from the task's own distribution; `seed` restarts the random stream. Returns the observation.
+    #[pyo3(signature = (seed=None))]
+    fn reset<'py>(&self, py: Python<'py>, seed: Option<u64>) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let obs = self.with(py, |inner| {
+            if let Some(seed) = seed {
+                inner.rng = ChaCha8Rng::seed_from_u64(seed);
+            }
+            inner.env.reset(&mut inner.rng).map(|()| inner.observation())
+        });
+        Ok(array(py, &obs.map_err(errors::value)?))
+    }
+
+    /// Starts an episode from `qpos` (nq) and `qvel` (nv), MuJoCo's convention. Returns the observation.
+    fn set_state<'py>(
+        &self,
+        py: Python<'py>,
+        qpos: &Bound<'py, PyAny>,
+        qvel: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let (qpos, qvel) = (vector("qpos", qpos, self.spec.nq)?, vector("qvel", qvel, self.spec.nv)?);
+        let obs = self.with(py, |inner| inner.env.set_state(&qpos, &qvel).map(|()| inner.observation()));
+        Ok(array(py, &obs.map_err(errors::value)?))
+    }
+
+    /// Simulates one control period. Returns observation, reward, terminated, and the fault's name if the physics failed.
+    fn step<'py>(&self, py: Python<'py>, action: &Bound<'py, PyAny>) -> PyResult<Stepped<'py>> {
+        let action = vector("action", action, self.spec.n_act())?;
+        if let Some(i) = action.iter().position(|a| !a.is_finite()) {
+            let name = &self.spec.actuators[i].name;
+            return Err(errors::value(format!(
+                "action[{i}] ('{name}') is {}: every entry must be finite; check the policy's output",
+                action[i]
+            )));
+        }
+        let (step, obs) = self.with(py, |inner| (inner.env.step(&action), inner.observation()));
+        Ok((array(py, &obs), step.reward, step.terminated, fault_name(step.fault)))
+    }
+
+    /// The observation (n_obs).
+    fn observe<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array(py, &self.with(py, |inner| inner.observation()))
+    }
+
+    /// Configuration (nq) and velocity (nv) in Pinocchio's convention, as `Projector` and `Controller` take them.
+    fn state<'py>(&self, py: Python<'py>) -> (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>) {
+        let (mut q, mut v) = (vec![0.0; self.spec.nq], vec![0.0; self.spec.nv]);
+        self.with(py, |inner| inner.env.state(&mut q, &mut v));
+        (array(py, &q), array(py, &v))
+    }
+
+    /// Configuration (nq), MuJoCo's convention.
+    #[getter]
+    fn qpos<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array(py, &self.with(py, |inner| inner.env.qpos().to_vec()))
+    }
+
+    /// Velocity (nv), MuJoCo's convention.
+    #[getter]
+    fn qvel<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array(py, &self.with(py, |inner| inner.env.qvel().to_vec()))
+    }
+
+    /// What the task asks for; empty where it has no goal.
+    #[getter]
+    fn goal<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array(py, &self.with(py, |inner| inner.env.goal().to_vec()))
+    }
+
+    #[setter]
+    fn set_goal(&self, goal: &Bound<'_, PyAny>) -> PyResult<()> {
+        let py = goal.py();
+        let goal: Vec<f64> = goal.extract().map_err(|_| errors::value("goal is not a vector of numbers"))?;
+        self.with(py, |inner| inner.env.set_goal(&goal)).map_err(errors::value)
+    }
+
+    /// Name of the task.
+    #[getter]
+    fn task(&self) -> &str {
+        self.spec.name
+    }
+
+    /// Names of the observation's entries (n_obs).
+    #[getter]
+    fn obs_names(&self) -> Vec<String> {
+        self.spec.obs.clone()
+    }
+
+    /// Joints in MuJoCo's order.
+    #[getter]
+    fn joint_names(&self) -> Vec<String> {
+        self.spec.joints.iter().map(|j| j.name.clone()).collect()
+    }
+
+    /// What each entry of the action moves (n_act).
+    #[getter]
+    fn actuator_names(&self) -> Vec<String> {
+        self.spec.actuators.iter().map(|a| a.name.clone()).collect()
+    }
+
+    /// Smallest action (n_act).
+    #[getter]
+    fn action_low<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array(py, &self.spec.action_low().collect::<Vec<_>>())
+    }
+
+    /// Largest action (n_act).
+    #[getter]
+    fn action_high<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array(py, &self.spec.action_high().collect::<Vec<_>>())
+    }
+
+    /// Entries of a configuration.
+    #[getter]
+    fn nq(&self) -> usize {
+        self.spec.nq
+    }
+
+    /// Degrees of freedom.
+    #[getter]
+    fn nv(&self) -> usize {
+        self.spec.nv
+    }
+
+    /// Control period [s].
+    #[getter]
+    fn dt(&self) -> f64 {
+        self.spec.dt
+    }
+
+    /// Control periods after which an episode is truncated by those who count.
+    #[getter]
+    fn max_episode_steps(&self) -> usize {
+        self.spec.max_episode_steps
+    }
+
+    /// The robot file's text.
+    #[getter]
+    fn model_text(&self, py: Python<'_>) -> &'static str {
+        self.with(py, |inner| inner.env.model_text())
+    }
+
+    fn __repr__(&self) -> String {
+        format!("Env('{}', {} observations, {} actions)", self.spec.name, self.spec.n_obs(), self.spec.n_act())
+    }
+}
+
+impl Env {
+    /// Runs `f` on the environment with the interpreter released.
+    fn with<R: Send>(&self, py: Python<'_>, f: impl FnOnce(&mut Inner) -> R + Send) -> R {
+        py.detach(|| f(&mut self.inner.lock().unwrap_or_else(std::sync::PoisonError::into_inner)))
+    }
+}

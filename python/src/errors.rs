@@ -1,0 +1,27 @@
+//! Rust errors as Python exceptions, with the same sentence.
+
+use nearl_constraints::ModelError;
+use nearl_runtime::SnapshotError;
+use pyo3::PyErr;
+use pyo3::exceptions::{PyOSError, PyValueError};
+
+/// What the user gave is wrong.
+pub(crate) fn value(error: impl std::fmt::Display) -> PyErr {
+    PyValueError::new_err(error.to_string())
+}
+
+/// A robot file.
+pub(crate) fn model(error: ModelError) -> PyErr {
+    match error {
+        ModelError::Unreadable { .. } => PyOSError::new_err(error.to_string()),
+        other => value(other),
+    }
+}
+
+/// A snapshot.
+pub(crate) fn snapshot(error: SnapshotError) -> PyErr {
+    match error {
+        SnapshotError::Unreadable { .. } => PyOSError::new_err(error.to_string()),
+        other => value(other),
+    }
+}

@@ -1,0 +1,167 @@
+//! One environment of a vector, with its buffers, its random stream and its time limit.
+
+use nearl_trainer::env::{ChaCha8Rng, Env, EnvError, Fault, SeedableRng};
+use nearl_runtime::{Controller, Noise, Output, State};
+
+/// When an episode that ended is begun anew (<https://farama.org/Vector-Autoreset-Mode>).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Autoreset {
+    /// In the next step, whose action is ignored.
+    NextStep,
+    /// In the same step; the last observation of the old episode is kept aside.
+    SameStep,
+}
+
+/// What a round does in every lane.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Work {
+    /// Begins an episode.
+    Reset,
+    /// One action.
+    Step(Autoreset),
+}
+
+/// Proposals instead of torques: the action is the next state that a policy would propose.
+///
+/// The controller's own policy is all zeros with unit deviation, so that the noise it is given is the change that is
+/// proposed, `proposal_k = s_k + scale_k noise_k`: the action takes the way every proposal takes.
+pub(crate) struct Proposing {
+    pub(crate) controller: Controller,
+    pub(crate) scale: Vec<f64>,
+    pub(crate) state: State,
+    pub(crate) noise: Noise,
+    pub(crate) out: Output,
+}
+
+/// What the projection did in a step, over its control ticks.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Projected {
+    /// Ticks whose raw proposal broke a limit.
+    pub(crate) raw_violations: u32,
+    /// Ticks whose target broke a limit, by the independent check.
+    pub(crate) target_violations: u32,
+    /// Weighted distance between proposal and target, the largest.
+    pub(crate) moved: f64,
+}
+
+/// One environment of a vector.
+pub(crate) struct Lane {
+    pub(crate) env: Box<dyn Env>,
+    pub(crate) proposing: Option<Proposing>,
+    pub(crate) rng: ChaCha8Rng,
+    pub(crate) max_steps: usize,
+    pub(crate) action: Vec<f64>,
+    pub(crate) obs: Vec<f64>,
+    pub(crate) final_obs: Option<Vec<f64>>,
+    pub(crate) reward: f64,
+    pub(crate) terminated: bool,
+    pub(crate) truncated: bool,
+    pub(crate) fault: Fault,
+    pub(crate) projected: Projected,
+    pub(crate) error: Option<EnvError>,
+    ticks: usize,
+    ended: bool,
+}
+
+impl Lane {
+    pub(crate) fn new(env: Box<dyn Env>, proposing: Option<Proposing>, n_action: usize, max_steps: usize, seed: u64) -> Lane {
+        let obs = vec![0.0; env.spec().n_obs()];
+        Lane {
+            env,
+            proposing,
+            rng: ChaCha8Rng::seed_from_u64(seed),
+            max_steps,
+            action: vec![0.0; n_action],
+            obs,
+            final_obs: None,
+            reward: 0.0,
+            terminated: false,
+            truncated: false,
+            fault: Fault::None,
+            projected: Projected::default(),
+            error: None,
+            ticks: 0,
+            ended: false,
+        }
+    }
+
+    pub(crate) fn run(&mut self, work: Work) {
+        (self.reward, self.terminated, self.truncated, self.final_obs) = (0.0, false, false, None);
+        (self.fault, self.projected) = (Fault::None, Projected::default());
+        match work {
+            Work::Step(_) if !self.ended => self.step(),
+            _ => self.reset(),
+        }
+        self.ended = self.terminated || self.truncated;
+        if let (Work::Step(Autoreset::SameStep), true) = (work, self.ended) {
+            self.final_obs = Some(self.obs.clone());
+            self.reset();
+            self.ended = false;
+        }
+    }
+
+    /// An episode that begins in `qpos` and `qvel`, MuJoCo's convention.
+    pub(crate) fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError> {
+        self.env.set_state(qpos, qvel)?;
+        self.begin();
+        Ok(())
+    }
+
+    fn reset(&mut self) {
+        self.error = self.env.reset(&mut self.rng).err();
+        self.begin();
+    }
+
+    fn begin(&mut self) {
+        (self.ticks, self.ended) = (0, false);
+        if let Some(p) = &mut self.proposing {
+            p.controller.reset();
+        }
+        self.env.observe(&mut self.obs);
+    }
+
+    fn step(&mut self) {
+        match &mut self.proposing {
+            None => {
+                let step = self.env.step(&self.action);
+                (self.reward, self.terminated, self.fault) = (step.reward, step.terminated, step.fault);
+                self.ticks += 1;
+            }
+            Some(p) => {
+                p.want(&self.action, &*self.env);
+                while self.ticks < self.max_steps && !self.terminated {
+                    let step = p.tick(&mut *self.env, &mut self.projected);
+                    (self.reward, self.terminated, self.fault) = (self.reward + step.reward, step.terminated, step.fault);
+                    self.ticks += 1;
+                    if self.ticks.is_multiple_of(p.controller.policy_every()) {
+                        break;
+                    }
+                }
+            }
+        }
+        self.truncated = self.ticks >= self.max_steps && !self.terminated;
+        self.env.observe(&mut self.obs);
+    }
+}
+
+impl Proposing {
+    /// Noise that makes the controller propose `state` (n_state).
+    fn want(&mut self, state: &[f64], env: &dyn Env) {
+        env.observe(&mut self.state.obs);
+        let layout = self.controller.layout();
+        for (k, s) in state.iter().enumerate() {
+            self.noise.proposal[k] = ((s - self.state.obs[layout.state()[k]]) / self.scale[k]) as f32;
+        }
+    }
+
+    fn tick(&mut self, env: &mut dyn Env, projected: &mut Projected) -> nearl_trainer::env::Step {
+        env.observe(&mut self.state.obs);
+        env.state(&mut self.state.q, &mut self.state.v);
+        self.controller.update(&self.state, &self.noise, &mut self.out);
+        let ledger = &self.out.next.ledger;
+        projected.raw_violations += u32::from(ledger.raw_violations.total() > 0);
+        projected.target_violations += u32::from(ledger.violations.total() > 0);
+        projected.moved = projected.moved.max(ledger.moved);
+        env.step(&self.out.action)
+    }
+}

@@ -1,0 +1,229 @@
+//! The robot model and its equations of motion.
+
+use std::path::PathBuf;
+use std::sync::{Mutex, PoisonError};
+
+use nearl_constraints::{self as constraints, Dynamics, convention};
+use numpy::{PyArray1, PyArray2};
+use pyo3::prelude::*;
+
+use crate::arrays::{array, array2, vector};
+use crate::errors;
+
+type Vector<'py> = Bound<'py, PyArray1<f64>>;
+
+/// A robot from a URDF or MJCF file, through Pinocchio. Configurations and velocities are in Pinocchio's convention; they differ
+/// from MuJoCo's for a free base only, and `q_from_mujoco` and its like translate.
+#[pyclass(module = "nearl._core", frozen)]
+pub(crate) struct Model {
+    pub(crate) model: constraints::Model,
+    dynamics: Mutex<Dynamics>,
+}
+
+#[pymethods]
+impl Model {
+    /// Reads a URDF file; the base is fixed to the world.
+    #[staticmethod]
+    fn from_urdf(py: Python<'_>, path: PathBuf) -> PyResult<Model> {
+        py.detach(|| constraints::Model::from_urdf(&path)).map(Model::of).map_err(errors::model)
+    }
+
+    /// Reads an MJCF file.
+    #[staticmethod]
+    fn from_mjcf(py: Python<'_>, path: PathBuf) -> PyResult<Model> {
+        py.detach(|| constraints::Model::from_mjcf(&path)).map(Model::of).map_err(errors::model)
+    }
+
+    /// Reads a URDF text.
+    #[staticmethod]
+    fn from_urdf_text(py: Python<'_>, text: &str) -> PyResult<Model> {
+        py.detach(|| constraints::Model::from_urdf_text(text)).map(Model::of).map_err(errors::model)
+    }
+
+    /// Reads an MJCF text.
+    #[staticmethod]
+    fn from_mjcf_text(py: Python<'_>, text: &str) -> PyResult<Model> {
+        py.detach(|| constraints::Model::from_mjcf_text(text)).map(Model::of).map_err(errors::model)
+    }
+
+    /// Entries of a configuration.
+    #[getter]
+    fn nq(&self) -> usize {
+        self.model.nq()
+    }
+
+    /// Degrees of freedom.
+    #[getter]
+    fn nv(&self) -> usize {
+        self.model.nv()
+    }
+
+    /// Joints in the order of the degrees of freedom.
+    #[getter]
+    fn joint_names(&self) -> Vec<String> {
+        self.model.joints().iter().map(|j| j.name.clone()).collect()
+    }
+
+    /// `(idx_q, nq, idx_v, nv)` of a joint.
+    fn joint(&self, name: &str) -> PyResult<(usize, usize, usize, usize)> {
+        let joint = self.model.joint(name).map_err(errors::model)?;
+        Ok((joint.idx_q, joint.nq, joint.idx_v, joint.nv))
+    }
+
+    /// Lower position limits (nq) [rad or m]; minus infinity is none.
+    #[getter]
+    fn lower_position_limit<'py>(&self, py: Python<'py>) -> Vector<'py> {
+        array(py, self.model.lower_position_limit())
+    }
+
+    /// Upper position limits (nq) [rad or m]; infinity is none.
+    #[getter]
+    fn upper_position_limit<'py>(&self, py: Python<'py>) -> Vector<'py> {
+        array(py, self.model.upper_position_limit())
+    }
+
+    /// Velocity limits (nv) [rad/s or m/s]; infinity is none.
+    #[getter]
+    fn velocity_limit<'py>(&self, py: Python<'py>) -> Vector<'py> {
+        array(py, self.model.velocity_limit())
+    }
+
+    /// Effort limits (nv) [N·m or N]; infinity is none.
+    #[getter]
+    fn effort_limit<'py>(&self, py: Python<'py>) -> Vector<'py> {
+        array(py, self.model.effort_limit())
+    }
+
+    /// Rotor inertia (nv) [kg·m² or kg], already in the mass matrix.
+    #[getter]
+    fn armature<'py>(&self, py: Python<'py>) -> Vector<'py> {
+        array(py, self.model.armature())
+    }
+
+    /// Viscous damping (nv) [N·m·s/rad or N·s/m].
+    #[getter]
+    fn damping<'py>(&self, py: Python<'py>) -> Vector<'py> {
+        array(py, self.model.damping())
+    }
+
+    /// Mass of everything that moves [kg].
+    #[getter]
+    fn total_mass(&self) -> f64 {
+        self.model.total_mass()
+    }
+
+    /// Forces the robot file describes that are not part of this model.
+    #[getter]
+    fn notes(&self) -> Vec<String> {
+        self.model.notes().to_vec()
+    }
+
+    /// The neutral configuration (nq).
+    fn neutral<'py>(&self, py: Python<'py>) -> Vector<'py> {
+        array(py, &self.model.neutral())
+    }
+
+    /// Mass matrix (nv x nv) [kg·m² or kg], armature included.
+    fn mass_matrix<'py>(&self, q: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let q_ = self.q("q", q)?;
+        let mut mass = vec![0.0; self.model.nv() * self.model.nv()];
+        self.dynamics().mass(&q_, &mut mass);
+        array2(q.py(), mass, self.model.nv())
+    }
+
+    /// Coriolis, centrifugal and gravity forces (nv) [N·m or N].
+    fn nle<'py>(&self, q: &Bound<'py, PyAny>, v: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+        let (q, v_) = (self.q("q", q)?, self.v("v", v)?);
+        Ok(self.tangent(v.py(), |d, out| d.nle(&q, &v_, out)))
+    }
+
+    /// Inverse dynamics `tau = M a + nle` (nv), without springs and dampers: a motor supplies `tau - passive(q, v)`.
+    fn rnea<'py>(&self, q: &Bound<'py, PyAny>, v: &Bound<'py, PyAny>, a: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+        let (q, v_, a) = (self.q("q", q)?, self.v("v", v)?, self.v("a", a)?);
+        Ok(self.tangent(v.py(), |d, out| d.rnea(&q, &v_, &a, out)))
+    }
+
+    /// Forward dynamics `a = M^-1 (tau - nle)` (nv).
+    fn aba<'py>(&self, q: &Bound<'py, PyAny>, v: &Bound<'py, PyAny>, tau: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+        let (q, v_, tau) = (self.q("q", q)?, self.v("v", v)?, self.v("tau", tau)?);
+        Ok(self.tangent(v.py(), |d, out| d.aba(&q, &v_, &tau, out)))
+    }
+
+    /// Forces of the joints' springs and dampers (nv) [N·m or N].
+    fn passive<'py>(&self, q: &Bound<'py, PyAny>, v: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+        let (q, v_) = (self.q("q", q)?, self.v("v", v)?);
+        Ok(self.tangent(v.py(), |d, out| d.passive(&q, &v_, out)))
+    }
+
+    /// The configuration (nq) reached from `q` along the tangent displacement `dq` (nv).
+    fn integrate<'py>(&self, q: &Bound<'py, PyAny>, dq: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+        let (q_, dq) = (self.q("q", q)?, self.v("dq", dq)?);
+        let mut out = vec![0.0; self.model.nq()];
+        self.dynamics().integrate(&q_, &dq, &mut out);
+        Ok(array(q.py(), &out))
+    }
+
+    /// The tangent displacement (nv) from `q0` to `q1` (nq).
+    fn difference<'py>(&self, q0: &Bound<'py, PyAny>, q1: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+        let (a, b) = (self.q("q0", q0)?, self.q("q1", q1)?);
+        Ok(self.tangent(q0.py(), |d, out| d.difference(&a, &b, out)))
+    }
+
+    /// Configuration (nq) from MuJoCo's.
+    fn q_from_mujoco<'py>(&self, qpos: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+        let (given, mut q) = (self.q("qpos", qpos)?, vec![0.0; self.model.nq()]);
+        convention::q_from_mujoco(&self.model, &given, &mut q);
+        Ok(array(qpos.py(), &q))
+    }
+
+    /// Velocity (nv) from MuJoCo's, at the configuration `q` (not `qpos`).
+    fn v_from_mujoco<'py>(&self, q: &Bound<'py, PyAny>, qvel: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+        let (q_, given) = (self.q("q", q)?, self.v("qvel", qvel)?);
+        Ok(self.tangent(q.py(), |_, out| convention::v_from_mujoco(&self.model, &q_, &given, out)))
+    }
+
+    /// Acceleration (nv) from MuJoCo's, at the state (`q`, `v`).
+    fn a_from_mujoco<'py>(
+        &self,
+        q: &Bound<'py, PyAny>,
+        v: &Bound<'py, PyAny>,
+        qacc: &Bound<'py, PyAny>,
+    ) -> PyResult<Vector<'py>> {
+        let (q_, v, given) = (self.q("q", q)?, self.v("v", v)?, self.v("qacc", qacc)?);
+        Ok(self.tangent(q.py(), |_, out| convention::a_from_mujoco(&self.model, &q_, &v, &given, out)))
+    }
+
+    /// Generalised force (nv) in MuJoCo's coordinates.
+    fn tau_to_mujoco<'py>(&self, q: &Bound<'py, PyAny>, tau: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+        let (q_, given) = (self.q("q", q)?, self.v("tau", tau)?);
+        Ok(self.tangent(q.py(), |_, out| convention::tau_to_mujoco(&self.model, &q_, &given, out)))
+    }
+
+    fn __repr__(&self) -> String {
+        format!("Model(nq={}, nv={}, joints={:?})", self.model.nq(), self.model.nv(), self.joint_names())
+    }
+}
+
+impl Model {
+    pub(crate) fn of(model: constraints::Model) -> Model {
+        Model { dynamics: Mutex::new(Dynamics::new(&model)), model }
+    }
+
+    pub(crate) fn q(&self, name: &str, value: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
+        vector(name, value, self.model.nq())
+    }
+
+    pub(crate) fn v(&self, name: &str, value: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
+        vector(name, value, self.model.nv())
+    }
+
+    fn dynamics(&self) -> std::sync::MutexGuard<'_, Dynamics> {
+        self.dynamics.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn tangent<'py>(&self, py: Python<'py>, f: impl FnOnce(&mut Dynamics, &mut [f64])) -> Vector<'py> {
+        let mut out = vec![0.0; self.model.nv()];
+        f(&mut self.dynamics(), &mut out);
+        array(py, &out)
+    }
+}

@@ -1,0 +1,101 @@
+"""Pinocchio through our model against MuJoCo's own Python package, on all five robots."""
+
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from conftest import ROBOTS
+
+import nearl
+
+GYMNASIUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+FILES = {
+    "HalfCheetah-v5": GYMNASIUM / "half_cheetah.xml",
+    "Hopper-v5": GYMNASIUM / "hopper.xml",
+    "Walker2d-v5": GYMNASIUM / "walker2d_v5.xml",
+    "Ant-v5": GYMNASIUM / "ant.xml",
+    "Panda-reach": ROBOTS / "panda" / "panda.urdf",
+}
+
+
+@pytest.fixture(params=FILES)
+def pair(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[nearl.Model, mujoco.MjModel]:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings into the working directory
+    path = FILES[request.param]
+    ours = nearl.Model.from_urdf(path) if path.suffix == ".urdf" else nearl.Model.from_mjcf(path)
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    off = mujoco.mjtDisableBit
+    theirs.opt.disableflags |= off.mjDSBL_CONTACT | off.mjDSBL_LIMIT
+    return ours, theirs
+
+
+def states(theirs: mujoco.MjModel, rng: np.random.Generator, n: int = 50):
+    data = mujoco.MjData(theirs)
+    for _ in range(n):
+        data.qpos[:] = theirs.qpos0
+        mujoco.mj_integratePos(theirs, data.qpos, rng.uniform(-1, 1, theirs.nv), 1.0)
+        data.qvel[:] = rng.normal(size=theirs.nv)
+        mujoco.mj_forward(theirs, data)
+        yield data
+
+
+def close(ours: np.ndarray, theirs: np.ndarray, tolerance: float) -> None:
+    assert np.abs(ours - theirs).max() <= tolerance * max(1e-3, np.abs(theirs).max())
+
+
+def test_sizes_mass_and_motors(pair) -> None:
+    ours, theirs = pair
+    assert (ours.nq, ours.nv) == (theirs.nq, theirs.nv)
+    assert ours.total_mass == pytest.approx(theirs.body_subtreemass[0], rel=1e-13)
+    assert ours.joint_names == [theirs.joint(i).name for i in range(theirs.njnt)]
+    for i in range(theirs.nu):
+        dof = theirs.jnt_dofadr[theirs.actuator_trnid[i, 0]]
+        assert ours.effort_limit[dof] == pytest.approx(theirs.actuator_gear[i, 0] * theirs.actuator_ctrlrange[i, 1])
+
+
+def test_mass_matrix(pair, rng) -> None:
+    ours, theirs = pair
+    for data in states(theirs, rng):
+        full = np.zeros((theirs.nv, theirs.nv))
+        mujoco.mj_fullM(theirs, data, full)
+        q = ours.q_from_mujoco(data.qpos)
+        mass = ours.mass_matrix(q)
+        # v_pinocchio = V v_mujoco and the kinetic energy is one: M_mujoco = V' M V.
+        change = np.stack([ours.v_from_mujoco(q, column) for column in np.eye(theirs.nv)], axis=1)
+        assert np.array_equal(mass, mass.T)
+        close(change.T @ mass @ change, full, 1e-12)
+
+
+def test_non_linear_effects(pair, rng) -> None:
+    ours, theirs = pair
+    for data in states(theirs, rng):
+        q = ours.q_from_mujoco(data.qpos)
+        v = ours.v_from_mujoco(q, data.qvel)
+        # MuJoCo's bias is the force at MuJoCo's zero acceleration.
+        bias = ours.rnea(q, v, ours.a_from_mujoco(q, v, np.zeros(theirs.nv)))
+        close(ours.tau_to_mujoco(q, bias), data.qfrc_bias, 1e-11)
+        assert np.abs(ours.nle(q, v) - ours.rnea(q, v, np.zeros(ours.nv))).max() < 1e-9
+        close(ours.tau_to_mujoco(q, ours.passive(q, v)), data.qfrc_passive, 1e-12)
+
+
+def test_inverse_dynamics(pair, rng) -> None:
+    ours, theirs = pair
+    for data in states(theirs, rng):
+        data.qacc[:] = 10 * rng.normal(size=theirs.nv)
+        qacc = data.qacc.copy()
+        mujoco.mj_inverse(theirs, data)
+        q = ours.q_from_mujoco(data.qpos)
+        v = ours.v_from_mujoco(q, data.qvel)
+        a = ours.a_from_mujoco(q, v, qacc)
+        tau = ours.rnea(q, v, a) - ours.passive(q, v)
+        close(ours.tau_to_mujoco(q, tau), data.qfrc_inverse, 1e-10)
+        close(ours.aba(q, v, ours.rnea(q, v, a)), a, 1e-8)
+
+
+def test_integrate_and_difference_invert_each_other(pair, rng) -> None:
+    ours, theirs = pair
+    for data in states(theirs, rng, 10):
+        q, dq = ours.q_from_mujoco(data.qpos), rng.uniform(-0.5, 0.5, ours.nv)
+        np.testing.assert_allclose(ours.difference(q, ours.integrate(q, dq)), dq, atol=1e-12)

@@ -1,0 +1,200 @@
+"""The projector against quadprog on problems put together here, from the formulas and not from our code."""
+
+import numpy as np
+import pytest
+import quadprog
+from conftest import robot
+
+import nearl
+
+A_MAX, SCALE = 20.0, 0.9
+Array = np.ndarray
+
+
+def upper_acceleration(d: Array, v: Array, speed: Array, dt: float, n: int) -> Array:
+    """Largest acceleration from which braking with A_MAX still ends in front of the limit at distance ``d``.
+
+    Del Prete (RA-L 2018) for n = 0; for n semi-implicit Euler sub-steps of length tau, the set
+    (v - A tau / 2)_+^2 <= 2 A d.
+    """
+    tau, kappa = (0.0, 0.5) if n == 0 else (dt / n, (n + 1) / (2 * n))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if n:
+            inside = np.min([2 * (d - j * tau * v) / (tau**2 * j * (j + 1)) for j in range(1, n + 1)], axis=0)
+        else:
+            end = 2 * (d - dt * v) / dt**2
+            inside = np.where((v <= 0) | (end > -v / dt), end, np.minimum(-(v**2) / (2 * d), -v / dt))
+        w = v - A_MAX * tau / 2
+        b, c = 2 * w * dt + 2 * A_MAX * kappa * dt**2, w**2 - 2 * A_MAX * (d - dt * v)
+        root = (-b + np.sqrt(b**2 - 4 * dt**2 * c)) / (2 * dt**2)
+    braking = np.where(np.isnan(root), -w / dt, np.fmax(root, -w / dt))
+    return np.min([np.full_like(v, A_MAX), (speed - v) / dt, inside, braking], axis=0)
+
+
+class Problem:
+    """min 1/2 y'H y + c'y s.t. box and torque rows, for one state and proposal."""
+
+    def __init__(self, model: nearl.Model, q: Array, v: Array, dt: float, n: int):
+        self.model, self.q, self.v, self.dt = model, q, v, dt
+        self.kappa = 0.5 if n == 0 else (n + 1) / (2 * n)
+        speed, low, high = SCALE * model.velocity_limit, model.lower_position_limit, model.upper_position_limit
+        self.upper = dt * upper_acceleration(high - q, v, speed, dt, n)
+        self.lower = -dt * upper_acceleration(q - low, -v, speed, dt, n)
+        self.rows = model.mass_matrix(q) / dt
+        offset = model.nle(q, v) - model.passive(q, v)
+        self.row_lower, self.row_upper = -model.effort_limit - offset, model.effort_limit - offset
+
+    def solve(self, q_hat: Array, v_hat: Array) -> Array | None:
+        nv = len(self.v)
+        y_q, y_v = (q_hat - self.q - self.dt * self.v) / (self.kappa * self.dt), v_hat - self.v
+        G = np.vstack([np.eye(nv), -np.eye(nv), self.rows, -self.rows])
+        h = np.concatenate([self.upper, -self.lower, self.row_upper, -self.row_lower])
+        try:
+            return quadprog.solve_qp(2 * np.eye(nv), y_q + y_v, -G.T, -h)[0]
+        except ValueError:
+            return None  # nothing satisfies all rows
+
+    def violation(self, y: Array) -> float:
+        """Largest violation: of the box in rad/s, of a torque row as a share of its limit."""
+        torque = np.maximum(self.rows @ y - self.row_upper, self.row_lower - self.rows @ y) / self.model.effort_limit
+        return max((y - self.upper).max(), (self.lower - y).max(), torque.max())
+
+
+def viable_state(model: nearl.Model, rng: np.random.Generator, n: int, dt: float) -> tuple[Array, Array]:
+    low, high = model.lower_position_limit, model.upper_position_limit
+    q = low + (high - low) * rng.uniform(0.001, 0.999, model.nq)
+    tau = dt / n if n else 0.0
+    brake = lambda d: np.sqrt(2 * A_MAX * d) + A_MAX * tau / 2  # noqa: E731
+    speed = SCALE * model.velocity_limit
+    v = rng.uniform(-np.minimum(speed, 0.98 * brake(q - low)), np.minimum(speed, 0.98 * brake(high - q)))
+    return q, v
+
+
+def make(model: nearl.Model, dt: float, n: int, **settings) -> nearl.Projector:
+    limits = [
+        nearl.PositionLimit(model),
+        nearl.VelocityLimit(model, scale=SCALE),
+        nearl.AccelerationLimit(model, A_MAX),
+        nearl.TorqueLimit(model),
+    ]
+    return nearl.Projector(model, limits, dt=dt, sub_steps=n, **settings)
+
+
+def cases(model: nearl.Model, rng: np.random.Generator, count: int, dt: float, n: int):
+    for _ in range(count):
+        q, v = viable_state(model, rng, n, dt)
+        size = 10.0 ** rng.uniform(-2, 2)
+        v_hat = v + size * A_MAX * dt * rng.normal(size=model.nv)
+        q_hat = q + dt * v + size * A_MAX * dt**2 * rng.normal(size=model.nq)
+        yield Problem(model, q, v, dt, n), q_hat, v_hat
+
+
+@pytest.mark.parametrize("solver, tolerance", [("ladder", 1e-6), ("clarabel", 1e-5)])
+@pytest.mark.parametrize("dt, n", [(1e-3, 1), (1e-2, 0), (1e-2, 5)])
+def test_targets_are_the_optimum(model, rng, dt, n, solver, tolerance) -> None:
+    projector = make(model, dt, n, solver=solver)
+    solved = torque_active = 0
+    for problem, q_hat, v_hat in cases(model, rng, 300, dt, n):
+        target = projector.project(problem.q, problem.v, q_hat, v_hat)
+        optimum = problem.solve(q_hat, v_hat)
+        y = target.v - problem.v
+        if optimum is None:
+            assert target.status == "braked" and target.reason == "no answer passed the checker"
+            continue
+        assert target.is_ok, f"{target.status}: {target.reason}"
+        solved += 1
+        torque_active += any(row["kind"] == "torque" for row in target.active)
+        distance = np.linalg.norm(y - optimum) / max(np.linalg.norm(optimum), A_MAX * dt)
+        assert distance <= tolerance, f"{target.status} {target.rung}: {distance}"
+        assert problem.violation(y) <= 1e-9
+        assert target.violations["torque"] == 0 and target.slack <= 1e-9
+        np.testing.assert_allclose(target.q, problem.q + dt * problem.v + problem.kappa * dt * y, atol=1e-12)
+    assert solved > 250 and torque_active > 20, f"{solved} solved, {torque_active} with torque rows active"
+
+
+@pytest.mark.parametrize("dt, n", [(1e-3, 1), (1e-2, 0)])
+def test_feasible_proposals_pass_bit_for_bit(model, rng, dt, n) -> None:
+    projector = make(model, dt, n)
+    passed = 0
+    while passed < 200:
+        q, v = viable_state(model, rng, n, dt)
+        problem = Problem(model, q, v, dt, n)
+        y = problem.lower + (problem.upper - problem.lower) * rng.uniform(0.05, 0.95, model.nv)
+        if problem.violation(y) > -1e-6:
+            continue
+        passed += 1
+        q_hat, v_hat = q + dt * v + problem.kappa * dt * y, v + y
+        target = projector.project(q, v, q_hat, v_hat)
+        assert target.status == "unchanged" and target.moved == 0 and target.active == []
+        assert np.array_equal(target.q, q_hat) and np.array_equal(target.v, v_hat)
+
+
+def test_the_problem_it_states_is_the_problem_it_solves(model, rng) -> None:
+    projector = make(model, 1e-3, 1)
+    for problem, q_hat, v_hat in cases(model, rng, 50, 1e-3, 1):
+        H, c, G, h = projector.problem(problem.q, problem.v, q_hat, v_hat)
+        optimum = problem.solve(q_hat, v_hat)
+        if optimum is None:
+            continue
+        stated = quadprog.solve_qp(H, -c, -G.T, -h)[0]
+        np.testing.assert_allclose(stated, optimum, atol=1e-8 * max(1.0, np.abs(optimum).max()))
+
+
+def test_a_batch_is_its_rows(model, rng) -> None:
+    projector = make(model, 1e-3, 1)
+    rows = [(p.q, p.v, q_hat, v_hat) for p, q_hat, v_hat in cases(model, rng, 101, 1e-3, 1)]
+    batch = [np.stack(x) for x in zip(*rows, strict=True)]
+    for threads in (1, 3, None):
+        targets = projector.project_batch(*batch, threads=threads)
+        assert len(targets) == 101 and targets.q.shape == (101, model.nq)
+        for i, row in enumerate(rows):
+            one = projector.project(*row)
+            assert np.array_equal(targets.q[i], one.q) and np.array_equal(targets.v[i], one.v)
+            assert targets.status[i] == one.status == targets[i].status
+            assert targets.moved[i] == one.moved and targets[i].active == one.active
+    assert len(projector.project_batch(*[x[:0] for x in batch])) == 0
+
+
+def test_multipliers_balance_the_pull_of_the_proposal(model, rng) -> None:
+    """Stationarity, with the rows as the ledger lists them: H (y - goal) + mu + G' lambda = 0."""
+    dt = 1e-3
+    projector = make(model, dt, 1)
+    for problem, q_hat, v_hat in cases(model, rng, 100, dt, 1):
+        target = projector.project(problem.q, problem.v, q_hat, v_hat)
+        if target.status != "solved":
+            continue
+        y = target.v - problem.v
+        pull = (q_hat - problem.q - dt * problem.v) / dt + v_hat - problem.v - 2 * y
+        held = np.zeros(model.nv)
+        for row in target.active:
+            sign = 1.0 if row["side"] == "upper" else -1.0
+            direction = problem.rows[row["dof"]] if row["kind"] == "torque" else np.eye(model.nv)[row["dof"]]
+            assert row["multiplier"] >= 0 and row["name"] == model.joint_names[row["dof"]]
+            held += sign * row["multiplier"] * direction
+        np.testing.assert_allclose(held, pull, atol=1e-6 * max(1.0, np.abs(pull).max()))
+
+
+def test_only_controllable_joints_move(rng) -> None:
+    model = robot("legs")
+    mine = ["thigh0", "calf2"]
+    limits = [nearl.PositionLimit(model), nearl.VelocityLimit(model), nearl.AccelerationLimit(model, A_MAX)]
+    for consistency in ("kinematic", "free"):
+        projector = nearl.Projector(model, limits, dt=1e-3, controllable=mine, consistency=consistency)
+        assert sorted(projector.controllable) == sorted(mine)
+        q, v = viable_state(model, rng, 1, 1e-3)
+        q_hat, v_hat = q + rng.normal(size=12), v + rng.normal(size=12)
+        target = projector.project(q, v, q_hat, v_hat)
+        kept = [i for i, name in enumerate(model.joint_names) if name not in mine]
+        moved = [i for i in range(12) if i not in kept]
+        assert np.array_equal(target.q[kept], q_hat[kept]) and np.array_equal(target.v[kept], v_hat[kept])
+        assert np.all(np.abs(target.v[moved] - v[moved]) <= A_MAX * 1e-3 + 1e-12)
+
+
+def test_nothing_finite_comes_back_as_anything_else(model) -> None:
+    projector, zero = make(model, 1e-3, 1), np.zeros(model.nv)
+    q = (model.lower_position_limit + model.upper_position_limit) / 2
+    bad = projector.project(q, zero, np.full(model.nq, np.nan), zero)
+    assert bad.status == "braked" and np.isfinite(bad.q).all() and np.array_equal(bad.v, zero)
+    lost = projector.project(np.full(model.nq, np.nan), zero, q, zero)
+    assert lost.status == "refused" and np.isfinite(lost.q).all() and not lost.is_ok
+    assert projector.project(q, zero, q, zero).status == "unchanged", "nothing of it stays behind"

@@ -1,0 +1,117 @@
+"""The report from a synthetic run: what must be in it, and what is said where something is missing."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+
+from nearl import curves, report
+from nearl.report import flight
+from nearl.report.read import ReadError, read_log, read_run
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
+    root = tmp_path_factory.mktemp("inputs")
+    runs = [synthetic.run_folder(root, "HalfCheetah-v5", algo, seed, top) for algo, top in (("pid2-ib", 4000), ("ppo", 3000)) for seed in range(3)]
+    return {
+        "runs": runs,
+        "logs": [synthetic.flight_log(root / "panda.mcap")],
+        "evals": [synthetic.evaluations(root / "eval.json")],
+        "summaries": [synthetic.summary(root / "summary.json")],
+    }
+
+
+def text_of(page: Path) -> str:
+    return re.sub(r"<[^>]+>", " ", re.sub(r"<style>.*?</style>", "", page.read_text(), flags=re.S))
+
+
+def test_everything_is_in_one_file(inputs, tmp_path) -> None:
+    page = report.build(tmp_path / "report.html", **inputs)
+    html, words = page.read_text(), text_of(page)
+    assert not re.search(r"(src|href)=\"(?!data:)", html), "nothing is fetched"
+    assert "<script" not in html and "url(" not in html
+    assert html.count("data:image/png") == 6
+    for part in ("HalfCheetah-v5, pid2-ib", "21.00 %", "4116.7", "95 % bootstrap", "threshold", "Rows that hold the target back", "later than the control period", "overruns", "9.1", "320.0"):
+        assert part in words or part in html, part
+
+
+def test_what_is_missing_is_said(inputs, tmp_path) -> None:
+    words = text_of(report.build(tmp_path / "r.html", runs=inputs["runs"][3:4]))
+    assert "No flight log was given" in words and "learned no inverse model" in words and "project nothing" in words
+    words = text_of(report.build(tmp_path / "r.html", logs=inputs["logs"]))
+    assert words.count("No run folder was given") == 3
+
+
+def test_the_command(inputs, tmp_path) -> None:
+    out = tmp_path / "report.html"
+    command = [sys.executable, "-m", "nearl.report", "--out", str(out)]
+    assert subprocess.run([*command, "--run", *map(str, inputs["runs"][:2])], check=True, capture_output=True, text=True).stdout.strip() == str(out)
+    failed = subprocess.run([*command, "--run", str(tmp_path)], capture_output=True, text=True)
+    assert failed.returncode == 1 and failed.stderr.startswith("nearl.report: ") and "no metrics.csv" in failed.stderr
+    assert failed.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("content", [b"", b"not mcap", b"\x89MCAP0\r\n"])
+def test_a_broken_log_is_refused_in_a_sentence(tmp_path, content) -> None:
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(content)
+    with pytest.raises(ReadError, match=r"broken\.mcap.*(cannot|can) be read|holds no ticks"):
+        read_log(path)
+
+
+def test_the_pull_from_states_is_the_sum_of_the_multipliers(tmp_path) -> None:
+    """Without torque rows active, what is worked out from the states is what the ledger says, row by row."""
+    path = synthetic.flight_log(tmp_path / "rows.mcap", 2000, {"joints": "a b c d e f g"}, rows=True)
+    log = read_log(path)
+    recorded = flight.active_rows(log)
+    log.active = []
+    derived = flight.active_rows(log)
+    assert any("position" in n or "viability" in n for n in recorded.names) and all(n[0] in "abcdefg" for n in recorded.names)
+    total = np.zeros((7, len(log)))
+    for name, values in zip(recorded.names, recorded.multiplier, strict=True):
+        if "torque" not in name:
+            total["abcdefg".index(name[0])] += np.where(np.isfinite(values), values, 0.0) * (1 if "↑" in name else -1)
+    pull = np.zeros((7, len(log)))
+    for name, values in zip(derived.names, derived.multiplier, strict=True):
+        pull["abcdefg".index(name[0])] += np.where(np.isfinite(values), values, 0.0) * (1 if "↑" in name else -1)
+    torque = np.zeros(len(log), bool)
+    for name, values in zip(recorded.names, recorded.multiplier, strict=True):
+        torque |= np.isfinite(values) & ("torque" in name)
+    assert (~torque).sum() > 1000
+    np.testing.assert_allclose(pull[:, ~torque], total[:, ~torque], atol=1e-6)
+
+
+def test_a_row_cut_short_is_left_out(inputs) -> None:
+    run = read_run(inputs["runs"][0])
+    assert run.algo == "pid2-ib" and run.seed == 0 and len(run.metrics["time/fps"]) == 244
+    assert len(run.column("rollout/ep_rew_mean")[0]) == 242
+
+
+def test_interquartile_mean_by_hand() -> None:
+    assert curves.interquartile_mean([1.0, 2.0, 3.0, 100.0]) == 2.5
+    assert curves.interquartile_mean([5.0]) == 5.0 and curves.interquartile_mean([1.0, 2.0]) == 1.5
+    # Three values: a quarter of 3 is 0.75, so the outer two count by a quarter each: (0.25 + 2 + 0.25 * 9) / 1.5.
+    assert curves.interquartile_mean([9.0, 1.0, 2.0]) == pytest.approx((0.25 * 1 + 2 + 0.25 * 9) / 1.5)
+    assert np.array_equal(curves.interquartile_mean([[0, 1], [2, 3]], axis=1), [0.5, 2.5])
+
+
+def test_the_band_covers_the_truth_about_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    covered = 0
+    for i in range(200):
+        low, high = curves.bootstrap_band(rng.normal(3.0, 1.0, size=20), resamples=400, seed=i)
+        covered += low <= 3.0 <= high
+    assert 172 <= covered <= 198  # 95 % of 200 is 190; a percentile bootstrap of 20 values covers a little less
+
+
+def test_curves_meet_where_all_seeds_have_values() -> None:
+    band = curves.over_seeds([([0, 10, 20], [0, 10, 20]), ([5, 30], [7, 32]), ([0, 20], [np.nan, 1])][:2], points=4)
+    assert np.array_equal(band.steps, [5, 10, 15, 20]) and np.allclose(band.centre, band.steps + 1)
+    with pytest.raises(ValueError, match="no steps in common"):
+        curves.over_seeds([([0, 1], [0, 0]), ([5, 6], [0, 0])])
+    assert np.array_equal(curves.smooth([1, 2, 3, 4], 2), [1, 1.5, 2.5, 3.5])

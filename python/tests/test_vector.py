@@ -1,0 +1,119 @@
+"""A vector is its single environments, on any number of threads; and its constrained form is the controller's path."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import ROBOTS
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import nearl
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("task", ["Hopper-v5", "Ant-v5", "Panda-reach"])
+def test_a_vector_equals_single_environments(task: str, mode: AutoresetMode) -> None:
+    steps, n = 150, 5
+    make = lambda: gymnasium.make(f"nearl/{task}", max_episode_steps=60)  # noqa: E731
+    singles = SyncVectorEnv([make] * n, autoreset_mode=mode)
+    vec = nearl.VecEnv(task, n, threads=3, max_episode_steps=60, autoreset_mode=mode)
+    assert vec.metadata["autoreset_mode"] is mode
+    assert vec.action_space == singles.action_space and vec.observation_space == singles.observation_space
+    assert np.array_equal(vec.reset(seed=11)[0], singles.reset(seed=11)[0])
+    vec.action_space.seed(5)
+    ended = np.zeros(2, int)
+    for _ in range(steps):
+        actions = vec.action_space.sample()
+        ours, theirs = vec.step(actions), singles.step(actions)
+        for a, b in zip(ours[:4], theirs[:4], strict=True):
+            assert np.array_equal(a, b) and a.dtype == b.dtype
+        ended += ours[2].sum(), ours[3].sum()
+        assert ("final_obs" in ours[4]) == ("final_obs" in theirs[4])
+        if "final_obs" in ours[4]:
+            assert np.array_equal(ours[4]["_final_obs"], theirs[4]["_final_obs"])
+            for a, b in zip(ours[4]["final_obs"], theirs[4]["final_obs"], strict=True):
+                assert (a is None and b is None) or np.array_equal(a, b)
+    assert ended[1] > 0, "the comparison covers truncations"
+    assert ended[0] > 0 or task != "Hopper-v5", "the comparison covers terminations"
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    def run(threads: int) -> np.ndarray:
+        vec = nearl.make_vec("Walker2d-v5", 7, seed=2, threads=threads)
+        rng = np.random.default_rng(0)
+        first, _ = vec.reset()
+        return np.concatenate([first, *[vec.step(rng.uniform(-1, 1, (7, 6)))[0] for _ in range(100)]])
+
+    assert np.array_equal(run(1), run(4))
+
+
+def test_python_runs_while_a_vector_steps() -> None:
+    vec = nearl.make_vec("Ant-v5", 32, threads=1)
+    vec.reset(seed=0)
+    with ThreadPoolExecutor(1) as pool:
+        job = pool.submit(lambda: [vec.step(np.zeros((32, 8)))[0] for _ in range(5)])
+        turns = 0
+        while not job.done():
+            turns += 1
+        assert len(job.result()) == 5
+    assert turns > 100, "the interpreter was held"
+
+
+def test_learned_inverse_dynamics_needs_a_snapshot() -> None:
+    with pytest.raises(ValueError, match="HalfCheetah-v5.*learned inverse model.*snapshot"):
+        nearl.make_vec("HalfCheetah-v5", 2, constraints="task")
+    with pytest.raises(OSError, match="nowhere.safetensors"):
+        nearl.make_vec("HalfCheetah-v5", 2, constraints="nowhere.safetensors")
+
+
+def test_constraints_hold_in_the_simulator_whatever_is_proposed() -> None:
+    vec = nearl.make_vec("Panda-reach", 4, constraints="task", seed=1)
+    assert vec.native.action_names == [f"{x}.panda_joint{i}" for x in "qv" for i in range(1, 8)]
+    model = nearl.Model.from_urdf(ROBOTS / "panda" / "panda.urdf")
+    low, high = model.lower_position_limit, model.upper_position_limit
+    rng = np.random.default_rng(3)
+    vec.reset(seed=1)
+    raw = 0
+    for _ in range(120):
+        wild = np.concatenate([rng.uniform(low - 1, high + 1, (4, 7)), rng.uniform(-9, 9, (4, 7))], axis=1)
+        _, _, terminated, _, info = vec.step(wild)
+        raw += info["raw_violations"].sum()
+        assert not terminated.any() and info["target_violations"].sum() == 0
+        assert np.all(vec.native.qpos > low + 0.01 - 1e-9) and np.all(vec.native.qpos < high - 0.01 + 1e-9)
+        assert np.all(np.abs(vec.native.qvel) < 0.9 * model.velocity_limit + 1e-9)
+    assert raw > 1000, "the proposals would have broken limits"
+
+
+def test_a_constrained_step_is_cubic_projection_and_inverse_dynamics() -> None:
+    """The same step put together from the parts in Python."""
+    vec = nearl.make_vec("Panda-reach", 1, constraints="task", seed=4)
+    obs = vec.reset(seed=4)[0][0]
+    model = nearl.Model.from_urdf(ROBOTS / "panda" / "panda.urdf")
+    limits = [
+        nearl.PositionLimit(model, 0.01),
+        nearl.VelocityLimit(model, scale=0.9),
+        nearl.AccelerationLimit(model, 10.0),
+        nearl.TorqueLimit(model, 0.95),
+    ]
+    projector = nearl.Projector(model, limits, dt=1e-3, sub_steps=1)
+    env = nearl.Env("Panda-reach")
+    env.reset(seed=4)
+    rng = np.random.default_rng(8)
+    for _ in range(10):
+        q0, v0 = env.state
+        wanted = np.concatenate([q0 + rng.uniform(-0.3, 0.3, 7), rng.uniform(-1, 1, 7)])
+        obs = vec.step(wanted[None])[0][0]
+        q1, v1, period = wanted[:7], wanted[7:], 0.02
+        for j in range(1, 21):
+            s = j / 20
+            # Hermite's cubic through (q0, v0) and (q1, v1), in its basis functions.
+            h = [2 * s**3 - 3 * s**2 + 1, s**3 - 2 * s**2 + s, -2 * s**3 + 3 * s**2, s**3 - s**2]
+            d = [6 * s**2 - 6 * s, 3 * s**2 - 4 * s + 1, -6 * s**2 + 6 * s, 3 * s**2 - 2 * s]
+            ends = [q0, period * v0, q1, period * v1]
+            proposal = [sum(a * b for a, b in zip(f, ends, strict=True)) for f in (h, d)]
+            q, v = env.state
+            target = projector.project(q, v, proposal[0], proposal[1] / period)
+            tau = model.rnea(q, v, target.acceleration) - model.passive(q, v)
+            env.step(tau)
+        np.testing.assert_allclose(obs[:14], np.concatenate(env.state), atol=2e-6)
