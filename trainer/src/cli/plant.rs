@@ -44,7 +44,7 @@ impl PlantCommand {
         let name = RobotName::new(&self.name)?;
         let link = PlantLink::open(&name, &plant.robot(self.lockstep))?;
         let mut settings =
-            if self.lockstep { PlantSettings::lockstep(dt) } else { PlantSettings::real_time(dt) };
+            if self.lockstep { PlantSettings::lockstep(dt) } else { PlantSettings::simulator(dt) };
         settings.ticks = self.seconds.map(|s| (s / dt).round() as u64);
         let stop = Stop::on_signals()?;
         if !self.json {
