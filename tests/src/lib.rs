@@ -32,7 +32,8 @@ pub fn request(task: &str, algo: &str, seed: u64, threads: usize, set: &[&str]) 
 pub fn random_policy(task: &str, seed: u64, gain: f32) -> Snapshot {
     let mut snapshot = training(task, "pid2-ib", seed, 1, &[]).snapshot().clone();
     let mut rng = rollout::stream(seed, 7);
-    let mut weight = |n: usize| (0..n).map(|_| gain * (2.0 * rng.random::<f32>() - 1.0)).collect::<Vec<f32>>();
+    let mut weight =
+        |n: usize| (0..n).map(|_| gain * (2.0 * rng.random::<f32>() - 1.0)).collect::<Vec<f32>>();
     let networks = &mut snapshot.networks;
     let layers = networks.policy.layers.iter().map(|l| DenseLayer {
         n_in: l.n_in,

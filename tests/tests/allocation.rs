@@ -30,7 +30,8 @@ static ALLOCATOR: Counting = Counting;
 
 /// Allocations and Clarabel solves of `ticks` updates in closed loop.
 fn count(snapshot: &nearl_runtime::Snapshot, ticks: usize) -> (u64, u64) {
-    let (mut env, mut controller) = (make_env(snapshot).expect("env"), Controller::new(snapshot).expect("controller"));
+    let (mut env, mut controller) =
+        (make_env(snapshot).expect("env"), Controller::new(snapshot).expect("controller"));
     let (mut state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
     env.reset(&mut stream(0, 0)).expect("reset");
     let (mut allocations, mut solves) = (0, 0);

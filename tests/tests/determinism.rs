@@ -32,7 +32,8 @@ fn deployment_repeats_training() {
         let file = folder.path().join("s.safetensors");
         t.snapshot().save(&file).expect("save");
         let loaded = Snapshot::load(&file).expect("load");
-        let (mut a, mut b) = (Controller::new(t.snapshot()).expect("a"), Controller::new(&loaded).expect("b"));
+        let (mut a, mut b) =
+            (Controller::new(t.snapshot()).expect("a"), Controller::new(&loaded).expect("b"));
         let (mut env, mut state) = (make_env(&loaded).expect("env"), a.state());
         let (mut out_a, mut out_b, noise) = (a.output(), b.output(), a.noise());
         env.reset(&mut stream(5, 0)).expect("reset");
@@ -55,7 +56,8 @@ fn deployment_repeats_training() {
 #[test]
 fn history_does_not_matter() {
     let t = training("Panda-reach", "pid2-ib", 0, 1, &[]);
-    let (mut fresh, mut used) = (Controller::new(t.snapshot()).expect("a"), Controller::new(t.snapshot()).expect("b"));
+    let (mut fresh, mut used) =
+        (Controller::new(t.snapshot()).expect("a"), Controller::new(t.snapshot()).expect("b"));
     let (mut state, noise) = (fresh.state(), fresh.noise());
     let (mut out_fresh, mut out_used) = (fresh.output(), used.output());
     for i in 0..1000 {

@@ -55,13 +55,28 @@ fn a_random_network_breaks_no_limit_of_the_panda() {
     for seed in [1, 2] {
         let o = run(seed, true, TICKS / 2);
         let broken = (o.position, o.velocity, o.torque);
-        assert_eq!(broken, (0, 0, 0), "seed {seed}: worst excess {:e}, targets refused {}", o.worst, o.refused);
-        assert_eq!((o.refused, o.braked), (0, 0), "seed {seed}: every target is certified and none needed the brake");
+        assert_eq!(
+            broken,
+            (0, 0, 0),
+            "seed {seed}: worst excess {:e}, targets refused {}",
+            o.worst,
+            o.refused
+        );
+        assert_eq!(
+            (o.refused, o.braked),
+            (0, 0),
+            "seed {seed}: every target is certified and none needed the brake"
+        );
     }
 }
 
 #[test]
 fn without_projection_the_same_network_breaks_them() {
     let o = run(1, false, TICKS / 10);
-    assert!(o.position + o.velocity > 100, "position {}, velocity {}: the test above could not fail", o.position, o.velocity);
+    assert!(
+        o.position + o.velocity > 100,
+        "position {}, velocity {}: the test above could not fail",
+        o.position,
+        o.velocity
+    );
 }

@@ -14,6 +14,8 @@ mod net;
 pub mod optimise;
 pub mod pid2;
 pub mod ppo;
+#[cfg(test)]
+mod reference;
 
 pub use adam::Adam;
 pub use batch::Batch;
@@ -53,4 +55,13 @@ pub trait Learner: Send {
     fn values(&mut self, x: &[f32]) -> Vec<f32>;
     /// Learns from a batch; `rate` scales every learning rate, `rng` orders the minibatches and draws latent noise.
     fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics;
+}
+
+/// Mean and standard deviation, for tests.
+#[cfg(test)]
+pub(crate) fn stats_of(x: &[f32]) -> (f64, f64) {
+    let n = x.len() as f64;
+    let mean = x.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
+    let variance = x.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n;
+    (mean, variance.sqrt())
 }

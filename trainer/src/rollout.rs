@@ -283,10 +283,17 @@ impl Worker {
         {
             column.clear();
         }
-        (s.sampled.clear(), s.action.clear(), s.log_prob.clear(), s.reward.clear());
-        (s.terminated.clear(), s.truncated.clear(), s.final_x.clear());
+        s.sampled.clear();
+        s.action.clear();
+        s.log_prob.clear();
+        s.reward.clear();
+        s.terminated.clear();
+        s.truncated.clear();
+        s.final_x.clear();
         self.tally = Tally::default();
-        (self.obs_stats.clear(), self.change_stats.clear(), self.return_stats.clear());
+        for stats in [&mut self.obs_stats, &mut self.change_stats, &mut self.return_stats] {
+            stats.clear();
+        }
     }
 
     /// Collects `n_steps` policy steps.

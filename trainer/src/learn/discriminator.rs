@@ -10,37 +10,37 @@ use nearl_runtime::net::kernel::{LANES, V, ZERO, exp};
 use rand_chacha::ChaCha8Rng;
 
 /// Size of the latent z.
-pub const LATENT: usize = LANES;
+pub(super) const LATENT: usize = LANES;
 
 /// Encoder (`n_obs + n_state -> 2 LATENT`: mean and log variance) and decoder (`LATENT -> 1`: logit of being real).
-pub struct Discriminator {
+pub(super) struct Discriminator {
     encoder: Net,
     decoder: Net,
     bottleneck: bool,
     /// Vectors of its parameters.
-    pub len: usize,
+    pub(super) len: usize,
     /// Vectors of its transposed weights.
-    pub transposed: usize,
+    pub(super) transposed: usize,
 }
 
 /// Buffers of one thread.
-pub struct DiscriminatorWork {
+pub(super) struct DiscriminatorWork {
     encoder: Tape,
     decoder: Tape,
     /// Input rows `[x, change]`.
-    pub input: Vec<V>,
+    pub(super) input: Vec<V>,
     /// Latent noise rows.
-    pub noise: Vec<V>,
+    pub(super) noise: Vec<V>,
     z: Vec<V>,
     d_code: Vec<V>,
     d_logit: Vec<V>,
     /// Logit of each row, densely; the caller replaces it by `dL / d logit`.
-    pub logit: Vec<V>,
+    pub(super) logit: Vec<V>,
 }
 
 impl Discriminator {
     /// One hidden layer of each width in `hidden`: the first for the encoder, the last for the decoder.
-    pub fn new(n_in: usize, hidden: &[usize], bottleneck: bool) -> Self {
+    pub(super) fn new(n_in: usize, hidden: &[usize], bottleneck: bool) -> Self {
         let (mut at, mut transposed) = (0, 0);
         let ends = (&hidden[..1], &hidden[hidden.len() - 1..]);
         let encoder = Net::new(&widths(n_in, ends.0, 2 * LATENT), true, &mut at, &mut transposed);
@@ -48,21 +48,27 @@ impl Discriminator {
         Self { encoder, decoder, bottleneck, len: at, transposed }
     }
 
+    /// Encoder and decoder.
+    #[cfg(test)]
+    pub(super) fn nets(&self) -> (&Net, &Net) {
+        (&self.encoder, &self.decoder)
+    }
+
     /// Orthogonal weights.
-    pub fn init(&self, p: &mut [V], rng: &mut ChaCha8Rng) {
+    pub(super) fn init(&self, p: &mut [V], rng: &mut ChaCha8Rng) {
         for net in [&self.encoder, &self.decoder] {
             net.mlp.write_dense(&init::orthogonal(&net.mlp.widths(), 1.0, rng), p);
         }
     }
 
     /// Refreshes the transposed weights.
-    pub fn refresh(&self, p: &[V], transposed: &mut [V]) {
+    pub(super) fn refresh(&self, p: &[V], transposed: &mut [V]) {
         self.encoder.transpose(p, transposed);
         self.decoder.transpose(p, transposed);
     }
 
     /// Buffers for a tile.
-    pub fn work(&self) -> DiscriminatorWork {
+    pub(super) fn work(&self) -> DiscriminatorWork {
         let n_in = self.encoder.mlp.n_in().div_ceil(LANES);
         DiscriminatorWork {
             encoder: self.encoder.tape(TILE),
@@ -79,7 +85,7 @@ impl Discriminator {
     /// `z = mu + sigma noise`, then the decoder; logits are in `w.logit`. Returns the sum of KL[E || N(0, 1)] over rows:
     /// `sum (sigma^2 + mu^2 - 1) / 2 - log sigma`.
     #[inline(always)]
-    pub fn forward(&self, p: &[V], w: &mut DiscriminatorWork) -> f32 {
+    pub(super) fn forward(&self, p: &[V], w: &mut DiscriminatorWork) -> f32 {
         let code = self.encoder.forward(p, &w.input, &mut w.encoder);
         let mut kl = ZERO;
         for ((z, c), &noise) in w.z.iter_mut().zip(code.chunks_exact(2)).zip(&w.noise) {
@@ -98,7 +104,7 @@ impl Discriminator {
     /// From `dL / d logit` in `w.logit` and a weight on the KL: adds the parameters' gradient to `grad` if given; returns
     /// the input's gradient if `input`.
     #[inline(always)]
-    pub fn backward<'w>(
+    pub(super) fn backward<'w>(
         &self,
         transposed: &[V],
         w: &'w mut DiscriminatorWork,
@@ -125,7 +131,7 @@ impl Discriminator {
 
 /// `-log sigmoid(x)` summed over lanes, for reports.
 #[inline(always)]
-pub fn softplus_sum(logits: &[V], sign: f32) -> f32 {
+pub(super) fn softplus_sum(logits: &[V], sign: f32) -> f32 {
     logits.iter().map(|l| l.0.iter().map(|&x| softplus(-sign * x)).sum::<f32>()).sum()
 }
 
@@ -135,7 +141,7 @@ fn softplus(x: f32) -> f32 {
 
 /// `d/dx -log sigmoid(sign x)`.
 #[inline(always)]
-pub fn logit_slope(logits: &mut [V], sign: f32, weight: f32) {
+pub(super) fn logit_slope(logits: &mut [V], sign: f32, weight: f32) {
     for l in logits {
         *l = sigmoid(*l * V::splat(-sign)) * V::splat(-sign * weight);
     }

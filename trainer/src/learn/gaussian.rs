@@ -18,9 +18,7 @@ pub(super) fn gather(to: &mut [V], vectors: usize, offset: usize, source: &[f32]
 pub(super) fn copy(to: &mut [f32], from: &[f32]) {
     let n = from.len();
     if n < LANES {
-        for k in 0..n {
-            to[k] = from[k];
-        }
+        to.copy_from_slice(from);
         return;
     }
     let mut k = 0;

@@ -13,38 +13,38 @@ use rand_chacha::ChaCha8Rng;
 use std::ops::Range;
 
 /// Network inputs beyond this many standard deviations are clipped, as in the controller.
-pub const CLIP: f32 = nearl_runtime::normaliser::CLIP as f32;
+pub(super) const CLIP: f32 = nearl_runtime::normaliser::CLIP as f32;
 
 /// Mean of I: `[x_c, w_c] -> a`, and where it lies in its parameter group.
-pub struct InverseModel {
+pub(super) struct InverseModel {
     /// The network.
-    pub net: Net,
+    pub(super) net: Net,
     start: usize,
     end: usize,
 }
 
 /// Buffers of one thread.
-pub struct InverseWork {
+pub(super) struct InverseWork {
     /// Activations.
-    pub tape: Tape,
+    pub(super) tape: Tape,
     /// Input rows.
-    pub input: Vec<V>,
+    pub(super) input: Vec<V>,
     /// Action rows.
-    pub action: Vec<V>,
+    pub(super) action: Vec<V>,
     /// Gradient of the output.
-    pub slope: Vec<V>,
+    pub(super) slope: Vec<V>,
 }
 
 impl InverseModel {
     /// Places the network at `at`; `log_std` vectors behind it are the caller's.
-    pub fn new(dims: &Dims, hidden: &[usize], at: &mut usize, transposed: &mut usize) -> Self {
+    pub(super) fn new(dims: &Dims, hidden: &[usize], at: &mut usize, transposed: &mut usize) -> Self {
         let start = *at;
         let net = Net::new(&widths(2 * dims.seen_obs.len(), hidden, dims.n_act), true, at, transposed);
         Self { net, start, end: *at }
     }
 
     /// A model in a group of its own.
-    pub fn alone(dims: &Dims, hidden: &[usize], rng: &mut ChaCha8Rng) -> (Self, Group) {
+    pub(super) fn alone(dims: &Dims, hidden: &[usize], rng: &mut ChaCha8Rng) -> (Self, Group) {
         let (mut at, mut transposed) = (0, 0);
         let model = Self::new(dims, hidden, &mut at, &mut transposed);
         let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
@@ -53,18 +53,18 @@ impl InverseModel {
     }
 
     /// Orthogonal weights; the first mean action is near zero.
-    pub fn init(&self, dims: &Dims, hidden: &[usize], p: &mut [V], rng: &mut ChaCha8Rng) {
+    pub(super) fn init(&self, dims: &Dims, hidden: &[usize], p: &mut [V], rng: &mut ChaCha8Rng) {
         let dense = init::orthogonal(&widths(2 * dims.seen_obs.len(), hidden, dims.n_act), 0.01, rng);
         self.net.mlp.write_dense(&dense, p);
     }
 
     /// Where its parameters lie.
-    pub fn range(&self) -> Range<usize> {
+    pub(super) fn range(&self) -> Range<usize> {
         self.start..self.end
     }
 
     /// Buffers for a tile.
-    pub fn work(&self) -> InverseWork {
+    pub(super) fn work(&self) -> InverseWork {
         let (n_in, n_out) = (self.net.mlp.n_in().div_ceil(LANES), self.net.mlp.n_out().div_ceil(LANES));
         InverseWork {
             tape: self.net.tape(TILE),
@@ -76,12 +76,12 @@ impl InverseModel {
 
     /// `L_I = sum |a - I(s_c, s'_c)|^2 / 2` on reached transitions (Eq. 4 of the paper for the mean of the Gaussian; its
     /// spread is left to the policy gradient, which needs it to explore).
-    pub fn tile(&self, group: &Group, t: &Tile<'_>, dims: &Dims, w: &mut InverseWork, grad: &mut [V]) {
+    pub(super) fn tile(&self, group: &Group, t: &Tile<'_>, dims: &Dims, w: &mut InverseWork, grad: &mut [V]) {
         supervised(self, group, t, dims, w, grad);
     }
 
     /// Mean squared error of the mean action over a batch, per action entry.
-    pub fn error(&self, p: &[V], batch: &Batch, dims: &Dims) -> f64 {
+    pub(super) fn error(&self, p: &[V], batch: &Batch, dims: &Dims) -> f64 {
         let mut w = self.work();
         let (mut sum, mut idx) = (0.0f64, [0u32; TILE]);
         for start in (0..batch.n).step_by(TILE) {

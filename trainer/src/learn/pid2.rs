@@ -14,7 +14,7 @@
 use super::batch::Batch;
 use super::discriminator::{Discriminator, DiscriminatorWork, LATENT, logit_slope, softplus_sum};
 use super::gaussian::{copy, gather, gather_one, inverse_sigma, residuals, residuals_back, surrogate};
-pub use super::inverse::{InverseModel, InverseWork};
+use super::inverse::{InverseModel, InverseWork};
 use super::net::{Net, Tape};
 use super::optimise::{Group, Params, Phases, SUMS, Schedule, TILE, Tile, add_sums, optimise};
 use super::ppo::{
@@ -68,7 +68,7 @@ impl Default for Pid2Settings {
             idm_threshold: 0.5,
             idm_lr: 3e-4,
             discriminator_lr: 3e-4,
-            generator_weight: 0.01,
+            generator_weight: 0.1,
             i_c: 0.5,
             beta: 0.1,
             alpha: 1e-5,
@@ -492,3 +492,6 @@ impl Phases for Nets {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

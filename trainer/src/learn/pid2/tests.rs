@@ -1,0 +1,182 @@
+//! Every gradient of PID^2 against central differences of the textbook losses in f64.
+
+use super::*;
+use crate::learn::reference::{self, *};
+use nearl_runtime::net::Dense;
+
+const LIMIT: f64 = 2e-4;
+
+fn dims() -> Dims {
+    Dims { n_obs: 7, n_state: 5, n_act: 3, seen_obs: vec![1, 2, 6], seen_state: vec![0, 2, 4] }
+}
+
+/// A learner with weights far from zero, and a minibatch.
+fn learner(stochastic: bool, bottleneck: bool) -> (Pid2, Batch) {
+    let ppo = PpoSettings { hidden: vec![6, 5], log_std: -0.3, ..PpoSettings::default() };
+    let settings = Pid2Settings { generator_weight: 0.7, beta: 0.2, ..Pid2Settings::default() };
+    let mut rng = crate::rollout::stream(1, 1);
+    let mut l = Pid2::new(dims(), ppo, settings, stochastic, bottleneck, 1, &mut rng);
+    for group in &mut l.params.groups {
+        // the small last layers would hide errors in what lies below them
+        scalars_mut(&mut group.p).iter_mut().filter(|x| x.abs() < 0.02).for_each(|x| *x *= 50.0);
+    }
+    for phase in [ACTOR, DISCRIMINATOR] {
+        l.nets.refresh(phase, &mut l.params);
+    }
+    let batch = batch(&dims(), TILE, 3);
+    for noise in &mut l.nets.noise {
+        noise.resize(batch.n * LATENT, 0.0);
+        noise.fill_with(|| StandardNormal.sample(&mut rng));
+    }
+    (l, batch)
+}
+
+/// Gradient of a phase over the one tile of the minibatch, and the phase's sums.
+fn gradient(l: &Pid2, batch: &Batch, phase: usize) -> (Vec<V>, [f32; SUMS]) {
+    let len = l.params.groups[l.nets.group(phase)].p.len();
+    let mut grad = vec![ZERO; len + 1];
+    let idx: Vec<u32> = (0..batch.n as u32).collect();
+    let (mean, std) = crate::learn::stats_of(&batch.advantage);
+    let tile =
+        Tile { batch, idx: &idx, scale: 1.0 / batch.n as f32, advantage: (mean as f32, (1.0 / std) as f32) };
+    l.nets.tile(phase, &l.params, tile, &mut l.nets.work(), &mut grad);
+    let sums = grad[len].0;
+    (grad, sums)
+}
+
+/// Discriminator on `[obs, change]` with given latent noise: logit and KL.
+fn judge(enc: &Net64, dec: &Net64, x: &[f64], noise: &[f64], bottleneck: bool) -> (f64, f64) {
+    let code = enc.forward(x);
+    let (mut z, mut kl) = (vec![0.0; LATENT], 0.0);
+    for j in 0..LATENT {
+        let (mean, log_var) = (code[j], code[LATENT + j]);
+        z[j] = mean;
+        if bottleneck {
+            z[j] += (0.5 * log_var).exp() * noise[j];
+            kl += 0.5 * (log_var.exp() + mean * mean - 1.0 - log_var);
+        }
+    }
+    (dec.forward(&z)[0], kl)
+}
+
+struct Nets64 {
+    policy: Net64,
+    value: Net64,
+    inverse: Option<Net64>,
+    log_std: Vec<f64>,
+    enc: Net64,
+    dec: Net64,
+}
+
+fn nets64(l: &Pid2) -> Nets64 {
+    let (a, d) = (&l.params.groups[0].p, &l.params.groups[1].p);
+    let (enc, dec) = l.nets.discriminator.nets();
+    Nets64 {
+        policy: Net64::of(&l.nets.policy.mlp.to_dense(a)),
+        value: Net64::of(&l.nets.value.mlp.to_dense(a)),
+        inverse: l.nets.inverse.as_ref().map(|(m, _)| Net64::of(&m.net.mlp.to_dense(a))),
+        log_std: l.log_std().iter().map(|&v| f64::from(v)).collect(),
+        enc: Net64::of(&enc.mlp.to_dense(d)),
+        dec: Net64::of(&dec.mlp.to_dense(d)),
+    }
+}
+
+fn actor_loss(l: &Pid2, b: &Batch, n: &Nets64) -> f64 {
+    let d = dims();
+    let one = |i: usize| {
+        let obs = row(&b.obs, i, d.n_obs);
+        let u = n.policy.forward(&obs);
+        let log_prob = match &n.inverse {
+            Some(inverse) => {
+                let (lo, hi) = (row(&b.lower, i, d.n_state), row(&b.upper, i, d.n_state));
+                let w: Vec<f64> = (0..d.n_state).map(|k| u[k].max(lo[k]).min(hi[k])).collect();
+                let mean = inverse.forward(&inverse_input(b, i, &d, &w));
+                log_normal(&row(&b.sampled, i, d.n_act), &mean, &n.log_std)
+            }
+            None => log_normal(&row(&b.proposal, i, d.n_state), &u, &n.log_std),
+        };
+        let e = n.value.forward(&obs)[0] - f64::from(b.returns[i]);
+        let x = [obs, u].concat();
+        let noise = row(&l.nets.noise[2], i, LATENT);
+        let (logit, _) = judge(&n.enc, &n.dec, &x, &noise, true);
+        reference::surrogate(b, i, log_prob, 0.2) + 0.5 * e * e + 0.7 * softplus(-logit)
+    };
+    (0..b.n).map(one).sum::<f64>() / b.n as f64
+}
+
+fn check(name: &str, net: &Net64, dense: &Dense, loss: impl Fn(&Net64) -> f64) {
+    let error = relative_error(net, &flat32(dense), loss);
+    assert!(error < LIMIT, "{name}: relative error {error:e}");
+}
+
+#[test]
+fn actor_gradients_equal_central_differences() {
+    for stochastic in [false, true] {
+        let (l, b) = learner(stochastic, true);
+        let (grad, sums) = gradient(&l, &b, ACTOR);
+        let n = nets64(&l);
+        let with = |f: &dyn Fn(&mut Nets64)| {
+            let mut m = nets64(&l);
+            f(&mut m);
+            actor_loss(&l, &b, &m)
+        };
+        let mlp = |net: &Net| net.mlp.to_dense(&grad);
+        check("policy", &n.policy, &mlp(&l.nets.policy), |p| with(&|m| m.policy = p.clone()));
+        check("value", &n.value, &mlp(&l.nets.value), |p| with(&|m| m.value = p.clone()));
+        let range = match (&l.nets.inverse, &l.nets.policy_log_std) {
+            (Some((model, range)), _) => {
+                let net = n.inverse.as_ref().expect("inverse");
+                check("inverse", net, &mlp(&model.net), |p| with(&|m| m.inverse = Some(p.clone())));
+                assert!(sums[5] > 0.0, "the projection clamps some entries");
+                range.clone()
+            }
+            (None, range) => range.clone().expect("log std"),
+        };
+        for k in 0..n.log_std.len() {
+            let slope = (with(&|m| m.log_std[k] += 1e-5) - with(&|m| m.log_std[k] -= 1e-5)) / 2e-5;
+            let analytic = f64::from(scalars(&grad[range.clone()])[k]);
+            assert!((slope - analytic).abs() < 1e-4 * (1.0 + slope.abs()), "log std {k}: {slope} {analytic}");
+        }
+    }
+}
+
+#[test]
+fn discriminator_gradients_equal_central_differences() {
+    for bottleneck in [true, false] {
+        let (l, b) = learner(false, bottleneck);
+        let (grad, sums) = gradient(&l, &b, DISCRIMINATOR);
+        let (n, d) = (nets64(&l), dims());
+        let loss = |enc: &Net64, dec: &Net64| {
+            let one = |i: usize| {
+                let obs = row(&b.obs, i, d.n_obs);
+                let real = [obs.clone(), row(&b.reached, i, d.n_state)].concat();
+                let fake = [obs, row(&b.proposal, i, d.n_state)].concat();
+                let (lr, kr) = judge(enc, dec, &real, &row(&l.nets.noise[0], i, LATENT), bottleneck);
+                let (lf, kf) = judge(enc, dec, &fake, &row(&l.nets.noise[1], i, LATENT), bottleneck);
+                softplus(-lr) + softplus(lf) + 0.2 * 0.5 * (kr + kf)
+            };
+            (0..b.n).map(one).sum::<f64>() / b.n as f64
+        };
+        let (enc, dec) = l.nets.discriminator.nets();
+        check("encoder", &n.enc, &enc.mlp.to_dense(&grad), |p| loss(p, &n.dec));
+        check("decoder", &n.dec, &dec.mlp.to_dense(&grad), |p| loss(&n.enc, p));
+        assert_eq!(sums[1] > 0.0, bottleneck, "the bottleneck's KL is reported where there is one");
+    }
+}
+
+#[test]
+fn inverse_gradient_equals_central_differences() {
+    let (l, b) = learner(false, true);
+    let (grad, _) = gradient(&l, &b, INVERSE);
+    let (n, d) = (nets64(&l), dims());
+    let loss = |net: &Net64| {
+        let one = |i: usize| {
+            let mean = net.forward(&inverse_input(&b, i, &d, &row(&b.reached, i, d.n_state)));
+            let a = row(&b.action, i, d.n_act);
+            mean.iter().zip(&a).map(|(m, a)| 0.5 * (m - a).powi(2)).sum::<f64>()
+        };
+        (0..b.n).map(one).sum::<f64>() / b.n as f64
+    };
+    let (model, _) = l.nets.inverse.as_ref().expect("inverse");
+    check("inverse", n.inverse.as_ref().expect("inverse"), &model.net.mlp.to_dense(&grad), loss);
+}

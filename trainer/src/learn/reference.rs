@@ -1,0 +1,116 @@
+//! For tests: the losses again, row by row in f64, as the textbook writes them. Shares no code with the kernels.
+
+use super::batch::Batch;
+use super::{Dims, stats_of};
+use nearl_runtime::net::Dense;
+
+/// A network in f64: weight (n_out x n_in) and bias of each layer.
+#[derive(Clone)]
+pub(super) struct Net64(pub(super) Vec<(Vec<f64>, Vec<f64>)>);
+
+impl Net64 {
+    pub(super) fn of(dense: &Dense) -> Self {
+        let wide = |x: &[f32]| x.iter().map(|&v| f64::from(v)).collect::<Vec<f64>>();
+        Self(dense.layers.iter().map(|l| (wide(&l.weight), wide(&l.bias))).collect())
+    }
+
+    /// Affine layers with tanh between them.
+    pub(super) fn forward(&self, x: &[f64]) -> Vec<f64> {
+        let mut h = x.to_vec();
+        for (i, (w, b)) in self.0.iter().enumerate() {
+            let n_in = h.len();
+            let y =
+                b.iter().enumerate().map(|(n, b)| b + (0..n_in).map(|k| w[n * n_in + k] * h[k]).sum::<f64>());
+            h = if i + 1 < self.0.len() { y.map(f64::tanh).collect() } else { y.collect() };
+        }
+        h
+    }
+
+    /// Parameters one after another: weight, bias of each layer.
+    pub(super) fn flat(&mut self) -> Vec<&mut f64> {
+        self.0.iter_mut().flat_map(|(w, b)| w.iter_mut().chain(b.iter_mut())).collect()
+    }
+}
+
+/// The parameters in the order of [`Net64::flat`].
+pub(super) fn flat32(dense: &Dense) -> Vec<f64> {
+    dense.layers.iter().flat_map(|l| l.weight.iter().chain(&l.bias)).map(|&v| f64::from(v)).collect()
+}
+
+pub(super) fn row(x: &[f32], i: usize, n: usize) -> Vec<f64> {
+    x[i * n..][..n].iter().map(|&v| f64::from(v)).collect()
+}
+
+pub(super) fn softplus(x: f64) -> f64 {
+    x.max(0.0) + (-x.abs()).exp().ln_1p()
+}
+
+/// log N(x; mean, exp(log_std)^2).
+pub(super) fn log_normal(x: &[f64], mean: &[f64], log_std: &[f64]) -> f64 {
+    let term = |((x, m), s): ((&f64, &f64), &f64)| {
+        let z = (x - m) / s.exp();
+        -0.5 * z * z - s - 0.5 * (2.0 * std::f64::consts::PI).ln()
+    };
+    x.iter().zip(mean).zip(log_std).map(term).sum()
+}
+
+/// PPO's clipped surrogate of one row with the minibatch's normalised advantage.
+pub(super) fn surrogate(b: &Batch, i: usize, log_prob: f64, clip: f64) -> f64 {
+    let (mean, std) = stats_of(&b.advantage);
+    let a = (f64::from(b.advantage[i]) - mean) / std;
+    let r = (log_prob - f64::from(b.log_prob[i])).exp();
+    -(r * a).min(r.clamp(1.0 - clip, 1.0 + clip) * a)
+}
+
+/// Input of the inverse model for change `w`.
+pub(super) fn inverse_input(b: &Batch, i: usize, d: &Dims, w: &[f64]) -> Vec<f64> {
+    let obs = row(&b.obs, i, d.n_obs);
+    let seen = d.seen_obs.iter().map(|&k| obs[k]);
+    seen.chain(d.seen_state.iter().map(|&k| w[k].clamp(-10.0, 10.0))).collect()
+}
+
+/// Central differences of `loss` in every parameter of `net` against `analytic`: relative error in the Euclidean norm.
+pub(super) fn relative_error(net: &Net64, analytic: &[f64], loss: impl Fn(&Net64) -> f64) -> f64 {
+    let mut probe = net.clone();
+    let n = probe.flat().len();
+    assert_eq!(n, analytic.len());
+    let (mut error, mut size) = (0.0, 0.0);
+    for k in 0..n {
+        const H: f64 = 1e-5;
+        let at = |probe: &mut Net64, x: f64| {
+            *probe.flat()[k] += x;
+            let l = loss(probe);
+            *probe.flat()[k] -= x;
+            l
+        };
+        let slope = (at(&mut probe, H) - at(&mut probe, -H)) / (2.0 * H);
+        error += (slope - analytic[k]).powi(2);
+        size += slope * slope;
+    }
+    assert!(size > 1e-12, "the gradient vanishes: the test could not fail");
+    (error / size).sqrt()
+}
+
+/// One minibatch of random experience.
+pub(super) fn batch(d: &Dims, n: usize, seed: u64) -> Batch {
+    use rand::RngExt;
+    let mut rng = crate::rollout::stream(seed, 0);
+    let mut draw = |k: usize, size: f32| -> Vec<f32> {
+        (0..n * k)
+            .map(|_| size * (rng.random::<f32>() + rng.random::<f32>() + rng.random::<f32>() - 1.5))
+            .collect()
+    };
+    Batch {
+        n,
+        obs: draw(d.n_obs, 1.0),
+        proposal: draw(d.n_state, 1.0),
+        lower: draw(d.n_state, 0.3).iter().map(|x| x - 0.3).collect(),
+        upper: draw(d.n_state, 0.3).iter().map(|x| x + 0.6).collect(),
+        reached: draw(d.n_state, 1.0),
+        sampled: draw(d.n_act, 1.0),
+        action: draw(d.n_act, 1.0),
+        log_prob: draw(1, 1.0).iter().map(|x| x - 4.0).collect(),
+        advantage: draw(1, 1.0),
+        returns: draw(1, 1.0),
+    }
+}
