@@ -57,7 +57,7 @@ def flight_log(path: Path, ticks: int = 3000, metadata: dict[str, str] | None = 
             if tick % 1000 == 1:
                 goal = np.where(rng.random(7) < 0.5, low - 0.3, high + 0.3)
             v_hat = 6.0 * (goal - q) + 0.05 * rng.normal(size=7)
-            v_hat = v + np.clip(v_hat - v, -0.03, 0.03)
+            v_hat = v + np.clip(v_hat - v, -0.5, 0.5) * (1 + np.sin(tick / 90))
             q_hat = q + dt * v_hat
             target = projector.project(q, v, q_hat, v_hat)
             due = 10**9 + tick * 10**6

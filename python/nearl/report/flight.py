@@ -74,7 +74,7 @@ def timeline(log: Log) -> tuple[str | None, str]:
     figure, axes = plt.subplots(figsize=(10.2, 1.25 + 0.23 * len(names)))
     low, high = np.nanpercentile(values, [2, 99.5])
     low = max(low, high * 1e-4, 1e-12)
-    norm = LogNorm(low, max(high, low * 10))
+    norm = LogNorm(low, max(high, low * 1.5))
     mesh = axes.pcolormesh(edges, np.arange(len(names) + 1), values, cmap="viridis_r", norm=norm, rasterized=True)
     axes.set_yticks(np.arange(len(names)) + 0.5, names)
     axes.set(xlabel="time [s]", title="Active constraints")
@@ -82,7 +82,9 @@ def timeline(log: Log) -> tuple[str | None, str]:
     axes.hlines(np.arange(1, len(names)), edges[0], edges[-1], color=GRID, linewidth=0.6)
     axes.tick_params(axis="y", length=0)
     axes.invert_yaxis()
-    figure.colorbar(mesh, ax=axes, label=rows.meaning, pad=0.012, aspect=max(8, 1.6 * len(names)))
+    bar = figure.colorbar(mesh, ax=axes, label=rows.meaning, pad=0.012, aspect=max(8, 1.6 * len(names)))
+    bar.ax.yaxis.set_major_formatter(lambda x, _: f"{x:g}")
+    bar.ax.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if norm.vmax < 20 * norm.vmin else "")
     left_out = f" The {len(rows.names) - len(busy)} least busy rows are left out." if len(busy) < len(rows.names) else ""
     caption = f"Rows that hold the target back, coloured by how hard they are leaned on (white: not active; arrow: which bound).{left_out}"
     return image(figure, caption), ""
@@ -132,10 +134,11 @@ def _three(axes: plt.Axes, time: Floats, dt: float, predicted: Floats, projected
     kept = np.concatenate([projected, reached])
     low, high = np.nanmin(kept), np.nanmax(kept)
     wide_low, wide_high = np.nanpercentile(predicted, [1, 99])
-    room = max(high - low, 1e-3)
+    room = max(high - low, 0.3 * max(abs(low), abs(high)), 1e-3)
     axes.set_ylim(max(min(low, wide_low), low - room) - 0.08 * room, min(max(high, wide_high), high + room) + 0.08 * room)
     axes.margins(x=0)
     axes.locator_params(axis="y", nbins=4)
+    axes.ticklabel_format(axis="y", useOffset=False)
 
 
 def _moved(log: Log) -> Floats:
@@ -179,7 +182,7 @@ def latency(log: Log) -> str:
     axes.annotate(f"deadline {deadline:g} µs", (deadline, 1), xycoords=("data", "axes fraction"), xytext=(-5, -4), textcoords="offset points", color=DEADLINE, ha="right", va="top")
     axes.set(xscale="log", yscale="log", xlabel="time [µs]", ylabel="ticks", title="Latency", xlim=(low, high))
     axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
-    axes.legend(loc="upper center")
+    figure.legend(loc="outside upper right", ncols=2)
     late = int(np.sum(total > deadline))
     return image(figure, f"{len(log)} ticks; {late} action{'' if late == 1 else 's'} later than the control period of {deadline:g} µs.")
 
