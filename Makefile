@@ -1,4 +1,4 @@
-# NEARL: set-up of a checkout. `make setup` may be run any number of times.
+# NEARL: set-up, demo and tests of a checkout. Every target does what it needs first and may be run any number of times.
 
 PYTHON ?= python3.11
 VENV := .venv
@@ -7,8 +7,31 @@ MUJOCO := lib/python3.11/site-packages/mujoco/libmujoco.so.3.17.0
 STAMP := $(VENV)/.requirements-$(shell sha256sum python/requirements.txt | cut -c1-16)
 LINKS := $(VENV)/mujoco-link/libmujoco.so $(VENV)/mujoco-link/libmujoco.so.3.17.0
 
-.PHONY: setup
+PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
+NEARL := target/release/nearl
+# Steps of the demo's training: about two minutes on two cores.
+DEMO_STEPS ?= 3000000
+
+.PHONY: setup build package demo test
 setup: $(LINKS)
+
+build: setup
+	cargo build --release --locked --bins
+
+# The Python package, built from this checkout into .venv.
+package: setup
+	$(PIP) --no-deps --no-build-isolation ./python
+
+# The main job: train with constraints, run the result and a bundled arm as separate processes, and report.
+demo: build package
+	rm -rf demo
+	$(NEARL) train HalfCheetah-v5 --algo pid2-ib --steps $(DEMO_STEPS) --out demo/train
+	$(NEARL) demo --run demo/train --out demo
+	@echo "open demo/report.html in a browser"
+
+test: build package
+	cargo test --release --locked
+	$(VENV)/bin/python -m pytest python/tests -q
 
 $(VENV)/bin/python:
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) was not found: install Python 3.11 or say 'make setup PYTHON=/path/to/python3.11'" >&2; exit 1; }

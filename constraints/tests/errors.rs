@@ -37,7 +37,7 @@ fn models() {
     std::fs::write(&empty, "").unwrap();
     refuse_model(Model::from_urdf(&empty), &["nearl-empty", "empty"]);
     std::fs::remove_file(&empty).unwrap();
-    refuse_model(Model::from_urdf_text("<robot"), &["the URDF text", "1:"]);
+    refuse_model(Model::from_urdf_text("<robot>\n<link</robot>"), &["the URDF text", "2:"]);
     refuse_model(Model::from_urdf_text("<mujoco/>"), &["<mujoco>", "<robot>"]);
     refuse_model(Model::from_mjcf_text("<robot/>"), &["<robot>", "<mujoco>"]);
     let mass = |m: &str| Model::from_urdf_text(&urdf(GOOD, m));

@@ -2,6 +2,7 @@
 //!
 //! Read [`controller`] first: the one data path is on that page.
 
+pub mod cli;
 pub mod controller;
 pub mod idm;
 pub mod link;

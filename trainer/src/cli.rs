@@ -1,6 +1,7 @@
 //! The `nearl` command line: one file a subcommand.
 
 mod bench;
+mod demo;
 mod eval;
 mod plant;
 mod project;
@@ -9,8 +10,7 @@ mod train;
 
 use clap::{Parser, Subcommand};
 
-/// Any failure, as one sentence.
-pub type Failure = Box<dyn std::error::Error + Send + Sync>;
+pub use nearl_runtime::cli::Failure;
 
 /// Let a learned policy move a robot without ever breaking its limits.
 #[derive(Parser)]
@@ -26,12 +26,16 @@ enum Command {
     Train(train::Train),
     /// Run episodes without noise, raw and projected.
     Eval(eval::Eval),
+    /// Plant and runtime as two processes, a hot swap, and the report.
+    Demo(demo::Demo),
     /// Project proposals read as JSON lines.
     Project(project::Project),
     /// Measure this machine.
     Bench(bench::Bench),
     /// MuJoCo as the robot, in real time, over shared memory.
     Plant(plant::PlantCommand),
+    /// Run a snapshot on a plant in real time.
+    Run(nearl_runtime::cli::RunCommand),
     /// List the bundled tasks.
     Tasks(tasks::Tasks),
 }
@@ -45,9 +49,11 @@ impl Cli {
         match self.command {
             Command::Train(c) => c.run(),
             Command::Eval(c) => c.run(),
+            Command::Demo(c) => c.run(),
             Command::Project(c) => c.run(),
             Command::Bench(c) => c.run(),
             Command::Plant(c) => c.run(),
+            Command::Run(c) => c.run(),
             Command::Tasks(c) => c.run(),
         }
     }

@@ -2,11 +2,13 @@
 
 use crate::env::{Env, EnvError, Limits, Meter};
 use crate::rollout::stream;
-use nearl_constraints::{LimitSet, Model, Target};
-use nearl_runtime::idm::AnalyticIdm;
+use nearl_constraints::{LimitSet, Model};
+use nearl_runtime::controller::Parts;
 use nearl_runtime::link::{
-    ActionMessage, Plant, Robot, STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, StateMessage, hash_names,
+    ActionMessage, Plant, Robot, STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, StateMessage,
 };
+use nearl_runtime::rt::{Brake, describe};
+use nearl_runtime::{Manifest, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 
 /// Excess over a limit that counts as rounding, in rad, rad/s or N m.
@@ -17,21 +19,14 @@ pub struct MujocoPlant {
     env: Box<dyn Env>,
     rng: ChaCha8Rng,
     meter: Meter,
-    limits: PlantLimits,
-    drive: Option<Drive>,
+    drive: Option<Brake>,
+    robot: Robot,
     action: Vec<f64>,
     force: Vec<f64>,
+    /// Configuration and velocity in Pinocchio's convention.
+    state: (Vec<f64>, Vec<f64>),
     episode: Episode,
     resets: bool,
-}
-
-/// Limits by degree of freedom in MuJoCo's order.
-#[derive(Clone, Debug)]
-pub struct PlantLimits {
-    /// What the meter watches.
-    pub watched: Limits,
-    /// Braking deceleration by degree of freedom.
-    pub braking: Vec<f64>,
 }
 
 #[derive(Default)]
@@ -45,86 +40,74 @@ struct Episode {
     saturated: u32,
 }
 
-impl PlantLimits {
-    /// The robot's own position and effort limits, and the task's velocity and acceleration limits.
-    pub fn new(env: &dyn Env, model: &Model, set: &LimitSet) -> Self {
-        let spec = env.spec();
-        let none = vec![f64::INFINITY; spec.nv];
-        let mut watched = Limits {
-            lower_position: vec![f64::NEG_INFINITY; spec.nq],
-            upper_position: vec![f64::INFINITY; spec.nq],
-            velocity: none.clone(),
-            effort: none.clone(),
-        };
-        let mut braking = none;
-        for j in spec.joints.iter() {
-            let Ok(m) = model.joint(&j.name) else { continue };
-            if m.nv != 1 {
-                continue;
-            }
-            watched.lower_position[j.idx_q] = set.q_lower[m.idx_v];
-            watched.upper_position[j.idx_q] = set.q_upper[m.idx_v];
-            watched.velocity[j.idx_v] = set.velocity[m.idx_v];
-            watched.effort[j.idx_v] = model.effort_limit()[m.idx_v];
-            braking[j.idx_v] = set.acceleration[m.idx_v];
-        }
-        Self { watched, braking }
+/// What the meter watches, in MuJoCo's order: the task's position and velocity limits, the robot file's effort limits.
+pub fn watched_limits(env: &dyn Env, model: &Model, set: &LimitSet) -> Limits {
+    let spec = env.spec();
+    let none = vec![f64::INFINITY; spec.nv];
+    let mut watched = Limits {
+        lower_position: vec![f64::NEG_INFINITY; spec.nq],
+        upper_position: vec![f64::INFINITY; spec.nq],
+        velocity: none.clone(),
+        effort: none,
+    };
+    for j in &spec.joints {
+        let Some(m) = model.joints().iter().find(|m| m.name == j.name && m.nv == 1) else { continue };
+        watched.lower_position[j.idx_q] = set.q_lower[m.idx_v];
+        watched.upper_position[j.idx_q] = set.q_upper[m.idx_v];
+        watched.velocity[j.idx_v] = set.velocity[m.idx_v];
+        watched.effort[j.idx_v] = model.effort_limit()[m.idx_v];
     }
+    watched
+}
 
-    /// Hash of the limits, announced with the plant.
-    pub fn digest(&self) -> u64 {
-        hash_names([format!("{:?}", self.watched)])
-    }
+/// Why a plant could not start.
+#[derive(Debug, thiserror::Error)]
+pub enum PlantError {
+    /// The environment.
+    #[error(transparent)]
+    Env(#[from] EnvError),
+    /// The task's robot, layout or limits.
+    #[error(transparent)]
+    Task(#[from] SnapshotError),
+    /// The limits to watch.
+    #[error(transparent)]
+    Limits(#[from] crate::env::LimitError),
 }
 
 impl MujocoPlant {
-    /// A plant at the start of its first episode. `resets`: episodes end and start as in training; otherwise the robot
-    /// simply goes on.
+    /// A plant of the task at the start of its first episode. `resets`: episodes end and start as in training; otherwise
+    /// the robot simply goes on.
     ///
     /// # Errors
-    /// [`EnvError`] when MuJoCo cannot evaluate the state.
-    pub fn new(
-        mut env: Box<dyn Env>,
-        model: &Model,
-        limits: PlantLimits,
-        seed: u64,
-        resets: bool,
-    ) -> Result<Self, EnvError> {
+    /// [`PlantError`].
+    pub fn new(manifest: &Manifest, seed: u64, resets: bool) -> Result<Self, PlantError> {
+        let mut env = crate::env::make(&manifest.task.name)?;
+        let Parts { model, projector, .. } = Parts::new(manifest)?;
         let mut rng = stream(seed, 0);
         env.reset(&mut rng)?;
-        let (n_act, nv) = (env.spec().n_act(), env.spec().nv);
-        let meter = Meter::new(limits.watched.clone(), TOLERANCE)
-            .unwrap_or_else(|e| unreachable!("limits of a built projector: {e}"));
-        let episode = Episode { bits: STATE_RESET, ..Episode::default() };
-        let drive = Drive::new(env.as_ref(), model, &limits);
+        let (n_act, nq, nv) = (env.spec().n_act(), env.spec().nq, env.spec().nv);
         Ok(Self {
+            meter: Meter::new(watched_limits(env.as_ref(), &model, projector.limits()), TOLERANCE)?,
+            drive: Brake::new(manifest)?,
+            robot: describe(manifest, false)?,
             env,
             rng,
-            meter,
-            limits,
-            drive,
             action: vec![0.0; n_act],
             force: vec![0.0; nv],
-            episode,
+            state: (vec![0.0; nq], vec![0.0; nv]),
+            episode: Episode { bits: STATE_RESET, ..Episode::default() },
             resets,
         })
     }
 
     /// What the plant announces.
     pub fn robot(&self, lockstep: bool) -> Robot {
-        let spec = self.env.spec();
-        let mut joints: Vec<_> = spec.joints.iter().collect();
-        joints.sort_by_key(|j| j.idx_v);
-        Robot {
-            joints: joints.iter().map(|j| j.name.clone()).collect(),
-            observation: spec.obs.clone(),
-            limits: self.limits.digest(),
-            nq: spec.nq,
-            nv: spec.nv,
-            nu: spec.n_act(),
-            dt: spec.dt,
-            lockstep,
-        }
+        Robot { lockstep, ..self.robot.clone() }
+    }
+
+    /// Control period in [s].
+    pub fn dt(&self) -> f64 {
+        self.env.spec().dt
     }
 
     /// The meter of the simulator's own state.
@@ -184,44 +167,14 @@ impl Plant for MujocoPlant {
         self.advance();
     }
 
-    /// The drive's own brake: `a = -sgn(v) min(A, |v| / dt)` through inverse dynamics where every joint has a motor and a
-    /// braking limit; no action elsewhere.
+    /// The drive's own brake, where analytic inverse dynamics knows the torque that stops the robot; no action elsewhere.
     fn brake(&mut self) {
         self.action.fill(0.0);
-        if let Some(drive) = &mut self.drive {
-            self.env.state(&mut drive.q, &mut drive.next.v);
-            let dt = self.env.spec().dt;
-            for (i, a) in drive.next.acceleration.iter_mut().enumerate() {
-                let v = drive.next.v[i];
-                *a = -v.signum() * self.limits.braking[i].min(v.abs() / dt);
-            }
-            let v = drive.next.v.clone();
-            drive.idm.torque(&drive.q, &v, &drive.next, &mut self.action);
-            for (a, range) in self.action.iter_mut().zip(&self.env.spec().actuators) {
-                *a = a.clamp(range.low, range.high);
-            }
+        if let Some(brake) = &mut self.drive {
+            self.env.state(&mut self.state.0, &mut self.state.1);
+            let (_, torque) = brake.update(&self.state.0, &self.state.1);
+            self.action.copy_from_slice(torque);
         }
         self.advance();
-    }
-}
-
-/// Inverse dynamics in the drives, for braking without a runtime.
-struct Drive {
-    idm: AnalyticIdm,
-    q: Vec<f64>,
-    next: Target,
-}
-
-impl Drive {
-    /// `None` where a joint has no motor or no braking limit.
-    fn new(env: &dyn Env, model: &Model, limits: &PlantLimits) -> Option<Self> {
-        let spec = env.spec();
-        let dofs: Vec<usize> = (0..spec.nv).collect();
-        let driven = spec.n_act() == spec.nv && limits.braking.iter().all(|a| a.is_finite());
-        driven.then(|| Self {
-            idm: AnalyticIdm::new(model, &dofs),
-            q: model.neutral(),
-            next: Target::new(model),
-        })
     }
 }

@@ -81,6 +81,7 @@ impl Conic {
             what: format!("Clarabel refused the problem of these limits: {error}"),
             next: "check the limits for extreme values",
         })?);
+        conic.solve(typical); // the first solve allocates more than the others
         Ok(conic)
     }
 

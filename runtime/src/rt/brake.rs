@@ -10,7 +10,7 @@ use crate::snapshot::{Manifest, PolicyKind, SnapshotError};
 use crate::task::IdmKind;
 
 /// Brings the controllable joints to rest as fast as every limit allows.
-pub(crate) struct Brake {
+pub struct Brake {
     projector: Projector,
     idm: AnalyticIdm,
     proposal: Proposal,
@@ -24,7 +24,10 @@ pub(crate) struct Brake {
 
 impl Brake {
     /// `None` where no analytic inverse dynamics knows the action that stops the robot.
-    pub(crate) fn new(manifest: &Manifest) -> Result<Option<Brake>, SnapshotError> {
+    ///
+    /// # Errors
+    /// [`SnapshotError::Unusable`] with the sentence of the layer that refused robot, layout or limits.
+    pub fn new(manifest: &Manifest) -> Result<Option<Brake>, SnapshotError> {
         if manifest.task.idm.kind != IdmKind::Pinocchio || manifest.policy == PolicyKind::Direct {
             return Ok(None);
         }
@@ -45,7 +48,7 @@ impl Brake {
 
     /// Proposes rest, `v' = 0` and `q' = q + T v - kappa T v`, and returns the torque [N m] for the nearest allowed
     /// state. Joints that are not controllable keep their velocity.
-    pub(crate) fn update(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
+    pub fn update(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
         let Period { dt, kappa, .. } = self.period;
         self.proposal.q.copy_from_slice(q);
         self.proposal.v.copy_from_slice(v);

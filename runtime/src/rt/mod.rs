@@ -26,6 +26,7 @@ pub(crate) mod thread;
 mod tick;
 
 pub use bench::bench_wake;
+pub use brake::Brake;
 pub use cycle::Sync;
 pub use grid::Grid;
 pub use mode::{Event, Mode, ModeLimits, Modes, Reason};

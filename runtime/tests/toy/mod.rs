@@ -38,7 +38,7 @@ impl Plant for PointMass {
         }
         (state.nq, state.nv, state.nu, state.n_obs) = (1, 1, 1, 1);
         state.time = self.tick as f64 * DT;
-        if self.episode_ticks > 0 && self.tick > 0 && self.tick % self.episode_ticks == 0 {
+        if self.episode_ticks > 0 && self.tick > 0 && self.tick.is_multiple_of(self.episode_ticks) {
             (self.q, self.v) = (1.0, 0.0);
         }
         state.episode = self.tick.checked_div(self.episode_ticks).unwrap_or(0);

@@ -24,6 +24,8 @@ enum What {
     Update(Ticks),
     /// One projection: percentiles beside an empty timer.
     Projection(Ticks),
+    #[command(flatten)]
+    Loop(nearl_runtime::cli::LoopBench),
 }
 
 #[derive(Args)]
@@ -70,6 +72,7 @@ impl Bench {
             What::Train(b) => b.run(),
             What::Update(b) => b.run(true),
             What::Projection(b) => b.run(false),
+            What::Loop(b) => b.run(),
         }
     }
 }

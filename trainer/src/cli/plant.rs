@@ -1,11 +1,10 @@
 //! `nearl plant`: MuJoCo as the robot, over shared memory.
 
 use super::{Failure, say};
-use crate::plant::{MujocoPlant, PlantLimits};
+use crate::plant::MujocoPlant;
+use crate::tasks;
 use crate::train::complete;
-use crate::{env, tasks};
 use clap::Args;
-use nearl_runtime::controller::Parts;
 use nearl_runtime::link::{PlantLink, PlantRunner, PlantSettings, RobotName};
 use nearl_runtime::rt::Stop;
 
@@ -40,15 +39,12 @@ impl PlantCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
         let mut manifest = tasks::load(&self.task, &self.set)?;
         complete(&mut manifest)?;
-        let Parts { model, projector, .. } = Parts::new(&manifest)?;
-        let environment = env::make(&manifest.task.name)?;
-        let dt = environment.spec().dt;
-        let limits = PlantLimits::new(environment.as_ref(), &model, projector.limits());
-        let mut plant = MujocoPlant::new(environment, &model, limits, self.seed, !self.endless)?;
+        let mut plant = MujocoPlant::new(&manifest, self.seed, !self.endless)?;
+        let dt = plant.dt();
         let name = RobotName::new(&self.name)?;
         let link = PlantLink::open(&name, &plant.robot(self.lockstep))?;
         let mut settings =
-            if self.lockstep { PlantSettings::lockstep(dt) } else { PlantSettings::real_time(dt) };
+            if self.lockstep { PlantSettings::lockstep(dt) } else { PlantSettings::simulator(dt) };
         settings.ticks = self.seconds.map(|s| (s / dt).round() as u64);
         let stop = Stop::on_signals()?;
         if !self.json {

@@ -1,0 +1,73 @@
+//! Same seed, same bits: whatever the threads, and in training as in deployment.
+
+use nearl_runtime::{Controller, Snapshot};
+use nearl_tests::training;
+use nearl_trainer::env::Env;
+use nearl_trainer::rollout::{make_env, stream};
+
+/// Record A = record B for one thread and two, over several updates of every algorithm.
+#[test]
+fn weights_do_not_depend_on_threads() {
+    for (task, algo) in [("HalfCheetah-v5", "pid2-ib"), ("Hopper-v5", "ppo"), ("Panda-reach", "pid2-ib")] {
+        let weights = |threads: usize, seed: u64| {
+            let set = ["train.ppo.batch_size=512", "train.n_steps=64"];
+            let mut t = training(task, algo, seed, threads, &set);
+            for _ in 0..4 {
+                t.iterate();
+            }
+            t.snapshot().to_bytes()
+        };
+        let one = weights(1, 3);
+        assert!(one == weights(2, 3), "{task} {algo}: two threads gave other weights than one");
+        assert!(one != weights(1, 4), "{task} {algo}: the seed changes nothing");
+    }
+}
+
+/// A snapshot that went through a file gives the training's own actions, bit for bit.
+#[test]
+fn deployment_repeats_training() {
+    for task in ["HalfCheetah-v5", "Panda-reach"] {
+        let mut t = training(task, "pid2-ib", 0, 1, &["train.n_steps=64", "train.ppo.batch_size=512"]);
+        (0..3).for_each(|_| drop(t.iterate()));
+        let folder = tempfile::tempdir().expect("folder");
+        let file = folder.path().join("s.safetensors");
+        t.snapshot().save(&file).expect("save");
+        let loaded = Snapshot::load(&file).expect("load");
+        let (mut a, mut b) = (Controller::new(t.snapshot()).expect("a"), Controller::new(&loaded).expect("b"));
+        let (mut env, mut state) = (make_env(&loaded).expect("env"), a.state());
+        let (mut out_a, mut out_b, noise) = (a.output(), b.output(), a.noise());
+        env.reset(&mut stream(5, 0)).expect("reset");
+        for tick in 0..500 {
+            env.observe(&mut state.obs);
+            env.state(&mut state.q, &mut state.v);
+            a.update(&state, &noise, &mut out_a);
+            b.update(&state, &noise, &mut out_b);
+            let bits = |x: &[f64]| x.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+            assert_eq!(bits(&out_a.action), bits(&out_b.action), "{task}, tick {tick}");
+            assert_eq!(bits(&out_a.target), bits(&out_b.target), "{task}, tick {tick}");
+            if env.step(&out_a.action).terminated {
+                env.reset(&mut stream(6, 0)).expect("reset");
+            }
+        }
+    }
+}
+
+/// What a controller did before does not change its bits after a reset.
+#[test]
+fn history_does_not_matter() {
+    let t = training("Panda-reach", "pid2-ib", 0, 1, &[]);
+    let (mut fresh, mut used) = (Controller::new(t.snapshot()).expect("a"), Controller::new(t.snapshot()).expect("b"));
+    let (mut state, noise) = (fresh.state(), fresh.noise());
+    let (mut out_fresh, mut out_used) = (fresh.output(), used.output());
+    for i in 0..1000 {
+        state.v.iter_mut().for_each(|v| *v = f64::from(i % 13) * 0.1);
+        state.obs[0] = if i % 7 == 0 { f64::NAN } else { 0.3 };
+        used.update(&state, &noise, &mut out_used);
+        assert!(out_used.action.iter().all(|a| a.is_finite()));
+    }
+    used.reset();
+    let state = fresh.state();
+    fresh.update(&state, &noise, &mut out_fresh);
+    used.update(&state, &noise, &mut out_used);
+    assert_eq!(out_fresh.action, out_used.action);
+}

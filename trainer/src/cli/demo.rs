@@ -1,0 +1,219 @@
+//! `nearl demo`: plant and runtime as two processes over shared memory, a hot swap while they run, and the report.
+
+use super::{Failure, say};
+use crate::evaluate::evaluate;
+use crate::run_folder;
+use clap::Args;
+use nearl_runtime::Snapshot;
+use nearl_runtime::link::{RobotName, TrainerLink, Verdict};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+/// The bundled snapshot: Panda-reach, trained with the command in `examples/snapshots/README.md`.
+const PANDA: &[u8] = include_bytes!("../../../examples/snapshots/panda-reach.safetensors");
+
+#[derive(Args)]
+pub(super) struct Demo {
+    /// Run folders or snapshots to show beside the bundled Panda.
+    #[arg(long = "run", value_name = "RUN")]
+    runs: Vec<PathBuf>,
+    /// Folder for logs, summary and report.
+    #[arg(long, default_value = "demo")]
+    out: PathBuf,
+    /// Seconds each robot runs.
+    #[arg(long, default_value_t = 10.0)]
+    seconds: f64,
+    /// Python that draws the report; `.venv/bin/python` where it exists, else `python3`.
+    #[arg(long)]
+    python: Option<PathBuf>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Demo {
+    pub(super) fn run(self) -> Result<(), Failure> {
+        std::fs::create_dir_all(&self.out)?;
+        let bundled = self.out.join("panda-reach.safetensors");
+        std::fs::write(&bundled, PANDA)?;
+        let mut snapshots =
+            self.runs.iter().map(|r| run_folder::snapshot_of(r)).collect::<Result<Vec<_>, _>>()?;
+        snapshots.push(bundled);
+        let shows = snapshots.iter().map(|s| self.show(s)).collect::<Result<Vec<_>, _>>()?;
+        let summary = self.out.join("summary.json");
+        std::fs::write(&summary, serde_json::to_string_pretty(&shows)?)?;
+        if self.json {
+            say(serde_json::to_string_pretty(&shows)?);
+        } else {
+            table(&shows);
+        }
+        let report = self.report(&summary, &shows)?;
+        if !self.json {
+            say(format!("report {}", report.display()));
+        }
+        Ok(())
+    }
+
+    /// One robot: plant, runtime, a swap in the middle, and an evaluation raw against projected.
+    fn show(&self, path: &Path) -> Result<Value, Failure> {
+        let snapshot = Snapshot::load(path)?;
+        let task = &snapshot.manifest.task.name;
+        let name = format!("demo-{}", std::process::id());
+        let log = self.out.join(format!("{task}.mcap"));
+        let _ = std::fs::remove_file(&log);
+        let task_file = self.out.join(format!("{task}.toml"));
+        std::fs::write(&task_file, snapshot.manifest.task.to_toml())?;
+        let nearl = std::env::current_exe()?;
+        let text = |p: &Path| p.display().to_string();
+        let mut plant = Process::start(&nearl, &["plant", &text(&task_file), "--name", &name, "--json"])?;
+        let seconds = self.seconds.to_string();
+        let run =
+            ["run", &text(path), "--plant", &name, "--seconds", &seconds, "--log", &text(&log), "--json"];
+        let runtime = Process::start(&nearl, &run)?;
+        let swap = self.swap(&name, &snapshot);
+        let report = runtime.json()?;
+        plant.stop();
+        let plant = plant.json()?;
+        let modes = [true, false].map(|projection| evaluate(&snapshot, 3, 0, projection));
+        let [projected, raw] = modes;
+        let (projected, raw) = (projected?, raw?);
+        Ok(
+            json!({ "task": task, "algo": snapshot.manifest.algo, "snapshot": text(path), "log": text(&log), "run": report,
+            "plant": plant, "swap": swap?, "evaluation": [projected, raw] }),
+        )
+    }
+
+    /// Pushes the next version of the same snapshot while the loop runs, then a damaged one, which must be refused.
+    fn swap(&self, name: &str, snapshot: &Snapshot) -> Result<Value, Failure> {
+        let mut link = TrainerLink::open(&RobotName::new(name)?)?;
+        link.wait_for_runtime(Duration::from_secs(10))?;
+        std::thread::sleep(Duration::from_secs_f64(self.seconds * 0.4));
+        let mut next = snapshot.clone();
+        next.manifest.version += 1;
+        let bytes = next.to_bytes();
+        let mut damaged = bytes.clone();
+        let last = damaged.len() - 1;
+        damaged[last] ^= 1;
+        let mut receipts = Vec::new();
+        for (version, bytes) in [(next.manifest.version, &bytes), (next.manifest.version + 1, &damaged)] {
+            link.push(version, bytes)?;
+            let receipt = link.wait_for_receipt(version, Duration::from_secs(10))?;
+            receipts.push(json!({ "version": version, "accepted": receipt.verdict() == Verdict::Accepted,
+                "verdict": format!("{:?}", receipt.verdict()), "text": receipt.text() }));
+        }
+        Ok(json!(receipts))
+    }
+
+    fn report(&self, summary: &Path, shows: &[Value]) -> Result<PathBuf, Failure> {
+        let out = self.out.join("report.html");
+        let venv = Path::new(".venv/bin/python");
+        let python =
+            self.python.clone().unwrap_or_else(|| if venv.exists() { venv.into() } else { "python3".into() });
+        let mut command = Command::new(&python);
+        command.args(["-m", "nearl.report", "--summary"]).arg(summary).arg("--out").arg(&out);
+        for run in self.runs.iter().filter(|r| r.is_dir()) {
+            command.arg("--run").arg(run);
+        }
+        for log in shows.iter().filter_map(|s| s["log"].as_str()) {
+            command.arg("--log").arg(log);
+        }
+        let run = command
+            .output()
+            .map_err(|e| format!("cannot start '{}': {e}; give --python", python.display()))?;
+        if !run.status.success() {
+            let why = String::from_utf8_lossy(&run.stderr);
+            let last = why.trim().lines().last().unwrap_or("no message").to_string();
+            return Err(format!(
+                "'{} -m nearl.report' failed: {last}; install the package with 'make setup' or give --python",
+                python.display()
+            )
+            .into());
+        }
+        Ok(out)
+    }
+}
+
+/// A child that is stopped whatever happens.
+struct Process(Option<Child>);
+
+impl Process {
+    fn start(program: &Path, arguments: &[&str]) -> Result<Self, Failure> {
+        let child = Command::new(program).args(arguments).stdout(Stdio::piped()).spawn()?;
+        Ok(Self(Some(child)))
+    }
+
+    /// Asks the process to end, as a terminal would.
+    fn stop(&mut self) {
+        if let Some(pid) = self.0.as_ref().and_then(|c| i32::try_from(c.id()).ok()) {
+            // SAFETY: sends a signal to a child that has not been waited for.
+            unsafe { libc::kill(pid, libc::SIGTERM) };
+        }
+    }
+
+    /// Waits and reads the JSON object it printed last.
+    fn json(mut self) -> Result<Value, Failure> {
+        let Some(child) = self.0.take() else { return Err("the process was already read".into()) };
+        let output = child.wait_with_output()?;
+        let text = String::from_utf8_lossy(&output.stdout);
+        let line = text.lines().rfind(|l| l.starts_with('{'));
+        line.and_then(|l| serde_json::from_str(l).ok()).ok_or_else(|| {
+            format!("a process of the demo ended without a report ({}); its message is above", output.status)
+                .into()
+        })
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        if let Some(mut child) = self.0.take() {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+fn table(shows: &[Value]) {
+    say(
+        "task             return   raw proposals  targets   robot outside its limits      update p50 / p99   wake p50 / p99   overruns  late",
+    );
+    say(
+        "                          outside        outside   with projection / without           [us]              [us]",
+    );
+    for s in shows {
+        let run = &s["run"];
+        let us = |v: &Value| v.as_f64().unwrap_or(f64::NAN) / 1e3;
+        let (mut percents, mut mean) = (Vec::new(), f64::NAN);
+        for e in s["evaluation"].as_array().into_iter().flatten() {
+            let of =
+                |k: &str| 100.0 * e[k].as_f64().unwrap_or(f64::NAN) / e["ticks"].as_f64().unwrap_or(f64::NAN);
+            percents.push([of("raw_violations"), of("target_violations"), of("reached_violations")]);
+            if e["mode"] == "projected" {
+                let returns: Vec<f64> =
+                    e["returns"].as_array().into_iter().flatten().filter_map(Value::as_f64).collect();
+                mean = returns.iter().sum::<f64>() / returns.len().max(1) as f64;
+            }
+        }
+        let [projected, raw] = [percents[0], percents[1]];
+        say(format!(
+            "{:<15}{mean:>8.1}{:>13.2} %{:>8.2} %{:>15.2} % / {:.2} %{:>17.1} / {:.1}{:>13.1} / {:.1}{:>10}{:>6}",
+            s["task"].as_str().unwrap_or(""),
+            projected[0],
+            projected[1],
+            projected[2],
+            raw[2],
+            us(&run["compute"]["p50"]),
+            us(&run["compute"]["p99"]),
+            us(&run["wake"]["p50"]),
+            us(&run["wake"]["p99"]),
+            run["counters"]["overruns"],
+            s["plant"]["report"]["late"]
+        ));
+        for r in s["swap"].as_array().into_iter().flatten() {
+            let what =
+                if r["accepted"] == true { "swapped in while running" } else { "refused while running" };
+            say(format!("  version {} {what}: {}", r["version"], r["text"].as_str().unwrap_or("")));
+        }
+    }
+}
