@@ -14,7 +14,7 @@ fn run(name: &str, torque: Option<f64>, settings: Settings) {
     let mut projector = panda_projector(torque, settings);
     let (mut random, mut target) = (Random(7), Target::new(projector.model()));
     let (mut q, mut v) = (vec![0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0], vec![0.0; 7]);
-    let (mut side, mut times) = ([1.0f64; 7], vec![Vec::with_capacity(TICKS); 4]);
+    let (mut side, mut times) = ([1.0f64; 7], [(); 4].map(|_| Vec::with_capacity(TICKS)));
     for _ in 0..TICKS {
         for s in &mut side {
             if random.next() < 0.003 {

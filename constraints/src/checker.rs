@@ -30,9 +30,9 @@ impl Verdict {
             return;
         }
         let excess = (value - limit) / limit.abs().max(1.0);
-        if !(excess <= TOLERANCE) {
-            self.counts.add(kind); // NaN counts
-            if !(excess <= self.worst) {
+        if excess.is_nan() || excess > TOLERANCE {
+            self.counts.add(kind);
+            if excess.is_nan() || excess > self.worst {
                 (self.worst, self.worst_dof) = (excess, dof);
             }
         }

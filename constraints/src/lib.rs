@@ -39,7 +39,7 @@
 //! The shared libraries of Pinocchio are in the Python wheels. A crate that links a binary, a test or an extension
 //! with this one needs them in its run path, through a `build.rs` of its own and this crate as a dependency:
 //!
-//! ```
+//! ```text
 //! fn main() {
 //!     if let Ok(lib) = std::env::var("DEP_NEARL_PINOCCHIO_LIB") {
 //!         println!("cargo:rustc-link-arg=-Wl,-rpath,{lib}");

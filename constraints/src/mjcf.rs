@@ -368,5 +368,5 @@ fn children<'a, 'i: 'a>(node: Node<'a, 'i>, tag: &'a str) -> impl Iterator<Item 
 
 /// The last value of an attribute over all <compiler> elements.
 fn compiler<'a>(root: Node<'a, '_>, key: &str) -> Option<&'a str> {
-    root.children().filter(|n| n.has_tag_name("compiler")).filter_map(|n| n.attribute(key)).last()
+    root.children().filter(|n| n.has_tag_name("compiler")).filter_map(|n| n.attribute(key)).next_back()
 }

@@ -77,25 +77,25 @@ fn limits_of_the_robot_file_that_are_not_there() {
     let one = |l: Box<dyn Limit>| vec![l];
     refuse_for(
         &bare,
-        &one(Box::new(PositionLimit::default())),
+        &one(Box::new(PositionLimit::with_margin(0.0))),
         &[0],
         settings(),
         &["'elbow'", "lower and upper"],
     );
     refuse_for(
         &bare,
-        &one(Box::new(VelocityLimit::default())),
+        &one(Box::new(VelocityLimit::scaled(1.0))),
         &[0],
         settings(),
         &["'elbow'", "velocity = {"],
     );
-    refuse_for(&bare, &one(Box::new(TorqueLimit::default())), &[0], settings(), &["'elbow'", "effort"]);
+    refuse_for(&bare, &one(Box::new(TorqueLimit::scaled(1.0))), &[0], settings(), &["'elbow'", "effort"]);
     let cheetah = robot("gymnasium/half_cheetah.xml");
     let words = ["'bthigh', 'bshin', 'bfoot'", "velocity"];
-    refuse_for(&cheetah, &one(Box::new(VelocityLimit::default())), &[3, 4, 5], settings(), &words);
+    refuse_for(&cheetah, &one(Box::new(VelocityLimit::scaled(1.0))), &[3, 4, 5], settings(), &words);
     refuse_for(
         &cheetah,
-        &one(Box::new(TorqueLimit::default())),
+        &one(Box::new(TorqueLimit::scaled(1.0))),
         &[0, 3],
         settings(),
         &["'rootx'", "do not control"],
@@ -106,7 +106,7 @@ fn limits_of_the_robot_file_that_are_not_there() {
 fn limits_that_make_no_sense() {
     let s = || Settings::new(0.001, 1);
     refuse(
-        &[Box::new(PositionLimit::default())],
+        &[Box::new(PositionLimit::with_margin(0.0))],
         &[0, 2],
         s(),
         &["'panda_joint1', 'panda_joint3'", "acceleration"],

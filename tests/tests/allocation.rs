@@ -2,7 +2,6 @@
 
 use nearl_runtime::Controller;
 use nearl_tests::{random_policy, training};
-use nearl_trainer::env::Env;
 use nearl_trainer::rollout::{make_env, stream};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;

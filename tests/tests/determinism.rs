@@ -2,7 +2,6 @@
 
 use nearl_runtime::{Controller, Snapshot};
 use nearl_tests::training;
-use nearl_trainer::env::Env;
 use nearl_trainer::rollout::{make_env, stream};
 
 /// Record A = record B for one thread and two, over several updates of every algorithm.

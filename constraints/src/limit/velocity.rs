@@ -38,7 +38,7 @@ impl VelocityLimit {
         VelocityLimit { settings: VelocitySettings { scale: None, limit: Some(limit) } }
     }
 
-    fn from_file(
+    fn restrict_by_file(
         &self,
         scale: f64,
         model: &Model,
@@ -77,7 +77,7 @@ impl Limit for VelocityLimit {
         }
         match (self.settings.scale, &self.settings.limit) {
             (None, Some(_)) => Ok(()),
-            (scale, _) => self.from_file(scale.unwrap_or(1.0), model, controllable, set),
+            (scale, _) => self.restrict_by_file(scale.unwrap_or(1.0), model, controllable, set),
         }
     }
 }
