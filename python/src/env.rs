@@ -198,7 +198,12 @@ impl Env {
     }
 
     fn __repr__(&self) -> String {
-        format!("Env('{}', {} observations, {} actions)", self.spec.name, self.spec.n_obs(), self.spec.n_act())
+        format!(
+            "Env('{}', {} observations, {} actions)",
+            self.spec.name,
+            self.spec.n_obs(),
+            self.spec.n_act()
+        )
     }
 }
 

@@ -1,7 +1,7 @@
 //! One environment of a vector, with its buffers, its random stream and its time limit.
 
-use nearl_trainer::env::{ChaCha8Rng, Env, EnvError, Fault, SeedableRng};
 use nearl_runtime::{Controller, Noise, Output, State};
+use nearl_trainer::env::{ChaCha8Rng, Env, EnvError, Fault, SeedableRng};
 
 /// When an episode that ended is begun anew (<https://farama.org/Vector-Autoreset-Mode>).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -64,7 +64,13 @@ pub(crate) struct Lane {
 }
 
 impl Lane {
-    pub(crate) fn new(env: Box<dyn Env>, proposing: Option<Proposing>, n_action: usize, max_steps: usize, seed: u64) -> Lane {
+    pub(crate) fn new(
+        env: Box<dyn Env>,
+        proposing: Option<Proposing>,
+        n_action: usize,
+        max_steps: usize,
+        seed: u64,
+    ) -> Lane {
         let obs = vec![0.0; env.spec().n_obs()];
         Lane {
             env,
@@ -131,7 +137,8 @@ impl Lane {
                 p.want(&self.action, &*self.env);
                 while self.ticks < self.max_steps && !self.terminated {
                     let step = p.tick(&mut *self.env, &mut self.projected);
-                    (self.reward, self.terminated, self.fault) = (self.reward + step.reward, step.terminated, step.fault);
+                    (self.reward, self.terminated, self.fault) =
+                        (self.reward + step.reward, step.terminated, step.fault);
                     self.ticks += 1;
                     if self.ticks.is_multiple_of(p.controller.policy_every()) {
                         break;

@@ -138,13 +138,23 @@ impl Model {
     }
 
     /// Inverse dynamics `tau = M a + nle` (nv), without springs and dampers: a motor supplies `tau - passive(q, v)`.
-    fn rnea<'py>(&self, q: &Bound<'py, PyAny>, v: &Bound<'py, PyAny>, a: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+    fn rnea<'py>(
+        &self,
+        q: &Bound<'py, PyAny>,
+        v: &Bound<'py, PyAny>,
+        a: &Bound<'py, PyAny>,
+    ) -> PyResult<Vector<'py>> {
         let (q, v_, a) = (self.q("q", q)?, self.v("v", v)?, self.v("a", a)?);
         Ok(self.tangent(v.py(), |d, out| d.rnea(&q, &v_, &a, out)))
     }
 
     /// Forward dynamics `a = M^-1 (tau - nle)` (nv).
-    fn aba<'py>(&self, q: &Bound<'py, PyAny>, v: &Bound<'py, PyAny>, tau: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
+    fn aba<'py>(
+        &self,
+        q: &Bound<'py, PyAny>,
+        v: &Bound<'py, PyAny>,
+        tau: &Bound<'py, PyAny>,
+    ) -> PyResult<Vector<'py>> {
         let (q, v_, tau) = (self.q("q", q)?, self.v("v", v)?, self.v("tau", tau)?);
         Ok(self.tangent(v.py(), |d, out| d.aba(&q, &v_, &tau, out)))
     }

@@ -35,17 +35,20 @@ impl Pool {
     pub(crate) fn new(lanes: Vec<Lane>, threads: usize) -> std::io::Result<Pool> {
         let lanes = Arc::new(lanes.into_iter().map(Mutex::new).collect::<Vec<_>>());
         let (finished, done) = channel();
-        let mut pool = Pool { rounds: Vec::new(), done, threads: Vec::new(), process: std::process::id(), lanes };
+        let mut pool =
+            Pool { rounds: Vec::new(), done, threads: Vec::new(), process: std::process::id(), lanes };
         for i in 1..threads.clamp(1, pool.lanes.len().max(1)) {
             let (send, rounds) = channel::<Arc<Round>>();
             let finished = finished.clone();
             pool.rounds.push(send);
-            pool.threads.push(std::thread::Builder::new().name(format!("nearl-vec-{i}")).spawn(move || {
-                for round in rounds {
-                    let run = std::panic::AssertUnwindSafe(|| round.run());
-                    let _ = finished.send(std::panic::catch_unwind(run).is_ok());
-                }
-            })?);
+            pool.threads.push(std::thread::Builder::new().name(format!("nearl-vec-{i}")).spawn(
+                move || {
+                    for round in rounds {
+                        let run = std::panic::AssertUnwindSafe(|| round.run());
+                        let _ = finished.send(std::panic::catch_unwind(run).is_ok());
+                    }
+                },
+            )?);
         }
         Ok(pool)
     }
@@ -67,7 +70,11 @@ impl Pool {
         }
         round.run();
         let ended = self.rounds.iter().filter(|_| self.done.recv() == Ok(true)).count();
-        if ended == self.rounds.len() { Ok(()) } else { Err("a thread of the vector environment panicked; make a new one".into()) }
+        if ended == self.rounds.len() {
+            Ok(())
+        } else {
+            Err("a thread of the vector environment panicked; make a new one".into())
+        }
     }
 
     /// The lanes, between rounds.

@@ -49,7 +49,11 @@ impl Projector {
     ) -> PyResult<Projector> {
         let robot = &model.get().model;
         let (consistency, solver) = (
-            choice("consistency", consistency, &[("kinematic", Consistency::Kinematic), ("free", Consistency::Free)])?,
+            choice(
+                "consistency",
+                consistency,
+                &[("kinematic", Consistency::Kinematic), ("free", Consistency::Free)],
+            )?,
             choice("solver", solver, &[("ladder", Solver::Ladder), ("clarabel", Solver::Clarabel)])?,
         );
         let settings = Settings { consistency, solver, velocity_weight, ..Settings::new(dt, sub_steps) };
@@ -60,7 +64,15 @@ impl Projector {
             .map_err(errors::value)?;
         let names = (0..robot.nv()).map(|i| robot.dof_name(i)).collect();
         let sizes = (robot.nq(), robot.nv());
-        Ok(Projector { names, sizes, controllable, settings, limits, projectors: Mutex::new(vec![first]), model })
+        Ok(Projector {
+            names,
+            sizes,
+            controllable,
+            settings,
+            limits,
+            projectors: Mutex::new(vec![first]),
+            model,
+        })
     }
 
     /// The nearest next state to `(q_proposal, v_proposal)` from the state `(q, v)`.
@@ -150,7 +162,12 @@ impl Projector {
     }
 
     fn __repr__(&self) -> String {
-        format!("Projector(dt={}, controllable={:?}, limits={:?})", self.settings.dt, self.controllable(), self.limits)
+        format!(
+            "Projector(dt={}, controllable={:?}, limits={:?})",
+            self.settings.dt,
+            self.controllable(),
+            self.limits
+        )
     }
 }
 
@@ -165,7 +182,8 @@ impl Projector {
         v_proposal: &Bound<'_, PyAny>,
     ) -> PyResult<State> {
         let model = self.model.get();
-        let proposal = Proposal { q: model.q("q_proposal", q_proposal)?, v: model.v("v_proposal", v_proposal)? };
+        let proposal =
+            Proposal { q: model.q("q_proposal", q_proposal)?, v: model.v("v_proposal", v_proposal)? };
         Ok((model.q("q", q)?, model.v("v", v)?, proposal))
     }
 
@@ -178,11 +196,21 @@ impl Projector {
         py.detach(|| f(&mut self.projectors.lock().unwrap_or_else(PoisonError::into_inner)[0], model))
     }
 
-    fn batch(&self, batch: &Batch, n: usize, threads: usize) -> Result<Vec<constraints::Target>, constraints::LimitError> {
+    fn batch(
+        &self,
+        batch: &Batch,
+        n: usize,
+        threads: usize,
+    ) -> Result<Vec<constraints::Target>, constraints::LimitError> {
         let model = &self.model.get().model;
         let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
         while projectors.len() < threads {
-            projectors.push(constraints::Projector::new(model, &self.limits, &self.controllable, self.settings.clone())?);
+            projectors.push(constraints::Projector::new(
+                model,
+                &self.limits,
+                &self.controllable,
+                self.settings.clone(),
+            )?);
         }
         let mut targets = vec![constraints::Target::new(model); n];
         let size = n.div_ceil(threads).max(1);
@@ -205,7 +233,12 @@ struct Batch {
 }
 
 impl Batch {
-    fn project(&self, first: usize, projector: &mut constraints::Projector, targets: &mut [constraints::Target]) {
+    fn project(
+        &self,
+        first: usize,
+        projector: &mut constraints::Projector,
+        targets: &mut [constraints::Target],
+    ) {
         let (nq, nv) = self.sizes;
         let mut proposal = Proposal { q: vec![0.0; nq], v: vec![0.0; nv] };
         for (i, target) in (first..).zip(targets) {
@@ -244,4 +277,3 @@ fn choice<T: Copy>(what: &str, given: &str, known: &[(&str, T)]) -> PyResult<T> 
         }
     }
 }
-

@@ -14,11 +14,19 @@ fn words(status: Status) -> (&'static str, Option<&'static str>) {
         Status::Unchanged => ("unchanged", None),
         Status::Clamped => ("clamped", None),
         Status::Solved => ("solved", None),
-        Status::Recovering => ("recovering", Some("a joint is outside its limits and may only return or brake")),
-        Status::Braked(BrakeReason::NonFiniteProposal) => ("braked", Some("the proposal holds NaN or infinity")),
+        Status::Recovering => {
+            ("recovering", Some("a joint is outside its limits and may only return or brake"))
+        }
+        Status::Braked(BrakeReason::NonFiniteProposal) => {
+            ("braked", Some("the proposal holds NaN or infinity"))
+        }
         Status::Braked(BrakeReason::NoCertifiedAnswer) => ("braked", Some("no answer passed the checker")),
-        Status::Braked(BrakeReason::NonFiniteDynamics) => ("braked", Some("the dynamics came out as NaN or infinity")),
-        Status::Refused(RefuseReason::NonFiniteState) => ("refused", Some("the measured state holds NaN or infinity")),
+        Status::Braked(BrakeReason::NonFiniteDynamics) => {
+            ("braked", Some("the dynamics came out as NaN or infinity"))
+        }
+        Status::Refused(RefuseReason::NonFiniteState) => {
+            ("refused", Some("the measured state holds NaN or infinity"))
+        }
         Status::Refused(RefuseReason::WrongLength) => ("refused", Some("a vector has the wrong length")),
     }
 }
@@ -217,7 +225,11 @@ impl Targets {
         array2(py, self.targets.iter().flat_map(|t| row(t).iter().copied()).collect(), width)
     }
 
-    fn column<'py>(&self, py: Python<'py>, f: impl Fn(&constraints::Ledger) -> f64) -> Bound<'py, PyArray1<f64>> {
+    fn column<'py>(
+        &self,
+        py: Python<'py>,
+        f: impl Fn(&constraints::Ledger) -> f64,
+    ) -> Bound<'py, PyArray1<f64>> {
         array(py, &self.targets.iter().map(|t| f(&t.ledger)).collect::<Vec<_>>())
     }
 }

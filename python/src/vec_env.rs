@@ -81,16 +81,33 @@ impl VecEnv {
             let pool = Pool::new(lanes, threads).map_err(errors::value)?;
             let mode = if same_step { Autoreset::SameStep } else { Autoreset::NextStep };
             let (n_obs, dt) = (spec.n_obs(), spec.dt * space.ticks as f64);
-            Ok(VecEnv { pool: Mutex::new(pool), mode, n: num_envs, n_obs, names: space.names, low: space.low, high: space.high, dt })
+            Ok(VecEnv {
+                pool: Mutex::new(pool),
+                mode,
+                n: num_envs,
+                n_obs,
+                names: space.names,
+                low: space.low,
+                high: space.high,
+                dt,
+            })
         })
     }
 
     /// Begins an episode everywhere; `seeds` (num_envs) restart the random streams. Returns observations (num_envs x n_obs).
     #[pyo3(signature = (seeds=None))]
-    fn reset<'py>(&self, py: Python<'py>, seeds: Option<Vec<Option<u64>>>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn reset<'py>(
+        &self,
+        py: Python<'py>,
+        seeds: Option<Vec<Option<u64>>>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let seeds = seeds.unwrap_or_else(|| vec![None; self.n]);
         if seeds.len() != self.n {
-            return Err(errors::value(format!("{} seeds for {} environments; give one each", seeds.len(), self.n)));
+            return Err(errors::value(format!(
+                "{} seeds for {} environments; give one each",
+                seeds.len(),
+                self.n
+            )));
         }
         let obs = self.with(py, |pool| {
             for (mut lane, seed) in pool.lanes().zip(&seeds) {
@@ -217,7 +234,10 @@ fn info<'py>(py: Python<'py>, pool: &Pool) -> PyResult<Bound<'py, PyDict>> {
         if values.iter().all(Option::is_none) {
             return Ok(());
         }
-        info.set_item(format!("_{key}"), PyArray1::from_vec(py, values.iter().map(Option::is_some).collect()))?;
+        info.set_item(
+            format!("_{key}"),
+            PyArray1::from_vec(py, values.iter().map(Option::is_some).collect()),
+        )?;
         let objects = values.into_iter().map(|v| v.map_or_else(|| py.None(), Bound::unbind));
         info.set_item(key, PyArray1::from_vec(py, objects.collect::<Vec<Py<PyAny>>>()))
     };
@@ -225,7 +245,8 @@ fn info<'py>(py: Python<'py>, pool: &Pool) -> PyResult<Bound<'py, PyDict>> {
     let fault = |l: &Lane| fault_name(l.fault).map(|f| pyo3::types::PyString::new(py, f).into_any());
     put("fault", pool.lanes().map(|l| fault(&l)).collect())?;
     if pool.lanes().next().is_some_and(|l| l.proposing.is_some()) {
-        let counts = |f: fn(&Lane) -> u32| PyArray1::from_vec(py, pool.lanes().map(|l| f(&l)).collect::<Vec<u32>>());
+        let counts =
+            |f: fn(&Lane) -> u32| PyArray1::from_vec(py, pool.lanes().map(|l| f(&l)).collect::<Vec<u32>>());
         info.set_item("raw_violations", counts(|l| l.projected.raw_violations))?;
         info.set_item("target_violations", counts(|l| l.projected.target_violations))?;
         info.set_item("moved", array(py, &pool.lanes().map(|l| l.projected.moved).collect::<Vec<_>>()))?;
@@ -264,7 +285,9 @@ impl Space {
 fn range(model: &Model, layout: &StateLayout, k: usize) -> (f64, f64) {
     use nearl_constraints::Entry;
     match layout.state_entry(k) {
-        Entry::Position { idx_q, .. } => (model.lower_position_limit()[idx_q], model.upper_position_limit()[idx_q]),
+        Entry::Position { idx_q, .. } => {
+            (model.lower_position_limit()[idx_q], model.upper_position_limit()[idx_q])
+        }
         Entry::Velocity { dof } => (-model.velocity_limit()[dof], model.velocity_limit()[dof]),
         Entry::Other => (f64::NEG_INFINITY, f64::INFINITY),
     }
@@ -283,7 +306,15 @@ fn task_snapshot(task: &str) -> PyResult<Snapshot> {
     let n_obs = manifest.task.state.observation.len();
     let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
     let normaliser = Normaliser::identity(n_obs, n_state);
-    Ok(open(Snapshot { networks: Networks { normaliser, policy: Dense { layers: Vec::new() }, policy_log_std: Vec::new(), idm: None }, manifest }))
+    Ok(open(Snapshot {
+        networks: Networks {
+            normaliser,
+            policy: Dense { layers: Vec::new() },
+            policy_log_std: Vec::new(),
+            idm: None,
+        },
+        manifest,
+    }))
 }
 
 /// A trained agent with its inverse model, its policy replaced by the caller.
@@ -291,7 +322,10 @@ fn agent_snapshot(task: &str, file: &str) -> PyResult<Snapshot> {
     let snapshot = Snapshot::load(Path::new(file)).map_err(errors::snapshot)?;
     let Manifest { task: of, policy, .. } = &snapshot.manifest;
     if of.name != task {
-        return Err(errors::value(format!("snapshot '{file}' was trained on '{}', not on '{task}'", of.name)));
+        return Err(errors::value(format!(
+            "snapshot '{file}' was trained on '{}', not on '{task}'",
+            of.name
+        )));
     }
     if *policy == PolicyKind::Direct {
         return Err(errors::value(format!(
@@ -303,8 +337,14 @@ fn agent_snapshot(task: &str, file: &str) -> PyResult<Snapshot> {
 
 /// The same with a policy of zeros and unit deviation: the noise becomes the proposed change.
 fn open(mut snapshot: Snapshot) -> Snapshot {
-    let (n_obs, n_state) = (snapshot.networks.normaliser.mean.len(), snapshot.networks.normaliser.scale.len());
-    let layer = DenseLayer { n_in: n_obs, n_out: n_state, weight: vec![0.0; n_obs * n_state], bias: vec![0.0; n_state] };
+    let (n_obs, n_state) =
+        (snapshot.networks.normaliser.mean.len(), snapshot.networks.normaliser.scale.len());
+    let layer = DenseLayer {
+        n_in: n_obs,
+        n_out: n_state,
+        weight: vec![0.0; n_obs * n_state],
+        bias: vec![0.0; n_state],
+    };
     snapshot.networks.policy = Dense { layers: vec![layer] };
     snapshot.networks.policy_log_std = vec![0.0; n_state];
     snapshot.manifest.policy = PolicyKind::Stochastic;

@@ -38,6 +38,14 @@ def test_a_vector_equals_single_environments(task: str, mode: AutoresetMode) -> 
     assert ended[0] > 0 or task != "Hopper-v5", "the comparison covers terminations"
 
 
+def test_actions_may_be_in_any_memory_order() -> None:
+    a, b = (nearl.make_vec("Walker2d-v5", 4, seed=1) for _ in range(2))
+    a.reset(), b.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (4, 6))
+    assert np.array_equal(a.step(actions)[0], b.step(np.asfortranarray(actions))[0])
+    assert np.array_equal(a.step(actions.astype(np.float32))[0], b.step(actions.astype(np.float32).astype(float))[0])
+
+
 def test_threads_do_not_change_a_bit() -> None:
     def run(threads: int) -> np.ndarray:
         vec = nearl.make_vec("Walker2d-v5", 7, seed=2, threads=threads)
