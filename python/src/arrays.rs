@@ -10,14 +10,14 @@ pub(crate) fn vector(name: &str, value: &Bound<'_, PyAny>, expected: usize) -> P
     if array.shape() != [expected] {
         return Err(shape(name, array.shape(), &format!("({expected},)")));
     }
-    values(&array)
+    Ok(values(&array))
 }
 
 /// Rows of `columns` numbers each, row by row, and how many there are.
 pub(crate) fn rows(name: &str, value: &Bound<'_, PyAny>, columns: usize) -> PyResult<(Vec<f64>, usize)> {
     let array = numbers(name, value)?;
     match array.shape() {
-        [n, width] if *width == columns => Ok((values(&array)?, *n)),
+        [n, width] if *width == columns => Ok((values(&array), *n)),
         other => Err(shape(name, other, &format!("(n, {columns})"))),
     }
 }
@@ -39,11 +39,12 @@ fn numbers<'py>(
 }
 
 /// In C order, whatever the strides were.
-fn values(array: &PyArrayLikeDyn<'_, f64, AllowTypeChange>) -> PyResult<Vec<f64>> {
-    Ok(match array.as_slice() {
-        Ok(slice) => slice.to_vec(),
-        Err(_) => array.as_array().iter().copied().collect(),
-    })
+fn values(array: &PyArrayLikeDyn<'_, f64, AllowTypeChange>) -> Vec<f64> {
+    // `as_slice` also takes Fortran order, in which the memory is not the rows.
+    match array.as_slice() {
+        Ok(slice) if array.is_c_contiguous() => slice.to_vec(),
+        _ => array.as_array().iter().copied().collect(),
+    }
 }
 
 fn shape(name: &str, given: &[usize], expected: &str) -> PyErr {

@@ -69,15 +69,18 @@ impl VelocityLimit {
     }
 }
 
-/// Acceleration limits [rad/s² or m/s²]; also the deceleration that braking in front of a position limit counts on.
+/// Acceleration limits [rad/s² or m/s²]. `braking`: the deceleration that braking in front of a position limit counts on, at most
+/// `limit`, which is also its default.
 #[pyclass(module = "nearl._core", frozen)]
 pub(crate) struct AccelerationLimit(constraints::AccelerationLimit);
 
 #[pymethods]
 impl AccelerationLimit {
     #[new]
-    fn new(model: &Model, limit: Values) -> PyResult<Self> {
-        let settings = AccelerationSettings { limit: limit.per_joint() };
+    #[pyo3(signature = (model, limit, braking=None))]
+    fn new(model: &Model, limit: Values, braking: Option<Values>) -> PyResult<Self> {
+        let settings =
+            AccelerationSettings { limit: limit.per_joint(), braking: braking.map(Values::per_joint) };
         checked(model, constraints::AccelerationLimit::new(settings)).map(Self)
     }
 

@@ -276,7 +276,9 @@ impl Space {
         let (mut names, mut low, mut high) = (Vec::new(), Vec::new(), Vec::new());
         for k in 0..layout.n_state() {
             let (l, h) = range(model, layout, k);
-            (names.push(layout.state_name(k).to_owned()), low.push(l), high.push(h));
+            names.push(layout.state_name(k).to_owned());
+            low.push(l);
+            high.push(h);
         }
         Ok(Space { names, low, high, ticks: controller.policy_every() })
     }

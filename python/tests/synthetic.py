@@ -57,7 +57,7 @@ def flight_log(path: Path, ticks: int = 3000, metadata: dict[str, str] | None = 
             if tick % 1000 == 1:
                 goal = np.where(rng.random(7) < 0.5, low - 0.3, high + 0.3)
             v_hat = 6.0 * (goal - q) + 0.05 * rng.normal(size=7)
-            v_hat = v + np.clip(v_hat - v, -0.03, 0.03)
+            v_hat = v + np.clip(v_hat - v, -0.5, 0.5) * (1 + np.sin(tick / 90))
             q_hat = q + dt * v_hat
             target = projector.project(q, v, q_hat, v_hat)
             due = 10**9 + tick * 10**6
@@ -99,5 +99,7 @@ def summary(path: Path) -> Path:
     times = {"count": 30000, "p50": 9_100, "p99": 14_000, "p999": 31_000, "max": 320_000}
     loop = {"robot": "panda", "ticks": 30000, "seconds": 30.0, "dt": 1e-3, "wake": times, "compute": times,
             "counters": {"overruns": 1, "raw_violations": 8123, "projected_violations": 0}}  # fmt: skip
-    path.write_text(json.dumps({"loops": [loop, {**loop, "robot": "HalfCheetah"}]}))
+    loop["plant"] = {"late": 2, "violations": {"position": 0, "velocity": 3}, "worst": {"position": 0.0, "velocity": 0.012}}
+    receipts = [{"version": 4, "accepted": True, "text": "in use"}, {"version": 5, "accepted": False, "text": "snapshot digest mismatch"}]
+    path.write_text(json.dumps([{"run": loop}, {"task": "HalfCheetah-v5", "run": loop, "swap": receipts}]))
     return path

@@ -152,6 +152,8 @@ def test_a_batch_is_its_rows(model, rng) -> None:
             assert np.array_equal(targets.q[i], one.q) and np.array_equal(targets.v[i], one.v)
             assert targets.status[i] == one.status == targets[i].status
             assert targets.moved[i] == one.moved and targets[i].active == one.active
+    for layout in (np.asfortranarray, lambda x: np.repeat(x, 2, axis=1)[:, ::2], lambda x: x[::-1].copy()[::-1]):
+        assert np.array_equal(projector.project_batch(*[layout(x) for x in batch]).q, targets.q)
     assert len(projector.project_batch(*[x[:0] for x in batch])) == 0
 
 

@@ -15,7 +15,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--run", metavar="RUN_FOLDER", help="run folders of 'nearl train'; seeds of one task and algorithm share a curve", **several)
     parser.add_argument("--log", metavar="FILE.mcap", help="flight logs of 'nearl run --log'", **several)
     parser.add_argument("--eval", metavar="FILE.json", help="output of 'nearl eval --json'", **several)
-    parser.add_argument("--summary", metavar="FILE.json", help="output of 'nearl run --json'", **several)
+    parser.add_argument("--summary", metavar="FILE.json", help="output of 'nearl run --json', or summary.json of 'nearl demo'", **several)
     parser.add_argument("--title", default="NEARL report")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.html")
     given = parser.parse_args(arguments)

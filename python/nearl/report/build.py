@@ -10,7 +10,7 @@ import numpy as np
 
 from nearl._core import __version__
 from nearl.report import flight, training
-from nearl.report.read import Log, ReadError, Run, read_evaluations, read_log, read_run, read_summaries
+from nearl.report.read import Log, ReadError, Run, Summary, read_json, read_log, read_run
 
 Paths = Iterable[str | Path]
 
@@ -45,7 +45,7 @@ def build(
         runs: Run folders of ``nearl train``.
         logs: Flight logs of ``nearl run --log``.
         evals: Output files of ``nearl eval --json``.
-        summaries: Output files of ``nearl run --json``.
+        summaries: Output files of ``nearl run --json``, or ``summary.json`` of ``nearl demo``.
         title: Heading.
 
     Raises:
@@ -54,12 +54,11 @@ def build(
     """
     trained = [read_run(Path(p)) for p in runs]
     flights = [read_log(Path(p)) for p in logs]
-    evaluations = [found for p in evals for found in read_evaluations(Path(p))]
-    loops = [found for p in summaries for found in read_summaries(Path(p))]
-    if not (trained or flights or evaluations or loops):
+    programs = [read_json(Path(p)) for p in (*evals, *summaries)]
+    if not (trained or flights or programs):
         raise ReadError("there is nothing to report; give at least one of --run, --log, --eval and --summary")
     sections = [
-        ("Results", _results(trained, evaluations, loops, flights)),
+        ("Results", _results(trained, programs, flights)),
         ("Learning", _or_sentence(training.learning_curves(trained), trained, "No run folder was given (--run).", "The runs given have no finished episodes.")),
         ("Inverse dynamics", _or_sentence(training.idm_loss(trained), trained, "No run folder was given (--run).", "The runs given learned no inverse model.")),
         ("Constraints while training", _or_sentence(training.violations(trained), trained, "No run folder was given (--run).", "The runs given project nothing.")),
@@ -95,23 +94,23 @@ def _none(sentence: str) -> str:
     return f'<p class="none">{html.escape(sentence)}</p>'
 
 
-def _results(
-    runs: list[Run],
-    evaluations: list[tuple[str, dict[str, Any]]],
-    loops: list[tuple[str, dict[str, Any]]],
-    logs: list[Log],
-) -> str:
+def _results(runs: list[Run], programs: list[Summary], logs: list[Log]) -> str:
     parts = []
-    if evaluations:
-        head = ["evaluation", "mode", "return", "episodes", "raw proposals outside", "targets outside", "reached outside"]
-        parts.append(_table("Episodes without exploration", head, [_evaluation_row(*e) for e in evaluations]))
+    if evaluations := [e for p in programs for e in p.evaluations]:
+        head = ["episodes without exploration", "mode", "return", "episodes", "raw proposals outside", "targets outside", "reached outside"]
+        parts.append(_table("Return and broken limits [share of ticks]", head, [_evaluation_row(*e) for e in evaluations]))
     if runs:
         head = ["training", "seed", "steps", "return at the end", "raw proposals outside", "targets outside", "steps/s"]
         parts.append(_table("Trainings", head, [_run_row(run) for run in runs]))
-    loop_head = ["loop", "ticks", "raw proposals outside", "targets outside", "compute p50", "p99", "p99.9", "max", "late wake p99", "overruns"]
-    rows = [_loop_row(*s) for s in loops] or [_log_row(log) for log in logs]
-    if rows:
-        parts.append(_table("Real-time loop [µs]", loop_head, rows))
+    loops = [_loop_row(*loop) for p in programs for loop in p.loops] or [_log_row(log) for log in logs]
+    if loops:
+        head = ["loop", "ticks", "compute p50", "p99", "p99.9", "max", "wake p50", "p99", "overruns", "late on the robot"]
+        parts.append(_table("Latency [µs]", head, loops))
+    if broken := [_broken_row(*loop) for p in programs for loop in p.loops]:
+        head = ["loop", "by raw proposals", "by projected targets", "by the robot", "robot's largest excess"]
+        parts.append(_table("Limits broken in the loop [count over joints and ticks]", head, broken))
+    if receipts := [_receipt_row(*r) for p in programs for r in p.receipts]:
+        parts.append(_table("Snapshots pushed while it ran", ["loop", "version", "verdict", "words"], receipts))
     return "".join(parts)
 
 
@@ -140,25 +139,34 @@ def _run_row(run: Run) -> list[str]:
 
 
 def _loop_row(name: str, s: dict[str, Any]) -> list[str]:
-    counters = s.get("counters", {})
-    us = [f"{s['compute'][p] * 1e-3:.1f}" for p in ("p50", "p99", "p999", "max")]
-    return [
-        name,
-        f"{s['ticks']:,}",
-        _count(counters.get("raw_violations")),
-        _count(counters.get("projected_violations")),
-        *us,
-        f"{s['wake']['p99'] * 1e-3:.1f}",
-        _count(counters.get("overruns")),
-    ]
+    us = [f"{s[what][p] * 1e-3:.1f}" for what, p in (*(("compute", p) for p in ("p50", "p99", "p999", "max")), ("wake", "p50"), ("wake", "p99"))]
+    return [name, f"{s['ticks']:,}", *us, _count(s.get("counters", {}).get("overruns")), _count(s.get("plant", {}).get("late"))]
 
 
 def _log_row(log: Log) -> list[str]:
     c = log.columns
     us = [f"{p:.1f}" for p in flight.percentiles((c["end_ns"] - c["begin_ns"]) * 1e-3)]
-    wake = flight.percentiles((c["begin_ns"] - c["due_ns"]) * 1e-3)[1]
-    outside = [_share(int(np.nansum(c[k] > 0)), len(log)) for k in ("raw_violations", "target_violations")]
-    return [log.path.stem, f"{len(log):,}", *outside, *us, f"{wake:.1f}", _count(np.nanmax(c["overruns"]))]
+    wake = [f"{p:.1f}" for p in flight.percentiles((c["begin_ns"] - c["due_ns"]) * 1e-3)[:2]]
+    return [log.path.stem, f"{len(log):,}", *us, *wake, _count(np.nanmax(c["overruns"])), "–"]
+
+
+def _broken_row(name: str, s: dict[str, Any]) -> list[str]:
+    counters, plant = s.get("counters", {}), s.get("plant", {})
+    broken = plant.get("violations", {})
+    excess = [f"{kind} {x:.2g}" for kind, x in plant.get("worst", {}).items() if x > 0]
+    return [
+        name,
+        _count(counters.get("raw_violations")),
+        _count(counters.get("projected_violations")),
+        _count(sum(broken.values()) if broken else None),
+        ", ".join(excess) or "–",
+    ]
+
+
+def _receipt_row(name: str, receipt: dict[str, Any]) -> list[str]:
+    words = str(receipt["text"])
+    short = words if len(words) <= 90 else words[:90].rsplit(" ", 1)[0] + " …"
+    return [name, str(receipt["version"]), "swapped in" if receipt["accepted"] else "refused", short]
 
 
 def _share(part: float | None, whole: float | None) -> str:

@@ -1,13 +1,12 @@
 """Figures of a flight log: active constraints, predicted / projected / reached state, latency."""
 
-from typing import NamedTuple
-
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 from numpy.typing import NDArray
 
 from nearl.report.read import Floats, Log
+from nearl.report.rows import active_rows, tick_proposals
 from nearl.report.style import DEADLINE, GRID, MUTED, PREDICTED, PROJECTED, REACHED, image
 
 COLUMNS_AT_MOST = 900
@@ -16,55 +15,11 @@ JOINTS_AT_MOST = 7
 WINDOW_TICKS = 600
 
 
-class Rows(NamedTuple):
-    """Rows that were ever active: names, and the multiplier of each over ticks (n_rows x n), NaN where not active."""
-
-    names: list[str]
-    multiplier: Floats
-    meaning: str
-
-
-def active_rows(log: Log) -> Rows:
-    """The rows of the ledger; where the log has none, what they add up to on each joint.
-
-    At the optimum the multipliers balance the pull towards the proposal, with unit weights
-    ``mu + G' lambda = (q_hat - q') / T + (v_hat - v')``, exactly zero for a joint that nothing holds back.
-    """
-    names = log.names(log.target_v.shape[1])
-    if any(log.active):
-        return _recorded(log, names)
-    pull = log.proposal_v - log.target_v
-    shift = log.target_q.shape[1] - log.target_v.shape[1]
-    dq = log.proposal_q - log.target_q
-    if shift == 0:
-        pull = pull + dq / log.dt
-    elif pull.shape[1] > 6:  # a free base has one configuration entry more; it is never projected
-        pull[:, 6:] += dq[:, 6 + shift :] / log.dt
-    found, values = [], []
-    for i, name in enumerate(names):
-        for side, signed in (("upper", pull[:, i]), ("lower", -pull[:, i])):
-            held = np.where(signed > 1e-9, signed, np.nan)
-            if np.isfinite(held).any():
-                found.append(f"{name} {'↑' if side == 'upper' else '↓'}")
-                values.append(held)
-    table = np.array(values).reshape(len(found), len(log))
-    return Rows(found, table, "multipliers on the joint, summed [rad/s]")
-
-
-def _recorded(log: Log, names: list[str]) -> Rows:
-    table: dict[tuple[int, str, str], Floats] = {}
-    for tick, rows in enumerate(log.active):
-        for row in rows:
-            key = (int(row["dof"]), str(row["kind"]), str(row["side"]))
-            table.setdefault(key, np.full(len(log), np.nan))[tick] = row["multiplier"]
-    keys = sorted(table)
-    label = [f"{names[d] if d < len(names) else d} {kind} {'↑' if side == 'upper' else '↓'}" for d, kind, side in keys]
-    return Rows(label, np.array([table[k] for k in keys]).reshape(len(keys), len(log)), "multiplier")
-
-
 def timeline(log: Log) -> tuple[str | None, str]:
     """Which rows were active when, and a sentence about the whole."""
     rows = active_rows(log)
+    if rows is None:
+        return None, "The log counts the active constraints, but does not hold enough to tell which they were."
     if not rows.names:
         return None, "No constraint was active in any tick."
     share = np.isfinite(rows.multiplier).mean(axis=1)
@@ -74,7 +29,7 @@ def timeline(log: Log) -> tuple[str | None, str]:
     figure, axes = plt.subplots(figsize=(10.2, 1.25 + 0.23 * len(names)))
     low, high = np.nanpercentile(values, [2, 99.5])
     low = max(low, high * 1e-4, 1e-12)
-    norm = LogNorm(low, max(high, low * 10))
+    norm = LogNorm(low, max(high, low * 1.5))
     mesh = axes.pcolormesh(edges, np.arange(len(names) + 1), values, cmap="viridis_r", norm=norm, rasterized=True)
     axes.set_yticks(np.arange(len(names)) + 0.5, names)
     axes.set(xlabel="time [s]", title="Active constraints")
@@ -82,7 +37,9 @@ def timeline(log: Log) -> tuple[str | None, str]:
     axes.hlines(np.arange(1, len(names)), edges[0], edges[-1], color=GRID, linewidth=0.6)
     axes.tick_params(axis="y", length=0)
     axes.invert_yaxis()
-    figure.colorbar(mesh, ax=axes, label=rows.meaning, pad=0.012, aspect=max(8, 1.6 * len(names)))
+    bar = figure.colorbar(mesh, ax=axes, label=rows.meaning, pad=0.012, aspect=max(8, 1.6 * len(names)))
+    bar.ax.yaxis.set_major_formatter(lambda x, _: f"{x:g}")
+    bar.ax.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if norm.vmax < 20 * norm.vmin else "")
     left_out = f" The {len(rows.names) - len(busy)} least busy rows are left out." if len(busy) < len(rows.names) else ""
     caption = f"Rows that hold the target back, coloured by how hard they are leaned on (white: not active; arrow: which bound).{left_out}"
     return image(figure, caption), ""
@@ -109,10 +66,11 @@ def states(log: Log) -> str | None:
         len(chosen), 2, figsize=(10.2, 1.0 + 1.35 * len(chosen)), sharex=True, squeeze=False
     )
     time = log.time[window]
+    q_hat, v_hat = tick_proposals(log)
     for row, i in zip(panels, chosen, strict=True):
         k = i + shift if i >= 6 or shift == 0 else i
-        _three(row[0], time, log.dt, log.proposal_q[window, k], log.target_q[window, k], log.q[window, k])
-        _three(row[1], time, log.dt, log.proposal_v[window, i], log.target_v[window, i], log.v[window, i])
+        _three(row[0], time, log.dt, q_hat[window, k], log.target_q[window, k], log.q[window, k])
+        _three(row[1], time, log.dt, v_hat[window, i], log.target_v[window, i], log.v[window, i])
         row[0].set_ylabel(names[i].replace("panda_", ""), rotation=0, ha="right", va="center")
     panels[0, 0].set_title("Position [rad or m]")
     panels[0, 1].set_title("Velocity [rad/s or m/s]")
@@ -120,7 +78,7 @@ def states(log: Log) -> str | None:
     figure.legend(handles, labels, loc="outside upper right", ncols=3)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
-    caption = f"What the policy predicted, what the projection made of it, and where the robot got to, {time[0]:.2f} s to {time[-1]:.2f} s: the ticks in which the projection had most to do."
+    caption = f"What the policy predicted for the end of each tick, what the projection made of it, and where the robot got to, {time[0]:.2f} s to {time[-1]:.2f} s: the ticks in which the projection had most to do."
     return image(figure, caption)
 
 
@@ -132,10 +90,11 @@ def _three(axes: plt.Axes, time: Floats, dt: float, predicted: Floats, projected
     kept = np.concatenate([projected, reached])
     low, high = np.nanmin(kept), np.nanmax(kept)
     wide_low, wide_high = np.nanpercentile(predicted, [1, 99])
-    room = max(high - low, 1e-3)
+    room = max(high - low, 0.3 * max(abs(low), abs(high)), 1e-3)
     axes.set_ylim(max(min(low, wide_low), low - room) - 0.08 * room, min(max(high, wide_high), high + room) + 0.08 * room)
     axes.margins(x=0)
     axes.locator_params(axis="y", nbins=4)
+    axes.ticklabel_format(axis="y", useOffset=False)
 
 
 def _moved(log: Log) -> Floats:
@@ -152,12 +111,17 @@ def _joints(log: Log) -> NDArray[np.intp]:
 
 
 def _window(log: Log) -> slice:
-    """The ticks with most to do."""
+    """The ticks with most to do, inside one episode where one is long enough."""
     total = _moved(log).sum(axis=1)
     if len(total) <= WINDOW_TICKS:
         return slice(0, len(total))
     sums = np.concatenate([[0.0], np.cumsum(total)])
-    start = int(np.argmax(sums[WINDOW_TICKS:] - sums[:-WINDOW_TICKS]))
+    inside = sums[WINDOW_TICKS:] - sums[:-WINDOW_TICKS]
+    episode = log.columns["episode"]
+    whole = episode[: len(inside)] == episode[WINDOW_TICKS - 1 :]
+    if whole.any():
+        inside = np.where(whole, inside, -1.0)
+    start = int(np.argmax(inside))
     return slice(start, start + WINDOW_TICKS)
 
 
@@ -179,7 +143,7 @@ def latency(log: Log) -> str:
     axes.annotate(f"deadline {deadline:g} µs", (deadline, 1), xycoords=("data", "axes fraction"), xytext=(-5, -4), textcoords="offset points", color=DEADLINE, ha="right", va="top")
     axes.set(xscale="log", yscale="log", xlabel="time [µs]", ylabel="ticks", title="Latency", xlim=(low, high))
     axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
-    axes.legend(loc="upper center")
+    figure.legend(loc="outside upper right", ncols=2)
     late = int(np.sum(total > deadline))
     return image(figure, f"{len(log)} ticks; {late} action{'' if late == 1 else 's'} later than the control period of {deadline:g} µs.")
 

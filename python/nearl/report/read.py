@@ -8,11 +8,14 @@ import struct
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from nearl import _core
 
 Floats = NDArray[np.float64]
 
@@ -93,18 +96,21 @@ class Log:
         due = self.columns["due_ns"]
         return (due - due[0]) * 1e-9
 
-    @property
+    @cached_property
     def dt(self) -> float:
-        """Control period [s]: the metadata's, else the median distance of ticks."""
+        """Control period [s]: the metadata's, else the bundled task's, else the median distance of ticks."""
         if "dt" in self.metadata:
             return float(self.metadata["dt"])
+        if self.metadata.get("task") in dict(_core.tasks()):
+            return _core.Env(self.metadata["task"]).dt
         gaps = np.diff(self.columns["due_ns"])
         return float(np.median(gaps)) * 1e-9 if len(gaps) else float("nan")
 
     def names(self, n: int) -> list[str]:
-        """Names of the degrees of freedom: the metadata's ``joints``, else numbers."""
-        text = self.metadata.get("joints", "")
-        given = json.loads(text) if text.startswith("[") else [x for x in re.split(r"[,\s]+", text) if x]
+        """Names of the degrees of freedom: the metadata's ``joints``, else the bundled task's, else numbers."""
+        given = [x for x in re.split(r"[,\s]+", self.metadata.get("joints", "")) if x]
+        if not given and self.metadata.get("task") in dict(_core.tasks()):
+            given = _core.Env(self.metadata["task"]).joint_names
         return given if len(given) == n else [f"joint {i}" for i in range(n)]
 
 
@@ -169,19 +175,25 @@ def _table(rows: list[list[float] | None]) -> Floats:
     return table
 
 
-def read_evaluations(path: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Every evaluation (``nearl eval --json``) in a JSON file, whatever it is wrapped in, with a name."""
-    found = list(_find(_json(path), {"mode", "returns"}, path.stem))
-    if not found:
-        raise ReadError(f"'{path}' holds no evaluation; give the output of 'nearl eval --json'")
-    return found
+@dataclass
+class Summary:
+    """What programs printed as JSON, with names: evaluations, reports of loops, receipts of pushed snapshots."""
+
+    evaluations: list[tuple[str, dict[str, Any]]]
+    loops: list[tuple[str, dict[str, Any]]]
+    receipts: list[tuple[str, dict[str, Any]]]
 
 
-def read_summaries(path: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Every loop report (``nearl run --json``) in a JSON file, whatever it is wrapped in, with a name."""
-    found = list(_find(_json(path), {"compute", "wake", "ticks"}, path.stem))
-    if not found:
-        raise ReadError(f"'{path}' holds no report of a loop; give the output of 'nearl run --json'")
+def read_json(path: Path) -> Summary:
+    """Everything known in a JSON file, whatever it is wrapped in: ``nearl eval|run|demo --json``."""
+    content, name = _json(path), path.stem
+    found = Summary(
+        list(_find(content, {"mode", "returns"}, name)),
+        list(_find(content, {"compute", "wake", "ticks"}, name)),
+        list(_find(content, {"version", "accepted", "text"}, name)),
+    )
+    if not (found.evaluations or found.loops):
+        raise ReadError(f"'{path}' holds neither evaluation nor report of a loop; give the output of 'nearl eval --json', 'nearl run --json' or 'nearl demo'")
     return found
 
 
@@ -192,13 +204,15 @@ def _json(path: Path) -> Any:
         raise ReadError(f"'{path}' is not JSON: {error}") from error
 
 
-def _find(node: Any, keys: set[str], name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+def _find(node: Any, keys: set[str], name: str, task: str | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Objects that have ``keys``, named by the ``task`` they are under, else by their ``robot``, else by the file."""
     if isinstance(node, dict):
         if keys <= node.keys():
-            yield node.get("robot") or name, node
+            yield task or node.get("robot") or name, node
             return
-        for key, child in node.items():
-            yield from _find(child, keys, key)
+        task = node.get("task", task)
+        for child in node.values():
+            yield from _find(child, keys, name, task)
     elif isinstance(node, list):
         for child in node:
-            yield from _find(child, keys, name)
+            yield from _find(child, keys, name, task)

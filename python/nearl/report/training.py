@@ -5,6 +5,7 @@ from collections import defaultdict
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter
 
 from nearl import curves
 from nearl.report.read import Run
@@ -66,16 +67,17 @@ def idm_loss(runs: list[Run]) -> list[str]:
     figure, panels = plt.subplots(1, len(tasks), figsize=(max(7.2, 5.0 * len(tasks)), 3.3), squeeze=False)
     for axes, (task, by_algo) in zip(panels[0], tasks.items(), strict=True):
         members = [run for algo in by_algo.values() for run in algo]
-        for run, colour in zip(members, CURVES * len(members)):
-            name = f"{run.algo}, seed {run.seed}" if len(members) > 1 else "inverse model"
-            if (before := run.column("idm/mse_before")) is not None:
-                axes.plot(*before, color=colour, alpha=0.35, linewidth=0.9, label=f"{name}, before the update")
-            if (after := run.column("idm/mse_after")) is not None:
-                axes.plot(*after, color=colour, label=f"{name}, after")
+        for colour, (algo, seeds) in zip(CURVES * len(by_algo), by_algo.items()):
+            prefix = f"{algo}, " if len(by_algo) > 1 else ""
+            for i, run in enumerate(seeds):
+                for column, words, look in (("before", "before an update", {"alpha": 0.35, "linewidth": 0.8}), ("after", "after", {"linewidth": 1.3})):
+                    if (found := run.column(f"idm/mse_{column}")) is not None:
+                        axes.plot(*found, color=colour, label=prefix + words if i == 0 else None, **look)
         if (threshold := next((c for r in members if (c := r.column("idm/threshold"))), None)) is not None:
             axes.plot(*threshold, color=DEADLINE, linestyle=(0, (5, 3)), linewidth=1.3, label="threshold")
         axes.set(title=task, yscale="log")
-        axes.legend(loc="upper right", ncols=2 if len(members) > 1 else 1)
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.legend(loc="upper right")
         steps_axis(axes)
     panels[0, 0].set_ylabel("squared error of the action")
     caption = "Loss of the inverse model before and after each update. Above the threshold it is trained until it is below; below, it is left alone."
