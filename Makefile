@@ -20,7 +20,7 @@ build: setup
 
 # The Python package, built from this checkout into .venv.
 package: setup
-	$(PIP) --no-deps --no-build-isolation ./python
+	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(PIP) --no-deps --no-build-isolation ./python
 
 # The main job: train with constraints, run the result and a bundled arm as separate processes, and report.
 demo: build package

@@ -17,7 +17,9 @@ pub struct Evaluation {
     pub ticks: u64,
     /// Ticks whose raw proposal broke a constraint.
     pub raw_violations: u64,
-    /// Ticks whose target broke a constraint.
+    /// Ticks that began with a joint already outside its limits.
+    pub recovering: u64,
+    /// Ticks that began inside and whose target broke a constraint.
     pub target_violations: u64,
     /// Ticks whose state, as the simulator has it afterwards, broke a position or velocity limit.
     pub reached_violations: u64,
@@ -51,6 +53,7 @@ pub fn evaluate(
         lengths: Vec::new(),
         ticks: 0,
         raw_violations: 0,
+        recovering: 0,
         target_violations: 0,
         reached_violations: 0,
         residual: 0.0,
@@ -62,6 +65,7 @@ pub fn evaluate(
         e.lengths.push(length);
         e.ticks += t.ticks;
         e.raw_violations += t.raw_violations;
+        e.recovering += t.recovering;
         e.target_violations += t.projected_violations;
         e.reached_violations += t.reached_violations;
         e.residual += t.residual;

@@ -75,7 +75,9 @@ pub struct Tally {
     pub ticks: u64,
     /// Ticks whose raw proposal broke a constraint.
     pub raw_violations: u64,
-    /// Ticks whose target broke a constraint, by the independent checker.
+    /// Ticks that began with a controllable joint already outside its limits: the projection can only lead it back.
+    pub recovering: u64,
+    /// Ticks that began inside and whose target broke a constraint, by the independent checker.
     pub projected_violations: u64,
     /// Ticks in which the projection moved the proposal.
     pub moved: u64,
@@ -94,6 +96,7 @@ impl Tally {
         self.episodes.extend_from_slice(&other.episodes);
         self.ticks += other.ticks;
         self.raw_violations += other.raw_violations;
+        self.recovering += other.recovering;
         self.projected_violations += other.projected_violations;
         self.moved += other.moved;
         self.distance += other.distance;
@@ -366,7 +369,8 @@ impl Worker {
         let ledger = &self.out.next.ledger;
         self.tally.ticks += 1;
         self.tally.raw_violations += u64::from(ledger.raw_violations.total() > 0);
-        self.tally.projected_violations += u64::from(ledger.violations.total() > 0);
+        self.tally.recovering += u64::from(ledger.outside > 0);
+        self.tally.projected_violations += u64::from(ledger.violations.total() > 0 && ledger.outside == 0);
         self.tally.moved += u64::from(ledger.moved > 0.0);
         self.tally.distance += ledger.moved;
         self.tally.faults += u64::from(step.fault != Fault::None);

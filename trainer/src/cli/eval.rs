@@ -38,17 +38,22 @@ impl Eval {
             return Ok(());
         }
         say(format!("{}, {} episodes", snapshot.manifest.task.name, self.episodes));
-        say("mode        return   raw proposals   targets   reached states   |reached - target|");
-        say("                     outside         outside   outside          [std of change]");
+        say(
+            "                    raw proposals   targets   reached states   already outside   |reached - target|",
+        );
+        say(
+            "mode        return  outside limits  outside          outside     (recovering)     [std of change]",
+        );
         for e in &results {
             let percent = |n: u64| 100.0 * n as f64 / e.ticks.max(1) as f64;
             say(format!(
-                "{:<10}{:>8.1}{:>14.2} %{:>8.2} %{:>15.2} %{:>18.3}",
+                "{:<10}{:>8.1}{:>14.2} %{:>7.2} %{:>15.2} %{:>15.2} %{:>20.3}",
                 e.mode,
                 e.mean_return(),
                 percent(e.raw_violations),
                 percent(e.target_violations),
                 percent(e.reached_violations),
+                percent(e.recovering),
                 e.residual
             ));
         }
