@@ -16,10 +16,10 @@ pub struct RunCommand {
     #[arg(long)]
     pub plant: String,
     /// Keep own time at this rate instead of following the plant [Hz]; must be the plant's.
-    #[arg(long)]
+    #[arg(long, value_parser = hertz)]
     pub rate: Option<f64>,
     /// Stop after so many seconds of ticks.
-    #[arg(long)]
+    #[arg(long, value_parser = seconds)]
     pub seconds: Option<f64>,
     /// Flight log (MCAP).
     #[arg(long)]
@@ -70,6 +70,38 @@ pub enum LoopBench {
     },
 }
 
+/// Prints a line. A closed pipe ends the program quietly, as other commands do; any other failure ends it with code 1.
+pub fn say(line: impl std::fmt::Display) {
+    use std::io::{ErrorKind, Write};
+    let mut out = std::io::stdout().lock();
+    match writeln!(out, "{line}").and_then(|()| out.flush()) {
+        Ok(()) => {}
+        Err(e) if e.kind() == ErrorKind::BrokenPipe => std::process::exit(0),
+        Err(e) => {
+            eprintln!("standard output cannot be written ({e}): send it to another file");
+            std::process::exit(1);
+        }
+    }
+}
+
+/// A duration in seconds on the command line: positive and finite.
+///
+/// # Errors
+/// One sentence.
+pub fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(s) if s > 0.0 && s <= 1e7 => Ok(s),
+        _ => Err(format!("'{text}' is not a duration; write seconds, for example 2.5")),
+    }
+}
+
+fn hertz(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(rate) if rate > 0.0 && rate <= 1e6 => Ok(rate),
+        _ => Err(format!("'{text}' is not a rate; write Hz, for example 1000")),
+    }
+}
+
 /// Any failure, as one sentence.
 pub type Failure = Box<dyn std::error::Error + Send + Sync>;
 
@@ -95,9 +127,9 @@ impl RunCommand {
         let stop = Stop::on_signals()?;
         let report = run(&settings, &self.snapshot, &RobotName::new(&self.plant)?, &stop)?;
         if self.json {
-            println!("{}", serde_json::to_string(&report)?);
+            say(serde_json::to_string(&report)?);
         } else {
-            print!("{report}");
+            say(report.to_string().trim_end());
         }
         Ok(())
     }
@@ -120,10 +152,10 @@ fn link(count: u64, json: bool) -> Result<(), Failure> {
     let name = RobotName::new(&format!("bench{}", std::process::id()))?;
     let result = bench_round_trip(&name, count)?;
     if json {
-        println!("{}", serde_json::to_string(&result)?);
+        say(serde_json::to_string(&result)?);
         return Ok(());
     }
-    println!("state {} B, action {} B, round trip in us:", result.state_bytes, result.action_bytes);
+    say(format!("state {} B, action {} B, round trip in us:", result.state_bytes, result.action_bytes));
     line("busy", &result.busy);
     line("paced at 1 kHz", &result.paced);
     Ok(())
@@ -142,14 +174,14 @@ fn wake(rate: f64, seconds: f64, priority: i32, cpu: Option<usize>, json: bool) 
         eprintln!("warning: {warning}");
     }
     if json {
-        println!("{}", serde_json::json!({ "rate_hz": rate, "wake_ns": late, "warnings": warnings }));
+        say(serde_json::json!({ "rate_hz": rate, "wake_ns": late, "warnings": warnings }));
         return Ok(());
     }
-    println!("empty loop at {rate} Hz, wake-up after the slot in us:");
+    say(format!("empty loop at {rate} Hz, wake-up after the slot in us:"));
     line("wake-up", &late);
     Ok(())
 }
 
 fn line(name: &str, percentiles: &Percentiles) {
-    println!("  {name:<16} {percentiles}");
+    say(format!("  {name:<16} {percentiles}"));
 }

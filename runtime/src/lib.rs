@@ -4,6 +4,7 @@
 
 pub mod cli;
 pub mod controller;
+pub mod doctor;
 pub mod idm;
 pub mod link;
 pub mod log;

@@ -151,8 +151,8 @@ pub enum SnapshotError {
         /// The value.
         value: f64,
     },
-    /// The robot, layout or limits inside the snapshot are refused.
-    #[error("snapshot cannot be used: {reason}")]
+    /// The robot, layout or limits of the task (a file, or inside a snapshot) are refused.
+    #[error("task cannot be used: {reason}")]
     Unusable {
         /// One sentence from the layer that refused.
         reason: String,

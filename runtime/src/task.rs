@@ -159,7 +159,7 @@ impl Task {
                 .map_err(|e| at(line_of(text, e.span()), first_line(e.message())))?;
             let task: Task = serde_path_to_error::deserialize(de).map_err(|e| {
                 let (key, inner) = (e.path().to_string(), e.into_inner());
-                at(format!("{} [{key}]", line_of(text, inner.span())), suggest(inner.message()))
+                at(format!("{}{}", line_of(text, inner.span()), bracket(&key)), suggest(inner.message()))
             })?;
             return task.checked(file);
         }
@@ -168,7 +168,7 @@ impl Task {
         }
         let task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
             let key = e.path().to_string();
-            at(format!(" [{key}]"), suggest(e.into_inner().message()))
+            at(bracket(&key), suggest(e.into_inner().message()))
         })?;
         task.checked(file)
     }
@@ -240,8 +240,13 @@ fn line_of(text: &str, span: Option<std::ops::Range<usize>>) -> String {
     span.map_or(String::new(), |s| format!(":{}", 1 + text[..s.start.min(text.len())].matches('\n').count()))
 }
 
+/// ` [key]`; nothing for the file as a whole.
+fn bracket(key: &str) -> String {
+    if key == "." { String::new() } else { format!(" [{key}]") }
+}
+
 /// `unknown field 'velocty', expected ...` gains the nearest key.
-fn suggest(message: &str) -> String {
+pub fn suggest(message: &str) -> String {
     let message = first_line(message);
     let mut quoted = message.split('`').skip(1).step_by(2);
     let Some(unknown) = quoted.next().filter(|_| message.starts_with("unknown ")) else { return message };

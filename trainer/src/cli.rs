@@ -11,6 +11,7 @@ mod train;
 use clap::{Parser, Subcommand};
 
 pub use nearl_runtime::cli::Failure;
+pub(crate) use nearl_runtime::cli::say;
 
 /// Let a learned policy move a robot without ever breaking its limits.
 #[derive(Parser)]
@@ -36,6 +37,8 @@ enum Command {
     Plant(plant::PlantCommand),
     /// Run a snapshot on a plant in real time.
     Run(nearl_runtime::cli::RunCommand),
+    /// Check that a snapshot, this machine and a plant are ready.
+    Doctor(nearl_runtime::doctor::DoctorCommand),
     /// List the bundled tasks.
     Tasks(tasks::Tasks),
 }
@@ -54,6 +57,7 @@ impl Cli {
             Command::Bench(c) => c.run(),
             Command::Plant(c) => c.run(),
             Command::Run(c) => c.run(),
+            Command::Doctor(c) => c.run(),
             Command::Tasks(c) => c.run(),
         }
     }
@@ -62,12 +66,4 @@ impl Cli {
 /// Cores of this machine.
 pub(crate) fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
-}
-
-/// Prints a line; a closed pipe ends the program quietly, as other commands do.
-pub(crate) fn say(line: impl std::fmt::Display) {
-    use std::io::Write;
-    if writeln!(std::io::stdout().lock(), "{line}").is_err() {
-        std::process::exit(0);
-    }
 }

@@ -23,7 +23,7 @@ pub enum RunError {
         path: String,
     },
     /// Reading.
-    #[error("'{path}' is not a run folder: {reason}; give a folder written by 'nearl train'")]
+    #[error("'{path}' is not a run: {reason}; give a folder or snapshot written by 'nearl train'")]
     Read {
         /// Folder.
         path: String,
@@ -108,6 +108,11 @@ impl RunFolder {
 pub fn snapshot_of(run: &Path) -> Result<PathBuf, RunError> {
     if run.is_file() {
         return Ok(run.into());
+    }
+    if !run.is_dir() {
+        let reason =
+            if run.exists() { "it is neither a folder nor a regular file" } else { "it does not exist" };
+        return Err(RunError::Read { path: run.display().to_string(), reason: reason.into() });
     }
     ["final", "latest"]
         .iter()

@@ -1,6 +1,7 @@
 //! `[train]` of the task file: how experience is collected, and the learner's own sections.
 
 use crate::learn::{Pid2Settings, PpoSettings};
+use nearl_runtime::task::suggest;
 use serde::{Deserialize, Serialize};
 
 /// How the unit of a proposed change is chosen.
@@ -78,7 +79,7 @@ impl TrainSettings {
     /// One sentence naming the key.
     pub fn read(table: &toml::Table) -> Result<Self, String> {
         let settings: Self = serde_path_to_error::deserialize(table.clone())
-            .map_err(|e| format!("[train.{}]: {}", e.path(), e.inner().message()))?;
+            .map_err(|e| format!("[train.{}]: {}", e.path(), suggest(e.inner().message())))?;
         let positive = [("n_envs", settings.n_envs), ("n_steps", settings.n_steps)];
         if let Some((key, _)) = positive.iter().find(|(_, v)| *v == 0) {
             return Err(format!("[train.{key}]: 0 collects nothing; give at least 1"));

@@ -4,6 +4,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use nearl_runtime::cli::{LoopBench, RunCommand};
+use nearl_runtime::doctor::DoctorCommand;
 
 #[derive(Parser)]
 #[command(name = "nearl-runtime", version, about = "NEARL's real-time loop")]
@@ -16,6 +17,8 @@ struct Arguments {
 enum Command {
     /// Run a snapshot on a plant in real time.
     Run(RunCommand),
+    /// Check that a snapshot, this machine and a plant are ready.
+    Doctor(DoctorCommand),
     /// Measure this machine: shared-memory round trip, or wake-up of an empty loop.
     Bench {
         #[command(subcommand)]
@@ -26,6 +29,7 @@ enum Command {
 fn main() -> ExitCode {
     let result = match Arguments::parse().command {
         Command::Run(command) => command.run(),
+        Command::Doctor(command) => command.run(),
         Command::Bench { what } => what.run(),
     };
     match result {

@@ -8,7 +8,7 @@ use rustix::io::Errno;
 
 use super::{LinkError, RobotName};
 
-const FOLDER: &str = "/dev/shm";
+pub(crate) const FOLDER: &str = "/dev/shm";
 const MEGABYTE: u64 = 1 << 20;
 
 /// Checks that `bytes` can really be written to shared memory: free blocks first, then a reserved probe file.
@@ -30,6 +30,11 @@ pub(crate) fn check(name: &RobotName, bytes: u64) -> Result<(), LinkError> {
     });
     let _ = std::fs::remove_file(&path);
     reserved
+}
+
+/// Free shared memory [bytes]; 0 if there is none.
+pub(crate) fn free() -> u64 {
+    statvfs(FOLDER).map_or(0, |space| space.f_bavail * space.f_frsize)
 }
 
 fn too_small(name: &RobotName, available: u64, bytes: u64) -> LinkError {

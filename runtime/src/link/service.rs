@@ -26,7 +26,7 @@ pub(crate) type Ipc = ipc_threadsafe::Service;
 /// Waits between attempts at a service that another process may be creating, or died creating [ms].
 const BACK_OFF: [u64; 5] = [20, 60, 180, 540, 1000];
 /// What the links of one robot may occupy in shared memory [bytes].
-const SHARED_MEMORY: u64 = 24 << 20;
+pub(crate) const SHARED_MEMORY: u64 = 24 << 20;
 
 /// One process's membership in the links of a robot.
 pub(crate) struct Bus {

@@ -35,6 +35,12 @@ impl TrainerLink {
         Ok(link)
     }
 
+    /// Waits for the plant to say what it is.
+    pub fn wait_for_plant(&mut self, patience: Duration) -> Result<RobotMessage, LinkError> {
+        let robot = &mut self.robot;
+        poll_for(patience, || robot.newest()).ok_or_else(|| LinkError::NoPlant(self.bus.name().clone()))
+    }
+
     /// Waits for the runtime's first sign of health.
     pub fn wait_for_runtime(&mut self, patience: Duration) -> Result<HealthMessage, LinkError> {
         let health = &mut self.health;

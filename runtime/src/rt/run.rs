@@ -22,7 +22,7 @@ use crate::rt::report::{PlantSummary, RunReport, percentiles};
 use crate::rt::thread::{ThreadSettings, prepare};
 use crate::rt::tick::{Build, Tick};
 use crate::rt::{Mode, Reason, Stop, swap};
-use crate::snapshot::Snapshot;
+use crate::snapshot::{Snapshot, SnapshotError};
 
 /// Records between loop and I/O thread.
 const RECORDS: usize = 256;
@@ -134,7 +134,10 @@ pub fn run(
     stop: &Stop,
 ) -> Result<RunReport, RunError> {
     let refused = |text: String| RunError::Snapshot(format!("{}: {text}", file.display()));
-    let snapshot = Snapshot::load(file).map_err(|e| refused(e.to_string()))?;
+    let snapshot = Snapshot::load(file).map_err(|e| match e {
+        SnapshotError::Unreadable { .. } => RunError::Snapshot(e.to_string()),
+        other => refused(other.to_string()),
+    })?;
     let (link, robot) = connect(plant, settings.patience)?;
     let first = Pilot::new(&snapshot, &robot).map_err(|e| refused(e.text))?;
     let mut settings = settings.clone();

@@ -23,7 +23,7 @@ pub(super) struct Demo {
     #[arg(long, default_value = "demo")]
     out: PathBuf,
     /// Seconds each robot runs.
-    #[arg(long, default_value_t = 10.0)]
+    #[arg(long, default_value = "10", value_parser = nearl_runtime::cli::seconds)]
     seconds: f64,
     /// Python that draws the report; `.venv/bin/python` where it exists, else `python3`.
     #[arg(long)]

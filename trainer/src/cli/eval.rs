@@ -27,7 +27,11 @@ pub(super) struct Eval {
 
 impl Eval {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let snapshot = Snapshot::load(&run_folder::snapshot_of(&self.run)?)?;
+        if self.episodes == 0 {
+            return Err("--episodes 0 measures nothing; give at least 1".into());
+        }
+        let file = run_folder::snapshot_of(&self.run)?;
+        let snapshot = Snapshot::load(&file).map_err(|e| format!("{}: {e}", file.display()))?;
         let results = self
             .compare
             .iter()

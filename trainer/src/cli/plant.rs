@@ -7,6 +7,7 @@ use crate::train::complete;
 use clap::Args;
 use nearl_runtime::link::{PlantLink, PlantRunner, PlantSettings, RobotName};
 use nearl_runtime::rt::Stop;
+use std::io::Write;
 
 #[derive(Args)]
 pub(super) struct PlantCommand {
@@ -16,7 +17,7 @@ pub(super) struct PlantCommand {
     #[arg(long)]
     name: String,
     /// Stop by itself after this time in [s].
-    #[arg(long)]
+    #[arg(long, value_parser = nearl_runtime::cli::seconds)]
     seconds: Option<f64>,
     /// Wait for the action of every state instead of keeping real time.
     #[arg(long)]
@@ -48,11 +49,13 @@ impl PlantCommand {
         settings.ticks = self.seconds.map(|s| (s / dt).round() as u64);
         let stop = Stop::on_signals()?;
         if !self.json {
-            say(format!(
-                "{} as '{name}', {:.0} Hz; start the runtime with --plant {name}",
-                self.task,
-                1.0 / dt
-            ));
+            // A closed output is no reason not to move: the robot does not depend on who reads.
+            let hertz = 1.0 / dt;
+            let _ = writeln!(
+                std::io::stdout(),
+                "{} as '{name}', {hertz:.0} Hz; start the runtime with --plant {name}",
+                self.task
+            );
         }
         let report = PlantRunner::new(link, settings)?.run(&mut plant, &stop);
         let m = plant.meter();

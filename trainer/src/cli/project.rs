@@ -36,7 +36,7 @@ impl Project {
         let Parts { model, mut projector, .. } = Parts::new(&manifest)?;
         let mut target = Target::new(&model);
         for (i, line) in std::io::stdin().lock().lines().enumerate() {
-            let line = line?;
+            let line = line.map_err(|e| format!("standard input, line {}: {e}", i + 1))?;
             if line.trim().is_empty() {
                 continue;
             }

@@ -1,0 +1,266 @@
+//! `nearl doctor`: is this snapshot, this machine and this plant ready to run? One line a check.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use nearl_constraints::{Period, certify_braking};
+use rustix::time::{ClockId, clock_getres};
+use serde::Serialize;
+
+use crate::cli::{Failure, say};
+use crate::controller::{Controller, Parts};
+use crate::link::{RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, remains};
+use crate::rt::{Pilot, ThreadSettings, bench_wake, prepare};
+use crate::snapshot::Snapshot;
+
+/// Check that a snapshot, this machine and a plant are ready.
+#[derive(Args, Debug)]
+pub struct DoctorCommand {
+    /// Snapshot file.
+    pub snapshot: PathBuf,
+    /// Name of a plant the snapshot is to drive.
+    #[arg(long)]
+    pub plant: Option<String>,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Outcome of one check.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Finding {
+    /// As it should be.
+    Ok,
+    /// It runs, but worse than it could.
+    Warn,
+    /// It does not run.
+    Fail,
+}
+
+/// One check with a sentence that says what was found and, if it is not ok, what to do.
+#[derive(Clone, Debug, Serialize)]
+pub struct Check {
+    /// What was looked at.
+    pub check: &'static str,
+    /// Outcome.
+    pub finding: Finding,
+    /// One sentence.
+    pub text: String,
+}
+
+/// States looked at for the braking certificate, and their seed.
+const SAMPLES: (usize, u64) = (5000, 1);
+/// Priority `nearl run` asks for.
+const PRIORITY: i32 = 40;
+/// Longest wait for the plant's announcement.
+const PATIENCE: Duration = Duration::from_secs(3);
+
+impl DoctorCommand {
+    /// Runs every check and prints a line for each.
+    ///
+    /// # Errors
+    /// One sentence naming the checks that failed.
+    pub fn run(self) -> Result<(), Failure> {
+        let checks = examine(&self.snapshot, self.plant.as_deref());
+        let failed: Vec<&str> =
+            checks.iter().filter(|c| c.finding == Finding::Fail).map(|c| c.check).collect();
+        if self.json {
+            say(serde_json::json!({ "ok": failed.is_empty(), "checks": checks }));
+        } else {
+            for Check { check, finding, text } in &checks {
+                say(format!("{:<5} {check:<10} {text}", format!("{finding:?}").to_lowercase()));
+            }
+        }
+        if failed.is_empty() {
+            return Ok(());
+        }
+        Err(format!("failed: {}; do what the lines say, then run doctor again", failed.join(", ")).into())
+    }
+}
+
+/// Every check, in order.
+pub fn examine(file: &Path, plant: Option<&str>) -> Vec<Check> {
+    let (snapshot, mut checks) = examine_snapshot(file);
+    let dt = snapshot.as_ref().map_or(1e-3, |s| s.manifest.task.time.dt);
+    checks.extend([memory(), stale_links(), priority(), lock(), clock(), wake(dt)]);
+    match (plant, &snapshot) {
+        (Some(name), Some(snapshot)) => checks.push(examine_plant(name, snapshot)),
+        (Some(_), None) => checks.push(fail("plant", "not asked, because the snapshot failed".into())),
+        (None, _) => {}
+    }
+    checks
+}
+
+fn ok(check: &'static str, text: String) -> Check {
+    Check { check, finding: Finding::Ok, text }
+}
+fn warn(check: &'static str, text: String) -> Check {
+    Check { check, finding: Finding::Warn, text }
+}
+fn fail(check: &'static str, text: String) -> Check {
+    Check { check, finding: Finding::Fail, text }
+}
+
+fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
+    let snapshot = match Snapshot::load(file) {
+        Ok(snapshot) => snapshot,
+        Err(e) => return (None, vec![fail("snapshot", e.to_string())]),
+    };
+    let m = &snapshot.manifest;
+    let (task, algo) = (&m.task.name, &m.algo);
+    let text =
+        format!("{task} by {algo}, version {}, {} steps, digest {}", m.version, m.steps, snapshot.digest());
+    let mut checks = vec![ok("snapshot", text)];
+    match Controller::new(&snapshot) {
+        Ok(_) => checks.push(ok("canary", "trial states gave finite actions".into())),
+        Err(e) => {
+            checks.push(fail("canary", e.to_string()));
+            return (None, checks);
+        }
+    }
+    checks.push(braking(&snapshot));
+    (Some(snapshot), checks)
+}
+
+/// Can the motors give the decelerations that the position limits count on?
+fn braking(snapshot: &Snapshot) -> Check {
+    let m = &snapshot.manifest;
+    let parts = match Parts::new(m) {
+        Ok(parts) => parts,
+        Err(e) => return fail("braking", e.to_string()),
+    };
+    let Parts { model, layout, limits, .. } = parts;
+    let controllable = layout.controllable();
+    if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {
+        return ok("braking", "the task has no torque limit, so there is nothing to certify".into());
+    }
+    let period = Period::new(m.task.time.dt, m.task.sub_steps() as u32);
+    let (samples, seed) = SAMPLES;
+    match certify_braking(&model, &limits, controllable, &period, samples, seed) {
+        Err(e) => fail("braking", e.to_string()),
+        Ok(c) => {
+            let (joint, margin) = (model.dof_name(c.dof), 100.0 * c.margin);
+            let found = format!(
+                "in the hardest of {} states '{joint}' might need {:.1} of its {:.1} N m or N to brake, margin {margin:.0} %",
+                c.samples, c.needed, c.effort
+            );
+            if c.holds() {
+                return ok("braking", found);
+            }
+            let scale = c.scale;
+            warn("braking", format!("{found}: multiply constraints.acceleration.limit by {scale:.2} or less"))
+        }
+    }
+}
+
+/// Room for the links.
+fn memory() -> Check {
+    let megabytes = |bytes: u64| bytes >> 20;
+    let needed = megabytes(SHARED_MEMORY);
+    let result = RobotName::new(&format!("doctor{}", std::process::id()))
+        .and_then(|name| check_memory(&name, SHARED_MEMORY));
+    match result {
+        Err(e) => fail("memory", e.to_string()),
+        Ok(()) => {
+            ok("memory", format!("/dev/shm has {} MB free, a robot needs {needed}", megabytes(free_memory())))
+        }
+    }
+}
+
+/// Links that only dead processes hold.
+fn stale_links() -> Check {
+    let all = remains();
+    let stale: Vec<_> = all.iter().filter(|r| r.is_stale()).collect();
+    if stale.is_empty() {
+        let alive = all.iter().filter(|r| r.alive > 0).count();
+        return ok("links", format!("{alive} robots are running, no link of a dead process is left"));
+    }
+    let kilobytes = stale.iter().map(|r| r.bytes).sum::<u64>() >> 10;
+    let names: Vec<String> = stale.iter().map(|r| format!("/dev/shm/nearl.{}.*", r.name)).collect();
+    warn(
+        "links",
+        format!(
+            "{kilobytes} kB are held by dead processes: start the robot again, which cleans up, or delete {}",
+            names.join(" ")
+        ),
+    )
+}
+
+/// Asks the operating system for `wish` on a thread that ends at once.
+fn wish(check: &'static str, granted: &str, wish: ThreadSettings) -> Check {
+    let thread = std::thread::Builder::new().spawn(move || prepare(&wish));
+    match thread.map(std::thread::JoinHandle::join) {
+        Ok(Ok(warnings)) if warnings.is_empty() => ok(check, granted.into()),
+        Ok(Ok(warnings)) => warn(check, warnings.join("; ")),
+        Ok(Err(_)) => fail(check, "the thread that asked panicked: report it with the message above".into()),
+        Err(e) => fail(check, format!("no thread could be started ({e}): raise `ulimit -u`")),
+    }
+}
+
+fn priority() -> Check {
+    let settings = ThreadSettings { priority: Some(PRIORITY), cpu: None, lock_memory: false };
+    wish("priority", &format!("SCHED_FIFO priority {PRIORITY} is granted"), settings)
+}
+
+fn lock() -> Check {
+    let settings = ThreadSettings { priority: None, cpu: None, lock_memory: true };
+    wish("lock", "memory can be locked", settings)
+}
+
+fn clock() -> Check {
+    let t = clock_getres(ClockId::Monotonic);
+    let resolution = t.tv_sec as u64 * 1_000_000_000 + t.tv_nsec as u64;
+    if resolution <= 1000 {
+        return ok("clock", format!("the monotonic clock counts {resolution} ns"));
+    }
+    let text = format!(
+        "the monotonic clock counts {resolution} ns: boot with high-resolution timers (CONFIG_HIGH_RES_TIMERS)"
+    );
+    warn("clock", text)
+}
+
+/// One second of an empty loop beside the control period `dt` [s].
+fn wake(dt: f64) -> Check {
+    let period = dt.min(1e-3);
+    let settings = ThreadSettings { priority: Some(PRIORITY), cpu: None, lock_memory: false };
+    let late = match bench_wake(period, (1.0 / period).round() as u64, settings) {
+        Ok((late, _)) => late,
+        Err(e) => return fail("wake-up", format!("the empty loop did not run ({e}): raise `ulimit -u`")),
+    };
+    let us = |ns: u64| ns as f64 * 1e-3;
+    let found = format!(
+        "an empty loop wakes up {:.0} us late (p50), {:.0} us (p99), {:.0} us at most; the period is {:.0} us",
+        us(late.p50),
+        us(late.p99),
+        us(late.max),
+        1e6 * dt
+    );
+    if late.p99 as f64 * 1e-9 < 0.5 * dt {
+        return ok("wake-up", found);
+    }
+    warn("wake-up", format!("{found}: stop other programs, or keep a core free and give it with --cpu"))
+}
+
+/// Does the plant answer, and is it the robot of the snapshot?
+fn examine_plant(name: &str, snapshot: &Snapshot) -> Check {
+    let robot = RobotName::new(name).and_then(|name| {
+        let mut link = TrainerLink::open(&name)?;
+        link.wait_for_plant(PATIENCE)
+    });
+    match robot {
+        Err(e) => fail("plant", e.to_string()),
+        Ok(robot) => match Pilot::new(snapshot, &robot) {
+            Err(refusal) => fail("plant", refusal.text),
+            Ok(_) => ok(
+                "plant",
+                format!(
+                    "`{name}` answers: {} joints, observation, period {} s and limits are the snapshot's",
+                    robot.joint_names().len(),
+                    robot.dt
+                ),
+            ),
+        },
+    }
+}
