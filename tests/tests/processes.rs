@@ -209,16 +209,17 @@ fn a_killed_runtime_trips_the_watchdog_and_the_plant_stands_still() {
     let plant = name.plant(&["--endless"]);
     let runtime = name.runtime(&[]);
     let mut viewer = name.link();
-    until("the robot moves", || viewer.state().filter(|s| speed(s.v()) > 0.1));
+    // A starved machine may trip it before; what counts is that the kill does.
+    let before = until("the robot moves", || viewer.state().filter(|s| speed(s.v()) > 0.1)).watchdog;
     runtime.kill();
     until("the watchdog brakes to rest", || {
-        viewer.state().filter(|s| s.watchdog == 1 && speed(s.v()) < 1e-3)
+        viewer.state().filter(|s| s.watchdog > before && speed(s.v()) < 1e-3)
     });
     // A successor takes over at once.
     let run = name.runtime(&["--seconds", "0.3"]).json();
     assert!(number(&run["modes"]["active"]) > 0 && run["modes"]["fault"] == 0, "{run}");
     let plant = plant.end();
-    assert_eq!(plant["report"]["watchdog"], 1, "{plant}");
+    assert!(number(&plant["report"]["watchdog"]) > before, "{plant}");
     assert!(number(&plant["report"]["braked"]) > 0, "{plant}");
     let worst = |kind: &str| plant["worst"][kind].as_f64().expect("number");
     assert!(worst("position") < 0.01 && worst("velocity") < 0.1 * 2.175, "{plant}");
@@ -238,7 +239,8 @@ fn a_signal_ends_the_runtime_braked_and_with_success() {
         assert_eq!((&run["last_mode"], &run["reason"]), (&"braking".into(), &"stop".into()), "{run}");
         until("the robot stands still", || viewer.state().filter(|s| speed(s.v()) < 1e-3));
         let plant = plant.end();
-        assert_eq!(plant["report"]["watchdog"], 0, "the runtime left without a farewell: {plant}");
+        let (told, counted) = (&run["plant"]["watchdog"], &plant["report"]["watchdog"]);
+        assert_eq!(told, counted, "the runtime left without a farewell: {plant}");
     }
 }
 
