@@ -9,6 +9,8 @@ LINKS := $(VENV)/mujoco-link/libmujoco.so $(VENV)/mujoco-link/libmujoco.so.3.17.
 
 PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
 NEARL := target/release/nearl
+# Everything is built inside the checkout, whatever the caller has set.
+export CARGO_TARGET_DIR := $(CURDIR)/target
 # Steps of the demo's training: about two minutes on two cores.
 DEMO_STEPS ?= 3000000
 

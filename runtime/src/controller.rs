@@ -7,15 +7,21 @@
 //! Training, evaluation, the real-time loop and replay all call [`Controller::update`]. Noise is an
 //! input: zero on the robot. Nothing is allocated after [`Controller::new`] but Clarabel's one block.
 
+mod maths;
+mod parts;
+
+pub use parts::{Parts, seen_entries};
+
 use crate::idm::{AnalyticIdm, LearnedIdm};
 use crate::net::Forward;
 use crate::normaliser::Normaliser;
-use crate::snapshot::{Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
-use crate::task::{IdmInput, IdmKind};
+use crate::snapshot::{Networks, PolicyKind, Snapshot, SnapshotError};
+use crate::task::IdmKind;
+use maths::{hermite, sample};
 use nearl_constraints::{
-    Entry, LimitSet, Model, Projector, Proposal, RefuseReason, Settings, StateLayout, Status, Target,
-    build_limits,
+    Entry, LimitSet, Model, Projector, Proposal, RefuseReason, StateLayout, Status, Target,
 };
+use parts::{check_sizes, halves, idx_q};
 use std::time::Instant;
 
 /// What is measured at the start of a tick.
@@ -100,7 +106,6 @@ pub struct Controller {
     dt: f64,
     policy_every: usize,
     projection: bool,
-    limits: LimitSet,
     /// Configuration index of each one-dof joint, by degree of freedom.
     idx_q: Vec<usize>,
     halves: Vec<(usize, Half)>,
@@ -119,7 +124,7 @@ impl Controller {
     /// # Errors
     /// [`SnapshotError`] with the sentence of the layer that refused.
     pub fn new(snapshot: &Snapshot) -> Result<Self, SnapshotError> {
-        let Parts { model, layout, projector, limits } = Parts::new(&snapshot.manifest)?;
+        let Parts { model, layout, projector } = Parts::new(&snapshot.manifest)?;
         let (m, n) = (&snapshot.manifest, &snapshot.networks);
         let n_act = m.action_lower.len();
         let kind = m.policy;
@@ -152,7 +157,6 @@ impl Controller {
             dt: m.task.time.dt,
             policy_every: m.task.time.policy_every,
             projection: true,
-            limits,
             idx_q: idx_q(&model),
             halves: halves(&layout),
             tick: 0,
@@ -381,14 +385,14 @@ impl Controller {
     /// Whether `state` is outside a position or velocity limit of a controllable joint by more than 1e-9.
     pub fn breaks_limits(&self, state: &State) -> bool {
         self.layout.controllable().iter().any(|&dof| {
-            let (q, v, l) = (state.q[self.idx_q[dof]], state.v[dof], &self.limits);
+            let (q, v, l) = (state.q[self.idx_q[dof]], state.v[dof], self.projector.limits());
             let position = q < l.q_lower[dof] - 1e-9 || q > l.q_upper[dof] + 1e-9;
             position || v.abs() > l.velocity[dof] + 1e-9
         })
     }
     /// Limits by degree of freedom.
     pub fn limits(&self) -> &LimitSet {
-        &self.limits
+        self.projector.limits()
     }
     /// Robot model.
     pub fn model(&self) -> &Model {
@@ -446,146 +450,4 @@ impl Controller {
             duration_ns: 0,
         }
     }
-}
-
-/// Robot, layout and projector of a task: what a controller needs beside its networks.
-pub struct Parts {
-    /// Robot model.
-    pub model: Model,
-    /// State layout.
-    pub layout: StateLayout,
-    /// Projector of the task's constraints.
-    pub projector: Projector,
-    /// The limits behind it, by degree of freedom.
-    pub limits: LimitSet,
-}
-
-impl Parts {
-    /// Builds and validates the three.
-    ///
-    /// # Errors
-    /// [`SnapshotError::Unusable`] with the sentence of the layer that refused.
-    pub fn new(m: &Manifest) -> Result<Self, SnapshotError> {
-        use crate::snapshot::ModelFormat;
-        let unusable = |reason: String| SnapshotError::Unusable { reason };
-        let model = match m.model_format {
-            ModelFormat::Urdf => Model::from_urdf_text(&m.model),
-            ModelFormat::Mjcf => Model::from_mjcf_text(&m.model),
-        }
-        .map_err(|e| unusable(e.to_string()))?;
-        let s = &m.task.state;
-        let layout =
-            StateLayout::new(&model, &s.observation, s.propose.as_deref(), s.controllable.as_deref())
-                .map_err(|e| unusable(e.to_string()))?;
-        let limits = build_limits(&m.task.constraints, &model).map_err(|e| unusable(e.to_string()))?;
-        let settings = Settings {
-            consistency: m.task.constraints.consistency,
-            solver: m.task.constraints.solver,
-            ..Settings::new(m.task.time.dt, m.task.sub_steps() as u32)
-        };
-        let projector = Projector::new(&model, &limits, layout.controllable(), settings)
-            .map_err(|e| unusable(e.to_string()))?;
-        let limits =
-            LimitSet::collect(&model, &limits, layout.controllable()).map_err(|e| unusable(e.to_string()))?;
-        Ok(Self { model, layout, projector, limits })
-    }
-}
-
-/// Controllable joints of which only one half is proposed.
-fn halves(layout: &StateLayout) -> Vec<(usize, Half)> {
-    let mut found = Vec::new();
-    for &dof in layout.controllable() {
-        let is = |want: fn(Entry) -> Option<usize>| {
-            (0..layout.n_state()).any(|k| want(layout.state_entry(k)) == Some(dof))
-        };
-        let position = is(|e| if let Entry::Position { dof, .. } = e { Some(dof) } else { None });
-        let velocity = is(|e| if let Entry::Velocity { dof } = e { Some(dof) } else { None });
-        match (position, velocity) {
-            (true, false) => found.push((dof, Half::Position)),
-            (false, true) => found.push((dof, Half::Velocity)),
-            _ => {}
-        }
-    }
-    found
-}
-
-/// Configuration index of each degree of freedom that belongs to a one-dof joint; 0 elsewhere (never read).
-fn idx_q(model: &Model) -> Vec<usize> {
-    let mut idx = vec![0; model.nv()];
-    for j in model.joints().iter().filter(|j| j.nv == 1) {
-        idx[j.idx_v] = j.idx_q;
-    }
-    idx
-}
-
-/// The entries of the proposed state that a learned inverse model sees.
-///
-/// # Errors
-/// [`SnapshotError::Unusable`] for a name that is not proposed.
-pub fn seen_entries(m: &Manifest, layout: &StateLayout) -> Result<Vec<usize>, SnapshotError> {
-    match &m.task.idm.input {
-        IdmInput::Controllable => Ok(layout.controllable_state().to_vec()),
-        IdmInput::Full => Ok((0..layout.n_state()).collect()),
-        IdmInput::Names(names) => names
-            .iter()
-            .map(|name| {
-                (0..layout.n_state()).find(|&k| layout.state_name(k) == name).ok_or_else(|| SnapshotError::Unusable {
-                    reason: format!("idm.input names '{name}', which is not a proposed entry; name entries of state.propose"),
-                })
-            })
-            .collect(),
-    }
-}
-
-fn check_sizes(m: &Manifest, n: &Networks, layout: &StateLayout) -> Result<(), SnapshotError> {
-    let (o, s, a) = (layout.n_obs(), layout.n_state(), m.action_lower.len());
-    let direct = m.policy == PolicyKind::Direct;
-    let out = if direct { a } else { s };
-    let mut want = vec![
-        ("normaliser.mean", n.normaliser.mean.len(), o),
-        ("normaliser.std", n.normaliser.std.len(), o),
-        ("normaliser.scale", n.normaliser.scale.len(), s),
-        ("policy.0.weight (inputs)", n.policy.n_in(), o),
-        ("policy (outputs)", n.policy.n_out(), out),
-        (
-            "policy.log_std",
-            n.policy_log_std.len(),
-            if m.policy == PolicyKind::Deterministic { 0 } else { out },
-        ),
-        ("action_upper", m.action_upper.len(), a),
-    ];
-    if m.task.idm.kind == IdmKind::Pinocchio && !direct {
-        want.push(("action_lower (one torque a controllable joint)", a, layout.controllable().len()));
-    } else if let Some((net, log_std)) = &n.idm {
-        want.push(("idm.0.weight (inputs)", net.n_in(), 2 * seen_entries(m, layout)?.len()));
-        want.push(("idm (outputs)", net.n_out(), a));
-        want.push(("idm.log_std", log_std.len(), a));
-    }
-    match want.into_iter().find(|(_, have, need)| have != need) {
-        Some((name, have, need)) => Err(SnapshotError::Shape {
-            name: name.into(),
-            expected: format!("{need} wide"),
-            actual: format!("{have} wide"),
-        }),
-        None => Ok(()),
-    }
-}
-
-/// Draws `x = mean + exp(log_std) noise` and returns `log N(x; mean, exp(log_std)^2)`, summed in f64.
-fn sample(mean: &[f32], log_std: &[f32], noise: &[f32], x: &mut [f32]) -> f64 {
-    let mut log_prob = 0.0;
-    for i in 0..x.len() {
-        let (s, z) = (log_std[i], noise[i]);
-        x[i] = s.exp().mul_add(z, mean[i]);
-        let z = f64::from(z);
-        log_prob -= 0.5 * z * z + f64::from(s) + 0.918_938_533_204_672_7;
-    }
-    log_prob
-}
-
-/// Cubic through (q0, v0) at s = 0 and (q1, v1) at s = 1, velocities per unit of s: position and velocity at s.
-fn hermite(s: f64, q0: f64, v0: f64, q1: f64, v1: f64) -> (f64, f64) {
-    let d = q1 - q0;
-    let (a, b) = (v0 + v1 - 2.0 * d, 3.0 * d - 2.0 * v0 - v1);
-    (q0 + s * (v0 + s * (b + s * a)), v0 + s * (2.0 * b + 3.0 * a * s))
 }

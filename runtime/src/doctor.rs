@@ -131,14 +131,14 @@ fn braking(snapshot: &Snapshot) -> Check {
         Ok(parts) => parts,
         Err(e) => return fail("braking", e.to_string()),
     };
-    let Parts { model, layout, limits, .. } = parts;
-    let controllable = layout.controllable();
+    let Parts { model, layout, projector } = parts;
+    let (limits, controllable) = (projector.limits(), layout.controllable());
     if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {
         return ok("braking", "the task has no torque limit, so there is nothing to certify".into());
     }
     let period = Period::new(m.task.time.dt, m.task.sub_steps() as u32);
     let (samples, seed) = SAMPLES;
-    match certify_braking(&model, &limits, controllable, &period, samples, seed) {
+    match certify_braking(&model, limits, controllable, &period, samples, seed) {
         Err(e) => fail("braking", e.to_string()),
         Ok(c) => {
             let (joint, margin) = (model.dof_name(c.dof), 100.0 * c.margin);

@@ -369,7 +369,8 @@ fn check_minibatch(minibatch: usize, batch: usize) -> Result<(), TrainError> {
 fn limit_scale(parts: &Parts, manifest: &Manifest) -> Result<Vec<f64>, TrainError> {
     use nearl_constraints::Entry;
     let period = manifest.task.time.dt * manifest.task.time.policy_every as f64;
-    let (velocity, acceleration) = (&parts.limits.velocity, &parts.limits.acceleration);
+    let limits = parts.projector.limits();
+    let (velocity, acceleration) = (&limits.velocity, &limits.acceleration);
     (0..parts.layout.n_state())
         .map(|k| {
             let scale = match parts.layout.state_entry(k) {

@@ -91,18 +91,10 @@ pub fn scalars_mut(v: &mut [V]) -> &mut [f32] {
     unsafe { std::slice::from_raw_parts_mut(v.as_mut_ptr().cast(), v.len() * LANES) }
 }
 
-/// `x` within `[lower, upper]` by two comparisons, which compile to vector minimum and maximum.
+/// `x` within `[lower, upper]`: two single choices, which compile to vector selects (nested ones go lane by lane).
 #[inline(always)]
 fn within(x: V, lower: f32, upper: f32) -> V {
-    x.map(|v| {
-        if v < lower {
-            lower
-        } else if v > upper {
-            upper
-        } else {
-            v
-        }
-    })
+    x.map(|v| if v < lower { lower } else { v }).map(|v| if v > upper { upper } else { v })
 }
 
 /// tanh by a rational minimax polynomial (13 / 6, as in Eigen); absolute error about 3e-7.

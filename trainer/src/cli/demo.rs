@@ -176,44 +176,46 @@ impl Drop for Process {
 
 fn table(shows: &[Value]) {
     say(
-        "task             return   raw proposals  targets   robot outside its limits      update p50 / p99   wake p50 / p99   overruns  late",
+        "                         limits broken, share of ticks                update [us]       wake-up [us]    of all ticks",
     );
     say(
-        "                          outside        outside   with projection / without           [us]              [us]",
+        "task             return  raw     target  robot   robot, no projection   p50     p99       p50      p99   overrun  late",
     );
     for s in shows {
         let run = &s["run"];
         let us = |v: &Value| v.as_f64().unwrap_or(f64::NAN) / 1e3;
-        let (mut percents, mut mean) = (Vec::new(), f64::NAN);
-        for e in s["evaluation"].as_array().into_iter().flatten() {
-            let of =
-                |k: &str| 100.0 * e[k].as_f64().unwrap_or(f64::NAN) / e["ticks"].as_f64().unwrap_or(f64::NAN);
-            percents.push([of("raw_violations"), of("target_violations"), of("reached_violations")]);
-            if e["mode"] == "projected" {
-                let returns: Vec<f64> =
-                    e["returns"].as_array().into_iter().flatten().filter_map(Value::as_f64).collect();
-                mean = returns.iter().sum::<f64>() / returns.len().max(1) as f64;
-            }
-        }
-        let [projected, raw] = [percents[0], percents[1]];
+        let count = |v: &Value| v.as_u64().unwrap_or(0);
+        let share = |e: &Value, key: &str| {
+            format!(
+                "{:.2}%",
+                100.0 * e[key].as_f64().unwrap_or(f64::NAN) / e["ticks"].as_f64().unwrap_or(f64::NAN)
+            )
+        };
+        let (projected, raw) = (&s["evaluation"][0], &s["evaluation"][1]);
+        let returns: Vec<f64> =
+            projected["returns"].as_array().into_iter().flatten().filter_map(Value::as_f64).collect();
         say(format!(
-            "{:<15}{mean:>8.1}{:>13.2} %{:>8.2} %{:>15.2} % / {:.2} %{:>17.1} / {:.1}{:>13.1} / {:.1}{:>10}{:>6}",
+            "{:<15}{:>8.1}  {:<8}{:<8}{:<8}{:<21}{:>5.1}{:>8.1}{:>10.1}{:>9.1}{:>10}{:>6}",
             s["task"].as_str().unwrap_or(""),
-            projected[0],
-            projected[1],
-            projected[2],
-            raw[2],
+            returns.iter().sum::<f64>() / returns.len().max(1) as f64,
+            share(projected, "raw_violations"),
+            share(projected, "target_violations"),
+            share(projected, "reached_violations"),
+            share(raw, "reached_violations"),
             us(&run["compute"]["p50"]),
             us(&run["compute"]["p99"]),
             us(&run["wake"]["p50"]),
             us(&run["wake"]["p99"]),
-            run["counters"]["overruns"],
-            s["plant"]["report"]["late"]
+            count(&run["counters"]["overruns"]),
+            count(&s["plant"]["report"]["late"]),
         ));
         for r in s["swap"].as_array().into_iter().flatten() {
-            let what =
-                if r["accepted"] == true { "swapped in while running" } else { "refused while running" };
-            say(format!("  version {} {what}: {}", r["version"], r["text"].as_str().unwrap_or("")));
+            let what = if r["accepted"] == true { "swapped in" } else { "refused" };
+            say(format!(
+                "  version {} {what} while running: {}",
+                r["version"],
+                r["text"].as_str().unwrap_or("")
+            ));
         }
     }
 }

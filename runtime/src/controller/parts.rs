@@ -1,0 +1,124 @@
+//! What a controller is built from, and the checks that a snapshot fits it.
+
+use super::Half;
+use crate::snapshot::{Manifest, ModelFormat, Networks, PolicyKind, SnapshotError};
+use crate::task::{IdmInput, IdmKind};
+use nearl_constraints::{Entry, Model, Projector, Settings, StateLayout, build_limits};
+
+/// Robot, layout and projector of a task: what a controller needs beside its networks.
+pub struct Parts {
+    /// Robot model.
+    pub model: Model,
+    /// State layout.
+    pub layout: StateLayout,
+    /// Projector of the task's constraints.
+    pub projector: Projector,
+}
+
+impl Parts {
+    /// Builds and validates the three.
+    ///
+    /// # Errors
+    /// [`SnapshotError::Unusable`] with the sentence of the layer that refused.
+    pub fn new(m: &Manifest) -> Result<Self, SnapshotError> {
+        let unusable = |reason: String| SnapshotError::Unusable { reason };
+        let model = match m.model_format {
+            ModelFormat::Urdf => Model::from_urdf_text(&m.model),
+            ModelFormat::Mjcf => Model::from_mjcf_text(&m.model),
+        }
+        .map_err(|e| unusable(e.to_string()))?;
+        let s = &m.task.state;
+        let layout =
+            StateLayout::new(&model, &s.observation, s.propose.as_deref(), s.controllable.as_deref())
+                .map_err(|e| unusable(e.to_string()))?;
+        let limits = build_limits(&m.task.constraints, &model).map_err(|e| unusable(e.to_string()))?;
+        let settings = Settings {
+            consistency: m.task.constraints.consistency,
+            solver: m.task.constraints.solver,
+            ..Settings::new(m.task.time.dt, m.task.sub_steps() as u32)
+        };
+        let projector = Projector::new(&model, &limits, layout.controllable(), settings)
+            .map_err(|e| unusable(e.to_string()))?;
+        Ok(Self { model, layout, projector })
+    }
+}
+
+/// Controllable joints of which only one half is proposed.
+pub(super) fn halves(layout: &StateLayout) -> Vec<(usize, Half)> {
+    let mut found = Vec::new();
+    for &dof in layout.controllable() {
+        let is = |want: fn(Entry) -> Option<usize>| {
+            (0..layout.n_state()).any(|k| want(layout.state_entry(k)) == Some(dof))
+        };
+        let position = is(|e| if let Entry::Position { dof, .. } = e { Some(dof) } else { None });
+        let velocity = is(|e| if let Entry::Velocity { dof } = e { Some(dof) } else { None });
+        match (position, velocity) {
+            (true, false) => found.push((dof, Half::Position)),
+            (false, true) => found.push((dof, Half::Velocity)),
+            _ => {}
+        }
+    }
+    found
+}
+
+/// Configuration index of each degree of freedom that belongs to a one-dof joint; 0 elsewhere (never read).
+pub(super) fn idx_q(model: &Model) -> Vec<usize> {
+    let mut idx = vec![0; model.nv()];
+    for j in model.joints().iter().filter(|j| j.nv == 1) {
+        idx[j.idx_v] = j.idx_q;
+    }
+    idx
+}
+
+/// The entries of the proposed state that a learned inverse model sees.
+///
+/// # Errors
+/// [`SnapshotError::Unusable`] for a name that is not proposed.
+pub fn seen_entries(m: &Manifest, layout: &StateLayout) -> Result<Vec<usize>, SnapshotError> {
+    match &m.task.idm.input {
+        IdmInput::Controllable => Ok(layout.controllable_state().to_vec()),
+        IdmInput::Full => Ok((0..layout.n_state()).collect()),
+        IdmInput::Names(names) => names
+            .iter()
+            .map(|name| {
+                (0..layout.n_state()).find(|&k| layout.state_name(k) == name).ok_or_else(|| SnapshotError::Unusable {
+                    reason: format!("idm.input names '{name}', which is not a proposed entry; name entries of state.propose"),
+                })
+            })
+            .collect(),
+    }
+}
+
+pub(super) fn check_sizes(m: &Manifest, n: &Networks, layout: &StateLayout) -> Result<(), SnapshotError> {
+    let (o, s, a) = (layout.n_obs(), layout.n_state(), m.action_lower.len());
+    let direct = m.policy == PolicyKind::Direct;
+    let out = if direct { a } else { s };
+    let mut want = vec![
+        ("normaliser.mean", n.normaliser.mean.len(), o),
+        ("normaliser.std", n.normaliser.std.len(), o),
+        ("normaliser.scale", n.normaliser.scale.len(), s),
+        ("policy.0.weight (inputs)", n.policy.n_in(), o),
+        ("policy (outputs)", n.policy.n_out(), out),
+        (
+            "policy.log_std",
+            n.policy_log_std.len(),
+            if m.policy == PolicyKind::Deterministic { 0 } else { out },
+        ),
+        ("action_upper", m.action_upper.len(), a),
+    ];
+    if m.task.idm.kind == IdmKind::Pinocchio && !direct {
+        want.push(("action_lower (one torque a controllable joint)", a, layout.controllable().len()));
+    } else if let Some((net, log_std)) = &n.idm {
+        want.push(("idm.0.weight (inputs)", net.n_in(), 2 * seen_entries(m, layout)?.len()));
+        want.push(("idm (outputs)", net.n_out(), a));
+        want.push(("idm.log_std", log_std.len(), a));
+    }
+    match want.into_iter().find(|(_, have, need)| have != need) {
+        Some((name, have, need)) => Err(SnapshotError::Shape {
+            name: name.into(),
+            expected: format!("{need} wide"),
+            actual: format!("{have} wide"),
+        }),
+        None => Ok(()),
+    }
+}
