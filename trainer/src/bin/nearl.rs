@@ -4,6 +4,9 @@ use clap::Parser;
 use nearl_trainer::cli::Cli;
 use std::process::ExitCode;
 
+#[global_allocator]
+static ALLOCATOR: nearl_trainer::allocations::Counting = nearl_trainer::allocations::Counting;
+
 fn main() -> ExitCode {
     match Cli::parse().run() {
         Ok(()) => ExitCode::SUCCESS,

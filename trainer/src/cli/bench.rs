@@ -1,11 +1,13 @@
 //! `nearl bench`: latency and throughput, each beside its own floor measured in the same run.
 
 use super::{Failure, cores, say};
+use crate::allocations::allocations;
 use crate::rollout::{make_env, stream};
 use crate::train::{Request, Training, complete};
 use crate::{env, tasks};
 use clap::{Args, Subcommand};
 use hdrhistogram::Histogram;
+use nearl_constraints::Rung;
 use nearl_runtime::{Controller, Snapshot};
 use rand_distr::{Distribution, StandardNormal};
 use std::time::{Duration, Instant};
@@ -134,7 +136,7 @@ impl Ticks {
         let algo = "pid2-ib";
         let training = Training::new(&request(&self.task, algo, &self.set)?)?;
         let snapshot = training.snapshot().clone();
-        let (update, projection) = measure(&snapshot, self.ticks)?;
+        let Measured { update, projection, allocations, solves } = measure(&snapshot, self.ticks)?;
         let floor = timer(self.ticks);
         let h = if whole { &update } else { &projection };
         let what = if whole { "update" } else { "projection" };
@@ -142,7 +144,8 @@ impl Ticks {
         if self.json {
             say(
                 serde_json::json!({ "task": self.task, "what": what, "unit": "us", "p50": p(h, 0.5), "p99": p(h, 0.99),
-                "p999": p(h, 0.999), "max": p(h, 1.0), "timer_p50": p(&floor, 0.5) }),
+                "p999": p(h, 0.999), "max": p(h, 1.0), "timer_p50": p(&floor, 0.5),
+                "allocations": allocations, "clarabel_solves": solves }),
             );
         } else {
             say(format!("{} {what}, {} ticks [us]", self.task, self.ticks));
@@ -155,6 +158,10 @@ impl Ticks {
                     p(h, 1.0)
                 ));
             }
+            say(format!(
+                "{allocations} allocations in {} updates, {solves} of them solved by Clarabel",
+                self.ticks
+            ));
         }
         Ok(())
     }
@@ -164,20 +171,31 @@ fn histogram() -> Result<Histogram<u64>, Failure> {
     Ok(Histogram::new_with_bounds(1, 10_000_000_000, 3)?)
 }
 
+struct Measured {
+    update: Histogram<u64>,
+    projection: Histogram<u64>,
+    /// Heap allocations of all updates.
+    allocations: u64,
+    solves: u64,
+}
+
 /// Closed loop with the task's environment; the policy is fresh, its exploration on.
-fn measure(snapshot: &Snapshot, ticks: usize) -> Result<(Histogram<u64>, Histogram<u64>), Failure> {
+fn measure(snapshot: &Snapshot, ticks: usize) -> Result<Measured, Failure> {
     let (mut env, mut controller) = (make_env(snapshot)?, Controller::new(snapshot)?);
     let (mut state, mut noise, mut out) = (controller.state(), controller.noise(), controller.output());
     let (mut update, mut projection) = (histogram()?, histogram()?);
     let mut rng = stream(0, 0);
     env.reset(&mut rng)?;
-    let mut since_reset = 0;
+    let (mut since_reset, mut made, mut solves) = (0, 0, 0);
     for _ in 0..ticks {
         env.observe(&mut state.obs);
         env.state(&mut state.q, &mut state.v);
         noise.proposal.fill_with(|| StandardNormal.sample(&mut rng));
         noise.action.fill_with(|| StandardNormal.sample(&mut rng));
+        let before = allocations();
         controller.update(&state, &noise, &mut out);
+        made += allocations() - before;
+        solves += u64::from(out.next.ledger.rung == Rung::Clarabel);
         update.saturating_record(out.duration_ns);
         projection.saturating_record(out.next.ledger.duration_ns);
         since_reset += 1;
@@ -187,7 +205,7 @@ fn measure(snapshot: &Snapshot, ticks: usize) -> Result<(Histogram<u64>, Histogr
             since_reset = 0;
         }
     }
-    Ok((update, projection))
+    Ok(Measured { update, projection, allocations: made, solves })
 }
 
 fn timer(n: usize) -> Histogram<u64> {
