@@ -32,7 +32,7 @@ demo: build package
 	@echo "open demo/report.html in a browser"
 
 test: build package
-	cargo test --release --locked
+	cargo test --release --locked --no-fail-fast
 	$(VENV)/bin/python -m pytest python/tests -q
 
 $(VENV)/bin/python:
