@@ -300,3 +300,6 @@ impl Ppo {
         self.nets.policy.mlp.to_dense(&self.params.groups[ACTOR].p)
     }
 }
+
+#[cfg(test)]
+mod tests;
