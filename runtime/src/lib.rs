@@ -14,6 +14,8 @@ pub mod rt;
 pub mod snapshot;
 pub mod task;
 
+pub use nearl_constraints as constraints;
+
 pub use controller::{Controller, Noise, Output, State};
 pub use snapshot::{Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
 pub use task::Task;

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 const ARROWS: &[(&str, &[&str])] = &[
     ("nearl-constraints", &[]),
     ("nearl-runtime", &["nearl-constraints"]),
-    ("nearl-trainer", &["nearl-constraints", "nearl-runtime"]),
+    ("nearl-trainer", &["nearl-runtime"]),
     ("nearl-python", &["nearl-constraints", "nearl-runtime", "nearl-trainer"]),
     ("nearl-tests", &["nearl-constraints", "nearl-runtime", "nearl-trainer"]),
 ];

@@ -2,7 +2,7 @@
 
 use crate::env::{Env, EnvError, Limits, Meter};
 use crate::rollout::stream;
-use nearl_constraints::{LimitSet, Model};
+use nearl_runtime::constraints::{LimitSet, Model};
 use nearl_runtime::controller::Parts;
 use nearl_runtime::link::{
     ActionMessage, Plant, Robot, STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, StateMessage,

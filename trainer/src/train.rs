@@ -367,7 +367,7 @@ fn check_minibatch(minibatch: usize, batch: usize) -> Result<(), TrainError> {
 
 /// What the limits allow in one policy period: `a_max T` for velocities, `v_max T` for positions.
 fn limit_scale(parts: &Parts, manifest: &Manifest) -> Result<Vec<f64>, TrainError> {
-    use nearl_constraints::Entry;
+    use nearl_runtime::constraints::Entry;
     let period = manifest.task.time.dt * manifest.task.time.policy_every as f64;
     let limits = parts.projector.limits();
     let (velocity, acceleration) = (&limits.velocity, &limits.acceleration);

@@ -7,7 +7,7 @@ use crate::train::{Request, Training, complete};
 use crate::{env, tasks};
 use clap::{Args, Subcommand};
 use hdrhistogram::Histogram;
-use nearl_constraints::Rung;
+use nearl_runtime::constraints::Rung;
 use nearl_runtime::{Controller, Snapshot};
 use rand_distr::{Distribution, StandardNormal};
 use std::time::{Duration, Instant};

@@ -6,7 +6,7 @@
 use super::{Failure, say};
 use crate::tasks;
 use clap::Args;
-use nearl_constraints::{Model, Proposal, Target};
+use nearl_runtime::constraints::{Model, Proposal, Target};
 use nearl_runtime::controller::Parts;
 use serde::Deserialize;
 use std::io::BufRead;
