@@ -2,6 +2,10 @@
 //! beyond its limit.
 
 use nearl_constraints::viability::{Dof, Period, interval};
+use nearl_constraints::{
+    AccelerationLimit, Limit, Model, PositionLimit, Projector, Proposal, Settings, Target, VelocityLimit,
+};
+use std::path::Path;
 
 /// Seeded uniform numbers (splitmix64).
 struct Random(u64);
@@ -107,6 +111,59 @@ fn many_joints_never_leave_their_sets() {
             }
         }
     }
+}
+
+/// The whole Panda through its projector, all joints at once, at every period and number of physics steps.
+#[test]
+fn the_panda_never_leaves_its_set() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/robots/panda/panda.urdf");
+    let model = Model::from_urdf(&file).expect("the bundled robot");
+    for dt in PERIODS {
+        for n in SUB_STEPS {
+            let limits: [Box<dyn Limit>; 3] = [
+                Box::new(PositionLimit::with_margin(0.0)),
+                Box::new(VelocityLimit::scaled(1.0)),
+                Box::new(AccelerationLimit::uniform(10.0)),
+            ];
+            let dofs: Vec<usize> = (0..7).collect();
+            let mut projector =
+                Projector::new(&model, &limits, &dofs, Settings::new(dt, n)).expect("the Panda's limits");
+            let (outside, violation) = attack_robot(&model, &mut projector, &Period::new(dt, n), 100_000);
+            assert!(
+                outside == 0 && violation <= 1e-9,
+                "T {dt}, n {n}: {outside} ticks outside or braked, {violation:e} beyond"
+            );
+        }
+    }
+}
+
+/// As [`attack`] on every joint of a robot: (ticks outside the set or without an answer, largest violation).
+fn attack_robot(model: &Model, projector: &mut Projector, p: &Period, steps: usize) -> (usize, f64) {
+    let (mut random, mut side) = (Random(5), [1.0f64; 7]);
+    let (mut proposal, mut target) = (Proposal::new(model), Target::new(model));
+    let (lower, upper) = (model.lower_position_limit(), model.upper_position_limit());
+    let mut q: Vec<f64> = lower.iter().zip(upper).map(|(l, u)| 0.5 * (l + u)).collect();
+    let mut v = vec![0.0; model.nv()];
+    let (mut outside, mut violation) = (0, 0.0f64);
+    for _ in 0..steps {
+        for i in 0..7 {
+            if random.next() < 0.02 {
+                side[i] = -side[i];
+            }
+            proposal.q[i] = q[i] + side[i] * random.between(0.0, 3.0);
+            proposal.v[i] = side[i] * random.between(0.0, 1e3);
+        }
+        let status = projector.project(&q, &v, &proposal, &mut target);
+        outside +=
+            usize::from(!status.is_ok() || target.ledger.outside > 0 || target.ledger.violations.total() > 0);
+        for i in 0..7 {
+            let (low, high);
+            (q[i], v[i], low, high) = advance(q[i], v[i], target.acceleration[i], p);
+            let speed = v[i].abs() - model.velocity_limit()[i];
+            violation = violation.max(high - upper[i]).max(lower[i] - low).max(speed);
+        }
+    }
+    (outside, violation)
 }
 
 /// Braking with all there is, from any state the box leads to, stops inside the limits.
