@@ -266,7 +266,6 @@ impl Controller {
         for k in 0..self.layout.n_state() {
             let s = self.held.obs[self.layout.state()[k]];
             let scale = self.normaliser.scale[k];
-            (out.target[k], out.lower[k], out.upper[k]) = (out.proposal[k], f32::NEG_INFINITY, f32::INFINITY);
             let bounds = self.projector.bounds();
             let (target, lower, upper) = match self.layout.state_entry(k) {
                 Entry::Position { idx_q, dof } => {
@@ -277,10 +276,10 @@ impl Controller {
             };
             out.target[k] = target;
             out.target_change[k] = ((target - s) / scale) as f32;
-            if self.projection {
-                out.lower[k] = ((lower - s) / scale) as f32;
-                out.upper[k] = ((upper - s) / scale) as f32;
-            }
+            (out.lower[k], out.upper[k]) = match self.projection {
+                true => (((lower - s) / scale) as f32, ((upper - s) / scale) as f32),
+                false => (f32::NEG_INFINITY, f32::INFINITY),
+            };
         }
     }
 

@@ -1,5 +1,7 @@
 //! Diagonal Gaussians over tiles of rows, and the small row operations the losses share.
 
+use super::optimise::{TILE, Tile};
+use super::ppo::{entropy_bonus, gather_advantage};
 use nearl_runtime::net::kernel::{LANES, V, ZERO, exp, scalars, scalars_mut};
 
 const HALF_LOG_TWO_PI: f64 = 0.918_938_533_204_672_7;
@@ -124,4 +126,44 @@ pub(super) fn surrogate(log_prob: &mut [V], old: &[V], advantage: &[V], range: f
         log_prob[i] = free.zip(held, |f, h| if f <= h { f } else { 0.0 }) * V::splat(-scale);
     }
     [loss.sum(), kl.sum(), clipped.sum()]
+}
+
+/// The sampled rows of a Gaussian policy and how it is judged.
+pub(super) struct Likelihood<'a> {
+    /// Log standard deviations in the parameter vector (n entries in whole vectors).
+    pub(super) log_std: &'a [V],
+    /// Entries.
+    pub(super) n: usize,
+    /// What was sampled.
+    pub(super) sampled: &'a [V],
+    /// Mean of the current policy.
+    pub(super) mean: &'a [V],
+    /// Clip range of the ratio.
+    pub(super) clip_range: f32,
+    /// Weight of the entropy bonus.
+    pub(super) ent_coef: f32,
+}
+
+/// PPO's loss of a tile: leaves `dL / d mean` in `d`, adds `dL / d log_std` to `grad_log_std`; returns the sums of
+/// [`surrogate`]. `rows` are scratch.
+#[inline(always)]
+pub(super) fn likelihood_ratio(
+    l: &Likelihood<'_>,
+    t: &Tile<'_>,
+    rows: &mut [Vec<V>; 3],
+    d: &mut [V],
+    grad_log_std: &mut [V],
+) -> [f32; 3] {
+    let mut inverse = [ZERO; 16];
+    let inverse = &mut inverse[..l.log_std.len()];
+    let constant = inverse_sigma(inverse, l.log_std, l.n);
+    let [log_prob, old, advantage] = rows;
+    log_prob.fill(V::splat(constant as f32));
+    gather_one(old, &t.batch.log_prob, t.idx);
+    gather_advantage(advantage, t);
+    residuals(d, l.sampled, l.mean, inverse, log_prob);
+    let sums = surrogate(log_prob, old, advantage, l.clip_range, t.scale);
+    residuals_back(d, inverse, log_prob, Some(&mut *grad_log_std), l.n);
+    entropy_bonus(grad_log_std, l.n, l.ent_coef * t.scale * TILE as f32);
+    sums
 }

@@ -13,13 +13,11 @@
 
 use super::batch::Batch;
 use super::discriminator::{Discriminator, DiscriminatorWork, LATENT, logit_slope, softplus_sum};
-use super::gaussian::{copy, gather, gather_one, inverse_sigma, residuals, residuals_back, surrogate};
+use super::gaussian::{Likelihood, copy, gather, likelihood_ratio};
 use super::inverse::{InverseModel, InverseWork};
 use super::net::{Net, Tape};
 use super::optimise::{Group, Params, Phases, SUMS, Schedule, TILE, Tile, add_sums, optimise};
-use super::ppo::{
-    PpoSettings, entropy_bonus, gather_advantage, mean_std, set_lanes, value_loss, values, widths,
-};
+use super::ppo::{PpoSettings, mean_std, set_lanes, value_loss, values, widths};
 use super::{Adam, Dims, Learner, Metrics, init};
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars, scalars_mut};
 use nearl_runtime::normaliser::Normaliser;
@@ -324,17 +322,16 @@ fn through_inverse(
     }
     gather(&mut inv.action, av, 0, &t.batch.sampled, a, t.idx);
     let mean = model.net.forward(&group.p, &inv.input, &mut inv.tape);
-    let mut inverse = [ZERO; 16];
-    let inverse = &mut inverse[..av];
-    let constant = inverse_sigma(inverse, &group.p[log_std.clone()], a);
-    let [log_prob, old, advantage] = &mut w.rows;
-    log_prob.fill(V::splat(constant as f32));
-    gather_one(old, &t.batch.log_prob, t.idx);
-    gather_advantage(advantage, t);
-    residuals(&mut inv.slope, &inv.action, mean, inverse, log_prob);
-    let [loss, kl, clipped] = surrogate(log_prob, old, advantage, n.ppo.clip_range, t.scale);
-    residuals_back(&mut inv.slope, inverse, log_prob, Some(&mut grad[log_std.clone()]), a);
-    entropy_bonus(&mut grad[log_std.clone()], a, n.ppo.ent_coef * t.scale * TILE as f32);
+    let likelihood = Likelihood {
+        log_std: &group.p[log_std.clone()],
+        n: a,
+        sampled: &inv.action,
+        mean,
+        clip_range: n.ppo.clip_range,
+        ent_coef: n.ppo.ent_coef,
+    };
+    let [loss, kl, clipped] =
+        likelihood_ratio(&likelihood, t, &mut w.rows, &mut inv.slope, &mut grad[log_std.clone()]);
     let dx = model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, Some(grad), true);
     // through the projection into the proposal
     let (dx, x) = (scalars(dx), scalars(&inv.input));
@@ -366,17 +363,16 @@ fn through_proposal(
     let s = n.dims.n_state;
     let sv = s.div_ceil(LANES);
     gather(&mut w.change, sv, 0, &t.batch.proposal, s, t.idx);
-    let mut inverse = [ZERO; 16];
-    let inverse = &mut inverse[..sv];
-    let constant = inverse_sigma(inverse, &group.p[log_std.clone()], s);
-    let [log_prob, old, advantage] = &mut w.rows;
-    log_prob.fill(V::splat(constant as f32));
-    gather_one(old, &t.batch.log_prob, t.idx);
-    gather_advantage(advantage, t);
-    residuals(&mut w.d_change, &w.change, w.policy.output(), inverse, log_prob);
-    let [loss, kl, clipped] = surrogate(log_prob, old, advantage, n.ppo.clip_range, t.scale);
-    residuals_back(&mut w.d_change, inverse, log_prob, Some(&mut grad[log_std.clone()]), s);
-    entropy_bonus(&mut grad[log_std.clone()], s, n.ppo.ent_coef * t.scale * TILE as f32);
+    let likelihood = Likelihood {
+        log_std: &group.p[log_std.clone()],
+        n: s,
+        sampled: &w.change,
+        mean: w.policy.output(),
+        clip_range: n.ppo.clip_range,
+        ent_coef: n.ppo.ent_coef,
+    };
+    let [loss, kl, clipped] =
+        likelihood_ratio(&likelihood, t, &mut w.rows, &mut w.d_change, &mut grad[log_std.clone()]);
     (sums[0], sums[1], sums[2]) = (loss, kl, clipped);
 }
 

@@ -2,9 +2,7 @@
 //! the side, so that its loss can be plotted beside the others.
 
 use super::batch::Batch;
-use super::gaussian::{
-    gather, gather_one, heads, inverse_sigma, residuals, residuals_back, set_heads, surrogate,
-};
+use super::gaussian::{Likelihood, gather, gather_one, heads, likelihood_ratio, set_heads};
 use super::inverse::InverseModel;
 use super::net::{Net, Tape};
 use super::optimise::{Group, Params, Phases, Schedule, TILE, Tile, add_sums, optimise};
@@ -221,17 +219,16 @@ fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [
     gather(&mut w.action, av, 0, &t.batch.sampled, a, t.idx);
     // log pi(a | s) and the clipped surrogate
     let mean = n.policy.forward(&group.p, &w.obs, &mut w.policy);
-    let mut inverse = [ZERO; 16];
-    let inverse = &mut inverse[..av];
-    let constant = inverse_sigma(inverse, &group.p[n.log_std.clone()], a);
-    let [log_prob, old, advantage] = &mut w.rows;
-    log_prob.fill(V::splat(constant as f32));
-    gather_one(old, &t.batch.log_prob, t.idx);
-    gather_advantage(advantage, &t);
-    residuals(&mut w.d_action, &w.action, mean, inverse, log_prob);
-    let [loss, kl, clipped] = surrogate(log_prob, old, advantage, s.clip_range, t.scale);
-    residuals_back(&mut w.d_action, inverse, log_prob, Some(&mut grad[n.log_std.clone()]), a);
-    entropy_bonus(&mut grad[n.log_std.clone()], a, s.ent_coef * t.scale * TILE as f32);
+    let likelihood = Likelihood {
+        log_std: &group.p[n.log_std.clone()],
+        n: a,
+        sampled: &w.action,
+        mean,
+        clip_range: s.clip_range,
+        ent_coef: s.ent_coef,
+    };
+    let log_std = &mut grad[n.log_std.clone()];
+    let [loss, kl, clipped] = likelihood_ratio(&likelihood, &t, &mut w.rows, &mut w.d_action, log_std);
     n.policy.backward(&group.transposed, &w.obs, &w.d_action, &mut w.policy, Some(grad), false);
     // value
     let value = n.value.forward(&group.p, &w.obs, &mut w.value);
