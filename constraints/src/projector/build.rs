@@ -1,12 +1,13 @@
 //! Building a projector: everything that can be wrong is found here.
 
 use super::active_set::ActiveSet;
+use super::backup::Backup;
 use super::conic::Conic;
 use super::coupled::Coupled;
 use super::sources::{Measured, Sources};
 use super::{Dofs, History, Projector, Stages, Switch};
 use crate::checker::Checker;
-use crate::target::{Bounds, Consistency, Settings, Solver};
+use crate::target::{Bounds, Braking, Consistency, Settings, Solver};
 use crate::viability::{Dof, Interval, Kind, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model, Soft};
 
@@ -27,7 +28,7 @@ impl Projector {
         let dofs = Dofs::new(model, controllable, settings.consistency)?;
         let switches = switches(model, limits, &dofs.controllable)?;
         let (each, limits) = (limits, LimitSet::collect(model, limits, &dofs.controllable)?);
-        check_combination(model, &limits, &dofs, settings.consistency)?;
+        check_combination(model, &limits, &dofs, (settings.consistency, settings.braking))?;
         let period = Period::new(settings.dt, settings.sub_steps);
         let weight: Vec<f64> = match &settings.velocity_weight {
             Some(w) => w.iter().map(|w| w * w).collect(),
@@ -55,7 +56,10 @@ impl Projector {
             goal: zero(),
             v_next: zero(),
             consistent: vec![false; nv],
+            v_wanted: zero(),
+            v_stop: zero(),
             tangent: zero(),
+            backup: Backup::new(model),
             integrated: model.neutral(),
             model: model.clone(),
             limits,
@@ -120,7 +124,7 @@ pub(super) fn check_combination(
     model: &Model,
     limits: &LimitSet,
     dofs: &Dofs,
-    consistency: Consistency,
+    (consistency, braking): (Consistency, Braking),
 ) -> Result<(), LimitError> {
     let names = |wrong: &dyn Fn(usize) -> bool| -> String {
         let list = dofs.controllable.iter().filter(|i| wrong(**i));
@@ -137,14 +141,12 @@ pub(super) fn check_combination(
         }
         Consistency::Free => {}
     }
-    let slow = |i: usize| {
-        let steepest = limits.profile[i].iter().flatten().map(|p| p.deceleration).fold(0.0, f64::max);
-        steepest > limits.braking[i]
-    };
-    let joints = names(&slow);
-    if !joints.is_empty() {
-        let what = format!("velocity_profile falls faster than the braking of {joints}");
-        return Err(LimitError::Unusable { what, next: "raise acceleration or braking, or lower squared" });
+    if braking == Braking::Stored {
+        let joints = names(&|i| limits.braking[i].is_infinite() || limits.effort[i].is_infinite());
+        if !joints.is_empty() {
+            let next = "add torque and acceleration limits, or set braking = \"certified\"";
+            return Err(LimitError::Missing { limit: "a stored brake", joints, next });
+        }
     }
     Ok(())
 }
