@@ -7,6 +7,7 @@ use super::coupled::Coupled;
 use super::sources::{Measured, Sources};
 use super::{Dofs, History, Projector, Stages, Switch};
 use crate::checker::Checker;
+use crate::ledger::{Rung, Status};
 use crate::target::{Bounds, Braking, Consistency, Settings, Solver};
 use crate::viability::{Dof, Interval, Kind, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model, Soft};
@@ -56,6 +57,8 @@ impl Projector {
             goal: zero(),
             v_next: zero(),
             consistent: vec![false; nv],
+            clamped: vec![[false; 2]; nv],
+            last: (Status::Unchanged, Rung::ClosedForm),
             v_wanted: zero(),
             v_stop: zero(),
             tangent: zero(),
@@ -185,7 +188,8 @@ fn stages(
     let worth = hessian.iter().zip(&sigma).fold(0.0, |most: f64, (h, sigma)| most.max(h * sigma * sigma));
     let scaled = |s: Soft| Soft { linear: s.linear * worth, quadratic: s.quadratic * worth };
     let soft = sources.softness().into_iter().map(|s| s.map(scaled)).collect();
-    let mut problem = Coupled::new(hessian, soft, sources.equalities(), &sources.dimensions());
+    let mut problem =
+        Coupled::new(hessian, soft, sources.equalities(), &sources.dimensions(), dofs.fixed.len());
     for k in 0..problem.n {
         (problem.lower[k], problem.upper[k]) = (-sigma[k], sigma[k]);
     }

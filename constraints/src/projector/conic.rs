@@ -369,7 +369,7 @@ mod tests {
 
     /// `min 1/2 (y - goal)^2` in two variables with `y_0 + y_1 <= 1`.
     fn problem() -> Coupled {
-        let mut p = Coupled::new(vec![1.0; 2], vec![None], vec![false], &[]);
+        let mut p = Coupled::new(vec![1.0; 2], vec![None], vec![false], &[], 0);
         (p.lower, p.upper, p.goal) = (vec![-5.0; 2], vec![5.0; 2], vec![2.0, 1.0]);
         (p.rows, p.row_upper) = (vec![1.0, 1.0], vec![1.0]);
         p

@@ -7,6 +7,7 @@ mod backup;
 mod build;
 mod conic;
 mod coupled;
+mod gradient;
 mod ladder;
 mod modes;
 mod sources;
@@ -74,6 +75,10 @@ pub struct Projector {
     v_next: Vec<f64>,
     /// The proposal's position and velocity belong together (nv).
     consistent: Vec<bool>,
+    /// Free mode: position and velocity of the dof were clamped (nv).
+    clamped: Vec<[bool; 2]>,
+    /// How the last tick ended.
+    last: (Status, Rung),
     /// Velocities of the target that no brake was verified for (nv).
     v_wanted: Vec<f64>,
     /// Velocities after a tick of the stored brake (nv).
@@ -139,6 +144,7 @@ impl Projector {
         target.ledger.reset();
         let status = self.ladder(q, v, proposal, target);
         target.ledger.status = status;
+        self.last = (status, target.ledger.rung);
         target.ledger.duration_ns = start.elapsed().as_nanos() as u64;
         status
     }
