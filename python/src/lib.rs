@@ -24,7 +24,10 @@ mod _core {
     #[pymodule_export]
     use super::env::{Env, tasks};
     #[pymodule_export]
-    use super::limits::{AccelerationLimit, PositionLimit, TorqueLimit, VelocityLimit};
+    use super::limits::{
+        AccelerationLimit, JerkLimit, Limit, LockedJoints, PositionLimit, RowLimit, TorqueLimit,
+        TorqueRateLimit, TorqueSpeedLimit, VelocityLimit, VelocityProfileLimit,
+    };
     #[pymodule_export]
     use super::model::Model;
     #[pymodule_export]
