@@ -5,6 +5,7 @@
 
 use crate::env::{Env, EnvError, Fault};
 use crate::stats::RunningStats;
+use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Networks, Noise, Output, PolicyKind, Snapshot, SnapshotError, State};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -111,6 +112,7 @@ pub struct Worker {
     env: Box<dyn Env>,
     controller: Controller,
     kind: PolicyKind,
+    learned: bool,
     rng: ChaCha8Rng,
     state: State,
     before: Vec<f64>,
@@ -239,6 +241,7 @@ impl Worker {
         let n_state = controller.layout().n_state();
         let mut worker = Self {
             kind: snapshot.manifest.policy,
+            learned: snapshot.manifest.task.idm.kind == IdmKind::Learned,
             state: controller.state(),
             before: vec![0.0; n_state],
             noise: controller.noise(),
@@ -333,7 +336,11 @@ impl Worker {
         let normal = |rng: &mut ChaCha8Rng| if explore { StandardNormal.sample(rng) } else { 0.0 };
         match self.kind {
             PolicyKind::Stochastic => self.noise.proposal.fill_with(|| normal(&mut self.rng)),
-            _ => self.noise.action.fill_with(|| normal(&mut self.rng)),
+            PolicyKind::Direct | PolicyKind::Deterministic => {}
+        }
+        // an analytic inverse model has no noise of its own
+        if self.kind != PolicyKind::Stochastic || self.learned {
+            self.noise.action.fill_with(|| normal(&mut self.rng));
         }
     }
 

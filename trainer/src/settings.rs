@@ -1,6 +1,6 @@
 //! `[train]` of the task file: how experience is collected, and the learner's own sections.
 
-use crate::learn::{Pid2Settings, PpoSettings};
+use crate::learn::{NearlSettings, NetSettings, Pid2Settings, PpoSettings};
 use nearl_runtime::task::suggest;
 use serde::{Deserialize, Serialize};
 
@@ -15,14 +15,15 @@ pub enum ChangeScale {
     Limits,
 }
 
-/// Whether the meta policy's proposal or the inverse model's action is Gaussian.
+/// What is Gaussian: a deterministic or a stochastic meta policy, for `nearl`, `pid2-gan` and `pid2-ib`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Exploration {
-    /// Deterministic proposal, Gaussian action (Eq. 1 of the paper); needs a learned inverse model.
+    /// Deterministic meta policy, Gaussian action (Eq. 1 of the paper); needs a learned inverse model.
     #[default]
     Action,
-    /// Gaussian proposal; the only choice with analytic inverse dynamics.
+    /// Stochastic meta policy; with a learned inverse model the action is Gaussian too. The only choice with analytic
+    /// inverse dynamics. The ratio has as many dimensions as the state: expect slower learning.
     Proposal,
 }
 
@@ -48,9 +49,13 @@ pub struct TrainSettings {
     pub exploration: Exploration,
     /// Project while collecting (Algorithm 2, line 8); off: constraints act in deployment only.
     pub project: bool,
-    /// Settings of `ppo`.
+    /// Sizes of the networks.
+    pub nets: NetSettings,
+    /// Settings of the clipped surrogate, for every algorithm.
     pub ppo: PpoSettings,
-    /// Settings of `pid2-ib`, `pid2-gan` and `nearl`.
+    /// Settings of `nearl`.
+    pub nearl: NearlSettings,
+    /// Settings of `pid2-ib` and `pid2-gan`.
     pub pid2: Pid2Settings,
 }
 
@@ -66,7 +71,9 @@ impl Default for TrainSettings {
             change_scale: ChangeScale::default(),
             exploration: Exploration::default(),
             project: true,
+            nets: NetSettings::default(),
             ppo: PpoSettings::default(),
+            nearl: NearlSettings::default(),
             pid2: Pid2Settings::default(),
         }
     }
@@ -89,6 +96,7 @@ impl TrainSettings {
                 return Err(format!("[train.{key}]: {v} is outside [0, 1]"));
             }
         }
+        settings.nets.check()?;
         Ok(settings)
     }
 }

@@ -1,6 +1,6 @@
 //! `nearl train`: collect, estimate advantages, update, write. The loop of every algorithm.
 
-use crate::learn::{Batch, Dims, Learner, Metrics, Pid2, Ppo, advantages};
+use crate::learn::{Batch, Dims, Kind, Learner, Metrics, Nearl, Pid2, Ppo, advantages};
 use crate::rollout::{Collector, RolloutError, Tally, stream};
 use crate::run_folder::{RunError, RunFolder};
 use crate::settings::{ChangeScale, Exploration, TrainSettings};
@@ -9,12 +9,17 @@ use nearl_runtime::controller::{Parts, seen_entries};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
+use rand_chacha::ChaCha8Rng;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Names of the algorithms.
 pub const ALGORITHMS: &[(&str, &str)] = &[
     ("ppo", "the paper's RL-Pure: a Gaussian policy on actions, nothing proposed or projected"),
+    (
+        "nearl",
+        "supervised meta policy and inverse model, policy gradient on the pair (the paper's Algorithm 1)",
+    ),
     ("pid2-gan", "policy, inverse dynamics and a discriminator without a bottleneck"),
     ("pid2-ib", "policy, inverse dynamics and a discriminator with the information bottleneck"),
 ];
@@ -23,7 +28,7 @@ pub const ALGORITHMS: &[(&str, &str)] = &[
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// An algorithm that does not exist.
-    #[error("no algorithm '{0}'; give one of ppo, pid2-gan, pid2-ib")]
+    #[error("no algorithm '{0}'; give one of ppo, nearl, pid2-gan, pid2-ib")]
     Algorithm(String),
     /// The `[train]` section, or what does not fit the task.
     #[error("{0}")]
@@ -97,6 +102,8 @@ pub const COLUMNS: &[&str] = &[
     "train/clamped_fraction",
     "train/grad_norm",
     "train/std",
+    "train/proposal_std",
+    "train/policy_mse",
     "discriminator/loss",
     "discriminator/kl",
     "discriminator/accuracy",
@@ -113,7 +120,7 @@ pub struct Training {
     obs_stats: RunningStats,
     change_stats: RunningStats,
     return_stats: RunningStats,
-    rng: rand_chacha::ChaCha8Rng,
+    rng: ChaCha8Rng,
     total: u64,
     recent: Vec<(f64, usize)>,
     begin: Instant,
@@ -146,20 +153,8 @@ impl Training {
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);
-        let stochastic = manifest.policy == PolicyKind::Stochastic;
-        let (ppo, pid2) = (settings.ppo.clone(), settings.pid2.clone());
-        let learner: Box<dyn Learner> = match request.algo.as_str() {
-            "ppo" => Box::new(Ppo::new(dims.clone(), ppo, request.threads, &mut rng)),
-            name => Box::new(Pid2::new(
-                dims.clone(),
-                ppo,
-                pid2,
-                stochastic,
-                name == "pid2-ib",
-                request.threads,
-                &mut rng,
-            )),
-        };
+        manifest.activation = settings.nets.activation;
+        let learner = learner(&manifest, &settings, dims.clone(), request.threads, &mut rng);
         let mut normaliser = Normaliser::identity(dims.n_obs, dims.n_state);
         if settings.change_scale == ChangeScale::Limits {
             normaliser.scale = limit_scale(&parts, &manifest)?;
@@ -276,6 +271,7 @@ impl Training {
             let s = &w.segment;
             b.obs.extend_from_slice(&s.x);
             b.proposal.extend_from_slice(&s.change);
+            b.target.extend_from_slice(&s.target_change);
             b.lower.extend_from_slice(&s.lower);
             b.upper.extend_from_slice(&s.upper);
             b.reached.extend_from_slice(&s.reached);
@@ -316,25 +312,48 @@ impl Training {
             "constraints/moved" => per_tick(t.moved),
             "constraints/distance" => t.distance / t.ticks.max(1) as f64,
             "idm/residual" => t.residual / t.ticks.max(1) as f64,
-            "idm/threshold" => self.settings.pid2.idm_threshold,
+            "idm/threshold" => match self.snapshot.manifest.algo.as_str() {
+                "nearl" => self.settings.nearl.idm_threshold,
+                _ => self.settings.pid2.idm_threshold,
+            },
             other => p.metrics.iter().find(|(n, _)| *n == other).map_or(f64::NAN, |(_, v)| *v),
         };
         COLUMNS.iter().map(|c| value(c)).collect()
     }
 }
 
+/// Fresh networks of the manifest's algorithm.
+fn learner(
+    manifest: &Manifest,
+    settings: &TrainSettings,
+    dims: Dims,
+    threads: usize,
+    rng: &mut ChaCha8Rng,
+) -> Box<dyn Learner> {
+    let (nets, ppo) = (&settings.nets, settings.ppo.clone());
+    let kind = Kind {
+        stochastic: manifest.policy == PolicyKind::Stochastic,
+        learned: manifest.task.idm.kind == IdmKind::Learned,
+    };
+    match manifest.algo.as_str() {
+        "ppo" => Box::new(Ppo::new(dims, nets, ppo, threads, rng)),
+        "nearl" => Box::new(Nearl::new(dims, nets, ppo, settings.nearl.clone(), kind, threads, rng)),
+        name => {
+            let bottleneck = name == "pid2-ib";
+            Box::new(Pid2::new(dims, nets, ppo, settings.pid2.clone(), kind, bottleneck, threads, rng))
+        }
+    }
+}
+
 fn policy_kind(algo: &str, settings: &TrainSettings, idm: IdmKind) -> Result<PolicyKind, TrainError> {
     match (algo, settings.exploration, idm) {
         ("ppo", ..) => Ok(PolicyKind::Direct),
-        ("pid2-gan" | "pid2-ib", Exploration::Proposal, IdmKind::Pinocchio) => Ok(PolicyKind::Stochastic),
-        ("pid2-gan" | "pid2-ib", Exploration::Action, IdmKind::Learned) => Ok(PolicyKind::Deterministic),
-        ("pid2-gan" | "pid2-ib", Exploration::Action, IdmKind::Pinocchio) => Err(TrainError::Settings(
+        (name, ..) if !ALGORITHMS.iter().any(|(n, _)| *n == name) => Err(TrainError::Algorithm(name.into())),
+        (_, Exploration::Proposal, _) => Ok(PolicyKind::Stochastic),
+        (_, Exploration::Action, IdmKind::Learned) => Ok(PolicyKind::Deterministic),
+        (_, Exploration::Action, IdmKind::Pinocchio) => Err(TrainError::Settings(
             "[train.exploration]: 'action' needs a learned inverse model, but idm.kind is 'pinocchio'; use exploration = \"proposal\"".into(),
         )),
-        ("pid2-gan" | "pid2-ib", Exploration::Proposal, IdmKind::Learned) => Err(TrainError::Settings(
-            "[train.exploration]: 'proposal' needs analytic inverse dynamics, but idm.kind is 'learned'; use exploration = \"action\"".into(),
-        )),
-        _ => Err(TrainError::Algorithm(algo.into())),
     }
 }
 

@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub(super) struct Train {
     /// Task name (see `nearl tasks`) or TOML file.
     task: String,
-    /// Algorithm: ppo, pid2-gan or pid2-ib.
+    /// Algorithm: ppo, nearl, pid2-gan or pid2-ib.
     #[arg(long, default_value = "pid2-ib")]
     algo: String,
     /// Environment steps; 1_000_000 and 1e6 are both read.
