@@ -77,7 +77,11 @@ fn affine(l: &Layer, params: &[V], x: &[f32], y: &mut [V], between: Option<Activ
             k += 1;
         }
         let sum = ((acc[0] + acc[1]) + (acc[2] + acc[3])) + b[j];
-        y[j] = between.map_or(sum, |f| f.apply(sum));
+        // no closure: it would be compiled without the vector instructions of its caller
+        y[j] = match between {
+            Some(f) => f.apply(sum),
+            None => sum,
+        };
     }
 }
 
