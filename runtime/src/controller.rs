@@ -295,6 +295,7 @@ impl Controller {
         }
         next.ledger.violations = next.ledger.raw_violations;
         next.ledger.moved = 0.0;
+        next.ledger.active.clear();
     }
 
     /// Where the proposal wants the robot at the end of this tick: on the cubic from the state at the

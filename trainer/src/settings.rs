@@ -47,8 +47,14 @@ pub struct TrainSettings {
     pub change_scale: ChangeScale,
     /// What is Gaussian.
     pub exploration: Exploration,
-    /// Project while collecting (Algorithm 2, line 8); off: constraints act in deployment only.
-    pub project: bool,
+    /// Project while collecting (Algorithm 2, line 8). Off: the raw proposal becomes the target in training, and the
+    /// constraints act in deployment only (a controller that loads the snapshot always projects; `nearl eval --compare
+    /// raw,projected` shows both).
+    pub project_in_training: bool,
+    /// The learner's reward is lowered by this for each unit of weighted distance that the projection moved the target
+    /// [1 / (weight rad/s)], summed over the ticks of a policy step. Returns and metrics stay the environment's own. No
+    /// effect where nothing is projected: `ppo`, or `project_in_training = false`.
+    pub moved_penalty: f64,
     /// Sizes of the networks.
     pub nets: NetSettings,
     /// Settings of the clipped surrogate, for every algorithm.
@@ -70,7 +76,8 @@ impl Default for TrainSettings {
             anneal: true,
             change_scale: ChangeScale::default(),
             exploration: Exploration::default(),
-            project: true,
+            project_in_training: true,
+            moved_penalty: 0.0,
             nets: NetSettings::default(),
             ppo: PpoSettings::default(),
             nearl: NearlSettings::default(),
@@ -95,6 +102,12 @@ impl TrainSettings {
             if !(0.0..=1.0).contains(&v) {
                 return Err(format!("[train.{key}]: {v} is outside [0, 1]"));
             }
+        }
+        if !(settings.moved_penalty.is_finite() && settings.moved_penalty >= 0.0) {
+            return Err(format!(
+                "[train.moved_penalty]: {} would reward being moved; give 0 or a positive number",
+                settings.moved_penalty
+            ));
         }
         settings.nets.check()?;
         Ok(settings)

@@ -1,7 +1,7 @@
 //! `nearl train`: collect, estimate advantages, update, write. The loop of every algorithm.
 
 use crate::learn::{Batch, Dims, Kind, Learner, Metrics, Nearl, Pid2, Ppo, advantages};
-use crate::rollout::{Collector, RolloutError, Tally, stream};
+use crate::rollout::{Collector, RolloutError, Segment, Tally, stream};
 use crate::run_folder::{RunError, RunFolder};
 use crate::settings::{ChangeScale, Exploration, TrainSettings};
 use crate::stats::RunningStats;
@@ -89,6 +89,8 @@ pub const COLUMNS: &[&str] = &[
     "constraints/reached_violations",
     "constraints/moved",
     "constraints/distance",
+    "constraints/avoided",
+    "constraints/active_rows",
     "idm/residual",
     "idm/threshold",
     "idm/mse_before",
@@ -169,7 +171,10 @@ impl Training {
             settings.gamma,
             request.seed,
         )?;
-        collector.workers().for_each(|w| w.set_projection(settings.project));
+        for worker in collector.workers() {
+            worker.set_projection(settings.project_in_training);
+            worker.set_moved_penalty(settings.moved_penalty);
+        }
         Ok(Self {
             obs_stats: RunningStats::new(dims.n_obs),
             change_stats: RunningStats::new(dims.n_state),
@@ -235,6 +240,11 @@ impl Training {
     /// What a controller runs on now.
     pub fn snapshot(&self) -> &Snapshot {
         &self.snapshot
+    }
+
+    /// What each environment collected last, in a fixed order.
+    pub fn segments(&mut self) -> impl Iterator<Item = &Segment> {
+        self.collector.workers().map(|w| &w.segment)
     }
 
     /// Seconds spent in updates.
@@ -311,6 +321,8 @@ impl Training {
             "constraints/reached_violations" => per_tick(t.reached_violations),
             "constraints/moved" => per_tick(t.moved),
             "constraints/distance" => t.distance / t.ticks.max(1) as f64,
+            "constraints/avoided" => t.avoided as f64 / t.raw_violations as f64,
+            "constraints/active_rows" => per_tick(t.active_rows),
             "idm/residual" => t.residual / t.ticks.max(1) as f64,
             "idm/threshold" => match self.snapshot.manifest.algo.as_str() {
                 "nearl" => self.settings.nearl.idm_threshold,
