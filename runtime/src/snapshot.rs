@@ -284,7 +284,8 @@ impl Snapshot {
     }
 }
 
-fn digest<'a>(manifest: &str, tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [u8])>) -> String {
+/// blake3 in hex over a text and tensors (name, shape, bytes), whatever their order.
+pub fn digest<'a>(manifest: &str, tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [u8])>) -> String {
     let mut hash = blake3::Hasher::new();
     hash.update(manifest.as_bytes());
     let mut sorted: Vec<_> = tensors.collect();

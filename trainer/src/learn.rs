@@ -30,7 +30,7 @@ pub use gae::{Advantages, advantages};
 pub use nearl::{Nearl, NearlSettings};
 pub use net::{Net, Tape};
 pub use nets::NetSettings;
-pub use optimise::Schedule;
+pub use optimise::{Params, Schedule};
 pub use pid2::{Pid2, Pid2Settings};
 pub use ppo::{Ppo, PpoSettings};
 
@@ -60,6 +60,10 @@ pub type Metrics = Vec<(&'static str, f64)>;
 pub trait Learner: Send {
     /// The current networks for a controller.
     fn networks(&self, normaliser: &Normaliser) -> Networks;
+    /// Everything an update changes.
+    fn params(&self) -> &Params;
+    /// Takes `f` to everything an update changes, then refreshes what follows from it.
+    fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String>;
     /// Value of each row of `x` (n x n_obs).
     fn values(&mut self, x: &[f32]) -> Vec<f32>;
     /// Learns from a batch; `rate` scales every learning rate, `rng` orders the minibatches and draws latent noise.

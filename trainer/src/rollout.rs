@@ -3,6 +3,7 @@
 //! Every environment has its own random stream and nothing is shared while they run, so a seed gives the
 //! same bits whatever the number of threads.
 
+mod resume;
 mod segment;
 mod worker;
 

@@ -125,6 +125,16 @@ impl Learner for Nearl {
         self.nets.combined.networks(self.actor(), normaliser)
     }
 
+    fn params(&self) -> &Params {
+        &self.params
+    }
+
+    fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
+        f(&mut self.params)?;
+        self.nets.refresh(ACTOR, &mut self.params);
+        Ok(())
+    }
+
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
         self.nets.combined.values(self.actor(), x)
     }

@@ -126,6 +126,17 @@ impl Learner for Ppo {
         }
     }
 
+    fn params(&self) -> &Params {
+        &self.params
+    }
+
+    fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
+        f(&mut self.params)?;
+        self.nets.refresh(ACTOR, &mut self.params);
+        self.nets.refresh(INVERSE, &mut self.params);
+        Ok(())
+    }
+
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
         values(&self.nets.value, &self.params.groups[ACTOR].p, x, self.nets.dims.n_obs)
     }

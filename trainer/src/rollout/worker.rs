@@ -1,5 +1,6 @@
 //! One environment behind its own controller.
 
+use super::resume::Episode;
 use super::{RolloutError, Segment, Tally};
 use crate::env::{Env, EnvError, Fault};
 use crate::stats::RunningStats;
@@ -10,12 +11,12 @@ use rand_distr::{Distribution, StandardNormal};
 
 /// One environment with its controller and its random stream.
 pub struct Worker {
-    env: Box<dyn Env>,
-    controller: Controller,
+    pub(super) env: Box<dyn Env>,
+    pub(super) controller: Controller,
     kind: PolicyKind,
     learned: bool,
-    rng: ChaCha8Rng,
-    state: State,
+    pub(super) rng: ChaCha8Rng,
+    pub(super) state: State,
     before: Vec<f64>,
     noise: Noise,
     out: Output,
@@ -24,9 +25,10 @@ pub struct Worker {
     moved_penalty: f64,
     /// Distance the projection moved the targets of this policy step.
     moved: f64,
-    discounted: f64,
-    episode: (f64, usize),
-    ticks: usize,
+    pub(super) discounted: f64,
+    pub(super) episode: (f64, usize),
+    pub(super) ticks: usize,
+    pub(super) history: Episode,
     /// The collected rows.
     pub segment: Segment,
     /// What was counted.
@@ -72,6 +74,7 @@ impl Worker {
             discounted: 0.0,
             episode: (0.0, 0),
             ticks: 0,
+            history: Episode::default(),
             segment: Segment::default(),
             tally: Tally::default(),
         };
@@ -98,13 +101,14 @@ impl Worker {
 
     fn restart(&mut self) -> Result<(), EnvError> {
         self.env.reset(&mut self.rng)?;
+        self.history.begin(&*self.env);
         self.controller.reset();
         (self.episode, self.ticks, self.discounted) = ((0.0, 0), 0, 0.0);
         self.observe();
         Ok(())
     }
 
-    fn observe(&mut self) {
+    pub(super) fn observe(&mut self) {
         self.env.observe(&mut self.state.obs);
         self.env.state(&mut self.state.q, &mut self.state.v);
     }
@@ -191,6 +195,7 @@ impl Worker {
 
     fn tick(&mut self) -> (f64, bool) {
         self.controller.update(&self.state, &self.noise, &mut self.out);
+        self.history.push(&self.out.action);
         let step = self.env.step(&self.out.action);
         self.ticks += 1;
         self.observe();
