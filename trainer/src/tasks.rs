@@ -1,5 +1,6 @@
 //! Bundled tasks and robots, and how a task name or file becomes a manifest.
 
+use nearl_runtime::net::Activation;
 use nearl_runtime::snapshot::{FORMAT, ModelFormat};
 use nearl_runtime::task::{Task, TaskError};
 use nearl_runtime::{Manifest, PolicyKind};
@@ -95,6 +96,7 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
         model,
         algo: String::new(),
         policy: PolicyKind::Deterministic,
+        activation: Activation::default(),
         version: 0,
         steps: 0,
         action_lower: Vec::new(),
