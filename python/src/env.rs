@@ -134,7 +134,7 @@ impl Env {
     /// Name of the task.
     #[getter]
     fn task(&self) -> &str {
-        self.spec.name
+        &self.spec.name
     }
 
     /// Names of the observation's entries (n_obs).
@@ -193,8 +193,8 @@ impl Env {
 
     /// The robot file's text.
     #[getter]
-    fn model_text(&self, py: Python<'_>) -> &'static str {
-        self.with(py, |inner| inner.env.model_text())
+    fn model_text(&self, py: Python<'_>) -> String {
+        self.with(py, |inner| inner.env.model_text().to_owned())
     }
 
     fn __repr__(&self) -> String {

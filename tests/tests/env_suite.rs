@@ -99,7 +99,7 @@ fn state_and_goal_repeat_an_episode() {
             (0..20).map(|_| env.step(&random_action(env, &mut rng)).reward.to_bits()).collect::<Vec<_>>()
         };
         let first = run(env.as_mut());
-        let mut other = env::make(env.spec().name).expect("a task");
+        let mut other = env::make(&env.spec().name).expect("a task");
         if !goal.is_empty() {
             other.set_goal(&goal).expect("a goal");
         }

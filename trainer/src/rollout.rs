@@ -71,6 +71,8 @@ pub struct Segment {
 pub struct Tally {
     /// Return and length in policy steps of each finished episode.
     pub episodes: Vec<(f64, usize)>,
+    /// Cost of each finished episode.
+    pub costs: Vec<f64>,
     /// Control ticks.
     pub ticks: u64,
     /// Ticks whose raw proposal broke a constraint.
@@ -94,6 +96,7 @@ pub struct Tally {
 impl Tally {
     fn add(&mut self, other: &Self) {
         self.episodes.extend_from_slice(&other.episodes);
+        self.costs.extend_from_slice(&other.costs);
         self.ticks += other.ticks;
         self.raw_violations += other.raw_violations;
         self.recovering += other.recovering;
@@ -120,6 +123,7 @@ pub struct Worker {
     gamma: f64,
     discounted: f64,
     episode: (f64, usize),
+    cost: f64,
     ticks: usize,
     /// The collected rows.
     pub segment: Segment,
@@ -146,7 +150,7 @@ pub struct Collector {
 /// [`RolloutError`].
 pub fn make_env(snapshot: &Snapshot) -> Result<Box<dyn Env>, RolloutError> {
     let task = &snapshot.manifest.task;
-    let env = crate::env::make(&task.name)?;
+    let env = crate::env::of_task(task, &snapshot.manifest.model, &task.name)?;
     if env.spec().obs != task.state.observation {
         return Err(RolloutError::Observation {
             task: task.name.clone(),
@@ -253,6 +257,7 @@ impl Worker {
             gamma,
             discounted: 0.0,
             episode: (0.0, 0),
+            cost: 0.0,
             ticks: 0,
             segment: Segment::default(),
             tally: Tally::default(),
@@ -269,7 +274,7 @@ impl Worker {
     fn restart(&mut self) -> Result<(), EnvError> {
         self.env.reset(&mut self.rng)?;
         self.controller.reset();
-        (self.episode, self.ticks, self.discounted) = ((0.0, 0), 0, 0.0);
+        (self.episode, self.cost, self.ticks, self.discounted) = ((0.0, 0), 0.0, 0, 0.0);
         self.observe();
         Ok(())
     }
@@ -309,6 +314,7 @@ impl Worker {
             self.store(reward, terminated, truncated && !terminated, t, t + 1 == n_steps);
             if terminated || truncated {
                 self.tally.episodes.push(self.episode);
+                self.tally.costs.push(self.cost);
                 // the same draws for a reset whatever happened before: an error here is a broken installation
                 self.restart().unwrap_or_else(|e| panic!("{e}"));
             }
@@ -323,6 +329,7 @@ impl Worker {
             let (_, terminated) = self.policy_step();
             if terminated || self.ticks >= self.env.spec().max_episode_steps {
                 let episode = self.episode;
+                self.tally.costs.push(self.cost);
                 self.restart().unwrap_or_else(|e| panic!("{e}"));
                 return episode;
             }
@@ -365,6 +372,7 @@ impl Worker {
         self.controller.update(&self.state, &self.noise, &mut self.out);
         let step = self.env.step(&self.out.action);
         self.ticks += 1;
+        self.cost += step.cost;
         self.observe();
         let ledger = &self.out.next.ledger;
         self.tally.ticks += 1;

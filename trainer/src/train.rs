@@ -65,6 +65,8 @@ pub struct Progress {
     pub return_mean: f64,
     /// Mean length of the last 100 episodes in policy steps.
     pub length_mean: f64,
+    /// Mean cost of the last 100 episodes.
+    pub cost_mean: f64,
     /// Counts of the iteration.
     pub tally: Tally,
     /// Numbers of the update.
@@ -78,6 +80,7 @@ pub const COLUMNS: &[&str] = &[
     "time/fps",
     "rollout/ep_rew_mean",
     "rollout/ep_len_mean",
+    "rollout/ep_cost_mean",
     "constraints/raw_violations",
     "constraints/target_violations",
     "constraints/recovering",
@@ -116,6 +119,7 @@ pub struct Training {
     rng: rand_chacha::ChaCha8Rng,
     total: u64,
     recent: Vec<(f64, usize)>,
+    recent_costs: Vec<f64>,
     begin: Instant,
     learning_seconds: f64,
 }
@@ -187,6 +191,7 @@ impl Training {
             rng,
             total: request.steps,
             recent: Vec::new(),
+            recent_costs: Vec::new(),
             begin: Instant::now(),
             learning_seconds: 0.0,
         })
@@ -200,6 +205,8 @@ impl Training {
         self.recent.extend_from_slice(&tally.episodes);
         let excess = self.recent.len().saturating_sub(100);
         self.recent.drain(..excess);
+        self.recent_costs.extend_from_slice(&tally.costs);
+        self.recent_costs.drain(..excess);
         let rate = if self.settings.anneal { 1.0 - self.fraction() as f32 } else { 1.0 };
         let learns = self.snapshot.manifest.steps > 0;
         self.merge_statistics();
@@ -222,6 +229,7 @@ impl Training {
             seconds: self.begin.elapsed().as_secs_f64(),
             return_mean: mean(|e| e.0),
             length_mean: mean(|e| e.1 as f64),
+            cost_mean: self.recent_costs.iter().sum::<f64>() / self.recent_costs.len() as f64,
             tally,
             metrics,
         }
@@ -309,6 +317,7 @@ impl Training {
             "time/fps" => p.steps as f64 / p.seconds,
             "rollout/ep_rew_mean" => p.return_mean,
             "rollout/ep_len_mean" => p.length_mean,
+            "rollout/ep_cost_mean" => p.cost_mean,
             "constraints/raw_violations" => per_tick(t.raw_violations),
             "constraints/target_violations" => per_tick(t.projected_violations),
             "constraints/recovering" => per_tick(t.recovering),
@@ -343,7 +352,8 @@ fn policy_kind(algo: &str, settings: &TrainSettings, idm: IdmKind) -> Result<Pol
 /// # Errors
 /// [`TrainError::Rollout`] when there is no such environment.
 pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
-    let env = crate::env::make(&manifest.task.name).map_err(RolloutError::from)?;
+    let env = crate::env::of_task(&manifest.task, &manifest.model, &manifest.task.name)
+        .map_err(RolloutError::from)?;
     let spec = env.spec();
     if manifest.task.state.observation.is_empty() {
         manifest.task.state.observation.clone_from(&spec.obs);

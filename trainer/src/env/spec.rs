@@ -6,7 +6,7 @@ use crate::mj::{Actuator, Joint, Model};
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spec {
     /// Name of the task.
-    pub name: &'static str,
+    pub name: String,
     /// Names of the observation's entries: `q.<joint>` and `v.<joint>` are a joint's position and velocity.
     pub obs: Vec<String>,
     /// Joints in MuJoCo's order.
@@ -68,9 +68,9 @@ impl Spec {
 }
 
 /// The part of a [`Spec`] that is not in the robot file.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct Constants {
-    pub(super) name: &'static str,
+    pub(super) name: String,
     pub(super) sub_steps: usize,
     pub(super) max_episode_steps: usize,
 }
