@@ -25,12 +25,14 @@ from nearl._core import (
     __version__,
     tasks,
 )
+from nearl.pid2 import PID2
 
 __all__ = [
     "AccelerationLimit",
     "Controller",
     "Ledger",
     "Model",
+    "PID2",
     "PositionLimit",
     "Projector",
     "Target",

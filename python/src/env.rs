@@ -3,6 +3,7 @@
 use std::sync::Mutex;
 
 use nearl_trainer::env::{self, ChaCha8Rng, Fault, SeedableRng};
+use nearl_trainer::tasks as task_files;
 use numpy::PyArray1;
 use pyo3::prelude::*;
 
@@ -22,7 +23,7 @@ pub(crate) fn fault_name(fault: Fault) -> Option<&'static str> {
 /// Names of the tasks that [`Env`] can make, with a line about each.
 #[pyfunction]
 pub(crate) fn tasks() -> Vec<(&'static str, &'static str)> {
-    env::REGISTRY.iter().map(|entry| (entry.name, entry.about)).collect()
+    task_files::names().into_iter().map(|name| (name, task_files::about(name))).collect()
 }
 
 struct Inner {
@@ -45,13 +46,13 @@ pub(crate) struct Env {
     spec: env::Spec,
 }
 
-type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, bool, Option<&'static str>);
+type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, f64, bool, Option<&'static str>);
 
 #[pymethods]
 impl Env {
     #[new]
     fn new(py: Python<'_>, task: &str) -> PyResult<Env> {
-        let env = py.detach(|| env::make(task)).map_err(errors::value)?;
+        let env = py.detach(|| task_files::env(task)).map_err(errors::task)?;
         let spec = env.spec().clone();
         Ok(Env { inner: Mutex::new(Inner { env, rng: ChaCha8Rng::seed_from_u64(0) }), spec })
     }
@@ -80,7 +81,7 @@ impl Env {
         Ok(array(py, &obs.map_err(errors::value)?))
     }
 
-    /// Simulates one control period. Returns observation, reward, terminated, and the fault's name if the physics failed.
+    /// Simulates one control period. Returns observation, reward, cost, terminated, and the fault's name if the physics failed.
     fn step<'py>(&self, py: Python<'py>, action: &Bound<'py, PyAny>) -> PyResult<Stepped<'py>> {
         let action = vector("action", action, self.spec.n_act())?;
         if let Some(i) = action.iter().position(|a| !a.is_finite()) {
@@ -91,7 +92,7 @@ impl Env {
             )));
         }
         let (step, obs) = self.with(py, |inner| (inner.env.step(&action), inner.observation()));
-        Ok((array(py, &obs), step.reward, step.terminated, fault_name(step.fault)))
+        Ok((array(py, &obs), step.reward, step.cost, step.terminated, fault_name(step.fault)))
     }
 
     /// The observation (n_obs).
@@ -183,6 +184,12 @@ impl Env {
     #[getter]
     fn dt(&self) -> f64 {
         self.spec.dt
+    }
+
+    /// Whether the task counts a cost beside its reward.
+    #[getter]
+    fn has_cost(&self) -> bool {
+        self.spec.has_cost
     }
 
     /// Control periods after which an episode is truncated by those who count.

@@ -235,6 +235,11 @@ impl Training {
         }
     }
 
+    /// Asks for `steps` more than were asked for, or were done, so far.
+    pub fn extend(&mut self, steps: u64) {
+        self.total = self.total.max(self.snapshot.manifest.steps) + steps;
+    }
+
     /// Whether the requested steps are done.
     pub fn is_done(&self) -> bool {
         self.snapshot.manifest.steps >= self.total

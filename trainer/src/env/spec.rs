@@ -27,6 +27,8 @@ pub struct Spec {
     pub semi_implicit_euler: bool,
     /// Control periods after which the caller truncates an episode.
     pub max_episode_steps: usize,
+    /// Whether [`Step::cost`](super::Step::cost) means anything.
+    pub has_cost: bool,
 }
 
 impl Spec {
@@ -63,6 +65,7 @@ impl Spec {
             sub_steps: task.sub_steps,
             semi_implicit_euler: model.is_euler(),
             max_episode_steps: task.max_episode_steps,
+            has_cost: false,
         }
     }
 }

@@ -18,7 +18,7 @@ pub(super) struct Costed {
 impl Costed {
     pub(super) fn new(inner: Box<dyn Env>, name: String, cost: Vec<Expression<Quantity>>) -> Costed {
         let before = Before::new(inner.sim().model());
-        Costed { spec: Spec { name, ..inner.spec().clone() }, before, inner, cost }
+        Costed { spec: Spec { name, has_cost: true, ..inner.spec().clone() }, before, inner, cost }
     }
 }
 

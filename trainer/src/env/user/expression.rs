@@ -86,7 +86,10 @@ fn number(holds: bool) -> f64 {
     f64::from(u8::from(holds))
 }
 
-const COMPARISONS: &[(&str, fn(f64, f64) -> f64)] = &[
+/// Signs of the same precedence.
+type Operators = &'static [(&'static str, fn(f64, f64) -> f64)];
+
+const COMPARISONS: Operators = &[
     ("<", |a, b| number(a < b)),
     ("<=", |a, b| number(a <= b)),
     (">", |a, b| number(a > b)),
@@ -94,8 +97,8 @@ const COMPARISONS: &[(&str, fn(f64, f64) -> f64)] = &[
     ("==", |a, b| number(a == b)),
     ("!=", |a, b| number(a != b)),
 ];
-const SUMS: &[(&str, fn(f64, f64) -> f64)] = &[("+", |a, b| a + b), ("-", |a, b| a - b)];
-const PRODUCTS: &[(&str, fn(f64, f64) -> f64)] = &[("*", |a, b| a * b), ("/", |a, b| a / b)];
+const SUMS: Operators = &[("+", |a, b| a + b), ("-", |a, b| a - b)];
+const PRODUCTS: Operators = &[("*", |a, b| a * b), ("/", |a, b| a / b)];
 
 enum Function {
     One(fn(f64) -> f64),
