@@ -1,8 +1,11 @@
 //! One native environment.
 
+use std::path::PathBuf;
 use std::sync::Mutex;
 
+use nearl_runtime::Snapshot;
 use nearl_trainer::env::{self, ChaCha8Rng, Fault, SeedableRng};
+use nearl_trainer::run_folder;
 use nearl_trainer::tasks as task_files;
 use numpy::PyArray1;
 use pyo3::prelude::*;
@@ -53,8 +56,19 @@ impl Env {
     #[new]
     fn new(py: Python<'_>, task: &str) -> PyResult<Env> {
         let env = py.detach(|| task_files::env(task)).map_err(errors::task)?;
-        let spec = env.spec().clone();
-        Ok(Env { inner: Mutex::new(Inner { env, rng: ChaCha8Rng::seed_from_u64(0) }), spec })
+        Ok(Env::around(env))
+    }
+
+    /// The environment that a snapshot, or the run in a folder, was trained in.
+    #[staticmethod]
+    fn of_snapshot(py: Python<'_>, path: PathBuf) -> PyResult<Env> {
+        let env = py.detach(|| {
+            let file =
+                if path.is_dir() { run_folder::snapshot_of(&path).map_err(errors::value)? } else { path };
+            let manifest = Snapshot::load(&file).map_err(errors::snapshot)?.manifest;
+            env::of_task(&manifest.task, &manifest.model, &manifest.task.name).map_err(errors::value)
+        })?;
+        Ok(Env::around(env))
     }
 
     /// Starts an episode from the task's own distribution; `seed` restarts the random stream. Returns the observation.
@@ -215,6 +229,11 @@ impl Env {
 }
 
 impl Env {
+    fn around(env: Box<dyn env::Env>) -> Env {
+        let spec = env.spec().clone();
+        Env { inner: Mutex::new(Inner { env, rng: ChaCha8Rng::seed_from_u64(0) }), spec }
+    }
+
     /// Runs `f` on the environment with the interpreter released.
     fn with<R: Send>(&self, py: Python<'_>, f: impl FnOnce(&mut Inner) -> R + Send) -> R {
         py.detach(|| f(&mut self.inner.lock().unwrap_or_else(std::sync::PoisonError::into_inner)))
