@@ -10,6 +10,7 @@
 import os
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
@@ -137,6 +138,7 @@ class PID2:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the snapshot: networks, normaliser, constraints, robot; ``nearl eval``, ``nearl run`` and :meth:`load` read it."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
         self._controller.save(path)
 
     @classmethod

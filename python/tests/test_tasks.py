@@ -133,3 +133,38 @@ def test_functions_of_the_wrong_shape_are_named() -> None:
     vec.reset(seed=0)
     with pytest.raises(ValueError, match=r"\[1\] is nan"):
         vec.step(np.zeros((3, 1)))
+
+
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Swimmer-v5", "Reacher-v5", "Pusher-v5", "Humanoid-v5"])
+def test_gymnasiums_mujoco_environments_become_task_files(env_id: str, tmp_path: Path) -> None:
+    file = nearl.from_gymnasium(env_id, tmp_path)
+    theirs, ours = gymnasium.make(env_id).unwrapped, nearl.Env(str(file))
+    assert ours.action_space == theirs.action_space and ours.dt == pytest.approx(theirs.dt, abs=1e-12)
+    assert ours.native.max_episode_steps == gymnasium.spec(env_id).max_episode_steps
+    theirs.action_space.seed(0)
+    theirs.reset(seed=0)
+    ours.set_state(theirs.data.qpos, theirs.data.qvel)
+    # Gymnasium's own reset has run a step's worth of derived quantities; from a set state both begin alike.
+    theirs.set_state(theirs.data.qpos.copy(), theirs.data.qvel.copy())
+    for _ in range(50):
+        action = theirs.action_space.sample().astype(np.float64)
+        theirs.step(action)
+        obs = ours.step(action)[0]
+        assert np.array_equal(ours.qpos, theirs.data.qpos) and np.array_equal(ours.qvel, theirs.data.qvel)
+    assert np.array_equal(obs, np.r_[ours.qpos, ours.qvel])
+    with pytest.raises(FileExistsError, match="is there already"):
+        nearl.from_gymnasium(env_id, tmp_path)
+
+
+def test_an_environment_without_mujoco_has_no_robot(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="'CartPole-v1' is not built on Gymnasium's MujocoEnv"):
+        nearl.from_gymnasium("CartPole-v1", tmp_path)
+
+
+def test_a_task_from_gymnasium_learns_once_its_reward_is_written(tmp_path: Path) -> None:
+    file = nearl.from_gymnasium("InvertedPendulum-v5", tmp_path)
+    text = file.read_text().replace("nothing_yet = 0.0", "alive = 1.0").replace("[termination]\n", '[termination]\nfell = "abs(q.hinge) > 0.2"\n')
+    file.write_text(text.replace("[reset]\n", '[reset]\nposition = "0.01 * uniform"\nvelocity = "0.01 * uniform"\n'))
+    seen: list[float] = []
+    nearl.PID2(file, settings={"train.n_envs": 8}).learn(40_000, callback=lambda _, m: seen.append(m.get("rollout/ep_rew_mean", 0.0)))
+    assert seen[1] < 100 < 200 < seen[-1], "Gymnasium's reward: 1 while it stands"
