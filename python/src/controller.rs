@@ -227,7 +227,7 @@ impl Controller {
         let controller = runtime::Controller::new(snapshot).map_err(errors::snapshot)?;
         let (model, layout) = (controller.model(), controller.layout());
         let sizes = (model.nq(), model.nv(), layout.n_obs());
-        let names = (0..model.nv()).map(|i| model.dof_name(i)).collect();
+        let names = controller.row_names();
         let (state, noise, out) = (controller.state(), controller.noise(), controller.output());
         let manifest = &snapshot.manifest;
         let stochastic = manifest.policy == PolicyKind::Stochastic;
