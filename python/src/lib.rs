@@ -13,6 +13,7 @@ mod model;
 mod pool;
 mod projector;
 mod target;
+mod training;
 mod vec_env;
 
 use pyo3::prelude::*;
@@ -34,6 +35,8 @@ mod _core {
     use super::projector::Projector;
     #[pymodule_export]
     use super::target::{Ledger, Target, Targets};
+    #[pymodule_export]
+    use super::training::Training;
     #[pymodule_export]
     use super::vec_env::VecEnv;
 
