@@ -40,6 +40,10 @@ enum Command {
     Plant(plant::PlantCommand),
     /// Run a snapshot on a plant in real time.
     Run(nearl_runtime::cli::RunCommand),
+    /// Compute every tick of a flight log again and compare it bit for bit.
+    Replay(nearl_runtime::cli::ReplayCommand),
+    /// Say what a code in a report, a log or a refusal means, and what to do.
+    Explain(nearl_runtime::cli::ExplainCommand),
     /// Check that a snapshot, this machine and a plant are ready.
     Doctor(nearl_runtime::doctor::DoctorCommand),
     /// List the bundled tasks.
@@ -61,6 +65,8 @@ impl Cli {
             Command::Bench(c) => c.run(),
             Command::Plant(c) => c.run(),
             Command::Run(c) => c.run(),
+            Command::Replay(c) => c.run(),
+            Command::Explain(c) => c.run(),
             Command::Doctor(c) => c.run(),
             Command::Tasks(c) => c.run(),
         }
