@@ -52,6 +52,8 @@ pub mod checker;
 pub mod convention;
 mod dynamics;
 mod error;
+pub mod geometry;
+mod kinematics;
 mod layout;
 pub mod ledger;
 pub mod limit;
@@ -59,6 +61,7 @@ mod mjcf;
 mod model;
 mod pinocchio;
 mod projector;
+mod row;
 mod target;
 mod urdf;
 pub mod viability;
@@ -66,13 +69,15 @@ pub mod viability;
 pub use certify::{Certificate, certify_braking};
 pub use dynamics::Dynamics;
 pub use error::{LimitError, ModelError};
+pub use kinematics::{FrameMotion, Kinematics, PointMotion};
 pub use layout::{Entry, LayoutError, StateLayout};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};
 pub use limit::{
     AccelerationLimit, ConstraintSettings, Limit, LimitSet, PerJoint, PositionLimit, TorqueLimit,
     VelocityLimit, build_limits,
 };
-pub use model::{Joint, Model};
+pub use model::{FrameId, Joint, Model};
 pub use projector::{Problem, Projector};
+pub use row::{Cone, Motion, Needs, Previous, Rows, RowsMut, Soft, Tick};
 pub use target::{Bounds, Consistency, Proposal, Settings, Solver, Target};
 pub use viability::{Kind, Period};

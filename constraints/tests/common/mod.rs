@@ -29,6 +29,12 @@ pub fn robot(file: &str) -> Model {
     }
 }
 
+/// The robot with a floating base.
+pub fn free(file: &str) -> Model {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/robots").join(file);
+    Model::from_urdf_free_flyer(&path).unwrap()
+}
+
 pub fn panda() -> Model {
     robot("panda/panda.urdf")
 }
