@@ -110,13 +110,17 @@ impl Kinematics {
     pub fn point_jacobian(&mut self, frame: FrameId, local: [f64; 3], jacobian: &mut [f64]) {
         let nv = self.model.nv();
         assert_eq!(jacobian.len(), 3 * nv, "point Jacobian: 3 * nv numbers");
-        jacobian.fill(0.0);
-        let point = self.frame(frame).place(local);
-        for (axis, row) in jacobian.chunks_exact_mut(nv).enumerate() {
-            let mut n = [0.0; 3];
-            n[axis] = 1.0;
-            self.add_row(frame, point, n, 1.0, row);
+        let at = self.frame(frame);
+        let [x, y, z] = minus(at.place(local), at.position);
+        let mut j = std::mem::take(&mut self.jacobian);
+        self.jacobian(frame, &mut j);
+        for i in 0..nv {
+            let of = |k: usize| j[k * nv + i];
+            jacobian[i] = of(0) + of(4) * z - of(5) * y;
+            jacobian[nv + i] = of(1) + of(5) * x - of(3) * z;
+            jacobian[2 * nv + i] = of(2) + of(3) * y - of(4) * x;
         }
+        self.jacobian = j;
     }
 
     /// Adds `scale n' J_p` to `row` (nv), with `J_p` the Jacobian of the point of `frame` that is at `point` [m] in the

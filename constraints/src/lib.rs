@@ -61,7 +61,7 @@ mod mjcf;
 mod model;
 mod pinocchio;
 mod projector;
-mod row;
+pub mod row;
 mod target;
 mod urdf;
 pub mod viability;
@@ -73,11 +73,12 @@ pub use kinematics::{FrameMotion, Kinematics, PointMotion};
 pub use layout::{Entry, LayoutError, StateLayout};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};
 pub use limit::{
-    AccelerationLimit, ConstraintSettings, Limit, LimitSet, PerJoint, PositionLimit, TorqueLimit,
-    VelocityLimit, build_limits,
+    AccelerationLimit, CollisionLimit, ConstraintSettings, EnergyLimit, FrameLimit, FrameSpeedLimit,
+    JerkLimit, Limit, LimitSet, LockedJoints, PerJoint, PositionLimit, TorqueLimit, TorqueRateLimit,
+    TorqueSpeedLimit, UserRow, VelocityLimit, VelocityProfileLimit, build_limits,
 };
 pub use model::{FrameId, Joint, Model};
 pub use projector::{Problem, Projector};
-pub use row::{Cone, Motion, Needs, Previous, Rows, RowsMut, Soft, Tick};
-pub use target::{Bounds, Consistency, Proposal, Settings, Solver, Target};
+pub use row::{Cone, Rows, Soft};
+pub use target::{Bounds, Braking, Consistency, Proposal, Settings, Solver, Target};
 pub use viability::{Kind, Period};

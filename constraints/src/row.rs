@@ -92,7 +92,7 @@ pub trait Rows: Send {
     /// What an active row is reported as.
     fn kind(&self) -> Kind;
 
-    /// One name a row, as people read it: `"torque of panda_joint4"`.
+    /// What each row is of: a joint, a frame, a pair of bodies.
     fn names(&self) -> Vec<String>;
 
     /// The size of each row's limit, in the unit of the row: what tolerances and scaling are shares of; above 0.
@@ -100,6 +100,11 @@ pub trait Rows: Send {
 
     /// What `fill` and `excess` read.
     fn needs(&self) -> Needs;
+
+    /// True when `lower` and `upper` are always equal.
+    fn equality(&self) -> bool {
+        false
+    }
 
     /// Writes the rows of the tick. Must not allocate.
     fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>);
@@ -113,7 +118,7 @@ pub trait Cone: Send {
     /// What the active cone is reported as.
     fn kind(&self) -> Kind;
 
-    /// Its name, as people read it: `"speed of panda_hand"`.
+    /// What it is of: a frame, the robot.
     fn name(&self) -> String;
 
     /// Rows of `G`.
@@ -133,7 +138,7 @@ pub trait Cone: Send {
 }
 
 /// How much a soft limit resists: the projector minimises `linear s + 1/2 quadratic s^2` beside the distance, with the slack `s` as a
-/// share of the limit's size and the distance in [weight rad/s]^2.
+/// share of the limit's size, in units of the distance that the largest velocity change of one period makes.
 ///
 /// With a `linear` part the limit holds exactly until the proposal pulls harder than that.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -147,6 +152,6 @@ pub struct Soft {
 
 impl Default for Soft {
     fn default() -> Soft {
-        Soft { linear: 10.0, quadratic: 1000.0 }
+        Soft { linear: 1.0, quadratic: 100.0 }
     }
 }

@@ -27,8 +27,11 @@ pub(crate) enum Stated {
     Missing,
 }
 
+/// Movable joints by name.
+type Joints = Vec<(String, Stated)>;
+
 /// Movable joints by name, and the collision geometry.
-pub(crate) fn read(xml: &str, file: &str) -> Result<(Vec<(String, Stated)>, Vec<LinkShape>), ModelError> {
+pub(crate) fn read(xml: &str, file: &str) -> Result<(Joints, Vec<LinkShape>), ModelError> {
     let malformed = |reason: String| ModelError::Malformed { file: file.to_string(), format: "URDF", reason };
     let document = Document::parse(xml).map_err(|e| malformed(e.to_string()))?;
     let root = document.root_element();

@@ -62,7 +62,7 @@ impl Projector {
         let first = py
             .detach(|| constraints::Projector::new(robot, &limits, &controllable, settings.clone()))
             .map_err(errors::value)?;
-        let names = (0..robot.nv()).map(|i| robot.dof_name(i)).collect();
+        let names = first.row_names();
         let sizes = (robot.nq(), robot.nv());
         Ok(Projector {
             names,

@@ -260,6 +260,9 @@ impl Controller {
         }
         self.interpolate();
         self.projector.project(&self.held.q, &self.held.v, &self.proposal, &mut out.next);
+        if self.projector.needs_previous() {
+            self.projector.remember(&out.next);
+        }
         if !self.projection {
             self.pass_raw(&mut out.next);
         }
@@ -360,6 +363,7 @@ impl Controller {
     /// Starts a new episode: the next tick is a policy tick.
     pub fn reset(&mut self) {
         self.tick = 0;
+        self.projector.set_previous(None);
     }
 
     /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.

@@ -8,17 +8,21 @@ mod conic;
 mod coupled;
 mod ladder;
 mod modes;
+mod sources;
+mod switch;
 
 pub use coupled::Problem;
 
 use crate::checker::Checker;
 use crate::ledger::{BrakeReason, RefuseReason, Rung, Status};
+use crate::row::Previous;
 use crate::target::{Bounds, Consistency, Proposal, Settings, Target};
 use crate::viability::{Dof, Interval, Kind, Period, interval};
 use crate::{Dynamics, LimitSet, Model};
 use active_set::ActiveSet;
 use conic::Conic;
 use coupled::Coupled;
+use sources::{Label, Sources};
 use std::time::Instant;
 
 /// Projects proposals for one robot at one control period.
@@ -27,15 +31,18 @@ use std::time::Instant;
 ///
 /// ```text
 ///     min_y 1/2 |W (q (+) (T v + kappa T y) (-) q_hat) / (kappa T)|^2 + 1/2 |W (v + y - v_hat)|^2
-///     s.t.  viability box of each dof,   |(M/T) y + nle - passive| <= effort
+///     s.t.  viability box of each dof,   lower <= G y <= upper,   |G_c y + c| <= radius
 /// ```
 ///
+/// with rows and cones from the limits (see [`row`](crate::row)), soft ones with a slack of their own,
+///
 /// and the free mode clamps `v'` to the box and `q'` to `q (+) [T v + kappa T lb, T v + kappa T ub]` cut with the
-/// position limits. Dofs that are not controllable pass through; in torque rows they are constants at the
+/// position limits. Dofs that are not controllable pass through; in rows and cones they are constants at the
 /// velocity change they propose.
 ///
 /// Nothing allocates after [`Projector::new`] but one small buffer inside each Clarabel solve. Given the same input, the
-/// output has the same bits, whatever was projected before.
+/// output has the same bits, whatever was projected before; what limits on jerk and torque rates know of the tick before is
+/// an input too, see [`Projector::set_previous`].
 pub struct Projector {
     model: Model,
     dynamics: Dynamics,
@@ -51,6 +58,11 @@ pub struct Projector {
     intervals: Vec<Interval>,
     checker: Checker,
     coupled: Option<Stages>,
+    /// The limits one by one, to switch them on and off.
+    switches: Vec<Switch>,
+    /// Generalised forces beside the motors' (nv) [N·m or N].
+    external: Vec<f64>,
+    previous: History,
     /// `q_hat (-) q` (nv).
     displacement: Vec<f64>,
     /// Unconstrained optimum of v' (nv).
@@ -77,10 +89,37 @@ pub(crate) struct Dofs {
 
 /// The stages for coupled rows.
 struct Stages {
+    sources: Sources,
+    /// Reports of rows, then cones.
+    labels: Vec<Label>,
     problem: Coupled,
     active_set: ActiveSet,
     conic: Conic,
     y: Vec<f64>,
+    /// The last answer is the active-set stage's.
+    exact: bool,
+    /// Bounds of soft rows while they are left out (m).
+    dropped: Vec<(f64, f64)>,
+}
+
+/// One limit, and whether it holds.
+struct Switch {
+    label: String,
+    set: LimitSet,
+    enabled: bool,
+}
+
+/// The tick before, where it is known.
+struct History {
+    known: bool,
+    acceleration: Vec<f64>,
+    torque: Vec<f64>,
+}
+
+impl History {
+    fn get(&self) -> Option<Previous<'_>> {
+        self.known.then_some(Previous { acceleration: &self.acceleration, torque: &self.torque })
+    }
 }
 
 impl Projector {
@@ -108,7 +147,9 @@ impl Projector {
         if !(finite(&proposal.q) && finite(&proposal.v)) {
             return self.brake(q, v, None, target, BrakeReason::NonFiniteProposal);
         }
-        target.ledger.raw_violations = self.checker.check(q, v, &proposal.q, &proposal.v).counts;
+        let previous = self.previous.get();
+        let raw = self.checker.check(q, v, &proposal.q, &proposal.v, &self.external, previous);
+        target.ledger.raw_violations = raw.counts;
         let outcome = match self.settings.consistency {
             Consistency::Kinematic => self.kinematic(q, v, proposal, target),
             Consistency::Free => self.free(v, proposal, target),
@@ -128,11 +169,6 @@ impl Projector {
     /// without coupled rows. Allocates.
     pub fn problem(&self) -> Option<Problem> {
         self.coupled.as_ref().map(|stages| Problem::of(&stages.problem, &self.dofs.controllable))
-    }
-
-    /// The limits of the model and the task together.
-    pub fn limits(&self) -> &LimitSet {
-        &self.limits
     }
 
     /// The dofs the projector may move, ascending.
@@ -193,11 +229,11 @@ impl Projector {
         target: &mut Target,
         status: Status,
     ) -> Status {
-        let verdict = self.checker.check(q, v, &target.q, &target.v);
+        let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
         target.ledger.violations = verdict.counts;
         target.ledger.slack = verdict.worst;
         let outside = target.ledger.outside > 0;
-        if verdict.accepts() || (outside && verdict.counts.torque == 0) {
+        if verdict.accepts() || (outside && verdict.counts.torque + verdict.counts.other == 0) {
             return if outside { Status::Recovering } else { status };
         }
         self.brake(q, v, Some(proposal), target, BrakeReason::NoCertifiedAnswer)
@@ -220,7 +256,7 @@ impl Projector {
         }
         target.ledger.active.clear();
         self.write(q, v, proposal, target);
-        let verdict = self.checker.check(q, v, &target.q, &target.v);
+        let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
         target.ledger.violations = verdict.counts;
         target.ledger.slack = if verdict.worst.is_finite() { verdict.worst } else { f64::MAX };
         target.ledger.rung = Rung::Brake;

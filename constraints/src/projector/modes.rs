@@ -31,7 +31,8 @@ impl Projector {
                     let side = if value > upper { Side::Upper } else { Side::Lower };
                     let kind = if side == Side::Upper { kinds.1 } else { kinds.0 };
                     let multiplier = weight * (value - clamped).abs();
-                    target.ledger.active.push(ActiveRow { kind, dof: i, side, multiplier });
+                    let row = ActiveRow { kind, row: i, side, multiplier, slack: 0.0 };
+                    target.ledger.active.push(row);
                     moved += weight * (value - clamped).powi(2);
                     unchanged = false;
                 }
@@ -165,6 +166,7 @@ impl Projector {
         let x = &self.intervals[dof];
         let (side, kind) =
             if signed > 0.0 { (Side::Upper, x.upper_kind) } else { (Side::Lower, x.lower_kind) };
-        target.ledger.active.push(ActiveRow { kind, dof, side, multiplier: signed.abs() });
+        let multiplier = signed.abs();
+        target.ledger.active.push(ActiveRow { kind, row: dof, side, multiplier, slack: 0.0 });
     }
 }

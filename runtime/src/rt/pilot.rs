@@ -130,6 +130,8 @@ pub fn numbers(ledger: &Ledger) -> LedgerNumbers {
             Rung::ActiveSet => 1,
             Rung::Clarabel => 2,
             Rung::Brake => 3,
+            Rung::Relaxed => 4,
+            Rung::StoredBrake => 5,
         },
         active: ledger.active.len() as u32,
         iterations: ledger.iterations,
