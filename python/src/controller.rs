@@ -41,7 +41,7 @@ impl Controller {
             let controller = runtime::Controller::new(&snapshot).map_err(errors::snapshot)?;
             let model = controller.model();
             let sizes = (model.nq(), model.nv(), controller.layout().n_obs());
-            let names = (0..model.nv()).map(|i| model.dof_name(i)).collect();
+            let names = controller.row_names();
             let (state, noise, out) = (controller.state(), controller.noise(), controller.output());
             let inner = Mutex::new(Inner { controller, state, noise, out });
             let manifest = &snapshot.manifest;

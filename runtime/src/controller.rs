@@ -363,7 +363,7 @@ impl Controller {
     /// Starts a new episode: the next tick is a policy tick.
     pub fn reset(&mut self) {
         self.tick = 0;
-        self.projector.set_previous(None);
+        self.projector.forget();
     }
 
     /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.
@@ -396,6 +396,10 @@ impl Controller {
     /// Limits by degree of freedom.
     pub fn limits(&self) -> &LimitSet {
         self.projector.limits()
+    }
+    /// What the ledger's active rows are of: dofs, then coupled rows.
+    pub fn row_names(&self) -> Vec<String> {
+        self.projector.row_names()
     }
     /// Robot model.
     pub fn model(&self) -> &Model {

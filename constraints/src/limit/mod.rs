@@ -36,7 +36,7 @@ pub use torque_rate::{TorqueRateLimit, TorqueRateSettings};
 pub use torque_speed::{TorqueSpeedLimit, TorqueSpeedSettings};
 pub use user::{UserRow, UserRowSettings};
 pub use velocity::{VelocityLimit, VelocitySettings};
-pub use velocity_profile::{JointProfile, VelocityProfileLimit, VelocityProfileSettings};
+pub use velocity_profile::{JointProfile, KnownRobot, VelocityProfileLimit, VelocityProfileSettings};
 
 use crate::{Cone, LimitError, Model, Rows, Soft};
 

@@ -5,7 +5,7 @@ use super::{
     PositionSettings, TorqueRateSettings, TorqueSettings, TorqueSpeedSettings, UserRowSettings,
     VelocityProfileSettings, VelocitySettings,
 };
-use crate::{Consistency, LimitError, Model, Solver};
+use crate::{Braking, Consistency, LimitError, Model, Solver};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -17,6 +17,8 @@ pub struct ConstraintSettings {
     pub consistency: Consistency,
     /// `"ladder"` (default) or `"clarabel"`.
     pub solver: Solver,
+    /// `"certified"` (default) or `"stored"`.
+    pub braking: Braking,
     /// `position = { margin = 0.01 }`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub position: Option<PositionSettings>,
