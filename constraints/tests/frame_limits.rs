@@ -338,7 +338,7 @@ fn cones_hold_speed_and_energy() {
 }
 
 #[test]
-fn energy_and_collisions_of_floating_robots() {
+fn a_floating_robot_watches_its_nearest_pairs() {
     let m = free("anymal/anymal.urdf");
     let nv = m.nv();
     let mut rows = CollisionLimit::new(CollisionSettings {

@@ -35,7 +35,8 @@ fn distances_worked_by_hand() {
     let (o, x) = (at([0.0; 3], [0.0; 3]), |x: f64| at([x, 0.0, 0.0], [0.0; 3]));
     let lying = |p| at(p, [0.0, FRAC_PI_2, 0.0]); // own z along x
     let turned = |p| at(p, [0.0, 0.0, FRAC_PI_2 / 2.0]); // by 45 degrees about z
-    let cases: [(&str, (&Shape, Placement), (&Shape, Placement), f64); 15] = [
+    type Solid<'a> = (&'a Shape, Placement);
+    let cases: [(&str, Solid, Solid, f64); 15] = [
         ("balls", (&ball, o), (&ball, x(1.0)), 0.8),
         ("balls overlapping", (&ball, o), (&ball, x(0.15)), -0.05),
         ("upright capsules", (&capsule, o), (&capsule, x(0.3)), 0.2),
