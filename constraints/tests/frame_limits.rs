@@ -3,9 +3,10 @@
 
 mod common;
 
+use common::solids::*;
 use common::*;
 use nearl_constraints::geometry::{Shape, separation};
-use nearl_constraints::limit::{CollisionSettings, FrameSettings, SolidSettings};
+use nearl_constraints::limit::{CollisionSettings, FrameSettings};
 use nearl_constraints::row::{Motion, RowsMut, Tick};
 use nearl_constraints::*;
 
@@ -66,50 +67,7 @@ fn judge(rows: &mut dyn Rows, model: &Model, q: &[f64], v: &[f64], y: &[f64], pe
     excess
 }
 
-fn solid(frame: &str, shape: Shape, position: [f64; 3]) -> SolidSettings {
-    SolidSettings { name: None, frame: Some(frame.into()), shape, position, rpy: [0.0; 3] }
-}
-
-fn obstacle(name: &str, shape: Shape, position: [f64; 3]) -> SolidSettings {
-    SolidSettings { name: Some(name.into()), frame: None, shape, position, rpy: [0.0; 3] }
-}
-
-/// A Panda in capsules and balls, over a floor and beside a post and a box.
-fn panda_solids() -> Vec<SolidSettings> {
-    let capsule = |radius, length| Shape::Capsule { radius, length };
-    vec![
-        solid("panda_link2", capsule(0.08, 0.2), [0.0; 3]),
-        solid("panda_link3", capsule(0.07, 0.2), [0.0, 0.0, -0.12]),
-        solid("panda_link4", Shape::Sphere { radius: 0.09 }, [-0.08, 0.06, 0.0]),
-        solid("panda_link5", capsule(0.06, 0.2), [0.0, 0.0, -0.2]),
-        solid("panda_link6", Shape::Sphere { radius: 0.08 }, [0.06, 0.0, 0.0]),
-        solid("panda_hand", capsule(0.05, 0.1), [0.0, 0.0, 0.05]),
-        obstacle("floor", Shape::HalfSpace, [0.0, 0.0, -0.02]),
-        obstacle("post", Shape::Cylinder { radius: 0.05, length: 1.2 }, [0.5, 0.35, 0.5]),
-        obstacle("crate", Shape::Box { size: [0.3, 0.3, 0.3] }, [0.45, -0.4, 0.15]),
-    ]
-}
-
-fn panda_collision(rows: usize, influence: f64) -> CollisionLimit {
-    CollisionLimit::new(CollisionSettings { shapes: panda_solids(), rows, influence, ..settings(&[]) })
-}
-
-fn settings(shapes: &[SolidSettings]) -> CollisionSettings {
-    CollisionSettings {
-        shapes: shapes.to_vec(),
-        urdf: false,
-        ignore: Vec::new(),
-        adjacent: false,
-        braking: 0.8,
-        margin: 0.005,
-        influence: 0.2,
-        rows: 8,
-        soft: None,
-    }
-}
-
-/// `G y / 1` is the change of the closing acceleration that the judge sees: at the row's bound the judge says zero, a little beyond
-/// it says so, a little inside it accepts. The judge uses no Jacobian.
+/// A little beyond the row's bound the judge says so, a little inside it accepts. The judge uses no Jacobian.
 #[test]
 fn rows_and_judge_draw_the_same_line() {
     let m = panda();

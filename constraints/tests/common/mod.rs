@@ -1,6 +1,8 @@
 //! What the tests of the projector share.
 #![allow(dead_code, unreachable_pub)]
 
+pub mod solids;
+
 use nearl_constraints::*;
 use std::path::Path;
 
