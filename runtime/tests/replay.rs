@@ -213,7 +213,9 @@ fn a_snapshot_that_misses_its_targets_is_taken_back_and_the_log_replays() {
         let now = trainer.health().map_or(0, |h| h.tick);
         ticks(&mut trainer, now + 1500);
     }
-    let receipt = trainer.wait_for_receipt(toy::MISSES, PATIENCE).unwrap();
+    let Ok(receipt) = trainer.wait_for_receipt(toy::MISSES, PATIENCE) else {
+        panic!("nothing was taken back: {}", running.end());
+    };
     assert_eq!(receipt.verdict(), Verdict::RolledBack, "{}", receipt.text());
     assert_eq!(verdicts, [Verdict::Accepted, Verdict::Accepted]);
     let report = running.end();
