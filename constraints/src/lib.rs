@@ -78,6 +78,8 @@ pub use limit::{
 };
 pub use model::{Joint, Model};
 pub use projector::{Problem, Projector};
+#[doc(hidden)]
+pub use projector::{LoneStages, Numbers};
 pub use row::{Cone, Rows, Soft};
 pub use target::{Bounds, Braking, Consistency, Proposal, Settings, Solver, Target};
 pub use viability::{Kind, Period};
