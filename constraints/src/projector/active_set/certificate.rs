@@ -26,8 +26,9 @@ impl ActiveSet {
         }
         let largest = self.held.iter().fold(0.0, |m: f64, r| m.max(self.lambda[*r].abs()));
         for r in 0..p.m {
-            let excess = (self.value[r] - p.row_upper[r]).max(p.row_lower[r] - self.value[r]);
-            good &= excess - self.slack(p, r) <= FINAL;
+            let (above, below) = (self.value[r] - p.row_upper[r], p.row_lower[r] - self.value[r]);
+            let bound = if above > below { p.row_upper[r] } else { p.row_lower[r] };
+            good &= above.max(below) - self.slack(p, r) <= FINAL * (1.0 + bound.abs());
             let Some(side) = self.row_side[r] else { continue };
             let multiplier = sign(side) * self.lambda[r];
             good &= pinned(p, r) || multiplier >= -FINAL * largest;

@@ -120,7 +120,7 @@ impl ActiveSet {
             *inverse = 1.0 / h;
         }
         let most = (p.n + p.m) as u32;
-        let warm = self.warm && self.resume(p) && self.improve(p, most) && self.is_strict(p);
+        let warm = self.warm && !self.held.is_empty() && self.resume(p) && self.improve(p, most) && self.is_strict(p);
         self.warm = warm || (self.start(p) && self.improve(p, self.iterations + 10 * most + 10));
         self.warm
     }
