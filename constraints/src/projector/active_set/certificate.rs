@@ -1,6 +1,6 @@
 //! What has to hold of an answer.
 
-use super::{ActiveSet, pinned, sign};
+use super::{ActiveSet, pinned};
 use crate::projector::coupled::Coupled;
 
 /// Conditions of the final answer hold to this share.
@@ -22,17 +22,16 @@ impl ActiveSet {
             good &= self.y[k] >= p.lower[k] - size && self.y[k] <= p.upper[k] + size && self.y[k].is_finite();
             self.y[k] = self.y[k].clamp(p.lower[k], p.upper[k]);
             let scale = p.hessian[k] * (1.0 + p.goal[k].abs() + self.y[k].abs());
-            good &= self.box_side[k].is_none_or(|side| sign(side) * self.mu[k] >= -FINAL * scale);
+            good &= self.box_side[k] * self.mu[k] >= -FINAL * scale;
         }
         let largest = self.held.iter().fold(0.0, |m: f64, r| m.max(self.lambda[*r].abs()));
         for r in 0..p.m {
             let (above, below) = (self.value[r] - p.row_upper[r], p.row_lower[r] - self.value[r]);
             let bound = if above > below { p.row_upper[r] } else { p.row_lower[r] };
             good &= above.max(below) - self.slack(p, r) <= FINAL * (1.0 + bound.abs());
-            let Some(side) = self.row_side[r] else { continue };
-            let multiplier = sign(side) * self.lambda[r];
+            let multiplier = self.row_side[r] * self.lambda[r]; // 0 if not held
             good &= pinned(p, r) || multiplier >= -FINAL * largest;
-            if let Some(soft) = p.soft[r] {
+            if let Some(soft) = p.soft[r].filter(|_| self.row_side[r] != 0.0) {
                 let beyond = multiplier - soft.linear;
                 good &= if self.elastic[r] { beyond >= -FINAL * largest } else { beyond <= FINAL * largest };
             }
@@ -45,12 +44,13 @@ impl ActiveSet {
         let mut strict = self.factor.conditioning() > INDEPENDENT;
         for k in 0..p.n {
             let least = STRICT * (p.upper[k] - p.lower[k]).clamp(1e-3, 1.0);
-            strict &= match self.box_side[k] {
-                Some(side) => sign(side) * self.mu[k] * self.inverse[k] > least,
-                None => self.y[k] - p.lower[k] > least && p.upper[k] - self.y[k] > least,
+            strict &= if self.box_side[k] == 0.0 {
+                self.y[k] - p.lower[k] > least && p.upper[k] - self.y[k] > least
+            } else {
+                self.box_side[k] * self.mu[k] * self.inverse[k] > least
             };
         }
-        for r in (0..p.m).filter(|r| self.row_side[*r].is_none()) {
+        for r in (0..p.m).filter(|r| self.row_side[*r] == 0.0) {
             let value = self.value[r];
             strict &= value - p.row_lower[r] > STRICT && p.row_upper[r] - value > STRICT;
         }

@@ -8,8 +8,7 @@
 //! and multipliers move by `-r` for rows and `-s_k (g_k - (G_R' r)_k)` for bounds of sign `s_k`; one that would become
 //! negative is released first.
 
-use super::{ActiveSet, Constraint, EXACT, dot, sign};
-use crate::ledger::Side;
+use super::{ActiveSet, Constraint, EXACT, bound, dot};
 use crate::projector::coupled::Coupled;
 
 /// What a step ends with.
@@ -29,23 +28,21 @@ impl ActiveSet {
             self.products(p);
         }
         let (mut worst, mut found) = (EXACT, None);
-        let mut see = |excess: f64, constraint: Constraint| {
-            if excess > worst {
-                (worst, found) = (excess, Some(constraint));
-            }
-        };
-        for r in 0..p.m {
-            if self.row_side[r].is_none() {
-                see(self.value[r] - p.row_upper[r], Constraint::Row(r, Side::Upper));
-                see(p.row_lower[r] - self.value[r], Constraint::Row(r, Side::Lower));
+        let values = self.value.iter().zip(&p.row_lower).zip(&p.row_upper).zip(&self.row_side);
+        for (r, (((value, low), high), side)) in values.enumerate() {
+            let (above, below) = (value - high, low - value);
+            if above.max(below) > worst && *side == 0.0 {
+                worst = above.max(below);
+                found = Some(Constraint::Row(r, if above > below { 1.0 } else { -1.0 }));
             }
         }
-        for k in 0..p.n {
-            let (low, y, high) = (p.lower[k], self.y[k], p.upper[k]);
-            if self.box_side[k].is_none() && !(low <= y && y <= high) {
-                let size = (high - low).clamp(1e-3, 1e3);
-                see((y - high) / size, Constraint::Box(k, Side::Upper));
-                see((low - y) / size, Constraint::Box(k, Side::Lower));
+        // Held dofs are at their bounds.
+        for (k, ((y, low), high)) in self.y.iter().zip(&p.lower).zip(&p.upper).enumerate() {
+            let (above, below) = (y - high, low - y);
+            let excess = above.max(below);
+            if excess > 0.0 && excess / (high - low).clamp(1e-3, 1e3) > worst {
+                worst = excess / (high - low).clamp(1e-3, 1e3);
+                found = Some(Constraint::Box(k, if above > below { 1.0 } else { -1.0 }));
             }
         }
         found
@@ -70,7 +67,7 @@ impl ActiveSet {
             if step.is_infinite() {
                 return false;
             }
-            self.advance(p, step, full.is_finite());
+            self.advance(step, full.is_finite());
             own += step;
             match blocking.filter(|_| blocked < full.min(bend)) {
                 Some(event) => {
@@ -90,8 +87,7 @@ impl ActiveSet {
         match constraint {
             Constraint::Box(k, _) => self.inverse[k],
             Constraint::Row(r, _) => {
-                let g = &p.rows[r * p.n..(r + 1) * p.n];
-                g.iter().zip(&self.inverse).map(|(g, inverse)| g * g * inverse).sum()
+                p.gradient(r).iter().zip(&self.inverse).map(|(g, inverse)| g * g * inverse).sum()
             }
         }
     }
@@ -101,22 +97,22 @@ impl ActiveSet {
         let (n, count) = (p.n, self.held.len());
         let product = match violated {
             Constraint::Box(k, side) => {
-                let own = sign(side) * self.inverse[k];
+                let own = side * self.inverse[k];
                 for (forward, row) in self.forward.iter_mut().zip(&self.held) {
                     *forward = p.rows[row * n + k] * own;
                 }
                 self.rest.fill(0.0);
-                self.rest[k] = sign(side);
+                self.rest[k] = side;
                 self.inverse[k]
             }
             Constraint::Row(r, side) => {
-                let (g, sign) = (&p.rows[r * n..(r + 1) * n], sign(side));
+                let g = p.gradient(r);
                 for k in 0..n {
-                    self.rest[k] = sign * g[k];
+                    self.rest[k] = side * g[k];
                     self.scaled[k] = self.rest[k] * self.weight[k];
                 }
                 for (forward, row) in self.forward.iter_mut().zip(&self.held) {
-                    *forward = dot(&p.rows[row * n..(row + 1) * n], &self.scaled);
+                    *forward = dot(p.gradient(*row), &self.scaled);
                 }
                 dot(&self.rest, &self.scaled)
             }
@@ -125,7 +121,7 @@ impl ActiveSet {
         self.r[..count].copy_from_slice(&self.forward[..count]);
         self.factor.backward(&mut self.r);
         for (&row, &r) in self.held.iter().zip(&self.r) {
-            for (rest, g) in self.rest.iter_mut().zip(&p.rows[row * n..(row + 1) * n]) {
+            for (rest, g) in self.rest.iter_mut().zip(p.gradient(row)) {
                 *rest -= r * g;
             }
         }
@@ -135,7 +131,7 @@ impl ActiveSet {
     /// `-g'z`.
     fn slope(&self, violated: Constraint) -> f64 {
         match violated {
-            Constraint::Box(k, side) => sign(side) * self.rest[k] * self.inverse[k],
+            Constraint::Box(k, side) => side * self.rest[k] * self.inverse[k],
             Constraint::Row(..) => dot(&self.scaled, &self.rest),
         }
     }
@@ -149,8 +145,8 @@ impl ActiveSet {
             }
         };
         for (a, &row) in self.held.iter().enumerate() {
-            let Some(side) = self.row_side[row] else { continue };
-            let (multiplier, rate) = (sign(side) * self.lambda[row], sign(side) * self.r[a]);
+            let side = self.row_side[row];
+            let (multiplier, rate) = (side * self.lambda[row], side * self.r[a]);
             match p.soft[row] {
                 None if p.equality[row] => {}
                 None => see(multiplier, rate, Event::Release(a)),
@@ -164,38 +160,35 @@ impl ActiveSet {
                 }
             }
         }
-        for k in 0..p.n {
-            if let Some(side) = self.box_side[k] {
-                see(sign(side) * self.mu[k], sign(side) * self.rest[k], Event::Free(k));
-            }
+        for (k, ((side, mu), rest)) in self.box_side.iter().zip(&self.mu).zip(&self.rest).enumerate() {
+            see(side * mu, side * rest, Event::Free(k)); // at rate 0 if not held
         }
         (least, found)
     }
 
     /// Moves the multipliers, and `y` if it can move.
-    fn advance(&mut self, p: &Coupled, step: f64, moves: bool) {
+    fn advance(&mut self, step: f64, moves: bool) {
         for (&row, r) in self.held.iter().zip(&self.r) {
             self.lambda[row] -= step * r;
         }
         let along = if moves { step } else { 0.0 };
-        for k in 0..p.n {
-            let rest = self.rest[k];
-            self.y[k] -= along * rest * self.weight[k];
-            if self.box_side[k].is_some() {
-                self.mu[k] -= step * rest;
-            }
+        for ((y, rest), weight) in self.y.iter_mut().zip(&self.rest).zip(&self.weight) {
+            *y -= along * rest * weight;
+        }
+        for ((mu, rest), side) in self.mu.iter_mut().zip(&self.rest).zip(&self.box_side) {
+            *mu -= step * rest * side.abs();
         }
     }
 
     fn happen(&mut self, p: &Coupled, event: Event) -> bool {
         match event {
             Event::Free(k) => {
-                (self.box_side[k], self.mu[k], self.weight[k]) = (None, 0.0, self.inverse[k]);
+                (self.box_side[k], self.mu[k], self.weight[k]) = (0.0, 0.0, self.inverse[k]);
                 self.reweigh(p, k, self.inverse[k])
             }
             Event::Release(a) => {
                 let row = self.held.remove(a);
-                (self.row_side[row], self.lambda[row], self.elastic[row]) = (None, 0.0, false);
+                (self.row_side[row], self.lambda[row], self.elastic[row]) = (0.0, 0.0, false);
                 self.factor.remove(a);
                 true
             }
@@ -219,15 +212,15 @@ impl ActiveSet {
     fn hold(&mut self, p: &Coupled, constraint: Constraint, multiplier: f64, product: f64) -> bool {
         match constraint {
             Constraint::Box(k, side) => {
-                (self.box_side[k], self.mu[k]) = (Some(side), sign(side) * multiplier);
-                (self.weight[k], self.y[k]) = (0.0, if side == Side::Upper { p.upper[k] } else { p.lower[k] });
+                (self.box_side[k], self.mu[k]) = (side, side * multiplier);
+                (self.weight[k], self.y[k]) = (0.0, if side > 0.0 { p.upper[k] } else { p.lower[k] });
                 self.reweigh(p, k, -self.inverse[k])
             }
             Constraint::Row(row, side) => {
-                (self.row_side[row], self.lambda[row]) = (Some(side), sign(side) * multiplier);
+                (self.row_side[row], self.lambda[row]) = (side, side * multiplier);
                 self.elastic[row] = p.soft[row].is_some_and(|s| multiplier >= s.linear * (1.0 - EXACT));
                 self.held.push(row);
-                if side == Side::Lower {
+                if side < 0.0 {
                     self.forward[..self.factor.size].iter_mut().for_each(|x| *x = -*x);
                 }
                 self.factor.append(&self.forward, product) || self.build_factor(p)
@@ -237,12 +230,8 @@ impl ActiveSet {
 
     fn excess(&self, p: &Coupled, constraint: Constraint) -> f64 {
         match constraint {
-            Constraint::Box(k, Side::Upper) => self.y[k] - p.upper[k],
-            Constraint::Box(k, Side::Lower) => p.lower[k] - self.y[k],
-            Constraint::Row(r, side) => {
-                let value = dot(&p.rows[r * p.n..(r + 1) * p.n], &self.y);
-                if side == Side::Upper { value - p.row_upper[r] } else { p.row_lower[r] - value }
-            }
+            Constraint::Box(k, side) => side * (self.y[k] - if side > 0.0 { p.upper[k] } else { p.lower[k] }),
+            Constraint::Row(r, side) => side * (dot(p.gradient(r), &self.y) - bound(p, r, side)),
         }
     }
 }

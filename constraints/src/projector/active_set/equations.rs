@@ -1,7 +1,6 @@
 //! The answer that follows from an active set alone.
 
-use super::{ActiveSet, dot};
-use crate::ledger::Side;
+use super::{ActiveSet, bound, dot};
 use crate::projector::coupled::Coupled;
 
 impl ActiveSet {
@@ -9,22 +8,18 @@ impl ActiveSet {
     pub(super) fn solve_equations(&mut self, p: &Coupled) -> bool {
         self.held.sort_unstable();
         for k in 0..p.n {
-            (self.y[k], self.weight[k]) = match self.box_side[k] {
-                None => (p.goal[k], self.inverse[k]),
-                Some(Side::Lower) => (p.lower[k], 0.0),
-                Some(Side::Upper) => (p.upper[k], 0.0),
-            };
+            let side = self.box_side[k];
+            let bound = if side > 0.0 { p.upper[k] } else { p.lower[k] };
+            (self.y[k], self.weight[k]) = if side == 0.0 { (p.goal[k], self.inverse[k]) } else { (bound, 0.0) };
         }
         if !self.build_factor(p) {
             return false;
         }
         for (a, &row) in self.held.iter().enumerate() {
-            let lower = self.row_side[row] == Some(Side::Lower);
-            let bound = if lower { p.row_lower[row] } else { p.row_upper[row] };
-            self.r[a] = dot(&p.rows[row * p.n..(row + 1) * p.n], &self.y) - bound;
+            let side = self.row_side[row];
+            self.r[a] = dot(p.gradient(row), &self.y) - bound(p, row, side);
             if let Some(soft) = p.soft[row].filter(|_| self.elastic[row]) {
-                let sign = if lower { -1.0 } else { 1.0 };
-                self.r[a] += sign * soft.linear / soft.quadratic;
+                self.r[a] += side * soft.linear / soft.quadratic;
             }
         }
         self.factor.forward(&mut self.r);
@@ -42,12 +37,12 @@ impl ActiveSet {
         pull.fill(0.0);
         for (&row, &r) in self.held.iter().zip(&self.r) {
             self.lambda[row] = r;
-            for (pull, g) in pull.iter_mut().zip(&p.rows[row * p.n..(row + 1) * p.n]) {
+            for (pull, g) in pull.iter_mut().zip(p.gradient(row)) {
                 *pull += r * g;
             }
         }
         for k in 0..p.n {
-            if self.box_side[k].is_some() {
+            if self.box_side[k] != 0.0 {
                 self.mu[k] = p.hessian[k] * (p.goal[k] - self.y[k]) - pull[k];
             } else {
                 (self.y[k], self.mu[k]) = (p.goal[k] - pull[k] * self.inverse[k], 0.0);
@@ -69,10 +64,10 @@ impl ActiveSet {
             return true;
         }
         self.free.clear();
-        self.free.extend((0..p.n).filter(|k| self.box_side[*k].is_none()));
+        self.free.extend((0..p.n).filter(|k| self.box_side[*k] == 0.0));
         let width = self.free.len();
         for (a, &row) in self.held.iter().enumerate() {
-            let g = &p.rows[row * p.n..(row + 1) * p.n];
+            let g = p.gradient(row);
             for (i, &k) in self.free.iter().enumerate() {
                 self.compact[a * width + i] = g[k];
                 self.scaled[i] = g[k] * self.inverse[k];

@@ -26,7 +26,6 @@ mod equations;
 mod factor;
 
 use super::coupled::Coupled;
-use crate::ledger::Side;
 use factor::Factor;
 
 /// Memory of the stage.
@@ -40,10 +39,10 @@ pub(crate) struct ActiveSet {
     pub(crate) lambda: Vec<f64>,
     /// Steps of the last call.
     pub(crate) iterations: u32,
-    /// Held bound of each dof (n).
-    box_side: Vec<Option<Side>>,
-    /// Held bound of each row (m).
-    row_side: Vec<Option<Side>>,
+    /// Held bound of each dof (n): 1 upper, -1 lower, 0 none.
+    box_side: Vec<f64>,
+    /// Held bound of each row (m): 1 upper, -1 lower, 0 none.
+    row_side: Vec<f64>,
     /// Soft rows that give way (m).
     elastic: Vec<bool>,
     /// Rows held, in the order of the factor.
@@ -74,11 +73,11 @@ pub(crate) struct ActiveSet {
     warm: bool,
 }
 
-/// A bound of a dof or of a row.
+/// A bound of a dof or of a row, and its side: 1 upper, -1 lower.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Constraint {
-    Box(usize, Side),
-    Row(usize, Side),
+    Box(usize, f64),
+    Row(usize, f64),
 }
 
 /// Rows and bounds may be exceeded by this share of their size.
@@ -94,8 +93,8 @@ impl ActiveSet {
             mu: vec![0.0; n],
             lambda: vec![0.0; m],
             iterations: 0,
-            box_side: vec![None; n],
-            row_side: vec![None; m],
+            box_side: vec![0.0; n],
+            row_side: vec![0.0; m],
             elastic: vec![false; m],
             held: Vec::with_capacity(m),
             free: Vec::with_capacity(n),
@@ -145,14 +144,11 @@ impl ActiveSet {
     /// The optimum of the box alone.
     fn start(&mut self, p: &Coupled) -> bool {
         self.held.clear();
-        self.row_side.fill(None);
+        self.row_side.fill(0.0);
         self.elastic.fill(false);
         for k in 0..p.n {
-            self.box_side[k] = match p.goal[k] {
-                goal if goal > p.upper[k] => Some(Side::Upper),
-                goal if goal < p.lower[k] => Some(Side::Lower),
-                _ => None,
-            };
+            let (above, below) = (p.goal[k] > p.upper[k], p.goal[k] < p.lower[k]);
+            self.box_side[k] = f64::from(u8::from(above)) - f64::from(u8::from(below && !above));
         }
         self.solve_equations(p)
     }
@@ -160,12 +156,7 @@ impl ActiveSet {
     /// The last active set, less what has the wrong sign; false when that does not settle.
     fn resume(&mut self, p: &Coupled) -> bool {
         for r in 0..p.m {
-            let gone = match self.row_side[r] {
-                Some(Side::Upper) => p.row_upper[r].is_infinite(),
-                Some(Side::Lower) => p.row_lower[r].is_infinite(),
-                None => false,
-            };
-            if gone {
+            if self.row_side[r] != 0.0 && bound(p, r, self.row_side[r]).is_infinite() {
                 self.drop_row(r);
             }
         }
@@ -185,14 +176,16 @@ impl ActiveSet {
     fn shed(&mut self, p: &Coupled) -> bool {
         let mut changed = false;
         for k in 0..p.n {
-            if self.box_side[k].is_some_and(|side| sign(side) * self.mu[k] < 0.0) {
-                self.box_side[k] = None;
+            if self.box_side[k] * self.mu[k] < 0.0 {
+                self.box_side[k] = 0.0;
                 changed = true;
             }
         }
         for r in 0..p.m {
-            let Some(side) = self.row_side[r] else { continue };
-            let multiplier = sign(side) * self.lambda[r];
+            let multiplier = self.row_side[r] * self.lambda[r];
+            if self.row_side[r] == 0.0 {
+                continue;
+            }
             if multiplier < 0.0 && !pinned(p, r) {
                 self.drop_row(r);
                 changed = true;
@@ -206,7 +199,7 @@ impl ActiveSet {
     }
 
     fn drop_row(&mut self, row: usize) {
-        (self.row_side[row], self.elastic[row]) = (None, false);
+        (self.row_side[row], self.elastic[row]) = (0.0, false);
         self.held.retain(|r| *r != row);
     }
 }
@@ -216,8 +209,9 @@ fn pinned(p: &Coupled, r: usize) -> bool {
     p.equality[r] && p.soft[r].is_none()
 }
 
-fn sign(side: Side) -> f64 {
-    if side == Side::Upper { 1.0 } else { -1.0 }
+/// The bound of row `r` on a side.
+fn bound(p: &Coupled, r: usize, side: f64) -> f64 {
+    if side > 0.0 { p.row_upper[r] } else { p.row_lower[r] }
 }
 
 /// `a'b` in four sums, which processors add at once.
