@@ -136,9 +136,11 @@ fn main() {
     }
     for file in &args {
         let problems = Problems::read(Path::new(file));
-        for (name, how, passes) in
-            [("nearl", How::Warm, PASSES), ("nearl-cold", How::Cold, PASSES), ("clarabel-rust", How::Clarabel, 3)]
-        {
+        for (name, how, passes) in [
+            ("nearl", How::Warm, PASSES),
+            ("nearl-cold", How::Cold, PASSES),
+            ("clarabel-rust", How::Clarabel, 3),
+        ] {
             report(&problems, name, &time(&problems, how, passes), out.as_deref());
         }
     }

@@ -77,9 +77,9 @@ pub use limit::{
     build_limits,
 };
 pub use model::{Joint, Model};
-pub use projector::{Problem, Projector};
 #[doc(hidden)]
 pub use projector::{LoneStages, Numbers};
+pub use projector::{Problem, Projector};
 pub use row::{Cone, Rows, Soft};
 pub use target::{Bounds, Braking, Consistency, Proposal, Settings, Solver, Target};
 pub use viability::{Kind, Period};

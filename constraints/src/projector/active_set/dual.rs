@@ -31,7 +31,7 @@ impl ActiveSet {
         let values = self.value.iter().zip(&p.row_lower).zip(&p.row_upper).zip(&self.row_side);
         for (r, (((value, low), high), side)) in values.enumerate() {
             let (above, below) = (value - high, low - value);
-            if above.max(below) > worst && *side == 0.0 {
+            if (above > worst || below > worst) && *side == 0.0 {
                 worst = above.max(below);
                 found = Some(Constraint::Row(r, if above > below { 1.0 } else { -1.0 }));
             }
@@ -39,9 +39,12 @@ impl ActiveSet {
         // Held dofs are at their bounds.
         for (k, ((y, low), high)) in self.y.iter().zip(&p.lower).zip(&p.upper).enumerate() {
             let (above, below) = (y - high, low - y);
-            let excess = above.max(below);
-            if excess > 0.0 && excess / (high - low).clamp(1e-3, 1e3) > worst {
-                worst = excess / (high - low).clamp(1e-3, 1e3);
+            if !(above > 0.0 || below > 0.0) {
+                continue;
+            }
+            let excess = above.max(below) / (high - low).clamp(1e-3, 1e3);
+            if excess > worst {
+                worst = excess;
                 found = Some(Constraint::Box(k, if above > below { 1.0 } else { -1.0 }));
             }
         }
@@ -140,13 +143,13 @@ impl ActiveSet {
     fn first_event(&self, p: &Coupled) -> (f64, Option<Event>) {
         let (mut least, mut found) = (f64::INFINITY, None);
         let mut see = |distance: f64, rate: f64, event: Event| {
-            if rate > 0.0 && distance.max(0.0) < least * rate {
+            if rate > 0.0 && distance < least * rate {
                 (least, found) = (distance.max(0.0) / rate, Some(event));
             }
         };
-        for (a, &row) in self.held.iter().enumerate() {
+        for (a, (&row, r)) in self.held.iter().zip(&self.r).enumerate() {
             let side = self.row_side[row];
-            let (multiplier, rate) = (side * self.lambda[row], side * self.r[a]);
+            let (multiplier, rate) = (side * self.lambda[row], side * r);
             match p.soft[row] {
                 None if p.equality[row] => {}
                 None => see(multiplier, rate, Event::Release(a)),

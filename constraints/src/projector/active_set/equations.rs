@@ -10,7 +10,8 @@ impl ActiveSet {
         for k in 0..p.n {
             let side = self.box_side[k];
             let bound = if side > 0.0 { p.upper[k] } else { p.lower[k] };
-            (self.y[k], self.weight[k]) = if side == 0.0 { (p.goal[k], self.inverse[k]) } else { (bound, 0.0) };
+            (self.y[k], self.weight[k]) =
+                if side == 0.0 { (p.goal[k], self.inverse[k]) } else { (bound, 0.0) };
         }
         if !self.build_factor(p) {
             return false;

@@ -119,7 +119,11 @@ impl ActiveSet {
             *inverse = 1.0 / h;
         }
         let most = (p.n + p.m) as u32;
-        let warm = self.warm && !self.held.is_empty() && self.resume(p) && self.improve(p, most) && self.is_strict(p);
+        let warm = self.warm
+            && !self.held.is_empty()
+            && self.resume(p)
+            && self.improve(p, most)
+            && self.is_strict(p);
         self.warm = warm || (self.start(p) && self.improve(p, self.iterations + 10 * most + 10));
         self.warm
     }
@@ -214,14 +218,14 @@ fn bound(p: &Coupled, r: usize, side: f64) -> f64 {
     if side > 0.0 { p.row_upper[r] } else { p.row_lower[r] }
 }
 
-/// `a'b` in four sums, which processors add at once.
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let (a4, b4) = (a.chunks_exact(4), b.chunks_exact(4));
-    let rest: f64 = a4.remainder().iter().zip(b4.remainder()).map(|(a, b)| a * b).sum();
+/// `a'c` in four sums, which processors add at once.
+fn dot(a: &[f64], c: &[f64]) -> f64 {
+    let (a4, c4) = (a.chunks_exact(4), c.chunks_exact(4));
+    let rest: f64 = a4.remainder().iter().zip(c4.remainder()).map(|(a, c)| a * c).sum();
     let mut sums = [0.0; 4];
-    for (a, b) in a4.zip(b4) {
+    for (a, c) in a4.zip(c4) {
         for k in 0..4 {
-            sums[k] += a[k] * b[k];
+            sums[k] += a[k] * c[k];
         }
     }
     (sums[0] + sums[2]) + (sums[1] + sums[3]) + rest
