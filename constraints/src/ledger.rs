@@ -11,6 +11,8 @@ pub enum Status {
     Clamped,
     /// Coupled rows were active; the nearest allowed state was solved for and checked.
     Solved,
+    /// No way to stop could be verified from the nearest allowed state: this one is nearer to the stored brake.
+    Slowed,
     /// A joint is outside its limits: it may only return or brake, the others follow the proposal.
     Recovering,
     /// The proposal was not used: every controllable joint brakes.
@@ -33,6 +35,8 @@ pub enum BrakeReason {
     NonFiniteProposal,
     /// No answer passed the checker: the coupled rows leave nothing, or the solver failed.
     NoCertifiedAnswer,
+    /// No way to stop could be verified; the stored brake is executed, or with none stored, each joint brakes for itself.
+    NoVerifiedBrake,
     /// The dynamics came out as NaN or infinity.
     NonFiniteDynamics,
 }

@@ -98,7 +98,8 @@ impl Kind {
 ///     v <= max(0, -offset + sqrt(2 deceleration (at - q)))
 /// ```
 ///
-/// and its mirror image in front of a lowest position. Braking with `deceleration` never crosses it, sampled at any period.
+/// and its mirror image in front of a lowest position. Braking with `deceleration` never crosses it, sampled at any period; for a
+/// joint that brakes less, the lower curve of its own braking takes its place.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Profile {
     /// Position at which the speed must be zero [rad or m].
@@ -148,6 +149,13 @@ pub struct Dof {
     pub profile: [Option<Profile>; 2],
     /// The dof stops and stays.
     pub locked: bool,
+}
+
+impl Profile {
+    /// The curve that braking with `braking` never crosses.
+    fn within(&self, braking: f64) -> Profile {
+        Profile { deceleration: self.deceleration.min(braking), ..*self }
+    }
 }
 
 impl Dof {
@@ -224,16 +232,20 @@ pub fn interval(dof: &Dof, q: f64, v: f64, period: &Period) -> Interval {
         false => upper_bound(dof, a, dof.upper - q, v, period),
     };
     if let Some(p) = &dof.profile[1] {
-        (upper, upper_kind) =
-            smaller((upper, upper_kind), (profile_bound(p, p.at - q, v, period), Kind::VelocityProfile));
+        (upper, upper_kind) = smaller(
+            (upper, upper_kind),
+            (profile_bound(&p.within(a), p.at - q, v, period), Kind::VelocityProfile),
+        );
     }
     let (mut lower, mut lower_kind) = match below {
         true => returning(dof, -v, period),
         false => upper_bound(dof, a, q - dof.lower, -v, period),
     };
     if let Some(p) = &dof.profile[0] {
-        (lower, lower_kind) =
-            smaller((lower, lower_kind), (profile_bound(p, q - p.at, -v, period), Kind::VelocityProfile));
+        (lower, lower_kind) = smaller(
+            (lower, lower_kind),
+            (profile_bound(&p.within(a), q - p.at, -v, period), Kind::VelocityProfile),
+        );
     }
     lower = -lower;
     let mut outside = (above || below).then_some(Kind::Position);

@@ -21,6 +21,10 @@ fn words(status: Status) -> (&'static str, Option<&'static str>) {
             ("braked", Some("the proposal holds NaN or infinity"))
         }
         Status::Braked(BrakeReason::NoCertifiedAnswer) => ("braked", Some("no answer passed the checker")),
+        Status::Slowed => ("slowed", Some("no way to stop could be verified from the nearest allowed state")),
+        Status::Braked(BrakeReason::NoVerifiedBrake) => {
+            ("braked", Some("no way to stop could be verified; the stored brake is executed"))
+        }
         Status::Braked(BrakeReason::NonFiniteDynamics) => {
             ("braked", Some("the dynamics came out as NaN or infinity"))
         }

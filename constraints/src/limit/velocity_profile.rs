@@ -62,7 +62,7 @@ const FR3: [JointProfile; 7] = [
 
 /// Position-dependent speed limits; exact at the end of every tick, for any period.
 ///
-/// The joint's braking must be at least the deceleration of its curves.
+/// Where a joint brakes less than its curves fall, the curves of its own braking hold, which are lower.
 #[derive(Debug, Clone)]
 pub struct VelocityProfileLimit {
     settings: VelocityProfileSettings,

@@ -1,12 +1,14 @@
 //! Building a projector: everything that can be wrong is found here.
 
 use super::active_set::ActiveSet;
+use super::backup::Backup;
 use super::conic::Conic;
 use super::coupled::Coupled;
 use super::sources::{Measured, Sources};
 use super::{Dofs, History, Projector, Stages, Switch};
 use crate::checker::Checker;
-use crate::target::{Bounds, Consistency, Settings, Solver};
+use crate::ledger::{Rung, Status};
+use crate::target::{Bounds, Braking, Consistency, Settings, Solver};
 use crate::viability::{Dof, Interval, Kind, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model, Soft};
 
@@ -27,7 +29,7 @@ impl Projector {
         let dofs = Dofs::new(model, controllable, settings.consistency)?;
         let switches = switches(model, limits, &dofs.controllable)?;
         let (each, limits) = (limits, LimitSet::collect(model, limits, &dofs.controllable)?);
-        check_combination(model, &limits, &dofs, settings.consistency)?;
+        check_combination(model, &limits, &dofs, (settings.consistency, settings.braking))?;
         let period = Period::new(settings.dt, settings.sub_steps);
         let weight: Vec<f64> = match &settings.velocity_weight {
             Some(w) => w.iter().map(|w| w * w).collect(),
@@ -55,7 +57,12 @@ impl Projector {
             goal: zero(),
             v_next: zero(),
             consistent: vec![false; nv],
+            clamped: vec![[false; 2]; nv],
+            last: (Status::Unchanged, Rung::ClosedForm),
+            v_wanted: zero(),
+            v_stop: zero(),
             tangent: zero(),
+            backup: Backup::new(model),
             integrated: model.neutral(),
             model: model.clone(),
             limits,
@@ -120,7 +127,7 @@ pub(super) fn check_combination(
     model: &Model,
     limits: &LimitSet,
     dofs: &Dofs,
-    consistency: Consistency,
+    (consistency, braking): (Consistency, Braking),
 ) -> Result<(), LimitError> {
     let names = |wrong: &dyn Fn(usize) -> bool| -> String {
         let list = dofs.controllable.iter().filter(|i| wrong(**i));
@@ -137,14 +144,12 @@ pub(super) fn check_combination(
         }
         Consistency::Free => {}
     }
-    let slow = |i: usize| {
-        let steepest = limits.profile[i].iter().flatten().map(|p| p.deceleration).fold(0.0, f64::max);
-        steepest > limits.braking[i]
-    };
-    let joints = names(&slow);
-    if !joints.is_empty() {
-        let what = format!("velocity_profile falls faster than the braking of {joints}");
-        return Err(LimitError::Unusable { what, next: "raise acceleration or braking, or lower squared" });
+    if braking == Braking::Stored {
+        let joints = names(&|i| limits.braking[i].is_infinite() || limits.effort[i].is_infinite());
+        if !joints.is_empty() {
+            let next = "add torque and acceleration limits, or set braking = \"certified\"";
+            return Err(LimitError::Missing { limit: "a stored brake", joints, next });
+        }
     }
     Ok(())
 }
@@ -183,7 +188,8 @@ fn stages(
     let worth = hessian.iter().zip(&sigma).fold(0.0, |most: f64, (h, sigma)| most.max(h * sigma * sigma));
     let scaled = |s: Soft| Soft { linear: s.linear * worth, quadratic: s.quadratic * worth };
     let soft = sources.softness().into_iter().map(|s| s.map(scaled)).collect();
-    let mut problem = Coupled::new(hessian, soft, sources.equalities(), &sources.dimensions());
+    let mut problem =
+        Coupled::new(hessian, soft, sources.equalities(), &sources.dimensions(), dofs.fixed.len());
     for k in 0..problem.n {
         (problem.lower[k], problem.upper[k]) = (-sigma[k], sigma[k]);
     }

@@ -300,19 +300,6 @@ impl Conic {
         }
         true
     }
-
-    /// Puts a NaN where Clarabel never forgets it, or a matrix at which it panics, for tests of what follows.
-    #[cfg(test)]
-    pub(crate) fn injure(&mut self, panic: bool) {
-        let Some(solver) = &mut self.solver else { return };
-        if panic {
-            solver.data.A.rowval.fill(usize::MAX / 2);
-        } else {
-            let mut p = self.p.nzval.clone();
-            p[0] = f64::NAN;
-            let _ = solver.update_P(&p);
-        }
-    }
 }
 
 /// A diagonal matrix in compressed columns; `None` is no entry.
@@ -373,5 +360,44 @@ fn settings(max_iter: u32) -> DefaultSettings<f64> {
         tol_gap_rel: 1e-12,
         tol_feas: 1e-11,
         ..DefaultSettings::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// `min 1/2 (y - goal)^2` in two variables with `y_0 + y_1 <= 1`.
+    fn problem() -> Coupled {
+        let mut p = Coupled::new(vec![1.0; 2], vec![None], vec![false], &[], 0);
+        (p.lower, p.upper, p.goal) = (vec![-5.0; 2], vec![5.0; 2], vec![2.0, 1.0]);
+        (p.rows, p.row_upper) = (vec![1.0, 1.0], vec![1.0]);
+        p
+    }
+
+    fn answers(conic: &mut Conic) -> bool {
+        let y = [1.0, 0.0]; // by hand: equal steps back along (1, 1)
+        conic.solve(&problem()) && conic.y.iter().zip(y).all(|(a, b)| (a - b).abs() < 1e-6)
+    }
+
+    #[test]
+    fn a_solver_with_a_nan_in_its_hessian_answers_in_the_tick_after() {
+        let mut conic = Conic::new(&problem(), vec![1.0; 2], 50, None).unwrap();
+        assert!(answers(&mut conic));
+        let sound = conic.p.nzval.clone();
+        let spoil = |conic: &mut Conic, p: &Vec<f64>| conic.solver.as_mut().unwrap().update_P(p).unwrap();
+        spoil(&mut conic, &vec![f64::NAN; sound.len()]);
+        assert!(!answers(&mut conic), "a NaN in P gives no answer");
+        spoil(&mut conic, &sound);
+        assert!(answers(&mut conic), "the buffers that held it are new");
+    }
+
+    #[test]
+    fn a_solver_that_panics_is_replaced_in_the_tick_after() {
+        let mut conic = Conic::new(&problem(), vec![1.0; 2], 50, None).unwrap();
+        conic.solver.as_mut().unwrap().data.A.rowval.fill(usize::MAX / 2);
+        assert!(!answers(&mut conic), "a panic gives no answer");
+        assert!(conic.solver.is_none());
+        assert!(answers(&mut conic), "a new solver answers");
     }
 }

@@ -37,6 +37,10 @@ pub(crate) struct Coupled {
     /// Rows whose bounds are equal (m).
     pub(crate) equality: Vec<bool>,
     pub(crate) cones: Vec<ConeRows>,
+    /// Number of dofs that are not controllable.
+    pub(crate) fixed: usize,
+    /// Their columns of `G` (m x fixed, row-major).
+    pub(crate) rows_fixed: Vec<f64>,
 }
 
 /// `|G y + c| <= radius`; infinite when switched off.
@@ -44,6 +48,8 @@ pub(crate) struct Coupled {
 pub(crate) struct ConeRows {
     /// dimension x n, row-major.
     pub(crate) g: Vec<f64>,
+    /// Columns of the dofs that are not controllable (dimension x fixed).
+    pub(crate) g_fixed: Vec<f64>,
     pub(crate) c: Vec<f64>,
     pub(crate) radius: f64,
     /// Size of the limit in its own unit.
@@ -59,9 +65,16 @@ impl Coupled {
         soft: Vec<Option<Soft>>,
         equality: Vec<bool>,
         dimensions: &[usize],
+        fixed: usize,
     ) -> Coupled {
         let (n, m) = (hessian.len(), soft.len());
-        let cone = |d: &usize| ConeRows { g: vec![0.0; d * n], c: vec![0.0; *d], radius: ROOM, size: 1.0 };
+        let cone = |d: &usize| ConeRows {
+            g: vec![0.0; d * n],
+            g_fixed: vec![0.0; d * fixed],
+            c: vec![0.0; *d],
+            radius: ROOM,
+            size: 1.0,
+        };
         Coupled {
             n,
             m,
@@ -76,6 +89,8 @@ impl Coupled {
             soft,
             equality,
             cones: dimensions.iter().map(cone).collect(),
+            fixed,
+            rows_fixed: vec![0.0; m * fixed],
         }
     }
 
@@ -87,6 +102,9 @@ impl Coupled {
         }
         self.row_lower[r] = (self.row_lower[r] - still) / size;
         self.row_upper[r] = (self.row_upper[r] - still) / size;
+        for (to, j) in self.rows_fixed[r * self.fixed..(r + 1) * self.fixed].iter_mut().zip(&dofs.fixed) {
+            *to = g[*j] / size;
+        }
         self.row_size[r] = size;
     }
 
@@ -164,6 +182,9 @@ impl ConeRows {
             for (k, j) in dofs.controllable.iter().enumerate() {
                 self.g[d * n + k] = row[*j] / size;
             }
+            for (u, j) in dofs.fixed.iter().enumerate() {
+                self.g_fixed[d * dofs.fixed.len() + u] = row[*j] / size;
+            }
         }
         self.size = size;
     }
@@ -181,8 +202,25 @@ impl ConeRows {
 
     /// Derivative of the norm with respect to `y_k`.
     pub(crate) fn slope(&self, y: &[f64], k: usize) -> f64 {
+        self.slope_along(y, |d| self.g[d * y.len() + k])
+    }
+
+    /// Derivative of the norm when `G y + c` moves along `direction`: `u' direction`.
+    pub(crate) fn slope_along(&self, y: &[f64], direction: impl Fn(usize) -> f64) -> f64 {
         let norm = self.norm(y).max(f64::MIN_POSITIVE);
-        (0..self.c.len()).map(|d| self.entry(d, y) * self.g[d * y.len() + k]).sum::<f64>() / norm
+        (0..self.c.len()).map(|d| self.entry(d, y) * direction(d)).sum::<f64>() / norm
+    }
+
+    /// Second derivative of the norm along two directions: `a' (I - u u') b / norm`.
+    pub(crate) fn curvature(
+        &self,
+        y: &[f64],
+        a: impl Fn(usize) -> f64 + Copy,
+        b: impl Fn(usize) -> f64 + Copy,
+    ) -> f64 {
+        let product: f64 = (0..self.c.len()).map(|d| a(d) * b(d)).sum();
+        let norm = self.norm(y).max(f64::MIN_POSITIVE);
+        (product - self.slope_along(y, a) * self.slope_along(y, b)) / norm
     }
 }
 

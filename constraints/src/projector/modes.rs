@@ -40,6 +40,8 @@ impl Projector {
             };
             let kinds = (x.lower_kind, x.upper_kind);
             target.v[i] = clamp(proposal.v[i], b.v_lower[i], b.v_upper[i], self.weight[i], kinds);
+            let v_clamped = target.v[i] != proposal.v[i];
+            let mut q_clamped = false;
             if let Some(iq) = self.dofs.single[i] {
                 let cut =
                     |bound: f64, limit: f64, kind: Kind| if bound == limit { Kind::Position } else { kind };
@@ -49,7 +51,9 @@ impl Projector {
                 );
                 let weight = self.weight[i] * position_weight;
                 target.q[iq] = clamp(proposal.q[iq], b.q_lower[i], b.q_upper[i], weight, kinds);
+                q_clamped = target.q[iq] != proposal.q[iq];
             }
+            self.clamped[i] = [q_clamped, v_clamped];
         }
         for i in 0..v.len() {
             target.acceleration[i] = (target.v[i] - v[i]) / self.period.dt;

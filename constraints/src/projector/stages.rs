@@ -40,7 +40,7 @@ impl LoneStages {
     /// Clarabel refuses the problem.
     pub fn new(first: &Numbers) -> Result<LoneStages, LimitError> {
         let (soft, equality) = (first.soft.clone(), first.equality.clone());
-        let mut problem = Coupled::new(first.hessian.clone(), soft, equality, &[]);
+        let mut problem = Coupled::new(first.hessian.clone(), soft, equality, &[], 0);
         put(&mut problem, first);
         let width = |k: usize| ((first.upper[k] - first.lower[k]) / 2.0).clamp(1e-3, 1e3);
         let sigma = (0..problem.n).map(width).collect();

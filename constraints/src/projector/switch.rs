@@ -24,7 +24,12 @@ impl Projector {
         self.switches.iter_mut().filter(|s| s.label == label).for_each(|s| s.enabled = on);
         self.collect_enabled();
         let sound = self.limits.check(&self.model, &self.dofs.controllable).and_then(|()| {
-            check_combination(&self.model, &self.limits, &self.dofs, self.settings.consistency)
+            check_combination(
+                &self.model,
+                &self.limits,
+                &self.dofs,
+                (self.settings.consistency, self.settings.braking),
+            )
         });
         if let Err(error) = sound {
             self.switches.iter_mut().zip(before).for_each(|(s, before)| s.enabled = before);
@@ -64,6 +69,11 @@ impl Projector {
         self.external.copy_from_slice(forces);
     }
 
+    /// The forces last set (nv).
+    pub fn external_forces(&self) -> &[f64] {
+        &self.external
+    }
+
     /// True when some limit speaks of the tick before.
     pub fn needs_previous(&self) -> bool {
         self.checker.needs().previous
@@ -80,6 +90,12 @@ impl Projector {
             self.previous.acceleration.copy_from_slice(previous.acceleration);
             self.previous.torque.copy_from_slice(previous.torque);
         }
+    }
+
+    /// Forgets the tick before and the stored brake: a new episode begins.
+    pub fn forget(&mut self) {
+        self.previous.known = false;
+        self.backup.stored = false;
     }
 
     /// Makes the last tick, which ended with `target`, the tick before.
