@@ -78,6 +78,8 @@ pub use limit::{
     TorqueSpeedLimit, UserRow, VelocityLimit, VelocityProfileLimit, build_limits,
 };
 pub use model::{FrameId, Joint, Model};
+#[doc(hidden)]
+pub use projector::{LoneStages, Numbers};
 pub use projector::{Problem, Projector};
 pub use row::{Cone, Rows, Soft};
 pub use target::{Bounds, Braking, Consistency, Proposal, Settings, Solver, Target};
