@@ -3,7 +3,8 @@
 //! The file's metadata has one key, `nearl`: the blake3 digest in hex, a line break, the manifest as JSON.
 //! The digest covers the manifest text and every tensor (name, shape, bytes), so any changed bit is refused.
 
-use crate::net::Dense;
+use crate::codes::SnapshotCode;
+use crate::net::{Activation, Dense};
 use crate::normaliser::Normaliser;
 use crate::task::Task;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -56,6 +57,9 @@ pub struct Manifest {
     pub algo: String,
     /// How the networks are read.
     pub policy: PolicyKind,
+    /// What lies between the layers of the networks; tanh in files that do not say.
+    #[serde(default)]
+    pub activation: Activation,
     /// Counts the snapshots of one run upwards; 0 for a file made by hand.
     pub version: u64,
     /// Environment steps seen by the learner.
@@ -173,16 +177,17 @@ impl SnapshotError {
     /// Stable name of the reason, for logs, replies and `nearl explain`.
     pub fn code(&self) -> &'static str {
         match self {
-            Self::Unreadable { .. } => "snapshot-unreadable",
-            Self::Malformed { .. } => "snapshot-malformed",
-            Self::Foreign { .. } => "snapshot-foreign",
-            Self::Digest { .. } => "snapshot-digest",
-            Self::MissingTensor { .. } => "snapshot-missing-tensor",
-            Self::Shape { .. } => "snapshot-shape",
-            Self::Value { .. } => "snapshot-value",
-            Self::Unusable { .. } => "snapshot-unusable",
-            Self::Canary { .. } => "snapshot-canary",
+            Self::Unreadable { .. } => SnapshotCode::Unreadable,
+            Self::Malformed { .. } => SnapshotCode::Malformed,
+            Self::Foreign { .. } => SnapshotCode::Foreign,
+            Self::Digest { .. } => SnapshotCode::Digest,
+            Self::MissingTensor { .. } => SnapshotCode::MissingTensor,
+            Self::Shape { .. } => SnapshotCode::Shape,
+            Self::Value { .. } => SnapshotCode::Value,
+            Self::Unusable { .. } => SnapshotCode::Unusable,
+            Self::Canary { .. } => SnapshotCode::Canary,
         }
+        .name()
     }
 }
 
@@ -281,7 +286,8 @@ impl Snapshot {
     }
 }
 
-fn digest<'a>(manifest: &str, tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [u8])>) -> String {
+/// blake3 in hex over a text and tensors (name, shape, bytes), whatever their order.
+pub fn digest<'a>(manifest: &str, tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [u8])>) -> String {
     let mut hash = blake3::Hasher::new();
     hash.update(manifest.as_bytes());
     let mut sorted: Vec<_> = tensors.collect();
