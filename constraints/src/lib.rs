@@ -52,6 +52,7 @@ pub mod checker;
 pub mod convention;
 mod dynamics;
 mod error;
+pub mod geometry;
 mod kinematics;
 mod layout;
 pub mod ledger;
@@ -68,15 +69,15 @@ pub mod viability;
 pub use certify::{Certificate, certify_braking};
 pub use dynamics::Dynamics;
 pub use error::{LimitError, ModelError};
-pub use kinematics::Kinematics;
+pub use kinematics::{FrameMotion, Kinematics, PointMotion};
 pub use layout::{Entry, LayoutError, StateLayout};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};
 pub use limit::{
-    AccelerationLimit, ConstraintSettings, JerkLimit, Limit, LimitSet, LockedJoints, PerJoint, PositionLimit,
-    TorqueLimit, TorqueRateLimit, TorqueSpeedLimit, UserRow, VelocityLimit, VelocityProfileLimit,
-    build_limits,
+    AccelerationLimit, CollisionLimit, ConstraintSettings, EnergyLimit, FrameLimit, FrameSpeedLimit,
+    JerkLimit, Limit, LimitSet, LockedJoints, PerJoint, PositionLimit, TorqueLimit, TorqueRateLimit,
+    TorqueSpeedLimit, UserRow, VelocityLimit, VelocityProfileLimit, build_limits,
 };
-pub use model::{Joint, Model};
+pub use model::{FrameId, Joint, Model};
 pub use projector::{Problem, Projector};
 pub use row::{Cone, Rows, Soft};
 pub use target::{Bounds, Braking, Consistency, Proposal, Settings, Solver, Target};

@@ -4,8 +4,10 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
+use crate::codes::{self, Explanation};
 use crate::link::{RobotName, bench_round_trip};
-use crate::rt::{Percentiles, RunSettings, Stop, ThreadSettings, bench_wake, run};
+use crate::log::replay;
+use crate::rt::{FaultPlan, Percentiles, RunSettings, Stop, ThreadSettings, bench_wake, run};
 
 /// Run a snapshot on a plant in real time.
 #[derive(Args, Debug)]
@@ -24,6 +26,18 @@ pub struct RunCommand {
     /// Flight log (MCAP).
     #[arg(long)]
     pub log: Option<PathBuf>,
+    /// Age at which a state is stale [s]; 5 periods, but at least 20 ms, if not given.
+    #[arg(long, value_parser = seconds)]
+    pub age_limit: Option<f64>,
+    /// Time over which the first motion is let in [s]; 0 begins at once.
+    #[arg(long, default_value_t = 0.2)]
+    pub ramp: f64,
+    /// A joint may move so many times further than its speed allows before its sample is rejected; 0 checks nothing.
+    #[arg(long, default_value_t = 3.0)]
+    pub jump: f64,
+    /// Rehearse the faults in this JSON file.
+    #[arg(long)]
+    pub faults: Option<PathBuf>,
     /// SCHED_FIFO priority; 0 keeps the normal scheduler.
     #[arg(long, default_value_t = 40)]
     pub priority: i32,
@@ -34,6 +48,26 @@ pub struct RunCommand {
     #[arg(long)]
     pub strict: bool,
     /// Print the report as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Compute every tick of a flight log again and compare it bit for bit.
+#[derive(Args, Debug)]
+pub struct ReplayCommand {
+    /// Flight log (MCAP) of `nearl run --log`.
+    pub file: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Say what a code in a report, a log or a refusal means, and what to do.
+#[derive(Args, Debug)]
+pub struct ExplainCommand {
+    /// The code, for example `stale-state`; all of them if none is given.
+    pub code: Option<String>,
+    /// Print JSON.
     #[arg(long)]
     pub json: bool,
 }
@@ -116,7 +150,17 @@ impl RunCommand {
             cpu: self.cpu,
             lock_memory: true,
         };
+        for (name, value) in [("--ramp", self.ramp), ("--jump", self.jump)] {
+            if !(0.0..=1e6).contains(&value) {
+                return Err(format!("{name} {value} is not usable: give 0 or a positive number").into());
+            }
+        }
+        let faults = self.faults.as_deref().map(FaultPlan::load).transpose()?.unwrap_or_default();
         let settings = RunSettings {
+            age_limit: self.age_limit,
+            ramp: self.ramp,
+            jump: self.jump,
+            faults,
             rate: self.rate,
             seconds: self.seconds,
             log: self.log,
@@ -130,6 +174,53 @@ impl RunCommand {
             say(serde_json::to_string(&report)?);
         } else {
             say(report.to_string().trim_end());
+        }
+        Ok(())
+    }
+}
+
+impl ReplayCommand {
+    /// Replays and prints what was found.
+    ///
+    /// # Errors
+    /// One sentence: the first tick and field that differ, or why the log cannot be replayed.
+    pub fn run(self) -> Result<(), Failure> {
+        let found = replay(&self.file)?;
+        if self.json {
+            say(serde_json::to_string(&found)?);
+        }
+        let file = self.file.display();
+        if let Some(difference) = &found.difference {
+            return Err(format!("{file}: {difference}; the {} ticks before are the same", found.ticks).into());
+        }
+        if !self.json {
+            let end = if found.complete { "" } else { "; the log was cut short by the end of its runtime" };
+            say(format!(
+                "{file}: {} ticks and {} swaps, bit for bit the same{end}",
+                found.ticks, found.swaps
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl ExplainCommand {
+    /// Prints the explanation.
+    ///
+    /// # Errors
+    /// One sentence for a code that does not exist, with the nearest that does.
+    pub fn run(self) -> Result<(), Failure> {
+        let all = codes::all();
+        let chosen: Vec<_> = match &self.code {
+            None => all,
+            Some(code) => vec![codes::find(code)?],
+        };
+        if self.json {
+            say(serde_json::to_string(&chosen)?);
+            return Ok(());
+        }
+        for Explanation { code, group, meaning, remedy } in chosen {
+            say(format!("{code} ({group}): {meaning}\n  What to do: {remedy}"));
         }
         Ok(())
     }

@@ -9,6 +9,7 @@ use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
 use crate::cli::{Failure, say};
+use crate::codes::CheckCode;
 use crate::controller::{Controller, Parts};
 use crate::link::{RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, remains};
 use crate::rt::{Pilot, ThreadSettings, bench_wake, prepare};
@@ -44,10 +45,14 @@ pub enum Finding {
 pub struct Check {
     /// What was looked at.
     pub check: &'static str,
+    /// Its code; `nearl explain` knows it.
+    pub code: CheckCode,
     /// Outcome.
     pub finding: Finding,
     /// One sentence.
     pub text: String,
+    /// The next step; none where all is well.
+    pub remedy: Option<&'static str>,
 }
 
 /// States looked at for the braking certificate, and their seed.
@@ -69,8 +74,12 @@ impl DoctorCommand {
         if self.json {
             say(serde_json::json!({ "ok": failed.is_empty(), "checks": checks }));
         } else {
-            for Check { check, finding, text } in &checks {
+            for Check { check, finding, text, .. } in &checks {
                 say(format!("{:<5} {check:<10} {text}", format!("{finding:?}").to_lowercase()));
+            }
+            let codes = checks.iter().filter(|c| c.finding != Finding::Ok).map(|c| c.code.name());
+            for code in codes {
+                say(format!("more: nearl explain {code}"));
             }
         }
         if failed.is_empty() {
@@ -87,36 +96,42 @@ pub fn examine(file: &Path, plant: Option<&str>) -> Vec<Check> {
     checks.extend([memory(), stale_links(), priority(), lock(), clock(), wake(dt)]);
     match (plant, &snapshot) {
         (Some(name), Some(snapshot)) => checks.push(examine_plant(name, snapshot)),
-        (Some(_), None) => checks.push(fail("plant", "not asked, because the snapshot failed".into())),
+        (Some(_), None) => {
+            checks.push(fail(CheckCode::Plant, "not asked, because the snapshot failed".into()))
+        }
         (None, _) => {}
     }
     checks
 }
 
-fn ok(check: &'static str, text: String) -> Check {
-    Check { check, finding: Finding::Ok, text }
+fn ok(code: CheckCode, text: String) -> Check {
+    Check { check: name(code), code, finding: Finding::Ok, text, remedy: None }
 }
-fn warn(check: &'static str, text: String) -> Check {
-    Check { check, finding: Finding::Warn, text }
+fn warn(code: CheckCode, text: String) -> Check {
+    Check { check: name(code), code, finding: Finding::Warn, text, remedy: Some(code.explanation().remedy) }
 }
-fn fail(check: &'static str, text: String) -> Check {
-    Check { check, finding: Finding::Fail, text }
+fn fail(code: CheckCode, text: String) -> Check {
+    Check { check: name(code), code, finding: Finding::Fail, text, remedy: Some(code.explanation().remedy) }
+}
+/// The code without the group in front.
+fn name(code: CheckCode) -> &'static str {
+    code.name().trim_start_matches("doctor-")
 }
 
 fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
     let snapshot = match Snapshot::load(file) {
         Ok(snapshot) => snapshot,
-        Err(e) => return (None, vec![fail("snapshot", e.to_string())]),
+        Err(e) => return (None, vec![fail(CheckCode::Snapshot, e.to_string())]),
     };
     let m = &snapshot.manifest;
     let (task, algo) = (&m.task.name, &m.algo);
     let text =
         format!("{task} by {algo}, version {}, {} steps, digest {}", m.version, m.steps, snapshot.digest());
-    let mut checks = vec![ok("snapshot", text)];
+    let mut checks = vec![ok(CheckCode::Snapshot, text)];
     match Controller::new(&snapshot) {
-        Ok(_) => checks.push(ok("canary", "trial states gave finite actions".into())),
+        Ok(_) => checks.push(ok(CheckCode::Canary, "trial states gave finite actions".into())),
         Err(e) => {
-            checks.push(fail("canary", e.to_string()));
+            checks.push(fail(CheckCode::Canary, e.to_string()));
             return (None, checks);
         }
     }
@@ -129,17 +144,17 @@ fn braking(snapshot: &Snapshot) -> Check {
     let m = &snapshot.manifest;
     let parts = match Parts::new(m) {
         Ok(parts) => parts,
-        Err(e) => return fail("braking", e.to_string()),
+        Err(e) => return fail(CheckCode::Braking, e.to_string()),
     };
     let Parts { model, layout, projector } = parts;
     let (limits, controllable) = (projector.limits(), layout.controllable());
     if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {
-        return ok("braking", "the task has no torque limit, so there is nothing to certify".into());
+        return ok(CheckCode::Braking, "the task has no torque limit, so there is nothing to certify".into());
     }
     let period = Period::new(m.task.time.dt, m.task.sub_steps() as u32);
     let (samples, seed) = SAMPLES;
     match certify_braking(&model, limits, controllable, &period, samples, seed) {
-        Err(e) => fail("braking", e.to_string()),
+        Err(e) => fail(CheckCode::Braking, e.to_string()),
         Ok(c) => {
             let (joint, margin) = (model.dof_name(c.dof), 100.0 * c.margin);
             let found = format!(
@@ -147,10 +162,13 @@ fn braking(snapshot: &Snapshot) -> Check {
                 c.samples, c.needed, c.effort
             );
             if c.holds() {
-                return ok("braking", found);
+                return ok(CheckCode::Braking, found);
             }
             let scale = c.scale;
-            warn("braking", format!("{found}: multiply constraints.acceleration.limit by {scale:.2} or less"))
+            warn(
+                CheckCode::Braking,
+                format!("{found}: multiply constraints.acceleration.limit by {scale:.2} or less"),
+            )
         }
     }
 }
@@ -162,10 +180,11 @@ fn memory() -> Check {
     let result = RobotName::new(&format!("doctor{}", std::process::id()))
         .and_then(|name| check_memory(&name, SHARED_MEMORY));
     match result {
-        Err(e) => fail("memory", e.to_string()),
-        Ok(()) => {
-            ok("memory", format!("/dev/shm has {} MB free, a robot needs {needed}", megabytes(free_memory())))
-        }
+        Err(e) => fail(CheckCode::Memory, e.to_string()),
+        Ok(()) => ok(
+            CheckCode::Memory,
+            format!("/dev/shm has {} MB free, a robot needs {needed}", megabytes(free_memory())),
+        ),
     }
 }
 
@@ -175,12 +194,15 @@ fn stale_links() -> Check {
     let stale: Vec<_> = all.iter().filter(|r| r.is_stale()).collect();
     if stale.is_empty() {
         let alive = all.iter().filter(|r| r.alive > 0).count();
-        return ok("links", format!("{alive} robots are running, no link of a dead process is left"));
+        return ok(
+            CheckCode::Links,
+            format!("{alive} robots are running, no link of a dead process is left"),
+        );
     }
     let kilobytes = stale.iter().map(|r| r.bytes).sum::<u64>() >> 10;
     let names: Vec<String> = stale.iter().map(|r| format!("/dev/shm/nearl.{}.*", r.name)).collect();
     warn(
-        "links",
+        CheckCode::Links,
         format!(
             "{kilobytes} kB are held by dead processes: start the robot again, which cleans up, or delete {}",
             names.join(" ")
@@ -189,7 +211,7 @@ fn stale_links() -> Check {
 }
 
 /// Asks the operating system for `wish` on a thread that ends at once.
-fn wish(check: &'static str, granted: &str, wish: ThreadSettings) -> Check {
+fn wish(check: CheckCode, granted: &str, wish: ThreadSettings) -> Check {
     let thread = std::thread::Builder::new().spawn(move || prepare(&wish));
     match thread.map(std::thread::JoinHandle::join) {
         Ok(Ok(warnings)) if warnings.is_empty() => ok(check, granted.into()),
@@ -201,24 +223,24 @@ fn wish(check: &'static str, granted: &str, wish: ThreadSettings) -> Check {
 
 fn priority() -> Check {
     let settings = ThreadSettings { priority: Some(PRIORITY), cpu: None, lock_memory: false };
-    wish("priority", &format!("SCHED_FIFO priority {PRIORITY} is granted"), settings)
+    wish(CheckCode::Priority, &format!("SCHED_FIFO priority {PRIORITY} is granted"), settings)
 }
 
 fn lock() -> Check {
     let settings = ThreadSettings { priority: None, cpu: None, lock_memory: true };
-    wish("lock", "memory can be locked", settings)
+    wish(CheckCode::Lock, "memory can be locked", settings)
 }
 
 fn clock() -> Check {
     let t = clock_getres(ClockId::Monotonic);
     let resolution = t.tv_sec as u64 * 1_000_000_000 + t.tv_nsec as u64;
     if resolution <= 1000 {
-        return ok("clock", format!("the monotonic clock counts {resolution} ns"));
+        return ok(CheckCode::Clock, format!("the monotonic clock counts {resolution} ns"));
     }
     let text = format!(
         "the monotonic clock counts {resolution} ns: boot with high-resolution timers (CONFIG_HIGH_RES_TIMERS)"
     );
-    warn("clock", text)
+    warn(CheckCode::Clock, text)
 }
 
 /// One second of an empty loop beside the control period `dt` [s].
@@ -227,7 +249,9 @@ fn wake(dt: f64) -> Check {
     let settings = ThreadSettings { priority: Some(PRIORITY), cpu: None, lock_memory: false };
     let late = match bench_wake(period, (1.0 / period).round() as u64, settings) {
         Ok((late, _)) => late,
-        Err(e) => return fail("wake-up", format!("the empty loop did not run ({e}): raise `ulimit -u`")),
+        Err(e) => {
+            return fail(CheckCode::WakeUp, format!("the empty loop did not run ({e}): raise `ulimit -u`"));
+        }
     };
     let us = |ns: u64| ns as f64 * 1e-3;
     let found = format!(
@@ -238,9 +262,12 @@ fn wake(dt: f64) -> Check {
         1e6 * dt
     );
     if late.p99 as f64 * 1e-9 < 0.5 * dt {
-        return ok("wake-up", found);
+        return ok(CheckCode::WakeUp, found);
     }
-    warn("wake-up", format!("{found}: stop other programs, or keep a core free and give it with --cpu"))
+    warn(
+        CheckCode::WakeUp,
+        format!("{found}: stop other programs, or keep a core free and give it with --cpu"),
+    )
 }
 
 /// Does the plant answer, and is it the robot of the snapshot?
@@ -250,11 +277,11 @@ fn examine_plant(name: &str, snapshot: &Snapshot) -> Check {
         link.wait_for_plant(PATIENCE)
     });
     match robot {
-        Err(e) => fail("plant", e.to_string()),
+        Err(e) => fail(CheckCode::Plant, e.to_string()),
         Ok(robot) => match Pilot::new(snapshot, &robot) {
-            Err(refusal) => fail("plant", refusal.text),
+            Err(refusal) => fail(CheckCode::Plant, refusal.text),
             Ok(_) => ok(
-                "plant",
+                CheckCode::Plant,
                 format!(
                     "`{name}` answers: {} joints, observation, period {} s and limits are the snapshot's",
                     robot.joint_names().len(),

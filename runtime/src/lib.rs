@@ -3,6 +3,7 @@
 //! Read [`controller`] first: the one data path is on that page.
 
 pub mod cli;
+pub mod codes;
 pub mod controller;
 pub mod doctor;
 pub mod idm;

@@ -3,6 +3,7 @@
 //! The file's metadata has one key, `nearl`: the blake3 digest in hex, a line break, the manifest as JSON.
 //! The digest covers the manifest text and every tensor (name, shape, bytes), so any changed bit is refused.
 
+use crate::codes::SnapshotCode;
 use crate::net::{Activation, Dense};
 use crate::normaliser::Normaliser;
 use crate::task::Task;
@@ -176,16 +177,17 @@ impl SnapshotError {
     /// Stable name of the reason, for logs, replies and `nearl explain`.
     pub fn code(&self) -> &'static str {
         match self {
-            Self::Unreadable { .. } => "snapshot-unreadable",
-            Self::Malformed { .. } => "snapshot-malformed",
-            Self::Foreign { .. } => "snapshot-foreign",
-            Self::Digest { .. } => "snapshot-digest",
-            Self::MissingTensor { .. } => "snapshot-missing-tensor",
-            Self::Shape { .. } => "snapshot-shape",
-            Self::Value { .. } => "snapshot-value",
-            Self::Unusable { .. } => "snapshot-unusable",
-            Self::Canary { .. } => "snapshot-canary",
+            Self::Unreadable { .. } => SnapshotCode::Unreadable,
+            Self::Malformed { .. } => SnapshotCode::Malformed,
+            Self::Foreign { .. } => SnapshotCode::Foreign,
+            Self::Digest { .. } => SnapshotCode::Digest,
+            Self::MissingTensor { .. } => SnapshotCode::MissingTensor,
+            Self::Shape { .. } => SnapshotCode::Shape,
+            Self::Value { .. } => SnapshotCode::Value,
+            Self::Unusable { .. } => SnapshotCode::Unusable,
+            Self::Canary { .. } => SnapshotCode::Canary,
         }
+        .name()
     }
 }
 

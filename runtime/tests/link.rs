@@ -85,7 +85,7 @@ fn a_plant_alone_brakes_from_the_start() {
 #[test]
 fn the_watchdog_takes_over_when_actions_stop() {
     let name = Name::new("watchdog");
-    let settings = PlantSettings { ticks: Some(400), watchdog: 0.05, ..PlantSettings::real_time(DT) };
+    let settings = PlantSettings { watchdog: 0.05, ..PlantSettings::real_time(DT) };
     let plant = PlantThread::start(&name, PointMass { q: 1.0, ..PointMass::default() }, settings);
     // A runtime that answers until its 20th action and then falls silent, as a killed one would.
     let (mut link, _) = nearl_runtime::rt::connect(&name.0, 5.0).unwrap();

@@ -5,6 +5,7 @@ mod demo;
 mod eval;
 mod plant;
 mod project;
+mod sweep;
 mod tasks;
 mod train;
 
@@ -25,6 +26,8 @@ pub struct Cli {
 enum Command {
     /// Train a policy on MuJoCo.
     Train(train::Train),
+    /// Train tasks x algorithms x seeds on all cores.
+    Sweep(sweep::SweepCommand),
     /// Run episodes without noise, raw and projected.
     Eval(eval::Eval),
     /// Plant and runtime as two processes, a hot swap, and the report.
@@ -37,6 +40,10 @@ enum Command {
     Plant(plant::PlantCommand),
     /// Run a snapshot on a plant in real time.
     Run(nearl_runtime::cli::RunCommand),
+    /// Compute every tick of a flight log again and compare it bit for bit.
+    Replay(nearl_runtime::cli::ReplayCommand),
+    /// Say what a code in a report, a log or a refusal means, and what to do.
+    Explain(nearl_runtime::cli::ExplainCommand),
     /// Check that a snapshot, this machine and a plant are ready.
     Doctor(nearl_runtime::doctor::DoctorCommand),
     /// List the bundled tasks.
@@ -51,12 +58,15 @@ impl Cli {
     pub fn run(self) -> Result<(), Failure> {
         match self.command {
             Command::Train(c) => c.run(),
+            Command::Sweep(c) => c.run(),
             Command::Eval(c) => c.run(),
             Command::Demo(c) => c.run(),
             Command::Project(c) => c.run(),
             Command::Bench(c) => c.run(),
             Command::Plant(c) => c.run(),
             Command::Run(c) => c.run(),
+            Command::Replay(c) => c.run(),
+            Command::Explain(c) => c.run(),
             Command::Doctor(c) => c.run(),
             Command::Tasks(c) => c.run(),
         }

@@ -14,5 +14,6 @@ pub mod rollout;
 pub mod run_folder;
 pub mod settings;
 pub mod stats;
+pub mod sweep;
 pub mod tasks;
 pub mod train;

@@ -81,6 +81,8 @@ pub struct Progress {
     pub return_mean: f64,
     /// Mean length of the last 100 episodes in policy steps.
     pub length_mean: f64,
+    /// Mean cost of the last 100 episodes.
+    pub cost_mean: f64,
     /// Counts of the iteration.
     pub tally: Tally,
     /// Numbers of the update.
@@ -101,6 +103,7 @@ pub struct Training {
     total: u64,
     seed: u64,
     recent: Vec<(f64, usize)>,
+    recent_costs: Vec<f64>,
     begin: Instant,
     /// Seconds of this training in earlier processes.
     earlier: f64,
@@ -166,6 +169,7 @@ impl Training {
             total: request.steps,
             seed: request.seed,
             recent: Vec::new(),
+            recent_costs: Vec::new(),
             begin: Instant::now(),
             earlier: 0.0,
             learning_seconds: 0.0,
@@ -180,6 +184,8 @@ impl Training {
         self.recent.extend_from_slice(&tally.episodes);
         let excess = self.recent.len().saturating_sub(100);
         self.recent.drain(..excess);
+        self.recent_costs.extend_from_slice(&tally.costs);
+        self.recent_costs.drain(..excess);
         let rate = if self.settings.anneal { 1.0 - self.fraction() as f32 } else { 1.0 };
         let learns = self.snapshot.manifest.steps > 0;
         self.merge_statistics();
@@ -202,9 +208,15 @@ impl Training {
             seconds: self.seconds(),
             return_mean: mean(|e| e.0),
             length_mean: mean(|e| e.1 as f64),
+            cost_mean: self.recent_costs.iter().sum::<f64>() / self.recent_costs.len() as f64,
             tally,
             metrics,
         }
+    }
+
+    /// Asks for `steps` more than were asked for, or were done, so far.
+    pub fn extend(&mut self, steps: u64) {
+        self.total = self.total.max(self.snapshot.manifest.steps) + steps;
     }
 
     /// Whether the requested steps are done.

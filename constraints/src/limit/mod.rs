@@ -4,6 +4,11 @@
 //! [`REGISTRY`]. Limits of single joints narrow the [`LimitSet`]; limits that tie joints together hand out [`Rows`] or a [`Cone`].
 
 mod acceleration;
+mod clearance;
+mod collision;
+mod energy;
+mod frame;
+mod frame_speed;
 mod jerk;
 mod locked;
 mod position;
@@ -17,6 +22,10 @@ mod velocity;
 mod velocity_profile;
 
 pub use acceleration::{AccelerationLimit, AccelerationSettings};
+pub use collision::{CollisionLimit, CollisionSettings, SolidSettings};
+pub use energy::{EnergyLimit, EnergySettings};
+pub use frame::{FrameBox, FrameLimit, FrameSettings, HalfSpace};
+pub use frame_speed::{FrameSpeedLimit, FrameSpeedSettings};
 pub use jerk::{JerkLimit, JerkSettings};
 pub use locked::LockedJoints;
 pub use position::{PositionLimit, PositionSettings};
@@ -135,6 +144,26 @@ pub const REGISTRY: &[Entry] = &[
         build: |s, _| Ok(one(&(!s.locked.is_empty()).then(|| s.locked.clone()), LockedJoints::new)),
     },
     Entry {
+        name: "frame",
+        example: "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.1] }, braking = 5.0 }]",
+        build: |s, _| Ok(each(&s.frame, FrameLimit::new)),
+    },
+    Entry {
+        name: "frame_speed",
+        example: "frame_speed = [{ frame = \"panda_hand\", limit = 0.25 }]",
+        build: |s, _| Ok(each(&s.frame_speed, FrameSpeedLimit::new)),
+    },
+    Entry {
+        name: "energy",
+        example: "energy = { limit = 2.0 }",
+        build: |s, _| Ok(one(&s.energy, EnergyLimit::new)),
+    },
+    Entry {
+        name: "collision",
+        example: "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \"floor\", shape = \"half_space\" }], braking = 2.0 }",
+        build: |s, _| Ok(one(&s.collision, CollisionLimit::new)),
+    },
+    Entry {
         name: "rows",
         example: "rows = [{ name = \"elbow up\", terms = { \"q.panda_joint4\" = 1.0 }, upper = -0.5, braking = 2.0 }]",
         build: |s, _| Ok(each(&s.rows, UserRow::new)),
@@ -177,4 +206,9 @@ fn listed<'a>(dofs: impl Iterator<Item = &'a usize>, text: impl Fn(usize) -> Str
 /// "'a', 'b'" over dofs.
 fn quoted(model: &Model, dofs: &[usize]) -> String {
     dofs.iter().map(|i| format!("'{}'", model.dof_name(*i))).collect::<Vec<_>>().join(", ")
+}
+
+/// "'a', 'b'".
+fn quoted_names(names: &[&str]) -> String {
+    names.iter().map(|n| format!("'{n}'")).collect::<Vec<_>>().join(", ")
 }

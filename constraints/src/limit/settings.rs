@@ -1,8 +1,9 @@
 //! The `[constraints]` section of a task file.
 
 use super::{
-    AccelerationSettings, JerkSettings, PositionSettings, TorqueRateSettings, TorqueSettings,
-    TorqueSpeedSettings, UserRowSettings, VelocityProfileSettings, VelocitySettings,
+    AccelerationSettings, CollisionSettings, EnergySettings, FrameSettings, FrameSpeedSettings, JerkSettings,
+    PositionSettings, TorqueRateSettings, TorqueSettings, TorqueSpeedSettings, UserRowSettings,
+    VelocityProfileSettings, VelocitySettings,
 };
 use crate::{Braking, Consistency, LimitError, Model, Solver};
 use serde::{Deserialize, Serialize};
@@ -45,6 +46,18 @@ pub struct ConstraintSettings {
     /// `locked = ["joint"]`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub locked: Vec<String>,
+    /// `frame = [{ frame, point, half_space, box, braking, margin, soft }]`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub frame: Vec<FrameSettings>,
+    /// `frame_speed = [{ frame, point, limit }]`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub frame_speed: Vec<FrameSpeedSettings>,
+    /// `energy = { limit = 2.0 }`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub energy: Option<EnergySettings>,
+    /// `collision = { shapes, urdf, ignore, adjacent, braking, margin, influence, rows, soft }`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub collision: Option<CollisionSettings>,
     /// `rows = [{ name, terms, lower, upper, equals, braking, soft }]`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub rows: Vec<UserRowSettings>,

@@ -69,6 +69,11 @@ impl Projector {
         self.external.copy_from_slice(forces);
     }
 
+    /// The forces last set (nv).
+    pub fn external_forces(&self) -> &[f64] {
+        &self.external
+    }
+
     /// True when some limit speaks of the tick before.
     pub fn needs_previous(&self) -> bool {
         self.checker.needs().previous

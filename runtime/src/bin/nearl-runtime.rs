@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use nearl_runtime::cli::{LoopBench, RunCommand};
+use nearl_runtime::cli::{ExplainCommand, LoopBench, ReplayCommand, RunCommand};
 use nearl_runtime::doctor::DoctorCommand;
 
 #[derive(Parser)]
@@ -17,6 +17,10 @@ struct Arguments {
 enum Command {
     /// Run a snapshot on a plant in real time.
     Run(RunCommand),
+    /// Compute every tick of a flight log again and compare it bit for bit.
+    Replay(ReplayCommand),
+    /// Say what a code means and what to do.
+    Explain(ExplainCommand),
     /// Check that a snapshot, this machine and a plant are ready.
     Doctor(DoctorCommand),
     /// Measure this machine: shared-memory round trip, or wake-up of an empty loop.
@@ -29,6 +33,8 @@ enum Command {
 fn main() -> ExitCode {
     let result = match Arguments::parse().command {
         Command::Run(command) => command.run(),
+        Command::Replay(command) => command.run(),
+        Command::Explain(command) => command.run(),
         Command::Doctor(command) => command.run(),
         Command::Bench { what } => what.run(),
     };

@@ -88,51 +88,34 @@ impl RobotMessage {
     }
 }
 
-/// Answer to a snapshot, by reason.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Verdict {
-    /// In use from the tick named in the receipt.
-    Accepted,
-    /// Not a snapshot, truncated, or the digest does not match the bytes.
-    Corrupt,
-    /// Made for other joints.
-    ForeignRobot,
-    /// Made for another observation, other sizes or another layout.
-    ForeignShape,
-    /// Made for another control period.
-    ForeignPeriod,
-    /// Holds numbers that are not finite, or gave such an answer on a trial state.
-    NotFinite,
-    /// Older than or as old as the one in use.
-    Outdated,
-    /// A newer one came before this one was taken into use.
-    Superseded,
-    /// Refused for the reason in the text.
-    Other,
+crate::codes::codes! {
+    /// Answer to a snapshot, by reason.
+    Verdict, "verdict" {
+        Accepted = "accepted", "The snapshot is in use from the tick named in the receipt.", "Nothing to do.";
+        Corrupt = "corrupt", "Not a snapshot, cut short, or the digest does not match the bytes.",
+            "Send the file again as `nearl train` wrote it.";
+        ForeignRobot = "foreign-robot", "Made for other joints, limits or actuators.",
+            "Use a snapshot trained with the plant's robot file.";
+        ForeignShape = "foreign-shape", "Made for another observation, other sizes or another layout.",
+            "Use a snapshot trained for the plant's task.";
+        ForeignPeriod = "foreign-period", "Made for another control period.",
+            "Start the plant with the snapshot's task, or train with the plant's period.";
+        NotFinite = "not-finite", "Holds numbers that are not finite or far too large, or gave such an answer on a trial state.",
+            "Push an earlier snapshot: the training diverged.";
+        Outdated = "outdated", "Not newer than the last one of the same sender.",
+            "Give each push a higher version.";
+        Superseded = "superseded", "A newer one came before this one was taken into use.",
+            "Nothing to do, or push less often.";
+        Other = "other", "Refused for the reason in the receipt's text.", "Read the text of the receipt.";
+        RolledBack = "rolled-back", "Taken back after its swap: the robot no longer reached its targets, the one before is in use again.",
+            "Train on with the transitions of that stretch, or raise the rollback factor if the rise was expected.";
+    }
 }
 
-const VERDICTS: [Verdict; 9] = [
-    Verdict::Accepted,
-    Verdict::Corrupt,
-    Verdict::ForeignRobot,
-    Verdict::ForeignShape,
-    Verdict::ForeignPeriod,
-    Verdict::NotFinite,
-    Verdict::Outdated,
-    Verdict::Superseded,
-    Verdict::Other,
-];
-
 impl Verdict {
-    /// The number in a message.
-    pub fn code(self) -> u32 {
-        self as u32
-    }
-
     /// The verdict of a message; numbers this build does not know are `Other`.
     pub fn from_code(code: u32) -> Verdict {
-        VERDICTS.get(code as usize).copied().unwrap_or(Verdict::Other)
+        Verdict::ALL.get(code as usize).copied().unwrap_or(Verdict::Other)
     }
 }
 
@@ -192,7 +175,7 @@ mod tests {
 
     #[test]
     fn verdict_codes_are_their_index() {
-        for (i, verdict) in VERDICTS.iter().enumerate() {
+        for (i, verdict) in Verdict::ALL.iter().enumerate() {
             assert_eq!(verdict.code() as usize, i);
         }
         assert_eq!(Verdict::from_code(99), Verdict::Other);

@@ -1,6 +1,7 @@
 //! What can go wrong while connecting or sending: one sentence each, with the next step.
 
 use super::RobotName;
+use crate::codes::LinkCode;
 
 /// Failure of a link call.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -99,4 +100,23 @@ pub enum LinkError {
         /// Files of the link.
         files: String,
     },
+}
+
+impl LinkError {
+    /// Stable name of the reason, for logs, replies and `nearl explain`.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::Name(_) => LinkCode::Name,
+            Self::Capacity { .. } => LinkCode::Capacity,
+            Self::NoPlant(_) => LinkCode::NoPlant,
+            Self::NoRuntime(_) => LinkCode::NoRuntime,
+            Self::Taken { .. } => LinkCode::Taken,
+            Self::Full { .. } => LinkCode::Full,
+            Self::Schema { .. } => LinkCode::Schema,
+            Self::Memory { .. } => LinkCode::Memory,
+            Self::MemoryMissing { .. } => LinkCode::MemoryMissing,
+            Self::Transport { .. } => LinkCode::Transport,
+        }
+        .name()
+    }
 }

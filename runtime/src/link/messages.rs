@@ -87,7 +87,7 @@ message! {
 
 message! {
     /// The action for one state.
-    ActionMessage, "action", version 1, buffer 4, history 0, subscribers 4 {
+    ActionMessage, "action", version 2, buffer 4, history 0, subscribers 4 {
         /// Tick of the runtime.
         tick: u64,
         /// `header.seq` of the state it was computed from.
@@ -161,7 +161,7 @@ pub struct LedgerNumbers {
 
 message! {
     /// One tick as the trainer learns from it.
-    TransitionMessage, "transition", version 1, buffer 1024, history 0, subscribers 2 {
+    TransitionMessage, "transition", version 2, buffer 1024, history 0, subscribers 2 {
         /// Tick of the runtime.
         tick: u64,
         /// `header.epoch` of the plant.
@@ -249,7 +249,7 @@ message! {
 
 message! {
     /// How the loop is doing, about ten times a second.
-    HealthMessage, "health", version 1, buffer 2, history 1, subscribers 8 {
+    HealthMessage, "health", version 2, buffer 2, history 1, subscribers 8 {
         /// Ticks so far.
         tick: u64,
         /// [`crate::rt::Mode`] as a number.
@@ -272,6 +272,12 @@ message! {
         swaps: u64,
         /// Snapshots refused.
         refused_snapshots: u64,
+        /// Snapshots taken back because the robot no longer reached its targets.
+        rolled_back: u64,
+        /// [`crate::rt::Reason`] as a number.
+        reason: u32,
+        /// Fills the line.
+        reserved: u32,
         /// Flight log records dropped.
         log_drops: u64,
         /// Limits the raw proposals broke.

@@ -1,6 +1,7 @@
 //! The queue in front of the file, and the thread behind it.
 
-use std::collections::BTreeMap;
+use std::borrow::Cow;
+use std::collections::{BTreeMap, HashSet};
 use std::fs::File;
 use std::io::{BufWriter, Seek, Write};
 use std::path::{Path, PathBuf};
@@ -12,14 +13,47 @@ use std::time::Duration;
 use mcap::records::MessageHeader;
 use mcap::{WriteOptions, Writer};
 use rtrb::{Consumer, Producer, RingBuffer};
+use serde::{Deserialize, Serialize};
 
-use super::encode::{SCHEMA, encode};
+use super::tick::{SCHEMA, encode};
 use crate::rt::Record;
 
-/// Records the queue holds: about 7 MB.
+/// Records the queue holds: about 9 MB.
 const CAPACITY: usize = 1024;
+/// Snapshots the queue holds, and the bytes of all that wait.
+const SNAPSHOTS: usize = 16;
+const SNAPSHOT_BYTES: u64 = 512 << 20;
+/// Topic of the ticks.
+pub(super) const TICK_TOPIC: &str = "tick";
+/// Topic that says which snapshot number is which attachment.
+pub(super) const SNAPSHOT_TOPIC: &str = "snapshot";
+const SNAPSHOT_SCHEMA: &str = r#"{"title": "nearl.Snapshot", "type": "object", "properties": {
+  "id": {"type": "integer"}, "version": {"type": "integer"}, "digest": {"type": "string"}, "bytes": {"type": "integer"}}}"#;
 /// The thread looks for records this often.
 const POLL: Duration = Duration::from_millis(2);
+
+/// A snapshot that may come into use: one message of topic `snapshot`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct SnapshotEntry {
+    /// In the order they were received; 0 for the first.
+    pub(super) id: u64,
+    pub(super) version: u64,
+    /// blake3 of the bytes, in hex.
+    pub(super) digest: String,
+    pub(super) bytes: u64,
+}
+
+/// Name of the attachment that holds the bytes with `digest`.
+pub(super) fn attachment_name(digest: &str) -> String {
+    format!("{digest}.safetensors")
+}
+
+/// A snapshot on its way to the file.
+struct Waiting {
+    id: u64,
+    version: u64,
+    bytes: Vec<u8>,
+}
 
 /// The flight log cannot be started.
 #[derive(Debug, thiserror::Error)]
@@ -36,6 +70,8 @@ pub struct LogSummary {
     pub written: u64,
     /// Records lost: the queue or the disk was full.
     pub dropped: u64,
+    /// Snapshots lost for the same reason: replay ends where they came into use.
+    pub dropped_snapshots: u64,
     /// Why writing stopped before the end.
     pub error: Option<String>,
 }
@@ -44,11 +80,14 @@ pub struct LogSummary {
 struct Shared {
     over: AtomicBool,
     dropped: AtomicU64,
+    dropped_snapshots: AtomicU64,
+    snapshot_bytes: AtomicU64,
 }
 
 /// The open log. Pushing never blocks; [`LogQueue::finish`] closes the file.
 pub struct LogQueue {
     records: Producer<Record>,
+    snapshots: Producer<Waiting>,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<LogSummary>>,
 }
@@ -64,21 +103,33 @@ impl LogQueue {
     fn start(sink: Box<dyn Sink>, metadata: &BTreeMap<String, String>) -> Result<LogQueue, String> {
         let writer = open(sink, metadata).map_err(|e| e.to_string())?;
         let (records, waiting) = RingBuffer::new(CAPACITY);
+        let (snapshots, snapshots_out) = RingBuffer::new(SNAPSHOTS);
         let shared = Arc::new(Shared::default());
         let thread = std::thread::Builder::new()
             .name("nearl-log".into())
             .spawn({
                 let shared = Arc::clone(&shared);
-                move || write_all(writer, waiting, &shared)
+                move || write_all(writer, waiting, snapshots_out, &shared)
             })
             .map_err(|e| e.to_string())?;
-        Ok(LogQueue { records, shared, thread: Some(thread) })
+        Ok(LogQueue { records, snapshots, shared, thread: Some(thread) })
     }
 
     /// Adds a record; drops and counts it if the queue is full.
     pub fn push(&mut self, record: &Record) {
         if self.records.push(*record).is_err() {
             self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Adds a snapshot before the first record that uses it; drops and counts it if too many bytes wait.
+    pub(crate) fn push_snapshot(&mut self, id: u64, version: u64, bytes: Vec<u8>) {
+        let (shared, length) = (&self.shared, bytes.len() as u64);
+        let has_room = shared.snapshot_bytes.load(Ordering::Acquire) + length <= SNAPSHOT_BYTES;
+        shared.snapshot_bytes.fetch_add(length, Ordering::AcqRel);
+        if !has_room || self.snapshots.push(Waiting { id, version, bytes }).is_err() {
+            shared.snapshot_bytes.fetch_sub(length, Ordering::AcqRel);
+            shared.dropped_snapshots.fetch_add(1, Ordering::Relaxed);
         }
     }
 
@@ -98,7 +149,7 @@ impl LogQueue {
         summary.unwrap_or_else(|| LogSummary {
             dropped: self.dropped(),
             error: Some("the log thread panicked".into()),
-            written: 0,
+            ..LogSummary::default()
         })
     }
 }
@@ -115,10 +166,13 @@ impl Drop for LogQueue {
 trait Sink: Write + Seek + Send {}
 impl<T: Write + Seek + Send> Sink for T {}
 
-/// An open file with its one channel.
+/// An open file with its channels.
 struct Log {
     writer: Writer<BufWriter<Box<dyn Sink>>>,
-    channel: u16,
+    ticks: u16,
+    snapshots: u16,
+    /// Digests of the attachments so far: the same bytes are written once.
+    attached: HashSet<String>,
     line: Vec<u8>,
 }
 
@@ -126,22 +180,49 @@ fn open(sink: Box<dyn Sink>, metadata: &BTreeMap<String, String>) -> mcap::McapR
     let options = WriteOptions::new().compression(None).chunk_size(Some(256 << 10)).library("nearl");
     let mut writer = options.create(BufWriter::new(sink))?;
     let schema = writer.add_schema("nearl.Tick", "jsonschema", SCHEMA.as_bytes())?;
-    let channel = writer.add_channel(schema, "tick", "json", &BTreeMap::new())?;
+    let ticks = writer.add_channel(schema, TICK_TOPIC, "json", &BTreeMap::new())?;
+    let schema = writer.add_schema("nearl.Snapshot", "jsonschema", SNAPSHOT_SCHEMA.as_bytes())?;
+    let snapshots = writer.add_channel(schema, SNAPSHOT_TOPIC, "json", &BTreeMap::new())?;
     writer.write_metadata(&mcap::records::Metadata { name: "nearl".into(), metadata: metadata.clone() })?;
     writer.flush()?;
-    Ok(Log { writer, channel, line: Vec::with_capacity(16 << 10) })
+    Ok(Log { writer, ticks, snapshots, attached: HashSet::new(), line: Vec::with_capacity(16 << 10) })
 }
 
 impl Log {
     fn write(&mut self, record: &Record) -> Result<(), String> {
         encode(record, &mut self.line).map_err(|e| e.to_string())?;
         let header = MessageHeader {
-            channel_id: self.channel,
+            channel_id: self.ticks,
             sequence: record.tick as u32,
             log_time: record.end,
             publish_time: record.begin,
         };
         self.writer.write_to_known_channel(&header, &self.line).map_err(|e| e.to_string())
+    }
+
+    fn attach(&mut self, snapshot: &Waiting) -> Result<(), String> {
+        let fail = |e: mcap::McapError| e.to_string();
+        let now = crate::rt::clock::now();
+        let entry = SnapshotEntry {
+            id: snapshot.id,
+            version: snapshot.version,
+            digest: blake3::hash(&snapshot.bytes).to_hex().to_string(),
+            bytes: snapshot.bytes.len() as u64,
+        };
+        if self.attached.insert(entry.digest.clone()) {
+            let attachment = mcap::Attachment {
+                log_time: now,
+                create_time: now,
+                name: attachment_name(&entry.digest),
+                media_type: "application/octet-stream".into(),
+                data: Cow::Borrowed(&snapshot.bytes),
+            };
+            self.writer.attach(&attachment).map_err(fail)?;
+        }
+        let line = serde_json::to_vec(&entry).map_err(|e| e.to_string())?;
+        let sequence = snapshot.id as u32;
+        let header = MessageHeader { channel_id: self.snapshots, sequence, log_time: now, publish_time: now };
+        self.writer.write_to_known_channel(&header, &line).map_err(fail)
     }
 
     fn close(mut self) -> Result<(), String> {
@@ -151,12 +232,19 @@ impl Log {
 }
 
 /// Writes until the end; after the first error everything else is dropped and counted.
-fn write_all(mut log: Log, mut waiting: Consumer<Record>, shared: &Shared) -> LogSummary {
+fn write_all(
+    mut log: Log,
+    mut waiting: Consumer<Record>,
+    mut snapshots: Consumer<Waiting>,
+    shared: &Shared,
+) -> LogSummary {
     crate::rt::thread::be_last();
     let mut summary = LogSummary::default();
     loop {
         let is_over = shared.over.load(Ordering::Acquire);
         while let Ok(record) = waiting.peek() {
+            // A snapshot is pushed before the first record that uses it, so it is seen here at the latest.
+            attach_all(&mut log, &mut snapshots, shared, &mut summary.error);
             match &summary.error {
                 Some(_) => drop_one(shared),
                 None => match log.write(record) {
@@ -169,6 +257,7 @@ fn write_all(mut log: Log, mut waiting: Consumer<Record>, shared: &Shared) -> Lo
             }
             let _ = waiting.pop();
         }
+        attach_all(&mut log, &mut snapshots, shared, &mut summary.error);
         if is_over {
             break;
         }
@@ -178,7 +267,19 @@ fn write_all(mut log: Log, mut waiting: Consumer<Record>, shared: &Shared) -> Lo
         summary.error.get_or_insert(error);
     }
     summary.dropped = shared.dropped.load(Ordering::Relaxed);
+    summary.dropped_snapshots = shared.dropped_snapshots.load(Ordering::Relaxed);
     summary
+}
+
+fn attach_all(log: &mut Log, snapshots: &mut Consumer<Waiting>, shared: &Shared, error: &mut Option<String>) {
+    while let Ok(snapshot) = snapshots.pop() {
+        shared.snapshot_bytes.fetch_sub(snapshot.bytes.len() as u64, Ordering::AcqRel);
+        let result = if error.is_some() { Err(String::new()) } else { log.attach(&snapshot) };
+        if let Err(reason) = result {
+            error.get_or_insert(reason);
+            shared.dropped_snapshots.fetch_add(1, Ordering::Relaxed);
+        }
+    }
 }
 
 fn drop_one(shared: &Shared) {

@@ -49,6 +49,29 @@ impl Brake {
     /// Proposes rest, `v' = 0` and `q' = q + T v - kappa T v`, and returns the torque [N m] for the nearest allowed
     /// state. Joints that are not controllable keep their velocity.
     pub fn update(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
+        self.propose_rest(q, v);
+        self.act(q, v)
+    }
+
+    /// The same for a proposal between rest and a target (nq, nv): `share` of the way from the one to the other.
+    pub fn approach(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        target_q: &[f64],
+        target_v: &[f64],
+        share: f64,
+    ) -> (Status, &[f64]) {
+        self.propose_rest(q, v);
+        for &(dof, idx_q) in &self.joints {
+            let (rest_q, rest_v) = (self.proposal.q[idx_q], self.proposal.v[dof]);
+            self.proposal.q[idx_q] = rest_q + share * (target_q[idx_q] - rest_q);
+            self.proposal.v[dof] = rest_v + share * (target_v[dof] - rest_v);
+        }
+        self.act(q, v)
+    }
+
+    fn propose_rest(&mut self, q: &[f64], v: &[f64]) {
         let Period { dt, kappa, .. } = self.period;
         self.proposal.q.copy_from_slice(q);
         self.proposal.v.copy_from_slice(v);
@@ -56,6 +79,9 @@ impl Brake {
             self.proposal.v[dof] = 0.0;
             self.proposal.q[idx_q] = q[idx_q] + dt * v[dof] - kappa * dt * v[dof];
         }
+    }
+
+    fn act(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
         let status = self.projector.project(q, v, &self.proposal, &mut self.target);
         self.idm.torque(q, v, &self.target, &mut self.action);
         for (action, &(lower, upper)) in self.action.iter_mut().zip(&self.range) {

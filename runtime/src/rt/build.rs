@@ -10,28 +10,38 @@ use crate::rt::tick::{Build, Refusal};
 
 /// A finished job.
 pub(crate) struct Built<T> {
+    /// Number of the snapshot, in the order they were received.
+    pub(crate) id: u64,
     pub(crate) header: SnapshotHeader,
+    pub(crate) bytes: Vec<u8>,
     pub(crate) result: Result<Box<T>, Refusal>,
 }
 
 /// The thread that builds, seen from the I/O thread. No call blocks.
 pub(crate) struct Builder<B: Build> {
-    jobs: Option<SyncSender<(SnapshotBytes, RobotMessage)>>,
+    jobs: Option<SyncSender<Job>>,
     built: Receiver<Built<B::Controller>>,
     thread: Option<JoinHandle<()>>,
-    waiting: Option<(SnapshotBytes, RobotMessage)>,
+    waiting: Option<Job>,
     busy: bool,
+}
+
+struct Job {
+    id: u64,
+    snapshot: SnapshotBytes,
+    robot: RobotMessage,
 }
 
 impl<B: Build> Builder<B> {
     pub(crate) fn start(mut build: B) -> std::io::Result<Builder<B>> {
-        let (jobs, work) = sync_channel::<(SnapshotBytes, RobotMessage)>(1);
+        let (jobs, work) = sync_channel::<Job>(1);
         let (done, built) = sync_channel(2);
         let thread = std::thread::Builder::new().name("nearl-build".into()).spawn(move || {
             thread::be_last();
-            for (snapshot, robot) in work {
+            for Job { id, snapshot, robot } in work {
                 let result = build_one(&mut build, &snapshot, &robot);
-                if done.send(Built { header: snapshot.header, result }).is_err() {
+                let SnapshotBytes { header, bytes } = snapshot;
+                if done.send(Built { id, header, bytes, result }).is_err() {
                     return;
                 }
             }
@@ -40,8 +50,13 @@ impl<B: Build> Builder<B> {
     }
 
     /// Takes a job; returns the header of the one it replaces, which is then never built.
-    pub(crate) fn take(&mut self, snapshot: SnapshotBytes, robot: RobotMessage) -> Option<SnapshotHeader> {
-        let replaced = self.waiting.replace((snapshot, robot)).map(|(old, _)| old.header);
+    pub(crate) fn take(
+        &mut self,
+        id: u64,
+        snapshot: SnapshotBytes,
+        robot: RobotMessage,
+    ) -> Option<SnapshotHeader> {
+        let replaced = self.waiting.replace(Job { id, snapshot, robot }).map(|old| old.snapshot.header);
         self.feed();
         replaced
     }

@@ -7,21 +7,26 @@
 //! - [`Sync::Clock`]: a tick begins on this thread's own absolute grid, with the newest state. For plants that
 //!   stream states at another rate; the action then meets a state up to one period older.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
 use hdrhistogram::Histogram;
 use rtrb::{Consumer, Producer};
 
 use crate::link::{ActionMessage, Message, StateMessage};
+use crate::rt::Stop;
 use crate::rt::clock::{self, Bell};
-use crate::rt::mode::{Event, Mode, ModeLimits, Modes};
+use crate::rt::core::{Core, CoreSettings, Inputs, Loaded};
+use crate::rt::faults::FaultPlan;
+use crate::rt::mode::Mode;
 use crate::rt::swap::Slot;
-use crate::rt::tick::{Outcome, Record, Step, Tick};
-use crate::rt::{Grid, Stop};
+use crate::rt::thread::Usage;
+use crate::rt::tick::{Record, Sensed, Tick};
+
+/// Ticks after which page faults and context switches of the thread are counted.
+const WARM: u64 = 300;
 
 /// Who keeps time.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Sync {
     /// The arrival of a state begins a tick.
@@ -30,24 +35,16 @@ pub enum Sync {
     Clock,
 }
 
-/// Settings of the loop; times in [ns].
+/// Settings of the loop beside those of its ticks; times in [ns].
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CycleSettings {
-    pub(crate) period: u64,
-    pub(crate) sync: Sync,
-    /// A state older than this is stale.
-    pub(crate) age_limit: u64,
+    pub(crate) core: CoreSettings,
     /// So long before and after the moment a state is due, the thread polls instead of sleeping.
     pub(crate) spin: u64,
-    /// The plant keeps real time: a tick longer than the period is an overrun.
-    pub(crate) real_time: bool,
     /// Ticks until the loop stops by itself.
     pub(crate) ticks: Option<u64>,
-    /// Largest speed entry that counts as standing still when stopping [1/s].
-    pub(crate) stop_speed: f64,
     /// Ticks of braking after which the loop ends anyway.
     pub(crate) stop_ticks: u64,
-    pub(crate) modes: ModeLimits,
 }
 
 /// The ends of the rings that belong to this thread.
@@ -55,7 +52,7 @@ pub(crate) struct Ends<T: Tick> {
     pub(crate) states: Consumer<StateMessage>,
     pub(crate) actions: Producer<ActionMessage>,
     pub(crate) records: Producer<Record>,
-    pub(crate) slot: Slot<T>,
+    pub(crate) slot: Slot<Loaded<T>>,
     pub(crate) bell: Arc<Bell>,
 }
 
@@ -64,16 +61,11 @@ pub(crate) struct Cycle<T: Tick> {
     settings: CycleSettings,
     ends: Ends<T>,
     stop: Stop,
-    controller: Box<T>,
-    modes: Modes,
-    grid: Grid,
-    record: Record,
+    core: Core<T>,
+    fresh: Option<StateMessage>,
     action: ActionMessage,
-    overran: bool,
-    usable: bool,
-    /// `brake` panicked: it is not called again on this controller. A panic of `tick` latches Fault.
-    brake_broken: bool,
     stopping: u64,
+    dropped: (u64, u64),
     pub(crate) wake: Histogram<u64>,
     pub(crate) compute: Histogram<u64>,
 }
@@ -83,53 +75,60 @@ pub(crate) struct CycleEnd<T: Tick> {
     pub(crate) last: Record,
     pub(crate) wake: Histogram<u64>,
     pub(crate) compute: Histogram<u64>,
+    pub(crate) usage: Usage,
     /// Only carried, so that another thread drops it.
-    _rest: (Box<T>, Ends<T>),
+    _rest: (Core<T>, Ends<T>),
 }
 
 impl<T: Tick> Cycle<T> {
-    pub(crate) fn new(settings: CycleSettings, controller: Box<T>, ends: Ends<T>, stop: Stop) -> Cycle<T> {
+    pub(crate) fn new(
+        settings: CycleSettings,
+        first: Box<Loaded<T>>,
+        faults: FaultPlan,
+        ends: Ends<T>,
+        stop: Stop,
+    ) -> Cycle<T> {
         Cycle {
-            modes: Modes::new(settings.modes),
-            grid: Grid::new(0, settings.period),
-            record: Record::new(),
+            core: Core::new(settings.core, first, 0, faults),
+            fresh: None,
             action: ActionMessage::zeroed(),
-            overran: false,
-            usable: false,
-            brake_broken: false,
             stopping: 0,
+            dropped: (0, 0),
             wake: histogram(),
             compute: histogram(),
             settings,
             ends,
             stop,
-            controller,
         }
     }
 
     /// Runs until a stop was asked for and the plant stands still.
     pub(crate) fn run(mut self) -> CycleEnd<T> {
-        self.grid = Grid::new(clock::now(), self.settings.period);
+        self.core.start(clock::now());
+        let mut usage = Usage::default();
         while !self.is_over() {
             self.wait();
             self.swap();
-            let event = self.sense();
-            self.decide(event);
-            self.act();
+            self.update();
             self.send();
             self.account();
+            if self.core.record.tick == WARM {
+                usage = Usage::of_this_thread();
+            }
         }
-        let Cycle { record, wake, compute, controller, ends, .. } = self;
-        CycleEnd { last: record, wake, compute, _rest: (controller, ends) }
+        let usage = Usage::of_this_thread().since(usage);
+        let Cycle { wake, compute, core, ends, .. } = self;
+        CycleEnd { last: core.record, wake, compute, usage, _rest: (core, ends) }
     }
 
     fn is_stopping(&self) -> bool {
-        self.stop.is_requested() || self.settings.ticks.is_some_and(|n| self.record.tick >= n)
+        self.stop.is_requested() || self.settings.ticks.is_some_and(|n| self.core.record.tick >= n)
     }
 
     fn is_over(&self) -> bool {
-        let still = self.record.state.v().iter().all(|v| v.abs() <= self.settings.stop_speed);
-        let blind = self.record.mode == Mode::Hold || !self.usable;
+        let (record, state) = (&self.core.record, self.core.estimate());
+        let still = state.v().iter().all(|v| v.abs() <= self.settings.core.stop_speed);
+        let blind = record.mode == Mode::Hold || record.sensed == Sensed::Missing;
         // At least one braking action must have gone out, whatever the speed.
         self.is_stopping()
             && self.stopping > 0
@@ -138,21 +137,18 @@ impl<T: Tick> Cycle<T> {
 
     /// Waits for the next state or the next slot, by [`Sync`].
     fn wait(&mut self) {
-        match self.settings.sync {
-            Sync::Clock => {
-                clock::sleep_until(self.grid.due());
-                self.record.due = self.grid.due();
-            }
+        match self.settings.core.sync {
+            Sync::Clock => clock::sleep_until(self.core.due()),
             Sync::Plant => self.wait_for_state(),
         }
-        self.record.begin = clock::now();
     }
 
     /// Sleeps on the bell, but is awake around the moment the state is due: waking an idle core costs more than the
     /// whole exchange.
     fn wait_for_state(&mut self) {
-        let last = clock::now() + self.settings.age_limit;
-        let expected = self.record.state.header.stamp + self.settings.period;
+        let core = &self.settings.core;
+        let last = clock::now() + core.age_limit;
+        let expected = self.core.record.state.header.stamp + core.period;
         let awake = expected.saturating_sub(self.settings.spin)..expected + self.settings.spin;
         loop {
             let seen = self.ends.bell.seen();
@@ -172,95 +168,29 @@ impl<T: Tick> Cycle<T> {
 
     /// Takes a new controller if one waits: always between two ticks.
     fn swap(&mut self) {
-        self.record.swapped = self.ends.slot.swap(&mut self.controller);
-        if self.record.swapped {
-            self.controller.reset();
-            self.brake_broken = false;
-            self.record.counters.swaps += 1;
-        }
-        self.record.policy_version = self.controller.version();
+        let swapped = self.ends.slot.swap(&mut self.core.controller);
+        self.core.swap(swapped);
     }
 
-    /// Takes the newest state and says what it is worth.
-    fn sense(&mut self) -> Event {
-        let (known, episode) = (self.record.state.header, self.record.state.episode);
-        self.record.fresh = false;
+    /// Takes the newest state and lets the controller act or brake.
+    fn update(&mut self) {
+        let begin = clock::now();
+        // The tick that is beginning is counted already; a stop by their number comes after the last of them.
+        let stop = self.stop.is_requested() || self.settings.ticks.is_some_and(|n| self.core.record.tick > n);
+        self.fresh = None;
         while let Ok(state) = self.ends.states.pop() {
-            self.record.state = state;
-            self.record.fresh = true;
+            self.fresh = Some(state);
         }
-        let state = &self.record.state;
-        let is_late = self.record.begin.saturating_sub(state.header.stamp) > self.settings.age_limit;
-        if self.record.fresh {
-            let is_next = state.header.epoch == known.epoch && state.header.seq > known.seq;
-            let lost = if is_next { state.header.seq - known.seq - 1 } else { 0 };
-            self.record.counters.lost_states += lost;
-            // By its number: the state that began the episode may be among the lost ones.
-            if !is_next || state.episode != episode {
-                self.controller.reset();
-            }
-            if self.settings.sync == Sync::Plant {
-                self.record.due = state.header.stamp;
-            }
-            if !state.is_finite() {
-                self.record.counters.bad_states += 1;
-                return Event::Bad;
-            }
-        } else if self.settings.sync == Sync::Clock && !is_late && known.seq > 0 {
-            self.record.counters.repeated += 1;
-            return Event::Good;
+        let inputs = Inputs { due: self.core.due(), begin, stop, fresh: self.fresh.as_ref() };
+        self.core.update(&inputs);
+        let periods = self.core.rehearsed_periods();
+        if periods > 0.0 {
+            while clock::now() < begin + (periods * self.settings.core.period as f64) as u64 {}
         }
-        if is_late || !self.record.fresh {
-            return Event::Stale;
-        }
-        Event::Good
-    }
-
-    fn decide(&mut self, event: Event) {
-        let stop = self.is_stopping();
-        self.record.mode = self.modes.update(event, self.overran, stop);
-        if event == Event::Stale && self.record.mode != Mode::Hold {
-            self.record.counters.stale += 1;
-        }
-        // A state that is bad or old is not acted upon: the plant brakes by itself.
-        self.usable = event == Event::Good;
-    }
-
-    /// Lets the controller act or brake; without an answer `nu` is 0 and the plant brakes by itself.
-    fn act(&mut self) {
-        self.record.step.nu = 0;
-        if self.record.mode == Mode::Active {
-            match self.call(T::tick) {
-                Some(Outcome::Acted) => {}
-                Some(Outcome::Refused) => {
-                    self.record.counters.refused += 1;
-                    self.record.mode = self.modes.update(Event::Refused, false, self.is_stopping());
-                }
-                None => self.record.mode = self.modes.update(Event::Panicked, false, false),
-            }
-        }
-        let brakes = matches!(self.record.mode, Mode::Braking | Mode::Fault) && self.usable;
-        if brakes && !self.brake_broken && self.call(T::brake).is_none() {
-            self.brake_broken = true;
-            self.record.mode = self.modes.update(Event::Panicked, false, false);
-        }
-        self.record.reason = self.modes.reason();
-    }
-
-    /// Calls a verb of the controller; `None` if it panicked.
-    fn call(&mut self, verb: fn(&mut T, &StateMessage, &mut Step) -> Outcome) -> Option<Outcome> {
-        let (controller, record) = (&mut self.controller, &mut self.record);
-        let called = catch_unwind(AssertUnwindSafe(|| verb(controller, &record.state, &mut record.step)));
-        let outcome = called.ok();
-        if outcome != Some(Outcome::Acted) {
-            self.record.step.nu = 0;
-        }
-        outcome
     }
 
     fn send(&mut self) {
-        self.record.tick += 1;
-        let record = &self.record;
+        let record = &self.core.record;
         let header = record.state.header;
         self.action.tick = record.tick;
         (self.action.state_seq, self.action.state_epoch) = (header.seq, header.epoch);
@@ -268,46 +198,20 @@ impl<T: Tick> Cycle<T> {
         self.action.policy_version = record.policy_version;
         self.action.nu = record.step.nu;
         self.action.action = record.step.action;
-        if self.ends.actions.push(self.action).is_err() {
-            self.record.counters.dropped_actions += 1;
-        }
-        self.record.end = clock::now();
+        self.dropped.0 += u64::from(self.ends.actions.push(self.action).is_err());
     }
 
     fn account(&mut self) {
-        self.finish();
-        let record = &mut self.record;
-        if record.fresh || self.settings.sync == Sync::Clock {
+        self.core.close(clock::now());
+        let record = &mut self.core.record;
+        (record.counters.dropped_actions, record.counters.dropped_records) = self.dropped;
+        if record.fresh || self.settings.core.sync == Sync::Clock {
             self.wake.saturating_record(record.begin.saturating_sub(record.due));
             self.compute.saturating_record(record.end - record.begin);
         }
-        if record.mode == Mode::Active {
-            record.counters.raw_violations += u64::from(record.step.ledger.raw_violations);
-            record.counters.projected_violations += u64::from(record.step.ledger.projected_violations);
-        }
-        record.counters.mode_ticks[record.mode.code() as usize] += 1;
-        if self.ends.records.push(*record).is_err() {
-            record.counters.dropped_records += 1;
-        }
+        self.dropped.1 += u64::from(self.ends.records.push(*record).is_err());
         if self.is_stopping() {
             self.stopping += 1;
-        }
-    }
-
-    /// Ends the tick on its grid.
-    fn finish(&mut self) {
-        let record = &mut self.record;
-        if self.settings.sync == Sync::Clock {
-            self.overran = self.grid.finish(record.end) > 0;
-            (record.counters.overruns, record.counters.skipped) = (self.grid.overruns(), self.grid.skipped());
-            return;
-        }
-        let late = record.end.saturating_sub(record.state.header.stamp) > self.settings.period;
-        self.overran = self.settings.real_time && record.fresh && late;
-        if self.overran {
-            let spent = record.end - record.state.header.stamp;
-            record.counters.overruns += 1;
-            record.counters.skipped += (spent - 1) / self.settings.period;
         }
     }
 }

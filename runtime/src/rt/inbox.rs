@@ -1,11 +1,15 @@
-//! Snapshots on their way into the loop: from bytes to a built controller to the swap, with one receipt for each.
+//! Snapshots on their way into the loop: from bytes to a built controller to the swap, with one receipt for each. The
+//! one before is kept and swapped back in when the robot no longer gets where the targets say.
 
 use crate::link::{
     Message, ReceiptMessage, RobotMessage, RuntimeLink, SnapshotBytes, SnapshotHeader, Verdict,
 };
-use crate::rt::build::Builder;
+use crate::log::LogQueue;
+use crate::rt::build::{Builder, Built};
+use crate::rt::core::Loaded;
+use crate::rt::residual::{Residual, RollbackSettings};
 use crate::rt::swap::Sender;
-use crate::rt::tick::{Build, Tick};
+use crate::rt::tick::{Build, Record, Tick};
 
 /// How many refusals are kept as text for the report.
 const KEPT: usize = 32;
@@ -13,11 +17,20 @@ const KEPT: usize = 32;
 /// The I/O thread's side of the hot swap.
 pub(crate) struct SnapshotInbox<B: Build> {
     builder: Builder<B>,
-    swap: Sender<B::Controller>,
+    swap: Sender<Loaded<B::Controller>>,
     /// Built, not yet offered to the loop.
-    ready: Option<(SnapshotHeader, Box<B::Controller>)>,
+    ready: Option<(SnapshotHeader, Box<Loaded<B::Controller>>)>,
     /// In the slot, not yet taken by the loop.
-    offered: Option<(SnapshotHeader, u64)>,
+    offered: Option<Offer>,
+    /// In use before the current one.
+    previous: Option<Box<Loaded<B::Controller>>>,
+    /// Header of the one in use; none for the first.
+    current: Option<SnapshotHeader>,
+    residual: Residual,
+    /// Why the current one is to be taken back.
+    condemned: Option<String>,
+    /// Snapshots received; the number of the newest.
+    received: u64,
     /// Sender and version of the newest snapshot that came.
     newest: (u64, u64),
     /// Versions taken into use: (first tick at the latest, version of the controller).
@@ -26,53 +39,98 @@ pub(crate) struct SnapshotInbox<B: Build> {
     pub(crate) refusals: Vec<String>,
     /// Snapshots refused.
     pub(crate) refused: u64,
+    /// Snapshots taken back.
+    pub(crate) rolled_back: u64,
+}
+
+/// What the loop is about to take.
+struct Offer {
+    /// Header of a new snapshot; none when the previous one is offered again.
+    header: Option<SnapshotHeader>,
+    version: u64,
+}
+
+/// What a look at the snapshots needs of the I/O thread.
+pub(crate) struct Desk<'a> {
+    pub(crate) link: &'a mut RuntimeLink,
+    pub(crate) log: &'a mut Option<LogQueue>,
+    pub(crate) robot: &'a RobotMessage,
+    /// The newest tick known.
+    pub(crate) tick: u64,
 }
 
 impl<B: Build> SnapshotInbox<B> {
-    pub(crate) fn new(builder: Builder<B>, swap: Sender<B::Controller>) -> SnapshotInbox<B> {
+    pub(crate) fn new(
+        builder: Builder<B>,
+        swap: Sender<Loaded<B::Controller>>,
+        rollback: RollbackSettings,
+    ) -> SnapshotInbox<B> {
         SnapshotInbox {
             builder,
             swap,
             ready: None,
             offered: None,
+            previous: None,
+            current: None,
+            residual: Residual::new(rollback),
+            condemned: None,
+            received: 0,
             newest: (0, 0),
             accepted: Vec::new(),
             refusals: Vec::new(),
             refused: 0,
+            rolled_back: 0,
         }
     }
 
-    /// Moves every snapshot one stage on; `tick` is the newest tick known.
-    pub(crate) fn pump(&mut self, link: &mut RuntimeLink, robot: &RobotMessage, tick: u64) {
-        self.settle(link, tick);
-        if let Some(snapshot) = link.newest_snapshot() {
-            self.receive(link, snapshot, robot);
+    /// Takes in a tick and the one before it.
+    pub(crate) fn observe(&mut self, previous: &Record, record: &Record) {
+        if let Some((before, after)) = self.residual.observe(previous, record) {
+            self.condemned = Some(format!(
+                "taken back: the velocity reached is {after:.3} rad/s or m/s off the target, {before:.3} before the swap"
+            ));
+        }
+    }
+
+    /// Moves every snapshot one stage on.
+    pub(crate) fn pump(&mut self, desk: &mut Desk<'_>) {
+        self.settle(desk);
+        if let Some(snapshot) = desk.link.newest_snapshot() {
+            self.receive(desk, snapshot);
         }
         if let Some(built) = self.builder.collect() {
-            match built.result {
-                Err(refusal) => self.refuse(link, &built.header, refusal.verdict, &refusal.text),
-                Ok(controller) => {
-                    if let Some((header, _)) = self.ready.replace((built.header, controller)) {
-                        self.supersede(link, &header);
-                    }
-                }
-            }
+            self.take(desk, built);
         }
         self.offer();
     }
 
-    fn receive(&mut self, link: &mut RuntimeLink, snapshot: SnapshotBytes, robot: &RobotMessage) {
+    fn receive(&mut self, desk: &mut Desk<'_>, snapshot: SnapshotBytes) {
         let (sender, version) = (snapshot.header.header.epoch, snapshot.header.version);
         if sender == self.newest.0 && version <= self.newest.1 {
             let text = format!(
                 "snapshot version {version} came after version {}: give each push a higher version",
                 self.newest.1
             );
-            return self.refuse(link, &snapshot.header, Verdict::Outdated, &text);
+            return self.refuse(desk.link, &snapshot.header, Verdict::Outdated, &text);
         }
         self.newest = (sender, version);
-        if let Some(replaced) = self.builder.take(snapshot, *robot) {
-            self.supersede(link, &replaced);
+        self.received += 1;
+        if let Some(replaced) = self.builder.take(self.received, snapshot, *desk.robot) {
+            supersede(desk.link, &replaced);
+        }
+    }
+
+    fn take(&mut self, desk: &mut Desk<'_>, built: Built<B::Controller>) {
+        let controller = match built.result {
+            Ok(controller) => *controller,
+            Err(refusal) => return self.refuse(desk.link, &built.header, refusal.verdict, &refusal.text),
+        };
+        if let Some(log) = desk.log {
+            log.push_snapshot(built.id, controller.version(), built.bytes);
+        }
+        let loaded = Box::new(Loaded { id: built.id, controller });
+        if let Some((header, _)) = self.ready.replace((built.header, loaded)) {
+            supersede(desk.link, &header);
         }
     }
 
@@ -80,38 +138,61 @@ impl<B: Build> SnapshotInbox<B> {
         if self.offered.is_some() {
             return;
         }
-        if let Some((header, controller)) = self.ready.take() {
-            let version = controller.version();
-            match self.swap.offer(controller) {
-                Ok(()) => self.offered = Some((header, version)),
-                Err(controller) => self.ready = Some((header, controller)),
-            }
+        // A new snapshot replaces a condemned one; without a new one, the previous is the better.
+        let (header, loaded) = match (self.ready.take(), &self.condemned) {
+            (Some((header, loaded)), _) => (Some(header), loaded),
+            (None, Some(_)) => match self.previous.take() {
+                Some(loaded) => (None, loaded),
+                None => return,
+            },
+            (None, None) => return,
+        };
+        let version = loaded.controller.version();
+        match (self.swap.offer(loaded), header) {
+            (Ok(()), header) => self.offered = Some(Offer { header, version }),
+            (Err(loaded), Some(header)) => self.ready = Some((header, loaded)),
+            (Err(loaded), None) => self.previous = Some(loaded),
         }
     }
 
-    /// The old controller came back: the new one is in use. The old one is dropped here.
-    fn settle(&mut self, link: &mut RuntimeLink, tick: u64) {
+    /// The old controller came back: the new one is in use. The one before the old is dropped here.
+    fn settle(&mut self, desk: &mut Desk<'_>) {
         let Some(old) = self.swap.collect() else { return };
-        drop(old);
-        if let Some((header, version)) = self.offered.take() {
-            self.accepted.push((tick, version));
-            reply(link, &header, tick, Verdict::Accepted, "in use");
+        let Some(Offer { header, version }) = self.offered.take() else { return };
+        self.accepted.push((desk.tick, version));
+        let condemned = self.condemned.take();
+        let Some(header) = header else {
+            if let (Some(bad), Some(text)) = (self.current.take(), condemned) {
+                self.rolled_back += 1;
+                self.note(&text);
+                reply(desk.link, &bad, desk.tick, Verdict::RolledBack, &text);
+            }
+            return;
+        };
+        // What was condemned is nothing to go back to.
+        if condemned.is_none() {
+            self.previous = Some(old);
         }
-    }
-
-    fn supersede(&mut self, link: &mut RuntimeLink, header: &SnapshotHeader) {
-        let text =
-            format!("snapshot version {} was overtaken by a newer one before its turn", header.version);
-        reply(link, header, 0, Verdict::Superseded, &text);
+        self.current = Some(header);
+        reply(desk.link, &header, desk.tick, Verdict::Accepted, "in use");
     }
 
     fn refuse(&mut self, link: &mut RuntimeLink, header: &SnapshotHeader, verdict: Verdict, text: &str) {
         self.refused += 1;
+        self.note(text);
+        reply(link, header, 0, verdict, text);
+    }
+
+    fn note(&mut self, text: &str) {
         if self.refusals.len() < KEPT {
             self.refusals.push(text.to_owned());
         }
-        reply(link, header, 0, verdict, text);
     }
+}
+
+fn supersede(link: &mut RuntimeLink, header: &SnapshotHeader) {
+    let text = format!("snapshot version {} was overtaken by a newer one before its turn", header.version);
+    reply(link, header, 0, Verdict::Superseded, &text);
 }
 
 fn reply(link: &mut RuntimeLink, header: &SnapshotHeader, tick: u64, verdict: Verdict, text: &str) {

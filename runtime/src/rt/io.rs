@@ -14,9 +14,9 @@ use crate::link::{
 };
 use crate::log::LogQueue;
 use crate::rt::clock::{self, Bell};
-use crate::rt::inbox::SnapshotInbox;
+use crate::rt::inbox::{Desk, SnapshotInbox};
 use crate::rt::report::percentiles;
-use crate::rt::tick::{Build, Record};
+use crate::rt::tick::{Build, Record, Sensed};
 
 /// Before a state is due, this thread is awake so much earlier [ns].
 const LEAD: u64 = 120_000;
@@ -118,10 +118,13 @@ impl<B: Build> Io<B> {
             log.push(record);
         }
         if record.fresh {
-            if let Some(previous) = self.traffic.previous.as_deref()
-                && previous.step.nu > 0
-            {
-                self.link.send_transition(&mut transition(previous, &record.state));
+            if let Some(previous) = self.traffic.previous.as_deref() {
+                self.snapshots.observe(previous, record);
+                // What was predicted or could not be used was not experienced.
+                let is_measured = previous.sensed == Sensed::Measured && record.sensed == Sensed::Measured;
+                if previous.step.nu > 0 && is_measured {
+                    self.link.send_transition(&mut transition(previous, &record.state));
+                }
             }
             match &mut self.traffic.previous {
                 Some(previous) => **previous = *record,
@@ -155,13 +158,15 @@ impl<B: Build> Io<B> {
                 self.robot = robot;
             }
         }
-        self.snapshots.pump(&mut self.link, &self.robot, self.traffic.tick);
+        let Io { link, log, robot, snapshots, traffic, .. } = self;
+        snapshots.pump(&mut Desk { link, log, robot, tick: traffic.tick });
         let now = clock::now();
         if now >= self.health.next {
             self.health.next = now + HEALTH;
             let mut message = self.health.message();
             message.refused_states = self.traffic.refused_states + self.link.state_counts().1;
             message.refused_snapshots = self.snapshots.refused + self.link.refused_snapshots();
+            message.rolled_back = self.snapshots.rolled_back;
             message.log_drops = self.log.as_ref().map_or(0, LogQueue::dropped);
             self.link.send_health(&mut message);
         }
@@ -222,7 +227,7 @@ impl Health {
     fn take(&mut self, record: &Record) {
         let (last, counters) = (&mut self.last, &record.counters);
         last.tick = record.tick;
-        last.mode = record.mode.code();
+        (last.mode, last.reason) = (record.mode.code(), record.reason.code());
         last.policy_version = record.policy_version;
         (last.overruns, last.skipped) = (counters.overruns, counters.skipped);
         (last.stale, last.swaps) = (counters.stale, counters.swaps);

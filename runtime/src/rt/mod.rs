@@ -6,19 +6,22 @@
 //! trainer ──snapshot──> I/O ──> builder ──> I/O ──slot──> real-time thread ──old controller──> I/O (dropped there)
 //! ```
 //!
-//! The page to read is `cycle.rs`. A run is [`run`]: a snapshot file on a plant by name.
+//! The pages to read are `core.rs`, a tick without threads and clocks, and `cycle.rs`, the thread around it. A run is [`run`]: a snapshot file on a plant by name.
 
 mod bench;
 mod brake;
 mod build;
 pub mod clock;
+pub mod core;
 mod cycle;
+pub mod faults;
 mod grid;
 mod inbox;
 mod io;
 mod mode;
 mod pilot;
 mod report;
+mod residual;
 mod run;
 mod stop;
 pub mod swap;
@@ -27,13 +30,16 @@ mod tick;
 
 pub use bench::bench_wake;
 pub use brake::Brake;
+pub use core::{Core, CoreSettings, Inputs, Loaded};
 pub use cycle::Sync;
+pub use faults::{Fault, FaultKind, FaultPlan, FaultyPlant, Odd};
 pub use grid::Grid;
 pub use mode::{Event, Mode, ModeLimits, Modes, Reason};
 pub use pilot::{Pilot, PilotBuilder, describe, numbers};
 pub(crate) use report::percentiles;
 pub use report::{Percentiles, PlantSummary, RunReport};
+pub use residual::RollbackSettings;
 pub use run::{RunError, RunSettings, connect, run, run_loop};
 pub use stop::Stop;
-pub use thread::{ThreadSettings, prepare};
-pub use tick::{Build, Counters, Outcome, Record, Refusal, Step, Tick};
+pub use thread::{ThreadSettings, Usage, prepare};
+pub use tick::{Build, Counters, MAX_ROWS, Outcome, Record, Refusal, Row, Sensed, Step, Tick};

@@ -1,92 +1,120 @@
 //! What the loop is allowed to do: a closed set of modes and one transition function.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
-/// Mode of the loop.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Mode {
-    /// No state has come yet: no action is sent, the plant keeps itself still.
-    Hold,
-    /// The controller acts.
-    Active,
-    /// Brakes to zero velocity; back to Active after enough good ticks, unless a stop was asked for.
-    Braking,
-    /// Latched: brakes until the process is restarted.
-    Fault,
+use crate::codes::codes;
+
+codes! {
+    /// Mode of the loop. Escalates at once; comes back only after good ticks in a row, and from Fault never.
+    Mode, "mode" {
+        Hold = "hold", "No usable state has come yet: no action is sent, the plant keeps itself still.",
+            "Start the plant; if it runs, see `refused_states` and `bad_states` in the report.";
+        Active = "active", "The controller acts.", "Nothing to do.";
+        Degraded = "degraded", "The controller acts on less than it should have: a predicted state, or late.",
+            "Look at the reason beside it; the loop returns to active after good ticks in a row.";
+        Braking = "braking", "Brakes to zero velocity, then stands still.",
+            "Look at the reason beside it; the loop returns to active after good ticks in a row, unless a stop was asked for.";
+        Fault = "fault", "Latched: brakes until the process is started again.",
+            "Look at the reason beside it, remove the cause, and start the runtime again.";
+    }
 }
 
 impl Mode {
-    /// All modes, in the order of their codes.
-    pub const ALL: [Mode; 4] = [Mode::Hold, Mode::Active, Mode::Braking, Mode::Fault];
-
-    /// The number in a message.
-    pub fn code(self) -> u32 {
-        self as u32
-    }
-
     /// The mode of a message; a number this build does not know is a fault.
     pub fn from_code(code: u32) -> Mode {
         Mode::ALL.get(code as usize).copied().unwrap_or(Mode::Fault)
     }
 
-    /// Lower-case name.
-    pub fn name(self) -> &'static str {
-        ["hold", "active", "braking", "fault"][self as usize]
+    /// True when the controller's action goes to the plant.
+    pub fn acts(self) -> bool {
+        matches!(self, Mode::Active | Mode::Degraded)
     }
 }
 
-/// Why the loop left Active.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Reason {
-    /// Nothing is wrong.
-    None,
-    /// No state within the age limit.
-    StaleState,
-    /// The state holds numbers that are not finite, or the wrong sizes.
-    BadState,
-    /// More bad states in a row than allowed.
-    BadStates,
-    /// The controller could not give a checked target.
-    Controller,
-    /// The controller panicked; it is not called again.
-    Panic,
-    /// More overruns in a row than allowed.
-    Overruns,
-    /// A stop was asked for.
-    Stop,
+codes! {
+    /// Why the loop is not Active.
+    Reason, "reason" {
+        None = "none", "Nothing is wrong.", "Nothing to do.";
+        StaleState = "stale-state", "No state came within the age limit, or its time stamp is older than that.",
+            "Check that the plant runs and is not starved of processor time; raise --age-limit if it pauses on purpose.";
+        FrozenState = "frozen-state", "The plant goes on sending, but its clock or its moving joints stand still.",
+            "Check the sensor or driver behind the plant: it repeats an old sample.";
+        LostStates = "lost-states", "More states in a row were lost between plant and loop than may be bridged.",
+            "Free processor time for plant and runtime, or lower the rate; `hold_states` is the number that is bridged.";
+        BadState = "bad-state", "The state holds NaN or infinity.",
+            "Check the plant's sensors; the first few are bridged by prediction, then the plant brakes.";
+        BadStates = "bad-states", "More states in a row held NaN or infinity than allowed; latched.",
+            "Repair the plant's sensors, then start the runtime again.";
+        ImplausibleState = "implausible-state", "A joint jumped further than its speed allows in the time that passed.",
+            "Check encoder and wiring of the plant; the sample was not used.";
+        ImplausibleStates = "implausible-states", "More implausible states in a row than allowed; latched.",
+            "Check encoders and joint order of the plant, then start the runtime again.";
+        Controller = "controller", "The controller refused the state: it gave no checked target.",
+            "See the status of the tick in the flight log, then `nearl explain STATUS`.";
+        NonFiniteProposal = "non-finite-proposals", "The policy proposed NaN or infinity several ticks in a row.",
+            "Go back to an earlier snapshot: the training diverged.";
+        NoVerifiedBrake = "no-verified-brakes", "Several ticks in a row no way to stop could be verified; the stored brake ran.",
+            "Lower acceleration or the proposals' size.";
+        NoCertifiedAnswer = "no-certified-answers", "Several ticks in a row no target passed the checker.",
+            "The limits leave nothing to do there: run `nearl doctor SNAPSHOT` and loosen what it names.";
+        NonFiniteDynamics = "non-finite-dynamics", "Several ticks in a row the dynamics gave NaN or infinity.",
+            "Check the robot file's masses and the plant's velocities.";
+        Panic = "panic", "The controller panicked; it is discarded and the robot model alone brakes; latched.",
+            "Report it with the flight log, and go back to an earlier snapshot.";
+        Overruns = "overruns", "Several ticks in a row ended after the next one was due.",
+            "Free a core for the runtime (--cpu, --priority), or lower the rate.";
+        Starved = "starved", "Overruns did not end although the loop was braking; latched.",
+            "Stop what takes the processor, then start the runtime again.";
+        Stop = "stop", "A stop was asked for, by a signal or because the time was over.", "Nothing to do.";
+    }
 }
 
 /// What one tick brought.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Event {
-    /// A fresh, finite state of the right sizes.
+    /// A fresh, plausible state.
     Good,
-    /// No state within the age limit.
-    Stale,
-    /// A state that cannot be used.
-    Bad,
-    /// The controller refused the tick.
-    Refused,
+    /// A predicted state stands in for the one that is missing or unusable.
+    Held(Reason),
+    /// There is no state to act upon.
+    Lost(Reason),
+    /// The controller refused the tick, or braked too often in a row.
+    Refused(Reason),
     /// The controller panicked.
     Panicked,
 }
 
-/// Limits of the transitions [ticks].
-#[derive(Clone, Copy, Debug)]
+/// When to change the mode [ticks].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct ModeLimits {
-    /// Good ticks in a row before Braking ends.
+    /// Good ticks in a row before Degraded or Braking ends.
     pub recover_after: u32,
-    /// Bad states in a row before the fault is latched.
+    /// Missing or unusable states in a row that are bridged by prediction.
+    pub hold_states: u32,
+    /// Unusable states in a row before the fault is latched; more than `hold_states`.
     pub bad_states: u32,
-    /// Overruns in a row before braking.
+    /// Ticks in a row in which the projector braked before the loop brakes.
+    pub braked_ticks: u32,
+    /// Overruns in a row before Degraded.
+    pub degrade_overruns: u32,
+    /// Overruns in a row before Braking.
     pub overruns: u32,
+    /// Overruns in a row before the fault is latched.
+    pub starved: u32,
 }
 
 impl Default for ModeLimits {
     fn default() -> Self {
-        ModeLimits { recover_after: 10, bad_states: 5, overruns: 10 }
+        ModeLimits {
+            recover_after: 10,
+            hold_states: 3,
+            bad_states: 8,
+            braked_ticks: 5,
+            degrade_overruns: 3,
+            overruns: 10,
+            starved: 100,
+        }
     }
 }
 
@@ -120,36 +148,71 @@ impl Modes {
     /// Takes in what a tick brought; `overran` if the tick before ended late, `stop` once a stop was asked for.
     pub fn update(&mut self, event: Event, overran: bool, stop: bool) -> Mode {
         self.count(event, overran);
+        let latched = self.latched(event);
         match event {
             _ if self.mode == Mode::Fault => {}
-            Event::Panicked => self.enter(Mode::Fault, Reason::Panic),
-            Event::Bad if self.bad >= self.limits.bad_states => self.enter(Mode::Fault, Reason::BadStates),
+            _ if latched != Reason::None => self.enter(Mode::Fault, latched),
             _ if stop => self.enter(Mode::Braking, Reason::Stop),
-            Event::Bad => self.brake(Reason::BadState),
-            Event::Stale => self.brake(Reason::StaleState),
-            Event::Refused => self.brake(Reason::Controller),
-            Event::Good if self.late >= self.limits.overruns => self.brake(Reason::Overruns),
-            Event::Good => self.good_tick(),
+            Event::Lost(reason) | Event::Refused(reason) => self.brake(reason),
+            _ if self.late >= self.limits.overruns => self.brake(Reason::Overruns),
+            Event::Held(reason) => self.degrade(reason),
+            _ if self.late >= self.limits.degrade_overruns => self.degrade(Reason::Overruns),
+            _ => self.good_tick(),
         }
         self.mode
     }
 
+    /// The controller's own outcome within a tick that was counted already.
+    pub fn escalate(&mut self, event: Event, stop: bool) -> Mode {
+        match event {
+            _ if self.mode == Mode::Fault => {}
+            Event::Panicked => self.enter(Mode::Fault, Reason::Panic),
+            _ if stop => self.enter(Mode::Braking, Reason::Stop),
+            Event::Refused(reason) | Event::Lost(reason) => self.brake(reason),
+            Event::Held(reason) => self.degrade(reason),
+            Event::Good => {}
+        }
+        self.good = 0;
+        self.mode
+    }
+
     fn count(&mut self, event: Event, overran: bool) {
+        let unusable = |reason| matches!(reason, Reason::BadState | Reason::ImplausibleState);
+        let is_bad = matches!(event, Event::Held(r) | Event::Lost(r) if unusable(r));
         self.good = if event == Event::Good && !overran { self.good.saturating_add(1) } else { 0 };
-        self.bad = if event == Event::Bad { self.bad.saturating_add(1) } else { 0 };
+        self.bad = if is_bad { self.bad.saturating_add(1) } else { 0 };
         self.late = if overran { self.late.saturating_add(1) } else { 0 };
     }
 
+    fn latched(&self, event: Event) -> Reason {
+        let is_over = self.bad >= self.limits.bad_states;
+        match event {
+            Event::Panicked => Reason::Panic,
+            Event::Lost(Reason::BadState) if is_over => Reason::BadStates,
+            Event::Lost(Reason::ImplausibleState) if is_over => Reason::ImplausibleStates,
+            _ if self.late >= self.limits.starved => Reason::Starved,
+            _ => Reason::None,
+        }
+    }
+
     fn brake(&mut self, reason: Reason) {
-        if self.mode == Mode::Active {
+        if self.mode.acts() {
             self.enter(Mode::Braking, reason);
+        }
+    }
+
+    fn degrade(&mut self, reason: Reason) {
+        if self.mode.acts() {
+            self.enter(Mode::Degraded, reason);
         }
     }
 
     fn good_tick(&mut self) {
         match self.mode {
             Mode::Hold => self.enter(Mode::Active, Reason::None),
-            Mode::Braking if self.good >= self.limits.recover_after => self.enter(Mode::Active, Reason::None),
+            Mode::Degraded | Mode::Braking if self.good >= self.limits.recover_after => {
+                self.enter(Mode::Active, Reason::None);
+            }
             _ => {}
         }
     }
@@ -167,26 +230,61 @@ mod tests {
         (0..times).map(|_| modes.update(event, false, false)).last().unwrap()
     }
 
+    fn limits() -> ModeLimits {
+        ModeLimits {
+            recover_after: 3,
+            bad_states: 2,
+            degrade_overruns: 1,
+            overruns: 2,
+            starved: 4,
+            ..ModeLimits::default()
+        }
+    }
+
     #[test]
     fn escalates_at_once_and_returns_slowly() {
-        let mut modes = Modes::new(ModeLimits { recover_after: 3, bad_states: 2, overruns: 2 });
-        assert_eq!(run(&mut modes, Event::Stale, 5), Mode::Hold);
+        let mut modes = Modes::new(limits());
+        let stale = Event::Lost(Reason::StaleState);
+        assert_eq!(run(&mut modes, stale, 5), Mode::Hold);
         assert_eq!(run(&mut modes, Event::Good, 1), Mode::Active);
-        assert_eq!(run(&mut modes, Event::Stale, 1), Mode::Braking);
+        assert_eq!(run(&mut modes, stale, 1), Mode::Braking);
         assert_eq!(modes.reason(), Reason::StaleState);
         assert_eq!(run(&mut modes, Event::Good, 2), Mode::Braking);
         assert_eq!(run(&mut modes, Event::Good, 1), Mode::Active);
-        assert_eq!(modes.update(Event::Good, true, false), Mode::Active);
-        assert_eq!(modes.update(Event::Good, true, false), Mode::Braking);
-        assert_eq!(modes.reason(), Reason::Overruns);
+    }
+
+    #[test]
+    fn overruns_degrade_then_brake_then_latch() {
+        let mut modes = Modes::new(limits());
+        run(&mut modes, Event::Good, 1);
+        let late = |modes: &mut Modes| (modes.update(Event::Good, true, false), modes.reason());
+        assert_eq!(late(&mut modes), (Mode::Degraded, Reason::Overruns));
+        assert_eq!(run(&mut modes, Event::Good, 2), Mode::Degraded);
+        assert_eq!(run(&mut modes, Event::Good, 1), Mode::Active);
+        assert_eq!(late(&mut modes), (Mode::Degraded, Reason::Overruns));
+        assert_eq!(late(&mut modes), (Mode::Braking, Reason::Overruns));
+        assert_eq!(late(&mut modes), (Mode::Braking, Reason::Overruns));
+        assert_eq!(late(&mut modes), (Mode::Fault, Reason::Starved));
+    }
+
+    #[test]
+    fn a_held_state_degrades_and_does_not_soften_braking() {
+        let mut modes = Modes::new(limits());
+        let held = Event::Held(Reason::BadState);
+        assert_eq!(run(&mut modes, held, 1), Mode::Hold);
+        run(&mut modes, Event::Good, 1);
+        assert_eq!(run(&mut modes, held, 5), Mode::Degraded);
+        run(&mut modes, Event::Refused(Reason::Controller), 1);
+        assert_eq!(run(&mut modes, held, 1), Mode::Braking);
+        assert_eq!(modes.reason(), Reason::Controller);
     }
 
     #[test]
     fn a_fault_stays() {
-        let mut modes = Modes::new(ModeLimits { recover_after: 1, bad_states: 2, overruns: 2 });
+        let mut modes = Modes::new(ModeLimits { recover_after: 1, ..limits() });
         run(&mut modes, Event::Good, 1);
-        assert_eq!(run(&mut modes, Event::Bad, 1), Mode::Braking);
-        assert_eq!(run(&mut modes, Event::Bad, 1), Mode::Fault);
+        assert_eq!(run(&mut modes, Event::Lost(Reason::BadState), 1), Mode::Braking);
+        assert_eq!(run(&mut modes, Event::Lost(Reason::BadState), 1), Mode::Fault);
         assert_eq!(run(&mut modes, Event::Good, 100), Mode::Fault);
         assert_eq!(modes.update(Event::Good, false, true), Mode::Fault);
         assert_eq!(modes.reason(), Reason::BadStates);

@@ -1,13 +1,14 @@
 //! The controller of a snapshot in the loop: states in, [`Controller::update`], numbers out.
 
-use nearl_constraints::{BrakeReason, Entry, Ledger, RefuseReason, Rung, Status};
+use nearl_constraints::{BrakeReason, Entry, Ledger, RefuseReason, Rung, Side, Status};
 
+use crate::codes::LedgerStatus;
 use crate::controller::{Controller, Noise, Output, State};
 use crate::link::{
     LedgerNumbers, MAX_JOINTS, MAX_OBS, Robot, RobotMessage, SnapshotBytes, StateMessage, Verdict, hash_names,
 };
 use crate::rt::brake::Brake;
-use crate::rt::tick::{Build, Outcome, Refusal, Step, Tick};
+use crate::rt::tick::{Build, MAX_ROWS, Outcome, Refusal, Row, Step, Tick};
 use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError};
 
 /// A controller with its inputs and outputs, checked against the plant it drives.
@@ -19,6 +20,10 @@ pub struct Pilot {
     output: Output,
     /// Which proposed entry is which (n_state).
     entries: Vec<Entry>,
+    /// What each observation entry measures (n_obs).
+    observed: Vec<Entry>,
+    /// Joints whose samples are checked: degree of freedom, configuration index, largest speed V [rad/s or m/s].
+    checked: Vec<(usize, usize, f64)>,
     /// The policy proposes states; a direct one gives actions only.
     proposes: bool,
 }
@@ -36,6 +41,8 @@ impl Pilot {
             noise: controller.noise(),
             output: controller.output(),
             entries: (0..layout.n_state()).map(|k| layout.state_entry(k)).collect(),
+            observed: layout.entries().to_vec(),
+            checked: checked(&controller),
             proposes: snapshot.manifest.policy != PolicyKind::Direct,
             controller,
         })
@@ -66,7 +73,26 @@ impl Pilot {
                 }
             }
             step.ledger = numbers(&output.next.ledger);
+            write_rows(&output.next.ledger, step);
         }
+    }
+}
+
+/// Joints of one degree of freedom whose speed is limited.
+fn checked(controller: &Controller) -> Vec<(usize, usize, f64)> {
+    let (limits, layout) = (controller.limits(), controller.layout());
+    let joints = controller.model().joints().iter().filter(|j| j.nv == 1);
+    joints
+        .filter(|j| layout.controllable().contains(&j.idx_v) && limits.velocity[j.idx_v].is_finite())
+        .map(|j| (j.idx_v, j.idx_q, limits.velocity[j.idx_v]))
+        .collect()
+}
+
+fn write_rows(ledger: &Ledger, step: &mut Step) {
+    for (row, active) in step.rows.iter_mut().zip(ledger.active.iter().take(MAX_ROWS)) {
+        let side = u8::from(active.side == Side::Upper);
+        let (kind, number) = (active.kind as u8, active.row as u16);
+        *row = Row { kind, side, row: number, multiplier: active.multiplier, slack: active.slack };
     }
 }
 
@@ -81,7 +107,7 @@ impl Tick for Pilot {
         self.state.obs.copy_from_slice(state.obs());
         let status = self.controller.update(&self.state, &self.noise, &mut self.output);
         self.write(step);
-        outcome(status)
+        if self.proposes { outcome(status) } else { refused_or_acted(status) }
     }
 
     fn brake(&mut self, state: &StateMessage, step: &mut Step) -> Outcome {
@@ -98,35 +124,92 @@ impl Tick for Pilot {
             v[..nv].copy_from_slice(&brake.target.v);
         }
         step.ledger = numbers(&brake.target.ledger);
+        write_rows(&brake.target.ledger, step);
         outcome(status)
     }
 
     fn reset(&mut self) {
         self.controller.reset();
     }
+
+    fn set_noise(&mut self, noise: f32) {
+        self.noise.proposal.fill(noise);
+    }
+
+    fn predict(&self, state: &mut StateMessage, step: &Step) {
+        (state.q, state.v) = (step.target_q, step.target_v);
+        let count = self.observed.len().min(state.obs.len());
+        for (value, entry) in state.obs[..count].iter_mut().zip(&self.observed) {
+            match *entry {
+                Entry::Position { idx_q, .. } => *value = step.target_q[idx_q],
+                Entry::Velocity { dof } => *value = step.target_v[dof],
+                Entry::Other => {}
+            }
+        }
+    }
+
+    /// With `S = max(V, |v|)` of the old state: `|v'| > jump S`, or `|q' - q| > jump age max(S, |v'|)`.
+    fn implausible(&self, old: &StateMessage, new: &StateMessage, age: f64, jump: f64) -> Option<usize> {
+        let jumped = |&&(dof, idx_q, limit): &&(usize, usize, f64)| {
+            let speed = limit.max(old.v[dof].abs());
+            let way = (new.q[idx_q] - old.q[idx_q]).abs();
+            new.v[dof].abs() > jump * speed || way > jump * age * speed.max(new.v[dof].abs())
+        };
+        self.checked.iter().find(jumped).map(|joint| joint.0)
+    }
+
+    fn soften(&mut self, state: &StateMessage, share: f64, step: &mut Step) {
+        let Some(brake) = &mut self.brake else { return };
+        let (nq, nv) = (state.q().len(), state.v().len());
+        let (status, action) =
+            brake.approach(state.q(), state.v(), &step.target_q[..nq], &step.target_v[..nv], share);
+        if outcome(status) != Outcome::Acted {
+            return;
+        }
+        step.action[..action.len()].copy_from_slice(action);
+        step.target_q[..nq].copy_from_slice(&brake.target.q);
+        step.target_v[..nv].copy_from_slice(&brake.target.v);
+        let raw_violations = step.ledger.raw_violations;
+        step.ledger = LedgerNumbers { raw_violations, ..numbers(&brake.target.ledger) };
+        write_rows(&brake.target.ledger, step);
+    }
+}
+
+/// A direct policy projects nothing, so its ledger can only refuse.
+fn refused_or_acted(status: Status) -> Outcome {
+    if matches!(status, Status::Refused(_)) { Outcome::Refused } else { Outcome::Acted }
 }
 
 /// A braked target is checked and may be applied; a refused one may not.
 fn outcome(status: Status) -> Outcome {
-    if matches!(status, Status::Refused(_)) { Outcome::Refused } else { Outcome::Acted }
+    match status {
+        Status::Refused(_) => Outcome::Refused,
+        Status::Braked(_) => Outcome::Braked,
+        _ => Outcome::Acted,
+    }
 }
 
-/// The ledger as plain numbers. Status: 0 to 3 in the order of [`Status`], 10 and up braked, 20 and up refused.
+/// The code of a projection's status.
+fn status(status: Status) -> LedgerStatus {
+    match status {
+        Status::Unchanged => LedgerStatus::Unchanged,
+        Status::Clamped => LedgerStatus::Clamped,
+        Status::Solved => LedgerStatus::Solved,
+        Status::Recovering => LedgerStatus::Recovering,
+        Status::Slowed => LedgerStatus::Slowed,
+        Status::Braked(BrakeReason::NoVerifiedBrake) => LedgerStatus::BrakedNoVerifiedBrake,
+        Status::Braked(BrakeReason::NonFiniteProposal) => LedgerStatus::BrakedNonFiniteProposal,
+        Status::Braked(BrakeReason::NoCertifiedAnswer) => LedgerStatus::BrakedNoCertifiedAnswer,
+        Status::Braked(BrakeReason::NonFiniteDynamics) => LedgerStatus::BrakedNonFiniteDynamics,
+        Status::Refused(RefuseReason::NonFiniteState) => LedgerStatus::RefusedNonFiniteState,
+        Status::Refused(RefuseReason::WrongLength) => LedgerStatus::RefusedWrongLength,
+    }
+}
+
+/// The ledger as plain numbers; the status is [`LedgerStatus::number`].
 pub fn numbers(ledger: &Ledger) -> LedgerNumbers {
     LedgerNumbers {
-        status: match ledger.status {
-            Status::Unchanged => 0,
-            Status::Clamped => 1,
-            Status::Solved => 2,
-            Status::Recovering => 3,
-            Status::Slowed => 4,
-            Status::Braked(BrakeReason::NonFiniteProposal) => 10,
-            Status::Braked(BrakeReason::NoCertifiedAnswer) => 11,
-            Status::Braked(BrakeReason::NonFiniteDynamics) => 12,
-            Status::Braked(BrakeReason::NoVerifiedBrake) => 13,
-            Status::Refused(RefuseReason::NonFiniteState) => 20,
-            Status::Refused(RefuseReason::WrongLength) => 21,
-        },
+        status: status(ledger.status).number(),
         rung: match ledger.rung {
             Rung::ClosedForm => 0,
             Rung::ActiveSet => 1,

@@ -7,7 +7,7 @@ use hdrhistogram::Histogram;
 use serde::Serialize;
 
 use crate::rt::tick::Counters;
-use crate::rt::{Mode, Reason, Sync};
+use crate::rt::{Mode, Reason, Sync, Usage};
 
 /// Percentiles of a time [ns].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -98,6 +98,10 @@ pub struct RunReport {
     pub refused_snapshots: u64,
     /// Why they were refused.
     pub refusals: Vec<String>,
+    /// Snapshots taken back because the robot no longer reached its targets.
+    pub rolled_back: u64,
+    /// Page faults and context switches of the real-time thread after its first 300 ticks.
+    pub usage: Usage,
     /// Records the flight log lost.
     pub log_drops: u64,
     /// Why the flight log stopped, if it did.
@@ -113,7 +117,8 @@ impl fmt::Display for RunReport {
         let c = &self.counters;
         writeln!(f, "{}: {} ticks of {} s in {:.1} s", self.robot, self.ticks, self.dt, self.seconds)?;
         let modes: Vec<String> = self.modes.iter().map(|(mode, n)| format!("{mode} {n}")).collect();
-        writeln!(f, "  modes            {}; ended in {}", modes.join(", "), self.last_mode.name())?;
+        let (last, reason) = (self.last_mode, self.reason);
+        writeln!(f, "  modes            {}; ended in {last} ({reason})", modes.join(", "))?;
         writeln!(f, "  wake-up          {}", self.wake)?;
         writeln!(f, "  compute          {}", self.compute)?;
         writeln!(
@@ -129,12 +134,19 @@ impl fmt::Display for RunReport {
         let plant: Vec<String> =
             self.plant.violations.iter().map(|(kind, n)| format!("{kind} {n}")).collect();
         writeln!(f, "  on the plant     {}", plant.join(", "))?;
+        let u = &self.usage;
+        writeln!(
+            f,
+            "  system           page faults {} + {}, context switches {} asked for, {} forced",
+            u.minor_faults, u.major_faults, u.voluntary_switches, u.involuntary_switches
+        )?;
         let versions: Vec<String> = self.versions.iter().map(|(_, version)| version.to_string()).collect();
         writeln!(
             f,
-            "  snapshots        versions {}; refused {}",
+            "  snapshots        versions {}; refused {}, taken back {}",
             versions.join(" "),
-            self.refused_snapshots
+            self.refused_snapshots,
+            self.rolled_back
         )?;
         for text in self.refusals.iter().chain(&self.warnings).chain(&self.log_error) {
             writeln!(f, "  note             {text}")?;

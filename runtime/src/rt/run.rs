@@ -13,12 +13,15 @@ use crate::link::{LinkError, METERS, RobotMessage, RobotName, RuntimeLink, State
 use crate::log::{LogError, LogQueue, LogSummary};
 use crate::rt::build::Builder;
 use crate::rt::clock::{self, Bell};
+use crate::rt::core::{CoreSettings, Loaded};
 use crate::rt::cycle::{Cycle, CycleEnd, CycleSettings, Ends, Sync};
+use crate::rt::faults::FaultPlan;
 use crate::rt::inbox::SnapshotInbox;
 use crate::rt::io::{Health, Io, Traffic};
 use crate::rt::mode::ModeLimits;
 use crate::rt::pilot::{Pilot, PilotBuilder};
 use crate::rt::report::{PlantSummary, RunReport, percentiles};
+use crate::rt::residual::RollbackSettings;
 use crate::rt::thread::{ThreadSettings, prepare};
 use crate::rt::tick::{Build, Tick};
 use crate::rt::{Mode, Reason, Stop, swap};
@@ -48,8 +51,16 @@ pub struct RunSettings {
     pub stop_speed: f64,
     /// Longest braking before the loop ends anyway [s].
     pub stop_patience: f64,
+    /// A joint may move so many times further than its speed allows before its sample is implausible; 0 is no check.
+    pub jump: f64,
+    /// Time over which the first motion is let in, where a robot model knows the way to stand still [s].
+    pub ramp: f64,
     /// When to brake and when to come back.
     pub modes: ModeLimits,
+    /// When a swapped-in snapshot is taken back.
+    pub rollback: RollbackSettings,
+    /// Faults to rehearse.
+    pub faults: FaultPlan,
     /// Wishes for the real-time thread.
     pub thread: ThreadSettings,
     /// A wish that is refused is an error.
@@ -58,6 +69,8 @@ pub struct RunSettings {
     pub log: Option<PathBuf>,
     /// Facts written into the flight log (snapshot digest, command).
     pub metadata: BTreeMap<String, String>,
+    /// Bytes of the first snapshot, kept in the flight log for replay.
+    pub first: Vec<u8>,
 }
 
 impl Default for RunSettings {
@@ -72,11 +85,16 @@ impl Default for RunSettings {
             patience: 5.0,
             stop_speed: 1e-2,
             stop_patience: 1.0,
+            jump: 3.0,
+            ramp: 0.2,
             modes: ModeLimits::default(),
+            rollback: RollbackSettings::default(),
+            faults: FaultPlan::default(),
             thread: ThreadSettings { priority: Some(40), cpu: None, lock_memory: true },
             strict: false,
             log: None,
             metadata: BTreeMap::new(),
+            first: Vec::new(),
         }
     }
 }
@@ -154,6 +172,7 @@ pub fn run(
         ("snapshot", file.display().to_string()),
         ("version", snapshot.manifest.version.to_string()),
     ];
+    settings.first = snapshot.to_bytes();
     settings.metadata.extend(facts.map(|(key, value)| (key.to_owned(), value)));
     run_loop(link, robot, first, PilotBuilder, &settings, stop)
 }
@@ -193,7 +212,8 @@ fn assemble<B: Build>(
     settings: &RunSettings,
     stop: &Stop,
 ) -> Result<(Cycle<B::Controller>, Io<B>), RunError> {
-    let log = settings.log.as_deref().map(|path| LogQueue::create(path, &settings.metadata)).transpose()?;
+    let cycle_settings = cycle_settings(&robot, settings);
+    let log = open_log(&robot, first.version(), &cycle_settings.core, settings)?;
     let thread_error = |name| move |e: std::io::Error| RunError::Thread { name, reason: e.to_string() };
     let builder = Builder::start(build).map_err(thread_error("nearl-build"))?;
     let (states_in, states) = RingBuffer::new(8);
@@ -202,7 +222,8 @@ fn assemble<B: Build>(
     let (swap, slot) = swap::slot();
     let bell = Arc::new(Bell::default());
     let ends = Ends { states, actions, records, slot, bell: Arc::clone(&bell) };
-    let cycle = Cycle::new(cycle_settings(&robot, settings), Box::new(first), ends, stop.clone());
+    let first = Box::new(Loaded { id: 0, controller: first });
+    let cycle = Cycle::new(cycle_settings, first, settings.faults.clone(), ends, stop.clone());
     let health = Health::new().map_err(|e| RunError::Snapshot(e.to_string()))?;
     let io = Io {
         link,
@@ -213,7 +234,7 @@ fn assemble<B: Build>(
         actions: actions_out,
         records: records_out,
         bell,
-        snapshots: SnapshotInbox::new(builder, swap),
+        snapshots: SnapshotInbox::new(builder, swap, settings.rollback),
         log,
         health,
         traffic: Traffic::default(),
@@ -226,16 +247,37 @@ fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings
     let shortest = if robot.is_lockstep() { 1.0 } else { 0.02 };
     let age_limit = settings.age_limit.unwrap_or_else(|| (5.0 * robot.dt).max(shortest));
     CycleSettings {
-        period: clock::nanoseconds(robot.dt),
-        sync: settings.sync,
-        age_limit: clock::nanoseconds(age_limit),
+        core: CoreSettings {
+            period: clock::nanoseconds(robot.dt),
+            sync: settings.sync,
+            age_limit: clock::nanoseconds(age_limit),
+            real_time: !robot.is_lockstep(),
+            stop_speed: settings.stop_speed,
+            jump: settings.jump,
+            ramp: (settings.ramp / robot.dt).round() as u32,
+            modes: settings.modes,
+        },
         spin: if robot.is_lockstep() { 0 } else { clock::nanoseconds(settings.spin) },
-        real_time: !robot.is_lockstep(),
         ticks: settings.ticks.or(settings.seconds.map(|s| (s / robot.dt).round() as u64)),
-        stop_speed: settings.stop_speed,
         stop_ticks: (settings.stop_patience / robot.dt).ceil() as u64,
-        modes: settings.modes,
     }
+}
+
+/// The flight log with everything its replay needs but the ticks.
+fn open_log(
+    robot: &RobotMessage,
+    version: u64,
+    core: &CoreSettings,
+    settings: &RunSettings,
+) -> Result<Option<LogQueue>, LogError> {
+    let Some(path) = settings.log.as_deref() else { return Ok(None) };
+    let mut facts = settings.metadata.clone();
+    facts.extend(crate::log::facts(robot, core, &settings.faults));
+    let mut log = LogQueue::create(path, &facts)?;
+    if !settings.first.is_empty() {
+        log.push_snapshot(0, version, settings.first.clone());
+    }
+    Ok(Some(log))
 }
 
 /// Starts the real-time thread and waits for its end.
@@ -291,7 +333,7 @@ fn report<B: Build>(
         ticks: end.last.tick,
         last_mode: end.last.mode,
         reason: if end.last.tick == 0 { Reason::Stop } else { end.last.reason },
-        modes: Mode::ALL.into_iter().map(mode_count).collect(),
+        modes: Mode::ALL.iter().copied().map(mode_count).collect(),
         counters,
         refused_states: io.traffic.refused_states + io.link.state_counts().1,
         wake: percentiles(&end.wake),
@@ -301,6 +343,8 @@ fn report<B: Build>(
         refusals: io.snapshots.refusals,
         log_drops: log.dropped,
         log_error: log.error,
+        rolled_back: io.snapshots.rolled_back,
+        usage: end.usage,
         warnings,
         plant: plant_summary(&end.last.state),
     }

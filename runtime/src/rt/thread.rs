@@ -14,6 +14,45 @@ pub struct ThreadSettings {
     pub lock_memory: bool,
 }
 
+/// What a thread cost the system.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct Usage {
+    /// Page faults served without reading from a disk.
+    pub minor_faults: u64,
+    /// Page faults that read from a disk.
+    pub major_faults: u64,
+    /// Context switches because the thread waited.
+    pub voluntary_switches: u64,
+    /// Context switches because another thread was given the core.
+    pub involuntary_switches: u64,
+}
+
+impl Usage {
+    /// Of the calling thread since its start.
+    pub(crate) fn of_this_thread() -> Usage {
+        // SAFETY: a struct of numbers, for which zero is a value.
+        let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
+        // SAFETY: plain call that fills the struct.
+        unsafe { libc::getrusage(libc::RUSAGE_THREAD, &raw mut usage) };
+        let count = |n: libc::c_long| n.max(0) as u64;
+        Usage {
+            minor_faults: count(usage.ru_minflt),
+            major_faults: count(usage.ru_majflt),
+            voluntary_switches: count(usage.ru_nvcsw),
+            involuntary_switches: count(usage.ru_nivcsw),
+        }
+    }
+
+    pub(crate) fn since(self, before: Usage) -> Usage {
+        Usage {
+            minor_faults: self.minor_faults - before.minor_faults,
+            major_faults: self.major_faults - before.major_faults,
+            voluntary_switches: self.voluntary_switches - before.voluntary_switches,
+            involuntary_switches: self.involuntary_switches - before.involuntary_switches,
+        }
+    }
+}
+
 /// Asks for `settings` on the calling thread; returns one sentence for each refusal.
 pub fn prepare(settings: &ThreadSettings) -> Vec<String> {
     // Sleeps of normal threads are rounded up by 50 us unless asked otherwise.

@@ -13,8 +13,19 @@ pub trait Tick: Send + 'static {
     /// Computes an action that brings the velocity to zero; [`Outcome::Refused`] leaves braking to the plant. Also
     /// called after a panic in `tick`: it must not rely on what `tick` may have left half done.
     fn brake(&mut self, state: &StateMessage, step: &mut Step) -> Outcome;
-    /// The next state begins a new episode, or follows a gap.
+    /// The next state begins a new episode, or follows a swap.
     fn reset(&mut self);
+    /// Sets every entry of the proposal's noise; 0 on a robot unless a rehearsed fault asks for another number.
+    fn set_noise(&mut self, _noise: f32) {}
+    /// Moves `state` on by one period, to where the action in `step` was to take it.
+    fn predict(&self, _state: &mut StateMessage, _step: &Step) {}
+    /// The first degree of freedom of `new` that cannot have come from `old` in `age` [s], allowing `jump` times its speed.
+    fn implausible(&self, _old: &StateMessage, _new: &StateMessage, _age: f64, _jump: f64) -> Option<usize> {
+        None
+    }
+    /// Takes `step` back towards standing still: `share` in (0, 1) of the way to its target is left. Only where a model
+    /// of the robot knows the action for that; the others stay as they are.
+    fn soften(&mut self, _state: &StateMessage, _share: f64, _step: &mut Step) {}
 }
 
 /// How a tick of the controller ended.
@@ -22,6 +33,8 @@ pub trait Tick: Send + 'static {
 pub enum Outcome {
     /// `step.action` is checked and may be applied.
     Acted,
+    /// The same, but the proposal was discarded and every joint brakes; the ledger's status says why.
+    Braked,
     /// There is no checked action: the loop brakes.
     Refused,
 }
@@ -64,6 +77,31 @@ pub struct Step {
     pub log_prob_action: f64,
     /// What the projection did.
     pub ledger: LedgerNumbers,
+    /// The first active rows, as many as fit; `ledger.active` counts all.
+    pub rows: [Row; MAX_ROWS],
+}
+
+/// Active rows a step has room for: a box row and two torque rows for each of 32 joints.
+pub const MAX_ROWS: usize = 96;
+
+/// A row that holds the target back, as plain numbers.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Row {
+    /// Place in [`Kind::ALL`](nearl_constraints::Kind::ALL).
+    pub kind: u8,
+    /// 0 for the lower, 1 for the upper bound.
+    pub side: u8,
+    /// Number of the row: the degree of freedom, or beyond those a coupled row.
+    pub row: u16,
+    /// How hard it is leaned on, see [`nearl_constraints::ActiveRow`].
+    pub multiplier: f64,
+    /// By how much a soft row is exceeded, as a share of its size.
+    pub slack: f64,
+}
+
+impl Row {
+    /// Names of the bounds by their number.
+    pub const SIDES: [&str; 2] = ["lower", "upper"];
 }
 
 impl Step {
@@ -80,12 +118,18 @@ impl Step {
             log_prob_proposal: 0.0,
             log_prob_action: 0.0,
             ledger: LedgerNumbers::default(),
+            rows: [Row::default(); MAX_ROWS],
         }
+    }
+
+    /// The active rows that fitted.
+    pub fn rows(&self) -> &[Row] {
+        &self.rows[..(self.ledger.active as usize).min(MAX_ROWS)]
     }
 }
 
 /// Counts of the loop since its start.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Counters {
     /// Ticks that ended after the next slot was due.
     pub overruns: u64,
@@ -99,8 +143,18 @@ pub struct Counters {
     pub lost_states: u64,
     /// States with numbers that are not finite.
     pub bad_states: u64,
+    /// States in which a joint jumped further than it can move.
+    pub implausible_states: u64,
+    /// States that repeat an older one although the plant should move.
+    pub frozen_states: u64,
+    /// States that came after a newer one, or twice.
+    pub out_of_order: u64,
+    /// Ticks that acted on a predicted state.
+    pub held: u64,
     /// Ticks the controller refused.
     pub refused: u64,
+    /// Ticks in which the projector discarded the proposal and braked.
+    pub braked: u64,
     /// Controllers swapped in.
     pub swaps: u64,
     /// Actions that found the ring full.
@@ -112,10 +166,22 @@ pub struct Counters {
     /// Limits the projected targets broke, summed over ticks.
     pub projected_violations: u64,
     /// Ticks in each mode, by code.
-    pub mode_ticks: [u64; 4],
+    pub mode_ticks: [u64; Mode::ALL.len()],
 }
 
-/// Everything about one tick. Passed by value through a ring; about 5 kB.
+/// What the state of a tick was worth.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Sensed {
+    /// The measured state was acted upon.
+    Measured,
+    /// A predicted one was.
+    Predicted,
+    /// There was none: the plant brakes by itself.
+    Missing,
+}
+
+/// Everything about one tick. Passed by value through a ring; about 8 kB.
 #[derive(Clone, Copy, Debug)]
 pub struct Record {
     /// Tick of the runtime, from 1.
@@ -134,9 +200,21 @@ pub struct Record {
     pub policy_version: u64,
     /// `state` is new in this tick.
     pub fresh: bool,
+    /// A state came that was not newer than the one before, and was not used.
+    pub ignored: bool,
     /// A controller was swapped in before this tick.
     pub swapped: bool,
-    /// The state acted upon.
+    /// Number of the snapshot in use, in the order they were received; 0 for the first.
+    pub snapshot: u64,
+    /// A stop had been asked for when the tick began.
+    pub stop: bool,
+    /// What the state was worth.
+    pub sensed: Sensed,
+    /// Share of the way to the target that the first motion was given; 1 once it is over.
+    pub ramp: f64,
+    /// Noise of the proposal, in every entry.
+    pub noise: f32,
+    /// The newest state, as measured.
     pub state: StateMessage,
     /// The controller's answer; meaningless if `step.nu` is 0.
     pub step: Step,
@@ -155,7 +233,13 @@ impl Record {
             reason: Reason::None,
             policy_version: 0,
             fresh: false,
+            ignored: false,
             swapped: false,
+            snapshot: 0,
+            stop: false,
+            sensed: Sensed::Missing,
+            ramp: 1.0,
+            noise: 0.0,
             state: StateMessage::zeroed(),
             step: Step::zeroed(),
             counters: Counters::default(),

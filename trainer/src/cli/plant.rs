@@ -6,7 +6,7 @@ use crate::tasks;
 use crate::train::complete;
 use clap::Args;
 use nearl_runtime::link::{PlantLink, PlantRunner, PlantSettings, RobotName};
-use nearl_runtime::rt::Stop;
+use nearl_runtime::rt::{FaultPlan, FaultyPlant, Stop};
 use std::io::Write;
 
 #[derive(Args)]
@@ -28,6 +28,9 @@ pub(super) struct PlantCommand {
     /// Seed of the initial states.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Rehearse the sensor faults in this JSON file.
+    #[arg(long)]
+    faults: Option<std::path::PathBuf>,
     /// Overrides of the task file.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -40,7 +43,8 @@ impl PlantCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
         let mut manifest = tasks::load(&self.task, &self.set)?;
         complete(&mut manifest)?;
-        let mut plant = MujocoPlant::new(&manifest, self.seed, !self.endless)?;
+        let plan = self.faults.as_deref().map(FaultPlan::load).transpose()?.unwrap_or_default();
+        let plant = MujocoPlant::new(&manifest, self.seed, !self.endless)?;
         let dt = plant.dt();
         let name = RobotName::new(&self.name)?;
         let link = PlantLink::open(&name, &plant.robot(self.lockstep))?;
@@ -57,8 +61,9 @@ impl PlantCommand {
                 self.task
             );
         }
-        let report = PlantRunner::new(link, settings)?.run(&mut plant, &stop);
-        let m = plant.meter();
+        let mut faulty = FaultyPlant::new(plant, plan);
+        let report = PlantRunner::new(link, settings)?.run(&mut faulty, &stop);
+        let m = faulty.plant.meter();
         let (p, v, t) = (m.position(), m.velocity(), m.effort());
         if self.json {
             say(

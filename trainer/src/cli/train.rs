@@ -41,7 +41,7 @@ pub(super) struct Train {
     json: bool,
 }
 
-fn steps(text: &str) -> Result<u64, String> {
+pub(super) fn steps(text: &str) -> Result<u64, String> {
     let clean = text.replace('_', "");
     match clean.parse::<f64>() {
         Ok(n) if n >= 1.0 && n.fract() == 0.0 && n < 1e15 => Ok(n as u64),

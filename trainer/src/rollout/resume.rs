@@ -49,7 +49,7 @@ impl Worker {
         put("qvel", e.qvel.clone());
         put("goal", e.goal.clone());
         put("actions", e.actions.clone());
-        put("sums", vec![self.episode.0, self.discounted]);
+        put("sums", vec![self.episode.0, self.discounted, self.cost]);
         put("obs", self.state.obs.clone());
         put("projector", self.controller.memory());
         Ok(())
@@ -70,7 +70,7 @@ impl Worker {
             goal: take("goal", Some(self.env.goal().len()))?,
             actions: take("actions", ticks.checked_mul(n_act))?,
         };
-        let (sums, obs) = (take("sums", Some(2))?, take("obs", Some(self.state.obs.len()))?);
+        let (sums, obs) = (take("sums", Some(3))?, take("obs", Some(self.state.obs.len()))?);
         let memory = take("projector", Some(self.controller.memory().len()))?;
         let changed =
             || format!("environment {i} does not repeat its episode: task, robot or MuJoCo changed");
@@ -90,7 +90,8 @@ impl Worker {
         if bits(&self.state.obs) != bits(&obs) {
             return Err(changed());
         }
-        (self.episode, self.ticks, self.discounted) = ((sums[0], length), ticks, sums[1]);
+        (self.episode, self.ticks) = ((sums[0], length), ticks);
+        (self.discounted, self.cost) = (sums[1], sums[2]);
         self.rng.set_word_pos(rng.into());
         Ok(())
     }

@@ -51,6 +51,8 @@ impl Segment {
 pub struct Tally {
     /// Return and length in policy steps of each finished episode.
     pub episodes: Vec<(f64, usize)>,
+    /// Cost of each finished episode.
+    pub costs: Vec<f64>,
     /// Control ticks.
     pub ticks: u64,
     /// Ticks whose raw proposal broke a constraint.
@@ -78,6 +80,7 @@ pub struct Tally {
 impl Tally {
     pub(super) fn add(&mut self, other: &Self) {
         self.episodes.extend_from_slice(&other.episodes);
+        self.costs.extend_from_slice(&other.costs);
         self.ticks += other.ticks;
         self.raw_violations += other.raw_violations;
         self.recovering += other.recovering;

@@ -27,6 +27,7 @@ pub struct Worker {
     moved: f64,
     pub(super) discounted: f64,
     pub(super) episode: (f64, usize),
+    pub(super) cost: f64,
     pub(super) ticks: usize,
     pub(super) history: Episode,
     /// The collected rows.
@@ -73,6 +74,7 @@ impl Worker {
             moved: 0.0,
             discounted: 0.0,
             episode: (0.0, 0),
+            cost: 0.0,
             ticks: 0,
             history: Episode::default(),
             segment: Segment::default(),
@@ -103,7 +105,7 @@ impl Worker {
         self.env.reset(&mut self.rng)?;
         self.history.begin(&*self.env);
         self.controller.reset();
-        (self.episode, self.ticks, self.discounted) = ((0.0, 0), 0, 0.0);
+        (self.episode, self.cost, self.ticks, self.discounted) = ((0.0, 0), 0.0, 0, 0.0);
         self.observe();
         Ok(())
     }
@@ -131,6 +133,7 @@ impl Worker {
             self.store(reward, terminated, truncated && !terminated, t, t + 1 == n_steps);
             if terminated || truncated {
                 self.tally.episodes.push(self.episode);
+                self.tally.costs.push(self.cost);
                 // the same draws for a reset whatever happened before: an error here is a broken installation
                 self.restart().unwrap_or_else(|e| panic!("{e}"));
             }
@@ -145,6 +148,7 @@ impl Worker {
             let (_, terminated) = self.policy_step();
             if terminated || self.ticks >= self.env.spec().max_episode_steps {
                 let episode = self.episode;
+                self.tally.costs.push(self.cost);
                 self.restart().unwrap_or_else(|e| panic!("{e}"));
                 return episode;
             }
@@ -198,6 +202,7 @@ impl Worker {
         self.history.push(&self.out.action);
         let step = self.env.step(&self.out.action);
         self.ticks += 1;
+        self.cost += step.cost;
         self.observe();
         let ledger = &self.out.next.ledger;
         self.tally.ticks += 1;

@@ -40,6 +40,7 @@ impl Training {
         put("stats.return".into(), Values::F64(self.return_stats.to_vec()));
         let recent = self.recent.iter().flat_map(|&(r, n)| [r, n as f64]).collect();
         put("recent".into(), Values::F64(recent));
+        put("recent_costs".into(), Values::F64(self.recent_costs.clone()));
         put("seconds".into(), Values::F64(vec![self.seconds()]));
         for (i, worker) in self.collector.workers().enumerate() {
             worker.save(i, &mut to)?;
@@ -81,6 +82,7 @@ impl Training {
             let n = stats.to_vec().len();
             stats.set(&from.take_f64(name, Some(n))?);
         }
+        self.recent_costs = from.take_f64("recent_costs", None)?;
         let recent = from.take_f64("recent", None)?;
         self.recent = recent.as_chunks::<2>().0.iter().map(|&[r, n]| (r, n as usize)).collect();
         self.earlier = from.take_f64("seconds", Some(1))?[0];

@@ -1,0 +1,91 @@
+//! The metadata of a flight log: what replay needs beside the ticks and the snapshots.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::tick::SCHEMA_VERSION;
+use crate::link::{Message, RobotMessage};
+use crate::rt::{CoreSettings, FaultPlan};
+
+/// The plant's description as readable facts.
+#[derive(Debug, Serialize, Deserialize)]
+struct RobotFacts {
+    joints: Vec<String>,
+    /// Hash over all joint names, those beyond the capacity of a message included.
+    joints_hash: u64,
+    observation: u64,
+    limits: u64,
+    dt: f64,
+    nq: u32,
+    nv: u32,
+    nu: u32,
+    n_obs: u32,
+    bits: u32,
+}
+
+/// What [`read`] finds again.
+#[derive(Debug)]
+pub(crate) struct Session {
+    pub(crate) robot: RobotMessage,
+    pub(crate) core: CoreSettings,
+    pub(crate) faults: FaultPlan,
+}
+
+/// Facts of a run as strings, as MCAP metadata has them.
+pub(crate) fn facts(
+    robot: &RobotMessage,
+    core: &CoreSettings,
+    faults: &FaultPlan,
+) -> BTreeMap<String, String> {
+    let joints = robot.joint_names();
+    let described = RobotFacts {
+        joints: joints.clone(),
+        joints_hash: robot.joints,
+        observation: robot.observation,
+        limits: robot.limits,
+        dt: robot.dt,
+        nq: robot.nq,
+        nv: robot.nv,
+        nu: robot.nu,
+        n_obs: robot.n_obs,
+        bits: robot.bits,
+    };
+    fn json(what: &str, value: &impl Serialize) -> (String, String) {
+        let text = serde_json::to_string(value).unwrap_or_else(|e| unreachable!("{what}: {e}"));
+        (what.to_owned(), text)
+    }
+    [
+        ("schema".to_owned(), SCHEMA_VERSION.to_string()),
+        ("dt".to_owned(), robot.dt.to_string()),
+        ("joints".to_owned(), joints.join(",")),
+        json("robot", &described),
+        json("settings", core),
+        json("faults", faults),
+    ]
+    .into()
+}
+
+/// Reads the facts back; the error is one clause.
+pub(crate) fn read(facts: &BTreeMap<String, String>) -> Result<Session, String> {
+    let get = |key: &str| facts.get(key).ok_or_else(|| format!("its metadata has no `{key}`"));
+    let version = get("schema")?;
+    if *version != SCHEMA_VERSION.to_string() {
+        return Err(format!("its schema is {version}, this build replays {SCHEMA_VERSION}"));
+    }
+    fn parse<T: for<'de> Deserialize<'de>>(key: &str, text: &str) -> Result<T, String> {
+        serde_json::from_str(text).map_err(|e| format!("its metadata `{key}` is damaged: {e}"))
+    }
+    let described: RobotFacts = parse("robot", get("robot")?)?;
+    let mut robot = RobotMessage::zeroed();
+    robot.set_joint_names(&described.joints);
+    robot.joints = described.joints_hash;
+    (robot.observation, robot.limits, robot.dt) = (described.observation, described.limits, described.dt);
+    (robot.nq, robot.nv, robot.nu) = (described.nq, described.nv, described.nu);
+    (robot.n_obs, robot.bits) = (described.n_obs, described.bits);
+    Ok(Session {
+        robot,
+        core: parse("settings", get("settings")?)?,
+        faults: parse("faults", get("faults")?)?,
+    })
+}

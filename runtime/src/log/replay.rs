@@ -1,0 +1,246 @@
+//! `nearl replay`: every tick of a flight log computed again, bit for bit.
+//!
+//! State, times, stop and swaps are taken from the log; modes, proposals, targets, ledgers, actions and counts are
+//! computed by the functions the loop itself calls ([`Core`]) and compared.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use mcap::read::{ChunkFlattener, Options};
+use mcap::records::Record as Part;
+use serde::Serialize;
+use serde_json::Value;
+
+use super::facts::{self, Session};
+use super::map::Map;
+use super::queue::{SNAPSHOT_TOPIC, SnapshotEntry, TICK_TOPIC, attachment_name};
+use super::tick::{TickJson, encode};
+use crate::link::{Message, SnapshotBytes, SnapshotHeader};
+use crate::rt::{Build, Core, Inputs, Loaded, PilotBuilder};
+
+/// What replay found.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Replay {
+    /// Ticks computed again with the same bits.
+    pub ticks: u64,
+    /// Controllers swapped in on the way.
+    pub swaps: u64,
+    /// The log was closed by the runtime, not cut by its death.
+    pub complete: bool,
+    /// Where log and replay first differ.
+    pub difference: Option<Difference>,
+}
+
+/// The first tick and field that differ.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Difference {
+    /// Tick.
+    pub tick: u64,
+    /// Field of the tick, for example `action[3]`.
+    pub field: String,
+    /// Its value in the log.
+    pub log: String,
+    /// Its value in the replay.
+    pub replay: String,
+}
+
+impl fmt::Display for Difference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Difference { tick, field, log, replay } = self;
+        write!(f, "tick {tick}: `{field}` is {log} in the log, replay gives {replay}")
+    }
+}
+
+/// Why a log cannot be replayed.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "flight log '{file}' cannot be replayed: {reason}; give a file written by `nearl run --log` of this build"
+)]
+pub struct ReplayError {
+    file: PathBuf,
+    reason: String,
+}
+
+/// Replays the log in `file`.
+///
+/// # Errors
+/// [`ReplayError`] if it is no flight log of this build, or a snapshot in it is refused.
+pub fn replay(file: &Path) -> Result<Replay, ReplayError> {
+    replay_with(file, PilotBuilder)
+}
+
+/// The same with controllers made by `build`.
+///
+/// # Errors
+/// As [`replay`].
+pub fn replay_with<B: Build>(file: &Path, build: B) -> Result<Replay, ReplayError> {
+    let fail = |reason: String| ReplayError { file: file.to_owned(), reason };
+    let map = Map::open(file).map_err(|e| fail(e.to_string()))?;
+    Replayer::new(build).run(map.bytes()).map_err(fail)
+}
+
+struct Replayer<B: Build> {
+    build: B,
+    topics: HashMap<u16, String>,
+    facts: BTreeMap<String, String>,
+    attachments: HashMap<String, Vec<u8>>,
+    snapshots: HashMap<u64, SnapshotEntry>,
+    running: Option<(Session, Core<B::Controller>)>,
+    line: Vec<u8>,
+    found: Replay,
+}
+
+impl<B: Build> Replayer<B> {
+    fn new(build: B) -> Self {
+        Replayer {
+            build,
+            topics: HashMap::new(),
+            facts: BTreeMap::new(),
+            attachments: HashMap::new(),
+            snapshots: HashMap::new(),
+            running: None,
+            line: Vec::new(),
+            found: Replay { ticks: 0, swaps: 0, complete: false, difference: None },
+        }
+    }
+
+    fn run(mut self, bytes: &[u8]) -> Result<Replay, String> {
+        let options = Options::IgnoreEndMagic | Options::ValidateChunkCrcs;
+        let parts = ChunkFlattener::new_with_options(bytes, options).map_err(|e| e.to_string())?;
+        for part in parts {
+            match part {
+                Ok(Part::DataEnd(_)) => self.found.complete = true,
+                Ok(part) => self.take(part)?,
+                // A runtime that was killed leaves its last chunk unfinished.
+                Err(mcap::McapError::UnexpectedEof | mcap::McapError::UnexpectedEoc) => break,
+                Err(e) => return Err(e.to_string()),
+            }
+            if self.found.difference.is_some() {
+                return Ok(self.found);
+            }
+        }
+        if self.found.ticks == 0 {
+            return Err("it holds no ticks".into());
+        }
+        Ok(self.found)
+    }
+
+    fn take(&mut self, part: Part<'_>) -> Result<(), String> {
+        match part {
+            Part::Channel(channel) => {
+                self.topics.insert(channel.id, channel.topic);
+            }
+            Part::Metadata(metadata) => self.facts.extend(metadata.metadata),
+            Part::Attachment { header, data, .. } => {
+                self.attachments.insert(header.name, data.into_owned());
+            }
+            Part::Message { header, data } => match self.topics.get(&header.channel_id).map(String::as_str) {
+                Some(TICK_TOPIC) => self.tick(&data)?,
+                Some(SNAPSHOT_TOPIC) => {
+                    let entry: SnapshotEntry = serde_json::from_slice(&data).map_err(|e| e.to_string())?;
+                    self.snapshots.insert(entry.id, entry);
+                }
+                _ => {}
+            },
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn tick(&mut self, logged: &[u8]) -> Result<(), String> {
+        let at = self.found.ticks + 1;
+        let parse = serde_json::from_slice::<TickJson<'_>>(logged);
+        let json = parse.map_err(|e| format!("the message of tick {at} is damaged: {e}"))?;
+        if json.tick != at {
+            self.differ(at, "tick", json.tick.to_string(), format!("{at}: the ticks before were dropped"));
+            return Ok(());
+        }
+        let state = json.state().ok_or_else(|| format!("a vector of tick {at} is too long"))?;
+        let (session, mut core) = match self.running.take() {
+            Some(running) => running,
+            None => self.start(&json)?,
+        };
+        if json.swapped {
+            core.controller = self.load(json.snapshot, &session)?;
+            self.found.swaps += 1;
+        }
+        core.swap(json.swapped);
+        let fresh = (json.fresh || json.ignored).then_some(&state);
+        core.update(&Inputs { due: core.due(), begin: json.begin_ns, stop: json.stop, fresh });
+        core.close(json.end_ns);
+        // What only the loop's threads know: how long the projection took, and what found a ring full.
+        let record = &mut core.record;
+        record.step.ledger.duration = if record.step.nu > 0 { json.duration() } else { 0 };
+        record.counters.dropped_actions = json.counters.dropped_actions;
+        record.counters.dropped_records = json.counters.dropped_records;
+        encode(record, &mut self.line).map_err(|e| e.to_string())?;
+        self.running = Some((session, core));
+        self.compare(at, logged)
+    }
+
+    fn start(&mut self, first: &TickJson<'_>) -> Result<(Session, Core<B::Controller>), String> {
+        let session = facts::read(&self.facts)?;
+        let controller = self.load(if first.swapped { 0 } else { first.snapshot }, &session)?;
+        let core = Core::new(session.core, controller, first.due_ns, session.faults.clone());
+        Ok((session, core))
+    }
+
+    fn load(&mut self, id: u64, session: &Session) -> Result<Box<Loaded<B::Controller>>, String> {
+        let missing = || format!("snapshot number {id} is not in it");
+        let entry = self.snapshots.get(&id).ok_or_else(missing)?;
+        let bytes = self.attachments.get(&attachment_name(&entry.digest)).ok_or_else(missing)?;
+        if blake3::hash(bytes).to_hex().as_str() != entry.digest {
+            return Err(format!("snapshot number {id} is damaged"));
+        }
+        let mut header = SnapshotHeader::zeroed();
+        (header.version, header.length) = (entry.version, bytes.len() as u64);
+        let snapshot = SnapshotBytes { header, bytes: bytes.clone() };
+        let controller = self.build.build(&snapshot, &session.robot).map_err(|refusal| refusal.text)?;
+        Ok(Box::new(Loaded { id, controller }))
+    }
+
+    fn compare(&mut self, tick: u64, logged: &[u8]) -> Result<(), String> {
+        if logged != self.line {
+            let log: Value = serde_json::from_slice(logged).map_err(|e| e.to_string())?;
+            let own: Value = serde_json::from_slice(&self.line).map_err(|e| e.to_string())?;
+            if let Some((field, log, own)) = first_difference("", &log, &own) {
+                self.differ(tick, &field, log, own);
+                return Ok(());
+            }
+        }
+        self.found.ticks += 1;
+        Ok(())
+    }
+
+    fn differ(&mut self, tick: u64, field: &str, log: String, replay: String) {
+        self.found.difference = Some(Difference { tick, field: field.to_owned(), log, replay });
+    }
+}
+
+/// Path and values of the first leaf that differs; numbers by their bits.
+fn first_difference(path: &str, a: &Value, b: &Value) -> Option<(String, String, String)> {
+    let join = |key: &str| if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") };
+    match (a, b) {
+        (Value::Object(x), Value::Object(y)) => {
+            let keys = x.keys().chain(y.keys().filter(|key| !x.contains_key(*key)));
+            keys.filter_map(|key| {
+                let value = |map: &serde_json::Map<String, Value>| map.get(key).cloned().unwrap_or_default();
+                first_difference(&join(key), &value(x), &value(y))
+            })
+            .next()
+        }
+        (Value::Array(x), Value::Array(y)) if x.len() == y.len() => {
+            let pairs = x.iter().zip(y).enumerate();
+            pairs.filter_map(|(i, (x, y))| first_difference(&format!("{path}[{i}]"), x, y)).next()
+        }
+        (Value::Number(x), Value::Number(y)) => {
+            let same = match (x.as_u64(), y.as_u64()) {
+                (Some(x), Some(y)) => x == y,
+                _ => x.as_f64().map(f64::to_bits) == y.as_f64().map(f64::to_bits),
+            };
+            (!same).then(|| (path.to_owned(), x.to_string(), y.to_string()))
+        }
+        _ => (a != b).then(|| (path.to_owned(), a.to_string(), b.to_string())),
+    }
+}

@@ -1,0 +1,365 @@
+//! A tick without threads, links and clocks: what the real-time thread and replay both call.
+//!
+//! ```text
+//! swap -> sense -> decide -> act -> close
+//! ```
+//!
+//! The same controllers and the same [`Inputs`] give the same bits.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use serde::{Deserialize, Serialize};
+
+use crate::codes::LedgerStatus;
+use crate::link::{Message, StateMessage};
+use crate::rt::faults::FaultPlan;
+use crate::rt::mode::{Event, Mode, ModeLimits, Modes, Reason};
+use crate::rt::tick::{Outcome, Record, Sensed, Step, Tick};
+use crate::rt::{Grid, Sync};
+
+/// Settings of a tick; times in [ns].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CoreSettings {
+    /// Control period.
+    pub period: u64,
+    /// Who keeps time.
+    pub sync: Sync,
+    /// A state older than this is stale.
+    pub age_limit: u64,
+    /// The plant keeps real time: a tick longer than the period is an overrun, and states in between are lost.
+    pub real_time: bool,
+    /// Largest speed entry that counts as standing still [rad/s or m/s].
+    pub stop_speed: f64,
+    /// A joint may move so many times further than its speed allows before its sample is implausible; 0 is no check.
+    pub jump: f64,
+    /// Ticks over which the first motion is let in.
+    pub ramp: u32,
+    /// When to change the mode.
+    pub modes: ModeLimits,
+}
+
+/// What the world brought to a tick: with the history, everything it depends on.
+#[derive(Clone, Copy, Debug)]
+pub struct Inputs<'a> {
+    /// When it was due by the loop's own clock [ns]; not used if the plant keeps time.
+    pub due: u64,
+    /// When it began [ns].
+    pub begin: u64,
+    /// A stop had been asked for.
+    pub stop: bool,
+    /// The newest state, if one came.
+    pub fresh: Option<&'a StateMessage>,
+}
+
+/// A controller and the number of its snapshot.
+pub struct Loaded<T> {
+    /// In the order the snapshots were received; 0 for the first.
+    pub id: u64,
+    /// The controller.
+    pub controller: T,
+}
+
+/// The loop's memory from tick to tick.
+pub struct Core<T: Tick> {
+    settings: CoreSettings,
+    /// The controller in use.
+    pub controller: Box<Loaded<T>>,
+    /// The tick.
+    pub record: Record,
+    modes: Modes,
+    grid: Grid,
+    faults: FaultPlan,
+    /// The state acted upon: the measured one, or a prediction.
+    estimate: StateMessage,
+    /// States predicted in a row; none can be before the first was measured.
+    held: Option<u32>,
+    braked: u32,
+    ramped: u32,
+    overran: bool,
+    /// `brake` panicked: it is not called again on this controller. A panic of `tick` latches Fault.
+    brake_broken: bool,
+}
+
+impl<T: Tick> Core<T> {
+    /// Begins in Hold; `start` is the first slot of the loop's own clock [ns].
+    pub fn new(settings: CoreSettings, controller: Box<Loaded<T>>, start: u64, faults: FaultPlan) -> Core<T> {
+        Core {
+            modes: Modes::new(settings.modes),
+            grid: Grid::new(start, settings.period),
+            record: Record::new(),
+            estimate: StateMessage::zeroed(),
+            held: None,
+            braked: 0,
+            ramped: 0,
+            overran: false,
+            brake_broken: false,
+            settings,
+            controller,
+            faults,
+        }
+    }
+
+    /// Moves the first slot of the loop's own clock [ns].
+    pub fn start(&mut self, start: u64) {
+        self.grid = Grid::new(start, self.settings.period);
+    }
+
+    /// Settings.
+    pub fn settings(&self) -> &CoreSettings {
+        &self.settings
+    }
+
+    /// When the next slot of the loop's own clock is due [ns].
+    pub fn due(&self) -> u64 {
+        self.grid.due()
+    }
+
+    /// The state acted upon.
+    pub fn estimate(&self) -> &StateMessage {
+        &self.estimate
+    }
+
+    /// Periods that a rehearsed fault makes this tick take at least.
+    pub fn rehearsed_periods(&self) -> f64 {
+        self.faults.periods(self.record.tick)
+    }
+
+    /// Begins a tick; `swapped` if [`Core::controller`] is another one since the last.
+    pub fn swap(&mut self, swapped: bool) {
+        self.record.swapped = swapped;
+        if swapped {
+            self.controller.controller.reset();
+            self.brake_broken = false;
+            self.record.counters.swaps += 1;
+        }
+        self.record.tick += 1;
+        self.record.snapshot = self.controller.id;
+        self.record.policy_version = self.controller.controller.version();
+    }
+
+    /// From the state to the action in [`Core::record`]; [`Core::close`] ends the tick.
+    pub fn update(&mut self, inputs: &Inputs<'_>) {
+        let record = &mut self.record;
+        (record.begin, record.stop) = (inputs.begin, inputs.stop);
+        if self.settings.sync == Sync::Clock {
+            record.due = inputs.due;
+        }
+        let event = self.sense(inputs.fresh);
+        self.record.mode = self.modes.update(event, self.overran, inputs.stop);
+        self.record.sensed = match event {
+            Event::Good if self.held == Some(0) => Sensed::Measured,
+            Event::Good => Sensed::Predicted,
+            Event::Held(_) if self.record.mode != Mode::Hold => Sensed::Predicted,
+            Event::Lost(Reason::LostStates) if self.record.fresh => Sensed::Measured,
+            _ => Sensed::Missing,
+        };
+        self.count(event);
+        self.act();
+    }
+
+    /// Ends the tick at `end` [ns] on its grid.
+    pub fn close(&mut self, end: u64) {
+        let record = &mut self.record;
+        record.end = end;
+        if self.settings.sync == Sync::Clock {
+            self.overran = self.grid.finish(end) > 0;
+            (record.counters.overruns, record.counters.skipped) = (self.grid.overruns(), self.grid.skipped());
+        } else {
+            let spent = end.saturating_sub(record.state.header.stamp);
+            self.overran = self.settings.real_time && record.fresh && spent > self.settings.period;
+            if self.overran {
+                record.counters.overruns += 1;
+                record.counters.skipped += (spent - 1) / self.settings.period;
+            }
+        }
+        if record.mode.acts() {
+            record.counters.raw_violations += u64::from(record.step.ledger.raw_violations);
+            record.counters.projected_violations += u64::from(record.step.ledger.projected_violations);
+        }
+        record.counters.mode_ticks[record.mode.code() as usize] += 1;
+    }
+
+    fn count(&mut self, event: Event) {
+        let (counters, mode) = (&mut self.record.counters, self.record.mode);
+        counters.held += u64::from(self.record.sensed == Sensed::Predicted);
+        let is_stale = matches!(event, Event::Lost(Reason::StaleState | Reason::FrozenState));
+        counters.stale += u64::from(is_stale && mode != Mode::Hold);
+    }
+
+    /// Lets the controller act or brake; without an answer `nu` is 0 and the plant brakes by itself.
+    fn act(&mut self) {
+        self.record.step.nu = 0;
+        self.record.ramp = 1.0;
+        self.record.noise = self.faults.noise(self.record.tick);
+        let stop = self.record.stop;
+        if self.record.mode.acts() {
+            let event = self.tick();
+            if event != Event::Good {
+                self.record.mode = self.modes.escalate(event, stop);
+            }
+        } else {
+            (self.ramped, self.braked) = (0, 0);
+        }
+        let is_usable = self.record.sensed != Sensed::Missing;
+        let brakes = matches!(self.record.mode, Mode::Braking | Mode::Fault) && is_usable;
+        if brakes && !self.brake_broken && self.call(T::brake).is_none() {
+            self.brake_broken = true;
+            self.record.mode = self.modes.escalate(Event::Panicked, stop);
+        }
+        self.record.reason = self.modes.reason();
+    }
+
+    /// The controller's tick, softened while the first motion is let in.
+    fn tick(&mut self) -> Event {
+        self.controller.controller.set_noise(self.record.noise);
+        let outcome = match self.faults.panics(self.record.tick) {
+            true => self.call(|_, _, _| panic!("rehearsed panic of the controller")),
+            false => self.call(T::tick),
+        };
+        self.braked = if outcome == Some(Outcome::Braked) { self.braked + 1 } else { 0 };
+        match outcome {
+            None => return Event::Panicked,
+            Some(Outcome::Refused) => {
+                self.record.counters.refused += 1;
+                return Event::Refused(Reason::Controller);
+            }
+            Some(Outcome::Braked) => {
+                self.record.counters.braked += 1;
+                if self.braked >= self.settings.modes.braked_ticks {
+                    return Event::Refused(braked_reason(self.record.step.ledger.status));
+                }
+            }
+            Some(Outcome::Acted) => self.soften(),
+        }
+        Event::Good
+    }
+
+    fn soften(&mut self) {
+        if self.ramped >= self.settings.ramp {
+            return;
+        }
+        self.ramped += 1;
+        self.record.ramp = f64::from(self.ramped) / f64::from(self.settings.ramp + 1);
+        let (share, step) = (self.record.ramp, &mut self.record.step);
+        self.controller.controller.soften(&self.estimate, share, step);
+    }
+
+    /// Calls a verb of the controller; `None` if it panicked.
+    fn call(&mut self, verb: fn(&mut T, &StateMessage, &mut Step) -> Outcome) -> Option<Outcome> {
+        let (controller, step) = (&mut self.controller.controller, &mut self.record.step);
+        let outcome = catch_unwind(AssertUnwindSafe(|| verb(controller, &self.estimate, step))).ok();
+        if !matches!(outcome, Some(Outcome::Acted | Outcome::Braked)) {
+            self.record.step.nu = 0;
+        }
+        outcome
+    }
+
+    /// Takes the newest state and says what it is worth.
+    fn sense(&mut self, fresh: Option<&StateMessage>) -> Event {
+        let known = self.record.state.header;
+        let is_old = |s: &StateMessage| s.header.epoch == known.epoch && s.header.seq <= known.seq;
+        self.record.ignored = fresh.is_some_and(is_old);
+        self.record.counters.out_of_order += u64::from(self.record.ignored);
+        let Some(state) = fresh.filter(|s| !is_old(s)) else {
+            self.record.fresh = false;
+            return self.without_state();
+        };
+        self.record.fresh = true;
+        if self.settings.sync == Sync::Plant {
+            self.record.due = state.header.stamp;
+        }
+        let is_next = state.header.epoch == known.epoch;
+        let lost = if is_next { state.header.seq - known.seq - 1 } else { 0 };
+        self.record.counters.lost_states += lost;
+        // By its number: the state that began the episode may be among the lost ones.
+        if !is_next || state.episode != self.record.state.episode {
+            self.controller.controller.reset();
+            self.held = None;
+        }
+        let is_frozen = is_next && self.is_frozen(state);
+        let missed = state.tick.saturating_sub(self.record.state.tick + 1);
+        let gap = if is_next && self.settings.real_time { missed.min(lost) } else { 0 };
+        self.record.state = *state;
+        self.judge(is_frozen, gap)
+    }
+
+    /// What the state just taken is worth.
+    fn judge(&mut self, is_frozen: bool, gap: u64) -> Event {
+        let (state, counters) = (&self.record.state, &mut self.record.counters);
+        if !state.is_finite() {
+            counters.bad_states += 1;
+            return self.hold(Reason::BadState);
+        }
+        if self.record.begin.saturating_sub(state.header.stamp) > self.settings.age_limit {
+            return Event::Lost(Reason::StaleState);
+        }
+        let jump = self.settings.jump;
+        if jump > 0.0 && self.held.is_some() {
+            let ticks = state.tick.saturating_sub(self.estimate.tick).max(1);
+            let age = ticks as f64 * self.settings.period as f64 * 1e-9;
+            if self.controller.controller.implausible(&self.estimate, state, age, jump).is_some() {
+                counters.implausible_states += 1;
+                return self.hold(Reason::ImplausibleState);
+            }
+        }
+        if is_frozen {
+            counters.frozen_states += 1;
+            return self.hold(Reason::FrozenState);
+        }
+        self.estimate = *state;
+        self.held = Some(0);
+        let is_bridged = gap <= u64::from(self.settings.modes.hold_states);
+        if is_bridged { Event::Good } else { Event::Lost(Reason::LostStates) }
+    }
+
+    /// No state came: with the loop's own clock a few are bridged, with the plant's the wait was over the age limit.
+    fn without_state(&mut self) -> Event {
+        if self.settings.sync == Sync::Plant || self.held.is_none() {
+            return Event::Lost(Reason::StaleState);
+        }
+        self.record.counters.repeated += 1;
+        let is_first = self.held == Some(0);
+        match self.hold(Reason::LostStates) {
+            // Two clocks of the same rate meet a slot without a state now and then.
+            Event::Held(_) if is_first => Event::Good,
+            event => event,
+        }
+    }
+
+    /// Puts a predicted state in place of the one that is missing, if that may be done once more.
+    fn hold(&mut self, reason: Reason) -> Event {
+        let has_acted = self.record.step.nu > 0 && self.modes.mode().acts();
+        match self.held {
+            Some(held) if held < self.settings.modes.hold_states && has_acted => {
+                self.held = Some(held + 1);
+                self.controller.controller.predict(&mut self.estimate, &self.record.step);
+                self.estimate.tick += 1;
+                Event::Held(reason)
+            }
+            _ => Event::Lost(reason),
+        }
+    }
+
+    /// The plant's clock stands still, or no joint has moved although the state says that one moves.
+    fn is_frozen(&self, new: &StateMessage) -> bool {
+        let old = &self.record.state;
+        if new.tick == old.tick {
+            return false; // sent again because no answer came
+        }
+        let moves = new.v().iter().any(|v| v.abs() > self.settings.stop_speed);
+        (new.time > 0.0 && new.time == old.time) || (moves && new.q() == old.q() && new.v() == old.v())
+    }
+}
+
+fn braked_reason(status: u32) -> Reason {
+    if status == LedgerStatus::BrakedNonFiniteProposal.number() {
+        Reason::NonFiniteProposal
+    } else if status == LedgerStatus::BrakedNonFiniteDynamics.number() {
+        Reason::NonFiniteDynamics
+    } else if status == LedgerStatus::BrakedNoVerifiedBrake.number() {
+        Reason::NoVerifiedBrake
+    } else {
+        Reason::NoCertifiedAnswer
+    }
+}
