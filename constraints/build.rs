@@ -18,7 +18,7 @@ const NEEDED: [(&str, &str); 4] = [
 /// Exported CMake targets that carry the compile definitions of the wheels.
 const TARGETS: [&str; 2] = ["lib/cmake/pinocchio/pinocchioTargets.cmake", "lib/cmake/coal/coalTargets.cmake"];
 
-const SOURCES: [&str; 2] = ["cpp/load.cpp", "cpp/dynamics.cpp"];
+const SOURCES: [&str; 3] = ["cpp/load.cpp", "cpp/dynamics.cpp", "cpp/kinematics.cpp"];
 
 fn main() {
     println!("cargo:rerun-if-env-changed=NEARL_SITE_PACKAGES");

@@ -28,7 +28,8 @@ struct nc_model {
 struct nc_data {
   pin::Data data;
   Vector q0, q1, dq; // integrate and difference are instantiated for plain vectors only
-  explicit nc_data(const pin::Model &m) : data(m), q0(m.nq), q1(m.nq), dq(m.nv) {}
+  pin::Data::Matrix6x jacobian;
+  explicit nc_data(const pin::Model &m) : data(m), q0(m.nq), q1(m.nq), dq(m.nv), jacobian(6, m.nv) {}
 };
 
 extern thread_local std::string nc_error;

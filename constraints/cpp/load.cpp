@@ -12,11 +12,14 @@ thread_local std::string nc_error;
 extern "C" {
 const char *nc_last_error(void) { return nc_error.c_str(); }
 
-nc_model *nc_model_from_urdf_text(const char *xml) {
+nc_model *nc_model_from_urdf_text(const char *xml, int free_flyer) {
   nc_model *out = nullptr;
   guard([&] {
     auto m = std::make_unique<nc_model>();
-    pin::urdf::buildModelFromXML(std::string(xml), m->model);
+    if (free_flyer)
+      pin::urdf::buildModelFromXML(std::string(xml), pin::JointModelFreeFlyer(), m->model);
+    else
+      pin::urdf::buildModelFromXML(std::string(xml), m->model);
     out = m.release();
   });
   return out;

@@ -11,7 +11,7 @@ typedef struct nc_data nc_data;   // scratch: one per thread
 const char *nc_last_error(void);
 
 // -- building (load.cpp) --
-nc_model *nc_model_from_urdf_text(const char *xml);
+nc_model *nc_model_from_urdf_text(const char *xml, int free_flyer);
 nc_model *nc_model_from_mjcf_file(const char *path);
 void nc_model_free(nc_model *);
 int nc_model_nq(const nc_model *);
@@ -39,6 +39,20 @@ int nc_nle(const nc_model *, nc_data *, const double *q, const double *v, double
 int nc_aba(const nc_model *, nc_data *, const double *q, const double *v, const double *tau, double *a);
 int nc_integrate(const nc_model *, nc_data *, const double *q, const double *dq, double *out);
 int nc_difference(const nc_model *, nc_data *, const double *q0, const double *q1, double *dq);
+
+// -- frames (kinematics.cpp): none of the functions with data allocates --
+int nc_model_nframes(const nc_model *); // with the universe, frame 0
+// *body: 1 for a link; *joint: the joint that moves it, -1 for none
+int nc_model_frame(const nc_model *, int frame, char *name, size_t name_cap, int *body, int *joint);
+int nc_model_joint_parent(const nc_model *, int joint); // -1: the universe
+// placements, velocities and accelerations of all joints; with jacobians != 0 also their Jacobians
+int nc_kinematics(const nc_model *, nc_data *, const double *q, const double *v, const double *a, int jacobians);
+// 24 numbers in world axes: position 3, rotation 3 x 3 by rows, velocity 6, classical acceleration 6 (linear first)
+int nc_frame(const nc_model *, nc_data *, int frame, double *out);
+// 6 x nv by rows (not columns), linear first, world axes at the frame's origin
+int nc_frame_jacobian(const nc_model *, nc_data *, int frame, double *jacobian);
+// spoils the placements of nc_kinematics
+int nc_kinetic_energy(const nc_model *, nc_data *, const double *q, const double *v, double *energy);
 #ifdef __cplusplus
 }
 #endif

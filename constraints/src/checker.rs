@@ -2,8 +2,9 @@
 //! assembly: no boxes, no rows, no mass matrix; the motor force comes from inverse dynamics.
 
 use crate::ledger::Counts;
+use crate::row::{Cone, Motion, Needs, Previous, Rows};
 use crate::viability::{Kind, Period};
-use crate::{Consistency, Dynamics, LimitSet, Model};
+use crate::{Consistency, Dynamics, Kinematics, Limit, LimitError, LimitSet, Model};
 
 /// A violation counts above this share of its limit (of 1 where the limit is smaller).
 pub const TOLERANCE: f64 = 1e-9;
@@ -15,8 +16,8 @@ pub struct Verdict {
     pub counts: Counts,
     /// The largest, as a share of its limit.
     pub worst: f64,
-    /// Dof of the largest.
-    pub worst_dof: usize,
+    /// Row of the largest, as in [`ActiveRow`](crate::ActiveRow).
+    pub worst_row: usize,
 }
 
 impl Verdict {
@@ -25,7 +26,7 @@ impl Verdict {
         self.counts.total() == 0
     }
 
-    fn see(&mut self, kind: Kind, dof: usize, value: f64, limit: f64) {
+    fn see(&mut self, kind: Kind, row: usize, value: f64, limit: f64) {
         if limit == f64::INFINITY && !value.is_nan() {
             return;
         }
@@ -33,7 +34,7 @@ impl Verdict {
         if excess.is_nan() || excess > TOLERANCE {
             self.counts.add(kind);
             if excess.is_nan() || excess > self.worst {
-                (self.worst, self.worst_dof) = (excess, dof);
+                (self.worst, self.worst_row) = (excess, row);
             }
         }
     }
@@ -42,42 +43,93 @@ impl Verdict {
 /// Scratch and constants of the judge.
 pub struct Checker {
     dynamics: Dynamics,
+    kinematics: Kinematics,
     limits: LimitSet,
     dofs: Vec<(usize, usize)>,
     period: Period,
     consistency: Consistency,
-    torque: bool,
+    rows: Vec<RowsOf>,
+    cones: Vec<ConeOf>,
+    needs: Needs,
+    excess: Vec<f64>,
     a: Vec<f64>,
     tau: Vec<f64>,
     passive: Vec<f64>,
 }
 
+/// Rows of one limit: which one, whether they are hard and switched on, their first row's number.
+struct RowsOf {
+    rows: Box<dyn Rows>,
+    limit: usize,
+    hard: bool,
+    enabled: bool,
+    first: usize,
+    count: usize,
+}
+
+struct ConeOf {
+    cone: Box<dyn Cone>,
+    limit: usize,
+    enabled: bool,
+    row: usize,
+}
+
 impl Checker {
     /// A judge of `limits` on the `controllable` dofs.
+    ///
+    /// # Errors
+    /// Those of the limits.
     pub fn new(
         model: &Model,
-        limits: &LimitSet,
+        limits: &[Box<dyn Limit>],
         controllable: &[usize],
         period: Period,
         consistency: Consistency,
-    ) -> Checker {
+    ) -> Result<Checker, LimitError> {
         let zero = || vec![0.0; model.nv()];
-        let torque = controllable.iter().any(|i| limits.effort[*i].is_finite());
-        Checker {
+        let (mut rows, mut cones, mut first) = (Vec::new(), Vec::new(), model.nv());
+        for (limit, l) in limits.iter().enumerate() {
+            if let Some(r) = l.rows(model, controllable)? {
+                let (hard, count) = (l.soft().is_none(), r.sizes().len());
+                rows.push(RowsOf { rows: r, limit, hard, enabled: true, first, count });
+                first += count;
+            }
+        }
+        for (limit, l) in limits.iter().enumerate() {
+            if let Some(cone) = l.cone(model, controllable)? {
+                cones.push(ConeOf { cone, limit, enabled: true, row: first });
+                first += 1;
+            }
+        }
+        let needs = rows.iter().map(|r| r.rows.needs()).chain(cones.iter().map(|c| c.cone.needs()));
+        Ok(Checker {
+            needs: needs.fold(Needs::default(), Needs::and),
+            excess: vec![0.0; rows.iter().map(|r| r.count).max().unwrap_or(0)],
+            rows,
+            cones,
             dynamics: Dynamics::new(model),
-            limits: limits.clone(),
+            kinematics: Kinematics::new(model),
+            limits: LimitSet::collect(model, limits, controllable)?,
             dofs: controllable.iter().map(|i| (*i, model.joint_of_dof(*i).idx_q)).collect(),
             period,
             consistency,
-            torque,
             a: zero(),
             tau: zero(),
             passive: zero(),
-        }
+        })
     }
 
-    /// Judges going from (`q`, `v`) to (`q_next`, `v_next`) in one period; configurations nq, velocities nv.
-    pub fn check(&mut self, q: &[f64], v: &[f64], q_next: &[f64], v_next: &[f64]) -> Verdict {
+    /// Judges going from (`q`, `v`) to (`q_next`, `v_next`) in one period; configurations nq, velocities nv. `external`:
+    /// generalised forces on the robot beside its motors (nv).
+    pub fn check(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        q_next: &[f64],
+        v_next: &[f64],
+        external: &[f64],
+        previous: Option<Previous<'_>>,
+    ) -> Verdict {
         let mut verdict = Verdict::default();
         for k in 0..self.dofs.len() {
             let (i, iq) = self.dofs[k];
@@ -87,11 +139,74 @@ impl Checker {
             if self.limits.has_position(i) {
                 self.positions(i, (q[iq], v[i]), (q_next[iq], v_next[i]), &mut verdict);
             }
+            self.profile(i, q_next[iq], v_next[i], &mut verdict);
+            if self.limits.locked[i] {
+                let slower = v[i].abs() - self.limits.braking[i] * self.period.dt;
+                verdict.see(Kind::Locked, i, v_next[i].abs(), slower.max(0.0));
+            }
         }
-        if self.torque {
-            self.motors(q, v, v_next, &mut verdict);
+        for i in 0..v.len() {
+            self.a[i] = (v_next[i] - v[i]) / self.period.dt;
         }
+        if self.needs.dynamics {
+            self.motors(q, v, external);
+        }
+        if self.needs.kinematics {
+            self.kinematics.update(q, v, &self.a);
+        }
+        self.coupled(&mut verdict, (q, v), (q_next, v_next), previous);
         verdict
+    }
+
+    /// Motor forces of the last motion judged, by inverse dynamics (nv); zero when no limit needs them.
+    pub fn torque(&self) -> &[f64] {
+        &self.tau
+    }
+
+    /// What the rows and cones need beside the state.
+    pub(crate) fn needs(&self) -> Needs {
+        self.needs
+    }
+
+    /// Switches the rows and cones of a limit, and takes over what is left of the limits of single joints.
+    pub(crate) fn enable(&mut self, limit: usize, on: bool, left: &LimitSet) {
+        self.rows.iter_mut().filter(|r| r.limit == limit).for_each(|r| r.enabled = on);
+        self.cones.iter_mut().filter(|c| c.limit == limit).for_each(|c| c.enabled = on);
+        self.limits.clear();
+        self.limits.tighten(left);
+    }
+
+    fn coupled(
+        &mut self,
+        verdict: &mut Verdict,
+        (q, v): (&[f64], &[f64]),
+        (q_next, v_next): (&[f64], &[f64]),
+        previous: Option<Previous<'_>>,
+    ) {
+        let (acceleration, torque, period) = (&self.a[..], &self.tau[..], &self.period);
+        let kinematics = &mut self.kinematics;
+        let mut motion = Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous };
+        for block in self.rows.iter_mut().filter(|r| r.hard && r.enabled) {
+            let excess = &mut self.excess[..block.count];
+            block.rows.excess(&mut motion, excess);
+            for (r, excess) in excess.iter().enumerate() {
+                verdict.see(block.rows.kind(), block.first + r, *excess, 0.0);
+            }
+        }
+        for block in self.cones.iter_mut().filter(|c| c.enabled) {
+            verdict.see(block.cone.kind(), block.row, block.cone.excess(&mut motion), 0.0);
+        }
+    }
+
+    /// The next speed is below the curves at the next position.
+    fn profile(&self, i: usize, q: f64, v: f64, verdict: &mut Verdict) {
+        let [lower, upper] = &self.limits.profile[i];
+        for (curve, d, speed) in [(upper, 1.0, v), (lower, -1.0, -v)] {
+            if let Some(p) = curve {
+                let room = (2.0 * p.deceleration * (d * (p.at - q)).max(0.0)).sqrt();
+                verdict.see(Kind::VelocityProfile, i, speed, (room - p.offset).max(0.0));
+            }
+        }
     }
 
     /// Next position inside both limits, sub-step positions inside, room to brake.
@@ -127,16 +242,12 @@ impl Checker {
         }
     }
 
-    /// `|rnea(q, v, (v' - v) / T) - passive| <= effort`.
-    fn motors(&mut self, q: &[f64], v: &[f64], v_next: &[f64], verdict: &mut Verdict) {
-        for i in 0..v.len() {
-            self.a[i] = (v_next[i] - v[i]) / self.period.dt;
-        }
+    /// `tau = rnea(q, v, (v' - v) / T) - passive - external`.
+    fn motors(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
         self.dynamics.rnea(q, v, &self.a, &mut self.tau);
         self.dynamics.passive(q, v, &mut self.passive);
-        for &(i, _) in &self.dofs {
-            let motor = self.tau[i] - self.passive[i];
-            verdict.see(Kind::Torque, i, motor.abs(), self.limits.effort[i]);
+        for ((tau, passive), external) in self.tau.iter_mut().zip(&self.passive).zip(external) {
+            *tau -= passive + external;
         }
     }
 }

@@ -59,6 +59,14 @@ pub enum ModelError {
         /// "; did you mean ..." or the list of joints.
         near: String,
     },
+    /// A name that is not a frame of the model.
+    #[error("no frame '{name}' in the model{near}")]
+    UnknownFrame {
+        /// Name asked for.
+        name: String,
+        /// "; did you mean ..." or the list of frames.
+        near: String,
+    },
 }
 
 /// A set of limits that cannot become a [`Projector`](crate::Projector).
@@ -72,6 +80,16 @@ pub enum LimitError {
         /// Name asked for.
         name: String,
         /// "; did you mean ..." or the list of joints.
+        near: String,
+    },
+    /// A name that is not a frame of the model.
+    #[error("{limit} names frame '{name}', which the model does not have{near}")]
+    UnknownFrame {
+        /// Which limit, as in the task file.
+        limit: &'static str,
+        /// Name asked for.
+        name: String,
+        /// "; did you mean ..." or the list of frames.
         near: String,
     },
     /// A number out of its domain.

@@ -11,6 +11,8 @@ pub enum Status {
     Clamped,
     /// Coupled rows were active; the nearest allowed state was solved for and checked.
     Solved,
+    /// No way to stop could be verified from the nearest allowed state: this one is nearer to the stored brake.
+    Slowed,
     /// A joint is outside its limits: it may only return or brake, the others follow the proposal.
     Recovering,
     /// The proposal was not used: every controllable joint brakes.
@@ -33,6 +35,8 @@ pub enum BrakeReason {
     NonFiniteProposal,
     /// No answer passed the checker: the coupled rows leave nothing, or the solver failed.
     NoCertifiedAnswer,
+    /// No way to stop could be verified; the stored brake is executed, or with none stored, each joint brakes for itself.
+    NoVerifiedBrake,
     /// The dynamics came out as NaN or infinity.
     NonFiniteDynamics,
 }
@@ -55,6 +59,10 @@ pub enum Rung {
     ActiveSet,
     /// Clarabel.
     Clarabel,
+    /// One of the two, without the soft rows.
+    Relaxed,
+    /// The brake that was verified ticks ago.
+    StoredBrake,
     /// Per-joint brake.
     Brake,
 }
@@ -73,13 +81,15 @@ pub enum Side {
 pub struct ActiveRow {
     /// What the row stands for.
     pub kind: Kind,
-    /// Its dof.
-    pub dof: usize,
+    /// Index into [`Projector::row_names`](crate::Projector::row_names): the dof of a box row, beyond nv a coupled row.
+    pub row: usize,
     /// Its active bound.
     pub side: Side,
     /// How hard it is leaned on, at least 0: derivative of the weighted squared distance with respect to the bound.
-    /// Box rows [weight² rad/s], torque rows [weight² (rad/s)² / N·m].
+    /// Box rows [weight² rad/s], coupled rows [weight² (rad/s)² / unit of the row].
     pub multiplier: f64,
+    /// By how much a soft row is exceeded, as a share of its size; 0 for hard rows.
+    pub slack: f64,
 }
 
 /// Number of violated limits by kind.
@@ -87,7 +97,7 @@ pub struct ActiveRow {
 pub struct Counts {
     /// Position limits.
     pub position: u32,
-    /// Velocity limits.
+    /// Velocity limits, profiles and locked joints.
     pub velocity: u32,
     /// Acceleration limits.
     pub acceleration: u32,
@@ -95,21 +105,24 @@ pub struct Counts {
     pub viability: u32,
     /// Motor force limits.
     pub torque: u32,
+    /// Coupled limits of all other kinds.
+    pub other: u32,
 }
 
 impl Counts {
     /// All of them.
     pub fn total(&self) -> u32 {
-        self.position + self.velocity + self.acceleration + self.viability + self.torque
+        self.position + self.velocity + self.acceleration + self.viability + self.torque + self.other
     }
 
     pub(crate) fn add(&mut self, kind: Kind) {
         *match kind {
             Kind::Position => &mut self.position,
-            Kind::Velocity => &mut self.velocity,
+            Kind::Velocity | Kind::VelocityProfile | Kind::Locked => &mut self.velocity,
             Kind::Acceleration => &mut self.acceleration,
             Kind::Viability => &mut self.viability,
             Kind::Torque => &mut self.torque,
+            _ => &mut self.other,
         } += 1;
     }
 }
@@ -121,7 +134,7 @@ pub struct Ledger {
     pub status: Status,
     /// Which stage gave the answer.
     pub rung: Rung,
-    /// Rows that hold the target back, in the order of dofs, box before torque.
+    /// Rows that hold the target back: the box in the order of dofs, then the coupled rows.
     pub active: Vec<ActiveRow>,
     /// Weighted distance between proposal and target [weight rad/s].
     pub moved: f64,
@@ -142,11 +155,12 @@ pub struct Ledger {
 }
 
 impl Ledger {
-    pub(crate) fn new(nv: usize) -> Ledger {
+    /// Memory for `rows` active rows.
+    pub(crate) fn new(rows: usize) -> Ledger {
         Ledger {
             status: Status::Unchanged,
             rung: Rung::ClosedForm,
-            active: Vec::with_capacity(3 * nv),
+            active: Vec::with_capacity(rows),
             moved: 0.0,
             slack: 0.0,
             iterations: 0,

@@ -52,6 +52,8 @@ pub mod checker;
 pub mod convention;
 mod dynamics;
 mod error;
+pub mod geometry;
+mod kinematics;
 mod layout;
 pub mod ledger;
 pub mod limit;
@@ -59,6 +61,7 @@ mod mjcf;
 mod model;
 mod pinocchio;
 mod projector;
+pub mod row;
 mod target;
 mod urdf;
 pub mod viability;
@@ -66,13 +69,16 @@ pub mod viability;
 pub use certify::{Certificate, certify_braking};
 pub use dynamics::Dynamics;
 pub use error::{LimitError, ModelError};
+pub use kinematics::{FrameMotion, Kinematics, PointMotion};
 pub use layout::{Entry, LayoutError, StateLayout};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};
 pub use limit::{
-    AccelerationLimit, ConstraintSettings, Limit, LimitSet, PerJoint, PositionLimit, TorqueLimit,
-    VelocityLimit, build_limits,
+    AccelerationLimit, CollisionLimit, ConstraintSettings, EnergyLimit, FrameLimit, FrameSpeedLimit,
+    JerkLimit, Limit, LimitSet, LockedJoints, PerJoint, PositionLimit, TorqueLimit, TorqueRateLimit,
+    TorqueSpeedLimit, UserRow, VelocityLimit, VelocityProfileLimit, build_limits,
 };
-pub use model::{Joint, Model};
+pub use model::{FrameId, Joint, Model};
 pub use projector::{Problem, Projector};
-pub use target::{Bounds, Consistency, Proposal, Settings, Solver, Target};
+pub use row::{Cone, Rows, Soft};
+pub use target::{Bounds, Braking, Consistency, Proposal, Settings, Solver, Target};
 pub use viability::{Kind, Period};

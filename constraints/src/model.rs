@@ -2,7 +2,7 @@
 
 use crate::error::{ModelError, near_names};
 use crate::mjcf::{self, Mjcf, MjcfJoint};
-use crate::pinocchio::RawModel;
+use crate::pinocchio::{RawFrame, RawJoint, RawModel};
 use crate::urdf::{self, Stated};
 use std::ffi::CString;
 use std::path::{Path, PathBuf};
@@ -24,6 +24,15 @@ pub struct Joint {
     pub idx_v: usize,
     /// Number of velocity entries (dofs).
     pub nv: usize,
+}
+
+/// A frame of a [`Model`]: a link, a joint or a site, by number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct FrameId(pub(crate) usize);
+
+impl FrameId {
+    /// The world: the frame that never moves.
+    pub const WORLD: FrameId = FrameId(0);
 }
 
 /// A robot model, immutable and shared: cloning copies a pointer.
@@ -50,6 +59,10 @@ struct Inner {
     total_mass: f64,
     neutral: Vec<f64>,
     notes: Vec<String>,
+    frames: Vec<RawFrame>,
+    /// Of Pinocchio's joints: the one before each, and its first and last dof.
+    chain: Vec<(Option<usize>, std::ops::Range<usize>)>,
+    collisions: Vec<urdf::LinkShape>,
 }
 
 impl Model {
@@ -58,7 +71,16 @@ impl Model {
     /// # Errors
     /// The file cannot be read, is not URDF, or holds impossible numbers.
     pub fn from_urdf(path: &Path) -> Result<Model, ModelError> {
-        urdf_model(&text_of(path)?, &path.display().to_string())
+        urdf_model(&text_of(path)?, &path.display().to_string(), false)
+    }
+
+    /// Reads a URDF file; the base floats: the first joint is a free joint called `root_joint` with 7 configuration
+    /// entries and 6 dofs in Pinocchio's convention (see [`convention`](crate::convention)), which no motor drives.
+    ///
+    /// # Errors
+    /// As [`Model::from_urdf`].
+    pub fn from_urdf_free_flyer(path: &Path) -> Result<Model, ModelError> {
+        urdf_model(&text_of(path)?, &path.display().to_string(), true)
     }
 
     /// Reads a URDF text; the base is fixed to the world.
@@ -66,7 +88,15 @@ impl Model {
     /// # Errors
     /// As [`Model::from_urdf`].
     pub fn from_urdf_text(xml: &str) -> Result<Model, ModelError> {
-        urdf_model(xml, "the URDF text")
+        urdf_model(xml, "the URDF text", false)
+    }
+
+    /// Reads a URDF text with a floating base; see [`Model::from_urdf_free_flyer`].
+    ///
+    /// # Errors
+    /// As [`Model::from_urdf`].
+    pub fn from_urdf_text_free_flyer(xml: &str) -> Result<Model, ModelError> {
+        urdf_model(xml, "the URDF text", true)
     }
 
     /// Reads an MJCF file and corrects what Pinocchio's reader leaves out, so that mass matrix, non-linear effects
@@ -198,6 +228,56 @@ impl Model {
         &self.0.notes
     }
 
+    /// The frame called `name`: a link, else a joint or a site. `"universe"` is the world.
+    ///
+    /// # Errors
+    /// There is none; the message lists near names.
+    pub fn frame(&self, name: &str) -> Result<FrameId, ModelError> {
+        self.find_frame(name).map_err(|near| ModelError::UnknownFrame { name: name.to_string(), near })
+    }
+
+    /// The frame called `name`, or the end of a sentence about near names.
+    pub(crate) fn find_frame(&self, name: &str) -> Result<FrameId, String> {
+        let called = |body: bool| self.0.frames.iter().position(|f| f.name == name && (f.body || !body));
+        let found = called(true).or_else(|| called(false)).map(FrameId);
+        found.ok_or_else(|| near_names(name, self.frame_names()))
+    }
+
+    /// Names of all frames by number; a link and a joint may share one.
+    pub fn frame_names(&self) -> impl Iterator<Item = &str> {
+        self.0.frames.iter().map(|f| f.name.as_str())
+    }
+
+    /// Name of a frame.
+    pub fn frame_name(&self, frame: FrameId) -> &str {
+        &self.0.frames[frame.0].name
+    }
+
+    /// True when a motion of `dof` can change where `frame` is.
+    pub fn moves(&self, dof: usize, frame: FrameId) -> bool {
+        let mut at = self.0.frames[frame.0].joint;
+        while let Some(joint) = at {
+            let (parent, dofs) = &self.0.chain[joint];
+            if dofs.contains(&dof) {
+                return true;
+            }
+            at = *parent;
+        }
+        false
+    }
+
+    /// True when two frames are on the same rigid body, or on two joined by one joint.
+    pub(crate) fn neighbours(&self, a: FrameId, b: FrameId) -> bool {
+        let (a, b) = (self.0.frames[a.0].joint, self.0.frames[b.0].joint);
+        let below = |child: Option<usize>, parent| child.is_some_and(|j| self.0.chain[j].0 == parent);
+        a == b || below(a, b) || below(b, a)
+    }
+
+    /// The collision primitives of a URDF, and the links whose collision geometry is a mesh; empty for an MJCF.
+    pub(crate) fn collisions(&self) -> &[urdf::LinkShape] {
+        &self.0.collisions
+    }
+
     pub(crate) fn raw_neutral(&self) -> &[f64] {
         &self.0.neutral
     }
@@ -222,10 +302,10 @@ fn c_text(text: &str, file: &str, format: &'static str) -> Result<CString, Model
     })
 }
 
-fn urdf_model(xml: &str, file: &str) -> Result<Model, ModelError> {
-    let stated = urdf::read(xml, file)?;
+fn urdf_model(xml: &str, file: &str, free_flyer: bool) -> Result<Model, ModelError> {
+    let (stated, collisions) = urdf::read(xml, file)?;
     let refused = |reason| ModelError::Refused { file: file.to_string(), format: "URDF", reason };
-    let raw = RawModel::from_urdf_text(&c_text(xml, file, "URDF")?).map_err(refused)?;
+    let raw = RawModel::from_urdf_text(&c_text(xml, file, "URDF")?, free_flyer).map_err(refused)?;
     let (limits, nv) = (raw.limits(), raw.nv());
     let mut inner = Inner::new(raw, nv);
     for j in inner.raw.joints() {
@@ -237,14 +317,15 @@ fn urdf_model(xml: &str, file: &str) -> Result<Model, ModelError> {
         inner.range_missing.push(stated == Stated::Missing);
         inner.joints.push(Joint { name: j.name, idx_q: j.idx_q, nq: j.nq, idx_v: j.idx_v, nv: j.nv });
     }
-    // In URDF a zero velocity or effort means that nobody filled it in.
-    let some = |x: &f64| if *x > 0.0 { *x } else { f64::INFINITY };
+    // In URDF a zero velocity or effort means that nobody filled it in; of a free joint, Pinocchio says the largest number.
+    let some = |x: &f64| if *x > 0.0 && *x < f64::MAX { *x } else { f64::INFINITY };
     inner.velocity = limits.velocity.iter().map(some).collect();
     inner.effort = limits.effort.iter().map(some).collect();
     if limits.friction.iter().any(|x| *x > 0.0) {
         inner.notes.push("dry joint friction is not modelled".to_string());
     }
     inner.damping = limits.damping;
+    inner.collisions = collisions;
     inner.finish(file)
 }
 
@@ -294,6 +375,7 @@ fn body_of<'a>(mjcf: &'a Mjcf, name: &str, size: (usize, usize)) -> Option<&'a [
 impl Inner {
     fn new(raw: RawModel, nv: usize) -> Inner {
         let (nq, zero, none) = (raw.nq(), vec![0.0; nv], vec![f64::INFINITY; nv]);
+        let link = |j: RawJoint| (j.parent, j.idx_v..j.idx_v + j.nv);
         Inner {
             nq,
             nv,
@@ -310,6 +392,9 @@ impl Inner {
             total_mass: raw.mass(),
             neutral: raw.neutral(),
             notes: Vec::new(),
+            frames: raw.frames(),
+            chain: raw.joints().into_iter().map(link).collect(),
+            collisions: Vec::new(),
             raw,
         }
     }

@@ -13,7 +13,7 @@ pub(crate) struct NcData {
 
 unsafe extern "C" {
     fn nc_last_error() -> *const c_char;
-    fn nc_model_from_urdf_text(xml: *const c_char) -> *mut NcModel;
+    fn nc_model_from_urdf_text(xml: *const c_char, free_flyer: c_int) -> *mut NcModel;
     fn nc_model_from_mjcf_file(path: *const c_char) -> *mut NcModel;
     fn nc_model_free(m: *mut NcModel);
     fn nc_model_nq(m: *const NcModel) -> c_int;
@@ -86,6 +86,38 @@ unsafe extern "C" {
         q1: *const f64,
         dq: *mut f64,
     ) -> c_int;
+    fn nc_model_nframes(m: *const NcModel) -> c_int;
+    fn nc_model_frame(
+        m: *const NcModel,
+        frame: c_int,
+        name: *mut c_char,
+        name_cap: usize,
+        body: *mut c_int,
+        joint: *mut c_int,
+    ) -> c_int;
+    fn nc_model_joint_parent(m: *const NcModel, joint: c_int) -> c_int;
+    pub(crate) fn nc_kinematics(
+        m: *const NcModel,
+        d: *mut NcData,
+        q: *const f64,
+        v: *const f64,
+        a: *const f64,
+        jacobians: c_int,
+    ) -> c_int;
+    pub(crate) fn nc_frame(m: *const NcModel, d: *mut NcData, frame: c_int, out: *mut f64) -> c_int;
+    pub(crate) fn nc_frame_jacobian(
+        m: *const NcModel,
+        d: *mut NcData,
+        frame: c_int,
+        jacobian: *mut f64,
+    ) -> c_int;
+    pub(crate) fn nc_kinetic_energy(
+        m: *const NcModel,
+        d: *mut NcData,
+        q: *const f64,
+        v: *const f64,
+        energy: *mut f64,
+    ) -> c_int;
 }
 
 /// Text of the last exception of this thread.
@@ -103,6 +135,17 @@ pub(crate) struct RawJoint {
     pub(crate) idx_v: usize,
     pub(crate) nv: usize,
     pub(crate) mass: f64,
+    /// The joint before it in the chain; `None` for the first.
+    pub(crate) parent: Option<usize>,
+}
+
+/// One frame: a link, a joint, or what an MJCF calls a site.
+pub(crate) struct RawFrame {
+    pub(crate) name: String,
+    /// True for a link.
+    pub(crate) body: bool,
+    /// The [`RawJoint`] that moves it; `None` for what is fixed to the world.
+    pub(crate) joint: Option<usize>,
 }
 
 /// Numbers per configuration entry (`lower`, `upper`) and per dof (the others).
@@ -131,9 +174,9 @@ impl Drop for RawModel {
 }
 
 impl RawModel {
-    pub(crate) fn from_urdf_text(xml: &CString) -> Result<RawModel, String> {
+    pub(crate) fn from_urdf_text(xml: &CString, free_flyer: bool) -> Result<RawModel, String> {
         // SAFETY: a NUL-terminated text, copied by the shim.
-        RawModel::own(unsafe { nc_model_from_urdf_text(xml.as_ptr()) })
+        RawModel::own(unsafe { nc_model_from_urdf_text(xml.as_ptr(), c_int::from(free_flyer)) })
     }
 
     pub(crate) fn from_mjcf_file(path: &CString) -> Result<RawModel, String> {
@@ -186,9 +229,25 @@ impl RawModel {
         };
         let (name, kind) = (name.to_string_lossy().into_owned(), kind.to_string_lossy().into_owned());
         let [idx_q, nq, idx_v, nv] = at.map(|x| x as usize);
-        // SAFETY: reads one inertia.
-        let mass = unsafe { nc_model_joint_mass(self.0, j) };
-        RawJoint { name, kind, idx_q, nq, idx_v, nv, mass }
+        // SAFETY: reads one inertia and one index.
+        let (mass, parent) = unsafe { (nc_model_joint_mass(self.0, j), nc_model_joint_parent(self.0, j)) };
+        RawJoint { name, kind, idx_q, nq, idx_v, nv, mass, parent: usize::try_from(parent).ok() }
+    }
+
+    pub(crate) fn frames(&self) -> Vec<RawFrame> {
+        // SAFETY: reads one field.
+        let n = unsafe { nc_model_nframes(self.0) };
+        (0..n).map(|f| self.frame(f)).collect()
+    }
+
+    fn frame(&self, f: c_int) -> RawFrame {
+        let (mut name, mut body, mut joint) = ([0 as c_char; 256], 0, -1);
+        // SAFETY: the buffer outlives the call and its size is passed; the shim terminates the text.
+        let name = unsafe {
+            nc_model_frame(self.0, f, name.as_mut_ptr(), name.len(), &raw mut body, &raw mut joint);
+            CStr::from_ptr(name.as_ptr()).to_string_lossy().into_owned()
+        };
+        RawFrame { name, body: body != 0, joint: usize::try_from(joint).ok() }
     }
 
     pub(crate) fn limits(&self) -> RawLimits {

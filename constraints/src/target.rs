@@ -3,6 +3,7 @@
 use crate::ledger::Ledger;
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
+use std::time::Duration;
 
 /// The raw next state a policy asks for. It is not a [`Target`] and cannot be sent to a robot.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,7 +38,7 @@ impl Target {
     /// Memory for targets of `model`.
     pub fn new(model: &Model) -> Target {
         let zero = vec![0.0; model.nv()];
-        let ledger = Ledger::new(model.nv());
+        let ledger = Ledger::new(8 * model.nv() + 64);
         Target { q: model.neutral(), v: zero.clone(), acceleration: zero, ledger }
     }
 }
@@ -100,6 +101,23 @@ pub struct Settings {
     pub velocity_weight: Option<Vec<f64>>,
     /// Iterations allowed to Clarabel.
     pub max_iter: u32,
+    /// Time allowed to one solve of Clarabel; its answer then counts only if it obeys everything. `None`: as long as it takes.
+    pub deadline: Option<Duration>,
+    /// What makes sure that a way to stop is left.
+    pub braking: Braking,
+}
+
+/// What makes sure that torque limits leave a way to stop.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Braking {
+    /// The braking decelerations are within the motors' reach everywhere, which
+    /// [`certify_braking`](crate::certify_braking) tells; nothing is done in a tick.
+    #[default]
+    Certified,
+    /// Each tick verifies a whole brake from the new state by inverse dynamics; where none is found, the last one that
+    /// was verified is executed.
+    Stored,
 }
 
 impl Settings {
@@ -112,6 +130,8 @@ impl Settings {
             solver: Solver::Ladder,
             velocity_weight: None,
             max_iter: 50,
+            deadline: None,
+            braking: Braking::Certified,
         }
     }
 

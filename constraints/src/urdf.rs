@@ -3,7 +3,18 @@
 //! Pinocchio turns missing position limits into [0, 0] and accepts lower above upper, zero effort and NaN.
 
 use crate::ModelError;
+use crate::geometry::{Placement, Shape};
 use roxmltree::{Document, Node};
+
+/// One `<collision>` of a link.
+#[derive(Debug, Clone)]
+pub(crate) struct LinkShape {
+    pub(crate) link: String,
+    /// `None` for a mesh.
+    pub(crate) shape: Option<Shape>,
+    /// In the link's axes.
+    pub(crate) placement: Placement,
+}
 
 /// Position limits as stated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -17,7 +28,10 @@ pub(crate) enum Stated {
 }
 
 /// Movable joints by name.
-pub(crate) fn read(xml: &str, file: &str) -> Result<Vec<(String, Stated)>, ModelError> {
+type Joints = Vec<(String, Stated)>;
+
+/// Movable joints by name, and the collision geometry.
+pub(crate) fn read(xml: &str, file: &str) -> Result<(Joints, Vec<LinkShape>), ModelError> {
     let malformed = |reason: String| ModelError::Malformed { file: file.to_string(), format: "URDF", reason };
     let document = Document::parse(xml).map_err(|e| malformed(e.to_string()))?;
     let root = document.root_element();
@@ -25,13 +39,47 @@ pub(crate) fn read(xml: &str, file: &str) -> Result<Vec<(String, Stated)>, Model
         return Err(malformed(format!("its root element is <{}>, not <robot>", root.tag_name().name())));
     }
     let mut wrong = Vec::new();
-    root.children().filter(|n| n.has_tag_name("link")).for_each(|link| check_link(link, &mut wrong));
+    let mut collisions = Vec::new();
+    for link in root.children().filter(|n| n.has_tag_name("link")) {
+        check_link(link, &mut wrong);
+        for node in link.children().filter(|n| n.has_tag_name("collision")) {
+            collisions.extend(collision(link.attribute("name").unwrap_or("?"), node, &mut wrong));
+        }
+    }
     let joints = root.children().filter(|n| n.has_tag_name("joint"));
     let stated = joints.filter_map(|joint| check_joint(joint, &mut wrong)).collect();
     if !wrong.is_empty() {
         return Err(ModelError::Impossible { file: file.to_string(), list: wrong.join("; ") });
     }
-    Ok(stated)
+    Ok((stated, collisions))
+}
+
+/// The solid of one `<collision>`; `None` when it holds none or impossible numbers.
+fn collision(link: &str, node: Node, wrong: &mut Vec<String>) -> Option<LinkShape> {
+    let mut numbers = |n: Node, key: &str, default: Option<&str>| -> Option<Vec<f64>> {
+        let text = n.attribute(key).or(default).unwrap_or("");
+        let parsed: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
+        let good = parsed.filter(|all| !all.is_empty() && all.iter().all(|x| x.is_finite()));
+        if good.is_none() {
+            wrong.push(format!("link '{link}' collision {} {key} is '{text}'", n.tag_name().name()));
+        }
+        good
+    };
+    let solid = node.children().find(|n| n.has_tag_name("geometry"))?.children().find(Node::is_element)?;
+    let mut one = |key: &str| numbers(solid, key, None).map(|x| x[0]);
+    let shape = match solid.tag_name().name() {
+        "sphere" => Some(Shape::Sphere { radius: one("radius")? }),
+        "cylinder" => Some(Shape::Cylinder { radius: one("radius")?, length: one("length")? }),
+        "capsule" => Some(Shape::Capsule { radius: one("radius")?, length: one("length")? }),
+        "box" => Some(Shape::Box { size: numbers(solid, "size", None)?.try_into().ok()? }),
+        _ => None,
+    };
+    let mut placement = Placement::IDENTITY;
+    if let Some(origin) = node.children().find(|n| n.has_tag_name("origin")) {
+        let mut three = |key| numbers(origin, key, Some("0 0 0")).and_then(|x| x.try_into().ok());
+        placement = Placement::new(three("xyz")?, three("rpy")?);
+    }
+    Some(LinkShape { link: link.to_string(), shape, placement })
 }
 
 fn check_link(link: Node, wrong: &mut Vec<String>) {

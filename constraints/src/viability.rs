@@ -28,6 +28,86 @@ pub enum Kind {
     Viability,
     /// Motor force limit.
     Torque,
+    /// Change of acceleration.
+    Jerk,
+    /// Motor force that falls with speed.
+    TorqueSpeed,
+    /// Change of motor force.
+    TorqueRate,
+    /// A point of a frame in front of a plane.
+    Frame,
+    /// Speed of a frame.
+    FrameSpeed,
+    /// Kinetic energy.
+    Energy,
+    /// Distance between two bodies.
+    Collision,
+    /// A row of the task file's own.
+    User,
+    /// A joint that must not move.
+    Locked,
+    /// Speed limit that depends on the position.
+    VelocityProfile,
+}
+
+impl Kind {
+    /// All kinds, in the order of their numbers.
+    pub const ALL: [Kind; 15] = [
+        Kind::Position,
+        Kind::Velocity,
+        Kind::Acceleration,
+        Kind::Viability,
+        Kind::Torque,
+        Kind::Jerk,
+        Kind::TorqueSpeed,
+        Kind::TorqueRate,
+        Kind::Frame,
+        Kind::FrameSpeed,
+        Kind::Energy,
+        Kind::Collision,
+        Kind::User,
+        Kind::Locked,
+        Kind::VelocityProfile,
+    ];
+
+    /// Its name in reports: `"torque_speed"`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Kind::Position => "position",
+            Kind::Velocity => "velocity",
+            Kind::Acceleration => "acceleration",
+            Kind::Viability => "viability",
+            Kind::Torque => "torque",
+            Kind::Jerk => "jerk",
+            Kind::TorqueSpeed => "torque_speed",
+            Kind::TorqueRate => "torque_rate",
+            Kind::Frame => "frame",
+            Kind::FrameSpeed => "frame_speed",
+            Kind::Energy => "energy",
+            Kind::Collision => "collision",
+            Kind::User => "user",
+            Kind::Locked => "locked",
+            Kind::VelocityProfile => "velocity_profile",
+        }
+    }
+}
+
+/// A speed limit that falls in front of a position, as robot makers state it:
+///
+/// ```text
+///     v <= max(0, -offset + sqrt(2 deceleration (at - q)))
+/// ```
+///
+/// and its mirror image in front of a lowest position. Braking with `deceleration` never crosses it, sampled at any period; for a
+/// joint that brakes less, the lower curve of its own braking takes its place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Profile {
+    /// Position at which the speed must be zero [rad or m].
+    pub at: f64,
+    /// Deceleration of the curve [rad/s² or m/s²].
+    pub deceleration: f64,
+    /// Speed taken off the curve, at least 0 [rad/s or m/s].
+    pub offset: f64,
 }
 
 /// How the plant moves during one control period.
@@ -65,14 +145,37 @@ pub struct Dof {
     pub acceleration: f64,
     /// Deceleration that braking may count on, at most A [rad/s² or m/s²].
     pub deceleration: f64,
+    /// Speed limits in front of a lowest and a highest position.
+    pub profile: [Option<Profile>; 2],
+    /// The dof stops and stays.
+    pub locked: bool,
+}
+
+impl Profile {
+    /// The curve that braking with `braking` never crosses.
+    fn within(&self, braking: f64) -> Profile {
+        Profile { deceleration: self.deceleration.min(braking), ..*self }
+    }
 }
 
 impl Dof {
+    /// No limits.
+    pub const FREE: Dof = Dof {
+        lower: f64::NEG_INFINITY,
+        upper: f64::INFINITY,
+        velocity: f64::INFINITY,
+        acceleration: f64::INFINITY,
+        deceleration: f64::INFINITY,
+        profile: [None, None],
+        locked: false,
+    };
+
     /// The limits of dof `i` of a set.
     pub fn of(limits: &LimitSet, i: usize) -> Dof {
         let (lower, upper) = (limits.q_lower[i], limits.q_upper[i]);
         let (acceleration, deceleration) = (limits.acceleration[i], limits.braking[i]);
-        Dof { lower, upper, velocity: limits.velocity[i], acceleration, deceleration }
+        let (velocity, profile, locked) = (limits.velocity[i], limits.profile[i], limits.locked[i]);
+        Dof { lower, upper, velocity, acceleration, deceleration, profile, locked }
     }
 
     /// The deceleration that braking counts on: the one stated, or less where a whole period of it would turn the dof round and
@@ -118,15 +221,32 @@ const CROSSING: f64 = 1e-6;
 /// The box of one dof at position `q` [rad or m] and velocity `v` [rad/s or m/s].
 pub fn interval(dof: &Dof, q: f64, v: f64, period: &Period) -> Interval {
     let a = dof.braking(period);
+    if dof.locked {
+        let stop = brake(dof, v, period);
+        let (lower_kind, upper_kind) = (Kind::Locked, Kind::Locked);
+        return Interval { lower: stop, upper: stop, lower_kind, upper_kind, outside: None };
+    }
     let (above, below) = (q > dof.upper + POSITION_TOLERANCE, q < dof.lower - POSITION_TOLERANCE);
-    let (mut upper, upper_kind) = match above {
+    let (mut upper, mut upper_kind) = match above {
         true => returning(dof, v, period),
         false => upper_bound(dof, a, dof.upper - q, v, period),
     };
-    let (mut lower, lower_kind) = match below {
+    if let Some(p) = &dof.profile[1] {
+        (upper, upper_kind) = smaller(
+            (upper, upper_kind),
+            (profile_bound(&p.within(a), p.at - q, v, period), Kind::VelocityProfile),
+        );
+    }
+    let (mut lower, mut lower_kind) = match below {
         true => returning(dof, -v, period),
         false => upper_bound(dof, a, q - dof.lower, -v, period),
     };
+    if let Some(p) = &dof.profile[0] {
+        (lower, lower_kind) = smaller(
+            (lower, lower_kind),
+            (profile_bound(&p.within(a), q - p.at, -v, period), Kind::VelocityProfile),
+        );
+    }
     lower = -lower;
     let mut outside = (above || below).then_some(Kind::Position);
     if lower > upper {
@@ -227,6 +347,32 @@ fn braking_bound(d: f64, v: f64, a: f64, p: &Period) -> f64 {
     ((-b + discriminant.sqrt()) / (2.0 * t * t)).max(-w / t)
 }
 
+/// The largest acceleration towards a boundary at distance `d`, approached with speed `w`, from which a deceleration of
+/// `braking` still stops in front of it: the position and viability bounds of a joint, for any other distance.
+///
+/// Never below `-braking` from inside the set; beyond the boundary whatever turns round in one period, at most `braking`.
+pub fn approach(d: f64, w: f64, braking: f64, period: &Period) -> f64 {
+    if d <= 0.0 {
+        return (-w / period.dt).clamp(-braking, braking);
+    }
+    let bound = position_bound(d, w, braking, period).min(braking_bound(d, w, braking, period));
+    floor(bound, d, w, braking, period)
+}
+
+/// The largest `a` after which the speed is below the profile. With `w = v + offset`, `(w + T a)^2 = 2 A d'` as in
+/// [`braking_bound`]; `v' <= 0` is always allowed. Braking by `A` for `T` changes `(v + offset)^2 - 2 A d` by
+/// `-2 A T offset` and no more, so from below the profile `-A` is always allowed.
+fn profile_bound(profile: &Profile, d: f64, v: f64, p: &Period) -> f64 {
+    let (t, a, w) = (p.dt, profile.deceleration, v + profile.offset);
+    let b = 2.0 * w * t + 2.0 * a * p.kappa * t * t;
+    let c = w * w - 2.0 * a * (d - t * v);
+    let discriminant = b * b - 4.0 * t * t * c;
+    let root =
+        if discriminant < 0.0 { f64::NEG_INFINITY } else { (-b + discriminant.sqrt()) / (2.0 * t * t) };
+    let below = v <= 0.0 || w * w <= 2.0 * a * (d + ROUNDING);
+    root.max(-v / t).max(if below { -a } else { f64::NEG_INFINITY })
+}
+
 fn smaller(x: (f64, Kind), y: (f64, Kind)) -> (f64, Kind) {
     if y.0 < x.0 { y } else { x }
 }
@@ -237,7 +383,14 @@ mod tests {
 
     #[test]
     fn far_from_everything_the_box_is_the_acceleration_limit() {
-        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0 };
+        let dof = Dof {
+            lower: -1.0,
+            upper: 1.0,
+            velocity: 5.0,
+            acceleration: 20.0,
+            deceleration: 20.0,
+            ..Dof::FREE
+        };
         let i = interval(&dof, 0.0, 0.0, &Period::new(0.01, 5));
         assert_eq!((i.lower, i.upper, i.outside), (-20.0, 20.0, None));
     }
@@ -251,6 +404,7 @@ mod tests {
             velocity: 10.0,
             acceleration: 2.0,
             deceleration: 2.0,
+            ..Dof::FREE
         };
         let i = interval(&dof, 0.0, 1.0, &Period::new(0.1, 0));
         let root = (-0.22 + (0.22f64 * 0.22 - 4.0 * 0.01 * 0.2).sqrt()) / 0.02;
@@ -261,7 +415,14 @@ mod tests {
 
     #[test]
     fn beyond_the_limit_it_may_only_return() {
-        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0 };
+        let dof = Dof {
+            lower: -1.0,
+            upper: 1.0,
+            velocity: 5.0,
+            acceleration: 20.0,
+            deceleration: 20.0,
+            ..Dof::FREE
+        };
         let p = Period::new(0.01, 1);
         let still = interval(&dof, 1.2, 0.0, &p);
         assert_eq!((still.lower, still.upper, still.outside), (-20.0, 0.0, Some(Kind::Position)));

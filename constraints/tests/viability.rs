@@ -74,7 +74,8 @@ const SUB_STEPS: [u32; 5] = [0, 1, 2, 5, 10];
 
 #[test]
 fn one_joint_never_leaves_its_set() {
-    let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0 };
+    let dof =
+        Dof { lower: -1.0, upper: 1.0, velocity: 5.0, acceleration: 20.0, deceleration: 20.0, ..Dof::FREE };
     for dt in PERIODS {
         for n in SUB_STEPS {
             let (outside, violation) = attack(&dof, &Period::new(dt, n), 100_000, &mut Random(7));
@@ -102,6 +103,7 @@ fn many_joints_never_leave_their_sets() {
                     velocity: 10f64.powf(random.between(-1.0, 1.3)),
                     acceleration: a_max,
                     deceleration: a_max * random.between(0.1, 1.5).min(1.0),
+                    ..Dof::FREE
                 };
                 let (outside, violation) = attack(&dof, &Period::new(dt, n), 2_500, &mut random);
                 assert!(
@@ -173,7 +175,14 @@ fn braking_from_any_admissible_state_stops_inside() {
     for dt in PERIODS {
         for n in SUB_STEPS {
             let p = Period::new(dt, n);
-            let dof = Dof { lower: -0.7, upper: 0.4, velocity: 4.0, acceleration: 15.0, deceleration: 15.0 };
+            let dof = Dof {
+                lower: -0.7,
+                upper: 0.4,
+                velocity: 4.0,
+                acceleration: 15.0,
+                deceleration: 15.0,
+                ..Dof::FREE
+            };
             let (mut q, mut v) = (0.0, 0.0);
             for _ in 0..300 {
                 for _ in 0..random.between(1.0, 30.0) as usize {

@@ -14,29 +14,45 @@ vectors of them.
 from nearl._core import (
     AccelerationLimit,
     Controller,
+    JerkLimit,
     Ledger,
+    Limit,
+    LockedJoints,
     Model,
     PositionLimit,
     Projector,
+    RowLimit,
     Target,
     Targets,
     TorqueLimit,
+    TorqueRateLimit,
+    TorqueSpeedLimit,
     VelocityLimit,
+    VelocityProfileLimit,
     __version__,
     tasks,
 )
+from nearl.pid2 import PID2
 
 __all__ = [
     "AccelerationLimit",
     "Controller",
+    "JerkLimit",
     "Ledger",
+    "Limit",
+    "LockedJoints",
     "Model",
+    "PID2",
     "PositionLimit",
     "Projector",
+    "RowLimit",
     "Target",
     "Targets",
     "TorqueLimit",
+    "TorqueRateLimit",
+    "TorqueSpeedLimit",
     "VelocityLimit",
+    "VelocityProfileLimit",
     "__version__",
     "tasks",
 ]
@@ -45,13 +61,14 @@ try:
     import gymnasium as _gymnasium  # noqa: F401
 except ImportError:  # the extra [train] is not installed
     def __getattr__(name: str):
-        if name in ("Env", "VecEnv", "make_vec", "register"):
+        if name in ("Env", "VecEnv", "from_gymnasium", "make_vec", "register"):
             raise ImportError(f"nearl.{name} needs Gymnasium: pip install 'nearl[train]'")
         raise AttributeError(f"module 'nearl' has no attribute '{name}'")
 else:
     from nearl.env import Env
+    from nearl.from_gymnasium import from_gymnasium
     from nearl.registration import register
     from nearl.vector import VecEnv, make_vec
 
-    __all__ += ["Env", "VecEnv", "make_vec", "register"]
+    __all__ += ["Env", "VecEnv", "from_gymnasium", "make_vec", "register"]
     register()

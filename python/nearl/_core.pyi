@@ -12,16 +12,34 @@ __version__: str
 _Floats = NDArray[np.float64]
 _Path = str | os.PathLike[str]
 _PerJoint = float | Mapping[str, float]
-_Status = Literal["unchanged", "clamped", "solved", "recovering", "braked", "refused"]
+_Soft = tuple[float, float]
+_Status = Literal["unchanged", "clamped", "solved", "slowed", "recovering", "braked", "refused"]
 
 def tasks() -> list[tuple[str, str]]: ...
 
 class ActiveRow(TypedDict):
-    kind: Literal["position", "velocity", "acceleration", "viability", "torque"]
-    dof: int
+    kind: Literal[
+        "position",
+        "velocity",
+        "acceleration",
+        "viability",
+        "torque",
+        "jerk",
+        "torque_speed",
+        "torque_rate",
+        "frame",
+        "frame_speed",
+        "energy",
+        "collision",
+        "user",
+        "locked",
+        "velocity_profile",
+    ]
+    row: int
     name: str
     side: Literal["lower", "upper"]
     multiplier: float
+    slack: float
 
 @final
 class Model:
@@ -69,23 +87,64 @@ class Model:
     def a_from_mujoco(self, q: ArrayLike, v: ArrayLike, qacc: ArrayLike) -> _Floats: ...
     def tau_to_mujoco(self, q: ArrayLike, tau: ArrayLike) -> _Floats: ...
 
+class Limit:
+    @property
+    def name(self) -> str: ...
+
 @final
-class PositionLimit:
+class PositionLimit(Limit):
     def __new__(cls, model: Model, margin: _PerJoint = 0.0) -> PositionLimit: ...
 
 @final
-class VelocityLimit:
+class VelocityLimit(Limit):
     def __new__(cls, model: Model, limit: _PerJoint | None = None, *, scale: float | None = None) -> VelocityLimit: ...
 
 @final
-class AccelerationLimit:
+class VelocityProfileLimit(Limit):
+    def __new__(
+        cls, model: Model, profile: Literal["fr3"] | Mapping[str, Mapping[str, float]]
+    ) -> VelocityProfileLimit: ...
+
+@final
+class AccelerationLimit(Limit):
     def __new__(cls, model: Model, limit: _PerJoint, braking: _PerJoint | None = None) -> AccelerationLimit: ...
 
 @final
-class TorqueLimit:
+class JerkLimit(Limit):
+    def __new__(cls, model: Model, limit: _PerJoint, soft: _Soft | None = None) -> JerkLimit: ...
+
+@final
+class TorqueLimit(Limit):
     def __new__(cls, model: Model, scale: float = 1.0) -> TorqueLimit: ...
 
-_Limit = PositionLimit | VelocityLimit | AccelerationLimit | TorqueLimit
+@final
+class TorqueSpeedLimit(Limit):
+    def __new__(
+        cls, model: Model, stall: _PerJoint, no_load: _PerJoint, soft: _Soft | None = None
+    ) -> TorqueSpeedLimit: ...
+
+@final
+class TorqueRateLimit(Limit):
+    def __new__(cls, model: Model, limit: _PerJoint, soft: _Soft | None = None) -> TorqueRateLimit: ...
+
+@final
+class LockedJoints(Limit):
+    def __new__(cls, model: Model, joints: Sequence[str]) -> LockedJoints: ...
+
+@final
+class RowLimit(Limit):
+    def __new__(
+        cls,
+        model: Model,
+        name: str,
+        terms: Mapping[str, float],
+        *,
+        lower: float | None = None,
+        upper: float | None = None,
+        equals: float | None = None,
+        braking: float | None = None,
+        soft: _Soft | None = None,
+    ) -> RowLimit: ...
 
 class _Report:
     @property
@@ -159,21 +218,46 @@ class Projector:
     def __new__(
         cls,
         model: Model,
-        limits: Sequence[_Limit],
+        limits: Sequence[Limit],
         dt: float,
         controllable: Sequence[str] | None = None,
         consistency: Literal["kinematic", "free"] = "kinematic",
         solver: Literal["ladder", "clarabel"] = "ladder",
         sub_steps: int = 1,
         velocity_weight: Sequence[float] | None = None,
+        braking: Literal["certified", "stored"] = "certified",
+        deadline: float | None = None,
     ) -> Projector: ...
-    def project(self, q: ArrayLike, v: ArrayLike, q_proposal: ArrayLike, v_proposal: ArrayLike) -> Target: ...
+    def project(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        q_proposal: ArrayLike,
+        v_proposal: ArrayLike,
+        previous: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> Target: ...
     def project_batch(
         self, q: ArrayLike, v: ArrayLike, q_proposal: ArrayLike, v_proposal: ArrayLike, threads: int | None = None
     ) -> Targets: ...
     def problem(
         self, q: ArrayLike, v: ArrayLike, q_proposal: ArrayLike, v_proposal: ArrayLike
-    ) -> tuple[_Floats, _Floats, _Floats, _Floats]: ...
+    ) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats]: ...
+    def vjp_batch(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        q_proposal: ArrayLike,
+        v_proposal: ArrayLike,
+        dq: ArrayLike,
+        dv: ArrayLike,
+        threads: int | None = None,
+    ) -> tuple[_Floats, _Floats]: ...
+    def set_enabled(self, name: str, on: bool) -> None: ...
+    def set_external_forces(self, forces: ArrayLike) -> None: ...
+    @property
+    def enabled(self) -> dict[str, bool]: ...
+    @property
+    def row_names(self) -> list[str]: ...
     @property
     def controllable(self) -> list[str]: ...
     @property
@@ -186,6 +270,9 @@ class Controller:
     @staticmethod
     def load(path: _Path) -> Controller: ...
     def update(self, q: ArrayLike, v: ArrayLike, obs: ArrayLike) -> tuple[_Floats, Ledger]: ...
+    def act(self, obs: ArrayLike, noise: ArrayLike | None = None) -> _Floats: ...
+    def another(self) -> Controller: ...
+    def save(self, path: _Path) -> None: ...
     def reset(self) -> None: ...
     @property
     def proposal(self) -> _Floats: ...
@@ -200,6 +287,8 @@ class Controller:
     @property
     def policy_every(self) -> int: ...
     @property
+    def n_noise(self) -> int: ...
+    @property
     def version(self) -> int: ...
     @property
     def task(self) -> str: ...
@@ -209,11 +298,31 @@ class Controller:
     def digest(self) -> str: ...
 
 @final
+class Training:
+    def __new__(
+        cls, task: str, algo: str, seed: int, threads: int, settings: Sequence[str], out: _Path | None
+    ) -> Training: ...
+    def extend(self, steps: int) -> None: ...
+    def iterate(self) -> dict[str, float]: ...
+    def checkpoint(self, name: str) -> str: ...
+    def controller(self) -> Controller: ...
+    @property
+    def done(self) -> bool: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def task(self) -> str: ...
+    @property
+    def columns(self) -> list[str]: ...
+
+@final
 class Env:
     def __new__(cls, task: str) -> Env: ...
+    @staticmethod
+    def of_snapshot(path: _Path) -> Env: ...
     def reset(self, seed: int | None = None) -> _Floats: ...
     def set_state(self, qpos: ArrayLike, qvel: ArrayLike) -> _Floats: ...
-    def step(self, action: ArrayLike) -> tuple[_Floats, float, bool, str | None]: ...
+    def step(self, action: ArrayLike) -> tuple[_Floats, float, float, bool, str | None]: ...
     def observe(self) -> _Floats: ...
     def state(self) -> tuple[_Floats, _Floats]: ...
     @property
@@ -243,6 +352,8 @@ class Env:
     @property
     def dt(self) -> float: ...
     @property
+    def has_cost(self) -> bool: ...
+    @property
     def max_episode_steps(self) -> int: ...
     @property
     def model_text(self) -> str: ...
@@ -263,6 +374,7 @@ class VecEnv:
     def step(
         self, actions: ArrayLike
     ) -> tuple[_Floats, _Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]: ...
+    def end(self, ended: Sequence[bool]) -> _Floats: ...
     def set_state(self, index: int, qpos: list[float], qvel: list[float]) -> None: ...
     @property
     def qpos(self) -> _Floats: ...

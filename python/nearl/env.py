@@ -16,7 +16,7 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     The time limit is Gymnasium's wrapper, which ``gymnasium.make("nearl/...")`` adds.
 
     Args:
-        task: Name of the task, one of ``nearl.tasks()``.
+        task: Name of the task, one of ``nearl.tasks()``, or a task file (TOML).
     """
 
     metadata = {"render_modes": []}
@@ -65,9 +65,15 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         return obs
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
-        """Simulates one control period. ``info["fault"]`` is there only if the physics could not be believed."""
-        obs, reward, terminated, fault = self._native.step(action)
-        return obs, reward, terminated, False, {} if fault is None else {"fault": fault}
+        """Simulates one control period.
+
+        ``info["cost"]`` is there where the task has a ``[cost]``, ``info["fault"]`` only if the physics could not be believed.
+        """
+        obs, reward, cost, terminated, fault = self._native.step(action)
+        info: dict[str, Any] = {"cost": cost} if self._native.has_cost else {}
+        if fault is not None:
+            info["fault"] = fault
+        return obs, reward, terminated, False, info
 
     def set_state(self, qpos: ArrayLike, qvel: ArrayLike) -> NDArray[np.float64]:
         """Begins an episode at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention; returns the observation."""

@@ -1,8 +1,10 @@
-"""Gymnasium's ids of the bundled tasks, ``nearl/HalfCheetah-v5`` and its like.
+"""Gymnasium's ids of the bundled tasks, ``nearl/HalfCheetah-v5`` and its like, and of task files.
 
-Importing ``nearl`` registers them; so does ``gymnasium.make("nearl:nearl/HalfCheetah-v5")``. (Gymnasium 1.x loads no plug-ins by
-itself: the ``gymnasium.envs`` entry point of earlier versions is not read any more.)
+Importing ``nearl`` registers the bundled ones; so does ``gymnasium.make("nearl:nearl/HalfCheetah-v5")``. (Gymnasium 1.x loads no
+plug-ins by itself: the ``gymnasium.envs`` entry point of earlier versions is not read any more.)
 """
+
+import os
 
 import gymnasium
 
@@ -13,16 +15,33 @@ MAX_EPISODE_STEPS = {"Panda-reach": 2000}
 MAX_EPISODE_STEPS_ELSE = 1000
 
 
-def register() -> None:
-    """Registers every task once, with its time limit."""
-    for task, _ in _core.tasks():
-        env_id = f"nearl/{task}"
-        if env_id in gymnasium.registry:
-            continue
+def register(*task_files: str | os.PathLike[str]) -> list[str]:
+    """Registers the bundled tasks, or the task files given; returns the ids, ``nearl/<name in the file>``.
+
+        env = gymnasium.make(nearl.register("my_task.toml")[0])
+
+    Raises:
+        OSError: a task file or its robot cannot be read.
+        ValueError: a task file is wrong; the message names the key.
+    """
+    if not task_files:
+        return [_register(task, task, MAX_EPISODE_STEPS.get(task, MAX_EPISODE_STEPS_ELSE)) for task, _ in _core.tasks()]
+    ids = []
+    for file in task_files:
+        env = _core.Env(os.fspath(file))
+        gymnasium.registry.pop(f"nearl/{env.task}", None)
+        ids.append(_register(env.task, os.path.abspath(file), env.max_episode_steps))
+    return ids
+
+
+def _register(name: str, task: str, max_episode_steps: int) -> str:
+    env_id = f"nearl/{name}"
+    if env_id not in gymnasium.registry:
         gymnasium.register(
             id=env_id,
             entry_point="nearl.env:Env",
             vector_entry_point="nearl.vector:VecEnv",
-            max_episode_steps=MAX_EPISODE_STEPS.get(task, MAX_EPISODE_STEPS_ELSE),
+            max_episode_steps=max_episode_steps,
             kwargs={"task": task},
         )
+    return env_id

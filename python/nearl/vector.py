@@ -1,7 +1,7 @@
 """Many environments in one call."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from nearl import _core
 
 Floats = NDArray[np.float64]
+Outcome = Callable[[Floats, Floats, Floats], ArrayLike]
 Step = tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
@@ -20,7 +21,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
     """``num_envs`` environments of one task, stepped natively on all cores with the interpreter released.
 
     Environment ``i`` behaves as a single one that was seeded with ``seed + i``. ``info`` holds, where there is something to say and
-    with the mask ``_<key>``: ``final_obs`` (same-step mode), ``fault``; and with ``constraints`` always: ``raw_violations`` and
+    with the mask ``_<key>``: ``final_obs`` (same-step mode), ``fault``; ``cost`` where the task has one; and with ``constraints`` always: ``raw_violations`` and
     ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit) and ``moved``.
 
     Args: see :func:`make_vec`.
@@ -37,6 +38,8 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         threads: int | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        reward: Outcome | None = None,
+        termination: Outcome | None = None,
     ):
         mode = AutoresetMode(autoreset_mode)
         if mode is AutoresetMode.DISABLED:
@@ -48,6 +51,9 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         same_step = mode is AutoresetMode.SAME_STEP
         self._native = _core.VecEnv(task, num_envs, constraints, seed, threads, max_episode_steps, same_step)
         self.num_envs = num_envs
+        self._reward, self._termination = reward, termination
+        self._obs = np.zeros((num_envs, self._native.n_obs))
+        self._over = np.zeros(num_envs, bool)  # whose next step only begins an episode
         self.metadata = {"autoreset_mode": mode, "render_modes": []}
         # Torques as Gymnasium's float32; a proposed state keeps its digits.
         dtype = np.float32 if constraints is None else np.float64
@@ -65,20 +71,65 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
             raise ValueError(f"reset options {sorted(options)} are not known; this vector takes none")
         if isinstance(seed, int | np.integer):
             seed = [int(seed) + i for i in range(self.num_envs)]
-        return self._native.reset(None if seed is None else list(seed)), {}
+        obs = self._native.reset(None if seed is None else list(seed))
+        self._obs, self._over = obs.copy(), np.zeros(self.num_envs, bool)
+        return obs, {}
 
     def step(self, actions: ArrayLike) -> Step:
         """One action (num_envs x n_act) each; an environment whose episode ended begins a new one, see the autoreset mode."""
-        return self._native.step(actions)
+        if self._reward is None and self._termination is None:
+            return self._native.step(actions)
+        return self._judged(np.asarray(actions, float))
+
+    def _judged(self, actions: Floats) -> Step:
+        """A step whose reward or termination the caller's functions give."""
+        obs, rewards, terminated, truncated, info = self._native.step(actions)
+        reached = obs.copy()  # the states the actions led to, also where a new episode began at once
+        for i in np.flatnonzero(info.get("_final_obs", ())):
+            reached[i] = info["final_obs"][i]
+        began = self._over
+        if self._reward is not None:
+            rewards = np.where(began, 0.0, self._ask("reward", self._reward, actions, reached, float))
+        if self._termination is not None:
+            ends = self._ask("termination", self._termination, actions, reached, bool) & ~began
+            fresh = ends & ~terminated & ~truncated
+            terminated, truncated = terminated | ends, truncated & ~ends
+            if fresh.any():
+                obs = self._native.end(fresh.tolist())
+                if self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP:
+                    _add_final(info, fresh, reached)
+        over = terminated | truncated
+        self._over = over & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
+        self._obs = obs.copy()
+        return obs, rewards, terminated, truncated, info
+
+    def _ask(self, name: str, function: Outcome, actions: Floats, reached: Floats, dtype: type) -> NDArray[Any]:
+        answer = np.asarray(function(self._obs, actions, reached))
+        if answer.shape != (self.num_envs,):
+            raise ValueError(f"{name}(obs, actions, next_obs) gave shape {answer.shape}; give one value an environment, ({self.num_envs},)")
+        if dtype is float and not np.isfinite(answer.astype(float)).all():
+            i = int(np.flatnonzero(~np.isfinite(answer.astype(float)))[0])
+            raise ValueError(f"{name}(obs, actions, next_obs)[{i}] is {answer[i]}: every entry must be finite")
+        return answer.astype(dtype)
 
     def set_state(self, index: int, qpos: ArrayLike, qvel: ArrayLike) -> None:
         """Begins an episode of environment ``index`` at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention."""
         self._native.set_state(index, np.asarray(qpos, float).tolist(), np.asarray(qvel, float).tolist())
+        self._obs[index] = self._native.end([False] * self.num_envs)[index]
+        self._over[index] = False
 
     @property
     def native(self) -> _core.VecEnv:
         """The Rust environments: names, ranges, states."""
         return self._native
+
+
+def _add_final(info: dict[str, Any], ended: NDArray[np.bool_], reached: Floats) -> None:
+    """Puts the last observations of the episodes that ended beside those that are there."""
+    final = info.setdefault("final_obs", np.full(len(ended), None, dtype=object))
+    mask = info.setdefault("_final_obs", np.zeros(len(ended), bool))
+    for i in np.flatnonzero(ended):
+        final[i], mask[i] = reached[i].copy(), True
 
 
 def make_vec(
@@ -89,11 +140,13 @@ def make_vec(
     threads: int | None = None,
     *,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    reward: Outcome | None = None,
+    termination: Outcome | None = None,
 ) -> VecEnv:
     """A vector of native environments.
 
     Args:
-        task: Name of the task, one of ``nearl.tasks()``.
+        task: Name of the task, one of ``nearl.tasks()``, or a task file (TOML) with a robot of your own.
         num_envs: Number of environments.
         constraints: None: an action is what the actuators get. ``"task"`` (tasks with analytic inverse dynamics) or the snapshot
             file of a trained agent: an action is the proposed next state, one entry per ``native.action_names``; it is projected
@@ -101,10 +154,13 @@ def make_vec(
             policy period.
         seed: Environment ``i`` draws from the stream of ``seed + i`` until ``reset(seed=...)`` says otherwise.
         threads: Threads to step on; all cores by default. Results do not depend on it.
+        reward: ``reward(obs, actions, next_obs)`` for all environments at once, arrays of num_envs rows in, (num_envs,) out: replaces
+            the task's. ``next_obs`` is what the action led to, also where a new episode has begun since.
+        termination: Likewise, true where an episode ends: beside the task's own.
         autoreset_mode: When an ended episode is begun anew: ``"NextStep"`` (Gymnasium's default) or ``"SameStep"``.
 
     Raises:
         ValueError: unknown task, a task without analytic inverse dynamics and no snapshot, or a snapshot of another task.
         OSError: the snapshot cannot be read.
     """
-    return VecEnv(task, num_envs, constraints, seed, threads, autoreset_mode=autoreset_mode)
+    return VecEnv(task, num_envs, constraints, seed, threads, autoreset_mode=autoreset_mode, reward=reward, termination=termination)

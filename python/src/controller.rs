@@ -3,7 +3,10 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
-use nearl_runtime::{self as runtime, Noise, Output, Snapshot, State};
+use nearl_constraints::Entry;
+use nearl_runtime::task::IdmKind;
+use nearl_runtime::{self as runtime, Noise, Output, PolicyKind, Snapshot, State};
+use nearl_trainer::run_folder;
 use numpy::PyArray1;
 use pyo3::prelude::*;
 
@@ -16,6 +19,45 @@ struct Inner {
     state: State,
     noise: Noise,
     out: Output,
+    stochastic: bool,
+}
+
+impl Inner {
+    /// Fills in the joints' state from the observation; what it does not hold stays at rest.
+    fn act(&mut self, obs: &[f64], noise: Option<&[f64]>) -> Vec<f64> {
+        self.state.obs.copy_from_slice(obs);
+        for (entry, value) in self.controller.layout().entries().iter().zip(obs) {
+            match *entry {
+                Entry::Position { idx_q, .. } => self.state.q[idx_q] = *value,
+                Entry::Velocity { dof } => self.state.v[dof] = *value,
+                Entry::Other => {}
+            }
+        }
+        let wanted = if self.stochastic { &mut self.noise.proposal } else { &mut self.noise.action };
+        wanted.fill(0.0);
+        for (n, x) in wanted.iter_mut().zip(noise.into_iter().flatten()) {
+            *n = *x as f32;
+        }
+        self.controller.update(&self.state, &self.noise, &mut self.out);
+        silence(&mut self.noise);
+        self.out.action.clone()
+    }
+}
+
+/// `update` is without noise.
+fn silence(noise: &mut Noise) {
+    noise.proposal.fill(0.0);
+    noise.action.fill(0.0);
+}
+
+/// The first joint whose position or velocity is not observed.
+fn first_unseen(controller: &runtime::Controller) -> Option<String> {
+    let (model, entries) = (controller.model(), controller.layout().entries());
+    let seen = |dof: usize| {
+        let position = entries.iter().any(|e| matches!(e, Entry::Position { dof: d, .. } if *d == dof));
+        position && entries.contains(&Entry::Velocity { dof })
+    };
+    (0..model.nv()).find(|dof| !seen(*dof)).map(|dof| model.dof_name(dof))
 }
 
 /// State to action: propose, project, invert, as on the robot.
@@ -23,6 +65,10 @@ struct Inner {
 pub(crate) struct Controller {
     inner: Mutex<Inner>,
     sizes: (usize, usize, usize),
+    n_noise: usize,
+    /// A joint whose state the observation lacks though the inverse dynamics needs it.
+    unseen: Option<String>,
+    snapshot: Snapshot,
     names: Vec<String>,
     task: String,
     algo: String,
@@ -33,20 +79,14 @@ type Updated<'py> = (Bound<'py, PyArray1<f64>>, Ledger);
 
 #[pymethods]
 impl Controller {
-    /// Reads and validates a snapshot file.
+    /// Reads and validates a snapshot file, or that of a run folder.
     #[staticmethod]
     fn load(py: Python<'_>, path: PathBuf) -> PyResult<Controller> {
         py.detach(|| {
+            let path =
+                if path.is_dir() { run_folder::snapshot_of(&path).map_err(errors::value)? } else { path };
             let snapshot = Snapshot::load(&path).map_err(errors::snapshot)?;
-            let controller = runtime::Controller::new(&snapshot).map_err(errors::snapshot)?;
-            let model = controller.model();
-            let sizes = (model.nq(), model.nv(), controller.layout().n_obs());
-            let names = (0..model.nv()).map(|i| model.dof_name(i)).collect();
-            let (state, noise, out) = (controller.state(), controller.noise(), controller.output());
-            let inner = Mutex::new(Inner { controller, state, noise, out });
-            let manifest = &snapshot.manifest;
-            let (task, algo, digest) = (manifest.task.name.clone(), manifest.algo.clone(), snapshot.digest());
-            Ok(Controller { inner, sizes, names, task, algo, digest })
+            Controller::new(&snapshot)
         })
     }
 
@@ -64,11 +104,42 @@ impl Controller {
             inner.state.q.copy_from_slice(&q_);
             inner.state.v.copy_from_slice(&v);
             inner.state.obs.copy_from_slice(&obs);
-            let Inner { controller, state, noise, out } = inner;
+            let Inner { controller, state, noise, out, .. } = inner;
             controller.update(state, noise, out);
             (out.action.clone(), out.next.ledger.clone())
         });
         Ok((array(py, &action), Ledger { ledger, names: self.names.clone() }))
+    }
+
+    /// One control tick for an observation (n_obs) that holds what the controller needs of the joints' state, as all bundled
+    /// tasks' do. `noise` (n_noise): standard normal numbers of the policy; none is deterministic. Returns the action (n_act).
+    #[pyo3(signature = (obs, noise=None))]
+    fn act<'py>(
+        &self,
+        obs: &Bound<'py, PyAny>,
+        noise: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let py = obs.py();
+        if let Some(joint) = &self.unseen {
+            return Err(errors::value(format!(
+                "the observation of '{}' has no 'q.{joint}' or no 'v.{joint}', which analytic inverse dynamics needs; use update(q, v, obs)",
+                self.task
+            )));
+        }
+        let obs = vector("obs", obs, self.sizes.2)?;
+        let noise = noise.map(|n| vector("noise", n, self.n_noise)).transpose()?;
+        let action = self.with(py, |inner| inner.act(&obs, noise.as_deref()));
+        Ok(array(py, &action))
+    }
+
+    /// The same controller once more, at the start of an episode.
+    fn another(&self, py: Python<'_>) -> PyResult<Controller> {
+        py.detach(|| Controller::new(&self.snapshot))
+    }
+
+    /// Writes the snapshot that it runs on.
+    fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
+        py.detach(|| self.snapshot.save(&path)).map_err(errors::snapshot)
     }
 
     /// Begins an episode: the next tick is one of the policy's.
@@ -109,6 +180,12 @@ impl Controller {
         self.with(py, |inner| inner.controller.dt())
     }
 
+    /// Random numbers of the policy in one tick.
+    #[getter]
+    fn n_noise(&self) -> usize {
+        self.n_noise
+    }
+
     /// Control ticks in one policy period.
     #[getter]
     fn policy_every(&self, py: Python<'_>) -> usize {
@@ -145,6 +222,24 @@ impl Controller {
 }
 
 impl Controller {
+    /// The controller of a snapshot.
+    pub(crate) fn new(snapshot: &Snapshot) -> PyResult<Controller> {
+        let controller = runtime::Controller::new(snapshot).map_err(errors::snapshot)?;
+        let (model, layout) = (controller.model(), controller.layout());
+        let sizes = (model.nq(), model.nv(), layout.n_obs());
+        let names = controller.row_names();
+        let (state, noise, out) = (controller.state(), controller.noise(), controller.output());
+        let manifest = &snapshot.manifest;
+        let stochastic = manifest.policy == PolicyKind::Stochastic;
+        let n_noise = if stochastic { noise.proposal.len() } else { noise.action.len() };
+        let analytic = manifest.task.idm.kind == IdmKind::Pinocchio && manifest.policy != PolicyKind::Direct;
+        let unseen = if analytic { first_unseen(&controller) } else { None };
+        let (task, algo, digest) = (manifest.task.name.clone(), manifest.algo.clone(), snapshot.digest());
+        let inner = Mutex::new(Inner { controller, state, noise, out, stochastic });
+        let snapshot = snapshot.clone();
+        Ok(Controller { inner, sizes, n_noise, unseen, names, task, algo, digest, snapshot })
+    }
+
     fn with<R: Send>(&self, py: Python<'_>, f: impl FnOnce(&mut Inner) -> R + Send) -> R {
         py.detach(|| f(&mut self.inner.lock().unwrap_or_else(PoisonError::into_inner)))
     }

@@ -1,8 +1,12 @@
 //! One native environment.
 
+use std::path::PathBuf;
 use std::sync::Mutex;
 
+use nearl_runtime::Snapshot;
 use nearl_trainer::env::{self, ChaCha8Rng, Fault, SeedableRng};
+use nearl_trainer::run_folder;
+use nearl_trainer::tasks as task_files;
 use numpy::PyArray1;
 use pyo3::prelude::*;
 
@@ -22,7 +26,7 @@ pub(crate) fn fault_name(fault: Fault) -> Option<&'static str> {
 /// Names of the tasks that [`Env`] can make, with a line about each.
 #[pyfunction]
 pub(crate) fn tasks() -> Vec<(&'static str, &'static str)> {
-    env::REGISTRY.iter().map(|entry| (entry.name, entry.about)).collect()
+    task_files::names().into_iter().map(|name| (name, task_files::about(name))).collect()
 }
 
 struct Inner {
@@ -45,15 +49,26 @@ pub(crate) struct Env {
     spec: env::Spec,
 }
 
-type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, bool, Option<&'static str>);
+type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, f64, bool, Option<&'static str>);
 
 #[pymethods]
 impl Env {
     #[new]
     fn new(py: Python<'_>, task: &str) -> PyResult<Env> {
-        let env = py.detach(|| env::make(task)).map_err(errors::value)?;
-        let spec = env.spec().clone();
-        Ok(Env { inner: Mutex::new(Inner { env, rng: ChaCha8Rng::seed_from_u64(0) }), spec })
+        let env = py.detach(|| task_files::env(task)).map_err(errors::task)?;
+        Ok(Env::around(env))
+    }
+
+    /// The environment that a snapshot, or the run in a folder, was trained in.
+    #[staticmethod]
+    fn of_snapshot(py: Python<'_>, path: PathBuf) -> PyResult<Env> {
+        let env = py.detach(|| {
+            let file =
+                if path.is_dir() { run_folder::snapshot_of(&path).map_err(errors::value)? } else { path };
+            let manifest = Snapshot::load(&file).map_err(errors::snapshot)?.manifest;
+            env::of_task(&manifest.task, &manifest.model, &manifest.task.name).map_err(errors::value)
+        })?;
+        Ok(Env::around(env))
     }
 
     /// Starts an episode from the task's own distribution; `seed` restarts the random stream. Returns the observation.
@@ -80,7 +95,7 @@ impl Env {
         Ok(array(py, &obs.map_err(errors::value)?))
     }
 
-    /// Simulates one control period. Returns observation, reward, terminated, and the fault's name if the physics failed.
+    /// Simulates one control period. Returns observation, reward, cost, terminated, and the fault's name if the physics failed.
     fn step<'py>(&self, py: Python<'py>, action: &Bound<'py, PyAny>) -> PyResult<Stepped<'py>> {
         let action = vector("action", action, self.spec.n_act())?;
         if let Some(i) = action.iter().position(|a| !a.is_finite()) {
@@ -91,7 +106,7 @@ impl Env {
             )));
         }
         let (step, obs) = self.with(py, |inner| (inner.env.step(&action), inner.observation()));
-        Ok((array(py, &obs), step.reward, step.terminated, fault_name(step.fault)))
+        Ok((array(py, &obs), step.reward, step.cost, step.terminated, fault_name(step.fault)))
     }
 
     /// The observation (n_obs).
@@ -134,7 +149,7 @@ impl Env {
     /// Name of the task.
     #[getter]
     fn task(&self) -> &str {
-        self.spec.name
+        &self.spec.name
     }
 
     /// Names of the observation's entries (n_obs).
@@ -185,6 +200,12 @@ impl Env {
         self.spec.dt
     }
 
+    /// Whether the task counts a cost beside its reward.
+    #[getter]
+    fn has_cost(&self) -> bool {
+        self.spec.has_cost
+    }
+
     /// Control periods after which an episode is truncated by those who count.
     #[getter]
     fn max_episode_steps(&self) -> usize {
@@ -193,8 +214,8 @@ impl Env {
 
     /// The robot file's text.
     #[getter]
-    fn model_text(&self, py: Python<'_>) -> &'static str {
-        self.with(py, |inner| inner.env.model_text())
+    fn model_text(&self, py: Python<'_>) -> String {
+        self.with(py, |inner| inner.env.model_text().to_owned())
     }
 
     fn __repr__(&self) -> String {
@@ -208,6 +229,11 @@ impl Env {
 }
 
 impl Env {
+    fn around(env: Box<dyn env::Env>) -> Env {
+        let spec = env.spec().clone();
+        Env { inner: Mutex::new(Inner { env, rng: ChaCha8Rng::seed_from_u64(0) }), spec }
+    }
+
     /// Runs `f` on the environment with the interpreter released.
     fn with<R: Send>(&self, py: Python<'_>, f: impl FnOnce(&mut Inner) -> R + Send) -> R {
         py.detach(|| f(&mut self.inner.lock().unwrap_or_else(std::sync::PoisonError::into_inner)))

@@ -2,6 +2,8 @@
 
 use nearl_constraints::ModelError;
 use nearl_runtime::SnapshotError;
+use nearl_runtime::task::TaskError;
+use nearl_trainer::tasks::TaskLoadError;
 use pyo3::PyErr;
 use pyo3::exceptions::{PyOSError, PyValueError};
 
@@ -14,6 +16,16 @@ pub(crate) fn value(error: impl std::fmt::Display) -> PyErr {
 pub(crate) fn model(error: ModelError) -> PyErr {
     match error {
         ModelError::Unreadable { .. } => PyOSError::new_err(error.to_string()),
+        other => value(other),
+    }
+}
+
+/// A task.
+pub(crate) fn task(error: TaskLoadError) -> PyErr {
+    match error {
+        TaskLoadError::Robot { .. } | TaskLoadError::Task(TaskError::Unreadable { .. }) => {
+            PyOSError::new_err(error.to_string())
+        }
         other => value(other),
     }
 }

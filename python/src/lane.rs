@@ -54,6 +54,7 @@ pub(crate) struct Lane {
     pub(crate) obs: Vec<f64>,
     pub(crate) final_obs: Option<Vec<f64>>,
     pub(crate) reward: f64,
+    pub(crate) cost: f64,
     pub(crate) terminated: bool,
     pub(crate) truncated: bool,
     pub(crate) fault: Fault,
@@ -81,6 +82,7 @@ impl Lane {
             obs,
             final_obs: None,
             reward: 0.0,
+            cost: 0.0,
             terminated: false,
             truncated: false,
             fault: Fault::None,
@@ -92,7 +94,8 @@ impl Lane {
     }
 
     pub(crate) fn run(&mut self, work: Work) {
-        (self.reward, self.terminated, self.truncated, self.final_obs) = (0.0, false, false, None);
+        (self.reward, self.cost, self.final_obs) = (0.0, 0.0, None);
+        (self.terminated, self.truncated) = (false, false);
         (self.fault, self.projected) = (Fault::None, Projected::default());
         match work {
             Work::Step(_) if !self.ended => self.step(),
@@ -103,6 +106,14 @@ impl Lane {
             self.final_obs = Some(self.obs.clone());
             self.reset();
             self.ended = false;
+        }
+    }
+
+    /// Ends the episode here, as if the task had.
+    pub(crate) fn end(&mut self, autoreset: Autoreset) {
+        match autoreset {
+            Autoreset::NextStep => self.ended = true,
+            Autoreset::SameStep => self.reset(),
         }
     }
 
@@ -130,15 +141,16 @@ impl Lane {
         match &mut self.proposing {
             None => {
                 let step = self.env.step(&self.action);
-                (self.reward, self.terminated, self.fault) = (step.reward, step.terminated, step.fault);
+                (self.reward, self.cost) = (step.reward, step.cost);
+                (self.terminated, self.fault) = (step.terminated, step.fault);
                 self.ticks += 1;
             }
             Some(p) => {
                 p.want(&self.action, &*self.env);
                 while self.ticks < self.max_steps && !self.terminated {
                     let step = p.tick(&mut *self.env, &mut self.projected);
-                    (self.reward, self.terminated, self.fault) =
-                        (self.reward + step.reward, step.terminated, step.fault);
+                    (self.reward, self.cost) = (self.reward + step.reward, self.cost + step.cost);
+                    (self.terminated, self.fault) = (step.terminated, step.fault);
                     self.ticks += 1;
                     if self.ticks.is_multiple_of(p.controller.policy_every()) {
                         break;

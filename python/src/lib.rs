@@ -13,6 +13,7 @@ mod model;
 mod pool;
 mod projector;
 mod target;
+mod training;
 mod vec_env;
 
 use pyo3::prelude::*;
@@ -24,13 +25,18 @@ mod _core {
     #[pymodule_export]
     use super::env::{Env, tasks};
     #[pymodule_export]
-    use super::limits::{AccelerationLimit, PositionLimit, TorqueLimit, VelocityLimit};
+    use super::limits::{
+        AccelerationLimit, JerkLimit, Limit, LockedJoints, PositionLimit, RowLimit, TorqueLimit,
+        TorqueRateLimit, TorqueSpeedLimit, VelocityLimit, VelocityProfileLimit,
+    };
     #[pymodule_export]
     use super::model::Model;
     #[pymodule_export]
     use super::projector::Projector;
     #[pymodule_export]
     use super::target::{Ledger, Target, Targets};
+    #[pymodule_export]
+    use super::training::Training;
     #[pymodule_export]
     use super::vec_env::VecEnv;
 

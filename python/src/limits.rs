@@ -1,14 +1,109 @@
-//! The limits a projector can be built from.
+//! The limits a projector can be built from. Each class is its constructor; what it holds is a [`Limit`].
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use nearl_constraints::limit::{AccelerationSettings, PositionSettings, VelocitySettings};
-use nearl_constraints::{self as constraints, Limit, LimitSet, PerJoint};
+use nearl_constraints::limit::{
+    AccelerationSettings, JerkSettings, JointProfile, KnownRobot, PositionSettings, TorqueRateSettings,
+    TorqueSpeedSettings, UserRowSettings, VelocityProfileSettings, VelocitySettings,
+};
+use nearl_constraints::{self as constraints, Cone, LimitError, LimitSet, PerJoint, Rows, Soft};
+use pyo3::PyClass;
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 
 use crate::errors;
 use crate::model::Model;
+
+/// What every limit is: pass a list of them to `Projector`. `name` is what `Projector.set_enabled` takes.
+#[pyclass(module = "nearl._core", frozen, subclass)]
+pub(crate) struct Limit(Arc<dyn constraints::Limit>);
+
+#[pymethods]
+impl Limit {
+    /// Name to switch the limit on and off by.
+    #[getter]
+    fn name(&self) -> &str {
+        self.0.label()
+    }
+
+    fn __repr__(&self) -> String {
+        format!("{:?}", self.0)
+    }
+}
+
+/// One limit shared by many projectors.
+#[derive(Debug, Clone)]
+pub(crate) struct Shared(Arc<dyn constraints::Limit>);
+
+impl constraints::Limit for Shared {
+    fn name(&self) -> &'static str {
+        self.0.name()
+    }
+
+    fn label(&self) -> &str {
+        self.0.label()
+    }
+
+    fn restrict(
+        &self,
+        model: &constraints::Model,
+        controllable: &[usize],
+        set: &mut LimitSet,
+    ) -> Result<(), LimitError> {
+        self.0.restrict(model, controllable, set)
+    }
+
+    fn rows(
+        &self,
+        model: &constraints::Model,
+        controllable: &[usize],
+    ) -> Result<Option<Box<dyn Rows>>, LimitError> {
+        self.0.rows(model, controllable)
+    }
+
+    fn cone(
+        &self,
+        model: &constraints::Model,
+        controllable: &[usize],
+    ) -> Result<Option<Box<dyn Cone>>, LimitError> {
+        self.0.cone(model, controllable)
+    }
+
+    fn soft(&self) -> Option<Soft> {
+        self.0.soft()
+    }
+}
+
+/// The Rust limits behind a list of Python ones.
+pub(crate) fn boxed(limits: &[Bound<'_, PyAny>]) -> PyResult<Vec<Box<dyn constraints::Limit>>> {
+    limits.iter().enumerate().map(|(i, limit)| one(i, limit)).collect()
+}
+
+fn one(i: usize, limit: &Bound<'_, PyAny>) -> PyResult<Box<dyn constraints::Limit>> {
+    match limit.cast::<Limit>() {
+        Ok(limit) => Ok(Box::new(Shared(limit.get().0.clone()))),
+        Err(_) => Err(PyTypeError::new_err(format!(
+            "limits[{i}] is {}, not a limit; pass objects such as nearl.PositionLimit(model)",
+            limit.get_type()
+        ))),
+    }
+}
+
+/// Refuses unknown joints and impossible numbers where they are written, before any projector is built.
+fn checked<P: PyClass<BaseType = Limit>>(
+    model: &Model,
+    own: P,
+    limit: impl constraints::Limit + 'static,
+) -> PyResult<PyClassInitializer<P>> {
+    let robot = &model.model;
+    let tried = limit
+        .restrict(robot, &[], &mut LimitSet::unlimited(robot.nv()))
+        .and_then(|()| limit.rows(robot, &[]).map(|_| ()))
+        .and_then(|()| limit.cone(robot, &[]).map(|_| ()));
+    tried.map_err(errors::value)?;
+    Ok(PyClassInitializer::from(Limit(Arc::new(limit))).add_subclass(own))
+}
 
 /// One number for every joint, or numbers by joint name.
 #[derive(FromPyObject)]
@@ -26,106 +121,200 @@ impl Values {
     }
 }
 
-/// Refuses unknown joints and impossible numbers where they are written, before any projector is built.
-fn checked<L: Limit>(model: &Model, limit: L) -> PyResult<L> {
-    let mut set = LimitSet::unlimited(model.model.nv());
-    limit.restrict(&model.model, &[], &mut set).map_err(errors::value)?;
-    Ok(limit)
+/// `(linear, quadratic)` weights.
+type Weights = (f64, f64);
+
+fn soft((linear, quadratic): Weights) -> Soft {
+    Soft { linear, quadratic }
 }
 
 /// Position limits of the robot file, `margin` [rad or m] inside.
-#[pyclass(module = "nearl._core", frozen)]
-pub(crate) struct PositionLimit(constraints::PositionLimit);
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct PositionLimit;
 
 #[pymethods]
 impl PositionLimit {
     #[new]
     #[pyo3(signature = (model, margin=Values::All(0.0)))]
-    fn new(model: &Model, margin: Values) -> PyResult<Self> {
+    fn new(model: &Model, margin: Values) -> PyResult<PyClassInitializer<Self>> {
         let settings = PositionSettings { margin: margin.per_joint() };
-        checked(model, constraints::PositionLimit::new(settings)).map(Self)
-    }
-
-    fn __repr__(&self) -> String {
-        format!("{:?}", self.0)
+        checked(model, Self, constraints::PositionLimit::new(settings))
     }
 }
 
 /// Speed limits: `scale` (0, 1] times the robot file's, or `limit` [rad/s or m/s]; the smaller where both are given.
-#[pyclass(module = "nearl._core", frozen)]
-pub(crate) struct VelocityLimit(constraints::VelocityLimit);
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct VelocityLimit;
 
 #[pymethods]
 impl VelocityLimit {
     #[new]
     #[pyo3(signature = (model, limit=None, *, scale=None))]
-    fn new(model: &Model, limit: Option<Values>, scale: Option<f64>) -> PyResult<Self> {
+    fn new(model: &Model, limit: Option<Values>, scale: Option<f64>) -> PyResult<PyClassInitializer<Self>> {
         let settings = VelocitySettings { scale, limit: limit.map(Values::per_joint) };
-        checked(model, constraints::VelocityLimit::new(settings)).map(Self)
+        checked(model, Self, constraints::VelocityLimit::new(settings))
     }
+}
 
-    fn __repr__(&self) -> String {
-        format!("{:?}", self.0)
+/// Speed limits that fall in front of position limits: `"fr3"` for a Franka Research 3, or by joint a dictionary of `limit`
+/// [rad/s], `offset` [rad/s], `squared` [rad/s²], `lower` and `upper` [rad] in `v <= min(limit, -offset + sqrt(squared (upper - q)))`.
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct VelocityProfileLimit;
+
+/// A robot's name or curves by joint.
+#[derive(FromPyObject)]
+enum Profile {
+    Robot(String),
+    Joints(BTreeMap<String, Curve>),
+}
+
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct Curve {
+    limit: f64,
+    offset: f64,
+    squared: f64,
+    lower: f64,
+    upper: f64,
+}
+
+#[pymethods]
+impl VelocityProfileLimit {
+    #[new]
+    fn new(model: &Model, profile: Profile) -> PyResult<PyClassInitializer<Self>> {
+        let settings = match profile {
+            Profile::Robot(name) if name == "fr3" => VelocityProfileSettings::Robot(KnownRobot::Fr3),
+            Profile::Robot(name) => {
+                return Err(errors::value(format!(
+                    "no velocity profile is built in for '{name}'; use \"fr3\" or a dictionary by joint"
+                )));
+            }
+            Profile::Joints(map) => {
+                let curve = |c: Curve| JointProfile {
+                    limit: c.limit,
+                    offset: c.offset,
+                    squared: c.squared,
+                    lower: c.lower,
+                    upper: c.upper,
+                };
+                VelocityProfileSettings::Joints(map.into_iter().map(|(joint, c)| (joint, curve(c))).collect())
+            }
+        };
+        checked(model, Self, constraints::VelocityProfileLimit::new(settings))
     }
 }
 
 /// Acceleration limits [rad/s² or m/s²]. `braking`: the deceleration that braking in front of a position limit counts on, at most
 /// `limit`, which is also its default.
-#[pyclass(module = "nearl._core", frozen)]
-pub(crate) struct AccelerationLimit(constraints::AccelerationLimit);
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct AccelerationLimit;
 
 #[pymethods]
 impl AccelerationLimit {
     #[new]
     #[pyo3(signature = (model, limit, braking=None))]
-    fn new(model: &Model, limit: Values, braking: Option<Values>) -> PyResult<Self> {
+    fn new(model: &Model, limit: Values, braking: Option<Values>) -> PyResult<PyClassInitializer<Self>> {
         let settings =
             AccelerationSettings { limit: limit.per_joint(), braking: braking.map(Values::per_joint) };
-        checked(model, constraints::AccelerationLimit::new(settings)).map(Self)
+        checked(model, Self, constraints::AccelerationLimit::new(settings))
     }
+}
 
-    fn __repr__(&self) -> String {
-        format!("{:?}", self.0)
+/// Jerk limits [rad/s³ or m/s³], always soft, with `soft = (linear, quadratic)` weights. They need the tick before: see
+/// `Projector.project(..., previous=target)`.
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct JerkLimit;
+
+#[pymethods]
+impl JerkLimit {
+    #[new]
+    #[pyo3(signature = (model, limit, soft=None))]
+    fn new(model: &Model, limit: Values, soft: Option<Weights>) -> PyResult<PyClassInitializer<Self>> {
+        let soft = soft.map_or_else(Soft::default, self::soft);
+        checked(model, Self, constraints::JerkLimit::new(JerkSettings { limit: limit.per_joint(), soft }))
     }
 }
 
 /// Motor force limits of the robot file times `scale` (0, 1].
-#[pyclass(module = "nearl._core", frozen)]
-pub(crate) struct TorqueLimit(constraints::TorqueLimit);
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct TorqueLimit;
 
 #[pymethods]
 impl TorqueLimit {
     #[new]
     #[pyo3(signature = (model, scale=1.0))]
-    fn new(model: &Model, scale: f64) -> PyResult<Self> {
-        checked(model, constraints::TorqueLimit::scaled(scale)).map(Self)
-    }
-
-    fn __repr__(&self) -> String {
-        format!("{:?}", self.0)
+    fn new(model: &Model, scale: f64) -> PyResult<PyClassInitializer<Self>> {
+        checked(model, Self, constraints::TorqueLimit::scaled(scale))
     }
 }
 
-/// The Rust limits behind a list of Python ones.
-pub(crate) fn boxed(limits: &[Bound<'_, PyAny>]) -> PyResult<Vec<Box<dyn Limit>>> {
-    limits.iter().enumerate().map(|(i, limit)| one(i, limit)).collect()
+/// Motors whose force falls with speed: `|tau + stall / no_load v| <= stall`, in [N·m or N] and [rad/s or m/s].
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct TorqueSpeedLimit;
+
+#[pymethods]
+impl TorqueSpeedLimit {
+    #[new]
+    #[pyo3(signature = (model, stall, no_load, soft=None))]
+    fn new(
+        model: &Model,
+        stall: Values,
+        no_load: Values,
+        soft: Option<Weights>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let (stall, no_load, soft) = (stall.per_joint(), no_load.per_joint(), soft.map(self::soft));
+        checked(model, Self, constraints::TorqueSpeedLimit::new(TorqueSpeedSettings { stall, no_load, soft }))
+    }
 }
 
-fn one(i: usize, limit: &Bound<'_, PyAny>) -> PyResult<Box<dyn Limit>> {
-    if let Ok(l) = limit.cast::<PositionLimit>() {
-        return Ok(Box::new(l.get().0.clone()));
+/// Limits on the change of motor forces [N·m/s or N/s], always soft; they need the tick before, like `JerkLimit`.
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct TorqueRateLimit;
+
+#[pymethods]
+impl TorqueRateLimit {
+    #[new]
+    #[pyo3(signature = (model, limit, soft=None))]
+    fn new(model: &Model, limit: Values, soft: Option<Weights>) -> PyResult<PyClassInitializer<Self>> {
+        let (limit, soft) = (limit.per_joint(), soft.map_or_else(Soft::default, self::soft));
+        checked(model, Self, constraints::TorqueRateLimit::new(TorqueRateSettings { limit, soft }))
     }
-    if let Ok(l) = limit.cast::<VelocityLimit>() {
-        return Ok(Box::new(l.get().0.clone()));
+}
+
+/// Joints that brake to standstill and stay.
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct LockedJoints;
+
+#[pymethods]
+impl LockedJoints {
+    #[new]
+    fn new(model: &Model, joints: Vec<String>) -> PyResult<PyClassInitializer<Self>> {
+        checked(model, Self, constraints::LockedJoints::new(joints))
     }
-    if let Ok(l) = limit.cast::<AccelerationLimit>() {
-        return Ok(Box::new(l.get().0.clone()));
+}
+
+/// A linear row over the next state: `lower <= sum of terms <= upper` or `equals`, with terms such as `{"q.elbow": 1.0, "v.wrist": -0.5}`.
+/// `braking` lets a sum of positions stop in front of its bounds; `soft` is `(linear, quadratic)` weights.
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct RowLimit;
+
+#[pymethods]
+impl RowLimit {
+    #[new]
+    #[pyo3(signature = (model, name, terms, *, lower=None, upper=None, equals=None, braking=None, soft=None))]
+    #[expect(clippy::too_many_arguments, reason = "one argument a setting, by keyword")]
+    fn new(
+        model: &Model,
+        name: String,
+        terms: BTreeMap<String, f64>,
+        lower: Option<f64>,
+        upper: Option<f64>,
+        equals: Option<f64>,
+        braking: Option<f64>,
+        soft: Option<Weights>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let soft = soft.map(self::soft);
+        let settings = UserRowSettings { name, terms, lower, upper, equals, braking, soft };
+        checked(model, Self, constraints::UserRow::new(settings))
     }
-    if let Ok(l) = limit.cast::<TorqueLimit>() {
-        return Ok(Box::new(l.get().0.clone()));
-    }
-    Err(PyTypeError::new_err(format!(
-        "limits[{i}] is {}, not a limit; pass PositionLimit, VelocityLimit, AccelerationLimit or TorqueLimit objects",
-        limit.get_type()
-    )))
 }

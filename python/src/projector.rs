@@ -1,10 +1,13 @@
 //! The projector: the nearest next state that every limit allows.
 
 use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
 
-use nearl_constraints::{self as constraints, Consistency, Proposal, Settings, Solver};
+use nearl_constraints::row::Previous;
+use nearl_constraints::{self as constraints, Braking, Consistency, Proposal, Settings, Solver};
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 
 use crate::arrays::{array, array2, matrix, rows};
 use crate::errors;
@@ -30,12 +33,14 @@ type Problem<'py> = (
     Bound<'py, PyArray1<f64>>,
     Bound<'py, PyArray2<f64>>,
     Bound<'py, PyArray1<f64>>,
+    Bound<'py, PyArray2<f64>>,
+    Bound<'py, PyArray1<f64>>,
 );
 
 #[pymethods]
 impl Projector {
     #[new]
-    #[pyo3(signature = (model, limits, dt, controllable=None, consistency="kinematic", solver="ladder", sub_steps=1, velocity_weight=None))]
+    #[pyo3(signature = (model, limits, dt, controllable=None, consistency="kinematic", solver="ladder", sub_steps=1, velocity_weight=None, braking="certified", deadline=None))]
     fn new(
         py: Python<'_>,
         model: Py<Model>,
@@ -46,6 +51,8 @@ impl Projector {
         solver: &str,
         sub_steps: u32,
         velocity_weight: Option<Vec<f64>>,
+        braking: &str,
+        deadline: Option<f64>,
     ) -> PyResult<Projector> {
         let robot = &model.get().model;
         let (consistency, solver) = (
@@ -56,13 +63,29 @@ impl Projector {
             )?,
             choice("solver", solver, &[("ladder", Solver::Ladder), ("clarabel", Solver::Clarabel)])?,
         );
-        let settings = Settings { consistency, solver, velocity_weight, ..Settings::new(dt, sub_steps) };
+        let braking =
+            choice("braking", braking, &[("certified", Braking::Certified), ("stored", Braking::Stored)])?;
+        let deadline = match deadline.map(Duration::try_from_secs_f64) {
+            None => None,
+            Some(Ok(deadline)) => Some(deadline),
+            Some(Err(_)) => {
+                return Err(errors::value("deadline is a time in seconds, at least 0; pass such a number"));
+            }
+        };
+        let settings = Settings {
+            consistency,
+            solver,
+            velocity_weight,
+            braking,
+            deadline,
+            ..Settings::new(dt, sub_steps)
+        };
         let controllable = dofs(robot, controllable)?;
         let limits = limits::boxed(&limits)?;
         let first = py
             .detach(|| constraints::Projector::new(robot, &limits, &controllable, settings.clone()))
             .map_err(errors::value)?;
-        let names = (0..robot.nv()).map(|i| robot.dof_name(i)).collect();
+        let names = first.row_names();
         let sizes = (robot.nq(), robot.nv());
         Ok(Projector {
             names,
@@ -75,17 +98,28 @@ impl Projector {
         })
     }
 
-    /// The nearest next state to `(q_proposal, v_proposal)` from the state `(q, v)`.
+    /// The nearest next state to `(q_proposal, v_proposal)` from the state `(q, v)`. `previous`: acceleration and motor force (nv each)
+    /// of the tick before, for limits on their change.
+    #[pyo3(signature = (q, v, q_proposal, v_proposal, previous=None))]
     fn project(
         &self,
         q: &Bound<'_, PyAny>,
         v: &Bound<'_, PyAny>,
         q_proposal: &Bound<'_, PyAny>,
         v_proposal: &Bound<'_, PyAny>,
+        previous: Option<(Bound<'_, PyAny>, Bound<'_, PyAny>)>,
     ) -> PyResult<Target> {
         let (state, py) = (self.state(q, v, q_proposal, v_proposal)?, q.py());
+        let model = self.model.get();
+        let before = match &previous {
+            None => None,
+            Some((a, tau)) => Some((model.v("previous acceleration", a)?, model.v("previous torque", tau)?)),
+        };
         let target = self.with(py, |projector, model| {
             let mut target = constraints::Target::new(model);
+            projector.set_previous(
+                before.as_ref().map(|(acceleration, torque)| Previous { acceleration, torque }),
+            );
             projector.project(&state.0, &state.1, &state.2, &mut target);
             target
         });
@@ -102,23 +136,14 @@ impl Projector {
         v_proposal: &Bound<'_, PyAny>,
         threads: Option<usize>,
     ) -> PyResult<Targets> {
-        let (nq, nv) = self.sizes;
-        let (q_, n) = rows("q", q, nq)?;
-        let batch = Batch {
-            sizes: self.sizes,
-            q: q_,
-            v: matrix("v", v, n, nv)?,
-            q_proposal: matrix("q_proposal", q_proposal, n, nq)?,
-            v_proposal: matrix("v_proposal", v_proposal, n, nv)?,
-        };
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        let threads = threads.unwrap_or(cores).clamp(1, n.max(1));
+        let (batch, n) = self.batch_of(q, v, q_proposal, v_proposal)?;
+        let threads = threads_for(threads, n);
         let targets = q.py().detach(|| self.batch(&batch, n, threads)).map_err(errors::value)?;
         Ok(Targets { targets, names: self.names.clone(), sizes: self.sizes })
     }
 
-    /// The problem of such a projection, for other solvers: `H, c, G, h` of `min 1/2 y'H y + c'y` s.t. `G y <= h`, with
-    /// `y = v' - v` of the controllable dofs.
+    /// The problem of such a projection, for other solvers: `H, c, G, h, A, b` of `min 1/2 x'H x + c'x` s.t. `G x <= h` and
+    /// `A x = b`, with x the changes `v' - v` of the controllable dofs, then a slack for each soft row. Cones are not in it.
     fn problem<'py>(
         &self,
         q: &Bound<'py, PyAny>,
@@ -134,13 +159,68 @@ impl Projector {
         let problem = problem.ok_or_else(|| {
             errors::value("this projector has no coupled rows, so a projection is a clamp of each dof; add a TorqueLimit for a problem")
         })?;
-        let n = problem.c.len();
+        let n = problem.n;
         Ok((
             array2(py, problem.hessian, n)?,
             array(py, &problem.c),
             array2(py, problem.g, n)?,
             array(py, &problem.h),
+            array2(py, problem.a, n)?,
+            array(py, &problem.b),
         ))
+    }
+
+    /// Vector-Jacobian products of n projections: for the derivatives `dq` (n x nv) and `dv` (n x nv) of a scalar with respect to the
+    /// targets, those with respect to `q_proposal` and `v_proposal`. Configurations count in tangent space.
+    #[pyo3(signature = (q, v, q_proposal, v_proposal, dq, dv, threads=None))]
+    #[expect(clippy::too_many_arguments, reason = "states, proposals and their derivatives")]
+    fn vjp_batch<'py>(
+        &self,
+        q: &Bound<'py, PyAny>,
+        v: &Bound<'py, PyAny>,
+        q_proposal: &Bound<'py, PyAny>,
+        v_proposal: &Bound<'py, PyAny>,
+        dq: &Bound<'py, PyAny>,
+        dv: &Bound<'py, PyAny>,
+        threads: Option<usize>,
+    ) -> PyResult<Pair<'py>> {
+        let (batch, n) = self.batch_of(q, v, q_proposal, v_proposal)?;
+        let nv = self.sizes.1;
+        let cotangents = (matrix("dq", dq, n, nv)?, matrix("dv", dv, n, nv)?);
+        let threads = threads_for(threads, n);
+        let py = q.py();
+        let run = || self.vjp(&batch, &cotangents, n, threads);
+        let (dq_proposal, dv_proposal) = py.detach(run).map_err(errors::value)?;
+        Ok((array2(py, dq_proposal, nv)?, array2(py, dv_proposal, nv)?))
+    }
+
+    /// Switches every limit of that name on or off.
+    fn set_enabled(&self, name: &str, on: bool) -> PyResult<()> {
+        let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
+        projectors.iter_mut().try_for_each(|p| p.set_enabled(name, on)).map_err(errors::value)
+    }
+
+    /// Names of the limits and whether they hold.
+    #[getter]
+    fn enabled<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let out = PyDict::new(py);
+        let projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
+        projectors[0].enabled().try_for_each(|(name, on)| out.set_item(name, on))?;
+        Ok(out)
+    }
+
+    /// Forces on the robot beside its motors, as generalised forces `J'f` (nv), for all projections to come: contact forces.
+    fn set_external_forces(&self, forces: &Bound<'_, PyAny>) -> PyResult<()> {
+        let forces = self.model.get().v("forces", forces)?;
+        let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
+        projectors.iter_mut().for_each(|p| p.set_external_forces(&forces));
+        Ok(())
+    }
+
+    /// What the rows of a ledger's `active` are of: dofs, then coupled rows.
+    #[getter]
+    fn row_names(&self) -> Vec<String> {
+        self.names.clone()
     }
 
     /// Names of the dofs the projector may move.
@@ -204,14 +284,7 @@ impl Projector {
     ) -> Result<Vec<constraints::Target>, constraints::LimitError> {
         let model = &self.model.get().model;
         let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
-        while projectors.len() < threads {
-            projectors.push(constraints::Projector::new(
-                model,
-                &self.limits,
-                &self.controllable,
-                self.settings.clone(),
-            )?);
-        }
+        self.more(&mut projectors, threads)?;
         let mut targets = vec![constraints::Target::new(model); n];
         let size = n.div_ceil(threads).max(1);
         std::thread::scope(|scope| {
@@ -221,6 +294,82 @@ impl Projector {
         });
         Ok(targets)
     }
+
+    /// As many projectors as threads, alike in what is switched on and in the forces.
+    fn more(
+        &self,
+        projectors: &mut Vec<constraints::Projector>,
+        threads: usize,
+    ) -> Result<(), constraints::LimitError> {
+        let model = &self.model.get().model;
+        while projectors.len() < threads {
+            let settings = self.settings.clone();
+            let mut new = constraints::Projector::new(model, &self.limits, &self.controllable, settings)?;
+            let off: Vec<String> =
+                projectors[0].enabled().filter(|(_, on)| !on).map(|(name, _)| name.to_string()).collect();
+            off.iter().try_for_each(|name| new.set_enabled(name, false))?;
+            new.set_external_forces(projectors[0].external_forces());
+            projectors.push(new);
+        }
+        projectors.iter_mut().for_each(constraints::Projector::forget);
+        Ok(())
+    }
+
+    fn batch_of(
+        &self,
+        q: &Bound<'_, PyAny>,
+        v: &Bound<'_, PyAny>,
+        q_proposal: &Bound<'_, PyAny>,
+        v_proposal: &Bound<'_, PyAny>,
+    ) -> PyResult<(Batch, usize)> {
+        let (nq, nv) = self.sizes;
+        let (q, n) = rows("q", q, nq)?;
+        let batch = Batch {
+            sizes: self.sizes,
+            q,
+            v: matrix("v", v, n, nv)?,
+            q_proposal: matrix("q_proposal", q_proposal, n, nq)?,
+            v_proposal: matrix("v_proposal", v_proposal, n, nv)?,
+        };
+        Ok((batch, n))
+    }
+
+    fn vjp(
+        &self,
+        batch: &Batch,
+        (dq, dv): &(Vec<f64>, Vec<f64>),
+        n: usize,
+        threads: usize,
+    ) -> Result<(Vec<f64>, Vec<f64>), constraints::LimitError> {
+        let (nv, model) = (self.sizes.1, &self.model.get().model);
+        let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
+        self.more(&mut projectors, threads)?;
+        let (mut dq_out, mut dv_out) = (vec![0.0; n * nv], vec![0.0; n * nv]);
+        let size = n.div_ceil(threads).max(1);
+        std::thread::scope(|scope| {
+            let chunks = dq_out.chunks_mut(size * nv).zip(dv_out.chunks_mut(size * nv));
+            for ((k, (dq_out, dv_out)), projector) in chunks.enumerate().zip(projectors.iter_mut()) {
+                scope.spawn(move || {
+                    let mut target = [constraints::Target::new(model)];
+                    for (j, (dq_out, dv_out)) in dq_out.chunks_mut(nv).zip(dv_out.chunks_mut(nv)).enumerate()
+                    {
+                        let i = k * size + j;
+                        batch.project(i, projector, &mut target);
+                        projector.vjp(&dq[i * nv..][..nv], &dv[i * nv..][..nv], dq_out, dv_out);
+                    }
+                });
+            }
+        });
+        Ok((dq_out, dv_out))
+    }
+}
+
+/// Two matrices.
+type Pair<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>);
+
+fn threads_for(wanted: Option<usize>, n: usize) -> usize {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    wanted.unwrap_or(cores).clamp(1, n.max(1))
 }
 
 /// States and proposals, row by row.

@@ -1,6 +1,6 @@
 //! What a projection returns.
 
-use nearl_constraints::{self as constraints, BrakeReason, Counts, Kind, RefuseReason, Rung, Side, Status};
+use nearl_constraints::{self as constraints, BrakeReason, Counts, RefuseReason, Rung, Side, Status};
 use numpy::{PyArray1, PyArray2};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
@@ -21,6 +21,10 @@ fn words(status: Status) -> (&'static str, Option<&'static str>) {
             ("braked", Some("the proposal holds NaN or infinity"))
         }
         Status::Braked(BrakeReason::NoCertifiedAnswer) => ("braked", Some("no answer passed the checker")),
+        Status::Slowed => ("slowed", Some("no way to stop could be verified from the nearest allowed state")),
+        Status::Braked(BrakeReason::NoVerifiedBrake) => {
+            ("braked", Some("no way to stop could be verified; the stored brake is executed"))
+        }
         Status::Braked(BrakeReason::NonFiniteDynamics) => {
             ("braked", Some("the dynamics came out as NaN or infinity"))
         }
@@ -28,16 +32,6 @@ fn words(status: Status) -> (&'static str, Option<&'static str>) {
             ("refused", Some("the measured state holds NaN or infinity"))
         }
         Status::Refused(RefuseReason::WrongLength) => ("refused", Some("a vector has the wrong length")),
-    }
-}
-
-fn kind(kind: Kind) -> &'static str {
-    match kind {
-        Kind::Position => "position",
-        Kind::Velocity => "velocity",
-        Kind::Acceleration => "acceleration",
-        Kind::Viability => "viability",
-        Kind::Torque => "torque",
     }
 }
 
@@ -49,6 +43,7 @@ fn counts<'py>(py: Python<'py>, c: &Counts) -> PyResult<Bound<'py, PyDict>> {
         ("acceleration", c.acceleration),
         ("viability", c.viability),
         ("torque", c.torque),
+        ("other", c.other),
     ] {
         out.set_item(name, n)?;
     }
@@ -82,27 +77,30 @@ impl Ledger {
         self.ledger.status.is_ok()
     }
 
-    /// Which stage answered: "closed form", "active set", "clarabel" or "brake".
+    /// Which stage answered: "closed form", "active set", "clarabel", "relaxed", "stored brake" or "brake".
     #[getter]
     fn rung(&self) -> &'static str {
         match self.ledger.rung {
             Rung::ClosedForm => "closed form",
             Rung::ActiveSet => "active set",
             Rung::Clarabel => "clarabel",
+            Rung::Relaxed => "relaxed",
+            Rung::StoredBrake => "stored brake",
             Rung::Brake => "brake",
         }
     }
 
-    /// Rows that hold the target back: `{"kind", "dof", "name", "side", "multiplier"}` each.
+    /// Rows that hold the target back: `{"kind", "row", "name", "side", "multiplier", "slack"}` each.
     #[getter]
     fn active<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyDict>>> {
         let row = |row: &constraints::ActiveRow| {
             let out = PyDict::new(py);
-            out.set_item("kind", kind(row.kind))?;
-            out.set_item("dof", row.dof)?;
-            out.set_item("name", self.names.get(row.dof))?;
+            out.set_item("kind", row.kind.name())?;
+            out.set_item("row", row.row)?;
+            out.set_item("name", self.names.get(row.row))?;
             out.set_item("side", if row.side == Side::Lower { "lower" } else { "upper" })?;
             out.set_item("multiplier", row.multiplier)?;
+            out.set_item("slack", row.slack)?;
             Ok(out)
         };
         self.ledger.active.iter().map(row).collect()

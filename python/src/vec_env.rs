@@ -59,11 +59,11 @@ impl VecEnv {
             return Err(errors::value("num_envs is 0; ask for at least one environment"));
         }
         py.detach(|| {
-            let first = env::make(task).map_err(errors::value)?;
+            let first = tasks::env(task).map_err(errors::task)?;
             let open = match constraints.as_deref() {
                 None => None,
                 Some("task") => Some(task_snapshot(task)?),
-                Some(file) => Some(agent_snapshot(task, file)?),
+                Some(file) => Some(agent_snapshot(&first.spec().name, file)?),
             };
             let spec = first.spec().clone();
             let max_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
@@ -147,6 +147,25 @@ impl VecEnv {
         let info = info(py, &pool)?;
         let flags = |f: Vec<bool>| PyArray1::from_vec(py, f);
         Ok((obs, array(py, &rewards), flags(terminated), flags(truncated), info))
+    }
+
+    /// Ends the episodes chosen (num_envs), as if the task had: by the autoreset mode, a new one begins in the next step, or at
+    /// once. Returns observations (num_envs x n_obs).
+    fn end<'py>(&self, py: Python<'py>, ended: Vec<bool>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        if ended.len() != self.n {
+            return Err(errors::value(format!(
+                "{} flags for {} environments; give one each",
+                ended.len(),
+                self.n
+            )));
+        }
+        let obs = self.with(py, |pool| {
+            for (mut lane, _) in pool.lanes().zip(&ended).filter(|(_, ended)| **ended) {
+                lane.end(self.mode);
+            }
+            self.observations(pool)
+        });
+        array2(py, obs.map_err(errors::value)?, self.n_obs)
     }
 
     /// Puts environment `index` into a state, MuJoCo's convention; an episode begins there.
@@ -244,6 +263,9 @@ fn info<'py>(py: Python<'py>, pool: &Pool) -> PyResult<Bound<'py, PyDict>> {
     put("final_obs", pool.lanes().map(|l| l.final_obs.as_ref().map(|o| array(py, o).into_any())).collect())?;
     let fault = |l: &Lane| fault_name(l.fault).map(|f| pyo3::types::PyString::new(py, f).into_any());
     put("fault", pool.lanes().map(|l| fault(&l)).collect())?;
+    if pool.lanes().next().is_some_and(|l| l.env.spec().has_cost) {
+        info.set_item("cost", array(py, &pool.lanes().map(|l| l.cost).collect::<Vec<_>>()))?;
+    }
     if pool.lanes().next().is_some_and(|l| l.proposing.is_some()) {
         let counts =
             |f: fn(&Lane) -> u32| PyArray1::from_vec(py, pool.lanes().map(|l| f(&l)).collect::<Vec<u32>>());
@@ -297,7 +319,7 @@ fn range(model: &Model, layout: &StateLayout, k: usize) -> (f64, f64) {
 
 /// A snapshot of the task alone: its inverse dynamics needs no learning.
 fn task_snapshot(task: &str) -> PyResult<Snapshot> {
-    let mut manifest = tasks::load(task, &[]).map_err(errors::value)?;
+    let mut manifest = tasks::load(task, &[]).map_err(errors::task)?;
     if manifest.task.idm.kind == IdmKind::Learned {
         return Err(errors::value(format!(
             "task '{task}' has a learned inverse model, so constraints=\"task\" has no way from a proposed state to an action; \

@@ -81,7 +81,7 @@ def test_impossible_numbers(planar) -> None:
 
 
 def test_something_that_is_no_limit(planar) -> None:
-    with pytest.raises(TypeError, match=r"limits\[0\] is .*float.*pass PositionLimit"):
+    with pytest.raises(TypeError, match=r"limits\[0\] is .*float.*pass objects such as nearl.PositionLimit"):
         nearl.Projector(planar, [3.0], dt=1e-3)
 
 

@@ -132,7 +132,7 @@ def test_feasible_proposals_pass_bit_for_bit(model, rng, dt, n) -> None:
 def test_the_problem_it_states_is_the_problem_it_solves(model, rng) -> None:
     projector = make(model, 1e-3, 1)
     for problem, q_hat, v_hat in cases(model, rng, 50, 1e-3, 1):
-        H, c, G, h = projector.problem(problem.q, problem.v, q_hat, v_hat)
+        H, c, G, h, A, _ = projector.problem(problem.q, problem.v, q_hat, v_hat)
         optimum = problem.solve(q_hat, v_hat)
         if optimum is None:
             continue
@@ -170,8 +170,9 @@ def test_multipliers_balance_the_pull_of_the_proposal(model, rng) -> None:
         held = np.zeros(model.nv)
         for row in target.active:
             sign = 1.0 if row["side"] == "upper" else -1.0
-            direction = problem.rows[row["dof"]] if row["kind"] == "torque" else np.eye(model.nv)[row["dof"]]
-            assert row["multiplier"] >= 0 and row["name"] == model.joint_names[row["dof"]]
+            assert row["multiplier"] >= 0 and row["slack"] == 0 and row["name"] == projector.row_names[row["row"]]
+            dof = model.joint_names.index(row["name"])
+            direction = problem.rows[dof] if row["kind"] == "torque" else np.eye(model.nv)[dof]
             held += sign * row["multiplier"] * direction
         np.testing.assert_allclose(held, pull, atol=1e-6 * max(1.0, np.abs(pull).max()))
 

@@ -27,7 +27,8 @@ def test_commands(block, tmp_path):
 
 
 @pytest.mark.parametrize("block", blocks("python"))
-def test_examples(block):
+def test_examples(block, tmp_path):
+    block = re.sub(r"\b(runs|demo)/", f"{tmp_path}/", block)
     run = subprocess.run([sys.executable, "-c", block], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stderr
 

@@ -13,7 +13,7 @@ mod parts;
 pub use parts::{Parts, seen_entries};
 
 use crate::idm::{AnalyticIdm, LearnedIdm};
-use crate::net::Forward;
+use crate::net::{Activation, Forward};
 use crate::normaliser::Normaliser;
 use crate::snapshot::{Networks, PolicyKind, Snapshot, SnapshotError};
 use crate::task::IdmKind;
@@ -96,6 +96,7 @@ pub struct Controller {
     model: Model,
     layout: StateLayout,
     kind: PolicyKind,
+    activation: Activation,
     normaliser: Normaliser,
     policy: Forward,
     policy_log_std: Vec<f32>,
@@ -136,7 +137,8 @@ impl Controller {
             }
             (_, IdmKind::Learned, Some((net, log_std))) => {
                 let seen = seen_entries(m, &layout)?;
-                (Inverse::Learned(LearnedIdm::new(Forward::from_dense(net), &layout, &seen)), log_std.clone())
+                let net = Forward::new(net, m.activation);
+                (Inverse::Learned(LearnedIdm::new(net, &layout, &seen)), log_std.clone())
             }
             (_, IdmKind::Learned, None) => {
                 return Err(SnapshotError::MissingTensor { name: "idm.0.weight".into() });
@@ -147,8 +149,9 @@ impl Controller {
         let proposal = Proposal { q: model.neutral(), v: zero(model.nv()) };
         let mut controller = Self {
             kind,
+            activation: m.activation,
             normaliser: n.normaliser.clone(),
-            policy: Forward::from_dense(&n.policy),
+            policy: Forward::new(&n.policy, m.activation),
             policy_log_std: n.policy_log_std.clone(),
             action_log_std,
             projector,
@@ -260,6 +263,9 @@ impl Controller {
         }
         self.interpolate();
         self.projector.project(&self.held.q, &self.held.v, &self.proposal, &mut out.next);
+        if self.projector.needs_previous() {
+            self.projector.remember(&out.next);
+        }
         if !self.projection {
             self.pass_raw(&mut out.next);
         }
@@ -292,6 +298,7 @@ impl Controller {
         }
         next.ledger.violations = next.ledger.raw_violations;
         next.ledger.moved = 0.0;
+        next.ledger.active.clear();
     }
 
     /// Where the proposal wants the robot at the end of this tick: on the cubic from the state at the
@@ -360,16 +367,17 @@ impl Controller {
     /// Starts a new episode: the next tick is a policy tick.
     pub fn reset(&mut self) {
         self.tick = 0;
+        self.projector.forget();
     }
 
     /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.
     pub fn set_networks(&mut self, networks: &Networks) {
         self.normaliser = networks.normaliser.clone();
-        self.policy = Forward::from_dense(&networks.policy);
+        self.policy = Forward::new(&networks.policy, self.activation);
         self.policy_log_std.clone_from(&networks.policy_log_std);
         match (&mut self.inverse, &networks.idm) {
             (Inverse::Learned(idm), Some((net, log_std))) => {
-                idm.set_net(Forward::from_dense(net));
+                idm.set_net(Forward::new(net, self.activation));
                 self.action_log_std.clone_from(log_std);
             }
             (Inverse::Direct, _) => self.action_log_std.clone_from(&networks.policy_log_std),
@@ -392,6 +400,10 @@ impl Controller {
     /// Limits by degree of freedom.
     pub fn limits(&self) -> &LimitSet {
         self.projector.limits()
+    }
+    /// What the ledger's active rows are of: dofs, then coupled rows.
+    pub fn row_names(&self) -> Vec<String> {
+        self.projector.row_names()
     }
     /// Robot model.
     pub fn model(&self) -> &Model {

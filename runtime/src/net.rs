@@ -1,11 +1,13 @@
-//! Small tanh networks: padded f32 kernels, shapes, and a forward pass of one sample without allocation.
+//! Small fully connected networks: padded f32 kernels, shapes, and a forward pass of one sample without allocation.
 
 pub mod kernel;
 
+mod activation;
 mod dense;
 mod forward;
 mod mlp;
 
+pub use activation::Activation;
 pub use dense::{Dense, DenseLayer};
 pub use forward::Forward;
 pub use mlp::{Layer, Mlp};

@@ -4,7 +4,7 @@
 //! The digest covers the manifest text and every tensor (name, shape, bytes), so any changed bit is refused.
 
 use crate::codes::SnapshotCode;
-use crate::net::Dense;
+use crate::net::{Activation, Dense};
 use crate::normaliser::Normaliser;
 use crate::task::Task;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -57,6 +57,9 @@ pub struct Manifest {
     pub algo: String,
     /// How the networks are read.
     pub policy: PolicyKind,
+    /// What lies between the layers of the networks; tanh in files that do not say.
+    #[serde(default)]
+    pub activation: Activation,
     /// Counts the snapshots of one run upwards; 0 for a file made by hand.
     pub version: u64,
     /// Environment steps seen by the learner.
@@ -283,7 +286,8 @@ impl Snapshot {
     }
 }
 
-fn digest<'a>(manifest: &str, tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [u8])>) -> String {
+/// blake3 in hex over a text and tensors (name, shape, bytes), whatever their order.
+pub fn digest<'a>(manifest: &str, tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [u8])>) -> String {
     let mut hash = blake3::Hasher::new();
     hash.update(manifest.as_bytes());
     let mut sorted: Vec<_> = tensors.collect();

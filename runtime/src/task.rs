@@ -10,14 +10,30 @@ use std::path::Path;
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Task {
-    /// Name of the environment that plays the robot in simulation, e.g. `HalfCheetah-v5`.
+    /// Name of the task; where neither `env` nor `[reward]` is given, also of the native environment, e.g. `HalfCheetah-v5`.
     pub name: String,
+    /// Native environment that the task adds constraints or a cost to; that of `name` when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub env: Option<String>,
     /// The robot file.
     pub model: ModelSection,
     /// Periods.
     pub time: TimeSection,
     /// Observation, proposal and controllable subset.
     pub state: StateSection,
+    /// Named expressions whose sum is the reward: makes the task an environment of its own. These four sections are kept for
+    /// the trainer, which reads and checks them.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub reward: toml::Table,
+    /// Named expressions whose sum is counted beside the reward.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub cost: toml::Table,
+    /// Named conditions any of which ends an episode.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub termination: toml::Table,
+    /// How an episode starts.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub reset: toml::Table,
     /// Prior constraints.
     pub constraints: ConstraintSettings,
     /// Inverse dynamics.
@@ -50,6 +66,9 @@ pub struct TimeSection {
     pub policy_every: usize,
     /// Physics step of the plant in [s]; 0 for a zero-order-hold plant (a robot, or RK4).
     pub sim_dt: f64,
+    /// Control ticks after which an episode of the user's own environment is cut.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_episode_steps: Option<usize>,
 }
 
 /// `[state]`: entries by name, see [`nearl_constraints::StateLayout`].
@@ -220,6 +239,9 @@ impl Task {
                     t.policy_every
                 ),
             );
+        }
+        if t.max_episode_steps == Some(0) {
+            return refuse("time.max_episode_steps", "0 ticks hold no episode; give at least 1".into());
         }
         if self.model.urdf.is_some() == self.model.mjcf.is_some() {
             return refuse("model", "give exactly one of 'urdf' and 'mjcf'".into());

@@ -30,6 +30,20 @@ fn count(snapshot: &nearl_runtime::Snapshot, ticks: usize) -> (u64, u64) {
 }
 
 #[test]
+fn a_step_of_a_user_task_allocates_nothing() {
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/hopper.toml");
+    let mut env = nearl_trainer::tasks::env(file).expect("task");
+    let mut obs = vec![0.0; env.spec().n_obs()];
+    env.reset(&mut stream(0, 0)).expect("reset");
+    let before = allocations();
+    for _ in 0..100 {
+        env.step(&[0.1, -0.2, 0.3]);
+        env.observe(&mut obs);
+    }
+    assert_eq!(allocations() - before, 0);
+}
+
+#[test]
 fn an_update_allocates_nothing_beyond_clarabel() {
     drop(std::hint::black_box(Box::new(1)));
     assert!(allocations() > 0, "the counter counts");

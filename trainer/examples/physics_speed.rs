@@ -11,7 +11,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let cores = std::thread::available_parallelism()?.get();
     println!("{:<16} {:>12} {:>12}", "task", "1 thread", format!("{cores} threads"));
     for task in env::names() {
-        let speed = |threads| env::bench::physics(task, threads, Duration::from_secs_f64(seconds));
+        let first = env::make(task)?;
+        let speed = |threads| env::bench::physics(first.as_ref(), threads, Duration::from_secs_f64(seconds));
         let (one, all) = (speed(1)?.steps_per_second(), speed(cores)?.steps_per_second());
         println!("{task:<16} {one:>12.0} {all:>12.0}");
     }

@@ -5,6 +5,7 @@ mod demo;
 mod eval;
 mod plant;
 mod project;
+mod sweep;
 mod tasks;
 mod train;
 
@@ -25,6 +26,8 @@ pub struct Cli {
 enum Command {
     /// Train a policy on MuJoCo.
     Train(train::Train),
+    /// Train tasks x algorithms x seeds on all cores.
+    Sweep(sweep::SweepCommand),
     /// Run episodes without noise, raw and projected.
     Eval(eval::Eval),
     /// Plant and runtime as two processes, a hot swap, and the report.
@@ -55,6 +58,7 @@ impl Cli {
     pub fn run(self) -> Result<(), Failure> {
         match self.command {
             Command::Train(c) => c.run(),
+            Command::Sweep(c) => c.run(),
             Command::Eval(c) => c.run(),
             Command::Demo(c) => c.run(),
             Command::Project(c) => c.run(),

@@ -4,7 +4,8 @@
 //! states, rewards to rounding) on MuJoCo 3.17.0. A time limit is no termination: the caller counts steps against
 //! [`Spec::max_episode_steps`] and keeps the two apart.
 //!
-//! A new task is one file with an `impl` of `Rules` and one line in [`REGISTRY`].
+//! A new native task is one file with an `impl` of `Rules` and one line in [`REGISTRY`]; a user's own is a task file
+//! ([`of_task`]).
 
 pub mod bench;
 
@@ -17,7 +18,10 @@ mod planar;
 mod rules;
 mod simulated;
 mod spec;
+mod user;
 mod walker2d;
+
+use nearl_runtime::task::Task;
 
 use crate::mj::{MjError, ModelFormat, Sim};
 
@@ -31,6 +35,8 @@ pub use spec::Spec;
 pub struct Step {
     /// Reward of the period; 0 where `fault` is not [`Fault::None`].
     pub reward: f64,
+    /// What the task's `[cost]` counts in the period; 0 where it has none.
+    pub cost: f64,
     /// The episode ended in this state: no value is to be bootstrapped from it. True at every fault.
     pub terminated: bool,
     /// Whether the physics can be believed.
@@ -139,7 +145,7 @@ pub trait Env: Send {
     fn last_error(&self) -> Option<&MjError>;
 
     /// The robot file's text, so that a snapshot can carry it.
-    fn model_text(&self) -> &'static str;
+    fn model_text(&self) -> &str;
 
     /// The robot file's language.
     fn model_format(&self) -> ModelFormat;
@@ -166,15 +172,25 @@ pub enum EnvError {
     #[error("task '{task}': {source}")]
     Physics {
         /// The task.
-        task: &'static str,
+        task: String,
         /// MuJoCo's side of it.
         source: MjError,
+    },
+    /// A section of a task file that describes an environment.
+    #[error("{origin} [{key}]: {reason}")]
+    Task {
+        /// The file, or the task where it came out of a snapshot.
+        origin: String,
+        /// The key.
+        key: String,
+        /// One sentence.
+        reason: String,
     },
     /// A goal the task cannot have.
     #[error("task '{task}' has a goal of {expected} entries, not {got}")]
     Goal {
         /// The task.
-        task: &'static str,
+        task: String,
         /// Entries of its goal, 0 when it has none.
         expected: usize,
         /// Entries given.
@@ -221,6 +237,27 @@ pub fn make(name: &str) -> Result<Box<dyn Env>, EnvError> {
         Some(entry) => (entry.build)(),
         None => Err(EnvError::Unknown { name: name.to_owned(), near: near_names(name) }),
     }
+}
+
+/// Makes the environment of a task file: the user's own if it has a `[reward]` (`text` is its robot, MJCF), else the native one
+/// it names with `env`, or by its own name. `origin` is the file or task in messages.
+///
+/// # Errors
+/// As [`make`]; [`EnvError::Task`] names the key that is wrong.
+pub fn of_task(task: &Task, text: &str, origin: &str) -> Result<Box<dyn Env>, EnvError> {
+    if user::is_own(task) {
+        return user::build(task, text, origin);
+    }
+    let own = [
+        ("termination", !task.termination.is_empty()),
+        ("reset", !task.reset.is_empty()),
+        ("time.max_episode_steps", task.time.max_episode_steps.is_some()),
+    ];
+    if let Some((key, _)) = own.iter().find(|(_, given)| *given) {
+        let reason = "only a task with its own [reward] has it, the native environments bring theirs; add [reward] or take it out";
+        return Err(EnvError::Task { origin: origin.into(), key: (*key).into(), reason: reason.into() });
+    }
+    user::with_cost(make(task.env.as_deref().unwrap_or(&task.name))?, task, origin)
 }
 
 fn near_names(name: &str) -> Vec<&'static str> {

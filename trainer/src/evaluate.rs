@@ -11,6 +11,8 @@ pub struct Evaluation {
     pub mode: &'static str,
     /// Return of each episode.
     pub returns: Vec<f64>,
+    /// Cost of each episode; zeros where the task has none.
+    pub costs: Vec<f64>,
     /// Length of each episode in policy steps.
     pub lengths: Vec<usize>,
     /// Control ticks.
@@ -32,6 +34,11 @@ impl Evaluation {
     pub fn mean_return(&self) -> f64 {
         self.returns.iter().sum::<f64>() / self.returns.len().max(1) as f64
     }
+
+    /// Mean cost of an episode.
+    pub fn mean_cost(&self) -> f64 {
+        self.costs.iter().sum::<f64>() / self.costs.len().max(1) as f64
+    }
 }
 
 /// Runs `episodes` without noise; `projection` off makes the raw proposal the target.
@@ -50,6 +57,7 @@ pub fn evaluate(
     let mut e = Evaluation {
         mode,
         returns: Vec::new(),
+        costs: Vec::new(),
         lengths: Vec::new(),
         ticks: 0,
         raw_violations: 0,
@@ -62,6 +70,7 @@ pub fn evaluate(
         let (ret, length) = worker.evaluate();
         let t = &worker.tally;
         e.returns.push(ret);
+        e.costs.extend_from_slice(&t.costs);
         e.lengths.push(length);
         e.ticks += t.ticks;
         e.raw_violations += t.raw_violations;

@@ -3,6 +3,7 @@
 //! [`train`] is the loop of every algorithm; [`learn::pid2`] is the paper's.
 
 pub mod allocations;
+pub mod checkpoint;
 pub mod cli;
 pub mod env;
 pub mod evaluate;
@@ -13,5 +14,6 @@ pub mod rollout;
 pub mod run_folder;
 pub mod settings;
 pub mod stats;
+pub mod sweep;
 pub mod tasks;
 pub mod train;

@@ -9,7 +9,7 @@ mod sim;
 
 use std::sync::Arc;
 
-use mujoco_rs::wrappers::mj_model::{MjModel, MjtJoint, MjtObjBase};
+use mujoco_rs::wrappers::mj_model::{MjModel, MjtJoint, MjtObjBase, MjtTrn};
 
 pub use guard::{last_warning, warnings};
 pub use sim::Sim;
@@ -230,6 +230,35 @@ impl Model {
                 }
             })
             .collect()
+    }
+
+    /// [`Model::actuators`] of a robot all of whose actuators drive a joint with one degree of freedom within a range.
+    ///
+    /// # Errors
+    /// A sentence naming the actuator that does not.
+    pub fn joint_actuators(&self) -> Result<Vec<Actuator>, String> {
+        let list = (0..self.nu())
+            .map(|id| self.name(MjtObjBase::mjOBJ_ACTUATOR, id).unwrap_or_else(|| format!("number {id}")));
+        for (id, name) in list.enumerate() {
+            let on_joint =
+                matches!(self.0.actuator_trntype()[id], MjtTrn::mjTRN_JOINT | MjtTrn::mjTRN_JOINTINPARENT);
+            let joint = self.0.actuator_trnid()[id][0].max(0) as usize;
+            if !on_joint || self.joint(joint).nv != 1 {
+                return Err(format!(
+                    "actuator '{name}' does not drive a joint with one degree of freedom; use joint transmissions"
+                ));
+            }
+            let [low, high] = self.0.actuator_ctrlrange()[id];
+            if !self.0.actuator_ctrllimited()[id] || low >= high {
+                return Err(format!(
+                    "actuator '{name}' has no ctrlrange; give it one, the action is chosen within it"
+                ));
+            }
+        }
+        match self.nu() {
+            0 => Err("the robot has no actuator; add an <actuator> section".into()),
+            _ => Ok(self.actuators()),
+        }
     }
 
     fn joint(&self, id: usize) -> Joint {

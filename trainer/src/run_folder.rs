@@ -16,8 +16,18 @@ pub enum RunError {
         /// What the system said.
         reason: String,
     },
+    /// The metrics do not belong to the checkpoint.
+    #[error("cannot go on with '{path}': {reason}; restore the file or start a new run with --out")]
+    Metrics {
+        /// File.
+        path: String,
+        /// One sentence.
+        reason: String,
+    },
     /// A run is already there.
-    #[error("'{path}' already holds a run; give another folder with --out or remove it")]
+    #[error(
+        "'{path}' already holds a run; go on with --resume, give another folder with --out, or remove it"
+    )]
     Exists {
         /// Folder.
         path: String,
@@ -71,6 +81,45 @@ impl RunFolder {
         Ok(Self { path: path.into(), metrics, columns: columns.len() })
     }
 
+    /// Opens the folder of a run to go on: keeps the rows of `metrics.csv` up to `steps`, of which there must be `rows`.
+    ///
+    /// Rows behind the checkpoint (of a run that was killed) are dropped: they come again.
+    ///
+    /// # Errors
+    /// [`RunError`] when there is no `metrics.csv`, or it has other columns or lacks rows.
+    pub fn reopen(path: &Path, columns: &[&str], steps: u64, rows: u64) -> Result<Self, RunError> {
+        let file = path.join("metrics.csv");
+        let broken = |reason: String| RunError::Metrics { path: file.display().to_string(), reason };
+        let text = std::fs::read_to_string(&file).map_err(|e| broken(e.to_string()))?;
+        let mut lines = text.split_inclusive('\n').filter_map(|l| l.strip_suffix('\n'));
+        if lines.next() != Some(columns.join(",").as_str()) {
+            return Err(broken("it has other columns than this program writes".into()));
+        }
+        let done = |l: &&str| {
+            let n = l.split(',').next().and_then(|c| c.parse::<f64>().ok());
+            n.is_some_and(|n| n <= steps as f64) && l.split(',').count() == columns.len()
+        };
+        let kept: Vec<&str> = lines.filter(done).collect();
+        if kept.len() as u64 != rows {
+            let found = kept.len();
+            return Err(broken(format!(
+                "it has {found} rows up to the checkpoint's {steps} steps, not {rows}"
+            )));
+        }
+        let whole: String =
+            std::iter::once(columns.join(",").as_str()).chain(kept).flat_map(|l| [l, "\n"]).collect();
+        let beside = path.join(format!("metrics.part{}", std::process::id()));
+        let open = || -> std::io::Result<File> {
+            std::fs::write(&beside, whole)?;
+            std::fs::rename(&beside, &file)?;
+            File::options().append(true).open(&file)
+        };
+        let write =
+            |e: std::io::Error| RunError::Write { path: file.display().to_string(), reason: e.to_string() };
+        let metrics = BufWriter::new(open().map_err(write)?);
+        Ok(Self { path: path.into(), metrics, columns: columns.len() })
+    }
+
     /// Appends one row of metrics; numbers that do not exist are empty cells.
     ///
     /// # Errors
@@ -85,14 +134,21 @@ impl RunFolder {
             .map_err(|e| RunError::Write { path: file.display().to_string(), reason: e.to_string() })
     }
 
-    /// Writes `checkpoints/<name>.safetensors` whole.
+    /// Writes `checkpoints/<name>.safetensors` whole. Only the newest of `final` and `latest` stays.
     ///
     /// # Errors
     /// [`SnapshotError`] with what the system said.
     pub fn save(&self, name: &str, snapshot: &Snapshot) -> Result<PathBuf, SnapshotError> {
         let path = self.path.join("checkpoints").join(format!("{name}.safetensors"));
         snapshot.save(&path)?;
-        Ok(path)
+        let other = if name == "final" { "latest" } else { "final" };
+        let stale = path.with_file_name(format!("{other}.safetensors"));
+        match std::fs::remove_file(&stale) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                Err(SnapshotError::Unreadable { file: stale.display().to_string(), reason: e.to_string() })
+            }
+            _ => Ok(path),
+        }
     }
 
     /// The folder.

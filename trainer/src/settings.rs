@@ -1,6 +1,6 @@
 //! `[train]` of the task file: how experience is collected, and the learner's own sections.
 
-use crate::learn::{Pid2Settings, PpoSettings};
+use crate::learn::{NearlSettings, NetSettings, Pid2Settings, PpoSettings};
 use nearl_runtime::task::suggest;
 use serde::{Deserialize, Serialize};
 
@@ -15,14 +15,15 @@ pub enum ChangeScale {
     Limits,
 }
 
-/// Whether the meta policy's proposal or the inverse model's action is Gaussian.
+/// What is Gaussian: a deterministic or a stochastic meta policy, for `nearl`, `pid2-gan` and `pid2-ib`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Exploration {
-    /// Deterministic proposal, Gaussian action (Eq. 1 of the paper); needs a learned inverse model.
+    /// Deterministic meta policy, Gaussian action (Eq. 1 of the paper); needs a learned inverse model.
     #[default]
     Action,
-    /// Gaussian proposal; the only choice with analytic inverse dynamics.
+    /// Stochastic meta policy; with a learned inverse model the action is Gaussian too. The only choice with analytic
+    /// inverse dynamics. The ratio has as many dimensions as the state: expect slower learning.
     Proposal,
 }
 
@@ -46,11 +47,21 @@ pub struct TrainSettings {
     pub change_scale: ChangeScale,
     /// What is Gaussian.
     pub exploration: Exploration,
-    /// Project while collecting (Algorithm 2, line 8); off: constraints act in deployment only.
-    pub project: bool,
-    /// Settings of `ppo`.
+    /// Project while collecting (Algorithm 2, line 8). Off: the raw proposal becomes the target in training, and the
+    /// constraints act in deployment only (a controller that loads the snapshot always projects; `nearl eval --compare
+    /// raw,projected` shows both).
+    pub project_in_training: bool,
+    /// The learner's reward is lowered by this for each unit of weighted distance that the projection moved the target
+    /// [1 / (weight rad/s)], summed over the ticks of a policy step. Returns and metrics stay the environment's own. No
+    /// effect where nothing is projected: `ppo`, or `project_in_training = false`.
+    pub moved_penalty: f64,
+    /// Sizes of the networks.
+    pub nets: NetSettings,
+    /// Settings of the clipped surrogate, for every algorithm.
     pub ppo: PpoSettings,
-    /// Settings of `pid2-ib`, `pid2-gan` and `nearl`.
+    /// Settings of `nearl`.
+    pub nearl: NearlSettings,
+    /// Settings of `pid2-ib` and `pid2-gan`.
     pub pid2: Pid2Settings,
 }
 
@@ -65,8 +76,11 @@ impl Default for TrainSettings {
             anneal: true,
             change_scale: ChangeScale::default(),
             exploration: Exploration::default(),
-            project: true,
+            project_in_training: true,
+            moved_penalty: 0.0,
+            nets: NetSettings::default(),
             ppo: PpoSettings::default(),
+            nearl: NearlSettings::default(),
             pid2: Pid2Settings::default(),
         }
     }
@@ -89,6 +103,13 @@ impl TrainSettings {
                 return Err(format!("[train.{key}]: {v} is outside [0, 1]"));
             }
         }
+        if !(settings.moved_penalty.is_finite() && settings.moved_penalty >= 0.0) {
+            return Err(format!(
+                "[train.moved_penalty]: {} would reward being moved; give 0 or a positive number",
+                settings.moved_penalty
+            ));
+        }
+        settings.nets.check()?;
         Ok(settings)
     }
 }

@@ -1,10 +1,8 @@
 //! Running mean and variance, merged batch by batch in a fixed order so that a seed gives the same bits
 //! whatever the number of threads.
 
-use serde::{Deserialize, Serialize};
-
 /// Mean, sum of squared deviations and count of each entry (Chan, Golub & LeVeque 1979).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct RunningStats {
     /// Mean of each entry.
     pub mean: Vec<f64>,
@@ -51,6 +49,23 @@ impl RunningStats {
             .iter()
             .map(|s| if self.count < 2.0 { floor } else { (s / self.count).sqrt().max(floor) })
             .collect()
+    }
+
+    /// Mean, sum of squared deviations and count one after another (2 n + 1), for a checkpoint.
+    pub fn to_vec(&self) -> Vec<f64> {
+        [self.mean.as_slice(), &self.m2, &[self.count]].concat()
+    }
+
+    /// The inverse of [`RunningStats::to_vec`].
+    ///
+    /// # Panics
+    /// When `x` has not 2 n + 1 entries.
+    pub fn set(&mut self, x: &[f64]) {
+        let n = self.mean.len();
+        assert_eq!(x.len(), 2 * n + 1, "statistics of {n} entries");
+        self.mean.copy_from_slice(&x[..n]);
+        self.m2.copy_from_slice(&x[n..2 * n]);
+        self.count = x[2 * n];
     }
 
     /// Forgets every sample.

@@ -1,5 +1,7 @@
 //! Bundled tasks and robots, and how a task name or file becomes a manifest.
 
+use crate::env::{self, Env, EnvError};
+use nearl_runtime::net::Activation;
 use nearl_runtime::snapshot::{FORMAT, ModelFormat};
 use nearl_runtime::task::{Task, TaskError};
 use nearl_runtime::{Manifest, PolicyKind};
@@ -12,7 +14,8 @@ macro_rules! bundled {
 }
 
 /// Task files by name (with `.toml`).
-const TASKS: &[(&str, &str)] = bundled!("tasks": "HalfCheetah-v5.toml", "Hopper-v5.toml", "Walker2d-v5.toml", "Ant-v5.toml", "Panda-reach.toml");
+const TASKS: &[(&str, &str)] = bundled!("tasks": "HalfCheetah-v5.toml", "Hopper-v5.toml", "Walker2d-v5.toml", "Ant-v5.toml", "Panda-reach.toml",
+    "HalfCheetah-velocity.toml", "Hopper-velocity.toml", "Walker2d-velocity.toml", "Ant-velocity.toml");
 
 /// Robot files by name.
 const ROBOTS: &[(&str, &str)] = bundled!("robots": "gymnasium/half_cheetah.xml", "gymnasium/hopper.xml",
@@ -24,6 +27,9 @@ pub enum TaskLoadError {
     /// The file itself.
     #[error(transparent)]
     Task(#[from] TaskError),
+    /// The environment that the file describes.
+    #[error(transparent)]
+    Env(#[from] EnvError),
     /// A name that is neither bundled nor a file.
     #[error("no task '{name}'{near}; give one of {all} or a TOML file")]
     Unknown {
@@ -88,6 +94,10 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
             reason: e.to_string(),
         })?,
     };
+    if !(parsed.reward.is_empty() && parsed.cost.is_empty() && parsed.env.is_none()) {
+        // mistakes in what describes the environment are found here, where the file's name is known
+        env::of_task(&parsed, &model, task)?;
+    }
     Ok(Manifest {
         format: FORMAT,
         task: parsed,
@@ -95,11 +105,31 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
         model,
         algo: String::new(),
         policy: PolicyKind::Deterministic,
+        activation: Activation::default(),
         version: 0,
         steps: 0,
         action_lower: Vec::new(),
         action_upper: Vec::new(),
     })
+}
+
+/// Makes the environment of a bundled task or a TOML file.
+///
+/// # Errors
+/// [`TaskLoadError`]; [`TaskLoadError::Env`] also where MuJoCo does not take the robot.
+pub fn env(task: &str) -> Result<Box<dyn Env>, TaskLoadError> {
+    let manifest = load(task, &[])?;
+    Ok(env::of_task(&manifest.task, &manifest.model, task)?)
+}
+
+/// What a bundled task is, in one line.
+pub fn about(name: &str) -> &'static str {
+    let native = env::REGISTRY.iter().find(|e| e.name == name).map(|e| e.about);
+    let comment = || {
+        let text = TASKS.iter().find(|(n, _)| n.trim_end_matches(".toml") == name).map_or("", |(_, t)| t);
+        text.lines().next().unwrap_or_default().trim_start_matches("# ")
+    };
+    native.unwrap_or_else(comment)
 }
 
 fn unknown(task: &str) -> TaskLoadError {

@@ -1,20 +1,33 @@
 //! `nearl train`: collect, estimate advantages, update, write. The loop of every algorithm.
 
-use crate::learn::{Batch, Dims, Learner, Metrics, Pid2, Ppo, advantages};
-use crate::rollout::{Collector, RolloutError, Tally, stream};
+mod columns;
+mod resume;
+mod setup;
+
+pub use columns::COLUMNS;
+pub use setup::complete;
+
+use crate::checkpoint::{self, Checkpoint, CheckpointError};
+use crate::learn::{Batch, Dims, Learner, Metrics, advantages};
+use crate::rollout::{Collector, RolloutError, Segment, Tally, stream};
 use crate::run_folder::{RunError, RunFolder};
-use crate::settings::{ChangeScale, Exploration, TrainSettings};
+use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
 use nearl_runtime::controller::{Parts, seen_entries};
 use nearl_runtime::normaliser::Normaliser;
-use nearl_runtime::task::IdmKind;
-use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
+use nearl_runtime::{Manifest, Snapshot, SnapshotError};
+use rand_chacha::ChaCha8Rng;
+use setup::{check_minibatch, learner, limit_scale, policy_kind};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Names of the algorithms.
 pub const ALGORITHMS: &[(&str, &str)] = &[
     ("ppo", "the paper's RL-Pure: a Gaussian policy on actions, nothing proposed or projected"),
+    (
+        "nearl",
+        "supervised meta policy and inverse model, policy gradient on the pair (the paper's Algorithm 1)",
+    ),
     ("pid2-gan", "policy, inverse dynamics and a discriminator without a bottleneck"),
     ("pid2-ib", "policy, inverse dynamics and a discriminator with the information bottleneck"),
 ];
@@ -23,7 +36,7 @@ pub const ALGORITHMS: &[(&str, &str)] = &[
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// An algorithm that does not exist.
-    #[error("no algorithm '{0}'; give one of ppo, pid2-gan, pid2-ib")]
+    #[error("no algorithm '{0}'; give one of ppo, nearl, pid2-gan, pid2-ib")]
     Algorithm(String),
     /// The `[train]` section, or what does not fit the task.
     #[error("{0}")]
@@ -37,6 +50,9 @@ pub enum TrainError {
     /// The snapshot.
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
+    /// The checkpoint.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
 }
 
 /// What to train.
@@ -65,43 +81,13 @@ pub struct Progress {
     pub return_mean: f64,
     /// Mean length of the last 100 episodes in policy steps.
     pub length_mean: f64,
+    /// Mean cost of the last 100 episodes.
+    pub cost_mean: f64,
     /// Counts of the iteration.
     pub tally: Tally,
     /// Numbers of the update.
     pub metrics: Metrics,
 }
-
-/// Columns of `metrics.csv`: SB3's tags where they exist.
-pub const COLUMNS: &[&str] = &[
-    "time/total_timesteps",
-    "time/seconds",
-    "time/fps",
-    "rollout/ep_rew_mean",
-    "rollout/ep_len_mean",
-    "constraints/raw_violations",
-    "constraints/target_violations",
-    "constraints/recovering",
-    "constraints/reached_violations",
-    "constraints/moved",
-    "constraints/distance",
-    "idm/residual",
-    "idm/threshold",
-    "idm/mse_before",
-    "idm/mse_after",
-    "idm/updated",
-    "train/policy_gradient_loss",
-    "train/approx_kl",
-    "train/clip_fraction",
-    "train/value_loss",
-    "train/generator_loss",
-    "train/clamped_fraction",
-    "train/grad_norm",
-    "train/std",
-    "discriminator/loss",
-    "discriminator/kl",
-    "discriminator/accuracy",
-    "discriminator/beta",
-];
 
 /// A training in progress.
 pub struct Training {
@@ -113,10 +99,14 @@ pub struct Training {
     obs_stats: RunningStats,
     change_stats: RunningStats,
     return_stats: RunningStats,
-    rng: rand_chacha::ChaCha8Rng,
+    rng: ChaCha8Rng,
     total: u64,
+    seed: u64,
     recent: Vec<(f64, usize)>,
+    recent_costs: Vec<f64>,
     begin: Instant,
+    /// Seconds of this training in earlier processes.
+    earlier: f64,
     learning_seconds: f64,
 }
 
@@ -146,20 +136,8 @@ impl Training {
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);
-        let stochastic = manifest.policy == PolicyKind::Stochastic;
-        let (ppo, pid2) = (settings.ppo.clone(), settings.pid2.clone());
-        let learner: Box<dyn Learner> = match request.algo.as_str() {
-            "ppo" => Box::new(Ppo::new(dims.clone(), ppo, request.threads, &mut rng)),
-            name => Box::new(Pid2::new(
-                dims.clone(),
-                ppo,
-                pid2,
-                stochastic,
-                name == "pid2-ib",
-                request.threads,
-                &mut rng,
-            )),
-        };
+        manifest.activation = settings.nets.activation;
+        let learner = learner(&manifest, &settings, dims.clone(), request.threads, &mut rng);
         let mut normaliser = Normaliser::identity(dims.n_obs, dims.n_state);
         if settings.change_scale == ChangeScale::Limits {
             normaliser.scale = limit_scale(&parts, &manifest)?;
@@ -174,7 +152,10 @@ impl Training {
             settings.gamma,
             request.seed,
         )?;
-        collector.workers().for_each(|w| w.set_projection(settings.project));
+        for worker in collector.workers() {
+            worker.set_projection(settings.project_in_training);
+            worker.set_moved_penalty(settings.moved_penalty);
+        }
         Ok(Self {
             obs_stats: RunningStats::new(dims.n_obs),
             change_stats: RunningStats::new(dims.n_state),
@@ -186,8 +167,11 @@ impl Training {
             dims,
             rng,
             total: request.steps,
+            seed: request.seed,
             recent: Vec::new(),
+            recent_costs: Vec::new(),
             begin: Instant::now(),
+            earlier: 0.0,
             learning_seconds: 0.0,
         })
     }
@@ -200,6 +184,8 @@ impl Training {
         self.recent.extend_from_slice(&tally.episodes);
         let excess = self.recent.len().saturating_sub(100);
         self.recent.drain(..excess);
+        self.recent_costs.extend_from_slice(&tally.costs);
+        self.recent_costs.drain(..excess);
         let rate = if self.settings.anneal { 1.0 - self.fraction() as f32 } else { 1.0 };
         let learns = self.snapshot.manifest.steps > 0;
         self.merge_statistics();
@@ -219,12 +205,18 @@ impl Training {
             |f: fn(&(f64, usize)) -> f64| self.recent.iter().map(f).sum::<f64>() / self.recent.len() as f64;
         Progress {
             steps: self.snapshot.manifest.steps,
-            seconds: self.begin.elapsed().as_secs_f64(),
+            seconds: self.seconds(),
             return_mean: mean(|e| e.0),
             length_mean: mean(|e| e.1 as f64),
+            cost_mean: self.recent_costs.iter().sum::<f64>() / self.recent_costs.len() as f64,
             tally,
             metrics,
         }
+    }
+
+    /// Asks for `steps` more than were asked for, or were done, so far.
+    pub fn extend(&mut self, steps: u64) {
+        self.total = self.total.max(self.snapshot.manifest.steps) + steps;
     }
 
     /// Whether the requested steps are done.
@@ -240,6 +232,16 @@ impl Training {
     /// What a controller runs on now.
     pub fn snapshot(&self) -> &Snapshot {
         &self.snapshot
+    }
+
+    /// What each environment collected last, in a fixed order.
+    pub fn segments(&mut self) -> impl Iterator<Item = &Segment> {
+        self.collector.workers().map(|w| &w.segment)
+    }
+
+    /// Seconds of training, those before a resume included.
+    fn seconds(&self) -> f64 {
+        self.earlier + self.begin.elapsed().as_secs_f64()
     }
 
     /// Seconds spent in updates.
@@ -276,6 +278,7 @@ impl Training {
             let s = &w.segment;
             b.obs.extend_from_slice(&s.x);
             b.proposal.extend_from_slice(&s.change);
+            b.target.extend_from_slice(&s.target_change);
             b.lower.extend_from_slice(&s.lower);
             b.upper.extend_from_slice(&s.upper);
             b.reached.extend_from_slice(&s.reached);
@@ -298,121 +301,61 @@ impl Training {
         debug_assert_eq!(b.obs.len(), b.n * self.dims.n_obs);
         b
     }
-
-    /// The progress as a row of `metrics.csv`.
-    pub fn row(&self, p: &Progress) -> Vec<f64> {
-        let t = &p.tally;
-        let per_tick = |n: u64| n as f64 / t.ticks.max(1) as f64;
-        let value = |name: &str| match name {
-            "time/total_timesteps" => p.steps as f64,
-            "time/seconds" => p.seconds,
-            "time/fps" => p.steps as f64 / p.seconds,
-            "rollout/ep_rew_mean" => p.return_mean,
-            "rollout/ep_len_mean" => p.length_mean,
-            "constraints/raw_violations" => per_tick(t.raw_violations),
-            "constraints/target_violations" => per_tick(t.projected_violations),
-            "constraints/recovering" => per_tick(t.recovering),
-            "constraints/reached_violations" => per_tick(t.reached_violations),
-            "constraints/moved" => per_tick(t.moved),
-            "constraints/distance" => t.distance / t.ticks.max(1) as f64,
-            "idm/residual" => t.residual / t.ticks.max(1) as f64,
-            "idm/threshold" => self.settings.pid2.idm_threshold,
-            other => p.metrics.iter().find(|(n, _)| *n == other).map_or(f64::NAN, |(_, v)| *v),
-        };
-        COLUMNS.iter().map(|c| value(c)).collect()
-    }
 }
 
-fn policy_kind(algo: &str, settings: &TrainSettings, idm: IdmKind) -> Result<PolicyKind, TrainError> {
-    match (algo, settings.exploration, idm) {
-        ("ppo", ..) => Ok(PolicyKind::Direct),
-        ("pid2-gan" | "pid2-ib", Exploration::Proposal, IdmKind::Pinocchio) => Ok(PolicyKind::Stochastic),
-        ("pid2-gan" | "pid2-ib", Exploration::Action, IdmKind::Learned) => Ok(PolicyKind::Deterministic),
-        ("pid2-gan" | "pid2-ib", Exploration::Action, IdmKind::Pinocchio) => Err(TrainError::Settings(
-            "[train.exploration]: 'action' needs a learned inverse model, but idm.kind is 'pinocchio'; use exploration = \"proposal\"".into(),
-        )),
-        ("pid2-gan" | "pid2-ib", Exploration::Proposal, IdmKind::Learned) => Err(TrainError::Settings(
-            "[train.exploration]: 'proposal' needs analytic inverse dynamics, but idm.kind is 'learned'; use exploration = \"action\"".into(),
-        )),
-        _ => Err(TrainError::Algorithm(algo.into())),
-    }
-}
+/// Seconds after which a checkpoint is written even if a tenth of the run is not done.
+const SAVE_SECONDS: f64 = 120.0;
 
-/// Fills what the environment knows: observation names and the actuators' range.
-///
-/// # Errors
-/// [`TrainError::Rollout`] when there is no such environment.
-pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
-    let env = crate::env::make(&manifest.task.name).map_err(RolloutError::from)?;
-    let spec = env.spec();
-    if manifest.task.state.observation.is_empty() {
-        manifest.task.state.observation.clone_from(&spec.obs);
-    }
-    manifest.action_lower = spec.action_low().collect();
-    manifest.action_upper = spec.action_high().collect();
-    Ok(())
-}
-
-fn check_minibatch(minibatch: usize, batch: usize) -> Result<(), TrainError> {
-    if minibatch == 0
-        || !minibatch.is_multiple_of(crate::learn::optimise::TILE)
-        || !batch.is_multiple_of(minibatch)
-    {
-        return Err(TrainError::Settings(format!(
-            "[train.ppo.batch_size]: {minibatch} must be a multiple of 32 that divides n_envs n_steps = {batch}"
-        )));
-    }
-    Ok(())
-}
-
-/// What the limits allow in one policy period: `a_max T` for velocities, `v_max T` for positions.
-fn limit_scale(parts: &Parts, manifest: &Manifest) -> Result<Vec<f64>, TrainError> {
-    use nearl_runtime::constraints::Entry;
-    let period = manifest.task.time.dt * manifest.task.time.policy_every as f64;
-    let limits = parts.projector.limits();
-    let (velocity, acceleration) = (&limits.velocity, &limits.acceleration);
-    (0..parts.layout.n_state())
-        .map(|k| {
-            let scale = match parts.layout.state_entry(k) {
-                Entry::Position { dof, .. } => velocity[dof] * period,
-                Entry::Velocity { dof } => acceleration[dof] * period,
-                Entry::Other => f64::INFINITY,
-            };
-            let name = parts.layout.state_name(k);
-            if scale.is_finite() && scale > 0.0 {
-                Ok(scale)
-            } else {
-                Err(TrainError::Settings(format!(
-                    "[train.change_scale]: 'limits' needs a velocity and an acceleration limit for '{name}'; set [constraints] or use change_scale = \"running\""
-                )))
-            }
-        })
-        .collect()
-}
-
-/// Trains to the end in a run folder; `report` sees each iteration and may stop the training by returning `false`.
+/// Trains to the end in a new run folder; `report` sees each iteration and may stop the training by returning `false`.
 ///
 /// # Errors
 /// [`TrainError`].
 pub fn train(
     request: &Request,
     out: &Path,
+    report: impl FnMut(&Progress, f64) -> bool,
+) -> Result<PathBuf, TrainError> {
+    let training = Training::new(request)?;
+    let folder = RunFolder::create(out, &training.snapshot().manifest, request.seed, COLUMNS)?;
+    run(training, folder, report)
+}
+
+/// Goes on where the run in folder `run` stopped, with the settings it was started with, as if it had not stopped: weights
+/// and metrics are the same bit for bit (but the columns of time), whatever the threads. Other `steps` than at first change
+/// the schedule of the learning rate from here on.
+///
+/// # Errors
+/// [`TrainError`]; a damaged or foreign checkpoint, or a `metrics.csv` that lacks rows, is refused in one sentence.
+pub fn resume(
+    path: &Path,
+    steps: Option<u64>,
+    threads: usize,
+    report: impl FnMut(&Progress, f64) -> bool,
+) -> Result<PathBuf, TrainError> {
+    let file = checkpoint::path_in(path);
+    let training = Training::resume(Checkpoint::load(&file)?, &file, steps, threads)?;
+    let manifest = &training.snapshot().manifest;
+    let folder = RunFolder::reopen(path, COLUMNS, manifest.steps, manifest.version)?;
+    run(training, folder, report)
+}
+
+fn run(
+    mut training: Training,
+    mut folder: RunFolder,
     mut report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
-    let mut training = Training::new(request)?;
-    let mut folder = RunFolder::create(out, &training.snapshot().manifest, request.seed, COLUMNS)?;
-    let (mut next_save, every) = (request.steps / 10, (request.steps / 10).max(1));
-    loop {
+    let every = (training.total / 10).max(1);
+    let (mut next_save, mut saved) = (every, Instant::now());
+    let mut go_on = true;
+    while go_on && !training.is_done() {
         let progress = training.iterate();
         folder.row(&training.row(&progress))?;
-        let go_on = report(&progress, training.fraction());
-        if training.is_done() || !go_on {
-            break;
-        }
-        if progress.steps >= next_save {
-            folder.save("latest", training.snapshot())?;
-            next_save += every;
+        go_on = report(&progress, training.fraction());
+        if progress.steps >= next_save || saved.elapsed().as_secs_f64() > SAVE_SECONDS {
+            training.save(&folder)?;
+            next_save = (progress.steps / every + 1) * every;
+            saved = Instant::now();
         }
     }
-    Ok(folder.save("final", training.snapshot())?)
+    training.save(&folder)
 }

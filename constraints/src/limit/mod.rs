@@ -1,104 +1,184 @@
-//! Limits of single joints: what a task file may ask for, one implementation a file.
+//! Limits: what a task file may ask for, one implementation a file.
 //!
 //! A new one is a file with a type implementing [`Limit`], a field in [`ConstraintSettings`] and a line in
-//! [`REGISTRY`].
+//! [`REGISTRY`]. Limits of single joints narrow the [`LimitSet`]; limits that tie joints together hand out [`Rows`] or a [`Cone`].
 
 mod acceleration;
+mod clearance;
+mod collision;
+mod energy;
+mod frame;
+mod frame_speed;
+mod jerk;
+mod locked;
 mod position;
+mod set;
 mod settings;
 mod torque;
+mod torque_rate;
+mod torque_speed;
+mod user;
 mod velocity;
+mod velocity_profile;
 
 pub use acceleration::{AccelerationLimit, AccelerationSettings};
+pub use collision::{CollisionLimit, CollisionSettings, SolidSettings};
+pub use energy::{EnergyLimit, EnergySettings};
+pub use frame::{FrameBox, FrameLimit, FrameSettings, HalfSpace};
+pub use frame_speed::{FrameSpeedLimit, FrameSpeedSettings};
+pub use jerk::{JerkLimit, JerkSettings};
+pub use locked::LockedJoints;
 pub use position::{PositionLimit, PositionSettings};
+pub use set::LimitSet;
 pub use settings::{ConstraintSettings, PerJoint};
 pub use torque::{TorqueLimit, TorqueSettings};
+pub use torque_rate::{TorqueRateLimit, TorqueRateSettings};
+pub use torque_speed::{TorqueSpeedLimit, TorqueSpeedSettings};
+pub use user::{UserRow, UserRowSettings};
 pub use velocity::{VelocityLimit, VelocitySettings};
+pub use velocity_profile::{JointProfile, KnownRobot, VelocityProfileLimit, VelocityProfileSettings};
 
-use crate::{LimitError, Model};
+use crate::{Cone, LimitError, Model, Rows, Soft};
 
-/// A hard limit on the motion of single joints.
+/// A limit on the motion: a part of the box of each joint, rows or a cone over several joints, or both.
 pub trait Limit: Send + Sync + std::fmt::Debug {
     /// Name in the task file.
     fn name(&self) -> &'static str;
+
+    /// Name to switch it on and off by, where several limits share [`Limit::name`].
+    fn label(&self) -> &str {
+        self.name()
+    }
 
     /// Narrows `set` for the dofs in `controllable`.
     ///
     /// # Errors
     /// Unknown joints, values out of their domain, or limits the robot file does not state; every joint is listed.
-    fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError>;
-}
-
-/// The numbers all limits boil down to, one per dof (nv); infinite is none.
-#[derive(Debug, Clone, PartialEq)]
-pub struct LimitSet {
-    /// Lowest position [rad or m].
-    pub q_lower: Vec<f64>,
-    /// Highest position [rad or m].
-    pub q_upper: Vec<f64>,
-    /// Largest speed V [rad/s or m/s].
-    pub velocity: Vec<f64>,
-    /// Largest acceleration A [rad/s² or m/s²].
-    pub acceleration: Vec<f64>,
-    /// Deceleration braking may count on, at most A [rad/s² or m/s²].
-    pub braking: Vec<f64>,
-    /// Largest motor force [N·m or N].
-    pub effort: Vec<f64>,
-}
-
-impl LimitSet {
-    /// No limits on `nv` dofs.
-    pub fn unlimited(nv: usize) -> LimitSet {
-        let none = vec![f64::INFINITY; nv];
-        LimitSet {
-            q_lower: vec![f64::NEG_INFINITY; nv],
-            q_upper: none.clone(),
-            velocity: none.clone(),
-            acceleration: none.clone(),
-            braking: none.clone(),
-            effort: none,
-        }
+    fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
+        let _ = (model, controllable, set);
+        Ok(())
     }
 
-    /// All `limits` together.
+    /// The rows it adds, anew for each caller.
     ///
     /// # Errors
-    /// Those of the limits; limits without any state between them.
-    pub fn collect(
-        model: &Model,
-        limits: &[Box<dyn Limit>],
-        controllable: &[usize],
-    ) -> Result<LimitSet, LimitError> {
-        let mut set = LimitSet::unlimited(model.nv());
-        for limit in limits {
-            limit.restrict(model, controllable, &mut set)?;
-        }
-        let empty = |i: &&usize| set.q_lower[**i] >= set.q_upper[**i];
-        let list = listed(controllable.iter().filter(empty), |i| {
-            let (low, high) = (set.q_lower[i], set.q_upper[i]);
-            format!("joint '{}' would have to stay above {low} and below {high} rad or m", model.dof_name(i))
-        });
-        if list.is_empty() { Ok(set) } else { Err(LimitError::Contradictory { list }) }
+    /// As [`Limit::restrict`].
+    fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
+        let _ = (model, controllable);
+        Ok(None)
     }
 
-    /// True when the dof has a lower or an upper position limit.
-    pub fn has_position(&self, dof: usize) -> bool {
-        self.q_lower[dof].is_finite() || self.q_upper[dof].is_finite()
+    /// The cone it adds, anew for each caller.
+    ///
+    /// # Errors
+    /// As [`Limit::restrict`].
+    fn cone(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Cone>>, LimitError> {
+        let _ = (model, controllable);
+        Ok(None)
+    }
+
+    /// How much its rows resist; `None` for hard rows. The part in the box is always hard.
+    fn soft(&self) -> Option<Soft> {
+        None
     }
 }
 
-/// Makes a limit from the task file's section, `None` when the section does not ask for it.
-type Build = fn(&ConstraintSettings, &Model) -> Result<Option<Box<dyn Limit>>, LimitError>;
+/// Makes the limits of one kind from the task file's section.
+type Build = fn(&ConstraintSettings, &Model) -> Result<Vec<Box<dyn Limit>>, LimitError>;
 
-/// All limits by their name in the task file.
-pub const REGISTRY: &[(&str, Build)] = &[
-    ("position", |s, _| Ok(s.position.clone().map(|x| Box::new(PositionLimit::new(x)) as Box<dyn Limit>))),
-    ("velocity", |s, _| Ok(s.velocity.clone().map(|x| Box::new(VelocityLimit::new(x)) as Box<dyn Limit>))),
-    ("acceleration", |s, _| {
-        Ok(s.acceleration.clone().map(|x| Box::new(AccelerationLimit::new(x)) as Box<dyn Limit>))
-    }),
-    ("torque", |s, _| Ok(s.torque.clone().map(|x| Box::new(TorqueLimit::new(x)) as Box<dyn Limit>))),
+/// One kind of limit.
+pub struct Entry {
+    /// Name in the task file.
+    pub name: &'static str,
+    /// What a line of the task file looks like, with the joints of a Panda.
+    pub example: &'static str,
+    /// Makes the limits.
+    pub build: Build,
+}
+
+/// All kinds of limits by their name in the task file.
+pub const REGISTRY: &[Entry] = &[
+    Entry {
+        name: "position",
+        example: "position = { margin = 0.01 }",
+        build: |s, _| Ok(one(&s.position, PositionLimit::new)),
+    },
+    Entry {
+        name: "velocity",
+        example: "velocity = { scale = 0.8 }",
+        build: |s, _| Ok(one(&s.velocity, VelocityLimit::new)),
+    },
+    Entry {
+        name: "acceleration",
+        example: "acceleration = { limit = 10.0 }",
+        build: |s, _| Ok(one(&s.acceleration, AccelerationLimit::new)),
+    },
+    Entry {
+        name: "torque",
+        example: "torque = { scale = 0.9 }",
+        build: |s, _| Ok(one(&s.torque, TorqueLimit::new)),
+    },
+    Entry {
+        name: "jerk",
+        example: "jerk = { limit = 500.0 }",
+        build: |s, _| Ok(one(&s.jerk, JerkLimit::new)),
+    },
+    Entry {
+        name: "torque_speed",
+        example: "torque_speed = { stall = 80.0, no_load = 3.0 }",
+        build: |s, _| Ok(one(&s.torque_speed, TorqueSpeedLimit::new)),
+    },
+    Entry {
+        name: "torque_rate",
+        example: "torque_rate = { limit = 1000.0 }",
+        build: |s, _| Ok(one(&s.torque_rate, TorqueRateLimit::new)),
+    },
+    Entry {
+        name: "velocity_profile",
+        example: "velocity_profile = \"fr3\"",
+        build: |s, _| Ok(one(&s.velocity_profile, VelocityProfileLimit::new)),
+    },
+    Entry {
+        name: "locked",
+        example: "locked = [\"panda_joint7\"]",
+        build: |s, _| Ok(one(&(!s.locked.is_empty()).then(|| s.locked.clone()), LockedJoints::new)),
+    },
+    Entry {
+        name: "frame",
+        example: "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.1] }, braking = 5.0 }]",
+        build: |s, _| Ok(each(&s.frame, FrameLimit::new)),
+    },
+    Entry {
+        name: "frame_speed",
+        example: "frame_speed = [{ frame = \"panda_hand\", limit = 0.25 }]",
+        build: |s, _| Ok(each(&s.frame_speed, FrameSpeedLimit::new)),
+    },
+    Entry {
+        name: "energy",
+        example: "energy = { limit = 2.0 }",
+        build: |s, _| Ok(one(&s.energy, EnergyLimit::new)),
+    },
+    Entry {
+        name: "collision",
+        example: "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \"floor\", shape = \"half_space\" }], braking = 2.0 }",
+        build: |s, _| Ok(one(&s.collision, CollisionLimit::new)),
+    },
+    Entry {
+        name: "rows",
+        example: "rows = [{ name = \"elbow up\", terms = { \"q.panda_joint4\" = 1.0 }, upper = -0.5, braking = 2.0 }]",
+        build: |s, _| Ok(each(&s.rows, UserRow::new)),
+    },
 ];
+
+/// The limit a setting asks for, if any.
+fn one<S: Clone, L: Limit + 'static>(settings: &Option<S>, new: fn(S) -> L) -> Vec<Box<dyn Limit>> {
+    each(settings.as_slice(), new)
+}
+
+/// A limit for each setting.
+fn each<S: Clone, L: Limit + 'static>(settings: &[S], new: fn(S) -> L) -> Vec<Box<dyn Limit>> {
+    settings.iter().map(|s| Box::new(new(s.clone())) as Box<dyn Limit>).collect()
+}
 
 /// The limits that a task file's `[constraints]` asks for, checked against all joints of `model` they name.
 ///
@@ -107,11 +187,13 @@ pub const REGISTRY: &[(&str, Build)] = &[
 /// [`Projector::new`](crate::Projector::new), which knows the controllable dofs.
 pub fn build_limits(settings: &ConstraintSettings, model: &Model) -> Result<Vec<Box<dyn Limit>>, LimitError> {
     let mut limits = Vec::new();
-    for (_, build) in REGISTRY {
-        limits.extend(build(settings, model)?);
+    for entry in REGISTRY {
+        limits.extend((entry.build)(settings, model)?);
     }
     for limit in &limits {
         limit.restrict(model, &[], &mut LimitSet::unlimited(model.nv()))?;
+        limit.rows(model, &[])?;
+        limit.cone(model, &[])?;
     }
     Ok(limits)
 }
@@ -124,4 +206,9 @@ fn listed<'a>(dofs: impl Iterator<Item = &'a usize>, text: impl Fn(usize) -> Str
 /// "'a', 'b'" over dofs.
 fn quoted(model: &Model, dofs: &[usize]) -> String {
     dofs.iter().map(|i| format!("'{}'", model.dof_name(*i))).collect::<Vec<_>>().join(", ")
+}
+
+/// "'a', 'b'".
+fn quoted_names(names: &[&str]) -> String {
+    names.iter().map(|n| format!("'{n}'")).collect::<Vec<_>>().join(", ")
 }

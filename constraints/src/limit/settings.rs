@@ -1,7 +1,11 @@
 //! The `[constraints]` section of a task file.
 
-use super::{AccelerationSettings, PositionSettings, TorqueSettings, VelocitySettings};
-use crate::{Consistency, LimitError, Model, Solver};
+use super::{
+    AccelerationSettings, CollisionSettings, EnergySettings, FrameSettings, FrameSpeedSettings, JerkSettings,
+    PositionSettings, TorqueRateSettings, TorqueSettings, TorqueSpeedSettings, UserRowSettings,
+    VelocityProfileSettings, VelocitySettings,
+};
+use crate::{Braking, Consistency, LimitError, Model, Solver};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -13,6 +17,8 @@ pub struct ConstraintSettings {
     pub consistency: Consistency,
     /// `"ladder"` (default) or `"clarabel"`.
     pub solver: Solver,
+    /// `"certified"` (default) or `"stored"`.
+    pub braking: Braking,
     /// `position = { margin = 0.01 }`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub position: Option<PositionSettings>,
@@ -25,6 +31,36 @@ pub struct ConstraintSettings {
     /// `torque = { scale = 0.9 }`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub torque: Option<TorqueSettings>,
+    /// `jerk = { limit = 500.0 }`; soft.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub jerk: Option<JerkSettings>,
+    /// `torque_speed = { stall = 80.0, no_load = 3.0 }`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub torque_speed: Option<TorqueSpeedSettings>,
+    /// `torque_rate = { limit = 1000.0 }`; soft.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub torque_rate: Option<TorqueRateSettings>,
+    /// `velocity_profile = "fr3"` or curves by joint.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub velocity_profile: Option<VelocityProfileSettings>,
+    /// `locked = ["joint"]`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub locked: Vec<String>,
+    /// `frame = [{ frame, point, half_space, box, braking, margin, soft }]`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub frame: Vec<FrameSettings>,
+    /// `frame_speed = [{ frame, point, limit }]`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub frame_speed: Vec<FrameSpeedSettings>,
+    /// `energy = { limit = 2.0 }`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub energy: Option<EnergySettings>,
+    /// `collision = { shapes, urdf, ignore, adjacent, braking, margin, influence, rows, soft }`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub collision: Option<CollisionSettings>,
+    /// `rows = [{ name, terms, lower, upper, equals, braking, soft }]`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub rows: Vec<UserRowSettings>,
 }
 
 /// One number for every joint, or numbers by joint name.

@@ -1,7 +1,8 @@
 //! Motor force limits of the robot file.
 
 use super::{Limit, LimitSet, quoted};
-use crate::{LimitError, Model};
+use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::{Kind, LimitError, Model};
 use serde::{Deserialize, Serialize};
 
 /// `torque = { scale }`.
@@ -42,6 +43,22 @@ impl Limit for TorqueLimit {
     }
 
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
+        for (i, effort) in self.efforts(model, controllable)? {
+            set.effort[i] = set.effort[i].min(effort);
+        }
+        Ok(())
+    }
+
+    fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
+        let efforts = self.efforts(model, controllable)?;
+        let motors = efforts.into_iter().map(|(i, effort)| (i, effort, model.dof_name(i))).collect();
+        Ok(Some(Box::new(TorqueRows { motors })))
+    }
+}
+
+impl TorqueLimit {
+    /// Dofs and their largest forces.
+    fn efforts(&self, model: &Model, controllable: &[usize]) -> Result<Vec<(usize, f64)>, LimitError> {
         let scale = self.settings.scale;
         if !(scale > 0.0 && scale <= 1.0) {
             let domain = "above 0 and at most 1";
@@ -55,9 +72,45 @@ impl Limit for TorqueLimit {
                 "write effort (URDF) or a motor with ctrlrange (MJCF) into it, or do not control the joint";
             return Err(LimitError::Missing { limit: "torque", joints: quoted(model, &missing), next });
         }
-        for &i in controllable {
-            set.effort[i] = set.effort[i].min(scale * stated[i]);
+        Ok(controllable.iter().map(|i| (*i, scale * stated[*i])).collect())
+    }
+}
+
+struct TorqueRows {
+    /// Dof, largest force, joint.
+    motors: Vec<(usize, f64, String)>,
+}
+
+impl Rows for TorqueRows {
+    fn kind(&self) -> Kind {
+        Kind::Torque
+    }
+
+    fn names(&self) -> Vec<String> {
+        self.motors.iter().map(|(_, _, joint)| joint.clone()).collect()
+    }
+
+    fn sizes(&self) -> Vec<f64> {
+        self.motors.iter().map(|(_, effort, _)| *effort).collect()
+    }
+
+    fn needs(&self) -> Needs {
+        Needs { dynamics: true, ..Needs::default() }
+    }
+
+    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+        let nv = tick.v.len();
+        for (r, &(i, effort, _)) in self.motors.iter().enumerate() {
+            for (g, mass) in rows.row(r).iter_mut().zip(&tick.mass[i * nv..(i + 1) * nv]) {
+                *g = mass / tick.period.dt;
+            }
+            (rows.lower[r], rows.upper[r]) = (-effort - tick.bias[i], effort - tick.bias[i]);
         }
-        Ok(())
+    }
+
+    fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]) {
+        for (x, &(i, effort, _)) in excess.iter_mut().zip(&self.motors) {
+            *x = motion.torque[i].abs() / effort - 1.0;
+        }
     }
 }

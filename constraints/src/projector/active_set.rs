@@ -17,7 +17,11 @@
 //!     y_F = goal_F - H_F^-1 G_RF' lambda,   mu_B = H_B (goal_B - y_B) - G_RB' lambda
 //! ```
 //!
-//! and every optimality condition is checked. It starts from the problem alone, so the same input gives the same
+//! A soft row r with slack `s_r` is rigid (`s_r = 0`) up to the multiplier `linear_r` and elastic beyond it, with
+//! `|lambda_r| = linear_r + quadratic_r s_r`: `1 / quadratic_r` joins the diagonal of S, and `sign_r linear_r / quadratic_r`
+//! the right-hand side.
+//!
+//! Every optimality condition is checked. It starts from the problem alone, so the same input gives the same
 //! bits; without an answer, Clarabel is asked.
 
 use super::coupled::Coupled;
@@ -38,12 +42,23 @@ pub(crate) struct ActiveSet {
     box_side: Vec<Option<Side>>,
     /// Held bound of each row (m).
     row_side: Vec<Option<Side>>,
+    /// Soft rows that give way (m).
+    elastic: Vec<bool>,
     /// Rows held, ascending.
     held: Vec<usize>,
     schur: Vec<f64>,
     r: Vec<f64>,
     /// `g - G_R' r` (n).
     rest: Vec<f64>,
+}
+
+/// What a step ends with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Event {
+    /// A multiplier reaches zero.
+    Release(Constraint),
+    /// A soft row begins to give way, or stops.
+    Bend(usize),
 }
 
 /// A bound of a dof or of a row.
@@ -68,6 +83,7 @@ impl ActiveSet {
             iterations: 0,
             box_side: vec![None; n],
             row_side: vec![None; m],
+            elastic: vec![false; m],
             held: Vec::with_capacity(m),
             schur: vec![0.0; m * m],
             r: vec![0.0; m],
@@ -95,6 +111,7 @@ impl ActiveSet {
         self.iterations = 0;
         self.held.clear();
         self.row_side.fill(None);
+        self.elastic.fill(false);
         self.lambda.fill(0.0);
         for k in 0..p.n {
             self.y[k] = p.goal[k].clamp(p.lower[k], p.upper[k]);
@@ -116,8 +133,8 @@ impl ActiveSet {
         };
         for r in (0..p.m).filter(|r| self.row_side[*r].is_none()) {
             let value = p.row(r, &self.y);
-            see((value - p.row_upper[r]) / p.row_size[r], Constraint::Row(r, Side::Upper));
-            see((p.row_lower[r] - value) / p.row_size[r], Constraint::Row(r, Side::Lower));
+            see(value - p.row_upper[r], Constraint::Row(r, Side::Upper));
+            see(p.row_lower[r] - value, Constraint::Row(r, Side::Lower));
         }
         for k in (0..p.n).filter(|k| self.box_side[*k].is_none()) {
             let size = (p.upper[k] - p.lower[k]).clamp(1e-3, 1e3);
@@ -135,12 +152,15 @@ impl ActiveSet {
             if !self.direction(p, violated) {
                 return false;
             }
+            let (give, slack, bend) = own_softness(p, violated, own);
             let slope: f64 =
                 self.free(p).map(|k| gradient(p, violated, k) * self.rest[k] / p.hessian[k]).sum();
+            let slope = slope + give;
             let size: f64 = (0..p.n).map(|k| gradient(p, violated, k).powi(2) / p.hessian[k]).sum();
-            let (blocked, blocking) = self.first_to_release(p);
-            let full = if slope > 1e-13 * size { self.excess(p, violated) / slope } else { f64::INFINITY };
-            let step = blocked.min(full);
+            let (blocked, blocking) = self.first_event(p);
+            let excess = self.excess(p, violated) - slack;
+            let full = if slope > 1e-13 * size { excess / slope } else { f64::INFINITY };
+            let step = blocked.min(full).min(bend);
             if step.is_infinite() {
                 return false;
             }
@@ -153,10 +173,15 @@ impl ActiveSet {
             }
             self.move_multipliers(p, step);
             own += step;
-            match blocking.filter(|_| blocked < full) {
-                Some(released) => self.release(released),
+            match blocking.filter(|_| blocked < full.min(bend)) {
+                Some(Event::Release(released)) => self.release(released),
+                Some(Event::Bend(row)) => self.elastic[row] = !self.elastic[row],
+                None if bend < full => {} // the row itself begins to give way
                 None => {
                     self.hold(violated, own);
+                    if let Constraint::Row(row, _) = violated {
+                        self.elastic[row] = p.soft[row].is_some_and(|s| own >= s.linear * (1.0 - EXACT));
+                    }
                     return true;
                 }
             }
@@ -180,22 +205,33 @@ impl ActiveSet {
         true
     }
 
-    /// Multiplier that reaches zero first, and the step at which it does.
-    fn first_to_release(&self, p: &Coupled) -> (f64, Option<Constraint>) {
+    /// The first multiplier to reach zero or its row's linear weight, and the step at which it does.
+    fn first_event(&self, p: &Coupled) -> (f64, Option<Event>) {
         let (mut least, mut found) = (f64::INFINITY, None);
-        let mut see = |multiplier: f64, rate: f64, constraint: Constraint| {
-            if rate > 0.0 && multiplier.max(0.0) / rate < least {
-                (least, found) = (multiplier.max(0.0) / rate, Some(constraint));
+        let mut see = |distance: f64, rate: f64, event: Event| {
+            if rate > 0.0 && distance.max(0.0) / rate < least {
+                (least, found) = (distance.max(0.0) / rate, Some(event));
             }
         };
         for (a, &row) in self.held.iter().enumerate() {
-            if let Some(side) = self.row_side[row] {
-                see(sign(side) * self.lambda[row], sign(side) * self.r[a], Constraint::Row(row, side));
+            let Some(side) = self.row_side[row] else { continue };
+            let (multiplier, rate) = (sign(side) * self.lambda[row], sign(side) * self.r[a]);
+            let linear = p.soft[row].map_or(f64::INFINITY, |s| s.linear);
+            if self.elastic[row] && linear > 0.0 {
+                see(multiplier - linear, rate, Event::Bend(row));
+                continue;
+            }
+            if !p.equality[row] {
+                see(multiplier, rate, Event::Release(Constraint::Row(row, side)));
+            }
+            if !self.elastic[row] {
+                see(linear - multiplier, -rate, Event::Bend(row));
             }
         }
         for k in 0..p.n {
             if let Some(side) = self.box_side[k] {
-                see(sign(side) * self.mu[k], sign(side) * self.rest[k], Constraint::Box(k, side));
+                let released = Event::Release(Constraint::Box(k, side));
+                see(sign(side) * self.mu[k], sign(side) * self.rest[k], released);
             }
         }
         (least, found)
@@ -228,6 +264,7 @@ impl ActiveSet {
             Constraint::Box(k, _) => (self.box_side[k], self.mu[k]) = (None, 0.0),
             Constraint::Row(row, _) => {
                 (self.row_side[row], self.lambda[row]) = (None, 0.0);
+                self.elastic[row] = false;
                 self.held.retain(|r| *r != row);
             }
         }
@@ -255,6 +292,9 @@ impl ActiveSet {
                 let sum = self.free(p).map(|k| ga[k] * gb[k] / p.hessian[k]).sum();
                 self.schur[a * size + b] = sum;
             }
+            if let Some(soft) = p.soft[self.held[a]].filter(|_| self.elastic[self.held[a]]) {
+                self.schur[a * size + a] += 1.0 / soft.quadratic;
+            }
         }
         cholesky_solve(&mut self.schur, &mut self.r, size)
     }
@@ -271,6 +311,10 @@ impl ActiveSet {
         for (a, &row) in self.held.iter().enumerate() {
             let lower = self.row_side[row] == Some(Side::Lower);
             self.r[a] = p.row(row, &self.y) - if lower { p.row_lower[row] } else { p.row_upper[row] };
+            if let Some(soft) = p.soft[row].filter(|_| self.elastic[row]) {
+                let sign = if lower { -1.0 } else { 1.0 };
+                self.r[a] += sign * soft.linear / soft.quadratic;
+            }
         }
         if !self.solve_schur(p) {
             return false;
@@ -292,6 +336,7 @@ impl ActiveSet {
     /// Primal and dual feasibility of the final answer; stationarity holds by construction.
     fn is_optimal(&mut self, p: &Coupled) -> bool {
         let mut good = p.violation(&self.y) <= FINAL && self.y.iter().all(|y| y.is_finite());
+        good &= (0..p.m).all(|r| p.soft[r].is_none_or(|_| p.excess(r, &self.y) - self.slack(p, r) <= FINAL));
         for k in 0..p.n {
             let size = FINAL * (1.0 + self.y[k].abs());
             good &= self.y[k] >= p.lower[k] - size && self.y[k] <= p.upper[k] + size;
@@ -301,9 +346,34 @@ impl ActiveSet {
         }
         let largest = self.lambda.iter().fold(0.0, |m: f64, x| m.max(x.abs()));
         for r in 0..p.m {
-            good &= self.row_side[r].is_none_or(|side| sign(side) * self.lambda[r] >= -FINAL * largest);
+            let Some(side) = self.row_side[r] else { continue };
+            let multiplier = sign(side) * self.lambda[r];
+            good &= p.equality[r] || multiplier >= -FINAL * largest;
+            if let Some(soft) = p.soft[r] {
+                let beyond = multiplier - soft.linear;
+                good &= if self.elastic[r] { beyond >= -FINAL * largest } else { beyond <= FINAL * largest };
+            }
         }
         good
+    }
+
+    /// Slack of row `r`, at least 0.
+    pub(crate) fn slack(&self, p: &Coupled, r: usize) -> f64 {
+        match p.soft[r] {
+            Some(soft) if self.elastic[r] => ((self.lambda[r].abs() - soft.linear) / soft.quadratic).max(0.0),
+            _ => 0.0,
+        }
+    }
+}
+
+/// Of the constraint being added with multiplier `own`: how much it gives per multiplier, its slack, and the step at which it
+/// begins to give.
+fn own_softness(p: &Coupled, constraint: Constraint, own: f64) -> (f64, f64, f64) {
+    let Constraint::Row(row, _) = constraint else { return (0.0, 0.0, f64::INFINITY) };
+    match p.soft[row] {
+        None => (0.0, 0.0, f64::INFINITY),
+        Some(soft) if own < soft.linear * (1.0 - EXACT) => (0.0, 0.0, soft.linear - own),
+        Some(soft) => (1.0 / soft.quadratic, (own - soft.linear) / soft.quadratic, f64::INFINITY),
     }
 }
 

@@ -1,20 +1,23 @@
 //! Building a projector: everything that can be wrong is found here.
 
 use super::active_set::ActiveSet;
+use super::backup::Backup;
 use super::conic::Conic;
 use super::coupled::Coupled;
-use super::{Dofs, Projector, Stages};
+use super::sources::{Measured, Sources};
+use super::{Dofs, History, Projector, Stages, Switch};
 use crate::checker::Checker;
-use crate::target::{Bounds, Consistency, Settings, Solver};
+use crate::ledger::{Rung, Status};
+use crate::target::{Bounds, Braking, Consistency, Settings, Solver};
 use crate::viability::{Dof, Interval, Kind, Period};
-use crate::{Dynamics, Limit, LimitError, LimitSet, Model};
+use crate::{Dynamics, Limit, LimitError, LimitSet, Model, Soft};
 
 impl Projector {
     /// A projector that moves the `controllable` dofs (indices into a velocity, any order) of `model` within `limits`.
     ///
     /// # Errors
     /// Settings out of their domain, dofs that do not exist, limits the robot file lacks or that contradict each other,
-    /// position limits without an acceleration to brake with, torque limits in free mode. Every joint is named.
+    /// position limits without an acceleration to brake with, coupled limits in free mode. Every joint is named.
     pub fn new(
         model: &Model,
         limits: &[Box<dyn Limit>],
@@ -24,8 +27,9 @@ impl Projector {
         let nv = model.nv();
         settings.validate(nv)?;
         let dofs = Dofs::new(model, controllable, settings.consistency)?;
-        let limits = LimitSet::collect(model, limits, &dofs.controllable)?;
-        check_combination(model, &limits, &dofs, settings.consistency)?;
+        let switches = switches(model, limits, &dofs.controllable)?;
+        let (each, limits) = (limits, LimitSet::collect(model, limits, &dofs.controllable)?);
+        check_combination(model, &limits, &dofs, (settings.consistency, settings.braking))?;
         let period = Period::new(settings.dt, settings.sub_steps);
         let weight: Vec<f64> = match &settings.velocity_weight {
             Some(w) => w.iter().map(|w| w * w).collect(),
@@ -41,8 +45,11 @@ impl Projector {
         let zero = || vec![0.0; nv];
         Ok(Projector {
             dynamics: Dynamics::new(model),
-            checker: Checker::new(model, &limits, &dofs.controllable, period, settings.consistency),
-            coupled: stages(model, &limits, &dofs, &weight, &settings)?,
+            checker: Checker::new(model, each, &dofs.controllable, period, settings.consistency)?,
+            coupled: stages(model, each, &limits, &dofs, &weight, &settings)?,
+            switches,
+            external: zero(),
+            previous: History { known: false, acceleration: zero(), torque: zero() },
             braking: (0..nv).map(|i| Dof::of(&limits, i).braking(&period)).collect(),
             bounds: Bounds::new(nv),
             intervals: vec![none; nv],
@@ -50,7 +57,12 @@ impl Projector {
             goal: zero(),
             v_next: zero(),
             consistent: vec![false; nv],
+            clamped: vec![[false; 2]; nv],
+            last: (Status::Unchanged, Rung::ClosedForm),
+            v_wanted: zero(),
+            v_stop: zero(),
             tangent: zero(),
+            backup: Backup::new(model),
             integrated: model.neutral(),
             model: model.clone(),
             limits,
@@ -96,12 +108,26 @@ impl Dofs {
     }
 }
 
+/// The limits one by one.
+fn switches(
+    model: &Model,
+    limits: &[Box<dyn Limit>],
+    controllable: &[usize],
+) -> Result<Vec<Switch>, LimitError> {
+    let switch = |limit: &dyn Limit| {
+        let mut set = LimitSet::unlimited(model.nv());
+        limit.restrict(model, controllable, &mut set)?;
+        Ok(Switch { label: limit.label().to_string(), set, enabled: true })
+    };
+    limits.iter().map(|limit| switch(&**limit)).collect()
+}
+
 /// Limits that make no sense together.
-fn check_combination(
+pub(super) fn check_combination(
     model: &Model,
     limits: &LimitSet,
     dofs: &Dofs,
-    consistency: Consistency,
+    (consistency, braking): (Consistency, Braking),
 ) -> Result<(), LimitError> {
     let names = |wrong: &dyn Fn(usize) -> bool| -> String {
         let list = dofs.controllable.iter().filter(|i| wrong(**i));
@@ -116,45 +142,66 @@ fn check_combination(
                 return Err(LimitError::Missing { limit, joints, next });
             }
         }
-        Consistency::Free => {
-            let joints = names(&|i| limits.effort[i].is_finite());
-            if !joints.is_empty() {
-                let what =
-                    format!("torque limits on {joints} in free mode, where no acceleration is decided");
-                return Err(LimitError::Unusable {
-                    what,
-                    next: "set consistency = \"kinematic\" or drop torque",
-                });
-            }
+        Consistency::Free => {}
+    }
+    if braking == Braking::Stored {
+        let joints = names(&|i| limits.braking[i].is_infinite() || limits.effort[i].is_infinite());
+        if !joints.is_empty() {
+            let next = "add torque and acceleration limits, or set braking = \"certified\"";
+            return Err(LimitError::Missing { limit: "a stored brake", joints, next });
         }
     }
     Ok(())
 }
 
-/// The stages for coupled rows, when there are any.
+/// The stages for coupled rows and cones, when there are any.
 fn stages(
     model: &Model,
+    each: &[Box<dyn Limit>],
     limits: &LimitSet,
     dofs: &Dofs,
     weight: &[f64],
     settings: &Settings,
 ) -> Result<Option<Stages>, LimitError> {
-    let hessian: Vec<f64> = dofs.controllable.iter().map(|i| 2.0 * weight[*i]).collect();
-    let mut problem = Coupled::new(model, limits, dofs, hessian);
-    let wanted = problem.m > 0 || settings.solver == Solver::Clarabel;
-    if !wanted || problem.n == 0 || settings.consistency == Consistency::Free {
+    let mut sources = Sources::new(model, each, &dofs.controllable)?;
+    let free = settings.consistency == Consistency::Free;
+    let labels = sources.labels();
+    if let Some(label) = labels.first().filter(|_| free) {
+        let what = format!(
+            "limits on {} of {} in free mode, where no acceleration is decided",
+            label.kind.name(),
+            labels
+                .iter()
+                .filter(|l| l.kind == label.kind)
+                .map(|l| format!("'{}'", l.name))
+                .collect::<Vec<_>>()
+                .join(", ")
+        );
+        return Err(LimitError::Unusable { what, next: "set consistency = \"kinematic\" or drop them" });
+    }
+    let wanted = !sources.is_empty() || settings.solver == Solver::Clarabel;
+    if !wanted || free || dofs.controllable.is_empty() {
         return Ok(None);
     }
     let sigma: Vec<f64> = dofs.controllable.iter().map(|i| typical_change(limits, *i, settings.dt)).collect();
+    let hessian: Vec<f64> = dofs.controllable.iter().map(|i| 2.0 * weight[*i]).collect();
+    let worth = hessian.iter().zip(&sigma).fold(0.0, |most: f64, (h, sigma)| most.max(h * sigma * sigma));
+    let scaled = |s: Soft| Soft { linear: s.linear * worth, quadratic: s.quadratic * worth };
+    let soft = sources.softness().into_iter().map(|s| s.map(scaled)).collect();
+    let mut problem =
+        Coupled::new(hessian, soft, sources.equalities(), &sources.dimensions(), dofs.fixed.len());
     for k in 0..problem.n {
         (problem.lower[k], problem.upper[k]) = (-sigma[k], sigma[k]);
     }
-    let zero = vec![0.0; model.nv()];
+    let (zero, neutral) = (vec![0.0; model.nv()], model.neutral());
     let mut dynamics = Dynamics::new(model);
-    problem.linearise(&mut dynamics, &model.neutral(), &zero, dofs, &zero, settings.dt);
-    let conic = Conic::new(&problem, sigma, settings.max_iter)?;
+    let rest = Measured { q: &neutral, v: &zero, external: &zero, previous: None };
+    let period = Period::new(settings.dt, settings.sub_steps);
+    sources.fill(&mut problem, &mut dynamics, &rest, dofs, &zero, &period);
+    let conic = Conic::new(&problem, sigma, settings.max_iter, settings.deadline)?;
     let (n, m) = (problem.n, problem.m);
-    Ok(Some(Stages { problem, active_set: ActiveSet::new(n, m), conic, y: vec![0.0; n] }))
+    let (active_set, y, dropped) = (ActiveSet::new(n, m), vec![0.0; n], vec![(0.0, 0.0); m]);
+    Ok(Some(Stages { sources, labels, problem, active_set, conic, y, exact: false, dropped }))
 }
 
 /// A velocity change of the size to expect in one period [rad/s or m/s].

@@ -1,14 +1,15 @@
-//! The problem of a tick with coupled rows, over the controllable dofs:
+//! The problem of a tick with coupled rows, over the controllable dofs, the slacks `s` of soft rows and the cones:
 //!
 //! ```text
-//!     min 1/2 sum_i h_i (y_i - goal_i)^2   s.t.   lower <= y <= upper,   row_lower <= G y <= row_upper
+//!     min 1/2 sum_i h_i (y_i - goal_i)^2 + sum_r linear_r |s_r| + 1/2 quadratic_r s_r^2
+//!     s.t.   lower <= y <= upper,   row_lower <= G y + s <= row_upper,   |G_c y + c| <= radius
 //! ```
 //!
-//! Torque rows are `G = M / T`, `row_upper = tau_max - nle + passive - G_u y_u` with the dofs u that are not
-//! controllable as constants, at the velocity change their proposal asks for.
+//! Rows and cones are shares of the sizes of their limits. Dofs that are not controllable are constants, at the velocity
+//! change their proposal asks for. Hard rows have no slack.
 
 use super::Dofs;
-use crate::{Dynamics, LimitSet, Model};
+use crate::Soft;
 
 /// The numbers of a tick; n dofs and m rows.
 #[derive(Debug, Clone)]
@@ -29,21 +30,51 @@ pub(crate) struct Coupled {
     pub(crate) row_lower: Vec<f64>,
     /// Upper bounds of the rows (m).
     pub(crate) row_upper: Vec<f64>,
-    /// Size of each row's limit (m), for tolerances and scaling.
+    /// Size of each row's limit in its own unit (m).
     pub(crate) row_size: Vec<f64>,
-    /// Dof of each row (m).
-    pub(crate) row_dof: Vec<usize>,
-    mass: Vec<f64>,
-    nle: Vec<f64>,
-    passive: Vec<f64>,
+    /// Softness of each row (m); `None` is hard.
+    pub(crate) soft: Vec<Option<Soft>>,
+    /// Rows whose bounds are equal (m).
+    pub(crate) equality: Vec<bool>,
+    pub(crate) cones: Vec<ConeRows>,
+    /// Number of dofs that are not controllable.
+    pub(crate) fixed: usize,
+    /// Their columns of `G` (m x fixed, row-major).
+    pub(crate) rows_fixed: Vec<f64>,
 }
 
+/// `|G y + c| <= radius`; infinite when switched off.
+#[derive(Debug, Clone)]
+pub(crate) struct ConeRows {
+    /// dimension x n, row-major.
+    pub(crate) g: Vec<f64>,
+    /// Columns of the dofs that are not controllable (dimension x fixed).
+    pub(crate) g_fixed: Vec<f64>,
+    pub(crate) c: Vec<f64>,
+    pub(crate) radius: f64,
+    /// Size of the limit in its own unit.
+    pub(crate) size: f64,
+}
+
+/// The least size numbers of a limit are multiplied by, so that disabled limits stay finite.
+const ROOM: f64 = 1e6;
+
 impl Coupled {
-    pub(crate) fn new(model: &Model, limits: &LimitSet, dofs: &Dofs, hessian: Vec<f64>) -> Coupled {
-        let nv = model.nv();
-        let row_dof: Vec<usize> =
-            dofs.controllable.iter().copied().filter(|i| limits.effort[*i].is_finite()).collect();
-        let (n, m) = (dofs.controllable.len(), row_dof.len());
+    pub(crate) fn new(
+        hessian: Vec<f64>,
+        soft: Vec<Option<Soft>>,
+        equality: Vec<bool>,
+        dimensions: &[usize],
+        fixed: usize,
+    ) -> Coupled {
+        let (n, m) = (hessian.len(), soft.len());
+        let cone = |d: &usize| ConeRows {
+            g: vec![0.0; d * n],
+            g_fixed: vec![0.0; d * fixed],
+            c: vec![0.0; *d],
+            radius: ROOM,
+            size: 1.0,
+        };
         Coupled {
             n,
             m,
@@ -52,42 +83,29 @@ impl Coupled {
             lower: vec![0.0; n],
             upper: vec![0.0; n],
             rows: vec![0.0; n * m],
-            row_lower: vec![0.0; m],
-            row_upper: vec![0.0; m],
-            row_size: row_dof.iter().map(|i| limits.effort[*i]).collect(),
-            row_dof,
-            mass: vec![0.0; nv * nv],
-            nle: vec![0.0; nv],
-            passive: vec![0.0; nv],
+            row_lower: vec![f64::NEG_INFINITY; m],
+            row_upper: vec![f64::INFINITY; m],
+            row_size: vec![1.0; m],
+            soft,
+            equality,
+            cones: dimensions.iter().map(cone).collect(),
+            fixed,
+            rows_fixed: vec![0.0; m * fixed],
         }
     }
 
-    /// Fills the rows at the state; `y` (nv) holds the velocity change of the dofs that are not controllable.
-    pub(crate) fn linearise(
-        &mut self,
-        dynamics: &mut Dynamics,
-        q: &[f64],
-        v: &[f64],
-        dofs: &Dofs,
-        y: &[f64],
-        dt: f64,
-    ) {
-        let nv = v.len();
-        dynamics.mass(q, &mut self.mass);
-        dynamics.nle(q, v, &mut self.nle);
-        dynamics.passive(q, v, &mut self.passive);
-        for r in 0..self.m {
-            let i = self.row_dof[r];
-            let mut offset = self.nle[i] - self.passive[i];
-            for &j in &dofs.fixed {
-                offset += self.mass[j * nv + i] * y[j] / dt;
-            }
-            for (k, &j) in dofs.controllable.iter().enumerate() {
-                self.rows[r * self.n + k] = self.mass[j * nv + i] / dt;
-            }
-            self.row_lower[r] = -self.row_size[r] - offset;
-            self.row_upper[r] = self.row_size[r] - offset;
+    /// Takes row `r` from `g` over all dofs (nv), its bounds already in place, as share of `size`.
+    pub(super) fn take_row(&mut self, r: usize, g: &[f64], size: f64, dofs: &Dofs, y: &[f64]) {
+        let still: f64 = dofs.fixed.iter().map(|j| g[*j] * y[*j]).sum();
+        for (to, j) in self.rows[r * self.n..(r + 1) * self.n].iter_mut().zip(&dofs.controllable) {
+            *to = g[*j] / size;
         }
+        self.row_lower[r] = (self.row_lower[r] - still) / size;
+        self.row_upper[r] = (self.row_upper[r] - still) / size;
+        for (to, j) in self.rows_fixed[r * self.fixed..(r + 1) * self.fixed].iter_mut().zip(&dofs.fixed) {
+            *to = g[*j] / size;
+        }
+        self.row_size[r] = size;
     }
 
     /// `G y` of row `r`.
@@ -96,27 +114,48 @@ impl Coupled {
         g.iter().zip(y).map(|(g, y)| g * y).sum()
     }
 
-    /// Largest violation of a row by `y`, as a share of its limit.
-    pub(crate) fn violation(&self, y: &[f64]) -> f64 {
-        (0..self.m).fold(0.0, |worst: f64, r| {
-            let value = self.row(r, y);
-            let excess = (value - self.row_upper[r]).max(self.row_lower[r] - value);
-            worst.max(excess / self.row_size[r])
-        })
+    /// By how much `y` exceeds row `r`; negative inside.
+    pub(crate) fn excess(&self, r: usize, y: &[f64]) -> f64 {
+        let value = self.row(r, y);
+        (value - self.row_upper[r]).max(self.row_lower[r] - value)
     }
 
-    /// Largest violation of the stationarity condition `H (y - goal) + G' lambda + mu = 0`.
-    pub(crate) fn residual(&self, y: &[f64], mu: &[f64], lambda: &[f64]) -> f64 {
+    /// Largest violation of a hard row by `y`.
+    pub(crate) fn violation(&self, y: &[f64]) -> f64 {
+        let hard = (0..self.m).filter(|r| self.soft[*r].is_none());
+        hard.fold(0.0, |worst: f64, r| worst.max(self.excess(r, y)))
+    }
+
+    /// True when `y` leaves every soft row without slack.
+    pub(crate) fn obeys_soft(&self, y: &[f64], tolerance: f64) -> bool {
+        (0..self.m).filter(|r| self.soft[*r].is_some()).all(|r| self.excess(r, y) <= tolerance)
+    }
+
+    /// Largest violation of a cone by `y`.
+    pub(crate) fn cone_violation(&self, y: &[f64]) -> f64 {
+        self.cones.iter().fold(0.0, |worst: f64, cone| worst.max(cone.norm(y) - cone.radius))
+    }
+
+    /// Largest violation of the stationarity condition `H (y - goal) + G' lambda + mu + cones = 0`. The force of a cone
+    /// with multiplier `nu` is `nu G_c' (G_c y + c) / |G_c y + c|`.
+    pub(crate) fn residual(&self, y: &[f64], mu: &[f64], lambda: &[f64], nu: &[f64]) -> f64 {
         (0..self.n).fold(0.0, |worst: f64, k| {
-            let pull: f64 = (0..self.m).map(|r| lambda[r] * self.rows[r * self.n + k]).sum();
-            worst.max((self.hessian[k] * (y[k] - self.goal[k]) + pull + mu[k]).abs())
+            let rows: f64 = (0..self.m).map(|r| lambda[r] * self.rows[r * self.n + k]).sum();
+            let cones: f64 = self.cones.iter().zip(nu).map(|(cone, nu)| nu * cone.slope(y, k)).sum();
+            worst.max((self.hessian[k] * (y[k] - self.goal[k]) + rows + cones + mu[k]).abs())
         })
     }
 
     /// False when anything is NaN or infinite that a solver would choke on.
     pub(crate) fn is_finite(&self) -> bool {
         let finite = |x: &[f64]| x.iter().all(|x| x.is_finite());
-        finite(&self.rows) && finite(&self.row_lower) && finite(&self.row_upper) && finite(&self.goal)
+        let number = |x: &[f64]| x.iter().all(|x| !x.is_nan());
+        let cones = self.cones.iter().all(|cone| finite(&cone.g) && finite(&cone.c) && !cone.radius.is_nan());
+        finite(&self.rows)
+            && number(&self.row_lower)
+            && number(&self.row_upper)
+            && finite(&self.goal)
+            && cones
     }
 
     /// Keeps goals far outside the box from spoiling a solver's scaling.
@@ -129,45 +168,141 @@ impl Coupled {
     }
 }
 
+impl ConeRows {
+    /// Takes the cone from `g` over all dofs (dimension x nv), with `c` and the radius already in place.
+    pub(super) fn take(&mut self, g: &[f64], nv: usize, size: f64, dofs: &Dofs, y: &[f64]) {
+        let n = dofs.controllable.len();
+        for (d, c) in self.c.iter_mut().enumerate() {
+            let row = &g[d * nv..(d + 1) * nv];
+            *c = (*c + dofs.fixed.iter().map(|j| row[*j] * y[*j]).sum::<f64>()) / size;
+            for (k, j) in dofs.controllable.iter().enumerate() {
+                self.g[d * n + k] = row[*j] / size;
+            }
+            for (u, j) in dofs.fixed.iter().enumerate() {
+                self.g_fixed[d * dofs.fixed.len() + u] = row[*j] / size;
+            }
+        }
+        self.size = size;
+    }
+
+    /// Entry `d` of `G y + c`.
+    fn entry(&self, d: usize, y: &[f64]) -> f64 {
+        let row = &self.g[d * y.len()..(d + 1) * y.len()];
+        self.c[d] + row.iter().zip(y).map(|(g, y)| g * y).sum::<f64>()
+    }
+
+    /// `|G y + c|`.
+    pub(crate) fn norm(&self, y: &[f64]) -> f64 {
+        (0..self.c.len()).map(|d| self.entry(d, y).powi(2)).sum::<f64>().sqrt()
+    }
+
+    /// Derivative of the norm with respect to `y_k`.
+    pub(crate) fn slope(&self, y: &[f64], k: usize) -> f64 {
+        self.slope_along(y, |d| self.g[d * y.len() + k])
+    }
+
+    /// Derivative of the norm when `G y + c` moves along `direction`: `u' direction`.
+    pub(crate) fn slope_along(&self, y: &[f64], direction: impl Fn(usize) -> f64) -> f64 {
+        let norm = self.norm(y).max(f64::MIN_POSITIVE);
+        (0..self.c.len()).map(|d| self.entry(d, y) * direction(d)).sum::<f64>() / norm
+    }
+
+    /// Second derivative of the norm along two directions: `a' (I - u u') b / norm`.
+    pub(crate) fn curvature(
+        &self,
+        y: &[f64],
+        a: impl Fn(usize) -> f64 + Copy,
+        b: impl Fn(usize) -> f64 + Copy,
+    ) -> f64 {
+        let product: f64 = (0..self.c.len()).map(|d| a(d) * b(d)).sum();
+        let norm = self.norm(y).max(f64::MIN_POSITIVE);
+        (product - self.slope_along(y, a) * self.slope_along(y, b)) / norm
+    }
+}
+
 /// Goals are kept within this many box widths.
 const FAR: f64 = 100.0;
 
-/// The problem of a tick in textbook form: `min 1/2 y'H y + c'y` s.t. `G y <= h`, for other solvers to check ours.
+/// The problem of a tick in textbook form for other solvers to check ours, over `x = (y, s)` with a slack `s >= 0` for each soft
+/// row: `min 1/2 x'H x + c'x` s.t. `G x <= h`, `A x = b` and `|C_k y + c_k| <= radius_k`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
-    /// Dofs of the variables.
+    /// Dofs of the variables `y`.
     pub dofs: Vec<usize>,
+    /// Number of variables: dofs, then slacks.
+    pub n: usize,
     /// `H` (n x n, row-major).
     pub hessian: Vec<f64>,
     /// `c` (n).
     pub c: Vec<f64>,
-    /// `G` (rows x n, row-major): upper box, lower box, upper torque, lower torque; infinite bounds left out.
+    /// `G` (rows x n, row-major): upper box, lower box, upper rows, lower rows, `-s`; infinite bounds left out.
     pub g: Vec<f64>,
     /// `h` (rows).
     pub h: Vec<f64>,
+    /// `A` (equalities x n, row-major).
+    pub a: Vec<f64>,
+    /// `b` (equalities).
+    pub b: Vec<f64>,
+    /// Cones: `C` (dimension x dofs, row-major), `c` (dimension), radius.
+    pub cones: Vec<(Vec<f64>, Vec<f64>, f64)>,
 }
 
 impl Problem {
     pub(crate) fn of(p: &Coupled, dofs: &[usize]) -> Problem {
-        let n = p.n;
-        let mut problem =
-            Problem { dofs: dofs.to_vec(), hessian: vec![0.0; n * n], c: vec![], g: vec![], h: vec![] };
-        let mut push = |row: &mut dyn Iterator<Item = f64>, bound: f64| {
-            if bound.is_finite() {
-                problem.g.extend(row);
-                problem.h.push(bound);
-            }
+        let slack_of: Vec<Option<usize>> = {
+            let mut next = p.n;
+            p.soft.iter().map(|s| s.map(|_| (next, next += 1).0)).collect()
+        };
+        let n = p.n + slack_of.iter().flatten().count();
+        let mut problem = Problem {
+            dofs: dofs.to_vec(),
+            n,
+            hessian: vec![0.0; n * n],
+            c: vec![0.0; n],
+            g: vec![],
+            h: vec![],
+            a: vec![],
+            b: vec![],
+            cones: vec![],
         };
         let unit = |k: usize, sign: f64| (0..n).map(move |j| if j == k { sign } else { 0.0 });
-        (0..n).for_each(|k| push(&mut unit(k, 1.0), p.upper[k]));
-        (0..n).for_each(|k| push(&mut unit(k, -1.0), -p.lower[k]));
-        let row = |r: usize, sign: f64| p.rows[r * n..(r + 1) * n].iter().map(move |x| sign * x);
-        (0..p.m).for_each(|r| push(&mut row(r, 1.0), p.row_upper[r]));
-        (0..p.m).for_each(|r| push(&mut row(r, -1.0), -p.row_lower[r]));
-        for k in 0..n {
-            problem.hessian[k * n + k] = p.hessian[k];
-            problem.c.push(-p.hessian[k] * p.goal[k]);
+        (0..p.n).for_each(|k| problem.push(unit(k, 1.0), p.upper[k]));
+        (0..p.n).for_each(|k| problem.push(unit(k, -1.0), -p.lower[k]));
+        let row = |r: usize, sign: f64| {
+            let slack = slack_of[r];
+            (0..n).map(move |k| match k < p.n {
+                true => sign * p.rows[r * p.n + k],
+                false => -f64::from(u8::from(slack == Some(k))),
+            })
+        };
+        for r in (0..p.m).filter(|r| p.equality[*r] && p.soft[*r].is_none() && p.row_upper[*r].is_finite()) {
+            problem.a.extend(row(r, 1.0));
+            problem.b.push(p.row_upper[r]);
         }
+        for r in (0..p.m).filter(|r| !p.equality[*r] || p.soft[*r].is_some()) {
+            problem.push(row(r, 1.0), p.row_upper[r]);
+            problem.push(row(r, -1.0), -p.row_lower[r]);
+        }
+        for k in 0..p.n {
+            problem.hessian[k * n + k] = p.hessian[k];
+            problem.c[k] = -p.hessian[k] * p.goal[k];
+        }
+        for (slack, soft) in slack_of.iter().zip(&p.soft) {
+            if let (Some(k), Some(soft)) = (*slack, soft) {
+                problem.hessian[k * n + k] = soft.quadratic;
+                problem.c[k] = soft.linear;
+                problem.push(unit(k, -1.0), 0.0);
+            }
+        }
+        let finite = p.cones.iter().filter(|cone| cone.radius.is_finite());
+        problem.cones = finite.map(|cone| (cone.g.clone(), cone.c.clone(), cone.radius)).collect();
         problem
+    }
+
+    fn push(&mut self, row: impl Iterator<Item = f64>, bound: f64) {
+        if bound.is_finite() {
+            self.g.extend(row);
+            self.h.push(bound);
+        }
     }
 }

@@ -1,12 +1,16 @@
-//! Coupled rows: the closed form if it obeys them, else the active-set stage, else Clarabel, else no answer.
+//! Coupled rows and cones: the closed form if it obeys them, else the active-set stage, else Clarabel, else both without the soft
+//! rows, else no answer.
 
+use super::sources::Measured;
 use super::{Projector, Stages};
 use crate::ledger::{ActiveRow, BrakeReason, Rung, Side};
 use crate::target::{Solver, Target};
-use crate::viability::Kind;
 
-/// Share of its limit by which the closed form and Clarabel's answer may exceed a row; the checker allows ten times this.
+/// Share of its limit by which the closed form and Clarabel's answer may exceed a row or a cone; the checker allows ten times this.
 const ROW_TOLERANCE: f64 = 1e-10;
+
+/// The same for equal rows, which Clarabel cannot be kept a little inside of.
+const EQUALITY_TOLERANCE: f64 = 5e-10;
 
 impl Projector {
     /// True when coupled rows changed `v_next`.
@@ -27,31 +31,32 @@ impl Projector {
         for &j in &self.dofs.fixed {
             self.tangent[j] = self.v_next[j] - v[j];
         }
-        p.linearise(&mut self.dynamics, q, v, &self.dofs, &self.tangent, self.period.dt);
+        let measured = Measured { q, v, external: &self.external, previous: self.previous.get() };
+        stages.sources.fill(p, &mut self.dynamics, &measured, &self.dofs, &self.tangent, &self.period);
         if !p.is_finite() {
             return Err(BrakeReason::NonFiniteDynamics);
         }
         p.tame_goal();
         let clamped = self.dofs.controllable.iter().any(|i| self.goal[*i] != self.v_next[*i]);
-        let obeyed = p.violation(&stages.y) <= ROW_TOLERANCE;
+        let obeyed =
+            stages.obeys(&stages.y, ROW_TOLERANCE) && stages.problem.obeys_soft(&stages.y, ROW_TOLERANCE);
         let by_clarabel = self.settings.solver == Solver::Clarabel;
         if obeyed && !(by_clarabel && clamped) {
             return Ok(false);
         }
         let rung = stages.solve(by_clarabel, &mut target.ledger.iterations)?;
         target.ledger.rung = rung;
-        self.take(v, rung, target);
+        self.take(v, target);
         Ok(true)
     }
 
     /// Takes over the answer of a stage with its multipliers.
-    fn take(&mut self, v: &[f64], rung: Rung, target: &mut Target) {
+    fn take(&mut self, v: &[f64], target: &mut Target) {
         let Some(stages) = &self.coupled else { return };
-        let exact = rung == Rung::ActiveSet;
         let (s, c, p) = (&stages.active_set, &stages.conic, &stages.problem);
-        let (y, mu, lambda) = if exact { (&s.y, &s.mu, &s.lambda) } else { (&c.y, &c.mu, &c.lambda) };
-        let rounding = if exact { 0.0 } else { 1e-6 };
-        target.ledger.residual = p.residual(y, mu, lambda);
+        let (y, mu, lambda) = if stages.exact { (&s.y, &s.mu, &s.lambda) } else { (&c.y, &c.mu, &c.lambda) };
+        let nu: &[f64] = if stages.exact { &[] } else { &c.nu };
+        target.ledger.residual = p.residual(y, mu, lambda, nu);
         for (k, &i) in self.dofs.controllable.iter().enumerate() {
             let (low, high) = (self.bounds.v_lower[i], self.bounds.v_upper[i]);
             // A dof at its bound or at its goal gets those bits, not a sum's.
@@ -62,32 +67,74 @@ impl Projector {
                 y => (v[i] + y).clamp(low, high),
             };
         }
+        let rounding = if stages.exact { 0.0 } else { 1e-6 };
         let floor = rounding * p.hessian.iter().fold(0.0, |m: f64, h| m.max(*h));
         for (k, &i) in self.dofs.controllable.iter().enumerate().filter(|(k, _)| mu[*k].abs() > floor) {
             self.push_box(i, mu[k], target);
         }
-        for r in (0..p.m).filter(|r| lambda[*r].abs() * p.row_size[*r] > floor) {
-            let side = if lambda[r] > 0.0 { Side::Upper } else { Side::Lower };
-            let multiplier = lambda[r].abs();
-            target.ledger.active.push(ActiveRow { kind: Kind::Torque, dof: p.row_dof[r], side, multiplier });
+        let nv = v.len();
+        for r in 0..p.m {
+            let excess = if p.soft[r].is_some() { p.excess(r, y).max(0.0) } else { 0.0 };
+            let slack = if excess > ROW_TOLERANCE { excess } else { 0.0 };
+            if lambda[r].abs() > floor || slack > 0.0 {
+                let upper = lambda[r] > 0.0 || (lambda[r] == 0.0 && p.row(r, y) > p.row_upper[r]);
+                let side = if upper { Side::Upper } else { Side::Lower };
+                let (kind, multiplier) = (stages.labels[r].kind, lambda[r].abs() / p.row_size[r]);
+                target.ledger.active.push(ActiveRow { kind, row: nv + r, side, multiplier, slack });
+            }
+        }
+        for (c, nu) in nu.iter().enumerate().filter(|(_, nu)| **nu > floor) {
+            let (label, multiplier) = (&stages.labels[p.m + c], nu / p.cones[c].size);
+            let (kind, row, side) = (label.kind, nv + p.m + c, Side::Upper);
+            target.ledger.active.push(ActiveRow { kind, row, side, multiplier, slack: 0.0 });
         }
     }
 }
 
 impl Stages {
     fn solve(&mut self, by_clarabel: bool, iterations: &mut u32) -> Result<Rung, BrakeReason> {
+        if let Some(rung) = self.answer(by_clarabel, iterations) {
+            return Ok(rung);
+        }
+        let p = &mut self.problem;
+        let soft = (0..p.m).filter(|r| p.soft[*r].is_some());
+        let dropped = soft.fold(0, |count, r| {
+            (self.dropped[r].0, self.dropped[r].1) = (p.row_lower[r], p.row_upper[r]);
+            (p.row_lower[r], p.row_upper[r]) = (f64::NEG_INFINITY, f64::INFINITY);
+            count + 1
+        });
+        if dropped == 0 {
+            return Err(BrakeReason::NoCertifiedAnswer);
+        }
+        let relaxed = self.answer(by_clarabel, iterations).map(|_| Rung::Relaxed);
+        let p = &mut self.problem;
+        for r in (0..p.m).filter(|r| p.soft[*r].is_some()) {
+            (p.row_lower[r], p.row_upper[r]) = self.dropped[r];
+        }
+        relaxed.ok_or(BrakeReason::NoCertifiedAnswer)
+    }
+
+    /// The first stage whose answer obeys everything hard.
+    fn answer(&mut self, by_clarabel: bool, iterations: &mut u32) -> Option<Rung> {
         if !by_clarabel {
             let settled = self.active_set.solve(&self.problem);
             *iterations += self.active_set.iterations;
-            if settled {
-                return Ok(Rung::ActiveSet);
+            self.exact = settled && self.problem.cone_violation(&self.active_set.y) <= ROW_TOLERANCE;
+            if self.exact {
+                return Some(Rung::ActiveSet);
             }
         }
+        self.exact = false;
         let answered = self.conic.solve(&self.problem);
         *iterations += self.conic.iterations;
-        if answered && self.problem.violation(&self.conic.y) <= ROW_TOLERANCE {
-            return Ok(Rung::Clarabel);
-        }
-        Err(BrakeReason::NoCertifiedAnswer)
+        (answered && self.obeys(&self.conic.y, ROW_TOLERANCE)).then_some(Rung::Clarabel)
+    }
+
+    /// Hard rows and cones hold.
+    fn obeys(&self, y: &[f64], tolerance: f64) -> bool {
+        let p = &self.problem;
+        let allowed = |r: usize| if p.equality[r] { EQUALITY_TOLERANCE } else { tolerance };
+        let rows = (0..p.m).filter(|r| p.soft[*r].is_none()).all(|r| p.excess(r, y) <= allowed(r));
+        rows && p.cone_violation(y) <= tolerance
     }
 }

@@ -3,22 +3,29 @@
 //! [`Projector::project`] is the page to read; the stages it calls are in the files beside it.
 
 mod active_set;
+mod backup;
 mod build;
 mod conic;
 mod coupled;
+mod gradient;
 mod ladder;
 mod modes;
+mod sources;
+mod switch;
 
 pub use coupled::Problem;
 
 use crate::checker::Checker;
 use crate::ledger::{BrakeReason, RefuseReason, Rung, Status};
-use crate::target::{Bounds, Consistency, Proposal, Settings, Target};
+use crate::row::Previous;
+use crate::target::{Bounds, Braking, Consistency, Proposal, Settings, Target};
 use crate::viability::{Dof, Interval, Kind, Period, interval};
 use crate::{Dynamics, LimitSet, Model};
 use active_set::ActiveSet;
+use backup::{Backup, With};
 use conic::Conic;
 use coupled::Coupled;
+use sources::{Label, Sources};
 use std::time::Instant;
 
 /// Projects proposals for one robot at one control period.
@@ -27,15 +34,18 @@ use std::time::Instant;
 ///
 /// ```text
 ///     min_y 1/2 |W (q (+) (T v + kappa T y) (-) q_hat) / (kappa T)|^2 + 1/2 |W (v + y - v_hat)|^2
-///     s.t.  viability box of each dof,   |(M/T) y + nle - passive| <= effort
+///     s.t.  viability box of each dof,   lower <= G y <= upper,   |G_c y + c| <= radius
 /// ```
 ///
+/// with rows and cones from the limits (see [`row`](crate::row)), soft ones with a slack of their own,
+///
 /// and the free mode clamps `v'` to the box and `q'` to `q (+) [T v + kappa T lb, T v + kappa T ub]` cut with the
-/// position limits. Dofs that are not controllable pass through; in torque rows they are constants at the
+/// position limits. Dofs that are not controllable pass through; in rows and cones they are constants at the
 /// velocity change they propose.
 ///
 /// Nothing allocates after [`Projector::new`] but one small buffer inside each Clarabel solve. Given the same input, the
-/// output has the same bits, whatever was projected before.
+/// output has the same bits, whatever was projected before; what limits on jerk and torque rates know of the tick before is
+/// an input too, see [`Projector::set_previous`].
 pub struct Projector {
     model: Model,
     dynamics: Dynamics,
@@ -51,6 +61,12 @@ pub struct Projector {
     intervals: Vec<Interval>,
     checker: Checker,
     coupled: Option<Stages>,
+    /// The limits one by one, to switch them on and off.
+    switches: Vec<Switch>,
+    /// Generalised forces beside the motors' (nv) [N·m or N].
+    external: Vec<f64>,
+    previous: History,
+    backup: Backup,
     /// `q_hat (-) q` (nv).
     displacement: Vec<f64>,
     /// Unconstrained optimum of v' (nv).
@@ -59,6 +75,14 @@ pub struct Projector {
     v_next: Vec<f64>,
     /// The proposal's position and velocity belong together (nv).
     consistent: Vec<bool>,
+    /// Free mode: position and velocity of the dof were clamped (nv).
+    clamped: Vec<[bool; 2]>,
+    /// How the last tick ended.
+    last: (Status, Rung),
+    /// Velocities of the target that no brake was verified for (nv).
+    v_wanted: Vec<f64>,
+    /// Velocities after a tick of the stored brake (nv).
+    v_stop: Vec<f64>,
     tangent: Vec<f64>,
     integrated: Vec<f64>,
 }
@@ -77,10 +101,37 @@ pub(crate) struct Dofs {
 
 /// The stages for coupled rows.
 struct Stages {
+    sources: Sources,
+    /// Reports of rows, then cones.
+    labels: Vec<Label>,
     problem: Coupled,
     active_set: ActiveSet,
     conic: Conic,
     y: Vec<f64>,
+    /// The last answer is the active-set stage's.
+    exact: bool,
+    /// Bounds of soft rows while they are left out (m).
+    dropped: Vec<(f64, f64)>,
+}
+
+/// One limit, and whether it holds.
+struct Switch {
+    label: String,
+    set: LimitSet,
+    enabled: bool,
+}
+
+/// The tick before, where it is known.
+struct History {
+    known: bool,
+    acceleration: Vec<f64>,
+    torque: Vec<f64>,
+}
+
+impl History {
+    fn get(&self) -> Option<Previous<'_>> {
+        self.known.then_some(Previous { acceleration: &self.acceleration, torque: &self.torque })
+    }
 }
 
 impl Projector {
@@ -93,6 +144,7 @@ impl Projector {
         target.ledger.reset();
         let status = self.ladder(q, v, proposal, target);
         target.ledger.status = status;
+        self.last = (status, target.ledger.rung);
         target.ledger.duration_ns = start.elapsed().as_nanos() as u64;
         status
     }
@@ -108,7 +160,9 @@ impl Projector {
         if !(finite(&proposal.q) && finite(&proposal.v)) {
             return self.brake(q, v, None, target, BrakeReason::NonFiniteProposal);
         }
-        target.ledger.raw_violations = self.checker.check(q, v, &proposal.q, &proposal.v).counts;
+        let previous = self.previous.get();
+        let raw = self.checker.check(q, v, &proposal.q, &proposal.v, &self.external, previous);
+        target.ledger.raw_violations = raw.counts;
         let outcome = match self.settings.consistency {
             Consistency::Kinematic => self.kinematic(q, v, proposal, target),
             Consistency::Free => self.free(v, proposal, target),
@@ -128,11 +182,6 @@ impl Projector {
     /// without coupled rows. Allocates.
     pub fn problem(&self) -> Option<Problem> {
         self.coupled.as_ref().map(|stages| Problem::of(&stages.problem, &self.dofs.controllable))
-    }
-
-    /// The limits of the model and the task together.
-    pub fn limits(&self) -> &LimitSet {
-        &self.limits
     }
 
     /// The dofs the projector may move, ascending.
@@ -193,14 +242,76 @@ impl Projector {
         target: &mut Target,
         status: Status,
     ) -> Status {
-        let verdict = self.checker.check(q, v, &target.q, &target.v);
+        let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
         target.ledger.violations = verdict.counts;
         target.ledger.slack = verdict.worst;
         let outside = target.ledger.outside > 0;
-        if verdict.accepts() || (outside && verdict.counts.torque == 0) {
-            return if outside { Status::Recovering } else { status };
+        if verdict.accepts() || (outside && verdict.counts.torque + verdict.counts.other == 0) {
+            let status = if outside { Status::Recovering } else { status };
+            return match self.settings.braking {
+                Braking::Certified => status,
+                Braking::Stored => self.keep_a_brake(q, v, proposal, target, status),
+            };
         }
         self.brake(q, v, Some(proposal), target, BrakeReason::NoCertifiedAnswer)
+    }
+
+    /// Takes the target if a brake from it is verified, else the furthest verified state on the way from one tick of the
+    /// stored brake to the target, else that tick. All of them obey the limits, which are convex.
+    fn keep_a_brake(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        proposal: &Proposal,
+        target: &mut Target,
+        status: Status,
+    ) -> Status {
+        if self.verify(&target.q, &target.v) {
+            return status;
+        }
+        if !self.backup.stored && !self.verify(q, v) {
+            return self.brake(q, v, Some(proposal), target, BrakeReason::NoVerifiedBrake);
+        }
+        let (mut good, mut bad) = (0.0, 1.0);
+        self.v_wanted.copy_from_slice(&target.v);
+        for &i in &self.dofs.controllable {
+            self.v_stop[i] = self.backup.next_velocity(i, v[i], &self.period);
+        }
+        for _ in 0..4 {
+            let share = 0.5 * (good + bad);
+            self.blend(share);
+            self.write(q, v, Some(proposal), target);
+            *(if self.verify(&target.q, &target.v) { &mut good } else { &mut bad }) = share;
+        }
+        self.blend(good);
+        self.write(q, v, Some(proposal), target);
+        self.report_rung(q, v, target, Rung::StoredBrake);
+        if good == 0.0 { Status::Braked(BrakeReason::NoVerifiedBrake) } else { Status::Slowed }
+    }
+
+    /// `v_next` between one tick of the stored brake (0) and the wanted velocities (1).
+    fn blend(&mut self, share: f64) {
+        self.consistent.fill(false);
+        self.v_next.copy_from_slice(&self.v_wanted);
+        for &i in &self.dofs.controllable {
+            let mixed = self.v_stop[i] + share * (self.v_wanted[i] - self.v_stop[i]);
+            self.v_next[i] = mixed.clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
+        }
+    }
+
+    fn verify(&mut self, q: &[f64], v: &[f64]) -> bool {
+        let (dynamics, limits, dofs, period) = (&mut self.dynamics, &self.limits, &self.dofs, &self.period);
+        let mut with = With { dynamics, limits, dofs, period, external: &self.external };
+        self.backup.verify(&mut with, q, v)
+    }
+
+    /// Reports a target that is not the nearest allowed one.
+    fn report_rung(&mut self, q: &[f64], v: &[f64], target: &mut Target, rung: Rung) {
+        target.ledger.active.clear();
+        let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
+        target.ledger.violations = verdict.counts;
+        target.ledger.slack = if verdict.worst.is_finite() { verdict.worst } else { f64::MAX };
+        target.ledger.rung = rung;
     }
 
     /// Last rung: every controllable dof takes `-sgn(v) min(A_b, |v| / T)`, inside its box.
@@ -218,12 +329,8 @@ impl Projector {
             let stop = v[i] - v[i].signum() * (self.braking[i] * self.period.dt).min(v[i].abs());
             self.v_next[i] = stop.clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
         }
-        target.ledger.active.clear();
         self.write(q, v, proposal, target);
-        let verdict = self.checker.check(q, v, &target.q, &target.v);
-        target.ledger.violations = verdict.counts;
-        target.ledger.slack = if verdict.worst.is_finite() { verdict.worst } else { f64::MAX };
-        target.ledger.rung = Rung::Brake;
+        self.report_rung(q, v, target, Rung::Brake);
         Status::Braked(reason)
     }
 

@@ -31,7 +31,8 @@ impl Projector {
                     let side = if value > upper { Side::Upper } else { Side::Lower };
                     let kind = if side == Side::Upper { kinds.1 } else { kinds.0 };
                     let multiplier = weight * (value - clamped).abs();
-                    target.ledger.active.push(ActiveRow { kind, dof: i, side, multiplier });
+                    let row = ActiveRow { kind, row: i, side, multiplier, slack: 0.0 };
+                    target.ledger.active.push(row);
                     moved += weight * (value - clamped).powi(2);
                     unchanged = false;
                 }
@@ -39,6 +40,8 @@ impl Projector {
             };
             let kinds = (x.lower_kind, x.upper_kind);
             target.v[i] = clamp(proposal.v[i], b.v_lower[i], b.v_upper[i], self.weight[i], kinds);
+            let v_clamped = target.v[i] != proposal.v[i];
+            let mut q_clamped = false;
             if let Some(iq) = self.dofs.single[i] {
                 let cut =
                     |bound: f64, limit: f64, kind: Kind| if bound == limit { Kind::Position } else { kind };
@@ -48,7 +51,9 @@ impl Projector {
                 );
                 let weight = self.weight[i] * position_weight;
                 target.q[iq] = clamp(proposal.q[iq], b.q_lower[i], b.q_upper[i], weight, kinds);
+                q_clamped = target.q[iq] != proposal.q[iq];
             }
+            self.clamped[i] = [q_clamped, v_clamped];
         }
         for i in 0..v.len() {
             target.acceleration[i] = (target.v[i] - v[i]) / self.period.dt;
@@ -165,6 +170,7 @@ impl Projector {
         let x = &self.intervals[dof];
         let (side, kind) =
             if signed > 0.0 { (Side::Upper, x.upper_kind) } else { (Side::Lower, x.lower_kind) };
-        target.ledger.active.push(ActiveRow { kind, dof, side, multiplier: signed.abs() });
+        let multiplier = signed.abs();
+        target.ledger.active.push(ActiveRow { kind, row: dof, side, multiplier, slack: 0.0 });
     }
 }

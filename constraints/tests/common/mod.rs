@@ -1,6 +1,8 @@
 //! What the tests of the projector share.
 #![allow(dead_code, unreachable_pub)]
 
+pub mod solids;
+
 use nearl_constraints::*;
 use std::path::Path;
 
@@ -27,6 +29,12 @@ pub fn robot(file: &str) -> Model {
         true => Model::from_urdf(&path).unwrap(),
         false => Model::from_mjcf(&path).unwrap(),
     }
+}
+
+/// The robot with a floating base.
+pub fn free(file: &str) -> Model {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/robots").join(file);
+    Model::from_urdf_free_flyer(&path).unwrap()
 }
 
 pub fn panda() -> Model {

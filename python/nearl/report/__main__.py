@@ -12,15 +12,16 @@ def main(arguments: list[str] | None = None) -> int:
     """Writes the report; 0 on success, 1 with one sentence on standard error otherwise."""
     parser = argparse.ArgumentParser(prog="python -m nearl.report", description="One HTML page about runs and flights.")
     several = {"action": "extend", "nargs": "+", "type": Path, "default": []}
+    parser.add_argument("sweeps", metavar="DIR", nargs="*", type=Path, help="folders of many runs, as 'nearl sweep' makes them: one figure, also as a PNG")
     parser.add_argument("--run", metavar="RUN_FOLDER", help="run folders of 'nearl train'; seeds of one task and algorithm share a curve", **several)
     parser.add_argument("--log", metavar="FILE.mcap", help="flight logs of 'nearl run --log'", **several)
     parser.add_argument("--eval", metavar="FILE.json", help="output of 'nearl eval --json'", **several)
     parser.add_argument("--summary", metavar="FILE.json", help="output of 'nearl run --json', or summary.json of 'nearl demo'", **several)
     parser.add_argument("--title", default="NEARL report")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.html")
+    parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE.html")
     given = parser.parse_args(arguments)
     try:
-        build(given.out, runs=given.run, logs=given.log, evals=given.eval, summaries=given.summary, title=given.title)
+        build(given.out, runs=given.run, logs=given.log, evals=given.eval, summaries=given.summary, sweeps=given.sweeps, title=given.title)
     except (ReadError, OSError) as error:
         print(f"nearl.report: {error}", file=sys.stderr)
         return 1

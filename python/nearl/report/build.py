@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from nearl._core import __version__
-from nearl.report import flight, training
+from nearl.report import flight, sweep, training
 from nearl.report.read import Log, ReadError, Run, Summary, read_json, read_log, read_run
+from nearl.report.style import image
 
 Paths = Iterable[str | Path]
 
@@ -36,6 +37,7 @@ def build(
     logs: Paths = (),
     evals: Paths = (),
     summaries: Paths = (),
+    sweeps: Paths = (),
     title: str = "NEARL report",
 ) -> Path:
     """Writes the report.
@@ -46,6 +48,7 @@ def build(
         logs: Flight logs of ``nearl run --log``.
         evals: Output files of ``nearl eval --json``.
         summaries: Output files of ``nearl run --json``, or ``summary.json`` of ``nearl demo``.
+        sweeps: Folders of many runs, as ``nearl sweep`` makes them: drawn in one figure, which is also written as a PNG beside the page.
         title: Heading.
 
     Raises:
@@ -55,25 +58,38 @@ def build(
     trained = [read_run(Path(p)) for p in runs]
     flights = [read_log(Path(p)) for p in logs]
     programs = [read_json(Path(p)) for p in (*evals, *summaries)]
-    if not (trained or flights or programs):
-        raise ReadError("there is nothing to report; give at least one of --run, --log, --eval and --summary")
-    sections = [
+    swept = [run for folder in sweeps for run in sweep.read_sweep(Path(folder))]
+    if not (trained or flights or programs or swept):
+        raise ReadError("there is nothing to report; give a folder of runs, or at least one of --run, --log, --eval and --summary")
+    out = Path(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    sections = [("All runs", _sweep(swept, out.with_suffix(".png")))] if swept else []
+    if trained or flights or programs:
+        sections += _sections(trained, programs, flights)
+    body = "".join(f"<section><h2>{html.escape(name)}</h2>{content}</section>" for name, content in sections)
+    page = (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<title>{html.escape(title)}</title><style>{CSS}</style></head><body><main><h1>{html.escape(title)}</h1>"
+        f'<p class="lead">{html.escape(_about(swept + trained, flights))}</p>{body}</main></body></html>\n'
+    )
+    out.write_text(page, encoding="utf-8")
+    return out
+
+
+def _sweep(runs: list[Run], picture: Path) -> str:
+    figure = sweep.figure(runs)
+    figure.savefig(picture, dpi=170, facecolor="white")
+    return image(figure, sweep.CAPTION) + _table("At the end", sweep.HEAD, sweep.table(runs))
+
+
+def _sections(trained: list[Run], programs: list[Summary], flights: list[Log]) -> list[tuple[str, str]]:
+    return [
         ("Results", _results(trained, programs, flights)),
         ("Learning", _or_sentence(training.learning_curves(trained), trained, "No run folder was given (--run).", "The runs given have no finished episodes.")),
         ("Inverse dynamics", _or_sentence(training.idm_loss(trained), trained, "No run folder was given (--run).", "The runs given learned no inverse model.")),
         ("Constraints while training", _or_sentence(training.violations(trained), trained, "No run folder was given (--run).", "The runs given project nothing.")),
         *_flights(flights),
     ]
-    body = "".join(f"<section><h2>{html.escape(name)}</h2>{content}</section>" for name, content in sections)
-    page = (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>{html.escape(title)}</title><style>{CSS}</style></head><body><main><h1>{html.escape(title)}</h1>"
-        f'<p class="lead">{html.escape(_about(trained, flights))}</p>{body}</main></body></html>\n'
-    )
-    out = Path(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(page, encoding="utf-8")
-    return out
 
 
 def _about(runs: list[Run], logs: list[Log]) -> str:

@@ -33,10 +33,11 @@ def _recorded(log: Log) -> Rows:
     table: dict[tuple[int, str, str], Floats] = {}
     for tick, rows in enumerate(log.active):
         for row in rows:
-            key = (int(row["dof"]), str(row["kind"]), str(row["side"]))
+            key = (int(row["row"]), str(row["kind"]), str(row["side"]))
             table.setdefault(key, np.full(len(log), np.nan))[tick] = row["multiplier"]
     keys = sorted(table)
-    label = [f"{names[dof]} {kind} {_arrow(side)}" for dof, kind, side in keys]
+    of = dict(enumerate(names))
+    label = [f"{of.get(row, f'row {row}')} {kind} {_arrow(side)}" for row, kind, side in keys]
     return Rows(label, np.array([table[k] for k in keys]).reshape(len(keys), len(log)), "multiplier")
 
 

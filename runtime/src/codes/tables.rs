@@ -8,10 +8,14 @@ codes! {
         Solved = "solved", "Torque rows were active; the nearest allowed state was solved for and checked.", "Nothing to do.";
         Recovering = "recovering", "A joint is outside its limits: it may only return or brake.",
             "See which joint in `active_rows`; the position limits of the task may be narrower than where the robot stood.";
+        Slowed = "slowed", "No way to stop could be verified from the nearest allowed state; the target is nearer to the stored brake.",
+            "Nothing to do; if it happens often, lower acceleration or the proposals' size.";
         BrakedNonFiniteProposal = "braked-non-finite-proposal", "The proposal held NaN or infinity; every joint brakes.",
             "Go back to an earlier snapshot: the training diverged.";
         BrakedNoCertifiedAnswer = "braked-no-certified-answer", "No target passed the checker; every joint brakes.",
             "The torque limits leave nothing to do there: run `nearl doctor SNAPSHOT` and loosen what it names.";
+        BrakedNoVerifiedBrake = "braked-no-verified-brake", "No way to stop could be verified; the stored brake is executed.",
+            "Nothing to do; if it happens often, lower acceleration or the proposals' size.";
         BrakedNonFiniteDynamics = "braked-non-finite-dynamics", "The dynamics gave NaN or infinity; every joint brakes.",
             "Check the robot file's masses and the plant's velocities.";
         RefusedNonFiniteState = "refused-non-finite-state", "The measured state held NaN or infinity.",
@@ -22,12 +26,13 @@ codes! {
 }
 
 impl LedgerStatus {
-    /// The number in messages: 0 to 3, 10 and up braked, 20 and up refused.
+    /// The number in messages: 0 to 4, 10 and up braked, 20 and up refused.
     pub fn number(self) -> u32 {
         match self {
             LedgerStatus::BrakedNonFiniteProposal => 10,
             LedgerStatus::BrakedNoCertifiedAnswer => 11,
             LedgerStatus::BrakedNonFiniteDynamics => 12,
+            LedgerStatus::BrakedNoVerifiedBrake => 13,
             LedgerStatus::RefusedNonFiniteState => 20,
             LedgerStatus::RefusedWrongLength => 21,
             plain => plain.code(),

@@ -35,6 +35,7 @@ impl Parts {
         let settings = Settings {
             consistency: m.task.constraints.consistency,
             solver: m.task.constraints.solver,
+            braking: m.task.constraints.braking,
             ..Settings::new(m.task.time.dt, m.task.sub_steps() as u32)
         };
         let projector = Projector::new(&model, &limits, layout.controllable(), settings)

@@ -4,6 +4,7 @@
 
 use std::borrow::Cow;
 
+use nearl_constraints::Kind;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::link::{Message, StateMessage};
@@ -156,10 +157,12 @@ struct LedgerJson {
 #[serde(deny_unknown_fields)]
 struct RowJson {
     kind: Cow<'static, str>,
-    dof: u16,
+    row: u16,
     side: Cow<'static, str>,
     #[serde(deserialize_with = "number")]
     multiplier: f64,
+    #[serde(deserialize_with = "number")]
+    slack: f64,
 }
 
 /// Writes `record` as one JSON object into `out` (cleared first). Vectors of a tick without an action are empty.
@@ -231,10 +234,11 @@ fn state_json(state: &StateMessage) -> StateJson<'_> {
 fn ledger_json(record: &Record) -> LedgerJson {
     let ledger = record.step.ledger;
     let row = |row: &Row| RowJson {
-        kind: Row::KINDS[usize::from(row.kind)].into(),
-        dof: row.dof,
+        kind: Kind::ALL[usize::from(row.kind)].name().into(),
+        row: row.row,
         side: Row::SIDES[usize::from(row.side)].into(),
         multiplier: row.multiplier,
+        slack: row.slack,
     };
     LedgerJson {
         status: ledger.status,

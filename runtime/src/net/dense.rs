@@ -13,7 +13,7 @@ pub struct DenseLayer {
     pub bias: Vec<f32>,
 }
 
-/// Affine layers with tanh between them; the last is linear.
+/// Affine layers with an [`Activation`](super::Activation) between them; the last is linear.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Dense {
     /// First to last.

@@ -1,7 +1,8 @@
 //! The forward pass of one sample: what runs in the control loop.
 
+use super::activation::Activation;
 use super::dense::Dense;
-use super::kernel::{LANES, V, ZERO, scalars, tanh};
+use super::kernel::{LANES, V, ZERO, scalars};
 use super::mlp::{Layer, Mlp};
 
 /// A network and its activations. Nothing is allocated after construction.
@@ -14,10 +15,10 @@ pub struct Forward {
 }
 
 impl Forward {
-    /// Packs a network.
-    pub fn from_dense(dense: &Dense) -> Self {
+    /// Packs a network with `activation` between its layers.
+    pub fn new(dense: &Dense, activation: Activation) -> Self {
         let mut len = 0;
-        let mlp = Mlp::new(&dense.widths(), false, &mut len);
+        let mlp = Mlp::new(&dense.widths(), activation, &mut len);
         let mut params = vec![ZERO; len];
         mlp.write_dense(dense, &mut params);
         let activations = dense.widths().iter().map(|w| vec![ZERO; w.div_ceil(LANES)]).collect();
@@ -51,13 +52,14 @@ fn body(net: &mut Forward) {
     let last = net.mlp.layers.len() - 1;
     for (i, layer) in net.mlp.layers.iter().enumerate() {
         let (before, after) = net.activations.split_at_mut(i + 1);
-        affine(layer, &net.params, scalars(&before[i]), &mut after[0], i < last || net.mlp.tanh_last);
+        let between = (i < last).then_some(net.mlp.activation);
+        affine(layer, &net.params, scalars(&before[i]), &mut after[0], between);
     }
 }
 
 /// `y = f(W' x + b)`; each output's sum runs over the inputs in four interleaved chains, in a fixed order.
 #[inline(always)]
-fn affine(l: &Layer, params: &[V], x: &[f32], y: &mut [V], squash: bool) {
+fn affine(l: &Layer, params: &[V], x: &[f32], y: &mut [V], between: Option<Activation>) {
     let n = l.n_vectors();
     let (w, b) = (&params[l.w..l.b], &params[l.b..l.b + n]);
     let x = &x[..l.k];
@@ -75,7 +77,11 @@ fn affine(l: &Layer, params: &[V], x: &[f32], y: &mut [V], squash: bool) {
             k += 1;
         }
         let sum = ((acc[0] + acc[1]) + (acc[2] + acc[3])) + b[j];
-        y[j] = if squash { tanh(sum) } else { sum };
+        // no closure: it would be compiled without the vector instructions of its caller
+        y[j] = match between {
+            Some(f) => f.apply(sum),
+            None => sum,
+        };
     }
 }
 
@@ -101,31 +107,40 @@ mod tests {
         Dense { layers: widths.windows(2).map(|d| layer(d, &mut next)).collect() }
     }
 
-    /// The textbook sum in f64 with the library's tanh.
-    fn reference(net: &Dense, x: &[f32]) -> Vec<f64> {
+    /// The textbook sum in f64 with the library's functions.
+    fn reference(net: &Dense, f: fn(f64) -> f64, x: &[f32]) -> Vec<f64> {
         let mut h: Vec<f64> = x.iter().map(|&v| f64::from(v)).collect();
         for (i, l) in net.layers.iter().enumerate() {
             let row = |n: usize| {
                 l.weight[n * l.n_in..][..l.n_in].iter().zip(&h).map(|(&w, x)| f64::from(w) * x).sum::<f64>()
             };
             let y: Vec<f64> = (0..l.n_out).map(|n| row(n) + f64::from(l.bias[n])).collect();
-            h = if i + 1 < net.layers.len() { y.iter().map(|v| v.tanh()).collect() } else { y };
+            h = if i + 1 < net.layers.len() { y.iter().map(|v| f(*v)).collect() } else { y };
         }
         h
     }
+
+    type Function = fn(f64) -> f64;
+    const FUNCTIONS: [(Activation, Function); 2] =
+        [(Activation::Tanh, f64::tanh), (Activation::Relu, |x| x.max(0.0))];
 
     #[test]
     fn forward_equals_the_textbook_sum() {
         for widths in [vec![17, 32, 32, 17], vec![3, 5, 1], vec![105, 32, 32, 8], vec![4, 2]] {
             let net = network(&widths);
-            let mut forward = Forward::from_dense(&net);
-            for s in 0..50 {
-                let x: Vec<f32> =
-                    (0..widths[0]).map(|i| ((i * 7 + s * 13) as f32 * 0.37).sin() * 2.0).collect();
-                let (y, want) = (forward.forward(&x).to_vec(), reference(&net, &x));
-                assert_eq!(y.len(), want.len());
-                for (y, w) in y.iter().zip(want) {
-                    assert!((f64::from(*y) - w).abs() < 5e-6, "{y} {w}");
+            for (activation, f) in FUNCTIONS {
+                let mut forward = Forward::new(&net, activation);
+                for s in 0..50 {
+                    let x: Vec<f32> =
+                        (0..widths[0]).map(|i| ((i * 7 + s * 13) as f32 * 0.37).sin() * 2.0).collect();
+                    let (y, want) = (forward.forward(&x).to_vec(), reference(&net, f, &x));
+                    assert_eq!(y.len(), want.len());
+                    for (y, w) in y.iter().zip(want) {
+                        assert!(
+                            (f64::from(*y) - w).abs() < 5e-6 * (1.0 + w.abs()),
+                            "{activation:?}: {y} {w}"
+                        );
+                    }
                 }
             }
         }
@@ -135,7 +150,7 @@ mod tests {
     fn tensors_survive_packing() {
         let net = network(&[19, 32, 7]);
         let mut len = 3;
-        let mlp = Mlp::new(&net.widths(), false, &mut len);
+        let mlp = Mlp::new(&net.widths(), Activation::Tanh, &mut len);
         let mut p = vec![ZERO; len];
         mlp.write_dense(&net, &mut p);
         assert_eq!(mlp.to_dense(&p), net);

@@ -4,6 +4,7 @@
 //! Lanes run over output features and every element's sum runs over `k` in order, so no result depends on
 //! the width of the processor's vectors: the baseline, AVX2 and AVX-512 give the same bits.
 
+use super::activation::Activation;
 use std::sync::atomic::{AtomicU8, Ordering};
 
 /// Lanes of one vector.
@@ -139,14 +140,14 @@ fn horner(c: &[f32], x: V) -> V {
 pub enum Out<'a> {
     /// Add a bias (n vectors).
     Bias(&'a [V]),
-    /// Add a bias (n vectors), then tanh.
-    BiasTanh(&'a [V]),
+    /// Add a bias (n vectors), then apply the activation.
+    BiasThen(&'a [V], Activation),
     /// As it is.
     Store,
     /// Add to what is there.
     Accumulate,
-    /// Times `1 - h^2`: the derivative of tanh at its output `h` (same layout as the product).
-    TimesDtanh(&'a [V]),
+    /// Times the activation's derivative at its output `h` (same layout as the product).
+    TimesDerivative(&'a [V], Activation),
 }
 
 /// `C = f(A B)`: A is (m x k) with element (i, p) at `a[i rs + p cs]`, row p of B starts at `b[p ldb]`,
@@ -206,13 +207,10 @@ fn block<const M: usize, const N: usize>(g: &Gemm<'_>, c: &mut [V], i0: usize, j
                 let v = acc[i][j];
                 *to = match g.out {
                     Out::Bias(b) => v + *b.get_unchecked(j0 + j),
-                    Out::BiasTanh(b) => tanh(v + *b.get_unchecked(j0 + j)),
+                    Out::BiasThen(b, f) => f.apply(v + *b.get_unchecked(j0 + j)),
                     Out::Store => v,
                     Out::Accumulate => v + *to,
-                    Out::TimesDtanh(h) => {
-                        let h = *h.get_unchecked(at);
-                        v - v * h * h
-                    }
+                    Out::TimesDerivative(h, f) => f.times_derivative(v, *h.get_unchecked(at)),
                 };
             }
         }
@@ -228,8 +226,8 @@ fn gemm_body<const WIDE: bool>(g: &Gemm<'_>, c: &mut [V]) {
     assert!(g.m.is_multiple_of(8) && c.len() >= last_c);
     assert!(g.a.len() > (g.m - 1) * g.rs + (g.k - 1) * g.cs && g.b.len() >= (g.k - 1) * g.ldb + g.n);
     match g.out {
-        Out::Bias(b) | Out::BiasTanh(b) => assert!(b.len() >= g.n),
-        Out::TimesDtanh(h) => assert!(h.len() >= last_c),
+        Out::Bias(b) | Out::BiasThen(b, _) => assert!(b.len() >= g.n),
+        Out::TimesDerivative(h, _) => assert!(h.len() >= last_c),
         Out::Store | Out::Accumulate => {}
     }
     let mut j = 0;

@@ -1,5 +1,6 @@
 //! Where the layers of a network lie in one flat, padded parameter vector.
 
+use super::activation::Activation;
 use super::dense::{Dense, DenseLayer};
 use super::kernel::{LANES, V, scalars, scalars_mut};
 
@@ -39,18 +40,18 @@ impl Layer {
     }
 }
 
-/// Shapes and offsets of a network with tanh between its layers.
+/// Shapes and offsets of a network; its last layer is linear.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mlp {
     /// First to last.
     pub layers: Vec<Layer>,
-    /// Whether the last layer has tanh too.
-    pub tanh_last: bool,
+    /// What lies between the layers.
+    pub activation: Activation,
 }
 
 impl Mlp {
     /// `widths` from input to output; `at` is the running length of the parameter vector, in vectors.
-    pub fn new(widths: &[usize], tanh_last: bool, at: &mut usize) -> Self {
+    pub fn new(widths: &[usize], activation: Activation, at: &mut usize) -> Self {
         let layers = widths
             .windows(2)
             .map(|d| {
@@ -60,7 +61,7 @@ impl Mlp {
                 layer
             })
             .collect();
-        Self { layers, tanh_last }
+        Self { layers, activation }
     }
 
     /// Inputs.

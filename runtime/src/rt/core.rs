@@ -357,6 +357,8 @@ fn braked_reason(status: u32) -> Reason {
         Reason::NonFiniteProposal
     } else if status == LedgerStatus::BrakedNonFiniteDynamics.number() {
         Reason::NonFiniteDynamics
+    } else if status == LedgerStatus::BrakedNoVerifiedBrake.number() {
+        Reason::NoVerifiedBrake
     } else {
         Reason::NoCertifiedAnswer
     }

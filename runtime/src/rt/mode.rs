@@ -53,6 +53,8 @@ codes! {
             "See the status of the tick in the flight log, then `nearl explain STATUS`.";
         NonFiniteProposal = "non-finite-proposals", "The policy proposed NaN or infinity several ticks in a row.",
             "Go back to an earlier snapshot: the training diverged.";
+        NoVerifiedBrake = "no-verified-brakes", "Several ticks in a row no way to stop could be verified; the stored brake ran.",
+            "Lower acceleration or the proposals' size.";
         NoCertifiedAnswer = "no-certified-answers", "Several ticks in a row no target passed the checker.",
             "The limits leave nothing to do there: run `nearl doctor SNAPSHOT` and loosen what it names.";
         NonFiniteDynamics = "non-finite-dynamics", "Several ticks in a row the dynamics gave NaN or infinity.",

@@ -1,6 +1,6 @@
 //! The controller of a snapshot in the loop: states in, [`Controller::update`], numbers out.
 
-use nearl_constraints::{BrakeReason, Entry, Kind, Ledger, RefuseReason, Rung, Side, Status};
+use nearl_constraints::{BrakeReason, Entry, Ledger, RefuseReason, Rung, Side, Status};
 
 use crate::codes::LedgerStatus;
 use crate::controller::{Controller, Noise, Output, State};
@@ -90,15 +90,9 @@ fn checked(controller: &Controller) -> Vec<(usize, usize, f64)> {
 
 fn write_rows(ledger: &Ledger, step: &mut Step) {
     for (row, active) in step.rows.iter_mut().zip(ledger.active.iter().take(MAX_ROWS)) {
-        let kind = match active.kind {
-            Kind::Position => 0,
-            Kind::Velocity => 1,
-            Kind::Acceleration => 2,
-            Kind::Viability => 3,
-            Kind::Torque => 4,
-        };
         let side = u8::from(active.side == Side::Upper);
-        *row = Row { kind, side, dof: active.dof as u16, multiplier: active.multiplier };
+        let (kind, number) = (active.kind as u8, active.row as u16);
+        *row = Row { kind, side, row: number, multiplier: active.multiplier, slack: active.slack };
     }
 }
 
@@ -202,6 +196,8 @@ fn status(status: Status) -> LedgerStatus {
         Status::Clamped => LedgerStatus::Clamped,
         Status::Solved => LedgerStatus::Solved,
         Status::Recovering => LedgerStatus::Recovering,
+        Status::Slowed => LedgerStatus::Slowed,
+        Status::Braked(BrakeReason::NoVerifiedBrake) => LedgerStatus::BrakedNoVerifiedBrake,
         Status::Braked(BrakeReason::NonFiniteProposal) => LedgerStatus::BrakedNonFiniteProposal,
         Status::Braked(BrakeReason::NoCertifiedAnswer) => LedgerStatus::BrakedNoCertifiedAnswer,
         Status::Braked(BrakeReason::NonFiniteDynamics) => LedgerStatus::BrakedNonFiniteDynamics,
@@ -219,6 +215,8 @@ pub fn numbers(ledger: &Ledger) -> LedgerNumbers {
             Rung::ActiveSet => 1,
             Rung::Clarabel => 2,
             Rung::Brake => 3,
+            Rung::Relaxed => 4,
+            Rung::StoredBrake => 5,
         },
         active: ledger.active.len() as u32,
         iterations: ledger.iterations,

@@ -87,19 +87,19 @@ pub const MAX_ROWS: usize = 96;
 /// A row that holds the target back, as plain numbers.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Row {
-    /// Place in `position, velocity, acceleration, viability, torque`.
+    /// Place in [`Kind::ALL`](nearl_constraints::Kind::ALL).
     pub kind: u8,
     /// 0 for the lower, 1 for the upper bound.
     pub side: u8,
-    /// Degree of freedom.
-    pub dof: u16,
+    /// Number of the row: the degree of freedom, or beyond those a coupled row.
+    pub row: u16,
     /// How hard it is leaned on, see [`nearl_constraints::ActiveRow`].
     pub multiplier: f64,
+    /// By how much a soft row is exceeded, as a share of its size.
+    pub slack: f64,
 }
 
 impl Row {
-    /// Names of the kinds by their number.
-    pub const KINDS: [&str; 5] = ["position", "velocity", "acceleration", "viability", "torque"];
     /// Names of the bounds by their number.
     pub const SIDES: [&str; 2] = ["lower", "upper"];
 }

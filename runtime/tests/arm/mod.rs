@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use nearl_constraints::{Dynamics, Model};
 use nearl_runtime::link::*;
-use nearl_runtime::net::{Dense, DenseLayer};
+use nearl_runtime::net::{Activation, Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::rt::*;
 use nearl_runtime::snapshot::{FORMAT, ModelFormat};
@@ -46,6 +46,7 @@ pub fn snapshot(version: u64, change: impl FnOnce(&mut Manifest)) -> Snapshot {
         model: URDF.into(),
         algo: "random".into(),
         policy: PolicyKind::Deterministic,
+        activation: Activation::default(),
         version,
         steps: 0,
         action_lower: effort.iter().map(|e| -e).collect(),

@@ -101,7 +101,7 @@ impl TrainBench {
             rates.push((training.snapshot().manifest.steps - from) as f64 / seconds);
             shares.push(training.learning_seconds() / seconds);
             let physics = env::bench::physics(
-                &request.manifest.task.name,
+                make_env(training.snapshot())?.as_ref(),
                 cores(),
                 Duration::from_secs_f64(self.seconds.min(3.0)),
             )?;

@@ -43,17 +43,18 @@ impl Eval {
         }
         say(format!("{}, {} episodes", snapshot.manifest.task.name, self.episodes));
         say(
-            "                    raw proposals   targets   reached states   already outside   |reached - target|",
+            "                              raw proposals   targets   reached states   already outside   |reached - target|",
         );
         say(
-            "mode        return  outside limits  outside          outside     (recovering)     [std of change]",
+            "mode        return      cost  outside limits  outside          outside     (recovering)     [std of change]",
         );
         for e in &results {
             let percent = |n: u64| 100.0 * n as f64 / e.ticks.max(1) as f64;
             say(format!(
-                "{:<10}{:>8.1}{:>14.2} %{:>7.2} %{:>15.2} %{:>15.2} %{:>20.3}",
+                "{:<10}{:>8.1}{:>10.1}{:>14.2} %{:>7.2} %{:>15.2} %{:>15.2} %{:>20.3}",
                 e.mode,
                 e.mean_return(),
+                e.mean_cost(),
                 percent(e.raw_violations),
                 percent(e.target_violations),
                 percent(e.reached_violations),

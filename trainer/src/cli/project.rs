@@ -34,7 +34,7 @@ impl Project {
         let mut manifest = tasks::load(&self.task, &self.set)?;
         crate::train::complete(&mut manifest)?;
         let Parts { model, mut projector, .. } = Parts::new(&manifest)?;
-        let mut target = Target::new(&model);
+        let (mut target, names) = (Target::new(&model), projector.row_names());
         for (i, line) in std::io::stdin().lock().lines().enumerate() {
             let line = line.map_err(|e| format!("standard input, line {}: {e}", i + 1))?;
             if line.trim().is_empty() {
@@ -48,8 +48,8 @@ impl Project {
                 .active
                 .iter()
                 .map(|a| {
-                    let (kind, side) = (format!("{:?}", a.kind), format!("{:?}", a.side));
-                    serde_json::json!({ "kind": kind.to_lowercase(), "joint": joint(&model, a.dof), "side": side.to_lowercase(), "multiplier": a.multiplier })
+                    let (kind, side) = (a.kind.name(), format!("{:?}", a.side));
+                    serde_json::json!({ "kind": kind, "name": names[a.row], "side": side.to_lowercase(), "multiplier": a.multiplier, "slack": a.slack })
                 })
                 .collect();
             say(serde_json::json!({
@@ -60,10 +60,6 @@ impl Project {
         }
         Ok(())
     }
-}
-
-fn joint(model: &Model, dof: usize) -> &str {
-    model.joints().iter().find(|j| (j.idx_v..j.idx_v + j.nv).contains(&dof)).map_or("", |j| &j.name)
 }
 
 fn parse(line: &str, model: &Model) -> Result<Line, String> {

@@ -1,7 +1,7 @@
 //! `nearl tasks`.
 
 use super::{Failure, say};
-use crate::{env, tasks};
+use crate::tasks;
 use clap::Args;
 
 #[derive(Args)]
@@ -13,14 +13,15 @@ pub(super) struct Tasks {
 
 impl Tasks {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let about = |name: &str| env::REGISTRY.iter().find(|e| e.name == name).map_or("", |e| e.about);
         if self.json {
-            let list: Vec<_> =
-                tasks::names().iter().map(|n| serde_json::json!({ "name": n, "about": about(n) })).collect();
+            let list: Vec<_> = tasks::names()
+                .iter()
+                .map(|n| serde_json::json!({ "name": n, "about": tasks::about(n) }))
+                .collect();
             say(serde_json::to_string_pretty(&list)?);
         } else {
             for name in tasks::names() {
-                say(format!("{name:<16}{}", about(name)));
+                say(format!("{name:<24}{}", tasks::about(name)));
             }
         }
         Ok(())

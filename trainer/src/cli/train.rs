@@ -1,11 +1,12 @@
 //! `nearl train`.
 
 use super::{Failure, cores, say};
+use crate::checkpoint::{self, Checkpoint};
 use crate::train::{Progress, Request, train};
 use crate::{run_folder, tasks};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -13,30 +14,34 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub(super) struct Train {
     /// Task name (see `nearl tasks`) or TOML file.
     task: String,
-    /// Algorithm: ppo, pid2-gan or pid2-ib.
-    #[arg(long, default_value = "pid2-ib")]
+    /// Algorithm: ppo, nearl, pid2-gan or pid2-ib.
+    #[arg(long, default_value = "pid2-ib", conflicts_with = "resume")]
     algo: String,
-    /// Environment steps; 1_000_000 and 1e6 are both read.
-    #[arg(long, default_value = "1000000", value_parser = steps)]
-    steps: u64,
+    /// Environment steps; 1_000_000 and 1e6 are both read. 1e6 when absent, with --resume what the run was started with.
+    #[arg(long, value_parser = steps)]
+    steps: Option<u64>,
     /// Seed of everything random; the same seed gives the same weights.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, conflicts_with = "resume")]
     seed: u64,
     /// Run folder; `runs/<task>/<algo>_<seed>` when absent.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "resume")]
     out: Option<PathBuf>,
+    /// Go on with the run in this folder, with the settings it was started with: the result is the same, bit for bit, as
+    /// if it had never stopped.
+    #[arg(long, value_name = "DIR")]
+    resume: Option<PathBuf>,
     /// Threads; all cores when absent. The result does not depend on it.
     #[arg(long)]
     threads: Option<usize>,
     /// Overrides of the task file, e.g. `constraints.velocity.scale=0.8`.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
+    #[arg(long = "set", value_name = "KEY=VALUE", conflicts_with = "resume")]
     set: Vec<String>,
     /// Print one JSON object an iteration instead of a progress bar.
     #[arg(long)]
     json: bool,
 }
 
-fn steps(text: &str) -> Result<u64, String> {
+pub(super) fn steps(text: &str) -> Result<u64, String> {
     let clean = text.replace('_', "");
     match clean.parse::<f64>() {
         Ok(n) if n >= 1.0 && n.fract() == 0.0 && n < 1e15 => Ok(n as u64),
@@ -44,43 +49,84 @@ fn steps(text: &str) -> Result<u64, String> {
     }
 }
 
+/// Steps of a training that does not say.
+const STEPS: u64 = 1_000_000;
+
+/// What is told about a run.
+struct Run {
+    name: String,
+    algo: String,
+    steps: u64,
+}
+
+impl Run {
+    /// What the checkpoint in `folder` says; it must be of `task`.
+    fn resumed(folder: &Path, task: &str, steps: Option<u64>) -> Result<Self, Failure> {
+        let header = Checkpoint::load(&checkpoint::path_in(folder))?.header;
+        let name = header.manifest.task.name;
+        if name != task {
+            let folder = folder.display();
+            return Err(format!(
+                "run '{folder}' trains '{name}', not '{task}'; write 'nearl train {name} --resume {folder}'"
+            )
+            .into());
+        }
+        Ok(Self { name, algo: header.manifest.algo, steps: steps.unwrap_or(header.total) })
+    }
+}
+
 impl Train {
     pub(super) fn run(self) -> Result<(), Failure> {
         let mut manifest = tasks::load(&self.task, &self.set)?;
         crate::train::complete(&mut manifest)?;
-        let name = manifest.task.name.clone();
-        let out =
-            self.out.unwrap_or_else(|| PathBuf::from(format!("runs/{name}/{}_{}", self.algo, self.seed)));
-        let request = Request {
-            manifest,
-            algo: self.algo,
-            steps: self.steps,
-            seed: self.seed,
-            threads: self.threads.unwrap_or_else(cores),
+        let run = match &self.resume {
+            Some(folder) => Run::resumed(folder, &manifest.task.name, self.steps)?,
+            None => Run {
+                name: manifest.task.name.clone(),
+                algo: self.algo.clone(),
+                steps: self.steps.unwrap_or(STEPS),
+            },
         };
+        let out = self
+            .resume
+            .clone()
+            .or(self.out)
+            .unwrap_or_else(|| PathBuf::from(format!("runs/{}/{}_{}", run.name, run.algo, self.seed)));
+        let threads = self.threads.unwrap_or_else(cores);
         let stop = Arc::new(AtomicBool::new(false));
         for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
             // the second signal ends the program at once
             signal_hook::flag::register_conditional_shutdown(signal, 1, Arc::clone(&stop))?;
             signal_hook::flag::register(signal, Arc::clone(&stop))?;
         }
-        let bar = bar(self.json, request.steps);
+        let bar = bar(self.json, run.steps);
         let mut last = None;
-        let saved = train(&request, &out, |p, _| {
+        let report = |p: &Progress, _| {
             show(&bar, self.json, p);
             last = Some((p.steps, p.seconds, p.return_mean));
             !stop.load(Ordering::Relaxed)
-        })?;
+        };
+        let saved = match &self.resume {
+            Some(folder) => crate::train::resume(folder, self.steps, threads, report)?,
+            None => {
+                let (algo, steps) = (run.algo.clone(), run.steps);
+                train(&Request { manifest, algo, steps, seed: self.seed, threads }, &out, report)?
+            }
+        };
         bar.finish_and_clear();
-        let (steps, seconds, mean) = last.unwrap_or((0, 0.0, f64::NAN));
+        let Some((steps, seconds, mean)) = last else {
+            say(format!("{} has its {} steps already; give more with --steps", out.display(), run.steps));
+            return Ok(());
+        };
         if self.json {
             say(
                 serde_json::json!({ "run": out, "snapshot": saved, "steps": steps, "seconds": seconds, "return": mean }),
             );
         } else {
             say(format!(
-                "{name} {}: return {mean:.0} (mean of the last 100 episodes) after {steps} steps in {seconds:.0} s, {:.0} steps/s",
-                request.algo,
+                "{} {}: return {mean:.0} (mean of the last 100 episodes) after {steps} steps in {seconds:.0} s, {:.0} steps/s",
+                run.name,
+                run.algo,
                 steps as f64 / seconds
             ));
             say(format!(
@@ -89,10 +135,12 @@ impl Train {
                 run_folder::snapshot_of(&out)?.display()
             ));
         }
-        if stop.load(Ordering::Relaxed) && steps < request.steps {
+        if stop.load(Ordering::Relaxed) && steps < run.steps {
             say(format!(
-                "stopped by a signal after {steps} of {} steps; what was learned is saved",
-                request.steps
+                "stopped by a signal after {steps} of {} steps; go on with 'nearl train {} --resume {}'",
+                run.steps,
+                self.task,
+                out.display()
             ));
         }
         Ok(())

@@ -3,6 +3,8 @@
 //! `reward = (x' - x) / dt + 1 [healthy] - 0.5 |a|^2 - 0.0005 |clip(cfrc, -1, 1)|^2`, where `x` is the torso's; healthy while
 //! `0.2 <= z <= 1` and the state is finite. Source: gymnasium 1.4.0, `envs/mujoco/ant_v5.py`.
 
+use std::borrow::Cow;
+
 use rand_chacha::ChaCha8Rng;
 
 use super::rules::{Robot, Rules, add_normal, add_uniform, squared};
@@ -13,8 +15,10 @@ use crate::mj::{MjError, Model, ModelFormat, Options, Sim};
 
 pub(super) const NAME: &str = "Ant-v5";
 pub(super) const ABOUT: &str = "quadruped on a free base, walk forward; 105 observations, 8 actions";
-const ROBOT: Robot =
-    Robot { text: include_str!("../../../examples/robots/gymnasium/ant.xml"), format: ModelFormat::Mjcf };
+const ROBOT: Robot = Robot {
+    text: Cow::Borrowed(include_str!("../../../examples/robots/gymnasium/ant.xml")),
+    format: ModelFormat::Mjcf,
+};
 const TORSO: usize = 1;
 const RESET_NOISE: f64 = 0.1;
 const CONTROL_COST: f64 = 0.5;
@@ -24,9 +28,9 @@ const CONTACT_COST: f64 = 5e-4;
 struct Ant;
 
 pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
-    let physics = |source| EnvError::Physics { task: NAME, source };
-    let model = Model::from_text(ROBOT.text, ROBOT.format, Options::default()).map_err(physics)?;
-    let task = Constants { name: NAME, sub_steps: 5, max_episode_steps: 1000 };
+    let physics = |source| EnvError::Physics { task: NAME.into(), source };
+    let model = Model::from_text(&ROBOT.text, ROBOT.format, Options::default()).map_err(physics)?;
+    let task = Constants { name: NAME.into(), sub_steps: 5, max_episode_steps: 1000 };
     let spec = Spec::new(&model, task, names(&model), model.actuators());
     Ok(Simulated::boxed(spec, ROBOT, Ant, Sim::new(&model).map_err(physics)?))
 }

@@ -7,7 +7,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
-use super::{Env, EnvError, make};
+use super::{Env, EnvError};
 
 /// Environments each thread goes round, as a rollout does.
 const ENVS: usize = 8;
@@ -28,13 +28,12 @@ impl Physics {
     }
 }
 
-/// Steps `task` with uniform random actions on `threads` threads for about `duration`, observing every state and starting a
+/// Steps copies of `first` with uniform random actions on `threads` threads for about `duration`, observing every state and starting a
 /// new episode at every end. Nothing is learned: this is what training cannot exceed.
 ///
 /// # Errors
-/// [`EnvError`] of [`make`] and [`Env::reset`].
-pub fn physics(task: &str, threads: usize, duration: Duration) -> Result<Physics, EnvError> {
-    let first = make(task)?;
+/// [`EnvError`] of [`Env::another`] and [`Env::reset`].
+pub fn physics(first: &dyn Env, threads: usize, duration: Duration) -> Result<Physics, EnvError> {
     let mut gangs = Vec::new();
     for _ in 0..threads.max(1) {
         gangs.push((0..ENVS).map(|_| first.another()).collect::<Result<Vec<_>, _>>()?);

@@ -19,7 +19,7 @@ const CONTROL_COST: f64 = 0.1;
 struct HalfCheetah;
 
 pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
-    planar::build(Constants { name: NAME, sub_steps: 5, max_episode_steps: 1000 }, ROBOT, HalfCheetah)
+    planar::build(Constants { name: NAME.into(), sub_steps: 5, max_episode_steps: 1000 }, ROBOT, HalfCheetah)
 }
 
 impl Rules for HalfCheetah {

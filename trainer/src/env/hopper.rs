@@ -21,7 +21,7 @@ const OBSERVED_SPEED: f64 = 10.0;
 struct Hopper;
 
 pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
-    planar::build(Constants { name: NAME, sub_steps: 4, max_episode_steps: 1000 }, ROBOT, Hopper)
+    planar::build(Constants { name: NAME.into(), sub_steps: 4, max_episode_steps: 1000 }, ROBOT, Hopper)
 }
 
 fn healthy(sim: &Sim) -> bool {

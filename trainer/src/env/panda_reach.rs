@@ -12,6 +12,8 @@
 //! bonus of the same size within about 5 cm that makes holding still at the goal the best thing to do. A period of a 50 Hz
 //! policy is 20 of these; an episode (2 s) returns about -9 for holding the start and +14 for going straight to the goal.
 
+use std::borrow::Cow;
+
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
@@ -24,8 +26,10 @@ use crate::mj::{Actuator, Joint, MjError, Model, ModelFormat, Options, Sim};
 pub(super) const NAME: &str = "Panda-reach";
 pub(super) const ABOUT: &str =
     "seven-joint arm under torque control, reach a point; 20 observations, 7 actions";
-const ROBOT: Robot =
-    Robot { text: include_str!("../../../examples/robots/panda/panda.urdf"), format: ModelFormat::Urdf };
+const ROBOT: Robot = Robot {
+    text: Cow::Borrowed(include_str!("../../../examples/robots/panda/panda.urdf")),
+    format: ModelFormat::Urdf,
+};
 const HAND: &str = "panda_hand";
 const DT: f64 = 1e-3;
 /// Pose to start from \[rad\]: elbow bent, hand in front of the base and pointing down.
@@ -58,9 +62,9 @@ struct PandaReach {
 }
 
 pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
-    let physics = |source| EnvError::Physics { task: NAME, source };
+    let physics = |source| EnvError::Physics { task: NAME.into(), source };
     let options = Options { sim_dt: Some(DT), without_contacts: true, explicit_damping: true };
-    let model = Model::from_text(ROBOT.text, ROBOT.format, options).map_err(physics)?;
+    let model = Model::from_text(&ROBOT.text, ROBOT.format, options).map_err(physics)?;
     let joints = model.joints();
     let expected = READY.len();
     if joints.len() != expected || model.nq() != expected {
@@ -72,7 +76,7 @@ pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
     }
     let mut names = joint_names(&model, 0);
     names.extend(["goal.x", "goal.y", "goal.z", "error.x", "error.y", "error.z"].map(String::from));
-    let task = Constants { name: NAME, sub_steps: 1, max_episode_steps: 2000 };
+    let task = Constants { name: NAME.into(), sub_steps: 1, max_episode_steps: 2000 };
     let spec = Spec::new(&model, task, names, joints.iter().map(torque).collect());
     let ranges =
         std::array::from_fn(|j| [joints[j].range[0] + LIMIT_MARGIN, joints[j].range[1] - LIMIT_MARGIN]);

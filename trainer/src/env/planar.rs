@@ -13,11 +13,12 @@ pub(super) fn build<R: Rules>(
     text: &'static str,
     rules: R,
 ) -> Result<Box<dyn Env>, EnvError> {
-    let physics = |source| EnvError::Physics { task: task.name, source };
-    let robot = Robot { text, format: ModelFormat::Mjcf };
+    let physics = |source| EnvError::Physics { task: task.name.clone(), source };
+    let robot = Robot { text: text.into(), format: ModelFormat::Mjcf };
     let model = Model::from_text(text, robot.format, Options::default()).map_err(physics)?;
+    let sim = Sim::new(&model).map_err(physics)?;
     let spec = Spec::new(&model, task, joint_names(&model, 1), model.actuators());
-    Ok(Simulated::boxed(spec, robot, rules, Sim::new(&model).map_err(physics)?))
+    Ok(Simulated::boxed(spec, robot, rules, sim))
 }
 
 /// `[q_1 .., v_0 ..]` with the velocities clipped to `[-clip, clip]`.

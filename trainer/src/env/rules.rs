@@ -1,5 +1,7 @@
 //! What a task adds to a simulated robot: the extension point of this folder.
 
+use std::borrow::Cow;
+
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -9,9 +11,9 @@ use crate::mj::{MjError, Model, ModelFormat, Sim};
 use super::spec::Spec;
 
 /// A robot file and how a task simulates it.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct Robot {
-    pub(super) text: &'static str,
+    pub(super) text: Cow<'static, str>,
     pub(super) format: ModelFormat,
 }
 
@@ -26,6 +28,9 @@ pub(super) trait Rules: Clone + Send + 'static {
         qpos: &mut [f64],
         qvel: &mut [f64],
     ) -> Result<(), MjError>;
+
+    /// Remembers what a period begins with, for the rules that compare more than [`Rules::progress`].
+    fn begin(&mut self, _sim: &Sim) {}
 
     /// Hands the action (n_act) to the plant.
     fn actuate(&self, _spec: &Spec, sim: &mut Sim, action: &[f64]) {

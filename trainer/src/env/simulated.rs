@@ -33,13 +33,13 @@ impl<R: Rules> Simulated<R> {
     }
 
     fn physics(&self) -> impl Fn(MjError) -> EnvError + use<R> {
-        let task = self.spec.name;
-        move |source| EnvError::Physics { task, source }
+        let task = self.spec.name.clone();
+        move |source| EnvError::Physics { task: task.clone(), source }
     }
 
     fn faulty(&mut self, fault: Fault) -> Step {
         self.counters.faults += 1;
-        Step { reward: 0.0, terminated: true, fault }
+        Step { reward: 0.0, cost: 0.0, terminated: true, fault }
     }
 
     fn simulate(&mut self, action: &[f64]) -> Result<(), MjError> {
@@ -75,6 +75,7 @@ impl<R: Rules> Env for Simulated<R> {
         let outside = action.iter().zip(&self.spec.actuators).filter(|(a, of)| **a < of.low || **a > of.high);
         self.counters.saturations += outside.count() as u64;
 
+        self.rules.begin(&self.sim);
         let before = self.rules.progress(&self.sim);
         if let Err(error) = self.simulate(action) {
             self.last_error = Some(error);
@@ -84,7 +85,7 @@ impl<R: Rules> Env for Simulated<R> {
             return self.faulty(Fault::Unstable);
         }
         let (reward, terminated) = self.rules.judge(&self.spec, &self.sim, before, action);
-        Step { reward, terminated, fault: Fault::None }
+        Step { reward, cost: 0.0, terminated, fault: Fault::None }
     }
 
     fn observe(&self, obs: &mut [f64]) {
@@ -116,7 +117,7 @@ impl<R: Rules> Env for Simulated<R> {
     }
 
     fn set_goal(&mut self, goal: &[f64]) -> Result<(), EnvError> {
-        let task = self.spec.name;
+        let task = self.spec.name.clone();
         let kept = self.rules.goal_mut();
         if kept.len() != goal.len() || goal.is_empty() {
             return Err(EnvError::Goal { task, expected: kept.len(), got: goal.len() });
@@ -137,8 +138,8 @@ impl<R: Rules> Env for Simulated<R> {
         self.last_error.as_ref()
     }
 
-    fn model_text(&self) -> &'static str {
-        self.robot.text
+    fn model_text(&self) -> &str {
+        &self.robot.text
     }
 
     fn model_format(&self) -> ModelFormat {
@@ -147,7 +148,7 @@ impl<R: Rules> Env for Simulated<R> {
 
     fn another(&self) -> Result<Box<dyn Env>, EnvError> {
         let sim = Sim::new(self.sim.model()).map_err(self.physics())?;
-        Ok(Simulated::boxed(self.spec.clone(), self.robot, self.rules.clone(), sim))
+        Ok(Simulated::boxed(self.spec.clone(), self.robot.clone(), self.rules.clone(), sim))
     }
 }
 

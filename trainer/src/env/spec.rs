@@ -6,7 +6,7 @@ use crate::mj::{Actuator, Joint, Model};
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spec {
     /// Name of the task.
-    pub name: &'static str,
+    pub name: String,
     /// Names of the observation's entries: `q.<joint>` and `v.<joint>` are a joint's position and velocity.
     pub obs: Vec<String>,
     /// Joints in MuJoCo's order.
@@ -27,6 +27,8 @@ pub struct Spec {
     pub semi_implicit_euler: bool,
     /// Control periods after which the caller truncates an episode.
     pub max_episode_steps: usize,
+    /// Whether [`Step::cost`](super::Step::cost) means anything.
+    pub has_cost: bool,
 }
 
 impl Spec {
@@ -63,14 +65,15 @@ impl Spec {
             sub_steps: task.sub_steps,
             semi_implicit_euler: model.is_euler(),
             max_episode_steps: task.max_episode_steps,
+            has_cost: false,
         }
     }
 }
 
 /// The part of a [`Spec`] that is not in the robot file.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct Constants {
-    pub(super) name: &'static str,
+    pub(super) name: String,
     pub(super) sub_steps: usize,
     pub(super) max_episode_steps: usize,
 }

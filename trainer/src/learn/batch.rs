@@ -9,6 +9,8 @@ pub struct Batch {
     pub obs: Vec<f32>,
     /// Sampled proposal u (n x n_state).
     pub proposal: Vec<f32>,
+    /// Projected change w (n x n_state).
+    pub target: Vec<f32>,
     /// Lowest change the projection lets through (n x n_state).
     pub lower: Vec<f32>,
     /// Highest change the projection lets through (n x n_state).

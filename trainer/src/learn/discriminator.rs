@@ -3,9 +3,10 @@
 
 use super::gaussian::{heads, set_heads, sigmoid};
 use super::init;
+use super::losses::widths;
 use super::net::{Net, Tape};
+use super::nets::NetSettings;
 use super::optimise::TILE;
-use super::ppo::widths;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, exp};
 use rand_chacha::ChaCha8Rng;
 
@@ -39,12 +40,13 @@ pub(super) struct DiscriminatorWork {
 }
 
 impl Discriminator {
-    /// One hidden layer of each width in `hidden`: the first for the encoder, the last for the decoder.
-    pub(super) fn new(n_in: usize, hidden: &[usize], bottleneck: bool) -> Self {
+    /// The first half of the hidden layers (rounded up) is the encoder's, the rest the decoder's.
+    pub(super) fn new(n_in: usize, nets: &NetSettings, bottleneck: bool) -> Self {
         let (mut at, mut transposed) = (0, 0);
-        let ends = (&hidden[..1], &hidden[hidden.len() - 1..]);
-        let encoder = Net::new(&widths(n_in, ends.0, 2 * LATENT), true, &mut at, &mut transposed);
-        let decoder = Net::new(&widths(LATENT, ends.1, 1), true, &mut at, &mut transposed);
+        let (hidden, f) = (&nets.discriminator, nets.activation);
+        let (before, after) = hidden.split_at(hidden.len().div_ceil(2));
+        let encoder = Net::new(&widths(n_in, before, 2 * LATENT), f, true, &mut at, &mut transposed);
+        let decoder = Net::new(&widths(LATENT, after, 1), f, true, &mut at, &mut transposed);
         Self { encoder, decoder, bottleneck, len: at, transposed }
     }
 

@@ -1,8 +1,10 @@
 //! Diagonal Gaussians over tiles of rows, and the small row operations the losses share.
 
+use super::losses::{entropy_bonus, gather_advantage};
 use super::optimise::{TILE, Tile};
-use super::ppo::{entropy_bonus, gather_advantage};
+use super::ppo::PpoSettings;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, exp, scalars, scalars_mut};
+use std::ops::Range;
 
 const HALF_LOG_TWO_PI: f64 = 0.918_938_533_204_672_7;
 
@@ -128,42 +130,48 @@ pub(super) fn surrogate(log_prob: &mut [V], old: &[V], advantage: &[V], range: f
     [loss.sum(), kl.sum(), clipped.sum()]
 }
 
-/// The sampled rows of a Gaussian policy and how it is judged.
-pub(super) struct Likelihood<'a> {
-    /// Log standard deviations in the parameter vector (n entries in whole vectors).
-    pub(super) log_std: &'a [V],
+/// One Gaussian of the policy: what was sampled from it, and where its spread lies in the parameter vector.
+pub(super) struct Gaussian<'a> {
+    /// Its log standard deviations in the parameter vector (n entries in whole vectors).
+    pub(super) log_std: Range<usize>,
     /// Entries.
     pub(super) n: usize,
     /// What was sampled.
     pub(super) sampled: &'a [V],
-    /// Mean of the current policy.
+    /// Its mean under the current policy.
     pub(super) mean: &'a [V],
-    /// Clip range of the ratio.
-    pub(super) clip_range: f32,
-    /// Weight of the entropy bonus.
-    pub(super) ent_coef: f32,
+    /// Receives `dL / d mean`.
+    pub(super) d: &'a mut [V],
 }
 
-/// PPO's loss of a tile: leaves `dL / d mean` in `d`, adds `dL / d log_std` to `grad_log_std`; returns the sums of
-/// [`surrogate`]. `rows` are scratch.
+/// PPO's loss of a tile for a policy that is a product of N Gaussians (one of them, or proposal and action): leaves
+/// `dL / d mean` in each `d`, adds `dL / d log_std` to `grad`; returns the sums of [`surrogate`]. `rows` are scratch.
 #[inline(always)]
-pub(super) fn likelihood_ratio(
-    l: &Likelihood<'_>,
+pub(super) fn likelihood_ratio<const N: usize>(
+    mut policy: [Gaussian<'_>; N],
+    settings: &PpoSettings,
     t: &Tile<'_>,
     rows: &mut [Vec<V>; 3],
-    d: &mut [V],
-    grad_log_std: &mut [V],
+    p: &[V],
+    grad: &mut [V],
 ) -> [f32; 3] {
-    let mut inverse = [ZERO; 16];
-    let inverse = &mut inverse[..l.log_std.len()];
-    let constant = inverse_sigma(inverse, l.log_std, l.n);
+    let mut inverse = [[ZERO; 16]; N];
+    let mut constant = 0.0;
+    for (g, inverse) in policy.iter().zip(&mut inverse) {
+        constant += inverse_sigma(&mut inverse[..g.log_std.len()], &p[g.log_std.clone()], g.n);
+    }
     let [log_prob, old, advantage] = rows;
     log_prob.fill(V::splat(constant as f32));
     gather_one(old, &t.batch.log_prob, t.idx);
     gather_advantage(advantage, t);
-    residuals(d, l.sampled, l.mean, inverse, log_prob);
-    let sums = surrogate(log_prob, old, advantage, l.clip_range, t.scale);
-    residuals_back(d, inverse, log_prob, Some(&mut *grad_log_std), l.n);
-    entropy_bonus(grad_log_std, l.n, l.ent_coef * t.scale * TILE as f32);
+    for (g, inverse) in policy.iter_mut().zip(&inverse) {
+        residuals(g.d, g.sampled, g.mean, &inverse[..g.log_std.len()], log_prob);
+    }
+    let sums = surrogate(log_prob, old, advantage, settings.clip_range, t.scale);
+    for (g, inverse) in policy.iter_mut().zip(&inverse) {
+        let grad = &mut grad[g.log_std.clone()];
+        residuals_back(g.d, &inverse[..g.log_std.len()], log_prob, Some(&mut *grad), g.n);
+        entropy_bonus(grad, g.n, settings.ent_coef * t.scale * TILE as f32);
+    }
     sums
 }

@@ -4,9 +4,10 @@ use super::Dims;
 use super::batch::Batch;
 use super::gaussian::gather;
 use super::init;
+use super::losses::widths;
 use super::net::{Net, Tape};
+use super::nets::NetSettings;
 use super::optimise::{Group, TILE, Tile, add_sums};
-use super::ppo::widths;
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars_mut};
 use rand_chacha::ChaCha8Rng;
@@ -37,24 +38,25 @@ pub(super) struct InverseWork {
 
 impl InverseModel {
     /// Places the network at `at`; `log_std` vectors behind it are the caller's.
-    pub(super) fn new(dims: &Dims, hidden: &[usize], at: &mut usize, transposed: &mut usize) -> Self {
+    pub(super) fn new(dims: &Dims, nets: &NetSettings, at: &mut usize, transposed: &mut usize) -> Self {
         let start = *at;
-        let net = Net::new(&widths(2 * dims.seen_obs.len(), hidden, dims.n_act), true, at, transposed);
+        let widths = widths(2 * dims.seen_obs.len(), &nets.idm, dims.n_act);
+        let net = Net::new(&widths, nets.activation, true, at, transposed);
         Self { net, start, end: *at }
     }
 
     /// A model in a group of its own.
-    pub(super) fn alone(dims: &Dims, hidden: &[usize], rng: &mut ChaCha8Rng) -> (Self, Group) {
+    pub(super) fn alone(dims: &Dims, nets: &NetSettings, rng: &mut ChaCha8Rng) -> (Self, Group) {
         let (mut at, mut transposed) = (0, 0);
-        let model = Self::new(dims, hidden, &mut at, &mut transposed);
+        let model = Self::new(dims, nets, &mut at, &mut transposed);
         let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
-        model.init(dims, hidden, &mut group.p, rng);
+        model.init(&mut group.p, rng);
         (model, group)
     }
 
     /// Orthogonal weights; the first mean action is near zero.
-    pub(super) fn init(&self, dims: &Dims, hidden: &[usize], p: &mut [V], rng: &mut ChaCha8Rng) {
-        let dense = init::orthogonal(&widths(2 * dims.seen_obs.len(), hidden, dims.n_act), 0.01, rng);
+    pub(super) fn init(&self, p: &mut [V], rng: &mut ChaCha8Rng) {
+        let dense = init::orthogonal(&self.net.mlp.widths(), 0.01, rng);
         self.net.mlp.write_dense(&dense, p);
     }
 
@@ -98,7 +100,7 @@ impl InverseModel {
 
 /// Input rows `[x_c, change_c]`.
 #[inline(always)]
-fn gather_input(to: &mut [V], batch: &Batch, change: &[f32], idx: &[u32], dims: &Dims) {
+pub(super) fn gather_input(to: &mut [V], batch: &Batch, change: &[f32], idx: &[u32], dims: &Dims) {
     let (n, vectors) = (dims.seen_obs.len(), (2 * dims.seen_obs.len()).div_ceil(LANES));
     let lanes = scalars_mut(to);
     for (r, &i) in idx.iter().enumerate() {

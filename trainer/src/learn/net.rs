@@ -2,7 +2,7 @@
 
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{Gemm, LANES, Out, V, ZERO, gemm, scalars, scalars_mut};
-use nearl_runtime::net::{Layer, Mlp};
+use nearl_runtime::net::{Activation, Layer, Mlp};
 
 /// Shapes of a network, and where its transposed weights lie (the backward pass reads them).
 #[derive(Clone, Debug)]
@@ -29,8 +29,14 @@ impl Tape {
 
 impl Net {
     /// `at` and `transposed_at` are running lengths in vectors; `input_grad`: the input's gradient is wanted.
-    pub fn new(widths: &[usize], input_grad: bool, at: &mut usize, transposed_at: &mut usize) -> Self {
-        let mlp = Mlp::new(widths, false, at);
+    pub fn new(
+        widths: &[usize],
+        activation: Activation,
+        input_grad: bool,
+        at: &mut usize,
+        transposed_at: &mut usize,
+    ) -> Self {
+        let mlp = Mlp::new(widths, activation, at);
         let place = |(i, l): (usize, &Layer)| {
             (i > 0 || input_grad).then(|| {
                 let here = *transposed_at;
@@ -81,7 +87,7 @@ impl Net {
                 b: &p[l.w..],
                 ldb: l.n_vectors(),
                 ldc: l.n_vectors(),
-                out: if i < last { Out::BiasTanh(bias) } else { Out::Bias(bias) },
+                out: if i < last { Out::BiasThen(bias, self.mlp.activation) } else { Out::Bias(bias) },
             };
             gemm(&product, &mut after[0]);
         }
@@ -133,7 +139,7 @@ impl Net {
                     b: &transposed[at..],
                     ldb: k,
                     ldc: k,
-                    out: if i > 0 { Out::TimesDtanh(source) } else { Out::Store },
+                    out: if i > 0 { Out::TimesDerivative(source, self.mlp.activation) } else { Out::Store },
                 };
                 gemm(&product, &mut next);
                 std::mem::swap(&mut current, &mut next);

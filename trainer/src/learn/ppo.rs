@@ -2,9 +2,11 @@
 //! the side, so that its loss can be plotted beside the others.
 
 use super::batch::Batch;
-use super::gaussian::{Likelihood, gather, gather_one, heads, likelihood_ratio, set_heads};
+use super::gaussian::{Gaussian, gather, likelihood_ratio};
 use super::inverse::InverseModel;
+use super::losses::{mean_std, set_lanes, value_loss, values, widths};
 use super::net::{Net, Tape};
+use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Schedule, TILE, Tile, add_sums, optimise};
 use super::{Adam, Dims, Learner, Metrics, init};
 use nearl_runtime::net::Dense;
@@ -19,8 +21,6 @@ use std::ops::Range;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PpoSettings {
-    /// Hidden widths of every network.
-    pub hidden: Vec<usize>,
     /// Learning rate.
     pub lr: f32,
     /// Passes over a batch.
@@ -42,7 +42,6 @@ pub struct PpoSettings {
 impl Default for PpoSettings {
     fn default() -> Self {
         Self {
-            hidden: vec![32, 32],
             lr: 3e-4,
             n_epochs: 10,
             batch_size: 64,
@@ -53,11 +52,6 @@ impl Default for PpoSettings {
             log_std: 0.0,
         }
     }
-}
-
-/// `widths` of a network from its ends and the hidden widths.
-pub(super) fn widths(n_in: usize, hidden: &[usize], n_out: usize) -> Vec<usize> {
-    [&[n_in], hidden, &[n_out]].concat()
 }
 
 /// Policy, value and inverse model.
@@ -94,19 +88,24 @@ const INVERSE: usize = 1;
 
 impl Ppo {
     /// Fresh networks.
-    pub fn new(dims: Dims, settings: PpoSettings, threads: usize, rng: &mut ChaCha8Rng) -> Self {
+    pub fn new(
+        dims: Dims,
+        nets: &NetSettings,
+        settings: PpoSettings,
+        threads: usize,
+        rng: &mut ChaCha8Rng,
+    ) -> Self {
         let (mut at, mut transposed) = (0, 0);
-        let (o, a) = (dims.n_obs, dims.n_act);
-        let hidden = settings.hidden.clone();
-        let policy = Net::new(&widths(o, &hidden, a), false, &mut at, &mut transposed);
+        let (o, a, f) = (dims.n_obs, dims.n_act, nets.activation);
+        let policy = Net::new(&widths(o, &nets.policy, a), f, false, &mut at, &mut transposed);
         let log_std = at..at + a.div_ceil(LANES);
         at = log_std.end;
-        let value = Net::new(&widths(o, &hidden, 1), false, &mut at, &mut transposed);
+        let value = Net::new(&widths(o, &nets.value, 1), f, false, &mut at, &mut transposed);
         let mut actor = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
-        policy.mlp.write_dense(&init::orthogonal(&widths(o, &hidden, a), 0.01, rng), &mut actor.p);
-        value.mlp.write_dense(&init::orthogonal(&widths(o, &hidden, 1), 1.0, rng), &mut actor.p);
+        policy.mlp.write_dense(&init::orthogonal(&policy.mlp.widths(), 0.01, rng), &mut actor.p);
+        value.mlp.write_dense(&init::orthogonal(&value.mlp.widths(), 1.0, rng), &mut actor.p);
         set_lanes(&mut actor.p[log_std.clone()], a, settings.log_std);
-        let (inverse, inverse_group) = InverseModel::alone(&dims, &hidden, rng);
+        let (inverse, inverse_group) = InverseModel::alone(&dims, nets, rng);
         let adam = vec![Adam::new(at, settings.lr), Adam::new(inverse_group.p.len(), settings.lr)];
         let nets = Nets { dims, settings, policy, log_std, value, inverse, len: at };
         let mut params = Params { groups: vec![actor, inverse_group], adam, beta: 0.0 };
@@ -114,11 +113,6 @@ impl Ppo {
         nets.refresh(INVERSE, &mut params);
         Self { nets, params, threads }
     }
-}
-
-/// The first `n` lanes of `p`.
-pub(super) fn set_lanes(p: &mut [V], n: usize, value: f32) {
-    nearl_runtime::net::kernel::scalars_mut(p)[..n].fill(value);
 }
 
 impl Learner for Ppo {
@@ -130,6 +124,17 @@ impl Learner for Ppo {
             policy_log_std: scalars(&p[self.nets.log_std.clone()])[..self.nets.dims.n_act].to_vec(),
             idm: None,
         }
+    }
+
+    fn params(&self) -> &Params {
+        &self.params
+    }
+
+    fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
+        f(&mut self.params)?;
+        self.nets.refresh(ACTOR, &mut self.params);
+        self.nets.refresh(INVERSE, &mut self.params);
+        Ok(())
     }
 
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
@@ -144,69 +149,16 @@ impl Learner for Ppo {
         let after = self.nets.inverse.error(&self.params.groups[INVERSE].p, batch, &self.nets.dims);
         let p = &self.params.groups[ACTOR].p;
         let log_std = &scalars(&p[self.nets.log_std.clone()])[..self.nets.dims.n_act];
-        vec![
+        let mut metrics = vec![
             ("train/policy_gradient_loss", report[0].mean[0]),
             ("train/approx_kl", report[0].mean[1]),
             ("train/clip_fraction", report[0].mean[2]),
             ("train/value_loss", report[0].mean[3]),
             ("train/grad_norm", report[0].norm),
             ("train/std", mean_std(log_std)),
-            ("idm/mse_before", before),
-            ("idm/mse_after", after),
-            ("idm/updated", 1.0),
-        ]
-    }
-}
-
-/// Mean standard deviation.
-pub(super) fn mean_std(log_std: &[f32]) -> f64 {
-    log_std.iter().map(|l| f64::from(l.exp())).sum::<f64>() / log_std.len().max(1) as f64
-}
-
-/// Value of each row of `x`.
-pub(super) fn values(net: &Net, p: &[V], x: &[f32], n_obs: usize) -> Vec<f32> {
-    let (n, vectors) = (x.len() / n_obs, n_obs.div_ceil(LANES));
-    let (mut tape, mut rows) = (net.tape(TILE), vec![ZERO; TILE * vectors]);
-    let mut out = Vec::with_capacity(n);
-    for start in (0..n).step_by(TILE) {
-        let count = TILE.min(n - start);
-        let idx: Vec<u32> = (start..start + count).map(|i| i as u32).collect();
-        gather(&mut rows, vectors, 0, x, n_obs, &idx);
-        let y = net.forward(p, &rows, &mut tape);
-        out.extend(y[..count].iter().map(|v| v.0[0]));
-    }
-    out
-}
-
-/// The value loss of a tile: `d = dL / dV` a row; returns the sum of squared errors.
-#[inline(always)]
-pub(super) fn value_loss(
-    d: &mut [V],
-    rows: &mut [Vec<V>; 3],
-    output: &[V],
-    t: &Tile<'_>,
-    weight: f32,
-) -> f32 {
-    let [value, target, slope] = rows;
-    heads(value, output);
-    gather_one(target, &t.batch.returns, t.idx);
-    let mut sum = ZERO;
-    for i in 0..value.len() {
-        let e = value[i] - target[i];
-        sum = sum.fma(e, e);
-        slope[i] = e * V::splat(2.0 * weight * t.scale);
-    }
-    set_heads(d, slope);
-    sum.sum()
-}
-
-/// Normalised advantages of the rows.
-#[inline(always)]
-pub(super) fn gather_advantage(to: &mut [V], t: &Tile<'_>) {
-    gather_one(to, &t.batch.advantage, t.idx);
-    let (mean, inverse) = t.advantage;
-    for a in to {
-        *a = (*a - V::splat(mean)) * V::splat(inverse);
+        ];
+        metrics.extend(super::idm_metrics(Some(before), Some(after), true));
+        metrics
     }
 }
 
@@ -219,30 +171,14 @@ fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [
     gather(&mut w.action, av, 0, &t.batch.sampled, a, t.idx);
     // log pi(a | s) and the clipped surrogate
     let mean = n.policy.forward(&group.p, &w.obs, &mut w.policy);
-    let likelihood = Likelihood {
-        log_std: &group.p[n.log_std.clone()],
-        n: a,
-        sampled: &w.action,
-        mean,
-        clip_range: s.clip_range,
-        ent_coef: s.ent_coef,
-    };
-    let log_std = &mut grad[n.log_std.clone()];
-    let [loss, kl, clipped] = likelihood_ratio(&likelihood, &t, &mut w.rows, &mut w.d_action, log_std);
+    let action = Gaussian { log_std: n.log_std.clone(), n: a, sampled: &w.action, mean, d: &mut w.d_action };
+    let [loss, kl, clipped] = likelihood_ratio([action], s, &t, &mut w.rows, &group.p, grad);
     n.policy.backward(&group.transposed, &w.obs, &w.d_action, &mut w.policy, Some(grad), false);
     // value
     let value = n.value.forward(&group.p, &w.obs, &mut w.value);
     let squares = value_loss(&mut w.d_value, &mut w.rows, value, &t, s.vf_coef);
     n.value.backward(&group.transposed, &w.obs, &w.d_value, &mut w.value, Some(grad), false);
     add_sums(grad, &[loss, kl, clipped, squares]);
-}
-
-/// Entropy of a diagonal Gaussian is the sum of its log standard deviations plus a constant.
-#[inline(always)]
-pub(super) fn entropy_bonus(grad: &mut [V], n: usize, weight: f32) {
-    for g in &mut nearl_runtime::net::kernel::scalars_mut(grad)[..n] {
-        *g -= weight;
-    }
 }
 
 multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = actor_body);

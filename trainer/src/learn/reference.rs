@@ -1,34 +1,44 @@
 //! For tests: the losses again, row by row in f64, as the textbook writes them. Shares no code with the kernels.
 
 use super::batch::Batch;
+use super::net::Net;
+use super::optimise::Tile;
 use super::{Dims, stats_of};
-use nearl_runtime::net::Dense;
+use nearl_runtime::net::kernel::{V, scalars_mut};
+use nearl_runtime::net::{Activation, Dense};
 
-/// A network in f64: weight (n_out x n_in) and bias of each layer.
+/// A network in f64: weight (n_out x n_in) and bias of each layer, and the function between them.
 #[derive(Clone)]
-pub(super) struct Net64(pub(super) Vec<(Vec<f64>, Vec<f64>)>);
+pub(super) struct Net64 {
+    layers: Vec<(Vec<f64>, Vec<f64>)>,
+    between: fn(f64) -> f64,
+}
 
 impl Net64 {
-    pub(super) fn of(dense: &Dense) -> Self {
+    pub(super) fn of(dense: &Dense, activation: Activation) -> Self {
         let wide = |x: &[f32]| x.iter().map(|&v| f64::from(v)).collect::<Vec<f64>>();
-        Self(dense.layers.iter().map(|l| (wide(&l.weight), wide(&l.bias))).collect())
+        let between = match activation {
+            Activation::Tanh => f64::tanh,
+            Activation::Relu => |x: f64| x.max(0.0),
+        };
+        Self { layers: dense.layers.iter().map(|l| (wide(&l.weight), wide(&l.bias))).collect(), between }
     }
 
-    /// Affine layers with tanh between them.
+    /// The textbook sums.
     pub(super) fn forward(&self, x: &[f64]) -> Vec<f64> {
         let mut h = x.to_vec();
-        for (i, (w, b)) in self.0.iter().enumerate() {
+        for (i, (w, b)) in self.layers.iter().enumerate() {
             let n_in = h.len();
             let y =
                 b.iter().enumerate().map(|(n, b)| b + (0..n_in).map(|k| w[n * n_in + k] * h[k]).sum::<f64>());
-            h = if i + 1 < self.0.len() { y.map(f64::tanh).collect() } else { y.collect() };
+            h = if i + 1 < self.layers.len() { y.map(self.between).collect() } else { y.collect() };
         }
         h
     }
 
     /// Parameters one after another: weight, bias of each layer.
     pub(super) fn flat(&mut self) -> Vec<&mut f64> {
-        self.0.iter_mut().flat_map(|(w, b)| w.iter_mut().chain(b.iter_mut())).collect()
+        self.layers.iter_mut().flat_map(|(w, b)| w.iter_mut().chain(b.iter_mut())).collect()
     }
 }
 
@@ -91,6 +101,22 @@ pub(super) fn relative_error(net: &Net64, analytic: &[f64], loss: impl Fn(&Net64
     (error / size).sqrt()
 }
 
+/// Moves weights and biases of the networks away from zero: small last layers would hide errors in what lies below them,
+/// and a unit whose inputs are all zero would sit on the kink of a ReLU.
+pub(super) fn spread(p: &mut [V], nets: &[&Net]) {
+    scalars_mut(p).iter_mut().filter(|x| x.abs() < 0.02).for_each(|x| *x *= 50.0);
+    for layer in nets.iter().flat_map(|n| &n.mlp.layers) {
+        let bias = &mut scalars_mut(&mut p[layer.b..layer.b + layer.n_vectors()])[..layer.n];
+        bias.iter_mut().enumerate().for_each(|(k, b)| *b = 0.3 * (1.7 * k as f32 + 0.5).sin());
+    }
+}
+
+/// The whole batch as one tile.
+pub(super) fn tile<'a>(batch: &'a Batch, idx: &'a [u32]) -> Tile<'a> {
+    let (mean, std) = stats_of(&batch.advantage);
+    Tile { batch, idx, scale: 1.0 / batch.n as f32, advantage: (mean as f32, (1.0 / std) as f32) }
+}
+
 /// One minibatch of random experience.
 pub(super) fn batch(d: &Dims, n: usize, seed: u64) -> Batch {
     use rand::RngExt;
@@ -100,10 +126,11 @@ pub(super) fn batch(d: &Dims, n: usize, seed: u64) -> Batch {
             .map(|_| size * (rng.random::<f32>() + rng.random::<f32>() + rng.random::<f32>() - 1.5))
             .collect()
     };
-    Batch {
+    let mut batch = Batch {
         n,
         obs: draw(d.n_obs, 1.0),
         proposal: draw(d.n_state, 1.0),
+        target: Vec::new(),
         lower: draw(d.n_state, 0.3).iter().map(|x| x - 0.3).collect(),
         upper: draw(d.n_state, 0.3).iter().map(|x| x + 0.6).collect(),
         reached: draw(d.n_state, 1.0),
@@ -112,5 +139,7 @@ pub(super) fn batch(d: &Dims, n: usize, seed: u64) -> Batch {
         log_prob: draw(1, 1.0).iter().map(|x| x - 4.0).collect(),
         advantage: draw(1, 1.0),
         returns: draw(1, 1.0),
-    }
+    };
+    batch.target = draw(d.n_state, 1.0);
+    batch
 }

@@ -177,6 +177,11 @@ impl Sim {
         self.state.xpos()[body]
     }
 
+    /// Position of every body's frame in the world \[m\], the world included, as of the last evaluation.
+    pub fn positions(&self) -> &[[f64; 3]] {
+        self.state.xpos()
+    }
+
     /// External force on each body `[torque, force]`, the world included, after [`Sim::compute_contact_forces`].
     pub fn contact_forces(&self) -> &[[f64; 6]] {
         self.state.cfrc_ext()

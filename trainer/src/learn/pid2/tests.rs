@@ -1,25 +1,40 @@
 //! Every gradient of PID^2 against central differences of the textbook losses in f64.
 
 use super::*;
+use crate::learn::Net;
+use crate::learn::optimise::TILE;
 use crate::learn::reference::{self, *};
-use nearl_runtime::net::Dense;
+use nearl_runtime::net::kernel::scalars;
+use nearl_runtime::net::{Activation, Dense};
 
 const LIMIT: f64 = 2e-4;
+const TANH: Activation = Activation::Tanh;
+const RELU: Activation = Activation::Relu;
 
 fn dims() -> Dims {
     Dims { n_obs: 7, n_state: 5, n_act: 3, seen_obs: vec![1, 2, 6], seen_state: vec![0, 2, 4] }
 }
 
 /// A learner with weights far from zero, and a minibatch.
-fn learner(stochastic: bool, bottleneck: bool) -> (Pid2, Batch) {
-    let ppo = PpoSettings { hidden: vec![6, 5], log_std: -0.3, ..PpoSettings::default() };
+fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2, Batch) {
+    let nets = NetSettings {
+        policy: vec![6, 5],
+        idm: vec![6, 5],
+        value: vec![7],
+        discriminator: vec![6, 5],
+        activation,
+    };
+    let ppo = PpoSettings { log_std: -0.3, ..PpoSettings::default() };
     let settings = Pid2Settings { generator_weight: 0.7, beta: 0.2, ..Pid2Settings::default() };
     let mut rng = crate::rollout::stream(1, 1);
-    let mut l = Pid2::new(dims(), ppo, settings, stochastic, bottleneck, 1, &mut rng);
-    for group in &mut l.params.groups {
-        // the small last layers would hide errors in what lies below them
-        scalars_mut(&mut group.p).iter_mut().filter(|x| x.abs() < 0.02).for_each(|x| *x *= 50.0);
-    }
+    let kind = Kind { stochastic, learned: !stochastic };
+    let mut l = Pid2::new(dims(), &nets, ppo, settings, kind, bottleneck, 1, &mut rng);
+    let c = &l.nets.combined;
+    let inverse = c.inverse.as_ref().map(|(m, _)| &m.net);
+    let actor: Vec<_> = [&c.policy, &c.value].into_iter().chain(inverse).collect();
+    spread(&mut l.params.groups[COMBINED].p, &actor);
+    let (encoder, decoder) = l.nets.discriminator.nets();
+    spread(&mut l.params.groups[JUDGE].p, &[encoder, decoder]);
     for phase in [ACTOR, DISCRIMINATOR] {
         l.nets.refresh(phase, &mut l.params);
     }
@@ -36,10 +51,7 @@ fn gradient(l: &Pid2, batch: &Batch, phase: usize) -> (Vec<V>, [f32; SUMS]) {
     let len = l.params.groups[l.nets.group(phase)].p.len();
     let mut grad = vec![ZERO; len + 1];
     let idx: Vec<u32> = (0..batch.n as u32).collect();
-    let (mean, std) = crate::learn::stats_of(&batch.advantage);
-    let tile =
-        Tile { batch, idx: &idx, scale: 1.0 / batch.n as f32, advantage: (mean as f32, (1.0 / std) as f32) };
-    l.nets.tile(phase, &l.params, tile, &mut l.nets.work(), &mut grad);
+    l.nets.tile(phase, &l.params, tile(batch, &idx), &mut l.nets.work(), &mut grad);
     let sums = grad[len].0;
     (grad, sums)
 }
@@ -71,13 +83,14 @@ struct Nets64 {
 fn nets64(l: &Pid2) -> Nets64 {
     let (a, d) = (&l.params.groups[0].p, &l.params.groups[1].p);
     let (enc, dec) = l.nets.discriminator.nets();
+    let of = |dense: &Dense| Net64::of(dense, enc.mlp.activation);
     Nets64 {
-        policy: Net64::of(&l.nets.policy.mlp.to_dense(a)),
-        value: Net64::of(&l.nets.value.mlp.to_dense(a)),
-        inverse: l.nets.inverse.as_ref().map(|(m, _)| Net64::of(&m.net.mlp.to_dense(a))),
-        log_std: l.log_std().iter().map(|&v| f64::from(v)).collect(),
-        enc: Net64::of(&enc.mlp.to_dense(d)),
-        dec: Net64::of(&dec.mlp.to_dense(d)),
+        policy: of(&l.nets.combined.policy.mlp.to_dense(a)),
+        value: of(&l.nets.combined.value.mlp.to_dense(a)),
+        inverse: l.nets.combined.inverse.as_ref().map(|(m, _)| of(&m.net.mlp.to_dense(a))),
+        log_std: l.nets.combined.log_std(l.actor()).iter().map(|&v| f64::from(v)).collect(),
+        enc: of(&enc.mlp.to_dense(d)),
+        dec: of(&dec.mlp.to_dense(d)),
     }
 }
 
@@ -111,8 +124,8 @@ fn check(name: &str, net: &Net64, dense: &Dense, loss: impl Fn(&Net64) -> f64) {
 
 #[test]
 fn actor_gradients_equal_central_differences() {
-    for stochastic in [false, true] {
-        let (l, b) = learner(stochastic, true);
+    for (stochastic, activation) in [(false, TANH), (true, TANH), (false, RELU), (true, RELU)] {
+        let (l, b) = learner(stochastic, true, activation);
         let (grad, sums) = gradient(&l, &b, ACTOR);
         let n = nets64(&l);
         let with = |f: &dyn Fn(&mut Nets64)| {
@@ -121,13 +134,13 @@ fn actor_gradients_equal_central_differences() {
             actor_loss(&l, &b, &m)
         };
         let mlp = |net: &Net| net.mlp.to_dense(&grad);
-        check("policy", &n.policy, &mlp(&l.nets.policy), |p| with(&|m| m.policy = p.clone()));
-        check("value", &n.value, &mlp(&l.nets.value), |p| with(&|m| m.value = p.clone()));
-        let range = match (&l.nets.inverse, &l.nets.policy_log_std) {
+        check("policy", &n.policy, &mlp(&l.nets.combined.policy), |p| with(&|m| m.policy = p.clone()));
+        check("value", &n.value, &mlp(&l.nets.combined.value), |p| with(&|m| m.value = p.clone()));
+        let range = match (&l.nets.combined.inverse, &l.nets.combined.policy_log_std) {
             (Some((model, range)), _) => {
                 let net = n.inverse.as_ref().expect("inverse");
                 check("inverse", net, &mlp(&model.net), |p| with(&|m| m.inverse = Some(p.clone())));
-                assert!(sums[5] > 0.0, "the projection clamps some entries");
+                assert!(sums[4] > 0.0, "the projection clamps some entries");
                 range.clone()
             }
             (None, range) => range.clone().expect("log std"),
@@ -142,8 +155,8 @@ fn actor_gradients_equal_central_differences() {
 
 #[test]
 fn discriminator_gradients_equal_central_differences() {
-    for bottleneck in [true, false] {
-        let (l, b) = learner(false, bottleneck);
+    for (bottleneck, activation) in [(true, TANH), (false, TANH), (true, RELU), (false, RELU)] {
+        let (l, b) = learner(false, bottleneck, activation);
         let (grad, sums) = gradient(&l, &b, DISCRIMINATOR);
         let (n, d) = (nets64(&l), dims());
         let loss = |enc: &Net64, dec: &Net64| {
@@ -166,17 +179,19 @@ fn discriminator_gradients_equal_central_differences() {
 
 #[test]
 fn inverse_gradient_equals_central_differences() {
-    let (l, b) = learner(false, true);
-    let (grad, _) = gradient(&l, &b, INVERSE);
-    let (n, d) = (nets64(&l), dims());
-    let loss = |net: &Net64| {
-        let one = |i: usize| {
-            let mean = net.forward(&inverse_input(&b, i, &d, &row(&b.reached, i, d.n_state)));
-            let a = row(&b.action, i, d.n_act);
-            mean.iter().zip(&a).map(|(m, a)| 0.5 * (m - a).powi(2)).sum::<f64>()
+    for activation in [TANH, RELU] {
+        let (l, b) = learner(false, true, activation);
+        let (grad, _) = gradient(&l, &b, INVERSE);
+        let (n, d) = (nets64(&l), dims());
+        let loss = |net: &Net64| {
+            let one = |i: usize| {
+                let mean = net.forward(&inverse_input(&b, i, &d, &row(&b.reached, i, d.n_state)));
+                let a = row(&b.action, i, d.n_act);
+                mean.iter().zip(&a).map(|(m, a)| 0.5 * (m - a).powi(2)).sum::<f64>()
+            };
+            (0..b.n).map(one).sum::<f64>() / b.n as f64
         };
-        (0..b.n).map(one).sum::<f64>() / b.n as f64
-    };
-    let (model, _) = l.nets.inverse.as_ref().expect("inverse");
-    check("inverse", n.inverse.as_ref().expect("inverse"), &model.net.mlp.to_dense(&grad), loss);
+        let (model, _) = l.nets.combined.inverse.as_ref().expect("inverse");
+        check("inverse", n.inverse.as_ref().expect("inverse"), &model.net.mlp.to_dense(&grad), loss);
+    }
 }

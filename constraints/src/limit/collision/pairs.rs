@@ -1,0 +1,146 @@
+//! Which solids are near each other now, and how fast they close.
+
+use super::super::clearance::Clearance;
+use crate::geometry::{Placement, Separation, Shape, separation};
+use crate::kinematics::{dot, minus, norm};
+use crate::{FrameId, FrameMotion, Kinematics, Period};
+
+/// A solid on a frame.
+pub(super) struct Body {
+    pub(super) name: String,
+    /// Name of the frame; empty for an obstacle.
+    link: String,
+    pub(super) frame: FrameId,
+    shape: Shape,
+    local: Placement,
+    radius: f64,
+}
+
+impl Body {
+    pub(super) fn new(name: String, link: String, frame: FrameId, shape: Shape, local: Placement) -> Body {
+        Body { name, link, frame, shape, local, radius: shape.bounding_radius() }
+    }
+
+    pub(super) fn called(&self, name: &str) -> bool {
+        self.name == name || self.link == name
+    }
+
+    pub(super) fn is_obstacle(&self) -> bool {
+        self.link.is_empty()
+    }
+
+    pub(super) fn is_plane(&self) -> bool {
+        self.shape == Shape::HalfSpace
+    }
+}
+
+/// How far to look and how many pairs to report.
+pub(super) struct Reach {
+    pub(super) influence: f64,
+    pub(super) rows: usize,
+}
+
+/// Two bodies near each other.
+#[derive(Clone, Copy)]
+pub(super) struct Near {
+    /// Row it is written to.
+    pub(super) slot: usize,
+    pub(super) frames: [FrameId; 2],
+    pub(super) between: Separation,
+    /// Closing speed of the nearest points [m/s].
+    speed: f64,
+}
+
+impl Near {
+    /// Distance less `margin` and how it closes. The acceleration of points fixed to the bodies says little about the distance: it leaves out
+    /// that the nearest points slide along both, so it is taken for zero.
+    pub(super) fn clearance(&self, margin: f64, period: &Period) -> Clearance {
+        Clearance::ahead(self.between.distance - margin, self.speed, 0.0, period)
+    }
+
+    /// Closing speed of the same points at another velocity of the joints.
+    pub(super) fn closing(&self, kinematics: &mut Kinematics) -> f64 {
+        let [a, b] = [0, 1].map(|k| kinematics.frame(self.frames[k]).carry(self.between.points[k]));
+        dot(self.between.normal, minus(a.velocity, b.velocity))
+    }
+}
+
+/// All solids and the pairs to watch.
+pub(super) struct Pairs {
+    bodies: Vec<Body>,
+    pairs: Vec<[usize; 2]>,
+    reach: Reach,
+    /// Of the bodies, at the state looked at.
+    at: Vec<(FrameMotion, Placement)>,
+    /// Distance and number of the nearest pairs.
+    nearest: Vec<(usize, Separation)>,
+    found: Vec<Near>,
+}
+
+impl Pairs {
+    pub(super) fn new(bodies: Vec<Body>, pairs: Vec<[usize; 2]>, reach: Reach) -> Pairs {
+        let (at, slots) = (Vec::with_capacity(bodies.len()), reach.rows.min(pairs.len()));
+        let (nearest, found) = (Vec::with_capacity(slots + 1), Vec::with_capacity(slots));
+        Pairs { bodies, pairs, reach, at, nearest, found }
+    }
+
+    /// Number of rows.
+    pub(super) fn slots(&self) -> usize {
+        self.reach.rows.min(self.pairs.len())
+    }
+
+    /// With a row for every pair, their names; else the rank by distance.
+    pub(super) fn names(&self) -> Vec<String> {
+        if self.pairs.len() > self.reach.rows {
+            return (1..=self.slots()).map(|k| format!("pair {k} by distance")).collect();
+        }
+        let name = |k: usize| self.bodies[k].name.as_str();
+        self.pairs.iter().map(|[a, b]| format!("{} and {}", name(*a), name(*b))).collect()
+    }
+
+    /// The nearest pairs within reach at the state `kinematics` is at, equal distances in the order of the pairs. Allocates nothing.
+    pub(super) fn look(&mut self, kinematics: &mut Kinematics) -> &[Near] {
+        self.at.clear();
+        for body in &self.bodies {
+            let frame = kinematics.frame(body.frame);
+            let placement =
+                Placement { position: frame.position, rotation: frame.rotation }.then(&body.local);
+            self.at.push((frame, placement));
+        }
+        self.rank();
+        self.found.clear();
+        for (rank, (pair, between)) in self.nearest.iter().enumerate() {
+            let [a, b] = self.pairs[*pair];
+            let on_a = self.at[a].0.carry(between.points[0]);
+            let on_b = self.at[b].0.carry(between.points[1]);
+            self.found.push(Near {
+                slot: if self.pairs.len() > self.reach.rows { rank } else { *pair },
+                frames: [self.bodies[a].frame, self.bodies[b].frame],
+                between: *between,
+                speed: dot(between.normal, minus(on_a.velocity, on_b.velocity)),
+            });
+        }
+        &self.found
+    }
+
+    /// Fills `nearest`, sorted by distance.
+    fn rank(&mut self) {
+        let slots = self.slots();
+        self.nearest.clear();
+        for (k, [a, b]) in self.pairs.iter().enumerate() {
+            let (x, y) = (&self.bodies[*a], &self.bodies[*b]);
+            let mut within = self.reach.influence;
+            if self.nearest.len() == slots {
+                within = within.min(self.nearest[slots - 1].1.distance);
+            }
+            let (at_x, at_y) = (&self.at[*a].1, &self.at[*b].1);
+            if norm(minus(at_x.position, at_y.position)) - x.radius - y.radius > within {
+                continue;
+            }
+            let Some(between) = separation((&x.shape, at_x), (&y.shape, at_y), within) else { continue };
+            let place = self.nearest.partition_point(|(_, s)| s.distance <= between.distance);
+            self.nearest.insert(place, (k, between));
+            self.nearest.truncate(slots);
+        }
+    }
+}

@@ -1,0 +1,123 @@
+//! How much kinetic energy the robot may carry.
+
+use super::Limit;
+use super::frame::check;
+use crate::row::{Cone, Motion, Needs, Tick};
+use crate::{Kind, Kinematics, LimitError, Model};
+use serde::{Deserialize, Serialize};
+
+/// `energy = { limit = 2.0 }`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EnergySettings {
+    /// Largest kinetic energy of the whole robot, rotors included [J].
+    pub limit: f64,
+}
+
+/// `1/2 (v + y)' M (v + y) <= limit`, as `|L' (v + y)| <= sqrt(2 limit)` with `M = L L'` at the measured configuration.
+///
+/// At the next configuration the energy differs by O(T |v|³); the next tick starts from the velocity measured.
+#[derive(Debug, Clone)]
+pub struct EnergyLimit {
+    settings: EnergySettings,
+}
+
+impl EnergyLimit {
+    /// From the task file's settings.
+    pub fn new(settings: EnergySettings) -> EnergyLimit {
+        EnergyLimit { settings }
+    }
+
+    /// At most `limit` [J].
+    pub fn of(limit: f64) -> EnergyLimit {
+        EnergyLimit { settings: EnergySettings { limit } }
+    }
+}
+
+impl Limit for EnergyLimit {
+    fn name(&self) -> &'static str {
+        "energy"
+    }
+
+    fn cone(&self, model: &Model, _controllable: &[usize]) -> Result<Option<Box<dyn Cone>>, LimitError> {
+        let limit = self.settings.limit;
+        check("energy limit", limit, limit > 0.0, "above 0 J")?;
+        Ok(Some(Box::new(EnergyCone { nv: model.nv(), limit, judge: Kinematics::new(model) })))
+    }
+}
+
+struct EnergyCone {
+    nv: usize,
+    limit: f64,
+    judge: Kinematics,
+}
+
+impl Cone for EnergyCone {
+    fn kind(&self) -> Kind {
+        Kind::Energy
+    }
+
+    fn name(&self) -> String {
+        "robot".to_string()
+    }
+
+    fn dimension(&self) -> usize {
+        self.nv
+    }
+
+    fn size(&self) -> f64 {
+        (2.0 * self.limit).sqrt()
+    }
+
+    fn needs(&self) -> Needs {
+        Needs { dynamics: true, ..Needs::default() }
+    }
+
+    fn fill(&mut self, tick: &mut Tick<'_>, g: &mut [f64], c: &mut [f64]) -> f64 {
+        factor(self.nv, tick.mass, g);
+        for (c, row) in c.iter_mut().zip(g.chunks_exact(self.nv)) {
+            *c = row.iter().zip(tick.v).map(|(g, v)| g * v).sum();
+        }
+        self.size()
+    }
+
+    fn excess(&mut self, motion: &mut Motion<'_>) -> f64 {
+        let energy = self.judge.kinetic_energy(motion.q, motion.v_next);
+        (energy / self.limit).sqrt() - 1.0
+    }
+}
+
+/// Writes `U = L'` (n x n, row-major, zero before) with `M = U' U`, row by row (Cholesky). A direction without inertia (a pivot that
+/// is zero to rounding) gets a row of zeros: `|U x|² = x' M x` holds for it too.
+fn factor(n: usize, mass: &[f64], u: &mut [f64]) {
+    for i in 0..n {
+        for j in i..n {
+            let done: f64 = (0..i).map(|k| u[k * n + i] * u[k * n + j]).sum();
+            u[i * n + j] = mass[i * n + j] - done;
+        }
+        let pivot = u[i * n + i];
+        let scale = if pivot > 1e-14 * mass[i * n + i] { 1.0 / pivot.sqrt() } else { 0.0 };
+        u[i * n + i..(i + 1) * n].iter_mut().for_each(|x| *x *= scale);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_factor_gives_the_quadratic_form_back() {
+        // The third dof moves nothing of its own: M = B' B with a 2 x 3 B.
+        let b = [[2.0, 1.0, -1.0], [0.0, 3.0, 2.0]];
+        let mass: Vec<f64> = (0..9).map(|k| (0..2).map(|r| b[r][k / 3] * b[r][k % 3]).sum()).collect();
+        let mut u = vec![0.0; 9];
+        factor(3, &mass, &mut u);
+        for i in 0..3 {
+            for j in 0..3 {
+                let product: f64 = (0..3).map(|k| u[k * 3 + i] * u[k * 3 + j]).sum();
+                assert!((product - mass[i * 3 + j]).abs() < 1e-12, "{i} {j} {product}");
+            }
+        }
+        assert_eq!(u[8], 0.0);
+    }
+}

@@ -1,0 +1,115 @@
+//! How fast a point of a frame may move.
+
+use super::Limit;
+use super::frame::{check, frame_of};
+use crate::kinematics::norm;
+use crate::row::{Cone, Motion, Needs, Tick};
+use crate::{FrameId, Kind, Kinematics, LimitError, Model};
+use serde::{Deserialize, Serialize};
+
+/// `frame_speed = [{ frame = "hand", limit = 0.25 }]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FrameSpeedSettings {
+    /// Name to switch it on and off by; the frame's when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// A link, joint or site of the robot file.
+    pub frame: String,
+    /// The point, in the frame's axes [m].
+    #[serde(default)]
+    pub point: [f64; 3],
+    /// Largest speed [m/s].
+    pub limit: f64,
+}
+
+/// `|J (v + y)| <= limit`: the speed of a point of a frame, with the Jacobian of the measured configuration.
+///
+/// Over the period the Jacobian turns by O(T |v|), and the speed with it; the next tick starts from the speed measured.
+#[derive(Debug, Clone)]
+pub struct FrameSpeedLimit {
+    settings: FrameSpeedSettings,
+}
+
+impl FrameSpeedLimit {
+    /// From the task file's settings.
+    pub fn new(settings: FrameSpeedSettings) -> FrameSpeedLimit {
+        FrameSpeedLimit { settings }
+    }
+
+    /// The origin of `frame` moves by at most `limit` [m/s].
+    pub fn of(frame: &str, limit: f64) -> FrameSpeedLimit {
+        let frame = frame.to_string();
+        FrameSpeedLimit { settings: FrameSpeedSettings { name: None, frame, point: [0.0; 3], limit } }
+    }
+}
+
+impl Limit for FrameSpeedLimit {
+    fn name(&self) -> &'static str {
+        "frame_speed"
+    }
+
+    fn label(&self) -> &str {
+        self.settings.name.as_deref().unwrap_or(&self.settings.frame)
+    }
+
+    fn cone(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Cone>>, LimitError> {
+        let s = &self.settings;
+        let frame = frame_of(model, "frame_speed", &s.frame, controllable)?;
+        check(&format!("speed limit of frame '{}'", s.frame), s.limit, s.limit > 0.0, "above 0 m/s")?;
+        check(&format!("point of frame '{}'", s.frame), s.point.iter().sum(), true, "finite, in m")?;
+        Ok(Some(Box::new(SpeedCone {
+            name: s.frame.clone(),
+            frame,
+            point: s.point,
+            limit: s.limit,
+            judge: Kinematics::new(model),
+            zero: vec![0.0; model.nv()],
+        })))
+    }
+}
+
+struct SpeedCone {
+    name: String,
+    frame: FrameId,
+    point: [f64; 3],
+    limit: f64,
+    /// Frames at the next velocity, for the judge.
+    judge: Kinematics,
+    zero: Vec<f64>,
+}
+
+impl Cone for SpeedCone {
+    fn kind(&self) -> Kind {
+        Kind::FrameSpeed
+    }
+
+    fn name(&self) -> String {
+        self.name.clone()
+    }
+
+    fn dimension(&self) -> usize {
+        3
+    }
+
+    fn size(&self) -> f64 {
+        self.limit
+    }
+
+    fn needs(&self) -> Needs {
+        Needs { kinematics: true, ..Needs::default() }
+    }
+
+    fn fill(&mut self, tick: &mut Tick<'_>, g: &mut [f64], c: &mut [f64]) -> f64 {
+        tick.kinematics.point_jacobian(self.frame, self.point, g);
+        for (c, row) in c.iter_mut().zip(g.chunks_exact(tick.v.len())) {
+            *c = row.iter().zip(tick.v).map(|(g, v)| g * v).sum();
+        }
+        self.limit
+    }
+
+    fn excess(&mut self, motion: &mut Motion<'_>) -> f64 {
+        self.judge.update_frames(motion.q, motion.v_next, &self.zero);
+        norm(self.judge.point(self.frame, self.point).velocity) / self.limit - 1.0
+    }
+}

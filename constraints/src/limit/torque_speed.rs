@@ -1,0 +1,109 @@
+//! Motors whose force falls with speed.
+
+use super::{Limit, PerJoint};
+use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::{Kind, LimitError, Model, Soft};
+use serde::{Deserialize, Serialize};
+
+/// `torque_speed = { stall, no_load }`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TorqueSpeedSettings {
+    /// Force at standstill [N·m or N].
+    pub stall: PerJoint,
+    /// Speed at which no force is left [rad/s or m/s].
+    pub no_load: PerJoint,
+    /// How much it resists; hard when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub soft: Option<Soft>,
+}
+
+/// The line of a direct-current motor, in both directions:
+///
+/// ```text
+///     |tau + (stall / no_load) v'| <= stall
+/// ```
+///
+/// at the speed `v'` the tick ends with. The gearbox's own limit, flat in speed, is [`TorqueLimit`](super::TorqueLimit).
+#[derive(Debug, Clone)]
+pub struct TorqueSpeedLimit {
+    settings: TorqueSpeedSettings,
+}
+
+impl TorqueSpeedLimit {
+    /// From the task file's settings.
+    pub fn new(settings: TorqueSpeedSettings) -> TorqueSpeedLimit {
+        TorqueSpeedLimit { settings }
+    }
+}
+
+impl Limit for TorqueSpeedLimit {
+    fn name(&self) -> &'static str {
+        "torque_speed"
+    }
+
+    fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
+        let positive = |x: f64| x > 0.0;
+        let stall = self.settings.stall.values(model, "torque_speed stall", positive, "above 0 N·m or N")?;
+        let no_load =
+            self.settings.no_load.values(model, "torque_speed no_load", positive, "above 0 rad/s or m/s")?;
+        let motor = |i: &usize| {
+            let (stall, no_load) = (stall[*i]?, no_load[*i]?);
+            Some(Motor { dof: *i, stall, slope: stall / no_load, joint: model.dof_name(*i) })
+        };
+        Ok(Some(Box::new(TorqueSpeedRows { motors: controllable.iter().filter_map(motor).collect() })))
+    }
+
+    fn soft(&self) -> Option<Soft> {
+        self.settings.soft
+    }
+}
+
+struct Motor {
+    dof: usize,
+    stall: f64,
+    slope: f64,
+    joint: String,
+}
+
+struct TorqueSpeedRows {
+    motors: Vec<Motor>,
+}
+
+impl Rows for TorqueSpeedRows {
+    fn kind(&self) -> Kind {
+        Kind::TorqueSpeed
+    }
+
+    fn names(&self) -> Vec<String> {
+        self.motors.iter().map(|m| m.joint.clone()).collect()
+    }
+
+    fn sizes(&self) -> Vec<f64> {
+        self.motors.iter().map(|m| m.stall).collect()
+    }
+
+    fn needs(&self) -> Needs {
+        Needs { dynamics: true, ..Needs::default() }
+    }
+
+    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+        let nv = tick.v.len();
+        for (r, m) in self.motors.iter().enumerate() {
+            let i = m.dof;
+            for (g, mass) in rows.row(r).iter_mut().zip(&tick.mass[i * nv..(i + 1) * nv]) {
+                *g = mass / tick.period.dt;
+            }
+            rows.row(r)[i] += m.slope;
+            let still = tick.bias[i] + m.slope * tick.v[i];
+            (rows.lower[r], rows.upper[r]) = (-m.stall - still, m.stall - still);
+        }
+    }
+
+    fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]) {
+        for (x, m) in excess.iter_mut().zip(&self.motors) {
+            let share = (motion.torque[m.dof] + m.slope * motion.v_next[m.dof]) / m.stall;
+            *x = share.abs() - 1.0;
+        }
+    }
+}

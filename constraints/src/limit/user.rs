@@ -1,0 +1,254 @@
+//! Linear rows of the task file's own, by state names.
+
+use super::Limit;
+use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::viability::approach;
+use crate::{Kind, LimitError, Model, Soft};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// `rows = [{ name, terms = { "q.joint" = 1.0, "v.joint" = -0.5 }, lower, upper, equals, braking, soft }]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UserRowSettings {
+    /// Name in reports, and to switch it on and off by.
+    pub name: String,
+    /// Coefficients of the next state: `q.<joint>` [rad or m], `v.<joint>` [per s], `a.<joint>` (acceleration) [per s²].
+    pub terms: BTreeMap<String, f64>,
+    /// Lowest value of the sum.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lower: Option<f64>,
+    /// Highest value of the sum.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub upper: Option<f64>,
+    /// The only value of the sum.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub equals: Option<f64>,
+    /// For sums of positions: the deceleration of the sum that may be counted on, so that it stops in front of a bound.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub braking: Option<f64>,
+    /// How much it resists; hard when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub soft: Option<Soft>,
+}
+
+/// `lower <= sum of terms of the next state <= upper`.
+///
+/// With `braking` B the sum `s` of positions is held like a joint: its acceleration toward a bound is at most what
+/// [`approach`] gives for its distance and speed. Without it the row speaks of the next state alone, and nothing looks
+/// ahead.
+#[derive(Debug, Clone)]
+pub struct UserRow {
+    settings: UserRowSettings,
+}
+
+impl UserRow {
+    /// From the task file's settings.
+    pub fn new(settings: UserRowSettings) -> UserRow {
+        UserRow { settings }
+    }
+
+    fn term(&self, model: &Model, name: &str, coefficient: f64) -> Result<Term, LimitError> {
+        let unusable = |why: &str| LimitError::Unusable {
+            what: format!("row '{}' names '{name}', {why}", self.settings.name),
+            next: "write q.<joint>, v.<joint> or a.<joint>",
+        };
+        let (letter, joint) = name.split_once('.').ok_or_else(|| unusable("which is no state"))?;
+        let quantity = match letter {
+            "q" => Quantity::Position,
+            "v" => Quantity::Velocity,
+            "a" => Quantity::Acceleration,
+            _ => return Err(unusable("which is no state")),
+        };
+        let unknown = |near| LimitError::UnknownJoint { limit: "rows", name: joint.to_string(), near };
+        let joint = model.find(joint).map_err(unknown)?;
+        if joint.nv != 1 || joint.nq != 1 {
+            return Err(unusable("a joint with several dofs"));
+        }
+        if !coefficient.is_finite() || coefficient == 0.0 {
+            let what = format!("coefficient of '{name}' in row '{}'", self.settings.name);
+            return Err(LimitError::BadValue { what, value: coefficient, domain: "a finite number but 0" });
+        }
+        Ok(Term { quantity, dof: joint.idx_v, idx_q: joint.idx_q, coefficient })
+    }
+
+    /// Lower and upper bound.
+    fn bounds(&self) -> Result<(f64, f64), LimitError> {
+        let s = &self.settings;
+        let bad = |what: &str, value, domain| {
+            Err(LimitError::BadValue { what: format!("{what} of row '{}'", s.name), value, domain })
+        };
+        for (what, value) in [("lower", s.lower), ("upper", s.upper), ("equals", s.equals)] {
+            if let Some(value) = value.filter(|x| !x.is_finite()) {
+                return bad(what, value, "a finite number");
+            }
+        }
+        if let Some(value) = s.braking.filter(|b| !(*b > 0.0 && b.is_finite())) {
+            return bad("braking", value, "above 0, in the unit of the sum per s²");
+        }
+        match (s.lower, s.upper, s.equals) {
+            (None, None, Some(x)) => Ok((x, x)),
+            (None, None, None) | (Some(_), _, Some(_)) | (_, Some(_), Some(_)) => Err(LimitError::Unusable {
+                what: format!("row '{}' needs equals, or lower or upper or both", s.name),
+                next: "give one of them",
+            }),
+            (Some(low), Some(high), _) if low >= high => Err(LimitError::Contradictory {
+                list: format!("row '{}' would have to stay above {low} and below {high}", s.name),
+            }),
+            (low, high, _) => Ok((low.unwrap_or(f64::NEG_INFINITY), high.unwrap_or(f64::INFINITY))),
+        }
+    }
+}
+
+impl Limit for UserRow {
+    fn name(&self) -> &'static str {
+        "rows"
+    }
+
+    fn label(&self) -> &str {
+        &self.settings.name
+    }
+
+    fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
+        let s = &self.settings;
+        let terms: Vec<Term> =
+            s.terms.iter().map(|(name, c)| self.term(model, name, *c)).collect::<Result<_, _>>()?;
+        let bounds = self.bounds()?;
+        if !controllable.is_empty() && !terms.iter().any(|t| controllable.contains(&t.dof)) {
+            return Err(LimitError::Unusable {
+                what: format!("row '{}' holds no controllable joint", s.name),
+                next: "name one, or drop the row",
+            });
+        }
+        if s.braking.is_some() && terms.iter().any(|t| t.quantity != Quantity::Position) {
+            return Err(LimitError::Unusable {
+                what: format!("row '{}' has braking but not only positions", s.name),
+                next: "brake on q.<joint> alone, or drop braking",
+            });
+        }
+        let largest =
+            [bounds.0, bounds.1].into_iter().filter(|x| x.is_finite()).fold(0.0, |m: f64, x| m.max(x.abs()));
+        let size = match s.braking {
+            Some(braking) => braking,
+            None if largest > 0.0 => largest,
+            None => terms.iter().fold(0.0, |m: f64, t| m.max(t.coefficient.abs())),
+        };
+        let equality = s.equals.is_some();
+        Ok(Some(Box::new(Row { name: s.name.clone(), terms, bounds, braking: s.braking, size, equality })))
+    }
+
+    fn soft(&self) -> Option<Soft> {
+        self.settings.soft
+    }
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Quantity {
+    Position,
+    Velocity,
+    Acceleration,
+}
+
+struct Term {
+    quantity: Quantity,
+    dof: usize,
+    idx_q: usize,
+    coefficient: f64,
+}
+
+struct Row {
+    name: String,
+    terms: Vec<Term>,
+    bounds: (f64, f64),
+    braking: Option<f64>,
+    size: f64,
+    equality: bool,
+}
+
+impl Row {
+    /// The sum of positions and its speed.
+    fn sum(&self, q: &[f64], v: &[f64]) -> (f64, f64) {
+        let each = |x: &dyn Fn(&Term) -> f64| self.terms.iter().map(|t| t.coefficient * x(t)).sum();
+        (each(&|t| q[t.idx_q]), each(&|t| v[t.dof]))
+    }
+}
+
+impl Rows for Row {
+    fn kind(&self) -> Kind {
+        Kind::User
+    }
+
+    fn names(&self) -> Vec<String> {
+        vec![self.name.clone()]
+    }
+
+    fn sizes(&self) -> Vec<f64> {
+        vec![self.size]
+    }
+
+    fn needs(&self) -> Needs {
+        Needs::default()
+    }
+
+    fn equality(&self) -> bool {
+        self.equality && self.braking.is_none()
+    }
+
+    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+        let (t, kappa) = (tick.period.dt, tick.period.kappa);
+        if let Some(braking) = self.braking {
+            let (s, w) = self.sum(tick.q, tick.v);
+            for term in &self.terms {
+                rows.row(0)[term.dof] += term.coefficient / t;
+            }
+            rows.upper[0] = bound(self.bounds.1 - s, w, braking, tick);
+            rows.lower[0] = -bound(s - self.bounds.0, -w, braking, tick);
+            if rows.lower[0] > rows.upper[0] {
+                rows.lower[0] = rows.upper[0];
+            }
+            return;
+        }
+        let mut still = 0.0;
+        for term in &self.terms {
+            let (i, c) = (term.dof, term.coefficient);
+            let (g, constant) = match term.quantity {
+                Quantity::Position => (kappa * t, tick.q[term.idx_q] + t * tick.v[i]),
+                Quantity::Velocity => (1.0, tick.v[i]),
+                Quantity::Acceleration => (1.0 / t, 0.0),
+            };
+            rows.row(0)[i] += c * g;
+            still += c * constant;
+        }
+        (rows.lower[0], rows.upper[0]) = (self.bounds.0 - still, self.bounds.1 - still);
+    }
+
+    fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]) {
+        if let Some(braking) = self.braking {
+            let (s, w) = self.sum(motion.q, motion.v);
+            let a: f64 = self.terms.iter().map(|t| t.coefficient * motion.acceleration[t.dof]).sum();
+            let limit = |d: f64, w: f64| {
+                if d.is_finite() { approach(d, w, braking, motion.period) } else { f64::INFINITY }
+            };
+            let (upper, lower) = (limit(self.bounds.1 - s, w), -limit(s - self.bounds.0, -w));
+            excess[0] = (a - upper).max(lower.min(upper) - a) / self.size;
+            return;
+        }
+        let value: f64 = self
+            .terms
+            .iter()
+            .map(|t| {
+                t.coefficient
+                    * match t.quantity {
+                        Quantity::Position => motion.q_next[t.idx_q],
+                        Quantity::Velocity => motion.v_next[t.dof],
+                        Quantity::Acceleration => motion.acceleration[t.dof],
+                    }
+            })
+            .sum();
+        excess[0] = (value - self.bounds.1).max(self.bounds.0 - value) / self.size;
+    }
+}
+
+fn bound(d: f64, w: f64, braking: f64, tick: &Tick<'_>) -> f64 {
+    if d.is_finite() { approach(d, w, braking, tick.period) } else { f64::INFINITY }
+}

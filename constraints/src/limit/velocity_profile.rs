@@ -1,0 +1,138 @@
+//! Speed limits that depend on the position, as robot makers state them.
+
+use super::{Limit, LimitSet};
+use crate::viability::Profile;
+use crate::{LimitError, Model};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// `velocity_profile = "fr3"`, or the curves joint by joint.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum VelocityProfileSettings {
+    /// A robot whose published curves are built in; joints are found by the end of their names, `joint1` to `joint7`.
+    Robot(KnownRobot),
+    /// Curves by joint.
+    Joints(BTreeMap<String, JointProfile>),
+}
+
+/// Robots whose curves are built in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum KnownRobot {
+    /// Franka Research 3 (Franka Control Interface documentation, "Limits for Franka Research 3").
+    Fr3,
+}
+
+/// The two curves of a joint,
+///
+/// ```text
+///     v <= min(limit, max(0, -offset + sqrt(squared (upper - q))))
+///     v >= -min(limit, max(0, -offset + sqrt(squared (q - lower))))
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct JointProfile {
+    /// Largest speed [rad/s or m/s].
+    pub limit: f64,
+    /// Speed taken off the curves [rad/s or m/s].
+    pub offset: f64,
+    /// Twice the deceleration of the curves [rad/s² or m/s²].
+    pub squared: f64,
+    /// Position at which the lower curve ends [rad or m].
+    pub lower: f64,
+    /// Position at which the upper curve ends [rad or m].
+    pub upper: f64,
+}
+
+const fn joint(limit: f64, offset: f64, squared: f64, lower: f64, upper: f64) -> JointProfile {
+    JointProfile { limit, offset, squared, lower, upper }
+}
+
+/// Joints 1 to 7 of the Franka Research 3.
+const FR3: [JointProfile; 7] = [
+    joint(2.62, 0.30, 12.0, -2.7501, 2.7501),
+    joint(2.62, 0.20, 5.17, -1.7918, 1.7918),
+    joint(2.62, 0.20, 7.00, -2.9065, 2.9065),
+    joint(2.62, 0.30, 8.00, -3.0481, -0.1458),
+    joint(5.26, 0.35, 34.0, -2.8101, 2.8101),
+    joint(4.18, 0.35, 11.0, 0.54092, 4.5205),
+    joint(5.26, 0.35, 34.0, -3.0196, 3.0196),
+];
+
+/// Position-dependent speed limits; exact at the end of every tick, for any period.
+///
+/// Where a joint brakes less than its curves fall, the curves of its own braking hold, which are lower.
+#[derive(Debug, Clone)]
+pub struct VelocityProfileLimit {
+    settings: VelocityProfileSettings,
+}
+
+impl VelocityProfileLimit {
+    /// From the task file's settings.
+    pub fn new(settings: VelocityProfileSettings) -> VelocityProfileLimit {
+        VelocityProfileLimit { settings }
+    }
+
+    /// Dofs and their curves.
+    fn curves(&self, model: &Model) -> Result<Vec<(usize, JointProfile)>, LimitError> {
+        match &self.settings {
+            VelocityProfileSettings::Robot(KnownRobot::Fr3) => fr3(model),
+            VelocityProfileSettings::Joints(map) => {
+                map.iter().map(|(name, curve)| named(model, name, curve)).collect()
+            }
+        }
+    }
+}
+
+fn fr3(model: &Model) -> Result<Vec<(usize, JointProfile)>, LimitError> {
+    let find = |k: usize| model.joints().iter().find(|j| j.nv == 1 && j.name.ends_with(&format!("joint{k}")));
+    let found: Vec<_> = (1..=7).filter_map(|k| Some((find(k)?.idx_v, FR3[k - 1]))).collect();
+    if found.len() == 7 {
+        return Ok(found);
+    }
+    let names: Vec<String> = (1..=7).filter(|k| find(*k).is_none()).map(|k| format!("joint{k}")).collect();
+    Err(LimitError::Unusable {
+        what: format!("velocity_profile = \"fr3\" finds no joint whose name ends with {}", names.join(", ")),
+        next: "use it with a Franka Research 3, or give the curves by joint",
+    })
+}
+
+fn named(model: &Model, name: &str, curve: &JointProfile) -> Result<(usize, JointProfile), LimitError> {
+    let limit = "velocity_profile";
+    let unknown = |near| LimitError::UnknownJoint { limit, name: name.to_string(), near };
+    let joint = model.find(name).map_err(unknown)?;
+    let bad = |what: &str, value: f64, domain: &'static str| {
+        Err(LimitError::BadValue {
+            what: format!("velocity_profile {what} of joint '{name}'"),
+            value,
+            domain,
+        })
+    };
+    match curve {
+        c if !(c.limit > 0.0 && c.limit.is_finite()) => bad("limit", c.limit, "above 0 rad/s or m/s"),
+        c if !(c.offset >= 0.0 && c.offset.is_finite()) => bad("offset", c.offset, "at least 0 rad/s or m/s"),
+        c if !(c.squared > 0.0 && c.squared.is_finite()) => {
+            bad("squared", c.squared, "above 0 rad/s² or m/s²")
+        }
+        c if c.lower >= c.upper || (c.upper - c.lower).is_nan() => bad("lower", c.lower, "below upper"),
+        c => Ok((joint.idx_v, *c)),
+    }
+}
+
+impl Limit for VelocityProfileLimit {
+    fn name(&self) -> &'static str {
+        "velocity_profile"
+    }
+
+    fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
+        for (i, c) in self.curves(model)? {
+            if controllable.contains(&i) {
+                let curve = |at: f64| Some(Profile { at, deceleration: 0.5 * c.squared, offset: c.offset });
+                set.velocity[i] = set.velocity[i].min(c.limit);
+                set.profile[i] = [curve(c.lower), curve(c.upper)];
+            }
+        }
+        Ok(())
+    }
+}

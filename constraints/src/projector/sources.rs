@@ -1,0 +1,206 @@
+//! The rows and cones of all limits, filled tick by tick into the problem of the controllable dofs.
+
+use super::Dofs;
+use super::coupled::Coupled;
+use crate::row::{Cone, Needs, Previous, Rows, RowsMut, Tick};
+use crate::{Dynamics, Kind, Kinematics, Limit, LimitError, Model, Period, Soft};
+
+/// Where rows come from, and the memory they are written to.
+pub(crate) struct Sources {
+    blocks: Vec<Block>,
+    cones: Vec<ConeBlock>,
+    needs: Needs,
+    scratch: Scratch,
+    kinematics: Kinematics,
+    /// `G` over all dofs of the largest block.
+    g: Vec<f64>,
+}
+
+/// What the dynamics say at the state of the tick.
+struct Scratch {
+    mass: Vec<f64>,
+    nle: Vec<f64>,
+    bias: Vec<f64>,
+    still: Vec<f64>,
+}
+
+struct Block {
+    rows: Box<dyn Rows>,
+    limit: usize,
+    first: usize,
+    sizes: Vec<f64>,
+    soft: Option<Soft>,
+    enabled: bool,
+}
+
+struct ConeBlock {
+    cone: Box<dyn Cone>,
+    limit: usize,
+    size: f64,
+    enabled: bool,
+}
+
+/// The measured state and what acts on the robot beside its motors.
+pub(crate) struct Measured<'a> {
+    pub(crate) q: &'a [f64],
+    pub(crate) v: &'a [f64],
+    /// Generalised forces from outside (nv).
+    pub(crate) external: &'a [f64],
+    pub(crate) previous: Option<Previous<'a>>,
+}
+
+/// What a row or cone is reported as.
+#[derive(Debug, Clone)]
+pub(crate) struct Label {
+    pub(crate) kind: Kind,
+    pub(crate) name: String,
+}
+
+impl Sources {
+    pub(crate) fn new(
+        model: &Model,
+        limits: &[Box<dyn Limit>],
+        controllable: &[usize],
+    ) -> Result<Sources, LimitError> {
+        let (mut blocks, mut cones, mut first) = (Vec::new(), Vec::new(), 0);
+        for (limit, l) in limits.iter().enumerate() {
+            if let Some(rows) = l.rows(model, controllable)? {
+                let (sizes, soft) = (rows.sizes(), l.soft());
+                check_sizes(&sizes, rows.names().len(), soft, l.label())?;
+                let block = Block { first, limit, soft, enabled: true, rows, sizes };
+                first += block.sizes.len();
+                blocks.push(block);
+            }
+            if let Some(cone) = l.cone(model, controllable)? {
+                check_sizes(&[cone.size()], 1, None, l.label())?;
+                cones.push(ConeBlock { limit, size: cone.size(), enabled: true, cone });
+            }
+        }
+        let needs = blocks.iter().map(|b| b.rows.needs()).chain(cones.iter().map(|c| c.cone.needs()));
+        let needs = needs.fold(Needs::default(), Needs::and);
+        let (nv, zero) = (model.nv(), || vec![0.0; model.nv()]);
+        let largest = blocks.iter().map(|b| b.sizes.len()).chain(cones.iter().map(|c| c.cone.dimension()));
+        let g = vec![0.0; nv * largest.max().unwrap_or(0)];
+        let scratch = Scratch { mass: vec![0.0; nv * nv], nle: zero(), bias: zero(), still: zero() };
+        Ok(Sources { blocks, cones, needs, scratch, kinematics: Kinematics::new(model), g })
+    }
+
+    /// No rows and no cones.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.blocks.iter().all(|b| b.sizes.is_empty()) && self.cones.is_empty()
+    }
+
+    /// Reports of all rows, then of all cones.
+    pub(crate) fn labels(&self) -> Vec<Label> {
+        let rows = self.blocks.iter().flat_map(|b| {
+            let kind = b.rows.kind();
+            b.rows.names().into_iter().map(move |name| Label { kind, name })
+        });
+        rows.chain(self.cones.iter().map(|c| Label { kind: c.cone.kind(), name: c.cone.name() })).collect()
+    }
+
+    /// Softness of each row.
+    pub(crate) fn softness(&self) -> Vec<Option<Soft>> {
+        self.blocks.iter().flat_map(|b| vec![b.soft; b.sizes.len()]).collect()
+    }
+
+    /// Which rows are equalities.
+    pub(crate) fn equalities(&self) -> Vec<bool> {
+        self.blocks.iter().flat_map(|b| vec![b.rows.equality(); b.sizes.len()]).collect()
+    }
+
+    /// Rows of the matrices of all cones.
+    pub(crate) fn dimensions(&self) -> Vec<usize> {
+        self.cones.iter().map(|c| c.cone.dimension()).collect()
+    }
+
+    /// Switches the rows and cones of a limit.
+    pub(crate) fn enable(&mut self, limit: usize, on: bool) {
+        self.blocks.iter_mut().filter(|b| b.limit == limit).for_each(|b| b.enabled = on);
+        self.cones.iter_mut().filter(|c| c.limit == limit).for_each(|c| c.enabled = on);
+    }
+
+    /// Writes the rows and cones of the tick, as shares of their sizes; `y` (nv) holds the velocity change of the dofs
+    /// that are not controllable.
+    pub(crate) fn fill(
+        &mut self,
+        problem: &mut Coupled,
+        dynamics: &mut Dynamics,
+        measured: &Measured<'_>,
+        dofs: &Dofs,
+        y: &[f64],
+        period: &Period,
+    ) {
+        let (q, v, s) = (measured.q, measured.v, &mut self.scratch);
+        if self.needs.dynamics {
+            dynamics.mass(q, &mut s.mass);
+            dynamics.nle(q, v, &mut s.nle);
+            dynamics.passive(q, v, &mut s.bias);
+            for i in 0..v.len() {
+                s.bias[i] = s.nle[i] - s.bias[i] - measured.external[i];
+            }
+        }
+        if self.needs.kinematics {
+            self.kinematics.update(q, v, &s.still);
+        }
+        let (mass, bias) = (&s.mass[..], &s.bias[..]);
+        let previous = measured.previous;
+        let mut tick = Tick { q, v, period, mass, bias, kinematics: &mut self.kinematics, previous };
+        let nv = v.len();
+        for block in &mut self.blocks {
+            let rows = block.first..block.first + block.sizes.len();
+            problem.row_lower[rows.clone()].fill(f64::NEG_INFINITY);
+            problem.row_upper[rows.clone()].fill(f64::INFINITY);
+            let g = &mut self.g[..nv * block.sizes.len()];
+            g.fill(0.0);
+            if block.enabled {
+                let (lower, upper) = (&mut problem.row_lower[rows.clone()], &mut problem.row_upper[rows]);
+                block.rows.fill(&mut tick, &mut RowsMut { g, lower, upper, nv });
+            }
+            for (r, size) in block.sizes.iter().enumerate() {
+                problem.take_row(block.first + r, &self.g[r * nv..(r + 1) * nv], *size, dofs, y);
+            }
+        }
+        for (c, block) in self.cones.iter_mut().enumerate() {
+            let cone = &mut problem.cones[c];
+            let g = &mut self.g[..nv * cone.c.len()];
+            g.fill(0.0);
+            cone.c.fill(0.0);
+            cone.radius = f64::INFINITY;
+            if block.enabled {
+                cone.radius = block.cone.fill(&mut tick, g, &mut cone.c) / block.size;
+            }
+            cone.take(g, nv, block.size, dofs, y);
+        }
+    }
+}
+
+impl Needs {
+    /// What either needs.
+    pub(crate) fn and(self, other: Needs) -> Needs {
+        Needs {
+            dynamics: self.dynamics || other.dynamics,
+            kinematics: self.kinematics || other.kinematics,
+            previous: self.previous || other.previous,
+        }
+    }
+}
+
+fn check_sizes(sizes: &[f64], names: usize, soft: Option<Soft>, label: &str) -> Result<(), LimitError> {
+    let bad = |what: &str, value, domain| {
+        Err(LimitError::BadValue { what: format!("{what} of limit '{label}'"), value, domain })
+    };
+    if let Some(size) = sizes.iter().find(|x| !(**x > 0.0 && x.is_finite())) {
+        return bad("size of a row", *size, "above 0");
+    }
+    if names != sizes.len() {
+        return bad("number of row names", names as f64, "the number of rows");
+    }
+    match soft {
+        Some(s) if !(s.linear >= 0.0 && s.linear.is_finite()) => bad("soft.linear", s.linear, "at least 0"),
+        Some(s) if !(s.quadratic > 0.0 && s.quadratic.is_finite()) => {
+            bad("soft.quadratic", s.quadratic, "above 0")
+        }
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,119 @@
+//! What may be changed between ticks: limits on and off, forces from outside, the tick before.
+
+use super::Projector;
+use super::build::check_combination;
+use crate::row::Previous;
+use crate::viability::Dof;
+use crate::{LimitError, LimitSet, Target};
+
+impl Projector {
+    /// Switches every limit with that label (see [`Limit::label`](crate::Limit::label)) on or off, for the ticks to come.
+    ///
+    /// # Errors
+    /// An unknown label, or limits that make no sense without it; nothing is changed then. An error allocates.
+    pub fn set_enabled(&mut self, label: &str, on: bool) -> Result<(), LimitError> {
+        if !self.switches.iter().any(|s| s.label == label) {
+            let known = self.switches.iter().map(|s| s.label.as_str());
+            let near = crate::error::near_names(label, known);
+            return Err(LimitError::Unusable {
+                what: format!("no limit is called '{label}'{near}"),
+                next: "name one of the projector's limits",
+            });
+        }
+        let before = self.switches.iter().map(|s| s.enabled).collect::<Vec<_>>();
+        self.switches.iter_mut().filter(|s| s.label == label).for_each(|s| s.enabled = on);
+        self.collect_enabled();
+        let sound = self.limits.check(&self.model, &self.dofs.controllable).and_then(|()| {
+            check_combination(
+                &self.model,
+                &self.limits,
+                &self.dofs,
+                (self.settings.consistency, self.settings.braking),
+            )
+        });
+        if let Err(error) = sound {
+            self.switches.iter_mut().zip(before).for_each(|(s, before)| s.enabled = before);
+            self.collect_enabled();
+            return Err(error);
+        }
+        for (limit, switch) in self.switches.iter().enumerate() {
+            if let Some(stages) = &mut self.coupled {
+                stages.sources.enable(limit, switch.enabled);
+            }
+            self.checker.enable(limit, switch.enabled, &self.limits);
+        }
+        Ok(())
+    }
+
+    /// Labels of all limits and whether they hold.
+    pub fn enabled(&self) -> impl Iterator<Item = (&str, bool)> {
+        self.switches.iter().map(|s| (s.label.as_str(), s.enabled))
+    }
+
+    fn collect_enabled(&mut self) {
+        self.limits.clear();
+        for switch in self.switches.iter().filter(|s| s.enabled) {
+            self.limits.tighten(&switch.set);
+        }
+        for i in 0..self.braking.len() {
+            self.braking[i] = Dof::of(&self.limits, i).braking(&self.period);
+        }
+    }
+
+    /// Forces on the robot beside its motors, as generalised forces `J'f` (nv) [N·m or N], for the ticks to come: contact
+    /// forces of a walking robot, measured or estimated, are held constant over a period.
+    ///
+    /// # Panics
+    /// When there are not nv of them.
+    pub fn set_external_forces(&mut self, forces: &[f64]) {
+        self.external.copy_from_slice(forces);
+    }
+
+    /// The forces last set (nv).
+    pub fn external_forces(&self) -> &[f64] {
+        &self.external
+    }
+
+    /// True when some limit speaks of the tick before.
+    pub fn needs_previous(&self) -> bool {
+        self.checker.needs().previous
+    }
+
+    /// Acceleration (nv) and motor force (nv) of the tick before, for limits on their change; `None`: not known, and
+    /// those limits do not hold in the next tick.
+    ///
+    /// # Panics
+    /// When there are not nv of them.
+    pub fn set_previous(&mut self, previous: Option<Previous<'_>>) {
+        self.previous.known = previous.is_some();
+        if let Some(previous) = previous {
+            self.previous.acceleration.copy_from_slice(previous.acceleration);
+            self.previous.torque.copy_from_slice(previous.torque);
+        }
+    }
+
+    /// Forgets the tick before and the stored brake: a new episode begins.
+    pub fn forget(&mut self) {
+        self.previous.known = false;
+        self.backup.stored = false;
+    }
+
+    /// Makes the last tick, which ended with `target`, the tick before.
+    pub fn remember(&mut self, target: &Target) {
+        self.previous.known = true;
+        self.previous.acceleration.copy_from_slice(&target.acceleration);
+        self.previous.torque.copy_from_slice(self.checker.torque());
+    }
+
+    /// Names of all rows an [`ActiveRow`](crate::ActiveRow) may speak of: the dofs (nv), then the coupled rows and cones.
+    pub fn row_names(&self) -> Vec<String> {
+        let dofs = (0..self.model.nv()).map(|i| self.model.dof_name(i));
+        let labels = self.coupled.iter().flat_map(|stages| stages.labels.iter().map(|l| l.name.clone()));
+        dofs.chain(labels).collect()
+    }
+
+    /// All limits that hold now, of single joints.
+    pub fn limits(&self) -> &LimitSet {
+        &self.limits
+    }
+}

@@ -1,0 +1,157 @@
+//! Coupled limits: rows and cones over the velocity change `y = v' - v` of all dofs.
+//!
+//! A limit that ties several dofs together hands the projector a [`Rows`] or a [`Cone`]. Both are asked twice a tick: `fill`
+//! writes the constraint for the solver, and `excess` evaluates what was meant at the final target for the
+//! [`checker`](crate::checker). The two must not share their formula: rows come from Jacobians and mass matrices, the judge from
+//! forward kinematics and inverse dynamics.
+
+use crate::{Kind, Kinematics, Period};
+use serde::{Deserialize, Serialize};
+
+/// What is known at the start of a tick. Lengths nq and nv; units rad or m, s, N·m or N.
+pub struct Tick<'a> {
+    /// Configuration (nq).
+    pub q: &'a [f64],
+    /// Velocity (nv).
+    pub v: &'a [f64],
+    /// The control period.
+    pub period: &'a Period,
+    /// Mass matrix (nv x nv, symmetric); zero unless some row has [`Needs::dynamics`].
+    pub mass: &'a [f64],
+    /// `nle - passive - external`: what the motors supply beside `M a` (nv); zero unless some row has [`Needs::dynamics`].
+    pub bias: &'a [f64],
+    /// Frames and Jacobians at `q`, `v` and zero acceleration; stale unless some row has [`Needs::kinematics`].
+    pub kinematics: &'a mut Kinematics,
+    /// The tick before, where it is known.
+    pub previous: Option<Previous<'a>>,
+}
+
+/// What the tick before asked of the robot.
+#[derive(Debug, Clone, Copy)]
+pub struct Previous<'a> {
+    /// Acceleration (nv).
+    pub acceleration: &'a [f64],
+    /// Motor force (nv).
+    pub torque: &'a [f64],
+}
+
+/// The step from measured state to target, for the judge.
+pub struct Motion<'a> {
+    /// Measured configuration (nq).
+    pub q: &'a [f64],
+    /// Measured velocity (nv).
+    pub v: &'a [f64],
+    /// Next configuration (nq).
+    pub q_next: &'a [f64],
+    /// Next velocity (nv).
+    pub v_next: &'a [f64],
+    /// `(v' - v) / T` (nv).
+    pub acceleration: &'a [f64],
+    /// Motor force by inverse dynamics at `q`, `v` and that acceleration (nv); zero unless some row has [`Needs::dynamics`].
+    pub torque: &'a [f64],
+    /// The control period.
+    pub period: &'a Period,
+    /// Frames at `q`, `v` and that acceleration; stale unless some row has [`Needs::kinematics`].
+    pub kinematics: &'a mut Kinematics,
+    /// The tick before, where it is known.
+    pub previous: Option<Previous<'a>>,
+}
+
+/// What of a [`Tick`] and a [`Motion`] a limit reads; the rest is not computed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Needs {
+    /// Mass matrix, bias and motor forces.
+    pub dynamics: bool,
+    /// Frames and Jacobians.
+    pub kinematics: bool,
+    /// Acceleration and motor force of the tick before.
+    pub previous: bool,
+}
+
+/// Memory of the rows of one limit; `lower <= G y <= upper`.
+pub struct RowsMut<'a> {
+    /// `G` (rows x nv, row-major), zero at the start of each tick.
+    pub g: &'a mut [f64],
+    /// Lower bounds; minus infinity at the start of each tick.
+    pub lower: &'a mut [f64],
+    /// Upper bounds; infinity at the start of each tick.
+    pub upper: &'a mut [f64],
+    /// nv.
+    pub nv: usize,
+}
+
+impl RowsMut<'_> {
+    /// Row `r` of `G` (nv).
+    pub fn row(&mut self, r: usize) -> &mut [f64] {
+        &mut self.g[r * self.nv..(r + 1) * self.nv]
+    }
+}
+
+/// Linear rows of one limit.
+pub trait Rows: Send {
+    /// What an active row is reported as.
+    fn kind(&self) -> Kind;
+
+    /// What each row is of: a joint, a frame, a pair of bodies.
+    fn names(&self) -> Vec<String>;
+
+    /// The size of each row's limit, in the unit of the row: what tolerances and scaling are shares of; above 0.
+    fn sizes(&self) -> Vec<f64>;
+
+    /// What `fill` and `excess` read.
+    fn needs(&self) -> Needs;
+
+    /// True when `lower` and `upper` are always equal.
+    fn equality(&self) -> bool {
+        false
+    }
+
+    /// Writes the rows of the tick. Must not allocate.
+    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>);
+
+    /// Writes by how much the motion exceeds the limit of each row, as a share of its size; negative inside. Must not allocate.
+    fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]);
+}
+
+/// One second-order cone `|G y + c| <= radius`.
+pub trait Cone: Send {
+    /// What the active cone is reported as.
+    fn kind(&self) -> Kind;
+
+    /// What it is of: a frame, the robot.
+    fn name(&self) -> String;
+
+    /// Rows of `G`.
+    fn dimension(&self) -> usize;
+
+    /// Radius, in the unit of the cone: what tolerances are shares of; above 0.
+    fn size(&self) -> f64;
+
+    /// What `fill` and `excess` read.
+    fn needs(&self) -> Needs;
+
+    /// Writes `G` (dimension x nv, row-major, zero before) and `c` (dimension), and returns the radius. Must not allocate.
+    fn fill(&mut self, tick: &mut Tick<'_>, g: &mut [f64], c: &mut [f64]) -> f64;
+
+    /// By how much the motion exceeds the cone, as a share of its size; negative inside. Must not allocate.
+    fn excess(&mut self, motion: &mut Motion<'_>) -> f64;
+}
+
+/// How much a soft limit resists: the projector minimises `linear s + 1/2 quadratic s^2` beside the distance, with the slack `s` as a
+/// share of the limit's size, in units of the distance that the largest velocity change of one period makes.
+///
+/// With a `linear` part the limit holds exactly until the proposal pulls harder than that.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Soft {
+    /// Linear weight, at least 0.
+    pub linear: f64,
+    /// Quadratic weight, above 0.
+    pub quadratic: f64,
+}
+
+impl Default for Soft {
+    fn default() -> Soft {
+        Soft { linear: 1.0, quadratic: 100.0 }
+    }
+}

@@ -1,0 +1,88 @@
+"""A task file to start from, made of a Gymnasium MuJoCo environment."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+TEMPLATE = """\
+# {env_id} as a task file. Robot, times, actions and episode length are Gymnasium's; the reward, the start and the end of an
+# episode are Python there and must be written here, or given to nearl.make_vec as functions.
+name = "{name}"
+
+[model]
+mjcf = "{robot}"
+
+[time]
+dt = {dt!r}
+sim_dt = {sim_dt!r}
+max_episode_steps = {steps}
+
+[state]
+controllable = [{joints}]
+
+[reward]
+nothing_yet = 0.0
+
+[termination]
+
+[reset]
+
+[constraints]
+consistency = "free"
+
+[idm]
+kind = "learned"
+input = "full"
+"""
+
+
+def from_gymnasium(env_id: str, folder: str | os.PathLike[str], **kwargs: Any) -> Path:
+    """Writes ``<name>.toml`` and its robot file into ``folder`` for a Gymnasium environment that is built on ``MujocoEnv``.
+
+    The task steps the same physics as Gymnasium, bit for bit for the same state and action, and observes all joint positions and
+    velocities. Reward, reset and termination are code in Gymnasium and do not come along: write them as expressions, which trains
+    everywhere, or pass functions to ``nearl.make_vec(file, n, reward=..., termination=...)``.
+
+    Not supported: robots with meshes, actuators that do not drive a single joint within a range, wrappers, environments that move
+    their goal or model while they run. Training with constraints also needs the robot to be one tree of bodies.
+
+    Args:
+        env_id: Name known to ``gymnasium.make``.
+        folder: Where to write; created if it does not exist.
+        **kwargs: For ``gymnasium.make``.
+
+    Returns:
+        The task file.
+
+    Raises:
+        ValueError: not a MuJoCo environment.
+        FileExistsError: the task file is there already.
+    """
+    import mujoco
+
+    env = gymnasium.make(env_id, **kwargs)
+    steps = env.spec.max_episode_steps if env.spec is not None else None
+    inner: Any = env.unwrapped
+    if not (hasattr(inner, "fullpath") and hasattr(inner, "frame_skip") and hasattr(inner, "model")):
+        raise ValueError(f"'{env_id}' is not built on Gymnasium's MujocoEnv, so it has no robot file; write a task file by hand")
+    model, name = inner.model, env_id.split("/")[-1].rsplit("-v", 1)[0]
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    file, robot = folder / f"{name}.toml", folder / Path(inner.fullpath).name
+    if file.exists():
+        raise FileExistsError(f"'{file}' is there already; give another folder or remove it")
+    text = Path(inner.fullpath).read_text()
+    if "<include" in text:
+        mujoco.mj_saveLastXML(str(robot), mujoco.MjModel.from_xml_path(inner.fullpath))
+    else:
+        robot.write_text(text)
+    driven = [model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)]
+    timestep = float(model.opt.timestep)
+    euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    joints = ", ".join(f'"{joint}"' for joint in dict.fromkeys(driven))
+    dt = round(timestep * inner.frame_skip, 12)
+    file.write_text(TEMPLATE.format(env_id=env_id, name=name, robot=robot.name, dt=dt, sim_dt=timestep if euler else 0.0, steps=steps or 1000, joints=joints))
+    env.close()
+    return file

@@ -1,0 +1,180 @@
+"""SB3's five lines on the Rust trainer.
+
+    agent = nearl.PID2("HalfCheetah-v5", algo="pid2-ib", seed=0)
+    agent.learn(1_000_000, progress_bar=True)
+    action, state = agent.predict(obs)
+    agent.save("cheetah.safetensors")
+    agent = nearl.PID2.load("cheetah.safetensors")
+"""
+
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nearl import _core
+
+Floats = NDArray[np.float64]
+Callback = Callable[["PID2", dict[str, float]], bool | None]
+
+
+class PID2:
+    """A policy that proposes states, its inverse dynamics and the constraints between them, trained in this process.
+
+    Args:
+        task: Name of the task, one of ``nearl.tasks()``, or a task file (TOML).
+        algo: ``"pid2-ib"``, ``"pid2-gan"``, ``"nearl"`` or ``"ppo"``; see ``nearl train --help``.
+        seed: Of everything random; the same seed gives the same weights whatever the number of threads.
+        threads: All cores by default.
+        settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.scale": 0.8}``.
+        run: Run folder to write as ``nearl train`` does; none by default.
+
+    Raises:
+        ValueError: unknown task, algorithm or setting; the message names it.
+        OSError: a file cannot be read, or ``run`` not written.
+    """
+
+    def __init__(
+        self,
+        task: str | os.PathLike[str],
+        algo: str = "pid2-ib",
+        *,
+        seed: int = 0,
+        threads: int | None = None,
+        settings: Mapping[str, Any] | None = None,
+        run: str | os.PathLike[str] | None = None,
+    ):
+        overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
+        threads = threads or os.cpu_count() or 1
+        self._training: _core.Training | None = _core.Training(os.fspath(task), algo, seed, threads, overrides, run)
+        self._run, self.task, self.algo, self.seed = run, self._training.task, algo, seed
+        self._begin(self._training.controller())
+
+    def _begin(self, controller: _core.Controller) -> None:
+        self._controller = controller
+        self._rng = np.random.default_rng(self.seed)
+
+    @property
+    def num_timesteps(self) -> int:
+        """Environment steps learned from so far; 0 for a loaded policy."""
+        return 0 if self._training is None else self._training.steps
+
+    @property
+    def controller(self) -> _core.Controller:
+        """The controller with what was learned so far."""
+        return self._controller
+
+    def learn(self, total_timesteps: int, callback: Callback | list[Callback] | None = None, progress_bar: bool = False) -> "PID2":
+        """Learns from at least ``total_timesteps`` more environment steps.
+
+        Args:
+            total_timesteps: Rounded up to whole batches of ``n_envs * n_steps``. The learning rate falls to zero at their end, so one
+                long call is not two short ones.
+            callback: ``callback(agent, metrics)`` after each iteration, or several; metrics by SB3's tags. ``False`` ends the learning.
+            progress_bar: Draws a bar on standard error, if that is a terminal.
+
+        The interpreter runs other threads meanwhile. Ctrl-C raises ``KeyboardInterrupt`` between two iterations; what was learned
+        stays, and is written where there is a run folder.
+        """
+        if self._training is None:
+            raise ValueError("a loaded policy predicts and does not learn: its file has no optimiser state; make a new PID2 of the task")
+        if total_timesteps < 1:
+            raise ValueError(f"total_timesteps is {total_timesteps}; ask for at least one step")
+        callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]
+        bar = _Bar(sys.stderr, self.num_timesteps, total_timesteps) if progress_bar else None
+        self._training.extend(int(total_timesteps))
+        try:
+            while not self._training.done:
+                metrics = self._training.iterate()
+                if bar is not None:
+                    bar.show(metrics)
+                if [c for c in callbacks if c(self, metrics) is False]:
+                    break
+        finally:
+            self._controller = self._training.controller()
+            if self._run is not None:
+                self._training.checkpoint("final")
+            if bar is not None:
+                bar.close()
+        return self
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: tuple[_core.Controller, ...] | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Floats, tuple[_core.Controller, ...] | None]:
+        """The action for one observation (n_obs) or several (n x n_obs), as the controller on the robot would give it.
+
+        Args:
+            observation: In the order of ``controller.obs_names``.
+            state: What the last call returned. It matters where the policy runs every few ticks only (Panda-reach); then each call is
+                one control tick, and without ``state`` the first of an episode. None elsewhere.
+            episode_start: (n) true where an episode begins.
+            deterministic: Without the noise of exploration.
+
+        Returns:
+            Action (n_act) or (n x n_act), within the actuators' range, and the state for the next call.
+        """
+        obs = np.asarray(observation, float)
+        rows = np.atleast_2d(obs)
+        if self._controller.policy_every == 1:
+            memory: tuple[_core.Controller, ...] = (self._controller,) * len(rows)
+        else:
+            memory = state if state is not None else tuple(self._controller.another() for _ in rows)
+            if len(memory) != len(rows):
+                raise ValueError(f"state is of {len(memory)} environments, observation of {len(rows)}; give the state of the same environments")
+            for controller, begins in zip(memory, np.broadcast_to(np.asarray(episode_start if episode_start is not None else False), len(rows))):
+                if begins:
+                    controller.reset()
+        noise = None if deterministic else self._rng.standard_normal((len(rows), self._controller.n_noise))
+        actions = np.stack([c.act(row, None if noise is None else noise[i]) for i, (c, row) in enumerate(zip(memory, rows))])
+        return (actions if obs.ndim > 1 else actions[0]), (None if self._controller.policy_every == 1 else memory)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the snapshot: networks, normaliser, constraints, robot; ``nearl eval``, ``nearl run`` and :meth:`load` read it."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        self._controller.save(path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "PID2":
+        """A policy to predict with, from a snapshot file or from the ``checkpoints`` of a run folder.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: it is not a snapshot, or was damaged.
+        """
+        agent = cls.__new__(cls)
+        controller = _core.Controller.load(path)
+        agent._training, agent._run, agent.task, agent.algo, agent.seed = None, None, controller.task, controller.algo, 0
+        agent._begin(controller)
+        return agent
+
+
+def _toml(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else f"{value!r}" if isinstance(value, str) else str(value)
+
+
+class _Bar:
+    """One line that overwrites itself."""
+
+    def __init__(self, out: TextIO, begin: int, steps: int):
+        self._out, self._begin, self._steps = out, begin, steps
+        self._shown = out.isatty()
+
+    def show(self, metrics: dict[str, float]) -> None:
+        if not self._shown:
+            return
+        done = min(1.0, (metrics["time/total_timesteps"] - self._begin) / self._steps)
+        words = f"return {metrics.get('rollout/ep_rew_mean', float('nan')):.0f}  {metrics['time/fps']:.0f} steps/s"
+        self._out.write(f"\r{'#' * round(30 * done):30} {100 * done:3.0f} %  {words}   ")
+        self._out.flush()
+
+    def close(self) -> None:
+        if self._shown:
+            self._out.write("\n")

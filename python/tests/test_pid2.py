@@ -1,0 +1,116 @@
+"""SB3's five lines: learn, predict, save, load; the same weights as `nearl train`; Ctrl-C keeps what was learned."""
+
+import _thread
+import threading
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import nearl
+
+CART_POLE = str(ROOT / "examples" / "tasks" / "cart-pole.toml")
+
+
+def test_five_lines(tmp_path: Path) -> None:
+    agent = nearl.PID2(CART_POLE, algo="pid2-ib", seed=0)
+    before = agent.predict(np.zeros(5))[0]
+    assert agent.learn(60_000) is agent and agent.num_timesteps >= 60_000
+    agent.save(tmp_path / "agent.safetensors")
+    loaded = nearl.PID2.load(tmp_path / "agent.safetensors")
+    assert loaded.task == "cart-pole" and loaded.algo == "pid2-ib"
+
+    env = gymnasium.make(nearl.register(CART_POLE)[0])
+    (obs, _), total, over, state = env.reset(seed=3), 0.0, False, None
+    while not over:
+        action, state = loaded.predict(obs, state, deterministic=True)
+        assert np.array_equal(action, agent.predict(obs)[0]) and action.shape == (1,) and state is None
+        obs, reward, terminated, truncated, _ = env.step(action)
+        total, over = total + reward, terminated or truncated
+    assert total > 400, "it balances"
+    assert not np.array_equal(before, agent.predict(np.zeros(5))[0])
+    with pytest.raises(ValueError, match="no optimiser state"):
+        loaded.learn(1000)
+
+
+def test_predictions_are_the_controllers_and_come_in_rows(tmp_path: Path) -> None:
+    agent = nearl.PID2("HalfCheetah-v5", seed=1, settings={"constraints.velocity.limit": 2.0}).learn(4096)
+    agent.save(tmp_path / "a.safetensors")
+    controller = nearl.Controller.load(tmp_path / "a.safetensors")
+    env = nearl.Env("HalfCheetah-v5")
+    rows = []
+    for seed in range(5):
+        obs, _ = env.reset(seed=seed)
+        q, v = env.state
+        rows.append((obs, controller.update(q, v, obs)[0]))
+    actions, _ = agent.predict(np.stack([obs for obs, _ in rows]))
+    assert np.array_equal(actions, np.stack([a for _, a in rows]))
+    noisy = [agent.predict(rows[0][0], deterministic=False)[0] for _ in range(200)]
+    assert np.std(noisy, axis=0).min() > 0.1 and np.array_equal(agent.predict(rows[0][0])[0], actions[0])
+
+
+def test_a_policy_of_every_twentieth_tick_keeps_its_proposal() -> None:
+    agent = nearl.PID2.load(ROOT / "examples" / "snapshots" / "panda-reach.safetensors")
+    envs = [nearl.Env("Panda-reach") for _ in range(2)]
+    obs = np.stack([env.reset(seed=i)[0] for i, env in enumerate(envs)])
+    controllers = [nearl.Controller.load(ROOT / "examples" / "snapshots" / "panda-reach.safetensors") for _ in envs]
+    state, start = None, np.ones(2, bool)
+    for tick in range(45):
+        if tick == 30:
+            start, _ = np.array([False, True]), controllers[1].reset()
+        actions, state = agent.predict(obs, state, start)
+        expected = [c.update(*env.state, o)[0] for c, env, o in zip(controllers, envs, obs)]
+        assert np.array_equal(actions, np.stack(expected))
+        obs = np.stack([env.step(a)[0] for env, a in zip(envs, actions)])
+        start = np.zeros(2, bool)
+    with pytest.raises(ValueError, match="state is of 2 environments, observation of 1"):
+        agent.predict(obs[0], state)
+
+
+def test_callbacks_see_metrics_and_stop_the_learning() -> None:
+    seen: list[dict[str, float]] = []
+
+    def third(agent: nearl.PID2, metrics: dict[str, float]) -> bool:
+        seen.append(metrics)
+        assert agent.num_timesteps == metrics["time/total_timesteps"]
+        return len(seen) < 3
+
+    nearl.PID2(CART_POLE, algo="ppo").learn(100_000, callback=[third], progress_bar=True)
+    assert [m["time/total_timesteps"] for m in seen] == [1024, 2048, 3072]
+    assert {"rollout/ep_rew_mean", "time/fps", "train/approx_kl"} <= seen[-1].keys()
+
+
+def test_the_same_seed_gives_the_same_policy_on_any_number_of_threads() -> None:
+    digest = lambda seed, threads: nearl.PID2(CART_POLE, seed=seed, threads=threads).learn(5000).controller.digest  # noqa: E731
+    assert digest(0, 1) == digest(0, 3) != digest(1, 1)
+
+
+def test_ctrl_c_keeps_what_was_learned(tmp_path: Path) -> None:
+    agent = nearl.PID2(CART_POLE, run=tmp_path / "run")
+    threading.Timer(1.0, _thread.interrupt_main).start()
+    with pytest.raises(KeyboardInterrupt):
+        agent.learn(10**9)
+    assert 0 < agent.num_timesteps < 10**9
+    loaded = nearl.PID2.load(tmp_path / "run")
+    assert np.array_equal(loaded.predict(np.zeros(5))[0], agent.predict(np.zeros(5))[0])
+    assert (tmp_path / "run" / "metrics.csv").read_text().startswith("time/total_timesteps,")
+
+
+def test_python_runs_while_it_learns() -> None:
+    agent, turns = nearl.PID2("HalfCheetah-v5", threads=1, settings={"train.n_steps": 1024}), 0
+    job = threading.Thread(target=lambda: agent.learn(16_384))
+    job.start()
+    while job.is_alive():
+        turns += 1
+    assert turns > 1000, "the interpreter was held"
+
+
+def test_mistakes_are_named() -> None:
+    with pytest.raises(ValueError, match="no algorithm 'sac'"):
+        nearl.PID2(CART_POLE, algo="sac")
+    with pytest.raises(ValueError, match="did you mean 'gamma'"):
+        nearl.PID2(CART_POLE, settings={"train.gama": 0.9})
+    with pytest.raises(ValueError, match="total_timesteps is 0"):
+        nearl.PID2(CART_POLE).learn(0)

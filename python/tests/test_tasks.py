@@ -1,0 +1,170 @@
+"""Tasks of the user's own and costs, through Gymnasium and through a vector; rewards and terminations by functions."""
+
+import shutil
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import ROOT
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import nearl
+
+CART_POLE = ROOT / "examples" / "tasks" / "cart-pole.toml"
+
+
+def test_a_task_file_is_a_gymnasium_environment() -> None:
+    (env_id,) = nearl.register(CART_POLE)
+    assert env_id == "nearl/cart-pole"
+    env = gymnasium.make(env_id)
+    check_env(env.unwrapped, skip_render_check=True)
+    assert env.spec.max_episode_steps == 500
+    obs, _ = env.reset(seed=1, options={"qpos": [0.2, 0.1], "qvel": [0.3, 0.4]})
+    np.testing.assert_allclose(obs, [0.2, np.sin(0.1), np.cos(0.1), 0.3, 0.4], atol=1e-15)
+    obs, reward, terminated, _, info = env.step(np.array([0.5], np.float32))
+    assert reward == pytest.approx(obs[2] - 0.1 * obs[0] ** 2 - 0.01 * 0.25, abs=1e-12) and not terminated and info == {}
+    env.reset(options={"qpos": [0, 0.39], "qvel": [0, 3.0]})
+    assert env.step(np.zeros(1))[2], "it fell"
+
+
+def test_a_task_file_is_a_vector() -> None:
+    vec = nearl.make_vec(str(CART_POLE), 3, seed=5)
+    assert vec.native.action_names == ["push"] and vec.reset(seed=5)[0].shape == (3, 5)
+    single = nearl.Env(str(CART_POLE))
+    obs, _ = single.reset(seed=6)
+    assert np.array_equal(vec.reset(seed=5)[0][1], obs)
+    assert vec.step(np.full((3, 1), 0.3))[1][1] == single.step(np.array([0.3]))[1]
+
+
+def test_mistakes_name_the_file_and_the_key(tmp_path: Path) -> None:
+    shutil.copy(CART_POLE.with_suffix(".xml"), tmp_path)
+    file = tmp_path / "mine.toml"
+    file.write_text(CART_POLE.read_text().replace('"cos(q.hinge)"\n', '"cos(q.hing)"\n'))
+    with pytest.raises(ValueError, match=r"mine.toml \[reward.upright\].*'q.hing'.*did you mean 'q.hinge'"):
+        nearl.make_vec(str(file), 2)
+    with pytest.raises(OSError, match="nowhere.toml"):
+        nearl.Env(str(tmp_path / "nowhere.toml"))
+
+
+@pytest.mark.parametrize(("task", "threshold"), [("HalfCheetah", 3.2096), ("Hopper", 0.7402), ("Walker2d", 2.3415), ("Ant", 2.6222)])
+def test_velocity_tasks_count_as_gymnasiums_speeds_say(task: str, threshold: float) -> None:
+    """Safety-Gymnasium: cost = speed > threshold, on the speed that Gymnasium's own environment reports."""
+    theirs = gymnasium.make(f"{task}-v5").unwrapped
+    ours = gymnasium.make(f"nearl/{task}-velocity").unwrapped
+    theirs.action_space.seed(0)
+    counts = [0, 0]
+    for episode in range(30):
+        theirs.reset(seed=episode)
+        qpos, qvel = theirs.data.qpos.copy(), theirs.data.qvel.copy()
+        qvel[0] = threshold * (episode % 3) * 0.8
+        theirs.set_state(qpos, qvel)
+        ours.set_state(qpos, qvel)
+        for _ in range(4):
+            action = theirs.action_space.sample().astype(np.float64)
+            info = theirs.step(action)[4]
+            speed = np.hypot(info["x_velocity"], info["y_velocity"]) if task == "Ant" else info["x_velocity"]
+            cost = ours.step(action)[4]["cost"]
+            assert cost == float(speed > threshold)
+            counts[int(cost)] += 1
+    assert min(counts) > 10, "both sides of the threshold are covered"
+
+
+def test_a_vector_tells_the_cost() -> None:
+    vec = nearl.make_vec("HalfCheetah-velocity", 2)
+    vec.reset(seed=0)
+    for i, speed in enumerate((0.0, 6.0)):
+        vec.set_state(i, vec.native.qpos[i], np.r_[speed, np.zeros(8)])
+    assert vec.step(np.zeros((2, 6)))[4]["cost"].tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_functions_that_say_what_the_task_says_change_nothing(mode: AutoresetMode, tmp_path: Path) -> None:
+    """Hopper's reward and termination in NumPy, on a task file without a termination, against the native Hopper."""
+    dt = 0.008
+
+    def reward(obs: np.ndarray, actions: np.ndarray, next_obs: np.ndarray) -> np.ndarray:
+        assert obs.shape == next_obs.shape == (4, 12) and actions.shape == (4, 3)
+        return (next_obs[:, 11] - obs[:, 11]) / dt + healthy(next_obs) - 1e-3 * (actions**2).sum(1)
+
+    def healthy(obs: np.ndarray) -> np.ndarray:
+        return (obs[:, 0] > 0.7) & (np.abs(obs[:, 1]) < 0.2)
+
+    text = (ROOT / "tests" / "fixtures" / "hopper.toml").read_text()
+    text = text.replace("[termination]\n", "").replace('low = "q.rootz <= 0.7"\n', "").replace('tilted = "abs(q.rooty) >= 0.2"\n', "")
+    text = text.replace('"clamp(v.foot_joint, -10, 10)",\n', '"clamp(v.foot_joint, -10, 10)", "q.rootx",\n').replace("dt = 0.008\n", "dt = 0.008\nmax_episode_steps = 25\n")
+    file = tmp_path / "bare.toml"
+    file.write_text(text)
+    ours = nearl.make_vec(str(file), 4, autoreset_mode=mode, reward=reward, termination=lambda o, a, n: ~healthy(n))
+    theirs = nearl.VecEnv("Hopper-v5", 4, max_episode_steps=25, autoreset_mode=mode)
+    ours.reset(seed=0), theirs.reset(seed=0)
+    rng, ends = np.random.default_rng(1), np.zeros(2, int)
+    over = np.zeros(4, bool)
+
+    def align(which: np.ndarray) -> None:
+        for i in np.flatnonzero(which):  # starts are drawn differently
+            ours.set_state(i, theirs.native.qpos[i], theirs.native.qvel[i])
+
+    align(np.ones(4, bool))
+    for _ in range(300):
+        actions = rng.uniform(-1, 1, (4, 3))
+        a, b = ours.step(actions), theirs.step(actions)
+        np.testing.assert_allclose(a[1], b[1], atol=1e-11)
+        assert np.array_equal(a[2], b[2]) and np.array_equal(a[3], b[3])
+        ends += b[2].sum(), b[3].sum()
+        if mode is AutoresetMode.SAME_STEP:
+            fresh = b[2] | b[3]
+            assert np.array_equal(a[4].get("_final_obs", np.zeros(4, bool)), fresh)
+            for i in np.flatnonzero(fresh):
+                assert np.array_equal(a[4]["final_obs"][i][:11], b[4]["final_obs"][i])
+        else:
+            fresh, over = over, b[2] | b[3]
+        align(fresh)
+    assert ends.min() > 3, "terminations and truncations are covered"
+
+
+def test_functions_of_the_wrong_shape_are_named() -> None:
+    vec = nearl.make_vec(str(CART_POLE), 3, reward=lambda o, a, n: 0.0)
+    vec.reset(seed=0)
+    with pytest.raises(ValueError, match=r"reward\(obs, actions, next_obs\) gave shape \(\); give one value an environment, \(3,\)"):
+        vec.step(np.zeros((3, 1)))
+    vec = nearl.make_vec(str(CART_POLE), 3, reward=lambda o, a, n: np.array([0, np.nan, 0]))
+    vec.reset(seed=0)
+    with pytest.raises(ValueError, match=r"\[1\] is nan"):
+        vec.step(np.zeros((3, 1)))
+
+
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Swimmer-v5", "Reacher-v5", "Pusher-v5", "Humanoid-v5"])
+def test_gymnasiums_mujoco_environments_become_task_files(env_id: str, tmp_path: Path) -> None:
+    file = nearl.from_gymnasium(env_id, tmp_path)
+    theirs, ours = gymnasium.make(env_id).unwrapped, nearl.Env(str(file))
+    assert ours.action_space == theirs.action_space and ours.dt == pytest.approx(theirs.dt, abs=1e-12)
+    assert ours.native.max_episode_steps == gymnasium.spec(env_id).max_episode_steps
+    theirs.action_space.seed(0)
+    theirs.reset(seed=0)
+    ours.set_state(theirs.data.qpos, theirs.data.qvel)
+    # Gymnasium's own reset has run a step's worth of derived quantities; from a set state both begin alike.
+    theirs.set_state(theirs.data.qpos.copy(), theirs.data.qvel.copy())
+    for _ in range(50):
+        action = theirs.action_space.sample().astype(np.float64)
+        theirs.step(action)
+        obs = ours.step(action)[0]
+        assert np.array_equal(ours.qpos, theirs.data.qpos) and np.array_equal(ours.qvel, theirs.data.qvel)
+    assert np.array_equal(obs, np.r_[ours.qpos, ours.qvel])
+    with pytest.raises(FileExistsError, match="is there already"):
+        nearl.from_gymnasium(env_id, tmp_path)
+
+
+def test_an_environment_without_mujoco_has_no_robot(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="'CartPole-v1' is not built on Gymnasium's MujocoEnv"):
+        nearl.from_gymnasium("CartPole-v1", tmp_path)
+
+
+def test_a_task_from_gymnasium_learns_once_its_reward_is_written(tmp_path: Path) -> None:
+    file = nearl.from_gymnasium("InvertedPendulum-v5", tmp_path)
+    text = file.read_text().replace("nothing_yet = 0.0", "alive = 1.0").replace("[termination]\n", '[termination]\nfell = "abs(q.hinge) > 0.2"\n')
+    file.write_text(text.replace("[reset]\n", '[reset]\nposition = "0.01 * uniform"\nvelocity = "0.01 * uniform"\n'))
+    seen: list[float] = []
+    nearl.PID2(file, settings={"train.n_envs": 8}).learn(40_000, callback=lambda _, m: seen.append(m.get("rollout/ep_rew_mean", 0.0)))
+    assert seen[1] < 100 < 200 < seen[-1], "Gymnasium's reward: 1 while it stands"

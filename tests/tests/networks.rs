@@ -1,0 +1,104 @@
+//! Networks from the task file: sizes and activation, from training through the snapshot to the controller.
+
+use nearl_runtime::net::{Activation, Dense};
+use nearl_runtime::{Controller, Snapshot, SnapshotError};
+use nearl_tests::{request, training};
+use nearl_trainer::train::Training;
+
+const SETS: [&str; 5] = [
+    "train.nets.policy=[24, 16, 8]",
+    "train.nets.idm=[20]",
+    "train.nets.value=[]",
+    "train.nets.discriminator=[12, 10, 8]",
+    "train.nets.activation=relu",
+];
+const SHORT: [&str; 3] = ["train.n_envs=4", "train.n_steps=32", "train.ppo.batch_size=64"];
+
+/// The textbook sums with `max(0, x)` between the layers.
+fn relu(net: &Dense, x: &[f32]) -> Vec<f64> {
+    let mut h: Vec<f64> = x.iter().map(|&v| f64::from(v)).collect();
+    for (i, l) in net.layers.iter().enumerate() {
+        let sum = |n: usize| {
+            let row = l.weight[n * l.n_in..][..l.n_in].iter().zip(&h);
+            f64::from(l.bias[n]) + row.map(|(&w, x)| f64::from(w) * x).sum::<f64>()
+        };
+        let y: Vec<f64> = (0..l.n_out).map(sum).collect();
+        h = if i + 1 < net.layers.len() { y.iter().map(|v| v.max(0.0)).collect() } else { y };
+    }
+    h
+}
+
+/// Sizes and activation of the task file reach the controller that loads the snapshot, for every algorithm.
+#[test]
+fn sizes_and_activation_survive_the_file() {
+    let set = [SETS.as_slice(), SHORT.as_slice()].concat();
+    for algo in ["ppo", "nearl", "pid2-gan", "pid2-ib"] {
+        let mut t = training("HalfCheetah-v5", algo, 0, 1, &set);
+        (0..3).for_each(|_| drop(t.iterate()));
+        let loaded = Snapshot::from_bytes(&t.snapshot().to_bytes()).expect("loads");
+        assert_eq!(loaded.manifest.activation, Activation::Relu);
+        let (n_out, nets) = (if algo == "ppo" { 6 } else { 17 }, &loaded.networks);
+        assert_eq!(nets.policy.widths(), [17, 24, 16, 8, n_out]);
+        let idm = nets.idm.as_ref().map(|(net, _)| net.widths());
+        assert_eq!(idm, (algo != "ppo").then(|| vec![24, 20, 6]));
+        let mut controller = Controller::new(&loaded).expect("controller");
+        let (mut state, mut out) = (controller.state(), controller.output());
+        state.obs.iter_mut().enumerate().for_each(|(i, x)| *x = (i as f64).sin());
+        controller.update(&state, &controller.noise(), &mut out);
+        let want = relu(&nets.policy, &out.x);
+        let got = if algo == "ppo" { &out.sampled } else { &out.change };
+        for (g, w) in got.iter().zip(want) {
+            assert!((f64::from(*g) - w).abs() < 1e-5 * (1.0 + w.abs()), "{algo}: {g} {w}");
+        }
+    }
+}
+
+/// The manifest is edited as a vandal would, digest included.
+fn with_manifest(snapshot: &Snapshot, from: &str, to: &str) -> Result<Snapshot, SnapshotError> {
+    let bytes = snapshot.to_bytes();
+    let head = u64::from_le_bytes(bytes[..8].try_into().expect("8 bytes")) as usize;
+    let mut header: serde_json::Value = serde_json::from_slice(&bytes[8..8 + head]).expect("header");
+    let text = header["__metadata__"]["nearl"].as_str().expect("text").to_owned();
+    let (_, manifest) = text.split_once('\n').expect("digest and manifest");
+    assert!(manifest.contains(from), "{manifest}");
+    let manifest = manifest.replace(from, to);
+    let write = |digest: &str, header: &mut serde_json::Value| {
+        header["__metadata__"]["nearl"] = format!("{digest}\n{manifest}").into();
+        let head = header.to_string();
+        [&(head.len() as u64).to_le_bytes(), head.as_bytes(), &bytes[8 + bytes_head(&bytes)..]].concat()
+    };
+    // a wrong digest is answered with the right one
+    match Snapshot::from_bytes(&write("0", &mut header)) {
+        Err(SnapshotError::Digest { actual, .. }) => Snapshot::from_bytes(&write(&actual, &mut header)),
+        other => other,
+    }
+}
+
+fn bytes_head(bytes: &[u8]) -> usize {
+    u64::from_le_bytes(bytes[..8].try_into().expect("8 bytes")) as usize
+}
+
+#[test]
+fn an_unknown_activation_is_refused_and_an_absent_one_is_tanh() {
+    let t = training("Panda-reach", "pid2-ib", 0, 1, &[]);
+    let refused = with_manifest(t.snapshot(), "\"activation\":\"tanh\"", "\"activation\":\"gelu\"");
+    let error = refused.expect_err("gelu is not known").to_string();
+    assert!(error.contains("gelu") && error.contains("tanh") && error.contains("relu"), "{error}");
+    let old = with_manifest(t.snapshot(), "\"activation\":\"tanh\",", "").expect("an older file");
+    assert_eq!(old.manifest.activation, Activation::Tanh);
+    assert_eq!(old.networks, t.snapshot().networks);
+}
+
+#[test]
+fn impossible_sizes_are_refused_in_a_sentence() {
+    for (set, word) in [
+        ("train.nets.policy=[32, 0]", "[train.nets.policy]: a hidden layer of width 0"),
+        ("train.nets.idm=[100000]", "[train.nets.idm]"),
+        ("train.nets.activation=gelu", "gelu"),
+        ("train.nets.polcy=[3]", "did you mean 'policy'"),
+    ] {
+        let error = Training::new(&request("HalfCheetah-v5", "pid2-ib", 0, 1, &[set])).map(|_| ());
+        let error = error.expect_err(set).to_string();
+        assert!(error.contains(word), "{set}: {error}");
+    }
+}

@@ -1,0 +1,172 @@
+//! `nearl sweep` as a user starts it: finished runs are left alone, broken ones done again, and a run is what `nearl train`
+//! would have made.
+
+mod common;
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use common::*;
+use nearl_runtime::Snapshot;
+
+const STEPS: &str = "4096";
+
+fn sweep(out: &Path, more: &[&str]) -> Output {
+    let cart_pole = repository().join("examples/tasks/cart-pole.toml");
+    let tasks = format!("{},Hopper-v5", cart_pole.display());
+    let mut command = Command::new(program("nearl"));
+    command.args([
+        "sweep",
+        "--tasks",
+        &tasks,
+        "--algos",
+        "ppo,pid2-ib",
+        "--seeds",
+        "0-1",
+        "--steps",
+        STEPS,
+        "--jobs",
+        "3",
+    ]);
+    command.arg("--out").arg(out).args(more);
+    command.output().expect("nearl sweep")
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+fn digest(run: &Path) -> String {
+    Snapshot::load(&run.join("checkpoints/final.safetensors")).expect("snapshot").digest()
+}
+
+#[test]
+fn a_sweep_finishes_what_is_not_finished() {
+    let folder = tempfile::tempdir().expect("folder");
+    let out = folder.path().join("sweep");
+    let first = sweep(&out, &["--json"]);
+    assert!(first.status.success(), "{}", text(&first.stderr));
+    let result: serde_json::Value = serde_json::from_slice(&first.stdout).expect("JSON");
+    assert_eq!((result["runs"].as_array().map(Vec::len), result["failed"].as_u64()), (Some(8), Some(0)));
+    let summary = result["summary"].as_array().expect("summary");
+    assert_eq!(summary.len(), 4);
+    let of =
+        |task: &str| summary.iter().find(|s| s["task"] == task && s["algo"] == "pid2-ib").expect("summary");
+    let (low, mean, high) = (
+        of("Hopper-v5")["lowest"].as_f64(),
+        of("Hopper-v5")["return"].as_f64(),
+        of("Hopper-v5")["highest"].as_f64(),
+    );
+    assert!(
+        low <= mean && mean <= high && of("cart-pole")["idm_loss"].is_f64() && of("cart-pole")["seeds"] == 2
+    );
+
+    let single = folder.path().join("single");
+    let mut train = Command::new(program("nearl"));
+    train.args([
+        "train",
+        "Hopper-v5",
+        "--algo",
+        "pid2-ib",
+        "--steps",
+        STEPS,
+        "--seed",
+        "1",
+        "--threads",
+        "2",
+        "--json",
+        "--out",
+    ]);
+    assert!(train.arg(&single).output().expect("nearl train").status.success());
+    assert_eq!(digest(&out.join("Hopper-v5/pid2-ib_1")), digest(&single), "a run of a sweep is a run");
+
+    let broken = out.join("cart-pole/ppo_0/checkpoints/final.safetensors");
+    let (kept, before) = (out.join("cart-pole/ppo_1/metrics.csv"), digest(&out.join("cart-pole/ppo_0")));
+    let written = kept.metadata().and_then(|m| m.modified()).expect("metrics");
+    std::fs::remove_file(&broken).expect("break a run");
+    let second = sweep(&out, &[]);
+    let words = text(&second.stdout);
+    assert!(second.status.success(), "{}", text(&second.stderr));
+    assert_eq!(words.matches("finished before").count(), 7, "{words}");
+    assert!(
+        words.contains("cart-pole ppo seed 0: was broken off, begins anew")
+            && words.contains("cart-pole ppo seed 0: done"),
+        "{words}"
+    );
+    assert!(words.contains("algorithm") && words.contains("pid2-ib"), "a table: {words}");
+    assert_eq!(
+        kept.metadata().and_then(|m| m.modified()).expect("metrics"),
+        written,
+        "a finished run is not touched"
+    );
+    assert_eq!(digest(&out.join("cart-pole/ppo_0")), before);
+
+    let other = sweep(&out, &["--set", "train.gamma=0.9"]);
+    assert_eq!(other.status.code(), Some(1));
+    assert!(text(&other.stderr).contains("holds a run of another task file"), "{}", text(&other.stderr));
+}
+
+#[test]
+fn a_sweep_that_is_stopped_saves_and_goes_on_later() {
+    let folder = tempfile::tempdir().expect("folder");
+    let mut command = Command::new(program("nearl"));
+    command.args([
+        "sweep",
+        "--tasks",
+        "Hopper-v5",
+        "--algos",
+        "ppo",
+        "--seeds",
+        "0-2",
+        "--steps",
+        "1e9",
+        "--jobs",
+        "2",
+    ]);
+    command.arg("--out").arg(folder.path());
+    let process = Process::start(&mut command);
+    let metrics = |seed: u32| folder.path().join(format!("Hopper-v5/ppo_{seed}/metrics.csv"));
+    let learning = |seed| std::fs::read_to_string(metrics(seed)).is_ok_and(|t| t.lines().count() > 3);
+    until("two runs learn", || (learning(0) && learning(1)).then_some(()));
+
+    let mut rival = Command::new(program("nearl"));
+    rival.args(["sweep", "--tasks", "Hopper-v5", "--out"]).arg(folder.path());
+    let refused = rival.output().expect("nearl sweep");
+    assert!(text(&refused.stderr).contains("another sweep is at work"), "{}", text(&refused.stderr));
+
+    process.signal(libc::SIGINT);
+    let output = process.output();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        text(&output.stderr).contains("3 of 3 runs did not finish; the same command goes on"),
+        "{}",
+        text(&output.stderr)
+    );
+    for seed in [0, 1] {
+        let saved = metrics(seed).with_file_name("checkpoints/final.safetensors");
+        assert!(Snapshot::load(&saved).expect("what was learned").manifest.steps > 0);
+    }
+    assert!(!metrics(2).exists(), "nothing starts after a stop");
+}
+
+#[test]
+fn mistakes_are_found_before_anything_runs() {
+    let folder = tempfile::tempdir().expect("folder");
+    for (arguments, says) in [
+        (["--tasks", "Hoper-v5", "--algos", "ppo", "--seeds", "0"], "did you mean 'Hopper-v5'"),
+        (["--tasks", "Hopper-v5", "--algos", "sac", "--seeds", "0"], "no algorithm 'sac'"),
+        (["--tasks", "Hopper-v5", "--algos", "ppo", "--seeds", "0,0"], "seed 0 is asked for twice"),
+        (["--tasks", "Hopper-v5", "--algos", "ppo", "--seeds", "3-1"], "are no seeds"),
+    ] {
+        let mut command = Command::new(program("nearl"));
+        let output = command
+            .arg("sweep")
+            .args(arguments)
+            .arg("--out")
+            .arg(folder.path())
+            .output()
+            .expect("nearl sweep");
+        assert!(!output.status.success() && text(&output.stderr).contains(says), "{}", text(&output.stderr));
+        assert!(!folder.path().join("Hopper-v5").exists());
+    }
+}

@@ -1,0 +1,227 @@
+//! Tasks written in TOML: equal to native ones where they say the same, refused with the key where they are wrong, and
+//! costs counted as Safety-Gymnasium counts them.
+
+use std::path::{Path, PathBuf};
+
+use nearl_trainer::env::{self, Env};
+use nearl_trainer::rollout::stream;
+use nearl_trainer::train::{Request, Training, complete};
+use nearl_trainer::{evaluate, tasks};
+use rand::RngExt;
+
+fn fixture(name: &str) -> String {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures").join(name).display().to_string()
+}
+
+fn example(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/tasks").join(name)
+}
+
+fn random_action(env: &dyn Env, rng: &mut env::ChaCha8Rng) -> Vec<f64> {
+    env.spec().action_low().zip(env.spec().action_high()).map(|(l, h)| rng.random_range(l..h)).collect()
+}
+
+/// Rewards, terminations and observations over `steps` of the same states and actions; terminations seen.
+fn assert_equal(own: &str, native: &str, steps: usize) -> usize {
+    let (mut own, mut native) =
+        (tasks::env(&fixture(own)).expect("user task"), env::make(native).expect("task"));
+    let mut rng = stream(3, 0);
+    let (mut seen, mut expected) = (vec![0.0; own.spec().n_obs()], vec![0.0; native.spec().n_obs()]);
+    assert_eq!(own.spec().actuators, native.spec().actuators);
+    assert_eq!(own.spec().dt, native.spec().dt);
+    let restart = |own: &mut dyn Env, native: &mut dyn Env, rng: &mut env::ChaCha8Rng| {
+        native.reset(rng).expect("reset");
+        own.set_state(native.qpos(), native.qvel()).expect("state");
+    };
+    restart(own.as_mut(), native.as_mut(), &mut rng);
+    let mut ends = 0;
+    for t in 0..steps {
+        let action = random_action(native.as_ref(), &mut rng);
+        let (a, b) = (own.step(&action), native.step(&action));
+        assert!((a.reward - b.reward).abs() < 1e-12, "step {t}: {} {}", a.reward, b.reward);
+        assert_eq!((a.terminated, a.fault), (b.terminated, b.fault), "step {t}");
+        assert_eq!((own.qpos(), own.qvel()), (native.qpos(), native.qvel()), "step {t}");
+        own.observe(&mut seen);
+        native.observe(&mut expected);
+        assert_eq!(seen, expected, "step {t}");
+        if b.terminated {
+            ends += 1;
+            restart(own.as_mut(), native.as_mut(), &mut rng);
+        }
+    }
+    ends
+}
+
+#[test]
+fn a_half_cheetah_of_ones_own_is_the_native_one() {
+    assert_equal("half_cheetah.toml", "HalfCheetah-v5", 1000);
+}
+
+#[test]
+fn a_hopper_of_ones_own_ends_its_episodes_as_the_native_one() {
+    assert!(assert_equal("hopper.toml", "Hopper-v5", 1000) > 10, "the comparison covers terminations");
+}
+
+#[test]
+fn starts_are_drawn_as_written_and_repeat_with_their_seed() {
+    let mut env = tasks::env(&example("cart-pole.toml").display().to_string()).expect("example");
+    let mut drawn = Vec::new();
+    for i in 0..200 {
+        env.reset(&mut stream(0, i)).expect("reset");
+        drawn.push((env.qpos().to_vec(), env.qvel().to_vec()));
+    }
+    let hinge: Vec<f64> = drawn.iter().map(|(q, _)| q[1]).collect();
+    let spread = hinge.iter().map(|h| h * h).sum::<f64>() / 200.0;
+    assert!(hinge.iter().all(|h| h.abs() <= 0.1) && (spread - 0.01 / 3.0).abs() < 1e-3, "{spread}");
+    assert!(drawn.iter().all(|(q, v)| q[0] == 0.0 && v.iter().all(|v| v.abs() <= 0.05) && v[0] != v[1]));
+    let mut other = env.another().expect("another");
+    other.reset(&mut stream(0, 199)).expect("reset");
+    assert_eq!((other.qpos(), other.qvel()), (env.qpos(), env.qvel()));
+}
+
+/// Text of the example, its replacement, and what the message must say.
+const MISTAKES: &[(&str, &str, &[&str])] = &[
+    (
+        "\"cos(q.hinge)\"\ncentred",
+        "\"cos(q.hingee)\"\ncentred",
+        &["[reward.upright]", "unknown name 'q.hingee'", "did you mean 'q.hinge'?"],
+    ),
+    ("u.squared\"", "u.pusch\"", &["[reward.effort]", "did you mean 'u.push'?"]),
+    (
+        "abs(q.hinge) > 0.4",
+        "abs(q.hinge > 0.4",
+        &["[termination.fell]", "')' is missing before the end at character 18"],
+    ),
+    (
+        "\"0.1 * uniform\"",
+        "\"0.1 * q.hinge\"",
+        &["[reset.q.hinge]", "unknown name 'q.hinge'", "there are uniform, normal"],
+    ),
+    ("q = { hinge", "q = { hinges", &["[reset.q.hinges]", "did you mean 'hinge'?"]),
+    (
+        "velocity = \"0.05 * uniform\"",
+        "velocities = 1",
+        &["[reset.", "velocities", "did you mean 'velocity'?"],
+    ),
+    ("\"-0.01 * u.squared\"", "[1]", &["[reward.effort]", "neither a number nor an expression"]),
+    ("dt = 0.02 ", "dt = 0.025 ", &["[time.sim_dt]", "not a whole number of physics steps"]),
+    ("sim_dt = 0.01", "sim_dt = 0.02", &["[time.sim_dt]", "timestep is 0.01 s"]),
+    ("\"sin(q.hinge)\"", "\"sin(u.push)\"", &["[state.observation]", "unknown name 'u.push'"]),
+    (
+        "max_episode_steps = 500",
+        "max_episode_steps = 0",
+        &["[time.max_episode_steps]", "0 ticks hold no episode"],
+    ),
+    ("[reward]", "[rewards]", &["unknown field `rewards`", "did you mean 'reward'?"]),
+    ("cart-pole.xml", "cart-poll.xml", &["cart-poll.xml", "cannot be read"]),
+];
+
+#[test]
+fn mistakes_are_named_with_file_and_key() {
+    let text = std::fs::read_to_string(example("cart-pole.toml")).expect("example");
+    let folder = tempfile::tempdir().expect("folder");
+    std::fs::copy(example("cart-pole.xml"), folder.path().join("cart-pole.xml")).expect("robot");
+    let file = folder.path().join("mine.toml");
+    for (from, to, says) in MISTAKES {
+        assert!(text.contains(from), "{from}");
+        std::fs::write(&file, text.replacen(from, to, 1)).expect("task");
+        let message = tasks::load(&file.display().to_string(), &[]).map(|_| ()).expect_err(to).to_string();
+        assert!(message.contains("mine.toml") || message.contains("cart-poll"), "{message}");
+        says.iter().for_each(|part| assert!(message.contains(part), "'{part}' is not in: {message}"));
+    }
+    std::fs::write(
+        &file,
+        text.replacen("[reward]", "[termination]", 1).replacen("[termination]\nfell", "[cost]\nfell", 1),
+    )
+    .expect("task");
+    let message = tasks::load(&file.display().to_string(), &[]).map(|_| ()).map_err(|e| e.to_string());
+    assert!(message.is_err_and(|m| m.contains("[termination]: only a task with its own [reward]")));
+}
+
+#[test]
+fn a_robot_without_a_usable_actuator_is_refused() {
+    let robot = std::fs::read_to_string(example("cart-pole.xml")).expect("robot");
+    let folder = tempfile::tempdir().expect("folder");
+    let file = folder.path().join("mine.toml");
+    std::fs::copy(example("cart-pole.toml"), &file).expect("task");
+    for (from, to, says) in [
+        (" ctrllimited=\"true\" ctrlrange=\"-1 1\"", "", "actuator 'push' has no ctrlrange"),
+        ("joint=\"slider\" gear=\"10\"", "body=\"cart\" gear=\"10\"", "MuJoCo cannot load"),
+    ] {
+        std::fs::write(folder.path().join("cart-pole.xml"), robot.replacen(from, to, 1)).expect("robot");
+        let message = tasks::load(&file.display().to_string(), &[]).map(|_| ()).expect_err(to).to_string();
+        assert!(message.contains(says), "{message}");
+    }
+}
+
+/// The thresholds of Safety-Gymnasium, on speeds computed here from the states.
+#[test]
+fn velocity_tasks_cost_one_for_each_step_over_the_threshold() {
+    for (task, threshold) in
+        [("HalfCheetah", 3.2096), ("Hopper", 0.7402), ("Walker2d", 2.3415), ("Ant", 2.6222)]
+    {
+        let mut env = tasks::env(&format!("{task}-velocity")).expect("task");
+        let mut native = env::make(&format!("{task}-v5")).expect("task");
+        let mut rng = stream(1, 0);
+        let (mut over, mut steps) = (0, 0);
+        for start in 0..60 {
+            native.reset(&mut rng).expect("reset");
+            let (qpos, mut qvel) = (native.qpos().to_vec(), native.qvel().to_vec());
+            (qvel[0], qvel[1]) =
+                (threshold * (f64::from(start % 3) - 0.6), if task == "Ant" { 1.5 } else { qvel[1] });
+            native.set_state(&qpos, &qvel).expect("state");
+            env.set_state(&qpos, &qvel).expect("state");
+            for _ in 0..5 {
+                let place =
+                    |e: &dyn Env| if task == "Ant" { e.sim().position(1) } else { [e.qpos()[0], 0.0, 0.0] };
+                let before = place(native.as_ref());
+                let action = random_action(native.as_ref(), &mut rng);
+                let (expected, step) = (native.step(&action), env.step(&action));
+                let after = place(native.as_ref());
+                let per_second = |k: usize| (after[k] - before[k]) / native.spec().dt;
+                let speed = if task == "Ant" { per_second(0).hypot(per_second(1)) } else { per_second(0) };
+                assert_eq!(step.cost, f64::from(u8::from(speed > threshold)), "{task} at {speed} m/s");
+                assert_eq!((step.reward, step.terminated), (expected.reward, expected.terminated), "{task}");
+                (over, steps) = (over + usize::from(speed > threshold), steps + 1);
+            }
+        }
+        assert!(over > 20 && over < steps - 20, "{task}: {over} of {steps} over the threshold");
+    }
+}
+
+fn trained(task: &str, algo: &str, steps: u64, set: &[&str]) -> (Training, Vec<f64>) {
+    let set: Vec<String> = set.iter().map(|s| (*s).to_string()).collect();
+    let mut manifest = tasks::load(task, &set).unwrap_or_else(|e| panic!("{e}"));
+    complete(&mut manifest).expect("manifest");
+    let mut training = Training::new(&Request { manifest, algo: algo.into(), steps, seed: 0, threads: 2 })
+        .expect("training");
+    let mut returns = Vec::new();
+    while !training.is_done() {
+        returns.push(training.iterate().return_mean);
+    }
+    (training, returns)
+}
+
+#[test]
+fn the_example_learns_to_balance() {
+    let file = example("cart-pole.toml").display().to_string();
+    for algo in ["ppo", "pid2-ib"] {
+        let (training, returns) = trained(&file, algo, 80_000, &[]);
+        let (first, last) = (returns[1], returns[returns.len() - 1]);
+        assert!(first < 150.0 && last > 300.0, "{algo}: from {first} to {last} of 500");
+        let e = evaluate::evaluate(training.snapshot(), 5, 1, true).expect("evaluation");
+        assert!(e.mean_return() > 400.0, "{algo}: {}", e.mean_return());
+    }
+}
+
+/// The speed of the root is projected in every target, and the evaluation counts what it costs.
+#[test]
+fn a_velocity_prior_holds_in_every_target() {
+    let (training, _) =
+        trained("HalfCheetah-velocity", "pid2-ib", 8192, &["constraints.velocity.limit.rootx=0.01"]);
+    let e = evaluate::evaluate(training.snapshot(), 2, 0, true).expect("evaluation");
+    assert!(e.raw_violations > e.ticks / 2, "proposals are faster than a centimetre a second");
+    assert_eq!(e.target_violations, 0);
+    assert!(e.reached_violations > 0, "no motor holds the root: what is reached is another matter");
+    assert_eq!(e.costs.len(), 2);
+}

@@ -1,0 +1,142 @@
+//! `nearl sweep`.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use clap::Args;
+use indicatif::ProgressBar;
+
+use super::{Failure, cores, say};
+use crate::sweep::{Event, Found, Row, Summary, Sweep, run};
+
+#[derive(Args)]
+pub(super) struct SweepCommand {
+    /// Tasks or task files, separated by commas.
+    #[arg(long, value_delimiter = ',', required = true)]
+    tasks: Vec<String>,
+    /// Algorithms, separated by commas.
+    #[arg(long, value_delimiter = ',', default_value = "ppo,pid2-ib")]
+    algos: Vec<String>,
+    /// Seeds: `0,1,2` or `0-2`.
+    #[arg(long, default_value = "0-2", value_parser = seeds)]
+    seeds: Seeds,
+    /// Environment steps of each run; 1_000_000 and 1e6 are both read.
+    #[arg(long, default_value = "1000000", value_parser = super::train::steps)]
+    steps: u64,
+    /// Folder of all runs: `<out>/<task>/<algo>_<seed>`.
+    #[arg(long)]
+    out: PathBuf,
+    /// Runs at a time, one thread each; all cores when absent.
+    #[arg(long)]
+    jobs: Option<usize>,
+    /// Overrides of every task file, e.g. `train.n_envs=32`.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone)]
+struct Seeds(Vec<u64>);
+
+fn seeds(text: &str) -> Result<Seeds, String> {
+    let wrong = || format!("'{text}' are no seeds; write 0,1,2 or 0-2");
+    let mut all = Vec::new();
+    for part in text.split(',') {
+        let (first, last) = part.split_once('-').unwrap_or((part, part));
+        let number = |s: &str| s.trim().parse::<u64>().map_err(|_| wrong());
+        let (first, last) = (number(first)?, number(last)?);
+        if last < first || last - first > 10_000 {
+            return Err(wrong());
+        }
+        all.extend(first..=last);
+    }
+    Ok(Seeds(all))
+}
+
+impl SweepCommand {
+    pub(super) fn run(self) -> Result<(), Failure> {
+        let Seeds(seeds) = self.seeds;
+        let sweep = Sweep {
+            tasks: self.tasks,
+            algos: self.algos,
+            seeds,
+            steps: self.steps,
+            out: self.out,
+            set: self.set,
+        };
+        let _lock = sweep.lock()?;
+        let runs = sweep.plan()?;
+        let stop = Arc::new(AtomicBool::new(false));
+        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+            signal_hook::flag::register(signal, Arc::clone(&stop))?;
+        }
+        let todo = runs.iter().filter(|r| r.found != Found::Finished).count() as u64;
+        let bar = if self.json { ProgressBar::hidden() } else { ProgressBar::new(todo * sweep.steps) };
+        let mut done = 0;
+        let failed = run(&sweep, &runs, self.jobs.unwrap_or_else(cores), &stop, |event| {
+            let line = |words: String| {
+                if !self.json {
+                    bar.suspend(|| say(words));
+                }
+            };
+            match event {
+                Event::Skipped(r) => line(format!("{} {} seed {}: finished before", r.name, r.algo, r.seed)),
+                Event::Started(r, true) => {
+                    line(format!("{} {} seed {}: was broken off, begins anew", r.name, r.algo, r.seed))
+                }
+                Event::Started(..) => {}
+                Event::Ended(r, Ok(())) => {
+                    done += sweep.steps;
+                    line(format!("{} {} seed {}: done", r.name, r.algo, r.seed));
+                }
+                Event::Ended(r, Err(words)) => {
+                    line(format!("{} {} seed {}: {words}", r.name, r.algo, r.seed));
+                }
+                Event::Waiting(steps) => bar.set_position(done + steps),
+            }
+        });
+        bar.finish_and_clear();
+        let rows: Vec<Row> = runs.iter().map(Row::of).collect();
+        let summary = Summary::of(&rows);
+        if self.json {
+            say(serde_json::to_string_pretty(
+                &serde_json::json!({ "summary": summary, "runs": rows, "failed": failed }),
+            )?);
+        } else {
+            table(&summary);
+        }
+        match failed {
+            0 => Ok(()),
+            n => Err(format!(
+                "{n} of {} runs did not finish; the same command goes on where it is",
+                runs.len()
+            )
+            .into()),
+        }
+    }
+}
+
+fn table(summary: &[Summary]) {
+    let number = |x: Option<f64>, digits: usize| x.map_or("-".into(), |x| format!("{x:.digits$}"));
+    say(format!(
+        "{:<22}{:<10}{:>5}{:>12}{:>10}{:>20}{:>9}{:>10}{:>10}",
+        "task", "algorithm", "runs", "steps", "return", "lowest .. highest", "cost", "idm loss", "steps/s"
+    ));
+    for s in summary {
+        say(format!(
+            "{:<22}{:<10}{:>5}{:>12}{:>10}{:>20}{:>9}{:>10}{:>10}",
+            s.task,
+            s.algo,
+            s.seeds,
+            number(s.steps, 0),
+            number(s.return_mean, 1),
+            format!("{} .. {}", number(s.lowest, 0), number(s.highest, 0)),
+            number(s.cost, 1),
+            number(s.idm_loss, 3),
+            number(s.steps_per_s, 0)
+        ));
+    }
+}

@@ -1,0 +1,89 @@
+//! A task with a cost beside its reward.
+
+use rand_chacha::ChaCha8Rng;
+
+use super::expression::Expression;
+use super::quantity::{Before, Outcome, Quantity};
+use crate::env::{Counters, Env, EnvError, Fault, Spec, Step};
+use crate::mj::{MjError, ModelFormat, Sim};
+
+/// Another environment, counting what the task file's `[cost]` says. Body positions are as that environment evaluates them.
+pub(super) struct Costed {
+    inner: Box<dyn Env>,
+    spec: Spec,
+    cost: Vec<Expression<Quantity>>,
+    before: Before,
+}
+
+impl Costed {
+    pub(super) fn new(inner: Box<dyn Env>, name: String, cost: Vec<Expression<Quantity>>) -> Costed {
+        let before = Before::new(inner.sim().model());
+        Costed { spec: Spec { name, has_cost: true, ..inner.spec().clone() }, before, inner, cost }
+    }
+}
+
+impl Env for Costed {
+    fn spec(&self) -> &Spec {
+        &self.spec
+    }
+
+    fn reset(&mut self, rng: &mut ChaCha8Rng) -> Result<(), EnvError> {
+        self.inner.reset(rng)
+    }
+
+    fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError> {
+        self.inner.set_state(qpos, qvel)
+    }
+
+    fn step(&mut self, action: &[f64]) -> Step {
+        self.before.remember(self.inner.sim());
+        let step = self.inner.step(action);
+        if step.fault != Fault::None {
+            return step;
+        }
+        let outcome = Outcome { sim: self.inner.sim(), before: &self.before, action, dt: self.spec.dt };
+        let cost = self.cost.iter().map(|e| e.value(|q| outcome.read(q))).sum();
+        Step { cost, ..step }
+    }
+
+    fn observe(&self, obs: &mut [f64]) {
+        self.inner.observe(obs);
+    }
+
+    fn state(&self, q: &mut [f64], v: &mut [f64]) {
+        self.inner.state(q, v);
+    }
+
+    fn sim(&self) -> &Sim {
+        self.inner.sim()
+    }
+
+    fn goal(&self) -> &[f64] {
+        self.inner.goal()
+    }
+
+    fn set_goal(&mut self, goal: &[f64]) -> Result<(), EnvError> {
+        self.inner.set_goal(goal)
+    }
+
+    fn counters(&self) -> Counters {
+        self.inner.counters()
+    }
+
+    fn last_error(&self) -> Option<&MjError> {
+        self.inner.last_error()
+    }
+
+    fn model_text(&self) -> &str {
+        self.inner.model_text()
+    }
+
+    fn model_format(&self) -> ModelFormat {
+        self.inner.model_format()
+    }
+
+    fn another(&self) -> Result<Box<dyn Env>, EnvError> {
+        let inner = self.inner.another()?;
+        Ok(Box::new(Costed::new(inner, self.spec.name.clone(), self.cost.clone())))
+    }
+}

@@ -1,0 +1,217 @@
+//! The combined policy `I o pi` with its value function, in one parameter group. [`gradient`] is the surrogate on it.
+//!
+//! | meta policy | inverse dynamics | ratio on | the policy learns through |
+//! |---|---|---|---|
+//! | deterministic | learned | `log I(a, s_c, C(pi(s)))` | the inverse model's input and the projection |
+//! | stochastic | learned | `log pi(u, s) + log I(a, s_c, w)` | its own likelihood; the target `w` is stored |
+//! | stochastic | analytic | `log pi(u, s)` | its own likelihood |
+
+mod gradient;
+
+use super::Dims;
+use super::batch::Batch;
+use super::inverse::{InverseModel, InverseWork};
+use super::losses::{mean_std, set_lanes, values, widths};
+use super::net::{Net, Tape};
+use super::nets::NetSettings;
+use super::optimise::{Group, TILE, Tile};
+use super::ppo::PpoSettings;
+use super::{Metrics, init};
+use nearl_runtime::Networks;
+use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars};
+use nearl_runtime::normaliser::Normaliser;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+
+/// How the policy gradient passes the projection.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Gradient {
+    /// The projection's derivative: zero where it clamped.
+    #[default]
+    Projection,
+    /// As if the projection were not there.
+    StraightThrough,
+}
+
+/// What of the combined policy is random and what is learned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Kind {
+    /// The meta policy is a Gaussian on proposals.
+    pub stochastic: bool,
+    /// The inverse model is a Gaussian network; otherwise it is analytic.
+    pub learned: bool,
+}
+
+/// Policy, inverse model and value in one parameter group.
+pub(super) struct Combined {
+    /// Sizes.
+    pub(super) dims: Dims,
+    /// Settings of the surrogate.
+    pub(super) ppo: PpoSettings,
+    /// How the gradient passes the projection.
+    pub(super) gradient: Gradient,
+    /// Meta policy.
+    pub(super) policy: Net,
+    /// Spread of a stochastic meta policy.
+    pub(super) policy_log_std: Option<Range<usize>>,
+    /// The learned inverse model and its spread.
+    pub(super) inverse: Option<(InverseModel, Range<usize>)>,
+    /// Value.
+    pub(super) value: Net,
+    /// Where the policy's network lies in the group.
+    pub(super) policy_range: Range<usize>,
+    /// Vectors of the group.
+    pub(super) len: usize,
+}
+
+/// Buffers of one thread.
+pub(super) struct CombinedWork {
+    pub(super) policy: Tape,
+    value: Tape,
+    inverse: Option<InverseWork>,
+    /// Observation rows.
+    pub(super) obs: Vec<V>,
+    /// Rows of a change of state.
+    pub(super) change: Vec<V>,
+    /// Gradient of the policy's output.
+    pub(super) d_change: Vec<V>,
+    d_value: Vec<V>,
+    rows: [Vec<V>; 3],
+}
+
+impl Combined {
+    /// Fresh networks and their parameter group.
+    pub(super) fn new(
+        dims: Dims,
+        nets: &NetSettings,
+        ppo: PpoSettings,
+        gradient: Gradient,
+        kind: Kind,
+        rng: &mut ChaCha8Rng,
+    ) -> (Self, Group) {
+        assert!(kind.stochastic || kind.learned, "a policy explores in its proposal or in its action");
+        let (mut at, mut transposed) = (0, 0);
+        let (o, s, f) = (dims.n_obs, dims.n_state, nets.activation);
+        let vectors = |at: &mut usize, n: usize| {
+            let range = *at..*at + n.div_ceil(LANES);
+            *at = range.end;
+            range
+        };
+        let policy = Net::new(&widths(o, &nets.policy, s), f, false, &mut at, &mut transposed);
+        let policy_range = 0..at;
+        let policy_log_std = kind.stochastic.then(|| vectors(&mut at, s));
+        let inverse = kind.learned.then(|| {
+            let model = InverseModel::new(&dims, nets, &mut at, &mut transposed);
+            let log_std = vectors(&mut at, dims.n_act);
+            (model, log_std)
+        });
+        let value = Net::new(&widths(o, &nets.value, 1), f, false, &mut at, &mut transposed);
+        let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
+        policy.mlp.write_dense(&init::orthogonal(&policy.mlp.widths(), 0.01, rng), &mut group.p);
+        value.mlp.write_dense(&init::orthogonal(&value.mlp.widths(), 1.0, rng), &mut group.p);
+        if let Some(range) = &policy_log_std {
+            set_lanes(&mut group.p[range.clone()], s, ppo.log_std);
+        }
+        if let Some((model, range)) = &inverse {
+            model.init(&mut group.p, rng);
+            set_lanes(&mut group.p[range.clone()], dims.n_act, ppo.log_std);
+        }
+        let combined =
+            Self { dims, ppo, gradient, policy, policy_log_std, inverse, value, policy_range, len: at };
+        combined.refresh(&mut group);
+        (combined, group)
+    }
+
+    /// Refreshes the transposed weights.
+    pub(super) fn refresh(&self, group: &mut Group) {
+        let Group { p, transposed } = group;
+        self.policy.transpose(p, transposed);
+        self.value.transpose(p, transposed);
+        self.refresh_inverse(group);
+    }
+
+    /// The same after a step of the inverse model alone.
+    pub(super) fn refresh_inverse(&self, group: &mut Group) {
+        if let Some((model, _)) = &self.inverse {
+            model.net.transpose(&group.p, &mut group.transposed);
+        }
+    }
+
+    /// Where the inverse model's network lies; empty with analytic inverse dynamics.
+    pub(super) fn inverse_range(&self) -> Range<usize> {
+        self.inverse.as_ref().map_or(0..0, |(model, _)| model.range())
+    }
+
+    /// Buffers for a tile.
+    pub(super) fn work(&self) -> CombinedWork {
+        let (ov, sv) = (self.dims.n_obs.div_ceil(LANES), self.dims.n_state.div_ceil(LANES));
+        CombinedWork {
+            policy: self.policy.tape(TILE),
+            value: self.value.tape(TILE),
+            inverse: self.inverse.as_ref().map(|(m, _)| m.work()),
+            obs: vec![ZERO; TILE * ov],
+            change: vec![ZERO; TILE * sv],
+            d_change: vec![ZERO; TILE * sv],
+            d_value: vec![ZERO; TILE],
+            rows: std::array::from_fn(|_| vec![ZERO; TILE / LANES]),
+        }
+    }
+
+    /// The current networks for a controller.
+    pub(super) fn networks(&self, p: &[V], normaliser: &Normaliser) -> Networks {
+        let lanes = |r: &Range<usize>, n: usize| scalars(&p[r.clone()])[..n].to_vec();
+        Networks {
+            normaliser: normaliser.clone(),
+            policy: self.policy.mlp.to_dense(p),
+            policy_log_std: self.policy_log_std.as_ref().map_or(Vec::new(), |r| lanes(r, self.dims.n_state)),
+            idm: self.inverse.as_ref().map(|(m, r)| (m.net.mlp.to_dense(p), lanes(r, self.dims.n_act))),
+        }
+    }
+
+    /// Value of each row of `x` (n x n_obs).
+    pub(super) fn values(&self, p: &[V], x: &[f32]) -> Vec<f32> {
+        values(&self.value, p, x, self.dims.n_obs)
+    }
+
+    /// Mean squared error of the inverse model over a batch; none with analytic inverse dynamics.
+    pub(super) fn idm_error(&self, p: &[V], batch: &Batch) -> Option<f64> {
+        self.inverse.as_ref().map(|(model, _)| model.error(p, batch, &self.dims))
+    }
+
+    /// The supervised loss of the inverse model (Eq. 4).
+    pub(super) fn idm_tile(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) {
+        if let (Some((model, _)), Some(work)) = (&self.inverse, &mut w.inverse) {
+            model.tile(group, t, &self.dims, work, grad);
+        }
+    }
+
+    /// Log standard deviations of what explores: the action's where it is Gaussian, else the proposal's.
+    pub(super) fn log_std(&self, p: &[V]) -> Vec<f32> {
+        let (range, n) = match (&self.inverse, &self.policy_log_std) {
+            (Some((_, range)), _) => (range, self.dims.n_act),
+            (None, Some(range)) => (range, self.dims.n_state),
+            (None, None) => return Vec::new(),
+        };
+        scalars(&p[range.clone()])[..n].to_vec()
+    }
+
+    /// What the actor's phase reports, under SB3's names.
+    pub(super) fn metrics(&self, p: &[V], mean: &[f64], norm: f64) -> Metrics {
+        let mut metrics = vec![
+            ("train/policy_gradient_loss", mean[0]),
+            ("train/approx_kl", mean[1]),
+            ("train/clip_fraction", mean[2]),
+            ("train/value_loss", mean[3]),
+            ("train/clamped_fraction", mean[4] / self.dims.seen_state.len().max(1) as f64),
+            ("train/grad_norm", norm),
+            ("train/std", mean_std(&self.log_std(p))),
+        ];
+        if let Some(range) = &self.policy_log_std {
+            let spread = &scalars(&p[range.clone()])[..self.dims.n_state];
+            metrics.push(("train/proposal_std", mean_std(spread)));
+        }
+        metrics
+    }
+}

@@ -1,0 +1,76 @@
+//! What the losses of every algorithm share beside their Gaussians: value, advantages, entropy, sizes.
+
+use super::gaussian::{gather, gather_one, heads, set_heads};
+use super::net::Net;
+use super::optimise::{TILE, Tile};
+use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars_mut};
+
+/// `widths` of a network from its ends and the hidden widths.
+pub(super) fn widths(n_in: usize, hidden: &[usize], n_out: usize) -> Vec<usize> {
+    [&[n_in], hidden, &[n_out]].concat()
+}
+
+/// The first `n` lanes of `p`.
+pub(super) fn set_lanes(p: &mut [V], n: usize, value: f32) {
+    scalars_mut(p)[..n].fill(value);
+}
+
+/// Mean standard deviation.
+pub(super) fn mean_std(log_std: &[f32]) -> f64 {
+    log_std.iter().map(|l| f64::from(l.exp())).sum::<f64>() / log_std.len().max(1) as f64
+}
+
+/// Value of each row of `x`.
+pub(super) fn values(net: &Net, p: &[V], x: &[f32], n_obs: usize) -> Vec<f32> {
+    let (n, vectors) = (x.len() / n_obs, n_obs.div_ceil(LANES));
+    let (mut tape, mut rows) = (net.tape(TILE), vec![ZERO; TILE * vectors]);
+    let mut out = Vec::with_capacity(n);
+    for start in (0..n).step_by(TILE) {
+        let count = TILE.min(n - start);
+        let idx: Vec<u32> = (start..start + count).map(|i| i as u32).collect();
+        gather(&mut rows, vectors, 0, x, n_obs, &idx);
+        let y = net.forward(p, &rows, &mut tape);
+        out.extend(y[..count].iter().map(|v| v.0[0]));
+    }
+    out
+}
+
+/// The value loss of a tile: `d = dL / dV` a row; returns the sum of squared errors.
+#[inline(always)]
+pub(super) fn value_loss(
+    d: &mut [V],
+    rows: &mut [Vec<V>; 3],
+    output: &[V],
+    t: &Tile<'_>,
+    weight: f32,
+) -> f32 {
+    let [value, target, slope] = rows;
+    heads(value, output);
+    gather_one(target, &t.batch.returns, t.idx);
+    let mut sum = ZERO;
+    for i in 0..value.len() {
+        let e = value[i] - target[i];
+        sum = sum.fma(e, e);
+        slope[i] = e * V::splat(2.0 * weight * t.scale);
+    }
+    set_heads(d, slope);
+    sum.sum()
+}
+
+/// Normalised advantages of the rows.
+#[inline(always)]
+pub(super) fn gather_advantage(to: &mut [V], t: &Tile<'_>) {
+    gather_one(to, &t.batch.advantage, t.idx);
+    let (mean, inverse) = t.advantage;
+    for a in to {
+        *a = (*a - V::splat(mean)) * V::splat(inverse);
+    }
+}
+
+/// Entropy of a diagonal Gaussian is the sum of its log standard deviations plus a constant.
+#[inline(always)]
+pub(super) fn entropy_bonus(grad: &mut [V], n: usize, weight: f32) {
+    for g in &mut scalars_mut(grad)[..n] {
+        *g -= weight;
+    }
+}

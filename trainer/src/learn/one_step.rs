@@ -1,0 +1,166 @@
+//! For tests: one step, reward `-|a - f(x)|^2`. Any correct policy gradient finds `f`, whatever stands between the policy and
+//! the action.
+
+use super::nearl::{Nearl, NearlSettings};
+use super::pid2::{Pid2, Pid2Settings};
+use super::{Batch, Dims, Kind, Learner, NetSettings, Ppo, PpoSettings};
+use nearl_runtime::Networks;
+use nearl_runtime::net::{Activation, Forward};
+use nearl_runtime::normaliser::Normaliser;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+const DETERMINISTIC: Kind = Kind { stochastic: false, learned: true };
+const STOCHASTIC: Kind = Kind { stochastic: true, learned: true };
+const ANALYTIC: Kind = Kind { stochastic: true, learned: false };
+
+/// The best action.
+fn goal(x: [f32; 2]) -> [f32; 2] {
+    [0.5 * x[0], -0.3 * x[1] + 0.4]
+}
+
+/// The change of state an action makes, and the action that makes it.
+fn reached(a: [f32; 2]) -> [f32; 2] {
+    [a[0] + 0.4 * a[1], a[1]]
+}
+fn analytic(w: [f32; 2]) -> [f32; 2] {
+    [w[0] - 0.4 * w[1], w[1]]
+}
+
+/// The networks of a learner as they act: `policy -> (inverse model) -> action`.
+struct Actor {
+    kind: Option<Kind>,
+    activation: Activation,
+    nets: Networks,
+}
+
+struct Sample {
+    proposal: [f32; 2],
+    action: [f32; 2],
+    log_prob: f32,
+}
+
+impl Actor {
+    fn act(&self, x: [f32; 2], mut noise: impl FnMut() -> f32) -> Sample {
+        let mut log_prob = 0.0;
+        let mut sample = |mean: &[f32], log_std: &[f32], random: bool| -> [f32; 2] {
+            std::array::from_fn(|k| {
+                if !random {
+                    return mean[k];
+                }
+                let z = noise();
+                log_prob -= 0.5 * z * z + log_std[k] + 0.918_938_5;
+                mean[k] + log_std[k].exp() * z
+            })
+        };
+        let mean = Forward::new(&self.nets.policy, self.activation).forward(&x).to_vec();
+        let Some(kind) = self.kind else {
+            let action = sample(&mean, &self.nets.policy_log_std, true);
+            return Sample { proposal: [0.0; 2], action, log_prob };
+        };
+        let proposal = sample(&mean, &self.nets.policy_log_std, kind.stochastic);
+        let action = match &self.nets.idm {
+            None => analytic(proposal),
+            Some((idm, log_std)) => {
+                let mean = Forward::new(idm, self.activation).forward(&[x, proposal].concat()).to_vec();
+                sample(&mean, log_std, true)
+            }
+        };
+        Sample { proposal, action, log_prob }
+    }
+
+    fn miss(&self, x: [f32; 2]) -> f64 {
+        let (a, g) = (self.act(x, || 0.0).action, goal(x));
+        (0..2).map(|k| f64::from((a[k] - g[k]).powi(2))).sum()
+    }
+}
+
+fn collect(actor: &Actor, n: usize, rng: &mut ChaCha8Rng) -> (Batch, f64) {
+    let mut b = Batch { n, ..Batch::default() };
+    let mut miss = 0.0;
+    for _ in 0..n {
+        let x: [f32; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut *rng));
+        let s = actor.act(x, || StandardNormal.sample(&mut *rng));
+        miss += actor.miss(x) / n as f64;
+        let g = goal(x);
+        let reward = -(0..2).map(|k| (s.action[k] - g[k]).powi(2)).sum::<f32>();
+        b.obs.extend(x);
+        b.proposal.extend(s.proposal);
+        b.target.extend(s.proposal);
+        b.reached.extend(reached(s.action));
+        b.sampled.extend(s.action);
+        b.action.extend(s.action);
+        b.log_prob.push(s.log_prob);
+        b.advantage.push(reward);
+        b.returns.push(reward);
+        b.lower.extend([-9.0; 2]);
+        b.upper.extend([9.0; 2]);
+    }
+    (b, miss)
+}
+
+/// Squared distance of the noise-free action from the best one before and after `rounds` updates.
+fn train(
+    kind: Option<Kind>,
+    nets: &NetSettings,
+    rounds: usize,
+    make: impl FnOnce(Dims, PpoSettings, &mut ChaCha8Rng) -> Box<dyn Learner>,
+) -> (f64, f64) {
+    let dims = Dims { n_obs: 2, n_state: 2, n_act: 2, seen_obs: vec![0, 1], seen_state: vec![0, 1] };
+    let mut rng = crate::rollout::stream(4, 0);
+    let settings = PpoSettings { lr: 1e-3, log_std: -0.5, ..PpoSettings::default() };
+    let mut learner = make(dims, settings, &mut rng);
+    let normaliser = Normaliser::identity(2, 2);
+    let actor = |l: &dyn Learner| Actor { kind, activation: nets.activation, nets: l.networks(&normaliser) };
+    let mut first = f64::NAN;
+    for round in 0..rounds {
+        let (batch, miss) = collect(&actor(&*learner), 1024, &mut rng);
+        if round == 0 {
+            first = miss;
+        }
+        let rate = 1.0 - round as f32 / rounds as f32;
+        learner.update(&batch, rate, &mut rng);
+    }
+    (first, collect(&actor(&*learner), 1024, &mut rng).1)
+}
+
+fn solves(name: &str, (first, last): (f64, f64)) {
+    assert!(first > 0.2 && last < 0.01, "{name}: squared distance {first} at first, {last} at last");
+}
+
+fn nets(activation: Activation) -> NetSettings {
+    NetSettings { activation, ..NetSettings::default() }
+}
+
+#[test]
+fn ppo_solves_it_with_every_activation() {
+    for f in [Activation::Tanh, Activation::Relu] {
+        let n = nets(f);
+        let got = train(None, &n, 40, |d, s, rng| Box::new(Ppo::new(d, &n, s, 1, rng)));
+        solves(&format!("ppo {f:?}"), got);
+    }
+}
+
+#[test]
+fn nearl_solves_it() {
+    let n = nets(Activation::Tanh);
+    for (kind, rounds) in [(DETERMINISTIC, 50), (STOCHASTIC, 50), (ANALYTIC, 50)] {
+        let got = train(Some(kind), &n, rounds, |d, s, rng| {
+            Box::new(Nearl::new(d, &n, s, NearlSettings::default(), kind, 1, rng))
+        });
+        solves(&format!("nearl {kind:?}"), got);
+    }
+}
+
+#[test]
+fn pid2_solves_it_with_and_without_bottleneck() {
+    for bottleneck in [false, true] {
+        let n = nets(Activation::Tanh);
+        for (kind, rounds) in [(DETERMINISTIC, 50), (STOCHASTIC, 50), (ANALYTIC, 50)] {
+            let got = train(Some(kind), &n, rounds, |d, s, rng| {
+                Box::new(Pid2::new(d, &n, s, Pid2Settings::default(), kind, bottleneck, 1, rng))
+            });
+            solves(&format!("pid2, bottleneck {bottleneck}, {kind:?}"), got);
+        }
+    }
+}

@@ -1,0 +1,61 @@
+//! The adversary of PID^2 (Eq. 2): reached transitions are real, proposed ones are not.
+
+use super::super::discriminator::{LATENT, logit_slope, softplus_sum};
+use super::super::gaussian::{copy, gather};
+use super::super::optimise::{Group, Params, TILE, Tile, add_sums};
+use super::{JUDGE, Nets, Work};
+use nearl_runtime::multiversion;
+use nearl_runtime::net::kernel::{LANES, V, scalars, scalars_mut};
+
+/// Non-saturating loss `-log D(E(s, pi(s)))`: adds its gradient to `dL / du`; returns its sum.
+#[inline(always)]
+pub(super) fn fool_discriminator(n: &Nets, judge: &Group, t: &Tile<'_>, w: &mut Work) -> f32 {
+    let (o, s) = (n.combined.dims.n_obs, n.combined.dims.n_state);
+    let (xv, sv) = ((o + s).div_ceil(LANES), s.div_ceil(LANES));
+    let d = &mut w.discriminator;
+    gather(&mut d.input, xv, 0, &t.batch.obs, o, t.idx);
+    gather(&mut d.noise, 1, 0, &n.noise[2], LATENT, t.idx);
+    let (x, u) = (scalars_mut(&mut d.input), scalars(w.actor.policy.output()));
+    for r in 0..TILE {
+        copy(&mut x[r * xv * LANES + o..][..s], &u[r * sv * LANES..][..s]);
+    }
+    n.discriminator.forward(&judge.p, d);
+    let loss = softplus_sum(&d.logit, 1.0);
+    logit_slope(&mut d.logit, 1.0, n.settings.generator_weight * t.scale);
+    let dx = scalars(n.discriminator.backward(&judge.transposed, d, 0.0, None, true));
+    let du = scalars_mut(&mut w.actor.d_change);
+    for r in 0..TILE {
+        for k in 0..s {
+            du[r * sv * LANES + k] += dx[r * xv * LANES + o + k];
+        }
+    }
+    loss
+}
+
+/// Real transitions against proposed ones through the bottleneck (Eq. 2).
+#[inline(always)]
+fn discriminator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
+    let (o, s) = (n.combined.dims.n_obs, n.combined.dims.n_state);
+    let xv = (o + s).div_ceil(LANES);
+    let (group, d) = (&params.groups[JUDGE], &mut w.discriminator);
+    let (mut loss, mut kl, mut right) = (0.0, 0.0, 0.0);
+    for (real, sign) in [(true, 1.0), (false, -1.0)] {
+        let (change, noise) =
+            if real { (&t.batch.reached, &n.noise[0]) } else { (&t.batch.proposal, &n.noise[1]) };
+        gather(&mut d.input, xv, 0, &t.batch.obs, o, t.idx);
+        gather(&mut d.input, xv, o, change, s, t.idx);
+        gather(&mut d.noise, 1, 0, noise, LATENT, t.idx);
+        kl += 0.5 * n.discriminator.forward(&group.p, d);
+        loss += softplus_sum(&d.logit, sign);
+        right += scalars(&d.logit).iter().filter(|&&l| l * sign > 0.0).count() as f32 * 0.5;
+        logit_slope(&mut d.logit, sign, t.scale);
+        // the mixture of real and proposed transitions bears the bottleneck: half each
+        n.discriminator.backward(&group.transposed, d, 0.5 * params.beta * t.scale, Some(grad), false);
+    }
+    add_sums(grad, &[loss, kl, right]);
+}
+
+multiversion!(
+    /// The discriminator's loss, its bottleneck included.
+    pub(super) fn judge(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = discriminator_body
+);

@@ -1,0 +1,96 @@
+//! What collecting leaves behind: rows for the learner, counts for the metrics.
+
+/// What one environment collected: `n_steps` policy steps, row by row.
+#[derive(Clone, Debug, Default)]
+pub struct Segment {
+    /// Network inputs (n_steps x n_obs).
+    pub x: Vec<f32>,
+    /// Sampled proposal, normalised change (n_steps x n_state).
+    pub change: Vec<f32>,
+    /// Projected change (n_steps x n_state).
+    pub target_change: Vec<f32>,
+    /// Bounds of the projection (n_steps x n_state).
+    pub lower: Vec<f32>,
+    /// See `lower`.
+    pub upper: Vec<f32>,
+    /// Reached change (n_steps x n_state).
+    pub reached: Vec<f32>,
+    /// Sampled action (n_steps x n_act).
+    pub sampled: Vec<f32>,
+    /// Executed action (n_steps x n_act).
+    pub action: Vec<f32>,
+    /// Log probability of what was sampled (n_steps).
+    pub log_prob: Vec<f32>,
+    /// Reward less the penalty for distance moved (n_steps).
+    pub reward: Vec<f64>,
+    /// The episode ended in a terminal state (n_steps).
+    pub terminated: Vec<bool>,
+    /// The episode was cut, by time or by the end of the segment (n_steps).
+    pub truncated: Vec<bool>,
+    /// Network input of the true final observation of each cut step: step and (n_obs).
+    pub final_x: Vec<(usize, Vec<f32>)>,
+}
+
+impl Segment {
+    /// Forgets every row; keeps the memory.
+    pub(super) fn clear(&mut self) {
+        let wide = [&mut self.x, &mut self.change, &mut self.target_change, &mut self.lower, &mut self.upper];
+        wide.into_iter().for_each(Vec::clear);
+        [&mut self.reached, &mut self.sampled, &mut self.action, &mut self.log_prob]
+            .into_iter()
+            .for_each(Vec::clear);
+        self.reward.clear();
+        self.terminated.clear();
+        self.truncated.clear();
+        self.final_x.clear();
+    }
+}
+
+/// What was counted while collecting.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Tally {
+    /// Return and length in policy steps of each finished episode.
+    pub episodes: Vec<(f64, usize)>,
+    /// Cost of each finished episode.
+    pub costs: Vec<f64>,
+    /// Control ticks.
+    pub ticks: u64,
+    /// Ticks whose raw proposal broke a constraint.
+    pub raw_violations: u64,
+    /// Ticks that began with a controllable joint already outside its limits: the projection can only lead it back.
+    pub recovering: u64,
+    /// Ticks that began inside and whose target broke a constraint, by the independent checker.
+    pub projected_violations: u64,
+    /// Ticks in which the projection moved the proposal.
+    pub moved: u64,
+    /// Sum of the weighted distances moved [weight rad/s].
+    pub distance: f64,
+    /// Ticks whose raw proposal broke a constraint and whose target breaks none.
+    pub avoided: u64,
+    /// Sum over ticks of the rows that held the target back.
+    pub active_rows: u64,
+    /// Ticks after which the simulator's own state was outside a position or velocity limit.
+    pub reached_violations: u64,
+    /// Sum over ticks of the mean |reached - target| of the controllable entries, in units of the scale of change.
+    pub residual: f64,
+    /// Periods the physics could not be believed.
+    pub faults: u64,
+}
+
+impl Tally {
+    pub(super) fn add(&mut self, other: &Self) {
+        self.episodes.extend_from_slice(&other.episodes);
+        self.costs.extend_from_slice(&other.costs);
+        self.ticks += other.ticks;
+        self.raw_violations += other.raw_violations;
+        self.recovering += other.recovering;
+        self.projected_violations += other.projected_violations;
+        self.moved += other.moved;
+        self.distance += other.distance;
+        self.avoided += other.avoided;
+        self.active_rows += other.active_rows;
+        self.reached_violations += other.reached_violations;
+        self.residual += other.residual;
+        self.faults += other.faults;
+    }
+}

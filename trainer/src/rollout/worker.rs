@@ -1,0 +1,259 @@
+//! One environment behind its own controller.
+
+use super::resume::Episode;
+use super::{RolloutError, Segment, Tally};
+use crate::env::{Env, EnvError, Fault};
+use crate::stats::RunningStats;
+use nearl_runtime::task::IdmKind;
+use nearl_runtime::{Controller, Networks, Noise, Output, PolicyKind, Snapshot, State};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+/// One environment with its controller and its random stream.
+pub struct Worker {
+    pub(super) env: Box<dyn Env>,
+    pub(super) controller: Controller,
+    kind: PolicyKind,
+    learned: bool,
+    pub(super) rng: ChaCha8Rng,
+    pub(super) state: State,
+    before: Vec<f64>,
+    noise: Noise,
+    out: Output,
+    scale: Vec<f64>,
+    gamma: f64,
+    moved_penalty: f64,
+    /// Distance the projection moved the targets of this policy step.
+    moved: f64,
+    pub(super) discounted: f64,
+    pub(super) episode: (f64, usize),
+    pub(super) cost: f64,
+    pub(super) ticks: usize,
+    pub(super) history: Episode,
+    /// The collected rows.
+    pub segment: Segment,
+    /// What was counted.
+    pub tally: Tally,
+    /// Raw observations of the segment.
+    pub obs_stats: RunningStats,
+    /// Changes of the proposed state in the segment.
+    pub change_stats: RunningStats,
+    /// Discounted returns in the segment, for scaling the reward.
+    pub return_stats: RunningStats,
+}
+
+impl Worker {
+    /// An environment at the start of an episode.
+    ///
+    /// # Errors
+    /// [`RolloutError`].
+    pub fn new(
+        env: Box<dyn Env>,
+        snapshot: &Snapshot,
+        gamma: f64,
+        rng: ChaCha8Rng,
+    ) -> Result<Self, RolloutError> {
+        let controller = Controller::new(snapshot)?;
+        let n_state = controller.layout().n_state();
+        let mut worker = Self {
+            kind: snapshot.manifest.policy,
+            learned: snapshot.manifest.task.idm.kind == IdmKind::Learned,
+            state: controller.state(),
+            before: vec![0.0; n_state],
+            noise: controller.noise(),
+            out: controller.output(),
+            scale: snapshot.networks.normaliser.scale.clone(),
+            obs_stats: RunningStats::new(controller.layout().n_obs()),
+            change_stats: RunningStats::new(n_state),
+            return_stats: RunningStats::new(1),
+            env,
+            controller,
+            rng,
+            gamma,
+            moved_penalty: 0.0,
+            moved: 0.0,
+            discounted: 0.0,
+            episode: (0.0, 0),
+            cost: 0.0,
+            ticks: 0,
+            history: Episode::default(),
+            segment: Segment::default(),
+            tally: Tally::default(),
+        };
+        worker.restart()?;
+        Ok(worker)
+    }
+
+    /// Hands new networks to the controller.
+    pub fn set_networks(&mut self, networks: &Networks) {
+        self.controller.set_networks(networks);
+        self.scale.clone_from(&networks.normaliser.scale);
+    }
+
+    /// Switches the projection, for comparisons.
+    pub fn set_projection(&mut self, on: bool) {
+        self.controller.set_projection(on);
+    }
+
+    /// Lowers the learner's reward by `penalty` for each unit of distance the projection moved a target
+    /// [1 / (weight rad/s)], summed over the ticks of a policy step.
+    pub fn set_moved_penalty(&mut self, penalty: f64) {
+        self.moved_penalty = penalty;
+    }
+
+    fn restart(&mut self) -> Result<(), EnvError> {
+        self.env.reset(&mut self.rng)?;
+        self.history.begin(&*self.env);
+        self.controller.reset();
+        (self.episode, self.cost, self.ticks, self.discounted) = ((0.0, 0), 0.0, 0, 0.0);
+        self.observe();
+        Ok(())
+    }
+
+    pub(super) fn observe(&mut self) {
+        self.env.observe(&mut self.state.obs);
+        self.env.state(&mut self.state.q, &mut self.state.v);
+    }
+
+    fn clear(&mut self) {
+        self.segment.clear();
+        self.tally = Tally::default();
+        for stats in [&mut self.obs_stats, &mut self.change_stats, &mut self.return_stats] {
+            stats.clear();
+        }
+    }
+
+    /// Collects `n_steps` policy steps.
+    pub fn collect(&mut self, n_steps: usize) {
+        self.clear();
+        for t in 0..n_steps {
+            self.draw(true);
+            let (reward, terminated) = self.policy_step();
+            let truncated = self.ticks >= self.env.spec().max_episode_steps;
+            self.store(reward, terminated, truncated && !terminated, t, t + 1 == n_steps);
+            if terminated || truncated {
+                self.tally.episodes.push(self.episode);
+                self.tally.costs.push(self.cost);
+                // the same draws for a reset whatever happened before: an error here is a broken installation
+                self.restart().unwrap_or_else(|e| panic!("{e}"));
+            }
+        }
+    }
+
+    /// One episode without noise: return and length in policy steps.
+    pub fn evaluate(&mut self) -> (f64, usize) {
+        self.clear();
+        self.draw(false);
+        loop {
+            let (_, terminated) = self.policy_step();
+            if terminated || self.ticks >= self.env.spec().max_episode_steps {
+                let episode = self.episode;
+                self.tally.costs.push(self.cost);
+                self.restart().unwrap_or_else(|e| panic!("{e}"));
+                return episode;
+            }
+        }
+    }
+
+    fn draw(&mut self, explore: bool) {
+        let normal = |rng: &mut ChaCha8Rng| if explore { StandardNormal.sample(rng) } else { 0.0 };
+        match self.kind {
+            PolicyKind::Stochastic => self.noise.proposal.fill_with(|| normal(&mut self.rng)),
+            PolicyKind::Direct | PolicyKind::Deterministic => {}
+        }
+        // an analytic inverse model has no noise of its own
+        if self.kind != PolicyKind::Stochastic || self.learned {
+            self.noise.action.fill_with(|| normal(&mut self.rng));
+        }
+    }
+
+    /// One proposal and the control ticks it spans.
+    fn policy_step(&mut self) -> (f64, bool) {
+        for (b, &i) in self.before.iter_mut().zip(self.controller.layout().state()) {
+            *b = self.state.obs[i];
+        }
+        let mut reward = 0.0;
+        self.moved = 0.0;
+        for _ in 0..self.controller.policy_every() {
+            let (r, terminated) = self.tick();
+            reward += r;
+            if terminated || self.ticks >= self.env.spec().max_episode_steps {
+                self.finish_step(reward);
+                return (reward, terminated);
+            }
+        }
+        self.finish_step(reward);
+        (reward, false)
+    }
+
+    fn finish_step(&mut self, reward: f64) {
+        self.episode.0 += reward;
+        self.episode.1 += 1;
+        self.discounted = self.discounted * self.gamma + self.penalised(reward);
+    }
+
+    /// What the learner is rewarded with for the policy step; the episode's return stays the environment's own.
+    fn penalised(&self, reward: f64) -> f64 {
+        reward - self.moved_penalty * self.moved
+    }
+
+    fn tick(&mut self) -> (f64, bool) {
+        self.controller.update(&self.state, &self.noise, &mut self.out);
+        self.history.push(&self.out.action);
+        let step = self.env.step(&self.out.action);
+        self.ticks += 1;
+        self.cost += step.cost;
+        self.observe();
+        let ledger = &self.out.next.ledger;
+        self.tally.ticks += 1;
+        self.tally.raw_violations += u64::from(ledger.raw_violations.total() > 0);
+        self.tally.recovering += u64::from(ledger.outside > 0);
+        self.tally.projected_violations += u64::from(ledger.violations.total() > 0 && ledger.outside == 0);
+        self.tally.moved += u64::from(ledger.moved > 0.0);
+        self.tally.distance += ledger.moved;
+        self.tally.avoided += u64::from(ledger.raw_violations.total() > 0 && ledger.violations.total() == 0);
+        self.tally.active_rows += ledger.active.len() as u64;
+        self.moved += ledger.moved;
+        self.tally.faults += u64::from(step.fault != Fault::None);
+        self.tally.reached_violations += u64::from(self.controller.breaks_limits(&self.state));
+        self.tally.residual += self.residual();
+        (step.reward, step.terminated)
+    }
+
+    /// Mean |reached - target| over the controllable entries, in units of the scale of change.
+    fn residual(&self) -> f64 {
+        let layout = self.controller.layout();
+        let seen = layout.controllable_state();
+        let miss =
+            |&k: &usize| (self.state.obs[layout.state()[k]] - self.out.target[k]).abs() / self.scale[k];
+        seen.iter().map(miss).sum::<f64>() / seen.len().max(1) as f64
+    }
+
+    fn store(&mut self, reward: f64, terminated: bool, truncated: bool, t: usize, last: bool) {
+        let reward = self.penalised(reward);
+        let (s, out) = (&mut self.segment, &self.out);
+        s.x.extend_from_slice(&out.x);
+        s.change.extend_from_slice(&out.change);
+        s.target_change.extend_from_slice(&out.target_change);
+        s.lower.extend_from_slice(&out.lower);
+        s.upper.extend_from_slice(&out.upper);
+        s.sampled.extend_from_slice(&out.sampled);
+        s.action.extend(out.action.iter().map(|&a| a as f32));
+        s.log_prob.push((out.log_prob_proposal + out.log_prob_action) as f32);
+        s.reward.push(reward);
+        s.terminated.push(terminated);
+        s.truncated.push(truncated || (last && !terminated));
+        for k in 0..self.before.len() {
+            self.before[k] = self.state.obs[self.controller.layout().state()[k]] - self.before[k];
+            s.reached.push((self.before[k] / self.scale[k]).clamp(-10.0, 10.0) as f32);
+        }
+        self.change_stats.push(&self.before);
+        self.obs_stats.push(&self.state.obs);
+        self.return_stats.push(&[self.discounted]);
+        if (truncated || last) && !terminated {
+            let mut x = vec![0.0; out.x.len()];
+            self.controller.normaliser().observation(&self.state.obs, &mut x);
+            s.final_x.push((t, x));
+        }
+    }
+}

@@ -1,0 +1,192 @@
+//! `nearl sweep`: tasks x algorithms x seeds, one worker process a run, as many at a time as there are cores.
+//!
+//! A run lies in `<out>/<task>/<algo>_<seed>`. One that is finished with the same task file and steps is left alone, one that
+//! was broken off is begun anew.
+
+mod summary;
+mod worker;
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+use nearl_runtime::Snapshot;
+
+use crate::run_folder::snapshot_of;
+use crate::tasks::{self, TaskLoadError};
+use crate::train::{ALGORITHMS, TrainError, complete};
+
+pub use summary::{Row, Summary};
+pub use worker::{Event, run};
+
+/// What to sweep over.
+#[derive(Clone, Debug)]
+pub struct Sweep {
+    /// Task names or files.
+    pub tasks: Vec<String>,
+    /// Algorithms.
+    pub algos: Vec<String>,
+    /// Seeds.
+    pub seeds: Vec<u64>,
+    /// Environment steps of each run.
+    pub steps: u64,
+    /// Folder of all runs.
+    pub out: PathBuf,
+    /// Overrides of every task file.
+    pub set: Vec<String>,
+}
+
+/// One training of a sweep.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Run {
+    /// Task as given.
+    pub task: String,
+    /// Name in the task file.
+    pub name: String,
+    /// Algorithm.
+    pub algo: String,
+    /// Seed.
+    pub seed: u64,
+    /// Run folder.
+    pub folder: PathBuf,
+    /// What is there already.
+    pub found: Found,
+}
+
+/// What a sweep finds in a run folder.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Found {
+    /// Nothing.
+    Nothing,
+    /// A run that was broken off.
+    Broken,
+    /// A run with all its steps.
+    Finished,
+}
+
+/// Why a sweep cannot start.
+#[derive(Debug, thiserror::Error)]
+pub enum SweepError {
+    /// A task.
+    #[error(transparent)]
+    Task(#[from] TaskLoadError),
+    /// Its environment.
+    #[error(transparent)]
+    Train(#[from] TrainError),
+    /// An algorithm that does not exist.
+    #[error("no algorithm '{0}'; give some of {1}")]
+    Algorithm(String, String),
+    /// A list with nothing in it, or with something twice.
+    #[error("{0}")]
+    List(String),
+    /// A finished run of something else.
+    #[error("'{path}' holds a run of another {what}; give another --out, or remove it")]
+    Other {
+        /// Run folder.
+        path: String,
+        /// What differs.
+        what: String,
+    },
+    /// The folder.
+    #[error("cannot write '{path}': {reason}; give another folder with --out")]
+    Write {
+        /// Folder or file.
+        path: String,
+        /// What the system said.
+        reason: String,
+    },
+    /// Another sweep works there.
+    #[error("another sweep is at work in '{path}'; wait for it or give another folder with --out")]
+    Busy {
+        /// Folder.
+        path: String,
+    },
+}
+
+impl Sweep {
+    /// Every run with what is already there, seed by seed, so that a sweep cut short has all tasks and algorithms.
+    ///
+    /// # Errors
+    /// [`SweepError`]: everything that can be wrong before hours are spent.
+    pub fn plan(&self) -> Result<Vec<Run>, SweepError> {
+        for (what, n) in
+            [("task", self.tasks.len()), ("algorithm", self.algos.len()), ("seed", self.seeds.len())]
+        {
+            if n == 0 {
+                return Err(SweepError::List(format!("a sweep needs at least one {what}")));
+            }
+        }
+        for algo in &self.algos {
+            if !ALGORITHMS.iter().any(|(name, _)| name == algo) {
+                let all: Vec<_> = ALGORITHMS.iter().map(|(name, _)| *name).collect();
+                return Err(SweepError::Algorithm(algo.clone(), all.join(", ")));
+            }
+        }
+        let mut files = Vec::new();
+        for task in &self.tasks {
+            let mut manifest = tasks::load(task, &self.set)?;
+            complete(&mut manifest)?;
+            files.push((task, manifest.task.name.clone(), manifest.task.to_toml()));
+        }
+        let mut runs: Vec<Run> = Vec::new();
+        for &seed in &self.seeds {
+            for (task, name, text) in &files {
+                for algo in &self.algos {
+                    let folder = self.out.join(name).join(format!("{algo}_{seed}"));
+                    if runs.iter().any(|r| r.folder == folder) {
+                        return Err(SweepError::List(format!(
+                            "{name}, {algo}, seed {seed} is asked for twice"
+                        )));
+                    }
+                    let found = self.found(&folder, text)?;
+                    runs.push(Run {
+                        task: (*task).clone(),
+                        name: name.clone(),
+                        algo: algo.clone(),
+                        seed,
+                        folder,
+                        found,
+                    });
+                }
+            }
+        }
+        Ok(runs)
+    }
+
+    fn found(&self, folder: &Path, task: &str) -> Result<Found, SweepError> {
+        if !folder.exists() {
+            return Ok(Found::Nothing);
+        }
+        let other =
+            |what: &str| Err(SweepError::Other { path: folder.display().to_string(), what: what.into() });
+        match std::fs::read_to_string(folder.join("task.toml")) {
+            Ok(text) if text != task => return other("task file"),
+            Ok(_) => {}
+            Err(_) => return Ok(Found::Broken),
+        }
+        let snapshot = snapshot_of(folder).ok().and_then(|file| Snapshot::load(&file).ok());
+        let finished = folder.join("checkpoints/final.safetensors").is_file();
+        match snapshot {
+            Some(s) if finished && s.manifest.steps >= self.steps => Ok(Found::Finished),
+            _ => Ok(Found::Broken),
+        }
+    }
+
+    /// Holds the folder until the file is dropped.
+    ///
+    /// # Errors
+    /// [`SweepError::Busy`], [`SweepError::Write`].
+    pub fn lock(&self) -> Result<File, SweepError> {
+        let path = self.out.join("sweep.lock");
+        let write =
+            |e: std::io::Error| SweepError::Write { path: path.display().to_string(), reason: e.to_string() };
+        std::fs::create_dir_all(&self.out).map_err(write)?;
+        let file = File::create(&path).map_err(write)?;
+        match file.try_lock() {
+            Ok(()) => Ok(file),
+            Err(std::fs::TryLockError::WouldBlock) => {
+                Err(SweepError::Busy { path: self.out.display().to_string() })
+            }
+            Err(std::fs::TryLockError::Error(e)) => Err(write(e)),
+        }
+    }
+}

@@ -1,0 +1,71 @@
+//! The columns of `metrics.csv` and how an iteration fills them.
+
+use super::{Progress, Training};
+
+/// Columns of `metrics.csv`: SB3's tags where they exist.
+pub const COLUMNS: &[&str] = &[
+    "time/total_timesteps",
+    "time/seconds",
+    "time/fps",
+    "rollout/ep_rew_mean",
+    "rollout/ep_len_mean",
+    "rollout/ep_cost_mean",
+    "constraints/raw_violations",
+    "constraints/target_violations",
+    "constraints/recovering",
+    "constraints/reached_violations",
+    "constraints/moved",
+    "constraints/distance",
+    "constraints/avoided",
+    "constraints/active_rows",
+    "idm/residual",
+    "idm/threshold",
+    "idm/mse_before",
+    "idm/mse_after",
+    "idm/updated",
+    "train/policy_gradient_loss",
+    "train/approx_kl",
+    "train/clip_fraction",
+    "train/value_loss",
+    "train/generator_loss",
+    "train/clamped_fraction",
+    "train/grad_norm",
+    "train/std",
+    "train/proposal_std",
+    "train/policy_mse",
+    "discriminator/loss",
+    "discriminator/kl",
+    "discriminator/accuracy",
+    "discriminator/beta",
+];
+
+impl Training {
+    /// The progress as a row of `metrics.csv`.
+    pub fn row(&self, p: &Progress) -> Vec<f64> {
+        let t = &p.tally;
+        let per_tick = |n: u64| n as f64 / t.ticks.max(1) as f64;
+        let value = |name: &str| match name {
+            "time/total_timesteps" => p.steps as f64,
+            "time/seconds" => p.seconds,
+            "time/fps" => p.steps as f64 / p.seconds,
+            "rollout/ep_rew_mean" => p.return_mean,
+            "rollout/ep_len_mean" => p.length_mean,
+            "rollout/ep_cost_mean" => p.cost_mean,
+            "constraints/raw_violations" => per_tick(t.raw_violations),
+            "constraints/target_violations" => per_tick(t.projected_violations),
+            "constraints/recovering" => per_tick(t.recovering),
+            "constraints/reached_violations" => per_tick(t.reached_violations),
+            "constraints/moved" => per_tick(t.moved),
+            "constraints/distance" => t.distance / t.ticks.max(1) as f64,
+            "constraints/avoided" => t.avoided as f64 / t.raw_violations as f64,
+            "constraints/active_rows" => per_tick(t.active_rows),
+            "idm/residual" => t.residual / t.ticks.max(1) as f64,
+            "idm/threshold" => match self.snapshot.manifest.algo.as_str() {
+                "nearl" => self.settings.nearl.idm_threshold,
+                _ => self.settings.pid2.idm_threshold,
+            },
+            other => p.metrics.iter().find(|(n, _)| *n == other).map_or(f64::NAN, |(_, v)| *v),
+        };
+        COLUMNS.iter().map(|c| value(c)).collect()
+    }
+}

@@ -1,0 +1,139 @@
+//! A training to disk and back.
+
+use super::{Request, TrainError, Training};
+use crate::checkpoint::{self, Checkpoint, CheckpointError, FORMAT, Header, Values};
+use crate::learn::Params;
+use crate::run_folder::RunFolder;
+use nearl_runtime::net::kernel::{LANES, V, scalars, scalars_mut};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+impl Training {
+    /// Everything the next iteration depends on.
+    ///
+    /// # Errors
+    /// One sentence.
+    pub fn checkpoint(&mut self) -> Result<Checkpoint, String> {
+        let rng = u64::try_from(self.rng.get_word_pos()).map_err(|e| format!("random stream: {e}"))?;
+        let params = self.learner.params();
+        let header = Header {
+            format: FORMAT,
+            manifest: self.snapshot.manifest.clone(),
+            total: self.total,
+            seed: self.seed,
+            rng,
+            adam: params.adam.iter().map(|a| a.t).collect(),
+            workers: Vec::new(),
+        };
+        let mut to = Checkpoint { header, tensors: BTreeMap::new() };
+        let mut put = |name: String, values: Values| to.tensors.insert(name, values);
+        for (i, group) in params.groups.iter().enumerate() {
+            put(format!("group.{i}"), f32s(&group.p));
+        }
+        for (i, adam) in params.adam.iter().enumerate() {
+            put(format!("adam.{i}.m"), f32s(&adam.m));
+            put(format!("adam.{i}.v"), f32s(&adam.v));
+        }
+        put("beta".into(), Values::F32(vec![params.beta]));
+        put("stats.obs".into(), Values::F64(self.obs_stats.to_vec()));
+        put("stats.change".into(), Values::F64(self.change_stats.to_vec()));
+        put("stats.return".into(), Values::F64(self.return_stats.to_vec()));
+        let recent = self.recent.iter().flat_map(|&(r, n)| [r, n as f64]).collect();
+        put("recent".into(), Values::F64(recent));
+        put("recent_costs".into(), Values::F64(self.recent_costs.clone()));
+        put("seconds".into(), Values::F64(vec![self.seconds()]));
+        for (i, worker) in self.collector.workers().enumerate() {
+            worker.save(i, &mut to)?;
+        }
+        Ok(to)
+    }
+
+    /// The training of a checkpoint; `file` is named in messages. `steps` other than the checkpoint's change its end.
+    ///
+    /// # Errors
+    /// [`TrainError`]: what [`Training::new`] refuses, or a checkpoint that does not fit its own task.
+    pub fn resume(
+        mut from: Checkpoint,
+        file: &Path,
+        steps: Option<u64>,
+        threads: usize,
+    ) -> Result<Self, TrainError> {
+        let header = &from.header;
+        let request = Request {
+            manifest: header.manifest.clone(),
+            algo: header.manifest.algo.clone(),
+            steps: steps.unwrap_or(header.total),
+            seed: header.seed,
+            threads,
+        };
+        let mut training = Self::new(&request)?;
+        let foreign = |reason| CheckpointError::Foreign { file: file.display().to_string(), reason };
+        training.restore(&mut from).map_err(foreign)?;
+        Ok(training)
+    }
+
+    fn restore(&mut self, from: &mut Checkpoint) -> Result<(), String> {
+        self.learner.restore(&mut |params| restore_params(params, from))?;
+        for (name, stats) in [
+            ("stats.obs", &mut self.obs_stats),
+            ("stats.change", &mut self.change_stats),
+            ("stats.return", &mut self.return_stats),
+        ] {
+            let n = stats.to_vec().len();
+            stats.set(&from.take_f64(name, Some(n))?);
+        }
+        self.recent_costs = from.take_f64("recent_costs", None)?;
+        let recent = from.take_f64("recent", None)?;
+        self.recent = recent.as_chunks::<2>().0.iter().map(|&[r, n]| (r, n as usize)).collect();
+        self.earlier = from.take_f64("seconds", Some(1))?[0];
+        self.rng.set_word_pos(from.header.rng.into());
+        let (have, need) = (from.header.workers.len(), self.settings.n_envs);
+        if have != need {
+            return Err(format!("it has {have} environments where the task has {need}"));
+        }
+        for (i, worker) in self.collector.workers().enumerate() {
+            worker.restore(i, from)?;
+        }
+        if let Some(name) = from.tensors.keys().next() {
+            return Err(format!("tensor '{name}' belongs to nothing"));
+        }
+        if self.snapshot.manifest.steps > 0 {
+            self.refresh();
+        }
+        Ok(())
+    }
+
+    /// Writes the snapshot (`final` when the steps are done, else `latest`) and the checkpoint; returns the snapshot's path.
+    pub(super) fn save(&mut self, folder: &RunFolder) -> Result<PathBuf, TrainError> {
+        let name = if self.is_done() { "final" } else { "latest" };
+        let path = folder.save(name, self.snapshot())?;
+        self.checkpoint().map_err(TrainError::Settings)?.save(&checkpoint::path_in(folder.path()))?;
+        Ok(path)
+    }
+}
+
+fn f32s(p: &[V]) -> Values {
+    Values::F32(scalars(p).to_vec())
+}
+
+fn restore_params(params: &mut Params, from: &mut Checkpoint) -> Result<(), String> {
+    let mut fill = |name: String, to: &mut [V]| -> Result<(), String> {
+        let values = from.take_f32(&name, to.len() * LANES)?;
+        scalars_mut(to).copy_from_slice(&values);
+        Ok(())
+    };
+    for (i, group) in params.groups.iter_mut().enumerate() {
+        fill(format!("group.{i}"), &mut group.p)?;
+    }
+    for (i, adam) in params.adam.iter_mut().enumerate() {
+        fill(format!("adam.{i}.m"), &mut adam.m)?;
+        fill(format!("adam.{i}.v"), &mut adam.v)?;
+    }
+    params.beta = from.take_f32("beta", 1)?[0];
+    let (have, need) = (from.header.adam.len(), params.adam.len());
+    if have != need {
+        return Err(format!("it has {have} optimisers where the algorithm has {need}"));
+    }
+    params.adam.iter_mut().zip(&from.header.adam).for_each(|(adam, t)| adam.t = *t);
+    Ok(())
+}

@@ -1,0 +1,102 @@
+//! From a manifest and its settings to what is trained.
+
+use super::{ALGORITHMS, TrainError};
+use crate::learn::{Dims, Kind, Learner, Nearl, Pid2, Ppo};
+use crate::rollout::RolloutError;
+use crate::settings::{Exploration, TrainSettings};
+use nearl_runtime::controller::Parts;
+use nearl_runtime::task::IdmKind;
+use nearl_runtime::{Manifest, PolicyKind};
+use rand_chacha::ChaCha8Rng;
+
+/// Fresh networks of the manifest's algorithm.
+pub(super) fn learner(
+    manifest: &Manifest,
+    settings: &TrainSettings,
+    dims: Dims,
+    threads: usize,
+    rng: &mut ChaCha8Rng,
+) -> Box<dyn Learner> {
+    let (nets, ppo) = (&settings.nets, settings.ppo.clone());
+    let kind = Kind {
+        stochastic: manifest.policy == PolicyKind::Stochastic,
+        learned: manifest.task.idm.kind == IdmKind::Learned,
+    };
+    match manifest.algo.as_str() {
+        "ppo" => Box::new(Ppo::new(dims, nets, ppo, threads, rng)),
+        "nearl" => Box::new(Nearl::new(dims, nets, ppo, settings.nearl.clone(), kind, threads, rng)),
+        name => {
+            let bottleneck = name == "pid2-ib";
+            Box::new(Pid2::new(dims, nets, ppo, settings.pid2.clone(), kind, bottleneck, threads, rng))
+        }
+    }
+}
+
+pub(super) fn policy_kind(
+    algo: &str,
+    settings: &TrainSettings,
+    idm: IdmKind,
+) -> Result<PolicyKind, TrainError> {
+    match (algo, settings.exploration, idm) {
+        ("ppo", ..) => Ok(PolicyKind::Direct),
+        (name, ..) if !ALGORITHMS.iter().any(|(n, _)| *n == name) => Err(TrainError::Algorithm(name.into())),
+        (_, Exploration::Proposal, _) => Ok(PolicyKind::Stochastic),
+        (_, Exploration::Action, IdmKind::Learned) => Ok(PolicyKind::Deterministic),
+        (_, Exploration::Action, IdmKind::Pinocchio) => Err(TrainError::Settings(
+            "[train.exploration]: 'action' needs a learned inverse model, but idm.kind is 'pinocchio'; use exploration = \"proposal\"".into(),
+        )),
+    }
+}
+
+/// Fills what the environment knows: observation names and the actuators' range.
+///
+/// # Errors
+/// [`TrainError::Rollout`] when there is no such environment.
+pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
+    let env = crate::env::of_task(&manifest.task, &manifest.model, &manifest.task.name)
+        .map_err(RolloutError::from)?;
+    let spec = env.spec();
+    if manifest.task.state.observation.is_empty() {
+        manifest.task.state.observation.clone_from(&spec.obs);
+    }
+    manifest.action_lower = spec.action_low().collect();
+    manifest.action_upper = spec.action_high().collect();
+    Ok(())
+}
+
+pub(super) fn check_minibatch(minibatch: usize, batch: usize) -> Result<(), TrainError> {
+    if minibatch == 0
+        || !minibatch.is_multiple_of(crate::learn::optimise::TILE)
+        || !batch.is_multiple_of(minibatch)
+    {
+        return Err(TrainError::Settings(format!(
+            "[train.ppo.batch_size]: {minibatch} must be a multiple of 32 that divides n_envs n_steps = {batch}"
+        )));
+    }
+    Ok(())
+}
+
+/// What the limits allow in one policy period: `a_max T` for velocities, `v_max T` for positions.
+pub(super) fn limit_scale(parts: &Parts, manifest: &Manifest) -> Result<Vec<f64>, TrainError> {
+    use nearl_runtime::constraints::Entry;
+    let period = manifest.task.time.dt * manifest.task.time.policy_every as f64;
+    let limits = parts.projector.limits();
+    let (velocity, acceleration) = (&limits.velocity, &limits.acceleration);
+    (0..parts.layout.n_state())
+        .map(|k| {
+            let scale = match parts.layout.state_entry(k) {
+                Entry::Position { dof, .. } => velocity[dof] * period,
+                Entry::Velocity { dof } => acceleration[dof] * period,
+                Entry::Other => f64::INFINITY,
+            };
+            let name = parts.layout.state_name(k);
+            if scale.is_finite() && scale > 0.0 {
+                Ok(scale)
+            } else {
+                Err(TrainError::Settings(format!(
+                    "[train.change_scale]: 'limits' needs a velocity and an acceleration limit for '{name}'; set [constraints] or use change_scale = \"running\""
+                )))
+            }
+        })
+        .collect()
+}
