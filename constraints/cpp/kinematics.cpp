@@ -19,11 +19,13 @@ int nc_model_frame(const nc_model *m, int frame, char *name, size_t name_cap, in
 
 int nc_model_joint_parent(const nc_model *m, int joint) { return (int)m->model.parents.at(joint + 1) - 1; }
 
-int nc_kinematics(const nc_model *m, nc_data *d, const double *q, const double *v, const double *a, int jacobians) {
+int nc_kinematics(const nc_model *m, nc_data *d, const double *q, const double *v, const double *a, double *jacobian) {
   const auto &x = m->model;
   return guard([&] {
     pin::forwardKinematics(x, d->data, input(q, x.nq), input(v, x.nv), input(a, x.nv));
-    if (jacobians) pin::computeJointJacobians(x, d->data); // at the placements of the line above
+    if (!jacobian) return;
+    pin::computeJointJacobians(x, d->data); // at the placements of the line above
+    MatrixMap(jacobian, 6, x.nv) = d->data.J;
   });
 }
 

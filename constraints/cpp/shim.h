@@ -45,8 +45,9 @@ int nc_model_nframes(const nc_model *); // with the universe, frame 0
 // *body: 1 for a link; *joint: the joint that moves it, -1 for none
 int nc_model_frame(const nc_model *, int frame, char *name, size_t name_cap, int *body, int *joint);
 int nc_model_joint_parent(const nc_model *, int joint); // -1: the universe
-// placements, velocities and accelerations of all joints; with jacobians != 0 also their Jacobians
-int nc_kinematics(const nc_model *, nc_data *, const double *q, const double *v, const double *a, int jacobians);
+// placements, velocities and accelerations of all joints; unless null, jacobian gets the column of each dof (6 x nv, linear first, of
+// the point at the world's origin, world axes)
+int nc_kinematics(const nc_model *, nc_data *, const double *q, const double *v, const double *a, double *jacobian);
 // 24 numbers in world axes: position 3, rotation 3 x 3 by rows, velocity 6, classical acceleration 6 (linear first)
 int nc_frame(const nc_model *, nc_data *, int frame, double *out);
 // 6 x nv by rows (not columns), linear first, world axes at the frame's origin

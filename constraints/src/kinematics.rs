@@ -12,7 +12,10 @@ use std::ffi::c_int;
 pub struct Kinematics {
     model: Model,
     scratch: RawData,
+    /// Of a frame (6 x nv, row-major).
     jacobian: Vec<f64>,
+    /// Column of each dof, for the point at the world's origin (nv x 6).
+    columns: Vec<f64>,
 }
 
 /// A frame at the state last given to [`Kinematics::update`].
@@ -46,25 +49,27 @@ pub struct PointMotion {
 impl Kinematics {
     /// Scratch for `model`.
     pub fn new(model: &Model) -> Kinematics {
-        let jacobian = vec![0.0; 6 * model.nv()];
-        Kinematics { scratch: RawData::new(model.raw()), model: model.clone(), jacobian }
+        let (jacobian, columns) = (vec![0.0; 6 * model.nv()], vec![0.0; 6 * model.nv()]);
+        Kinematics { scratch: RawData::new(model.raw()), model: model.clone(), jacobian, columns }
     }
 
     /// Moves all frames and Jacobians to configuration `q` (nq), velocity `v` (nv) and acceleration `a` (nv).
     pub fn update(&mut self, q: &[f64], v: &[f64], a: &[f64]) {
-        self.move_to(q, v, a, 1);
+        let columns = self.columns.as_mut_ptr();
+        self.move_to(q, v, a, columns);
     }
 
     /// The same without Jacobians, which stay where the last [`update`](Kinematics::update) left them.
     pub fn update_frames(&mut self, q: &[f64], v: &[f64], a: &[f64]) {
-        self.move_to(q, v, a, 0);
+        self.move_to(q, v, a, std::ptr::null_mut());
     }
 
-    fn move_to(&mut self, q: &[f64], v: &[f64], a: &[f64], jacobians: c_int) {
+    fn move_to(&mut self, q: &[f64], v: &[f64], a: &[f64], columns: *mut f64) {
         self.check(q, &[v, a]);
         let (m, d) = self.pointers();
-        // SAFETY: lengths checked. Forward kinematics has no failure for arguments of the right length.
-        let code = unsafe { pinocchio::nc_kinematics(m, d, q.as_ptr(), v.as_ptr(), a.as_ptr(), jacobians) };
+        // SAFETY: lengths checked, `columns` is null or has room for 6 nv numbers. Forward kinematics has no failure for arguments of
+        // the right length.
+        let code = unsafe { pinocchio::nc_kinematics(m, d, q.as_ptr(), v.as_ptr(), a.as_ptr(), columns) };
         assert_eq!(code, 0, "forward kinematics: {}", pinocchio::last_error());
     }
 
@@ -106,37 +111,29 @@ impl Kinematics {
         }
     }
 
-    /// Jacobian (3 x nv, row-major) of the point that has coordinates `local` [m] in `frame`: `J_p = J_v - [r]x J_w`.
+    /// Jacobian (3 x nv, row-major) of the point that has coordinates `local` [m] in `frame`.
     pub fn point_jacobian(&mut self, frame: FrameId, local: [f64; 3], jacobian: &mut [f64]) {
         let nv = self.model.nv();
         assert_eq!(jacobian.len(), 3 * nv, "point Jacobian: 3 * nv numbers");
-        let at = self.frame(frame);
-        let [x, y, z] = minus(at.place(local), at.position);
-        let mut j = std::mem::take(&mut self.jacobian);
-        self.jacobian(frame, &mut j);
-        for i in 0..nv {
-            let of = |k: usize| j[k * nv + i];
-            jacobian[i] = of(0) + of(4) * z - of(5) * y;
-            jacobian[nv + i] = of(1) + of(5) * x - of(3) * z;
-            jacobian[2 * nv + i] = of(2) + of(3) * y - of(4) * x;
-        }
-        self.jacobian = j;
+        jacobian.fill(0.0);
+        let point = self.frame(frame).place(local);
+        let (x, rest) = jacobian.split_at_mut(nv);
+        let (y, z) = rest.split_at_mut(nv);
+        self.add_row(frame, point, [1.0, 0.0, 0.0], 1.0, x);
+        self.add_row(frame, point, [0.0, 1.0, 0.0], 1.0, y);
+        self.add_row(frame, point, [0.0, 0.0, 1.0], 1.0, z);
     }
 
     /// Adds `scale n' J_p` to `row` (nv), with `J_p` the Jacobian of the point of `frame` that is at `point` [m] in the
-    /// world: `n' J_p = n' J_v + (r x n)' J_w`, `r` from the frame's origin to the point.
-    pub fn add_row(&mut self, frame: FrameId, point: [f64; 3], n: [f64; 3], scale: f64, row: &mut [f64]) {
-        let nv = self.model.nv();
-        assert_eq!(row.len(), nv, "row: nv numbers");
-        let origin = self.frame(frame).position;
-        let mut j = std::mem::take(&mut self.jacobian);
-        self.jacobian(frame, &mut j);
-        let turn = cross(minus(point, origin), n);
-        for (i, x) in row.iter_mut().enumerate() {
-            let of = |k: usize| j[k * nv + i];
-            *x += scale * (dot(n, [of(0), of(1), of(2)]) + dot(turn, [of(3), of(4), of(5)]));
-        }
-        self.jacobian = j;
+    /// world. A column with linear part `s_v` at the world's origin and angular part `s_w` moves the point by
+    /// `s_v + s_w x p`, so the entry is `n . s_v + (p x n) . s_w`.
+    pub fn add_row(&self, frame: FrameId, point: [f64; 3], n: [f64; 3], scale: f64, row: &mut [f64]) {
+        assert_eq!(row.len(), self.model.nv(), "row: nv numbers");
+        let turn = cross(point, n);
+        self.model.for_each_dof(frame, |i| {
+            let [a, b, c, d, e, f] = self.columns[6 * i..6 * i + 6] else { return };
+            row[i] += scale * (dot(n, [a, b, c]) + dot(turn, [d, e, f]));
+        });
     }
 
     /// Adds to `tau` (nv) [N·m or N] what a wrench on `frame` does to the joints: `tau += J' f`.

@@ -25,7 +25,7 @@
 //! 2. [`limit`]: what a limit is and how to add one;
 //! 3. [`Projector`] (`projector/mod.rs`): the tick; then `projector/coupled.rs` (the rows), `active_set.rs`, `conic.rs`;
 //! 4. [`checker`]: the judge that shares no code with the above; [`certify_braking`]: whether the motors can brake;
-//! 5. [`Model`], [`Dynamics`], [`convention`]: the robot, and how it meets MuJoCo.
+//! 5. [`Model`], [`Dynamics`], [`Kinematics`], [`convention`]: the robot, and how it meets MuJoCo; [`geometry`]: distances between solids.
 //!
 //! # What is promised
 //!
@@ -78,6 +78,8 @@ pub use limit::{
     TorqueSpeedLimit, UserRow, VelocityLimit, VelocityProfileLimit, build_limits,
 };
 pub use model::{FrameId, Joint, Model};
+#[doc(hidden)]
+pub use projector::{LoneStages, Numbers};
 pub use projector::{Problem, Projector};
 pub use row::{Cone, Rows, Soft};
 pub use target::{Bounds, Braking, Consistency, Proposal, Settings, Solver, Target};

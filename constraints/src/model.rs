@@ -255,15 +255,19 @@ impl Model {
 
     /// True when a motion of `dof` can change where `frame` is.
     pub fn moves(&self, dof: usize, frame: FrameId) -> bool {
+        let mut found = false;
+        self.for_each_dof(frame, |i| found |= i == dof);
+        found
+    }
+
+    /// The dofs that move `frame`, from the frame back to the base.
+    pub(crate) fn for_each_dof(&self, frame: FrameId, mut f: impl FnMut(usize)) {
         let mut at = self.0.frames[frame.0].joint;
         while let Some(joint) = at {
             let (parent, dofs) = &self.0.chain[joint];
-            if dofs.contains(&dof) {
-                return true;
-            }
+            dofs.clone().for_each(&mut f);
             at = *parent;
         }
-        false
     }
 
     /// True when two frames are on the same rigid body, or on two joined by one joint.

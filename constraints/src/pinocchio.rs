@@ -102,7 +102,7 @@ unsafe extern "C" {
         q: *const f64,
         v: *const f64,
         a: *const f64,
-        jacobians: c_int,
+        jacobian: *mut f64,
     ) -> c_int;
     pub(crate) fn nc_frame(m: *const NcModel, d: *mut NcData, frame: c_int, out: *mut f64) -> c_int;
     pub(crate) fn nc_frame_jacobian(

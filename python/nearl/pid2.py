@@ -81,7 +81,7 @@ class PID2:
         stays, and is written where there is a run folder.
         """
         if self._training is None:
-            raise ValueError("a loaded policy predicts and does not learn: its file has no optimiser state; make a new PID2 of the task")
+            raise ValueError("a policy loaded from a snapshot file predicts and does not learn: the file has no optimiser state; load a run folder, or make a new PID2")
         if total_timesteps < 1:
             raise ValueError(f"total_timesteps is {total_timesteps}; ask for at least one step")
         callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]
@@ -97,7 +97,7 @@ class PID2:
         finally:
             self._controller = self._training.controller()
             if self._run is not None:
-                self._training.checkpoint("final")
+                self._training.checkpoint()
             if bar is not None:
                 bar.close()
         return self
@@ -142,16 +142,21 @@ class PID2:
         self._controller.save(path)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "PID2":
-        """A policy to predict with, from a snapshot file or from the ``checkpoints`` of a run folder.
+    def load(cls, path: str | os.PathLike[str], threads: int | None = None) -> "PID2":
+        """A policy to predict with, from a snapshot file; from a run folder, one that can also learn on, exactly where it stopped.
+
+        A run that was stopped ``n`` steps before its end gives, after ``learn(n)``, the same weights as one that was not stopped.
 
         Raises:
             OSError: the file cannot be read.
             ValueError: it is not a snapshot, or was damaged.
         """
         agent = cls.__new__(cls)
-        controller = _core.Controller.load(path)
-        agent._training, agent._run, agent.task, agent.algo, agent.seed = None, None, controller.task, controller.algo, 0
+        agent._training, agent._run, agent.seed = None, None, 0
+        if (Path(path) / "checkpoints" / "resume.safetensors").is_file():
+            agent._training, agent._run = _core.Training.resume(path, threads or os.cpu_count() or 1), path
+        controller = _core.Controller.load(path) if agent._training is None else agent._training.controller()
+        agent.task, agent.algo = controller.task, controller.algo
         agent._begin(controller)
         return agent
 

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use nearl_trainer::checkpoint::{self, Checkpoint};
 use nearl_trainer::run_folder::RunFolder;
 use nearl_trainer::tasks;
 use nearl_trainer::train::{self, COLUMNS, Request, complete};
@@ -49,6 +50,22 @@ impl Training {
         })
     }
 
+    /// The training of a run folder where it stopped, to go on in it.
+    #[staticmethod]
+    fn resume(py: Python<'_>, path: PathBuf, threads: usize) -> PyResult<Training> {
+        py.detach(|| {
+            let file = checkpoint::path_in(&path);
+            let from = Checkpoint::load(&file).map_err(errors::value)?;
+            let training =
+                train::Training::resume(from, &file, None, threads.max(1)).map_err(errors::value)?;
+            let manifest = &training.snapshot().manifest;
+            let task = manifest.task.name.clone();
+            let folder = RunFolder::reopen(&path, COLUMNS, manifest.steps, manifest.version);
+            let folder = Some(folder.map_err(errors::value)?);
+            Ok(Training { inner: Mutex::new(Inner { training, folder }), task })
+        })
+    }
+
     /// Asks for `steps` more; the learning rate falls to zero at their end.
     fn extend(&self, steps: u64) {
         self.lock().training.extend(steps);
@@ -70,15 +87,13 @@ impl Training {
         Ok(metrics)
     }
 
-    /// Writes `checkpoints/<name>.safetensors` in the run folder; returns its path.
-    fn checkpoint(&self, py: Python<'_>, name: &str) -> PyResult<PathBuf> {
+    /// Writes snapshot and checkpoint into the run folder; returns the snapshot's path.
+    fn checkpoint(&self, py: Python<'_>) -> PyResult<PathBuf> {
         py.detach(|| {
-            let inner = self.lock();
-            let folder = inner
-                .folder
-                .as_ref()
-                .ok_or_else(|| errors::value("this training has no run folder; give out="))?;
-            folder.save(name, inner.training.snapshot()).map_err(errors::snapshot)
+            let mut inner = self.lock();
+            let Inner { training, folder } = &mut *inner;
+            let none = || errors::value("this training has no run folder; give out=");
+            training.save(folder.as_ref().ok_or_else(none)?).map_err(errors::value)
         })
     }
 

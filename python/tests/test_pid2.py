@@ -95,6 +95,7 @@ def test_ctrl_c_keeps_what_was_learned(tmp_path: Path) -> None:
     assert 0 < agent.num_timesteps < 10**9
     loaded = nearl.PID2.load(tmp_path / "run")
     assert np.array_equal(loaded.predict(np.zeros(5))[0], agent.predict(np.zeros(5))[0])
+    assert loaded.num_timesteps == agent.num_timesteps
     assert (tmp_path / "run" / "metrics.csv").read_text().startswith("time/total_timesteps,")
 
 
@@ -114,3 +115,12 @@ def test_mistakes_are_named() -> None:
         nearl.PID2(CART_POLE, settings={"train.gama": 0.9})
     with pytest.raises(ValueError, match="total_timesteps is 0"):
         nearl.PID2(CART_POLE).learn(0)
+
+
+def test_a_stopped_run_goes_on_exactly(tmp_path: Path) -> None:
+    whole = nearl.PID2(CART_POLE, run=tmp_path / "whole", threads=1).learn(8192)
+    nearl.PID2(CART_POLE, run=tmp_path / "part").learn(8192, callback=lambda a, _: a.num_timesteps < 4096)
+    part = nearl.PID2.load(tmp_path / "part")
+    assert part.num_timesteps == 4096
+    part.learn(4096)
+    assert part.controller.digest == whole.controller.digest

@@ -370,6 +370,20 @@ impl Controller {
         self.projector.forget();
     }
 
+    /// What the next policy tick depends on beside its arguments, as plain numbers; see [`Projector::memory`].
+    pub fn memory(&self) -> Vec<f64> {
+        self.projector.memory()
+    }
+
+    /// Begins in the middle of an episode, at a policy tick, with what [`Controller::memory`] gave.
+    ///
+    /// # Panics
+    /// When it has another length.
+    pub fn set_memory(&mut self, memory: &[f64]) {
+        self.reset();
+        self.projector.set_memory(memory);
+    }
+
     /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.
     pub fn set_networks(&mut self, networks: &Networks) {
         self.normaliser = networks.normaliser.clone();

@@ -74,12 +74,9 @@ impl DoctorCommand {
         if self.json {
             say(serde_json::json!({ "ok": failed.is_empty(), "checks": checks }));
         } else {
-            for Check { check, finding, text, .. } in &checks {
-                say(format!("{:<5} {check:<10} {text}", format!("{finding:?}").to_lowercase()));
-            }
-            let codes = checks.iter().filter(|c| c.finding != Finding::Ok).map(|c| c.code.name());
-            for code in codes {
-                say(format!("more: nearl explain {code}"));
+            for Check { check, code, finding, text, .. } in &checks {
+                let more = if *finding == Finding::Ok { String::new() } else { format!(" [{code}]") };
+                say(format!("{:<5} {check:<10} {text}{more}", format!("{finding:?}").to_lowercase()));
             }
         }
         if failed.is_empty() {

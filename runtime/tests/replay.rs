@@ -188,3 +188,42 @@ fn what_is_no_flight_log_is_one_sentence() {
     let text = replay(&folder.0).unwrap_err().to_string();
     assert!(text.contains("not a regular file"), "{text}");
 }
+
+#[test]
+fn a_snapshot_that_misses_its_targets_is_taken_back_and_the_log_replays() {
+    let folder = Scratch::new("rollback");
+    let log = folder.0.join("rollback.mcap");
+    let name = Name::new("rollback");
+    let body = toy::PointMass { q: 1.0, ..toy::PointMass::default() };
+    let plant = toy::PlantThread::start(&name, body, PlantSettings::lockstep(toy::DT));
+    let settings = RunSettings { log: Some(log.clone()), first: b"spring".to_vec(), ..toy::settings() };
+    let running = toy::LoopThread::start(&name, settings, |_| {});
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    trainer.wait_for_runtime(PATIENCE).unwrap();
+    let ticks = |trainer: &mut TrainerLink, n: u64| {
+        while trainer.state().is_none_or(|s| s.tick < n) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    };
+    ticks(&mut trainer, 400);
+    let mut verdicts = Vec::new();
+    for version in [2, toy::MISSES] {
+        trainer.push(version, b"spring").unwrap();
+        verdicts.push(trainer.wait_for_receipt(version, PATIENCE).unwrap().verdict());
+        let now = trainer.health().map_or(0, |h| h.tick);
+        ticks(&mut trainer, now + 1500);
+    }
+    let Ok(receipt) = trainer.wait_for_receipt(toy::MISSES, PATIENCE) else {
+        panic!("nothing was taken back: {}", running.end());
+    };
+    assert_eq!(receipt.verdict(), Verdict::RolledBack, "{}", receipt.text());
+    assert_eq!(verdicts, [Verdict::Accepted, Verdict::Accepted]);
+    let report = running.end();
+    plant.end();
+    assert_eq!(report.versions.iter().map(|v| v.1).collect::<Vec<_>>(), [1, 2, toy::MISSES, 2]);
+    assert_eq!((report.rolled_back, report.counters.swaps), (1, 3));
+    assert!(report.refusals[0].contains("off the target"), "{:?}", report.refusals);
+    let (drops, _dropped) = std::sync::mpsc::channel();
+    let found = nearl_runtime::log::replay_with(&log, toy::SpringBuilder(drops)).unwrap();
+    assert_eq!((found.difference, found.ticks, found.swaps), (None, report.ticks, 3));
+}

@@ -81,6 +81,13 @@ fn pid2_gan_on_the_arm() {
     check("Panda-reach", "pid2-gan", &["train.n_steps=40", "train.ppo.batch_size=160"]);
 }
 
+/// Limits that remember the tick before, and a stored brake.
+#[test]
+fn limits_with_a_memory() {
+    let more = ["train.n_steps=40", "train.ppo.batch_size=160", "constraints.jerk.limit=800.0"];
+    check("Panda-reach", "pid2-ib", &[more.as_slice(), &["constraints.braking=stored"]].concat());
+}
+
 /// A run that was killed has rows behind its checkpoint, the last of them cut: they come again, once.
 #[test]
 fn rows_behind_the_checkpoint_come_again() {

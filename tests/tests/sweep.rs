@@ -89,7 +89,7 @@ fn a_sweep_finishes_what_is_not_finished() {
     assert!(second.status.success(), "{}", text(&second.stderr));
     assert_eq!(words.matches("finished before").count(), 7, "{words}");
     assert!(
-        words.contains("cart-pole ppo seed 0: was broken off, begins anew")
+        words.contains("cart-pole ppo seed 0: was broken off, goes on")
             && words.contains("cart-pole ppo seed 0: done"),
         "{words}"
     );
@@ -143,10 +143,45 @@ fn a_sweep_that_is_stopped_saves_and_goes_on_later() {
         text(&output.stderr)
     );
     for seed in [0, 1] {
-        let saved = metrics(seed).with_file_name("checkpoints/final.safetensors");
+        let saved = metrics(seed).with_file_name("checkpoints/latest.safetensors");
         assert!(Snapshot::load(&saved).expect("what was learned").manifest.steps > 0);
     }
     assert!(!metrics(2).exists(), "nothing starts after a stop");
+}
+
+/// Both runs are stopped; one goes on from its checkpoint, one has lost it.
+#[test]
+fn a_sweep_goes_on_exactly_where_it_stopped() {
+    let folder = tempfile::tempdir().expect("folder");
+    let cart_pole = repository().join("examples/tasks/cart-pole.toml").display().to_string();
+    let (steps, out) = ("200000", folder.path().join("sweep"));
+    let sweep = || {
+        let mut command = Command::new(program("nearl"));
+        command.args(["sweep", "--tasks", &cart_pole, "--algos", "pid2-ib", "--seeds", "0-1", "--jobs", "2"]);
+        command.args(["--steps", steps, "--out"]).arg(&out);
+        command
+    };
+    let run = |seed: u32| out.join(format!("cart-pole/pid2-ib_{seed}"));
+    let process = Process::start(&mut sweep());
+    let learning =
+        |s| std::fs::read_to_string(run(s).join("metrics.csv")).is_ok_and(|t| t.lines().count() > 5);
+    until("two runs learn", || (learning(0) && learning(1)).then_some(()));
+    process.signal(libc::SIGINT);
+    assert_eq!(process.output().status.code(), Some(1), "stopped before the end");
+    std::fs::remove_dir_all(run(1).join("checkpoints")).expect("lose a checkpoint");
+
+    let again = sweep().output().expect("nearl sweep");
+    let words = text(&again.stdout);
+    assert!(again.status.success(), "{}", text(&again.stderr));
+    assert!(words.contains("seed 0: was broken off, goes on"), "{words}");
+    assert!(words.contains("seed 1: was broken off, begins anew"), "{words}");
+    for seed in [0, 1] {
+        let single = folder.path().join(format!("single_{seed}"));
+        let mut train = Command::new(program("nearl"));
+        train.args(["train", &cart_pole, "--steps", steps, "--seed", &seed.to_string(), "--json", "--out"]);
+        assert!(train.arg(&single).output().expect("nearl train").status.success());
+        assert_eq!(digest(&run(seed)), digest(&single), "seed {seed}");
+    }
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! `nearl sweep`: tasks x algorithms x seeds, one worker process a run, as many at a time as there are cores.
 //!
 //! A run lies in `<out>/<task>/<algo>_<seed>`. One that is finished with the same task file and steps is left alone, one that
-//! was broken off is begun anew.
+//! was broken off goes on from its checkpoint, or is begun anew where it has none.
 
 mod summary;
 mod worker;
@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use nearl_runtime::Snapshot;
 
+use crate::checkpoint::{self, Checkpoint};
 use crate::run_folder::snapshot_of;
 use crate::tasks::{self, TaskLoadError};
 use crate::train::{ALGORITHMS, TrainError, complete};
@@ -57,8 +58,10 @@ pub struct Run {
 pub enum Found {
     /// Nothing.
     Nothing,
-    /// A run that was broken off.
+    /// A run that was broken off before its first checkpoint, or was started for another number of steps.
     Broken,
+    /// A run that was broken off and can go on.
+    Resumable,
     /// A run with all its steps.
     Finished,
 }
@@ -167,8 +170,14 @@ impl Sweep {
         let finished = folder.join("checkpoints/final.safetensors").is_file();
         match snapshot {
             Some(s) if finished && s.manifest.steps >= self.steps => Ok(Found::Finished),
+            _ if self.resumable(folder) => Ok(Found::Resumable),
             _ => Ok(Found::Broken),
         }
+    }
+
+    /// Whether going on gives what an uninterrupted run of these steps would: the learning rate's schedule depends on them.
+    fn resumable(&self, folder: &Path) -> bool {
+        Checkpoint::load(&checkpoint::path_in(folder)).is_ok_and(|c| c.header.total == self.steps)
     }
 
     /// Holds the folder until the file is dropped.

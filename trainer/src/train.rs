@@ -214,9 +214,9 @@ impl Training {
         }
     }
 
-    /// Asks for `steps` more than were asked for, or were done, so far.
+    /// Asks for `steps` more than were done so far.
     pub fn extend(&mut self, steps: u64) {
-        self.total = self.total.max(self.snapshot.manifest.steps) + steps;
+        self.total = self.snapshot.manifest.steps + steps;
     }
 
     /// Whether the requested steps are done.

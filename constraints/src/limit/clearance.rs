@@ -58,6 +58,13 @@ impl Ahead {
         &mut self.kinematics
     }
 
+    /// The same without Jacobians.
+    pub(super) fn look_at_frames(&mut self, q: &[f64], v: &[f64], dt: f64) -> &mut Kinematics {
+        self.step.iter_mut().zip(v).for_each(|(s, v)| *s = dt * v);
+        self.dynamics.integrate(q, &self.step, &mut self.q);
+        self.turn(v)
+    }
+
     /// Gives the frames another velocity, at the configuration of the last look.
     pub(super) fn turn(&mut self, v: &[f64]) -> &mut Kinematics {
         self.kinematics.update_frames(&self.q, v, &self.zero);

@@ -248,7 +248,8 @@ impl Rows for FrameRows {
     }
 
     fn excess(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
-        let at = self.ahead.look(motion.q, motion.v, motion.period.dt).point(self.frame, self.point);
+        let at =
+            self.ahead.look_at_frames(motion.q, motion.v, motion.period.dt).point(self.frame, self.point);
         let then = self.ahead.turn(motion.v_next).point(self.frame, self.point);
         for (x, plane) in out.iter_mut().zip(&self.planes) {
             let clearance = plane.clearance(&at, motion.period);

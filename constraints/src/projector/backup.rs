@@ -59,6 +59,23 @@ impl Backup {
         }
     }
 
+    /// As new: what is tried first next depends on nothing that was.
+    pub(crate) fn forget(&mut self) {
+        (self.stored, self.favourite) = (false, 0);
+    }
+
+    /// Stored or not, what passed last, and the decelerations.
+    pub(crate) fn memory(&self) -> Vec<f64> {
+        let head = [f64::from(u8::from(self.stored)), self.favourite as f64];
+        [&head, self.deceleration.as_slice()].concat()
+    }
+
+    pub(crate) fn set_memory(&mut self, memory: &[f64]) {
+        self.stored = memory[0] != 0.0;
+        self.favourite = memory[1] as usize % TRIED.len();
+        self.deceleration.copy_from_slice(&memory[2..]);
+    }
+
     /// Looks for a brake from the state and stores it; the old one stays when there is none.
     pub(crate) fn verify(&mut self, with: &mut With<'_>, q: &[f64], v: &[f64]) -> bool {
         for k in 0..TRIED.len() {

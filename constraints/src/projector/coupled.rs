@@ -108,10 +108,14 @@ impl Coupled {
         self.row_size[r] = size;
     }
 
+    /// Row `r` of `G` (n).
+    pub(crate) fn gradient(&self, r: usize) -> &[f64] {
+        &self.rows[r * self.n..(r + 1) * self.n]
+    }
+
     /// `G y` of row `r`.
     pub(crate) fn row(&self, r: usize, y: &[f64]) -> f64 {
-        let g = &self.rows[r * self.n..(r + 1) * self.n];
-        g.iter().zip(y).map(|(g, y)| g * y).sum()
+        self.gradient(r).iter().zip(y).map(|(g, y)| g * y).sum()
     }
 
     /// By how much `y` exceeds row `r`; negative inside.

@@ -11,9 +11,12 @@ mod gradient;
 mod ladder;
 mod modes;
 mod sources;
+mod stages;
 mod switch;
 
 pub use coupled::Problem;
+#[doc(hidden)]
+pub use stages::{LoneStages, Numbers};
 
 use crate::checker::Checker;
 use crate::ledger::{BrakeReason, RefuseReason, Rung, Status};

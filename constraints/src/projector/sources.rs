@@ -104,9 +104,9 @@ impl Sources {
         self.blocks.iter().flat_map(|b| vec![b.soft; b.sizes.len()]).collect()
     }
 
-    /// Which rows are equalities.
+    /// Which rows are equalities without softness; a soft one is a row of no width.
     pub(crate) fn equalities(&self) -> Vec<bool> {
-        self.blocks.iter().flat_map(|b| vec![b.rows.equality(); b.sizes.len()]).collect()
+        self.blocks.iter().flat_map(|b| vec![b.rows.equality() && b.soft.is_none(); b.sizes.len()]).collect()
     }
 
     /// Rows of the matrices of all cones.

@@ -95,7 +95,27 @@ impl Projector {
     /// Forgets the tick before and the stored brake: a new episode begins.
     pub fn forget(&mut self) {
         self.previous.known = false;
-        self.backup.stored = false;
+        self.backup.forget();
+    }
+
+    /// What the next projection depends on beside its arguments, as plain numbers: the tick before and the stored brake.
+    /// For a checkpoint in the middle of an episode.
+    pub fn memory(&self) -> Vec<f64> {
+        let known = f64::from(u8::from(self.previous.known));
+        [&[known], self.previous.acceleration.as_slice(), &self.previous.torque, &self.backup.memory()]
+            .concat()
+    }
+
+    /// Takes what [`Projector::memory`] gave.
+    ///
+    /// # Panics
+    /// When it has another length.
+    pub fn set_memory(&mut self, memory: &[f64]) {
+        let nv = self.previous.acceleration.len();
+        self.previous.known = memory[0] != 0.0;
+        self.previous.acceleration.copy_from_slice(&memory[1..=nv]);
+        self.previous.torque.copy_from_slice(&memory[1 + nv..=2 * nv]);
+        self.backup.set_memory(&memory[1 + 2 * nv..]);
     }
 
     /// Makes the last tick, which ended with `target`, the tick before.

@@ -30,7 +30,7 @@ pub(crate) use memory::{check as check_memory, free as free_memory};
 pub use messages::*;
 pub use name::RobotName;
 pub use plant::{PlantLink, Robot};
-pub use port::SnapshotBytes;
+pub use port::{Sequence, SnapshotBytes};
 pub use remains::{Remains, remains};
 pub use runner::{Pace, Plant, PlantReport, PlantRunner, PlantSettings};
 pub use runtime::RuntimeLink;

@@ -33,19 +33,44 @@ impl<M: Message + ZeroCopySend> Outbox<M> {
     }
 }
 
+/// The order of what one sender numbers: what came twice or late is left out, what never came is counted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sequence {
+    last: (u64, u64),
+    /// Messages that were numbered but never arrived.
+    pub lost: u64,
+    /// Messages left out because a newer one, or the same, came before.
+    pub old: u64,
+}
+
+impl Sequence {
+    /// True if the message with this header is the next to be used.
+    pub fn accept(&mut self, header: &super::Header) -> bool {
+        let (epoch, seq) = self.last;
+        if header.epoch == epoch {
+            if header.seq <= seq {
+                self.old += 1;
+                return false;
+            }
+            self.lost += header.seq - seq - 1;
+        }
+        self.last = (header.epoch, header.seq);
+        true
+    }
+}
+
 /// Receiving end of a topic.
 pub(crate) struct Inbox<M: Message + ZeroCopySend> {
     port: Subscriber<Ipc, M, ()>,
-    last: (u64, u64),
-    /// Messages the sender numbered but that never arrived.
-    pub(crate) lost: u64,
+    /// Order of the messages, and what was lost.
+    pub(crate) sequence: Sequence,
     /// Messages with another schema hash.
     pub(crate) refused: u64,
 }
 
 impl<M: Message + ZeroCopySend> Inbox<M> {
     pub(crate) fn new(port: Subscriber<Ipc, M, ()>) -> Inbox<M> {
-        Inbox { port, last: (0, 0), lost: 0, refused: 0 }
+        Inbox { port, sequence: Sequence::default(), refused: 0 }
     }
 
     /// The next message in order; duplicates and foreign schemas are left out.
@@ -56,15 +81,9 @@ impl<M: Message + ZeroCopySend> Inbox<M> {
                 self.refused += 1;
                 continue;
             }
-            let (epoch, seq) = self.last;
-            if header.epoch == epoch {
-                if header.seq <= seq {
-                    continue;
-                }
-                self.lost += header.seq - seq - 1;
+            if self.sequence.accept(&header) {
+                return Some(*sample.payload());
             }
-            self.last = (header.epoch, header.seq);
-            return Some(*sample.payload());
         }
         None
     }

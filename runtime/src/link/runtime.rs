@@ -64,7 +64,7 @@ impl RuntimeLink {
 
     /// States lost on the way, and states of another schema.
     pub fn state_counts(&self) -> (u64, u64) {
-        (self.state.lost, self.state.refused)
+        (self.state.sequence.lost, self.state.refused)
     }
 
     /// The newest snapshot not yet read.

@@ -84,7 +84,7 @@ impl TrainerLink {
 
     /// Transitions lost because they were not read in time.
     pub fn lost_transitions(&self) -> u64 {
-        self.transition.lost
+        self.transition.sequence.lost
     }
 
     /// The next receipt in order.

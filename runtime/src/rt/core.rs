@@ -294,6 +294,10 @@ impl<T: Tick> Core<T> {
         if self.record.begin.saturating_sub(state.header.stamp) > self.settings.age_limit {
             return Event::Lost(Reason::StaleState);
         }
+        if is_frozen {
+            counters.frozen_states += 1;
+            return self.hold(Reason::FrozenState);
+        }
         let jump = self.settings.jump;
         if jump > 0.0 && self.held.is_some() {
             let ticks = state.tick.saturating_sub(self.estimate.tick).max(1);
@@ -302,10 +306,6 @@ impl<T: Tick> Core<T> {
                 counters.implausible_states += 1;
                 return self.hold(Reason::ImplausibleState);
             }
-        }
-        if is_frozen {
-            counters.frozen_states += 1;
-            return self.hold(Reason::FrozenState);
         }
         self.estimate = *state;
         self.held = Some(0);

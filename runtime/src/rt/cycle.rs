@@ -210,9 +210,7 @@ impl<T: Tick> Cycle<T> {
             self.compute.saturating_record(record.end - record.begin);
         }
         self.dropped.1 += u64::from(self.ends.records.push(*record).is_err());
-        if self.is_stopping() {
-            self.stopping += 1;
-        }
+        self.stopping += u64::from(self.core.record.stop);
     }
 }
 

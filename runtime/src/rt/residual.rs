@@ -52,7 +52,8 @@ impl Residual {
                 self.window.pop_front();
             }
         }
-        if record.swapped {
+        // By the number, because the tick of the swap itself may have come without a state or been dropped.
+        if record.snapshot != previous.snapshot {
             let is_known = 4 * self.window.len() >= self.settings.window;
             self.before = is_known.then(|| self.mean());
             self.window.clear();
@@ -86,9 +87,9 @@ mod tests {
     use super::*;
     use crate::rt::Mode;
 
-    fn tick(n: u64, error: f64, swapped: bool) -> Record {
+    fn tick(n: u64, error: f64, snapshot: u64) -> Record {
         let mut record = Record::new();
-        (record.mode, record.fresh, record.swapped, record.step.nu) = (Mode::Active, true, swapped, 1);
+        (record.mode, record.fresh, record.snapshot, record.step.nu) = (Mode::Active, true, snapshot, 1);
         (record.state.nv, record.state.tick) = (1, n);
         record.state.v[0] = error; // the target is 0
         record
@@ -97,7 +98,12 @@ mod tests {
     fn run(errors: impl Iterator<Item = (f64, bool)>) -> Vec<u64> {
         let settings = RollbackSettings { window: 10, factor: 3.0, floor: 0.05 };
         let mut residual = Residual::new(settings);
-        let records: Vec<Record> = errors.enumerate().map(|(n, (e, s))| tick(n as u64, e, s)).collect();
+        let mut snapshot = 0;
+        let mut next = |(n, (error, swapped)): (usize, (f64, bool))| {
+            snapshot += u64::from(swapped);
+            tick(n as u64, error, snapshot)
+        };
+        let records: Vec<Record> = errors.enumerate().map(&mut next).collect();
         let pairs = records.windows(2);
         pairs.filter_map(|p| residual.observe(&p[0], &p[1]).map(|_| p[1].state.tick)).collect()
     }

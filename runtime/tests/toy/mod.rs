@@ -10,6 +10,8 @@ use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 
 pub const DT: f64 = 1e-3;
+/// Version of the spring that does not reach its targets.
+pub const MISSES: u64 = 1000;
 
 /// q' = q + v dt, v' = v + action dt.
 #[derive(Default)]
@@ -88,6 +90,9 @@ impl Tick for Spring {
         step.nu = 1;
         step.proposal_q[0] = 0.0;
         step.action[0] = -(self.version as f64) * state.q()[0];
+        let miss = if self.version == MISSES { 1.0 } else { 0.0 };
+        step.target_v[0] = state.v()[0] + step.action[0] * DT + miss;
+        step.target_q[0] = state.q()[0] + step.target_v[0] * DT;
         step.ledger.raw_violations = 1;
         Outcome::Acted
     }

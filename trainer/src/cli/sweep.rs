@@ -8,7 +8,7 @@ use clap::Args;
 use indicatif::ProgressBar;
 
 use super::{Failure, cores, say};
-use crate::sweep::{Event, Found, Row, Summary, Sweep, run};
+use crate::sweep::{Event, Found, Row, Run, Summary, Sweep, run};
 
 #[derive(Args)]
 pub(super) struct SweepCommand {
@@ -77,24 +77,23 @@ impl SweepCommand {
         let bar = if self.json { ProgressBar::hidden() } else { ProgressBar::new(todo * sweep.steps) };
         let mut done = 0;
         let failed = run(&sweep, &runs, self.jobs.unwrap_or_else(cores), &stop, |event| {
-            let line = |words: String| {
+            let line = |r: &Run, words: &str| {
                 if !self.json {
-                    bar.suspend(|| say(words));
+                    bar.suspend(|| say(format!("{} {} seed {}: {words}", r.name, r.algo, r.seed)));
                 }
             };
             match event {
-                Event::Skipped(r) => line(format!("{} {} seed {}: finished before", r.name, r.algo, r.seed)),
-                Event::Started(r, true) => {
-                    line(format!("{} {} seed {}: was broken off, begins anew", r.name, r.algo, r.seed))
-                }
-                Event::Started(..) => {}
+                Event::Skipped(r) => line(r, "finished before"),
+                Event::Started(r) => match r.found {
+                    Found::Resumable => line(r, "was broken off, goes on"),
+                    Found::Broken => line(r, "was broken off, begins anew"),
+                    _ => {}
+                },
                 Event::Ended(r, Ok(())) => {
                     done += sweep.steps;
-                    line(format!("{} {} seed {}: done", r.name, r.algo, r.seed));
+                    line(r, "done");
                 }
-                Event::Ended(r, Err(words)) => {
-                    line(format!("{} {} seed {}: {words}", r.name, r.algo, r.seed));
-                }
+                Event::Ended(r, Err(words)) => line(r, &words),
                 Event::Waiting(steps) => bar.set_position(done + steps),
             }
         });

@@ -51,6 +51,7 @@ impl Worker {
         put("actions", e.actions.clone());
         put("sums", vec![self.episode.0, self.discounted, self.cost]);
         put("obs", self.state.obs.clone());
+        put("projector", self.controller.memory());
         Ok(())
     }
 
@@ -70,6 +71,7 @@ impl Worker {
             actions: take("actions", ticks.checked_mul(n_act))?,
         };
         let (sums, obs) = (take("sums", Some(3))?, take("obs", Some(self.state.obs.len()))?);
+        let memory = take("projector", Some(self.controller.memory().len()))?;
         let changed =
             || format!("environment {i} does not repeat its episode: task, robot or MuJoCo changed");
         let e = &self.history;
@@ -82,7 +84,7 @@ impl Worker {
                 return Err(changed());
             }
         }
-        self.controller.reset();
+        self.controller.set_memory(&memory);
         self.observe();
         let bits = |x: &[f64]| x.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
         if bits(&self.state.obs) != bits(&obs) {

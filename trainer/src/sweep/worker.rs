@@ -17,8 +17,8 @@ const PAUSE: Duration = Duration::from_millis(100);
 pub enum Event<'a> {
     /// A run was left alone, it was finished before.
     Skipped(&'a Run),
-    /// A worker started; `true`: over a run that was broken off.
-    Started(&'a Run, bool),
+    /// A worker started.
+    Started(&'a Run),
     /// A worker ended: `Ok`, or its last words.
     Ended(&'a Run, Result<(), String>),
     /// Time passed; steps done by all workers at work.
@@ -49,7 +49,7 @@ pub fn run(
             }
             match start(sweep, run) {
                 Ok(process) => {
-                    tell(Event::Started(run, run.found == Found::Broken));
+                    tell(Event::Started(run));
                     working.push(Worker { run, process });
                 }
                 Err(words) => {
@@ -78,7 +78,7 @@ pub fn run(
     }
 }
 
-/// Starts `nearl train` on one thread. A broken run is removed first: its folder was written by an earlier sweep.
+/// Starts `nearl train` on one thread. A run without a checkpoint is removed first: its folder was written by an earlier sweep.
 fn start(sweep: &Sweep, run: &Run) -> Result<Child, String> {
     if run.found == Found::Broken {
         std::fs::remove_dir_all(&run.folder)
@@ -86,10 +86,14 @@ fn start(sweep: &Sweep, run: &Run) -> Result<Child, String> {
     }
     let program = std::env::current_exe().map_err(|e| format!("cannot find this program: {e}"))?;
     let mut command = Command::new(program);
-    command.args(["train", &run.task, "--algo", &run.algo, "--threads", "1", "--json"]);
-    command.args(["--steps", &sweep.steps.to_string(), "--seed", &run.seed.to_string()]);
-    command.arg("--out").arg(&run.folder);
-    command.args(sweep.set.iter().flat_map(|set| ["--set", set]));
+    command.args(["train", &run.task, "--threads", "1", "--json"]);
+    if run.found == Found::Resumable {
+        command.arg("--resume").arg(&run.folder);
+    } else {
+        command.args(["--algo", &run.algo, "--seed", &run.seed.to_string()]);
+        command.args(["--steps", &sweep.steps.to_string()]).arg("--out").arg(&run.folder);
+        command.args(sweep.set.iter().flat_map(|set| ["--set", set]));
+    }
     command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
     command.process_group(0); // Ctrl-C reaches the sweep alone, which asks its workers once
     // SAFETY: prctl is async-signal-safe and touches nothing of the parent.

@@ -104,7 +104,10 @@ impl Training {
     }
 
     /// Writes the snapshot (`final` when the steps are done, else `latest`) and the checkpoint; returns the snapshot's path.
-    pub(super) fn save(&mut self, folder: &RunFolder) -> Result<PathBuf, TrainError> {
+    ///
+    /// # Errors
+    /// [`TrainError`] with what the system said.
+    pub fn save(&mut self, folder: &RunFolder) -> Result<PathBuf, TrainError> {
         let name = if self.is_done() { "final" } else { "latest" };
         let path = folder.save(name, self.snapshot())?;
         self.checkpoint().map_err(TrainError::Settings)?.save(&checkpoint::path_in(folder.path()))?;

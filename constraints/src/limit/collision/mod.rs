@@ -289,7 +289,7 @@ impl Rows for CollisionRows {
 
     fn excess(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
         out.fill(f64::NEG_INFINITY);
-        let near = self.pairs.look(self.ahead.look(motion.q, motion.v, motion.period.dt));
+        let near = self.pairs.look(self.ahead.look_at_frames(motion.q, motion.v, motion.period.dt));
         let then = self.ahead.turn(motion.v_next);
         for near in near {
             let clearance = near.clearance(self.margin, motion.period);

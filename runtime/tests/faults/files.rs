@@ -1,0 +1,63 @@
+//! Faults of snapshot files.
+
+use std::time::{Duration, Instant};
+
+use nearl_runtime::{Snapshot, SnapshotError};
+
+use crate::arm::*;
+
+/// A small snapshot: the robot file makes most of it.
+fn bytes() -> Vec<u8> {
+    snapshot(1, |_| {}).to_bytes()
+}
+
+#[test]
+fn fault_10_every_flipped_byte_is_refused() {
+    let good = bytes();
+    assert!(Snapshot::from_bytes(&good).is_ok());
+    let mut damaged = good.clone();
+    // A prime step, so that every kind of byte (header, manifest, weights) is met; all of them take a minute.
+    for at in (0..good.len()).step_by(13) {
+        damaged[at] ^= 1 << (at % 8);
+        let error = Snapshot::from_bytes(&damaged).err();
+        assert!(error.is_some(), "byte {at} of {} was flipped and not missed", good.len());
+        damaged[at] = good[at];
+    }
+    let last = good.len() - 1;
+    damaged[last] ^= 1;
+    assert_eq!(Snapshot::from_bytes(&damaged).unwrap_err().code(), "snapshot-digest");
+}
+
+#[test]
+fn fault_12_every_truncation_is_refused() {
+    let good = bytes();
+    for length in 0..good.len() {
+        let error = Snapshot::from_bytes(&good[..length]).unwrap_err();
+        assert_eq!(error.code(), "snapshot-malformed", "{length} of {} bytes", good.len());
+    }
+    assert!(Snapshot::from_bytes(&good).is_ok(), "the next good one is taken");
+}
+
+#[test]
+fn fault_13_what_is_no_regular_file_is_refused_at_once() {
+    let folder = Scratch::new("fault13");
+    let (fifo, link, file) = (folder.0.join("fifo"), folder.0.join("link"), folder.0.join("file"));
+    std::fs::write(&file, bytes()).unwrap();
+    std::os::unix::fs::symlink(&file, &link).unwrap();
+    let name = std::ffi::CString::new(fifo.to_str().unwrap()).unwrap();
+    // SAFETY: plain call with a path that ends in a zero.
+    assert_eq!(unsafe { libc::mkfifo(name.as_ptr(), 0o600) }, 0);
+    let begin = Instant::now();
+    for path in [&fifo, &link, &folder.0, &"/dev/zero".into(), &folder.0.join("missing")] {
+        let error: SnapshotError = Snapshot::load(path).unwrap_err();
+        assert_eq!(error.code(), "snapshot-unreadable", "{}", path.display());
+    }
+    assert!(begin.elapsed() < Duration::from_secs(30), "a pipe without a writer was opened");
+    std::fs::set_permissions(&file, std::os::unix::fs::PermissionsExt::from_mode(0o000)).unwrap();
+    // SAFETY: plain call.
+    if unsafe { libc::geteuid() } == 0 {
+        println!("not tested: an unreadable file, because root may read everything");
+        return;
+    }
+    assert_eq!(Snapshot::load(&file).unwrap_err().code(), "snapshot-unreadable");
+}
