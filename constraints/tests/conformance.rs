@@ -184,3 +184,15 @@ fn impossible_numbers_are_refused_by_name() {
         assert!(error.contains(expected), "{line}: {error}");
     }
 }
+
+#[test]
+fn the_page_about_limits_names_every_kind_with_its_example() {
+    let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/LIMITS.md")).unwrap();
+    for entry in REGISTRY {
+        assert!(
+            page.contains(&format!("| `{}` |", entry.example)),
+            "docs/LIMITS.md lacks `{}`",
+            entry.example
+        );
+    }
+}
