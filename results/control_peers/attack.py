@@ -3,9 +3,11 @@
 python attack.py TICKS [SEED]
 
 TICKS for each rule and attack. All rules meet the same seeds, starts and attacks; what they are asked for depends on where they went.
-A rule without an answer, or with one that is no number, holds the velocity of the tick before.
+Where a rule has no answer, or one that is no number, its joints brake by what the motors can always give; what the proposal holds that
+is no number reaches the rule as it is.
 """
 
+import logging
 import sys
 import warnings
 
@@ -98,7 +100,7 @@ def run(rule, kind, ticks, seed):
         except Exception:  # whatever a package raises when it has no answer
             v_next = None
         if v_next is None or not np.all(np.isfinite(v_next)):
-            v_next, silent = v, silent + 1
+            v_next, silent = v - np.sign(v) * np.minimum(limits.braking * DT, np.abs(v)), silent + 1
         tau = pin.rnea(model, dynamics, q, v, (v_next - v) / DT)
         state.qfrc_applied[:] = tau
         mujoco.mj_step(sim, state)
@@ -117,6 +119,7 @@ def run(rule, kind, ticks, seed):
 
 def main() -> None:
     warnings.simplefilter("ignore")
+    logging.disable(logging.CRITICAL)
     ticks, seed = int(float(sys.argv[1])), int(sys.argv[2]) if len(sys.argv) > 2 else 1
     print("| rule | attack | ticks | position | velocity | acceleration | torque | worst: position, velocity, acceleration, torque [share] | no answer |")
     print("|---|---|---|---|---|---|---|---|---|")

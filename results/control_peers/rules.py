@@ -61,11 +61,12 @@ def posture_target(q, q_hat, v_hat):
     return q + 0.5 * ((q_hat - q) + DT * v_hat)
 
 
-def by_pink(model: pin.Model, limits: Limits, solver: str = "quadprog"):
-    """pink's posture task with its configuration, velocity and acceleration limits; the last holds its braking bound."""
+def by_pink(model: pin.Model, limits: Limits, most: np.ndarray, solver: str):
+    """pink's posture task with its configuration, velocity and acceleration limits; the last holds its braking bound. It has one
+    number for both: `most`."""
     model.upperVelocityLimit = limits.speed
     data = model.createData()
-    acceleration = pink.limits.AccelerationLimit(model, limits.acceleration)
+    acceleration = pink.limits.AccelerationLimit(model, most)
     bounds = [pink.limits.ConfigurationLimit(model), pink.limits.VelocityLimit(model, limits.speed), acceleration]
     task = pink.tasks.PostureTask(cost=1.0)
 
@@ -78,7 +79,7 @@ def by_pink(model: pin.Model, limits: Limits, solver: str = "quadprog"):
     return rule
 
 
-def by_mink(limits: Limits, solver: str = "quadprog"):
+def by_mink(limits: Limits, solver: str):
     """mink's posture task with its configuration and velocity limits; it has no acceleration limit."""
     model = mujoco.MjModel.from_xml_string(FILE.read_text())
     speed = {model.joint(j).name: limits.speed[j] for j in range(model.njnt)}
@@ -150,7 +151,8 @@ def rules(solver: str = "quadprog") -> dict:
         return {
             "NEARL, certified braking": ours(limits),
             "NEARL, stored brake": ours(limits, "stored"),
-            "pink, braking bound": by_pink(panda()[0], limits, solver),
+            "pink, braking bound": by_pink(panda()[0], limits, limits.acceleration, solver),
+            "pink, braking bound, slow": by_pink(panda()[0], limits, limits.braking, solver),
             "mink": by_mink(limits, solver),
             "ros2_control, saturation": by_saturation_limiter(limits),
             "ros2_control, range": by_range_limiter(limits),

@@ -4,6 +4,7 @@ use super::active_set::ActiveSet;
 use super::backup::Backup;
 use super::conic::Conic;
 use super::coupled::Coupled;
+use super::polish::Polish;
 use super::sources::{Measured, Sources};
 use super::{Dofs, History, Projector, Stages, Switch};
 use crate::checker::Checker;
@@ -200,8 +201,9 @@ fn stages(
     sources.fill(&mut problem, &mut dynamics, &rest, dofs, &zero, &period);
     let conic = Conic::new(&problem, sigma, settings.max_iter, settings.deadline)?;
     let (n, m) = (problem.n, problem.m);
+    let polish = Polish::new(&problem);
     let (active_set, y, dropped) = (ActiveSet::new(n, m), vec![0.0; n], vec![(0.0, 0.0); m]);
-    Ok(Some(Stages { sources, labels, problem, active_set, conic, y, exact: false, dropped }))
+    Ok(Some(Stages { sources, labels, problem, active_set, conic, polish, y, exact: false, dropped }))
 }
 
 /// A velocity change of the size to expect in one period [rad/s or m/s].

@@ -171,7 +171,7 @@ impl Kkt<'_> {
 }
 
 /// Solves `K x = b` in place by elimination with pivots; false when K is singular.
-fn solve(k: &mut [f64], b: &mut [f64], n: usize) -> bool {
+pub(super) fn solve(k: &mut [f64], b: &mut [f64], n: usize) -> bool {
     let largest = k.iter().fold(0.0, |m: f64, x| m.max(x.abs()));
     for col in 0..n {
         let pivot =

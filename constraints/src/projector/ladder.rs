@@ -129,6 +129,9 @@ impl Stages {
         }
         self.exact = false;
         let answered = self.conic.solve(&self.problem);
+        if answered {
+            self.polish.refine(&self.problem, &mut self.conic);
+        }
         *iterations += self.conic.iterations;
         (answered && self.obeys(&self.conic.y, ROW_TOLERANCE)).then_some(Rung::Clarabel)
     }

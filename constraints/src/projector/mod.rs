@@ -10,6 +10,7 @@ mod coupled;
 mod gradient;
 mod ladder;
 mod modes;
+mod polish;
 mod sources;
 mod stages;
 mod switch;
@@ -28,6 +29,7 @@ use active_set::ActiveSet;
 use backup::{Backup, With};
 use conic::Conic;
 use coupled::Coupled;
+use polish::Polish;
 use sources::{Label, Sources};
 use std::time::Instant;
 
@@ -110,6 +112,7 @@ struct Stages {
     problem: Coupled,
     active_set: ActiveSet,
     conic: Conic,
+    polish: Polish,
     y: Vec<f64>,
     /// The last answer is the active-set stage's.
     exact: bool,
