@@ -15,8 +15,9 @@ use crate::link::service::{Bus, Ipc};
 use crate::link::{Header, LinkError, Message, RobotName};
 use crate::rt::clock;
 
-/// Wait between two looks at an empty buffer: far below the time of a chunk.
-const NAP: Duration = Duration::from_micros(100);
+/// Waits between two looks at an empty buffer: they double from the first to the longest, far below the time the server needs
+/// to fill a buffer.
+const NAP: (Duration, Duration) = (Duration::from_micros(50), Duration::from_millis(1));
 /// Silence after which the client looks whether the server still lives.
 const SUSPICION: Duration = Duration::from_millis(250);
 
@@ -124,12 +125,11 @@ impl RolloutClient {
         }
         let ids = (request, self.bus.epoch());
         Ok(Rollouts {
-            pending,
+            pending: Some(pending),
             bus: Arc::clone(&self.bus),
             ids,
             chunks: 0,
             steps: 0,
-            over: false,
             cancelled: false,
         })
     }
@@ -141,14 +141,16 @@ pub(super) fn bytes_of(message: &RequestMessage) -> &[u8] {
     unsafe { std::slice::from_raw_parts(std::ptr::from_ref(message).cast(), size_of::<RequestMessage>()) }
 }
 
+type Pending = PendingResponse<Ipc, [u8], (), [f64], ReplyMessage>;
+
 /// The answers to one request. Dropping it frees the server's place.
 pub struct Rollouts {
-    pending: PendingResponse<Ipc, [u8], (), [f64], ReplyMessage>,
+    /// `None` once the stream is over: the client may then ask for another.
+    pending: Option<Pending>,
     bus: Arc<Bus>,
     ids: (u64, u64),
     chunks: u64,
     steps: u64,
-    over: bool,
     cancelled: bool,
 }
 
@@ -159,18 +161,18 @@ impl Rollouts {
     /// [`RequestError::Refused`] with the server's answer, [`RequestError::ServerGone`], or [`RequestError::Silent`]
     /// after `patience` without a reply. Every error but the last ends the stream.
     pub fn next(&mut self, patience: Duration) -> Result<Option<Chunk>, RequestError> {
-        if self.over {
-            return Ok(None);
+        let Some(pending) = self.pending.take() else { return Ok(None) };
+        let result = self.wait(&pending, patience);
+        if matches!(result, Ok(Some(_)) | Err(RequestError::Silent { .. })) {
+            self.pending = Some(pending);
         }
-        let result = self.wait(patience);
-        self.over = !matches!(result, Ok(Some(_)) | Err(RequestError::Silent { .. }));
         result
     }
 
     /// Asks the server to stop. Chunks under way still come; then [`Rollouts::next`] gives `None`.
     pub fn cancel(&mut self) {
         self.cancelled = true;
-        self.pending.set_disconnect_hint();
+        self.pending.iter().for_each(PendingResponse::set_disconnect_hint);
     }
 
     /// Transitions received so far.
@@ -178,11 +180,11 @@ impl Rollouts {
         self.steps
     }
 
-    fn wait(&mut self, patience: Duration) -> Result<Option<Chunk>, RequestError> {
+    fn wait(&mut self, pending: &Pending, patience: Duration) -> Result<Option<Chunk>, RequestError> {
         let start = Instant::now();
-        let mut suspicion = SUSPICION;
+        let (mut suspicion, mut nap) = (SUSPICION, NAP.0);
         loop {
-            if let Some((reply, numbers)) = self.receive()? {
+            if let Some((reply, numbers)) = self.receive(pending)? {
                 match self.read(&reply, numbers)? {
                     Some(end) => return Ok(end),
                     None => continue,
@@ -197,19 +199,20 @@ impl Rollouts {
                 suspicion += SUSPICION;
                 self.bus.node().try_cleanup_dead_nodes();
                 // Its last reply may have come between the look into the buffer and here.
-                if !self.pending.is_connected() && !self.pending.has_response() {
+                if !pending.is_connected() && !pending.has_response() {
                     return Err(RequestError::ServerGone(self.bus.name().clone()));
                 }
             }
-            std::thread::sleep(NAP);
+            std::thread::sleep(nap);
+            nap = NAP.1.min(2 * nap);
         }
     }
 
     /// The next reply to this request; those to a request of a client that had this place before are left out.
-    fn receive(&mut self) -> Result<Option<(ReplyMessage, Vec<f64>)>, LinkError> {
+    fn receive(&self, pending: &Pending) -> Result<Option<(ReplyMessage, Vec<f64>)>, LinkError> {
         loop {
             let failed = |e| self.bus.name().transport("receive a reply", format!("{e:?}"));
-            let Some(sample) = self.pending.receive().map_err(failed)? else { return Ok(None) };
+            let Some(sample) = pending.receive().map_err(failed)? else { return Ok(None) };
             let reply = *sample.user_header();
             let unreadable = (reply.request, reply.client) == (0, 0);
             if reply.header.schema == ReplyMessage::SCHEMA && (unreadable || self.is_ours(&reply)) {
