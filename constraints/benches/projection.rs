@@ -127,8 +127,7 @@ fn main() {
     println!("| limits | rung | ticks | p50 [us] | p99 | p99.9 | allocations |");
     println!("|---|---|---|---|---|---|---|");
     let panda_from = [0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0];
-    let mut panda_run =
-        |name: &str, torque, settings| run(name, panda_projector(torque, settings), &panda_from);
+    let panda_run = |name: &str, torque, settings| run(name, panda_projector(torque, settings), &panda_from);
     panda_run("Panda, box, 1 sub-step", None, base());
     panda_run("Panda, box, 5 sub-steps", None, Settings::new(0.001, 5));
     panda_run("Panda, box, free", None, Settings { consistency: Consistency::Free, ..base() });

@@ -23,7 +23,7 @@
 //!
 //! 1. [`viability`]: why position, velocity and acceleration limits never contradict each other;
 //! 2. [`limit`]: what a limit is and how to add one;
-//! 3. [`Projector`] (`projector/mod.rs`): the tick; then `projector/coupled.rs` (the rows), `active_set.rs`, `conic.rs`;
+//! 3. [`Projector`] (`projector/mod.rs`): the tick; then `projector/coupled.rs` (the rows), `active_set/`, `conic.rs`;
 //! 4. [`checker`]: the judge that shares no code with the above; [`certify_braking`]: whether the motors can brake;
 //! 5. [`Model`], [`Dynamics`], [`Kinematics`], [`convention`]: the robot, and how it meets MuJoCo; [`geometry`]: distances between solids.
 //!

@@ -117,6 +117,7 @@ fn the_stages_agree() {
         tried += 1;
         let exact = stages.exact();
         assert!(stages.exact_iterations() <= bound(kind));
+        assert!(!stages.empty());
         if exact {
             solved += 1;
             let y = stages.exact_answer();
@@ -219,7 +220,7 @@ fn brute_force_finds_nothing_better() {
                 assert!(!exact, "an answer where there is none");
             }
             Some((_, best)) => {
-                assert!(exact, "problem {k} unsolved");
+                assert!(exact && !stages.empty(), "problem {k} unsolved");
                 solved += 1;
                 let off = stages.exact_answer().iter().zip(best.iter()).map(|(a, b)| (a - b).abs());
                 let off = off.fold(0.0, f64::max);
@@ -233,7 +234,7 @@ fn brute_force_finds_nothing_better() {
 /// What cannot be obeyed is said not to be, at every size and within the bound on steps.
 #[test]
 fn what_is_empty_is_found_empty() {
-    let mut random = Random(13);
+    let (mut random, mut shown) = (Random(13), 0);
     for _ in 0..400 {
         let kind = shapes(&mut random);
         let kind = Kind { m: kind.m.max(1), ..kind };
@@ -241,8 +242,11 @@ fn what_is_empty_is_found_empty() {
         let mut stages = LoneStages::new(&p).unwrap();
         stages.put(&p);
         assert!(!stages.exact());
+        shown += usize::from(stages.empty());
         assert!(stages.exact_iterations() <= bound(kind));
     }
+    println!("{shown} of 400 shown to be empty"); // where rows depend on each other, Clarabel has the word
+    assert!(shown >= 360, "{shown}");
 }
 
 /// Along a path of problems, as in closed loop and with jumps and empty ones between, the stage that starts from its last active
@@ -271,6 +275,7 @@ fn a_warm_start_changes_no_bit() {
             cold.forget();
             let found = (warm.exact(), cold.exact());
             assert_eq!(found.0, found.1, "path {path} tick {tick}");
+            assert!(!(found.0 && (warm.empty() || cold.empty())));
             steps[0] += u64::from(warm.exact_iterations());
             steps[1] += u64::from(cold.exact_iterations());
             if found.0 {

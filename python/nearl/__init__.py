@@ -13,7 +13,11 @@ vectors of them.
 
 from nearl._core import (
     AccelerationLimit,
+    CollisionLimit,
     Controller,
+    EnergyLimit,
+    FrameLimit,
+    FrameSpeedLimit,
     JerkLimit,
     Ledger,
     Limit,
@@ -37,7 +41,11 @@ from nearl.pid2 import PID2
 
 __all__ = [
     "AccelerationLimit",
+    "CollisionLimit",
     "Controller",
+    "EnergyLimit",
+    "FrameLimit",
+    "FrameSpeedLimit",
     "JerkLimit",
     "Ledger",
     "Limit",

@@ -44,13 +44,16 @@ class ActiveRow(TypedDict):
 @final
 class Model:
     @staticmethod
-    def from_urdf(path: _Path) -> Model: ...
+    def from_urdf(path: _Path, free_flyer: bool = False) -> Model: ...
     @staticmethod
     def from_mjcf(path: _Path) -> Model: ...
     @staticmethod
     def from_urdf_text(text: str) -> Model: ...
     @staticmethod
     def from_mjcf_text(text: str) -> Model: ...
+    @property
+    def frame_names(self) -> list[str]: ...
+    def external_forces(self, q: ArrayLike, wrenches: Mapping[str, Sequence[float]]) -> _Floats: ...
     @property
     def nq(self) -> int: ...
     @property
@@ -130,6 +133,51 @@ class TorqueRateLimit(Limit):
 @final
 class LockedJoints(Limit):
     def __new__(cls, model: Model, joints: Sequence[str]) -> LockedJoints: ...
+
+@final
+class FrameLimit(Limit):
+    def __new__(
+        cls,
+        model: Model,
+        frame: str,
+        braking: float,
+        *,
+        normal: Sequence[float] | None = None,
+        through: Sequence[float] | None = None,
+        lower: Sequence[float] | None = None,
+        upper: Sequence[float] | None = None,
+        point: Sequence[float] = ...,
+        margin: float = 0.0,
+        soft: _Soft | None = None,
+        name: str | None = None,
+    ) -> FrameLimit: ...
+
+@final
+class FrameSpeedLimit(Limit):
+    def __new__(
+        cls, model: Model, frame: str, limit: float, *, point: Sequence[float] = ..., name: str | None = None
+    ) -> FrameSpeedLimit: ...
+
+@final
+class EnergyLimit(Limit):
+    def __new__(cls, model: Model, limit: float) -> EnergyLimit: ...
+
+@final
+class CollisionLimit(Limit):
+    def __new__(
+        cls,
+        model: Model,
+        shapes: Sequence[Mapping[str, Any]],
+        braking: float,
+        *,
+        margin: float = 0.0,
+        urdf: bool = False,
+        ignore: Sequence[tuple[str, str]] = ...,
+        adjacent: bool = False,
+        influence: float = 0.2,
+        rows: int = 16,
+        soft: _Soft | None = None,
+    ) -> CollisionLimit: ...
 
 @final
 class RowLimit(Limit):

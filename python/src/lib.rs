@@ -27,8 +27,9 @@ mod _core {
     use super::env::{Env, tasks};
     #[pymodule_export]
     use super::limits::{
-        AccelerationLimit, JerkLimit, Limit, LockedJoints, PositionLimit, RowLimit, TorqueLimit,
-        TorqueRateLimit, TorqueSpeedLimit, VelocityLimit, VelocityProfileLimit,
+        AccelerationLimit, CollisionLimit, EnergyLimit, FrameLimit, FrameSpeedLimit, JerkLimit, Limit,
+        LockedJoints, PositionLimit, RowLimit, TorqueLimit, TorqueRateLimit, TorqueSpeedLimit, VelocityLimit,
+        VelocityProfileLimit,
     };
     #[pymodule_export]
     use super::link::{RolloutClient, Rollouts, rollout_ledger};

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nearl_constraints::limit::{
-    AccelerationSettings, JerkSettings, JointProfile, KnownRobot, PositionSettings, TorqueRateSettings,
+    AccelerationSettings, CollisionSettings, EnergySettings, FrameBox, FrameSettings, FrameSpeedSettings,
+    HalfSpace, JerkSettings, JointProfile, KnownRobot, PositionSettings, TorqueRateSettings,
     TorqueSpeedSettings, UserRowSettings, VelocityProfileSettings, VelocitySettings,
 };
 use nearl_constraints::{self as constraints, Cone, LimitError, LimitSet, PerJoint, Rows, Soft};
@@ -316,5 +317,113 @@ impl RowLimit {
         let soft = soft.map(self::soft);
         let settings = UserRowSettings { name, terms, lower, upper, equals, braking, soft };
         checked(model, Self, constraints::UserRow::new(settings))
+    }
+}
+
+/// A point of a frame on one side of a plane, `normal . (p - through) <= 0`, or inside a box of world axes, `lower <= p <= upper`; `point` is in
+/// the frame's axes [m]. It stops in front of the faces with `braking` [m/s²], `margin` [m] inside.
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct FrameLimit;
+
+#[pymethods]
+impl FrameLimit {
+    #[new]
+    #[pyo3(signature = (model, frame, braking, *, normal=None, through=None, lower=None, upper=None, point=[0.0; 3], margin=0.0, soft=None, name=None))]
+    #[expect(clippy::too_many_arguments, reason = "one argument a setting, by keyword")]
+    fn new(
+        model: &Model,
+        frame: String,
+        braking: f64,
+        normal: Option<[f64; 3]>,
+        through: Option<[f64; 3]>,
+        lower: Option<[f64; 3]>,
+        upper: Option<[f64; 3]>,
+        point: [f64; 3],
+        margin: f64,
+        soft: Option<Weights>,
+        name: Option<String>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let half_space = match (normal, through) {
+            (None, None) => None,
+            (Some(normal), through) => Some(HalfSpace { normal, through: through.unwrap_or_default() }),
+            (None, Some(_)) => {
+                return Err(errors::value(
+                    "through needs normal, the direction that is not allowed; give both",
+                ));
+            }
+        };
+        let inside = (lower.is_some() || upper.is_some()).then(|| FrameBox {
+            lower: lower.unwrap_or([f64::NEG_INFINITY; 3]),
+            upper: upper.unwrap_or([f64::INFINITY; 3]),
+        });
+        let soft = soft.map(self::soft);
+        let settings = FrameSettings { name, frame, point, half_space, inside, braking, margin, soft };
+        checked(model, Self, constraints::FrameLimit::new(settings))
+    }
+}
+
+/// The speed of a frame's `point` [m, in its axes] stays below `limit` [m/s], in every direction.
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct FrameSpeedLimit;
+
+#[pymethods]
+impl FrameSpeedLimit {
+    #[new]
+    #[pyo3(signature = (model, frame, limit, *, point=[0.0; 3], name=None))]
+    fn new(
+        model: &Model,
+        frame: String,
+        limit: f64,
+        point: [f64; 3],
+        name: Option<String>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let settings = FrameSpeedSettings { name, frame, point, limit };
+        checked(model, Self, constraints::FrameSpeedLimit::new(settings))
+    }
+}
+
+/// The kinetic energy of the whole robot stays below `limit` [J].
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct EnergyLimit;
+
+#[pymethods]
+impl EnergyLimit {
+    #[new]
+    fn new(model: &Model, limit: f64) -> PyResult<PyClassInitializer<Self>> {
+        checked(model, Self, constraints::EnergyLimit::new(EnergySettings { limit }))
+    }
+}
+
+/// Bodies keep clear of each other and of what stands around them. `shapes`: dictionaries as in a task file, such as
+/// `{"frame": "hand", "shape": {"sphere": {"radius": 0.1}}, "position": [0, 0, 0.05]}` or `{"name": "floor", "shape": "half_space"}`; `urdf=True`
+/// adds the robot file's own spheres, boxes, cylinders and capsules. Distances close with at most `braking` [m/s²], down to `margin` [m].
+#[pyclass(module = "nearl._core", frozen, extends = Limit)]
+pub(crate) struct CollisionLimit;
+
+#[pymethods]
+impl CollisionLimit {
+    #[new]
+    #[pyo3(signature = (model, shapes, braking, *, margin=0.0, urdf=false, ignore=vec![], adjacent=false, influence=0.2, rows=16, soft=None))]
+    #[expect(clippy::too_many_arguments, reason = "one argument a setting, by keyword")]
+    fn new(
+        model: &Model,
+        shapes: &Bound<'_, PyAny>,
+        braking: f64,
+        margin: f64,
+        urdf: bool,
+        ignore: Vec<[String; 2]>,
+        adjacent: bool,
+        influence: f64,
+        rows: usize,
+        soft: Option<Weights>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let text: String = shapes.py().import("json")?.call_method1("dumps", (shapes,))?.extract()?;
+        let shapes = serde_json::from_str(&text).map_err(|e| {
+            errors::value(format!("shapes are not as in a task file: {e}; see docs/TASKS.md"))
+        })?;
+        let soft = soft.map(self::soft);
+        let settings =
+            CollisionSettings { shapes, urdf, ignore, adjacent, braking, margin, influence, rows, soft };
+        checked(model, Self, constraints::CollisionLimit::new(settings))
     }
 }

@@ -22,10 +22,39 @@ pub(crate) struct Model {
 
 #[pymethods]
 impl Model {
-    /// Reads a URDF file; the base is fixed to the world.
+    /// Reads a URDF file; the base is fixed to the world, or with `free_flyer` floats: seven positions (x, y, z and a quaternion x, y,
+    /// z, w) and six velocities in the base's axes come first.
     #[staticmethod]
-    fn from_urdf(py: Python<'_>, path: PathBuf) -> PyResult<Model> {
-        py.detach(|| constraints::Model::from_urdf(&path)).map(Model::of).map_err(errors::model)
+    #[pyo3(signature = (path, free_flyer=false))]
+    fn from_urdf(py: Python<'_>, path: PathBuf, free_flyer: bool) -> PyResult<Model> {
+        let read =
+            if free_flyer { constraints::Model::from_urdf_free_flyer } else { constraints::Model::from_urdf };
+        py.detach(|| read(&path)).map(Model::of).map_err(errors::model)
+    }
+
+    /// Names of the frames: links, joints and sites.
+    #[getter]
+    fn frame_names(&self) -> Vec<String> {
+        self.model.frame_names().map(str::to_string).collect()
+    }
+
+    /// Generalised forces `J'f` (nv) of wrenches on frames at `q` (nq), for `Projector.set_external_forces`: force [N] and moment
+    /// about the frame's origin [N·m] by frame name, in world axes, from the environment on the robot.
+    fn external_forces<'py>(
+        &self,
+        py: Python<'py>,
+        q: &Bound<'_, PyAny>,
+        wrenches: std::collections::BTreeMap<String, [f64; 6]>,
+    ) -> PyResult<Vector<'py>> {
+        let (q, zero) = (self.q("q", q)?, vec![0.0; self.model.nv()]);
+        let mut kinematics = constraints::Kinematics::new(&self.model);
+        kinematics.update(&q, &zero, &zero);
+        let mut tau = zero;
+        for (name, wrench) in wrenches {
+            let frame = self.model.frame(&name).map_err(errors::model)?;
+            kinematics.add_wrench(frame, wrench, &mut tau);
+        }
+        Ok(array(py, &tau))
     }
 
     /// Reads an MJCF file.

@@ -375,6 +375,16 @@ impl Controller {
         self.projector.memory()
     }
 
+    /// Appends [`Controller::memory`] to `memory`; allocates only where that has no room.
+    pub fn write_memory(&self, memory: &mut Vec<f64>) {
+        self.projector.write_memory(memory);
+    }
+
+    /// The projector: what it knows of the tick before moves between those of one robot.
+    pub(crate) fn projector(&mut self) -> &mut Projector {
+        &mut self.projector
+    }
+
     /// Begins in the middle of an episode, at a policy tick, with what [`Controller::memory`] gave.
     ///
     /// # Panics

@@ -53,6 +53,9 @@ pub struct ModelSection {
     /// MJCF file, relative to the task file, or the name of a bundled robot.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mjcf: Option<String>,
+    /// The base of the URDF floats instead of being fixed to the world.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub free_flyer: bool,
 }
 
 /// `[time]`.
@@ -245,6 +248,11 @@ impl Task {
         }
         if self.model.urdf.is_some() == self.model.mjcf.is_some() {
             return refuse("model", "give exactly one of 'urdf' and 'mjcf'".into());
+        }
+        if self.model.free_flyer && self.model.mjcf.is_some() {
+            let next =
+                "free_flyer is for URDF files; an MJCF file says itself whether its base floats, so drop it";
+            return refuse("model.free_flyer", next.into());
         }
         Ok(self)
     }

@@ -194,7 +194,8 @@ fn a_snapshot_that_misses_its_targets_is_taken_back_and_the_log_replays() {
     let folder = Scratch::new("rollback");
     let log = folder.0.join("rollback.mcap");
     let name = Name::new("rollback");
-    let body = toy::PointMass { q: 1.0, ..toy::PointMass::default() };
+    let pause = Duration::from_micros(200);
+    let body = toy::PointMass { q: 1.0, pause, ..toy::PointMass::default() };
     let plant = toy::PlantThread::start(&name, body, PlantSettings::lockstep(toy::DT));
     let settings = RunSettings { log: Some(log.clone()), first: b"spring".to_vec(), ..toy::settings() };
     let running = toy::LoopThread::start(&name, settings, |_| {});
@@ -214,7 +215,11 @@ fn a_snapshot_that_misses_its_targets_is_taken_back_and_the_log_replays() {
         ticks(&mut trainer, now + 1500);
     }
     let Ok(receipt) = trainer.wait_for_receipt(toy::MISSES, PATIENCE) else {
-        panic!("nothing was taken back: {}", running.end());
+        let report = running.end();
+        panic!(
+            "nothing was taken back: {} {:?} {:?} {report}",
+            report.rolled_back, report.versions, report.counters
+        );
     };
     assert_eq!(receipt.verdict(), Verdict::RolledBack, "{}", receipt.text());
     assert_eq!(verdicts, [Verdict::Accepted, Verdict::Accepted]);

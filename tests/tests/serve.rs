@@ -123,7 +123,8 @@ fn accepted(client: &mut RolloutClient) -> Rollouts {
 fn client() {
     let Ok(name) = std::env::var(ROLE) else { return };
     let mut client = RolloutClient::open(&RobotName::new(&name).expect("name"), PATIENCE).expect("server");
-    let _rollouts = begin(&mut client);
+    // The test that looks for a busy server takes the place for moments.
+    let _rollouts = accepted(&mut client);
     std::thread::sleep(PATIENCE);
 }
 

@@ -65,9 +65,9 @@ impl Backup {
     }
 
     /// Stored or not, what passed last, and the decelerations.
-    pub(crate) fn memory(&self) -> Vec<f64> {
-        let head = [f64::from(u8::from(self.stored)), self.favourite as f64];
-        [&head, self.deceleration.as_slice()].concat()
+    pub(crate) fn write_memory(&self, memory: &mut Vec<f64>) {
+        memory.extend_from_slice(&[f64::from(u8::from(self.stored)), self.favourite as f64]);
+        memory.extend_from_slice(&self.deceleration);
     }
 
     pub(crate) fn set_memory(&mut self, memory: &[f64]) {

@@ -123,6 +123,9 @@ impl Stages {
             if self.exact {
                 return Some(Rung::ActiveSet);
             }
+            if self.active_set.empty {
+                return None; // shown: no stage has an answer
+            }
         }
         self.exact = false;
         let answered = self.conic.solve(&self.problem);

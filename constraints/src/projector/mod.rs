@@ -277,9 +277,8 @@ impl Projector {
         }
         let (mut good, mut bad) = (0.0, 1.0);
         self.v_wanted.copy_from_slice(&target.v);
-        for &i in &self.dofs.controllable {
-            self.v_stop[i] = self.backup.next_velocity(i, v[i], &self.period);
-        }
+        self.stop(q, v, target, true);
+        self.v_stop.copy_from_slice(&self.v_next);
         for _ in 0..4 {
             let share = 0.5 * (good + bad);
             self.blend(share);
@@ -317,7 +316,7 @@ impl Projector {
         target.ledger.rung = rung;
     }
 
-    /// Last rung: every controllable dof takes `-sgn(v) min(A_b, |v| / T)`, inside its box.
+    /// Last rung: a tick of a brake, see [`Projector::stop`].
     fn brake(
         &mut self,
         q: &[f64],
@@ -328,13 +327,29 @@ impl Projector {
     ) -> Status {
         self.v_next.copy_from_slice(proposal.map_or(v, |p| &p.v));
         self.consistent.fill(false);
+        let unsolved = matches!(reason, BrakeReason::NoCertifiedAnswer | BrakeReason::NonFiniteDynamics);
+        self.stop(q, v, target, !unsolved);
+        self.write(q, v, proposal, target);
+        let stored = self.settings.braking == Braking::Stored && self.backup.stored;
+        self.report_rung(q, v, target, if stored { Rung::StoredBrake } else { Rung::Brake });
+        Status::Braked(reason)
+    }
+
+    /// `v_next` after a tick of the stored brake, or of `-sgn(v) min(A_b, |v| / T)` where none is stored: inside the box and, if
+    /// `rows`, the nearest to it that the coupled rows allow, should they allow any.
+    fn stop(&mut self, q: &[f64], v: &[f64], target: &mut Target, rows: bool) {
+        let stored = self.settings.braking == Braking::Stored && self.backup.stored;
         for &i in &self.dofs.controllable {
-            let stop = v[i] - v[i].signum() * (self.braking[i] * self.period.dt).min(v[i].abs());
+            let stop = match stored {
+                true => self.backup.next_velocity(i, v[i], &self.period),
+                false => v[i] - v[i].signum() * (self.braking[i] * self.period.dt).min(v[i].abs()),
+            };
             self.v_next[i] = stop.clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
         }
-        self.write(q, v, proposal, target);
-        self.report_rung(q, v, target, Rung::Brake);
-        Status::Braked(reason)
+        if rows {
+            self.goal.copy_from_slice(&self.v_next);
+            let _ = self.coupled_rows(q, v, target); // without an answer the brake stays as it is
+        }
     }
 
     /// A finite target that stands still, for a state nobody knows.

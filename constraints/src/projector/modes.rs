@@ -98,7 +98,7 @@ impl Projector {
             let mut size = 1.0;
             if let Some(iq) = self.dofs.single[i] {
                 self.displacement[i] = proposal.q[iq] - q[iq];
-                size = proposal.q[iq].abs().max(q[iq].abs()).max(1.0);
+                size = q[iq].abs().max(1.0); // not the proposal's: next to 1e300 every speed would belong
             }
             let (e, y_v) = (self.displacement[i], (proposal.v[i] - v[i]).clamp(-HUGE, HUGE));
             let y_q = ((e - t * v[i]) / (kappa * t)).clamp(-HUGE, HUGE);

@@ -58,6 +58,11 @@ impl LoneStages {
         self.active_set.solve(&self.problem)
     }
 
+    /// The active-set stage showed that no answer exists.
+    pub fn empty(&self) -> bool {
+        self.active_set.empty
+    }
+
     /// Lets the next [`exact`](Self::exact) start from the problem alone.
     pub fn forget(&mut self) {
         self.active_set.forget();

@@ -101,9 +101,17 @@ impl Projector {
     /// What the next projection depends on beside its arguments, as plain numbers: the tick before and the stored brake.
     /// For a checkpoint in the middle of an episode.
     pub fn memory(&self) -> Vec<f64> {
-        let known = f64::from(u8::from(self.previous.known));
-        [&[known], self.previous.acceleration.as_slice(), &self.previous.torque, &self.backup.memory()]
-            .concat()
+        let mut memory = Vec::new();
+        self.write_memory(&mut memory);
+        memory
+    }
+
+    /// Appends [`Projector::memory`] to `memory`; allocates only where that has no room.
+    pub fn write_memory(&self, memory: &mut Vec<f64>) {
+        memory.push(f64::from(u8::from(self.previous.known)));
+        memory.extend_from_slice(&self.previous.acceleration);
+        memory.extend_from_slice(&self.previous.torque);
+        self.backup.write_memory(memory);
     }
 
     /// Takes what [`Projector::memory`] gave.

@@ -23,6 +23,7 @@ impl Parts {
     pub fn new(m: &Manifest) -> Result<Self, SnapshotError> {
         let unusable = |reason: String| SnapshotError::Unusable { reason };
         let model = match m.model_format {
+            ModelFormat::Urdf if m.task.model.free_flyer => Model::from_urdf_text_free_flyer(&m.model),
             ModelFormat::Urdf => Model::from_urdf_text(&m.model),
             ModelFormat::Mjcf => Model::from_mjcf_text(&m.model),
         }

@@ -37,7 +37,8 @@ pub(crate) const SCHEMA: &str = r#"{
       "raw_violations": {"type": "integer"}, "projected_violations": {"type": "integer"}, "moved": {"type": "number"},
       "slack": {"type": "number"}, "residual": {"type": "number"}, "duration_ns": {"type": "integer"},
       "active_rows": {"type": "array", "items": {"type": "object", "properties": {
-        "kind": {"type": "string"}, "dof": {"type": "integer"}, "side": {"type": "string"}, "multiplier": {"type": "number"}}}}}},
+        "kind": {"type": "string"}, "row": {"type": "integer"}, "side": {"type": "string"}, "multiplier": {"type": "number"},
+        "slack": {"type": "number"}}}}}},
     "counters": {"type": "object"},
     "overruns": {"type": "integer"}, "stale": {"type": "integer"}, "lost_states": {"type": "integer"}
   }

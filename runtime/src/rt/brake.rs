@@ -46,6 +46,11 @@ impl Brake {
         }))
     }
 
+    /// The projector, whose memory is the controller's too.
+    pub(crate) fn projector(&mut self) -> &mut Projector {
+        &mut self.projector
+    }
+
     /// Proposes rest, `v' = 0` and `q' = q + T v - kappa T v`, and returns the torque [N m] for the nearest allowed
     /// state. Joints that are not controllable keep their velocity.
     pub fn update(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {

@@ -72,6 +72,8 @@ pub struct Core<T: Tick> {
     faults: FaultPlan,
     /// The state acted upon: the measured one, or a prediction.
     estimate: StateMessage,
+    /// What the controller saved in the tick before, for the one swapped in after it.
+    memory: Vec<f64>,
     /// States predicted in a row; none can be before the first was measured.
     held: Option<u32>,
     braked: u32,
@@ -84,7 +86,10 @@ pub struct Core<T: Tick> {
 impl<T: Tick> Core<T> {
     /// Begins in Hold; `start` is the first slot of the loop's own clock [ns].
     pub fn new(settings: CoreSettings, controller: Box<Loaded<T>>, start: u64, faults: FaultPlan) -> Core<T> {
+        let mut memory = Vec::new();
+        controller.controller.save_memory(&mut memory);
         Core {
+            memory,
             modes: Modes::new(settings.modes),
             grid: Grid::new(start, settings.period),
             record: Record::new(),
@@ -130,6 +135,7 @@ impl<T: Tick> Core<T> {
         self.record.swapped = swapped;
         if swapped {
             self.controller.controller.reset();
+            self.controller.controller.load_memory(&self.memory);
             self.brake_broken = false;
             self.record.counters.swaps += 1;
         }
@@ -208,6 +214,9 @@ impl<T: Tick> Core<T> {
             self.record.mode = self.modes.escalate(Event::Panicked, stop);
         }
         self.record.reason = self.modes.reason();
+        if self.record.step.nu > 0 {
+            self.controller.controller.save_memory(&mut self.memory);
+        }
     }
 
     /// The controller's tick, softened while the first motion is let in.
@@ -275,6 +284,7 @@ impl<T: Tick> Core<T> {
         // By its number: the state that began the episode may be among the lost ones.
         if !is_next || state.episode != self.record.state.episode {
             self.controller.controller.reset();
+            self.memory.clear();
             self.held = None;
         }
         let is_frozen = is_next && self.is_frozen(state);

@@ -1,6 +1,6 @@
 //! The controller of a snapshot in the loop: states in, [`Controller::update`], numbers out.
 
-use nearl_constraints::{BrakeReason, Entry, Ledger, RefuseReason, Rung, Side, Status};
+use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, RefuseReason, Rung, Side, Status};
 
 use crate::codes::LedgerStatus;
 use crate::controller::{Controller, Noise, Output, State};
@@ -26,6 +26,11 @@ pub struct Pilot {
     checked: Vec<(usize, usize, f64)>,
     /// The policy proposes states; a direct one gives actions only.
     proposes: bool,
+    /// A number for the limits of the joints: equal limits, equal numbers.
+    limits: f64,
+    /// Scratch, with room for what is shared.
+    memory: Vec<f64>,
+    memory_len: usize,
 }
 
 impl Pilot {
@@ -44,8 +49,21 @@ impl Pilot {
             observed: layout.entries().to_vec(),
             checked: checked(&controller),
             proposes: snapshot.manifest.policy != PolicyKind::Direct,
+            limits: number_of(controller.limits()),
+            memory_len: 1 + controller.memory().len(),
+            memory: controller.memory(),
             controller,
         })
+    }
+
+    /// Controller and brake have projectors of their own; what one verified, the other may count on.
+    fn share(&mut self, from_brake: bool) {
+        let Pilot { brake: Some(brake), controller, memory, .. } = self else { return };
+        let (brake, controller) = (brake.projector(), controller.projector());
+        let (from, to) = if from_brake { (brake, controller) } else { (controller, brake) };
+        memory.clear();
+        from.write_memory(memory);
+        to.set_memory(memory);
     }
 
     fn write(&self, step: &mut Step) {
@@ -88,6 +106,25 @@ fn checked(controller: &Controller) -> Vec<(usize, usize, f64)> {
         .collect()
 }
 
+/// The low half of a hash of the limits.
+fn number_of(limits: &LimitSet) -> f64 {
+    let mut hash = blake3::Hasher::new();
+    for values in [
+        &limits.q_lower,
+        &limits.q_upper,
+        &limits.velocity,
+        &limits.acceleration,
+        &limits.braking,
+        &limits.effort,
+    ] {
+        for value in values {
+            hash.update(&value.to_le_bytes());
+        }
+    }
+    let bytes = hash.finalize();
+    f64::from(u32::from_le_bytes([0, 1, 2, 3].map(|k| bytes.as_bytes()[k])))
+}
+
 fn write_rows(ledger: &Ledger, step: &mut Step) {
     for (row, active) in step.rows.iter_mut().zip(ledger.active.iter().take(MAX_ROWS)) {
         let side = u8::from(active.side == Side::Upper);
@@ -107,6 +144,7 @@ impl Tick for Pilot {
         self.state.obs.copy_from_slice(state.obs());
         let status = self.controller.update(&self.state, &self.noise, &mut self.output);
         self.write(step);
+        self.share(false);
         if self.proposes { outcome(status) } else { refused_or_acted(status) }
     }
 
@@ -125,11 +163,27 @@ impl Tick for Pilot {
         }
         step.ledger = numbers(&brake.target.ledger);
         write_rows(&brake.target.ledger, step);
+        self.share(true);
         outcome(status)
     }
 
     fn reset(&mut self) {
         self.controller.reset();
+        self.share(false);
+    }
+
+    fn save_memory(&self, memory: &mut Vec<f64>) {
+        memory.clear();
+        memory.push(self.limits);
+        self.controller.write_memory(memory);
+    }
+
+    fn load_memory(&mut self, memory: &[f64]) {
+        // A way to stop within other limits is none within these.
+        if memory.first() == Some(&self.limits) && memory.len() == self.memory_len {
+            self.controller.projector().set_memory(&memory[1..]);
+            self.share(false);
+        }
     }
 
     fn set_noise(&mut self, noise: f32) {
@@ -172,6 +226,7 @@ impl Tick for Pilot {
         let raw_violations = step.ledger.raw_violations;
         step.ledger = LedgerNumbers { raw_violations, ..numbers(&brake.target.ledger) };
         write_rows(&brake.target.ledger, step);
+        self.share(true);
     }
 }
 

@@ -17,6 +17,11 @@ pub trait Tick: Send + 'static {
     fn reset(&mut self);
     /// Sets every entry of the proposal's noise; 0 on a robot unless a rehearsed fault asks for another number.
     fn set_noise(&mut self, _noise: f32) {}
+    /// What the next tick depends on beside its state, in place of what is in `memory`; a way to stop that was verified, for one.
+    /// Allocates only where `memory` has no room.
+    fn save_memory(&self, _memory: &mut Vec<f64>) {}
+    /// Takes what another controller of the same robot saved in the tick before, if it fits.
+    fn load_memory(&mut self, _memory: &[f64]) {}
     /// Moves `state` on by one period, to where the action in `step` was to take it.
     fn predict(&self, _state: &mut StateMessage, _step: &Step) {}
     /// The first degree of freedom of `new` that cannot have come from `old` in `age` [s], allowing `jump` times its speed.

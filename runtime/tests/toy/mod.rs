@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::{JoinHandle, ThreadId};
+use std::time::Duration;
 
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
@@ -21,6 +22,8 @@ pub struct PointMass {
     pub applied: Vec<f64>,
     pub versions: Vec<u64>,
     pub braked: u64,
+    /// Sleeps so long in every tick: a loop in lockstep outruns its log otherwise.
+    pub pause: Duration,
     /// Ticks of an episode; 0 is one without end.
     pub episode_ticks: u64,
     /// Observes NaN from this tick on, for that many ticks.
@@ -56,6 +59,7 @@ impl Plant for PointMass {
     }
 
     fn apply(&mut self, action: &ActionMessage) {
+        std::thread::sleep(self.pause);
         self.applied.push(action.action()[0]);
         self.versions.push(action.policy_version);
         self.v += action.action()[0] * DT;

@@ -11,6 +11,16 @@
 use super::{ActiveSet, Constraint, EXACT, bound, dot};
 use crate::projector::coupled::Coupled;
 
+/// Constraints that contradict each other by more than this share are empty to every stage: far above the shares to which Clarabel's
+/// answers are taken.
+const CLEAR: f64 = 1e-8;
+
+/// Square of the share of its own size below which a direction's component is rounding.
+const NOISE: f64 = 1e-24;
+
+/// A constraint this near to depending on the held ones, as share of its own size, is looked at again with a new factor.
+const NEAR: f64 = 1e-6;
+
 /// What a step ends with.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Event {
@@ -58,16 +68,24 @@ impl ActiveSet {
         let mut own = 0.0; // multiplier of the violated constraint
         while self.iterations < most {
             self.iterations += 1;
-            let product = self.direction(p, violated);
             let (give, slack, bend) = own_softness(p, violated, own);
-            let slope = self.slope(violated) + give;
-            let (blocked, blocking) = self.first_event(p);
+            let mut product = self.direction(p, violated);
+            let mut slope = self.slope(violated) + give;
+            if slope < NEAR * size {
+                if !self.build_factor(p) {
+                    return false;
+                }
+                product = self.direction(p, violated);
+                slope = self.slope(violated) + give;
+            }
+            let (blocked, blocking) = self.first_event(p, NOISE * size);
             let full = match slope > 1e-13 * size {
                 true => (self.excess(p, violated) - slack) / slope,
                 false => f64::INFINITY,
             };
             let step = blocked.min(full).min(bend);
             if step.is_infinite() {
+                self.empty = self.is_empty(p, violated);
                 return false;
             }
             self.advance(step, full.is_finite());
@@ -83,6 +101,17 @@ impl ActiveSet {
             }
         }
         false
+    }
+
+    /// With the held constraints written `g_a'y <= h_a`, nothing lets go of them: `g = G_R' r + rest` with `r <= 0` and `rest` of
+    /// the held bounds' signs against them. So every y that exceeds no held one by more than some share exceeds `violated` by what `y` does,
+    /// less that share times the multipliers' sum.
+    fn is_empty(&self, p: &Coupled, violated: Constraint) -> bool {
+        let rows: f64 = self.held.iter().zip(&self.r).map(|(_, r)| r.abs()).sum();
+        let bounds: f64 = self.rest.iter().zip(&self.box_side).map(|(rest, side)| (rest * side).abs()).sum();
+        let free = (0..p.n).filter(|k| self.box_side[*k] == 0.0);
+        let left: f64 = free.map(|k| self.rest[k].abs() * (p.upper[k] - p.lower[k])).sum();
+        self.excess(p, violated) - left > CLEAR * (1.0 + rows + bounds)
     }
 
     /// `g'H^-1 g`.
@@ -139,32 +168,34 @@ impl ActiveSet {
         }
     }
 
-    /// The first multiplier to reach zero or its row's linear weight, and the step at which it does.
-    fn first_event(&self, p: &Coupled) -> (f64, Option<Event>) {
+    /// The first multiplier to reach zero or its row's linear weight, and the step at which it does. A rate whose square, times what
+    /// it counts for in S, is below `noise` is none.
+    fn first_event(&self, p: &Coupled, noise: f64) -> (f64, Option<Event>) {
         let (mut least, mut found) = (f64::INFINITY, None);
-        let mut see = |distance: f64, rate: f64, event: Event| {
-            if rate > 0.0 && distance < least * rate {
+        let mut see = |distance: f64, rate: f64, counts: f64, event: Event| {
+            if rate > 0.0 && distance < least * rate && rate * rate * counts > noise {
                 (least, found) = (distance.max(0.0) / rate, Some(event));
             }
         };
         for (a, (&row, r)) in self.held.iter().zip(&self.r).enumerate() {
-            let side = self.row_side[row];
+            let (side, counts) = (self.row_side[row], self.factor.diagonal(a));
             let (multiplier, rate) = (side * self.lambda[row], side * r);
             match p.soft[row] {
                 None if p.equality[row] => {}
-                None => see(multiplier, rate, Event::Release(a)),
+                None => see(multiplier, rate, counts, Event::Release(a)),
                 Some(soft) if self.elastic[row] && soft.linear > 0.0 => {
-                    see(multiplier - soft.linear, rate, Event::Bend(a));
+                    see(multiplier - soft.linear, rate, counts, Event::Bend(a));
                 }
-                Some(_) if self.elastic[row] => see(multiplier, rate, Event::Release(a)),
+                Some(_) if self.elastic[row] => see(multiplier, rate, counts, Event::Release(a)),
                 Some(soft) => {
-                    see(multiplier, rate, Event::Release(a));
-                    see(soft.linear - multiplier, -rate, Event::Bend(a));
+                    see(multiplier, rate, counts, Event::Release(a));
+                    see(soft.linear - multiplier, -rate, counts, Event::Bend(a));
                 }
             }
         }
-        for (k, ((side, mu), rest)) in self.box_side.iter().zip(&self.mu).zip(&self.rest).enumerate() {
-            see(side * mu, side * rest, Event::Free(k)); // at rate 0 if not held
+        let bounds = self.box_side.iter().zip(&self.mu).zip(&self.rest).zip(&self.inverse);
+        for (k, (((side, mu), rest), inverse)) in bounds.enumerate() {
+            see(side * mu, side * rest, *inverse, Event::Free(k)); // at rate 0 if not held
         }
         (least, found)
     }

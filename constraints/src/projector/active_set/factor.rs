@@ -129,7 +129,7 @@ impl Factor {
 }
 
 /// A downdate that leaves less than this share of a pivot has lost too many digits.
-const LOST: f64 = 1e-6;
+const LOST: f64 = 1e-4;
 
 #[cfg(test)]
 mod tests {

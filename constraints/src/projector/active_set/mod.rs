@@ -39,6 +39,8 @@ pub(crate) struct ActiveSet {
     pub(crate) lambda: Vec<f64>,
     /// Steps of the last call.
     pub(crate) iterations: u32,
+    /// The last call showed that nothing obeys all hard rows and the box, by a wide margin.
+    pub(crate) empty: bool,
     /// Held bound of each dof (n): 1 upper, -1 lower, 0 none.
     box_side: Vec<f64>,
     /// Held bound of each row (m): 1 upper, -1 lower, 0 none.
@@ -93,6 +95,7 @@ impl ActiveSet {
             mu: vec![0.0; n],
             lambda: vec![0.0; m],
             iterations: 0,
+            empty: false,
             box_side: vec![0.0; n],
             row_side: vec![0.0; m],
             elastic: vec![false; m],
@@ -114,7 +117,7 @@ impl ActiveSet {
 
     /// True when the optimum was found; then `y` and the multipliers hold it.
     pub(crate) fn solve(&mut self, p: &Coupled) -> bool {
-        self.iterations = 0;
+        (self.iterations, self.empty) = (0, false);
         for (inverse, h) in self.inverse.iter_mut().zip(&p.hessian) {
             *inverse = 1.0 / h;
         }
@@ -124,7 +127,8 @@ impl ActiveSet {
             && self.resume(p)
             && self.improve(p, most)
             && self.is_strict(p);
-        self.warm = warm || (self.start(p) && self.improve(p, self.iterations + 10 * most + 10));
+        self.warm =
+            warm || (!self.empty && self.start(p) && self.improve(p, self.iterations + 10 * most + 10));
         self.warm
     }
 

@@ -1,0 +1,134 @@
+//! Writes problems and our answers, for independent solvers to judge: `results/oracles/judge.py`.
+//!
+//! `cargo run --release -p nearl-constraints --example oracle_problems -- COUNT FILE`
+//!
+//! For each robot a closed loop with rows (torque limits, a soft, an equal and a hard row of the user's own) and one with cones
+//! (frame speed, kinetic energy, torque limits): states, proposals and targets of COUNT ticks in which a row or a cone held the
+//! target back. One JSON object a line; nothing of our matrices is written.
+
+use nearl_constraints::*;
+use serde_json::json;
+use std::error::Error;
+use std::io::Write;
+use std::path::Path;
+
+const DT: f64 = 1e-3;
+
+/// Robot, share or value of the speed limit, acceleration limit [rad/s²], share of the motor forces, frame, its speed [m/s],
+/// kinetic energy [J].
+struct Case(&'static str, &'static str, f64, f64, &'static str, f64, f64);
+
+const CASES: [Case; 7] = [
+    Case("panda", "scale = 0.6", 40.0, 0.9, "panda_link7", 0.6, 1.5),
+    Case("ur5", "scale = 0.6", 60.0, 0.9, "tool0", 0.8, 1.5),
+    Case("xarm7", "scale = 0.6", 30.0, 1.0, "link7", 0.6, 1.5),
+    Case("solo12", "limit = 15.0", 400.0, 0.002, "FL_FOOT", 1.5, 0.1),
+    Case("anymal", "scale = 0.8", 300.0, 0.8, "LF_FOOT", 1.5, 2.0),
+    Case("g1", "scale = 0.1", 200.0, 0.9, "left_wrist_yaw_link", 0.8, 1.0),
+    Case("simple_humanoid", "scale = 0.5", 100.0, 0.9, "l_wrist", 0.5, 1.0),
+];
+
+/// Seeded uniform numbers (splitmix64).
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    fn between(&mut self, low: f64, high: f64) -> f64 {
+        low + (high - low) * self.next()
+    }
+}
+
+/// The `[constraints]` section of a case.
+fn constraints(case: &Case, model: &Model, cones: bool) -> String {
+    let Case(_, speed, acceleration, torque, frame, frame_speed, energy) = case;
+    let braking = 0.2 * acceleration;
+    let mut text = format!(
+        "position = {{}}\nvelocity = {{ {speed} }}\nacceleration = {{ limit = {acceleration:?}, braking = {braking:?} }}\ntorque = {{ scale = {torque:?} }}\n"
+    );
+    if cones {
+        text += &format!("frame_speed = [{{ frame = \"{frame}\", limit = {frame_speed:?} }}]\n");
+        return text + &format!("energy = {{ limit = {energy:?} }}\n");
+    }
+    let j = |k: usize| &model.joints()[k].name;
+    text + &format!(
+        "rows = [{{ name = \"soft\", terms = {{ \"v.{}\" = 1.0, \"v.{}\" = -0.5 }}, lower = -0.1, upper = 0.1, soft = {{ linear = 0.3, quadratic = 20.0 }} }},\n\
+         {{ name = \"equal\", terms = {{ \"v.{}\" = 1.0, \"v.{}\" = -0.5 }}, equals = 0.0 }},\n\
+         {{ name = \"hard\", terms = {{ \"v.{}\" = 1.0, \"v.{}\" = 1.0 }}, upper = 0.25 }}]\n",
+        j(0),
+        j(1),
+        j(2),
+        j(3),
+        j(4),
+        j(5)
+    )
+}
+
+/// Closed loop: the robot is where the target said.
+fn run(case: &Case, cones: bool, count: usize, out: &mut impl Write) -> Result<String, Box<dyn Error>> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("../examples/robots/{0}/{0}.urdf", case.0));
+    let model = Model::from_urdf(&path)?;
+    let text = constraints(case, &model, cones);
+    let settings: ConstraintSettings = toml::from_str(&text)?;
+    let all: Vec<usize> = (0..model.nv()).collect();
+    let mut projector =
+        Projector::new(&model, &build_limits(&settings, &model)?, &all, Settings::new(DT, 1))?;
+    let set = projector.limits().clone();
+    let kind = if cones { "cones" } else { "rows" };
+    let head = json!({ "robot": case.0, "kind": kind, "dt": DT, "joints": model.joints().iter().map(|j| &j.name).collect::<Vec<_>>(),
+        "constraints": settings });
+    writeln!(out, "{head}")?;
+    let (mut random, mut target, mut raw) = (Random(7), Target::new(&model), Proposal::new(&model));
+    let (mut q, mut v) = (vec![], vec![]);
+    let (mut ticks, mut written, mut solved, mut braked, mut wish) = (0, 0, 0, 0, vec![0.0; model.nv()]);
+    while written < count && ticks < 400 * count {
+        if ticks % 1000 == 0 {
+            let place = |i: usize, r: &mut Random| {
+                set.q_lower[i] + (set.q_upper[i] - set.q_lower[i]) * r.between(0.3, 0.7)
+            };
+            q = all.iter().map(|i| place(*i, &mut random)).collect();
+            v = vec![0.0; model.nv()];
+        }
+        if ticks % 60 == 0 {
+            wish.iter_mut().for_each(|w| *w = random.between(-1.5, 1.5));
+        }
+        for i in 0..model.nv() {
+            let reach = set.acceleration[i] * DT;
+            let step = (wish[i] * set.velocity[i] - v[i]).clamp(-3.0 * reach, 3.0 * reach);
+            raw.v[i] = v[i] + step + reach * random.between(-1.0, 1.0);
+            raw.q[i] = q[i] + DT * (raw.v[i] + reach * random.between(-1.0, 1.0));
+        }
+        let status = projector.project(&q, &v, &raw, &mut target);
+        solved += usize::from(status == Status::Solved);
+        braked += usize::from(!status.is_ok());
+        if status == Status::Solved && random.next() < 0.2 {
+            let kinds: Vec<&str> = target.ledger.active.iter().map(|r| r.kind.name()).collect();
+            let rung = format!("{:?}", target.ledger.rung);
+            let line = json!({ "q": q, "v": v, "q_hat": raw.q, "v_hat": raw.v, "answer": target.v, "active": kinds, "rung": rung });
+            writeln!(out, "{line}")?;
+            written += 1;
+        }
+        (q, v) = (target.q.clone(), target.v.clone());
+        ticks += 1;
+    }
+    Ok(format!("{:16} {kind:5} {ticks} ticks, {solved} solved, {braked} braked, {written} written", case.0))
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let mut words = std::env::args().skip(1);
+    let usage = "usage: oracle_problems COUNT FILE";
+    let (count, file) = (words.next().ok_or(usage)?.parse()?, words.next().ok_or(usage)?);
+    let mut out = std::io::BufWriter::new(std::fs::File::create(file)?);
+    for case in &CASES {
+        for cones in [false, true] {
+            println!("{}", run(case, cones, count, &mut out)?);
+        }
+    }
+    Ok(())
+}
