@@ -299,7 +299,7 @@ fn malformed_requests_are_answered_and_counted_while_others_go_on() {
 }
 
 #[test]
-fn the_place_of_a_killed_client_is_free_within_a_second() {
+fn the_place_of_a_killed_client_becomes_free() {
     let name = Name::new("killed");
     let server = Serving::start(&name, 1, 1);
     let mut command = std::process::Command::new(std::env::current_exe().expect("path of the test program"));
