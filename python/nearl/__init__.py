@@ -36,6 +36,7 @@ from nearl._core import (
     __version__,
     tasks,
 )
+from nearl.link import Link
 from nearl.pid2 import PID2
 
 __all__ = [
@@ -48,6 +49,7 @@ __all__ = [
     "JerkLimit",
     "Ledger",
     "Limit",
+    "Link",
     "LockedJoints",
     "Model",
     "PID2",

@@ -9,6 +9,7 @@ mod env;
 mod errors;
 mod lane;
 mod limits;
+mod link;
 mod model;
 mod pool;
 mod projector;
@@ -30,6 +31,8 @@ mod _core {
         LockedJoints, PositionLimit, RowLimit, TorqueLimit, TorqueRateLimit, TorqueSpeedLimit, VelocityLimit,
         VelocityProfileLimit,
     };
+    #[pymodule_export]
+    use super::link::{RolloutClient, Rollouts, rollout_ledger};
     #[pymodule_export]
     use super::model::Model;
     #[pymodule_export]

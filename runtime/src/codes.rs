@@ -60,7 +60,7 @@ use crate::rt::{Mode, Reason};
 pub struct Explanation {
     /// Stable name.
     pub code: &'static str,
-    /// Where it appears: `mode`, `reason`, `status`, `verdict`, `snapshot`, `link` or `doctor`.
+    /// Where it appears: `mode`, `reason`, `status`, `verdict`, `snapshot`, `link`, `doctor` or `rollout`.
     pub group: &'static str,
     /// What happened.
     pub meaning: &'static str,
@@ -78,6 +78,7 @@ pub fn all() -> Vec<Explanation> {
         SnapshotCode::explanations(),
         LinkCode::explanations(),
         CheckCode::explanations(),
+        crate::rollout_protocol::Answer::explanations(),
     ]
     .concat()
 }

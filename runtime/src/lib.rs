@@ -11,6 +11,7 @@ pub mod link;
 pub mod log;
 pub mod net;
 pub mod normaliser;
+pub mod rollout_protocol;
 pub mod rt;
 pub mod snapshot;
 pub mod task;

@@ -5,6 +5,7 @@ mod demo;
 mod eval;
 mod plant;
 mod project;
+mod serve;
 mod sweep;
 mod tasks;
 mod train;
@@ -40,6 +41,8 @@ enum Command {
     Plant(plant::PlantCommand),
     /// Run a snapshot on a plant in real time.
     Run(nearl_runtime::cli::RunCommand),
+    /// Constrained rollouts for other processes, over shared memory.
+    Serve(serve::Serve),
     /// Compute every tick of a flight log again and compare it bit for bit.
     Replay(nearl_runtime::cli::ReplayCommand),
     /// Say what a code in a report, a log or a refusal means, and what to do.
@@ -65,6 +68,7 @@ impl Cli {
             Command::Bench(c) => c.run(),
             Command::Plant(c) => c.run(),
             Command::Run(c) => c.run(),
+            Command::Serve(c) => c.run(),
             Command::Replay(c) => c.run(),
             Command::Explain(c) => c.run(),
             Command::Doctor(c) => c.run(),

@@ -12,6 +12,7 @@ pub mod mj;
 pub mod plant;
 pub mod rollout;
 pub mod run_folder;
+pub mod serve;
 pub mod settings;
 pub mod stats;
 pub mod sweep;

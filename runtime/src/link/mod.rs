@@ -19,7 +19,7 @@ mod remains;
 mod runner;
 mod runtime;
 pub(crate) mod schema;
-mod service;
+pub(crate) mod service;
 mod trainer;
 
 pub use access::Verdict;

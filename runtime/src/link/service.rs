@@ -56,6 +56,10 @@ impl Bus {
         Ok(Bus { node, name: name.clone(), epoch })
     }
 
+    pub(crate) fn node(&self) -> &Node<Ipc> {
+        &self.node
+    }
+
     pub(crate) fn name(&self) -> &RobotName {
         &self.name
     }
@@ -136,7 +140,7 @@ impl Bus {
         Ok(BytesInbox::new(port))
     }
 
-    fn topic(&self, topic: &str) -> Result<ServiceName, LinkError> {
+    pub(crate) fn topic(&self, topic: &str) -> Result<ServiceName, LinkError> {
         let name = format!("nearl/{}/{topic}", self.name);
         ServiceName::new(&name).map_err(|e| self.name.transport(format!("name `{topic}`"), format!("{e:?}")))
     }
@@ -196,7 +200,10 @@ fn is_passing(error: &Failure) -> bool {
     )
 }
 
-fn retry<T, E>(mut attempt: impl FnMut() -> Result<T, E>, is_passing: impl Fn(&E) -> bool) -> Result<T, E> {
+pub(crate) fn retry<T, E>(
+    mut attempt: impl FnMut() -> Result<T, E>,
+    is_passing: impl Fn(&E) -> bool,
+) -> Result<T, E> {
     for wait in BACK_OFF {
         match attempt() {
             Err(error) if is_passing(&error) => std::thread::sleep(Duration::from_millis(wait)),

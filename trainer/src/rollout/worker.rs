@@ -1,5 +1,7 @@
 //! One environment behind its own controller.
 
+mod stream;
+
 use super::resume::Episode;
 use super::{RolloutError, Segment, Tally};
 use crate::env::{Env, EnvError, Fault};

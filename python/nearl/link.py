@@ -1,0 +1,179 @@
+"""Constrained rollouts from a server on this machine, over shared memory.
+
+    # Terminal 1
+    nearl serve panda.safetensors --name panda
+    # Terminal 2
+    with nearl.Link("panda") as link:
+        for chunk in link.rollout(seed=0, n_steps=10_000):
+            learn(chunk.obs, chunk.action, chunk.reward, chunk.terminated)
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nearl import _core
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+class RolloutRefused(RuntimeError):
+    """The server's refusal, or its end of a rollout; ``answer`` is the code that ``nearl explain`` knows."""
+
+    def __init__(self, answer: str, text: str) -> None:
+        super().__init__(f"{answer}: {text}")
+        self.answer = answer
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Some transitions in a row; n is their number.
+
+    Attributes:
+        sequence: Number of the chunk, from 0.
+        first_step: Policy step of the first row.
+        version: Version of the policy.
+        constraints: Id of the server's constraint set, as ``rollout(constraints=...)`` takes it.
+        obs: Observation the policy saw (n x n_obs).
+        next_obs: Observation its step led to; before the reset where an episode ended (n x n_obs).
+        proposal: Raw proposed state (n x n_state) [rad, rad/s].
+        target: Projected state of the step's last control tick (n x n_state) [rad, rad/s].
+        action: What the actuators were given in the last control tick (n x n_act).
+        log_prob_proposal: log pi(proposal | obs) (n).
+        log_prob_action: log I(action | obs, target) of the last control tick (n).
+        reward: The task's own (n).
+        cost: The task's own (n).
+        terminated: The episode ended in a terminal state (n).
+        truncated: The episode was cut by the time limit (n).
+        ledger: Sums over the control ticks of each step by name (n each).
+    """
+
+    sequence: int
+    first_step: int
+    version: int
+    constraints: int
+    obs: Floats
+    next_obs: Floats
+    proposal: Floats
+    target: Floats
+    action: Floats
+    log_prob_proposal: Floats
+    log_prob_action: Floats
+    reward: Floats
+    cost: Floats
+    terminated: Bools
+    truncated: Bools
+    ledger: dict[str, Floats]
+
+    def __len__(self) -> int:
+        return len(self.reward)
+
+
+def _chunk(sequence: int, first_step: int, version: int, constraints: int, rows: Floats, columns: list[tuple[str, int]]) -> Chunk:
+    parts, at = {}, 0
+    for name, width in columns:
+        parts[name] = rows[:, at : at + width]
+        at += width
+    ended, ledger = parts.pop("ended") != 0, parts.pop("ledger")
+    for name in ("log_prob_proposal", "log_prob_action", "reward", "cost"):
+        parts[name] = parts[name][:, 0]
+    names = _core.rollout_ledger()
+    return Chunk(
+        sequence,
+        first_step,
+        version,
+        constraints,
+        **parts,
+        terminated=ended[:, 0],
+        truncated=ended[:, 1],
+        ledger={name: ledger[:, i] for i, name in enumerate(names)},
+    )
+
+
+class Rollout(Iterator[Chunk]):
+    """Chunks of one request, in order. Leaving the loop early: ``cancel`` and read on to the end, or ``close``."""
+
+    def __init__(self, rollouts: _core.Rollouts, patience: float) -> None:
+        self._rollouts = rollouts
+        self._patience = patience
+
+    def __next__(self) -> Chunk:
+        """The next chunk.
+
+        Raises:
+            RolloutRefused: the server refuses or ends the request.
+            TimeoutError: nothing came in time; asking again goes on.
+            ConnectionError: the server is gone.
+        """
+        given = self._rollouts.next(self._patience)
+        if given is None:
+            raise StopIteration
+        return _chunk(*given)
+
+    def cancel(self) -> None:
+        """Asks the server to stop; chunks under way still come, then the iteration ends."""
+        self._rollouts.cancel()
+
+    def close(self) -> None:
+        """Leaves at once; the server's place is free again."""
+        self._rollouts.close()
+
+
+class Link:
+    """Connection to the servers of one name on this machine.
+
+    Args:
+        name: As in ``nearl serve SNAPSHOT --name NAME``.
+        patience: Longest wait for the server, and for each chunk [s].
+    """
+
+    def __init__(self, name: str, patience: float = 10.0) -> None:
+        self.name = name
+        self._patience = patience
+        self._client: _core.RolloutClient | None = None
+
+    def rollout(
+        self, seed: int, n_steps: int, noise: bool = True, version: int | None = None, constraints: bool | int = True
+    ) -> Rollout:
+        """Policy steps on the server's task. The same arguments give the same bits, whoever else asks.
+
+        Args:
+            seed: Of initial states and noise, from 0.
+            n_steps: Policy steps, over as many episodes as it takes.
+            noise: Sample as the policy does; without, its mean.
+            version: Of the policy; refused if the server has another. None takes the server's.
+            constraints: True projects onto the server's, False onto none; a number is refused by a server with others.
+
+        Raises:
+            ValueError: a number is out of range.
+            ConnectionError: there is no server.
+            RuntimeError: two rollouts of this link are under way already.
+        """
+        for what, value, least in (("seed", seed, 0), ("n_steps", n_steps, 1), ("version", version, 0)):
+            if value is not None and not least <= value < 2**64:
+                raise ValueError(f"{what} is {value}; give a number from {least} to 2**64 - 1")
+        if isinstance(constraints, bool):
+            wanted = None if constraints else 0
+        elif 0 < constraints < 2**64:
+            wanted = constraints
+        else:
+            raise ValueError(f"constraints is {constraints}; give True, False or the number of a chunk's constraints")
+        if self._client is None:
+            self._client = _core.RolloutClient(self.name, self._patience)
+        return Rollout(self._client.request(seed, n_steps, noise, version, wanted), self._patience)
+
+    def close(self) -> None:
+        """Leaves; rollouts under way can still be read."""
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+    def __enter__(self) -> "Link":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

@@ -1,0 +1,264 @@
+//! The client's end: a request out, transitions in.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use iceoryx2::pending_response::PendingResponse;
+use iceoryx2::port::client::{Client, RequestSendError};
+use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy};
+use iceoryx2::service::port_factory::client::ClientCreateError;
+
+use super::messages::{Answer, MAX_REQUEST, ReplyMessage, RequestMessage};
+use super::service;
+use super::{Layout, Request, RequestError};
+use crate::link::service::{Bus, Ipc};
+use crate::link::{Header, LinkError, Message, RobotName};
+use crate::rt::clock;
+
+/// Waits between two looks at an empty buffer: they double from the first to the longest, far below the time the server needs
+/// to fill a buffer.
+const NAP: (Duration, Duration) = (Duration::from_micros(50), Duration::from_millis(1));
+/// Silence after which the client looks whether the server still lives.
+const SUSPICION: Duration = Duration::from_millis(250);
+
+/// Asks a rollout server of this machine. Requests may overlap, two at a time.
+pub struct RolloutClient {
+    port: Client<Ipc, [u8], (), [f64], ReplyMessage>,
+    bus: Arc<Bus>,
+    requests: u64,
+}
+
+/// One chunk of transitions.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Chunk {
+    /// Sizes of a row.
+    pub layout: Layout,
+    /// Number of the chunk, from 0.
+    pub sequence: u64,
+    /// Policy step of the first row.
+    pub first_step: u64,
+    /// Version of the policy.
+    pub version: u64,
+    /// Id of the server's constraint set.
+    pub constraints: u64,
+    /// Transitions in the chunk.
+    pub rows: usize,
+    /// The rows one after the other (rows x [`Layout::width`]).
+    pub numbers: Vec<f64>,
+}
+
+impl Chunk {
+    /// The entries of a column, row by row; empty for a name that does not exist.
+    pub fn column<'a>(&'a self, name: &str) -> impl Iterator<Item = &'a [f64]> + use<'a> {
+        let place = self.layout.find(name);
+        let rows = self.numbers.chunks_exact(self.layout.width().max(1));
+        place.into_iter().flat_map(move |p| rows.clone().map(move |row| &row[p.clone()]))
+    }
+}
+
+impl RolloutClient {
+    /// Opens the service of `name` and waits up to `patience` for its server.
+    ///
+    /// # Errors
+    /// [`RequestError::NoServer`], or [`RequestError::Link`].
+    pub fn open(name: &RobotName, patience: Duration) -> Result<RolloutClient, RequestError> {
+        let bus = Bus::join(name)?;
+        let factory = service::open(&bus)?;
+        let port = factory
+            .client_builder()
+            .initial_max_slice_len(MAX_REQUEST)
+            .allocation_strategy(AllocationStrategy::Static)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .create()
+            .map_err(|e| match e {
+                ClientCreateError::ExceedsMaxSupportedClients => service::full(&bus),
+                other => name.transport("ask for rollouts", format!("{other:?}")),
+            })?;
+        let end = Instant::now() + patience;
+        let config = || iceoryx2::service::port_factory::PortFactory::dynamic_config(&factory);
+        while config().number_of_servers() == 0 {
+            if Instant::now() >= end {
+                return Err(RequestError::NoServer(name.clone()));
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        Ok(RolloutClient { port, bus: Arc::new(bus), requests: 0 })
+    }
+
+    /// Sends a request; its transitions come from what is returned.
+    ///
+    /// # Errors
+    /// [`RequestError`]. The server's own refusals come with the first [`Rollouts::next`].
+    pub fn request(&mut self, request: &Request) -> Result<Rollouts, RequestError> {
+        self.requests += 1;
+        let mut message = request.message(self.requests);
+        message.header = Header {
+            schema: RequestMessage::SCHEMA,
+            epoch: self.bus.epoch(),
+            seq: self.requests,
+            stamp: clock::now(),
+        };
+        self.send(bytes_of(&message), self.requests)
+    }
+
+    /// Sends any bytes as a request, as a broken client would. An answer to bytes the server cannot read has number 0.
+    ///
+    /// # Errors
+    /// [`RequestError`].
+    pub fn request_bytes(&mut self, bytes: &[u8]) -> Result<Rollouts, RequestError> {
+        self.send(bytes, 0)
+    }
+
+    fn send(&self, bytes: &[u8], request: u64) -> Result<Rollouts, RequestError> {
+        if bytes.len() > MAX_REQUEST {
+            return Err(RequestError::TooLong { bytes: bytes.len(), limit: MAX_REQUEST });
+        }
+        let name = self.bus.name();
+        let failed = |e: String| RequestError::from(name.transport("send a request", e));
+        let sample = self.port.loan_slice_uninit(bytes.len()).map_err(|e| failed(format!("{e:?}")))?;
+        let pending = sample.write_from_slice(bytes).send().map_err(|e| match e {
+            RequestSendError::ExceedsMaxActiveRequests => RequestError::TooMany(name.clone()),
+            other => failed(format!("{other:?}")),
+        })?;
+        if pending.number_of_server_connections() == 0 {
+            return Err(RequestError::NoServer(name.clone()));
+        }
+        let ids = (request, self.bus.epoch());
+        Ok(Rollouts {
+            pending: Some(pending),
+            bus: Arc::clone(&self.bus),
+            ids,
+            chunks: 0,
+            steps: 0,
+            cancelled: false,
+        })
+    }
+}
+
+/// The bytes of a message.
+pub(super) fn bytes_of(message: &RequestMessage) -> &[u8] {
+    // SAFETY: `repr(C)` numbers without padding between them; only read while `message` is borrowed.
+    unsafe { std::slice::from_raw_parts(std::ptr::from_ref(message).cast(), size_of::<RequestMessage>()) }
+}
+
+type Pending = PendingResponse<Ipc, [u8], (), [f64], ReplyMessage>;
+
+/// The answers to one request. Dropping it frees the server's place.
+pub struct Rollouts {
+    /// `None` once the stream is over: the client may then ask for another.
+    pending: Option<Pending>,
+    bus: Arc<Bus>,
+    ids: (u64, u64),
+    chunks: u64,
+    steps: u64,
+    cancelled: bool,
+}
+
+impl Rollouts {
+    /// The next chunk; `None` after the last one, or after [`Rollouts::cancel`] once the server agreed.
+    ///
+    /// # Errors
+    /// [`RequestError::Refused`] with the server's answer, [`RequestError::ServerGone`], or [`RequestError::Silent`]
+    /// after `patience` without a reply. Every error but the last ends the stream.
+    pub fn next(&mut self, patience: Duration) -> Result<Option<Chunk>, RequestError> {
+        let Some(pending) = self.pending.take() else { return Ok(None) };
+        let result = self.wait(&pending, patience);
+        if matches!(result, Ok(Some(_)) | Err(RequestError::Silent { .. })) {
+            self.pending = Some(pending);
+        }
+        result
+    }
+
+    /// Asks the server to stop. Chunks under way still come; then [`Rollouts::next`] gives `None`.
+    pub fn cancel(&mut self) {
+        self.cancelled = true;
+        self.pending.iter().for_each(PendingResponse::set_disconnect_hint);
+    }
+
+    /// Transitions received so far.
+    pub fn steps(&self) -> u64 {
+        self.steps
+    }
+
+    fn wait(&mut self, pending: &Pending, patience: Duration) -> Result<Option<Chunk>, RequestError> {
+        let start = Instant::now();
+        let (mut suspicion, mut nap) = (SUSPICION, NAP.0);
+        loop {
+            if let Some((reply, numbers)) = self.receive(pending)? {
+                match self.read(&reply, numbers)? {
+                    Some(end) => return Ok(end),
+                    None => continue,
+                }
+            }
+            let silent = start.elapsed();
+            if silent >= patience {
+                let name = self.bus.name().clone();
+                return Err(RequestError::Silent { name, seconds: patience.as_secs_f64() });
+            }
+            if silent >= suspicion {
+                suspicion += SUSPICION;
+                self.bus.node().try_cleanup_dead_nodes();
+                // Its last reply may have come between the look into the buffer and here.
+                if !pending.is_connected() && !pending.has_response() {
+                    return Err(RequestError::ServerGone(self.bus.name().clone()));
+                }
+            }
+            std::thread::sleep(nap);
+            nap = NAP.1.min(2 * nap);
+        }
+    }
+
+    /// The next reply to this request; those to a request of a client that had this place before are left out.
+    fn receive(&self, pending: &Pending) -> Result<Option<(ReplyMessage, Vec<f64>)>, LinkError> {
+        loop {
+            let failed = |e| self.bus.name().transport("receive a reply", format!("{e:?}"));
+            let Some(sample) = pending.receive().map_err(failed)? else { return Ok(None) };
+            let reply = *sample.user_header();
+            let unreadable = (reply.request, reply.client) == (0, 0);
+            if reply.header.schema == ReplyMessage::SCHEMA && (unreadable || self.is_ours(&reply)) {
+                return Ok(Some((reply, sample.payload().to_vec())));
+            }
+        }
+    }
+
+    fn is_ours(&self, reply: &ReplyMessage) -> bool {
+        (self.ids.0 == 0 || reply.request == self.ids.0) && reply.client == self.ids.1
+    }
+
+    /// `None` to go on waiting, else what [`Rollouts::next`] returns.
+    fn read(
+        &mut self,
+        reply: &ReplyMessage,
+        numbers: Vec<f64>,
+    ) -> Result<Option<Option<Chunk>>, RequestError> {
+        let broken = |what: String| RequestError::Broken { name: self.bus.name().clone(), what };
+        match reply.answer() {
+            Some(Answer::Accepted) => Ok(None),
+            Some(Answer::Chunk) => {
+                let (layout, rows) = (Layout::of(reply), reply.rows as usize);
+                if (reply.chunk, reply.first_step) != (self.chunks, self.steps) {
+                    let (got, wanted) = (reply.chunk, self.chunks);
+                    return Err(broken(format!("chunk {got} instead of {wanted}")));
+                }
+                if layout.width().checked_mul(rows) != Some(numbers.len()) {
+                    return Err(broken(format!("{} numbers for {rows} rows", numbers.len())));
+                }
+                self.chunks += 1;
+                self.steps += u64::from(reply.rows);
+                Ok(Some(Some(Chunk {
+                    layout,
+                    sequence: reply.chunk,
+                    first_step: reply.first_step,
+                    version: reply.version,
+                    constraints: reply.constraints,
+                    rows,
+                    numbers,
+                })))
+            }
+            Some(Answer::Done) => Ok(Some(None)),
+            Some(Answer::Cancelled) if self.cancelled => Ok(Some(None)),
+            Some(answer) => Err(RequestError::Refused { answer, text: reply.text() }),
+            None => Err(broken(format!("the unknown answer {}", reply.answer))),
+        }
+    }
+}

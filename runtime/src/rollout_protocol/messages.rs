@@ -1,0 +1,118 @@
+//! Request, reply and what a reply can say.
+
+use crate::codes::codes;
+use crate::link::schema::message;
+
+/// Numbers in one chunk at most.
+pub const MAX_CHUNK: usize = 4096;
+/// Bytes in one request at most; a well-formed one has the size of [`RequestMessage`].
+pub const MAX_REQUEST: usize = 1024;
+/// Capacity of the sentence in a [`ReplyMessage`] [bytes].
+pub const MAX_REPLY_TEXT: usize = 256;
+
+/// In `version` and `constraints`: what the server has.
+pub(super) const OWN: u64 = u64::MAX;
+
+message! {
+    /// What a client asks for.
+    RequestMessage, "rollout-request", version 1, buffer 4, history 0, subscribers 1 {
+        /// Number of the request, chosen by the client.
+        request: u64,
+        /// Seed of the initial states and of the noise.
+        seed: u64,
+        /// Policy steps.
+        n_steps: u64,
+        /// Version of the policy; all ones for the server's.
+        version: u64,
+        /// Id of the constraint set; 0 for none, all ones for the server's.
+        constraints: u64,
+        /// 1 with the policy's noise, 0 without.
+        noise: u32,
+        /// Zero.
+        reserved: u32,
+    }
+}
+
+message! {
+    /// Header of every answer; the numbers of a chunk follow it.
+    ReplyMessage, "rollout-reply", version 1, buffer 4, history 0, subscribers 1 {
+        /// Number of the request.
+        request: u64,
+        /// Epoch of the client that asked.
+        client: u64,
+        /// Version of the policy.
+        version: u64,
+        /// Id of the server's constraint set.
+        constraints: u64,
+        /// Number of the chunk, from 0.
+        chunk: u64,
+        /// Policy step of the first row.
+        first_step: u64,
+        /// Policy steps asked for.
+        n_steps: u64,
+        /// [`Answer`] by its number.
+        answer: u32,
+        /// Rows in this chunk.
+        rows: u32,
+        /// Entries of an observation.
+        n_obs: u32,
+        /// Entries of a proposed state.
+        n_state: u32,
+        /// Entries of an action.
+        n_act: u32,
+        /// Bytes used in `text`.
+        length: u32,
+        /// One sentence for whoever asked.
+        text: [u8; MAX_REPLY_TEXT],
+    }
+}
+
+codes! {
+    /// What a reply of the rollout server says.
+    Answer, "rollout" {
+        Accepted = "rollout-accepted", "The rollout server took the request; chunks follow.", "Nothing to do.";
+        Chunk = "rollout-chunk", "A chunk of transitions.", "Nothing to do.";
+        Done = "rollout-done", "All steps asked for were sent.", "Nothing to do.";
+        Cancelled = "rollout-cancelled", "The client cancelled the request.", "Nothing to do.";
+        Busy = "rollout-busy", "The rollout server has as many requests as it takes.",
+            "Ask again later, or start the server with a higher --requests.";
+        LimitExceeded = "limit-exceeded", "The request asks for more steps than the rollout server gives at once.",
+            "Ask for fewer steps, or start the server with a higher --max-steps.";
+        BadRequest = "bad-request", "The request has a wrong length, schema or value.",
+            "Read the text of the reply; use the client of the same nearl build.";
+        Failed = "rollout-failed", "The simulator failed in the middle of the rollout.",
+            "Read the server's error output; ask with another seed.";
+        Closing = "rollout-closing", "The rollout server was asked to end.", "Start it again and repeat the request.";
+    }
+}
+
+impl ReplyMessage {
+    /// The answer; `None` for a number this build does not know.
+    pub fn answer(&self) -> Option<Answer> {
+        Answer::ALL.get(self.answer as usize).copied()
+    }
+
+    /// The sentence.
+    pub fn text(&self) -> String {
+        let length = (self.length as usize).min(MAX_REPLY_TEXT);
+        String::from_utf8_lossy(&self.text[..length]).into_owned()
+    }
+
+    /// Writes answer and sentence; a sentence beyond the capacity is cut at a character.
+    pub fn set(&mut self, answer: Answer, text: &str) {
+        let mut length = text.len().min(MAX_REPLY_TEXT);
+        while !text.is_char_boundary(length) {
+            length -= 1;
+        }
+        self.answer = answer.code();
+        self.length = length as u32;
+        self.text = [0; MAX_REPLY_TEXT];
+        self.text[..length].copy_from_slice(&text.as_bytes()[..length]);
+    }
+}
+
+impl Default for ReplyMessage {
+    fn default() -> ReplyMessage {
+        <ReplyMessage as crate::link::Message>::zeroed()
+    }
+}

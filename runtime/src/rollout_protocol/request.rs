@@ -1,0 +1,162 @@
+//! A request as a client means it, and as it arrives.
+
+use super::messages::{OWN, RequestMessage};
+use crate::Manifest;
+use crate::link::{Header, Message, hash_names};
+
+/// Which constraints a rollout is projected onto.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Constraints {
+    /// The server's.
+    #[default]
+    Own,
+    /// None: the raw proposal is the target.
+    Off,
+    /// Those with this id ([`constraint_set`]); refused by a server with others.
+    Id(u64),
+}
+
+/// What a client asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Request {
+    /// Seed of the initial states and of the noise; the same seed gives the same bits.
+    pub seed: u64,
+    /// Policy steps.
+    pub n_steps: u64,
+    /// Version of the policy; the server's if `None`.
+    pub version: Option<u64>,
+    /// Sample as the policy does; without, its mean.
+    pub noise: bool,
+    /// What the proposals are projected onto.
+    pub constraints: Constraints,
+}
+
+impl Request {
+    /// `n_steps` policy steps from `seed`, with noise, by the server's policy and constraints.
+    pub fn new(seed: u64, n_steps: u64) -> Request {
+        Request { seed, n_steps, version: None, noise: true, constraints: Constraints::Own }
+    }
+
+    /// The message number `request`; the sender fills the header.
+    pub fn message(&self, request: u64) -> RequestMessage {
+        RequestMessage {
+            request,
+            seed: self.seed,
+            n_steps: self.n_steps,
+            version: self.version.unwrap_or(OWN),
+            constraints: match self.constraints {
+                Constraints::Own => OWN,
+                Constraints::Off => 0,
+                Constraints::Id(id) => id,
+            },
+            noise: u32::from(self.noise),
+            ..RequestMessage::zeroed()
+        }
+    }
+}
+
+/// Why bytes are no request: one sentence, and the request's number and client as far as they can be believed.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{reason}")]
+pub struct Malformed {
+    /// Number of the request; 0 if the bytes do not hold one.
+    pub request: u64,
+    /// Epoch of the client; 0 if the bytes do not hold one.
+    pub client: u64,
+    /// One sentence.
+    pub reason: String,
+}
+
+/// Reads a request; returns its number, the client's epoch and what is asked for.
+///
+/// # Errors
+/// [`Malformed`] for a wrong length, schema or value. Any bytes are allowed.
+pub fn decode(bytes: &[u8]) -> Result<(u64, u64, Request), Malformed> {
+    let size = size_of::<RequestMessage>();
+    if bytes.len() != size {
+        let reason =
+            format!("a request has {size} bytes, this one {}: use the client of this build", bytes.len());
+        return Err(Malformed { request: 0, client: 0, reason });
+    }
+    // SAFETY: the length is the struct's, every bit pattern is a value, and the read does not need alignment.
+    let m = unsafe { bytes.as_ptr().cast::<RequestMessage>().read_unaligned() };
+    let Header { schema, epoch, .. } = m.header;
+    let refuse = |request, client, reason| Err(Malformed { request, client, reason });
+    if schema != RequestMessage::SCHEMA {
+        let ours = RequestMessage::SCHEMA;
+        return refuse(
+            0,
+            0,
+            format!(
+                "the request's schema is {schema:016x}, the server's {ours:016x}: run both from the same nearl build"
+            ),
+        );
+    }
+    if m.n_steps == 0 {
+        return refuse(m.request, epoch, "n_steps is 0: ask for at least 1 step".into());
+    }
+    if m.noise > 1 || m.reserved != 0 {
+        let (noise, reserved) = (m.noise, m.reserved);
+        return refuse(
+            m.request,
+            epoch,
+            format!("noise is {noise} and reserved {reserved}: noise is 0 or 1, reserved 0"),
+        );
+    }
+    let constraints = match m.constraints {
+        OWN => Constraints::Own,
+        0 => Constraints::Off,
+        id => Constraints::Id(id),
+    };
+    let version = (m.version != OWN).then_some(m.version);
+    let request = Request { seed: m.seed, n_steps: m.n_steps, version, noise: m.noise == 1, constraints };
+    Ok((m.request, epoch, request))
+}
+
+/// Id of a snapshot's constraint set: a hash of its effective `[constraints]` and robot, never 0 or all ones.
+pub fn constraint_set(manifest: &Manifest) -> u64 {
+    let constraints = serde_json::to_string(&manifest.task.constraints).unwrap_or_default();
+    hash_names([constraints.as_str(), &manifest.model]).clamp(1, OWN - 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn bytes(message: &RequestMessage) -> Vec<u8> {
+        super::super::client::bytes_of(message).to_vec()
+    }
+
+    fn sent(request: &Request) -> RequestMessage {
+        let mut message = request.message(7);
+        message.header = Header { schema: RequestMessage::SCHEMA, epoch: 3, seq: 1, stamp: 0 };
+        message
+    }
+
+    #[test]
+    fn what_is_asked_arrives() {
+        let asked = [
+            Request::new(u64::MAX, 1),
+            Request { version: Some(9), noise: false, constraints: Constraints::Off, ..Request::new(0, 5) },
+            Request { constraints: Constraints::Id(12), ..Request::new(1, 2) },
+        ];
+        for request in asked {
+            assert_eq!(decode(&bytes(&sent(&request))), Ok((7, 3, request)));
+        }
+    }
+
+    #[test]
+    fn wrong_length_schema_and_values_are_refused_by_name() {
+        let good = sent(&Request::new(1, 2));
+        let refused = |message: RequestMessage| decode(&bytes(&message)).unwrap_err();
+        assert!(decode(&[]).unwrap_err().reason.contains("this one 0"));
+        assert!(decode(&[255; 1024]).unwrap_err().reason.contains("this one 1024"));
+        let mut foreign = good;
+        foreign.header.schema ^= 1;
+        assert!(refused(foreign).reason.contains("schema"));
+        assert!(refused(RequestMessage { n_steps: 0, ..good }).reason.contains("n_steps"));
+        let noisy = refused(RequestMessage { noise: 2, ..good });
+        assert!(noisy.reason.contains("noise is 2"));
+        assert_eq!((noisy.request, noisy.client), (7, 3));
+    }
+}

@@ -1,0 +1,141 @@
+//! The server's end: requests in, replies out. Nothing here knows what a rollout is.
+
+use std::collections::HashSet;
+
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::port::server::Server;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::port::{BackpressureAction, SendError};
+use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, CallbackProgression};
+use iceoryx2::service::port_factory::server::ServerCreateError;
+
+use super::messages::{Answer, MAX_CHUNK, ReplyMessage};
+use super::service::{self, Factory};
+use crate::link::service::{Bus, Ipc};
+use crate::link::{Header, LinkError, Message, RobotName};
+use crate::rt::clock;
+
+/// The only server of a name.
+pub struct RolloutServer {
+    port: Server<Ipc, [u8], (), [f64], ReplyMessage>,
+    factory: Factory,
+    bus: Bus,
+}
+
+/// What became of a reply.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Delivery {
+    /// It is in the client's buffer.
+    Sent,
+    /// The client's buffer is full: try again later.
+    Full,
+    /// The client is gone.
+    Gone,
+}
+
+impl RolloutServer {
+    /// Takes the name; a second server of the same name is refused.
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn open(name: &RobotName) -> Result<RolloutServer, LinkError> {
+        let bus = Bus::join(name)?;
+        let factory = service::open(&bus)?;
+        let port = factory
+            .server_builder()
+            .initial_max_slice_len(MAX_CHUNK)
+            .allocation_strategy(AllocationStrategy::Static)
+            .max_loaned_responses_per_request(1)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            // A full buffer is told to the sender, who keeps the chunk: nothing is lost and nobody waits.
+            .set_backpressure_handler(|_| BackpressureAction::DiscardDataAndFail)
+            .create()
+            .map_err(|e| match e {
+                ServerCreateError::ExceedsMaxSupportedServers => {
+                    LinkError::Taken { name: name.clone(), role: "rollout server" }
+                }
+                other => name.transport("serve rollouts", format!("{other:?}")),
+            })?;
+        bus.reserve()?;
+        Ok(RolloutServer { port, factory, bus })
+    }
+
+    /// The next request, whatever its bytes are.
+    pub fn receive(&mut self) -> Option<Caller> {
+        let active = self.port.receive().ok().flatten()?;
+        Some(Caller { active, epoch: self.bus.epoch(), seq: 0 })
+    }
+
+    /// Removes what killed processes left, and returns the clients that are still there; costs some file accesses.
+    pub fn survivors(&mut self) -> HashSet<u128> {
+        self.bus.node().try_cleanup_dead_nodes();
+        // A failure leaves the connections as they are until the next call.
+        let _ = self.port.update_connections();
+        let mut alive = HashSet::new();
+        iceoryx2::service::port_factory::PortFactory::dynamic_config(&self.factory).list_clients(|client| {
+            alive.insert(client.client_id.value());
+            CallbackProgression::Continue
+        });
+        alive
+    }
+}
+
+/// One request and the way back to whoever sent it. Dropping it ends the client's stream.
+pub struct Caller {
+    active: ActiveRequest<Ipc, [u8], (), [f64], ReplyMessage>,
+    epoch: u64,
+    seq: u64,
+}
+
+impl Caller {
+    /// The request as it came.
+    pub fn bytes(&self) -> &[u8] {
+        self.active.payload()
+    }
+
+    /// The client; given by the transport, so that no client can pass for another.
+    pub fn client(&self) -> u128 {
+        self.active.origin().value()
+    }
+
+    /// False once the client dropped the request or ended.
+    pub fn is_connected(&self) -> bool {
+        self.active.is_connected()
+    }
+
+    /// True once the client asked to cancel; it waits for the answer.
+    pub fn wants_cancel(&self) -> bool {
+        self.active.has_disconnect_hint()
+    }
+
+    /// Sends a reply with the numbers of its chunk (none for other answers).
+    pub fn send(&mut self, reply: &mut ReplyMessage, numbers: &[f64]) -> Delivery {
+        reply.header = Header {
+            schema: ReplyMessage::SCHEMA,
+            epoch: self.epoch,
+            seq: self.seq + 1,
+            stamp: clock::now(),
+        };
+        if !self.active.is_connected() {
+            return Delivery::Gone;
+        }
+        let Ok(mut sample) = self.active.loan_slice_uninit(numbers.len()) else { return Delivery::Full };
+        *sample.user_header_mut() = *reply;
+        match sample.write_from_slice(numbers).send() {
+            Ok(()) => {
+                self.seq += 1;
+                Delivery::Sent
+            }
+            Err(SendError::UnableToDeliver) => Delivery::Full,
+            Err(_) => Delivery::Gone,
+        }
+    }
+
+    /// Sends a reply without numbers to the request `ids` (number, client's epoch).
+    pub fn answer(&mut self, answer: Answer, text: &str, ids: (u64, u64)) -> Delivery {
+        let mut reply = ReplyMessage::zeroed();
+        (reply.request, reply.client) = ids;
+        reply.set(answer, text);
+        self.send(&mut reply, &[])
+    }
+}
