@@ -48,7 +48,7 @@ fn changed(task: &str, from: &str, to: &str) -> String {
 
 /// Bundled task, text in it, its replacement, and what the message must say about the file.
 const FILES: &[(&str, &str, &str, &[&str])] = &[
-    ("Panda-reach", "velocity = {", "velocty = {", &["t.toml:22", "velocty", "did you mean 'velocity'"]),
+    ("Panda-reach", "velocity = {", "velocty = {", &["t.toml:23", "velocty", "did you mean 'velocity'"]),
     (
         "Panda-reach",
         "[constraints]",
