@@ -26,6 +26,10 @@ fn random_weights_swapped_in_motion_break_no_limit_and_the_stop_ends_at_rest() {
         trainer.push(version, &snapshot(version, |_| {}).to_bytes()).unwrap();
         let receipt = trainer.wait_for_receipt(version, Duration::from_secs(20)).unwrap();
         assert_eq!(receipt.verdict(), Verdict::Accepted, "{}", receipt.text());
+        // Each policy gets the same time to set the arm in motion, however fast the swaps are.
+        while trainer.state().is_none_or(|s| s.tick < receipt.tick + 600) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
     }
     stop.request();
     let report = running.join().unwrap().unwrap();
