@@ -191,6 +191,18 @@ impl SnapshotError {
     }
 }
 
+/// Writes a file whole: to a name beside it, then renamed, so that no reader ever sees a part of it.
+///
+/// # Errors
+/// What the system said.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let beside = path.with_extension(format!("part{}", std::process::id()));
+    let mut file = std::fs::File::create(&beside)?;
+    file.write_all(bytes)?;
+    file.sync_all()?;
+    std::fs::rename(&beside, path)
+}
+
 impl Snapshot {
     /// Reads and validates a file.
     ///
@@ -217,15 +229,7 @@ impl Snapshot {
     /// # Errors
     /// [`SnapshotError::Unreadable`] with what the system said.
     pub fn save(&self, path: &Path) -> Result<(), SnapshotError> {
-        let bytes = self.to_bytes();
-        let beside = path.with_extension(format!("part{}", std::process::id()));
-        let write = || -> std::io::Result<()> {
-            let mut file = std::fs::File::create(&beside)?;
-            file.write_all(&bytes)?;
-            file.sync_all()?;
-            std::fs::rename(&beside, path)
-        };
-        write().map_err(|e| SnapshotError::Unreadable {
+        write_whole(path, &self.to_bytes()).map_err(|e| SnapshotError::Unreadable {
             file: path.display().to_string(),
             reason: e.to_string(),
         })

@@ -3,11 +3,10 @@
 //! The file's metadata has one key, `nearl-checkpoint`: the blake3 digest in hex, a line break, a header as JSON. The digest
 //! covers header and tensors, as in a snapshot. Floating-point numbers of the state are tensors, so no bit is lost.
 
-use nearl_runtime::snapshot::{MAX_BYTES, Manifest, digest};
+use nearl_runtime::snapshot::{MAX_BYTES, Manifest, digest, write_whole};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Version of the file format.
@@ -113,15 +112,7 @@ impl Checkpoint {
     /// # Errors
     /// [`CheckpointError::Unusable`] with what the system said.
     pub fn save(&self, path: &Path) -> Result<(), CheckpointError> {
-        let bytes = self.to_bytes();
-        let beside = path.with_extension(format!("part{}", std::process::id()));
-        let write = || -> std::io::Result<()> {
-            let mut file = std::fs::File::create(&beside)?;
-            file.write_all(&bytes)?;
-            file.sync_all()?;
-            std::fs::rename(&beside, path)
-        };
-        write().map_err(|e| CheckpointError::Unusable {
+        write_whole(path, &self.to_bytes()).map_err(|e| CheckpointError::Unusable {
             file: path.display().to_string(),
             reason: e.to_string(),
         })

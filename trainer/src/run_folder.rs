@@ -1,5 +1,6 @@
 //! The run folder: `task.toml metrics.csv env.json checkpoints/` of one training.
 
+use nearl_runtime::snapshot::write_whole;
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -108,10 +109,8 @@ impl RunFolder {
         }
         let whole: String =
             std::iter::once(columns.join(",").as_str()).chain(kept).flat_map(|l| [l, "\n"]).collect();
-        let beside = path.join(format!("metrics.part{}", std::process::id()));
         let open = || -> std::io::Result<File> {
-            std::fs::write(&beside, whole)?;
-            std::fs::rename(&beside, &file)?;
+            write_whole(&file, whole.as_bytes())?;
             File::options().append(true).open(&file)
         };
         let write =

@@ -20,9 +20,10 @@ impl Projector {
                 next: "name one of the projector's limits",
             });
         }
-        let before = self.switches.iter().map(|s| s.enabled).collect::<Vec<_>>();
-        self.switches.iter_mut().filter(|s| s.label == label).for_each(|s| s.enabled = on);
-        self.collect_enabled();
+        if self.switches.iter().all(|s| s.label != label || s.enabled == on) {
+            return Ok(());
+        }
+        self.collect_enabled(label, on);
         let sound = self.limits.check(&self.model, &self.dofs.controllable).and_then(|()| {
             check_combination(
                 &self.model,
@@ -32,8 +33,7 @@ impl Projector {
             )
         });
         if let Err(error) = sound {
-            self.switches.iter_mut().zip(before).for_each(|(s, before)| s.enabled = before);
-            self.collect_enabled();
+            self.collect_enabled(label, !on); // limits of one label are always alike
             return Err(error);
         }
         for (limit, switch) in self.switches.iter().enumerate() {
@@ -50,7 +50,8 @@ impl Projector {
         self.switches.iter().map(|s| (s.label.as_str(), s.enabled))
     }
 
-    fn collect_enabled(&mut self) {
+    fn collect_enabled(&mut self, label: &str, on: bool) {
+        self.switches.iter_mut().filter(|s| s.label == label).for_each(|s| s.enabled = on);
         self.limits.clear();
         for switch in self.switches.iter().filter(|s| s.enabled) {
             self.limits.tighten(&switch.set);
