@@ -50,21 +50,44 @@ pub enum RefuseReason {
     WrongLength,
 }
 
-/// Which stage gave the answer.
+/// Which stage gave the answer, in the order in which they are tried; the number is the one in messages and logs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Rung {
     /// Per-joint clamp.
-    ClosedForm,
+    ClosedForm = 0,
     /// Exact active-set stage.
-    ActiveSet,
+    ActiveSet = 1,
     /// Clarabel.
-    Clarabel,
+    Clarabel = 2,
     /// One of the two, without the soft rows.
-    Relaxed,
+    Relaxed = 4,
     /// The brake that was verified ticks ago.
-    StoredBrake,
+    StoredBrake = 5,
     /// Per-joint brake.
-    Brake,
+    Brake = 3,
+}
+
+impl Rung {
+    /// Every rung at the place of its [`number`](Self::number).
+    pub const ALL: [Rung; 6] =
+        [Self::ClosedForm, Self::ActiveSet, Self::Clarabel, Self::Brake, Self::Relaxed, Self::StoredBrake];
+
+    /// Its number in messages and logs.
+    pub fn number(self) -> u32 {
+        self as u32
+    }
+
+    /// Its name in words.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::ClosedForm => "closed form",
+            Self::ActiveSet => "active set",
+            Self::Clarabel => "clarabel",
+            Self::Brake => "brake",
+            Self::Relaxed => "relaxed",
+            Self::StoredBrake => "stored brake",
+        }
+    }
 }
 
 /// Which bound of a row is active.
@@ -177,5 +200,17 @@ impl Ledger {
         let mut active = std::mem::take(&mut self.active);
         active.clear();
         *self = Ledger { active, ..Ledger::new(0) };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rung_is_found_by_its_number() {
+        for (number, rung) in Rung::ALL.into_iter().enumerate() {
+            assert_eq!(rung.number(), number as u32, "{}", rung.name());
+        }
     }
 }

@@ -1,6 +1,6 @@
 //! What a projection returns.
 
-use nearl_constraints::{self as constraints, BrakeReason, Counts, RefuseReason, Rung, Side, Status};
+use nearl_constraints::{self as constraints, BrakeReason, Counts, RefuseReason, Side, Status};
 use numpy::{PyArray1, PyArray2};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
@@ -80,14 +80,7 @@ impl Ledger {
     /// Which stage answered: "closed form", "active set", "clarabel", "relaxed", "stored brake" or "brake".
     #[getter]
     fn rung(&self) -> &'static str {
-        match self.ledger.rung {
-            Rung::ClosedForm => "closed form",
-            Rung::ActiveSet => "active set",
-            Rung::Clarabel => "clarabel",
-            Rung::Relaxed => "relaxed",
-            Rung::StoredBrake => "stored brake",
-            Rung::Brake => "brake",
-        }
+        self.ledger.rung.name()
     }
 
     /// Rows that hold the target back: `{"kind", "row", "name", "side", "multiplier", "slack"}` each.

@@ -9,6 +9,7 @@ from mcap.writer import Writer
 
 import nearl
 
+RUNGS = ["closed form", "active set", "clarabel", "brake", "relaxed", "stored brake"]
 COLUMNS = [
     "time/total_timesteps", "time/seconds", "time/fps", "rollout/ep_rew_mean", "rollout/ep_len_mean",
     "constraints/raw_violations", "constraints/target_violations", "constraints/reached_violations", "constraints/moved",
@@ -50,7 +51,7 @@ def flight_log(path: Path, ticks: int = 3000, metadata: dict[str, str] | None = 
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        writer.add_metadata("nearl", metadata or {})
+        writer.add_metadata("nearl", {"rungs": ",".join(RUNGS)} | (metadata or {}))
         schema = writer.register_schema("nearl.Tick", "jsonschema", b"{}")
         channel = writer.register_channel("tick", "json", schema)
         for tick in range(1, ticks + 1):
@@ -69,7 +70,7 @@ def flight_log(path: Path, ticks: int = 3000, metadata: dict[str, str] | None = 
                 "state": {"seq": tick, "episode": 0, "reward": 0.0, "q": q.tolist(), "v": v.tolist()},
                 "proposal_q": q_hat.tolist(), "proposal_v": v_hat.tolist(), "target_q": target.q.tolist(), "target_v": target.v.tolist(),
                 "action": [0.0] * 7,
-                "ledger": {"status": 1, "rung": 0, "active": len(target.active), "iterations": target.iterations,
+                "ledger": {"status": 1, "rung": RUNGS.index(target.rung), "active": len(target.active), "iterations": target.iterations,
                            "raw_violations": sum(target.raw_violations.values()), "projected_violations": sum(target.violations.values()),
                            "moved": target.moved, "slack": target.slack, "residual": target.residual, "duration_ns": target.duration_ns},
                 "overruns": 0, "stale": 0, "lost_states": 0,

@@ -35,8 +35,8 @@ def test_everything_is_in_one_file(inputs, tmp_path) -> None:
     html, words = page.read_text(), text_of(page)
     assert not re.search(r"(src|href)=\"(?!data:)", html), "nothing is fetched"
     assert "<script" not in html and "url(" not in html
-    assert html.count("data:image/png") == 6
-    for part in ("HalfCheetah-v5, pid2-ib", "21.00 %", "4116.7", "95 % bootstrap", "threshold", "Rows that hold the target back", "later than the control period", "overruns", "9.1", "320.0", "velocity 0.012", "8,123", "swapped in", "refused"):
+    assert html.count("data:image/png") == 7
+    for part in ("HalfCheetah-v5, pid2-ib", "21.00 %", "4116.7", "95 % bootstrap", "threshold", "Rows that hold the target back", "later than the control period", "Which stage of the projector answered", "Always zero: slack", "overruns", "9.1", "320.0", "velocity 0.012", "8,123", "swapped in", "refused"):
         assert part in words or part in html, part
 
 

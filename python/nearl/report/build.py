@@ -205,7 +205,7 @@ def _flights(logs: list[Log]) -> list[tuple[str, str]]:
     sections = []
     for log in logs:
         picture, sentence = flight.timeline(log)
-        parts = [picture or _none(sentence), flight.states(log) or _none("No tick of this flight had a target."), flight.latency(log)]
+        parts = [picture or _none(sentence), flight.states(log) or _none("No tick of this flight had a target."), flight.ledger(log), flight.latency(log)]
         modes = {mode: log.mode.count(mode) for mode in sorted(set(log.mode))}
         words = ", ".join(f"{n:,} {mode}" for mode, n in modes.items())
         metadata = f" Metadata: {json.dumps(log.metadata, ensure_ascii=False)[:400]}" if log.metadata else ""

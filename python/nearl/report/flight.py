@@ -125,6 +125,40 @@ def _window(log: Log) -> slice:
     return slice(start, start + WINDOW_TICKS)
 
 
+def ledger(log: Log) -> str:
+    """Which stage answered, how far it moved the proposal, by how much soft limits gave way, and its iterations, over time."""
+    numbers = ("moved", "moved\n[rad/s]"), ("slack", "slack\n[share]"), ("iterations", "iterations")
+    drawn = [(log.columns[key], label) for key, label in numbers if np.nan_to_num(log.columns[key]).any()]
+    rung, names = log.columns["rung"], log.rungs()
+    used = np.unique(rung[np.isfinite(rung)]).astype(int)
+    share = [np.where(np.isfinite(rung), rung == k, False) for k in used]
+    figure, panels = plt.subplots(
+        1 + len(drawn), 1, figsize=(10.2, 1.0 + 0.3 * len(used) + 1.05 * len(drawn)), sharex=True, squeeze=False,
+        height_ratios=[0.3 * max(len(used), 1), *[1.05] * len(drawn)],
+    )  # fmt: skip
+    first, *others = panels[:, 0]
+    end = max(log.time[-1], log.dt)
+    if share:
+        seen = _binned(np.array(share, float))
+        first.pcolormesh(np.linspace(0, end, seen.shape[1] + 1), np.arange(len(used) + 1), np.where(seen > 0, seen, np.nan), cmap="Blues", vmin=0, vmax=1.3, rasterized=True)
+    label = [f"{names[k] if k < len(names) else f'stage {k}'} {100 * s.mean():.3g} %" for k, s in zip(used, share, strict=True)]
+    first.set_yticks(np.arange(len(used)) + 0.5, label)
+    first.set_title("Ledger of the projection")
+    first.tick_params(axis="y", length=0)
+    first.grid(False)
+    first.invert_yaxis()
+    for axes, (values, words) in zip(others, drawn, strict=True):
+        largest = _binned(values[None, :])[0]
+        axes.fill_between(np.linspace(0, end, len(largest)), np.nan_to_num(largest), color=PROJECTED, alpha=0.6, linewidth=0.5)
+        axes.set_ylabel(words, rotation=0, ha="right", va="center")
+        axes.set_ylim(bottom=0)
+        axes.locator_params(axis="y", nbins=3)
+    panels[-1, 0].set(xlabel="time [s]", xlim=(0, end))
+    quiet = [key for key, _ in numbers if not np.nan_to_num(log.columns[key]).any()]
+    zero = f" Always zero: {', '.join(quiet)}." if quiet else ""
+    return image(figure, f"Which stage of the projector answered (share of ticks), and the largest of each moment: distance between proposal and target, excess of soft limits as a share of their size, iterations.{zero}")
+
+
 def latency(log: Log) -> str:
     """Histograms of compute time and of due-to-action time with the deadline."""
     c = log.columns

@@ -106,6 +106,10 @@ class Log:
         gaps = np.diff(self.columns["due_ns"])
         return float(np.median(gaps)) * 1e-9 if len(gaps) else float("nan")
 
+    def rungs(self) -> list[str]:
+        """Names of the projection's stages, each at the place of its number in the log."""
+        return [x for x in self.metadata.get("rungs", "").split(",") if x]
+
     def names(self, n: int) -> list[str]:
         """Names of the degrees of freedom: the metadata's ``joints``, else the bundled task's, else numbers."""
         given = [x for x in re.split(r"[,\s]+", self.metadata.get("joints", "")) if x]
@@ -130,6 +134,8 @@ _NUMBERS = {
     "moved": ("ledger", "moved"),
     "active": ("ledger", "active"),
     "iterations": ("ledger", "iterations"),
+    "slack": ("ledger", "slack"),
+    "rung": ("ledger", "rung"),
     "projection_ns": ("ledger", "duration_ns"),
 }
 

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use nearl_constraints::Rung;
 use serde::{Deserialize, Serialize};
 
 use super::tick::SCHEMA_VERSION;
@@ -59,6 +60,7 @@ pub(crate) fn facts(
         ("schema".to_owned(), SCHEMA_VERSION.to_string()),
         ("dt".to_owned(), robot.dt.to_string()),
         ("joints".to_owned(), joints.join(",")),
+        ("rungs".to_owned(), Rung::ALL.map(Rung::name).join(",")),
         json("robot", &described),
         json("settings", core),
         json("faults", faults),

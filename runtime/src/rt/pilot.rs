@@ -1,6 +1,6 @@
 //! The controller of a snapshot in the loop: states in, [`Controller::update`], numbers out.
 
-use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, RefuseReason, Rung, Side, Status};
+use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, RefuseReason, Side, Status};
 
 use crate::codes::LedgerStatus;
 use crate::controller::{Controller, Noise, Output, State};
@@ -265,14 +265,7 @@ fn status(status: Status) -> LedgerStatus {
 pub fn numbers(ledger: &Ledger) -> LedgerNumbers {
     LedgerNumbers {
         status: status(ledger.status).number(),
-        rung: match ledger.rung {
-            Rung::ClosedForm => 0,
-            Rung::ActiveSet => 1,
-            Rung::Clarabel => 2,
-            Rung::Brake => 3,
-            Rung::Relaxed => 4,
-            Rung::StoredBrake => 5,
-        },
+        rung: ledger.rung.number(),
         active: ledger.active.len() as u32,
         iterations: ledger.iterations,
         raw_violations: ledger.raw_violations.total(),
