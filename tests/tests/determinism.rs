@@ -7,18 +7,25 @@ use nearl_trainer::rollout::{make_env, stream};
 /// Record A = record B for one thread and two, over several updates of every algorithm.
 #[test]
 fn weights_do_not_depend_on_threads() {
-    for (task, algo) in [("HalfCheetah-v5", "pid2-ib"), ("Hopper-v5", "ppo"), ("Panda-reach", "pid2-ib")] {
+    // a minibatch of 512 is cut among threads, one of 64 is not
+    for (task, algo, minibatch) in [
+        ("HalfCheetah-v5", "pid2-ib", 512),
+        ("HalfCheetah-v5", "pid2-ib", 64),
+        ("Hopper-v5", "ppo", 512),
+        ("Hopper-v5", "ppo", 64),
+        ("Panda-reach", "pid2-ib", 512),
+    ] {
         let weights = |threads: usize, seed: u64| {
-            let set = ["train.ppo.batch_size=512", "train.n_steps=64"];
-            let mut t = training(task, algo, seed, threads, &set);
+            let minibatch = format!("train.ppo.batch_size={minibatch}");
+            let mut t = training(task, algo, seed, threads, &[&minibatch, "train.n_steps=64"]);
             for _ in 0..4 {
                 t.iterate();
             }
             t.snapshot().to_bytes()
         };
         let one = weights(1, 3);
-        assert!(one == weights(2, 3), "{task} {algo}: two threads gave other weights than one");
-        assert!(one != weights(1, 4), "{task} {algo}: the seed changes nothing");
+        assert!(one == weights(2, 3), "{task} {algo} {minibatch}: two threads gave other weights than one");
+        assert!(one != weights(1, 4), "{task} {algo} {minibatch}: the seed changes nothing");
     }
 }
 

@@ -40,6 +40,9 @@ pub enum RolloutError {
     },
 }
 
+/// Portions of the work a thread takes, at least.
+const PORTIONS: usize = 32;
+
 /// All workers of a training.
 pub struct Collector {
     workers: Vec<Mutex<Worker>>,
@@ -93,11 +96,23 @@ impl Collector {
     }
 
     /// Collects one segment in every environment.
+    ///
+    /// Threads take portions of segments in turn, so that all end at nearly the same time; which thread takes which does
+    /// not matter, the next portion of a worker is always the same.
     pub fn collect(&mut self) {
-        let next = AtomicUsize::new(0);
+        let n_steps = self.n_steps;
+        self.workers().for_each(|w| w.begin(n_steps));
+        let n = self.workers.len();
+        let portion = (n * n_steps).div_ceil(PORTIONS * self.threads).clamp(1, n_steps);
+        let (next, portions) = (AtomicUsize::new(0), n * n_steps.div_ceil(portion));
         let run = || {
-            while let Some(worker) = self.workers.get(next.fetch_add(1, Ordering::Relaxed)) {
-                worker.lock().unwrap_or_else(std::sync::PoisonError::into_inner).collect(self.n_steps);
+            loop {
+                let k = next.fetch_add(1, Ordering::Relaxed);
+                if k >= portions {
+                    break;
+                }
+                let worker = &self.workers[k % n];
+                worker.lock().unwrap_or_else(std::sync::PoisonError::into_inner).go_on(portion);
             }
         };
         std::thread::scope(|s| {

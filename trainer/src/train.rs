@@ -15,7 +15,7 @@ use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
 use nearl_runtime::controller::{Parts, seen_entries};
 use nearl_runtime::normaliser::Normaliser;
-use nearl_runtime::{Manifest, Snapshot, SnapshotError};
+use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 use setup::{check_minibatch, learner, limit_scale, policy_kind};
 use std::path::{Path, PathBuf};
@@ -95,6 +95,8 @@ pub struct Training {
     snapshot: Snapshot,
     learner: Box<dyn Learner>,
     collector: Collector,
+    /// The last batch: its memory is used again.
+    batch: Batch,
     dims: Dims,
     obs_stats: RunningStats,
     change_stats: RunningStats,
@@ -164,6 +166,7 @@ impl Training {
             snapshot,
             learner,
             collector,
+            batch: Batch::default(),
             dims,
             rng,
             total: request.steps,
@@ -190,9 +193,9 @@ impl Training {
         let learns = self.snapshot.manifest.steps > 0;
         self.merge_statistics();
         let metrics = if learns {
-            let batch = self.batch();
+            self.fill_batch();
             let start = Instant::now();
-            let metrics = self.learner.update(&batch, rate, &mut self.rng);
+            let metrics = self.learner.update(&self.batch, rate, &mut self.rng);
             self.learning_seconds += start.elapsed().as_secs_f64();
             metrics
         } else {
@@ -269,18 +272,23 @@ impl Training {
     }
 
     /// The collected segments as one batch with advantages.
-    fn batch(&mut self) -> Batch {
+    fn fill_batch(&mut self) {
         let n_steps = self.settings.n_steps;
-        let mut b = Batch { n: self.settings.n_envs * n_steps, ..Batch::default() };
+        let proposes = self.snapshot.manifest.policy != PolicyKind::Direct;
+        let b = &mut self.batch;
+        b.clear();
+        b.n = self.settings.n_envs * n_steps;
         let scale = if self.settings.scale_reward { 1.0 / self.return_stats.std(1e-8)[0] } else { 1.0 };
         let mut cuts = Vec::new();
         for w in self.collector.workers() {
             let s = &w.segment;
             b.obs.extend_from_slice(&s.x);
-            b.proposal.extend_from_slice(&s.change);
-            b.target.extend_from_slice(&s.target_change);
-            b.lower.extend_from_slice(&s.lower);
-            b.upper.extend_from_slice(&s.upper);
+            if proposes {
+                b.proposal.extend_from_slice(&s.change);
+                b.target.extend_from_slice(&s.target_change);
+                b.lower.extend_from_slice(&s.lower);
+                b.upper.extend_from_slice(&s.upper);
+            }
             b.reached.extend_from_slice(&s.reached);
             b.sampled.extend_from_slice(&s.sampled);
             b.action.extend_from_slice(&s.action);
@@ -299,7 +307,6 @@ impl Training {
             b.returns.extend(a.returns);
         }
         debug_assert_eq!(b.obs.len(), b.n * self.dims.n_obs);
-        b
     }
 }
 

@@ -44,6 +44,9 @@ struct TrainBench {
     /// Repetitions, alternating with the physics.
     #[arg(long, default_value_t = 3)]
     repeat: usize,
+    /// Seconds of the physics alone beside each repetition; 0 leaves it out.
+    #[arg(long, default_value_t = 3.0)]
+    physics_seconds: f64,
     /// Overrides of the task file, e.g. `train.ppo.batch_size=2048`.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -100,30 +103,34 @@ impl TrainBench {
             let seconds = start.elapsed().as_secs_f64();
             rates.push((training.snapshot().manifest.steps - from) as f64 / seconds);
             shares.push(training.learning_seconds() / seconds);
-            let physics = env::bench::physics(
-                make_env(training.snapshot())?.as_ref(),
-                cores(),
-                Duration::from_secs_f64(self.seconds.min(3.0)),
-            )?;
-            ceilings.push(physics.steps_per_second() / ticks);
+            let physics_time = self.physics_seconds.min(self.seconds);
+            if physics_time > 0.0 {
+                let env = make_env(training.snapshot())?;
+                let physics =
+                    env::bench::physics(env.as_ref(), cores(), Duration::from_secs_f64(physics_time))?;
+                ceilings.push(physics.steps_per_second() / ticks);
+            }
         }
         let median = |x: &mut Vec<f64>| {
             x.sort_by(f64::total_cmp);
-            x[x.len() / 2]
+            x.get(x.len() / 2).copied()
         };
-        let (rate, ceiling, share) = (median(&mut rates), median(&mut ceilings), median(&mut shares));
+        let (Some(rate), Some(share)) = (median(&mut rates), median(&mut shares)) else { return Ok(()) };
+        let ceiling = median(&mut ceilings);
         if self.json {
             say(
                 serde_json::json!({ "task": self.task, "algo": self.algo, "threads": cores(), "steps_per_s": rate,
-                "physics_steps_per_s": ceiling, "fraction": rate / ceiling, "update_share": share }),
+                "physics_steps_per_s": ceiling, "fraction": ceiling.map(|c| rate / c), "update_share": share }),
             );
         } else {
+            let beside = ceiling.map_or(String::new(), |c| {
+                format!(" {:.0} % of the physics alone ({c:.0} steps/s),", 100.0 * rate / c)
+            });
             say(format!(
-                "{} {} on {} threads: {rate:.0} steps/s, {:.0} % of the physics alone ({ceiling:.0} steps/s), updates take {:.0} % of the time",
+                "{} {} on {} threads: {rate:.0} steps/s,{beside} updates take {:.0} % of the time",
                 self.task,
                 self.algo,
                 cores(),
-                100.0 * rate / ceiling,
                 100.0 * share
             ));
         }

@@ -1,6 +1,7 @@
 //! One batch of experience in network space, row by row.
 
-/// `n` samples; names as in `docs/ARCHITECTURE.md`, "Network space".
+/// `n` samples; names as in `docs/ARCHITECTURE.md`, "Network space". `ppo` proposes nothing: what is of the proposal and its
+/// projection may be empty there.
 #[derive(Clone, Debug, Default)]
 pub struct Batch {
     /// Samples.
@@ -27,4 +28,15 @@ pub struct Batch {
     pub advantage: Vec<f32>,
     /// Target of the value network (n).
     pub returns: Vec<f32>,
+}
+
+impl Batch {
+    /// Forgets every row; keeps the memory.
+    pub fn clear(&mut self) {
+        self.n = 0;
+        let states = [&mut self.obs, &mut self.proposal, &mut self.target, &mut self.lower, &mut self.upper];
+        let actions = [&mut self.reached, &mut self.sampled, &mut self.action];
+        let numbers = [&mut self.log_prob, &mut self.advantage, &mut self.returns];
+        states.into_iter().chain(actions).chain(numbers).for_each(Vec::clear);
+    }
 }

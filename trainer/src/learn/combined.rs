@@ -14,7 +14,7 @@ use super::inverse::{InverseModel, InverseWork};
 use super::losses::{mean_std, set_lanes, values, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
-use super::optimise::{Group, TILE, Tile};
+use super::optimise::{Group, Rows, TILE, Tile};
 use super::ppo::PpoSettings;
 use super::{Metrics, init};
 use nearl_runtime::Networks;
@@ -170,14 +170,28 @@ impl Combined {
         }
     }
 
+    /// The rows that [`Combined::policy_gradient`] reads.
+    pub(super) fn rows<'b>(&self, batch: &'b Batch) -> Vec<Rows<'b>> {
+        let d = &self.dims;
+        let mut rows = vec![Rows::new(&batch.obs, d.n_obs)];
+        if self.inverse.is_some() {
+            rows.push(Rows::new(&batch.sampled, d.n_act));
+        }
+        match self.policy_log_std {
+            None => rows.extend([&batch.lower, &batch.upper].map(|b| Rows::new(b, d.n_state))),
+            Some(_) => rows.extend([&batch.proposal, &batch.target].map(|b| Rows::new(b, d.n_state))),
+        }
+        rows
+    }
+
     /// Value of each row of `x` (n x n_obs).
-    pub(super) fn values(&self, p: &[V], x: &[f32]) -> Vec<f32> {
-        values(&self.value, p, x, self.dims.n_obs)
+    pub(super) fn values(&self, p: &[V], x: &[f32], threads: usize) -> Vec<f32> {
+        values(&self.value, p, x, self.dims.n_obs, threads)
     }
 
     /// Mean squared error of the inverse model over a batch; none with analytic inverse dynamics.
-    pub(super) fn idm_error(&self, p: &[V], batch: &Batch) -> Option<f64> {
-        self.inverse.as_ref().map(|(model, _)| model.error(p, batch, &self.dims))
+    pub(super) fn idm_error(&self, p: &[V], batch: &Batch, threads: usize) -> Option<f64> {
+        self.inverse.as_ref().map(|(model, _)| model.error(p, batch, &self.dims, threads))
     }
 
     /// The supervised loss of the inverse model (Eq. 4).

@@ -4,7 +4,7 @@ use super::Dims;
 use super::batch::Batch;
 use super::gaussian::gather;
 use super::init;
-use super::losses::widths;
+use super::losses::{in_parts, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
 use super::optimise::{Group, TILE, Tile, add_sums};
@@ -83,18 +83,19 @@ impl InverseModel {
     }
 
     /// Mean squared error of the mean action over a batch, per action entry.
-    pub(super) fn error(&self, p: &[V], batch: &Batch, dims: &Dims) -> f64 {
-        let mut w = self.work();
-        let (mut sum, mut idx) = (0.0f64, [0u32; TILE]);
-        for start in (0..batch.n).step_by(TILE) {
-            for (k, i) in idx.iter_mut().enumerate() {
-                *i = (start + k).min(batch.n - 1) as u32;
+    pub(super) fn error(&self, p: &[V], batch: &Batch, dims: &Dims, threads: usize) -> f64 {
+        let mut sums = vec![0.0f32; batch.n.div_ceil(TILE)];
+        in_parts(&mut sums, 1, threads, |first, sums| {
+            let (mut w, mut idx) = (self.work(), [0u32; TILE]);
+            for (tile, sum) in (first..).zip(sums) {
+                let start = tile * TILE;
+                for (k, i) in idx.iter_mut().enumerate() {
+                    *i = (start + k).min(batch.n - 1) as u32;
+                }
+                squared_error(self, p, batch, &idx, dims, &mut w, TILE.min(batch.n - start), sum);
             }
-            let mut part = 0.0;
-            squared_error(self, p, batch, &idx, dims, &mut w, TILE.min(batch.n - start), &mut part);
-            sum += f64::from(part);
-        }
-        sum / (batch.n * dims.n_act) as f64
+        });
+        sums.into_iter().map(f64::from).sum::<f64>() / (batch.n * dims.n_act) as f64
     }
 }
 

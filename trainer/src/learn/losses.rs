@@ -21,18 +21,45 @@ pub(super) fn mean_std(log_std: &[f32]) -> f64 {
 }
 
 /// Value of each row of `x`.
-pub(super) fn values(net: &Net, p: &[V], x: &[f32], n_obs: usize) -> Vec<f32> {
+pub(super) fn values(net: &Net, p: &[V], x: &[f32], n_obs: usize, threads: usize) -> Vec<f32> {
     let (n, vectors) = (x.len() / n_obs, n_obs.div_ceil(LANES));
-    let (mut tape, mut rows) = (net.tape(TILE), vec![ZERO; TILE * vectors]);
-    let mut out = Vec::with_capacity(n);
-    for start in (0..n).step_by(TILE) {
-        let count = TILE.min(n - start);
-        let idx: Vec<u32> = (start..start + count).map(|i| i as u32).collect();
-        gather(&mut rows, vectors, 0, x, n_obs, &idx);
-        let y = net.forward(p, &rows, &mut tape);
-        out.extend(y[..count].iter().map(|v| v.0[0]));
-    }
+    let mut out = vec![0.0; n];
+    in_parts(&mut out, TILE, threads, |first, out| {
+        let (mut tape, mut rows) = (net.tape(TILE), vec![ZERO; TILE * vectors]);
+        for (start, out) in (first..).step_by(TILE).zip(out.chunks_mut(TILE)) {
+            let idx: Vec<u32> = (start..start + out.len()).map(|i| i as u32).collect();
+            gather(&mut rows, vectors, 0, x, n_obs, &idx);
+            let y = net.forward(p, &rows, &mut tape);
+            out.iter_mut().zip(y).for_each(|(out, y)| *out = y.0[0]);
+        }
+    });
     out
+}
+
+/// Tiles that one thread has done before another one has started.
+const FEW_TILES: usize = 64;
+
+/// Runs `f(first, part)` over `out` cut into parts of whole tiles of `tile` entries, a thread each: every entry must
+/// depend on its own place alone.
+pub(super) fn in_parts<T: Send>(
+    out: &mut [T],
+    tile: usize,
+    threads: usize,
+    f: impl Fn(usize, &mut [T]) + Sync,
+) {
+    let tiles = out.len().div_ceil(tile);
+    let size = tiles.div_ceil(threads.max(1)).max(FEW_TILES) * tile;
+    std::thread::scope(|scope| {
+        let mut parts = out.chunks_mut(size).enumerate();
+        let own = parts.next();
+        for (k, part) in parts {
+            let f = &f;
+            scope.spawn(move || f(k * size, part));
+        }
+        if let Some((_, part)) = own {
+            f(0, part);
+        }
+    });
 }
 
 /// The value loss of a tile: `d = dL / dV` a row; returns the sum of squared errors.

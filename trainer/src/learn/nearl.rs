@@ -14,7 +14,7 @@
 use super::combined::{Combined, CombinedWork, Gradient, Kind};
 use super::gaussian::gather;
 use super::nets::NetSettings;
-use super::optimise::{Group, Params, Phases, Schedule, Tile, add_sums, optimise};
+use super::optimise::{Group, Params, Phases, Rows, Schedule, Tile, add_sums, optimise};
 use super::pid2::Pid2Settings;
 use super::ppo::PpoSettings;
 use super::{Adam, Batch, Dims, Learner, Metrics};
@@ -97,7 +97,7 @@ impl Learner for Nearl {
     fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics {
         let s = &self.nets.combined.ppo;
         let schedule = Schedule { epochs: s.n_epochs, minibatch: s.batch_size, threads: self.threads, rate };
-        let before = self.nets.combined.idm_error(self.actor(), batch);
+        let before = self.nets.combined.idm_error(self.actor(), batch, self.threads);
         let inverse_learns = before.is_some_and(|e| e >= self.nets.settings.idm_threshold);
         let mut phases = Vec::new();
         if self.nets.settings.policy_lr > 0.0 {
@@ -116,7 +116,7 @@ impl Learner for Nearl {
         if let Some(imitate) = of(IMITATE) {
             metrics.push(("train/policy_mse", imitate.mean[0] / self.nets.combined.dims.n_state as f64));
         }
-        let after = self.nets.combined.idm_error(self.actor(), batch);
+        let after = self.nets.combined.idm_error(self.actor(), batch, self.threads);
         metrics.extend(super::idm_metrics(before, after, inverse_learns));
         metrics
     }
@@ -136,7 +136,7 @@ impl Learner for Nearl {
     }
 
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
-        self.nets.combined.values(self.actor(), x)
+        self.nets.combined.values(self.actor(), x, self.threads)
     }
 }
 
@@ -197,6 +197,11 @@ impl Phases for Nets {
     }
     fn max_norm(&self, phase: usize) -> f32 {
         if phase == ACTOR { self.combined.ppo.max_grad_norm } else { f32::INFINITY }
+    }
+    fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>> {
+        let mut rows = self.combined.rows(batch);
+        rows.push(Rows::new(&batch.reached, self.combined.dims.n_state));
+        rows
     }
 }
 

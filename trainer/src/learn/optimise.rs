@@ -1,8 +1,13 @@
 //! Runs the phases of an algorithm over minibatches, on several threads, with the same bits for any number of them.
 //!
 //! A minibatch is cut into a number of shards that depends on its size alone. Each thread computes some shards; after a
-//! barrier every thread adds all shards in order and applies the same step to its own replica of the parameters. Nothing
-//! is allocated per minibatch.
+//! barrier every thread adds all shards in order and applies the same step to its own replica of the parameters. A minibatch
+//! too small to be cut runs its parameter groups side by side instead ([`lanes`]). Nothing is allocated per minibatch.
+
+mod lanes;
+mod rows;
+
+pub use rows::Rows;
 
 use super::adam::{Adam, norm};
 use super::batch::Batch;
@@ -70,6 +75,12 @@ pub trait Phases: Sync {
     fn refresh(&self, phase: usize, params: &mut Params);
     /// Largest norm of the gradient of phase `k`.
     fn max_norm(&self, phase: usize) -> f32;
+    /// Whether phases of the first phase's group read another group, as it was before the minibatch.
+    fn reads_other_group(&self) -> bool {
+        false
+    }
+    /// The rows that a tile reads, so that the next ones can be on their way.
+    fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>>;
     /// Changes what is not a parameter (the bottleneck's multiplier) from the sums of phase `k`, averaged over rows.
     fn after(&self, _phase: usize, _mean: &[f32; SUMS], _params: &mut Params) {}
 }
@@ -96,6 +107,14 @@ pub struct PhaseReport {
     pub norm: f64,
 }
 
+impl PhaseReport {
+    /// From sums over `steps` minibatches to means.
+    fn average(&mut self, steps: f64) {
+        self.mean.iter_mut().for_each(|m| *m /= steps);
+        self.norm /= steps;
+    }
+}
+
 /// Counts the threads that arrived; each round needs all of them.
 struct Barrier {
     threads: usize,
@@ -105,11 +124,15 @@ struct Barrier {
 impl Barrier {
     fn wait(&self, round: usize) {
         self.arrived.fetch_add(1, Ordering::AcqRel);
-        let mut spins = 0u32;
-        while self.arrived.load(Ordering::Acquire) < self.threads * round {
-            spins += 1;
-            if spins < 4000 { std::hint::spin_loop() } else { std::thread::yield_now() }
-        }
+        wait_until(|| self.arrived.load(Ordering::Acquire) >= self.threads * round);
+    }
+}
+
+fn wait_until(ready: impl Fn() -> bool) {
+    let mut spins = 0u32;
+    while !ready() {
+        spins += 1;
+        if spins < 4000 { std::hint::spin_loop() } else { std::thread::yield_now() }
     }
 }
 
@@ -141,12 +164,19 @@ pub fn optimise<P: Phases>(
         phases,
         schedule,
         orders: &orders,
+        rows: rows::scattered(algorithm, batch),
         shards,
         threads,
         // two buffers a shard: one barrier an optimiser step
         gradients: (0..shards).map(|_| std::array::from_fn(|_| RwLock::new(vec![ZERO; longest]))).collect(),
         barrier: Barrier { threads, arrived: AtomicUsize::new(0) },
     };
+    if shards == 1
+        && schedule.threads > 1
+        && let Some(lanes) = run.lanes()
+    {
+        return run.side_by_side(params, lanes);
+    }
     std::thread::scope(|scope| {
         for t in 1..threads {
             let mut replica = params.clone();
@@ -163,6 +193,8 @@ struct Run<'a, P: Phases> {
     phases: &'a [usize],
     schedule: Schedule,
     orders: &'a [Vec<u32>],
+    /// What is fetched ahead of its use.
+    rows: Vec<Rows<'a>>,
     shards: usize,
     threads: usize,
     gradients: Vec<[RwLock<Vec<V>>; 2]>,
@@ -192,10 +224,7 @@ impl<P: Phases> Run<'_, P> {
             }
             steps += 1.0;
         }
-        for r in &mut reports {
-            r.mean.iter_mut().for_each(|m| *m /= steps);
-            r.norm /= steps;
-        }
+        reports.iter_mut().for_each(|r| r.average(steps));
         reports
     }
 
@@ -213,9 +242,14 @@ impl<P: Phases> Run<'_, P> {
         let rows = idx.len() / self.shards;
         let mut grad = self.gradients[s][odd].write().unwrap_or_else(std::sync::PoisonError::into_inner);
         grad[..len].fill(ZERO);
-        for idx in idx[s * rows..][..rows].chunks_exact(TILE) {
-            let tile =
-                Tile { batch: self.batch, idx, scale: 1.0 / self.schedule.minibatch as f32, advantage };
+        let (scale, all) = (1.0 / self.schedule.minibatch as f32, idx);
+        for at in (s * rows..(s + 1) * rows).step_by(TILE) {
+            if phase == self.phases[0] {
+                // after the last tile of a shard comes the first of this thread's next one
+                let next = if at + TILE < (s + 1) * rows { at + TILE } else { (s + self.threads) * rows };
+                rows::prefetch(&self.rows, all.get(next..next + TILE).unwrap_or(&[]));
+            }
+            let tile = Tile { batch: self.batch, idx: &all[at..at + TILE], scale, advantage };
             self.algorithm.tile(phase, params, tile, work, &mut grad[..len]);
         }
     }

@@ -16,7 +16,7 @@ mod adversary;
 use super::combined::{Combined, CombinedWork, Gradient, Kind};
 use super::discriminator::{Discriminator, DiscriminatorWork, LATENT};
 use super::nets::NetSettings;
-use super::optimise::{Group, Params, Phases, SUMS, Schedule, Tile, add_sums, optimise};
+use super::optimise::{Group, Params, Phases, Rows, SUMS, Schedule, Tile, add_sums, optimise};
 use super::ppo::PpoSettings;
 use super::{Adam, Batch, Dims, Learner, Metrics};
 use adversary::{fool_discriminator, judge};
@@ -83,8 +83,31 @@ struct Nets {
     settings: Pid2Settings,
     combined: Combined,
     discriminator: Discriminator,
-    /// Latent noise (n x LATENT) of real, proposed and generator passes.
-    noise: [Vec<f32>; 3],
+    /// Latent noise (n x LATENT), read by three passes: see [`Nets::noise_shift`].
+    noise: Vec<f32>,
+}
+
+/// A pass through the bottleneck.
+#[derive(Clone, Copy)]
+enum Pass {
+    Real,
+    Proposed,
+    Generator,
+}
+
+impl Nets {
+    /// The rows by which a pass reads the table of latent noise apart from the others: no sample meets the same noise
+    /// twice, and a table of a third of the size stays in the caches.
+    fn noise_shift(&self, pass: Pass) -> usize {
+        pass as usize * (self.noise.len() / LATENT) / 3
+    }
+
+    /// Latent noise of sample `i` in a pass.
+    fn noise(&self, pass: Pass, i: usize) -> &[f32] {
+        let at = (i + self.noise_shift(pass)) * LATENT;
+        let at = if at >= self.noise.len() { at - self.noise.len() } else { at };
+        &self.noise[at..at + LATENT]
+    }
 }
 
 /// Buffers of one thread.
@@ -123,7 +146,7 @@ impl Pid2 {
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
         ];
         let params = Params { groups: vec![actor, judge], adam, beta: settings.beta };
-        let nets = Nets { settings, combined, discriminator, noise: [Vec::new(), Vec::new(), Vec::new()] };
+        let nets = Nets { settings, combined, discriminator, noise: Vec::new() };
         Self { nets, params, threads }
     }
 
@@ -135,13 +158,11 @@ impl Pid2 {
 impl Learner for Pid2 {
     /// One round of Algorithm 2 on the collected batch.
     fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics {
-        for noise in &mut self.nets.noise {
-            noise.resize(batch.n * LATENT, 0.0);
-            noise.fill_with(|| StandardNormal.sample(&mut *rng));
-        }
+        self.nets.noise.resize(batch.n * LATENT, 0.0);
+        self.nets.noise.fill_with(|| StandardNormal.sample(&mut *rng));
         let s = &self.nets.combined.ppo;
         let schedule = Schedule { epochs: s.n_epochs, minibatch: s.batch_size, threads: self.threads, rate };
-        let before = self.nets.combined.idm_error(self.actor(), batch);
+        let before = self.nets.combined.idm_error(self.actor(), batch, self.threads);
         let inverse_learns = before.is_some_and(|e| e >= self.nets.settings.idm_threshold);
         let mut phases = vec![ACTOR];
         if self.nets.settings.generator_weight > 0.0 {
@@ -162,7 +183,7 @@ impl Learner for Pid2 {
                 ("discriminator/beta", f64::from(self.params.beta)),
             ]);
         }
-        let after = self.nets.combined.idm_error(self.actor(), batch);
+        let after = self.nets.combined.idm_error(self.actor(), batch, self.threads);
         metrics.extend(super::idm_metrics(before, after, inverse_learns));
         metrics
     }
@@ -183,7 +204,7 @@ impl Learner for Pid2 {
     }
 
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
-        self.nets.combined.values(self.actor(), x)
+        self.nets.combined.values(self.actor(), x, self.threads)
     }
 }
 
@@ -237,6 +258,20 @@ impl Phases for Nets {
     }
     fn max_norm(&self, phase: usize) -> f32 {
         if phase == ACTOR { self.combined.ppo.max_grad_norm } else { f32::INFINITY }
+    }
+    /// The policy is judged.
+    fn reads_other_group(&self) -> bool {
+        true
+    }
+    fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>> {
+        let mut rows = self.combined.rows(batch);
+        if self.settings.generator_weight > 0.0 {
+            let n = self.combined.dims.n_state;
+            rows.extend([&batch.reached, &batch.proposal].map(|b| Rows::new(b, n)));
+            let shift = |pass| Rows::shifted(&self.noise, LATENT, self.noise_shift(pass));
+            rows.extend([Pass::Real, Pass::Proposed, Pass::Generator].map(shift));
+        }
+        rows
     }
     /// `beta <- max(0, beta + alpha (KL - I_c))`.
     fn after(&self, phase: usize, mean: &[f32; SUMS], params: &mut Params) {

@@ -7,7 +7,7 @@ use super::inverse::InverseModel;
 use super::losses::{mean_std, set_lanes, value_loss, values, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
-use super::optimise::{Group, Params, Phases, Schedule, TILE, Tile, add_sums, optimise};
+use super::optimise::{Group, Params, Phases, Rows, Schedule, TILE, Tile, add_sums, optimise};
 use super::{Adam, Dims, Learner, Metrics, init};
 use nearl_runtime::net::Dense;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars};
@@ -69,6 +69,12 @@ struct Nets {
     value: Net,
     inverse: InverseModel,
     len: usize,
+}
+
+impl Nets {
+    fn idm_error(&self, params: &Params, batch: &Batch, threads: usize) -> f64 {
+        self.inverse.error(&params.groups[INVERSE].p, batch, &self.dims, threads)
+    }
 }
 
 /// Buffers of one thread.
@@ -138,15 +144,15 @@ impl Learner for Ppo {
     }
 
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
-        values(&self.nets.value, &self.params.groups[ACTOR].p, x, self.nets.dims.n_obs)
+        values(&self.nets.value, &self.params.groups[ACTOR].p, x, self.nets.dims.n_obs, self.threads)
     }
 
     fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics {
         let s = &self.nets.settings;
-        let before = self.nets.inverse.error(&self.params.groups[INVERSE].p, batch, &self.nets.dims);
+        let before = self.nets.idm_error(&self.params, batch, self.threads);
         let schedule = Schedule { epochs: s.n_epochs, minibatch: s.batch_size, threads: self.threads, rate };
         let report = optimise(&self.nets, &mut self.params, batch, &[ACTOR, INVERSE], schedule, rng);
-        let after = self.nets.inverse.error(&self.params.groups[INVERSE].p, batch, &self.nets.dims);
+        let after = self.nets.idm_error(&self.params, batch, self.threads);
         let p = &self.params.groups[ACTOR].p;
         let log_std = &scalars(&p[self.nets.log_std.clone()])[..self.nets.dims.n_act];
         let mut metrics = vec![
@@ -223,6 +229,15 @@ impl Phases for Nets {
     }
     fn max_norm(&self, _: usize) -> f32 {
         self.settings.max_grad_norm
+    }
+    fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>> {
+        let d = &self.dims;
+        vec![
+            Rows::new(&batch.obs, d.n_obs),
+            Rows::new(&batch.sampled, d.n_act),
+            Rows::new(&batch.reached, d.n_state),
+            Rows::new(&batch.action, d.n_act),
+        ]
     }
 }
 

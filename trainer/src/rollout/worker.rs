@@ -31,6 +31,8 @@ pub struct Worker {
     pub(super) episode: (f64, usize),
     pub(super) cost: f64,
     pub(super) ticks: usize,
+    /// Policy steps left in the segment.
+    left: usize,
     pub(super) history: Episode,
     /// The collected rows.
     pub segment: Segment,
@@ -78,6 +80,7 @@ impl Worker {
             episode: (0.0, 0),
             cost: 0.0,
             ticks: 0,
+            left: 0,
             history: Episode::default(),
             segment: Segment::default(),
             tally: Tally::default(),
@@ -127,12 +130,25 @@ impl Worker {
 
     /// Collects `n_steps` policy steps.
     pub fn collect(&mut self, n_steps: usize) {
+        self.begin(n_steps);
+        self.go_on(n_steps);
+    }
+
+    /// Begins a segment of `n_steps` policy steps.
+    pub(super) fn begin(&mut self, n_steps: usize) {
         self.clear();
-        for t in 0..n_steps {
+        self.left = n_steps;
+    }
+
+    /// Collects the next `n` policy steps of the segment, or those that are left.
+    pub(super) fn go_on(&mut self, n: usize) {
+        for _ in 0..n.min(self.left) {
+            self.left -= 1;
             self.draw(true);
             let (reward, terminated) = self.policy_step();
             let truncated = self.ticks >= self.env.spec().max_episode_steps;
-            self.store(reward, terminated, truncated && !terminated, t, t + 1 == n_steps);
+            let t = self.segment.reward.len();
+            self.store(reward, terminated, truncated && !terminated, t, self.left == 0);
             if terminated || truncated {
                 self.tally.episodes.push(self.episode);
                 self.tally.costs.push(self.cost);

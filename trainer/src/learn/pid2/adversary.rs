@@ -1,11 +1,18 @@
 //! The adversary of PID^2 (Eq. 2): reached transitions are real, proposed ones are not.
 
-use super::super::discriminator::{LATENT, logit_slope, softplus_sum};
+use super::super::discriminator::{logit_slope, softplus_sum};
 use super::super::gaussian::{copy, gather};
 use super::super::optimise::{Group, Params, TILE, Tile, add_sums};
-use super::{JUDGE, Nets, Work};
+use super::{JUDGE, Nets, Pass, Work};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, scalars, scalars_mut};
+
+#[inline(always)]
+fn gather_noise(n: &Nets, pass: Pass, t: &Tile<'_>, to: &mut [V]) {
+    for (row, &i) in to.iter_mut().zip(t.idx) {
+        copy(&mut row.0, n.noise(pass, i as usize));
+    }
+}
 
 /// Non-saturating loss `-log D(E(s, pi(s)))`: adds its gradient to `dL / du`; returns its sum.
 #[inline(always)]
@@ -14,7 +21,7 @@ pub(super) fn fool_discriminator(n: &Nets, judge: &Group, t: &Tile<'_>, w: &mut 
     let (xv, sv) = ((o + s).div_ceil(LANES), s.div_ceil(LANES));
     let d = &mut w.discriminator;
     gather(&mut d.input, xv, 0, &t.batch.obs, o, t.idx);
-    gather(&mut d.noise, 1, 0, &n.noise[2], LATENT, t.idx);
+    gather_noise(n, Pass::Generator, t, &mut d.noise);
     let (x, u) = (scalars_mut(&mut d.input), scalars(w.actor.policy.output()));
     for r in 0..TILE {
         copy(&mut x[r * xv * LANES + o..][..s], &u[r * sv * LANES..][..s]);
@@ -39,12 +46,12 @@ fn discriminator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad
     let xv = (o + s).div_ceil(LANES);
     let (group, d) = (&params.groups[JUDGE], &mut w.discriminator);
     let (mut loss, mut kl, mut right) = (0.0, 0.0, 0.0);
+    gather(&mut d.input, xv, 0, &t.batch.obs, o, t.idx);
     for (real, sign) in [(true, 1.0), (false, -1.0)] {
-        let (change, noise) =
-            if real { (&t.batch.reached, &n.noise[0]) } else { (&t.batch.proposal, &n.noise[1]) };
-        gather(&mut d.input, xv, 0, &t.batch.obs, o, t.idx);
+        let (change, pass) =
+            if real { (&t.batch.reached, Pass::Real) } else { (&t.batch.proposal, Pass::Proposed) };
         gather(&mut d.input, xv, o, change, s, t.idx);
-        gather(&mut d.noise, 1, 0, noise, LATENT, t.idx);
+        gather_noise(n, pass, &t, &mut d.noise);
         kl += 0.5 * n.discriminator.forward(&group.p, d);
         loss += softplus_sum(&d.logit, sign);
         right += scalars(&d.logit).iter().filter(|&&l| l * sign > 0.0).count() as f32 * 0.5;

@@ -39,10 +39,8 @@ fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2,
         l.nets.refresh(phase, &mut l.params);
     }
     let batch = batch(&dims(), TILE, 3);
-    for noise in &mut l.nets.noise {
-        noise.resize(batch.n * LATENT, 0.0);
-        noise.fill_with(|| StandardNormal.sample(&mut rng));
-    }
+    l.nets.noise.resize(batch.n * LATENT, 0.0);
+    l.nets.noise.fill_with(|| StandardNormal.sample(&mut rng));
     (l, batch)
 }
 
@@ -69,6 +67,10 @@ fn judge(enc: &Net64, dec: &Net64, x: &[f64], noise: &[f64], bottleneck: bool) -
         }
     }
     (dec.forward(&z)[0], kl)
+}
+
+fn noise(l: &Pid2, pass: Pass, i: usize) -> Vec<f64> {
+    l.nets.noise(pass, i).iter().map(|&x| f64::from(x)).collect()
 }
 
 struct Nets64 {
@@ -110,7 +112,7 @@ fn actor_loss(l: &Pid2, b: &Batch, n: &Nets64) -> f64 {
         };
         let e = n.value.forward(&obs)[0] - f64::from(b.returns[i]);
         let x = [obs, u].concat();
-        let noise = row(&l.nets.noise[2], i, LATENT);
+        let noise = noise(l, Pass::Generator, i);
         let (logit, _) = judge(&n.enc, &n.dec, &x, &noise, true);
         reference::surrogate(b, i, log_prob, 0.2) + 0.5 * e * e + 0.7 * softplus(-logit)
     };
@@ -164,8 +166,8 @@ fn discriminator_gradients_equal_central_differences() {
                 let obs = row(&b.obs, i, d.n_obs);
                 let real = [obs.clone(), row(&b.reached, i, d.n_state)].concat();
                 let fake = [obs, row(&b.proposal, i, d.n_state)].concat();
-                let (lr, kr) = judge(enc, dec, &real, &row(&l.nets.noise[0], i, LATENT), bottleneck);
-                let (lf, kf) = judge(enc, dec, &fake, &row(&l.nets.noise[1], i, LATENT), bottleneck);
+                let (lr, kr) = judge(enc, dec, &real, &noise(&l, Pass::Real, i), bottleneck);
+                let (lf, kf) = judge(enc, dec, &fake, &noise(&l, Pass::Proposed, i), bottleneck);
                 softplus(-lr) + softplus(lf) + 0.2 * 0.5 * (kr + kf)
             };
             (0..b.n).map(one).sum::<f64>() / b.n as f64
