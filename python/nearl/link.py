@@ -1,4 +1,4 @@
-"""Constrained rollouts from a server on this machine, over shared memory.
+"""Constrained rollouts from a server on this machine, and a running loop's states and weights, over shared memory.
 
     # Terminal 1
     nearl serve panda.safetensors --name panda
@@ -6,16 +6,25 @@
     with nearl.Link("panda") as link:
         for chunk in link.rollout(seed=0, n_steps=10_000):
             learn(chunk.obs, chunk.action, chunk.reward, chunk.terminated)
+
+    # With `nearl plant` and `nearl run --plant arm` in other terminals
+    with nearl.Link("arm") as link:
+        states = link.states()                 # every tick since the last call, with its policy version
+        receipt = link.push("better.safetensors")
+        print(receipt.accepted, receipt.text)
 """
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nearl import _core
+from nearl.states import Receipt, States, from_arrays
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -124,17 +133,18 @@ class Rollout(Iterator[Chunk]):
 
 
 class Link:
-    """Connection to the servers of one name on this machine.
+    """Connection to the rollout server, or to the running loop, of one name on this machine.
 
     Args:
-        name: As in ``nearl serve SNAPSHOT --name NAME``.
-        patience: Longest wait for the server, and for each chunk [s].
+        name: As in ``nearl serve SNAPSHOT --name NAME`` or ``nearl run SNAPSHOT --plant NAME``.
+        patience: Longest wait for server or loop, and for each chunk, state or receipt [s].
     """
 
     def __init__(self, name: str, patience: float = 10.0) -> None:
         self.name = name
         self._patience = patience
         self._client: _core.RolloutClient | None = None
+        self._loop: _core.LoopClient | None = None
 
     def rollout(
         self, seed: int, n_steps: int, noise: bool = True, version: int | None = None, constraints: bool | int = True
@@ -166,8 +176,40 @@ class Link:
             self._client = _core.RolloutClient(self.name, self._patience)
         return Rollout(self._client.request(seed, n_steps, noise, version, wanted), self._patience)
 
+    def states(self) -> States:
+        """Every tick of the loop since the last call (the first call begins now), at least one.
+
+        The loop keeps 1024 ticks for a reader that is behind; ``lost`` counts older ones.
+
+        Raises:
+            ConnectionError: there is no loop.
+            TimeoutError: the loop acts on nothing: it holds, or it is gone.
+        """
+        arrays, lost = self._running().transitions(self._patience)
+        if not len(arrays["tick"]):
+            raise TimeoutError(f"the loop of `{self.name}` sent nothing for {self._patience} s; see its mode with nearl run --json")
+        return from_arrays(arrays, lost)
+
+    def push(self, snapshot: str | os.PathLike[str] | bytes) -> Receipt:
+        """Puts a snapshot (a file or its bytes) into the running loop; what does not fit the robot is refused.
+
+        Raises:
+            OSError: the file cannot be read.
+            ConnectionError: there is no loop, no answer came, or another trainer pushes to it.
+        """
+        data = snapshot if isinstance(snapshot, bytes) else Path(snapshot).read_bytes()
+        return Receipt(*self._running().push(data, self._patience))
+
+    def _running(self) -> _core.LoopClient:
+        if self._loop is None:
+            self._loop = _core.LoopClient(self.name, self._patience)
+        return self._loop
+
     def close(self) -> None:
         """Leaves; rollouts under way can still be read."""
+        if self._loop is not None:
+            self._loop.close()
+            self._loop = None
         if self._client is not None:
             self._client.close()
             self._client = None

@@ -10,6 +10,7 @@ mod errors;
 mod lane;
 mod limits;
 mod link;
+mod loop_link;
 mod model;
 mod pool;
 mod projector;
@@ -33,6 +34,8 @@ mod _core {
     };
     #[pymodule_export]
     use super::link::{RolloutClient, Rollouts, rollout_ledger};
+    #[pymodule_export]
+    use super::loop_link::{LoopClient, loop_modes};
     #[pymodule_export]
     use super::model::Model;
     #[pymodule_export]

@@ -12,7 +12,7 @@ use pyo3::prelude::*;
 use crate::errors;
 
 /// Between two looks at Python's signals while waiting.
-const SIGNALS: Duration = Duration::from_millis(100);
+pub(crate) const SIGNALS: Duration = Duration::from_millis(100);
 
 fn error(py: Python<'_>, error: RequestError) -> PyErr {
     match error {
@@ -35,7 +35,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// Time in [s] from Python.
-fn seconds(patience: f64) -> PyResult<Duration> {
+pub(crate) fn seconds(patience: f64) -> PyResult<Duration> {
     Duration::try_from_secs_f64(patience).map_err(|_| {
         PyValueError::new_err(format!("patience is {patience} s; give a finite time of at least 0"))
     })

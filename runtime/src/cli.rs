@@ -1,5 +1,7 @@
 //! Subcommands of a robot's program: `nearl-runtime` has them, and `nearl` has the same.
 
+mod limits;
+
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
@@ -8,6 +10,7 @@ use crate::codes::{self, Explanation};
 use crate::link::{RobotName, bench_round_trip};
 use crate::log::replay;
 use crate::rt::{FaultPlan, Percentiles, RunSettings, Stop, ThreadSettings, bench_wake, run};
+pub use limits::LimitOptions;
 
 /// Run a snapshot on a plant in real time.
 #[derive(Args, Debug)]
@@ -35,6 +38,9 @@ pub struct RunCommand {
     /// A joint may move so many times further than its speed allows before its sample is rejected; 0 checks nothing.
     #[arg(long, default_value_t = 3.0)]
     pub jump: f64,
+    /// Explore: act with the policy's own noise, drawn from this seed, for a trainer that learns from the loop. Every limit still holds.
+    #[arg(long, value_name = "SEED")]
+    pub explore: Option<u64>,
     /// Rehearse the faults in this JSON file.
     #[arg(long)]
     pub faults: Option<PathBuf>,
@@ -50,6 +56,9 @@ pub struct RunCommand {
     /// Print the report as JSON.
     #[arg(long)]
     pub json: bool,
+    /// When the loop changes its mode.
+    #[command(flatten)]
+    pub limits: LimitOptions,
 }
 
 /// Compute every tick of a flight log again and compare it bit for bit.
@@ -156,7 +165,11 @@ impl RunCommand {
             }
         }
         let faults = self.faults.as_deref().map(FaultPlan::load).transpose()?.unwrap_or_default();
+        let (modes, rollback) = self.limits.settings()?;
         let settings = RunSettings {
+            modes,
+            rollback,
+            explore: self.explore,
             age_limit: self.age_limit,
             ramp: self.ramp,
             jump: self.jump,

@@ -8,6 +8,7 @@
 //! input: zero on the robot. Nothing is allocated after [`Controller::new`] but Clarabel's one block.
 
 mod maths;
+mod noise;
 mod parts;
 
 pub use parts::{Parts, seen_entries};
@@ -368,6 +369,11 @@ impl Controller {
     pub fn reset(&mut self) {
         self.tick = 0;
         self.projector.forget();
+    }
+
+    /// Whether the policy runs in the next tick.
+    pub fn begins_period(&self) -> bool {
+        self.tick.is_multiple_of(self.policy_every)
     }
 
     /// What the next policy tick depends on beside its arguments, as plain numbers; see [`Projector::memory`].

@@ -11,7 +11,7 @@ use nearl_runtime::Snapshot;
 use nearl_runtime::link::{RobotName, remove_files};
 use nearl_runtime::rollout_protocol::*;
 use nearl_runtime::rt::Stop;
-use nearl_trainer::rollout::{Collector, Worker, make_env, stream};
+use nearl_trainer::rollout::{Worker, make_env, stream};
 use nearl_trainer::serve::{Report, Settings, serve};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
@@ -339,44 +339,24 @@ fn a_client_outlives_its_server_and_asks_the_next_one() {
     assert_eq!((&report["done"], &report["closed"]), (&1.into(), &1.into()), "{report}");
 }
 
-/// Processor time of this process, all threads [s]; it says more than the clock where others use the machine.
-fn processor() -> f64 {
-    let mut time = libc::timespec { tv_sec: 0, tv_nsec: 0 };
-    // SAFETY: writes the struct it is given.
-    assert_eq!(unsafe { libc::clock_gettime(libc::CLOCK_PROCESS_CPUTIME_ID, &raw mut time) }, 0);
-    time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
-}
-
-/// Steps per second of the clock, and of processor time.
-fn rates(steps: f64, run: impl FnOnce()) -> [f64; 2] {
-    let (start, used) = (Instant::now(), processor());
-    run();
-    [steps / start.elapsed().as_secs_f64(), steps / (processor() - used)]
-}
-
-/// Prints the rates beside in-process collection with as many environments and threads; nothing is asserted of them.
+/// The rates themselves are for the reader; here only that they are measured.
 #[test]
-fn throughput_beside_collection_in_the_same_process() {
-    let (name, snapshot) = (Name::new("rate"), snapshot());
-    let (clients, steps, threads) = (4, 2000, 2);
-    let mut collector = Collector::new(&snapshot, clients, steps, threads, 0.99, 0).expect("collector");
-    let server = Serving::start(&name, threads, clients);
-    let mut open: Vec<_> = (0..clients).map(|_| name.client()).collect();
-    let (rounds, total) = (3, (clients * steps) as f64);
-    for _ in 0..rounds {
-        let collected = rates(total, || collector.collect());
-        let served = rates(total, || {
-            std::thread::scope(|scope| {
-                for (seed, client) in open.iter_mut().enumerate() {
-                    scope.spawn(move || rollout(client, &Request::new(seed as u64, steps as u64)));
-                }
-            });
-        });
-        for (i, per) in ["s", "processor s"].iter().enumerate() {
-            let (served, collected) = (served[i], collected[i]);
-            let share = 100.0 * served / collected;
-            println!("served {served:.0} steps/{per}, collected {collected:.0} steps/{per}: {share:.0} %");
-        }
+fn the_benchmark_prints_served_beside_collected() {
+    let panda = panda();
+    let arguments = [
+        "bench",
+        "serve",
+        panda.to_str().expect("UTF-8"),
+        "--steps",
+        "200",
+        "--repeat",
+        "1",
+        "--clients",
+        "2",
+        "--json",
+    ];
+    let rates = Process::nearl(&arguments).json();
+    for key in ["served_steps_per_s", "collected_steps_per_s", "ratio", "processor_ratio"] {
+        assert!(rates[key].as_f64().is_some_and(|r| r.is_finite() && r > 0.0), "{key}: {rates}");
     }
-    assert_eq!(server.end().done, rounds * clients as u64);
 }

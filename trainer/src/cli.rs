@@ -1,6 +1,7 @@
 //! The `nearl` command line: one file a subcommand.
 
 mod bench;
+mod bench_serve;
 mod demo;
 mod eval;
 mod plant;

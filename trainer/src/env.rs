@@ -43,6 +43,19 @@ pub struct Step {
     pub fault: Fault,
 }
 
+/// A state as a plant sends it.
+#[derive(Debug, Clone, Copy)]
+pub struct Moment<'a> {
+    /// Configuration (nq), Pinocchio's convention.
+    pub q: &'a [f64],
+    /// Velocity (nv), Pinocchio's convention.
+    pub v: &'a [f64],
+    /// Observation (n_obs); the goal is read from it.
+    pub obs: &'a [f64],
+    /// The plant's own time \[s\].
+    pub time: f64,
+}
+
 /// Why a control period is not to be believed. The robot then needs [`Env::reset`] or [`Env::set_state`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
@@ -107,6 +120,14 @@ pub trait Env: Send {
     /// # Panics
     /// When `action` has not [`Spec::n_act`] entries.
     fn step(&mut self, action: &[f64]) -> Step;
+
+    /// What a control period would have given that led from `from` to `to` under `action` (n_act): the task's own judgement
+    /// of what happened elsewhere, on a robot or in another process. The environment is left in `to`, with its goal. Rewards of
+    /// contact forces are those of `to` at rest in its contacts, as far as MuJoCo can tell from the state alone.
+    ///
+    /// # Errors
+    /// [`EnvError::Physics`] for a wrong length or an entry that is not finite.
+    fn judge(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError>;
 
     /// Writes the observation (n_obs), in the order of [`Spec::obs`].
     fn observe(&self, obs: &mut [f64]);

@@ -9,6 +9,7 @@ pub mod env;
 pub mod evaluate;
 pub mod learn;
 pub mod mj;
+pub mod online;
 pub mod plant;
 pub mod rollout;
 pub mod run_folder;

@@ -4,9 +4,11 @@
 //! same bits whatever the number of threads.
 
 mod resume;
+mod rows;
 mod segment;
 mod worker;
 
+pub use rows::{Period, Rows};
 pub use segment::{Segment, Tally};
 pub use worker::Worker;
 
@@ -126,15 +128,6 @@ impl Collector {
     /// The workers in a fixed order.
     pub fn workers(&mut self) -> impl Iterator<Item = &mut Worker> {
         self.workers.iter_mut().map(|w| w.get_mut().unwrap_or_else(std::sync::PoisonError::into_inner))
-    }
-
-    /// Sums what was counted in the last segment, in a fixed order.
-    pub fn tally(&mut self) -> Tally {
-        let mut sum = Tally::default();
-        for w in self.workers() {
-            sum.add(&w.tally);
-        }
-        sum
     }
 }
 

@@ -3,13 +3,15 @@
 mod columns;
 mod resume;
 mod setup;
+mod source;
 
 pub use columns::COLUMNS;
 pub use setup::complete;
+pub use source::{Experience, Gathered, Source, SourceError};
 
 use crate::checkpoint::{self, Checkpoint, CheckpointError};
 use crate::learn::{Batch, Dims, Learner, Metrics, advantages};
-use crate::rollout::{Collector, RolloutError, Segment, Tally, stream};
+use crate::rollout::{RolloutError, Segment, Tally, stream};
 use crate::run_folder::{RunError, RunFolder};
 use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
@@ -44,6 +46,9 @@ pub enum TrainError {
     /// Rollouts.
     #[error(transparent)]
     Rollout(#[from] RolloutError),
+    /// Where experience comes from.
+    #[error(transparent)]
+    Source(#[from] SourceError),
     /// The run folder.
     #[error(transparent)]
     Run(#[from] RunError),
@@ -94,7 +99,7 @@ pub struct Training {
     settings: TrainSettings,
     snapshot: Snapshot,
     learner: Box<dyn Learner>,
-    collector: Collector,
+    source: Box<dyn Source>,
     /// The last batch: its memory is used again.
     batch: Batch,
     dims: Dims,
@@ -121,6 +126,14 @@ impl Training {
     /// # Errors
     /// [`TrainError`] in one sentence.
     pub fn new(request: &Request) -> Result<Self, TrainError> {
+        Self::on(request, &Experience::Here)
+    }
+
+    /// The same with experience from elsewhere.
+    ///
+    /// # Errors
+    /// [`TrainError`] in one sentence.
+    pub fn on(request: &Request, experience: &Experience) -> Result<Self, TrainError> {
         let mut manifest = request.manifest.clone();
         let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
         manifest.algo.clone_from(&request.algo);
@@ -146,18 +159,7 @@ impl Training {
         }
         let networks = learner.networks(&normaliser);
         let snapshot = Snapshot { manifest, networks };
-        let mut collector = Collector::new(
-            &snapshot,
-            settings.n_envs,
-            settings.n_steps,
-            request.threads,
-            settings.gamma,
-            request.seed,
-        )?;
-        for worker in collector.workers() {
-            worker.set_projection(settings.project_in_training);
-            worker.set_moved_penalty(settings.moved_penalty);
-        }
+        let source = experience.open(&snapshot, &settings, request.threads, request.seed)?;
         Ok(Self {
             obs_stats: RunningStats::new(dims.n_obs),
             change_stats: RunningStats::new(dims.n_state),
@@ -165,7 +167,7 @@ impl Training {
             settings,
             snapshot,
             learner,
-            collector,
+            source,
             batch: Batch::default(),
             dims,
             rng,
@@ -179,11 +181,29 @@ impl Training {
         })
     }
 
-    /// Collects and learns once. The first batch only fills the statistics of observations, changes and returns.
+    /// [`Training::step`] on environments of this process, which neither fail nor stop.
+    ///
+    /// # Panics
+    /// When the experience comes from elsewhere and ends.
     pub fn iterate(&mut self) -> Progress {
-        self.collector.set_networks(&self.snapshot.networks);
-        self.collector.collect();
-        let tally = self.collector.tally();
+        match self.step() {
+            Ok(Some(progress)) => progress,
+            Ok(None) => panic!("the source of experience was stopped"),
+            Err(e) => panic!("{e}"),
+        }
+    }
+
+    /// Collects and learns once; `None` if a stop came before the batch was full. The first batch only fills the statistics of
+    /// observations, changes and returns.
+    ///
+    /// # Errors
+    /// [`TrainError::Source`].
+    pub fn step(&mut self) -> Result<Option<Progress>, TrainError> {
+        if !self.source.collect(&self.snapshot)? {
+            return Ok(None);
+        }
+        let mut tally = Tally::default();
+        self.source.gathered().iter().for_each(|g| tally.add(g.tally));
         self.recent.extend_from_slice(&tally.episodes);
         let excess = self.recent.len().saturating_sub(100);
         self.recent.drain(..excess);
@@ -192,7 +212,7 @@ impl Training {
         let rate = if self.settings.anneal { 1.0 - self.fraction() as f32 } else { 1.0 };
         let learns = self.snapshot.manifest.steps > 0;
         self.merge_statistics();
-        let metrics = if learns {
+        let mut metrics = if learns {
             self.fill_batch();
             let start = Instant::now();
             let metrics = self.learner.update(&self.batch, rate, &mut self.rng);
@@ -201,12 +221,13 @@ impl Training {
         } else {
             Metrics::new()
         };
+        metrics.extend(self.source.notes());
         self.snapshot.manifest.steps += (self.settings.n_envs * self.settings.n_steps) as u64;
         self.snapshot.manifest.version += 1;
         self.refresh();
         let mean =
             |f: fn(&(f64, usize)) -> f64| self.recent.iter().map(f).sum::<f64>() / self.recent.len() as f64;
-        Progress {
+        Ok(Some(Progress {
             steps: self.snapshot.manifest.steps,
             seconds: self.seconds(),
             return_mean: mean(|e| e.0),
@@ -214,7 +235,7 @@ impl Training {
             cost_mean: self.recent_costs.iter().sum::<f64>() / self.recent_costs.len() as f64,
             tally,
             metrics,
-        }
+        }))
     }
 
     /// Asks for `steps` more than were done so far.
@@ -239,7 +260,7 @@ impl Training {
 
     /// What each environment collected last, in a fixed order.
     pub fn segments(&mut self) -> impl Iterator<Item = &Segment> {
-        self.collector.workers().map(|w| &w.segment)
+        self.source.gathered().into_iter().map(|g| g.segment)
     }
 
     /// Seconds of training, those before a resume included.
@@ -253,10 +274,10 @@ impl Training {
     }
 
     fn merge_statistics(&mut self) {
-        for w in self.collector.workers() {
-            self.obs_stats.merge(&w.obs_stats);
-            self.change_stats.merge(&w.change_stats);
-            self.return_stats.merge(&w.return_stats);
+        for g in self.source.gathered() {
+            self.obs_stats.merge(g.obs_stats);
+            self.change_stats.merge(g.change_stats);
+            self.return_stats.merge(g.return_stats);
         }
     }
 
@@ -280,8 +301,8 @@ impl Training {
         b.n = self.settings.n_envs * n_steps;
         let scale = if self.settings.scale_reward { 1.0 / self.return_stats.std(1e-8)[0] } else { 1.0 };
         let mut cuts = Vec::new();
-        for w in self.collector.workers() {
-            let s = &w.segment;
+        for g in self.source.gathered() {
+            let s = g.segment;
             b.obs.extend_from_slice(&s.x);
             if proposes {
                 b.proposal.extend_from_slice(&s.change);
@@ -298,10 +319,12 @@ impl Training {
             cuts.push((reward, finals, s.terminated.clone(), s.truncated.clone()));
         }
         let values = self.learner.values(&b.obs);
-        for (i, (reward, finals, terminated, truncated)) in cuts.iter().enumerate() {
+        let mut first = 0;
+        for (reward, finals, terminated, truncated) in &cuts {
             let final_values = self.learner.values(finals);
             let (gamma, lambda) = (self.settings.gamma as f32, self.settings.gae_lambda as f32);
-            let value = &values[i * n_steps..][..n_steps];
+            let value = &values[first..][..reward.len()];
+            first += reward.len();
             let a = advantages(reward, value, terminated, truncated, &final_values, gamma, lambda);
             b.advantage.extend(a.advantage);
             b.returns.extend(a.returns);
@@ -322,7 +345,20 @@ pub fn train(
     out: &Path,
     report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
-    let training = Training::new(request)?;
+    train_on(request, &Experience::Here, out, report)
+}
+
+/// [`train`] with experience from elsewhere.
+///
+/// # Errors
+/// [`TrainError`].
+pub fn train_on(
+    request: &Request,
+    experience: &Experience,
+    out: &Path,
+    report: impl FnMut(&Progress, f64) -> bool,
+) -> Result<PathBuf, TrainError> {
+    let training = Training::on(request, experience)?;
     let folder = RunFolder::create(out, &training.snapshot().manifest, request.seed, COLUMNS)?;
     run(training, folder, report)
 }
@@ -339,8 +375,22 @@ pub fn resume(
     threads: usize,
     report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
+    resume_on(path, &Experience::Here, steps, threads, report)
+}
+
+/// [`resume`] with experience from elsewhere: weights, statistics and schedule go on, episodes begin anew.
+///
+/// # Errors
+/// [`TrainError`].
+pub fn resume_on(
+    path: &Path,
+    experience: &Experience,
+    steps: Option<u64>,
+    threads: usize,
+    report: impl FnMut(&Progress, f64) -> bool,
+) -> Result<PathBuf, TrainError> {
     let file = checkpoint::path_in(path);
-    let training = Training::resume(Checkpoint::load(&file)?, &file, steps, threads)?;
+    let training = Training::resume_on(Checkpoint::load(&file)?, &file, experience, steps, threads)?;
     let manifest = &training.snapshot().manifest;
     let folder = RunFolder::reopen(path, COLUMNS, manifest.steps, manifest.version)?;
     run(training, folder, report)
@@ -355,7 +405,15 @@ fn run(
     let (mut next_save, mut saved) = (every, Instant::now());
     let mut go_on = true;
     while go_on && !training.is_done() {
-        let progress = training.iterate();
+        let progress = match training.step() {
+            Ok(Some(progress)) => progress,
+            Ok(None) => break,
+            Err(e) => {
+                // What was learned is kept; the reason is what the caller hears.
+                training.save(&folder)?;
+                return Err(e);
+            }
+        };
         folder.row(&training.row(&progress))?;
         go_on = report(&progress, training.fraction());
         if progress.steps >= next_save || saved.elapsed().as_secs_f64() > SAVE_SECONDS {

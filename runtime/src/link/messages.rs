@@ -161,7 +161,7 @@ pub struct LedgerNumbers {
 
 message! {
     /// One tick as the trainer learns from it.
-    TransitionMessage, "transition", version 2, buffer 1024, history 0, subscribers 2 {
+    TransitionMessage, "transition", version 3, buffer 1024, history 0, subscribers 2 {
         /// Tick of the runtime.
         tick: u64,
         /// `header.epoch` of the plant.
@@ -186,6 +186,14 @@ message! {
         nu: u32,
         /// Entries used in `obs`.
         n_obs: u32,
+        /// 1 if the noise of the tick was drawn from `explore`, 0 if there was none.
+        explores: u32,
+        /// Ticks since the policy ran; 0 where it ran in this one.
+        period_tick: u32,
+        /// Seed of the noise: [`Noise::draw`](crate::Noise::draw) with it and the last tick in which the policy ran gives the noise again.
+        explore: u64,
+        /// Time of the plant's own clock [s].
+        time: f64,
         /// Reward reported with the next state.
         reward: f64,
         /// Log probability of the proposal.

@@ -37,6 +37,9 @@ pub struct CoreSettings {
     pub ramp: u32,
     /// When to change the mode.
     pub modes: ModeLimits,
+    /// Seed of the exploration noise; without one there is none.
+    #[serde(default)]
+    pub explore: Option<u64>,
 }
 
 /// What the world brought to a tick: with the history, everything it depends on.
@@ -222,6 +225,10 @@ impl<T: Tick> Core<T> {
     /// The controller's tick, softened while the first motion is let in.
     fn tick(&mut self) -> Event {
         self.controller.controller.set_noise(self.record.noise);
+        // A rehearsed fault takes the place of exploration.
+        if let (Some(seed), true) = (self.settings.explore, self.record.noise == 0.0) {
+            self.controller.controller.explore(seed, self.record.tick);
+        }
         let outcome = match self.faults.panics(self.record.tick) {
             true => self.call(|_, _, _| panic!("rehearsed panic of the controller")),
             false => self.call(T::tick),

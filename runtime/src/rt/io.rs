@@ -39,6 +39,7 @@ pub(crate) struct Io<B: Build> {
     pub(crate) bell: Arc<Bell>,
     pub(crate) snapshots: SnapshotInbox<B>,
     pub(crate) log: Option<LogQueue>,
+    pub(crate) explore: Option<u64>,
     pub(crate) period: u64,
     pub(crate) polls_always: bool,
     pub(crate) health: Health,
@@ -123,7 +124,7 @@ impl<B: Build> Io<B> {
                 // What was predicted or could not be used was not experienced.
                 let is_measured = previous.sensed == Sensed::Measured && record.sensed == Sensed::Measured;
                 if previous.step.nu > 0 && is_measured {
-                    self.link.send_transition(&mut transition(previous, &record.state));
+                    self.link.send_transition(&mut transition(previous, &record.state, self.explore));
                 }
             }
             match &mut self.traffic.previous {
@@ -186,7 +187,7 @@ impl<B: Build> Io<B> {
 }
 
 /// The transition from one record to the state that followed it.
-fn transition(record: &Record, next: &StateMessage) -> TransitionMessage {
+fn transition(record: &Record, next: &StateMessage, explore: Option<u64>) -> TransitionMessage {
     let mut m = TransitionMessage::zeroed();
     let (state, step) = (&record.state, &record.step);
     m.tick = record.tick;
@@ -197,6 +198,8 @@ fn transition(record: &Record, next: &StateMessage) -> TransitionMessage {
     m.episode = state.episode;
     m.next_bits = next.bits;
     m.mode = record.mode.code();
+    (m.explores, m.explore) = (u32::from(explore.is_some()), explore.unwrap_or(0));
+    (m.period_tick, m.time) = (step.period_tick, state.time);
     (m.nq, m.nv, m.nu, m.n_obs) = (state.nq, state.nv, step.nu, state.n_obs);
     m.reward = next.reward;
     (m.log_prob_proposal, m.log_prob_action) = (step.log_prob_proposal, step.log_prob_action);

@@ -31,6 +31,8 @@ pub struct Pilot {
     /// Scratch, with room for what is shared.
     memory: Vec<f64>,
     memory_len: usize,
+    /// Ticks since the policy ran.
+    period_tick: u32,
 }
 
 impl Pilot {
@@ -52,6 +54,7 @@ impl Pilot {
             limits: number_of(controller.limits()),
             memory_len: 1 + controller.memory().len(),
             memory: controller.memory(),
+            period_tick: 0,
             controller,
         })
     }
@@ -71,6 +74,7 @@ impl Pilot {
         let (nq, nv) = (state.q.len(), state.v.len());
         step.nu = output.action.len() as u32;
         step.action[..output.action.len()].copy_from_slice(&output.action);
+        step.period_tick = self.period_tick;
         step.log_prob_proposal = output.log_prob_proposal;
         step.log_prob_action = output.log_prob_action;
         for q in [&mut step.proposal_q, &mut step.target_q] {
@@ -143,6 +147,7 @@ impl Tick for Pilot {
         self.state.v.copy_from_slice(state.v());
         self.state.obs.copy_from_slice(state.obs());
         let status = self.controller.update(&self.state, &self.noise, &mut self.output);
+        self.period_tick = if self.output.policy_tick { 0 } else { self.period_tick + 1 };
         self.write(step);
         self.share(false);
         if self.proposes { outcome(status) } else { refused_or_acted(status) }
@@ -188,6 +193,12 @@ impl Tick for Pilot {
 
     fn set_noise(&mut self, noise: f32) {
         self.noise.proposal.fill(noise);
+    }
+
+    fn explore(&mut self, seed: u64, tick: u64) {
+        if self.controller.begins_period() {
+            self.noise.draw(seed, tick);
+        }
     }
 
     fn predict(&self, state: &mut StateMessage, step: &Step) {

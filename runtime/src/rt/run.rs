@@ -57,6 +57,8 @@ pub struct RunSettings {
     pub ramp: f64,
     /// When to brake and when to come back.
     pub modes: ModeLimits,
+    /// Seed of the exploration noise; without one the policy acts without noise.
+    pub explore: Option<u64>,
     /// When a swapped-in snapshot is taken back.
     pub rollback: RollbackSettings,
     /// Faults to rehearse.
@@ -88,6 +90,7 @@ impl Default for RunSettings {
             jump: 3.0,
             ramp: 0.2,
             modes: ModeLimits::default(),
+            explore: None,
             rollback: RollbackSettings::default(),
             faults: FaultPlan::default(),
             thread: ThreadSettings { priority: Some(40), cpu: None, lock_memory: true },
@@ -236,6 +239,7 @@ fn assemble<B: Build>(
         bell,
         snapshots: SnapshotInbox::new(builder, swap, settings.rollback),
         log,
+        explore: settings.explore,
         health,
         traffic: Traffic::default(),
     };
@@ -256,6 +260,7 @@ fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings
             jump: settings.jump,
             ramp: (settings.ramp / robot.dt).round() as u32,
             modes: settings.modes,
+            explore: settings.explore,
         },
         spin: if robot.is_lockstep() { 0 } else { clock::nanoseconds(settings.spin) },
         ticks: settings.ticks.or(settings.seconds.map(|s| (s / robot.dt).round() as u64)),

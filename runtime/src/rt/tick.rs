@@ -17,6 +17,8 @@ pub trait Tick: Send + 'static {
     fn reset(&mut self);
     /// Sets every entry of the proposal's noise; 0 on a robot unless a rehearsed fault asks for another number.
     fn set_noise(&mut self, _noise: f32) {}
+    /// Draws the noise of `tick` from `seed`, if the policy runs in it.
+    fn explore(&mut self, _seed: u64, _tick: u64) {}
     /// What the next tick depends on beside its state, in place of what is in `memory`; a way to stop that was verified, for one.
     /// Allocates only where `memory` has no room.
     fn save_memory(&self, _memory: &mut Vec<f64>) {}
@@ -76,6 +78,8 @@ pub struct Step {
     pub target_v: [f64; MAX_JOINTS],
     /// Action in the plant's units (nu).
     pub action: [f64; MAX_JOINTS],
+    /// Ticks since the policy ran; 0 where it ran in this one.
+    pub period_tick: u32,
     /// Log probability of the proposal.
     pub log_prob_proposal: f64,
     /// Log probability of the action.
@@ -120,6 +124,7 @@ impl Step {
             target_q: zero,
             target_v: zero,
             action: zero,
+            period_tick: 0,
             log_prob_proposal: 0.0,
             log_prob_action: 0.0,
             ledger: LedgerNumbers::default(),

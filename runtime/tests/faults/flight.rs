@@ -35,6 +35,7 @@ pub fn settings() -> CoreSettings {
         jump: 3.0,
         ramp: 50,
         modes: ModeLimits::default(),
+        explore: None,
     }
 }
 

@@ -48,6 +48,11 @@ impl Process {
         Process(Some(command.spawn().expect("start of a child")))
     }
 
+    /// Process id.
+    pub fn id(&self) -> u32 {
+        self.0.as_ref().expect("a running child").id()
+    }
+
     /// Sends `signal`.
     pub fn signal(&self, signal: libc::c_int) {
         let id = self.0.as_ref().expect("a running child").id();

@@ -26,6 +26,8 @@ enum What {
     Update(Ticks),
     /// One projection: percentiles beside an empty timer.
     Projection(Ticks),
+    /// Rollouts served over shared memory, beside as many collected in this process.
+    Serve(super::bench_serve::ServeBench),
     #[command(flatten)]
     Loop(nearl_runtime::cli::LoopBench),
 }
@@ -77,6 +79,7 @@ impl Bench {
             What::Train(b) => b.run(),
             What::Update(b) => b.run(true),
             What::Projection(b) => b.run(false),
+            What::Serve(b) => b.run(),
             What::Loop(b) => b.run(),
         }
     }

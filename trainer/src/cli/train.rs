@@ -2,10 +2,11 @@
 
 use super::{Failure, cores, say};
 use crate::checkpoint::{self, Checkpoint};
-use crate::train::{Progress, Request, train};
+use crate::train::{Experience, Progress, Request, resume_on, train_on};
 use crate::{run_folder, tasks};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
+use nearl_runtime::link::RobotName;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -30,6 +31,10 @@ pub(super) struct Train {
     /// if it had never stopped.
     #[arg(long, value_name = "DIR")]
     resume: Option<PathBuf>,
+    /// Learn from the running loop of this robot instead of environments of one's own, and push snapshots back while it runs:
+    /// `nearl plant TASK --name NAME`, then `nearl run SNAPSHOT --plant NAME --explore SEED`.
+    #[arg(long, value_name = "NAME")]
+    from: Option<String>,
     /// Threads; all cores when absent. The result does not depend on it.
     #[arg(long)]
     threads: Option<usize>,
@@ -99,6 +104,10 @@ impl Train {
             signal_hook::flag::register_conditional_shutdown(signal, 1, Arc::clone(&stop))?;
             signal_hook::flag::register(signal, Arc::clone(&stop))?;
         }
+        let experience = match &self.from {
+            Some(name) => Experience::Loop(RobotName::new(name)?, Arc::clone(&stop)),
+            None => Experience::Here,
+        };
         let bar = bar(self.json, run.steps);
         let mut last = None;
         let report = |p: &Progress, _| {
@@ -107,14 +116,19 @@ impl Train {
             !stop.load(Ordering::Relaxed)
         };
         let saved = match &self.resume {
-            Some(folder) => crate::train::resume(folder, self.steps, threads, report)?,
+            Some(folder) => resume_on(folder, &experience, self.steps, threads, report)?,
             None => {
                 let (algo, steps) = (run.algo.clone(), run.steps);
-                train(&Request { manifest, algo, steps, seed: self.seed, threads }, &out, report)?
+                let request = Request { manifest, algo, steps, seed: self.seed, threads };
+                train_on(&request, &experience, &out, report)?
             }
         };
         bar.finish_and_clear();
         let Some((steps, seconds, mean)) = last else {
+            if stop.load(Ordering::Relaxed) {
+                say(format!("stopped by a signal before the first batch; run folder {}", out.display()));
+                return Ok(());
+            }
             say(format!("{} has its {} steps already; give more with --steps", out.display(), run.steps));
             return Ok(());
         };

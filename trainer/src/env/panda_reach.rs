@@ -176,6 +176,10 @@ impl Rules for PandaReach {
         &self.goal
     }
 
+    fn goal_in_observation(&self) -> std::ops::Range<usize> {
+        14..17
+    }
+
     fn goal_mut(&mut self) -> &mut [f64] {
         &mut self.goal
     }

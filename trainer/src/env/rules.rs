@@ -1,6 +1,7 @@
 //! What a task adds to a simulated robot: the extension point of this folder.
 
 use std::borrow::Cow;
+use std::ops::Range;
 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -56,6 +57,11 @@ pub(super) trait Rules: Clone + Send + 'static {
     /// The goal, empty where there is none.
     fn goal(&self) -> &[f64] {
         &[]
+    }
+
+    /// Where the goal is in the observation; an empty range where there is none.
+    fn goal_in_observation(&self) -> Range<usize> {
+        0..0
     }
 
     /// Where to write a new goal.

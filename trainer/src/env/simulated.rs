@@ -3,7 +3,7 @@
 use rand_chacha::ChaCha8Rng;
 
 use super::rules::{Robot, Rules};
-use super::{Counters, Env, EnvError, Fault, Spec, Step};
+use super::{Counters, Env, EnvError, Fault, Moment, Spec, Step};
 use crate::mj::{JointKind, MjError, ModelFormat, Sim};
 
 /// A robot, its simulation and a task's rules.
@@ -40,6 +40,31 @@ impl<R: Rules> Simulated<R> {
     fn faulty(&mut self, fault: Fault) -> Step {
         self.counters.faults += 1;
         Step { reward: 0.0, cost: 0.0, terminated: true, fault }
+    }
+
+    /// Puts the robot where a plant said it was.
+    fn place(&mut self, at: &Moment<'_>) -> Result<(), EnvError> {
+        let (mut qpos, mut qvel) = (at.q.to_vec(), at.v.to_vec());
+        if (qpos.len(), qvel.len()) == (self.spec.nq, self.spec.nv) {
+            for joint in &self.spec.joints {
+                match joint.kind {
+                    JointKind::Slide | JointKind::Hinge => {}
+                    JointKind::Ball => qpos[joint.idx_q..][..4].rotate_right(1),
+                    JointKind::Free => {
+                        let quaternion = &mut qpos[joint.idx_q + 3..][..4];
+                        to_world(quaternion, &mut qvel[joint.idx_v..][..3]);
+                        quaternion.rotate_right(1);
+                    }
+                }
+            }
+        }
+        self.sim.set_state(&qpos, &qvel).map_err(self.physics())?;
+        self.sim.set_time(at.time);
+        let (place, goal) = (self.rules.goal_in_observation(), self.rules.goal_mut());
+        if let Some(seen) = at.obs.get(place).filter(|seen| seen.len() == goal.len()) {
+            goal.copy_from_slice(seen);
+        }
+        Ok(())
     }
 
     fn simulate(&mut self, action: &[f64]) -> Result<(), MjError> {
@@ -86,6 +111,16 @@ impl<R: Rules> Env for Simulated<R> {
         }
         let (reward, terminated) = self.rules.judge(&self.spec, &self.sim, before, action);
         Step { reward, cost: 0.0, terminated, fault: Fault::None }
+    }
+
+    fn judge(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
+        self.place(from)?;
+        self.rules.begin(&self.sim);
+        let before = self.rules.progress(&self.sim);
+        self.place(to)?;
+        self.rules.finish(&mut self.sim).map_err(self.physics())?;
+        let (reward, terminated) = self.rules.judge(&self.spec, &self.sim, before, action);
+        Ok(Step { reward, cost: 0.0, terminated, fault: Fault::None })
     }
 
     fn observe(&self, obs: &mut [f64]) {
@@ -159,16 +194,24 @@ fn rotate_left(quaternion: &mut [f64]) {
     quaternion.iter_mut().for_each(|c| *c /= length);
 }
 
-/// `v <- R' v` for the rotation `R` (body to world) of the unit quaternion `x y z w`:
-/// `R' v = v - 2 w (u x v) + 2 u x (u x v)` with `u = (x, y, z)`.
+/// `v <- R' v` for the rotation `R` (body to world) of the unit quaternion `x y z w`.
 fn to_body(quaternion: &[f64], v: &mut [f64]) {
-    let (u, w) = ([quaternion[0], quaternion[1], quaternion[2]], quaternion[3]);
+    rotate([-quaternion[0], -quaternion[1], -quaternion[2]], quaternion[3], v);
+}
+
+/// `v <- R v`, the inverse of [`to_body`].
+fn to_world(quaternion: &[f64], v: &mut [f64]) {
+    rotate([quaternion[0], quaternion[1], quaternion[2]], quaternion[3], v);
+}
+
+/// `v <- v + 2 w (u x v) + 2 u x (u x v)`.
+fn rotate(u: [f64; 3], w: f64, v: &mut [f64]) {
     let cross = |a: [f64; 3], b: [f64; 3]| {
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     };
     let uv = cross(u, [v[0], v[1], v[2]]);
     let uuv = cross(u, uv);
     for i in 0..3 {
-        v[i] += 2.0 * (uuv[i] - w * uv[i]);
+        v[i] += 2.0 * (uuv[i] + w * uv[i]);
     }
 }

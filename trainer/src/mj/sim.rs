@@ -149,6 +149,12 @@ impl Sim {
         self.state.qacc()
     }
 
+    /// Sets the simulated time \[s\].
+    pub fn set_time(&mut self, time: f64) {
+        // SAFETY: one number is written.
+        unsafe { self.state.ffi_mut() }.time = time;
+    }
+
     /// Simulated time \[s\].
     pub fn time(&self) -> f64 {
         self.state.time()

@@ -78,7 +78,7 @@ pub struct Tally {
 }
 
 impl Tally {
-    pub(super) fn add(&mut self, other: &Self) {
+    pub(crate) fn add(&mut self, other: &Self) {
         self.episodes.extend_from_slice(&other.episodes);
         self.costs.extend_from_slice(&other.costs);
         self.ticks += other.ticks;

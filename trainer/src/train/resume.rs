@@ -1,6 +1,6 @@
 //! A training to disk and back.
 
-use super::{Request, TrainError, Training};
+use super::{Experience, Request, TrainError, Training};
 use crate::checkpoint::{self, Checkpoint, CheckpointError, FORMAT, Header, Values};
 use crate::learn::Params;
 use crate::run_folder::RunFolder;
@@ -42,9 +42,7 @@ impl Training {
         put("recent".into(), Values::F64(recent));
         put("recent_costs".into(), Values::F64(self.recent_costs.clone()));
         put("seconds".into(), Values::F64(vec![self.seconds()]));
-        for (i, worker) in self.collector.workers().enumerate() {
-            worker.save(i, &mut to)?;
-        }
+        self.source.save(&mut to)?;
         Ok(to)
     }
 
@@ -53,8 +51,22 @@ impl Training {
     /// # Errors
     /// [`TrainError`]: what [`Training::new`] refuses, or a checkpoint that does not fit its own task.
     pub fn resume(
+        from: Checkpoint,
+        file: &Path,
+        steps: Option<u64>,
+        threads: usize,
+    ) -> Result<Self, TrainError> {
+        Self::resume_on(from, file, &Experience::Here, steps, threads)
+    }
+
+    /// The same with experience from elsewhere: the episodes under way are forgotten.
+    ///
+    /// # Errors
+    /// As [`Training::resume`].
+    pub fn resume_on(
         mut from: Checkpoint,
         file: &Path,
+        experience: &Experience,
         steps: Option<u64>,
         threads: usize,
     ) -> Result<Self, TrainError> {
@@ -66,7 +78,7 @@ impl Training {
             seed: header.seed,
             threads,
         };
-        let mut training = Self::new(&request)?;
+        let mut training = Self::on(&request, experience)?;
         let foreign = |reason| CheckpointError::Foreign { file: file.display().to_string(), reason };
         training.restore(&mut from).map_err(foreign)?;
         Ok(training)
@@ -87,13 +99,7 @@ impl Training {
         self.recent = recent.as_chunks::<2>().0.iter().map(|&[r, n]| (r, n as usize)).collect();
         self.earlier = from.take_f64("seconds", Some(1))?[0];
         self.rng.set_word_pos(from.header.rng.into());
-        let (have, need) = (from.header.workers.len(), self.settings.n_envs);
-        if have != need {
-            return Err(format!("it has {have} environments where the task has {need}"));
-        }
-        for (i, worker) in self.collector.workers().enumerate() {
-            worker.restore(i, from)?;
-        }
+        self.source.restore(from)?;
         if let Some(name) = from.tensors.keys().next() {
             return Err(format!("tensor '{name}' belongs to nothing"));
         }

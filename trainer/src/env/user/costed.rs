@@ -4,7 +4,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::expression::Expression;
 use super::quantity::{Before, Outcome, Quantity};
-use crate::env::{Counters, Env, EnvError, Fault, Spec, Step};
+use crate::env::{Counters, Env, EnvError, Fault, Moment, Spec, Step};
 use crate::mj::{MjError, ModelFormat, Sim};
 
 /// Another environment, counting what the task file's `[cost]` says. Body positions are as that environment evaluates them.
@@ -19,6 +19,14 @@ impl Costed {
     pub(super) fn new(inner: Box<dyn Env>, name: String, cost: Vec<Expression<Quantity>>) -> Costed {
         let before = Before::new(inner.sim().model());
         Costed { spec: Spec { name, has_cost: true, ..inner.spec().clone() }, before, inner, cost }
+    }
+}
+
+impl Costed {
+    fn with_cost(&self, step: Step, action: &[f64]) -> Step {
+        let outcome = Outcome { sim: self.inner.sim(), before: &self.before, action, dt: self.spec.dt };
+        let cost = self.cost.iter().map(|e| e.value(|q| outcome.read(q))).sum();
+        Step { cost, ..step }
     }
 }
 
@@ -41,9 +49,15 @@ impl Env for Costed {
         if step.fault != Fault::None {
             return step;
         }
-        let outcome = Outcome { sim: self.inner.sim(), before: &self.before, action, dt: self.spec.dt };
-        let cost = self.cost.iter().map(|e| e.value(|q| outcome.read(q))).sum();
-        Step { cost, ..step }
+        self.with_cost(step, action)
+    }
+
+    fn judge(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
+        // The state before is judged on its own first, so that what it began with can be remembered.
+        self.inner.judge(from, from, action)?;
+        self.before.remember(self.inner.sim());
+        let step = self.inner.judge(from, to, action)?;
+        Ok(self.with_cost(step, action))
     }
 
     fn observe(&self, obs: &mut [f64]) {

@@ -1,0 +1,132 @@
+//! Rows for the learner from policy steps that were taken in another process.
+
+use super::{Segment, Tally};
+use crate::stats::RunningStats;
+use nearl_runtime::normaliser::Normaliser;
+use nearl_runtime::{Controller, Output};
+
+/// What was collected elsewhere, as a [`Worker`](super::Worker) keeps it.
+pub struct Rows {
+    /// The collected rows.
+    pub segment: Segment,
+    /// What was counted.
+    pub tally: Tally,
+    /// Raw observations.
+    pub obs_stats: RunningStats,
+    /// Changes of the proposed state.
+    pub change_stats: RunningStats,
+    /// Discounted returns.
+    pub return_stats: RunningStats,
+    /// Observation index of each proposed entry.
+    state: Vec<usize>,
+    gamma: f64,
+    moved_penalty: f64,
+    discounted: f64,
+    change: Vec<f64>,
+    /// Network input of the state after the last row.
+    after: Vec<f32>,
+}
+
+/// One policy step.
+pub struct Period<'a> {
+    /// What the controller put out in its last tick.
+    pub out: &'a Output,
+    /// Observation at its begin (n_obs).
+    pub before: &'a [f64],
+    /// Observation at its end (n_obs).
+    pub after: &'a [f64],
+    /// The task's reward.
+    pub reward: f64,
+    /// Distance the projection moved the targets.
+    pub moved: f64,
+    /// The episode ended in a terminal state.
+    pub terminated: bool,
+    /// The episode was cut by time.
+    pub truncated: bool,
+}
+
+impl Rows {
+    /// No rows yet; `moved_penalty` as in [`Worker::set_moved_penalty`](super::Worker::set_moved_penalty).
+    pub fn new(controller: &Controller, gamma: f64, moved_penalty: f64) -> Self {
+        let layout = controller.layout();
+        Self {
+            segment: Segment::default(),
+            tally: Tally::default(),
+            obs_stats: RunningStats::new(layout.n_obs()),
+            change_stats: RunningStats::new(layout.n_state()),
+            return_stats: RunningStats::new(1),
+            state: layout.state().to_vec(),
+            gamma,
+            moved_penalty,
+            discounted: 0.0,
+            change: vec![0.0; layout.n_state()],
+            after: vec![0.0; layout.n_obs()],
+        }
+    }
+
+    /// Rows so far.
+    pub fn len(&self) -> usize {
+        self.segment.reward.len()
+    }
+
+    /// No rows yet.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Forgets rows and counts; the episode goes on.
+    pub fn clear(&mut self) {
+        self.segment.clear();
+        self.tally = Tally::default();
+        for stats in [&mut self.obs_stats, &mut self.change_stats, &mut self.return_stats] {
+            stats.clear();
+        }
+    }
+
+    /// Adds a policy step.
+    pub fn push(&mut self, p: &Period<'_>, normaliser: &Normaliser) {
+        let (s, out) = (&mut self.segment, p.out);
+        let reward = p.reward - self.moved_penalty * p.moved;
+        self.discounted = self.discounted * self.gamma + reward;
+        s.x.extend_from_slice(&out.x);
+        s.change.extend_from_slice(&out.change);
+        s.target_change.extend_from_slice(&out.target_change);
+        s.lower.extend_from_slice(&out.lower);
+        s.upper.extend_from_slice(&out.upper);
+        s.sampled.extend_from_slice(&out.sampled);
+        s.action.extend(out.action.iter().map(|&a| a as f32));
+        s.log_prob.push((out.log_prob_proposal + out.log_prob_action) as f32);
+        s.reward.push(reward);
+        s.terminated.push(p.terminated);
+        s.truncated.push(false);
+        for (k, &i) in self.state.iter().enumerate() {
+            self.change[k] = p.after[i] - p.before[i];
+            s.reached.push((self.change[k] / normaliser.scale[k]).clamp(-10.0, 10.0) as f32);
+        }
+        self.change_stats.push(&self.change);
+        self.obs_stats.push(p.after);
+        self.return_stats.push(&[self.discounted]);
+        normaliser.observation(p.after, &mut self.after);
+        if p.truncated && !p.terminated {
+            self.cut();
+        }
+        if p.truncated || p.terminated {
+            self.discounted = 0.0;
+        }
+    }
+
+    /// Nothing follows the last row: its state gets a value, and no advantage flows across.
+    pub fn cut(&mut self) {
+        let (last, s) = (self.segment.reward.len(), &mut self.segment);
+        if last > 0 && !s.terminated[last - 1] && !s.truncated[last - 1] {
+            s.truncated[last - 1] = true;
+            s.final_x.push((last - 1, self.after.clone()));
+        }
+    }
+
+    /// What comes next follows from nothing seen here.
+    pub fn interrupt(&mut self) {
+        self.cut();
+        self.discounted = 0.0;
+    }
+}
