@@ -70,6 +70,7 @@ struct RowsOf {
 struct ConeOf {
     cone: Box<dyn Cone>,
     limit: usize,
+    hard: bool,
     enabled: bool,
     row: usize,
 }
@@ -97,7 +98,7 @@ impl Checker {
         }
         for (limit, l) in limits.iter().enumerate() {
             if let Some(cone) = l.cone(model, controllable)? {
-                cones.push(ConeOf { cone, limit, enabled: true, row: first });
+                cones.push(ConeOf { cone, limit, hard: l.soft().is_none(), enabled: true, row: first });
                 first += 1;
             }
         }
@@ -193,7 +194,7 @@ impl Checker {
                 verdict.see(block.rows.kind(), block.first + r, *excess, 0.0);
             }
         }
-        for block in self.cones.iter_mut().filter(|c| c.enabled) {
+        for block in self.cones.iter_mut().filter(|c| c.hard && c.enabled) {
             verdict.see(block.cone.kind(), block.row, block.cone.excess(&mut motion), 0.0);
         }
     }

@@ -80,7 +80,7 @@ pub use limit::{
 pub use model::{FrameId, Joint, Model};
 #[doc(hidden)]
 pub use projector::{LoneStages, Numbers};
-pub use projector::{Problem, Projector};
+pub use projector::{Problem, ProblemCone, Projector};
 pub use row::{Cone, Rows, Soft};
 pub use target::{Bounds, Braking, Consistency, Proposal, Settings, Solver, Target};
 pub use viability::{Kind, Period};

@@ -22,6 +22,7 @@ fn row(name: &str, terms: &[(&str, f64)]) -> UserRowSettings {
         upper: None,
         equals: None,
         braking: None,
+        margin: 0.0,
         soft: None,
     }
 }
@@ -62,10 +63,7 @@ fn fr3_upper(i: usize, q: f64) -> f64 {
 fn the_fr3_rule_holds_at_every_tick() {
     for (braking, sub_steps) in [(10.0, 0), (10.0, 1), (20.0, 5)] {
         let limits: Vec<Box<dyn Limit>> = vec![
-            Box::new(AccelerationLimit::new(AccelerationSettings {
-                limit: PerJoint::All(braking),
-                braking: None,
-            })),
+            Box::new(AccelerationLimit::new(AccelerationSettings::of(PerJoint::All(braking), None))),
             Box::new(VelocityProfileLimit::new(VelocityProfileSettings::Robot(limit::KnownRobot::Fr3))),
         ];
         let settings = Settings::new(0.001, sub_steps);

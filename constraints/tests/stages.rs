@@ -245,8 +245,8 @@ fn what_is_empty_is_found_empty() {
         shown += usize::from(stages.empty());
         assert!(stages.exact_iterations() <= bound(kind));
     }
-    println!("{shown} of 400 shown to be empty"); // where rows depend on each other, Clarabel has the word
-    assert!(shown >= 360, "{shown}");
+    println!("{shown} of 400 shown to be empty");
+    assert!(shown >= 390, "{shown}"); // Clarabel has the word in the others
 }
 
 /// Along a path of problems, as in closed loop and with jumps and empty ones between, the stage that starts from its last active

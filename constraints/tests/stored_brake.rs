@@ -15,7 +15,7 @@ fn no_brake_asks_more_of_a_motor_than_it_has() {
     let limits: Vec<Box<dyn Limit>> = vec![
         Box::new(PositionLimit::default()),
         Box::new(VelocityLimit::scaled(0.15)),
-        Box::new(AccelerationLimit::new(AccelerationSettings { limit, braking })),
+        Box::new(AccelerationLimit::new(AccelerationSettings::of(limit, braking))),
         Box::new(TorqueLimit::default()),
     ];
     let settings = Settings { braking: Braking::Stored, ..Settings::new(0.001, 1) };

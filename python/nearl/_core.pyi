@@ -100,35 +100,56 @@ class PositionLimit(Limit):
 
 @final
 class VelocityLimit(Limit):
-    def __new__(cls, model: Model, limit: _PerJoint | None = None, *, scale: float | None = None) -> VelocityLimit: ...
+    def __new__(
+        cls,
+        model: Model,
+        limit: _PerJoint | None = None,
+        *,
+        scale: float | None = None,
+        margin: _PerJoint | None = None,
+    ) -> VelocityLimit: ...
 
 @final
 class VelocityProfileLimit(Limit):
     def __new__(
-        cls, model: Model, profile: Literal["fr3"] | Mapping[str, Mapping[str, float]]
+        cls, model: Model, profile: Literal["fr3"] | Mapping[str, Mapping[str, float]], *, margin: float = 0.0
     ) -> VelocityProfileLimit: ...
 
 @final
 class AccelerationLimit(Limit):
-    def __new__(cls, model: Model, limit: _PerJoint, braking: _PerJoint | None = None) -> AccelerationLimit: ...
+    def __new__(
+        cls, model: Model, limit: _PerJoint, braking: _PerJoint | None = None, *, margin: _PerJoint | None = None
+    ) -> AccelerationLimit: ...
 
 @final
 class JerkLimit(Limit):
-    def __new__(cls, model: Model, limit: _PerJoint, soft: _Soft | None = None) -> JerkLimit: ...
+    def __new__(
+        cls, model: Model, limit: _PerJoint, soft: _Soft | None = None, *, margin: _PerJoint | None = None
+    ) -> JerkLimit: ...
 
 @final
 class TorqueLimit(Limit):
-    def __new__(cls, model: Model, scale: float = 1.0) -> TorqueLimit: ...
+    def __new__(
+        cls, model: Model, scale: float = 1.0, *, margin: _PerJoint | None = None, soft: _Soft | None = None
+    ) -> TorqueLimit: ...
 
 @final
 class TorqueSpeedLimit(Limit):
     def __new__(
-        cls, model: Model, stall: _PerJoint, no_load: _PerJoint, soft: _Soft | None = None
+        cls,
+        model: Model,
+        stall: _PerJoint,
+        no_load: _PerJoint,
+        soft: _Soft | None = None,
+        *,
+        margin: _PerJoint | None = None,
     ) -> TorqueSpeedLimit: ...
 
 @final
 class TorqueRateLimit(Limit):
-    def __new__(cls, model: Model, limit: _PerJoint, soft: _Soft | None = None) -> TorqueRateLimit: ...
+    def __new__(
+        cls, model: Model, limit: _PerJoint, soft: _Soft | None = None, *, margin: _PerJoint | None = None
+    ) -> TorqueRateLimit: ...
 
 @final
 class LockedJoints(Limit):
@@ -155,12 +176,22 @@ class FrameLimit(Limit):
 @final
 class FrameSpeedLimit(Limit):
     def __new__(
-        cls, model: Model, frame: str, limit: float, *, point: Sequence[float] = ..., name: str | None = None
+        cls,
+        model: Model,
+        frame: str,
+        limit: float,
+        *,
+        point: Sequence[float] = ...,
+        name: str | None = None,
+        margin: float = 0.0,
+        soft: _Soft | None = None,
     ) -> FrameSpeedLimit: ...
 
 @final
 class EnergyLimit(Limit):
-    def __new__(cls, model: Model, limit: float) -> EnergyLimit: ...
+    def __new__(
+        cls, model: Model, limit: float, *, margin: float = 0.0, soft: _Soft | None = None
+    ) -> EnergyLimit: ...
 
 @final
 class CollisionLimit(Limit):
@@ -192,6 +223,7 @@ class RowLimit(Limit):
         equals: float | None = None,
         braking: float | None = None,
         soft: _Soft | None = None,
+        margin: float = 0.0,
     ) -> RowLimit: ...
 
 class _Report:

@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nearl_constraints::limit::{
-    AccelerationSettings, CollisionSettings, EnergySettings, FrameBox, FrameSettings, FrameSpeedSettings,
-    HalfSpace, JerkSettings, JointProfile, KnownRobot, PositionSettings, TorqueRateSettings,
-    TorqueSpeedSettings, UserRowSettings, VelocityProfileSettings, VelocitySettings,
+    AccelerationSettings, AlwaysHard, CollisionSettings, EnergySettings, FrameBox, FrameSettings,
+    FrameSpeedSettings, HalfSpace, JerkSettings, JointProfile, KnownRobot, PositionSettings, RobotProfile,
+    TorqueRateSettings, TorqueSettings, TorqueSpeedSettings, UserRowSettings, VelocityProfileSettings,
+    VelocitySettings,
 };
 use nearl_constraints::{self as constraints, Cone, LimitError, LimitSet, PerJoint, Rows, Soft};
 use pyo3::PyClass;
@@ -138,27 +139,34 @@ impl PositionLimit {
     #[new]
     #[pyo3(signature = (model, margin=Values::All(0.0)))]
     fn new(model: &Model, margin: Values) -> PyResult<PyClassInitializer<Self>> {
-        let settings = PositionSettings { margin: margin.per_joint() };
+        let settings = PositionSettings { margin: margin.per_joint(), soft: AlwaysHard };
         checked(model, Self, constraints::PositionLimit::new(settings))
     }
 }
 
-/// Speed limits: `scale` (0, 1] times the robot file's, or `limit` [rad/s or m/s]; the smaller where both are given.
+/// Speed limits: `scale` (0, 1] times the robot file's, or `limit` [rad/s or m/s]; the smaller where both are given, less `margin`.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct VelocityLimit;
 
 #[pymethods]
 impl VelocityLimit {
     #[new]
-    #[pyo3(signature = (model, limit=None, *, scale=None))]
-    fn new(model: &Model, limit: Option<Values>, scale: Option<f64>) -> PyResult<PyClassInitializer<Self>> {
-        let settings = VelocitySettings { scale, limit: limit.map(Values::per_joint) };
+    #[pyo3(signature = (model, limit=None, *, scale=None, margin=None))]
+    fn new(
+        model: &Model,
+        limit: Option<Values>,
+        scale: Option<f64>,
+        margin: Option<Values>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let (limit, margin) = (limit.map(Values::per_joint), margin.map(Values::per_joint));
+        let settings = VelocitySettings { scale, limit, margin, soft: AlwaysHard };
         checked(model, Self, constraints::VelocityLimit::new(settings))
     }
 }
 
 /// Speed limits that fall in front of position limits: `"fr3"` for a Franka Research 3, or by joint a dictionary of `limit`
 /// [rad/s], `offset` [rad/s], `squared` [rad/s²], `lower` and `upper` [rad] in `v <= min(limit, -offset + sqrt(squared (upper - q)))`.
+/// `margin` [rad/s] is kept below all of them.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct VelocityProfileLimit;
 
@@ -182,9 +190,12 @@ struct Curve {
 #[pymethods]
 impl VelocityProfileLimit {
     #[new]
-    fn new(model: &Model, profile: Profile) -> PyResult<PyClassInitializer<Self>> {
+    #[pyo3(signature = (model, profile, *, margin=0.0))]
+    fn new(model: &Model, profile: Profile, margin: f64) -> PyResult<PyClassInitializer<Self>> {
         let settings = match profile {
-            Profile::Robot(name) if name == "fr3" => VelocityProfileSettings::Robot(KnownRobot::Fr3),
+            Profile::Robot(name) if name == "fr3" => {
+                VelocityProfileSettings::RobotLess(RobotProfile { robot: KnownRobot::Fr3, margin })
+            }
             Profile::Robot(name) => {
                 return Err(errors::value(format!(
                     "no velocity profile is built in for '{name}'; use \"fr3\" or a dictionary by joint"
@@ -197,6 +208,7 @@ impl VelocityProfileLimit {
                     squared: c.squared,
                     lower: c.lower,
                     upper: c.upper,
+                    margin,
                 };
                 VelocityProfileSettings::Joints(map.into_iter().map(|(joint, c)| (joint, curve(c))).collect())
             }
@@ -205,7 +217,7 @@ impl VelocityProfileLimit {
     }
 }
 
-/// Acceleration limits [rad/s² or m/s²]. `braking`: the deceleration that braking in front of a position limit counts on, at most
+/// Acceleration limits [rad/s² or m/s²], less `margin`. `braking`: the deceleration that braking in front of a position limit counts on, at most
 /// `limit`, which is also its default.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct AccelerationLimit;
@@ -213,15 +225,21 @@ pub(crate) struct AccelerationLimit;
 #[pymethods]
 impl AccelerationLimit {
     #[new]
-    #[pyo3(signature = (model, limit, braking=None))]
-    fn new(model: &Model, limit: Values, braking: Option<Values>) -> PyResult<PyClassInitializer<Self>> {
-        let settings =
-            AccelerationSettings { limit: limit.per_joint(), braking: braking.map(Values::per_joint) };
+    #[pyo3(signature = (model, limit, braking=None, *, margin=None))]
+    fn new(
+        model: &Model,
+        limit: Values,
+        braking: Option<Values>,
+        margin: Option<Values>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let margin = margin.map(Values::per_joint);
+        let of = AccelerationSettings::of(limit.per_joint(), braking.map(Values::per_joint));
+        let settings = AccelerationSettings { margin, ..of };
         checked(model, Self, constraints::AccelerationLimit::new(settings))
     }
 }
 
-/// Jerk limits [rad/s³ or m/s³], always soft, with `soft = (linear, quadratic)` weights. They need the tick before: see
+/// Jerk limits [rad/s³ or m/s³], less `margin`, always soft, with `soft = (linear, quadratic)` weights. They need the tick before: see
 /// `Projector.project(..., previous=target)`.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct JerkLimit;
@@ -229,56 +247,77 @@ pub(crate) struct JerkLimit;
 #[pymethods]
 impl JerkLimit {
     #[new]
-    #[pyo3(signature = (model, limit, soft=None))]
-    fn new(model: &Model, limit: Values, soft: Option<Weights>) -> PyResult<PyClassInitializer<Self>> {
+    #[pyo3(signature = (model, limit, soft=None, *, margin=None))]
+    fn new(
+        model: &Model,
+        limit: Values,
+        soft: Option<Weights>,
+        margin: Option<Values>,
+    ) -> PyResult<PyClassInitializer<Self>> {
         let soft = soft.map_or_else(Soft::default, self::soft);
-        checked(model, Self, constraints::JerkLimit::new(JerkSettings { limit: limit.per_joint(), soft }))
+        let (limit, margin) = (limit.per_joint(), margin.map(Values::per_joint));
+        checked(model, Self, constraints::JerkLimit::new(JerkSettings { limit, margin, soft }))
     }
 }
 
-/// Motor force limits of the robot file times `scale` (0, 1].
+/// Motor force limits of the robot file times `scale` (0, 1], less `margin` [N·m or N]. With `soft = (linear, quadratic)` weights they are no
+/// promise that braking may count on.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct TorqueLimit;
 
 #[pymethods]
 impl TorqueLimit {
     #[new]
-    #[pyo3(signature = (model, scale=1.0))]
-    fn new(model: &Model, scale: f64) -> PyResult<PyClassInitializer<Self>> {
-        checked(model, Self, constraints::TorqueLimit::scaled(scale))
+    #[pyo3(signature = (model, scale=1.0, *, margin=None, soft=None))]
+    fn new(
+        model: &Model,
+        scale: f64,
+        margin: Option<Values>,
+        soft: Option<Weights>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let (margin, soft) = (margin.map(Values::per_joint), soft.map(self::soft));
+        checked(model, Self, constraints::TorqueLimit::new(TorqueSettings { scale, margin, soft }))
     }
 }
 
-/// Motors whose force falls with speed: `|tau + stall / no_load v| <= stall`, in [N·m or N] and [rad/s or m/s].
+/// Motors whose force falls with speed: `|tau + stall / no_load v| <= stall - margin`, in [N·m or N] and [rad/s or m/s].
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct TorqueSpeedLimit;
 
 #[pymethods]
 impl TorqueSpeedLimit {
     #[new]
-    #[pyo3(signature = (model, stall, no_load, soft=None))]
+    #[pyo3(signature = (model, stall, no_load, soft=None, *, margin=None))]
     fn new(
         model: &Model,
         stall: Values,
         no_load: Values,
         soft: Option<Weights>,
+        margin: Option<Values>,
     ) -> PyResult<PyClassInitializer<Self>> {
         let (stall, no_load, soft) = (stall.per_joint(), no_load.per_joint(), soft.map(self::soft));
-        checked(model, Self, constraints::TorqueSpeedLimit::new(TorqueSpeedSettings { stall, no_load, soft }))
+        let settings = TorqueSpeedSettings { stall, no_load, margin: margin.map(Values::per_joint), soft };
+        checked(model, Self, constraints::TorqueSpeedLimit::new(settings))
     }
 }
 
-/// Limits on the change of motor forces [N·m/s or N/s], always soft; they need the tick before, like `JerkLimit`.
+/// Limits on the change of motor forces [N·m/s or N/s], less `margin`, always soft; they need the tick before, like `JerkLimit`.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct TorqueRateLimit;
 
 #[pymethods]
 impl TorqueRateLimit {
     #[new]
-    #[pyo3(signature = (model, limit, soft=None))]
-    fn new(model: &Model, limit: Values, soft: Option<Weights>) -> PyResult<PyClassInitializer<Self>> {
+    #[pyo3(signature = (model, limit, soft=None, *, margin=None))]
+    fn new(
+        model: &Model,
+        limit: Values,
+        soft: Option<Weights>,
+        margin: Option<Values>,
+    ) -> PyResult<PyClassInitializer<Self>> {
         let (limit, soft) = (limit.per_joint(), soft.map_or_else(Soft::default, self::soft));
-        checked(model, Self, constraints::TorqueRateLimit::new(TorqueRateSettings { limit, soft }))
+        let settings = TorqueRateSettings { limit, margin: margin.map(Values::per_joint), soft };
+        checked(model, Self, constraints::TorqueRateLimit::new(settings))
     }
 }
 
@@ -295,14 +334,14 @@ impl LockedJoints {
 }
 
 /// A linear row over the next state: `lower <= sum of terms <= upper` or `equals`, with terms such as `{"q.elbow": 1.0, "v.wrist": -0.5}`.
-/// `braking` lets a sum of positions stop in front of its bounds; `soft` is `(linear, quadratic)` weights.
+/// `braking` lets a sum of positions stop in front of its bounds, `margin` inside them; `soft` is `(linear, quadratic)` weights.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct RowLimit;
 
 #[pymethods]
 impl RowLimit {
     #[new]
-    #[pyo3(signature = (model, name, terms, *, lower=None, upper=None, equals=None, braking=None, soft=None))]
+    #[pyo3(signature = (model, name, terms, *, lower=None, upper=None, equals=None, braking=None, soft=None, margin=0.0))]
     #[expect(clippy::too_many_arguments, reason = "one argument a setting, by keyword")]
     fn new(
         model: &Model,
@@ -313,9 +352,10 @@ impl RowLimit {
         equals: Option<f64>,
         braking: Option<f64>,
         soft: Option<Weights>,
+        margin: f64,
     ) -> PyResult<PyClassInitializer<Self>> {
         let soft = soft.map(self::soft);
-        let settings = UserRowSettings { name, terms, lower, upper, equals, braking, soft };
+        let settings = UserRowSettings { name, terms, lower, upper, equals, braking, margin, soft };
         checked(model, Self, constraints::UserRow::new(settings))
     }
 }
@@ -362,35 +402,45 @@ impl FrameLimit {
     }
 }
 
-/// The speed of a frame's `point` [m, in its axes] stays below `limit` [m/s], in every direction.
+/// The speed of a frame's `point` [m, in its axes] stays below `limit - margin` [m/s], in every direction; `soft` is `(linear, quadratic)` weights.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct FrameSpeedLimit;
 
 #[pymethods]
 impl FrameSpeedLimit {
     #[new]
-    #[pyo3(signature = (model, frame, limit, *, point=[0.0; 3], name=None))]
+    #[pyo3(signature = (model, frame, limit, *, point=[0.0; 3], name=None, margin=0.0, soft=None))]
     fn new(
         model: &Model,
         frame: String,
         limit: f64,
         point: [f64; 3],
         name: Option<String>,
+        margin: f64,
+        soft: Option<Weights>,
     ) -> PyResult<PyClassInitializer<Self>> {
-        let settings = FrameSpeedSettings { name, frame, point, limit };
+        let soft = soft.map(self::soft);
+        let settings = FrameSpeedSettings { name, frame, point, limit, margin, soft };
         checked(model, Self, constraints::FrameSpeedLimit::new(settings))
     }
 }
 
-/// The kinetic energy of the whole robot stays below `limit` [J].
+/// The kinetic energy of the whole robot stays below `limit - margin` [J]; `soft` is `(linear, quadratic)` weights.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct EnergyLimit;
 
 #[pymethods]
 impl EnergyLimit {
     #[new]
-    fn new(model: &Model, limit: f64) -> PyResult<PyClassInitializer<Self>> {
-        checked(model, Self, constraints::EnergyLimit::new(EnergySettings { limit }))
+    #[pyo3(signature = (model, limit, *, margin=0.0, soft=None))]
+    fn new(
+        model: &Model,
+        limit: f64,
+        margin: f64,
+        soft: Option<Weights>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let soft = soft.map(self::soft);
+        checked(model, Self, constraints::EnergyLimit::new(EnergySettings { limit, margin, soft }))
     }
 }
 

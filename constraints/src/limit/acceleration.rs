@@ -1,6 +1,7 @@
 //! Acceleration limits, which are also what braking counts on.
 
-use super::{Limit, LimitSet, PerJoint};
+use super::margin::less_each;
+use super::{AlwaysHard, Limit, LimitSet, PerJoint};
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
 
@@ -14,6 +15,19 @@ pub struct AccelerationSettings {
     /// [rad/s² or m/s²].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub braking: Option<PerJoint>,
+    /// Acceleration kept below the limit [rad/s² or m/s²].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub margin: Option<PerJoint>,
+    /// Has no soft form.
+    #[serde(default, skip_serializing)]
+    pub soft: AlwaysHard,
+}
+
+impl AccelerationSettings {
+    /// `limit`, and the deceleration that `braking` counts on.
+    pub fn of(limit: PerJoint, braking: Option<PerJoint>) -> AccelerationSettings {
+        AccelerationSettings { limit, braking, margin: None, soft: AlwaysHard }
+    }
 }
 
 /// `|a| <= A`, and every position limit is approached so that `braking` still stops in front of it.
@@ -33,7 +47,7 @@ impl AccelerationLimit {
 
     /// The same limit [rad/s² or m/s²] for every joint.
     pub fn uniform(a_max: f64) -> AccelerationLimit {
-        AccelerationLimit { settings: AccelerationSettings { limit: PerJoint::All(a_max), braking: None } }
+        AccelerationLimit { settings: AccelerationSettings::of(PerJoint::All(a_max), None) }
     }
 }
 
@@ -44,7 +58,8 @@ impl Limit for AccelerationLimit {
 
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         let domain = "above 0 rad/s² or m/s²";
-        let values = self.settings.limit.values(model, "acceleration limit", |x| x > 0.0, domain)?;
+        let mut values = self.settings.limit.values(model, "acceleration limit", |x| x > 0.0, domain)?;
+        less_each(model, "acceleration margin", &mut values, self.settings.margin.as_ref(), controllable)?;
         for &i in controllable {
             set.acceleration[i] = set.acceleration[i].min(values[i].unwrap_or(f64::INFINITY));
             set.braking[i] = set.braking[i].min(set.acceleration[i]);

@@ -2,16 +2,23 @@
 
 use super::Limit;
 use super::frame::check;
+use super::margin::{is_zero, less};
 use crate::row::{Cone, Motion, Needs, Tick};
-use crate::{Kind, Kinematics, LimitError, Model};
+use crate::{Kind, Kinematics, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
-/// `energy = { limit = 2.0 }`.
+/// `energy = { limit = 2.0 }`, also with `margin` and `soft`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnergySettings {
     /// Largest kinetic energy of the whole robot, rotors included [J].
     pub limit: f64,
+    /// Energy kept below the limit [J].
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub margin: f64,
+    /// How much it resists; hard when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub soft: Option<Soft>,
 }
 
 /// `1/2 (v + y)' M (v + y) <= limit`, as `|L' (v + y)| <= sqrt(2 limit)` with `M = L L'` at the measured configuration.
@@ -30,7 +37,7 @@ impl EnergyLimit {
 
     /// At most `limit` [J].
     pub fn of(limit: f64) -> EnergyLimit {
-        EnergyLimit { settings: EnergySettings { limit } }
+        EnergyLimit { settings: EnergySettings { limit, margin: 0.0, soft: None } }
     }
 }
 
@@ -40,9 +47,13 @@ impl Limit for EnergyLimit {
     }
 
     fn cone(&self, model: &Model, _controllable: &[usize]) -> Result<Option<Box<dyn Cone>>, LimitError> {
-        let limit = self.settings.limit;
-        check("energy limit", limit, limit > 0.0, "above 0 J")?;
+        check("energy limit", self.settings.limit, self.settings.limit > 0.0, "above 0 J")?;
+        let limit = less("energy margin", self.settings.limit, self.settings.margin)?;
         Ok(Some(Box::new(EnergyCone { nv: model.nv(), limit, judge: Kinematics::new(model) })))
+    }
+
+    fn soft(&self) -> Option<Soft> {
+        self.settings.soft
     }
 }
 

@@ -2,12 +2,13 @@
 
 use super::Limit;
 use super::frame::{check, frame_of};
+use super::margin::{is_zero, less};
 use crate::kinematics::norm;
 use crate::row::{Cone, Motion, Needs, Tick};
-use crate::{FrameId, Kind, Kinematics, LimitError, Model};
+use crate::{FrameId, Kind, Kinematics, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
-/// `frame_speed = [{ frame = "hand", limit = 0.25 }]`.
+/// `frame_speed = [{ frame = "hand", limit = 0.25 }]`, also with `margin` and `soft`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FrameSpeedSettings {
@@ -21,6 +22,12 @@ pub struct FrameSpeedSettings {
     pub point: [f64; 3],
     /// Largest speed [m/s].
     pub limit: f64,
+    /// Speed kept below the limit [m/s].
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub margin: f64,
+    /// How much it resists; hard when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub soft: Option<Soft>,
 }
 
 /// `|J (v + y)| <= limit`: the speed of a point of a frame, with the Jacobian of the measured configuration.
@@ -40,7 +47,8 @@ impl FrameSpeedLimit {
     /// The origin of `frame` moves by at most `limit` [m/s].
     pub fn of(frame: &str, limit: f64) -> FrameSpeedLimit {
         let frame = frame.to_string();
-        FrameSpeedLimit { settings: FrameSpeedSettings { name: None, frame, point: [0.0; 3], limit } }
+        let (name, point, margin, soft) = (None, [0.0; 3], 0.0, None);
+        FrameSpeedLimit { settings: FrameSpeedSettings { name, frame, point, limit, margin, soft } }
     }
 }
 
@@ -58,14 +66,19 @@ impl Limit for FrameSpeedLimit {
         let frame = frame_of(model, "frame_speed", &s.frame, controllable)?;
         check(&format!("speed limit of frame '{}'", s.frame), s.limit, s.limit > 0.0, "above 0 m/s")?;
         check(&format!("point of frame '{}'", s.frame), s.point.iter().sum(), true, "finite, in m")?;
+        let limit = less(&format!("speed margin of frame '{}'", s.frame), s.limit, s.margin)?;
         Ok(Some(Box::new(SpeedCone {
             name: s.frame.clone(),
             frame,
             point: s.point,
-            limit: s.limit,
+            limit,
             judge: Kinematics::new(model),
             zero: vec![0.0; model.nv()],
         })))
+    }
+
+    fn soft(&self) -> Option<Soft> {
+        self.settings.soft
     }
 }
 

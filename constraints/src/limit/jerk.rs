@@ -1,5 +1,6 @@
 //! Jerk limits.
 
+use super::margin::less_each;
 use super::{Limit, PerJoint};
 use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
 use crate::{Kind, LimitError, Model, Soft};
@@ -11,6 +12,9 @@ use serde::{Deserialize, Serialize};
 pub struct JerkSettings {
     /// Largest jerk J [rad/s³ or m/s³].
     pub limit: PerJoint,
+    /// Jerk kept below the limit [rad/s³ or m/s³].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub margin: Option<PerJoint>,
     /// How much it resists.
     #[serde(default)]
     pub soft: Soft,
@@ -39,8 +43,9 @@ impl Limit for JerkLimit {
     }
 
     fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
-        let values =
+        let mut values =
             self.settings.limit.values(model, "jerk limit", |x| x > 0.0, "above 0 rad/s³ or m/s³")?;
+        less_each(model, "jerk margin", &mut values, self.settings.margin.as_ref(), controllable)?;
         let rows = controllable.iter().filter_map(|i| values[*i].map(|j| (*i, j, model.dof_name(*i))));
         Ok(Some(Box::new(JerkRows { dofs: rows.collect() })))
     }

@@ -11,6 +11,7 @@ mod frame;
 mod frame_speed;
 mod jerk;
 mod locked;
+mod margin;
 mod position;
 mod set;
 mod settings;
@@ -28,6 +29,7 @@ pub use frame::{FrameBox, FrameLimit, FrameSettings, HalfSpace};
 pub use frame_speed::{FrameSpeedLimit, FrameSpeedSettings};
 pub use jerk::{JerkLimit, JerkSettings};
 pub use locked::LockedJoints;
+pub use margin::AlwaysHard;
 pub use position::{PositionLimit, PositionSettings};
 pub use set::LimitSet;
 pub use settings::{ConstraintSettings, PerJoint};
@@ -36,7 +38,9 @@ pub use torque_rate::{TorqueRateLimit, TorqueRateSettings};
 pub use torque_speed::{TorqueSpeedLimit, TorqueSpeedSettings};
 pub use user::{UserRow, UserRowSettings};
 pub use velocity::{VelocityLimit, VelocitySettings};
-pub use velocity_profile::{JointProfile, KnownRobot, VelocityProfileLimit, VelocityProfileSettings};
+pub use velocity_profile::{
+    JointProfile, KnownRobot, RobotProfile, VelocityProfileLimit, VelocityProfileSettings,
+};
 
 use crate::{Cone, LimitError, Model, Rows, Soft};
 
@@ -77,7 +81,7 @@ pub trait Limit: Send + Sync + std::fmt::Debug {
         Ok(None)
     }
 
-    /// How much its rows resist; `None` for hard rows. The part in the box is always hard.
+    /// How much its rows or its cone resist; `None` for hard ones. The part in the box is always hard.
     fn soft(&self) -> Option<Soft> {
         None
     }

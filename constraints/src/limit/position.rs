@@ -1,6 +1,6 @@
 //! Position limits of the robot file.
 
-use super::{Limit, LimitSet, PerJoint, quoted};
+use super::{AlwaysHard, Limit, LimitSet, PerJoint, quoted};
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
 
@@ -10,11 +10,14 @@ use serde::{Deserialize, Serialize};
 pub struct PositionSettings {
     /// Distance kept from both limits [rad or m].
     pub margin: PerJoint,
+    /// Has no soft form.
+    #[serde(skip_serializing)]
+    pub soft: AlwaysHard,
 }
 
 impl Default for PositionSettings {
     fn default() -> Self {
-        PositionSettings { margin: PerJoint::All(0.0) }
+        PositionSettings { margin: PerJoint::All(0.0), soft: AlwaysHard }
     }
 }
 
@@ -34,7 +37,7 @@ impl PositionLimit {
 
     /// The same margin [rad or m] for every joint.
     pub fn with_margin(margin: f64) -> PositionLimit {
-        PositionLimit { settings: PositionSettings { margin: PerJoint::All(margin) } }
+        PositionLimit { settings: PositionSettings { margin: PerJoint::All(margin), soft: AlwaysHard } }
     }
 }
 

@@ -1,25 +1,32 @@
 //! Motor force limits of the robot file.
 
-use super::{Limit, LimitSet, quoted};
+use super::margin::less_each;
+use super::{Limit, LimitSet, PerJoint, quoted};
 use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
-use crate::{Kind, LimitError, Model};
+use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
-/// `torque = { scale }`.
+/// `torque = { scale }`, also with `margin` and `soft`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TorqueSettings {
     /// Share of the robot file's effort limit, in (0, 1].
     pub scale: f64,
+    /// Force kept below that share [N·m or N].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub margin: Option<PerJoint>,
+    /// How much it resists; hard when absent. A soft one is no promise that braking may count on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub soft: Option<Soft>,
 }
 
 impl Default for TorqueSettings {
     fn default() -> Self {
-        TorqueSettings { scale: 1.0 }
+        TorqueSettings { scale: 1.0, margin: None, soft: None }
     }
 }
 
-/// `|(M/T) y + nle - passive| <= scale * effort`, at the state of the tick.
+/// `|(M/T) y + nle - passive| <= scale * effort - margin`, at the state of the tick.
 #[derive(Debug, Clone, Default)]
 pub struct TorqueLimit {
     settings: TorqueSettings,
@@ -33,7 +40,7 @@ impl TorqueLimit {
 
     /// A share in (0, 1] of the robot file's effort limits.
     pub fn scaled(scale: f64) -> TorqueLimit {
-        TorqueLimit { settings: TorqueSettings { scale } }
+        TorqueLimit { settings: TorqueSettings { scale, ..TorqueSettings::default() } }
     }
 }
 
@@ -43,7 +50,8 @@ impl Limit for TorqueLimit {
     }
 
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
-        for (i, effort) in self.efforts(model, controllable)? {
+        let efforts = self.efforts(model, controllable)?;
+        for (i, effort) in efforts.into_iter().filter(|_| self.settings.soft.is_none()) {
             set.effort[i] = set.effort[i].min(effort);
         }
         Ok(())
@@ -53,6 +61,10 @@ impl Limit for TorqueLimit {
         let efforts = self.efforts(model, controllable)?;
         let motors = efforts.into_iter().map(|(i, effort)| (i, effort, model.dof_name(i))).collect();
         Ok(Some(Box::new(TorqueRows { motors })))
+    }
+
+    fn soft(&self) -> Option<Soft> {
+        self.settings.soft
     }
 }
 
@@ -72,7 +84,9 @@ impl TorqueLimit {
                 "write effort (URDF) or a motor with ctrlrange (MJCF) into it, or do not control the joint";
             return Err(LimitError::Missing { limit: "torque", joints: quoted(model, &missing), next });
         }
-        Ok(controllable.iter().map(|i| (*i, scale * stated[*i])).collect())
+        let mut efforts: Vec<_> = stated.iter().map(|effort| Some(scale * effort)).collect();
+        less_each(model, "torque margin", &mut efforts, self.settings.margin.as_ref(), controllable)?;
+        Ok(controllable.iter().filter_map(|i| Some((*i, efforts[*i]?))).collect())
     }
 }
 

@@ -1,5 +1,6 @@
 //! Limits on how fast motor forces change.
 
+use super::margin::less_each;
 use super::{Limit, PerJoint};
 use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
 use crate::{Kind, LimitError, Model, Soft};
@@ -11,6 +12,9 @@ use serde::{Deserialize, Serialize};
 pub struct TorqueRateSettings {
     /// Largest change R [N·m/s or N/s].
     pub limit: PerJoint,
+    /// Change kept below the limit [N·m/s or N/s].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub margin: Option<PerJoint>,
     /// How much it resists.
     #[serde(default)]
     pub soft: Soft,
@@ -39,7 +43,8 @@ impl Limit for TorqueRateLimit {
 
     fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
         let domain = "above 0 N·m/s or N/s";
-        let values = self.settings.limit.values(model, "torque_rate limit", |x| x > 0.0, domain)?;
+        let mut values = self.settings.limit.values(model, "torque_rate limit", |x| x > 0.0, domain)?;
+        less_each(model, "torque_rate margin", &mut values, self.settings.margin.as_ref(), controllable)?;
         let rows = controllable.iter().filter_map(|i| values[*i].map(|rate| (*i, rate, model.dof_name(*i))));
         Ok(Some(Box::new(TorqueRateRows { dofs: rows.collect() })))
     }

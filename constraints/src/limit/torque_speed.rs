@@ -1,5 +1,6 @@
 //! Motors whose force falls with speed.
 
+use super::margin::less_each;
 use super::{Limit, PerJoint};
 use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
 use crate::{Kind, LimitError, Model, Soft};
@@ -13,6 +14,9 @@ pub struct TorqueSpeedSettings {
     pub stall: PerJoint,
     /// Speed at which no force is left [rad/s or m/s].
     pub no_load: PerJoint,
+    /// Force kept below the line [N·m or N].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub margin: Option<PerJoint>,
     /// How much it resists; hard when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub soft: Option<Soft>,
@@ -21,7 +25,7 @@ pub struct TorqueSpeedSettings {
 /// The line of a direct-current motor, in both directions:
 ///
 /// ```text
-///     |tau + (stall / no_load) v'| <= stall
+///     |tau + (stall / no_load) v'| <= stall - margin
 /// ```
 ///
 /// at the speed `v'` the tick ends with. The gearbox's own limit, flat in speed, is [`TorqueLimit`](super::TorqueLimit).
@@ -47,9 +51,11 @@ impl Limit for TorqueSpeedLimit {
         let stall = self.settings.stall.values(model, "torque_speed stall", positive, "above 0 N·m or N")?;
         let no_load =
             self.settings.no_load.values(model, "torque_speed no_load", positive, "above 0 rad/s or m/s")?;
+        let mut most = stall.clone();
+        less_each(model, "torque_speed margin", &mut most, self.settings.margin.as_ref(), controllable)?;
         let motor = |i: &usize| {
-            let (stall, no_load) = (stall[*i]?, no_load[*i]?);
-            Some(Motor { dof: *i, stall, slope: stall / no_load, joint: model.dof_name(*i) })
+            let (most, slope) = (most[*i]?, stall[*i]? / no_load[*i]?);
+            Some(Motor { dof: *i, most, slope, joint: model.dof_name(*i) })
         };
         Ok(Some(Box::new(TorqueSpeedRows { motors: controllable.iter().filter_map(motor).collect() })))
     }
@@ -61,7 +67,8 @@ impl Limit for TorqueSpeedLimit {
 
 struct Motor {
     dof: usize,
-    stall: f64,
+    /// Stall force less the margin.
+    most: f64,
     slope: f64,
     joint: String,
 }
@@ -80,7 +87,7 @@ impl Rows for TorqueSpeedRows {
     }
 
     fn sizes(&self) -> Vec<f64> {
-        self.motors.iter().map(|m| m.stall).collect()
+        self.motors.iter().map(|m| m.most).collect()
     }
 
     fn needs(&self) -> Needs {
@@ -96,13 +103,13 @@ impl Rows for TorqueSpeedRows {
             }
             rows.row(r)[i] += m.slope;
             let still = tick.bias[i] + m.slope * tick.v[i];
-            (rows.lower[r], rows.upper[r]) = (-m.stall - still, m.stall - still);
+            (rows.lower[r], rows.upper[r]) = (-m.most - still, m.most - still);
         }
     }
 
     fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]) {
         for (x, m) in excess.iter_mut().zip(&self.motors) {
-            let share = (motion.torque[m.dof] + m.slope * motion.v_next[m.dof]) / m.stall;
+            let share = (motion.torque[m.dof] + m.slope * motion.v_next[m.dof]) / m.most;
             *x = share.abs() - 1.0;
         }
     }

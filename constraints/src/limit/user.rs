@@ -1,13 +1,14 @@
 //! Linear rows of the task file's own, by state names.
 
 use super::Limit;
+use super::margin::is_zero;
 use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
 use crate::viability::approach;
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// `rows = [{ name, terms = { "q.joint" = 1.0, "v.joint" = -0.5 }, lower, upper, equals, braking, soft }]`.
+/// `rows = [{ name, terms = { "q.joint" = 1.0, "v.joint" = -0.5 }, lower, upper, equals, braking, margin, soft }]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct UserRowSettings {
@@ -27,6 +28,9 @@ pub struct UserRowSettings {
     /// For sums of positions: the deceleration of the sum that may be counted on, so that it stops in front of a bound.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub braking: Option<f64>,
+    /// Distance of the sum kept from its bounds.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub margin: f64,
     /// How much it resists; hard when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub soft: Option<Soft>,
@@ -86,7 +90,15 @@ impl UserRow {
         if let Some(value) = s.braking.filter(|b| !(*b > 0.0 && b.is_finite())) {
             return bad("braking", value, "above 0, in the unit of the sum per s²");
         }
-        match (s.lower, s.upper, s.equals) {
+        if !(s.margin >= 0.0 && s.margin.is_finite()) {
+            return bad("margin", s.margin, "at least 0, in the unit of the sum");
+        }
+        let (lower, upper) = (s.lower.map(|x| x + s.margin), s.upper.map(|x| x - s.margin));
+        match (lower, upper, s.equals) {
+            (None, None, Some(_)) if s.margin > 0.0 => Err(LimitError::Unusable {
+                what: format!("row '{}' has equals and a margin, which leave nothing", s.name),
+                next: "drop the margin, or give lower and upper",
+            }),
             (None, None, Some(x)) => Ok((x, x)),
             (None, None, None) | (Some(_), _, Some(_)) | (_, Some(_), Some(_)) => Err(LimitError::Unusable {
                 what: format!("row '{}' needs equals, or lower or upper or both", s.name),

@@ -1,10 +1,11 @@
 //! Speed limits: the robot file's, scaled, or the task file's own.
 
-use super::{Limit, LimitSet, PerJoint, quoted};
+use super::margin::less_each;
+use super::{AlwaysHard, Limit, LimitSet, PerJoint, quoted};
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
 
-/// `velocity = { scale }` or `velocity = { limit }`; with both, the smaller holds; with none, `scale = 1`.
+/// `velocity = { scale }` or `velocity = { limit }`, less `margin`; with both, the smaller holds; with none, `scale = 1`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VelocitySettings {
@@ -14,6 +15,12 @@ pub struct VelocitySettings {
     /// Own limits [rad/s or m/s].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub limit: Option<PerJoint>,
+    /// Speed kept below the limit [rad/s or m/s].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub margin: Option<PerJoint>,
+    /// Has no soft form.
+    #[serde(skip_serializing)]
+    pub soft: AlwaysHard,
 }
 
 /// `|v'| <= V`.
@@ -30,12 +37,12 @@ impl VelocityLimit {
 
     /// A share in (0, 1] of the robot file's limits.
     pub fn scaled(scale: f64) -> VelocityLimit {
-        VelocityLimit { settings: VelocitySettings { scale: Some(scale), limit: None } }
+        VelocityLimit { settings: VelocitySettings { scale: Some(scale), ..VelocitySettings::default() } }
     }
 
     /// Own limits [rad/s or m/s].
     pub fn values(limit: PerJoint) -> VelocityLimit {
-        VelocityLimit { settings: VelocitySettings { scale: None, limit: Some(limit) } }
+        VelocityLimit { settings: VelocitySettings { limit: Some(limit), ..VelocitySettings::default() } }
     }
 
     fn restrict_by_file(
@@ -43,7 +50,7 @@ impl VelocityLimit {
         scale: f64,
         model: &Model,
         controllable: &[usize],
-        set: &mut LimitSet,
+        own: &mut [Option<f64>],
     ) -> Result<(), LimitError> {
         if !(scale > 0.0 && scale <= 1.0) {
             let domain = "above 0 and at most 1";
@@ -57,7 +64,7 @@ impl VelocityLimit {
             return Err(LimitError::Missing { limit: "velocity", joints: quoted(model, &missing), next });
         }
         for &i in controllable {
-            set.velocity[i] = set.velocity[i].min(scale * stated[i]);
+            own[i] = Some(own[i].unwrap_or(f64::INFINITY).min(scale * stated[i]));
         }
         Ok(())
     }
@@ -69,15 +76,18 @@ impl Limit for VelocityLimit {
     }
 
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
-        if let Some(limit) = &self.settings.limit {
-            let values = limit.values(model, "velocity limit", |x| x > 0.0, "above 0 rad/s or m/s")?;
-            for &i in controllable {
-                set.velocity[i] = set.velocity[i].min(values[i].unwrap_or(f64::INFINITY));
-            }
+        let mut own = match &self.settings.limit {
+            Some(limit) => limit.values(model, "velocity limit", |x| x > 0.0, "above 0 rad/s or m/s")?,
+            None => vec![None; model.nv()],
+        };
+        if self.settings.scale.is_some() || self.settings.limit.is_none() {
+            let scale = self.settings.scale.unwrap_or(1.0);
+            self.restrict_by_file(scale, model, controllable, &mut own)?;
         }
-        match (self.settings.scale, &self.settings.limit) {
-            (None, Some(_)) => Ok(()),
-            (scale, _) => self.restrict_by_file(scale.unwrap_or(1.0), model, controllable, set),
+        less_each(model, "velocity margin", &mut own, self.settings.margin.as_ref(), controllable)?;
+        for &i in controllable {
+            set.velocity[i] = set.velocity[i].min(own[i].unwrap_or(f64::INFINITY));
         }
+        Ok(())
     }
 }

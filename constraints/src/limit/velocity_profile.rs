@@ -1,19 +1,36 @@
 //! Speed limits that depend on the position, as robot makers state them.
 
+use super::margin::{is_zero, less};
 use super::{Limit, LimitSet};
 use crate::viability::Profile;
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// `velocity_profile = "fr3"`, or the curves joint by joint.
+/// `velocity_profile = "fr3"`, `{ robot = "fr3", margin = 0.05 }`, or the curves joint by joint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "velocity_profile is \"fr3\", { robot = \"fr3\", margin = 0.05 }, or by joint { limit, offset, squared, lower, upper } and \
+                 perhaps margin; it is always hard and takes no soft"
+)]
 pub enum VelocityProfileSettings {
     /// A robot whose published curves are built in; joints are found by the end of their names, `joint1` to `joint7`.
     Robot(KnownRobot),
+    /// The same, less a margin.
+    RobotLess(RobotProfile),
     /// Curves by joint.
     Joints(BTreeMap<String, JointProfile>),
+}
+
+/// A robot's published curves less a margin.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RobotProfile {
+    /// Whose curves.
+    pub robot: KnownRobot,
+    /// Speed kept below them [rad/s or m/s].
+    pub margin: f64,
 }
 
 /// Robots whose curves are built in.
@@ -43,10 +60,13 @@ pub struct JointProfile {
     pub lower: f64,
     /// Position at which the upper curve ends [rad or m].
     pub upper: f64,
+    /// Speed kept below the curves and the limit [rad/s or m/s].
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub margin: f64,
 }
 
 const fn joint(limit: f64, offset: f64, squared: f64, lower: f64, upper: f64) -> JointProfile {
-    JointProfile { limit, offset, squared, lower, upper }
+    JointProfile { limit, offset, squared, lower, upper, margin: 0.0 }
 }
 
 /// Joints 1 to 7 of the Franka Research 3.
@@ -77,7 +97,10 @@ impl VelocityProfileLimit {
     /// Dofs and their curves.
     fn curves(&self, model: &Model) -> Result<Vec<(usize, JointProfile)>, LimitError> {
         match &self.settings {
-            VelocityProfileSettings::Robot(KnownRobot::Fr3) => fr3(model),
+            VelocityProfileSettings::Robot(KnownRobot::Fr3) => fr3(model, 0.0),
+            VelocityProfileSettings::RobotLess(RobotProfile { robot: KnownRobot::Fr3, margin }) => {
+                fr3(model, *margin)
+            }
             VelocityProfileSettings::Joints(map) => {
                 map.iter().map(|(name, curve)| named(model, name, curve)).collect()
             }
@@ -85,9 +108,10 @@ impl VelocityProfileLimit {
     }
 }
 
-fn fr3(model: &Model) -> Result<Vec<(usize, JointProfile)>, LimitError> {
+fn fr3(model: &Model, margin: f64) -> Result<Vec<(usize, JointProfile)>, LimitError> {
     let find = |k: usize| model.joints().iter().find(|j| j.nv == 1 && j.name.ends_with(&format!("joint{k}")));
-    let found: Vec<_> = (1..=7).filter_map(|k| Some((find(k)?.idx_v, FR3[k - 1]))).collect();
+    let found: Vec<_> =
+        (1..=7).filter_map(|k| Some((find(k)?.idx_v, JointProfile { margin, ..FR3[k - 1] }))).collect();
     if found.len() == 7 {
         return Ok(found);
     }
@@ -128,8 +152,10 @@ impl Limit for VelocityProfileLimit {
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         for (i, c) in self.curves(model)? {
             if controllable.contains(&i) {
-                let curve = |at: f64| Some(Profile { at, deceleration: 0.5 * c.squared, offset: c.offset });
-                set.velocity[i] = set.velocity[i].min(c.limit);
+                let what = format!("velocity_profile margin of joint '{}'", model.dof_name(i));
+                let (limit, offset) = (less(&what, c.limit, c.margin)?, c.offset + c.margin);
+                let curve = |at: f64| Some(Profile { at, deceleration: 0.5 * c.squared, offset });
+                set.velocity[i] = set.velocity[i].min(limit);
                 set.profile[i] = [curve(c.lower), curve(c.upper)];
             }
         }

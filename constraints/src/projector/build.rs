@@ -189,8 +189,8 @@ fn stages(
     let worth = hessian.iter().zip(&sigma).fold(0.0, |most: f64, (h, sigma)| most.max(h * sigma * sigma));
     let scaled = |s: Soft| Soft { linear: s.linear * worth, quadratic: s.quadratic * worth };
     let soft = sources.softness().into_iter().map(|s| s.map(scaled)).collect();
-    let mut problem =
-        Coupled::new(hessian, soft, sources.equalities(), &sources.dimensions(), dofs.fixed.len());
+    let cones: Vec<_> = sources.cones().into_iter().map(|(d, soft)| (d, soft.map(scaled))).collect();
+    let mut problem = Coupled::new(hessian, soft, sources.equalities(), &cones, dofs.fixed.len());
     for k in 0..problem.n {
         (problem.lower[k], problem.upper[k]) = (-sigma[k], sigma[k]);
     }
@@ -202,7 +202,8 @@ fn stages(
     let conic = Conic::new(&problem, sigma, settings.max_iter, settings.deadline)?;
     let (n, m) = (problem.n, problem.m);
     let polish = Polish::new(&problem);
-    let (active_set, y, dropped) = (ActiveSet::new(n, m), vec![0.0; n], vec![(0.0, 0.0); m]);
+    let dropped = vec![(0.0, 0.0); m + cones.len()];
+    let (active_set, y) = (ActiveSet::new(n, m), vec![0.0; n]);
     Ok(Some(Stages { sources, labels, problem, active_set, conic, polish, y, exact: false, dropped }))
 }
 

@@ -1,12 +1,12 @@
 //! Clarabel: for cones, and as the judge of last resort; built once and updated in place.
 //!
-//! Variables are `u = y / sigma`, the lifted `z = G u`, one per row, and a slack `s` for each soft row; without the lifting
+//! Variables are `u = y / sigma`, the lifted `z = G u`, one per row, and a slack `s` for each soft row and cone; without the lifting
 //! each dense row would stand in the factor twice:
 //!
 //! ```text
 //!     min 1/2 u'P u + c'u + linear's + 1/2 s'Q s
 //!     s.t.   G u - z = 0 (equal rows: G u = b),   u <= u_max,   -u <= -u_min,
-//!            z - s <= z_max,   -z - s <= -z_min,   -s <= 0,   |G_c u + c| <= radius
+//!            z - s <= z_max,   -z - s <= -z_min,   -s <= 0,   |G_c u + c| <= radius + s
 //! ```
 //!
 //! P is constant, so no NaN can enter it (a NaN in P stays in Clarabel's buffers for good). Clarabel's own equilibration is
@@ -57,7 +57,7 @@ struct Shape {
     m: usize,
     /// Column of each lifted row; none for equal rows.
     z: Vec<Option<usize>>,
-    /// Column of each slack.
+    /// Column of each slack: of rows, then of cones.
     s: Vec<Option<usize>>,
     columns: usize,
     /// First row of: the upper box, upper rows (m each), lower rows, slacks.
@@ -82,7 +82,9 @@ impl Shape {
         let mut columns = n;
         let mut column = |wanted: bool| wanted.then(|| (columns, columns += 1).0);
         let z: Vec<Option<usize>> = (0..m).map(|r| column(!p.equality[r])).collect();
-        let s: Vec<Option<usize>> = (0..m).map(|r| column(p.soft[r].is_some() && !p.equality[r])).collect();
+        let mut s: Vec<Option<usize>> =
+            (0..m).map(|r| column(p.soft[r].is_some() && !p.equality[r])).collect();
+        s.extend(p.cones.iter().map(|cone| column(cone.soft.is_some())));
         let row_upper = m + 2 * n;
         let count = z.iter().flatten().count();
         let (row_lower, slack) = (row_upper + count, row_upper + 2 * count);
@@ -100,7 +102,7 @@ impl Shape {
         self.z[r].map(|column| column - self.n)
     }
 
-    /// Position of row `r` among the slacks.
+    /// Position among the slacks of row `r`, or of cone `r - m`.
     fn slack_of(&self, r: usize) -> Option<usize> {
         let first = self.n + self.z.iter().flatten().count();
         self.s[r].map(|column| column - first)
@@ -121,7 +123,8 @@ impl Conic {
         let scale = weights.iter().fold(f64::MIN_POSITIVE, |s: f64, w| s.max(*w));
         let mut diagonal: Vec<Option<f64>> = weights.iter().map(|w| Some(w / scale)).collect();
         diagonal.resize(shape.columns, None);
-        for (column, soft) in shape.s.iter().zip(&typical.soft) {
+        let softness = typical.soft.iter().copied().chain(typical.cones.iter().map(|cone| cone.soft));
+        for (column, soft) in shape.s.iter().zip(softness) {
             if let (Some(column), Some(soft)) = (column, soft) {
                 diagonal[*column] = Some(soft.quadratic / scale);
             }
@@ -171,13 +174,18 @@ impl Conic {
         let solver = DefaultSolver::new(p, &self.c, a, &self.b, &cones, self.settings.clone());
         let mut solver = solver.map_err(|e| e.to_string())?;
         if self.deadline.is_some() {
-            let (start, ends) = (self.start, self.ends.clone());
-            let late = move |_: &_| start.elapsed().as_nanos() as u64 > ends.load(Ordering::Relaxed);
-            solver.set_termination_callback(late);
+            let late = self.clock();
+            solver.set_termination_callback(move |_: &_| late());
         }
         self.solver = Some(solver);
         self.run(&typical); // the first solve allocates more than the others
         Ok(())
+    }
+
+    /// Whether the time of the last solve is over.
+    pub(crate) fn clock(&self) -> impl Fn() -> bool + Send + 'static {
+        let (start, ends) = (self.start, self.ends.clone());
+        move || start.elapsed().as_nanos() as u64 > ends.load(Ordering::Relaxed)
     }
 
     fn slacks(&self) -> usize {
@@ -204,8 +212,12 @@ impl Conic {
                 self.c[column] = soft.linear / self.scale;
             }
         }
-        for (first, cone) in x.cones.iter().zip(&p.cones) {
-            self.b[*first] = cone.radius.min(FAR) * (1.0 - TIGHTEN);
+        for (k, (first, cone)) in x.cones.iter().zip(&p.cones).enumerate() {
+            let tighten = if cone.soft.is_some() { 0.0 } else { TIGHTEN };
+            self.b[*first] = cone.radius.min(FAR) * (1.0 - tighten);
+            if let (Some(column), Some(soft)) = (x.s[x.m + k], cone.soft) {
+                self.c[column] = soft.linear / self.scale;
+            }
             for (b, c) in self.b[first + 1..].iter_mut().zip(&cone.c) {
                 *b = *c;
             }
@@ -316,7 +328,7 @@ fn diagonal_matrix(diagonal: &[Option<f64>]) -> CscMatrix<f64> {
 }
 
 /// Constraint matrix in compressed columns, with the numbers of `p` to come: `[G; I; -I; 0; 0; 0; -G_c]` for each u,
-/// `[-1; 0; 0; I; -I; 0; 0]` for each z, `[0; 0; 0; -I; -I; -I; 0]` for each s.
+/// `[-1; 0; 0; I; -I; 0; 0]` for each z, `[0; 0; 0; -I; -I; -I; 0]` for the s of a row, `[0; 0; 0; 0; 0; -I; -1]` for that of a cone.
 fn pattern(x: &Shape, p: &Coupled) -> CscMatrix<f64> {
     let (mut colptr, mut rowval, mut nzval) = (vec![0], vec![], vec![]);
     for k in 0..x.n {
@@ -341,6 +353,13 @@ fn pattern(x: &Shape, p: &Coupled) -> CscMatrix<f64> {
         if let (Some(at), Some(slack)) = (x.lifted(r), x.slack_of(r)) {
             rowval.extend([x.row_upper + at, x.row_lower + at, x.slack + slack]);
             nzval.extend([-1.0, -1.0, -1.0]);
+            colptr.push(rowval.len());
+        }
+    }
+    for (c, first) in x.cones.iter().enumerate() {
+        if let Some(slack) = x.slack_of(x.m + c) {
+            rowval.extend([x.slack + slack, *first]);
+            nzval.extend([-1.0, -1.0]);
             colptr.push(rowval.len());
         }
     }

@@ -2,11 +2,11 @@
 //!
 //! ```text
 //!     min 1/2 sum_i h_i (y_i - goal_i)^2 + sum_r linear_r |s_r| + 1/2 quadratic_r s_r^2
-//!     s.t.   lower <= y <= upper,   row_lower <= G y + s <= row_upper,   |G_c y + c| <= radius
+//!     s.t.   lower <= y <= upper,   row_lower <= G y + s <= row_upper,   |G_c y + c| <= radius + s_c
 //! ```
 //!
 //! Rows and cones are shares of the sizes of their limits. Dofs that are not controllable are constants, at the velocity
-//! change their proposal asks for. Hard rows have no slack.
+//! change their proposal asks for. Hard rows and cones have no slack.
 
 use super::Dofs;
 use crate::Soft;
@@ -43,7 +43,7 @@ pub(crate) struct Coupled {
     pub(crate) rows_fixed: Vec<f64>,
 }
 
-/// `|G y + c| <= radius`; infinite when switched off.
+/// `|G y + c| <= radius + s`; infinite when switched off.
 #[derive(Debug, Clone)]
 pub(crate) struct ConeRows {
     /// dimension x n, row-major.
@@ -52,6 +52,8 @@ pub(crate) struct ConeRows {
     pub(crate) g_fixed: Vec<f64>,
     pub(crate) c: Vec<f64>,
     pub(crate) radius: f64,
+    /// Softness; `None` is hard.
+    pub(crate) soft: Option<Soft>,
     /// Size of the limit in its own unit.
     pub(crate) size: f64,
 }
@@ -64,11 +66,12 @@ impl Coupled {
         hessian: Vec<f64>,
         soft: Vec<Option<Soft>>,
         equality: Vec<bool>,
-        dimensions: &[usize],
+        cones: &[(usize, Option<Soft>)],
         fixed: usize,
     ) -> Coupled {
         let (n, m) = (hessian.len(), soft.len());
-        let cone = |d: &usize| ConeRows {
+        let cone = |(d, soft): &(usize, Option<Soft>)| ConeRows {
+            soft: *soft,
             g: vec![0.0; d * n],
             g_fixed: vec![0.0; d * fixed],
             c: vec![0.0; *d],
@@ -88,7 +91,7 @@ impl Coupled {
             row_size: vec![1.0; m],
             soft,
             equality,
-            cones: dimensions.iter().map(cone).collect(),
+            cones: cones.iter().map(cone).collect(),
             fixed,
             rows_fixed: vec![0.0; m * fixed],
         }
@@ -130,14 +133,17 @@ impl Coupled {
         hard.fold(0.0, |worst: f64, r| worst.max(self.excess(r, y)))
     }
 
-    /// True when `y` leaves every soft row without slack.
+    /// True when `y` leaves every soft row and cone without slack.
     pub(crate) fn obeys_soft(&self, y: &[f64], tolerance: f64) -> bool {
-        (0..self.m).filter(|r| self.soft[*r].is_some()).all(|r| self.excess(r, y) <= tolerance)
+        let mut rows = (0..self.m).filter(|r| self.soft[*r].is_some());
+        let mut cones = self.cones.iter().filter(|cone| cone.soft.is_some());
+        rows.all(|r| self.excess(r, y) <= tolerance) && cones.all(|cone| cone.excess(y) <= tolerance)
     }
 
-    /// Largest violation of a cone by `y`.
+    /// Largest violation of a hard cone by `y`.
     pub(crate) fn cone_violation(&self, y: &[f64]) -> f64 {
-        self.cones.iter().fold(0.0, |worst: f64, cone| worst.max(cone.norm(y) - cone.radius))
+        let hard = self.cones.iter().filter(|cone| cone.soft.is_none());
+        hard.fold(0.0, |worst: f64, cone| worst.max(cone.excess(y)))
     }
 
     /// Largest violation of the stationarity condition `H (y - goal) + G' lambda + mu + cones = 0`. The force of a cone
@@ -195,6 +201,11 @@ impl ConeRows {
         self.c[d] + row.iter().zip(y).map(|(g, y)| g * y).sum::<f64>()
     }
 
+    /// By how much `y` exceeds the radius; negative inside.
+    pub(crate) fn excess(&self, y: &[f64]) -> f64 {
+        self.norm(y) - self.radius
+    }
+
     /// `|G y + c|`.
     pub(crate) fn norm(&self, y: &[f64]) -> f64 {
         (0..self.c.len()).map(|d| self.entry(d, y).powi(2)).sum::<f64>().sqrt()
@@ -228,7 +239,7 @@ impl ConeRows {
 const FAR: f64 = 100.0;
 
 /// The problem of a tick in textbook form for other solvers to check ours, over `x = (y, s)` with a slack `s >= 0` for each soft
-/// row: `min 1/2 x'H x + c'x` s.t. `G x <= h`, `A x = b` and `|C_k y + c_k| <= radius_k`.
+/// row, then for each soft cone: `min 1/2 x'H x + c'x` s.t. `G x <= h`, `A x = b` and `|C_k y + c_k| <= radius_k + s_k`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
     /// Dofs of the variables `y`.
@@ -247,15 +258,29 @@ pub struct Problem {
     pub a: Vec<f64>,
     /// `b` (equalities).
     pub b: Vec<f64>,
-    /// Cones: `C` (dimension x dofs, row-major), `c` (dimension), radius.
-    pub cones: Vec<(Vec<f64>, Vec<f64>, f64)>,
+    /// Cones that are switched on.
+    pub cones: Vec<ProblemCone>,
+}
+
+/// `|C y + c| <= radius + s` of a [`Problem`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct ProblemCone {
+    /// `C` (dimension x dofs, row-major).
+    pub g: Vec<f64>,
+    /// `c` (dimension).
+    pub c: Vec<f64>,
+    /// Radius.
+    pub radius: f64,
+    /// Variable that is its slack `s`; `None` for a hard cone, which has none.
+    pub slack: Option<usize>,
 }
 
 impl Problem {
     pub(crate) fn of(p: &Coupled, dofs: &[usize]) -> Problem {
         let slack_of: Vec<Option<usize>> = {
             let mut next = p.n;
-            p.soft.iter().map(|s| s.map(|_| (next, next += 1).0)).collect()
+            let cones = p.cones.iter().map(|cone| cone.soft);
+            p.soft.iter().copied().chain(cones).map(|s| s.map(|_| (next, next += 1).0)).collect()
         };
         let n = p.n + slack_of.iter().flatten().count();
         let mut problem = Problem {
@@ -291,15 +316,22 @@ impl Problem {
             problem.hessian[k * n + k] = p.hessian[k];
             problem.c[k] = -p.hessian[k] * p.goal[k];
         }
-        for (slack, soft) in slack_of.iter().zip(&p.soft) {
+        let softness = p.soft.iter().copied().chain(p.cones.iter().map(|cone| cone.soft));
+        for (slack, soft) in slack_of.iter().zip(softness) {
             if let (Some(k), Some(soft)) = (*slack, soft) {
                 problem.hessian[k * n + k] = soft.quadratic;
                 problem.c[k] = soft.linear;
                 problem.push(unit(k, -1.0), 0.0);
             }
         }
-        let finite = p.cones.iter().filter(|cone| cone.radius.is_finite());
-        problem.cones = finite.map(|cone| (cone.g.clone(), cone.c.clone(), cone.radius)).collect();
+        let finite = p.cones.iter().zip(&slack_of[p.m..]).filter(|(cone, _)| cone.radius.is_finite());
+        let cone = |(cone, slack): (&ConeRows, &Option<usize>)| ProblemCone {
+            g: cone.g.clone(),
+            c: cone.c.clone(),
+            radius: cone.radius,
+            slack: *slack,
+        };
+        problem.cones = finite.map(cone).collect();
         problem
     }
 

@@ -1,19 +1,13 @@
 //! Derivative of the target with respect to the proposal, as a vector-Jacobian product.
 //!
-//! With F the dofs off their bounds, A the active rows and cone normals, and D the give of elastic rows, the optimality conditions
-//! of the last tick change with the goal as
-//!
-//! ```text
-//!     [ H + C   A' ] [ dy ]   [ H dgoal ]
-//!     [   A    -D  ] [ dl ] = [    0    ]      C = nu G_c' (I - u u') G_c / |G_c y + c|,   u = (G_c y + c) / |G_c y + c|
-//! ```
-//!
-//! so for a cotangent w of y the cotangent of the goal is `H z` with `z = (K^-1)(w, 0)`: the weighted projector onto the null space
+//! The optimality conditions of the last tick (`kkt.rs`) change with the goal as `K (dy, dlambda) = (H dgoal, 0)`, so for a cotangent w of y the cotangent of the goal is `H z` with `z = (K^-1)(w, 0)`: the weighted projector onto the null space
 //! of the active rows. `goal = v + (y_q + y_v) / 2` then hands half of it to the velocity and `1 / (2 kappa T)` to the position
 //! proposed. Where the active set changes there is no derivative; this is then one of its one-sided ones.
 
 use super::coupled::Coupled;
+use super::kkt::Kkt;
 use super::{Projector, Stages};
+use crate::Soft;
 use crate::ledger::{Rung, Status};
 use crate::target::Consistency;
 
@@ -57,7 +51,7 @@ impl Projector {
         let dgoal = match solved {
             None => self.through_the_box(&w),
             Some(stages) => {
-                let (dgoal, dfixed) = Kkt::of(stages).pull_back(&stages.problem, &w);
+                let (dgoal, dfixed) = Held::of(stages).pull_back(&stages.problem, &w);
                 for (&j, d) in self.dofs.fixed.iter().zip(dfixed) {
                     dv_proposal[j] += d;
                 }
@@ -78,17 +72,14 @@ impl Projector {
 }
 
 /// The conditions that hold with equality at the answer of a stage.
-struct Kkt<'a> {
+struct Held<'a> {
     y: &'a [f64],
-    /// Dofs off their bounds.
-    free: Vec<usize>,
-    rows: Vec<usize>,
-    /// Cones with their multipliers.
-    cones: Vec<(usize, f64)>,
+    nu: &'a [f64],
+    kkt: Kkt,
 }
 
-impl Kkt<'_> {
-    fn of(stages: &Stages) -> Kkt<'_> {
+impl Held<'_> {
+    fn of(stages: &Stages) -> Held<'_> {
         let (s, c, p) = (&stages.active_set, &stages.conic, &stages.problem);
         let (y, mu, lambda) = if stages.exact { (&s.y, &s.mu, &s.lambda) } else { (&c.y, &c.mu, &c.lambda) };
         let nu: &[f64] = if stages.exact { &[] } else { &c.nu };
@@ -96,104 +87,53 @@ impl Kkt<'_> {
         let largest = all.fold(0.0, |most: f64, x| most.max(x.abs()));
         let floor = if stages.exact { 0.0 } else { ROUNDING * largest };
         let held = |x: f64| x.abs() > floor;
-        Kkt {
-            y,
-            free: (0..p.n).filter(|k| !held(mu[*k])).collect(),
-            rows: (0..p.m).filter(|r| held(lambda[*r])).collect(),
-            cones: nu.iter().copied().enumerate().filter(|(_, nu)| held(*nu)).collect(),
-        }
+        let give = |soft: Option<Soft>, excess: f64| {
+            soft.filter(|_| excess > 1e-9).map_or(0.0, |s| 1.0 / s.quadratic)
+        };
+        let rows = (0..p.m).filter(|r| held(lambda[*r]));
+        let cones = (0..nu.len()).filter(|c| held(nu[*c]));
+        let mut kkt = Kkt::default();
+        kkt.free.extend((0..p.n).filter(|k| !held(mu[*k])));
+        kkt.rows.extend(rows.map(|r| (r, give(p.soft[r], p.excess(r, y)))));
+        kkt.cones.extend(cones.map(|c| (c, give(p.cones[c].soft, p.cones[c].excess(y)))));
+        kkt.look(p, y);
+        Held { y, nu, kkt }
     }
 
     /// Cotangents of the goal (n) and of the velocity changes of the dofs that are not controllable.
-    fn pull_back(&self, p: &Coupled, w: &[f64]) -> (Vec<f64>, Vec<f64>) {
-        let (f, size) = (self.free.len(), self.free.len() + self.rows.len() + self.cones.len());
-        let mut k = vec![0.0; size * size];
-        let mut z = vec![0.0; size];
-        for (a, &i) in self.free.iter().enumerate() {
-            k[a * size + a] = p.hessian[i];
-            z[a] = w[i];
-        }
-        let mut border = |a: usize, gradient: &dyn Fn(usize) -> f64, give: f64| {
-            for (b, &i) in self.free.iter().enumerate() {
-                (k[a * size + b], k[b * size + a]) = (gradient(i), gradient(i));
-            }
-            k[a * size + a] = -give;
-        };
-        for (a, &r) in self.rows.iter().enumerate() {
-            let elastic = p.soft[r].filter(|_| p.excess(r, self.y) > 1e-9);
-            border(f + a, &|i| p.rows[r * p.n + i], elastic.map_or(0.0, |s| 1.0 / s.quadratic));
-        }
-        for (a, &(c, _)) in self.cones.iter().enumerate() {
-            border(f + self.rows.len() + a, &|i| p.cones[c].slope(self.y, i), 0.0);
-        }
-        for &(c, nu) in &self.cones {
-            for (a, &i) in self.free.iter().enumerate() {
-                for (b, &j) in self.free.iter().enumerate() {
-                    k[a * size + b] += nu
-                        * p.cones[c].curvature(
-                            self.y,
-                            |d| p.cones[c].g[d * p.n + i],
-                            |d| p.cones[c].g[d * p.n + j],
-                        );
-                }
-            }
-        }
-        if !solve(&mut k, &mut z, size) {
-            z.fill(0.0); // dependent rows: no unique derivative
+    fn pull_back(&mut self, p: &Coupled, w: &[f64]) -> (Vec<f64>, Vec<f64>) {
+        let kkt = &mut self.kkt;
+        kkt.x = kkt.free.iter().map(|i| w[*i]).collect();
+        kkt.x.resize(kkt.free.len() + kkt.rows.len() + kkt.cones.len(), 0.0);
+        if !kkt.solve(p, self.nu) {
+            kkt.x.fill(0.0); // dependent rows: no unique derivative
         }
         let mut dgoal = vec![0.0; p.n];
-        for (a, &i) in self.free.iter().enumerate() {
-            dgoal[i] = p.hessian[i] * z[a];
+        for (&i, z) in kkt.free.iter().zip(&kkt.x) {
+            dgoal[i] = p.hessian[i] * z;
         }
-        (dgoal, self.fixed(p, &z))
+        (dgoal, self.fixed(p))
     }
 
     /// Constants of rows and cones: `-G_u' z_row`, and for cones the turn of their normals as well.
-    fn fixed(&self, p: &Coupled, z: &[f64]) -> Vec<f64> {
-        let f = self.free.len();
+    fn fixed(&self, p: &Coupled) -> Vec<f64> {
+        let Kkt { free, rows, cones, x: z, .. } = &self.kkt;
+        let f = free.len();
         let column = |u: usize| {
             let mut sum = 0.0;
-            for (a, &r) in self.rows.iter().enumerate() {
+            for (a, &(r, _)) in rows.iter().enumerate() {
                 sum -= p.rows_fixed[r * p.fixed + u] * z[f + a];
             }
-            for (a, &(c, nu)) in self.cones.iter().enumerate() {
+            for (a, &(c, _)) in cones.iter().enumerate() {
                 let cone = &p.cones[c];
                 let own = |d: usize| cone.g_fixed[d * p.fixed + u];
-                sum -= cone.slope_along(self.y, own) * z[f + self.rows.len() + a];
-                for (b, &i) in self.free.iter().enumerate() {
-                    sum -= nu * z[b] * cone.curvature(self.y, |d| cone.g[d * p.n + i], own);
+                sum -= cone.slope_along(self.y, own) * z[f + rows.len() + a];
+                for (b, &i) in free.iter().enumerate() {
+                    sum -= self.nu[c] * z[b] * cone.curvature(self.y, |d| cone.g[d * p.n + i], own);
                 }
             }
             sum
         };
         (0..p.fixed).map(column).collect()
     }
-}
-
-/// Solves `K x = b` in place by elimination with pivots; false when K is singular.
-pub(super) fn solve(k: &mut [f64], b: &mut [f64], n: usize) -> bool {
-    let largest = k.iter().fold(0.0, |m: f64, x| m.max(x.abs()));
-    for col in 0..n {
-        let pivot =
-            (col..n).max_by(|a, c| k[a * n + col].abs().total_cmp(&k[c * n + col].abs())).unwrap_or(col);
-        if k[pivot * n + col].abs() <= 1e-14 * largest {
-            return false;
-        }
-        if pivot != col {
-            (0..n).for_each(|j| k.swap(col * n + j, pivot * n + j));
-            b.swap(col, pivot);
-        }
-        for row in col + 1..n {
-            let factor = k[row * n + col] / k[col * n + col];
-            if factor != 0.0 {
-                (col..n).for_each(|j| k[row * n + j] -= factor * k[col * n + j]);
-                b[row] -= factor * b[col];
-            }
-        }
-    }
-    for row in (0..n).rev() {
-        let sum: f64 = (row + 1..n).map(|j| k[row * n + j] * b[j]).sum();
-        b[row] = (b[row] - sum) / k[row * n + row];
-    }
-    true
 }

@@ -83,10 +83,14 @@ impl Projector {
                 target.ledger.active.push(ActiveRow { kind, row: nv + r, side, multiplier, slack });
             }
         }
-        for (c, nu) in nu.iter().enumerate().filter(|(_, nu)| **nu > floor) {
-            let (label, multiplier) = (&stages.labels[p.m + c], nu / p.cones[c].size);
-            let (kind, row, side) = (label.kind, nv + p.m + c, Side::Upper);
-            target.ledger.active.push(ActiveRow { kind, row, side, multiplier, slack: 0.0 });
+        for (c, cone) in p.cones.iter().enumerate() {
+            let (nu, excess) = (nu.get(c).copied().unwrap_or(0.0), cone.excess(y));
+            let slack = if cone.soft.is_some() && excess > ROW_TOLERANCE { excess } else { 0.0 };
+            if nu > floor || slack > 0.0 {
+                let (kind, multiplier) = (stages.labels[p.m + c].kind, nu / cone.size);
+                let (row, side) = (nv + p.m + c, Side::Upper);
+                target.ledger.active.push(ActiveRow { kind, row, side, multiplier, slack });
+            }
         }
     }
 }
@@ -103,6 +107,14 @@ impl Stages {
             (p.row_lower[r], p.row_upper[r]) = (f64::NEG_INFINITY, f64::INFINITY);
             count + 1
         });
+        let dropped =
+            p.cones.iter_mut().zip(&mut self.dropped[p.m..]).fold(dropped, |count, (cone, kept)| {
+                if cone.soft.is_none() {
+                    return count;
+                }
+                kept.1 = std::mem::replace(&mut cone.radius, f64::INFINITY);
+                count + 1
+            });
         if dropped == 0 {
             return Err(BrakeReason::NoCertifiedAnswer);
         }
@@ -111,6 +123,8 @@ impl Stages {
         for r in (0..p.m).filter(|r| p.soft[*r].is_some()) {
             (p.row_lower[r], p.row_upper[r]) = self.dropped[r];
         }
+        let cones = p.cones.iter_mut().zip(&self.dropped[p.m..]);
+        cones.filter(|(cone, _)| cone.soft.is_some()).for_each(|(cone, kept)| cone.radius = kept.1);
         relaxed.ok_or(BrakeReason::NoCertifiedAnswer)
     }
 
@@ -119,7 +133,8 @@ impl Stages {
         if !by_clarabel {
             let settled = self.active_set.solve(&self.problem);
             *iterations += self.active_set.iterations;
-            self.exact = settled && self.problem.cone_violation(&self.active_set.y) <= ROW_TOLERANCE;
+            let y = &self.active_set.y; // of the rows alone
+            self.exact = settled && self.problem.cones.iter().all(|cone| cone.excess(y) <= ROW_TOLERANCE);
             if self.exact {
                 return Some(Rung::ActiveSet);
             }
@@ -130,7 +145,8 @@ impl Stages {
         self.exact = false;
         let answered = self.conic.solve(&self.problem);
         if answered {
-            self.polish.refine(&self.problem, &mut self.conic);
+            let late = self.conic.clock();
+            self.polish.refine(&self.problem, &mut self.conic, late);
         }
         *iterations += self.conic.iterations;
         (answered && self.obeys(&self.conic.y, ROW_TOLERANCE)).then_some(Rung::Clarabel)

@@ -8,6 +8,7 @@ mod build;
 mod conic;
 mod coupled;
 mod gradient;
+mod kkt;
 mod ladder;
 mod modes;
 mod polish;
@@ -15,7 +16,7 @@ mod sources;
 mod stages;
 mod switch;
 
-pub use coupled::Problem;
+pub use coupled::{Problem, ProblemCone};
 #[doc(hidden)]
 pub use stages::{LoneStages, Numbers};
 
@@ -116,7 +117,7 @@ struct Stages {
     y: Vec<f64>,
     /// The last answer is the active-set stage's.
     exact: bool,
-    /// Bounds of soft rows while they are left out (m).
+    /// Bounds of soft rows (m) and radii of soft cones while they are left out.
     dropped: Vec<(f64, f64)>,
 }
 

@@ -1,19 +1,12 @@
 //! Newton's method on the optimality conditions, from Clarabel's answer on, for problems with cones.
 //!
-//! An interior point ends where its steps stop paying: up to 3e-4 of the largest velocity change from the optimum. With F the dofs off
-//! their bounds and A the rows and cone normals that hold back, each step solves
-//!
-//! ```text
-//!     [ H + C   A' ] [ dy     ]   [ H (goal - y)   ]
-//!     [   A    -D  ] [ lambda ] = [ bound - A y    ]      C = nu (G_c'G_c - s s') / |G_c y + c|,   s = G_c' u
-//! ```
-//!
-//! (letters as in `gradient.rs`), then lets go what pulls the wrong way and takes up what is exceeded. The answer counts only when
-//! nothing is left to change; else Clarabel's stays.
+//! An interior point ends where its steps stop paying: up to 3e-4 of the largest velocity change from the optimum. From there each step
+//! solves `K (dy, lambda) = (H (goal - y), bound - A y)` (`kkt.rs`), then lets go what pulls the wrong way and takes up what is exceeded.
+//! The answer counts only when nothing is left to change; else, and when the steps or the time run out, Clarabel's stays.
 
 use super::conic::Conic;
 use super::coupled::Coupled;
-use super::gradient::solve;
+use super::kkt::Kkt;
 
 /// Steps allowed.
 const STEPS: u32 = 30;
@@ -30,7 +23,7 @@ enum Held {
     Not,
     Lower,
     Upper,
-    /// A soft row beyond its lower or upper bound.
+    /// A soft row or cone beyond its lower or upper bound.
     BeyondLower,
     BeyondUpper,
 }
@@ -44,21 +37,12 @@ pub(crate) struct Polish {
     mu: Vec<f64>,
     lambda: Vec<f64>,
     nu: Vec<f64>,
-    /// `G_c' G_c` (n x n) and `s` (n) of each cone, and `|G_c y + c|`.
-    gram: Vec<Vec<f64>>,
-    normal: Vec<Vec<f64>>,
-    norm: Vec<f64>,
-    point: Vec<f64>,
-    /// Unknowns: dofs, then n + rows, then n + m + cones.
-    active: Vec<usize>,
-    k: Vec<f64>,
-    x: Vec<f64>,
+    kkt: Kkt,
 }
 
 impl Polish {
     pub(crate) fn new(p: &Coupled) -> Polish {
         let (n, m, cones) = (p.n, p.m, p.cones.len());
-        let size = if cones == 0 { 0 } else { n + m + cones };
         Polish {
             dofs: vec![Held::Not; n],
             rows: vec![Held::Not; m],
@@ -67,34 +51,32 @@ impl Polish {
             mu: vec![0.0; n],
             lambda: vec![0.0; m],
             nu: vec![0.0; cones],
-            gram: vec![vec![0.0; n * n]; cones],
-            normal: vec![vec![0.0; n]; cones],
-            norm: vec![0.0; cones],
-            point: vec![0.0; p.cones.iter().map(|c| c.c.len()).max().unwrap_or(0)],
-            active: Vec::with_capacity(size),
-            k: vec![0.0; size * size],
-            x: vec![0.0; size],
+            kkt: if cones == 0 { Kkt::default() } else { Kkt::with_room(p) },
         }
     }
 
-    /// Replaces the answer by the optimum near it, where Newton's method finds it.
-    pub(crate) fn refine(&mut self, p: &Coupled, answer: &mut Conic) {
+    /// Replaces the answer by the optimum near it, where Newton's method finds it before `late`; true when it did.
+    pub(crate) fn refine(&mut self, p: &Coupled, answer: &mut Conic, late: impl Fn() -> bool) -> bool {
         if p.cones.is_empty() {
-            return;
+            return false;
         }
         self.start(p, answer);
         let reach = (0..p.n).fold(f64::MIN_POSITIVE, |w: f64, k| w.max(p.upper[k] - p.lower[k]));
         for _ in 0..STEPS {
-            let Some(moved) = self.step(p) else { return };
+            if late() {
+                return false;
+            }
+            let Some(moved) = self.step(p) else { return false };
             let changed = self.change(p, reach);
             if !changed && moved <= 1e-13 * reach {
                 answer.y.copy_from_slice(&self.y);
                 answer.mu.copy_from_slice(&self.mu);
                 answer.lambda.copy_from_slice(&self.lambda);
                 answer.nu.copy_from_slice(&self.nu);
-                return;
+                return true;
             }
         }
+        false
     }
 
     /// Takes over the answer and what holds it back.
@@ -119,27 +101,10 @@ impl Polish {
             self.rows[r] = if gives { beyond(held) } else { held };
         }
         for (c, cone) in p.cones.iter().enumerate() {
-            self.cones[c] = if cone.radius.is_finite() { side(answer.nu[c].max(0.0)) } else { Held::Not };
-            for (i, row) in self.gram[c].chunks_exact_mut(p.n).enumerate() {
-                for (j, g) in row.iter_mut().enumerate() {
-                    *g = cone.g.chunks_exact(p.n).map(|g| g[i] * g[j]).sum();
-                }
-            }
-        }
-    }
-
-    /// `|G_c y + c|` and its slope.
-    fn look(&mut self, p: &Coupled) {
-        for (c, cone) in p.cones.iter().enumerate() {
-            let point = &mut self.point[..cone.c.len()];
-            for (d, row) in cone.g.chunks_exact(p.n).enumerate() {
-                point[d] = cone.c[d] + row.iter().zip(&self.y).map(|(g, y)| g * y).sum::<f64>();
-            }
-            self.norm[c] = point.iter().map(|x| x * x).sum::<f64>().sqrt().max(f64::MIN_POSITIVE);
-            for (k, s) in self.normal[c].iter_mut().enumerate() {
-                *s = point.iter().enumerate().map(|(d, x)| x * cone.g[d * p.n + k]).sum::<f64>()
-                    / self.norm[c];
-            }
+            let nu = answer.nu[c];
+            let gives = cone.soft.is_some_and(|s| nu > s.linear * (1.0 + ROUNDING.1));
+            let held = if cone.radius.is_finite() { side(nu.max(0.0)) } else { Held::Not };
+            self.cones[c] = if gives { beyond(held) } else { held };
         }
     }
 
@@ -153,66 +118,45 @@ impl Polish {
                 _ => self.y[k] = p.upper[k],
             }
         }
-        self.look(p);
-        self.active.clear();
-        self.active.extend((0..n).filter(|k| self.dofs[*k] == Held::Not));
-        let free = self.active.len();
-        self.active.extend((0..m).filter(|r| self.rows[*r] != Held::Not).map(|r| n + r));
-        self.active.extend((0..p.cones.len()).filter(|c| self.cones[*c] != Held::Not).map(|c| n + m + c));
-        let size = self.active.len();
-        let (k, x) = (&mut self.k[..size * size], &mut self.x[..size]);
-        k.fill(0.0);
-        for a in 0..free {
-            let i = self.active[a];
-            k[a * size + a] = p.hessian[i];
-            x[a] = p.hessian[i] * (p.goal[i] - self.y[i]);
+        let kkt = &mut self.kkt;
+        kkt.look(p, &self.y);
+        kkt.free.clear();
+        kkt.rows.clear();
+        kkt.cones.clear();
+        kkt.x.clear();
+        for k in (0..n).filter(|k| self.dofs[*k] == Held::Not) {
+            kkt.free.push(k);
+            kkt.x.push(p.hessian[k] * (p.goal[k] - self.y[k]));
         }
-        for a in free..size {
-            let at = self.active[a];
-            for b in 0..free {
-                let i = self.active[b];
-                let g = if at < n + m { p.rows[(at - n) * n + i] } else { self.normal[at - n - m][i] };
-                (k[a * size + b], k[b * size + a]) = (g, g);
-            }
-            if at >= n + m {
-                let c = at - n - m;
-                x[a] = p.cones[c].radius - self.norm[c];
-                for (b, d) in (0..free).flat_map(|b| (0..free).map(move |d| (b, d))) {
-                    let (i, j) = (self.active[b], self.active[d]);
-                    let turn = self.gram[c][i * n + j] - self.normal[c][i] * self.normal[c][j];
-                    k[b * size + d] += self.nu[c] * turn / self.norm[c];
-                }
-                continue;
-            }
-            let (r, held) = (at - n, self.rows[at - n]);
-            let upper = matches!(held, Held::Upper | Held::BeyondUpper);
-            x[a] = if upper { p.row_upper[r] } else { p.row_lower[r] } - p.row(r, &self.y);
-            if let (Held::BeyondLower | Held::BeyondUpper, Some(soft)) = (held, p.soft[r]) {
-                // lambda = +-(linear + quadratic s) with the slack s beyond the bound
-                k[a * size + a] = -1.0 / soft.quadratic;
-                x[a] -= if upper { soft.linear } else { -soft.linear } / soft.quadratic;
-            }
+        // lambda = +-(linear + quadratic s) with the slack s beyond the bound
+        for r in (0..m).filter(|r| self.rows[*r] != Held::Not) {
+            let upper = matches!(self.rows[r], Held::Upper | Held::BeyondUpper);
+            let bound = if upper { p.row_upper[r] } else { p.row_lower[r] } - p.row(r, &self.y);
+            let soft = p.soft[r].filter(|_| self.rows[r].gives());
+            let linear = soft.map_or(0.0, |s| s.linear / s.quadratic);
+            kkt.rows.push((r, soft.map_or(0.0, |s| 1.0 / s.quadratic)));
+            kkt.x.push(if upper { bound - linear } else { bound + linear });
         }
-        if !solve(k, x, size) || !x.iter().all(|x| x.is_finite()) {
+        for c in (0..p.cones.len()).filter(|c| self.cones[*c] != Held::Not) {
+            let soft = p.cones[c].soft.filter(|_| self.cones[c].gives());
+            kkt.cones.push((c, soft.map_or(0.0, |s| 1.0 / s.quadratic)));
+            kkt.x.push(p.cones[c].radius - kkt.norm[c] - soft.map_or(0.0, |s| s.linear / s.quadratic));
+        }
+        if !kkt.solve(p, &self.nu) {
             return None;
         }
         self.lambda.fill(0.0);
         self.nu.fill(0.0);
-        let mut moved = 0.0f64;
-        for (a, &at) in self.active.iter().enumerate() {
-            match at {
-                i if i < n => {
-                    self.y[i] += x[a];
-                    moved = moved.max(x[a].abs());
-                }
-                r if r < n + m => self.lambda[r - n] = x[a],
-                c => self.nu[c - n - m] = x[a],
-            }
-        }
-        self.look(p);
+        let (dy, multipliers) = kkt.x.split_at(kkt.free.len());
+        let (lambda, nu) = multipliers.split_at(kkt.rows.len());
+        kkt.free.iter().zip(dy).for_each(|(k, dy)| self.y[*k] += dy);
+        kkt.rows.iter().zip(lambda).for_each(|((r, _), x)| self.lambda[*r] = *x);
+        kkt.cones.iter().zip(nu).for_each(|((c, _), x)| self.nu[*c] = *x);
+        let moved = dy.iter().fold(0.0, |most: f64, dy| most.max(dy.abs()));
+        kkt.look(p, &self.y);
         for i in 0..n {
             let rows: f64 = (0..m).map(|r| self.lambda[r] * p.rows[r * n + i]).sum();
-            let cones: f64 = self.nu.iter().zip(&self.normal).map(|(nu, s)| nu * s[i]).sum();
+            let cones: f64 = self.nu.iter().zip(&kkt.normal).map(|(nu, s)| nu * s[i]).sum();
             let pull = p.hessian[i] * (p.goal[i] - self.y[i]) - rows - cones;
             self.mu[i] = if self.dofs[i] == Held::Not { 0.0 } else { pull };
         }
@@ -258,14 +202,24 @@ impl Polish {
             set(&mut self.rows[r], to);
         }
         for (c, cone) in p.cones.iter().enumerate() {
+            let nu = self.nu[c];
+            let linear = cone.soft.map_or(f64::INFINITY, |s| s.linear);
             let to = match self.cones[c] {
-                Held::Not if self.norm[c] > cone.radius + EXCESS => Held::Upper,
-                Held::Upper if self.nu[c] < -floor => Held::Not,
+                Held::Not if self.kkt.norm[c] > cone.radius + EXCESS => Held::Upper,
+                Held::Upper | Held::BeyondUpper if nu < -floor => Held::Not,
+                Held::Upper if nu > linear + floor => Held::BeyondUpper,
+                Held::BeyondUpper if nu < linear - floor => Held::Upper,
                 now => now,
             };
             set(&mut self.cones[c], to);
         }
         changed
+    }
+}
+
+impl Held {
+    fn gives(self) -> bool {
+        matches!(self, Held::BeyondLower | Held::BeyondUpper)
     }
 }
 
@@ -276,3 +230,6 @@ fn beyond(held: Held) -> Held {
         other => other,
     }
 }
+
+#[cfg(test)]
+mod tests;

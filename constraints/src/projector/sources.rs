@@ -37,6 +37,7 @@ struct ConeBlock {
     cone: Box<dyn Cone>,
     limit: usize,
     size: f64,
+    soft: Option<Soft>,
     enabled: bool,
 }
 
@@ -72,8 +73,9 @@ impl Sources {
                 blocks.push(block);
             }
             if let Some(cone) = l.cone(model, controllable)? {
-                check_sizes(&[cone.size()], 1, None, l.label())?;
-                cones.push(ConeBlock { limit, size: cone.size(), enabled: true, cone });
+                let (size, soft) = (cone.size(), l.soft());
+                check_sizes(&[size], 1, soft, l.label())?;
+                cones.push(ConeBlock { limit, size, soft, enabled: true, cone });
             }
         }
         let needs = blocks.iter().map(|b| b.rows.needs()).chain(cones.iter().map(|c| c.cone.needs()));
@@ -109,9 +111,9 @@ impl Sources {
         self.blocks.iter().flat_map(|b| vec![b.rows.equality() && b.soft.is_none(); b.sizes.len()]).collect()
     }
 
-    /// Rows of the matrices of all cones.
-    pub(crate) fn dimensions(&self) -> Vec<usize> {
-        self.cones.iter().map(|c| c.cone.dimension()).collect()
+    /// Rows of the matrix of each cone, and its softness.
+    pub(crate) fn cones(&self) -> Vec<(usize, Option<Soft>)> {
+        self.cones.iter().map(|c| (c.cone.dimension(), c.soft)).collect()
     }
 
     /// Switches the rows and cones of a limit.

@@ -57,7 +57,7 @@ pub fn panda_limits(torque: Option<f64>) -> Vec<Box<dyn Limit>> {
     let mut limits: Vec<Box<dyn Limit>> = vec![
         Box::new(PositionLimit::default()),
         Box::new(VelocityLimit::scaled(0.6)),
-        Box::new(AccelerationLimit::new(limit::AccelerationSettings { limit, braking })),
+        Box::new(AccelerationLimit::new(limit::AccelerationSettings::of(limit, braking))),
     ];
     if let Some(scale) = torque {
         limits.push(Box::new(TorqueLimit::scaled(scale)));

@@ -124,7 +124,7 @@ fn limits(model: &Model, robot: &Robot, share: f64) -> Vec<Box<dyn Limit>> {
     let per_joint = |share: f64| {
         PerJoint::Joints(model.joints().iter().map(|j| (j.name.clone(), share * a(j.idx_v))).collect())
     };
-    let acceleration = AccelerationSettings { limit: per_joint(1.0), braking: Some(per_joint(share)) };
+    let acceleration = AccelerationSettings::of(per_joint(1.0), Some(per_joint(share)));
     vec![
         Box::new(PositionLimit::default()),
         Box::new(VelocityLimit::scaled(robot.speed)),

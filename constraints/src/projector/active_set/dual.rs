@@ -21,6 +21,12 @@ const NOISE: f64 = 1e-24;
 /// A constraint this near to depending on the held ones, as share of its own size, is looked at again with a new factor.
 const NEAR: f64 = 1e-6;
 
+/// A constraint nearer than this to depending on the held ones, which nothing blocks, may show that nothing obeys them all.
+const SUSPECT: f64 = 1e-3;
+
+/// A constraint nearer than this depends on them: the factor could not hold it.
+const DEPENDENT: f64 = 1e-11;
+
 /// What a step ends with.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Event {
@@ -79,13 +85,16 @@ impl ActiveSet {
                 slope = self.slope(violated) + give;
             }
             let (blocked, blocking) = self.first_event(p, NOISE * size);
-            let full = match slope > 1e-13 * size {
+            if slope < SUSPECT * size && blocked.min(bend).is_infinite() && self.is_empty(p, violated) {
+                self.empty = true;
+                return false;
+            }
+            let full = match slope > DEPENDENT * size {
                 true => (self.excess(p, violated) - slack) / slope,
                 false => f64::INFINITY,
             };
             let step = blocked.min(full).min(bend);
             if step.is_infinite() {
-                self.empty = self.is_empty(p, violated);
                 return false;
             }
             self.advance(step, full.is_finite());
@@ -104,14 +113,24 @@ impl ActiveSet {
     }
 
     /// With the held constraints written `g_a'y <= h_a`, nothing lets go of them: `g = G_R' r + rest` with `r <= 0` and `rest` of
-    /// the held bounds' signs against them. So every y that exceeds no held one by more than some share exceeds `violated` by what `y` does,
-    /// less that share times the multipliers' sum.
+    /// the held bounds' signs against them. So every y in the box that exceeds no hard held one by more than some share exceeds `violated` by
+    /// what the present `y` does, less that share times the multipliers' sum, less what the free dofs and the soft rows can make up for.
     fn is_empty(&self, p: &Coupled, violated: Constraint) -> bool {
-        let rows: f64 = self.held.iter().zip(&self.r).map(|(_, r)| r.abs()).sum();
+        if matches!(violated, Constraint::Row(r, _) if p.soft[r].is_some()) {
+            return false;
+        }
+        let hard = self.held.iter().zip(&self.r).filter(|(row, _)| p.soft[**row].is_none());
+        let rows: f64 = hard.map(|(_, r)| r.abs()).sum();
         let bounds: f64 = self.rest.iter().zip(&self.box_side).map(|(rest, side)| (rest * side).abs()).sum();
+        let reach = |k: usize| (p.upper[k] - self.y[k]).max(self.y[k] - p.lower[k]);
         let free = (0..p.n).filter(|k| self.box_side[*k] == 0.0);
-        let left: f64 = free.map(|k| self.rest[k].abs() * (p.upper[k] - p.lower[k])).sum();
-        self.excess(p, violated) - left > CLEAR * (1.0 + rows + bounds)
+        let left: f64 = free.map(|k| self.rest[k].abs() * reach(k)).sum();
+        let soft = self.held.iter().zip(&self.r).filter(|(row, r)| p.soft[**row].is_some() && **r != 0.0);
+        let give = soft.map(|(row, r)| {
+            let most: f64 = p.gradient(*row).iter().enumerate().map(|(k, g)| g.abs() * reach(k)).sum();
+            r.abs() * most
+        });
+        self.excess(p, violated) - left - give.sum::<f64>() > CLEAR * (1.0 + rows + bounds)
     }
 
     /// `g'H^-1 g`.
