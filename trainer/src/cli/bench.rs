@@ -26,6 +26,8 @@ enum What {
     Update(Ticks),
     /// One projection: percentiles beside an empty timer.
     Projection(Ticks),
+    /// Plant and loop of the Panda under load and hot swaps: everything the loop promises, counted.
+    Soak(super::soak::Soak),
     #[command(flatten)]
     Loop(nearl_runtime::cli::LoopBench),
 }
@@ -74,6 +76,7 @@ impl Bench {
             What::Train(b) => b.run(),
             What::Update(b) => b.run(true),
             What::Projection(b) => b.run(false),
+            What::Soak(b) => b.run(),
             What::Loop(b) => b.run(),
         }
     }
