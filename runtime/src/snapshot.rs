@@ -191,6 +191,17 @@ impl SnapshotError {
     }
 }
 
+/// What a parser says of a damaged file, which may quote any of it: its first line, cut to what a message holds.
+pub(crate) fn one_line(text: &dyn std::fmt::Display) -> String {
+    const MOST: usize = 200;
+    let text = text.to_string();
+    let mut line: String = text.lines().next().unwrap_or_default().chars().take(MOST).collect();
+    if line.len() < text.trim_end().len() {
+        line.push_str("...");
+    }
+    line
+}
+
 /// Writes a file whole: to a name beside it, then renamed, so that no reader ever sees a part of it.
 ///
 /// # Errors
@@ -258,8 +269,8 @@ impl Snapshot {
     /// # Errors
     /// [`SnapshotError`].
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
-        let malformed = |e: safetensors::SafeTensorError| SnapshotError::Malformed { reason: e.to_string() };
-        let foreign = |reason: String| SnapshotError::Foreign { reason };
+        let malformed = |e: safetensors::SafeTensorError| SnapshotError::Malformed { reason: one_line(&e) };
+        let foreign = |reason: String| SnapshotError::Foreign { reason: one_line(&reason) };
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(malformed)?;
         let file = SafeTensors::deserialize(bytes).map_err(malformed)?;
         let text = header
@@ -273,7 +284,7 @@ impl Snapshot {
         views.sort_by(|a, b| a.0.cmp(&b.0));
         let actual = digest(manifest, views.iter().map(|(n, v)| (n.as_str(), v.shape(), v.data())));
         if actual != expected {
-            return Err(SnapshotError::Digest { expected: expected.into(), actual });
+            return Err(SnapshotError::Digest { expected: one_line(&expected), actual });
         }
         let manifest: Manifest = serde_json::from_str(manifest).map_err(|e| foreign(e.to_string()))?;
         if manifest.format != FORMAT {

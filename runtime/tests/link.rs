@@ -14,6 +14,7 @@ fn a_second_owner_is_refused_by_role() {
     let runtime = RuntimeLink::open(&name.0).unwrap();
     let error = RuntimeLink::open(&name.0).err().unwrap();
     assert_eq!(error, LinkError::Taken { name: name.0.clone(), role: "runtime" });
+    assert_eq!(error.code(), "link-taken");
     let error = PlantLink::open(&name.0, &robot(false)).err().unwrap();
     assert_eq!(error, LinkError::Taken { name: name.0.clone(), role: "plant" });
     drop(runtime);
@@ -85,7 +86,7 @@ fn a_plant_alone_brakes_from_the_start() {
 #[test]
 fn the_watchdog_takes_over_when_actions_stop() {
     let name = Name::new("watchdog");
-    let settings = PlantSettings { watchdog: 0.05, ..PlantSettings::real_time(DT) };
+    let settings = PlantSettings { watchdog: 1.0, ..PlantSettings::real_time(DT) }; // longer than a starved machine pauses
     let plant = PlantThread::start(&name, PointMass { q: 1.0, ..PointMass::default() }, settings);
     // A runtime that answers until its 20th action and then falls silent, as a killed one would.
     let (mut link, _) = nearl_runtime::rt::connect(&name.0, 5.0).unwrap();

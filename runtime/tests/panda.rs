@@ -89,9 +89,10 @@ fn foreign_and_damaged_snapshots_are_refused_by_reason_while_the_loop_runs() {
     }
     stop.request();
     let report = running.join().unwrap().unwrap();
-    plant.end();
+    let (plant, _) = plant.end();
     assert_eq!((report.counters.swaps, report.refused_snapshots), (0, 6));
-    assert_eq!(report.counters.stale, 0);
+    assert_eq!((report.counters.stale, report.modes["fault"], report.modes["degraded"]), (0, 0, 0));
+    assert!(plant.worst.iter().all(|e| *e <= 1e-9), "position, velocity, torque: {:?}", plant.worst);
 }
 
 #[test]

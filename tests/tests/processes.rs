@@ -261,3 +261,55 @@ fn a_second_plant_or_runtime_of_the_same_name_is_refused() {
     assert_eq!(runtime.end()["reason"], "stop");
     assert_no_limit_broken(&plant.end());
 }
+
+/// Nobody reads what it prints, and the reader of its log has gone: the loop moves the robot to the end.
+#[test]
+fn a_run_whose_readers_are_gone_moves_on_and_ends_well() {
+    let name = Name::new("no-readers");
+    let plant = name.plant(&["--lockstep"]);
+    let panda = panda();
+    let mut command = Command::new(program("nearl"));
+    command.arg("run").arg(&panda).args(["--plant", name.text(), "--seconds", "2"]);
+    let piped = std::process::Stdio::piped;
+    let mut child = command.stdout(piped()).stderr(piped()).spawn().expect("start");
+    drop((child.stdout.take(), child.stderr.take()));
+    let status = child.wait().expect("wait");
+    assert_eq!(status.code(), Some(0), "neither a panic nor SIGPIPE ends it: {status}");
+    // A log into a pipe that is closed on the other side: refused by name, or counted while the loop runs on.
+    let mut command = Command::new(program("nearl"));
+    command.arg("run").arg(&panda).args(["--plant", name.text(), "--seconds", "1", "--log", "/dev/stdout"]);
+    let mut child = command.stdout(piped()).stderr(piped()).spawn().expect("start");
+    drop(child.stdout.take());
+    let output = child.wait_with_output().expect("output");
+    let error = String::from_utf8_lossy(&output.stderr);
+    let is_refused = output.status.code() == Some(1) && error.contains("flight log /dev/stdout");
+    assert!(output.status.code() == Some(0) || is_refused, "{}: {error}", output.status);
+    let plant = plant.end();
+    assert!(number(&plant["report"]["fresh"]) >= 2000, "{plant}");
+    assert_eq!(plant["report"]["watchdog"], 0, "it left with a farewell: {plant}");
+    assert_no_limit_broken(&plant);
+}
+
+/// A second of the soak: it loads, swaps, logs and replays, and finds every promise that does not depend on the machine kept.
+#[test]
+fn a_short_soak_keeps_what_does_not_depend_on_the_machine() {
+    let folder = tempfile::tempdir().expect("folder");
+    let out = folder.path().to_str().expect("UTF-8");
+    let soak =
+        ["bench", "soak", "--seconds", "1", "--hogs", "1", "--swap-every", "0.05", "--out", out, "--json"];
+    let report = Process::nearl(&soak).json();
+    let (soak, kept) = (&report["soak"], &report["kept"]);
+    // The command itself fails for a broken limit, unless the plant missed an action and held an old one.
+    for promise in ["no allocation", "every tick has one mode", "no snapshot refused"] {
+        assert_eq!(kept[promise], true, "{promise}: {report}");
+    }
+    assert!(number(&soak["run"]["counters"]["swaps"]) >= number(&soak["swaps"]["accepted"]), "{report}");
+    assert!(
+        number(&soak["swaps"]["pushed"]) > 0 && number(&soak["empty_loop_wake_ns"]["count"]) == 1000,
+        "{report}"
+    );
+    // A log that a starved machine could not write in time ends its replay early, and says so.
+    if soak["run"]["log_drops"] == 0 && soak["run"]["counters"]["dropped_records"] == 0 {
+        assert_eq!(kept["replay bit-equal"], true, "{report}");
+    }
+}

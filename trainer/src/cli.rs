@@ -7,6 +7,7 @@ mod eval;
 mod plant;
 mod project;
 mod serve;
+mod soak;
 mod sweep;
 mod tasks;
 mod train;

@@ -90,6 +90,7 @@ pub struct LogQueue {
     snapshots: Producer<Waiting>,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<LogSummary>>,
+    path: PathBuf,
 }
 
 impl LogQueue {
@@ -97,7 +98,9 @@ impl LogQueue {
     pub fn create(path: &Path, metadata: &BTreeMap<String, String>) -> Result<LogQueue, LogError> {
         let fail = |reason: String| LogError { path: path.to_owned(), reason };
         let file = File::create(path).map_err(|e| fail(e.to_string()))?;
-        LogQueue::start(Box::new(file), metadata).map_err(fail)
+        let mut log = LogQueue::start(Box::new(file), metadata).map_err(fail)?;
+        log.path = path.to_owned();
+        Ok(log)
     }
 
     fn start(sink: Box<dyn Sink>, metadata: &BTreeMap<String, String>) -> Result<LogQueue, String> {
@@ -112,7 +115,7 @@ impl LogQueue {
                 move || write_all(writer, waiting, snapshots_out, &shared)
             })
             .map_err(|e| e.to_string())?;
-        Ok(LogQueue { records, snapshots, shared, thread: Some(thread) })
+        Ok(LogQueue { records, snapshots, shared, thread: Some(thread), path: PathBuf::new() })
     }
 
     /// Adds a record; drops and counts it if the queue is full.
@@ -146,11 +149,18 @@ impl LogQueue {
     fn join(&mut self) -> LogSummary {
         self.shared.over.store(true, Ordering::Release);
         let summary = self.thread.take().and_then(|thread| thread.join().ok());
-        summary.unwrap_or_else(|| LogSummary {
+        let mut summary = summary.unwrap_or_else(|| LogSummary {
             dropped: self.dropped(),
-            error: Some("the log thread panicked".into()),
+            error: Some("its thread panicked".into()),
             ..LogSummary::default()
-        })
+        });
+        if let Some(reason) = &mut summary.error {
+            let path = self.path.display();
+            *reason = format!(
+                "flight log {path} stopped ({reason}): free space there, or choose another --log file"
+            );
+        }
+        summary
     }
 }
 
@@ -197,11 +207,11 @@ impl Log {
             log_time: record.end,
             publish_time: record.begin,
         };
-        self.writer.write_to_known_channel(&header, &self.line).map_err(|e| e.to_string())
+        self.writer.write_to_known_channel(&header, &self.line).map_err(said)
     }
 
     fn attach(&mut self, snapshot: &Waiting) -> Result<(), String> {
-        let fail = |e: mcap::McapError| e.to_string();
+        let fail = said;
         let now = crate::rt::clock::now();
         let entry = SnapshotEntry {
             id: snapshot.id,
@@ -226,8 +236,16 @@ impl Log {
     }
 
     fn close(mut self) -> Result<(), String> {
-        self.writer.finish().map_err(|e| e.to_string())?;
+        self.writer.finish().map_err(said)?;
         self.writer.into_inner().flush().map_err(|e| e.to_string())
+    }
+}
+
+/// The system's own words, where it has any.
+fn said(error: mcap::McapError) -> String {
+    match error {
+        mcap::McapError::Io(e) => e.to_string(),
+        other => other.to_string(),
     }
 }
 

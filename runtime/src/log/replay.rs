@@ -7,8 +7,9 @@ use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use mcap::read::{ChunkFlattener, Options};
+use mcap::read::parse_record;
 use mcap::records::Record as Part;
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -18,6 +19,7 @@ use super::queue::{SNAPSHOT_TOPIC, SnapshotEntry, TICK_TOPIC, attachment_name};
 use super::tick::{TickJson, encode};
 use crate::link::{Message, SnapshotBytes, SnapshotHeader};
 use crate::rt::{Build, Core, Inputs, Loaded, PilotBuilder};
+use crate::snapshot::one_line;
 
 /// What replay found.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -105,16 +107,31 @@ impl<B: Build> Replayer<B> {
         }
     }
 
-    fn run(mut self, bytes: &[u8]) -> Result<Replay, String> {
-        let options = Options::IgnoreEndMagic | Options::ValidateChunkCrcs;
-        let parts = ChunkFlattener::new_with_options(bytes, options).map_err(|e| e.to_string())?;
-        for part in parts {
+    fn run(mut self, mut bytes: &[u8]) -> Result<Replay, String> {
+        // No part is longer than the file: a damaged length is refused before memory is taken for it.
+        let options = LinearReaderOptions::default()
+            .with_skip_end_magic(true)
+            .with_validate_chunk_crcs(true)
+            .with_record_length_limit(bytes.len());
+        let mut reader = LinearReader::new_with_options(options);
+        while let Some(event) = reader.next_event() {
+            let part = match event {
+                Ok(LinearReadEvent::ReadRequest(wanted)) => {
+                    let (now, rest) = bytes.split_at(wanted.min(bytes.len()));
+                    reader.insert(now.len()).copy_from_slice(now);
+                    reader.notify_read(now.len());
+                    bytes = rest;
+                    continue;
+                }
+                Ok(LinearReadEvent::Record { data, opcode }) => parse_record(opcode, data),
+                Err(e) => Err(e),
+            };
             match part {
                 Ok(Part::DataEnd(_)) => self.found.complete = true,
                 Ok(part) => self.take(part)?,
                 // A runtime that was killed leaves its last chunk unfinished.
                 Err(mcap::McapError::UnexpectedEof | mcap::McapError::UnexpectedEoc) => break,
-                Err(e) => return Err(e.to_string()),
+                Err(e) => return Err(one_line(&e)),
             }
             if self.found.difference.is_some() {
                 return Ok(self.found);
@@ -138,7 +155,7 @@ impl<B: Build> Replayer<B> {
             Part::Message { header, data } => match self.topics.get(&header.channel_id).map(String::as_str) {
                 Some(TICK_TOPIC) => self.tick(&data)?,
                 Some(SNAPSHOT_TOPIC) => {
-                    let entry: SnapshotEntry = serde_json::from_slice(&data).map_err(|e| e.to_string())?;
+                    let entry: SnapshotEntry = serde_json::from_slice(&data).map_err(|e| one_line(&e))?;
                     self.snapshots.insert(entry.id, entry);
                 }
                 _ => {}
@@ -151,7 +168,7 @@ impl<B: Build> Replayer<B> {
     fn tick(&mut self, logged: &[u8]) -> Result<(), String> {
         let at = self.found.ticks + 1;
         let parse = serde_json::from_slice::<TickJson<'_>>(logged);
-        let json = parse.map_err(|e| format!("the message of tick {at} is damaged: {e}"))?;
+        let json = parse.map_err(|e| format!("the message of tick {at} is damaged: {}", one_line(&e)))?;
         if json.tick != at {
             self.differ(at, "tick", json.tick.to_string(), format!("{at}: the ticks before were dropped"));
             return Ok(());

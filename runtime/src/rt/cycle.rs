@@ -19,7 +19,7 @@ use crate::rt::core::{Core, CoreSettings, Inputs, Loaded};
 use crate::rt::faults::FaultPlan;
 use crate::rt::mode::Mode;
 use crate::rt::swap::Slot;
-use crate::rt::thread::Usage;
+use crate::rt::thread::{CountAllocations, Usage};
 use crate::rt::tick::{Record, Sensed, Tick};
 
 /// Ticks after which page faults and context switches of the thread are counted.
@@ -45,6 +45,7 @@ pub(crate) struct CycleSettings {
     pub(crate) ticks: Option<u64>,
     /// Ticks of braking after which the loop ends anyway.
     pub(crate) stop_ticks: u64,
+    pub(crate) allocations: Option<CountAllocations>,
 }
 
 /// The ends of the rings that belong to this thread.
@@ -105,7 +106,8 @@ impl<T: Tick> Cycle<T> {
     /// Runs until a stop was asked for and the plant stands still.
     pub(crate) fn run(mut self) -> CycleEnd<T> {
         self.core.start(clock::now());
-        let mut usage = Usage::default();
+        let count = self.settings.allocations;
+        let mut usage = Usage::of_this_thread(count);
         while !self.is_over() {
             self.wait();
             self.swap();
@@ -113,10 +115,10 @@ impl<T: Tick> Cycle<T> {
             self.send();
             self.account();
             if self.core.record.tick == WARM {
-                usage = Usage::of_this_thread();
+                usage = Usage::of_this_thread(count);
             }
         }
-        let usage = Usage::of_this_thread().since(usage);
+        let usage = Usage::of_this_thread(count).since(usage);
         let Cycle { wake, compute, core, ends, .. } = self;
         CycleEnd { last: core.record, wake, compute, usage, _rest: (core, ends) }
     }

@@ -133,7 +133,7 @@ impl FaultPlan {
     pub fn load(path: &Path) -> Result<FaultPlan, FaultPlanError> {
         let fail = |reason: String| FaultPlanError { file: path.display().to_string(), reason };
         let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
-        serde_json::from_str(&text).map_err(|e| fail(e.to_string()))
+        serde_json::from_str(&text).map_err(|e| fail(crate::snapshot::one_line(&e)))
     }
 
     /// The faults of `tick` (from 1) with their number in the list.
@@ -142,8 +142,8 @@ impl FaultPlan {
         self.faults.iter().enumerate().filter(move |(_, f)| is_now(f)).map(|(i, f)| (i, f.kind))
     }
 
-    /// The joint that fault number `index` hits: one of `n`, by the seed.
-    pub fn joint(&self, index: usize, n: usize) -> usize {
+    /// A number below `n` for fault number `index`, by the seed: the joint it hits, or the moment it comes.
+    pub fn draw(&self, index: usize, n: usize) -> usize {
         let mixed = (self.seed ^ (index as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15))
             .wrapping_mul(0xbf58_476d_1ce4_e5b9);
         ((mixed >> 33) as usize).checked_rem(n).unwrap_or(0)
@@ -170,7 +170,7 @@ impl FaultPlan {
     /// Plays the faults of the plant's sensors on the state of `tick`; `last` is the one measured before.
     pub fn spoil(&self, tick: u64, state: &mut StateMessage, last: &StateMessage) {
         for (index, kind) in self.at(tick) {
-            let joint = self.joint(index, state.v().len().min(state.q().len()));
+            let joint = self.draw(index, state.v().len().min(state.q().len()));
             match kind {
                 FaultKind::State { number } => state.v[joint] = number.value(),
                 FaultKind::Jump { by } => state.q[joint] += by,

@@ -41,5 +41,5 @@ pub use report::{Percentiles, PlantSummary, RunReport};
 pub use residual::RollbackSettings;
 pub use run::{RunError, RunSettings, connect, run, run_loop};
 pub use stop::Stop;
-pub use thread::{ThreadSettings, Usage, prepare};
+pub use thread::{CountAllocations, ThreadSettings, Usage, prepare};
 pub use tick::{Build, Counters, MAX_ROWS, Outcome, Record, Refusal, Row, Sensed, Step, Tick};

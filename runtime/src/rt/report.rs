@@ -100,7 +100,7 @@ pub struct RunReport {
     pub refusals: Vec<String>,
     /// Snapshots taken back because the robot no longer reached its targets.
     pub rolled_back: u64,
-    /// Page faults and context switches of the real-time thread after its first 300 ticks.
+    /// Page faults, context switches and, where they are counted, allocations of the real-time thread after its first 300 ticks.
     pub usage: Usage,
     /// Records the flight log lost.
     pub log_drops: u64,
@@ -137,8 +137,12 @@ impl fmt::Display for RunReport {
         let u = &self.usage;
         writeln!(
             f,
-            "  system           page faults {} + {}, context switches {} asked for, {} forced",
-            u.minor_faults, u.major_faults, u.voluntary_switches, u.involuntary_switches
+            "  system           page faults {} + {}, context switches {} asked for, {} forced{}",
+            u.minor_faults,
+            u.major_faults,
+            u.voluntary_switches,
+            u.involuntary_switches,
+            u.allocations.map_or(String::new(), |n| format!(", {n} allocations"))
         )?;
         let versions: Vec<String> = self.versions.iter().map(|(_, version)| version.to_string()).collect();
         writeln!(

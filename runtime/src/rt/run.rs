@@ -22,7 +22,7 @@ use crate::rt::mode::ModeLimits;
 use crate::rt::pilot::{Pilot, PilotBuilder};
 use crate::rt::report::{PlantSummary, RunReport, percentiles};
 use crate::rt::residual::RollbackSettings;
-use crate::rt::thread::{ThreadSettings, prepare};
+use crate::rt::thread::{CountAllocations, ThreadSettings, prepare};
 use crate::rt::tick::{Build, Tick};
 use crate::rt::{Mode, Reason, Stop, swap};
 use crate::snapshot::{Snapshot, SnapshotError};
@@ -67,6 +67,8 @@ pub struct RunSettings {
     pub thread: ThreadSettings,
     /// A wish that is refused is an error.
     pub strict: bool,
+    /// Counts the heap allocations of the real-time thread, in a program whose allocator can.
+    pub allocations: Option<CountAllocations>,
     /// Flight log file.
     pub log: Option<PathBuf>,
     /// Facts written into the flight log (snapshot digest, command).
@@ -95,6 +97,7 @@ impl Default for RunSettings {
             faults: FaultPlan::default(),
             thread: ThreadSettings { priority: Some(40), cpu: None, lock_memory: true },
             strict: false,
+            allocations: None,
             log: None,
             metadata: BTreeMap::new(),
             first: Vec::new(),
@@ -265,6 +268,7 @@ fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings
         spin: if robot.is_lockstep() { 0 } else { clock::nanoseconds(settings.spin) },
         ticks: settings.ticks.or(settings.seconds.map(|s| (s / robot.dt).round() as u64)),
         stop_ticks: (settings.stop_patience / robot.dt).ceil() as u64,
+        allocations: settings.allocations,
     }
 }
 

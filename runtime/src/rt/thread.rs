@@ -25,11 +25,16 @@ pub struct Usage {
     pub voluntary_switches: u64,
     /// Context switches because another thread was given the core.
     pub involuntary_switches: u64,
+    /// Heap allocations, in a program that counts them.
+    pub allocations: Option<u64>,
 }
+
+/// Heap allocations of the calling thread so far, in a program whose allocator counts them.
+pub type CountAllocations = fn() -> u64;
 
 impl Usage {
     /// Of the calling thread since its start.
-    pub(crate) fn of_this_thread() -> Usage {
+    pub(crate) fn of_this_thread(allocations: Option<CountAllocations>) -> Usage {
         // SAFETY: a struct of numbers, for which zero is a value.
         let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
         // SAFETY: plain call that fills the struct.
@@ -40,6 +45,7 @@ impl Usage {
             major_faults: count(usage.ru_majflt),
             voluntary_switches: count(usage.ru_nvcsw),
             involuntary_switches: count(usage.ru_nivcsw),
+            allocations: allocations.map(|count| count()),
         }
     }
 
@@ -49,6 +55,7 @@ impl Usage {
             major_faults: self.major_faults - before.major_faults,
             voluntary_switches: self.voluntary_switches - before.voluntary_switches,
             involuntary_switches: self.involuntary_switches - before.involuntary_switches,
+            allocations: self.allocations.map(|count| count - before.allocations.unwrap_or(0)),
         }
     }
 }

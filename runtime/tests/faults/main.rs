@@ -7,6 +7,10 @@
 mod arm;
 mod files;
 mod flight;
+mod kills;
+mod peers;
+mod solver;
+mod stage;
 mod system;
 mod table;
 #[path = "../toy/mod.rs"]
@@ -14,10 +18,7 @@ mod toy;
 
 use arm::*;
 use flight::{Flight, settings};
-use nearl_constraints::{Projector, Proposal, Rung, Settings, Solver, Status, Target};
-use nearl_runtime::Manifest;
 use nearl_runtime::codes::LedgerStatus;
-use nearl_runtime::controller::Parts;
 use nearl_runtime::rt::*;
 
 const ROUNDING: f64 = 1e-9;
@@ -87,61 +88,6 @@ fn fault_04_the_first_motion_is_let_in() {
     };
     assert!(flight.panda.speeds[10] < 0.5 * without.panda.speeds[10], "half way in it is slower");
     flight.assert_within_limits(ROUNDING);
-}
-
-/// Torque limits far below what holding still needs leave nothing to choose from.
-#[test]
-fn fault_05_an_empty_set_brakes_and_names_the_status() {
-    let mut weak = stochastic(1);
-    weak.manifest.task.constraints.torque.as_mut().expect("the task has torque rows").scale = 0.01;
-    let mut flight = Flight::new(&weak, settings(), FaultPlan::default());
-    flight.fly(100);
-    let ledger = flight.records[0].step.ledger;
-    assert_eq!(ledger.status, LedgerStatus::BrakedNoCertifiedAnswer.number());
-    assert!(ledger.projected_violations > 0, "what the brake cannot keep is counted");
-    assert_eq!(flight.first(Mode::Braking).unwrap().1, Reason::NoCertifiedAnswer);
-    assert!(flight.panda.worst[2] <= ROUNDING, "the motors' own limits hold: {:?}", flight.panda.worst);
-}
-
-/// With motors of half their strength, so that torque rows are active.
-fn panda_projector(change: impl FnOnce(&mut Settings)) -> (Projector, Vec<f64>) {
-    let weaken = |m: &mut Manifest| m.task.constraints.torque.as_mut().expect("torque rows").scale = 0.5;
-    let manifest = snapshot(1, weaken).manifest;
-    let Parts { model, layout, projector } = Parts::new(&manifest).unwrap();
-    let limits = nearl_constraints::build_limits(&manifest.task.constraints, &model).unwrap();
-    let mut settings = projector.settings().clone();
-    change(&mut settings);
-    (Projector::new(&model, &limits, layout.controllable(), settings).unwrap(), Panda::new().q)
-}
-
-#[test]
-fn fault_06_an_answer_cut_by_the_iteration_cap_is_used_only_if_it_is_certified() {
-    let (mut capped, q) = panda_projector(|s| (s.solver, s.max_iter) = (Solver::Clarabel, 1));
-    let mut target = Target::new(capped.model());
-    let mut cut = 0;
-    for k in 0..50 {
-        let proposal = Proposal { q: q.clone(), v: vec![0.05 * f64::from(k); N] };
-        let status = capped.project(&q, &[0.0; N], &proposal, &mut target);
-        let is_capped = target.ledger.rung == Rung::Clarabel && target.ledger.iterations == 1;
-        cut += u32::from(is_capped || matches!(status, Status::Braked(_)));
-        assert_eq!(target.ledger.violations.total(), 0, "{status:?}");
-    }
-    assert!(cut > 10, "the cap was met {cut} times");
-}
-
-#[test]
-fn fault_07_a_failed_solve_leaves_the_next_one_healthy() {
-    let (mut used, q) = panda_projector(|_| {});
-    let (mut new, _) = panda_projector(|_| {});
-    let mut target = Target::new(used.model());
-    let wild = Proposal { q: q.clone(), v: vec![1e200; N] };
-    let status = used.project(&q, &[1e200; N], &wild, &mut target);
-    assert!(!status.is_ok() || status == Status::Recovering, "{status:?}");
-    let proposal = Proposal { q: q.clone(), v: vec![0.02; N] };
-    let mut expected = Target::new(new.model());
-    used.project(&q, &[0.0; N], &proposal, &mut target);
-    new.project(&q, &[0.0; N], &proposal, &mut expected);
-    assert_eq!((target.q, target.v, target.ledger.status), (expected.q, expected.v, expected.ledger.status));
 }
 
 #[test]
@@ -236,37 +182,6 @@ fn fault_35_opposite_policies_every_ten_ticks_obey_every_limit() {
     }
     assert_eq!(flight.counters().projected_violations, 0);
     flight.assert_within_limits(ROUNDING);
-}
-
-/// At speeds the motors cannot brake from, the answer is still finite and within the actuators' range.
-#[test]
-fn fault_36_torques_beyond_the_motors_are_never_sent() {
-    let mut flight = Flight::new(&stochastic(1), settings(), FaultPlan::default());
-    for speed in [3.0, 30.0, 300.0] {
-        flight.panda.v = vec![speed; N];
-        let (effort, before) = (flight.panda.effort.clone(), flight.records.len());
-        flight.fly(20);
-        for record in &flight.records[before..] {
-            let action = &record.step.action[..record.step.nu as usize];
-            assert!(action.iter().zip(&effort).all(|(a, e)| a.abs() <= *e), "{action:?}");
-        }
-    }
-    assert!(flight.records.iter().any(|r| !matches!(r.step.ledger.status, 0..=2)), "no tick was hard");
-}
-
-#[test]
-fn fault_37_denormal_numbers_change_nothing() {
-    let denormal = FaultKind::Proposal { number: Odd::Denormal };
-    let (with, without) = (Flight::of(&[(100, 400, denormal)], 600), Flight::of(&[], 600));
-    let difference = |a: &[f64], b: &[f64]| a.iter().zip(b).fold(0.0, |m, (a, b)| f64::max(m, (a - b).abs()));
-    assert!(difference(&with.panda.q, &without.panda.q) < 1e-9);
-    let time = |flight: &Flight| flight.records.iter().map(|r| r.step.ledger.duration).sum::<u64>();
-    println!(
-        "time of the projections with denormal noise and without [ns]: {} {}",
-        time(&with),
-        time(&without)
-    );
-    with.assert_within_limits(ROUNDING);
 }
 
 /// Random policies swapped at random ticks: a search for states from which the motors cannot keep the limits. The shoulder's

@@ -10,6 +10,7 @@ use crate::toy::{self, DT, LoopThread, Name, PlantThread, PointMass, SpringBuild
 
 const ROLE: &str = "NEARL_FAULT_ROLE";
 const NAME: &str = "NEARL_FAULT_NAME";
+const STRICT: &str = "NEARL_FAULT_STRICT";
 const PATIENCE: Duration = Duration::from_secs(20);
 
 /// Not a test of its own: the body of the processes the tests below start.
@@ -33,12 +34,75 @@ fn child() {
             let build = SpringBuilder(drops.clone());
             run_loop(link, robot, spring(1, &drops), build, &toy::settings(), &stop).unwrap();
         }
-        Ok("memory") => match TrainerLink::open(&name) {
-            Ok(_) => println!("opened"),
-            Err(error) => println!("refused {}", error.code()),
-        },
+        Ok("memory") => memory(&name),
+        Ok("full-disk") => full_disk(&name),
+        Ok("no-rights") => no_rights(&name),
         role => panic!("no such role: {role:?}"),
     }
+}
+
+/// Opens every end of the links in turn, then pushes more than there is memory for.
+fn memory(name: &RobotName) {
+    let say = |what: &str, result: Result<(), LinkError>| match result {
+        Ok(()) => println!("said {what} opened"),
+        Err(error) => println!("said {what} {}", error.code()),
+    };
+    say("plant", PlantLink::open(name, &toy::robot(false)).map(|_| ()));
+    say("runtime", RuntimeLink::open(name).map(|_| ()));
+    match TrainerLink::open(name) {
+        Ok(mut trainer) => say("push", trainer.push(2, &vec![7; 64 << 20])),
+        Err(error) => say("trainer", Err(error)),
+    }
+}
+
+/// The disk has room for 400 kB of log: the limit on the size of files stands in for it.
+fn full_disk(name: &RobotName) {
+    let log = std::env::temp_dir().join(format!("nearl-full-{}.mcap", std::process::id()));
+    let (link, robot) = connect(name, 20.0).unwrap();
+    let (drops, _dropped) = std::sync::mpsc::channel();
+    let limit = libc::rlimit { rlim_cur: 400_000, rlim_max: 400_000 };
+    // SAFETY: plain calls; this process ends after the run.
+    unsafe {
+        libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
+        assert_eq!(libc::setrlimit(libc::RLIMIT_FSIZE, &raw const limit), 0);
+    }
+    let settings = RunSettings { ticks: Some(2000), log: Some(log.clone()), ..toy::settings() };
+    let first = spring(1, &drops);
+    let report = run_loop(link, robot, first, SpringBuilder(drops), &settings, &Stop::new()).unwrap();
+    let _ = std::fs::remove_file(log);
+    let said = report.log_error.as_deref().unwrap_or_default();
+    assert!(said.contains("nearl-full-") && said.contains("File too large"), "{said}");
+    assert!(report.log_drops > 1000, "{}", report.log_drops);
+    assert_eq!((report.modes["active"], report.reason, report.counters.stale), (2000, Reason::Stop, 0));
+}
+
+/// Without any right: first strict, then not.
+fn no_rights(name: &RobotName) {
+    let (link, robot) = connect(name, 20.0).unwrap();
+    let none = libc::rlimit { rlim_cur: 0, rlim_max: 0 };
+    // SAFETY: plain calls; this process ends after the runs.
+    unsafe {
+        assert_eq!(libc::setrlimit(libc::RLIMIT_RTPRIO, &raw const none), 0);
+        assert_eq!(libc::setrlimit(libc::RLIMIT_MEMLOCK, &raw const none), 0);
+        if libc::geteuid() == 0 {
+            assert_eq!(libc::setresuid(65534, 65534, 65534), 0);
+        }
+    }
+    let strict = std::env::var(STRICT).is_ok();
+    let thread = ThreadSettings { priority: Some(40), cpu: None, lock_memory: true };
+    let settings = RunSettings { thread, strict, ticks: Some(50), ..toy::settings() };
+    let (drops, _dropped) = std::sync::mpsc::channel();
+    let first = spring(1, &drops);
+    let result = run_loop(link, robot, first, SpringBuilder(drops), &settings, &Stop::new());
+    let said = match result {
+        Ok(report) if !strict => {
+            assert_eq!(report.modes["active"], 50);
+            report.warnings.join("; ")
+        }
+        Err(error @ RunError::Strict(_)) if strict => error.to_string(),
+        other => panic!("{other:?}"),
+    };
+    assert!(said.contains("memory is not locked") && said.contains("no real-time priority 40"), "{said}");
 }
 
 fn command(role: &str, name: &Name) -> Command {
@@ -48,7 +112,7 @@ fn command(role: &str, name: &Name) -> Command {
     command
 }
 
-fn until(what: &str, mut condition: impl FnMut() -> bool) {
+pub fn until(what: &str, mut condition: impl FnMut() -> bool) {
     let end = Instant::now() + Duration::from_secs(60);
     while !condition() {
         assert!(Instant::now() < end, "within 60 s: {what}");
@@ -56,7 +120,7 @@ fn until(what: &str, mut condition: impl FnMut() -> bool) {
     }
 }
 
-fn signal(child: &Child, signal: i32) {
+pub fn signal(child: &Child, signal: i32) {
     // SAFETY: plain call on a child that has not been waited for.
     assert_eq!(unsafe { libc::kill(child.id() as i32, signal) }, 0);
 }
@@ -91,25 +155,6 @@ fn fault_15_a_stopped_trainer_stops_nothing_else() {
 }
 
 #[test]
-fn fault_17_a_storm_of_restarts_ends_with_a_runtime_that_runs() {
-    let name = Name::new("storm");
-    let plant = PlantThread::start(&name, body(), PlantSettings::lockstep(DT));
-    let mut viewer = TrainerLink::open(&name.0).unwrap();
-    for n in 0..40_u64 {
-        let mut runtime = command("runtime", &name).spawn().unwrap();
-        std::thread::sleep(Duration::from_micros((n * 7919 % 40) * 1000));
-        runtime.kill().unwrap();
-        runtime.wait().unwrap();
-    }
-    let mut runtime = command("runtime", &name).spawn().unwrap();
-    let pid = runtime.id();
-    until("the last one runs", || viewer.health().is_some_and(|h| h.pid == pid && h.tick > 100));
-    signal(&runtime, libc::SIGTERM);
-    assert!(runtime.wait().unwrap().success());
-    plant.end();
-}
-
-#[test]
 fn fault_18_a_consumer_that_never_reads_loses_the_oldest_and_slows_nothing() {
     let name = Name::new("slow");
     let plant = PlantThread::start(&name, body(), PlantSettings::lockstep(DT));
@@ -124,29 +169,85 @@ fn fault_18_a_consumer_that_never_reads_loses_the_oldest_and_slows_nothing() {
     assert_eq!((report.modes["active"], report.counters.stale), (4000, 0));
 }
 
-/// A private `/dev/shm`, which needs user namespaces.
-fn with_memory(options: &str, name: &Name) -> Option<String> {
+/// Memory of a process [bytes], all but what it maps from files and shared memory.
+fn memory_of(child: &Child) -> u64 {
+    let text = std::fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap();
+    let line = text.lines().find(|l| l.starts_with("RssAnon:")).unwrap();
+    line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
+}
+
+/// 20000 transitions that nobody reads would be 90 MB.
+#[test]
+fn fault_18_what_a_consumer_never_reads_takes_no_more_memory() {
+    let name = Name::new("bounded");
+    let plant = PlantThread::start(&name, body(), PlantSettings::lockstep(DT));
+    let consumer = TrainerLink::open(&name.0).unwrap();
+    let mut viewer = TrainerLink::open(&name.0).unwrap();
+    let mut runtime = command("runtime", &name).spawn().unwrap();
+    let mut taken = [(0, 0); 2];
+    for (taken, ticks) in taken.iter_mut().zip([3000, 23_000]) {
+        until("the loop goes on", || viewer.health().is_some_and(|h| h.tick > ticks));
+        let shared = remains().into_iter().find(|r| r.name == name.0.as_str()).map_or(0, |r| r.bytes);
+        *taken = (memory_of(&runtime), shared);
+    }
+    signal(&runtime, libc::SIGTERM);
+    assert!(runtime.wait().unwrap().success());
+    plant.end();
+    drop(consumer);
+    let [(before, shared), (after, shared_after)] = taken;
+    assert!(after < before + (4 << 20), "own memory {before} B after 3000 ticks, {after} B after 23000");
+    assert_eq!(shared_after, shared, "shared memory");
+}
+
+/// What the ends of the links say in a private `/dev/shm`, which needs user namespaces.
+fn with_memory(options: &str, name: &Name) -> Option<Vec<String>> {
     let script = format!("mount -t tmpfs -o {options} tmpfs /dev/shm || exit 77; exec \"$0\" \"$@\"");
     let inner = command("memory", name);
     let mut outer = Command::new("unshare");
     outer.args(["-rm", "sh", "-c", &script]).arg(inner.get_program()).args(inner.get_args());
     outer.env(ROLE, "memory").env(NAME, name.0.as_str());
     let output = outer.output().ok()?;
+    if output.status.code().is_none() {
+        panic!("killed instead of refused: {output:?}");
+    }
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    let said = text.lines().find(|l| l.starts_with("refused ") || *l == "opened").map(str::to_owned);
-    assert!(said.is_some() || !output.status.success(), "killed or silent: {output:?}");
-    said
+    let said: Vec<String> = text.lines().filter_map(|l| l.split_once("said ")).map(|s| s.1.into()).collect();
+    (!said.is_empty()).then_some(said)
 }
 
 #[test]
 fn fault_20_shared_memory_that_is_tiny_or_read_only_is_refused_before_any_motion() {
     let name = Name::new("memory");
-    if with_memory("size=64M", &name).as_deref() != Some("opened") {
+    let Some(enough) = with_memory("size=400M", &name) else {
         println!("not tested: no private mount namespace (`unshare -rm`) is permitted here");
         return;
+    };
+    assert_eq!(enough, ["plant opened", "runtime opened", "push opened"]);
+    assert_eq!(
+        with_memory("size=64M", &name).unwrap(),
+        ["plant opened", "runtime opened", "push link-memory"],
+        "a snapshot beyond the memory is refused, not written"
+    );
+    let all = |code: &str| ["plant", "runtime", "trainer"].map(|role| format!("{role} {code}"));
+    assert_eq!(with_memory("size=1M", &name).unwrap(), all("link-memory"));
+    assert_eq!(with_memory("size=64M,ro", &name).unwrap(), all("link-memory-missing"));
+}
+
+#[test]
+fn fault_29_a_disk_that_fills_up_costs_records_and_no_tick() {
+    let name = Name::new("full-disk");
+    let plant = PlantThread::start(&name, body(), PlantSettings::lockstep(DT));
+    let output = command("full-disk", &name).stderr(Stdio::piped()).output().unwrap();
+    let (body, counted) = plant.end();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    // The same recursion without a log.
+    let (mut q, mut v) = (1.0_f64, 0.0_f64);
+    for action in body.applied.iter().take(2000) {
+        assert_eq!(action.to_bits(), (-q).to_bits());
+        v += action * DT;
+        q += v * DT;
     }
-    assert_eq!(with_memory("size=1M", &name).as_deref(), Some("refused link-memory"));
-    assert_eq!(with_memory("size=64M,ro", &name).as_deref(), Some("refused link-memory-missing"));
+    assert!(body.applied.len() >= 2000 && counted.watchdog == 0, "{counted:?}");
 }
 
 /// No clock but the monotonic one is read, so a jump of the wall clock can have no effect.
@@ -187,4 +288,21 @@ fn fault_32_a_refused_wish_is_an_error_if_strict_and_a_warning_if_not() {
     assert!(report.warnings[0].contains("core 100000"), "{:?}", report.warnings);
     assert_eq!(report.modes["active"], 50);
     plant.end();
+}
+
+#[test]
+fn fault_32_without_rights_strict_refuses_and_best_effort_warns() {
+    for strict in [true, false] {
+        let name = Name::new("no-rights");
+        let plant = PlantThread::start(&name, body(), PlantSettings::lockstep(DT));
+        let mut command = command("no-rights", &name);
+        if strict {
+            command.env(STRICT, "1");
+        }
+        let output = command.stderr(Stdio::piped()).output().unwrap();
+        let (body, counted) = plant.end();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        assert_eq!(body.applied.is_empty(), strict, "a strict refusal comes before any motion");
+        assert_eq!(counted.watchdog, 0);
+    }
 }

@@ -28,6 +28,8 @@ enum What {
     Projection(Ticks),
     /// Rollouts served over shared memory, beside as many collected in this process.
     Serve(super::bench_serve::ServeBench),
+    /// Plant and loop of the Panda under load and hot swaps: everything the loop promises, counted.
+    Soak(super::soak::Soak),
     #[command(flatten)]
     Loop(nearl_runtime::cli::LoopBench),
 }
@@ -80,6 +82,7 @@ impl Bench {
             What::Update(b) => b.run(true),
             What::Projection(b) => b.run(false),
             What::Serve(b) => b.run(),
+            What::Soak(b) => b.run(),
             What::Loop(b) => b.run(),
         }
     }

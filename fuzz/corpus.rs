@@ -1,0 +1,102 @@
+//! The files that are damaged, and how they were made.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use nearl_runtime::link::*;
+use nearl_runtime::rollout_protocol::{Constraints, ReplyMessage, Request};
+use nearl_runtime::rt::*;
+
+use crate::arm::*;
+use crate::messages::bytes_of;
+use crate::toy::{self, Name};
+
+fn folder() -> PathBuf {
+    std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus")
+}
+
+/// The contents of `corpus/<target>`, by name; for task files the bundled ones too.
+pub fn files(target: &str) -> Vec<Vec<u8>> {
+    let mut folders = vec![folder().join(target)];
+    if target == "task" {
+        folders.push(folder().join("../../examples/tasks"));
+    }
+    let entries =
+        folders.iter().flat_map(|f| std::fs::read_dir(f).unwrap_or_else(|e| panic!("{}: {e}", f.display())));
+    let mut paths: Vec<PathBuf> = entries.map(|e| e.expect("entry").path()).collect();
+    paths.sort();
+    assert!(!paths.is_empty(), "corpus/{target} is empty");
+    paths.iter().map(|p| std::fs::read(p).expect("corpus file")).collect()
+}
+
+fn write(target: &str, name: &str, bytes: &[u8]) {
+    let folder = folder().join(target);
+    std::fs::create_dir_all(&folder).expect("folder");
+    std::fs::write(folder.join(name), bytes).expect("corpus file");
+}
+
+/// Every folder has files; with `NEARL_WRITE` they are made anew.
+#[test]
+fn corpus_is_there() {
+    if std::env::var_os("NEARL_WRITE").is_some() {
+        write_all();
+    }
+    for target in ["snapshot", "task", "plan", "message", "state", "robot", "rollout", "log"] {
+        assert!(!files(target).is_empty());
+    }
+}
+
+fn write_all() {
+    write("snapshot", "deterministic", &snapshot(1, |_| {}).to_bytes());
+    write("snapshot", "stochastic", &stochastic(2).to_bytes());
+    let mut learned = snapshot(3, |m| m.task.idm.kind = nearl_runtime::task::IdmKind::Learned);
+    learned.networks.idm = Some((learned.networks.policy.clone(), vec![0.0; 2 * N]));
+    write("snapshot", "learned-inverse", &learned.to_bytes());
+    let rows = "rows = [{ name = \"sum\", terms = { \"q.panda_joint1\" = 1.0, \"v.panda_joint2\" = -0.5 }, lower = -1.0, upper = 1.0, braking = 2.0, soft = { linear = 1.0, quadratic = 10.0 } }]";
+    let more = "jerk = { limit = 500.0 }\ntorque_rate = { limit = 1000.0 }\nenergy = { limit = 2.0 }\nlocked = [\"panda_joint7\"]\nvelocity_profile = \"fr3\"";
+    let text =
+        TASK.replace("torque = { scale = 0.95 }", &format!("{rows}\n{more}\ntorque = {{ scale = 0.95 }}"));
+    write("task", "all-limits.toml", text.as_bytes());
+    let kind = |kind| Fault { tick: 100, count: 3, kind };
+    let faults = vec![
+        kind(FaultKind::State { number: Odd::Nan }),
+        kind(FaultKind::Jump { by: 0.5 }),
+        kind(FaultKind::Freeze),
+        kind(FaultKind::Late { age: 0.1 }),
+        kind(FaultKind::Overrun { periods: 2.5 }),
+    ];
+    let plan = FaultPlan { seed: 3, faults };
+    write("plan", "several.json", serde_json::to_string(&plan).expect("JSON").as_bytes());
+    let manifest = snapshot(1, |_| {}).manifest;
+    let robot = describe(&manifest, true).expect("robot").message(&RobotName::new("a").expect("name"));
+    write("robot", "panda", bytes_of(&robot.expect("message")));
+    let mut state = StateMessage::zeroed();
+    Panda::new().observe(&mut state);
+    write("state", "panda", bytes_of(&state));
+    write("message", "state", bytes_of(&state));
+    let mut receipt = ReceiptMessage::zeroed();
+    receipt.set(Verdict::Corrupt, "the digest does not match");
+    write("message", "receipt", bytes_of(&receipt));
+    let asked = Request { version: Some(3), constraints: Constraints::Off, ..Request::new(7, 100) };
+    let mut request = asked.message(5);
+    request.header.schema = nearl_runtime::rollout_protocol::RequestMessage::SCHEMA;
+    write("rollout", "request", bytes_of(&request));
+    let mut reply = ReplyMessage::zeroed();
+    (reply.n_obs, reply.n_state, reply.n_act, reply.rows) = (14, 14, 7, 30);
+    write("rollout", "reply", bytes_of(&reply));
+    write("log", "flight.mcap", &flight());
+}
+
+/// Eight ticks and more of the arm, with a swap.
+fn flight() -> Vec<u8> {
+    let (name, first) = (Name::new("fuzz-log"), snapshot(1, |_| {}));
+    let folder = Scratch::new("fuzz-flight");
+    let (file, log) = (File::new("fuzz-log", &first), folder.0.join("flight.mcap"));
+    let plant = start_with(&name, &first, FaultPlan::default(), Duration::from_millis(5));
+    let faults = FaultPlan { seed: 1, faults: vec![Fault { tick: 4, count: 1, kind: FaultKind::Panic }] };
+    let settings = RunSettings { ticks: Some(8), log: Some(log.clone()), faults, ..toy::settings() };
+    let report = execute_with(&name, &file.0, &Stop::new(), settings).join().expect("loop").expect("run");
+    plant.end();
+    assert_eq!((report.log_drops, report.log_error), (0, None));
+    std::fs::read(log).expect("log")
+}

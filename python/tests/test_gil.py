@@ -1,0 +1,80 @@
+"""A Python that does nothing but hold its lock, with a controller and a rollout under way, does not hold up the loop."""
+
+import ctypes
+import json
+import subprocess
+import threading
+import time
+import uuid
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from mcap.reader import make_reader
+
+import nearl
+
+SNAPSHOT = ROOT / "examples" / "snapshots" / "panda-reach.safetensors"
+NEARL = ROOT / "target" / "release" / "nearl"
+
+
+def start(*arguments: str) -> subprocess.Popen:
+    return subprocess.Popen([NEARL, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def end(process: subprocess.Popen) -> str:
+    process.terminate()
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    return out
+
+
+def hold_the_lock(seconds: float) -> tuple[int, int]:
+    """Sleeps inside a C call that keeps the lock; monotonic begin and end [ns]."""
+    begin = time.monotonic_ns()
+    ctypes.PyDLL(None).usleep(int(seconds * 1e6))
+    return begin, time.monotonic_ns()
+
+
+def test_the_loop_runs_on_while_python_holds_its_lock(tmp_path: Path) -> None:
+    if not NEARL.exists():
+        pytest.fail(f"{NEARL} was not built: run 'make build'")
+    name, log = f"gil-{uuid.uuid4().hex[:8]}", tmp_path / "flight.mcap"
+    plant = start("plant", "Panda-reach", "--name", name, "--endless", "--json")
+    server = start("serve", SNAPSHOT, "--name", f"{name}-s", "--threads", "1")
+    server.stdout.readline()
+    runtime = start("run", SNAPSHOT, "--plant", name, "--log", log, "--json")
+    controller = nearl.Controller.load(SNAPSHOT)
+    with nearl.Link(f"{name}-s") as link:
+        rollout = link.rollout(seed=0, n_steps=100_000)
+        first = next(rollout)
+        turns, over = [], threading.Event()
+
+        def count() -> None:
+            while not over.is_set():
+                turns.append(time.monotonic_ns())
+                time.sleep(0.001)
+
+        counter = threading.Thread(target=count)
+        counter.start()
+        while not log.exists() or log.stat().st_size < 1_000_000:  # the loop runs
+            assert runtime.poll() is None, runtime.communicate()
+            time.sleep(0.01)
+        begin, finish = hold_the_lock(1.0)
+        over.set()
+        counter.join()
+        assert len(first) > 0 and np.isfinite(next(rollout).obs).all() and controller is not None
+        rollout.close()
+    margin = 50_000_000
+    assert not [t for t in turns if begin + margin < t < finish - margin], "no Python thread ran: the lock was held"
+    report, moved = json.loads(end(runtime)), json.loads(end(plant))
+    end(server)
+    with log.open("rb") as file:
+        messages = make_reader(file).iter_messages(topics=["tick"])
+        ticks = [json.loads(message.data) for _, _, message in messages]
+    inside = [tick for tick in ticks if begin < tick["begin_ns"] < finish]
+    # How many of the 1000 fit depends on the machine; that it goes on, not.
+    assert len(inside) > 100, f"{len(inside)} ticks while the lock was held"
+    assert report["modes"]["fault"] == 0 and report["counters"]["projected_violations"] == 0, report
+    assert moved["violations"]["torque"] == 0, moved

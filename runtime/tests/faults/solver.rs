@@ -1,0 +1,212 @@
+//! Faults of the projection and its solver: nothing to choose from, cut short, failed, beyond the motors, odd numbers.
+
+use nearl_constraints::limit::UserRowSettings;
+use nearl_constraints::{
+    BrakeReason, Kind, Projector, Proposal, Rung, Settings, Soft, Solver, Status, Target,
+};
+use nearl_runtime::codes::LedgerStatus;
+use nearl_runtime::controller::Parts;
+use nearl_runtime::rt::*;
+use nearl_runtime::{Manifest, Snapshot};
+
+use crate::arm::*;
+use crate::flight::{Flight, settings};
+use crate::{ROUNDING, arm};
+
+/// Torque limits far below what holding still needs leave nothing to choose from.
+#[test]
+fn torque_limits_that_leave_nothing_brake_and_name_the_status() {
+    let mut weak = stochastic(1);
+    weak.manifest.task.constraints.torque.as_mut().expect("the task has torque rows").scale = 0.01;
+    let mut flight = Flight::new(&weak, settings(), FaultPlan::default());
+    flight.fly(100);
+    let ledger = flight.records[0].step.ledger;
+    assert_eq!(ledger.status, LedgerStatus::BrakedNoCertifiedAnswer.number());
+    assert!(ledger.projected_violations > 0, "what the brake cannot keep is counted");
+    assert_eq!(flight.first(Mode::Braking).unwrap().1, Reason::NoCertifiedAnswer);
+    assert!(flight.panda.worst[2] <= ROUNDING, "the motors' own limits hold: {:?}", flight.panda.worst);
+}
+
+/// `velocity of joint 1 >= 0.5` beside `<= -0.5` [rad/s].
+fn contradiction(soft: Option<Soft>) -> Snapshot {
+    let row = |name: &str, lower, upper| UserRowSettings {
+        name: name.into(),
+        terms: [(format!("v.{}", arm::joint(0)), 1.0)].into(),
+        lower,
+        upper,
+        equals: None,
+        braking: None,
+        soft,
+    };
+    let mut snapshot = stochastic(1);
+    snapshot.manifest.task.constraints.rows =
+        vec![row("left", Some(0.5), None), row("right", None, Some(-0.5))];
+    snapshot
+}
+
+#[test]
+fn fault_05_contradicting_soft_rows_give_way_by_name_and_hard_ones_brake() {
+    let mut soft = Flight::new(&contradiction(Some(Soft::default())), settings(), FaultPlan::default());
+    soft.fly(600);
+    assert!(soft.records[1..].iter().all(|r| r.mode == Mode::Active), "{:?}", soft.counters());
+    for record in &soft.records {
+        let gave_way = |r: &&Row| Kind::ALL[r.kind as usize] == Kind::User && r.slack > 0.0;
+        assert!(record.step.rows().iter().any(|r| gave_way(&r)), "the row that gave way is reported");
+    }
+    soft.assert_within_limits(ROUNDING);
+    let mut hard = Flight::new(&contradiction(None), settings(), FaultPlan::default());
+    hard.fly(100);
+    let ledger = hard.records[0].step.ledger;
+    assert_eq!(ledger.status, LedgerStatus::BrakedNoCertifiedAnswer.number());
+    assert_eq!(hard.first(Mode::Braking).unwrap().1, Reason::NoCertifiedAnswer);
+    assert!(hard.panda.worst.iter().all(|excess| *excess <= ROUNDING), "{:?}", hard.panda.worst);
+    assert!(*hard.panda.speeds.last().unwrap() < 1e-2, "it stands still");
+}
+
+/// With motors of half their strength, so that torque rows are active.
+fn panda_projector(change: impl FnOnce(&mut Settings)) -> (Projector, Vec<f64>) {
+    let weaken = |m: &mut Manifest| m.task.constraints.torque.as_mut().expect("torque rows").scale = 0.5;
+    let manifest = snapshot(1, weaken).manifest;
+    let Parts { model, layout, projector } = Parts::new(&manifest).unwrap();
+    let limits = nearl_constraints::build_limits(&manifest.task.constraints, &model).unwrap();
+    let mut settings = projector.settings().clone();
+    change(&mut settings);
+    (Projector::new(&model, &limits, layout.controllable(), settings).unwrap(), Panda::new().q)
+}
+
+/// In closed loop: what was cut short is used where the checker accepts it, and braked with its own reason where not.
+#[test]
+fn fault_06_an_answer_cut_by_cap_or_deadline_is_used_only_if_the_checker_accepts() {
+    let brake = Status::Braked(BrakeReason::NoCertifiedAnswer);
+    let (mut used, mut braked) = (0, 0);
+    let cuts: [fn(&mut Settings); 5] = [
+        |s| s.max_iter = 1,
+        |s| s.max_iter = 4,
+        |s| s.max_iter = 6,
+        |s| s.max_iter = 8,
+        |s| s.deadline = Some(std::time::Duration::ZERO),
+    ];
+    for cut in cuts {
+        let mut cap = 0;
+        let (mut capped, start) = panda_projector(|s| {
+            s.solver = Solver::Clarabel;
+            cut(s);
+            cap = s.max_iter;
+        });
+        let (mut q, mut v) = (start, vec![0.0; N]);
+        let mut target = Target::new(capped.model());
+        let mut brakes = 0;
+        for k in 0..600 {
+            let wish: Vec<f64> = weights(k / 50, N).iter().map(|w| 2.0 * f64::from(*w)).collect();
+            let status = capped.project(&q, &v, &Proposal { q: q.clone(), v: wish }, &mut target);
+            let ledger = &target.ledger;
+            assert_eq!(ledger.violations.total(), 0, "tick {k}: {status:?}");
+            used += u32::from(ledger.rung == Rung::Clarabel && ledger.iterations == cap);
+            if status == brake {
+                brakes += 1;
+                assert_eq!(numbers(ledger).status, LedgerStatus::BrakedNoCertifiedAnswer.number());
+                assert!(matches!(ledger.rung, Rung::Brake | Rung::StoredBrake), "{:?}", ledger.rung);
+            }
+            (q, v) = (target.q.clone(), target.v.clone());
+        }
+        println!("cap {cap}: {brakes} of 600 ticks braked");
+        braked += brakes;
+    }
+    assert!(used > 0 && braked > 0, "both branches: used {used}, braked {braked}");
+}
+
+#[test]
+fn fault_07_a_failed_solve_leaves_the_next_one_healthy() {
+    let (mut used, q) = panda_projector(|_| {});
+    let (mut new, _) = panda_projector(|_| {});
+    let mut target = Target::new(used.model());
+    let wild = Proposal { q: q.clone(), v: vec![1e200; N] };
+    let status = used.project(&q, &[1e200; N], &wild, &mut target);
+    assert!(!status.is_ok() || status == Status::Recovering, "{status:?}");
+    let proposal = Proposal { q: q.clone(), v: vec![0.02; N] };
+    let mut expected = Target::new(new.model());
+    used.project(&q, &[0.0; N], &proposal, &mut target);
+    new.project(&q, &[0.0; N], &proposal, &mut expected);
+    assert_eq!((target.q, target.v, target.ledger.status), (expected.q, expected.v, expected.ledger.status));
+}
+
+/// At speeds the motors cannot brake from, the answer is still finite and within the actuators' range.
+#[test]
+fn fault_36_torques_beyond_the_motors_are_never_sent() {
+    let mut flight = Flight::new(&stochastic(1), settings(), FaultPlan::default());
+    for speed in [3.0, 30.0, 300.0] {
+        flight.panda.v = vec![speed; N];
+        let (effort, before) = (flight.panda.effort.clone(), flight.records.len());
+        flight.fly(20);
+        for record in &flight.records[before..] {
+            let action = &record.step.action[..record.step.nu as usize];
+            assert!(action.iter().zip(&effort).all(|(a, e)| a.abs() <= *e), "{action:?}");
+        }
+    }
+    assert!(flight.records.iter().any(|r| !matches!(r.step.ledger.status, 0..=2)), "no tick was hard");
+}
+
+/// The robot model carries a payload that its motors cannot hold up, or links of nearly no mass, so that the inertia
+/// matrix is singular up to rounding.
+#[test]
+fn fault_36_a_wrong_payload_and_a_singular_inertia_brake() {
+    let loaded = |mass: &str| {
+        let mut snapshot = stochastic(1);
+        let model = snapshot.manifest.model.replace("<mass value=\"0.735522\" />", mass);
+        assert_ne!(model, snapshot.manifest.model);
+        snapshot.manifest.model = model;
+        snapshot
+    };
+    let mut heavy = Flight::new(&loaded("<mass value=\"60\" />"), settings(), FaultPlan::default());
+    heavy.fly(100);
+    assert_eq!(
+        heavy.records[0].step.ledger.status,
+        LedgerStatus::BrakedNoCertifiedAnswer.number(),
+        "no torque within the motors' range holds it"
+    );
+    assert_eq!(heavy.first(Mode::Braking).unwrap().1, Reason::NoCertifiedAnswer);
+    let mut light = stochastic(1);
+    let parts: Vec<&str> = URDF.split("<inertia ").collect();
+    let thin = |part: &&str| part.split_once("/>").map_or(String::new(), |(_, rest)| rest.to_owned());
+    let point = "<inertia ixx=\"1e-14\" ixy=\"0\" ixz=\"0\" iyy=\"1e-14\" iyz=\"0\" izz=\"1e-14\"/>";
+    let rest: String = parts[1..].iter().map(|part| format!("{point}{}", thin(part))).collect();
+    light.manifest.model = format!("{}{rest}", parts[0]);
+    let mut singular = Flight::new(&light, settings(), FaultPlan::default());
+    singular.panda.q = vec![0.0; N]; // stretched out
+    singular.panda.q[3] = singular.panda.upper[3] - 0.02;
+    singular.fly(300);
+    for flight in [&heavy, &singular] {
+        for record in &flight.records {
+            let action = &record.step.action[..record.step.nu as usize];
+            let within = action.iter().zip(&flight.panda.effort).all(|(a, e)| a.abs() <= *e);
+            assert!(within, "{action:?}");
+        }
+        assert!(flight.panda.worst[2] <= ROUNDING, "{:?}", flight.panda.worst);
+    }
+}
+
+/// The same decisions, the same work (rung and iterations of every tick), the same motion up to rounding; the times are
+/// printed.
+#[test]
+fn fault_37_denormal_numbers_change_nothing() {
+    let fly = |tiny: f64, faults: &[(u64, u64, FaultKind)]| {
+        let mut flight = Flight::new(&stochastic(1), settings(), crate::flight::plan(faults));
+        (flight.panda.q[0], flight.panda.v) = (tiny, vec![tiny; N]);
+        flight.fly(600);
+        flight
+    };
+    let denormal = FaultKind::Proposal { number: Odd::Denormal };
+    let (with, without) = (fly(1e-310, &[(1, 600, denormal)]), fly(0.0, &[]));
+    assert!(with.records[0].state.v().iter().all(|v| v.is_subnormal()));
+    assert!(with.records.iter().all(|r| r.noise.is_subnormal()));
+    for (a, b) in with.records.iter().zip(&without.records) {
+        let work = |r: &Record| (r.mode, r.step.ledger.rung, r.step.ledger.iterations, r.step.ledger.status);
+        assert_eq!(work(a), work(b), "tick {}", a.tick);
+    }
+    let difference = |a: &[f64], b: &[f64]| a.iter().zip(b).fold(0.0, |m, (a, b)| f64::max(m, (a - b).abs()));
+    assert!(difference(&with.panda.q, &without.panda.q) < 1e-9);
+    let time = |flight: &Flight| flight.records.iter().map(|r| r.step.ledger.duration).sum::<u64>();
+    let (tiny, plain) = (time(&with), time(&without));
+    println!("projections with denormal numbers: {:.2} of the time without", tiny as f64 / plain as f64);
+    with.assert_within_limits(ROUNDING);
+}
