@@ -3,33 +3,12 @@
 
 #[path = "../tests/common/mod.rs"]
 mod common;
+#[path = "../tests/common/counting.rs"]
+mod counting;
 
 use common::*;
 use nearl_constraints::*;
 use rustix::time::{ClockId, clock_gettime};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicUsize, Ordering};
-
-struct Counting;
-
-static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
-
-// SAFETY: forwards to the system allocator.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
-        // SAFETY: the caller's promise.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promise.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
 
 const TICKS: usize = 50_000;
 
@@ -74,9 +53,9 @@ fn run(name: &str, mut projector: Projector, from: &[f64]) {
         }
         let y: Vec<f64> = (0..n).map(|i| side[i] * random.between(0.0, reach[i])).collect();
         let raw = consistent(&projector, &q, &v, &y);
-        let (before, start) = (ALLOCATIONS.load(Ordering::Relaxed), now());
+        let (before, start) = (counting::allocations(), now());
         projector.project(&q, &v, &raw, &mut target);
-        let (took, after) = (now() - start - clock, ALLOCATIONS.load(Ordering::Relaxed));
+        let (took, after) = (now() - start - clock, counting::allocations());
         let (each, allocations) = &mut times[target.ledger.rung as usize];
         each.push(took);
         *allocations += after - before;

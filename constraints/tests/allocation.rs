@@ -1,32 +1,11 @@
 //! A tick allocates nothing, except one buffer inside each Clarabel solve.
 
 mod common;
+#[path = "common/counting.rs"]
+mod counting;
 
 use common::*;
 use nearl_constraints::*;
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicUsize, Ordering};
-
-struct Counting;
-
-static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
-
-// SAFETY: forwards to the system allocator.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
-        // SAFETY: the caller's promise.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promise.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
 
 /// Ticks by rung, allocations by rung.
 fn count(projector: &mut Projector, size: f64) -> ([usize; 6], [usize; 6]) {
@@ -35,11 +14,11 @@ fn count(projector: &mut Projector, size: f64) -> ([usize; 6], [usize; 6]) {
     for _ in 0..2000 {
         let (q, v) = inner_state(projector, &mut random);
         let raw = proposal(projector, &q, &v, size, &mut random);
-        let before = ALLOCATIONS.load(Ordering::Relaxed);
+        let before = counting::allocations();
         projector.project(&q, &v, &raw, &mut target);
         let rung = target.ledger.rung as usize;
         ticks[rung] += 1;
-        allocations[rung] += ALLOCATIONS.load(Ordering::Relaxed) - before;
+        allocations[rung] += counting::allocations() - before;
     }
     (ticks, allocations)
 }

@@ -90,12 +90,25 @@ pub trait Limit: Send + Sync + std::fmt::Debug {
 /// Makes the limits of one kind from the task file's section.
 type Build = fn(&ConstraintSettings, &Model) -> Result<Vec<Box<dyn Limit>>, LimitError>;
 
+/// Whether a kind of limit forbids or resists.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    /// Always hard: braking counts on it.
+    Hard,
+    /// Always soft: braking comes first.
+    Soft,
+    /// Hard unless `soft` is given.
+    Either,
+}
+
 /// One kind of limit.
 pub struct Entry {
     /// Name in the task file.
     pub name: &'static str,
     /// What a line of the task file looks like, with the joints of a Panda.
     pub example: &'static str,
+    /// Hard, soft or either.
+    pub form: Form,
     /// Makes the limits.
     pub build: Build,
 }
@@ -105,71 +118,85 @@ pub const REGISTRY: &[Entry] = &[
     Entry {
         name: "position",
         example: "position = { margin = 0.01 }",
+        form: Form::Hard,
         build: |s, _| Ok(one(&s.position, PositionLimit::new)),
     },
     Entry {
         name: "velocity",
         example: "velocity = { scale = 0.8 }",
+        form: Form::Hard,
         build: |s, _| Ok(one(&s.velocity, VelocityLimit::new)),
     },
     Entry {
         name: "acceleration",
         example: "acceleration = { limit = 10.0 }",
+        form: Form::Hard,
         build: |s, _| Ok(one(&s.acceleration, AccelerationLimit::new)),
     },
     Entry {
         name: "torque",
         example: "torque = { scale = 0.9 }",
+        form: Form::Either,
         build: |s, _| Ok(one(&s.torque, TorqueLimit::new)),
     },
     Entry {
         name: "jerk",
         example: "jerk = { limit = 500.0 }",
+        form: Form::Soft,
         build: |s, _| Ok(one(&s.jerk, JerkLimit::new)),
     },
     Entry {
         name: "torque_speed",
         example: "torque_speed = { stall = 80.0, no_load = 3.0 }",
+        form: Form::Either,
         build: |s, _| Ok(one(&s.torque_speed, TorqueSpeedLimit::new)),
     },
     Entry {
         name: "torque_rate",
         example: "torque_rate = { limit = 1000.0 }",
+        form: Form::Soft,
         build: |s, _| Ok(one(&s.torque_rate, TorqueRateLimit::new)),
     },
     Entry {
         name: "velocity_profile",
         example: "velocity_profile = \"fr3\"",
+        form: Form::Hard,
         build: |s, _| Ok(one(&s.velocity_profile, VelocityProfileLimit::new)),
     },
     Entry {
         name: "locked",
         example: "locked = [\"panda_joint7\"]",
+        form: Form::Hard,
         build: |s, _| Ok(one(&(!s.locked.is_empty()).then(|| s.locked.clone()), LockedJoints::new)),
     },
     Entry {
         name: "frame",
         example: "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.1] }, braking = 5.0 }]",
+        form: Form::Either,
         build: |s, _| Ok(each(&s.frame, FrameLimit::new)),
     },
     Entry {
         name: "frame_speed",
         example: "frame_speed = [{ frame = \"panda_hand\", limit = 0.25 }]",
+        form: Form::Either,
         build: |s, _| Ok(each(&s.frame_speed, FrameSpeedLimit::new)),
     },
     Entry {
         name: "energy",
         example: "energy = { limit = 2.0 }",
+        form: Form::Either,
         build: |s, _| Ok(one(&s.energy, EnergyLimit::new)),
     },
     Entry {
         name: "collision",
         example: "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \"floor\", shape = \"half_space\" }], braking = 2.0 }",
+        form: Form::Either,
         build: |s, _| Ok(one(&s.collision, CollisionLimit::new)),
     },
     Entry {
         name: "rows",
         example: "rows = [{ name = \"elbow up\", terms = { \"q.panda_joint4\" = 1.0 }, upper = -0.5, braking = 2.0 }]",
+        form: Form::Either,
         build: |s, _| Ok(each(&s.rows, UserRow::new)),
     },
 ];
