@@ -6,6 +6,7 @@ import subprocess
 import threading
 import time
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,21 @@ SNAPSHOT = ROOT / "examples" / "snapshots" / "panda-reach.safetensors"
 NEARL = ROOT / "target" / "release" / "nearl"
 
 
+STARTED: list[subprocess.Popen] = []
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left() -> Iterator[None]:
+    """Processes end with the test, however it ends."""
+    yield
+    for process in STARTED:
+        process.kill()
+        process.wait()
+
+
 def start(*arguments: str) -> subprocess.Popen:
-    return subprocess.Popen([NEARL, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    STARTED.append(subprocess.Popen([NEARL, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+    return STARTED[-1]
 
 
 def end(process: subprocess.Popen) -> str:
