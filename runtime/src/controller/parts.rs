@@ -21,7 +21,8 @@ impl Parts {
     /// # Errors
     /// [`SnapshotError::Unusable`] with the sentence of the layer that refused.
     pub fn new(m: &Manifest) -> Result<Self, SnapshotError> {
-        let unusable = |reason: String| SnapshotError::Unusable { reason };
+        // A name quoted from the manifest may hold line breaks.
+        let unusable = |reason: String| SnapshotError::Unusable { reason: reason.replace(['\n', '\r'], " ") };
         let model = match m.model_format {
             ModelFormat::Urdf if m.task.model.free_flyer => Model::from_urdf_text_free_flyer(&m.model),
             ModelFormat::Urdf => Model::from_urdf_text(&m.model),

@@ -77,7 +77,9 @@ pub fn replay(file: &Path) -> Result<Replay, ReplayError> {
 /// # Errors
 /// As [`replay`].
 pub fn replay_with<B: Build>(file: &Path, build: B) -> Result<Replay, ReplayError> {
-    let fail = |reason: String| ReplayError { file: file.to_owned(), reason };
+    // What is quoted from a damaged file may hold line breaks.
+    let fail =
+        |reason: String| ReplayError { file: file.to_owned(), reason: reason.replace(['\n', '\r'], " ") };
     let map = Map::open(file).map_err(|e| fail(e.to_string()))?;
     Replayer::new(build).run(map.bytes()).map_err(fail)
 }
