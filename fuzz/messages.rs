@@ -56,8 +56,7 @@ pub fn read_robot(bytes: &[u8]) {
 pub fn with_core(fuzz: impl FnOnce(&dyn Fn(&[u8]))) {
     let first = stochastic(1);
     let name = RobotName::new("fuzz").expect("name");
-    let robot =
-        describe(&first.manifest, false).and_then(|r| Ok(r.message(&name).expect("message"))).expect("robot");
+    let robot = describe(&first.manifest, false).map(|r| r.message(&name).expect("message")).expect("robot");
     let controller = Pilot::new(&first, &robot).unwrap_or_else(|e| panic!("{}", e.text));
     let settings = CoreSettings {
         period: 1_000_000,
@@ -68,6 +67,7 @@ pub fn with_core(fuzz: impl FnOnce(&dyn Fn(&[u8]))) {
         jump: 3.0,
         ramp: 50,
         modes: ModeLimits::default(),
+        explore: Some(3),
     };
     let core = Core::new(settings, Box::new(Loaded { id: 0, controller }), 0, FaultPlan::default());
     let core = std::cell::RefCell::new((core, 0_u64));

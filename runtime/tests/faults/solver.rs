@@ -37,6 +37,7 @@ fn contradiction(soft: Option<Soft>) -> Snapshot {
         equals: None,
         braking: None,
         soft,
+        margin: 0.0,
     };
     let mut snapshot = stochastic(1);
     snapshot.manifest.task.constraints.rows =
