@@ -146,9 +146,40 @@ impl Coupled {
         hard.fold(0.0, |worst: f64, cone| worst.max(cone.excess(y)))
     }
 
-    /// Largest violation of the stationarity condition `H (y - goal) + G' lambda + mu + cones = 0`. The force of a cone
-    /// with multiplier `nu` is `nu G_c' (G_c y + c) / |G_c y + c|`.
+    /// Largest violation of the optimality conditions: stationarity `H (y - goal) + G' lambda + mu + cones = 0`, where the
+    /// force of a cone with multiplier `nu` is `nu G_c' (G_c y + c) / |G_c y + c|`, and complementarity (`unmatched`).
     pub(crate) fn residual(&self, y: &[f64], mu: &[f64], lambda: &[f64], nu: &[f64]) -> f64 {
+        let stationary = self.stationarity(y, mu, lambda, nu);
+        let stiffest = self.stiffest();
+        let largest =
+            |slopes: &mut dyn Iterator<Item = f64>| slopes.fold(0.0, |most: f64, g| most.max(g.abs()));
+        let boxes = (0..self.n).map(|k| {
+            let excess = if mu[k] > 0.0 { y[k] - self.upper[k] } else { self.lower[k] - y[k] };
+            unmatched(mu[k].abs(), excess, 1.0, self.hessian[k], None)
+        });
+        let rows = (0..self.m).map(|r| {
+            let (value, force) = (self.row(r, y), lambda[r]);
+            let excess = match force {
+                f if f > 0.0 => value - self.row_upper[r],
+                f if f < 0.0 => self.row_lower[r] - value,
+                _ => self.excess(r, y),
+            };
+            let slope = largest(&mut self.gradient(r).iter().copied());
+            unmatched(force.abs(), excess, slope, stiffest, self.soft[r])
+        });
+        let cones = self.cones.iter().zip(nu).map(|(cone, nu)| {
+            let slope = largest(&mut (0..self.n).map(|k| cone.slope(y, k)));
+            unmatched(*nu, cone.excess(y), slope, stiffest, cone.soft)
+        });
+        boxes.chain(rows).chain(cones).fold(stationary, f64::max)
+    }
+
+    /// Largest entry of the Hessian.
+    pub(crate) fn stiffest(&self) -> f64 {
+        self.hessian.iter().fold(f64::MIN_POSITIVE, |most: f64, h| most.max(*h))
+    }
+
+    fn stationarity(&self, y: &[f64], mu: &[f64], lambda: &[f64], nu: &[f64]) -> f64 {
         (0..self.n).fold(0.0, |worst: f64, k| {
             let rows: f64 = (0..self.m).map(|r| lambda[r] * self.rows[r * self.n + k]).sum();
             let cones: f64 = self.cones.iter().zip(nu).map(|(cone, nu)| nu * cone.slope(y, k)).sum();
@@ -176,6 +207,22 @@ impl Coupled {
             self.goal[k] = self.goal[k].clamp(-FAR * FAR * FAR, FAR * FAR * FAR);
         }
     }
+}
+
+/// How far a multiplier (at least 0) and the excess of its bound are from belonging together, as a force on a velocity: the
+/// smaller of what the multiplier would have to change by and what the bound would have to move by, through the stiffness
+/// of the weights. Beyond a soft bound the multiplier is `linear + quadratic excess`, at it at most `linear`.
+fn unmatched(multiplier: f64, excess: f64, slope: f64, stiffness: f64, soft: Option<Soft>) -> f64 {
+    if slope <= 0.0 || excess == f64::NEG_INFINITY {
+        return multiplier * slope;
+    }
+    let wanted = match soft {
+        Some(soft) if excess > 0.0 => soft.linear + soft.quadratic * excess,
+        Some(soft) if excess == 0.0 => multiplier.min(soft.linear),
+        None if excess >= 0.0 => return 0.0, // a hard bound that is exceeded is the checker's business
+        _ => 0.0,
+    };
+    ((multiplier - wanted).abs() * slope).min(excess.abs() / slope * stiffness)
 }
 
 impl ConeRows {
@@ -340,5 +387,38 @@ impl Problem {
             self.g.extend(row);
             self.h.push(bound);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// `min 1/2 |y - (2, 1)|^2` with `y_0 + y_1 <= 1`: by hand (1, 0), and the row pulls with 1.
+    #[test]
+    fn forces_that_balance_are_no_optimum_where_their_bound_is_far() {
+        let mut p = Coupled::new(vec![1.0; 2], vec![None], vec![false], &[], 0);
+        (p.lower, p.upper, p.goal) = (vec![-5.0; 2], vec![5.0; 2], vec![2.0, 1.0]);
+        (p.rows, p.row_upper) = (vec![1.0, 1.0], vec![1.0]);
+        assert_eq!(p.residual(&[1.0, 0.0], &[0.0; 2], &[1.0], &[]), 0.0);
+        let short = p.residual(&[0.2, -0.8], &[0.0; 2], &[1.8], &[]); // balanced, 1.6 inside
+        assert!((short - 1.6).abs() < 1e-12, "{short}");
+        let boxed = p.residual(&[1.0, 0.0], &[1.0, 1.0], &[0.0], &[]); // the box is 4 and 5 away
+        assert_eq!(boxed, 1.0);
+    }
+
+    /// The same with the row soft, `0.1 s + 1/2 2 s^2`: beyond it the row pulls with `0.1 + 2 s`.
+    #[test]
+    fn a_soft_row_pulls_as_hard_as_it_is_exceeded() {
+        let soft = Soft { linear: 0.1, quadratic: 2.0 };
+        let mut p = Coupled::new(vec![1.0; 2], vec![Some(soft)], vec![false], &[], 0);
+        (p.lower, p.upper, p.goal) = (vec![-5.0; 2], vec![5.0; 2], vec![2.0, 1.0]);
+        (p.rows, p.row_upper) = (vec![1.0, 1.0], vec![1.0]);
+        // y = goal - lambda (1, 1), lambda = 0.1 + 2 (2 - 2 lambda): lambda = 4.1 / 5.
+        let lambda: f64 = 0.82;
+        let y = [2.0 - lambda, 1.0 - lambda];
+        assert!(p.residual(&y, &[0.0; 2], &[lambda], &[]) < 1e-12);
+        let inside = p.residual(&[0.9, -0.1], &[0.0; 2], &[1.1], &[]); // 0.2 inside, and yet it pulls
+        assert!((inside - 0.2).abs() < 1e-12, "{inside}");
     }
 }

@@ -1,4 +1,4 @@
-//! Newton's method on the optimality conditions, from Clarabel's answer on, for problems with cones.
+//! Newton's method on the optimality conditions, from Clarabel's answer on.
 //!
 //! An interior point ends where its steps stop paying: up to 3e-4 of the largest velocity change from the optimum. From there each step
 //! solves `K (dy, lambda) = (H (goal - y), bound - A y)` (`kkt.rs`), then lets go what pulls the wrong way and takes up what is exceeded.
@@ -51,15 +51,12 @@ impl Polish {
             mu: vec![0.0; n],
             lambda: vec![0.0; m],
             nu: vec![0.0; cones],
-            kkt: if cones == 0 { Kkt::default() } else { Kkt::with_room(p) },
+            kkt: Kkt::with_room(p),
         }
     }
 
     /// Replaces the answer by the optimum near it, where Newton's method finds it before `late`; true when it did.
     pub(crate) fn refine(&mut self, p: &Coupled, answer: &mut Conic, late: impl Fn() -> bool) -> bool {
-        if p.cones.is_empty() {
-            return false;
-        }
         self.start(p, answer);
         let reach = (0..p.n).fold(f64::MIN_POSITIVE, |w: f64, k| w.max(p.upper[k] - p.lower[k]));
         for _ in 0..STEPS {
@@ -79,7 +76,8 @@ impl Polish {
         false
     }
 
-    /// Takes over the answer and what holds it back.
+    /// Takes over the answer and what holds it back: the bounds whose force is larger than what moving to them would cost. Where
+    /// Clarabel stopped early every bound has a force.
     fn start(&mut self, p: &Coupled, answer: &Conic) {
         let all = answer.mu.iter().chain(&answer.lambda).chain(&answer.nu);
         let floor = ROUNDING.1 * all.fold(0.0, |most: f64, x| most.max(x.abs()));
@@ -90,12 +88,21 @@ impl Polish {
         };
         self.y.copy_from_slice(&answer.y);
         self.nu.copy_from_slice(&answer.nu);
-        (0..p.n).for_each(|k| self.dofs[k] = side(answer.mu[k]));
+        let stiffness = p.stiffest();
+        for k in 0..p.n {
+            let held = side(answer.mu[k]);
+            let gap = if held == Held::Upper { p.upper[k] - self.y[k] } else { self.y[k] - p.lower[k] };
+            self.dofs[k] = if answer.mu[k].abs() > gap * p.hessian[k] { held } else { Held::Not };
+        }
         for r in 0..p.m {
             let held = if p.equality[r] && p.soft[r].is_none() && p.row_upper[r].is_finite() {
                 Held::Upper
             } else {
-                side(answer.lambda[r])
+                let held = side(answer.lambda[r]);
+                let value = p.row(r, &self.y);
+                let gap = if held == Held::Upper { p.row_upper[r] - value } else { value - p.row_lower[r] };
+                let slope = p.gradient(r).iter().fold(0.0, |most: f64, g| most.max(g.abs()));
+                if answer.lambda[r].abs() * slope * slope > gap * stiffness { held } else { Held::Not }
             };
             let gives = p.soft[r].is_some_and(|s| answer.lambda[r].abs() > s.linear * (1.0 + ROUNDING.1));
             self.rows[r] = if gives { beyond(held) } else { held };
