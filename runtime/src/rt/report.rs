@@ -24,6 +24,9 @@ pub struct Percentiles {
     pub max: u64,
 }
 
+/// Versions a printed report shows, the last ones; `--json` has all.
+const VERSIONS_SHOWN: usize = 12;
+
 impl fmt::Display for Percentiles {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let us = |ns: u64| ns as f64 * 1e-3;
@@ -144,11 +147,14 @@ impl fmt::Display for RunReport {
             u.involuntary_switches,
             u.allocations.map_or(String::new(), |n| format!(", {n} allocations"))
         )?;
-        let versions: Vec<String> = self.versions.iter().map(|(_, version)| version.to_string()).collect();
+        let left_out = self.versions.len().saturating_sub(VERSIONS_SHOWN);
+        let last: Vec<String> =
+            self.versions[left_out..].iter().map(|(_, version)| version.to_string()).collect();
+        let earlier = if left_out > 0 { format!("{left_out} earlier, then ") } else { String::new() };
         writeln!(
             f,
-            "  snapshots        versions {}; refused {}, taken back {}",
-            versions.join(" "),
+            "  snapshots        versions {earlier}{}; refused {}, taken back {}",
+            last.join(" "),
             self.refused_snapshots,
             self.rolled_back
         )?;
