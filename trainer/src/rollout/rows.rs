@@ -85,24 +85,15 @@ impl Rows {
 
     /// Adds a policy step.
     pub fn push(&mut self, p: &Period<'_>, normaliser: &Normaliser) {
-        let (s, out) = (&mut self.segment, p.out);
         let reward = p.reward - self.moved_penalty * p.moved;
         self.discounted = self.discounted * self.gamma + reward;
-        s.x.extend_from_slice(&out.x);
-        s.change.extend_from_slice(&out.change);
-        s.target_change.extend_from_slice(&out.target_change);
-        s.lower.extend_from_slice(&out.lower);
-        s.upper.extend_from_slice(&out.upper);
-        s.sampled.extend_from_slice(&out.sampled);
-        s.action.extend(out.action.iter().map(|&a| a as f32));
-        s.log_prob.push((out.log_prob_proposal + out.log_prob_action) as f32);
-        s.reward.push(reward);
-        s.terminated.push(p.terminated);
-        s.truncated.push(false);
-        for (k, &i) in self.state.iter().enumerate() {
-            self.change[k] = p.after[i] - p.before[i];
-            s.reached.push((self.change[k] / normaliser.scale[k]).clamp(-10.0, 10.0) as f32);
+        for (change, &i) in self.change.iter_mut().zip(&self.state) {
+            *change = p.after[i] - p.before[i];
         }
+        self.segment.push(p.out, &self.change, &normaliser.scale);
+        self.segment.reward.push(reward);
+        self.segment.terminated.push(p.terminated);
+        self.segment.truncated.push(false);
         self.change_stats.push(&self.change);
         self.obs_stats.push(p.after);
         self.return_stats.push(&[self.discounted]);

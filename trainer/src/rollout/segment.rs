@@ -1,5 +1,7 @@
 //! What collecting leaves behind: rows for the learner, counts for the metrics.
 
+use nearl_runtime::Output;
+
 /// What one environment collected: `n_steps` policy steps, row by row.
 #[derive(Clone, Debug, Default)]
 pub struct Segment {
@@ -32,6 +34,19 @@ pub struct Segment {
 }
 
 impl Segment {
+    /// Adds what the controller put out in a policy step, and the change of state it led to in units of `scale` (n_state each).
+    pub(super) fn push(&mut self, out: &Output, change: &[f64], scale: &[f64]) {
+        self.x.extend_from_slice(&out.x);
+        self.change.extend_from_slice(&out.change);
+        self.target_change.extend_from_slice(&out.target_change);
+        self.lower.extend_from_slice(&out.lower);
+        self.upper.extend_from_slice(&out.upper);
+        self.sampled.extend_from_slice(&out.sampled);
+        self.action.extend(out.action.iter().map(|&a| a as f32));
+        self.log_prob.push((out.log_prob_proposal + out.log_prob_action) as f32);
+        self.reached.extend(change.iter().zip(scale).map(|(c, scale)| (c / scale).clamp(-10.0, 10.0) as f32));
+    }
+
     /// Forgets every row; keeps the memory.
     pub(super) fn clear(&mut self) {
         let wide = [&mut self.x, &mut self.change, &mut self.target_change, &mut self.lower, &mut self.upper];

@@ -250,21 +250,13 @@ impl Worker {
     fn store(&mut self, reward: f64, terminated: bool, truncated: bool, t: usize, last: bool) {
         let reward = self.penalised(reward);
         let (s, out) = (&mut self.segment, &self.out);
-        s.x.extend_from_slice(&out.x);
-        s.change.extend_from_slice(&out.change);
-        s.target_change.extend_from_slice(&out.target_change);
-        s.lower.extend_from_slice(&out.lower);
-        s.upper.extend_from_slice(&out.upper);
-        s.sampled.extend_from_slice(&out.sampled);
-        s.action.extend(out.action.iter().map(|&a| a as f32));
-        s.log_prob.push((out.log_prob_proposal + out.log_prob_action) as f32);
+        for (before, &i) in self.before.iter_mut().zip(self.controller.layout().state()) {
+            *before = self.state.obs[i] - *before;
+        }
+        s.push(out, &self.before, &self.scale);
         s.reward.push(reward);
         s.terminated.push(terminated);
         s.truncated.push(truncated || (last && !terminated));
-        for k in 0..self.before.len() {
-            self.before[k] = self.state.obs[self.controller.layout().state()[k]] - self.before[k];
-            s.reached.push((self.before[k] / self.scale[k]).clamp(-10.0, 10.0) as f32);
-        }
         self.change_stats.push(&self.before);
         self.obs_stats.push(&self.state.obs);
         self.return_stats.push(&[self.discounted]);
