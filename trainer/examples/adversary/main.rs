@@ -13,9 +13,11 @@ mod victim;
 use attack::{Attack, Kind, Random};
 use nearl_runtime::constraints::{BrakeReason, Braking, Dynamics, Proposal, Status, Target};
 use serde_json::json;
+use std::collections::BTreeMap;
 use std::error::Error;
-use std::io::Write;
 use std::path::Path;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use victim::{DT, ROBOTS, Victim};
 
 /// An excess above this share of the limit (of 1 where the limit is smaller) is a violation.
@@ -69,14 +71,9 @@ impl Counts {
     }
 }
 
-/// One closed loop of `ticks` ticks.
-fn run(
-    victim: &Victim,
-    braking: Braking,
-    kind: Kind,
-    ticks: usize,
-    seed: u64,
-) -> Result<Counts, Box<dyn Error>> {
+/// Runs one closed loop.
+fn run(job: &Job) -> Result<Counts, Box<dyn Error>> {
+    let &Job { victim, braking, kind, ticks, seed } = job;
     let (n, mut random) = (victim.model.nv(), Random(seed ^ 0xa5a5));
     let mut projector = victim.projector(braking)?;
     let mut attack = Attack::new(kind, &victim.model, &victim.set, DT, seed);
@@ -152,41 +149,80 @@ fn main() -> Result<(), Box<dyn Error>> {
     let only: Vec<String> = words.collect();
     let chosen: Vec<_> =
         ROBOTS.iter().filter(|r| only.is_empty() || only.iter().any(|o| o == r.name)).collect();
-    std::fs::create_dir_all(&folder)?;
-    let mut table = std::fs::File::create(Path::new(&folder).join("table.md"))?;
-    let mut lines = std::fs::File::create(Path::new(&folder).join("counts.jsonl"))?;
-    writeln!(table, "{HEAD}")?;
     let robots = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/robots");
-    for robot in &chosen {
-        let victim = Victim::new(robot, &robots)?;
+    let victims = chosen.iter().map(|r| Victim::new(r, &robots)).collect::<Result<Vec<_>, _>>()?;
+    let mut jobs = Vec::new();
+    for victim in &victims {
         let modes: &[Braking] = match victim.certified {
             Some(_) => &[Braking::Certified, Braking::Stored],
             None => &[Braking::Stored],
         };
         let each = (ticks / (chosen.len() * modes.len() * Kind::ALL.len()) as f64).ceil() as usize;
         for &braking in modes {
-            for (k, kind) in Kind::ALL.into_iter().enumerate() {
-                let c = run(&victim, braking, kind, each, 1 + k as u64)?;
-                let row = line(robot.name, braking, kind, &c);
-                println!("{row}");
-                writeln!(table, "{row}")?;
-                writeln!(lines, "{}", record(robot.name, &victim, braking, kind, &c))?;
-            }
+            jobs.extend((1..).zip(Kind::ALL).map(|(seed, kind)| Job {
+                victim,
+                braking,
+                kind,
+                ticks: each,
+                seed,
+            }));
         }
     }
-    Ok(())
+    std::fs::create_dir_all(&folder)?;
+    let (next, done) = (AtomicUsize::new(0), Mutex::new(BTreeMap::new()));
+    let work = || -> Result<(), String> {
+        loop {
+            let k = next.fetch_add(1, Ordering::Relaxed);
+            let Some(job) = jobs.get(k) else { return Ok(()) };
+            let counts = run(job).map_err(|e| e.to_string())?;
+            println!("{}", line(job, &counts));
+            let mut done = done.lock().map_err(|e| e.to_string())?;
+            done.insert(k, counts);
+            write(Path::new(&folder), &jobs, &done).map_err(|e| format!("{folder}: {e}"))?;
+        }
+    };
+    std::thread::scope(|scope| {
+        let threads: Vec<_> =
+            (0..std::thread::available_parallelism()?.get()).map(|_| scope.spawn(work)).collect();
+        for thread in threads {
+            thread.join().map_err(|_| "a thread of the adversary panicked")??;
+        }
+        Ok(())
+    })
+}
+
+/// One closed loop.
+struct Job<'a> {
+    victim: &'a Victim,
+    braking: Braking,
+    kind: Kind,
+    ticks: usize,
+    seed: u64,
+}
+
+/// Writes what is done so far, in the order of the jobs and not of their ends.
+fn write(folder: &Path, jobs: &[Job], done: &BTreeMap<usize, Counts>) -> std::io::Result<()> {
+    let (mut table, mut lines) = (format!("{HEAD}\n"), String::new());
+    for (k, counts) in done {
+        table += &format!("{}\n", line(&jobs[*k], counts));
+        lines += &format!("{}\n", record(&jobs[*k], counts));
+    }
+    std::fs::write(folder.join("table.md"), table)?;
+    std::fs::write(folder.join("counts.jsonl"), lines)
 }
 
 const HEAD: &str = "\
 | robot | braking | attack | ticks | position | velocity | acceleration | torque | worst excess | empty sets | stored brake | non-finite | other brakes | solved % | missed q, v, a |
 |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|";
 
-fn line(robot: &str, braking: Braking, kind: Kind, c: &Counts) -> String {
+fn line(job: &Job, c: &Counts) -> String {
+    let &Job { victim, braking, kind, .. } = job;
     let [p, v, a, t] = c.broken;
     let worst = c.worst.iter().fold(f64::NEG_INFINITY, |m, x| m.max(*x));
     let [mq, mv, ma] = c.missed;
     format!(
-        "| {robot} | {} | {} | {} | {p} | {v} | {a} | {t} | {worst:.1e} | {} | {} | {} | {} | {:.1} | {mq:.0e}, {mv:.0e}, {ma:.0e} |",
+        "| {} | {} | {} | {} | {p} | {v} | {a} | {t} | {worst:.1e} | {} | {} | {} | {} | {:.1} | {mq:.0e}, {mv:.0e}, {ma:.0e} |",
+        victim.name,
         format!("{braking:?}").to_lowercase(),
         kind.name(),
         c.ticks,
@@ -198,9 +234,10 @@ fn line(robot: &str, braking: Braking, kind: Kind, c: &Counts) -> String {
     )
 }
 
-fn record(robot: &str, victim: &Victim, braking: Braking, kind: Kind, c: &Counts) -> serde_json::Value {
+fn record(job: &Job, c: &Counts) -> serde_json::Value {
+    let &Job { victim, braking, kind, .. } = job;
     json!({
-        "robot": robot, "dofs": victim.model.nv(), "braking": braking, "certified_share": victim.certified,
+        "robot": victim.name, "dofs": victim.model.nv(), "braking": braking, "certified_share": victim.certified,
         "attack": kind.name(), "ticks": c.ticks, "position": c.broken[0], "velocity": c.broken[1],
         "acceleration": c.broken[2], "torque": c.broken[3], "worst": c.worst, "empty": c.empty,
         "stored_brake": c.stored_brake, "nonfinite": c.nonfinite, "other_brakes": c.other_brakes,

@@ -29,6 +29,7 @@ pub(crate) const ROBOTS: [Robot; 5] = [
 
 /// What a robot is attacked with.
 pub(crate) struct Victim {
+    pub(crate) name: &'static str,
     pub(crate) model: Model,
     pub(crate) limits: Vec<Box<dyn Limit>>,
     pub(crate) set: LimitSet,
@@ -53,7 +54,7 @@ impl Victim {
         let find =
             |j: &Joint| joints.iter().find(|m| m.name == j.name).map(|m| m.idx_v).ok_or(j.name.clone());
         let order = model.joints().iter().map(find).collect::<Result<Vec<_>, _>>()?;
-        Ok(Victim { model, limits, set, certified, plant, order })
+        Ok(Victim { name: robot.name, model, limits, set, certified, plant, order })
     }
 
     pub(crate) fn projector(&self, braking: Braking) -> Result<Projector, LimitError> {
