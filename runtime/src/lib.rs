@@ -15,6 +15,7 @@ pub mod rollout_protocol;
 pub mod rt;
 pub mod snapshot;
 pub mod task;
+pub mod tunnel;
 
 pub use nearl_constraints as constraints;
 

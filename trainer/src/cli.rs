@@ -51,6 +51,8 @@ enum Command {
     Explain(nearl_runtime::cli::ExplainCommand),
     /// Check that a snapshot, this machine and a plant are ready.
     Doctor(nearl_runtime::doctor::DoctorCommand),
+    /// Write the configuration of a tunnel to another host, and say how to start it.
+    Tunnel(nearl_runtime::tunnel::TunnelCommand),
     /// List the bundled tasks.
     Tasks(tasks::Tasks),
 }
@@ -74,6 +76,7 @@ impl Cli {
             Command::Replay(c) => c.run(),
             Command::Explain(c) => c.run(),
             Command::Doctor(c) => c.run(),
+            Command::Tunnel(c) => c.run(),
             Command::Tasks(c) => c.run(),
         }
     }

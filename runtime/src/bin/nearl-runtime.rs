@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 use nearl_runtime::cli::{ExplainCommand, LoopBench, ReplayCommand, RunCommand};
 use nearl_runtime::doctor::DoctorCommand;
+use nearl_runtime::tunnel::TunnelCommand;
 
 #[derive(Parser)]
 #[command(name = "nearl-runtime", version, about = "NEARL's real-time loop")]
@@ -23,6 +24,8 @@ enum Command {
     Explain(ExplainCommand),
     /// Check that a snapshot, this machine and a plant are ready.
     Doctor(DoctorCommand),
+    /// Write the configuration of a tunnel to another host, and say how to start it.
+    Tunnel(TunnelCommand),
     /// Measure this machine: shared-memory round trip, or wake-up of an empty loop.
     Bench {
         #[command(subcommand)]
@@ -36,6 +39,7 @@ fn main() -> ExitCode {
         Command::Replay(command) => command.run(),
         Command::Explain(command) => command.run(),
         Command::Doctor(command) => command.run(),
+        Command::Tunnel(command) => command.run(),
         Command::Bench { what } => what.run(),
     };
     match result {

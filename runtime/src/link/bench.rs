@@ -41,7 +41,7 @@ pub fn bench_round_trip(name: &RobotName, n: u64) -> Result<RoundTrip, LinkError
 fn echo(name: &RobotName, over: &AtomicBool) -> Result<(), LinkError> {
     let bus = Bus::join(name)?;
     let mut states = bus.inbox::<StateMessage>()?;
-    let mut actions = bus.outbox::<ActionMessage>("runtime")?;
+    let mut actions = bus.outbox::<ActionMessage>()?;
     let mut action = ActionMessage::zeroed();
     while !over.load(Ordering::Acquire) {
         match states.newest() {
@@ -58,7 +58,7 @@ fn echo(name: &RobotName, over: &AtomicBool) -> Result<(), LinkError> {
 fn measure(name: &RobotName, n: u64) -> Result<RoundTrip, LinkError> {
     let fail = |e: hdrhistogram::CreationError| name.transport("measure", e.to_string());
     let bus = Bus::join(name)?;
-    let mut states = bus.outbox::<StateMessage>("plant")?;
+    let mut states = bus.outbox::<StateMessage>()?;
     let mut actions = bus.inbox::<ActionMessage>()?;
     let mut state = StateMessage::zeroed();
     let mut exchange = |patience: u64| {

@@ -13,6 +13,7 @@ mod error;
 mod memory;
 mod messages;
 mod name;
+mod owner;
 mod plant;
 mod port;
 mod remains;

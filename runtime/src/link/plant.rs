@@ -1,5 +1,6 @@
 //! The plant's ends of the links.
 
+use super::owner::Owner;
 use super::port::{Inbox, Outbox};
 use super::service::Bus;
 use super::*;
@@ -59,6 +60,7 @@ pub struct PlantLink {
     robot: Outbox<RobotMessage>,
     hello: RobotMessage,
     bus: Bus,
+    _owner: Owner,
 }
 
 impl PlantLink {
@@ -66,12 +68,14 @@ impl PlantLink {
     pub fn open(name: &RobotName, robot: &Robot) -> Result<PlantLink, LinkError> {
         let hello = robot.message(name)?;
         let bus = Bus::join(name)?;
+        let owner = bus.own("plant")?;
         let mut link = PlantLink {
-            state: bus.outbox("plant")?,
-            robot: bus.outbox("plant")?,
+            state: bus.outbox()?,
+            robot: bus.outbox()?,
             action: bus.inbox()?,
             hello,
             bus,
+            _owner: owner,
         };
         link.bus.reserve()?;
         link.announce();

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::owner::Owner;
 use super::port::{BytesInbox, Inbox, Outbox};
 use super::service::Bus;
 use super::*;
@@ -16,21 +17,24 @@ pub struct RuntimeLink {
     receipt: Outbox<ReceiptMessage>,
     health: Outbox<HealthMessage>,
     bus: Bus,
+    _owner: Owner,
 }
 
 impl RuntimeLink {
     /// Opens all topics; a second runtime of the same robot is refused.
     pub fn open(name: &RobotName) -> Result<RuntimeLink, LinkError> {
         let bus = Bus::join(name)?;
+        let owner = bus.own("runtime")?;
         let link = RuntimeLink {
-            action: bus.outbox("runtime")?,
-            transition: bus.outbox("runtime")?,
-            receipt: bus.outbox("runtime")?,
-            health: bus.outbox("runtime")?,
+            action: bus.outbox()?,
+            transition: bus.outbox()?,
+            receipt: bus.outbox()?,
+            health: bus.outbox()?,
             state: bus.inbox()?,
             robot: bus.inbox()?,
             snapshot: bus.bytes_inbox()?,
             bus,
+            _owner: owner,
         };
         link.bus.reserve()?;
         Ok(link)

@@ -151,7 +151,7 @@ mod tests {
         use crate::link::service::Bus;
         let name = crate::link::RobotName::new(&format!("t{}-schema", std::process::id())).unwrap();
         let bus = Bus::join(&name).unwrap();
-        let _first = bus.outbox::<a::Pair>("plant").unwrap();
+        let _first = bus.outbox::<a::Pair>().unwrap();
         bus.inbox::<a::Pair>().unwrap();
         let error = bus.inbox::<swapped::Pair>().err().unwrap();
         assert_eq!(error, crate::link::LinkError::Schema { name: name.clone(), topic: "pair" });

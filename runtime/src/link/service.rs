@@ -1,8 +1,8 @@
 //! Opening iceoryx2 services with the same settings on every end.
 //!
 //! Only publish-subscribe is used. Whoever starts first creates the service, the others open it, so start order does
-//! not matter. `max_publishers(1)` makes the publisher's place the single-owner lock of plant, runtime and trainer; a
-//! killed owner's place is freed when the next node cleans up after dead ones.
+//! not matter. Who may publish is decided by [`Owner`]; a topic has a second publisher's place for a tunnel to another host.
+//! What a killed process left is removed when the next node joins.
 
 use std::time::Duration;
 
@@ -16,6 +16,7 @@ use iceoryx2::service::builder::publish_subscribe::{
 };
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
+use super::owner::Owner;
 use super::port::{BytesInbox, BytesOutbox, Inbox, Outbox};
 use super::schema::Message;
 use super::{LinkError, RobotName, SnapshotHeader, memory};
@@ -25,6 +26,8 @@ pub(crate) type Ipc = ipc_threadsafe::Service;
 
 /// Waits between attempts at a service that another process may be creating, or died creating [ms].
 const BACK_OFF: [u64; 5] = [20, 60, 180, 540, 1000];
+/// The owner, and a tunnel.
+const PUBLISHERS: usize = 2;
 /// What the links of one robot may occupy in shared memory [bytes].
 pub(crate) const SHARED_MEMORY: u64 = 24 << 20;
 
@@ -83,18 +86,20 @@ impl Bus {
         retry(build, is_passing).map_err(|e| self.open_error(M::TOPIC, &e))
     }
 
-    /// The only publisher of `M`; `role` names the owner in the error of a second one.
-    pub(crate) fn outbox<M: Message + ZeroCopySend>(
-        &self,
-        role: &'static str,
-    ) -> Result<Outbox<M>, LinkError> {
+    /// Takes a role of the robot; its owner publishes the role's topics.
+    pub(crate) fn own(&self, role: &'static str) -> Result<Owner, LinkError> {
+        Owner::take(&self.name, role)
+    }
+
+    /// A publisher of `M`, for the owner of its role.
+    pub(crate) fn outbox<M: Message + ZeroCopySend>(&self) -> Result<Outbox<M>, LinkError> {
         let service = self.service::<M>()?;
         let port = service
             .publisher_builder()
             .max_loaned_samples(1)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
-            .map_err(|e| self.publisher_error(M::TOPIC, role, e))?;
+            .map_err(|e| self.publisher_error(M::TOPIC, &e))?;
         Ok(Outbox::new(port, self.epoch))
     }
 
@@ -116,7 +121,7 @@ impl Bus {
         retry(build, is_passing).map_err(|e| self.open_error(SnapshotHeader::TOPIC, &e))
     }
 
-    /// The only publisher of snapshots.
+    /// A publisher of snapshots, for the trainer.
     pub(crate) fn bytes_outbox(&self) -> Result<BytesOutbox, LinkError> {
         let port = self
             .bytes()?
@@ -126,7 +131,7 @@ impl Bus {
             .initial_max_slice_len(1 << 16)
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .create()
-            .map_err(|e| self.publisher_error(SnapshotHeader::TOPIC, "trainer", e))?;
+            .map_err(|e| self.publisher_error(SnapshotHeader::TOPIC, &e))?;
         Ok(BytesOutbox::new(port, self.name.clone(), self.epoch))
     }
 
@@ -154,13 +159,8 @@ impl Bus {
         }
     }
 
-    fn publisher_error(&self, topic: &str, role: &'static str, error: PublisherCreateError) -> LinkError {
-        match error {
-            PublisherCreateError::ExceedsMaxSupportedPublishers => {
-                LinkError::Taken { name: self.name.clone(), role }
-            }
-            other => self.name.transport(format!("publish `{topic}`"), format!("{other:?}")),
-        }
+    fn publisher_error(&self, topic: &str, error: &PublisherCreateError) -> LinkError {
+        self.name.transport(format!("publish `{topic}`"), format!("{error:?}"))
     }
 
     fn subscriber_error(&self, topic: &'static str, error: SubscriberCreateError) -> LinkError {
@@ -179,7 +179,7 @@ where
     H: std::fmt::Debug + ZeroCopySend,
 {
     builder
-        .max_publishers(1)
+        .max_publishers(PUBLISHERS)
         .max_nodes(24)
         .subscriber_max_buffer_size(buffer)
         .subscriber_max_borrowed_samples(1)

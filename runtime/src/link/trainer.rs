@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::owner::Owner;
 use super::port::{BytesOutbox, Inbox};
 use super::runtime::poll_for;
 use super::service::Bus;
@@ -14,7 +15,7 @@ pub struct TrainerLink {
     receipt: Inbox<ReceiptMessage>,
     health: Inbox<HealthMessage>,
     robot: Inbox<RobotMessage>,
-    snapshot: Option<BytesOutbox>,
+    snapshot: Option<(BytesOutbox, Owner)>,
     bus: Bus,
 }
 
@@ -50,10 +51,11 @@ impl TrainerLink {
     /// Sends the bytes of a snapshot file as `version`; a second trainer of the same robot is refused.
     pub fn push(&mut self, version: u64, bytes: &[u8]) -> Result<(), LinkError> {
         if self.snapshot.is_none() {
-            self.snapshot = Some(self.bus.bytes_outbox()?);
+            let owner = self.bus.own("trainer")?;
+            self.snapshot = Some((self.bus.bytes_outbox()?, owner));
         }
         match &mut self.snapshot {
-            Some(outbox) => outbox.send(version, bytes),
+            Some((outbox, _)) => outbox.send(version, bytes),
             None => Ok(()),
         }
     }
@@ -66,7 +68,7 @@ impl TrainerLink {
     ) -> Result<ReceiptMessage, LinkError> {
         let (receipt, snapshot, epoch) = (&mut self.receipt, &self.snapshot, self.bus.epoch());
         poll_for(patience, || {
-            snapshot.iter().for_each(BytesOutbox::attend);
+            snapshot.iter().for_each(|(outbox, _)| outbox.attend());
             std::iter::from_fn(|| receipt.next()).find(|r| r.trainer_epoch == epoch && r.version == version)
         })
         .ok_or_else(|| LinkError::NoRuntime(self.bus.name().clone()))
@@ -74,7 +76,7 @@ impl TrainerLink {
 
     /// Keeps late runtimes served with the last snapshot; call now and then while not pushing.
     pub fn attend(&self) {
-        self.snapshot.iter().for_each(BytesOutbox::attend);
+        self.snapshot.iter().for_each(|(outbox, _)| outbox.attend());
     }
 
     /// The next transition in order.

@@ -5,7 +5,7 @@ use crate::evaluate::evaluate;
 use crate::run_folder;
 use clap::Args;
 use nearl_runtime::Snapshot;
-use nearl_runtime::link::{RobotName, TrainerLink, Verdict};
+use nearl_runtime::link::{RobotName, TrainerLink, Verdict, remove_files};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -76,6 +76,7 @@ impl Demo {
         let report = runtime.json()?;
         plant.stop();
         let plant = plant.json()?;
+        remove_files(&RobotName::new(&name)?);
         let modes = [true, false].map(|projection| evaluate(&snapshot, 3, 0, projection));
         let [projected, raw] = modes;
         let (projected, raw) = (projected?, raw?);
