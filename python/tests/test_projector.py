@@ -112,6 +112,23 @@ def test_targets_are_the_optimum(model, rng, dt, n, solver, tolerance) -> None:
     assert solved > 250 and torque_active > 20, f"{solved} solved, {torque_active} with torque rows active"
 
 
+@pytest.mark.parametrize("solver, furthest_size", [("ladder", 8), ("clarabel", 5)])
+def test_targets_are_the_optimum_however_far_the_proposal(model, rng, solver, furthest_size) -> None:
+    """Goals beyond 100 times the box were brought nearer dof by dof, which pulled another way: answers were up to the whole box off."""
+    projector, compared, furthest = make(model, 1e-3, 1, solver=solver), 0, 0.0
+    for size in np.repeat(10.0 ** np.arange(2, furthest_size + 1), 60):
+        q, v = viable_state(model, rng, 1, 1e-3)
+        pull = size * A_MAX * 1e-3 * rng.normal(size=model.nv)
+        target = projector.project(q, v, q + 1e-3 * (v + pull), v + pull)
+        nearer = pull * min(1.0, 1e6 / size)  # quadprog's answers are rounding beyond it, and do not change any more
+        optimum = Problem(model, q, v, 1e-3, 1).solve(q + 1e-3 * (v + nearer), v + nearer)
+        if optimum is None:
+            continue
+        compared += any(row["kind"] == "torque" for row in target.active)
+        furthest = max(furthest, np.abs(target.v - v - optimum).max())
+    assert furthest < 1e-8 and compared > 50, f"{furthest:.1e} rad/s, {compared} with torque rows active"
+
+
 @pytest.mark.parametrize("dt, n", [(1e-3, 1), (1e-2, 0)])
 def test_feasible_proposals_pass_bit_for_bit(model, rng, dt, n) -> None:
     projector = make(model, dt, n)

@@ -73,7 +73,7 @@ struct Shape {
 /// Rows are tightened by this share of their limit, more than the solver's tolerance.
 const TIGHTEN: f64 = 1e-9;
 
-/// A bound this many `sigma` away is none.
+/// A bound this many `sigma` away is none. A goal as many widths of the box away is brought this near: farther ones spoil the scaling.
 const FAR: f64 = 1e4;
 
 impl Shape {
@@ -195,8 +195,9 @@ impl Conic {
     /// Overwrites c, A and b with the numbers of the tick.
     fn fill(&mut self, p: &Coupled) {
         let (n, x) = (self.shape.n, &self.shape);
+        let share = p.share_within(FAR);
         for k in 0..n {
-            self.c[k] = -p.hessian[k] * self.sigma[k] * p.goal[k] / self.scale;
+            self.c[k] = -p.hessian[k] * self.sigma[k] * p.nearer_goal(k, share) / self.scale;
             self.b[x.upper + k] = (p.upper[k] / self.sigma[k]).min(FAR);
             self.b[x.upper + n + k] = (-p.lower[k] / self.sigma[k]).min(FAR);
         }

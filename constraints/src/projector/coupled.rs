@@ -199,13 +199,31 @@ impl Coupled {
             && cones
     }
 
-    /// Keeps goals far outside the box from spoiling a solver's scaling.
+    /// Brings a goal so far outside that the answer would be all rounding nearer, along the way to the box: clamped dof by dof, it
+    /// would pull another way.
     pub(crate) fn tame_goal(&mut self) {
+        let share = self.share_within(FAR);
         for k in 0..self.n {
-            let width = (self.upper[k] - self.lower[k]).clamp(1e-6, FAR);
-            self.goal[k] = self.goal[k].clamp(self.lower[k] - FAR * width, self.upper[k] + FAR * width);
-            self.goal[k] = self.goal[k].clamp(-FAR * FAR * FAR, FAR * FAR * FAR);
+            self.goal[k] = self.nearer_goal(k, share);
         }
+    }
+
+    /// The share of the way from the box to the goal that is at most `widths` times the widest side of the box.
+    pub(crate) fn share_within(&self, widths: f64) -> f64 {
+        let sides = self.upper.iter().zip(&self.lower).map(|(upper, lower)| upper - lower);
+        let widest = sides.filter(|side| side.is_finite()).fold(1e-6, f64::max).min(1.0);
+        let way = (0..self.n).fold(0.0, |most: f64, k| most.max((self.goal[k] - self.in_box(k)).abs()));
+        if way > widths * widest { widths * widest / way } else { 1.0 }
+    }
+
+    /// The goal of dof `k` at that share of the way.
+    pub(crate) fn nearer_goal(&self, k: usize, share: f64) -> f64 {
+        let start = self.in_box(k);
+        if share < 1.0 { start + share * (self.goal[k] - start) } else { self.goal[k] }
+    }
+
+    fn in_box(&self, k: usize) -> f64 {
+        self.goal[k].max(self.lower[k].max(-FAR)).min(self.upper[k].min(FAR))
     }
 }
 
@@ -282,8 +300,8 @@ impl ConeRows {
     }
 }
 
-/// Goals are kept within this many box widths.
-const FAR: f64 = 100.0;
+/// Goals are kept within this many times the widest side of the box; without bounds, within this many rad/s or m/s.
+const FAR: f64 = 1e6;
 
 /// The problem of a tick in textbook form for other solvers to check ours, over `x = (y, s)` with a slack `s >= 0` for each soft
 /// row, then for each soft cone: `min 1/2 x'H x + c'x` s.t. `G x <= h`, `A x = b` and `|C_k y + c_k| <= radius_k + s_k`.

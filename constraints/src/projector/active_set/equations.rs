@@ -1,6 +1,6 @@
 //! The answer that follows from an active set alone.
 
-use super::{ActiveSet, bound, dot};
+use super::{ActiveSet, EXACT, bound, dot};
 use crate::projector::coupled::Coupled;
 
 impl ActiveSet {
@@ -27,8 +27,40 @@ impl ActiveSet {
         self.factor.backward(&mut self.r);
         self.spread(p);
         self.products(p);
+        if self.left_over(p) > EXACT {
+            self.refine(p);
+        }
         self.fresh = true;
         true
+    }
+
+    /// How far the held rows are from their equations, into `r`; returns the most. With a goal far outside, `y_F` is a small difference
+    /// of large numbers.
+    fn left_over(&mut self, p: &Coupled) -> f64 {
+        let mut most: f64 = 0.0;
+        for (a, &row) in self.held.iter().enumerate() {
+            let side = self.row_side[row];
+            self.r[a] = self.value[row] - bound(p, row, side);
+            if let Some(soft) = p.soft[row].filter(|_| self.elastic[row]) {
+                self.r[a] += (side * soft.linear - self.lambda[row]) / soft.quadratic;
+            }
+            most = most.max(self.r[a].abs());
+        }
+        most
+    }
+
+    /// Takes what is left over in `r` out of `y_F` and the multipliers.
+    fn refine(&mut self, p: &Coupled) {
+        self.factor.forward(&mut self.r);
+        self.factor.backward(&mut self.r);
+        for (&row, &r) in self.held.iter().zip(&self.r) {
+            self.lambda[row] += r;
+            for (k, g) in p.gradient(row).iter().enumerate() {
+                self.y[k] -= r * g * self.weight[k];
+                self.mu[k] -= r * g * self.box_side[k].abs();
+            }
+        }
+        self.products(p);
     }
 
     /// `y`, `mu` and `lambda` from the multipliers in `r`.
