@@ -31,8 +31,22 @@ pub enum Gradient {
     /// The projection's derivative: zero where it clamped.
     #[default]
     Projection,
+    /// The same, but an entry beyond its bound may be drawn back towards it; the derivative alone leaves it where it is.
+    Inward,
     /// As if the projection were not there.
     StraightThrough,
+}
+
+impl Gradient {
+    /// True if the slope `dx` of the loss at the projected entry `x` reaches the proposed entry `u`.
+    #[inline(always)]
+    fn passes(self, u: f32, x: f32, dx: f32) -> bool {
+        match self {
+            Self::Projection => x == u,
+            Self::Inward => x == u || (u - x) * dx > 0.0,
+            Self::StraightThrough => true,
+        }
+    }
 }
 
 /// What of the combined policy is random and what is learned.
@@ -227,5 +241,22 @@ impl Combined {
             metrics.push(("train/proposal_std", mean_std(spread)));
         }
         metrics
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Gradient;
+
+    /// Descending along the slope moves the proposal against its sign.
+    #[test]
+    fn inward_lets_a_proposal_come_back_and_never_go_further() {
+        let passes = |g: Gradient| {
+            [(0.5, 0.5, 1.0), (2.0, 1.0, 1.0), (2.0, 1.0, -1.0), (-2.0, -1.0, 1.0), (-2.0, -1.0, -1.0)]
+                .map(|(u, x, dx)| g.passes(u, x, dx))
+        };
+        assert_eq!(passes(Gradient::Projection), [true, false, false, false, false]);
+        assert_eq!(passes(Gradient::Inward), [true, true, false, false, true]);
+        assert_eq!(passes(Gradient::StraightThrough), [true; 5]);
     }
 }

@@ -5,7 +5,7 @@ use super::super::gaussian::{Gaussian, gather, likelihood_ratio};
 use super::super::inverse::{CLIP, InverseModel, gather_input};
 use super::super::losses::value_loss;
 use super::super::optimise::{Group, TILE, Tile};
-use super::{Combined, CombinedWork, Gradient};
+use super::{Combined, CombinedWork};
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars, scalars_mut};
 use std::ops::Range;
 
@@ -91,13 +91,12 @@ impl Combined {
             model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, Some(grad), true);
         // through the projection into the proposal
         let (dx, x) = (scalars(dx), scalars(&inv.input));
-        let straight = self.gradient == Gradient::StraightThrough;
         w.d_change.fill(ZERO);
         let du = scalars_mut(&mut w.d_change);
         for r in 0..TILE {
             for j in 0..seen {
                 let (at, k) = (r * xv * LANES + seen + j, r * sv * LANES + d.seen_state[j]);
-                if straight || x[at] == u[k] {
+                if self.gradient.passes(u[k], x[at], dx[at]) {
                     du[k] = dx[at];
                 }
             }

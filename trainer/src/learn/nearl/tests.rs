@@ -21,7 +21,8 @@ fn learner(kind: Kind, activation: Activation) -> Nearl {
     };
     let ppo = PpoSettings { log_std: -0.3, ent_coef: 0.05, ..PpoSettings::default() };
     let mut rng = crate::rollout::stream(1, 1);
-    let mut l = Nearl::new(dims(), &nets, ppo, NearlSettings::default(), kind, 1, &mut rng);
+    let settings = NearlSettings { gradient: Gradient::Projection, ..NearlSettings::default() };
+    let mut l = Nearl::new(dims(), &nets, ppo, settings, kind, 1, &mut rng);
     let c = &l.nets.combined;
     let inverse = c.inverse.as_ref().map(|(m, _)| &m.net);
     let nets: Vec<_> = [&c.policy, &c.value].into_iter().chain(inverse).collect();

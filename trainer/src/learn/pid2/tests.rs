@@ -25,7 +25,9 @@ fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2,
         activation,
     };
     let ppo = PpoSettings { log_std: -0.3, ..PpoSettings::default() };
-    let settings = Pid2Settings { generator_weight: 0.7, beta: 0.2, ..Pid2Settings::default() };
+    // Of the three, only this is the derivative of a loss.
+    let gradient = Gradient::Projection;
+    let settings = Pid2Settings { generator_weight: 0.7, beta: 0.2, gradient, ..Pid2Settings::default() };
     let mut rng = crate::rollout::stream(1, 1);
     let kind = Kind { stochastic, learned: !stochastic };
     let mut l = Pid2::new(dims(), &nets, ppo, settings, kind, bottleneck, 1, &mut rng);
