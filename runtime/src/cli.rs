@@ -262,6 +262,7 @@ fn link(count: u64, json: bool) -> Result<(), Failure> {
     say(format!("state {} B, action {} B, round trip in us:", result.state_bytes, result.action_bytes));
     line("busy", &result.busy);
     line("paced at 1 kHz", &result.paced);
+    line(&format!("busy, {} B each", result.ping_bytes), &result.ping);
     Ok(())
 }
 

@@ -19,57 +19,109 @@ pub struct RoundTrip {
     pub busy: Percentiles,
     /// One each millisecond, on an absolute grid.
     pub paced: Percentiles,
+    /// One after the other with messages of [`RoundTrip::ping_bytes`]: what the transport itself costs.
+    pub ping: Percentiles,
+    /// Size of these messages [bytes].
+    pub ping_bytes: usize,
 }
 
-/// Measures `n` round trips busy and `n` paced at 1 kHz between two threads, both polling; segments are the same as
+/// A message and its answer.
+trait Pair {
+    type Out: Message + iceoryx2::prelude::ZeroCopySend;
+    type Back: Message + iceoryx2::prelude::ZeroCopySend;
+    /// Where an answer has the number of its message.
+    const ANSWERS: (fn(&Self::Back) -> u64, fn(&mut Self::Back, u64));
+}
+
+struct Control;
+struct Transport;
+
+impl Pair for Control {
+    type Out = StateMessage;
+    type Back = ActionMessage;
+    const ANSWERS: (fn(&ActionMessage) -> u64, fn(&mut ActionMessage, u64)) =
+        (|back| back.state_seq, |back, seq| back.state_seq = seq);
+}
+
+impl Pair for Transport {
+    type Out = PingMessage;
+    type Back = PongMessage;
+    const ANSWERS: (fn(&PongMessage) -> u64, fn(&mut PongMessage, u64)) =
+        (|back| back.ping_seq, |back, seq| back.ping_seq = seq);
+}
+
+/// Measures `n` round trips busy, `n` paced at 1 kHz and `n` pings between two threads, both polling; segments are the same as
 /// between processes. Removes the files of `name` afterwards: use a name of its own.
 pub fn bench_round_trip(name: &RobotName, n: u64) -> Result<RoundTrip, LinkError> {
+    let control = with_echo::<Control>(name, n, true);
+    let transport = control.and_then(|control| Ok((control, with_echo::<Transport>(name, n, false)?)));
+    remove_files(name);
+    let ([busy, paced], [ping, _]) = transport?;
+    let (state_bytes, action_bytes) = (size_of::<StateMessage>(), size_of::<ActionMessage>());
+    Ok(RoundTrip { state_bytes, action_bytes, busy, paced, ping, ping_bytes: size_of::<PingMessage>() })
+}
+
+fn with_echo<P: Pair>(name: &RobotName, n: u64, pace: bool) -> Result<[Percentiles; 2], LinkError> {
     let over = AtomicBool::new(false);
-    let result = std::thread::scope(|scope| {
-        let echo = scope.spawn(|| echo(name, &over));
-        let result = measure(name, n);
+    std::thread::scope(|scope| {
+        let echo = scope.spawn(|| echo::<P>(name, &over));
+        let result = measure::<P>(name, n, pace);
         over.store(true, Ordering::Release);
         match echo.join() {
             Ok(echoed) => echoed.and(result),
             Err(_) => Err(name.transport("measure", "the echo thread panicked")),
         }
-    });
-    remove_files(name);
-    result
+    })
 }
 
-fn echo(name: &RobotName, over: &AtomicBool) -> Result<(), LinkError> {
+fn echo<P: Pair>(name: &RobotName, over: &AtomicBool) -> Result<(), LinkError> {
     let bus = Bus::join(name)?;
-    let mut states = bus.inbox::<StateMessage>()?;
-    let mut actions = bus.outbox::<ActionMessage>()?;
-    let mut action = ActionMessage::zeroed();
+    let mut inbox = bus.inbox::<P::Out>()?;
+    let mut outbox = bus.outbox::<P::Back>()?;
+    let (mut back, mut poll) = (P::Back::zeroed(), Poll::default());
     while !over.load(Ordering::Acquire) {
-        match states.newest() {
-            Some(state) => {
-                action.state_seq = state.header.seq;
-                actions.send(&mut action);
+        match inbox.newest() {
+            Some(out) => {
+                (P::ANSWERS.1)(&mut back, out.header().seq);
+                outbox.send(&mut back);
+                poll = Poll::default();
             }
-            None => std::thread::yield_now(),
+            None => poll.again(),
         }
     }
     Ok(())
 }
 
-fn measure(name: &RobotName, n: u64) -> Result<RoundTrip, LinkError> {
+/// Polling that leaves the core to others after a while: without a second core nothing would ever answer.
+#[derive(Default)]
+struct Poll(u32);
+
+impl Poll {
+    fn again(&mut self) {
+        self.0 += 1;
+        if self.0 < 10_000 {
+            std::hint::spin_loop();
+        } else {
+            std::thread::yield_now();
+        }
+    }
+}
+
+fn measure<P: Pair>(name: &RobotName, n: u64, pace: bool) -> Result<[Percentiles; 2], LinkError> {
     let fail = |e: hdrhistogram::CreationError| name.transport("measure", e.to_string());
     let bus = Bus::join(name)?;
-    let mut states = bus.outbox::<StateMessage>()?;
-    let mut actions = bus.inbox::<ActionMessage>()?;
-    let mut state = StateMessage::zeroed();
+    let mut outbox = bus.outbox::<P::Out>()?;
+    let mut inbox = bus.inbox::<P::Back>()?;
+    let mut out = P::Out::zeroed();
     let mut exchange = |patience: u64| {
-        states.send(&mut state);
-        let end = clock::now() + patience;
+        outbox.send(&mut out);
+        let (end, mut poll) = (clock::now() + patience, Poll::default());
         while clock::now() < end {
-            match actions.newest() {
-                Some(action) if action.state_seq == state.header.seq => {
-                    return Some(clock::now() - state.header.stamp);
+            match inbox.newest() {
+                Some(back) if (P::ANSWERS.0)(&back) == out.header().seq => {
+                    return Some(clock::now() - out.header().stamp);
                 }
-                _ => std::thread::yield_now(),
+                _ => poll.again(),
             }
         }
         None
@@ -85,14 +137,9 @@ fn measure(name: &RobotName, n: u64) -> Result<RoundTrip, LinkError> {
         exchange(1_000_000_000).into_iter().for_each(|t| busy.saturating_record(t));
     }
     let start = clock::now();
-    for i in 0..n {
+    for i in 0..if pace { n } else { 0 } {
         clock::sleep_until(start + i * 1_000_000);
         exchange(1_000_000_000).into_iter().for_each(|t| paced.saturating_record(t));
     }
-    Ok(RoundTrip {
-        state_bytes: size_of::<StateMessage>(),
-        action_bytes: size_of::<ActionMessage>(),
-        busy: percentiles(&busy),
-        paced: percentiles(&paced),
-    })
+    Ok([percentiles(&busy), percentiles(&paced)])
 }

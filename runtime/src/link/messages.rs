@@ -106,6 +106,22 @@ message! {
 }
 
 message! {
+    /// Asks for a [`PongMessage`]: the smallest message there is, to measure the transport itself.
+    PingMessage, "ping", version 1, buffer 8, history 0, subscribers 4 {
+        /// Nothing.
+        nothing: u64,
+    }
+}
+
+message! {
+    /// The answer to a [`PingMessage`].
+    PongMessage, "pong", version 1, buffer 4, history 0, subscribers 4 {
+        /// `header.seq` of the ping.
+        ping_seq: u64,
+    }
+}
+
+message! {
     /// What the plant is; a snapshot for another robot is refused against it.
     RobotMessage, "robot", version 1, buffer 1, history 1, subscribers 16 {
         /// Hash of the joint names in order, see [`crate::link::hash_names`].
