@@ -70,6 +70,9 @@ fn constraints(case: &Case, model: &Model, cones: bool) -> String {
     )
 }
 
+/// Sizes of proposals, in largest velocity changes of one tick.
+const SIZES: [f64; 5] = [3.0, 3.0, 30.0, 300.0, 3000.0];
+
 /// Closed loop: the robot is where the target said.
 fn run(case: &Case, cones: bool, count: usize, out: &mut impl Write) -> Result<String, Box<dyn Error>> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("../examples/robots/{0}/{0}.urdf", case.0));
@@ -87,6 +90,8 @@ fn run(case: &Case, cones: bool, count: usize, out: &mut impl Write) -> Result<S
     let (mut random, mut target, mut raw) = (Random(7), Target::new(&model), Proposal::new(&model));
     let (mut q, mut v) = (vec![], vec![]);
     let (mut ticks, mut written, mut solved, mut braked, mut wish) = (0, 0, 0, 0, vec![0.0; model.nv()]);
+    // How far proposals go, in largest changes of one tick: mostly what a policy asks for, sometimes what nobody should.
+    let mut size = SIZES[0];
     while written < count && ticks < 400 * count {
         if ticks % 1000 == 0 {
             let place = |i: usize, r: &mut Random| {
@@ -97,12 +102,13 @@ fn run(case: &Case, cones: bool, count: usize, out: &mut impl Write) -> Result<S
         }
         if ticks % 60 == 0 {
             wish.iter_mut().for_each(|w| *w = random.between(-1.5, 1.5));
+            size = SIZES[(random.next() * SIZES.len() as f64) as usize];
         }
         for i in 0..model.nv() {
             let reach = set.acceleration[i] * DT;
-            let step = (wish[i] * set.velocity[i] - v[i]).clamp(-3.0 * reach, 3.0 * reach);
+            let step = (size / 3.0 * (wish[i] * set.velocity[i] - v[i])).clamp(-size * reach, size * reach);
             raw.v[i] = v[i] + step + reach * random.between(-1.0, 1.0);
-            raw.q[i] = q[i] + DT * (raw.v[i] + reach * random.between(-1.0, 1.0));
+            raw.q[i] = q[i] + DT * (raw.v[i] + size / 3.0 * reach * random.between(-1.0, 1.0));
         }
         let status = projector.project(&q, &v, &raw, &mut target);
         solved += usize::from(status == Status::Solved);
