@@ -43,7 +43,7 @@ fn run(name: &str, mut projector: Projector, from: &[f64]) {
     let mut target = Target::new(projector.model());
     let (mut q, mut v, mut side) = (from.to_vec(), vec![0.0; n], vec![1.0f64; n]);
     let reach: Vec<f64> = (0..n).map(|i| projector.limits().acceleration[i].min(1e3) * 2e-3).collect();
-    let rungs = ["closed form", "active set", "Clarabel", "relaxed", "stored brake", "brake"];
+    let rungs = Rung::ALL.map(Rung::name);
     let mut times = rungs.map(|_| (Vec::with_capacity(TICKS), 0));
     for _ in 0..TICKS {
         for s in &mut side {
@@ -56,7 +56,7 @@ fn run(name: &str, mut projector: Projector, from: &[f64]) {
         let (before, start) = (counting::allocations(), now());
         projector.project(&q, &v, &raw, &mut target);
         let (took, after) = (now() - start - clock, counting::allocations());
-        let (each, allocations) = &mut times[target.ledger.rung as usize];
+        let (each, allocations) = &mut times[target.ledger.rung.number() as usize];
         each.push(took);
         *allocations += after - before;
         q.copy_from_slice(&target.q);
