@@ -76,7 +76,7 @@ impl RolloutServer {
 
     /// Removes what killed processes left, and returns the clients that are still there; costs some file accesses.
     pub fn survivors(&mut self) -> HashSet<u128> {
-        self.bus.node().try_cleanup_dead_nodes();
+        self.bus.clean();
         // A failure leaves the connections as they are until the next call.
         let _ = self.port.update_connections();
         self.departed.sweep();
