@@ -18,7 +18,9 @@ fn error(py: Python<'_>, error: RequestError) -> PyErr {
     match error {
         RequestError::Link(LinkError::Name(_)) => errors::value(error),
         RequestError::TooMany(_) => PyRuntimeError::new_err(error.to_string()),
-        RequestError::Silent { .. } => PyTimeoutError::new_err(error.to_string()),
+        RequestError::Silent { .. } | RequestError::Behind { .. } => {
+            PyTimeoutError::new_err(error.to_string())
+        }
         RequestError::Refused { answer, text } => {
             let class = py.import("nearl.link").and_then(|m| m.getattr("RolloutRefused"));
             match class.and_then(|class| class.call1((answer.name(), text))) {

@@ -19,17 +19,13 @@ pub(crate) fn check(name: &RobotName, bytes: u64) -> Result<(), LinkError> {
     if available < bytes {
         return Err(too_small(name, available, bytes));
     }
-    let path = format!("{FOLDER}/{}probe{}", name.prefix(), std::process::id());
-    let mut options = OpenOptions::new();
-    let probe = options.write(true).create(true).truncate(true).mode(0o600).open(&path);
-    let reserved = probe.map_err(|e| missing(e.to_string())).and_then(|file| {
-        fallocate(&file, FallocateFlags::empty(), 0, bytes).map_err(|e| match e {
-            Errno::NOSPC => too_small(name, available, bytes),
-            other => missing(other.to_string()),
-        })
-    });
-    let _ = std::fs::remove_file(&path);
-    reserved
+    // Without a name: whoever is killed here leaves nothing.
+    let probe = OpenOptions::new().write(true).custom_flags(libc::O_TMPFILE).mode(0o600).open(FOLDER);
+    let probe = probe.map_err(|e| missing(e.to_string()))?;
+    fallocate(&probe, FallocateFlags::empty(), 0, bytes).map_err(|e| match e {
+        Errno::NOSPC => too_small(name, available, bytes),
+        other => missing(other.to_string()),
+    })
 }
 
 /// Free shared memory [bytes]; 0 if there is none.

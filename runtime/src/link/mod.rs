@@ -9,6 +9,7 @@
 
 mod access;
 mod bench;
+mod debris;
 mod error;
 mod memory;
 mod messages;

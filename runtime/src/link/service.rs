@@ -19,7 +19,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use super::owner::Owner;
 use super::port::{BytesInbox, BytesOutbox, Inbox, Outbox};
 use super::schema::Message;
-use super::{LinkError, RobotName, SnapshotHeader, memory};
+use super::{LinkError, RobotName, SnapshotHeader, debris, memory};
 use crate::rt::clock;
 
 pub(crate) type Ipc = ipc_threadsafe::Service;
@@ -54,9 +54,16 @@ impl Bus {
             |e| matches!(e, NodeCreationFailure::InternalError | NodeCreationFailure::SystemCorrupted),
         )
         .map_err(|e| name.transport("start", format!("{e:?}")))?;
-        node.try_cleanup_dead_nodes();
         let epoch = clock::now() ^ (u64::from(std::process::id()) << 40);
-        Ok(Bus { node, name: name.clone(), epoch })
+        let bus = Bus { node, name: name.clone(), epoch };
+        bus.clean();
+        Ok(bus)
+    }
+
+    /// Removes what dead processes left.
+    pub(crate) fn clean(&self) {
+        self.node.try_cleanup_dead_nodes();
+        debris::sweep(&self.name);
     }
 
     pub(crate) fn node(&self) -> &Node<Ipc> {

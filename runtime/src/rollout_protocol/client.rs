@@ -5,11 +5,12 @@ use std::time::{Duration, Instant};
 
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::{Client, RequestSendError};
-use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy};
+use iceoryx2::prelude::BackpressureStrategy;
+use iceoryx2::service::port_factory::PortFactory;
 use iceoryx2::service::port_factory::client::ClientCreateError;
 
-use super::messages::{Answer, MAX_REQUEST, ReplyMessage, RequestMessage};
-use super::service;
+use super::messages::{Answer, Envelope, MAX_REQUEST, ReplyMessage, RequestMessage};
+use super::service::{self, Factory};
 use super::{Layout, Request, RequestError};
 use crate::link::service::{Bus, Ipc};
 use crate::link::{Header, LinkError, Message, RobotName};
@@ -20,10 +21,13 @@ use crate::rt::clock;
 const NAP: (Duration, Duration) = (Duration::from_micros(50), Duration::from_millis(1));
 /// Silence after which the client looks whether the server still lives.
 const SUSPICION: Duration = Duration::from_millis(250);
+/// Time for a server to take one of this client's requests, so that there is room for the next.
+const ROOM: Duration = Duration::from_secs(10);
 
 /// Asks a rollout server of this machine. Requests may overlap, two at a time.
 pub struct RolloutClient {
-    port: Client<Ipc, [u8], (), [f64], ReplyMessage>,
+    port: Client<Ipc, Envelope, (), [f64], ReplyMessage>,
+    factory: Factory,
     bus: Arc<Bus>,
     requests: u64,
 }
@@ -66,8 +70,6 @@ impl RolloutClient {
         let factory = service::open(&bus)?;
         let port = factory
             .client_builder()
-            .initial_max_slice_len(MAX_REQUEST)
-            .allocation_strategy(AllocationStrategy::Static)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|e| match e {
@@ -75,17 +77,17 @@ impl RolloutClient {
                 other => name.transport("ask for rollouts", format!("{other:?}")),
             })?;
         let end = Instant::now() + patience;
-        let config = || iceoryx2::service::port_factory::PortFactory::dynamic_config(&factory);
-        while config().number_of_servers() == 0 {
+        while factory.dynamic_config().number_of_servers() == 0 {
             if Instant::now() >= end {
                 return Err(RequestError::NoServer(name.clone()));
             }
             std::thread::sleep(Duration::from_millis(2));
         }
-        Ok(RolloutClient { port, bus: Arc::new(bus), requests: 0 })
+        Ok(RolloutClient { port, factory, bus: Arc::new(bus), requests: 0 })
     }
 
-    /// Sends a request; its transitions come from what is returned.
+    /// Sends a request; its transitions come from what is returned. Waits, 10 s at most, while the server has not yet taken this
+    /// client's last ones.
     ///
     /// # Errors
     /// [`RequestError`]. The server's own refusals come with the first [`Rollouts::next`].
@@ -110,28 +112,42 @@ impl RolloutClient {
     }
 
     fn send(&self, bytes: &[u8], request: u64) -> Result<Rollouts, RequestError> {
-        if bytes.len() > MAX_REQUEST {
-            return Err(RequestError::TooLong { bytes: bytes.len(), limit: MAX_REQUEST });
+        let envelope =
+            Envelope::new(bytes).ok_or(RequestError::TooLong { bytes: bytes.len(), limit: MAX_REQUEST })?;
+        let start = Instant::now();
+        let (mut suspicion, mut nap) = (SUSPICION, NAP.0);
+        loop {
+            if let Some(pending) = self.deliver(envelope)? {
+                let (bus, client) = (Arc::clone(&self.bus), service::client_number(self.port.id().value()));
+                let pending = Some(pending);
+                return Ok(Rollouts { pending, bus, client, request, chunks: 0, steps: 0, cancelled: false });
+            }
+            if start.elapsed() >= suspicion {
+                suspicion += SUSPICION;
+                self.bus.node().try_cleanup_dead_nodes();
+            }
+            let name = || self.bus.name().clone();
+            if self.factory.dynamic_config().number_of_servers() == 0 {
+                return Err(RequestError::NoServer(name()));
+            }
+            if start.elapsed() >= ROOM {
+                return Err(RequestError::Behind { name: name(), seconds: ROOM.as_secs_f64() });
+            }
+            std::thread::sleep(nap);
+            nap = NAP.1.min(2 * nap);
         }
+    }
+
+    /// `None` if the server has no room for another request of this client now.
+    fn deliver(&self, envelope: Envelope) -> Result<Option<Pending>, RequestError> {
         let name = self.bus.name();
         let failed = |e: String| RequestError::from(name.transport("send a request", e));
-        let sample = self.port.loan_slice_uninit(bytes.len()).map_err(|e| failed(format!("{e:?}")))?;
-        let pending = sample.write_from_slice(bytes).send().map_err(|e| match e {
+        let sample = self.port.loan_uninit().map_err(|e| failed(format!("{e:?}")))?;
+        let pending = sample.write_payload(envelope).send().map_err(|e| match e {
             RequestSendError::ExceedsMaxActiveRequests => RequestError::TooMany(name.clone()),
             other => failed(format!("{other:?}")),
         })?;
-        if pending.number_of_server_connections() == 0 {
-            return Err(RequestError::NoServer(name.clone()));
-        }
-        let ids = (request, self.bus.epoch());
-        Ok(Rollouts {
-            pending: Some(pending),
-            bus: Arc::clone(&self.bus),
-            ids,
-            chunks: 0,
-            steps: 0,
-            cancelled: false,
-        })
+        Ok((pending.number_of_server_connections() > 0).then_some(pending))
     }
 }
 
@@ -141,14 +157,17 @@ pub(super) fn bytes_of(message: &RequestMessage) -> &[u8] {
     unsafe { std::slice::from_raw_parts(std::ptr::from_ref(message).cast(), size_of::<RequestMessage>()) }
 }
 
-type Pending = PendingResponse<Ipc, [u8], (), [f64], ReplyMessage>;
+type Pending = PendingResponse<Ipc, Envelope, (), [f64], ReplyMessage>;
 
 /// The answers to one request. Dropping it frees the server's place.
 pub struct Rollouts {
     /// `None` once the stream is over: the client may then ask for another.
     pending: Option<Pending>,
     bus: Arc<Bus>,
-    ids: (u64, u64),
+    /// This client, as the server's replies name it.
+    client: u64,
+    /// Number of the request; 0 for bytes that hold none.
+    request: u64,
     chunks: u64,
     steps: u64,
     cancelled: bool,
@@ -214,15 +233,16 @@ impl Rollouts {
             let failed = |e| self.bus.name().transport("receive a reply", format!("{e:?}"));
             let Some(sample) = pending.receive().map_err(failed)? else { return Ok(None) };
             let reply = *sample.user_header();
-            let unreadable = (reply.request, reply.client) == (0, 0);
-            if reply.header.schema == ReplyMessage::SCHEMA && (unreadable || self.is_ours(&reply)) {
+            if reply.header.schema == ReplyMessage::SCHEMA && self.is_ours(&reply) {
                 return Ok(Some((reply, sample.payload().to_vec())));
             }
         }
     }
 
+    /// A reply to bytes that hold no number has number 0.
     fn is_ours(&self, reply: &ReplyMessage) -> bool {
-        (self.ids.0 == 0 || reply.request == self.ids.0) && reply.client == self.ids.1
+        let numbered = self.request != 0 && reply.request != 0;
+        reply.client == self.client && (!numbered || reply.request == self.request)
     }
 
     /// `None` to go on waiting, else what [`Rollouts::next`] returns.

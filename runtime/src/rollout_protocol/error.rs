@@ -15,6 +15,16 @@ pub enum RequestError {
         "no rollout server named `{0}` answers on this machine: start `nearl serve SNAPSHOT --name {0}` first"
     )]
     NoServer(RobotName),
+    /// The server's buffer for this client stayed full.
+    #[error(
+        "the rollout server `{name}` has taken no request of this client for {seconds} s: look whether it is stopped, then ask again with a new client"
+    )]
+    Behind {
+        /// Server.
+        name: RobotName,
+        /// Time given [s].
+        seconds: f64,
+    },
     /// The server died or ended while it worked on a request.
     #[error(
         "the rollout server `{0}` is gone: start `nearl serve SNAPSHOT --name {0}` again and repeat the request"

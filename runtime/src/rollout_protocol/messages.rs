@@ -10,6 +10,38 @@ pub const MAX_REQUEST: usize = 1024;
 /// Capacity of the sentence in a [`ReplyMessage`] [bytes].
 pub const MAX_REPLY_TEXT: usize = 256;
 
+/// A request as it travels: any bytes, in a place of fixed size.
+///
+/// Not a slice: of a slice whose client has left, iceoryx2 0.10 never gives the buffer back.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Envelope {
+    length: u64,
+    bytes: [u8; MAX_REQUEST],
+}
+
+impl Envelope {
+    /// `None` for more bytes than fit.
+    pub(super) fn new(bytes: &[u8]) -> Option<Envelope> {
+        let mut envelope = Envelope { length: bytes.len() as u64, bytes: [0; MAX_REQUEST] };
+        envelope.bytes.get_mut(..bytes.len())?.copy_from_slice(bytes);
+        Some(envelope)
+    }
+
+    /// The bytes; a peer may send any number as their length.
+    pub(super) fn bytes(&self) -> &[u8] {
+        let length = usize::try_from(self.length).unwrap_or(MAX_REQUEST).min(MAX_REQUEST);
+        &self.bytes[..length]
+    }
+}
+
+// SAFETY: `repr(C)`, self-contained, no pointers.
+unsafe impl iceoryx2::prelude::ZeroCopySend for Envelope {
+    unsafe fn type_name() -> &'static str {
+        "nearl.rollout-envelope.v1"
+    }
+}
+
 /// In `version` and `constraints`: what the server has.
 pub(super) const OWN: u64 = u64::MAX;
 
@@ -35,10 +67,10 @@ message! {
 
 message! {
     /// Header of every answer; the numbers of a chunk follow it.
-    ReplyMessage, "rollout-reply", version 1, buffer 4, history 0, subscribers 1 {
+    ReplyMessage, "rollout-reply", version 2, buffer 4, history 0, subscribers 1 {
         /// Number of the request.
         request: u64,
-        /// Epoch of the client that asked.
+        /// The client that asked, as the transport knows it; filled by [`Caller`](super::Caller).
         client: u64,
         /// Version of the policy.
         version: u64,

@@ -8,6 +8,7 @@
 //! further one for it. A request never holds a path: the server has one task and one snapshot.
 
 mod client;
+mod departed;
 mod error;
 mod layout;
 mod messages;

@@ -1,24 +1,26 @@
 //! The server's end: requests in, replies out. Nothing here knows what a rollout is.
 
 use std::collections::HashSet;
+use std::mem::ManuallyDrop;
+use std::sync::Arc;
 
-use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::server::Server;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{BackpressureAction, SendError};
-use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, CallbackProgression};
+use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy};
 use iceoryx2::service::port_factory::server::ServerCreateError;
 
-use super::messages::{Answer, MAX_CHUNK, ReplyMessage};
-use super::service::{self, Factory};
+use super::departed::{Active, Departed};
+use super::messages::{Answer, Envelope, MAX_CHUNK, ReplyMessage};
+use super::service;
 use crate::link::service::{Bus, Ipc};
 use crate::link::{Header, LinkError, Message, RobotName};
 use crate::rt::clock;
 
 /// The only server of a name.
 pub struct RolloutServer {
-    port: Server<Ipc, [u8], (), [f64], ReplyMessage>,
-    factory: Factory,
+    port: Server<Ipc, Envelope, (), [f64], ReplyMessage>,
+    departed: Arc<Departed>,
     bus: Bus,
 }
 
@@ -57,40 +59,50 @@ impl RolloutServer {
                 other => name.transport("serve rollouts", format!("{other:?}")),
             })?;
         bus.reserve()?;
-        Ok(RolloutServer { port, factory, bus })
+        Ok(RolloutServer { port, departed: Arc::new(Departed::new(factory)), bus })
     }
 
-    /// The next request, whatever its bytes are.
+    /// The next request, whatever its bytes are; those whose client no longer waits are left out.
     pub fn receive(&mut self) -> Option<Caller> {
-        let active = self.port.receive().ok().flatten()?;
-        Some(Caller { active, epoch: self.bus.epoch(), seq: 0 })
+        loop {
+            let active = ManuallyDrop::new(self.port.receive().ok().flatten()?);
+            let (departed, epoch) = (Arc::clone(&self.departed), self.bus.epoch());
+            let caller = Caller { active, departed, epoch, seq: 0 };
+            if caller.is_connected() {
+                return Some(caller);
+            }
+        }
     }
 
     /// Removes what killed processes left, and returns the clients that are still there; costs some file accesses.
     pub fn survivors(&mut self) -> HashSet<u128> {
-        self.bus.node().try_cleanup_dead_nodes();
+        self.bus.clean();
         // A failure leaves the connections as they are until the next call.
         let _ = self.port.update_connections();
-        let mut alive = HashSet::new();
-        iceoryx2::service::port_factory::PortFactory::dynamic_config(&self.factory).list_clients(|client| {
-            alive.insert(client.client_id.value());
-            CallbackProgression::Continue
-        });
-        alive
+        self.departed.sweep();
+        self.departed.listed()
     }
 }
 
 /// One request and the way back to whoever sent it. Dropping it ends the client's stream.
 pub struct Caller {
-    active: ActiveRequest<Ipc, [u8], (), [f64], ReplyMessage>,
+    active: ManuallyDrop<Active>,
+    departed: Arc<Departed>,
     epoch: u64,
     seq: u64,
+}
+
+impl Drop for Caller {
+    fn drop(&mut self) {
+        // SAFETY: taken once, and nothing looks at it afterwards.
+        self.departed.let_go(unsafe { ManuallyDrop::take(&mut self.active) });
+    }
 }
 
 impl Caller {
     /// The request as it came.
     pub fn bytes(&self) -> &[u8] {
-        self.active.payload()
+        self.active.payload().bytes()
     }
 
     /// The client; given by the transport, so that no client can pass for another.
@@ -116,6 +128,7 @@ impl Caller {
             seq: self.seq + 1,
             stamp: clock::now(),
         };
+        reply.client = service::client_number(self.client());
         if !self.active.is_connected() {
             return Delivery::Gone;
         }
@@ -131,10 +144,10 @@ impl Caller {
         }
     }
 
-    /// Sends a reply without numbers to the request `ids` (number, client's epoch).
-    pub fn answer(&mut self, answer: Answer, text: &str, ids: (u64, u64)) -> Delivery {
-        let mut reply = ReplyMessage::zeroed();
-        (reply.request, reply.client) = ids;
+    /// Sends a reply without numbers to request number `request`; 0 if its bytes do not hold one. A new request may meet a full
+    /// buffer, too: what the client left unread of an earlier one.
+    pub fn answer(&mut self, answer: Answer, text: &str, request: u64) -> Delivery {
+        let mut reply = ReplyMessage { request, ..ReplyMessage::default() };
         reply.set(answer, text);
         self.send(&mut reply, &[])
     }

@@ -2,6 +2,7 @@
 
 use super::job::{Job, Stage};
 use super::pool::{Outcome, Pool};
+use super::refusal::Refusal;
 use super::turns::Turns;
 use super::{Report, ServeError, Settings};
 use crate::rollout::Worker;
@@ -13,6 +14,8 @@ use std::collections::{BTreeMap, HashSet};
 
 pub(super) struct Desk {
     jobs: BTreeMap<u64, Job>,
+    /// Answers that end a request at once, and wait for room.
+    refusals: Vec<Refusal>,
     turns: Turns<u64>,
     slots: u64,
     settings: Settings,
@@ -34,6 +37,7 @@ impl Desk {
         }
         Ok(Desk {
             jobs: BTreeMap::new(),
+            refusals: Vec::new(),
             turns: Turns::new(),
             slots: 0,
             settings: settings.clone(),
@@ -47,22 +51,21 @@ impl Desk {
     }
 
     /// Accepts or refuses a request; every one that can be answered is.
-    pub(super) fn admit(&mut self, mut caller: Caller) {
+    pub(super) fn admit(&mut self, caller: Caller) {
         self.report.requests += 1;
-        let (ids, verdict) = match decode(caller.bytes()) {
-            Ok((number, client, request)) => ((number, client), self.check(request)),
-            Err(e) => ((e.request, e.client), Err((Answer::BadRequest, e.reason))),
+        let (number, verdict) = match decode(caller.bytes()) {
+            Ok((number, _, request)) => (number, self.check(request)),
+            Err(e) => (e.request, Err((Answer::BadRequest, e.reason))),
         };
         match verdict {
-            Ok(request) => self.accept(caller, ids, request),
+            Ok(request) => self.accept(caller, number, request),
             Err((answer, text)) => {
                 match answer {
                     Answer::Busy => self.report.busy += 1,
                     Answer::LimitExceeded => self.report.limit += 1,
                     _ => self.report.malformed += 1,
                 }
-                // A new request has an empty buffer; a client that is gone already needs no answer.
-                caller.answer(answer, &text, ids);
+                self.refusals.push(Refusal::new(caller, number, answer, text));
             }
         }
     }
@@ -102,10 +105,9 @@ impl Desk {
         Ok(request)
     }
 
-    fn accept(&mut self, caller: Caller, ids: (u64, u64), request: Request) {
+    fn accept(&mut self, caller: Caller, number: u64, request: Request) {
         let reply = ReplyMessage {
-            request: ids.0,
-            client: ids.1,
+            request: number,
             version: self.version,
             constraints: self.constraints,
             n_steps: request.n_steps,
@@ -131,6 +133,7 @@ impl Desk {
     /// Sends what is ready, queues whose buffer is empty again, and lets go of what is cancelled, finished or without a
     /// client.
     pub(super) fn attend(&mut self) {
+        self.refusals.retain_mut(|refusal| !refusal.is_over(self.settings.patience));
         let slots: Vec<u64> = self.jobs.keys().copied().collect();
         for slot in slots {
             let Some(job) = self.jobs.get_mut(&slot) else { continue };

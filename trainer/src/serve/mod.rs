@@ -7,6 +7,7 @@
 mod desk;
 mod job;
 mod pool;
+mod refusal;
 mod turns;
 
 use crate::rollout::RolloutError;
