@@ -1,36 +1,30 @@
-//! `nearl tunnel`: what iceoryx2's tunnel over zenoh needs to carry the links of a robot to a trainer on another host.
+//! `nearl tunnel`: the links of a robot, carried to a trainer on another host by iceoryx2's own tunnel over zenoh.
 //!
-//! Each robot has shared memory and files of its own name ([`RobotName`]), so the tunnel needs the same configuration as the
-//! links. What crosses is what a trainer reads and writes; actions never leave the robot's host.
+//! Each robot has shared memory and files of its own name ([`RobotName`]), so the tunnel needs the configuration of the links.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command};
+use std::time::Duration;
 
 use clap::Args;
+use rustix::process::{Pid, Signal, kill_process};
 use serde_json::json;
 
-use crate::cli::{Failure, say};
-use crate::link::{
-    HealthMessage, Message, ReceiptMessage, RobotMessage, RobotName, SnapshotHeader, StateMessage,
-    TransitionMessage,
-};
+use crate::cli::Failure;
+use crate::link::{CROSSING, Crossing, RobotName};
+use crate::rt::Stop;
 
-/// Topics that cross; the action is not among them.
-const TOPICS: [&str; 6] = [
-    RobotMessage::TOPIC,
-    StateMessage::TOPIC,
-    TransitionMessage::TOPIC,
-    HealthMessage::TOPIC,
-    ReceiptMessage::TOPIC,
-    SnapshotHeader::TOPIC,
-];
+/// iceoryx2's tunnel, a program of its own.
+const PROGRAM: &str = "iox2-link-tunnel-zenoh";
+const INSTALL: &str = "cargo install --locked --version 0.10.0 iceoryx2-integrations-zenoh-link-tunnel-cli";
 
 /// Pause between two looks of the tunnel for messages [ms].
-const POLL: u32 = 1;
+const POLL: &str = "1";
 
-/// Write the configuration of a tunnel to another host, and say how to start it.
+/// Carry the links of a robot to or from another host until a signal comes; needs iceoryx2's tunnel for zenoh.
 #[derive(Args, Debug)]
 pub struct TunnelCommand {
-    /// Name of the robot.
+    /// Name of the robot, the same on both hosts.
     pub name: String,
     /// Address on which this host waits for the other, for example `tcp/0.0.0.0:7447`.
     #[arg(long, required_unless_present = "connect")]
@@ -38,19 +32,35 @@ pub struct TunnelCommand {
     /// Address of the host that listens, for example `tcp/192.168.1.20:7447`.
     #[arg(long)]
     pub connect: Option<String>,
-    /// Folder for the configuration; `tunnel/<name>` if not given.
+    /// Folder for the tunnel's configuration; `tunnel/<name>` if not given.
     #[arg(long)]
     pub out: Option<PathBuf>,
 }
 
 impl TunnelCommand {
-    /// Writes the files and prints the command.
+    /// Runs the tunnel until it ends or a signal comes.
     ///
     /// # Errors
-    /// One sentence: the name, or the file that could not be written.
+    /// One sentence: the name, a file that could not be written, or the tunnel that is missing or gave up.
     pub fn run(self) -> Result<(), Failure> {
         let name = RobotName::new(&self.name)?;
-        let folder = self.out.unwrap_or_else(|| PathBuf::from("tunnel").join(name.as_str()));
+        let folder = self.out.clone().unwrap_or_else(|| PathBuf::from("tunnel").join(name.as_str()));
+        self.configure(&name, &folder)?;
+        let _topics = Crossing::open(&name)?;
+        let stop = Stop::on_signals()?;
+        let mut command = Command::new(PROGRAM);
+        command.current_dir(&folder).args(["--zenoh-config", "zenoh.json5", "--poll", POLL]);
+        for topic in CROSSING {
+            command.args(["--allow", &format!("nearl/{name}/{topic}")]);
+        }
+        let child = command
+            .spawn()
+            .map_err(|e| format!("{PROGRAM} could not be started ({e}): install it with `{INSTALL}`"))?;
+        wait(child, &stop)
+    }
+
+    /// Writes the configuration of iceoryx2 and of zenoh.
+    fn configure(&self, name: &RobotName, folder: &Path) -> Result<(), Failure> {
         let endpoints = |address: &Option<String>| json!({ "endpoints": address.iter().collect::<Vec<_>>() });
         let zenoh = json!({
             "mode": "peer",
@@ -59,20 +69,35 @@ impl TunnelCommand {
             "scouting": { "multicast": { "enabled": false } },
         });
         let config = folder.join("config");
-        let write = |file: PathBuf, text: String| {
-            std::fs::write(&file, text)
-                .map_err(|e| format!("{} cannot be written ({e}): choose another --out", file.display()))
+        let failed = |file: &Path, e: std::io::Error| {
+            format!("{} cannot be written ({e}): choose another --out", file.display())
         };
-        std::fs::create_dir_all(&config)
-            .map_err(|e| format!("{} cannot be made ({e}): choose another --out", config.display()))?;
-        write(config.join("iceoryx2.toml"), toml::to_string(&name.config()?)?)?;
-        write(folder.join("zenoh.json5"), serde_json::to_string_pretty(&zenoh)?)?;
-        let allowed = TOPICS.map(|topic| format!(" --allow nearl/{name}/{topic}")).concat();
-        say(format!(
-            "cd {} && iox2-link-tunnel-zenoh --zenoh-config zenoh.json5 --poll {POLL}{allowed}",
-            folder.display()
-        ));
+        std::fs::create_dir_all(&config).map_err(|e| failed(&config, e))?;
+        let files = [
+            (config.join("iceoryx2.toml"), toml::to_string(&name.config()?)?),
+            (folder.join("zenoh.json5"), serde_json::to_string_pretty(&zenoh)?),
+        ];
+        for (file, text) in files {
+            std::fs::write(&file, text).map_err(|e| failed(&file, e))?;
+        }
         Ok(())
+    }
+}
+
+fn wait(mut child: Child, stop: &Stop) -> Result<(), Failure> {
+    loop {
+        if let Some(status) = child.try_wait()? {
+            return Err(format!("{PROGRAM} ended ({status}): its own lines above say why").into());
+        }
+        if stop.is_requested() {
+            // Asked, not killed: it then removes its own files.
+            if let Some(pid) = Pid::from_raw(child.id() as i32) {
+                kill_process(pid, Signal::TERM)?;
+            }
+            child.wait()?;
+            return Ok(());
+        }
+        std::thread::sleep(Duration::from_millis(50));
     }
 }
 
@@ -87,12 +112,13 @@ mod tests {
             name: "arm".into(),
             listen: None,
             connect: Some("tcp/10.0.0.1:7447".into()),
-            out: Some(folder.clone()),
+            out: None,
         };
-        command.run().unwrap();
+        let name = RobotName::new("arm").unwrap();
+        command.configure(&name, &folder).unwrap();
         let text = std::fs::read_to_string(folder.join("config/iceoryx2.toml")).unwrap();
         let read: iceoryx2::config::Config = toml::from_str(&text).unwrap();
-        assert_eq!(read, RobotName::new("arm").unwrap().config().unwrap());
+        assert_eq!(read, name.config().unwrap());
         let zenoh = std::fs::read_to_string(folder.join("zenoh.json5")).unwrap();
         let zenoh: serde_json::Value = serde_json::from_str(&zenoh).unwrap();
         assert_eq!(zenoh["connect"]["endpoints"][0], "tcp/10.0.0.1:7447");

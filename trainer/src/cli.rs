@@ -51,7 +51,7 @@ enum Command {
     Explain(nearl_runtime::cli::ExplainCommand),
     /// Check that a snapshot, this machine and a plant are ready.
     Doctor(nearl_runtime::doctor::DoctorCommand),
-    /// Write the configuration of a tunnel to another host, and say how to start it.
+    /// Carry a robot's links to or from another host.
     Tunnel(nearl_runtime::tunnel::TunnelCommand),
     /// List the bundled tasks.
     Tasks(tasks::Tasks),

@@ -24,7 +24,7 @@ enum Command {
     Explain(ExplainCommand),
     /// Check that a snapshot, this machine and a plant are ready.
     Doctor(DoctorCommand),
-    /// Write the configuration of a tunnel to another host, and say how to start it.
+    /// Carry a robot's links to or from another host.
     Tunnel(TunnelCommand),
     /// Measure this machine: shared-memory round trip, or wake-up of an empty loop.
     Bench {

@@ -9,6 +9,7 @@
 
 mod access;
 mod bench;
+mod crossing;
 mod debris;
 mod error;
 mod memory;
@@ -26,6 +27,7 @@ mod trainer;
 
 pub use access::Verdict;
 pub use bench::{RoundTrip, bench_round_trip};
+pub(crate) use crossing::{CROSSING, Crossing};
 pub use error::LinkError;
 pub use memory::remove_files;
 pub(crate) use memory::{check as check_memory, free as free_memory};

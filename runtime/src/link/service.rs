@@ -83,7 +83,7 @@ impl Bus {
         memory::reserve(&self.name)
     }
 
-    fn service<M: Message + ZeroCopySend>(&self) -> Result<PortFactory<Ipc, M, ()>, LinkError> {
+    pub(super) fn service<M: Message + ZeroCopySend>(&self) -> Result<PortFactory<Ipc, M, ()>, LinkError> {
         let topic = self.topic(M::TOPIC)?;
         let build = || {
             settings(self.node.service_builder(&topic).publish_subscribe::<M>(), M::BUFFER, M::HISTORY)
@@ -117,7 +117,7 @@ impl Bus {
         Ok(Inbox::new(port))
     }
 
-    fn bytes(&self) -> Result<PortFactory<Ipc, [u8], SnapshotHeader>, LinkError> {
+    pub(super) fn bytes(&self) -> Result<PortFactory<Ipc, [u8], SnapshotHeader>, LinkError> {
         let topic = self.topic(SnapshotHeader::TOPIC)?;
         let build = || {
             let service = self.node.service_builder(&topic).publish_subscribe::<[u8]>();

@@ -1,4 +1,4 @@
-//! Where experience comes from: environments of this process, a rollout server, or a running loop.
+//! Where experience comes from: environments of this process, or a running loop.
 
 use crate::checkpoint::Checkpoint;
 use crate::online::{LoopSource, OnlineError};
