@@ -29,8 +29,10 @@ pub struct RoundTrip {
 trait Pair {
     type Out: Message + iceoryx2::prelude::ZeroCopySend;
     type Back: Message + iceoryx2::prelude::ZeroCopySend;
-    /// Where an answer has the number of its message.
-    const ANSWERS: (fn(&Self::Back) -> u64, fn(&mut Self::Back, u64));
+    /// Number of the message that `back` answers.
+    fn answered(back: &Self::Back) -> u64;
+    /// Makes `back` the answer to message `seq`.
+    fn answer(back: &mut Self::Back, seq: u64);
 }
 
 struct Control;
@@ -39,15 +41,23 @@ struct Transport;
 impl Pair for Control {
     type Out = StateMessage;
     type Back = ActionMessage;
-    const ANSWERS: (fn(&ActionMessage) -> u64, fn(&mut ActionMessage, u64)) =
-        (|back| back.state_seq, |back, seq| back.state_seq = seq);
+    fn answered(back: &ActionMessage) -> u64 {
+        back.state_seq
+    }
+    fn answer(back: &mut ActionMessage, seq: u64) {
+        back.state_seq = seq;
+    }
 }
 
 impl Pair for Transport {
     type Out = PingMessage;
     type Back = PongMessage;
-    const ANSWERS: (fn(&PongMessage) -> u64, fn(&mut PongMessage, u64)) =
-        (|back| back.ping_seq, |back, seq| back.ping_seq = seq);
+    fn answered(back: &PongMessage) -> u64 {
+        back.ping_seq
+    }
+    fn answer(back: &mut PongMessage, seq: u64) {
+        back.ping_seq = seq;
+    }
 }
 
 /// Measures `n` round trips busy, `n` paced at 1 kHz and `n` pings between two threads, both polling; segments are the same as
@@ -82,7 +92,7 @@ fn echo<P: Pair>(name: &RobotName, over: &AtomicBool) -> Result<(), LinkError> {
     while !over.load(Ordering::Acquire) {
         match inbox.newest() {
             Some(out) => {
-                (P::ANSWERS.1)(&mut back, out.header().seq);
+                P::answer(&mut back, out.header().seq);
                 outbox.send(&mut back);
                 poll = Poll::default();
             }
@@ -118,7 +128,7 @@ fn measure<P: Pair>(name: &RobotName, n: u64, pace: bool) -> Result<[Percentiles
         let (end, mut poll) = (clock::now() + patience, Poll::default());
         while clock::now() < end {
             match inbox.newest() {
-                Some(back) if (P::ANSWERS.0)(&back) == out.header().seq => {
+                Some(back) if P::answered(&back) == out.header().seq => {
                     return Some(clock::now() - out.header().stamp);
                 }
                 _ => poll.again(),

@@ -12,8 +12,9 @@ use std::time::Duration;
 
 use super::RobotName;
 
-/// Age from which half a node is no longer one that is being made or removed; both take milliseconds.
-const AGE: Duration = Duration::from_secs(10);
+/// What is half a node before and after this pause is not one that is being made or removed; both take milliseconds. Only a start
+/// that finds one waits.
+const PAUSE: Duration = Duration::from_millis(100);
 /// The files that monitor a node, after the name's prefix and the node's number.
 const MONITOR: [&str; 3] = [".node_monitor", ".node_monitor_owner_lock", ".node_monitor_context"];
 
@@ -23,21 +24,30 @@ pub(super) fn sweep(name: &RobotName) {
 }
 
 fn sweep_folder(nodes: &Path, prefix: &str) {
-    let names: BTreeSet<OsString> =
-        read_dir(nodes).into_iter().flatten().flatten().map(|e| e.file_name()).collect();
-    for name in &names {
-        let Some(node) = name.to_str().and_then(|n| n.parse::<u128>().ok()) else { continue };
-        let folder = nodes.join(name);
-        let monitored = names.contains(&OsString::from(format!("{prefix}{node}{}", MONITOR[0])));
-        let whole = monitored && folder.join(format!("{prefix}node.details")).exists();
-        if !whole && is_gone(node) && is_old(&folder) {
-            // Another process may be faster: what it left is removed all the same.
-            let _ = remove_dir_all(&folder);
-            for file in MONITOR {
-                let _ = remove_file(nodes.join(format!("{prefix}{node}{file}")));
-            }
+    let before = halves(nodes, prefix);
+    if before.is_empty() {
+        return;
+    }
+    std::thread::sleep(PAUSE);
+    for node in before.intersection(&halves(nodes, prefix)) {
+        // Another process may be faster: what it left is removed all the same.
+        let _ = remove_dir_all(nodes.join(node.to_string()));
+        for file in MONITOR {
+            let _ = remove_file(nodes.join(format!("{prefix}{node}{file}")));
         }
     }
+}
+
+/// Nodes of processes that are gone, without details or without a monitor.
+fn halves(nodes: &Path, prefix: &str) -> BTreeSet<u128> {
+    let names: BTreeSet<OsString> =
+        read_dir(nodes).into_iter().flatten().flatten().map(|e| e.file_name()).collect();
+    let whole = |node: u128| {
+        names.contains(&OsString::from(format!("{prefix}{node}{}", MONITOR[0])))
+            && nodes.join(node.to_string()).join(format!("{prefix}node.details")).exists()
+    };
+    let numbers = names.iter().filter_map(|name| name.to_str()?.parse::<u128>().ok());
+    numbers.filter(|&node| !whole(node) && is_gone(node)).collect()
 }
 
 /// True if the process that made the node no longer exists: its number is in the node's.
@@ -46,21 +56,15 @@ fn is_gone(node: u128) -> bool {
     !Path::new("/proc").join(process.to_string()).exists()
 }
 
-fn is_old(folder: &Path) -> bool {
-    let changed = folder.metadata().and_then(|m| m.modified());
-    changed.is_ok_and(|time| time.elapsed().is_ok_and(|age| age > AGE))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::fs::{File, create_dir_all, write};
-    use std::time::SystemTime;
+    use std::fs::{create_dir_all, write};
 
     const PREFIX: &str = "nearl.debris.";
 
-    /// A node with these of its files, changed `age` ago.
-    fn node(nodes: &Path, process: u32, details: bool, monitor: bool, age: Duration) -> String {
+    /// A node with these of its files.
+    fn node(nodes: &Path, process: u32, details: bool, monitor: bool) -> String {
         let number = (u128::from(process) << 64 | 7).to_string();
         let folder = nodes.join(&number);
         create_dir_all(&folder).unwrap();
@@ -71,21 +75,15 @@ mod tests {
         if monitor {
             MONITOR.iter().for_each(|m| write(nodes.join(format!("{PREFIX}{number}{m}")), "").unwrap());
         }
-        File::open(&folder).unwrap().set_modified(SystemTime::now() - age).unwrap();
         number
     }
 
     #[test]
-    fn only_old_halves_of_dead_processes_go() {
+    fn only_halves_of_dead_processes_go() {
         let nodes = std::env::temp_dir().join(format!("nearl-debris-{}", std::process::id()));
-        let old = Duration::from_secs(60);
         let (dead, alive) = (u32::MAX >> 1, std::process::id());
-        let gone = [node(&nodes, dead, true, false, old), node(&nodes, dead - 1, false, true, old)];
-        let kept = [
-            node(&nodes, dead - 2, true, true, old),
-            node(&nodes, dead - 3, true, false, Duration::ZERO),
-            node(&nodes, alive, true, false, old),
-        ];
+        let gone = [node(&nodes, dead, true, false), node(&nodes, dead - 1, false, true)];
+        let kept = [node(&nodes, dead - 2, true, true), node(&nodes, alive, true, false)];
         sweep_folder(&nodes, PREFIX);
         let left: Vec<String> =
             read_dir(&nodes).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
