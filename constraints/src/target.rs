@@ -136,7 +136,7 @@ impl Settings {
     }
 
     /// Refuses what no projection could be made with.
-    pub(crate) fn validate(&self, nv: usize) -> Result<(), LimitError> {
+    pub(crate) fn validate(&self, model: &Model) -> Result<(), LimitError> {
         let bad = |what: &str, value: f64, domain| {
             Err(LimitError::BadValue { what: what.to_string(), value, domain })
         };
@@ -150,12 +150,18 @@ impl Settings {
             return bad("max_iter", 0.0, "at least 1");
         }
         let Some(weights) = &self.velocity_weight else { return Ok(()) };
-        if weights.len() != nv {
+        if weights.len() != model.nv() {
             return bad("length of velocity_weight", weights.len() as f64, "nv, one weight per dof");
         }
-        match weights.iter().find(|w| !(**w >= 1e-3 && **w <= 1e3)) {
-            Some(w) => bad("velocity_weight", *w, "between 0.001 and 1000"),
-            None => Ok(()),
+        let unusable = (0..weights.len()).filter(|i| !(1e-3..=1e3).contains(&weights[*i]));
+        let named: Vec<String> =
+            unusable.map(|i| format!("{} of '{}'", weights[i], model.dof_name(i))).collect();
+        if named.is_empty() {
+            return Ok(());
         }
+        Err(LimitError::Unusable {
+            what: format!("velocity_weight {} is not between 0.001 and 1000", named.join(", ")),
+            next: "give every dof a positive, finite weight",
+        })
     }
 }

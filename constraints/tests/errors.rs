@@ -126,6 +126,11 @@ fn limits_that_make_no_sense() {
     refuse(&[], &[1, 1], s(), &["'panda_joint2'", "twice"]);
     refuse(&[], &[0], Settings::new(-0.1, 1), &["dt", "-0.1", "above 0 s"]);
     refuse(&[], &[0], Settings { velocity_weight: Some(vec![1.0]), ..s() }, &["velocity_weight"]);
+    let singular = vec![1.0, 0.0, 1.0, f64::NAN, 1.0, -1.0, f64::INFINITY];
+    let words = [
+        "velocity_weight 0 of 'panda_joint2', NaN of 'panda_joint4', -1 of 'panda_joint6', inf of 'panda_joint7'",
+    ];
+    refuse(&[], &[0], Settings { velocity_weight: Some(singular), ..s() }, &words);
     let free = Settings { consistency: Consistency::Free, ..s() };
     refuse(&panda_limits(Some(1.0)), &[0], free, &["torque", "'panda_joint1'", "kinematic"]);
     refuse_for(&robot("gymnasium/ant.xml"), &[], &[2, 6], s(), &["1 of the 6 dofs", "'root'"]);

@@ -26,7 +26,7 @@ impl Projector {
         settings: Settings,
     ) -> Result<Projector, LimitError> {
         let nv = model.nv();
-        settings.validate(nv)?;
+        settings.validate(model)?;
         let dofs = Dofs::new(model, controllable, settings.consistency)?;
         let switches = switches(model, limits, &dofs.controllable)?;
         let (each, limits) = (limits, LimitSet::collect(model, limits, &dofs.controllable)?);
