@@ -9,12 +9,16 @@ A problem is the projection of one proposal on a Panda. With `T` the period, `si
 is imported.
 """
 
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import quadprog
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from bounds import upper_acceleration  # noqa: E402
 
 URDF = Path(__file__).resolve().parents[2] / "examples/robots/panda/panda.urdf"
 PERIOD = 1e-3  # [s], one semi-implicit Euler step
@@ -58,17 +62,6 @@ class Problems:
         )
 
 
-def upper_acceleration(d: Array, v: Array, speed: Array) -> Array:
-    """Largest acceleration towards a limit at distance d [rad] after which braking still stops before it."""
-    inside = (d - PERIOD * v) / PERIOD**2
-    w = v - ACCELERATION * PERIOD / 2
-    b, c = 2 * w * PERIOD + 2 * ACCELERATION * PERIOD**2, w**2 - 2 * ACCELERATION * (d - PERIOD * v)
-    with np.errstate(invalid="ignore"):
-        root = (-b + np.sqrt(b**2 - 4 * PERIOD**2 * c)) / (2 * PERIOD**2)
-    stopping = np.where(np.isnan(root), -w / PERIOD, np.fmax(root, -w / PERIOD))
-    return np.min([np.full_like(v, ACCELERATION), (speed - v) / PERIOD, inside, stopping], axis=0)
-
-
 def draw(n: int, rng: np.random.Generator, size: tuple[float, float]) -> Problems:
     """States inside the limits with room to brake, and proposals `10^size` times `sigma` away; size is drawn uniformly."""
     model = pin.buildModelFromUrdf(str(URDF))
@@ -89,8 +82,8 @@ def draw(n: int, rng: np.random.Generator, size: tuple[float, float]) -> Problem
     return Problems(
         q, v, q_hat, v_hat,
         goal=((q_hat - q) / PERIOD - v + v_hat - v) / (2 * SIGMA),
-        lower=-upper_acceleration(q - low, -v, speed) / ACCELERATION,
-        upper=upper_acceleration(high - q, v, speed) / ACCELERATION,
+        lower=-upper_acceleration(q - low, -v, speed, ACCELERATION, ACCELERATION, PERIOD) / ACCELERATION,
+        upper=upper_acceleration(high - q, v, speed, ACCELERATION, ACCELERATION, PERIOD) / ACCELERATION,
         rows=mass * ACCELERATION / effort[:, None],
         row_lower=-1 - nle / effort,
         row_upper=1 - nle / effort,

@@ -15,18 +15,10 @@ import proxsuite
 import quadprog
 from scipy import sparse
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from bounds import upper_acceleration  # noqa: E402
+
 ROBOTS = Path(__file__).resolve().parents[2] / "examples" / "robots"
-
-
-def upper_acceleration(d, v, speed, most, braking, dt):
-    """Largest acceleration towards a limit at distance d after which `braking` still stops before it; one semi-implicit Euler step."""
-    inside = (d - dt * v) / dt**2
-    w = v - braking * dt / 2
-    b, c = 2 * w * dt + 2 * braking * dt**2, w**2 - 2 * braking * (d - dt * v)
-    with np.errstate(invalid="ignore"):
-        root = (-b + np.sqrt(b**2 - 4 * dt**2 * c)) / (2 * dt**2)
-    stopping = np.where(np.isnan(root), -w / dt, np.fmax(root, -w / dt))
-    return np.min([most, (speed - v) / dt, inside, stopping], axis=0)
 
 
 class Robot:
