@@ -24,6 +24,37 @@ const SUSPICION: Duration = Duration::from_millis(250);
 /// Time for a server to take one of this client's requests, so that there is room for the next.
 const ROOM: Duration = Duration::from_secs(10);
 
+/// Looking for something again and again, at first often.
+struct Waiting {
+    start: Instant,
+    suspicion: Duration,
+    nap: Duration,
+}
+
+impl Waiting {
+    fn new() -> Waiting {
+        Waiting { start: Instant::now(), suspicion: SUSPICION, nap: NAP.0 }
+    }
+
+    fn silent(&self) -> Duration {
+        self.start.elapsed()
+    }
+
+    /// True once in [`SUSPICION`].
+    fn is_suspicious(&mut self) -> bool {
+        let due = self.silent() >= self.suspicion;
+        if due {
+            self.suspicion += SUSPICION;
+        }
+        due
+    }
+
+    fn nap(&mut self) {
+        std::thread::sleep(self.nap);
+        self.nap = NAP.1.min(2 * self.nap);
+    }
+}
+
 /// Asks a rollout server of this machine. Requests may overlap, two at a time.
 pub struct RolloutClient {
     port: Client<Ipc, Envelope, (), [f64], ReplyMessage>,
@@ -114,27 +145,24 @@ impl RolloutClient {
     fn send(&self, bytes: &[u8], request: u64) -> Result<Rollouts, RequestError> {
         let envelope =
             Envelope::new(bytes).ok_or(RequestError::TooLong { bytes: bytes.len(), limit: MAX_REQUEST })?;
-        let start = Instant::now();
-        let (mut suspicion, mut nap) = (SUSPICION, NAP.0);
+        let mut waiting = Waiting::new();
         loop {
             if let Some(pending) = self.deliver(envelope)? {
                 let (bus, client) = (Arc::clone(&self.bus), service::client_number(self.port.id().value()));
                 let pending = Some(pending);
                 return Ok(Rollouts { pending, bus, client, request, chunks: 0, steps: 0, cancelled: false });
             }
-            if start.elapsed() >= suspicion {
-                suspicion += SUSPICION;
+            if waiting.is_suspicious() {
                 self.bus.node().try_cleanup_dead_nodes();
             }
             let name = || self.bus.name().clone();
             if self.factory.dynamic_config().number_of_servers() == 0 {
                 return Err(RequestError::NoServer(name()));
             }
-            if start.elapsed() >= ROOM {
+            if waiting.silent() >= ROOM {
                 return Err(RequestError::Behind { name: name(), seconds: ROOM.as_secs_f64() });
             }
-            std::thread::sleep(nap);
-            nap = NAP.1.min(2 * nap);
+            waiting.nap();
         }
     }
 
@@ -200,8 +228,7 @@ impl Rollouts {
     }
 
     fn wait(&mut self, pending: &Pending, patience: Duration) -> Result<Option<Chunk>, RequestError> {
-        let start = Instant::now();
-        let (mut suspicion, mut nap) = (SUSPICION, NAP.0);
+        let mut waiting = Waiting::new();
         loop {
             if let Some((reply, numbers)) = self.receive(pending)? {
                 match self.read(&reply, numbers)? {
@@ -209,21 +236,18 @@ impl Rollouts {
                     None => continue,
                 }
             }
-            let silent = start.elapsed();
-            if silent >= patience {
+            if waiting.silent() >= patience {
                 let name = self.bus.name().clone();
                 return Err(RequestError::Silent { name, seconds: patience.as_secs_f64() });
             }
-            if silent >= suspicion {
-                suspicion += SUSPICION;
+            if waiting.is_suspicious() {
                 self.bus.node().try_cleanup_dead_nodes();
                 // Its last reply may have come between the look into the buffer and here.
                 if !pending.is_connected() && !pending.has_response() {
                     return Err(RequestError::ServerGone(self.bus.name().clone()));
                 }
             }
-            std::thread::sleep(nap);
-            nap = NAP.1.min(2 * nap);
+            waiting.nap();
         }
     }
 
