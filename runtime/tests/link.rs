@@ -60,13 +60,31 @@ fn names_do_not_meet() {
 }
 
 #[test]
+fn what_hangs_in_its_creation_is_cleared_away() {
+    use std::os::unix::fs::PermissionsExt;
+    let name = Name::new("hangs");
+    let user = std::fs::metadata("/proc/self").map(|m| std::os::unix::fs::MetadataExt::uid(&m)).unwrap();
+    let services = std::env::temp_dir().join(format!("nearl-{user}/{}/services", name.0));
+    let listed = || std::fs::read_dir(&services).unwrap().map(|f| f.unwrap().path()).collect::<Vec<_>>();
+    let link = RuntimeLink::open(&name.0).unwrap();
+    let files = listed();
+    drop(link);
+    assert!(files.len() >= 5 && listed().is_empty(), "{files:?}");
+    // As a process leaves it that is killed between creating a service and finishing its description.
+    std::fs::write(&files[0], "").unwrap();
+    std::fs::set_permissions(&files[0], PermissionsExt::from_mode(0o600)).unwrap();
+    RuntimeLink::open(&name.0).unwrap();
+}
+
+#[test]
 fn late_subscribers_still_get_the_last_snapshot() {
     let name = Name::new("late");
     let mut trainer = TrainerLink::open(&name.0).unwrap();
     trainer.push(7, b"weights").unwrap();
     let mut runtime = RuntimeLink::open(&name.0).unwrap();
+    let mut reader = runtime.take_snapshots().unwrap();
     trainer.attend();
-    let snapshot = runtime.newest_snapshot().unwrap();
+    let snapshot = reader.next().unwrap();
     assert_eq!((snapshot.header.version, snapshot.bytes.as_slice()), (7, &b"weights"[..]));
 }
 

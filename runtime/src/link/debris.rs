@@ -2,12 +2,14 @@
 //!
 //! iceoryx2 0.10 finds dead processes by the monitor file of their node, and reads where the node keeps its files from its
 //! details. The details come first and go first, so one killed in between leaves a node without a monitor or without details,
-//! which no clean-up finds or finishes.
+//! which no clean-up finds or finishes. One killed while it created a service leaves its description unfinished; whoever comes
+//! later waits for it in vain.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fs::{read_dir, remove_dir_all, remove_file};
-use std::path::Path;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::RobotName;
@@ -34,6 +36,28 @@ fn sweep_folder(nodes: &Path, prefix: &str) {
         let _ = remove_dir_all(nodes.join(node.to_string()));
         for file in MONITOR {
             let _ = remove_file(nodes.join(format!("{prefix}{node}{file}")));
+        }
+    }
+}
+
+/// Descriptions of services that are not finished: they become readable only, to the owner, when they are.
+pub(super) struct Unfinished(BTreeSet<(PathBuf, u64)>);
+
+impl Unfinished {
+    pub(super) fn of(name: &RobotName) -> Unfinished {
+        let files = read_dir(name.folder().join("services")).into_iter().flatten().flatten();
+        let half = files.filter_map(|f| {
+            let meta = f.metadata().ok()?;
+            (meta.is_file() && meta.mode() & 0o777 == 0o600).then(|| (f.path(), meta.ino()))
+        });
+        Unfinished(half.collect())
+    }
+
+    /// Removes those that still are: finishing takes milliseconds, so this is to be called seconds later.
+    pub(super) fn remove(&self, name: &RobotName) {
+        for (file, _) in self.0.intersection(&Unfinished::of(name).0) {
+            // Another process may be faster.
+            let _ = remove_file(file);
         }
     }
 }

@@ -34,7 +34,7 @@ pub(crate) use memory::{check as check_memory, free as free_memory};
 pub use messages::*;
 pub use name::RobotName;
 pub use plant::{PlantLink, Robot};
-pub use port::{Sequence, SnapshotBytes};
+pub use port::{Sequence, SnapshotBytes, SnapshotReader};
 pub use remains::{Remains, remains};
 pub use runner::{Pace, Plant, PlantReport, PlantRunner, PlantSettings};
 pub use runtime::RuntimeLink;

@@ -146,19 +146,24 @@ impl BytesOutbox {
 }
 
 /// Receiving end of the snapshot topic.
-pub(crate) struct BytesInbox {
+pub struct SnapshotReader {
     port: Subscriber<Ipc, [u8], SnapshotHeader>,
-    pub(crate) refused: u64,
+    refused: u64,
 }
 
-impl BytesInbox {
-    pub(crate) fn new(port: Subscriber<Ipc, [u8], SnapshotHeader>) -> BytesInbox {
-        BytesInbox { port, refused: 0 }
+impl SnapshotReader {
+    pub(crate) fn new(port: Subscriber<Ipc, [u8], SnapshotHeader>) -> SnapshotReader {
+        SnapshotReader { port, refused: 0 }
     }
 
-    /// The newest snapshot not yet read.
-    pub(crate) fn newest(&mut self) -> Option<SnapshotBytes> {
-        let mut newest = None;
+    /// Snapshots whose header did not fit their bytes.
+    pub fn refused(&self) -> u64 {
+        self.refused
+    }
+
+    /// The next snapshot. Copies it, which takes a millisecond for a few megabytes.
+    #[allow(clippy::should_implement_trait)]
+    pub fn next(&mut self) -> Option<SnapshotBytes> {
         while let Ok(Some(sample)) = self.port.receive() {
             let header = *sample.user_header();
             if header.header.schema != SnapshotHeader::SCHEMA
@@ -167,8 +172,8 @@ impl BytesInbox {
                 self.refused += 1;
                 continue;
             }
-            newest = Some(SnapshotBytes { header, bytes: sample.payload().to_vec() });
+            return Some(SnapshotBytes { header, bytes: sample.payload().to_vec() });
         }
-        newest
+        None
     }
 }

@@ -46,13 +46,15 @@ pub struct PlantSettings {
     pub watchdog: f64,
     /// Ticks until the plant stops by itself.
     pub ticks: Option<u64>,
+    /// SCHED_FIFO priority, if the system allows it; it polls without a pause in lockstep, which needs none.
+    pub priority: Option<i32>,
 }
 
 impl PlantSettings {
     /// Real time with a deadline of 0.6 periods and a watchdog of 5 periods, but at least 20 ms.
     pub fn real_time(dt: f64) -> PlantSettings {
         let watchdog = (5.0 * dt).max(0.02);
-        PlantSettings { dt, pace: Pace::RealTime, deadline: 0.6, watchdog, ticks: None }
+        PlantSettings { dt, pace: Pace::RealTime, deadline: 0.6, watchdog, ticks: None, priority: None }
     }
 
     /// Real time for a simulator, whose time may stretch: rather than holding an old action it waits up to 15 ms (at
@@ -134,7 +136,7 @@ impl PlantRunner {
 
     /// Runs until `stop`, or for the number of ticks of the settings.
     pub fn run(mut self, plant: &mut impl Plant, stop: &Stop) -> PlantReport {
-        crate::rt::thread::be_prompt();
+        crate::rt::thread::be_prompt(self.settings.priority);
         let period = clock::nanoseconds(self.settings.dt);
         let mut grid = Grid::new(clock::now() + period, period);
         while !stop.is_requested() && self.settings.ticks.is_none_or(|n| self.report.ticks < n) {

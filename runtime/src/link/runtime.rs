@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::owner::Owner;
-use super::port::{BytesInbox, Inbox, Outbox};
+use super::port::{Inbox, Outbox, SnapshotReader};
 use super::service::Bus;
 use super::*;
 
@@ -11,7 +11,7 @@ use super::*;
 pub struct RuntimeLink {
     state: Inbox<StateMessage>,
     robot: Inbox<RobotMessage>,
-    snapshot: BytesInbox,
+    snapshots: Option<SnapshotReader>,
     action: Outbox<ActionMessage>,
     transition: Outbox<TransitionMessage>,
     receipt: Outbox<ReceiptMessage>,
@@ -32,7 +32,7 @@ impl RuntimeLink {
             health: bus.outbox()?,
             state: bus.inbox()?,
             robot: bus.inbox()?,
-            snapshot: bus.bytes_inbox()?,
+            snapshots: Some(bus.bytes_inbox()?),
             bus,
             _owner: owner,
         };
@@ -71,14 +71,9 @@ impl RuntimeLink {
         (self.state.sequence.lost, self.state.refused)
     }
 
-    /// The newest snapshot not yet read.
-    pub fn newest_snapshot(&mut self) -> Option<SnapshotBytes> {
-        self.snapshot.newest()
-    }
-
-    /// Snapshots whose header did not fit their bytes.
-    pub fn refused_snapshots(&self) -> u64 {
-        self.snapshot.refused
+    /// The snapshots, for a thread of its own; `None` if they were taken before.
+    pub fn take_snapshots(&mut self) -> Option<SnapshotReader> {
+        self.snapshots.take()
     }
 
     /// Sends the action of a tick.

@@ -17,7 +17,7 @@ use iceoryx2::service::builder::publish_subscribe::{
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::owner::Owner;
-use super::port::{BytesInbox, BytesOutbox, Inbox, Outbox};
+use super::port::{BytesOutbox, Inbox, Outbox, SnapshotReader};
 use super::schema::Message;
 use super::{LinkError, RobotName, SnapshotHeader, debris, memory};
 use crate::rt::clock;
@@ -90,7 +90,7 @@ impl Bus {
                 .max_subscribers(M::SUBSCRIBERS)
                 .open_or_create()
         };
-        retry(build, is_passing).map_err(|e| self.open_error(M::TOPIC, &e))
+        self.open(build, is_passing).map_err(|e| self.open_error(M::TOPIC, &e))
     }
 
     /// Takes a role of the robot; its owner publishes the role's topics.
@@ -125,7 +125,7 @@ impl Bus {
                 .max_subscribers(SnapshotHeader::SUBSCRIBERS)
                 .open_or_create()
         };
-        retry(build, is_passing).map_err(|e| self.open_error(SnapshotHeader::TOPIC, &e))
+        self.open(build, is_passing).map_err(|e| self.open_error(SnapshotHeader::TOPIC, &e))
     }
 
     /// A publisher of snapshots, for the trainer.
@@ -143,13 +143,29 @@ impl Bus {
     }
 
     /// A subscriber of snapshots.
-    pub(crate) fn bytes_inbox(&self) -> Result<BytesInbox, LinkError> {
+    pub(crate) fn bytes_inbox(&self) -> Result<SnapshotReader, LinkError> {
         let port = self
             .bytes()?
             .subscriber_builder()
             .create()
             .map_err(|e| self.subscriber_error(SnapshotHeader::TOPIC, e))?;
-        Ok(BytesInbox::new(port))
+        Ok(SnapshotReader::new(port))
+    }
+
+    /// Opens a service, or creates it. What hangs in its creation until the last attempt was left by a killed process.
+    pub(crate) fn open<T, E>(
+        &self,
+        mut attempt: impl FnMut() -> Result<T, E>,
+        is_passing: impl Fn(&E) -> bool,
+    ) -> Result<T, E> {
+        let unfinished = debris::Unfinished::of(&self.name);
+        retry(&mut attempt, &is_passing).or_else(|error| {
+            if !is_passing(&error) {
+                return Err(error);
+            }
+            unfinished.remove(&self.name);
+            attempt()
+        })
     }
 
     pub(crate) fn topic(&self, topic: &str) -> Result<ServiceName, LinkError> {
@@ -207,10 +223,7 @@ fn is_passing(error: &Failure) -> bool {
     )
 }
 
-pub(crate) fn retry<T, E>(
-    mut attempt: impl FnMut() -> Result<T, E>,
-    is_passing: impl Fn(&E) -> bool,
-) -> Result<T, E> {
+fn retry<T, E>(mut attempt: impl FnMut() -> Result<T, E>, is_passing: impl Fn(&E) -> bool) -> Result<T, E> {
     for wait in BACK_OFF {
         match attempt() {
             Err(error) if is_passing(&error) => std::thread::sleep(Duration::from_millis(wait)),

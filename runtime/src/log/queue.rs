@@ -256,7 +256,7 @@ fn write_all(
     mut snapshots: Consumer<Waiting>,
     shared: &Shared,
 ) -> LogSummary {
-    crate::rt::thread::be_last();
+    crate::rt::thread::be_patient();
     let mut summary = LogSummary::default();
     loop {
         let is_over = shared.over.load(Ordering::Acquire);

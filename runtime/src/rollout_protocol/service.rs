@@ -8,7 +8,7 @@ use iceoryx2::service::port_factory::request_response::PortFactory;
 
 use super::messages::{Envelope, ReplyMessage};
 use crate::link::LinkError;
-use crate::link::service::{Bus, Ipc, retry};
+use crate::link::service::{Bus, Ipc};
 
 /// Clients at once, over all processes.
 const CLIENTS: usize = 24;
@@ -41,7 +41,7 @@ pub(super) fn open(bus: &Bus) -> Result<Factory, LinkError> {
             .enable_fire_and_forget_requests(true)
             .open_or_create()
     };
-    retry(build, is_passing).map_err(|e| match e {
+    bus.open(build, is_passing).map_err(|e| match e {
         Failure::RequestResponseOpenError(
             Open::IncompatibleRequestOrResponseType | Open::VersionMismatch,
         ) => LinkError::Schema { name: bus.name().clone(), topic: "rollout" },

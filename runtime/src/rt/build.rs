@@ -37,7 +37,7 @@ impl<B: Build> Builder<B> {
         let (jobs, work) = sync_channel::<Job>(1);
         let (done, built) = sync_channel(2);
         let thread = std::thread::Builder::new().name("nearl-build".into()).spawn(move || {
-            thread::be_last();
+            thread::be_patient();
             for Job { id, snapshot, robot } in work {
                 let result = build_one(&mut build, &snapshot, &robot);
                 let SnapshotBytes { header, bytes } = snapshot;

@@ -39,7 +39,7 @@ pub enum Sync {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CycleSettings {
     pub(crate) core: CoreSettings,
-    /// So long before and after the moment a state is due, the thread polls instead of sleeping.
+    /// So long before a state is due, the thread wakes up to poll for it; 0 sleeps until it comes.
     pub(crate) spin: u64,
     /// Ticks until the loop stops by itself.
     pub(crate) ticks: Option<u64>,
@@ -145,13 +145,16 @@ impl<T: Tick> Cycle<T> {
         }
     }
 
-    /// Sleeps on the bell, but is awake around the moment the state is due: waking an idle core costs more than the
-    /// whole exchange.
+    /// Sleeps once, on the bell, and is awake when the state is due: waking an idle core costs more than the whole exchange. Only
+    /// when the state is late by more than a quarter of a period does it sleep again.
     fn wait_for_state(&mut self) {
-        let core = &self.settings.core;
+        let (core, spin) = (&self.settings.core, self.settings.spin);
         let last = clock::now() + core.age_limit;
         let expected = self.core.record.state.header.stamp + core.period;
-        let awake = expected.saturating_sub(self.settings.spin)..expected + self.settings.spin;
+        let awake = match spin {
+            0 => 0..0,
+            _ => expected.saturating_sub(spin)..expected + spin.max(core.period / 4),
+        };
         loop {
             let seen = self.ends.bell.seen();
             let now = clock::now();

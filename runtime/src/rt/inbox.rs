@@ -7,6 +7,7 @@ use crate::link::{
 use crate::log::LogQueue;
 use crate::rt::build::{Builder, Built};
 use crate::rt::core::Loaded;
+use crate::rt::receive::SnapshotReceiver;
 use crate::rt::residual::{Residual, RollbackSettings};
 use crate::rt::swap::Sender;
 use crate::rt::tick::{Build, Record, Tick};
@@ -16,6 +17,7 @@ const KEPT: usize = 32;
 
 /// The I/O thread's side of the hot swap.
 pub(crate) struct SnapshotInbox<B: Build> {
+    receiver: SnapshotReceiver,
     builder: Builder<B>,
     swap: Sender<Loaded<B::Controller>>,
     /// Built, not yet offered to the loop.
@@ -37,8 +39,7 @@ pub(crate) struct SnapshotInbox<B: Build> {
     pub(crate) accepted: Vec<(u64, u64)>,
     /// Sentences of refusals, the first ones.
     pub(crate) refusals: Vec<String>,
-    /// Snapshots refused.
-    pub(crate) refused: u64,
+    refused: u64,
     /// Snapshots taken back.
     pub(crate) rolled_back: u64,
 }
@@ -61,11 +62,13 @@ pub(crate) struct Desk<'a> {
 
 impl<B: Build> SnapshotInbox<B> {
     pub(crate) fn new(
+        receiver: SnapshotReceiver,
         builder: Builder<B>,
         swap: Sender<Loaded<B::Controller>>,
         rollback: RollbackSettings,
     ) -> SnapshotInbox<B> {
         SnapshotInbox {
+            receiver,
             builder,
             swap,
             ready: None,
@@ -83,6 +86,11 @@ impl<B: Build> SnapshotInbox<B> {
         }
     }
 
+    /// Snapshots refused so far, those with a header that did not fit included.
+    pub(crate) fn refused(&self) -> u64 {
+        self.refused + self.receiver.refused()
+    }
+
     /// Takes in a tick and the one before it.
     pub(crate) fn observe(&mut self, previous: &Record, record: &Record) {
         if let Some((before, after)) = self.residual.observe(previous, record) {
@@ -95,7 +103,7 @@ impl<B: Build> SnapshotInbox<B> {
     /// Moves every snapshot one stage on.
     pub(crate) fn pump(&mut self, desk: &mut Desk<'_>) {
         self.settle(desk);
-        if let Some(snapshot) = desk.link.newest_snapshot() {
+        while let Some(snapshot) = self.receiver.next() {
             self.receive(desk, snapshot);
         }
         if let Some(built) = self.builder.collect() {

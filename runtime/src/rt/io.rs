@@ -42,6 +42,8 @@ pub(crate) struct Io<B: Build> {
     pub(crate) explore: Option<u64>,
     pub(crate) period: u64,
     pub(crate) polls_always: bool,
+    /// That of the real-time thread.
+    pub(crate) priority: Option<i32>,
     pub(crate) health: Health,
     pub(crate) traffic: Traffic,
 }
@@ -64,7 +66,8 @@ pub(crate) struct Traffic {
 impl<B: Build> Io<B> {
     /// Runs until `over` is set and nothing is left to move; returns itself for the report.
     pub(crate) fn run(mut self, over: &AtomicBool) -> Io<B> {
-        crate::rt::thread::be_prompt();
+        // Who polls without a pause would take a core for itself at a real-time priority.
+        crate::rt::thread::be_prompt(self.priority.filter(|_| !self.polls_always));
         loop {
             let is_over = over.load(Ordering::Acquire);
             let moved = self.move_states() | self.move_actions() | self.move_records();
@@ -166,7 +169,7 @@ impl<B: Build> Io<B> {
             self.health.next = now + HEALTH;
             let mut message = self.health.message();
             message.refused_states = self.traffic.refused_states + self.link.state_counts().1;
-            message.refused_snapshots = self.snapshots.refused + self.link.refused_snapshots();
+            message.refused_snapshots = self.snapshots.refused();
             message.rolled_back = self.snapshots.rolled_back;
             message.log_drops = self.log.as_ref().map_or(0, LogQueue::dropped);
             self.link.send_health(&mut message);

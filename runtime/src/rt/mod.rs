@@ -1,9 +1,9 @@
-//! The real-time loop: one thread that computes, one that talks, one that builds, one that logs.
+//! The real-time loop: one thread that computes, one that talks, one that receives snapshots, one that builds, one that logs.
 //!
 //! ```text
 //! plant ──state──> I/O thread ──ring, bell──> real-time thread: wait, swap, sense, decide, act, send, account
 //!       <─action──            <──ring────────
-//! trainer ──snapshot──> I/O ──> builder ──> I/O ──slot──> real-time thread ──old controller──> I/O (dropped there)
+//! trainer ──snapshot──> receiver ──> I/O ──> builder ──> I/O ──slot──> real-time thread ──old controller──> I/O (dropped there)
 //! ```
 //!
 //! The pages to read are `core.rs`, a tick without threads and clocks, and `cycle.rs`, the thread around it. A run is [`run`]: a snapshot file on a plant by name.
@@ -20,6 +20,7 @@ mod inbox;
 mod io;
 mod mode;
 mod pilot;
+mod receive;
 mod report;
 mod residual;
 mod run;

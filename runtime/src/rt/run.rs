@@ -20,6 +20,7 @@ use crate::rt::inbox::SnapshotInbox;
 use crate::rt::io::{Health, Io, Traffic};
 use crate::rt::mode::ModeLimits;
 use crate::rt::pilot::{Pilot, PilotBuilder};
+use crate::rt::receive::SnapshotReceiver;
 use crate::rt::report::{PlantSummary, RunReport, percentiles};
 use crate::rt::residual::RollbackSettings;
 use crate::rt::thread::{CountAllocations, ThreadSettings, prepare};
@@ -39,7 +40,7 @@ pub struct RunSettings {
     pub rate: Option<f64>,
     /// Age at which a state is stale [s]; the default is 5 periods, at least 20 ms.
     pub age_limit: Option<f64>,
-    /// So long before and after a state is due, the real-time thread polls instead of sleeping [s].
+    /// So long before a state is due, the real-time thread wakes up to poll for it [s]; 0 sleeps until it comes.
     pub spin: f64,
     /// Seconds of ticks until the loop stops by itself, if `ticks` is not given.
     pub seconds: Option<f64>,
@@ -127,6 +128,9 @@ pub enum RunError {
         /// Of snapshot and plant [Hz].
         own: f64,
     },
+    /// Somebody took the link's snapshots.
+    #[error("the snapshots of `{0}` were taken from its link: open another RuntimeLink for the loop")]
+    NoSnapshots(RobotName),
     /// Strict mode.
     #[error("--strict: {0}")]
     Strict(String),
@@ -211,17 +215,19 @@ pub fn run_loop<B: Build>(
 
 /// Every ring and every thread's half of it.
 fn assemble<B: Build>(
-    link: RuntimeLink,
+    mut link: RuntimeLink,
     robot: RobotMessage,
     first: B::Controller,
     build: B,
     settings: &RunSettings,
     stop: &Stop,
 ) -> Result<(Cycle<B::Controller>, Io<B>), RunError> {
+    let Some(reader) = link.take_snapshots() else { return Err(RunError::NoSnapshots(link.name().clone())) };
     let cycle_settings = cycle_settings(&robot, settings);
     let log = open_log(&robot, first.version(), &cycle_settings.core, settings)?;
     let thread_error = |name| move |e: std::io::Error| RunError::Thread { name, reason: e.to_string() };
     let builder = Builder::start(build).map_err(thread_error("nearl-build"))?;
+    let receiver = SnapshotReceiver::start(reader).map_err(thread_error("nearl-receive"))?;
     let (states_in, states) = RingBuffer::new(8);
     let (actions, actions_out) = RingBuffer::new(8);
     let (records, records_out) = RingBuffer::new(RECORDS);
@@ -235,12 +241,13 @@ fn assemble<B: Build>(
         link,
         period: clock::nanoseconds(robot.dt),
         polls_always: robot.is_lockstep() || settings.sync == Sync::Clock,
+        priority: settings.thread.priority,
         robot,
         states: states_in,
         actions: actions_out,
         records: records_out,
         bell,
-        snapshots: SnapshotInbox::new(builder, swap, settings.rollback),
+        snapshots: SnapshotInbox::new(receiver, builder, swap, settings.rollback),
         log,
         explore: settings.explore,
         health,
@@ -333,6 +340,7 @@ fn report<B: Build>(
     let seconds = (clock::now() - begin) as f64 * 1e-9;
     let log = io.log.take().map_or_else(LogSummary::default, LogQueue::finish);
     let counters = end.last.counters;
+    let refused_snapshots = io.snapshots.refused();
     let mode_count = |mode: Mode| (mode.name(), counters.mode_ticks[mode.code() as usize]);
     RunReport {
         robot: robot_name,
@@ -348,7 +356,7 @@ fn report<B: Build>(
         wake: percentiles(&end.wake),
         compute: percentiles(&end.compute),
         versions: std::iter::once((0, version)).chain(io.snapshots.accepted).collect(),
-        refused_snapshots: io.snapshots.refused,
+        refused_snapshots,
         refusals: io.snapshots.refusals,
         log_drops: log.dropped,
         log_error: log.error,

@@ -70,9 +70,13 @@ pub fn prepare(settings: &ThreadSettings) -> Vec<String> {
     results.into_iter().flatten().filter_map(Result::err).collect()
 }
 
-/// For the threads that exchange messages in each tick: exact timers, and ahead of ordinary work if that is allowed.
-pub(crate) fn be_prompt() {
+/// For the threads that exchange messages in each tick: exact timers, and ahead of ordinary work if that is allowed. They yield
+/// while they poll, so at the `priority` of the real-time thread each of them gets its turn even on a single core.
+pub(crate) fn be_prompt(priority: Option<i32>) {
     let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(1));
+    if priority.is_some_and(|p| be_first(p).is_ok()) {
+        return;
+    }
     // SAFETY: plain call; on Linux it changes the calling thread only. Without the right it changes nothing.
     unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, -15) };
 }
@@ -88,9 +92,20 @@ fn lock_memory() -> Result<(), String> {
             limit / 1024
         ));
     }
+    keep_memory();
     let all = rustix::mm::MlockAllFlags::CURRENT | rustix::mm::MlockAllFlags::FUTURE;
     rustix::mm::mlockall(all)
         .map_err(|e| format!("memory is not locked ({e}): raise the limit with `ulimit -l unlimited`"))
+}
+
+/// Lets the allocator keep what it was given. Each return to the system, and each large allocation of its own mapping, takes the
+/// lock of the process's memory map, and waiting for it can cost a prompt thread many periods.
+fn keep_memory() {
+    #[cfg(target_env = "gnu")]
+    for (parameter, value) in [(libc::M_MMAP_MAX, 0), (libc::M_TRIM_THRESHOLD, libc::c_int::MAX)] {
+        // SAFETY: plain calls that set a number each.
+        unsafe { libc::mallopt(parameter, value) };
+    }
 }
 
 fn stay_on(cpu: usize) -> Result<(), String> {
@@ -117,13 +132,14 @@ fn be_first(priority: i32) -> Result<(), String> {
     ))
 }
 
-/// Lets the builder of controllers run only when nothing else wants the core.
-pub(crate) fn be_last() {
+/// Lets the builder of controllers step back behind the loop. Not to the very end: a thread that is starved while it holds a
+/// lock of the process (the allocator's, that of the memory map) holds up the others.
+pub(crate) fn be_patient() {
     let parameters = libc::sched_param { sched_priority: 0 };
     // SAFETY: as above. A refusal only means the normal scheduler.
     unsafe { libc::sched_setscheduler(0, libc::SCHED_BATCH, &parameters) };
     // SAFETY: on Linux the call changes the calling thread only.
-    unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, 19) };
+    unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, 5) };
 }
 
 /// Touches 256 kB of stack so that no tick meets a page fault there.

@@ -22,6 +22,9 @@ pub(super) struct PlantCommand {
     /// Wait for the action of every state instead of keeping real time.
     #[arg(long)]
     lockstep: bool,
+    /// SCHED_FIFO priority, 1 to 99, if the system allows it; best that of the runtime.
+    #[arg(long, value_parser = clap::value_parser!(i32).range(1..=99), conflicts_with = "lockstep")]
+    priority: Option<i32>,
     /// Let the robot go on instead of starting episodes anew.
     #[arg(long)]
     endless: bool,
@@ -50,6 +53,7 @@ impl PlantCommand {
         let link = PlantLink::open(&name, &plant.robot(self.lockstep))?;
         let mut settings =
             if self.lockstep { PlantSettings::lockstep(dt) } else { PlantSettings::simulator(dt) };
+        settings.priority = self.priority;
         settings.ticks = self.seconds.map(|s| (s / dt).round() as u64);
         let stop = Stop::on_signals()?;
         if !self.json {

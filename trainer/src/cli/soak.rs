@@ -47,7 +47,7 @@ pub(super) struct Soak {
     /// Another program that measures itself under the same load afterwards and prints JSON, for example a loop in Python.
     #[arg(long)]
     beside: Option<String>,
-    /// SCHED_FIFO priority; 0 keeps the normal scheduler.
+    /// SCHED_FIFO priority of loop, plant and empty loop; 0 keeps the normal scheduler.
     #[arg(long, default_value_t = 40)]
     priority: i32,
     /// Core of the loop.
@@ -163,7 +163,7 @@ impl Soak {
         std::fs::write(&task, snapshot.manifest.task.to_toml())?;
         let log = self.out.join("soak.mcap");
         let _ = std::fs::remove_file(&log);
-        let plant = PlantProcess::start(&task, &name)?;
+        let plant = PlantProcess::start(&task, &name, self.priority)?;
         let over = Stop::new();
         let thread = ThreadSettings {
             priority: (self.priority > 0).then_some(self.priority),

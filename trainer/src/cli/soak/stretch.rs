@@ -135,9 +135,12 @@ pub(super) fn opposite(snapshot: &Snapshot) -> Snapshot {
 pub(super) struct PlantProcess(Option<Child>);
 
 impl PlantProcess {
-    pub(super) fn start(task: &Path, name: &RobotName) -> Result<PlantProcess, Failure> {
+    pub(super) fn start(task: &Path, name: &RobotName, priority: i32) -> Result<PlantProcess, Failure> {
         let mut command = Command::new(std::env::current_exe()?);
         command.arg("plant").arg(task).args(["--name", name.as_str(), "--endless", "--json"]);
+        if priority > 0 {
+            command.args(["--priority", &priority.to_string()]);
+        }
         Ok(PlantProcess(Some(command.stdout(Stdio::piped()).spawn()?)))
     }
 
