@@ -1,8 +1,13 @@
 //! Building controllers from snapshot bytes on a thread of its own, one at a time; only the newest bytes are kept.
+//!
+//! Between this thread and the I/O thread lie rings that neither side ever waits in. A channel's receiver spins while a sender is
+//! in the middle of a send: at a real-time priority it may keep the very core that the sender needs to go on.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
+use std::time::Duration;
+
+use rtrb::{Consumer, Producer, RingBuffer};
 
 use crate::link::{RobotMessage, SnapshotBytes, SnapshotHeader, Verdict};
 use crate::rt::thread;
@@ -19,12 +24,20 @@ pub(crate) struct Built<T> {
 
 /// The thread that builds, seen from the I/O thread. No call blocks.
 pub(crate) struct Builder<B: Build> {
-    jobs: Option<SyncSender<Job>>,
-    built: Receiver<Built<B::Controller>>,
+    /// `None` once the thread is to end.
+    jobs: Option<Producer<Job>>,
+    built: Consumer<Built<B::Controller>>,
+    /// What is no longer needed: freeing megabytes may wait for the allocator, so it is done where they came from.
+    scrap: Producer<Box<dyn Send>>,
     thread: Option<JoinHandle<()>>,
     waiting: Option<Job>,
     busy: bool,
 }
+
+/// Things that may wait to be dropped.
+const SCRAP: usize = 16;
+/// Time between two looks for a job.
+const NAP: Duration = Duration::from_millis(1);
 
 struct Job {
     id: u64,
@@ -34,19 +47,29 @@ struct Job {
 
 impl<B: Build> Builder<B> {
     pub(crate) fn start(mut build: B) -> std::io::Result<Builder<B>> {
-        let (jobs, work) = sync_channel::<Job>(1);
-        let (done, built) = sync_channel(2);
+        let (jobs, mut work) = RingBuffer::<Job>::new(1);
+        let (mut done, built) = RingBuffer::new(1);
+        let (scrap, mut scraps) = RingBuffer::<Box<dyn Send>>::new(SCRAP);
         let thread = std::thread::Builder::new().name("nearl-build".into()).spawn(move || {
             thread::be_patient();
-            for Job { id, snapshot, robot } in work {
+            loop {
+                while let Ok(scrap) = scraps.pop() {
+                    drop(scrap);
+                }
+                let Ok(Job { id, snapshot, robot }) = work.pop() else {
+                    if work.is_abandoned() {
+                        return;
+                    }
+                    std::thread::sleep(NAP);
+                    continue;
+                };
                 let result = build_one(&mut build, &snapshot, &robot);
                 let SnapshotBytes { header, bytes } = snapshot;
-                if done.send(Built { id, header, bytes, result }).is_err() {
-                    return;
-                }
+                // There is room: the next job is only given once this one was collected.
+                let _ = done.push(Built { id, header, bytes, result });
             }
         })?;
-        Ok(Builder { jobs: Some(jobs), built, thread: Some(thread), waiting: None, busy: false })
+        Ok(Builder { jobs: Some(jobs), built, scrap, thread: Some(thread), waiting: None, busy: false })
     }
 
     /// Takes a job; returns the header of the one it replaces, which is then never built.
@@ -61,24 +84,25 @@ impl<B: Build> Builder<B> {
         replaced
     }
 
+    /// Has `scrap` dropped on the builder's thread, or here if too much waits for that.
+    pub(crate) fn discard(&mut self, scrap: Box<dyn Send>) {
+        let _ = self.scrap.push(scrap);
+    }
+
     /// The finished job, if there is one.
     pub(crate) fn collect(&mut self) -> Option<Built<B::Controller>> {
-        match self.built.try_recv() {
-            Ok(built) => {
-                self.busy = false;
-                self.feed();
-                Some(built)
-            }
-            Err(TryRecvError::Empty | TryRecvError::Disconnected) => None,
-        }
+        let built = self.built.pop().ok()?;
+        self.busy = false;
+        self.feed();
+        Some(built)
     }
 
     fn feed(&mut self) {
         if self.busy {
             return;
         }
-        if let (Some(job), Some(jobs)) = (self.waiting.take(), &self.jobs) {
-            self.busy = jobs.try_send(job).is_ok();
+        if let (Some(job), Some(jobs)) = (self.waiting.take(), &mut self.jobs) {
+            self.busy = jobs.push(job).is_ok();
         }
     }
 }
@@ -86,8 +110,6 @@ impl<B: Build> Builder<B> {
 impl<B: Build> Drop for Builder<B> {
     fn drop(&mut self) {
         self.jobs = None;
-        // A result nobody collects is received here, so that the thread is never stuck in its send.
-        while self.built.recv().is_ok() {}
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }

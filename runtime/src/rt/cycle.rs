@@ -66,6 +66,8 @@ pub(crate) struct Cycle<T: Tick> {
     fresh: Option<StateMessage>,
     action: ActionMessage,
     stopping: u64,
+    /// Sleeps for a state that was late.
+    late_waits: u64,
     dropped: (u64, u64),
     pub(crate) wake: Histogram<u64>,
     pub(crate) compute: Histogram<u64>,
@@ -94,6 +96,7 @@ impl<T: Tick> Cycle<T> {
             fresh: None,
             action: ActionMessage::zeroed(),
             stopping: 0,
+            late_waits: 0,
             dropped: (0, 0),
             wake: histogram(),
             compute: histogram(),
@@ -107,7 +110,7 @@ impl<T: Tick> Cycle<T> {
     pub(crate) fn run(mut self) -> CycleEnd<T> {
         self.core.start(clock::now());
         let count = self.settings.allocations;
-        let mut usage = Usage::of_this_thread(count);
+        let (mut usage, mut late_waits) = (Usage::of_this_thread(count), 0);
         while !self.is_over() {
             self.wait();
             self.swap();
@@ -115,10 +118,11 @@ impl<T: Tick> Cycle<T> {
             self.send();
             self.account();
             if self.core.record.tick == WARM {
-                usage = Usage::of_this_thread(count);
+                (usage, late_waits) = (Usage::of_this_thread(count), self.late_waits);
             }
         }
-        let usage = Usage::of_this_thread(count).since(usage);
+        let mut usage = Usage::of_this_thread(count).since(usage);
+        usage.late_waits = self.late_waits - late_waits;
         let Cycle { wake, compute, core, ends, .. } = self;
         CycleEnd { last: core.record, wake, compute, usage, _rest: (core, ends) }
     }
@@ -166,6 +170,7 @@ impl<T: Tick> Cycle<T> {
             } else if now < awake.start {
                 self.ends.bell.wait(seen, awake.start.min(last));
             } else {
+                self.late_waits += u64::from(spin > 0);
                 self.ends.bell.wait(seen, last);
             }
         }

@@ -133,12 +133,14 @@ impl<B: Build> SnapshotInbox<B> {
             Ok(controller) => *controller,
             Err(refusal) => return self.refuse(desk.link, &built.header, refusal.verdict, &refusal.text),
         };
-        if let Some(log) = desk.log {
-            log.push_snapshot(built.id, controller.version(), built.bytes);
+        match desk.log {
+            Some(log) => log.push_snapshot(built.id, controller.version(), built.bytes),
+            None => self.builder.discard(Box::new(built.bytes)),
         }
         let loaded = Box::new(Loaded { id: built.id, controller });
-        if let Some((header, _)) = self.ready.replace((built.header, loaded)) {
+        if let Some((header, loaded)) = self.ready.replace((built.header, loaded)) {
             supersede(desk.link, &header);
+            self.builder.discard(loaded);
         }
     }
 
@@ -163,13 +165,14 @@ impl<B: Build> SnapshotInbox<B> {
         }
     }
 
-    /// The old controller came back: the new one is in use. The one before the old is dropped here.
+    /// The old controller came back: the new one is in use. The one before the old is no longer needed.
     fn settle(&mut self, desk: &mut Desk<'_>) {
         let Some(old) = self.swap.collect() else { return };
-        let Some(Offer { header, version }) = self.offered.take() else { return };
+        let Some(Offer { header, version }) = self.offered.take() else { return self.builder.discard(old) };
         self.accepted.push((desk.tick, version));
         let condemned = self.condemned.take();
         let Some(header) = header else {
+            self.builder.discard(old);
             if let (Some(bad), Some(text)) = (self.current.take(), condemned) {
                 self.rolled_back += 1;
                 self.note(&text);
@@ -178,8 +181,9 @@ impl<B: Build> SnapshotInbox<B> {
             return;
         };
         // What was condemned is nothing to go back to.
-        if condemned.is_none() {
-            self.previous = Some(old);
+        let scrap = if condemned.is_none() { self.previous.replace(old) } else { Some(old) };
+        if let Some(scrap) = scrap {
+            self.builder.discard(scrap);
         }
         self.current = Some(header);
         reply(desk.link, &header, desk.tick, Verdict::Accepted, "in use");

@@ -3,7 +3,7 @@
 //! ```text
 //! plant ──state──> I/O thread ──ring, bell──> real-time thread: wait, swap, sense, decide, act, send, account
 //!       <─action──            <──ring────────
-//! trainer ──snapshot──> receiver ──> I/O ──> builder ──> I/O ──slot──> real-time thread ──old controller──> I/O (dropped there)
+//! trainer ──snapshot──> receiver ──> I/O ──> builder ──> I/O ──slot──> real-time thread ──old controller──> I/O ──> builder (dropped there)
 //! ```
 //!
 //! The pages to read are `core.rs`, a tick without threads and clocks, and `cycle.rs`, the thread around it. A run is [`run`]: a snapshot file on a plant by name.

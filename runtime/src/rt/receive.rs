@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
+
+use rtrb::{Consumer, Producer, PushError, RingBuffer};
 
 use crate::link::{SnapshotBytes, SnapshotReader};
 use crate::rt::thread;
@@ -16,7 +17,7 @@ const NAP: Duration = Duration::from_millis(2);
 
 /// The thread, seen from the I/O thread. No call blocks.
 pub(crate) struct SnapshotReceiver {
-    snapshots: Option<Receiver<SnapshotBytes>>,
+    snapshots: Consumer<SnapshotBytes>,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
@@ -29,18 +30,18 @@ struct Shared {
 
 impl SnapshotReceiver {
     pub(crate) fn start(reader: SnapshotReader) -> std::io::Result<SnapshotReceiver> {
-        let (deliver, snapshots) = sync_channel(WAITING);
+        let (deliver, snapshots) = RingBuffer::new(WAITING);
         let shared = Arc::new(Shared::default());
         let seen = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
             .name("nearl-receive".into())
-            .spawn(move || receive(reader, &deliver, &seen))?;
-        Ok(SnapshotReceiver { snapshots: Some(snapshots), shared, thread: Some(thread) })
+            .spawn(move || receive(reader, deliver, &seen))?;
+        Ok(SnapshotReceiver { snapshots, shared, thread: Some(thread) })
     }
 
     /// The next snapshot that came.
-    pub(crate) fn next(&self) -> Option<SnapshotBytes> {
-        self.snapshots.as_ref().and_then(|s| s.try_recv().ok())
+    pub(crate) fn next(&mut self) -> Option<SnapshotBytes> {
+        self.snapshots.pop().ok()
     }
 
     /// Snapshots whose header did not fit their bytes.
@@ -52,25 +53,25 @@ impl SnapshotReceiver {
 impl Drop for SnapshotReceiver {
     fn drop(&mut self) {
         self.shared.over.store(true, Ordering::Release);
-        // Ends a delivery that nobody collects.
-        self.snapshots = None;
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
     }
 }
 
-fn receive(mut reader: SnapshotReader, deliver: &SyncSender<SnapshotBytes>, shared: &Shared) {
+fn receive(mut reader: SnapshotReader, mut deliver: Producer<SnapshotBytes>, shared: &Shared) {
     thread::be_patient();
+    let mut waiting = None;
     while !shared.over.load(Ordering::Acquire) {
-        match reader.next() {
-            Some(snapshot) => {
-                if deliver.send(snapshot).is_err() {
-                    return;
-                }
+        waiting = waiting.or_else(|| reader.next());
+        shared.refused.store(reader.refused(), Ordering::Relaxed);
+        match waiting.take().map(|snapshot| deliver.push(snapshot)) {
+            Some(Ok(())) => {}
+            Some(Err(PushError::Full(snapshot))) => {
+                waiting = Some(snapshot);
+                std::thread::sleep(NAP);
             }
             None => std::thread::sleep(NAP),
         }
-        shared.refused.store(reader.refused(), Ordering::Relaxed);
     }
 }

@@ -140,10 +140,11 @@ impl fmt::Display for RunReport {
         let u = &self.usage;
         writeln!(
             f,
-            "  system           page faults {} + {}, context switches {} asked for, {} forced{}",
+            "  system           page faults {} + {}, context switches {} asked for ({} for late states), {} forced{}",
             u.minor_faults,
             u.major_faults,
             u.voluntary_switches,
+            u.late_waits,
             u.involuntary_switches,
             u.allocations.map_or(String::new(), |n| format!(", {n} allocations"))
         )?;

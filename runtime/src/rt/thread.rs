@@ -23,6 +23,8 @@ pub struct Usage {
     pub major_faults: u64,
     /// Context switches because the thread waited.
     pub voluntary_switches: u64,
+    /// Those among them for a state that was late: once a tick the real-time thread sleeps for its state.
+    pub late_waits: u64,
     /// Context switches because another thread was given the core.
     pub involuntary_switches: u64,
     /// Heap allocations, in a program that counts them.
@@ -44,6 +46,7 @@ impl Usage {
             minor_faults: count(usage.ru_minflt),
             major_faults: count(usage.ru_majflt),
             voluntary_switches: count(usage.ru_nvcsw),
+            late_waits: 0,
             involuntary_switches: count(usage.ru_nivcsw),
             allocations: allocations.map(|count| count()),
         }
@@ -54,6 +57,7 @@ impl Usage {
             minor_faults: self.minor_faults - before.minor_faults,
             major_faults: self.major_faults - before.major_faults,
             voluntary_switches: self.voluntary_switches - before.voluntary_switches,
+            late_waits: self.late_waits - before.late_waits,
             involuntary_switches: self.involuntary_switches - before.involuntary_switches,
             allocations: self.allocations.map(|count| count - before.allocations.unwrap_or(0)),
         }

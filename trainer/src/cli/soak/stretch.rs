@@ -43,7 +43,7 @@ impl Stretch {
             "plant within limits": self.plant["violations"].as_object().is_some_and(|v| v.values().all(|n| n == 0)),
             "no allocation": run.usage.allocations == Some(0),
             "no page fault": (run.usage.minor_faults, run.usage.major_faults) == (0, 0),
-            "at most one voluntary switch a tick": run.usage.voluntary_switches <= run.ticks,
+            "at most one voluntary switch a tick whose state was in time": run.usage.voluntary_switches <= run.ticks + run.usage.late_waits,
             "every tick has one mode": states == run.ticks,
             "no action or record lost in the loop": (c.dropped_actions, c.dropped_records) == (0, 0),
             "replay bit-equal": self.replay.is_null() || (self.replay["difference"].is_null() && self.replay["ticks"] == run.ticks),
