@@ -94,7 +94,7 @@ pub fn with_core(fuzz: impl FnOnce(&dyn Fn(&[u8]))) {
 /// A request for the server, a reply for the client.
 pub fn read_rollout(bytes: &[u8]) {
     if let Err(error) = rollout::decode(bytes) {
-        assert_sentence(&error.to_string(), &["request", "n_steps", "noise"]);
+        assert_sentence(&error.to_string(), &["request", "n_steps", "noise", "n_envs", "gamma"]);
     }
     let reply: ReplyMessage = message(bytes);
     assert!(reply.text().chars().count() <= rollout::MAX_REPLY_TEXT);

@@ -77,7 +77,7 @@ impl RolloutClient {
             Some(0) => Constraints::Off,
             Some(id) => Constraints::Id(id),
         };
-        let request = Request { seed, n_steps, version, noise, constraints };
+        let request = Request { version, noise, constraints, ..Request::new(seed, n_steps) };
         let sent = py.detach(|| lock(&self.inner).as_mut().map(|client| client.request(&request)));
         let name = &self.name;
         let closed =

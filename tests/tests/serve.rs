@@ -57,7 +57,7 @@ struct Serving {
 impl Serving {
     fn start(name: &Name, threads: usize, requests: usize) -> Serving {
         let (name, stop) = (name.0.clone(), Stop::new());
-        let settings = Settings { threads, requests, max_steps: ENDLESS, patience: PATIENCE };
+        let settings = Settings { threads, requests, max_steps: ENDLESS, max_envs: 16, patience: PATIENCE };
         let (ready, wait) = channel();
         let thread = std::thread::spawn({
             let stop = stop.clone();

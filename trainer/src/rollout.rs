@@ -3,11 +3,13 @@
 //! Every environment has its own random stream and nothing is shared while they run, so a seed gives the
 //! same bits whatever the number of threads.
 
+mod carried;
 mod resume;
 mod rows;
 mod segment;
 mod worker;
 
+pub use carried::Carried;
 pub use rows::{Period, Rows};
 pub use segment::{Segment, Tally};
 pub use worker::Worker;

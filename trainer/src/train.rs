@@ -2,10 +2,12 @@
 
 mod columns;
 mod resume;
+mod served;
 mod setup;
 mod source;
 
 pub use columns::COLUMNS;
+pub use served::{ServedError, ServedSource};
 pub use setup::complete;
 pub use source::{Experience, Gathered, Source, SourceError};
 
@@ -17,6 +19,7 @@ use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
 use nearl_runtime::controller::{Parts, seen_entries};
 use nearl_runtime::normaliser::Normaliser;
+use nearl_runtime::rollout_protocol::Layout;
 use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 use setup::{check_minibatch, learner, limit_scale, policy_kind};
@@ -159,7 +162,8 @@ impl Training {
         }
         let networks = learner.networks(&normaliser);
         let snapshot = Snapshot { manifest, networks };
-        let source = experience.open(&snapshot, &settings, request.threads, request.seed)?;
+        let sizes = Layout { n_obs: dims.n_obs, n_state: dims.n_state, n_act: dims.n_act };
+        let source = experience.open(&snapshot, sizes, &settings, request.threads, request.seed)?;
         Ok(Self {
             obs_stats: RunningStats::new(dims.n_obs),
             change_stats: RunningStats::new(dims.n_state),

@@ -91,6 +91,12 @@ impl Chunk {
     }
 }
 
+/// What a reply brings.
+enum Piece {
+    Chunk(Chunk),
+    Part(Vec<f64>),
+}
+
 impl RolloutClient {
     /// Opens the service of `name` and waits up to `patience` for its server.
     ///
@@ -208,6 +214,27 @@ impl Rollouts {
     /// [`RequestError::Refused`] with the server's answer, [`RequestError::ServerGone`], or [`RequestError::Silent`]
     /// after `patience` without a reply. Every error but the last ends the stream.
     pub fn next(&mut self, patience: Duration) -> Result<Option<Chunk>, RequestError> {
+        match self.next_piece(patience)? {
+            None => Ok(None),
+            Some(Piece::Chunk(chunk)) => Ok(Some(chunk)),
+            Some(Piece::Part(_)) => Err(self.broken("a part of a training instead of a chunk".into())),
+        }
+    }
+
+    /// The next part of what a [`Training`](super::Training) collected: numbers that go on where the last part ended. Otherwise
+    /// as [`Rollouts::next`].
+    ///
+    /// # Errors
+    /// As [`Rollouts::next`].
+    pub fn next_part(&mut self, patience: Duration) -> Result<Option<Vec<f64>>, RequestError> {
+        match self.next_piece(patience)? {
+            None => Ok(None),
+            Some(Piece::Part(numbers)) => Ok(Some(numbers)),
+            Some(Piece::Chunk(_)) => Err(self.broken("a chunk instead of a part of a training".into())),
+        }
+    }
+
+    fn next_piece(&mut self, patience: Duration) -> Result<Option<Piece>, RequestError> {
         let Some(pending) = self.pending.take() else { return Ok(None) };
         let result = self.wait(&pending, patience);
         if matches!(result, Ok(Some(_)) | Err(RequestError::Silent { .. })) {
@@ -222,12 +249,16 @@ impl Rollouts {
         self.pending.iter().for_each(PendingResponse::set_disconnect_hint);
     }
 
-    /// Transitions received so far.
+    fn broken(&self, what: String) -> RequestError {
+        RequestError::Broken { name: self.bus.name().clone(), what }
+    }
+
+    /// Transitions received so far, or numbers of a training.
     pub fn steps(&self) -> u64 {
         self.steps
     }
 
-    fn wait(&mut self, pending: &Pending, patience: Duration) -> Result<Option<Chunk>, RequestError> {
+    fn wait(&mut self, pending: &Pending, patience: Duration) -> Result<Option<Piece>, RequestError> {
         let mut waiting = Waiting::new();
         loop {
             if let Some((reply, numbers)) = self.receive(pending)? {
@@ -269,27 +300,31 @@ impl Rollouts {
         reply.client == self.client && (!numbered || reply.request == self.request)
     }
 
-    /// `None` to go on waiting, else what [`Rollouts::next`] returns.
+    /// `None` to go on waiting, else what is returned.
     fn read(
         &mut self,
         reply: &ReplyMessage,
         numbers: Vec<f64>,
-    ) -> Result<Option<Option<Chunk>>, RequestError> {
-        let broken = |what: String| RequestError::Broken { name: self.bus.name().clone(), what };
+    ) -> Result<Option<Option<Piece>>, RequestError> {
+        let broken = |what: String| self.broken(what);
         match reply.answer() {
             Some(Answer::Accepted) => Ok(None),
-            Some(Answer::Chunk) => {
+            Some(answer @ (Answer::Chunk | Answer::Part)) => {
                 let (layout, rows) = (Layout::of(reply), reply.rows as usize);
                 if (reply.chunk, reply.first_step) != (self.chunks, self.steps) {
                     let (got, wanted) = (reply.chunk, self.chunks);
                     return Err(broken(format!("chunk {got} instead of {wanted}")));
                 }
-                if layout.width().checked_mul(rows) != Some(numbers.len()) {
+                let width = if answer == Answer::Chunk { layout.width() } else { 1 };
+                if width.checked_mul(rows) != Some(numbers.len()) {
                     return Err(broken(format!("{} numbers for {rows} rows", numbers.len())));
                 }
                 self.chunks += 1;
                 self.steps += u64::from(reply.rows);
-                Ok(Some(Some(Chunk {
+                if answer == Answer::Part {
+                    return Ok(Some(Some(Piece::Part(numbers))));
+                }
+                Ok(Some(Some(Piece::Chunk(Chunk {
                     layout,
                     sequence: reply.chunk,
                     first_step: reply.first_step,
@@ -297,7 +332,7 @@ impl Rollouts {
                     constraints: reply.constraints,
                     rows,
                     numbers,
-                })))
+                }))))
             }
             Some(Answer::Done) => Ok(Some(None)),
             Some(Answer::Cancelled) if self.cancelled => Ok(Some(None)),

@@ -47,27 +47,35 @@ pub(super) const OWN: u64 = u64::MAX;
 
 message! {
     /// What a client asks for.
-    RequestMessage, "rollout-request", version 1, buffer 4, history 0, subscribers 1 {
+    RequestMessage, "rollout-request", version 2, buffer 4, history 0, subscribers 1 {
         /// Number of the request, chosen by the client.
         request: u64,
         /// Seed of the initial states and of the noise.
         seed: u64,
-        /// Policy steps.
+        /// Policy steps; of each environment in a training.
         n_steps: u64,
         /// Version of the policy; all ones for the server's.
         version: u64,
         /// Id of the constraint set; 0 for none, all ones for the server's.
         constraints: u64,
+        /// Environments of a training; 0 for a rollout, and then zero in all that follows but `noise`.
+        n_envs: u64,
+        /// Number of the first environment's random stream.
+        stream: u64,
+        /// Discount of the returns that scale the reward.
+        gamma: f64,
+        /// What the reward is lowered by for each unit of distance moved.
+        moved_penalty: f64,
         /// 1 with the policy's noise, 0 without.
         noise: u32,
-        /// Zero.
-        reserved: u32,
+        /// 1 if a training's environments begin anew, 0 if they go on.
+        begins: u32,
     }
 }
 
 message! {
     /// Header of every answer; the numbers of a chunk follow it.
-    ReplyMessage, "rollout-reply", version 2, buffer 4, history 0, subscribers 1 {
+    ReplyMessage, "rollout-reply", version 3, buffer 4, history 0, subscribers 1 {
         /// Number of the request.
         request: u64,
         /// The client that asked, as the transport knows it; filled by [`Caller`](super::Caller).
@@ -76,15 +84,15 @@ message! {
         version: u64,
         /// Id of the server's constraint set.
         constraints: u64,
-        /// Number of the chunk, from 0.
+        /// Number of the chunk or part, from 0.
         chunk: u64,
-        /// Policy step of the first row.
+        /// Policy step of the first row; for a part, its first number among all.
         first_step: u64,
         /// Policy steps asked for.
         n_steps: u64,
         /// [`Answer`] by its number.
         answer: u32,
-        /// Rows in this chunk.
+        /// Rows in this chunk, or numbers in this part.
         rows: u32,
         /// Entries of an observation.
         n_obs: u32,
@@ -104,6 +112,7 @@ codes! {
     Answer, "rollout" {
         Accepted = "rollout-accepted", "The rollout server took the request; chunks follow.", "Nothing to do.";
         Chunk = "rollout-chunk", "A chunk of transitions.", "Nothing to do.";
+        Part = "rollout-part", "A part of what a training collected.", "Nothing to do.";
         Done = "rollout-done", "All steps asked for were sent.", "Nothing to do.";
         Cancelled = "rollout-cancelled", "The client cancelled the request.", "Nothing to do.";
         Busy = "rollout-busy", "The rollout server has as many requests as it takes.",

@@ -16,25 +16,43 @@ pub enum Constraints {
     Id(u64),
 }
 
+/// Experience for a learner instead of a rollout: environments that go on from one request of a client to its next. The answer is
+/// not a stream of transitions but, in parts, what [`Rollouts::next_part`](super::Rollouts::next_part) gives.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Training {
+    /// Environments; each takes the steps of the request.
+    pub n_envs: u64,
+    /// They begin anew; else they go on where the client's last request left them.
+    pub begins: bool,
+    /// Environment `i` draws from the seed's random stream `stream + i`.
+    pub stream: u64,
+    /// Discount of the returns that scale the reward, in \[0, 1\].
+    pub gamma: f64,
+    /// What the reward is lowered by for each unit of distance the projection moved a target, at least 0.
+    pub moved_penalty: f64,
+}
+
 /// What a client asks for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Request {
     /// Seed of the initial states and of the noise; the same seed gives the same bits.
     pub seed: u64,
     /// Policy steps.
     pub n_steps: u64,
-    /// Version of the policy; the server's if `None`.
+    /// Version of the policy; the server's if `None`. A training may also name the one that was pushed to the server last.
     pub version: Option<u64>,
     /// Sample as the policy does; without, its mean.
     pub noise: bool,
     /// What the proposals are projected onto.
     pub constraints: Constraints,
+    /// Collects for a learner.
+    pub training: Option<Training>,
 }
 
 impl Request {
     /// `n_steps` policy steps from `seed`, with noise, by the server's policy and constraints.
     pub fn new(seed: u64, n_steps: u64) -> Request {
-        Request { seed, n_steps, version: None, noise: true, constraints: Constraints::Own }
+        Request { seed, n_steps, version: None, noise: true, constraints: Constraints::Own, training: None }
     }
 
     /// The message number `request`; the sender fills the header.
@@ -50,6 +68,11 @@ impl Request {
                 Constraints::Id(id) => id,
             },
             noise: u32::from(self.noise),
+            n_envs: self.training.map_or(0, |t| t.n_envs),
+            begins: self.training.map_or(0, |t| u32::from(t.begins)),
+            stream: self.training.map_or(0, |t| t.stream),
+            gamma: self.training.map_or(0.0, |t| t.gamma),
+            moved_penalty: self.training.map_or(0.0, |t| t.moved_penalty),
             ..RequestMessage::zeroed()
         }
     }
@@ -95,22 +118,42 @@ pub fn decode(bytes: &[u8]) -> Result<(u64, u64, Request), Malformed> {
     if m.n_steps == 0 {
         return refuse(m.request, epoch, "n_steps is 0: ask for at least 1 step".into());
     }
-    if m.noise > 1 || m.reserved != 0 {
-        let (noise, reserved) = (m.noise, m.reserved);
-        return refuse(
-            m.request,
-            epoch,
-            format!("noise is {noise} and reserved {reserved}: noise is 0 or 1, reserved 0"),
-        );
+    if m.noise > 1 || m.begins > 1 {
+        let (noise, begins) = (m.noise, m.begins);
+        return refuse(m.request, epoch, format!("noise is {noise} and begins {begins}: each is 0 or 1"));
     }
+    let training = match training(&m) {
+        Ok(training) => training,
+        Err(reason) => return refuse(m.request, epoch, reason),
+    };
     let constraints = match m.constraints {
         OWN => Constraints::Own,
         0 => Constraints::Off,
         id => Constraints::Id(id),
     };
     let version = (m.version != OWN).then_some(m.version);
-    let request = Request { seed: m.seed, n_steps: m.n_steps, version, noise: m.noise == 1, constraints };
-    Ok((m.request, epoch, request))
+    let (seed, n_steps, noise) = (m.seed, m.n_steps, m.noise == 1);
+    Ok((m.request, epoch, Request { seed, n_steps, version, noise, constraints, training }))
+}
+
+fn training(m: &RequestMessage) -> Result<Option<Training>, String> {
+    let RequestMessage { n_envs, stream, gamma, moved_penalty, .. } = *m;
+    if n_envs == 0 {
+        let is_empty = (stream, m.begins) == (0, 0) && (gamma, moved_penalty) == (0.0, 0.0);
+        return match is_empty {
+            true => Ok(None),
+            false => Err("n_envs is 0, but something is said of a training: give its environments".into()),
+        };
+    }
+    if !(0.0..=1.0).contains(&gamma) || !(0.0..f64::INFINITY).contains(&moved_penalty) {
+        return Err(format!(
+            "gamma is {gamma} and moved_penalty {moved_penalty}: gamma lies in [0, 1], moved_penalty is at least 0"
+        ));
+    }
+    if m.noise == 0 {
+        return Err("noise is 0: a training needs the policy's noise".into());
+    }
+    Ok(Some(Training { n_envs, begins: m.begins == 1, stream, gamma, moved_penalty }))
 }
 
 /// Id of a snapshot's constraint set: a hash of its effective `[constraints]` and robot, never 0 or all ones.
@@ -127,6 +170,9 @@ mod tests {
         super::super::client::bytes_of(message).to_vec()
     }
 
+    const TRAINING: Training =
+        Training { n_envs: 8, begins: true, stream: 16, gamma: 0.99, moved_penalty: 0.5 };
+
     fn sent(request: &Request) -> RequestMessage {
         let mut message = request.message(7);
         message.header = Header { schema: RequestMessage::SCHEMA, epoch: 3, seq: 1, stamp: 0 };
@@ -139,6 +185,7 @@ mod tests {
             Request::new(u64::MAX, 1),
             Request { version: Some(9), noise: false, constraints: Constraints::Off, ..Request::new(0, 5) },
             Request { constraints: Constraints::Id(12), ..Request::new(1, 2) },
+            Request { training: Some(TRAINING), ..Request::new(3, 256) },
         ];
         for request in asked {
             assert_eq!(decode(&bytes(&sent(&request))), Ok((7, 3, request)));
@@ -158,5 +205,17 @@ mod tests {
         let noisy = refused(RequestMessage { noise: 2, ..good });
         assert!(noisy.reason.contains("noise is 2"));
         assert_eq!((noisy.request, noisy.client), (7, 3));
+        let training = sent(&Request { training: Some(TRAINING), ..Request::new(1, 2) });
+        for (broken, what) in [
+            (RequestMessage { n_envs: 0, ..training }, "n_envs is 0"),
+            (RequestMessage { gamma: f64::NAN, ..training }, "gamma is NaN"),
+            (RequestMessage { gamma: 1.5, ..training }, "gamma is 1.5"),
+            (RequestMessage { moved_penalty: -1.0, ..training }, "moved_penalty -1"),
+            (RequestMessage { moved_penalty: f64::INFINITY, ..training }, "moved_penalty inf"),
+            (RequestMessage { begins: 7, ..training }, "begins 7"),
+            (RequestMessage { noise: 0, ..training }, "noise is 0"),
+        ] {
+            assert!(refused(broken).reason.contains(what), "{what}");
+        }
     }
 }

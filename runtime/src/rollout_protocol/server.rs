@@ -13,12 +13,20 @@ use iceoryx2::service::port_factory::server::ServerCreateError;
 use super::departed::{Active, Departed};
 use super::messages::{Answer, Envelope, MAX_CHUNK, ReplyMessage};
 use super::service;
+use crate::link::owner::Owner;
+use crate::link::port::Outbox;
 use crate::link::service::{Bus, Ipc};
-use crate::link::{Header, LinkError, Message, RobotName};
+use crate::link::{
+    Header, LinkError, Message, ReceiptMessage, RobotName, SnapshotBytes, SnapshotHeader, SnapshotReader,
+    Verdict,
+};
 use crate::rt::clock;
 
-/// The only server of a name.
+/// The only server of a name. It also takes the snapshots that a trainer pushes to the name.
 pub struct RolloutServer {
+    snapshots: SnapshotReader,
+    receipts: Outbox<ReceiptMessage>,
+    _owner: Owner,
     port: Server<Ipc, Envelope, (), [f64], ReplyMessage>,
     departed: Arc<Departed>,
     bus: Bus,
@@ -58,8 +66,24 @@ impl RolloutServer {
                 }
                 other => name.transport("serve rollouts", format!("{other:?}")),
             })?;
+        let owner = bus.own("runtime")?;
+        let (snapshots, receipts) = (bus.bytes_inbox()?, bus.outbox()?);
         bus.reserve()?;
-        Ok(RolloutServer { port, departed: Arc::new(Departed::new(factory)), bus })
+        let departed = Arc::new(Departed::new(factory));
+        Ok(RolloutServer { snapshots, receipts, _owner: owner, port, departed, bus })
+    }
+
+    /// The next snapshot that was pushed to the name. One that was pushed before a request was sent is here once the request is.
+    pub fn snapshot(&mut self) -> Option<SnapshotBytes> {
+        self.snapshots.next()
+    }
+
+    /// Answers a snapshot.
+    pub fn receipt(&mut self, header: &SnapshotHeader, verdict: Verdict, text: &str) {
+        let mut receipt = ReceiptMessage::zeroed();
+        (receipt.trainer_epoch, receipt.version) = (header.header.epoch, header.version);
+        receipt.set(verdict, text);
+        self.receipts.send(&mut receipt);
     }
 
     /// The next request, whatever its bytes are; those whose client no longer waits are left out.

@@ -81,8 +81,13 @@ impl ServeBench {
     fn measure(&self, snapshot: &Snapshot, name: &RobotName) -> Result<Vec<[[f64; 2]; 2]>, Failure> {
         let threads = self.threads.unwrap_or_else(cores).max(1);
         let mut collector = Collector::new(snapshot, self.clients, self.steps, threads, 0.99, 0)?;
-        let settings =
-            Settings { threads, requests: self.clients, max_steps: self.steps as u64, patience: PATIENCE };
+        let settings = Settings {
+            threads,
+            requests: self.clients,
+            max_steps: self.steps as u64,
+            max_envs: 1,
+            patience: PATIENCE,
+        };
         let (stop, (ready, wait)) = (Stop::new(), channel());
         let total = (self.clients * self.steps) as f64;
         std::thread::scope(|scope| {

@@ -27,6 +27,9 @@ pub(super) struct Serve {
     /// Policy steps of one request at most.
     #[arg(long, default_value_t = 1_000_000)]
     max_steps: u64,
+    /// Environments of a client that learns (`nearl train TASK --collect NAME`) at most.
+    #[arg(long, default_value_t = 256)]
+    max_envs: u64,
     /// A client that takes nothing for so long loses its place [s].
     #[arg(long, default_value_t = 60.0, value_parser = nearl_runtime::cli::seconds)]
     patience: f64,
@@ -44,6 +47,7 @@ impl Serve {
             threads: self.threads.unwrap_or_else(cores),
             requests: self.requests,
             max_steps: self.max_steps,
+            max_envs: self.max_envs,
             patience: Duration::from_secs_f64(self.patience),
         };
         let stop = Stop::on_signals()?;

@@ -35,6 +35,10 @@ pub(super) struct Train {
     /// `nearl plant TASK --name NAME`, then `nearl run SNAPSHOT --plant NAME --explore SEED`.
     #[arg(long, value_name = "NAME")]
     from: Option<String>,
+    /// Collect in the rollout server of this name (`nearl serve SNAPSHOT --name NAME`), which must serve the same task; a seed gives
+    /// the same weights as without.
+    #[arg(long, value_name = "NAME", conflicts_with = "from")]
+    collect: Option<String>,
     /// Threads; all cores when absent. The result does not depend on it.
     #[arg(long)]
     threads: Option<usize>,
@@ -104,9 +108,10 @@ impl Train {
             signal_hook::flag::register_conditional_shutdown(signal, 1, Arc::clone(&stop))?;
             signal_hook::flag::register(signal, Arc::clone(&stop))?;
         }
-        let experience = match &self.from {
-            Some(name) => Experience::Loop(RobotName::new(name)?, Arc::clone(&stop)),
-            None => Experience::Here,
+        let experience = match (&self.from, &self.collect) {
+            (Some(name), _) => Experience::Loop(RobotName::new(name)?, Arc::clone(&stop)),
+            (None, Some(name)) => Experience::Served(RobotName::new(name)?, Arc::clone(&stop)),
+            (None, None) => Experience::Here,
         };
         let bar = bar(self.json, run.steps);
         let mut last = None;

@@ -135,13 +135,13 @@ impl Worker {
     }
 
     /// Begins a segment of `n_steps` policy steps.
-    pub(super) fn begin(&mut self, n_steps: usize) {
+    pub(crate) fn begin(&mut self, n_steps: usize) {
         self.clear();
         self.left = n_steps;
     }
 
     /// Collects the next `n` policy steps of the segment, or those that are left.
-    pub(super) fn go_on(&mut self, n: usize) {
+    pub(crate) fn go_on(&mut self, n: usize) {
         for _ in 0..n.min(self.left) {
             self.left -= 1;
             self.draw(true);

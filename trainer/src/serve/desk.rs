@@ -1,16 +1,20 @@
 //! Takes requests in, decides whose chunk is simulated next, and sends what is ready.
 
-use super::job::{Job, Stage};
+use super::job::{Job, Rollout, Stage, Subject};
+use super::policy::Policies;
 use super::pool::{Outcome, Pool};
 use super::refusal::Refusal;
+use super::training::Session;
 use super::turns::Turns;
 use super::{Report, ServeError, Settings};
 use crate::rollout::Worker;
 use nearl_runtime::Snapshot;
+use nearl_runtime::link::{SnapshotBytes, Verdict};
 use nearl_runtime::rollout_protocol::{
     Answer, Caller, Constraints, Layout, MAX_CHUNK, ReplyMessage, Request, constraint_set, decode,
 };
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::sync::Arc;
 
 pub(super) struct Desk {
     jobs: BTreeMap<u64, Job>,
@@ -22,8 +26,10 @@ pub(super) struct Desk {
     layout: Layout,
     /// Steps of a full chunk.
     rows: usize,
-    version: u64,
+    policies: Policies,
     constraints: u64,
+    /// Environments of the clients that learn, between two of their requests.
+    sessions: HashMap<u128, Session>,
     /// Workers of requests that ended.
     freed: Vec<Box<Worker>>,
     report: Report,
@@ -43,8 +49,9 @@ impl Desk {
             settings: settings.clone(),
             layout,
             rows: MAX_CHUNK / width,
-            version: manifest.version,
+            policies: Policies::new(snapshot),
             constraints: constraint_set(manifest),
+            sessions: HashMap::new(),
             freed: Vec::new(),
             report: Report::default(),
         })
@@ -54,11 +61,14 @@ impl Desk {
     pub(super) fn admit(&mut self, caller: Caller) {
         self.report.requests += 1;
         let (number, verdict) = match decode(caller.bytes()) {
-            Ok((number, _, request)) => (number, self.check(request)),
+            Ok((number, _, request)) => {
+                let subject = self.check(&request).and_then(|policy| self.subject(&caller, &request, policy));
+                (number, subject.map(|subject| (request, subject)))
+            }
             Err(e) => (e.request, Err((Answer::BadRequest, e.reason))),
         };
         match verdict {
-            Ok(request) => self.accept(caller, number, request),
+            Ok((request, subject)) => self.accept(caller, number, request, subject),
             Err((answer, text)) => {
                 match answer {
                     Answer::Busy => self.report.busy += 1,
@@ -70,23 +80,26 @@ impl Desk {
         }
     }
 
-    fn check(&self, request: Request) -> Result<Request, (Answer, String)> {
-        let (steps, most) = (request.n_steps, self.settings.max_steps);
+    /// The policy a request asks for, if it can be served.
+    fn check(&self, request: &Request) -> Result<Arc<Snapshot>, (Answer, String)> {
+        let (n_envs, settings) = (request.training.map_or(1, |t| t.n_envs), &self.settings);
+        let (steps, most) = (request.n_steps.saturating_mul(n_envs), settings.max_steps);
         if steps > most {
             return Err((
                 Answer::LimitExceeded,
                 format!("{steps} steps are more than the {most} this server gives at once: ask for fewer"),
             ));
         }
-        if let Some(version) = request.version.filter(|v| *v != self.version) {
-            let own = self.version;
+        if n_envs > settings.max_envs {
+            let most = settings.max_envs;
             return Err((
-                Answer::BadRequest,
+                Answer::LimitExceeded,
                 format!(
-                    "the server has version {own} of the policy, not {version}: ask for that or for the current one"
+                    "{n_envs} environments are more than the {most} this server keeps for a client: ask for fewer, or raise --max-envs"
                 ),
             ));
         }
+        let policy = self.policies.find(request).map_err(|text| (Answer::BadRequest, text))?;
         if let Constraints::Id(id) = request.constraints
             && id != self.constraints
         {
@@ -98,17 +111,40 @@ impl Desk {
                 ),
             ));
         }
-        let places = self.settings.requests;
+        let places = settings.requests;
         if self.jobs.len() >= places {
             return Err((Answer::Busy, format!("all {places} places are taken: ask again later")));
         }
-        Ok(request)
+        Ok(policy)
     }
 
-    fn accept(&mut self, caller: Caller, number: u64, request: Request) {
+    /// What the request is about; a training goes on with what its client's last one left.
+    fn subject(
+        &mut self,
+        caller: &Caller,
+        request: &Request,
+        policy: Arc<Snapshot>,
+    ) -> Result<Subject, (Answer, String)> {
+        let Some(training) = &request.training else { return Ok(Subject::Rollout(Rollout::default())) };
+        if training.begins {
+            return Ok(Subject::Training(Session::begin(request, training, policy)));
+        }
+        let session = self.sessions.remove(&caller.client());
+        let Some(mut session) = session.filter(|s| s.n_envs() as u64 == training.n_envs) else {
+            let n_envs = training.n_envs;
+            return Err((
+                Answer::BadRequest,
+                format!("this client has no training of {n_envs} environments to go on with: begin one"),
+            ));
+        };
+        session.go_on(request, policy);
+        Ok(Subject::Training(session))
+    }
+
+    fn accept(&mut self, caller: Caller, number: u64, request: Request, subject: Subject) {
         let reply = ReplyMessage {
             request: number,
-            version: self.version,
+            version: self.policies.version(&request),
             constraints: self.constraints,
             n_steps: request.n_steps,
             n_obs: self.layout.n_obs as u32,
@@ -117,7 +153,15 @@ impl Desk {
             ..ReplyMessage::default()
         };
         self.slots += 1;
-        self.jobs.insert(self.slots, Job::new(caller, request, reply));
+        self.jobs.insert(self.slots, Job::new(caller, request, subject, reply));
+    }
+
+    /// Takes a policy that was pushed to the server, for those who learn.
+    pub(super) fn take_policy(&mut self, bytes: &SnapshotBytes) -> (Verdict, String) {
+        match self.policies.push(bytes) {
+            Ok(()) => (Verdict::Accepted, "in use by those who learn".into()),
+            Err(refusal) => refusal,
+        }
     }
 
     /// Lets go of the requests of all other clients.
@@ -126,8 +170,14 @@ impl Desk {
             self.jobs.iter().filter(|(_, j)| !alive.contains(&j.client)).map(|(s, _)| *s).collect();
         for slot in dead {
             self.report.gone += 1;
-            self.remove(slot);
+            self.remove(slot, false);
         }
+        self.sessions.retain(|client, _| alive.contains(client));
+    }
+
+    /// True while a client has not read what is ready for it, or learns and will ask again soon.
+    pub(super) fn is_awaited(&self) -> bool {
+        !self.sessions.is_empty() || self.jobs.values().any(|job| !job.is_flushed())
     }
 
     /// Sends what is ready, queues whose buffer is empty again, and lets go of what is cancelled, finished or without a
@@ -143,14 +193,14 @@ impl Desk {
             let waits_too_long = job.stuck().is_some_and(|since| since.elapsed() > self.settings.patience);
             if !job.caller.is_connected() || waits_too_long || !job.flush() {
                 self.report.gone += 1;
-                self.remove(slot);
+                self.remove(slot, false);
             } else if let (Stage::Ending(answer), true) = (job.stage, job.is_flushed()) {
                 match answer {
                     Answer::Done => self.report.done += 1,
                     Answer::Cancelled => self.report.cancelled += 1,
                     _ => self.report.failed += 1,
                 }
-                self.remove(slot);
+                self.remove(slot, answer == Answer::Done);
             } else if job.wants_turn() {
                 self.turns.push(job.client, slot);
             }
@@ -164,25 +214,29 @@ impl Desk {
         }
         while pool.wants_more() {
             let Some(slot) = self.turns.pop() else { return };
-            let Some(job) = self.jobs.get_mut(&slot).filter(|j| j.stage == Stage::Waiting) else { continue };
-            pool.give(job.task(slot, self.rows));
+            let Some(job) = self.jobs.get_mut(&slot).filter(|j| j.stage == Stage::Running) else { continue };
+            if let Some(task) = job.task(slot, self.rows) {
+                pool.give(task);
+            }
+            if job.wants_turn() {
+                self.turns.push(job.client, slot);
+            }
         }
     }
 
     /// Takes a simulated chunk; [`Desk::attend`] sends it and queues the request again.
     pub(super) fn take_back(&mut self, outcome: Outcome) {
-        let Outcome { slot, rows, result } = outcome;
-        let Some(job) = self.jobs.get_mut(&slot).filter(|j| j.stage == Stage::AtWork) else {
+        let Outcome { slot, place, rows, result } = outcome;
+        let Some(job) = self.jobs.get_mut(&slot).filter(|j| j.stage == Stage::Running) else {
             // Cancelled or gone in the meantime.
-            self.freed.extend(result.ok().map(|(worker, _)| worker));
+            self.freed.extend(result.ok().filter(|_| place.is_none()).map(|(worker, _)| worker));
             return;
         };
         match result {
             Err(reason) => job.end(Answer::Failed, &reason),
             Ok((worker, numbers)) => {
-                job.worker = Some(worker);
                 self.report.steps += rows as u64;
-                job.chunk(rows, numbers, self.layout);
+                job.take_back(place, worker, rows, numbers);
             }
         }
     }
@@ -197,9 +251,14 @@ impl Desk {
         self.report
     }
 
-    fn remove(&mut self, slot: u64) {
-        if let Some(job) = self.jobs.remove(&slot) {
-            self.freed.extend(job.worker);
+    /// Forgets a request; a training whose every number was sent may be gone on with.
+    fn remove(&mut self, slot: u64, is_done: bool) {
+        let Some(job) = self.jobs.remove(&slot) else { return };
+        let client = job.client;
+        match job.into_subject() {
+            Subject::Rollout(rollout) => self.freed.extend(rollout.into_worker()),
+            Subject::Training(session) if is_done => drop(self.sessions.insert(client, session)),
+            Subject::Training(_) => {}
         }
     }
 }

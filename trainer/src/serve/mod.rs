@@ -2,12 +2,15 @@
 //!
 //! Every request has an environment and a controller of its own, through the same [`Worker`](crate::rollout::Worker) as
 //! training, with the random stream of its seed: its transitions do not depend on who else asks or on the number of threads.
+//! A client may also learn: it keeps its environments, and pushes the policy they act by ([`training`], [`policy`]).
 //! One thread talks to the clients; the others simulate one chunk at a time, and [`turns`] says whose.
 
 mod desk;
 mod job;
+mod policy;
 mod pool;
 mod refusal;
+mod training;
 mod turns;
 
 use crate::rollout::RolloutError;
@@ -27,6 +30,8 @@ pub struct Settings {
     pub requests: usize,
     /// Policy steps of one request at most.
     pub max_steps: u64,
+    /// Environments of a client that learns at most.
+    pub max_envs: u64,
     /// A client that takes nothing for so long loses its place.
     pub patience: Duration,
 }
@@ -85,6 +90,8 @@ pub enum ServeError {
 
 /// Longest wait for a finished chunk before the clients are looked at again.
 const WAIT: Duration = Duration::from_millis(1);
+/// The same while a client waits for the server.
+const SHORT_WAIT: Duration = Duration::from_micros(100);
 /// Between two searches for clients that died.
 const SEARCH: Duration = Duration::from_millis(250);
 
@@ -111,18 +118,28 @@ pub fn serve(
         let mut searched = Instant::now();
         while !stop.is_requested() {
             while let Some(caller) = server.receive() {
+                // What was pushed before the request is in use with it.
+                take_policies(&mut server, &mut desk);
                 desk.admit(caller);
             }
+            take_policies(&mut server, &mut desk);
             if searched.elapsed() > SEARCH {
                 desk.keep_only(&server.survivors());
                 searched = Instant::now();
             }
             desk.attend();
             desk.hand_out(&mut pool);
-            if let Some(outcome) = pool.wait(WAIT) {
+            if let Some(outcome) = pool.wait(if desk.is_awaited() { SHORT_WAIT } else { WAIT }) {
                 desk.take_back(outcome);
             }
         }
         Ok(desk.close())
     })
+}
+
+fn take_policies(server: &mut RolloutServer, desk: &mut desk::Desk) {
+    while let Some(bytes) = server.snapshot() {
+        let (verdict, text) = desk.take_policy(&bytes);
+        server.receipt(&bytes.header, verdict, &text);
+    }
 }

@@ -1,4 +1,4 @@
-//! The threads that simulate: one chunk of one request at a time.
+//! The threads that simulate: one chunk or portion of one request at a time.
 
 use crate::env::Env;
 use crate::rollout::{RolloutError, Worker, make_env, stream};
@@ -10,27 +10,43 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::Scope;
 use std::time::Duration;
 
-/// What the first chunk of a request begins with.
+/// What an environment begins with.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Start {
     pub(super) seed: u64,
+    /// Random stream of the seed.
+    pub(super) stream: u64,
     pub(super) projection: bool,
+    pub(super) gamma: f64,
+    pub(super) moved_penalty: f64,
 }
 
-/// One chunk to simulate.
+/// What is to be simulated.
+pub(super) enum Work {
+    /// The next chunk of a rollout, the first of which begins with `start`.
+    Chunk { start: Option<Start>, noise: bool },
+    /// The next portion of a training's segment by the networks of `snapshot`. The first of a segment says how long it is; an
+    /// environment without a worker begins with `start`.
+    Segment { snapshot: Arc<Snapshot>, begins: Option<usize>, start: Start },
+}
+
+/// So many steps to simulate.
 pub(super) struct Task {
     pub(super) slot: u64,
-    /// The request's own worker; any idle one, or none, when `start` is given.
+    /// Which environment of a training.
+    pub(super) place: Option<usize>,
+    /// The environment's own worker. A rollout that begins takes any idle one.
     pub(super) worker: Option<Box<Worker>>,
-    pub(super) start: Option<Start>,
     pub(super) rows: usize,
-    pub(super) noise: bool,
+    pub(super) work: Work,
 }
 
-/// A simulated chunk, or one sentence why there is none; the worker is lost then.
+/// What was simulated, or one sentence why it was not; the worker is lost then.
 pub(super) struct Outcome {
     pub(super) slot: u64,
+    pub(super) place: Option<usize>,
     pub(super) rows: usize,
+    /// The numbers of a chunk; a segment stays in its worker.
     pub(super) result: Result<(Box<Worker>, Vec<f64>), String>,
 }
 
@@ -40,7 +56,7 @@ pub(super) struct Pool {
     outcomes: Receiver<Outcome>,
     layout: Layout,
     threads: usize,
-    /// Chunks handed out and not yet back.
+    /// Tasks handed out and not yet back.
     at_work: usize,
     idle: Vec<Box<Worker>>,
 }
@@ -67,14 +83,14 @@ impl Pool {
         self.layout
     }
 
-    /// True while another chunk keeps a thread from waiting.
+    /// True while another task keeps a thread from waiting.
     pub(super) fn wants_more(&self) -> bool {
         self.at_work < 2 * self.threads
     }
 
-    /// Queues a chunk; a first one gets an idle worker if there is one.
+    /// Queues a task; a rollout that begins gets an idle worker if there is one.
     pub(super) fn give(&mut self, mut task: Task) {
-        if task.worker.is_none() {
+        if task.worker.is_none() && matches!(task.work, Work::Chunk { .. }) {
             task.worker = self.idle.pop();
         }
         if self.tasks.send(task).is_ok() {
@@ -82,12 +98,12 @@ impl Pool {
         }
     }
 
-    /// Keeps a worker for the next request.
+    /// Keeps the worker of a rollout for the next one.
     pub(super) fn keep(&mut self, worker: Box<Worker>) {
         self.idle.push(worker);
     }
 
-    /// The next finished chunk, if one comes in time.
+    /// The next finished task, if one comes in time.
     pub(super) fn wait(&mut self, patience: Duration) -> Option<Outcome> {
         match self.outcomes.recv_timeout(patience) {
             Ok(outcome) => {
@@ -102,32 +118,70 @@ impl Pool {
 fn simulate(env: &dyn Env, snapshot: &Snapshot, queue: &Mutex<Receiver<Task>>, done: &Sender<Outcome>) {
     loop {
         let task = queue.lock().unwrap_or_else(PoisonError::into_inner).recv();
-        let Ok(task) = task else { return };
-        let (slot, rows) = (task.slot, task.rows);
-        let result = catch_unwind(AssertUnwindSafe(|| chunk(env, snapshot, task))).unwrap_or_else(|_| {
+        let Ok(Task { slot, place, worker, rows, work }) = task else { return };
+        let run = || match work {
+            Work::Chunk { start, noise } => chunk(env, snapshot, worker, start, rows, noise),
+            Work::Segment { snapshot, begins, start } => portion(env, &snapshot, worker, start, begins, rows),
+        };
+        let result = catch_unwind(AssertUnwindSafe(run)).unwrap_or_else(|_| {
             Err("the simulator stopped; the reason is in the server's error output".into())
         });
-        if done.send(Outcome { slot, rows, result }).is_err() {
+        if done.send(Outcome { slot, place, rows, result }).is_err() {
             return;
         }
     }
 }
 
-fn chunk(env: &dyn Env, snapshot: &Snapshot, task: Task) -> Result<(Box<Worker>, Vec<f64>), String> {
-    let mut worker = match task.worker {
+type Simulated = Result<(Box<Worker>, Vec<f64>), String>;
+
+fn chunk(
+    env: &dyn Env,
+    snapshot: &Snapshot,
+    worker: Option<Box<Worker>>,
+    start: Option<Start>,
+    rows: usize,
+    noise: bool,
+) -> Simulated {
+    let mut worker = match worker {
         Some(worker) => worker,
         None => {
             let env = env.another().map_err(|e| e.to_string())?;
             Box::new(Worker::new(env, snapshot, 1.0, stream(0, 0)).map_err(|e| e.to_string())?)
         }
     };
-    if let Some(start) = task.start {
+    if let Some(start) = start {
         worker.set_projection(start.projection);
-        worker.reseed(stream(start.seed, 0)).map_err(|e| e.to_string())?;
+        worker.reseed(stream(start.seed, start.stream)).map_err(|e| e.to_string())?;
     }
-    let mut numbers = Vec::with_capacity(task.rows * worker.layout().width());
-    for _ in 0..task.rows {
-        worker.transition(task.noise, &mut numbers);
+    let mut numbers = Vec::with_capacity(rows * worker.layout().width());
+    for _ in 0..rows {
+        worker.transition(noise, &mut numbers);
     }
     Ok((worker, numbers))
+}
+
+fn portion(
+    env: &dyn Env,
+    snapshot: &Snapshot,
+    worker: Option<Box<Worker>>,
+    start: Start,
+    begins: Option<usize>,
+    rows: usize,
+) -> Simulated {
+    let mut worker = match worker {
+        Some(worker) => worker,
+        None => {
+            let (env, rng) = (env.another().map_err(|e| e.to_string())?, stream(start.seed, start.stream));
+            let mut worker = Worker::new(env, snapshot, start.gamma, rng).map_err(|e| e.to_string())?;
+            worker.set_projection(start.projection);
+            worker.set_moved_penalty(start.moved_penalty);
+            Box::new(worker)
+        }
+    };
+    if let Some(n_steps) = begins {
+        worker.set_networks(&snapshot.networks);
+        worker.begin(n_steps);
+    }
+    worker.go_on(rows);
+    Ok((worker, Vec::new()))
 }

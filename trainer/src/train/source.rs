@@ -1,12 +1,14 @@
-//! Where experience comes from: environments of this process, or a running loop.
+//! Where experience comes from: environments of this process or of a rollout server, or a running loop.
 
+use super::served::{ServedError, ServedSource};
 use crate::checkpoint::Checkpoint;
 use crate::online::{LoopSource, OnlineError};
-use crate::rollout::{Collector, RolloutError, Rows, Segment, Tally};
+use crate::rollout::{Carried, Collector, RolloutError, Rows, Segment, Tally};
 use crate::settings::TrainSettings;
 use crate::stats::RunningStats;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::RobotName;
+use nearl_runtime::rollout_protocol::Layout;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -19,6 +21,9 @@ pub enum SourceError {
     /// A running loop.
     #[error(transparent)]
     Online(#[from] OnlineError),
+    /// A rollout server.
+    #[error(transparent)]
+    Served(#[from] ServedError),
 }
 
 /// What the user chose.
@@ -29,6 +34,8 @@ pub enum Experience {
     Here,
     /// The running loop of this robot, until the flag is set.
     Loop(RobotName, Arc<AtomicBool>),
+    /// The rollout server of this name, until the flag is set.
+    Served(RobotName, Arc<AtomicBool>),
 }
 
 /// One stretch of experience with its statistics.
@@ -46,7 +53,13 @@ pub struct Gathered<'a> {
 }
 
 impl<'a> Gathered<'a> {
-    /// What was collected in another process.
+    /// What a rollout server collected.
+    pub fn of_carried(carried: &'a Carried) -> Self {
+        let Carried { segment, tally, obs_stats, change_stats, return_stats } = carried;
+        Self { segment, tally, obs_stats, change_stats, return_stats }
+    }
+
+    /// What was collected in a running loop.
     pub fn of_rows(rows: &'a Rows) -> Self {
         Self {
             segment: &rows.segment,
@@ -128,6 +141,7 @@ impl Experience {
     pub(super) fn open(
         &self,
         snapshot: &Snapshot,
+        sizes: Layout,
         settings: &TrainSettings,
         threads: usize,
         seed: u64,
@@ -144,6 +158,9 @@ impl Experience {
             }
             Self::Loop(name, stop) => {
                 Ok(Box::new(LoopSource::open(name, snapshot, settings, Arc::clone(stop))?))
+            }
+            Self::Served(name, stop) => {
+                Ok(Box::new(ServedSource::open(name, settings, sizes, seed, Arc::clone(stop))?))
             }
         }
     }

@@ -1,0 +1,144 @@
+//! What a worker collected, as plain numbers on their way from one process to another, bit for bit.
+
+use super::{Segment, Tally, Worker};
+use crate::stats::RunningStats;
+use nearl_runtime::rollout_protocol::Layout;
+
+/// What was collected in one environment of another process.
+#[derive(Clone, Debug)]
+pub struct Carried {
+    /// Rows.
+    pub segment: Segment,
+    /// Counts.
+    pub tally: Tally,
+    /// Raw observations.
+    pub obs_stats: RunningStats,
+    /// Changes of the proposed state.
+    pub change_stats: RunningStats,
+    /// Discounted returns.
+    pub return_stats: RunningStats,
+}
+
+impl Worker {
+    /// Appends what was collected to `numbers`: each list by its length and its entries, narrow ones in pairs.
+    pub fn carry(&self, numbers: &mut Vec<f64>) {
+        let (s, t) = (&self.segment, &self.tally);
+        for list in narrow(s) {
+            push(numbers, pairs(list));
+        }
+        push(numbers, s.reward.iter().copied());
+        for list in [&s.terminated, &s.truncated] {
+            push(numbers, list.iter().map(|&bit| f64::from(u8::from(bit))));
+        }
+        push(numbers, s.final_x.iter().map(|(t, _)| *t as f64));
+        push(numbers, s.final_x.iter().flat_map(|(_, x)| x).map(|&x| f64::from(x)));
+        push(numbers, t.episodes.iter().flat_map(|&(total, length)| [total, length as f64]));
+        push(numbers, t.costs.iter().copied());
+        let Tally { ticks, raw_violations, recovering, projected_violations, moved, .. } = *t;
+        let Tally { avoided, active_rows, reached_violations, faults, .. } = *t;
+        let counts = [ticks, raw_violations, recovering, projected_violations, moved];
+        let more = [avoided, active_rows, reached_violations, faults];
+        push(numbers, counts.into_iter().chain(more).map(|n| n as f64));
+        push(numbers, [t.distance, t.residual].into_iter());
+        for stats in [&self.obs_stats, &self.change_stats, &self.return_stats] {
+            push(numbers, stats.to_vec().into_iter());
+        }
+    }
+}
+
+impl Carried {
+    /// The inverse of [`Worker::carry`] for `n_steps` steps of these sizes; `None` for numbers of any other shape.
+    pub fn read(mut numbers: &[f64], sizes: Layout, n_steps: usize) -> Option<Self> {
+        let Layout { n_obs, n_state, n_act } = sizes;
+        let from = &mut numbers;
+        let mut s = Segment::default();
+        let widths = [n_obs, n_state, n_state, n_state, n_state, n_state, n_act, n_act, 1];
+        for (list, width) in narrow_mut(&mut s).into_iter().zip(widths) {
+            let length = n_steps * width;
+            list.extend(exactly(from, length.div_ceil(2))?.iter().flat_map(|&pair| split(pair)).take(length));
+        }
+        s.reward.extend_from_slice(exactly(from, n_steps)?);
+        for list in [&mut s.terminated, &mut s.truncated] {
+            list.extend(exactly(from, n_steps)?.iter().map(|&bit| bit != 0.0));
+        }
+        let cuts = pull(from)?;
+        let final_x = exactly(from, cuts.len() * n_obs)?.chunks_exact(n_obs.max(1));
+        for (&t, x) in cuts.iter().zip(final_x) {
+            s.final_x.push((t as usize, x.iter().map(|&x| x as f32).collect()));
+        }
+        let (episodes, costs) = (pull(from)?.as_chunks::<2>().0, pull(from)?);
+        let counts = exactly(from, 9)?;
+        let &[distance, residual] = exactly(from, 2)? else { return None };
+        let count = |i: usize| counts[i] as u64;
+        let tally = Tally {
+            episodes: episodes.iter().map(|&[total, length]| (total, length as usize)).collect(),
+            costs: costs.to_vec(),
+            ticks: count(0),
+            raw_violations: count(1),
+            recovering: count(2),
+            projected_violations: count(3),
+            moved: count(4),
+            avoided: count(5),
+            active_rows: count(6),
+            reached_violations: count(7),
+            faults: count(8),
+            distance,
+            residual,
+        };
+        let mut stats = |n: usize| {
+            let mut stats = RunningStats::new(n);
+            stats.set(exactly(from, 2 * n + 1)?);
+            Some(stats)
+        };
+        let (obs_stats, change_stats, return_stats) = (stats(n_obs)?, stats(n_state)?, stats(1)?);
+        let cuts_fit = s.final_x.iter().all(|(t, _)| *t < n_steps);
+        (from.is_empty() && cuts_fit).then_some(Self {
+            segment: s,
+            tally,
+            obs_stats,
+            change_stats,
+            return_stats,
+        })
+    }
+}
+
+fn narrow(s: &Segment) -> [&[f32]; 9] {
+    let Segment { x, change, target_change, lower, upper, reached, sampled, action, log_prob, .. } = s;
+    [x, change, target_change, lower, upper, reached, sampled, action, log_prob]
+}
+
+fn narrow_mut(s: &mut Segment) -> [&mut Vec<f32>; 9] {
+    let Segment { x, change, target_change, lower, upper, reached, sampled, action, log_prob, .. } = s;
+    [x, change, target_change, lower, upper, reached, sampled, action, log_prob]
+}
+
+/// Two narrow numbers in the place of a wide one, bit by bit.
+fn pairs(list: &[f32]) -> impl Iterator<Item = f64> {
+    let bits = |x: Option<&f32>| u64::from(x.map_or(0, |x| x.to_bits()));
+    list.chunks(2).map(move |pair| f64::from_bits(bits(pair.first()) | bits(pair.get(1)) << 32))
+}
+
+fn split(pair: f64) -> [f32; 2] {
+    let bits = pair.to_bits();
+    [f32::from_bits(bits as u32), f32::from_bits((bits >> 32) as u32)]
+}
+
+fn push(numbers: &mut Vec<f64>, list: impl Iterator<Item = f64>) {
+    let place = numbers.len();
+    numbers.push(0.0);
+    numbers.extend(list);
+    numbers[place] = (numbers.len() - place - 1) as f64;
+}
+
+/// The next list.
+fn pull<'a>(from: &mut &'a [f64]) -> Option<&'a [f64]> {
+    let (&length, rest) = from.split_first()?;
+    let (list, rest) = rest.split_at_checked(length as usize)?;
+    *from = rest;
+    Some(list)
+}
+
+/// The next list, of `length` entries.
+fn exactly<'a>(from: &mut &'a [f64], length: usize) -> Option<&'a [f64]> {
+    pull(from).filter(|list| list.len() == length)
+}

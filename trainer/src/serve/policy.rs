@@ -1,0 +1,111 @@
+//! The policies a server acts by: its own, and for those who learn the one that was pushed last.
+
+use nearl_runtime::link::{SnapshotBytes, Verdict};
+use nearl_runtime::net::Dense;
+use nearl_runtime::rollout_protocol::Request;
+use nearl_runtime::{Controller, Manifest, Networks, Snapshot, SnapshotError};
+use serde_json::Value;
+use std::sync::Arc;
+
+pub(super) struct Policies {
+    own: Arc<Snapshot>,
+    pushed: Option<(u64, Arc<Snapshot>)>,
+    /// What a pushed snapshot must share with the server's own.
+    task: Value,
+}
+
+impl Policies {
+    pub(super) fn new(own: &Snapshot) -> Policies {
+        Policies { task: shared(&own.manifest), own: Arc::new(own.clone()), pushed: None }
+    }
+
+    /// The policy of a request; one sentence if the server does not have it.
+    pub(super) fn find(&self, request: &Request) -> Result<Arc<Snapshot>, String> {
+        let own = self.own.manifest.version;
+        let Some(version) = request.version else { return Ok(Arc::clone(&self.own)) };
+        match &self.pushed {
+            Some((pushed, snapshot)) if request.training.is_some() && *pushed == version => {
+                Ok(Arc::clone(snapshot))
+            }
+            Some((pushed, _)) if request.training.is_some() => {
+                Err(format!("version {pushed} was pushed last, not {version}: push before each request"))
+            }
+            None if request.training.is_some() => {
+                Err(format!("no version was pushed to the server, but {version} is asked for: push it first"))
+            }
+            _ if version == own => Ok(Arc::clone(&self.own)),
+            _ => Err(format!(
+                "the server has version {own} of the policy, not {version}: ask for that or for the current one"
+            )),
+        }
+    }
+
+    /// The version that [`Policies::find`] gives.
+    pub(super) fn version(&self, request: &Request) -> u64 {
+        request.version.unwrap_or(self.own.manifest.version)
+    }
+
+    /// Takes a snapshot of the server's own task.
+    pub(super) fn push(&mut self, bytes: &SnapshotBytes) -> Result<(), (Verdict, String)> {
+        let snapshot = Snapshot::from_bytes(&bytes.bytes).map_err(refused)?;
+        if let Some(section) = difference(&self.task, &shared(&snapshot.manifest)) {
+            let task = &self.own.manifest.task.name;
+            return Err((
+                Verdict::ForeignRobot,
+                format!(
+                    "it differs from the server's task '{task}' in {section}: train with the task that is served, or serve the other"
+                ),
+            ));
+        }
+        let has_shape = |known: &(u64, Arc<Snapshot>)| has_shape(&known.1, &snapshot);
+        if !self.pushed.as_ref().is_some_and(has_shape) {
+            Controller::new(&snapshot).map_err(refused)?;
+        }
+        self.pushed = Some((bytes.header.version, Arc::new(snapshot)));
+        Ok(())
+    }
+}
+
+fn refused(e: SnapshotError) -> (Verdict, String) {
+    let verdict = match e {
+        SnapshotError::Shape { .. } | SnapshotError::MissingTensor { .. } => Verdict::ForeignShape,
+        SnapshotError::Value { .. } | SnapshotError::Canary { .. } => Verdict::NotFinite,
+        SnapshotError::Unusable { .. } => Verdict::Other,
+        _ => Verdict::Corrupt,
+    };
+    (verdict, e.to_string())
+}
+
+/// The task without the learner's settings, and the robot.
+fn shared(manifest: &Manifest) -> Value {
+    let mut task = serde_json::to_value(&manifest.task).unwrap_or_default();
+    if let Value::Object(sections) = &mut task {
+        sections.remove("train");
+        sections.insert("robot file".into(), manifest.model.clone().into());
+    }
+    task
+}
+
+/// The first section in which two tasks differ.
+fn difference(a: &Value, b: &Value) -> Option<String> {
+    let (Value::Object(a), Value::Object(b)) = (a, b) else { return Some("its form".into()) };
+    let all = a.keys().chain(b.keys());
+    let section = all.into_iter().find(|key| a.get(*key) != b.get(*key))?;
+    Some(if section.contains(' ') { format!("the {section}") } else { format!("[{section}]") })
+}
+
+/// True if a controller of `known` can take the networks of `new`.
+fn has_shape(known: &Snapshot, new: &Snapshot) -> bool {
+    let layers = |net: &Dense| net.layers.iter().map(|l| (l.n_in, l.n_out)).collect::<Vec<_>>();
+    let shape = |n: &Networks| {
+        let lists = [
+            n.normaliser.mean.len(),
+            n.normaliser.std.len(),
+            n.normaliser.scale.len(),
+            n.policy_log_std.len(),
+        ];
+        (lists, layers(&n.policy), n.idm.as_ref().map(|(net, log_std)| (layers(net), log_std.len())))
+    };
+    let (a, b) = (&known.manifest, &new.manifest);
+    (a.policy, a.activation) == (b.policy, b.activation) && shape(&known.networks) == shape(&new.networks)
+}

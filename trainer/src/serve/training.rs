@@ -1,0 +1,107 @@
+//! A client that learns: its environments go on from one of its requests to the next.
+
+use super::pool::{Start, Task, Work};
+use crate::rollout::Worker;
+use nearl_runtime::Snapshot;
+use nearl_runtime::rollout_protocol::{Constraints, Request, Training};
+use std::sync::Arc;
+
+/// The environments of one client.
+pub(super) struct Session {
+    places: Vec<Place>,
+    /// The networks they act by.
+    snapshot: Arc<Snapshot>,
+    n_steps: usize,
+    /// What the environments that have none yet begin with.
+    start: Start,
+}
+
+/// One environment with its share of the request under way.
+struct Place {
+    stage: Stage,
+    worker: Option<Box<Worker>>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Stage {
+    /// So many steps are left.
+    Left(usize),
+    /// A portion is being simulated, and so many steps are left after it.
+    AtWork(usize),
+    /// All steps were simulated.
+    Collected,
+    /// And handed out.
+    Carried,
+}
+
+impl Session {
+    /// Environments that begin with `request`.
+    pub(super) fn begin(request: &Request, training: &Training, snapshot: Arc<Snapshot>) -> Session {
+        let n_steps = usize::try_from(request.n_steps).unwrap_or(usize::MAX);
+        let places = (0..training.n_envs).map(|_| Place { stage: Stage::Left(n_steps), worker: None });
+        let Training { stream, gamma, moved_penalty, .. } = *training;
+        let projection = request.constraints != Constraints::Off;
+        let start = Start { seed: request.seed, stream, projection, gamma, moved_penalty };
+        Session { places: places.collect(), snapshot, n_steps, start }
+    }
+
+    /// Goes on with `request`.
+    pub(super) fn go_on(&mut self, request: &Request, snapshot: Arc<Snapshot>) {
+        self.snapshot = snapshot;
+        self.n_steps = usize::try_from(request.n_steps).unwrap_or(usize::MAX);
+        self.places.iter_mut().for_each(|place| place.stage = Stage::Left(self.n_steps));
+    }
+
+    /// Environments.
+    pub(super) fn n_envs(&self) -> usize {
+        self.places.len()
+    }
+
+    /// True while an environment waits for its next portion.
+    pub(super) fn wants(&self) -> bool {
+        self.places.iter().any(|p| matches!(p.stage, Stage::Left(_)))
+    }
+
+    /// The next portion, of the first environment that waits for one: the first are done, and sent, while the last are simulated.
+    pub(super) fn task(&mut self, slot: u64, rows: usize) -> Option<Task> {
+        let i = self.places.iter().position(|p| matches!(p.stage, Stage::Left(_)))?;
+        let place = &mut self.places[i];
+        let Stage::Left(left) = place.stage else { return None };
+        let rows = rows.min(left);
+        place.stage = Stage::AtWork(left - rows);
+        let begins = left == self.n_steps;
+        let work = Work::Segment {
+            snapshot: Arc::clone(&self.snapshot),
+            begins: begins.then_some(self.n_steps),
+            start: Start { stream: self.start.stream + i as u64, ..self.start },
+        };
+        Some(Task { slot, place: Some(i), worker: place.worker.take(), rows, work })
+    }
+
+    /// Takes the worker back after its portion.
+    pub(super) fn take_back(&mut self, place: usize, worker: Box<Worker>) {
+        let place = &mut self.places[place];
+        place.worker = Some(worker);
+        place.stage = match place.stage {
+            Stage::AtWork(0) => Stage::Collected,
+            Stage::AtWork(left) => Stage::Left(left),
+            other => other,
+        };
+    }
+
+    /// What the next environment that is done collected: its number, how many numbers follow, and these.
+    pub(super) fn carry(&mut self) -> Option<Vec<f64>> {
+        let i = self.places.iter().position(|p| p.stage == Stage::Collected)?;
+        let place = &mut self.places[i];
+        place.stage = Stage::Carried;
+        let mut numbers = vec![i as f64, 0.0];
+        place.worker.as_ref()?.carry(&mut numbers);
+        numbers[1] = (numbers.len() - 2) as f64;
+        Some(numbers)
+    }
+
+    /// True once everything was handed out.
+    pub(super) fn is_over(&self) -> bool {
+        self.places.iter().all(|p| p.stage == Stage::Carried)
+    }
+}
