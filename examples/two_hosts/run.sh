@@ -9,6 +9,7 @@ set -eu
 cd "$(dirname "$0")/../.."
 nearl=$PWD/target/release/nearl
 out=$PWD/runs/two_hosts
+pace=${PACE:---lockstep} # PACE="--priority 40": in real time, where the system allows a real-time priority
 seconds=${SECONDS_OF_FLIGHT:-60} # of flight; learning takes about half of it
 command -v iox2-link-tunnel-zenoh >/dev/null || { echo "iox2-link-tunnel-zenoh was not found: install it as the head of this file says, and put it on the PATH" >&2; exit 1; }
 [ "$(id -u)" = 0 ] || { echo "namespaces need root: run this with sudo" >&2; exit 1; }
@@ -30,7 +31,7 @@ robot ip addr add 10.77.0.1/24 dev nearl-a; robot ip link set nearl-a up
 trainer ip addr add 10.77.0.2/24 dev nearl-b; trainer ip link set nearl-b up
 
 # robot: the arm, its loop, and the tunnel that waits
-robot "$nearl" plant Panda-reach --name arm --lockstep --seconds "$((seconds + 3))" --json > "$out/plant.json" &
+robot "$nearl" plant Panda-reach --name arm $pace --seconds "$((seconds + 3))" --json > "$out/plant.json" &
 plant=$!
 robot "$nearl" run examples/snapshots/panda-reach.safetensors --plant arm --explore 0 --rollback-factor 5 --seconds "$seconds" --json > "$out/loop.json" &
 loop=$!

@@ -22,7 +22,14 @@ struct Outcome {
 }
 
 fn run(seed: u64, projection: bool, ticks: usize) -> Outcome {
-    let snapshot = random_policy("Panda-reach", seed, 3.0);
+    run_at(seed, projection, ticks, 0.001)
+}
+
+/// With a control period of `dt` [s].
+fn run_at(seed: u64, projection: bool, ticks: usize, dt: f64) -> Outcome {
+    let mut snapshot = random_policy("Panda-reach", seed, 3.0);
+    let time = &mut snapshot.manifest.task.time;
+    (time.dt, time.sim_dt) = (dt, dt);
     let mut env = make_env(&snapshot).expect("environment");
     let mut controller = Controller::new(&snapshot).expect("controller");
     controller.set_projection(projection);
@@ -69,6 +76,15 @@ fn a_random_network_breaks_no_limit_of_the_panda() {
             (0, 0),
             "seed {seed}: every target is certified and none needed the joints' own brakes"
         );
+    }
+}
+
+/// What is simulated has the period that the constraints reckon with.
+#[test]
+fn another_rate_breaks_none_either() {
+    for dt in [0.002, 0.0005, 0.0001] {
+        let o = run_at(3, true, TICKS / 5, dt);
+        assert_eq!((o.position, o.velocity, o.torque), (0, 0, 0), "{dt} s: worst excess {:e}", o.worst);
     }
 }
 

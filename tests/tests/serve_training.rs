@@ -160,6 +160,29 @@ fn what_cannot_be_collected_is_refused_by_name() {
 }
 
 #[test]
+fn a_busy_server_is_asked_again() {
+    let asked = request("Hopper-v5", "ppo", 0, 1, &SMALL);
+    let server = Serving::start("collect-busy", Run::new(&asked).expect("training").snapshot().clone());
+    let mut run = Run::on(&asked, &server.experience()).expect("a server");
+    let mut clients: Vec<RolloutClient> = (0..8).map(|_| server.client()).collect();
+    let taken: Vec<Rollouts> = clients
+        .iter_mut()
+        .map(|client| {
+            let mut rollouts = client.request(&Request::new(1, 2000)).expect("request");
+            rollouts.next(PATIENCE).expect("chunk").expect("chunk");
+            rollouts
+        })
+        .collect();
+    let over = std::thread::spawn(move || {
+        std::thread::sleep(Duration::from_millis(200));
+        drop(taken);
+    });
+    trace(&mut run, 2);
+    over.join().expect("the places are free again");
+    assert!(server.end().busy >= 1);
+}
+
+#[test]
 fn a_server_that_ends_keeps_what_was_learned() {
     let asked = request("Hopper-v5", "ppo", 0, 1, &SMALL);
     let server = Serving::start("collect-ends", Run::new(&asked).expect("training").snapshot().clone());

@@ -233,15 +233,30 @@ pub struct Entry {
     /// What it is, in one line.
     pub about: &'static str,
     build: fn() -> Result<Box<dyn Env>, EnvError>,
+    /// The same with a control period of one physics step of any length [s], where the task allows it.
+    build_at: Option<fn(f64) -> Result<Box<dyn Env>, EnvError>>,
+}
+
+impl Entry {
+    const fn fixed(
+        name: &'static str,
+        about: &'static str,
+        build: fn() -> Result<Box<dyn Env>, EnvError>,
+    ) -> Entry {
+        Entry { name, about, build, build_at: None }
+    }
 }
 
 /// Every task.
 pub const REGISTRY: &[Entry] = &[
-    Entry { name: half_cheetah::NAME, about: half_cheetah::ABOUT, build: half_cheetah::build },
-    Entry { name: hopper::NAME, about: hopper::ABOUT, build: hopper::build },
-    Entry { name: walker2d::NAME, about: walker2d::ABOUT, build: walker2d::build },
-    Entry { name: ant::NAME, about: ant::ABOUT, build: ant::build },
-    Entry { name: panda_reach::NAME, about: panda_reach::ABOUT, build: panda_reach::build },
+    Entry::fixed(half_cheetah::NAME, half_cheetah::ABOUT, half_cheetah::build),
+    Entry::fixed(hopper::NAME, hopper::ABOUT, hopper::build),
+    Entry::fixed(walker2d::NAME, walker2d::ABOUT, walker2d::build),
+    Entry::fixed(ant::NAME, ant::ABOUT, ant::build),
+    Entry {
+        build_at: Some(panda_reach::build_at),
+        ..Entry::fixed(panda_reach::NAME, panda_reach::ABOUT, panda_reach::build)
+    },
 ];
 
 /// Names of all tasks.
@@ -254,10 +269,12 @@ pub fn names() -> impl Iterator<Item = &'static str> {
 /// # Errors
 /// [`EnvError::Unknown`] with the names that look alike; [`EnvError::Physics`] when its robot does not compile.
 pub fn make(name: &str) -> Result<Box<dyn Env>, EnvError> {
-    match REGISTRY.iter().find(|entry| entry.name == name) {
-        Some(entry) => (entry.build)(),
-        None => Err(EnvError::Unknown { name: name.to_owned(), near: near_names(name) }),
-    }
+    (entry(name)?.build)()
+}
+
+fn entry(name: &str) -> Result<&'static Entry, EnvError> {
+    let unknown = || EnvError::Unknown { name: name.to_owned(), near: near_names(name) };
+    REGISTRY.iter().find(|entry| entry.name == name).ok_or_else(unknown)
 }
 
 /// Makes the environment of a task file: the user's own if it has a `[reward]` (`text` is its robot, MJCF), else the native one
@@ -278,7 +295,28 @@ pub fn of_task(task: &Task, text: &str, origin: &str) -> Result<Box<dyn Env>, En
         let reason = "only a task with its own [reward] has it, the native environments bring theirs; add [reward] or take it out";
         return Err(EnvError::Task { origin: origin.into(), key: (*key).into(), reason: reason.into() });
     }
-    user::with_cost(make(task.env.as_deref().unwrap_or(&task.name))?, task, origin)
+    let (entry, time) = (entry(task.env.as_deref().unwrap_or(&task.name))?, &task.time);
+    let env = match entry.build_at {
+        Some(build_at) if time.dt == time.sim_dt => build_at(time.dt)?,
+        _ => (entry.build)()?,
+    };
+    check_time(task, env.spec(), origin)?;
+    user::with_cost(env, task, origin)
+}
+
+/// The constraints reckon with the task's periods: what is simulated must have them.
+fn check_time(task: &Task, spec: &Spec, origin: &str) -> Result<(), EnvError> {
+    let time = &task.time;
+    let differs = |given: f64, own: f64| (given - own).abs() > 1e-12;
+    let (key, given, own) = if differs(time.dt, spec.dt) {
+        ("time.dt", time.dt, spec.dt)
+    } else if time.sim_dt != 0.0 && differs(time.sim_dt, spec.sim_dt) {
+        ("time.sim_dt", time.sim_dt, spec.sim_dt)
+    } else {
+        return Ok(());
+    };
+    let reason = format!("{given} s, but the environment '{}' simulates {own} s; write that", spec.name);
+    Err(EnvError::Task { origin: origin.into(), key: key.into(), reason })
 }
 
 fn near_names(name: &str) -> Vec<&'static str> {

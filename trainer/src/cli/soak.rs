@@ -56,7 +56,7 @@ pub(super) struct Soak {
     /// Folder for snapshot, flight log and report.
     #[arg(long, default_value = "soak")]
     out: PathBuf,
-    /// Do not write and replay a flight log (5.6 kB a tick).
+    /// Do not write and replay a flight log (3.2 kB a tick).
     #[arg(long)]
     no_log: bool,
     /// Print JSON.

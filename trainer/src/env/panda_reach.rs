@@ -1,7 +1,7 @@
 //! Panda-reach: bring a torque-controlled arm's hand to a goal and hold it there, against gravity.
 //!
 //! The action is the seven joint torques \[N·m\], clamped at the robot file's effort limits. One physics step is one control
-//! period of 1 ms, and damping is integrated explicitly, so inside the joint stops
+//! period, 1 ms unless the task file says otherwise, and damping is integrated explicitly, so inside the joint stops
 //!
 //! `v' = v + dt a`, `q' = q + dt v'`, `M(q) a = action - nle(q, v) - D v`
 //!
@@ -31,7 +31,10 @@ const ROBOT: Robot = Robot {
     format: ModelFormat::Urdf,
 };
 const HAND: &str = "panda_hand";
+/// Control period, unless the task file has another [s].
 const DT: f64 = 1e-3;
+/// Length of an episode [s].
+const EPISODE: f64 = 2.0;
 /// Pose to start from \[rad\]: elbow bent, hand in front of the base and pointing down.
 const READY: [f64; 7] = [
     0.0,
@@ -62,8 +65,13 @@ struct PandaReach {
 }
 
 pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
+    build_at(DT)
+}
+
+/// With another control period [s]; its episodes last as long.
+pub(super) fn build_at(dt: f64) -> Result<Box<dyn Env>, EnvError> {
     let physics = |source| EnvError::Physics { task: NAME.into(), source };
-    let options = Options { sim_dt: Some(DT), without_contacts: true, explicit_damping: true };
+    let options = Options { sim_dt: Some(dt), without_contacts: true, explicit_damping: true };
     let model = Model::from_text(&ROBOT.text, ROBOT.format, options).map_err(physics)?;
     let joints = model.joints();
     let expected = READY.len();
@@ -76,7 +84,8 @@ pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
     }
     let mut names = joint_names(&model, 0);
     names.extend(["goal.x", "goal.y", "goal.z", "error.x", "error.y", "error.z"].map(String::from));
-    let task = Constants { name: NAME.into(), sub_steps: 1, max_episode_steps: 2000 };
+    let max_episode_steps = (EPISODE / dt).round() as usize;
+    let task = Constants { name: NAME.into(), sub_steps: 1, max_episode_steps };
     let spec = Spec::new(&model, task, names, joints.iter().map(torque).collect());
     let ranges =
         std::array::from_fn(|j| [joints[j].range[0] + LIMIT_MARGIN, joints[j].range[1] - LIMIT_MARGIN]);

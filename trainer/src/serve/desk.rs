@@ -129,9 +129,9 @@ impl Desk {
         if training.begins {
             return Ok(Subject::Training(Session::begin(request, training, policy)));
         }
-        let session = self.sessions.remove(&caller.client());
-        let Some(mut session) = session.filter(|s| s.n_envs() as u64 == training.n_envs) else {
-            let n_envs = training.n_envs;
+        let (client, n_envs) = (caller.client(), training.n_envs);
+        let fits = self.sessions.get(&client).is_some_and(|s| s.n_envs() as u64 == n_envs);
+        let Some(mut session) = fits.then(|| self.sessions.remove(&client)).flatten() else {
             return Err((
                 Answer::BadRequest,
                 format!("this client has no training of {n_envs} environments to go on with: begin one"),

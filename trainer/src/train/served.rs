@@ -10,7 +10,7 @@ use crate::settings::TrainSettings;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{LinkError, RobotName, TrainerLink, Verdict};
 use nearl_runtime::rollout_protocol::{
-    Constraints, Layout, Request, RequestError, RolloutClient, Rollouts, Training,
+    Answer, Constraints, Layout, Request, RequestError, RolloutClient, Training,
 };
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,6 +18,8 @@ use std::time::{Duration, Instant};
 
 /// Longest wait for the server, and longest silence of it.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// Pause before a server that was busy is asked again.
+const BUSY: Duration = Duration::from_millis(20);
 /// Between two looks whether a stop was asked for.
 const LOOK: Duration = Duration::from_millis(100);
 
@@ -97,12 +99,19 @@ impl ServedSource {
     fn fill(&mut self, snapshot: &Snapshot) -> Result<bool, ServedError> {
         self.version += 1;
         self.link.push(self.version, &snapshot.to_bytes())?;
-        let (version, training) = (Some(self.version), Some(self.training));
-        let mut answers = self.client.request(&Request { version, training, ..self.request })?;
-        let numbers = match self.receive(&mut answers) {
-            Ok(Some(numbers)) => numbers,
-            Ok(None) => return Ok(false),
-            Err(e) => return Err(self.refusal().unwrap_or(e)),
+        let begin = Instant::now();
+        let numbers = loop {
+            match self.ask() {
+                Ok(Some(numbers)) => break numbers,
+                Ok(None) => return Ok(false),
+                // Others have taken all places for now.
+                Err(ServedError::Request(RequestError::Refused { answer: Answer::Busy, .. }))
+                    if begin.elapsed() < PATIENCE && !self.is_stopped() =>
+                {
+                    std::thread::sleep(BUSY);
+                }
+                Err(e) => return Err(self.refusal().unwrap_or(e)),
+            }
         };
         self.collected = self.read(&numbers)?;
         self.training.begins = false;
@@ -110,7 +119,9 @@ impl ServedSource {
     }
 
     /// Every number of the answer; `None` if a stop came first.
-    fn receive(&self, answers: &mut Rollouts) -> Result<Option<Vec<f64>>, ServedError> {
+    fn ask(&mut self) -> Result<Option<Vec<f64>>, ServedError> {
+        let (version, training) = (Some(self.version), Some(self.training));
+        let mut answers = self.client.request(&Request { version, training, ..self.request })?;
         let (mut numbers, mut heard) = (Vec::new(), Instant::now());
         loop {
             match answers.next_part(LOOK) {
