@@ -226,23 +226,22 @@ fn nearest(near: &[&str]) -> String {
     }
 }
 
+/// A task, or why there is none.
+type Made = Result<Box<dyn Env>, EnvError>;
+
 /// A task that can be made by name.
 pub struct Entry {
     /// Its name.
     pub name: &'static str,
     /// What it is, in one line.
     pub about: &'static str,
-    build: fn() -> Result<Box<dyn Env>, EnvError>,
+    build: fn() -> Made,
     /// The same with a control period of one physics step of any length [s], where the task allows it.
-    build_at: Option<fn(f64) -> Result<Box<dyn Env>, EnvError>>,
+    build_at: Option<fn(f64) -> Made>,
 }
 
 impl Entry {
-    const fn fixed(
-        name: &'static str,
-        about: &'static str,
-        build: fn() -> Result<Box<dyn Env>, EnvError>,
-    ) -> Entry {
+    const fn fixed(name: &'static str, about: &'static str, build: fn() -> Made) -> Entry {
         Entry { name, about, build, build_at: None }
     }
 }
