@@ -141,14 +141,12 @@ fn hot_swap_changes_the_version_between_two_ticks() {
         let receipt = trainer.wait_for_receipt(version, PATIENCE).unwrap();
         assert_eq!(receipt.verdict(), Verdict::Accepted, "{}", receipt.text());
     }
-    let drops: Vec<_> = running.drops.try_iter().collect();
-    assert_eq!(
-        drops.iter().map(|d| d.0).collect::<Vec<_>>(),
-        [1, 2, 3, 4],
-        "the one before is kept, the one before that is dropped at once"
-    );
-    let io_thread = drops[0].1;
-    assert!(drops.iter().all(|d| d.1 == io_thread), "all by the one thread that is not the loop");
+    let drops: Vec<_> = (0..4).map(|_| running.drops.recv_timeout(PATIENCE).unwrap()).collect();
+    let versions: Vec<_> = drops.iter().map(|d| d.0).collect();
+    assert_eq!(versions, [1, 2, 3, 4], "the one before is kept, the one before that is dropped");
+    assert!(running.drops.try_recv().is_err(), "the one before is kept");
+    let builder = drops[0].1;
+    assert!(drops.iter().all(|d| d.1 == builder), "all by the one thread that has the time");
     let report = running.end();
     let (plant, _) = plant.end();
     assert_eq!(report.counters.swaps, 5);
