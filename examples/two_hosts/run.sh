@@ -21,7 +21,7 @@ host() { # a namespace that lives until the script ends
 }
 host; holder_a=$!
 host; holder_b=$!
-trap 'kill $holder_a $holder_b' EXIT # and with them whatever runs in their namespaces
+trap 'kill -KILL $holder_a $holder_b' EXIT # `unshare` waits through SIGTERM; with it ends whatever runs in its namespaces
 sleep 1
 a=$(pgrep -P $holder_a) b=$(pgrep -P $holder_b)
 ip link add nearl-a netns "$a" type veth peer name nearl-b netns "$b"
