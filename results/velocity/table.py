@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nearl.curves import interquartile_mean
 from nearl.report.sweep import read_sweep
 
 WAYS = {
@@ -23,12 +24,6 @@ COLUMNS = {
     "residual": "idm/residual",
     "idm_mse": "idm/mse_after",
 }
-
-
-def iqm(values: list[float]) -> float:
-    """Mean of the middle half; each end of three values counts a quarter."""
-    x = np.sort(np.repeat(values, 4))
-    return float(np.mean(x[len(x) // 4 : len(x) - len(x) // 4]))
 
 
 def main(runs: Path, folder: Path) -> None:
@@ -48,7 +43,7 @@ def main(runs: Path, folder: Path) -> None:
 
     def cell(way: str, task: str, name: str) -> str:
         values = [float(r[name]) for r in rows if (r["way"], r["task"]) == (way, task) and r[name]]
-        return f"{iqm(values):.4g} ({min(values):.3g} .. {max(values):.3g})" if values else ""
+        return f"{interquartile_mean(values):.4g} ({min(values):.3g} .. {max(values):.3g})" if values else ""
 
     lines = ["| task | | " + " | ".join(COLUMNS) + " |", "|---|---|" + "---|" * len(COLUMNS)]
     for task in sorted({r["task"] for r in rows}):
