@@ -1,6 +1,7 @@
 //! Slices and texts of messages. A peer may send any number as a length, so every length is clamped to the capacity.
 
 use super::messages::*;
+use crate::snapshot::SnapshotError;
 
 macro_rules! slices {
     ($message:ident { $($get:ident, $get_mut:ident : $field:ident [$count:ident];)* }) => {
@@ -113,6 +114,19 @@ crate::codes::codes! {
 }
 
 impl Verdict {
+    /// What a refusal of the bytes themselves amounts to.
+    pub fn of(error: &SnapshotError) -> Verdict {
+        match error {
+            SnapshotError::Malformed { .. }
+            | SnapshotError::Digest { .. }
+            | SnapshotError::Foreign { .. }
+            | SnapshotError::MissingTensor { .. } => Verdict::Corrupt,
+            SnapshotError::Shape { .. } => Verdict::ForeignShape,
+            SnapshotError::Value { .. } | SnapshotError::Canary { .. } => Verdict::NotFinite,
+            _ => Verdict::Other,
+        }
+    }
+
     /// The verdict of a message; numbers this build does not know are `Other`.
     pub fn from_code(code: u32) -> Verdict {
         Verdict::ALL.get(code as usize).copied().unwrap_or(Verdict::Other)
@@ -120,6 +134,14 @@ impl Verdict {
 }
 
 impl ReceiptMessage {
+    /// The answer to the snapshot with `header`.
+    pub(crate) fn answer(header: &SnapshotHeader, verdict: Verdict, text: &str) -> ReceiptMessage {
+        let mut receipt = <ReceiptMessage as super::Message>::zeroed();
+        (receipt.trainer_epoch, receipt.version) = (header.header.epoch, header.version);
+        receipt.set(verdict, text);
+        receipt
+    }
+
     /// The verdict.
     pub fn verdict(&self) -> Verdict {
         Verdict::from_code(self.verdict)

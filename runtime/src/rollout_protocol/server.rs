@@ -80,10 +80,7 @@ impl RolloutServer {
 
     /// Answers a snapshot.
     pub fn receipt(&mut self, header: &SnapshotHeader, verdict: Verdict, text: &str) {
-        let mut receipt = ReceiptMessage::zeroed();
-        (receipt.trainer_epoch, receipt.version) = (header.header.epoch, header.version);
-        receipt.set(verdict, text);
-        self.receipts.send(&mut receipt);
+        self.receipts.send(&mut ReceiptMessage::answer(header, verdict, text));
     }
 
     /// The next request, whatever its bytes are; those whose client no longer waits are left out.

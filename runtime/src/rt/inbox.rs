@@ -1,9 +1,7 @@
 //! Snapshots on their way into the loop: from bytes to a built controller to the swap, with one receipt for each. The
 //! one before is kept and swapped back in when the robot no longer gets where the targets say.
 
-use crate::link::{
-    Message, ReceiptMessage, RobotMessage, RuntimeLink, SnapshotBytes, SnapshotHeader, Verdict,
-};
+use crate::link::{ReceiptMessage, RobotMessage, RuntimeLink, SnapshotBytes, SnapshotHeader, Verdict};
 use crate::log::LogQueue;
 use crate::rt::build::{Builder, Built};
 use crate::rt::core::Loaded;
@@ -208,10 +206,7 @@ fn supersede(link: &mut RuntimeLink, header: &SnapshotHeader) {
 }
 
 fn reply(link: &mut RuntimeLink, header: &SnapshotHeader, tick: u64, verdict: Verdict, text: &str) {
-    let mut receipt = ReceiptMessage::zeroed();
-    receipt.trainer_epoch = header.header.epoch;
-    receipt.version = header.version;
+    let mut receipt = ReceiptMessage::answer(header, verdict, text);
     receipt.tick = tick;
-    receipt.set(verdict, text);
     link.send_receipt(&mut receipt);
 }

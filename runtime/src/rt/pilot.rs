@@ -38,7 +38,7 @@ pub struct Pilot {
 impl Pilot {
     /// Builds and validates the controller of `snapshot` for `robot`. Allocates and parses the robot file.
     pub fn new(snapshot: &Snapshot, robot: &RobotMessage) -> Result<Pilot, Refusal> {
-        let refuse = |error: SnapshotError| Refusal { verdict: verdict(&error), text: error.to_string() };
+        let refuse = |error: SnapshotError| Refusal { verdict: Verdict::of(&error), text: error.to_string() };
         let controller = Controller::new(snapshot).map_err(refuse)?;
         compare(&describe_controller(&controller, &snapshot.manifest), robot)?;
         let layout = controller.layout();
@@ -297,7 +297,7 @@ impl Build for PilotBuilder {
 
     fn build(&mut self, snapshot: &SnapshotBytes, robot: &RobotMessage) -> Result<Pilot, Refusal> {
         let parsed = Snapshot::from_bytes(&snapshot.bytes);
-        let snapshot = parsed.map_err(|e| Refusal { verdict: verdict(&e), text: e.to_string() })?;
+        let snapshot = parsed.map_err(|e| Refusal { verdict: Verdict::of(&e), text: e.to_string() })?;
         Pilot::new(&snapshot, robot)
     }
 }
@@ -386,16 +386,4 @@ fn compare(own: &Robot, plant: &RobotMessage) -> Result<(), Refusal> {
         return refuse(Verdict::ForeignRobot, text.into());
     }
     Ok(())
-}
-
-fn verdict(error: &SnapshotError) -> Verdict {
-    match error {
-        SnapshotError::Malformed { .. }
-        | SnapshotError::Digest { .. }
-        | SnapshotError::Foreign { .. }
-        | SnapshotError::MissingTensor { .. } => Verdict::Corrupt,
-        SnapshotError::Shape { .. } => Verdict::ForeignShape,
-        SnapshotError::Value { .. } | SnapshotError::Canary { .. } => Verdict::NotFinite,
-        _ => Verdict::Other,
-    }
 }

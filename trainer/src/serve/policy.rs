@@ -67,13 +67,7 @@ impl Policies {
 }
 
 fn refused(e: SnapshotError) -> (Verdict, String) {
-    let verdict = match e {
-        SnapshotError::Shape { .. } | SnapshotError::MissingTensor { .. } => Verdict::ForeignShape,
-        SnapshotError::Value { .. } | SnapshotError::Canary { .. } => Verdict::NotFinite,
-        SnapshotError::Unusable { .. } => Verdict::Other,
-        _ => Verdict::Corrupt,
-    };
-    (verdict, e.to_string())
+    (Verdict::of(&e), e.to_string())
 }
 
 /// The task without the learner's settings, and the robot.
