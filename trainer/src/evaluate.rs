@@ -68,7 +68,7 @@ pub fn evaluate(
     };
     for _ in 0..episodes {
         let (ret, length) = worker.evaluate();
-        let t = &worker.tally;
+        let t = &worker.collected.tally;
         e.returns.push(ret);
         e.costs.extend_from_slice(&t.costs);
         e.lengths.push(length);

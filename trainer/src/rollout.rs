@@ -9,9 +9,8 @@ mod rows;
 mod segment;
 mod worker;
 
-pub use carried::Carried;
 pub use rows::{Period, Rows};
-pub use segment::{Segment, Tally};
+pub use segment::{Collected, Segment, Tally};
 pub use worker::Worker;
 
 use crate::env::{Env, EnvError};

@@ -11,7 +11,7 @@ pub use columns::COLUMNS;
 pub use run::{resume, resume_on, train, train_on};
 pub use served::{ServedError, ServedSource};
 pub use setup::complete;
-pub use source::{Experience, Gathered, Source, SourceError};
+pub use source::{Experience, Source, SourceError};
 
 use crate::checkpoint::CheckpointError;
 use crate::learn::{Batch, Dims, Learner, Metrics, advantages};
@@ -208,7 +208,7 @@ impl Training {
             return Ok(None);
         }
         let mut tally = Tally::default();
-        self.source.gathered().iter().for_each(|g| tally.add(g.tally));
+        self.source.gathered().iter().for_each(|g| tally.add(&g.tally));
         self.recent.extend_from_slice(&tally.episodes);
         let excess = self.recent.len().saturating_sub(100);
         self.recent.drain(..excess);
@@ -265,7 +265,7 @@ impl Training {
 
     /// What each environment collected last, in a fixed order.
     pub fn segments(&mut self) -> impl Iterator<Item = &Segment> {
-        self.source.gathered().into_iter().map(|g| g.segment)
+        self.source.gathered().into_iter().map(|g| &g.segment)
     }
 
     /// Seconds of training, those before a resume included.
@@ -280,9 +280,9 @@ impl Training {
 
     fn merge_statistics(&mut self) {
         for g in self.source.gathered() {
-            self.obs_stats.merge(g.obs_stats);
-            self.change_stats.merge(g.change_stats);
-            self.return_stats.merge(g.return_stats);
+            self.obs_stats.merge(&g.obs_stats);
+            self.change_stats.merge(&g.change_stats);
+            self.return_stats.merge(&g.return_stats);
         }
     }
 
@@ -307,7 +307,7 @@ impl Training {
         let scale = if self.settings.scale_reward { 1.0 / self.return_stats.std(1e-8)[0] } else { 1.0 };
         let mut cuts = Vec::new();
         for g in self.source.gathered() {
-            let s = g.segment;
+            let s = &g.segment;
             b.obs.extend_from_slice(&s.x);
             if proposes {
                 b.proposal.extend_from_slice(&s.change);

@@ -8,9 +8,9 @@ mod stream;
 pub use stream::{LeftOut, Stream};
 
 use crate::env::EnvError;
-use crate::rollout::{RolloutError, make_env};
+use crate::rollout::{Collected, RolloutError, make_env};
 use crate::settings::TrainSettings;
-use crate::train::{Gathered, Source, SourceError};
+use crate::train::{Source, SourceError};
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{LinkError, RobotName, TrainerLink, Verdict};
 use std::sync::Arc;
@@ -194,8 +194,8 @@ impl Source for LoopSource {
         Ok(self.fill(snapshot)?)
     }
 
-    fn gathered(&mut self) -> Vec<Gathered<'_>> {
-        vec![Gathered::of_rows(&self.stream.rows)]
+    fn gathered(&mut self) -> Vec<&Collected> {
+        vec![&self.stream.rows.collected]
     }
 
     fn notes(&self) -> Vec<(&'static str, f64)> {

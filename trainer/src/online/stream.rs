@@ -180,8 +180,8 @@ impl Stream {
         }
         if ended {
             if self.episode.whole {
-                self.rows.tally.episodes.push((self.episode.total, self.episode.steps));
-                self.rows.tally.costs.push(self.episode.cost);
+                self.rows.collected.tally.episodes.push((self.episode.total, self.episode.steps));
+                self.rows.collected.tally.costs.push(self.episode.cost);
             }
             // A robot that goes on after the end is not in a new episode.
             self.episode = Episode::default();
@@ -223,7 +223,7 @@ impl Stream {
             self.left_out.unlike += 1;
             self.sums.spoiled = true;
         } else if tick.policy_version == self.wanted {
-            count(&mut self.rows.tally, &self.out);
+            count(&mut self.rows.collected.tally, &self.out);
         } else {
             self.left_out.stale += 1;
         }

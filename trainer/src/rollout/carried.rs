@@ -1,26 +1,11 @@
 //! What a worker collected, as plain numbers on their way from one process to another, bit for bit.
 
-use super::{Segment, Tally, Worker};
+use super::{Collected, Segment, Tally};
 use crate::stats::RunningStats;
 use nearl_runtime::rollout_protocol::Layout;
 
-/// What was collected in one environment of another process.
-#[derive(Clone, Debug)]
-pub struct Carried {
-    /// Rows.
-    pub segment: Segment,
-    /// Counts.
-    pub tally: Tally,
-    /// Raw observations.
-    pub obs_stats: RunningStats,
-    /// Changes of the proposed state.
-    pub change_stats: RunningStats,
-    /// Discounted returns.
-    pub return_stats: RunningStats,
-}
-
-impl Worker {
-    /// Appends what was collected to `numbers`: each list by its length and its entries, narrow ones in pairs.
+impl Collected {
+    /// Appends everything to `numbers`: each list by its length and its entries, narrow ones in pairs.
     pub fn carry(&self, numbers: &mut Vec<f64>) {
         let (s, t) = (&self.segment, &self.tally);
         for list in narrow(s) {
@@ -44,10 +29,8 @@ impl Worker {
             push(numbers, stats.to_vec().into_iter());
         }
     }
-}
 
-impl Carried {
-    /// The inverse of [`Worker::carry`] for `n_steps` steps of these sizes; `None` for numbers of any other shape.
+    /// The inverse of [`Collected::carry`] for `n_steps` steps of these sizes; `None` for numbers of any other shape.
     pub fn read(mut numbers: &[f64], sizes: Layout, n_steps: usize) -> Option<Self> {
         let Layout { n_obs, n_state, n_act } = sizes;
         let from = &mut numbers;

@@ -1,22 +1,13 @@
 //! Rows for the learner from policy steps that were taken in another process.
 
-use super::{Segment, Tally};
-use crate::stats::RunningStats;
+use super::Collected;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Controller, Output};
 
 /// What was collected elsewhere, as a [`Worker`](super::Worker) keeps it.
 pub struct Rows {
-    /// The collected rows.
-    pub segment: Segment,
-    /// What was counted.
-    pub tally: Tally,
-    /// Raw observations.
-    pub obs_stats: RunningStats,
-    /// Changes of the proposed state.
-    pub change_stats: RunningStats,
-    /// Discounted returns.
-    pub return_stats: RunningStats,
+    /// What was collected.
+    pub collected: Collected,
     /// Observation index of each proposed entry.
     state: Vec<usize>,
     gamma: f64,
@@ -50,11 +41,7 @@ impl Rows {
     pub fn new(controller: &Controller, gamma: f64, moved_penalty: f64) -> Self {
         let layout = controller.layout();
         Self {
-            segment: Segment::default(),
-            tally: Tally::default(),
-            obs_stats: RunningStats::new(layout.n_obs()),
-            change_stats: RunningStats::new(layout.n_state()),
-            return_stats: RunningStats::new(1),
+            collected: Collected::new(layout.n_obs(), layout.n_state()),
             state: layout.state().to_vec(),
             gamma,
             moved_penalty,
@@ -66,7 +53,7 @@ impl Rows {
 
     /// Rows so far.
     pub fn len(&self) -> usize {
-        self.segment.reward.len()
+        self.collected.segment.reward.len()
     }
 
     /// No rows yet.
@@ -76,11 +63,7 @@ impl Rows {
 
     /// Forgets rows and counts; the episode goes on.
     pub fn clear(&mut self) {
-        self.segment.clear();
-        self.tally = Tally::default();
-        for stats in [&mut self.obs_stats, &mut self.change_stats, &mut self.return_stats] {
-            stats.clear();
-        }
+        self.collected.clear();
     }
 
     /// Adds a policy step.
@@ -90,13 +73,13 @@ impl Rows {
         for (change, &i) in self.change.iter_mut().zip(&self.state) {
             *change = p.after[i] - p.before[i];
         }
-        self.segment.push(p.out, &self.change, &normaliser.scale);
-        self.segment.reward.push(reward);
-        self.segment.terminated.push(p.terminated);
-        self.segment.truncated.push(false);
-        self.change_stats.push(&self.change);
-        self.obs_stats.push(p.after);
-        self.return_stats.push(&[self.discounted]);
+        self.collected.segment.push(p.out, &self.change, &normaliser.scale);
+        self.collected.segment.reward.push(reward);
+        self.collected.segment.terminated.push(p.terminated);
+        self.collected.segment.truncated.push(false);
+        self.collected.change_stats.push(&self.change);
+        self.collected.obs_stats.push(p.after);
+        self.collected.return_stats.push(&[self.discounted]);
         normaliser.observation(p.after, &mut self.after);
         if p.truncated && !p.terminated {
             self.cut();
@@ -108,7 +91,7 @@ impl Rows {
 
     /// Nothing follows the last row: its state gets a value, and no advantage flows across.
     pub fn cut(&mut self) {
-        let (last, s) = (self.segment.reward.len(), &mut self.segment);
+        let (last, s) = (self.collected.segment.reward.len(), &mut self.collected.segment);
         if last > 0 && !s.terminated[last - 1] && !s.truncated[last - 1] {
             s.truncated[last - 1] = true;
             s.final_x.push((last - 1, self.after.clone()));

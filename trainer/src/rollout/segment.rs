@@ -1,5 +1,6 @@
 //! What collecting leaves behind: rows for the learner, counts for the metrics.
 
+use crate::stats::RunningStats;
 use nearl_runtime::Output;
 
 /// What one environment collected: `n_steps` policy steps, row by row.
@@ -107,5 +108,42 @@ impl Tally {
         self.reached_violations += other.reached_violations;
         self.residual += other.residual;
         self.faults += other.faults;
+    }
+}
+
+/// One stretch of experience with its counts and statistics.
+#[derive(Clone, Debug)]
+pub struct Collected {
+    /// The collected rows.
+    pub segment: Segment,
+    /// What was counted.
+    pub tally: Tally,
+    /// Raw observations.
+    pub obs_stats: RunningStats,
+    /// Changes of the proposed state.
+    pub change_stats: RunningStats,
+    /// Discounted returns, for scaling the reward.
+    pub return_stats: RunningStats,
+}
+
+impl Collected {
+    /// Nothing yet.
+    pub(super) fn new(n_obs: usize, n_state: usize) -> Self {
+        Self {
+            segment: Segment::default(),
+            tally: Tally::default(),
+            obs_stats: RunningStats::new(n_obs),
+            change_stats: RunningStats::new(n_state),
+            return_stats: RunningStats::new(1),
+        }
+    }
+
+    /// Forgets everything; keeps the rows' memory.
+    pub(super) fn clear(&mut self) {
+        self.segment.clear();
+        self.tally = Tally::default();
+        for stats in [&mut self.obs_stats, &mut self.change_stats, &mut self.return_stats] {
+            stats.clear();
+        }
     }
 }

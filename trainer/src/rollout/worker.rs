@@ -3,9 +3,8 @@
 mod stream;
 
 use super::resume::Episode;
-use super::{RolloutError, Segment, Tally};
+use super::{Collected, RolloutError};
 use crate::env::{Env, EnvError, Fault};
-use crate::stats::RunningStats;
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Networks, Noise, Output, PolicyKind, Snapshot, State};
 use rand_chacha::ChaCha8Rng;
@@ -34,16 +33,8 @@ pub struct Worker {
     /// Policy steps left in the segment.
     left: usize,
     pub(super) history: Episode,
-    /// The collected rows.
-    pub segment: Segment,
-    /// What was counted.
-    pub tally: Tally,
-    /// Raw observations of the segment.
-    pub obs_stats: RunningStats,
-    /// Changes of the proposed state in the segment.
-    pub change_stats: RunningStats,
-    /// Discounted returns in the segment, for scaling the reward.
-    pub return_stats: RunningStats,
+    /// What was collected in the segment.
+    pub collected: Collected,
 }
 
 impl Worker {
@@ -67,9 +58,7 @@ impl Worker {
             noise: controller.noise(),
             out: controller.output(),
             scale: snapshot.networks.normaliser.scale.clone(),
-            obs_stats: RunningStats::new(controller.layout().n_obs()),
-            change_stats: RunningStats::new(n_state),
-            return_stats: RunningStats::new(1),
+            collected: Collected::new(controller.layout().n_obs(), n_state),
             env,
             controller,
             rng,
@@ -82,8 +71,6 @@ impl Worker {
             ticks: 0,
             left: 0,
             history: Episode::default(),
-            segment: Segment::default(),
-            tally: Tally::default(),
         };
         worker.restart()?;
         Ok(worker)
@@ -120,14 +107,6 @@ impl Worker {
         self.env.state(&mut self.state.q, &mut self.state.v);
     }
 
-    fn clear(&mut self) {
-        self.segment.clear();
-        self.tally = Tally::default();
-        for stats in [&mut self.obs_stats, &mut self.change_stats, &mut self.return_stats] {
-            stats.clear();
-        }
-    }
-
     /// Collects `n_steps` policy steps.
     pub fn collect(&mut self, n_steps: usize) {
         self.begin(n_steps);
@@ -136,7 +115,7 @@ impl Worker {
 
     /// Begins a segment of `n_steps` policy steps.
     pub(crate) fn begin(&mut self, n_steps: usize) {
-        self.clear();
+        self.collected.clear();
         self.left = n_steps;
     }
 
@@ -147,11 +126,11 @@ impl Worker {
             self.draw(true);
             let (reward, terminated) = self.policy_step();
             let truncated = self.ticks >= self.env.spec().max_episode_steps;
-            let t = self.segment.reward.len();
+            let t = self.collected.segment.reward.len();
             self.store(reward, terminated, truncated && !terminated, t, self.left == 0);
             if terminated || truncated {
-                self.tally.episodes.push(self.episode);
-                self.tally.costs.push(self.cost);
+                self.collected.tally.episodes.push(self.episode);
+                self.collected.tally.costs.push(self.cost);
                 // the same draws for a reset whatever happened before: an error here is a broken installation
                 self.restart().unwrap_or_else(|e| panic!("{e}"));
             }
@@ -160,13 +139,13 @@ impl Worker {
 
     /// One episode without noise: return and length in policy steps.
     pub fn evaluate(&mut self) -> (f64, usize) {
-        self.clear();
+        self.collected.clear();
         self.draw(false);
         loop {
             let (_, terminated) = self.policy_step();
             if terminated || self.ticks >= self.env.spec().max_episode_steps {
                 let episode = self.episode;
-                self.tally.costs.push(self.cost);
+                self.collected.tally.costs.push(self.cost);
                 self.restart().unwrap_or_else(|e| panic!("{e}"));
                 return episode;
             }
@@ -223,18 +202,20 @@ impl Worker {
         self.cost += step.cost;
         self.observe();
         let ledger = &self.out.next.ledger;
-        self.tally.ticks += 1;
-        self.tally.raw_violations += u64::from(ledger.raw_violations.total() > 0);
-        self.tally.recovering += u64::from(ledger.outside > 0);
-        self.tally.projected_violations += u64::from(ledger.violations.total() > 0 && ledger.outside == 0);
-        self.tally.moved += u64::from(ledger.moved > 0.0);
-        self.tally.distance += ledger.moved;
-        self.tally.avoided += u64::from(ledger.raw_violations.total() > 0 && ledger.violations.total() == 0);
-        self.tally.active_rows += ledger.active.len() as u64;
+        self.collected.tally.ticks += 1;
+        self.collected.tally.raw_violations += u64::from(ledger.raw_violations.total() > 0);
+        self.collected.tally.recovering += u64::from(ledger.outside > 0);
+        self.collected.tally.projected_violations +=
+            u64::from(ledger.violations.total() > 0 && ledger.outside == 0);
+        self.collected.tally.moved += u64::from(ledger.moved > 0.0);
+        self.collected.tally.distance += ledger.moved;
+        self.collected.tally.avoided +=
+            u64::from(ledger.raw_violations.total() > 0 && ledger.violations.total() == 0);
+        self.collected.tally.active_rows += ledger.active.len() as u64;
         self.moved += ledger.moved;
-        self.tally.faults += u64::from(step.fault != Fault::None);
-        self.tally.reached_violations += u64::from(self.controller.breaks_limits(&self.state));
-        self.tally.residual += self.residual();
+        self.collected.tally.faults += u64::from(step.fault != Fault::None);
+        self.collected.tally.reached_violations += u64::from(self.controller.breaks_limits(&self.state));
+        self.collected.tally.residual += self.residual();
         (step.reward, step.terminated)
     }
 
@@ -249,7 +230,7 @@ impl Worker {
 
     fn store(&mut self, reward: f64, terminated: bool, truncated: bool, t: usize, last: bool) {
         let reward = self.penalised(reward);
-        let (s, out) = (&mut self.segment, &self.out);
+        let (s, out) = (&mut self.collected.segment, &self.out);
         for (before, &i) in self.before.iter_mut().zip(self.controller.layout().state()) {
             *before = self.state.obs[i] - *before;
         }
@@ -257,9 +238,9 @@ impl Worker {
         s.reward.push(reward);
         s.terminated.push(terminated);
         s.truncated.push(truncated || (last && !terminated));
-        self.change_stats.push(&self.before);
-        self.obs_stats.push(&self.state.obs);
-        self.return_stats.push(&[self.discounted]);
+        self.collected.change_stats.push(&self.before);
+        self.collected.obs_stats.push(&self.state.obs);
+        self.collected.return_stats.push(&[self.discounted]);
         if (truncated || last) && !terminated {
             let mut x = vec![0.0; out.x.len()];
             self.controller.normaliser().observation(&self.state.obs, &mut x);

@@ -3,9 +3,9 @@
 //! Each iteration pushes the networks over the links of the server's name and asks for one segment of every environment. They
 //! go on in the server from request to request, so a seed gives the same weights as environments of this process.
 
-use super::source::{Gathered, Source, SourceError};
+use super::source::{Source, SourceError};
 use crate::checkpoint::Checkpoint;
-use crate::rollout::Carried;
+use crate::rollout::Collected;
 use crate::settings::TrainSettings;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{LinkError, RobotName, TrainerLink, Verdict};
@@ -42,14 +42,6 @@ pub enum ServedError {
         /// The server's sentence.
         text: String,
     },
-    /// Not what was asked for.
-    #[error("the rollout server `{name}` sent {what}: run server and trainer from the same nearl build")]
-    Broken {
-        /// Server.
-        name: RobotName,
-        /// What came.
-        what: String,
-    },
 }
 
 /// A rollout server as a source of experience.
@@ -61,7 +53,7 @@ pub struct ServedSource {
     sizes: Layout,
     request: Request,
     training: Training,
-    collected: Vec<Carried>,
+    collected: Vec<Collected>,
     version: u64,
 }
 
@@ -148,21 +140,21 @@ impl ServedSource {
     }
 
     /// The segments in the order of their environments, whatever order they came in.
-    fn read(&self, mut numbers: &[f64]) -> Result<Vec<Carried>, ServedError> {
-        let broken = |what: String| ServedError::Broken { name: self.name.clone(), what };
+    fn read(&self, mut numbers: &[f64]) -> Result<Vec<Collected>, ServedError> {
+        let broken = |what| ServedError::from(RequestError::Broken { name: self.name.clone(), what });
         let n_envs = self.training.n_envs as usize;
-        let mut found: Vec<Option<Carried>> = vec![None; n_envs];
+        let mut found: Vec<Option<Collected>> = vec![None; n_envs];
         while let [env, length, rest @ ..] = numbers {
             let cut = || broken(format!("a segment of {length} numbers where {} are left", rest.len()));
             let (segment, more) = rest.split_at_checked(*length as usize).ok_or_else(cut)?;
             let odd = || broken(format!("a segment of environment {env} that is none of this task"));
             let carried =
-                Carried::read(segment, self.sizes, self.request.n_steps as usize).ok_or_else(odd)?;
+                Collected::read(segment, self.sizes, self.request.n_steps as usize).ok_or_else(odd)?;
             *found.get_mut(*env as usize).ok_or_else(odd)? = Some(carried);
             numbers = more;
         }
         let count = found.iter().flatten().count();
-        let all: Option<Vec<Carried>> = found.into_iter().collect();
+        let all: Option<Vec<Collected>> = found.into_iter().collect();
         all.ok_or_else(|| broken(format!("segments of {count} environments where there are {n_envs}")))
     }
 }
@@ -172,8 +164,8 @@ impl Source for ServedSource {
         Ok(self.fill(snapshot)?)
     }
 
-    fn gathered(&mut self) -> Vec<Gathered<'_>> {
-        self.collected.iter().map(Gathered::of_carried).collect()
+    fn gathered(&mut self) -> Vec<&Collected> {
+        self.collected.iter().collect()
     }
 
     /// The episodes begin anew, with random streams that were not used before.

@@ -3,9 +3,8 @@
 use super::served::{ServedError, ServedSource};
 use crate::checkpoint::Checkpoint;
 use crate::online::{LoopSource, OnlineError};
-use crate::rollout::{Carried, Collector, RolloutError, Rows, Segment, Tally};
+use crate::rollout::{Collected, Collector, RolloutError};
 use crate::settings::TrainSettings;
-use crate::stats::RunningStats;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::RobotName;
 use nearl_runtime::rollout_protocol::Layout;
@@ -38,39 +37,6 @@ pub enum Experience {
     Served(RobotName, Arc<AtomicBool>),
 }
 
-/// One stretch of experience with its statistics.
-pub struct Gathered<'a> {
-    /// Rows.
-    pub segment: &'a Segment,
-    /// Counts.
-    pub tally: &'a Tally,
-    /// Raw observations.
-    pub obs_stats: &'a RunningStats,
-    /// Changes of the proposed state.
-    pub change_stats: &'a RunningStats,
-    /// Discounted returns.
-    pub return_stats: &'a RunningStats,
-}
-
-impl<'a> Gathered<'a> {
-    /// What a rollout server collected.
-    pub fn of_carried(carried: &'a Carried) -> Self {
-        let Carried { segment, tally, obs_stats, change_stats, return_stats } = carried;
-        Self { segment, tally, obs_stats, change_stats, return_stats }
-    }
-
-    /// What was collected in a running loop.
-    pub fn of_rows(rows: &'a Rows) -> Self {
-        Self {
-            segment: &rows.segment,
-            tally: &rows.tally,
-            obs_stats: &rows.obs_stats,
-            change_stats: &rows.change_stats,
-            return_stats: &rows.return_stats,
-        }
-    }
-}
-
 /// A source of experience. A batch has `n_envs n_steps` rows, in any number of stretches in a fixed order.
 pub trait Source: Send {
     /// Collects a batch with the networks of `snapshot`; false if a stop came first.
@@ -79,7 +45,7 @@ pub trait Source: Send {
     /// [`SourceError`] in one sentence.
     fn collect(&mut self, snapshot: &Snapshot) -> Result<bool, SourceError>;
     /// What was collected last.
-    fn gathered(&mut self) -> Vec<Gathered<'_>>;
+    fn gathered(&mut self) -> Vec<&Collected>;
     /// Numbers of its own for the metrics.
     fn notes(&self) -> Vec<(&'static str, f64)> {
         Vec::new()
@@ -108,16 +74,8 @@ impl Source for Collector {
         Ok(true)
     }
 
-    fn gathered(&mut self) -> Vec<Gathered<'_>> {
-        self.workers()
-            .map(|w| Gathered {
-                segment: &w.segment,
-                tally: &w.tally,
-                obs_stats: &w.obs_stats,
-                change_stats: &w.change_stats,
-                return_stats: &w.return_stats,
-            })
-            .collect()
+    fn gathered(&mut self) -> Vec<&Collected> {
+        self.workers().map(|w| &w.collected).collect()
     }
 
     fn save(&mut self, to: &mut Checkpoint) -> Result<(), String> {

@@ -1,7 +1,8 @@
 //! One policy step at a time with everything it produced: what the rollout server sends.
 
-use super::{Tally, Worker};
+use super::Worker;
 use crate::env::EnvError;
+use crate::rollout::Tally;
 use nearl_runtime::rollout_protocol::Layout;
 use rand_chacha::ChaCha8Rng;
 
@@ -12,7 +13,7 @@ impl Worker {
     /// [`EnvError`] of the environment's reset.
     pub fn reseed(&mut self, rng: ChaCha8Rng) -> Result<(), EnvError> {
         self.rng = rng;
-        self.clear();
+        self.collected.clear();
         self.restart()
     }
 
@@ -26,7 +27,7 @@ impl Worker {
     pub fn transition(&mut self, explore: bool, row: &mut Vec<f64>) {
         row.extend_from_slice(&self.state.obs);
         self.draw(explore);
-        self.tally = Tally::default();
+        self.collected.tally = Tally::default();
         let cost = self.cost;
         let (reward, terminated) = self.policy_step();
         let truncated = !terminated && self.ticks >= self.env.spec().max_episode_steps;
@@ -37,7 +38,7 @@ impl Worker {
         row.extend_from_slice(&out.action);
         row.extend([out.log_prob_proposal, out.log_prob_action, reward, self.cost - cost]);
         row.extend([f64::from(u8::from(terminated)), f64::from(u8::from(truncated))]);
-        let t = &self.tally;
+        let t = &self.collected.tally;
         let counts = [t.ticks, t.raw_violations, t.recovering, t.projected_violations, t.moved];
         row.extend(counts.map(|n| n as f64));
         row.push(t.distance);
