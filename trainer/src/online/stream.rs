@@ -5,7 +5,7 @@
 //! bit for bit (the first motion is let in softly; what the projector remembers was lost in a gap) is counted and left out.
 
 use crate::env::{Env, EnvError, Moment};
-use crate::rollout::{Period, Rows, Tally};
+use crate::rollout::{Period, Rows};
 use nearl_runtime::link::{STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, TransitionMessage};
 use nearl_runtime::rt::Mode;
 use nearl_runtime::{Controller, Networks, Noise, Output, PolicyKind, Snapshot, SnapshotError, State};
@@ -223,7 +223,7 @@ impl Stream {
             self.left_out.unlike += 1;
             self.sums.spoiled = true;
         } else if tick.policy_version == self.wanted {
-            count(&mut self.rows.collected.tally, &self.out);
+            self.rows.collected.tally.count(&self.out.next.ledger);
         } else {
             self.left_out.stale += 1;
         }
@@ -286,17 +286,4 @@ fn follows(last: &TransitionMessage, next: &TransitionMessage) -> bool {
 
 fn moment(tick: &TransitionMessage) -> Moment<'_> {
     Moment { q: tick.q(), v: tick.v(), obs: tick.obs(), time: tick.time }
-}
-
-/// Counts a tick as a worker does, but what only a simulator knows.
-fn count(tally: &mut Tally, out: &Output) {
-    let ledger = &out.next.ledger;
-    tally.ticks += 1;
-    tally.raw_violations += u64::from(ledger.raw_violations.total() > 0);
-    tally.recovering += u64::from(ledger.outside > 0);
-    tally.projected_violations += u64::from(ledger.violations.total() > 0 && ledger.outside == 0);
-    tally.moved += u64::from(ledger.moved > 0.0);
-    tally.distance += ledger.moved;
-    tally.avoided += u64::from(ledger.raw_violations.total() > 0 && ledger.violations.total() == 0);
-    tally.active_rows += ledger.active.len() as u64;
 }

@@ -2,6 +2,7 @@
 
 use crate::stats::RunningStats;
 use nearl_runtime::Output;
+use nearl_runtime::constraints::Ledger;
 
 /// What one environment collected: `n_steps` policy steps, row by row.
 #[derive(Clone, Debug, Default)]
@@ -94,6 +95,19 @@ pub struct Tally {
 }
 
 impl Tally {
+    /// Counts a control tick by what the projection says of it; what only a simulator knows is the caller's.
+    pub(crate) fn count(&mut self, ledger: &Ledger) {
+        let (raw, left) = (ledger.raw_violations.total() > 0, ledger.violations.total() > 0);
+        self.ticks += 1;
+        self.raw_violations += u64::from(raw);
+        self.recovering += u64::from(ledger.outside > 0);
+        self.projected_violations += u64::from(left && ledger.outside == 0);
+        self.moved += u64::from(ledger.moved > 0.0);
+        self.distance += ledger.moved;
+        self.avoided += u64::from(raw && !left);
+        self.active_rows += ledger.active.len() as u64;
+    }
+
     pub(crate) fn add(&mut self, other: &Self) {
         self.episodes.extend_from_slice(&other.episodes);
         self.costs.extend_from_slice(&other.costs);

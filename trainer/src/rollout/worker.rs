@@ -202,16 +202,7 @@ impl Worker {
         self.cost += step.cost;
         self.observe();
         let ledger = &self.out.next.ledger;
-        self.collected.tally.ticks += 1;
-        self.collected.tally.raw_violations += u64::from(ledger.raw_violations.total() > 0);
-        self.collected.tally.recovering += u64::from(ledger.outside > 0);
-        self.collected.tally.projected_violations +=
-            u64::from(ledger.violations.total() > 0 && ledger.outside == 0);
-        self.collected.tally.moved += u64::from(ledger.moved > 0.0);
-        self.collected.tally.distance += ledger.moved;
-        self.collected.tally.avoided +=
-            u64::from(ledger.raw_violations.total() > 0 && ledger.violations.total() == 0);
-        self.collected.tally.active_rows += ledger.active.len() as u64;
+        self.collected.tally.count(ledger);
         self.moved += ledger.moved;
         self.collected.tally.faults += u64::from(step.fault != Fault::None);
         self.collected.tally.reached_violations += u64::from(self.controller.breaks_limits(&self.state));
