@@ -22,6 +22,7 @@ pub mod pid2;
 pub mod ppo;
 #[cfg(test)]
 mod reference;
+mod value;
 
 pub use adam::Adam;
 pub use batch::Batch;

@@ -72,11 +72,11 @@ fn square_sum(g: &[V], out: &mut f32) {
 }
 multiversion!(fn run_square_sum(g: &[V], out: &mut f32) = square_sum);
 
-/// Euclidean norm of a gradient.
-pub(super) fn norm(g: &[V]) -> f32 {
+/// Squared Euclidean length of a gradient.
+pub(super) fn square(g: &[V]) -> f32 {
     let mut sum = 0.0;
     run_square_sum(g, &mut sum);
-    sum.sqrt()
+    sum
 }
 
 #[cfg(test)]

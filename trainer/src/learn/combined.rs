@@ -1,4 +1,4 @@
-//! The combined policy `I o pi` with its value function, in one parameter group. [`gradient`] is the surrogate on it.
+//! The combined policy `I o pi` in one parameter group. [`gradient`] is the surrogate on it.
 //!
 //! | meta policy | inverse dynamics | ratio on | the policy learns through |
 //! |---|---|---|---|
@@ -11,11 +11,12 @@ mod gradient;
 use super::Dims;
 use super::batch::Batch;
 use super::inverse::{InverseModel, InverseWork};
-use super::losses::{mean_std, set_lanes, values, widths};
+use super::losses::{mean_std, set_lanes, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
-use super::optimise::{Group, Rows, TILE, Tile};
+use super::optimise::{Group, PhaseReport, Rows, TILE, Tile};
 use super::ppo::PpoSettings;
+use super::value::Value;
 use super::{Metrics, init};
 use nearl_runtime::Networks;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars};
@@ -58,7 +59,7 @@ pub struct Kind {
     pub learned: bool,
 }
 
-/// Policy, inverse model and value in one parameter group.
+/// Policy and inverse model in one parameter group, and the value in its own.
 pub(super) struct Combined {
     /// Sizes.
     pub(super) dims: Dims,
@@ -73,7 +74,7 @@ pub(super) struct Combined {
     /// The learned inverse model and its spread.
     pub(super) inverse: Option<(InverseModel, Range<usize>)>,
     /// Value.
-    pub(super) value: Net,
+    pub(super) value: Value,
     /// Where the policy's network lies in the group.
     pub(super) policy_range: Range<usize>,
     /// Vectors of the group.
@@ -83,7 +84,6 @@ pub(super) struct Combined {
 /// Buffers of one thread.
 pub(super) struct CombinedWork {
     pub(super) policy: Tape,
-    value: Tape,
     inverse: Option<InverseWork>,
     /// Observation rows.
     pub(super) obs: Vec<V>,
@@ -91,12 +91,11 @@ pub(super) struct CombinedWork {
     pub(super) change: Vec<V>,
     /// Gradient of the policy's output.
     pub(super) d_change: Vec<V>,
-    d_value: Vec<V>,
     rows: [Vec<V>; 3],
 }
 
 impl Combined {
-    /// Fresh networks and their parameter group.
+    /// Fresh networks, the parameter group of policy and inverse model, and that of the value.
     pub(super) fn new(
         dims: Dims,
         nets: &NetSettings,
@@ -104,7 +103,7 @@ impl Combined {
         gradient: Gradient,
         kind: Kind,
         rng: &mut ChaCha8Rng,
-    ) -> (Self, Group) {
+    ) -> (Self, [Group; 2]) {
         assert!(kind.stochastic || kind.learned, "a policy explores in its proposal or in its action");
         let (mut at, mut transposed) = (0, 0);
         let (o, s, f) = (dims.n_obs, dims.n_state, nets.activation);
@@ -121,10 +120,9 @@ impl Combined {
             let log_std = vectors(&mut at, dims.n_act);
             (model, log_std)
         });
-        let value = Net::new(&widths(o, &nets.value, 1), f, false, &mut at, &mut transposed);
         let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
         policy.mlp.write_dense(&init::orthogonal(&policy.mlp.widths(), 0.01, rng), &mut group.p);
-        value.mlp.write_dense(&init::orthogonal(&value.mlp.widths(), 1.0, rng), &mut group.p);
+        let (value, value_group) = Value::new(&dims, nets, ppo.vf_coef, rng);
         if let Some(range) = &policy_log_std {
             set_lanes(&mut group.p[range.clone()], s, ppo.log_std);
         }
@@ -135,14 +133,13 @@ impl Combined {
         let combined =
             Self { dims, ppo, gradient, policy, policy_log_std, inverse, value, policy_range, len: at };
         combined.refresh(&mut group);
-        (combined, group)
+        (combined, [group, value_group])
     }
 
     /// Refreshes the transposed weights.
     pub(super) fn refresh(&self, group: &mut Group) {
         let Group { p, transposed } = group;
         self.policy.transpose(p, transposed);
-        self.value.transpose(p, transposed);
         self.refresh_inverse(group);
     }
 
@@ -163,12 +160,10 @@ impl Combined {
         let (ov, sv) = (self.dims.n_obs.div_ceil(LANES), self.dims.n_state.div_ceil(LANES));
         CombinedWork {
             policy: self.policy.tape(TILE),
-            value: self.value.tape(TILE),
             inverse: self.inverse.as_ref().map(|(m, _)| m.work()),
             obs: vec![ZERO; TILE * ov],
             change: vec![ZERO; TILE * sv],
             d_change: vec![ZERO; TILE * sv],
-            d_value: vec![ZERO; TILE],
             rows: std::array::from_fn(|_| vec![ZERO; TILE / LANES]),
         }
     }
@@ -198,11 +193,6 @@ impl Combined {
         rows
     }
 
-    /// Value of each row of `x` (n x n_obs).
-    pub(super) fn values(&self, p: &[V], x: &[f32], threads: usize) -> Vec<f32> {
-        values(&self.value, p, x, self.dims.n_obs, threads)
-    }
-
     /// Mean squared error of the inverse model over a batch; none with analytic inverse dynamics.
     pub(super) fn idm_error(&self, p: &[V], batch: &Batch, threads: usize) -> Option<f64> {
         self.inverse.as_ref().map(|(model, _)| model.error(p, batch, &self.dims, threads))
@@ -225,15 +215,16 @@ impl Combined {
         scalars(&p[range.clone()])[..n].to_vec()
     }
 
-    /// What the actor's phase reports, under SB3's names.
-    pub(super) fn metrics(&self, p: &[V], mean: &[f64], norm: f64) -> Metrics {
+    /// What the phases of actor and value report, under SB3's names.
+    pub(super) fn metrics(&self, p: &[V], actor: &PhaseReport, value: &PhaseReport) -> Metrics {
+        let mean = &actor.mean;
         let mut metrics = vec![
             ("train/policy_gradient_loss", mean[0]),
             ("train/approx_kl", mean[1]),
             ("train/clip_fraction", mean[2]),
-            ("train/value_loss", mean[3]),
-            ("train/clamped_fraction", mean[4] / self.dims.seen_state.len().max(1) as f64),
-            ("train/grad_norm", norm),
+            ("train/value_loss", value.mean[0]),
+            ("train/clamped_fraction", mean[3] / self.dims.seen_state.len().max(1) as f64),
+            ("train/grad_norm", actor.norm),
             ("train/std", mean_std(&self.log_std(p))),
         ];
         if let Some(range) = &self.policy_log_std {

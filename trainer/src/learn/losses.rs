@@ -1,9 +1,8 @@
 //! What the losses of every algorithm share beside their Gaussians: value, advantages, entropy, sizes.
 
-use super::gaussian::{gather, gather_one, heads, set_heads};
-use super::net::Net;
-use super::optimise::{TILE, Tile};
-use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars_mut};
+use super::gaussian::{gather_one, heads, set_heads};
+use super::optimise::Tile;
+use nearl_runtime::net::kernel::{V, ZERO, scalars_mut};
 
 /// `widths` of a network from its ends and the hidden widths.
 pub(super) fn widths(n_in: usize, hidden: &[usize], n_out: usize) -> Vec<usize> {
@@ -18,22 +17,6 @@ pub(super) fn set_lanes(p: &mut [V], n: usize, value: f32) {
 /// Mean standard deviation.
 pub(super) fn mean_std(log_std: &[f32]) -> f64 {
     log_std.iter().map(|l| f64::from(l.exp())).sum::<f64>() / log_std.len().max(1) as f64
-}
-
-/// Value of each row of `x`.
-pub(super) fn values(net: &Net, p: &[V], x: &[f32], n_obs: usize, threads: usize) -> Vec<f32> {
-    let (n, vectors) = (x.len() / n_obs, n_obs.div_ceil(LANES));
-    let mut out = vec![0.0; n];
-    in_parts(&mut out, TILE, threads, |first, out| {
-        let (mut tape, mut rows) = (net.tape(TILE), vec![ZERO; TILE * vectors]);
-        for (start, out) in (first..).step_by(TILE).zip(out.chunks_mut(TILE)) {
-            let idx: Vec<u32> = (start..start + out.len()).map(|i| i as u32).collect();
-            gather(&mut rows, vectors, 0, x, n_obs, &idx);
-            let y = net.forward(p, &rows, &mut tape);
-            out.iter_mut().zip(y).for_each(|(out, y)| *out = y.0[0]);
-        }
-    });
-    out
 }
 
 /// Tiles that one thread has done before another one has started.

@@ -7,7 +7,7 @@
 //! policy gradient on the combined policy, Eq. 1
 //! ```
 //!
-//! The losses run on each minibatch in the order of [`IMITATE`], [`INVERSE`], [`ACTOR`], each with its own optimiser: run one
+//! The losses run on each minibatch in the order of [`IMITATE`], [`INVERSE`], [`ACTOR`], [`VALUE`], each with its own optimiser: run one
 //! after another over the whole batch, the first two would leave PPO's ratio far from 1 before its first step. What was
 //! reached is possible but not optimal, so the first loss pulls against the last; PID^2 replaces it by an adversary.
 
@@ -17,6 +17,7 @@ use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, Schedule, Tile, add_sums, optimise};
 use super::pid2::Pid2Settings;
 use super::ppo::PpoSettings;
+use super::value::ValueWork;
 use super::{Adam, Batch, Dims, Learner, Metrics};
 use nearl_runtime::net::kernel::{LANES, V, ZERO};
 use nearl_runtime::normaliser::Normaliser;
@@ -50,8 +51,15 @@ impl Default for NearlSettings {
 pub const IMITATE: usize = 0;
 /// Phase of the supervised inverse model.
 pub const INVERSE: usize = 1;
-/// Phase of the policy gradient and the value.
+/// Phase of the policy gradient.
 pub const ACTOR: usize = 2;
+/// Phase of the value.
+pub const VALUE: usize = 3;
+
+/// Parameter group of policy and inverse model.
+const COMBINED: usize = 0;
+/// Parameter group of the value.
+const CRITIC: usize = 1;
 
 /// The learner.
 pub struct Nearl {
@@ -77,18 +85,19 @@ impl Nearl {
         rng: &mut ChaCha8Rng,
     ) -> Self {
         let lr = ppo.lr;
-        let (combined, group) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
+        let (combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
         let adam = vec![
             Adam::new(combined.policy_range.len(), settings.policy_lr),
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
             Adam::new(combined.len, lr),
+            Adam::new(combined.value.len(), lr),
         ];
-        let params = Params { groups: vec![group], adam, beta: 0.0 };
+        let params = Params { groups: vec![actor, critic], adam, beta: 0.0 };
         Self { nets: Nets { settings, combined }, params, threads }
     }
 
     fn actor(&self) -> &[V] {
-        &self.params.groups[0].p
+        &self.params.groups[COMBINED].p
     }
 }
 
@@ -106,12 +115,12 @@ impl Learner for Nearl {
         if inverse_learns {
             phases.push(INVERSE);
         }
-        phases.push(ACTOR);
+        phases.extend([ACTOR, VALUE]);
         let report = optimise(&self.nets, &mut self.params, batch, &phases, schedule, rng);
         let of = |phase| phases.iter().position(|p| *p == phase).map(|i| &report[i]);
         let mut metrics = Metrics::new();
-        if let Some(actor) = of(ACTOR) {
-            metrics = self.nets.combined.metrics(self.actor(), &actor.mean, actor.norm);
+        if let (Some(actor), Some(value)) = (of(ACTOR), of(VALUE)) {
+            metrics = self.nets.combined.metrics(self.actor(), actor, value);
         }
         if let Some(imitate) = of(IMITATE) {
             metrics.push(("train/policy_mse", imitate.mean[0] / self.nets.combined.dims.n_state as f64));
@@ -131,19 +140,19 @@ impl Learner for Nearl {
 
     fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
         f(&mut self.params)?;
-        self.nets.refresh(ACTOR, &mut self.params);
+        [ACTOR, VALUE].iter().for_each(|&phase| self.nets.refresh(phase, &mut self.params));
         Ok(())
     }
 
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
-        self.nets.combined.values(self.actor(), x, self.threads)
+        self.nets.combined.value.of(&self.params.groups[CRITIC], x, self.threads)
     }
 }
 
 /// `L_pi = sum |(s' - s) / scale - pi(s)|^2 / 2` on reached transitions (for the mean, where the policy is stochastic).
 #[inline(always)]
 fn imitate_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) {
-    let (c, group) = (&n.combined, &params.groups[0]);
+    let (c, group) = (&n.combined, &params.groups[COMBINED]);
     let s = c.dims.n_state;
     c.propose(group, &t, w);
     gather(&mut w.change, s.div_ceil(LANES), 0, &t.batch.reached, s, t.idx);
@@ -157,11 +166,11 @@ fn imitate_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedWork, gr
     add_sums(grad, &[sum.sum()]);
 }
 
-/// Policy gradient on the combined policy (Eq. 1) and the value.
+/// Policy gradient on the combined policy (Eq. 1).
 #[inline(always)]
 fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) {
-    let sums = n.combined.policy_gradient(&params.groups[0], &t, w, grad);
-    n.combined.learn(&params.groups[0], w, grad);
+    let sums = n.combined.policy_gradient(&params.groups[COMBINED], &t, w, grad);
+    n.combined.learn(&params.groups[COMBINED], w, grad);
     add_sums(grad, &sums);
 }
 
@@ -169,34 +178,47 @@ multiversion!(fn imitate(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Combine
 multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) = actor_body);
 
 impl Phases for Nets {
-    type Work = CombinedWork;
+    type Work = (CombinedWork, ValueWork);
 
-    fn work(&self) -> CombinedWork {
-        self.combined.work()
+    fn work(&self) -> Self::Work {
+        (self.combined.work(), self.combined.value.work())
     }
-    fn group(&self, _: usize) -> usize {
-        0
+    fn group(&self, phase: usize) -> usize {
+        if phase == VALUE { CRITIC } else { COMBINED }
     }
     fn range(&self, phase: usize) -> Range<usize> {
         match phase {
             IMITATE => self.combined.policy_range.clone(),
             INVERSE => self.combined.inverse_range(),
+            VALUE => 0..self.combined.value.len(),
             _ => 0..self.combined.len,
         }
     }
-    fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) {
+    fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Self::Work, grad: &mut [V]) {
+        let (w, value) = w;
         match phase {
             IMITATE => imitate(self, params, t, w, grad),
-            INVERSE => self.combined.idm_tile(&params.groups[0], &t, w, grad),
+            INVERSE => self.combined.idm_tile(&params.groups[COMBINED], &t, w, grad),
+            VALUE => self.combined.value.tile(&params.groups[CRITIC], &t, value, grad),
             _ => actor(self, params, t, w, grad),
         }
     }
     fn refresh(&self, phase: usize, params: &mut Params) {
-        let group: &mut Group = &mut params.groups[0];
-        if phase == INVERSE { self.combined.refresh_inverse(group) } else { self.combined.refresh(group) }
+        let group: &mut Group = &mut params.groups[self.group(phase)];
+        match phase {
+            INVERSE => self.combined.refresh_inverse(group),
+            VALUE => self.combined.value.refresh(group),
+            _ => self.combined.refresh(group),
+        }
     }
     fn max_norm(&self, phase: usize) -> f32 {
-        if phase == ACTOR { self.combined.ppo.max_grad_norm } else { f32::INFINITY }
+        if matches!(phase, ACTOR | VALUE) { self.combined.ppo.max_grad_norm } else { f32::INFINITY }
+    }
+    fn clipped_with(&self, phase: usize) -> Option<usize> {
+        [None, None, Some(VALUE), Some(ACTOR)][phase]
+    }
+    fn lane(&self, phase: usize) -> usize {
+        usize::from(phase == VALUE)
     }
     fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>> {
         let mut rows = self.combined.rows(batch);

@@ -2,14 +2,14 @@
 //!
 //! A minibatch is cut into a number of shards that depends on its size alone. Each thread computes some shards; after a
 //! barrier every thread adds all shards in order and applies the same step to its own replica of the parameters. A minibatch
-//! too small to be cut runs its parameter groups side by side instead ([`lanes`]). Nothing is allocated per minibatch.
+//! too small to be cut runs its phases in two lanes side by side instead ([`lanes`]). Nothing is allocated per minibatch.
 
 mod lanes;
 mod rows;
 
 pub use rows::Rows;
 
-use super::adam::{Adam, norm};
+use super::adam::{Adam, square};
 use super::batch::Batch;
 use nearl_runtime::net::kernel::{LANES, V, ZERO};
 use rand::RngExt;
@@ -75,9 +75,15 @@ pub trait Phases: Sync {
     fn refresh(&self, phase: usize, params: &mut Params);
     /// Largest norm of the gradient of phase `k`.
     fn max_norm(&self, phase: usize) -> f32;
-    /// Whether phases of the first phase's group read another group, as it was before the minibatch.
-    fn reads_other_group(&self) -> bool {
-        false
+    /// The phase before or after `k` whose gradient is clipped as one vector with that of `k`.
+    fn clipped_with(&self, _phase: usize) -> Option<usize> {
+        None
+    }
+    /// Lane of phase `k`, 0 or 1: phases of two lanes change no group in common, and lane 1 reads nothing that lane 0 changes.
+    fn lane(&self, phase: usize) -> usize;
+    /// The one group of lane 1 that lane 0 reads, as it was before the minibatch.
+    fn read_across(&self) -> Option<usize> {
+        None
     }
     /// The rows that a tile reads, so that the next ones can be on their way.
     fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>>;
@@ -156,7 +162,7 @@ pub fn optimise<P: Phases>(
     );
     let orders: Vec<Vec<u32>> = (0..schedule.epochs).map(|_| shuffled(batch.n, rng)).collect();
     let shards = if mb.is_multiple_of(SHARD) { mb / SHARD } else { 1 };
-    let longest = params.groups.iter().map(|g| g.p.len()).max().unwrap_or(0) + 1;
+    let longest = longest(params);
     let threads = schedule.threads.clamp(1, shards);
     let run = Run {
         algorithm,
@@ -187,6 +193,11 @@ pub fn optimise<P: Phases>(
     })
 }
 
+/// Vectors of the gradient of the largest group, with what is reported.
+fn longest(params: &Params) -> usize {
+    params.groups.iter().map(|g| g.p.len()).max().unwrap_or(0) + 1
+}
+
 struct Run<'a, P: Phases> {
     algorithm: &'a P,
     batch: &'a Batch,
@@ -204,13 +215,11 @@ struct Run<'a, P: Phases> {
 impl<P: Phases> Run<'_, P> {
     fn worker(&self, thread: usize, params: &mut Params) -> Vec<PhaseReport> {
         let mut work = self.algorithm.work();
-        let longest = params.groups.iter().map(|g| g.p.len()).max().unwrap_or(0) + 1;
-        let (mut sum, mut round, mut steps) = (vec![ZERO; longest], 0, 0.0);
-        let mut reports = vec![PhaseReport::default(); self.phases.len()];
-        for idx in self.orders.iter().flat_map(|o| o.chunks_exact(self.schedule.minibatch)) {
+        let (mut sums, mut reports, mut round) = (self.sums(params), self.reports(), 0);
+        for idx in self.minibatches() {
             let advantage = moments(self.batch, idx);
-            for (report, &phase) in reports.iter_mut().zip(self.phases) {
-                let len = params.groups[self.algorithm.group(phase)].p.len() + 1;
+            for (k, &phase) in self.phases.iter().enumerate() {
+                let len = params.groups[self.group(k)].p.len() + 1;
                 for s in (thread..self.shards).step_by(self.threads) {
                     self.shard(s, phase, idx, advantage, params, &mut work, round % 2, len);
                 }
@@ -219,13 +228,67 @@ impl<P: Phases> Run<'_, P> {
                 if self.threads > 1 {
                     self.barrier.wait(round);
                 }
-                self.gather(&mut sum[..len], odd);
-                self.step(phase, &mut sum[..len], params, report);
+                self.gather(&mut sums[k][..len], odd);
+                self.settle(k, &sums, params, &mut reports);
             }
-            steps += 1.0;
         }
-        reports.iter_mut().for_each(|r| r.average(steps));
+        reports.iter_mut().for_each(|r| r.average(self.minibatches().count() as f64));
         reports
+    }
+
+    /// Rows of every minibatch of every epoch.
+    fn minibatches(&self) -> impl Iterator<Item = &[u32]> {
+        self.orders.iter().flat_map(|o| o.chunks_exact(self.schedule.minibatch))
+    }
+
+    /// A gradient for each phase.
+    fn sums(&self, params: &Params) -> Vec<Vec<V>> {
+        vec![vec![ZERO; longest(params)]; self.phases.len()]
+    }
+
+    fn reports(&self) -> Vec<PhaseReport> {
+        vec![PhaseReport::default(); self.phases.len()]
+    }
+
+    /// Parameter group of the phase at `k`.
+    fn group(&self, k: usize) -> usize {
+        self.algorithm.group(self.phases[k])
+    }
+
+    /// The position of the phase that the one at `k` is clipped with, if it runs.
+    fn partner(&self, k: usize) -> Option<usize> {
+        let with = self.algorithm.clipped_with(self.phases[k])?;
+        self.phases.iter().position(|&phase| phase == with)
+    }
+
+    /// Steps the phase at `k`, and before it the one it is clipped with; the first of the two waits for the second.
+    fn settle(&self, k: usize, sums: &[Vec<V>], params: &mut Params, reports: &mut [PhaseReport]) {
+        let squared = |k: usize, params: &Params| self.squared(k, &sums[k], params);
+        match self.partner(k) {
+            Some(p) if p > k => {}
+            Some(p) => {
+                let length = (squared(p, params) + squared(k, params)).sqrt();
+                self.step(p, length, &sums[p], params, &mut reports[p]);
+                self.step(k, length, &sums[k], params, &mut reports[k]);
+            }
+            None => {
+                let length = squared(k, params).sqrt();
+                self.step(k, length, &sums[k], params, &mut reports[k]);
+            }
+        }
+    }
+
+    /// Squared length of the gradient of the phase at `k`.
+    fn squared(&self, k: usize, sum: &[V], params: &Params) -> f32 {
+        let (grad, _) = self.parts(k, sum, params);
+        square(grad)
+    }
+
+    /// The gradient of the phase at `k`, and what it reports.
+    fn parts<'s>(&self, k: usize, sum: &'s [V], params: &Params) -> (&'s [V], &'s V) {
+        let phase = self.phases[k];
+        let len = params.groups[self.group(k)].p.len();
+        (&sum[self.algorithm.range(phase)], &sum[len])
     }
 
     fn shard(
@@ -266,15 +329,15 @@ impl<P: Phases> Run<'_, P> {
         }
     }
 
-    fn step(&self, phase: usize, sum: &mut [V], params: &mut Params, report: &mut PhaseReport) {
-        let (grad, sums) = sum.split_at(sum.len() - 1);
-        let mean = sums[0].0.map(|x| x / self.schedule.minibatch as f32);
-        let range = self.algorithm.range(phase);
-        let grad = &grad[range.clone()];
-        let (length, limit) = (norm(grad), self.algorithm.max_norm(phase));
+    /// One step of the phase at `k`, clipped by `length`.
+    fn step(&self, k: usize, length: f32, sum: &[V], params: &mut Params, report: &mut PhaseReport) {
+        let phase = self.phases[k];
+        let (grad, reported) = self.parts(k, sum, params);
+        let mean = reported.0.map(|x| x / self.schedule.minibatch as f32);
+        let limit = self.algorithm.max_norm(phase);
         let scale = if length > limit { limit / length } else { 1.0 };
-        let group = &mut params.groups[self.algorithm.group(phase)];
-        params.adam[phase].step(&mut group.p[range], grad, scale, self.schedule.rate);
+        let group = &mut params.groups[self.group(k)];
+        params.adam[phase].step(&mut group.p[self.algorithm.range(phase)], grad, scale, self.schedule.rate);
         self.algorithm.refresh(phase, params);
         self.algorithm.after(phase, &mean, params);
         report.norm += f64::from(length);

@@ -4,10 +4,10 @@
 //! collect with constraints                                        (line 8; `rollout`)
 //! discriminator, bottleneck, and policy against them, Eq. 2       (line 9)
 //! inverse model on reached transitions, Eq. 4, above a threshold  (lines 10 to 12)
-//! policy gradient on the combined policy, Eq. 1                   (line 13)
+//! policy gradient on the combined policy, Eq. 1, and the value    (line 13)
 //! ```
 //!
-//! The three losses run on each minibatch in the order of [`ACTOR`], [`DISCRIMINATOR`], [`INVERSE`]. The gradient of
+//! The losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`DISCRIMINATOR`], [`INVERSE`]. The gradient of
 //! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the
 //! bounds, zero where the projection clamped.
 
@@ -18,6 +18,7 @@ use super::discriminator::{Discriminator, DiscriminatorWork, LATENT};
 use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, SUMS, Schedule, Tile, add_sums, optimise};
 use super::ppo::PpoSettings;
+use super::value::ValueWork;
 use super::{Adam, Batch, Dims, Learner, Metrics};
 use adversary::{fool_discriminator, judge};
 use nearl_runtime::net::kernel::{V, ZERO};
@@ -65,12 +66,14 @@ impl Default for Pid2Settings {
     }
 }
 
-/// Phase of the policy gradient, the value and the adversarial loss of the policy.
+/// Phase of the policy gradient and the adversarial loss of the policy.
 pub const ACTOR: usize = 0;
+/// Phase of the value.
+pub const VALUE: usize = 1;
 /// Phase of the discriminator.
-pub const DISCRIMINATOR: usize = 1;
+pub const DISCRIMINATOR: usize = 2;
 /// Phase of the supervised inverse model.
-pub const INVERSE: usize = 2;
+pub const INVERSE: usize = 3;
 
 /// The learner.
 pub struct Pid2 {
@@ -113,13 +116,16 @@ impl Nets {
 /// Buffers of one thread.
 struct Work {
     actor: CombinedWork,
+    value: ValueWork,
     discriminator: DiscriminatorWork,
 }
 
-/// Parameter group of policy, inverse model and value.
+/// Parameter group of policy and inverse model.
 const COMBINED: usize = 0;
+/// Parameter group of the value.
+const CRITIC: usize = 1;
 /// Parameter group of the discriminator.
-const JUDGE: usize = 1;
+const JUDGE: usize = 2;
 
 impl Pid2 {
     /// Fresh networks. `bottleneck` off is `pid2-gan`.
@@ -135,17 +141,18 @@ impl Pid2 {
     ) -> Self {
         let lr = ppo.lr;
         let discriminator = Discriminator::new(dims.n_obs + dims.n_state, nets, bottleneck);
-        let (combined, actor) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
+        let (combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
         let d = &discriminator;
         let mut judge = Group { p: vec![ZERO; d.len], transposed: vec![ZERO; d.transposed] };
         d.init(&mut judge.p, rng);
         d.refresh(&judge.p, &mut judge.transposed);
         let adam = vec![
             Adam::new(combined.len, lr),
+            Adam::new(combined.value.len(), lr),
             Adam::new(d.len, settings.discriminator_lr),
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
         ];
-        let params = Params { groups: vec![actor, judge], adam, beta: settings.beta };
+        let params = Params { groups: vec![actor, critic, judge], adam, beta: settings.beta };
         let nets = Nets { settings, combined, discriminator, noise: Vec::new() };
         Self { nets, params, threads }
     }
@@ -164,7 +171,7 @@ impl Learner for Pid2 {
         let schedule = Schedule { epochs: s.n_epochs, minibatch: s.batch_size, threads: self.threads, rate };
         let before = self.nets.combined.idm_error(self.actor(), batch, self.threads);
         let inverse_learns = before.is_some_and(|e| e >= self.nets.settings.idm_threshold);
-        let mut phases = vec![ACTOR];
+        let mut phases = vec![ACTOR, VALUE];
         if self.nets.settings.generator_weight > 0.0 {
             phases.push(DISCRIMINATOR);
         }
@@ -172,11 +179,11 @@ impl Learner for Pid2 {
             phases.push(INVERSE);
         }
         let report = optimise(&self.nets, &mut self.params, batch, &phases, schedule, rng);
-        let mut metrics = self.nets.combined.metrics(self.actor(), &report[0].mean, report[0].norm);
+        let mut metrics = self.nets.combined.metrics(self.actor(), &report[0], &report[1]);
         if phases.contains(&DISCRIMINATOR) {
-            let judge = &report[1].mean;
+            let judge = &report[2].mean;
             metrics.extend([
-                ("train/generator_loss", report[0].mean[5]),
+                ("train/generator_loss", report[0].mean[4]),
                 ("discriminator/loss", judge[0]),
                 ("discriminator/kl", judge[1]),
                 ("discriminator/accuracy", judge[2]),
@@ -198,27 +205,26 @@ impl Learner for Pid2 {
 
     fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
         f(&mut self.params)?;
-        self.nets.refresh(ACTOR, &mut self.params);
-        self.nets.refresh(DISCRIMINATOR, &mut self.params);
+        [ACTOR, VALUE, DISCRIMINATOR].iter().for_each(|&phase| self.nets.refresh(phase, &mut self.params));
         Ok(())
     }
 
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
-        self.nets.combined.values(self.actor(), x, self.threads)
+        self.nets.combined.value.of(&self.params.groups[CRITIC], x, self.threads)
     }
 }
 
-/// Policy gradient on the combined policy (Eq. 1), value, and the adversarial loss of the policy (Eq. 2).
+/// Policy gradient on the combined policy (Eq. 1), and the adversarial loss of the policy (Eq. 2).
 #[inline(always)]
 fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
     let group = &params.groups[COMBINED];
-    let [loss, kl, clipped, squares, clamped] = n.combined.policy_gradient(group, &t, &mut w.actor, grad);
+    let [loss, kl, clipped, clamped] = n.combined.policy_gradient(group, &t, &mut w.actor, grad);
     let mut generator = 0.0;
     if n.settings.generator_weight > 0.0 {
         generator = fool_discriminator(n, &params.groups[JUDGE], &t, w);
     }
     n.combined.learn(group, &mut w.actor, grad);
-    add_sums(grad, &[loss, kl, clipped, squares, clamped, generator]);
+    add_sums(grad, &[loss, kl, clipped, clamped, generator]);
 }
 
 multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = actor_body);
@@ -227,14 +233,20 @@ impl Phases for Nets {
     type Work = Work;
 
     fn work(&self) -> Work {
-        Work { actor: self.combined.work(), discriminator: self.discriminator.work() }
+        let value = self.combined.value.work();
+        Work { actor: self.combined.work(), value, discriminator: self.discriminator.work() }
     }
     fn group(&self, phase: usize) -> usize {
-        if phase == DISCRIMINATOR { JUDGE } else { COMBINED }
+        match phase {
+            VALUE => CRITIC,
+            DISCRIMINATOR => JUDGE,
+            _ => COMBINED,
+        }
     }
     fn range(&self, phase: usize) -> Range<usize> {
         match phase {
             ACTOR => 0..self.combined.len,
+            VALUE => 0..self.combined.value.len(),
             INVERSE => self.combined.inverse_range(),
             _ => 0..self.discriminator.len,
         }
@@ -242,6 +254,7 @@ impl Phases for Nets {
     fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
         match phase {
             ACTOR => actor(self, params, t, w, grad),
+            VALUE => self.combined.value.tile(&params.groups[CRITIC], &t, &mut w.value, grad),
             INVERSE => self.combined.idm_tile(&params.groups[COMBINED], &t, &mut w.actor, grad),
             _ => judge(self, params, t, w, grad),
         }
@@ -249,6 +262,7 @@ impl Phases for Nets {
     fn refresh(&self, phase: usize, params: &mut Params) {
         match phase {
             ACTOR => self.combined.refresh(&mut params.groups[COMBINED]),
+            VALUE => self.combined.value.refresh(&mut params.groups[CRITIC]),
             INVERSE => self.combined.refresh_inverse(&mut params.groups[COMBINED]),
             _ => {
                 let Group { p, transposed } = &mut params.groups[JUDGE];
@@ -257,11 +271,17 @@ impl Phases for Nets {
         }
     }
     fn max_norm(&self, phase: usize) -> f32 {
-        if phase == ACTOR { self.combined.ppo.max_grad_norm } else { f32::INFINITY }
+        if matches!(phase, ACTOR | VALUE) { self.combined.ppo.max_grad_norm } else { f32::INFINITY }
+    }
+    fn clipped_with(&self, phase: usize) -> Option<usize> {
+        [Some(VALUE), Some(ACTOR), None, None][phase]
+    }
+    fn lane(&self, phase: usize) -> usize {
+        usize::from(matches!(phase, VALUE | DISCRIMINATOR))
     }
     /// The policy is judged.
-    fn reads_other_group(&self) -> bool {
-        true
+    fn read_across(&self) -> Option<usize> {
+        (self.settings.generator_weight > 0.0).then_some(JUDGE)
     }
     fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>> {
         let mut rows = self.combined.rows(batch);

@@ -4,10 +4,11 @@
 use super::batch::Batch;
 use super::gaussian::{Gaussian, gather, likelihood_ratio};
 use super::inverse::InverseModel;
-use super::losses::{mean_std, set_lanes, value_loss, values, widths};
+use super::losses::{mean_std, set_lanes, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, Schedule, TILE, Tile, add_sums, optimise};
+use super::value::{Value, ValueWork};
 use super::{Adam, Dims, Learner, Metrics, init};
 use nearl_runtime::net::Dense;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars};
@@ -54,7 +55,7 @@ impl Default for PpoSettings {
     }
 }
 
-/// Policy, value and inverse model.
+/// Policy, value and inverse model, each in a parameter group of its own.
 pub struct Ppo {
     nets: Nets,
     params: Params,
@@ -66,7 +67,7 @@ struct Nets {
     settings: PpoSettings,
     policy: Net,
     log_std: Range<usize>,
-    value: Net,
+    value: Value,
     inverse: InverseModel,
     len: usize,
 }
@@ -80,17 +81,18 @@ impl Nets {
 /// Buffers of one thread.
 pub struct Work {
     policy: Tape,
-    value: Tape,
+    value: ValueWork,
     inverse: super::inverse::InverseWork,
     obs: Vec<V>,
     action: Vec<V>,
     d_action: Vec<V>,
-    d_value: Vec<V>,
     rows: [Vec<V>; 3],
 }
 
+/// Phases, each with a parameter group of its own.
 const ACTOR: usize = 0;
-const INVERSE: usize = 1;
+const VALUE: usize = 1;
+const INVERSE: usize = 2;
 
 impl Ppo {
     /// Fresh networks.
@@ -106,17 +108,16 @@ impl Ppo {
         let policy = Net::new(&widths(o, &nets.policy, a), f, false, &mut at, &mut transposed);
         let log_std = at..at + a.div_ceil(LANES);
         at = log_std.end;
-        let value = Net::new(&widths(o, &nets.value, 1), f, false, &mut at, &mut transposed);
         let mut actor = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
         policy.mlp.write_dense(&init::orthogonal(&policy.mlp.widths(), 0.01, rng), &mut actor.p);
-        value.mlp.write_dense(&init::orthogonal(&value.mlp.widths(), 1.0, rng), &mut actor.p);
+        let (value, value_group) = Value::new(&dims, nets, settings.vf_coef, rng);
         set_lanes(&mut actor.p[log_std.clone()], a, settings.log_std);
         let (inverse, inverse_group) = InverseModel::alone(&dims, nets, rng);
-        let adam = vec![Adam::new(at, settings.lr), Adam::new(inverse_group.p.len(), settings.lr)];
+        let groups = vec![actor, value_group, inverse_group];
+        let adam = groups.iter().map(|g| Adam::new(g.p.len(), settings.lr)).collect();
         let nets = Nets { dims, settings, policy, log_std, value, inverse, len: at };
-        let mut params = Params { groups: vec![actor, inverse_group], adam, beta: 0.0 };
-        nets.refresh(ACTOR, &mut params);
-        nets.refresh(INVERSE, &mut params);
+        let mut params = Params { groups, adam, beta: 0.0 };
+        [ACTOR, VALUE, INVERSE].iter().for_each(|&phase| nets.refresh(phase, &mut params));
         Self { nets, params, threads }
     }
 }
@@ -138,20 +139,19 @@ impl Learner for Ppo {
 
     fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
         f(&mut self.params)?;
-        self.nets.refresh(ACTOR, &mut self.params);
-        self.nets.refresh(INVERSE, &mut self.params);
+        [ACTOR, VALUE, INVERSE].iter().for_each(|&phase| self.nets.refresh(phase, &mut self.params));
         Ok(())
     }
 
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
-        values(&self.nets.value, &self.params.groups[ACTOR].p, x, self.nets.dims.n_obs, self.threads)
+        self.nets.value.of(&self.params.groups[VALUE], x, self.threads)
     }
 
     fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics {
         let s = &self.nets.settings;
         let before = self.nets.idm_error(&self.params, batch, self.threads);
         let schedule = Schedule { epochs: s.n_epochs, minibatch: s.batch_size, threads: self.threads, rate };
-        let report = optimise(&self.nets, &mut self.params, batch, &[ACTOR, INVERSE], schedule, rng);
+        let report = optimise(&self.nets, &mut self.params, batch, &[ACTOR, VALUE, INVERSE], schedule, rng);
         let after = self.nets.idm_error(&self.params, batch, self.threads);
         let p = &self.params.groups[ACTOR].p;
         let log_std = &scalars(&p[self.nets.log_std.clone()])[..self.nets.dims.n_act];
@@ -159,7 +159,7 @@ impl Learner for Ppo {
             ("train/policy_gradient_loss", report[0].mean[0]),
             ("train/approx_kl", report[0].mean[1]),
             ("train/clip_fraction", report[0].mean[2]),
-            ("train/value_loss", report[0].mean[3]),
+            ("train/value_loss", report[1].mean[0]),
             ("train/grad_norm", report[0].norm),
             ("train/std", mean_std(log_std)),
         ];
@@ -180,11 +180,7 @@ fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [
     let action = Gaussian { log_std: n.log_std.clone(), n: a, sampled: &w.action, mean, d: &mut w.d_action };
     let [loss, kl, clipped] = likelihood_ratio([action], s, &t, &mut w.rows, &group.p, grad);
     n.policy.backward(&group.transposed, &w.obs, &w.d_action, &mut w.policy, Some(grad), false);
-    // value
-    let value = n.value.forward(&group.p, &w.obs, &mut w.value);
-    let squares = value_loss(&mut w.d_value, &mut w.rows, value, &t, s.vf_coef);
-    n.value.backward(&group.transposed, &w.obs, &w.d_value, &mut w.value, Some(grad), false);
-    add_sums(grad, &[loss, kl, clipped, squares]);
+    add_sums(grad, &[loss, kl, clipped]);
 }
 
 multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = actor_body);
@@ -196,12 +192,11 @@ impl Phases for Nets {
         let (ov, av) = (self.dims.n_obs.div_ceil(LANES), self.dims.n_act.div_ceil(LANES));
         Work {
             policy: self.policy.tape(TILE),
-            value: self.value.tape(TILE),
+            value: self.value.work(),
             inverse: self.inverse.work(),
             obs: vec![ZERO; TILE * ov],
             action: vec![ZERO; TILE * av],
             d_action: vec![ZERO; TILE * av],
-            d_value: vec![ZERO; TILE],
             rows: std::array::from_fn(|_| vec![ZERO; TILE / LANES]),
         }
     }
@@ -209,26 +204,35 @@ impl Phases for Nets {
         phase
     }
     fn range(&self, phase: usize) -> Range<usize> {
-        if phase == ACTOR { 0..self.len } else { self.inverse.range() }
+        match phase {
+            ACTOR => 0..self.len,
+            VALUE => 0..self.value.len(),
+            _ => self.inverse.range(),
+        }
     }
     fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
-        if phase == ACTOR {
-            actor(self, params, t, w, grad);
-        } else {
-            self.inverse.tile(&params.groups[INVERSE], &t, &self.dims, &mut w.inverse, grad);
+        match phase {
+            ACTOR => actor(self, params, t, w, grad),
+            VALUE => self.value.tile(&params.groups[VALUE], &t, &mut w.value, grad),
+            _ => self.inverse.tile(&params.groups[INVERSE], &t, &self.dims, &mut w.inverse, grad),
         }
     }
     fn refresh(&self, phase: usize, params: &mut Params) {
         let group = &mut params.groups[phase];
-        if phase == ACTOR {
-            self.policy.transpose(&group.p, &mut group.transposed);
-            self.value.transpose(&group.p, &mut group.transposed);
-        } else {
-            self.inverse.net.transpose(&group.p, &mut group.transposed);
+        match phase {
+            ACTOR => self.policy.transpose(&group.p, &mut group.transposed),
+            VALUE => self.value.refresh(group),
+            _ => self.inverse.net.transpose(&group.p, &mut group.transposed),
         }
     }
     fn max_norm(&self, _: usize) -> f32 {
         self.settings.max_grad_norm
+    }
+    fn clipped_with(&self, phase: usize) -> Option<usize> {
+        [Some(VALUE), Some(ACTOR), None][phase]
+    }
+    fn lane(&self, phase: usize) -> usize {
+        usize::from(phase == INVERSE)
     }
     fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>> {
         let d = &self.dims;

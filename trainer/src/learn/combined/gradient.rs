@@ -3,14 +3,13 @@
 
 use super::super::gaussian::{Gaussian, gather, likelihood_ratio};
 use super::super::inverse::{CLIP, InverseModel, gather_input};
-use super::super::losses::value_loss;
 use super::super::optimise::{Group, TILE, Tile};
 use super::{Combined, CombinedWork};
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars, scalars_mut};
 use std::ops::Range;
 
-/// Sums over rows: loss, approximate KL, clipped rows, squared value errors, clamped entries.
-pub(in super::super) type ActorSums = [f32; 5];
+/// Sums over rows: loss, approximate KL, clipped rows, clamped entries.
+pub(in super::super) type ActorSums = [f32; 4];
 
 impl Combined {
     /// Output of the policy for the rows of the tile.
@@ -21,7 +20,7 @@ impl Combined {
         self.policy.forward(&group.p, &w.obs, &mut w.policy);
     }
 
-    /// Policy gradient on the combined policy (Eq. 1) and the value loss. Leaves `dL / du` in `w.d_change`, where other
+    /// Policy gradient on the combined policy (Eq. 1). Leaves `dL / du` in `w.d_change`, where other
     /// losses of the policy may add to it before [`Combined::learn`].
     #[inline(always)]
     pub(in super::super) fn policy_gradient(
@@ -40,10 +39,7 @@ impl Combined {
             (Some(pi), None) => (self.through_proposal(pi, group, t, w, grad), 0.0),
             (None, None) => unreachable!("refused in `new`"),
         };
-        let value = self.value.forward(&group.p, &w.obs, &mut w.value);
-        let squares = value_loss(&mut w.d_value, &mut w.rows, value, t, self.ppo.vf_coef);
-        self.value.backward(&group.transposed, &w.obs, &w.d_value, &mut w.value, Some(grad), false);
-        [loss, kl, clipped, squares, clamped]
+        [loss, kl, clipped, clamped]
     }
 
     /// From `dL / du` in `w.d_change` to the policy's parameters.

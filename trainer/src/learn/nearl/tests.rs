@@ -25,14 +25,15 @@ fn learner(kind: Kind, activation: Activation) -> Nearl {
     let mut l = Nearl::new(dims(), &nets, ppo, settings, kind, 1, &mut rng);
     let c = &l.nets.combined;
     let inverse = c.inverse.as_ref().map(|(m, _)| &m.net);
-    let nets: Vec<_> = [&c.policy, &c.value].into_iter().chain(inverse).collect();
-    spread(&mut l.params.groups[0].p, &nets);
-    l.nets.combined.refresh(&mut l.params.groups[0]);
+    let nets: Vec<_> = [&c.policy].into_iter().chain(inverse).collect();
+    spread(&mut l.params.groups[COMBINED].p, &nets);
+    spread(&mut l.params.groups[CRITIC].p, &[&c.value.net]);
+    [ACTOR, VALUE].iter().for_each(|&phase| l.nets.refresh(phase, &mut l.params));
     l
 }
 
 fn gradient(l: &Nearl, batch: &Batch, phase: usize) -> Vec<V> {
-    let mut grad = vec![ZERO; l.nets.combined.len + 1];
+    let mut grad = vec![ZERO; l.params.groups[l.nets.group(phase)].p.len() + 1];
     let idx: Vec<u32> = (0..batch.n as u32).collect();
     l.nets.tile(phase, &l.params, tile(batch, &idx), &mut l.nets.work(), &mut grad);
     grad
@@ -85,13 +86,14 @@ fn joint_ratio_equals_central_differences() {
         };
         let spreads = [wide(spread_pi, d.n_state, p), wide(spread_i, d.n_act, p)];
         let of = |net: &crate::learn::Net| Net64::of(&net.mlp.to_dense(p), activation);
-        let (policy, inverse, value) = (of(&c.policy), of(&model.net), of(&c.value));
+        let (policy, inverse) = (of(&c.policy), of(&model.net));
+        let value = Net64::of(&c.value.net.mlp.to_dense(&l.params.groups[CRITIC].p), activation);
         for i in 0..b.n {
             // ratios around 1, some of them clipped
             let old = log_prob(&b, i, &policy, &inverse, &spreads) as f32;
             b.log_prob[i] = old + 0.3 * (b.log_prob[i] + 4.0);
         }
-        let (b, grad) = (&b, gradient(&l, &b, ACTOR));
+        let (b, grad, value_grad) = (&b, gradient(&l, &b, ACTOR), gradient(&l, &b, VALUE));
         let loss = |policy: &Net64, inverse: &Net64, value: &Net64, s: &[Vec<f64>; 2]| {
             let one = |i: usize| {
                 let e = value.forward(&row(&b.obs, i, d.n_obs))[0] - f64::from(b.returns[i]);
@@ -104,7 +106,9 @@ fn joint_ratio_equals_central_differences() {
         let errors = [
             relative_error(&policy, &flat(&c.policy), |n| loss(n, &inverse, &value, &spreads)),
             relative_error(&inverse, &flat(&model.net), |n| loss(&policy, n, &value, &spreads)),
-            relative_error(&value, &flat(&c.value), |n| loss(&policy, &inverse, n, &spreads)),
+            relative_error(&value, &flat32(&c.value.net.mlp.to_dense(&value_grad)), |n| {
+                loss(&policy, &inverse, n, &spreads)
+            }),
         ];
         assert!(errors.iter().all(|e| *e < 2e-4), "{activation:?}: policy, inverse, value: {errors:?}");
         for (which, (range, n)) in [(spread_pi, d.n_state), (spread_i, d.n_act)].into_iter().enumerate() {

@@ -1,12 +1,12 @@
-//! Parameter groups that learn side by side, for minibatches too small to be cut.
+//! Phases in two lanes side by side, for minibatches too small to be cut.
 //!
-//! The phases of the first phase's group are the leader, all others the follower. The follower reads nothing the leader
-//! changes. Where the leader reads the follower's group, it takes it as it was before the same minibatch: both do exactly
+//! Lane 1 reads nothing that lane 0 changes. Where lane 0 reads a group of lane 1, it takes it as it was before the same
+//! minibatch; where gradients of both are clipped together, each tells the other the square of its length. Both do exactly
 //! what one thread does in turn, to the bit.
 
 use super::{Group, Params, PhaseReport, Phases, Run, moments, wait_until};
-use nearl_runtime::net::kernel::ZERO;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use nearl_runtime::net::kernel::V;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 /// Minibatches the follower may be ahead.
@@ -44,47 +44,62 @@ fn copy(to: &mut Group, from: &Group) {
     to.transposed.copy_from_slice(&from.transposed);
 }
 
+/// Squared lengths of gradients, from one lane to the other. There are two slots a lane: it can only write a minibatch's after
+/// it read the other's of the minibatch before.
+#[derive(Default)]
+struct Lengths {
+    slots: [[AtomicU64; 2]; 2],
+}
+
+impl Lengths {
+    fn tell(&self, lane: usize, step: usize, square: f32) {
+        let stamped = (step as u64 + 1) << 32 | u64::from(square.to_bits());
+        self.slots[lane][step % 2].store(stamped, Ordering::Release);
+    }
+
+    /// What the other lane tells of this minibatch.
+    fn ask(&self, lane: usize, step: usize) -> f32 {
+        let slot = &self.slots[1 - lane][step % 2];
+        wait_until(|| slot.load(Ordering::Acquire) >> 32 == step as u64 + 1);
+        f32::from_bits(slot.load(Ordering::Acquire) as u32)
+    }
+}
+
 impl<P: Phases> Run<'_, P> {
-    /// Positions of the leader's and the follower's phases, if there are two lanes.
-    pub(super) fn lanes(&self) -> Option<(Vec<usize>, Vec<usize>)> {
-        let group = |k: usize| self.algorithm.group(self.phases[k]);
-        let (leader, follower): (Vec<_>, Vec<_>) =
-            (0..self.phases.len()).partition(|&k| group(k) == group(0));
-        let first = group(*follower.first()?);
-        follower.iter().all(|&k| group(k) == first).then_some((leader, follower))
+    /// Positions of the phases of both lanes, if both have some.
+    pub(super) fn lanes(&self) -> Option<[Vec<usize>; 2]> {
+        let of =
+            |lane| (0..self.phases.len()).filter(|&k| self.algorithm.lane(self.phases[k]) == lane).collect();
+        let lanes: [Vec<usize>; 2] = [of(0), of(1)];
+        lanes.iter().all(|l| !l.is_empty()).then_some(lanes)
     }
 
     /// The lanes on two threads; what each phase reported, in their order.
-    pub(super) fn side_by_side(
-        &self,
-        params: &mut Params,
-        (leader, follower): (Vec<usize>, Vec<usize>),
-    ) -> Vec<PhaseReport> {
-        let group = self.algorithm.group(self.phases[follower[0]]);
-        let trail = self.algorithm.reads_other_group().then(|| Trail::new(&params.groups[group]));
-        let mut reports = vec![PhaseReport::default(); self.phases.len()];
+    pub(super) fn side_by_side(&self, params: &mut Params, lanes: [Vec<usize>; 2]) -> Vec<PhaseReport> {
+        let trail = self.algorithm.read_across().map(|group| (group, Trail::new(&params.groups[group])));
+        let lengths = Lengths::default();
         let mut theirs = params.clone();
-        let (ahead, behind) = std::thread::scope(|scope| {
+        let (mut reports, others) = std::thread::scope(|scope| {
             let other = scope.spawn(|| {
-                self.lane(1, &follower, &mut theirs, |step, params| {
-                    if let Some(trail) = &trail {
-                        trail.write(step, &params.groups[group]);
+                self.lane(1, &lanes[1], &lengths, &mut theirs, |step, params| {
+                    if let Some((group, trail)) = &trail {
+                        trail.write(step, &params.groups[*group]);
                     }
                 })
             });
-            let ahead = self.lane(0, &leader, params, |step, params| {
-                if let Some(trail) = &trail {
-                    trail.read(step, &mut params.groups[group]);
+            let reports = self.lane(0, &lanes[0], &lengths, params, |step, params| {
+                if let Some((group, trail)) = &trail {
+                    trail.read(step, &mut params.groups[*group]);
                 }
             });
-            (ahead, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            (reports, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
         });
-        for (&k, report) in leader.iter().chain(&follower).zip(ahead.into_iter().chain(behind)) {
-            reports[k] = report;
-        }
-        params.groups[group] = theirs.groups.swap_remove(group);
-        for &k in &follower {
-            params.adam[self.phases[k]].clone_from(&theirs.adam[self.phases[k]]);
+        for &k in &lanes[1] {
+            let phase = self.phases[k];
+            let group = self.algorithm.group(phase);
+            reports[k] = others[k];
+            params.groups[group].clone_from(&theirs.groups[group]);
+            params.adam[phase].clone_from(&theirs.adam[phase]);
         }
         params.beta = theirs.beta;
         reports
@@ -93,38 +108,65 @@ impl<P: Phases> Run<'_, P> {
     /// The phases at positions `mine` over every minibatch; `before` comes first in each.
     fn lane(
         &self,
-        buffer: usize,
+        index: usize,
         mine: &[usize],
+        lengths: &Lengths,
         params: &mut Params,
         before: impl Fn(usize, &mut Params),
     ) -> Vec<PhaseReport> {
         let mut work = self.algorithm.work();
-        let longest = params.groups.iter().map(|g| g.p.len()).max().unwrap_or(0) + 1;
-        let mut sum = vec![ZERO; longest];
-        let mut reports = vec![PhaseReport::default(); mine.len()];
-        let minibatches = self.orders.iter().flat_map(|o| o.chunks_exact(self.schedule.minibatch));
-        let mut steps = 0;
-        for idx in minibatches {
-            before(steps, params);
+        let mut lane = Lane { index, lengths, sums: self.sums(params), reports: self.reports(), held: None };
+        for (step, idx) in self.minibatches().enumerate() {
+            before(step, params);
             let advantage = moments(self.batch, idx);
-            for (report, &k) in reports.iter_mut().zip(mine) {
-                let phase = self.phases[k];
-                let len = params.groups[self.algorithm.group(phase)].p.len() + 1;
-                self.shard(0, phase, idx, advantage, params, &mut work, buffer, len);
-                self.gather(&mut sum[..len], buffer);
-                self.step(phase, &mut sum[..len], params, report);
+            for &k in mine {
+                if lane.held.is_some_and(|(held, _)| self.group(held) == self.group(k)) {
+                    lane.release(self, step, params);
+                }
+                let len = params.groups[self.group(k)].p.len() + 1;
+                self.shard(0, self.phases[k], idx, advantage, params, &mut work, index, len);
+                self.gather(&mut lane.sums[k][..len], index);
+                if self.partner(k).is_some_and(|p| !mine.contains(&p)) {
+                    let square = self.squared(k, &lane.sums[k], params);
+                    lengths.tell(index, step, square);
+                    lane.held = Some((k, square));
+                } else {
+                    self.settle(k, &lane.sums, params, &mut lane.reports);
+                }
             }
-            steps += 1;
+            lane.release(self, step, params);
         }
-        reports.iter_mut().for_each(|r| r.average(steps as f64));
-        reports
+        lane.reports.iter_mut().for_each(|r| r.average(self.minibatches().count() as f64));
+        lane.reports
+    }
+}
+
+/// One of the two threads.
+struct Lane<'l> {
+    index: usize,
+    lengths: &'l Lengths,
+    /// Gradient of each phase.
+    sums: Vec<Vec<V>>,
+    reports: Vec<PhaseReport>,
+    /// The phase that waits for the other lane's length, and the square of its own.
+    held: Option<(usize, f32)>,
+}
+
+impl Lane<'_> {
+    /// Steps the phase that waits; as late as possible, so that the other lane has had time.
+    fn release<P: Phases>(&mut self, run: &Run<'_, P>, step: usize, params: &mut Params) {
+        if let Some((k, square)) = self.held.take() {
+            let length = (square + self.lengths.ask(self.index, step)).sqrt();
+            run.step(k, length, &self.sums[k], params, &mut self.reports[k]);
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use crate::learn::{
-        Batch, Dims, Gradient, Kind, Learner, NetSettings, Pid2, Pid2Settings, Ppo, PpoSettings, reference,
+        Batch, Dims, Gradient, Kind, Learner, Nearl, NearlSettings, NetSettings, Pid2, Pid2Settings, Ppo,
+        PpoSettings, reference,
     };
 
     fn dims() -> Dims {
@@ -137,10 +179,21 @@ mod tests {
         if algo == "ppo" {
             return Box::new(Ppo::new(dims(), &nets, ppo, threads, &mut rng));
         }
+        let kind = Kind { stochastic: false, learned: true };
+        if algo == "nearl" {
+            return Box::new(Nearl::new(
+                dims(),
+                &nets,
+                ppo,
+                NearlSettings::default(),
+                kind,
+                threads,
+                &mut rng,
+            ));
+        }
         // the supervised phase of the inverse model takes part, on the policy's side
         let settings =
             Pid2Settings { idm_threshold: 0.0, gradient: Gradient::Projection, ..Pid2Settings::default() };
-        let kind = Kind { stochastic: false, learned: true };
         Box::new(Pid2::new(dims(), &nets, ppo, settings, kind, true, threads, &mut rng))
     }
 
@@ -163,7 +216,7 @@ mod tests {
     #[test]
     fn side_by_side_equals_in_turn() {
         let batch = reference::batch(&dims(), 512, 3);
-        for algo in ["ppo", "pid2-ib"] {
+        for algo in ["ppo", "nearl", "pid2-ib"] {
             let (one, two) = (updated(algo, 1, &batch), updated(algo, 2, &batch));
             assert!(one.0 == two.0, "{algo}: two threads gave other parameters than one");
             assert_eq!(one.1, two.1, "{algo}: two threads reported something else than one");

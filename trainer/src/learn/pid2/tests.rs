@@ -33,11 +33,12 @@ fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2,
     let mut l = Pid2::new(dims(), &nets, ppo, settings, kind, bottleneck, 1, &mut rng);
     let c = &l.nets.combined;
     let inverse = c.inverse.as_ref().map(|(m, _)| &m.net);
-    let actor: Vec<_> = [&c.policy, &c.value].into_iter().chain(inverse).collect();
+    let actor: Vec<_> = [&c.policy].into_iter().chain(inverse).collect();
     spread(&mut l.params.groups[COMBINED].p, &actor);
+    spread(&mut l.params.groups[CRITIC].p, &[&c.value.net]);
     let (encoder, decoder) = l.nets.discriminator.nets();
     spread(&mut l.params.groups[JUDGE].p, &[encoder, decoder]);
-    for phase in [ACTOR, DISCRIMINATOR] {
+    for phase in [ACTOR, VALUE, DISCRIMINATOR] {
         l.nets.refresh(phase, &mut l.params);
     }
     let batch = batch(&dims(), TILE, 3);
@@ -85,12 +86,12 @@ struct Nets64 {
 }
 
 fn nets64(l: &Pid2) -> Nets64 {
-    let (a, d) = (&l.params.groups[0].p, &l.params.groups[1].p);
+    let [a, v, d] = [COMBINED, CRITIC, JUDGE].map(|group| &l.params.groups[group].p);
     let (enc, dec) = l.nets.discriminator.nets();
     let of = |dense: &Dense| Net64::of(dense, enc.mlp.activation);
     Nets64 {
         policy: of(&l.nets.combined.policy.mlp.to_dense(a)),
-        value: of(&l.nets.combined.value.mlp.to_dense(a)),
+        value: of(&l.nets.combined.value.net.mlp.to_dense(v)),
         inverse: l.nets.combined.inverse.as_ref().map(|(m, _)| of(&m.net.mlp.to_dense(a))),
         log_std: l.nets.combined.log_std(l.actor()).iter().map(|&v| f64::from(v)).collect(),
         enc: of(&enc.mlp.to_dense(d)),
@@ -131,6 +132,7 @@ fn actor_gradients_equal_central_differences() {
     for (stochastic, activation) in [(false, TANH), (true, TANH), (false, RELU), (true, RELU)] {
         let (l, b) = learner(stochastic, true, activation);
         let (grad, sums) = gradient(&l, &b, ACTOR);
+        let (value_grad, _) = gradient(&l, &b, VALUE);
         let n = nets64(&l);
         let with = |f: &dyn Fn(&mut Nets64)| {
             let mut m = nets64(&l);
@@ -139,12 +141,13 @@ fn actor_gradients_equal_central_differences() {
         };
         let mlp = |net: &Net| net.mlp.to_dense(&grad);
         check("policy", &n.policy, &mlp(&l.nets.combined.policy), |p| with(&|m| m.policy = p.clone()));
-        check("value", &n.value, &mlp(&l.nets.combined.value), |p| with(&|m| m.value = p.clone()));
+        let value = l.nets.combined.value.net.mlp.to_dense(&value_grad);
+        check("value", &n.value, &value, |p| with(&|m| m.value = p.clone()));
         let range = match (&l.nets.combined.inverse, &l.nets.combined.policy_log_std) {
             (Some((model, range)), _) => {
                 let net = n.inverse.as_ref().expect("inverse");
                 check("inverse", net, &mlp(&model.net), |p| with(&|m| m.inverse = Some(p.clone())));
-                assert!(sums[4] > 0.0, "the projection clamps some entries");
+                assert!(sums[3] > 0.0, "the projection clamps some entries");
                 range.clone()
             }
             (None, range) => range.clone().expect("log std"),

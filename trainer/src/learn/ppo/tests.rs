@@ -17,12 +17,17 @@ fn gradients(activation: Activation) {
     let nets = NetSettings { policy: vec![6, 5], value: vec![4, 6], activation, ..NetSettings::default() };
     let settings = PpoSettings { log_std: -0.3, ent_coef: 0.05, ..PpoSettings::default() };
     let mut l = Ppo::new(dims(), &nets, settings, 1, &mut crate::rollout::stream(1, 1));
-    spread(&mut l.params.groups[ACTOR].p, &[&l.nets.policy, &l.nets.value]);
-    l.nets.refresh(ACTOR, &mut l.params);
+    spread(&mut l.params.groups[ACTOR].p, &[&l.nets.policy]);
+    spread(&mut l.params.groups[VALUE].p, &[&l.nets.value.net]);
+    [ACTOR, VALUE].iter().for_each(|&phase| l.nets.refresh(phase, &mut l.params));
     let (b, d) = (batch(&dims(), TILE, 3), dims());
     let idx: Vec<u32> = (0..b.n as u32).collect();
-    let mut grad = vec![ZERO; l.nets.len + 1];
-    l.nets.tile(ACTOR, &l.params, tile(&b, &idx), &mut l.nets.work(), &mut grad);
+    let gradient = |phase: usize| {
+        let mut grad = vec![ZERO; l.params.groups[phase].p.len() + 1];
+        l.nets.tile(phase, &l.params, tile(&b, &idx), &mut l.nets.work(), &mut grad);
+        grad
+    };
+    let (grad, value_grad) = (gradient(ACTOR), gradient(VALUE));
     let p = &l.params.groups[ACTOR].p;
     let lanes: Vec<f64> =
         scalars(&p[l.nets.log_std.clone()])[..d.n_act].iter().map(|&v| f64::from(v)).collect();
@@ -35,11 +40,13 @@ fn gradients(activation: Activation) {
         };
         (0..b.n).map(one).sum::<f64>() / b.n as f64 - 0.05 * log_std.iter().sum::<f64>()
     };
-    let of = |net: &Net| Net64::of(&net.mlp.to_dense(p), activation);
-    let (policy, value) = (of(&l.nets.policy), of(&l.nets.value));
+    let of = |net: &Net, group: usize| Net64::of(&net.mlp.to_dense(&l.params.groups[group].p), activation);
+    let (policy, value) = (of(&l.nets.policy, ACTOR), of(&l.nets.value.net, VALUE));
     let errors = [
         relative_error(&policy, &flat32(&l.nets.policy.mlp.to_dense(&grad)), |n| loss(n, &value, &lanes)),
-        relative_error(&value, &flat32(&l.nets.value.mlp.to_dense(&grad)), |n| loss(&policy, n, &lanes)),
+        relative_error(&value, &flat32(&l.nets.value.net.mlp.to_dense(&value_grad)), |n| {
+            loss(&policy, n, &lanes)
+        }),
     ];
     assert!(errors.iter().all(|e| *e < 2e-4), "policy, value: {errors:?}");
     for k in 0..d.n_act {

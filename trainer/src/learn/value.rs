@@ -1,0 +1,93 @@
+//! The value network V(s), in a parameter group of its own.
+
+use super::Dims;
+use super::gaussian::gather;
+use super::init;
+use super::losses::{in_parts, value_loss, widths};
+use super::net::{Net, Tape};
+use super::nets::NetSettings;
+use super::optimise::{Group, TILE, Tile, add_sums};
+use nearl_runtime::multiversion;
+use nearl_runtime::net::Layer;
+use nearl_runtime::net::kernel::{LANES, V, ZERO};
+use rand_chacha::ChaCha8Rng;
+
+/// The network, and the weight of its loss.
+pub(super) struct Value {
+    pub(super) net: Net,
+    n_obs: usize,
+    weight: f32,
+}
+
+/// Buffers of one thread.
+pub(super) struct ValueWork {
+    tape: Tape,
+    obs: Vec<V>,
+    slope: Vec<V>,
+    rows: [Vec<V>; 3],
+}
+
+impl Value {
+    /// A fresh network and its parameter group; its loss has the weight `weight`.
+    pub(super) fn new(dims: &Dims, nets: &NetSettings, weight: f32, rng: &mut ChaCha8Rng) -> (Self, Group) {
+        let (mut at, mut transposed) = (0, 0);
+        let net =
+            Net::new(&widths(dims.n_obs, &nets.value, 1), nets.activation, false, &mut at, &mut transposed);
+        let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
+        net.mlp.write_dense(&init::orthogonal(&net.mlp.widths(), 1.0, rng), &mut group.p);
+        let value = Self { net, n_obs: dims.n_obs, weight };
+        value.refresh(&mut group);
+        (value, group)
+    }
+
+    /// Vectors of its parameters.
+    pub(super) fn len(&self) -> usize {
+        self.net.mlp.layers.iter().map(Layer::len).sum()
+    }
+
+    /// Refreshes the transposed weights.
+    pub(super) fn refresh(&self, group: &mut Group) {
+        self.net.transpose(&group.p, &mut group.transposed);
+    }
+
+    /// Buffers for a tile.
+    pub(super) fn work(&self) -> ValueWork {
+        ValueWork {
+            tape: self.net.tape(TILE),
+            obs: vec![ZERO; TILE * self.n_obs.div_ceil(LANES)],
+            slope: vec![ZERO; TILE],
+            rows: std::array::from_fn(|_| vec![ZERO; TILE / LANES]),
+        }
+    }
+
+    /// Squared error from the returns; its sum over rows is the tile's first sum.
+    pub(super) fn tile(&self, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) {
+        squared_error(self, group, t, w, grad);
+    }
+
+    /// Value of each row of `x` (n x n_obs).
+    pub(super) fn of(&self, group: &Group, x: &[f32], threads: usize) -> Vec<f32> {
+        let (n_obs, vectors) = (self.n_obs, self.n_obs.div_ceil(LANES));
+        let mut out = vec![0.0; x.len() / n_obs];
+        in_parts(&mut out, TILE, threads, |first, out| {
+            let mut w = self.work();
+            for (start, out) in (first..).step_by(TILE).zip(out.chunks_mut(TILE)) {
+                let idx: Vec<u32> = (start..start + out.len()).map(|i| i as u32).collect();
+                gather(&mut w.obs, vectors, 0, x, n_obs, &idx);
+                let y = self.net.forward(&group.p, &w.obs, &mut w.tape);
+                out.iter_mut().zip(y).for_each(|(out, y)| *out = y.0[0]);
+            }
+        });
+        out
+    }
+}
+
+#[inline(always)]
+fn body(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) {
+    gather(&mut w.obs, v.n_obs.div_ceil(LANES), 0, &t.batch.obs, v.n_obs, t.idx);
+    let value = v.net.forward(&group.p, &w.obs, &mut w.tape);
+    let squares = value_loss(&mut w.slope, &mut w.rows, value, t, v.weight);
+    v.net.backward(&group.transposed, &w.obs, &w.slope, &mut w.tape, Some(grad), false);
+    add_sums(grad, &[squares]);
+}
+multiversion!(fn squared_error(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) = body);
