@@ -198,6 +198,11 @@ impl Combined {
         self.inverse.as_ref().map(|(model, _)| model.error(p, batch, &self.dims, threads))
     }
 
+    /// The rows that [`Combined::idm_tile`] reads.
+    pub(super) fn idm_rows<'b>(&self, batch: &'b Batch) -> Vec<Rows<'b>> {
+        self.inverse.as_ref().map_or(Vec::new(), |(model, _)| model.rows(&self.dims, batch))
+    }
+
     /// The supervised loss of the inverse model (Eq. 4).
     pub(super) fn idm_tile(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) {
         if let (Some((model, _)), Some(work)) = (&self.inverse, &mut w.inverse) {

@@ -7,7 +7,7 @@ use super::init;
 use super::losses::{in_parts, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
-use super::optimise::{Group, TILE, Tile, add_sums};
+use super::optimise::{Group, Rows, TILE, Tile, add_sums};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars_mut};
 use rand_chacha::ChaCha8Rng;
@@ -74,6 +74,15 @@ impl InverseModel {
             action: vec![ZERO; TILE * n_out],
             slope: vec![ZERO; TILE * n_out],
         }
+    }
+
+    /// The rows that [`InverseModel::tile`] reads.
+    pub(super) fn rows<'b>(&self, dims: &Dims, batch: &'b Batch) -> Vec<Rows<'b>> {
+        vec![
+            Rows::new(&batch.obs, dims.n_obs),
+            Rows::new(&batch.reached, dims.n_state),
+            Rows::new(&batch.action, dims.n_act),
+        ]
     }
 
     /// `L_I = sum |a - I(s_c, s'_c)|^2 / 2` on reached transitions (Eq. 4 of the paper for the mean of the Gaussian; its

@@ -220,10 +220,14 @@ impl Phases for Nets {
     fn lane(&self, phase: usize) -> usize {
         usize::from(phase == VALUE)
     }
-    fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>> {
-        let mut rows = self.combined.rows(batch);
-        rows.push(Rows::new(&batch.reached, self.combined.dims.n_state));
-        rows
+    fn rows<'b>(&'b self, phase: usize, batch: &'b Batch) -> Vec<Rows<'b>> {
+        let d = &self.combined.dims;
+        match phase {
+            IMITATE => vec![Rows::new(&batch.obs, d.n_obs), Rows::new(&batch.reached, d.n_state)],
+            INVERSE => self.combined.idm_rows(batch),
+            VALUE => self.combined.value.rows(batch),
+            _ => self.combined.rows(batch),
+        }
     }
 }
 

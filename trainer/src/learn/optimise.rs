@@ -85,8 +85,8 @@ pub trait Phases: Sync {
     fn read_across(&self) -> Option<usize> {
         None
     }
-    /// The rows that a tile reads, so that the next ones can be on their way.
-    fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>>;
+    /// The rows that a tile of phase `k` reads, so that the next ones can be on their way.
+    fn rows<'b>(&'b self, phase: usize, batch: &'b Batch) -> Vec<Rows<'b>>;
     /// Changes what is not a parameter (the bottleneck's multiplier) from the sums of phase `k`, averaged over rows.
     fn after(&self, _phase: usize, _mean: &[f32; SUMS], _params: &mut Params) {}
 }
@@ -170,7 +170,7 @@ pub fn optimise<P: Phases>(
         phases,
         schedule,
         orders: &orders,
-        rows: rows::scattered(algorithm, batch),
+        rows: rows::scattered(algorithm, phases, batch),
         shards,
         threads,
         // two buffers a shard: one barrier an optimiser step
@@ -204,8 +204,8 @@ struct Run<'a, P: Phases> {
     phases: &'a [usize],
     schedule: Schedule,
     orders: &'a [Vec<u32>],
-    /// What is fetched ahead of its use.
-    rows: Vec<Rows<'a>>,
+    /// What is fetched ahead of its use, for each phase.
+    rows: Vec<Vec<Rows<'a>>>,
     shards: usize,
     threads: usize,
     gradients: Vec<[RwLock<Vec<V>>; 2]>,
@@ -218,10 +218,10 @@ impl<P: Phases> Run<'_, P> {
         let (mut sums, mut reports, mut round) = (self.sums(params), self.reports(), 0);
         for idx in self.minibatches() {
             let advantage = moments(self.batch, idx);
-            for (k, &phase) in self.phases.iter().enumerate() {
+            for k in 0..self.phases.len() {
                 let len = params.groups[self.group(k)].p.len() + 1;
                 for s in (thread..self.shards).step_by(self.threads) {
-                    self.shard(s, phase, idx, advantage, params, &mut work, round % 2, len);
+                    self.shard(s, k, idx, advantage, params, &mut work, round % 2, len);
                 }
                 let odd = round % 2;
                 round += 1;
@@ -294,7 +294,7 @@ impl<P: Phases> Run<'_, P> {
     fn shard(
         &self,
         s: usize,
-        phase: usize,
+        k: usize,
         idx: &[u32],
         advantage: (f32, f32),
         params: &Params,
@@ -307,13 +307,11 @@ impl<P: Phases> Run<'_, P> {
         grad[..len].fill(ZERO);
         let (scale, all) = (1.0 / self.schedule.minibatch as f32, idx);
         for at in (s * rows..(s + 1) * rows).step_by(TILE) {
-            if phase == self.phases[0] {
-                // after the last tile of a shard comes the first of this thread's next one
-                let next = if at + TILE < (s + 1) * rows { at + TILE } else { (s + self.threads) * rows };
-                rows::prefetch(&self.rows, all.get(next..next + TILE).unwrap_or(&[]));
-            }
+            // after the last tile of a shard comes the first of this thread's next one
+            let next = if at + TILE < (s + 1) * rows { at + TILE } else { (s + self.threads) * rows };
+            rows::prefetch(&self.rows[k], all.get(next..next + TILE).unwrap_or(&[]));
             let tile = Tile { batch: self.batch, idx: &all[at..at + TILE], scale, advantage };
-            self.algorithm.tile(phase, params, tile, work, &mut grad[..len]);
+            self.algorithm.tile(self.phases[k], params, tile, work, &mut grad[..len]);
         }
     }
 

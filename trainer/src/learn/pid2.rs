@@ -283,15 +283,27 @@ impl Phases for Nets {
     fn read_across(&self) -> Option<usize> {
         (self.settings.generator_weight > 0.0).then_some(JUDGE)
     }
-    fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>> {
-        let mut rows = self.combined.rows(batch);
-        if self.settings.generator_weight > 0.0 {
-            let n = self.combined.dims.n_state;
-            rows.extend([&batch.reached, &batch.proposal].map(|b| Rows::new(b, n)));
-            let shift = |pass| Rows::shifted(&self.noise, LATENT, self.noise_shift(pass));
-            rows.extend([Pass::Real, Pass::Proposed, Pass::Generator].map(shift));
+    fn rows<'b>(&'b self, phase: usize, batch: &'b Batch) -> Vec<Rows<'b>> {
+        let d = &self.combined.dims;
+        let noise = |pass| Rows::shifted(&self.noise, LATENT, self.noise_shift(pass));
+        match phase {
+            ACTOR => {
+                let mut rows = self.combined.rows(batch);
+                if self.settings.generator_weight > 0.0 {
+                    rows.push(noise(Pass::Generator));
+                }
+                rows
+            }
+            VALUE => self.combined.value.rows(batch),
+            INVERSE => self.combined.idm_rows(batch),
+            _ => vec![
+                Rows::new(&batch.obs, d.n_obs),
+                Rows::new(&batch.reached, d.n_state),
+                Rows::new(&batch.proposal, d.n_state),
+                noise(Pass::Real),
+                noise(Pass::Proposed),
+            ],
         }
-        rows
     }
     /// `beta <- max(0, beta + alpha (KL - I_c))`.
     fn after(&self, phase: usize, mean: &[f32; SUMS], params: &mut Params) {

@@ -234,14 +234,13 @@ impl Phases for Nets {
     fn lane(&self, phase: usize) -> usize {
         usize::from(phase == INVERSE)
     }
-    fn rows<'b>(&'b self, batch: &'b Batch) -> Vec<Rows<'b>> {
+    fn rows<'b>(&'b self, phase: usize, batch: &'b Batch) -> Vec<Rows<'b>> {
         let d = &self.dims;
-        vec![
-            Rows::new(&batch.obs, d.n_obs),
-            Rows::new(&batch.sampled, d.n_act),
-            Rows::new(&batch.reached, d.n_state),
-            Rows::new(&batch.action, d.n_act),
-        ]
+        match phase {
+            ACTOR => vec![Rows::new(&batch.obs, d.n_obs), Rows::new(&batch.sampled, d.n_act)],
+            VALUE => self.value.rows(batch),
+            _ => self.inverse.rows(d, batch),
+        }
     }
 }
 

@@ -1,12 +1,12 @@
 //! The value network V(s), in a parameter group of its own.
 
-use super::Dims;
 use super::gaussian::gather;
 use super::init;
 use super::losses::{in_parts, value_loss, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
-use super::optimise::{Group, TILE, Tile, add_sums};
+use super::optimise::{Group, Rows, TILE, Tile, add_sums};
+use super::{Batch, Dims};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::Layer;
 use nearl_runtime::net::kernel::{LANES, V, ZERO};
@@ -58,6 +58,11 @@ impl Value {
             slope: vec![ZERO; TILE],
             rows: std::array::from_fn(|_| vec![ZERO; TILE / LANES]),
         }
+    }
+
+    /// The rows that [`Value::tile`] reads.
+    pub(super) fn rows<'b>(&self, batch: &'b Batch) -> Vec<Rows<'b>> {
+        vec![Rows::new(&batch.obs, self.n_obs)]
     }
 
     /// Squared error from the returns; its sum over rows is the tile's first sum.

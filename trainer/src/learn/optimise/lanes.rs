@@ -124,7 +124,7 @@ impl<P: Phases> Run<'_, P> {
                     lane.release(self, step, params);
                 }
                 let len = params.groups[self.group(k)].p.len() + 1;
-                self.shard(0, self.phases[k], idx, advantage, params, &mut work, index, len);
+                self.shard(0, k, idx, advantage, params, &mut work, index, len);
                 self.gather(&mut lane.sums[k][..len], index);
                 if self.partner(k).is_some_and(|p| !mine.contains(&p)) {
                     let square = self.squared(k, &lane.sums[k], params);

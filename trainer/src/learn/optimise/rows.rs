@@ -32,11 +32,15 @@ impl<'b> Rows<'b> {
 /// Bytes that stay in a core's cache from one pass over the batch to the next.
 const CACHED: usize = 1 << 20;
 
-/// The rows worth fetching ahead: all that `algorithm` reads, or none where they stay in the cache.
-pub(super) fn scattered<'b, P: Phases>(algorithm: &'b P, batch: &'b Batch) -> Vec<Rows<'b>> {
-    let rows = algorithm.rows(batch);
-    let bytes: usize = rows.iter().map(|r| 4 * r.width * batch.n).sum();
-    if bytes > CACHED { rows } else { Vec::new() }
+/// The rows worth fetching ahead in each phase: all that `algorithm` reads, or none where they stay in the cache.
+pub(super) fn scattered<'b, P: Phases>(
+    algorithm: &'b P,
+    phases: &[usize],
+    batch: &'b Batch,
+) -> Vec<Vec<Rows<'b>>> {
+    let rows: Vec<Vec<Rows<'b>>> = phases.iter().map(|&phase| algorithm.rows(phase, batch)).collect();
+    let bytes: usize = rows.iter().flatten().map(|r| 4 * r.width * batch.n).sum();
+    if bytes > CACHED { rows } else { vec![Vec::new(); phases.len()] }
 }
 
 /// Fetches the rows of samples `idx` into the cache; only a hint, which no result depends on.
