@@ -3,7 +3,7 @@
 
 use super::super::gaussian::{Gaussian, gather, likelihood_ratio};
 use super::super::inverse::{CLIP, InverseModel, gather_input};
-use super::super::optimise::{Group, TILE, Tile};
+use super::super::optimise::{Group, Tile};
 use super::{Combined, CombinedWork};
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars, scalars_mut};
 use std::ops::Range;
@@ -59,23 +59,25 @@ impl Combined {
         w: &mut CombinedWork,
         grad: &mut [V],
     ) -> ([f32; 3], f32) {
-        let (d, a) = (&self.dims, self.dims.n_act);
+        let (d, a, s) = (&self.dims, self.dims.n_act, self.dims.n_state);
         let seen = d.seen_obs.len();
-        let (xv, av, sv) = ((2 * seen).div_ceil(LANES), a.div_ceil(LANES), d.n_state.div_ceil(LANES));
+        let (xv, av, sv) = ((2 * seen).div_ceil(LANES), a.div_ceil(LANES), s.div_ceil(LANES));
         let Some(inv) = &mut w.inverse else { unreachable!("made with the model") };
         // project again with the current policy
         let u = scalars(w.policy.output());
-        let (x, mut clamped) = (scalars_mut(&mut inv.input), 0.0);
-        for (r, &i) in t.idx.iter().enumerate() {
+        let rows = scalars_mut(&mut inv.input).chunks_exact_mut(xv * LANES).zip(u.chunks_exact(sv * LANES));
+        let mut clamped = 0u32;
+        for ((row, u), &i) in rows.zip(t.idx) {
             let i = i as usize;
-            for j in 0..seen {
-                let k = d.seen_state[j];
-                let raw = u[r * sv * LANES + k];
-                let held = raw.max(t.batch.lower[i * d.n_state + k]).min(t.batch.upper[i * d.n_state + k]);
-                let held = held.clamp(-CLIP, CLIP);
-                x[r * xv * LANES + j] = t.batch.obs[i * d.n_obs + d.seen_obs[j]];
-                x[r * xv * LANES + seen + j] = held;
-                clamped += if held == raw { 0.0 } else { 1.0 };
+            let (lower, upper) = (&t.batch.lower[i * s..][..s], &t.batch.upper[i * s..][..s]);
+            let obs = &t.batch.obs[i * d.n_obs..][..d.n_obs];
+            let (x, w) = row.split_at_mut(seen);
+            for (x, &o) in x.iter_mut().zip(&d.seen_obs) {
+                *x = obs[o];
+            }
+            for (w, &k) in w.iter_mut().zip(&d.seen_state) {
+                *w = u[k].max(lower[k]).min(upper[k]).clamp(-CLIP, CLIP);
+                clamped += u32::from(*w != u[k]);
             }
         }
         gather(&mut inv.action, av, 0, &t.batch.sampled, a, t.idx);
@@ -86,18 +88,15 @@ impl Combined {
         let dx =
             model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, Some(grad), true);
         // through the projection into the proposal
-        let (dx, x) = (scalars(dx), scalars(&inv.input));
         w.d_change.fill(ZERO);
-        let du = scalars_mut(&mut w.d_change);
-        for r in 0..TILE {
-            for j in 0..seen {
-                let (at, k) = (r * xv * LANES + seen + j, r * sv * LANES + d.seen_state[j]);
-                if self.gradient.passes(u[k], x[at], dx[at]) {
-                    du[k] = dx[at];
-                }
+        let rows = scalars_mut(&mut w.d_change).chunks_exact_mut(sv * LANES).zip(u.chunks_exact(sv * LANES));
+        let slopes = scalars(&inv.input).chunks_exact(xv * LANES).zip(scalars(dx).chunks_exact(xv * LANES));
+        for ((du, u), (x, dx)) in rows.zip(slopes) {
+            for ((&k, &x), &dx) in d.seen_state.iter().zip(&x[seen..]).zip(&dx[seen..]) {
+                du[k] = if self.gradient.passes(u[k], x, dx) { dx } else { 0.0 };
             }
         }
-        (sums, clamped)
+        (sums, clamped as f32)
     }
 
     /// Ratio on `log pi(u | s) + log I(a | s_c, w_c)` with the target `w` as it was.

@@ -2,7 +2,7 @@
 
 use super::super::discriminator::{logit_slope, softplus_sum};
 use super::super::gaussian::{copy, gather};
-use super::super::optimise::{Group, Params, TILE, Tile, add_sums};
+use super::super::optimise::{Group, Params, Tile, add_sums};
 use super::{JUDGE, Nets, Pass, Work};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, scalars, scalars_mut};
@@ -22,18 +22,18 @@ pub(super) fn fool_discriminator(n: &Nets, judge: &Group, t: &Tile<'_>, w: &mut 
     let d = &mut w.discriminator;
     gather(&mut d.input, xv, 0, &t.batch.obs, o, t.idx);
     gather_noise(n, Pass::Generator, t, &mut d.noise);
-    let (x, u) = (scalars_mut(&mut d.input), scalars(w.actor.policy.output()));
-    for r in 0..TILE {
-        copy(&mut x[r * xv * LANES + o..][..s], &u[r * sv * LANES..][..s]);
+    let u = scalars(w.actor.policy.output()).chunks_exact(sv * LANES);
+    for (x, u) in scalars_mut(&mut d.input).chunks_exact_mut(xv * LANES).zip(u) {
+        copy(&mut x[o..o + s], &u[..s]);
     }
     n.discriminator.forward(&judge.p, d);
     let loss = softplus_sum(&d.logit, 1.0);
     logit_slope(&mut d.logit, 1.0, n.settings.generator_weight * t.scale);
-    let dx = scalars(n.discriminator.backward(&judge.transposed, d, 0.0, None, true));
-    let du = scalars_mut(&mut w.actor.d_change);
-    for r in 0..TILE {
-        for k in 0..s {
-            du[r * sv * LANES + k] += dx[r * xv * LANES + o + k];
+    let dx =
+        scalars(n.discriminator.backward(&judge.transposed, d, 0.0, None, true)).chunks_exact(xv * LANES);
+    for (du, dx) in scalars_mut(&mut w.actor.d_change).chunks_exact_mut(sv * LANES).zip(dx) {
+        for (du, dx) in du.iter_mut().zip(&dx[o..o + s]) {
+            *du += dx;
         }
     }
     loss
