@@ -1,7 +1,7 @@
 //! A network over tiles of rows: forward with a tape, backward to parameters and inputs.
 
 use nearl_runtime::multiversion;
-use nearl_runtime::net::kernel::{Gemm, LANES, Out, V, ZERO, gemm, scalars, scalars_mut};
+use nearl_runtime::net::kernel::{Gemm, LANES, Out, V, ZERO, gemm, scalars};
 use nearl_runtime::net::{Activation, Layer, Mlp};
 
 /// Shapes of a network, and where its transposed weights lie (the backward pass reads them).
@@ -59,14 +59,8 @@ impl Net {
     pub fn transpose(&self, p: &[V], transposed: &mut [V]) {
         for (l, at) in self.mlp.layers.iter().zip(&self.transposed) {
             let Some(at) = *at else { continue };
-            let (row, t_row) = (l.n_vectors() * LANES, l.k_vectors() * LANES);
-            let t = scalars_mut(&mut transposed[at..at + row * l.k_vectors()]);
-            let w = scalars(&p[l.w..l.b]);
-            for k in 0..l.k {
-                for n in 0..l.n {
-                    t[n * t_row + k] = w[k * row + n];
-                }
-            }
+            let (n, k) = (l.n_vectors(), l.k_vectors());
+            transpose(&p[l.w..l.b], n, &mut transposed[at..at + n * LANES * k], k);
         }
     }
 
@@ -149,6 +143,29 @@ impl Net {
         &tape.grads[0][..if input { rows * self.mlp.layers[0].k_vectors() } else { 0 }]
     }
 }
+
+/// Rows of `w` (n vectors each) to columns of `t` (k vectors a row), in squares of 16 x 16; rows beyond the last are zero.
+#[inline(always)]
+fn squares(w: &[V], n: usize, t: &mut [V], k: usize) {
+    for i in 0..k {
+        for j in 0..n {
+            let mut from = [ZERO; LANES];
+            for (r, from) in from.iter_mut().enumerate() {
+                if let Some(v) = w.get((i * LANES + r) * n + j) {
+                    *from = *v;
+                }
+            }
+            for c in 0..LANES {
+                let mut to = ZERO;
+                for r in 0..LANES {
+                    to.0[r] = from[r].0[c];
+                }
+                t[(j * LANES + c) * k + i] = to;
+            }
+        }
+    }
+}
+multiversion!(fn transpose(w: &[V], n: usize, t: &mut [V], k: usize) = squares);
 
 #[inline(always)]
 fn sums(d: &[V], n: usize, out: &mut [V]) {

@@ -34,7 +34,8 @@ impl Trail {
 
     fn read(&self, step: usize, group: &mut Group) {
         wait_until(|| self.written.load(Ordering::Acquire) > step);
-        copy(group, &self.slots[step % AHEAD].lock().unwrap_or_else(PoisonError::into_inner));
+        // the slot is written anew before it is read again
+        std::mem::swap(group, &mut self.slots[step % AHEAD].lock().unwrap_or_else(PoisonError::into_inner));
         self.read.store(step + 1, Ordering::Release);
     }
 }
