@@ -112,7 +112,7 @@ impl Combined {
             *at = range.end;
             range
         };
-        let policy = Net::new(&widths(o, &nets.policy, s), f, false, &mut at, &mut transposed);
+        let policy = Net::new(&widths(o, &nets.policy, s), f, 0, &mut at, &mut transposed);
         let policy_range = 0..at;
         let policy_log_std = kind.stochastic.then(|| vectors(&mut at, s));
         let inverse = kind.learned.then(|| {

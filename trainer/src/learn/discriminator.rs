@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 /// Size of the latent z.
 pub(super) const LATENT: usize = LANES;
 
-/// Encoder (`n_obs + n_state -> 2 LATENT`: mean and log variance) and decoder (`LATENT -> 1`: logit of being real).
+/// Encoder (`n_state + n_obs -> 2 LATENT`: mean and log variance) and decoder (`LATENT -> 1`: logit of being real).
 pub(super) struct Discriminator {
     encoder: Net,
     decoder: Net,
@@ -28,7 +28,7 @@ pub(super) struct Discriminator {
 pub(super) struct DiscriminatorWork {
     encoder: Tape,
     decoder: Tape,
-    /// Input rows `[x, change]`.
+    /// Input rows `[change, x]`.
     pub(super) input: Vec<V>,
     /// Latent noise rows.
     pub(super) noise: Vec<V>,
@@ -41,12 +41,13 @@ pub(super) struct DiscriminatorWork {
 
 impl Discriminator {
     /// The first half of the hidden layers (rounded up) is the encoder's, the rest the decoder's.
-    pub(super) fn new(n_in: usize, nets: &NetSettings, bottleneck: bool) -> Self {
+    pub(super) fn new(n_state: usize, n_obs: usize, nets: &NetSettings, bottleneck: bool) -> Self {
         let (mut at, mut transposed) = (0, 0);
         let (hidden, f) = (&nets.discriminator, nets.activation);
         let (before, after) = hidden.split_at(hidden.len().div_ceil(2));
-        let encoder = Net::new(&widths(n_in, before, 2 * LATENT), f, true, &mut at, &mut transposed);
-        let decoder = Net::new(&widths(LATENT, after, 1), f, true, &mut at, &mut transposed);
+        let in_out = widths(n_state + n_obs, before, 2 * LATENT);
+        let encoder = Net::new(&in_out, f, n_state, &mut at, &mut transposed);
+        let decoder = Net::new(&widths(LATENT, after, 1), f, LATENT, &mut at, &mut transposed);
         Self { encoder, decoder, bottleneck, len: at, transposed }
     }
 
@@ -104,7 +105,7 @@ impl Discriminator {
     }
 
     /// From `dL / d logit` in `w.logit` and a weight on the KL: adds the parameters' gradient to `grad` if given; returns
-    /// the input's gradient if `input`.
+    /// the gradient of the change if `input`.
     #[inline(always)]
     pub(super) fn backward<'w>(
         &self,

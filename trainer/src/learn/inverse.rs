@@ -41,7 +41,7 @@ impl InverseModel {
     pub(super) fn new(dims: &Dims, nets: &NetSettings, at: &mut usize, transposed: &mut usize) -> Self {
         let start = *at;
         let widths = widths(2 * dims.seen_obs.len(), &nets.idm, dims.n_act);
-        let net = Net::new(&widths, nets.activation, true, at, transposed);
+        let net = Net::new(&widths, nets.activation, 2 * dims.seen_obs.len(), at, transposed);
         Self { net, start, end: *at }
     }
 

@@ -10,6 +10,8 @@ pub struct Net {
     /// Shapes and offsets in the parameter vector.
     pub mlp: Mlp,
     transposed: Vec<Option<usize>>,
+    /// Vectors of the input's gradient.
+    input_vectors: usize,
 }
 
 /// Activations of one tile of rows.
@@ -28,24 +30,26 @@ impl Tape {
 }
 
 impl Net {
-    /// `at` and `transposed_at` are running lengths in vectors; `input_grad`: the input's gradient is wanted.
+    /// `at` and `transposed_at` are running lengths in vectors; the gradient of the first `input_grad` inputs is wanted.
     pub fn new(
         widths: &[usize],
         activation: Activation,
-        input_grad: bool,
+        input_grad: usize,
         at: &mut usize,
         transposed_at: &mut usize,
     ) -> Self {
         let mlp = Mlp::new(widths, activation, at);
+        let input_vectors = input_grad.div_ceil(LANES);
         let place = |(i, l): (usize, &Layer)| {
-            (i > 0 || input_grad).then(|| {
+            let k = if i > 0 { l.k_vectors() } else { input_vectors };
+            (k > 0).then(|| {
                 let here = *transposed_at;
-                *transposed_at += l.n_vectors() * LANES * l.k_vectors();
+                *transposed_at += l.n_vectors() * LANES * k;
                 here
             })
         };
         let transposed = mlp.layers.iter().enumerate().map(place).collect();
-        Self { mlp, transposed }
+        Self { mlp, transposed, input_vectors }
     }
 
     /// Buffers for `rows` rows, a multiple of 8.
@@ -57,9 +61,9 @@ impl Net {
 
     /// Refreshes the transposed weights; call after each change of the parameters `p`.
     pub fn transpose(&self, p: &[V], transposed: &mut [V]) {
-        for (l, at) in self.mlp.layers.iter().zip(&self.transposed) {
-            let Some(at) = *at else { continue };
-            let (n, k) = (l.n_vectors(), l.k_vectors());
+        for (i, l) in self.mlp.layers.iter().enumerate() {
+            let Some(at) = self.transposed[i] else { continue };
+            let (n, k) = (l.n_vectors(), if i > 0 { l.k_vectors() } else { self.input_vectors });
             transpose(&p[l.w..l.b], n, &mut transposed[at..at + n * LANES * k], k);
         }
     }
@@ -89,7 +93,8 @@ impl Net {
     }
 
     /// From the output's gradient `dy` (padding zero): adds the parameters' gradient to `grad` if given; returns the
-    /// input's gradient if `input` (empty otherwise; the net must have been made for it).
+    /// gradient of the inputs it was made for if `input` (whole vectors a row, what lies beyond those inputs is of no use),
+    /// nothing otherwise.
     pub fn backward<'t>(
         &self,
         transposed: &[V],
@@ -123,6 +128,7 @@ impl Net {
                 column_sums(d, n, &mut g[l.b..l.b + n]);
             }
             if let Some(at) = self.transposed[i].filter(|_| i > 0 || input) {
+                let k = if i > 0 { k } else { self.input_vectors };
                 let product = Gemm {
                     m: rows,
                     k: l.n,
@@ -140,7 +146,7 @@ impl Net {
             }
         }
         tape.grads = [current, next];
-        &tape.grads[0][..if input { rows * self.mlp.layers[0].k_vectors() } else { 0 }]
+        &tape.grads[0][..if input { rows * self.input_vectors } else { 0 }]
     }
 }
 

@@ -140,7 +140,7 @@ impl Pid2 {
         rng: &mut ChaCha8Rng,
     ) -> Self {
         let lr = ppo.lr;
-        let discriminator = Discriminator::new(dims.n_obs + dims.n_state, nets, bottleneck);
+        let discriminator = Discriminator::new(dims.n_state, dims.n_obs, nets, bottleneck);
         let (combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
         let d = &discriminator;
         let mut judge = Group { p: vec![ZERO; d.len], transposed: vec![ZERO; d.transposed] };

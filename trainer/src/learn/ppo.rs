@@ -105,7 +105,7 @@ impl Ppo {
     ) -> Self {
         let (mut at, mut transposed) = (0, 0);
         let (o, a, f) = (dims.n_obs, dims.n_act, nets.activation);
-        let policy = Net::new(&widths(o, &nets.policy, a), f, false, &mut at, &mut transposed);
+        let policy = Net::new(&widths(o, &nets.policy, a), f, 0, &mut at, &mut transposed);
         let log_std = at..at + a.div_ceil(LANES);
         at = log_std.end;
         let mut actor = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };

@@ -31,8 +31,7 @@ impl Value {
     /// A fresh network and its parameter group; its loss has the weight `weight`.
     pub(super) fn new(dims: &Dims, nets: &NetSettings, weight: f32, rng: &mut ChaCha8Rng) -> (Self, Group) {
         let (mut at, mut transposed) = (0, 0);
-        let net =
-            Net::new(&widths(dims.n_obs, &nets.value, 1), nets.activation, false, &mut at, &mut transposed);
+        let net = Net::new(&widths(dims.n_obs, &nets.value, 1), nets.activation, 0, &mut at, &mut transposed);
         let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
         net.mlp.write_dense(&init::orthogonal(&net.mlp.widths(), 1.0, rng), &mut group.p);
         let value = Self { net, n_obs: dims.n_obs, weight };

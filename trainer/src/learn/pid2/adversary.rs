@@ -20,19 +20,20 @@ pub(super) fn fool_discriminator(n: &Nets, judge: &Group, t: &Tile<'_>, w: &mut 
     let (o, s) = (n.combined.dims.n_obs, n.combined.dims.n_state);
     let (xv, sv) = ((o + s).div_ceil(LANES), s.div_ceil(LANES));
     let d = &mut w.discriminator;
-    gather(&mut d.input, xv, 0, &t.batch.obs, o, t.idx);
+    gather(&mut d.input, xv, s, &t.batch.obs, o, t.idx);
     gather_noise(n, Pass::Generator, t, &mut d.noise);
     let u = scalars(w.actor.policy.output()).chunks_exact(sv * LANES);
     for (x, u) in scalars_mut(&mut d.input).chunks_exact_mut(xv * LANES).zip(u) {
-        copy(&mut x[o..o + s], &u[..s]);
+        copy(&mut x[..s], &u[..s]);
     }
     n.discriminator.forward(&judge.p, d);
     let loss = softplus_sum(&d.logit, 1.0);
     logit_slope(&mut d.logit, 1.0, n.settings.generator_weight * t.scale);
-    let dx =
-        scalars(n.discriminator.backward(&judge.transposed, d, 0.0, None, true)).chunks_exact(xv * LANES);
-    for (du, dx) in scalars_mut(&mut w.actor.d_change).chunks_exact_mut(sv * LANES).zip(dx) {
-        for (du, dx) in du.iter_mut().zip(&dx[o..o + s]) {
+    let dx = scalars(n.discriminator.backward(&judge.transposed, d, 0.0, None, true));
+    let rows =
+        scalars_mut(&mut w.actor.d_change).chunks_exact_mut(sv * LANES).zip(dx.chunks_exact(sv * LANES));
+    for (du, dx) in rows {
+        for (du, dx) in du[..s].iter_mut().zip(dx) {
             *du += dx;
         }
     }
@@ -46,11 +47,11 @@ fn discriminator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad
     let xv = (o + s).div_ceil(LANES);
     let (group, d) = (&params.groups[JUDGE], &mut w.discriminator);
     let (mut loss, mut kl, mut right) = (0.0, 0.0, 0.0);
-    gather(&mut d.input, xv, 0, &t.batch.obs, o, t.idx);
+    gather(&mut d.input, xv, s, &t.batch.obs, o, t.idx);
     for (real, sign) in [(true, 1.0), (false, -1.0)] {
         let (change, pass) =
             if real { (&t.batch.reached, Pass::Real) } else { (&t.batch.proposal, Pass::Proposed) };
-        gather(&mut d.input, xv, o, change, s, t.idx);
+        gather(&mut d.input, xv, 0, change, s, t.idx);
         gather_noise(n, pass, &t, &mut d.noise);
         kl += 0.5 * n.discriminator.forward(&group.p, d);
         loss += softplus_sum(&d.logit, sign);

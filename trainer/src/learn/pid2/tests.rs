@@ -57,7 +57,7 @@ fn gradient(l: &Pid2, batch: &Batch, phase: usize) -> (Vec<V>, [f32; SUMS]) {
     (grad, sums)
 }
 
-/// Discriminator on `[obs, change]` with given latent noise: logit and KL.
+/// Discriminator on `[change, obs]` with given latent noise: logit and KL.
 fn judge(enc: &Net64, dec: &Net64, x: &[f64], noise: &[f64], bottleneck: bool) -> (f64, f64) {
     let code = enc.forward(x);
     let (mut z, mut kl) = (vec![0.0; LATENT], 0.0);
@@ -114,7 +114,7 @@ fn actor_loss(l: &Pid2, b: &Batch, n: &Nets64) -> f64 {
             None => log_normal(&row(&b.proposal, i, d.n_state), &u, &n.log_std),
         };
         let e = n.value.forward(&obs)[0] - f64::from(b.returns[i]);
-        let x = [obs, u].concat();
+        let x = [u, obs].concat();
         let noise = noise(l, Pass::Generator, i);
         let (logit, _) = judge(&n.enc, &n.dec, &x, &noise, true);
         reference::surrogate(b, i, log_prob, 0.2) + 0.5 * e * e + 0.7 * softplus(-logit)
@@ -169,8 +169,8 @@ fn discriminator_gradients_equal_central_differences() {
         let loss = |enc: &Net64, dec: &Net64| {
             let one = |i: usize| {
                 let obs = row(&b.obs, i, d.n_obs);
-                let real = [obs.clone(), row(&b.reached, i, d.n_state)].concat();
-                let fake = [obs, row(&b.proposal, i, d.n_state)].concat();
+                let real = [row(&b.reached, i, d.n_state), obs.clone()].concat();
+                let fake = [row(&b.proposal, i, d.n_state), obs].concat();
                 let (lr, kr) = judge(enc, dec, &real, &noise(&l, Pass::Real, i), bottleneck);
                 let (lf, kf) = judge(enc, dec, &fake, &noise(&l, Pass::Proposed, i), bottleneck);
                 softplus(-lr) + softplus(lf) + 0.2 * 0.5 * (kr + kf)
