@@ -62,3 +62,22 @@ fn gradients(activation: Activation) {
         );
     }
 }
+
+/// After one step Adam's first moment is a tenth of the clipped gradient.
+#[test]
+fn gradients_of_policy_and_value_are_clipped_as_one_vector() {
+    let length = |max_grad_norm: f32| {
+        let settings = PpoSettings { max_grad_norm, n_epochs: 1, batch_size: TILE, ..PpoSettings::default() };
+        let mut rng = crate::rollout::stream(1, 1);
+        let mut l = Ppo::new(dims(), &NetSettings::default(), settings, 1, &mut rng);
+        l.update(&batch(&dims(), TILE, 3), 1.0, &mut rng);
+        [ACTOR, VALUE].map(|phase| {
+            let m = scalars(&l.params.adam[phase].m);
+            10.0 * m.iter().map(|&m| f64::from(m).powi(2)).sum::<f64>().sqrt()
+        })
+    };
+    let (free, held) = (length(f32::INFINITY), length(0.01));
+    assert!(free.iter().all(|l| *l > 0.02), "both would be cut alone: {free:?}");
+    assert!((held[0].hypot(held[1]) - 0.01).abs() < 1e-7, "{held:?}");
+    assert!((held[0] / held[1] - free[0] / free[1]).abs() < 1e-4 * free[0] / free[1], "{held:?} {free:?}");
+}
