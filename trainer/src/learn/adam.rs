@@ -1,7 +1,7 @@
 //! Adam (Kingma & Ba 2015) on a flat padded parameter vector.
 
 use nearl_runtime::multiversion;
-use nearl_runtime::net::kernel::{V, ZERO};
+use nearl_runtime::net::kernel::{V, ZERO, scalars, scalars_mut};
 
 /// First and second moments, and the step count.
 #[derive(Clone, Debug)]
@@ -33,15 +33,14 @@ struct Step<'a> {
 /// `m <- b1 m + (1 - b1) g`, `v <- b2 v + (1 - b2) g^2`, `p <- p - lr m^ / (sqrt(v^) + eps)`.
 #[inline(always)]
 fn body(s: Step<'_>) {
-    let (b1, b2, scale, rate, eps) =
-        (V::splat(BETA1), V::splat(BETA2), V::splat(s.scale), V::splat(s.rate), V::splat(EPS));
-    let (o1, o2) = (V::splat(1.0 - BETA1), V::splat(1.0 - BETA2));
-    let (c1, c2) = (V::splat(s.correction[0]), V::splat(s.correction[1]));
-    for (((p, &g), m), v) in s.p.iter_mut().zip(s.g).zip(s.m).zip(s.v) {
-        let g = g * scale;
-        *m = *m * b1 + g * o1;
-        *v = *v * b2 + g * g * o2;
-        *p = *p - rate * (*m * c1) / ((*v * c2).map(f32::sqrt) + eps);
+    let [c1, c2] = s.correction;
+    // number by number: whole vectors of 16 make the compiler work across them, with scattered loads and stores
+    let moments = scalars_mut(s.m).iter_mut().zip(scalars_mut(s.v));
+    for ((p, &g), (m, v)) in scalars_mut(s.p).iter_mut().zip(scalars(s.g)).zip(moments) {
+        let g = g * s.scale;
+        *m = *m * BETA1 + g * (1.0 - BETA1);
+        *v = *v * BETA2 + g * g * (1.0 - BETA2);
+        *p -= s.rate * (*m * c1) / ((*v * c2).sqrt() + EPS);
     }
 }
 multiversion!(fn run(s: Step<'_>) = body);
