@@ -9,10 +9,10 @@ use nearl_runtime::net::kernel::V;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-/// Minibatches the follower may be ahead.
+/// Minibatches that lane 1 may be ahead.
 const AHEAD: usize = 4;
 
-/// The follower's group as it was before each of its last minibatches.
+/// A group of lane 1 as it was before each of its last minibatches.
 struct Trail {
     slots: [Mutex<Group>; AHEAD],
     written: AtomicUsize,
