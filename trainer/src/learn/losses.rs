@@ -1,8 +1,8 @@
-//! What the losses of every algorithm share beside their Gaussians: value, advantages, entropy, sizes.
+//! What the losses of every algorithm share beside their Gaussians: advantages, entropy, sizes.
 
-use super::gaussian::{gather_one, heads, set_heads};
+use super::gaussian::gather_one;
 use super::optimise::Tile;
-use nearl_runtime::net::kernel::{V, ZERO, scalars_mut};
+use nearl_runtime::net::kernel::{V, scalars_mut};
 
 /// `widths` of a network from its ends and the hidden widths.
 pub(super) fn widths(n_in: usize, hidden: &[usize], n_out: usize) -> Vec<usize> {
@@ -43,28 +43,6 @@ pub(super) fn in_parts<T: Send>(
             f(0, part);
         }
     });
-}
-
-/// The value loss of a tile: `d = dL / dV` a row; returns the sum of squared errors.
-#[inline(always)]
-pub(super) fn value_loss(
-    d: &mut [V],
-    rows: &mut [Vec<V>; 3],
-    output: &[V],
-    t: &Tile<'_>,
-    weight: f32,
-) -> f32 {
-    let [value, target, slope] = rows;
-    heads(value, output);
-    gather_one(target, &t.batch.returns, t.idx);
-    let mut sum = ZERO;
-    for i in 0..value.len() {
-        let e = value[i] - target[i];
-        sum = sum.fma(e, e);
-        slope[i] = e * V::splat(2.0 * weight * t.scale);
-    }
-    set_heads(d, slope);
-    sum.sum()
 }
 
 /// Normalised advantages of the rows.

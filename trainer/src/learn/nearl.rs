@@ -90,7 +90,7 @@ impl Nearl {
             Adam::new(combined.policy_range.len(), settings.policy_lr),
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
             Adam::new(combined.len, lr),
-            Adam::new(combined.value.len(), lr),
+            Adam::new(combined.value.len, lr),
         ];
         let params = Params { groups: vec![actor, critic], adam, beta: 0.0 };
         Self { nets: Nets { settings, combined }, params, threads }
@@ -190,7 +190,7 @@ impl Phases for Nets {
         match phase {
             IMITATE => self.combined.policy_range.clone(),
             INVERSE => self.combined.inverse_range(),
-            VALUE => 0..self.combined.value.len(),
+            VALUE => 0..self.combined.value.len,
             _ => 0..self.combined.len,
         }
     }

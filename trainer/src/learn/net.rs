@@ -9,9 +9,8 @@ use nearl_runtime::net::{Activation, Layer, Mlp};
 pub struct Net {
     /// Shapes and offsets in the parameter vector.
     pub mlp: Mlp,
-    transposed: Vec<Option<usize>>,
-    /// Vectors of the input's gradient.
-    input_vectors: usize,
+    /// Of each layer whose input's gradient is wanted: where they start, and vectors of that gradient.
+    transposed: Vec<Option<(usize, usize)>>,
 }
 
 /// Activations of one tile of rows.
@@ -39,17 +38,16 @@ impl Net {
         transposed_at: &mut usize,
     ) -> Self {
         let mlp = Mlp::new(widths, activation, at);
-        let input_vectors = input_grad.div_ceil(LANES);
         let place = |(i, l): (usize, &Layer)| {
-            let k = if i > 0 { l.k_vectors() } else { input_vectors };
+            let k = if i > 0 { l.k_vectors() } else { input_grad.div_ceil(LANES) };
             (k > 0).then(|| {
                 let here = *transposed_at;
                 *transposed_at += l.n_vectors() * LANES * k;
-                here
+                (here, k)
             })
         };
         let transposed = mlp.layers.iter().enumerate().map(place).collect();
-        Self { mlp, transposed, input_vectors }
+        Self { mlp, transposed }
     }
 
     /// Buffers for `rows` rows, a multiple of 8.
@@ -61,9 +59,8 @@ impl Net {
 
     /// Refreshes the transposed weights; call after each change of the parameters `p`.
     pub fn transpose(&self, p: &[V], transposed: &mut [V]) {
-        for (i, l) in self.mlp.layers.iter().enumerate() {
-            let Some(at) = self.transposed[i] else { continue };
-            let (n, k) = (l.n_vectors(), if i > 0 { l.k_vectors() } else { self.input_vectors });
+        for (l, place) in self.mlp.layers.iter().zip(&self.transposed) {
+            let (Some((at, k)), n) = (*place, l.n_vectors()) else { continue };
             transpose(&p[l.w..l.b], n, &mut transposed[at..at + n * LANES * k], k);
         }
     }
@@ -127,8 +124,7 @@ impl Net {
                 gemm(&product, &mut g[l.w..l.b]);
                 column_sums(d, n, &mut g[l.b..l.b + n]);
             }
-            if let Some(at) = self.transposed[i].filter(|_| i > 0 || input) {
-                let k = if i > 0 { k } else { self.input_vectors };
+            if let Some((at, k)) = self.transposed[i].filter(|_| i > 0 || input) {
                 let product = Gemm {
                     m: rows,
                     k: l.n,
@@ -146,7 +142,8 @@ impl Net {
             }
         }
         tape.grads = [current, next];
-        &tape.grads[0][..if input { rows * self.input_vectors } else { 0 }]
+        let wanted = self.transposed[0].filter(|_| input).map_or(0, |(_, k)| k);
+        &tape.grads[0][..rows * wanted]
     }
 }
 

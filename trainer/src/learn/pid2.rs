@@ -148,7 +148,7 @@ impl Pid2 {
         d.refresh(&judge.p, &mut judge.transposed);
         let adam = vec![
             Adam::new(combined.len, lr),
-            Adam::new(combined.value.len(), lr),
+            Adam::new(combined.value.len, lr),
             Adam::new(d.len, settings.discriminator_lr),
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
         ];
@@ -246,7 +246,7 @@ impl Phases for Nets {
     fn range(&self, phase: usize) -> Range<usize> {
         match phase {
             ACTOR => 0..self.combined.len,
-            VALUE => 0..self.combined.value.len(),
+            VALUE => 0..self.combined.value.len,
             INVERSE => self.combined.inverse_range(),
             _ => 0..self.discriminator.len,
         }

@@ -206,7 +206,7 @@ impl Phases for Nets {
     fn range(&self, phase: usize) -> Range<usize> {
         match phase {
             ACTOR => 0..self.len,
-            VALUE => 0..self.value.len(),
+            VALUE => 0..self.value.len,
             _ => self.inverse.range(),
         }
     }

@@ -1,20 +1,21 @@
 //! The value network V(s), in a parameter group of its own.
 
-use super::gaussian::gather;
+use super::gaussian::{gather, gather_one, heads, set_heads};
 use super::init;
-use super::losses::{in_parts, value_loss, widths};
+use super::losses::{in_parts, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
 use super::optimise::{Group, Rows, TILE, Tile, add_sums};
 use super::{Batch, Dims};
 use nearl_runtime::multiversion;
-use nearl_runtime::net::Layer;
 use nearl_runtime::net::kernel::{LANES, V, ZERO};
 use rand_chacha::ChaCha8Rng;
 
 /// The network, and the weight of its loss.
 pub(super) struct Value {
     pub(super) net: Net,
+    /// Vectors of its parameters.
+    pub(super) len: usize,
     n_obs: usize,
     weight: f32,
 }
@@ -34,14 +35,9 @@ impl Value {
         let net = Net::new(&widths(dims.n_obs, &nets.value, 1), nets.activation, 0, &mut at, &mut transposed);
         let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
         net.mlp.write_dense(&init::orthogonal(&net.mlp.widths(), 1.0, rng), &mut group.p);
-        let value = Self { net, n_obs: dims.n_obs, weight };
+        let value = Self { net, len: at, n_obs: dims.n_obs, weight };
         value.refresh(&mut group);
         (value, group)
-    }
-
-    /// Vectors of its parameters.
-    pub(super) fn len(&self) -> usize {
-        self.net.mlp.layers.iter().map(Layer::len).sum()
     }
 
     /// Refreshes the transposed weights.
@@ -90,8 +86,17 @@ impl Value {
 fn body(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) {
     gather(&mut w.obs, v.n_obs.div_ceil(LANES), 0, &t.batch.obs, v.n_obs, t.idx);
     let value = v.net.forward(&group.p, &w.obs, &mut w.tape);
-    let squares = value_loss(&mut w.slope, &mut w.rows, value, t, v.weight);
+    let [value_of, target, slope] = &mut w.rows;
+    heads(value_of, value);
+    gather_one(target, &t.batch.returns, t.idx);
+    let mut squares = ZERO;
+    for i in 0..value_of.len() {
+        let e = value_of[i] - target[i];
+        squares = squares.fma(e, e);
+        slope[i] = e * V::splat(2.0 * v.weight * t.scale);
+    }
+    set_heads(&mut w.slope, slope);
     v.net.backward(&group.transposed, &w.obs, &w.slope, &mut w.tape, Some(grad), false);
-    add_sums(grad, &[squares]);
+    add_sums(grad, &[squares.sum()]);
 }
 multiversion!(fn squared_error(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) = body);

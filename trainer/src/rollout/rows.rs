@@ -73,13 +73,8 @@ impl Rows {
         for (change, &i) in self.change.iter_mut().zip(&self.state) {
             *change = p.after[i] - p.before[i];
         }
-        self.collected.segment.push(p.out, &self.change, &normaliser.scale);
-        self.collected.segment.reward.push(reward);
-        self.collected.segment.terminated.push(p.terminated);
-        self.collected.segment.truncated.push(false);
-        self.collected.change_stats.push(&self.change);
-        self.collected.obs_stats.push(p.after);
-        self.collected.return_stats.push(&[self.discounted]);
+        let change = (&self.change[..], &normaliser.scale[..]);
+        self.collected.push(p.out, change, p.after, (reward, self.discounted), (p.terminated, false));
         normaliser.observation(p.after, &mut self.after);
         if p.truncated && !p.terminated {
             self.cut();

@@ -152,6 +152,25 @@ impl Collected {
         }
     }
 
+    /// Adds a policy step that led to the observation `after` by the change of state `change`; `discounted` is the return so far,
+    /// `truncated` that nothing follows in this stretch.
+    pub(super) fn push(
+        &mut self,
+        out: &Output,
+        (change, scale): (&[f64], &[f64]),
+        after: &[f64],
+        (reward, discounted): (f64, f64),
+        (terminated, truncated): (bool, bool),
+    ) {
+        self.segment.push(out, change, scale);
+        self.segment.reward.push(reward);
+        self.segment.terminated.push(terminated);
+        self.segment.truncated.push(truncated);
+        self.change_stats.push(change);
+        self.obs_stats.push(after);
+        self.return_stats.push(&[discounted]);
+    }
+
     /// Forgets everything; keeps the rows' memory.
     pub(super) fn clear(&mut self) {
         self.segment.clear();

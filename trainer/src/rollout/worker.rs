@@ -221,21 +221,17 @@ impl Worker {
 
     fn store(&mut self, reward: f64, terminated: bool, truncated: bool, t: usize, last: bool) {
         let reward = self.penalised(reward);
-        let (s, out) = (&mut self.collected.segment, &self.out);
+        let out = &self.out;
         for (before, &i) in self.before.iter_mut().zip(self.controller.layout().state()) {
             *before = self.state.obs[i] - *before;
         }
-        s.push(out, &self.before, &self.scale);
-        s.reward.push(reward);
-        s.terminated.push(terminated);
-        s.truncated.push(truncated || (last && !terminated));
-        self.collected.change_stats.push(&self.before);
-        self.collected.obs_stats.push(&self.state.obs);
-        self.collected.return_stats.push(&[self.discounted]);
+        let ended = (terminated, truncated || (last && !terminated));
+        let change = (&self.before[..], &self.scale[..]);
+        self.collected.push(out, change, &self.state.obs, (reward, self.discounted), ended);
         if (truncated || last) && !terminated {
             let mut x = vec![0.0; out.x.len()];
             self.controller.normaliser().observation(&self.state.obs, &mut x);
-            s.final_x.push((t, x));
+            self.collected.segment.final_x.push((t, x));
         }
     }
 }
