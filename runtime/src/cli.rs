@@ -259,10 +259,9 @@ fn link(count: u64, json: bool) -> Result<(), Failure> {
         say(serde_json::to_string(&result)?);
         return Ok(());
     }
-    say(format!("state {} B, action {} B, round trip in us:", result.state_bytes, result.action_bytes));
+    say(format!("state and action of {} joints, round trip in us:", result.joints));
     line("busy", &result.busy);
     line("paced at 1 kHz", &result.paced);
-    line(&format!("busy, {} B each", result.ping_bytes), &result.ping);
     Ok(())
 }
 

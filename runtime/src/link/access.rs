@@ -1,6 +1,10 @@
 //! Slices and texts of messages. A peer may send any number as a length, so every length is clamped to the capacity.
 
+use std::mem::offset_of;
+use std::ops::Range;
+
 use super::messages::*;
+use super::schema::{Arrays, WORD};
 use crate::snapshot::SnapshotError;
 
 macro_rules! slices {
@@ -18,6 +22,24 @@ macro_rules! slices {
                     &mut self.$field[..count]
                 }
             )*
+        }
+        impl Arrays for $message {
+            const FIXED: usize = {
+                let starts = [$(offset_of!($message, $field) / WORD),*];
+                let (mut first, mut i) = (starts[0], 1);
+                while i < starts.len() {
+                    first = if starts[i] < first { starts[i] } else { first };
+                    i += 1;
+                }
+                first
+            };
+            type Ranges = [Range<usize>; [$(stringify!($field)),*].len()];
+            fn arrays(&self) -> Self::Ranges {
+                [$({
+                    let start = offset_of!($message, $field) / WORD;
+                    start..start + (self.$count as usize).min(self.$field.len())
+                }),*]
+            }
         }
     };
 }

@@ -5,14 +5,13 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::service::{Bus, Ipc};
 use super::{
-    HealthMessage, LinkError, Message, ReceiptMessage, RobotMessage, RobotName, SnapshotHeader, StateMessage,
+    HealthMessage, LinkError, Message, ReceiptMessage, RobotMessage, RobotName, SnapshotHeader,
     TransitionMessage,
 };
 
-/// What a trainer reads and writes. Actions never leave the robot's host.
-pub(crate) const CROSSING: [&str; 6] = [
+/// What a trainer reads and writes. States and actions never leave the robot's host.
+pub(crate) const CROSSING: [&str; 5] = [
     RobotMessage::TOPIC,
-    StateMessage::TOPIC,
     TransitionMessage::TOPIC,
     HealthMessage::TOPIC,
     ReceiptMessage::TOPIC,
@@ -22,7 +21,6 @@ pub(crate) const CROSSING: [&str; 6] = [
 /// The topics of [`CROSSING`], until it is dropped.
 pub(crate) struct Crossing {
     _robot: PortFactory<Ipc, RobotMessage, ()>,
-    _state: PortFactory<Ipc, StateMessage, ()>,
     _transition: PortFactory<Ipc, TransitionMessage, ()>,
     _health: PortFactory<Ipc, HealthMessage, ()>,
     _receipt: PortFactory<Ipc, ReceiptMessage, ()>,
@@ -36,7 +34,6 @@ impl Crossing {
         let bus = Bus::join(name)?;
         Ok(Crossing {
             _robot: bus.service()?,
-            _state: bus.service()?,
             _transition: bus.service()?,
             _health: bus.service()?,
             _receipt: bus.service()?,

@@ -33,7 +33,7 @@ pub(crate) fn free() -> u64 {
     statvfs(FOLDER).map_or(0, |space| space.f_bavail * space.f_frsize)
 }
 
-fn too_small(name: &RobotName, available: u64, bytes: u64) -> LinkError {
+pub(super) fn too_small(name: &RobotName, available: u64, bytes: u64) -> LinkError {
     let (available, needed) = (available / MEGABYTE, bytes.div_ceil(MEGABYTE));
     LinkError::Memory { name: name.clone(), path: FOLDER, available, needed }
 }

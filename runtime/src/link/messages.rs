@@ -2,9 +2,9 @@
 //!
 //! | topic | from -> to | type |
 //! |---|---|---|
+//! | `state` | plant -> all on this host, the newest alone | [`StateMessage`] |
+//! | `action` | runtime -> plant, the newest alone | [`ActionMessage`] |
 //! | `robot` | plant -> all | [`RobotMessage`] |
-//! | `state` | plant -> runtime | [`StateMessage`] |
-//! | `action` | runtime -> plant | [`ActionMessage`] |
 //! | `transition` | runtime -> trainer | [`TransitionMessage`] |
 //! | `snapshot` | trainer -> runtime | bytes with [`SnapshotHeader`] |
 //! | `receipt` | runtime -> trainer | [`ReceiptMessage`] |
@@ -35,7 +35,7 @@ pub const METERS: [&str; 4] = ["position", "velocity", "acceleration", "torque"]
 
 message! {
     /// One sample of the plant, published on its time grid.
-    StateMessage, "state", version 1, buffer 8, history 0, subscribers 4 {
+    StateMessage, "state", version 1 {
         /// Tick of the plant since its start.
         tick: u64,
         /// Grid time of the tick, monotonic [ns].
@@ -87,7 +87,7 @@ message! {
 
 message! {
     /// The action for one state.
-    ActionMessage, "action", version 2, buffer 4, history 0, subscribers 4 {
+    ActionMessage, "action", version 2 {
         /// Tick of the runtime.
         tick: u64,
         /// `header.seq` of the state it was computed from.
@@ -106,24 +106,8 @@ message! {
 }
 
 message! {
-    /// Asks for a [`PongMessage`]: the smallest message there is, to measure the transport itself.
-    PingMessage, "ping", version 1, buffer 8, history 0, subscribers 4 {
-        /// Nothing.
-        nothing: u64,
-    }
-}
-
-message! {
-    /// The answer to a [`PingMessage`].
-    PongMessage, "pong", version 1, buffer 4, history 0, subscribers 4 {
-        /// `header.seq` of the ping.
-        ping_seq: u64,
-    }
-}
-
-message! {
     /// What the plant is; a snapshot for another robot is refused against it.
-    RobotMessage, "robot", version 1, buffer 1, history 1, subscribers 16 {
+    RobotMessage, "robot", version 1, beside StateMessage, beside ActionMessage, buffer 1, history 1, subscribers 16 {
         /// Hash of the joint names in order, see [`crate::link::hash_names`].
         joints: u64,
         /// Hash of the observation entry names in order.

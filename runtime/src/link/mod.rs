@@ -1,4 +1,5 @@
-//! Links between plant, runtime and trainer: iceoryx2 publish-subscribe over shared memory.
+//! Links between plant, runtime and trainer over shared memory: state and action as the newest of each ([`board`]), everything else as
+//! iceoryx2 publish-subscribe.
 //!
 //! Every robot name has its own segments and files, so robots (and tests) never meet. Messages are plain numbers with
 //! a capacity fixed at compile time ([`MAX_JOINTS`], [`MAX_OBS`]); a robot that does not fit is refused at start with
@@ -9,6 +10,7 @@
 
 mod access;
 mod bench;
+mod board;
 mod crossing;
 mod debris;
 mod error;
@@ -38,6 +40,6 @@ pub use port::{Sequence, SnapshotBytes, SnapshotReader};
 pub use remains::{Remains, remains};
 pub use runner::{Pace, Plant, PlantReport, PlantRunner, PlantSettings};
 pub use runtime::RuntimeLink;
-pub use schema::{Header, Message, hash_names};
+pub use schema::{Header, Message, Queued, hash_names};
 pub(crate) use service::SHARED_MEMORY;
 pub use trainer::TrainerLink;

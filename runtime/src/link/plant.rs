@@ -1,7 +1,8 @@
 //! The plant's ends of the links.
 
+use super::board::{Board, BoardReader};
 use super::owner::Owner;
-use super::port::{Inbox, Outbox};
+use super::port::Outbox;
 use super::service::Bus;
 use super::*;
 
@@ -55,8 +56,8 @@ impl Robot {
 
 /// Sends states, receives actions, and says what the plant is.
 pub struct PlantLink {
-    action: Inbox<ActionMessage>,
-    state: Outbox<StateMessage>,
+    action: BoardReader<ActionMessage>,
+    state: Board<StateMessage>,
     robot: Outbox<RobotMessage>,
     hello: RobotMessage,
     bus: Bus,
@@ -70,9 +71,9 @@ impl PlantLink {
         let bus = Bus::join(name)?;
         let owner = bus.own("plant")?;
         let mut link = PlantLink {
-            state: bus.outbox()?,
+            state: Board::create(name, bus.epoch())?,
+            action: BoardReader::open(name),
             robot: bus.outbox()?,
-            action: bus.inbox()?,
             hello,
             bus,
             _owner: owner,
@@ -82,18 +83,24 @@ impl PlantLink {
         Ok(link)
     }
 
-    /// Announces the plant again, for readers that came later.
+    /// Announces the plant again, for readers that came later, and looks for a runtime that came.
     pub fn announce(&mut self) -> bool {
+        self.attend();
         self.robot.send(&mut self.hello)
     }
 
-    /// Sends a state; its number is in `message.header.seq` afterwards.
-    pub fn send_state(&mut self, message: &mut StateMessage) -> bool {
-        self.state.send(message)
+    /// Looks for a runtime that came. To be called now and then while none answers; costs a system call.
+    pub fn attend(&mut self) {
+        self.action.attend();
     }
 
-    /// The newest action not yet read.
-    pub fn newest_action(&mut self) -> Option<ActionMessage> {
+    /// Sends a state; its number is in `message.header.seq` afterwards.
+    pub fn send_state(&mut self, message: &mut StateMessage) {
+        self.state.send(message);
+    }
+
+    /// The newest action, if it was not read before.
+    pub fn newest_action(&mut self) -> Option<&ActionMessage> {
         self.action.newest()
     }
 

@@ -3,20 +3,20 @@
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
-use iceoryx2::prelude::ZeroCopySend;
 
+use super::schema::Queued;
 use super::service::Ipc;
 use super::{LinkError, Message, RobotName, SnapshotHeader, memory};
 use crate::rt::clock;
 
 /// Sending end of a topic. One heap allocation per message inside iceoryx2: not for the real-time thread.
-pub(crate) struct Outbox<M: Message + ZeroCopySend> {
+pub(crate) struct Outbox<M: Queued> {
     port: Publisher<Ipc, M, ()>,
     epoch: u64,
     seq: u64,
 }
 
-impl<M: Message + ZeroCopySend> Outbox<M> {
+impl<M: Queued> Outbox<M> {
     pub(crate) fn new(port: Publisher<Ipc, M, ()>, epoch: u64) -> Outbox<M> {
         Outbox { port, epoch, seq: 0 }
     }
@@ -60,7 +60,7 @@ impl Sequence {
 }
 
 /// Receiving end of a topic.
-pub(crate) struct Inbox<M: Message + ZeroCopySend> {
+pub(crate) struct Inbox<M: Queued> {
     port: Subscriber<Ipc, M, ()>,
     /// Order of the messages, and what was lost.
     pub(crate) sequence: Sequence,
@@ -68,7 +68,7 @@ pub(crate) struct Inbox<M: Message + ZeroCopySend> {
     pub(crate) refused: u64,
 }
 
-impl<M: Message + ZeroCopySend> Inbox<M> {
+impl<M: Queued> Inbox<M> {
     pub(crate) fn new(port: Subscriber<Ipc, M, ()>) -> Inbox<M> {
         Inbox { port, sequence: Sequence::default(), refused: 0 }
     }

@@ -219,7 +219,7 @@ impl PlantRunner {
             let header = self.state.header;
             match self.link.newest_action() {
                 Some(action) if (action.state_epoch, action.state_seq) == (header.epoch, header.seq) => {
-                    return Some(action);
+                    return Some(*action);
                 }
                 // The runtime ended in order: the plant is on its own at once, without the watchdog.
                 Some(action) if action.is_farewell() => self.is_attached = false,
@@ -239,6 +239,7 @@ impl PlantRunner {
             if self.is_attached {
                 std::thread::yield_now();
             } else {
+                self.link.attend();
                 clock::sleep_until(now + SLOW_POLL);
             }
         }

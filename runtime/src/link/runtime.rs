@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::board::{Board, BoardReader};
 use super::owner::Owner;
 use super::port::{Inbox, Outbox, SnapshotReader};
 use super::service::Bus;
@@ -9,10 +10,10 @@ use super::*;
 
 /// Everything the runtime sends and receives for one robot.
 pub struct RuntimeLink {
-    state: Inbox<StateMessage>,
+    state: BoardReader<StateMessage>,
     robot: Inbox<RobotMessage>,
     snapshots: Option<SnapshotReader>,
-    action: Outbox<ActionMessage>,
+    action: Board<ActionMessage>,
     transition: Outbox<TransitionMessage>,
     receipt: Outbox<ReceiptMessage>,
     health: Outbox<HealthMessage>,
@@ -26,11 +27,11 @@ impl RuntimeLink {
         let bus = Bus::join(name)?;
         let owner = bus.own("runtime")?;
         let link = RuntimeLink {
-            action: bus.outbox()?,
+            action: Board::create(name, bus.epoch())?,
             transition: bus.outbox()?,
             receipt: bus.outbox()?,
             health: bus.outbox()?,
-            state: bus.inbox()?,
+            state: BoardReader::open(name),
             robot: bus.inbox()?,
             snapshots: Some(bus.bytes_inbox()?),
             bus,
@@ -42,8 +43,7 @@ impl RuntimeLink {
 
     /// Waits for the plant to say what it is.
     pub fn wait_for_plant(&mut self, patience: Duration) -> Result<RobotMessage, LinkError> {
-        let robot = &mut self.robot;
-        poll_for(patience, || robot.newest()).ok_or_else(|| LinkError::NoPlant(self.bus.name().clone()))
+        poll_for(patience, || self.robot()).ok_or_else(|| LinkError::NoPlant(self.bus.name().clone()))
     }
 
     /// The robot's name.
@@ -56,19 +56,23 @@ impl RuntimeLink {
         self.bus.epoch()
     }
 
-    /// The plant's description if it was sent again (a plant restarted).
+    /// The plant's description if it was sent again; the states of a plant that restarted are read from then on.
     pub fn robot(&mut self) -> Option<RobotMessage> {
-        self.robot.newest()
+        let robot = self.robot.newest();
+        if robot.is_some() {
+            self.state.attend();
+        }
+        robot
     }
 
-    /// The newest state not yet read.
-    pub fn newest_state(&mut self) -> Option<StateMessage> {
+    /// The newest state, if it was not read before.
+    pub fn newest_state(&mut self) -> Option<&StateMessage> {
         self.state.newest()
     }
 
-    /// States lost on the way, and states of another schema.
-    pub fn state_counts(&self) -> (u64, u64) {
-        (self.state.sequence.lost, self.state.refused)
+    /// States of another schema.
+    pub fn refused_states(&self) -> u64 {
+        self.state.refused
     }
 
     /// The snapshots, for a thread of its own; `None` if they were taken before.
@@ -77,8 +81,8 @@ impl RuntimeLink {
     }
 
     /// Sends the action of a tick.
-    pub fn send_action(&mut self, message: &mut ActionMessage) -> bool {
-        self.action.send(message)
+    pub fn send_action(&mut self, message: &mut ActionMessage) {
+        self.action.send(message);
     }
 
     /// Sends a transition.

@@ -64,12 +64,6 @@ pub unsafe trait Message: Copy + Debug + Send + Sync + 'static {
     const TOPIC: &'static str;
     /// Hash over version, field names, types, offsets and the size.
     const SCHEMA: u64;
-    /// Messages kept for a subscriber that is behind; the oldest is dropped.
-    const BUFFER: usize;
-    /// Messages a late subscriber still gets.
-    const HISTORY: usize;
-    /// Largest number of subscribers.
-    const SUBSCRIBERS: usize;
 
     /// The header.
     fn header(&self) -> &Header;
@@ -83,10 +77,50 @@ pub unsafe trait Message: Copy + Debug + Send + Sync + 'static {
     }
 }
 
-/// Declares a message: `message! { Name, "topic", version, buffer, history, subscribers { field: type, .. } }`.
+/// A message that travels in an iceoryx2 queue.
+pub trait Queued: Message + iceoryx2::prelude::ZeroCopySend {
+    /// Messages kept for a subscriber that is behind; the oldest is dropped.
+    const BUFFER: usize;
+    /// Messages a late subscriber still gets.
+    const HISTORY: usize;
+    /// Largest number of subscribers.
+    const SUBSCRIBERS: usize;
+}
+
+/// Bytes of a word: messages are rows of them.
+pub(crate) const WORD: usize = size_of::<u64>();
+
+/// Which words of a message are in use: the fixed ones in front, then a part of each array.
+pub(crate) trait Arrays {
+    /// Words before the first array.
+    const FIXED: usize;
+    /// One range for each array.
+    type Ranges: IntoIterator<Item = std::ops::Range<usize>> + PartialEq;
+    /// The words of each array's used entries.
+    fn arrays(&self) -> Self::Ranges;
+}
+
+/// Declares a message, `message! { Name, "topic", version { field: type, .. } }`, and the queue it travels in if there is one:
+/// `version, buffer, history, subscribers`. Ends that disagree on a message named `beside` another disagree on that one too.
 macro_rules! message {
-    ($(#[$meta:meta])* $name:ident, $topic:literal, version $version:literal, buffer $buffer:literal,
-     history $history:literal, subscribers $subscribers:literal { $($(#[$doc:meta])* $field:ident : $type:ty,)* }) => {
+    ($(#[$meta:meta])* $name:ident, $topic:literal, version $version:literal $(, beside $beside:ident)*, buffer $buffer:literal,
+     history $history:literal, subscribers $subscribers:literal { $($fields:tt)* }) => {
+        $crate::link::schema::message! { $(#[$meta])* $name, $topic, version $version $(, beside $beside)* { $($fields)* } }
+        impl $crate::link::schema::Queued for $name {
+            const BUFFER: usize = $buffer;
+            const HISTORY: usize = $history;
+            const SUBSCRIBERS: usize = $subscribers;
+        }
+        // SAFETY: `repr(C)`, self-contained, no pointers.
+        unsafe impl iceoryx2::prelude::ZeroCopySend for $name {
+            unsafe fn type_name() -> &'static str {
+                static NAME: std::sync::OnceLock<String> = std::sync::OnceLock::new();
+                NAME.get_or_init(|| format!("nearl.{}.v{}.{:016x}", $topic, $version, <$name as $crate::link::Message>::SCHEMA))
+            }
+        }
+    };
+    ($(#[$meta:meta])* $name:ident, $topic:literal, version $version:literal $(, beside $beside:ident)*
+     { $($(#[$doc:meta])* $field:ident : $type:ty,)* }) => {
         $(#[$meta])*
         #[repr(C)]
         #[derive(Clone, Copy, Debug)]
@@ -101,21 +135,12 @@ macro_rules! message {
             const SCHEMA: u64 = {
                 use $crate::link::schema::{hash_bytes, hash_field, hash_number, hash_start};
                 let hash = hash_number(hash_bytes(hash_start(), $topic.as_bytes()), $version);
+                $(let hash = hash_number(hash, <$beside as $crate::link::Message>::SCHEMA);)*
                 $(let hash = hash_field(hash, stringify!($field), stringify!($type), std::mem::offset_of!($name, $field));)*
                 hash_number(hash, std::mem::size_of::<$name>() as u64)
             };
-            const BUFFER: usize = $buffer;
-            const HISTORY: usize = $history;
-            const SUBSCRIBERS: usize = $subscribers;
             fn header(&self) -> &$crate::link::Header { &self.header }
             fn header_mut(&mut self) -> &mut $crate::link::Header { &mut self.header }
-        }
-        // SAFETY: `repr(C)`, self-contained, no pointers.
-        unsafe impl iceoryx2::prelude::ZeroCopySend for $name {
-            unsafe fn type_name() -> &'static str {
-                static NAME: std::sync::OnceLock<String> = std::sync::OnceLock::new();
-                NAME.get_or_init(|| format!("nearl.{}.v{}.{:016x}", $topic, $version, <$name as $crate::link::Message>::SCHEMA))
-            }
         }
     };
 }

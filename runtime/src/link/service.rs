@@ -1,6 +1,6 @@
 //! Opening iceoryx2 services with the same settings on every end.
 //!
-//! Only publish-subscribe is used. Whoever starts first creates the service, the others open it, so start order does
+//! Only publish-subscribe is used; state and action need no service ([`super::board`]). Whoever starts first creates the service, the others open it, so start order does
 //! not matter. Who may publish is decided by [`Owner`]; a topic has a second publisher's place for a tunnel to another host.
 //! What a killed process left is removed when the next node joins.
 
@@ -18,7 +18,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::owner::Owner;
 use super::port::{BytesOutbox, Inbox, Outbox, SnapshotReader};
-use super::schema::Message;
+use super::schema::{Message, Queued};
 use super::{LinkError, RobotName, SnapshotHeader, debris, memory};
 use crate::rt::clock;
 
@@ -83,7 +83,7 @@ impl Bus {
         memory::reserve(&self.name)
     }
 
-    pub(super) fn service<M: Message + ZeroCopySend>(&self) -> Result<PortFactory<Ipc, M, ()>, LinkError> {
+    pub(super) fn service<M: Queued>(&self) -> Result<PortFactory<Ipc, M, ()>, LinkError> {
         let topic = self.topic(M::TOPIC)?;
         let build = || {
             settings(self.node.service_builder(&topic).publish_subscribe::<M>(), M::BUFFER, M::HISTORY)
@@ -99,7 +99,7 @@ impl Bus {
     }
 
     /// A publisher of `M`, for the owner of its role.
-    pub(crate) fn outbox<M: Message + ZeroCopySend>(&self) -> Result<Outbox<M>, LinkError> {
+    pub(crate) fn outbox<M: Queued>(&self) -> Result<Outbox<M>, LinkError> {
         let service = self.service::<M>()?;
         let port = service
             .publisher_builder()
@@ -111,7 +111,7 @@ impl Bus {
     }
 
     /// A subscriber of `M`.
-    pub(crate) fn inbox<M: Message + ZeroCopySend>(&self) -> Result<Inbox<M>, LinkError> {
+    pub(crate) fn inbox<M: Queued>(&self) -> Result<Inbox<M>, LinkError> {
         let service = self.service::<M>()?;
         let port = service.subscriber_builder().create().map_err(|e| self.subscriber_error(M::TOPIC, e))?;
         Ok(Inbox::new(port))

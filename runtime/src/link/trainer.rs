@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::board::BoardReader;
 use super::owner::Owner;
 use super::port::{BytesOutbox, Inbox};
 use super::runtime::poll_for;
@@ -10,7 +11,7 @@ use super::*;
 
 /// Reads states, transitions, receipts and health of one robot, and pushes snapshots.
 pub struct TrainerLink {
-    state: Inbox<StateMessage>,
+    state: BoardReader<StateMessage>,
     transition: Inbox<TransitionMessage>,
     receipt: Inbox<ReceiptMessage>,
     health: Inbox<HealthMessage>,
@@ -24,7 +25,7 @@ impl TrainerLink {
     pub fn open(name: &RobotName) -> Result<TrainerLink, LinkError> {
         let bus = Bus::join(name)?;
         let link = TrainerLink {
-            state: bus.inbox()?,
+            state: BoardReader::open(name),
             transition: bus.inbox()?,
             receipt: bus.inbox()?,
             health: bus.inbox()?,
@@ -94,9 +95,10 @@ impl TrainerLink {
         self.receipt.next()
     }
 
-    /// The newest state not yet read.
+    /// The newest state, if it was not read before; of a plant on this host.
     pub fn state(&mut self) -> Option<StateMessage> {
-        self.state.newest()
+        self.state.attend();
+        self.state.newest().copied()
     }
 
     /// The newest health message not yet read.

@@ -87,24 +87,18 @@ impl<B: Build> Io<B> {
 
     fn move_states(&mut self) -> bool {
         let Some(state) = self.link.newest_state() else { return false };
-        if !self.fits(&state) {
+        if !fits(&self.robot, state) {
             self.traffic.refused_states += 1;
             return true;
         }
         self.traffic.last_state = clock::now();
         self.traffic.last_due = state.header.stamp;
-        match self.states.push(state) {
+        match self.states.push(*state) {
             Ok(()) => self.traffic.waits_for_action = true,
             Err(_) => self.traffic.dropped_states += 1,
         }
         self.bell.ring();
         true
-    }
-
-    fn fits(&self, state: &StateMessage) -> bool {
-        let robot = &self.robot;
-        state.header.epoch == robot.header.epoch
-            && (state.nq, state.nv, state.n_obs) == (robot.nq, robot.nv, robot.n_obs)
     }
 
     fn move_actions(&mut self) -> bool {
@@ -168,7 +162,7 @@ impl<B: Build> Io<B> {
         if now >= self.health.next {
             self.health.next = now + HEALTH;
             let mut message = self.health.message();
-            message.refused_states = self.traffic.refused_states + self.link.state_counts().1;
+            message.refused_states = self.traffic.refused_states + self.link.refused_states();
             message.refused_snapshots = self.snapshots.refused();
             message.rolled_back = self.snapshots.rolled_back;
             message.log_drops = self.log.as_ref().map_or(0, LogQueue::dropped);
@@ -187,6 +181,12 @@ impl<B: Build> Io<B> {
         }
         clock::sleep_until((next - LEAD).min(now + NAP));
     }
+}
+
+/// True if the state is of the size and from the plant that were announced.
+fn fits(robot: &RobotMessage, state: &StateMessage) -> bool {
+    state.header.epoch == robot.header.epoch
+        && (state.nq, state.nv, state.n_obs) == (robot.nq, robot.nv, robot.n_obs)
 }
 
 /// The transition from one record to the state that followed it.

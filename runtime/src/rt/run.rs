@@ -352,7 +352,7 @@ fn report<B: Build>(
         reason: if end.last.tick == 0 { Reason::Stop } else { end.last.reason },
         modes: Mode::ALL.iter().copied().map(mode_count).collect(),
         counters,
-        refused_states: io.traffic.refused_states + io.link.state_counts().1,
+        refused_states: io.traffic.refused_states + io.link.refused_states(),
         wake: percentiles(&end.wake),
         compute: percentiles(&end.compute),
         versions: std::iter::once((0, version)).chain(io.snapshots.accepted).collect(),

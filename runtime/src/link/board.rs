@@ -1,0 +1,353 @@
+//! The newest message of one sender: how state and action travel. Of both only the newest counts, and a tick waits for them.
+//!
+//! A file of shared memory holds a count and two places for the message. The sender writes into the place that the count does not
+//! show, then counts on; a reader copies the place that is shown and keeps the copy if the count is still the same. Nobody waits for
+//! anybody, there is no system call, and a process killed at any moment leaves the last whole message. Only the entries in use are copied.
+//!
+//! The file gets its name when it is complete. A sender's successor puts its own in its place, which readers find when they
+//! [`attend`](BoardReader::attend); who may send is decided by [`Owner`](super::owner::Owner).
+//!
+//! iceoryx2 0.10 has no service for this: its queue takes more than twice as long (`examples/round_trip.rs`), and its blackboard never gives
+//! the place of a killed writer to the next one.
+
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::ops::Range;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::ptr;
+use std::sync::atomic::{AtomicU64, Ordering, fence};
+
+use rustix::fs::{FallocateFlags, fallocate};
+use rustix::io::Errno;
+use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
+
+use super::schema::{Arrays, WORD};
+use super::{Header, LinkError, Message, RobotName, memory};
+use crate::rt::clock;
+
+/// Words between what must not share a cache line, nor the line fetched with it.
+const APART: usize = 128 / WORD;
+/// Where the schema hash of the message lies [words].
+const SCHEMA: usize = 0;
+/// Where the count lies: the number of the newest message, 0 before the first [words].
+const COUNT: usize = APART;
+/// Where the first place begins [words].
+const PLACES: usize = 2 * APART;
+
+/// Words of a message.
+const fn words<M>() -> usize {
+    assert!(size_of::<M>().is_multiple_of(WORD) && align_of::<M>() == WORD, "a message is a row of words");
+    size_of::<M>() / WORD
+}
+
+/// The file of a message, mapped.
+struct Memory {
+    start: *mut std::ffi::c_void,
+    words: usize,
+}
+
+// SAFETY: the mapping belongs to this value alone, and its words are atomic.
+unsafe impl Send for Memory {}
+
+impl Memory {
+    /// Words of the file of a message: schema, count, two places.
+    const fn length<M>() -> usize {
+        PLACES + 2 * words::<M>().next_multiple_of(APART)
+    }
+
+    fn map<M>(file: &File, rights: ProtFlags) -> io::Result<Memory> {
+        let words = Self::length::<M>();
+        if file.metadata()?.len() < (words * WORD) as u64 {
+            return Err(io::Error::other("it is shorter than its message"));
+        }
+        // SAFETY: a new mapping at an address of the system's choice; nothing else refers to it.
+        let start = unsafe { mmap(ptr::null_mut(), words * WORD, rights, MapFlags::SHARED, file, 0) }?;
+        Ok(Memory { start, words })
+    }
+
+    fn all(&self) -> &[AtomicU64] {
+        // SAFETY: the mapping has this length, begins at a page and lives as long as `self`; other processes write whole words.
+        unsafe { std::slice::from_raw_parts(self.start.cast(), self.words) }
+    }
+
+    fn count(&self) -> &AtomicU64 {
+        &self.all()[COUNT]
+    }
+
+    /// The place of the message with this number.
+    fn place<M>(&self, number: u64) -> &[AtomicU64] {
+        let start = PLACES + (number % 2) as usize * words::<M>().next_multiple_of(APART);
+        &self.all()[start..start + words::<M>()]
+    }
+}
+
+impl Drop for Memory {
+    fn drop(&mut self) {
+        // SAFETY: the mapping made in `map`, which nothing refers to any more.
+        let _ = unsafe { munmap(self.start, self.words * WORD) };
+    }
+}
+
+/// Where the file of a topic lies.
+fn path<M: Message>(name: &RobotName) -> PathBuf {
+    Path::new(memory::FOLDER).join(format!("{}newest-{}", name.prefix(), M::TOPIC))
+}
+
+/// Sending end, for the owner of the topic's role. Dropping it takes the file's name away.
+pub(crate) struct Board<M: Message + Arrays> {
+    path: PathBuf,
+    memory: Memory,
+    epoch: u64,
+    number: u64,
+    _message: std::marker::PhantomData<M>,
+}
+
+impl<M: Message + Arrays> Board<M> {
+    /// Makes the file, in place of one that is there. The owner of the role only.
+    pub(crate) fn create(name: &RobotName, epoch: u64) -> Result<Board<M>, LinkError> {
+        let path = path::<M>(name);
+        let failed = |e: io::Error| name.transport(format!("make {}", path.display()), e.to_string());
+        // The owner's alone: what a predecessor left half made is begun anew.
+        let half = PathBuf::from(format!("{}.half", path.display()));
+        let mut options = OpenOptions::new();
+        options.read(true).write(true).create(true).truncate(true).mode(0o600);
+        let file = options.open(&half).map_err(failed)?;
+        let bytes = (Memory::length::<M>() * WORD) as u64;
+        fallocate(&file, FallocateFlags::empty(), 0, bytes).map_err(|e| match e {
+            Errno::NOSPC => memory::too_small(name, memory::free(), bytes),
+            other => failed(other.into()),
+        })?;
+        let memory = Memory::map::<M>(&file, ProtFlags::READ | ProtFlags::WRITE).map_err(failed)?;
+        memory.all()[SCHEMA].store(M::SCHEMA, Ordering::Relaxed);
+        std::fs::rename(&half, &path).map_err(failed)?;
+        Ok(Board { path, memory, epoch, number: 0, _message: std::marker::PhantomData })
+    }
+
+    /// Numbers, stamps and shows `message`.
+    pub(crate) fn send(&mut self, message: &mut M) {
+        self.number += 1;
+        *message.header_mut() =
+            Header { schema: M::SCHEMA, epoch: self.epoch, seq: self.number, stamp: clock::now() };
+        let place = self.memory.place::<M>(self.number);
+        // Whoever reads a word written from here on sees that the message before has been shown.
+        fence(Ordering::Release);
+        let words = words_of(message);
+        for range in std::iter::once(0..M::FIXED).chain(message.arrays()) {
+            for (to, from) in place[range.clone()].iter().zip(&words[range]) {
+                to.store(*from, Ordering::Relaxed);
+            }
+        }
+        self.memory.count().store(self.number, Ordering::Release);
+    }
+}
+
+impl<M: Message + Arrays> Drop for Board<M> {
+    fn drop(&mut self) {
+        // Readers keep what they have mapped. The name is this sender's as long as it owns the role.
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+/// Receiving end.
+pub(crate) struct BoardReader<M: Message + Arrays> {
+    path: PathBuf,
+    /// The sender's file, and its number in the file system.
+    memory: Option<Memory>,
+    file: u64,
+    number: u64,
+    message: Box<M>,
+    /// Messages of another layout, and files that are none of ours.
+    pub(crate) refused: u64,
+}
+
+impl<M: Message + Arrays> BoardReader<M> {
+    /// Finds the sender if it is there; else [`BoardReader::attend`] will.
+    pub(crate) fn open(name: &RobotName) -> BoardReader<M> {
+        let (path, message) = (path::<M>(name), Box::new(M::zeroed()));
+        let mut reader = BoardReader { path, memory: None, file: 0, number: 0, message, refused: 0 };
+        reader.attend();
+        reader
+    }
+
+    /// Turns to a sender that came since the last call. One system call if none did.
+    pub(crate) fn attend(&mut self) {
+        if std::fs::metadata(&self.path).is_ok_and(|meta| meta.ino() != self.file) {
+            // A file that vanishes meanwhile is looked for again with the next call.
+            let Ok(file) = File::open(&self.path) else { return };
+            let Ok(meta) = file.metadata() else { return };
+            self.file = meta.ino();
+            match Memory::map::<M>(&file, ProtFlags::READ) {
+                Ok(memory) if memory.all()[SCHEMA].load(Ordering::Relaxed) == M::SCHEMA => {
+                    (self.memory, self.number) = (Some(memory), 0);
+                }
+                _ => self.refused += 1,
+            }
+        }
+    }
+
+    /// The newest message, if it was not read before.
+    #[inline]
+    pub(crate) fn newest(&mut self) -> Option<&M> {
+        let memory = self.memory.as_ref()?;
+        let mut number = memory.count().load(Ordering::Acquire);
+        if number == self.number {
+            return None;
+        }
+        loop {
+            copy(memory.place::<M>(number), &mut *self.message);
+            // Whatever of this was written after the next message was shown, that message is seen to be shown.
+            fence(Ordering::Acquire);
+            let now = memory.count().load(Ordering::Relaxed);
+            if now == number {
+                break;
+            }
+            number = now;
+        }
+        self.number = number;
+        if self.message.header().schema != M::SCHEMA {
+            self.refused += 1;
+            return None;
+        }
+        Some(&self.message)
+    }
+}
+
+/// Copies the entries in use; the others stay zero.
+#[inline]
+fn copy<M: Message + Arrays>(place: &[AtomicU64], message: &mut M) {
+    let take = |message: &mut M, range: Range<usize>| {
+        let words = words_of_mut(message);
+        for (to, from) in words[range.clone()].iter_mut().zip(&place[range]) {
+            *to = from.load(Ordering::Relaxed);
+        }
+    };
+    let before = message.arrays();
+    take(message, 0..M::FIXED);
+    if message.arrays() != before {
+        words_of_mut(message)[M::FIXED..].fill(0);
+    }
+    for range in message.arrays() {
+        take(message, range);
+    }
+}
+
+fn words_of<M: Message>(message: &M) -> &[u64] {
+    // SAFETY: a message is plain numbers without padding, in whole aligned words.
+    unsafe { std::slice::from_raw_parts(ptr::from_ref(message).cast(), words::<M>()) }
+}
+
+fn words_of_mut<M: Message>(message: &mut M) -> &mut [u64] {
+    // SAFETY: as above, and every bit pattern is a value.
+    unsafe { std::slice::from_raw_parts_mut(ptr::from_mut(message).cast(), words::<M>()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{ActionMessage, MAX_OBS, StateMessage, remove_files};
+    use super::*;
+    use std::sync::atomic::AtomicBool;
+
+    fn name(what: &str) -> RobotName {
+        RobotName::new(&format!("t{}-{what}", std::process::id())).unwrap()
+    }
+
+    fn state(nq: u32, n_obs: u32, value: f64) -> StateMessage {
+        let mut state = StateMessage::zeroed();
+        (state.nq, state.nv, state.n_obs) = (nq, nq, n_obs);
+        state.q_mut().fill(value);
+        state.v_mut().fill(-value);
+        state.obs_mut().fill(value);
+        state
+    }
+
+    #[test]
+    fn the_newest_is_read_once_and_successors_are_found() {
+        let name = name("board");
+        let mut reader = BoardReader::<StateMessage>::open(&name);
+        assert!(reader.newest().is_none());
+        let mut first = Board::create(&name, 1).unwrap();
+        reader.attend();
+        assert!(reader.newest().is_none(), "nothing was sent yet");
+        for value in [1.0, 2.0, 3.0] {
+            first.send(&mut state(7, 14, value));
+        }
+        let newest = reader.newest().unwrap();
+        assert_eq!((newest.header.epoch, newest.header.seq, newest.obs()), (1, 3, [3.0; 14].as_slice()));
+        assert!(reader.newest().is_none());
+        // Another sender: what the first one shows is read until its successor is attended to.
+        first.send(&mut state(7, 14, 4.0));
+        std::mem::forget(first); // as a killed process leaves it
+        let mut second = Board::create(&name, 2).unwrap();
+        second.send(&mut state(2, 1, 5.0));
+        assert_eq!(reader.newest().map(|s| s.header.epoch), Some(1));
+        reader.attend();
+        let newest = reader.newest().unwrap();
+        assert_eq!((newest.header.epoch, newest.header.seq, newest.q()), (2, 1, [5.0, 5.0].as_slice()));
+        assert!(
+            newest.q[2..].iter().chain(&newest.obs[1..]).all(|x| *x == 0.0),
+            "what is not in use is zero"
+        );
+        drop(second);
+        assert!(!path::<StateMessage>(&name).exists(), "the name goes with its owner");
+        remove_files(&name);
+    }
+
+    #[test]
+    fn a_message_is_never_torn() {
+        let name = name("torn");
+        let mut board = Board::create(&name, 1).unwrap();
+        let mut reader = BoardReader::<ActionMessage>::open(&name);
+        let over = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let mut action = ActionMessage::zeroed();
+                for tick in 1..=1_000_000_u64 {
+                    (action.tick, action.nu) = (tick, 1 + (tick % 64) as u32);
+                    action.action_mut().fill(tick as f64);
+                    board.send(&mut action);
+                }
+                over.store(true, Ordering::Release);
+            });
+            let mut last = 0;
+            while !over.load(Ordering::Acquire) {
+                let Some(action) = reader.newest() else { continue };
+                assert!(action.header.seq > last && action.tick == action.header.seq);
+                assert_eq!(u64::from(action.nu), 1 + action.tick % 64);
+                assert!(action.action().iter().all(|x| *x == action.tick as f64), "{action:?}");
+                last = action.tick;
+            }
+        });
+        remove_files(&name);
+    }
+
+    #[test]
+    fn foreign_files_and_lying_lengths_are_refused_or_clamped() {
+        let name = name("foreign");
+        std::fs::write(path::<StateMessage>(&name), b"short").unwrap();
+        let mut reader = BoardReader::<StateMessage>::open(&name);
+        assert!(reader.newest().is_none());
+        assert_eq!(reader.refused, 1);
+        reader.attend();
+        assert_eq!(reader.refused, 1, "a file is refused once");
+
+        let board = Board::<StateMessage>::create(&name, 1).unwrap();
+        reader.attend();
+        board.memory.place::<StateMessage>(9).iter().for_each(|word| word.store(u64::MAX, Ordering::Relaxed));
+        board.memory.count().store(9, Ordering::Release);
+        assert!(reader.newest().is_none(), "another schema");
+        assert_eq!(reader.refused, 2);
+        board.memory.place::<StateMessage>(10)[1..]
+            .iter()
+            .for_each(|word| word.store(u64::MAX, Ordering::Relaxed));
+        board.memory.place::<StateMessage>(10)[0].store(StateMessage::SCHEMA, Ordering::Relaxed);
+        board.memory.count().store(10, Ordering::Release);
+        assert_eq!(reader.newest().unwrap().obs().len(), MAX_OBS);
+
+        board.memory.all()[SCHEMA].store(7, Ordering::Relaxed);
+        let mut late = BoardReader::<StateMessage>::open(&name);
+        assert!(late.newest().is_none());
+        assert_eq!(late.refused, 1);
+        remove_files(&name);
+    }
+}
