@@ -5,7 +5,6 @@
 //! full, records are dropped and counted; the loop never notices. [`replay()`] computes a log again.
 
 mod facts;
-mod map;
 mod queue;
 mod replay;
 mod tick;

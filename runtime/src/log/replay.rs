@@ -5,6 +5,8 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
+use std::fs::File;
+use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use mcap::read::parse_record;
@@ -14,12 +16,14 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::facts::{self, Session};
-use super::map::Map;
 use super::queue::{SNAPSHOT_TOPIC, SnapshotEntry, TICK_TOPIC, attachment_name};
 use super::tick::{TickJson, encode};
 use crate::link::{Message, SnapshotBytes, SnapshotHeader};
 use crate::rt::{Build, Core, Inputs, Loaded, PilotBuilder};
 use crate::snapshot::one_line;
+
+/// Bytes read at a time: a log may be larger than memory.
+const PORTION: usize = 1 << 20;
 
 /// What replay found.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -80,8 +84,19 @@ pub fn replay_with<B: Build>(file: &Path, build: B) -> Result<Replay, ReplayErro
     // What is quoted from a damaged file may hold line breaks.
     let fail =
         |reason: String| ReplayError { file: file.to_owned(), reason: reason.replace(['\n', '\r'], " ") };
-    let map = Map::open(file).map_err(|e| fail(e.to_string()))?;
-    Replayer::new(build).run(map.bytes()).map_err(fail)
+    let (log, length) = open(file).map_err(|e| fail(e.to_string()))?;
+    Replayer::new(build).run(log, length).map_err(fail)
+}
+
+/// The log to be read from its start, and its length.
+fn open(file: &Path) -> io::Result<(BufReader<File>, usize)> {
+    let meta = std::fs::metadata(file)?; // asked before: to open a pipe would wait for its other end
+    let length = meta.len() as usize;
+    match (meta.is_file(), length) {
+        (false, _) => Err(io::Error::other("it is not a regular file")),
+        (true, 0) => Err(io::Error::other("it is empty")),
+        _ => Ok((BufReader::with_capacity(PORTION, File::open(file)?), length)),
+    }
 }
 
 struct Replayer<B: Build> {
@@ -109,20 +124,18 @@ impl<B: Build> Replayer<B> {
         }
     }
 
-    fn run(mut self, mut bytes: &[u8]) -> Result<Replay, String> {
+    fn run(mut self, mut log: impl Read, length: usize) -> Result<Replay, String> {
         // No part is longer than the file: a damaged length is refused before memory is taken for it.
         let options = LinearReaderOptions::default()
             .with_skip_end_magic(true)
             .with_validate_chunk_crcs(true)
-            .with_record_length_limit(bytes.len());
+            .with_record_length_limit(length);
         let mut reader = LinearReader::new_with_options(options);
         while let Some(event) = reader.next_event() {
             let part = match event {
                 Ok(LinearReadEvent::ReadRequest(wanted)) => {
-                    let (now, rest) = bytes.split_at(wanted.min(bytes.len()));
-                    reader.insert(now.len()).copy_from_slice(now);
-                    reader.notify_read(now.len());
-                    bytes = rest;
+                    let read = log.read(reader.insert(wanted.min(PORTION))).map_err(|e| e.to_string())?;
+                    reader.notify_read(read);
                     continue;
                 }
                 Ok(LinearReadEvent::Record { data, opcode }) => parse_record(opcode, data),
