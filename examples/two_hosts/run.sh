@@ -31,7 +31,7 @@ robot ip addr add 10.77.0.1/24 dev nearl-a; robot ip link set nearl-a up
 trainer ip addr add 10.77.0.2/24 dev nearl-b; trainer ip link set nearl-b up
 
 # robot: the arm, its loop, and the tunnel that waits
-robot "$nearl" plant Panda-reach --name arm $pace --seconds "$((seconds + 3))" --json > "$out/plant.json" &
+robot "$nearl" plant Panda-reach --name arm $pace --json > "$out/plant.json" &
 plant=$!
 robot "$nearl" run examples/snapshots/panda-reach.safetensors --plant arm --explore 0 --rollback-factor 5 --seconds "$seconds" --json > "$out/loop.json" &
 loop=$!
@@ -42,6 +42,7 @@ trainer "$nearl" tunnel arm --connect tcp/10.77.0.1:7447 --out "$out/trainer" > 
 trainer "$nearl" train Panda-reach --from arm --steps 1024 --set train.n_steps=8 --set train.ppo.batch_size=64 --out "$out/train" || echo "the training ended early" >&2
 
 wait $loop
+pkill -TERM -f "^$nearl plant Panda-reach --name arm" # in lockstep its time stands still without a loop
 wait $plant
 python3 - "$out" <<'PYTHON'
 import csv, json, sys

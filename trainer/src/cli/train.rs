@@ -142,8 +142,12 @@ impl Train {
                 serde_json::json!({ "run": out, "snapshot": saved, "steps": steps, "seconds": seconds, "return": mean }),
             );
         } else {
+            let result = match mean.is_nan() {
+                true => "no episode ended".to_owned(),
+                false => format!("return {mean:.0} (mean of the last 100 episodes)"),
+            };
             say(format!(
-                "{} {}: return {mean:.0} (mean of the last 100 episodes) after {steps} steps in {seconds:.0} s, {:.0} steps/s",
+                "{} {}: {result} after {steps} steps in {seconds:.0} s, {:.0} steps/s",
                 run.name,
                 run.algo,
                 steps as f64 / seconds
