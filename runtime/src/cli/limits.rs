@@ -27,9 +27,9 @@ pub struct LimitOptions {
     /// Overruns in a row before Braking; at least --degrade-overruns.
     #[arg(long, value_name = "TICKS", default_value_t = ModeLimits::default().overruns)]
     pub overruns: u32,
-    /// Overruns in a row before Fault is latched; more than --overruns.
-    #[arg(long, value_name = "TICKS", default_value_t = ModeLimits::default().starved)]
-    pub starved: u32,
+    /// Overruns in a row before Fault is latched; more than --overruns. [default: 100, but at least a tenth of a second]
+    #[arg(long, value_name = "TICKS")]
+    pub starved: Option<u32>,
     /// Ticks over which the distance of reached and target velocity is averaged before and after a swap; 0 never goes back.
     #[arg(long, value_name = "TICKS", default_value_t = RollbackSettings::default().window)]
     pub rollback_window: usize,
@@ -51,7 +51,7 @@ impl LimitOptions {
             ("--bad-states", self.bad_states, "--hold-states", self.hold_states.saturating_add(1)),
             ("--degrade-overruns", self.degrade_overruns, "1", 1),
             ("--overruns", self.overruns, "--degrade-overruns", self.degrade_overruns),
-            ("--starved", self.starved, "--overruns", self.overruns.saturating_add(1)),
+            ("--starved", self.starved.unwrap_or(u32::MAX), "--overruns", self.overruns.saturating_add(1)),
             ("--recover-after", self.recover_after, "1", 1),
             ("--braked-ticks", self.braked_ticks, "1", 1),
         ];

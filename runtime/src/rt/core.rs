@@ -93,7 +93,7 @@ impl<T: Tick> Core<T> {
         controller.controller.save_memory(&mut memory);
         Core {
             memory,
-            modes: Modes::new(settings.modes),
+            modes: Modes::new(settings.modes, settings.period),
             grid: Grid::new(start, settings.period),
             record: Record::new(),
             estimate: StateMessage::zeroed(),

@@ -100,8 +100,8 @@ pub struct ModeLimits {
     pub degrade_overruns: u32,
     /// Overruns in a row before Braking.
     pub overruns: u32,
-    /// Overruns in a row before the fault is latched.
-    pub starved: u32,
+    /// Overruns in a row before the fault is latched; `None`: a hundred, and no fewer than fit a tenth of a second.
+    pub starved: Option<u32>,
 }
 
 impl Default for ModeLimits {
@@ -113,8 +113,17 @@ impl Default for ModeLimits {
             braked_ticks: 5,
             degrade_overruns: 3,
             overruns: 10,
-            starved: 100,
+            starved: None,
         }
+    }
+}
+
+impl ModeLimits {
+    /// Overruns in a row before the fault is latched, at a period of `period` [ns]: more of them at a high rate, where a short pause of
+    /// the machine costs many ticks.
+    fn starved_at(&self, period: u64) -> u32 {
+        let tenth = u32::try_from(100_000_000_u64.div_ceil(period.max(1))).unwrap_or(u32::MAX);
+        self.starved.unwrap_or_else(|| tenth.max(100).max(self.overruns.saturating_add(1)))
     }
 }
 
@@ -122,6 +131,7 @@ impl Default for ModeLimits {
 #[derive(Clone, Copy, Debug)]
 pub struct Modes {
     limits: ModeLimits,
+    starved: u32,
     mode: Mode,
     reason: Reason,
     good: u32,
@@ -130,9 +140,17 @@ pub struct Modes {
 }
 
 impl Modes {
-    /// Begins in Hold.
-    pub fn new(limits: ModeLimits) -> Modes {
-        Modes { limits, mode: Mode::Hold, reason: Reason::None, good: 0, bad: 0, late: 0 }
+    /// Begins in Hold; `period` [ns].
+    pub fn new(limits: ModeLimits, period: u64) -> Modes {
+        Modes {
+            limits,
+            starved: limits.starved_at(period),
+            mode: Mode::Hold,
+            reason: Reason::None,
+            good: 0,
+            bad: 0,
+            late: 0,
+        }
     }
 
     /// The mode.
@@ -190,7 +208,7 @@ impl Modes {
             Event::Panicked => Reason::Panic,
             Event::Lost(Reason::BadState) if is_over => Reason::BadStates,
             Event::Lost(Reason::ImplausibleState) if is_over => Reason::ImplausibleStates,
-            _ if self.late >= self.limits.starved => Reason::Starved,
+            _ if self.late >= self.starved => Reason::Starved,
             _ => Reason::None,
         }
     }
@@ -236,14 +254,14 @@ mod tests {
             bad_states: 2,
             degrade_overruns: 1,
             overruns: 2,
-            starved: 4,
+            starved: Some(4),
             ..ModeLimits::default()
         }
     }
 
     #[test]
     fn escalates_at_once_and_returns_slowly() {
-        let mut modes = Modes::new(limits());
+        let mut modes = Modes::new(limits(), 1_000_000);
         let stale = Event::Lost(Reason::StaleState);
         assert_eq!(run(&mut modes, stale, 5), Mode::Hold);
         assert_eq!(run(&mut modes, Event::Good, 1), Mode::Active);
@@ -255,7 +273,7 @@ mod tests {
 
     #[test]
     fn overruns_degrade_then_brake_then_latch() {
-        let mut modes = Modes::new(limits());
+        let mut modes = Modes::new(limits(), 1_000_000);
         run(&mut modes, Event::Good, 1);
         let late = |modes: &mut Modes| (modes.update(Event::Good, true, false), modes.reason());
         assert_eq!(late(&mut modes), (Mode::Degraded, Reason::Overruns));
@@ -269,7 +287,7 @@ mod tests {
 
     #[test]
     fn a_held_state_degrades_and_does_not_soften_braking() {
-        let mut modes = Modes::new(limits());
+        let mut modes = Modes::new(limits(), 1_000_000);
         let held = Event::Held(Reason::BadState);
         assert_eq!(run(&mut modes, held, 1), Mode::Hold);
         run(&mut modes, Event::Good, 1);
@@ -281,7 +299,7 @@ mod tests {
 
     #[test]
     fn a_fault_stays() {
-        let mut modes = Modes::new(ModeLimits { recover_after: 1, ..limits() });
+        let mut modes = Modes::new(ModeLimits { recover_after: 1, ..limits() }, 1_000_000);
         run(&mut modes, Event::Good, 1);
         assert_eq!(run(&mut modes, Event::Lost(Reason::BadState), 1), Mode::Braking);
         assert_eq!(run(&mut modes, Event::Lost(Reason::BadState), 1), Mode::Fault);
@@ -291,8 +309,17 @@ mod tests {
     }
 
     #[test]
+    fn a_tenth_of_a_second_of_overruns_latches_at_high_rates() {
+        let at = |period| ModeLimits::default().starved_at(period);
+        assert_eq!((at(20_000_000), at(1_000_000), at(200_000)), (100, 100, 500));
+        let patient = ModeLimits { overruns: 300, ..ModeLimits::default() };
+        assert_eq!(patient.starved_at(1_000_000), 301, "braking comes first");
+        assert_eq!(limits().starved_at(200_000), 4, "what is given counts");
+    }
+
+    #[test]
     fn a_stop_cannot_be_recovered_from() {
-        let mut modes = Modes::new(ModeLimits::default());
+        let mut modes = Modes::new(ModeLimits::default(), 1_000_000);
         run(&mut modes, Event::Good, 1);
         for _ in 0..100 {
             assert_eq!(modes.update(Event::Good, false, true), Mode::Braking);

@@ -39,7 +39,7 @@ pub const ROWS: &[Row] = &[
     (20, "shared memory tiny or read-only", "refused before any motion", &["link-memory", "link-memory-missing"], SYSTEM, "fault_20_shared_memory_that_is_tiny_or_read_only_is_refused_before_any_motion"),
     (21, "wall clock jumps", "no effect: it is never read", &["none"], "runtime/tests/clock.rs", "fault_21_a_wall_clock_that_jumps_changes_no_bit"),
     (22, "one overrun", "counted, the slots are skipped", &["none"], HERE, "fault_22_one_overrun_is_counted_and_nothing_else"),
-    (23, "overruns in a row", "after 3 degraded, after 10 braking, after 100 latched", &["overruns", "starved"], HERE, "fault_23_overruns_in_a_row_degrade_then_brake_then_latch"),
+    (23, "overruns in a row", "after 3 degraded, after 10 braking, after 100 (a tenth of a second at high rates) latched", &["overruns", "starved"], HERE, "fault_23_overruns_in_a_row_degrade_then_brake_then_latch"),
     (24, "stale sample: old time stamp, frozen values", "old: brakes; frozen: 3 bridged, then brakes", &["stale-state", "frozen-state"], HERE, "fault_24_stale_and_frozen_samples_brake"),
     (25, "dropped, doubled, reordered samples", "up to 3 lost are bridged by the plant, more brake; old ones are left out", &["lost-states"], HERE, "fault_25_lost_states_are_bridged_or_braked_and_others_left_out"),
     (26, "sensor jump", "rejected and counted, bridged 3 times, after 8 latched", &["implausible-state", "implausible-states"], HERE, "fault_26_a_jump_is_rejected_and_counted"),
