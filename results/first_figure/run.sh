@@ -6,11 +6,12 @@ set -euo pipefail
 cd "$(dirname "$0")/../.."
 tasks=HalfCheetah-v5,Hopper-v5,Walker2d-v5,Ant-v5
 with=runs/first_figure without=runs/first_figure_without_prior
+nets=train.nets.idm=[32,32] # the same networks for all
 
-target/release/nearl sweep --tasks $tasks --algos ppo,nearl,pid2-gan,pid2-ib --seeds 0-2 --steps 1e6 --out $with
+target/release/nearl sweep --tasks $tasks --algos ppo,nearl,pid2-gan,pid2-ib --seeds 0-2 --steps 1e6 --set "$nets" --out $with
 .venv/bin/python results/curves.py $with results/first_figure
 
-target/release/nearl sweep --tasks $tasks --algos nearl,pid2-gan,pid2-ib --seeds 0-2 --steps 1e6 --set train.project_in_training=false --out $without
+target/release/nearl sweep --tasks $tasks --algos nearl,pid2-gan,pid2-ib --seeds 0-2 --steps 1e6 --set "$nets" --set train.project_in_training=false --out $without
 for run in "$with"/*/ppo_*; do
     cp -rn "$run" "$without/$(basename "$(dirname "$run")")/"
 done

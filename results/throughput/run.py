@@ -29,7 +29,7 @@ def command(system, task, minibatch, a):
     if system == "physics":
         return [f"{a.target}/examples/physics_speed", str(a.seconds / 4), task]
     if system in ("ppo", "pid2-ib"):
-        settings = [f"train.ppo.batch_size={minibatch}", f"train.n_envs={ours}", f"train.n_steps={batch // ours}"]
+        settings = [f"train.ppo.batch_size={minibatch}", f"train.n_envs={ours}", f"train.n_steps={batch // ours}", "train.nets.idm=[32,32]"]
         return [f"{a.target}/nearl", "bench", "train", task, "--algo", system, "--seconds", str(a.seconds), "--repeat", "1",
                 "--physics-seconds", "0", "--json", *(w for s in settings for w in ("--set", s))]
     script, n_envs = {"jax-envpool": ("jax_envpool_ppo.py", jax), "sb3": ("sb3_ppo.py", sb3)}[system]
