@@ -142,14 +142,11 @@ impl Train {
                 serde_json::json!({ "run": out, "snapshot": saved, "steps": steps, "seconds": seconds, "return": mean }),
             );
         } else {
-            let result = match mean.is_nan() {
-                true => "no episode ended".to_owned(),
-                false => format!("return {mean:.0} (mean of the last 100 episodes)"),
-            };
             say(format!(
-                "{} {}: {result} after {steps} steps in {seconds:.0} s, {:.0} steps/s",
+                "{} {}: {} after {steps} steps in {seconds:.0} s, {:.0} steps/s",
                 run.name,
                 run.algo,
+                returned(mean, " (mean of the last 100 episodes)"),
                 steps as f64 / seconds
             ));
             say(format!(
@@ -190,5 +187,10 @@ fn show(bar: &ProgressBar, json: bool, p: &Progress) {
         return;
     }
     bar.set_position(p.steps.min(bar.length().unwrap_or(0)));
-    bar.set_message(format!("return {:.0}  {:.0} steps/s", p.return_mean, p.steps as f64 / p.seconds));
+    bar.set_message(format!("{}  {:.0} steps/s", returned(p.return_mean, ""), p.steps as f64 / p.seconds));
+}
+
+/// The mean return and `of` what; in words while no episode has ended.
+fn returned(mean: f64, of: &str) -> String {
+    if mean.is_nan() { "no episode ended".to_owned() } else { format!("return {mean:.0}{of}") }
 }
