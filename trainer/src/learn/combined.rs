@@ -84,7 +84,7 @@ pub(super) struct Combined {
 /// Buffers of one thread.
 pub(super) struct CombinedWork {
     pub(super) policy: Tape,
-    inverse: Option<InverseWork>,
+    pub(super) inverse: Option<InverseWork>,
     /// Observation rows.
     pub(super) obs: Vec<V>,
     /// Rows of a change of state.

@@ -163,4 +163,10 @@ fn pid2_solves_it_with_and_without_bottleneck() {
             solves(&format!("pid2, bottleneck {bottleneck}, {kind:?}"), got);
         }
     }
+    let (n, settings) =
+        (nets(Activation::Tanh), Pid2Settings { null_space: true, ..Pid2Settings::default() });
+    let got = train(Some(DETERMINISTIC), &n, 50, |d, s, rng| {
+        Box::new(Pid2::new(d, &n, s, settings.clone(), DETERMINISTIC, true, 1, rng))
+    });
+    solves("pid2, null space", got);
 }

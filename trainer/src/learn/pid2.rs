@@ -12,6 +12,7 @@
 //! bounds, zero where the projection clamped.
 
 mod adversary;
+mod null_space;
 
 use super::combined::{Combined, CombinedWork, Gradient, Kind};
 use super::discriminator::{Discriminator, DiscriminatorWork, LATENT};
@@ -24,6 +25,7 @@ use adversary::{fool_discriminator, judge};
 use nearl_runtime::net::kernel::{V, ZERO};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Networks, multiversion};
+use null_space::NullSpace;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
@@ -41,6 +43,9 @@ pub struct Pid2Settings {
     pub discriminator_lr: f32,
     /// Weight of the adversarial loss in the policy's gradient; 0 leaves the adversary out.
     pub generator_weight: f32,
+    /// The adversary moves a proposal only where the mean action stays as it is. No effect where the policy does not learn
+    /// through the inverse model (`exploration = "proposal"`).
+    pub null_space: bool,
     /// Information the bottleneck may pass, in [nat] (I_c).
     pub i_c: f32,
     /// Multiplier of the bottleneck at the start.
@@ -58,6 +63,7 @@ impl Default for Pid2Settings {
             idm_lr: 3e-4,
             discriminator_lr: 3e-4,
             generator_weight: 0.1,
+            null_space: false,
             i_c: 0.5,
             beta: 0.1,
             alpha: 1e-5,
@@ -118,6 +124,8 @@ struct Work {
     actor: CombinedWork,
     value: ValueWork,
     discriminator: DiscriminatorWork,
+    /// Where the adversary is held to it.
+    null_space: Option<NullSpace>,
 }
 
 /// Parameter group of policy and inverse model.
@@ -221,7 +229,7 @@ fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [
     let [loss, kl, clipped, clamped] = n.combined.policy_gradient(group, &t, &mut w.actor, grad);
     let mut generator = 0.0;
     if n.settings.generator_weight > 0.0 {
-        generator = fool_discriminator(n, &params.groups[JUDGE], &t, w);
+        generator = fool_discriminator(n, params, &t, w);
     }
     n.combined.learn(group, &mut w.actor, grad);
     add_sums(grad, &[loss, kl, clipped, clamped, generator]);
@@ -233,8 +241,13 @@ impl Phases for Nets {
     type Work = Work;
 
     fn work(&self) -> Work {
-        let value = self.combined.value.work();
-        Work { actor: self.combined.work(), value, discriminator: self.discriminator.work() }
+        Work {
+            actor: self.combined.work(),
+            value: self.combined.value.work(),
+            discriminator: self.discriminator.work(),
+            null_space: (self.settings.null_space && self.combined.policy_log_std.is_none())
+                .then(|| NullSpace::new(&self.combined.dims)),
+        }
     }
     fn group(&self, phase: usize) -> usize {
         match phase {

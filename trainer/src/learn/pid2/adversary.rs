@@ -2,8 +2,8 @@
 
 use super::super::discriminator::{logit_slope, softplus_sum};
 use super::super::gaussian::{copy, gather};
-use super::super::optimise::{Group, Params, Tile, add_sums};
-use super::{JUDGE, Nets, Pass, Work};
+use super::super::optimise::{Params, Tile, add_sums};
+use super::{COMBINED, JUDGE, Nets, Pass, Work};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, scalars, scalars_mut};
 
@@ -16,7 +16,8 @@ fn gather_noise(n: &Nets, pass: Pass, t: &Tile<'_>, to: &mut [V]) {
 
 /// Non-saturating loss `-log D(E(s, pi(s)))`: adds its gradient to `dL / du`; returns its sum.
 #[inline(always)]
-pub(super) fn fool_discriminator(n: &Nets, judge: &Group, t: &Tile<'_>, w: &mut Work) -> f32 {
+pub(super) fn fool_discriminator(n: &Nets, params: &Params, t: &Tile<'_>, w: &mut Work) -> f32 {
+    let judge = &params.groups[JUDGE];
     let (o, s) = (n.combined.dims.n_obs, n.combined.dims.n_state);
     let (xv, sv) = ((o + s).div_ceil(LANES), s.div_ceil(LANES));
     let d = &mut w.discriminator;
@@ -29,13 +30,20 @@ pub(super) fn fool_discriminator(n: &Nets, judge: &Group, t: &Tile<'_>, w: &mut 
     n.discriminator.forward(&judge.p, d);
     let loss = softplus_sum(&d.logit, 1.0);
     logit_slope(&mut d.logit, 1.0, n.settings.generator_weight * t.scale);
-    let dx = scalars(n.discriminator.backward(&judge.transposed, d, 0.0, None, true));
-    let rows =
-        scalars_mut(&mut w.actor.d_change).chunks_exact_mut(sv * LANES).zip(dx.chunks_exact(sv * LANES));
+    let dx = n.discriminator.backward(&judge.transposed, d, 0.0, None, true);
+    let rows = scalars_mut(&mut w.actor.d_change)
+        .chunks_exact_mut(sv * LANES)
+        .zip(scalars(dx).chunks_exact(sv * LANES));
     for (du, dx) in rows {
         for (du, dx) in du[..s].iter_mut().zip(dx) {
             *du += dx;
         }
+    }
+    if let (Some(null_space), Some((model, _)), Some(inverse)) =
+        (&mut w.null_space, &n.combined.inverse, &mut w.actor.inverse)
+    {
+        let (dims, group, u) = (&n.combined.dims, &params.groups[COMBINED], w.actor.policy.output());
+        null_space.leave(dims, model, group, inverse, u, dx, &mut w.actor.d_change);
     }
     loss
 }

@@ -4,7 +4,8 @@ use super::*;
 use crate::learn::Net;
 use crate::learn::optimise::TILE;
 use crate::learn::reference::{self, *};
-use nearl_runtime::net::kernel::scalars;
+use nalgebra::{DMatrix, DVector};
+use nearl_runtime::net::kernel::{LANES, scalars};
 use nearl_runtime::net::{Activation, Dense};
 
 const LIMIT: f64 = 2e-4;
@@ -12,7 +13,7 @@ const TANH: Activation = Activation::Tanh;
 const RELU: Activation = Activation::Relu;
 
 fn dims() -> Dims {
-    Dims { n_obs: 7, n_state: 5, n_act: 3, seen_obs: vec![1, 2, 6], seen_state: vec![0, 2, 4] }
+    Dims { n_obs: 7, n_state: 5, n_act: 2, seen_obs: vec![1, 2, 6], seen_state: vec![0, 2, 4] }
 }
 
 /// A learner with weights far from zero, and a minibatch.
@@ -200,5 +201,65 @@ fn inverse_gradient_equals_central_differences() {
         };
         let (model, _) = l.nets.combined.inverse.as_ref().expect("inverse");
         check("inverse", n.inverse.as_ref().expect("inverse"), &model.net.mlp.to_dense(&grad), loss);
+    }
+}
+
+/// `dL / du` of the policy, row by row, and the proposals.
+fn slopes(l: &Pid2, b: &Batch) -> (Vec<V>, Vec<V>) {
+    let (mut w, idx) = (l.nets.work(), (0..b.n as u32).collect::<Vec<_>>());
+    let mut grad = vec![ZERO; l.params.groups[COMBINED].p.len() + 1];
+    l.nets.tile(ACTOR, &l.params, tile(b, &idx), &mut w, &mut grad);
+    (w.actor.d_change, w.actor.policy.output().to_vec())
+}
+
+/// `(1 - J+ J)` with the Jacobian by central differences and its pseudo-inverse by singular values, in f64.
+#[test]
+fn in_the_null_space_the_adversary_leaves_the_mean_action_as_it_is() {
+    let d = dims();
+    for activation in [TANH, RELU] {
+        let (mut l, b) = learner(false, true, activation);
+        let mut with = |weight, null_space| {
+            l.nets.settings.generator_weight = weight;
+            l.nets.settings.null_space = null_space;
+            slopes(&l, &b)
+        };
+        let (alone, u) = with(0.0, false);
+        let [full, left] = [false, true].map(|null_space| with(0.7, null_space).0);
+        let inverse = nets64(&l).inverse.expect("inverse");
+        let of = |rows: &[V], i: usize| row(scalars(rows), i, LANES);
+        let (mut free_entries, mut size) = (0, 0.0);
+        for i in 0..b.n {
+            let part = |rows: &[V]| {
+                let of_both = of(rows, i).into_iter().zip(of(&alone, i));
+                of_both.map(|(both, alone)| both - alone).collect::<Vec<f64>>()
+            };
+            let (asked, got, u) = (part(&full), part(&left), of(&u, i));
+            let (lower, upper) = (row(&b.lower, i, d.n_state), row(&b.upper, i, d.n_state));
+            let mean = |u: &[f64]| {
+                let w: Vec<f64> = (0..d.n_state).map(|k| u[k].max(lower[k]).min(upper[k])).collect();
+                inverse.forward(&inverse_input(&b, i, &d, &w))
+            };
+            let jacobian = DMatrix::from_fn(d.n_act, d.n_state, |a, k| {
+                let at = |x: f64| {
+                    let mut moved = u.clone();
+                    moved[k] += x;
+                    mean(&moved)[a]
+                };
+                (at(1e-6) - at(-1e-6)) / 2e-6
+            });
+            let slope = DVector::from_row_slice(&asked[..d.n_state]);
+            let pseudo = jacobian.clone().pseudo_inverse(1e-7).expect("positive");
+            let want = &slope - pseudo * (&jacobian * &slope);
+            free_entries += jacobian.column_iter().filter(|c| c.norm() > 0.0).count();
+            size += (&want - &slope).norm();
+            for k in 0..d.n_state {
+                let error = (got[k] - want[k]).abs();
+                assert!(error < 2e-4 * slope.norm(), "row {i}, entry {k}: {} instead of {}", got[k], want[k]);
+            }
+        }
+        assert!(
+            free_entries > 2 * b.n && size > 0.0,
+            "some entries are free, and what they do to the action is taken out"
+        );
     }
 }
