@@ -12,13 +12,13 @@ use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars, scalars_mut};
 /// A gradient whose square shrinks below this part when what earlier actions cover is taken out depends on them.
 const DEPENDENT: f32 = 1e-6;
 
-/// Buffers of one thread.
+/// Buffers of one thread: for a tile of rows, then for sixteen of them at a time, a lane each.
 pub(super) struct NullSpace {
     /// Gradients of the mean action's entries, each with a row of the inverse model's input for every row of the tile.
     jacobian: Vec<Vec<V>>,
     /// Gradient of the model's output that picks one entry.
     pick: Vec<V>,
-    /// The same gradients for one row, made orthonormal.
+    /// The same gradients made orthonormal: n_act rows of the entries that the inverse model sees.
     basis: Vec<V>,
     /// One for the entries that reach the inverse model unclamped.
     free: Vec<V>,
@@ -26,29 +26,32 @@ pub(super) struct NullSpace {
     slope: Vec<V>,
 }
 
+/// Sum of products, in each lane.
 #[inline(always)]
-fn dot(a: &[V], b: &[V]) -> f32 {
-    a.iter().zip(b).fold(ZERO, |sum, (&a, &b)| sum.fma(a, b)).sum()
+fn dot(a: &[V], b: &[V]) -> V {
+    a.iter().zip(b).fold(ZERO, |sum, (&a, &b)| sum.fma(a, b))
 }
 
-/// `to += c x`.
+/// `from -= c x`, in each lane.
 #[inline(always)]
-fn add(to: &mut [V], c: f32, x: &[V]) {
-    for (to, &x) in to.iter_mut().zip(x) {
-        *to = to.fma(V::splat(c), x);
+fn take(from: &mut [V], c: V, x: &[V]) {
+    let c = ZERO - c;
+    for (from, &x) in from.iter_mut().zip(x) {
+        *from = from.fma(c, x);
     }
 }
 
 impl NullSpace {
     /// Buffers for a tile.
     pub(super) fn new(d: &Dims) -> Self {
-        let (xv, av) = ((2 * d.seen_obs.len()).div_ceil(LANES), d.n_act.div_ceil(LANES));
+        let seen = d.seen_obs.len();
+        let (xv, av) = ((2 * seen).div_ceil(LANES), d.n_act.div_ceil(LANES));
         Self {
             jacobian: vec![vec![ZERO; TILE * xv]; d.n_act],
             pick: vec![ZERO; TILE * av],
-            basis: vec![ZERO; d.n_act * xv],
-            free: vec![ZERO; xv],
-            slope: vec![ZERO; xv],
+            basis: vec![ZERO; d.n_act * seen],
+            free: vec![ZERO; seen],
+            slope: vec![ZERO; seen],
         }
     }
 
@@ -71,49 +74,55 @@ impl NullSpace {
             self.pick.fill(ZERO);
             scalars_mut(&mut self.pick).chunks_exact_mut(av * LANES).for_each(|row| row[a] = 1.0);
             let (input, tape) = (&inverse.input, &mut inverse.tape);
-            jacobian.copy_from_slice(model.net.backward(
-                &group.transposed,
-                input,
-                &self.pick,
-                tape,
-                None,
-                true,
-            ));
+            let rows = model.net.backward(&group.transposed, input, &self.pick, tape, None, true);
+            jacobian.copy_from_slice(rows);
         }
-        let inputs = scalars(&inverse.input).chunks_exact(xv * LANES);
-        let [u, dx] = [u, dx].map(|rows| scalars(rows).chunks_exact(sv * LANES));
-        let rows = scalars_mut(du).chunks_exact_mut(sv * LANES).zip(dx).zip(u).zip(inputs);
-        for (r, (((du, dx), u), x)) in rows.enumerate() {
-            let (free, slope) = (scalars_mut(&mut self.free), scalars_mut(&mut self.slope));
-            for (j, &k) in (seen..).zip(&d.seen_state) {
-                (free[j], slope[j]) = if x[j] == u[k] { (1.0, dx[k]) } else { (0.0, 0.0) };
+        let (x, u, dx, du) = (scalars(&inverse.input), scalars(u), scalars(dx), scalars_mut(du));
+        for first in (0..TILE).step_by(LANES) {
+            let input = |lane: usize| (first + lane) * xv * LANES + seen;
+            let state = |lane: usize| (first + lane) * sv * LANES;
+            for (j, &k) in d.seen_state.iter().enumerate() {
+                for lane in 0..LANES {
+                    let free = x[input(lane) + j] == u[state(lane) + k];
+                    self.free[j].0[lane] = f32::from(u8::from(free));
+                    self.slope[j].0[lane] = if free { dx[state(lane) + k] } else { 0.0 };
+                }
             }
-            self.row(r, xv);
-            let (free, slope) = (scalars(&self.free), scalars(&self.slope));
-            for (j, &k) in (seen..).zip(&d.seen_state) {
-                du[k] += free[j] * (slope[j] - dx[k]);
+            for (own, rows) in self.basis.chunks_exact_mut(seen).zip(&self.jacobian) {
+                let rows = scalars(rows);
+                for (j, (own, &free)) in own.iter_mut().zip(&self.free).enumerate() {
+                    for lane in 0..LANES {
+                        own.0[lane] = rows[input(lane) + j];
+                    }
+                    *own = *own * free;
+                }
+            }
+            self.take_out();
+            for (j, &k) in d.seen_state.iter().enumerate() {
+                for lane in 0..LANES {
+                    let at = state(lane) + k;
+                    du[at] += self.free[j].0[lane] * (self.slope[j].0[lane] - dx[at]);
+                }
             }
         }
     }
 
-    /// Gram-Schmidt on the gradients of row `r`, entry by entry of the action; what each adds is taken out of the slope.
+    /// Gram-Schmidt on the gradients, one entry of the action after another; what each adds is taken out of the slope.
     #[inline(always)]
-    fn row(&mut self, r: usize, xv: usize) {
-        for (a, jacobian) in self.jacobian.iter().enumerate() {
-            let (before, own) = self.basis.split_at_mut(a * xv);
-            let own = &mut own[..xv];
-            for ((own, &j), &free) in own.iter_mut().zip(&jacobian[r * xv..]).zip(&self.free) {
-                *own = j * free;
+    fn take_out(&mut self) {
+        let seen = self.slope.len();
+        for a in 0..self.jacobian.len() {
+            let (before, own) = self.basis.split_at_mut(a * seen);
+            let own = &mut own[..seen];
+            let least = dot(own, own) * V::splat(DEPENDENT);
+            for b in before.chunks_exact(seen) {
+                take(own, dot(own, b), b);
             }
-            let size = dot(own, own);
-            for b in before.chunks_exact(xv) {
-                add(own, -dot(own, b), b);
-            }
-            let left = dot(own, own);
-            let scale = if left > DEPENDENT * size { 1.0 / left.sqrt() } else { 0.0 };
-            own.iter_mut().for_each(|v| *v = *v * V::splat(scale));
+            let scale =
+                dot(own, own).zip(least, |left, least| if left > least { 1.0 / left.sqrt() } else { 0.0 });
+            own.iter_mut().for_each(|v| *v = *v * scale);
             let covered = dot(own, &self.slope);
-            add(&mut self.slope, -covered, own);
+            take(&mut self.slope, covered, own);
         }
     }
 }
