@@ -9,7 +9,8 @@
 //!
 //! The losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`DISCRIMINATOR`], [`INVERSE`]. The gradient of
 //! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the
-//! bounds, zero where the projection clamped.
+//! bounds, zero where the projection clamped. The adversarial loss pulls at the proposal as a whole, or only at what the action
+//! leaves free of it ([`null_space`]).
 
 mod adversary;
 mod null_space;
