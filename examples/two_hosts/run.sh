@@ -42,7 +42,7 @@ trainer "$nearl" tunnel arm --connect tcp/10.77.0.1:7447 --out "$out/trainer" > 
 trainer "$nearl" train Panda-reach --from arm --steps 1024 --set train.n_steps=8 --set train.ppo.batch_size=64 --out "$out/train" || echo "the training ended early" >&2
 
 wait $loop
-pkill -TERM -P $plant # the plant is the child of its nsenter; in lockstep its time stands still without a loop
+pkill -TERM -P "$(pgrep -P $plant)" # shell, nsenter, plant; in lockstep the plant's time stands still without a loop
 wait $plant
 python3 - "$out" <<'PYTHON'
 import csv, json, sys
