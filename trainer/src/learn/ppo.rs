@@ -112,7 +112,9 @@ impl Ppo {
         policy.mlp.write_dense(&init::orthogonal(&policy.mlp.widths(), 0.01, rng), &mut actor.p);
         let (value, value_group) = Value::new(&dims, nets, settings.vf_coef, rng);
         set_lanes(&mut actor.p[log_std.clone()], a, settings.log_std);
-        let (inverse, inverse_group) = InverseModel::alone(&dims, nets, rng);
+        let mut aside = rng.clone(); // so that the policy learns the same with any inverse model beside it
+        aside.set_stream(!rng.get_stream());
+        let (inverse, inverse_group) = InverseModel::alone(&dims, nets, &mut aside);
         let groups = vec![actor, value_group, inverse_group];
         let adam = groups.iter().map(|g| Adam::new(g.p.len(), settings.lr)).collect();
         let nets = Nets { dims, settings, policy, log_std, value, inverse, len: at };

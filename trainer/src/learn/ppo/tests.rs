@@ -81,3 +81,17 @@ fn gradients_of_policy_and_value_are_clipped_as_one_vector() {
     assert!((held[0].hypot(held[1]) - 0.01).abs() < 1e-7, "{held:?}");
     assert!((held[0] / held[1] - free[0] / free[1]).abs() < 1e-4 * free[0] / free[1], "{held:?} {free:?}");
 }
+
+/// Its first weights come from a stream of its own, so that runs of PPO with other inverse models beside it are the same.
+#[test]
+fn the_inverse_model_on_the_side_changes_nothing() {
+    let learned = |idm: Vec<usize>| {
+        let nets = NetSettings { idm, ..NetSettings::default() };
+        let settings = PpoSettings { n_epochs: 2, batch_size: TILE, ..PpoSettings::default() };
+        let mut rng = crate::rollout::stream(1, 1);
+        let mut l = Ppo::new(dims(), &nets, settings, 1, &mut rng);
+        l.update(&batch(&dims(), 2 * TILE, 3), 1.0, &mut rng);
+        [ACTOR, VALUE].map(|phase| scalars(&l.params.groups[phase].p).to_vec())
+    };
+    assert!(learned(vec![]) == learned(vec![32, 32]), "other weights of policy or value");
+}
