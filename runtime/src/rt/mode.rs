@@ -214,7 +214,9 @@ impl Modes {
     }
 
     fn brake(&mut self, reason: Reason) {
-        if self.mode.acts() {
+        // Whatever it brakes for: while no state comes, that is what keeps it there.
+        let is_alone = self.mode == Mode::Braking && reason == Reason::StaleState;
+        if self.mode.acts() || is_alone {
             self.enter(Mode::Braking, reason);
         }
     }
@@ -283,6 +285,22 @@ mod tests {
         assert_eq!(late(&mut modes), (Mode::Braking, Reason::Overruns));
         assert_eq!(late(&mut modes), (Mode::Braking, Reason::Overruns));
         assert_eq!(late(&mut modes), (Mode::Fault, Reason::Starved));
+    }
+
+    #[test]
+    fn a_plant_that_falls_silent_while_the_loop_brakes_is_named() {
+        let mut modes = Modes::new(limits(), 1_000_000);
+        run(&mut modes, Event::Good, 1);
+        modes.update(Event::Good, true, false);
+        assert_eq!(modes.update(Event::Good, true, false), Mode::Braking);
+        assert_eq!(modes.reason(), Reason::Overruns);
+        modes.update(Event::Lost(Reason::LostStates), true, false);
+        assert_eq!(modes.reason(), Reason::Overruns, "a slot without a state says less");
+        run(&mut modes, Event::Lost(Reason::StaleState), 1);
+        assert_eq!((modes.mode(), modes.reason()), (Mode::Braking, Reason::StaleState));
+        modes.update(Event::Lost(Reason::StaleState), false, true);
+        modes.update(Event::Lost(Reason::StaleState), false, true);
+        assert_eq!(modes.reason(), Reason::Stop);
     }
 
     #[test]
