@@ -37,13 +37,15 @@ fn rows(name: &str, limit: &dyn Limit) {
     let mut rows = limit.rows(&model, &[0, 1, 2, 3, 4, 5, 6]).unwrap().unwrap();
     let (mut kinematics, v, n) = (Kinematics::new(&model), [0.3; 7], rows.sizes().len());
     let (mut g, mut lower, mut upper) = (vec![0.0; 7 * n], vec![0.0; n], vec![0.0; n]);
+    let mut outside = vec![false; n];
     time(&format!("{name}, {n} rows: fill"), |k| {
         let q = &configuration(k);
         let (mass, bias, previous) = (&[][..], &[][..], None);
         let mut tick = Tick { q, v: &v, period: &period, mass, bias, kinematics: &mut kinematics, previous };
         g.fill(0.0);
         upper.fill(f64::INFINITY);
-        rows.fill(&mut tick, &mut RowsMut { g: &mut g, lower: &mut lower, upper: &mut upper, nv: 7 });
+        let (g, lower, upper, outside) = (&mut g[..], &mut lower[..], &mut upper[..], &mut outside[..]);
+        rows.fill(&mut tick, &mut RowsMut { g, lower, upper, outside, nv: 7 });
     });
     time(&format!("{name}, {n} rows: judge"), |k| {
         let q = &configuration(k);

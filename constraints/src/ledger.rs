@@ -13,7 +13,8 @@ pub enum Status {
     Solved,
     /// No way to stop could be verified from the nearest allowed state: this one is nearer to the stored brake.
     Slowed,
-    /// A joint is outside its limits: it may only return or brake, the others follow the proposal.
+    /// A joint, a point of a frame, a pair of bodies or a row is outside its limits, see [`Ledger::outside`]: it may only come back
+    /// or brake, the rest follows the proposal.
     Recovering,
     /// The proposal was not used: every controllable joint brakes.
     Braked(BrakeReason),
@@ -173,8 +174,8 @@ pub struct Ledger {
     pub raw_violations: Counts,
     /// What the target violates, by the independent checker; zero unless braking or recovering.
     pub violations: Counts,
-    /// Number of dofs that are outside their limits already.
-    pub outside: u32,
+    /// What the measured state is beyond already, as in [`ActiveRow::row`]: dofs, then hard coupled rows.
+    pub outside: Vec<usize>,
 }
 
 impl Ledger {
@@ -191,15 +192,16 @@ impl Ledger {
             duration_ns: 0,
             raw_violations: Counts::default(),
             violations: Counts::default(),
-            outside: 0,
+            outside: Vec::with_capacity(rows),
         }
     }
 
     /// Empties the report, keeping the memory.
     pub(crate) fn reset(&mut self) {
-        let mut active = std::mem::take(&mut self.active);
+        let (mut active, mut outside) = (std::mem::take(&mut self.active), std::mem::take(&mut self.outside));
         active.clear();
-        *self = Ledger { active, ..Ledger::new(0) };
+        outside.clear();
+        *self = Ledger { active, outside, ..Ledger::new(0) };
     }
 }
 

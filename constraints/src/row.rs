@@ -76,6 +76,8 @@ pub struct RowsMut<'a> {
     pub lower: &'a mut [f64],
     /// Upper bounds; infinity at the start of each tick.
     pub upper: &'a mut [f64],
+    /// The measured state is beyond the boundary that the row keeps; false at the start of each tick.
+    pub outside: &'a mut [bool],
     /// nv.
     pub nv: usize,
 }

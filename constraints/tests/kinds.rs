@@ -2,7 +2,9 @@
 
 mod common;
 
+use common::solids::{obstacle, settings, solid};
 use common::*;
+use nearl_constraints::geometry::Shape;
 use nearl_constraints::limit::{AccelerationSettings, UserRowSettings, VelocityProfileSettings};
 use nearl_constraints::*;
 use std::collections::BTreeMap;
@@ -131,6 +133,31 @@ fn a_sum_of_positions_stops_in_front_of_its_bound() {
     });
     println!("sum between {lowest} and {highest}, {braked} braked");
     assert!(highest <= 0.9 + 1e-9 && lowest >= -0.8 - 1e-9 && highest > 0.89 && braked == 0);
+}
+
+/// Beyond a row, a plane and a floor: named, and not called clean.
+#[test]
+fn what_is_outside_at_the_start_is_named() {
+    let q = [0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0];
+    let low =
+        UserRowSettings { upper: Some(-2.0), braking: Some(2.0), ..row("elbow", &[("q.panda_joint4", 1.0)]) };
+    let solids = [
+        solid("panda_hand", Shape::Sphere { radius: 0.1 }, [0.0; 3]),
+        obstacle("table", Shape::HalfSpace, [0.0, 0.0, 1.0]),
+    ];
+    let limits: [(Box<dyn Limit>, &str); 3] = [
+        (Box::new(UserRow::new(low)), "elbow"),
+        (Box::new(FrameLimit::half_space("panda_hand", [0.0, 0.0, 1.0], [0.0, 0.0, 0.3], 5.0)), "panda_hand"),
+        (Box::new(CollisionLimit::new(settings(&solids))), "panda_hand and table"),
+    ];
+    for (limit, name) in limits {
+        let mut projector = with(vec![limit], Settings::new(0.001, 1));
+        let (mut target, raw) = (Target::new(projector.model()), Proposal { q: q.to_vec(), v: vec![0.0; 7] });
+        let status = projector.project(&q, &[0.0; 7], &raw, &mut target);
+        let names = projector.row_names();
+        let outside: Vec<_> = target.ledger.outside.iter().map(|r| names[*r].as_str()).collect();
+        assert_eq!((status, &outside[..]), (Status::Recovering, &[name][..]), "{:?}", target.ledger);
+    }
 }
 
 #[test]

@@ -287,7 +287,7 @@ fn the_panda_stays_inside_everything() {
                 matches!(status, Status::Unchanged | Status::Clamped | Status::Solved),
                 "step {step}: {l:?} {q:?} {v:?}"
             );
-            assert_eq!((l.violations.total(), l.outside), (0, 0), "step {step}: {l:?}");
+            assert_eq!((l.violations.total(), l.outside.len()), (0, 0), "step {step}: {l:?}");
             (raw_violations.torque, raw_violations.position) = (
                 raw_violations.torque + l.raw_violations.torque,
                 raw_violations.position + l.raw_violations.position,
@@ -343,7 +343,7 @@ fn outside_its_limits_a_joint_may_only_return() {
         assert!(target.v[0] <= 0.0 || q[0] <= 2.8973, "step {step}: {:?}", target.ledger);
         assert!(target.acceleration[0].abs() <= 15.0 + 1e-9);
         match q[0] > 2.8973 + 1e-9 {
-            true => assert_eq!((status, target.ledger.outside), (Status::Recovering, 1)),
+            true => assert_eq!((status, &target.ledger.outside[..]), (Status::Recovering, &[0][..])),
             false => returned = returned.or(Some(step)),
         }
         (q, v) = (target.q.clone(), target.v.clone());

@@ -156,8 +156,9 @@ fn attack_robot(model: &Model, projector: &mut Projector, p: &Period, steps: usi
             proposal.v[i] = side[i] * random.between(0.0, 1e3);
         }
         let status = projector.project(&q, &v, &proposal, &mut target);
-        outside +=
-            usize::from(!status.is_ok() || target.ledger.outside > 0 || target.ledger.violations.total() > 0);
+        outside += usize::from(
+            !status.is_ok() || !target.ledger.outside.is_empty() || target.ledger.violations.total() > 0,
+        );
         for i in 0..7 {
             let (low, high);
             (q[i], v[i], low, high) = advance(q[i], v[i], target.acceleration[i], p);

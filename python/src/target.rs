@@ -14,9 +14,10 @@ fn words(status: Status) -> (&'static str, Option<&'static str>) {
         Status::Unchanged => ("unchanged", None),
         Status::Clamped => ("clamped", None),
         Status::Solved => ("solved", None),
-        Status::Recovering => {
-            ("recovering", Some("a joint is outside its limits and may only return or brake"))
-        }
+        Status::Recovering => (
+            "recovering",
+            Some("the measured state is outside what `outside` names, which may only come back or brake"),
+        ),
         Status::Braked(BrakeReason::NonFiniteProposal) => {
             ("braked", Some("the proposal holds NaN or infinity"))
         }
@@ -97,6 +98,12 @@ impl Ledger {
             Ok(out)
         };
         self.ledger.active.iter().map(row).collect()
+    }
+
+    /// Names of the joints and rows that the measured state is beyond already; they may only come back or brake.
+    #[getter]
+    fn outside(&self) -> Vec<&str> {
+        self.ledger.outside.iter().filter_map(|row| self.names.get(*row)).map(String::as_str).collect()
     }
 
     /// Weighted distance between proposal and target [rad/s].

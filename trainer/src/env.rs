@@ -15,6 +15,7 @@ mod hopper;
 mod meter;
 mod panda_reach;
 mod planar;
+mod robot_check;
 mod rules;
 mod simulated;
 mod spec;
@@ -300,7 +301,13 @@ pub fn of_task(task: &Task, text: &str, origin: &str) -> Result<Box<dyn Env>, En
         _ => (entry.build)()?,
     };
     check_time(task, env.spec(), origin)?;
+    check_robot(task, text, env.as_ref(), origin)?;
     user::with_cost(env, task, origin)
+}
+
+/// Whether a task file describes or names an environment: by `[reward]`, by `env`, or by the name of a native one.
+pub fn is_known(task: &Task) -> bool {
+    user::is_own(task) || task.env.is_some() || entry(&task.name).is_ok()
 }
 
 /// The constraints reckon with the task's periods: what is simulated must have them.
@@ -316,6 +323,33 @@ fn check_time(task: &Task, spec: &Spec, origin: &str) -> Result<(), EnvError> {
     };
     let reason = format!("{given} s, but the environment '{}' simulates {own} s; write that", spec.name);
     Err(EnvError::Task { origin: origin.into(), key: key.into(), reason })
+}
+
+/// A native environment brings its robot: constraints for another one would hold nowhere.
+fn check_robot(task: &Task, text: &str, env: &dyn Env, origin: &str) -> Result<(), EnvError> {
+    if text == env.model_text() {
+        return Ok(());
+    }
+    let (file, format) = match (&task.model.urdf, &task.model.mjcf) {
+        (Some(file), _) => (file, ModelFormat::Urdf),
+        (None, Some(file)) => (file, ModelFormat::Mjcf),
+        (None, None) => return Ok(()),
+    };
+    let read = |text: &str, format| match format {
+        ModelFormat::Urdf => nearl_runtime::constraints::Model::from_urdf_text(text),
+        ModelFormat::Mjcf => nearl_runtime::constraints::Model::from_mjcf_text(text),
+    };
+    // Files that cannot be read are refused, with the reason, where the constraints are built.
+    let (Ok(given), Ok(own)) = (read(text, format), read(env.model_text(), env.model_format())) else {
+        return Ok(());
+    };
+    let Some(what) = robot_check::difference(&given, &own) else { return Ok(()) };
+    let reason = format!(
+        "the environment '{}' simulates a robot of its own, from which '{file}' differs in {what}; leave that file as it is, or \
+         describe the task of another robot with [reward]",
+        env.spec().name
+    );
+    Err(EnvError::Task { origin: origin.into(), key: "model".into(), reason })
 }
 
 fn near_names(name: &str) -> Vec<&'static str> {

@@ -93,6 +93,11 @@ impl Clearance {
         Clearance { d: distance + t * w + period.kappa * t * t * c, w, ahead: speed, c }
     }
 
+    /// Further beyond the boundary than what creeps over it.
+    pub(super) fn is_outside(&self) -> bool {
+        self.d < -CREEP
+    }
+
     /// Upper bound of `r y / T` [m/s²].
     pub(super) fn bound(&self, braking: f64, period: &Period) -> f64 {
         self.allowed(braking, period) - self.c

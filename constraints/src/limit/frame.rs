@@ -243,7 +243,9 @@ impl Rows for FrameRows {
             for (i, g) in rows.row(r).iter_mut().enumerate() {
                 *g = dot(plane.n, [j[i], j[nv + i], j[2 * nv + i]]) / period.dt;
             }
-            rows.upper[r] = plane.clearance(&at, period).bound(self.braking, period);
+            let clearance = plane.clearance(&at, period);
+            rows.upper[r] = clearance.bound(self.braking, period);
+            rows.outside[r] = clearance.is_outside();
         }
     }
 

@@ -3,7 +3,7 @@
 use super::Limit;
 use super::margin::is_zero;
 use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
-use crate::viability::approach;
+use crate::viability::{POSITION_TOLERANCE, approach};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -66,8 +66,11 @@ impl UserRow {
         };
         let unknown = |near| LimitError::UnknownJoint { limit: "rows", name: joint.to_string(), near };
         let joint = model.find(joint).map_err(unknown)?;
-        if joint.nv != 1 || joint.nq != 1 {
+        if joint.nv != 1 {
             return Err(unusable("a joint with several dofs"));
+        }
+        if joint.nq != 1 && quantity == Quantity::Position {
+            return Err(unusable("a continuous joint, whose position is (cos, sin) and no angle"));
         }
         if !coefficient.is_finite() || coefficient == 0.0 {
             let what = format!("coefficient of '{name}' in row '{}'", self.settings.name);
@@ -136,6 +139,17 @@ impl Limit for UserRow {
             return Err(LimitError::Unusable {
                 what: format!("row '{}' has braking but not only positions", s.name),
                 next: "brake on q.<joint> alone, or drop braking",
+            });
+        }
+        let is_equality = bounds.0 == bounds.1;
+        let of_positions = terms.iter().all(|t| t.quantity == Quantity::Position);
+        if s.braking.is_none() && s.soft.is_none() && of_positions && !is_equality {
+            return Err(LimitError::Unusable {
+                what: format!(
+                    "row '{}' bounds positions but has no braking, so that nothing stops in front of it",
+                    s.name
+                ),
+                next: "give braking, the deceleration of the sum to count on, or soft",
             });
         }
         let largest =
@@ -210,6 +224,7 @@ impl Rows for Row {
         let (t, kappa) = (tick.period.dt, tick.period.kappa);
         if let Some(braking) = self.braking {
             let (s, w) = self.sum(tick.q, tick.v);
+            rows.outside[0] = (self.bounds.0 - s).max(s - self.bounds.1) > POSITION_TOLERANCE;
             for term in &self.terms {
                 rows.row(0)[term.dof] += term.coefficient / t;
             }

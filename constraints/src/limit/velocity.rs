@@ -5,14 +5,15 @@ use super::{AlwaysHard, Limit, LimitSet, PerJoint, quoted};
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
 
-/// `velocity = { scale }` or `velocity = { limit }`, less `margin`; with both, the smaller holds; with none, `scale = 1`.
+/// `velocity = { scale }` or `velocity = { limit }`, less `margin`; with both, the smaller holds; with none, `scale = 1`. Joints that
+/// `limit` does not name keep the robot file's.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VelocitySettings {
     /// Share of the robot file's limit, in (0, 1].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scale: Option<f64>,
-    /// Own limits [rad/s or m/s].
+    /// Own limits [rad/s or m/s], in place of the robot file's.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub limit: Option<PerJoint>,
     /// Speed kept below the limit [rad/s or m/s].
@@ -83,6 +84,9 @@ impl Limit for VelocityLimit {
         if self.settings.scale.is_some() || self.settings.limit.is_none() {
             let scale = self.settings.scale.unwrap_or(1.0);
             self.restrict_by_file(scale, model, controllable, &mut own)?;
+        }
+        for &i in controllable {
+            own[i] = own[i].or(Some(model.velocity_limit()[i]).filter(|v| v.is_finite()));
         }
         less_each(model, "velocity margin", &mut own, self.settings.margin.as_ref(), controllable)?;
         for &i in controllable {

@@ -36,6 +36,12 @@ impl Projector {
         if !p.is_finite() {
             return Err(BrakeReason::NonFiniteDynamics);
         }
+        let named = &mut target.ledger.outside; // a brake asks a second time
+        for row in stages.sources.outside().map(|r| v.len() + r) {
+            if !named.contains(&row) {
+                named.push(row);
+            }
+        }
         p.tame_goal();
         let clamped = self.dofs.controllable.iter().any(|i| self.goal[*i] != self.v_next[*i]);
         let obeyed =

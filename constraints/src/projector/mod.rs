@@ -235,7 +235,9 @@ impl Projector {
                 }
                 (self.bounds.q_lower[i], self.bounds.q_upper[i]) = (lower, upper);
             }
-            target.ledger.outside += u32::from(x.outside.is_some());
+            if x.outside.is_some() {
+                target.ledger.outside.push(i);
+            }
             self.intervals[i] = x;
         }
     }
@@ -252,9 +254,10 @@ impl Projector {
         let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
         target.ledger.violations = verdict.counts;
         target.ledger.slack = verdict.worst;
-        let outside = target.ledger.outside > 0;
-        if verdict.accepts() || (outside && verdict.counts.torque + verdict.counts.other == 0) {
-            let status = if outside { Status::Recovering } else { status };
+        let outside = &target.ledger.outside;
+        let is_joint_outside = outside.iter().any(|row| *row < v.len());
+        if verdict.accepts() || (is_joint_outside && verdict.counts.torque + verdict.counts.other == 0) {
+            let status = if outside.is_empty() { status } else { Status::Recovering };
             return match self.settings.braking {
                 Braking::Certified => status,
                 Braking::Stored => self.keep_a_brake(q, v, proposal, target, status),

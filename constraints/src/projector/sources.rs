@@ -14,6 +14,8 @@ pub(crate) struct Sources {
     kinematics: Kinematics,
     /// `G` over all dofs of the largest block.
     g: Vec<f64>,
+    /// Rows beyond whose boundary the measured state is.
+    outside: Vec<bool>,
 }
 
 /// What the dynamics say at the state of the tick.
@@ -84,7 +86,8 @@ impl Sources {
         let largest = blocks.iter().map(|b| b.sizes.len()).chain(cones.iter().map(|c| c.cone.dimension()));
         let g = vec![0.0; nv * largest.max().unwrap_or(0)];
         let scratch = Scratch { mass: vec![0.0; nv * nv], nle: zero(), bias: zero(), still: zero() };
-        Ok(Sources { blocks, cones, needs, scratch, kinematics: Kinematics::new(model), g })
+        let outside = vec![false; first];
+        Ok(Sources { blocks, cones, needs, scratch, kinematics: Kinematics::new(model), g, outside })
     }
 
     /// No rows and no cones.
@@ -114,6 +117,12 @@ impl Sources {
     /// Rows of the matrix of each cone, and its softness.
     pub(crate) fn cones(&self) -> Vec<(usize, Option<Soft>)> {
         self.cones.iter().map(|c| (c.cone.dimension(), c.soft)).collect()
+    }
+
+    /// Hard rows beyond whose boundary the state last filled in is, ascending.
+    pub(crate) fn outside(&self) -> impl Iterator<Item = usize> {
+        let hard = self.blocks.iter().filter(|b| b.soft.is_none());
+        hard.flat_map(|b| b.first..b.first + b.sizes.len()).filter(|r| self.outside[*r])
     }
 
     /// Switches the rows and cones of a limit.
@@ -149,6 +158,7 @@ impl Sources {
         let previous = measured.previous;
         let mut tick = Tick { q, v, period, mass, bias, kinematics: &mut self.kinematics, previous };
         let nv = v.len();
+        self.outside.fill(false);
         for block in &mut self.blocks {
             let rows = block.first..block.first + block.sizes.len();
             problem.row_lower[rows.clone()].fill(f64::NEG_INFINITY);
@@ -156,8 +166,10 @@ impl Sources {
             let g = &mut self.g[..nv * block.sizes.len()];
             g.fill(0.0);
             if block.enabled {
-                let (lower, upper) = (&mut problem.row_lower[rows.clone()], &mut problem.row_upper[rows]);
-                block.rows.fill(&mut tick, &mut RowsMut { g, lower, upper, nv });
+                let (lower, upper) =
+                    (&mut problem.row_lower[rows.clone()], &mut problem.row_upper[rows.clone()]);
+                let outside = &mut self.outside[rows];
+                block.rows.fill(&mut tick, &mut RowsMut { g, lower, upper, outside, nv });
             }
             for (r, size) in block.sizes.iter().enumerate() {
                 problem.take_row(block.first + r, &self.g[r * nv..(r + 1) * nv], *size, dofs, y);

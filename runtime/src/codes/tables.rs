@@ -6,8 +6,8 @@ codes! {
         Unchanged = "unchanged", "The proposal obeys every limit and was passed on bit for bit.", "Nothing to do.";
         Clamped = "clamped", "The proposal was moved to the nearest allowed state, joint by joint.", "Nothing to do.";
         Solved = "solved", "Torque rows were active; the nearest allowed state was solved for and checked.", "Nothing to do.";
-        Recovering = "recovering", "A joint is outside its limits: it may only return or brake.",
-            "See which joint in `active_rows`; the position limits of the task may be narrower than where the robot stood.";
+        Recovering = "recovering", "A joint, frame, pair of bodies or row is outside its limits: it may only come back or brake.",
+            "See which in `outside` of the ledger (Python, `nearl project`); the limits of the task may be narrower than where the robot stood.";
         Slowed = "slowed", "No way to stop could be verified from the nearest allowed state; the target is nearer to the stored brake.",
             "Nothing to do; if it happens often, lower acceleration or the proposals' size.";
         BrakedNonFiniteProposal = "braked-non-finite-proposal", "The proposal held NaN or infinity; every joint brakes.",

@@ -21,29 +21,51 @@ impl Parts {
     /// # Errors
     /// [`SnapshotError::Unusable`] with the sentence of the layer that refused.
     pub fn new(m: &Manifest) -> Result<Self, SnapshotError> {
-        // A name quoted from the manifest may hold line breaks.
-        let unusable = |reason: String| SnapshotError::Unusable { reason: reason.replace(['\n', '\r'], " ") };
-        let model = match m.model_format {
+        let model = Self::robot(m)?;
+        let s = &m.task.state;
+        let layout =
+            StateLayout::new(&model, &s.observation, s.propose.as_deref(), s.controllable.as_deref())
+                .map_err(|e| unusable(&e))?;
+        let projector = Self::projector(m, &model, layout.controllable())?;
+        Ok(Self { model, layout, projector })
+    }
+
+    /// The robot model alone.
+    ///
+    /// # Errors
+    /// As [`Parts::new`].
+    pub fn robot(m: &Manifest) -> Result<Model, SnapshotError> {
+        match m.model_format {
             ModelFormat::Urdf if m.task.model.free_flyer => Model::from_urdf_text_free_flyer(&m.model),
             ModelFormat::Urdf => Model::from_urdf_text(&m.model),
             ModelFormat::Mjcf => Model::from_mjcf_text(&m.model),
         }
-        .map_err(|e| unusable(e.to_string()))?;
-        let s = &m.task.state;
-        let layout =
-            StateLayout::new(&model, &s.observation, s.propose.as_deref(), s.controllable.as_deref())
-                .map_err(|e| unusable(e.to_string()))?;
-        let limits = build_limits(&m.task.constraints, &model).map_err(|e| unusable(e.to_string()))?;
+        .map_err(|e| unusable(&e))
+    }
+
+    /// The projector of the task's constraints for the dofs in `controllable`, ascending.
+    ///
+    /// # Errors
+    /// As [`Parts::new`].
+    pub fn projector(
+        m: &Manifest,
+        model: &Model,
+        controllable: &[usize],
+    ) -> Result<Projector, SnapshotError> {
+        let limits = build_limits(&m.task.constraints, model).map_err(|e| unusable(&e))?;
         let settings = Settings {
             consistency: m.task.constraints.consistency,
             solver: m.task.constraints.solver,
             braking: m.task.constraints.braking,
             ..Settings::new(m.task.time.dt, m.task.sub_steps() as u32)
         };
-        let projector = Projector::new(&model, &limits, layout.controllable(), settings)
-            .map_err(|e| unusable(e.to_string()))?;
-        Ok(Self { model, layout, projector })
+        Projector::new(model, &limits, controllable, settings).map_err(|e| unusable(&e))
     }
+}
+
+/// A name quoted from the manifest may hold line breaks.
+fn unusable(reason: &dyn std::fmt::Display) -> SnapshotError {
+    SnapshotError::Unusable { reason: reason.to_string().replace(['\n', '\r'], " ") }
 }
 
 /// Controllable joints of which only one half is proposed.

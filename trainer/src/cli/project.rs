@@ -1,14 +1,16 @@
 //! `nearl project`: states and proposals in, targets out, one JSON object a line.
 //!
 //! Input `{"q": [..], "v": [..], "q_proposal": [..], "v_proposal": [..]}`; output
-//! `{"q": [..], "v": [..], "status": "..", "active": [..], "moved": .., "iterations": .., "residual": ..}`.
+//! `{"q": [..], "v": [..], "status": "..", "active": [..], "outside": [..], "moved": .., "violations": .., ..}`.
 
 use super::{Failure, say};
-use crate::tasks;
+use crate::{env, tasks};
 use clap::Args;
-use nearl_runtime::constraints::{Model, Proposal, Target};
+use nearl_runtime::Manifest;
+use nearl_runtime::constraints::{Model, Projector, Proposal, Target};
 use nearl_runtime::controller::Parts;
 use serde::Deserialize;
+use std::collections::BTreeSet;
 use std::io::BufRead;
 
 #[derive(Args)]
@@ -32,8 +34,7 @@ struct Line {
 impl Project {
     pub(super) fn run(self) -> Result<(), Failure> {
         let mut manifest = tasks::load(&self.task, &self.set)?;
-        crate::train::complete(&mut manifest)?;
-        let Parts { model, mut projector, .. } = Parts::new(&manifest)?;
+        let (model, mut projector) = robot(&mut manifest)?;
         let (mut target, names) = (Target::new(&model), projector.row_names());
         for (i, line) in std::io::stdin().lock().lines().enumerate() {
             let line = line.map_err(|e| format!("standard input, line {}: {e}", i + 1))?;
@@ -52,14 +53,36 @@ impl Project {
                     serde_json::json!({ "kind": kind, "name": names[a.row], "side": side.to_lowercase(), "multiplier": a.multiplier, "slack": a.slack })
                 })
                 .collect();
+            let outside: Vec<_> = l.outside.iter().map(|row| &names[*row]).collect();
             say(serde_json::json!({
-                "q": target.q, "v": target.v, "status": format!("{:?}", l.status), "rung": format!("{:?}", l.rung), "active": active,
+                "q": target.q, "v": target.v, "status": format!("{:?}", l.status), "rung": format!("{:?}", l.rung), "active": active, "outside": outside,
                 "moved": l.moved, "slack": l.slack, "iterations": l.iterations, "residual": l.residual,
                 "raw_violations": l.raw_violations.total(), "violations": l.violations.total(), "duration_ns": l.duration_ns,
             }));
         }
         Ok(())
     }
+}
+
+/// Robot and projector of a task, which needs no environment to project: a file that names none has all joints of the robot file (but a
+/// floating base) or those of `state.controllable`.
+fn robot(manifest: &mut Manifest) -> Result<(Model, Projector), Failure> {
+    if env::is_known(&manifest.task) {
+        crate::train::complete(manifest)?;
+        let Parts { model, projector, .. } = Parts::new(manifest)?;
+        return Ok((model, projector));
+    }
+    let model = Parts::robot(manifest)?;
+    let controllable = match &manifest.task.state.controllable {
+        Some(names) => {
+            let found: Result<Vec<_>, _> = names.iter().map(|name| model.joint(name)).collect();
+            found?.iter().flat_map(|j| j.idx_v..j.idx_v + j.nv).collect()
+        }
+        None => model.joints().iter().filter(|j| j.nv == 1).map(|j| j.idx_v).collect::<BTreeSet<_>>(),
+    };
+    let controllable: Vec<usize> = controllable.into_iter().collect();
+    let projector = Parts::projector(manifest, &model, &controllable)?;
+    Ok((model, projector))
 }
 
 fn parse(line: &str, model: &Model) -> Result<Line, String> {
@@ -72,8 +95,11 @@ fn parse(line: &str, model: &Model) -> Result<Line, String> {
         ("q_proposal", &input.q_proposal, model.nq()),
         ("v_proposal", &input.v_proposal, model.nv()),
     ];
-    match sizes.iter().find(|(_, x, n)| x.len() != *n) {
-        Some((key, x, n)) => Err(format!("'{key}' has {} numbers, but the robot has {n}", x.len())),
-        None => Ok(input),
+    if let Some((key, x, n)) = sizes.iter().find(|(_, x, n)| x.len() != *n) {
+        return Err(format!("'{key}' has {} numbers, but the robot has {n}", x.len()));
     }
+    for (key, q) in [("q", &input.q), ("q_proposal", &input.q_proposal)] {
+        model.check_configuration(q).map_err(|e| format!("'{key}': {e}"))?;
+    }
+    Ok(input)
 }

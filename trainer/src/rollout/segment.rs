@@ -100,8 +100,8 @@ impl Tally {
         let (raw, left) = (ledger.raw_violations.total() > 0, ledger.violations.total() > 0);
         self.ticks += 1;
         self.raw_violations += u64::from(raw);
-        self.recovering += u64::from(ledger.outside > 0);
-        self.projected_violations += u64::from(left && ledger.outside == 0);
+        self.recovering += u64::from(!ledger.outside.is_empty());
+        self.projected_violations += u64::from(left && ledger.outside.is_empty());
         self.moved += u64::from(ledger.moved > 0.0);
         self.distance += ledger.moved;
         self.avoided += u64::from(raw && !left);

@@ -283,7 +283,9 @@ impl Rows for CollisionRows {
                     kinematics.add_row(frame, point, near.between.normal, sign, row);
                 }
             }
-            rows.upper[near.slot] = near.clearance(self.margin, period).bound(self.braking, period);
+            let clearance = near.clearance(self.margin, period);
+            rows.upper[near.slot] = clearance.bound(self.braking, period);
+            rows.outside[near.slot] = clearance.is_outside();
         }
     }
 
