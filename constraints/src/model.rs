@@ -223,7 +223,32 @@ impl Model {
         self.0.neutral.clone()
     }
 
-    /// Forces the robot file describes that are not part of this model; empty when there are none.
+    /// Refuses a configuration (nq) that is none: quaternions and (cos, sin) pairs must have length 1 to a thousandth. NaN passes, which the
+    /// projector answers for.
+    ///
+    /// # Errors
+    /// A sentence that names the joint.
+    pub fn check_configuration(&self, q: &[f64]) -> Result<(), String> {
+        for joint in self.joints() {
+            let (what, at) = match (joint.nq, joint.nv) {
+                (2, 1) => ("(cos, sin) of continuous joint", joint.idx_q),
+                (4, 3) => ("quaternion of joint", joint.idx_q),
+                (7, 6) => ("quaternion of joint", joint.idx_q + 3),
+                _ => continue,
+            };
+            let length = q[at..joint.idx_q + joint.nq].iter().map(|x| x * x).sum::<f64>().sqrt();
+            if (length - 1.0).abs() > UNIT {
+                let next = match joint.nq {
+                    2 => "write [cos(angle), sin(angle)]",
+                    _ => "write x, y, z, w of a unit quaternion",
+                };
+                return Err(format!("{what} '{}' has length {length}, not 1; {next}", joint.name));
+            }
+        }
+        Ok(())
+    }
+
+    /// What the robot file describes that is not part of this model: forces, mimic joints; empty when there is nothing.
     pub fn notes(&self) -> &[String] {
         &self.0.notes
     }
@@ -306,8 +331,11 @@ fn c_text(text: &str, file: &str, format: &'static str) -> Result<CString, Model
     })
 }
 
+/// Quaternions and (cos, sin) pairs may be this far from length 1.
+const UNIT: f64 = 1e-3;
+
 fn urdf_model(xml: &str, file: &str, free_flyer: bool) -> Result<Model, ModelError> {
-    let (stated, collisions) = urdf::read(xml, file)?;
+    let (stated, collisions, mimics) = urdf::read(xml, file)?;
     let refused = |reason| ModelError::Refused { file: file.to_string(), format: "URDF", reason };
     let raw = RawModel::from_urdf_text(&c_text(xml, file, "URDF")?, free_flyer).map_err(refused)?;
     let (limits, nv) = (raw.limits(), raw.nv());
@@ -328,6 +356,7 @@ fn urdf_model(xml: &str, file: &str, free_flyer: bool) -> Result<Model, ModelErr
     if limits.friction.iter().any(|x| *x > 0.0) {
         inner.notes.push("dry joint friction is not modelled".to_string());
     }
+    inner.notes.extend(mimics);
     inner.damping = limits.damping;
     inner.collisions = collisions;
     inner.finish(file)

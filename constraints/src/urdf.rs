@@ -5,6 +5,7 @@
 use crate::ModelError;
 use crate::geometry::{Placement, Shape};
 use roxmltree::{Document, Node};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// One `<collision>` of a link.
 #[derive(Debug, Clone)]
@@ -30,8 +31,11 @@ pub(crate) enum Stated {
 /// Movable joints by name.
 type Joints = Vec<(String, Stated)>;
 
-/// Movable joints by name, and the collision geometry.
-pub(crate) fn read(xml: &str, file: &str) -> Result<(Joints, Vec<LinkShape>), ModelError> {
+/// Movable joints by name, the collision geometry, and a note for each mimic joint.
+type Read = (Joints, Vec<LinkShape>, Vec<String>);
+
+/// Reads what Pinocchio does not tell; what cannot be is refused, all of it in one sentence.
+pub(crate) fn read(xml: &str, file: &str) -> Result<Read, ModelError> {
     let malformed = |reason: String| ModelError::Malformed { file: file.to_string(), format: "URDF", reason };
     let document = Document::parse(xml).map_err(|e| malformed(e.to_string()))?;
     let root = document.root_element();
@@ -46,12 +50,66 @@ pub(crate) fn read(xml: &str, file: &str) -> Result<(Joints, Vec<LinkShape>), Mo
             collisions.extend(collision(link.attribute("name").unwrap_or("?"), node, &mut wrong));
         }
     }
-    let joints = root.children().filter(|n| n.has_tag_name("joint"));
-    let stated = joints.filter_map(|joint| check_joint(joint, &mut wrong)).collect();
+    let joints = || root.children().filter(|n| n.has_tag_name("joint"));
+    check_tree(root, &mut wrong);
+    let mimics = joints().filter_map(mimic).collect();
+    let stated = joints().filter_map(|joint| check_joint(joint, &mut wrong)).collect();
     if !wrong.is_empty() {
         return Err(ModelError::Impossible { file: file.to_string(), list: wrong.join("; ") });
     }
-    Ok((stated, collisions))
+    Ok((stated, collisions, mimics))
+}
+
+/// Names once each, links that are there, and one root: what Pinocchio's reader says on standard error only.
+fn check_tree(robot: Node, wrong: &mut Vec<String>) {
+    let named = |tag| {
+        robot.children().filter(move |n| n.has_tag_name(tag)).map(|n| n.attribute("name").unwrap_or("?"))
+    };
+    for tag in ["link", "joint"] {
+        let mut seen = BTreeSet::new();
+        let again: BTreeSet<_> = named(tag).filter(|name| !seen.insert(*name)).collect();
+        wrong.extend(again.iter().map(|name| format!("{tag} '{name}' is there more than once")));
+    }
+    let links: BTreeSet<_> = named("link").collect();
+    let mut parents = BTreeMap::new();
+    for joint in robot.children().filter(|n| n.has_tag_name("joint")) {
+        let name = joint.attribute("name").unwrap_or("?");
+        let mut end = |tag: &str| {
+            let link = joint.children().find(|n| n.has_tag_name(tag)).and_then(|n| n.attribute("link"));
+            match link {
+                None => wrong.push(format!("joint '{name}' has no <{tag} link=...>")),
+                Some(link) if !links.contains(link) => {
+                    wrong.push(format!("joint '{name}' has the {tag} link '{link}', which is not there"));
+                }
+                Some(_) => {}
+            }
+            link
+        };
+        let (_, child) = (end("parent"), end("child"));
+        if let Some(other) = child.and_then(|child| parents.insert(child, name)) {
+            wrong.push(format!(
+                "link '{}' is the child of joints '{other}' and '{name}'",
+                child.unwrap_or("?")
+            ));
+        }
+    }
+    let roots: Vec<_> = links.iter().filter(|link| !parents.contains_key(*link)).collect();
+    if roots.len() > 1 {
+        let names = roots.iter().map(|n| format!("'{n}'")).collect::<Vec<_>>().join(", ");
+        wrong.push(format!("the links {names} are no joint's child, but only one may be the root"));
+    }
+}
+
+/// Pinocchio reads a mimic joint as one of its own.
+fn mimic(joint: Node) -> Option<String> {
+    let mimic = joint.children().find(|n| n.has_tag_name("mimic"))?;
+    let (name, of) = (joint.attribute("name").unwrap_or("?"), mimic.attribute("joint").unwrap_or("?"));
+    let number = |key, default| mimic.attribute(key).unwrap_or(default).to_string();
+    let (multiplier, offset) = (number("multiplier", "1"), number("offset", "0"));
+    Some(format!(
+        "joint '{name}' mimics '{of}' in the file (multiplier {multiplier}, offset {offset}), but moves on its own in this model: leave it out of \
+         the controllable joints, or hold both together with a row"
+    ))
 }
 
 /// The solid of one `<collision>`; `None` when it holds none or impossible numbers.
@@ -96,6 +154,8 @@ fn check_link(link: Node, wrong: &mut Vec<String>) {
                 ));
             } else if part.has_tag_name("mass") && value < 0.0 {
                 wrong.push(format!("link '{name}' mass is {value} kg"));
+            } else if matches!(a.name(), "ixx" | "iyy" | "izz") && value < 0.0 {
+                wrong.push(format!("link '{name}' inertia {} is {value} kg m²", a.name()));
             }
         }
     }
@@ -104,10 +164,26 @@ fn check_link(link: Node, wrong: &mut Vec<String>) {
 fn check_joint(joint: Node, wrong: &mut Vec<String>) -> Option<(String, Stated)> {
     let name = joint.attribute("name").unwrap_or("?").to_string();
     let kind = joint.attribute("type").unwrap_or("?");
-    if !matches!(kind, "revolute" | "prismatic" | "continuous") {
+    const KINDS: [&str; 6] = ["revolute", "continuous", "prismatic", "fixed", "floating", "planar"];
+    if !KINDS.contains(&kind) {
+        wrong.push(format!("joint '{name}' has the type '{kind}', which is none of {}", KINDS.join(", ")));
+    }
+    if !KINDS[..3].contains(&kind) {
         return None;
     }
+    let axis = joint.children().find(|n| n.has_tag_name("axis")).and_then(|n| n.attribute("xyz"));
+    if axis.is_some_and(|xyz| xyz.split_whitespace().all(|x| x.parse() == Ok(0.0))) {
+        wrong.push(format!("joint '{name}' has the axis 0 0 0"));
+    }
     let limit = joint.children().find(|n| n.has_tag_name("limit"));
+    if kind != "continuous" {
+        let missing =
+            ["effort", "velocity"].into_iter().filter(|key| limit.is_none_or(|l| !l.has_attribute(*key)));
+        let missing: Vec<_> = missing.collect();
+        if !missing.is_empty() {
+            wrong.push(format!("joint '{name}' states no {} in <limit>", missing.join(" and no ")));
+        }
+    }
     let mut number = |key: &str| {
         let text = limit?.attribute(key)?;
         let value = text.trim().parse::<f64>().unwrap_or(f64::NAN);

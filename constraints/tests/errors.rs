@@ -53,6 +53,28 @@ fn models() {
         limit(r#"<limit lower="NaN" upper="1" effort="-5" velocity="2"/>"#),
         &["lower is 'NaN'", "effort is '-5'"],
     );
+    let tree = |joint: &str| {
+        Model::from_urdf_text(&urdf(GOOD, "1").replace("</robot>", &format!("{joint}</robot>")))
+    };
+    let third =
+        r#"<link name="c"/><joint name="wrist" type="revolut"><parent link="a"/><child link="c"/></joint>"#;
+    refuse_model(tree(third), &["joint 'wrist' has the type 'revolut'", "continuous"]);
+    refuse_model(tree(r#"<link name="c"/>"#), &["'a', 'c'", "root"]);
+    refuse_model(tree(r#"<link name="b"/>"#), &["link 'b' is there more than once"]);
+    let nowhere = r#"<joint name="tip" type="fixed"><parent link="b"/><child link="hand"/></joint>"#;
+    refuse_model(tree(nowhere), &["joint 'tip' has the child link 'hand', which is not there"]);
+    let twice = r#"<joint name="tip" type="fixed"><parent link="a"/><child link="b"/></joint>"#;
+    refuse_model(tree(twice), &["link 'b' is the child of joints 'elbow' and 'tip'"]);
+    refuse_model(limit(""), &["joint 'elbow' states no effort and no velocity in <limit>"]);
+    let flat = urdf(GOOD, "1").replace("0 0 1", "0 0 0");
+    refuse_model(Model::from_urdf_text(&flat), &["joint 'elbow' has the axis 0 0 0"]);
+    let mimic = r#"<link name="c"/><joint name="twin" type="continuous"><parent link="b"/><child link="c"/><mimic joint="elbow" multiplier="-1"/></joint>"#;
+    let noted = tree(mimic).unwrap();
+    assert!(noted.notes()[0].contains("joint 'twin' mimics 'elbow' in the file (multiplier -1, offset 0)"));
+    let mut q = noted.neutral();
+    q[1] = 0.5;
+    assert!(noted.check_configuration(&q).unwrap_err().contains("(cos, sin) of continuous joint 'twin'"));
+    assert_eq!(noted.check_configuration(&noted.neutral()), Ok(()));
     refuse_model(
         mass("1").and_then(|m| m.joint("elbwo").map(|_| m.clone())),
         &["'elbwo'", "did you mean 'elbow'"],

@@ -90,7 +90,9 @@ impl Controller {
         })
     }
 
-    /// One control tick without noise: the action (n_act) and the ledger. `q` and `v` in Pinocchio's convention.
+    /// One control tick without noise: the action (n_act) and the ledger. `q` and `v` in Pinocchio's convention. With NaN or infinity in
+    /// them the ledger says "refused", and the action is the one that the last finite state asked for: right for a tick or two, so
+    /// brake if it lasts.
     fn update<'py>(
         &self,
         q: &Bound<'py, PyAny>,
@@ -112,7 +114,8 @@ impl Controller {
     }
 
     /// One control tick for an observation (n_obs) that holds what the controller needs of the joints' state, as all bundled
-    /// tasks' do. `noise` (n_noise): standard normal numbers of the policy; none is deterministic. Returns the action (n_act).
+    /// tasks' do. `noise` (n_noise): standard normal numbers of the policy; none is deterministic. Returns the action (n_act). An
+    /// observation that is not finite raises ValueError, and the controller stays as it was.
     #[pyo3(signature = (obs, noise=None))]
     fn act<'py>(
         &self,
@@ -127,6 +130,13 @@ impl Controller {
             )));
         }
         let obs = vector("obs", obs, self.sizes.2)?;
+        if let Some(i) = obs.iter().position(|x| !x.is_finite()) {
+            return Err(errors::value(format!(
+                "obs[{i}] ('{}') is {}; check the sensor behind it, and brake if it lasts",
+                self.obs_names(py)[i],
+                obs[i]
+            )));
+        }
         let noise = noise.map(|n| vector("noise", n, self.n_noise)).transpose()?;
         let action = self.with(py, |inner| inner.act(&obs, noise.as_deref()));
         Ok(array(py, &action))

@@ -240,7 +240,7 @@ impl AccelerationLimit {
 }
 
 /// Jerk limits [rad/s³ or m/s³], less `margin`, always soft, with `soft = (linear, quadratic)` weights. They need the tick before: see
-/// `Projector.project(..., previous=target)`.
+/// `previous` of `Projector.project`.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct JerkLimit;
 

@@ -141,7 +141,7 @@ impl Model {
         self.model.total_mass()
     }
 
-    /// Forces the robot file describes that are not part of this model.
+    /// What the robot file describes that is not part of this model: forces, mimic joints.
     #[getter]
     fn notes(&self) -> Vec<String> {
         self.model.notes().to_vec()

@@ -16,6 +16,11 @@ use crate::model::Model;
 use crate::target::{Target, Targets};
 
 /// Projects proposed next states. Safe to share between threads; projections of one object then wait for each other.
+///
+/// `dt`: control period [s]. `controllable`: joints it may move (all). `sub_steps`: how the plant moves within a period: n semi-implicit
+/// Euler steps of a simulator (1, as MuJoCo's Euler with one step a period), or 0 for constant acceleration: a real robot, or Runge-Kutta.
+/// `velocity_weight`: weights of the dofs in the distance (nv, 1 each). `braking`: "certified" or "stored", `consistency`, `solver`: see
+/// docs/LIMITS.md. `deadline`: Clarabel gives up after this time [s].
 #[pyclass(module = "nearl._core", frozen)]
 pub(crate) struct Projector {
     model: Py<Model>,
@@ -99,7 +104,7 @@ impl Projector {
     }
 
     /// The nearest next state to `(q_proposal, v_proposal)` from the state `(q, v)`. `previous`: acceleration and motor force (nv each)
-    /// of the tick before, for limits on their change.
+    /// of the tick before, `(target.acceleration, tau)`: without it, limits on jerk and on the rate of torque do not hold in this tick.
     #[pyo3(signature = (q, v, q_proposal, v_proposal, previous=None))]
     fn project(
         &self,
@@ -126,7 +131,8 @@ impl Projector {
         Target::of(py, target, &self.names)
     }
 
-    /// The same for n rows at once, on `threads` threads (all cores by default). The order of rows does not matter.
+    /// The same for n rows at once, on `threads` threads (all cores by default). The order of rows does not matter. Limits on jerk and on
+    /// the rate of torque are refused: they need the tick before, which a batch does not have.
     #[pyo3(signature = (q, v, q_proposal, v_proposal, threads=None))]
     fn project_batch(
         &self,
@@ -136,6 +142,11 @@ impl Projector {
         v_proposal: &Bound<'_, PyAny>,
         threads: Option<usize>,
     ) -> PyResult<Targets> {
+        if self.with(q.py(), |projector, _| projector.needs_previous()) {
+            return Err(errors::value(
+                "a limit on jerk or on the rate of torque needs the tick before, which a batch does not have; call project(..., previous=(acceleration, torque)) row by row, or switch it off with set_enabled",
+            ));
+        }
         let (batch, n) = self.batch_of(q, v, q_proposal, v_proposal)?;
         let threads = threads_for(threads, n);
         let targets = q.py().detach(|| self.batch(&batch, n, threads)).map_err(errors::value)?;
@@ -264,7 +275,11 @@ impl Projector {
         let model = self.model.get();
         let proposal =
             Proposal { q: model.q("q_proposal", q_proposal)?, v: model.v("v_proposal", v_proposal)? };
-        Ok((model.q("q", q)?, model.v("v", v)?, proposal))
+        let q = model.q("q", q)?;
+        for (name, of) in [("q", &q), ("q_proposal", &proposal.q)] {
+            model.model.check_configuration(of).map_err(|e| errors::value(format!("{name}: {e}")))?;
+        }
+        Ok((q, model.v("v", v)?, proposal))
     }
 
     fn with<R: Send>(
@@ -331,6 +346,12 @@ impl Projector {
             q_proposal: matrix("q_proposal", q_proposal, n, nq)?,
             v_proposal: matrix("v_proposal", v_proposal, n, nv)?,
         };
+        for (name, of) in [("q", &batch.q), ("q_proposal", &batch.q_proposal)] {
+            for (row, of) in of.chunks_exact(nq.max(1)).enumerate() {
+                let checked = self.model.get().model.check_configuration(of);
+                checked.map_err(|e| errors::value(format!("{name}[{row}]: {e}")))?;
+            }
+        }
         Ok((batch, n))
     }
 

@@ -179,9 +179,16 @@ impl Controller {
 
     /// One control tick. The same state, noise and history of ticks since [`Controller::reset`] give the same bits.
     ///
-    /// A state that is not finite is replaced by the last finite one and reported as such.
+    /// A state that is not finite is replaced by the last finite one and reported as such: the action is then what that one asked for,
+    /// and no longer right once the robot has moved on. [`rt`](crate::rt) bridges a few such ticks and then brakes; so should a loop
+    /// of your own. A state of another robot's size is refused, and the action stays as it was.
     pub fn update(&mut self, state: &State, noise: &Noise, out: &mut Output) -> Status {
         let begin = Instant::now();
+        let sizes = |s: &State| [s.q.len(), s.v.len(), s.obs.len()];
+        if sizes(state) != sizes(&self.held) {
+            out.next.ledger.status = Status::Refused(RefuseReason::WrongLength);
+            return out.next.ledger.status;
+        }
         let held = self.hold_last_finite(state);
         self.propose(noise, out);
         self.project(out);
