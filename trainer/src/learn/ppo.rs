@@ -113,7 +113,7 @@ impl Ppo {
         let (value, value_group) = Value::new(&dims, nets, settings.vf_coef, rng);
         set_lanes(&mut actor.p[log_std.clone()], a, settings.log_std);
         let mut aside = rng.clone(); // so that the policy learns the same with any inverse model beside it
-        aside.set_stream(!rng.get_stream());
+        aside.set_stream(rng.get_stream() ^ (1 << 63)); // far from those of environments
         let (inverse, inverse_group) = InverseModel::alone(&dims, nets, &mut aside);
         let groups = vec![actor, value_group, inverse_group];
         let adam = groups.iter().map(|g| Adam::new(g.p.len(), settings.lr)).collect();
