@@ -9,6 +9,7 @@
 
 import os
 import sys
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TextIO
@@ -85,6 +86,7 @@ class PID2:
         if total_timesteps < 1:
             raise ValueError(f"total_timesteps is {total_timesteps}; ask for at least one step")
         callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]
+        save = _Save(self.num_timesteps, total_timesteps)
         bar = _Bar(sys.stderr, self.num_timesteps, total_timesteps) if progress_bar else None
         self._training.extend(int(total_timesteps))
         try:
@@ -92,6 +94,8 @@ class PID2:
                 metrics = self._training.iterate()
                 if bar is not None:
                     bar.show(metrics)
+                if self._run is not None and save.is_due(self.num_timesteps):
+                    self._training.checkpoint()
                 if [c for c in callbacks if c(self, metrics) is False]:
                     break
         finally:
@@ -163,6 +167,20 @@ class PID2:
 
 def _toml(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else f"{value!r}" if isinstance(value, str) else str(value)
+
+
+class _Save:
+    """When ``nearl train`` writes a checkpoint: every tenth of the steps, and every two minutes."""
+
+    def __init__(self, begin: int, steps: int):
+        self._every = max(1, steps // 10)
+        self._next, self._last = begin + self._every, time.monotonic()
+
+    def is_due(self, steps: int) -> bool:
+        if steps < self._next and time.monotonic() - self._last < 120:
+            return False
+        self._next, self._last = steps + self._every, time.monotonic()
+        return True
 
 
 class _Bar:

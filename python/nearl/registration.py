@@ -26,9 +26,11 @@ def register(*task_files: str | os.PathLike[str]) -> list[str]:
     """
     if not task_files:
         return [_register(task, task, MAX_EPISODE_STEPS.get(task, MAX_EPISODE_STEPS_ELSE)) for task, _ in _core.tasks()]
-    ids = []
+    ids, bundled = [], {task for task, _ in _core.tasks()}
     for file in task_files:
         env = _core.Env(os.fspath(file))
+        if env.task in bundled:
+            raise ValueError(f"{os.fspath(file)} [name]: '{env.task}' is a bundled task, whose id it would take; give the file another name")
         gymnasium.registry.pop(f"nearl/{env.task}", None)
         ids.append(_register(env.task, os.path.abspath(file), env.max_episode_steps))
     return ids

@@ -31,7 +31,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
 
     def __init__(
         self,
-        task: str,
+        task: str | os.PathLike[str],
         num_envs: int = 1,
         constraints: str | os.PathLike[str] | None = None,
         seed: int = 0,
@@ -47,6 +47,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; ask for at least one environment")
         threads = threads or os.cpu_count() or 1
+        task = os.fspath(task)
         constraints = None if constraints is None else os.fspath(constraints)
         same_step = mode is AutoresetMode.SAME_STEP
         self._native = _core.VecEnv(task, num_envs, constraints, seed, threads, max_episode_steps, same_step)
@@ -133,7 +134,7 @@ def _add_final(info: dict[str, Any], ended: NDArray[np.bool_], reached: Floats) 
 
 
 def make_vec(
-    task: str,
+    task: str | os.PathLike[str],
     num_envs: int,
     constraints: str | os.PathLike[str] | None = None,
     seed: int = 0,

@@ -124,3 +124,18 @@ def test_a_stopped_run_goes_on_exactly(tmp_path: Path) -> None:
     assert part.num_timesteps == 4096
     part.learn(4096)
     assert part.controller.digest == whole.controller.digest
+
+
+def test_a_run_folder_has_checkpoints_on_the_way(tmp_path) -> None:
+    seen = []
+    agent = nearl.PID2("examples/tasks/cart-pole.toml", algo="ppo", run=tmp_path / "run", threads=1)
+    agent.learn(40_960, callback=lambda *_: seen.append((tmp_path / "run/checkpoints/resume.safetensors").is_file()))
+    assert not seen[0] and any(seen), seen
+
+
+def test_an_observation_that_is_not_finite_is_refused_by_name() -> None:
+    agent = nearl.PID2("examples/tasks/cart-pole.toml", algo="ppo", threads=1)
+    before = agent.predict(np.full(5, 0.1))[0]
+    with pytest.raises(ValueError, match=r"obs\[2\] \('.*'\) is NaN"):
+        agent.predict(np.array([[0.1] * 5, [0.1, 0.1, np.nan, 0.1, 0.1]]))
+    assert (agent.predict(np.full(5, 0.1))[0] == before).all()

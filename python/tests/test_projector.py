@@ -218,3 +218,31 @@ def test_nothing_finite_comes_back_as_anything_else(model) -> None:
     lost = projector.project(np.full(model.nq, np.nan), zero, q, zero)
     assert lost.status == "refused" and np.isfinite(lost.q).all() and not lost.is_ok
     assert projector.project(q, zero, q, zero).status == "unchanged", "nothing of it stays behind"
+
+
+def test_what_is_outside_is_named_and_what_is_no_configuration_is_refused() -> None:
+    panda = nearl.Model.from_urdf("examples/robots/panda/panda.urdf")
+    q, zero = np.array([0, 0, 0, -1.5, 0, 1.5, 0]), np.zeros(7)
+    row = nearl.RowLimit(panda, "elbow", {"q.panda_joint4": 1.0}, upper=-2.0, braking=2.0)
+    limits = [nearl.AccelerationLimit(panda, 10.0), nearl.VelocityLimit(panda, {"panda_joint1": 1.0})]
+    target = nearl.Projector(panda, [*limits, row], 1e-3).project(q, zero, q, zero)
+    assert (target.status, target.outside) == ("recovering", ["elbow"]) and "outside" in target.reason
+    fast = nearl.Projector(panda, limits, 1e-3)
+    v = np.zeros(7)
+    for _ in range(1000):
+        target = fast.project(q, v, q + 1.0, np.full(7, 9.0))
+        q, v = target.q, target.v
+    assert v[0] == 1.0 and (np.abs(v[1:]) <= panda.velocity_limit[1:]).all(), "joints without a number keep the file's"
+    with pytest.raises(ValueError, match="has no braking|no braking"):
+        nearl.RowLimit(panda, "elbow", {"q.panda_joint4": 1.0}, upper=-2.0)
+    solo = nearl.Model.from_urdf("examples/robots/solo12/solo12.urdf", free_flyer=True)
+    projector = nearl.Projector(solo, [nearl.AccelerationLimit(solo, 10.0)], 1e-3, controllable=list(solo.joint_names[1:]))
+    good, still = solo.neutral(), np.zeros(solo.nv)
+    bad = good.copy()
+    bad[3:7] = 0
+    assert projector.project(good, still, good, still).is_ok
+    with pytest.raises(ValueError, match="q: quaternion of joint 'root_joint' has length 0, not 1"):
+        projector.project(bad, still, good, still)
+    jerk = nearl.Projector(panda, [limits[0], nearl.JerkLimit(panda, 100.0)], 1e-3)
+    with pytest.raises(ValueError, match="needs the tick before"):
+        jerk.project_batch(q[None], zero[None], q[None], zero[None])

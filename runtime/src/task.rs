@@ -209,6 +209,13 @@ impl Task {
         let refuse = |key: &str, reason: String| {
             Err(TaskError::Invalid { file: file.into(), place: format!(" [{key}]"), reason })
         };
+        let is_path = self.name.contains(['/', '\\']) || matches!(self.name.trim(), "" | "." | "..");
+        if is_path {
+            return refuse(
+                "name",
+                format!("'{}' must name a folder of runs; write it without '/' and '\\'", self.name),
+            );
+        }
         let t = &self.time;
         if !(t.dt.is_finite() && t.dt > 0.0) {
             return refuse(

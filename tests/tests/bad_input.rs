@@ -96,8 +96,14 @@ const FILES: &[(&str, &str, &str, &[&str])] = &[
     (
         "Panda-reach",
         "name = \"Panda-reach\"",
-        "name = \"Panda-rech\"",
-        &["Panda-rech", "did you mean 'Panda-reach'"],
+        "name = \"../escape\"\nenv = \"Panda-reach\"",
+        &["t.toml [name]", "'../escape'", "without '/'"],
+    ),
+    (
+        "Panda-reach",
+        "[state]",
+        "[state]\ncontrollable = []",
+        &["no joint is controllable", "'position' would hold for none", "state.controllable"],
     ),
 ];
 
@@ -113,6 +119,45 @@ fn a_bad_task_file_is_refused_with_file_line_and_key() {
     assert_refused(folder.path(), &["project", "missing.toml"], b"", &["missing.toml", "No such file"]);
     std::fs::create_dir(folder.path().join("folder.toml")).expect("folder");
     assert_refused(folder.path(), &["project", "folder.toml"], b"", &["folder.toml", "directory"]);
+}
+
+/// Without an environment there is nothing to train on, but a robot and limits are enough to project.
+#[test]
+fn an_environment_is_needed_to_train_and_its_robot_is_its_own() {
+    let folder = folder();
+    let write = |from: &str, to: &str| {
+        std::fs::write(folder.path().join("t.toml"), changed("Panda-reach", from, to)).expect("task file");
+    };
+    write("name = \"Panda-reach\"", "name = \"Panda-rech\"");
+    assert_refused(folder.path(), &["train", "t.toml"], b"", &["Panda-rech", "did you mean 'Panda-reach'"]);
+    let line = br#"{"q":[0,0,0,-1.5,0,1.5,0],"v":[0,0,0,0,0,0,0],"q_proposal":[9,0,0,-1.5,0,1.5,0],"v_proposal":[0,0,0,0,0,0,0]}"#;
+    let (code, alone, error) = nearl(folder.path(), &["project", "t.toml"], line);
+    assert_eq!(code, Some(0), "{error}");
+    write("", "");
+    let (_, with, _) = nearl(folder.path(), &["project", "t.toml"], line);
+    let target = |text: &str| {
+        let line: serde_json::Value = serde_json::from_str(text).expect("JSON");
+        (line["q"].clone(), line["v"].clone(), line["active"].clone())
+    };
+    assert_eq!(target(&alone), target(&with));
+
+    let robot =
+        std::fs::read_to_string(repository().join("examples/robots/panda/panda.urdf")).expect("robot");
+    let heavy = robot.replace("<mass value=\"", "<mass value=\"1");
+    assert_ne!(heavy, robot);
+    std::fs::write(folder.path().join("heavy.urdf"), heavy).expect("robot");
+    write("panda.urdf", "heavy.urdf");
+    let says = ["t.toml", "[model]", "'heavy.urdf' differs in its masses", "[reward]"];
+    assert_refused(folder.path(), &["train", "t.toml"], b"", &says[1..]);
+    write("urdf = \"panda.urdf\"", "urdf = \"ur5.urdf\"");
+    let ur5 = repository().join("examples/robots/ur5/ur5.urdf");
+    std::fs::copy(ur5, folder.path().join("ur5.urdf")).expect("robot");
+    assert_refused(
+        folder.path(),
+        &["plant", "t.toml", "--name", "ur"],
+        b"",
+        &["differs in its joints", "shoulder_pan_joint"],
+    );
 }
 
 /// The file above is good where it is not changed: without this, every refusal could have another cause.
@@ -142,6 +187,10 @@ const COMMANDS: &[(&[&str], &[&str])] = &[
     ),
     (&["train", "Hopper-v5", "--set", "train.n_envs=0"], &["train.n_envs", "at least 1"]),
     (&["train", "Hopper-v5", "--set", "train.gamma=1.5"], &["train.gamma", "1.5", "[0, 1]"]),
+    (
+        &["train", "Hopper-v5", "--set", "train.ppo.clip_range=-0.2"],
+        &["train.ppo.clip_range", "-0.2", "above 0"],
+    ),
     (&["train", "Hopper-v5", "--set", "nonsense"], &["--set nonsense", "key=value"]),
     (&["train", "Hopper-v5", "--set", "=3"], &["--set =3", "the key is empty"]),
     (&["train", "Hopper-v5", "--set", "time.dt.x=3"], &["--set time.dt.x=3", "'dt' is a value"]),

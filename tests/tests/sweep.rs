@@ -12,6 +12,10 @@ use nearl_runtime::Snapshot;
 const STEPS: &str = "4096";
 
 fn sweep(out: &Path, more: &[&str]) -> Output {
+    sweep_of(STEPS, out, more)
+}
+
+fn sweep_of(steps: &str, out: &Path, more: &[&str]) -> Output {
     let cart_pole = repository().join("examples/tasks/cart-pole.toml");
     let tasks = format!("{},Hopper-v5", cart_pole.display());
     let mut command = Command::new(program("nearl"));
@@ -24,7 +28,7 @@ fn sweep(out: &Path, more: &[&str]) -> Output {
         "--seeds",
         "0-1",
         "--steps",
-        STEPS,
+        steps,
         "--jobs",
         "3",
     ]);
@@ -104,6 +108,27 @@ fn a_sweep_finishes_what_is_not_finished() {
     let other = sweep(&out, &["--set", "train.gamma=0.9"]);
     assert_eq!(other.status.code(), Some(1));
     assert!(text(&other.stderr).contains("holds a run of another task file"), "{}", text(&other.stderr));
+    let longer = sweep_of("20000", &out, &[]);
+    let words = text(&longer.stderr);
+    assert_eq!(longer.status.code(), Some(1));
+    assert!(words.contains("of them done, where 20000 are asked for"), "{words}");
+    assert_eq!(digest(&out.join("cart-pole/ppo_0")), before, "nothing is removed");
+
+    let strange = out.join("cart-pole/ppo_1");
+    std::fs::rename(&strange, out.join("kept")).expect("move");
+    std::fs::create_dir(&strange).expect("folder");
+    std::fs::write(strange.join("notes.md"), "mine").expect("notes");
+    let refused = sweep(&out, &[]);
+    let words = text(&refused.stderr);
+    assert!(words.contains("ppo_1' holds no run: it has no task.toml"), "{words}");
+    assert_eq!(std::fs::read_to_string(strange.join("notes.md")).ok().as_deref(), Some("mine"));
+
+    std::fs::remove_dir_all(&strange).expect("remove");
+    std::fs::rename(out.join("kept"), &strange).expect("move back");
+    let held = std::fs::File::open(&strange).expect("folder");
+    held.lock().expect("lock");
+    let busy = sweep(&out, &[]);
+    assert!(text(&busy.stderr).contains("another training is at work in"), "{}", text(&busy.stderr));
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use nearl_trainer::env::{self, Env};
 use nearl_trainer::rollout::stream;
-use nearl_trainer::train::{Request, Training, complete};
+use nearl_trainer::train::{Request, Training, complete, train};
 use nearl_trainer::{evaluate, tasks};
 use rand::RngExt;
 
@@ -136,6 +136,23 @@ fn mistakes_are_named_with_file_and_key() {
     .expect("task");
     let message = tasks::load(&file.display().to_string(), &[]).map(|_| ()).map_err(|e| e.to_string());
     assert!(message.is_err_and(|m| m.contains("[termination]: only a task with its own [reward]")));
+}
+
+/// A reward that leaves its domain ends the training instead of spoiling it, and what was learned stays.
+#[test]
+fn a_reward_that_is_no_number_ends_the_training() {
+    let text = std::fs::read_to_string(example("cart-pole.toml")).expect("example");
+    let folder = tempfile::tempdir().expect("folder");
+    std::fs::copy(example("cart-pole.xml"), folder.path().join("cart-pole.xml")).expect("robot");
+    let (file, run) = (folder.path().join("mine.toml"), folder.path().join("run"));
+    let odd = "[reward]\nodd = \"0.0 * log(q.slider + 0.5)\"";
+    std::fs::write(&file, text.replacen("[reward]", odd, 1)).expect("task");
+    let mut manifest = tasks::load(&file.display().to_string(), &[]).expect("task");
+    complete(&mut manifest).expect("environment");
+    let request = Request { manifest, algo: "ppo".into(), steps: 100_000, seed: 0, threads: 1 };
+    let error = train(&request, &run, |_, _| true).expect_err("a reward of NaN").to_string();
+    assert!(error.contains("a reward of 'cart-pole' came out as NaN after"), "{error}");
+    assert!(run.join("checkpoints/latest.safetensors").is_file());
 }
 
 #[test]

@@ -17,6 +17,14 @@ use clap::{Parser, Subcommand};
 pub use nearl_runtime::cli::Failure;
 pub(crate) use nearl_runtime::cli::say;
 
+/// What is said of control periods with a [`Fault`](crate::env::Fault).
+fn unstable(periods: u64) -> String {
+    format!(
+        "{periods} control periods could not be simulated (the state blew up): each ended its episode with the reward 0; look at masses, gears, \
+         actuator ranges and the physics step"
+    )
+}
+
 /// Let a learned policy move a robot without ever breaking its limits.
 #[derive(Parser)]
 #[command(name = "nearl", version, about, propagate_version = true)]

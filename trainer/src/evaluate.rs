@@ -25,6 +25,8 @@ pub struct Evaluation {
     pub target_violations: u64,
     /// Ticks whose state, as the simulator has it afterwards, broke a position or velocity limit.
     pub reached_violations: u64,
+    /// Control periods that could not be simulated: each ended its episode with the reward 0.
+    pub faults: u64,
     /// Mean over ticks and controllable entries of |reached - target|, in standard deviations of change.
     pub residual: f64,
 }
@@ -64,6 +66,7 @@ pub fn evaluate(
         recovering: 0,
         target_violations: 0,
         reached_violations: 0,
+        faults: 0,
         residual: 0.0,
     };
     for _ in 0..episodes {
@@ -77,6 +80,7 @@ pub fn evaluate(
         e.recovering += t.recovering;
         e.target_violations += t.projected_violations;
         e.reached_violations += t.reached_violations;
+        e.faults += t.faults;
         e.residual += t.residual;
     }
     e.residual /= e.ticks.max(1) as f64;

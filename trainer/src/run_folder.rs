@@ -25,6 +25,12 @@ pub enum RunError {
         /// One sentence.
         reason: String,
     },
+    /// A training is at work there.
+    #[error("another training is at work in '{path}'; wait for it or give another folder with --out")]
+    Busy {
+        /// Folder.
+        path: String,
+    },
     /// A run is already there.
     #[error(
         "'{path}' already holds a run; go on with --resume, give another folder with --out, or remove it"
@@ -41,6 +47,21 @@ pub enum RunError {
         /// What is missing.
         reason: String,
     },
+}
+
+/// Holds a run folder until the file is dropped: two trainings would mix their rows.
+///
+/// # Errors
+/// [`RunError::Busy`]; [`RunError::Write`] when it cannot be opened.
+pub fn lock(path: &Path) -> Result<File, RunError> {
+    let write =
+        |e: std::io::Error| RunError::Write { path: path.display().to_string(), reason: e.to_string() };
+    let folder = File::open(path).map_err(write)?;
+    match folder.try_lock() {
+        Ok(()) => Ok(folder),
+        Err(std::fs::TryLockError::WouldBlock) => Err(RunError::Busy { path: path.display().to_string() }),
+        Err(std::fs::TryLockError::Error(e)) => Err(write(e)),
+    }
 }
 
 /// Writes one training to disk.

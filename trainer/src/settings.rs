@@ -103,6 +103,7 @@ impl TrainSettings {
                 return Err(format!("[train.{key}]: {v} is outside [0, 1]"));
             }
         }
+        settings.check_learners()?;
         if !(settings.moved_penalty.is_finite() && settings.moved_penalty >= 0.0) {
             return Err(format!(
                 "[train.moved_penalty]: {} would reward being moved; give 0 or a positive number",
@@ -111,5 +112,67 @@ impl TrainSettings {
         }
         settings.nets.check()?;
         Ok(settings)
+    }
+
+    /// Numbers with which no learner learns.
+    fn check_learners(&self) -> Result<(), String> {
+        let (ppo, pid2, nearl) = (&self.ppo, &self.pid2, &self.nearl);
+        if ppo.n_epochs == 0 {
+            return Err("[train.ppo.n_epochs]: 0 learns nothing; give at least 1".into());
+        }
+        let above = |x: f64| x > 0.0 && x.is_finite();
+        let at_least = |x: f64| x >= 0.0 && x.is_finite();
+        let norm = |x: f64| x > 0.0;
+        type Domain = (fn(f64) -> bool, &'static str);
+        let (positive, not_negative): (Domain, Domain) = ((above, "above 0"), (at_least, "at least 0"));
+        let single = f64::from;
+        for (key, value, (allowed, domain)) in [
+            ("ppo.lr", single(ppo.lr), positive),
+            ("ppo.clip_range", single(ppo.clip_range), positive),
+            ("ppo.vf_coef", single(ppo.vf_coef), not_negative),
+            ("ppo.ent_coef", single(ppo.ent_coef), not_negative),
+            ("ppo.max_grad_norm", single(ppo.max_grad_norm), (norm, "above 0, or inf for none")),
+            ("ppo.log_std", single(ppo.log_std), (f64::is_finite as fn(f64) -> bool, "finite")),
+            ("pid2.idm_threshold", pid2.idm_threshold, not_negative),
+            ("pid2.idm_lr", single(pid2.idm_lr), positive),
+            ("pid2.discriminator_lr", single(pid2.discriminator_lr), positive),
+            ("pid2.generator_weight", single(pid2.generator_weight), not_negative),
+            ("pid2.i_c", single(pid2.i_c), not_negative),
+            ("pid2.beta", single(pid2.beta), not_negative),
+            ("pid2.alpha", single(pid2.alpha), not_negative),
+            ("nearl.policy_lr", single(nearl.policy_lr), not_negative),
+            ("nearl.idm_threshold", nearl.idm_threshold, not_negative),
+            ("nearl.idm_lr", single(nearl.idm_lr), positive),
+        ] {
+            if !allowed(value) {
+                return Err(format!("[train.{key}]: {value} is not {domain}; correct it"));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_with_which_nothing_learns_are_refused_by_name() {
+        let read = |text: &str| TrainSettings::read(&toml::from_str(text).unwrap());
+        for (text, words) in [
+            ("ppo.clip_range = -0.2", "[train.ppo.clip_range]: -0.2"),
+            ("ppo.lr = nan", "[train.ppo.lr]: NaN is not above 0"),
+            ("ppo.n_epochs = 0", "[train.ppo.n_epochs]: 0 learns nothing"),
+            ("ppo.max_grad_norm = -1.0", "[train.ppo.max_grad_norm]"),
+            ("ppo.log_std = nan", "[train.ppo.log_std]"),
+            ("pid2.generator_weight = -5.0", "[train.pid2.generator_weight]: -5 is not at least 0"),
+            ("pid2.beta = nan", "[train.pid2.beta]"),
+            ("nearl.idm_lr = -1.0", "[train.nearl.idm_lr]"),
+        ] {
+            let refused = read(text).unwrap_err();
+            assert!(refused.contains(words), "{refused}");
+        }
+        assert!(read("ppo.max_grad_norm = inf").is_ok(), "no clipping");
+        assert!(read("pid2 = { generator_weight = 0.0, idm_threshold = 0.0 }").is_ok());
     }
 }

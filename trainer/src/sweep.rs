@@ -1,7 +1,8 @@
 //! `nearl sweep`: tasks x algorithms x seeds, one worker process a run, as many at a time as there are cores.
 //!
 //! A run lies in `<out>/<task>/<algo>_<seed>`. One that is finished with the same task file and steps is left alone, one that
-//! was broken off goes on from its checkpoint, or is begun anew where it has none.
+//! was broken off goes on from its checkpoint, or is begun anew where it has none. Whatever else is there is refused before
+//! anything starts, and nothing is ever removed but the metrics of a run that never reached a checkpoint.
 
 mod summary;
 mod worker;
@@ -9,10 +10,8 @@ mod worker;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use nearl_runtime::Snapshot;
-
 use crate::checkpoint::{self, Checkpoint};
-use crate::run_folder::snapshot_of;
+use crate::run_folder::{self, RunError, snapshot_of};
 use crate::tasks::{self, TaskLoadError};
 use crate::train::{ALGORITHMS, TrainError, complete};
 
@@ -58,7 +57,7 @@ pub struct Run {
 pub enum Found {
     /// Nothing.
     Nothing,
-    /// A run that was broken off before its first checkpoint, or was started for another number of steps.
+    /// A run that was broken off before its first checkpoint.
     Broken,
     /// A run that was broken off and can go on.
     Resumable,
@@ -81,14 +80,17 @@ pub enum SweepError {
     /// A list with nothing in it, or with something twice.
     #[error("{0}")]
     List(String),
-    /// A finished run of something else.
-    #[error("'{path}' holds a run of another {what}; give another --out, or remove it")]
+    /// Something else is where a run should lie.
+    #[error("'{path}' holds {what}; give another --out, or move it away")]
     Other {
         /// Run folder.
         path: String,
-        /// What differs.
+        /// What is there.
         what: String,
     },
+    /// The run folder itself.
+    #[error(transparent)]
+    Folder(#[from] RunError),
     /// The folder.
     #[error("cannot write '{path}': {reason}; give another folder with --out")]
     Write {
@@ -159,25 +161,32 @@ impl Sweep {
         if !folder.exists() {
             return Ok(Found::Nothing);
         }
-        let other =
-            |what: &str| Err(SweepError::Other { path: folder.display().to_string(), what: what.into() });
+        drop(run_folder::lock(folder)?);
+        let other = |what: String| Err(SweepError::Other { path: folder.display().to_string(), what });
         match std::fs::read_to_string(folder.join("task.toml")) {
-            Ok(text) if text != task => return other("task file"),
+            Ok(text) if text != task => return other("a run of another task file".into()),
             Ok(_) => {}
-            Err(_) => return Ok(Found::Broken),
+            Err(_) if is_empty(folder) => return Ok(Found::Nothing),
+            Err(_) => return other("no run: it has no task.toml".into()),
         }
-        let snapshot = snapshot_of(folder).ok().and_then(|file| Snapshot::load(&file).ok());
-        let finished = folder.join("checkpoints/final.safetensors").is_file();
-        match snapshot {
-            Some(s) if finished && s.manifest.steps >= self.steps => Ok(Found::Finished),
-            _ if self.resumable(folder) => Ok(Found::Resumable),
-            _ => Ok(Found::Broken),
+        let checkpoint = checkpoint::path_in(folder);
+        if !checkpoint.exists() && snapshot_of(folder).is_err() {
+            return Ok(Found::Broken);
         }
-    }
-
-    /// Whether going on gives what an uninterrupted run of these steps would: the learning rate's schedule depends on them.
-    fn resumable(&self, folder: &Path) -> bool {
-        Checkpoint::load(&checkpoint::path_in(folder)).is_ok_and(|c| c.header.total == self.steps)
+        let file = checkpoint.display().to_string();
+        let Ok(Checkpoint { header, .. }) = Checkpoint::load(&checkpoint) else {
+            return other(format!("a run whose checkpoint '{file}' cannot be read"));
+        };
+        // The learning rate's schedule depends on the steps, so that a run of others is another run.
+        let (done, total) = (header.manifest.steps, header.total);
+        if total != self.steps {
+            return other(format!(
+                "a run of {total} steps, {done} of them done, where {} are asked for",
+                self.steps
+            ));
+        }
+        let is_whole = folder.join("checkpoints/final.safetensors").is_file();
+        Ok(if done >= total && is_whole { Found::Finished } else { Found::Resumable })
     }
 
     /// Holds the folder until the file is dropped.
@@ -198,4 +207,14 @@ impl Sweep {
             Err(std::fs::TryLockError::Error(e)) => Err(write(e)),
         }
     }
+}
+
+/// Nothing in it but what a run makes before its task file.
+fn is_empty(folder: &Path) -> bool {
+    let inside =
+        |at: &Path| std::fs::read_dir(at).map(|d| d.flatten().map(|e| e.file_name()).collect::<Vec<_>>());
+    let names = inside(folder).unwrap_or_default();
+    names.iter().all(|n| n == "checkpoints")
+        && inside(&folder.join("checkpoints")).is_ok_and(|n| n.is_empty())
+        || names.is_empty()
 }

@@ -15,7 +15,7 @@ pub use source::{Experience, Source, SourceError};
 
 use crate::checkpoint::CheckpointError;
 use crate::learn::{Batch, Dims, Learner, Metrics, advantages};
-use crate::rollout::{RolloutError, Segment, Tally, stream};
+use crate::rollout::{Collected, RolloutError, Segment, Tally, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
@@ -206,6 +206,14 @@ impl Training {
     pub fn step(&mut self) -> Result<Option<Progress>, TrainError> {
         if !self.source.collect(&self.snapshot)? {
             return Ok(None);
+        }
+        let bad = |g: &&Collected| g.segment.reward.iter().find(|r| !r.is_finite()).copied();
+        if let Some(reward) = self.source.gathered().iter().find_map(bad) {
+            let (task, steps) = (&self.snapshot.manifest.task.name, self.snapshot.manifest.steps);
+            return Err(TrainError::Settings(format!(
+                "a reward of '{task}' came out as {reward} after {steps} steps, and nothing can be learned from it; look for a logarithm, root or \
+                 quotient in [reward] that leaves its domain"
+            )));
         }
         let mut tally = Tally::default();
         self.source.gathered().iter().for_each(|g| tally.add(&g.tally));

@@ -28,6 +28,13 @@ impl Projector {
         let nv = model.nv();
         settings.validate(model)?;
         let dofs = Dofs::new(model, controllable, settings.consistency)?;
+        if let (Some(limit), true) = (limits.first(), dofs.controllable.is_empty()) {
+            let what = format!("no joint is controllable, so that '{}' would hold for none", limit.label());
+            return Err(LimitError::Unusable {
+                what,
+                next: "name the joints in state.controllable, or drop the limits",
+            });
+        }
         let switches = switches(model, limits, &dofs.controllable)?;
         let (each, limits) = (limits, LimitSet::collect(model, limits, &dofs.controllable)?);
         check_combination(model, &limits, &dofs, (settings.consistency, settings.braking))?;

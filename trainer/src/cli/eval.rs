@@ -1,6 +1,6 @@
 //! `nearl eval`.
 
-use super::{Failure, say};
+use super::{Failure, say, unstable};
 use crate::evaluate::evaluate;
 use crate::run_folder;
 use clap::Args;
@@ -61,6 +61,9 @@ impl Eval {
                 percent(e.recovering),
                 e.residual
             ));
+        }
+        for e in results.iter().filter(|e| e.faults > 0) {
+            say(format!("{}: {}", e.mode, unstable(e.faults)));
         }
         Ok(())
     }

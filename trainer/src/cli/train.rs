@@ -1,6 +1,6 @@
 //! `nearl train`.
 
-use super::{Failure, cores, say};
+use super::{Failure, cores, say, unstable};
 use crate::checkpoint::{self, Checkpoint};
 use crate::train::{Experience, Progress, Request, resume_on, train_on};
 use crate::{run_folder, tasks};
@@ -66,6 +66,7 @@ struct Run {
     name: String,
     algo: String,
     steps: u64,
+    done: u64,
 }
 
 impl Run {
@@ -80,7 +81,8 @@ impl Run {
             )
             .into());
         }
-        Ok(Self { name, algo: header.manifest.algo, steps: steps.unwrap_or(header.total) })
+        let (algo, done) = (header.manifest.algo, header.manifest.steps);
+        Ok(Self { name, algo, steps: steps.unwrap_or(header.total), done })
     }
 }
 
@@ -94,6 +96,7 @@ impl Train {
                 name: manifest.task.name.clone(),
                 algo: self.algo.clone(),
                 steps: self.steps.unwrap_or(STEPS),
+                done: 0,
             },
         };
         let out = self
@@ -114,9 +117,10 @@ impl Train {
             (None, None) => Experience::Here,
         };
         let bar = bar(self.json, run.steps);
-        let mut last = None;
+        let (mut last, mut faults) = (None, 0);
         let report = |p: &Progress, _| {
             show(&bar, self.json, p);
+            faults += p.tally.faults;
             last = Some((p.steps, p.seconds, p.return_mean));
             !stop.load(Ordering::Relaxed)
         };
@@ -129,12 +133,20 @@ impl Train {
             }
         };
         bar.finish_and_clear();
+        if faults > 0 {
+            eprintln!("nearl: {}", unstable(faults));
+        }
         let Some((steps, seconds, mean)) = last else {
             if stop.load(Ordering::Relaxed) {
                 say(format!("stopped by a signal before the first batch; run folder {}", out.display()));
                 return Ok(());
             }
-            say(format!("{} has its {} steps already; give more with --steps", out.display(), run.steps));
+            let done = run.done;
+            say(format!(
+                "{} has {done} of {} steps already; give more with --steps",
+                out.display(),
+                run.steps
+            ));
             return Ok(());
         };
         if self.json {

@@ -78,11 +78,16 @@ pub fn run(
     }
 }
 
-/// Starts `nearl train` on one thread. A run without a checkpoint is removed first: its folder was written by an earlier sweep.
+/// Starts `nearl train` on one thread. Of a run without a checkpoint, which has nothing to go on from, the metrics are removed first.
 fn start(sweep: &Sweep, run: &Run) -> Result<Child, String> {
     if run.found == Found::Broken {
-        std::fs::remove_dir_all(&run.folder)
-            .map_err(|e| format!("cannot remove '{}': {e}", run.folder.display()))?;
+        let metrics = run.folder.join("metrics.csv");
+        match std::fs::remove_file(&metrics) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                return Err(format!("cannot remove '{}': {e}", metrics.display()));
+            }
+            _ => {}
+        }
     }
     let program = std::env::current_exe().map_err(|e| format!("cannot find this program: {e}"))?;
     let mut command = Command::new(program);

@@ -2,7 +2,7 @@
 
 use super::{COLUMNS, Experience, Progress, Request, TrainError, Training};
 use crate::checkpoint::{self, Checkpoint};
-use crate::run_folder::RunFolder;
+use crate::run_folder::{self, RunFolder};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -33,6 +33,7 @@ pub fn train_on(
 ) -> Result<PathBuf, TrainError> {
     let training = Training::on(request, experience)?;
     let folder = RunFolder::create(out, &training.snapshot().manifest, request.seed, COLUMNS)?;
+    let _held = run_folder::lock(out)?;
     run(training, folder, report)
 }
 
@@ -62,9 +63,20 @@ pub fn resume_on(
     threads: usize,
     report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
+    let _held = path.is_dir().then(|| run_folder::lock(path)).transpose()?;
     let file = checkpoint::path_in(path);
     let training = Training::resume_on(Checkpoint::load(&file)?, &file, experience, steps, threads)?;
     let manifest = &training.snapshot().manifest;
+    if let Some(asked) = steps.filter(|asked| *asked < manifest.steps) {
+        return Err(TrainError::Settings(format!(
+            "--steps: {asked}, but '{}' has {} steps already; give the steps of the whole run, or leave it out",
+            path.display(),
+            manifest.steps
+        )));
+    }
+    if let (true, Ok(snapshot)) = (training.is_done(), run_folder::snapshot_of(path)) {
+        return Ok(snapshot);
+    }
     let folder = RunFolder::reopen(path, COLUMNS, manifest.steps, manifest.version)?;
     run(training, folder, report)
 }
