@@ -16,7 +16,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::ops::Range;
 use std::sync::RwLock;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 /// Rows computed at a time by one thread.
 pub const TILE: usize = 32;
@@ -125,20 +125,43 @@ impl PhaseReport {
 struct Barrier {
     threads: usize,
     arrived: AtomicUsize,
+    alarm: Alarm,
 }
 
 impl Barrier {
     fn wait(&self, round: usize) {
         self.arrived.fetch_add(1, Ordering::AcqRel);
-        wait_until(|| self.arrived.load(Ordering::Acquire) >= self.threads * round);
+        self.alarm.wait_until(|| self.arrived.load(Ordering::Acquire) >= self.threads * round);
     }
 }
 
-fn wait_until(ready: impl Fn() -> bool) {
-    let mut spins = 0u32;
-    while !ready() {
-        spins += 1;
-        if spins < 4000 { std::hint::spin_loop() } else { std::thread::yield_now() }
+/// Tells the threads that wait for each other when one of them panicked, so that none waits forever.
+#[derive(Default)]
+struct Alarm(AtomicBool);
+
+/// Raises the alarm if its thread panics.
+struct Watch<'a>(&'a Alarm);
+
+impl Drop for Watch<'_> {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            self.0.0.store(true, Ordering::Release);
+        }
+    }
+}
+
+impl Alarm {
+    fn watch(&self) -> Watch<'_> {
+        Watch(self)
+    }
+
+    fn wait_until(&self, ready: impl Fn() -> bool) {
+        let mut spins = 0u32;
+        while !ready() {
+            assert!(!self.0.load(Ordering::Acquire), "another thread of the learner panicked");
+            spins += 1;
+            if spins < 4000 { std::hint::spin_loop() } else { std::thread::yield_now() }
+        }
     }
 }
 
@@ -175,7 +198,7 @@ pub fn optimise<P: Phases>(
         threads,
         // two buffers a shard: one barrier an optimiser step
         gradients: (0..shards).map(|_| std::array::from_fn(|_| RwLock::new(vec![ZERO; longest]))).collect(),
-        barrier: Barrier { threads, arrived: AtomicUsize::new(0) },
+        barrier: Barrier { threads, arrived: AtomicUsize::new(0), alarm: Alarm::default() },
     };
     if shards == 1
         && schedule.threads > 1
@@ -214,6 +237,7 @@ struct Run<'a, P: Phases> {
 
 impl<P: Phases> Run<'_, P> {
     fn worker(&self, thread: usize, params: &mut Params) -> Vec<PhaseReport> {
+        let _watch = self.barrier.alarm.watch();
         let mut work = self.algorithm.work();
         let (mut sums, mut reports, mut round) = (self.sums(params), self.reports(), 0);
         for idx in self.minibatches() {

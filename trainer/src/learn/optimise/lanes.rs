@@ -4,7 +4,7 @@
 //! minibatch; where gradients of both are clipped together, each tells the other the square of its length. Both do exactly
 //! what one thread does in turn, to the bit.
 
-use super::{Group, Params, PhaseReport, Phases, Run, moments, wait_until};
+use super::{Alarm, Group, Params, PhaseReport, Phases, Run, moments};
 use nearl_runtime::net::kernel::V;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -25,15 +25,15 @@ impl Trail {
         Self { slots, written: AtomicUsize::new(0), read: AtomicUsize::new(0) }
     }
 
-    fn write(&self, step: usize, group: &Group) {
-        wait_until(|| self.read.load(Ordering::Acquire) + AHEAD > step);
+    fn write(&self, step: usize, group: &Group, alarm: &Alarm) {
+        alarm.wait_until(|| self.read.load(Ordering::Acquire) + AHEAD > step);
         let mut slot = self.slots[step % AHEAD].lock().unwrap_or_else(PoisonError::into_inner);
         copy(&mut slot, group);
         self.written.store(step + 1, Ordering::Release);
     }
 
-    fn read(&self, step: usize, group: &mut Group) {
-        wait_until(|| self.written.load(Ordering::Acquire) > step);
+    fn read(&self, step: usize, group: &mut Group, alarm: &Alarm) {
+        alarm.wait_until(|| self.written.load(Ordering::Acquire) > step);
         // the slot is written anew before it is read again
         std::mem::swap(group, &mut self.slots[step % AHEAD].lock().unwrap_or_else(PoisonError::into_inner));
         self.read.store(step + 1, Ordering::Release);
@@ -59,9 +59,9 @@ impl Lengths {
     }
 
     /// What the other lane tells of this minibatch.
-    fn ask(&self, lane: usize, step: usize) -> f32 {
+    fn ask(&self, lane: usize, step: usize, alarm: &Alarm) -> f32 {
         let slot = &self.slots[1 - lane][step % 2];
-        wait_until(|| slot.load(Ordering::Acquire) >> 32 == step as u64 + 1);
+        alarm.wait_until(|| slot.load(Ordering::Acquire) >> 32 == step as u64 + 1);
         f32::from_bits(slot.load(Ordering::Acquire) as u32)
     }
 }
@@ -78,19 +78,19 @@ impl<P: Phases> Run<'_, P> {
     /// The lanes on two threads; what each phase reported, in their order.
     pub(super) fn side_by_side(&self, params: &mut Params, lanes: [Vec<usize>; 2]) -> Vec<PhaseReport> {
         let trail = self.algorithm.read_across().map(|group| (group, Trail::new(&params.groups[group])));
-        let lengths = Lengths::default();
+        let (lengths, alarm) = (Lengths::default(), &self.barrier.alarm);
         let mut theirs = params.clone();
         let (mut reports, others) = std::thread::scope(|scope| {
             let other = scope.spawn(|| {
                 self.lane(1, &lanes[1], &lengths, &mut theirs, |step, params| {
                     if let Some((group, trail)) = &trail {
-                        trail.write(step, &params.groups[*group]);
+                        trail.write(step, &params.groups[*group], alarm);
                     }
                 })
             });
             let reports = self.lane(0, &lanes[0], &lengths, params, |step, params| {
                 if let Some((group, trail)) = &trail {
-                    trail.read(step, &mut params.groups[*group]);
+                    trail.read(step, &mut params.groups[*group], alarm);
                 }
             });
             (reports, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
@@ -115,6 +115,7 @@ impl<P: Phases> Run<'_, P> {
         params: &mut Params,
         before: impl Fn(usize, &mut Params),
     ) -> Vec<PhaseReport> {
+        let _watch = self.barrier.alarm.watch();
         let mut work = self.algorithm.work();
         let mut lane = Lane { index, lengths, sums: self.sums(params), reports: self.reports(), held: None };
         for (step, idx) in self.minibatches().enumerate() {
@@ -157,7 +158,7 @@ impl Lane<'_> {
     /// Steps the phase that waits; as late as possible, so that the other lane has had time.
     fn release<P: Phases>(&mut self, run: &Run<'_, P>, step: usize, params: &mut Params) {
         if let Some((k, square)) = self.held.take() {
-            let length = (square + self.lengths.ask(self.index, step)).sqrt();
+            let length = (square + self.lengths.ask(self.index, step, &run.barrier.alarm)).sqrt();
             run.step(k, length, &self.sums[k], params, &mut self.reports[k]);
         }
     }
@@ -212,6 +213,18 @@ mod tests {
         let mut bits: Vec<u32> = all.flat_map(|v| v.0.map(f32::to_bits)).collect();
         bits.push(params.beta.to_bits());
         (bits, reports)
+    }
+
+    /// A clip range below zero panics in the policy's lane; the judge's would wait for it forever.
+    #[test]
+    fn a_panic_in_one_lane_ends_the_other() {
+        let (nets, ppo) =
+            (NetSettings::default(), PpoSettings { clip_range: -0.2, ..PpoSettings::default() });
+        let (mut rng, kind) = (crate::rollout::stream(1, 1), Kind { stochastic: false, learned: true });
+        let mut learner = Pid2::new(dims(), &nets, ppo, Pid2Settings::default(), kind, true, 2, &mut rng);
+        let batch = reference::batch(&dims(), 1024, 3);
+        let update = std::panic::AssertUnwindSafe(|| drop(learner.update(&batch, 1.0, &mut rng)));
+        assert!(std::panic::catch_unwind(update).is_err());
     }
 
     #[test]
