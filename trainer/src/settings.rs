@@ -156,6 +156,44 @@ impl TrainSettings {
 mod tests {
     use super::*;
 
+    /// The value in the row of `key`, after the heading of its table.
+    fn on_page(page: &str, table: &str, key: &str) -> toml::Value {
+        let (_, rows) = page.split_once(table).unwrap_or_else(|| panic!("no '{table}' on the page"));
+        let row = rows.lines().find_map(|l| l.strip_prefix(&format!("| `{key}` | ")));
+        let cell = row.unwrap_or_else(|| panic!("no '{key}' below '{table}'")).split(" |").next();
+        let text = format!("x = {}", cell.unwrap().trim_matches('`'));
+        toml::from_str::<toml::Table>(&text).unwrap_or_else(|e| panic!("{key}: {e}"))["x"].clone()
+    }
+
+    #[test]
+    fn the_page_about_training_has_every_key_with_its_value_and_every_column() {
+        let page = include_str!("../../docs/TRAINING.md");
+        let number = |v: &toml::Value| v.as_float().or(v.as_integer().map(|i| i as f64));
+        let mut keys = 0;
+        let mut compare = |table: &str, key: &str, value: &toml::Value| {
+            let told = on_page(page, table, key);
+            let same = match (number(&told), number(value)) {
+                (Some(a), Some(b)) => (a - b).abs() <= 1e-6 * b.abs(),
+                _ => told == *value,
+            };
+            assert!(same, "{table} {key}: {told} on the page, {value} in the program");
+            keys += 1;
+        };
+        let settings = toml::Table::try_from(TrainSettings::default()).unwrap();
+        for (key, value) in &settings {
+            match value {
+                toml::Value::Table(section) => {
+                    section.iter().for_each(|(k, v)| compare(&format!("| `train.{key}` |"), k, v));
+                }
+                value => compare("## `[train]`", key, value),
+            }
+        }
+        assert_eq!(keys, 36);
+        for column in crate::train::COLUMNS {
+            assert!(page.contains(&format!("`{column}`")), "{column}");
+        }
+    }
+
     #[test]
     fn numbers_with_which_nothing_learns_are_refused_by_name() {
         let read = |text: &str| TrainSettings::read(&toml::from_str(text).unwrap());
