@@ -52,7 +52,7 @@ fn main() {
 /// The folder `cmeel.prefix` of the wheels.
 fn prefix() -> PathBuf {
     let site = env::var("NEARL_SITE_PACKAGES").unwrap_or_else(|_| {
-        panic!("NEARL_SITE_PACKAGES is not set: run cargo inside the repository, after `make setup`")
+        panic!("NEARL_SITE_PACKAGES is not set: run cargo inside the repository after `make setup`, or set it to the `.venv/lib/python3.11/site-packages` there")
     });
     let prefix = Path::new(&site).join("cmeel.prefix");
     for (file, package) in NEEDED {

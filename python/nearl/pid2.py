@@ -7,6 +7,7 @@
     agent = nearl.PID2.load("cheetah.safetensors")
 """
 
+import json
 import os
 import sys
 import time
@@ -166,7 +167,13 @@ class PID2:
 
 
 def _toml(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else f"{value!r}" if isinstance(value, str) else str(value)
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{json.dumps(key)} = {_toml(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return json.dumps(value) if isinstance(value, str) else str(value).lower()  # TOML writes true, nan and inf
 
 
 class _Save:

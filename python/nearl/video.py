@@ -80,6 +80,8 @@ def _frames(
     model, scene, renderer = _renderer(env, size)
     import mujoco
 
+    if seconds is not None and seconds <= 0:
+        raise ValueError(f"seconds is {seconds}; give a time above 0")
     limit = env.max_episode_steps if seconds is None else min(env.max_episode_steps, round(seconds / env.dt))
     view = _camera(mujoco, model, camera)
     try:

@@ -33,7 +33,9 @@ pub(crate) fn task(error: TaskLoadError) -> PyErr {
 /// A snapshot.
 pub(crate) fn snapshot(error: SnapshotError) -> PyErr {
     match error {
-        SnapshotError::Unreadable { .. } => PyOSError::new_err(error.to_string()),
+        SnapshotError::Unreadable { .. } | SnapshotError::Unwritable { .. } => {
+            PyOSError::new_err(error.to_string())
+        }
         other => value(other),
     }
 }

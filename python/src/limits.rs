@@ -469,7 +469,7 @@ impl CollisionLimit {
     ) -> PyResult<PyClassInitializer<Self>> {
         let text: String = shapes.py().import("json")?.call_method1("dumps", (shapes,))?.extract()?;
         let shapes = serde_json::from_str(&text).map_err(|e| {
-            errors::value(format!("shapes are not as in a task file: {e}; see docs/TASKS.md"))
+            errors::value(format!("shapes are not as in a task file: {e}; see docs/LIMITS.md"))
         })?;
         let soft = soft.map(self::soft);
         let settings =

@@ -103,6 +103,14 @@ pub enum SnapshotError {
         /// One sentence.
         reason: String,
     },
+    /// The file cannot be written.
+    #[error("cannot write snapshot '{file}': {reason}; give another path, or make room")]
+    Unwritable {
+        /// Path as given.
+        file: String,
+        /// What the system said.
+        reason: String,
+    },
     /// Not a safetensors file, or cut short.
     #[error("snapshot is not a safetensors file: {reason}; it may be cut short: copy it again")]
     Malformed {
@@ -177,7 +185,7 @@ impl SnapshotError {
     /// Stable name of the reason, for logs, replies and `nearl explain`.
     pub fn code(&self) -> &'static str {
         match self {
-            Self::Unreadable { .. } => SnapshotCode::Unreadable,
+            Self::Unreadable { .. } | Self::Unwritable { .. } => SnapshotCode::Unreadable,
             Self::Malformed { .. } => SnapshotCode::Malformed,
             Self::Foreign { .. } => SnapshotCode::Foreign,
             Self::Digest { .. } => SnapshotCode::Digest,
@@ -238,9 +246,9 @@ impl Snapshot {
     /// Writes the file whole: to a name beside it, then renamed.
     ///
     /// # Errors
-    /// [`SnapshotError::Unreadable`] with what the system said.
+    /// [`SnapshotError::Unwritable`] with what the system said.
     pub fn save(&self, path: &Path) -> Result<(), SnapshotError> {
-        write_whole(path, &self.to_bytes()).map_err(|e| SnapshotError::Unreadable {
+        write_whole(path, &self.to_bytes()).map_err(|e| SnapshotError::Unwritable {
             file: path.display().to_string(),
             reason: e.to_string(),
         })

@@ -112,7 +112,7 @@ pub enum IdmKind {
 
 /// Entries of state and target that a learned inverse model sees.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "lowercase", expecting = "expected \"controllable\", \"full\" or a list of names")]
 pub enum IdmInput {
     /// The controllable subset S_c.
     #[default]

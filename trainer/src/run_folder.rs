@@ -165,7 +165,7 @@ impl RunFolder {
         let stale = path.with_file_name(format!("{other}.safetensors"));
         match std::fs::remove_file(&stale) {
             Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
-                Err(SnapshotError::Unreadable { file: stale.display().to_string(), reason: e.to_string() })
+                Err(SnapshotError::Unwritable { file: stale.display().to_string(), reason: e.to_string() })
             }
             _ => Ok(path),
         }

@@ -65,7 +65,7 @@ pub struct ConstraintSettings {
 
 /// One number for every joint, or numbers by joint name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "expected a number, or a table of numbers by joint")]
 pub enum PerJoint {
     /// The same for all joints.
     All(f64),
