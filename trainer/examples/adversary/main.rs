@@ -119,7 +119,12 @@ fn tell(tick: usize, counts: &Counts, worst: [f64; 4], proposal: &Proposal, targ
         let l = &target.ledger;
         eprintln!(
             "tick {tick}: {:?} by {:?}, excess {worst:?} (position, velocity, acceleration, torque), {:?}, {} outside; proposed {:?} {:?}",
-            l.status, l.rung, l.violations, l.outside, proposal.q, proposal.v
+            l.status,
+            l.rung,
+            l.violations,
+            l.outside.len(),
+            proposal.q,
+            proposal.v
         );
     }
 }
