@@ -153,6 +153,11 @@ fn a_reward_that_is_no_number_ends_the_training() {
     let error = train(&request, &run, |_, _| true).expect_err("a reward of NaN").to_string();
     assert!(error.contains("a reward of 'cart-pole' came out as NaN after"), "{error}");
     assert!(run.join("checkpoints/latest.safetensors").is_file());
+    let again = tasks::load(&run.join("task.toml").display().to_string(), &[]).expect("the run's own file");
+    assert!(
+        again.task.reward.contains_key("odd"),
+        "the task file of a run, its robot beside it, is a task file"
+    );
 }
 
 #[test]

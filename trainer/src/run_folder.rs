@@ -1,4 +1,4 @@
-//! The run folder: `task.toml metrics.csv env.json checkpoints/` of one training.
+//! The run folder: `task.toml metrics.csv env.json checkpoints/` and the robot file of one training.
 
 use nearl_runtime::snapshot::write_whole;
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
@@ -49,6 +49,18 @@ pub enum RunError {
     },
 }
 
+/// The effective task file as it stands in a run folder, and the name of the robot file beside it.
+pub fn task_file(manifest: &Manifest) -> (String, String) {
+    let mut task = manifest.task.clone();
+    let model = &mut task.model;
+    let mut name = String::new();
+    for file in [&mut model.urdf, &mut model.mjcf].into_iter().flatten() {
+        name = Path::new(file).file_name().map_or("robot".into(), |n| n.to_string_lossy().into_owned());
+        file.clone_from(&name);
+    }
+    (task.to_toml(), name)
+}
+
 /// Holds a run folder until the file is dropped: two trainings would mix their rows.
 ///
 /// # Errors
@@ -72,7 +84,7 @@ pub struct RunFolder {
 }
 
 impl RunFolder {
-    /// Creates the folder with `task.toml`, `env.json` and an empty `metrics.csv` with `columns`.
+    /// Creates the folder with `task.toml` and its robot file, `env.json` and an empty `metrics.csv` with `columns`.
     ///
     /// # Errors
     /// [`RunError`]; a folder that already holds a run is never overwritten.
@@ -90,7 +102,9 @@ impl RunFolder {
             let file = path.join(name);
             std::fs::write(&file, text).map_err(|e| write(&file, e))
         };
-        put("task.toml", &manifest.task.to_toml())?;
+        let (task, robot) = task_file(manifest);
+        put(&robot, &manifest.model)?;
+        put("task.toml", &task)?;
         let host = serde_json::json!({
             "algo": manifest.algo, "seed": seed, "version": env!("CARGO_PKG_VERSION"),
             "mujoco": "3.17.0", "pinocchio": "4.1.0", "isa": nearl_runtime::net::kernel::isa(),

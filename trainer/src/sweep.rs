@@ -130,7 +130,7 @@ impl Sweep {
         for task in &self.tasks {
             let mut manifest = tasks::load(task, &self.set)?;
             complete(&mut manifest)?;
-            files.push((task, manifest.task.name.clone(), manifest.task.to_toml()));
+            files.push((task, manifest.task.name.clone(), run_folder::task_file(&manifest).0));
         }
         let mut runs: Vec<Run> = Vec::new();
         for &seed in &self.seeds {
