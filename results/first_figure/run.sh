@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The paper's first figure: four tasks, four algorithms, a million steps each, as the bundled task files set them. PPO and PID2-IB with five
-# seeds (eight on Walker2d, where runs differ most), the others with three; about an hour on two idle cores. Then the four for eight
+# seeds (twenty on Walker2d, where runs differ most), the others with three; an hour and a half on two idle cores. Then the four for eight
 # million steps on HalfCheetah, twenty-five minutes. Finished runs are skipped, broken ones go on.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -8,7 +8,7 @@ tasks=HalfCheetah-v5,Hopper-v5,Walker2d-v5,Ant-v5
 runs=runs/first_figure long=runs/first_figure_8M
 
 target/release/nearl sweep --tasks $tasks --algos ppo,pid2-ib --seeds 0-4 --steps 1e6 --out $runs
-target/release/nearl sweep --tasks Walker2d-v5 --algos ppo,pid2-ib --seeds 5-7 --steps 1e6 --out $runs
+target/release/nearl sweep --tasks Walker2d-v5 --algos ppo,pid2-ib --seeds 5-19 --steps 1e6 --out $runs
 target/release/nearl sweep --tasks $tasks --algos nearl,pid2-gan --seeds 0-2 --steps 1e6 --out $runs
 .venv/bin/python results/curves.py $runs results/first_figure
 
