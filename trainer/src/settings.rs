@@ -145,6 +145,7 @@ impl TrainSettings {
             ("nearl.idm_lr", single(nearl.idm_lr), positive),
         ] {
             if !allowed(value) {
+                let value = value as f32; // as it was written
                 return Err(format!("[train.{key}]: {value} is not {domain}; correct it"));
             }
         }
@@ -198,7 +199,7 @@ mod tests {
     fn numbers_with_which_nothing_learns_are_refused_by_name() {
         let read = |text: &str| TrainSettings::read(&toml::from_str(text).unwrap());
         for (text, words) in [
-            ("ppo.clip_range = -0.2", "[train.ppo.clip_range]: -0.2"),
+            ("ppo.clip_range = -0.2", "[train.ppo.clip_range]: -0.2 is"),
             ("ppo.lr = nan", "[train.ppo.lr]: NaN is not above 0"),
             ("ppo.n_epochs = 0", "[train.ppo.n_epochs]: 0 learns nothing"),
             ("ppo.max_grad_norm = -1.0", "[train.ppo.max_grad_norm]"),
