@@ -125,7 +125,7 @@ fn a_sweep_finishes_what_is_not_finished() {
 
     std::fs::remove_dir_all(&strange).expect("remove");
     std::fs::rename(out.join("kept"), &strange).expect("move back");
-    let held = std::fs::File::open(&strange).expect("folder");
+    let held = std::fs::File::open(strange.join("env.json")).expect("file");
     held.lock().expect("lock");
     let busy = sweep(&out, &[]);
     assert!(text(&busy.stderr).contains("another training is at work in"), "{}", text(&busy.stderr));

@@ -61,16 +61,23 @@ pub fn task_file(manifest: &Manifest) -> (String, String) {
     (task.to_toml(), name)
 }
 
-/// Holds a run folder until the file is dropped: two trainings would mix their rows.
+/// Holds a run folder until the file is dropped: two trainings would mix their rows. What is locked is `env.json`, which is never written
+/// again; none where there is none, hence no run.
 ///
 /// # Errors
-/// [`RunError::Busy`]; [`RunError::Write`] when it cannot be opened.
-pub fn lock(path: &Path) -> Result<File, RunError> {
+/// [`RunError::Busy`]; [`RunError::Write`] when it cannot be opened or locked.
+pub fn lock(path: &Path) -> Result<Option<File>, RunError> {
+    let file = path.join("env.json");
     let write =
-        |e: std::io::Error| RunError::Write { path: path.display().to_string(), reason: e.to_string() };
-    let folder = File::open(path).map_err(write)?;
-    match folder.try_lock() {
-        Ok(()) => Ok(folder),
+        |e: std::io::Error| RunError::Write { path: file.display().to_string(), reason: e.to_string() };
+    // for appending: a file system over the network locks nothing that may not be written
+    let held = match File::options().append(true).open(&file) {
+        Ok(held) => held,
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(e) => return Err(write(e)),
+    };
+    match held.try_lock() {
+        Ok(()) => Ok(Some(held)),
         Err(std::fs::TryLockError::WouldBlock) => Err(RunError::Busy { path: path.display().to_string() }),
         Err(std::fs::TryLockError::Error(e)) => Err(write(e)),
     }

@@ -63,7 +63,7 @@ pub fn resume_on(
     threads: usize,
     report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
-    let _held = path.is_dir().then(|| run_folder::lock(path)).transpose()?;
+    let _held = run_folder::lock(path)?;
     let file = checkpoint::path_in(path);
     let training = Training::resume_on(Checkpoint::load(&file)?, &file, experience, steps, threads)?;
     let manifest = &training.snapshot().manifest;
