@@ -76,10 +76,21 @@ pub fn lock(path: &Path) -> Result<Option<File>, RunError> {
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(e) => return Err(write(e)),
     };
-    match held.try_lock() {
-        Ok(()) => Ok(Some(held)),
-        Err(std::fs::TryLockError::WouldBlock) => Err(RunError::Busy { path: path.display().to_string() }),
-        Err(std::fs::TryLockError::Error(e)) => Err(write(e)),
+    match is_ours(&held).map_err(write)? {
+        true => Ok(Some(held)),
+        false => Err(RunError::Busy { path: path.display().to_string() }),
+    }
+}
+
+/// Locks a file until it is dropped; false if another process or handle holds it.
+///
+/// # Errors
+/// What the system said.
+pub fn is_ours(file: &File) -> std::io::Result<bool> {
+    match file.try_lock() {
+        Ok(()) => Ok(true),
+        Err(std::fs::TryLockError::WouldBlock) => Ok(false),
+        Err(std::fs::TryLockError::Error(e)) => Err(e),
     }
 }
 
@@ -110,8 +121,8 @@ impl RunFolder {
             std::fs::write(&file, text).map_err(|e| write(&file, e))
         };
         let (task, robot) = task_file(manifest);
-        put(&robot, &manifest.model)?;
         put("task.toml", &task)?;
+        put(&robot, &manifest.model)?;
         let host = serde_json::json!({
             "algo": manifest.algo, "seed": seed, "version": env!("CARGO_PKG_VERSION"),
             "mujoco": "3.17.0", "pinocchio": "4.1.0", "isa": nearl_runtime::net::kernel::isa(),

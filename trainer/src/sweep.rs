@@ -199,12 +199,9 @@ impl Sweep {
             |e: std::io::Error| SweepError::Write { path: path.display().to_string(), reason: e.to_string() };
         std::fs::create_dir_all(&self.out).map_err(write)?;
         let file = File::create(&path).map_err(write)?;
-        match file.try_lock() {
-            Ok(()) => Ok(file),
-            Err(std::fs::TryLockError::WouldBlock) => {
-                Err(SweepError::Busy { path: self.out.display().to_string() })
-            }
-            Err(std::fs::TryLockError::Error(e)) => Err(write(e)),
+        match run_folder::is_ours(&file).map_err(write)? {
+            true => Ok(file),
+            false => Err(SweepError::Busy { path: self.out.display().to_string() }),
         }
     }
 }

@@ -135,15 +135,15 @@ impl Limit for UserRow {
                 next: "name one, or drop the row",
             });
         }
-        if s.braking.is_some() && terms.iter().any(|t| t.quantity != Quantity::Position) {
+        let (equality, of_positions) =
+            (s.equals.is_some(), terms.iter().all(|t| t.quantity == Quantity::Position));
+        if s.braking.is_some() && !of_positions {
             return Err(LimitError::Unusable {
                 what: format!("row '{}' has braking but not only positions", s.name),
                 next: "brake on q.<joint> alone, or drop braking",
             });
         }
-        let is_equality = bounds.0 == bounds.1;
-        let of_positions = terms.iter().all(|t| t.quantity == Quantity::Position);
-        if s.braking.is_none() && s.soft.is_none() && of_positions && !is_equality {
+        if s.braking.is_none() && s.soft.is_none() && of_positions && !equality {
             return Err(LimitError::Unusable {
                 what: format!(
                     "row '{}' bounds positions but has no braking, so that nothing stops in front of it",
@@ -159,7 +159,6 @@ impl Limit for UserRow {
             None if largest > 0.0 => largest,
             None => terms.iter().fold(0.0, |m: f64, t| m.max(t.coefficient.abs())),
         };
-        let equality = s.equals.is_some();
         Ok(Some(Box::new(Row { name: s.name.clone(), terms, bounds, braking: s.braking, size, equality })))
     }
 
