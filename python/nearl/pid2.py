@@ -10,7 +10,6 @@
 import json
 import os
 import sys
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TextIO
@@ -53,7 +52,7 @@ class PID2:
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
         threads = threads or os.cpu_count() or 1
         self._training: _core.Training | None = _core.Training(os.fspath(task), algo, seed, threads, overrides, run)
-        self._run, self.task, self.algo, self.seed = run, self._training.task, algo, seed
+        self.task, self.algo, self.seed = self._training.task, algo, seed
         self._begin(self._training.controller())
 
     def _begin(self, controller: _core.Controller) -> None:
@@ -79,7 +78,8 @@ class PID2:
             callback: ``callback(agent, metrics)`` after each iteration, or several; metrics by SB3's tags. ``False`` ends the learning.
             progress_bar: Draws a bar on standard error, if that is a terminal.
 
-        The interpreter runs other threads meanwhile. Ctrl-C raises ``KeyboardInterrupt`` between two iterations; what was learned
+        A run folder is held against other trainings meanwhile, and has a checkpoint after every tenth of the steps and every two
+        minutes. The interpreter runs other threads meanwhile. Ctrl-C raises ``KeyboardInterrupt`` between two iterations; what was learned
         stays, and is written where there is a run folder.
         """
         if self._training is None:
@@ -87,22 +87,18 @@ class PID2:
         if total_timesteps < 1:
             raise ValueError(f"total_timesteps is {total_timesteps}; ask for at least one step")
         callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]
-        save = _Save(self.num_timesteps, total_timesteps)
         bar = _Bar(sys.stderr, self.num_timesteps, total_timesteps) if progress_bar else None
-        self._training.extend(int(total_timesteps))
+        self._training.begin(int(total_timesteps))
         try:
             while not self._training.done:
                 metrics = self._training.iterate()
                 if bar is not None:
                     bar.show(metrics)
-                if self._run is not None and save.is_due(self.num_timesteps):
-                    self._training.checkpoint()
                 if [c for c in callbacks if c(self, metrics) is False]:
                     break
         finally:
             self._controller = self._training.controller()
-            if self._run is not None:
-                self._training.checkpoint()
+            self._training.end()
             if bar is not None:
                 bar.close()
         return self
@@ -157,9 +153,9 @@ class PID2:
             ValueError: it is not a snapshot, or was damaged.
         """
         agent = cls.__new__(cls)
-        agent._training, agent._run, agent.seed = None, None, 0
+        agent._training, agent.seed = None, 0
         if (Path(path) / "checkpoints" / "resume.safetensors").is_file():
-            agent._training, agent._run = _core.Training.resume(path, threads or os.cpu_count() or 1), path
+            agent._training = _core.Training.resume(path, threads or os.cpu_count() or 1)
         controller = _core.Controller.load(path) if agent._training is None else agent._training.controller()
         agent.task, agent.algo = controller.task, controller.algo
         agent._begin(controller)
@@ -174,20 +170,6 @@ def _toml(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_toml, value)) + "]"
     return json.dumps(value) if isinstance(value, str) else str(value).lower()  # TOML writes true, nan and inf
-
-
-class _Save:
-    """When ``nearl train`` writes a checkpoint: every tenth of the steps, and every two minutes."""
-
-    def __init__(self, begin: int, steps: int):
-        self._every = max(1, steps // 10)
-        self._next, self._last = begin + self._every, time.monotonic()
-
-    def is_due(self, steps: int) -> bool:
-        if steps < self._next and time.monotonic() - self._last < 120:
-            return False
-        self._next, self._last = steps + self._every, time.monotonic()
-        return True
 
 
 class _Bar:

@@ -3,7 +3,10 @@
 use nearl_constraints::ModelError;
 use nearl_runtime::SnapshotError;
 use nearl_runtime::task::TaskError;
+use nearl_trainer::checkpoint::CheckpointError;
+use nearl_trainer::run_folder::RunError;
 use nearl_trainer::tasks::TaskLoadError;
+use nearl_trainer::train::TrainError;
 use pyo3::PyErr;
 use pyo3::exceptions::{PyOSError, PyValueError};
 
@@ -26,6 +29,18 @@ pub(crate) fn task(error: TaskLoadError) -> PyErr {
         TaskLoadError::Robot { .. } | TaskLoadError::Task(TaskError::Unreadable { .. }) => {
             PyOSError::new_err(error.to_string())
         }
+        other => value(other),
+    }
+}
+
+/// A training and its run folder.
+pub(crate) fn train(error: TrainError) -> PyErr {
+    match error {
+        TrainError::Run(RunError::Write { .. })
+        | TrainError::Checkpoint(CheckpointError::Unusable { .. } | CheckpointError::Unwritable { .. }) => {
+            PyOSError::new_err(error.to_string())
+        }
+        TrainError::Snapshot(e) => snapshot(e),
         other => value(other),
     }
 }

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use nearl_trainer::checkpoint::{self, Checkpoint};
-use nearl_trainer::run_folder::RunFolder;
+use nearl_trainer::run_folder::{self, RunFolder};
 use nearl_trainer::tasks;
-use nearl_trainer::train::{self, COLUMNS, Request, complete};
+use nearl_trainer::train::{self, COLUMNS, Request, TrainError, complete};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -15,6 +15,7 @@ use crate::errors;
 
 struct Inner {
     training: train::Training,
+    /// Open between `begin` and `end`.
     folder: Option<RunFolder>,
 }
 
@@ -23,6 +24,7 @@ struct Inner {
 pub(crate) struct Training {
     inner: Mutex<Inner>,
     task: String,
+    out: Option<PathBuf>,
 }
 
 #[pymethods]
@@ -40,13 +42,13 @@ impl Training {
     ) -> PyResult<Training> {
         py.detach(|| {
             let mut manifest = tasks::load(task, &settings).map_err(errors::task)?;
-            complete(&mut manifest).map_err(errors::value)?;
-            let task = manifest.task.name.clone();
+            complete(&mut manifest).map_err(errors::train)?;
             let request = Request { manifest, algo: algo.into(), steps: 0, seed, threads: threads.max(1) };
-            let training = train::Training::new(&request).map_err(errors::value)?;
-            let create = |out: PathBuf| RunFolder::create(&out, &training.snapshot().manifest, seed, COLUMNS);
-            let folder = out.map(create).transpose().map_err(errors::value)?;
-            Ok(Training { inner: Mutex::new(Inner { training, folder }), task })
+            let training = train::Training::new(&request).map_err(errors::train)?;
+            if let Some(out) = &out {
+                RunFolder::create(out, &training.snapshot().manifest, seed, COLUMNS).map_err(run)?;
+            }
+            Ok(Training::of(training, out))
         })
     }
 
@@ -55,30 +57,52 @@ impl Training {
     fn resume(py: Python<'_>, path: PathBuf, threads: usize) -> PyResult<Training> {
         py.detach(|| {
             let file = checkpoint::path_in(&path);
-            let from = Checkpoint::load(&file).map_err(errors::value)?;
+            let from = Checkpoint::load(&file).map_err(|e| errors::train(e.into()))?;
             let training =
-                train::Training::resume(from, &file, None, threads.max(1)).map_err(errors::value)?;
-            let manifest = &training.snapshot().manifest;
-            let task = manifest.task.name.clone();
-            let folder = RunFolder::reopen(&path, COLUMNS, manifest.steps, manifest.version);
-            let folder = Some(folder.map_err(errors::value)?);
-            Ok(Training { inner: Mutex::new(Inner { training, folder }), task })
+                train::Training::resume(from, &file, None, threads.max(1)).map_err(errors::train)?;
+            Ok(Training::of(training, Some(path)))
         })
     }
 
-    /// Asks for `steps` more; the learning rate falls to zero at their end.
-    fn extend(&self, steps: u64) {
-        self.lock().training.extend(steps);
+    /// Asks for `steps` more, at whose end the learning rate falls to zero, and holds the run folder until `end`.
+    fn begin(&self, py: Python<'_>, steps: u64) -> PyResult<()> {
+        py.detach(|| {
+            let mut inner = self.lock();
+            let manifest = &inner.training.snapshot().manifest;
+            if let Some(out) = &self.out {
+                let held = run_folder::lock(out).map_err(run)?;
+                let file = checkpoint::path_in(out);
+                let further = |c: &Checkpoint| c.header.manifest.steps > manifest.steps;
+                if file.exists()
+                    && further(&Checkpoint::load(&file).map_err(|e| errors::train(e.into()))?)
+                {
+                    return Err(errors::value(format!(
+                        "the run in '{}' has gone on since this agent was made or loaded, at {} steps; load it again with \
+                         PID2.load, or give another folder with run=",
+                        out.display(),
+                        manifest.steps
+                    )));
+                }
+                let folder = RunFolder::reopen(out, held, COLUMNS, manifest.steps, manifest.version);
+                inner.folder = Some(folder.map_err(run)?);
+            }
+            inner.training.extend(steps);
+            Ok(())
+        })
     }
 
     /// Collects and learns once; metrics by column, those that exist.
     fn iterate<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let row = py.detach(|| {
             let mut inner = self.lock();
-            let progress = inner.training.iterate();
-            let row = inner.training.row(&progress);
-            inner.folder.as_mut().map_or(Ok(()), |f| f.row(&row)).map_err(errors::value)?;
-            Ok::<_, PyErr>(row)
+            let Inner { training, folder } = &mut *inner;
+            let progress = match folder {
+                Some(folder) => training.step_in(folder),
+                None => training.step(),
+            };
+            let stopped = || errors::value("the source of experience was stopped");
+            let progress = progress.map_err(errors::train)?.ok_or_else(stopped)?;
+            Ok::<_, PyErr>(training.row(&progress))
         })?;
         let metrics = PyDict::new(py);
         for (name, value) in COLUMNS.iter().zip(row).filter(|(_, value)| value.is_finite()) {
@@ -87,13 +111,12 @@ impl Training {
         Ok(metrics)
     }
 
-    /// Writes snapshot and checkpoint into the run folder; returns the snapshot's path.
-    fn checkpoint(&self, py: Python<'_>) -> PyResult<PathBuf> {
+    /// Writes snapshot and checkpoint, and leaves the run folder to others; nothing where there is none.
+    fn end(&self, py: Python<'_>) -> PyResult<()> {
         py.detach(|| {
             let mut inner = self.lock();
-            let Inner { training, folder } = &mut *inner;
-            let none = || errors::value("this training has no run folder; give out=");
-            training.save(folder.as_ref().ok_or_else(none)?).map_err(errors::value)
+            let Some(mut folder) = inner.folder.take() else { return Ok(()) };
+            inner.training.save(&mut folder).map(drop).map_err(errors::train)
         })
     }
 
@@ -119,16 +142,19 @@ impl Training {
     fn task(&self) -> &str {
         &self.task
     }
-
-    /// Names of all metrics.
-    #[getter]
-    fn columns(&self) -> Vec<&'static str> {
-        COLUMNS.to_vec()
-    }
 }
 
 impl Training {
+    fn of(training: train::Training, out: Option<PathBuf>) -> Training {
+        let task = training.snapshot().manifest.task.name.clone();
+        Training { inner: Mutex::new(Inner { training, folder: None }), task, out }
+    }
+
     fn lock(&self) -> MutexGuard<'_, Inner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+fn run(error: run_folder::RunError) -> PyErr {
+    errors::train(TrainError::Run(error))
 }

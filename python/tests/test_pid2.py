@@ -2,6 +2,7 @@
 
 import _thread
 import threading
+import tomllib
 from pathlib import Path
 
 import gymnasium
@@ -139,3 +140,36 @@ def test_an_observation_that_is_not_finite_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"obs\[2\] \('.*'\) is NaN"):
         agent.predict(np.array([[0.1] * 5, [0.1, 0.1, np.nan, 0.1, 0.1]]))
     assert (agent.predict(np.full(5, 0.1))[0] == before).all()
+
+
+def test_two_agents_do_not_mix_their_rows_in_one_run_folder(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    first = nearl.PID2(CART_POLE, algo="ppo", run=run, threads=1).learn(4096)
+    second = nearl.PID2.load(run)
+    busy: list[str] = []
+
+    def intrude(*_: object) -> None:
+        with pytest.raises(ValueError, match="another training is at work in") as refused:
+            second.learn(2048)
+        busy.append(str(refused.value))
+
+    first.learn(2048, callback=intrude)
+    assert busy
+    with pytest.raises(ValueError, match="has gone on since this agent was made or loaded, at 4096 steps"):
+        second.learn(2048)
+    third = nearl.PID2.load(run).learn(2048)
+    rows = [int(line.split(",")[0]) for line in (run / "metrics.csv").read_text().splitlines()[1:]]
+    assert rows == list(range(1024, 8193, 1024))
+    assert third.num_timesteps == 8192
+
+
+def test_a_reward_that_is_not_a_number_ends_the_learning(tmp_path: Path) -> None:
+    task = tmp_path / "task.toml"
+    text = Path(CART_POLE).read_text()
+    task.write_text(text.replace("[reward]", "[reward]\nroot = \"log(cos(0.1) - 2.0)\"", 1))
+    robot = Path(CART_POLE).parent / tomllib.loads(text)["model"]["mjcf"]
+    (tmp_path / robot.name).write_text(robot.read_text())
+    agent = nearl.PID2(task, algo="ppo", run=tmp_path / "run", threads=1)
+    with pytest.raises(ValueError, match="nothing can be learned from it"):
+        agent.learn(2048)
+    assert (tmp_path / "run/checkpoints/resume.safetensors").is_file()

@@ -75,7 +75,15 @@ pub struct Checkpoint {
 /// Why a checkpoint cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
-    /// Missing, not a regular file, too large, or not writable.
+    /// The file system.
+    #[error("cannot write checkpoint '{file}': {reason}; what was written there last still holds")]
+    Unwritable {
+        /// Path.
+        file: String,
+        /// What the system said.
+        reason: String,
+    },
+    /// Missing, not a regular file, or too large.
     #[error("cannot use checkpoint '{file}': {reason}; give the run folder of 'nearl train' with --resume")]
     Unusable {
         /// Path.
@@ -110,9 +118,9 @@ impl Checkpoint {
     /// Writes the file whole: to a name beside it, then renamed.
     ///
     /// # Errors
-    /// [`CheckpointError::Unusable`] with what the system said.
+    /// [`CheckpointError::Unwritable`] with what the system said.
     pub fn save(&self, path: &Path) -> Result<(), CheckpointError> {
-        write_whole(path, &self.to_bytes()).map_err(|e| CheckpointError::Unusable {
+        write_whole(path, &self.to_bytes()).map_err(|e| CheckpointError::Unwritable {
             file: path.display().to_string(),
             reason: e.to_string(),
         })

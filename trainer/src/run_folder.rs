@@ -5,6 +5,7 @@ use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 /// Why a run folder cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -94,11 +95,16 @@ pub fn is_ours(file: &File) -> std::io::Result<bool> {
     }
 }
 
-/// Writes one training to disk.
+/// Seconds after which a checkpoint is written even if a tenth of the run is not done.
+const SAVE_SECONDS: f64 = 120.0;
+
+/// Writes one training to disk. Others are kept from the folder until it is dropped.
 pub struct RunFolder {
     path: PathBuf,
     metrics: BufWriter<File>,
     columns: usize,
+    saved: (u64, Instant),
+    _held: Option<File>,
 }
 
 impl RunFolder {
@@ -132,16 +138,23 @@ impl RunFolder {
         let file = path.join("metrics.csv");
         let mut metrics = BufWriter::new(File::create(&file).map_err(|e| write(&file, e))?);
         writeln!(metrics, "{}", columns.join(",")).map_err(|e| write(&file, e))?;
-        Ok(Self { path: path.into(), metrics, columns: columns.len() })
+        Ok(Self::open(path, metrics, columns, 0, lock(path)?))
     }
 
     /// Opens the folder of a run to go on: keeps the rows of `metrics.csv` up to `steps`, of which there must be `rows`.
     ///
-    /// Rows behind the checkpoint (of a run that was killed) are dropped: they come again.
+    /// Rows behind the checkpoint (of a run that was killed) are dropped: they come again. `held` is the folder's [`lock`], taken
+    /// before the checkpoint was read.
     ///
     /// # Errors
     /// [`RunError`] when there is no `metrics.csv`, or it has other columns or lacks rows.
-    pub fn reopen(path: &Path, columns: &[&str], steps: u64, rows: u64) -> Result<Self, RunError> {
+    pub fn reopen(
+        path: &Path,
+        held: Option<File>,
+        columns: &[&str],
+        steps: u64,
+        rows: u64,
+    ) -> Result<Self, RunError> {
         let file = path.join("metrics.csv");
         let broken = |reason: String| RunError::Metrics { path: file.display().to_string(), reason };
         let text = std::fs::read_to_string(&file).map_err(|e| broken(e.to_string()))?;
@@ -169,7 +182,18 @@ impl RunFolder {
         let write =
             |e: std::io::Error| RunError::Write { path: file.display().to_string(), reason: e.to_string() };
         let metrics = BufWriter::new(open().map_err(write)?);
-        Ok(Self { path: path.into(), metrics, columns: columns.len() })
+        Ok(Self::open(path, metrics, columns, steps, held))
+    }
+
+    fn open(path: &Path, metrics: BufWriter<File>, columns: &[&str], steps: u64, held: Option<File>) -> Self {
+        let saved = (steps, Instant::now());
+        Self { path: path.into(), metrics, columns: columns.len(), saved, _held: held }
+    }
+
+    /// Whether a checkpoint is due after `steps` of `total`: at every tenth, and after two minutes.
+    pub fn is_due(&self, steps: u64, total: u64) -> bool {
+        let every = (total / 10).max(1);
+        steps / every > self.saved.0 / every || self.saved.1.elapsed().as_secs_f64() > SAVE_SECONDS
     }
 
     /// Appends one row of metrics; numbers that do not exist are empty cells.
@@ -190,7 +214,8 @@ impl RunFolder {
     ///
     /// # Errors
     /// [`SnapshotError`] with what the system said.
-    pub fn save(&self, name: &str, snapshot: &Snapshot) -> Result<PathBuf, SnapshotError> {
+    pub fn save(&mut self, name: &str, snapshot: &Snapshot) -> Result<PathBuf, SnapshotError> {
+        self.saved = (snapshot.manifest.steps, Instant::now());
         let path = self.path.join("checkpoints").join(format!("{name}.safetensors"));
         snapshot.save(&path)?;
         let other = if name == "final" { "latest" } else { "final" };

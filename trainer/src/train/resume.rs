@@ -113,7 +113,7 @@ impl Training {
     ///
     /// # Errors
     /// [`TrainError`] with what the system said.
-    pub fn save(&mut self, folder: &RunFolder) -> Result<PathBuf, TrainError> {
+    pub fn save(&mut self, folder: &mut RunFolder) -> Result<PathBuf, TrainError> {
         let name = if self.is_done() { "final" } else { "latest" };
         let path = folder.save(name, self.snapshot())?;
         self.checkpoint().map_err(TrainError::Settings)?.save(&checkpoint::path_in(folder.path()))?;

@@ -4,10 +4,6 @@ use super::{COLUMNS, Experience, Progress, Request, TrainError, Training};
 use crate::checkpoint::{self, Checkpoint};
 use crate::run_folder::{self, RunFolder};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
-
-/// Seconds after which a checkpoint is written even if a tenth of the run is not done.
-const SAVE_SECONDS: f64 = 120.0;
 
 /// Trains to the end in a new run folder; `report` sees each iteration and may stop the training by returning `false`.
 ///
@@ -33,7 +29,6 @@ pub fn train_on(
 ) -> Result<PathBuf, TrainError> {
     let training = Training::on(request, experience)?;
     let folder = RunFolder::create(out, &training.snapshot().manifest, request.seed, COLUMNS)?;
-    let _held = run_folder::lock(out)?;
     run(training, folder, report)
 }
 
@@ -63,7 +58,7 @@ pub fn resume_on(
     threads: usize,
     report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
-    let _held = run_folder::lock(path)?;
+    let held = run_folder::lock(path)?;
     let file = checkpoint::path_in(path);
     let training = Training::resume_on(Checkpoint::load(&file)?, &file, experience, steps, threads)?;
     let manifest = &training.snapshot().manifest;
@@ -77,7 +72,7 @@ pub fn resume_on(
     if let (true, Ok(snapshot)) = (training.is_done(), run_folder::snapshot_of(path)) {
         return Ok(snapshot);
     }
-    let folder = RunFolder::reopen(path, COLUMNS, manifest.steps, manifest.version)?;
+    let folder = RunFolder::reopen(path, held, COLUMNS, manifest.steps, manifest.version)?;
     run(training, folder, report)
 }
 
@@ -86,26 +81,34 @@ fn run(
     mut folder: RunFolder,
     mut report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
-    let every = (training.total / 10).max(1);
-    let (mut next_save, mut saved) = (every, Instant::now());
-    let mut go_on = true;
-    while go_on && !training.is_done() {
-        let progress = match training.step() {
+    while !training.is_done() {
+        let Some(progress) = training.step_in(&mut folder)? else { break };
+        if !report(&progress, training.fraction()) {
+            break;
+        }
+    }
+    training.save(&mut folder)
+}
+
+impl Training {
+    /// [`Training::step`], its row in the run folder, and a checkpoint where one is due on the way; at the end it is the
+    /// caller's to [`save`](Training::save). What was learned is kept when the step fails.
+    ///
+    /// # Errors
+    /// [`TrainError`].
+    pub fn step_in(&mut self, folder: &mut RunFolder) -> Result<Option<Progress>, TrainError> {
+        let progress = match self.step() {
             Ok(Some(progress)) => progress,
-            Ok(None) => break,
+            Ok(None) => return Ok(None),
             Err(e) => {
-                // What was learned is kept; the reason is what the caller hears.
-                training.save(&folder)?;
+                self.save(folder)?;
                 return Err(e);
             }
         };
-        folder.row(&training.row(&progress))?;
-        go_on = report(&progress, training.fraction());
-        if progress.steps >= next_save || saved.elapsed().as_secs_f64() > SAVE_SECONDS {
-            training.save(&folder)?;
-            next_save = (progress.steps / every + 1) * every;
-            saved = Instant::now();
+        folder.row(&self.row(&progress))?;
+        if !self.is_done() && folder.is_due(progress.steps, self.total) {
+            self.save(folder)?;
         }
+        Ok(Some(progress))
     }
-    training.save(&folder)
 }
