@@ -123,9 +123,10 @@ impl<'a> Search<'a> {
         self.sample();
         self.dynamics.mass(&self.q, &mut self.mass);
         self.dynamics.nle(&self.q, &self.v, &mut self.nle);
-        self.dynamics.passive(&self.q, &self.v, &mut self.passive);
+        self.dynamics.passive_over(self.period, &self.q, &self.v, &mut self.passive);
         let nv = self.v.len();
         for &i in self.controllable {
+            self.mass[i * nv + i] += self.period.resistance(self.model, i);
             let effort = self.limits.effort[i];
             let still = (self.nle[i] - self.passive[i]).abs();
             let moving: f64 =

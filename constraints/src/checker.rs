@@ -54,7 +54,6 @@ pub struct Checker {
     excess: Vec<f64>,
     a: Vec<f64>,
     tau: Vec<f64>,
-    passive: Vec<f64>,
 }
 
 /// Rows of one limit: which one, whether they are hard and switched on, their first row's number.
@@ -116,7 +115,6 @@ impl Checker {
             consistency,
             a: zero(),
             tau: zero(),
-            passive: zero(),
         })
     }
 
@@ -243,12 +241,9 @@ impl Checker {
         }
     }
 
-    /// `tau = rnea(q, v, (v' - v) / T) - passive - external`.
+    /// [`Dynamics::motors`] less the external forces.
     fn motors(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
-        self.dynamics.rnea(q, v, &self.a, &mut self.tau);
-        self.dynamics.passive(q, v, &mut self.passive);
-        for ((tau, passive), external) in self.tau.iter_mut().zip(&self.passive).zip(external) {
-            *tau -= passive + external;
-        }
+        self.dynamics.motors(&self.period, q, v, &self.a, &mut self.tau);
+        self.tau.iter_mut().zip(external).for_each(|(tau, external)| *tau -= external);
     }
 }

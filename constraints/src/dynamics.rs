@@ -2,6 +2,7 @@
 
 use crate::Model;
 use crate::pinocchio::{self, RawData};
+use crate::viability::Period;
 use std::ffi::c_int;
 
 /// Scratch of one thread. Nothing below allocates; a slice of the wrong length panics, and where Pinocchio throws
@@ -12,13 +13,15 @@ pub struct Dynamics {
     model: Model,
     scratch: RawData,
     lengths: (usize, usize),
+    passive: Vec<f64>,
 }
 
 impl Dynamics {
     /// Scratch for `model`.
     pub fn new(model: &Model) -> Dynamics {
         let lengths = (model.nq(), model.nv());
-        Dynamics { scratch: RawData::new(model.raw()), model: model.clone(), lengths }
+        let passive = vec![0.0; lengths.1];
+        Dynamics { scratch: RawData::new(model.raw()), model: model.clone(), lengths, passive }
     }
 
     /// Inverse dynamics `tau = M a + nle`, without the passive forces: a motor supplies `tau - passive`.
@@ -72,15 +75,38 @@ impl Dynamics {
     ///
     /// Springs act on joints with one dof; a free or ball joint has dampers only.
     pub fn passive(&self, q: &[f64], v: &[f64], passive: &mut [f64]) {
+        self.passive_after(0.0, q, v, passive);
+    }
+
+    /// [`Dynamics::passive`] on average over a period without acceleration: springs meet the configuration half a period less half a
+    /// sub-step later. Constant acceleration adds [`Period::resistance`].
+    pub fn passive_over(&self, period: &Period, q: &[f64], v: &[f64], passive: &mut [f64]) {
+        self.passive_after(0.5 * (period.dt - period.tau), q, v, passive);
+    }
+
+    fn passive_after(&self, time: f64, q: &[f64], v: &[f64], passive: &mut [f64]) {
         self.check(q, &[v, passive]);
         let m = &self.model;
         for joint in m.joints() {
             for i in joint.idx_v..joint.idx_v + joint.nv {
                 let k = m.stiffness()[i];
-                let spring = if k == 0.0 { 0.0 } else { k * (q[joint.idx_q] - m.spring_reference()[i]) };
+                let at = q[joint.idx_q] + time * v[i];
+                let spring = if k == 0.0 { 0.0 } else { k * (at - m.spring_reference()[i]) };
                 passive[i] = -spring - m.damping()[i] * v[i];
             }
         }
+    }
+
+    /// What the motors supply (nv) to keep acceleration `a` over a period that begins at `q`, `v`, without external forces:
+    /// `tau = rnea(q, v, a) - passive`, springs and dampers as they are on average over the period.
+    pub fn motors(&mut self, period: &Period, q: &[f64], v: &[f64], a: &[f64], tau: &mut [f64]) {
+        self.rnea(q, v, a, tau);
+        let mut passive = std::mem::take(&mut self.passive);
+        self.passive_over(period, q, v, &mut passive);
+        for (i, tau) in tau.iter_mut().enumerate() {
+            *tau += period.resistance(&self.model, i) * a[i] - passive[i];
+        }
+        self.passive = passive;
     }
 
     /// `out = q (+) dq`: the configuration reached from `q` (nq) along the tangent displacement `dq` (nv).

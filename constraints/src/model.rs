@@ -197,8 +197,8 @@ impl Model {
         &self.0.armature
     }
 
-    /// Viscous damping (nv) [N·m·s/rad or N·s/m]. MuJoCo's Euler integrator treats it implicitly: it moves with
-    /// `M + dt * damping` in place of `M`.
+    /// Viscous damping (nv) [N·m·s/rad or N·s/m]. It acts on the velocity during the period:
+    /// [`crate::Period::resistance`].
     pub fn damping(&self) -> &[f64] {
         &self.0.damping
     }

@@ -18,12 +18,26 @@ pub struct Tick<'a> {
     pub period: &'a Period,
     /// Mass matrix (nv x nv, symmetric); zero unless some row has [`Needs::dynamics`].
     pub mass: &'a [f64],
-    /// `nle - passive - external`: what the motors supply beside `M a` (nv); zero unless some row has [`Needs::dynamics`].
+    /// What springs and dampers add to its diagonal for the motors (nv), [`Period::resistance`].
+    pub resistance: &'a [f64],
+    /// `nle - passive - external`: what the motors supply beside `(M + resistance) a` (nv), passive forces on average over the period;
+    /// zero unless some row has [`Needs::dynamics`].
     pub bias: &'a [f64],
     /// Frames and Jacobians at `q`, `v` and zero acceleration; stale unless some row has [`Needs::kinematics`].
     pub kinematics: &'a mut Kinematics,
     /// The tick before, where it is known.
     pub previous: Option<Previous<'a>>,
+}
+
+impl Tick<'_> {
+    /// Writes `g` (nv), by which the force of motor `i` rises for a unit of velocity change: row `i` of `(M + resistance) / T`.
+    pub fn motor(&self, i: usize, g: &mut [f64]) {
+        let (nv, t) = (self.v.len(), self.period.dt);
+        for (g, mass) in g.iter_mut().zip(&self.mass[i * nv..(i + 1) * nv]) {
+            *g = mass / t;
+        }
+        g[i] += self.resistance[i] / t;
+    }
 }
 
 /// What the tick before asked of the robot.

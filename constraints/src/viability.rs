@@ -12,7 +12,7 @@
 //! Control of Robot Manipulators", RA-L 2018. The familiar `v' <= sqrt(2 A d)` is the same parabola at the wrong end
 //! of the step, and conflicts with the acceleration limit near the position limit.
 
-use crate::LimitSet;
+use crate::{LimitSet, Model};
 
 /// What set a bound, or what a violation violates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -129,6 +129,15 @@ impl Period {
         let n = f64::from(sub_steps);
         let (tau, kappa) = if sub_steps == 0 { (0.0, 0.5) } else { (dt / n, (n + 1.0) / (2.0 * n)) };
         Period { dt, sub_steps, tau, kappa }
+    }
+
+    /// What the damper and the spring of dof `i` add to the mass matrix's diagonal when the acceleration is constant over the period:
+    /// `kappa T D + (T^2 - tau^2) / 6 K`, for they meet the velocity `v + kappa T a` and the configuration
+    /// `q + (T - tau) / 2 v + (T^2 - tau^2) / 6 a` on average. With one sub-step it is `T D`: MuJoCo's Euler step, which is implicit in the
+    /// damping.
+    pub fn resistance(&self, model: &Model, i: usize) -> f64 {
+        let (t, tau) = (self.dt, self.tau);
+        self.kappa * t * model.damping()[i] + (t * t - tau * tau) / 6.0 * model.stiffness()[i]
     }
 }
 

@@ -12,6 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 
 
+class NoCommonSteps(ValueError):
+    """Curves of which one ends before another begins."""
+
+
 class Band(NamedTuple):
     """A curve over seeds: ``steps``, ``centre``, ``low`` and ``high``, each (n_points); ``seeds`` (n_seeds x n_points)."""
 
@@ -70,7 +74,7 @@ def over_seeds(curves: Sequence[tuple[ArrayLike, ArrayLike]], points: int = 200)
         raise ValueError("no curve has a finite point")
     start, end = max(s[0] for s, _ in cleaned), min(s[-1] for s, _ in cleaned)
     if end < start:
-        raise ValueError(f"the curves have no steps in common: one begins at {start:g}, another ends at {end:g}")
+        raise NoCommonSteps(f"the curves have no steps in common: one begins at {start:g}, another ends at {end:g}")
     grid = np.linspace(start, end, points)
     seeds = np.stack([np.interp(grid, s, v) for s, v in cleaned])
     centre = interquartile_mean(seeds)

@@ -30,7 +30,7 @@ class PID2:
         task: Name of the task, one of ``nearl.tasks()``, or a task file (TOML).
         algo: ``"pid2-ib"``, ``"pid2-gan"``, ``"nearl"`` or ``"ppo"``; see ``nearl train --help``.
         seed: Of everything random; the same seed gives the same weights whatever the number of threads.
-        threads: All cores by default.
+        threads: At least 1; all cores by default.
         settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.scale": 0.8}``.
         run: Run folder to write as ``nearl train`` does; none by default.
 
@@ -50,8 +50,9 @@ class PID2:
         run: str | os.PathLike[str] | None = None,
     ):
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
-        threads = threads or os.cpu_count() or 1
-        self._training: _core.Training | None = _core.Training(os.fspath(task), algo, seed, threads, overrides, run)
+        if not 0 <= seed < 2**64:
+            raise ValueError(f"seed is {seed}; give a whole number from 0 to 2**64 - 1")
+        self._training: _core.Training | None = _core.Training(os.fspath(task), algo, seed, _threads(threads), overrides, run)
         self.task, self.algo, self.seed = self._training.task, algo, seed
         self._begin(self._training.controller())
 
@@ -155,11 +156,17 @@ class PID2:
         agent = cls.__new__(cls)
         agent._training, agent.seed = None, 0
         if (Path(path) / "checkpoints" / "resume.safetensors").is_file():
-            agent._training = _core.Training.resume(path, threads or os.cpu_count() or 1)
+            agent._training = _core.Training.resume(path, _threads(threads))
         controller = _core.Controller.load(path) if agent._training is None else agent._training.controller()
         agent.task, agent.algo = controller.task, controller.algo
         agent._begin(controller)
         return agent
+
+
+def _threads(threads: int | None) -> int:
+    if threads is not None and threads < 1:
+        raise ValueError(f"threads is {threads}; give at least 1, or leave it out for all cores")
+    return threads or os.cpu_count() or 1
 
 
 def _toml(value: Any) -> str:

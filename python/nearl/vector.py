@@ -108,6 +108,8 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         answer = np.asarray(function(self._obs, actions, reached))
         if answer.shape != (self.num_envs,):
             raise ValueError(f"{name}(obs, actions, next_obs) gave shape {answer.shape}; give one value an environment, ({self.num_envs},)")
+        if dtype is bool and answer.dtype != bool:
+            raise ValueError(f"{name}(obs, actions, next_obs) gave {answer.dtype} values, such as {answer[0]!r}; give True or False, e.g. `next_obs[:, 0] > 1`")
         if dtype is float and not np.isfinite(answer.astype(float)).all():
             i = int(np.flatnonzero(~np.isfinite(answer.astype(float)))[0])
             raise ValueError(f"{name}(obs, actions, next_obs)[{i}] is {answer[i]}: every entry must be finite")

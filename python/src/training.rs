@@ -15,7 +15,9 @@ use crate::errors;
 
 struct Inner {
     training: train::Training,
-    /// Open between `begin` and `end`.
+    /// Between `begin` and `end`.
+    learns: bool,
+    /// Open meanwhile.
     folder: Option<RunFolder>,
 }
 
@@ -68,6 +70,9 @@ impl Training {
     fn begin(&self, py: Python<'_>, steps: u64) -> PyResult<()> {
         py.detach(|| {
             let mut inner = self.lock();
+            if inner.learns {
+                return Err(errors::value("this agent is learning already, in another thread; wait for its end"));
+            }
             let manifest = &inner.training.snapshot().manifest;
             if let Some(out) = &self.out {
                 let held = run_folder::lock(out).map_err(run)?;
@@ -87,6 +92,7 @@ impl Training {
                 inner.folder = Some(folder.map_err(run)?);
             }
             inner.training.extend(steps);
+            inner.learns = true;
             Ok(())
         })
     }
@@ -95,7 +101,7 @@ impl Training {
     fn iterate<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let row = py.detach(|| {
             let mut inner = self.lock();
-            let Inner { training, folder } = &mut *inner;
+            let Inner { training, folder, .. } = &mut *inner;
             let progress = match folder {
                 Some(folder) => training.step_in(folder),
                 None => training.step(),
@@ -115,6 +121,7 @@ impl Training {
     fn end(&self, py: Python<'_>) -> PyResult<()> {
         py.detach(|| {
             let mut inner = self.lock();
+            inner.learns = false;
             let Some(mut folder) = inner.folder.take() else { return Ok(()) };
             inner.training.save(&mut folder).map(drop).map_err(errors::train)
         })
@@ -147,7 +154,7 @@ impl Training {
 impl Training {
     fn of(training: train::Training, out: Option<PathBuf>) -> Training {
         let task = training.snapshot().manifest.task.name.clone();
-        Training { inner: Mutex::new(Inner { training, folder: None }), task, out }
+        Training { inner: Mutex::new(Inner { training, learns: false, folder: None }), task, out }
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {

@@ -173,3 +173,25 @@ def test_a_reward_that_is_not_a_number_ends_the_learning(tmp_path: Path) -> None
     with pytest.raises(ValueError, match="nothing can be learned from it"):
         agent.learn(2048)
     assert (tmp_path / "run/checkpoints/resume.safetensors").is_file()
+
+
+def test_numbers_that_no_training_has_are_refused() -> None:
+    for wrong in ({"seed": -1}, {"seed": 2**64}, {"threads": 0}):
+        name, value = next(iter(wrong.items()))
+        with pytest.raises(ValueError, match=f"{name} is {value}"):
+            nearl.PID2(CART_POLE, **wrong)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"\[train.n_envs\] = 16, \[train.n_steps\] = 1000000000.*give fewer"):
+        nearl.PID2(CART_POLE, settings={"train.n_envs": 16, "train.n_steps": 1_000_000_000})
+
+
+def test_a_second_learn_at_the_same_time_is_refused() -> None:
+    agent = nearl.PID2(CART_POLE, algo="ppo", threads=1)
+    refused: list[str] = []
+
+    def again(*_: object) -> None:
+        with pytest.raises(ValueError, match="learning already") as error:
+            agent.learn(1024)
+        refused.append(str(error.value))
+
+    agent.learn(1024, callback=again)
+    assert refused and agent.num_timesteps == 1024

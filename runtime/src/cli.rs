@@ -15,7 +15,7 @@ pub use limits::LimitOptions;
 /// Run a snapshot on a plant in real time.
 #[derive(Args, Debug)]
 pub struct RunCommand {
-    /// Snapshot file.
+    /// Run folder or snapshot file.
     pub snapshot: PathBuf,
     /// Name of the plant.
     #[arg(long)]

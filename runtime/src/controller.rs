@@ -134,7 +134,8 @@ impl Controller {
         let (inverse, action_log_std) = match (kind, m.task.idm.kind, &n.idm) {
             (PolicyKind::Direct, ..) => (Inverse::Direct, n.policy_log_std.clone()),
             (_, IdmKind::Pinocchio, _) => {
-                (Inverse::Analytic(AnalyticIdm::new(&model, layout.controllable())), vec![0.0; n_act])
+                let idm = AnalyticIdm::new(&model, layout.controllable(), m.task.period());
+                (Inverse::Analytic(idm), vec![0.0; n_act])
             }
             (_, IdmKind::Learned, Some((net, log_std))) => {
                 let seen = seen_entries(m, &layout)?;

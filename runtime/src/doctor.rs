@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use nearl_constraints::{Braking, Period, certify_braking};
+use nearl_constraints::{Braking, Model, certify_braking};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
@@ -13,12 +13,12 @@ use crate::codes::CheckCode;
 use crate::controller::{Controller, Parts};
 use crate::link::{RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, remains};
 use crate::rt::{Pilot, ThreadSettings, bench_wake, prepare};
-use crate::snapshot::Snapshot;
+use crate::snapshot::{Manifest, Snapshot, in_run};
 
 /// Check that a snapshot, this machine and a plant are ready.
 #[derive(Args, Debug)]
 pub struct DoctorCommand {
-    /// Snapshot file.
+    /// Run folder or snapshot file.
     pub snapshot: PathBuf,
     /// Name of a plant the snapshot is to drive.
     #[arg(long)]
@@ -68,7 +68,7 @@ impl DoctorCommand {
     /// # Errors
     /// One sentence naming the checks that failed.
     pub fn run(self) -> Result<(), Failure> {
-        let checks = examine(&self.snapshot, self.plant.as_deref());
+        let checks = examine(&in_run(&self.snapshot), self.plant.as_deref());
         let failed: Vec<&str> =
             checks.iter().filter(|c| c.finding == Finding::Fail).map(|c| c.check).collect();
         if self.json {
@@ -132,23 +132,29 @@ fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
             return (None, checks);
         }
     }
-    checks.push(braking(&snapshot));
+    match Parts::new(&snapshot.manifest) {
+        Ok(parts) => checks.extend([notes(&parts.model), braking(&snapshot.manifest, parts)]),
+        Err(e) => checks.push(fail(CheckCode::Braking, e.to_string())),
+    }
     (Some(snapshot), checks)
 }
 
+/// What the robot file has that projection and inverse dynamics do not reckon with.
+fn notes(model: &Model) -> Check {
+    match model.notes() {
+        [] => ok(CheckCode::Model, "the model holds what the robot file describes".into()),
+        notes => warn(CheckCode::Model, notes.join("; ")),
+    }
+}
+
 /// Can the motors give the decelerations that the position limits count on?
-fn braking(snapshot: &Snapshot) -> Check {
-    let m = &snapshot.manifest;
-    let parts = match Parts::new(m) {
-        Ok(parts) => parts,
-        Err(e) => return fail(CheckCode::Braking, e.to_string()),
-    };
+fn braking(m: &Manifest, parts: Parts) -> Check {
     let Parts { model, layout, projector } = parts;
     let (limits, controllable) = (projector.limits(), layout.controllable());
     if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {
         return ok(CheckCode::Braking, "the task has no torque limit, so there is nothing to certify".into());
     }
-    let period = Period::new(m.task.time.dt, m.task.sub_steps() as u32);
+    let period = m.task.period();
     let (samples, seed) = SAMPLES;
     match certify_braking(&model, limits, controllable, &period, samples, seed) {
         Err(e) => fail(CheckCode::Braking, e.to_string()),

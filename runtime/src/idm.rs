@@ -2,7 +2,7 @@
 
 use crate::net::Forward;
 use crate::normaliser::CLIP;
-use nearl_constraints::{Dynamics, Model, StateLayout, Target};
+use nearl_constraints::{Dynamics, Model, Period, StateLayout, Target};
 
 /// A Gaussian network I(a | s_c, s'_c): the mean action from the observation entries of S_c and their
 /// projected change, both in network space.
@@ -38,33 +38,26 @@ impl LearnedIdm {
     }
 }
 
-/// Recursive Newton-Euler on the robot model: `tau = M(q) a + nle(q, v) - tau_passive(q, v)`
-/// with `a = (v' - v) / dt` (Featherstone 2008; through Pinocchio).
+/// Recursive Newton-Euler on the robot model: `tau = M(q) a + nle(q, v) - tau_passive` with `a = (v' - v) / dt` (Featherstone 2008; through
+/// Pinocchio), springs and dampers on average over the period ([`Dynamics::motors`]).
 pub struct AnalyticIdm {
     dynamics: Dynamics,
     dofs: Vec<usize>,
+    period: Period,
     tau: Vec<f64>,
-    passive: Vec<f64>,
 }
 
 impl AnalyticIdm {
-    /// Actions are the torques of `dofs`, in that order.
-    pub fn new(model: &Model, dofs: &[usize]) -> Self {
-        let nv = model.nv();
-        Self {
-            dynamics: Dynamics::new(model),
-            dofs: dofs.to_vec(),
-            tau: vec![0.0; nv],
-            passive: vec![0.0; nv],
-        }
+    /// Actions are the torques of `dofs`, in that order, held over `period`.
+    pub fn new(model: &Model, dofs: &[usize], period: Period) -> Self {
+        Self { dynamics: Dynamics::new(model), dofs: dofs.to_vec(), period, tau: vec![0.0; model.nv()] }
     }
 
     /// Torque in [N m] or [N] that takes (q, v) to `target`, written to `action` (n_act).
     pub fn torque(&mut self, q: &[f64], v: &[f64], target: &Target, action: &mut [f64]) {
-        self.dynamics.rnea(q, v, &target.acceleration, &mut self.tau);
-        self.dynamics.passive(q, v, &mut self.passive);
+        self.dynamics.motors(&self.period, q, v, &target.acceleration, &mut self.tau);
         for (a, &d) in action.iter_mut().zip(&self.dofs) {
-            *a = self.tau[d] - self.passive[d];
+            *a = self.tau[d];
         }
     }
 }

@@ -11,7 +11,7 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Version of the file format.
 pub const FORMAT: u32 = 1;
@@ -220,6 +220,12 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     file.write_all(bytes)?;
     file.sync_all()?;
     std::fs::rename(&beside, path)
+}
+
+/// The snapshot file in a run folder of `nearl train`, its final one, else its latest; any other path as it is.
+pub fn in_run(path: &Path) -> PathBuf {
+    let file = |name: &str| path.join("checkpoints").join(format!("{name}.safetensors"));
+    ["final", "latest"].into_iter().map(file).find(|p| p.is_file()).unwrap_or_else(|| path.into())
 }
 
 impl Snapshot {

@@ -2,7 +2,8 @@
 //!
 //! An unknown key, a wrong type or a value out of range is one sentence with file, line and key.
 
-use nearl_constraints::ConstraintSettings;
+use crate::snapshot::ModelFormat;
+use nearl_constraints::{ConstraintSettings, Period};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -20,6 +21,7 @@ pub struct Task {
     /// Periods.
     pub time: TimeSection,
     /// Observation, proposal and controllable subset.
+    #[serde(default)]
     pub state: StateSection,
     /// Named expressions whose sum is the reward: makes the task an environment of its own. These four sections are kept for
     /// the trainer, which reads and checks them.
@@ -58,6 +60,14 @@ pub struct ModelSection {
     pub free_flyer: bool,
 }
 
+impl ModelSection {
+    /// The robot file and its language; none where the section names no file, which [`Task::parse`] refuses.
+    pub fn file(&self) -> Option<(&str, ModelFormat)> {
+        let urdf = self.urdf.as_deref().map(|file| (file, ModelFormat::Urdf));
+        urdf.or(self.mjcf.as_deref().map(|file| (file, ModelFormat::Mjcf)))
+    }
+}
+
 /// `[time]`.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
@@ -75,7 +85,7 @@ pub struct TimeSection {
 }
 
 /// `[state]`: entries by name, see [`nearl_constraints::StateLayout`].
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Default, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct StateSection {
     /// Every observation entry, in the environment's order; the environment's own names when absent.
@@ -203,6 +213,11 @@ impl Task {
     /// Physics sub-steps in one control period; 0 for a zero-order-hold plant.
     pub fn sub_steps(&self) -> usize {
         if self.time.sim_dt == 0.0 { 0 } else { (self.time.dt / self.time.sim_dt).round() as usize }
+    }
+
+    /// The control period with its sub-steps.
+    pub fn period(&self) -> Period {
+        Period::new(self.time.dt, self.sub_steps() as u32)
     }
 
     fn checked(self, file: &str) -> Result<Self, TaskError> {

@@ -90,6 +90,14 @@ impl Cli {
     }
 }
 
+/// A number of threads or jobs.
+pub(crate) fn at_least_one(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(0) | Err(_) => Err(format!("'{text}' is not a whole number above 0; leave it out for all cores")),
+        Ok(n) => Ok(n),
+    }
+}
+
 /// Cores of this machine.
 pub(crate) fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)

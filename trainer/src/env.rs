@@ -330,11 +330,7 @@ fn check_robot(task: &Task, text: &str, env: &dyn Env, origin: &str) -> Result<(
     if text == env.model_text() {
         return Ok(());
     }
-    let (file, format) = match (&task.model.urdf, &task.model.mjcf) {
-        (Some(file), _) => (file, ModelFormat::Urdf),
-        (None, Some(file)) => (file, ModelFormat::Mjcf),
-        (None, None) => return Ok(()),
-    };
+    let Some((file, format)) = task.model.file() else { return Ok(()) };
     let read = |text: &str, format| match format {
         ModelFormat::Urdf => nearl_runtime::constraints::Model::from_urdf_text(text),
         ModelFormat::Mjcf => nearl_runtime::constraints::Model::from_mjcf_text(text),

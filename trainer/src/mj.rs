@@ -48,14 +48,7 @@ pub enum MjError {
     NoBody(String),
 }
 
-/// Language of a robot file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ModelFormat {
-    /// MuJoCo's own XML.
-    Mjcf,
-    /// Unified Robot Description Format.
-    Urdf,
-}
+pub use nearl_runtime::snapshot::ModelFormat;
 
 /// What of a robot file's simulation settings to replace. The default replaces nothing.
 #[derive(Debug, Clone, Copy, Default)]
@@ -64,8 +57,6 @@ pub struct Options {
     pub sim_dt: Option<f64>,
     /// Leave contacts out.
     pub without_contacts: bool,
-    /// Integrate joint damping explicitly, so that Euler's step is `v' = v + sim_dt * a` to the last bit.
-    pub explicit_damping: bool,
 }
 
 /// Kind of a joint.
@@ -142,12 +133,9 @@ impl Model {
         if let Some(sim_dt) = options.sim_dt {
             opt.timestep = sim_dt;
         }
-        use mujoco_rs::mujoco_c::mjtDisableBit::{mjDSBL_CONTACT, mjDSBL_EULERDAMP};
+        use mujoco_rs::mujoco_c::mjtDisableBit::mjDSBL_CONTACT;
         if options.without_contacts {
             opt.disableflags |= mjDSBL_CONTACT as i32;
-        }
-        if options.explicit_damping {
-            opt.disableflags |= mjDSBL_EULERDAMP as i32;
         }
         Ok(Model(Arc::new(model)))
     }

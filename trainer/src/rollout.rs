@@ -29,6 +29,20 @@ pub enum RolloutError {
     /// The snapshot.
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
+    /// More environments or steps than fit into memory.
+    #[error(
+        "[train.n_envs] = {n_envs}, [train.n_steps] = {n_steps}: {what} would take more memory than the {free} MB that are free; give fewer"
+    )]
+    Memory {
+        /// Environments.
+        n_envs: usize,
+        /// Steps of each.
+        n_steps: usize,
+        /// What does not fit.
+        what: String,
+        /// Free memory [MB].
+        free: u64,
+    },
     /// The task's observation is not the environment's.
     #[error(
         "task '{task}' observes {task_says}, but its environment gives {env_says}; leave state.observation out to use the environment's"
@@ -70,6 +84,16 @@ pub fn make_env(snapshot: &Snapshot) -> Result<Box<dyn Env>, RolloutError> {
     Ok(env)
 }
 
+/// Memory that is free, and all there is [MB]; nothing where the system does not say.
+fn memory() -> Option<[u64; 2]> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let of = |key: &str| {
+        let line = text.lines().find_map(|l| l.strip_prefix(key))?;
+        Some(line.trim_end_matches("kB").trim().parse::<u64>().ok()? >> 10)
+    };
+    Some([of("MemAvailable:")?, of("MemTotal:")?])
+}
+
 impl Collector {
     /// `n_envs` environments that collect `n_steps` policy steps each, on `threads` threads.
     ///
@@ -84,9 +108,25 @@ impl Collector {
         seed: u64,
     ) -> Result<Self, RolloutError> {
         let first = make_env(snapshot)?;
-        let workers = (0..n_envs)
-            .map(|i| Ok(Mutex::new(Worker::new(first.another()?, snapshot, gamma, stream(seed, i as u64))?)))
-            .collect::<Result<Vec<_>, RolloutError>>()?;
+        // Float32 numbers of a row, in the workers and once more in the batch.
+        let row =
+            8 * (first.spec().n_obs() + 6 * (first.spec().nq + first.spec().nv) + 3 * first.spec().n_act());
+        let batch = (n_envs as u64).saturating_mul(n_steps as u64).saturating_mul(row as u64) >> 20;
+        let (mut workers, full) =
+            (Vec::new(), |what: String, free| RolloutError::Memory { n_envs, n_steps, what, free });
+        for i in 0..n_envs {
+            if let Some([free, total]) = (i % 64 == 0).then(memory).flatten()
+                && free < batch + total / 16
+            {
+                let what = if i == 0 {
+                    format!("a batch of {batch} MB")
+                } else {
+                    format!("environments after the first {i}")
+                };
+                return Err(full(what, free));
+            }
+            workers.push(Mutex::new(Worker::new(first.another()?, snapshot, gamma, stream(seed, i as u64))?));
+        }
         Ok(Self { workers, threads: threads.clamp(1, n_envs.max(1)), n_steps })
     }
 

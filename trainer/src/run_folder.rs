@@ -1,6 +1,6 @@
 //! The run folder: `task.toml metrics.csv env.json checkpoints/` and the robot file of one training.
 
-use nearl_runtime::snapshot::write_whole;
+use nearl_runtime::snapshot::{in_run, write_whole};
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -11,7 +11,9 @@ use std::time::Instant;
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// Creating or writing.
-    #[error("cannot write '{path}': {reason}; give another folder with --out")]
+    #[error(
+        "cannot write '{path}': {reason}; make it writable, or give another folder (a run that is to go on can be copied there)"
+    )]
     Write {
         /// File or folder.
         path: String,
@@ -60,6 +62,15 @@ pub fn task_file(manifest: &Manifest) -> (String, String) {
         file.clone_from(&name);
     }
     (task.to_toml(), name)
+}
+
+/// Whether something was learned there: a row of metrics, or a checkpoint.
+fn holds_a_run(path: &Path) -> bool {
+    let rows = |text: String| text.lines().count() > 1;
+    let has = |name: &str| path.join("checkpoints").join(name).exists();
+    std::fs::read_to_string(path.join("metrics.csv"))
+        .map_or_else(|e| e.kind() != std::io::ErrorKind::NotFound, rows)
+        || ["resume", "final", "latest"].iter().any(|name| has(&format!("{name}.safetensors")))
 }
 
 /// Holds a run folder until the file is dropped: two trainings would mix their rows. What is locked is `env.json`, which is never written
@@ -117,7 +128,8 @@ impl RunFolder {
             path: p.display().to_string(),
             reason: e.to_string(),
         };
-        if path.join("metrics.csv").exists() {
+        drop(lock(path)?);
+        if holds_a_run(path) {
             return Err(RunError::Exists { path: path.display().to_string() });
         }
         let checkpoints = path.join("checkpoints");
@@ -247,12 +259,8 @@ pub fn snapshot_of(run: &Path) -> Result<PathBuf, RunError> {
             if run.exists() { "it is neither a folder nor a regular file" } else { "it does not exist" };
         return Err(RunError::Read { path: run.display().to_string(), reason: reason.into() });
     }
-    ["final", "latest"]
-        .iter()
-        .map(|n| run.join("checkpoints").join(format!("{n}.safetensors")))
-        .find(|p| p.is_file())
-        .ok_or_else(|| RunError::Read {
-            path: run.display().to_string(),
-            reason: "it has no checkpoints/final.safetensors or latest.safetensors".into(),
-        })
+    let file = in_run(run);
+    let reason = "it has no checkpoints/final.safetensors or latest.safetensors";
+    let none = || RunError::Read { path: run.display().to_string(), reason: reason.into() };
+    if file.is_file() { Ok(file) } else { Err(none()) }
 }

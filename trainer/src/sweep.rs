@@ -208,10 +208,9 @@ impl Sweep {
 
 /// Nothing in it but what a run makes before its task file.
 fn is_empty(folder: &Path) -> bool {
-    let inside =
-        |at: &Path| std::fs::read_dir(at).map(|d| d.flatten().map(|e| e.file_name()).collect::<Vec<_>>());
-    let names = inside(folder).unwrap_or_default();
-    names.iter().all(|n| n == "checkpoints")
-        && inside(&folder.join("checkpoints")).is_ok_and(|n| n.is_empty())
-        || names.is_empty()
+    let is_bare = |at: &Path, but: &str| {
+        std::fs::read_dir(at).is_ok_and(|mut inside| inside.all(|e| e.is_ok_and(|e| e.file_name() == but)))
+    };
+    let checkpoints = folder.join("checkpoints");
+    is_bare(folder, "checkpoints") && (!checkpoints.exists() || is_bare(&checkpoints, ""))
 }

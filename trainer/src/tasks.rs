@@ -2,7 +2,7 @@
 
 use crate::env::{self, Env, EnvError};
 use nearl_runtime::net::Activation;
-use nearl_runtime::snapshot::{FORMAT, ModelFormat};
+use nearl_runtime::snapshot::FORMAT;
 use nearl_runtime::task::{Task, TaskError};
 use nearl_runtime::{Manifest, PolicyKind};
 use std::path::Path;
@@ -40,6 +40,12 @@ pub enum TaskLoadError {
         /// Bundled names.
         all: String,
     },
+    /// A robot file in place of a task file.
+    #[error("'{file}' is a robot file; give the TOML task file that names it under [model]")]
+    NoTask {
+        /// As given.
+        file: String,
+    },
     /// The robot file of the task.
     #[error(
         "task '{task}' names the robot file '{robot}', which cannot be read: {reason}; give a path relative to the task file"
@@ -73,6 +79,9 @@ pub fn robot(name: &str) -> Option<&'static str> {
 pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError> {
     let path = Path::new(task);
     let bundled = TASKS.iter().find(|(n, _)| n.trim_end_matches(".toml") == task);
+    if path.extension().is_some_and(|e| ["xml", "urdf", "mjcf"].iter().any(|robot| e == *robot)) {
+        return Err(TaskLoadError::NoTask { file: task.into() });
+    }
     let parsed = match bundled {
         Some((name, text)) => Task::parse(name, text, overrides)?,
         None if path.extension().is_some_and(|e| e == "toml") || path.exists() => {
@@ -80,13 +89,11 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
         }
         None => return Err(unknown(task)),
     };
-    let (file, model_format) = match (&parsed.model.urdf, &parsed.model.mjcf) {
-        (Some(f), _) => (f.clone(), ModelFormat::Urdf),
-        (None, Some(f)) => (f.clone(), ModelFormat::Mjcf),
-        (None, None) => unreachable!("Task::parse requires one of them"),
+    let Some((file, model_format)) = parsed.model.file() else {
+        unreachable!("Task::parse requires a robot file")
     };
-    let beside = path.parent().unwrap_or(Path::new(".")).join(&file);
-    let model = match robot(&file) {
+    let beside = path.parent().unwrap_or(Path::new(".")).join(file);
+    let model = match robot(file) {
         Some(text) if bundled.is_some() || !beside.exists() => text.to_string(),
         _ => std::fs::read_to_string(&beside).map_err(|e| TaskLoadError::Robot {
             task: parsed.name.clone(),

@@ -217,6 +217,14 @@ impl Training {
         }
         let mut tally = Tally::default();
         self.source.gathered().iter().for_each(|g| tally.add(&g.tally));
+        if tally.faults > 0 && tally.faults >= tally.ticks {
+            let task = &self.snapshot.manifest.task.name;
+            return Err(TrainError::Settings(format!(
+                "the physics of '{task}' failed in all {} control periods of a batch, and nothing can be learned from it; look at [reset] and at \
+                 the robot file's timestep",
+                tally.ticks
+            )));
+        }
         self.recent.extend_from_slice(&tally.episodes);
         let excess = self.recent.len().saturating_sub(100);
         self.recent.drain(..excess);

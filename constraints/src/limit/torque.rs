@@ -113,11 +113,8 @@ impl Rows for TorqueRows {
     }
 
     fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
-        let nv = tick.v.len();
         for (r, &(i, effort, _)) in self.motors.iter().enumerate() {
-            for (g, mass) in rows.row(r).iter_mut().zip(&tick.mass[i * nv..(i + 1) * nv]) {
-                *g = mass / tick.period.dt;
-            }
+            tick.motor(i, rows.row(r));
             (rows.lower[r], rows.upper[r]) = (-effort - tick.bias[i], effort - tick.bias[i]);
         }
     }

@@ -78,11 +78,10 @@ impl Rows for TorqueRateRows {
 
     fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
         let Some(previous) = tick.previous else { return };
-        let (nv, t) = (tick.v.len(), tick.period.dt);
+        let t = tick.period.dt;
         for (r, &(i, limit, _)) in self.dofs.iter().enumerate() {
-            for (g, mass) in rows.row(r).iter_mut().zip(&tick.mass[i * nv..(i + 1) * nv]) {
-                *g = mass / (t * t);
-            }
+            tick.motor(i, rows.row(r));
+            rows.row(r).iter_mut().for_each(|g| *g /= t);
             let still = (tick.bias[i] - previous.torque[i]) / t;
             (rows.lower[r], rows.upper[r]) = (-limit - still, limit - still);
         }

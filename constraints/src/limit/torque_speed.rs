@@ -95,12 +95,9 @@ impl Rows for TorqueSpeedRows {
     }
 
     fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
-        let nv = tick.v.len();
         for (r, m) in self.motors.iter().enumerate() {
             let i = m.dof;
-            for (g, mass) in rows.row(r).iter_mut().zip(&tick.mass[i * nv..(i + 1) * nv]) {
-                *g = mass / tick.period.dt;
-            }
+            tick.motor(i, rows.row(r));
             rows.row(r)[i] += m.slope;
             let still = tick.bias[i] + m.slope * tick.v[i];
             (rows.lower[r], rows.upper[r]) = (-m.most - still, m.most - still);

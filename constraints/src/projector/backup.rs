@@ -40,7 +40,6 @@ pub(crate) struct Backup {
     v: Vec<f64>,
     a: Vec<f64>,
     tau: Vec<f64>,
-    passive: Vec<f64>,
 }
 
 impl Backup {
@@ -55,7 +54,6 @@ impl Backup {
             v: zero(),
             a: zero(),
             tau: zero(),
-            passive: zero(),
         }
     }
 
@@ -153,12 +151,11 @@ impl Backup {
                 self.q[iq] += v[i].signum() * way;
             }
         }
-        with.dynamics.rnea(&self.q, &self.v, &self.a, &mut self.tau);
-        with.dynamics.passive(&self.q, &self.v, &mut self.passive);
-        with.dofs.controllable.iter().all(|&i| {
-            let motor = self.tau[i] - self.passive[i] - with.external[i];
-            motor.abs() <= SHARE * with.limits.effort[i]
-        })
+        with.dynamics.motors(with.period, &self.q, &self.v, &self.a, &mut self.tau);
+        with.dofs
+            .controllable
+            .iter()
+            .all(|&i| (self.tau[i] - with.external[i]).abs() <= SHARE * with.limits.effort[i])
     }
 }
 

@@ -22,6 +22,7 @@ pub(crate) struct Sources {
 struct Scratch {
     mass: Vec<f64>,
     nle: Vec<f64>,
+    resistance: Vec<f64>,
     bias: Vec<f64>,
     still: Vec<f64>,
 }
@@ -85,7 +86,13 @@ impl Sources {
         let (nv, zero) = (model.nv(), || vec![0.0; model.nv()]);
         let largest = blocks.iter().map(|b| b.sizes.len()).chain(cones.iter().map(|c| c.cone.dimension()));
         let g = vec![0.0; nv * largest.max().unwrap_or(0)];
-        let scratch = Scratch { mass: vec![0.0; nv * nv], nle: zero(), bias: zero(), still: zero() };
+        let scratch = Scratch {
+            mass: vec![0.0; nv * nv],
+            nle: zero(),
+            resistance: zero(),
+            bias: zero(),
+            still: zero(),
+        };
         let outside = vec![false; first];
         Ok(Sources { blocks, cones, needs, scratch, kinematics: Kinematics::new(model), g, outside })
     }
@@ -146,7 +153,10 @@ impl Sources {
         if self.needs.dynamics {
             dynamics.mass(q, &mut s.mass);
             dynamics.nle(q, v, &mut s.nle);
-            dynamics.passive(q, v, &mut s.bias);
+            dynamics.passive_over(period, q, v, &mut s.bias);
+            for (i, r) in s.resistance.iter_mut().enumerate() {
+                *r = period.resistance(dynamics.model(), i);
+            }
             for i in 0..v.len() {
                 s.bias[i] = s.nle[i] - s.bias[i] - measured.external[i];
             }
@@ -154,9 +164,10 @@ impl Sources {
         if self.needs.kinematics {
             self.kinematics.update(q, v, &s.still);
         }
-        let (mass, bias) = (&s.mass[..], &s.bias[..]);
+        let (mass, resistance, bias) = (&s.mass[..], &s.resistance[..], &s.bias[..]);
         let previous = measured.previous;
-        let mut tick = Tick { q, v, period, mass, bias, kinematics: &mut self.kinematics, previous };
+        let mut tick =
+            Tick { q, v, period, mass, resistance, bias, kinematics: &mut self.kinematics, previous };
         let nv = v.len();
         self.outside.fill(false);
         for block in &mut self.blocks {

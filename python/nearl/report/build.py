@@ -79,7 +79,7 @@ def build(
 def _sweep(runs: list[Run], picture: Path) -> str:
     figure = sweep.figure(runs)
     figure.savefig(picture, dpi=170, facecolor="white")
-    return image(figure, sweep.CAPTION) + _table("At the end", sweep.HEAD, sweep.table(runs))
+    return image(figure, sweep.CAPTION) + _table("At the end: means over the last ten rows of a run", sweep.HEAD, sweep.table(runs))
 
 
 def _sections(trained: list[Run], programs: list[Summary], flights: list[Log]) -> list[tuple[str, str]]:

@@ -75,7 +75,10 @@ def _band(axes: Axes, members: list[Run], metric: str, colour: str) -> None:
     if len(found) > 1:
         for steps, values in found:
             axes.plot(steps, values, color=colour, alpha=0.28, linewidth=0.7)
-    band = curves.over_seeds(found)
+    try:
+        band = curves.over_seeds(found)
+    except curves.NoCommonSteps:  # the thin lines say it
+        return
     axes.plot(band.steps, band.centre, color=colour)
     axes.fill_between(band.steps, band.low, band.high, color=colour, alpha=0.18, linewidth=0)
 

@@ -52,7 +52,11 @@ def _band(axes: Axes, members: list[Run], algo: str, colour: str) -> bool:
         return False
     for steps, values in found:
         axes.plot(steps, values, color=colour, alpha=0.28, linewidth=0.8)
-    band = curves.over_seeds(found)
+    try:
+        band = curves.over_seeds(found)
+    except curves.NoCommonSteps:
+        axes.plot([], [], color=colour, label=f"{label}, no steps in common")
+        return False
     axes.plot(band.steps, band.centre, color=colour, label=label)
     axes.fill_between(band.steps, band.low, band.high, color=colour, alpha=0.18, linewidth=0)
     return True

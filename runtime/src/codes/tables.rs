@@ -93,6 +93,8 @@ codes! {
         Snapshot = "doctor-snapshot", "Can the snapshot file be read, and is it whole?",
             "Do what the sentence says; `nearl explain` knows its reason.";
         Canary = "doctor-canary", "Do trial states give finite actions?", "Use an earlier snapshot.";
+        Model = "doctor-model", "Does the model hold everything that the robot file describes?",
+            "Take it out of the robot file, or leave a margin for it.";
         Braking = "doctor-braking", "Can the motors give the decelerations that the position limits count on?",
             "Multiply constraints.acceleration.limit by the number in the sentence, or lower constraints.velocity.scale.";
         Memory = "doctor-memory", "Is there room for the links in /dev/shm?", "Free space there or remount it larger.";

@@ -35,12 +35,12 @@ impl Brake {
         let controllable = layout.controllable();
         let joints = model.joints().iter().filter(|j| j.nv == 1 && controllable.contains(&j.idx_v));
         Ok(Some(Brake {
-            idm: AnalyticIdm::new(&model, controllable),
+            idm: AnalyticIdm::new(&model, controllable, manifest.task.period()),
             proposal: Proposal::new(&model),
             target: Target::new(&model),
             joints: joints.map(|j| (j.idx_v, j.idx_q)).collect(),
             range: manifest.action_lower.iter().copied().zip(manifest.action_upper.iter().copied()).collect(),
-            period: Period::new(manifest.task.time.dt, manifest.task.sub_steps() as u32),
+            period: manifest.task.period(),
             action: vec![0.0; manifest.action_lower.len()],
             projector,
         }))

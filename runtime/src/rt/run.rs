@@ -26,7 +26,7 @@ use crate::rt::residual::RollbackSettings;
 use crate::rt::thread::{CountAllocations, ThreadSettings, prepare};
 use crate::rt::tick::{Build, Tick};
 use crate::rt::{Mode, Reason, Stop, swap};
-use crate::snapshot::{Snapshot, SnapshotError};
+use crate::snapshot::{Snapshot, SnapshotError, in_run};
 
 /// Records between loop and I/O thread.
 const RECORDS: usize = 256;
@@ -154,15 +154,16 @@ pub fn connect(name: &RobotName, patience: f64) -> Result<(RuntimeLink, RobotMes
     Ok((link, robot))
 }
 
-/// Runs the snapshot in `file` on the plant named `plant` until `stop`: what `nearl run` does.
+/// Runs the snapshot in `file` (or in the run folder `file`) on the plant named `plant` until `stop`: what `nearl run` does.
 pub fn run(
     settings: &RunSettings,
     file: &Path,
     plant: &RobotName,
     stop: &Stop,
 ) -> Result<RunReport, RunError> {
+    let file = in_run(file);
     let refused = |text: String| RunError::Snapshot(format!("{}: {text}", file.display()));
-    let snapshot = Snapshot::load(file).map_err(|e| match e {
+    let snapshot = Snapshot::load(&file).map_err(|e| match e {
         SnapshotError::Unreadable { .. } => RunError::Snapshot(e.to_string()),
         other => refused(other.to_string()),
     })?;

@@ -1,6 +1,6 @@
 //! `nearl bench serve`: rollouts over shared memory beside as many collected in this process.
 
-use super::{Failure, cores, say};
+use super::{Failure, at_least_one, cores, say};
 use crate::rollout::Collector;
 use crate::run_folder;
 use crate::serve::{Settings, serve};
@@ -30,7 +30,7 @@ pub(super) struct ServeBench {
     #[arg(long, default_value_t = 5)]
     repeat: usize,
     /// Threads of both; all cores if not given.
-    #[arg(long)]
+    #[arg(long, value_parser = at_least_one)]
     threads: Option<usize>,
     /// Print JSON.
     #[arg(long)]

@@ -1,6 +1,6 @@
 //! `nearl serve`: constrained rollouts for other processes.
 
-use super::{Failure, cores, say};
+use super::{Failure, at_least_one, cores, say};
 use crate::run_folder;
 use crate::serve::{Settings, serve};
 use clap::Args;
@@ -19,7 +19,7 @@ pub(super) struct Serve {
     #[arg(long)]
     name: String,
     /// Threads that simulate; all cores if not given.
-    #[arg(long)]
+    #[arg(long, value_parser = at_least_one)]
     threads: Option<usize>,
     /// Requests under way at once; further ones are answered busy.
     #[arg(long, default_value_t = 16)]

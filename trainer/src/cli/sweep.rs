@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 use clap::Args;
 use indicatif::ProgressBar;
 
-use super::{Failure, cores, say};
+use super::{Failure, at_least_one, cores, say};
 use crate::sweep::{Event, Found, Row, Run, Summary, Sweep, run};
 
 #[derive(Args)]
@@ -28,7 +28,7 @@ pub(super) struct SweepCommand {
     #[arg(long)]
     out: PathBuf,
     /// Runs at a time, one thread each; all cores when absent.
-    #[arg(long)]
+    #[arg(long, value_parser = at_least_one)]
     jobs: Option<usize>,
     /// Overrides of every task file, e.g. `train.n_envs=32`.
     #[arg(long = "set", value_name = "KEY=VALUE")]

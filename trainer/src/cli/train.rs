@@ -1,6 +1,6 @@
 //! `nearl train`.
 
-use super::{Failure, cores, say, unstable};
+use super::{Failure, at_least_one, cores, say, unstable};
 use crate::checkpoint::{self, Checkpoint};
 use crate::train::{Experience, Progress, Request, resume_on, train_on};
 use crate::{run_folder, tasks};
@@ -40,7 +40,7 @@ pub(super) struct Train {
     #[arg(long, value_name = "NAME", conflicts_with = "from")]
     collect: Option<String>,
     /// Threads; all cores when absent. The result does not depend on it.
-    #[arg(long)]
+    #[arg(long, value_parser = at_least_one)]
     threads: Option<usize>,
     /// Overrides of the task file, e.g. `constraints.velocity.scale=0.8`.
     #[arg(long = "set", value_name = "KEY=VALUE", conflicts_with = "resume")]
@@ -77,7 +77,7 @@ impl Run {
         if name != task {
             let folder = folder.display();
             return Err(format!(
-                "run '{folder}' trains '{name}', not '{task}'; write 'nearl train {name} --resume {folder}'"
+                "run '{folder}' trains '{name}', not '{task}'; write 'nearl train {folder}/task.toml --resume {folder}'"
             )
             .into());
         }

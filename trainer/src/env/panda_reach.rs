@@ -1,9 +1,9 @@
 //! Panda-reach: bring a torque-controlled arm's hand to a goal and hold it there, against gravity.
 //!
 //! The action is the seven joint torques \[N·m\], clamped at the robot file's effort limits. One physics step is one control
-//! period, 1 ms unless the task file says otherwise, and damping is integrated explicitly, so inside the joint stops
+//! period, 1 ms unless the task file says otherwise, so inside the joint stops
 //!
-//! `v' = v + dt a`, `q' = q + dt v'`, `M(q) a = action - nle(q, v) - D v`
+//! `v' = v + dt a`, `q' = q + dt v'`, `M(q) a = action - nle(q, v)`
 //!
 //! holds to rounding: a constraint on `a` is a constraint on what happens. Contacts are left out; the joint stops act as
 //! MuJoCo's soft stops.
@@ -71,7 +71,7 @@ pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
 /// With another control period [s]; its episodes last as long.
 pub(super) fn build_at(dt: f64) -> Result<Box<dyn Env>, EnvError> {
     let physics = |source| EnvError::Physics { task: NAME.into(), source };
-    let options = Options { sim_dt: Some(dt), without_contacts: true, explicit_damping: true };
+    let options = Options { sim_dt: Some(dt), without_contacts: true };
     let model = Model::from_text(&ROBOT.text, ROBOT.format, options).map_err(physics)?;
     let joints = model.joints();
     let expected = READY.len();

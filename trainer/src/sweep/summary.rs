@@ -1,12 +1,13 @@
-//! What a sweep came to: the last line of each run's metrics, and the interquartile mean over seeds.
+//! What a sweep came to: the mean of the last ten rows of each run's metrics (as in `nearl.report`), and the interquartile mean over seeds.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::Serialize;
 
 use super::Run;
 
-/// The end of one run; numbers that it does not have are absent.
+/// The end of one run: means over its last ten rows; numbers that it does not have are absent.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Row {
     /// Task.
@@ -59,18 +60,21 @@ pub struct Summary {
 impl Row {
     /// Reads the end of a run.
     pub fn of(run: &Run) -> Row {
-        let last = last_row(&run.folder);
-        let number = |key: &str| last.iter().rev().find(|(k, _)| k == key).and_then(|(_, v)| *v);
+        let end = last_rows(&run.folder);
+        let mean = |key: &str| {
+            let values = end.get(key)?;
+            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+        };
         Row {
             task: run.name.clone(),
             algo: run.algo.clone(),
             seed: run.seed,
             run: run.folder.display().to_string(),
-            steps: number("time/total_timesteps"),
-            return_mean: number("rollout/ep_rew_mean"),
-            cost: number("rollout/ep_cost_mean"),
-            idm_loss: number("idm/mse_after"),
-            steps_per_s: number("time/fps"),
+            steps: end.get("time/total_timesteps").and_then(|v| v.last().copied()),
+            return_mean: mean("rollout/ep_rew_mean"),
+            cost: mean("rollout/ep_cost_mean"),
+            idm_loss: mean("idm/mse_after"),
+            steps_per_s: mean("time/fps"),
         }
     }
 }
@@ -120,16 +124,18 @@ fn interquartile_mean(sorted: &[f64]) -> Option<f64> {
     Some(sorted.iter().enumerate().map(|(i, x)| weight(i).max(0.0) * x).sum::<f64>() / (high - low))
 }
 
-/// Name and value of each column in the last line that a run wrote whole.
-fn last_row(folder: &Path) -> Vec<(String, Option<f64>)> {
+/// The last ten numbers of each column, of lines that were written whole.
+fn last_rows(folder: &Path) -> BTreeMap<String, Vec<f64>> {
     let text = std::fs::read_to_string(folder.join("metrics.csv")).unwrap_or_default();
     let mut lines = text.lines();
     let names: Vec<&str> = lines.next().unwrap_or_default().split(',').collect();
-    let values: Vec<&str> = lines.next_back().unwrap_or_default().split(',').collect();
-    if values.len() != names.len() {
-        return Vec::new();
-    }
-    names.iter().zip(values).map(|(n, v)| ((*n).to_string(), v.parse().ok())).collect()
+    let rows: Vec<Vec<&str>> =
+        lines.map(|l| l.split(',').collect()).filter(|r: &Vec<_>| r.len() == names.len()).collect();
+    let column = |k: usize| {
+        let numbers: Vec<f64> = rows.iter().filter_map(|r| r[k].parse().ok()).collect();
+        numbers[numbers.len().saturating_sub(10)..].to_vec()
+    };
+    names.iter().enumerate().map(|(k, name)| ((*name).to_string(), column(k))).collect()
 }
 
 #[cfg(test)]

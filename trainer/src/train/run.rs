@@ -101,7 +101,9 @@ impl Training {
             Ok(Some(progress)) => progress,
             Ok(None) => return Ok(None),
             Err(e) => {
-                self.save(folder)?;
+                if self.snapshot().manifest.version > 0 {
+                    self.save(folder)?;
+                }
                 return Err(e);
             }
         };
