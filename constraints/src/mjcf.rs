@@ -109,10 +109,13 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
             }
         }
         let top = children(self.root, "worldbody").flat_map(|w| children(w, "body"));
-        let massive = top.filter(|b| b.descendants().any(|n| is_joint(n) || n.has_tag_name("geom")));
-        if massive.count() > 1 {
+        let massive: Vec<String> = top
+            .filter(|b| b.descendants().any(|n| is_joint(n) || n.has_tag_name("geom")))
+            .map(called)
+            .collect();
+        if massive.len() > 1 {
             let next = "keep one tree below <worldbody>, the reader would drop the others";
-            return Err(self.unsupported("several top-level bodies", next));
+            return Err(self.unsupported(&format!("several top-level bodies: {}", massive.join(", ")), next));
         }
         let from_geoms = compiler(self.root, "inertiafromgeom");
         for geom in self.root.descendants().filter(|n| n.has_tag_name("geom")) {
@@ -123,7 +126,40 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
                 .all(|(key, default)| self.attribute(geom, key).unwrap_or(default).trim() == "0");
             if bodiless && !from_inertial && self.attribute(geom, "mass") != Some("0") {
                 let next = "give its body an <inertial>, the reader would take it for massless";
-                return Err(self.unsupported("a geom without collision (contype and conaffinity 0)", next));
+                let (geom, body) = (called(geom), called(body));
+                let feature = format!("{geom} of {body} without collision (contype and conaffinity 0)");
+                return Err(self.unsupported(&feature, next));
+            }
+        }
+        self.refuse_forces()
+    }
+
+    /// Forces that would be missing without a word.
+    fn refuse_forces(&self) -> Result<(), ModelError> {
+        for node in self.root.descendants() {
+            let stated = |key: &str| match self.attribute(node, key) {
+                Some(text) => {
+                    let numbers = self.numbers(text, &format!("{key} of {}", called(node)))?;
+                    Ok(numbers
+                        .iter()
+                        .any(|x| *x != 0.0)
+                        .then(|| format!("{key}='{text}' of {}", called(node))))
+                }
+                None => Ok(None),
+            };
+            if node.has_tag_name("body")
+                && let Some(feature) = stated("gravcomp")?
+            {
+                return Err(self.unsupported(&feature, "take it out"));
+            }
+            if is_joint(node) {
+                if let Some(feature) = stated("springdamper")? {
+                    return Err(self.unsupported(&feature, "write stiffness and damping instead"));
+                }
+                if self.attribute(node, "actuatorgravcomp") == Some("true") {
+                    let feature = format!("actuatorgravcomp='true' of {}", called(node));
+                    return Err(self.unsupported(&feature, "take it out"));
+                }
             }
         }
         Ok(())
@@ -253,29 +289,44 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
 
     /// `|gear| * min(|gain| * ctrlrange, forcerange)` of one motor, infinite when neither range is stated.
     fn motor(&self, node: Node<'a, 'i>, joint: &str) -> Result<f64, ModelError> {
-        let first = |key: &str| match self.attribute(node, key) {
-            Some(text) => {
-                let numbers = self.numbers(text, &format!("actuator of '{joint}' {key}"))?;
-                Ok(numbers.first().copied())
-            }
-            None => Ok(None),
-        };
-        let gear = first("gear")?.unwrap_or(1.0).abs();
-        let direct = match node.tag_name().name() {
-            "motor" => Some(1.0),
-            "general" if self.attribute(node, "biastype").is_none_or(|b| b == "none") => {
-                Some(first("gainprm")?.unwrap_or(1.0).abs())
-            }
-            _ => None,
+        let gear = match self.attribute(node, "gear") {
+            Some(text) => self.first(text, &format!("actuator of '{joint}' gear"))?.unwrap_or(1.0).abs(),
+            None => 1.0,
         };
         let mut force = f64::INFINITY;
-        if let (Some(gain), true) = (direct, self.limited(node, "ctrllimited", "ctrlrange")) {
-            force = gain * symmetric(self.range(node, "ctrlrange", 1.0, joint)?);
+        if self.limited(node, "ctrllimited", "ctrlrange")
+            && let Some(gain) = self.gain(node, joint)?
+        {
+            force = gain.abs() * symmetric(self.range(node, "ctrlrange", 1.0, joint)?);
         }
         if self.limited(node, "forcelimited", "forcerange") {
             force = force.min(symmetric(self.range(node, "forcerange", 1.0, joint)?));
         }
         Ok(gear * force)
+    }
+
+    /// Force per control where that is all of the force. As in MuJoCo, <motor> sets gain and bias anew, wherever it stands.
+    fn gain(&self, node: Node<'a, 'i>, joint: &str) -> Result<Option<f64>, ModelError> {
+        let (mut gain, mut fixed, mut unbiased, mut shortcut) = (1.0, true, true, None);
+        for setting in self.settings(node) {
+            let law = ["gainprm", "gaintype", "biastype"].map(|key| setting.attribute(key));
+            match (setting.tag_name().name(), shortcut) {
+                ("motor", _) => (gain, fixed, unbiased, shortcut) = (1.0, true, true, None),
+                ("general", Some(tag)) if tag == "adhesion" || law.iter().any(Option::is_some) => {
+                    let feature = format!("<general> on top of <{tag}> for the actuator of '{joint}'");
+                    return Err(self.unsupported(&feature, "put the two into different default classes"));
+                }
+                ("general", _) => {
+                    if let Some(text) = law[0] {
+                        gain = self.first(text, &format!("actuator of '{joint}' gainprm"))?.unwrap_or(gain);
+                    }
+                    fixed = law[1].map_or(fixed, |kind| kind == "fixed");
+                    unbiased = law[2].map_or(unbiased, |kind| kind == "none");
+                }
+                (tag, _) => shortcut = Some(tag),
+            }
+        }
+        Ok((shortcut.is_none() && fixed && unbiased).then_some(gain))
     }
 
     /// MuJoCo's tristate: stated, else true when the range is there (and `autolimits` is not off).
@@ -301,12 +352,15 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
 
     /// An attribute of `node`: its own, else that of its default class and the classes around it.
     fn attribute(&self, node: Node<'a, 'i>, key: &str) -> Option<&'a str> {
-        if let Some(own) = node.attribute(key) {
-            return Some(own);
-        }
-        let tag = node.tag_name().name();
-        if tag == "freejoint" {
-            return None; // free joints of this form take no defaults
+        let own = node.attribute(key);
+        own.or_else(|| self.settings(node).iter().rev().find_map(|n| n.attribute(key)))
+    }
+
+    /// The elements that set attributes of `node`: its default classes from the outside in, then itself. Later ones win.
+    fn settings(&self, node: Node<'a, 'i>) -> Vec<Node<'a, 'i>> {
+        let mut settings = vec![node];
+        if node.has_tag_name("freejoint") {
+            return settings; // free joints of this form take no defaults
         }
         let class = node.attribute("class").or_else(|| {
             node.ancestors()
@@ -314,16 +368,19 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
                 .filter(|n| n.has_tag_name("body"))
                 .find_map(|n| n.attribute("childclass"))
         });
+        // MuJoCo keeps one actuator default a class, which every actuator tag sets.
+        let actuator = node.parent_element().is_some_and(|p| p.has_tag_name("actuator"));
+        let applies = |n: &Node| match actuator {
+            true => ACTUATORS.contains(&n.tag_name().name()),
+            false => n.tag_name() == node.tag_name(),
+        };
         let mut at = self.default_class(class.unwrap_or("main"));
         while let Some(default) = at {
-            // A general actuator's attributes may be set through <general> for any actuator kind.
-            let found = children(default, tag).filter_map(|n| n.attribute(key)).last();
-            if found.is_some() {
-                return found;
-            }
+            settings.extend(default.children().rev().filter(applies));
             at = default.parent_element().filter(|p| p.has_tag_name("default"));
         }
-        None
+        settings.reverse();
+        settings
     }
 
     fn default_class(&self, class: &str) -> Option<Node<'a, 'i>> {
@@ -342,6 +399,11 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
         }
     }
 
+    /// The first of some numbers, if there is one.
+    fn first(&self, text: &str, what: &str) -> Result<Option<f64>, ModelError> {
+        Ok(self.numbers(text, what)?.first().copied())
+    }
+
     fn numbers(&self, text: &str, what: &str) -> Result<Vec<f64>, ModelError> {
         let parse = |word: &str| word.parse::<f64>().ok().filter(|x| x.is_finite());
         text.split_whitespace()
@@ -351,6 +413,29 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
 }
 
 const RAD: f64 = std::f64::consts::PI / 180.0;
+
+/// What may stand for an actuator in a default class.
+const ACTUATORS: [&str; 10] = [
+    "general",
+    "motor",
+    "position",
+    "velocity",
+    "intvelocity",
+    "damper",
+    "cylinder",
+    "muscle",
+    "adhesion",
+    "dcmotor",
+];
+
+/// "body 'arm'", or "an unnamed body in line 7".
+fn called(node: Node) -> String {
+    let tag = node.tag_name().name();
+    match node.attribute("name") {
+        Some(name) => format!("{tag} '{name}'"),
+        None => format!("an unnamed {tag} in line {}", node.document().text_pos_at(node.range().start).row),
+    }
+}
 
 /// The force available in both directions.
 fn symmetric((low, high): (f64, f64)) -> f64 {

@@ -80,9 +80,14 @@ fn models() {
         &["'elbwo'", "did you mean 'elbow'"],
     );
     let two = "<mujoco><worldbody><body><joint/><geom size='1'/></body><body><joint/><geom size='1'/></body></worldbody></mujoco>";
-    refuse_model(Model::from_mjcf_text(two), &["several top-level bodies"]);
+    refuse_model(Model::from_mjcf_text(two), &["several top-level bodies", "unnamed body in line 1"]);
+    let two = two.replacen("<body>", "<body name='left'>", 1).replacen("<body>", "<body name='right'>", 1);
+    refuse_model(Model::from_mjcf_text(&two), &["body 'left', body 'right'"]);
     let ghost = "<mujoco><worldbody><body><joint name='a'/><geom size='1' contype='0' conaffinity='0'/></body></worldbody></mujoco>";
-    refuse_model(Model::from_mjcf_text(ghost), &["geom without collision", "<inertial>"]);
+    let words = ["an unnamed geom in line 1 of an unnamed body in line 1 without collision", "<inertial>"];
+    refuse_model(Model::from_mjcf_text(ghost), &words);
+    let ghost = ghost.replace("<body>", "<body name='arm'>").replace("<geom ", "<geom name='skin' ");
+    refuse_model(Model::from_mjcf_text(&ghost), &["geom 'skin' of body 'arm' without collision"]);
     refuse_model(
         Model::from_mjcf_text("<mujoco><include file='x.xml'/></mujoco>"),
         &["<include>", "mj_saveLastXML"],
@@ -90,6 +95,63 @@ fn models() {
     let range =
         "<mujoco><worldbody><body><joint name='a' range='3 1'/><geom size='1'/></body></worldbody></mujoco>";
     refuse_model(Model::from_mjcf_text(range), &["'a' range", "lower 3 above upper 1"]);
+}
+
+/// In MuJoCo the first joint has stiffness 40 and damping 8 (`jnt_stiffness`, `dof_damping`); these forces were zero here.
+#[test]
+fn forces_that_would_be_missing() {
+    let file = |defaults: &str, body: &str, joint: &str| {
+        Model::from_mjcf_text(&format!(
+            "<mujoco><default>{defaults}</default><worldbody><body name='arm' {body}><joint name='a' {joint}/>\
+             <geom size='1' mass='1'/></body></worldbody></mujoco>"
+        ))
+    };
+    let spring = ["springdamper='0.1 1' of joint 'a'", "write stiffness and damping instead"];
+    refuse_model(file("", "", "springdamper='0.1 1'"), &spring);
+    refuse_model(file("<joint springdamper='0.1 1'/>", "", ""), &spring);
+    let inner = "<default class='c'><joint springdamper='0.1 1'/></default>";
+    refuse_model(file(inner, "childclass='c'", ""), &spring);
+    refuse_model(file("", "gravcomp='1'", ""), &["gravcomp='1' of body 'arm'", "take it out"]);
+    let motors = ["actuatorgravcomp='true' of joint 'a'", "take it out"];
+    refuse_model(file("", "", "actuatorgravcomp='true'"), &motors);
+    refuse_model(file("<joint actuatorgravcomp='true'/>", "", ""), &motors);
+    for (defaults, body, joint) in [
+        ("<joint springdamper='0.1 1'/>", "", "springdamper='0 0'"),
+        (inner, "", ""),
+        ("", "gravcomp='0'", "actuatorgravcomp='false'"),
+        ("<joint actuatorgravcomp='true'/>", "", "actuatorgravcomp='false'"),
+        ("", "", "stiffness='40' damping='8'"),
+    ] {
+        assert!(file(defaults, body, joint).is_ok(), "{defaults} {body} {joint}");
+    }
+}
+
+/// What MuJoCo makes of these depends on gains that the reader does not follow: 7, 3 and -5 times the control, and so on.
+#[test]
+fn actuators_whose_default_class_mixes_shortcuts() {
+    let file = |defaults: &str, actuator: &str| {
+        Model::from_mjcf_text(&format!(
+            "<mujoco><default>{defaults}</default><worldbody><body name='arm'><joint name='a'/>\
+             <geom size='1' mass='1'/></body></worldbody>\
+             <actuator>{actuator}</actuator></mujoco>"
+        ))
+    };
+    for (tag, defaults, actuator) in [
+        ("position", "<position kp='7'/><general biastype='none'/>", "<general joint='a' ctrlrange='-1 1'/>"),
+        (
+            "position",
+            "<position kp='7'/>",
+            "<general joint='a' ctrlrange='-1 1' gainprm='3' biastype='none'/>",
+        ),
+        ("damper", "<damper kv='5' ctrlrange='0 1'/>", "<general joint='a' gaintype='fixed'/>"),
+        ("adhesion", "<adhesion gain='5' ctrlrange='0 1'/>", "<general joint='a'/>"),
+    ] {
+        let words =
+            [&format!("<general> on top of <{tag}> for the actuator of 'a'"), "different default classes"];
+        refuse_model(file(defaults, actuator), &words);
+    }
+    let unlimited = file("<position kp='7'/><general biastype='none'/>", "<general joint='a'/>");
+    assert_eq!(unlimited.unwrap().effort_limit(), [f64::INFINITY]);
 }
 
 #[test]
@@ -156,6 +218,69 @@ fn limits_that_make_no_sense() {
     let free = Settings { consistency: Consistency::Free, ..s() };
     refuse(&panda_limits(Some(1.0)), &[0], free, &["torque", "'panda_joint1'", "kinematic"]);
     refuse_for(&robot("gymnasium/ant.xml"), &[], &[2, 6], s(), &["1 of the 6 dofs", "'root'"]);
+}
+
+fn serial(names: &[&str]) -> Model {
+    let links = (0..=names.len()).map(|k| {
+        format!(
+            r#"<link name="l{k}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>"#
+        )
+    });
+    let joints = names.iter().enumerate().map(|(k, name)| {
+        let (kind, limit) = match name.starts_with("endless") {
+            true => ("continuous", r#"<limit effort="5" velocity="2"/>"#),
+            false => ("revolute", GOOD),
+        };
+        format!(
+            r#"<joint name="{name}" type="{kind}"><parent link="l{k}"/><child link="l{}"/><axis xyz="0 0 1"/>{limit}</joint>"#,
+            k + 1
+        )
+    });
+    Model::from_urdf_text(&format!(r#"<robot name="r">{}</robot>"#, links.chain(joints).collect::<String>()))
+        .unwrap()
+}
+
+/// The curve of a continuous joint looked at the cosine of its angle, and the checker with it: neither did anything.
+#[test]
+fn velocity_profiles_of_other_joints() {
+    let built = |model: &Model, line: &str, dofs: &[usize]| {
+        let text = format!("acceleration = {{ limit = 10.0 }}\n{line}");
+        let limits = build_limits(&toml::from_str::<ConstraintSettings>(&text).unwrap(), model)?;
+        Projector::new(model, &limits, dofs, Settings::new(0.001, 1))
+    };
+    let refuse = |model: &Model, line: &str, dofs: &[usize], words: &[&str]| {
+        let text = built(model, line, dofs).err().expect("an error").to_string();
+        words.iter().for_each(|w| assert!(text.contains(w), "'{w}' is not in: {text}"));
+    };
+    let curve = |joint: &str| {
+        format!(
+            "velocity_profile = {{ {joint} = {{ limit = 1.0, offset = 0.0, squared = 1.0, lower = -0.5, upper = 0.5 }} }}"
+        )
+    };
+    let mixed = serial(&["elbow", "endless"]);
+    let words = ["velocity_profile names 'endless', a continuous joint", "take it out"];
+    refuse(&mixed, &curve("endless"), &[0, 1], &words);
+    refuse(&mixed, &curve("endless"), &[0], &words);
+    assert!(built(&mixed, &curve("elbow"), &[0, 1]).is_ok());
+    let ant = robot("gymnasium/ant.xml");
+    refuse(&ant, &curve("root"), &[6], &["velocity_profile names 'root', a joint with several dofs"]);
+
+    let fr3 = "velocity_profile = \"fr3\"";
+    let names = |arm: &str| (1..=7).map(|k| format!("{arm}joint{k}")).collect::<Vec<_>>();
+    let of = |names: &[String]| serial(&names.iter().map(String::as_str).collect::<Vec<_>>());
+    let all: Vec<usize> = (0..14).collect();
+    let two = of(&[names("left_"), names("right_")].concat());
+    let words = ["several arms", "'left_joint1', 'right_joint1'", "give the curves by joint"];
+    refuse(&two, fr3, &all, &words);
+    refuse(&of(&names("endless_")), fr3, &all[..7], &["no joint whose name ends with joint1, joint2"]);
+    let torn = of(&[&names("left_")[..3], &names("right_")[3..]].concat());
+    refuse(&torn, fr3, &all[..7], &["no seven joints of one arm"]);
+
+    let fingers = ["finger_joint1".to_string(), "finger_joint2".to_string()];
+    let held = of(&[&fingers[..], &names("fr3_")].concat());
+    let speeds = built(&held, fr3, &all[..9]).unwrap().limits().velocity.clone();
+    let none = f64::INFINITY;
+    assert_eq!(speeds, [none, none, 2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26]);
 }
 
 #[test]

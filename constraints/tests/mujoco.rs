@@ -1,5 +1,5 @@
-//! The model computes what MuJoCo 3.17.0 computes on the same file: numbers in `fixtures/mujoco.json`, written by
-//! `fixtures/generate.py`.
+//! The model computes what MuJoCo 3.17.0 computes on the same file: numbers in `fixtures/mujoco.json` and `fixtures/motors.json`,
+//! written by `fixtures/generate.py` and `fixtures/generate_motors.py`.
 
 use nearl_constraints::{Dynamics, Model, convention as c};
 use serde_json::Value;
@@ -155,4 +155,23 @@ fn motor_strength_is_gear_times_control_range() {
     assert_eq!(of(odd, "elbow"), 4.0); // actuatorfrcrange below the motor's 100
     assert_eq!(of(odd, "tail_slide"), 10.0); // gain 5 x gear 2 x 1
     assert_eq!(of(odd, "slide"), f64::INFINITY);
+}
+
+/// MuJoCo keeps one actuator default a class, whichever tag sets it; the reader looked at the tag of the actuator alone.
+#[test]
+fn motor_strength_through_default_classes_is_mujoco_s() {
+    let text = std::fs::read_to_string(root().join("constraints/tests/fixtures/motors.json")).unwrap();
+    let cases: Value = serde_json::from_str(&text).unwrap();
+    let (mut finite, mut infinite) = (0, 0);
+    for case in cases.as_array().unwrap() {
+        let model = Model::from_mjcf_text(case["xml"].as_str().unwrap()).unwrap();
+        let (ours, theirs) = (model.effort_limit()[0], case["effort"].as_f64().unwrap_or(f64::INFINITY));
+        assert!(
+            ours == theirs || (ours / theirs - 1.0).abs() < 1e-12,
+            "{ours} and not {theirs}: {}",
+            case["xml"]
+        );
+        *(if theirs.is_finite() { &mut finite } else { &mut infinite }) += 1;
+    }
+    assert!(finite > 10 && infinite > 5, "{finite} {infinite}: this proves nothing");
 }

@@ -115,8 +115,9 @@ class PID2:
 
         Args:
             observation: In the order of ``controller.obs_names``.
-            state: What the last call returned. It matters where the policy runs every few ticks only (Panda-reach); then each call is
-                one control tick, and without ``state`` the first of an episode. None elsewhere.
+            state: What the last call returned. It matters where ``controller.remembers``: the policy runs every few ticks only
+                (Panda-reach), a limit speaks of the tick before (jerk, torque rate), or a brake is stored. Each call is then one control
+                tick, and without ``state`` the first of an episode. None elsewhere.
             episode_start: (n) true where an episode begins.
             deterministic: Without the noise of exploration.
 
@@ -125,7 +126,7 @@ class PID2:
         """
         obs = np.asarray(observation, float)
         rows = np.atleast_2d(obs)
-        if self._controller.policy_every == 1:
+        if not self._controller.remembers:
             memory: tuple[_core.Controller, ...] = (self._controller,) * len(rows)
         else:
             memory = state if state is not None else tuple(self._controller.another() for _ in rows)
@@ -136,7 +137,7 @@ class PID2:
                     controller.reset()
         noise = None if deterministic else self._rng.standard_normal((len(rows), self._controller.n_noise))
         actions = np.stack([c.act(row, None if noise is None else noise[i]) for i, (c, row) in enumerate(zip(memory, rows))])
-        return (actions if obs.ndim > 1 else actions[0]), (None if self._controller.policy_every == 1 else memory)
+        return (actions if obs.ndim > 1 else actions[0]), (memory if self._controller.remembers else None)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the snapshot: networks, normaliser, constraints, robot; ``nearl eval``, ``nearl run`` and :meth:`load` read it."""

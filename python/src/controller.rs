@@ -196,6 +196,12 @@ impl Controller {
         self.n_noise
     }
 
+    /// Whether what comes out of a tick depends on the ticks before.
+    #[getter]
+    fn remembers(&self, py: Python<'_>) -> bool {
+        self.with(py, |inner| inner.controller.remembers())
+    }
+
     /// Control ticks in one policy period.
     #[getter]
     fn policy_every(&self, py: Python<'_>) -> usize {

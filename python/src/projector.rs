@@ -131,8 +131,8 @@ impl Projector {
         Target::of(py, target, &self.names)
     }
 
-    /// The same for n rows at once, on `threads` threads (all cores by default). The order of rows does not matter. Limits on jerk and on
-    /// the rate of torque are refused: they need the tick before, which a batch does not have.
+    /// The same for n rows at once, on `threads` threads (all cores by default). The order of rows does not matter: each begins with no
+    /// stored brake. Limits on jerk and on the rate of torque are refused: they need the tick before, which a batch does not have.
     #[pyo3(signature = (q, v, q_proposal, v_proposal, threads=None))]
     fn project_batch(
         &self,
@@ -142,11 +142,11 @@ impl Projector {
         v_proposal: &Bound<'_, PyAny>,
         threads: Option<usize>,
     ) -> PyResult<Targets> {
-        if self.with(q.py(), |projector, _| projector.needs_previous()) {
-            return Err(errors::value(
-                "a limit on jerk or on the rate of torque needs the tick before, which a batch does not have; call project(..., previous=(acceleration, torque)) row by row, or switch it off with set_enabled",
-            ));
-        }
+        self.refuse_previous(
+            q.py(),
+            "a batch",
+            "call project(..., previous=(acceleration, torque)) row by row, or build a projector without it",
+        )?;
         let (batch, n) = self.batch_of(q, v, q_proposal, v_proposal)?;
         let threads = threads_for(threads, n);
         let targets = q.py().detach(|| self.batch(&batch, n, threads)).map_err(errors::value)?;
@@ -154,7 +154,8 @@ impl Projector {
     }
 
     /// The problem of such a projection, for other solvers: `H, c, G, h, A, b` of `min 1/2 x'H x + c'x` s.t. `G x <= h` and
-    /// `A x = b`, with x the changes `v' - v` of the controllable dofs, then a slack for each soft row. Cones are not in it.
+    /// `A x = b`, with x the changes `v' - v` of the controllable dofs, then a slack for each soft row. Cones are not in it. Limits on jerk
+    /// and on the rate of torque are refused as in a batch.
     fn problem<'py>(
         &self,
         q: &Bound<'py, PyAny>,
@@ -162,9 +163,13 @@ impl Projector {
         q_proposal: &Bound<'py, PyAny>,
         v_proposal: &Bound<'py, PyAny>,
     ) -> PyResult<Problem<'py>> {
+        self.refuse_previous(q.py(), "problem()", "build a projector without it")?;
         let (state, py) = (self.state(q, v, q_proposal, v_proposal)?, q.py());
         let problem = self.with(py, |projector, model| {
+            let memory = projector.memory();
+            projector.forget();
             projector.project(&state.0, &state.1, &state.2, &mut constraints::Target::new(model));
+            projector.set_memory(&memory);
             projector.problem()
         });
         let problem = problem.ok_or_else(|| {
@@ -182,7 +187,8 @@ impl Projector {
     }
 
     /// Vector-Jacobian products of n projections: for the derivatives `dq` (n x nv) and `dv` (n x nv) of a scalar with respect to the
-    /// targets, those with respect to `q_proposal` and `v_proposal`. Configurations count in tangent space.
+    /// targets, those with respect to `q_proposal` and `v_proposal`. Configurations count in tangent space. Limits on jerk and on the rate
+    /// of torque are refused as in `project_batch`.
     #[pyo3(signature = (q, v, q_proposal, v_proposal, dq, dv, threads=None))]
     #[expect(clippy::too_many_arguments, reason = "states, proposals and their derivatives")]
     fn vjp_batch<'py>(
@@ -195,6 +201,7 @@ impl Projector {
         dv: &Bound<'py, PyAny>,
         threads: Option<usize>,
     ) -> PyResult<Pair<'py>> {
+        self.refuse_previous(q.py(), "a batch", "build a projector without it")?;
         let (batch, n) = self.batch_of(q, v, q_proposal, v_proposal)?;
         let nv = self.sizes.1;
         let cotangents = (matrix("dq", dq, n, nv)?, matrix("dv", dv, n, nv)?);
@@ -282,6 +289,16 @@ impl Projector {
         Ok((q, model.v("v", v)?, proposal))
     }
 
+    /// Refuses limits that need the tick before, for `whom` without it.
+    fn refuse_previous(&self, py: Python<'_>, whom: &str, next: &str) -> PyResult<()> {
+        match self.with(py, |projector, _| projector.needs_previous()) {
+            true => Err(errors::value(format!(
+                "a limit on jerk or on the rate of torque needs the tick before, which {whom} does not have; {next}"
+            ))),
+            false => Ok(()),
+        }
+    }
+
     fn with<R: Send>(
         &self,
         py: Python<'_>,
@@ -326,7 +343,6 @@ impl Projector {
             new.set_external_forces(projectors[0].external_forces());
             projectors.push(new);
         }
-        projectors.iter_mut().for_each(constraints::Projector::forget);
         Ok(())
     }
 
@@ -403,6 +419,7 @@ struct Batch {
 }
 
 impl Batch {
+    /// Projects rows from `first` on, each as if it were the only one. What the projector remembers stays.
     fn project(
         &self,
         first: usize,
@@ -411,11 +428,14 @@ impl Batch {
     ) {
         let (nq, nv) = self.sizes;
         let mut proposal = Proposal { q: vec![0.0; nq], v: vec![0.0; nv] };
+        let memory = projector.memory();
         for (i, target) in (first..).zip(targets) {
             proposal.q.copy_from_slice(&self.q_proposal[i * nq..][..nq]);
             proposal.v.copy_from_slice(&self.v_proposal[i * nv..][..nv]);
+            projector.forget();
             projector.project(&self.q[i * nq..][..nq], &self.v[i * nv..][..nv], &proposal, target);
         }
+        projector.set_memory(&memory);
     }
 }
 

@@ -60,13 +60,13 @@ pub(crate) struct Ledger {
 
 #[pymethods]
 impl Ledger {
-    /// "unchanged", "clamped", "solved", "recovering", "braked" or "refused".
+    /// "unchanged", "clamped", "solved", "slowed", "recovering", "braked" or "refused".
     #[getter]
     fn status(&self) -> &'static str {
         words(self.ledger.status).0
     }
 
-    /// Why the status is "recovering", "braked" or "refused".
+    /// Why the status is "slowed", "recovering", "braked" or "refused".
     #[getter]
     fn reason(&self) -> Option<&'static str> {
         words(self.ledger.status).1

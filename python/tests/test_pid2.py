@@ -195,3 +195,19 @@ def test_a_second_learn_at_the_same_time_is_refused() -> None:
 
     agent.learn(1024, callback=again)
     assert refused and agent.num_timesteps == 1024
+
+
+def test_rows_of_a_prediction_do_not_hear_of_each_other(tmp_path: Path) -> None:
+    task = tmp_path / "task.toml"
+    text = Path(CART_POLE).read_text().replace('consistency = "free"', 'consistency = "kinematic"\njerk = { limit = { slider = 50.0 } }')
+    task.write_text(text)
+    (tmp_path / "cart-pole.xml").write_text((Path(CART_POLE).parent / "cart-pole.xml").read_text())
+    agent = nearl.PID2(task, algo="pid2-ib", threads=1)
+    assert agent.controller.remembers
+    obs = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 5))
+    actions, state = agent.predict(obs)
+    assert state is not None and np.array_equal(agent.predict(obs[::-1])[0][::-1], actions)
+    # an episode that begins forgets; one that goes on does not
+    begun, state = agent.predict(obs, state, np.ones(8, bool))
+    assert np.array_equal(begun, actions)
+    assert not np.array_equal(agent.predict(-obs, state)[0], agent.predict(-obs)[0])

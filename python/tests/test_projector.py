@@ -40,7 +40,8 @@ class Problem:
         speed, low, high = SCALE * model.velocity_limit, model.lower_position_limit, model.upper_position_limit
         self.upper = dt * upper_acceleration(high - q, v, speed, dt, n)
         self.lower = -dt * upper_acceleration(q - low, -v, speed, dt, n)
-        self.rows = model.mass_matrix(q) / dt
+        damping = model.passive(q, 0 * v) - model.passive(q, 0 * v + 1)  # it meets v + kappa (v' - v) on average
+        self.rows = model.mass_matrix(q) / dt + self.kappa * np.diag(damping)
         offset = model.nle(q, v) - model.passive(q, v)
         self.row_lower, self.row_upper = -model.effort_limit - offset, model.effort_limit - offset
 
@@ -157,21 +158,45 @@ def test_the_problem_it_states_is_the_problem_it_solves(model, rng) -> None:
         np.testing.assert_allclose(stated, optimum, atol=1e-8 * max(1.0, np.abs(optimum).max()))
 
 
-def test_a_batch_is_its_rows(model, rng) -> None:
-    projector = make(model, 1e-3, 1)
+@pytest.mark.parametrize("braking", ["certified", "stored"])
+def test_a_batch_is_its_rows(model, rng, braking) -> None:
+    """A brake stored for the row before was used for the next: rows depended on their order and on the number of threads."""
+    projector = make(model, 1e-3, 1, braking=braking)
     rows = [(p.q, p.v, q_hat, v_hat) for p, q_hat, v_hat in cases(model, rng, 101, 1e-3, 1)]
     batch = [np.stack(x) for x in zip(*rows, strict=True)]
-    for threads in (1, 3, None):
+    fresh = [make(model, 1e-3, 1, braking=braking).project(*row) for row in rows]
+    for threads in (1, 2, 3, None):
         targets = projector.project_batch(*batch, threads=threads)
         assert len(targets) == 101 and targets.q.shape == (101, model.nq)
-        for i, row in enumerate(rows):
-            one = projector.project(*row)
+        for i, one in enumerate(fresh):
             assert np.array_equal(targets.q[i], one.q) and np.array_equal(targets.v[i], one.v)
             assert targets.status[i] == one.status == targets[i].status
             assert targets.moved[i] == one.moved and targets[i].active == one.active
+        if braking == "certified":
+            assert all(np.array_equal(projector.project(*row).v, v) for row, v in zip(rows, targets.v, strict=True))
+    order = rng.permutation(101)
+    shuffled = projector.project_batch(*[x[order] for x in batch], threads=2)
+    assert np.array_equal(shuffled.q, targets.q[order]) and np.array_equal(shuffled.v, targets.v[order])
+    assert [targets.status[i] for i in order] == list(shuffled.status)
+    weights = rng.normal(size=(101, model.nv)), rng.normal(size=(101, model.nv))
+    pulled = [projector.vjp_batch(*batch, *weights, threads=threads) for threads in (1, 2)]
+    pulled.append([x[np.argsort(order)] for x in projector.vjp_batch(*[x[order] for x in (*batch, *weights)], threads=2)])
+    assert all(np.array_equal(x, y) for one in pulled[1:] for x, y in zip(pulled[0], one, strict=True))
     for layout in (np.asfortranarray, lambda x: np.repeat(x, 2, axis=1)[:, ::2], lambda x: x[::-1].copy()[::-1]):
         assert np.array_equal(projector.project_batch(*[layout(x) for x in batch]).q, targets.q)
     assert len(projector.project_batch(*[x[:0] for x in batch])) == 0
+
+
+def test_batches_and_problems_leave_a_stored_brake_alone(model, rng) -> None:
+    row, *others = [(p.q, p.v, q_hat, v_hat) for p, q_hat, v_hat in cases(model, rng, 60, 1e-3, 1)]
+    batch = [np.stack(x) for x in zip(row, *others, strict=True)]
+    alone, busy = (make(model, 1e-3, 1, braking="stored") for _ in range(2))
+    stated = make(model, 1e-3, 1, braking="stored").problem(*row)
+    for k, other in enumerate(others):
+        one, two = alone.project(*other), busy.project(*other)
+        assert one.status == two.status and np.array_equal(one.q, two.q) and np.array_equal(one.v, two.v), f"row {k}"
+        busy.project_batch(*batch, threads=2)
+        assert all(np.array_equal(x, y) for x, y in zip(stated, busy.problem(*row), strict=True)), f"row {k}"
 
 
 def test_multipliers_balance_the_pull_of_the_proposal(model, rng) -> None:
@@ -244,5 +269,8 @@ def test_what_is_outside_is_named_and_what_is_no_configuration_is_refused() -> N
     with pytest.raises(ValueError, match="q: quaternion of joint 'root_joint' has length 0, not 1"):
         projector.project(bad, still, good, still)
     jerk = nearl.Projector(panda, [limits[0], nearl.JerkLimit(panda, 100.0)], 1e-3)
-    with pytest.raises(ValueError, match="needs the tick before"):
-        jerk.project_batch(q[None], zero[None], q[None], zero[None])
+    rows = q[None], zero[None], q[None], zero[None]
+    assert jerk.project(q, zero, q, zero, previous=(zero, zero)).is_ok
+    for call, arrays in (("project_batch", rows), ("vjp_batch", (*rows, zero[None], zero[None])), ("problem", (q, zero, q, zero))):
+        with pytest.raises(ValueError, match="needs the tick before, which .* does not have; .*build a projector without it"):
+            getattr(jerk, call)(*arrays)

@@ -273,7 +273,7 @@ fn wake(rate: f64, seconds: f64, priority: i32, cpu: Option<usize>, json: bool) 
         .into());
     }
     let settings = ThreadSettings { priority: (priority > 0).then_some(priority), cpu, lock_memory: true };
-    let (late, warnings) = bench_wake(1.0 / rate, (rate * seconds) as u64, settings)?;
+    let (late, warnings) = bench_wake(1.0 / rate, (rate * seconds) as u64, settings, &Stop::new())?;
     for warning in &warnings {
         eprintln!("warning: {warning}");
     }

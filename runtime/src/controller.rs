@@ -435,6 +435,22 @@ impl Controller {
             position || v.abs() > l.velocity[dof] + 1e-9
         })
     }
+    /// Mean `|reached - target|` over the entries of the controllable joints, in units of the scale of change: how far observation `obs`
+    /// (n_obs) is from what `out` asked for. 0 for a policy on actions, which asks for no state.
+    pub fn residual(&self, obs: &[f64], out: &Output) -> f64 {
+        if self.kind == PolicyKind::Direct {
+            return 0.0;
+        }
+        let seen = self.layout.controllable_state();
+        let miss =
+            |&k: &usize| (obs[self.layout.state()[k]] - out.target[k]).abs() / self.normaliser.scale[k];
+        seen.iter().map(miss).sum::<f64>() / seen.len().max(1) as f64
+    }
+    /// Whether what comes out of a tick depends on the ticks before: the policy proposes every few ticks, a limit speaks of the tick before, or
+    /// a brake is stored.
+    pub fn remembers(&self) -> bool {
+        self.policy_every > 1 || self.projector.needs_previous() || self.projector.stores_a_brake()
+    }
     /// Limits by degree of freedom.
     pub fn limits(&self) -> &LimitSet {
         self.projector.limits()

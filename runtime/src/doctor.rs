@@ -12,7 +12,7 @@ use crate::cli::{Failure, say};
 use crate::codes::CheckCode;
 use crate::controller::{Controller, Parts};
 use crate::link::{RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, remains};
-use crate::rt::{Pilot, ThreadSettings, bench_wake, prepare};
+use crate::rt::{Pilot, Stop, ThreadSettings, bench_wake, prepare};
 use crate::snapshot::{Manifest, Snapshot, in_run};
 
 /// Check that a snapshot, this machine and a plant are ready.
@@ -256,7 +256,7 @@ fn clock() -> Check {
 fn wake(dt: f64) -> Check {
     let period = dt.min(1e-3);
     let settings = ThreadSettings { priority: Some(PRIORITY), cpu: None, lock_memory: false };
-    let late = match bench_wake(period, (1.0 / period).round() as u64, settings) {
+    let late = match bench_wake(period, (1.0 / period).round() as u64, settings, &Stop::new()) {
         Ok((late, _)) => late,
         Err(e) => {
             return fail(CheckCode::WakeUp, format!("the empty loop did not run ({e}): raise `ulimit -u`"));

@@ -304,6 +304,13 @@ impl Snapshot {
         if manifest.format != FORMAT {
             return Err(foreign(format!("format {} where this program reads {FORMAT}", manifest.format)));
         }
+        manifest.task.check("its task").map_err(|e| foreign(e.to_string()))?;
+        let ranges = manifest.action_lower.iter().zip(&manifest.action_upper);
+        if let Some((lower, upper)) =
+            ranges.into_iter().find(|(l, u)| !(l.is_finite() && u.is_finite() && l <= u))
+        {
+            return Err(foreign(format!("an action range from {lower} to {upper}")));
+        }
         let networks = Networks::read(&views, manifest.policy)?;
         Ok(Self { manifest, networks })
     }

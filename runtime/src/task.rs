@@ -193,7 +193,8 @@ impl Task {
                 let (key, inner) = (e.path().to_string(), e.into_inner());
                 at(format!("{}{}", line_of(text, inner.span()), bracket(&key)), suggest(inner.message()))
             })?;
-            return task.checked(file);
+            task.check(file)?;
+            return Ok(task);
         }
         for set in overrides {
             apply(&mut table, set)?;
@@ -202,7 +203,8 @@ impl Task {
             let key = e.path().to_string();
             at(bracket(&key), suggest(e.into_inner().message()))
         })?;
-        task.checked(file)
+        task.check(file)?;
+        Ok(task)
     }
 
     /// The effective file as TOML, for the run folder.
@@ -220,7 +222,8 @@ impl Task {
         Period::new(self.time.dt, self.sub_steps() as u32)
     }
 
-    fn checked(self, file: &str) -> Result<Self, TaskError> {
+    /// Refuses what no task can have; `file` is named.
+    pub(crate) fn check(&self, file: &str) -> Result<(), TaskError> {
         let refuse = |key: &str, reason: String| {
             Err(TaskError::Invalid { file: file.into(), place: format!(" [{key}]"), reason })
         };
@@ -276,7 +279,7 @@ impl Task {
                 "free_flyer is for URDF files; an MJCF file says itself whether its base floats, so drop it";
             return refuse("model.free_flyer", next.into());
         }
-        Ok(self)
+        Ok(())
     }
 }
 

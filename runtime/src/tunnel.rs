@@ -86,16 +86,19 @@ impl TunnelCommand {
 
 fn wait(mut child: Child, stop: &Stop) -> Result<(), Failure> {
     loop {
-        if let Some(status) = child.try_wait()? {
-            return Err(format!("{PROGRAM} ended ({status}): its own lines above say why").into());
-        }
+        // Ctrl-C reaches the child too: that it has ended is then no failure.
         if stop.is_requested() {
             // Asked, not killed: it then removes its own files.
-            if let Some(pid) = Pid::from_raw(child.id() as i32) {
+            if child.try_wait()?.is_none()
+                && let Some(pid) = Pid::from_raw(child.id() as i32)
+            {
                 kill_process(pid, Signal::TERM)?;
             }
             child.wait()?;
             return Ok(());
+        }
+        if let Some(status) = child.try_wait()? {
+            return Err(format!("{PROGRAM} ended ({status}): its own lines above say why").into());
         }
         std::thread::sleep(Duration::from_millis(50));
     }

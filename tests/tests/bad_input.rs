@@ -216,7 +216,7 @@ fn bad_arguments_are_refused_with_their_name() {
     let at = |name: &str| folder.path().join(name);
     std::fs::create_dir(at("empty")).expect("folder");
     std::fs::create_dir(at("run")).expect("folder");
-    std::fs::write(at("run/metrics.csv"), "").expect("file");
+    std::fs::write(at("run/metrics.csv"), "steps\n2048\n").expect("file");
     std::fs::copy(panda(), at("panda")).expect("copy");
     std::os::unix::fs::symlink("panda", at("link")).expect("link");
     assert!(Command::new("mkfifo").arg(at("fifo")).status().expect("mkfifo").success());
@@ -337,11 +337,13 @@ fn the_doctor_checks_snapshot_machine_and_plant() {
     let (code, lines, out) = doctor(&[file, "--plant", &name]);
     assert_eq!(code, Some(0), "{out}");
     let looked: Vec<&str> = lines.iter().map(|(_, check)| check.as_str()).collect();
-    let all =
-        ["snapshot", "canary", "braking", "memory", "links", "priority", "lock", "clock", "wake-up", "plant"];
+    let all = [
+        "snapshot", "canary", "model", "braking", "memory", "links", "priority", "lock", "clock", "wake-up",
+        "plant",
+    ];
     assert_eq!(looked, all, "{out}");
     assert!(lines.iter().all(|(finding, _)| finding == "ok" || finding == "warn"), "{out}");
-    assert!(lines[9].0 == "ok" && out.contains("7 joints"), "{out}");
+    assert!(lines[10].0 == "ok" && out.contains("7 joints"), "{out}");
     plant.end();
 
     // Another robot, and no robot.
@@ -350,11 +352,11 @@ fn the_doctor_checks_snapshot_machine_and_plant() {
     nearl_tests::training("HalfCheetah-v5", "pid2-ib", 0, 1, &[]).snapshot().save(&cheetah).expect("save");
     let plant = Process::nearl(&["plant", "Panda-reach", "--name", &name, "--lockstep", "--json"]);
     let (code, lines, out) = doctor(&[cheetah.to_str().expect("UTF-8"), "--plant", &name]);
-    assert_eq!((code, lines[9].0.as_str()), (Some(1), "fail"), "{out}");
+    assert_eq!((code, lines[10].0.as_str()), (Some(1), "fail"), "{out}");
     assert!(out.contains("`panda_joint1` on the plant"), "{out}");
     plant.end();
     let (code, lines, out) = doctor(&[file, "--plant", &name]);
-    assert_eq!((code, lines[9].0.as_str()), (Some(1), "fail"), "{out}");
+    assert_eq!((code, lines[10].0.as_str()), (Some(1), "fail"), "{out}");
     assert!(out.contains(&format!("start `nearl plant TASK --name {name}` first")), "{out}");
     remove_files(&RobotName::new(&name).expect("name"));
 }

@@ -90,6 +90,18 @@ fn an_unknown_activation_is_refused_and_an_absent_one_is_tanh() {
 }
 
 #[test]
+fn a_manifest_that_no_task_file_could_give_is_refused() {
+    let t = training("Panda-reach", "pid2-ib", 0, 1, &[]);
+    for (from, to, words) in [
+        ("\"policy_every\":20", "\"policy_every\":0", "policy_every"),
+        ("\"action_lower\":[-87.0", "\"action_lower\":[88.0", "an action range from 88 to 87"),
+    ] {
+        let error = with_manifest(t.snapshot(), from, to).expect_err(words).to_string();
+        assert!(error.contains(words), "{error}");
+    }
+}
+
+#[test]
 fn impossible_sizes_are_refused_in_a_sentence() {
     for (set, word) in [
         ("train.nets.policy=[32, 0]", "[train.nets.policy]: a hidden layer of width 0"),

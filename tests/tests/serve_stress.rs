@@ -62,7 +62,7 @@ fn expected(snapshot: &Snapshot, seed: u64) -> Vec<u64> {
     let env = make_env(snapshot).expect("environment");
     let mut worker = Worker::new(env, snapshot, 1.0, stream(seed, 0)).expect("worker");
     let mut row = Vec::new();
-    (0..STEPS).for_each(|_| worker.transition(true, &mut row));
+    (0..STEPS).for_each(|_| worker.transition(true, &mut row).expect("a transition"));
     row.iter().map(|x| x.to_bits()).collect()
 }
 

@@ -161,6 +161,38 @@ fn a_reward_that_is_no_number_ends_the_training() {
 }
 
 #[test]
+fn a_start_that_is_undefined_for_some_draws_ends_the_training_and_keeps_what_was_learned() {
+    let folder = tempfile::tempdir().expect("folder");
+    let text = std::fs::read_to_string(example("cart-pole.toml")).expect("task");
+    let task = folder.path().join("task.toml");
+    std::fs::write(&task, text.replace("0.1 * uniform", "0.2 * sqrt(0.99 + uniform)")).expect("task");
+    std::fs::copy(example("cart-pole.xml"), folder.path().join("cart-pole.xml")).expect("robot");
+    let mut manifest = tasks::load(&task.display().to_string(), &[]).expect("task");
+    complete(&mut manifest).expect("manifest");
+    let request = Request { manifest, algo: "ppo".into(), steps: 1_000_000, seed: 0, threads: 2 };
+    let out = folder.path().join("run");
+    let error = train(&request, &out, |_, _| true).expect_err("a root of what is negative").to_string();
+    assert!(error.contains("task 'cart-pole' [reset]: qpos[1] came out as NaN"), "{error}");
+    assert!(out.join("checkpoints/resume.safetensors").is_file());
+}
+
+#[test]
+fn more_outputs_than_can_be_learned_are_refused_by_number() {
+    let folder = tempfile::tempdir().expect("folder");
+    let more: String = (0..300).map(|k| format!(", \"sin({k} * q.slider)\"")).collect();
+    let text = std::fs::read_to_string(example("cart-pole.toml")).expect("task");
+    let task = folder.path().join("task.toml");
+    std::fs::write(&task, text.replace("\"v.hinge\"]", &format!("\"v.hinge\"{more}]"))).expect("task");
+    std::fs::copy(example("cart-pole.xml"), folder.path().join("cart-pole.xml")).expect("robot");
+    let mut manifest =
+        tasks::load(&task.display().to_string(), &["train.exploration=proposal".into()]).expect("task");
+    complete(&mut manifest).expect("manifest");
+    let request = Request { manifest, algo: "pid2-ib".into(), steps: 1024, seed: 0, threads: 1 };
+    let error = Training::new(&request).map(|_| ()).expect_err("305 entries").to_string();
+    assert!(error.contains("'cart-pole' has 305 proposed entries, and"), "{error}");
+}
+
+#[test]
 fn a_robot_without_a_usable_actuator_is_refused() {
     let robot = std::fs::read_to_string(example("cart-pole.xml")).expect("robot");
     let folder = tempfile::tempdir().expect("folder");

@@ -70,7 +70,7 @@ pub fn evaluate(
         residual: 0.0,
     };
     for _ in 0..episodes {
-        let (ret, length) = worker.evaluate();
+        let (ret, length) = worker.evaluate().map_err(RolloutError::from)?;
         let t = &worker.collected.tally;
         e.returns.push(ret);
         e.costs.extend_from_slice(&t.costs);

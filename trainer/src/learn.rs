@@ -28,6 +28,7 @@ pub use adam::Adam;
 pub use batch::Batch;
 pub use combined::{Gradient, Kind};
 pub use gae::{Advantages, advantages};
+pub use gaussian::MOST_OUTPUTS;
 pub use nearl::{Nearl, NearlSettings};
 pub use net::{Net, Tape};
 pub use nets::NetSettings;

@@ -11,6 +11,9 @@ use nearl_runtime::rt::{Brake, describe};
 use nearl_runtime::{Manifest, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 
+/// Starts that are drawn for an episode before the plant gives up.
+const MOST_DRAWS: usize = 100;
+
 /// Excess over a limit that counts as rounding, in rad, rad/s or N m.
 pub const TOLERANCE: f64 = 1e-9;
 
@@ -137,7 +140,13 @@ impl MujocoPlant {
     }
 
     fn begin_episode(&mut self) {
-        self.env.reset(&mut self.rng).unwrap_or_else(|e| panic!("{e}"));
+        // A start of one's own may be undefined for some of its draws; a plant that stops would stop a robot.
+        let mut refused = 0;
+        while let Err(e) = self.env.reset(&mut self.rng) {
+            refused += 1;
+            assert!(refused < MOST_DRAWS, "{e}");
+            eprintln!("nearl: the start of an episode is drawn again: {e}");
+        }
         let e = &mut self.episode;
         *e = Episode { number: e.number + 1, last: e.total, bits: STATE_RESET, ..Episode::default() };
     }

@@ -142,20 +142,28 @@ impl Collector {
     ///
     /// Threads take portions of segments in turn, so that all end at nearly the same time; which thread takes which does
     /// not matter, the next portion of a worker is always the same.
-    pub fn collect(&mut self) {
+    ///
+    /// # Errors
+    /// [`RolloutError::Env`] of a reset.
+    pub fn collect(&mut self) -> Result<(), RolloutError> {
         let n_steps = self.n_steps;
         self.workers().for_each(|w| w.begin(n_steps));
         let n = self.workers.len();
         let portion = (n * n_steps).div_ceil(PORTIONS * self.threads).clamp(1, n_steps);
         let (next, portions) = (AtomicUsize::new(0), n * n_steps.div_ceil(portion));
+        let failed = Mutex::new(None);
         let run = || {
             loop {
                 let k = next.fetch_add(1, Ordering::Relaxed);
                 if k >= portions {
                     break;
                 }
-                let worker = &self.workers[k % n];
-                worker.lock().unwrap_or_else(std::sync::PoisonError::into_inner).go_on(portion);
+                let mut worker =
+                    self.workers[k % n].lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+                if let Err(e) = worker.go_on(portion) {
+                    next.store(portions, Ordering::Relaxed);
+                    *failed.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = Some(e);
+                }
             }
         };
         std::thread::scope(|s| {
@@ -164,6 +172,8 @@ impl Collector {
             }
             run();
         });
+        let failed = failed.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+        failed.map_or(Ok(()), |e| Err(e.into()))
     }
 
     /// The workers in a fixed order.

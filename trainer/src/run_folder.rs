@@ -11,9 +11,7 @@ use std::time::Instant;
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// Creating or writing.
-    #[error(
-        "cannot write '{path}': {reason}; make it writable, or give another folder (a run that is to go on can be copied there)"
-    )]
+    #[error("cannot write '{path}': {reason}; give another folder with --out, or make this one writable")]
     Write {
         /// File or folder.
         path: String,
@@ -62,6 +60,18 @@ pub fn task_file(manifest: &Manifest) -> (String, String) {
         file.clone_from(&name);
     }
     (task.to_toml(), name)
+}
+
+/// Writes the effective task file as `<name>.toml` with its robot file beside it; returns its path.
+///
+/// # Errors
+/// What the system said.
+pub fn write_task(folder: &Path, name: &str, manifest: &Manifest) -> std::io::Result<PathBuf> {
+    let (task, robot) = task_file(manifest);
+    std::fs::write(folder.join(robot), &manifest.model)?;
+    let file = folder.join(format!("{name}.toml"));
+    std::fs::write(&file, task)?;
+    Ok(file)
 }
 
 /// Whether something was learned there: a row of metrics, or a checkpoint.

@@ -14,7 +14,7 @@ pub use setup::complete;
 pub use source::{Experience, Source, SourceError};
 
 use crate::checkpoint::CheckpointError;
-use crate::learn::{Batch, Dims, Learner, Metrics, advantages};
+use crate::learn::{Batch, Dims, Learner, MOST_OUTPUTS, Metrics, advantages};
 use crate::rollout::{Collected, RolloutError, Segment, Tally, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
@@ -152,6 +152,15 @@ impl Training {
             seen_obs: seen.iter().map(|&k| parts.layout.state()[k]).collect(),
             seen_state: seen,
         };
+        if let Some((what, n)) = [("proposed entries", dims.n_state), ("actions", dims.n_act)]
+            .into_iter()
+            .find(|(_, n)| *n > MOST_OUTPUTS)
+        {
+            return Err(TrainError::Settings(format!(
+                "'{}' has {n} {what}, and {MOST_OUTPUTS} can be learned; name fewer under state.propose",
+                manifest.task.name
+            )));
+        }
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);

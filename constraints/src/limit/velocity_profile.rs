@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
                  perhaps margin; it is always hard and takes no soft"
 )]
 pub enum VelocityProfileSettings {
-    /// A robot whose published curves are built in; joints are found by the end of their names, `joint1` to `joint7`.
+    /// A robot whose published curves are built in; joints are found by their names, the same but for the end, `joint1` to `joint7`.
     Robot(KnownRobot),
     /// The same, less a margin.
     RobotLess(RobotProfile),
@@ -109,23 +109,55 @@ impl VelocityProfileLimit {
 }
 
 fn fr3(model: &Model, margin: f64) -> Result<Vec<(usize, JointProfile)>, LimitError> {
-    let find = |k: usize| model.joints().iter().find(|j| j.nv == 1 && j.name.ends_with(&format!("joint{k}")));
-    let found: Vec<_> =
-        (1..=7).filter_map(|k| Some((find(k)?.idx_v, JointProfile { margin, ..FR3[k - 1] }))).collect();
-    if found.len() == 7 {
-        return Ok(found);
+    let unusable = |what: String, next| Err(LimitError::Unusable { what, next });
+    let joints = || model.joints().iter().filter(|j| (j.nq, j.nv) == (1, 1));
+    let named = |name: String| joints().find(|j| j.name == name).map(|j| j.idx_v);
+    let arms: Vec<(&str, Vec<usize>)> = joints()
+        .filter_map(|j| j.name.strip_suffix("joint1"))
+        .filter_map(|arm| {
+            Some((arm, (1..=7).map(|k| named(format!("{arm}joint{k}"))).collect::<Option<_>>()?))
+        })
+        .collect();
+    match &arms[..] {
+        [(_, dofs)] => {
+            Ok(dofs.iter().zip(FR3).map(|(i, curve)| (*i, JointProfile { margin, ..curve })).collect())
+        }
+        [] => {
+            let ends = (1..=7).map(|k| format!("joint{k}"));
+            let missing: Vec<String> = ends.filter(|end| !joints().any(|j| j.name.ends_with(end))).collect();
+            let what = match &missing[..] {
+                [] => "seven joints of one arm, alike but for joint1 to joint7".to_string(),
+                _ => format!("joint whose name ends with {}", missing.join(", ")),
+            };
+            unusable(
+                format!("velocity_profile = \"fr3\" finds no {what}"),
+                "use it with a Franka Research 3, or give the curves by joint",
+            )
+        }
+        _ => {
+            let names: Vec<String> = arms.iter().map(|(arm, _)| format!("'{arm}joint1'")).collect();
+            unusable(
+                format!("velocity_profile = \"fr3\" finds several arms, from {} on", names.join(", ")),
+                "give the curves by joint",
+            )
+        }
     }
-    let names: Vec<String> = (1..=7).filter(|k| find(*k).is_none()).map(|k| format!("joint{k}")).collect();
-    Err(LimitError::Unusable {
-        what: format!("velocity_profile = \"fr3\" finds no joint whose name ends with {}", names.join(", ")),
-        next: "use it with a Franka Research 3, or give the curves by joint",
-    })
 }
 
 fn named(model: &Model, name: &str, curve: &JointProfile) -> Result<(usize, JointProfile), LimitError> {
     let limit = "velocity_profile";
     let unknown = |near| LimitError::UnknownJoint { limit, name: name.to_string(), near };
     let joint = model.find(name).map_err(unknown)?;
+    if (joint.nq, joint.nv) != (1, 1) {
+        let why = match joint.nv {
+            1 => "a continuous joint, whose position is (cos, sin) and no angle",
+            _ => "a joint with several dofs",
+        };
+        return Err(LimitError::Unusable {
+            what: format!("velocity_profile names '{name}', {why}"),
+            next: "take it out",
+        });
+    }
     let bad = |what: &str, value: f64, domain: &'static str| {
         Err(LimitError::BadValue {
             what: format!("velocity_profile {what} of joint '{name}'"),

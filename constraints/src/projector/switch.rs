@@ -80,6 +80,11 @@ impl Projector {
         self.checker.needs().previous
     }
 
+    /// True when a brake is stored from tick to tick ([`Braking::Stored`](crate::Braking)).
+    pub fn stores_a_brake(&self) -> bool {
+        self.settings.braking == crate::Braking::Stored
+    }
+
     /// Acceleration (nv) and motor force (nv) of the tick before, for limits on their change; `None`: not known, and
     /// those limits do not hold in the next tick.
     ///

@@ -5,6 +5,9 @@ use clap::Args;
 use super::Failure;
 use crate::rt::{ModeLimits, RollbackSettings};
 
+/// Longest window of the residual [ticks]; its memory is taken at once.
+const MOST_WINDOW: usize = 1_000_000;
+
 /// When the loop degrades, brakes, latches, recovers and rolls back.
 #[derive(Args, Clone, Copy, Debug)]
 #[command(next_help_heading = "Mode limits and rollback")]
@@ -60,6 +63,13 @@ impl LimitOptions {
             return Err(
                 format!("{name} {ticks} ticks is below {least}, by {than}: give at least {least}").into()
             );
+        }
+        if self.rollback_window > MOST_WINDOW {
+            let window = self.rollback_window;
+            return Err(format!(
+                "--rollback-window {window} ticks is not usable: give at most {MOST_WINDOW}"
+            )
+            .into());
         }
         let rollback = [
             ("--rollback-factor", self.rollback_factor, 1.0),

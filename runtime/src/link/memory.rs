@@ -55,7 +55,7 @@ pub(crate) fn reserve(name: &RobotName) -> Result<(), LinkError> {
     Ok(())
 }
 
-/// Removes what a robot name left behind. Only for names no process uses any more (tests, `nearl doctor`).
+/// Removes what a robot name left behind. Only for names no process uses any more (tests, demonstrations, benchmarks).
 pub fn remove_files(name: &RobotName) {
     let prefix = name.prefix();
     for entry in read_dir(FOLDER).into_iter().flatten().flatten() {

@@ -1,22 +1,27 @@
 //! Wake-up of an empty loop: the floor under every latency reported beside it.
 
 use crate::rt::thread::{ThreadSettings, prepare};
-use crate::rt::{Grid, Percentiles, clock, percentiles};
+use crate::rt::{Grid, Percentiles, Stop, clock, percentiles};
 
-/// Sleeps through `ticks` slots of `dt` [s] on a thread with `settings` and returns how late [ns] it woke, with one
+/// Sleeps through `ticks` slots of `dt` [s] on a thread with `settings`, or until `stop`, and returns how late [ns] it woke, with one
 /// sentence for each thing the operating system refused.
 pub fn bench_wake(
     dt: f64,
     ticks: u64,
     settings: ThreadSettings,
+    stop: &Stop,
 ) -> std::io::Result<(Percentiles, Vec<String>)> {
     let mut late = hdrhistogram::Histogram::<u64>::new_with_bounds(1, 10_000_000_000, 3)
         .map_err(|e| std::io::Error::other(e.to_string()))?;
+    let stop = stop.clone();
     let loop_body = move || {
         let warnings = prepare(&settings);
         let period = clock::nanoseconds(dt);
         let mut grid = Grid::new(clock::now() + period, period);
         for _ in 0..ticks {
+            if stop.is_requested() {
+                break;
+            }
             clock::sleep_until(grid.due());
             let now = clock::now();
             late.saturating_record(now - grid.due());

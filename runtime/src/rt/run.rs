@@ -359,7 +359,7 @@ fn report<B: Build>(
         versions: std::iter::once((0, version)).chain(io.snapshots.accepted).collect(),
         refused_snapshots,
         refusals: io.snapshots.refusals,
-        log_drops: log.dropped,
+        log_drops: log.dropped + log.dropped_snapshots,
         log_error: log.error,
         rolled_back: io.snapshots.rolled_back,
         usage: end.usage,

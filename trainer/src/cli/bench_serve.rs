@@ -99,10 +99,7 @@ impl ServeBench {
                 let mut clients = (0..self.clients).map(|_| open()).collect::<Result<Vec<_>, _>>()?;
                 (0..self.repeat.max(1))
                     .map(|_| {
-                        let collected = rates(total, || {
-                            collector.collect();
-                            Ok::<_, Failure>(())
-                        })?;
+                        let collected = rates(total, || Ok::<_, Failure>(collector.collect()?))?;
                         let served = rates(total, || read_all(&mut clients, self.steps as u64))?;
                         Ok([served, collected])
                     })

@@ -2,7 +2,7 @@
 
 use super::{Failure, say};
 use crate::evaluate::evaluate;
-use crate::run_folder;
+use crate::run_folder::{self, write_task};
 use clap::Args;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{RobotName, TrainerLink, Verdict, remove_files};
@@ -63,8 +63,7 @@ impl Demo {
         let name = format!("demo-{}", std::process::id());
         let log = self.out.join(format!("{task}.mcap"));
         let _ = std::fs::remove_file(&log);
-        let task_file = self.out.join(format!("{task}.toml"));
-        std::fs::write(&task_file, snapshot.manifest.task.to_toml())?;
+        let task_file = write_task(&self.out, task, &snapshot.manifest)?;
         let nearl = std::env::current_exe()?;
         let text = |p: &Path| p.display().to_string();
         let mut plant = Process::start(&nearl, &["plant", &text(&task_file), "--name", &name, "--json"])?;

@@ -4,7 +4,7 @@ use super::{Failure, say, unstable};
 use crate::evaluate::evaluate;
 use crate::run_folder;
 use clap::Args;
-use nearl_runtime::Snapshot;
+use nearl_runtime::{PolicyKind, Snapshot};
 use std::path::PathBuf;
 
 #[derive(Args)]
@@ -50,16 +50,20 @@ impl Eval {
         );
         for e in &results {
             let percent = |n: u64| 100.0 * n as f64 / e.ticks.max(1) as f64;
+            // A policy on actions proposes nothing.
+            let proposes = snapshot.manifest.policy != PolicyKind::Direct;
+            let of_targets = |text: String| if proposes { text } else { "-".into() };
+            let share = |n: u64| of_targets(format!("{:.2} %", percent(n)));
             say(format!(
-                "{:<10}{:>8.1}{:>10.1}{:>14.2} %{:>7.2} %{:>15.2} %{:>15.2} %{:>20.3}",
+                "{:<10}{:>8.1}{:>10.1}{:>16}{:>9}{:>15.2} %{:>17}{:>20}",
                 e.mode,
                 e.mean_return(),
                 e.mean_cost(),
-                percent(e.raw_violations),
-                percent(e.target_violations),
+                share(e.raw_violations),
+                share(e.target_violations),
                 percent(e.reached_violations),
-                percent(e.recovering),
-                e.residual
+                share(e.recovering),
+                of_targets(format!("{:.3}", e.residual)),
             ));
         }
         for e in results.iter().filter(|e| e.faults > 0) {

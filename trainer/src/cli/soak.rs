@@ -4,6 +4,7 @@ mod stretch;
 
 use super::{Failure, cores, say};
 use crate::allocations::allocations;
+use crate::run_folder::write_task;
 use clap::Args;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{RobotName, TrainerLink, Verdict, remove_files};
@@ -159,8 +160,7 @@ impl Soak {
         let name = RobotName::new(&format!("soak-{}", std::process::id()))?;
         let file = self.out.join("soak.safetensors");
         snapshot.save(&file)?;
-        let task = self.out.join("soak.toml");
-        std::fs::write(&task, snapshot.manifest.task.to_toml())?;
+        let task = write_task(&self.out, "soak", &snapshot.manifest)?;
         let log = self.out.join("soak.mcap");
         let _ = std::fs::remove_file(&log);
         let plant = PlantProcess::start(&task, &name, self.priority)?;
@@ -181,7 +181,7 @@ impl Soak {
         let (run, swaps, empty) = scope(|scope| {
             hogs(scope, self.hogs(), &over);
             let swaps = self.swapper(scope, &name, &snapshot, &over);
-            let empty = scope.spawn(|| bench_wake(1.0 / rate, (rate * seconds) as u64, thread));
+            let empty = scope.spawn(|| bench_wake(1.0 / rate, (rate * seconds) as u64, thread, &over));
             let run = run(&settings, &file, &name, stop);
             over.request();
             (run, swaps.join(), empty.join())

@@ -84,7 +84,16 @@ impl<R: Rules> Env for Simulated<R> {
         qpos.copy_from_slice(self.sim.model().qpos0());
         qvel.fill(0.0);
         let started = self.rules.start(rng, &mut self.sim, qpos, qvel);
-        started.and_then(|()| self.sim.set_state(qpos, qvel)).map_err(self.physics())
+        started.and_then(|()| self.sim.set_state(qpos, qvel)).map_err(|e| match e {
+            MjError::NotFinite { what, index, value } => EnvError::Task {
+                origin: format!("task '{}'", self.spec.name),
+                key: "reset".into(),
+                reason: format!(
+                    "{what}[{index}] came out as {value}; look for a logarithm, root or quotient that leaves its domain for some draws"
+                ),
+            },
+            other => self.physics()(other),
+        })
     }
 
     fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError> {

@@ -6,6 +6,10 @@ use super::ppo::PpoSettings;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, exp, scalars, scalars_mut};
 use std::ops::Range;
 
+const MOST_VECTORS: usize = 16;
+/// Most outputs of a Gaussian network.
+pub const MOST_OUTPUTS: usize = MOST_VECTORS * LANES;
+
 const HALF_LOG_TWO_PI: f64 = 0.918_938_533_204_672_7;
 
 /// Copies rows `idx` of `source` (each `width` wide) into rows of `to`, `vectors` vectors each, from lane `offset`.
@@ -91,7 +95,7 @@ pub(super) fn residuals(d: &mut [V], x: &[V], mean: &[V], inverse: &[V], log_pro
 #[inline(always)]
 pub(super) fn residuals_back(d: &mut [V], inverse: &[V], c: &[V], grad: Option<&mut [V]>, n: usize) {
     let vectors = inverse.len();
-    let (mut total, mut spread) = (0.0, [ZERO; 16]);
+    let (mut total, mut spread) = (0.0, [ZERO; MOST_VECTORS]);
     for (d, &c) in d.chunks_exact_mut(vectors).zip(scalars(c)) {
         total += c;
         let c = V::splat(c);
@@ -155,7 +159,7 @@ pub(super) fn likelihood_ratio<const N: usize>(
     p: &[V],
     grad: &mut [V],
 ) -> [f32; 3] {
-    let mut inverse = [[ZERO; 16]; N];
+    let mut inverse = [[ZERO; MOST_VECTORS]; N];
     let mut constant = 0.0;
     for (g, inverse) in policy.iter().zip(&mut inverse) {
         constant += inverse_sigma(&mut inverse[..g.log_std.len()], &p[g.log_std.clone()], g.n);

@@ -10,7 +10,6 @@ use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, Schedule, TILE, Tile, add_sums, optimise};
 use super::value::{Value, ValueWork};
 use super::{Adam, Dims, Learner, Metrics, init};
-use nearl_runtime::net::Dense;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Networks, multiversion};
@@ -243,14 +242,6 @@ impl Phases for Nets {
             VALUE => self.value.rows(batch),
             _ => self.inverse.rows(d, batch),
         }
-    }
-}
-
-/// The policy as a network, for tests and exports.
-impl Ppo {
-    /// Mean action network.
-    pub fn policy(&self) -> Dense {
-        self.nets.policy.mlp.to_dense(&self.params.groups[ACTOR].p)
     }
 }
 

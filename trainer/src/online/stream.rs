@@ -66,6 +66,8 @@ pub struct Stream {
     aligned: bool,
     /// Computed again, waiting for the state it led to.
     last: Option<Box<TransitionMessage>>,
+    /// The tally has it.
+    counted: bool,
     sums: Sums,
     episode: Episode,
     /// What was collected.
@@ -97,6 +99,7 @@ impl Stream {
             wanted: 0,
             aligned: false,
             last: None,
+            counted: false,
             sums: Sums::default(),
             episode: Episode::default(),
             rows: Rows::new(&controller, gamma, moved_penalty),
@@ -150,6 +153,13 @@ impl Stream {
             self.aligned = true;
             self.episode = Episode { whole: true, ..Episode::default() };
             return Ok(());
+        }
+        if self.counted {
+            self.state.q.copy_from_slice(next.q());
+            self.state.v.copy_from_slice(next.v());
+            let tally = &mut self.rows.collected.tally;
+            tally.reached_violations += u64::from(self.controller.breaks_limits(&self.state));
+            tally.residual += self.controller.residual(next.obs(), &self.out);
         }
         let step = self.env.judge(&moment(last), &moment(next), last.action())?;
         self.sums.reward += step.reward;
@@ -219,11 +229,13 @@ impl Stream {
         self.state.obs.copy_from_slice(tick.obs());
         self.controller.update(&self.state, &self.noise, &mut self.out);
         self.sums.moved += self.out.next.ledger.moved;
+        self.counted = false;
         if !self.is_like(tick) {
             self.left_out.unlike += 1;
             self.sums.spoiled = true;
         } else if tick.policy_version == self.wanted {
             self.rows.collected.tally.count(&self.out.next.ledger);
+            self.counted = true;
         } else {
             self.left_out.stale += 1;
         }

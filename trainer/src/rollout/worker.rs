@@ -108,9 +108,12 @@ impl Worker {
     }
 
     /// Collects `n_steps` policy steps.
-    pub fn collect(&mut self, n_steps: usize) {
+    ///
+    /// # Errors
+    /// [`EnvError`] of a reset.
+    pub fn collect(&mut self, n_steps: usize) -> Result<(), EnvError> {
         self.begin(n_steps);
-        self.go_on(n_steps);
+        self.go_on(n_steps)
     }
 
     /// Begins a segment of `n_steps` policy steps.
@@ -120,7 +123,10 @@ impl Worker {
     }
 
     /// Collects the next `n` policy steps of the segment, or those that are left.
-    pub(crate) fn go_on(&mut self, n: usize) {
+    ///
+    /// # Errors
+    /// [`EnvError`] of a reset: one's own may be undefined for some of its draws.
+    pub(crate) fn go_on(&mut self, n: usize) -> Result<(), EnvError> {
         for _ in 0..n.min(self.left) {
             self.left -= 1;
             self.draw(true);
@@ -131,14 +137,17 @@ impl Worker {
             if terminated || truncated {
                 self.collected.tally.episodes.push(self.episode);
                 self.collected.tally.costs.push(self.cost);
-                // the same draws for a reset whatever happened before: an error here is a broken installation
-                self.restart().unwrap_or_else(|e| panic!("{e}"));
+                self.restart()?;
             }
         }
+        Ok(())
     }
 
     /// One episode without noise: return and length in policy steps.
-    pub fn evaluate(&mut self) -> (f64, usize) {
+    ///
+    /// # Errors
+    /// [`EnvError`] of a reset.
+    pub fn evaluate(&mut self) -> Result<(f64, usize), EnvError> {
         self.collected.clear();
         self.draw(false);
         loop {
@@ -146,8 +155,8 @@ impl Worker {
             if terminated || self.ticks >= self.env.spec().max_episode_steps {
                 let episode = self.episode;
                 self.collected.tally.costs.push(self.cost);
-                self.restart().unwrap_or_else(|e| panic!("{e}"));
-                return episode;
+                self.restart()?;
+                return Ok(episode);
             }
         }
     }
@@ -206,17 +215,8 @@ impl Worker {
         self.moved += ledger.moved;
         self.collected.tally.faults += u64::from(step.fault != Fault::None);
         self.collected.tally.reached_violations += u64::from(self.controller.breaks_limits(&self.state));
-        self.collected.tally.residual += self.residual();
+        self.collected.tally.residual += self.controller.residual(&self.state.obs, &self.out);
         (step.reward, step.terminated)
-    }
-
-    /// Mean |reached - target| over the controllable entries, in units of the scale of change.
-    fn residual(&self) -> f64 {
-        let layout = self.controller.layout();
-        let seen = layout.controllable_state();
-        let miss =
-            |&k: &usize| (self.state.obs[layout.state()[k]] - self.out.target[k]).abs() / self.scale[k];
-        seen.iter().map(miss).sum::<f64>() / seen.len().max(1) as f64
     }
 
     fn store(&mut self, reward: f64, terminated: bool, truncated: bool, t: usize, last: bool) {

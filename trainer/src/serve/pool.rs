@@ -155,7 +155,7 @@ fn chunk(
     }
     let mut numbers = Vec::with_capacity(rows * worker.layout().width());
     for _ in 0..rows {
-        worker.transition(noise, &mut numbers);
+        worker.transition(noise, &mut numbers).map_err(|e| e.to_string())?;
     }
     Ok((worker, numbers))
 }
@@ -182,6 +182,6 @@ fn portion(
         worker.set_networks(&snapshot.networks);
         worker.begin(n_steps);
     }
-    worker.go_on(rows);
+    worker.go_on(rows).map_err(|e| e.to_string())?;
     Ok((worker, Vec::new()))
 }

@@ -73,7 +73,7 @@ impl Session {
         let work = Work::Segment {
             snapshot: Arc::clone(&self.snapshot),
             begins: begins.then_some(self.n_steps),
-            start: Start { stream: self.start.stream + i as u64, ..self.start },
+            start: Start { stream: self.start.stream.wrapping_add(i as u64), ..self.start },
         };
         Some(Task { slot, place: Some(i), worker: place.worker.take(), rows, work })
     }

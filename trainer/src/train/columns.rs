@@ -1,6 +1,9 @@
 //! The columns of `metrics.csv` and how an iteration fills them.
 
 use super::{Progress, Training};
+use nearl_runtime::PolicyKind;
+
+const REACHED: &str = "constraints/reached_violations";
 
 /// Columns of `metrics.csv`: SB3's tags where they exist.
 pub const COLUMNS: &[&str] = &[
@@ -13,7 +16,7 @@ pub const COLUMNS: &[&str] = &[
     "constraints/raw_violations",
     "constraints/target_violations",
     "constraints/recovering",
-    "constraints/reached_violations",
+    REACHED,
     "constraints/moved",
     "constraints/distance",
     "constraints/avoided",
@@ -44,7 +47,12 @@ impl Training {
     pub fn row(&self, p: &Progress) -> Vec<f64> {
         let t = &p.tally;
         let per_tick = |n: u64| n as f64 / t.ticks.max(1) as f64;
+        // A policy on actions proposes nothing: nothing is projected, and no target is missed.
+        let proposes = self.snapshot.manifest.policy != PolicyKind::Direct;
+        let of_targets =
+            |name: &str| name == "idm/residual" || name.starts_with("constraints/") && name != REACHED;
         let value = |name: &str| match name {
+            name if !proposes && of_targets(name) => f64::NAN,
             "time/total_timesteps" => p.steps as f64,
             "time/seconds" => p.seconds,
             "time/fps" => p.steps as f64 / p.seconds,
@@ -54,7 +62,7 @@ impl Training {
             "constraints/raw_violations" => per_tick(t.raw_violations),
             "constraints/target_violations" => per_tick(t.projected_violations),
             "constraints/recovering" => per_tick(t.recovering),
-            "constraints/reached_violations" => per_tick(t.reached_violations),
+            REACHED => per_tick(t.reached_violations),
             "constraints/moved" => per_tick(t.moved),
             "constraints/distance" => t.distance / t.ticks.max(1) as f64,
             "constraints/avoided" => t.avoided as f64 / t.raw_violations as f64,

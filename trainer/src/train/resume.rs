@@ -115,9 +115,9 @@ impl Training {
     /// [`TrainError`] with what the system said.
     pub fn save(&mut self, folder: &mut RunFolder) -> Result<PathBuf, TrainError> {
         let name = if self.is_done() { "final" } else { "latest" };
-        let path = folder.save(name, self.snapshot())?;
+        // The checkpoint first: from it the snapshot can be written again, should this end here.
         self.checkpoint().map_err(TrainError::Settings)?.save(&checkpoint::path_in(folder.path()))?;
-        Ok(path)
+        Ok(folder.save(name, self.snapshot())?)
     }
 }
 

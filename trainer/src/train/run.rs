@@ -69,8 +69,9 @@ pub fn resume_on(
             manifest.steps
         )));
     }
-    if let (true, Ok(snapshot)) = (training.is_done(), run_folder::snapshot_of(path)) {
-        return Ok(snapshot);
+    let last = path.join("checkpoints").join("final.safetensors");
+    if training.is_done() && last.is_file() {
+        return Ok(last);
     }
     let folder = RunFolder::reopen(path, held, COLUMNS, manifest.steps, manifest.version)?;
     run(training, folder, report)
@@ -101,8 +102,10 @@ impl Training {
             Ok(Some(progress)) => progress,
             Ok(None) => return Ok(None),
             Err(e) => {
-                if self.snapshot().manifest.version > 0 {
-                    self.save(folder)?;
+                if self.snapshot().manifest.version > 0
+                    && let Err(unsaved) = self.save(folder)
+                {
+                    return Err(TrainError::Settings(format!("{e}; besides, {unsaved}")));
                 }
                 return Err(e);
             }

@@ -102,6 +102,7 @@ impl ServedSource {
                 {
                     std::thread::sleep(BUSY);
                 }
+                _ if self.is_stopped() => return Ok(false),
                 Err(e) => return Err(self.refusal().unwrap_or(e)),
             }
         };

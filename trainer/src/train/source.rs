@@ -70,7 +70,7 @@ pub trait Source: Send {
 impl Source for Collector {
     fn collect(&mut self, snapshot: &Snapshot) -> Result<bool, SourceError> {
         self.set_networks(&snapshot.networks);
-        Collector::collect(self);
+        Collector::collect(self)?;
         Ok(true)
     }
 

@@ -24,7 +24,10 @@ impl Worker {
     }
 
     /// One policy step; appends its row to `row` as [`Layout::columns`] has it. The tally holds this step alone.
-    pub fn transition(&mut self, explore: bool, row: &mut Vec<f64>) {
+    ///
+    /// # Errors
+    /// [`EnvError`] of a reset.
+    pub fn transition(&mut self, explore: bool, row: &mut Vec<f64>) -> Result<(), EnvError> {
         row.extend_from_slice(&self.state.obs);
         self.draw(explore);
         self.collected.tally = Tally::default();
@@ -45,8 +48,8 @@ impl Worker {
         row.extend([t.avoided, t.active_rows, t.reached_violations].map(|n| n as f64));
         row.extend([t.residual, t.faults as f64]);
         if terminated || truncated {
-            // the same draws for a reset whatever happened before: an error here is a broken installation
-            self.restart().unwrap_or_else(|e| panic!("{e}"));
+            self.restart()?;
         }
+        Ok(())
     }
 }
