@@ -166,7 +166,7 @@ impl Model {
         Ok(self.tangent(v.py(), |d, out| d.nle(&q, &v_, out)))
     }
 
-    /// Inverse dynamics `tau = M a + nle` (nv), without springs and dampers: a motor supplies `tau - passive(q, v)`.
+    /// Inverse dynamics `tau = M a + nle` (nv), without springs and dampers; `motors` has them.
     fn rnea<'py>(
         &self,
         q: &Bound<'py, PyAny>,
@@ -192,6 +192,27 @@ impl Model {
     fn passive<'py>(&self, q: &Bound<'py, PyAny>, v: &Bound<'py, PyAny>) -> PyResult<Vector<'py>> {
         let (q, v_) = (self.q("q", q)?, self.v("v", v)?);
         Ok(self.tangent(v.py(), |d, out| d.passive(&q, &v_, out)))
+    }
+
+    /// What the motors supply (nv) [N·m or N] to keep acceleration `a` over a control period of `dt` [s] that begins at `q`, `v`: `rnea` less
+    /// the passive forces, which are taken on average over the period. `sub_steps` as for `Projector`.
+    #[pyo3(signature = (q, v, a, dt, sub_steps=1))]
+    fn motors<'py>(
+        &self,
+        q: &Bound<'py, PyAny>,
+        v: &Bound<'py, PyAny>,
+        a: &Bound<'py, PyAny>,
+        dt: f64,
+        sub_steps: u32,
+    ) -> PyResult<Vector<'py>> {
+        if !(dt.is_finite() && dt > 0.0) {
+            return Err(errors::value(format!(
+                "dt is {dt} s, no control period; give a positive number of seconds"
+            )));
+        }
+        let period = constraints::Period::new(dt, sub_steps);
+        let (q, v_, a) = (self.q("q", q)?, self.v("v", v)?, self.v("a", a)?);
+        Ok(self.tangent(v.py(), |d, out| d.motors(&period, &q, &v_, &a, out)))
     }
 
     /// The configuration (nq) reached from `q` along the tangent displacement `dq` (nv).

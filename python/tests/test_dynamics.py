@@ -94,6 +94,24 @@ def test_inverse_dynamics(pair, rng) -> None:
         close(ours.aba(q, v, ours.rnea(q, v, a)), a, 1e-8)
 
 
+def test_motors_reckon_with_euler_s_implicit_damping(pair, rng) -> None:
+    """MuJoCo's own inverse of its discrete step."""
+    ours, theirs = pair
+    if theirs.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+        pytest.skip("another integrator")
+    flags = theirs.opt.enableflags
+    theirs.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_INVDISCRETE
+    for data in states(theirs, rng):
+        data.qacc[:] = 10 * rng.normal(size=theirs.nv)
+        qacc = data.qacc.copy()
+        mujoco.mj_inverse(theirs, data)
+        q = ours.q_from_mujoco(data.qpos)
+        v = ours.v_from_mujoco(q, data.qvel)
+        tau = ours.motors(q, v, ours.a_from_mujoco(q, v, qacc), theirs.opt.timestep)
+        close(ours.tau_to_mujoco(q, tau), data.qfrc_inverse, 1e-10)
+    theirs.opt.enableflags = flags
+
+
 def test_integrate_and_difference_invert_each_other(pair, rng) -> None:
     ours, theirs = pair
     for data in states(theirs, rng, 10):

@@ -28,7 +28,8 @@ class Tick:
 
     @property
     def torque(self) -> Array:
-        return self.model.rnea(self.q, self.v, self.acceleration) - self.model.passive(self.q, self.v)
+        # With one Euler step the dampers meet the next velocity; there are no springs.
+        return self.model.rnea(self.q, self.v, self.acceleration) - self.model.passive(self.q, self.v_next)
 
 
 def tip(q: Array) -> Array:
