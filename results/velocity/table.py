@@ -43,7 +43,7 @@ def main(runs: Path, folder: Path) -> None:
 
     def cell(way: str, task: str, name: str) -> str:
         values = [float(r[name]) for r in rows if (r["way"], r["task"]) == (way, task) and r[name]]
-        return f"{interquartile_mean(values):.4g} ({min(values):.3g} .. {max(values):.3g})" if values else ""
+        return f"{interquartile_mean(values):.4g} ({min(values):.3g} .. {max(values):.3g})" if values else "–"
 
     lines = ["| task | | " + " | ".join(COLUMNS) + " |", "|---|---|" + "---|" * len(COLUMNS)]
     for task in sorted({r["task"] for r in rows}):
