@@ -163,6 +163,8 @@ def test_an_environment_without_mujoco_has_no_robot(tmp_path: Path) -> None:
 
 def test_a_task_from_gymnasium_learns_once_its_reward_is_written(tmp_path: Path) -> None:
     file = nearl.from_gymnasium("InvertedPendulum-v5", tmp_path)
+    with pytest.raises(ValueError, match=r"\[reward\] of 'InvertedPendulum' is 0 whatever happens"):
+        nearl.PID2(file)
     text = file.read_text().replace("nothing_yet = 0.0", "alive = 1.0").replace("[termination]\n", '[termination]\nfell = "abs(q.hinge) > 0.2"\n')
     file.write_text(text.replace("[reset]\n", '[reset]\nposition = "0.01 * uniform"\nvelocity = "0.01 * uniform"\n'))
     seen: list[float] = []

@@ -29,9 +29,9 @@ fn weights_do_not_depend_on_threads() {
     }
 }
 
-/// A snapshot that went through a file gives the training's own actions, bit for bit.
+/// A controller of a snapshot that went through a file gives the actions of one of the training's own, bit for bit.
 #[test]
-fn deployment_repeats_training() {
+fn a_snapshot_survives_its_file() {
     for task in ["HalfCheetah-v5", "Panda-reach"] {
         let mut t = training(task, "pid2-ib", 0, 1, &["train.n_steps=64", "train.ppo.batch_size=512"]);
         (0..3).for_each(|_| drop(t.iterate()));

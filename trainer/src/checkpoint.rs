@@ -3,7 +3,7 @@
 //! The file's metadata has one key, `nearl-checkpoint`: the blake3 digest in hex, a line break, a header as JSON. The digest
 //! covers header and tensors, as in a snapshot. Floating-point numbers of the state are tensors, so no bit is lost.
 
-use nearl_runtime::snapshot::{MAX_BYTES, Manifest, digest, write_whole};
+use nearl_runtime::snapshot::{Manifest, digest, write_whole};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
@@ -12,6 +12,8 @@ use std::path::{Path, PathBuf};
 /// Version of the file format.
 pub const FORMAT: u32 = 1;
 const KEY: &str = "nearl-checkpoint";
+/// Largest file that is read: far above what the widest networks need, and below what a wrong file would fill memory with.
+const MAX_BYTES: u64 = 8 << 30;
 
 /// Everything but floating-point state.
 #[derive(Clone, Debug, Serialize, Deserialize)]

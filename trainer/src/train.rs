@@ -139,6 +139,14 @@ impl Training {
     /// [`TrainError`] in one sentence.
     pub fn on(request: &Request, experience: &Experience) -> Result<Self, TrainError> {
         let mut manifest = request.manifest.clone();
+        let reward = &manifest.task.reward;
+        let is_nothing = |v: &toml::Value| v.as_float() == Some(0.0) || v.as_integer() == Some(0);
+        if !reward.is_empty() && reward.values().all(is_nothing) {
+            return Err(TrainError::Settings(format!(
+                "[reward] of '{}' is 0 whatever happens, and nothing can be learned from it; write what the task rewards",
+                manifest.task.name
+            )));
+        }
         let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
         manifest.algo.clone_from(&request.algo);
         manifest.policy = policy_kind(&request.algo, &settings, manifest.task.idm.kind)?;
