@@ -152,14 +152,10 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
             {
                 return Err(self.unsupported(&feature, "take it out"));
             }
-            if is_joint(node) {
-                if let Some(feature) = stated("springdamper")? {
-                    return Err(self.unsupported(&feature, "write stiffness and damping instead"));
-                }
-                if self.attribute(node, "actuatorgravcomp") == Some("true") {
-                    let feature = format!("actuatorgravcomp='true' of {}", called(node));
-                    return Err(self.unsupported(&feature, "take it out"));
-                }
+            if is_joint(node)
+                && let Some(feature) = stated("springdamper")?
+            {
+                return Err(self.unsupported(&feature, "write stiffness and damping instead"));
             }
         }
         Ok(())

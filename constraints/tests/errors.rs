@@ -112,14 +112,10 @@ fn forces_that_would_be_missing() {
     let inner = "<default class='c'><joint springdamper='0.1 1'/></default>";
     refuse_model(file(inner, "childclass='c'", ""), &spring);
     refuse_model(file("", "gravcomp='1'", ""), &["gravcomp='1' of body 'arm'", "take it out"]);
-    let motors = ["actuatorgravcomp='true' of joint 'a'", "take it out"];
-    refuse_model(file("", "", "actuatorgravcomp='true'"), &motors);
-    refuse_model(file("<joint actuatorgravcomp='true'/>", "", ""), &motors);
     for (defaults, body, joint) in [
         ("<joint springdamper='0.1 1'/>", "", "springdamper='0 0'"),
         (inner, "", ""),
-        ("", "gravcomp='0'", "actuatorgravcomp='false'"),
-        ("<joint actuatorgravcomp='true'/>", "", "actuatorgravcomp='false'"),
+        ("", "gravcomp='0'", "actuatorgravcomp='true'"), // compensates what no body asks for
         ("", "", "stiffness='40' damping='8'"),
     ] {
         assert!(file(defaults, body, joint).is_ok(), "{defaults} {body} {joint}");
