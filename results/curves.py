@@ -56,8 +56,6 @@ def main(runs: Path, folder: Path) -> None:
         at = lambda k, s: f"{values[k][s]:.5g}" if s in values[k] else ""  # noqa: E731
         curves += [head | {"steps": int(s)} | {k: at(k, s) for k in values} for s in steps[::THIN]]
         last = {k: "" if (v := end(run, m)) is None else f"{v:.5g}" for k, m in COLUMNS.items()}
-        if run.algo == "ppo":
-            last["residual"] = ""  # it asks for no state; older runs have a number there
         ends.append(head | {"steps": int(steps[-1]), **last, "without_noise": f"{without_noise(run):.5g}", "seconds": round(run.column("time/seconds")[1][-1])})
     write(folder / "curves.csv", curves)
     write(folder / "runs.csv", ends)

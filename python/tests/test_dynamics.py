@@ -80,15 +80,20 @@ def test_non_linear_effects(pair, rng) -> None:
         close(ours.tau_to_mujoco(q, ours.passive(q, v)), data.qfrc_passive, 1e-12)
 
 
-def test_inverse_dynamics(pair, rng) -> None:
-    ours, theirs = pair
+def inverses(ours, theirs, rng):
+    """MuJoCo's inverse dynamics at random states and accelerations, with what they are in Pinocchio's convention."""
     for data in states(theirs, rng):
         data.qacc[:] = 10 * rng.normal(size=theirs.nv)
         qacc = data.qacc.copy()
         mujoco.mj_inverse(theirs, data)
         q = ours.q_from_mujoco(data.qpos)
         v = ours.v_from_mujoco(q, data.qvel)
-        a = ours.a_from_mujoco(q, v, qacc)
+        yield data, q, v, ours.a_from_mujoco(q, v, qacc)
+
+
+def test_inverse_dynamics(pair, rng) -> None:
+    ours, theirs = pair
+    for data, q, v, a in inverses(ours, theirs, rng):
         tau = ours.rnea(q, v, a) - ours.passive(q, v)
         close(ours.tau_to_mujoco(q, tau), data.qfrc_inverse, 1e-10)
         close(ours.aba(q, v, ours.rnea(q, v, a)), a, 1e-8)
@@ -101,13 +106,8 @@ def test_motors_reckon_with_euler_s_implicit_damping(pair, rng) -> None:
         pytest.skip("another integrator")
     flags = theirs.opt.enableflags
     theirs.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_INVDISCRETE
-    for data in states(theirs, rng):
-        data.qacc[:] = 10 * rng.normal(size=theirs.nv)
-        qacc = data.qacc.copy()
-        mujoco.mj_inverse(theirs, data)
-        q = ours.q_from_mujoco(data.qpos)
-        v = ours.v_from_mujoco(q, data.qvel)
-        tau = ours.motors(q, v, ours.a_from_mujoco(q, v, qacc), theirs.opt.timestep)
+    for data, q, v, a in inverses(ours, theirs, rng):
+        tau = ours.motors(q, v, a, theirs.opt.timestep)
         close(ours.tau_to_mujoco(q, tau), data.qfrc_inverse, 1e-10)
     theirs.opt.enableflags = flags
 

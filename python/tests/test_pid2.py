@@ -163,12 +163,18 @@ def test_two_agents_do_not_mix_their_rows_in_one_run_folder(tmp_path: Path) -> N
     assert third.num_timesteps == 8192
 
 
-def test_a_reward_that_is_not_a_number_ends_the_learning(tmp_path: Path) -> None:
-    task = tmp_path / "task.toml"
-    text = Path(CART_POLE).read_text()
-    task.write_text(text.replace("[reward]", "[reward]\nroot = \"log(cos(0.1) - 2.0)\"", 1))
+def edited(folder: Path, old: str, new: str) -> Path:
+    """The cart-pole with ``old`` replaced by ``new``, and its robot beside it."""
+    text, task = Path(CART_POLE).read_text(), folder / "task.toml"
+    assert old in text
+    task.write_text(text.replace(old, new, 1))
     robot = Path(CART_POLE).parent / tomllib.loads(text)["model"]["mjcf"]
-    (tmp_path / robot.name).write_text(robot.read_text())
+    (folder / robot.name).write_text(robot.read_text())
+    return task
+
+
+def test_a_reward_that_is_not_a_number_ends_the_learning(tmp_path: Path) -> None:
+    task = edited(tmp_path, "[reward]", '[reward]\nroot = "log(cos(0.1) - 2.0)"')
     agent = nearl.PID2(task, algo="ppo", run=tmp_path / "run", threads=1)
     with pytest.raises(ValueError, match="nothing can be learned from it"):
         agent.learn(2048)
@@ -198,10 +204,7 @@ def test_a_second_learn_at_the_same_time_is_refused() -> None:
 
 
 def test_rows_of_a_prediction_do_not_hear_of_each_other(tmp_path: Path) -> None:
-    task = tmp_path / "task.toml"
-    text = Path(CART_POLE).read_text().replace('consistency = "free"', 'consistency = "kinematic"\njerk = { limit = { slider = 50.0 } }')
-    task.write_text(text)
-    (tmp_path / "cart-pole.xml").write_text((Path(CART_POLE).parent / "cart-pole.xml").read_text())
+    task = edited(tmp_path, 'consistency = "free"', 'consistency = "kinematic"\njerk = { limit = { slider = 50.0 } }')
     agent = nearl.PID2(task, algo="pid2-ib", threads=1)
     assert agent.controller.remembers
     obs = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 5))

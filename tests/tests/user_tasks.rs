@@ -17,6 +17,16 @@ fn example(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/tasks").join(name)
 }
 
+/// The cart-pole in `folder` with `from` replaced by `to`, and its robot beside it.
+fn edited(folder: &Path, from: &str, to: &str) -> String {
+    let text = std::fs::read_to_string(example("cart-pole.toml")).expect("example");
+    assert!(text.contains(from), "{from}");
+    std::fs::copy(example("cart-pole.xml"), folder.join("cart-pole.xml")).expect("robot");
+    let file = folder.join("mine.toml");
+    std::fs::write(&file, text.replacen(from, to, 1)).expect("task");
+    file.display().to_string()
+}
+
 fn random_action(env: &dyn Env, rng: &mut env::ChaCha8Rng) -> Vec<f64> {
     env.spec().action_low().zip(env.spec().action_high()).map(|(l, h)| rng.random_range(l..h)).collect()
 }
@@ -118,36 +128,27 @@ const MISTAKES: &[(&str, &str, &[&str])] = &[
 
 #[test]
 fn mistakes_are_named_with_file_and_key() {
-    let text = std::fs::read_to_string(example("cart-pole.toml")).expect("example");
     let folder = tempfile::tempdir().expect("folder");
-    std::fs::copy(example("cart-pole.xml"), folder.path().join("cart-pole.xml")).expect("robot");
-    let file = folder.path().join("mine.toml");
     for (from, to, says) in MISTAKES {
-        assert!(text.contains(from), "{from}");
-        std::fs::write(&file, text.replacen(from, to, 1)).expect("task");
-        let message = tasks::load(&file.display().to_string(), &[]).map(|_| ()).expect_err(to).to_string();
+        let message =
+            tasks::load(&edited(folder.path(), from, to), &[]).map(|_| ()).expect_err(to).to_string();
         assert!(message.contains("mine.toml") || message.contains("cart-poll"), "{message}");
         says.iter().for_each(|part| assert!(message.contains(part), "'{part}' is not in: {message}"));
     }
-    std::fs::write(
-        &file,
-        text.replacen("[reward]", "[termination]", 1).replacen("[termination]\nfell", "[cost]\nfell", 1),
-    )
-    .expect("task");
-    let message = tasks::load(&file.display().to_string(), &[]).map(|_| ()).map_err(|e| e.to_string());
+    let file = edited(folder.path(), "[reward]", "[termination]");
+    let text = std::fs::read_to_string(&file).expect("task");
+    std::fs::write(&file, text.replacen("[termination]\nfell", "[cost]\nfell", 1)).expect("task");
+    let message = tasks::load(&file, &[]).map(|_| ()).map_err(|e| e.to_string());
     assert!(message.is_err_and(|m| m.contains("[termination]: only a task with its own [reward]")));
 }
 
 /// A reward that leaves its domain ends the training instead of spoiling it, and what was learned stays.
 #[test]
 fn a_reward_that_is_no_number_ends_the_training() {
-    let text = std::fs::read_to_string(example("cart-pole.toml")).expect("example");
     let folder = tempfile::tempdir().expect("folder");
-    std::fs::copy(example("cart-pole.xml"), folder.path().join("cart-pole.xml")).expect("robot");
-    let (file, run) = (folder.path().join("mine.toml"), folder.path().join("run"));
+    let run = folder.path().join("run");
     let odd = "[reward]\nodd = \"0.0 * log(q.slider + 0.5)\"";
-    std::fs::write(&file, text.replacen("[reward]", odd, 1)).expect("task");
-    let mut manifest = tasks::load(&file.display().to_string(), &[]).expect("task");
+    let mut manifest = tasks::load(&edited(folder.path(), "[reward]", odd), &[]).expect("task");
     complete(&mut manifest).expect("environment");
     let request = Request { manifest, algo: "ppo".into(), steps: 100_000, seed: 0, threads: 1 };
     let error = train(&request, &run, |_, _| true).expect_err("a reward of NaN").to_string();
@@ -163,11 +164,8 @@ fn a_reward_that_is_no_number_ends_the_training() {
 #[test]
 fn a_start_that_is_undefined_for_some_draws_ends_the_training_and_keeps_what_was_learned() {
     let folder = tempfile::tempdir().expect("folder");
-    let text = std::fs::read_to_string(example("cart-pole.toml")).expect("task");
-    let task = folder.path().join("task.toml");
-    std::fs::write(&task, text.replace("0.1 * uniform", "0.2 * sqrt(0.99 + uniform)")).expect("task");
-    std::fs::copy(example("cart-pole.xml"), folder.path().join("cart-pole.xml")).expect("robot");
-    let mut manifest = tasks::load(&task.display().to_string(), &[]).expect("task");
+    let task = edited(folder.path(), "0.1 * uniform", "0.2 * sqrt(0.99 + uniform)");
+    let mut manifest = tasks::load(&task, &[]).expect("task");
     complete(&mut manifest).expect("manifest");
     let request = Request { manifest, algo: "ppo".into(), steps: 1_000_000, seed: 0, threads: 2 };
     let out = folder.path().join("run");
@@ -180,12 +178,8 @@ fn a_start_that_is_undefined_for_some_draws_ends_the_training_and_keeps_what_was
 fn more_outputs_than_can_be_learned_are_refused_by_number() {
     let folder = tempfile::tempdir().expect("folder");
     let more: String = (0..300).map(|k| format!(", \"sin({k} * q.slider)\"")).collect();
-    let text = std::fs::read_to_string(example("cart-pole.toml")).expect("task");
-    let task = folder.path().join("task.toml");
-    std::fs::write(&task, text.replace("\"v.hinge\"]", &format!("\"v.hinge\"{more}]"))).expect("task");
-    std::fs::copy(example("cart-pole.xml"), folder.path().join("cart-pole.xml")).expect("robot");
-    let mut manifest =
-        tasks::load(&task.display().to_string(), &["train.exploration=proposal".into()]).expect("task");
+    let task = edited(folder.path(), "\"v.hinge\"]", &format!("\"v.hinge\"{more}]"));
+    let mut manifest = tasks::load(&task, &["train.exploration=proposal".into()]).expect("task");
     complete(&mut manifest).expect("manifest");
     let request = Request { manifest, algo: "pid2-ib".into(), steps: 1024, seed: 0, threads: 1 };
     let error = Training::new(&request).map(|_| ()).expect_err("305 entries").to_string();

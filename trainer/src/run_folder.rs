@@ -1,5 +1,6 @@
 //! The run folder: `task.toml metrics.csv env.json checkpoints/` and the robot file of one training.
 
+use crate::checkpoint;
 use nearl_runtime::snapshot::{in_run, write_whole};
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use std::fs::File;
@@ -65,22 +66,35 @@ pub fn task_file(manifest: &Manifest) -> (String, String) {
 /// Writes the effective task file as `<name>.toml` with its robot file beside it; returns its path.
 ///
 /// # Errors
-/// What the system said.
-pub fn write_task(folder: &Path, name: &str, manifest: &Manifest) -> std::io::Result<PathBuf> {
+/// [`RunError::Write`] naming the file.
+pub fn write_task(folder: &Path, name: &str, manifest: &Manifest) -> Result<PathBuf, RunError> {
     let (task, robot) = task_file(manifest);
-    std::fs::write(folder.join(robot), &manifest.model)?;
     let file = folder.join(format!("{name}.toml"));
-    std::fs::write(&file, task)?;
+    put(&file, &task)?;
+    put(&folder.join(robot), &manifest.model)?;
     Ok(file)
+}
+
+fn put(file: &Path, text: &str) -> Result<(), RunError> {
+    std::fs::write(file, text).map_err(unwritten(file))
+}
+
+/// Why `file` cannot be written.
+fn unwritten(file: &Path) -> impl Fn(std::io::Error) -> RunError {
+    move |e| RunError::Write { path: file.display().to_string(), reason: e.to_string() }
 }
 
 /// Whether something was learned there: a row of metrics, or a checkpoint.
 fn holds_a_run(path: &Path) -> bool {
     let rows = |text: String| text.lines().count() > 1;
-    let has = |name: &str| path.join("checkpoints").join(name).exists();
     std::fs::read_to_string(path.join("metrics.csv"))
         .map_or_else(|e| e.kind() != std::io::ErrorKind::NotFound, rows)
-        || ["resume", "final", "latest"].iter().any(|name| has(&format!("{name}.safetensors")))
+        || has_checkpoint(path)
+}
+
+/// Whether there is something to go on from or to evaluate.
+pub fn has_checkpoint(path: &Path) -> bool {
+    checkpoint::path_in(path).exists() || snapshot_of(path).is_ok()
 }
 
 /// Holds a run folder until the file is dropped: two trainings would mix their rows. What is locked is `env.json`, which is never written
@@ -90,15 +104,13 @@ fn holds_a_run(path: &Path) -> bool {
 /// [`RunError::Busy`]; [`RunError::Write`] when it cannot be opened or locked.
 pub fn lock(path: &Path) -> Result<Option<File>, RunError> {
     let file = path.join("env.json");
-    let write =
-        |e: std::io::Error| RunError::Write { path: file.display().to_string(), reason: e.to_string() };
     // for appending: a file system over the network locks nothing that may not be written
     let held = match File::options().append(true).open(&file) {
         Ok(held) => held,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-        Err(e) => return Err(write(e)),
+        Err(e) => return Err(unwritten(&file)(e)),
     };
-    match is_ours(&held).map_err(write)? {
+    match is_ours(&held).map_err(unwritten(&file))? {
         true => Ok(Some(held)),
         false => Err(RunError::Busy { path: path.display().to_string() }),
     }
@@ -134,32 +146,22 @@ impl RunFolder {
     /// # Errors
     /// [`RunError`]; a folder that already holds a run is never overwritten.
     pub fn create(path: &Path, manifest: &Manifest, seed: u64, columns: &[&str]) -> Result<Self, RunError> {
-        let write = |p: &Path, e: std::io::Error| RunError::Write {
-            path: p.display().to_string(),
-            reason: e.to_string(),
-        };
         drop(lock(path)?);
         if holds_a_run(path) {
             return Err(RunError::Exists { path: path.display().to_string() });
         }
         let checkpoints = path.join("checkpoints");
-        std::fs::create_dir_all(&checkpoints).map_err(|e| write(&checkpoints, e))?;
-        let put = |name: &str, text: &str| {
-            let file = path.join(name);
-            std::fs::write(&file, text).map_err(|e| write(&file, e))
-        };
-        let (task, robot) = task_file(manifest);
-        put("task.toml", &task)?;
-        put(&robot, &manifest.model)?;
+        std::fs::create_dir_all(&checkpoints).map_err(unwritten(&checkpoints))?;
+        write_task(path, "task", manifest)?;
         let host = serde_json::json!({
             "algo": manifest.algo, "seed": seed, "version": env!("CARGO_PKG_VERSION"),
             "mujoco": "3.17.0", "pinocchio": "4.1.0", "isa": nearl_runtime::net::kernel::isa(),
             "cores": std::thread::available_parallelism().map_or(1, usize::from), "os": std::env::consts::OS, "arch": std::env::consts::ARCH,
         });
-        put("env.json", &format!("{host:#}\n"))?;
+        put(&path.join("env.json"), &format!("{host:#}\n"))?;
         let file = path.join("metrics.csv");
-        let mut metrics = BufWriter::new(File::create(&file).map_err(|e| write(&file, e))?);
-        writeln!(metrics, "{}", columns.join(",")).map_err(|e| write(&file, e))?;
+        let mut metrics = BufWriter::new(File::create(&file).map_err(unwritten(&file))?);
+        writeln!(metrics, "{}", columns.join(",")).map_err(unwritten(&file))?;
         Ok(Self::open(path, metrics, columns, 0, lock(path)?))
     }
 
@@ -201,9 +203,7 @@ impl RunFolder {
             write_whole(&file, whole.as_bytes())?;
             File::options().append(true).open(&file)
         };
-        let write =
-            |e: std::io::Error| RunError::Write { path: file.display().to_string(), reason: e.to_string() };
-        let metrics = BufWriter::new(open().map_err(write)?);
+        let metrics = BufWriter::new(open().map_err(unwritten(&file))?);
         Ok(Self::open(path, metrics, columns, steps, held))
     }
 
@@ -227,9 +227,7 @@ impl RunFolder {
         let cell = |v: &f64| if v.is_finite() { v.to_string() } else { String::new() };
         let line = values.iter().map(cell).collect::<Vec<_>>().join(",");
         let file = self.path.join("metrics.csv");
-        writeln!(self.metrics, "{line}")
-            .and_then(|()| self.metrics.flush())
-            .map_err(|e| RunError::Write { path: file.display().to_string(), reason: e.to_string() })
+        writeln!(self.metrics, "{line}").and_then(|()| self.metrics.flush()).map_err(unwritten(&file))
     }
 
     /// Writes `checkpoints/<name>.safetensors` whole. Only the newest of `final` and `latest` stays.

@@ -11,7 +11,7 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use crate::checkpoint::{self, Checkpoint};
-use crate::run_folder::{self, RunError, snapshot_of};
+use crate::run_folder::{self, RunError};
 use crate::tasks::{self, TaskLoadError};
 use crate::train::{ALGORITHMS, TrainError, complete};
 
@@ -170,7 +170,7 @@ impl Sweep {
             Err(_) => return other("no run: it has no task.toml".into()),
         }
         let checkpoint = checkpoint::path_in(folder);
-        if !checkpoint.exists() && snapshot_of(folder).is_err() {
+        if !run_folder::has_checkpoint(folder) {
             return Ok(Found::Broken);
         }
         let file = checkpoint.display().to_string();

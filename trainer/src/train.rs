@@ -14,7 +14,7 @@ pub use setup::complete;
 pub use source::{Experience, Source, SourceError};
 
 use crate::checkpoint::CheckpointError;
-use crate::learn::{Batch, Dims, Learner, MOST_OUTPUTS, Metrics, advantages};
+use crate::learn::{Batch, Dims, Learner, Metrics, advantages};
 use crate::rollout::{Collected, RolloutError, Segment, Tally, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
@@ -24,7 +24,7 @@ use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::rollout_protocol::Layout;
 use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
-use setup::{check_minibatch, learner, limit_scale, policy_kind};
+use setup::{check_minibatch, check_outputs, check_reward, learner, limit_scale, policy_kind};
 use std::time::Instant;
 
 /// Names of the algorithms.
@@ -139,14 +139,7 @@ impl Training {
     /// [`TrainError`] in one sentence.
     pub fn on(request: &Request, experience: &Experience) -> Result<Self, TrainError> {
         let mut manifest = request.manifest.clone();
-        let reward = &manifest.task.reward;
-        let is_nothing = |v: &toml::Value| v.as_float() == Some(0.0) || v.as_integer() == Some(0);
-        if !reward.is_empty() && reward.values().all(is_nothing) {
-            return Err(TrainError::Settings(format!(
-                "[reward] of '{}' is 0 whatever happens, and nothing can be learned from it; write what the task rewards",
-                manifest.task.name
-            )));
-        }
+        check_reward(&manifest.task)?;
         let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
         manifest.algo.clone_from(&request.algo);
         manifest.policy = policy_kind(&request.algo, &settings, manifest.task.idm.kind)?;
@@ -160,15 +153,7 @@ impl Training {
             seen_obs: seen.iter().map(|&k| parts.layout.state()[k]).collect(),
             seen_state: seen,
         };
-        if let Some((what, n)) = [("proposed entries", dims.n_state), ("actions", dims.n_act)]
-            .into_iter()
-            .find(|(_, n)| *n > MOST_OUTPUTS)
-        {
-            return Err(TrainError::Settings(format!(
-                "'{}' has {n} {what}, and {MOST_OUTPUTS} can be learned; name fewer under state.propose",
-                manifest.task.name
-            )));
-        }
+        check_outputs(&manifest.task.name, &dims)?;
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);

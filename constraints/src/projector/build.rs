@@ -171,7 +171,8 @@ fn stages(
     weight: &[f64],
     settings: &Settings,
 ) -> Result<Option<Stages>, LimitError> {
-    let mut sources = Sources::new(model, each, &dofs.controllable)?;
+    let period = Period::new(settings.dt, settings.sub_steps);
+    let mut sources = Sources::new(model, each, &dofs.controllable, &period)?;
     let free = settings.consistency == Consistency::Free;
     let labels = sources.labels();
     if let Some(label) = labels.first().filter(|_| free) {
@@ -204,7 +205,6 @@ fn stages(
     let (zero, neutral) = (vec![0.0; model.nv()], model.neutral());
     let mut dynamics = Dynamics::new(model);
     let rest = Measured { q: &neutral, v: &zero, external: &zero, previous: None };
-    let period = Period::new(settings.dt, settings.sub_steps);
     sources.fill(&mut problem, &mut dynamics, &rest, dofs, &zero, &period);
     let conic = Conic::new(&problem, sigma, settings.max_iter, settings.deadline)?;
     let (n, m) = (problem.n, problem.m);

@@ -65,6 +65,7 @@ impl Sources {
         model: &Model,
         limits: &[Box<dyn Limit>],
         controllable: &[usize],
+        period: &Period,
     ) -> Result<Sources, LimitError> {
         let (mut blocks, mut cones, mut first) = (Vec::new(), Vec::new(), 0);
         for (limit, l) in limits.iter().enumerate() {
@@ -89,7 +90,7 @@ impl Sources {
         let scratch = Scratch {
             mass: vec![0.0; nv * nv],
             nle: zero(),
-            resistance: zero(),
+            resistance: (0..nv).map(|i| period.resistance(model, i)).collect(),
             bias: zero(),
             still: zero(),
         };
@@ -154,9 +155,6 @@ impl Sources {
             dynamics.mass(q, &mut s.mass);
             dynamics.nle(q, v, &mut s.nle);
             dynamics.passive_over(period, q, v, &mut s.bias);
-            for (i, r) in s.resistance.iter_mut().enumerate() {
-                *r = period.resistance(dynamics.model(), i);
-            }
             for i in 0..v.len() {
                 s.bias[i] = s.nle[i] - s.bias[i] - measured.external[i];
             }

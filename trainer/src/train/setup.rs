@@ -1,11 +1,11 @@
 //! From a manifest and its settings to what is trained.
 
 use super::{ALGORITHMS, TrainError};
-use crate::learn::{Dims, Kind, Learner, Nearl, Pid2, Ppo};
+use crate::learn::{Dims, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Ppo};
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
 use nearl_runtime::controller::Parts;
-use nearl_runtime::task::IdmKind;
+use nearl_runtime::task::{IdmKind, Task};
 use nearl_runtime::{Manifest, PolicyKind};
 use rand_chacha::ChaCha8Rng;
 
@@ -62,6 +62,27 @@ pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
     manifest.action_lower = spec.action_low().collect();
     manifest.action_upper = spec.action_high().collect();
     Ok(())
+}
+
+pub(super) fn check_reward(task: &Task) -> Result<(), TrainError> {
+    let is_nothing = |v: &toml::Value| v.as_float() == Some(0.0) || v.as_integer() == Some(0);
+    if task.reward.is_empty() || !task.reward.values().all(is_nothing) {
+        return Ok(());
+    }
+    Err(TrainError::Settings(format!(
+        "[reward] of '{}' is 0 whatever happens, and nothing can be learned from it; write what the task rewards",
+        task.name
+    )))
+}
+
+pub(super) fn check_outputs(task: &str, dims: &Dims) -> Result<(), TrainError> {
+    let outputs = [("proposed entries", dims.n_state), ("actions", dims.n_act)];
+    match outputs.into_iter().find(|(_, n)| *n > MOST_OUTPUTS) {
+        None => Ok(()),
+        Some((what, n)) => Err(TrainError::Settings(format!(
+            "'{task}' has {n} {what}, and {MOST_OUTPUTS} can be learned; name fewer under state.propose"
+        ))),
+    }
 }
 
 pub(super) fn check_minibatch(minibatch: usize, batch: usize) -> Result<(), TrainError> {
