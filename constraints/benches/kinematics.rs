@@ -40,9 +40,9 @@ fn rows(name: &str, limit: &dyn Limit) {
     let mut outside = vec![false; n];
     time(&format!("{name}, {n} rows: fill"), |k| {
         let q = &configuration(k);
-        let (mass, resistance, bias, previous) = (&[][..], &[][..], &[][..], None);
+        let (mass, motors, bias, previous) = (&[][..], &[][..], &[][..], None);
         let kinematics = &mut kinematics;
-        let mut tick = Tick { q, v: &v, period: &period, mass, resistance, bias, kinematics, previous };
+        let mut tick = Tick { q, v: &v, period: &period, mass, motors, bias, kinematics, previous };
         g.fill(0.0);
         upper.fill(f64::INFINITY);
         let (g, lower, upper, outside) = (&mut g[..], &mut lower[..], &mut upper[..], &mut outside[..]);

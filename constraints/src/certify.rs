@@ -35,9 +35,10 @@ impl Certificate {
 /// Looks for a state of the viable set in which the motors could not give the decelerations B braking counts on:
 ///
 /// ```text
-///     sum_j |M_ij| B_j + |nle_i - passive_i| <= effort_i
+///     sum_j |rows_ij| B_j + |bias_i| <= effort_i
 /// ```
 ///
+/// with the motor forces `rows a + bias` of [`Dynamics::motor_rows`],
 /// over `samples` seeded random states, a tenth of the positions and half of the velocities at their limits. While it
 /// holds, the torque rows never empty the box. It is a search, not a proof: keep some margin. Dofs that are not
 /// controllable rest at the neutral configuration.
@@ -78,9 +79,8 @@ struct Search<'a> {
     random: u64,
     q: Vec<f64>,
     v: Vec<f64>,
-    mass: Vec<f64>,
-    nle: Vec<f64>,
-    passive: Vec<f64>,
+    motors: Vec<f64>,
+    bias: Vec<f64>,
     worst: Certificate,
 }
 
@@ -112,25 +112,21 @@ impl<'a> Search<'a> {
             random: seed,
             q: model.neutral(),
             v: zero.clone(),
-            mass: vec![0.0; nv * nv],
-            nle: zero.clone(),
-            passive: zero,
+            motors: vec![0.0; nv * nv],
+            bias: zero,
             worst,
         }
     }
 
     fn look(&mut self) {
         self.sample();
-        self.dynamics.mass(&self.q, &mut self.mass);
-        self.dynamics.nle(&self.q, &self.v, &mut self.nle);
-        self.dynamics.passive_over(self.period, &self.q, &self.v, &mut self.passive);
+        self.dynamics.motor_rows(self.period, &self.q, &self.v, &mut self.motors, &mut self.bias);
         let nv = self.v.len();
         for &i in self.controllable {
-            self.mass[i * nv + i] += self.period.resistance(self.model, i);
             let effort = self.limits.effort[i];
-            let still = (self.nle[i] - self.passive[i]).abs();
-            let moving: f64 =
-                self.controllable.iter().map(|j| self.mass[j * nv + i].abs() * self.limits.braking[*j]).sum();
+            let still = self.bias[i].abs();
+            let row = &self.motors[i * nv..(i + 1) * nv];
+            let moving: f64 = self.controllable.iter().map(|j| row[*j].abs() * self.limits.braking[*j]).sum();
             let (margin, scale) = (1.0 - (still + moving) / effort, ((effort - still) / moving).max(0.0));
             self.worst.scale = self.worst.scale.min(scale);
             if margin < self.worst.margin {

@@ -147,7 +147,7 @@ impl Checker {
         for i in 0..v.len() {
             self.a[i] = (v_next[i] - v[i]) / self.period.dt;
         }
-        if self.needs.dynamics {
+        if self.needs.motors {
             self.motors(q, v, external);
         }
         if self.needs.kinematics {

@@ -13,15 +13,26 @@ pub struct Dynamics {
     model: Model,
     scratch: RawData,
     lengths: (usize, usize),
-    passive: Vec<f64>,
+    middle: Middle,
+}
+
+/// The state whose forces stand for those of a whole period, and scratch (q: nq, the rest nv).
+#[derive(Default)]
+struct Middle {
+    q: Vec<f64>,
+    v: Vec<f64>,
+    step: Vec<f64>,
+    force: Vec<f64>,
+    behind: Vec<f64>,
 }
 
 impl Dynamics {
     /// Scratch for `model`.
     pub fn new(model: &Model) -> Dynamics {
         let lengths = (model.nq(), model.nv());
-        let passive = vec![0.0; lengths.1];
-        Dynamics { scratch: RawData::new(model.raw()), model: model.clone(), lengths, passive }
+        let zero = || vec![0.0; lengths.1];
+        let middle = Middle { q: model.neutral(), v: zero(), step: zero(), force: zero(), behind: zero() };
+        Dynamics { scratch: RawData::new(model.raw()), model: model.clone(), lengths, middle }
     }
 
     /// Inverse dynamics `tau = M a + nle`, without the passive forces: a motor supplies `tau - passive`.
@@ -81,7 +92,7 @@ impl Dynamics {
     /// [`Dynamics::passive`] on average over a period without acceleration: springs meet the configuration half a period less half a
     /// sub-step later. Constant acceleration adds [`Period::resistance`].
     pub fn passive_over(&self, period: &Period, q: &[f64], v: &[f64], passive: &mut [f64]) {
-        self.passive_after(0.5 * (period.dt - period.tau), q, v, passive);
+        self.passive_after(period.lag(), q, v, passive);
     }
 
     fn passive_after(&self, time: f64, q: &[f64], v: &[f64], passive: &mut [f64]) {
@@ -97,16 +108,82 @@ impl Dynamics {
         }
     }
 
-    /// What the motors supply (nv) to keep acceleration `a` over a period that begins at `q`, `v`, without external forces:
-    /// `tau = rnea(q, v, a) - passive`, springs and dampers as they are on average over the period.
+    /// What the motors supply (nv) to keep acceleration `a` over a period that begins at `q`, `v`, without external forces. With the
+    /// configuration `q* = q (+) h v` and the velocity `v + h a` at which the plant evaluates its forces on average (`h` is
+    /// [`Period::lag`], 0 with one physics step in the period):
+    ///
+    /// ```text
+    ///     tau = M(q*) a + nle(q*, v) + h (d nle / d v) a - passive
+    /// ```
+    ///
+    /// It is linear in `a`, as the rows of the projector are ([`Dynamics::motor_rows`]), and off by `O(T^2)`; springs and dampers are
+    /// averaged exactly.
     pub fn motors(&mut self, period: &Period, q: &[f64], v: &[f64], a: &[f64], tau: &mut [f64]) {
-        self.rnea(q, v, a, tau);
-        let mut passive = std::mem::take(&mut self.passive);
-        self.passive_over(period, q, v, &mut passive);
-        for (i, tau) in tau.iter_mut().enumerate() {
-            *tau += period.resistance(&self.model, i) * a[i] - passive[i];
+        self.check(q, &[v, a, tau]);
+        let mut m = std::mem::take(&mut self.middle);
+        let lag = period.lag();
+        if lag == 0.0 {
+            self.rnea(q, v, a, tau);
+        } else {
+            self.go_on(lag, q, v, &mut m);
+            self.rnea(&m.q, v, a, tau);
+            m.step.iter_mut().zip(a).for_each(|(step, a)| *step = lag * a);
+            self.nle_along(v, &mut m);
+            tau.iter_mut().zip(&m.force).for_each(|(tau, nle)| *tau += nle);
         }
-        self.passive = passive;
+        self.passive_over(period, q, v, &mut m.force);
+        for (i, tau) in tau.iter_mut().enumerate() {
+            *tau += period.resistance(&self.model, i) * a[i] - m.force[i];
+        }
+        self.middle = m;
+    }
+
+    /// [`Dynamics::motors`] for any acceleration: `tau = rows a + bias`, with `rows` (nv x nv, row-major) and `bias` (nv). With several
+    /// physics steps in the period it evaluates the non-linear effects `2 nv` times.
+    pub fn motor_rows(&mut self, period: &Period, q: &[f64], v: &[f64], rows: &mut [f64], bias: &mut [f64]) {
+        self.check(q, &[v, bias]);
+        let mut m = std::mem::take(&mut self.middle);
+        let (nv, lag) = (self.lengths.1, period.lag());
+        if lag == 0.0 {
+            self.mass(q, rows);
+            self.nle(q, v, bias);
+        } else {
+            self.go_on(lag, q, v, &mut m);
+            self.mass(&m.q, rows);
+            self.nle(&m.q, v, bias);
+            for j in 0..nv {
+                m.step.fill(0.0);
+                m.step[j] = 1.0;
+                self.nle_along(v, &mut m);
+                rows.iter_mut().skip(j).step_by(nv).zip(&m.force).for_each(|(row, nle)| *row += lag * nle);
+            }
+        }
+        self.passive_over(period, q, v, &mut m.force);
+        for i in 0..nv {
+            rows[i * nv + i] += period.resistance(&self.model, i);
+            bias[i] -= m.force[i];
+        }
+        self.middle = m;
+    }
+
+    /// `force = (d nle / d v) step` at `v`. The non-linear effects are quadratic in the velocity, so that the central difference is the
+    /// derivative for a step of any size. (Pinocchio's own derivative is off for bodies with several joints: it takes their axes for
+    /// constant.)
+    fn nle_along(&mut self, v: &[f64], m: &mut Middle) {
+        let shift = |m: &mut Middle, sign: f64| {
+            m.v.iter_mut().zip(v.iter().zip(&m.step)).for_each(|(x, (v, step))| *x = v + sign * step);
+        };
+        shift(m, -1.0);
+        self.nle(&m.q, &m.v, &mut m.behind);
+        shift(m, 1.0);
+        self.nle(&m.q, &m.v, &mut m.force);
+        m.force.iter_mut().zip(&m.behind).for_each(|(ahead, behind)| *ahead = 0.5 * (*ahead - behind));
+    }
+
+    /// Writes the configuration reached from `q` at velocity `v` after `time`.
+    fn go_on(&mut self, time: f64, q: &[f64], v: &[f64], m: &mut Middle) {
+        m.step.iter_mut().zip(v).for_each(|(step, v)| *step = time * v);
+        self.integrate(q, &m.step, &mut m.q);
     }
 
     /// `out = q (+) dq`: the configuration reached from `q` (nq) along the tangent displacement `dq` (nv).

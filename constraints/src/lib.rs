@@ -30,9 +30,9 @@
 //! # What is promised
 //!
 //! With analytic inverse dynamics, a fully actuated robot and a model that is right, the reached state obeys position,
-//! velocity, acceleration and torque limits for any proposal, as long as the braking holds by [`certify_braking`]. Torque
-//! rows are evaluated at the start of the period. Contact forces are not modelled. Of a floating base, the rows hold the
-//! proposed motion constant.
+//! velocity, acceleration and torque limits for any proposal, as long as the braking holds by [`certify_braking`]. With
+//! one physics step in a period that is exact, with several right to second order in it. Contact forces are not modelled. Of a
+//! floating base, the rows hold the proposed motion constant.
 //!
 //! # Linking
 //!

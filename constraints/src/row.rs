@@ -16,12 +16,12 @@ pub struct Tick<'a> {
     pub v: &'a [f64],
     /// The control period.
     pub period: &'a Period,
-    /// Mass matrix (nv x nv, symmetric); zero unless some row has [`Needs::dynamics`].
+    /// Mass matrix (nv x nv, symmetric); zero unless some row has [`Needs::mass`].
     pub mass: &'a [f64],
-    /// What springs and dampers add to its diagonal for the motors (nv), [`Period::resistance`].
-    pub resistance: &'a [f64],
-    /// `nle - passive - external`: what the motors supply beside `(M + resistance) a` (nv), passive forces on average over the period;
-    /// zero unless some row has [`Needs::dynamics`].
+    /// What an acceleration costs the motors (nv x nv, row-major), [`Dynamics::motor_rows`](crate::Dynamics::motor_rows); zero unless
+    /// some row has [`Needs::motors`].
+    pub motors: &'a [f64],
+    /// What the motors supply without acceleration (nv), less the external forces; zero unless some row has [`Needs::motors`].
     pub bias: &'a [f64],
     /// Frames and Jacobians at `q`, `v` and zero acceleration; stale unless some row has [`Needs::kinematics`].
     pub kinematics: &'a mut Kinematics,
@@ -30,13 +30,12 @@ pub struct Tick<'a> {
 }
 
 impl Tick<'_> {
-    /// Writes `g` (nv), by which the force of motor `i` rises for a unit of velocity change: row `i` of `(M + resistance) / T`.
+    /// Writes `g` (nv), by which the force of motor `i` rises for a unit of velocity change: row `i` of `motors / T`.
     pub fn motor(&self, i: usize, g: &mut [f64]) {
         let (nv, t) = (self.v.len(), self.period.dt);
-        for (g, mass) in g.iter_mut().zip(&self.mass[i * nv..(i + 1) * nv]) {
-            *g = mass / t;
+        for (g, row) in g.iter_mut().zip(&self.motors[i * nv..(i + 1) * nv]) {
+            *g = row / t;
         }
-        g[i] += self.resistance[i] / t;
     }
 }
 
@@ -61,7 +60,8 @@ pub struct Motion<'a> {
     pub v_next: &'a [f64],
     /// `(v' - v) / T` (nv).
     pub acceleration: &'a [f64],
-    /// Motor force by inverse dynamics at `q`, `v` and that acceleration (nv); zero unless some row has [`Needs::dynamics`].
+    /// Motor force for that acceleration by inverse dynamics (nv), [`Dynamics::motors`](crate::Dynamics::motors) less the external forces;
+    /// zero unless some row has [`Needs::motors`].
     pub torque: &'a [f64],
     /// The control period.
     pub period: &'a Period,
@@ -74,8 +74,10 @@ pub struct Motion<'a> {
 /// What of a [`Tick`] and a [`Motion`] a limit reads; the rest is not computed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Needs {
-    /// Mass matrix, bias and motor forces.
-    pub dynamics: bool,
+    /// Mass matrix.
+    pub mass: bool,
+    /// Motor forces.
+    pub motors: bool,
     /// Frames and Jacobians.
     pub kinematics: bool,
     /// Acceleration and motor force of the tick before.

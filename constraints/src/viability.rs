@@ -131,6 +131,11 @@ impl Period {
         Period { dt, sub_steps, tau, kappa }
     }
 
+    /// How long after the start of the period the plant evaluates its forces, on average: `(T - tau) / 2` [s].
+    pub fn lag(&self) -> f64 {
+        0.5 * (self.dt - self.tau)
+    }
+
     /// What the damper and the spring of dof `i` add to the mass matrix's diagonal when the acceleration is constant over the period:
     /// `kappa T D + (T^2 - tau^2) / 6 K`, for they meet the velocity `v + kappa T a` and the configuration
     /// `q + (T - tau) / 2 v + (T^2 - tau^2) / 6 a` on average. With one sub-step it is `T D`: MuJoCo's Euler step, which is implicit in the

@@ -36,16 +36,8 @@ fn fill(rows: &mut dyn Rows, model: &Model, q: &[f64], v: &[f64], period: &Perio
     kinematics.update(q, v, &vec![0.0; nv]);
     let mut f =
         Filled { g: vec![0.0; n * nv], lower: vec![f64::NEG_INFINITY; n], upper: vec![f64::INFINITY; n] };
-    let mut tick = Tick {
-        q,
-        v,
-        period,
-        mass: &[],
-        resistance: &[],
-        bias: &[],
-        kinematics: &mut kinematics,
-        previous: None,
-    };
+    let mut tick =
+        Tick { q, v, period, mass: &[], motors: &[], bias: &[], kinematics: &mut kinematics, previous: None };
     let (g, lower, upper) = (&mut f.g[..], &mut f.lower[..], &mut f.upper[..]);
     let outside = &mut vec![false; n][..];
     rows.fill(&mut tick, &mut RowsMut { g, lower, upper, outside, nv });

@@ -1,7 +1,7 @@
 //! The model computes what MuJoCo 3.17.0 computes on the same file: numbers in `fixtures/mujoco.json` and `fixtures/motors.json`,
 //! written by `fixtures/generate.py` and `fixtures/generate_motors.py`.
 
-use nearl_constraints::{Dynamics, Model, convention as c};
+use nearl_constraints::{Dynamics, Model, Period, convention as c};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -53,6 +53,32 @@ fn joints_ranges_and_mass_are_mujoco_s() {
                 ),
                 false => assert!(lower == f64::NEG_INFINITY && upper == f64::INFINITY, "{name} {joint:?}"),
             }
+        }
+    }
+}
+
+/// The projector's rows and what its judge asks for; with several physics steps in a period a mass matrix alone would not do.
+#[test]
+fn rows_of_the_motors_are_the_motors() {
+    for (name, robot, model) in robots() {
+        let (nq, nv) = (model.nq(), model.nv());
+        let mut dynamics = Dynamics::new(&model);
+        for (state, sub_steps) in
+            robot["states"].as_array().unwrap().iter().zip([0, 1, 5].into_iter().cycle())
+        {
+            let (mut q, mut v, mut a) = (vec![0.0; nq], vec![0.0; nv], vec![0.0; nv]);
+            c::q_from_mujoco(&model, &numbers(&state["qpos"]), &mut q);
+            c::v_from_mujoco(&model, &q, &numbers(&state["qvel"]), &mut v);
+            c::a_from_mujoco(&model, &q, &v, &numbers(&state["qacc"]), &mut a);
+            let period = Period::new(0.01, sub_steps);
+            let (mut rows, mut tau, mut judged) = (vec![0.0; nv * nv], vec![0.0; nv], vec![0.0; nv]);
+            dynamics.motor_rows(&period, &q, &v, &mut rows, &mut tau);
+            tau.iter_mut().zip(rows.chunks(nv)).for_each(|(tau, row)| {
+                *tau += row.iter().zip(&a).map(|(r, a)| r * a).sum::<f64>();
+            });
+            dynamics.motors(&period, &q, &v, &a, &mut judged);
+            let off = relative(&tau, &judged);
+            assert!(off < 1e-11, "{name}, {sub_steps} sub-steps: {off:e}");
         }
     }
 }

@@ -195,7 +195,7 @@ impl Model {
     }
 
     /// What the motors supply (nv) [N·m or N] to keep acceleration `a` over a control period of `dt` [s] that begins at `q`, `v`: `rnea` less
-    /// the passive forces, which are taken on average over the period. `sub_steps` as for `Projector`.
+    /// the passive forces, on average over the period. `sub_steps` as for `Projector`.
     #[pyo3(signature = (q, v, a, dt, sub_steps=1))]
     fn motors<'py>(
         &self,

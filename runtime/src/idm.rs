@@ -39,7 +39,7 @@ impl LearnedIdm {
 }
 
 /// Recursive Newton-Euler on the robot model: `tau = M(q) a + nle(q, v) - tau_passive` with `a = (v' - v) / dt` (Featherstone 2008; through
-/// Pinocchio), springs and dampers on average over the period ([`Dynamics::motors`]).
+/// Pinocchio), on average over the period ([`Dynamics::motors`]).
 pub struct AnalyticIdm {
     dynamics: Dynamics,
     dofs: Vec<usize>,

@@ -81,7 +81,7 @@ impl Cone for EnergyCone {
     }
 
     fn needs(&self) -> Needs {
-        Needs { dynamics: true, ..Needs::default() }
+        Needs { mass: true, ..Needs::default() }
     }
 
     fn fill(&mut self, tick: &mut Tick<'_>, g: &mut [f64], c: &mut [f64]) -> f64 {

@@ -26,7 +26,7 @@ impl Default for TorqueSettings {
     }
 }
 
-/// `|(M/T) y + nle - passive| <= scale * effort - margin`, at the state of the tick.
+/// `|tau| <= scale * effort - margin`, with the motor forces of a whole period, [`Dynamics::motors`](crate::Dynamics::motors).
 #[derive(Debug, Clone, Default)]
 pub struct TorqueLimit {
     settings: TorqueSettings,
@@ -109,7 +109,7 @@ impl Rows for TorqueRows {
     }
 
     fn needs(&self) -> Needs {
-        Needs { dynamics: true, ..Needs::default() }
+        Needs { motors: true, ..Needs::default() }
     }
 
     fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {

@@ -73,7 +73,7 @@ impl Rows for TorqueRateRows {
     }
 
     fn needs(&self) -> Needs {
-        Needs { dynamics: true, previous: true, ..Needs::default() }
+        Needs { motors: true, previous: true, ..Needs::default() }
     }
 
     fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {

@@ -91,7 +91,7 @@ impl Rows for TorqueSpeedRows {
     }
 
     fn needs(&self) -> Needs {
-        Needs { dynamics: true, ..Needs::default() }
+        Needs { motors: true, ..Needs::default() }
     }
 
     fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {

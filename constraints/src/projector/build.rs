@@ -172,7 +172,7 @@ fn stages(
     settings: &Settings,
 ) -> Result<Option<Stages>, LimitError> {
     let period = Period::new(settings.dt, settings.sub_steps);
-    let mut sources = Sources::new(model, each, &dofs.controllable, &period)?;
+    let mut sources = Sources::new(model, each, &dofs.controllable)?;
     let free = settings.consistency == Consistency::Free;
     let labels = sources.labels();
     if let Some(label) = labels.first().filter(|_| free) {

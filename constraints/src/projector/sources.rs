@@ -18,11 +18,10 @@ pub(crate) struct Sources {
     outside: Vec<bool>,
 }
 
-/// What the dynamics say at the state of the tick.
+/// What the dynamics say about the tick.
 struct Scratch {
     mass: Vec<f64>,
-    nle: Vec<f64>,
-    resistance: Vec<f64>,
+    motors: Vec<f64>,
     bias: Vec<f64>,
     still: Vec<f64>,
 }
@@ -65,7 +64,6 @@ impl Sources {
         model: &Model,
         limits: &[Box<dyn Limit>],
         controllable: &[usize],
-        period: &Period,
     ) -> Result<Sources, LimitError> {
         let (mut blocks, mut cones, mut first) = (Vec::new(), Vec::new(), 0);
         for (limit, l) in limits.iter().enumerate() {
@@ -87,13 +85,8 @@ impl Sources {
         let (nv, zero) = (model.nv(), || vec![0.0; model.nv()]);
         let largest = blocks.iter().map(|b| b.sizes.len()).chain(cones.iter().map(|c| c.cone.dimension()));
         let g = vec![0.0; nv * largest.max().unwrap_or(0)];
-        let scratch = Scratch {
-            mass: vec![0.0; nv * nv],
-            nle: zero(),
-            resistance: (0..nv).map(|i| period.resistance(model, i)).collect(),
-            bias: zero(),
-            still: zero(),
-        };
+        let scratch =
+            Scratch { mass: vec![0.0; nv * nv], motors: vec![0.0; nv * nv], bias: zero(), still: zero() };
         let outside = vec![false; first];
         Ok(Sources { blocks, cones, needs, scratch, kinematics: Kinematics::new(model), g, outside })
     }
@@ -151,21 +144,19 @@ impl Sources {
         period: &Period,
     ) {
         let (q, v, s) = (measured.q, measured.v, &mut self.scratch);
-        if self.needs.dynamics {
+        if self.needs.mass {
             dynamics.mass(q, &mut s.mass);
-            dynamics.nle(q, v, &mut s.nle);
-            dynamics.passive_over(period, q, v, &mut s.bias);
-            for i in 0..v.len() {
-                s.bias[i] = s.nle[i] - s.bias[i] - measured.external[i];
-            }
+        }
+        if self.needs.motors {
+            dynamics.motor_rows(period, q, v, &mut s.motors, &mut s.bias);
+            s.bias.iter_mut().zip(measured.external).for_each(|(bias, external)| *bias -= external);
         }
         if self.needs.kinematics {
             self.kinematics.update(q, v, &s.still);
         }
-        let (mass, resistance, bias) = (&s.mass[..], &s.resistance[..], &s.bias[..]);
+        let (mass, motors, bias) = (&s.mass[..], &s.motors[..], &s.bias[..]);
         let previous = measured.previous;
-        let mut tick =
-            Tick { q, v, period, mass, resistance, bias, kinematics: &mut self.kinematics, previous };
+        let mut tick = Tick { q, v, period, mass, motors, bias, kinematics: &mut self.kinematics, previous };
         let nv = v.len();
         self.outside.fill(false);
         for block in &mut self.blocks {
@@ -202,7 +193,8 @@ impl Needs {
     /// What either needs.
     pub(crate) fn and(self, other: Needs) -> Needs {
         Needs {
-            dynamics: self.dynamics || other.dynamics,
+            mass: self.mass || other.mass,
+            motors: self.motors || other.motors,
             kinematics: self.kinematics || other.kinematics,
             previous: self.previous || other.previous,
         }
