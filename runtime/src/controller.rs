@@ -85,6 +85,25 @@ enum Inverse {
     Analytic(AnalyticIdm),
 }
 
+/// How far a joint is outside a limit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Excess {
+    /// Degree of freedom.
+    pub dof: usize,
+    /// Distance from the limit [rad or m, per s for a velocity].
+    pub by: f64,
+}
+
+impl Excess {
+    /// The larger of two.
+    pub fn larger(a: Option<Excess>, b: Option<Excess>) -> Option<Excess> {
+        match (a, b) {
+            (Some(a), Some(b)) if b.by <= a.by => Some(a),
+            (a, b) => b.or(a),
+        }
+    }
+}
+
 /// The half of a joint's state that is proposed alone.
 #[derive(Clone, Copy)]
 enum Half {
@@ -272,11 +291,11 @@ impl Controller {
         }
         self.interpolate();
         self.projector.project(&self.held.q, &self.held.v, &self.proposal, &mut out.next);
+        if !self.projection {
+            self.projector.pass(&self.held.q, &self.held.v, &self.proposal, &mut out.next);
+        }
         if self.projector.needs_previous() {
             self.projector.remember(&out.next);
-        }
-        if !self.projection {
-            self.pass_raw(&mut out.next);
         }
         for k in 0..self.layout.n_state() {
             let s = self.held.obs[self.layout.state()[k]];
@@ -296,18 +315,6 @@ impl Controller {
                 false => (f32::NEG_INFINITY, f32::INFINITY),
             };
         }
-    }
-
-    /// The raw proposal as target; what it breaks stays in the ledger.
-    fn pass_raw(&self, next: &mut Target) {
-        next.q.copy_from_slice(&self.proposal.q);
-        next.v.copy_from_slice(&self.proposal.v);
-        for (a, (&to, &from)) in next.acceleration.iter_mut().zip(self.proposal.v.iter().zip(&self.held.v)) {
-            *a = (to - from) / self.dt;
-        }
-        next.ledger.violations = next.ledger.raw_violations;
-        next.ledger.moved = 0.0;
-        next.ledger.active.clear();
     }
 
     /// Where the proposal wants the robot at the end of this tick: on the cubic from the state at the
@@ -427,13 +434,18 @@ impl Controller {
     pub fn set_projection(&mut self, on: bool) {
         self.projection = on;
     }
-    /// Whether `state` is outside a position or velocity limit of a controllable joint by more than 1e-9.
-    pub fn breaks_limits(&self, state: &State) -> bool {
-        self.layout.controllable().iter().any(|&dof| {
-            let (q, v, l) = (state.q[self.idx_q[dof]], state.v[dof], self.projector.limits());
-            let position = q < l.q_lower[dof] - 1e-9 || q > l.q_upper[dof] + 1e-9;
-            position || v.abs() > l.velocity[dof] + 1e-9
-        })
+    /// How far `state` is outside the limits of the controllable joints: the largest excess of a position and of a velocity; less than
+    /// 1e-9 is none.
+    pub fn excess(&self, state: &State) -> [Option<Excess>; 2] {
+        let (mut worst, l) = ([None::<Excess>; 2], self.projector.limits());
+        for &dof in self.layout.controllable() {
+            let (q, v) = (state.q[self.idx_q[dof]], state.v[dof]);
+            let by = [(l.q_lower[dof] - q).max(q - l.q_upper[dof]), v.abs() - l.velocity[dof]];
+            for (worst, by) in worst.iter_mut().zip(by) {
+                *worst = Excess::larger(*worst, (by > 1e-9).then_some(Excess { dof, by }));
+            }
+        }
+        worst
     }
     /// Mean `|reached - target|` over the entries of the controllable joints, in units of the scale of change: how far observation `obs`
     /// (n_obs) is from what `out` asked for. 0 for a policy on actions, which asks for no state.

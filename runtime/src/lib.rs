@@ -19,6 +19,6 @@ pub mod tunnel;
 
 pub use nearl_constraints as constraints;
 
-pub use controller::{Controller, Noise, Output, State};
+pub use controller::{Controller, Excess, Noise, Output, State};
 pub use snapshot::{Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
 pub use task::Task;

@@ -2,7 +2,7 @@
 
 use nearl_runtime::{Controller, Snapshot};
 use nearl_tests::training;
-use nearl_trainer::rollout::{make_env, stream};
+use nearl_trainer::rollout::{Worker, make_env, stream};
 
 /// Record A = record B for one thread and two, over several updates of every algorithm.
 #[test]
@@ -56,6 +56,47 @@ fn a_snapshot_survives_its_file() {
                 env.reset(&mut stream(6, 0)).expect("reset");
             }
         }
+    }
+}
+
+/// An episode of the training's own worker, which got its networks from the learner, is one of a controller that loaded the snapshot's file.
+#[test]
+fn what_collects_is_what_is_deployed() {
+    for (task, algo) in [("Hopper-v5", "pid2-ib"), ("HalfCheetah-v5", "ppo"), ("Panda-reach", "pid2-ib")] {
+        let mut t = training(task, algo, 0, 1, &["train.n_steps=64", "train.ppo.batch_size=512"]);
+        let first = t.snapshot().clone();
+        let env = make_env(&first).expect("env");
+        let mut worker = Worker::new(env, &first, 1.0, stream(3, 0)).expect("worker");
+        (0..3).for_each(|_| drop(t.iterate()));
+        worker.set_networks(&t.snapshot().networks);
+        let (ret, steps) = worker.evaluate().expect("episode");
+
+        let loaded = Snapshot::from_bytes(&t.snapshot().to_bytes()).expect("snapshot");
+        let (mut env, mut controller) =
+            (make_env(&loaded).expect("env"), Controller::new(&loaded).expect("controller"));
+        let (mut state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
+        env.reset(&mut stream(3, 0)).expect("reset");
+        // rewards are summed period by period, as there
+        let (mut own, mut period, every) = (0.0, 0.0, controller.policy_every());
+        let ticks = (1..=env.spec().max_episode_steps).find(|tick| {
+            env.observe(&mut state.obs);
+            env.state(&mut state.q, &mut state.v);
+            controller.update(&state, &noise, &mut out);
+            let step = env.step(&out.action);
+            period += step.reward;
+            let is_end = step.terminated || *tick == env.spec().max_episode_steps;
+            if is_end || controller.begins_period() {
+                own += std::mem::take(&mut period);
+            }
+            is_end
+        });
+        let ticks = ticks.expect("an end");
+        assert_eq!(
+            (ret.to_bits(), steps),
+            (own.to_bits(), ticks.div_ceil(every)),
+            "{task} {algo}: {ret} and {own}"
+        );
+        assert_ne!(t.snapshot().networks.policy.layers[0].weight, first.networks.policy.layers[0].weight);
     }
 }
 

@@ -271,5 +271,7 @@ fn a_velocity_prior_holds_in_every_target() {
     assert!(e.raw_violations > e.ticks / 2, "proposals are faster than a centimetre a second");
     assert_eq!(e.target_violations, 0);
     assert!(e.reached_violations > 0, "no motor holds the root: what is reached is another matter");
+    let worst = e.worst.iter().find(|w| w.limit == "velocity").expect("the root is too fast");
+    assert!(worst.joint == "rootx" && worst.by > 0.01, "{worst:?}");
     assert_eq!(e.costs.len(), 2);
 }

@@ -4,6 +4,17 @@ use crate::rollout::{RolloutError, Worker, make_env, stream};
 use nearl_runtime::Snapshot;
 use serde::Serialize;
 
+/// How far a joint came beyond a limit.
+#[derive(Clone, Debug, Serialize)]
+pub struct Worst {
+    /// `position` or `velocity`.
+    pub limit: &'static str,
+    /// The joint.
+    pub joint: String,
+    /// Distance [rad or m, per s for a velocity].
+    pub by: f64,
+}
+
 /// Mean results of some episodes.
 #[derive(Clone, Debug, Serialize)]
 pub struct Evaluation {
@@ -25,6 +36,8 @@ pub struct Evaluation {
     pub target_violations: u64,
     /// Ticks whose state, as the simulator has it afterwards, broke a position or velocity limit.
     pub reached_violations: u64,
+    /// Furthest that the simulator came beyond a position and a velocity limit; only what was broken.
+    pub worst: Vec<Worst>,
     /// Control periods that could not be simulated: each ended its episode with the reward 0.
     pub faults: u64,
     /// Mean over ticks and controllable entries of |reached - target|, in standard deviations of change.
@@ -66,6 +79,7 @@ pub fn evaluate(
         recovering: 0,
         target_violations: 0,
         reached_violations: 0,
+        worst: Vec::new(),
         faults: 0,
         residual: 0.0,
     };
@@ -84,5 +98,10 @@ pub fn evaluate(
         e.residual += t.residual;
     }
     e.residual /= e.ticks.max(1) as f64;
+    let named = ["position", "velocity"].into_iter().zip(worker.excess);
+    let joint = |dof| worker.controller.model().dof_name(dof);
+    e.worst = named
+        .filter_map(|(limit, excess)| excess.map(|x| Worst { limit, joint: joint(x.dof), by: x.by }))
+        .collect();
     Ok(e)
 }

@@ -4,7 +4,7 @@ use super::Projector;
 use super::build::check_combination;
 use crate::row::Previous;
 use crate::viability::Dof;
-use crate::{LimitError, LimitSet, Target};
+use crate::{LimitError, LimitSet, Proposal, Target};
 
 impl Projector {
     /// Switches every limit with that label (see [`Limit::label`](crate::Limit::label)) on or off, for the ticks to come.
@@ -134,9 +134,24 @@ impl Projector {
 
     /// Makes the last tick, which ended with `target`, the tick before.
     pub fn remember(&mut self, target: &Target) {
-        self.previous.known = true;
         self.previous.acceleration.copy_from_slice(&target.acceleration);
         self.previous.torque.copy_from_slice(self.checker.torque());
+        let known = |x: &[f64]| x.iter().all(|x| x.is_finite());
+        self.previous.known = known(&self.previous.acceleration) && known(&self.previous.torque);
+    }
+
+    /// Takes `proposal` as the target of the tick just projected, whatever it breaks: `violations` and what is remembered are the
+    /// proposal's. For comparisons with what [`Projector::project`] does; `q`, `v` as there.
+    pub fn pass(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) {
+        target.q.copy_from_slice(&proposal.q);
+        target.v.copy_from_slice(&proposal.v);
+        for (a, (to, from)) in target.acceleration.iter_mut().zip(proposal.v.iter().zip(v)) {
+            *a = (to - from) / self.period.dt;
+        }
+        let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
+        (target.ledger.violations, target.ledger.slack) = (verdict.counts, verdict.worst);
+        target.ledger.moved = 0.0;
+        target.ledger.active.clear();
     }
 
     /// Names of all rows an [`ActiveRow`](crate::ActiveRow) may speak of: the dofs (nv), then the coupled rows and cones.

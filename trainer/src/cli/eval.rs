@@ -66,6 +66,13 @@ impl Eval {
                 of_targets(format!("{:.3}", e.residual)),
             ));
         }
+        for (e, w) in results.iter().flat_map(|e| e.worst.iter().map(move |w| (e, w))) {
+            let unit = if w.limit == "position" { "rad or m" } else { "rad/s or m/s" };
+            say(format!(
+                "{}: joint '{}' came furthest beyond its {} limit, by {:.3e} {unit}",
+                e.mode, w.joint, w.limit, w.by
+            ));
+        }
         for e in results.iter().filter(|e| e.faults > 0) {
             say(format!("{}: {}", e.mode, unstable(e.faults)));
         }

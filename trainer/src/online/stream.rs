@@ -158,7 +158,7 @@ impl Stream {
             self.state.q.copy_from_slice(next.q());
             self.state.v.copy_from_slice(next.v());
             let tally = &mut self.rows.collected.tally;
-            tally.reached_violations += u64::from(self.controller.breaks_limits(&self.state));
+            tally.reached_violations += u64::from(self.controller.excess(&self.state) != [None; 2]);
             tally.residual += self.controller.residual(next.obs(), &self.out);
         }
         let step = self.env.judge(&moment(last), &moment(next), last.action())?;

@@ -6,14 +6,14 @@ use super::resume::Episode;
 use super::{Collected, RolloutError};
 use crate::env::{Env, EnvError, Fault};
 use nearl_runtime::task::IdmKind;
-use nearl_runtime::{Controller, Networks, Noise, Output, PolicyKind, Snapshot, State};
+use nearl_runtime::{Controller, Excess, Networks, Noise, Output, PolicyKind, Snapshot, State};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 /// One environment with its controller and its random stream.
 pub struct Worker {
     pub(super) env: Box<dyn Env>,
-    pub(super) controller: Controller,
+    pub(crate) controller: Controller,
     kind: PolicyKind,
     learned: bool,
     pub(super) rng: ChaCha8Rng,
@@ -30,6 +30,8 @@ pub struct Worker {
     pub(super) episode: (f64, usize),
     pub(super) cost: f64,
     pub(super) ticks: usize,
+    /// Furthest that a position and a velocity came beyond its limit.
+    pub(crate) excess: [Option<Excess>; 2],
     /// Policy steps left in the segment.
     left: usize,
     pub(super) history: Episode,
@@ -69,6 +71,7 @@ impl Worker {
             episode: (0.0, 0),
             cost: 0.0,
             ticks: 0,
+            excess: [None; 2],
             left: 0,
             history: Episode::default(),
         };
@@ -214,7 +217,9 @@ impl Worker {
         self.collected.tally.count(ledger);
         self.moved += ledger.moved;
         self.collected.tally.faults += u64::from(step.fault != Fault::None);
-        self.collected.tally.reached_violations += u64::from(self.controller.breaks_limits(&self.state));
+        let excess = self.controller.excess(&self.state);
+        self.collected.tally.reached_violations += u64::from(excess != [None; 2]);
+        self.excess = [0, 1].map(|k| Excess::larger(self.excess[k], excess[k]));
         self.collected.tally.residual += self.controller.residual(&self.state.obs, &self.out);
         (step.reward, step.terminated)
     }
