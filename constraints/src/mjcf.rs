@@ -90,6 +90,10 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
                 return Err(self.unsupported(&format!("<{tag}>"), expand));
             }
         }
+        if children(self.root, "default").nth(1).is_some() {
+            let next = "put all of it into one, the reader would take the first";
+            return Err(self.unsupported("several <default> sections", next));
+        }
         for key in ["inertiagrouprange", "boundmass", "boundinertia", "balanceinertia"] {
             if compiler(self.root, key).is_some() {
                 return Err(

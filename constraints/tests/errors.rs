@@ -97,6 +97,22 @@ fn models() {
     refuse_model(Model::from_mjcf_text(range), &["'a' range", "lower 3 above upper 1"]);
 }
 
+/// MuJoCo reads them one after the other into one class; Pinocchio reads the first.
+#[test]
+fn several_sections_of_defaults() {
+    let file = |more: &str| {
+        Model::from_mjcf_text(&format!(
+            "<mujoco><default><joint damping='1'/></default>{more}<worldbody><body name='arm'><joint name='a'/>\
+             <geom size='1' mass='1'/></body></worldbody></mujoco>"
+        ))
+    };
+    assert_eq!(file("").unwrap().damping(), [1.0]);
+    refuse_model(
+        file("<default><joint damping='2'/></default>"),
+        &["several <default> sections", "put all of it into one"],
+    );
+}
+
 /// In MuJoCo the first joint has stiffness 40 and damping 8 (`jnt_stiffness`, `dof_damping`); these forces were zero here.
 #[test]
 fn forces_that_would_be_missing() {

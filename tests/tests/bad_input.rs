@@ -208,6 +208,11 @@ const COMMANDS: &[(&[&str], &[&str])] = &[
     (&["run", "panda", "--plant", "a/b"], &["`a/b`", "letters, digits"]),
     (&["plant", "Panda-reach", "--name", "a.b"], &["`a.b`", "letters, digits"]),
     (&["doctor", "fifo"], &["failed: snapshot"]),
+    (
+        &["plant", "Panda-reach", "--name", "a", "--faults", "lost.json"],
+        &["'lost.json'", "fault 2 of the list happens between plant and loop", "take it out"],
+    ),
+    (&["run", "panda", "--plant", "a", "--faults", "lost.json"], &["'lost.json'", "fault 2 of the list"]),
 ];
 
 #[test]
@@ -217,6 +222,9 @@ fn bad_arguments_are_refused_with_their_name() {
     std::fs::create_dir(at("empty")).expect("folder");
     std::fs::create_dir(at("run")).expect("folder");
     std::fs::write(at("run/metrics.csv"), "steps\n2048\n").expect("file");
+    let faults =
+        r#"{"faults": [{"tick": 9, "kind": {"fault": "freeze"}}, {"tick": 99, "kind": {"fault": "drop"}}]}"#;
+    std::fs::write(at("lost.json"), faults).expect("file");
     std::fs::copy(panda(), at("panda")).expect("copy");
     std::os::unix::fs::symlink("panda", at("link")).expect("link");
     assert!(Command::new("mkfifo").arg(at("fifo")).status().expect("mkfifo").success());

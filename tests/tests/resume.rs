@@ -2,8 +2,10 @@
 
 use nearl_tests::request;
 use nearl_trainer::checkpoint::path_in;
+use nearl_trainer::run_folder::RunFolder;
 use nearl_trainer::train::{Request, resume, train};
 use std::path::Path;
+use std::sync::Barrier;
 
 const BATCH: u64 = 4 * 160;
 const ITERATIONS: u64 = 8;
@@ -89,6 +91,28 @@ fn limits_with_a_memory() {
 }
 
 /// A run that was killed has rows behind its checkpoint, the last of them cut: they come again, once.
+#[test]
+fn of_trainings_that_begin_in_one_folder_at_once_one_has_it() {
+    for _ in 0..20 {
+        let out = tempfile::tempdir().expect("folder");
+        let manifest = &asked("Hopper-v5", "ppo", 1, &[]).manifest;
+        let begin = Barrier::new(4);
+        let create = || {
+            begin.wait();
+            let folder = RunFolder::create(&out.path().join("run"), manifest, 0, &["steps"]);
+            begin.wait();
+            folder.map(drop).map_err(|e| e.to_string())
+        };
+        let all = std::thread::scope(|s| {
+            let threads = [(); 4].map(|()| s.spawn(create));
+            threads.map(|t| t.join().expect("a thread"))
+        });
+        assert_eq!(all.iter().filter(|r| r.is_ok()).count(), 1, "{all:?}");
+        let is_refusal = |e: &String| e.contains("another training is at work");
+        assert!(all.iter().filter_map(|r| r.as_ref().err()).all(is_refusal), "{all:?}");
+    }
+}
+
 #[test]
 fn rows_behind_the_checkpoint_come_again() {
     let folder = tempfile::tempdir().expect("folder");

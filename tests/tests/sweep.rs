@@ -163,7 +163,7 @@ fn a_sweep_that_is_stopped_saves_and_goes_on_later() {
     let output = process.output();
     assert_eq!(output.status.code(), Some(1));
     assert!(
-        text(&output.stderr).contains("3 of 3 runs did not finish; the same command goes on"),
+        text(&output.stderr).contains("interrupted with 3 of 3 runs to go; the same command goes on"),
         "{}",
         text(&output.stderr)
     );
@@ -207,6 +207,20 @@ fn a_sweep_goes_on_exactly_where_it_stopped() {
         assert!(train.arg(&single).output().expect("nearl train").status.success());
         assert_eq!(digest(&run(seed)), digest(&single), "seed {seed}");
     }
+}
+
+/// Not "goes on": it would end there again.
+#[test]
+fn a_sweep_whose_runs_fail_says_what_to_do() {
+    let folder = tempfile::tempdir().expect("folder");
+    let cart_pole = repository().join("examples/tasks/cart-pole.toml").display().to_string();
+    let odd = "reward.odd=\"0.0 * log(q.slider + 0.5)\"";
+    let mut command = Command::new(program("nearl"));
+    command.args(["sweep", "--tasks", &cart_pole, "--algos", "ppo", "--seeds", "0", "--set", odd, "--out"]);
+    let output = command.arg(folder.path()).output().expect("nearl sweep");
+    let (words, error) = (text(&output.stdout), text(&output.stderr));
+    assert!(words.contains("a reward of 'cart-pole' came out as NaN"), "{words}");
+    assert!(error.contains("1 of 1 runs ended with the errors above; mend what they name"), "{error}");
 }
 
 #[test]

@@ -146,23 +146,30 @@ impl RunFolder {
     /// # Errors
     /// [`RunError`]; a folder that already holds a run is never overwritten.
     pub fn create(path: &Path, manifest: &Manifest, seed: u64, columns: &[&str]) -> Result<Self, RunError> {
+        let is_free = || match holds_a_run(path) {
+            true => Err(RunError::Exists { path: path.display().to_string() }),
+            false => Ok(()),
+        };
         drop(lock(path)?);
-        if holds_a_run(path) {
-            return Err(RunError::Exists { path: path.display().to_string() });
-        }
+        is_free()?;
         let checkpoints = path.join("checkpoints");
         std::fs::create_dir_all(&checkpoints).map_err(unwritten(&checkpoints))?;
+        // Held before anything is written, and looked at again: another training may have come at the same time.
+        let env = path.join("env.json");
+        File::options().append(true).create(true).open(&env).map_err(unwritten(&env))?;
+        let held = lock(path)?;
+        is_free()?;
         write_task(path, "task", manifest)?;
         let host = serde_json::json!({
             "algo": manifest.algo, "seed": seed, "version": env!("CARGO_PKG_VERSION"),
             "mujoco": "3.17.0", "pinocchio": "4.1.0", "isa": nearl_runtime::net::kernel::isa(),
             "cores": std::thread::available_parallelism().map_or(1, usize::from), "os": std::env::consts::OS, "arch": std::env::consts::ARCH,
         });
-        put(&path.join("env.json"), &format!("{host:#}\n"))?;
+        put(&env, &format!("{host:#}\n"))?;
         let file = path.join("metrics.csv");
         let mut metrics = BufWriter::new(File::create(&file).map_err(unwritten(&file))?);
         writeln!(metrics, "{}", columns.join(",")).map_err(unwritten(&file))?;
-        Ok(Self::open(path, metrics, columns, 0, lock(path)?))
+        Ok(Self::open(path, metrics, columns, 0, held))
     }
 
     /// Opens the folder of a run to go on: keeps the rows of `metrics.csv` up to `steps`, of which there must be `rows`.

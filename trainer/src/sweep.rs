@@ -208,9 +208,10 @@ impl Sweep {
 
 /// Nothing in it but what a run makes before its task file.
 fn is_empty(folder: &Path) -> bool {
-    let is_bare = |at: &Path, but: &str| {
-        std::fs::read_dir(at).is_ok_and(|mut inside| inside.all(|e| e.is_ok_and(|e| e.file_name() == but)))
+    let is_bare = |at: &Path, but: &[&str]| {
+        let known = |e: std::fs::DirEntry| but.iter().any(|name| e.file_name() == *name);
+        std::fs::read_dir(at).is_ok_and(|mut inside| inside.all(|e| e.is_ok_and(known)))
     };
     let checkpoints = folder.join("checkpoints");
-    is_bare(folder, "checkpoints") && (!checkpoints.exists() || is_bare(&checkpoints, ""))
+    is_bare(folder, &["checkpoints", "env.json"]) && (!checkpoints.exists() || is_bare(&checkpoints, &[]))
 }

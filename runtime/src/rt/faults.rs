@@ -115,6 +115,13 @@ pub enum FaultKind {
     },
 }
 
+impl FaultKind {
+    /// Between plant and loop: the tests play these, on messages of their own.
+    fn is_of_the_way(self) -> bool {
+        matches!(self, FaultKind::Drop | FaultKind::Duplicate | FaultKind::Reorder | FaultKind::Late { .. })
+    }
+}
+
 /// Why a plan cannot be played.
 #[derive(Debug, thiserror::Error)]
 #[error(
@@ -126,14 +133,21 @@ pub struct FaultPlanError {
 }
 
 impl FaultPlan {
-    /// Reads a JSON file.
+    /// Reads a JSON file of faults that `nearl plant` or `nearl run` plays.
     ///
     /// # Errors
-    /// One sentence with the file.
+    /// One sentence with the file, also for a fault of the way between the two.
     pub fn load(path: &Path) -> Result<FaultPlan, FaultPlanError> {
         let fail = |reason: String| FaultPlanError { file: path.display().to_string(), reason };
         let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
-        serde_json::from_str(&text).map_err(|e| fail(crate::snapshot::one_line(&e)))
+        let plan: FaultPlan = serde_json::from_str(&text).map_err(|e| fail(crate::snapshot::one_line(&e)))?;
+        match plan.faults.iter().position(|f| f.kind.is_of_the_way()) {
+            Some(i) => Err(fail(format!(
+                "fault {} of the list happens between plant and loop, where no command plays one; take it out",
+                i + 1
+            ))),
+            None => Ok(plan),
+        }
     }
 
     /// The faults of `tick` (from 1) with their number in the list.

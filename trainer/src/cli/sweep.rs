@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use indicatif::ProgressBar;
@@ -109,10 +109,13 @@ impl SweepCommand {
         }
         match failed {
             0 => Ok(()),
-            n => Err(format!(
-                "{n} of {} runs did not finish; the same command goes on where it is",
-                runs.len()
-            )
+            n => Err(match stop.load(Ordering::Relaxed) {
+                true => format!("interrupted with {n} of {} runs to go; the same command goes on", runs.len()),
+                false => format!(
+                    "{n} of {} runs ended with the errors above; mend what they name, then the same command goes on",
+                    runs.len()
+                ),
+            }
             .into()),
         }
     }
