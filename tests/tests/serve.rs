@@ -184,7 +184,7 @@ fn what_is_served_is_what_training_collects() {
     let mut worker =
         Worker::new(make_env(&snapshot).expect("env"), &snapshot, 0.99, stream(3, 0)).expect("worker");
     worker.collect(steps as usize).expect("rollout");
-    let collected = &worker.collected.segment;
+    let collected = &worker.rows.collected.segment;
     assert_eq!(bits(&reward), bits(&collected.reward));
     assert_eq!((action, log_prob), (collected.action.clone(), collected.log_prob.clone()));
     // The learner also cuts at the end of its segment; a served stream says what the task says.

@@ -5,6 +5,7 @@ mod bench_serve;
 mod demo;
 mod eval;
 mod plant;
+mod process;
 mod project;
 mod serve;
 mod soak;

@@ -85,7 +85,7 @@ pub fn evaluate(
     };
     for _ in 0..episodes {
         let (ret, length) = worker.evaluate().map_err(RolloutError::from)?;
-        let t = &worker.collected.tally;
+        let t = &worker.rows.collected.tally;
         e.returns.push(ret);
         e.costs.extend_from_slice(&t.costs);
         e.lengths.push(length);

@@ -11,7 +11,7 @@ from matplotlib.ticker import NullFormatter
 from nearl import curves
 from nearl.report.read import ReadError, Run, read_run
 from nearl.report.style import CURVES, DEADLINE, steps_axis
-from nearl.report.training import final_return, grouped
+from nearl.report.training import band, final_return, grouped
 
 # The order in which the paper lists them; others follow.
 ORDER = ["ppo", "nearl", "pid2-gan", "pid2-ib"]
@@ -57,7 +57,7 @@ def figure(runs: list[Run]) -> Figure:
                 _empty(panels[row, column], "no cost")
                 continue
             for name, colour in zip(names, CURVES * len(names)):
-                _band(panels[row, column], by_algo.get(name, []), metric, colour)
+                band(panels[row, column], by_algo.get(name, []), metric, colour)
         _threshold(panels[1, column], [run for members in by_algo.values() for run in members])
         steps_axis(panels[-1, column])
     for row, (_, label) in enumerate(rows):
@@ -66,21 +66,6 @@ def figure(runs: list[Run]) -> Figure:
     lines.append(plt.Line2D([], [], color=DEADLINE, linestyle=(0, (5, 3)), label="threshold"))
     drawn.legend(handles=lines, loc="outside lower center", ncols=len(lines))
     return drawn
-
-
-def _band(axes: Axes, members: list[Run], metric: str, colour: str) -> None:
-    found = [c for c in (run.column(metric) for run in members) if c is not None]
-    if not found:
-        return
-    if len(found) > 1:
-        for steps, values in found:
-            axes.plot(steps, values, color=colour, alpha=0.28, linewidth=0.7)
-    try:
-        band = curves.over_seeds(found)
-    except curves.NoCommonSteps:  # the thin lines say it
-        return
-    axes.plot(band.steps, band.centre, color=colour)
-    axes.fill_between(band.steps, band.low, band.high, color=colour, alpha=0.18, linewidth=0)
 
 
 def _threshold(axes: Axes, members: list[Run]) -> None:

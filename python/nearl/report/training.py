@@ -31,7 +31,7 @@ def learning_curves(runs: list[Run]) -> list[str]:
     several = False
     for axes, (task, by_algo) in zip(panels[0], groups.items(), strict=True):
         for colour, (algo, members) in zip(CURVES * len(by_algo), by_algo.items()):
-            several |= _band(axes, members, algo, colour)
+            several |= band(axes, members, "rollout/ep_rew_mean", colour, algo)
         axes.set_title(task)
         axes.legend(loc="upper left")
         steps_axis(axes)
@@ -42,23 +42,24 @@ def learning_curves(runs: list[Run]) -> list[str]:
     return [image(figure, caption)]
 
 
-def _band(axes: Axes, members: list[Run], algo: str, colour: str) -> bool:
-    found = [c for c in (run.column("rollout/ep_rew_mean") for run in members) if c is not None]
+def band(axes: Axes, members: list[Run], metric: str, colour: str, label: str | None = None) -> bool:
+    """Runs of one kind: thin lines for the seeds, their interquartile mean and its band. True where there is a band."""
+    found = [c for c in (run.column(metric) for run in members) if c is not None]
     if not found:
         return False
-    label = f"{algo} ({len(found)} seed{'s' if len(found) > 1 else ''})"
+    words = label and f"{label} ({len(found)} seed{'s' if len(found) > 1 else ''})"
     if len(found) == 1:
-        axes.plot(*found[0], color=colour, label=label)
+        axes.plot(*found[0], color=colour, label=words)
         return False
     for steps, values in found:
         axes.plot(steps, values, color=colour, alpha=0.28, linewidth=0.8)
     try:
-        band = curves.over_seeds(found)
-    except curves.NoCommonSteps:
-        axes.plot([], [], color=colour, label=f"{label}, no steps in common")
+        over = curves.over_seeds(found)
+    except curves.NoCommonSteps:  # the thin lines are there
+        axes.plot([], [], color=colour, label=words and f"{words}, no steps in common")
         return False
-    axes.plot(band.steps, band.centre, color=colour, label=label)
-    axes.fill_between(band.steps, band.low, band.high, color=colour, alpha=0.18, linewidth=0)
+    axes.plot(over.steps, over.centre, color=colour, label=words)
+    axes.fill_between(over.steps, over.low, over.high, color=colour, alpha=0.18, linewidth=0)
     return True
 
 

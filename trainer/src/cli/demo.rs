@@ -1,5 +1,6 @@
 //! `nearl demo`: plant and runtime as two processes over shared memory, a hot swap while they run, and the report.
 
+use super::process::Process;
 use super::{Failure, say};
 use crate::evaluate::evaluate;
 use crate::run_folder::{self, write_task};
@@ -8,7 +9,7 @@ use nearl_runtime::Snapshot;
 use nearl_runtime::link::{RobotName, TrainerLink, Verdict, remove_files};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::Command;
 use std::time::Duration;
 
 /// The bundled snapshot: Panda-reach, trained with the command in `examples/snapshots/README.md`.
@@ -64,17 +65,15 @@ impl Demo {
         let log = self.out.join(format!("{task}.mcap"));
         let _ = std::fs::remove_file(&log);
         let task_file = write_task(&self.out, task, &snapshot.manifest)?;
-        let nearl = std::env::current_exe()?;
         let text = |p: &Path| p.display().to_string();
-        let mut plant = Process::start(&nearl, &["plant", &text(&task_file), "--name", &name, "--json"])?;
+        let plant = Process::nearl(&["plant", &text(&task_file), "--name", &name, "--json"])?;
         let seconds = self.seconds.to_string();
         let run =
             ["run", &text(path), "--plant", &name, "--seconds", &seconds, "--log", &text(&log), "--json"];
-        let runtime = Process::start(&nearl, &run)?;
+        let runtime = Process::nearl(&run)?;
         let swap = self.swap(&name, &snapshot);
         let report = runtime.json()?;
-        plant.stop();
-        let plant = plant.json()?;
+        let plant = plant.stop().json()?;
         remove_files(&RobotName::new(&name)?);
         let modes = [true, false].map(|projection| evaluate(&snapshot, 3, 0, projection));
         let [projected, raw] = modes;
@@ -132,45 +131,6 @@ impl Demo {
             .into());
         }
         Ok(out)
-    }
-}
-
-/// A child that is stopped whatever happens.
-struct Process(Option<Child>);
-
-impl Process {
-    fn start(program: &Path, arguments: &[&str]) -> Result<Self, Failure> {
-        let child = Command::new(program).args(arguments).stdout(Stdio::piped()).spawn()?;
-        Ok(Self(Some(child)))
-    }
-
-    /// Asks the process to end, as a terminal would.
-    fn stop(&mut self) {
-        if let Some(pid) = self.0.as_ref().and_then(|c| i32::try_from(c.id()).ok()) {
-            // SAFETY: sends a signal to a child that has not been waited for.
-            unsafe { libc::kill(pid, libc::SIGTERM) };
-        }
-    }
-
-    /// Waits and reads the JSON object it printed last.
-    fn json(mut self) -> Result<Value, Failure> {
-        let Some(child) = self.0.take() else { return Err("the process was already read".into()) };
-        let output = child.wait_with_output()?;
-        let text = String::from_utf8_lossy(&output.stdout);
-        let line = text.lines().rfind(|l| l.starts_with('{'));
-        line.and_then(|l| serde_json::from_str(l).ok()).ok_or_else(|| {
-            format!("a process of the demo ended without a report ({}); its message is above", output.status)
-                .into()
-        })
-    }
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        if let Some(mut child) = self.0.take() {
-            let _ = child.kill();
-            let _ = child.wait();
-        }
     }
 }
 

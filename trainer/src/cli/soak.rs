@@ -2,6 +2,7 @@
 
 mod stretch;
 
+use super::process::{Process, last_json};
 use super::{Failure, cores, say};
 use crate::allocations::allocations;
 use crate::run_folder::write_task;
@@ -15,7 +16,7 @@ use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::thread::{Scope, ScopedJoinHandle, scope, sleep};
 use std::time::Duration;
-use stretch::{PlantProcess, Stretch, Swaps, at_rate, ballast, opposite};
+use stretch::{Stretch, Swaps, at_rate, ballast, opposite};
 
 /// The bundled snapshot.
 const PANDA: &[u8] = include_bytes!("../../../examples/snapshots/panda-reach.safetensors");
@@ -163,7 +164,12 @@ impl Soak {
         let task = write_task(&self.out, "soak", &snapshot.manifest)?;
         let log = self.out.join("soak.mcap");
         let _ = std::fs::remove_file(&log);
-        let plant = PlantProcess::start(&task, &name, self.priority)?;
+        let (task, priority) = (task.display().to_string(), self.priority.to_string());
+        let mut plant = vec!["plant", &task, "--name", name.as_str(), "--endless", "--json"];
+        if self.priority > 0 {
+            plant.extend(["--priority", &priority]);
+        }
+        let plant = Process::nearl(&plant)?;
         let over = Stop::new();
         let thread = ThreadSettings {
             priority: (self.priority > 0).then_some(self.priority),
@@ -186,7 +192,7 @@ impl Soak {
             over.request();
             (run, swaps.join(), empty.join())
         });
-        let (plant, run) = (plant.end()?, run?);
+        let (plant, run) = (plant.stop().json()?, run?);
         remove_files(&name);
         let panicked = |what: &str| -> Failure { format!("the thread of the {what} panicked").into() };
         let swaps = swaps.map_err(|_| panicked("swaps"))??;
@@ -240,9 +246,7 @@ impl Soak {
             over.request();
             output
         })?;
-        let text = String::from_utf8_lossy(&output.stdout);
-        let line = text.lines().rfind(|line| line.starts_with('{'));
-        line.and_then(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
+        last_json(&output.stdout).ok_or_else(|| {
             format!("'{command}' printed no JSON object ({}): see --beside", output.status).into()
         })
     }

@@ -19,12 +19,7 @@ impl Collected {
         push(numbers, s.final_x.iter().flat_map(|(_, x)| x).map(|&x| f64::from(x)));
         push(numbers, t.episodes.iter().flat_map(|&(total, length)| [total, length as f64]));
         push(numbers, t.costs.iter().copied());
-        let Tally { ticks, raw_violations, recovering, projected_violations, moved, .. } = *t;
-        let Tally { avoided, active_rows, reached_violations, faults, .. } = *t;
-        let counts = [ticks, raw_violations, recovering, projected_violations, moved];
-        let more = [avoided, active_rows, reached_violations, faults];
-        push(numbers, counts.into_iter().chain(more).map(|n| n as f64));
-        push(numbers, [t.distance, t.residual].into_iter());
+        push(numbers, t.ledger().into_iter());
         for stats in [&self.obs_stats, &self.change_stats, &self.return_stats] {
             push(numbers, stats.to_vec().into_iter());
         }
@@ -50,23 +45,10 @@ impl Collected {
             s.final_x.push((t as usize, x.iter().map(|&x| x as f32).collect()));
         }
         let (episodes, costs) = (pull(from)?.as_chunks::<2>().0, pull(from)?);
-        let counts = exactly(from, 9)?;
-        let &[distance, residual] = exactly(from, 2)? else { return None };
-        let count = |i: usize| counts[i] as u64;
         let tally = Tally {
             episodes: episodes.iter().map(|&[total, length]| (total, length as usize)).collect(),
             costs: costs.to_vec(),
-            ticks: count(0),
-            raw_violations: count(1),
-            recovering: count(2),
-            projected_violations: count(3),
-            moved: count(4),
-            avoided: count(5),
-            active_rows: count(6),
-            reached_violations: count(7),
-            faults: count(8),
-            distance,
-            residual,
+            ..Tally::of_ledger(pull(from)?.try_into().ok()?)
         };
         let mut stats = |n: usize| {
             let mut stats = RunningStats::new(n);

@@ -49,7 +49,7 @@ impl Worker {
         put("qvel", e.qvel.clone());
         put("goal", e.goal.clone());
         put("actions", e.actions.clone());
-        put("sums", vec![self.episode.0, self.discounted, self.cost]);
+        put("sums", vec![self.episode.0, self.rows.discounted, self.cost]);
         put("obs", self.state.obs.clone());
         put("projector", self.controller.memory());
         Ok(())
@@ -91,7 +91,7 @@ impl Worker {
             return Err(changed());
         }
         (self.episode, self.ticks) = ((sums[0], length), ticks);
-        (self.discounted, self.cost) = (sums[1], sums[2]);
+        (self.rows.discounted, self.cost) = (sums[1], sums[2]);
         self.rng.set_word_pos(rng.into());
         Ok(())
     }

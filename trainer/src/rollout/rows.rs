@@ -1,18 +1,20 @@
-//! Rows for the learner from policy steps that were taken in another process.
+//! Rows for the learner, policy step by policy step, wherever they were taken.
 
 use super::Collected;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Controller, Output};
 
-/// What was collected elsewhere, as a [`Worker`](super::Worker) keeps it.
+/// Rows with what is counted beside them.
 pub struct Rows {
     /// What was collected.
     pub collected: Collected,
     /// Observation index of each proposed entry.
     state: Vec<usize>,
     gamma: f64,
-    moved_penalty: f64,
-    discounted: f64,
+    /// What a unit of distance moved takes from the learner's reward.
+    pub(super) moved_penalty: f64,
+    /// Discounted return of the episode so far.
+    pub(super) discounted: f64,
     change: Vec<f64>,
     /// Network input of the state after the last row.
     after: Vec<f32>,
@@ -37,7 +39,7 @@ pub struct Period<'a> {
 }
 
 impl Rows {
-    /// No rows yet; `moved_penalty` as in [`Worker::set_moved_penalty`](super::Worker::set_moved_penalty).
+    /// No rows yet. `moved_penalty` is taken from the reward for each unit of distance moved [1 / (weight rad/s)].
     pub fn new(controller: &Controller, gamma: f64, moved_penalty: f64) -> Self {
         let layout = controller.layout();
         Self {

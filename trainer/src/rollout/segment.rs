@@ -3,6 +3,7 @@
 use crate::stats::RunningStats;
 use nearl_runtime::Output;
 use nearl_runtime::constraints::Ledger;
+use nearl_runtime::rollout_protocol::LEDGER;
 
 /// What one environment collected: `n_steps` policy steps, row by row.
 #[derive(Clone, Debug, Default)]
@@ -106,6 +107,42 @@ impl Tally {
         self.distance += ledger.moved;
         self.avoided += u64::from(raw && !left);
         self.active_rows += ledger.active.len() as u64;
+    }
+
+    /// Counts and sums over ticks, in the order of [`LEDGER`].
+    pub(crate) fn ledger(&self) -> [f64; LEDGER.len()] {
+        let Self { ticks, raw_violations, recovering, projected_violations, moved, distance, .. } = *self;
+        let Self { avoided, active_rows, reached_violations, residual, faults, .. } = *self;
+        let [ticks, raw, recovering, left, moved] =
+            [ticks, raw_violations, recovering, projected_violations, moved].map(|n| n as f64);
+        let [avoided, rows, reached, faults] =
+            [avoided, active_rows, reached_violations, faults].map(|n| n as f64);
+        [ticks, raw, recovering, left, moved, distance, avoided, rows, reached, residual, faults]
+    }
+
+    /// The inverse of [`Tally::ledger`], without episodes.
+    pub(crate) fn of_ledger(ledger: [f64; LEDGER.len()]) -> Self {
+        let [ticks, raw, recovering, left, moved, distance, avoided, rows, reached, residual, faults] =
+            ledger;
+        let [ticks, raw_violations, recovering, projected_violations, moved] =
+            [ticks, raw, recovering, left, moved].map(|n| n as u64);
+        let [avoided, active_rows, reached_violations, faults] =
+            [avoided, rows, reached, faults].map(|n| n as u64);
+        Self {
+            episodes: Vec::new(),
+            costs: Vec::new(),
+            ticks,
+            raw_violations,
+            recovering,
+            projected_violations,
+            moved,
+            distance,
+            avoided,
+            active_rows,
+            reached_violations,
+            residual,
+            faults,
+        }
     }
 
     pub(crate) fn add(&mut self, other: &Self) {

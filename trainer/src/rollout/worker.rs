@@ -3,7 +3,7 @@
 mod stream;
 
 use super::resume::Episode;
-use super::{Collected, RolloutError};
+use super::{Period, RolloutError, Rows};
 use crate::env::{Env, EnvError, Fault};
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Excess, Networks, Noise, Output, PolicyKind, Snapshot, State};
@@ -18,15 +18,12 @@ pub struct Worker {
     learned: bool,
     pub(super) rng: ChaCha8Rng,
     pub(super) state: State,
+    /// Observation at the begin of this policy step.
     before: Vec<f64>,
     noise: Noise,
     out: Output,
-    scale: Vec<f64>,
-    gamma: f64,
-    moved_penalty: f64,
     /// Distance the projection moved the targets of this policy step.
     moved: f64,
-    pub(super) discounted: f64,
     pub(super) episode: (f64, usize),
     pub(super) cost: f64,
     pub(super) ticks: usize,
@@ -36,7 +33,7 @@ pub struct Worker {
     left: usize,
     pub(super) history: Episode,
     /// What was collected in the segment.
-    pub collected: Collected,
+    pub rows: Rows,
 }
 
 impl Worker {
@@ -51,23 +48,18 @@ impl Worker {
         rng: ChaCha8Rng,
     ) -> Result<Self, RolloutError> {
         let controller = Controller::new(snapshot)?;
-        let n_state = controller.layout().n_state();
         let mut worker = Self {
             kind: snapshot.manifest.policy,
             learned: snapshot.manifest.task.idm.kind == IdmKind::Learned,
             state: controller.state(),
-            before: vec![0.0; n_state],
+            before: vec![0.0; controller.layout().n_obs()],
             noise: controller.noise(),
             out: controller.output(),
-            scale: snapshot.networks.normaliser.scale.clone(),
-            collected: Collected::new(controller.layout().n_obs(), n_state),
+            rows: Rows::new(&controller, gamma, 0.0),
             env,
             controller,
             rng,
-            gamma,
-            moved_penalty: 0.0,
             moved: 0.0,
-            discounted: 0.0,
             episode: (0.0, 0),
             cost: 0.0,
             ticks: 0,
@@ -82,7 +74,6 @@ impl Worker {
     /// Hands new networks to the controller.
     pub fn set_networks(&mut self, networks: &Networks) {
         self.controller.set_networks(networks);
-        self.scale.clone_from(&networks.normaliser.scale);
     }
 
     /// Switches the projection, for comparisons.
@@ -93,14 +84,15 @@ impl Worker {
     /// Lowers the learner's reward by `penalty` for each unit of distance the projection moved a target
     /// [1 / (weight rad/s)], summed over the ticks of a policy step.
     pub fn set_moved_penalty(&mut self, penalty: f64) {
-        self.moved_penalty = penalty;
+        self.rows.moved_penalty = penalty;
     }
 
     fn restart(&mut self) -> Result<(), EnvError> {
         self.env.reset(&mut self.rng)?;
         self.history.begin(&*self.env);
         self.controller.reset();
-        (self.episode, self.cost, self.ticks, self.discounted) = ((0.0, 0), 0.0, 0, 0.0);
+        self.rows.interrupt();
+        (self.episode, self.cost, self.ticks) = ((0.0, 0), 0.0, 0);
         self.observe();
         Ok(())
     }
@@ -121,7 +113,7 @@ impl Worker {
 
     /// Begins a segment of `n_steps` policy steps.
     pub(crate) fn begin(&mut self, n_steps: usize) {
-        self.collected.clear();
+        self.rows.clear();
         self.left = n_steps;
     }
 
@@ -135,12 +127,15 @@ impl Worker {
             self.draw(true);
             let (reward, terminated) = self.policy_step();
             let truncated = self.ticks >= self.env.spec().max_episode_steps;
-            let t = self.collected.segment.reward.len();
-            self.store(reward, terminated, truncated && !terminated, t, self.left == 0);
+            let (before, after, moved) = (&self.before[..], &self.state.obs[..], self.moved);
+            let period = Period { out: &self.out, before, after, reward, moved, terminated, truncated };
+            self.rows.push(&period, self.controller.normaliser());
             if terminated || truncated {
-                self.collected.tally.episodes.push(self.episode);
-                self.collected.tally.costs.push(self.cost);
+                self.rows.collected.tally.episodes.push(self.episode);
+                self.rows.collected.tally.costs.push(self.cost);
                 self.restart()?;
+            } else if self.left == 0 {
+                self.rows.cut();
             }
         }
         Ok(())
@@ -151,13 +146,13 @@ impl Worker {
     /// # Errors
     /// [`EnvError`] of a reset.
     pub fn evaluate(&mut self) -> Result<(f64, usize), EnvError> {
-        self.collected.clear();
+        self.rows.clear();
         self.draw(false);
         loop {
             let (_, terminated) = self.policy_step();
             if terminated || self.ticks >= self.env.spec().max_episode_steps {
                 let episode = self.episode;
-                self.collected.tally.costs.push(self.cost);
+                self.rows.collected.tally.costs.push(self.cost);
                 self.restart()?;
                 return Ok(episode);
             }
@@ -178,32 +173,20 @@ impl Worker {
 
     /// One proposal and the control ticks it spans.
     fn policy_step(&mut self) -> (f64, bool) {
-        for (b, &i) in self.before.iter_mut().zip(self.controller.layout().state()) {
-            *b = self.state.obs[i];
-        }
-        let mut reward = 0.0;
+        self.before.copy_from_slice(&self.state.obs);
+        let (mut reward, mut terminated) = (0.0, false);
         self.moved = 0.0;
         for _ in 0..self.controller.policy_every() {
-            let (r, terminated) = self.tick();
+            let (r, is_end) = self.tick();
             reward += r;
+            terminated = is_end;
             if terminated || self.ticks >= self.env.spec().max_episode_steps {
-                self.finish_step(reward);
-                return (reward, terminated);
+                break;
             }
         }
-        self.finish_step(reward);
-        (reward, false)
-    }
-
-    fn finish_step(&mut self, reward: f64) {
         self.episode.0 += reward;
         self.episode.1 += 1;
-        self.discounted = self.discounted * self.gamma + self.penalised(reward);
-    }
-
-    /// What the learner is rewarded with for the policy step; the episode's return stays the environment's own.
-    fn penalised(&self, reward: f64) -> f64 {
-        reward - self.moved_penalty * self.moved
+        (reward, terminated)
     }
 
     fn tick(&mut self) -> (f64, bool) {
@@ -213,30 +196,14 @@ impl Worker {
         self.ticks += 1;
         self.cost += step.cost;
         self.observe();
-        let ledger = &self.out.next.ledger;
-        self.collected.tally.count(ledger);
+        let (ledger, tally) = (&self.out.next.ledger, &mut self.rows.collected.tally);
+        tally.count(ledger);
         self.moved += ledger.moved;
-        self.collected.tally.faults += u64::from(step.fault != Fault::None);
+        tally.faults += u64::from(step.fault != Fault::None);
         let excess = self.controller.excess(&self.state);
-        self.collected.tally.reached_violations += u64::from(excess != [None; 2]);
+        tally.reached_violations += u64::from(excess != [None; 2]);
+        tally.residual += self.controller.residual(&self.state.obs, &self.out);
         self.excess = [0, 1].map(|k| Excess::larger(self.excess[k], excess[k]));
-        self.collected.tally.residual += self.controller.residual(&self.state.obs, &self.out);
         (step.reward, step.terminated)
-    }
-
-    fn store(&mut self, reward: f64, terminated: bool, truncated: bool, t: usize, last: bool) {
-        let reward = self.penalised(reward);
-        let out = &self.out;
-        for (before, &i) in self.before.iter_mut().zip(self.controller.layout().state()) {
-            *before = self.state.obs[i] - *before;
-        }
-        let ended = (terminated, truncated || (last && !terminated));
-        let change = (&self.before[..], &self.scale[..]);
-        self.collected.push(out, change, &self.state.obs, (reward, self.discounted), ended);
-        if (truncated || last) && !terminated {
-            let mut x = vec![0.0; out.x.len()];
-            self.controller.normaliser().observation(&self.state.obs, &mut x);
-            self.collected.segment.final_x.push((t, x));
-        }
     }
 }

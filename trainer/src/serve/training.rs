@@ -95,7 +95,7 @@ impl Session {
         let place = &mut self.places[i];
         place.stage = Stage::Carried;
         let mut numbers = vec![i as f64, 0.0];
-        place.worker.as_ref()?.collected.carry(&mut numbers);
+        place.worker.as_ref()?.rows.collected.carry(&mut numbers);
         numbers[1] = (numbers.len() - 2) as f64;
         Some(numbers)
     }

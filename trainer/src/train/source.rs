@@ -75,7 +75,7 @@ impl Source for Collector {
     }
 
     fn gathered(&mut self) -> Vec<&Collected> {
-        self.workers().map(|w| &w.collected).collect()
+        self.workers().map(|w| &w.rows.collected).collect()
     }
 
     fn save(&mut self, to: &mut Checkpoint) -> Result<(), String> {

@@ -2,12 +2,9 @@
 
 use crate::cli::{Failure, say};
 use nearl_runtime::Snapshot;
-use nearl_runtime::link::RobotName;
 use nearl_runtime::net::{Dense, DenseLayer};
 use nearl_runtime::rt::RunReport;
 use serde_json::{Value, json};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
 
 /// What one stretch at one rate gave.
 pub(super) struct Stretch {
@@ -133,40 +130,4 @@ pub(super) fn opposite(snapshot: &Snapshot) -> Snapshot {
         last.weight.iter_mut().chain(&mut last.bias).for_each(|w| *w = -*w);
     }
     opposite
-}
-
-/// `nearl plant` as a process of its own, stopped whatever happens.
-pub(super) struct PlantProcess(Option<Child>);
-
-impl PlantProcess {
-    pub(super) fn start(task: &Path, name: &RobotName, priority: i32) -> Result<PlantProcess, Failure> {
-        let mut command = Command::new(std::env::current_exe()?);
-        command.arg("plant").arg(task).args(["--name", name.as_str(), "--endless", "--json"]);
-        if priority > 0 {
-            command.args(["--priority", &priority.to_string()]);
-        }
-        Ok(PlantProcess(Some(command.stdout(Stdio::piped()).spawn()?)))
-    }
-
-    /// Ends it and reads what it counted.
-    pub(super) fn end(mut self) -> Result<Value, Failure> {
-        let Some(child) = self.0.take() else { return Err("the plant had ended".into()) };
-        if let Ok(pid) = i32::try_from(child.id()) {
-            // SAFETY: sends a signal to a child that has not been waited for.
-            unsafe { libc::kill(pid, libc::SIGTERM) };
-        }
-        let output = child.wait_with_output()?;
-        serde_json::from_slice(&output.stdout).map_err(|e| {
-            format!("the plant gave no report ({}, {e}); its message is above", output.status).into()
-        })
-    }
-}
-
-impl Drop for PlantProcess {
-    fn drop(&mut self) {
-        if let Some(mut child) = self.0.take() {
-            let _ = child.kill();
-            let _ = child.wait();
-        }
-    }
 }

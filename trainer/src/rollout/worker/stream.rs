@@ -13,7 +13,7 @@ impl Worker {
     /// [`EnvError`] of the environment's reset.
     pub fn reseed(&mut self, rng: ChaCha8Rng) -> Result<(), EnvError> {
         self.rng = rng;
-        self.collected.clear();
+        self.rows.clear();
         self.restart()
     }
 
@@ -30,7 +30,7 @@ impl Worker {
     pub fn transition(&mut self, explore: bool, row: &mut Vec<f64>) -> Result<(), EnvError> {
         row.extend_from_slice(&self.state.obs);
         self.draw(explore);
-        self.collected.tally = Tally::default();
+        self.rows.collected.tally = Tally::default();
         let cost = self.cost;
         let (reward, terminated) = self.policy_step();
         let truncated = !terminated && self.ticks >= self.env.spec().max_episode_steps;
@@ -41,12 +41,7 @@ impl Worker {
         row.extend_from_slice(&out.action);
         row.extend([out.log_prob_proposal, out.log_prob_action, reward, self.cost - cost]);
         row.extend([f64::from(u8::from(terminated)), f64::from(u8::from(truncated))]);
-        let t = &self.collected.tally;
-        let counts = [t.ticks, t.raw_violations, t.recovering, t.projected_violations, t.moved];
-        row.extend(counts.map(|n| n as f64));
-        row.push(t.distance);
-        row.extend([t.avoided, t.active_rows, t.reached_violations].map(|n| n as f64));
-        row.extend([t.residual, t.faults as f64]);
+        row.extend(self.rows.collected.tally.ledger());
         if terminated || truncated {
             self.restart()?;
         }
