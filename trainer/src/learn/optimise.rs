@@ -15,8 +15,8 @@ use nearl_runtime::net::kernel::{LANES, V, ZERO};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::ops::Range;
-use std::sync::RwLock;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering, fence};
+use std::sync::{Condvar, Mutex, PoisonError, RwLock};
 
 /// Rows computed at a time by one thread.
 pub const TILE: usize = 32;
@@ -131,21 +131,32 @@ struct Barrier {
 impl Barrier {
     fn wait(&self, round: usize) {
         self.arrived.fetch_add(1, Ordering::AcqRel);
+        self.alarm.ring();
         self.alarm.wait_until(|| self.arrived.load(Ordering::Acquire) >= self.threads * round);
     }
 }
 
-/// Tells the threads that wait for each other when one of them panicked, so that none waits forever.
-#[derive(Default)]
-struct Alarm(AtomicBool);
+/// Looks before a thread that waits goes to sleep.
+const LOOKS: u32 = 4000;
 
-/// Raises the alarm if its thread panics.
+/// How the threads wait for each other: awake for a while, then asleep, so that a core others use too goes to the one waited for.
+/// When one of them panics, none waits forever.
+#[derive(Default)]
+struct Alarm {
+    panicked: AtomicBool,
+    sleeping: AtomicUsize,
+    bed: Mutex<()>,
+    bell: Condvar,
+}
+
+/// Tells the others if its thread panics.
 struct Watch<'a>(&'a Alarm);
 
 impl Drop for Watch<'_> {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            self.0.0.store(true, Ordering::Release);
+            self.0.panicked.store(true, Ordering::Release);
+            self.0.ring();
         }
     }
 }
@@ -155,13 +166,31 @@ impl Alarm {
         Watch(self)
     }
 
-    fn wait_until(&self, ready: impl Fn() -> bool) {
-        let mut spins = 0u32;
-        while !ready() {
-            assert!(!self.0.load(Ordering::Acquire), "another thread of the learner panicked");
-            spins += 1;
-            if spins < 4000 { std::hint::spin_loop() } else { std::thread::yield_now() }
+    /// Wakes who sleeps; comes after every change that another thread may wait for.
+    fn ring(&self) {
+        // Either this thread sees the sleeper, or the sleeper sees the change.
+        fence(Ordering::SeqCst);
+        if self.sleeping.load(Ordering::Relaxed) > 0 {
+            drop(self.bed.lock().unwrap_or_else(PoisonError::into_inner));
+            self.bell.notify_all();
         }
+    }
+
+    fn wait_until(&self, ready: impl Fn() -> bool) {
+        let is_over = || ready() || self.panicked.load(Ordering::Acquire);
+        if !(0..LOOKS).any(|_| {
+            std::hint::spin_loop();
+            is_over()
+        }) {
+            let mut bed = self.bed.lock().unwrap_or_else(PoisonError::into_inner);
+            self.sleeping.fetch_add(1, Ordering::Relaxed);
+            fence(Ordering::SeqCst);
+            while !is_over() {
+                bed = self.bell.wait(bed).unwrap_or_else(PoisonError::into_inner);
+            }
+            self.sleeping.fetch_sub(1, Ordering::Relaxed);
+        }
+        assert!(ready(), "another thread of the learner panicked");
     }
 }
 
@@ -327,7 +356,7 @@ impl<P: Phases> Run<'_, P> {
         len: usize,
     ) {
         let rows = idx.len() / self.shards;
-        let mut grad = self.gradients[s][odd].write().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let mut grad = self.gradients[s][odd].write().unwrap_or_else(PoisonError::into_inner);
         grad[..len].fill(ZERO);
         let (scale, all) = (1.0 / self.schedule.minibatch as f32, idx);
         for at in (s * rows..(s + 1) * rows).step_by(TILE) {
@@ -340,8 +369,7 @@ impl<P: Phases> Run<'_, P> {
     }
 
     fn gather(&self, sum: &mut [V], odd: usize) {
-        let read =
-            |s: usize| self.gradients[s][odd].read().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let read = |s: usize| self.gradients[s][odd].read().unwrap_or_else(PoisonError::into_inner);
         let n = sum.len();
         sum.copy_from_slice(&read(0)[..n]);
         for s in 1..self.shards {
@@ -401,5 +429,45 @@ pub fn add_sums(grad: &mut [V], values: &[f32]) {
     let last = grad.len() - 1;
     for (lane, v) in grad[last].0.iter_mut().zip(values) {
         *lane += v;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Alarm, Ordering};
+    use std::panic::{AssertUnwindSafe, catch_unwind};
+    use std::sync::atomic::AtomicBool;
+
+    /// Long after it went to sleep.
+    fn after_a_while(alarm: &Alarm, then: impl FnOnce()) {
+        while alarm.sleeping.load(Ordering::Acquire) == 0 {
+            std::thread::yield_now();
+        }
+        std::thread::sleep(std::time::Duration::from_millis(5));
+        then();
+    }
+
+    #[test]
+    fn who_sleeps_is_woken_by_what_it_waits_for_and_by_a_panic() {
+        let (alarm, ready) = (Alarm::default(), AtomicBool::new(false));
+        std::thread::scope(|scope| {
+            scope.spawn(|| alarm.wait_until(|| ready.load(Ordering::Acquire)));
+            after_a_while(&alarm, || {
+                ready.store(true, Ordering::Release);
+                alarm.ring();
+            });
+        });
+        assert_eq!(alarm.sleeping.load(Ordering::Acquire), 0);
+        std::thread::scope(|scope| {
+            let waits = scope.spawn(|| catch_unwind(AssertUnwindSafe(|| alarm.wait_until(|| false))));
+            after_a_while(&alarm, || {
+                let panics = catch_unwind(AssertUnwindSafe(|| {
+                    let _watch = alarm.watch();
+                    panic!("on purpose");
+                }));
+                assert!(panics.is_err());
+            });
+            assert!(waits.join().expect("a thread").is_err(), "it waited for what never comes");
+        });
     }
 }

@@ -30,6 +30,7 @@ impl Trail {
         let mut slot = self.slots[step % AHEAD].lock().unwrap_or_else(PoisonError::into_inner);
         copy(&mut slot, group);
         self.written.store(step + 1, Ordering::Release);
+        alarm.ring();
     }
 
     fn read(&self, step: usize, group: &mut Group, alarm: &Alarm) {
@@ -37,6 +38,7 @@ impl Trail {
         // the slot is written anew before it is read again
         std::mem::swap(group, &mut self.slots[step % AHEAD].lock().unwrap_or_else(PoisonError::into_inner));
         self.read.store(step + 1, Ordering::Release);
+        alarm.ring();
     }
 }
 
@@ -53,9 +55,10 @@ struct Lengths {
 }
 
 impl Lengths {
-    fn tell(&self, lane: usize, step: usize, square: f32) {
+    fn tell(&self, lane: usize, step: usize, square: f32, alarm: &Alarm) {
         let stamped = (step as u64 + 1) << 32 | u64::from(square.to_bits());
         self.slots[lane][step % 2].store(stamped, Ordering::Release);
+        alarm.ring();
     }
 
     /// What the other lane tells of this minibatch.
@@ -130,7 +133,7 @@ impl<P: Phases> Run<'_, P> {
                 self.gather(&mut lane.sums[k][..len], index);
                 if self.partner(k).is_some_and(|p| !mine.contains(&p)) {
                     let square = self.squared(k, &lane.sums[k], params);
-                    lengths.tell(index, step, square);
+                    lengths.tell(index, step, square, &self.barrier.alarm);
                     lane.held = Some((k, square));
                 } else {
                     self.settle(k, &lane.sums, params, &mut lane.reports);
