@@ -3,6 +3,7 @@
 #include <pinocchio/algorithm/aba.hpp>
 #include <pinocchio/algorithm/crba.hpp>
 #include <pinocchio/algorithm/joint-configuration.hpp>
+#include <pinocchio/algorithm/rnea-derivatives.hpp>
 #include <pinocchio/algorithm/rnea.hpp>
 
 extern "C" {
@@ -35,6 +36,15 @@ int nc_nle(const nc_model *m, nc_data *d, const double *q, const double *v, doub
   const auto &x = m->model;
   return guard([&] {
     VectorMap(nle, x.nv) = pin::nonLinearEffects(x, d->data, input(q, x.nq), input(v, x.nv));
+  });
+}
+
+int nc_nle_by_velocity(const nc_model *m, nc_data *d, const double *q, const double *v, double *by_velocity) {
+  const auto &x = m->model;
+  return guard([&] {
+    d->dq.setZero();
+    pin::computeRNEADerivatives(x, d->data, input(q, x.nq), input(v, x.nv), Input(d->dq));
+    MatrixMap(by_velocity, x.nv, x.nv) = d->data.dtau_dv.transpose();
   });
 }
 

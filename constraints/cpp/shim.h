@@ -36,6 +36,8 @@ void nc_data_free(nc_data *);
 int nc_rnea(const nc_model *, nc_data *, const double *q, const double *v, const double *a, double *tau);
 int nc_mass(const nc_model *, nc_data *, const double *q, double *mass);
 int nc_nle(const nc_model *, nc_data *, const double *q, const double *v, double *nle);
+// d nle_i / d v_j, nv x nv, row-major
+int nc_nle_by_velocity(const nc_model *, nc_data *, const double *q, const double *v, double *by_velocity);
 int nc_aba(const nc_model *, nc_data *, const double *q, const double *v, const double *tau, double *a);
 int nc_integrate(const nc_model *, nc_data *, const double *q, const double *dq, double *out);
 int nc_difference(const nc_model *, nc_data *, const double *q0, const double *q1, double *dq);

@@ -13,10 +13,12 @@ pub struct Dynamics {
     model: Model,
     scratch: RawData,
     lengths: (usize, usize),
+    /// Pinocchio's derivatives take the axes of the joints for constant.
+    axes_turn: bool,
     middle: Middle,
 }
 
-/// The state whose forces stand for those of a whole period, and scratch (q: nq, the rest nv).
+/// The state whose forces stand for those of a whole period, and scratch (nv, `q` nq).
 #[derive(Default)]
 struct Middle {
     q: Vec<f64>,
@@ -24,6 +26,8 @@ struct Middle {
     step: Vec<f64>,
     force: Vec<f64>,
     behind: Vec<f64>,
+    /// nv x nv.
+    by_velocity: Vec<f64>,
 }
 
 impl Dynamics {
@@ -31,8 +35,21 @@ impl Dynamics {
     pub fn new(model: &Model) -> Dynamics {
         let lengths = (model.nq(), model.nv());
         let zero = || vec![0.0; lengths.1];
-        let middle = Middle { q: model.neutral(), v: zero(), step: zero(), force: zero(), behind: zero() };
-        Dynamics { scratch: RawData::new(model.raw()), model: model.clone(), lengths, middle }
+        let middle = Middle {
+            q: model.neutral(),
+            v: zero(),
+            step: zero(),
+            force: zero(),
+            behind: zero(),
+            by_velocity: vec![0.0; lengths.1 * lengths.1],
+        };
+        Dynamics {
+            scratch: RawData::new(model.raw()),
+            model: model.clone(),
+            axes_turn: model.has_composites(),
+            lengths,
+            middle,
+        }
     }
 
     /// Inverse dynamics `tau = M a + nle`, without the passive forces: a motor supplies `tau - passive`.
@@ -138,8 +155,7 @@ impl Dynamics {
         self.middle = m;
     }
 
-    /// [`Dynamics::motors`] for any acceleration: `tau = rows a + bias`, with `rows` (nv x nv, row-major) and `bias` (nv). With several
-    /// physics steps in the period it evaluates the non-linear effects `2 nv` times.
+    /// [`Dynamics::motors`] for any acceleration: `tau = rows a + bias`, with `rows` (nv x nv, row-major) and `bias` (nv).
     pub fn motor_rows(&mut self, period: &Period, q: &[f64], v: &[f64], rows: &mut [f64], bias: &mut [f64]) {
         self.check(q, &[v, bias]);
         let mut m = std::mem::take(&mut self.middle);
@@ -151,12 +167,8 @@ impl Dynamics {
             self.go_on(lag, q, v, &mut m);
             self.mass(&m.q, rows);
             self.nle(&m.q, v, bias);
-            for j in 0..nv {
-                m.step.fill(0.0);
-                m.step[j] = 1.0;
-                self.nle_along(v, &mut m);
-                rows.iter_mut().skip(j).step_by(nv).zip(&m.force).for_each(|(row, nle)| *row += lag * nle);
-            }
+            self.nle_by_velocity(v, &mut m);
+            rows.iter_mut().zip(&m.by_velocity).for_each(|(row, slope)| *row += lag * slope);
         }
         self.passive_over(period, q, v, &mut m.force);
         for i in 0..nv {
@@ -166,9 +178,28 @@ impl Dynamics {
         self.middle = m;
     }
 
+    /// `by_velocity = d nle / d v` (nv x nv, row-major) at `v`: Pinocchio's, or column by column where that is off.
+    fn nle_by_velocity(&mut self, v: &[f64], m: &mut Middle) {
+        if !self.axes_turn {
+            // SAFETY: `m` has been made for this model, and the lengths of `v` were checked.
+            let code = unsafe {
+                let (model, data) = self.pointers();
+                let by_velocity = m.by_velocity.as_mut_ptr();
+                pinocchio::nc_nle_by_velocity(model, data, m.q.as_ptr(), v.as_ptr(), by_velocity)
+            };
+            return spoil(code, &mut m.by_velocity);
+        }
+        let nv = v.len();
+        for j in 0..nv {
+            m.step.fill(0.0);
+            m.step[j] = 1.0;
+            self.nle_along(v, m);
+            m.by_velocity.iter_mut().skip(j).step_by(nv).zip(&m.force).for_each(|(to, from)| *to = *from);
+        }
+    }
+
     /// `force = (d nle / d v) step` at `v`. The non-linear effects are quadratic in the velocity, so that the central difference is the
-    /// derivative for a step of any size. (Pinocchio's own derivative is off for bodies with several joints: it takes their axes for
-    /// constant.)
+    /// derivative for a step of any size.
     fn nle_along(&mut self, v: &[f64], m: &mut Middle) {
         let shift = |m: &mut Middle, sign: f64| {
             m.v.iter_mut().zip(v.iter().zip(&m.step)).for_each(|(x, (v, step))| *x = v + sign * step);

@@ -90,9 +90,11 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
                 return Err(self.unsupported(&format!("<{tag}>"), expand));
             }
         }
-        if children(self.root, "default").nth(1).is_some() {
-            let next = "put all of it into one, the reader would take the first";
-            return Err(self.unsupported("several <default> sections", next));
+        for section in ["compiler", "default"] {
+            if children(self.root, section).nth(1).is_some() {
+                let next = "put all of it into one, the reader would take the first";
+                return Err(self.unsupported(&format!("several <{section}> sections"), next));
+            }
         }
         for key in ["inertiagrouprange", "boundmass", "boundinertia", "balanceinertia"] {
             if compiler(self.root, key).is_some() {
@@ -125,10 +127,18 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
         for geom in self.root.descendants().filter(|n| n.has_tag_name("geom")) {
             let Some(body) = geom.parent_element().filter(|p| p.has_tag_name("body")) else { continue };
             let from_inertial = from_geoms != Some("true") && children(body, "inertial").next().is_some();
+            let is_massless = from_inertial || self.attribute(geom, "mass") == Some("0");
+            let is_mesh =
+                self.attribute(geom, "type") == Some("mesh") || self.attribute(geom, "mesh").is_some();
+            if is_mesh && !is_massless {
+                let next =
+                    "give its body an <inertial>, the reader reads no meshes and would take it for massless";
+                return Err(self.unsupported(&format!("mesh {} of {}", called(geom), called(body)), next));
+            }
             let bodiless = [("contype", "1"), ("conaffinity", "1")]
                 .iter()
                 .all(|(key, default)| self.attribute(geom, key).unwrap_or(default).trim() == "0");
-            if bodiless && !from_inertial && self.attribute(geom, "mass") != Some("0") {
+            if bodiless && !is_massless {
                 let next = "give its body an <inertial>, the reader would take it for massless";
                 let (geom, body) = (called(geom), called(body));
                 let feature = format!("{geom} of {body} without collision (contype and conaffinity 0)");
@@ -451,7 +461,7 @@ fn children<'a, 'i: 'a>(node: Node<'a, 'i>, tag: &'a str) -> impl Iterator<Item 
     node.children().filter(move |n| n.has_tag_name(tag))
 }
 
-/// The last value of an attribute over all <compiler> elements.
+/// A setting of the <compiler> element.
 fn compiler<'a>(root: Node<'a, '_>, key: &str) -> Option<&'a str> {
-    root.children().filter(|n| n.has_tag_name("compiler")).filter_map(|n| n.attribute(key)).next_back()
+    root.children().find(|n| n.has_tag_name("compiler")).and_then(|n| n.attribute(key))
 }

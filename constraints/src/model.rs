@@ -295,6 +295,13 @@ impl Model {
         }
     }
 
+    /// True when some body hangs on several joints, which Pinocchio keeps as one whose axes turn with its configuration.
+    pub(crate) fn has_composites(&self) -> bool {
+        let joints =
+            |dofs: &std::ops::Range<usize>| self.0.joints.iter().filter(|j| dofs.contains(&j.idx_v)).count();
+        self.0.chain.iter().any(|(_, dofs)| joints(dofs) > 1)
+    }
+
     /// True when two frames are on the same rigid body, or on two joined by one joint.
     pub(crate) fn neighbours(&self, a: FrameId, b: FrameId) -> bool {
         let (a, b) = (self.0.frames[a.0].joint, self.0.frames[b.0].joint);

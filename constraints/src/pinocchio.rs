@@ -64,6 +64,13 @@ unsafe extern "C" {
         v: *const f64,
         nle: *mut f64,
     ) -> c_int;
+    pub(crate) fn nc_nle_by_velocity(
+        m: *const NcModel,
+        d: *mut NcData,
+        q: *const f64,
+        v: *const f64,
+        by_velocity: *mut f64,
+    ) -> c_int;
     pub(crate) fn nc_aba(
         m: *const NcModel,
         d: *mut NcData,

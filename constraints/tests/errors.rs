@@ -99,7 +99,7 @@ fn models() {
 
 /// MuJoCo reads them one after the other into one class; Pinocchio reads the first.
 #[test]
-fn several_sections_of_defaults() {
+fn several_sections_of_a_kind() {
     let file = |more: &str| {
         Model::from_mjcf_text(&format!(
             "<mujoco><default><joint damping='1'/></default>{more}<worldbody><body name='arm'><joint name='a'/>\
@@ -107,10 +107,26 @@ fn several_sections_of_defaults() {
         ))
     };
     assert_eq!(file("").unwrap().damping(), [1.0]);
-    refuse_model(
-        file("<default><joint damping='2'/></default>"),
-        &["several <default> sections", "put all of it into one"],
-    );
+    let one = "put all of it into one";
+    refuse_model(file("<default><joint damping='2'/></default>"), &["several <default> sections", one]);
+    refuse_model(file("<compiler/><compiler angle='radian'/>"), &["several <compiler> sections", one]);
+}
+
+/// Its body would weigh nothing.
+#[test]
+fn a_mesh_that_is_to_give_the_mass() {
+    let file = |defaults: &str, body: &str, geom: &str| {
+        Model::from_mjcf_text(&format!(
+            "<mujoco><default>{defaults}</default><asset><mesh name='m' vertex='0 0 0 1 0 0 0 1 0 0 0 1'/></asset>\
+             <worldbody><body name='arm'><joint name='a'/>{body}<geom name='g' mesh='m' {geom}/></body></worldbody></mujoco>"
+        ))
+    };
+    let words = ["mesh geom 'g' of body 'arm'", "give its body an <inertial>"];
+    refuse_model(file("", "", "type='mesh'"), &words);
+    refuse_model(file("<geom type='mesh'/>", "", ""), &words);
+    let inertial = "<inertial pos='0 0 0' mass='2' diaginertia='1 1 1'/>";
+    assert_eq!(file("", inertial, "type='mesh'").unwrap().total_mass(), 2.0);
+    assert!(file("", "<geom size='1' mass='1'/>", "type='mesh' mass='0'").is_ok());
 }
 
 /// In MuJoCo the first joint has stiffness 40 and damping 8 (`jnt_stiffness`, `dof_damping`); these forces were zero here.

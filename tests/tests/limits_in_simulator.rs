@@ -132,7 +132,8 @@ fn swing(sub_steps: u32, dampers: bool) -> Swing {
     let mut most = Swing { fastest: 0.0, furthest: 0.0, missed: 0.0 };
     for _ in 0..20_000 {
         observe(env.as_ref(), &mut state);
-        controller.update(&state, &noise, &mut out);
+        let status = controller.update(&state, &noise, &mut out);
+        assert!(status.is_ok(), "{sub_steps} sub-steps: {status:?}");
         env.step(&out.action);
         for (i, limit) in [1.98, 2.18].into_iter().enumerate() {
             let (q, v) = (env.qpos()[i].abs(), env.qvel()[i]);

@@ -90,7 +90,6 @@ fn limits_with_a_memory() {
     check("Panda-reach", "pid2-ib", &[more.as_slice(), &["constraints.braking=stored"]].concat());
 }
 
-/// A run that was killed has rows behind its checkpoint, the last of them cut: they come again, once.
 #[test]
 fn of_trainings_that_begin_in_one_folder_at_once_one_has_it() {
     for _ in 0..20 {
@@ -113,6 +112,7 @@ fn of_trainings_that_begin_in_one_folder_at_once_one_has_it() {
     }
 }
 
+/// A run that was killed has rows behind its checkpoint, the last of them cut: they come again, once.
 #[test]
 fn rows_behind_the_checkpoint_come_again() {
     let folder = tempfile::tempdir().expect("folder");

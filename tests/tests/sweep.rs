@@ -221,6 +221,9 @@ fn a_sweep_whose_runs_fail_says_what_to_do() {
     let (words, error) = (text(&output.stdout), text(&output.stderr));
     assert!(words.contains("a reward of 'cart-pole' came out as NaN"), "{words}");
     assert!(error.contains("1 of 1 runs ended with the errors above; mend what they name"), "{error}");
+    command.arg("--json");
+    let error = text(&command.output().expect("nearl sweep").stderr);
+    assert!(error.contains("seed 0: ") && error.contains("came out as NaN"), "{error}");
 }
 
 #[test]

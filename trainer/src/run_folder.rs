@@ -97,8 +97,8 @@ pub fn has_checkpoint(path: &Path) -> bool {
     checkpoint::path_in(path).exists() || snapshot_of(path).is_ok()
 }
 
-/// Holds a run folder until the file is dropped: two trainings would mix their rows. What is locked is `env.json`, which is never written
-/// again; none where there is none, hence no run.
+/// Holds a run folder until the file is dropped: two trainings would mix their rows. What is locked is `env.json`, which is written
+/// once and not replaced; none where there is none, hence no run.
 ///
 /// # Errors
 /// [`RunError::Busy`]; [`RunError::Write`] when it cannot be opened or locked.
@@ -165,7 +165,12 @@ impl RunFolder {
             "mujoco": "3.17.0", "pinocchio": "4.1.0", "isa": nearl_runtime::net::kernel::isa(),
             "cores": std::thread::available_parallelism().map_or(1, usize::from), "os": std::env::consts::OS, "arch": std::env::consts::ARCH,
         });
-        put(&env, &format!("{host:#}\n"))?;
+        let about = || -> std::io::Result<()> {
+            let Some(mut file) = held.as_ref() else { return Ok(()) };
+            file.set_len(0)?;
+            file.write_all(format!("{host:#}\n").as_bytes())
+        };
+        about().map_err(unwritten(&env))?;
         let file = path.join("metrics.csv");
         let mut metrics = BufWriter::new(File::create(&file).map_err(unwritten(&file))?);
         writeln!(metrics, "{}", columns.join(",")).map_err(unwritten(&file))?;

@@ -141,7 +141,7 @@ impl Projector {
     }
 
     /// Takes `proposal` as the target of the tick just projected, whatever it breaks: `violations` and what is remembered are the
-    /// proposal's. For comparisons with what [`Projector::project`] does; `q`, `v` as there.
+    /// proposal's; status and rung stay the projection's. For comparisons with what [`Projector::project`] does; `q`, `v` as there.
     pub fn pass(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) {
         target.q.copy_from_slice(&proposal.q);
         target.v.copy_from_slice(&proposal.v);
@@ -149,7 +149,8 @@ impl Projector {
             *a = (to - from) / self.period.dt;
         }
         let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
-        (target.ledger.violations, target.ledger.slack) = (verdict.counts, verdict.worst);
+        target.ledger.violations = verdict.counts;
+        target.ledger.slack = if verdict.worst.is_finite() { verdict.worst } else { f64::MAX };
         target.ledger.moved = 0.0;
         target.ledger.active.clear();
     }

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use indicatif::ProgressBar;
@@ -76,11 +76,15 @@ impl SweepCommand {
         let todo = runs.iter().filter(|r| r.found != Found::Finished).count() as u64;
         let bar = if self.json { ProgressBar::hidden() } else { ProgressBar::new(todo * sweep.steps) };
         let mut done = 0;
-        let failed = run(&sweep, &runs, self.jobs.unwrap_or_else(cores), &stop, |event| {
+        let left = run(&sweep, &runs, self.jobs.unwrap_or_else(cores), &stop, |event| {
             let line = |r: &Run, words: &str| {
                 if !self.json {
                     bar.suspend(|| say(format!("{} {} seed {}: {words}", r.name, r.algo, r.seed)));
                 }
+            };
+            let error = |r: &Run, words: &str| match self.json {
+                true => eprintln!("{} {} seed {}: {words}", r.name, r.algo, r.seed),
+                false => line(r, words),
             };
             match event {
                 Event::Skipped(r) => line(r, "finished before"),
@@ -93,7 +97,7 @@ impl SweepCommand {
                     done += sweep.steps;
                     line(r, "done");
                 }
-                Event::Ended(r, Err(words)) => line(r, &words),
+                Event::Ended(r, Err(words)) => error(r, &words),
                 Event::Waiting(steps) => bar.set_position(done + steps),
             }
         });
@@ -102,22 +106,24 @@ impl SweepCommand {
         let summary = Summary::of(&rows);
         if self.json {
             say(serde_json::to_string_pretty(
-                &serde_json::json!({ "summary": summary, "runs": rows, "failed": failed }),
+                &serde_json::json!({ "summary": summary, "runs": rows, "failed": left.failed, "stopped": left.stopped }),
             )?);
         } else {
             table(&summary);
         }
-        match failed {
-            0 => Ok(()),
-            n => Err(match stop.load(Ordering::Relaxed) {
-                true => format!("interrupted with {n} of {} runs to go; the same command goes on", runs.len()),
-                false => format!(
-                    "{n} of {} runs ended with the errors above; mend what they name, then the same command goes on",
-                    runs.len()
-                ),
-            }
-            .into()),
+        let all = runs.len();
+        let mut words = Vec::new();
+        if left.stopped > 0 {
+            let n = left.stopped;
+            words.push(format!("interrupted with {n} of {all} runs to go; the same command goes on"));
         }
+        if left.failed > 0 {
+            words.push(format!(
+                "{} of {all} runs ended with the errors above; mend what they name, and where that is the task, move their folders away",
+                left.failed
+            ));
+        }
+        if words.is_empty() { Ok(()) } else { Err(words.join("; ").into()) }
     }
 }
 

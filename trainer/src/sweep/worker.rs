@@ -25,21 +25,24 @@ pub enum Event<'a> {
     Waiting(u64),
 }
 
+/// Runs that are not finished.
+pub struct Left {
+    /// Ended by themselves, with an error that was told.
+    pub failed: usize,
+    /// Stopped, or not begun.
+    pub stopped: usize,
+}
+
 struct Worker<'a> {
     run: &'a Run,
     process: Child,
 }
 
 /// Trains what is not finished, `jobs` at a time, each on one thread. `stop` asks the workers to save and end, and starts no
-/// more. Returns the number of runs that are not finished.
-pub fn run(
-    sweep: &Sweep,
-    runs: &[Run],
-    jobs: usize,
-    stop: &AtomicBool,
-    mut tell: impl FnMut(Event),
-) -> usize {
-    let (mut waiting, mut working, mut failed, mut told) = (runs.iter(), Vec::new(), 0, false);
+/// more.
+pub fn run(sweep: &Sweep, runs: &[Run], jobs: usize, stop: &AtomicBool, mut tell: impl FnMut(Event)) -> Left {
+    let (mut waiting, mut working, mut told) = (runs.iter(), Vec::new(), false);
+    let mut left = Left { failed: 0, stopped: 0 };
     loop {
         while working.len() < jobs.max(1) && !stop.load(Ordering::Relaxed) {
             let Some(run) = waiting.next() else { break };
@@ -53,7 +56,7 @@ pub fn run(
                     working.push(Worker { run, process });
                 }
                 Err(words) => {
-                    failed += 1;
+                    left.failed += 1;
                     tell(Event::Ended(run, Err(words)));
                 }
             }
@@ -64,14 +67,15 @@ pub fn run(
         working.retain_mut(|worker: &mut Worker| match end(worker, sweep.steps) {
             None => true,
             Some(result) => {
-                failed += usize::from(result.is_err());
+                *(if told { &mut left.stopped } else { &mut left.failed }) += usize::from(result.is_err());
                 tell(Event::Ended(worker.run, result));
                 false
             }
         });
-        let left = !stop.load(Ordering::Relaxed) && waiting.len() > 0;
-        if working.is_empty() && !left {
-            return failed + waiting.filter(|r| r.found != Found::Finished).count();
+        let goes_on = !stop.load(Ordering::Relaxed) && waiting.len() > 0;
+        if working.is_empty() && !goes_on {
+            left.stopped += waiting.filter(|r| r.found != Found::Finished).count();
+            return left;
         }
         tell(Event::Waiting(working.iter().map(|w| steps(&w.run.folder)).sum()));
         std::thread::sleep(PAUSE);
