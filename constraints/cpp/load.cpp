@@ -87,6 +87,18 @@ int nc_model_set_gravity(nc_model *m, const double gravity[3]) {
   return guard([&] { m->model.gravity.linear(Eigen::Vector3d(gravity[0], gravity[1], gravity[2])); });
 }
 
+int nc_model_place_base(nc_model *m, const double *pose) {
+  return guard([&] {
+    const pin::SE3 base(Eigen::Map<const Eigen::Matrix3d>(pose + 3), Eigen::Map<const Eigen::Vector3d>(pose));
+    for (pin::JointIndex j = 1; j < pin::JointIndex(m->model.njoints); ++j)
+      if (m->model.parents[j] == 0)
+        m->model.jointPlacements[j] = base * m->model.jointPlacements[j];
+    for (pin::FrameIndex f = 1; f < pin::FrameIndex(m->model.nframes); ++f) // 0 is the universe
+      if (m->model.frames[f].parentJoint == 0)
+        m->model.frames[f].placement = base * m->model.frames[f].placement;
+  });
+}
+
 int nc_model_set_armature(nc_model *m, const double *armature) {
   return guard([&] { m->model.armature = input(armature, m->model.nv); });
 }

@@ -28,6 +28,8 @@ double nc_model_joint_mass(const nc_model *, int joint);
 int nc_model_scale_mass(nc_model *, double factor);
 int nc_model_set_gravity(nc_model *, const double gravity[3]);
 int nc_model_set_armature(nc_model *, const double *armature);
+// moves everything that hangs on the universe; pose: position, then the rotation matrix column by column
+int nc_model_place_base(nc_model *, const double pose[12]);
 int nc_model_neutral(const nc_model *, double *q);
 
 // -- evaluating (dynamics.cpp): none of these allocates --

@@ -2,6 +2,7 @@
 //! motor strength, gravity, total mass. What would be read wrongly is refused.
 
 use crate::ModelError;
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 use roxmltree::{Document, Node};
 
 /// One joint of the file; angles in rad.
@@ -44,6 +45,8 @@ impl MjcfKind {
 pub(crate) struct Mjcf {
     pub(crate) gravity: [f64; 3],
     pub(crate) total_mass: Option<f64>,
+    /// Where the base stands, if it has no joint.
+    pub(crate) base: Option<Isometry3<f64>>,
     pub(crate) bodies: Vec<Vec<MjcfJoint>>,
     pub(crate) notes: Vec<String>,
 }
@@ -61,6 +64,7 @@ pub(crate) fn read(xml: &str, file: &str) -> Result<Mjcf, ModelError> {
     let mut mjcf = Mjcf {
         gravity: reader.gravity()?,
         total_mass: reader.total_mass()?,
+        base: reader.base()?,
         bodies: Vec::new(),
         notes: reader.notes(),
     };
@@ -124,6 +128,10 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
             return Err(self.unsupported(&format!("several top-level bodies: {}", massive.join(", ")), next));
         }
         let from_geoms = compiler(self.root, "inertiafromgeom");
+        if from_geoms == Some("true") && self.root.descendants().any(|n| n.has_tag_name("inertial")) {
+            let next = "take the <inertial> elements out, the reader would follow them";
+            return Err(self.unsupported("compiler inertiafromgeom='true' beside <inertial>", next));
+        }
         for geom in self.root.descendants().filter(|n| n.has_tag_name("geom")) {
             let Some(body) = geom.parent_element().filter(|p| p.has_tag_name("body")) else { continue };
             let from_inertial = from_geoms != Some("true") && children(body, "inertial").next().is_some();
@@ -148,8 +156,25 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
         self.refuse_forces()
     }
 
-    /// Forces that would be missing without a word.
+    /// Forces that would be missing without a word, or be there though they are switched off.
     fn refuse_forces(&self) -> Result<(), ModelError> {
+        let flags = || children(self.root, "option").flat_map(|o| children(o, "flag"));
+        for key in ["damper", "spring", "eulerdamp", "actuation"] {
+            if flags().any(|f| f.attribute(key) == Some("disable")) {
+                return Err(self.unsupported(&format!("flag {key}='disable'"), "take it out"));
+            }
+        }
+        for motor in children(self.root, "actuator").flat_map(|a| a.children()).filter(Node::is_element) {
+            for key in ["armature", "damping"] {
+                let stated = self
+                    .attribute(motor, key)
+                    .filter(|text| text.split_whitespace().any(|x| x.parse() != Ok(0.0)));
+                if let Some(text) = stated {
+                    let next = "write it at the joint";
+                    return Err(self.unsupported(&format!("{key}='{text}' of {}", called(motor)), next));
+                }
+            }
+        }
         for node in self.root.descendants() {
             let stated = |key: &str| match self.attribute(node, key) {
                 Some(text) => {
@@ -194,6 +219,33 @@ impl<'a, 'i: 'a> Reader<'a, 'i> {
         let Some(text) = compiler(self.root, "settotalmass") else { return Ok(None) };
         let mass = self.number(text, "compiler settotalmass")?;
         Ok((mass > 0.0).then_some(mass)) // MuJoCo: negative means off
+    }
+
+    /// The pose of the top-level body, which Pinocchio reads only where it has a joint.
+    fn base(&self) -> Result<Option<Isometry3<f64>>, ModelError> {
+        let mut top = children(self.root, "worldbody").flat_map(|w| children(w, "body"));
+        let Some(base) = top.find(|b| b.descendants().any(is_joint)).filter(|b| !b.children().any(is_joint))
+        else {
+            return Ok(None);
+        };
+        for key in ["euler", "axisangle", "xyaxes", "zaxis"] {
+            if base.attribute(key).is_some() {
+                return Err(
+                    self.unsupported(&format!("{key} of {}", called(base)), "write it as quat='w x y z'")
+                );
+            }
+        }
+        let numbers = |key: &str, otherwise: &[f64]| match base.attribute(key) {
+            Some(text) => self.numbers(text, &format!("{key} of {}", called(base))),
+            None => Ok(otherwise.to_vec()),
+        };
+        let (position, rotation) = (numbers("pos", &[0.0; 3])?, numbers("quat", &[1.0, 0.0, 0.0, 0.0])?);
+        let (&[x, y, z], &[w, i, j, k]) = (&position[..], &rotation[..]) else {
+            return Err(self.impossible(format!("pos or quat of {} has not 3 and 4 numbers", called(base))));
+        };
+        let rotation = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), 1e-9)
+            .ok_or_else(|| self.impossible(format!("quat of {} is zero", called(base))))?;
+        Ok(Some(Isometry3::from_parts(Translation3::new(x, y, z), rotation)))
     }
 
     /// Forces of the file that are not part of the equations of motion here.

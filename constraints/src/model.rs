@@ -375,6 +375,9 @@ fn mjcf_model(xml: &str, path: &Path, file: &str) -> Result<Model, ModelError> {
     let path = c_text(&path.display().to_string(), file, "MJCF")?;
     let mut raw = RawModel::from_mjcf_file(&path).map_err(refused)?;
     raw.set_gravity(mjcf.gravity);
+    if let Some(base) = &mjcf.base {
+        raw.place_base(base);
+    }
     if let Some(total) = mjcf.total_mass {
         let factor = total / raw.mass();
         raw.scale_mass(factor);

@@ -1,5 +1,6 @@
 //! The border to the C++ shim (`cpp/shim.h`): raw functions and two owners.
 
+use nalgebra::Isometry3;
 use std::ffi::{CStr, CString, c_char, c_int};
 
 #[repr(C)]
@@ -45,6 +46,7 @@ unsafe extern "C" {
     fn nc_model_scale_mass(m: *mut NcModel, factor: f64) -> c_int;
     fn nc_model_set_gravity(m: *mut NcModel, gravity: *const f64) -> c_int;
     fn nc_model_set_armature(m: *mut NcModel, armature: *const f64) -> c_int;
+    fn nc_model_place_base(m: *mut NcModel, pose: *const f64) -> c_int;
     fn nc_model_neutral(m: *const NcModel, q: *mut f64) -> c_int;
     fn nc_data_new(m: *const NcModel) -> *mut NcData;
     fn nc_data_free(d: *mut NcData);
@@ -301,6 +303,15 @@ impl RawModel {
         assert_eq!(armature.len(), self.nv());
         // SAFETY: exclusive access, nv numbers.
         unsafe { nc_model_set_armature(self.0, armature.as_ptr()) };
+    }
+
+    pub(crate) fn place_base(&mut self, base: &Isometry3<f64>) {
+        let rotation = base.rotation.to_rotation_matrix();
+        let mut pose = [0.0; 12];
+        pose[..3].copy_from_slice(base.translation.vector.as_slice());
+        pose[3..].copy_from_slice(rotation.matrix().as_slice());
+        // SAFETY: exclusive access, twelve numbers.
+        unsafe { nc_model_place_base(self.0, pose.as_ptr()) };
     }
 
     pub(crate) fn neutral(&self) -> Vec<f64> {

@@ -129,6 +129,28 @@ fn a_mesh_that_is_to_give_the_mass() {
     assert!(file("", "<geom size='1' mass='1'/>", "type='mesh' mass='0'").is_ok());
 }
 
+/// Forces that MuJoCo leaves out or adds, and masses that it takes from elsewhere.
+#[test]
+fn switches_that_would_be_overlooked() {
+    let file = |head: &str, body: &str, motor: &str| {
+        Model::from_mjcf_text(&format!(
+            "<mujoco>{head}<worldbody><body name='arm'><joint name='a' damping='1'/>{body}<geom size='1' mass='1'/></body></worldbody>\
+             <actuator><motor name='m' joint='a' {motor}/></actuator></mujoco>"
+        ))
+    };
+    for flag in ["damper", "spring", "eulerdamp", "actuation"] {
+        let head = format!("<option><flag {flag}='disable'/></option>");
+        refuse_model(file(&head, "", ""), &[&format!("flag {flag}='disable'"), "take it out"]);
+    }
+    refuse_model(file("", "", "armature='0.1'"), &["armature='0.1' of motor 'm'", "at the joint"]);
+    refuse_model(file("", "", "damping='2 0'"), &["damping='2 0' of motor 'm'", "at the joint"]);
+    let inertial = "<inertial pos='0 0 0' mass='2' diaginertia='1 1 1'/>";
+    let geoms = "<compiler inertiafromgeom='true'/>";
+    refuse_model(file(geoms, inertial, ""), &["inertiafromgeom='true' beside <inertial>"]);
+    assert!(file(geoms, "", "damping='0'").is_ok());
+    assert!(file("<option><flag contact='disable' eulerdamp='enable'/></option>", inertial, "").is_ok());
+}
+
 /// In MuJoCo the first joint has stiffness 40 and damping 8 (`jnt_stiffness`, `dof_damping`); these forces were zero here.
 #[test]
 fn forces_that_would_be_missing() {

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use nearl_runtime::Controller;
-use nearl_runtime::constraints::{Dynamics, Model, Period, Rung};
+use nearl_runtime::constraints::{Dynamics, Kinematics, Model, Period, Rung};
 use nearl_tests::random_policy;
 use nearl_trainer::env::{Env, Meter};
 use nearl_trainer::mj;
@@ -228,6 +228,33 @@ fn passive_forces_are_their_average_over_a_period() {
             // The forces at the start of the period are off by 0.03 to 0.06 m/s in place of this.
             let allowed = if sub_steps == 1 { 1e-13 } else { 1.5e-3 };
             assert!(off < allowed, "D {damping}, K {stiffness}, {sub_steps} sub-steps: {off} m/s off");
+        }
+    }
+}
+
+/// A base without a joint stands where MuJoCo has it: gravity and frames follow.
+#[test]
+fn an_arm_on_a_tilted_base_is_the_simulator_s() {
+    let robot = r#"<mujoco><compiler angle="radian"/><worldbody>
+        <body name="base" pos="0.5 0.1 0.3" quat="0.8 0.2 -0.5 0.3"><geom type="box" size="0.1 0.1 0.1" mass="3"/>
+          <body name="plate" pos="0 0.2 0.1" quat="0.9 0 0.3 0">
+            <body name="upper" pos="0.1 0 0.2"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.1 0 0.4" size="0.03" mass="1"/>
+              <body name="tool" pos="0.1 0 0.4"><joint name="b" axis="1 0 0"/><geom type="sphere" size="0.05" pos="0.1 0.2 0" mass="0.5"/></body>
+            </body></body></body></worldbody></mujoco>"#;
+    let model = Model::from_mjcf_text(robot).expect("robot");
+    let (mut dynamics, mut kinematics) = (Dynamics::new(&model), Kinematics::new(&model));
+    let plant = mj::Model::from_text(robot, mj::ModelFormat::Mjcf, mj::Options::default()).expect("plant");
+    let (mut sim, mut nle) = (mj::Sim::new(&plant).expect("simulation"), [0.0; 2]);
+    for (q, v) in [([0.0, 0.0], [0.0, 0.0]), ([0.7, -1.2], [2.0, -3.0])] {
+        sim.set_state(&q, &v).expect("state");
+        sim.forward().expect("forces");
+        dynamics.nle(&q, &v, &mut nle);
+        assert!((0..2).all(|i| (nle[i] - sim.nle()[i]).abs() < 1e-12), "{nle:?} and {:?}", sim.nle());
+        kinematics.update(&q, &v, &[0.0; 2]);
+        for name in ["base", "plate", "upper", "tool"] {
+            let ours = kinematics.frame(model.frame(name).expect("frame")).position;
+            let theirs = sim.position(plant.body(name).expect("body"));
+            assert!((0..3).all(|k| (ours[k] - theirs[k]).abs() < 1e-12), "{name}: {ours:?} and {theirs:?}");
         }
     }
 }

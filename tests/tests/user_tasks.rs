@@ -174,6 +174,44 @@ fn a_start_that_is_undefined_for_some_draws_ends_the_training_and_keeps_what_was
     assert!(out.join("checkpoints/resume.safetensors").is_file());
 }
 
+/// A torque written to an actuator that makes something else of it would break every limit.
+#[test]
+fn analytic_inverse_dynamics_wants_motors_of_the_controllable_joints() {
+    let folder = tempfile::tempdir().expect("folder");
+    let robot = std::fs::read_to_string(fixture("two_link.xml")).expect("robot");
+    let task = folder.path().join("two_link.toml");
+    let refusal = |from: &str, to: &str| {
+        assert!(robot.contains(from));
+        std::fs::write(folder.path().join("two_link.xml"), robot.replace(from, to)).expect("robot");
+        std::fs::copy(fixture("two_link.toml"), &task).expect("task");
+        let mut manifest = tasks::load(&task.display().to_string(), &[]).expect("task");
+        complete(&mut manifest).err().map(|e| e.to_string()).unwrap_or_default()
+    };
+    assert_eq!(refusal("<motor joint=\"elbow\"", "<motor joint=\"elbow\""), "");
+    let shoulder = "<motor joint=\"shoulder\" ctrlrange=\"-80 80\"/>";
+    let elbow = "<motor joint=\"elbow\" ctrlrange=\"-30 30\"/>";
+    for (from, to, says) in [
+        (
+            elbow,
+            "<motor joint=\"elbow\" gear=\"30\" ctrlrange=\"-1 1\"/>",
+            "actuator 'elbow' of joint 'elbow' has gear 30",
+        ),
+        (elbow, "<motor joint=\"elbow\" gear=\"-1\" ctrlrange=\"-30 30\"/>", "has gear -1"),
+        (elbow, "<general joint=\"elbow\" gainprm=\"18\" ctrlrange=\"-1 1\"/>", "is no plain <motor>"),
+        (elbow, "<velocity joint=\"elbow\" kv=\"5\" ctrlrange=\"-30 30\" forcerange=\"-30 30\"/>", "is no plain <motor>"),
+        (
+            elbow,
+            "<general joint=\"elbow\" dyntype=\"filter\" dynprm=\"0.1\" ctrlrange=\"-30 30\"/>",
+            "is no plain <motor>",
+        ),
+        (shoulder, "", "in the order shoulder, elbow, but the actuators drive elbow;"),
+        ("<actuator>", &format!("<actuator>{elbow}"), "but the actuators drive elbow, shoulder, elbow;"),
+    ] {
+        let message = refusal(from, to);
+        assert!(message.contains(says), "{to}: {message}");
+    }
+}
+
 #[test]
 fn more_outputs_than_can_be_learned_are_refused_by_number() {
     let folder = tempfile::tempdir().expect("folder");

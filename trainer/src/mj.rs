@@ -10,7 +10,7 @@ mod sim;
 use std::sync::Arc;
 
 use mujoco_rs::mujoco_c::{mjtDisableBit, mjtEnableBit};
-use mujoco_rs::wrappers::mj_model::{MjModel, MjtJoint, MjtObjBase, MjtTrn};
+use mujoco_rs::wrappers::mj_model::{MjModel, MjtBias, MjtDyn, MjtGain, MjtJoint, MjtObjBase, MjtTrn};
 
 pub use guard::{last_warning, warnings};
 pub use sim::Sim;
@@ -103,8 +103,10 @@ pub struct Actuator {
     pub joint: String,
     /// Degree of freedom it moves (index into `qvel`).
     pub dof: usize,
-    /// Joint force or torque per unit of action \[N or N·m\].
+    /// Joint force or torque per unit of the actuator's force.
     pub gear: f64,
+    /// The action is the actuator's force: no gain, bias, delay or dynamics of its own.
+    pub is_plain: bool,
     /// Smallest action that has an effect of its own.
     pub low: f64,
     /// Largest action that has an effect of its own.
@@ -218,11 +220,20 @@ impl Model {
                     joint: self.joint_name(joint),
                     dof: self.0.jnt_dofadr()[joint] as usize,
                     gear: self.0.actuator_gear()[id][0],
+                    is_plain: self.is_plain(id),
                     low,
                     high,
                 }
             })
             .collect()
+    }
+
+    fn is_plain(&self, id: usize) -> bool {
+        self.0.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED
+            && self.0.actuator_gainprm()[id][0] == 1.0
+            && self.0.actuator_biastype()[id] == MjtBias::mjBIAS_NONE
+            && self.0.actuator_dyntype()[id] == MjtDyn::mjDYN_NONE
+            && self.0.actuator_delay()[id] == 0.0
     }
 
     /// [`Model::actuators`] of a robot all of whose actuators drive a joint with one degree of freedom within a range.

@@ -105,6 +105,7 @@ fn torque(joint: &Joint) -> Actuator {
         name,
         dof: joint.idx_v,
         gear: 1.0,
+        is_plain: true,
         low: -joint.effort,
         high: joint.effort,
     }

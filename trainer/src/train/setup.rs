@@ -1,6 +1,7 @@
 //! From a manifest and its settings to what is trained.
 
 use super::{ALGORITHMS, TrainError};
+use crate::env::Spec;
 use crate::learn::{Dims, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Ppo};
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
@@ -61,7 +62,36 @@ pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
     }
     manifest.action_lower = spec.action_low().collect();
     manifest.action_upper = spec.action_high().collect();
+    if manifest.task.idm.kind == IdmKind::Pinocchio {
+        check_motors(manifest, spec)?;
+    }
     Ok(())
+}
+
+/// Analytic inverse dynamics gives one torque a controllable joint: the actuators have to be these joints' motors, in their order.
+fn check_motors(manifest: &Manifest, spec: &Spec) -> Result<(), TrainError> {
+    let Parts { model, layout, .. } = Parts::new(manifest).map_err(RolloutError::from)?;
+    let joints: Vec<String> = layout.controllable().iter().map(|dof| model.dof_name(*dof)).collect();
+    let driven: Vec<&str> = spec.actuators.iter().map(|a| a.joint.as_str()).collect();
+    let task = &manifest.task.name;
+    if driven != joints {
+        return Err(TrainError::Settings(format!(
+            "[idm] kind = \"pinocchio\" of '{task}' gives one torque a controllable joint, in the order {}, but the actuators drive {}; \
+             give each of these joints one motor, in that order, or take kind = \"learned\"",
+            joints.join(", "),
+            driven.join(", ")
+        )));
+    }
+    match spec.actuators.iter().find(|a| a.gear != 1.0 || !a.is_plain) {
+        None => Ok(()),
+        Some(a) => Err(TrainError::Settings(format!(
+            "[idm] kind = \"pinocchio\" of '{task}' gives torques, but actuator '{}' of joint '{}' {}; \
+             write <motor gear=\"1\"> with the joint's torque [N m or N] as its ctrlrange, or take kind = \"learned\"",
+            a.name,
+            a.joint,
+            if a.is_plain { format!("has gear {}", a.gear) } else { "is no plain <motor>".into() }
+        ))),
+    }
 }
 
 pub(super) fn check_reward(task: &Task) -> Result<(), TrainError> {
