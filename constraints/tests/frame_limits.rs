@@ -247,6 +247,38 @@ fn a_hand_stops_in_front_of_a_plane() {
     }
 }
 
+/// Fast swings at 10 ms: the closing speed changes by more than `braking` in a period while no joint accelerates.
+#[test]
+fn a_ball_stops_in_front_of_a_floor_however_fast_the_joints_turn() {
+    let (m, dt) = (panda(), 0.01);
+    let ball = solid("panda_hand", Shape::Sphere { radius: 0.05 }, [0.0; 3]);
+    let floor = obstacle("floor", Shape::HalfSpace, [0.0, 0.0, 0.15]);
+    let mut limits = panda_limits(None);
+    let near = CollisionSettings { braking: 0.5, influence: 8.0, margin: 0.0, ..settings(&[ball, floor]) };
+    limits.push(Box::new(CollisionLimit::new(near)));
+    let mut projector = Projector::new(&m, &limits, &[0, 1, 2, 3, 4, 5, 6], Settings::new(dt, 1)).unwrap();
+    let (mut random, mut target, mut k) = (Random(4), Target::new(&m), Kinematics::new(&m));
+    let (hand, mut lowest, mut active) = (m.frame("panda_hand").unwrap(), f64::INFINITY, 0);
+    for _ in 0..40 {
+        let (mut q, mut v) = (vec![0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0], vec![0.0; 7]);
+        let mut pull = [0.0; 7];
+        for tick in 0..300 {
+            if tick % 60 == 0 {
+                pull = [0; 7].map(|_| random.between(-1.0, 1.0).signum());
+            }
+            let raw = consistent(&projector, &q, &v, &pull);
+            projector.project(&q, &v, &raw, &mut target);
+            active += usize::from(target.ledger.active.iter().any(|a| a.kind == Kind::Collision));
+            q.copy_from_slice(&target.q);
+            v.copy_from_slice(&target.v);
+            k.update_frames(&q, &v, &v);
+            lowest = lowest.min(k.frame(hand).position[2] - 0.05);
+        }
+    }
+    println!("lowest {lowest:.9} m above a floor at 0.15, {active} ticks at it");
+    assert!(lowest > 0.15 - 2e-5 && active > 1000, "{lowest} {active}");
+}
+
 /// Speed of the hand and energy of the robot against what they mean, at every tick.
 #[test]
 fn cones_hold_speed_and_energy() {

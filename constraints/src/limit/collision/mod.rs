@@ -79,16 +79,15 @@ pub struct SolidSettings {
 /// these points at `q (+) T v`, where the robot will be if no joint accelerates:
 ///
 /// ```text
-///     n' (J_A - J_B) y / T  <=  approach(d, w),    d = d^ + T w^,  w = w^
+///     n' (J_A - J_B) y / T  <=  approach(d, w) - c
 /// ```
 ///
-/// as for a [`FrameLimit`](super::FrameLimit), for every pair within `influence` (at most `rows` of them, the nearest
+/// as for a [`FrameLimit`](super::FrameLimit), with the change `c` of the closing speed from `q` to there per second, for every pair within `influence` (at most `rows` of them, the nearest
 /// first; the others have none).
 ///
 /// # How exact
 ///
-/// The distance at the end of the period is off by O((T y)²). That `w` changes along the way, because the bodies turn, is not foreseen but
-/// measured in the next tick, so a distance may end some T² times the curvature beyond the margin (microns at 1 kHz). Where a
+/// The distance at the end of the period is off by O((T y)²): microns at 10 ms. Where a
 /// face or an edge turns nearly parallel to a surface the nearest point jumps, and `w` with it by the angular speed times the
 /// width of the face: `margin` must cover what `braking` cannot. Nobody certifies that the joints can brake by `braking`: choose what they
 /// can do everywhere (0.8 m/s² held on the Panda, 2 m/s² did not). `influence` must exceed `margin` plus the stopping
@@ -274,6 +273,7 @@ impl Rows for CollisionRows {
 
     fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
         let (scale, period) = (1.0 / tick.period.dt, tick.period);
+        self.pairs.begin(self.ahead.look_at_frames(tick.q, tick.v, 0.0));
         let kinematics = self.ahead.look(tick.q, tick.v, period.dt);
         for near in self.pairs.look(kinematics) {
             let row = rows.row(near.slot);
@@ -291,6 +291,7 @@ impl Rows for CollisionRows {
 
     fn excess(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
         out.fill(f64::NEG_INFINITY);
+        self.pairs.begin(self.ahead.look_at_frames(motion.q, motion.v, 0.0));
         let near = self.pairs.look(self.ahead.look_at_frames(motion.q, motion.v, motion.period.dt));
         let then = self.ahead.turn(motion.v_next);
         for near in near {

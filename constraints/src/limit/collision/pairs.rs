@@ -49,13 +49,18 @@ pub(super) struct Near {
     pub(super) between: Separation,
     /// Closing speed of the nearest points [m/s].
     speed: f64,
+    /// The same before the period.
+    before: f64,
+    /// Size of the relative acceleration of these points, as points of the bodies, while no joint accelerates [m/s²].
+    most: f64,
 }
 
 impl Near {
-    /// Distance less `margin` and how it closes. The acceleration of points fixed to the bodies says little about the distance: it leaves out
-    /// that the nearest points slide along both, so it is taken for zero.
+    /// Distance less `margin` and how it closes. The closing acceleration is the change of the closing speed over the period, which knows
+    /// that the nearest points slide along both bodies; where they jump, no more than the points' own.
     pub(super) fn clearance(&self, margin: f64, period: &Period) -> Clearance {
-        Clearance::ahead(self.between.distance - margin, self.speed, 0.0, period)
+        let c = ((self.speed - self.before) / period.dt).clamp(-self.most, self.most);
+        Clearance::ahead(self.between.distance - margin, self.speed, c, period)
     }
 
     /// Closing speed of the same points at another velocity of the joints.
@@ -70,7 +75,8 @@ pub(super) struct Pairs {
     bodies: Vec<Body>,
     pairs: Vec<[usize; 2]>,
     reach: Reach,
-    /// Of the bodies, at the state looked at.
+    /// Of the bodies, at the begin of the period and at the state looked at.
+    before: Vec<(FrameMotion, Placement)>,
     at: Vec<(FrameMotion, Placement)>,
     /// Distance and number of the nearest pairs.
     nearest: Vec<(usize, Separation)>,
@@ -79,9 +85,10 @@ pub(super) struct Pairs {
 
 impl Pairs {
     pub(super) fn new(bodies: Vec<Body>, pairs: Vec<[usize; 2]>, reach: Reach) -> Pairs {
-        let (at, slots) = (Vec::with_capacity(bodies.len()), reach.rows.min(pairs.len()));
+        let room = || Vec::with_capacity(bodies.len());
+        let (before, at, slots) = (room(), room(), reach.rows.min(pairs.len()));
         let (nearest, found) = (Vec::with_capacity(slots + 1), Vec::with_capacity(slots));
-        Pairs { bodies, pairs, reach, at, nearest, found }
+        Pairs { bodies, pairs, reach, before, at, nearest, found }
     }
 
     /// Number of rows.
@@ -98,26 +105,35 @@ impl Pairs {
         self.pairs.iter().map(|[a, b]| format!("{} and {}", name(*a), name(*b))).collect()
     }
 
+    /// Where the bodies are at the begin of the period.
+    pub(super) fn begin(&mut self, kinematics: &mut Kinematics) {
+        place(&self.bodies, kinematics, &mut self.before);
+    }
+
     /// The nearest pairs within reach at the state `kinematics` is at, equal distances in the order of the pairs. Allocates nothing.
     pub(super) fn look(&mut self, kinematics: &mut Kinematics) -> &[Near] {
-        self.at.clear();
-        for body in &self.bodies {
-            let frame = kinematics.frame(body.frame);
-            let placement =
-                Placement { position: frame.position, rotation: frame.rotation }.then(&body.local);
-            self.at.push((frame, placement));
-        }
+        place(&self.bodies, kinematics, &mut self.at);
         self.rank();
         self.found.clear();
         for (rank, (pair, between)) in self.nearest.iter().enumerate() {
             let [a, b] = self.pairs[*pair];
-            let on_a = self.at[a].0.carry(between.points[0]);
-            let on_b = self.at[b].0.carry(between.points[1]);
+            let relative = |at: &[(FrameMotion, Placement)], points: [[f64; 3]; 2]| {
+                let (on_a, on_b) = (at[a].0.carry(points[0]), at[b].0.carry(points[1]));
+                (minus(on_a.velocity, on_b.velocity), minus(on_a.acceleration, on_b.acceleration))
+            };
+            let (velocity, acceleration) = relative(&self.at, between.points);
+            let (x, y) =
+                ((&self.bodies[a].shape, &self.before[a].1), (&self.bodies[b].shape, &self.before[b].1));
+            let speed = dot(between.normal, velocity);
+            let before = separation(x, y, f64::INFINITY)
+                .map_or(speed, |was| dot(was.normal, relative(&self.before, was.points).0));
             self.found.push(Near {
                 slot: if self.pairs.len() > self.reach.rows { rank } else { *pair },
                 frames: [self.bodies[a].frame, self.bodies[b].frame],
                 between: *between,
-                speed: dot(between.normal, minus(on_a.velocity, on_b.velocity)),
+                speed,
+                before,
+                most: norm(acceleration),
             });
         }
         &self.found
@@ -143,4 +159,13 @@ impl Pairs {
             self.nearest.truncate(slots);
         }
     }
+}
+
+/// Moves the bodies with their frames.
+fn place(bodies: &[Body], kinematics: &mut Kinematics, at: &mut Vec<(FrameMotion, Placement)>) {
+    at.clear();
+    at.extend(bodies.iter().map(|body| {
+        let frame = kinematics.frame(body.frame);
+        (frame, Placement { position: frame.position, rotation: frame.rotation }.then(&body.local))
+    }));
 }
