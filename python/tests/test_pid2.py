@@ -1,6 +1,7 @@
 """SB3's five lines: learn, predict, save, load; the same weights as `nearl train`; Ctrl-C keeps what was learned."""
 
 import _thread
+import signal
 import threading
 import tomllib
 from pathlib import Path
@@ -89,6 +90,7 @@ def test_the_same_seed_gives_the_same_policy_on_any_number_of_threads() -> None:
 
 
 def test_ctrl_c_keeps_what_was_learned(tmp_path: Path) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background ignores it
     agent = nearl.PID2(CART_POLE, run=tmp_path / "run")
     threading.Timer(1.0, _thread.interrupt_main).start()
     with pytest.raises(KeyboardInterrupt):

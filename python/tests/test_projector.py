@@ -41,8 +41,12 @@ class Problem:
         self.upper = dt * upper_acceleration(high - q, v, speed, dt, n)
         self.lower = -dt * upper_acceleration(q - low, -v, speed, dt, n)
         damping = model.passive(q, 0 * v) - model.passive(q, 0 * v + 1)  # it meets v + kappa (v' - v) on average
-        self.rows = model.mass_matrix(q) / dt + self.kappa * np.diag(damping)
-        offset = model.nle(q, v) - model.passive(q, v)
+        # gravity and the rest are met at q + h v and v + h (v' - v) / dt
+        h = dt / 2 if n == 0 else (dt - dt / n) / 2
+        middle, eye = model.integrate(q, h * v), np.eye(len(v))
+        slope = np.column_stack([(model.nle(middle, v + e) - model.nle(middle, v - e)) / 2 for e in eye])
+        self.rows = (model.mass_matrix(middle) + h * slope) / dt + self.kappa * np.diag(damping)
+        offset = model.nle(middle, v) - model.passive(q, v)
         self.row_lower, self.row_upper = -model.effort_limit - offset, model.effort_limit - offset
 
     def solve(self, q_hat: Array, v_hat: Array) -> Array | None:

@@ -256,6 +256,15 @@ impl Task {
                 format!("dt = {} s is not a whole number of physics steps of {} s", t.dt, t.sim_dt),
             );
         }
+        if t.sim_dt > 0.0 && t.dt / t.sim_dt > 1000.5 {
+            return refuse(
+                "time.dt",
+                format!(
+                    "{} s are more than 1000 physics steps of {} s; give the period in seconds",
+                    t.dt, t.sim_dt
+                ),
+            );
+        }
         if t.policy_every == 0 {
             return refuse("time.policy_every", "0 ticks; the policy needs at least every tick = 1".into());
         }

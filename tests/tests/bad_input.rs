@@ -71,6 +71,12 @@ const FILES: &[(&str, &str, &str, &[&str])] = &[
     ("Panda-reach", "dt = 0.001\npolicy", "dt = -0.001\npolicy", &["t.toml", "time.dt", "-0.001 s"]),
     ("Panda-reach", "dt = 0.001\npolicy", "dt = nan\npolicy", &["t.toml", "time.dt", "NaN s"]),
     ("Panda-reach", "sim_dt = 0.001", "sim_dt = 0.0007", &["time.sim_dt", "whole number", "0.0007 s"]),
+    (
+        "Panda-reach",
+        "sim_dt = 0.001",
+        "sim_dt = 5e-7",
+        &["time.dt", "more than 1000 physics steps of 0.0000005 s"],
+    ),
     ("HalfCheetah-v5", "dt = 0.05\nsim_dt", "dt = 0.1\nsim_dt", &["time.dt", "0.1 s", "simulates 0.05 s"]),
     ("Ant-v5", "dt = 0.05", "dt = 0.04", &["time.dt", "0.04 s", "simulates 0.05 s"]),
     ("Panda-reach", "sim_dt = 0.001", "sim_dt = 0.0005", &["time.sim_dt", "0.0005 s", "simulates 0.001 s"]),
