@@ -108,10 +108,37 @@ fn checked<P: PyClass<BaseType = Limit>>(
 }
 
 /// One number for every joint, or numbers by joint name.
-#[derive(FromPyObject)]
 enum Values {
     All(f64),
     Joints(BTreeMap<String, f64>),
+}
+
+impl<'a, 'py> FromPyObject<'a, 'py> for Values {
+    type Error = PyErr;
+
+    fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        let all = given.extract().map(Values::All);
+        all.or_else(|_| given.extract().map(Values::Joints)).map_err(|_: PyErr| {
+            expected("a number for all joints, or numbers by name: {\"elbow\": 1.5}", &given)
+        })
+    }
+}
+
+/// Names in a list; a single string would be read letter by letter.
+struct Names(Vec<String>);
+
+impl<'a, 'py> FromPyObject<'a, 'py> for Names {
+    type Error = PyErr;
+
+    fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        given.extract().map(Names).map_err(|_: PyErr| expected("a list of names: [\"elbow\"]", &given))
+    }
+}
+
+/// Why an argument is refused; Python says which one before it.
+fn expected(what: &str, given: &Bound<'_, PyAny>) -> PyErr {
+    let name = given.get_type().name().map_or("another type".into(), |n| n.to_string());
+    PyTypeError::new_err(format!("expected {what}; got {name}"))
 }
 
 impl Values {
@@ -124,9 +151,18 @@ impl Values {
 }
 
 /// `(linear, quadratic)` weights.
-type Weights = (f64, f64);
+struct Weights(f64, f64);
 
-fn soft((linear, quadratic): Weights) -> Soft {
+impl<'a, 'py> FromPyObject<'a, 'py> for Weights {
+    type Error = PyErr;
+
+    fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        let pair = given.extract().map(|(linear, quadratic)| Weights(linear, quadratic));
+        pair.map_err(|_: PyErr| expected("the weights (linear, quadratic): (1.0, 100.0)", &given))
+    }
+}
+
+fn soft(Weights(linear, quadratic): Weights) -> Soft {
     Soft { linear, quadratic }
 }
 
@@ -328,8 +364,8 @@ pub(crate) struct LockedJoints;
 #[pymethods]
 impl LockedJoints {
     #[new]
-    fn new(model: &Model, joints: Vec<String>) -> PyResult<PyClassInitializer<Self>> {
-        checked(model, Self, constraints::LockedJoints::new(joints))
+    fn new(model: &Model, joints: Names) -> PyResult<PyClassInitializer<Self>> {
+        checked(model, Self, constraints::LockedJoints::new(joints.0))
     }
 }
 
