@@ -27,6 +27,38 @@ impl Status {
     pub fn is_ok(&self) -> bool {
         !matches!(self, Status::Braked(_) | Status::Refused(_))
     }
+
+    /// Its name in one word, as Python and `nearl project` say it.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Status::Unchanged => "unchanged",
+            Status::Clamped => "clamped",
+            Status::Solved => "solved",
+            Status::Slowed => "slowed",
+            Status::Recovering => "recovering",
+            Status::Braked(_) => "braked",
+            Status::Refused(_) => "refused",
+        }
+    }
+
+    /// Why, where there is a reason.
+    pub fn reason(&self) -> Option<&'static str> {
+        Some(match self {
+            Status::Unchanged | Status::Clamped | Status::Solved => return None,
+            Status::Slowed => "no way to stop could be verified from the nearest allowed state",
+            Status::Recovering => {
+                "the measured state is outside what `outside` names, which may only come back or brake"
+            }
+            Status::Braked(BrakeReason::NonFiniteProposal) => "the proposal holds NaN or infinity",
+            Status::Braked(BrakeReason::NoCertifiedAnswer) => "no answer passed the checker",
+            Status::Braked(BrakeReason::NoVerifiedBrake) => {
+                "no way to stop could be verified; the stored brake is executed"
+            }
+            Status::Braked(BrakeReason::NonFiniteDynamics) => "the dynamics came out as NaN or infinity",
+            Status::Refused(RefuseReason::NonFiniteState) => "the measured state holds NaN or infinity",
+            Status::Refused(RefuseReason::WrongLength) => "a vector has the wrong length",
+        })
+    }
 }
 
 /// Why the joints brake.

@@ -1,40 +1,12 @@
 //! What a projection returns.
 
-use nearl_constraints::{self as constraints, BrakeReason, Counts, RefuseReason, Side, Status};
+use nearl_constraints::{self as constraints, Counts, Side};
 use numpy::{PyArray1, PyArray2};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arrays::{array, array2};
-
-/// Short name of a status, and the reason where there is one.
-fn words(status: Status) -> (&'static str, Option<&'static str>) {
-    match status {
-        Status::Unchanged => ("unchanged", None),
-        Status::Clamped => ("clamped", None),
-        Status::Solved => ("solved", None),
-        Status::Recovering => (
-            "recovering",
-            Some("the measured state is outside what `outside` names, which may only come back or brake"),
-        ),
-        Status::Braked(BrakeReason::NonFiniteProposal) => {
-            ("braked", Some("the proposal holds NaN or infinity"))
-        }
-        Status::Braked(BrakeReason::NoCertifiedAnswer) => ("braked", Some("no answer passed the checker")),
-        Status::Slowed => ("slowed", Some("no way to stop could be verified from the nearest allowed state")),
-        Status::Braked(BrakeReason::NoVerifiedBrake) => {
-            ("braked", Some("no way to stop could be verified; the stored brake is executed"))
-        }
-        Status::Braked(BrakeReason::NonFiniteDynamics) => {
-            ("braked", Some("the dynamics came out as NaN or infinity"))
-        }
-        Status::Refused(RefuseReason::NonFiniteState) => {
-            ("refused", Some("the measured state holds NaN or infinity"))
-        }
-        Status::Refused(RefuseReason::WrongLength) => ("refused", Some("a vector has the wrong length")),
-    }
-}
 
 fn counts<'py>(py: Python<'py>, c: &Counts) -> PyResult<Bound<'py, PyDict>> {
     let out = PyDict::new(py);
@@ -63,13 +35,13 @@ impl Ledger {
     /// "unchanged", "clamped", "solved", "slowed", "recovering", "braked" or "refused".
     #[getter]
     fn status(&self) -> &'static str {
-        words(self.ledger.status).0
+        self.ledger.status.name()
     }
 
     /// Why the status is "slowed", "recovering", "braked" or "refused".
     #[getter]
     fn reason(&self) -> Option<&'static str> {
-        words(self.ledger.status).1
+        self.ledger.status.reason()
     }
 
     /// Whether the target is the nearest allowed state to the proposal.
@@ -150,7 +122,7 @@ impl Ledger {
 
     fn __repr__(&self) -> String {
         let l = &self.ledger;
-        format!("Ledger('{}', {} active, moved {:.3e})", words(l.status).0, l.active.len(), l.moved)
+        format!("Ledger('{}', {} active, moved {:.3e})", l.status.name(), l.active.len(), l.moved)
     }
 }
 
@@ -200,7 +172,7 @@ impl Target {
     }
 
     fn __repr__(&self) -> String {
-        let words = words(self.target.ledger.status).0;
+        let words = self.target.ledger.status.name();
         format!("Target('{words}', q={:?}, v={:?})", self.target.q, self.target.v)
     }
 }
@@ -255,7 +227,7 @@ impl Targets {
     /// Status of each (n).
     #[getter]
     fn status(&self) -> Vec<&'static str> {
-        self.targets.iter().map(|t| words(t.ledger.status).0).collect()
+        self.targets.iter().map(|t| t.ledger.status.name()).collect()
     }
 
     /// Whether each is the nearest allowed state (n).
