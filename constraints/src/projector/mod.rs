@@ -316,11 +316,16 @@ impl Projector {
 
     /// Reports a target that is not the nearest allowed one.
     fn report_rung(&mut self, q: &[f64], v: &[f64], target: &mut Target, rung: Rung) {
+        self.report_unsolved(q, v, target);
+        target.ledger.rung = rung;
+    }
+
+    /// No rows hold a target that was not solved for; what it breaks, the checker says.
+    fn report_unsolved(&mut self, q: &[f64], v: &[f64], target: &mut Target) {
         target.ledger.active.clear();
         let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
         target.ledger.violations = verdict.counts;
         target.ledger.slack = if verdict.worst.is_finite() { verdict.worst } else { f64::MAX };
-        target.ledger.rung = rung;
     }
 
     /// Last rung: a tick of a brake, see [`Projector::stop`].

@@ -148,11 +148,8 @@ impl Projector {
         for (a, (to, from)) in target.acceleration.iter_mut().zip(proposal.v.iter().zip(v)) {
             *a = (to - from) / self.period.dt;
         }
-        let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
-        target.ledger.violations = verdict.counts;
-        target.ledger.slack = if verdict.worst.is_finite() { verdict.worst } else { f64::MAX };
+        self.report_unsolved(q, v, target);
         target.ledger.moved = 0.0;
-        target.ledger.active.clear();
     }
 
     /// Names of all rows an [`ActiveRow`](crate::ActiveRow) may speak of: the dofs (nv), then the coupled rows and cones.
