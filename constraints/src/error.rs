@@ -51,6 +51,20 @@ pub enum ModelError {
         /// All of them, joint by joint.
         list: String,
     },
+    /// More than a robot has: refused before anything is built from it.
+    #[error(
+        "{file} has {count} {what}, more than the {most} that are read; leave out what does not belong to the robot"
+    )]
+    TooLarge {
+        /// File, or "the text".
+        file: String,
+        /// What there is too much of.
+        what: &'static str,
+        /// How many.
+        count: usize,
+        /// How many are allowed.
+        most: usize,
+    },
     /// A name that is not a joint of the model.
     #[error("no joint '{name}' in the model{near}")]
     UnknownJoint {

@@ -50,6 +50,7 @@
 mod certify;
 pub mod checker;
 pub mod convention;
+pub mod description;
 mod dynamics;
 mod error;
 pub mod geometry;
@@ -67,6 +68,7 @@ mod urdf;
 pub mod viability;
 
 pub use certify::{Certificate, certify_braking};
+pub use description::RobotDescription;
 pub use dynamics::Dynamics;
 pub use error::{LimitError, ModelError};
 pub use kinematics::{FrameMotion, Kinematics, PointMotion};

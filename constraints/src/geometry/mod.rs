@@ -45,7 +45,8 @@ pub enum Shape {
 }
 
 /// Position and rotation in a parent.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Placement {
     /// Origin [m].
     pub position: [f64; 3],
