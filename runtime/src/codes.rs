@@ -1,72 +1,14 @@
 //! Every code a program of this workspace prints, with what it means and what to do: the text behind `nearl explain`.
 //!
-//! A code is declared once, with its enum variant, by a macro of this module; [`all`] walks them.
-
-/// Declares an enum whose variants carry a stable name, a meaning and a remedy. The number of a variant is its place.
-macro_rules! codes {
-    ($(#[$meta:meta])* $name:ident, $group:literal { $($variant:ident = $code:literal, $meaning:literal, $remedy:literal;)+ }) => {
-        $(#[$meta])*
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-        pub enum $name {
-            $(#[doc = $meaning] #[serde(rename = $code)] $variant,)+
-        }
-
-        impl $name {
-            /// All of them, in the order of their numbers.
-            pub const ALL: &'static [$name] = &[$($name::$variant),+];
-
-            /// The number in a message.
-            pub fn code(self) -> u32 {
-                self as u32
-            }
-
-            /// The stable name, as logs and `nearl explain` have it.
-            pub fn name(self) -> &'static str {
-                match self { $($name::$variant => $code,)+ }
-            }
-
-            /// Name, meaning and remedy.
-            pub fn explanation(self) -> $crate::codes::Explanation {
-                match self {
-                    $($name::$variant => $crate::codes::Explanation {
-                        code: $code, group: $group, meaning: $meaning, remedy: $remedy,
-                    },)+
-                }
-            }
-
-            pub(crate) fn explanations() -> Vec<$crate::codes::Explanation> {
-                Self::ALL.iter().map(|code| code.explanation()).collect()
-            }
-        }
-
-        impl std::fmt::Display for $name {
-            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                f.write_str(self.name())
-            }
-        }
-    };
-}
-pub(crate) use codes;
+//! A code is declared once, with its enum variant, by [`nearl_controller::codes!`]; [`all`] walks them.
 
 mod tables;
 
-pub use tables::{CheckCode, LedgerStatus, LinkCode, SnapshotCode};
+pub use nearl_controller::codes::{Explanation, LedgerStatus, SnapshotCode};
+pub use tables::{CheckCode, LinkCode};
 
 use crate::link::Verdict;
 use crate::rt::{Mode, Reason};
-
-/// What a code means and what to do about it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
-pub struct Explanation {
-    /// Stable name.
-    pub code: &'static str,
-    /// Where it appears: `mode`, `reason`, `status`, `verdict`, `snapshot`, `link`, `doctor` or `rollout`.
-    pub group: &'static str,
-    /// What happened.
-    pub meaning: &'static str,
-    /// The next step.
-    pub remedy: &'static str,
-}
 
 /// Every code of every group, in the order of the groups.
 pub fn all() -> Vec<Explanation> {

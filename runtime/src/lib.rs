@@ -1,24 +1,18 @@
-//! Snapshot, networks, controller, real-time loop and links: all a robot needs.
+//! Real-time loop, links, flight log and doctor: with the controller of `nearl-controller`, all a robot needs.
 //!
 //! Read [`controller`] first: the one data path is on that page.
 
 pub mod cli;
 pub mod codes;
-pub mod controller;
 pub mod doctor;
-pub mod idm;
 pub mod link;
 pub mod log;
-pub mod net;
-pub mod normaliser;
 pub mod rollout_protocol;
 pub mod rt;
-pub mod snapshot;
-pub mod task;
 pub mod tunnel;
 
-pub use nearl_constraints as constraints;
-
-pub use controller::{Controller, Excess, Noise, Output, State};
-pub use snapshot::{Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
-pub use task::Task;
+pub use nearl_controller::constraints;
+pub use nearl_controller::{
+    Controller, Excess, Manifest, Networks, Noise, Output, PolicyKind, Snapshot, SnapshotError, State, Task,
+};
+pub use nearl_controller::{controller, idm, multiversion, net, normaliser, snapshot, task};

@@ -1,16 +1,20 @@
 //! The dependency arrows of docs/ARCHITECTURE.md, read from cargo itself.
 
-use cargo_metadata::{DependencyKind, MetadataCommand};
-use std::collections::BTreeMap;
+use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, NodeDep};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Crate -> the workspace crates it may import.
 const ARROWS: &[(&str, &[&str])] = &[
     ("nearl-constraints", &[]),
-    ("nearl-runtime", &["nearl-constraints"]),
+    ("nearl-controller", &["nearl-constraints"]),
+    ("nearl-runtime", &["nearl-constraints", "nearl-controller"]),
     ("nearl-trainer", &["nearl-runtime"]),
     ("nearl-python", &["nearl-constraints", "nearl-runtime", "nearl-trainer"]),
     ("nearl-tests", &["nearl-constraints", "nearl-runtime", "nearl-trainer"]),
 ];
+
+/// What a program that embeds the controller must not have to build: links, command lines, logs, physics, Python.
+const NOT_EMBEDDED: &[&str] = &["iceoryx2", "clap", "mcap", "rtrb", "signal-hook", "mujoco-rs", "pyo3"];
 
 /// Libraries that only one crate (and those above it) may name.
 const OWNED: &[(&str, &str)] = &[
@@ -46,6 +50,31 @@ fn no_other_arrow_exists() {
             }
         }
     }
+}
+
+/// Every package that a build of `name` compiles into it or for it, itself included.
+fn packages<'a>(metadata: &'a Metadata, name: &str) -> BTreeSet<&'a str> {
+    let resolve = metadata.resolve.as_ref().expect("a resolved graph");
+    let nodes: BTreeMap<_, _> = resolve.nodes.iter().map(|node| (&node.id, node)).collect();
+    let package: BTreeMap<_, _> = metadata.packages.iter().map(|p| (&p.id, p)).collect();
+    let mut open: Vec<_> = package.values().filter(|p| p.name.as_str() == name).map(|p| &p.id).collect();
+    let mut seen = BTreeSet::new();
+    while let Some(id) = open.pop() {
+        if seen.insert(id) {
+            let normal = |d: &&NodeDep| d.dep_kinds.iter().any(|k| k.kind == DependencyKind::Normal);
+            open.extend(nodes[id].deps.iter().filter(normal).map(|d| &d.pkg));
+        }
+    }
+    seen.iter().map(|id| package[id].name.as_str()).collect()
+}
+
+#[test]
+fn the_controller_is_embedded_without_links_threads_and_command_lines() {
+    let metadata = MetadataCommand::new().exec().expect("cargo metadata runs");
+    let controller = packages(&metadata, "nearl-controller");
+    assert!(controller.contains("nearl-constraints") && controller.len() > 10, "{controller:?}");
+    let found: Vec<_> = NOT_EMBEDDED.iter().filter(|library| controller.contains(**library)).collect();
+    assert!(found.is_empty(), "nearl-controller builds {found:?}");
 }
 
 #[test]

@@ -111,7 +111,7 @@ impl RobotMessage {
     }
 }
 
-crate::codes::codes! {
+nearl_controller::codes! {
     /// Answer to a snapshot, by reason.
     Verdict, "verdict" {
         Accepted = "accepted", "The snapshot is in use from the tick named in the receipt.", "Nothing to do.";

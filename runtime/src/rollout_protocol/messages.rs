@@ -1,7 +1,7 @@
 //! Request, reply and what a reply can say.
 
-use crate::codes::codes;
 use crate::link::schema::message;
+use nearl_controller::codes;
 
 /// Numbers in one chunk at most.
 pub const MAX_CHUNK: usize = 4096;

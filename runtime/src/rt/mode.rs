@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::codes::codes;
+use nearl_controller::codes;
 
 codes! {
     /// Mode of the loop. Escalates at once; comes back only after good ticks in a row, and from Fault never.

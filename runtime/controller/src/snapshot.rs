@@ -200,7 +200,7 @@ impl SnapshotError {
 }
 
 /// What a parser says of a damaged file, which may quote any of it: its first line, cut to what a message holds.
-pub(crate) fn one_line(text: &dyn std::fmt::Display) -> String {
+pub fn one_line(text: &dyn std::fmt::Display) -> String {
     const MOST: usize = 200;
     let text = text.to_string();
     let mut line: String = text.lines().next().unwrap_or_default().chars().take(MOST).collect();

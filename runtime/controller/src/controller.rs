@@ -200,7 +200,7 @@ impl Controller {
     /// One control tick. The same state, noise and history of ticks since [`Controller::reset`] give the same bits.
     ///
     /// A state that is not finite is replaced by the last finite one and reported as such: the action is then what that one asked for,
-    /// and no longer right once the robot has moved on. [`rt`](crate::rt) bridges a few such ticks and then brakes; so should a loop
+    /// and no longer right once the robot has moved on. The real-time loop of `nearl-runtime` bridges a few such ticks and then brakes; so should a loop
     /// of your own. A state of another robot's size is refused, and the action stays as it was.
     pub fn update(&mut self, state: &State, noise: &Noise, out: &mut Output) -> Status {
         let begin = Instant::now();
@@ -402,7 +402,7 @@ impl Controller {
     }
 
     /// The projector: what it knows of the tick before moves between those of one robot.
-    pub(crate) fn projector(&mut self) -> &mut Projector {
+    pub fn projector(&mut self) -> &mut Projector {
         &mut self.projector
     }
 
