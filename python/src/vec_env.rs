@@ -372,6 +372,7 @@ fn open(mut snapshot: Snapshot) -> Snapshot {
     snapshot.networks.policy = Dense { layers: vec![layer] };
     snapshot.networks.policy_log_std = vec![0.0; n_state];
     snapshot.manifest.policy = PolicyKind::Stochastic;
+    snapshot.manifest.functions.clear();
     snapshot
 }
 

@@ -1,6 +1,6 @@
 //! Networks from the task file: sizes and activation, from training through the snapshot to the controller.
 
-use nearl_runtime::net::{Activation, Dense};
+use nearl_runtime::net::{Activation, Dense, Forward, Function};
 use nearl_runtime::{Controller, Snapshot, SnapshotError};
 use nearl_tests::{request, training};
 use nearl_trainer::train::Training;
@@ -113,4 +113,41 @@ fn impossible_sizes_are_refused_in_a_sentence() {
         let error = error.expect_err(set).to_string();
         assert!(error.contains(word), "{set}: {error}");
     }
+}
+
+/// A function after each layer and clips of the inputs survive the file and reach the controller; a file that says too few is refused.
+#[test]
+fn functions_of_layers_and_clips_survive_the_file() {
+    let t = training("HalfCheetah-v5", "ppo", 0, 1, &SHORT);
+    let mut snapshot = t.snapshot().clone();
+    assert_eq!(
+        Snapshot::from_bytes(&snapshot.to_bytes()).expect("loads").networks.normaliser.clip,
+        Vec::<[f64; 2]>::new()
+    );
+    let functions = [Function::Elu, Function::Silu, Function::Tanh];
+    snapshot.manifest.functions = functions.to_vec();
+    let n = snapshot.networks.normaliser.mean.len();
+    snapshot.networks.normaliser.clip = (0..n).map(|i| [-0.1 * i as f64, f64::INFINITY]).collect();
+    let loaded = Snapshot::from_bytes(&snapshot.to_bytes()).expect("loads");
+    assert_eq!(loaded.manifest.functions, functions);
+    assert_eq!(loaded.networks, snapshot.networks);
+    let mut controller = Controller::new(&loaded).expect("controller");
+    let (mut state, mut out) = (controller.state(), controller.output());
+    state.obs.iter_mut().enumerate().for_each(|(i, x)| *x = 20.0 * (i as f64).sin());
+    controller.update(&state, &controller.noise(), &mut out);
+    for (i, &x) in out.x.iter().enumerate() {
+        let norm = &loaded.networks.normaliser;
+        let want = ((state.obs[i] - norm.mean[i]) / norm.std[i]).max(-0.1 * i as f64);
+        assert_eq!(x, want as f32);
+    }
+    let want = Forward::layered(&loaded.networks.policy, functions.to_vec()).forward(&out.x).to_vec();
+    assert_eq!(out.sampled, want);
+
+    snapshot.manifest.functions.pop();
+    let refused = Snapshot::from_bytes(&snapshot.to_bytes()).unwrap_err();
+    assert!(refused.to_string().contains("functions after 2 layers of a policy that has 3"), "{refused}");
+    snapshot.manifest.functions.clear();
+    snapshot.networks.normaliser.clip[3] = [1.0, f64::NAN];
+    let refused = Snapshot::from_bytes(&snapshot.to_bytes()).unwrap_err();
+    assert!(matches!(refused, SnapshotError::Value { index: 3, .. }), "{refused}");
 }

@@ -113,6 +113,7 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
         algo: String::new(),
         policy: PolicyKind::Deterministic,
         activation: Activation::default(),
+        functions: Vec::new(),
         version: 0,
         steps: 0,
         action_lower: Vec::new(),

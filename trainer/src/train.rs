@@ -310,8 +310,7 @@ impl Training {
             ChangeScale::Running => self.change_stats.std(1e-4),
             ChangeScale::Limits => self.snapshot.networks.normaliser.scale.clone(),
         };
-        let normaliser =
-            Normaliser { mean: self.obs_stats.mean.clone(), std: self.obs_stats.std(1e-4), scale };
+        let normaliser = Normaliser::new(self.obs_stats.mean.clone(), self.obs_stats.std(1e-4), scale);
         self.snapshot.networks = self.learner.networks(&normaliser);
     }
 

@@ -14,7 +14,7 @@ mod parts;
 pub use parts::{Parts, seen_entries};
 
 use crate::idm::{AnalyticIdm, LearnedIdm};
-use crate::net::{Activation, Forward};
+use crate::net::{Activation, Forward, Function};
 use crate::normaliser::Normaliser;
 use crate::snapshot::{Networks, PolicyKind, Snapshot, SnapshotError};
 use crate::task::IdmKind;
@@ -117,6 +117,7 @@ pub struct Controller {
     layout: StateLayout,
     kind: PolicyKind,
     activation: Activation,
+    functions: Vec<Function>,
     normaliser: Normaliser,
     policy: Forward,
     policy_log_std: Vec<f32>,
@@ -172,7 +173,8 @@ impl Controller {
             kind,
             activation: m.activation,
             normaliser: n.normaliser.clone(),
-            policy: Forward::new(&n.policy, m.activation),
+            policy: Forward::layered(&n.policy, m.policy_functions(n.policy.layers.len())),
+            functions: m.policy_functions(n.policy.layers.len()),
             policy_log_std: n.policy_log_std.clone(),
             action_log_std,
             projector,
@@ -418,7 +420,7 @@ impl Controller {
     /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.
     pub fn set_networks(&mut self, networks: &Networks) {
         self.normaliser = networks.normaliser.clone();
-        self.policy = Forward::new(&networks.policy, self.activation);
+        self.policy = Forward::layered(&networks.policy, self.functions.clone());
         self.policy_log_std.clone_from(&networks.policy_log_std);
         match (&mut self.inverse, &networks.idm) {
             (Inverse::Learned(idm), Some((net, log_std))) => {

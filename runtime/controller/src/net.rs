@@ -5,9 +5,11 @@ pub mod kernel;
 mod activation;
 mod dense;
 mod forward;
+mod function;
 mod mlp;
 
 pub use activation::Activation;
 pub use dense::{Dense, DenseLayer};
 pub use forward::Forward;
+pub use function::Function;
 pub use mlp::{Layer, Mlp};

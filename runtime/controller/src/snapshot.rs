@@ -4,7 +4,7 @@
 //! The digest covers the manifest text and every tensor (name, shape, bytes), so any changed bit is refused.
 
 use crate::codes::SnapshotCode;
-use crate::net::{Activation, Dense};
+use crate::net::{Activation, Dense, Function};
 use crate::normaliser::Normaliser;
 use crate::task::Task;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -60,6 +60,9 @@ pub struct Manifest {
     /// What lies between the layers of the networks; tanh in files that do not say.
     #[serde(default)]
     pub activation: Activation,
+    /// What follows each layer of the policy, first to last; where it does not say, `activation` between layers and nothing after the last.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub functions: Vec<Function>,
     /// Counts the snapshots of one run upwards; 0 for a file made by hand.
     pub version: u64,
     /// Environment steps seen by the learner.
@@ -68,6 +71,17 @@ pub struct Manifest {
     pub action_lower: Vec<f64>,
     /// Highest action the actuators take (n_act).
     pub action_upper: Vec<f64>,
+}
+
+impl Manifest {
+    /// What follows each of the policy's `layers` layers.
+    pub fn policy_functions(&self, layers: usize) -> Vec<Function> {
+        if self.functions.is_empty() {
+            Function::between(self.activation, layers)
+        } else {
+            self.functions.clone()
+        }
+    }
 }
 
 /// The numbers of a policy, as the learner hands them to a controller.
@@ -312,6 +326,10 @@ impl Snapshot {
             return Err(foreign(format!("an action range from {lower} to {upper}")));
         }
         let networks = Networks::read(&views, manifest.policy)?;
+        let (said, layers) = (manifest.functions.len(), networks.policy.layers.len());
+        if said != 0 && said != layers {
+            return Err(foreign(format!("functions after {said} layers of a policy that has {layers}")));
+        }
         Ok(Self { manifest, networks })
     }
 
@@ -356,6 +374,11 @@ impl Networks {
             f64s("normaliser.std", &self.normaliser.std),
             f64s("normaliser.scale", &self.normaliser.scale),
         ];
+        if !self.normaliser.clip.is_empty() {
+            let side = |i: usize| self.normaliser.clip.iter().map(|c| c[i]).collect::<Vec<f64>>();
+            out.push(f64s("normaliser.lower", &side(0)));
+            out.push(f64s("normaliser.upper", &side(1)));
+        }
         let mut net = |prefix: &str, dense: &Dense, log_std: &[f32]| {
             for (i, l) in dense.layers.iter().enumerate() {
                 out.push(f32s(format!("{prefix}.{i}.weight"), vec![l.n_out, l.n_in], &l.weight));
@@ -375,6 +398,7 @@ impl Networks {
             mean: read_f64(views, "normaliser.mean")?,
             std: read_f64(views, "normaliser.std")?,
             scale: read_f64(views, "normaliser.scale")?,
+            clip: read_clip(views)?,
         };
         for (name, values) in [("normaliser.std", &normaliser.std), ("normaliser.scale", &normaliser.scale)] {
             if let Some((index, &value)) = values.iter().enumerate().find(|(_, v)| **v <= 0.0) {
@@ -427,6 +451,32 @@ fn checked<T: Copy + Into<f64>>(name: &str, values: Vec<T>) -> Result<Vec<T>, Sn
 fn read_f64(views: &[(String, TensorView<'_>)], name: &str) -> Result<Vec<f64>, SnapshotError> {
     let view = find(views, name, Dtype::F64, 1)?;
     checked(name, view.data().as_chunks::<8>().0.iter().map(|c| f64::from_le_bytes(*c)).collect())
+}
+
+/// `normaliser.lower` and `normaliser.upper`, which may be infinite; empty where the file has neither.
+fn read_clip(views: &[(String, TensorView<'_>)]) -> Result<Vec<[f64; 2]>, SnapshotError> {
+    if !views.iter().any(|(n, _)| n == "normaliser.lower" || n == "normaliser.upper") {
+        return Ok(Vec::new());
+    }
+    let side = |name| -> Result<Vec<f64>, SnapshotError> {
+        let view = find(views, name, Dtype::F64, 1)?;
+        Ok(view.data().as_chunks::<8>().0.iter().map(|c| f64::from_le_bytes(*c)).collect())
+    };
+    let (lower, upper) = (side("normaliser.lower")?, side("normaliser.upper")?);
+    if lower.len() != upper.len() {
+        return Err(SnapshotError::Shape {
+            name: "normaliser.upper".into(),
+            expected: format!("{} wide", lower.len()),
+            actual: format!("{} wide", upper.len()),
+        });
+    }
+    // also refuses what is not a number
+    if let Some(index) =
+        lower.iter().zip(&upper).position(|(l, u)| !matches!(l.partial_cmp(u), Some(o) if o.is_le()))
+    {
+        return Err(SnapshotError::Value { name: "normaliser.lower".into(), index, value: lower[index] });
+    }
+    Ok(lower.into_iter().zip(upper).map(|(l, u)| [l, u]).collect())
 }
 
 fn read_f32(

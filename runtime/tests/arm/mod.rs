@@ -47,6 +47,7 @@ pub fn snapshot(version: u64, change: impl FnOnce(&mut Manifest)) -> Snapshot {
         algo: "random".into(),
         policy: PolicyKind::Deterministic,
         activation: Activation::default(),
+        functions: Vec::new(),
         version,
         steps: 0,
         action_lower: effort.iter().map(|e| -e).collect(),
@@ -61,7 +62,7 @@ pub fn snapshot(version: u64, change: impl FnOnce(&mut Manifest)) -> Snapshot {
         bias: weights(seed + 1, n_out),
     };
     let policy = Dense { layers: vec![layer(version, n, 16), layer(version + 7, 16, n)] };
-    let normaliser = Normaliser { mean: vec![0.0; n], std: vec![1.0; n], scale: vec![0.5; n] };
+    let normaliser = Normaliser::new(vec![0.0; n], vec![1.0; n], vec![0.5; n]);
     Snapshot { manifest, networks: Networks { normaliser, policy, policy_log_std: vec![], idm: None } }
 }
 

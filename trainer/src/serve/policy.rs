@@ -101,5 +101,6 @@ fn has_shape(known: &Snapshot, new: &Snapshot) -> bool {
         (lists, layers(&n.policy), n.idm.as_ref().map(|(net, log_std)| (layers(net), log_std.len())))
     };
     let (a, b) = (&known.manifest, &new.manifest);
-    (a.policy, a.activation) == (b.policy, b.activation) && shape(&known.networks) == shape(&new.networks)
+    (a.policy, a.activation, &a.functions) == (b.policy, b.activation, &b.functions)
+        && shape(&known.networks) == shape(&new.networks)
 }

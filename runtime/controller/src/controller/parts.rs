@@ -121,6 +121,7 @@ pub(super) fn check_sizes(m: &Manifest, n: &Networks, layout: &StateLayout) -> R
     let mut want = vec![
         ("normaliser.mean", n.normaliser.mean.len(), o),
         ("normaliser.std", n.normaliser.std.len(), o),
+        ("normaliser.lower", if n.normaliser.clip.is_empty() { o } else { n.normaliser.clip.len() }, o),
         ("normaliser.scale", n.normaliser.scale.len(), s),
         ("policy.0.weight (inputs)", n.policy.n_in(), o),
         ("policy (outputs)", n.policy.n_out(), out),

@@ -2,6 +2,7 @@
 
 use super::activation::Activation;
 use super::dense::Dense;
+use super::function::Function;
 use super::kernel::{LANES, V, ZERO, scalars};
 use super::mlp::{Layer, Mlp};
 
@@ -9,6 +10,8 @@ use super::mlp::{Layer, Mlp};
 #[derive(Clone)]
 pub struct Forward {
     mlp: Mlp,
+    /// What follows each layer.
+    functions: Vec<Function>,
     params: Vec<V>,
     /// Input and output of every layer, padded.
     activations: Vec<Vec<V>>,
@@ -17,12 +20,22 @@ pub struct Forward {
 impl Forward {
     /// Packs a network with `activation` between its layers.
     pub fn new(dense: &Dense, activation: Activation) -> Self {
+        Self::layered(dense, Function::between(activation, dense.layers.len()))
+    }
+
+    /// Packs a network with a function of its own after each layer.
+    ///
+    /// # Panics
+    /// When there are not as many functions as layers.
+    pub fn layered(dense: &Dense, functions: Vec<Function>) -> Self {
+        assert_eq!(dense.layers.len(), functions.len(), "one function a layer");
         let mut len = 0;
-        let mlp = Mlp::new(&dense.widths(), activation, &mut len);
+        // the layout alone is used; what follows a layer is ours
+        let mlp = Mlp::new(&dense.widths(), Activation::default(), &mut len);
         let mut params = vec![ZERO; len];
         mlp.write_dense(dense, &mut params);
         let activations = dense.widths().iter().map(|w| vec![ZERO; w.div_ceil(LANES)]).collect();
-        Self { mlp, params, activations }
+        Self { mlp, functions, params, activations }
     }
 
     /// Inputs.
@@ -49,17 +62,15 @@ impl Forward {
 
 #[inline(always)]
 fn body(net: &mut Forward) {
-    let last = net.mlp.layers.len() - 1;
-    for (i, layer) in net.mlp.layers.iter().enumerate() {
+    for (i, (layer, &function)) in net.mlp.layers.iter().zip(&net.functions).enumerate() {
         let (before, after) = net.activations.split_at_mut(i + 1);
-        let between = (i < last).then_some(net.mlp.activation);
-        affine(layer, &net.params, scalars(&before[i]), &mut after[0], between);
+        affine(layer, &net.params, scalars(&before[i]), &mut after[0], function);
     }
 }
 
 /// `y = f(W' x + b)`; each output's sum runs over the inputs in four interleaved chains, in a fixed order.
 #[inline(always)]
-fn affine(l: &Layer, params: &[V], x: &[f32], y: &mut [V], between: Option<Activation>) {
+fn affine(l: &Layer, params: &[V], x: &[f32], y: &mut [V], function: Function) {
     let n = l.n_vectors();
     let (w, b) = (&params[l.w..l.b], &params[l.b..l.b + n]);
     let x = &x[..l.k];
@@ -78,10 +89,7 @@ fn affine(l: &Layer, params: &[V], x: &[f32], y: &mut [V], between: Option<Activ
         }
         let sum = ((acc[0] + acc[1]) + (acc[2] + acc[3])) + b[j];
         // no closure: it would be compiled without the vector instructions of its caller
-        y[j] = match between {
-            Some(f) => f.apply(sum),
-            None => sum,
-        };
+        y[j] = function.apply(sum);
     }
 }
 
@@ -120,8 +128,8 @@ mod tests {
         h
     }
 
-    type Function = fn(f64) -> f64;
-    const FUNCTIONS: [(Activation, Function); 2] =
+    type Scalar = fn(f64) -> f64;
+    const FUNCTIONS: [(Activation, Scalar); 2] =
         [(Activation::Tanh, f64::tanh), (Activation::Relu, |x| x.max(0.0))];
 
     #[test]
@@ -141,6 +149,45 @@ mod tests {
                             "{activation:?}: {y} {w}"
                         );
                     }
+                }
+            }
+        }
+    }
+
+    /// One function after each layer, in f64.
+    fn layered_reference(net: &Dense, functions: &[Function], x: &[f32]) -> Vec<f64> {
+        let exact = |f: Function, x: f64| match f {
+            Function::Identity => x,
+            Function::Tanh => x.tanh(),
+            Function::Relu => x.max(0.0),
+            Function::Elu => x.max(x.min(0.0).exp_m1()),
+            Function::Silu => x / (1.0 + (-x).exp()),
+            Function::Softplus => x.exp().ln_1p(),
+            Function::Sigmoid => 1.0 / (1.0 + (-x).exp()),
+        };
+        let mut h: Vec<f64> = x.iter().map(|&v| f64::from(v)).collect();
+        for (l, &f) in net.layers.iter().zip(functions) {
+            let one = Dense { layers: vec![l.clone()] };
+            let x32: Vec<f32> = h.iter().map(|&v| v as f32).collect();
+            h = reference(&one, |x| x, &x32).into_iter().map(|v| exact(f, v)).collect();
+        }
+        h
+    }
+
+    #[test]
+    fn every_layer_has_its_own_function() {
+        for functions in
+            Function::ALL.windows(3).chain([&[Function::Softplus, Function::Sigmoid, Function::Tanh][..]])
+        {
+            let net = network(&[48, 96, 33, 12]);
+            let mut forward = Forward::layered(&net, functions.to_vec());
+            for s in 0..20 {
+                let x: Vec<f32> = (0..48).map(|i| ((i * 7 + s * 13) as f32 * 0.37).sin() * 2.0).collect();
+                for (y, want) in forward.forward(&x).iter().zip(layered_reference(&net, functions, &x)) {
+                    assert!(
+                        (f64::from(*y) - want).abs() < 1e-5 * (1.0 + want.abs()),
+                        "{functions:?}: {y} {want}"
+                    );
                 }
             }
         }
