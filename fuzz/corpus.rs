@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use nearl_runtime::link::*;
-use nearl_runtime::rollout_protocol::{Constraints, ReplyMessage, Request, Training};
 use nearl_runtime::rt::*;
+use nearl_trainer::rollout_protocol::{Constraints, ReplyMessage, Request, Training};
 
 use crate::arm::*;
 use crate::messages::bytes_of;
@@ -79,11 +79,11 @@ fn write_all() {
     write("message", "receipt", bytes_of(&receipt));
     let asked = Request { version: Some(3), constraints: Constraints::Off, ..Request::new(7, 100) };
     let mut request = asked.message(5);
-    request.header.schema = nearl_runtime::rollout_protocol::RequestMessage::SCHEMA;
+    request.header.schema = nearl_trainer::rollout_protocol::RequestMessage::SCHEMA;
     write("rollout", "request", bytes_of(&request));
     let training = Training { n_envs: 8, begins: true, stream: 16, gamma: 0.99, moved_penalty: 0.1 };
     let mut request = Request { training: Some(training), ..Request::new(7, 256) }.message(6);
-    request.header.schema = nearl_runtime::rollout_protocol::RequestMessage::SCHEMA;
+    request.header.schema = nearl_trainer::rollout_protocol::RequestMessage::SCHEMA;
     write("rollout", "training", bytes_of(&request));
     let mut reply = ReplyMessage::zeroed();
     (reply.n_obs, reply.n_state, reply.n_act, reply.rows) = (14, 14, 7, 30);

@@ -1,8 +1,8 @@
 //! Messages whose numbers another program wrote.
 
 use nearl_runtime::link::*;
-use nearl_runtime::rollout_protocol::{self as rollout, Layout, ReplyMessage};
 use nearl_runtime::rt::*;
+use nearl_trainer::rollout_protocol::{self as rollout, Layout, ReplyMessage};
 
 use crate::arm::*;
 use crate::assert_sentence;

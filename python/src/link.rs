@@ -4,7 +4,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use nearl_runtime::link::{LinkError, RobotName};
-use nearl_runtime::rollout_protocol::{self as protocol, Chunk, Constraints, Request, RequestError};
+use nearl_trainer::rollout_protocol::{self as protocol, Chunk, Constraints, Request, RequestError};
 use numpy::{PyArray1, PyArray2, PyArrayMethods};
 use pyo3::exceptions::{PyConnectionError, PyRuntimeError, PyTimeoutError, PyValueError};
 use pyo3::prelude::*;

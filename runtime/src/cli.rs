@@ -218,15 +218,15 @@ impl ReplayCommand {
 }
 
 impl ExplainCommand {
-    /// Prints the explanation.
+    /// Prints the explanation; `further` are codes of the program beside those of this crate.
     ///
     /// # Errors
     /// One sentence for a code that does not exist, with the nearest that does.
-    pub fn run(self) -> Result<(), Failure> {
-        let all = codes::all();
+    pub fn run(self, further: Vec<Explanation>) -> Result<(), Failure> {
+        let all = [codes::all(), further].concat();
         let chosen: Vec<_> = match &self.code {
             None => all,
-            Some(code) => vec![codes::find(code)?],
+            Some(code) => vec![codes::find(&all, code)?],
         };
         if self.json {
             say(serde_json::to_string(&chosen)?);

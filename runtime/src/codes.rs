@@ -4,13 +4,14 @@
 
 mod tables;
 
+pub use nearl_controller::codes;
 pub use nearl_controller::codes::{Explanation, LedgerStatus, SnapshotCode};
 pub use tables::{CheckCode, LinkCode};
 
 use crate::link::Verdict;
 use crate::rt::{Mode, Reason};
 
-/// Every code of every group, in the order of the groups.
+/// Every code of loop, links, snapshots and doctor, in the order of the groups.
 pub fn all() -> Vec<Explanation> {
     [
         Mode::explanations(),
@@ -20,7 +21,6 @@ pub fn all() -> Vec<Explanation> {
         SnapshotCode::explanations(),
         LinkCode::explanations(),
         CheckCode::explanations(),
-        crate::rollout_protocol::Answer::explanations(),
     ]
     .concat()
 }
@@ -33,12 +33,11 @@ pub struct UnknownCode {
     nearest: &'static str,
 }
 
-/// The explanation of `code`.
+/// The explanation of `code` among `all`.
 ///
 /// # Errors
 /// [`UnknownCode`] with the nearest one that exists.
-pub fn find(code: &str) -> Result<Explanation, UnknownCode> {
-    let all = all();
+pub fn find(all: &[Explanation], code: &str) -> Result<Explanation, UnknownCode> {
     if let Some(found) = all.iter().find(|e| e.code == code) {
         return Ok(*found);
     }
@@ -61,14 +60,14 @@ mod tests {
             for text in [e.meaning, e.remedy] {
                 assert!(text.ends_with(['.', '?']) && text.len() > 10, "{}: '{text}'", e.code);
             }
-            assert_eq!(find(e.code).unwrap(), *e);
+            assert_eq!(find(&all, e.code).unwrap(), *e);
         }
         assert!(all.len() > 50);
     }
 
     #[test]
     fn an_unknown_code_names_the_nearest() {
-        let text = find("stale-sate").unwrap_err().to_string();
+        let text = find(&all(), "stale-sate").unwrap_err().to_string();
         assert!(text.contains("'stale-state'"), "{text}");
     }
 }

@@ -1,14 +1,22 @@
 //! Real-time loop, links, flight log and doctor: with the controller of `nearl-controller`, all a robot needs.
 //!
-//! Read [`controller`] first: the one data path is on that page.
+//! Read [`controller`] first: the one data path is on that page. The feature `cli`, on by default, holds the command line: `cli`, `doctor` and
+//! `tunnel`.
 
+#[cfg(feature = "cli")]
 pub mod cli;
+pub mod clock;
 pub mod codes;
+#[cfg(feature = "cli")]
 pub mod doctor;
+mod grid;
 pub mod link;
 pub mod log;
-pub mod rollout_protocol;
+mod percentiles;
 pub mod rt;
+mod stop;
+mod thread;
+#[cfg(feature = "cli")]
 pub mod tunnel;
 
 pub use nearl_controller::constraints;

@@ -12,7 +12,7 @@ use serde_json::json;
 
 use crate::cli::Failure;
 use crate::link::{CROSSING, Crossing, RobotName};
-use crate::rt::Stop;
+use crate::stop::Stop;
 
 /// iceoryx2's tunnel, a program of its own.
 const PROGRAM: &str = "iox2-link-tunnel-zenoh";

@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 use common::*;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{RobotName, remove_files};
-use nearl_runtime::rollout_protocol::*;
 use nearl_runtime::rt::Stop;
 use nearl_trainer::rollout::{Worker, make_env, stream};
+use nearl_trainer::rollout_protocol::*;
 use nearl_trainer::serve::{Report, Settings, serve};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use common::*;
 use nearl_runtime::link::{RobotName, remains, remove_files};
-use nearl_runtime::rollout_protocol::*;
+use nearl_trainer::rollout_protocol::*;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const ROLE: &str = "NEARL_TEST_CLIENT_TO_KILL";

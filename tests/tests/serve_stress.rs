@@ -13,8 +13,8 @@ use std::time::{Duration, Instant};
 use common::*;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{RobotName, remains, remove_files};
-use nearl_runtime::rollout_protocol::*;
 use nearl_trainer::rollout::{Worker, make_env, stream};
+use nearl_trainer::rollout_protocol::*;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 use serde_json::Value;
 

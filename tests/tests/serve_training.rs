@@ -10,9 +10,9 @@ use std::time::Duration;
 
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{RobotName, TrainerLink, Verdict, remove_files};
-use nearl_runtime::rollout_protocol::*;
 use nearl_runtime::rt::Stop;
 use nearl_tests::request;
+use nearl_trainer::rollout_protocol::*;
 use nearl_trainer::serve::{Report, Settings, serve};
 use nearl_trainer::train::{Experience, Training as Run};
 

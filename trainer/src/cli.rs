@@ -83,7 +83,7 @@ impl Cli {
             Command::Run(c) => c.run(),
             Command::Serve(c) => c.run(),
             Command::Replay(c) => c.run(),
-            Command::Explain(c) => c.run(),
+            Command::Explain(c) => c.run(crate::rollout_protocol::Answer::explanations()),
             Command::Doctor(c) => c.run(),
             Command::Tunnel(c) => c.run(),
             Command::Tasks(c) => c.run(),

@@ -19,3 +19,5 @@ pub mod stats;
 pub mod sweep;
 pub mod tasks;
 pub mod train;
+
+pub use nearl_rollout_protocol as rollout_protocol;

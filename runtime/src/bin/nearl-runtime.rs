@@ -37,7 +37,7 @@ fn main() -> ExitCode {
     let result = match Arguments::parse().command {
         Command::Run(command) => command.run(),
         Command::Replay(command) => command.run(),
-        Command::Explain(command) => command.run(),
+        Command::Explain(command) => command.run(Vec::new()),
         Command::Doctor(command) => command.run(),
         Command::Tunnel(command) => command.run(),
         Command::Bench { what } => what.run(),

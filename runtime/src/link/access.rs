@@ -157,7 +157,7 @@ impl Verdict {
 
 impl ReceiptMessage {
     /// The answer to the snapshot with `header`.
-    pub(crate) fn answer(header: &SnapshotHeader, verdict: Verdict, text: &str) -> ReceiptMessage {
+    pub fn answer(header: &SnapshotHeader, verdict: Verdict, text: &str) -> ReceiptMessage {
         let mut receipt = <ReceiptMessage as super::Message>::zeroed();
         (receipt.trainer_epoch, receipt.version) = (header.header.epoch, header.version);
         receipt.set(verdict, text);

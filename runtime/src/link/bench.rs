@@ -6,7 +6,8 @@ use std::time::Duration;
 use serde::Serialize;
 
 use super::*;
-use crate::rt::{Percentiles, clock, percentiles};
+use crate::clock;
+use crate::percentiles::{Percentiles, percentiles};
 
 /// Joints of the robot whose ticks are sent: an arm's.
 const JOINTS: usize = 7;

@@ -24,7 +24,7 @@ use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 
 use super::schema::{Arrays, WORD};
 use super::{Header, LinkError, Message, RobotName, memory};
-use crate::rt::clock;
+use crate::clock;
 
 /// Words between what must not share a cache line, nor the line fetched with it.
 const APART: usize = 128 / WORD;

@@ -11,35 +11,40 @@
 mod access;
 mod bench;
 mod board;
+#[cfg(feature = "cli")]
 mod crossing;
 mod debris;
 mod error;
 mod memory;
 mod messages;
 mod name;
-pub(crate) mod owner;
+mod owner;
 mod plant;
-pub(crate) mod port;
+mod port;
 mod remains;
 mod runner;
 mod runtime;
-pub(crate) mod schema;
-pub(crate) mod service;
+pub mod schema;
+pub mod service;
 mod trainer;
 
 pub use access::Verdict;
 pub use bench::{RoundTrip, bench_round_trip};
+#[cfg(feature = "cli")]
 pub(crate) use crossing::{CROSSING, Crossing};
 pub use error::LinkError;
 pub use memory::remove_files;
+#[cfg(feature = "cli")]
 pub(crate) use memory::{check as check_memory, free as free_memory};
 pub use messages::*;
 pub use name::RobotName;
+pub use owner::Owner;
 pub use plant::{PlantLink, Robot};
-pub use port::{Sequence, SnapshotBytes, SnapshotReader};
+pub use port::{Outbox, Sequence, SnapshotBytes, SnapshotReader};
 pub use remains::{Remains, remains};
 pub use runner::{Pace, Plant, PlantReport, PlantRunner, PlantSettings};
 pub use runtime::RuntimeLink;
 pub use schema::{Header, Message, Queued, hash_names};
+#[cfg(feature = "cli")]
 pub(crate) use service::SHARED_MEMORY;
 pub use trainer::TrainerLink;

@@ -53,7 +53,8 @@ impl RobotName {
         Ok(config)
     }
 
-    pub(crate) fn transport(&self, action: impl Into<String>, reason: impl Into<String>) -> LinkError {
+    /// The error of something the transport refused: `action` is what was tried, `reason` what it said.
+    pub fn transport(&self, action: impl Into<String>, reason: impl Into<String>) -> LinkError {
         LinkError::Transport {
             name: self.clone(),
             action: action.into(),

@@ -13,7 +13,7 @@ use super::{LinkError, RobotName};
 
 /// Holds a role of a robot until it is dropped.
 #[derive(Debug)]
-pub(crate) struct Owner {
+pub struct Owner {
     path: PathBuf,
     _lock: File,
 }

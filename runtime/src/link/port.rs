@@ -7,10 +7,10 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use super::schema::Queued;
 use super::service::Ipc;
 use super::{LinkError, Message, RobotName, SnapshotHeader, memory};
-use crate::rt::clock;
+use crate::clock;
 
 /// Sending end of a topic. One heap allocation per message inside iceoryx2: not for the real-time thread.
-pub(crate) struct Outbox<M: Queued> {
+pub struct Outbox<M: Queued> {
     port: Publisher<Ipc, M, ()>,
     epoch: u64,
     seq: u64,
@@ -22,7 +22,7 @@ impl<M: Queued> Outbox<M> {
     }
 
     /// Numbers, stamps and sends `message`; false if it could not be sent.
-    pub(crate) fn send(&mut self, message: &mut M) -> bool {
+    pub fn send(&mut self, message: &mut M) -> bool {
         self.seq += 1;
         *message.header_mut() =
             super::Header { schema: M::SCHEMA, epoch: self.epoch, seq: self.seq, stamp: clock::now() };

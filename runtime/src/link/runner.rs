@@ -11,7 +11,10 @@
 use serde::Serialize;
 
 use super::{ActionMessage, LinkError, Message, PlantLink, RobotName, StateMessage};
-use crate::rt::{Grid, Percentiles, Stop, clock};
+use crate::clock;
+use crate::grid::Grid;
+use crate::percentiles::{Percentiles, percentiles};
+use crate::stop::Stop;
 
 /// A robot or its simulator.
 pub trait Plant {
@@ -136,7 +139,7 @@ impl PlantRunner {
 
     /// Runs until `stop`, or for the number of ticks of the settings.
     pub fn run(mut self, plant: &mut impl Plant, stop: &Stop) -> PlantReport {
-        crate::rt::thread::be_prompt(self.settings.priority);
+        crate::thread::be_prompt(self.settings.priority);
         let period = clock::nanoseconds(self.settings.dt);
         let mut grid = Grid::new(clock::now() + period, period);
         while !stop.is_requested() && self.settings.ticks.is_none_or(|n| self.report.ticks < n) {
@@ -153,7 +156,7 @@ impl PlantRunner {
             }
         }
         (self.report.overruns, self.report.skipped) = (grid.overruns(), grid.skipped());
-        self.report.round_trip = crate::rt::percentiles(&self.round_trip);
+        self.report.round_trip = percentiles(&self.round_trip);
         self.report
     }
 

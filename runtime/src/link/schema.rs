@@ -10,12 +10,12 @@ const FNV_OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
 const FNV_PRIME: u64 = 0x0000_0100_0000_01b3;
 
 /// Start value of a schema hash (FNV-1a, 64 bits).
-pub(crate) const fn hash_start() -> u64 {
+pub const fn hash_start() -> u64 {
     FNV_OFFSET
 }
 
 /// FNV-1a over `bytes`, continuing from `hash`.
-pub(crate) const fn hash_bytes(mut hash: u64, bytes: &[u8]) -> u64 {
+pub const fn hash_bytes(mut hash: u64, bytes: &[u8]) -> u64 {
     let mut i = 0;
     while i < bytes.len() {
         hash = (hash ^ bytes[i] as u64).wrapping_mul(FNV_PRIME);
@@ -25,12 +25,12 @@ pub(crate) const fn hash_bytes(mut hash: u64, bytes: &[u8]) -> u64 {
 }
 
 /// FNV-1a over the eight bytes of `number`, continuing from `hash`.
-pub(crate) const fn hash_number(hash: u64, number: u64) -> u64 {
+pub const fn hash_number(hash: u64, number: u64) -> u64 {
     hash_bytes(hash, &number.to_le_bytes())
 }
 
 /// One field of a message: name, type and offset go into the hash.
-pub(crate) const fn hash_field(hash: u64, name: &str, type_name: &str, offset: usize) -> u64 {
+pub const fn hash_field(hash: u64, name: &str, type_name: &str, offset: usize) -> u64 {
     hash_number(hash_bytes(hash_bytes(hash, name.as_bytes()), type_name.as_bytes()), offset as u64)
 }
 
@@ -102,10 +102,11 @@ pub(crate) trait Arrays {
 
 /// Declares a message, `message! { Name, "topic", version { field: type, .. } }`, and the queue it travels in if there is one:
 /// `version, buffer, history, subscribers`. Ends that disagree on a message named `beside` another disagree on that one too.
-macro_rules! message {
+#[macro_export]
+macro_rules! link_message {
     ($(#[$meta:meta])* $name:ident, $topic:literal, version $version:literal $(, beside $beside:ident)*, buffer $buffer:literal,
      history $history:literal, subscribers $subscribers:literal { $($fields:tt)* }) => {
-        $crate::link::schema::message! { $(#[$meta])* $name, $topic, version $version $(, beside $beside)* { $($fields)* } }
+        $crate::link_message! { $(#[$meta])* $name, $topic, version $version $(, beside $beside)* { $($fields)* } }
         impl $crate::link::schema::Queued for $name {
             const BUFFER: usize = $buffer;
             const HISTORY: usize = $history;
@@ -144,7 +145,7 @@ macro_rules! message {
         }
     };
 }
-pub(crate) use message;
+pub(crate) use link_message as message;
 
 #[cfg(test)]
 mod tests {

@@ -20,9 +20,10 @@ use super::owner::Owner;
 use super::port::{BytesOutbox, Inbox, Outbox, SnapshotReader};
 use super::schema::{Message, Queued};
 use super::{LinkError, RobotName, SnapshotHeader, debris, memory};
-use crate::rt::clock;
+use crate::clock;
 
-pub(crate) type Ipc = ipc_threadsafe::Service;
+/// How nodes find each other and wait: shared memory of this machine, usable from any thread.
+pub type Ipc = ipc_threadsafe::Service;
 
 /// Waits between attempts at a service that another process may be creating, or died creating [ms].
 const BACK_OFF: [u64; 5] = [20, 60, 180, 540, 1000];
@@ -32,7 +33,7 @@ const PUBLISHERS: usize = 2;
 pub(crate) const SHARED_MEMORY: u64 = 24 << 20;
 
 /// One process's membership in the links of a robot.
-pub(crate) struct Bus {
+pub struct Bus {
     node: Node<Ipc>,
     name: RobotName,
     epoch: u64,
@@ -40,7 +41,10 @@ pub(crate) struct Bus {
 
 impl Bus {
     /// Checks shared memory, joins, and removes what dead processes left.
-    pub(crate) fn join(name: &RobotName) -> Result<Bus, LinkError> {
+    ///
+    /// # Errors
+    /// [`LinkError`] for shared memory that is missing or too small, or what the transport said.
+    pub fn join(name: &RobotName) -> Result<Bus, LinkError> {
         set_log_level_from_env_or(LogLevel::Fatal);
         memory::check(name, SHARED_MEMORY)?;
         let config = name.config()?;
@@ -61,25 +65,31 @@ impl Bus {
     }
 
     /// Removes what dead processes left.
-    pub(crate) fn clean(&self) {
+    pub fn clean(&self) {
         self.node.try_cleanup_dead_nodes();
         debris::sweep(&self.name);
     }
 
-    pub(crate) fn node(&self) -> &Node<Ipc> {
+    /// The node of the transport.
+    pub fn node(&self) -> &Node<Ipc> {
         &self.node
     }
 
-    pub(crate) fn name(&self) -> &RobotName {
+    /// Robot, or server.
+    pub fn name(&self) -> &RobotName {
         &self.name
     }
 
-    pub(crate) fn epoch(&self) -> u64 {
+    /// Start of this process at the links, see [`Header::epoch`](super::Header::epoch).
+    pub fn epoch(&self) -> u64 {
         self.epoch
     }
 
     /// Reserves the memory of all segments opened so far.
-    pub(crate) fn reserve(&self) -> Result<(), LinkError> {
+    ///
+    /// # Errors
+    /// [`LinkError`] where there is too little.
+    pub fn reserve(&self) -> Result<(), LinkError> {
         memory::reserve(&self.name)
     }
 
@@ -94,12 +104,18 @@ impl Bus {
     }
 
     /// Takes a role of the robot; its owner publishes the role's topics.
-    pub(crate) fn own(&self, role: &'static str) -> Result<Owner, LinkError> {
+    ///
+    /// # Errors
+    /// [`LinkError::Taken`].
+    pub fn own(&self, role: &'static str) -> Result<Owner, LinkError> {
         Owner::take(&self.name, role)
     }
 
     /// A publisher of `M`, for the owner of its role.
-    pub(crate) fn outbox<M: Queued>(&self) -> Result<Outbox<M>, LinkError> {
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn outbox<M: Queued>(&self) -> Result<Outbox<M>, LinkError> {
         let service = self.service::<M>()?;
         let port = service
             .publisher_builder()
@@ -143,7 +159,10 @@ impl Bus {
     }
 
     /// A subscriber of snapshots.
-    pub(crate) fn bytes_inbox(&self) -> Result<SnapshotReader, LinkError> {
+    ///
+    /// # Errors
+    /// [`LinkError`].
+    pub fn bytes_inbox(&self) -> Result<SnapshotReader, LinkError> {
         let port = self
             .bytes()?
             .subscriber_builder()
@@ -153,7 +172,10 @@ impl Bus {
     }
 
     /// Opens a service, or creates it. What hangs in its creation until the last attempt was left by a killed process.
-    pub(crate) fn open<T, E>(
+    ///
+    /// # Errors
+    /// What the last attempt said.
+    pub fn open<T, E>(
         &self,
         mut attempt: impl FnMut() -> Result<T, E>,
         is_passing: impl Fn(&E) -> bool,
@@ -168,7 +190,11 @@ impl Bus {
         })
     }
 
-    pub(crate) fn topic(&self, topic: &str) -> Result<ServiceName, LinkError> {
+    /// The name of one of this robot's services.
+    ///
+    /// # Errors
+    /// [`LinkError`] for a name the transport refuses.
+    pub fn topic(&self, topic: &str) -> Result<ServiceName, LinkError> {
         let name = format!("nearl/{}/{topic}", self.name);
         ServiceName::new(&name).map_err(|e| self.name.transport(format!("name `{topic}`"), format!("{e:?}")))
     }

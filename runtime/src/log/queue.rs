@@ -212,7 +212,7 @@ impl Log {
 
     fn attach(&mut self, snapshot: &Waiting) -> Result<(), String> {
         let fail = said;
-        let now = crate::rt::clock::now();
+        let now = crate::clock::now();
         let entry = SnapshotEntry {
             id: snapshot.id,
             version: snapshot.version,
@@ -256,7 +256,7 @@ fn write_all(
     mut snapshots: Consumer<Waiting>,
     shared: &Shared,
 ) -> LogSummary {
-    crate::rt::thread::be_patient();
+    crate::thread::be_patient();
     let mut summary = LogSummary::default();
     loop {
         let is_over = shared.over.load(Ordering::Acquire);

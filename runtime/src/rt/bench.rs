@@ -1,7 +1,10 @@
 //! Wake-up of an empty loop: the floor under every latency reported beside it.
 
-use crate::rt::thread::{ThreadSettings, prepare};
-use crate::rt::{Grid, Percentiles, Stop, clock, percentiles};
+use crate::clock;
+use crate::grid::Grid;
+use crate::percentiles::{Percentiles, percentiles};
+use crate::stop::Stop;
+use crate::thread::{ThreadSettings, prepare};
 
 /// Sleeps through `ticks` slots of `dt` [s] on a thread with `settings`, or until `stop`, and returns how late [ns] it woke, with one
 /// sentence for each thing the operating system refused.

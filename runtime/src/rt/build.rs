@@ -10,8 +10,8 @@ use std::time::Duration;
 use rtrb::{Consumer, Producer, RingBuffer};
 
 use crate::link::{RobotMessage, SnapshotBytes, SnapshotHeader, Verdict};
-use crate::rt::thread;
 use crate::rt::tick::{Build, Refusal};
+use crate::thread;
 
 /// A finished job.
 pub(crate) struct Built<T> {

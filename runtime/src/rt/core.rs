@@ -11,11 +11,12 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use serde::{Deserialize, Serialize};
 
 use crate::codes::LedgerStatus;
+use crate::grid::Grid;
 use crate::link::{Message, StateMessage};
+use crate::rt::Sync;
 use crate::rt::faults::FaultPlan;
 use crate::rt::mode::{Event, Mode, ModeLimits, Modes, Reason};
 use crate::rt::tick::{Outcome, Record, Sensed, Step, Tick};
-use crate::rt::{Grid, Sync};
 
 /// Settings of a tick; times in [ns].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -12,15 +12,15 @@ use std::sync::Arc;
 use hdrhistogram::Histogram;
 use rtrb::{Consumer, Producer};
 
+use crate::clock::{self, Bell};
 use crate::link::{ActionMessage, Message, StateMessage};
-use crate::rt::Stop;
-use crate::rt::clock::{self, Bell};
 use crate::rt::core::{Core, CoreSettings, Inputs, Loaded};
 use crate::rt::faults::FaultPlan;
 use crate::rt::mode::Mode;
 use crate::rt::swap::Slot;
-use crate::rt::thread::{CountAllocations, Usage};
 use crate::rt::tick::{Record, Sensed, Tick};
+use crate::stop::Stop;
+use crate::thread::{CountAllocations, Usage};
 
 /// Ticks after which page faults and context switches of the thread are counted.
 const WARM: u64 = 300;

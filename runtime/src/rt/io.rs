@@ -9,13 +9,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use hdrhistogram::Histogram;
 use rtrb::{Consumer, Producer};
 
+use crate::clock::{self, Bell};
 use crate::link::{
     ActionMessage, HealthMessage, Message, RobotMessage, RuntimeLink, StateMessage, TransitionMessage,
 };
 use crate::log::LogQueue;
-use crate::rt::clock::{self, Bell};
+use crate::percentiles::percentiles;
 use crate::rt::inbox::{Desk, SnapshotInbox};
-use crate::rt::report::percentiles;
 use crate::rt::tick::{Build, Record, Sensed};
 
 /// Before a state is due, this thread is awake so much earlier [ns].
@@ -67,7 +67,7 @@ impl<B: Build> Io<B> {
     /// Runs until `over` is set and nothing is left to move; returns itself for the report.
     pub(crate) fn run(mut self, over: &AtomicBool) -> Io<B> {
         // Who polls without a pause would take a core for itself at a real-time priority.
-        crate::rt::thread::be_prompt(self.priority.filter(|_| !self.polls_always));
+        crate::thread::be_prompt(self.priority.filter(|_| !self.polls_always));
         loop {
             let is_over = over.load(Ordering::Acquire);
             let moved = self.move_states() | self.move_actions() | self.move_records();

@@ -8,7 +8,7 @@ use std::time::Duration;
 use rtrb::{Consumer, Producer, PushError, RingBuffer};
 
 use crate::link::{SnapshotBytes, SnapshotReader};
-use crate::rt::thread;
+use crate::thread;
 
 /// Snapshots that wait to be collected; of those beyond, the transport keeps the newest.
 const WAITING: usize = 2;

@@ -3,51 +3,15 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use hdrhistogram::Histogram;
 use serde::Serialize;
 
+use crate::percentiles::Percentiles;
 use crate::rt::tick::Counters;
-use crate::rt::{Mode, Reason, Sync, Usage};
-
-/// Percentiles of a time [ns].
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct Percentiles {
-    /// Number of samples.
-    pub count: u64,
-    /// Median.
-    pub p50: u64,
-    /// 99 of 100 are below.
-    pub p99: u64,
-    /// 999 of 1000 are below.
-    pub p999: u64,
-    /// Largest.
-    pub max: u64,
-}
+use crate::rt::{Mode, Reason, Sync};
+use crate::thread::Usage;
 
 /// Versions a printed report shows, the last ones; `--json` has all.
 const VERSIONS_SHOWN: usize = 12;
-
-impl fmt::Display for Percentiles {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let us = |ns: u64| ns as f64 * 1e-3;
-        let (p50, p99, p999, max) = (us(self.p50), us(self.p99), us(self.p999), us(self.max));
-        write!(
-            f,
-            "p50 {p50:>8.1}  p99 {p99:>8.1}  p99.9 {p999:>8.1}  max {max:>9.1} us  ({} samples)",
-            self.count
-        )
-    }
-}
-
-pub(crate) fn percentiles(histogram: &Histogram<u64>) -> Percentiles {
-    Percentiles {
-        count: histogram.len(),
-        p50: histogram.value_at_quantile(0.5),
-        p99: histogram.value_at_quantile(0.99),
-        p999: histogram.value_at_quantile(0.999),
-        max: histogram.max(),
-    }
-}
 
 /// What the plant said about itself in its last state.
 #[derive(Clone, Debug, Default, Serialize)]

@@ -9,10 +9,11 @@ use std::time::Duration;
 
 use rtrb::RingBuffer;
 
+use crate::clock::{self, Bell};
 use crate::link::{LinkError, METERS, RobotMessage, RobotName, RuntimeLink, StateMessage};
 use crate::log::{LogError, LogQueue, LogSummary};
+use crate::percentiles::percentiles;
 use crate::rt::build::Builder;
-use crate::rt::clock::{self, Bell};
 use crate::rt::core::{CoreSettings, Loaded};
 use crate::rt::cycle::{Cycle, CycleEnd, CycleSettings, Ends, Sync};
 use crate::rt::faults::FaultPlan;
@@ -21,12 +22,13 @@ use crate::rt::io::{Health, Io, Traffic};
 use crate::rt::mode::ModeLimits;
 use crate::rt::pilot::{Pilot, PilotBuilder};
 use crate::rt::receive::SnapshotReceiver;
-use crate::rt::report::{PlantSummary, RunReport, percentiles};
+use crate::rt::report::{PlantSummary, RunReport};
 use crate::rt::residual::RollbackSettings;
-use crate::rt::thread::{CountAllocations, ThreadSettings, prepare};
 use crate::rt::tick::{Build, Tick};
-use crate::rt::{Mode, Reason, Stop, swap};
+use crate::rt::{Mode, Reason, swap};
 use crate::snapshot::{Snapshot, SnapshotError, in_run};
+use crate::stop::Stop;
+use crate::thread::{CountAllocations, ThreadSettings, prepare};
 
 /// Records between loop and I/O thread.
 const RECORDS: usize = 256;

@@ -2,7 +2,7 @@
 
 use super::{Collected, Segment, Tally};
 use crate::stats::RunningStats;
-use nearl_runtime::rollout_protocol::Layout;
+use nearl_rollout_protocol::Layout;
 
 impl Collected {
     /// Appends everything to `numbers`: each list by its length and its entries, narrow ones in pairs.

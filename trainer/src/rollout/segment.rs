@@ -1,9 +1,9 @@
 //! What collecting leaves behind: rows for the learner, counts for the metrics.
 
 use crate::stats::RunningStats;
+use nearl_rollout_protocol::LEDGER;
 use nearl_runtime::Output;
 use nearl_runtime::constraints::Ledger;
-use nearl_runtime::rollout_protocol::LEDGER;
 
 /// What one environment collected: `n_steps` policy steps, row by row.
 #[derive(Clone, Debug, Default)]

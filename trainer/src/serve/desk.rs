@@ -8,11 +8,11 @@ use super::training::Session;
 use super::turns::Turns;
 use super::{Report, ServeError, Settings};
 use crate::rollout::Worker;
-use nearl_runtime::Snapshot;
-use nearl_runtime::link::{SnapshotBytes, Verdict};
-use nearl_runtime::rollout_protocol::{
+use nearl_rollout_protocol::{
     Answer, Caller, Constraints, Layout, MAX_CHUNK, ReplyMessage, Request, constraint_set, decode,
 };
+use nearl_runtime::Snapshot;
+use nearl_runtime::link::{SnapshotBytes, Verdict};
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
 

@@ -3,9 +3,7 @@
 use super::pool::{Start, Task, Work};
 use super::training::Session;
 use crate::rollout::Worker;
-use nearl_runtime::rollout_protocol::{
-    Answer, Caller, Constraints, Delivery, MAX_CHUNK, ReplyMessage, Request,
-};
+use nearl_rollout_protocol::{Answer, Caller, Constraints, Delivery, MAX_CHUNK, ReplyMessage, Request};
 use std::collections::VecDeque;
 use std::ops::Range;
 use std::rc::Rc;

@@ -14,9 +14,9 @@ mod training;
 mod turns;
 
 use crate::rollout::RolloutError;
+use nearl_rollout_protocol::{MAX_CHUNK, RolloutServer};
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{LinkError, RobotName};
-use nearl_runtime::rollout_protocol::{MAX_CHUNK, RolloutServer};
 use nearl_runtime::rt::Stop;
 use serde::Serialize;
 use std::time::{Duration, Instant};

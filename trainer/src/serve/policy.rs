@@ -1,8 +1,8 @@
 //! The policies a server acts by: its own, and for those who learn the one that was pushed last.
 
+use nearl_rollout_protocol::Request;
 use nearl_runtime::link::{SnapshotBytes, Verdict};
 use nearl_runtime::net::Dense;
-use nearl_runtime::rollout_protocol::Request;
 use nearl_runtime::{Controller, Manifest, Networks, Snapshot, SnapshotError};
 use serde_json::Value;
 use std::sync::Arc;

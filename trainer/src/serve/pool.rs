@@ -2,8 +2,8 @@
 
 use crate::env::Env;
 use crate::rollout::{RolloutError, Worker, make_env, stream};
+use nearl_rollout_protocol::Layout;
 use nearl_runtime::Snapshot;
-use nearl_runtime::rollout_protocol::Layout;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};

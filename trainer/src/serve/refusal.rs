@@ -1,6 +1,6 @@
 //! An answer that ends a request at once, kept until its client has room for it.
 
-use nearl_runtime::rollout_protocol::{Answer, Caller, Delivery};
+use nearl_rollout_protocol::{Answer, Caller, Delivery};
 use std::time::{Duration, Instant};
 
 pub(super) struct Refusal {

@@ -2,8 +2,8 @@
 
 use super::pool::{Start, Task, Work};
 use crate::rollout::Worker;
+use nearl_rollout_protocol::{Constraints, Request, Training};
 use nearl_runtime::Snapshot;
-use nearl_runtime::rollout_protocol::{Constraints, Request, Training};
 use std::sync::Arc;
 
 /// The environments of one client.

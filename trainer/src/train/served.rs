@@ -7,11 +7,9 @@ use super::source::{Source, SourceError};
 use crate::checkpoint::Checkpoint;
 use crate::rollout::Collected;
 use crate::settings::TrainSettings;
+use nearl_rollout_protocol::{Answer, Constraints, Layout, Request, RequestError, RolloutClient, Training};
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{LinkError, RobotName, TrainerLink, Verdict};
-use nearl_runtime::rollout_protocol::{
-    Answer, Constraints, Layout, Request, RequestError, RolloutClient, Training,
-};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};

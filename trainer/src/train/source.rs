@@ -5,9 +5,9 @@ use crate::checkpoint::Checkpoint;
 use crate::online::{LoopSource, OnlineError};
 use crate::rollout::{Collected, Collector, RolloutError};
 use crate::settings::TrainSettings;
+use nearl_rollout_protocol::Layout;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::RobotName;
-use nearl_runtime::rollout_protocol::Layout;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 

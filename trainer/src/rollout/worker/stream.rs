@@ -3,7 +3,7 @@
 use super::Worker;
 use crate::env::EnvError;
 use crate::rollout::Tally;
-use nearl_runtime::rollout_protocol::Layout;
+use nearl_rollout_protocol::Layout;
 use rand_chacha::ChaCha8Rng;
 
 impl Worker {

@@ -13,14 +13,12 @@ use iceoryx2::service::port_factory::server::ServerCreateError;
 use super::departed::{Active, Departed};
 use super::messages::{Answer, Envelope, MAX_CHUNK, ReplyMessage};
 use super::service;
-use crate::link::owner::Owner;
-use crate::link::port::Outbox;
-use crate::link::service::{Bus, Ipc};
-use crate::link::{
-    Header, LinkError, Message, ReceiptMessage, RobotName, SnapshotBytes, SnapshotHeader, SnapshotReader,
-    Verdict,
+use nearl_runtime::clock;
+use nearl_runtime::link::service::{Bus, Ipc};
+use nearl_runtime::link::{
+    Header, LinkError, Message, Outbox, Owner, ReceiptMessage, RobotName, SnapshotBytes, SnapshotHeader,
+    SnapshotReader, Verdict,
 };
-use crate::rt::clock;
 
 /// The only server of a name. It also takes the snapshots that a trainer pushes to the name.
 pub struct RolloutServer {

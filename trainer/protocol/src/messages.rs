@@ -1,7 +1,7 @@
 //! Request, reply and what a reply can say.
 
-use crate::link::schema::message;
-use nearl_controller::codes;
+use nearl_runtime::codes::codes;
+use nearl_runtime::link_message as message;
 
 /// Numbers in one chunk at most.
 pub const MAX_CHUNK: usize = 4096;
@@ -154,6 +154,6 @@ impl ReplyMessage {
 
 impl Default for ReplyMessage {
     fn default() -> ReplyMessage {
-        <ReplyMessage as crate::link::Message>::zeroed()
+        <ReplyMessage as nearl_runtime::link::Message>::zeroed()
     }
 }

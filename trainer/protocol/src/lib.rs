@@ -1,4 +1,5 @@
-//! Constrained rollouts for other processes on this machine: what a client asks, what the server answers.
+//! Constrained rollouts for other processes on this machine: what a client asks, what the server answers. A client needs neither MuJoCo nor
+//! the trainer.
 //!
 //! One request-response service of iceoryx2 per server name. A request is the bytes of one [`RequestMessage`]; they are
 //! checked by [`decode`], so anything may arrive. The answers are [`Answer::Accepted`] or a refusal, then numbered

@@ -7,8 +7,8 @@ use iceoryx2::service::builder::request_response::{
 use iceoryx2::service::port_factory::request_response::PortFactory;
 
 use super::messages::{Envelope, ReplyMessage};
-use crate::link::LinkError;
-use crate::link::service::{Bus, Ipc};
+use nearl_runtime::link::LinkError;
+use nearl_runtime::link::service::{Bus, Ipc};
 
 /// Clients at once, over all processes.
 const CLIENTS: usize = 24;

@@ -1,8 +1,8 @@
 //! A request as a client means it, and as it arrives.
 
 use super::messages::{OWN, RequestMessage};
-use crate::Manifest;
-use crate::link::{Header, Message, hash_names};
+use nearl_runtime::Manifest;
+use nearl_runtime::link::{Header, Message, hash_names};
 
 /// Which constraints a rollout is projected onto.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -167,7 +167,7 @@ mod tests {
     use super::*;
 
     fn bytes(message: &RequestMessage) -> Vec<u8> {
-        super::super::client::bytes_of(message).to_vec()
+        crate::client::bytes_of(message).to_vec()
     }
 
     const TRAINING: Training =

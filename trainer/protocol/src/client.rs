@@ -12,9 +12,9 @@ use iceoryx2::service::port_factory::client::ClientCreateError;
 use super::messages::{Answer, Envelope, MAX_REQUEST, ReplyMessage, RequestMessage};
 use super::service::{self, Factory};
 use super::{Layout, Request, RequestError};
-use crate::link::service::{Bus, Ipc};
-use crate::link::{Header, LinkError, Message, RobotName};
-use crate::rt::clock;
+use nearl_runtime::clock;
+use nearl_runtime::link::service::{Bus, Ipc};
+use nearl_runtime::link::{Header, LinkError, Message, RobotName};
 
 /// Waits between two looks at an empty buffer: they double from the first to the longest, far below the time the server needs
 /// to fill a buffer.

@@ -1,7 +1,7 @@
 //! What can go wrong for a client: one sentence each, with the next step.
 
 use super::Answer;
-use crate::link::{LinkError, RobotName};
+use nearl_runtime::link::{LinkError, RobotName};
 
 /// Failure of a rollout client's call.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

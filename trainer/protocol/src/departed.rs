@@ -14,7 +14,7 @@ use iceoryx2::service::port_factory::PortFactory;
 
 use super::messages::{Envelope, ReplyMessage};
 use super::service::Factory;
-use crate::link::service::Ipc;
+use nearl_runtime::link::service::Ipc;
 
 pub(super) type Active = ActiveRequest<Ipc, Envelope, (), [f64], ReplyMessage>;
 
