@@ -51,6 +51,7 @@ mod certify;
 pub mod checker;
 pub mod convention;
 pub mod description;
+pub mod drive;
 mod dynamics;
 mod error;
 pub mod geometry;
@@ -60,6 +61,7 @@ pub mod ledger;
 pub mod limit;
 mod mjcf;
 mod model;
+mod period_dynamics;
 mod pinocchio;
 mod projector;
 pub mod row;
@@ -69,20 +71,22 @@ pub mod viability;
 
 pub use certify::{Certificate, certify_braking};
 pub use description::RobotDescription;
+pub use drive::Drive;
 pub use dynamics::Dynamics;
 pub use error::{LimitError, ModelError};
 pub use kinematics::{FrameMotion, Kinematics, PointMotion};
 pub use layout::{Entry, LayoutError, StateLayout};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};
 pub use limit::{
-    AccelerationLimit, CollisionLimit, ConstraintSettings, EnergyLimit, FrameLimit, FrameSpeedLimit,
-    JerkLimit, Limit, LimitSet, LockedJoints, PerJoint, PositionLimit, TorqueLimit, TorqueRateLimit,
-    TorqueSpeedLimit, UserRow, VelocityLimit, VelocityProfileLimit, build_limits,
+    AccelerationLimit, CollisionLimit, ConstraintSettings, DriveTorqueLimit, EnergyLimit, FrameLimit,
+    FrameSpeedLimit, JerkLimit, Limit, LimitSet, LockedJoints, PerJoint, PositionLimit, TorqueLimit,
+    TorqueRateLimit, TorqueSpeedLimit, UserRow, VelocityLimit, VelocityProfileLimit, build_limits,
 };
 pub use model::{FrameId, Joint, Model};
+pub use period_dynamics::PeriodDynamics;
 #[doc(hidden)]
 pub use projector::{LoneStages, Numbers};
 pub use projector::{Problem, ProblemCone, Projector};
 pub use row::{Cone, Rows, Soft};
-pub use target::{Bounds, Braking, Consistency, Proposal, Settings, Solver, Target};
+pub use target::{Bounds, Braking, Consistency, Guard, Proposal, Settings, Solver, Target};
 pub use viability::{Kind, Period};

@@ -86,6 +86,60 @@ pub enum Solver {
     Clarabel,
 }
 
+/// Whether actions that were not made from a projected state are checked before they are sent, and by what.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "GuardWord", into = "GuardWord")]
+pub enum Guard {
+    /// `false`: the action of a policy, or of a learned inverse model, goes to the actuators as it is.
+    #[default]
+    Off,
+    /// `"simulator"`: where a simulator is at hand (training, evaluation, `nearl plant`) it is asked where the action leads, contacts included.
+    Simulator,
+    /// `true`: the state that the robot model says it leads to is projected, and the action of the projected state is sent.
+    Model,
+}
+
+/// How a task file writes a [`Guard`].
+#[derive(Serialize, Deserialize)]
+#[serde(untagged, expecting = "expected true, false or \"simulator\"")]
+enum GuardWord {
+    Plain(bool),
+    Named(GuardName),
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum GuardName {
+    Simulator,
+}
+
+impl From<GuardWord> for Guard {
+    fn from(word: GuardWord) -> Guard {
+        match word {
+            GuardWord::Plain(false) => Guard::Off,
+            GuardWord::Plain(true) => Guard::Model,
+            GuardWord::Named(GuardName::Simulator) => Guard::Simulator,
+        }
+    }
+}
+
+impl From<Guard> for GuardWord {
+    fn from(guard: Guard) -> GuardWord {
+        match guard {
+            Guard::Off => GuardWord::Plain(false),
+            Guard::Model => GuardWord::Plain(true),
+            Guard::Simulator => GuardWord::Named(GuardName::Simulator),
+        }
+    }
+}
+
+impl Guard {
+    /// Nothing is checked.
+    pub fn is_off(&self) -> bool {
+        *self == Guard::Off
+    }
+}
+
 /// Settings of a projector.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {

@@ -136,13 +136,18 @@ impl Period {
         0.5 * (self.dt - self.tau)
     }
 
+    /// How far an acceleration `a` has moved the configuration at which the plant evaluates its forces, on average:
+    /// `(T^2 - tau^2) / 6 a` [s²].
+    pub fn sag(&self) -> f64 {
+        (self.dt * self.dt - self.tau * self.tau) / 6.0
+    }
+
     /// What the damper and the spring of dof `i` add to the mass matrix's diagonal when the acceleration is constant over the period:
     /// `kappa T D + (T^2 - tau^2) / 6 K`, for they meet the velocity `v + kappa T a` and the configuration
     /// `q + (T - tau) / 2 v + (T^2 - tau^2) / 6 a` on average. With one sub-step it is `T D`: MuJoCo's Euler step, which is implicit in the
     /// damping.
     pub fn resistance(&self, model: &Model, i: usize) -> f64 {
-        let (t, tau) = (self.dt, self.tau);
-        self.kappa * t * model.damping()[i] + (t * t - tau * tau) / 6.0 * model.stiffness()[i]
+        self.kappa * self.dt * model.damping()[i] + self.sag() * model.stiffness()[i]
     }
 }
 

@@ -50,6 +50,43 @@ fn random_weights_swapped_in_motion_break_no_limit_and_the_stop_ends_at_rest() {
     assert!(*plant.speeds.last().unwrap() < 1e-2, "it stops by its own torques");
 }
 
+/// What a UR or KUKA controller is sent: positions, which are those of the projected state.
+#[test]
+fn position_commands_lead_within_the_limits_and_are_refused_by_a_robot_that_takes_torques() {
+    let name = Name::new("panda-positions");
+    let positions = |version| {
+        snapshot(version, |m| {
+            m.task.command = toml::from_str("interface = \"position\"").unwrap();
+            m.action_lower.fill(-10.0); // beyond every joint's range: what is sent is bounded by the limits
+            m.action_upper.fill(10.0);
+        })
+    };
+    let first = positions(1);
+    let file = File::new("panda-positions", &first);
+    let plant = start_panda(&name, &first, Panda { follows_positions: true, ..Panda::new() });
+    let stop = Stop::new();
+    let running = execute(&name, &file.0, &stop);
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    trainer.wait_for_runtime(Duration::from_secs(20)).unwrap();
+    while trainer.state().is_none_or(|s| s.tick < 3000) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let torques = snapshot(2, |m| (m.action_lower, m.action_upper) = (vec![-10.0; N], vec![10.0; N]));
+    trainer.push(2, &torques.to_bytes()).unwrap();
+    let receipt = trainer.wait_for_receipt(2, Duration::from_secs(20)).unwrap();
+    assert_ne!(receipt.verdict(), Verdict::Accepted, "{}", receipt.text());
+    stop.request();
+    let report = running.join().unwrap().unwrap();
+    let (plant, counted) = plant.end();
+    assert!(report.counters.raw_violations > 500, "the raw policy must break limits: {:?}", report.counters);
+    assert_eq!((report.counters.projected_violations, counted.late), (0, 0));
+    assert!(plant.worst[..2].iter().all(|excess| *excess <= 1e-9), "position, velocity: {:?}", plant.worst);
+    assert!(plant.accelerated <= 10.0 + 1e-5, "acceleration: {} rad/s^2", plant.accelerated);
+    let fastest = plant.speeds.iter().copied().fold(0.0, f64::max);
+    assert!(fastest > 0.5, "the arm must move for this to mean anything: {fastest} rad/s");
+    assert!(*plant.speeds.last().unwrap() < 1e-2, "it stops by the positions it is sent");
+}
+
 #[test]
 fn foreign_and_damaged_snapshots_are_refused_by_reason_while_the_loop_runs() {
     let name = Name::new("panda-foreign");

@@ -122,6 +122,11 @@ pub trait Env: Send {
     /// When `action` has not [`Spec::n_act`] entries.
     fn step(&mut self, action: &[f64]) -> Step;
 
+    /// Simulates a control period under `action` (n_act) beside the environment, which stays as it is, and writes the state it ends in: `qpos` (nq)
+    /// and `qvel` (nv) in MuJoCo's convention. A [`Env::step`] with the same bits that follows takes this one over. False when the physics
+    /// cannot be believed, and nothing is written.
+    fn foresee(&mut self, action: &[f64], qpos: &mut [f64], qvel: &mut [f64]) -> bool;
+
     /// What a control period would have given that led from `from` to `to` under `action` (n_act): the task's own judgement
     /// of what happened elsewhere, on a robot or in another process. The environment is left in `to`, with its goal. Rewards of
     /// contact forces are those of `to` at rest in its contacts, as far as MuJoCo can tell from the state alone.

@@ -36,6 +36,10 @@ pub struct Evaluation {
     pub target_violations: u64,
     /// Ticks whose state, as the simulator has it afterwards, broke a position or velocity limit.
     pub reached_violations: u64,
+    /// Ticks whose action the simulator's guard replaced by one that stays inside.
+    pub replaced: u64,
+    /// Ticks for which it found none.
+    pub unavoided: u64,
     /// Furthest that the simulator came beyond a position and a velocity limit; only what was broken.
     pub worst: Vec<Worst>,
     /// Control periods that could not be simulated: each ended its episode with the reward 0.
@@ -79,6 +83,8 @@ pub fn evaluate(
         recovering: 0,
         target_violations: 0,
         reached_violations: 0,
+        replaced: 0,
+        unavoided: 0,
         worst: Vec::new(),
         faults: 0,
         residual: 0.0,
@@ -97,6 +103,7 @@ pub fn evaluate(
         e.faults += t.faults;
         e.residual += t.residual;
     }
+    [e.replaced, e.unavoided] = worker.foreseen;
     e.residual /= e.ticks.max(1) as f64;
     let named = ["position", "velocity"].into_iter().zip(worker.excess);
     let joint = |dof| worker.controller.model().dof_name(dof);

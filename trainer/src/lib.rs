@@ -7,6 +7,7 @@ pub mod checkpoint;
 pub mod cli;
 pub mod env;
 pub mod evaluate;
+pub mod foresight;
 pub mod learn;
 pub mod mj;
 pub mod online;

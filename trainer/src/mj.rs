@@ -228,6 +228,20 @@ impl Model {
             .collect()
     }
 
+    /// What actuator `id` gives for its control, the position and the velocity of its joint: `gain u + by_q q + by_v v`; none where it is
+    /// another kind, has dynamics or a delay.
+    pub fn gains(&self, id: usize) -> Option<[f64; 3]> {
+        let (gain, bias) = (self.0.actuator_gainprm().get(id)?, &self.0.actuator_biasprm()[id]);
+        let linear = self.0.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED
+            && self.0.actuator_dyntype()[id] == MjtDyn::mjDYN_NONE
+            && self.0.actuator_delay()[id] == 0.0;
+        match self.0.actuator_biastype()[id] {
+            MjtBias::mjBIAS_NONE if linear => Some([gain[0], 0.0, 0.0]),
+            MjtBias::mjBIAS_AFFINE if linear && bias[0] == 0.0 => Some([gain[0], bias[1], bias[2]]),
+            _ => None,
+        }
+    }
+
     fn is_plain(&self, id: usize) -> bool {
         self.0.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED
             && self.0.actuator_gainprm()[id][0] == 1.0

@@ -1,8 +1,9 @@
 //! MuJoCo as the robot behind a link: `nearl plant`.
 
 use crate::env::{Env, EnvError, Limits, Meter};
+use crate::foresight::Foresight;
 use crate::rollout::stream;
-use nearl_runtime::constraints::{LimitSet, Model};
+use nearl_runtime::constraints::{Guard, LimitSet, Model};
 use nearl_runtime::controller::Parts;
 use nearl_runtime::link::{
     ActionMessage, Plant, Robot, STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, StateMessage,
@@ -22,6 +23,8 @@ pub struct MujocoPlant {
     env: Box<dyn Env>,
     rng: ChaCha8Rng,
     meter: Meter,
+    /// Asks the simulator where an action leads, if the task says so.
+    foresight: Option<Foresight>,
     drive: Option<Brake>,
     robot: Robot,
     action: Vec<f64>,
@@ -89,8 +92,11 @@ impl MujocoPlant {
         let mut rng = stream(seed, 0);
         env.reset(&mut rng)?;
         let (n_act, nq, nv) = (env.spec().n_act(), env.spec().nq, env.spec().nv);
+        let limits = watched_limits(env.as_ref(), &model, projector.limits());
+        let asks = manifest.task.constraints.guard == Guard::Simulator;
         Ok(Self {
-            meter: Meter::new(watched_limits(env.as_ref(), &model, projector.limits()), TOLERANCE)?,
+            foresight: asks.then(|| Foresight::new(env.as_ref(), &limits)),
+            meter: Meter::new(limits, TOLERANCE)?,
             drive: Brake::new(manifest)?,
             robot: describe(manifest, false)?,
             env,
@@ -124,6 +130,9 @@ impl MujocoPlant {
             return;
         }
         self.episode.bits = 0;
+        if let Some(foresight) = &mut self.foresight {
+            foresight.update(self.env.as_mut(), &mut self.action);
+        }
         let step = self.env.step(&self.action);
         let e = &mut self.episode;
         (e.tick, e.reward, e.total) = (e.tick + 1, step.reward, e.total + step.reward);

@@ -6,6 +6,7 @@
 mod acceleration;
 mod clearance;
 mod collision;
+mod drive;
 mod energy;
 mod frame;
 mod frame_speed;
@@ -24,6 +25,7 @@ mod velocity_profile;
 
 pub use acceleration::{AccelerationLimit, AccelerationSettings};
 pub use collision::{CollisionLimit, CollisionSettings, SolidSettings};
+pub use drive::DriveTorqueLimit;
 pub use energy::{EnergyLimit, EnergySettings};
 pub use frame::{FrameBox, FrameLimit, FrameSettings, HalfSpace};
 pub use frame_speed::{FrameSpeedLimit, FrameSpeedSettings};

@@ -5,7 +5,7 @@ use super::{
     PositionSettings, TorqueRateSettings, TorqueSettings, TorqueSpeedSettings, UserRowSettings,
     VelocityProfileSettings, VelocitySettings,
 };
-use crate::{Braking, Consistency, LimitError, Model, Solver};
+use crate::{Braking, Consistency, Guard, LimitError, Model, Solver};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -19,6 +19,9 @@ pub struct ConstraintSettings {
     pub solver: Solver,
     /// `"certified"` (default) or `"stored"`.
     pub braking: Braking,
+    /// `true`: actions of a policy and of a learned inverse model lead to a projected state too.
+    #[serde(skip_serializing_if = "Guard::is_off")]
+    pub guard: Guard,
     /// `position = { margin = 0.01 }`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub position: Option<PositionSettings>,

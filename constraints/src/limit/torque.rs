@@ -70,7 +70,11 @@ impl Limit for TorqueLimit {
 
 impl TorqueLimit {
     /// Dofs and their largest forces.
-    fn efforts(&self, model: &Model, controllable: &[usize]) -> Result<Vec<(usize, f64)>, LimitError> {
+    pub(super) fn efforts(
+        &self,
+        model: &Model,
+        controllable: &[usize],
+    ) -> Result<Vec<(usize, f64)>, LimitError> {
         let scale = self.settings.scale;
         if !(scale > 0.0 && scale <= 1.0) {
             let domain = "above 0 and at most 1";

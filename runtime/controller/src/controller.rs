@@ -4,9 +4,13 @@
 //! state -> propose -> project -> inverse dynamics -> action
 //! ```
 //!
+//! An action that comes out of a network takes the same way once more where the task asks for it (`[constraints] guard = true`): it proposes the
+//! state that it leads to.
+//!
 //! Training, evaluation, the real-time loop and replay all call [`Controller::update`]. Noise is an
 //! input: zero on the robot. Nothing is allocated after [`Controller::new`] but Clarabel's one block.
 
+mod guard;
 mod maths;
 mod noise;
 mod parts;
@@ -18,9 +22,10 @@ use crate::net::{Activation, Forward, Function};
 use crate::normaliser::Normaliser;
 use crate::snapshot::{Networks, PolicyKind, Snapshot, SnapshotError};
 use crate::task::IdmKind;
+use guard::Guard;
 use maths::{hermite, sample};
 use nearl_constraints::{
-    Entry, LimitSet, Model, Projector, Proposal, RefuseReason, StateLayout, Status, Target,
+    Bounds, Entry, LimitSet, Model, Projector, Proposal, RefuseReason, StateLayout, Status, Target,
 };
 use parts::{check_sizes, halves, idx_q};
 use std::time::Instant;
@@ -124,6 +129,7 @@ pub struct Controller {
     action_log_std: Vec<f32>,
     projector: Projector,
     inverse: Inverse,
+    guard: Option<Guard>,
     action_range: Vec<(f64, f64)>,
     dt: f64,
     policy_every: usize,
@@ -154,7 +160,8 @@ impl Controller {
         let (inverse, action_log_std) = match (kind, m.task.idm.kind, &n.idm) {
             (PolicyKind::Direct, ..) => (Inverse::Direct, n.policy_log_std.clone()),
             (_, IdmKind::Pinocchio, _) => {
-                let idm = AnalyticIdm::new(&model, layout.controllable(), m.task.period());
+                let drives = Parts::drives(m, &model, layout.controllable())?;
+                let idm = AnalyticIdm::new(&model, layout.controllable(), &drives, m.task.period());
                 (Inverse::Analytic(idm), vec![0.0; n_act])
             }
             (_, IdmKind::Learned, Some((net, log_std))) => {
@@ -166,6 +173,7 @@ impl Controller {
                 return Err(SnapshotError::MissingTensor { name: "idm.0.weight".into() });
             }
         };
+        let guard = if m.guards() { Some(Guard::new(m, &model, &layout)?) } else { None };
         let zero = |n| vec![0.0; n];
         let rest = State { q: model.neutral(), v: zero(model.nv()), obs: zero(layout.n_obs()) };
         let proposal = Proposal { q: model.neutral(), v: zero(model.nv()) };
@@ -179,6 +187,7 @@ impl Controller {
             action_log_std,
             projector,
             inverse,
+            guard,
             action_range: m.action_lower.iter().copied().zip(m.action_upper.iter().copied()).collect(),
             dt: m.task.time.dt,
             policy_every: m.task.time.policy_every,
@@ -215,6 +224,7 @@ impl Controller {
         self.propose(noise, out);
         self.project(out);
         self.invert(noise, out);
+        self.guard(out);
         self.tick += 1;
         out.duration_ns = begin.elapsed().as_nanos() as u64;
         if held {
@@ -291,6 +301,9 @@ impl Controller {
             out.next.ledger.status = Status::Unchanged;
             return;
         }
+        if self.guard.is_some() {
+            self.projector.forget(); // the guard remembers the tick before: it has the last word
+        }
         self.interpolate();
         self.projector.project(&self.held.q, &self.held.v, &self.proposal, &mut out.next);
         if !self.projection {
@@ -299,10 +312,15 @@ impl Controller {
         if self.projector.needs_previous() {
             self.projector.remember(&out.next);
         }
+        let bounds = self.projector.bounds();
+        self.report(bounds, out);
+    }
+
+    /// Writes the target, and what the projection lets through, entry by entry.
+    fn report(&self, bounds: &Bounds, out: &mut Output) {
         for k in 0..self.layout.n_state() {
             let s = self.held.obs[self.layout.state()[k]];
             let scale = self.normaliser.scale[k];
-            let bounds = self.projector.bounds();
             let (target, lower, upper) = match self.layout.state_entry(k) {
                 Entry::Position { idx_q, dof } => {
                     (out.next.q[idx_q], bounds.q_lower[dof], bounds.q_upper[dof])
@@ -357,7 +375,7 @@ impl Controller {
             }
             Inverse::Analytic(idm) => {
                 out.log_prob_action = 0.0;
-                idm.torque(&self.held.q, &self.held.v, &out.next, &mut out.action);
+                idm.action(&self.held.q, &self.held.v, &out.next, &mut out.action);
             }
         }
         for (i, (a, &(lower, upper))) in out.action.iter_mut().zip(&self.action_range).enumerate() {
@@ -365,6 +383,29 @@ impl Controller {
                 *a = f64::from(out.sampled[i]);
             }
             *a = if a.is_finite() { a.clamp(lower, upper) } else { 0.0 };
+        }
+    }
+
+    /// The action of the nearest allowed state in place of one that leads elsewhere. Of a direct policy, where its action leads is what it
+    /// proposes.
+    fn guard(&mut self, out: &mut Output) {
+        let Some(guard) = &mut self.guard else { return };
+        guard.update(&self.held.q, &self.held.v, &mut out.action, &mut out.next, self.projection);
+        for (a, &(lower, upper)) in out.action.iter_mut().zip(&self.action_range) {
+            *a = if a.is_finite() { a.clamp(lower, upper) } else { 0.0 };
+        }
+        if self.kind != PolicyKind::Direct {
+            return;
+        }
+        for k in 0..self.layout.n_state() {
+            out.proposal[k] = match self.layout.state_entry(k) {
+                Entry::Position { idx_q, .. } => guard.proposal.q[idx_q],
+                Entry::Velocity { dof } => guard.proposal.v[dof],
+                Entry::Other => self.held.obs[self.layout.state()[k]],
+            };
+        }
+        if let Some(guard) = &self.guard {
+            self.report(guard.bounds(), out);
         }
     }
 
@@ -385,7 +426,7 @@ impl Controller {
     /// Starts a new episode: the next tick is a policy tick.
     pub fn reset(&mut self) {
         self.tick = 0;
-        self.projector.forget();
+        self.projector().forget();
     }
 
     /// Whether the policy runs in the next tick.
@@ -395,17 +436,22 @@ impl Controller {
 
     /// What the next policy tick depends on beside its arguments, as plain numbers; see [`Projector::memory`].
     pub fn memory(&self) -> Vec<f64> {
-        self.projector.memory()
+        self.last_word().memory()
     }
 
     /// Appends [`Controller::memory`] to `memory`; allocates only where that has no room.
     pub fn write_memory(&self, memory: &mut Vec<f64>) {
-        self.projector.write_memory(memory);
+        self.last_word().write_memory(memory);
     }
 
-    /// The projector: what it knows of the tick before moves between those of one robot.
+    /// The projector that decides what happens: the guard's where there is one.
+    fn last_word(&self) -> &Projector {
+        self.guard.as_ref().map_or(&self.projector, |guard| &guard.projector)
+    }
+
+    /// The same: what it knows of the tick before moves between those of one robot.
     pub fn projector(&mut self) -> &mut Projector {
-        &mut self.projector
+        self.guard.as_mut().map_or(&mut self.projector, |guard| &mut guard.projector)
     }
 
     /// Begins in the middle of an episode, at a policy tick, with what [`Controller::memory`] gave.
@@ -414,7 +460,7 @@ impl Controller {
     /// When it has another length.
     pub fn set_memory(&mut self, memory: &[f64]) {
         self.reset();
-        self.projector.set_memory(memory);
+        self.projector().set_memory(memory);
     }
 
     /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.
@@ -439,7 +485,7 @@ impl Controller {
     /// How far `state` is outside the limits of the controllable joints: the largest excess of a position and of a velocity; less than
     /// 1e-9 is none.
     pub fn excess(&self, state: &State) -> [Option<Excess>; 2] {
-        let (mut worst, l) = ([None::<Excess>; 2], self.projector.limits());
+        let (mut worst, l) = ([None::<Excess>; 2], self.limits());
         for &dof in self.layout.controllable() {
             let (q, v) = (state.q[self.idx_q[dof]], state.v[dof]);
             let by = [(l.q_lower[dof] - q).max(q - l.q_upper[dof]), v.abs() - l.velocity[dof]];
@@ -450,9 +496,9 @@ impl Controller {
         worst
     }
     /// Mean `|reached - target|` over the entries of the controllable joints, in units of the scale of change: how far observation `obs`
-    /// (n_obs) is from what `out` asked for. 0 for a policy on actions, which asks for no state.
+    /// (n_obs) is from what `out` asked for. 0 for a policy on actions without a guard, which asks for no state.
     pub fn residual(&self, obs: &[f64], out: &Output) -> f64 {
-        if self.kind == PolicyKind::Direct {
+        if self.kind == PolicyKind::Direct && self.guard.is_none() {
             return 0.0;
         }
         let seen = self.layout.controllable_state();
@@ -463,15 +509,16 @@ impl Controller {
     /// Whether what comes out of a tick depends on the ticks before: the policy proposes every few ticks, a limit speaks of the tick before, or
     /// a brake is stored.
     pub fn remembers(&self) -> bool {
-        self.policy_every > 1 || self.projector.needs_previous() || self.projector.stores_a_brake()
+        let last = self.last_word();
+        self.policy_every > 1 || last.needs_previous() || last.stores_a_brake()
     }
     /// Limits by degree of freedom.
     pub fn limits(&self) -> &LimitSet {
-        self.projector.limits()
+        self.last_word().limits()
     }
     /// What the ledger's active rows are of: dofs, then coupled rows.
     pub fn row_names(&self) -> Vec<String> {
-        self.projector.row_names()
+        self.last_word().row_names()
     }
     /// Robot model.
     pub fn model(&self) -> &Model {

@@ -2,7 +2,8 @@
 
 use crate::net::Forward;
 use crate::normaliser::CLIP;
-use nearl_constraints::{Dynamics, Model, Period, StateLayout, Target};
+use nearl_constraints::drive::Arrival;
+use nearl_constraints::{Drive, Dynamics, Model, Period, StateLayout, Target};
 
 /// A Gaussian network I(a | s_c, s'_c): the mean action from the observation entries of S_c and their
 /// projected change, both in network space.
@@ -39,25 +40,40 @@ impl LearnedIdm {
 }
 
 /// Recursive Newton-Euler on the robot model: `tau = M(q) a + nle(q, v) - tau_passive` with `a = (v' - v) / dt` (Featherstone 2008; through
-/// Pinocchio), on average over the period ([`Dynamics::motors`]).
+/// Pinocchio), on average over the period ([`Dynamics::motors`]); then what the [`Drive`] of each joint is to be sent for it.
 pub struct AnalyticIdm {
     dynamics: Dynamics,
-    dofs: Vec<usize>,
+    joints: Vec<Joint>,
     period: Period,
     tau: Vec<f64>,
 }
 
+struct Joint {
+    dof: usize,
+    idx_q: usize,
+    drive: Drive,
+}
+
 impl AnalyticIdm {
-    /// Actions are the torques of `dofs`, in that order, held over `period`.
-    pub fn new(model: &Model, dofs: &[usize], period: Period) -> Self {
-        Self { dynamics: Dynamics::new(model), dofs: dofs.to_vec(), period, tau: vec![0.0; model.nv()] }
+    /// Actions are the commands to the joints of `dofs`, in that order, held over `period`; `drives` (nv) says which.
+    pub fn new(model: &Model, dofs: &[usize], drives: &[Drive], period: Period) -> Self {
+        let joint = |&dof: &usize| Joint { dof, idx_q: model.joint_of_dof(dof).idx_q, drive: drives[dof] };
+        let joints = dofs.iter().map(joint).collect();
+        Self { dynamics: Dynamics::new(model), joints, period, tau: vec![0.0; model.nv()] }
     }
 
-    /// Torque in [N m] or [N] that takes (q, v) to `target`, written to `action` (n_act).
-    pub fn torque(&mut self, q: &[f64], v: &[f64], target: &Target, action: &mut [f64]) {
+    /// Command of each joint (n_act) that takes (q, v) to `target`: of motors the force [N m or N].
+    pub fn action(&mut self, q: &[f64], v: &[f64], target: &Target, action: &mut [f64]) {
         self.dynamics.motors(&self.period, q, v, &target.acceleration, &mut self.tau);
-        for (a, &d) in action.iter_mut().zip(&self.dofs) {
-            *a = self.tau[d];
+        for (action, joint) in action.iter_mut().zip(&self.joints) {
+            let &Joint { dof, idx_q, drive } = joint;
+            let to = Arrival {
+                q: target.q[idx_q],
+                v: target.v[dof],
+                a: target.acceleration[dof],
+                tau: self.tau[dof],
+            };
+            *action = drive.command(&self.period, q[idx_q], v[dof], &to);
         }
     }
 }

@@ -3,6 +3,7 @@
 //! Read [`controller`] first: the one data path is on that page. Nothing here opens a link, starts a thread or reads a command line.
 
 pub mod codes;
+pub mod command;
 pub mod controller;
 pub mod idm;
 pub mod net;

@@ -6,7 +6,8 @@
 use crate::codes::SnapshotCode;
 use crate::net::{Activation, Dense, Function};
 use crate::normaliser::Normaliser;
-use crate::task::Task;
+use crate::task::{IdmKind, Task};
+use nearl_constraints::Guard;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -81,6 +82,18 @@ impl Manifest {
         } else {
             self.functions.clone()
         }
+    }
+
+    /// Whether the controller of this snapshot guards its actions: those of a network, where the task asks for it. Analytic inverse dynamics
+    /// of a projected state needs no guard.
+    pub fn guards(&self) -> bool {
+        let network = self.policy == PolicyKind::Direct || self.task.idm.kind == IdmKind::Learned;
+        network && self.task.constraints.guard == Guard::Model
+    }
+
+    /// Whether a state is proposed in each tick, by the policy or by the guard on its behalf.
+    pub fn proposes(&self) -> bool {
+        self.policy != PolicyKind::Direct || self.guards()
     }
 }
 

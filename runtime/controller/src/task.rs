@@ -2,6 +2,7 @@
 //!
 //! An unknown key, a wrong type or a value out of range is one sentence with file, line and key.
 
+use crate::command::CommandSection;
 use crate::snapshot::ModelFormat;
 use nearl_constraints::{ConstraintSettings, Period};
 use serde::{Deserialize, Serialize};
@@ -36,6 +37,9 @@ pub struct Task {
     /// How an episode starts.
     #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
     pub reset: toml::Table,
+    /// What the joints are commanded.
+    #[serde(default, skip_serializing_if = "CommandSection::is_effort")]
+    pub command: CommandSection,
     /// Prior constraints.
     pub constraints: ConstraintSettings,
     /// Inverse dynamics.

@@ -28,14 +28,19 @@ impl Brake {
     /// # Errors
     /// [`SnapshotError::Unusable`] with the sentence of the layer that refused robot, layout or limits.
     pub fn new(manifest: &Manifest) -> Result<Option<Brake>, SnapshotError> {
-        if manifest.task.idm.kind != IdmKind::Pinocchio || manifest.policy == PolicyKind::Direct {
+        let guards = manifest.guards();
+        let analytic = manifest.task.idm.kind == IdmKind::Pinocchio && manifest.policy != PolicyKind::Direct;
+        if !(guards || analytic) {
             return Ok(None);
         }
         let Parts { model, layout, projector, .. } = Parts::new(manifest)?;
         let controllable = layout.controllable();
+        let projector =
+            if guards { Parts::guard_projector(manifest, &model, controllable)? } else { projector };
+        let drives = Parts::drives(manifest, &model, controllable)?;
         let joints = model.joints().iter().filter(|j| j.nv == 1 && controllable.contains(&j.idx_v));
         Ok(Some(Brake {
-            idm: AnalyticIdm::new(&model, controllable, manifest.task.period()),
+            idm: AnalyticIdm::new(&model, controllable, &drives, manifest.task.period()),
             proposal: Proposal::new(&model),
             target: Target::new(&model),
             joints: joints.map(|j| (j.idx_v, j.idx_q)).collect(),
@@ -51,8 +56,8 @@ impl Brake {
         &mut self.projector
     }
 
-    /// Proposes rest, `v' = 0` and `q' = q + T v - kappa T v`, and returns the torque [N m] for the nearest allowed
-    /// state. Joints that are not controllable keep their velocity.
+    /// Proposes rest, `v' = 0` and `q' = q + T v - kappa T v`, and returns the command (of motors the torque [N m]) for the
+    /// nearest allowed state. Joints that are not controllable keep their velocity.
     pub fn update(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
         self.propose_rest(q, v);
         self.act(q, v)
@@ -88,7 +93,7 @@ impl Brake {
 
     fn act(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
         let status = self.projector.project(q, v, &self.proposal, &mut self.target);
-        self.idm.torque(q, v, &self.target, &mut self.action);
+        self.idm.action(q, v, &self.target, &mut self.action);
         for (action, &(lower, upper)) in self.action.iter_mut().zip(&self.range) {
             *action = if action.is_finite() { action.clamp(lower, upper) } else { 0.0 };
         }

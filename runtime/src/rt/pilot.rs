@@ -9,7 +9,7 @@ use crate::link::{
 };
 use crate::rt::brake::Brake;
 use crate::rt::tick::{Build, MAX_ROWS, Outcome, Refusal, Row, Step, Tick};
-use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError};
+use crate::snapshot::{Manifest, Snapshot, SnapshotError};
 
 /// A controller with its inputs and outputs, checked against the plant it drives.
 pub struct Pilot {
@@ -24,7 +24,7 @@ pub struct Pilot {
     observed: Vec<Entry>,
     /// Joints whose samples are checked: degree of freedom, configuration index, largest speed V [rad/s or m/s].
     checked: Vec<(usize, usize, f64)>,
-    /// The policy proposes states; a direct one gives actions only.
+    /// The policy proposes states; a direct one without a guard gives actions only.
     proposes: bool,
     /// A number for the limits of the joints: equal limits, equal numbers.
     limits: f64,
@@ -50,7 +50,7 @@ impl Pilot {
             entries: (0..layout.n_state()).map(|k| layout.state_entry(k)).collect(),
             observed: layout.entries().to_vec(),
             checked: checked(&controller),
-            proposes: snapshot.manifest.policy != PolicyKind::Direct,
+            proposes: snapshot.manifest.proposes(),
             limits: number_of(controller.limits()),
             memory_len: 1 + controller.memory().len(),
             memory: controller.memory(),
@@ -328,7 +328,7 @@ fn robot(model: &nearl_constraints::Model, observation: &[String], manifest: &Ma
     }
 }
 
-/// Digest of the robot file's limits and the actuators' range: a robot with weaker motors is another robot.
+/// Digest of the robot file's limits, the actuators' range and what they are commanded: a robot with weaker motors is another robot.
 fn limits_digest(model: &nearl_constraints::Model, manifest: &Manifest) -> u64 {
     let lists = [
         model.lower_position_limit(),
@@ -338,7 +338,9 @@ fn limits_digest(model: &nearl_constraints::Model, manifest: &Manifest) -> u64 {
         &manifest.action_lower,
         &manifest.action_upper,
     ];
-    hash_names(lists.into_iter().flatten().map(|x| x.to_bits().to_string()))
+    let command = &manifest.task.command;
+    let interface = (!command.is_effort()).then(|| format!("{command:?}"));
+    hash_names(lists.into_iter().flatten().map(|x| x.to_bits().to_string()).chain(interface))
 }
 
 /// Refuses a snapshot made for another robot, naming what differs.

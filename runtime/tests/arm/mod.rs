@@ -78,6 +78,10 @@ pub struct Panda {
     pub worst: [f64; 3],
     pub speeds: Vec<f64>,
     pub braked: u64,
+    /// The robot's own drives take it to the position it is sent.
+    pub follows_positions: bool,
+    /// Its largest acceleration then [rad/s²].
+    pub accelerated: f64,
     /// Time it takes to measure: lockstep is faster than a trainer can push.
     pub pause: Duration,
 }
@@ -96,6 +100,8 @@ impl Panda {
             worst: [f64::NEG_INFINITY; 3],
             speeds: Vec::new(),
             braked: 0,
+            follows_positions: false,
+            accelerated: 0.0,
             pause: Duration::ZERO,
         }
     }
@@ -113,6 +119,18 @@ impl Plant for Panda {
 
     fn apply(&mut self, action: &ActionMessage) {
         let (mut passive, mut a) = (vec![0.0; N], vec![0.0; N]);
+        if self.follows_positions {
+            for (i, sent) in action.action().iter().enumerate() {
+                let v = (sent - self.q[i]) / toy::DT;
+                (self.accelerated, self.v[i], self.q[i]) =
+                    (self.accelerated.max((v - self.v[i]).abs() / toy::DT), v, *sent);
+                let position = (self.q[i] - self.upper[i]).max(self.lower[i] - self.q[i]);
+                self.worst[0] = self.worst[0].max(position);
+                self.worst[1] = self.worst[1].max(v.abs() - self.velocity[i]);
+            }
+            self.speeds.push(self.v.iter().fold(0.0, |m, v| f64::max(m, v.abs())));
+            return;
+        }
         self.dynamics.passive(&self.q, &self.v, &mut passive);
         let tau: Vec<f64> = action.action().iter().zip(&passive).map(|(t, p)| t + p).collect();
         self.dynamics.aba(&self.q, &self.v, &tau, &mut a);
@@ -163,12 +181,20 @@ pub fn start(name: &Name, snapshot: &Snapshot) -> ArmThread {
 }
 
 pub fn start_with(name: &Name, snapshot: &Snapshot, plan: FaultPlan, pause: Duration) -> ArmThread {
+    start_faulty(name, snapshot, plan, Panda { pause, ..Panda::new() })
+}
+
+pub fn start_panda(name: &Name, snapshot: &Snapshot, panda: Panda) -> ArmThread {
+    start_faulty(name, snapshot, FaultPlan::default(), panda)
+}
+
+fn start_faulty(name: &Name, snapshot: &Snapshot, plan: FaultPlan, panda: Panda) -> ArmThread {
     let link = PlantLink::open(&name.0, &describe(&snapshot.manifest, true).unwrap()).unwrap();
     let stop = Stop::new();
     let thread = std::thread::spawn({
         let stop = stop.clone();
         move || {
-            let mut plant = FaultyPlant::new(Panda { pause, ..Panda::new() }, plan);
+            let mut plant = FaultyPlant::new(panda, plan);
             let runner = PlantRunner::new(link, PlantSettings::lockstep(toy::DT)).unwrap();
             let report = runner.run(&mut plant, &stop);
             (plant, report)

@@ -4,7 +4,7 @@ use super::{Failure, say, unstable};
 use crate::evaluate::evaluate;
 use crate::run_folder;
 use clap::Args;
-use nearl_runtime::{PolicyKind, Snapshot};
+use nearl_runtime::Snapshot;
 use std::path::PathBuf;
 
 #[derive(Args)]
@@ -50,8 +50,8 @@ impl Eval {
         );
         for e in &results {
             let percent = |n: u64| 100.0 * n as f64 / e.ticks.max(1) as f64;
-            // A policy on actions proposes nothing.
-            let proposes = snapshot.manifest.policy != PolicyKind::Direct;
+            // A policy on actions without a guard proposes nothing.
+            let proposes = snapshot.manifest.proposes();
             let of_targets = |text: String| if proposes { text } else { "-".into() };
             let share = |n: u64| of_targets(format!("{:.2} %", percent(n)));
             say(format!(
@@ -64,6 +64,12 @@ impl Eval {
                 percent(e.reached_violations),
                 share(e.recovering),
                 of_targets(format!("{:.3}", e.residual)),
+            ));
+        }
+        for e in results.iter().filter(|e| e.replaced + e.unavoided > 0) {
+            say(format!(
+                "{}: the simulator's guard replaced the action of {} ticks, and found none that stays inside for {}",
+                e.mode, e.replaced, e.unavoided
             ));
         }
         for (e, w) in results.iter().flat_map(|e| e.worst.iter().map(move |w| (e, w))) {

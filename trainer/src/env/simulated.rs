@@ -12,6 +12,9 @@ pub(super) struct Simulated<R> {
     robot: Robot,
     rules: R,
     sim: Sim,
+    /// A control period ahead of `sim`, and the action that led there.
+    ahead: Option<Sim>,
+    foreseen: Vec<f64>,
     start: (Vec<f64>, Vec<f64>),
     counters: Counters,
     last_error: Option<MjError>,
@@ -26,6 +29,8 @@ impl<R: Rules> Simulated<R> {
             robot,
             rules,
             sim,
+            ahead: None,
+            foreseen: Vec::new(),
             start,
             counters: Counters::default(),
             last_error: None,
@@ -58,6 +63,7 @@ impl<R: Rules> Simulated<R> {
                 }
             }
         }
+        self.foreseen.clear();
         self.sim.set_state(&qpos, &qvel).map_err(self.physics())?;
         self.sim.set_time(at.time);
         let (place, goal) = (self.rules.goal_in_observation(), self.rules.goal_mut());
@@ -68,9 +74,28 @@ impl<R: Rules> Simulated<R> {
     }
 
     fn simulate(&mut self, action: &[f64]) -> Result<(), MjError> {
-        self.rules.actuate(&self.spec, &mut self.sim, action);
-        self.sim.step(self.spec.sub_steps)?;
+        let same = |(a, b): (&f64, &f64)| a.to_bits() == b.to_bits();
+        let is_foreseen = self.foreseen.len() == action.len() && self.foreseen.iter().zip(action).all(same);
+        self.foreseen.clear();
+        match self.ahead.as_mut().filter(|_| is_foreseen) {
+            Some(ahead) => std::mem::swap(&mut self.sim, ahead),
+            None => {
+                self.rules.actuate(&self.spec, &mut self.sim, action);
+                self.sim.step(self.spec.sub_steps)?;
+            }
+        }
         self.rules.finish(&mut self.sim)
+    }
+
+    /// A control period under `action` from the present state, in [`Simulated::ahead`].
+    fn look_ahead(&mut self, action: &[f64]) -> Result<(), MjError> {
+        let ahead = match &mut self.ahead {
+            Some(ahead) => ahead,
+            none => none.insert(Sim::new(self.sim.model())?),
+        };
+        ahead.copy_from(&self.sim)?;
+        self.rules.actuate(&self.spec, ahead, action);
+        ahead.step(self.spec.sub_steps)
     }
 }
 
@@ -80,6 +105,7 @@ impl<R: Rules> Env for Simulated<R> {
     }
 
     fn reset(&mut self, rng: &mut ChaCha8Rng) -> Result<(), EnvError> {
+        self.foreseen.clear();
         let (qpos, qvel) = &mut self.start;
         qpos.copy_from_slice(self.sim.model().qpos0());
         qvel.fill(0.0);
@@ -97,6 +123,7 @@ impl<R: Rules> Env for Simulated<R> {
     }
 
     fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError> {
+        self.foreseen.clear();
         self.sim.set_state(qpos, qvel).map_err(self.physics())
     }
 
@@ -120,6 +147,19 @@ impl<R: Rules> Env for Simulated<R> {
         }
         let (reward, terminated) = self.rules.judge(&self.spec, &self.sim, before, action);
         Step { reward, cost: 0.0, terminated, fault: Fault::None }
+    }
+
+    fn foresee(&mut self, action: &[f64], qpos: &mut [f64], qvel: &mut [f64]) -> bool {
+        assert_eq!(action.len(), self.spec.n_act(), "the action of '{}' has another length", self.spec.name);
+        self.foreseen.clear();
+        if action.iter().any(|a| !a.is_finite()) || self.look_ahead(action).is_err() {
+            return false;
+        }
+        let Some(ahead) = self.ahead.as_mut().filter(|ahead| !ahead.is_unstable()) else { return false };
+        qpos.copy_from_slice(ahead.qpos());
+        qvel.copy_from_slice(ahead.qvel());
+        self.foreseen.extend_from_slice(action);
+        true
     }
 
     fn judge(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {

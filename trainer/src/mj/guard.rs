@@ -17,6 +17,7 @@ use super::MjError;
 type Handler = unsafe extern "C-unwind" fn(*const MjLogMessage);
 
 unsafe extern "C-unwind" {
+    pub(super) fn mj_copyData(to: *mut mjData, m: *const mjModel, from: *const mjData) -> *mut mjData;
     pub(super) fn mj_resetData(m: *const mjModel, d: *mut mjData);
     pub(super) fn mj_forward(m: *const mjModel, d: *mut mjData);
     pub(super) fn mj_step(m: *const mjModel, d: *mut mjData);

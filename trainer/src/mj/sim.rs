@@ -105,6 +105,22 @@ impl Sim {
         })
     }
 
+    /// Becomes what `other`, a simulation of the same robot, is: what follows is the same, bit for bit.
+    ///
+    /// # Errors
+    /// [`MjError::Engine`].
+    ///
+    /// # Panics
+    /// When the robots differ.
+    pub fn copy_from(&mut self, other: &Sim) -> Result<(), MjError> {
+        assert!(Arc::ptr_eq(&self.model.0, &other.model.0), "a copy of another robot's state");
+        let from: *const mjData = other.state.ffi();
+        self.call(|m, d| {
+            // SAFETY: both states belong to this model.
+            unsafe { guard::mj_copyData(d, m, from) };
+        })
+    }
+
     /// Evaluates accelerations and forces at the present state, for [`Sim::acceleration`] and its like.
     ///
     /// # Errors
@@ -132,6 +148,13 @@ impl Sim {
             unstable |= std::mem::take(&mut counters[kind as usize].number) > 0;
         }
         unstable
+    }
+
+    /// What [`Sim::take_unstable`] would say.
+    pub fn is_unstable(&self) -> bool {
+        let counters = &self.state.ffi().warning;
+        let kinds = [MjtWarning::mjWARN_BADQPOS, MjtWarning::mjWARN_BADQVEL, MjtWarning::mjWARN_BADQACC];
+        kinds.into_iter().any(|kind| counters[kind as usize].number > 0)
     }
 
     /// Configuration (nq), MuJoCo's convention.

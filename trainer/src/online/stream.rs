@@ -8,7 +8,7 @@ use crate::env::{Env, EnvError, Moment};
 use crate::rollout::{Period, Rows};
 use nearl_runtime::link::{STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, TransitionMessage};
 use nearl_runtime::rt::Mode;
-use nearl_runtime::{Controller, Networks, Noise, Output, PolicyKind, Snapshot, SnapshotError, State};
+use nearl_runtime::{Controller, Networks, Noise, Output, Snapshot, SnapshotError, State};
 use std::collections::VecDeque;
 
 /// Versions whose networks are kept: the newest, and the one that still acts while it is built.
@@ -90,7 +90,7 @@ impl Stream {
         let controller = Controller::new(snapshot)?;
         Ok(Self {
             env,
-            proposes: snapshot.manifest.policy != PolicyKind::Direct,
+            proposes: snapshot.manifest.proposes(),
             state: controller.state(),
             noise: controller.noise(),
             out: controller.output(),

@@ -5,6 +5,9 @@ mod stream;
 use super::resume::Episode;
 use super::{Period, RolloutError, Rows};
 use crate::env::{Env, EnvError, Fault};
+use crate::foresight::{Foresight, Verdict};
+use crate::plant::watched_limits;
+use nearl_runtime::constraints::Guard;
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Excess, Networks, Noise, Output, PolicyKind, Snapshot, State};
 use rand_chacha::ChaCha8Rng;
@@ -17,6 +20,11 @@ pub struct Worker {
     kind: PolicyKind,
     learned: bool,
     pub(super) rng: ChaCha8Rng,
+    /// Asks the simulator where an action leads, if the task says so.
+    foresight: Option<Foresight>,
+    foresees: bool,
+    /// Actions that [`Foresight`] replaced, and those for which it found none.
+    pub(crate) foreseen: [u64; 2],
     pub(super) state: State,
     /// Observation at the begin of this policy step.
     before: Vec<f64>,
@@ -48,7 +56,12 @@ impl Worker {
         rng: ChaCha8Rng,
     ) -> Result<Self, RolloutError> {
         let controller = Controller::new(snapshot)?;
+        let asks = snapshot.manifest.task.constraints.guard == Guard::Simulator;
+        let limits = watched_limits(&*env, controller.model(), controller.limits());
         let mut worker = Self {
+            foresight: asks.then(|| Foresight::new(&*env, &limits)),
+            foresees: true,
+            foreseen: [0; 2],
             kind: snapshot.manifest.policy,
             learned: snapshot.manifest.task.idm.kind == IdmKind::Learned,
             state: controller.state(),
@@ -79,6 +92,7 @@ impl Worker {
     /// Switches the projection, for comparisons.
     pub fn set_projection(&mut self, on: bool) {
         self.controller.set_projection(on);
+        self.foresees = on;
     }
 
     /// Lowers the learner's reward by `penalty` for each unit of distance the projection moved a target
@@ -191,6 +205,13 @@ impl Worker {
 
     fn tick(&mut self) -> (f64, bool) {
         self.controller.update(&self.state, &self.noise, &mut self.out);
+        if let Some(foresight) = self.foresight.as_mut().filter(|_| self.foresees) {
+            match foresight.update(&mut *self.env, &mut self.out.action) {
+                Verdict::Kept => {}
+                Verdict::Replaced => self.foreseen[0] += 1,
+                Verdict::Outside => self.foreseen[1] += 1,
+            }
+        }
         self.history.push(&self.out.action);
         let step = self.env.step(&self.out.action);
         self.ticks += 1;

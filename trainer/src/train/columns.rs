@@ -1,7 +1,6 @@
 //! The columns of `metrics.csv` and how an iteration fills them.
 
 use super::{Progress, Training};
-use nearl_runtime::PolicyKind;
 
 const REACHED: &str = "constraints/reached_violations";
 
@@ -47,8 +46,8 @@ impl Training {
     pub fn row(&self, p: &Progress) -> Vec<f64> {
         let t = &p.tally;
         let per_tick = |n: u64| n as f64 / t.ticks.max(1) as f64;
-        // A policy on actions proposes nothing: nothing is projected, and no target is missed.
-        let proposes = self.snapshot.manifest.policy != PolicyKind::Direct;
+        // A policy on actions without a guard proposes nothing: nothing is projected, and no target is missed.
+        let proposes = self.snapshot.manifest.proposes();
         let of_targets =
             |name: &str| name == "idm/residual" || name.starts_with("constraints/") && name != REACHED;
         let value = |name: &str| match name {

@@ -1,10 +1,11 @@
 //! From a manifest and its settings to what is trained.
 
 use super::{ALGORITHMS, TrainError};
-use crate::env::Spec;
+use crate::env::Env;
 use crate::learn::{Dims, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Ppo};
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
+use nearl_runtime::constraints::{Drive, Guard};
 use nearl_runtime::controller::Parts;
 use nearl_runtime::task::{IdmKind, Task};
 use nearl_runtime::{Manifest, PolicyKind};
@@ -62,15 +63,19 @@ pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
     }
     manifest.action_lower = spec.action_low().collect();
     manifest.action_upper = spec.action_high().collect();
-    if manifest.task.idm.kind == IdmKind::Pinocchio {
-        check_motors(manifest, spec)?;
+    let guards = manifest.task.constraints.guard == Guard::Model;
+    if manifest.task.idm.kind == IdmKind::Pinocchio || guards {
+        check_motors(manifest, env.as_ref())?;
     }
     Ok(())
 }
 
-/// Analytic inverse dynamics gives one torque a controllable joint: the actuators have to be these joints' motors, in their order.
-fn check_motors(manifest: &Manifest, spec: &Spec) -> Result<(), TrainError> {
+/// Analytic inverse dynamics, and a guard, give one command a controllable joint: the actuators have to be these joints' motors or drives, in
+/// their order.
+fn check_motors(manifest: &Manifest, env: &dyn Env) -> Result<(), TrainError> {
+    let spec = env.spec();
     let Parts { model, layout, .. } = Parts::new(manifest).map_err(RolloutError::from)?;
+    let drives = Parts::drives(manifest, &model, layout.controllable()).map_err(RolloutError::from)?;
     let joints: Vec<String> = layout.controllable().iter().map(|dof| model.dof_name(*dof)).collect();
     let driven: Vec<&str> = spec.actuators.iter().map(|a| a.joint.as_str()).collect();
     let task = &manifest.task.name;
@@ -82,7 +87,30 @@ fn check_motors(manifest: &Manifest, spec: &Spec) -> Result<(), TrainError> {
             driven.join(", ")
         )));
     }
-    match spec.actuators.iter().find(|a| a.gear != 1.0 || !a.is_plain) {
+    let controllable = layout.controllable();
+    let of = |k: usize| drives[controllable[k]];
+    for (k, a) in spec.actuators.iter().enumerate().filter(|(k, _)| of(*k) != Drive::Effort) {
+        let gains = env.sim().model().gains(k).filter(|_| a.gear == 1.0);
+        let fits = match (of(k), gains) {
+            (Drive::Pd { stiffness, damping }, Some([gain, by_q, by_v])) => {
+                (gain, by_q, by_v) == (stiffness, -stiffness, -damping)
+            }
+            (Drive::Position, Some([gain, by_q, _])) => gain > 0.0 && gain == -by_q,
+            (Drive::Velocity, Some([gain, by_q, by_v])) => gain > 0.0 && by_q == 0.0 && gain == -by_v,
+            _ => false,
+        };
+        if !fits {
+            return Err(TrainError::Settings(format!(
+                "[command] of '{task}' sends '{}' commands to joint '{}', but actuator '{}' is none for them; write <position kp=\"K\" kv=\"D\"> \
+                 with the stiffness and damping of the task file (<velocity kv=\"D\"> for 'velocity'), or another interface",
+                of(k).name(),
+                a.joint,
+                a.name
+            )));
+        }
+    }
+    let motors = spec.actuators.iter().enumerate().filter(|(k, _)| of(*k) == Drive::Effort).map(|(_, a)| a);
+    match motors.into_iter().find(|a| a.gear != 1.0 || !a.is_plain) {
         None => Ok(()),
         Some(a) => Err(TrainError::Settings(format!(
             "[idm] kind = \"pinocchio\" of '{task}' gives torques, but actuator '{}' of joint '{}' {}; \

@@ -3,7 +3,10 @@
 use super::Half;
 use crate::snapshot::{Manifest, ModelFormat, Networks, PolicyKind, SnapshotError};
 use crate::task::{IdmInput, IdmKind};
-use nearl_constraints::{Entry, Model, Projector, Settings, StateLayout, build_limits};
+use nearl_constraints::{
+    Consistency, Drive, DriveTorqueLimit, Entry, Model, Projector, Settings, StateLayout, TorqueLimit,
+    build_limits,
+};
 
 /// Robot, layout and projector of a task: what a controller needs beside its networks.
 pub struct Parts {
@@ -52,9 +55,43 @@ impl Parts {
         model: &Model,
         controllable: &[usize],
     ) -> Result<Projector, SnapshotError> {
-        let limits = build_limits(&m.task.constraints, model).map_err(|e| unusable(&e))?;
+        Self::projector_of(m, model, controllable, m.task.constraints.consistency)
+    }
+
+    /// The projector of the task's guard: an action decides one acceleration of each dof, so position and velocity belong together.
+    ///
+    /// # Errors
+    /// As [`Parts::new`].
+    pub fn guard_projector(
+        m: &Manifest,
+        model: &Model,
+        controllable: &[usize],
+    ) -> Result<Projector, SnapshotError> {
+        Self::projector_of(m, model, controllable, Consistency::Kinematic)
+    }
+
+    /// What each dof of the model is commanded (nv).
+    ///
+    /// # Errors
+    /// As [`Parts::new`].
+    pub fn drives(m: &Manifest, model: &Model, controllable: &[usize]) -> Result<Vec<Drive>, SnapshotError> {
+        m.task.command.drives(model, controllable).map_err(|e| unusable(&e))
+    }
+
+    fn projector_of(
+        m: &Manifest,
+        model: &Model,
+        controllable: &[usize],
+        consistency: Consistency,
+    ) -> Result<Projector, SnapshotError> {
+        let mut limits = build_limits(&m.task.constraints, model).map_err(|e| unusable(&e))?;
+        let drives = Self::drives(m, model, controllable)?;
+        let is_pd = |drive: &Drive| matches!(drive, Drive::Pd { .. });
+        if let Some(torque) = m.task.constraints.torque.clone().filter(|_| drives.iter().any(is_pd)) {
+            limits.push(Box::new(DriveTorqueLimit::new(TorqueLimit::new(torque), &drives)));
+        }
         let settings = Settings {
-            consistency: m.task.constraints.consistency,
+            consistency,
             solver: m.task.constraints.solver,
             braking: m.task.constraints.braking,
             ..Settings::new(m.task.time.dt, m.task.sub_steps() as u32)
@@ -64,7 +101,7 @@ impl Parts {
 }
 
 /// A name quoted from the manifest may hold line breaks.
-fn unusable(reason: &dyn std::fmt::Display) -> SnapshotError {
+pub(super) fn unusable(reason: &dyn std::fmt::Display) -> SnapshotError {
     SnapshotError::Unusable { reason: reason.to_string().replace(['\n', '\r'], " ") }
 }
 

@@ -52,6 +52,10 @@ impl Env for Costed {
         self.with_cost(step, action)
     }
 
+    fn foresee(&mut self, action: &[f64], qpos: &mut [f64], qvel: &mut [f64]) -> bool {
+        self.inner.foresee(action, qpos, qvel)
+    }
+
     fn judge(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
         // The state before is judged on its own first, so that what it began with can be remembered.
         self.inner.judge(from, from, action)?;

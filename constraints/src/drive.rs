@@ -1,0 +1,98 @@
+//! What a joint is commanded for a period, and what its drive makes of it.
+
+use crate::Period;
+
+/// The command interface of one joint.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub enum Drive {
+    /// A motor force [N·m or N], held over the period.
+    #[default]
+    Effort,
+    /// The position at the end of the period [rad or m]: the robot follows by itself.
+    Position,
+    /// The velocity at the end of the period [rad/s or m/s]: the robot follows by itself.
+    Velocity,
+    /// The target position `q*` [rad or m] of a drive that gives `tau = K (q* - q) - D v`.
+    Pd {
+        /// K [N·m/rad or N/m], above 0.
+        stiffness: f64,
+        /// D [N·m s/rad or N s/m], at least 0.
+        damping: f64,
+    },
+}
+
+/// What a command means for the equations of motion of a period.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Held {
+    /// This motor force, whatever happens.
+    Force(f64),
+    /// `force - resistance a` on average over the period.
+    Servo {
+        /// Force that falls away for a unit of acceleration.
+        resistance: f64,
+        /// Force without acceleration.
+        force: f64,
+    },
+    /// This acceleration, whatever it takes.
+    Acceleration(f64),
+}
+
+/// Where a joint is at the end of a period, and what it takes to come there.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Arrival {
+    /// Position [rad or m].
+    pub q: f64,
+    /// Velocity [rad/s or m/s].
+    pub v: f64,
+    /// Constant acceleration [rad/s² or m/s²].
+    pub a: f64,
+    /// Motor force on average over the period [N·m or N].
+    pub tau: f64,
+}
+
+impl Drive {
+    /// What `command` does to a joint at `q`, `v`. With `h` and `c` of [`Period::lag`] and [`Period::sag`], a drive gives on average
+    ///
+    /// ```text
+    ///     K (q* - q - h v - c a) - D (v + h a)
+    /// ```
+    pub fn held(&self, period: &Period, q: f64, v: f64, command: f64) -> Held {
+        let (t, lag, sag) = (period.dt, period.lag(), period.sag());
+        match *self {
+            Drive::Effort => Held::Force(command),
+            Drive::Position => Held::Acceleration((command - q - t * v) / (period.kappa * t * t)),
+            Drive::Velocity => Held::Acceleration((command - v) / t),
+            Drive::Pd { stiffness, damping } => Held::Servo {
+                resistance: stiffness * sag + damping * lag,
+                force: stiffness * (command - q - lag * v) - damping * v,
+            },
+        }
+    }
+
+    /// The command that takes a joint from `q`, `v` to `to`: the inverse of [`Drive::held`],
+    ///
+    /// ```text
+    ///     q* = q + h v + c a + (tau + D (v + h a)) / K
+    /// ```
+    pub fn command(&self, period: &Period, q: f64, v: f64, to: &Arrival) -> f64 {
+        let (lag, sag) = (period.lag(), period.sag());
+        match *self {
+            Drive::Effort => to.tau,
+            Drive::Position => to.q,
+            Drive::Velocity => to.v,
+            Drive::Pd { stiffness, damping } => {
+                q + lag * v + sag * to.a + (to.tau + damping * (v + lag * to.a)) / stiffness
+            }
+        }
+    }
+
+    /// Its name in the task file.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Drive::Effort => "effort",
+            Drive::Position => "position",
+            Drive::Velocity => "velocity",
+            Drive::Pd { .. } => "pd",
+        }
+    }
+}

@@ -1,0 +1,155 @@
+//! The guard: an action that no projected state led to becomes one that such a state leads to.
+
+use super::parts::unusable;
+use crate::snapshot::{Manifest, SnapshotError};
+use nearl_constraints::drive::{Arrival, Held};
+use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposal, StateLayout, Target};
+
+/// Forward, project, back. With `S_c` the controllable dofs, whose motors the action (n_act) drives:
+///
+/// ```text
+///     tau -> a = R^-1 (tau - b)                     forward dynamics over the period
+///         -> v + T a, q (+) (T v + kappa T^2 a)     the proposal
+///         -> project -> a'                          as the proposal of any policy
+///         -> tau' = R a' + b                        on S_c, while the other dofs follow
+/// ```
+///
+/// Joints with a drive take their command for the force (see [`Drive`]). Where the projection moves nothing the action stays bit for bit.
+pub(super) struct Guard {
+    pub(super) projector: Projector,
+    dynamics: PeriodDynamics,
+    dofs: Vec<usize>,
+    /// By dof (nv).
+    drives: Vec<Drive>,
+    pub(super) proposal: Proposal,
+    /// Configuration index of each dof that is a joint of its own.
+    single: Vec<Option<usize>>,
+    held: Vec<Held>,
+    tau: Vec<f64>,
+    a: Vec<f64>,
+    /// Tangent displacement of the period, and where it leads.
+    step: Vec<f64>,
+    on: nearl_constraints::Dynamics,
+}
+
+impl Guard {
+    /// The guard of a task whose actions are the commands to the controllable joints.
+    ///
+    /// # Errors
+    /// [`SnapshotError::Unusable`] for actions that are no such forces, and limits that do not suffice for a promise.
+    pub(super) fn new(m: &Manifest, model: &Model, layout: &StateLayout) -> Result<Guard, SnapshotError> {
+        let dofs = layout.controllable().to_vec();
+        let drives = super::Parts::drives(m, model, &dofs)?;
+        check_actions(m, model, &dofs, &drives)?;
+        let projector = super::Parts::guard_projector(m, model, &dofs)?;
+        let nv = model.nv();
+        let single = (0..nv).map(|i| {
+            let joint = model.joint_of_dof(i);
+            (joint.nq == 1 && joint.nv == 1).then_some(joint.idx_q)
+        });
+        Ok(Guard {
+            dynamics: PeriodDynamics::new(model, &dofs, m.task.period()),
+            proposal: Proposal::new(model),
+            single: single.collect(),
+            held: vec![Held::Force(0.0); nv],
+            tau: vec![0.0; nv],
+            drives,
+            a: vec![0.0; nv],
+            step: vec![0.0; nv],
+            on: nearl_constraints::Dynamics::new(model),
+            projector,
+            dofs,
+        })
+    }
+
+    /// Replaces `action` (n_act), which is finite and within the actuators' range, by the one of the nearest state that every limit allows; `next`
+    /// is that state with its ledger. With `hold` off the action stays and `next` is where it leads.
+    pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], next: &mut Target, hold: bool) {
+        self.dynamics.update(q, v, self.projector.external_forces());
+        self.foresee(q, v, action);
+        self.projector.project(q, v, &self.proposal, next);
+        if !hold {
+            self.projector.pass(q, v, &self.proposal, next);
+        }
+        if self.projector.needs_previous() {
+            self.projector.remember(next);
+        }
+        if hold && self.is_moved(next) {
+            self.a.copy_from_slice(&next.acceleration);
+            self.dynamics.drive(&mut self.a, &mut self.tau);
+            for (action, &i) in action.iter_mut().zip(&self.dofs) {
+                let iq = self.single[i].unwrap_or(0);
+                let to = Arrival { q: next.q[iq], v: next.v[i], a: self.a[i], tau: self.tau[i] };
+                *action = self.drives[i].command(self.dynamics.period(), q[iq], v[i], &to);
+            }
+        }
+    }
+
+    /// Writes the proposal: the state at the end of the period under `action`.
+    fn foresee(&mut self, q: &[f64], v: &[f64], action: &[f64]) {
+        let period = *self.dynamics.period();
+        let (t, kappa) = (period.dt, period.kappa);
+        for (&i, action) in self.dofs.iter().zip(action) {
+            let at = q[self.single[i].unwrap_or(0)];
+            self.held[i] = self.drives[i].held(&period, at, v[i], *action);
+        }
+        self.dynamics.accelerate(&self.held, &mut self.a);
+        for i in 0..v.len() {
+            let y = t * self.a[i];
+            self.proposal.v[i] = v[i] + y;
+            self.step[i] = t * v[i] + kappa * t * y;
+        }
+        if self.single.iter().any(Option::is_none) {
+            self.on.integrate(q, &self.step, &mut self.proposal.q);
+        }
+        for (i, iq) in self.single.iter().enumerate() {
+            if let Some(iq) = *iq {
+                self.proposal.q[iq] = q[iq] + self.step[i];
+            }
+        }
+    }
+
+    /// Whether the target differs from the proposal in a controllable joint.
+    fn is_moved(&self, next: &Target) -> bool {
+        let differs = |&i: &usize| {
+            let q = |iq: usize| next.q[iq] != self.proposal.q[iq];
+            next.v[i] != self.proposal.v[i] || self.single[i].is_some_and(q)
+        };
+        self.dofs.iter().any(differs)
+    }
+
+    pub(super) fn bounds(&self) -> &Bounds {
+        self.projector.bounds()
+    }
+}
+
+/// Each controllable joint needs a motor of known strength, which the action is the force of.
+fn check_actions(m: &Manifest, model: &Model, dofs: &[usize], drives: &[Drive]) -> Result<(), SnapshotError> {
+    let refuse = |reason: String| Err(unusable(&reason));
+    let of_force = |i: &usize| matches!(drives[*i], Drive::Effort | Drive::Pd { .. });
+    if m.task.constraints.torque.is_none() && dofs.iter().any(of_force) {
+        return refuse(
+            "[constraints] guard = true without a torque limit would ask for more than the motors give; add torque = { scale = 1.0 }".into(),
+        );
+    }
+    if m.action_lower.len() != dofs.len() {
+        return refuse(format!(
+            "[constraints] guard = true needs one motor for each controllable joint, but there are {} actions for {} joints; name the driven \
+             joints in state.controllable",
+            m.action_lower.len(),
+            dofs.len()
+        ));
+    }
+    let motors = dofs.iter().zip(m.action_lower.iter().zip(&m.action_upper));
+    for (&i, (lower, upper)) in motors.filter(|(i, _)| drives[**i] == Drive::Effort) {
+        let (effort, most) = (model.effort_limit()[i], upper.max(-lower));
+        if (most - effort).abs() > 1e-9 * effort.max(1.0) {
+            return refuse(format!(
+                "[constraints] guard = true needs actions in N m or N, but that of joint '{}' goes to {most} and its motor to {effort}; write \
+                 <motor gear=\"1\"> with the joint's torque as its ctrlrange",
+                model.dof_name(i)
+            ));
+        }
+    }
+    Ok(())
+}
