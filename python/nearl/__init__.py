@@ -71,14 +71,16 @@ try:
     import gymnasium as _gymnasium  # noqa: F401
 except ImportError:  # the extra [train] is not installed
     def __getattr__(name: str):
-        if name in ("Env", "VecEnv", "from_gymnasium", "make_vec", "register"):
+        if name in ("Env", "Guard", "ProjectedEnv", "VecEnv", "from_gymnasium", "make_vec", "register"):
             raise ImportError(f"nearl.{name} needs Gymnasium: pip install 'nearl[train]'")
         raise AttributeError(f"module 'nearl' has no attribute '{name}'")
 else:
     from nearl.env import Env
     from nearl.from_gymnasium import from_gymnasium
+    from nearl.guard import Guard
+    from nearl.projected import ProjectedEnv
     from nearl.registration import register
     from nearl.vector import VecEnv, make_vec
 
-    __all__ += ["Env", "VecEnv", "from_gymnasium", "make_vec", "register"]
+    __all__ += ["Env", "Guard", "ProjectedEnv", "VecEnv", "from_gymnasium", "make_vec", "register"]
     register()

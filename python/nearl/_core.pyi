@@ -454,6 +454,7 @@ class VecEnv:
         threads: int,
         max_episode_steps: int | None,
         same_step: bool,
+        actions: str = "state",
     ) -> VecEnv: ...
     def reset(self, seeds: Sequence[int | None] | None = None) -> _Floats: ...
     def step(

@@ -41,7 +41,7 @@ def _register(name: str, task: str, max_episode_steps: int) -> str:
     if env_id not in gymnasium.registry:
         gymnasium.register(
             id=env_id,
-            entry_point="nearl.env:Env",
+            entry_point="nearl.projected:make",
             vector_entry_point="nearl.vector:VecEnv",
             max_episode_steps=max_episode_steps,
             kwargs={"task": task},

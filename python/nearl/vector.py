@@ -40,6 +40,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         reward: Outcome | None = None,
         termination: Outcome | None = None,
+        actions: str = "state",
     ):
         mode = AutoresetMode(autoreset_mode)
         if mode is AutoresetMode.DISABLED:
@@ -50,7 +51,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         task = os.fspath(task)
         constraints = None if constraints is None else os.fspath(constraints)
         same_step = mode is AutoresetMode.SAME_STEP
-        self._native = _core.VecEnv(task, num_envs, constraints, seed, threads, max_episode_steps, same_step)
+        self._native = _core.VecEnv(task, num_envs, constraints, seed, threads, max_episode_steps, same_step, actions)
         self.num_envs = num_envs
         self._reward, self._termination = reward, termination
         self._obs = np.zeros((num_envs, self._native.n_obs))
@@ -145,6 +146,7 @@ def make_vec(
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     reward: Outcome | None = None,
     termination: Outcome | None = None,
+    actions: str = "state",
 ) -> VecEnv:
     """A vector of native environments.
 
@@ -155,6 +157,10 @@ def make_vec(
             file of a trained agent: an action is the proposed next state, one entry per ``native.action_names``; it is projected
             onto the constraints and inverted to an action by the controller that also runs on the robot. A step then spans one
             policy period.
+        actions: What an action is with ``constraints``. ``"state"``: the proposed next state. ``"change"``: its change in [-1, 1], in units of what
+            the limits allow in a policy period (of a trained agent, of three standard deviations of its changes). ``"guarded"`` (with
+            ``constraints="task"``): what the actuators get, which gives way where the state it leads to would break a limit; the robot model tells
+            where the task has analytic inverse dynamics, else the simulator, for positions and velocities.
         seed: Environment ``i`` draws from the stream of ``seed + i`` until ``reset(seed=...)`` says otherwise.
         threads: Threads to step on; all cores by default. Results do not depend on it.
         reward: ``reward(obs, actions, next_obs)`` for all environments at once, arrays of num_envs rows in, (num_envs,) out: replaces
@@ -166,4 +172,4 @@ def make_vec(
         ValueError: unknown task, a task without analytic inverse dynamics and no snapshot, or a snapshot of another task.
         OSError: the snapshot cannot be read.
     """
-    return VecEnv(task, num_envs, constraints, seed, threads, autoreset_mode=autoreset_mode, reward=reward, termination=termination)
+    return VecEnv(task, num_envs, constraints, seed, threads, autoreset_mode=autoreset_mode, reward=reward, termination=termination, actions=actions)

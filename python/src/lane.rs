@@ -2,6 +2,7 @@
 
 use nearl_runtime::{Controller, Noise, Output, State};
 use nearl_trainer::env::{ChaCha8Rng, Env, EnvError, Fault, SeedableRng};
+use nearl_trainer::foresight::{Foresight, Verdict};
 
 /// When an episode that ended is begun anew (<https://farama.org/Vector-Autoreset-Mode>).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,11 +22,27 @@ pub(crate) enum Work {
     Step(Autoreset),
 }
 
-/// Proposals instead of torques: the action is the next state that a policy would propose.
+/// What an action of a constrained environment is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Meaning {
+    /// The next state, entry by entry.
+    State,
+    /// The change of the state, in units of [`Proposing::unit`].
+    Change,
+    /// What the actuators get, where the guard allows it.
+    Action,
+}
+
+/// A controller between action and actuators.
 ///
-/// The controller's own policy is all zeros with unit deviation, so that the noise it is given is the change that is
-/// proposed, `proposal_k = s_k + scale_k noise_k`: the action takes the way every proposal takes.
+/// Its own policy is all zeros with unit deviation, so that the noise it is given is what it puts out: the change that is
+/// proposed, `proposal_k = s_k + scale_k noise_k`, or the action. Either takes the way that a policy's takes.
 pub(crate) struct Proposing {
+    pub(crate) meaning: Meaning,
+    /// Change of an entry that an action of 1 asks for (n_state).
+    pub(crate) unit: Vec<f64>,
+    /// Asks the simulator where the action leads, instead of the robot model.
+    pub(crate) foresight: Option<Foresight>,
     pub(crate) controller: Controller,
     pub(crate) scale: Vec<f64>,
     pub(crate) state: State,
@@ -164,16 +181,35 @@ impl Lane {
 }
 
 impl Proposing {
-    /// Noise that makes the controller propose `state` (n_state).
-    fn want(&mut self, state: &[f64], env: &dyn Env) {
+    /// Noise that makes the controller propose, or do, what `action` means.
+    fn want(&mut self, action: &[f64], env: &dyn Env) {
         env.observe(&mut self.state.obs);
         let layout = self.controller.layout();
-        for (k, s) in state.iter().enumerate() {
-            self.noise.proposal[k] = ((s - self.state.obs[layout.state()[k]]) / self.scale[k]) as f32;
+        match self.meaning {
+            Meaning::State => {
+                for (k, s) in action.iter().enumerate() {
+                    self.noise.proposal[k] = ((s - self.state.obs[layout.state()[k]]) / self.scale[k]) as f32;
+                }
+            }
+            Meaning::Change => {
+                for (k, change) in action.iter().enumerate() {
+                    self.noise.proposal[k] = (change * self.unit[k] / self.scale[k]) as f32;
+                }
+            }
+            Meaning::Action if self.foresight.is_some() => self.out.action.copy_from_slice(action),
+            Meaning::Action => {
+                self.noise.action.iter_mut().zip(action).for_each(|(noise, a)| *noise = *a as f32);
+            }
         }
     }
 
     fn tick(&mut self, env: &mut dyn Env, projected: &mut Projected) -> nearl_trainer::env::Step {
+        if let Some(foresight) = &mut self.foresight {
+            let verdict = foresight.update(env, &mut self.out.action);
+            projected.raw_violations += u32::from(verdict != Verdict::Kept);
+            projected.target_violations += u32::from(verdict == Verdict::Outside);
+            return env.step(&self.out.action);
+        }
         env.observe(&mut self.state.obs);
         env.state(&mut self.state.q, &mut self.state.v);
         self.controller.update(&self.state, &self.noise, &mut self.out);

@@ -3,13 +3,15 @@
 use std::path::Path;
 use std::sync::Mutex;
 
-use nearl_constraints::{Model, StateLayout};
+use nearl_constraints::{Guard, Model, StateLayout};
+use nearl_runtime::controller::Parts;
 use nearl_runtime::net::{Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot};
 use nearl_trainer::env::{self, ChaCha8Rng, SeedableRng};
-use nearl_trainer::{tasks, train};
+use nearl_trainer::foresight::Foresight;
+use nearl_trainer::{plant, tasks, train};
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -17,7 +19,7 @@ use pyo3::types::PyDict;
 use crate::arrays::{array, array2, matrix};
 use crate::env::fault_name;
 use crate::errors;
-use crate::lane::{Autoreset, Lane, Proposing, Work};
+use crate::lane::{Autoreset, Lane, Meaning, Proposing, Work};
 use crate::pool::Pool;
 
 /// `n` environments of one task (see `nearl.make_vec`).
@@ -43,8 +45,9 @@ type Stepped<'py> = (
 
 #[pymethods]
 impl VecEnv {
-    /// `constraints`: None, "task", or a snapshot file. `same_step`: how an ended episode is begun anew.
+    /// `constraints`: None, "task", or a snapshot file; `actions`: what an action is then. `same_step`: how an ended episode is begun anew.
     #[new]
+    #[pyo3(signature = (task, num_envs, constraints, seed, threads, max_episode_steps, same_step, actions="state"))]
     fn new(
         py: Python<'_>,
         task: &str,
@@ -54,7 +57,23 @@ impl VecEnv {
         threads: usize,
         max_episode_steps: Option<usize>,
         same_step: bool,
+        actions: &str,
     ) -> PyResult<VecEnv> {
+        let meaning = match actions {
+            "state" => Meaning::State,
+            "change" => Meaning::Change,
+            "guarded" => Meaning::Action,
+            other => {
+                return Err(errors::value(format!(
+                    "actions is '{other}'; give \"state\", \"change\" or \"guarded\""
+                )));
+            }
+        };
+        if constraints.is_none() && meaning != Meaning::State {
+            return Err(errors::value(format!(
+                "actions is '{actions}' without constraints; give constraints=\"task\" too"
+            )));
+        }
         if num_envs == 0 {
             return Err(errors::value("num_envs is 0; ask for at least one environment"));
         }
@@ -62,25 +81,36 @@ impl VecEnv {
             let first = tasks::env(task).map_err(errors::task)?;
             let open = match constraints.as_deref() {
                 None => None,
+                Some("task") if meaning == Meaning::Action => Some(guarded_snapshot(task)?),
                 Some("task") => Some(task_snapshot(task)?),
+                Some(_) if meaning == Meaning::Action => {
+                    return Err(errors::value(
+                        "actions is 'guarded', which needs no trained agent; give constraints=\"task\"",
+                    ));
+                }
                 Some(file) => Some(agent_snapshot(&first.spec().name, file)?),
             };
             let spec = first.spec().clone();
             let max_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
             let space = match &open {
                 None => Space::actions(&spec),
-                Some(snapshot) => Space::proposals(snapshot)?,
+                Some(_) if meaning == Meaning::Action => Space::actions(&spec),
+                Some(snapshot) => Space::proposals(snapshot, meaning)?,
             };
             let lanes = (0..num_envs as u64)
                 .map(|i| {
                     let env = first.another().map_err(errors::value)?;
-                    let proposing = open.as_ref().map(proposing).transpose()?;
+                    let proposing = open.as_ref().map(|s| proposing(s, &*env, meaning)).transpose()?;
                     Ok(Lane::new(env, proposing, space.names.len(), max_steps, seed.wrapping_add(i)))
                 })
                 .collect::<PyResult<Vec<_>>>()?;
             let pool = Pool::new(lanes, threads).map_err(errors::value)?;
             let mode = if same_step { Autoreset::SameStep } else { Autoreset::NextStep };
-            let (n_obs, dt) = (spec.n_obs(), spec.dt * space.ticks as f64);
+            let ticks = match &open {
+                Some(snapshot) => snapshot.manifest.task.time.policy_every,
+                None => 1,
+            };
+            let (n_obs, dt) = (spec.n_obs(), spec.dt * ticks as f64);
             Ok(VecEnv {
                 pool: Mutex::new(pool),
                 mode,
@@ -281,28 +311,26 @@ struct Space {
     names: Vec<String>,
     low: Vec<f64>,
     high: Vec<f64>,
-    /// Control periods in a step.
-    ticks: usize,
 }
 
 impl Space {
     fn actions(spec: &env::Spec) -> Space {
         let names = spec.actuators.iter().map(|a| a.name.clone()).collect();
-        Space { names, low: spec.action_low().collect(), high: spec.action_high().collect(), ticks: 1 }
+        Space { names, low: spec.action_low().collect(), high: spec.action_high().collect() }
     }
 
-    /// A proposed position ranges over the joint's limits, a velocity over its own; anything else is unbounded.
-    fn proposals(snapshot: &Snapshot) -> PyResult<Space> {
+    /// A proposed position ranges over the joint's limits, a velocity over its own; anything else is unbounded. A change ranges over [-1, 1].
+    fn proposals(snapshot: &Snapshot, meaning: Meaning) -> PyResult<Space> {
         let controller = Controller::new(snapshot).map_err(errors::snapshot)?;
         let (model, layout) = (controller.model(), controller.layout());
         let (mut names, mut low, mut high) = (Vec::new(), Vec::new(), Vec::new());
         for k in 0..layout.n_state() {
-            let (l, h) = range(model, layout, k);
+            let (l, h) = if meaning == Meaning::Change { (-1.0, 1.0) } else { range(model, layout, k) };
             names.push(layout.state_name(k).to_owned());
             low.push(l);
             high.push(h);
         }
-        Ok(Space { names, low, high, ticks: controller.policy_every() })
+        Ok(Space { names, low, high })
     }
 }
 
@@ -363,21 +391,50 @@ fn agent_snapshot(task: &str, file: &str) -> PyResult<Snapshot> {
 fn open(mut snapshot: Snapshot) -> Snapshot {
     let (n_obs, n_state) =
         (snapshot.networks.normaliser.mean.len(), snapshot.networks.normaliser.scale.len());
-    let layer = DenseLayer {
-        n_in: n_obs,
-        n_out: n_state,
-        weight: vec![0.0; n_obs * n_state],
-        bias: vec![0.0; n_state],
-    };
-    snapshot.networks.policy = Dense { layers: vec![layer] };
+    snapshot.networks.policy = Dense { layers: vec![zeros(n_obs, n_state)] };
     snapshot.networks.policy_log_std = vec![0.0; n_state];
     snapshot.manifest.policy = PolicyKind::Stochastic;
     snapshot.manifest.functions.clear();
     snapshot
 }
 
-fn proposing(snapshot: &Snapshot) -> PyResult<Proposing> {
+/// The task's limits around actions as the actuators take them: by the robot model where it knows what they lead to, else by the simulator.
+fn guarded_snapshot(task: &str) -> PyResult<Snapshot> {
+    let mut manifest = tasks::load(task, &[]).map_err(errors::task)?;
+    let by_model = manifest.task.idm.kind == IdmKind::Pinocchio;
+    manifest.task.constraints.guard = if by_model { Guard::Model } else { Guard::Simulator };
+    train::complete(&mut manifest).map_err(errors::value)?;
+    manifest.policy = PolicyKind::Direct;
+    let n_obs = manifest.task.state.observation.len();
+    let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
+    let n_act = manifest.action_lower.len();
+    let policy = Dense { layers: vec![zeros(n_obs, n_act)] };
+    let normaliser = Normaliser::identity(n_obs, n_state);
+    let networks = Networks { normaliser, policy, policy_log_std: vec![0.0; n_act], idm: None };
+    Ok(Snapshot { manifest, networks })
+}
+
+fn zeros(n_in: usize, n_out: usize) -> DenseLayer {
+    DenseLayer { n_in, n_out, weight: vec![0.0; n_in * n_out], bias: vec![0.0; n_out] }
+}
+
+fn proposing(snapshot: &Snapshot, env: &dyn env::Env, meaning: Meaning) -> PyResult<Proposing> {
     let controller = Controller::new(snapshot).map_err(errors::snapshot)?;
     let (state, noise, out) = (controller.state(), controller.noise(), controller.output());
-    Ok(Proposing { scale: controller.normaliser().scale.clone(), controller, state, noise, out })
+    let scale = controller.normaliser().scale.clone();
+    let unit = if meaning == Meaning::Change { units(snapshot, &controller)? } else { Vec::new() };
+    let asks = meaning == Meaning::Action && snapshot.manifest.task.constraints.guard == Guard::Simulator;
+    let foresight = asks.then(|| {
+        Foresight::new(env, &plant::watched_limits(env, controller.model(), controller.limits()))
+    });
+    Ok(Proposing { meaning, unit, foresight, scale, controller, state, noise, out })
+}
+
+/// The change that an action of 1 asks for: what the limits allow in a policy period, or three standard deviations of a trained agent's changes.
+fn units(snapshot: &Snapshot, controller: &Controller) -> PyResult<Vec<f64>> {
+    if snapshot.manifest.task.idm.kind == IdmKind::Learned {
+        return Ok(controller.normaliser().scale.iter().map(|s| 3.0 * s).collect());
+    }
+    let parts = Parts::new(&snapshot.manifest).map_err(errors::snapshot)?;
+    train::limit_scale(&parts, &snapshot.manifest).map_err(errors::value)
 }

@@ -121,7 +121,7 @@ fn without_the_guard_both_break_them() {
 /// An arm that begins to fall is within limits that let it: its torques come through (which [`run`] checks), in most ticks.
 #[test]
 fn what_is_allowed_comes_through_bit_for_bit() {
-    let o = run(&direct(4, 0.5, &[ON, "constraints.acceleration={ limit = 200.0 }"]), 4, 4000, 40);
+    let o = run(&direct(4, 0.02, &[ON, "constraints.acceleration={ limit = 200.0 }"]), 4, 4000, 40);
     assert!(o.moved < 2000, "{} of 4000 ticks were moved", o.moved);
 }
 

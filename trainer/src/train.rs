@@ -10,7 +10,7 @@ mod source;
 pub use columns::COLUMNS;
 pub use run::{resume, resume_on, train, train_on};
 pub use served::{ServedError, ServedSource};
-pub use setup::complete;
+pub use setup::{complete, limit_scale};
 pub use source::{Experience, Source, SourceError};
 
 use crate::checkpoint::CheckpointError;
@@ -24,7 +24,7 @@ use nearl_runtime::controller::{Parts, seen_entries};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
-use setup::{check_minibatch, check_outputs, check_reward, learner, limit_scale, policy_kind};
+use setup::{check_minibatch, check_outputs, check_reward, learner, policy_kind};
 use std::time::Instant;
 
 /// Names of the algorithms.

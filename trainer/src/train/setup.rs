@@ -156,7 +156,10 @@ pub(super) fn check_minibatch(minibatch: usize, batch: usize) -> Result<(), Trai
 }
 
 /// What the limits allow in one policy period: `a_max T` for velocities, `v_max T` for positions.
-pub(super) fn limit_scale(parts: &Parts, manifest: &Manifest) -> Result<Vec<f64>, TrainError> {
+///
+/// # Errors
+/// [`TrainError::Settings`] for an entry without such limits.
+pub fn limit_scale(parts: &Parts, manifest: &Manifest) -> Result<Vec<f64>, TrainError> {
     use nearl_runtime::constraints::Entry;
     let period = manifest.task.time.dt * manifest.task.time.policy_every as f64;
     let limits = parts.projector.limits();

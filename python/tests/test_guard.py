@@ -1,0 +1,137 @@
+"""`nearl.Guard`, and environments whose actions pass the constraints: what is promised is measured on the environment's own state."""
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+mujoco = pytest.importorskip("mujoco")
+
+import nearl
+from nearl.guard import nearest
+
+LIMITS = {"position": {}, "velocity": {"limit": 25.0}}
+
+
+def outside(env) -> bool:
+    """By the robot file's ranges, not by the guard's own words."""
+    m, data = env.unwrapped.model, env.unwrapped.data
+    ranged = m.jnt_limited.astype(bool)
+    q, v = data.qpos[m.jnt_qposadr[ranged]], data.qvel[m.jnt_dofadr[ranged]]
+    low, high = m.jnt_range[ranged].T
+    return bool((q < low - 1e-9).any() or (q > high + 1e-9).any() or (np.abs(v) > 25.0 + 1e-9).any())
+
+
+def test_bang_bang_actions_end_within_the_limits():
+    count = {}
+    for guarded in (False, True):
+        env = gymnasium.make("HalfCheetah-v5")
+        env = nearl.Guard(env, LIMITS) if guarded else env
+        env.reset(seed=1)
+        rng = np.random.default_rng(2)
+        count[guarded] = 0
+        for _ in range(400):
+            action = np.sign(rng.uniform(-1, 1, 6)).astype(np.float32)
+            _, _, _, _, info = env.step(action)
+            count[guarded] += outside(env)
+            if guarded:
+                assert (info["guard"] == "outside") == outside(env) == env.outside
+                assert info["guard"] != "kept" or (info["action"] == action).all()
+    assert count[False] > 40 and count[True] <= 4, count
+
+
+def test_what_is_allowed_changes_nothing():
+    plain, guarded = gymnasium.make("HalfCheetah-v5"), nearl.Guard(gymnasium.make("HalfCheetah-v5"), LIMITS)
+    plain.reset(seed=3)
+    guarded.reset(seed=3)
+    rng = np.random.default_rng(4)
+    kept = 0
+    for _ in range(60):
+        action = rng.uniform(-0.2, 0.2, 6).astype(np.float32)
+        expected = plain.step(action)
+        obs, reward, *_, info = guarded.step(action)
+        if info["guard"] != "kept":
+            break
+        kept += 1
+        assert (obs == expected[0]).all() and reward == expected[1]
+    assert kept > 5
+
+
+def test_nearest_is_the_solution_of_a_general_solver():
+    quadprog = pytest.importorskip("quadprog")
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        asked, trial, slope = rng.uniform(-1, 1, 4), rng.uniform(-1, 1, 4), rng.normal(size=(3, 4))
+        value = slope @ (rng.uniform(-0.9, 0.9, 4) - trial)  # some action has it
+        lower, upper = value - 0.1, value + 0.1
+        u = nearest(asked, trial, slope, lower, upper)
+        rows = np.vstack([slope, -slope, np.eye(4), -np.eye(4)])
+        least = np.concatenate([lower + slope @ trial, -upper - slope @ trial, -np.ones(8)])
+        best = quadprog.solve_qp(np.eye(4), asked, rows.T, least)[0]
+        assert np.abs(u - best).max() < 1e-2
+
+
+@pytest.mark.parametrize(
+    ("constraints", "words"),
+    [
+        ({"torque": {}}, "torque"),
+        ({"velocity": {"limit": {"knee": 1.0}}}, "knee"),
+        ({"velocity": {"limit": -1.0}}, "-1.0"),
+        ({"position": {"margin": 9.0}}, "margin"),
+        ({"velocity": {}}, "limit"),
+    ],
+)
+def test_what_is_no_limit_is_refused_by_name(constraints, words):
+    with pytest.raises(ValueError, match=words):
+        nearl.Guard(gymnasium.make("HalfCheetah-v5"), constraints)
+
+
+def test_an_environment_without_mujoco_is_refused():
+    with pytest.raises(ValueError, match="MujocoEnv"):
+        nearl.Guard(gymnasium.make("CartPole-v1"), LIMITS)
+
+
+@pytest.mark.parametrize("actions", ["state", "change", "guarded"])
+def test_random_actions_of_every_meaning_break_no_limit_of_the_panda(actions):
+    env = gymnasium.make("nearl/Panda-reach", constraints="task", actions=actions)
+    assert np.isfinite(env.action_space.low).all() and np.isfinite(env.action_space.high).all()
+    env.action_space.seed(6)
+    obs, _ = env.reset(seed=7)
+    raw = steps = 0
+    for _ in range(300):
+        obs, _, terminated, truncated, info = env.step(env.action_space.sample())
+        assert info["target_violations"] == 0
+        raw, steps = raw + info["raw_violations"], steps + 1
+        q, v = obs[:7], obs[7:14]
+        assert (np.abs(v) <= 2.62).all() and (np.abs(q) <= 3.76).all()
+        if terminated or truncated:
+            env.reset()
+    assert raw > 100, "the actions must be wild for this to mean anything"
+
+
+def test_a_vector_of_guarded_cheetahs_stays_inside():
+    count = {}
+    for actions in (None, "guarded"):
+        kwargs = {} if actions is None else {"constraints": "task", "actions": actions}
+        envs = nearl.make_vec("HalfCheetah-v5", 4, **kwargs)
+        envs.reset(seed=8)
+        rng = np.random.default_rng(9)
+        file = gymnasium.make("HalfCheetah-v5").unwrapped.model
+        low, high = file.jnt_range[3:].T
+        count[actions] = 0
+        for _ in range(200):
+            *_, info = envs.step(np.sign(rng.uniform(-1, 1, (4, 6))))
+            q, v = envs.native.qpos[:, 3:], envs.native.qvel[:, 3:]
+            beyond = (q < low - 1e-9) | (q > high + 1e-9) | (np.abs(v) > 25.0 + 1e-9)
+            count[actions] += beyond.any(axis=1).sum()
+            if actions:
+                assert (beyond.any(axis=1) == (info["target_violations"] > 0)).all()
+    assert count[None] > 50 and count["guarded"] <= 8, count
+
+
+def test_actions_of_an_unknown_meaning_are_refused():
+    with pytest.raises(ValueError, match="'torque'"):
+        nearl.make_vec("Panda-reach", 1, constraints="task", actions="torque")
+    with pytest.raises(ValueError, match="without constraints"):
+        nearl.make_vec("Panda-reach", 1, actions="change")
+    with pytest.raises(ValueError, match="without constraints"):
+        gymnasium.make("nearl/Panda-reach", actions="guarded")
