@@ -16,6 +16,9 @@ _Soft = tuple[float, float]
 _Status = Literal["unchanged", "clamped", "solved", "slowed", "recovering", "braked", "refused"]
 
 def tasks() -> list[tuple[str, str]]: ...
+def nearest_action(
+    asked: Sequence[float], trial: ArrayLike, slope: ArrayLike, lower: ArrayLike, upper: ArrayLike
+) -> _Floats: ...
 
 class ActiveRow(TypedDict):
     kind: Literal[

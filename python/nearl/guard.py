@@ -7,6 +7,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nearl import _core
+
 Floats = NDArray[np.float64]
 PerJoint = float | Mapping[str, float]
 
@@ -15,8 +17,6 @@ DRAWS = 64  # actions drawn where these do not do
 STEP = 0.01  # of the differences, as a share of an action's range
 INSIDE = 1e-3  # how far inside the limits linearised dynamics aim, as a share of a limit's size
 ROUNDING = 1e-9
-WORTH = 1e3  # what a row's excess costs in the distance
-SWEEPS = 200
 
 
 class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -108,7 +108,7 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
                 beside[k] += step
                 slope[:, k] = (self._foresee(self._middle + self._half * beside) - at) / step
             inside = INSIDE * self._size
-            trial = nearest(asked, trial, slope, self._lower + inside - at, self._upper - inside - at)
+            trial = _core.nearest_action(asked, trial, slope, self._lower + inside - at, self._upper - inside - at)
             at = self._foresee(self._middle + self._half * trial)
             excess = self._excess(at)
             if excess < least:
@@ -169,32 +169,6 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
         if (lower > upper).any():
             raise ValueError("a joint has no position or velocity left within its limits; give a smaller margin")
         return list(q), list(v), lower, upper
-
-
-def nearest(asked: Floats, trial: Floats, slope: Floats, lower: Floats, upper: Floats) -> Floats:
-    """The u in [-1, 1] nearest to ``asked`` with ``lower <= slope (u - trial) <= upper``, rows giving way where they cannot all hold.
-
-    Coordinate ascent on the dual (Hildreth 1957), its multipliers bounded.
-    """
-    length = np.linalg.norm(slope, axis=1)
-    moving = length > 1e-12
-    rows = np.vstack([slope[moving] / length[moving, None], np.eye(len(asked))])
-    at = rows[: moving.sum()] @ trial
-    lower = np.concatenate([lower[moving] / length[moving] + at, -np.ones(len(asked))])
-    upper = np.concatenate([upper[moving] / length[moving] + at, np.ones(len(asked))])
-    worth = np.concatenate([np.full(moving.sum(), WORTH), np.full(len(asked), np.inf)])
-    u, multiplier = asked.copy(), np.zeros(len(rows))
-    for _ in range(SWEEPS):
-        change = 0.0
-        for r, row in enumerate(rows):
-            free = row @ u + multiplier[r]
-            new = free - min(max(free, lower[r]), upper[r])
-            new = min(max(new, -worth[r]), worth[r])
-            u -= (new - multiplier[r]) * row
-            change, multiplier[r] = max(change, abs(new - multiplier[r])), new
-        if change < 1e-9:
-            break
-    return np.clip(u, -1.0, 1.0)
 
 
 def _per_joint(value: PerJoint, joints: Mapping[str, int], what: str) -> dict[str, float]:

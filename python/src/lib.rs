@@ -12,6 +12,7 @@ mod limits;
 mod link;
 mod loop_link;
 mod model;
+mod nearest;
 mod pool;
 mod projector;
 mod target;
@@ -38,6 +39,8 @@ mod _core {
     use super::loop_link::{LoopClient, loop_modes};
     #[pymodule_export]
     use super::model::Model;
+    #[pymodule_export]
+    use super::nearest::nearest_action;
     #[pymodule_export]
     use super::projector::Projector;
     #[pymodule_export]

@@ -424,9 +424,8 @@ fn proposing(snapshot: &Snapshot, env: &dyn env::Env, meaning: Meaning) -> PyRes
     let scale = controller.normaliser().scale.clone();
     let unit = if meaning == Meaning::Change { units(snapshot, &controller)? } else { Vec::new() };
     let asks = meaning == Meaning::Action && snapshot.manifest.task.constraints.guard == Guard::Simulator;
-    let foresight = asks.then(|| {
-        Foresight::new(env, &plant::watched_limits(env, controller.model(), controller.limits()))
-    });
+    let foresight = asks
+        .then(|| Foresight::new(env, &plant::watched_limits(env, controller.model(), controller.limits())));
     Ok(Proposing { meaning, unit, foresight, scale, controller, state, noise, out })
 }
 

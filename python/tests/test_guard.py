@@ -7,7 +7,7 @@ gymnasium = pytest.importorskip("gymnasium")
 mujoco = pytest.importorskip("mujoco")
 
 import nearl
-from nearl.guard import nearest
+from nearl._core import nearest_action
 
 LIMITS = {"position": {}, "velocity": {"limit": 25.0}}
 
@@ -56,14 +56,14 @@ def test_what_is_allowed_changes_nothing():
     assert kept > 5
 
 
-def test_nearest_is_the_solution_of_a_general_solver():
+def test_the_nearest_action_is_the_solution_of_a_general_solver():
     quadprog = pytest.importorskip("quadprog")
     rng = np.random.default_rng(5)
     for _ in range(50):
         asked, trial, slope = rng.uniform(-1, 1, 4), rng.uniform(-1, 1, 4), rng.normal(size=(3, 4))
         value = slope @ (rng.uniform(-0.9, 0.9, 4) - trial)  # some action has it
         lower, upper = value - 0.1, value + 0.1
-        u = nearest(asked, trial, slope, lower, upper)
+        u = nearest_action(asked, trial, slope, lower, upper)
         rows = np.vstack([slope, -slope, np.eye(4), -np.eye(4)])
         least = np.concatenate([lower + slope @ trial, -upper - slope @ trial, -np.ones(8)])
         best = quadprog.solve_qp(np.eye(4), asked, rows.T, least)[0]

@@ -47,7 +47,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let [file, ticks, seed] = &args[..] else { return Err("give SNAPSHOT TICKS SEED".into()) };
     let (ticks, seed) = (ticks.parse::<usize>()?, seed.parse::<u64>()?);
     let snapshot = Snapshot::load(Path::new(file))?;
-    println!("task,guard,ticks,outside,unavoidable,began_inside,outside_from_inside,unavoidable_from_inside,mean_return,episodes,steps_per_second");
+    println!(
+        "task,guard,ticks,outside,unavoidable,began_inside,outside_from_inside,unavoidable_from_inside,mean_return,episodes,steps_per_second"
+    );
     for guarded in [false, true] {
         let mut run = Run::new(&snapshot, guarded, seed)?;
         let count = run.count(ticks)?;
@@ -158,7 +160,13 @@ impl Run {
                 match k % 4 {
                     0 | 2 => (self.out.action[i] + half * r * r * r).clamp(*low, *high),
                     1 => low + half * (r + 1.0),
-                    _ => if r > 0.0 { *high } else { *low },
+                    _ => {
+                        if r > 0.0 {
+                            *high
+                        } else {
+                            *low
+                        }
+                    }
                 }
             };
             let action: Vec<f64> = ranges.iter().enumerate().map(draw).collect();

@@ -5,8 +5,9 @@
 
 mod nearest;
 
+pub use nearest::Nearest;
+
 use crate::env::{Env, Limits};
-use nearest::Nearest;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;

@@ -1,7 +1,7 @@
 //! The nearest action by linearised dynamics: a small quadratic programme whose rows may give way.
 
 /// Sweeps over the rows.
-const SWEEPS: usize = 200;
+const SWEEPS: usize = 500;
 /// What a row's excess costs, in units of the distance: rows give way only where they cannot all hold.
 const WORTH: f64 = 1e3;
 /// Change of a multiplier that ends the sweeps.
@@ -15,7 +15,7 @@ const SMALL: f64 = 1e-9;
 ///
 /// with rows scaled to unit length, by coordinate ascent on the dual (Hildreth 1957): a multiplier that would pass `WORTH` stays there. Exact in the
 /// limit; an answer counts only after a step of the simulator.
-pub(super) struct Nearest {
+pub struct Nearest {
     n: usize,
     u: Vec<f64>,
     /// Multiplier of each row (signed: positive at its upper bound), then of the box.
@@ -24,22 +24,18 @@ pub(super) struct Nearest {
 }
 
 impl Nearest {
-    pub(super) fn new(n: usize, rows: usize) -> Nearest {
+    /// For `n` actions and `rows` rows.
+    pub fn new(n: usize, rows: usize) -> Nearest {
         Nearest { n, u: vec![0.0; n], multiplier: vec![0.0; rows + n], scale: vec![0.0; rows] }
     }
 
-    pub(super) fn solution(&self) -> &[f64] {
+    /// The last solution (n).
+    pub fn solution(&self) -> &[f64] {
         &self.u
     }
 
-    /// `slope` (rows x n) at `trial` (n); `bounds` of a row are those of its change from there.
-    pub(super) fn solve(
-        &mut self,
-        asked: &[f64],
-        trial: &[f64],
-        slope: &[f64],
-        bounds: impl Fn(usize) -> [f64; 2],
-    ) {
+    /// Solves with `slope` (rows x n) at `trial` (n); `bounds` of a row are those of its change from there.
+    pub fn solve(&mut self, asked: &[f64], trial: &[f64], slope: &[f64], bounds: impl Fn(usize) -> [f64; 2]) {
         let (n, rows) = (self.n, self.scale.len());
         self.u.copy_from_slice(asked);
         self.multiplier.fill(0.0);
