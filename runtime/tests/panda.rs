@@ -7,9 +7,9 @@ use std::path::Path;
 use std::time::Duration;
 
 use arm::*;
-use nearl_runtime::Manifest;
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
+use nearl_runtime::{Manifest, PolicyKind};
 use toy::Name;
 
 #[test]
@@ -47,6 +47,50 @@ fn random_weights_swapped_in_motion_break_no_limit_and_the_stop_ends_at_rest() {
     );
     let fastest = plant.speeds.iter().copied().fold(0.0, f64::max);
     assert!(fastest > 0.5, "the arm must move for this to mean anything: {fastest} rad/s");
+    assert!(*plant.speeds.last().unwrap() < 1e-2, "it stops by its own torques");
+}
+
+/// A policy of torques under its guard: the same promise in the loop, over hot swaps, with a brake of its own at the end.
+#[test]
+fn random_torques_are_guarded_in_the_loop() {
+    let name = Name::new("panda-guarded");
+    let guarded = |version| {
+        let mut snapshot = snapshot(version, |m| {
+            m.policy = PolicyKind::Direct;
+            m.task.constraints.guard = nearl_constraints::Guard::Model;
+        });
+        let policy = &mut snapshot.networks.policy;
+        let last = policy.layers.last_mut().unwrap();
+        (last.n_out, last.weight) = (N, weights(version + 3, 16 * N).iter().map(|w| 40.0 * w).collect());
+        last.bias = weights(version + 4, N);
+        snapshot.networks.policy_log_std = vec![0.0; N];
+        snapshot
+    };
+    let file = File::new("panda-guarded", &guarded(1));
+    let plant = start(&name, &guarded(1));
+    let stop = Stop::new();
+    let running = execute(&name, &file.0, &stop);
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    trainer.wait_for_runtime(Duration::from_secs(20)).unwrap();
+    for version in 2..=4 {
+        trainer.push(version, &guarded(version).to_bytes()).unwrap();
+        let receipt = trainer.wait_for_receipt(version, Duration::from_secs(20)).unwrap();
+        assert_eq!(receipt.verdict(), Verdict::Accepted, "{}", receipt.text());
+        while trainer.state().is_none_or(|s| s.tick < receipt.tick + 600) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+    stop.request();
+    let report = running.join().unwrap().unwrap();
+    let (plant, counted) = plant.end();
+    assert_eq!((report.counters.swaps, report.counters.projected_violations, counted.late), (3, 0, 0));
+    assert!(report.counters.raw_violations > 1000, "{:?}", report.counters);
+    assert!(
+        plant.worst.iter().all(|excess| *excess <= 1e-9),
+        "position, velocity, torque: {:?}",
+        plant.worst
+    );
+    assert!(plant.speeds.iter().copied().fold(0.0, f64::max) > 0.5, "the arm must move");
     assert!(*plant.speeds.last().unwrap() < 1e-2, "it stops by its own torques");
 }
 
