@@ -41,6 +41,14 @@ impl Verdict {
     }
 }
 
+/// What rows and cones are judged for.
+enum Meant<'a> {
+    /// What they ask of a target, with the tick before.
+    Asked(Option<Previous<'a>>),
+    /// What they are there to keep.
+    Kept,
+}
+
 /// Scratch and constants of the judge.
 pub struct Checker {
     dynamics: Dynamics,
@@ -131,20 +139,32 @@ impl Checker {
         previous: Option<Previous<'_>>,
     ) -> Verdict {
         let mut verdict = Verdict::default();
+        self.boxes(&mut verdict, (q, v), (q_next, v_next));
+        self.prepare(q, v, v_next, external);
+        self.coupled(&mut verdict, (q, v), (q_next, v_next), Meant::Asked(previous));
+        verdict
+    }
+
+    /// The limits of single joints.
+    fn boxes(&mut self, verdict: &mut Verdict, (q, v): (&[f64], &[f64]), (q_next, v_next): (&[f64], &[f64])) {
         for k in 0..self.dofs.len() {
             let (i, iq) = self.dofs[k];
             let a = (v_next[i] - v[i]) / self.period.dt;
             verdict.see(Kind::Velocity, i, v_next[i].abs(), self.limits.velocity[i]);
             verdict.see(Kind::Acceleration, i, a.abs(), self.limits.acceleration[i]);
             if self.limits.has_position(i) {
-                self.positions(i, (q[iq], v[i]), (q_next[iq], v_next[i]), &mut verdict);
+                self.positions(i, (q[iq], v[i]), (q_next[iq], v_next[i]), verdict);
             }
-            self.profile(i, q_next[iq], v_next[i], &mut verdict);
+            self.profile(i, q_next[iq], v_next[i], verdict);
             if self.limits.locked[i] {
                 let slower = v[i].abs() - self.limits.braking[i] * self.period.dt;
                 verdict.see(Kind::Locked, i, v_next[i].abs(), slower.max(0.0));
             }
         }
+    }
+
+    /// Acceleration, motor forces and frames of a motion.
+    fn prepare(&mut self, q: &[f64], v: &[f64], v_next: &[f64], external: &[f64]) {
         for i in 0..v.len() {
             self.a[i] = (v_next[i] - v[i]) / self.period.dt;
         }
@@ -154,8 +174,62 @@ impl Checker {
         if self.needs.kinematics {
             self.kinematics.update(q, v, &self.a);
         }
-        self.coupled(&mut verdict, (q, v), (q_next, v_next), previous);
+    }
+
+    /// Judges the step of a brake like [`Checker::check`], its rows and cones for what they keep ([`Rows::breach`]) and no more.
+    pub fn check_brake(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        q_next: &[f64],
+        v_next: &[f64],
+        external: &[f64],
+    ) -> Verdict {
+        let mut verdict = Verdict::default();
+        self.boxes(&mut verdict, (q, v), (q_next, v_next));
+        self.prepare(q, v, v_next, external);
+        self.coupled(&mut verdict, (q, v), (q_next, v_next), Meant::Kept);
         verdict
+    }
+
+    /// Number of hard rows and cones.
+    pub(crate) fn hard(&self) -> usize {
+        let rows = self.rows.iter().filter(|r| r.hard).map(|r| r.count).sum::<usize>();
+        rows + self.cones.iter().filter(|c| c.hard).count()
+    }
+
+    /// Writes the breach of each hard row, then of each hard cone ([`Checker::hard`]); minus infinity where it is switched off.
+    pub(crate) fn breaches(
+        &mut self,
+        (q, v): (&[f64], &[f64]),
+        (q_next, v_next): (&[f64], &[f64]),
+        external: &[f64],
+        out: &mut [f64],
+    ) {
+        self.prepare(q, v, v_next, external);
+        let (acceleration, torque, period, previous) = (&self.a[..], &self.tau[..], &self.period, None);
+        let kinematics = &mut self.kinematics;
+        let mut motion = Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous };
+        out.fill(f64::NEG_INFINITY);
+        let mut first = 0;
+        for block in self.rows.iter_mut().filter(|r| r.hard) {
+            if block.enabled {
+                block.rows.breach(&mut motion, &mut out[first..first + block.count]);
+            }
+            first += block.count;
+        }
+        for block in self.cones.iter_mut().filter(|c| c.hard) {
+            if block.enabled {
+                out[first] = block.cone.breach(&mut motion);
+            }
+            first += 1;
+        }
+    }
+
+    /// Kinds of the hard rows, then of the hard cones.
+    pub(crate) fn hard_kinds(&self) -> Vec<Kind> {
+        let rows = self.rows.iter().filter(|r| r.hard).flat_map(|r| vec![r.rows.kind(); r.count]);
+        rows.chain(self.cones.iter().filter(|c| c.hard).map(|c| c.cone.kind())).collect()
     }
 
     /// Motor forces of the last motion judged, by inverse dynamics (nv); zero when no limit needs them.
@@ -181,20 +255,29 @@ impl Checker {
         verdict: &mut Verdict,
         (q, v): (&[f64], &[f64]),
         (q_next, v_next): (&[f64], &[f64]),
-        previous: Option<Previous<'_>>,
+        meant: Meant<'_>,
     ) {
+        let previous = match meant {
+            Meant::Asked(previous) => previous,
+            Meant::Kept => None,
+        };
+        let kept = matches!(meant, Meant::Kept);
         let (acceleration, torque, period) = (&self.a[..], &self.tau[..], &self.period);
         let kinematics = &mut self.kinematics;
         let mut motion = Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous };
         for block in self.rows.iter_mut().filter(|r| r.hard && r.enabled) {
             let excess = &mut self.excess[..block.count];
-            block.rows.excess(&mut motion, excess);
+            match kept {
+                true => block.rows.breach(&mut motion, excess),
+                false => block.rows.excess(&mut motion, excess),
+            }
             for (r, excess) in excess.iter().enumerate() {
                 verdict.see(block.rows.kind(), block.first + r, *excess, 0.0);
             }
         }
         for block in self.cones.iter_mut().filter(|c| c.hard && c.enabled) {
-            verdict.see(block.cone.kind(), block.row, block.cone.excess(&mut motion), 0.0);
+            let excess = if kept { block.cone.breach(&mut motion) } else { block.cone.excess(&mut motion) };
+            verdict.see(block.cone.kind(), block.row, excess, 0.0);
         }
     }
 

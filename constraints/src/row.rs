@@ -129,6 +129,13 @@ pub trait Rows: Send {
 
     /// Writes by how much the motion exceeds the limit of each row, as a share of its size; negative inside. Must not allocate.
     fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]);
+
+    /// Writes by how much the motion or the state it ends in breaks what each row is there to keep, above 0 where it does, in any unit
+    /// that is continuous along a motion. A brake is verified for this: [`excess`](Rows::excess) may ask for more, so that a way to
+    /// stop is left. Minus infinity is a row that no brake can keep. Must not allocate.
+    fn breach(&mut self, motion: &mut Motion<'_>, breach: &mut [f64]) {
+        self.excess(motion, breach);
+    }
 }
 
 /// One second-order cone `|G y + c| <= radius`.
@@ -153,6 +160,11 @@ pub trait Cone: Send {
 
     /// By how much the motion exceeds the cone, as a share of its size; negative inside. Must not allocate.
     fn excess(&mut self, motion: &mut Motion<'_>) -> f64;
+
+    /// By how much the state that the motion ends in is beyond the cone, see [`Rows::breach`]. Must not allocate.
+    fn breach(&mut self, motion: &mut Motion<'_>) -> f64 {
+        self.excess(motion)
+    }
 }
 
 /// How much a soft limit resists: the projector minimises `linear s + 1/2 quadratic s^2` beside the distance, with the slack `s` as a

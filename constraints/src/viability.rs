@@ -168,6 +168,9 @@ pub struct Dof {
     pub profile: [Option<Profile>; 2],
     /// The dof stops and stays.
     pub locked: bool,
+    /// Room to brake is left for whole periods of one acceleration each, the last one just long enough to stand. Without it the last
+    /// may turn the dof round, which stops it up to `A T^2 / 8` earlier.
+    pub whole: bool,
 }
 
 impl Profile {
@@ -187,6 +190,7 @@ impl Dof {
         deceleration: f64::INFINITY,
         profile: [None, None],
         locked: false,
+        whole: false,
     };
 
     /// The limits of dof `i` of a set.
@@ -194,7 +198,7 @@ impl Dof {
         let (lower, upper) = (limits.q_lower[i], limits.q_upper[i]);
         let (acceleration, deceleration) = (limits.acceleration[i], limits.braking[i]);
         let (velocity, profile, locked) = (limits.velocity[i], limits.profile[i], limits.locked[i]);
-        Dof { lower, upper, velocity, acceleration, deceleration, profile, locked }
+        Dof { lower, upper, velocity, acceleration, deceleration, profile, locked, whole: false }
     }
 
     /// The deceleration that braking counts on: the one stated, or less where a whole period of it would turn the dof round and
@@ -302,15 +306,38 @@ fn upper_bound(dof: &Dof, a: f64, d: f64, v: f64, p: &Period) -> (f64, Kind) {
     if d == f64::INFINITY || a_max == f64::INFINITY {
         return bound;
     }
+    let least = |x: f64| if dof.whole { whole_floor(x, d, v, a, p) } else { floor(x, d, v, a, p) };
     if d < p.dt * v.max(0.0) + a_max * p.dt * p.dt {
-        bound = smaller(bound, (floor(position_bound(d, v, a, p), d, v, a, p), Kind::Position));
+        bound = smaller(bound, (least(position_bound(d, v, a, p)), Kind::Position));
     }
     // Where even full acceleration leaves room to brake, the parabola does not bind.
     let (v_next, d_next) = (v + a_max * p.dt - 0.5 * a * p.tau, d - p.dt * v - p.kappa * p.dt * p.dt * a_max);
-    if (v_next > 0.0 && v_next * v_next > 2.0 * a * d_next) || d_next < 0.0 {
-        bound = smaller(bound, (floor(braking_bound(d, v, a, p), d, v, a, p), Kind::Viability));
+    let more = if dof.whole { 0.125 * a * p.dt * p.dt } else { 0.0 };
+    if (v_next > 0.0 && v_next * v_next > 2.0 * a * (d_next - more)) || d_next < 0.0 {
+        let smooth = braking_bound(d, v, a, p);
+        let braking = if dof.whole { smooth.min(whole_bound(d, v, a, p)) } else { smooth };
+        bound = smaller(bound, (least(braking), Kind::Viability));
     }
     bound
+}
+
+/// The largest `x` after which braking by whole periods of `a` stops in time: the way `W` from speed `s` is the largest of the lines
+///
+/// ```text
+///     W_k(s) = s T (k + 1 - kappa) - a T^2 k (k + 1) / 2,   k = 0, 1, ...
+/// ```
+///
+/// so that `d - T v - kappa T^2 x >= W_k(v + T x)` for all of them; below `x = -v / T` there is no way left to go.
+fn whole_bound(d: f64, v: f64, a: f64, p: &Period) -> f64 {
+    let t = p.dt;
+    let line = |k: f64| {
+        let room = d - v * t * (k + 2.0 - p.kappa) + 0.5 * a * t * t * k * (k + 1.0);
+        room / (t * t * (k + 1.0))
+    };
+    // The lines touch the parabola of a brake without periods, next to whose bound the least of them is.
+    let near = ((v + t * braking_bound(d, v, a, p)).max(0.0) / (a * t)).floor();
+    let least = (-2..=2).map(|step| line((near + f64::from(step)).max(0.0)));
+    least.fold(f64::INFINITY, f64::min).max(-v / t)
 }
 
 /// From inside the set, braking with `A` is always allowed. Close to the limit the formulas lose that to rounding: with
@@ -319,6 +346,14 @@ fn floor(bound: f64, d: f64, v: f64, a: f64, p: &Period) -> f64 {
     let w = (v - 0.5 * a * p.tau).max(0.0);
     let inside = w * w <= 2.0 * a * (d + ROUNDING);
     if inside { bound.max(-a) } else { bound }
+}
+
+/// The same for whole periods: where those of `a` and a shorter one stop in time, the next of them is always allowed, and turns nothing
+/// round.
+fn whole_floor(bound: f64, d: f64, v: f64, a: f64, p: &Period) -> f64 {
+    let (t, k) = (p.dt, (v / (a * p.dt)).floor().max(0.0));
+    let way = v * t * (k + 1.0 - p.kappa) - 0.5 * a * t * t * k * (k + 1.0);
+    if way.max(0.0) <= d + ROUNDING { bound.max(-a.min(v.max(0.0) / t)) } else { floor(bound, d, v, a, p) }
 }
 
 /// Positions at the end of each sub-step, `d - j tau v - tau^2 j (j + 1) / 2 a >= 0`:

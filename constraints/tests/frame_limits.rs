@@ -303,15 +303,16 @@ fn cones_hold_speed_and_energy() {
             }
             let raw = consistent(&projector, &q, &v, &pull);
             projector.project(&q, &v, &raw, &mut target);
+            let ahead: Vec<f64> = (0..7).map(|i| q[i] + DT * v[i]).collect();
             let value = match kind {
                 Kind::FrameSpeed => {
-                    k.update_frames(&q, &target.v, &target.v);
+                    k.update_frames(&ahead, &target.v, &target.v);
                     k.frame(hand).velocity.iter().map(|x| x * x).sum::<f64>().sqrt() / 0.25
                 }
                 _ => {
                     let (mut with, mut without) = (vec![0.0; 7], vec![0.0; 7]);
-                    dynamics.rnea(&q, &[0.0; 7], &target.v, &mut with);
-                    dynamics.rnea(&q, &[0.0; 7], &[0.0; 7], &mut without);
+                    dynamics.rnea(&ahead, &[0.0; 7], &target.v, &mut with);
+                    dynamics.rnea(&ahead, &[0.0; 7], &[0.0; 7], &mut without);
                     (0..7).map(|i| 0.5 * target.v[i] * (with[i] - without[i])).sum::<f64>() / 0.8
                 }
             };

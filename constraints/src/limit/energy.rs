@@ -4,7 +4,7 @@ use super::Limit;
 use super::frame::check;
 use super::margin::{is_zero, less};
 use crate::row::{Cone, Motion, Needs, Tick};
-use crate::{Kind, Kinematics, LimitError, Model, Soft};
+use crate::{Dynamics, Kind, Kinematics, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
 /// `energy = { limit = 2.0 }`, also with `margin` and `soft`.
@@ -21,9 +21,11 @@ pub struct EnergySettings {
     pub soft: Option<Soft>,
 }
 
-/// `1/2 (v + y)' M (v + y) <= limit`, as `|L' (v + y)| <= sqrt(2 limit)` with `M = L L'` at the measured configuration.
+/// `1/2 (v + y)' M (v + y) <= limit`, as `|L' (v + y)| <= sqrt(2 limit)` with `M = L L'` at `q (+) T v`, where the robot will be but for what the
+/// velocity change does to its way.
 ///
-/// At the next configuration the energy differs by O(T |v|³); the next tick starts from the velocity measured.
+/// At the next configuration the energy differs by O(T |y| |v|²). As with [`FrameSpeedLimit`](super::FrameSpeedLimit), only a stored
+/// brake is verified for it.
 #[derive(Debug, Clone)]
 pub struct EnergyLimit {
     settings: EnergySettings,
@@ -49,7 +51,9 @@ impl Limit for EnergyLimit {
     fn cone(&self, model: &Model, _controllable: &[usize]) -> Result<Option<Box<dyn Cone>>, LimitError> {
         check("energy limit", self.settings.limit, self.settings.limit > 0.0, "above 0 J")?;
         let limit = less("energy margin", self.settings.limit, self.settings.margin)?;
-        Ok(Some(Box::new(EnergyCone { nv: model.nv(), limit, judge: Kinematics::new(model) })))
+        let (nv, dynamics, judge) = (model.nv(), Dynamics::new(model), Kinematics::new(model));
+        let (q, step, mass) = (model.neutral(), vec![0.0; nv], vec![0.0; nv * nv]);
+        Ok(Some(Box::new(EnergyCone { nv, limit, dynamics, judge, q, step, mass })))
     }
 
     fn soft(&self) -> Option<Soft> {
@@ -60,7 +64,20 @@ impl Limit for EnergyLimit {
 struct EnergyCone {
     nv: usize,
     limit: f64,
+    dynamics: Dynamics,
     judge: Kinematics,
+    /// `q (+) T v` (nq), `T v` (nv), mass matrix (nv x nv).
+    q: Vec<f64>,
+    step: Vec<f64>,
+    mass: Vec<f64>,
+}
+
+impl EnergyCone {
+    /// Writes `q (+) T v`.
+    fn look_ahead(&mut self, q: &[f64], v: &[f64], dt: f64) {
+        self.step.iter_mut().zip(v).for_each(|(step, v)| *step = dt * v);
+        self.dynamics.integrate(q, &self.step, &mut self.q);
+    }
 }
 
 impl Cone for EnergyCone {
@@ -81,11 +98,13 @@ impl Cone for EnergyCone {
     }
 
     fn needs(&self) -> Needs {
-        Needs { mass: true, ..Needs::default() }
+        Needs::default()
     }
 
     fn fill(&mut self, tick: &mut Tick<'_>, g: &mut [f64], c: &mut [f64]) -> f64 {
-        factor(self.nv, tick.mass, g);
+        self.look_ahead(tick.q, tick.v, tick.period.dt);
+        self.dynamics.mass(&self.q, &mut self.mass);
+        factor(self.nv, &self.mass, g);
         for (c, row) in c.iter_mut().zip(g.chunks_exact(self.nv)) {
             *c = row.iter().zip(tick.v).map(|(g, v)| g * v).sum();
         }
@@ -93,7 +112,13 @@ impl Cone for EnergyCone {
     }
 
     fn excess(&mut self, motion: &mut Motion<'_>) -> f64 {
-        let energy = self.judge.kinetic_energy(motion.q, motion.v_next);
+        self.look_ahead(motion.q, motion.v, motion.period.dt);
+        let energy = self.judge.kinetic_energy(&self.q, motion.v_next);
+        (energy / self.limit).sqrt() - 1.0
+    }
+
+    fn breach(&mut self, motion: &mut Motion<'_>) -> f64 {
+        let energy = self.judge.kinetic_energy(motion.q_next, motion.v_next);
         (energy / self.limit).sqrt() - 1.0
     }
 }

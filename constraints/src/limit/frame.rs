@@ -258,4 +258,13 @@ impl Rows for FrameRows {
             *x = clearance.excess(dot(plane.n, then.velocity), self.braking, motion.period);
         }
     }
+
+    /// Metres beyond the plane.
+    fn breach(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
+        let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
+        let at = then.point(self.frame, self.point);
+        for (x, plane) in out.iter_mut().zip(&self.planes) {
+            *x = dot(plane.n, at.position) - plane.offset;
+        }
+    }
 }

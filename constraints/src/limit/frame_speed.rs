@@ -1,11 +1,12 @@
 //! How fast a point of a frame may move.
 
 use super::Limit;
+use super::clearance::Ahead;
 use super::frame::{check, frame_of};
 use super::margin::{is_zero, less};
 use crate::kinematics::norm;
 use crate::row::{Cone, Motion, Needs, Tick};
-use crate::{FrameId, Kind, Kinematics, LimitError, Model, Soft};
+use crate::{FrameId, Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
 /// `frame_speed = [{ frame = "hand", limit = 0.25 }]`, also with `margin` and `soft`.
@@ -30,9 +31,11 @@ pub struct FrameSpeedSettings {
     pub soft: Option<Soft>,
 }
 
-/// `|J (v + y)| <= limit`: the speed of a point of a frame, with the Jacobian of the measured configuration.
+/// `|J (v + y)| <= limit`: the speed of a point of a frame, with the Jacobian at `q (+) T v`, where the robot will be but for what the
+/// velocity change does to its way: the speed at the end of the period is off by O(T |y| |v|).
 ///
-/// Over the period the Jacobian turns by O(T |v|), and the speed with it; the next tick starts from the speed measured.
+/// That the joints can brake the point is not in it: as they stop one after the other it may first become faster. A stored brake
+/// ([`Braking::Stored`](crate::Braking)) is verified for it.
 #[derive(Debug, Clone)]
 pub struct FrameSpeedLimit {
     settings: FrameSpeedSettings,
@@ -72,8 +75,8 @@ impl Limit for FrameSpeedLimit {
             frame,
             point: s.point,
             limit,
-            judge: Kinematics::new(model),
-            zero: vec![0.0; model.nv()],
+            ahead: Ahead::new(model),
+            judge: Ahead::new(model),
         })))
     }
 
@@ -87,9 +90,9 @@ struct SpeedCone {
     frame: FrameId,
     point: [f64; 3],
     limit: f64,
+    ahead: Ahead,
     /// Frames at the next velocity, for the judge.
-    judge: Kinematics,
-    zero: Vec<f64>,
+    judge: Ahead,
 }
 
 impl Cone for SpeedCone {
@@ -110,11 +113,11 @@ impl Cone for SpeedCone {
     }
 
     fn needs(&self) -> Needs {
-        Needs { kinematics: true, ..Needs::default() }
+        Needs::default()
     }
 
     fn fill(&mut self, tick: &mut Tick<'_>, g: &mut [f64], c: &mut [f64]) -> f64 {
-        tick.kinematics.point_jacobian(self.frame, self.point, g);
+        self.ahead.look(tick.q, tick.v, tick.period.dt).point_jacobian(self.frame, self.point, g);
         for (c, row) in c.iter_mut().zip(g.chunks_exact(tick.v.len())) {
             *c = row.iter().zip(tick.v).map(|(g, v)| g * v).sum();
         }
@@ -122,7 +125,12 @@ impl Cone for SpeedCone {
     }
 
     fn excess(&mut self, motion: &mut Motion<'_>) -> f64 {
-        self.judge.update_frames(motion.q, motion.v_next, &self.zero);
-        norm(self.judge.point(self.frame, self.point).velocity) / self.limit - 1.0
+        self.judge.look_at_frames(motion.q, motion.v, motion.period.dt);
+        norm(self.judge.turn(motion.v_next).point(self.frame, self.point).velocity) / self.limit - 1.0
+    }
+
+    fn breach(&mut self, motion: &mut Motion<'_>) -> f64 {
+        let then = self.judge.look_at_frames(motion.q_next, motion.v_next, 0.0);
+        norm(then.point(self.frame, self.point).velocity) / self.limit - 1.0
     }
 }

@@ -273,6 +273,21 @@ impl Rows for Row {
             .sum();
         excess[0] = (value - self.bounds.1).max(self.bounds.0 - value) / self.size;
     }
+
+    /// Beyond the bounds where the motion ends. A row that standing still breaks is none that a brake can keep.
+    fn breach(&mut self, motion: &mut Motion<'_>, breach: &mut [f64]) {
+        if self.braking.is_some() {
+            let (s, _) = self.sum(motion.q_next, motion.v_next);
+            breach[0] = (s - self.bounds.1).max(self.bounds.0 - s) / self.size;
+            return;
+        }
+        let of_positions = self.terms.iter().any(|t| t.quantity == Quantity::Position);
+        let stands = self.bounds.0 <= 0.0 && self.bounds.1 >= 0.0;
+        match !self.equality && (of_positions || stands) {
+            true => self.excess(motion, breach),
+            false => breach[0] = f64::NEG_INFINITY,
+        }
+    }
 }
 
 fn bound(d: f64, w: f64, braking: f64, tick: &Tick<'_>) -> f64 {

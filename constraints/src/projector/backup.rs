@@ -1,31 +1,61 @@
-//! The stored brake: before a target is taken, a whole brake from it is verified by inverse dynamics.
+//! A way to stop, verified for every hard limit before a new state is taken.
 //!
-//! In a brake every controllable joint slows down with a constant deceleration `b_i` until it stands. For the `k`-th tick
-//! of it, with `N_i = floor(|v_i| / (b_i T))` full ticks before the last, shorter one,
+//! A brake gives every controllable joint `i` a constant deceleration `b_i` until it stands. In the `k`-th tick of it, with
+//! `N_i = floor(|v_i| / (b_i T))` full ticks before the last, shorter one,
 //!
 //! ```text
 //!     v_k = v - k b T,   q_k = q + k T v - b T^2 (k (k - 1) / 2 + kappa k)     (k <= N_i, sign of v)
 //! ```
 //!
-//! The motor forces at the ticks looked at must stay below [`SHARE`] of their limits, and every joint must stand before its
-//! position limit. By induction there is always a way to stop: either the new state has a verified brake, or the old one has,
-//! and the first tick of that brake leads to a state whose brake is the rest of it.
+//! and in the last one the rest of the speed is taken off, so that no joint turns round. A brake counts when each joint stands before
+//! its position limit in these very ticks, stays below its speed profile, and every hard row and cone holds
+//! ([`Rows::breach`](crate::Rows::breach)) at the ticks looked at and, by the bound of [`Backup::between`], at those between them.
+//! By induction there is always a way to stop: either the new state has a verified brake, or the old one has, and the first tick of
+//! that brake leads to a state whose brake is the rest of it.
 
 use super::Dofs;
-use crate::viability::{Dof, Period};
-use crate::{Dynamics, LimitSet, Model};
+use crate::checker::Checker;
+use crate::viability::{Dof, Kind, Period};
+use crate::{Dynamics, Limit, LimitError, LimitSet, Model};
 
-/// Share of the motors' limits a brake may use at the ticks looked at; the rest covers the ticks between them.
-const SHARE: f64 = 0.97;
+/// A breach up to this is rounding.
+const ROUNDING: f64 = 1e-10;
 
-/// Ticks of a brake that are looked at, spread over its length.
-const LOOKS: u32 = 24;
+/// Ways of braking, tried from the one that passed last on.
+const TRIED: [Plan; 7] = [
+    Plan::Together(1.0),
+    Plan::Together(2.0),
+    Plan::Apart(1.0),
+    Plan::Together(5.0),
+    Plan::Apart(0.5),
+    Plan::Apart(0.2),
+    Plan::Apart(0.0),
+];
 
-/// Decelerations tried, between the least that stops in time (0) and the largest braking may count on (1).
-const TRIED: [f64; 4] = [1.0, 0.5, 0.2, 0.0];
-
-/// Without a position limit near, a brake takes at least this share of the largest deceleration.
+/// Without a position limit near, a joint that brakes by itself takes at least this share of the largest deceleration.
 const LEAST: f64 = 0.05;
+
+/// A stretch of equal accelerations is looked at in this many ticks, one more for every [`FAR`] of way.
+const FEWEST: u32 = 5;
+
+/// Way of all joints together [rad or m].
+const FAR: f64 = 0.4;
+
+/// Ticks looked at in a stretch at most; a brake that is not settled then does not count.
+const MOST: u32 = 65;
+
+/// A brake of more ticks than this is as good as one without ticks.
+const MANY: f64 = 1e5;
+
+/// How the joints share a brake.
+#[derive(Debug, Clone, Copy)]
+enum Plan {
+    /// All stand at the same time, this many times as late as the quickest stop; only those that must are quicker. The direction of
+    /// the velocity stays, and with it whatever is a sum of them.
+    Together(f64),
+    /// Each by itself, between the least that stops in time (0) and the largest deceleration (1).
+    Apart(f64),
+}
 
 /// The last verified brake and the scratch to verify another.
 pub(crate) struct Backup {
@@ -35,26 +65,58 @@ pub(crate) struct Backup {
     deceleration: Vec<f64>,
     /// The index into [`TRIED`] that passed last.
     favourite: usize,
+    judge: Checker,
+    dynamics: Dynamics,
+    /// By how much each row may be broken (hard rows): what the measured state breaks already.
+    allowed: Vec<f64>,
+    /// Rows of which a state, not a motion, is beyond the limit.
+    of_state: Vec<bool>,
     trial: Vec<f64>,
+    now: State,
+    next: State,
+    way: Vec<f64>,
+    /// Ticks at which some acceleration of the brake changes.
+    cuts: Vec<u32>,
+    /// Ticks looked at in a stretch, and the breach of each row there.
+    ticks: Vec<u32>,
+    breach: Vec<f64>,
+}
+
+struct State {
     q: Vec<f64>,
     v: Vec<f64>,
-    a: Vec<f64>,
-    tau: Vec<f64>,
 }
 
 impl Backup {
-    pub(crate) fn new(model: &Model) -> Backup {
+    pub(crate) fn new(
+        model: &Model,
+        limits: &[Box<dyn Limit>],
+        controllable: &[usize],
+        settings: &crate::Settings,
+    ) -> Result<Backup, LimitError> {
         let zero = || vec![0.0; model.nv()];
-        Backup {
+        let state = || State { q: model.neutral(), v: zero() };
+        let period = Period::new(settings.dt, settings.sub_steps);
+        let judge = Checker::new(model, limits, controllable, period, settings.consistency)?;
+        let of_state = |kind: &Kind| {
+            matches!(kind, Kind::Frame | Kind::FrameSpeed | Kind::Energy | Kind::Collision | Kind::User)
+        };
+        Ok(Backup {
             stored: false,
             deceleration: zero(),
             favourite: 0,
+            dynamics: Dynamics::new(model),
+            allowed: vec![0.0; judge.hard()],
+            of_state: judge.hard_kinds().iter().map(of_state).collect(),
             trial: zero(),
-            q: model.neutral(),
-            v: zero(),
-            a: zero(),
-            tau: zero(),
-        }
+            now: state(),
+            next: state(),
+            way: zero(),
+            cuts: Vec::with_capacity(2 * model.nv() + 1),
+            ticks: Vec::with_capacity(MOST as usize),
+            breach: vec![0.0; judge.hard() * MOST as usize],
+            judge,
+        })
     }
 
     /// As new: what is tried first next depends on nothing that was.
@@ -74,8 +136,35 @@ impl Backup {
         self.deceleration.copy_from_slice(&memory[2..]);
     }
 
+    /// Switches the rows and cones of a limit.
+    pub(crate) fn enable(&mut self, limit: usize, on: bool, left: &LimitSet) {
+        self.judge.enable(limit, on, left);
+    }
+
+    /// A tick begins: nothing is beyond its limit.
+    pub(crate) fn begin(&mut self) {
+        self.allowed.fill(0.0);
+    }
+
+    /// Allows what the state breaks already, so that it may come back; true when that is anything.
+    pub(crate) fn excuse(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
+        self.judge.breaches((q, v), (q, v), with.external, &mut self.allowed);
+        for (allowed, of_state) in self.allowed.iter_mut().zip(&self.of_state) {
+            *allowed = if *of_state { allowed.max(0.0) } else { 0.0 };
+        }
+        self.allowed.iter().any(|allowed| *allowed > 0.0)
+    }
+
+    /// The motion breaks no hard row or cone.
+    pub(crate) fn allows(&mut self, with: &With<'_>, from: (&[f64], &[f64]), to: (&[f64], &[f64])) -> bool {
+        let rows = self.allowed.len();
+        let breach = &mut self.breach[..rows];
+        self.judge.breaches(from, to, with.external, breach);
+        breach.iter().zip(&self.allowed).all(|(breach, allowed)| *breach <= allowed + ROUNDING)
+    }
+
     /// Looks for a brake from the state and stores it; the old one stays when there is none.
-    pub(crate) fn verify(&mut self, with: &mut With<'_>, q: &[f64], v: &[f64]) -> bool {
+    pub(crate) fn verify(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
         for k in 0..TRIED.len() {
             let index = (self.favourite + k) % TRIED.len();
             if self.plan(with, q, v, TRIED[index]) && self.within_reach(with, q, v) {
@@ -93,84 +182,225 @@ impl Backup {
     }
 
     /// Decelerations of a brake from the state; false when some joint cannot stand before its limit.
-    fn plan(&mut self, with: &With<'_>, q: &[f64], v: &[f64], share: f64) -> bool {
+    fn plan(&mut self, with: &With<'_>, q: &[f64], v: &[f64], plan: Plan) -> bool {
+        let dt = with.period.dt;
+        let most = |i: usize| Dof::of(with.limits, i).braking(with.period);
+        let quickest = with.dofs.controllable.iter().map(|&i| v[i].abs() / (most(i) * dt));
+        let quickest = quickest.fold(0.0, f64::max);
         for &i in &with.dofs.controllable {
             let dof = Dof::of(with.limits, i);
-            let most = dof.braking(with.period);
-            let room = match with.dofs.single[i] {
-                Some(iq) if v[i] > 0.0 => dof.upper - q[iq],
-                Some(iq) if v[i] < 0.0 => q[iq] - dof.lower,
-                _ => f64::INFINITY,
+            let (most, speed) = (most(i), v[i].abs());
+            let least = match with.dofs.single[i] {
+                _ if dof.locked => most,
+                Some(iq) if speed > 0.0 => least_deceleration(&dof, q[iq], v[i], with.period),
+                _ => 0.0,
             };
-            let least = least_deceleration(room, v[i].abs(), with.period).max(LEAST * most);
             if least > most * (1.0 + 1e-9) {
                 return false;
             }
-            self.trial[i] = least.min(most) + share * (most - least.min(most));
+            let least = least.min(most);
+            self.trial[i] = match plan {
+                _ if speed == 0.0 => most,
+                Plan::Together(late) => {
+                    let ticks = (late * quickest - 1e-9).ceil().max(1.0);
+                    (speed / (ticks * dt)).max(least).min(most)
+                }
+                Plan::Apart(share) => {
+                    let least = least.max(LEAST * most);
+                    least + share * (most - least)
+                }
+            };
         }
         true
     }
 
-    /// The motors can give the planned brake: at ticks spread over it, and around those in which a joint comes to rest.
-    fn within_reach(&mut self, with: &mut With<'_>, q: &[f64], v: &[f64]) -> bool {
-        let dofs = with.dofs;
-        let dt = with.period.dt;
-        let full = |trial: &[f64], i: usize| (v[i].abs() / (trial[i] * dt)).floor().min(1e6) as u32;
-        let last = dofs.controllable.iter().map(|i| full(&self.trial, *i)).max().unwrap_or(0) + 1;
-        let stride = (last / LOOKS).max(1);
-        let mut k = 0;
-        while k < last + stride {
-            if !self.holds_at(with, q, v, k.min(last)) {
+    /// Full ticks of the planned brake of dof `i`, and the speed left after them.
+    fn full(&self, i: usize, v: f64, dt: f64) -> (f64, f64) {
+        let step = self.trial[i] * dt;
+        let ticks = (v.abs() / step + 1e-9).floor();
+        let left = v.abs() - ticks * step;
+        (ticks, if left > 1e-9 * step { left } else { 0.0 })
+    }
+
+    /// Every hard row and cone holds in every tick of the planned brake.
+    fn within_reach(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
+        self.cuts.clear();
+        for &i in &with.dofs.controllable {
+            let (full, left) = self.full(i, v[i], with.period.dt);
+            let full = full.min(1e6) as u32;
+            self.cuts.push(full);
+            if left > 0.0 {
+                self.cuts.push(full + 1);
+            }
+        }
+        self.cuts.sort_unstable();
+        self.cuts.dedup();
+        let mut first = 0;
+        for k in 0..self.cuts.len() {
+            let end = self.cuts[k];
+            if end > first && !self.stretch(with, q, v, (first, end - 1)) {
                 return false;
             }
-            k += stride;
+            first = end;
         }
-        dofs.controllable.iter().filter(|i| stride > 1 && v[**i] != 0.0).all(|&i| {
-            let rest = full(&self.trial, i);
-            (rest.saturating_sub(1)..=rest + 1).all(|k| self.holds_at(with, q, v, k))
+        self.stretch(with, q, v, (first, first)) // at rest
+    }
+
+    /// Every hard row and cone holds from tick `first` to tick `last`, between which no acceleration changes: looked at in ever more
+    /// ticks until the bound on those between them settles it.
+    fn stretch(&mut self, with: &With<'_>, q: &[f64], v: &[f64], (first, last): (u32, u32)) -> bool {
+        let rows = self.allowed.len();
+        let length = last - first;
+        let speed: f64 = with.dofs.controllable.iter().map(|&i| v[i].abs()).sum();
+        let way = 0.5 * speed * f64::from(length) * with.period.dt;
+        let mut looks = FEWEST + (way / FAR).min(f64::from(MOST)) as u32;
+        loop {
+            looks = looks.min(MOST);
+            let all = looks > length;
+            let count = if all { length + 1 } else { looks };
+            self.ticks.clear();
+            for n in 0..count {
+                let at = if all { n } else { (length * n + (count - 1) / 2) / (count - 1) };
+                self.ticks.push(first + at);
+                self.look(with, q, v, first + at, n as usize);
+                let seen = &self.breach[n as usize * rows..(n as usize + 1) * rows];
+                let holds = |(breach, allowed): (&f64, &f64)| *breach <= allowed + ROUNDING;
+                if !seen.iter().zip(&self.allowed).all(holds) {
+                    return false;
+                }
+            }
+            if all || self.between() {
+                return true;
+            }
+            if looks == MOST {
+                return false;
+            }
+            looks = 2 * looks - 1;
+        }
+    }
+
+    /// No row is broken between the ticks looked at: by a parabola through three of them a row rises above the higher of two ends by an
+    /// eighth of its second difference, past a corner by a half, which is what is allowed for.
+    fn between(&self) -> bool {
+        let rows = self.allowed.len();
+        let count = self.ticks.len();
+        let at = |n: usize, r: usize| self.breach[n * rows + r];
+        let apart = |n: usize| f64::from(self.ticks[n + 1] - self.ticks[n]);
+        let bend = |n: usize, r: usize| {
+            let slopes = (at(n + 1, r) - at(n, r)) / apart(n) - (at(n, r) - at(n - 1, r)) / apart(n - 1);
+            slopes.abs() * apart(n).max(apart(n - 1))
+        };
+        (0..rows).filter(|r| at(0, *r) > f64::NEG_INFINITY).all(|r| {
+            let mut before = bend(1, r);
+            (0..count - 1).all(|n| {
+                let after = if n + 2 < count { bend(n + 1, r) } else { before };
+                let most = at(n, r).max(at(n + 1, r)) + 0.5 * before.max(after);
+                before = after;
+                most <= self.allowed[r] || self.ticks[n + 1] - self.ticks[n] == 1
+            })
         })
     }
 
-    fn holds_at(&mut self, with: &mut With<'_>, q: &[f64], v: &[f64], k: u32) -> bool {
+    /// Writes the breach of each row in tick `k` of the planned brake to place `n`.
+    fn look(&mut self, with: &With<'_>, q: &[f64], v: &[f64], k: u32, n: usize) {
+        self.reach(with, q, v, k + 1);
+        std::mem::swap(&mut self.now, &mut self.next);
+        self.reach(with, q, v, k);
+        std::mem::swap(&mut self.now, &mut self.next);
+        let rows = self.allowed.len();
+        let (now, next) = (&self.now, &self.next);
+        let breach = &mut self.breach[n * rows..(n + 1) * rows];
+        self.judge.breaches((&now.q, &now.v), (&next.q, &next.v), with.external, breach);
+    }
+
+    /// Writes the state after `k` ticks of the planned brake to `next`.
+    fn reach(&mut self, with: &With<'_>, q: &[f64], v: &[f64], k: u32) {
         let (dt, kappa) = (with.period.dt, with.period.kappa);
-        self.q.copy_from_slice(q);
-        self.v.copy_from_slice(v);
-        self.a.fill(0.0);
+        self.way.fill(0.0);
+        self.next.v.copy_from_slice(v);
         for &i in &with.dofs.controllable {
             let (b, speed) = (self.trial[i], v[i].abs());
-            let full = (speed / (b * dt)).floor();
+            let (full, rest) = self.full(i, v[i], dt);
             let ticks = f64::from(k).min(full);
-            let mut left = speed - ticks * b * dt;
+            let mut left = if ticks == full { rest } else { speed - ticks * b * dt };
             let mut way = ticks * dt * speed - b * dt * dt * (0.5 * ticks * (ticks - 1.0) + kappa * ticks);
             if f64::from(k) > full {
                 (way, left) = (way + dt * left * (1.0 - kappa), 0.0); // the last, shorter tick
             }
-            self.a[i] = -v[i].signum() * b.min(left / dt);
-            self.v[i] = v[i].signum() * left;
+            (self.way[i], self.next.v[i]) = (v[i].signum() * way, v[i].signum() * left);
+        }
+        if with.dofs.curved {
+            self.dynamics.integrate(q, &self.way, &mut self.next.q);
+            return;
+        }
+        self.next.q.copy_from_slice(q);
+        for &i in &with.dofs.controllable {
             if let Some(iq) = with.dofs.single[i] {
-                self.q[iq] += v[i].signum() * way;
+                self.next.q[iq] += self.way[i];
             }
         }
-        with.dynamics.motors(with.period, &self.q, &self.v, &self.a, &mut self.tau);
-        with.dofs
-            .controllable
-            .iter()
-            .all(|&i| (self.tau[i] - with.external[i]).abs() <= SHARE * with.limits.effort[i])
     }
 }
 
 /// What a brake is planned with.
 pub(crate) struct With<'a> {
-    pub(crate) dynamics: &'a mut Dynamics,
     pub(crate) limits: &'a LimitSet,
     pub(crate) dofs: &'a Dofs,
     pub(crate) period: &'a Period,
     pub(crate) external: &'a [f64],
 }
 
-/// The least deceleration that stops within `room` from `speed`: the smaller root of `(speed - b tau / 2)^2 = 2 b room`.
-fn least_deceleration(room: f64, speed: f64, period: &Period) -> f64 {
-    if room.is_infinite() || speed == 0.0 {
+/// The least deceleration that stops a dof before its position limit and below its speed profile; infinite where none does.
+fn least_deceleration(dof: &Dof, q: f64, v: f64, period: &Period) -> f64 {
+    let (room, profile, at) = match v > 0.0 {
+        true => (dof.upper - q, dof.profile[1], 1.0),
+        false => (q - dof.lower, dof.profile[0], -1.0),
+    };
+    let mut least = stopping(room, v.abs(), period).max(smooth(room, v.abs(), period));
+    if let Some(p) = profile {
+        // Braking with the deceleration of the parabola that leads from here to the end of the profile stays below the profile.
+        let needed = (v.abs() + p.offset).powi(2) / (2.0 * (at * (p.at - q)).max(f64::MIN_POSITIVE));
+        least = least.max(needed.min(p.deceleration).min(dof.braking(period)));
+    }
+    least
+}
+
+/// The least deceleration that stops within `room` from `speed` in whole ticks and a shorter one: with `k` whole ticks
+///
+/// ```text
+///     speed T (k + 1 - kappa) - b T^2 k (k + 1) / 2 = room,   k = floor(speed / (b T))
+/// ```
+fn stopping(room: f64, speed: f64, period: &Period) -> f64 {
+    let t = period.dt;
+    if room == f64::INFINITY {
+        return 0.0;
+    }
+    if room < speed * t * (1.0 - period.kappa) - ROUNDING {
+        return f64::INFINITY;
+    }
+    let with = |k: f64| (speed * t * (k + 1.0 - period.kappa) - room) / (0.5 * t * t * k * (k + 1.0));
+    // Of a brake without ticks, which needs a little less; then the whole ticks that are the largest deceleration.
+    let rough = speed * speed / (2.0 * room.max(0.0) + speed * period.tau).max(f64::MIN_POSITIVE);
+    let whole = speed / (rough * t);
+    if whole > MANY {
+        return rough * (1.0 + 1.0 / MANY); // the ticks make less of a difference than this
+    }
+    let mut k = whole.floor().max(1.0);
+    let mut least = with(k);
+    for step in [-1.0, 1.0] {
+        while k + step >= 1.0 && with(k + step) > least {
+            k += step;
+            least = with(k);
+        }
+    }
+    // Not more than what stops within one tick.
+    least.clamp(0.0, speed / t)
+}
+
+/// The least deceleration `b` that keeps the joint in the set of [`interval`](crate::viability::interval): the smaller root of
+/// `(speed - b tau / 2)^2 = 2 b room`. That set is left a little later than the ticks need between some of them.
+fn smooth(room: f64, speed: f64, period: &Period) -> f64 {
+    if room == f64::INFINITY {
         return 0.0;
     }
     let half = speed * period.tau + 2.0 * room.max(0.0);

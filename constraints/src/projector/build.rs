@@ -70,7 +70,7 @@ impl Projector {
             v_wanted: zero(),
             v_stop: zero(),
             tangent: zero(),
-            backup: Backup::new(model),
+            backup: Backup::new(model, each, &dofs.controllable, &settings)?,
             integrated: model.neutral(),
             model: model.clone(),
             limits,
@@ -153,9 +153,9 @@ pub(super) fn check_combination(
         Consistency::Free => {}
     }
     if braking == Braking::Stored {
-        let joints = names(&|i| limits.braking[i].is_infinite() || limits.effort[i].is_infinite());
+        let joints = names(&|i| limits.braking[i].is_infinite());
         if !joints.is_empty() {
-            let next = "add torque and acceleration limits, or set braking = \"certified\"";
+            let next = "add an acceleration limit, or set braking = \"certified\"";
             return Err(LimitError::Missing { limit: "a stored brake", joints, next });
         }
     }

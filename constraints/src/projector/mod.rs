@@ -34,6 +34,9 @@ use polish::Polish;
 use sources::{Label, Sources};
 use std::time::Instant;
 
+/// Share of the way to a target that is tried first where the target itself is refused: rows are linear, what they keep is not quite.
+const NEARLY: f64 = 0.98;
+
 /// Projects proposals for one robot at one control period.
 ///
 /// With `T` the period, `y = v' - v` and `kappa` from [`Period`], the kinematic mode solves
@@ -212,6 +215,7 @@ impl Projector {
         let free = self.settings.consistency == Consistency::Free;
         for &i in &self.dofs.controllable {
             let mut dof = Dof::of(&self.limits, i);
+            dof.whole = self.settings.braking == Braking::Stored;
             if dof.acceleration.is_infinite() {
                 // Free mode without braking: the cut below is all there is.
                 (dof.lower, dof.upper) = (f64::NEG_INFINITY, f64::INFINITY);
@@ -266,8 +270,8 @@ impl Projector {
         self.brake(q, v, Some(proposal), target, BrakeReason::NoCertifiedAnswer)
     }
 
-    /// Takes the target if a brake from it is verified, else the furthest verified state on the way from one tick of the
-    /// stored brake to the target, else that tick. All of them obey the limits, which are convex.
+    /// Takes the target if it breaks nothing and a brake from it is verified, else the furthest such state on the way from one tick of the
+    /// stored brake to the target, else that tick.
     fn keep_a_brake(
         &mut self,
         q: &[f64],
@@ -276,7 +280,12 @@ impl Projector {
         target: &mut Target,
         status: Status,
     ) -> Status {
-        if self.verify(&target.q, &target.v) {
+        self.backup.begin();
+        if self.leads_to_a_brake(q, v, target) {
+            return status;
+        }
+        let outside = self.excuse(q, v);
+        if outside && self.leads_to_a_brake(q, v, target) {
             return status;
         }
         if !self.backup.stored && !self.verify(q, v) {
@@ -286,16 +295,39 @@ impl Projector {
         self.v_wanted.copy_from_slice(&target.v);
         self.stop(q, v, target, true);
         self.v_stop.copy_from_slice(&self.v_next);
-        for _ in 0..4 {
-            let share = 0.5 * (good + bad);
+        for k in 0..4 {
+            let share = if k == 0 { NEARLY } else { 0.5 * (good + bad) };
             self.blend(share);
             self.write(q, v, Some(proposal), target);
-            *(if self.verify(&target.q, &target.v) { &mut good } else { &mut bad }) = share;
+            let leads = self.leads_to_a_brake(q, v, target);
+            *(if leads { &mut good } else { &mut bad }) = share;
+            if leads && k == 0 {
+                break;
+            }
         }
         self.blend(good);
         self.write(q, v, Some(proposal), target);
         self.report_rung(q, v, target, Rung::StoredBrake);
-        if good == 0.0 { Status::Braked(BrakeReason::NoVerifiedBrake) } else { Status::Slowed }
+        match good == 0.0 {
+            true => Status::Braked(BrakeReason::NoVerifiedBrake),
+            false if target.ledger.outside.is_empty() => Status::Slowed,
+            false => Status::Recovering,
+        }
+    }
+
+    /// The step to the target breaks no hard row or cone, and a brake from it is verified, which is then stored.
+    fn leads_to_a_brake(&mut self, q: &[f64], v: &[f64], target: &Target) -> bool {
+        let with =
+            With { limits: &self.limits, dofs: &self.dofs, period: &self.period, external: &self.external };
+        self.backup.allows(&with, (q, v), (&target.q, &target.v))
+            && self.backup.verify(&with, &target.q, &target.v)
+    }
+
+    /// Allows brakes what the measured state breaks already; true when that is anything.
+    fn excuse(&mut self, q: &[f64], v: &[f64]) -> bool {
+        let with =
+            With { limits: &self.limits, dofs: &self.dofs, period: &self.period, external: &self.external };
+        self.backup.excuse(&with, q, v)
     }
 
     /// `v_next` between one tick of the stored brake (0) and the wanted velocities (1).
@@ -309,21 +341,25 @@ impl Projector {
     }
 
     fn verify(&mut self, q: &[f64], v: &[f64]) -> bool {
-        let (dynamics, limits, dofs, period) = (&mut self.dynamics, &self.limits, &self.dofs, &self.period);
-        let mut with = With { dynamics, limits, dofs, period, external: &self.external };
-        self.backup.verify(&mut with, q, v)
+        let with =
+            With { limits: &self.limits, dofs: &self.dofs, period: &self.period, external: &self.external };
+        self.backup.verify(&with, q, v)
     }
 
     /// Reports a target that is not the nearest allowed one.
     fn report_rung(&mut self, q: &[f64], v: &[f64], target: &mut Target, rung: Rung) {
-        self.report_unsolved(q, v, target);
         target.ledger.rung = rung;
+        self.report_unsolved(q, v, target);
     }
 
     /// No rows hold a target that was not solved for; what it breaks, the checker says.
     fn report_unsolved(&mut self, q: &[f64], v: &[f64], target: &mut Target) {
         target.ledger.active.clear();
-        let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
+        let (checker, to) = (&mut self.checker, (&target.q[..], &target.v[..]));
+        let verdict = match target.ledger.rung {
+            Rung::StoredBrake => checker.check_brake(q, v, to.0, to.1, &self.external),
+            _ => checker.check(q, v, to.0, to.1, &self.external, self.previous.get()),
+        };
         target.ledger.violations = verdict.counts;
         target.ledger.slack = if verdict.worst.is_finite() { verdict.worst } else { f64::MAX };
     }
@@ -347,8 +383,8 @@ impl Projector {
         Status::Braked(reason)
     }
 
-    /// `v_next` after a tick of the stored brake, or of `-sgn(v) min(A_b, |v| / T)` where none is stored: inside the box and, if
-    /// `rows`, the nearest to it that the coupled rows allow, should they allow any.
+    /// `v_next` after a tick of the stored brake, as it was verified, or of `-sgn(v) min(A_b, |v| / T)` where none is stored: inside the
+    /// box and, if `rows`, the nearest to it that the coupled rows allow, should they allow any.
     fn stop(&mut self, q: &[f64], v: &[f64], target: &mut Target, rows: bool) {
         let stored = self.settings.braking == Braking::Stored && self.backup.stored;
         for &i in &self.dofs.controllable {
@@ -358,7 +394,7 @@ impl Projector {
             };
             self.v_next[i] = stop.clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
         }
-        if rows {
+        if rows && !stored {
             self.goal.copy_from_slice(&self.v_next);
             let _ = self.coupled_rows(q, v, target); // without an answer the brake stays as it is
         }

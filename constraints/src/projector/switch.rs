@@ -41,6 +41,7 @@ impl Projector {
                 stages.sources.enable(limit, switch.enabled);
             }
             self.checker.enable(limit, switch.enabled, &self.limits);
+            self.backup.enable(limit, switch.enabled, &self.limits);
         }
         Ok(())
     }
@@ -148,7 +149,9 @@ impl Projector {
         for (a, (to, from)) in target.acceleration.iter_mut().zip(proposal.v.iter().zip(v)) {
             *a = (to - from) / self.period.dt;
         }
+        let rung = std::mem::replace(&mut target.ledger.rung, crate::Rung::ClosedForm);
         self.report_unsolved(q, v, target);
+        target.ledger.rung = rung;
         target.ledger.moved = 0.0;
     }
 

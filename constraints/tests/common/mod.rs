@@ -1,6 +1,7 @@
 //! What the tests of the projector share.
 #![allow(dead_code, unreachable_pub)]
 
+pub mod arms;
 pub mod solids;
 
 use nearl_constraints::*;

@@ -299,4 +299,12 @@ impl Rows for CollisionRows {
             out[near.slot] = clearance.excess(near.closing(then), self.braking, motion.period);
         }
     }
+
+    /// Metres by which the two nearest bodies are closer than the margin, in the first place: which pair is in which slot changes
+    /// along a motion.
+    fn breach(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
+        out.fill(f64::NEG_INFINITY);
+        let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
+        out[0] = self.margin - self.pairs.least(then);
+    }
 }

@@ -110,6 +110,13 @@ impl Pairs {
         place(&self.bodies, kinematics, &mut self.before);
     }
 
+    /// The least distance of all pairs, at most the influence [m]. Allocates nothing.
+    pub(super) fn least(&mut self, kinematics: &mut Kinematics) -> f64 {
+        place(&self.bodies, kinematics, &mut self.at);
+        self.rank();
+        self.nearest.iter().fold(self.reach.influence, |least, (_, between)| least.min(between.distance))
+    }
+
     /// The nearest pairs within reach at the state `kinematics` is at, equal distances in the order of the pairs. Allocates nothing.
     pub(super) fn look(&mut self, kinematics: &mut Kinematics) -> &[Near] {
         place(&self.bodies, kinematics, &mut self.at);
