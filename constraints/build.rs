@@ -8,17 +8,16 @@ use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 /// What the wheels must hold, with the package that brings it.
-const NEEDED: [(&str, &str); 4] = [
+const NEEDED: [(&str, &str); 3] = [
     ("include/pinocchio/config.hpp", "libpinocchio"),
     ("include/eigen3/Eigen/Core", "cmeel-eigen"),
-    ("include/urdfdom_headers/urdf_model/model.h", "cmeel-urdfdom-headers"),
-    ("lib/libpinocchio_parsers.so", "libpinocchio"),
+    ("lib/libpinocchio_default.so", "libpinocchio"),
 ];
 
 /// Exported CMake targets that carry the compile definitions of the wheels.
 const TARGETS: [&str; 2] = ["lib/cmake/pinocchio/pinocchioTargets.cmake", "lib/cmake/coal/coalTargets.cmake"];
 
-const SOURCES: [&str; 3] = ["cpp/load.cpp", "cpp/dynamics.cpp", "cpp/kinematics.cpp"];
+const SOURCES: [&str; 3] = ["cpp/build.cpp", "cpp/dynamics.cpp", "cpp/kinematics.cpp"];
 
 fn main() {
     println!("cargo:rerun-if-env-changed=NEARL_SITE_PACKAGES");
@@ -29,7 +28,7 @@ fn main() {
     let include = prefix.join("include");
     let mut build = cc::Build::new();
     build.cpp(true).std("c++17").warnings(false).flag("-w").opt_level(2).debug(false).files(SOURCES);
-    for folder in ["", "eigen3", "urdfdom_headers", "urdfdom"] {
+    for folder in ["", "eigen3"] {
         build.flag("-isystem").flag(include.join(folder));
     }
     for definition in exported_definitions(&prefix) {
@@ -43,7 +42,6 @@ fn main() {
     let lib = prefix.join("lib");
     println!("cargo:rustc-link-search=native={}", lib.display());
     println!("cargo:rustc-link-lib=dylib=pinocchio_default");
-    println!("cargo:rustc-link-lib=dylib=pinocchio_parsers");
     println!("cargo:rustc-link-arg=-Wl,-rpath-link,{}", lib.display());
     println!("cargo:rustc-link-arg=-Wl,-rpath,{}", lib.display());
     println!("cargo:lib={}", lib.display()); // DEP_NEARL_PINOCCHIO_LIB in the build scripts of dependants

@@ -3,22 +3,8 @@
 #include <pinocchio/algorithm/frames.hpp>
 #include <pinocchio/algorithm/jacobian.hpp>
 #include <pinocchio/algorithm/kinematics.hpp>
-#include <cstdio>
 
 extern "C" {
-int nc_model_nframes(const nc_model *m) { return m->model.nframes; }
-
-int nc_model_frame(const nc_model *m, int frame, char *name, size_t name_cap, int *body, int *joint) {
-  return guard([&] {
-    const auto &f = m->model.frames.at(frame);
-    std::snprintf(name, name_cap, "%s", f.name.c_str());
-    *body = f.type == pin::BODY;
-    *joint = (int)f.parentJoint - 1;
-  });
-}
-
-int nc_model_joint_parent(const nc_model *m, int joint) { return (int)m->model.parents.at(joint + 1) - 1; }
-
 int nc_kinematics(const nc_model *m, nc_data *d, const double *q, const double *v, const double *a, double *jacobian) {
   const auto &x = m->model;
   return guard([&] {

@@ -10,26 +10,20 @@ typedef struct nc_data nc_data;   // scratch: one per thread
 
 const char *nc_last_error(void);
 
-// -- building (load.cpp) --
-nc_model *nc_model_from_urdf_text(const char *xml, int free_flyer);
-nc_model *nc_model_from_mjcf_file(const char *path);
+// -- building (build.cpp): joints are numbered from 0 as they are added, -1 is the world --
+// poses: position, then the rotation matrix row by row
+enum { NC_FREE, NC_BALL, NC_HINGE, NC_CONTINUOUS, NC_SLIDE, NC_PLANAR };
+nc_model *nc_model_new(const double gravity[3]);
 void nc_model_free(nc_model *);
 int nc_model_nq(const nc_model *);
 int nc_model_nv(const nc_model *);
-int nc_model_njoints(const nc_model *); // without the universe
-// joint 0 is the first after the universe; *type: the letters Pinocchio names the joint with
-int nc_model_joint(const nc_model *, int joint, char *name, size_t name_cap, char *type, size_t type_cap,
-                   int *idx_q, int *nq, int *idx_v, int *nv);
-// lower and upper hold nq numbers, the others nv
-int nc_model_limits(const nc_model *, double *lower, double *upper, double *velocity, double *effort,
-                    double *damping, double *friction);
+// depth first; axis has length 1
+int nc_model_add_joint(nc_model *, int parent, int kind, const double axis[3], const double pose[12]);
+// inertia about com: xx, xy, xz, yy, yz, zz
+int nc_model_append_body(nc_model *, int joint, const double pose[12], double mass, const double com[3], const double inertia[6]);
+int nc_model_add_frame(nc_model *, int joint, const double pose[12]); // frame 0 is the universe
 double nc_model_mass(const nc_model *);
-double nc_model_joint_mass(const nc_model *, int joint);
-int nc_model_scale_mass(nc_model *, double factor);
-int nc_model_set_gravity(nc_model *, const double gravity[3]);
 int nc_model_set_armature(nc_model *, const double *armature);
-// moves everything that hangs on the universe; pose: position, then the rotation matrix column by column
-int nc_model_place_base(nc_model *, const double pose[12]);
 int nc_model_neutral(const nc_model *, double *q);
 
 // -- evaluating (dynamics.cpp): none of these allocates --
@@ -45,10 +39,6 @@ int nc_integrate(const nc_model *, nc_data *, const double *q, const double *dq,
 int nc_difference(const nc_model *, nc_data *, const double *q0, const double *q1, double *dq);
 
 // -- frames (kinematics.cpp): none of the functions with data allocates --
-int nc_model_nframes(const nc_model *); // with the universe, frame 0
-// *body: 1 for a link; *joint: the joint that moves it, -1 for none
-int nc_model_frame(const nc_model *, int frame, char *name, size_t name_cap, int *body, int *joint);
-int nc_model_joint_parent(const nc_model *, int joint); // -1: the universe
 // placements, velocities and accelerations of all joints; unless null, jacobian gets the column of each dof (6 x nv, linear first, of
 // the point at the world's origin, world axes)
 int nc_kinematics(const nc_model *, nc_data *, const double *q, const double *v, const double *a, double *jacobian);

@@ -71,11 +71,6 @@ pub fn tau_to_mujoco(model: &Model, q: &[f64], tau: &[f64], mujoco: &mut [f64]) 
     v_to_mujoco(model, q, tau, mujoco);
 }
 
-/// Generalised force in Pinocchio's coordinates from MuJoCo's; forces transform like velocities.
-pub fn tau_from_mujoco(model: &Model, q: &[f64], mujoco: &[f64], tau: &mut [f64]) {
-    v_from_mujoco(model, q, mujoco, tau);
-}
-
 fn for_each_free(model: &Model, mut f: impl FnMut(&Joint)) {
     model.joints().iter().filter(|j| j.nq == 7 && j.nv == 6).for_each(&mut f);
 }

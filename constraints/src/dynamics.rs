@@ -13,8 +13,6 @@ pub struct Dynamics {
     model: Model,
     scratch: RawData,
     lengths: (usize, usize),
-    /// Pinocchio's derivatives take the axes of the joints for constant.
-    axes_turn: bool,
     middle: Middle,
 }
 
@@ -43,13 +41,7 @@ impl Dynamics {
             behind: zero(),
             by_velocity: vec![0.0; lengths.1 * lengths.1],
         };
-        Dynamics {
-            scratch: RawData::new(model.raw()),
-            model: model.clone(),
-            axes_turn: model.has_composites(),
-            lengths,
-            middle,
-        }
+        Dynamics { scratch: RawData::new(model.raw()), model: model.clone(), lengths, middle }
     }
 
     /// Inverse dynamics `tau = M a + nle`, without the passive forces: a motor supplies `tau - passive`.
@@ -178,24 +170,15 @@ impl Dynamics {
         self.middle = m;
     }
 
-    /// `by_velocity = d nle / d v` (nv x nv, row-major) at `v`: Pinocchio's, or column by column where that is off.
+    /// `by_velocity = d nle / d v` (nv x nv, row-major) at `v`.
     fn nle_by_velocity(&mut self, v: &[f64], m: &mut Middle) {
-        if !self.axes_turn {
-            // SAFETY: `m` has been made for this model, and the lengths of `v` were checked.
-            let code = unsafe {
-                let (model, data) = self.pointers();
-                let by_velocity = m.by_velocity.as_mut_ptr();
-                pinocchio::nc_nle_by_velocity(model, data, m.q.as_ptr(), v.as_ptr(), by_velocity)
-            };
-            return spoil(code, &mut m.by_velocity);
-        }
-        let nv = v.len();
-        for j in 0..nv {
-            m.step.fill(0.0);
-            m.step[j] = 1.0;
-            self.nle_along(v, m);
-            m.by_velocity.iter_mut().skip(j).step_by(nv).zip(&m.force).for_each(|(to, from)| *to = *from);
-        }
+        // SAFETY: `m` has been made for this model, and the lengths of `v` were checked.
+        let code = unsafe {
+            let (model, data) = self.pointers();
+            let by_velocity = m.by_velocity.as_mut_ptr();
+            pinocchio::nc_nle_by_velocity(model, data, m.q.as_ptr(), v.as_ptr(), by_velocity)
+        };
+        spoil(code, &mut m.by_velocity);
     }
 
     /// `force = (d nle / d v) step` at `v`. The non-linear effects are quadratic in the velocity, so that the central difference is the

@@ -24,24 +24,12 @@ pub enum ModelError {
         reason: String,
     },
     /// Pinocchio refused it.
-    #[error("{file} was refused by Pinocchio: {reason}; correct the {format} file")]
+    #[error("{file} was refused by Pinocchio: {reason}; correct the file")]
     Refused {
         /// File, or "the text".
         file: String,
-        /// "URDF" or "MJCF".
-        format: &'static str,
         /// Pinocchio's words.
         reason: String,
-    },
-    /// The file uses something that would be read wrongly; a silently wrong model is worse than none.
-    #[error("{file} uses {feature}, which this reader does not support; {next}")]
-    Unsupported {
-        /// File, or "the text".
-        file: String,
-        /// Element or attribute.
-        feature: String,
-        /// What to do instead.
-        next: &'static str,
     },
     /// Numbers that cannot be: NaN, lower above upper, negative mass; every one is listed.
     #[error("{file} holds impossible numbers: {list}; correct them in the file")]

@@ -47,6 +47,7 @@
 //! }
 //! ```
 
+mod assemble;
 mod certify;
 pub mod checker;
 pub mod convention;
@@ -59,7 +60,6 @@ mod kinematics;
 mod layout;
 pub mod ledger;
 pub mod limit;
-mod mjcf;
 mod model;
 mod period_dynamics;
 mod pinocchio;

@@ -1,106 +1,249 @@
-//! What a URDF really states about each joint, and the numbers in it that cannot be.
+//! A robot from a URDF: links become bodies, fixed joints frames, in Pinocchio's order (the joints of a link by name).
 //!
-//! Pinocchio turns missing position limits into [0, 0] and accepts lower above upper, zero effort and NaN.
+//! What cannot be is refused, all of it in one sentence; what is not part of the description is noted.
+
+mod check;
+mod collision;
 
 use crate::ModelError;
-use crate::geometry::{Placement, Shape};
-use roxmltree::{Document, Node};
-use std::collections::{BTreeMap, BTreeSet};
+use crate::description::{Body, Frame, JointDescription, JointKind, Motor, Range, RobotDescription};
+use crate::geometry::Placement;
+use check::{check_joint, check_link, check_tree};
+use roxmltree::{Document, Node, ParsingOptions};
+use std::collections::HashMap;
 
-/// One `<collision>` of a link.
-#[derive(Debug, Clone)]
-pub(crate) struct LinkShape {
-    pub(crate) link: String,
-    /// `None` for a mesh.
-    pub(crate) shape: Option<Shape>,
-    /// In the link's axes.
-    pub(crate) placement: Placement,
-}
+/// Acceleration of free fall that URDF implies [m/s²].
+const GRAVITY: [f64; 3] = [0.0, 0.0, -9.81];
 
-/// Position limits as stated.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Stated {
-    /// Both numbers are in the file.
-    Range,
-    /// A continuous joint: none by intention.
-    Unlimited,
-    /// A revolute or prismatic joint without them.
-    Missing,
-}
+/// Larger files are refused while they are read.
+const MOST_NODES: u32 = 1_000_000;
 
-/// Movable joints by name.
-type Joints = Vec<(String, Stated)>;
-
-/// Movable joints by name, the collision geometry, and a note for each mimic joint.
-type Read = (Joints, Vec<LinkShape>, Vec<String>);
-
-/// Reads what Pinocchio does not tell; what cannot be is refused, all of it in one sentence.
-pub(crate) fn read(xml: &str, file: &str) -> Result<Read, ModelError> {
+/// Reads a text called `file` in messages; with `free_flyer` the root link floats on a joint called `root_joint`.
+pub(crate) fn read(xml: &str, file: &str, free_flyer: bool) -> Result<RobotDescription, ModelError> {
     let malformed = |reason: String| ModelError::Malformed { file: file.to_string(), format: "URDF", reason };
-    let document = Document::parse(xml).map_err(|e| malformed(e.to_string()))?;
+    let options = ParsingOptions { nodes_limit: MOST_NODES, ..ParsingOptions::default() };
+    let document = Document::parse_with_options(xml, options).map_err(|e| malformed(e.to_string()))?;
     let root = document.root_element();
     if !root.has_tag_name("robot") {
         return Err(malformed(format!("its root element is <{}>, not <robot>", root.tag_name().name())));
     }
     let mut wrong = Vec::new();
-    let mut collisions = Vec::new();
-    for link in root.children().filter(|n| n.has_tag_name("link")) {
-        check_link(link, &mut wrong);
-        for node in link.children().filter(|n| n.has_tag_name("collision")) {
-            collisions.extend(collision(link.attribute("name").unwrap_or("?"), node, &mut wrong));
-        }
-    }
-    let joints = || root.children().filter(|n| n.has_tag_name("joint"));
+    children(root, "link").for_each(|link| check_link(link, &mut wrong));
     check_tree(root, &mut wrong);
-    let mimics = joints().filter_map(mimic).collect();
-    let stated = joints().filter_map(|joint| check_joint(joint, &mut wrong)).collect();
-    if !wrong.is_empty() {
-        return Err(ModelError::Impossible { file: file.to_string(), list: wrong.join("; ") });
+    children(root, "joint").for_each(|joint| check_joint(joint, &mut wrong));
+    let mut reader = Reader { robot: empty(root), wrong };
+    if reader.wrong.is_empty() {
+        reader.tree(root, free_flyer);
+        reader.notes(root);
     }
-    Ok((stated, collisions, mimics))
+    match reader.wrong.is_empty() {
+        true => Ok(reader.robot),
+        false => Err(ModelError::Impossible { file: file.to_string(), list: reader.wrong.join("; ") }),
+    }
 }
 
-/// Names once each, links that are there, and one root: what Pinocchio's reader says on standard error only.
-fn check_tree(robot: Node, wrong: &mut Vec<String>) {
-    let named = |tag| {
-        robot.children().filter(move |n| n.has_tag_name(tag)).map(|n| n.attribute("name").unwrap_or("?"))
-    };
-    for tag in ["link", "joint"] {
-        let mut seen = BTreeSet::new();
-        let again: BTreeSet<_> = named(tag).filter(|name| !seen.insert(*name)).collect();
-        wrong.extend(again.iter().map(|name| format!("{tag} '{name}' is there more than once")));
-    }
-    let links: BTreeSet<_> = named("link").collect();
-    let mut parents = BTreeMap::new();
-    for joint in robot.children().filter(|n| n.has_tag_name("joint")) {
-        let name = joint.attribute("name").unwrap_or("?");
-        let mut end = |tag: &str| {
-            let link = joint.children().find(|n| n.has_tag_name(tag)).and_then(|n| n.attribute("link"));
-            match link {
-                None => wrong.push(format!("joint '{name}' has no <{tag} link=...>")),
-                Some(link) if !links.contains(link) => {
-                    wrong.push(format!("joint '{name}' has the {tag} link '{link}', which is not there"));
-                }
-                Some(_) => {}
+struct Reader {
+    robot: RobotDescription,
+    wrong: Vec<String>,
+}
+
+impl Reader {
+    /// Adds the links depth first, without recursion: a chain may be long.
+    fn tree(&mut self, root: Node, free_flyer: bool) {
+        let links: HashMap<_, _> = children(root, "link").map(|link| (called(link), link)).collect();
+        let mut below: HashMap<&str, Vec<Node>> = HashMap::new();
+        let mut joints: Vec<_> = children(root, "joint").collect();
+        joints.sort_by_key(|joint| called(*joint));
+        joints.iter().for_each(|joint| below.entry(end(*joint, "parent")).or_default().push(*joint));
+        let is_child = |link: &Node| joints.iter().any(|joint| end(*joint, "child") == called(*link));
+        let Some(first) = children(root, "link").find(|link| !is_child(link)) else { return };
+        let mut open = vec![(first, None, None)];
+        let mut seen = 0;
+        while let Some((link, joint, parent)) = open.pop() {
+            let number = self.robot.bodies.len();
+            self.body(link, joint, parent);
+            if joint.is_none() && free_flyer {
+                self.robot.bodies[0].joints.push(JointDescription::new("root_joint", JointKind::Free));
             }
-            link
-        };
-        let (_, child) = (end("parent"), end("child"));
-        if let Some(other) = child.and_then(|child| parents.insert(child, name)) {
-            wrong.push(format!(
-                "link '{}' is the child of joints '{other}' and '{name}'",
-                child.unwrap_or("?")
+            let next = below.get(called(link)).into_iter().flatten().rev();
+            open.extend(next.map(|joint| (links[end(*joint, "child")], Some(*joint), Some(number))));
+            seen += 1;
+        }
+        if seen < links.len() {
+            let there = |name: &&&str| !self.robot.bodies.iter().any(|body| body.name == **name);
+            let mut circle: Vec<_> = links.keys().filter(there).map(|name| format!("'{name}'")).collect();
+            circle.sort();
+            let names = circle.join(", ");
+            self.wrong.push(format!(
+                "the links {names} hang on each other in a circle and not on '{}'",
+                called(first)
             ));
         }
     }
-    let roots: Vec<_> = links.iter().filter(|link| !parents.contains_key(*link)).collect();
-    if roots.len() > 1 {
-        let names = roots.iter().map(|n| format!("'{n}'")).collect::<Vec<_>>().join(", ");
-        wrong.push(format!("the links {names} are no joint's child, but only one may be the root"));
+
+    fn body(&mut self, link: Node, joint: Option<Node>, parent: Option<usize>) {
+        let number = self.robot.bodies.len();
+        let mut body = Body {
+            name: called(link).to_string(),
+            parent,
+            placement: joint.map_or(Placement::IDENTITY, |joint| self.origin(joint)),
+            mass: 0.0,
+            com: [0.0; 3],
+            inertia: [0.0; 6],
+            joints: Vec::new(),
+        };
+        if let Some(inertial) = children(link, "inertial").next() {
+            self.inertial(link, inertial, &mut body);
+        }
+        if let Some(joint) = joint {
+            match self.joint(joint) {
+                Some(joint) => body.joints.push(joint),
+                None => self.robot.frames.push(Frame {
+                    name: called(joint).to_string(),
+                    body: Some(number),
+                    placement: Placement::IDENTITY,
+                }),
+            }
+        }
+        let solids = children(link, "collision");
+        self.robot.solids.extend(solids.filter_map(|c| collision::read(number, c, &mut self.wrong)));
+        self.robot.bodies.push(body);
+    }
+
+    /// Mass, its centre, and the inertia `R I R'` in the link's axes.
+    fn inertial(&mut self, link: Node, inertial: Node, body: &mut Body) {
+        let at = self.origin(inertial);
+        let name = called(link);
+        let [mass] = self.numbers(name, inertial, "mass", ["value"]);
+        let keys = ["ixx", "ixy", "ixz", "iyy", "iyz", "izz"];
+        let [xx, xy, xz, yy, yz, zz] = self.numbers(name, inertial, "inertia", keys);
+        let (own, r) = ([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], at.rotation);
+        let entry = |i: usize, j: usize| -> f64 {
+            (0..3).map(|k| (0..3).map(|l| r[i][k] * own[k][l] * r[j][l]).sum::<f64>()).sum()
+        };
+        (body.mass, body.com) = (mass, at.position);
+        body.inertia = match r == Placement::IDENTITY.rotation {
+            true => [xx, xy, xz, yy, yz, zz],
+            false => [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)],
+        };
+    }
+
+    /// A moving joint; `None` for a fixed one.
+    fn joint(&mut self, node: Node) -> Option<JointDescription> {
+        let name = called(node);
+        let kind = match node.attribute("type") {
+            Some("revolute") => JointKind::Hinge,
+            Some("continuous") => JointKind::Continuous,
+            Some("prismatic") => JointKind::Slide,
+            Some("floating") => JointKind::Free,
+            Some("planar") => JointKind::Planar,
+            _ => return None,
+        };
+        let mut joint = JointDescription::new(name, kind);
+        let axis = self.axis(node);
+        if kind == JointKind::Planar && axis != [0.0, 0.0, 1.0] {
+            let text = "moves in its x-y plane here; turn its <origin> so that the axis is 0 0 1";
+            self.wrong.push(format!("planar joint '{name}' has the axis {axis:?}, but {text}"));
+        }
+        if !kind.has_one_dof() {
+            return Some(joint);
+        }
+        joint.axis = axis;
+        let limit = |key| number(children(node, "limit").next()?, key);
+        joint.range = match (limit("lower"), limit("upper")) {
+            _ if kind == JointKind::Continuous => Range::Unlimited,
+            (Some(lower), Some(upper)) => Range::Limited(lower, upper),
+            _ => Range::NotStated,
+        };
+        // A zero means that nobody filled it in.
+        (joint.velocity, joint.effort) =
+            (limit("velocity").filter(|x| *x > 0.0), limit("effort").filter(|x| *x > 0.0));
+        let dynamics = |key| number(children(node, "dynamics").next()?, key);
+        (joint.damping, joint.friction) =
+            (dynamics("damping").unwrap_or(0.0), dynamics("friction").unwrap_or(0.0));
+        let order = self.robot.motors.len();
+        self.robot.motors.push(Motor::direct(name, order, joint.effort));
+        Some(joint)
+    }
+
+    /// The axis at length 1; along x where none is stated.
+    fn axis(&mut self, joint: Node) -> [f64; 3] {
+        let Some(axis) = children(joint, "axis").next() else { return [1.0, 0.0, 0.0] };
+        let xyz: [f64; 3] = self.three(joint, axis, "xyz", "1 0 0");
+        let length = xyz.iter().map(|x| x * x).sum::<f64>().sqrt();
+        if length == 1.0 { xyz } else { xyz.map(|x| x / length) }
+    }
+
+    /// `<origin xyz rpy>` of an element.
+    fn origin(&mut self, of: Node) -> Placement {
+        let Some(origin) = children(of, "origin").next() else { return Placement::IDENTITY };
+        let position = self.three(of, origin, "xyz", "0 0 0");
+        match self.three(of, origin, "rpy", "0 0 0") {
+            [0.0, 0.0, 0.0] => Placement { position, ..Placement::IDENTITY },
+            rpy => Placement::new(position, rpy),
+        }
+    }
+
+    fn three(&mut self, of: Node, node: Node, key: &str, otherwise: &str) -> [f64; 3] {
+        let text = node.attribute(key).unwrap_or(otherwise);
+        let numbers: Option<Vec<f64>> = text.split_whitespace().map(finite).collect();
+        numbers.and_then(|x| x.try_into().ok()).unwrap_or_else(|| {
+            let name = of.ancestors().find_map(|n| n.attribute("name")).unwrap_or("?");
+            let (tag, inner) = (of.tag_name().name(), node.tag_name().name());
+            self.wrong.push(format!("{tag} of '{name}' has {inner} {key} '{text}', not three numbers"));
+            [0.0, 0.0, 1.0]
+        })
+    }
+
+    /// Attributes that must be there.
+    fn numbers<const N: usize>(&mut self, link: &str, of: Node, tag: &str, keys: [&str; N]) -> [f64; N] {
+        let node = children(of, tag).next();
+        keys.map(|key| {
+            node.and_then(|node| number(node, key)).unwrap_or_else(|| {
+                self.wrong.push(format!("link '{link}' has an <inertial> without {tag} {key}"));
+                0.0
+            })
+        })
+    }
+
+    /// What the description leaves out, and links that move and weigh nothing.
+    fn notes(&mut self, root: Node) {
+        let robot = &mut self.robot;
+        if robot.joints().any(|joint| joint.friction > 0.0) {
+            robot.notes.push("dry joint friction is not modelled".to_string());
+        }
+        robot.notes.extend(children(root, "joint").filter_map(mimic));
+        let mut weighs: Vec<bool> = robot.bodies.iter().map(|body| body.mass > 0.0).collect();
+        for k in (0..robot.bodies.len()).rev().filter(|k| robot.bodies[*k].joints.is_empty()) {
+            if let Some(parent) = robot.bodies[k].parent {
+                weighs[parent] |= weighs[k];
+            }
+        }
+        let light =
+            robot.bodies.iter().zip(&weighs).filter(|(body, weighs)| !(body.joints.is_empty() || **weighs));
+        let names: Vec<String> = light.map(|(body, _)| format!("'{}'", body.name)).collect();
+        if !names.is_empty() {
+            let names = names.join(", ");
+            robot.notes.push(format!(
+                "the moving links {names} have no mass: give each an <inertial>, or fix it to its parent"
+            ));
+        }
     }
 }
 
-/// Pinocchio reads a mimic joint as one of its own.
+fn empty(root: Node) -> RobotDescription {
+    RobotDescription {
+        name: called(root).to_string(),
+        gravity: GRAVITY,
+        bodies: Vec::new(),
+        frames: Vec::new(),
+        solids: Vec::new(),
+        motors: Vec::new(),
+        notes: Vec::new(),
+    }
+}
+
+/// A mimic joint is one of its own here.
 fn mimic(joint: Node) -> Option<String> {
     let mimic = joint.children().find(|n| n.has_tag_name("mimic"))?;
     let (name, of) = (joint.attribute("name").unwrap_or("?"), mimic.attribute("joint").unwrap_or("?"));
@@ -112,98 +255,23 @@ fn mimic(joint: Node) -> Option<String> {
     ))
 }
 
-/// The solid of one `<collision>`; `None` when it holds none or impossible numbers.
-fn collision(link: &str, node: Node, wrong: &mut Vec<String>) -> Option<LinkShape> {
-    let mut numbers = |n: Node, key: &str, default: Option<&str>| -> Option<Vec<f64>> {
-        let text = n.attribute(key).or(default).unwrap_or("");
-        let parsed: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
-        let good = parsed.filter(|all| !all.is_empty() && all.iter().all(|x| x.is_finite()));
-        if good.is_none() {
-            wrong.push(format!("link '{link}' collision {} {key} is '{text}'", n.tag_name().name()));
-        }
-        good
-    };
-    let solid = node.children().find(|n| n.has_tag_name("geometry"))?.children().find(Node::is_element)?;
-    let mut one = |key: &str| numbers(solid, key, None).map(|x| x[0]);
-    let shape = match solid.tag_name().name() {
-        "sphere" => Some(Shape::Sphere { radius: one("radius")? }),
-        "cylinder" => Some(Shape::Cylinder { radius: one("radius")?, length: one("length")? }),
-        "capsule" => Some(Shape::Capsule { radius: one("radius")?, length: one("length")? }),
-        "box" => Some(Shape::Box { size: numbers(solid, "size", None)?.try_into().ok()? }),
-        _ => None,
-    };
-    let mut placement = Placement::IDENTITY;
-    if let Some(origin) = node.children().find(|n| n.has_tag_name("origin")) {
-        let mut three = |key| numbers(origin, key, Some("0 0 0")).and_then(|x| x.try_into().ok());
-        placement = Placement::new(three("xyz")?, three("rpy")?);
-    }
-    Some(LinkShape { link: link.to_string(), shape, placement })
+fn children<'a, 'i: 'a>(node: Node<'a, 'i>, tag: &'a str) -> impl Iterator<Item = Node<'a, 'i>> {
+    node.children().filter(move |n| n.has_tag_name(tag))
 }
 
-fn check_link(link: Node, wrong: &mut Vec<String>) {
-    let name = link.attribute("name").unwrap_or("?");
-    for part in link.children().filter(|n| n.has_tag_name("inertial")).flat_map(|i| i.children()) {
-        for a in part.attributes().filter(|_| part.has_tag_name("mass") || part.has_tag_name("inertia")) {
-            let value = a.value().trim().parse::<f64>().unwrap_or(f64::NAN);
-            if !value.is_finite() {
-                wrong.push(format!(
-                    "link '{name}' {} {} is '{}'",
-                    part.tag_name().name(),
-                    a.name(),
-                    a.value()
-                ));
-            } else if part.has_tag_name("mass") && value < 0.0 {
-                wrong.push(format!("link '{name}' mass is {value} kg"));
-            } else if matches!(a.name(), "ixx" | "iyy" | "izz") && value < 0.0 {
-                wrong.push(format!("link '{name}' inertia {} is {value} kg m²", a.name()));
-            }
-        }
-    }
+fn called<'a>(node: Node<'a, '_>) -> &'a str {
+    node.attribute("name").unwrap_or("?")
 }
 
-fn check_joint(joint: Node, wrong: &mut Vec<String>) -> Option<(String, Stated)> {
-    let name = joint.attribute("name").unwrap_or("?").to_string();
-    let kind = joint.attribute("type").unwrap_or("?");
-    const KINDS: [&str; 6] = ["revolute", "continuous", "prismatic", "fixed", "floating", "planar"];
-    if !KINDS.contains(&kind) {
-        wrong.push(format!("joint '{name}' has the type '{kind}', which is none of {}", KINDS.join(", ")));
-    }
-    if !KINDS[..3].contains(&kind) {
-        return None;
-    }
-    let axis = joint.children().find(|n| n.has_tag_name("axis")).and_then(|n| n.attribute("xyz"));
-    if axis.is_some_and(|xyz| xyz.split_whitespace().all(|x| x.parse() == Ok(0.0))) {
-        wrong.push(format!("joint '{name}' has the axis 0 0 0"));
-    }
-    let limit = joint.children().find(|n| n.has_tag_name("limit"));
-    if kind != "continuous" {
-        let missing =
-            ["effort", "velocity"].into_iter().filter(|key| limit.is_none_or(|l| !l.has_attribute(*key)));
-        let missing: Vec<_> = missing.collect();
-        if !missing.is_empty() {
-            wrong.push(format!("joint '{name}' states no {} in <limit>", missing.join(" and no ")));
-        }
-    }
-    let mut number = |key: &str| {
-        let text = limit?.attribute(key)?;
-        let value = text.trim().parse::<f64>().unwrap_or(f64::NAN);
-        if !value.is_finite() || (matches!(key, "effort" | "velocity") && value < 0.0) {
-            wrong.push(format!("joint '{name}' {key} is '{text}'"));
-            return None;
-        }
-        Some(value)
-    };
-    let (lower, upper) = (number("lower"), number("upper"));
-    let _ = (number("effort"), number("velocity"));
-    if let (Some(lower), Some(upper)) = (lower, upper)
-        && lower > upper
-    {
-        wrong.push(format!("joint '{name}' has lower {lower} above upper {upper}"));
-    }
-    let stated = match kind {
-        "continuous" => Stated::Unlimited,
-        _ if lower.is_some() && upper.is_some() => Stated::Range,
-        _ => Stated::Missing,
-    };
-    Some((name, stated))
+/// The link at one end of a joint.
+fn end<'a, 'i: 'a>(joint: Node<'a, 'i>, tag: &'a str) -> &'a str {
+    children(joint, tag).find_map(|n| n.attribute("link")).unwrap_or("?")
+}
+
+fn number(node: Node, key: &str) -> Option<f64> {
+    finite(node.attribute(key)?)
+}
+
+fn finite(word: &str) -> Option<f64> {
+    word.trim().parse().ok().filter(|x: &f64| x.is_finite())
 }

@@ -39,7 +39,6 @@ fn models() {
     std::fs::remove_file(&empty).unwrap();
     refuse_model(Model::from_urdf_text("<robot>\n<link</robot>"), &["the URDF text", "2:"]);
     refuse_model(Model::from_urdf_text("<mujoco/>"), &["<mujoco>", "<robot>"]);
-    refuse_model(Model::from_mjcf_text("<robot/>"), &["<robot>", "<mujoco>"]);
     let mass = |m: &str| Model::from_urdf_text(&urdf(GOOD, m));
     assert!(mass("1").is_ok());
     refuse_model(mass("-1"), &["link 'b' mass is -1 kg"]);
@@ -79,129 +78,57 @@ fn models() {
         mass("1").and_then(|m| m.joint("elbwo").map(|_| m.clone())),
         &["'elbwo'", "did you mean 'elbow'"],
     );
-    let two = "<mujoco><worldbody><body><joint/><geom size='1'/></body><body><joint/><geom size='1'/></body></worldbody></mujoco>";
-    refuse_model(Model::from_mjcf_text(two), &["several top-level bodies", "unnamed body in line 1"]);
-    let two = two.replacen("<body>", "<body name='left'>", 1).replacen("<body>", "<body name='right'>", 1);
-    refuse_model(Model::from_mjcf_text(&two), &["body 'left', body 'right'"]);
-    let ghost = "<mujoco><worldbody><body><joint name='a'/><geom size='1' contype='0' conaffinity='0'/></body></worldbody></mujoco>";
-    let words = ["an unnamed geom in line 1 of an unnamed body in line 1 without collision", "<inertial>"];
-    refuse_model(Model::from_mjcf_text(ghost), &words);
-    let ghost = ghost.replace("<body>", "<body name='arm'>").replace("<geom ", "<geom name='skin' ");
-    refuse_model(Model::from_mjcf_text(&ghost), &["geom 'skin' of body 'arm' without collision"]);
+}
+
+/// Each of these was read as something else, or not at all, without a word.
+#[test]
+fn urdfs_that_say_too_little_or_the_impossible() {
+    let with = |from: &str, to: &str| {
+        let text = urdf(GOOD, "1");
+        assert!(text.contains(from));
+        Model::from_urdf_text(&text.replacen(from, to, 1))
+    };
+    refuse_model(with(r#"<mass value="1"/>"#, ""), &["link 'b' has an <inertial> without mass value"]);
+    refuse_model(with(r#"izz="1""#, ""), &["link 'b' has an <inertial> without inertia izz"]);
     refuse_model(
-        Model::from_mjcf_text("<mujoco><include file='x.xml'/></mujoco>"),
-        &["<include>", "mj_saveLastXML"],
+        with("<axis", r#"<origin xyz="0 1"/><axis"#),
+        &["joint of 'elbow'", "xyz '0 1'", "three numbers"],
     );
-    let range =
-        "<mujoco><worldbody><body><joint name='a' range='3 1'/><geom size='1'/></body></worldbody></mujoco>";
-    refuse_model(Model::from_mjcf_text(range), &["'a' range", "lower 3 above upper 1"]);
+    let circle = "</robot>";
+    let joints = ["c", "d"].map(|link| format!(r#"<link name="{link}"/>"#)).concat()
+        + r#"<joint name="x" type="fixed"><parent link="c"/><child link="d"/></joint>"#
+        + r#"<joint name="y" type="fixed"><parent link="d"/><child link="c"/></joint></robot>"#;
+    refuse_model(with(circle, &joints), &["'c', 'd'", "in a circle"]);
+    let planar = with(r#"type="revolute""#, r#"type="planar""#);
+    assert_eq!(planar.map(|m| (m.nq(), m.nv())), Ok((4, 3)));
+    let tilted = with(
+        r#"type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>"#,
+        r#"type="planar"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/>"#,
+    );
+    refuse_model(tilted, &["planar joint 'elbow'", "0 0 1"]);
+    let weightless = with("<inertial>", "<inertial/><x>").map_err(|e| e.to_string());
+    assert!(weightless.is_err(), "not XML");
+    let light = r#"<link name="c"/><joint name="wrist" type="continuous"><parent link="b"/><child link="c"/></joint></robot>"#;
+    let light = with("</robot>", light).unwrap();
+    assert!(light.notes()[0].contains("the moving links 'c' have no mass"), "{:?}", light.notes());
+    let base_only = with(r#"type="revolute""#, r#"type="fixed""#);
+    refuse_model(base_only, &["the URDF text", "no movable joint"]);
 }
 
-/// MuJoCo reads them one after the other into one class; Pinocchio reads the first.
+/// By its size, before anything is built; reading does not recurse.
 #[test]
-fn several_sections_of_a_kind() {
-    let file = |more: &str| {
-        Model::from_mjcf_text(&format!(
-            "<mujoco><default><joint damping='1'/></default>{more}<worldbody><body name='arm'><joint name='a'/>\
-             <geom size='1' mass='1'/></body></worldbody></mujoco>"
-        ))
-    };
-    assert_eq!(file("").unwrap().damping(), [1.0]);
-    let one = "put all of it into one";
-    refuse_model(file("<default><joint damping='2'/></default>"), &["several <default> sections", one]);
-    refuse_model(file("<compiler/><compiler angle='radian'/>"), &["several <compiler> sections", one]);
-}
-
-/// Its body would weigh nothing.
-#[test]
-fn a_mesh_that_is_to_give_the_mass() {
-    let file = |defaults: &str, body: &str, geom: &str| {
-        Model::from_mjcf_text(&format!(
-            "<mujoco><default>{defaults}</default><asset><mesh name='m' vertex='0 0 0 1 0 0 0 1 0 0 0 1'/></asset>\
-             <worldbody><body name='arm'><joint name='a'/>{body}<geom name='g' mesh='m' {geom}/></body></worldbody></mujoco>"
-        ))
-    };
-    let words = ["mesh geom 'g' of body 'arm'", "give its body an <inertial>"];
-    refuse_model(file("", "", "type='mesh'"), &words);
-    refuse_model(file("<geom type='mesh'/>", "", ""), &words);
-    let inertial = "<inertial pos='0 0 0' mass='2' diaginertia='1 1 1'/>";
-    assert_eq!(file("", inertial, "type='mesh'").unwrap().total_mass(), 2.0);
-    assert!(file("", "<geom size='1' mass='1'/>", "type='mesh' mass='0'").is_ok());
-}
-
-/// Forces that MuJoCo leaves out or adds, and masses that it takes from elsewhere.
-#[test]
-fn switches_that_would_be_overlooked() {
-    let file = |head: &str, body: &str, motor: &str| {
-        Model::from_mjcf_text(&format!(
-            "<mujoco>{head}<worldbody><body name='arm'><joint name='a' damping='1'/>{body}<geom size='1' mass='1'/></body></worldbody>\
-             <actuator><motor name='m' joint='a' {motor}/></actuator></mujoco>"
-        ))
-    };
-    for flag in ["damper", "spring", "eulerdamp", "actuation"] {
-        let head = format!("<option><flag {flag}='disable'/></option>");
-        refuse_model(file(&head, "", ""), &[&format!("flag {flag}='disable'"), "take it out"]);
-    }
-    refuse_model(file("", "", "armature='0.1'"), &["armature='0.1' of motor 'm'", "at the joint"]);
-    refuse_model(file("", "", "damping='2 0'"), &["damping='2 0' of motor 'm'", "at the joint"]);
-    let inertial = "<inertial pos='0 0 0' mass='2' diaginertia='1 1 1'/>";
-    let geoms = "<compiler inertiafromgeom='true'/>";
-    refuse_model(file(geoms, inertial, ""), &["inertiafromgeom='true' beside <inertial>"]);
-    assert!(file(geoms, "", "damping='0'").is_ok());
-    assert!(file("<option><flag contact='disable' eulerdamp='enable'/></option>", inertial, "").is_ok());
-}
-
-/// In MuJoCo the first joint has stiffness 40 and damping 8 (`jnt_stiffness`, `dof_damping`); these forces were zero here.
-#[test]
-fn forces_that_would_be_missing() {
-    let file = |defaults: &str, body: &str, joint: &str| {
-        Model::from_mjcf_text(&format!(
-            "<mujoco><default>{defaults}</default><worldbody><body name='arm' {body}><joint name='a' {joint}/>\
-             <geom size='1' mass='1'/></body></worldbody></mujoco>"
-        ))
-    };
-    let spring = ["springdamper='0.1 1' of joint 'a'", "write stiffness and damping instead"];
-    refuse_model(file("", "", "springdamper='0.1 1'"), &spring);
-    refuse_model(file("<joint springdamper='0.1 1'/>", "", ""), &spring);
-    let inner = "<default class='c'><joint springdamper='0.1 1'/></default>";
-    refuse_model(file(inner, "childclass='c'", ""), &spring);
-    refuse_model(file("", "gravcomp='1'", ""), &["gravcomp='1' of body 'arm'", "take it out"]);
-    for (defaults, body, joint) in [
-        ("<joint springdamper='0.1 1'/>", "", "springdamper='0 0'"),
-        (inner, "", ""),
-        ("", "gravcomp='0'", "actuatorgravcomp='true'"), // compensates what no body asks for
-        ("", "", "stiffness='40' damping='8'"),
-    ] {
-        assert!(file(defaults, body, joint).is_ok(), "{defaults} {body} {joint}");
-    }
-}
-
-/// What MuJoCo makes of these depends on gains that the reader does not follow: 7, 3 and -5 times the control, and so on.
-#[test]
-fn actuators_whose_default_class_mixes_shortcuts() {
-    let file = |defaults: &str, actuator: &str| {
-        Model::from_mjcf_text(&format!(
-            "<mujoco><default>{defaults}</default><worldbody><body name='arm'><joint name='a'/>\
-             <geom size='1' mass='1'/></body></worldbody>\
-             <actuator>{actuator}</actuator></mujoco>"
-        ))
-    };
-    for (tag, defaults, actuator) in [
-        ("position", "<position kp='7'/><general biastype='none'/>", "<general joint='a' ctrlrange='-1 1'/>"),
-        (
-            "position",
-            "<position kp='7'/>",
-            "<general joint='a' ctrlrange='-1 1' gainprm='3' biastype='none'/>",
-        ),
-        ("damper", "<damper kv='5' ctrlrange='0 1'/>", "<general joint='a' gaintype='fixed'/>"),
-        ("adhesion", "<adhesion gain='5' ctrlrange='0 1'/>", "<general joint='a'/>"),
-    ] {
-        let words =
-            [&format!("<general> on top of <{tag}> for the actuator of 'a'"), "different default classes"];
-        refuse_model(file(defaults, actuator), &words);
-    }
-    let unlimited = file("<position kp='7'/><general biastype='none'/>", "<general joint='a'/>");
-    assert_eq!(unlimited.unwrap().effort_limit(), [f64::INFINITY]);
+fn a_chain_of_twenty_thousand_joints_is_refused() {
+    let links: String = (0..20_001).map(|k| format!(r#"<link name="l{k}"/>"#)).collect();
+    let joints: String = (0..20_000)
+        .map(|k| {
+            let (parent, child) = (format!("l{k}"), format!("l{}", k + 1));
+            format!(r#"<joint name="j{k}" type="continuous"><parent link="{parent}"/><child link="{child}"/></joint>"#)
+        })
+        .collect();
+    let text = format!(r#"<robot name="worm">{links}{joints}</robot>"#);
+    refuse_model(Model::from_urdf_text(&text), &["the URDF text has 20000 dofs", "500"]);
+    let fixed = text.replace("continuous", "fixed");
+    refuse_model(Model::from_urdf_text(&fixed), &["20001 bodies", "5000"]);
 }
 
 #[test]

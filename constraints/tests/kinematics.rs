@@ -29,8 +29,7 @@ fn robots() -> Vec<Robot> {
         let path = root.join("examples/robots").join(file["file"].as_str().unwrap());
         let model = match file["free_flyer"].as_bool().unwrap() {
             true => Model::from_urdf_free_flyer(&path).unwrap(),
-            false if path.extension().unwrap() == "xml" => Model::from_mjcf(&path).unwrap(),
-            false => Model::from_urdf(&path).unwrap(),
+            false => robot(file["file"].as_str().unwrap()),
         };
         let names: Vec<&str> =
             file["joints"].as_array().unwrap().iter().map(|x| x.as_str().unwrap()).collect();

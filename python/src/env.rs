@@ -66,7 +66,7 @@ impl Env {
             let file =
                 if path.is_dir() { run_folder::snapshot_of(&path).map_err(errors::value)? } else { path };
             let manifest = Snapshot::load(&file).map_err(errors::snapshot)?.manifest;
-            env::of_task(&manifest.task, &manifest.model, &manifest.task.name).map_err(errors::value)
+            env::of_task(&manifest, &manifest.task.name).map_err(errors::value)
         })?;
         Ok(Env::around(env))
     }

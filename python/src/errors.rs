@@ -4,6 +4,7 @@ use nearl_constraints::ModelError;
 use nearl_runtime::SnapshotError;
 use nearl_runtime::task::TaskError;
 use nearl_trainer::checkpoint::CheckpointError;
+use nearl_trainer::robot::RobotError;
 use nearl_trainer::run_folder::RunError;
 use nearl_trainer::tasks::TaskLoadError;
 use nearl_trainer::train::TrainError;
@@ -19,6 +20,14 @@ pub(crate) fn value(error: impl std::fmt::Display) -> PyErr {
 pub(crate) fn model(error: ModelError) -> PyErr {
     match error {
         ModelError::Unreadable { .. } => PyOSError::new_err(error.to_string()),
+        other => value(other),
+    }
+}
+
+/// A robot file that MuJoCo or our own reader looked at.
+pub(crate) fn robot(error: RobotError) -> PyErr {
+    match error {
+        RobotError::Model(error) => model(error),
         other => value(other),
     }
 }

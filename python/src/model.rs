@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
-use nearl_constraints::{self as constraints, Dynamics, convention};
+use nearl_constraints::{self as constraints, Dynamics, RobotDescription, convention};
+use nearl_trainer::robot;
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 
@@ -12,7 +13,7 @@ use crate::errors;
 
 type Vector<'py> = Bound<'py, PyArray1<f64>>;
 
-/// A robot from a URDF or MJCF file, through Pinocchio. Configurations and velocities are in Pinocchio's convention; they differ
+/// A robot from a URDF or MJCF file, or from its description. Configurations and velocities are in Pinocchio's convention; they differ
 /// from MuJoCo's for a free base only, and `q_from_mujoco` and its like translate.
 #[pyclass(module = "nearl._core", frozen)]
 pub(crate) struct Model {
@@ -57,10 +58,30 @@ impl Model {
         Ok(array(py, &tau))
     }
 
-    /// Reads an MJCF file.
+    /// Reads an MJCF file through MuJoCo, with what it includes and its meshes.
     #[staticmethod]
     fn from_mjcf(py: Python<'_>, path: PathBuf) -> PyResult<Model> {
-        py.detach(|| constraints::Model::from_mjcf(&path)).map(Model::of).map_err(errors::model)
+        py.detach(|| robot::read_mjcf(&path)).map_err(errors::robot).and_then(Model::build)
+    }
+
+    /// Builds a robot from the JSON text of a description.
+    #[staticmethod]
+    fn from_description(text: &str) -> PyResult<Model> {
+        let description = serde_json::from_str(text);
+        description
+            .map_err(|e| errors::value(format!("no description of a robot: {e}")))
+            .and_then(Model::build)
+    }
+
+    /// The robot as plain numbers: bodies, joints, motors, frames and solids, as JSON text.
+    fn description(&self) -> PyResult<String> {
+        serde_json::to_string(self.model.description()).map_err(errors::value)
+    }
+
+    /// Dry friction (nv) [N·m or N]: the force that a joint withstands before it moves.
+    #[getter]
+    fn friction<'py>(&self, py: Python<'py>) -> Vector<'py> {
+        array(py, self.model.friction())
     }
 
     /// Reads a URDF text.
@@ -69,10 +90,10 @@ impl Model {
         py.detach(|| constraints::Model::from_urdf_text(text)).map(Model::of).map_err(errors::model)
     }
 
-    /// Reads an MJCF text.
+    /// Reads an MJCF text through MuJoCo; files that it names are looked for in the current folder.
     #[staticmethod]
     fn from_mjcf_text(py: Python<'_>, text: &str) -> PyResult<Model> {
-        py.detach(|| constraints::Model::from_mjcf_text(text)).map(Model::of).map_err(errors::model)
+        py.detach(|| robot::read_mjcf_text(text)).map_err(errors::robot).and_then(Model::build)
     }
 
     /// Entries of a configuration.
@@ -265,6 +286,10 @@ impl Model {
 }
 
 impl Model {
+    fn build(description: RobotDescription) -> PyResult<Model> {
+        constraints::Model::from_description(description).map(Model::of).map_err(errors::model)
+    }
+
     pub(crate) fn of(model: constraints::Model) -> Model {
         Model { dynamics: Mutex::new(Dynamics::new(&model)), model }
     }

@@ -146,7 +146,8 @@ fn foreign_and_damaged_snapshots_are_refused_by_reason_while_the_loop_runs() {
     *flipped.last_mut().unwrap() ^= 1;
     let good = snapshot(3, |_| {}).to_bytes();
     let renamed = |m: &mut Manifest| {
-        m.model = m.model.replace("panda_joint3", "elbow");
+        let robot = serde_json::to_string(&m.robot).unwrap().replace("panda_joint3", "elbow");
+        m.robot = serde_json::from_str(&robot).unwrap();
         m.task.state.observation.iter_mut().for_each(|n| *n = n.replace("panda_joint3", "elbow"));
         m.task.state.propose.iter_mut().flatten().for_each(|n| *n = n.replace("panda_joint3", "elbow"));
     };

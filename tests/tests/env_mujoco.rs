@@ -117,7 +117,7 @@ fn a_pendulum_moves_as_the_equation_says() {
 
 #[test]
 fn a_urdf_keeps_its_tool_frame_its_limits_and_its_damping() {
-    let options = Options { sim_dt: Some(1e-3), without_contacts: true };
+    let options = Options { sim_dt: Some(1e-3), without_contacts: true, ..Options::default() };
     let model = Model::from_text(ARM, ModelFormat::Urdf, options).expect("the model compiles");
     let joint = &model.joints()[0];
     assert_eq!((joint.name.as_str(), joint.range, joint.effort), ("shoulder", [-1.0, 2.0], 30.0));

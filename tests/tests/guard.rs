@@ -194,7 +194,7 @@ struct Driven {
 impl Driven {
     fn new() -> Driven {
         let text = include_str!("../../examples/robots/panda/panda.urdf");
-        let options = mj::Options { sim_dt: Some(1e-4), without_contacts: true };
+        let options = mj::Options { sim_dt: Some(1e-4), without_contacts: true, ..mj::Options::default() };
         let model = mj::Model::from_text(text, mj::ModelFormat::Urdf, options).expect("plant");
         Driven { sim: mj::Sim::new(&model).expect("simulation") }
     }

@@ -9,6 +9,7 @@ use nearl_tests::random_policy;
 use nearl_trainer::env::{Env, Meter};
 use nearl_trainer::mj;
 use nearl_trainer::plant::{TOLERANCE, watched_limits};
+use nearl_trainer::robot;
 use nearl_trainer::rollout::{make_env, stream};
 
 /// Ticks of 1 ms.
@@ -102,6 +103,11 @@ fn without_projection_the_same_network_breaks_them() {
     );
 }
 
+/// A robot of an MJCF text.
+fn model(mjcf: &str) -> Model {
+    Model::from_description(robot::read_mjcf_text(mjcf).expect("robot")).expect("model")
+}
+
 /// The two-link arm's file with another timestep, with or without its dampers and springs.
 fn arm(text: &str, timestep: f64, dampers: bool) -> String {
     let text = text.replace("timestep=\"0.01\"", &format!("timestep=\"{timestep}\""));
@@ -124,7 +130,9 @@ fn swing(sub_steps: u32, dampers: bool) -> Swing {
     let mut snapshot = random_policy(&file.display().to_string(), 5, 3.0);
     let m = &mut snapshot.manifest;
     m.task.time.sim_dt = 0.01 / f64::from(sub_steps);
-    m.model = arm(&m.model, m.task.time.sim_dt, dampers);
+    let file = m.simulation.as_mut().expect("a robot file");
+    file.text = arm(&file.text, m.task.time.sim_dt, dampers);
+    m.robot = robot::describe(file, false).expect("robot");
     let mut env = make_env(&snapshot).expect("environment");
     let mut controller = Controller::new(&snapshot).expect("controller");
     let (mut state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
@@ -173,7 +181,7 @@ fn motor_forces_are_those_of_a_whole_period() {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/two_link.xml");
     let text = std::fs::read_to_string(file).expect("robot");
     let (q, v, a) = ([0.4, -0.9], [2.0, -3.0], [20.0, -25.0]);
-    let model = Model::from_mjcf_text(&arm(&text, 0.01, false)).expect("robot");
+    let model = model(&arm(&text, 0.01, false));
     let mut dynamics = Dynamics::new(&model);
     for (sub_steps, integrator) in [(2, "Euler"), (5, "Euler"), (0, "RK4")] {
         let mut off = |dt: f64| {
@@ -213,12 +221,13 @@ fn passive_forces_are_their_average_over_a_period() {
     let (dt, q, v, a) = (0.01, 0.1, -0.7, 25.0);
     for (damping, stiffness) in [(30.0, 0.0), (0.0, 2000.0), (30.0, 2000.0)] {
         let text = robot(damping, stiffness);
-        let mut dynamics = Dynamics::new(&Model::from_mjcf_text(&text).expect("robot"));
+        let mut dynamics = Dynamics::new(&model(&text));
         for sub_steps in [1, 2, 5] {
             let period = Period::new(dt, sub_steps);
             let mut tau = [0.0];
             dynamics.motors(&period, &[q], &[v], &[a], &mut tau);
-            let options = mj::Options { sim_dt: Some(period.tau), without_contacts: true };
+            let options =
+                mj::Options { sim_dt: Some(period.tau), without_contacts: true, ..mj::Options::default() };
             let plant = mj::Model::from_text(&text, mj::ModelFormat::Mjcf, options).expect("plant");
             let mut sim = mj::Sim::new(&plant).expect("simulation");
             sim.set_state(&[q], &[v]).expect("state");
@@ -241,7 +250,7 @@ fn an_arm_on_a_tilted_base_is_the_simulator_s() {
             <body name="upper" pos="0.1 0 0.2"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.1 0 0.4" size="0.03" mass="1"/>
               <body name="tool" pos="0.1 0 0.4"><joint name="b" axis="1 0 0"/><geom type="sphere" size="0.05" pos="0.1 0.2 0" mass="0.5"/></body>
             </body></body></body></worldbody></mujoco>"#;
-    let model = Model::from_mjcf_text(robot).expect("robot");
+    let model = model(robot);
     let (mut dynamics, mut kinematics) = (Dynamics::new(&model), Kinematics::new(&model));
     let plant = mj::Model::from_text(robot, mj::ModelFormat::Mjcf, mj::Options::default()).expect("plant");
     let (mut sim, mut nle) = (mj::Sim::new(&plant).expect("simulation"), [0.0; 2]);

@@ -7,6 +7,7 @@ mod eval;
 mod plant;
 mod process;
 mod project;
+mod robot;
 mod serve;
 mod soak;
 mod sweep;
@@ -62,6 +63,8 @@ enum Command {
     Doctor(nearl_runtime::doctor::DoctorCommand),
     /// Carry a robot's links to or from another host.
     Tunnel(nearl_runtime::tunnel::TunnelCommand),
+    /// Say what is read from a robot file: joints, limits, motors, and what is left out.
+    Robot(robot::RobotCommand),
     /// List the bundled tasks.
     Tasks(tasks::Tasks),
 }
@@ -86,6 +89,7 @@ impl Cli {
             Command::Explain(c) => c.run(crate::rollout_protocol::Answer::explanations()),
             Command::Doctor(c) => c.run(),
             Command::Tunnel(c) => c.run(),
+            Command::Robot(c) => c.run(),
             Command::Tasks(c) => c.run(),
         }
     }

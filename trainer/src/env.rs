@@ -22,9 +22,13 @@ mod spec;
 mod user;
 mod walker2d;
 
+use nearl_runtime::Manifest;
+use nearl_runtime::constraints::Model;
+use nearl_runtime::snapshot::Simulation;
 use nearl_runtime::task::Task;
 
 use crate::mj::{MjError, ModelFormat, Sim};
+use crate::robot;
 
 pub use meter::{Excess, LimitError, Limits, Meter, Worst};
 pub use rand_chacha::ChaCha8Rng;
@@ -171,7 +175,7 @@ pub trait Env: Send {
     /// MuJoCo's words at the last [`Fault::Engine`].
     fn last_error(&self) -> Option<&MjError>;
 
-    /// The robot file's text, so that a snapshot can carry it.
+    /// The robot file's text.
     fn model_text(&self) -> &str;
 
     /// The robot file's language.
@@ -282,14 +286,15 @@ fn entry(name: &str) -> Result<&'static Entry, EnvError> {
     REGISTRY.iter().find(|entry| entry.name == name).ok_or_else(unknown)
 }
 
-/// Makes the environment of a task file: the user's own if it has a `[reward]` (`text` is its robot, MJCF), else the native one
-/// it names with `env`, or by its own name. `origin` is the file or task in messages.
+/// Makes the environment of a task: the user's own if it has a `[reward]`, else the native one it names with `env`, or by its own
+/// name. `origin` is the file or task in messages.
 ///
 /// # Errors
 /// As [`make`]; [`EnvError::Task`] names the key that is wrong.
-pub fn of_task(task: &Task, text: &str, origin: &str) -> Result<Box<dyn Env>, EnvError> {
+pub fn of_task(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvError> {
+    let task = &manifest.task;
     if user::is_own(task) {
-        return user::build(task, text, origin);
+        return user::build(manifest, origin);
     }
     let own = [
         ("termination", !task.termination.is_empty()),
@@ -306,7 +311,7 @@ pub fn of_task(task: &Task, text: &str, origin: &str) -> Result<Box<dyn Env>, En
         _ => (entry.build)()?,
     };
     check_time(task, env.spec(), origin)?;
-    check_robot(task, text, env.as_ref(), origin)?;
+    check_robot(manifest, env.as_ref(), origin)?;
     user::with_cost(env, task, origin)
 }
 
@@ -331,17 +336,15 @@ fn check_time(task: &Task, spec: &Spec, origin: &str) -> Result<(), EnvError> {
 }
 
 /// A native environment brings its robot: constraints for another one would hold nowhere.
-fn check_robot(task: &Task, text: &str, env: &dyn Env, origin: &str) -> Result<(), EnvError> {
-    if text == env.model_text() {
+fn check_robot(manifest: &Manifest, env: &dyn Env, origin: &str) -> Result<(), EnvError> {
+    if manifest.simulation.as_ref().is_some_and(|given| given.text == env.model_text()) {
         return Ok(());
     }
-    let Some((file, format)) = task.model.file() else { return Ok(()) };
-    let read = |text: &str, format| match format {
-        ModelFormat::Urdf => nearl_runtime::constraints::Model::from_urdf_text(text),
-        ModelFormat::Mjcf => nearl_runtime::constraints::Model::from_mjcf_text(text),
-    };
-    // Files that cannot be read are refused, with the reason, where the constraints are built.
-    let (Ok(given), Ok(own)) = (read(text, format), read(env.model_text(), env.model_format())) else {
+    let Some((file, _)) = manifest.task.model.file() else { return Ok(()) };
+    let own = Simulation { format: env.model_format(), text: env.model_text().to_string(), folder: None };
+    let own = robot::describe(&own, manifest.task.model.free_flyer).map(Model::from_description);
+    // A robot of which no model can be built is refused, with the reason, where the constraints are built.
+    let (Ok(given), Ok(Ok(own))) = (Model::from_description(manifest.robot.clone()), own) else {
         return Ok(());
     };
     let Some(what) = robot_check::difference(&given, &own) else { return Ok(()) };

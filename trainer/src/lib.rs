@@ -12,6 +12,7 @@ pub mod learn;
 pub mod mj;
 pub mod online;
 pub mod plant;
+pub mod robot;
 pub mod rollout;
 pub mod run_folder;
 pub mod serve;

@@ -4,12 +4,17 @@
 //! MuJoCo's fatal errors arrive as [`MjError::Engine`], its warnings are counted ([`warnings`]) and never written to a
 //! file. A newer MuJoCo is a change of this module and of a version number.
 
+mod describe;
 mod guard;
+mod motors;
 mod sim;
 
+use std::path::Path;
 use std::sync::Arc;
 
+use mujoco_rs::error::MjModelError;
 use mujoco_rs::mujoco_c::{mjtDisableBit, mjtEnableBit};
+use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::mj_model::{MjModel, MjtBias, MjtDyn, MjtGain, MjtJoint, MjtObjBase, MjtTrn};
 
 pub use guard::{last_warning, warnings};
@@ -44,6 +49,9 @@ pub enum MjError {
         /// What was given.
         value: f64,
     },
+    /// A robot whose equations of motion plain numbers cannot say.
+    #[error("MuJoCo reads the robot file, but a controller cannot reckon with it: {0}")]
+    NoDescription(String),
     /// The robot file has no such body.
     #[error("the robot has no body '{0}'")]
     NoBody(String),
@@ -58,6 +66,8 @@ pub struct Options {
     pub sim_dt: Option<f64>,
     /// Leave contacts out.
     pub without_contacts: bool,
+    /// The base of a URDF floats on a free joint called `root_joint`.
+    pub floats: bool,
 }
 
 /// Kind of a joint.
@@ -118,7 +128,7 @@ pub struct Actuator {
 pub struct Model(Arc<MjModel>);
 
 impl Model {
-    /// Compiles a robot from its text.
+    /// Compiles a robot from its text; files that it names are looked for in the current folder.
     ///
     /// A URDF keeps its fixed links as bodies (MuJoCo would merge them and lose a tool frame's name), unless the file
     /// brings its own `<mujoco>` settings.
@@ -126,11 +136,25 @@ impl Model {
     /// # Errors
     /// [`MjError::Load`] with MuJoCo's own explanation.
     pub fn from_text(text: &str, format: ModelFormat, options: Options) -> Result<Model, MjError> {
+        Model::from_text_in(text, format, None, options)
+    }
+
+    /// The same for a text that stands, or stood, in a file of `folder`: there are the files it includes and its meshes.
+    ///
+    /// # Errors
+    /// As [`Model::from_text`].
+    pub fn from_text_in(
+        text: &str,
+        format: ModelFormat,
+        folder: Option<&Path>,
+        options: Options,
+    ) -> Result<Model, MjError> {
         let text = match format {
             ModelFormat::Mjcf => text.to_owned(),
+            ModelFormat::Urdf if options.floats => keep_fixed_links(&set_afloat(text)?),
             ModelFormat::Urdf => keep_fixed_links(text),
         };
-        let loaded = guard::counting_warnings(|| MjModel::from_xml_string(&text));
+        let loaded = guard::counting_warnings(|| compile(&text, folder));
         let mut model = loaded.map_err(|e| MjError::Load(guard::one_line(&e.to_string())))?;
         let opt = model.opt_mut();
         if let Some(sim_dt) = options.sim_dt {
@@ -312,6 +336,26 @@ impl Model {
     }
 }
 
+/// Compiles a text as if it stood in a file of `folder`.
+fn compile(text: &str, folder: Option<&Path>) -> Result<MjModel, MjModelError> {
+    let Some(folder) = folder else { return MjModel::from_xml_string(text) };
+    let (path, mut files) = (folder.join("nearl-robot.xml"), MjVfs::new());
+    files.add_from_buffer(&path, text.as_bytes())?;
+    MjModel::from_xml_vfs(&path, &files)
+}
+
+/// Hangs a URDF's root link on the world by a free joint.
+fn set_afloat(urdf: &str) -> Result<String, MjError> {
+    let model = nearl_runtime::constraints::Model::from_urdf_text(urdf);
+    let root =
+        model.map(|m| m.description().bodies[0].name.clone()).map_err(|e| MjError::Load(e.to_string()))?;
+    let end = urdf.rfind("</robot>").unwrap_or(urdf.len());
+    let joint = format!(
+        "<link name=\"world\"/><joint name=\"root_joint\" type=\"floating\"><parent link=\"world\"/><child link=\"{root}\"/></joint>"
+    );
+    Ok(format!("{}{joint}{}", &urdf[..end], &urdf[end..]))
+}
+
 /// Adds MuJoCo's setting that keeps fixed links after the opening `<robot ...>`.
 fn keep_fixed_links(urdf: &str) -> String {
     let opening = urdf.find("<robot").and_then(|at| urdf[at..].find('>').map(|end| at + end + 1));
@@ -327,7 +371,7 @@ fn keep_fixed_links(urdf: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::{Model, ModelFormat, Options, Sim, mjtDisableBit};
-    use crate::tasks;
+    use crate::{robot, tasks};
     use rand::{RngExt, SeedableRng};
     use std::sync::Arc;
 
@@ -336,7 +380,8 @@ mod tests {
     fn one_tree_needs_no_islands() {
         let islands = mjtDisableBit::mjDSBL_ISLAND as i32;
         for task in ["HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5"] {
-            let text = tasks::load(task, &[]).expect("task").model;
+            let manifest = tasks::load(task, &[]).expect("task");
+            let text = robot::simulation(&manifest).expect("bundled").text;
             let without = Model::from_text(&text, ModelFormat::Mjcf, Options::default()).expect("robot");
             assert_ne!(without.0.opt().disableflags & islands, 0, "{task}");
             let mut with = Model::from_text(&text, ModelFormat::Mjcf, Options::default()).expect("robot");

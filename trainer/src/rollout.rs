@@ -73,7 +73,7 @@ pub struct Collector {
 /// [`RolloutError`].
 pub fn make_env(snapshot: &Snapshot) -> Result<Box<dyn Env>, RolloutError> {
     let task = &snapshot.manifest.task;
-    let env = crate::env::of_task(task, &snapshot.manifest.model, &task.name)?;
+    let env = crate::env::of_task(&snapshot.manifest, &task.name)?;
     if env.spec().obs != task.state.observation {
         return Err(RolloutError::Observation {
             task: task.name.clone(),

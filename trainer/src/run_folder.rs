@@ -1,6 +1,7 @@
 //! The run folder: `task.toml metrics.csv env.json checkpoints/` and the robot file of one training.
 
 use crate::checkpoint;
+use crate::robot;
 use nearl_runtime::snapshot::{in_run, write_whole};
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use std::fs::File;
@@ -51,16 +52,26 @@ pub enum RunError {
     },
 }
 
-/// The effective task file as it stands in a run folder, and the name of the robot file beside it.
-pub fn task_file(manifest: &Manifest) -> (String, String) {
+/// The effective task file as it stands in a run folder, and the robot file beside it by name and text. A robot file that names
+/// other files stays where it is.
+pub fn task_file(manifest: &Manifest) -> (String, Option<(String, String)>) {
     let mut task = manifest.task.clone();
-    let model = &mut task.model;
-    let mut name = String::new();
-    for file in [&mut model.urdf, &mut model.mjcf].into_iter().flatten() {
-        name = Path::new(file).file_name().map_or("robot".into(), |n| n.to_string_lossy().into_owned());
-        file.clone_from(&name);
+    let mut copy = None;
+    if let Some(simulation) = robot::simulation(manifest) {
+        let model = &mut task.model;
+        for file in [&mut model.urdf, &mut model.mjcf].into_iter().flatten() {
+            let name =
+                Path::new(file).file_name().map_or("robot".into(), |n| n.to_string_lossy().into_owned());
+            match &simulation.folder {
+                Some(folder) => *file = folder.join(name).display().to_string(),
+                None => {
+                    file.clone_from(&name);
+                    copy = Some((name, simulation.text.clone()));
+                }
+            }
+        }
     }
-    (task.to_toml(), name)
+    (task.to_toml(), copy)
 }
 
 /// Writes the effective task file as `<name>.toml` with its robot file beside it; returns its path.
@@ -71,7 +82,9 @@ pub fn write_task(folder: &Path, name: &str, manifest: &Manifest) -> Result<Path
     let (task, robot) = task_file(manifest);
     let file = folder.join(format!("{name}.toml"));
     put(&file, &task)?;
-    put(&folder.join(robot), &manifest.model)?;
+    if let Some((name, text)) = robot {
+        put(&folder.join(name), &text)?;
+    }
     Ok(file)
 }
 

@@ -1,8 +1,9 @@
 //! Bundled tasks and robots, and how a task name or file becomes a manifest.
 
 use crate::env::{self, Env, EnvError};
+use crate::robot::{self, RobotError};
 use nearl_runtime::net::Activation;
-use nearl_runtime::snapshot::FORMAT;
+use nearl_runtime::snapshot::{FORMAT, Simulation};
 use nearl_runtime::task::{Task, TaskError};
 use nearl_runtime::{Manifest, PolicyKind};
 use std::path::Path;
@@ -30,6 +31,16 @@ pub enum TaskLoadError {
     /// The environment that the file describes.
     #[error(transparent)]
     Env(#[from] EnvError),
+    /// The robot file cannot be used.
+    #[error("task '{task}' names the robot file '{robot}', which cannot be used: {source}")]
+    Description {
+        /// Task name.
+        task: String,
+        /// As written.
+        robot: String,
+        /// Why.
+        source: RobotError,
+    },
     /// A name that is neither bundled nor a file.
     #[error("no task '{name}'{near}; give one of {all} or a TOML file")]
     Unknown {
@@ -89,27 +100,22 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
         }
         None => return Err(unknown(task)),
     };
-    let Some((file, model_format)) = parsed.model.file() else {
-        unreachable!("Task::parse requires a robot file")
+    let (simulation, is_bundled) = robot_file(&parsed, path, bundled.is_some())?;
+    let floats = parsed.model.free_flyer;
+    let described = match parsed.reward.is_empty() {
+        true => robot::describe(&simulation, floats),
+        false => robot::describe_simulated(&simulation, floats),
     };
-    let beside = path.parent().unwrap_or(Path::new(".")).join(file);
-    let model = match robot(file) {
-        Some(text) if bundled.is_some() || !beside.exists() => text.to_string(),
-        _ => std::fs::read_to_string(&beside).map_err(|e| TaskLoadError::Robot {
-            task: parsed.name.clone(),
-            robot: beside.display().to_string(),
-            reason: e.to_string(),
-        })?,
-    };
-    if !(parsed.reward.is_empty() && parsed.cost.is_empty() && parsed.env.is_none()) {
-        // mistakes in what describes the environment are found here, where the file's name is known
-        env::of_task(&parsed, &model, task)?;
-    }
-    Ok(Manifest {
+    let description = described.map_err(|source| TaskLoadError::Description {
+        task: parsed.name.clone(),
+        robot: parsed.model.file().map_or(String::new(), |(file, _)| file.to_string()),
+        source,
+    })?;
+    let manifest = Manifest {
         format: FORMAT,
         task: parsed,
-        model_format,
-        model,
+        robot: description,
+        simulation: (!is_bundled).then_some(simulation),
         algo: String::new(),
         policy: PolicyKind::Deterministic,
         activation: Activation::default(),
@@ -118,7 +124,33 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
         steps: 0,
         action_lower: Vec::new(),
         action_upper: Vec::new(),
-    })
+    };
+    let of = &manifest.task;
+    if !(of.reward.is_empty() && of.cost.is_empty() && of.env.is_none()) {
+        // mistakes in what describes the environment are found here, where the file's name is known
+        env::of_task(&manifest, task)?;
+    }
+    Ok(manifest)
+}
+
+/// The robot file that a task read from `path` names, and whether it is a bundled one.
+fn robot_file(task: &Task, path: &Path, is_bundled: bool) -> Result<(Simulation, bool), TaskLoadError> {
+    let Some((file, format)) = task.model.file() else { unreachable!("Task::parse requires a robot file") };
+    let beside = path.parent().unwrap_or(Path::new(".")).join(file);
+    if let Some(text) = self::robot(file)
+        && (is_bundled || !beside.exists())
+    {
+        return Ok((Simulation { format, text: text.to_string(), folder: None }, true));
+    }
+    let text = std::fs::read_to_string(&beside).map_err(|e| TaskLoadError::Robot {
+        task: task.name.clone(),
+        robot: beside.display().to_string(),
+        reason: e.to_string(),
+    })?;
+    let names_files = text.contains("file=") || text.contains("filename=");
+    let folder = names_files.then(|| robot::folder_of(&beside));
+    let is_copy = robot(file).is_some_and(|bundled| bundled == text);
+    Ok((Simulation { format, text, folder }, is_copy))
 }
 
 /// Makes the environment of a bundled task or a TOML file.
@@ -127,7 +159,7 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
 /// [`TaskLoadError`]; [`TaskLoadError::Env`] also where MuJoCo does not take the robot.
 pub fn env(task: &str) -> Result<Box<dyn Env>, TaskLoadError> {
     let manifest = load(task, &[])?;
-    Ok(env::of_task(&manifest.task, &manifest.model, task)?)
+    Ok(env::of_task(&manifest, task)?)
 }
 
 /// What a bundled task is, in one line.

@@ -88,6 +88,7 @@ impl Motor {
         let [constant, per_position, per_velocity] = self.bias;
         let mut force = f64::INFINITY;
         if let Some(range) = self.control_range
+            && self.not_modelled.is_none()
             && (per_position, per_velocity) == (0.0, 0.0)
         {
             let ends = range.map(|u| self.gain * u + constant);

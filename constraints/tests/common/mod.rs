@@ -24,12 +24,20 @@ impl Random {
     }
 }
 
+/// A robot of `examples/robots`.
 pub fn robot(file: &str) -> Model {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/robots").join(file);
     match file.ends_with("urdf") {
         true => Model::from_urdf(&path).unwrap(),
-        false => Model::from_mjcf(&path).unwrap(),
+        false => described(path.file_stem().unwrap().to_str().unwrap()),
     }
+}
+
+/// A robot that MuJoCo has read: `fixtures/robots/NAME.json`, written by `nearl robot --json`.
+pub fn described(name: &str) -> Model {
+    let file = format!("{}/tests/fixtures/robots/{name}.json", env!("CARGO_MANIFEST_DIR"));
+    let description = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
+    Model::from_description(description).unwrap()
 }
 
 /// The robot with a floating base.

@@ -3,11 +3,13 @@
 //! The file's metadata has one key, `nearl`: the blake3 digest in hex, a line break, the manifest as JSON.
 //! The digest covers the manifest text and every tensor (name, shape, bytes), so any changed bit is refused.
 
+mod first;
+
 use crate::codes::SnapshotCode;
 use crate::net::{Activation, Dense, Function};
 use crate::normaliser::Normaliser;
 use crate::task::{IdmKind, Task};
-use nearl_constraints::Guard;
+use nearl_constraints::{Guard, RobotDescription};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -15,7 +17,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Version of the file format.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 /// Larger files are refused before they are read, in [byte].
 pub const MAX_BYTES: u64 = 256 << 20;
 const KEY: &str = "nearl";
@@ -32,7 +34,7 @@ pub enum PolicyKind {
     Stochastic,
 }
 
-/// Format of the robot file inside the snapshot.
+/// Language of a robot file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ModelFormat {
@@ -40,6 +42,20 @@ pub enum ModelFormat {
     Urdf,
     /// MuJoCo's MJCF.
     Mjcf,
+}
+
+/// The robot file that a simulator compiles. A controller never reads it, and a snapshot of a robot that the simulator brings
+/// itself has none.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Simulation {
+    /// Its language.
+    pub format: ModelFormat,
+    /// Its text.
+    pub text: String,
+    /// Where the files are that it includes, and its meshes; absent when it names none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub folder: Option<PathBuf>,
 }
 
 /// Everything but the numbers.
@@ -50,10 +66,11 @@ pub struct Manifest {
     pub format: u32,
     /// The effective task file.
     pub task: Task,
-    /// Format of `model`.
-    pub model_format: ModelFormat,
-    /// Text of the robot file.
-    pub model: String,
+    /// The robot: all that a controller knows of it.
+    pub robot: RobotDescription,
+    /// The robot file for the simulator of the trainer.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub simulation: Option<Simulation>,
     /// Algorithm that made the weights, e.g. `pid2-ib`.
     pub algo: String,
     /// How the networks are read.
@@ -327,10 +344,8 @@ impl Snapshot {
         if actual != expected {
             return Err(SnapshotError::Digest { expected: one_line(&expected), actual });
         }
-        let manifest: Manifest = serde_json::from_str(manifest).map_err(|e| foreign(e.to_string()))?;
-        if manifest.format != FORMAT {
-            return Err(foreign(format!("format {} where this program reads {FORMAT}", manifest.format)));
-        }
+        let manifest = first::read(manifest).map_err(foreign)?;
+        manifest.robot.check("its robot").map_err(|e| foreign(e.to_string()))?;
         manifest.task.check("its task").map_err(|e| foreign(e.to_string()))?;
         let ranges = manifest.action_lower.iter().zip(&manifest.action_upper);
         if let Some((lower, upper)) =

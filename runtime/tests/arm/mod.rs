@@ -10,7 +10,7 @@ use nearl_runtime::link::*;
 use nearl_runtime::net::{Activation, Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::rt::*;
-use nearl_runtime::snapshot::{FORMAT, ModelFormat};
+use nearl_runtime::snapshot::FORMAT;
 use nearl_runtime::{Manifest, Networks, PolicyKind, Snapshot, Task};
 
 use crate::toy::{self, Name};
@@ -38,12 +38,13 @@ pub fn snapshot(version: u64, change: impl FnOnce(&mut Manifest)) -> Snapshot {
     let mut task = Task::parse("Panda-reach.toml", TASK, &[]).unwrap();
     let entries = |kind: &'static str| (0..N).map(move |i| format!("{kind}.{}", joint(i)));
     task.state.observation = entries("q").chain(entries("v")).collect();
-    let effort = Model::from_urdf_text(URDF).unwrap().effort_limit().to_vec();
+    let model = Model::from_urdf_text(URDF).unwrap();
+    let effort = model.effort_limit().to_vec();
     let mut manifest = Manifest {
         format: FORMAT,
         task,
-        model_format: ModelFormat::Urdf,
-        model: URDF.into(),
+        robot: model.description().clone(),
+        simulation: None,
         algo: "random".into(),
         policy: PolicyKind::Deterministic,
         activation: Activation::default(),

@@ -48,7 +48,7 @@ impl Victim {
         let certified = certified_share(&model, robot)?;
         let limits = limits(&model, robot, certified.unwrap_or(0.2));
         let set = LimitSet::collect(&model, &limits, &every(&model))?;
-        let options = mj::Options { sim_dt: Some(DT), without_contacts: true };
+        let options = mj::Options { sim_dt: Some(DT), without_contacts: true, ..mj::Options::default() };
         let plant = mj::Model::from_text(&without_stops(&text), mj::ModelFormat::Urdf, options)?;
         let joints = plant.joints();
         let find =

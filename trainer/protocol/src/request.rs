@@ -159,7 +159,8 @@ fn training(m: &RequestMessage) -> Result<Option<Training>, String> {
 /// Id of a snapshot's constraint set: a hash of its effective `[constraints]` and robot, never 0 or all ones.
 pub fn constraint_set(manifest: &Manifest) -> u64 {
     let constraints = serde_json::to_string(&manifest.task.constraints).unwrap_or_default();
-    hash_names([constraints.as_str(), &manifest.model]).clamp(1, OWN - 1)
+    let robot = serde_json::to_string(&manifest.robot).unwrap_or_default();
+    hash_names([constraints, robot]).clamp(1, OWN - 1)
 }
 
 #[cfg(test)]

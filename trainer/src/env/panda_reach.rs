@@ -71,7 +71,7 @@ pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
 /// With another control period [s]; its episodes last as long.
 pub(super) fn build_at(dt: f64) -> Result<Box<dyn Env>, EnvError> {
     let physics = |source| EnvError::Physics { task: NAME.into(), source };
-    let options = Options { sim_dt: Some(dt), without_contacts: true };
+    let options = Options { sim_dt: Some(dt), without_contacts: true, ..Options::default() };
     let model = Model::from_text(&ROBOT.text, ROBOT.format, options).map_err(physics)?;
     let joints = model.joints();
     let expected = READY.len();

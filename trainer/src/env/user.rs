@@ -1,4 +1,4 @@
-//! Tasks of the user's own: any MJCF robot with reward, cost, reset and termination written in the task file, and native
+//! Tasks of the user's own: any robot with reward, cost, reset and termination written in the task file, and native
 //! tasks with a cost added.
 //!
 //! `[reward]` and `[cost]` are named expressions whose sum counts, `[termination]` named conditions of which any ends the
@@ -12,6 +12,9 @@ mod lexer;
 mod quantity;
 mod settings;
 
+use nearl_runtime::Manifest;
+use nearl_runtime::constraints::RobotDescription;
+use nearl_runtime::constraints::description::Motor;
 use nearl_runtime::task::Task;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -21,7 +24,8 @@ use super::rules::{Robot, Rules, joint_names};
 use super::simulated::Simulated;
 use super::spec::{Constants, Spec};
 use super::{Env, EnvError};
-use crate::mj::{JointKind, MjError, Model, ModelFormat, Options, Sim};
+use crate::mj::{Actuator, JointKind, MjError, Model, ModelFormat, Sim};
+use crate::robot;
 use costed::Costed;
 use expression::Expression;
 use quantity::{Before, Names, Outcome, Place, Quantity, read_state};
@@ -39,6 +43,16 @@ struct User {
     start: Vec<Entry>,
     before: Before,
     dt: f64,
+    /// Motors that MuJoCo's model does not have; without any, the action is its control.
+    drives: Vec<Drive>,
+}
+
+/// A motor and where its joint's entries are.
+#[derive(Clone)]
+struct Drive {
+    motor: Motor,
+    idx_q: usize,
+    idx_v: usize,
 }
 
 /// Whether the task file describes an environment itself.
@@ -56,17 +70,19 @@ pub(super) fn with_cost(env: Box<dyn Env>, task: &Task, origin: &str) -> Result<
     Ok(Box::new(Costed::new(env, task.name.clone(), cost)))
 }
 
-/// The environment of a task file with its robot's text; `origin` is the file or task in messages.
-pub(super) fn build(task: &Task, text: &str, origin: &str) -> Result<Box<dyn Env>, EnvError> {
+/// The environment of a task that describes one; `origin` is the file or task in messages.
+pub(super) fn build(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvError> {
     let physics = |source| EnvError::Physics { task: origin.into(), source };
-    if task.model.mjcf.is_none() {
-        let reason = "a task with its own [reward] needs an MJCF robot; convert the URDF with MuJoCo's compile program";
-        return Err(refused(origin, mistake("model.urdf", reason)));
-    }
-    let model = Model::from_text(text, ModelFormat::Mjcf, Options::default()).map_err(physics)?;
-    let (spec, rules) = parse(task, &model).map_err(|m| refused(origin, m))?;
-    let robot = Robot { text: text.to_owned().into(), format: ModelFormat::Mjcf };
+    let task = &manifest.task;
+    let Some(file) = robot::simulation(manifest) else {
+        let reason =
+            "the snapshot holds no robot file for the simulator; give the run's folder or the task file";
+        return Err(refused(origin, mistake("model", reason)));
+    };
+    let model = robot::compile(&file, task.model.free_flyer).map_err(physics)?;
+    let (spec, rules) = parse(manifest, file.format, &model).map_err(|m| refused(origin, m))?;
     let sim = Sim::new(&model).map_err(physics)?;
+    let robot = Robot { text: file.text.into(), format: file.format };
     with_cost(Simulated::boxed(spec, robot, rules, sim), task, origin)
 }
 
@@ -74,9 +90,13 @@ fn refused(origin: &str, mistake: Mistake) -> EnvError {
     EnvError::Task { origin: origin.into(), key: mistake.key, reason: mistake.reason }
 }
 
-fn parse(task: &Task, model: &Model) -> Result<(Spec, User), Mistake> {
+fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spec, User), Mistake> {
+    let task = &manifest.task;
     let sub_steps = sub_steps(task, model)?;
-    let actuators = model.joint_actuators().map_err(|e| mistake("model.mjcf", e))?;
+    let (actuators, drives) = match format {
+        ModelFormat::Mjcf => (model.joint_actuators().map_err(|e| mistake("model.mjcf", e))?, Vec::new()),
+        ModelFormat::Urdf => drives(&manifest.robot, model).map_err(|e| mistake("model.urdf", e))?,
+    };
     let listed =
         if task.state.observation.is_empty() { all_names(model) } else { task.state.observation.clone() };
     let seen = Names::new(model, Place::Observation);
@@ -94,8 +114,41 @@ fn parse(task: &Task, model: &Model) -> Result<(Spec, User), Mistake> {
         start: starts(task, &spec.joints, &Names::new(model, Place::Start))?,
         before: Before::new(model),
         dt: spec.dt,
+        drives,
     };
     Ok((spec, rules))
+}
+
+/// The motors of a URDF, which MuJoCo does not know: actions within their ranges, and the joints they drive.
+fn drives(robot: &RobotDescription, model: &Model) -> Result<(Vec<Actuator>, Vec<Drive>), String> {
+    let (joints, mut motors) = (model.joints(), robot.motors.clone());
+    motors.sort_by_key(|motor| motor.order);
+    let mut found = (Vec::new(), Vec::new());
+    for motor in motors {
+        let Some([low, high]) = motor.control_range else {
+            return Err(format!(
+                "joint '{}' states no effort, and the action is chosen within it; write it into <limit>",
+                motor.joint
+            ));
+        };
+        let Some(joint) = joints.iter().find(|joint| joint.name == motor.joint) else {
+            return Err(format!("MuJoCo has no joint '{}'; join it to the others", motor.joint));
+        };
+        found.0.push(Actuator {
+            name: motor.name.clone(),
+            joint: motor.joint.clone(),
+            dof: joint.idx_v,
+            gear: motor.gear,
+            is_plain: true,
+            low,
+            high,
+        });
+        found.1.push(Drive { motor, idx_q: joint.idx_q, idx_v: joint.idx_v });
+    }
+    match found.0.is_empty() {
+        true => Err("the robot has no joint that a motor could drive".into()),
+        false => Ok(found),
+    }
 }
 
 /// Physics steps in a control period, by the robot file's own step.
@@ -152,6 +205,16 @@ impl Rules for User {
 
     fn begin(&mut self, sim: &Sim) {
         self.before.remember(sim);
+    }
+
+    fn actuate(&self, _: &Spec, sim: &mut Sim, action: &[f64]) {
+        if self.drives.is_empty() {
+            return sim.ctrl_mut().copy_from_slice(action);
+        }
+        for (drive, action) in self.drives.iter().zip(action) {
+            let (q, v) = (sim.qpos()[drive.idx_q], sim.qvel()[drive.idx_v]);
+            sim.force_mut()[drive.idx_v] = drive.motor.torque(*action, q, v);
+        }
     }
 
     fn progress(&self, _: &Sim) -> f64 {

@@ -75,7 +75,7 @@ fn shared(manifest: &Manifest) -> Value {
     let mut task = serde_json::to_value(&manifest.task).unwrap_or_default();
     if let Value::Object(sections) = &mut task {
         sections.remove("train");
-        sections.insert("robot file".into(), manifest.model.clone().into());
+        sections.insert("robot file".into(), serde_json::to_value(&manifest.robot).unwrap_or_default());
     }
     task
 }

@@ -55,8 +55,7 @@ pub(super) fn policy_kind(
 /// # Errors
 /// [`TrainError::Rollout`] when there is no such environment.
 pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
-    let env = crate::env::of_task(&manifest.task, &manifest.model, &manifest.task.name)
-        .map_err(RolloutError::from)?;
+    let env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
     let spec = env.spec();
     if manifest.task.state.observation.is_empty() {
         manifest.task.state.observation.clone_from(&spec.obs);

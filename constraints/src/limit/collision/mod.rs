@@ -152,17 +152,20 @@ impl CollisionLimit {
     /// The primitives of the robot file.
     fn add_links(&self, model: &Model, bodies: &mut Vec<Body>) -> Result<(), LimitError> {
         let (mut found, mut bare) = (false, Vec::new());
-        for c in model.collisions() {
-            let unknown = |near| LimitError::UnknownFrame { limit: "collision", name: c.link.clone(), near };
-            let frame = model.find_frame(&c.link).map_err(unknown)?;
-            match c.shape {
+        let robot = model.description();
+        for solid in &robot.solids {
+            let link = solid.body.map_or("universe", |body| &robot.bodies[body].name);
+            let unknown =
+                |near| LimitError::UnknownFrame { limit: "collision", name: link.to_string(), near };
+            let frame = model.find_frame(link).map_err(unknown)?;
+            match solid.shape {
                 Some(shape) => {
-                    shape.check(&format!("a collision solid of link '{}'", c.link))?;
-                    bodies.push(Body::new(c.link.clone(), c.link.clone(), frame, shape, c.placement));
+                    shape.check(&format!("a collision solid of link '{link}'"))?;
+                    bodies.push(Body::new(link.to_string(), link.to_string(), frame, shape, solid.placement));
                     found = true;
                 }
-                None if self.settings.shapes.iter().any(|s| s.frame.as_ref() == Some(&c.link)) => {}
-                None => bare.push(c.link.as_str()),
+                None if self.settings.shapes.iter().any(|s| s.frame.as_deref() == Some(link)) => {}
+                None => bare.push(link),
             }
         }
         if !bare.is_empty() {

@@ -1,7 +1,7 @@
 //! What a controller is built from, and the checks that a snapshot fits it.
 
 use super::Half;
-use crate::snapshot::{Manifest, ModelFormat, Networks, PolicyKind, SnapshotError};
+use crate::snapshot::{Manifest, Networks, PolicyKind, SnapshotError};
 use crate::task::{IdmInput, IdmKind};
 use nearl_constraints::{
     Consistency, Drive, DriveTorqueLimit, Entry, Model, Projector, Settings, StateLayout, TorqueLimit,
@@ -38,12 +38,7 @@ impl Parts {
     /// # Errors
     /// As [`Parts::new`].
     pub fn robot(m: &Manifest) -> Result<Model, SnapshotError> {
-        match m.model_format {
-            ModelFormat::Urdf if m.task.model.free_flyer => Model::from_urdf_text_free_flyer(&m.model),
-            ModelFormat::Urdf => Model::from_urdf_text(&m.model),
-            ModelFormat::Mjcf => Model::from_mjcf_text(&m.model),
-        }
-        .map_err(|e| unusable(&e))
+        Model::from_description(m.robot.clone()).map_err(|e| unusable(&e))
     }
 
     /// The projector of the task's constraints for the dofs in `controllable`, ascending.

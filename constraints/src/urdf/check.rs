@@ -1,0 +1,111 @@
+//! The numbers and names of a URDF that cannot be, all of them in one sentence.
+
+use roxmltree::Node;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Types of joints that URDF has.
+const KINDS: [&str; 6] = ["revolute", "continuous", "prismatic", "fixed", "floating", "planar"];
+
+/// Names once each, links that are there, one root, and no circles.
+pub(super) fn check_tree(robot: Node, wrong: &mut Vec<String>) {
+    let named = |tag| {
+        robot.children().filter(move |n| n.has_tag_name(tag)).map(|n| n.attribute("name").unwrap_or("?"))
+    };
+    for tag in ["link", "joint"] {
+        let mut seen = BTreeSet::new();
+        let again: BTreeSet<_> = named(tag).filter(|name| !seen.insert(*name)).collect();
+        wrong.extend(again.iter().map(|name| format!("{tag} '{name}' is there more than once")));
+    }
+    let links: BTreeSet<_> = named("link").collect();
+    let mut parents = BTreeMap::new();
+    for joint in robot.children().filter(|n| n.has_tag_name("joint")) {
+        let name = joint.attribute("name").unwrap_or("?");
+        let mut end = |tag: &str| {
+            let link = joint.children().find(|n| n.has_tag_name(tag)).and_then(|n| n.attribute("link"));
+            match link {
+                None => wrong.push(format!("joint '{name}' has no <{tag} link=...>")),
+                Some(link) if !links.contains(link) => {
+                    wrong.push(format!("joint '{name}' has the {tag} link '{link}', which is not there"));
+                }
+                Some(_) => {}
+            }
+            link
+        };
+        let (_, child) = (end("parent"), end("child"));
+        if let Some(other) = child.and_then(|child| parents.insert(child, name)) {
+            wrong.push(format!(
+                "link '{}' is the child of joints '{other}' and '{name}'",
+                child.unwrap_or("?")
+            ));
+        }
+    }
+    let roots: Vec<_> = links.iter().filter(|link| !parents.contains_key(*link)).collect();
+    if roots.is_empty() {
+        wrong.push("every link is some joint's child, but one must be the root".to_string());
+    }
+    if roots.len() > 1 {
+        let names = roots.iter().map(|n| format!("'{n}'")).collect::<Vec<_>>().join(", ");
+        wrong.push(format!("the links {names} are no joint's child, but only one may be the root"));
+    }
+}
+
+pub(super) fn check_link(link: Node, wrong: &mut Vec<String>) {
+    let name = link.attribute("name").unwrap_or("?");
+    for part in link.children().filter(|n| n.has_tag_name("inertial")).flat_map(|i| i.children()) {
+        for a in part.attributes().filter(|_| part.has_tag_name("mass") || part.has_tag_name("inertia")) {
+            let value = a.value().trim().parse::<f64>().unwrap_or(f64::NAN);
+            if !value.is_finite() {
+                wrong.push(format!(
+                    "link '{name}' {} {} is '{}'",
+                    part.tag_name().name(),
+                    a.name(),
+                    a.value()
+                ));
+            } else if part.has_tag_name("mass") && value < 0.0 {
+                wrong.push(format!("link '{name}' mass is {value} kg"));
+            } else if matches!(a.name(), "ixx" | "iyy" | "izz") && value < 0.0 {
+                wrong.push(format!("link '{name}' inertia {} is {value} kg m²", a.name()));
+            }
+        }
+    }
+}
+
+pub(super) fn check_joint(joint: Node, wrong: &mut Vec<String>) {
+    let name = joint.attribute("name").unwrap_or("?");
+    let kind = joint.attribute("type").unwrap_or("?");
+    if !KINDS.contains(&kind) {
+        wrong.push(format!("joint '{name}' has the type '{kind}', which is none of {}", KINDS.join(", ")));
+    }
+    if !KINDS[..3].contains(&kind) {
+        return;
+    }
+    let axis = joint.children().find(|n| n.has_tag_name("axis")).and_then(|n| n.attribute("xyz"));
+    if axis.is_some_and(|xyz| xyz.split_whitespace().all(|x| x.parse() == Ok(0.0))) {
+        wrong.push(format!("joint '{name}' has the axis 0 0 0"));
+    }
+    let limit = joint.children().find(|n| n.has_tag_name("limit"));
+    if kind != "continuous" {
+        let missing =
+            ["effort", "velocity"].into_iter().filter(|key| limit.is_none_or(|l| !l.has_attribute(*key)));
+        let missing: Vec<_> = missing.collect();
+        if !missing.is_empty() {
+            wrong.push(format!("joint '{name}' states no {} in <limit>", missing.join(" and no ")));
+        }
+    }
+    let mut number = |key: &str| {
+        let text = limit?.attribute(key)?;
+        let value = text.trim().parse::<f64>().unwrap_or(f64::NAN);
+        if !value.is_finite() || (matches!(key, "effort" | "velocity") && value < 0.0) {
+            wrong.push(format!("joint '{name}' {key} is '{text}'"));
+            return None;
+        }
+        Some(value)
+    };
+    let (lower, upper) = (number("lower"), number("upper"));
+    let _ = (number("effort"), number("velocity"));
+    if let (Some(lower), Some(upper)) = (lower, upper)
+        && lower > upper
+    {
+        wrong.push(format!("joint '{name}' has lower {lower} above upper {upper}"));
+    }
+}

@@ -1,0 +1,313 @@
+//! What is described of a robot is what MuJoCo simulates: mass matrix, forces, limits and motors, on the bundled robots, on all robots
+//! of Gymnasium, and on files of the kind that people keep (defaults, includes, replicas, meshes, several trees, ball joints).
+
+use std::path::{Path, PathBuf};
+
+use nearl_runtime::constraints::convention as c;
+use nearl_runtime::constraints::description::{Command, RobotDescription};
+use nearl_runtime::constraints::{Dynamics, Model};
+use nearl_runtime::snapshot::{ModelFormat, Simulation};
+use nearl_trainer::mj::{JointKind, Sim};
+use nearl_trainer::robot;
+use nearl_trainer::rollout::stream;
+use rand::RngExt;
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+fn file(path: &Path) -> Simulation {
+    let text = std::fs::read_to_string(path).expect("robot file");
+    Simulation { format: ModelFormat::Mjcf, text, folder: Some(robot::folder_of(path)) }
+}
+
+/// Largest difference over the largest number.
+fn relative(ours: &[f64], theirs: &[f64]) -> f64 {
+    assert_eq!(ours.len(), theirs.len());
+    let size = theirs.iter().fold(1e-3f64, |m, x| m.max(x.abs()));
+    ours.iter().zip(theirs).fold(0.0f64, |m, (a, b)| m.max((a - b).abs())) / size
+}
+
+struct Pair {
+    name: String,
+    description: RobotDescription,
+    model: Model,
+    dynamics: Dynamics,
+    sim: Sim,
+    random: nearl_trainer::env::ChaCha8Rng,
+}
+
+impl Pair {
+    fn new(name: &str, file: &Simulation) -> Pair {
+        let simulated = robot::compile(file, false).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let description = robot::describe(file, false).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let model = Model::from_description(description.clone()).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let (dynamics, sim) = (Dynamics::new(&model), Sim::new(&simulated).expect("simulation"));
+        Pair { name: name.to_string(), description, model, dynamics, sim, random: stream(3, 0) }
+    }
+
+    fn number(&mut self) -> f64 {
+        self.random.random_range(-1.7..1.7)
+    }
+
+    /// A random state in MuJoCo's convention; free and ball joints get any rotation.
+    fn state(&mut self) -> (Vec<f64>, Vec<f64>) {
+        let mut qpos = self.sim.model().qpos0().to_vec();
+        for joint in self.sim.model().joints() {
+            match joint.kind {
+                JointKind::Hinge | JointKind::Slide => qpos[joint.idx_q] += 0.5 * self.number(),
+                _ => {
+                    let at = joint.idx_q + joint.nq - 4;
+                    let x: [f64; 4] = std::array::from_fn(|_| self.number());
+                    let length = x.iter().map(|x| x * x).sum::<f64>().sqrt();
+                    (0..4).for_each(|k| qpos[at + k] = x[k] / length);
+                }
+            }
+        }
+        let qvel = (0..self.model.nv()).map(|_| 2.0 * self.number()).collect();
+        (qpos, qvel)
+    }
+
+    fn check(&mut self) {
+        let mujoco = self.sim.model().clone();
+        let names = |m: &Model| m.joints().iter().map(|j| j.name.clone()).collect::<Vec<_>>();
+        assert_eq!(names(&self.model), mujoco.joints().iter().map(|j| j.name.clone()).collect::<Vec<_>>());
+        assert_eq!((self.model.nq(), self.model.nv()), (mujoco.nq(), mujoco.nv()), "{}", self.name);
+        for (ours, theirs) in self.model.joints().iter().zip(mujoco.joints()).filter(|(j, _)| j.nq == 1) {
+            let range = [self.model.lower_position_limit(), self.model.upper_position_limit()];
+            assert_eq!(range.map(|limit| limit[ours.idx_q]), theirs.range, "{} {}", self.name, ours.name);
+        }
+        for _ in 0..4 {
+            let (qpos, qvel) = self.state();
+            self.motions(&qpos, &qvel);
+            self.motors(&qpos, &qvel);
+        }
+    }
+
+    /// Mass matrix, column by column in MuJoCo's coordinates, and the forces of its own and of springs and dampers.
+    fn motions(&mut self, qpos: &[f64], qvel: &[f64]) {
+        let (m, nv, name) = (&self.model, self.model.nv(), &self.name);
+        self.sim.set_state(qpos, qvel).expect("state");
+        let (mut q, mut v) = (vec![0.0; m.nq()], vec![0.0; nv]);
+        c::q_from_mujoco(m, qpos, &mut q);
+        c::v_from_mujoco(m, &q, qvel, &mut v);
+        let zeros = || vec![0.0; nv];
+        let (mut mass, mut theirs) = (vec![0.0; nv * nv], vec![0.0; nv * nv]);
+        self.dynamics.mass(&q, &mut mass);
+        self.sim.mass(&mut theirs).expect("mass matrix");
+        for k in 0..nv {
+            let (mut unit, mut turned, mut out) = (zeros(), zeros(), zeros());
+            unit[k] = 1.0;
+            c::v_from_mujoco(m, &q, &unit, &mut turned);
+            let column: Vec<f64> =
+                (0..nv).map(|i| (0..nv).map(|j| mass[j * nv + i] * turned[j]).sum()).collect();
+            c::tau_to_mujoco(m, &q, &column, &mut out);
+            let off = relative(&out, &theirs[k * nv..(k + 1) * nv]);
+            assert!(off < 1e-11, "{name}: column {k} of the mass matrix differs by {off:e}");
+        }
+        let (mut still, mut tau, mut out) = (zeros(), zeros(), zeros());
+        c::a_from_mujoco(m, &q, &v, &zeros(), &mut still);
+        self.dynamics.rnea(&q, &v, &still, &mut tau);
+        c::tau_to_mujoco(m, &q, &tau, &mut out);
+        let off = relative(&out, self.sim.nle());
+        assert!(off < 1e-10, "{name}: nle differs by {off:e}");
+        if !m.notes().iter().any(|note| note.contains("fluid") || note.contains("tendons")) {
+            self.dynamics.passive(&q, &v, &mut tau);
+            c::tau_to_mujoco(m, &q, &tau, &mut out);
+            let off = relative(&out, self.sim.passive());
+            assert!(off < 1e-11, "{name}: springs and dampers differ by {off:e}");
+        }
+    }
+
+    /// Joint torques for controls within and beyond their ranges.
+    fn motors(&mut self, qpos: &[f64], qvel: &[f64]) {
+        self.sim.set_state(qpos, qvel).expect("state");
+        let controls: Vec<f64> = (0..self.sim.model().nu()).map(|_| 3.0 * self.number()).collect();
+        self.sim.ctrl_mut().copy_from_slice(&controls);
+        self.sim.forward().expect("forces");
+        let (mut theirs, mut ours) = (vec![0.0; self.model.nv()], vec![0.0; self.model.nv()]);
+        self.sim.applied_force(&mut theirs);
+        for motor in self.description.motors.iter().filter(|motor| motor.not_modelled.is_none()) {
+            let joint = self.model.joint(&motor.joint).expect("its joint");
+            let (q, v) = (qpos[joint.idx_q], qvel[joint.idx_v]);
+            let torque = motor.torque(controls[motor.order], q, v);
+            ours[joint.idx_v] += torque;
+            let half = 0.5 * torque;
+            let back = motor.torque(motor.control(half, q, v), q, v);
+            let within = motor
+                .control_range
+                .is_none_or(|[low, high]| (low..=high).contains(&motor.control(half, q, v)));
+            assert!(
+                !within || (back - half).abs() <= 1e-9 * (1.0 + half.abs()),
+                "{motor:?}: {back} and not {half}"
+            );
+        }
+        for (joint, at) in self.description.joints().zip(self.model.joints()) {
+            if let Some(effort) = joint.effort {
+                ours[at.idx_v] = ours[at.idx_v].clamp(-effort, effort);
+            }
+        }
+        let all = self.description.motors.iter().all(|motor| motor.not_modelled.is_none());
+        if all && !self.description.notes.iter().any(|note| note.contains("actuator")) {
+            let off = relative(&ours, &theirs);
+            assert!(off < 1e-11, "{}: motors {ours:?} and not {theirs:?}", self.name);
+        }
+    }
+}
+
+#[test]
+fn gymnasium_s_robots_are_mujoco_s() {
+    let packages = PathBuf::from(std::env::var("NEARL_SITE_PACKAGES").expect("set in .cargo/config.toml"));
+    let folder = packages.join("gymnasium/envs/mujoco/assets");
+    let mut seen = 0;
+    for entry in std::fs::read_dir(&folder).expect("Gymnasium is installed by 'make setup'") {
+        let path = entry.expect("entry").path();
+        if path.extension().is_some_and(|ending| ending == "xml") {
+            Pair::new(&path.display().to_string(), &file(&path)).check();
+            seen += 1;
+        }
+    }
+    assert!(seen >= 13, "{seen} robots");
+}
+
+#[test]
+fn odd_and_bundled_robots_are_mujoco_s() {
+    for name in ["ant", "half_cheetah", "hopper", "walker2d_v5"] {
+        Pair::new(name, &file(&root().join(format!("examples/robots/gymnasium/{name}.xml")))).check();
+    }
+    Pair::new("odd", &file(&root().join("constraints/tests/fixtures/odd.xml"))).check();
+}
+
+/// The stored descriptions that crates without MuJoCo test with are those of today.
+#[test]
+fn stored_descriptions_are_up_to_date() {
+    for (name, path) in [
+        ("ant", "examples/robots/gymnasium/ant.xml"),
+        ("half_cheetah", "examples/robots/gymnasium/half_cheetah.xml"),
+        ("hopper", "examples/robots/gymnasium/hopper.xml"),
+        ("walker2d_v5", "examples/robots/gymnasium/walker2d_v5.xml"),
+        ("odd", "constraints/tests/fixtures/odd.xml"),
+    ] {
+        let stored =
+            std::fs::read_to_string(root().join(format!("constraints/tests/fixtures/robots/{name}.json")));
+        let stored: RobotDescription = serde_json::from_str(&stored.expect("stored")).expect("a description");
+        assert_eq!(
+            robot::read_mjcf(&root().join(path)),
+            Ok(stored),
+            "write it with 'nearl robot --json {path}'"
+        );
+    }
+}
+
+/// A folder of files as robots are kept in collections.
+fn collection() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().expect("a folder");
+    let write = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        std::fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+        std::fs::write(path, text).expect("a file");
+    };
+    write(
+        "meshes/wedge.obj",
+        "v 0 0 0\nv 0.2 0 0\nv 0 0.1 0\nv 0 0 0.3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n",
+    );
+    write(
+        "parts/finger.xml",
+        r#"<mujocoinclude><body name="finger" pos="0 0.05 0.2"><joint name="finger" class="slider" range="0 0.04"/>
+        <geom class="skin" mesh="wedge"/><site name="tip" pos="0 0 0.02" euler="0 30 0"/></body></mujocoinclude>"#,
+    );
+    write(
+        "arm.xml",
+        r#"<mujoco model="collected"><compiler angle="radian" meshdir="meshes" autolimits="true"/>
+        <option timestep="0.002"><flag contact="disable"/></option>
+        <default><default class="arm"><joint axis="0 0 1" damping="1.5" armature="0.1" frictionloss="0.2"/>
+          <geom contype="0" conaffinity="0" density="700"/>
+          <position kp="200" kv="20" inheritrange="1" forcerange="-87 87"/>
+          <default class="slider"><joint type="slide" axis="0 1 0" damping="3"/></default>
+          <default class="skin"><geom type="mesh"/></default></default></default>
+        <asset><mesh name="wedge" file="wedge.obj" scale="1.5 1 1"/></asset>
+        <worldbody>
+          <frame pos="0.2 0.1 0.3" euler="0.3 -0.2 0.7">
+            <body name="shoulder" childclass="arm"><joint name="shoulder" range="-2.9 2.9"/><geom class="skin" mesh="wedge"/>
+              <body name="elbow" pos="0 0 0.33" quat="1 -1 0 0"><joint name="elbow" range="-1.8 1.8" ref="0.4" springref="0.1" stiffness="2"/>
+                <joint name="elbow_roll" axis="1 2 -1" pos="0.01 0.02 0.03" actuatorfrcrange="-5 5"/><geom type="capsule" size="0.04 0.1"/>
+                <include file="parts/finger.xml"/></body></body></frame>
+          <body name="second" pos="1 0 0"><joint name="slide_x" type="slide" axis="1 0 0" ref="-0.3"/><joint name="pole" type="ball" pos="0 0 0.1" damping="0.1"/>
+            <geom type="cylinder" size="0.02 0.4" mass="0.7"/></body>
+          <replicate count="3" offset="0 0.5 0" sep="_"><body name="cube" pos="0 0 2"><freejoint/><geom type="box" size="0.05 0.06 0.07"/></body></replicate>
+        </worldbody>
+        <actuator><general name="roll" joint="elbow_roll" gear="-3" gainprm="5" biastype="affine" biasprm="0.7 0 -0.3" ctrlrange="-2 1"/>
+          <position name="elbow" class="arm" joint="elbow"/><velocity name="finger" joint="finger" kv="40" ctrlrange="-1 1"/>
+          <motor name="slide" joint="slide_x" gear="4" ctrlrange="-3 3" armature="0.02" damping="0.5"/>
+          <position name="shoulder" class="arm" joint="shoulder"/></actuator></mujoco>"#,
+    );
+    folder
+}
+
+#[test]
+fn robots_as_people_keep_them_are_mujoco_s() {
+    let folder = collection();
+    let mut pair = Pair::new("collected", &file(&folder.path().join("arm.xml")));
+    pair.check();
+    let model = &pair.model;
+    assert_eq!(pair.description.name, "collected");
+    assert_eq!((model.joints().len(), model.nv()), (9, 5 + 3 + 18));
+    assert!(model.frame("tip").is_ok() && model.frame("cube_1").is_ok() && model.frame("second").is_ok());
+    let motor = |name: &str| pair.description.motors.iter().find(|m| m.name == name).expect("a motor");
+    let commands = ["roll", "elbow", "finger", "slide"].map(|name| motor(name).command);
+    assert_eq!(commands, [Command::Effort, Command::Pd, Command::Velocity, Command::Effort]);
+    assert_eq!((motor("roll").order, motor("shoulder").order), (0, 4));
+    let effort = |joint: &str| model.effort_limit()[model.joint(joint).expect("joint").idx_v];
+    assert_eq!((effort("slide_x"), effort("shoulder"), effort("elbow_roll")), (12.0, 87.0, 5.0));
+    assert_eq!(model.friction()[model.joint("elbow").expect("joint").idx_v], 0.2);
+    assert_eq!(model.notes(), ["joint frictionloss is not modelled"]);
+}
+
+/// A file that cannot be found, or that no numbers say, is one sentence.
+#[test]
+fn what_cannot_be_described_is_refused_by_name() {
+    let refused = |body: &str, head: &str, words: &[&str]| {
+        let text = format!(r#"<mujoco>{head}<worldbody><body name="arm" {body}</body></worldbody></mujoco>"#);
+        let text = robot::read_mjcf_text(&text).expect_err("an error").to_string();
+        words.iter().for_each(|w| assert!(text.contains(w), "'{w}' is not in: {text}"));
+    };
+    let geom = r#"<geom size="0.1" mass="1"/>"#;
+    refused(
+        &format!(r#"gravcomp="1"><joint name="a" damping="1"/>{geom}"#),
+        r#"<option><flag eulerdamp="disable"/></option>"#,
+        &["body 'arm' has gravcomp 1", "eulerdamp"],
+    );
+    refused(
+        &format!(r#"><joint name="a" type="ball" stiffness="2"/>{geom}"#),
+        "",
+        &["joint 'a' has 3 dofs and a spring"],
+    );
+    refused(
+        r#"><joint name="a"/><geom type="mesh" mesh="m"/>"#,
+        r#"<asset><mesh name="m" file="no/such.obj"/></asset>"#,
+        &["no/such.obj"],
+    );
+    refused("><joint name=\"a\"/>", "", &["mass"]);
+    let still = robot::read_mjcf_text(&format!(
+        "<mujoco><worldbody><body name='arm'>{geom}</body></worldbody></mujoco>"
+    ));
+    let words =
+        Model::from_description(still.expect("a description")).err().expect("nothing moves").to_string();
+    assert!(words.contains("no movable joint"), "{words}");
+}
+
+/// MuJoCo keeps one actuator default a class, which every tag sets: the strength is that of the compiled model.
+#[test]
+fn motor_strength_through_default_classes_is_mujoco_s() {
+    let text = std::fs::read_to_string(root().join("tests/fixtures/motors.json")).expect("fixture");
+    let cases: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+    let (mut finite, mut infinite) = (0, 0);
+    for case in cases.as_array().expect("cases") {
+        let xml = case["xml"].as_str().expect("a robot");
+        let model = Model::from_description(robot::read_mjcf_text(xml).expect("robot")).expect("model");
+        let (ours, theirs) = (model.effort_limit()[0], case["effort"].as_f64().unwrap_or(f64::INFINITY));
+        assert!(ours == theirs || (ours / theirs - 1.0).abs() < 1e-12, "{ours} and not {theirs}: {xml}");
+        *(if theirs.is_finite() { &mut finite } else { &mut infinite }) += 1;
+    }
+    assert!(finite > 10 && infinite > 5, "{finite} {infinite}: this proves nothing");
+}

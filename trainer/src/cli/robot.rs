@@ -1,0 +1,70 @@
+//! `nearl robot`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use nearl_runtime::constraints::Model;
+use nearl_runtime::constraints::description::{Range, RobotDescription};
+
+use super::{Failure, say};
+use crate::robot;
+
+#[derive(Args)]
+pub(super) struct RobotCommand {
+    /// URDF or MJCF file.
+    file: PathBuf,
+    /// The base of a URDF floats.
+    #[arg(long)]
+    free_flyer: bool,
+    /// Print the whole description as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl RobotCommand {
+    pub(super) fn run(self) -> Result<(), Failure> {
+        let description = robot::read(&self.file, self.free_flyer)?;
+        let model = Model::from_description(description.clone())?;
+        if self.json {
+            say(serde_json::to_string(&description)?);
+            return Ok(());
+        }
+        let (bodies, nq, nv) = (description.bodies.len(), model.nq(), model.nv());
+        say(format!(
+            "{}: {bodies} bodies, nq {nq}, nv {nv}, {:.4} kg move",
+            description.name,
+            model.total_mass()
+        ));
+        joints(&description, &model);
+        motors(&description);
+        description.notes.iter().for_each(|note| say(format!("note: {note}")));
+        Ok(())
+    }
+}
+
+fn joints(description: &RobotDescription, model: &Model) {
+    for (joint, at) in description.joints().zip(model.joints()) {
+        let range = match joint.range {
+            Range::Limited(lower, upper) => format!("{lower:.4} .. {upper:.4}"),
+            Range::Unlimited => "no limits".to_string(),
+            Range::NotStated => "limits not stated".to_string(),
+        };
+        let (velocity, effort) = (model.velocity_limit()[at.idx_v], model.effort_limit()[at.idx_v]);
+        let kind = format!("{:?}", joint.kind).to_lowercase();
+        say(format!("joint {:<24} {kind:<11}{range}, velocity {velocity}, effort {effort}", joint.name));
+    }
+}
+
+fn motors(description: &RobotDescription) {
+    for motor in &description.motors {
+        let command = format!("{:?}", motor.command).to_lowercase();
+        let law = match &motor.not_modelled {
+            Some(reason) => format!("has {reason}: no torque can be turned into its control"),
+            None => format!("gear {}, gain {}, bias {:?}", motor.gear, motor.gain, motor.bias),
+        };
+        say(format!(
+            "motor {:<24} {command:<11}control {} of joint {}, {law}",
+            motor.name, motor.order, motor.joint
+        ));
+    }
+}

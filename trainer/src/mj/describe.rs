@@ -1,0 +1,221 @@
+//! From MuJoCo's compiled model to a [`RobotDescription`]: whatever a file includes, replicates, takes from defaults or from meshes,
+//! MuJoCo has already resolved.
+
+use nearl_runtime::constraints::description::{
+    Body, Frame, JointDescription, JointKind as Kind, Range, RobotDescription, Solid,
+};
+use nearl_runtime::constraints::geometry::{Placement, Shape};
+
+use mujoco_rs::mujoco_c::mjtDisableBit;
+use mujoco_rs::wrappers::mj_model::{MjtGeomBase, MjtObjBase};
+
+use super::{JointKind, MjError, Model, motors};
+
+impl Model {
+    /// The robot as plain numbers, from which the dynamics of the controller are built. Its joints stand in MuJoCo's order.
+    ///
+    /// # Errors
+    /// [`MjError::NoDescription`] with everything that the numbers cannot say and that would be wrong without: smooth forces other
+    /// than linear springs and dampers of joints.
+    pub fn describe(&self) -> Result<RobotDescription, MjError> {
+        let beyond = self.beyond();
+        if !beyond.is_empty() {
+            return Err(MjError::NoDescription(beyond.join("; ")));
+        }
+        let mut robot = RobotDescription {
+            name: self.name_of_model(),
+            gravity: if self.disables(mjtDisableBit::mjDSBL_GRAVITY) {
+                [0.0; 3]
+            } else {
+                self.0.opt().gravity
+            },
+            bodies: (1..self.n_bodies()).map(|id| self.describe_body(id)).collect(),
+            frames: self.sites(),
+            solids: self.solids(),
+            motors: Vec::new(),
+            notes: self.notes(),
+        };
+        make_unique(robot.bodies.iter_mut().map(|body| &mut body.name));
+        motors::add(self, &mut robot);
+        Ok(robot)
+    }
+
+    pub(super) fn disables(&self, bit: mjtDisableBit) -> bool {
+        self.0.opt().disableflags & bit as i32 != 0
+    }
+
+    fn describe_body(&self, id: usize) -> Body {
+        let m = &self.0;
+        let count = m.body_jntnum()[id].max(0) as usize;
+        let first = m.body_jntadr()[id].max(0) as usize;
+        let joints: Vec<_> = (first..first + count).map(|id| self.describe_joint(id)).collect();
+        let is_free = joints.iter().any(|j| j.kind == Kind::Free);
+        Body {
+            name: self.body_name(id),
+            parent: (m.body_parentid()[id] as usize).checked_sub(1),
+            // The configuration of a free joint says where in the world the body is.
+            placement: match is_free {
+                true => Placement::IDENTITY,
+                false => placement(m.body_pos()[id], m.body_quat()[id]),
+            },
+            mass: m.body_mass()[id],
+            com: m.body_ipos()[id],
+            inertia: turned(m.body_inertia()[id], rotation(m.body_iquat()[id])),
+            joints,
+        }
+    }
+
+    fn describe_joint(&self, id: usize) -> JointDescription {
+        let (m, joint) = (&self.0, self.joint(id));
+        let (q, v) = (joint.idx_q, joint.idx_v);
+        let one = joint.nv == 1;
+        let spring = if self.disables(mjtDisableBit::mjDSBL_SPRING) { 0.0 } else { m.jnt_stiffness()[id] };
+        let damper = if self.disables(mjtDisableBit::mjDSBL_DAMPER) { 0.0 } else { m.dof_damping()[v] };
+        let friction =
+            if self.disables(mjtDisableBit::mjDSBL_FRICTIONLOSS) { 0.0 } else { m.dof_frictionloss()[v] };
+        let stops = m.jnt_limited()[id] && one && !self.disables(mjtDisableBit::mjDSBL_LIMIT);
+        let [low, high] = m.jnt_actfrcrange()[id];
+        JointDescription {
+            kind: match joint.kind {
+                JointKind::Free => Kind::Free,
+                JointKind::Ball => Kind::Ball,
+                JointKind::Slide => Kind::Slide,
+                JointKind::Hinge => Kind::Hinge,
+            },
+            axis: if one { m.jnt_axis()[id] } else { [0.0, 0.0, 1.0] },
+            anchor: if joint.kind == JointKind::Free { [0.0; 3] } else { m.jnt_pos()[id] },
+            reference: if one { m.qpos0()[q] } else { 0.0 },
+            range: if stops { Range::Limited(joint.range[0], joint.range[1]) } else { Range::Unlimited },
+            velocity: None,
+            effort: m.jnt_actfrclimited()[id].then(|| (-low).min(high).max(0.0)),
+            damping: damper,
+            stiffness: if one { spring } else { 0.0 },
+            spring_reference: if one { m.qpos_spring()[q] } else { 0.0 },
+            armature: m.dof_armature()[v],
+            friction,
+            ..JointDescription::new(&joint.name, Kind::Hinge)
+        }
+    }
+
+    fn sites(&self) -> Vec<Frame> {
+        let m = &self.0;
+        let site = |id: usize| {
+            Some(Frame {
+                name: self.name(MjtObjBase::mjOBJ_SITE, id)?,
+                body: (m.site_bodyid()[id] as usize).checked_sub(1),
+                placement: placement(m.site_pos()[id], m.site_quat()[id]),
+            })
+        };
+        (0..m.site_bodyid().len()).filter_map(site).collect()
+    }
+
+    /// Geoms that can touch something.
+    fn solids(&self) -> Vec<Solid> {
+        let m = &self.0;
+        let touches = |id: &usize| m.geom_contype()[*id] != 0 || m.geom_conaffinity()[*id] != 0;
+        let solid = |id: usize| {
+            let [x, y, z] = m.geom_size()[id];
+            let shape = match m.geom_type()[id] {
+                MjtGeomBase::mjGEOM_PLANE => Some(Shape::HalfSpace),
+                MjtGeomBase::mjGEOM_SPHERE => Some(Shape::Sphere { radius: x }),
+                MjtGeomBase::mjGEOM_CAPSULE => Some(Shape::Capsule { radius: x, length: 2.0 * y }),
+                MjtGeomBase::mjGEOM_CYLINDER => Some(Shape::Cylinder { radius: x, length: 2.0 * y }),
+                MjtGeomBase::mjGEOM_BOX => Some(Shape::Box { size: [2.0 * x, 2.0 * y, 2.0 * z] }),
+                _ => None,
+            };
+            let body = (m.geom_bodyid()[id] as usize).checked_sub(1);
+            Solid { body, shape, placement: placement(m.geom_pos()[id], m.geom_quat()[id]) }
+        };
+        (0..m.geom_type().len()).filter(touches).map(solid).collect()
+    }
+
+    /// Smooth forces that no description can say: without them the equations of motion would be wrong.
+    fn beyond(&self) -> Vec<String> {
+        let m = &self.0;
+        let mut beyond = Vec::new();
+        for id in (1..self.n_bodies()).filter(|id| m.body_gravcomp()[*id] != 0.0) {
+            beyond.push(format!(
+                "body '{}' has gravcomp {}: take it out",
+                self.body_name(id),
+                m.body_gravcomp()[id]
+            ));
+        }
+        for (id, joint) in self.joints().into_iter().enumerate() {
+            let name = &joint.name;
+            if joint.nv > 1 && m.jnt_stiffness()[id] != 0.0 && !self.disables(mjtDisableBit::mjDSBL_SPRING) {
+                beyond.push(format!(
+                    "joint '{name}' has {} dofs and a spring: set its stiffness to 0",
+                    joint.nv
+                ));
+            }
+            let bent = m.jnt_stiffnesspoly()[id].iter().chain(&m.dof_dampingpoly()[joint.idx_v]);
+            if bent.into_iter().any(|x| *x != 0.0) {
+                beyond.push(format!(
+                    "joint '{name}' has a spring or damper that is not linear: make it linear"
+                ));
+            }
+        }
+        let damped = m.dof_damping().iter().any(|d| *d != 0.0);
+        if self.is_euler() && damped && self.disables(mjtDisableBit::mjDSBL_EULERDAMP) {
+            beyond.push("the option flag eulerdamp is off: take it out".to_string());
+        }
+        beyond
+    }
+
+    /// What the file says and the description does not.
+    fn notes(&self) -> Vec<String> {
+        let (m, mut notes) = (&self.0, Vec::new());
+        let mut note = |present: bool, text: &str| {
+            if present {
+                notes.push(text.to_string());
+            }
+        };
+        note(m.neq() > 0, "equality constraints are not modelled");
+        note(m.ntendon() > 0, "tendons are not modelled");
+        note(m.nflex() > 0, "flexible bodies are not modelled");
+        note(m.dof_frictionloss().iter().any(|x| *x != 0.0), "joint frictionloss is not modelled");
+        let option = m.opt();
+        let air = option.density != 0.0 || option.viscosity != 0.0;
+        note(air, "fluid forces are not modelled");
+        let balls = |id: usize| m.jnt_limited()[id] && self.joint(id).nv > 1;
+        note((0..m.jnt_type().len()).any(balls), "limits of ball joints are not modelled");
+        note(m.body_mocapid().iter().any(|id| *id >= 0), "mocap bodies are taken to stand still");
+        note(self.disables(mjtDisableBit::mjDSBL_ACTUATION), "the file switches its actuators off");
+        notes
+    }
+
+    fn name_of_model(&self) -> String {
+        // SAFETY: MuJoCo's buffer of names begins with the model's own and every name ends with a zero.
+        let name = unsafe { std::ffi::CStr::from_ptr(self.0.ffi().names) };
+        name.to_string_lossy().into_owned()
+    }
+}
+
+/// Nameless bodies take the name of a joint, which may be another body's.
+fn make_unique<'a>(names: impl Iterator<Item = &'a mut String>) {
+    let mut seen = std::collections::HashSet::new();
+    for name in names {
+        while !seen.insert(name.clone()) {
+            name.push('_');
+        }
+    }
+}
+
+fn placement(position: [f64; 3], quaternion: [f64; 4]) -> Placement {
+    Placement { position, rotation: rotation(quaternion) }
+}
+
+/// Rotation matrix by rows of a unit quaternion `w x y z`.
+fn rotation([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
+    [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+}
+
+/// `R diag(moments) R'` as xx, xy, xz, yy, yz, zz.
+fn turned(moments: [f64; 3], r: [[f64; 3]; 3]) -> [f64; 6] {
+    let entry = |i: usize, j: usize| (0..3).map(|k| r[i][k] * moments[k] * r[j][k]).sum();
+    [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)]
+}

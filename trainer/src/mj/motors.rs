@@ -1,0 +1,133 @@
+//! MuJoCo's actuators as motors.
+
+use nearl_runtime::constraints::description::{Command, JointDescription, Motor, RobotDescription};
+
+use mujoco_rs::mujoco_c::mjtDisableBit;
+use mujoco_rs::wrappers::mj_model::{MjtBias, MjtDyn, MjtGain, MjtObjBase, MjtTrn};
+
+use super::Model;
+
+/// Adds the motors of joints with one dof, with their rotors and dampers; what else drives the robot is noted.
+pub(super) fn add(model: &Model, robot: &mut RobotDescription) {
+    for id in 0..model.n_actuators() {
+        let name = model.actuator_name(id);
+        match model.driven_joint(id) {
+            Some(joint) if model.0.actuator_ctrlnum()[id] == 1 => {
+                let motor = model.motor(id, name, &joint);
+                load(model, id, motor.gear, robot, &joint);
+                robot.motors.push(motor);
+            }
+            _ => robot
+                .notes
+                .push(format!("actuator '{name}' does not drive a joint with one dof and is not modelled")),
+        }
+    }
+}
+
+/// A motor's rotor and damper act on the joint by the square of the gear.
+fn load(model: &Model, id: usize, gear: f64, robot: &mut RobotDescription, joint: &str) {
+    let joints = robot.bodies.iter_mut().flat_map(|body| &mut body.joints);
+    let Some(joint): Option<&mut JointDescription> = joints.into_iter().find(|j| j.name == joint) else {
+        return;
+    };
+    joint.armature += gear * gear * model.0.actuator_armature()[id];
+    joint.damping += gear * gear * model.0.actuator_damping()[id];
+}
+
+impl Model {
+    fn n_actuators(&self) -> usize {
+        self.0.actuator_trntype().len()
+    }
+
+    fn actuator_name(&self, id: usize) -> String {
+        self.name(MjtObjBase::mjOBJ_ACTUATOR, id).unwrap_or_else(|| match self.driven_joint(id) {
+            Some(joint) => joint,
+            None => format!("number {id}"),
+        })
+    }
+
+    /// Name of the joint with one dof that an actuator drives.
+    fn driven_joint(&self, id: usize) -> Option<String> {
+        let kind = self.0.actuator_trntype()[id];
+        let on_joint = matches!(kind, MjtTrn::mjTRN_JOINT | MjtTrn::mjTRN_JOINTINPARENT);
+        let joint = usize::try_from(self.0.actuator_trnid()[id][0]).ok().filter(|_| on_joint)?;
+        Some(self.joint(joint)).filter(|j| j.nv == 1).map(|j| j.name)
+    }
+
+    fn motor(&self, id: usize, name: String, joint: &str) -> Motor {
+        let m = &self.0;
+        let order = m.actuator_ctrladr()[id].max(0) as usize;
+        let gain = m.actuator_gainprm()[id][0];
+        let bias = match m.actuator_biastype()[id] {
+            MjtBias::mjBIAS_AFFINE => {
+                let b = &m.actuator_biasprm()[id];
+                [b[0], b[1], b[2]]
+            }
+            _ => [0.0; 3],
+        };
+        let clamps = m.actuator_ctrllimited()[order] && !self.disables(mjtDisableBit::mjDSBL_CLAMPCTRL);
+        Motor {
+            name,
+            joint: joint.to_string(),
+            order,
+            command: command(gain, bias),
+            gear: m.actuator_gear()[m.actuator_outadr()[id].max(0) as usize][0],
+            gain,
+            bias,
+            control_range: clamps.then(|| m.actuator_ctrlrange()[order]),
+            force_range: self.force_range(id, order),
+            not_modelled: self.beyond_the_law(id),
+        }
+    }
+
+    /// The file's own, and of a filtered control what the control's range allows: a filter does not overshoot.
+    fn force_range(&self, id: usize, order: usize) -> Option<[f64; 2]> {
+        let m = &self.0;
+        let own = m.actuator_forcelimited()[id].then(|| m.actuator_forcerange()[id]);
+        let is_filter = matches!(m.actuator_dyntype()[id], MjtDyn::mjDYN_FILTER | MjtDyn::mjDYN_FILTEREXACT)
+            && m.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED
+            && m.actuator_biastype()[id] == MjtBias::mjBIAS_NONE;
+        if !is_filter || !m.actuator_ctrllimited()[order] {
+            return own;
+        }
+        let ends = m.actuator_ctrlrange()[order].map(|u| m.actuator_gainprm()[id][0] * u);
+        let (low, high) = (ends[0].min(ends[1]), ends[0].max(ends[1]));
+        Some(own.map_or([low, high], |own| [own[0].max(low), own[1].min(high)]))
+    }
+
+    /// Why an actuator's force is more than gain, control and bias.
+    fn beyond_the_law(&self, id: usize) -> Option<String> {
+        let m = &self.0;
+        let kind = if m.actuator_gaintype()[id] != MjtGain::mjGAIN_FIXED {
+            "a gain that depends on the state"
+        } else if !matches!(m.actuator_biastype()[id], MjtBias::mjBIAS_NONE | MjtBias::mjBIAS_AFFINE) {
+            "a bias that is not affine"
+        } else if m.actuator_dyntype()[id] != MjtDyn::mjDYN_NONE {
+            "dynamics of its own"
+        } else if m.actuator_delay()[id] != 0.0 {
+            "a delay"
+        } else if m.actuator_gear()[m.actuator_outadr()[id].max(0) as usize][0] == 0.0 {
+            "gear 0"
+        } else if m.actuator_gainprm()[id][0] == 0.0 {
+            "gain 0"
+        } else if m.actuator_dampingpoly()[id].iter().any(|x| *x != 0.0) {
+            "a damper that is not linear"
+        } else {
+            return None;
+        };
+        Some(kind.to_string())
+    }
+}
+
+/// What the control means, by what the force does where the control is the joint's own position or velocity.
+fn command(gain: f64, [_, position, velocity]: [f64; 3]) -> Command {
+    if position == -gain && velocity == 0.0 {
+        Command::Position
+    } else if position == -gain {
+        Command::Pd
+    } else if position == 0.0 && velocity == -gain {
+        Command::Velocity
+    } else {
+        Command::Effort
+    }
+}

@@ -1,0 +1,122 @@
+//! From a robot file to its description, and where the simulator's robot file comes from.
+
+use std::path::{Path, PathBuf};
+
+use nearl_runtime::Manifest;
+use nearl_runtime::constraints::description::{JointKind, Range, RobotDescription};
+use nearl_runtime::constraints::{Model, ModelError};
+use nearl_runtime::snapshot::{ModelFormat, Simulation};
+
+use crate::mj::{self, MjError, Options};
+
+/// Why a robot file has no description.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum RobotError {
+    /// MuJoCo's side of it.
+    #[error(transparent)]
+    Physics(#[from] MjError),
+    /// The URDF's side of it.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+}
+
+/// Describes a robot file: an MJCF through MuJoCo, a URDF by our own reader. `floats`: the base of the URDF is free.
+///
+/// # Errors
+/// [`RobotError`].
+pub fn describe(file: &Simulation, floats: bool) -> Result<RobotDescription, RobotError> {
+    match file.format {
+        ModelFormat::Mjcf => Ok(compile(file, false)?.describe()?),
+        ModelFormat::Urdf => read_urdf(&file.text, floats),
+    }
+}
+
+/// Describes a robot file as MuJoCo simulates it: of a URDF, joints and masses are MuJoCo's (a continuous joint is a hinge without
+/// limits, a link without `<inertial>` weighs what its geometry does), limits and motors the file's.
+///
+/// # Errors
+/// [`RobotError`].
+pub fn describe_simulated(file: &Simulation, floats: bool) -> Result<RobotDescription, RobotError> {
+    let mut robot = compile(file, floats)?.describe()?;
+    if file.format == ModelFormat::Mjcf {
+        return Ok(robot);
+    }
+    let stated = read_urdf(&file.text, floats)?;
+    for joint in robot.bodies.iter_mut().flat_map(|body| &mut body.joints) {
+        let Some(own) = stated.joints().find(|own| own.name == joint.name) else { continue };
+        (joint.velocity, joint.effort) = (own.velocity, own.effort);
+        if own.range == Range::NotStated && joint.kind != JointKind::Free {
+            joint.range = Range::NotStated;
+        }
+    }
+    let is_there = |name: &str| robot.joints().any(|joint| joint.name == name);
+    let motors = stated.motors.into_iter().filter(|motor| is_there(&motor.joint)).collect();
+    robot.name = stated.name;
+    robot.motors = motors;
+    let more: Vec<_> = stated.notes.into_iter().filter(|note| !note.contains("no mass")).collect();
+    robot.notes.extend(more);
+    Ok(robot)
+}
+
+/// Describes a file, an MJCF by its ending `.xml` or `.mjcf`. `floats`: the base of a URDF is free.
+///
+/// # Errors
+/// [`RobotError`].
+pub fn read(path: &Path, floats: bool) -> Result<RobotDescription, RobotError> {
+    let is_mjcf = path.extension().is_some_and(|ending| ending == "xml" || ending == "mjcf");
+    match (is_mjcf, floats) {
+        (true, _) => read_mjcf(path),
+        (false, true) => Ok(Model::from_urdf_free_flyer(path)?.description().clone()),
+        (false, false) => Ok(Model::from_urdf(path)?.description().clone()),
+    }
+}
+
+/// Describes an MJCF file, with what it includes and its meshes.
+///
+/// # Errors
+/// [`RobotError`].
+pub fn read_mjcf(path: &Path) -> Result<RobotDescription, RobotError> {
+    let unreadable = |reason: String| ModelError::Unreadable { path: path.to_path_buf(), reason };
+    let text = std::fs::read_to_string(path).map_err(|e| unreadable(e.to_string()))?;
+    if text.trim().is_empty() {
+        return Err(unreadable("the file is empty".to_string()).into());
+    }
+    describe(&Simulation { format: ModelFormat::Mjcf, text, folder: Some(folder_of(path)) }, false)
+}
+
+/// Describes an MJCF text; files that it names are looked for in the current folder.
+///
+/// # Errors
+/// [`RobotError`].
+pub fn read_mjcf_text(text: &str) -> Result<RobotDescription, RobotError> {
+    describe(&Simulation { format: ModelFormat::Mjcf, text: text.to_string(), folder: None }, false)
+}
+
+/// The folder of a file, as seen from everywhere.
+pub fn folder_of(file: &Path) -> PathBuf {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    folder.canonicalize().unwrap_or_else(|_| folder.to_path_buf())
+}
+
+/// Compiles a robot file for simulation.
+///
+/// # Errors
+/// [`MjError::Load`].
+pub fn compile(file: &Simulation, floats: bool) -> Result<mj::Model, MjError> {
+    let options = Options { floats, ..Options::default() };
+    mj::Model::from_text_in(&file.text, file.format, file.folder.as_deref(), options)
+}
+
+/// The robot file of a manifest: its own, else the bundled one that its task names.
+pub fn simulation(manifest: &Manifest) -> Option<Simulation> {
+    let bundled = || {
+        let (file, format) = manifest.task.model.file()?;
+        Some(Simulation { format, text: crate::tasks::robot(file)?.to_string(), folder: None })
+    };
+    manifest.simulation.clone().or_else(bundled)
+}
+
+fn read_urdf(text: &str, floats: bool) -> Result<RobotDescription, RobotError> {
+    let read = if floats { Model::from_urdf_text_free_flyer } else { Model::from_urdf_text };
+    Ok(read(text)?.description().clone())
+}
