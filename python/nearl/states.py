@@ -34,7 +34,6 @@ class States:
         target_q, target_v: Its projection (n x nq, n x nv).
         action: What the actuators were given (n x n_act).
         period_tick: Ticks since the policy ran (n).
-        reward: What the plant reports of the step (n).
         log_prob_proposal, log_prob_action: As sampled (n).
         moved: Distance between proposal and target (n).
         raw_violations, projected_violations: Limits broken by proposal and target (n).
@@ -59,7 +58,6 @@ class States:
     target_v: Floats
     action: Floats
     period_tick: Integers
-    reward: Floats
     log_prob_proposal: Floats
     log_prob_action: Floats
     moved: Floats

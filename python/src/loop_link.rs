@@ -146,8 +146,7 @@ const INTEGERS: [(&str, Integer); 11] = [
     ("raw_violations", |t| u64::from(t.ledger.raw_violations)),
     ("projected_violations", |t| u64::from(t.ledger.projected_violations)),
 ];
-const NUMBERS: [(&str, Number); 4] = [
-    ("reward", |t| t.reward),
+const NUMBERS: [(&str, Number); 3] = [
     ("log_prob_proposal", |t| t.log_prob_proposal),
     ("log_prob_action", |t| t.log_prob_action),
     ("moved", |t| t.ledger.moved),

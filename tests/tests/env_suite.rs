@@ -6,6 +6,7 @@ use std::time::Duration;
 use nearl_trainer::env::{
     self, ChaCha8Rng, Env, EnvError, Excess, Fault, LimitError, Limits, Meter, SeedableRng,
 };
+use nearl_trainer::mj::Inverse;
 use rand::RngExt;
 
 fn every_task() -> impl Iterator<Item = Box<dyn Env>> {
@@ -326,36 +327,68 @@ fn limits() -> Limits {
         lower_position: vec![-1.0, f64::NEG_INFINITY],
         upper_position: vec![2.0, f64::INFINITY],
         velocity: vec![3.0, f64::INFINITY],
+        acceleration: vec![40.0, f64::INFINITY],
         effort: vec![10.0, 5.0],
     }
 }
 
 #[test]
 fn the_meter_counts_what_is_outside() {
-    let mut meter = Meter::new(limits(), 1e-9).expect("limits");
-    assert_eq!(meter.observe(&[2.0, 1e9], &[-3.0, 1e9], &[10.0, -5.0]), Excess::default());
-    assert_eq!(meter.observe(&[2.0 + 1e-12, 0.0], &[0.0; 2], &[0.0; 2]).position, 2.0 + 1e-12 - 2.0);
-    assert_eq!((meter.position().states, meter.velocity().states, meter.effort().states), (0, 0, 0));
+    let mut meter = Meter::new(limits(), 1e-9, 0.1).expect("limits");
+    assert_eq!(meter.records()[3], None, "no force was given yet");
+    meter.begin(&[-3.0, 0.0]);
+    assert_eq!(meter.observe(&[2.0, 1e9], &[-3.0, 1e9], Some(&[10.0, -5.0])), Excess::default());
+    assert_eq!(meter.observe(&[2.0 + 1e-12, 0.0], &[0.0; 2], Some(&[0.0; 2])).position, 2.0 + 1e-12 - 2.0);
+    assert!(meter.records().iter().all(|found| found.is_some_and(|w| w.states == 0)));
+    // From rest to 5.5 rad/s in 0.1 s are 55 rad/s^2.
     assert_eq!(
-        meter.observe(&[-1.5, 0.0], &[4.0, 0.0], &[0.0, 7.0]),
-        Excess { position: 0.5, velocity: 1.0, effort: 2.0 }
+        meter.observe(&[-1.5, 0.0], &[5.5, 0.0], Some(&[0.0, 7.0])),
+        Excess { position: 0.5, velocity: 2.5, acceleration: 15.0, effort: 2.0 }
     );
-    meter.observe(&[-1.25, 0.0], &[0.0; 2], &[0.0; 2]);
-    let (position, effort) = (meter.position(), meter.effort());
+    meter.begin(&[0.0; 2]);
+    meter.observe(&[-1.25, 0.0], &[0.0; 2], None);
+    let (position, acceleration) = (meter.position(), meter.acceleration());
+    let effort = meter.effort().expect("forces were given");
     assert_eq!((position.states, position.excess, position.index, position.at), (2, 0.5, 0, 2));
+    assert_eq!((acceleration.states, acceleration.excess, acceleration.index), (1, 15.0, 0));
     assert_eq!((effort.states, effort.excess, effort.index, effort.at), (1, 2.0, 1, 2));
     assert_eq!(meter.states(), 4);
+}
+
+/// MuJoCo's inverse dynamics gives back what drove the robot, from its motion alone.
+#[test]
+fn the_inverse_finds_the_force_in_the_motion() {
+    let mut found = 0;
+    for mut env in every_task() {
+        let Some(mut inverse) = Inverse::new(env.sim()).expect("memory") else { continue };
+        env.reset(&mut seeded(3)).expect("reset");
+        let (n_act, nv) = (env.spec().n_act(), env.spec().nv);
+        let (mut told, mut force) = (vec![0.0; nv], vec![0.0; nv]);
+        for k in 0..200 {
+            let share = |i: usize| 0.5 * (0.1 * k as f64 + i as f64).sin();
+            let action: Vec<f64> = (0..n_act).map(|i| share(i) * env.spec().actuators[i].high).collect();
+            env.step(&action);
+            env.sim().applied_force(&mut told);
+            inverse.force(env.sim(), &mut force).expect("an inverse");
+            for (i, (a, b)) in force.iter().zip(&told).enumerate() {
+                let name = &env.spec().name;
+                assert!((a - b).abs() < 1e-6 * (1.0 + b.abs()), "{name}, tick {k}, dof {i}: {a} instead of {b}");
+            }
+        }
+        found += 1;
+    }
+    assert!(found > 0, "no task has an integrator with an inverse");
 }
 
 #[test]
 fn the_meter_takes_nothing_unbelievable_for_inside() {
     for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
         for entry in 0..2 {
-            let mut meter = Meter::new(limits(), 1e-9).expect("limits");
+            let mut meter = Meter::new(limits(), 1e-9, 0.1).expect("limits");
             let mut q = [0.0; 2];
             q[entry] = bad;
-            assert_eq!(meter.observe(&q, &[0.0; 2], &[0.0; 2]).position, f64::INFINITY);
-            assert_eq!(meter.observe(&[0.0; 2], &q, &[0.0; 2]).velocity, f64::INFINITY);
+            assert_eq!(meter.observe(&q, &[0.0; 2], None).position, f64::INFINITY);
+            assert_eq!(meter.observe(&[0.0; 2], &q, None).velocity, f64::INFINITY);
             assert_eq!((meter.position().states, meter.velocity().states), (1, 1));
         }
     }
@@ -364,11 +397,11 @@ fn the_meter_takes_nothing_unbelievable_for_inside() {
 #[test]
 fn limits_that_make_no_sense_are_refused() {
     let crossed = Limits { lower_position: vec![3.0, 0.0], ..limits() };
-    assert!(matches!(Meter::new(crossed, 0.0), Err(LimitError::Empty { what: "position", index: 0, .. })));
+    assert!(matches!(Meter::new(crossed, 0.0, 0.1), Err(LimitError::Empty { what: "position", index: 0, .. })));
     let negative = Limits { velocity: vec![3.0, -1.0], ..limits() };
-    assert!(matches!(Meter::new(negative, 0.0), Err(LimitError::Empty { what: "velocity", index: 1, .. })));
+    assert!(matches!(Meter::new(negative, 0.0, 0.1), Err(LimitError::Empty { what: "velocity", index: 1, .. })));
     let short = Limits { effort: vec![1.0], ..limits() };
-    assert!(matches!(Meter::new(short, 0.0), Err(LimitError::Lengths { effort: 1, .. })));
+    assert!(matches!(Meter::new(short, 0.0, 0.1), Err(LimitError::Lengths { effort: 1, .. })));
 }
 
 #[test]

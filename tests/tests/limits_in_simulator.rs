@@ -7,7 +7,7 @@ use nearl_runtime::Controller;
 use nearl_runtime::constraints::{Dynamics, Kinematics, Model, Period, Rung};
 use nearl_tests::random_policy;
 use nearl_trainer::env::{Env, Meter};
-use nearl_trainer::mj;
+use nearl_trainer::mj::{self, Inverse};
 use nearl_trainer::plant::{TOLERANCE, watched_limits};
 use nearl_trainer::robot;
 use nearl_trainer::rollout::{make_env, stream};
@@ -38,10 +38,12 @@ fn run_at(seed: u64, projection: bool, ticks: usize, dt: f64) -> Outcome {
     let mut controller = Controller::new(&snapshot).expect("controller");
     controller.set_projection(projection);
     let limits = watched_limits(env.as_ref(), controller.model(), controller.limits());
-    let mut meter = Meter::new(limits, TOLERANCE).expect("limits");
+    let mut meter = Meter::new(limits, TOLERANCE, dt).expect("limits");
     let (mut state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
     let mut force = vec![0.0; env.spec().nv];
     env.reset(&mut stream(seed, 0)).expect("reset");
+    let mut inverse = Inverse::new(env.sim()).expect("memory").expect("an integrator with an inverse");
+    meter.begin(env.qvel());
     let (mut refused, mut braked) = (0, 0);
     for _ in 0..ticks {
         observe(env.as_ref(), &mut state);
@@ -50,10 +52,14 @@ fn run_at(seed: u64, projection: bool, ticks: usize, dt: f64) -> Outcome {
         braked += u64::from(!status.is_ok() && out.next.ledger.rung == Rung::Brake);
         refused += u64::from(out.next.ledger.violations.total() > 0);
         env.step(&out.action);
-        env.sim().applied_force(&mut force);
-        meter.observe(env.qpos(), env.qvel(), &force);
+        inverse.force(env.sim(), &mut force).expect("an inverse");
+        meter.observe(env.qpos(), env.qvel(), Some(&force));
     }
-    let (p, v, t) = (meter.position(), meter.velocity(), meter.effort());
+    let [p, v, a, t] = meter.records().map(|found| found.expect("all four are measured"));
+    eprintln!(
+        "EXCESS p {:e} v {:e} a {:e} ({}) t {:e} ({})",
+        p.excess, v.excess, a.excess, a.states, t.excess, t.states
+    );
     let worst = p.excess.max(v.excess).max(t.excess);
     Outcome { position: p.states, velocity: v.states, torque: t.states, worst, refused, braked }
 }

@@ -1,10 +1,13 @@
-//! `nearl eval`: episodes without noise, raw and projected.
+//! Episodes without noise, raw and projected, and what they were worth.
 
 use crate::rollout::{RolloutError, Worker, make_env, stream};
-use nearl_runtime::Snapshot;
+use nearl_runtime::constraints::{
+    ConstraintSettings, LimitSet, Model, PerJoint, build_limits,
+};
+use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use serde::Serialize;
 
-/// How far a joint came beyond a limit.
+/// How far a joint came beyond a limit that the projection keeps: the robot's own, less the task's margin or share of it.
 #[derive(Clone, Debug, Serialize)]
 pub struct Worst {
     /// `position` or `velocity`.
@@ -13,6 +16,8 @@ pub struct Worst {
     pub joint: String,
     /// Distance [rad or m, per s for a velocity].
     pub by: f64,
+    /// Furthest that any joint came beyond its limit without margins; 0 when none did.
+    pub beyond_margin: f64,
 }
 
 /// Mean results of some episodes.
@@ -54,6 +59,13 @@ impl Evaluation {
         self.returns.iter().sum::<f64>() / self.returns.len().max(1) as f64
     }
 
+    /// Standard deviation of the returns, with n - 1; 0 of a single episode.
+    pub fn std_return(&self) -> f64 {
+        let mean = self.mean_return();
+        let squares: f64 = self.returns.iter().map(|r| (r - mean).powi(2)).sum();
+        (squares / self.returns.len().saturating_sub(1).max(1) as f64).sqrt()
+    }
+
     /// Mean cost of an episode.
     pub fn mean_cost(&self) -> f64 {
         self.costs.iter().sum::<f64>() / self.costs.len().max(1) as f64
@@ -72,6 +84,9 @@ pub fn evaluate(
 ) -> Result<Evaluation, RolloutError> {
     let mut worker = Worker::new(make_env(snapshot)?, snapshot, 1.0, stream(seed, 0))?;
     worker.set_projection(projection);
+    let (model, layout) = (worker.controller.model(), worker.controller.layout());
+    let own = without_margins(&snapshot.manifest, model, layout.controllable());
+    worker.beyond = Some((own.map_err(RolloutError::from)?, [None; 2]));
     let mode = if projection { "projected" } else { "raw" };
     let mut e = Evaluation {
         mode,
@@ -105,10 +120,22 @@ pub fn evaluate(
     }
     [e.replaced, e.unavoided] = worker.foreseen;
     e.residual /= e.ticks.max(1) as f64;
-    let named = ["position", "velocity"].into_iter().zip(worker.excess);
-    let joint = |dof| worker.controller.model().dof_name(dof);
-    e.worst = named
-        .filter_map(|(limit, excess)| excess.map(|x| Worst { limit, joint: joint(x.dof), by: x.by }))
-        .collect();
+    let beyond = worker.beyond.as_ref().map_or([None; 2], |(_, most)| *most);
+    for ((limit, excess), own) in ["position", "velocity"].into_iter().zip(worker.excess).zip(beyond) {
+        let joint = |dof| worker.controller.model().dof_name(dof);
+        let beyond_margin = own.map_or(0.0, |x| x.by);
+        e.worst.extend(excess.map(|x| Worst { limit, joint: joint(x.dof), by: x.by, beyond_margin }));
+    }
     Ok(e)
+}
+
+/// The position and velocity limits of the task with no margin and the robot's whole speed.
+fn without_margins(m: &Manifest, model: &Model, controllable: &[usize]) -> Result<LimitSet, SnapshotError> {
+    let ConstraintSettings { mut position, mut velocity, .. } = m.task.constraints.clone();
+    position.iter_mut().for_each(|p| p.margin = PerJoint::All(0.0));
+    velocity.iter_mut().for_each(|v| (v.scale, v.margin) = (v.scale.map(|_| 1.0), None));
+    let settings = ConstraintSettings { position, velocity, ..ConstraintSettings::default() };
+    let unusable = |e: nearl_runtime::constraints::LimitError| SnapshotError::Unusable { reason: e.to_string() };
+    let limits = build_limits(&settings, model).map_err(unusable)?;
+    LimitSet::collect(model, &limits, controllable).map_err(unusable)
 }

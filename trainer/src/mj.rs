@@ -6,6 +6,7 @@
 
 mod describe;
 mod guard;
+mod inverse;
 mod motors;
 mod sim;
 
@@ -18,6 +19,7 @@ use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::mj_model::{MjModel, MjtBias, MjtDyn, MjtGain, MjtJoint, MjtObjBase, MjtTrn};
 
 pub use guard::{last_warning, warnings};
+pub use inverse::Inverse;
 pub use sim::Sim;
 
 /// Why MuJoCo could not do what was asked.
@@ -199,6 +201,11 @@ impl Model {
     /// Whether a physics step is MuJoCo's Euler (velocity first, then position with the new velocity).
     pub fn is_euler(&self) -> bool {
         self.0.opt().integrator == mujoco_rs::mujoco_c::mjtIntegrator::mjINT_EULER as i32
+    }
+
+    /// Whether a physics step is MuJoCo's Runge-Kutta of fourth order.
+    pub fn is_runge_kutta(&self) -> bool {
+        self.0.opt().integrator == mujoco_rs::mujoco_c::mjtIntegrator::mjINT_RK4 as i32
     }
 
     /// Mass of all bodies \[kg\].

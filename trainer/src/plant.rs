@@ -2,11 +2,12 @@
 
 use crate::env::{Env, EnvError, Limits, Meter};
 use crate::foresight::Foresight;
+use crate::mj::{Inverse, MjError};
 use crate::rollout::stream;
 use nearl_runtime::constraints::{Guard, LimitSet, Model};
 use nearl_runtime::controller::Parts;
 use nearl_runtime::link::{
-    ActionMessage, Plant, Robot, STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, StateMessage,
+    ActionMessage, Plant, Robot, STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, StateMessage, TallyMessage,
 };
 use nearl_runtime::rt::{Brake, describe};
 use nearl_runtime::{Manifest, SnapshotError};
@@ -15,7 +16,7 @@ use rand_chacha::ChaCha8Rng;
 /// Starts that are drawn for an episode before the plant gives up.
 const MOST_DRAWS: usize = 100;
 
-/// Excess over a limit that counts as rounding, in rad, rad/s or N m.
+/// Excess over a limit that counts as rounding, in rad, rad/s or N m; for an acceleration what follows from that of a velocity.
 pub const TOLERANCE: f64 = 1e-9;
 
 /// A task's environment as a plant: measures its own limits, brakes by itself, starts episodes anew.
@@ -25,6 +26,8 @@ pub struct MujocoPlant {
     meter: Meter,
     /// Asks the simulator where an action leads, if the task says so.
     foresight: Option<Foresight>,
+    /// `None` where MuJoCo's step has no inverse, so that torque is not measured.
+    inverse: Option<Inverse>,
     drive: Option<Brake>,
     robot: Robot,
     action: Vec<f64>,
@@ -41,12 +44,11 @@ struct Episode {
     tick: u64,
     total: f64,
     last: f64,
-    reward: f64,
     bits: u32,
     saturated: u32,
 }
 
-/// What the meter watches, in MuJoCo's order: the task's position and velocity limits, the robot file's effort limits.
+/// What the meter watches, in MuJoCo's order: the task's limits, and the robot file's effort where the task limits no torque.
 pub fn watched_limits(env: &dyn Env, model: &Model, set: &LimitSet) -> Limits {
     let spec = env.spec();
     let none = vec![f64::INFINITY; spec.nv];
@@ -54,6 +56,7 @@ pub fn watched_limits(env: &dyn Env, model: &Model, set: &LimitSet) -> Limits {
         lower_position: vec![f64::NEG_INFINITY; spec.nq],
         upper_position: vec![f64::INFINITY; spec.nq],
         velocity: none.clone(),
+        acceleration: none.clone(),
         effort: none,
     };
     for j in &spec.joints {
@@ -61,7 +64,8 @@ pub fn watched_limits(env: &dyn Env, model: &Model, set: &LimitSet) -> Limits {
         watched.lower_position[j.idx_q] = set.q_lower[m.idx_v];
         watched.upper_position[j.idx_q] = set.q_upper[m.idx_v];
         watched.velocity[j.idx_v] = set.velocity[m.idx_v];
-        watched.effort[j.idx_v] = model.effort_limit()[m.idx_v];
+        watched.acceleration[j.idx_v] = set.acceleration[m.idx_v];
+        watched.effort[j.idx_v] = model.effort_limit()[m.idx_v].min(set.effort[m.idx_v]);
     }
     watched
 }
@@ -75,6 +79,9 @@ pub enum PlantError {
     /// The task's robot, layout or limits.
     #[error(transparent)]
     Task(#[from] SnapshotError),
+    /// MuJoCo.
+    #[error(transparent)]
+    Physics(#[from] MjError),
     /// The limits to watch.
     #[error(transparent)]
     Limits(#[from] crate::env::LimitError),
@@ -91,12 +98,15 @@ impl MujocoPlant {
         let Parts { model, projector, .. } = Parts::new(manifest)?;
         let mut rng = stream(seed, 0);
         env.reset(&mut rng)?;
-        let (n_act, nq, nv) = (env.spec().n_act(), env.spec().nq, env.spec().nv);
         let limits = watched_limits(env.as_ref(), &model, projector.limits());
+        let mut meter = Meter::new(limits.clone(), TOLERANCE, env.spec().dt)?;
+        meter.begin(env.qvel());
+        let (n_act, nq, nv) = (env.spec().n_act(), env.spec().nq, env.spec().nv);
         let asks = manifest.task.constraints.guard == Guard::Simulator;
         Ok(Self {
             foresight: asks.then(|| Foresight::new(env.as_ref(), &limits)),
-            meter: Meter::new(limits, TOLERANCE)?,
+            meter,
+            inverse: Inverse::new(env.sim())?,
             drive: Brake::new(manifest)?,
             robot: describe(manifest, false)?,
             env,
@@ -135,7 +145,7 @@ impl MujocoPlant {
         }
         let step = self.env.step(&self.action);
         let e = &mut self.episode;
-        (e.tick, e.reward, e.total) = (e.tick + 1, step.reward, e.total + step.reward);
+        (e.tick, e.total) = (e.tick + 1, e.total + step.reward);
         let range = &self.env.spec().actuators;
         e.saturated =
             self.action.iter().zip(range).filter(|(a, r)| **a < r.low || **a > r.high).count() as u32;
@@ -144,8 +154,10 @@ impl MujocoPlant {
         } else if self.resets && e.tick >= self.env.spec().max_episode_steps as u64 {
             e.bits |= STATE_TRUNCATED;
         }
-        self.env.sim().applied_force(&mut self.force);
-        self.meter.observe(self.env.qpos(), self.env.qvel(), &self.force);
+        let sim = self.env.sim();
+        // A motion that MuJoCo cannot go back from is one of no known force.
+        let known = self.inverse.as_mut().is_some_and(|inverse| inverse.force(sim, &mut self.force).is_ok());
+        self.meter.observe(self.env.qpos(), self.env.qvel(), known.then_some(&self.force[..]));
     }
 
     fn begin_episode(&mut self) {
@@ -156,6 +168,7 @@ impl MujocoPlant {
             assert!(refused < MOST_DRAWS, "{e}");
             eprintln!("nearl: the start of an episode is drawn again: {e}");
         }
+        self.meter.begin(self.env.qvel());
         let e = &mut self.episode;
         *e = Episode { number: e.number + 1, last: e.total, bits: STATE_RESET, ..Episode::default() };
     }
@@ -172,11 +185,14 @@ impl Plant for MujocoPlant {
         s.time = self.env.sim().time();
         let e = &self.episode;
         (s.episode, s.episode_tick, s.bits, s.saturated) = (e.number, e.tick, e.bits, e.saturated);
-        (s.reward, s.episode_return, s.last_return, s.episodes) = (e.reward, e.total, e.last, e.number);
-        let m = &self.meter;
-        let (p, v, t) = (m.position(), m.velocity(), m.effort());
-        s.violations = [p.states, v.states, 0, t.states];
-        s.worst = [p.excess, v.excess, 0.0, t.excess];
+    }
+
+    fn tally(&self, t: &mut TallyMessage) {
+        let e = &self.episode;
+        (t.episodes, t.episode_return, t.last_return) = (e.number, e.total, e.last);
+        for (i, found) in self.meter.records().into_iter().enumerate() {
+            found.iter().for_each(|worst| t.measure(i, worst.states, worst.excess));
+        }
     }
 
     fn apply(&mut self, action: &ActionMessage) {

@@ -128,7 +128,6 @@ _NUMBERS = {
     "policy_version": ("policy_version",),
     "seq": ("state", "seq"),
     "episode": ("state", "episode"),
-    "reward": ("state", "reward"),
     "raw_violations": ("ledger", "raw_violations"),
     "target_violations": ("ledger", "projected_violations"),
     "moved": ("ledger", "moved"),

@@ -485,7 +485,11 @@ impl Controller {
     /// How far `state` is outside the limits of the controllable joints: the largest excess of a position and of a velocity; less than
     /// 1e-9 is none.
     pub fn excess(&self, state: &State) -> [Option<Excess>; 2] {
-        let (mut worst, l) = ([None::<Excess>; 2], self.limits());
+        self.excess_over(self.limits(), state)
+    }
+    /// The same over limits of one's own, by degree of freedom.
+    pub fn excess_over(&self, l: &LimitSet, state: &State) -> [Option<Excess>; 2] {
+        let mut worst = [None::<Excess>; 2];
         for &dof in self.layout.controllable() {
             let (q, v) = (state.q[self.idx_q[dof]], state.v[dof]);
             let by = [(l.q_lower[dof] - q).max(q - l.q_upper[dof]), v.abs() - l.velocity[dof]];

@@ -5,6 +5,7 @@
 //! | `state` | plant -> all on this host, the newest alone | [`StateMessage`] |
 //! | `action` | runtime -> plant, the newest alone | [`ActionMessage`] |
 //! | `robot` | plant -> all | [`RobotMessage`] |
+//! | `tally` | plant -> all | [`TallyMessage`] |
 //! | `transition` | runtime -> trainer | [`TransitionMessage`] |
 //! | `snapshot` | trainer -> runtime | bytes with [`SnapshotHeader`] |
 //! | `receipt` | runtime -> trainer | [`ReceiptMessage`] |
@@ -30,12 +31,12 @@ pub const STATE_TRUNCATED: u32 = 4;
 /// The plant waits for the action of every state (no real-time grid).
 pub const ROBOT_LOCKSTEP: u32 = 1;
 
-/// Limit meters of the plant, by index: position, velocity, acceleration, torque.
+/// Limits that a plant may measure, by their place in a [`TallyMessage`].
 pub const METERS: [&str; 4] = ["position", "velocity", "acceleration", "torque"];
 
 message! {
     /// One sample of the plant, published on its time grid.
-    StateMessage, "state", version 1 {
+    StateMessage, "state", version 2 {
         /// Tick of the plant since its start.
         tick: u64,
         /// Grid time of the tick, monotonic [ns].
@@ -58,22 +59,10 @@ message! {
         bits: u32,
         /// Entries of the last action the plant had to saturate.
         saturated: u32,
-        /// Reward of the step that led here.
-        reward: f64,
-        /// Sum of rewards of the running episode.
-        episode_return: f64,
-        /// Return of the last finished episode, 0 before the first.
-        last_return: f64,
-        /// Episodes finished.
-        episodes: u64,
         /// Ticks the plant held the last action because none came in time.
         late: u64,
         /// Times the plant's watchdog braked.
         watchdog: u64,
-        /// Ticks that broke a limit, measured by the plant, by `METERS`.
-        violations: [u64; 4],
-        /// Largest excess over a limit seen so far [rad or m, 1/s, 1/s2, N m], by `METERS`.
-        worst: [f64; 4],
         /// Configuration.
         q: [f64; MAX_JOINTS],
         /// Velocity.
@@ -133,6 +122,43 @@ message! {
     }
 }
 
+message! {
+    /// What the plant counted since its start, a few times a second and when its runtime leaves: how its states kept the limits, and what
+    /// its episodes earned where it has any. No tick needs it.
+    TallyMessage, "tally", version 1, buffer 1, history 1, subscribers 16 {
+        /// Tick of the plant up to which it counted.
+        tick: u64,
+        /// Bit i is set if the plant measures the limit `METERS[i]`; the numbers of the others say nothing.
+        measured: u64,
+        /// Ticks that broke a limit, by `METERS`.
+        violations: [u64; 4],
+        /// Largest excess over a limit seen so far [rad or m, 1/s, 1/s2, N m], by `METERS`.
+        worst: [f64; 4],
+        /// Episodes finished.
+        episodes: u64,
+        /// Sum of rewards of the running episode; 0 for a plant that earns none.
+        episode_return: f64,
+        /// Return of the last finished episode, 0 before the first.
+        last_return: f64,
+    }
+}
+
+impl TallyMessage {
+    /// Fills in what the meter of `METERS[i]` found.
+    pub fn measure(&mut self, i: usize, violations: u64, worst: f64) {
+        self.measured |= 1 << i;
+        (self.violations[i], self.worst[i]) = (violations, worst);
+    }
+
+    /// Name, ticks outside and largest excess of each limit; `None` for one that the plant does not measure.
+    pub fn meters(&self) -> [(&'static str, Option<(u64, f64)>); 4] {
+        std::array::from_fn(|i| {
+            let found = (self.measured >> i & 1 == 1).then_some((self.violations[i], self.worst[i]));
+            (METERS[i], found)
+        })
+    }
+}
+
 /// What the ledger of a tick says, as plain numbers.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -161,7 +187,7 @@ pub struct LedgerNumbers {
 
 message! {
     /// One tick as the trainer learns from it.
-    TransitionMessage, "transition", version 3, buffer 1024, history 0, subscribers 2 {
+    TransitionMessage, "transition", version 4, buffer 1024, history 0, subscribers 2 {
         /// Tick of the runtime.
         tick: u64,
         /// `header.epoch` of the plant.
@@ -194,8 +220,6 @@ message! {
         explore: u64,
         /// Time of the plant's own clock [s].
         time: f64,
-        /// Reward reported with the next state.
-        reward: f64,
         /// Log probability of the proposal.
         log_prob_proposal: f64,
         /// Log probability of the action.

@@ -59,6 +59,7 @@ pub struct PlantLink {
     action: BoardReader<ActionMessage>,
     state: Board<StateMessage>,
     robot: Outbox<RobotMessage>,
+    tally: Outbox<TallyMessage>,
     hello: RobotMessage,
     bus: Bus,
     _owner: Owner,
@@ -74,6 +75,7 @@ impl PlantLink {
             state: Board::create(name, bus.epoch())?,
             action: BoardReader::open(name),
             robot: bus.outbox()?,
+            tally: bus.outbox()?,
             hello,
             bus,
             _owner: owner,
@@ -97,6 +99,11 @@ impl PlantLink {
     /// Sends a state; its number is in `message.header.seq` afterwards.
     pub fn send_state(&mut self, message: &mut StateMessage) {
         self.state.send(message);
+    }
+
+    /// Says what the plant counted so far.
+    pub fn send_tally(&mut self, message: &mut TallyMessage) -> bool {
+        self.tally.send(message)
     }
 
     /// The newest action, if it was not read before.

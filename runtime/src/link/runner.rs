@@ -10,7 +10,7 @@
 
 use serde::Serialize;
 
-use super::{ActionMessage, LinkError, Message, PlantLink, RobotName, StateMessage};
+use super::{ActionMessage, LinkError, Message, PlantLink, RobotName, StateMessage, TallyMessage};
 use crate::clock;
 use crate::grid::Grid;
 use crate::percentiles::{Percentiles, percentiles};
@@ -24,6 +24,8 @@ pub trait Plant {
     fn apply(&mut self, action: &ActionMessage);
     /// Advances one control period while bringing the velocity to zero, or keeping it there.
     fn brake(&mut self);
+    /// Writes what was counted since the start; a plant that measures no limit and has no episodes leaves it as it is.
+    fn tally(&self, _tally: &mut TallyMessage) {}
 }
 
 /// Who waits for whom.
@@ -155,6 +157,7 @@ impl PlantRunner {
                 grid.finish(clock::now());
             }
         }
+        self.send_tally(plant);
         (self.report.overruns, self.report.skipped) = (grid.overruns(), grid.skipped());
         self.report.round_trip = percentiles(&self.round_trip);
         self.report
@@ -167,7 +170,7 @@ impl PlantRunner {
         (self.state.late, self.state.watchdog) = (self.report.late, self.report.watchdog);
         self.link.send_state(&mut self.state);
         let sent = self.state.header.stamp;
-        match self.wait(due, stop) {
+        match self.wait(plant, due, stop) {
             Some(action) => {
                 if self.is_attached {
                     self.round_trip.saturating_record(clock::now() - sent);
@@ -185,8 +188,16 @@ impl PlantRunner {
         self.report.ticks += 1;
         if due >= self.next_announce {
             self.link.announce();
+            self.send_tally(plant);
             self.next_announce = due + ANNOUNCE;
         }
+    }
+
+    fn send_tally(&mut self, plant: &impl Plant) {
+        let mut tally = TallyMessage::zeroed();
+        tally.tick = self.report.ticks;
+        plant.tally(&mut tally);
+        self.link.send_tally(&mut tally);
     }
 
     /// Applies the last action, or brakes if the runtime left that to the plant.
@@ -215,7 +226,7 @@ impl PlantRunner {
     }
 
     /// The action for the state just sent, if it comes in time.
-    fn wait(&mut self, due: u64, stop: &Stop) -> Option<ActionMessage> {
+    fn wait(&mut self, plant: &impl Plant, due: u64, stop: &Stop) -> Option<ActionMessage> {
         let until = due + clock::nanoseconds(self.settings.dt * self.settings.deadline);
         let mut resend = clock::now() + RESEND;
         loop {
@@ -225,7 +236,10 @@ impl PlantRunner {
                     return Some(*action);
                 }
                 // The runtime ended in order: the plant is on its own at once, without the watchdog.
-                Some(action) if action.is_farewell() => self.is_attached = false,
+                Some(action) if action.is_farewell() => {
+                    self.is_attached = false;
+                    self.send_tally(plant);
+                }
                 _ => {}
             }
             let now = clock::now();

@@ -12,6 +12,7 @@ use super::*;
 pub struct RuntimeLink {
     state: BoardReader<StateMessage>,
     robot: Inbox<RobotMessage>,
+    tally: Inbox<TallyMessage>,
     snapshots: Option<SnapshotReader>,
     action: Board<ActionMessage>,
     transition: Outbox<TransitionMessage>,
@@ -33,6 +34,7 @@ impl RuntimeLink {
             health: bus.outbox()?,
             state: BoardReader::open(name),
             robot: bus.inbox()?,
+            tally: bus.inbox()?,
             snapshots: Some(bus.bytes_inbox()?),
             bus,
             _owner: owner,
@@ -63,6 +65,11 @@ impl RuntimeLink {
             self.state.attend();
         }
         robot
+    }
+
+    /// What the plant counted, if it said so since the last call.
+    pub fn tally(&mut self) -> Option<TallyMessage> {
+        self.tally.newest()
     }
 
     /// The newest state, if it was not read before.

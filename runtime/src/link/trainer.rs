@@ -16,6 +16,7 @@ pub struct TrainerLink {
     receipt: Inbox<ReceiptMessage>,
     health: Inbox<HealthMessage>,
     robot: Inbox<RobotMessage>,
+    tally: Inbox<TallyMessage>,
     snapshot: Option<(BytesOutbox, Owner)>,
     bus: Bus,
 }
@@ -30,6 +31,7 @@ impl TrainerLink {
             receipt: bus.inbox()?,
             health: bus.inbox()?,
             robot: bus.inbox()?,
+            tally: bus.inbox()?,
             snapshot: None,
             bus,
         };
@@ -109,6 +111,11 @@ impl TrainerLink {
     /// The plant's description, if it was sent since the last call.
     pub fn robot(&mut self) -> Option<RobotMessage> {
         self.robot.newest()
+    }
+
+    /// What the plant counted, if it said so since the last call; of a plant on this host.
+    pub fn tally(&mut self) -> Option<TallyMessage> {
+        self.tally.newest()
     }
 
     /// The robot's name.

@@ -11,7 +11,7 @@ use crate::link::{Message, StateMessage};
 use crate::rt::{Counters, Mode, Reason, Record, Row, Sensed};
 
 /// Version of the tick messages; replay reads this one only.
-pub const SCHEMA_VERSION: u32 = 2;
+pub const SCHEMA_VERSION: u32 = 3;
 
 /// JSON schema of the `tick` topic.
 pub(crate) const SCHEMA: &str = r#"{
@@ -24,8 +24,7 @@ pub(crate) const SCHEMA: &str = r#"{
     "state": {"type": "object", "properties": {
       "epoch": {"type": "integer"}, "seq": {"type": "integer"}, "stamp_ns": {"type": "integer"}, "tick": {"type": "integer"}, "time": {"type": "number"},
       "episode": {"type": "integer"}, "episode_tick": {"type": "integer"}, "bits": {"type": "integer"}, "saturated": {"type": "integer"},
-      "reward": {"type": "number"}, "episode_return": {"type": "number"}, "late": {"type": "integer"}, "watchdog": {"type": "integer"},
-      "violations": {"type": "array", "items": {"type": "integer"}}, "worst": {"type": "array", "items": {"type": "number"}},
+      "late": {"type": "integer"}, "watchdog": {"type": "integer"},
       "q": {"type": "array", "items": {"type": "number"}}, "v": {"type": "array", "items": {"type": "number"}},
       "obs": {"type": "array", "items": {"type": "number"}}, "applied": {"type": "array", "items": {"type": "number"}}}},
     "proposal_q": {"type": "array", "items": {"type": "number"}}, "proposal_v": {"type": "array", "items": {"type": "number"}},
@@ -121,14 +120,8 @@ struct StateJson<'a> {
     episode_tick: u64,
     bits: u32,
     saturated: u32,
-    #[serde(deserialize_with = "number")]
-    reward: f64,
-    #[serde(deserialize_with = "number")]
-    episode_return: f64,
     late: u64,
     watchdog: u64,
-    violations: [u64; 4],
-    worst: Numbers<'a>,
     q: Numbers<'a>,
     v: Numbers<'a>,
     obs: Numbers<'a>,
@@ -219,12 +212,8 @@ fn state_json(state: &StateMessage) -> StateJson<'_> {
         episode_tick: state.episode_tick,
         bits: state.bits,
         saturated: state.saturated,
-        reward: state.reward,
-        episode_return: state.episode_return,
         late: state.late,
         watchdog: state.watchdog,
-        violations: state.violations,
-        worst: state.worst[..].into(),
         q: state.q().into(),
         v: state.v().into(),
         obs: state.obs().into(),
@@ -270,13 +259,11 @@ impl TickJson<'_> {
         (state.tick, state.time) = (json.tick, json.time);
         (state.episode, state.episode_tick) = (json.episode, json.episode_tick);
         (state.bits, state.saturated) = (json.bits, json.saturated);
-        (state.reward, state.episode_return) = (json.reward, json.episode_return);
-        (state.late, state.watchdog, state.violations) = (json.late, json.watchdog, json.violations);
+        (state.late, state.watchdog) = (json.late, json.watchdog);
         let fill = |to: &mut [f64], from: &Numbers<'_>| -> Option<u32> {
             to.get_mut(..from.0.len())?.copy_from_slice(&from.0);
             u32::try_from(from.0.len()).ok()
         };
-        fill(&mut state.worst, &json.worst)?;
         state.nq = fill(&mut state.q, &json.q)?;
         state.nv = fill(&mut state.v, &json.v)?;
         state.n_obs = fill(&mut state.obs, &json.obs)?;

@@ -186,6 +186,8 @@ impl<T: Tick> Core<T> {
         if record.mode.acts() {
             record.counters.raw_violations += u64::from(record.step.ledger.raw_violations);
             record.counters.projected_violations += u64::from(record.step.ledger.projected_violations);
+            let is_unprojected = record.step.ledger.status == LedgerStatus::NotProjected.number();
+            record.counters.unprojected += u64::from(is_unprojected);
         }
         record.counters.mode_ticks[record.mode.code() as usize] += 1;
     }

@@ -11,7 +11,8 @@ use rtrb::{Consumer, Producer};
 
 use crate::clock::{self, Bell};
 use crate::link::{
-    ActionMessage, HealthMessage, Message, RobotMessage, RuntimeLink, StateMessage, TransitionMessage,
+    ActionMessage, HealthMessage, Message, RobotMessage, RuntimeLink, StateMessage, TallyMessage,
+    TransitionMessage,
 };
 use crate::log::LogQueue;
 use crate::percentiles::percentiles;
@@ -26,6 +27,8 @@ const NAP: u64 = 500_000;
 const SILENT: u64 = 5_000_000;
 /// Least time between two looks at what is not part of a tick [ns].
 const ATTEND: u64 = 500_000;
+/// Longest wait for a plant's last count [ns].
+const ANSWER: u64 = 300_000_000;
 /// Period of the health message [ns].
 const HEALTH: u64 = 100_000_000;
 
@@ -46,6 +49,8 @@ pub(crate) struct Io<B: Build> {
     pub(crate) priority: Option<i32>,
     pub(crate) health: Health,
     pub(crate) traffic: Traffic,
+    /// What the plant counted, as far as it said.
+    pub(crate) tally: Option<TallyMessage>,
 }
 
 /// What this thread counts and remembers.
@@ -133,6 +138,21 @@ impl<B: Build> Io<B> {
         true
     }
 
+    /// Waits for the plant's count up to its tick `tick`, which it sends when the runtime leaves; what it said last if it does not answer.
+    pub(crate) fn last_tally(&mut self, tick: u64) -> Option<TallyMessage> {
+        let until = clock::now() + ANSWER;
+        while self.tally.is_none_or(|t| t.tick < tick) && clock::now() < until {
+            self.hear_tally();
+            clock::sleep_until(clock::now() + NAP);
+        }
+        self.tally
+    }
+
+    fn hear_tally(&mut self) {
+        let epoch = self.robot.header.epoch;
+        self.tally = self.link.tally().filter(|t| t.header.epoch == epoch).or(self.tally);
+    }
+
     /// True when nothing urgent is expected soon.
     fn has_time(&self) -> bool {
         let now = clock::now();
@@ -156,6 +176,7 @@ impl<B: Build> Io<B> {
                 self.robot = robot;
             }
         }
+        self.hear_tally();
         let Io { link, log, robot, snapshots, traffic, .. } = self;
         snapshots.pump(&mut Desk { link, log, robot, tick: traffic.tick });
         let now = clock::now();
@@ -204,7 +225,6 @@ fn transition(record: &Record, next: &StateMessage, explore: Option<u64>) -> Tra
     (m.explores, m.explore) = (u32::from(explore.is_some()), explore.unwrap_or(0));
     (m.period_tick, m.time) = (step.period_tick, state.time);
     (m.nq, m.nv, m.nu, m.n_obs) = (state.nq, state.nv, step.nu, state.n_obs);
-    m.reward = next.reward;
     (m.log_prob_proposal, m.log_prob_action) = (step.log_prob_proposal, step.log_prob_action);
     m.ledger = step.ledger;
     (m.q, m.v, m.obs) = (state.q, state.v, state.obs);

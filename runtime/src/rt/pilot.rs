@@ -83,7 +83,8 @@ impl Pilot {
         for v in [&mut step.proposal_v, &mut step.target_v] {
             v[..nv].copy_from_slice(&state.v);
         }
-        step.ledger = LedgerNumbers { duration: output.duration_ns, ..LedgerNumbers::default() };
+        let status = LedgerStatus::NotProjected.number();
+        step.ledger = LedgerNumbers { status, duration: output.duration_ns, ..LedgerNumbers::default() };
         if self.proposes {
             step.target_q[..nq].copy_from_slice(&output.next.q);
             step.target_v[..nv].copy_from_slice(&output.next.v);

@@ -13,17 +13,19 @@ use crate::thread::Usage;
 /// Versions a printed report shows, the last ones; `--json` has all.
 const VERSIONS_SHOWN: usize = 12;
 
-/// What the plant said about itself in its last state.
+/// What the plant said about itself: the link in its last state, limits and episodes in its last tally.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct PlantSummary {
     /// Ticks the plant held the last action because none came in time.
     pub late: u64,
     /// Times its watchdog braked.
     pub watchdog: u64,
-    /// Ticks that broke a limit in the plant itself, by kind.
+    /// Ticks that broke a limit in the plant itself, for each kind that it measures.
     pub violations: BTreeMap<&'static str, u64>,
-    /// Largest excess over a limit, by kind.
+    /// Largest excess over a limit, for each kind that it measures.
     pub worst: BTreeMap<&'static str, f64>,
+    /// Kinds of limits that the plant does not measure.
+    pub not_measured: Vec<&'static str>,
     /// Episodes finished.
     pub episodes: u64,
     /// Return of the last finished episode.
@@ -79,6 +81,21 @@ pub struct RunReport {
     pub plant: PlantSummary,
 }
 
+impl RunReport {
+    /// What proposals and targets broke; a policy that proposes nothing breaks nothing either, which says nothing.
+    fn projected(&self) -> String {
+        let c = &self.counters;
+        let counts = format!("raw proposal {}, projected {}", c.raw_violations, c.projected_violations);
+        match c.unprojected {
+            0 => counts,
+            all if all == c.mode_ticks[Mode::Active.code() as usize] + c.mode_ticks[Mode::Degraded.code() as usize] => {
+                "nothing was projected: the policy gives actions, and no limit was looked at but the actuators' range".into()
+            }
+            some => format!("{counts}; {some} ticks acted without a projection: their policy gives actions"),
+        }
+    }
+}
+
 impl fmt::Display for RunReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let c = &self.counters;
@@ -93,13 +110,10 @@ impl fmt::Display for RunReport {
             "  timing           overruns {}, skipped {}, late {}, stale {}, states lost {}",
             c.overruns, c.skipped, self.plant.late, c.stale, c.lost_states
         )?;
-        writeln!(
-            f,
-            "  limits broken    raw proposal {}, projected {}",
-            c.raw_violations, c.projected_violations
-        )?;
-        let plant: Vec<String> =
-            self.plant.violations.iter().map(|(kind, n)| format!("{kind} {n}")).collect();
+        writeln!(f, "  limits broken    {}", self.projected())?;
+        let measured = self.plant.violations.iter().map(|(kind, n)| format!("{kind} {n}"));
+        let others = self.plant.not_measured.iter().map(|kind| format!("{kind} not measured"));
+        let plant: Vec<String> = measured.chain(others).collect();
         writeln!(f, "  on the plant     {}", plant.join(", "))?;
         let u = &self.usage;
         writeln!(

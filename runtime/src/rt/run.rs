@@ -10,7 +10,7 @@ use std::time::Duration;
 use rtrb::RingBuffer;
 
 use crate::clock::{self, Bell};
-use crate::link::{LinkError, METERS, RobotMessage, RobotName, RuntimeLink, StateMessage};
+use crate::link::{LinkError, Message, RobotMessage, RobotName, RuntimeLink, StateMessage, TallyMessage};
 use crate::log::{LogError, LogQueue, LogSummary};
 use crate::percentiles::percentiles;
 use crate::rt::build::Builder;
@@ -255,6 +255,7 @@ fn assemble<B: Build>(
         explore: settings.explore,
         health,
         traffic: Traffic::default(),
+        tally: None,
     };
     Ok((cycle, io))
 }
@@ -341,6 +342,7 @@ fn report<B: Build>(
     warnings: Vec<String>,
 ) -> RunReport {
     let seconds = (clock::now() - begin) as f64 * 1e-9;
+    let tally = io.last_tally(end.last.state.tick);
     let log = io.log.take().map_or_else(LogSummary::default, LogQueue::finish);
     let counters = end.last.counters;
     let refused_snapshots = io.snapshots.refused();
@@ -366,18 +368,22 @@ fn report<B: Build>(
         rolled_back: io.snapshots.rolled_back,
         usage: end.usage,
         warnings,
-        plant: plant_summary(&end.last.state),
+        plant: plant_summary(&end.last.state, tally.as_ref()),
     }
 }
 
-fn plant_summary(state: &StateMessage) -> PlantSummary {
+fn plant_summary(state: &StateMessage, tally: Option<&TallyMessage>) -> PlantSummary {
+    let none = TallyMessage::zeroed();
+    let tally = tally.unwrap_or(&none);
+    let measured = || tally.meters().into_iter().filter_map(|(kind, found)| Some((kind, found?)));
     PlantSummary {
         late: state.late,
         watchdog: state.watchdog,
-        violations: METERS.into_iter().zip(state.violations).collect(),
-        worst: METERS.into_iter().zip(state.worst).collect(),
-        episodes: state.episodes,
-        last_return: state.last_return,
-        episode_return: state.episode_return,
+        violations: measured().map(|(kind, (ticks, _))| (kind, ticks)).collect(),
+        worst: measured().map(|(kind, (_, excess))| (kind, excess)).collect(),
+        not_measured: tally.meters().into_iter().filter(|m| m.1.is_none()).map(|m| m.0).collect(),
+        episodes: tally.episodes,
+        last_return: tally.last_return,
+        episode_return: tally.episode_return,
     }
 }

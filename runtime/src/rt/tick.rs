@@ -175,6 +175,8 @@ pub struct Counters {
     pub raw_violations: u64,
     /// Limits the projected targets broke, summed over ticks.
     pub projected_violations: u64,
+    /// Ticks that acted on what no projection has seen: their policy gives actions and proposes no state.
+    pub unprojected: u64,
     /// Ticks in each mode, by code.
     pub mode_ticks: [u64; Mode::ALL.len()],
 }

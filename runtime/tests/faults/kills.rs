@@ -93,6 +93,13 @@ fn fault_16_a_killed_runtime_is_braked_in_time_and_its_successor_takes_over() {
     assert!(counted.watchdog >= trips, "{counted:?}");
 }
 
+/// Keeps the largest excess that the plant has said.
+fn hear(viewer: &mut TrainerLink, worst: &mut [f64; 4]) {
+    for (i, (_, found)) in viewer.tally().into_iter().flat_map(|t| t.meters()).enumerate() {
+        worst[i] = found.map_or(worst[i], |(_, excess)| excess.max(worst[i]));
+    }
+}
+
 #[test]
 fn a_plant_killed_in_motion_is_missed_by_its_reason_and_its_successor_is_taken_up() {
     let (stage, moments) = (Stage::new("kill-plant"), moments());
@@ -114,14 +121,14 @@ fn a_plant_killed_in_motion_is_missed_by_its_reason_and_its_successor_is_taken_u
     for k in 0..kills(3) {
         let mut moved = false;
         until("the arm moves", || {
+            hear(&mut viewer, &mut worst);
             viewer.state().is_some_and(|s| {
-                (0..4).for_each(|i| worst[i] = s.worst[i].max(worst[i]));
                 moved |= fastest(&s) > 0.1;
                 moved
             })
         });
         pause(moments.draw(k, 100));
-        viewer.state().into_iter().for_each(|s| (0..4).for_each(|i| worst[i] = s.worst[i].max(worst[i])));
+        hear(&mut viewer, &mut worst);
         kill(plant);
         until("the loop brakes by its reason", || {
             let seen = viewer.health().map(|h| (h.mode, h.reason));
@@ -134,7 +141,9 @@ fn a_plant_killed_in_motion_is_missed_by_its_reason_and_its_successor_is_taken_u
     let report = running.join().unwrap().unwrap();
     kill(plant);
     assert_eq!((report.modes["fault"], report.refused_snapshots), (0, 0), "{report}");
-    assert!([0, 1, 3].iter().all(|i| worst[*i] <= ROUNDING), "position, velocity, torque: {worst:?}");
+    // A killed plant says nothing more: what is looked at here is a tenth of a second old at most.
+    let kept = |i: &usize| worst[*i].is_finite() && worst[*i] <= ROUNDING;
+    assert!([0, 1, 3].iter().all(kept), "position, velocity, torque: {worst:?}");
 }
 
 #[test]

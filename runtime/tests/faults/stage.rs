@@ -38,8 +38,11 @@ impl DrivenArm {
 impl Plant for DrivenArm {
     fn observe(&mut self, state: &mut StateMessage) {
         self.panda.observe(state);
-        let [position, velocity, torque] = self.panda.worst;
-        state.worst = [position, velocity, 0.0, torque];
+    }
+    fn tally(&self, tally: &mut TallyMessage) {
+        for (i, worst) in [0, 1, 3].into_iter().zip(self.panda.worst) {
+            tally.measure(i, u64::from(worst > ROUNDING), worst);
+        }
     }
     fn apply(&mut self, action: &ActionMessage) {
         let now = (action.state_epoch, action.state_seq);

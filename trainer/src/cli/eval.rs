@@ -43,10 +43,10 @@ impl Eval {
         }
         say(format!("{}, {} episodes", snapshot.manifest.task.name, self.episodes));
         say(
-            "                              raw proposals   targets   reached states   already outside   |reached - target|",
+            "                                         raw proposals   targets   reached states   already outside   |reached - target|",
         );
         say(
-            "mode        return      cost  outside limits  outside          outside     (recovering)     [std of change]",
+            "mode        return ± spread        cost  outside limits  outside          outside     (recovering)     [std of change]",
         );
         for e in &results {
             let percent = |n: u64| 100.0 * n as f64 / e.ticks.max(1) as f64;
@@ -55,9 +55,10 @@ impl Eval {
             let of_targets = |text: String| if proposes { text } else { "-".into() };
             let share = |n: u64| of_targets(format!("{:.2} %", percent(n)));
             say(format!(
-                "{:<10}{:>8.1}{:>10.1}{:>16}{:>9}{:>15.2} %{:>17}{:>20}",
+                "{:<10}{:>8.1} ± {:<8.1}{:>10.1}{:>16}{:>9}{:>15.2} %{:>17}{:>20}",
                 e.mode,
                 e.mean_return(),
+                e.std_return(),
                 e.mean_cost(),
                 share(e.raw_violations),
                 share(e.target_violations),
@@ -74,8 +75,12 @@ impl Eval {
         }
         for (e, w) in results.iter().flat_map(|e| e.worst.iter().map(move |w| (e, w))) {
             let unit = if w.limit == "position" { "rad or m" } else { "rad/s or m/s" };
+            let without = match w.beyond_margin {
+                0.0 => "none came beyond its limit without margins".into(),
+                by => format!("beyond its limit without margins one came by {by:.3e} {unit}"),
+            };
             say(format!(
-                "{}: joint '{}' came furthest beyond its {} limit, by {:.3e} {unit}",
+                "{}: joint '{}' came furthest beyond its {} limit as the task has it, by {:.3e} {unit}; {without}",
                 e.mode, w.joint, w.limit, w.by
             ));
         }

@@ -5,8 +5,9 @@ use crate::plant::MujocoPlant;
 use crate::tasks;
 use crate::train::complete;
 use clap::Args;
-use nearl_runtime::link::{PlantLink, PlantRunner, PlantSettings, RobotName};
+use nearl_runtime::link::{METERS, PlantLink, PlantRunner, PlantSettings, RobotName};
 use nearl_runtime::rt::{FaultPlan, FaultyPlant, Stop};
+use std::collections::BTreeMap;
 use std::io::Write;
 
 #[derive(Args)]
@@ -67,12 +68,15 @@ impl PlantCommand {
         }
         let mut faulty = FaultyPlant::new(plant, plan);
         let report = PlantRunner::new(link, settings)?.run(&mut faulty, &stop);
-        let m = faulty.plant.meter();
-        let (p, v, t) = (m.position(), m.velocity(), m.effort());
+        let found: Vec<_> = METERS.into_iter().zip(faulty.plant.meter().records()).collect();
         if self.json {
+            let measured = || found.iter().filter_map(|(kind, w)| Some((*kind, (*w)?)));
+            let violations: BTreeMap<_, _> = measured().map(|(kind, w)| (kind, w.states)).collect();
+            let worst: BTreeMap<_, _> = measured().map(|(kind, w)| (kind, w.excess)).collect();
+            let not_measured: Vec<_> =
+                found.iter().filter(|(_, w)| w.is_none()).map(|(kind, _)| kind).collect();
             say(
-                serde_json::json!({ "report": report, "violations": { "position": p.states, "velocity": v.states, "torque": t.states },
-                "worst": { "position": p.excess, "velocity": v.excess, "torque": t.excess } }),
+                serde_json::json!({ "report": report, "violations": violations, "worst": worst, "not_measured": not_measured }),
             );
             return Ok(());
         }
@@ -80,8 +84,16 @@ impl PlantCommand {
             "{} ticks, {} late, {} braked, watchdog {}",
             report.ticks, report.late, report.braked, report.watchdog
         ));
-        for (what, unit, w) in [("position", "rad", p), ("velocity", "rad/s", v), ("torque", "N m", t)] {
-            say(format!("{what:<9} limit broken in {} ticks, by at most {:.3e} {unit}", w.states, w.excess));
+        for ((what, found), unit) in found.into_iter().zip(["rad", "rad/s", "rad/s^2", "N m"]) {
+            say(match found {
+                Some(w) => {
+                    format!(
+                        "{what:<12} limit broken in {} ticks, by at most {:.3e} {unit}",
+                        w.states, w.excess
+                    )
+                }
+                None => format!("{what:<12} not measured"),
+            });
         }
         Ok(())
     }

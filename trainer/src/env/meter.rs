@@ -9,6 +9,8 @@ pub struct Limits {
     pub upper_position: Vec<f64>,
     /// Largest speed of each degree of freedom (nv) \[rad/s or m/s\].
     pub velocity: Vec<f64>,
+    /// Largest acceleration of each degree of freedom (nv), as the difference of velocities a tick apart \[rad/s² or m/s²\].
+    pub acceleration: Vec<f64>,
     /// Largest force or torque on each degree of freedom (nv) \[N·m or N\].
     pub effort: Vec<f64>,
 }
@@ -18,8 +20,8 @@ pub struct Limits {
 pub enum LimitError {
     /// Vectors that do not go together.
     #[error(
-        "the limits have {lower} lower and {upper} upper positions, {velocity} velocities and {effort} efforts: \
-             positions must be equal in number, velocities and efforts too"
+        "the limits have {lower} lower and {upper} upper positions, {velocity} velocities, {acceleration} accelerations and {effort} efforts: \
+             positions must be equal in number, and all others too"
     )]
     Lengths {
         /// Lower positions given.
@@ -28,6 +30,8 @@ pub enum LimitError {
         upper: usize,
         /// Velocities given.
         velocity: usize,
+        /// Accelerations given.
+        acceleration: usize,
         /// Efforts given.
         effort: usize,
     },
@@ -52,6 +56,8 @@ pub struct Excess {
     pub position: f64,
     /// Largest excess of a speed \[rad/s or m/s\].
     pub velocity: f64,
+    /// Largest excess of an acceleration \[rad/s² or m/s²\].
+    pub acceleration: f64,
     /// Largest excess of a force \[N·m or N\].
     pub effort: f64,
 }
@@ -74,49 +80,72 @@ pub struct Worst {
 pub struct Meter {
     limits: Limits,
     tolerance: f64,
+    dt: f64,
+    /// Velocity (nv) of the state before.
+    before: Vec<f64>,
     states: u64,
     position: Worst,
     velocity: Worst,
-    effort: Worst,
+    acceleration: Worst,
+    effort: Option<Worst>,
 }
 
 impl Meter {
     /// A meter that counts a state as outside when some entry exceeds its limit by more than `tolerance` (in the limit's
-    /// unit; 0 is exact, 1e-9 forgives rounding).
+    /// unit; 0 is exact, 1e-9 forgives rounding). An acceleration is the difference of two velocities `dt` \[s\] apart, and may exceed its
+    /// limit by what that makes of the tolerance.
     ///
     /// # Errors
     /// [`LimitError`] for lengths that do not go together and ranges that are empty or NaN.
-    pub fn new(limits: Limits, tolerance: f64) -> Result<Meter, LimitError> {
+    pub fn new(limits: Limits, tolerance: f64, dt: f64) -> Result<Meter, LimitError> {
         let (lower, upper) = (limits.lower_position.len(), limits.upper_position.len());
         let (velocity, effort) = (limits.velocity.len(), limits.effort.len());
-        if lower != upper || velocity != effort {
-            return Err(LimitError::Lengths { lower, upper, velocity, effort });
+        let acceleration = limits.acceleration.len();
+        if lower != upper || velocity != effort || velocity != acceleration {
+            return Err(LimitError::Lengths { lower, upper, velocity, acceleration, effort });
         }
         let positions = limits.lower_position.iter().zip(&limits.upper_position).map(|(l, u)| (*l, *u));
         nonempty("position", positions)?;
         nonempty("velocity", limits.velocity.iter().map(|v| (-v, *v)))?;
+        nonempty("acceleration", limits.acceleration.iter().map(|a| (-a, *a)))?;
         nonempty("effort", limits.effort.iter().map(|e| (-e, *e)))?;
-        let [position, velocity, effort] = [Worst::default(); 3];
-        Ok(Meter { limits, tolerance, states: 0, position, velocity, effort })
+        let [position, velocity, acceleration] = [Worst::default(); 3];
+        let before = vec![0.0; limits.velocity.len()];
+        Ok(Meter { limits, tolerance, dt, before, states: 0, position, velocity, acceleration, effort: None })
     }
 
-    /// Measures one state: `q` (nq), `v` (nv) and the force that acted on each degree of freedom (nv).
+    /// Takes `v` (nv) as the velocity from which the next state's acceleration counts: an episode begins.
+    ///
+    /// # Panics
+    /// When it has another length than the limits.
+    pub fn begin(&mut self, v: &[f64]) {
+        self.before.copy_from_slice(v);
+    }
+
+    /// Measures one state: `q` (nq), `v` (nv) and, where it is known, the force that acted on each degree of freedom (nv).
     ///
     /// # Panics
     /// When a slice has another length than its limits.
-    pub fn observe(&mut self, q: &[f64], v: &[f64], force: &[f64]) -> Excess {
-        let Limits { lower_position, upper_position, velocity, effort } = &self.limits;
-        assert!(q.len() == lower_position.len() && v.len() == velocity.len() && force.len() == effort.len());
-        let at = self.states;
+    pub fn observe(&mut self, q: &[f64], v: &[f64], force: Option<&[f64]>) -> Excess {
+        let Limits { lower_position, upper_position, velocity, acceleration, effort } = &self.limits;
+        assert!(q.len() == lower_position.len() && v.len() == velocity.len());
+        let (at, tolerance) = (self.states, self.tolerance);
         self.states += 1;
         // The last term makes an infinite entry NaN where there is no limit either.
         let outside = |i: usize| (lower_position[i] - q[i]).max(q[i] - upper_position[i]) + 0.0 * q[i];
-        let position = self.position.note(at, self.tolerance, (0..q.len()).map(outside));
+        let position = self.position.note(at, tolerance, (0..q.len()).map(outside));
         let too_fast = v.iter().zip(velocity).map(|(v, limit)| v.abs() - limit);
-        let velocity = self.velocity.note(at, self.tolerance, too_fast);
-        let too_strong = force.iter().zip(effort).map(|(f, limit)| f.abs() - limit);
-        let effort = self.effort.note(at, self.tolerance, too_strong);
-        Excess { position, velocity, effort }
+        let velocity = self.velocity.note(at, tolerance, too_fast);
+        let change = v.iter().zip(&self.before).map(|(new, old)| ((new - old) / self.dt).abs());
+        let too_sudden = change.zip(acceleration).map(|(a, limit)| a - limit);
+        let acceleration = self.acceleration.note(at, 2.0 * tolerance / self.dt, too_sudden);
+        self.before.copy_from_slice(v);
+        let effort = force.map_or(0.0, |force| {
+            assert_eq!(force.len(), effort.len(), "one force for each degree of freedom");
+            let too_strong = force.iter().zip(effort).map(|(f, limit)| f.abs() - limit);
+            self.effort.get_or_insert_default().note(at, tolerance, too_strong)
+        });
+        Excess { position, velocity, acceleration, effort }
     }
 
     /// States measured.
@@ -134,9 +163,19 @@ impl Meter {
         self.velocity
     }
 
-    /// Record of the effort limits.
-    pub fn effort(&self) -> Worst {
+    /// Record of the acceleration limits.
+    pub fn acceleration(&self) -> Worst {
+        self.acceleration
+    }
+
+    /// Record of the effort limits; `None` where no force was ever given.
+    pub fn effort(&self) -> Option<Worst> {
         self.effort
+    }
+
+    /// All records in the order of [`METERS`](nearl_runtime::link::METERS); `None` for what was not measured.
+    pub fn records(&self) -> [Option<Worst>; 4] {
+        [Some(self.position), Some(self.velocity), Some(self.acceleration), self.effort]
     }
 }
 

@@ -20,6 +20,7 @@ unsafe extern "C-unwind" {
     pub(super) fn mj_copyData(to: *mut mjData, m: *const mjModel, from: *const mjData) -> *mut mjData;
     pub(super) fn mj_resetData(m: *const mjModel, d: *mut mjData);
     pub(super) fn mj_forward(m: *const mjModel, d: *mut mjData);
+    pub(super) fn mj_inverse(m: *const mjModel, d: *mut mjData);
     pub(super) fn mj_step(m: *const mjModel, d: *mut mjData);
     pub(super) fn mj_kinematics(m: *const mjModel, d: *mut mjData);
     pub(super) fn mj_rnePostConstraint(m: *const mjModel, d: *mut mjData);

@@ -25,6 +25,7 @@ use super::{MjError, Model, guard};
 pub struct Sim {
     model: Model,
     state: MjData<Arc<MjModel>>,
+    before: (Vec<f64>, Vec<f64>),
 }
 
 impl Sim {
@@ -35,7 +36,8 @@ impl Sim {
     pub fn new(model: &Model) -> Result<Sim, MjError> {
         let state = guard::counting_warnings(|| MjData::try_new(Arc::clone(&model.0)));
         let state = state.map_err(|e| MjError::Engine(e.to_string()))?;
-        let mut sim = Sim { model: model.clone(), state };
+        let before = (vec![0.0; model.nq()], vec![0.0; model.nv()]);
+        let mut sim = Sim { model: model.clone(), state, before };
         sim.reset()?;
         Ok(sim)
     }
@@ -97,8 +99,18 @@ impl Sim {
     /// # Errors
     /// [`MjError::Engine`]; the simulation is then back at its initial state.
     pub fn step(&mut self, sub_steps: usize) -> Result<(), MjError> {
+        let Some(all_but_one) = sub_steps.checked_sub(1) else { return Ok(()) };
+        if all_but_one > 0 {
+            self.steps(all_but_one)?;
+        }
+        self.before.0.copy_from_slice(self.state.qpos());
+        self.before.1.copy_from_slice(self.state.qvel());
+        self.steps(1)
+    }
+
+    fn steps(&mut self, count: usize) -> Result<(), MjError> {
         self.call(|m, d| {
-            for _ in 0..sub_steps {
+            for _ in 0..count {
                 // SAFETY: own model and state.
                 unsafe { guard::mj_step(m, d) }
             }
@@ -114,11 +126,17 @@ impl Sim {
     /// When the robots differ.
     pub fn copy_from(&mut self, other: &Sim) -> Result<(), MjError> {
         assert!(Arc::ptr_eq(&self.model.0, &other.model.0), "a copy of another robot's state");
+        self.before.clone_from(&other.before);
         let from: *const mjData = other.state.ffi();
         self.call(|m, d| {
             // SAFETY: both states belong to this model.
             unsafe { guard::mj_copyData(d, m, from) };
         })
+    }
+
+    /// Configuration (nq) and velocity (nv) in which the last physics step began.
+    pub fn before(&self) -> (&[f64], &[f64]) {
+        (&self.before.0, &self.before.1)
     }
 
     /// Evaluates accelerations and forces at the present state, for [`Sim::acceleration`] and its like.

@@ -7,7 +7,7 @@ use super::{Period, RolloutError, Rows};
 use crate::env::{Env, EnvError, Fault};
 use crate::foresight::{Foresight, Verdict};
 use crate::plant::watched_limits;
-use nearl_runtime::constraints::Guard;
+use nearl_runtime::constraints::{Guard, LimitSet};
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Excess, Networks, Noise, Output, PolicyKind, Snapshot, State};
 use rand_chacha::ChaCha8Rng;
@@ -37,6 +37,8 @@ pub struct Worker {
     pub(super) ticks: usize,
     /// Furthest that a position and a velocity came beyond its limit.
     pub(crate) excess: [Option<Excess>; 2],
+    /// Limits that an evaluation measures too, and how far these were left.
+    pub(crate) beyond: Option<(LimitSet, [Option<Excess>; 2])>,
     /// Policy steps left in the segment.
     left: usize,
     pub(super) history: Episode,
@@ -77,6 +79,7 @@ impl Worker {
             cost: 0.0,
             ticks: 0,
             excess: [None; 2],
+            beyond: None,
             left: 0,
             history: Episode::default(),
         };
@@ -224,7 +227,11 @@ impl Worker {
         let excess = self.controller.excess(&self.state);
         tally.reached_violations += u64::from(excess != [None; 2]);
         tally.residual += self.controller.residual(&self.state.obs, &self.out);
-        self.excess = [0, 1].map(|k| Excess::larger(self.excess[k], excess[k]));
+        let larger = |most: &[_; 2], new: [_; 2]| [0, 1].map(|k| Excess::larger(most[k], new[k]));
+        self.excess = larger(&self.excess, excess);
+        if let Some((limits, most)) = &mut self.beyond {
+            *most = larger(most, self.controller.excess_over(limits, &self.state));
+        }
         (step.reward, step.terminated)
     }
 }

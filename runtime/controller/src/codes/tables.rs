@@ -20,19 +20,22 @@ codes! {
             "Check the robot file's masses and the plant's velocities.";
         RefusedNonFiniteState = "refused-non-finite-state", "The measured state held NaN or infinity.",
             "Check the plant's sensors.";
+        NotProjected = "not-projected", "The policy gives actions and proposes no state: nothing was projected, and no limit was looked at.",
+            "Train with an algorithm that proposes states (`nearl train TASK --algo pid2-ib`) where limits matter.";
         RefusedWrongLength = "refused-wrong-length", "The state does not have the robot's number of entries.",
             "Start plant and runtime with the same robot file.";
     }
 }
 
 impl LedgerStatus {
-    /// The number in messages: 0 to 4, 10 and up braked, 20 and up refused.
+    /// The number in messages: 0 to 4 projected, 5 not, 10 and up braked, 20 and up refused.
     pub fn number(self) -> u32 {
         match self {
             LedgerStatus::BrakedNonFiniteProposal => 10,
             LedgerStatus::BrakedNoCertifiedAnswer => 11,
             LedgerStatus::BrakedNonFiniteDynamics => 12,
             LedgerStatus::BrakedNoVerifiedBrake => 13,
+            LedgerStatus::NotProjected => 5,
             LedgerStatus::RefusedNonFiniteState => 20,
             LedgerStatus::RefusedWrongLength => 21,
             plain => plain.code(),
