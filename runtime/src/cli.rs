@@ -9,7 +9,7 @@ use clap::{Args, Subcommand};
 use crate::codes::{self, Explanation};
 use crate::link::{RobotName, bench_round_trip};
 use crate::log::replay;
-use crate::rt::{FaultPlan, Percentiles, RunSettings, Stop, ThreadSettings, bench_wake, run};
+use crate::rt::{FaultPlan, PRIORITY, Percentiles, RunSettings, Stop, ThreadSettings, bench_wake, run};
 pub use limits::LimitOptions;
 
 /// Run a snapshot on a plant in real time.
@@ -33,10 +33,10 @@ pub struct RunCommand {
     #[arg(long, value_parser = seconds)]
     pub age_limit: Option<f64>,
     /// Time over which the first motion is let in [s]; 0 begins at once.
-    #[arg(long, default_value_t = 0.2)]
+    #[arg(long, default_value_t = RunSettings::default().ramp)]
     pub ramp: f64,
     /// A joint may move so many times further than its speed allows before its sample is rejected; 0 checks nothing.
-    #[arg(long, default_value_t = 3.0)]
+    #[arg(long, default_value_t = RunSettings::default().jump)]
     pub jump: f64,
     /// Explore: act with the policy's own noise, drawn from this seed, for a trainer that learns from the loop. Every limit still holds.
     #[arg(long, value_name = "SEED")]
@@ -45,7 +45,7 @@ pub struct RunCommand {
     #[arg(long)]
     pub faults: Option<PathBuf>,
     /// SCHED_FIFO priority; 0 keeps the normal scheduler.
-    #[arg(long, default_value_t = 40)]
+    #[arg(long, default_value_t = PRIORITY)]
     pub priority: i32,
     /// Core to stay on.
     #[arg(long)]
@@ -102,7 +102,7 @@ pub enum LoopBench {
         #[arg(long, default_value_t = 5.0)]
         seconds: f64,
         /// SCHED_FIFO priority; 0 keeps the normal scheduler.
-        #[arg(long, default_value_t = 40)]
+        #[arg(long, default_value_t = PRIORITY)]
         priority: i32,
         /// Core to stay on.
         #[arg(long)]

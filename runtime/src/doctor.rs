@@ -12,7 +12,7 @@ use crate::cli::{Failure, say};
 use crate::codes::CheckCode;
 use crate::controller::{Controller, Parts};
 use crate::link::{RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, remains};
-use crate::rt::{Pilot, Stop, ThreadSettings, bench_wake, prepare};
+use crate::rt::{PRIORITY, Pilot, Stop, ThreadSettings, bench_wake, prepare};
 use crate::snapshot::{Manifest, Snapshot, in_run};
 
 /// Check that a snapshot, this machine and a plant are ready.
@@ -57,8 +57,6 @@ pub struct Check {
 
 /// States looked at for the braking certificate, and their seed.
 const SAMPLES: (usize, u64) = (5000, 1);
-/// Priority `nearl run` asks for.
-const PRIORITY: i32 = 40;
 /// Longest wait for the plant's announcement.
 const PATIENCE: Duration = Duration::from_secs(3);
 

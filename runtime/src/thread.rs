@@ -3,6 +3,9 @@
 
 use std::num::NonZeroU64;
 
+/// SCHED_FIFO priority of the loop where nothing else is asked for: above ordinary real-time work, below the kernel's own threads at 50.
+pub const PRIORITY: i32 = 40;
+
 /// Wishes for one thread and its process.
 #[derive(Clone, Copy, Debug)]
 pub struct ThreadSettings {
@@ -12,6 +15,13 @@ pub struct ThreadSettings {
     pub cpu: Option<usize>,
     /// Lock all memory of the process.
     pub lock_memory: bool,
+}
+
+impl Default for ThreadSettings {
+    /// [`PRIORITY`] on any core, memory locked.
+    fn default() -> Self {
+        ThreadSettings { priority: Some(PRIORITY), cpu: None, lock_memory: true }
+    }
 }
 
 /// What a thread cost the system.

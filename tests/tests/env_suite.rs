@@ -372,7 +372,10 @@ fn the_inverse_finds_the_force_in_the_motion() {
             inverse.force(env.sim(), &mut force).expect("an inverse");
             for (i, (a, b)) in force.iter().zip(&told).enumerate() {
                 let name = &env.spec().name;
-                assert!((a - b).abs() < 1e-6 * (1.0 + b.abs()), "{name}, tick {k}, dof {i}: {a} instead of {b}");
+                assert!(
+                    (a - b).abs() < 1e-6 * (1.0 + b.abs()),
+                    "{name}, tick {k}, dof {i}: {a} instead of {b}"
+                );
             }
         }
         found += 1;
@@ -397,9 +400,15 @@ fn the_meter_takes_nothing_unbelievable_for_inside() {
 #[test]
 fn limits_that_make_no_sense_are_refused() {
     let crossed = Limits { lower_position: vec![3.0, 0.0], ..limits() };
-    assert!(matches!(Meter::new(crossed, 0.0, 0.1), Err(LimitError::Empty { what: "position", index: 0, .. })));
+    assert!(matches!(
+        Meter::new(crossed, 0.0, 0.1),
+        Err(LimitError::Empty { what: "position", index: 0, .. })
+    ));
     let negative = Limits { velocity: vec![3.0, -1.0], ..limits() };
-    assert!(matches!(Meter::new(negative, 0.0, 0.1), Err(LimitError::Empty { what: "velocity", index: 1, .. })));
+    assert!(matches!(
+        Meter::new(negative, 0.0, 0.1),
+        Err(LimitError::Empty { what: "velocity", index: 1, .. })
+    ));
     let short = Limits { effort: vec![1.0], ..limits() };
     assert!(matches!(Meter::new(short, 0.0, 0.1), Err(LimitError::Lengths { effort: 1, .. })));
 }

@@ -320,6 +320,17 @@ pub fn is_known(task: &Task) -> bool {
     user::is_own(task) || task.env.is_some() || entry(&task.name).is_ok()
 }
 
+/// Control period and physics step [s] of the native environment that a task names, the step 0 where it is none that the projector can
+/// count on; `None` for a task of one's own and for one without an environment.
+pub fn own_time(task: &Task) -> Option<(f64, f64)> {
+    if user::is_own(task) {
+        return None;
+    }
+    let env = (entry(task.env.as_deref().unwrap_or(&task.name)).ok()?.build)().ok()?;
+    let spec = env.spec();
+    Some((spec.dt, if spec.semi_implicit_euler { spec.sim_dt } else { 0.0 }))
+}
+
 /// The constraints reckon with the task's periods: what is simulated must have them.
 fn check_time(task: &Task, spec: &Spec, origin: &str) -> Result<(), EnvError> {
     let time = &task.time;

@@ -1,9 +1,7 @@
 //! Episodes without noise, raw and projected, and what they were worth.
 
 use crate::rollout::{RolloutError, Worker, make_env, stream};
-use nearl_runtime::constraints::{
-    ConstraintSettings, LimitSet, Model, PerJoint, build_limits,
-};
+use nearl_runtime::constraints::{ConstraintSettings, LimitSet, Model, PerJoint, build_limits};
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use serde::Serialize;
 
@@ -135,7 +133,8 @@ fn without_margins(m: &Manifest, model: &Model, controllable: &[usize]) -> Resul
     position.iter_mut().for_each(|p| p.margin = PerJoint::All(0.0));
     velocity.iter_mut().for_each(|v| (v.scale, v.margin) = (v.scale.map(|_| 1.0), None));
     let settings = ConstraintSettings { position, velocity, ..ConstraintSettings::default() };
-    let unusable = |e: nearl_runtime::constraints::LimitError| SnapshotError::Unusable { reason: e.to_string() };
+    let unusable =
+        |e: nearl_runtime::constraints::LimitError| SnapshotError::Unusable { reason: e.to_string() };
     let limits = build_limits(&settings, model).map_err(unusable)?;
     LimitSet::collect(model, &limits, controllable).map_err(unusable)
 }

@@ -94,9 +94,9 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
         return Err(TaskLoadError::NoTask { file: task.into() });
     }
     let parsed = match bundled {
-        Some((name, text)) => Task::parse(name, text, overrides)?,
+        Some((name, text)) => Task::parse_with(name, text, overrides, &env::own_time)?,
         None if path.extension().is_some_and(|e| e == "toml") || path.exists() => {
-            Task::read(path, overrides)?
+            Task::read_with(path, overrides, &env::own_time)?
         }
         None => return Err(unknown(task)),
     };

@@ -20,6 +20,7 @@ pub struct Task {
     /// The robot file.
     pub model: ModelSection,
     /// Periods.
+    #[serde(default)]
     pub time: TimeSection,
     /// Observation, proposal and controllable subset.
     #[serde(default)]
@@ -76,17 +77,44 @@ impl ModelSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct TimeSection {
-    /// Control period in [s].
+    /// Control period in [s]; of a native environment its own when absent.
+    #[serde(default = "unstated", deserialize_with = "stated")]
     pub dt: f64,
     /// The policy proposes every k-th control tick; its proposal is for the end of those k ticks.
     #[serde(default = "one")]
     pub policy_every: usize,
-    /// Physics step of the plant in [s]; 0 for a zero-order-hold plant (a robot, or RK4).
+    /// Physics step of the plant in [s]; 0 for a zero-order-hold plant (a robot, or RK4). Of a native environment its own when absent.
+    #[serde(default = "unstated", deserialize_with = "stated")]
     pub sim_dt: f64,
     /// Control ticks after which an episode of the user's own environment is cut.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_episode_steps: Option<usize>,
 }
+
+impl Default for TimeSection {
+    /// Nothing but the policy's period is stated.
+    fn default() -> Self {
+        TimeSection { dt: unstated(), policy_every: one(), sim_dt: unstated(), max_episode_steps: None }
+    }
+}
+
+/// A period that the file leaves to its environment.
+fn unstated() -> f64 {
+    f64::NAN
+}
+
+/// A period that the file states; one that is not a number would pass for one that it does not.
+fn stated<'de, D: serde::Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    let seconds = f64::deserialize(from)?;
+    match seconds.is_nan() {
+        true => Err(serde::de::Error::custom("NaN s is no period; give seconds")),
+        false => Ok(seconds),
+    }
+}
+
+/// Control period and physics step [s] of the environment that a task names, for those that its file does not state; `None` where the file
+/// has to state them.
+pub type OwnTime<'a> = &'a dyn Fn(&Task) -> Option<(f64, f64)>;
 
 /// `[state]`: entries by name, see [`nearl_constraints::StateLayout`].
 #[derive(Clone, Debug, Default, Deserialize, Serialize)]
@@ -175,10 +203,18 @@ impl Task {
     /// # Errors
     /// [`TaskError`] naming file, line and key.
     pub fn read(path: &Path, overrides: &[String]) -> Result<Self, TaskError> {
+        Self::read_with(path, overrides, &|_| None)
+    }
+
+    /// The same where the environments are known, whose periods need not be stated.
+    ///
+    /// # Errors
+    /// As [`Task::read`].
+    pub fn read_with(path: &Path, overrides: &[String], own: OwnTime<'_>) -> Result<Self, TaskError> {
         let file = path.display().to_string();
         let text = std::fs::read_to_string(path)
             .map_err(|e| TaskError::Unreadable { file: file.clone(), reason: e.to_string() })?;
-        Self::parse(&file, &text, overrides)
+        Self::parse_with(&file, &text, overrides, own)
     }
 
     /// The same from text; `file` is the name used in messages.
@@ -186,6 +222,19 @@ impl Task {
     /// # Errors
     /// As [`Task::read`].
     pub fn parse(file: &str, text: &str, overrides: &[String]) -> Result<Self, TaskError> {
+        Self::parse_with(file, text, overrides, &|_| None)
+    }
+
+    /// The same where the environments are known, whose periods need not be stated.
+    ///
+    /// # Errors
+    /// As [`Task::read`].
+    pub fn parse_with(
+        file: &str,
+        text: &str,
+        overrides: &[String],
+        own: OwnTime<'_>,
+    ) -> Result<Self, TaskError> {
         let at = |place, reason| TaskError::Invalid { file: file.into(), place, reason };
         let mut table: toml::Table =
             toml::from_str(text).map_err(|e| at(line_of(text, e.span()), first_line(e.message())))?;
@@ -193,22 +242,35 @@ impl Task {
             // read from the text, not from the table, so that the message can name the line
             let de = toml::Deserializer::parse(text)
                 .map_err(|e| at(line_of(text, e.span()), first_line(e.message())))?;
-            let task: Task = serde_path_to_error::deserialize(de).map_err(|e| {
+            let mut task: Task = serde_path_to_error::deserialize(de).map_err(|e| {
                 let (key, inner) = (e.path().to_string(), e.into_inner());
                 at(format!("{}{}", line_of(text, inner.span()), bracket(&key)), suggest(inner.message()))
             })?;
+            task.state_time(own);
             task.check(file)?;
             return Ok(task);
         }
         for set in overrides {
             apply(&mut table, set)?;
         }
-        let task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
+        let mut task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
             let key = e.path().to_string();
             at(bracket(&key), suggest(e.into_inner().message()))
         })?;
+        task.state_time(own);
         task.check(file)?;
         Ok(task)
+    }
+
+    /// Takes what the file leaves out from the environment.
+    fn state_time(&mut self, own: OwnTime<'_>) {
+        if (self.time.dt.is_nan() || self.time.sim_dt.is_nan())
+            && let Some((dt, sim_dt)) = own(self)
+        {
+            let time = &mut self.time;
+            time.dt = if time.dt.is_nan() { dt } else { time.dt };
+            time.sim_dt = if time.sim_dt.is_nan() { sim_dt } else { time.sim_dt };
+        }
     }
 
     /// The effective file as TOML, for the run folder.
@@ -239,6 +301,14 @@ impl Task {
             );
         }
         let t = &self.time;
+        for (key, value, what) in
+            [("time.dt", t.dt, "the control period"), ("time.sim_dt", t.sim_dt, "the physics step, or 0")]
+        {
+            if value.is_nan() {
+                let whose = "only a task of a native environment may leave it out";
+                return refuse(key, format!("{what} is not stated, and {whose}; give seconds"));
+            }
+        }
         if !(t.dt.is_finite() && t.dt > 0.0) {
             return refuse(
                 "time.dt",

@@ -29,7 +29,7 @@ pub use crate::clock;
 pub use crate::grid::Grid;
 pub use crate::percentiles::Percentiles;
 pub use crate::stop::Stop;
-pub use crate::thread::{CountAllocations, ThreadSettings, Usage, prepare};
+pub use crate::thread::{CountAllocations, PRIORITY, ThreadSettings, Usage, prepare};
 pub use bench::bench_wake;
 pub use brake::Brake;
 pub use core::{Core, CoreSettings, Inputs, Loaded};

@@ -86,21 +86,29 @@ pub enum Event {
 
 /// When to change the mode [ticks].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "cli", derive(clap::Args))]
 #[serde(deny_unknown_fields)]
 pub struct ModeLimits {
     /// Good ticks in a row before Degraded or Braking ends.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "TICKS", default_value_t = ModeLimits::default().recover_after))]
     pub recover_after: u32,
     /// Missing or unusable states in a row that are bridged by prediction.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "TICKS", default_value_t = ModeLimits::default().hold_states))]
     pub hold_states: u32,
-    /// Unusable states in a row before the fault is latched; more than `hold_states`.
+    /// Unusable states in a row before Fault is latched; more than those of `hold_states`.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "TICKS", default_value_t = ModeLimits::default().bad_states))]
     pub bad_states: u32,
     /// Ticks in a row in which the projector braked before the loop brakes.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "TICKS", default_value_t = ModeLimits::default().braked_ticks))]
     pub braked_ticks: u32,
     /// Overruns in a row before Degraded.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "TICKS", default_value_t = ModeLimits::default().degrade_overruns))]
     pub degrade_overruns: u32,
-    /// Overruns in a row before Braking.
+    /// Overruns in a row before Braking; at least those of Degraded.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "TICKS", default_value_t = ModeLimits::default().overruns))]
     pub overruns: u32,
-    /// Overruns in a row before the fault is latched; `None`: a hundred, and no fewer than fit a tenth of a second.
+    /// Overruns in a row before Fault is latched, more than those of Braking; if not given a hundred, and no fewer than fit a tenth of a second.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "TICKS"))]
     pub starved: Option<u32>,
 }
 

@@ -8,13 +8,17 @@ use crate::rt::Record;
 
 /// When a swapped-in snapshot is taken back.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "cli", derive(clap::Args))]
 #[serde(deny_unknown_fields)]
 pub struct RollbackSettings {
-    /// Ticks over which the residual is averaged before and after a swap; 0 never goes back.
+    /// Ticks over which the distance of reached and target velocity is averaged before and after a swap; 0 never goes back.
+    #[cfg_attr(feature = "cli", arg(long = "rollback-window", value_name = "TICKS", default_value_t = RollbackSettings::default().window))]
     pub window: usize,
-    /// The mean after the swap may be so many times the mean before.
+    /// The mean after a swap may be so many times the mean before.
+    #[cfg_attr(feature = "cli", arg(long = "rollback-factor", value_name = "FACTOR", default_value_t = RollbackSettings::default().factor))]
     pub factor: f64,
-    /// Means below this are never a reason [rad/s or m/s].
+    /// Means below this are no reason to go back [rad/s or m/s].
+    #[cfg_attr(feature = "cli", arg(long = "rollback-floor", value_name = "SPEED", default_value_t = RollbackSettings::default().floor))]
     pub floor: f64,
 }
 

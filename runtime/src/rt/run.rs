@@ -98,7 +98,7 @@ impl Default for RunSettings {
             explore: None,
             rollback: RollbackSettings::default(),
             faults: FaultPlan::default(),
-            thread: ThreadSettings { priority: Some(40), cpu: None, lock_memory: true },
+            thread: ThreadSettings::default(),
             strict: false,
             allocations: None,
             log: None,

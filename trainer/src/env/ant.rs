@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::rules::{Robot, Rules, add_normal, add_uniform, squared};
 use super::simulated::Simulated;
-use super::spec::{Constants, Spec};
+use super::spec::{Constants, EPISODE, Spec};
 use super::{Env, EnvError};
 use crate::mj::{MjError, Model, ModelFormat, Options, Sim};
 
@@ -30,7 +30,7 @@ struct Ant;
 pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
     let physics = |source| EnvError::Physics { task: NAME.into(), source };
     let model = Model::from_text(&ROBOT.text, ROBOT.format, Options::default()).map_err(physics)?;
-    let task = Constants { name: NAME.into(), sub_steps: 5, max_episode_steps: 1000 };
+    let task = Constants { name: NAME.into(), sub_steps: 5, max_episode_steps: EPISODE };
     let spec = Spec::new(&model, task, names(&model), model.actuators());
     Ok(Simulated::boxed(spec, ROBOT, Ant, Sim::new(&model).map_err(physics)?))
 }

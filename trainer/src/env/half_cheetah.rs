@@ -5,7 +5,7 @@
 use rand_chacha::ChaCha8Rng;
 
 use super::rules::{Rules, add_normal, add_uniform, squared};
-use super::spec::{Constants, Spec};
+use super::spec::{Constants, EPISODE, Spec};
 use super::{Env, EnvError, planar};
 use crate::mj::{MjError, Sim};
 
@@ -19,7 +19,11 @@ const CONTROL_COST: f64 = 0.1;
 struct HalfCheetah;
 
 pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
-    planar::build(Constants { name: NAME.into(), sub_steps: 5, max_episode_steps: 1000 }, ROBOT, HalfCheetah)
+    planar::build(
+        Constants { name: NAME.into(), sub_steps: 5, max_episode_steps: EPISODE },
+        ROBOT,
+        HalfCheetah,
+    )
 }
 
 impl Rules for HalfCheetah {

@@ -6,7 +6,7 @@
 use rand_chacha::ChaCha8Rng;
 
 use super::rules::{Rules, add_uniform, squared};
-use super::spec::{Constants, Spec};
+use super::spec::{Constants, EPISODE, Spec};
 use super::{Env, EnvError, planar};
 use crate::mj::{MjError, Sim};
 
@@ -21,7 +21,7 @@ const OBSERVED_SPEED: f64 = 10.0;
 struct Hopper;
 
 pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
-    planar::build(Constants { name: NAME.into(), sub_steps: 4, max_episode_steps: 1000 }, ROBOT, Hopper)
+    planar::build(Constants { name: NAME.into(), sub_steps: 4, max_episode_steps: EPISODE }, ROBOT, Hopper)
 }
 
 fn healthy(sim: &Sim) -> bool {

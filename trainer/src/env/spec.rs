@@ -70,6 +70,9 @@ impl Spec {
     }
 }
 
+/// Control periods in an episode of Gymnasium's tasks, and of every other unless its file says otherwise.
+pub(super) const EPISODE: usize = 1000;
+
 /// The part of a [`Spec`] that is not in the robot file.
 #[derive(Debug, Clone)]
 pub(super) struct Constants {

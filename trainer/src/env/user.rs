@@ -22,7 +22,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use super::rules::{Robot, Rules, joint_names};
 use super::simulated::Simulated;
-use super::spec::{Constants, Spec};
+use super::spec::{Constants, EPISODE, Spec};
 use super::{Env, EnvError};
 use crate::mj::{Actuator, JointKind, MjError, Model, ModelFormat, Sim};
 use crate::robot;
@@ -30,9 +30,6 @@ use costed::Costed;
 use expression::Expression;
 use quantity::{Before, Names, Outcome, Place, Quantity, read_state};
 use settings::{Entry, Mistake, mistake, starts, terms};
-
-/// Control periods in an episode unless the task file says otherwise.
-const EPISODE: usize = 1000;
 
 /// The rules of a task file.
 #[derive(Clone)]
