@@ -8,6 +8,7 @@ use nearl_trainer::robot::RobotError;
 use nearl_trainer::run_folder::RunError;
 use nearl_trainer::tasks::TaskLoadError;
 use nearl_trainer::train::TrainError;
+use nearl_trainer::vector::VectorError;
 use pyo3::PyErr;
 use pyo3::exceptions::{PyOSError, PyValueError};
 
@@ -50,6 +51,15 @@ pub(crate) fn train(error: TrainError) -> PyErr {
             PyOSError::new_err(error.to_string())
         }
         TrainError::Snapshot(e) => snapshot(e),
+        other => value(other),
+    }
+}
+
+/// A vector of environments.
+pub(crate) fn vector(error: VectorError) -> PyErr {
+    match error {
+        VectorError::Task(e) => task(e),
+        VectorError::Snapshot(e) => snapshot(e),
         other => value(other),
     }
 }

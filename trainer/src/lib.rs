@@ -21,5 +21,6 @@ pub mod stats;
 pub mod sweep;
 pub mod tasks;
 pub mod train;
+pub mod vector;
 
 pub use nearl_rollout_protocol as rollout_protocol;

@@ -1,12 +1,19 @@
 //! One environment of a vector, with its buffers, its random stream and its time limit.
 
-use nearl_runtime::{Controller, Noise, Output, State};
-use nearl_trainer::env::{ChaCha8Rng, Env, EnvError, Fault, SeedableRng};
-use nearl_trainer::foresight::{Foresight, Verdict};
+use crate::foresight::{Foresight, Verdict};
+use crate::env::{ChaCha8Rng, Env, EnvError, Fault, SeedableRng, Step};
+use crate::plant::watched_limits;
+use crate::rollout::Tally;
+use crate::train::limit_scale;
+use super::VectorError;
+use nearl_runtime::constraints::Guard;
+use nearl_runtime::controller::Parts;
+use nearl_runtime::task::IdmKind;
+use nearl_runtime::{Controller, Noise, Output, Snapshot, State};
 
 /// When an episode that ended is begun anew (<https://farama.org/Vector-Autoreset-Mode>).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Autoreset {
+pub enum Autoreset {
     /// In the next step, whose action is ignored.
     NextStep,
     /// In the same step; the last observation of the old episode is kept aside.
@@ -15,7 +22,7 @@ pub(crate) enum Autoreset {
 
 /// What a round does in every lane.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Work {
+pub(super) enum Round {
     /// Begins an episode.
     Reset,
     /// One action.
@@ -24,10 +31,10 @@ pub(crate) enum Work {
 
 /// What an action of a constrained environment is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Meaning {
+pub enum Meaning {
     /// The next state, entry by entry.
     State,
-    /// The change of the state, in units of [`Proposing::unit`].
+    /// The change of the state, in units of what the limits allow in a step, or three standard deviations of a trained agent's changes.
     Change,
     /// What the actuators get, where the guard allows it.
     Action,
@@ -37,52 +44,51 @@ pub(crate) enum Meaning {
 ///
 /// Its own policy is all zeros with unit deviation, so that the noise it is given is what it puts out: the change that is
 /// proposed, `proposal_k = s_k + scale_k noise_k`, or the action. Either takes the way that a policy's takes.
-pub(crate) struct Proposing {
-    pub(crate) meaning: Meaning,
+pub(super) struct Proposing {
+    meaning: Meaning,
     /// Change of an entry that an action of 1 asks for (n_state).
-    pub(crate) unit: Vec<f64>,
+    unit: Vec<f64>,
     /// Asks the simulator where the action leads, instead of the robot model.
-    pub(crate) foresight: Option<Foresight>,
-    pub(crate) controller: Controller,
-    pub(crate) scale: Vec<f64>,
-    pub(crate) state: State,
-    pub(crate) noise: Noise,
-    pub(crate) out: Output,
+    foresight: Option<Foresight>,
+    controller: Controller,
+    scale: Vec<f64>,
+    state: State,
+    noise: Noise,
+    out: Output,
 }
 
-/// What the projection did in a step, over its control ticks.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Projected {
-    /// Ticks whose raw proposal broke a limit.
-    pub(crate) raw_violations: u32,
-    /// Ticks whose target broke a limit, by the independent check.
-    pub(crate) target_violations: u32,
-    /// Weighted distance between proposal and target, the largest.
-    pub(crate) moved: f64,
-}
-
-/// One environment of a vector.
-pub(crate) struct Lane {
-    pub(crate) env: Box<dyn Env>,
-    pub(crate) proposing: Option<Proposing>,
-    pub(crate) rng: ChaCha8Rng,
-    pub(crate) max_steps: usize,
-    pub(crate) action: Vec<f64>,
-    pub(crate) obs: Vec<f64>,
-    pub(crate) final_obs: Option<Vec<f64>>,
-    pub(crate) reward: f64,
-    pub(crate) cost: f64,
-    pub(crate) terminated: bool,
-    pub(crate) truncated: bool,
-    pub(crate) fault: Fault,
-    pub(crate) projected: Projected,
-    pub(crate) error: Option<EnvError>,
+/// One environment of a vector, as its last step left it.
+pub struct Lane {
+    pub(super) env: Box<dyn Env>,
+    pub(super) proposing: Option<Proposing>,
+    pub(super) rng: ChaCha8Rng,
+    max_steps: usize,
+    pub(super) action: Vec<f64>,
+    pub(super) error: Option<EnvError>,
     ticks: usize,
     ended: bool,
+    /// Observation (n_obs); of the new episode where one has begun.
+    pub obs: Vec<f64>,
+    /// Last observation of an episode that ended in the step, if a new one has begun in it.
+    pub final_obs: Option<Vec<f64>>,
+    /// Reward of the step.
+    pub reward: f64,
+    /// Cost of the step; 0 where the task has none.
+    pub cost: f64,
+    /// The task ended the episode.
+    pub terminated: bool,
+    /// The time limit cut it.
+    pub truncated: bool,
+    /// Why the step is not to be believed.
+    pub fault: Fault,
+    /// What projection or guard did over the control ticks of the step, as every rollout counts it; nothing where there is neither.
+    pub tally: Tally,
+    /// Largest distance between proposal and target in one of these ticks.
+    pub moved: f64,
 }
 
 impl Lane {
-    pub(crate) fn new(
+    pub(super) fn new(
         env: Box<dyn Env>,
         proposing: Option<Proposing>,
         n_action: usize,
@@ -103,23 +109,45 @@ impl Lane {
             terminated: false,
             truncated: false,
             fault: Fault::None,
-            projected: Projected::default(),
+            tally: Tally::default(),
+            moved: 0.0,
             error: None,
             ticks: 0,
             ended: false,
         }
     }
 
-    pub(crate) fn run(&mut self, work: Work) {
+    /// Configuration (nq), MuJoCo's convention.
+    pub fn qpos(&self) -> &[f64] {
+        self.env.qpos()
+    }
+
+    /// Velocity (nv), MuJoCo's convention.
+    pub fn qvel(&self) -> &[f64] {
+        self.env.qvel()
+    }
+
+    /// Whether the task counts a cost beside its reward.
+    pub fn has_cost(&self) -> bool {
+        self.env.spec().has_cost
+    }
+
+    /// Whether actions are proposals.
+    pub fn is_projected(&self) -> bool {
+        self.proposing.is_some()
+    }
+
+    /// Does what the round says.
+    pub(super) fn run(&mut self, round: Round) {
         (self.reward, self.cost, self.final_obs) = (0.0, 0.0, None);
         (self.terminated, self.truncated) = (false, false);
-        (self.fault, self.projected) = (Fault::None, Projected::default());
-        match work {
-            Work::Step(_) if !self.ended => self.step(),
+        (self.fault, self.tally, self.moved) = (Fault::None, Tally::default(), 0.0);
+        match round {
+            Round::Step(_) if !self.ended => self.step(),
             _ => self.reset(),
         }
         self.ended = self.terminated || self.truncated;
-        if let (Work::Step(Autoreset::SameStep), true) = (work, self.ended) {
+        if let (Round::Step(Autoreset::SameStep), true) = (round, self.ended) {
             self.final_obs = Some(self.obs.clone());
             self.reset();
             self.ended = false;
@@ -127,7 +155,7 @@ impl Lane {
     }
 
     /// Ends the episode here, as if the task had.
-    pub(crate) fn end(&mut self, autoreset: Autoreset) {
+    pub(super) fn end(&mut self, autoreset: Autoreset) {
         match autoreset {
             Autoreset::NextStep => self.ended = true,
             Autoreset::SameStep => self.reset(),
@@ -135,7 +163,7 @@ impl Lane {
     }
 
     /// An episode that begins in `qpos` and `qvel`, MuJoCo's convention.
-    pub(crate) fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError> {
+    pub(super) fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError> {
         self.env.set_state(qpos, qvel)?;
         self.begin();
         Ok(())
@@ -165,7 +193,7 @@ impl Lane {
             Some(p) => {
                 p.want(&self.action, &*self.env);
                 while self.ticks < self.max_steps && !self.terminated {
-                    let step = p.tick(&mut *self.env, &mut self.projected);
+                    let step = p.tick(&mut *self.env, &mut self.tally, &mut self.moved);
                     (self.reward, self.cost) = (self.reward + step.reward, self.cost + step.cost);
                     (self.terminated, self.fault) = (step.terminated, step.fault);
                     self.ticks += 1;
@@ -181,6 +209,18 @@ impl Lane {
 }
 
 impl Proposing {
+    /// `snapshot` holds a policy of zeros and unit deviation.
+    pub(super) fn new(snapshot: &Snapshot, env: &dyn Env, meaning: Meaning) -> Result<Proposing, VectorError> {
+        let controller = Controller::new(snapshot)?;
+        let (state, noise, out) = (controller.state(), controller.noise(), controller.output());
+        let scale = controller.normaliser().scale.clone();
+        let unit = if meaning == Meaning::Change { units(snapshot, &controller)? } else { Vec::new() };
+        let asks = meaning == Meaning::Action && snapshot.manifest.task.constraints.guard == Guard::Simulator;
+        let limits = || watched_limits(env, controller.model(), controller.limits());
+        let foresight = asks.then(|| Foresight::new(env, &limits()));
+        Ok(Proposing { meaning, unit, foresight, scale, controller, state, noise, out })
+    }
+
     /// Noise that makes the controller propose, or do, what `action` means.
     fn want(&mut self, action: &[f64], env: &dyn Env) {
         env.observe(&mut self.state.obs);
@@ -203,20 +243,29 @@ impl Proposing {
         }
     }
 
-    fn tick(&mut self, env: &mut dyn Env, projected: &mut Projected) -> nearl_trainer::env::Step {
+    /// One control period, with what the projection or the guard did in it.
+    fn tick(&mut self, env: &mut dyn Env, tally: &mut Tally, moved: &mut f64) -> Step {
         if let Some(foresight) = &mut self.foresight {
             let verdict = foresight.update(env, &mut self.out.action);
-            projected.raw_violations += u32::from(verdict != Verdict::Kept);
-            projected.target_violations += u32::from(verdict == Verdict::Outside);
+            tally.ticks += 1;
+            tally.raw_violations += u64::from(verdict != Verdict::Kept);
+            tally.projected_violations += u64::from(verdict == Verdict::Outside);
             return env.step(&self.out.action);
         }
         env.observe(&mut self.state.obs);
         env.state(&mut self.state.q, &mut self.state.v);
         self.controller.update(&self.state, &self.noise, &mut self.out);
         let ledger = &self.out.next.ledger;
-        projected.raw_violations += u32::from(ledger.raw_violations.total() > 0);
-        projected.target_violations += u32::from(ledger.violations.total() > 0);
-        projected.moved = projected.moved.max(ledger.moved);
+        tally.count(ledger);
+        *moved = moved.max(ledger.moved);
         env.step(&self.out.action)
     }
+}
+
+/// The change that an action of 1 asks for.
+fn units(snapshot: &Snapshot, controller: &Controller) -> Result<Vec<f64>, VectorError> {
+    if snapshot.manifest.task.idm.kind == IdmKind::Learned {
+        return Ok(controller.normaliser().scale.iter().map(|s| 3.0 * s).collect());
+    }
+    Ok(limit_scale(&Parts::new(&snapshot.manifest)?, &snapshot.manifest)?)
 }

@@ -5,46 +5,46 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use crate::lane::{Lane, Work};
+use super::lane::{Lane, Round};
 
-/// One piece of work for all lanes; threads take the next lane until none is left.
-struct Round {
+/// A round for all lanes; threads take the next lane until none is left.
+struct Shared {
     lanes: Arc<Vec<Mutex<Lane>>>,
     next: AtomicUsize,
-    work: Work,
+    round: Round,
 }
 
-impl Round {
+impl Shared {
     fn run(&self) {
         while let Some(lane) = self.lanes.get(self.next.fetch_add(1, Ordering::Relaxed)) {
-            lane.lock().unwrap_or_else(PoisonError::into_inner).run(self.work);
+            lane.lock().unwrap_or_else(PoisonError::into_inner).run(self.round);
         }
     }
 }
 
-/// The threads, one fewer than work: the caller is one too.
-pub(crate) struct Pool {
+/// The lanes and the threads that run them, one fewer than there are: the caller is one too.
+pub(super) struct Pool {
     lanes: Arc<Vec<Mutex<Lane>>>,
-    rounds: Vec<Sender<Arc<Round>>>,
+    rounds: Vec<Sender<Arc<Shared>>>,
     done: Receiver<bool>,
     threads: Vec<JoinHandle<()>>,
     process: u32,
 }
 
 impl Pool {
-    pub(crate) fn new(lanes: Vec<Lane>, threads: usize) -> std::io::Result<Pool> {
+    pub(super) fn new(lanes: Vec<Lane>, threads: usize) -> std::io::Result<Pool> {
         let lanes = Arc::new(lanes.into_iter().map(Mutex::new).collect::<Vec<_>>());
         let (finished, done) = channel();
         let mut pool =
             Pool { rounds: Vec::new(), done, threads: Vec::new(), process: std::process::id(), lanes };
         for i in 1..threads.clamp(1, pool.lanes.len().max(1)) {
-            let (send, rounds) = channel::<Arc<Round>>();
+            let (send, rounds) = channel::<Arc<Shared>>();
             let finished = finished.clone();
             pool.rounds.push(send);
             pool.threads.push(std::thread::Builder::new().name(format!("nearl-vec-{i}")).spawn(
                 move || {
-                    for round in rounds {
-                        let run = std::panic::AssertUnwindSafe(|| round.run());
+                    for shared in rounds {
+                        let run = std::panic::AssertUnwindSafe(|| shared.run());
                         let _ = finished.send(std::panic::catch_unwind(run).is_ok());
                     }
                 },
@@ -53,22 +53,22 @@ impl Pool {
         Ok(pool)
     }
 
-    /// Does `work` in every lane.
+    /// Runs a round in every lane.
     ///
     /// # Errors
     /// A sentence when the process was forked since the threads were made, or a thread panicked.
-    pub(crate) fn run(&mut self, work: Work) -> Result<(), String> {
+    pub(super) fn run(&mut self, round: Round) -> Result<(), String> {
         if self.process != std::process::id() {
             return Err(
                 "this vector environment was made before the process was forked, so its threads are gone; make it in the child process"
                     .into(),
             );
         }
-        let round = Arc::new(Round { lanes: Arc::clone(&self.lanes), next: AtomicUsize::new(0), work });
+        let shared = Arc::new(Shared { lanes: Arc::clone(&self.lanes), next: AtomicUsize::new(0), round });
         for thread in &self.rounds {
-            let _ = thread.send(Arc::clone(&round));
+            let _ = thread.send(Arc::clone(&shared));
         }
-        round.run();
+        shared.run();
         let ended = self.rounds.iter().filter(|_| self.done.recv() == Ok(true)).count();
         if ended == self.rounds.len() {
             Ok(())
@@ -78,7 +78,7 @@ impl Pool {
     }
 
     /// The lanes, between rounds.
-    pub(crate) fn lanes(&self) -> impl Iterator<Item = std::sync::MutexGuard<'_, Lane>> {
+    pub(super) fn lanes(&self) -> impl Iterator<Item = std::sync::MutexGuard<'_, Lane>> {
         self.lanes.iter().map(|lane| lane.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }

@@ -1,0 +1,123 @@
+//! What an action of a vector is, and the snapshots whose proposals are the caller's.
+
+use std::path::Path;
+
+use super::{Meaning, VectorError};
+use crate::env::Spec;
+use crate::{tasks, train};
+use nearl_runtime::constraints::{Entry, Guard, Model, StateLayout};
+use nearl_runtime::net::{Dense, DenseLayer};
+use nearl_runtime::normaliser::Normaliser;
+use nearl_runtime::task::IdmKind;
+use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
+
+/// Names and range of an action.
+pub(super) struct Space {
+    pub(super) names: Vec<String>,
+    pub(super) low: Vec<f64>,
+    pub(super) high: Vec<f64>,
+}
+
+impl Space {
+    pub(super) fn actions(spec: &Spec) -> Space {
+        let names = spec.actuators.iter().map(|a| a.name.clone()).collect();
+        Space { names, low: spec.action_low().collect(), high: spec.action_high().collect() }
+    }
+
+    /// A proposed position ranges over the joint's limits, a velocity over its own; anything else is unbounded. A change ranges over [-1, 1].
+    pub(super) fn proposals(snapshot: &Snapshot, meaning: Meaning) -> Result<Space, SnapshotError> {
+        let controller = Controller::new(snapshot)?;
+        let (model, layout) = (controller.model(), controller.layout());
+        let (mut names, mut low, mut high) = (Vec::new(), Vec::new(), Vec::new());
+        for k in 0..layout.n_state() {
+            let (l, h) = if meaning == Meaning::Change { (-1.0, 1.0) } else { range(model, layout, k) };
+            names.push(layout.state_name(k).to_owned());
+            low.push(l);
+            high.push(h);
+        }
+        Ok(Space { names, low, high })
+    }
+}
+
+fn range(model: &Model, layout: &StateLayout, k: usize) -> (f64, f64) {
+    match layout.state_entry(k) {
+        Entry::Position { idx_q, .. } => {
+            (model.lower_position_limit()[idx_q], model.upper_position_limit()[idx_q])
+        }
+        Entry::Velocity { dof } => (-model.velocity_limit()[dof], model.velocity_limit()[dof]),
+        Entry::Other => (f64::NEG_INFINITY, f64::INFINITY),
+    }
+}
+
+/// A snapshot of the task alone: its inverse dynamics needs no learning.
+pub(super) fn task_snapshot(task: &str) -> Result<Snapshot, VectorError> {
+    let mut manifest = tasks::load(task, &[])?;
+    if manifest.task.idm.kind == IdmKind::Learned {
+        return Err(VectorError::Unusable(format!(
+            "task '{task}' has a learned inverse model, so constraints=\"task\" has no way from a proposed state to an action; \
+             give the snapshot of a trained agent: constraints=\"runs/{task}/.../checkpoints/final.safetensors\""
+        )));
+    }
+    train::complete(&mut manifest)?;
+    let n_obs = manifest.task.state.observation.len();
+    let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
+    let normaliser = Normaliser::identity(n_obs, n_state);
+    Ok(open(Snapshot {
+        networks: Networks {
+            normaliser,
+            policy: Dense { layers: Vec::new() },
+            policy_log_std: Vec::new(),
+            idm: None,
+        },
+        manifest,
+    }))
+}
+
+/// A trained agent with its inverse model, its policy replaced by the caller.
+pub(super) fn agent_snapshot(task: &str, file: &str) -> Result<Snapshot, VectorError> {
+    let snapshot = Snapshot::load(Path::new(file))?;
+    let Manifest { task: of, policy, .. } = &snapshot.manifest;
+    if of.name != task {
+        return Err(VectorError::Unusable(format!(
+            "snapshot '{file}' was trained on '{}', not on '{task}'",
+            of.name
+        )));
+    }
+    if *policy == PolicyKind::Direct {
+        return Err(VectorError::Unusable(format!(
+            "snapshot '{file}' holds a policy that acts directly: it has no inverse model; give one trained with pid2-ib"
+        )));
+    }
+    Ok(open(snapshot))
+}
+
+/// The same with a policy of zeros and unit deviation: the noise becomes the proposed change.
+fn open(mut snapshot: Snapshot) -> Snapshot {
+    let (n_obs, n_state) =
+        (snapshot.networks.normaliser.mean.len(), snapshot.networks.normaliser.scale.len());
+    snapshot.networks.policy = Dense { layers: vec![zeros(n_obs, n_state)] };
+    snapshot.networks.policy_log_std = vec![0.0; n_state];
+    snapshot.manifest.policy = PolicyKind::Stochastic;
+    snapshot.manifest.functions.clear();
+    snapshot
+}
+
+/// The task's limits around actions as the actuators take them: by the robot model where it knows what they lead to, else by the simulator.
+pub(super) fn guarded_snapshot(task: &str) -> Result<Snapshot, VectorError> {
+    let mut manifest = tasks::load(task, &[])?;
+    let by_model = manifest.task.idm.kind == IdmKind::Pinocchio;
+    manifest.task.constraints.guard = if by_model { Guard::Model } else { Guard::Simulator };
+    train::complete(&mut manifest)?;
+    manifest.policy = PolicyKind::Direct;
+    let n_obs = manifest.task.state.observation.len();
+    let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
+    let n_act = manifest.action_lower.len();
+    let policy = Dense { layers: vec![zeros(n_obs, n_act)] };
+    let normaliser = Normaliser::identity(n_obs, n_state);
+    let networks = Networks { normaliser, policy, policy_log_std: vec![0.0; n_act], idm: None };
+    Ok(Snapshot { manifest, networks })
+}
+
+fn zeros(n_in: usize, n_out: usize) -> DenseLayer {
+    DenseLayer { n_in, n_out, weight: vec![0.0; n_in * n_out], bias: vec![0.0; n_out] }
+}
