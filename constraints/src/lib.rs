@@ -77,11 +77,7 @@ pub use error::{LimitError, ModelError};
 pub use kinematics::{FrameMotion, Kinematics, PointMotion};
 pub use layout::{Entry, LayoutError, StateLayout};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};
-pub use limit::{
-    AccelerationLimit, CollisionLimit, ConstraintSettings, DriveTorqueLimit, EnergyLimit, FrameLimit,
-    FrameSpeedLimit, JerkLimit, Limit, LimitSet, LockedJoints, PerJoint, PositionLimit, TorqueLimit,
-    TorqueRateLimit, TorqueSpeedLimit, UserRow, VelocityLimit, VelocityProfileLimit, build_limits,
-};
+pub use limit::*;
 pub use model::{FrameId, Joint, Model};
 pub use period_dynamics::PeriodDynamics;
 #[doc(hidden)]

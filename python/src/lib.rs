@@ -26,12 +26,6 @@ mod _core {
     #[pymodule_export]
     use super::env::{Env, tasks};
     #[pymodule_export]
-    use super::limits::{
-        AccelerationLimit, CollisionLimit, EnergyLimit, FrameLimit, FrameSpeedLimit, JerkLimit, Limit,
-        LockedJoints, PositionLimit, RowLimit, TorqueLimit, TorqueRateLimit, TorqueSpeedLimit, VelocityLimit,
-        VelocityProfileLimit,
-    };
-    #[pymodule_export]
     use super::link::{RolloutClient, Rollouts, rollout_ledger};
     #[pymodule_export]
     use super::loop_link::{LoopClient, loop_modes};
@@ -47,6 +41,13 @@ mod _core {
     use super::training::Training;
     #[pymodule_export]
     use super::vec_env::VecEnv;
+
+    use pyo3::prelude::*;
+
+    #[pymodule_init]
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        super::limits::add_to(module)
+    }
 
     /// Version of the package.
     #[pymodule_export]

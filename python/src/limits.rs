@@ -17,6 +17,26 @@ use pyo3::prelude::*;
 use crate::errors;
 use crate::model::Model;
 
+/// Adds every class of this page to the module.
+pub(crate) fn add_to(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<Limit>()?;
+    module.add_class::<AccelerationLimit>()?;
+    module.add_class::<CollisionLimit>()?;
+    module.add_class::<EnergyLimit>()?;
+    module.add_class::<FrameLimit>()?;
+    module.add_class::<FrameSpeedLimit>()?;
+    module.add_class::<JerkLimit>()?;
+    module.add_class::<LockedJoints>()?;
+    module.add_class::<PositionLimit>()?;
+    module.add_class::<RowLimit>()?;
+    module.add_class::<TorqueLimit>()?;
+    module.add_class::<TorqueRateLimit>()?;
+    module.add_class::<TorqueSpeedLimit>()?;
+    module.add_class::<VelocityLimit>()?;
+    module.add_class::<VelocityProfileLimit>()?;
+    Ok(())
+}
+
 /// What every limit is: pass a list of them to `Projector`. `name` is what `Projector.set_enabled` takes.
 #[pyclass(module = "nearl._core", frozen, subclass)]
 pub(crate) struct Limit(Arc<dyn constraints::Limit>);

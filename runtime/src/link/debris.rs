@@ -1,9 +1,10 @@
 //! What a process left that was killed while it joined or while it was cleaned up after.
 //!
-//! iceoryx2 0.10 finds dead processes by the monitor file of their node, and reads where the node keeps its files from its
-//! details. The details come first and go first, so one killed in between leaves a node without a monitor or without details,
-//! which no clean-up finds or finishes. One killed while it created a service leaves its description unfinished; whoever comes
-//! later waits for it in vain.
+//! Each node of iceoryx2 0.10 has two files: its details, which say where its other files are, and its monitor, by which others see
+//! that its process is dead. A node that is made writes the details before the monitor, and one that is removed loses the details
+//! before the monitor. So a process killed between the two leaves a node without a monitor, which no clean-up finds, or without
+//! details, which none can finish. A process killed while it created a service leaves the service's description unfinished, and
+//! whoever comes later waits for it in vain.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;

@@ -293,7 +293,7 @@ impl Phases for Nets {
     fn lane(&self, phase: usize) -> usize {
         usize::from(matches!(phase, VALUE | DISCRIMINATOR))
     }
-    /// The policy is judged.
+    /// The policy's phase asks the discriminator what it thinks of the proposals, unless its loss has no weight.
     fn read_across(&self) -> Option<usize> {
         (self.settings.generator_weight > 0.0).then_some(JUDGE)
     }
