@@ -61,7 +61,8 @@ impl VecEnv {
         };
         let actions = meaning;
         let autoreset = if same_step { Autoreset::SameStep } else { Autoreset::NextStep };
-        let settings = Settings { num_envs, constraints, actions, seed, threads, max_episode_steps, autoreset };
+        let settings =
+            Settings { num_envs, constraints, actions, seed, threads, max_episode_steps, autoreset };
         let vector = py.detach(|| Vector::new(task, &settings)).map_err(errors::vector)?;
         Ok(VecEnv(Mutex::new(vector)))
     }

@@ -59,7 +59,7 @@ fn run(snapshot: &Snapshot, seed: u64, ticks: usize, restart_every: usize) -> Ou
     let mut env = make_env(snapshot).expect("environment");
     let mut controller = Controller::new(snapshot).expect("controller");
     let limits = watched_limits(env.as_ref(), controller.model(), controller.limits());
-    let mut meter = Meter::new(limits, TOLERANCE).expect("limits");
+    let mut meter = Meter::new(limits, TOLERANCE, env.spec().dt).expect("limits");
     let (mut state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
     let mut force = vec![0.0; env.spec().nv];
     let mut rng = stream(seed, 0);
@@ -69,6 +69,7 @@ fn run(snapshot: &Snapshot, seed: u64, ticks: usize, restart_every: usize) -> Ou
         if tick % restart_every == 0 {
             env.reset(&mut rng).expect("reset");
             controller.reset();
+            meter.begin(env.qvel());
         }
         env.observe(&mut state.obs);
         env.state(&mut state.q, &mut state.v);
@@ -85,9 +86,10 @@ fn run(snapshot: &Snapshot, seed: u64, ticks: usize, restart_every: usize) -> Ou
         }
         env.step(&out.action);
         env.sim().applied_force(&mut force);
-        meter.observe(env.qpos(), env.qvel(), &force);
+        meter.observe(env.qpos(), env.qvel(), Some(&force));
     }
-    let (p, v, t) = (meter.position(), meter.velocity(), meter.effort());
+    let (p, v) = (meter.position(), meter.velocity());
+    let t = meter.effort().expect("forces were given");
     let worst = p.excess.max(v.excess).max(t.excess);
     Outcome { broken: [p.states, v.states, t.states], worst, moved, refused, braked }
 }

@@ -240,7 +240,7 @@ fn nearest(near: &[&str]) -> String {
 type Made = Result<Box<dyn Env>, EnvError>;
 
 /// A task that can be made by name.
-pub struct Entry {
+pub struct Registered {
     /// Its name.
     pub name: &'static str,
     /// What it is, in one line.
@@ -250,21 +250,21 @@ pub struct Entry {
     build_at: Option<fn(f64) -> Made>,
 }
 
-impl Entry {
-    const fn fixed(name: &'static str, about: &'static str, build: fn() -> Made) -> Entry {
-        Entry { name, about, build, build_at: None }
+impl Registered {
+    const fn fixed(name: &'static str, about: &'static str, build: fn() -> Made) -> Registered {
+        Registered { name, about, build, build_at: None }
     }
 }
 
 /// Every task.
-pub const REGISTRY: &[Entry] = &[
-    Entry::fixed(half_cheetah::NAME, half_cheetah::ABOUT, half_cheetah::build),
-    Entry::fixed(hopper::NAME, hopper::ABOUT, hopper::build),
-    Entry::fixed(walker2d::NAME, walker2d::ABOUT, walker2d::build),
-    Entry::fixed(ant::NAME, ant::ABOUT, ant::build),
-    Entry {
+pub const REGISTRY: &[Registered] = &[
+    Registered::fixed(half_cheetah::NAME, half_cheetah::ABOUT, half_cheetah::build),
+    Registered::fixed(hopper::NAME, hopper::ABOUT, hopper::build),
+    Registered::fixed(walker2d::NAME, walker2d::ABOUT, walker2d::build),
+    Registered::fixed(ant::NAME, ant::ABOUT, ant::build),
+    Registered {
         build_at: Some(panda_reach::build_at),
-        ..Entry::fixed(panda_reach::NAME, panda_reach::ABOUT, panda_reach::build)
+        ..Registered::fixed(panda_reach::NAME, panda_reach::ABOUT, panda_reach::build)
     },
 ];
 
@@ -281,7 +281,7 @@ pub fn make(name: &str) -> Result<Box<dyn Env>, EnvError> {
     (entry(name)?.build)()
 }
 
-fn entry(name: &str) -> Result<&'static Entry, EnvError> {
+fn entry(name: &str) -> Result<&'static Registered, EnvError> {
     let unknown = || EnvError::Unknown { name: name.to_owned(), near: near_names(name) };
     REGISTRY.iter().find(|entry| entry.name == name).ok_or_else(unknown)
 }

@@ -50,7 +50,7 @@ struct Offer {
 }
 
 /// What a look at the snapshots needs of the I/O thread.
-pub(crate) struct Desk<'a> {
+pub(crate) struct Surroundings<'a> {
     pub(crate) link: &'a mut RuntimeLink,
     pub(crate) log: &'a mut Option<LogQueue>,
     pub(crate) robot: &'a RobotMessage,
@@ -99,7 +99,7 @@ impl<B: Build> SnapshotInbox<B> {
     }
 
     /// Moves every snapshot one stage on.
-    pub(crate) fn pump(&mut self, desk: &mut Desk<'_>) {
+    pub(crate) fn pump(&mut self, desk: &mut Surroundings<'_>) {
         self.settle(desk);
         while let Some(snapshot) = self.receiver.next() {
             self.receive(desk, snapshot);
@@ -110,7 +110,7 @@ impl<B: Build> SnapshotInbox<B> {
         self.offer();
     }
 
-    fn receive(&mut self, desk: &mut Desk<'_>, snapshot: SnapshotBytes) {
+    fn receive(&mut self, desk: &mut Surroundings<'_>, snapshot: SnapshotBytes) {
         let (sender, version) = (snapshot.header.header.epoch, snapshot.header.version);
         if sender == self.newest.0 && version <= self.newest.1 {
             let text = format!(
@@ -126,7 +126,7 @@ impl<B: Build> SnapshotInbox<B> {
         }
     }
 
-    fn take(&mut self, desk: &mut Desk<'_>, built: Built<B::Controller>) {
+    fn take(&mut self, desk: &mut Surroundings<'_>, built: Built<B::Controller>) {
         let controller = match built.result {
             Ok(controller) => *controller,
             Err(refusal) => return self.refuse(desk.link, &built.header, refusal.verdict, &refusal.text),
@@ -164,7 +164,7 @@ impl<B: Build> SnapshotInbox<B> {
     }
 
     /// The old controller came back: the new one is in use. The one before the old is no longer needed.
-    fn settle(&mut self, desk: &mut Desk<'_>) {
+    fn settle(&mut self, desk: &mut Surroundings<'_>) {
         let Some(old) = self.swap.collect() else { return };
         let Some(Offer { header, version }) = self.offered.take() else { return self.builder.discard(old) };
         self.accepted.push((desk.tick, version));

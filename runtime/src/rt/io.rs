@@ -16,7 +16,7 @@ use crate::link::{
 };
 use crate::log::LogQueue;
 use crate::percentiles::percentiles;
-use crate::rt::inbox::{Desk, SnapshotInbox};
+use crate::rt::inbox::{SnapshotInbox, Surroundings};
 use crate::rt::tick::{Build, Record, Sensed};
 
 /// Before a state is due, this thread is awake so much earlier [ns].
@@ -178,7 +178,7 @@ impl<B: Build> Io<B> {
         }
         self.hear_tally();
         let Io { link, log, robot, snapshots, traffic, .. } = self;
-        snapshots.pump(&mut Desk { link, log, robot, tick: traffic.tick });
+        snapshots.pump(&mut Surroundings { link, log, robot, tick: traffic.tick });
         let now = clock::now();
         if now >= self.health.next {
             self.health.next = now + HEALTH;

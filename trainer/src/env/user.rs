@@ -29,7 +29,7 @@ use crate::robot;
 use costed::Costed;
 use expression::Expression;
 use quantity::{Before, Names, Outcome, Place, Quantity, read_state};
-use settings::{Entry, Mistake, mistake, starts, terms};
+use settings::{Mistake, Start, mistake, starts, terms};
 
 /// The rules of a task file.
 #[derive(Clone)]
@@ -37,7 +37,7 @@ struct User {
     observation: Vec<Expression<Quantity>>,
     reward: Vec<Expression<Quantity>>,
     termination: Vec<Expression<Quantity>>,
-    start: Vec<Entry>,
+    start: Vec<Start>,
     before: Before,
     dt: f64,
     /// Motors that MuJoCo's model does not have; without any, the action is its control.

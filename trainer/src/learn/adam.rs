@@ -20,7 +20,7 @@ const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPS: f32 = 1e-5;
 
-struct Step<'a> {
+struct Update<'a> {
     p: &'a mut [V],
     g: &'a [V],
     m: &'a mut [V],
@@ -32,7 +32,7 @@ struct Step<'a> {
 
 /// `m <- b1 m + (1 - b1) g`, `v <- b2 v + (1 - b2) g^2`, `p <- p - lr m^ / (sqrt(v^) + eps)`.
 #[inline(always)]
-fn body(s: Step<'_>) {
+fn body(s: Update<'_>) {
     let [c1, c2] = s.correction;
     // number by number: whole vectors of 16 make the compiler work across them, with scattered loads and stores
     let moments = scalars_mut(s.m).iter_mut().zip(scalars_mut(s.v));
@@ -43,7 +43,7 @@ fn body(s: Step<'_>) {
         *p -= s.rate * (*m * c1) / ((*v * c2).sqrt() + EPS);
     }
 }
-multiversion!(fn run(s: Step<'_>) = body);
+multiversion!(fn run(s: Update<'_>) = body);
 
 impl Adam {
     /// Moments zero for `n` vectors of parameters.
@@ -55,7 +55,7 @@ impl Adam {
     pub fn step(&mut self, p: &mut [V], g: &[V], scale: f32, rate: f32) {
         self.t += 1;
         let correction = [1.0 / (1.0 - BETA1.powi(self.t)), 1.0 / (1.0 - BETA2.powi(self.t))];
-        run(Step { p, g, m: &mut self.m, v: &mut self.v, scale, rate: self.lr * rate, correction });
+        run(Update { p, g, m: &mut self.m, v: &mut self.v, scale, rate: self.lr * rate, correction });
     }
 }
 

@@ -1,6 +1,6 @@
 //! One accepted request: how far it is, and what is still to be sent.
 
-use super::pool::{Start, Task, Work};
+use super::pool::{Order, Start, Task};
 use super::training::Session;
 use crate::rollout::Worker;
 use nearl_rollout_protocol::{Answer, Caller, Constraints, Delivery, MAX_CHUNK, ReplyMessage, Request};
@@ -85,9 +85,9 @@ impl Job {
                 let projection = request.constraints != Constraints::Off;
                 let start =
                     Start { seed: request.seed, stream: 0, projection, gamma: 1.0, moved_penalty: 0.0 };
-                let work = Work::Chunk { start: (r.simulated == 0).then_some(start), noise: request.noise };
+                let order = Order::Chunk { start: (r.simulated == 0).then_some(start), noise: request.noise };
                 let rows = rows.min(usize::try_from(left).unwrap_or(rows));
-                Some(Task { slot, place: None, worker: r.worker.take(), rows, work })
+                Some(Task { slot, place: None, worker: r.worker.take(), rows, order })
             }
         }
     }

@@ -22,7 +22,7 @@ pub(super) struct Start {
 }
 
 /// What is to be simulated.
-pub(super) enum Work {
+pub(super) enum Order {
     /// The next chunk of a rollout, the first of which begins with `start`.
     Chunk { start: Option<Start>, noise: bool },
     /// The next portion of a training's segment by the networks of `snapshot`. The first of a segment says how long it is; an
@@ -38,7 +38,7 @@ pub(super) struct Task {
     /// The environment's own worker. A rollout that begins takes any idle one.
     pub(super) worker: Option<Box<Worker>>,
     pub(super) rows: usize,
-    pub(super) work: Work,
+    pub(super) order: Order,
 }
 
 /// What was simulated, or one sentence why it was not; the worker is lost then.
@@ -90,7 +90,7 @@ impl Pool {
 
     /// Queues a task; a rollout that begins gets an idle worker if there is one.
     pub(super) fn give(&mut self, mut task: Task) {
-        if task.worker.is_none() && matches!(task.work, Work::Chunk { .. }) {
+        if task.worker.is_none() && matches!(task.order, Order::Chunk { .. }) {
             task.worker = self.idle.pop();
         }
         if self.tasks.send(task).is_ok() {
@@ -118,10 +118,12 @@ impl Pool {
 fn simulate(env: &dyn Env, snapshot: &Snapshot, queue: &Mutex<Receiver<Task>>, done: &Sender<Outcome>) {
     loop {
         let task = queue.lock().unwrap_or_else(PoisonError::into_inner).recv();
-        let Ok(Task { slot, place, worker, rows, work }) = task else { return };
-        let run = || match work {
-            Work::Chunk { start, noise } => chunk(env, snapshot, worker, start, rows, noise),
-            Work::Segment { snapshot, begins, start } => portion(env, &snapshot, worker, start, begins, rows),
+        let Ok(Task { slot, place, worker, rows, order }) = task else { return };
+        let run = || match order {
+            Order::Chunk { start, noise } => chunk(env, snapshot, worker, start, rows, noise),
+            Order::Segment { snapshot, begins, start } => {
+                portion(env, &snapshot, worker, start, begins, rows)
+            }
         };
         let result = catch_unwind(AssertUnwindSafe(run)).unwrap_or_else(|_| {
             Err("the simulator stopped; the reason is in the server's error output".into())

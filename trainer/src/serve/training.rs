@@ -1,6 +1,6 @@
 //! A client that learns: its environments go on from one of its requests to the next.
 
-use super::pool::{Start, Task, Work};
+use super::pool::{Order, Start, Task};
 use crate::rollout::Worker;
 use nearl_rollout_protocol::{Constraints, Request, Training};
 use nearl_runtime::Snapshot;
@@ -70,12 +70,12 @@ impl Session {
         let rows = rows.min(left);
         place.stage = Stage::AtWork(left - rows);
         let begins = left == self.n_steps;
-        let work = Work::Segment {
+        let order = Order::Segment {
             snapshot: Arc::clone(&self.snapshot),
             begins: begins.then_some(self.n_steps),
             start: Start { stream: self.start.stream.wrapping_add(i as u64), ..self.start },
         };
-        Some(Task { slot, place: Some(i), worker: place.worker.take(), rows, work })
+        Some(Task { slot, place: Some(i), worker: place.worker.take(), rows, order })
     }
 
     /// Takes the worker back after its portion.

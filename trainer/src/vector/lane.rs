@@ -1,11 +1,11 @@
 //! One environment of a vector, with its buffers, its random stream and its time limit.
 
-use crate::foresight::{Foresight, Verdict};
+use super::VectorError;
 use crate::env::{ChaCha8Rng, Env, EnvError, Fault, SeedableRng, Step};
+use crate::foresight::{Foresight, Verdict};
 use crate::plant::watched_limits;
 use crate::rollout::Tally;
 use crate::train::limit_scale;
-use super::VectorError;
 use nearl_runtime::constraints::Guard;
 use nearl_runtime::controller::Parts;
 use nearl_runtime::task::IdmKind;
@@ -210,7 +210,11 @@ impl Lane {
 
 impl Proposing {
     /// `snapshot` holds a policy of zeros and unit deviation.
-    pub(super) fn new(snapshot: &Snapshot, env: &dyn Env, meaning: Meaning) -> Result<Proposing, VectorError> {
+    pub(super) fn new(
+        snapshot: &Snapshot,
+        env: &dyn Env,
+        meaning: Meaning,
+    ) -> Result<Proposing, VectorError> {
         let controller = Controller::new(snapshot)?;
         let (state, noise, out) = (controller.state(), controller.noise(), controller.output());
         let scale = controller.normaliser().scale.clone();

@@ -117,7 +117,8 @@ impl Vector {
         let lanes = (0..settings.num_envs as u64)
             .map(|i| {
                 let (env, seed) = (first.another()?, settings.seed.wrapping_add(i));
-                let proposing = open.as_ref().map(|s| Proposing::new(s, &*env, settings.actions)).transpose()?;
+                let proposing =
+                    open.as_ref().map(|s| Proposing::new(s, &*env, settings.actions)).transpose()?;
                 Ok(Lane::new(env, proposing, space.names.len(), max_steps, seed))
             })
             .collect::<Result<Vec<_>, VectorError>>()?;

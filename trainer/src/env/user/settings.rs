@@ -71,7 +71,7 @@ impl Text {
 
 /// One entry of the start: where it goes, whether it replaces what is there, and its value.
 #[derive(Debug, Clone)]
-pub(super) struct Entry {
+pub(super) struct Start {
     pub(super) velocity: bool,
     pub(super) index: usize,
     pub(super) replace: bool,
@@ -79,7 +79,7 @@ pub(super) struct Entry {
 }
 
 /// The starts of an episode, in the order they are drawn.
-pub(super) fn starts(task: &Task, joints: &[crate::mj::Joint], names: &Names) -> Result<Vec<Entry>, Mistake> {
+pub(super) fn starts(task: &Task, joints: &[crate::mj::Joint], names: &Names) -> Result<Vec<Start>, Mistake> {
     let reset: Reset = serde_path_to_error::deserialize(task.reset.clone())
         .map_err(|e| mistake(format!("reset.{}", e.path()), suggest(e.inner().message())))?;
     let size = |width: fn(&crate::mj::Joint) -> usize| joints.iter().map(width).sum::<usize>();
@@ -90,7 +90,7 @@ pub(super) fn starts(task: &Task, joints: &[crate::mj::Joint], names: &Names) ->
     ] {
         let Some(text) = text else { continue };
         let value = text.compile(names).map_err(|e| mistake(format!("reset.{key}"), e))?;
-        entries.extend((0..n).map(|index| Entry { velocity, index, replace: false, value: value.clone() }));
+        entries.extend((0..n).map(|index| Start { velocity, index, replace: false, value: value.clone() }));
     }
     for (letter, given, velocity) in [("q", &reset.q, false), ("v", &reset.v, true)] {
         for (name, text) in given {
@@ -105,7 +105,7 @@ pub(super) fn starts(task: &Task, joints: &[crate::mj::Joint], names: &Names) ->
             })?;
             let index = if velocity { joint.idx_v } else { joint.idx_q };
             let value = text.compile(names).map_err(|e| mistake(key, e))?;
-            entries.push(Entry { velocity, index, replace: true, value });
+            entries.push(Start { velocity, index, replace: true, value });
         }
     }
     Ok(entries)
