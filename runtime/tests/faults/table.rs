@@ -11,7 +11,7 @@ const FILES: &str = "runtime/tests/faults/files.rs";
 const KILLS: &str = "runtime/tests/faults/kills.rs";
 const PEERS: &str = "runtime/tests/faults/peers.rs";
 const SOLVER: &str = "runtime/tests/faults/solver.rs";
-const PROCESSES: &str = "tests/tests/processes.rs";
+const PROCESSES: &str = "tests/tests/programs/processes.rs";
 const SYSTEM: &str = "runtime/tests/faults/system.rs";
 
 /// All faults.
@@ -25,7 +25,7 @@ pub const ROWS: &[Row] = &[
     (6, "solver hits its iteration cap or deadline", "used only if the checker accepts, else brakes", &["braked-no-certified-answer"], SOLVER, "fault_06_an_answer_cut_by_cap_or_deadline_is_used_only_if_the_checker_accepts"),
     (7, "solver fails numerically", "brakes in that tick, the next is as if new", &["braked-non-finite-dynamics"], SOLVER, "fault_07_a_failed_solve_leaves_the_next_one_healthy"),
     (8, "controller or solver panics", "caught, discarded, latched; the robot model brakes", &["panic"], HERE, "fault_08_a_panic_is_latched_and_the_robot_model_brakes"),
-    (9, "policy file of wrong shape, type, name", "refused, the loop keeps the last good one", &["snapshot-shape", "snapshot-missing-tensor", "foreign-shape"], "runtime/tests/panda.rs", "foreign_and_damaged_snapshots_are_refused_by_reason_while_the_loop_runs"),
+    (9, "policy file of wrong shape, type, name", "refused, the loop keeps the last good one", &["snapshot-shape", "snapshot-missing-tensor", "foreign-shape"], "runtime/tests/suite/panda.rs", "foreign_and_damaged_snapshots_are_refused_by_reason_while_the_loop_runs"),
     (10, "bit flips", "refused", &["snapshot-digest", "corrupt"], FILES, "fault_10_every_flipped_byte_is_refused"),
     (11, "NaN or huge weights, zero standard deviation", "refused", &["snapshot-value", "not-finite"], PROCESSES, "snapshots_that_do_not_fit_are_refused_with_their_reason_and_a_good_one_is_swapped_in"),
     (12, "truncated file", "refused at every length, the next good one is taken", &["snapshot-malformed"], FILES, "fault_12_every_truncation_is_refused"),
@@ -44,7 +44,7 @@ pub const ROWS: &[Row] = &[
     (25, "dropped, doubled, reordered samples", "up to 3 lost are bridged by the plant, more brake; old ones are left out", &["lost-states"], HERE, "fault_25_lost_states_are_bridged_or_braked_and_others_left_out"),
     (26, "sensor jump", "rejected and counted, bridged 3 times, after 8 latched", &["implausible-state", "implausible-states"], HERE, "fault_26_a_jump_is_rejected_and_counted"),
     (27, "robot file with missing or odd limits", "refused, each joint listed", &["snapshot-unusable"], FILES, "fault_27_missing_and_odd_limits_are_refused_by_joint"),
-    (28, "bad task file", "refused with file, line and key", &["snapshot-unusable"], "tests/tests/bad_input.rs", "a_bad_task_file_is_refused_with_file_line_and_key"),
+    (28, "bad task file", "refused with file, line and key", &["snapshot-unusable"], "tests/tests/programs/bad_input.rs", "a_bad_task_file_is_refused_with_file_line_and_key"),
     (29, "disk full while logging", "records are dropped and counted, the loop is unchanged", &["active"], SYSTEM, "fault_29_a_disk_that_fills_up_costs_records_and_no_tick"),
     (30, "standard output or log reader closed", "the loop runs on; commands end quietly", &["none"], PROCESSES, "a_run_whose_readers_are_gone_moves_on_and_ends_well"),
     (31, "SIGINT, SIGTERM", "brakes to zero velocity, exit code 0; a second one ends at once with 130", &["stop"], KILLS, "fault_31_a_signal_at_any_moment_brakes_to_rest_and_a_second_one_ends_at_once"),

@@ -1,0 +1,21 @@
+//! The tests of the constraints, as one program.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod attack;
+mod certify;
+mod conformance;
+mod errors;
+mod frame_limits;
+mod geometry;
+mod gradient;
+mod huge_proposals;
+mod kinds;
+mod kinematics;
+mod motors;
+mod mujoco;
+mod projector;
+mod stages;
+mod stored_brake;
+mod viability;

@@ -1,0 +1,13 @@
+//! The tests of loop, links and log that need no process of their own, as one program.
+
+#[path = "../arm/mod.rs"]
+mod arm;
+#[path = "../toy/mod.rs"]
+mod toy;
+
+mod crash;
+mod cycle;
+mod link;
+mod log;
+mod panda;
+mod replay;

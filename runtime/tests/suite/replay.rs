@@ -1,0 +1,232 @@
+//! record = replay(record), and an edited record is found out.
+
+use crate::toy;
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::arm::*;
+use crate::toy::Name;
+use nearl_runtime::link::*;
+use nearl_runtime::log::replay;
+use nearl_runtime::rt::*;
+use serde_json::Value;
+
+fn fault(tick: u64, count: u64, kind: FaultKind) -> Fault {
+    Fault { tick, count, kind }
+}
+
+/// Sensor faults of every kind that heals, a proposal of NaN, and at the end a panic.
+fn plan() -> FaultPlan {
+    FaultPlan {
+        seed: 3,
+        faults: vec![
+            fault(300, 2, FaultKind::State { number: Odd::Nan }),
+            fault(400, 1, FaultKind::Jump { by: 0.5 }),
+            fault(500, 3, FaultKind::Freeze),
+            fault(600, 6, FaultKind::State { number: Odd::Infinity }),
+            fault(700, 20, FaultKind::Proposal { number: Odd::Nan }),
+            fault(1500, 1, FaultKind::Panic),
+        ],
+    }
+}
+
+/// A run with three hot swaps and the plan above; returns the log.
+fn record(test: &str, folder: &Path) -> (PathBuf, RunReport) {
+    let name = Name::new(test);
+    let first = stochastic(1);
+    let file = folder.join(format!("{test}.safetensors"));
+    first.save(&file).unwrap();
+    let log = folder.join(format!("{test}.mcap"));
+    let plant = start_with(&name, &first, plan(), Duration::from_micros(500));
+    let stop = Stop::new();
+    let settings =
+        RunSettings { log: Some(log.clone()), faults: plan(), ticks: Some(1600), ..toy::settings() };
+    let running = execute_with(&name, &file, &stop, settings);
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    if let Err(error) = trainer.wait_for_runtime(PATIENCE) {
+        panic!("{error}; {:?}", running.join());
+    }
+    for version in 2..=4 {
+        trainer.push(version, &stochastic(version).to_bytes()).unwrap();
+        let receipt = trainer.wait_for_receipt(version, PATIENCE).unwrap();
+        assert_eq!(receipt.verdict(), Verdict::Accepted, "{}", receipt.text());
+    }
+    let report = running.join().unwrap().unwrap();
+    plant.end();
+    (log, report)
+}
+
+#[test]
+fn a_run_with_swaps_and_faults_replays_bit_for_bit() {
+    let folder = Scratch::new("replay");
+    let (log, report) = record("replay", &folder.0);
+    let c = &report.counters;
+    assert_eq!((report.log_drops, c.dropped_records, report.log_error.as_deref()), (0, 0, None));
+    assert_eq!(c.swaps, 3, "{report}");
+    assert!(c.bad_states >= 8 && c.implausible_states >= 1 && c.frozen_states >= 3, "{c:?}");
+    assert!(c.held >= 6 && c.braked >= 5, "{c:?}");
+    assert_eq!((report.last_mode, report.reason), (Mode::Fault, Reason::Panic), "{report}");
+    let found = replay(&log).unwrap();
+    assert_eq!(found.difference, None);
+    assert_eq!((found.ticks, found.swaps, found.complete), (report.ticks, 3, true));
+}
+
+/// Edits a message; false leaves it out.
+type Change<'a> = &'a dyn Fn(&mut Value) -> bool;
+
+/// Copies the log with the message of `tick` changed, or left out if `change` says so.
+fn edit(from: &Path, to: &Path, tick: u64, change: Change<'_>) {
+    use mcap::read::ChunkFlattener;
+    use mcap::records::{MessageHeader, Record as Part};
+    let bytes = std::fs::read(from).unwrap();
+    let file = std::io::BufWriter::new(std::fs::File::create(to).unwrap());
+    let mut writer = mcap::WriteOptions::new().compression(None).create(file).unwrap();
+    let mut channels: BTreeMap<u16, u16> = BTreeMap::new();
+    let mut is_over = false;
+    for part in ChunkFlattener::new(&bytes).unwrap() {
+        match part.unwrap() {
+            Part::DataEnd(_) => is_over = true,
+            _ if is_over => {}
+            Part::Metadata(m) => writer.write_metadata(&m).unwrap(),
+            Part::Attachment { header, data, .. } => writer
+                .attach(&mcap::Attachment {
+                    log_time: 0,
+                    create_time: 0,
+                    name: header.name,
+                    media_type: header.media_type,
+                    data: Cow::Owned(data.into_owned()),
+                })
+                .unwrap(),
+            Part::Channel(c) => {
+                let schema = writer.add_schema(&c.topic, "jsonschema", b"{}").unwrap();
+                let id = writer.add_channel(schema, &c.topic, "json", &BTreeMap::new()).unwrap();
+                channels.insert(c.id, id);
+            }
+            Part::Message { header, data } => {
+                let mut value: Value = serde_json::from_slice(&data).unwrap();
+                let keep = value["tick"] != tick || change(&mut value);
+                let header = MessageHeader { channel_id: channels[&header.channel_id], ..header };
+                if keep {
+                    writer.write_to_known_channel(&header, value.to_string().as_bytes()).unwrap();
+                }
+            }
+            _ => {}
+        }
+    }
+    writer.finish().unwrap();
+}
+
+#[test]
+fn an_edited_log_is_found_out_at_its_tick_and_field() {
+    let folder = Scratch::new("edited");
+    let (log, _) = record("edited", &folder.0);
+    let copy = folder.0.join("copy.mcap");
+    let found = |tick: u64, change: Change<'_>| {
+        edit(&log, &copy, tick, change);
+        replay(&copy).unwrap().difference
+    };
+    // The copy itself is the same: only the spelling of the file differs.
+    assert_eq!(found(0, &|_| true), None);
+    let flip = |value: &mut Value| {
+        let x = value.as_f64().unwrap();
+        *value = f64::from_bits(x.to_bits() ^ 1).into();
+        true
+    };
+    let cases: [(u64, &str, Change<'_>); 6] = [
+        (250, "action[3]", &|m| flip(&mut m["action"][3])),
+        (251, "target_v[0]", &|m| flip(&mut m["target_v"][0])),
+        (252, "proposal_v[6]", &|m| flip(&mut m["proposal_v"][6])),
+        (302, "mode", &|m| {
+            m["mode"] = "active".into();
+            true
+        }),
+        (400, "counters.implausible_states", &|m| {
+            m["counters"]["implausible_states"] = 0.into();
+            true
+        }),
+        (253, "ledger.moved", &|m| flip(&mut m["ledger"]["moved"])),
+    ];
+    for (tick, field, change) in cases {
+        let difference = found(tick, change).unwrap_or_else(|| panic!("{field} of tick {tick} was not seen"));
+        assert_eq!((difference.tick, difference.field.as_str()), (tick, field), "{difference}");
+    }
+    // A changed state changes what is computed from it, in the same tick.
+    let moved = |m: &mut Value| {
+        m["state"]["q"][2] = (m["state"]["q"][2].as_f64().unwrap() + 1e-9).into();
+        true
+    };
+    assert_eq!(found(260, &moved).unwrap().tick, 260);
+    let gap = found(270, &|_| false).unwrap();
+    assert_eq!((gap.tick, gap.field.as_str(), gap.log.as_str()), (270, "tick", "271"), "{gap}");
+}
+
+#[test]
+fn a_log_cut_by_the_death_of_its_runtime_replays_as_far_as_it_goes() {
+    let folder = Scratch::new("cut");
+    let (log, report) = record("cut", &folder.0);
+    let bytes = std::fs::read(&log).unwrap();
+    let cut = folder.0.join("cut.mcap");
+    std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+    let found = replay(&cut).unwrap();
+    assert_eq!((found.difference, found.complete), (None, false));
+    assert!(found.ticks > 100 && found.ticks < report.ticks, "{} of {}", found.ticks, report.ticks);
+}
+
+#[test]
+fn what_is_no_flight_log_is_one_sentence() {
+    let folder = Scratch::new("no-log");
+    let file = folder.0.join("x.mcap");
+    for (content, says) in [(&b""[..], "it is empty"), (b"not mcap", "cannot be replayed")] {
+        std::fs::write(&file, content).unwrap();
+        let text = replay(&file).unwrap_err().to_string();
+        assert!(text.contains(says) && text.contains("x.mcap"), "{text}");
+    }
+    let text = replay(&folder.0).unwrap_err().to_string();
+    assert!(text.contains("not a regular file"), "{text}");
+}
+
+#[test]
+fn a_snapshot_that_misses_its_targets_is_taken_back_and_the_log_replays() {
+    let folder = Scratch::new("rollback");
+    let log = folder.0.join("rollback.mcap");
+    let name = Name::new("rollback");
+    let pause = Duration::from_micros(200);
+    let body = toy::PointMass { q: 1.0, pause, ..toy::PointMass::default() };
+    let plant = toy::PlantThread::start(&name, body, PlantSettings::lockstep(toy::DT));
+    let settings = RunSettings { log: Some(log.clone()), first: b"spring".to_vec(), ..toy::settings() };
+    let running = toy::LoopThread::start(&name, settings, |_| {});
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    trainer.wait_for_runtime(PATIENCE).unwrap();
+    let ticks = |trainer: &mut TrainerLink, n: u64| {
+        while trainer.state().is_none_or(|s| s.tick < n) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    };
+    ticks(&mut trainer, 400);
+    let mut verdicts = Vec::new();
+    for version in [2, toy::MISSES] {
+        trainer.push(version, b"spring").unwrap();
+        verdicts.push(trainer.wait_for_receipt(version, PATIENCE).unwrap().verdict());
+        let now = trainer.health().map_or(0, |h| h.tick);
+        ticks(&mut trainer, now + 1500);
+    }
+    let Ok(receipt) = trainer.wait_for_receipt(toy::MISSES, PATIENCE) else {
+        let report = running.end();
+        panic!(
+            "nothing was taken back: {} {:?} {:?} {report}",
+            report.rolled_back, report.versions, report.counters
+        );
+    };
+    assert_eq!(receipt.verdict(), Verdict::RolledBack, "{}", receipt.text());
+    assert_eq!(verdicts, [Verdict::Accepted, Verdict::Accepted]);
+    let report = running.end();
+    plant.end();
+    assert_eq!(report.versions.iter().map(|v| v.1).collect::<Vec<_>>(), [1, 2, toy::MISSES, 2]);
+    assert_eq!((report.rolled_back, report.counters.swaps), (1, 3));
+    assert!(report.refusals[0].contains("off the target"), "{:?}", report.refusals);
+    let (drops, _dropped) = std::sync::mpsc::channel();
+    let found = nearl_runtime::log::replay_with(&log, toy::SpringBuilder(drops)).unwrap();
+    assert_eq!((found.difference, found.ticks, found.swaps), (None, report.ticks, 3));
+}

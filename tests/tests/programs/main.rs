@@ -1,0 +1,12 @@
+//! Tests that start the programs themselves, as one program: beside them runs nothing that takes the processor for long.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod bad_input;
+mod online;
+mod processes;
+mod serve;
+mod serve_clients;
+mod serve_training;
+mod sweep;

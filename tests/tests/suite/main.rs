@@ -1,0 +1,14 @@
+//! What crosses crates, within one process.
+
+mod architecture;
+mod determinism;
+mod env_mujoco;
+mod env_parity;
+mod env_suite;
+mod guard;
+mod limits_in_simulator;
+mod networks;
+mod prior_in_training;
+mod resume;
+mod robots;
+mod user_tasks;
