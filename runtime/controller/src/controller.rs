@@ -161,7 +161,8 @@ impl Controller {
             (PolicyKind::Direct, ..) => (Inverse::Direct, n.policy_log_std.clone()),
             (_, IdmKind::Pinocchio, _) => {
                 let drives = Parts::drives(m, &model, layout.controllable())?;
-                let idm = AnalyticIdm::new(&model, layout.controllable(), &drives, m.task.period());
+                let motors = Parts::motors(&model, layout.controllable(), &drives)?;
+                let idm = AnalyticIdm::new(&model, layout.controllable(), &drives, motors, m.task.period());
                 (Inverse::Analytic(idm), vec![0.0; n_act])
             }
             (_, IdmKind::Learned, Some((net, log_std))) => {

@@ -1,5 +1,6 @@
 //! Inverse dynamics: from the state and the projected state to the action.
 
+use crate::motors::Motors;
 use crate::net::Forward;
 use crate::normaliser::CLIP;
 use nearl_constraints::drive::Arrival;
@@ -44,6 +45,7 @@ impl LearnedIdm {
 pub struct AnalyticIdm {
     dynamics: Dynamics,
     joints: Vec<Joint>,
+    motors: Motors,
     period: Period,
     tau: Vec<f64>,
 }
@@ -55,17 +57,17 @@ struct Joint {
 }
 
 impl AnalyticIdm {
-    /// Actions are the commands to the joints of `dofs`, in that order, held over `period`; `drives` (nv) says which.
-    pub fn new(model: &Model, dofs: &[usize], drives: &[Drive], period: Period) -> Self {
+    /// Actions are what the `motors` of the joints of `dofs` are sent, held over `period`; `drives` (nv) says what the joints are commanded.
+    pub fn new(model: &Model, dofs: &[usize], drives: &[Drive], motors: Motors, period: Period) -> Self {
         let joint = |&dof: &usize| Joint { dof, idx_q: model.joint_of_dof(dof).idx_q, drive: drives[dof] };
         let joints = dofs.iter().map(joint).collect();
-        Self { dynamics: Dynamics::new(model), joints, period, tau: vec![0.0; model.nv()] }
+        Self { dynamics: Dynamics::new(model), joints, motors, period, tau: vec![0.0; model.nv()] }
     }
 
-    /// Command of each joint (n_act) that takes (q, v) to `target`: of motors the force [N m or N].
+    /// What each motor is sent (n_act) to take (q, v) to `target`; of a plain motor it is the force [N m or N].
     pub fn action(&mut self, q: &[f64], v: &[f64], target: &Target, action: &mut [f64]) {
         self.dynamics.motors(&self.period, q, v, &target.acceleration, &mut self.tau);
-        for (action, joint) in action.iter_mut().zip(&self.joints) {
+        for (k, joint) in self.joints.iter().enumerate() {
             let &Joint { dof, idx_q, drive } = joint;
             let to = Arrival {
                 q: target.q[idx_q],
@@ -73,7 +75,8 @@ impl AnalyticIdm {
                 a: target.acceleration[dof],
                 tau: self.tau[dof],
             };
-            *action = drive.command(&self.period, q[idx_q], v[dof], &to);
+            let command = drive.command(&self.period, q[idx_q], v[dof], &to);
+            action[self.motors.place(k)] = self.motors.action(k, command);
         }
     }
 }

@@ -6,6 +6,7 @@ pub mod codes;
 pub mod command;
 pub mod controller;
 pub mod idm;
+pub mod motors;
 pub mod net;
 pub mod normaliser;
 pub mod snapshot;

@@ -38,9 +38,10 @@ impl Brake {
         let projector =
             if guards { Parts::guard_projector(manifest, &model, controllable)? } else { projector };
         let drives = Parts::drives(manifest, &model, controllable)?;
+        let motors = Parts::motors(&model, controllable, &drives)?;
         let joints = model.joints().iter().filter(|j| j.nv == 1 && controllable.contains(&j.idx_v));
         Ok(Some(Brake {
-            idm: AnalyticIdm::new(&model, controllable, &drives, manifest.task.period()),
+            idm: AnalyticIdm::new(&model, controllable, &drives, motors, manifest.task.period()),
             proposal: Proposal::new(&model),
             target: Target::new(&model),
             joints: joints.map(|j| (j.idx_v, j.idx_q)).collect(),

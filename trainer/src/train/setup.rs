@@ -7,6 +7,7 @@ use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
 use nearl_runtime::constraints::{Drive, Guard};
 use nearl_runtime::controller::Parts;
+use nearl_runtime::motors::Motors;
 use nearl_runtime::task::{IdmKind, Task};
 use nearl_runtime::{Manifest, PolicyKind};
 use rand_chacha::ChaCha8Rng;
@@ -69,28 +70,30 @@ pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
     Ok(())
 }
 
-/// Analytic inverse dynamics, and a guard, give one command a controllable joint: the actuators have to be these joints' motors or drives, in
-/// their order.
+/// Analytic inverse dynamics, and a guard, give one command a controllable joint: the actuators have to be these joints' motors or drives.
 fn check_motors(manifest: &Manifest, env: &dyn Env) -> Result<(), TrainError> {
     let spec = env.spec();
     let Parts { model, layout, .. } = Parts::new(manifest).map_err(RolloutError::from)?;
-    let drives = Parts::drives(manifest, &model, layout.controllable()).map_err(RolloutError::from)?;
-    let joints: Vec<String> = layout.controllable().iter().map(|dof| model.dof_name(*dof)).collect();
+    let controllable = layout.controllable();
+    let drives = Parts::drives(manifest, &model, controllable).map_err(RolloutError::from)?;
+    let joints: Vec<String> = controllable.iter().map(|dof| model.dof_name(*dof)).collect();
     let driven: Vec<&str> = spec.actuators.iter().map(|a| a.joint.as_str()).collect();
     let task = &manifest.task.name;
-    if driven != joints {
+    if driven.len() != joints.len() || joints.iter().any(|joint| !driven.contains(&joint.as_str())) {
         return Err(TrainError::Settings(format!(
-            "[idm] kind = \"pinocchio\" of '{task}' gives one torque a controllable joint, in the order {}, but the actuators drive {}; \
-             give each of these joints one motor, in that order, or take kind = \"learned\"",
+            "[idm] kind = \"pinocchio\" of '{task}' gives one torque a controllable joint ({}), but the actuators drive {}; \
+             give each of these joints one motor, or take kind = \"learned\"",
             joints.join(", "),
             driven.join(", ")
         )));
     }
-    let controllable = layout.controllable();
-    let of = |k: usize| drives[controllable[k]];
-    for (k, a) in spec.actuators.iter().enumerate().filter(|(k, _)| of(*k) != Drive::Effort) {
-        let gains = env.sim().model().gains(k).filter(|_| a.gear == 1.0);
-        let fits = match (of(k), gains) {
+    let motors = Motors::new(&model, controllable, &drives)
+        .map_err(|reason| TrainError::Settings(format!("[idm] of '{task}': {reason}")))?;
+    let commanded = controllable.iter().enumerate().filter(|(_, dof)| drives[**dof] != Drive::Effort);
+    for (k, &dof) in commanded {
+        let a = &spec.actuators[motors.place(k)];
+        let gains = env.sim().model().gains(motors.place(k)).filter(|_| a.gear == 1.0);
+        let fits = match (drives[dof], gains) {
             (Drive::Pd { stiffness, damping }, Some([gain, by_q, by_v])) => {
                 (gain, by_q, by_v) == (stiffness, -stiffness, -damping)
             }
@@ -102,23 +105,13 @@ fn check_motors(manifest: &Manifest, env: &dyn Env) -> Result<(), TrainError> {
             return Err(TrainError::Settings(format!(
                 "[command] of '{task}' sends '{}' commands to joint '{}', but actuator '{}' is none for them; write <position kp=\"K\" kv=\"D\"> \
                  with the stiffness and damping of the task file (<velocity kv=\"D\"> for 'velocity'), or another interface",
-                of(k).name(),
+                drives[dof].name(),
                 a.joint,
                 a.name
             )));
         }
     }
-    let motors = spec.actuators.iter().enumerate().filter(|(k, _)| of(*k) == Drive::Effort).map(|(_, a)| a);
-    match motors.into_iter().find(|a| a.gear != 1.0 || !a.is_plain) {
-        None => Ok(()),
-        Some(a) => Err(TrainError::Settings(format!(
-            "[idm] kind = \"pinocchio\" of '{task}' gives torques, but actuator '{}' of joint '{}' {}; \
-             write <motor gear=\"1\"> with the joint's torque [N m or N] as its ctrlrange, or take kind = \"learned\"",
-            a.name,
-            a.joint,
-            if a.is_plain { format!("has gear {}", a.gear) } else { "is no plain <motor>".into() }
-        ))),
-    }
+    Ok(())
 }
 
 pub(super) fn check_reward(task: &Task) -> Result<(), TrainError> {

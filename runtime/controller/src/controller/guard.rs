@@ -1,6 +1,7 @@
 //! The guard: an action that no projected state led to becomes one that such a state leads to.
 
 use super::parts::unusable;
+use crate::motors::Motors;
 use crate::snapshot::{Manifest, SnapshotError};
 use nearl_constraints::drive::{Arrival, Held};
 use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposal, StateLayout, Target};
@@ -21,6 +22,7 @@ pub(super) struct Guard {
     dofs: Vec<usize>,
     /// By dof (nv).
     drives: Vec<Drive>,
+    motors: Motors,
     pub(super) proposal: Proposal,
     /// Configuration index of each dof that is a joint of its own.
     single: Vec<Option<usize>>,
@@ -40,7 +42,8 @@ impl Guard {
     pub(super) fn new(m: &Manifest, model: &Model, layout: &StateLayout) -> Result<Guard, SnapshotError> {
         let dofs = layout.controllable().to_vec();
         let drives = super::Parts::drives(m, model, &dofs)?;
-        check_actions(m, model, &dofs, &drives)?;
+        let motors = super::Parts::motors(model, &dofs, &drives)?;
+        check_actions(m, model, &dofs, &drives, &motors)?;
         let projector = super::Parts::guard_projector(m, model, &dofs)?;
         let nv = model.nv();
         let single = (0..nv).map(|i| {
@@ -54,6 +57,7 @@ impl Guard {
             held: vec![Held::Force(0.0); nv],
             tau: vec![0.0; nv],
             drives,
+            motors,
             a: vec![0.0; nv],
             step: vec![0.0; nv],
             on: nearl_constraints::Dynamics::new(model),
@@ -77,10 +81,11 @@ impl Guard {
         if hold && self.is_moved(next) {
             self.a.copy_from_slice(&next.acceleration);
             self.dynamics.drive(&mut self.a, &mut self.tau);
-            for (action, &i) in action.iter_mut().zip(&self.dofs) {
+            for (k, &i) in self.dofs.iter().enumerate() {
                 let iq = self.single[i].unwrap_or(0);
                 let to = Arrival { q: next.q[iq], v: next.v[i], a: self.a[i], tau: self.tau[i] };
-                *action = self.drives[i].command(self.dynamics.period(), q[iq], v[i], &to);
+                let command = self.drives[i].command(self.dynamics.period(), q[iq], v[i], &to);
+                action[self.motors.place(k)] = self.motors.action(k, command);
             }
         }
     }
@@ -89,9 +94,10 @@ impl Guard {
     fn foresee(&mut self, q: &[f64], v: &[f64], action: &[f64]) {
         let period = *self.dynamics.period();
         let (t, kappa) = (period.dt, period.kappa);
-        for (&i, action) in self.dofs.iter().zip(action) {
+        for (k, &i) in self.dofs.iter().enumerate() {
             let at = q[self.single[i].unwrap_or(0)];
-            self.held[i] = self.drives[i].held(&period, at, v[i], *action);
+            let command = self.motors.command(k, action[self.motors.place(k)]);
+            self.held[i] = self.drives[i].held(&period, at, v[i], command);
         }
         self.dynamics.accelerate(&self.held, &mut self.a);
         for i in 0..v.len() {
@@ -124,7 +130,13 @@ impl Guard {
 }
 
 /// Each controllable joint needs a motor of known strength, which the action is the force of.
-fn check_actions(m: &Manifest, model: &Model, dofs: &[usize], drives: &[Drive]) -> Result<(), SnapshotError> {
+fn check_actions(
+    m: &Manifest,
+    model: &Model,
+    dofs: &[usize],
+    drives: &[Drive],
+    motors: &Motors,
+) -> Result<(), SnapshotError> {
     let refuse = |reason: String| Err(unusable(&reason));
     let of_force = |i: &usize| matches!(drives[*i], Drive::Effort | Drive::Pd { .. });
     if m.task.constraints.torque.is_none() && dofs.iter().any(of_force) {
@@ -140,9 +152,9 @@ fn check_actions(m: &Manifest, model: &Model, dofs: &[usize], drives: &[Drive]) 
             dofs.len()
         ));
     }
-    let motors = dofs.iter().zip(m.action_lower.iter().zip(&m.action_upper));
-    for (&i, (lower, upper)) in motors.filter(|(i, _)| drives[**i] == Drive::Effort) {
-        let (effort, most) = (model.effort_limit()[i], upper.max(-lower));
+    for (k, &i) in dofs.iter().enumerate().filter(|(_, i)| drives[**i] == Drive::Effort) {
+        let ends = [&m.action_lower, &m.action_upper].map(|range| motors.command(k, range[motors.place(k)]));
+        let (effort, most) = (model.effort_limit()[i], ends[0].abs().max(ends[1].abs()));
         if (most - effort).abs() > 1e-9 * effort.max(1.0) {
             return refuse(format!(
                 "[constraints] guard = true needs actions in N m or N, but that of joint '{}' goes to {most} and its motor to {effort}; write \

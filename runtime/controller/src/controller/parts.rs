@@ -1,6 +1,7 @@
 //! What a controller is built from, and the checks that a snapshot fits it.
 
 use super::Half;
+use crate::motors::Motors;
 use crate::snapshot::{Manifest, Networks, PolicyKind, SnapshotError};
 use crate::task::{IdmInput, IdmKind};
 use nearl_constraints::{
@@ -71,6 +72,14 @@ impl Parts {
     /// As [`Parts::new`].
     pub fn drives(m: &Manifest, model: &Model, controllable: &[usize]) -> Result<Vec<Drive>, SnapshotError> {
         m.task.command.drives(model, controllable).map_err(|e| unusable(&e))
+    }
+
+    /// The motors of the controllable joints, whose commands `drives` (nv) names.
+    ///
+    /// # Errors
+    /// As [`Parts::new`].
+    pub fn motors(model: &Model, controllable: &[usize], drives: &[Drive]) -> Result<Motors, SnapshotError> {
+        Motors::new(model, controllable, drives).map_err(|e| unusable(&e))
     }
 
     fn projector_of(
