@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Our stages beside other solvers on the same problems, in turns, in thread CPU time; writes the table of results/qp/README.md.
-# Needs python3.11, a C compiler and the network: the other solvers are fetched for this comparison alone, into target/qp.
+# Needs Python 3.11, a C compiler and the network: the other solvers are fetched for this comparison alone, into target/qp.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 root=$(cd "$here/../../.." && pwd)
@@ -16,10 +16,9 @@ venv/bin/python -m pip install --quiet --disable-pip-version-check --requirement
 # DAQP in C, from its source distribution, with the flags of its own setup.py and with those of this processor.
 version=0.11.0 sha256=2f27baf18d2acca14186498e651b34e0bed455627e777d3fd8ba655e7e40f920
 if [ ! -d "daqp-$version" ]; then
-  url=$(curl -sSf https://pypi.org/simple/daqp/ | grep -o "https://[^\"#]*daqp-$version.tar.gz" | head -1)
-  curl -sSf -o daqp.tar.gz "$url"
-  echo "$sha256  daqp.tar.gz" | sha256sum --check --quiet
-  tar xf daqp.tar.gz
+  venv/bin/python -m pip download --quiet --no-deps --no-build-isolation --no-binary daqp --dest . "daqp==$version"
+  echo "$sha256  daqp-$version.tar.gz" | sha256sum --check --quiet
+  tar xf "daqp-$version.tar.gz"
 fi
 flags="-O3 -fassociative-math -fno-signed-zeros -fno-trapping-math"
 sources=daqp-$version/csrc
