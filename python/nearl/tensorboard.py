@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from nearl.report.read import ReadError, read_run
+from nearl.runs import ReadError, read_run
 
 STEPS = "time/total_timesteps"
 

@@ -50,7 +50,7 @@ def test_the_figure_has_every_task_algorithm_and_seed(swept: Path) -> None:
     runs = sweep.read_sweep(swept)
     assert len(runs) == 18 and sweep.algorithms(runs) == ["ppo", "nearl", "pid2-ib"], "the paper's order"
     figure = sweep.figure(runs)
-    panels = np.array(figure.axes).reshape(2, 2)  # no cost, no third row
+    panels = np.array(figure.axes).reshape(3, 2)  # no cost, no fourth row
     assert {axes.get_title(loc="left") for axes in panels[0]} == {"Hopper-v5", "HalfCheetah-v5"}
     for axes in panels[0]:
         assert len(axes.lines) == 3 * (3 + 1), "a thin line a seed and one for their mean"
@@ -58,7 +58,8 @@ def test_the_figure_has_every_task_algorithm_and_seed(swept: Path) -> None:
     for axes in panels[1]:
         assert axes.get_yscale() == "log" and any(line.get_linestyle() != "-" for line in axes.lines), "the threshold"
     found = [run.column("rollout/ep_rew_mean") for run in runs if (run.task, run.algo) == ("Hopper-v5", "ppo")]
-    thick = [line for line in panels[0, list(a.get_title(loc="left") for a in panels[0]).index("Hopper-v5")].lines if line.get_alpha() is None][0]
+    hopper = next(panel for panel in panels[0] if panel.get_title(loc="left") == "Hopper-v5")
+    thick = next(line for line in hopper.lines if line.get_alpha() is None)
     np.testing.assert_allclose(thick.get_ydata(), curves.over_seeds(found).centre)
     plt.close(figure)
 
@@ -70,8 +71,9 @@ def test_the_command_writes_a_page_and_a_picture(swept: Path, tmp_path: Path) ->
     assert page.count("data:image/png") == 1 and not re.search(r"(src|href)=\"(?!data:)", page)
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     row = next(r for r in sweep.table(sweep.read_sweep(swept)) if r[0] == "Hopper-v5, pid2-ib")
-    ends = [np.mean(r.column("rollout/ep_rew_mean")[1][-10:]) for r in sweep.read_sweep(swept) if (r.task, r.algo) == ("Hopper-v5", "pid2-ib")]
-    assert row[1] == "3" and float(row[3]) == pytest.approx(curves.interquartile_mean(ends), abs=0.06) and row[3] in page
+    found = [r.column("rollout/ep_rew_mean") for r in sweep.read_sweep(swept) if (r.task, r.algo) == ("Hopper-v5", "pid2-ib")]
+    assert row[1] == "3" and float(row[3]) == pytest.approx(curves.over_seeds(found).centre[-1], abs=0.06) and row[3] in page
+    assert row[7] == "0.00 %", "no target of the synthetic runs is outside"
     with pytest.raises(ReadError, match="holds no run with metrics"):
         report.build(out, sweeps=[tmp_path])
 
@@ -85,8 +87,8 @@ def test_costs_have_their_own_row(tmp_path: Path) -> None:
         rows = "\n".join(f"{1000 * i},{i},{i if task == 'with' else 0}" for i in range(1, 5))
         (run / "metrics.csv").write_text(f"time/total_timesteps,rollout/ep_rew_mean,rollout/ep_cost_mean\n{rows}\n")
     figure = sweep.figure(sweep.read_sweep(tmp_path))
-    assert len(figure.axes) == 6 and [len(axes.lines) for axes in figure.axes[4:]] == [1, 0]
-    assert sweep.table(sweep.read_sweep(tmp_path))[0][-1] == "2.5"
+    assert len(figure.axes) == 4 and [len(axes.lines) for axes in figure.axes[2:]] == [1, 0]
+    assert sweep.table(sweep.read_sweep(tmp_path))[0][-1] == "4.0", "where the curve ends"
     plt.close(figure)
 
 

@@ -1,5 +1,6 @@
 """The report from a synthetic run: what must be in it, and what is said where something is missing."""
 
+import json
 import re
 import subprocess
 import sys
@@ -35,16 +36,50 @@ def test_everything_is_in_one_file(inputs, tmp_path) -> None:
     html, words = page.read_text(), text_of(page)
     assert not re.search(r"(src|href)=\"(?!data:)", html), "nothing is fetched"
     assert "<script" not in html and "url(" not in html
-    assert html.count("data:image/png") == 7
-    for part in ("HalfCheetah-v5, pid2-ib", "21.00 %", "4116.7", "95 % bootstrap", "threshold", "Rows that hold the target back", "later than the control period", "Which stage of the projector answered", "Always zero: slack", "overruns", "9.1", "320.0", "velocity 0.012", "8,123", "swapped in", "refused"):
+    assert html.count("data:image/png") == 8
+    for part in (
+        "HalfCheetah-v5, pid2-ib",
+        "21.00 %",
+        "4116.7",
+        "95 % bootstrap",
+        "threshold",
+        "Rows that hold the target back",
+        "later than the control period",
+        "Which stage of the projector answered",
+        "Always zero: slack",
+        "overruns",
+        "9.1",
+        "320.0",
+        "velocity 0.012",
+        "8,123",
+        "swapped in",
+        "refused",
+    ):
         assert part in words or part in html, part
 
 
-def test_what_is_missing_is_said(inputs, tmp_path) -> None:
-    words = text_of(report.build(tmp_path / "r.html", runs=inputs["runs"][3:4]))
-    assert "No flight log was given" in words and "learned no inverse model" in words and "project nothing" in words
-    words = text_of(report.build(tmp_path / "r.html", logs=inputs["logs"]))
-    assert words.count("No run folder was given") == 3
+def test_what_was_not_measured_has_no_section(inputs, tmp_path) -> None:
+    def sections(**given) -> list[str]:
+        return re.findall("<h2>(.*?)</h2>", report.build(tmp_path / "r.html", **given).read_text())
+
+    assert sections(runs=inputs["runs"][3:4]) == ["Results", "Learning"], "plain PPO projects nothing and learns no inverse model"
+    assert sections(logs=inputs["logs"]) == ["Results", "Flight panda.mcap"]
+
+
+def test_the_first_screen_is_the_promise_in_three_numbers(inputs, tmp_path) -> None:
+    page = report.build(tmp_path / "r.html", **inputs).read_text()
+    first = page[: page.index("<h2>")]
+    shown = re.findall(r"<strong[^>]*>(.*?)</strong>", first)
+    told = json.loads(inputs["evals"][0].read_text())
+    (e,) = [e for e in (told if isinstance(told, list) else told["evaluations"]) if e["mode"] == "projected"][:1]
+    share = {kind: f"{100 * e[f'{kind}_violations'] / e['ticks']:.2f} %" for kind in ("raw", "target", "reached")}
+    assert shown == [share["raw"], share["target"], share["reached"]] and first.count("data:image/png") == 1
+
+
+def test_settings_of_a_loop_are_a_table_and_no_raw_json(tmp_path) -> None:
+    log = synthetic.flight_log(tmp_path / "long.mcap", 300, {"dt": "0.001", "settings": json.dumps({"key": "x" * 900})})
+    page = report.build(tmp_path / "r.html", logs=[log]).read_text()
+    assert "<details>" in page and "Metadata:" not in page and "x" * 301 not in page
 
 
 def test_the_command(inputs, tmp_path) -> None:

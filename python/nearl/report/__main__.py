@@ -3,6 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 from nearl.report.build import build
 from nearl.report.read import ReadError
@@ -11,7 +12,7 @@ from nearl.report.read import ReadError
 def main(arguments: list[str] | None = None) -> int:
     """Writes the report; 0 on success, 1 with one sentence on standard error otherwise."""
     parser = argparse.ArgumentParser(prog="python -m nearl.report", description="One HTML page about runs and flights.")
-    several = {"action": "extend", "nargs": "+", "type": Path, "default": []}
+    several: dict[str, Any] = {"action": "extend", "nargs": "+", "type": Path, "default": []}
     parser.add_argument("sweeps", metavar="DIR", nargs="*", type=Path, help="folders of many runs, as 'nearl sweep' makes them: one figure, also as a PNG")
     parser.add_argument("--run", metavar="RUN_FOLDER", help="run folders of 'nearl train'; seeds of one task and algorithm share a curve", **several)
     parser.add_argument("--log", metavar="FILE.mcap", help="flight logs of 'nearl run --log'", **several)

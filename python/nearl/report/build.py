@@ -1,7 +1,6 @@
-"""The page: tables and figures in order, a sentence where there is nothing to show."""
+"""The page: the promise in three numbers and a picture, then tables and figures of what was measured."""
 
 import html
-import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,23 +9,33 @@ import numpy as np
 
 from nearl._core import __version__
 from nearl.report import flight, sweep, training
+from nearl.report.promise import promise
 from nearl.report.read import Log, ReadError, Run, Summary, read_json, read_log, read_run
 from nearl.report.style import image
 
 Paths = Iterable[str | Path]
 
 CSS = """
-:root { color-scheme: light; }
-body { font: 15px/1.55 system-ui, "Segoe UI", Roboto, sans-serif; color: #1d2939; background: #f9fafb; margin: 0; }
-main { max-width: 1040px; margin: 0 auto; padding: 2.2rem 1.4rem 4rem; }
+:root { color-scheme: light dark; --ink: #1d2939; --soft: #475467; --page: #f9fafb; --card: #fff; --line: #e4e7ec; --good: #067647; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e6e9ef; --soft: #a3adbd; --page: #12161d; --card: #1b212b; --line: #333c4a; --good: #4cc38a; }
+  figure { background: #fff; } figure figcaption { color: #475467; }
+}
+* { box-sizing: border-box; }
+body { font: 15px/1.55 system-ui, "Segoe UI", Roboto, sans-serif; color: var(--ink); background: var(--page); margin: 0; }
+main { max-width: 1120px; margin: 0 auto; padding: 2.2rem 1.4rem 4rem; overflow-wrap: anywhere; }
 h1 { font-size: 1.7rem; margin: 0 0 .2rem; } h2 { font-size: 1.2rem; margin: 2.4rem 0 .6rem; }
-h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; color: #475467; }
-p.lead, figcaption { color: #475467; } p.none { color: #667085; font-style: italic; }
-figure { margin: .8rem 0 1.4rem; background: #fff; border: 1px solid #e4e7ec; border-radius: 8px; padding: .8rem; }
+h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; color: var(--soft); }
+p.lead, figcaption, details { color: var(--soft); }
+.promise { display: grid; grid-template-columns: repeat(auto-fit, minmax(220px, 1fr)); gap: .8rem; margin: 1rem 0; }
+.promise div { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: .7rem 1rem; }
+.promise strong { display: block; font-size: 1.75rem; line-height: 1.25; } .promise .good { color: var(--good); }
+figure { margin: .8rem 0 1.4rem; background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: .8rem; }
 figure img { max-width: 100%; height: auto; display: block; margin: 0 auto; } figcaption { font-size: .87rem; margin-top: .5rem; }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; background: #fff; font-variant-numeric: tabular-nums; font-size: .92rem; }
-th, td { padding: .38rem .8rem; border-bottom: 1px solid #e4e7ec; text-align: right; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } th { color: #475467; font-weight: 600; border-bottom: 2px solid #d0d5dd; }
+table { width: 100%; border-collapse: collapse; background: var(--card); font-variant-numeric: tabular-nums; font-size: .87rem; }
+th, td { padding: .35rem .5rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: bottom; overflow-wrap: break-word; }
+th:first-child, td:first-child { text-align: left; min-width: 9em; } th { color: var(--soft); font-weight: 600; border-bottom-width: 2px; }
+td.words { text-align: left; }
 """
 
 
@@ -64,13 +73,12 @@ def build(
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     sections = [("All runs", _sweep(swept, out.with_suffix(".png")))] if swept else []
-    if trained or flights or programs:
-        sections += _sections(trained, programs, flights)
-    body = "".join(f"<section><h2>{html.escape(name)}</h2>{content}</section>" for name, content in sections)
+    sections += _sections(trained, programs, flights)
+    body = "".join(f"<section><h2>{html.escape(name)}</h2>{content}</section>" for name, content in sections if content)
     page = (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{html.escape(title)}</title><style>{CSS}</style></head><body><main><h1>{html.escape(title)}</h1>"
-        f'<p class="lead">{html.escape(_about(swept + trained, flights))}</p>{body}</main></body></html>\n'
+        f'<p class="lead">{html.escape(_about(swept + trained, flights))}</p>{_first_screen(trained, programs, flights)}{body}</main></body></html>\n'
     )
     out.write_text(page, encoding="utf-8")
     return out
@@ -79,15 +87,26 @@ def build(
 def _sweep(runs: list[Run], picture: Path) -> str:
     figure = sweep.figure(runs)
     figure.savefig(picture, dpi=170, facecolor="white")
-    return image(figure, sweep.CAPTION) + _table("At the end: means over the last ten rows of a run", sweep.HEAD, sweep.table(runs))
+    return image(figure, sweep.CAPTION) + _table("At the last step that all seeds have, where the curves end", sweep.HEAD, sweep.table(runs))
+
+
+def _first_screen(trained: list[Run], programs: list[Summary], flights: list[Log]) -> str:
+    """The promise in three measured numbers, and the picture of a flight in which the projection had work."""
+    cards = "".join(
+        f'<div><strong class="{"good" if good else ""}">{html.escape(number)}</strong>{html.escape(words)}</div>'
+        for number, words, good in promise(trained, programs, flights)
+    )
+    picture = next((drawn for log in flights if (drawn := flight.states(log, at_most=2))), "")
+    return (f'<div class="promise">{cards}</div>' if cards else "") + picture
 
 
 def _sections(trained: list[Run], programs: list[Summary], flights: list[Log]) -> list[tuple[str, str]]:
+    """What was measured; a section without content is left out."""
     return [
         ("Results", _results(trained, programs, flights)),
-        ("Learning", _or_sentence(training.learning_curves(trained), trained, "No run folder was given (--run).", "The runs given have no finished episodes.")),
-        ("Inverse dynamics", _or_sentence(training.idm_loss(trained), trained, "No run folder was given (--run).", "The runs given learned no inverse model.")),
-        ("Constraints while training", _or_sentence(training.violations(trained), trained, "No run folder was given (--run).", "The runs given project nothing.")),
+        ("Learning", "".join(training.learning_curves(trained))),
+        ("Inverse dynamics", "".join(training.idm_loss(trained))),
+        ("Constraints while training", "".join(training.violations(trained))),
         *_flights(flights),
     ]
 
@@ -102,21 +121,13 @@ def _about(runs: list[Run], logs: list[Log]) -> str:
     return " ".join(parts) + f" nearl {__version__}."
 
 
-def _or_sentence(figures: list[str], given: list[Any], none: str, empty: str) -> str:
-    return "".join(figures) or _none(empty if given else none)
-
-
-def _none(sentence: str) -> str:
-    return f'<p class="none">{html.escape(sentence)}</p>'
-
-
 def _results(runs: list[Run], programs: list[Summary], logs: list[Log]) -> str:
     parts = []
     if evaluations := [e for p in programs for e in p.evaluations]:
         head = ["episodes without exploration", "mode", "return", "episodes", "raw proposals outside", "targets outside", "reached outside"]
         parts.append(_table("Return and broken limits [share of ticks]", head, [_evaluation_row(*e) for e in evaluations]))
     if runs:
-        head = ["training", "seed", "steps", "return at the end", "raw proposals outside", "targets outside", "steps/s"]
+        head = ["training", "seed", "steps", "return at the end", "raw proposals outside", "targets outside", "reached outside", "steps/s"]
         parts.append(_table("Trainings", head, [_run_row(run) for run in runs]))
     loops = [_loop_row(*loop) for p in programs for loop in p.loops] or [_log_row(log) for log in logs]
     if loops:
@@ -126,7 +137,7 @@ def _results(runs: list[Run], programs: list[Summary], logs: list[Log]) -> str:
         head = ["loop", "by raw proposals", "by projected targets", "by the robot", "robot's largest excess"]
         parts.append(_table("Limits broken in the loop [count over joints and ticks]", head, broken))
     if receipts := [_receipt_row(*r) for p in programs for r in p.receipts]:
-        parts.append(_table("Snapshots pushed while it ran", ["loop", "version", "verdict", "words"], receipts))
+        parts.append(_table("Snapshots pushed while it ran", ["loop", "version", "verdict", "words"], receipts, words=3))
     return "".join(parts)
 
 
@@ -134,7 +145,8 @@ def _evaluation_row(name: str, e: dict[str, Any]) -> list[str]:
     returns = np.asarray(e["returns"], float)
     spread = f" ± {returns.std():.1f}" if len(returns) > 1 else ""
     mean = f"{returns.mean():.1f}{spread}" if len(returns) else "–"
-    return [name, str(e["mode"]), mean, str(len(returns)), *(_share(e.get(k), e.get("ticks")) for k in ("raw_violations", "target_violations", "reached_violations"))]
+    kinds = ("raw_violations", "target_violations", "reached_violations")
+    return [name, str(e["mode"]), mean, str(len(returns)), *(_share(e.get(k), e.get("ticks")) for k in kinds)]
 
 
 def _run_row(run: Run) -> list[str]:
@@ -143,13 +155,14 @@ def _run_row(run: Run) -> list[str]:
         return None if found is None else float(np.mean(found[1][-10:]))
 
     end = training.final_return(run)
-    raw, target, fps = last("constraints/raw_violations"), last("constraints/target_violations"), last("time/fps")
+    shares = [last(f"constraints/{kind}_violations") for kind in ("raw", "target", "reached")]
+    fps = last("time/fps")
     return [
         f"{run.task}, {run.algo}",
         "–" if run.seed is None else str(run.seed),
         "–" if end is None else f"{end[1]:,.0f}",
         "–" if end is None else f"{end[0]:.1f}",
-        *("–" if x is None else f"{100 * x:.2f} %" for x in (raw, target)),
+        *("–" if x is None else f"{100 * x:.2f} %" for x in shares),
         "–" if fps is None else f"{fps:,.0f}",
     ]
 
@@ -193,22 +206,32 @@ def _count(n: float | None) -> str:
     return "–" if n is None or not np.isfinite(n) else f"{int(n):,}"
 
 
-def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], words: int | None = None) -> str:
+    """A table; the column ``words`` holds sentences."""
     cells = "".join(f"<th>{html.escape(h)}</th>" for h in head)
-    lines = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    return f'<h3>{html.escape(caption)}</h3><div class="scroll"><table><thead><tr>{cells}</tr></thead><tbody>{lines}</tbody></table></div>'
+
+    def line(row: Sequence[str]) -> str:
+        return "".join(f'<td class="words">{html.escape(c)}</td>' if i == words else f"<td>{html.escape(c)}</td>" for i, c in enumerate(row))
+
+    lines = "".join(f"<tr>{line(row)}</tr>" for row in rows)
+    return f"<h3>{html.escape(caption)}</h3><table><thead><tr>{cells}</tr></thead><tbody>{lines}</tbody></table>"
 
 
 def _flights(logs: list[Log]) -> list[tuple[str, str]]:
-    if not logs:
-        return [("Flight", _none("No flight log was given (--log): no constraint timeline, no states, no latency."))]
     sections = []
     for log in logs:
         picture, sentence = flight.timeline(log)
-        parts = [picture or _none(sentence), flight.states(log) or _none("No tick of this flight had a target."), flight.ledger(log), flight.latency(log)]
+        parts = [picture or f'<p class="lead">{html.escape(sentence)}</p>', flight.states(log) or "", flight.ledger(log), flight.latency(log)]
         modes = {mode: log.mode.count(mode) for mode in sorted(set(log.mode))}
         words = ", ".join(f"{n:,} {mode}" for mode, n in modes.items())
-        metadata = f" Metadata: {json.dumps(log.metadata, ensure_ascii=False)[:400]}" if log.metadata else ""
-        lead = f'<p class="lead">{html.escape(f"Ticks by mode: {words}.{metadata}")}</p>'
-        sections.append((f"Flight {log.path.name}", lead + "".join(parts)))
+        lead = f'<p class="lead">Ticks by mode: {html.escape(words)}.</p>'
+        sections.append((f"Flight {log.path.name}", lead + "".join(parts) + _settings(log)))
     return sections
+
+
+def _settings(log: Log) -> str:
+    """What the loop was started with, folded away."""
+    if not log.metadata:
+        return ""
+    rows = [[key, value if len(value) <= 300 else value[:300] + " …"] for key, value in sorted(log.metadata.items())]
+    return f"<details><summary>Settings of the loop</summary>{_table('', ['name', 'value'], rows, words=1)}</details>"

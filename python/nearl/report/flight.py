@@ -29,7 +29,8 @@ def timeline(log: Log) -> tuple[str | None, str]:
     figure, axes = plt.subplots(figsize=(10.2, 1.25 + 0.23 * len(names)))
     low, high = np.nanpercentile(values, [2, 99.5])
     low = max(low, high * 1e-4, 1e-12)
-    norm = LogNorm(low, max(high, low * 1.5))
+    high = max(high, low * 1.5)
+    norm = LogNorm(low, high)
     mesh = axes.pcolormesh(edges, np.arange(len(names) + 1), values, cmap="viridis_r", norm=norm, rasterized=True)
     axes.set_yticks(np.arange(len(names)) + 0.5, names)
     axes.set(xlabel="time [s]", title="Active constraints")
@@ -39,7 +40,7 @@ def timeline(log: Log) -> tuple[str | None, str]:
     axes.invert_yaxis()
     bar = figure.colorbar(mesh, ax=axes, label=rows.meaning, pad=0.012, aspect=max(8, 1.6 * len(names)))
     bar.ax.yaxis.set_major_formatter(lambda x, _: f"{x:g}")
-    bar.ax.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if norm.vmax < 20 * norm.vmin else "")
+    bar.ax.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if high < 20 * low else "")
     left_out = f" The {len(rows.names) - len(busy)} least busy rows are left out." if len(busy) < len(rows.names) else ""
     caption = f"Rows that hold the target back, coloured by how hard they are leaned on (white: not active; arrow: which bound).{left_out}"
     return image(figure, caption), ""
@@ -55,11 +56,16 @@ def _binned(values: Floats) -> Floats:
     return np.where(np.isfinite(binned), binned, np.nan)
 
 
-def states(log: Log) -> str | None:
+def has_targets(log: Log) -> bool:
+    """Whether any tick of the flight had a target."""
+    return bool(np.isfinite(log.target_v).any())
+
+
+def states(log: Log, at_most: int = JOINTS_AT_MOST) -> str | None:
     """Predicted, projected and reached position and velocity of the joints that were moved most."""
-    if not np.isfinite(log.target_v).any():
+    if not has_targets(log):
         return None
-    chosen, window = _joints(log), _window(log)
+    chosen, window = _joints(log, at_most), _window(log)
     names = log.names(log.target_v.shape[1])
     shift = log.target_q.shape[1] - log.target_v.shape[1]
     figure, panels = plt.subplots(
@@ -78,7 +84,10 @@ def states(log: Log) -> str | None:
     figure.legend(handles, labels, loc="outside upper right", ncols=3)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
-    caption = f"What the policy predicted for the end of each tick, what the projection made of it, and where the robot got to, {time[0]:.2f} s to {time[-1]:.2f} s: the ticks in which the projection had most to do."
+    caption = (
+        "What the policy predicted for the end of each tick, what the projection made of it, and where the robot got to, "
+        f"{time[0]:.2f} s to {time[-1]:.2f} s: the ticks in which the projection had most to do."
+    )
     return image(figure, caption)
 
 
@@ -102,12 +111,12 @@ def _moved(log: Log) -> Floats:
     return np.nan_to_num(np.abs(log.proposal_v - log.target_v))
 
 
-def _joints(log: Log) -> NDArray[np.intp]:
+def _joints(log: Log, at_most: int) -> NDArray[np.intp]:
     """The busiest joints in their order; those that move where none was projected."""
     distance = _moved(log).mean(axis=0)
     if not distance.any():
         distance = np.nan_to_num(np.nanstd(log.v, axis=0))
-    return np.sort(np.argsort(-distance, kind="stable")[:JOINTS_AT_MOST])
+    return np.sort(np.argsort(-distance, kind="stable")[:at_most])
 
 
 def _window(log: Log) -> slice:
@@ -140,7 +149,8 @@ def ledger(log: Log) -> str:
     end = max(log.time[-1], log.dt)
     if share:
         seen = _binned(np.array(share, float))
-        first.pcolormesh(np.linspace(0, end, seen.shape[1] + 1), np.arange(len(used) + 1), np.where(seen > 0, seen, np.nan), cmap="Blues", vmin=0, vmax=1.3, rasterized=True)
+        edges, shares = np.linspace(0, end, seen.shape[1] + 1), np.where(seen > 0, seen, np.nan)
+        first.pcolormesh(edges, np.arange(len(used) + 1), shares, cmap="Blues", vmin=0, vmax=1.3, rasterized=True)
     label = [f"{names[k] if k < len(names) else f'stage {k}'} {100 * s.mean():.3g} %" for k, s in zip(used, share, strict=True)]
     first.set_yticks(np.arange(len(used)) + 0.5, label)
     first.set_title("Ledger of the projection")
@@ -156,7 +166,11 @@ def ledger(log: Log) -> str:
     panels[-1, 0].set(xlabel="time [s]", xlim=(0, end))
     quiet = [key for key, _ in numbers if not np.nan_to_num(log.columns[key]).any()]
     zero = f" Always zero: {', '.join(quiet)}." if quiet else ""
-    return image(figure, f"Which stage of the projector answered (share of ticks), and the largest of each moment: distance between proposal and target, excess of soft limits as a share of their size, iterations.{zero}")
+    caption = (
+        "Which stage of the projector answered (share of ticks), and the largest of each moment: distance between proposal and target, "
+        f"excess of soft limits as a share of their size, iterations.{zero}"
+    )
+    return image(figure, caption)
 
 
 def latency(log: Log) -> str:
@@ -174,7 +188,8 @@ def latency(log: Log) -> str:
         label = f"{name}: p50 {p50:.1f}, p99 {p99:.1f}, max {np.nanmax(x):.1f} µs"
         axes.hist(x, bins=bins, color=colour, alpha=0.6, label=label)
     axes.axvline(deadline, color=DEADLINE, linewidth=1.5)
-    axes.annotate(f"deadline {deadline:g} µs", (deadline, 1), xycoords=("data", "axes fraction"), xytext=(-5, -4), textcoords="offset points", color=DEADLINE, ha="right", va="top")
+    place = {"xycoords": ("data", "axes fraction"), "xytext": (-5, -4), "textcoords": "offset points", "ha": "right", "va": "top"}
+    axes.annotate(f"deadline {deadline:g} µs", (deadline, 1), color=DEADLINE, **place)
     axes.set(xscale="log", yscale="log", xlabel="time [µs]", ylabel="ticks", title="Latency", xlim=(low, high))
     axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
     figure.legend(loc="outside upper right", ncols=2)

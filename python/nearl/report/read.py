@@ -1,11 +1,9 @@
-"""Run folders, flight logs and JSON summaries as arrays."""
+"""Flight logs and JSON summaries as arrays."""
 
-import csv
 import io
 import json
 import re
 import struct
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,59 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nearl import _core
+from nearl.runs import ReadError, Run, json_of, read_run
 
 Floats = NDArray[np.float64]
-
-
-class ReadError(ValueError):
-    """A file that is not what it was given as."""
-
-
-@dataclass
-class Run:
-    """One training."""
-
-    path: Path
-    task: str
-    algo: str
-    seed: int | None
-    metrics: dict[str, Floats]
-
-    def column(self, name: str) -> tuple[Floats, Floats] | None:
-        """Steps and values of a metric where it has values; None where it has none."""
-        steps, values = self.metrics.get("time/total_timesteps"), self.metrics.get(name)
-        if steps is None or values is None:
-            return None
-        good = np.isfinite(steps) & np.isfinite(values)
-        return (steps[good], values[good]) if good.any() else None
-
-
-def read_run(path: Path) -> Run:
-    """``task.toml``, ``env.json`` and ``metrics.csv`` of a run folder; the first two may be missing."""
-    file = path / "metrics.csv"
-    if not file.is_file():
-        raise ReadError(f"'{path}' is not a run folder: it has no metrics.csv; give a folder written by 'nearl train'")
-    with file.open(newline="") as text:
-        rows = list(csv.reader(text))
-    if not rows or not rows[0]:
-        raise ReadError(f"'{file}' is empty; the training stopped before its first update")
-    header, rows = rows[0], [row for row in rows[1:] if len(row) == len(rows[0])]  # the last row may be half written
-    metrics = {name: np.array([_number(row[i]) for row in rows]) for i, name in enumerate(header)}
-    host = _json(path / "env.json") if (path / "env.json").is_file() else {}
-    task = path.parent.name
-    if (path / "task.toml").is_file():
-        task = tomllib.loads((path / "task.toml").read_text()).get("name", task)
-    named = re.fullmatch(r"(.+)_(\d+)", path.name)
-    algo = host.get("algo") or (named[1] if named else path.name)
-    seed = host.get("seed", int(named[2]) if named else None)
-    return Run(path, task or "task", algo, seed, metrics)
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return float("nan")
+__all__ = ["Log", "ReadError", "Run", "Summary", "read_json", "read_log", "read_run"]
 
 
 @dataclass
@@ -191,7 +140,7 @@ class Summary:
 
 def read_json(path: Path) -> Summary:
     """Everything known in a JSON file, whatever it is wrapped in: ``nearl eval|run|demo --json``."""
-    content, name = _json(path), path.stem
+    content, name = json_of(path), path.stem
     found = Summary(
         list(_find(content, {"mode", "returns"}, name)),
         list(_find(content, {"compute", "wake", "ticks"}, name)),
@@ -200,13 +149,6 @@ def read_json(path: Path) -> Summary:
     if not (found.evaluations or found.loops):
         raise ReadError(f"'{path}' holds neither evaluation nor report of a loop; give the output of 'nearl eval --json', 'nearl run --json' or 'nearl demo'")
     return found
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise ReadError(f"'{path}' is not JSON: {error}") from error
 
 
 def _find(node: Any, keys: set[str], name: str, task: str | None = None) -> Iterator[tuple[str, dict[str, Any]]]:

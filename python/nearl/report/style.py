@@ -45,7 +45,7 @@ plt.rcParams.update(
 def steps_axis(axes: Axes) -> None:
     """Environment steps along x, as 250k or 1.5M."""
 
-    def words(x: float, _: int) -> str:
+    def words(x: float, _: float) -> str:
         for size, unit in ((1e6, "M"), (1e3, "k")):
             if abs(x) >= size:
                 return f"{x / size:g}{unit}"

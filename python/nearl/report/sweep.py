@@ -1,24 +1,26 @@
-"""Many runs in one figure: tasks side by side, return above the inverse model's loss, and the cost where a task has one."""
+"""Many runs in one figure: tasks side by side, return above the inverse model's loss, states outside the limits, and cost."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import NullFormatter, PercentFormatter
 
 from nearl import curves
 from nearl.report.read import ReadError, Run, read_run
 from nearl.report.style import CURVES, DEADLINE, steps_axis
-from nearl.report.training import band, final_return, grouped
+from nearl.report.training import band, grouped
 
 # The order in which the paper lists them; others follow.
 ORDER = ["ppo", "nearl", "pid2-gan", "pid2-ib"]
 RETURN, LOSS, COST = "rollout/ep_rew_mean", "idm/mse_after", "rollout/ep_cost_mean"
+RAW, TARGET, REACHED = (f"constraints/{kind}_violations" for kind in ("raw", "target", "reached"))
 CAPTION = (
-    "Columns: tasks. Return: mean of the last 100 training episodes, exploration included. Loss of the inverse model after each update, "
-    "with the threshold above which it is trained. Line: interquartile mean over seeds; band: 95 % bootstrap interval; thin lines: the seeds."
+    "Columns: tasks. Return: mean of the last 100 training episodes, exploration included. Loss of the inverse model after each update, with the "
+    "threshold above which it is trained. Outside: share of control periods that ended beyond a limit. "
+    "Line: interquartile mean over seeds; band: 95 % bootstrap interval; thin lines: the seeds."
 )
 
 
@@ -45,7 +47,11 @@ def algorithms(runs: list[Run]) -> list[str]:
 def figure(runs: list[Run]) -> Figure:
     """The paper's first figure from these runs."""
     tasks, names = grouped(runs), algorithms(runs)
-    rows = [(RETURN, "return"), (LOSS, "inverse model's loss")]
+    rows = [(RETURN, "return")]
+    if any(run.column(LOSS) for run in runs):
+        rows.append((LOSS, "inverse model's loss"))
+    if any(run.column(REACHED) for run in runs):
+        rows.append((REACHED, "reached states outside"))
     costly = {id(run) for run in runs if (found := run.column(COST)) is not None and found[1].max() > 0}
     if costly:
         rows.append((COST, "cost of an episode"))
@@ -58,12 +64,17 @@ def figure(runs: list[Run]) -> Figure:
                 continue
             for name, colour in zip(names, CURVES * len(names)):
                 band(panels[row, column], by_algo.get(name, []), metric, colour)
-        _threshold(panels[1, column], [run for members in by_algo.values() for run in members])
+            if metric == LOSS:
+                _threshold(panels[row, column], [run for members in by_algo.values() for run in members])
+            if metric == REACHED:
+                panels[row, column].yaxis.set_major_formatter(PercentFormatter(1.0))
+                panels[row, column].set_ylim(bottom=0)
         steps_axis(panels[-1, column])
     for row, (_, label) in enumerate(rows):
         panels[row, 0].set_ylabel(label)
     lines = [plt.Line2D([], [], color=colour, label=name) for name, colour in zip(names, CURVES * len(names))]
-    lines.append(plt.Line2D([], [], color=DEADLINE, linestyle=(0, (5, 3)), label="threshold"))
+    if any(metric == LOSS for metric, _ in rows):
+        lines.append(plt.Line2D([], [], color=DEADLINE, linestyle=(0, (5, 3)), label="threshold"))
     drawn.legend(handles=lines, loc="outside lower center", ncols=len(lines))
     return drawn
 
@@ -85,25 +96,39 @@ def _empty(axes: Axes, words: str) -> None:
     axes.set_yticks([])
 
 
-HEAD = ["task, algorithm", "seeds", "steps", "return, interquartile mean", "95 % interval", "inverse model's loss", "cost"]
+HEAD = [
+    *("task, algorithm", "seeds", "steps", "return", "95 % interval", "seeds from .. to"),
+    *("raw outside", "targets outside", "reached outside", "inverse model's loss", "cost"),
+]
 
 
 def table(runs: list[Run]) -> list[list[str]]:
-    """One line a task and algorithm: means over the last ten rows of each run, then the interquartile mean over seeds."""
+    """One line a task and algorithm: where its curve ends, the interquartile mean over seeds, its interval, and the seeds' range."""
     lines, tasks = [], grouped(runs)
     for task, by_algo in tasks.items():
         for name in algorithms([run for members in by_algo.values() for run in members]):
-            ends = [end for end in (final_return(run) for run in by_algo[name]) if end is not None]
-            returns = np.array([value for value, _ in ends])
-            words = ["–", "–", "–"]
-            if len(returns):
-                low, high = curves.bootstrap_band(returns) if len(returns) > 1 else (np.nan, np.nan)
-                interval = f"{low:.1f} .. {high:.1f}" if len(returns) > 1 else "–"
-                words = [f"{min(steps for _, steps in ends):,.0f}", f"{curves.interquartile_mean(returns):.1f}", interval]
-            lines.append([f"{task}, {name}", str(len(by_algo[name])), *words, _end(by_algo[name], LOSS, 3), _end(by_algo[name], COST, 1)])
+            members = by_algo[name]
+            words = ["–", "–", "–", "–"]
+            if (end := _end(members, RETURN)) is not None:
+                several = end.seeds.shape[0] > 1
+                interval = f"{end.low[-1]:.1f} .. {end.high[-1]:.1f}" if several else "–"
+                spread = f"{end.seeds[:, -1].min():.1f} .. {end.seeds[:, -1].max():.1f}" if several else "–"
+                words = [f"{end.steps[-1]:,.0f}", f"{end.centre[-1]:.1f}", interval, spread]
+            shares = [_number(members, metric, lambda x: f"{100 * x:.2f} %") for metric in (RAW, TARGET, REACHED)]
+            loss, cost = _number(members, LOSS, lambda x: f"{x:.3f}"), _number(members, COST, lambda x: f"{x:.1f}")
+            lines.append([f"{task}, {name}", str(len(members)), *words, *shares, loss, cost])
     return lines
 
 
-def _end(members: list[Run], metric: str, digits: int) -> str:
+def _end(members: list[Run], metric: str) -> curves.Band | None:
+    """The curve over seeds, as the figure draws it; None where there is none, or none in common."""
     found = [c for c in (run.column(metric) for run in members) if c is not None]
-    return f"{curves.interquartile_mean([values[-10:].mean() for _, values in found]):.{digits}f}" if found else "–"
+    try:
+        return curves.over_seeds(found) if found else None
+    except curves.NoCommonSteps:
+        return None
+
+
+def _number(members: list[Run], metric: str, words: Callable[[float], str]) -> str:
+    end = _end(members, metric)
+    return "–" if end is None else words(float(end.centre[-1]))

@@ -9,7 +9,7 @@ from matplotlib.ticker import NullFormatter
 
 from nearl import curves
 from nearl.report.read import Run
-from nearl.report.style import CURVES, DEADLINE, PREDICTED, PROJECTED, MUTED, image, steps_axis
+from nearl.report.style import CURVES, DEADLINE, MUTED, PREDICTED, PROJECTED, image, steps_axis
 
 Groups = dict[str, dict[str, list[Run]]]
 

@@ -1,0 +1,61 @@
+"""The promise of the first screen in three numbers, out of what was measured."""
+
+import numpy as np
+
+from nearl.report.flight import percentiles
+from nearl.report.read import Log, Run, Summary
+
+Card = tuple[str, str, bool]
+
+
+def promise(trained: list[Run], programs: list[Summary], flights: list[Log]) -> list[Card]:
+    """At most three of: proposals outside, targets outside, reached states outside, time of a tick; ``(number, words, is good)``."""
+    shares = _of_evaluations(programs) or _of_flights(flights) or _of_trainings(trained)
+    cards = [
+        (f"{100 * shares[kind]:.2f} %", words, kind != "raw" and shares[kind] == 0)
+        for kind, words in (
+            ("raw", "of raw proposals broke a limit"),
+            ("target", "of projected targets did"),
+            ("reached", "of the reached states did"),
+        )
+        if kind in shares
+    ]
+    times = _times(programs, flights)
+    if len(cards) == 3 or times is None:
+        return cards
+    return [*cards, (f"{times[0]:.0f} µs", f"99 of 100 ticks were computed within, of {times[1]}", True)]
+
+
+def _of_evaluations(programs: list[Summary]) -> dict[str, float]:
+    """The first evaluation with the projection on."""
+    for _, e in (found for p in programs for found in p.evaluations):
+        if e["mode"] == "projected" and e.get("ticks"):
+            kinds = ("raw", "target", "reached")
+            return {kind: e[f"{kind}_violations"] / e["ticks"] for kind in kinds if e.get(f"{kind}_violations") is not None}
+    return {}
+
+
+def _of_flights(flights: list[Log]) -> dict[str, float]:
+    for log in flights:
+        acted = np.isfinite(log.target_v).all(axis=1) if log.target_v.size else np.zeros(len(log), bool)
+        if acted.any():
+            return {kind: float(np.mean(log.columns[f"{kind}_violations"][acted] > 0)) for kind in ("raw", "target")}
+    return {}
+
+
+def _of_trainings(trained: list[Run]) -> dict[str, float]:
+    """Means over the last ten rows of the first training that projects."""
+    for run in trained:
+        found = {kind: run.column(f"constraints/{kind}_violations") for kind in ("raw", "target", "reached")}
+        if found["raw"] is not None:
+            return {kind: float(np.mean(column[1][-10:])) for kind, column in found.items() if column is not None}
+    return {}
+
+
+def _times(programs: list[Summary], flights: list[Log]) -> tuple[float, str] | None:
+    """p99 of the time that a tick took to compute [us], and of how much."""
+    for name, loop in (found for p in programs for found in p.loops):
+        return loop["compute"]["p99"] * 1e-3, f"the loop of {name}"
+    for log in flights:
+        return float(percentiles((log.columns["end_ns"] - log.columns["begin_ns"]) * 1e-3)[1]), f"{1e6 * log.dt:.0f} µs in a period"
+    return None
