@@ -6,9 +6,18 @@ from typing import Any
 
 import gymnasium
 
+from nearl.gymnasium_tasks import as_toml, own_sections
+
+# What is written where the reward is not known.
+EMPTY = """\
+[reward]
+nothing_yet = 0.0
+
+[termination]
+
+[reset]"""
 TEMPLATE = """\
-# {env_id} as a task file. Robot, times, actions and episode length are Gymnasium's; the reward, the start and the end of an
-# episode are Python there and must be written here, or given to nearl.make_vec as functions.
+# {env_id} as a task file. Robot, times, actions and episode length are Gymnasium's; {about}
 name = "{name}"
 
 [model]
@@ -22,12 +31,7 @@ max_episode_steps = {steps}
 [state]
 controllable = [{joints}]
 
-[reward]
-nothing_yet = 0.0
-
-[termination]
-
-[reset]
+{sections}
 
 [constraints]
 consistency = "free"
@@ -42,7 +46,8 @@ def from_gymnasium(env_id: str, folder: str | os.PathLike[str], **kwargs: Any) -
     """Writes ``<name>.toml`` and its robot file into ``folder`` for a Gymnasium environment that is built on ``MujocoEnv``.
 
     The task steps the same physics as Gymnasium, bit for bit for the same state and action, and observes all joint positions and
-    velocities. Reward, reset and termination are code in Gymnasium and do not come along: write them as expressions, which trains
+    velocities. Reward, start and end of an episode come along for InvertedPendulum, InvertedDoublePendulum, Swimmer, Reacher and Pusher (v5);
+    HalfCheetah, Hopper, Walker2d and Ant are bundled tasks. For others they are code in Gymnasium: write them as expressions, which trains
     everywhere, or pass functions to ``nearl.make_vec(file, n, reward=..., termination=...)``.
 
     Not supported: robots with meshes, actuators that do not drive a single joint within a range, wrappers, environments that move
@@ -83,6 +88,14 @@ def from_gymnasium(env_id: str, folder: str | os.PathLike[str], **kwargs: Any) -
     euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     joints = ", ".join(f'"{joint}"' for joint in dict.fromkeys(driven))
     dt = round(timestep * inner.frame_skip, 12)
-    file.write_text(TEMPLATE.format(env_id=env_id, name=name, robot=robot.name, dt=dt, sim_dt=timestep if euler else 0.0, steps=steps or 1000, joints=joints))
+    own = own_sections(inner)
+    about = (
+        "so are reward, start and end of an episode."
+        if own
+        else "the reward, the start and the end of an\n# episode are Python there and must be written here, or given to nearl.make_vec as functions."
+    )
+    times = {"dt": dt, "sim_dt": timestep if euler else 0.0, "steps": steps or 1000}
+    sections = as_toml(own) if own else EMPTY
+    file.write_text(TEMPLATE.format(env_id=env_id, name=name, robot=robot.name, joints=joints, about=about, sections=sections, **times))
     env.close()
     return file

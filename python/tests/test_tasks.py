@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -93,7 +94,8 @@ def test_functions_that_say_what_the_task_says_change_nothing(mode: AutoresetMod
 
     text = (ROOT / "tests" / "fixtures" / "hopper.toml").read_text()
     text = text.replace("[termination]\n", "").replace('low = "q.rootz <= 0.7"\n', "").replace('tilted = "abs(q.rooty) >= 0.2"\n', "")
-    text = text.replace('"clamp(v.foot_joint, -10, 10)",\n', '"clamp(v.foot_joint, -10, 10)", "q.rootx",\n').replace("dt = 0.008\n", "dt = 0.008\nmax_episode_steps = 25\n")
+    text = text.replace('"clamp(v.foot_joint, -10, 10)",\n', '"clamp(v.foot_joint, -10, 10)", "q.rootx",\n')
+    text = text.replace("dt = 0.008\n", "dt = 0.008\nmax_episode_steps = 25\n")
     file = tmp_path / "bare.toml"
     file.write_text(text)
     ours = nearl.make_vec(str(file), 4, autoreset_mode=mode, reward=reward, termination=lambda o, a, n: ~healthy(n))
@@ -156,17 +158,49 @@ def test_gymnasiums_mujoco_environments_become_task_files(env_id: str, tmp_path:
         nearl.from_gymnasium(env_id, tmp_path)
 
 
+def judged_afresh(env: gymnasium.Env, action: np.ndarray) -> float:
+    """Gymnasium's own reward function; after a step MuJoCo's places of bodies are those before its last physics step, here they are new."""
+    mujoco.mj_forward(env.model, env.data)
+    if type(env).__name__ != "InvertedDoublePendulumEnv":
+        return env._get_rew(action)[0]
+    x, _, y = env.data.site_xpos[0]
+    return env._get_rew(x, y, bool(y <= 1))[0]
+
+
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Swimmer-v5", "Reacher-v5", "Pusher-v5"])
+def test_gymnasiums_own_tasks_bring_their_rewards_and_ends(env_id: str, tmp_path: Path) -> None:
+    theirs, ours = gymnasium.make(env_id).unwrapped, nearl.Env(str(nearl.from_gymnasium(env_id, tmp_path)))
+    theirs.action_space.seed(1)
+    theirs.reset(seed=1)
+    ours.set_state(theirs.data.qpos, theirs.data.qvel)
+    ends = 0
+    for _ in range(300):
+        action = theirs.action_space.sample().astype(np.float64)
+        _, reward, terminated, _, _ = theirs.step(action)
+        _, our_reward, our_terminated, _, _ = ours.step(action)
+        if env_id in ("InvertedDoublePendulum-v5", "Reacher-v5", "Pusher-v5"):
+            reward = judged_afresh(theirs, action)
+        assert our_reward == pytest.approx(reward, abs=1e-12)
+        if terminated or our_terminated:  # a tip that crosses the line within a physics step may be seen one period apart
+            assert our_terminated == (reward <= 1)
+            ends += 1
+            theirs.reset()
+        theirs.set_state(theirs.data.qpos.copy(), theirs.data.qvel.copy())
+        ours.set_state(theirs.data.qpos, theirs.data.qvel)
+    assert ends > 0 or "Inverted" not in env_id
+    drawn = np.array([np.r_[ours.reset(seed=seed)[0], 0] for seed in range(20)])
+    assert drawn.std(axis=0).max() > 0, "episodes begin at random places"
+
+
 def test_an_environment_without_mujoco_has_no_robot(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="'CartPole-v1' is not built on Gymnasium's MujocoEnv"):
         nearl.from_gymnasium("CartPole-v1", tmp_path)
 
 
-def test_a_task_from_gymnasium_learns_once_its_reward_is_written(tmp_path: Path) -> None:
+def test_a_task_from_gymnasium_learns(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"\[reward\] of 'Humanoid' is 0 whatever happens"):
+        nearl.PID2(nearl.from_gymnasium("Humanoid-v5", tmp_path))
     file = nearl.from_gymnasium("InvertedPendulum-v5", tmp_path)
-    with pytest.raises(ValueError, match=r"\[reward\] of 'InvertedPendulum' is 0 whatever happens"):
-        nearl.PID2(file)
-    text = file.read_text().replace("nothing_yet = 0.0", "alive = 1.0").replace("[termination]\n", '[termination]\nfell = "abs(q.hinge) > 0.2"\n')
-    file.write_text(text.replace("[reset]\n", '[reset]\nposition = "0.01 * uniform"\nvelocity = "0.01 * uniform"\n'))
     seen: list[float] = []
     nearl.PID2(file, settings={"train.n_envs": 8}).learn(40_000, callback=lambda _, m: seen.append(m.get("rollout/ep_rew_mean", 0.0)))
     assert seen[1] < 100 < 200 < seen[-1], "Gymnasium's reward: 1 while it stands"
