@@ -9,10 +9,11 @@ Every machine of the cluster needs the package and sees the folder. Finished run
 
 import argparse
 import shutil
-import tomllib
 from itertools import product
 from pathlib import Path
 from typing import Any
+
+import tomllib
 
 
 def train(task: str, algo: str, seed: int, steps: int, out: str, settings: dict[str, Any]) -> tuple[str, float | None]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.render import Frame, Renderer
 
 
 class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
@@ -17,13 +18,20 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
     Args:
         task: Name of the task, one of ``nearl.tasks()``, or a task file (TOML).
+        render_mode: ``"rgb_array"`` makes :meth:`render` draw the robot, also without a screen (EGL); None draws nothing.
+        width: Of a picture [pixel].
+        height: Of a picture [pixel].
+        camera: A camera of the robot file; by default its ``track``, else one that follows the robot.
     """
 
-    metadata = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # as Gymnasium declares it
 
-    def __init__(self, task: str, render_mode: str | None = None):
-        if render_mode is not None:
-            raise ValueError(f"render_mode is '{render_mode}', but these environments do not render; leave it out")
+    def __init__(self, task: str, render_mode: str | None = None, width: int = 480, height: int = 480, camera: str | None = None):
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode is '{render_mode}'; give 'rgb_array', or leave it out")
+        self.render_mode = render_mode
+        self._picture = (width, height), camera
+        self._renderer: Renderer | None = None
         self._native = _core.Env(task)
         self._seeded = False
         low = self._native.action_low.astype(np.float32)
@@ -74,6 +82,24 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         if fault is not None:
             info["fault"] = fault
         return obs, reward, terminated, False, info
+
+    def render(self) -> Frame | None:  # type: ignore[override]
+        """The robot as a picture (height x width x 3); None without ``render_mode="rgb_array"``.
+
+        Raises:
+            VideoError: MuJoCo cannot render on this machine; the message says what is missing.
+        """
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            self._renderer = Renderer(self._native, *self._picture)
+        return self._renderer.frame(self._native.qpos, self._native.qvel)
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
     def set_state(self, qpos: ArrayLike, qvel: ArrayLike) -> NDArray[np.float64]:
         """Begins an episode at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention; returns the observation."""

@@ -10,17 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nearl import _core
 from nearl.pid2 import PID2
-
-Frame = NDArray[np.uint8]
-
-
-class VideoError(RuntimeError):
-    """No video can be made here; the message says what is missing."""
+from nearl.render import Frame, Renderer, VideoError
 
 
 def record(
@@ -77,24 +69,16 @@ def record(
 def _frames(
     agent: PID2, env: _core.Env, episodes: int, seconds: float | None, stride: int, size: tuple[int, int], camera: str | None, seed: int
 ) -> Iterator[Frame]:
-    model, scene, renderer = _renderer(env, size)
-    import mujoco
-
+    renderer = Renderer(env, size, camera)
     if seconds is not None and seconds <= 0:
         raise ValueError(f"seconds is {seconds}; give a time above 0")
     limit = env.max_episode_steps if seconds is None else min(env.max_episode_steps, round(seconds / env.dt))
-    view = _camera(mujoco, model, camera)
     try:
         for episode in range(episodes):
             obs, state, start = env.reset(seed + episode), None, True
             for step in range(limit):
                 if step % stride == 0:
-                    scene.qpos[:], scene.qvel[:] = env.qpos, env.qvel
-                    mujoco.mj_forward(model, scene)
-                    renderer.update_scene(scene, view)
-                    if model.ngeom == 0:
-                        _skeleton(mujoco, model, scene, renderer.scene)
-                    yield renderer.render()
+                    yield renderer.frame(env.qpos, env.qvel)
                 action, state = agent.predict(obs, state, start)
                 obs, _, _, terminated, _ = env.step(action)
                 start = False
@@ -102,45 +86,6 @@ def _frames(
                     break
     finally:
         renderer.close()
-
-
-def _renderer(env: _core.Env, size: tuple[int, int]) -> tuple[Any, Any, Any]:
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    backend = os.environ["MUJOCO_GL"]
-    try:
-        import mujoco
-
-        model = mujoco.MjModel.from_xml_string(env.model_text)
-        model.vis.global_.offwidth, model.vis.global_.offheight = size
-        return model, mujoco.MjData(model), mujoco.Renderer(model, size[1], size[0])
-    except Exception as error:  # each missing library fails in its own way, from AttributeError to EGLError
-        words = str(error).strip().splitlines() or [type(error).__name__]
-        advice = "on Debian: apt install libegl1 libegl-mesa0 libgl1-mesa-dri" if backend == "egl" else "try MUJOCO_GL=egl"
-        raise VideoError(f"MuJoCo cannot render with MUJOCO_GL={backend} ({words[0]}); {advice}") from error
-
-
-def _camera(mujoco: Any, model: Any, name: str | None) -> Any:
-    names = [model.camera(i).name for i in range(model.ncam)]
-    if name is not None and name not in names:
-        raise VideoError(f"the robot has no camera '{name}'; it has {', '.join(names) or 'none'}")
-    if name is not None or "track" in names:
-        return name or "track"
-    view = mujoco.MjvCamera()
-    view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, model.nbody - 1)
-    view.distance, view.azimuth, view.elevation = 2.0 * model.stat.extent, 120.0, -15.0
-    return view
-
-
-def _skeleton(mujoco: Any, model: Any, state: Any, scene: Any) -> None:
-    """A robot file without shapes (a URDF stripped of its meshes) is drawn as capsules between its bodies."""
-    for body in range(2, model.nbody):
-        ends = state.xpos[model.body_parentid[body]], state.xpos[body]
-        if scene.ngeom < scene.maxgeom and np.linalg.norm(ends[1] - ends[0]) > 1e-6:
-            geom = scene.geoms[scene.ngeom]
-            colour = np.array([0.85, 0.45, 0.2, 1.0], np.float32)
-            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, np.zeros(3), np.zeros(3), np.zeros(9), colour)
-            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.03, *ends)
-            scene.ngeom += 1
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -154,9 +99,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--camera", help="a camera of the robot file")
     parser.add_argument("--seed", type=int, default=0)
-    given = vars(parser.parse_args(arguments))
+    given: dict[str, Any] = vars(parser.parse_args(arguments))
+    given["size"] = tuple(given["size"])
     try:
-        n = record(given.pop("run"), given["out"], **{k: tuple(v) if k == "size" else v for k, v in given.items() if k != "out"})
+        n = record(given["run"], given["out"], **{k: v for k, v in given.items() if k not in ("run", "out")})
     except (VideoError, OSError, ValueError) as error:
         print(f"nearl.video: {error}", file=sys.stderr)
         return 1

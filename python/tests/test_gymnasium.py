@@ -7,6 +7,7 @@ from conftest import LOCOMOTION
 from gymnasium.utils.env_checker import check_env
 
 import nearl
+import nearl.render
 
 STEPS = 1000
 
@@ -89,3 +90,32 @@ def test_reset_options_place_the_robot() -> None:
 def test_gymnasium_makes_our_vector_by_its_own_name() -> None:
     vec = gymnasium.make_vec("nearl/Hopper-v5", num_envs=3, vectorization_mode="vector_entry_point")
     assert isinstance(vec.unwrapped, nearl.VecEnv) and vec.reset(seed=0)[0].shape == (3, 11)
+
+
+def drawn(env: gymnasium.Env) -> np.ndarray:
+    try:
+        return env.render()
+    except nearl.render.VideoError as error:
+        pytest.skip(str(error))
+
+
+def test_an_environment_draws_its_state() -> None:
+    env = gymnasium.make("nearl:nearl/Hopper-v5", render_mode="rgb_array", width=160, height=120)
+    env.reset(seed=0)
+    first = drawn(env)
+    assert first.shape == (120, 160, 3) and first.dtype == np.uint8 and first.std() > 5
+    assert np.array_equal(drawn(env), first)
+    qpos = env.unwrapped.qpos.copy()
+    env.unwrapped.set_state(qpos + [0, 0, 0.5, 0.3, -0.5, 0.3], np.zeros(6))
+    assert (drawn(env) != first).any(axis=2).mean() > 0.02, "the robot moved in the picture"
+    env.close()
+    with pytest.raises(ValueError, match="give 'rgb_array'"):
+        nearl.Env("Hopper-v5", render_mode="human")
+
+
+def test_libraries_that_ask_for_pictures_first_get_their_environments() -> None:
+    """SB3's make_vec_env hands `render_mode` to every constructor."""
+    one = {"render_mode": "rgb_array"}
+    envs = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("nearl:nearl/HalfCheetah-v5", **one) for _ in range(4)])
+    obs, _ = envs.reset(seed=0)
+    assert obs.shape == (4, 17) and not np.array_equal(obs[0], obs[1])

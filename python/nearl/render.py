@@ -1,0 +1,81 @@
+"""Pictures of a robot through MuJoCo's own renderer, on a machine without a screen."""
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nearl import _core
+
+Frame = NDArray[np.uint8]
+
+
+class VideoError(RuntimeError):
+    """No picture can be made here; the message says what is missing."""
+
+
+class Renderer:
+    """Draws a task's robot.
+
+    Args:
+        env: The native environment, whose robot is drawn.
+        size: Width and height [pixel].
+        camera: A camera of the robot file; by default its ``track``, else one that follows the robot.
+
+    Raises:
+        VideoError: no renderer here, or no such camera.
+    """
+
+    def __init__(self, env: _core.Env, size: tuple[int, int], camera: str | None = None):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+        backend = os.environ["MUJOCO_GL"]
+        try:
+            import mujoco
+
+            self._mujoco = mujoco
+            self._model = mujoco.MjModel.from_xml_string(env.model_text)
+            self._model.vis.global_.offwidth, self._model.vis.global_.offheight = size
+            self._data = mujoco.MjData(self._model)
+            self._renderer = mujoco.Renderer(self._model, size[1], size[0])
+        except Exception as error:  # each missing library fails in its own way, from AttributeError to EGLError
+            words = str(error).strip().splitlines() or [type(error).__name__]
+            advice = "on Debian: apt install libegl1 libegl-mesa0 libgl1-mesa-dri" if backend == "egl" else "try MUJOCO_GL=egl"
+            raise VideoError(f"MuJoCo cannot render with MUJOCO_GL={backend} ({words[0]}); {advice}") from error
+        self._view = self._camera(camera)
+
+    def frame(self, qpos: ArrayLike, qvel: ArrayLike) -> Frame:
+        """The robot at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention, as a picture (height x width x 3)."""
+        self._data.qpos[:], self._data.qvel[:] = qpos, qvel
+        self._mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data, self._view)
+        if self._model.ngeom == 0:
+            self._skeleton(self._renderer.scene)
+        return self._renderer.render().copy()
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self._renderer.close()
+
+    def _camera(self, name: str | None) -> Any:
+        names = [self._model.camera(i).name for i in range(self._model.ncam)]
+        if name is not None and name not in names:
+            raise VideoError(f"the robot has no camera '{name}'; it has {', '.join(names) or 'none'}")
+        if name is not None or "track" in names:
+            return name or "track"
+        view = self._mujoco.MjvCamera()
+        view.type, view.trackbodyid = self._mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, self._model.nbody - 1)
+        view.distance, view.azimuth, view.elevation = 2.0 * self._model.stat.extent, 120.0, -15.0
+        return view
+
+    def _skeleton(self, scene: Any) -> None:
+        """A robot file without shapes (a URDF stripped of its meshes) is drawn as capsules between its bodies."""
+        capsule = self._mujoco.mjtGeom.mjGEOM_CAPSULE
+        for body in range(2, self._model.nbody):
+            ends = self._data.xpos[self._model.body_parentid[body]], self._data.xpos[body]
+            if scene.ngeom < scene.maxgeom and np.linalg.norm(ends[1] - ends[0]) > 1e-6:
+                geom = scene.geoms[scene.ngeom]
+                colour = np.array([0.85, 0.45, 0.2, 1.0], np.float32)
+                self._mujoco.mjv_initGeom(geom, capsule, np.zeros(3), np.zeros(3), np.zeros(9), colour)
+                self._mujoco.mjv_connector(geom, capsule, 0.03, *ends)
+                scene.ngeom += 1
