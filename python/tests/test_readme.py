@@ -1,4 +1,5 @@
-"""Every command and every example of README.md runs. `make` itself is what runs the tests, so its lines are not repeated."""
+"""Every command and every example of README.md and of the pages in docs/ runs. `make` itself is what runs the tests, so its lines are
+not repeated."""
 
 import re
 import subprocess
@@ -9,14 +10,16 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 NEARL = ROOT / "target/release/nearl"
 
 
 def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+    found = [(page.stem, block) for page in PAGES for block in re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL)]
+    return [pytest.param(block, id=f"{page}: {block.strip().splitlines()[0][:60]}") for page, block in found]
 
 
-@pytest.mark.parametrize("block", blocks("sh"), ids=lambda b: b.strip().splitlines()[0][:60])
+@pytest.mark.parametrize("block", blocks("sh"))
 def test_commands(block, tmp_path):
     if not NEARL.exists():
         pytest.fail(f"{NEARL} was not built: run 'make build'")
@@ -38,3 +41,18 @@ def test_every_command_line_is_covered():
     targets = set(re.findall(r"^    make (\w+)", README, re.MULTILINE))
     makefile = (ROOT / "Makefile").read_text()
     assert targets and all(re.search(rf"^{t}:", makefile, re.MULTILINE) for t in targets)
+
+
+EXAMPLES = sorted((ROOT / "examples" / "python").glob("*.py"))
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_python_examples(example, tmp_path):
+    assert len(example.read_text().splitlines()) < 60
+    arguments = {"record_video": [str(tmp_path)], "sb3_vec_env": ["4096"]}.get(example.stem, [])
+    if example.stem == "sb3_vec_env":
+        pytest.importorskip("stable_baselines3")
+    run = subprocess.run([sys.executable, example, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0 and run.stdout, run.stderr
+    if example.stem == "record_video":
+        assert [file.suffix for file in tmp_path.iterdir()].count(".mp4") == 1
