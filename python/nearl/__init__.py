@@ -70,7 +70,7 @@ __all__ = [
 try:
     import gymnasium as _gymnasium  # noqa: F401
 except ImportError:  # the extra [train] is not installed
-    def __getattr__(name: str):
+    def __getattr__(name: str) -> object:
         if name in ("Env", "Guard", "ProjectedEnv", "VecEnv", "from_gymnasium", "make_vec", "register"):
             raise ImportError(f"nearl.{name} needs Gymnasium: pip install 'nearl[train]'")
         raise AttributeError(f"module 'nearl' has no attribute '{name}'")

@@ -17,7 +17,7 @@ _Status = Literal["unchanged", "clamped", "solved", "slowed", "recovering", "bra
 
 def tasks() -> list[tuple[str, str]]: ...
 def nearest_action(
-    asked: Sequence[float], trial: ArrayLike, slope: ArrayLike, lower: ArrayLike, upper: ArrayLike
+    asked: ArrayLike, trial: ArrayLike, slope: ArrayLike, lower: ArrayLike, upper: ArrayLike
 ) -> _Floats: ...
 
 class ActiveRow(TypedDict):

@@ -51,10 +51,11 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
         import mujoco
 
         super().__init__(env)
-        inner = env.unwrapped
+        inner: Any = env.unwrapped
         missing = [name for name in ("model", "data", "frame_skip") if not hasattr(inner, name)]
         if missing or not isinstance(env.action_space, gymnasium.spaces.Box):
-            raise ValueError(f"{inner} is no MuJoCo environment with continuous actions (no {', '.join(missing) or 'box of actions'}); give one built on MujocoEnv")
+            lacks = ", ".join(missing) or "box of actions"
+            raise ValueError(f"{inner} is no MuJoCo environment with continuous actions (no {lacks}); give one built on MujocoEnv")
         self._mujoco, self._model, self._frame_skip = mujoco, inner.model, inner.frame_skip
         self._ahead = mujoco.MjData(self._model)
         self._ctrl = ctrl or (lambda action: action)

@@ -24,16 +24,18 @@ def project(projector: nearl.Projector) -> Callable[[Any, Any, Any, Any], tuple[
         raise ValueError(f"the model has {model.nq} positions for {model.nv} velocities; gradients need joints with one each")
 
     def forward(*arrays: Any) -> tuple[np.ndarray, np.ndarray]:
-        targets = projector.project_batch(*(np.asarray(x, dtype=np.float64) for x in arrays))
+        q, v, q_proposal, v_proposal = (np.asarray(x, dtype=np.float64) for x in arrays)
+        targets = projector.project_batch(q, v, q_proposal, v_proposal)
         return targets.q.astype(arrays[2].dtype), targets.v.astype(arrays[3].dtype)
 
     def backward(*arrays: Any) -> tuple[np.ndarray, np.ndarray]:
-        dq, dv = projector.vjp_batch(*(np.asarray(x, dtype=np.float64) for x in arrays))
+        q, v, q_proposal, v_proposal, q_bar, v_bar = (np.asarray(x, dtype=np.float64) for x in arrays)
+        dq, dv = projector.vjp_batch(q, v, q_proposal, v_proposal, q_bar, v_bar)
         return dq.astype(arrays[2].dtype), dv.astype(arrays[3].dtype)
 
     def call(function: Callable[..., Any], *arrays: Any) -> tuple[jax.Array, jax.Array]:
         shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays[2:4])
-        return jax.pure_callback(function, shapes, *arrays, vmap_method="sequential")  # type: ignore[return-value]
+        return jax.pure_callback(function, shapes, *arrays, vmap_method="sequential")
 
     @jax.custom_vjp
     def projected(q: Any, v: Any, q_proposal: Any, v_proposal: Any) -> tuple[jax.Array, jax.Array]:

@@ -84,7 +84,9 @@ class PID2:
         stays, and is written where there is a run folder.
         """
         if self._training is None:
-            raise ValueError("a policy loaded from a snapshot file predicts and does not learn: the file has no optimiser state; load a run folder, or make a new PID2")
+            raise ValueError(
+                "a policy loaded from a snapshot file predicts and does not learn: the file has no optimiser state; load a run folder, or make a new PID2"
+            )
         if total_timesteps < 1:
             raise ValueError(f"total_timesteps is {total_timesteps}; ask for at least one step")
         callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]

@@ -20,7 +20,7 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     Args: see :func:`nearl.make_vec`.
     """
 
-    metadata = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(
         self, task: str | os.PathLike[str], constraints: str | os.PathLike[str] = "task", actions: str = "state", render_mode: str | None = None

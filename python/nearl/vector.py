@@ -21,8 +21,8 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
     """``num_envs`` environments of one task, stepped natively on all cores with the interpreter released.
 
     Environment ``i`` behaves as a single one that was seeded with ``seed + i``. ``info`` holds, where there is something to say and
-    with the mask ``_<key>``: ``final_obs`` (same-step mode), ``fault``; ``cost`` where the task has one; and with ``constraints`` always: ``raw_violations`` and
-    ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit) and ``moved``.
+    with the mask ``_<key>``: ``final_obs`` (same-step mode), ``fault``; ``cost`` where the task has one; and with ``constraints`` always:
+    ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit) and ``moved``.
 
     Args: see :func:`make_vec`.
     """
@@ -58,7 +58,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         self._over = np.zeros(num_envs, bool)  # whose next step only begins an episode
         self.metadata = {"autoreset_mode": mode, "render_modes": []}
         # Torques as Gymnasium's float32; a proposed state keeps its digits.
-        dtype = np.float32 if constraints is None else np.float64
+        dtype: Any = np.float32 if constraints is None else np.float64
         low, high = self._native.action_low.astype(dtype), self._native.action_high.astype(dtype)
         self.single_action_space = Box(low, high, dtype=dtype)
         self.single_observation_space = Box(-np.inf, np.inf, (self._native.n_obs,), np.float64)
@@ -77,7 +77,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         self._obs, self._over = obs.copy(), np.zeros(self.num_envs, bool)
         return obs, {}
 
-    def step(self, actions: ArrayLike) -> Step:
+    def step(self, actions: ArrayLike) -> Step:  # type: ignore[override]  # flags are booleans
         """One action (num_envs x n_act) each; an environment whose episode ended begins a new one, see the autoreset mode."""
         if self._reward is None and self._termination is None:
             return self._native.step(actions)

@@ -15,12 +15,25 @@ use crate::limits;
 use crate::model::Model;
 use crate::target::{Target, Targets};
 
-/// Projects proposed next states. Safe to share between threads; projections of one object then wait for each other.
+/// Projects proposed next states: the nearest state at the end of a period that every limit allows.
 ///
-/// `dt`: control period [s]. `controllable`: joints it may move (all). `sub_steps`: how the plant moves within a period: n semi-implicit
-/// Euler steps of a simulator (1, as MuJoCo's Euler with one step a period), or 0 for constant acceleration: a real robot, or Runge-Kutta.
-/// `velocity_weight`: weights of the dofs in the distance (nv, 1 each). `braking`: "certified" or "stored", `consistency`, `solver`: see
-/// docs/LIMITS.md. `deadline`: Clarabel gives up after this time [s].
+/// "Nearest" is the smallest sum over the joints of `w² ((v' - v_proposal)² + ((q' - q_proposal) / (kappa dt))²)`: positions are divided by a
+/// period so that both are velocities. `kappa` is 1 with one physics step a period and 1/2 at constant acceleration.
+///
+/// Safe to share between threads; projections of one object then wait for each other.
+///
+/// Args:
+///     model (Model): the robot, with nq positions and nv velocities.
+///     limits (list[Limit]): what must hold; a limit that is not given does not.
+///     dt (float): control period [s].
+///     controllable (list[str] | None): names of the joints that may be moved; all by default.
+///     consistency ("kinematic" | "free"): position and velocity belong together, or are clamped apart.
+///     solver ("ladder" | "clarabel"): closed form, then active set, then Clarabel; or Clarabel at once.
+///     sub_steps (int): how the plant moves within a period: n semi-implicit Euler steps of a simulator (1, as MuJoCo's Euler with one step
+///         a period), or 0 for constant acceleration: a real robot, or Runge-Kutta.
+///     velocity_weight (list[float] | None): w of each velocity (nv), from 0.001 to 1000; 1 each by default.
+///     braking ("certified" | "stored"): what makes sure that a way to stop is left; see docs/LIMITS.md.
+///     deadline (float | None): time after which Clarabel gives up [s].
 #[pyclass(module = "nearl._core", frozen)]
 pub(crate) struct Projector {
     model: Py<Model>,
@@ -103,8 +116,18 @@ impl Projector {
         })
     }
 
-    /// The nearest next state to `(q_proposal, v_proposal)` from the state `(q, v)`. `previous`: acceleration and motor force (nv each)
-    /// of the tick before, `(target.acceleration, tau)`: without it, limits on jerk and on the rate of torque do not hold in this tick.
+    /// The nearest next state to `(q_proposal, v_proposal)` from the state `(q, v)`.
+    ///
+    /// Args:
+    ///     q (nq): measured configuration [rad, m], Pinocchio's convention.
+    ///     v (nv): measured velocity [rad/s, m/s].
+    ///     q_proposal (nq): configuration wanted at the end of the period.
+    ///     v_proposal (nv): velocity wanted at the end of the period.
+    ///     previous: acceleration (nv) [rad/s²] and motor force (nv) [N m, N] of the tick before, `(target.acceleration, tau)`: without it,
+    ///         limits on jerk and on the rate of torque do not hold in this tick.
+    ///
+    /// Returns:
+    ///     Target: `q` (nq), `v` (nv), `acceleration` (nv), and the ledger's fields (`status`, `active`, `moved`, ...).
     #[pyo3(signature = (q, v, q_proposal, v_proposal, previous=None))]
     fn project(
         &self,

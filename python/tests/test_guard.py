@@ -6,8 +6,8 @@ import pytest
 gymnasium = pytest.importorskip("gymnasium")
 mujoco = pytest.importorskip("mujoco")
 
-import nearl
-from nearl._core import nearest_action
+import nearl  # noqa: E402
+from nearl._core import nearest_action  # noqa: E402
 
 LIMITS = {"position": {}, "velocity": {"limit": 25.0}}
 

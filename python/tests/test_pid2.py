@@ -3,12 +3,12 @@
 import _thread
 import signal
 import threading
-import tomllib
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+import tomllib
 from conftest import ROOT
 
 import nearl

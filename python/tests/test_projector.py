@@ -154,7 +154,7 @@ def test_feasible_proposals_pass_bit_for_bit(model, rng, dt, n) -> None:
 def test_the_problem_it_states_is_the_problem_it_solves(model, rng) -> None:
     projector = make(model, 1e-3, 1)
     for problem, q_hat, v_hat in cases(model, rng, 50, 1e-3, 1):
-        H, c, G, h, A, _ = projector.problem(problem.q, problem.v, q_hat, v_hat)
+        H, c, G, h, *_ = projector.problem(problem.q, problem.v, q_hat, v_hat)
         optimum = problem.solve(q_hat, v_hat)
         if optimum is None:
             continue

@@ -26,7 +26,7 @@ pub(super) struct Demo {
     /// Seconds each robot runs.
     #[arg(long, default_value = "10", value_parser = nearl_runtime::cli::seconds)]
     seconds: f64,
-    /// Python that draws the report; `.venv/bin/python` where it exists, else `python3`.
+    /// Python that draws the report; by default that of the package this command came with, else `.venv/bin/python`, else `python3`.
     #[arg(long)]
     python: Option<PathBuf>,
     /// Print JSON.
@@ -107,9 +107,9 @@ impl Demo {
 
     fn report(&self, summary: &Path, shows: &[Value]) -> Result<PathBuf, Failure> {
         let out = self.out.join("report.html");
-        let venv = Path::new(".venv/bin/python");
-        let python =
-            self.python.clone().unwrap_or_else(|| if venv.exists() { venv.into() } else { "python3".into() });
+        let venv = || Some(PathBuf::from(".venv/bin/python")).filter(|python| python.exists());
+        let package = || std::env::var_os("NEARL_PYTHON").map(PathBuf::from);
+        let python = self.python.clone().or_else(package).or_else(venv).unwrap_or_else(|| "python3".into());
         let mut command = Command::new(&python);
         command.args(["-m", "nearl.report", "--summary"]).arg(summary).arg("--out").arg(&out);
         for run in self.runs.iter().filter(|r| r.is_dir()) {
@@ -125,7 +125,7 @@ impl Demo {
             let why = String::from_utf8_lossy(&run.stderr);
             let last = why.trim().lines().last().unwrap_or("no message").to_string();
             return Err(format!(
-                "'{} -m nearl.report' failed: {last}; install the package with 'make setup' or give --python",
+                "'{} -m nearl.report' failed: {last}; install the package with 'make package' or give --python",
                 python.display()
             )
             .into());

@@ -7,9 +7,11 @@ use crate::{run_folder, tasks};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use nearl_runtime::link::RobotName;
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 #[derive(Args)]
 pub(super) struct Train {
@@ -117,9 +119,10 @@ impl Train {
             (None, None) => Experience::Here,
         };
         let bar = bar(self.json, run.steps);
-        let (mut last, mut faults) = (None, 0);
+        let (mut last, mut faults, mut lines) = (None, 0, Lines::new(self.json));
         let report = |p: &Progress, _| {
             show(&bar, self.json, p);
+            lines.show(p, run.steps);
             faults += p.tally.faults;
             last = Some((p.steps, p.seconds, p.return_mean));
             !stop.load(Ordering::Relaxed)
@@ -176,6 +179,31 @@ impl Train {
             ));
         }
         Ok(())
+    }
+}
+
+/// Time between two lines of a training that no bar shows.
+const BETWEEN_LINES: Duration = Duration::from_secs(30);
+
+/// A line now and then where there is no terminal, so that a log shows how far the training is.
+struct Lines {
+    /// When the next is due; `None` where a bar or JSON shows it.
+    due: Option<Instant>,
+}
+
+impl Lines {
+    fn new(json: bool) -> Lines {
+        let silent = json || std::io::stderr().is_terminal();
+        Lines { due: (!silent).then(|| Instant::now() + BETWEEN_LINES) }
+    }
+
+    fn show(&mut self, p: &Progress, steps: u64) {
+        let now = Instant::now();
+        if self.due.is_some_and(|due| now >= due) {
+            self.due = Some(now + BETWEEN_LINES);
+            let speed = p.steps as f64 / p.seconds;
+            eprintln!("{} of {steps} steps, {}, {speed:.0} steps/s", p.steps, returned(p.return_mean, ""));
+        }
     }
 }
 
