@@ -320,7 +320,7 @@ impl Model {
 
 fn text_of(path: &Path) -> Result<String, ModelError> {
     let fail = |reason: String| ModelError::Unreadable { path: PathBuf::from(path), reason };
-    let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
+    let text = crate::read_text(path).map_err(|e| fail(e.to_string()))?;
     if text.trim().is_empty() { Err(fail("the file is empty".to_string())) } else { Ok(text) }
 }
 

@@ -87,8 +87,11 @@ def test_the_loop_runs_on_while_python_holds_its_lock(tmp_path: Path) -> None:
     with log.open("rb") as file:
         messages = make_reader(file).iter_messages(topics=["tick"])
         ticks = [json.loads(message.data) for _, _, message in messages]
-    inside = [tick for tick in ticks if begin < tick["begin_ns"] < finish]
-    # How many of the 1000 fit depends on the machine; that it goes on, not.
-    assert len(inside) > 100, f"{len(inside)} ticks while the lock was held"
+    starts = np.array([tick["begin_ns"] for tick in ticks])
+    inside = ((starts > begin) & (starts < finish)).sum() / (finish - begin)
+    # How many ticks a second the machine makes is its own affair; that they are as many as without the lock, not.
+    free = starts[(starts < begin) | (starts > finish)]
+    outside = len(free) / (starts[-1] - starts[0] - (finish - begin))
+    assert inside > 0.8 * outside, f"{inside * 1e9:.0f} ticks a second while the lock was held, {outside * 1e9:.0f} without"
     assert report["modes"]["fault"] == 0 and report["counters"]["projected_violations"] == 0, report
     assert moved["violations"]["torque"] == 0, moved

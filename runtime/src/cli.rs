@@ -9,7 +9,9 @@ use clap::{Args, Subcommand};
 use crate::codes::{self, Explanation};
 use crate::link::{RobotName, bench_round_trip};
 use crate::log::replay;
-use crate::rt::{FaultPlan, PRIORITY, Percentiles, RunSettings, Stop, ThreadSettings, bench_wake, run};
+use crate::rt::{
+    FaultPlan, PRIORITY, Percentiles, Reason, RunSettings, Stop, ThreadSettings, bench_wake, run,
+};
 pub use limits::LimitOptions;
 
 /// Run a snapshot on a plant in real time.
@@ -23,7 +25,7 @@ pub struct RunCommand {
     /// Keep own time at this rate instead of following the plant [Hz]; must be the plant's.
     #[arg(long, value_parser = hertz)]
     pub rate: Option<f64>,
-    /// Stop after so many seconds of ticks.
+    /// Stop after so many seconds: of ticks, and at most one more of the wall's where the plant keeps real time.
     #[arg(long, value_parser = seconds)]
     pub seconds: Option<f64>,
     /// Flight log (MCAP).
@@ -32,6 +34,9 @@ pub struct RunCommand {
     /// Age at which a state is stale [s]; 5 periods, but at least 20 ms, if not given.
     #[arg(long, value_parser = seconds)]
     pub age_limit: Option<f64>,
+    /// So long without a state, and the plant is gone: the run ends with exit code 3 [s].
+    #[arg(long, value_parser = seconds, default_value_t = 5.0)]
+    pub plant_patience: f64,
     /// Time over which the first motion is let in [s]; 0 begins at once.
     #[arg(long, default_value_t = RunSettings::default().ramp)]
     pub ramp: f64,
@@ -41,6 +46,13 @@ pub struct RunCommand {
     /// Explore: act with the policy's own noise, drawn from this seed, for a trainer that learns from the loop. Every limit still holds.
     #[arg(long, value_name = "SEED")]
     pub explore: Option<u64>,
+    /// The limits of this loop, in place of its first snapshot's: a task file, or any TOML file with a section [constraints]. No
+    /// snapshot may loosen them, the first included.
+    #[arg(long = "limits", value_name = "FILE", conflicts_with = "allow_looser")]
+    pub limits_file: Option<PathBuf>,
+    /// Take snapshots that loosen the limits of the loop, too.
+    #[arg(long)]
+    pub allow_looser: bool,
     /// Rehearse the faults in this JSON file.
     #[arg(long)]
     pub faults: Option<PathBuf>,
@@ -148,6 +160,35 @@ fn hertz(text: &str) -> Result<f64, String> {
 /// Any failure, as one sentence.
 pub type Failure = Box<dyn std::error::Error + Send + Sync>;
 
+/// Exit code of a run whose plant is gone.
+pub const PLANT_GONE: u8 = 3;
+/// Exit code of a plant whose runtime is gone.
+pub const LOOP_GONE: u8 = 4;
+
+/// Exit code of a run or a plant whose shared memory was taken away.
+pub const MEMORY_TORN: u8 = 5;
+
+/// A run or a plant that ended by itself for a reason with an exit code of its own.
+#[derive(Debug, thiserror::Error)]
+#[error("`{name}`: {reason}: {} {}", .reason.explanation().meaning, .reason.explanation().remedy)]
+pub struct Ended {
+    code: u8,
+    reason: Reason,
+    name: String,
+}
+
+impl Ended {
+    /// As a failure.
+    pub fn failure(code: u8, reason: Reason, name: &str) -> Failure {
+        Box::new(Ended { code, reason, name: name.to_owned() })
+    }
+}
+
+/// The exit code that a program ends with after `failure`: 1 unless it has one of its own.
+pub fn exit_code(failure: &Failure) -> u8 {
+    failure.downcast_ref::<Ended>().map_or(1, |ended| ended.code)
+}
+
 impl RunCommand {
     /// Runs until the time is over or a signal comes, and prints the report.
     ///
@@ -171,8 +212,11 @@ impl RunCommand {
             rollback,
             explore: self.explore,
             age_limit: self.age_limit,
+            plant_patience: self.plant_patience,
             ramp: self.ramp,
             jump: self.jump,
+            limits: self.limits_file,
+            allow_looser: self.allow_looser,
             faults,
             rate: self.rate,
             seconds: self.seconds,
@@ -188,7 +232,11 @@ impl RunCommand {
         } else {
             say(report.to_string().trim_end());
         }
-        Ok(())
+        match report.reason {
+            Reason::PlantGone => Err(Ended::failure(PLANT_GONE, report.reason, &self.plant)),
+            Reason::MemoryTorn => Err(Ended::failure(MEMORY_TORN, report.reason, &self.plant)),
+            _ => Ok(()),
+        }
     }
 }
 

@@ -11,9 +11,13 @@ use serde::Serialize;
 use crate::cli::{Failure, say};
 use crate::codes::CheckCode;
 use crate::controller::{Controller, Parts};
-use crate::link::{RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, remains};
+use crate::holding;
+use crate::link::{
+    Remains, RobotMessage, RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, home_of_user,
+    remains,
+};
 use crate::rt::{PRIORITY, Pilot, Stop, ThreadSettings, bench_wake, prepare};
-use crate::snapshot::{Manifest, Snapshot, in_run};
+use crate::snapshot::{Manifest, Snapshot, SnapshotError, in_run};
 
 /// Check that a snapshot, this machine and a plant are ready.
 #[derive(Args, Debug)]
@@ -99,6 +103,17 @@ pub fn examine(file: &Path, plant: Option<&str>) -> Vec<Check> {
     checks
 }
 
+/// What the checks of a task say before it is trained: one line for each that is not as it should be, with what to change.
+///
+/// # Errors
+/// As [`Parts::new`].
+pub fn advice(manifest: &Manifest) -> Result<Vec<String>, SnapshotError> {
+    let parts = Parts::new(manifest)?;
+    let checks = [holding(manifest, &parts), braking(manifest, parts)];
+    let odd = checks.into_iter().filter(|check| check.finding != Finding::Ok);
+    Ok(odd.map(|check| format!("{} [{}]", check.text, check.code)).collect())
+}
+
 fn ok(code: CheckCode, text: String) -> Check {
     Check { check: name(code), code, finding: Finding::Ok, text, remedy: None }
 }
@@ -131,7 +146,9 @@ fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
         }
     }
     match Parts::new(&snapshot.manifest) {
-        Ok(parts) => checks.extend([notes(&parts.model), braking(&snapshot.manifest, parts)]),
+        Ok(parts) => {
+            checks.extend([notes(&parts.model), projection(m), holding(m, &parts), braking(m, parts)]);
+        }
         Err(e) => checks.push(fail(CheckCode::Braking, e.to_string())),
     }
     (Some(snapshot), checks)
@@ -142,6 +159,42 @@ fn notes(model: &Model) -> Check {
     match model.notes() {
         [] => ok(CheckCode::Model, "the model holds what the robot file describes".into()),
         notes => warn(CheckCode::Model, notes.join("; ")),
+    }
+}
+
+/// Does anything keep the limits at all?
+fn projection(m: &Manifest) -> Check {
+    match m.proposes() {
+        false => warn(
+            CheckCode::Projection,
+            "its policy is direct and not guarded: nothing is projected, so no limit of the task is kept; set constraints.guard, or train with an algorithm other than ppo".into(),
+        ),
+        true => ok(CheckCode::Projection, "every target is projected into the limits of the task".into()),
+    }
+}
+
+/// Can the motors hold the robot everywhere within its position limits?
+fn holding(m: &Manifest, parts: &Parts) -> Check {
+    let Parts { model, layout, projector } = parts;
+    let (limits, controllable) = (projector.limits(), layout.controllable());
+    if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {
+        return ok(CheckCode::Holding, "the task has no torque limit to compare gravity with".into());
+    }
+    let period = m.task.period();
+    if let Some(text) = holding::refusal(model, limits, controllable, &period) {
+        return fail(CheckCode::Holding, text);
+    }
+    let loads = holding::heaviest(model, limits, controllable, &period);
+    let share = |l: &holding::Load| l.needed / l.effort;
+    match loads.iter().max_by(|a, b| share(a).total_cmp(&share(b))) {
+        None => ok(CheckCode::Holding, "no joint has a torque limit".into()),
+        Some(l) => ok(
+            CheckCode::Holding,
+            format!(
+                "standing still takes at most {:.1} of {:.1} N m or N, at joint '{}'",
+                l.needed, l.effort, l.joint
+            ),
+        ),
     }
 }
 
@@ -157,24 +210,27 @@ fn braking(m: &Manifest, parts: Parts) -> Check {
     match certify_braking(&model, limits, controllable, &period, samples, seed) {
         Err(e) => fail(CheckCode::Braking, e.to_string()),
         Ok(c) => {
-            let (joint, margin) = (model.dof_name(c.dof), 100.0 * c.margin);
+            let joint = model.dof_name(c.dof);
             let found = format!(
-                "in the hardest of {} states '{joint}' might need {:.1} of its {:.1} N m or N to brake, margin {margin:.0} %",
+                "in the hardest of {} states '{joint}' might need {:.1} of its {:.1} N m or N to brake",
                 c.samples, c.needed, c.effort
             );
             if c.holds() {
                 return ok(CheckCode::Braking, found);
             }
             if m.task.constraints.braking == Braking::Stored {
-                let kept = "each tick verifies a way to stop before it takes a state";
-                return ok(CheckCode::Braking, format!("{found}: not certified, so {kept}"));
+                let kept = "each tick verifies a way to stop before it takes a state (constraints.braking = \"stored\")";
+                return ok(CheckCode::Braking, format!("{found}: too little, so {kept}"));
             }
-            let scale = c.scale;
+            // Rounded down: what is advised must do.
+            let scale = (100.0 * c.scale).floor() / 100.0;
+            let smaller = match scale > 0.0 {
+                true => format!(", or multiply constraints.acceleration.limit by {scale:.2} or less"),
+                false => String::new(),
+            };
             warn(
                 CheckCode::Braking,
-                format!(
-                    "{found}: multiply constraints.acceleration.limit by {scale:.2} or less, or set constraints.braking = \"stored\""
-                ),
+                format!("{found}, which is too little: set constraints.braking = \"stored\"{smaller}"),
             )
         }
     }
@@ -207,7 +263,9 @@ fn stale_links() -> Check {
         );
     }
     let kilobytes = stale.iter().map(|r| r.bytes).sum::<u64>() >> 10;
-    let names: Vec<String> = stale.iter().map(|r| format!("/dev/shm/nearl.{}.*", r.name)).collect();
+    let folder = home_of_user();
+    let name = |r: &&Remains| format!("/dev/shm/nearl.{0}.* and {1}/{0}", r.name, folder.display());
+    let names: Vec<String> = stale.iter().map(name).collect();
     warn(
         CheckCode::Links,
         format!(
@@ -250,8 +308,15 @@ fn clock() -> Check {
     warn(CheckCode::Clock, text)
 }
 
+/// Shortest control period that is tried [s].
+const SHORTEST: f64 = 2e-5;
+
 /// One second of an empty loop beside the control period `dt` [s].
 fn wake(dt: f64) -> Check {
+    if dt < SHORTEST {
+        let text = format!("the period is {dt:e} s, which no loop here keeps: give at least {SHORTEST:e} s");
+        return fail(CheckCode::WakeUp, text);
+    }
     let period = dt.min(1e-3);
     let settings = ThreadSettings { priority: Some(PRIORITY), cpu: None, lock_memory: false };
     let late = match bench_wake(period, (1.0 / period).round() as u64, settings, &Stop::new()) {
@@ -277,6 +342,41 @@ fn wake(dt: f64) -> Check {
     )
 }
 
+/// What was compared with the plant, and what it did not say.
+fn plant_found(name: &str, robot: &RobotMessage) -> Check {
+    let (mut same, mut unsaid) = (vec!["joints", "observation"], Vec::new());
+    let file = "the robot file's limits and the actuators' range";
+    if robot.limits != 0 {
+        same.push(file)
+    } else {
+        unsaid.push(file)
+    };
+    let stated = "position, velocity, acceleration and torque limits by number";
+    let found =
+        format!("`{name}` answers: its {} joints, period of {} s, ", robot.joint_names().len(), robot.dt);
+    let found = format!("{found}{} are the snapshot's", same.join(", "));
+    match robot.states_limits() {
+        true => {
+            let found = format!("{found}, and the snapshot allows no joint more than the plant: {stated}");
+            if unsaid.is_empty() {
+                return ok(CheckCode::Plant, found);
+            }
+            warn(
+                CheckCode::Plant,
+                format!("{found}; not compared, because the plant does not state them: {file}"),
+            )
+        }
+        false => {
+            unsaid.push(stated);
+            let unsaid = unsaid.join(", and ");
+            warn(
+                CheckCode::Plant,
+                format!("{found}; not compared, because the plant does not state them: {unsaid}"),
+            )
+        }
+    }
+}
+
 /// Does the plant answer, and is it the robot of the snapshot?
 fn examine_plant(name: &str, snapshot: &Snapshot) -> Check {
     let robot = RobotName::new(name).and_then(|name| {
@@ -287,14 +387,7 @@ fn examine_plant(name: &str, snapshot: &Snapshot) -> Check {
         Err(e) => fail(CheckCode::Plant, e.to_string()),
         Ok(robot) => match Pilot::new(snapshot, &robot) {
             Err(refusal) => fail(CheckCode::Plant, refusal.text),
-            Ok(_) => ok(
-                CheckCode::Plant,
-                format!(
-                    "`{name}` answers: {} joints, observation, period {} s and limits are the snapshot's",
-                    robot.joint_names().len(),
-                    robot.dt
-                ),
-            ),
+            Ok(_) => plant_found(name, &robot),
         },
     }
 }

@@ -10,6 +10,7 @@ pub mod codes;
 #[cfg(feature = "cli")]
 pub mod doctor;
 mod grid;
+pub mod holding;
 pub mod link;
 pub mod log;
 mod percentiles;

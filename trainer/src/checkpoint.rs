@@ -148,14 +148,8 @@ impl Checkpoint {
     pub fn load(path: &Path) -> Result<Self, CheckpointError> {
         let file = path.display().to_string();
         let unusable = |reason: String| CheckpointError::Unusable { file: file.clone(), reason };
-        let meta = std::fs::symlink_metadata(path).map_err(|e| unusable(e.to_string()))?;
-        if !meta.is_file() || meta.len() > MAX_BYTES {
-            return Err(unusable(format!(
-                "it is not a regular file of at most {MAX_BYTES} bytes ({} bytes)",
-                meta.len()
-            )));
-        }
-        let bytes = std::fs::read(path).map_err(|e| unusable(e.to_string()))?;
+        let bytes = nearl_runtime::constraints::read_bounded(path, MAX_BYTES, false);
+        let bytes = bytes.map_err(|e| unusable(e.to_string()))?;
         Self::from_bytes(&file, &bytes)
     }
 

@@ -77,7 +77,7 @@ pub fn read(path: &Path, floats: bool) -> Result<RobotDescription, RobotError> {
 /// [`RobotError`].
 pub fn read_mjcf(path: &Path) -> Result<RobotDescription, RobotError> {
     let unreadable = |reason: String| ModelError::Unreadable { path: path.to_path_buf(), reason };
-    let text = std::fs::read_to_string(path).map_err(|e| unreadable(e.to_string()))?;
+    let text = nearl_runtime::constraints::read_text(path).map_err(|e| unreadable(e.to_string()))?;
     if text.trim().is_empty() {
         return Err(unreadable("the file is empty".to_string()).into());
     }

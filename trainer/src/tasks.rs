@@ -142,7 +142,7 @@ fn robot_file(task: &Task, path: &Path, is_bundled: bool) -> Result<(Simulation,
     {
         return Ok((Simulation { format, text: text.to_string(), folder: None }, true));
     }
-    let text = std::fs::read_to_string(&beside).map_err(|e| TaskLoadError::Robot {
+    let text = nearl_runtime::constraints::read_text(&beside).map_err(|e| TaskLoadError::Robot {
         task: task.name.clone(),
         robot: beside.display().to_string(),
         reason: e.to_string(),

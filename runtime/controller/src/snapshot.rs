@@ -280,17 +280,8 @@ impl Snapshot {
     pub fn load(path: &Path) -> Result<Self, SnapshotError> {
         let unreadable =
             |reason: String| SnapshotError::Unreadable { file: path.display().to_string(), reason };
-        let meta = std::fs::symlink_metadata(path).map_err(|e| unreadable(e.to_string()))?;
-        if !meta.is_file() {
-            return Err(unreadable("it is not a regular file".into()));
-        }
-        if meta.len() > MAX_BYTES {
-            return Err(unreadable(format!(
-                "it has {} bytes, more than the limit of {MAX_BYTES}",
-                meta.len()
-            )));
-        }
-        Self::from_bytes(&std::fs::read(path).map_err(|e| unreadable(e.to_string()))?)
+        let bytes = nearl_constraints::read_bounded(path, MAX_BYTES, false);
+        Self::from_bytes(&bytes.map_err(|e| unreadable(e.to_string()))?)
     }
 
     /// Writes the file whole: to a name beside it, then renamed.

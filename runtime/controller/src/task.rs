@@ -212,7 +212,7 @@ impl Task {
     /// As [`Task::read`].
     pub fn read_with(path: &Path, overrides: &[String], own: OwnTime<'_>) -> Result<Self, TaskError> {
         let file = path.display().to_string();
-        let text = std::fs::read_to_string(path)
+        let text = nearl_constraints::read_text(path)
             .map_err(|e| TaskError::Unreadable { file: file.clone(), reason: e.to_string() })?;
         Self::parse_with(&file, &text, overrides, own)
     }
@@ -271,6 +271,26 @@ impl Task {
             time.dt = if time.dt.is_nan() { dt } else { time.dt };
             time.sim_dt = if time.sim_dt.is_nan() { sim_dt } else { time.sim_dt };
         }
+    }
+
+    /// The section `[constraints]` of the TOML file `path`: a task file, or one with that section alone.
+    ///
+    /// # Errors
+    /// As [`Task::read`].
+    pub fn read_constraints(path: &Path) -> Result<ConstraintSettings, TaskError> {
+        let file = path.display().to_string();
+        let text = nearl_constraints::read_text(path)
+            .map_err(|e| TaskError::Unreadable { file: file.clone(), reason: e.to_string() })?;
+        let at = |place, reason| TaskError::Invalid { file: file.clone(), place, reason };
+        let mut table: toml::Table =
+            toml::from_str(&text).map_err(|e| at(line_of(&text, e.span()), first_line(e.message())))?;
+        let Some(section) = table.remove("constraints") else {
+            return Err(at(String::new(), "it has no section [constraints]; write one".into()));
+        };
+        serde_path_to_error::deserialize(section).map_err(|e| {
+            let key = e.path().to_string();
+            at(bracket(&format!("constraints.{key}")), suggest(e.into_inner().message()))
+        })
     }
 
     /// The effective file as TOML, for the run folder.

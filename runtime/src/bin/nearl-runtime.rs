@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use nearl_runtime::cli::{ExplainCommand, LoopBench, ReplayCommand, RunCommand};
+use nearl_runtime::cli::{ExplainCommand, LoopBench, ReplayCommand, RunCommand, exit_code};
 use nearl_runtime::doctor::DoctorCommand;
 use nearl_runtime::tunnel::TunnelCommand;
 
@@ -46,7 +46,7 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("nearl-runtime: {error}");
-            ExitCode::FAILURE
+            ExitCode::from(exit_code(&error))
         }
     }
 }

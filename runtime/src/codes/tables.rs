@@ -21,6 +21,8 @@ codes! {
         Memory = "link-memory", "Shared memory has too little room.", "Free space in /dev/shm or remount it larger.";
         MemoryMissing = "link-memory-missing", "Shared memory is missing or cannot be written.",
             "Mount a writable tmpfs at /dev/shm.";
+        Foreign = "link-foreign", "A file or folder of the links is another user's, a link, a pipe, or open to others.",
+            "Find out who made it, then remove it; see docs/SECURITY.md.";
         Transport = "link-transport", "iceoryx2 failed for another reason.",
             "If no nearl process of the robot is alive, delete the files the sentence names and try again.";
     }
@@ -34,8 +36,12 @@ codes! {
         Canary = "doctor-canary", "Do trial states give finite actions?", "Use an earlier snapshot.";
         Model = "doctor-model", "Does the model hold everything that the robot file describes?",
             "Take it out of the robot file, or leave a margin for it.";
+        Projection = "doctor-projection", "Are the policy's targets projected into the limits?",
+            "Train with an algorithm that proposes states, not with `ppo`.";
+        Holding = "doctor-holding", "Can the motors hold the robot still everywhere within its position limits?",
+            "Raise constraints.torque.scale, or narrow the position limits to where the motors can.";
         Braking = "doctor-braking", "Can the motors give the decelerations that the position limits count on?",
-            "Multiply constraints.acceleration.limit by the number in the sentence, or lower constraints.velocity.scale.";
+            "Set constraints.braking = \"stored\", or multiply constraints.acceleration.limit by the number in the sentence.";
         Memory = "doctor-memory", "Is there room for the links in /dev/shm?", "Free space there or remount it larger.";
         Links = "doctor-links", "Are there links that only dead processes hold?",
             "Start the robot again, which cleans up, or delete the files the sentence names.";

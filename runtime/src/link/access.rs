@@ -105,6 +105,25 @@ impl RobotMessage {
         }
     }
 
+    /// Writes the limits of the joints, as many as a message holds.
+    pub fn set_limits(&mut self, limits: &nearl_constraints::LimitSet) {
+        self.bits |= ROBOT_LIMITS;
+        for (to, from) in [
+            (&mut self.q_lower, &limits.q_lower),
+            (&mut self.q_upper, &limits.q_upper),
+            (&mut self.velocity, &limits.velocity),
+            (&mut self.acceleration, &limits.acceleration),
+            (&mut self.effort, &limits.effort),
+        ] {
+            to.iter_mut().zip(from).for_each(|(to, from)| *to = *from);
+        }
+    }
+
+    /// True if the plant states its limits by number.
+    pub fn states_limits(&self) -> bool {
+        self.bits & ROBOT_LIMITS != 0
+    }
+
     /// True if the plant waits for the action of every state.
     pub fn is_lockstep(&self) -> bool {
         self.bits & ROBOT_LOCKSTEP != 0
@@ -132,6 +151,8 @@ nearl_controller::codes! {
         Other = "other", "Refused for the reason in the receipt's text.", "Read the text of the receipt.";
         RolledBack = "rolled-back", "Taken back after its swap: the robot no longer reached its targets, the one before is in use again.",
             "Train on with the transitions of that stretch, or raise the rollback factor if the rise was expected.";
+        Looser = "looser-limits", "Its limits, or the way it keeps them, would allow more than those fixed when the loop was started.",
+            "Train within the limits of the loop; only its operator can allow more, with `nearl run --limits FILE` or `--allow-looser`.";
     }
 }
 

@@ -49,6 +49,7 @@ fn robot() -> Robot {
         joints: names("joint").collect(),
         observation: names("q.joint").chain(names("v.joint")).collect(),
         limits: 0,
+        stated: None,
         nq: JOINTS,
         nv: JOINTS,
         nu: JOINTS,

@@ -10,11 +10,11 @@
 //! iceoryx2 0.10 has no service for this: its queue takes more than twice as long (`examples/round_trip.rs`), and its blackboard never gives
 //! the place of a killed writer to the next one.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io;
 use std::ops::Range;
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
-use std::path::{Path, PathBuf};
+use std::os::unix::fs::MetadataExt;
+use std::path::PathBuf;
 use std::ptr;
 use std::sync::atomic::{AtomicU64, Ordering, fence};
 
@@ -23,7 +23,7 @@ use rustix::io::Errno;
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 
 use super::schema::{Arrays, WORD};
-use super::{Header, LinkError, Message, RobotName, memory};
+use super::{Header, LinkError, Message, RobotName, home, memory};
 use crate::clock;
 
 /// Words between what must not share a cache line, nor the line fetched with it.
@@ -91,7 +91,7 @@ impl Drop for Memory {
 
 /// Where the file of a topic lies.
 fn path<M: Message>(name: &RobotName) -> PathBuf {
-    Path::new(memory::FOLDER).join(format!("{}newest-{}", name.prefix(), M::TOPIC))
+    name.folder().join(format!("newest-{}", M::TOPIC))
 }
 
 /// Sending end, for the owner of the topic's role. Dropping it takes the file's name away.
@@ -110,9 +110,9 @@ impl<M: Message + Arrays> Board<M> {
         let failed = |e: io::Error| name.transport(format!("make {}", path.display()), e.to_string());
         // The owner's alone: what a predecessor left half made is begun anew.
         let half = PathBuf::from(format!("{}.half", path.display()));
-        let mut options = OpenOptions::new();
-        options.read(true).write(true).create(true).truncate(true).mode(0o600);
-        let file = options.open(&half).map_err(failed)?;
+        let _ = std::fs::remove_file(&half);
+        let file = home::private().read(true).write(true).create_new(true).open(&half);
+        let file = file.map_err(|e| home::foreign(name, &half, &e))?;
         let bytes = (Memory::length::<M>() * WORD) as u64;
         fallocate(&file, FallocateFlags::empty(), 0, bytes).map_err(|e| match e {
             Errno::NOSPC => memory::too_small(name, memory::free(), bytes),
@@ -172,9 +172,17 @@ impl<M: Message + Arrays> BoardReader<M> {
 
     /// Turns to a sender that came since the last call. One system call if none did.
     pub(crate) fn attend(&mut self) {
-        if std::fs::metadata(&self.path).is_ok_and(|meta| meta.ino() != self.file) {
+        let Ok(named) = std::fs::symlink_metadata(&self.path) else { return };
+        if named.ino() != self.file {
             // A file that vanishes meanwhile is looked for again with the next call.
-            let Ok(file) = File::open(&self.path) else { return };
+            let file = match home::own_file(&self.path, false) {
+                Ok(file) => file,
+                Err(e) if e.kind() == io::ErrorKind::NotFound => return,
+                Err(_) => {
+                    (self.file, self.refused) = (named.ino(), self.refused + 1);
+                    return;
+                }
+            };
             let Ok(meta) = file.metadata() else { return };
             self.file = meta.ino();
             match Memory::map::<M>(&file, ProtFlags::READ) {
@@ -264,6 +272,7 @@ mod tests {
     #[test]
     fn the_newest_is_read_once_and_successors_are_found() {
         let name = name("board");
+        let _home = home::Home::enter(&name).unwrap();
         let mut reader = BoardReader::<StateMessage>::open(&name);
         assert!(reader.newest().is_none());
         let mut first = Board::create(&name, 1).unwrap();
@@ -296,6 +305,7 @@ mod tests {
     #[test]
     fn a_message_is_never_torn() {
         let name = name("torn");
+        let _home = home::Home::enter(&name).unwrap();
         let mut board = Board::create(&name, 1).unwrap();
         let mut reader = BoardReader::<ActionMessage>::open(&name);
         let over = AtomicBool::new(false);
@@ -324,6 +334,13 @@ mod tests {
     #[test]
     fn foreign_files_and_lying_lengths_are_refused_or_clamped() {
         let name = name("foreign");
+        let _home = home::Home::enter(&name).unwrap();
+        std::os::unix::fs::symlink("/etc/passwd", path::<StateMessage>(&name)).unwrap();
+        let mut linked = BoardReader::<StateMessage>::open(&name);
+        linked.attend();
+        assert_eq!(linked.refused, 1, "a link is refused once, and not followed");
+        std::fs::remove_file(path::<StateMessage>(&name)).unwrap();
+        home::own_file(&path::<StateMessage>(&name), true).unwrap();
         std::fs::write(path::<StateMessage>(&name), b"short").unwrap();
         let mut reader = BoardReader::<StateMessage>::open(&name);
         assert!(reader.newest().is_none());

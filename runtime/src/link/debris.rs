@@ -8,12 +8,12 @@
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
-use std::fs::{read_dir, remove_dir_all, remove_file};
+use std::fs::{Metadata, read_dir, remove_dir_all, remove_file};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::RobotName;
+use super::{RobotName, memory};
 
 /// What is half a node before and after this pause is not one that is being made or removed; both take milliseconds. Only a start
 /// that finds one waits.
@@ -23,7 +23,7 @@ const MONITOR: [&str; 3] = [".node_monitor", ".node_monitor_owner_lock", ".node_
 
 /// Removes the halves of nodes of processes that are gone.
 pub(super) fn sweep(name: &RobotName) {
-    sweep_folder(&name.folder().join("nodes"), &name.prefix());
+    sweep_folder(&name.folder().join("nodes"), &name.segments());
 }
 
 fn sweep_folder(nodes: &Path, prefix: &str) {
@@ -39,6 +39,27 @@ fn sweep_folder(nodes: &Path, prefix: &str) {
             let _ = remove_file(nodes.join(format!("{prefix}{node}{file}")));
         }
     }
+}
+
+/// Removes segments that were begun and not finished: until they are, only their owner may write them and nobody may read them. Whoever opens
+/// the ports of the dead would wait for them, so this comes before a node is made.
+pub(super) fn sweep_segments(name: &RobotName) {
+    let before = begun(name);
+    if before.is_empty() {
+        return;
+    }
+    std::thread::sleep(PAUSE);
+    for (file, _) in before.intersection(&begun(name)) {
+        let _ = remove_file(file);
+    }
+}
+
+fn begun(name: &RobotName) -> BTreeSet<(PathBuf, u64)> {
+    let is_begun = |meta: &Metadata| meta.is_file() && meta.mode() & 0o777 == 0o200;
+    let segments = name.segments();
+    memory::files(&segments)
+        .filter_map(|f| f.metadata().ok().filter(is_begun).map(|meta| (f.path(), meta.ino())))
+        .collect()
 }
 
 /// Descriptions of services that are not finished: they become readable only, to the owner, when they are.

@@ -86,6 +86,18 @@ pub enum LinkError {
         /// The system's reason.
         reason: String,
     },
+    /// A file or folder of the links is another user's, or not what it should be.
+    #[error(
+        "the links of `{name}` are not opened, because of {path}: {reason}; find out who made it, then remove it"
+    )]
+    Foreign {
+        /// Robot.
+        name: RobotName,
+        /// The file or folder.
+        path: String,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// iceoryx2 failed for another reason.
     #[error(
         "the link of `{name}` could not {action} ({reason}): if no nearl process for it is alive, delete {files} and try again"
@@ -115,6 +127,7 @@ impl LinkError {
             Self::Schema { .. } => LinkCode::Schema,
             Self::Memory { .. } => LinkCode::Memory,
             Self::MemoryMissing { .. } => LinkCode::MemoryMissing,
+            Self::Foreign { .. } => LinkCode::Foreign,
             Self::Transport { .. } => LinkCode::Transport,
         }
         .name()

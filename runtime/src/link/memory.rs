@@ -1,12 +1,12 @@
 //! Shared memory is checked and reserved before the first message: a full tmpfs otherwise kills the writer with SIGBUS.
 
-use std::fs::{File, OpenOptions, read_dir};
-use std::os::unix::fs::OpenOptionsExt;
+use std::fs::{DirEntry, Metadata, OpenOptions, read_dir};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
 
 use rustix::fs::{FallocateFlags, fallocate, statvfs};
 use rustix::io::Errno;
 
-use super::{LinkError, RobotName};
+use super::{LinkError, RobotName, home};
 
 pub(crate) const FOLDER: &str = "/dev/shm";
 const MEGABYTE: u64 = 1 << 20;
@@ -38,16 +38,32 @@ pub(super) fn too_small(name: &RobotName, available: u64, bytes: u64) -> LinkErr
     LinkError::Memory { name: name.clone(), path: FOLDER, available, needed }
 }
 
+/// Every file in shared memory whose name begins with `prefix`.
+pub(super) fn files(prefix: &str) -> impl Iterator<Item = DirEntry> {
+    let entries = read_dir(FOLDER).into_iter().flatten().flatten();
+    entries.filter(move |entry| entry.file_name().to_string_lossy().starts_with(prefix))
+}
+
+/// Closes the segments of this robot to other users: iceoryx2 opens one of them, a counter, to all.
+pub(super) fn close_to_others(name: &RobotName) {
+    let user = rustix::process::geteuid().as_raw();
+    for entry in files(&name.segments()) {
+        let is_open = |meta: &Metadata| meta.is_file() && meta.uid() == user && meta.mode() & 0o077 != 0;
+        if let Ok(file) = home::private().read(true).open(entry.path())
+            && file.metadata().is_ok_and(|meta| is_open(&meta))
+        {
+            let _ = file.set_permissions(PermissionsExt::from_mode(0o600));
+        }
+    }
+}
+
 /// Reserves every page of the segments this robot has now, so that no later write meets a full tmpfs.
 pub(crate) fn reserve(name: &RobotName) -> Result<(), LinkError> {
-    let prefix = name.prefix();
-    for entry in read_dir(FOLDER).into_iter().flatten().flatten() {
-        if !entry.file_name().to_string_lossy().starts_with(&prefix) {
-            continue;
-        }
+    for entry in files(&name.segments()) {
         // A segment may vanish or belong to a peer that is starting: only a full tmpfs matters here.
-        let Ok(file) = File::options().write(true).open(entry.path()) else { continue };
-        let Ok(length) = file.metadata().map(|m| m.len()) else { continue };
+        let Ok(file) = home::private().write(true).open(entry.path()) else { continue };
+        let Ok(meta) = file.metadata() else { continue };
+        let length = if meta.is_file() { meta.len() } else { 0 };
         if length > 0 && fallocate(&file, FallocateFlags::KEEP_SIZE, 0, length) == Err(Errno::NOSPC) {
             return Err(too_small(name, 0, length));
         }
@@ -57,13 +73,15 @@ pub(crate) fn reserve(name: &RobotName) -> Result<(), LinkError> {
 
 /// Removes what a robot name left behind. Only for names no process uses any more (tests, demonstrations, benchmarks).
 pub fn remove_files(name: &RobotName) {
-    let prefix = name.prefix();
-    for entry in read_dir(FOLDER).into_iter().flatten().flatten() {
-        if entry.file_name().to_string_lossy().starts_with(&prefix) {
-            let _ = std::fs::remove_file(entry.path());
-        }
-    }
+    remove_segments(name);
     let _ = std::fs::remove_dir_all(name.folder());
+}
+
+/// Removes iceoryx2's segments of a robot name; those of other users stay.
+pub(super) fn remove_segments(name: &RobotName) {
+    for entry in files(&name.prefix()) {
+        let _ = std::fs::remove_file(entry.path());
+    }
 }
 
 #[cfg(test)]

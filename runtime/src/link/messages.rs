@@ -30,6 +30,8 @@ pub const STATE_TERMINATED: u32 = 2;
 pub const STATE_TRUNCATED: u32 = 4;
 /// The plant waits for the action of every state (no real-time grid).
 pub const ROBOT_LOCKSTEP: u32 = 1;
+/// The plant states its limits by number; infinite is none.
+pub const ROBOT_LIMITS: u32 = 2;
 
 /// Limits that a plant may measure, by their place in a [`TallyMessage`].
 pub const METERS: [&str; 4] = ["position", "velocity", "acceleration", "torque"];
@@ -96,7 +98,7 @@ message! {
 
 message! {
     /// What the plant is; a snapshot for another robot is refused against it.
-    RobotMessage, "robot", version 1, beside StateMessage, beside ActionMessage, buffer 1, history 1, subscribers 16 {
+    RobotMessage, "robot", version 2, beside StateMessage, beside ActionMessage, buffer 1, history 1, subscribers 16 {
         /// Hash of the joint names in order, see [`crate::link::hash_names`].
         joints: u64,
         /// Hash of the observation entry names in order.
@@ -117,6 +119,16 @@ message! {
         bits: u32,
         /// Process that runs the plant.
         pid: u32,
+        /// Lowest position the plant allows, by velocity entry; this and the next four count only with `ROBOT_LIMITS` [rad or m].
+        q_lower: [f64; MAX_JOINTS],
+        /// Highest position [rad or m].
+        q_upper: [f64; MAX_JOINTS],
+        /// Largest speed [rad/s or m/s].
+        velocity: [f64; MAX_JOINTS],
+        /// Largest acceleration [rad/s² or m/s²].
+        acceleration: [f64; MAX_JOINTS],
+        /// Largest motor force [N m or N].
+        effort: [f64; MAX_JOINTS],
         /// Joint names, each followed by a line break, as UTF-8, zero padded.
         names: [u8; MAX_NAMES],
     }

@@ -15,6 +15,7 @@ mod board;
 mod crossing;
 mod debris;
 mod error;
+mod home;
 mod memory;
 mod messages;
 mod name;
@@ -26,6 +27,7 @@ mod runner;
 mod runtime;
 pub mod schema;
 pub mod service;
+pub(crate) mod torn;
 mod trainer;
 
 pub use access::Verdict;
@@ -33,6 +35,8 @@ pub use bench::{RoundTrip, bench_round_trip};
 #[cfg(feature = "cli")]
 pub(crate) use crossing::{CROSSING, Crossing};
 pub use error::LinkError;
+#[cfg(feature = "cli")]
+pub(crate) use home::of_user as home_of_user;
 pub use memory::remove_files;
 #[cfg(feature = "cli")]
 pub(crate) use memory::{check as check_memory, free as free_memory};

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
 
-use super::LinkError;
+use super::{LinkError, home};
 
 /// Name of one robot (or test) on this machine. Links of different names share no file.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
@@ -34,10 +34,19 @@ impl RobotName {
         format!("nearl.{}.", self.0)
     }
 
-    /// Folder of the bookkeeping files, per user and robot.
+    /// Folder of everything of this robot but iceoryx2's segments, in that of the user.
     pub(crate) fn folder(&self) -> PathBuf {
-        let user = rustix::process::geteuid().as_raw();
-        std::env::temp_dir().join(format!("nearl-{user}")).join(&self.0)
+        home::of_user().join(&self.0)
+    }
+
+    /// The part of the segments' names that other users cannot guess; none while nobody has links of the robot.
+    pub(crate) fn token(&self) -> Option<String> {
+        home::read_token(&self.folder())
+    }
+
+    /// Start of the names of the segments there are now.
+    pub(crate) fn segments(&self) -> String {
+        format!("{}{}.", self.prefix(), self.token().unwrap_or_default())
     }
 
     /// Explicit configuration: no `config/iceoryx2.toml` of the working directory is read.
@@ -45,10 +54,11 @@ impl RobotName {
         let mut config = Config::default();
         let fail = |reason: String| self.transport("be configured", reason);
         let folder = self.folder();
-        let folder = folder.to_str().ok_or_else(|| fail("the temporary folder is not UTF-8".into()))?;
+        let folder = folder.to_str().ok_or_else(|| fail("its folder is not UTF-8".into()))?;
         let root = Path::new(folder.as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         config.global.set_root_path(&root);
-        config.global.prefix = FileName::new(self.prefix().as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
+        config.global.prefix =
+            FileName::new(self.segments().as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         config.global.creation_timeout = Duration::from_millis(500);
         Ok(config)
     }

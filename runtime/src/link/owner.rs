@@ -1,15 +1,14 @@
 //! The single owner of a role: whoever holds a lock on a file beside the robot's segments. The system lets go of it when the
 //! process ends, however it ends, so that a killed owner never stands in the way of the next one.
 
-use std::fs::{File, OpenOptions};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
-use std::path::{Path, PathBuf};
+use std::fs::File;
+use std::os::unix::fs::MetadataExt;
+use std::path::PathBuf;
 
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 
-use super::memory::FOLDER;
-use super::{LinkError, RobotName};
+use super::{LinkError, RobotName, home};
 
 /// Holds a role of a robot until it is dropped.
 #[derive(Debug)]
@@ -24,12 +23,10 @@ impl Owner {
     /// # Errors
     /// [`LinkError::Taken`] when another process, or another link of this one, has it.
     pub(crate) fn take(name: &RobotName, role: &'static str) -> Result<Owner, LinkError> {
-        let path = Path::new(FOLDER).join(format!("{}owner-{role}", name.prefix()));
+        let path = name.folder().join(format!("owner-{role}"));
         let failed = |e: std::io::Error| name.transport(format!("lock {}", path.display()), e.to_string());
         loop {
-            let mut options = OpenOptions::new();
-            let file =
-                options.write(true).create(true).truncate(false).mode(0o600).open(&path).map_err(failed)?;
+            let file = home::own_file(&path, true).map_err(|e| home::foreign(name, &path, &e))?;
             match flock(&file, FlockOperation::NonBlockingLockExclusive) {
                 Err(Errno::WOULDBLOCK) => return Err(LinkError::Taken { name: name.clone(), role }),
                 Err(e) => return Err(failed(e.into())),
@@ -61,6 +58,7 @@ mod tests {
     #[test]
     fn a_role_has_one_owner_at_a_time() {
         let name = RobotName::new(&format!("t{}-owner", std::process::id())).unwrap();
+        let home = home::Home::enter(&name).unwrap();
         let first = Owner::take(&name, "plant").unwrap();
         let taken = LinkError::Taken { name: name.clone(), role: "plant" };
         assert_eq!(Owner::take(&name, "plant").unwrap_err(), taken);
@@ -68,15 +66,15 @@ mod tests {
         drop(first);
         drop(Owner::take(&name, "plant").unwrap());
         drop(other);
-        assert!(
-            !Path::new(FOLDER).join(format!("{}owner-plant", name.prefix())).exists(),
-            "the file goes with its owner"
-        );
+        assert!(!name.folder().join("owner-plant").exists(), "the file goes with its owner");
+        drop(home);
+        super::super::remove_files(&name);
     }
 
     #[test]
     fn a_crowd_never_owns_a_role_together() {
         let name = RobotName::new(&format!("t{}-crowd", std::process::id())).unwrap();
+        let _home = home::Home::enter(&name).unwrap();
         let (inside, owned) = (AtomicU32::new(0), AtomicU32::new(0));
         std::thread::scope(|scope| {
             for _ in 0..4 {

@@ -1,5 +1,7 @@
 //! The plant's ends of the links.
 
+use nearl_constraints::LimitSet;
+
 use super::board::{Board, BoardReader};
 use super::owner::Owner;
 use super::port::Outbox;
@@ -13,8 +15,10 @@ pub struct Robot {
     pub joints: Vec<String>,
     /// Names of the observation entries.
     pub observation: Vec<String>,
-    /// Hash of the limits the plant enforces, 0 if it enforces none.
+    /// Hash of the robot file's limits and the actuators' range, 0 if it says nothing about them.
     pub limits: u64,
+    /// The limits it states by number, by velocity entry: a snapshot that allows more is refused. None if it states none.
+    pub stated: Option<LimitSet>,
     /// Number of configuration entries.
     pub nq: usize,
     /// Number of velocity entries.
@@ -49,6 +53,9 @@ impl Robot {
         (message.nq, message.nv, message.nu) = (self.nq as u32, self.nv as u32, self.nu as u32);
         message.n_obs = self.observation.len() as u32;
         message.bits = if self.lockstep { ROBOT_LOCKSTEP } else { 0 };
+        if let Some(stated) = &self.stated {
+            message.set_limits(stated);
+        }
         message.pid = std::process::id();
         Ok(message)
     }
@@ -61,8 +68,8 @@ pub struct PlantLink {
     robot: Outbox<RobotMessage>,
     tally: Outbox<TallyMessage>,
     hello: RobotMessage,
-    bus: Bus,
     _owner: Owner,
+    bus: Bus,
 }
 
 impl PlantLink {

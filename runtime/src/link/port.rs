@@ -8,6 +8,7 @@ use super::schema::Queued;
 use super::service::Ipc;
 use super::{LinkError, Message, RobotName, SnapshotHeader, memory};
 use crate::clock;
+use crate::snapshot::MAX_BYTES;
 
 /// Sending end of a topic. One heap allocation per message inside iceoryx2: not for the real-time thread.
 pub struct Outbox<M: Queued> {
@@ -121,6 +122,12 @@ impl BytesOutbox {
     }
 
     pub(crate) fn send(&mut self, version: u64, bytes: &[u8]) -> Result<(), LinkError> {
+        if bytes.len() as u64 > MAX_BYTES {
+            return Err(self.name.transport(
+                "send a snapshot",
+                format!("it has {} bytes, more than the limit of {MAX_BYTES}", bytes.len()),
+            ));
+        }
         // The segment may grow to the next power of two and is written at once: check before the first write.
         memory::check(&self.name, 4 * bytes.len().next_power_of_two() as u64)?;
         let failed = |e: String| self.name.transport("send a snapshot", e);
@@ -166,8 +173,10 @@ impl SnapshotReader {
     pub fn next(&mut self) -> Option<SnapshotBytes> {
         while let Ok(Some(sample)) = self.port.receive() {
             let header = *sample.user_header();
+            // A push has the limit of a file, and is refused before it is copied.
             if header.header.schema != SnapshotHeader::SCHEMA
                 || header.length != sample.payload().len() as u64
+                || header.length > MAX_BYTES
             {
                 self.refused += 1;
                 continue;

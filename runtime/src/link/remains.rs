@@ -6,9 +6,9 @@ use std::os::unix::fs::MetadataExt;
 
 use iceoryx2::prelude::{CallbackProgression, Node, NodeState};
 
-use super::RobotName;
 use super::memory::FOLDER;
 use super::service::Ipc;
+use super::{RobotName, home};
 
 /// Shared memory of one robot name.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -21,31 +21,50 @@ pub struct Remains {
     pub dead: usize,
     /// Memory taken [bytes].
     pub bytes: u64,
+    /// A process has links of the robot now.
+    pub held: bool,
 }
 
 impl Remains {
     /// True if nobody but dead processes holds it.
     pub fn is_stale(&self) -> bool {
-        self.alive == 0 && self.dead > 0
+        !self.held
     }
 }
 
-/// Every robot name with shared memory on this machine, sorted by name.
+/// Every robot name of this user with shared memory or files on this machine, sorted by name.
 pub fn remains() -> Vec<Remains> {
     let mut sizes: BTreeMap<String, u64> = BTreeMap::new();
     for entry in read_dir(FOLDER).into_iter().flatten().flatten() {
         let file = entry.file_name().to_string_lossy().into_owned();
         let name = file.strip_prefix("nearl.").and_then(|rest| rest.split_once('.')).map(|(name, _)| name);
-        if let (Some(name), Ok(meta)) = (name, entry.metadata()) {
+        if let (Some(name), Ok(meta)) = (name, entry.metadata())
+            && meta.uid() == rustix::process::geteuid().as_raw()
+        {
             *sizes.entry(name.to_owned()).or_default() += 512 * meta.blocks();
+        }
+    }
+    for entry in read_dir(home::of_user()).into_iter().flatten().flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let Ok(robot) = RobotName::new(&name) else { continue };
+        if home::has_files(&robot) || home::is_held(&robot) {
+            let files = read_dir(entry.path()).into_iter().flatten().flatten();
+            let bytes =
+                files.filter_map(|f| f.metadata().ok()).filter(|m| m.is_file()).map(|m| 512 * m.blocks());
+            *sizes.entry(name).or_default() += bytes.sum::<u64>();
         }
     }
     sizes.into_iter().filter_map(|(name, bytes)| of(&name, bytes)).collect()
 }
 
 fn of(name: &str, bytes: u64) -> Option<Remains> {
-    let config = RobotName::new(name).ok()?.config().ok()?;
-    let mut remains = Remains { name: name.to_owned(), alive: 0, dead: 0, bytes };
+    let robot = RobotName::new(name).ok()?;
+    let mut remains =
+        Remains { name: name.to_owned(), alive: 0, dead: 0, bytes, held: home::is_held(&robot) };
+    if robot.token().is_none() {
+        return Some(remains);
+    }
+    let config = robot.config().ok()?;
     let count = |state| {
         match state {
             NodeState::<Ipc>::Alive(_) | NodeState::Inaccessible(_) => remains.alive += 1,

@@ -10,7 +10,7 @@
 
 use serde::Serialize;
 
-use super::{ActionMessage, LinkError, Message, PlantLink, RobotName, StateMessage, TallyMessage};
+use super::{ActionMessage, LinkError, Message, PlantLink, RobotName, StateMessage, TallyMessage, torn};
 use crate::clock;
 use crate::grid::Grid;
 use crate::percentiles::{Percentiles, percentiles};
@@ -51,6 +51,9 @@ pub struct PlantSettings {
     pub watchdog: f64,
     /// Ticks until the plant stops by itself.
     pub ticks: Option<u64>,
+    /// Time without an action, from the start or the last one, after which the runtime counts as gone and the plant ends [s]; without it the
+    /// plant brakes and waits for the next runtime.
+    pub loop_patience: Option<f64>,
     /// SCHED_FIFO priority, if the system allows it; it polls without a pause in lockstep, which needs none.
     pub priority: Option<i32>,
 }
@@ -59,7 +62,8 @@ impl PlantSettings {
     /// Real time with a deadline of 0.6 periods and a watchdog of 5 periods, but at least 20 ms.
     pub fn real_time(dt: f64) -> PlantSettings {
         let watchdog = (5.0 * dt).max(0.02);
-        PlantSettings { dt, pace: Pace::RealTime, deadline: 0.6, watchdog, ticks: None, priority: None }
+        let (ticks, loop_patience, priority) = (None, None, None);
+        PlantSettings { dt, pace: Pace::RealTime, deadline: 0.6, watchdog, ticks, loop_patience, priority }
     }
 
     /// Real time for a simulator, whose time may stretch: rather than holding an old action it waits up to 15 ms (at
@@ -92,12 +96,25 @@ pub struct PlantReport {
     pub overruns: u64,
     /// Slots left out.
     pub skipped: u64,
+    /// Looks for a runtime while there was none.
+    pub looks: u64,
+    /// Shared memory was taken away under the plant: it braked to rest and ended.
+    pub memory_torn: bool,
+    /// The runtime was gone for longer than [`PlantSettings::loop_patience`]: the plant ended by itself.
+    pub loop_gone: bool,
     /// From sending the state to having its action.
     pub round_trip: Percentiles,
 }
 
-/// Polls between looks at the clock while no runtime is attached [ns].
+/// Polls between looks at the clock while a runtime that is not attached yet is being waited for [ns].
 const SLOW_POLL: u64 = 30_000;
+/// Longest braking of a plant that ends by itself [s], and the speed that counts as rest [rad/s or m/s].
+const LAST_BRAKE: f64 = 2.0;
+const STILL: f64 = 1e-2;
+/// Looks for a runtime in a tick while there is none.
+const LOOKS: u64 = 3;
+/// Share of the period over which they are spread.
+const ALONE: f64 = 0.6;
 /// The plant announces itself this often [ns].
 const ANNOUNCE: u64 = 100_000_000;
 /// In lockstep, a state without an answer is sent again after this time [ns]: a runtime may have come late.
@@ -111,6 +128,10 @@ pub struct PlantRunner {
     last: ActionMessage,
     last_fresh: u64,
     is_attached: bool,
+    /// A runtime sends actions, though not yet in time for the state they are for.
+    is_near: bool,
+    /// When an action came last, whatever state it was for, and when the first could have.
+    last_heard: u64,
     next_announce: u64,
     report: PlantReport,
     round_trip: hdrhistogram::Histogram<u64>,
@@ -128,6 +149,8 @@ impl PlantRunner {
             last: ActionMessage::zeroed(),
             last_fresh: 0,
             is_attached: false,
+            is_near: false,
+            last_heard: clock::now(),
             next_announce: 0,
             report: PlantReport::default(),
             round_trip,
@@ -144,7 +167,15 @@ impl PlantRunner {
         crate::thread::be_prompt(self.settings.priority);
         let period = clock::nanoseconds(self.settings.dt);
         let mut grid = Grid::new(clock::now() + period, period);
+        self.last_heard = clock::now();
+        torn::watch();
         while !stop.is_requested() && self.settings.ticks.is_none_or(|n| self.report.ticks < n) {
+            self.report.loop_gone = self.is_deserted();
+            self.report.memory_torn = torn::is_torn();
+            if self.report.loop_gone || self.report.memory_torn {
+                self.brake_alone(plant);
+                break;
+            }
             let due = match self.settings.pace {
                 Pace::RealTime => grid.due(),
                 Pace::Lockstep => clock::now(),
@@ -176,6 +207,7 @@ impl PlantRunner {
                     self.round_trip.saturating_record(clock::now() - sent);
                 }
                 self.last_fresh = clock::now();
+                self.last_heard = self.last_fresh;
                 self.is_attached = true;
                 self.last = action;
                 self.report.fresh += 1;
@@ -198,6 +230,29 @@ impl PlantRunner {
         tally.tick = self.report.ticks;
         plant.tally(&mut tally);
         self.link.send_tally(&mut tally);
+    }
+
+    /// To rest, by the plant's own means and without the link: after this nobody drives it.
+    fn brake_alone(&mut self, plant: &mut impl Plant) {
+        let period = clock::nanoseconds(self.settings.dt);
+        let mut grid = Grid::new(clock::now() + period, period);
+        for _ in 0..(LAST_BRAKE / self.settings.dt).ceil() as u64 {
+            plant.observe(&mut self.state);
+            if self.state.v().iter().all(|v| v.abs() < STILL) {
+                return;
+            }
+            self.report.braked += 1;
+            plant.brake();
+            if self.settings.pace == Pace::RealTime {
+                clock::sleep_until(grid.due());
+                grid.finish(clock::now());
+            }
+        }
+    }
+
+    fn is_deserted(&self) -> bool {
+        let patience = self.settings.loop_patience.map(clock::nanoseconds);
+        patience.is_some_and(|patience| clock::now() > self.last_heard + patience)
     }
 
     /// Applies the last action, or brakes if the runtime left that to the plant.
@@ -227,7 +282,8 @@ impl PlantRunner {
 
     /// The action for the state just sent, if it comes in time.
     fn wait(&mut self, plant: &impl Plant, due: u64, stop: &Stop) -> Option<ActionMessage> {
-        let until = due + clock::nanoseconds(self.settings.dt * self.settings.deadline);
+        let period = clock::nanoseconds(self.settings.dt);
+        let watchdog = clock::nanoseconds(self.settings.watchdog);
         let mut resend = clock::now() + RESEND;
         loop {
             let header = self.state.header;
@@ -237,15 +293,21 @@ impl PlantRunner {
                 }
                 // The runtime ended in order: the plant is on its own at once, without the watchdog.
                 Some(action) if action.is_farewell() => {
-                    self.is_attached = false;
+                    (self.is_attached, self.is_near) = (false, false);
                     self.send_tally(plant);
                 }
-                _ => {}
+                Some(_) => (self.is_near, self.last_heard) = (true, clock::now()),
+                None => {}
             }
             let now = clock::now();
+            // Without a runtime there is nothing to wait for: the plant keeps its own time, and only looks whether one comes.
+            self.is_near &= now < self.last_heard + watchdog;
+            let is_waiting = self.is_attached || self.is_near;
+            let share = if is_waiting { self.settings.deadline } else { self.settings.deadline.min(ALONE) };
+            let until = due + (share * period as f64) as u64;
             match self.settings.pace {
                 Pace::RealTime if now >= until => return None,
-                Pace::Lockstep if stop.is_requested() => return None,
+                Pace::Lockstep if stop.is_requested() || self.is_deserted() => return None,
                 Pace::Lockstep if now >= resend => {
                     self.link.announce();
                     self.link.send_state(&mut self.state);
@@ -255,10 +317,13 @@ impl PlantRunner {
             }
             if self.is_attached {
                 std::thread::yield_now();
-            } else {
-                self.link.attend();
-                clock::sleep_until(now + SLOW_POLL);
+                continue;
             }
+            self.link.attend();
+            let is_alone = !is_waiting && self.settings.pace == Pace::RealTime;
+            self.report.looks += u64::from(!is_waiting);
+            let pause = if is_alone { (until.saturating_sub(due) / LOOKS).max(SLOW_POLL) } else { SLOW_POLL };
+            clock::sleep_until((now + pause).min(until.max(now + SLOW_POLL)));
         }
     }
 }

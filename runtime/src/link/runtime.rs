@@ -18,8 +18,8 @@ pub struct RuntimeLink {
     transition: Outbox<TransitionMessage>,
     receipt: Outbox<ReceiptMessage>,
     health: Outbox<HealthMessage>,
-    bus: Bus,
     _owner: Owner,
+    bus: Bus,
 }
 
 impl RuntimeLink {

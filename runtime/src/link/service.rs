@@ -16,6 +16,7 @@ use iceoryx2::service::builder::publish_subscribe::{
 };
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
+use super::home::Home;
 use super::owner::Owner;
 use super::port::{BytesOutbox, Inbox, Outbox, SnapshotReader};
 use super::schema::{Message, Queued};
@@ -37,16 +38,20 @@ pub struct Bus {
     node: Node<Ipc>,
     name: RobotName,
     epoch: u64,
+    /// Last: what the others remove when they go lies in it.
+    _home: Home,
 }
 
 impl Bus {
-    /// Checks shared memory, joins, and removes what dead processes left.
+    /// Checks shared memory and the folders, joins, and removes what dead processes left.
     ///
     /// # Errors
     /// [`LinkError`] for shared memory that is missing or too small, or what the transport said.
     pub fn join(name: &RobotName) -> Result<Bus, LinkError> {
         set_log_level_from_env_or(LogLevel::Fatal);
         memory::check(name, SHARED_MEMORY)?;
+        let home = Home::enter(name)?;
+        debris::sweep_segments(name);
         let config = name.config()?;
         let node = retry(
             || {
@@ -59,7 +64,8 @@ impl Bus {
         )
         .map_err(|e| name.transport("start", format!("{e:?}")))?;
         let epoch = clock::now() ^ (u64::from(std::process::id()) << 40);
-        let bus = Bus { node, name: name.clone(), epoch };
+        memory::close_to_others(name);
+        let bus = Bus { node, name: name.clone(), epoch, _home: home };
         bus.clean();
         Ok(bus)
     }

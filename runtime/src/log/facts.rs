@@ -6,7 +6,7 @@ use nearl_constraints::Rung;
 use serde::{Deserialize, Serialize};
 
 use super::tick::SCHEMA_VERSION;
-use crate::link::{Message, RobotMessage};
+use crate::link::{Message, ROBOT_LIMITS, RobotMessage};
 use crate::rt::{CoreSettings, FaultPlan};
 
 /// The plant's description as readable facts.
@@ -84,7 +84,8 @@ pub(crate) fn read(facts: &BTreeMap<String, String>) -> Result<Session, String> 
     robot.joints = described.joints_hash;
     (robot.observation, robot.limits, robot.dt) = (described.observation, described.limits, described.dt);
     (robot.nq, robot.nv, robot.nu) = (described.nq, described.nv, described.nu);
-    (robot.n_obs, robot.bits) = (described.n_obs, described.bits);
+    // The limits were compared when the run began; their numbers are not in the log.
+    (robot.n_obs, robot.bits) = (described.n_obs, described.bits & !ROBOT_LIMITS);
     Ok(Session {
         robot,
         core: parse("settings", get("settings")?)?,

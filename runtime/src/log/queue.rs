@@ -2,8 +2,9 @@
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashSet};
-use std::fs::File;
+use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, Seek, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -29,6 +30,8 @@ pub(super) const TICK_TOPIC: &str = "tick";
 pub(super) const SNAPSHOT_TOPIC: &str = "snapshot";
 const SNAPSHOT_SCHEMA: &str = r#"{"title": "nearl.Snapshot", "type": "object", "properties": {
   "id": {"type": "integer"}, "version": {"type": "integer"}, "digest": {"type": "string"}, "bytes": {"type": "integer"}}}"#;
+/// Logs of one name in a folder.
+const MOST_LOGS: usize = 10_000;
 /// The thread looks for records this often.
 const POLL: Duration = Duration::from_millis(2);
 
@@ -94,13 +97,18 @@ pub struct LogQueue {
 }
 
 impl LogQueue {
-    /// Creates the file and starts its thread; `metadata` (snapshot digest, seed, command) goes into the file.
+    /// Creates the file, with a number behind its name if there is one already, and starts its thread; `metadata` (snapshot digest, seed, command) goes into the file.
     pub fn create(path: &Path, metadata: &BTreeMap<String, String>) -> Result<LogQueue, LogError> {
         let fail = |reason: String| LogError { path: path.to_owned(), reason };
-        let file = File::create(path).map_err(|e| fail(e.to_string()))?;
+        let (file, path) = begin(path).map_err(|e| fail(e.to_string()))?;
         let mut log = LogQueue::start(Box::new(file), metadata).map_err(fail)?;
-        log.path = path.to_owned();
+        log.path = path;
         Ok(log)
+    }
+
+    /// The file that is written.
+    pub fn path(&self) -> &Path {
+        &self.path
     }
 
     fn start(sink: Box<dyn Sink>, metadata: &BTreeMap<String, String>) -> Result<LogQueue, String> {
@@ -170,6 +178,35 @@ impl Drop for LogQueue {
             self.join();
         }
     }
+}
+
+/// A new file at `path`, or beside the one that is there: the record of a crash outlives the restart. What is there and is no file is
+/// refused without being opened. A limit on the size of files is an error of the write from now on, not the end of the process.
+fn begin(path: &Path) -> std::io::Result<(File, PathBuf)> {
+    // SAFETY: plain call; the disposition of this signal alone.
+    unsafe { libc::signal(libc::SIGXFSZ, libc::SIG_IGN) };
+    for number in 1..=MOST_LOGS {
+        let path = if number == 1 { path.to_owned() } else { numbered(path, number) };
+        match OpenOptions::new().write(true).create_new(true).mode(0o600).open(&path) {
+            Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {}
+            opened => return opened.map(|file| (file, path)),
+        }
+        if !std::fs::symlink_metadata(&path)?.is_file() {
+            return Err(std::io::Error::other("there is something that is not a regular file"));
+        }
+    }
+    Err(std::io::Error::other(format!("there are {MOST_LOGS} of this name already")))
+}
+
+/// `arm-2.mcap` of `arm.mcap`.
+fn numbered(path: &Path, number: usize) -> PathBuf {
+    let part = |text: Option<&std::ffi::OsStr>| text.unwrap_or_default().to_string_lossy().into_owned();
+    let (stem, end) = (part(path.file_stem()), part(path.extension()));
+    path.with_file_name(if end.is_empty() {
+        format!("{stem}-{number}")
+    } else {
+        format!("{stem}-{number}.{end}")
+    })
 }
 
 /// What the log is written to: a file, outside of tests.

@@ -73,7 +73,7 @@ pub struct ReplayError {
 /// # Errors
 /// [`ReplayError`] if it is no flight log of this build, or a snapshot in it is refused.
 pub fn replay(file: &Path) -> Result<Replay, ReplayError> {
-    replay_with(file, PilotBuilder)
+    replay_with(file, PilotBuilder::default())
 }
 
 /// The same with controllers made by `build`.
@@ -90,12 +90,10 @@ pub fn replay_with<B: Build>(file: &Path, build: B) -> Result<Replay, ReplayErro
 
 /// The log to be read from its start, and its length.
 fn open(file: &Path) -> io::Result<(BufReader<File>, usize)> {
-    let meta = std::fs::metadata(file)?; // asked before: to open a pipe would wait for its other end
-    let length = meta.len() as usize;
-    match (meta.is_file(), length) {
-        (false, _) => Err(io::Error::other("it is not a regular file")),
-        (true, 0) => Err(io::Error::other("it is empty")),
-        _ => Ok((BufReader::with_capacity(PORTION, File::open(file)?), length)),
+    let file = nearl_constraints::open_regular(file, true)?;
+    match file.metadata()?.len() as usize {
+        0 => Err(io::Error::other("it is empty")),
+        length => Ok((BufReader::with_capacity(PORTION, file), length)),
     }
 }
 

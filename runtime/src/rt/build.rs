@@ -36,6 +36,8 @@ pub(crate) struct Builder<B: Build> {
 
 /// Things that may wait to be dropped.
 const SCRAP: usize = 16;
+/// Room of the thread: parsers of robot files recurse as deep as the files are nested [bytes].
+const STACK: usize = 16 << 20;
 /// Time between two looks for a job.
 const NAP: Duration = Duration::from_millis(1);
 
@@ -50,25 +52,26 @@ impl<B: Build> Builder<B> {
         let (jobs, mut work) = RingBuffer::<Job>::new(1);
         let (mut done, built) = RingBuffer::new(1);
         let (scrap, mut scraps) = RingBuffer::<Box<dyn Send>>::new(SCRAP);
-        let thread = std::thread::Builder::new().name("nearl-build".into()).spawn(move || {
-            thread::be_patient();
-            loop {
-                while let Ok(scrap) = scraps.pop() {
-                    drop(scrap);
-                }
-                let Ok(Job { id, snapshot, robot }) = work.pop() else {
-                    if work.is_abandoned() {
-                        return;
+        let thread =
+            std::thread::Builder::new().name("nearl-build".into()).stack_size(STACK).spawn(move || {
+                thread::be_patient();
+                loop {
+                    while let Ok(scrap) = scraps.pop() {
+                        drop(scrap);
                     }
-                    std::thread::sleep(NAP);
-                    continue;
-                };
-                let result = build_one(&mut build, &snapshot, &robot);
-                let SnapshotBytes { header, bytes } = snapshot;
-                // There is room: the next job is only given once this one was collected.
-                let _ = done.push(Built { id, header, bytes, result });
-            }
-        })?;
+                    let Ok(Job { id, snapshot, robot }) = work.pop() else {
+                        if work.is_abandoned() {
+                            return;
+                        }
+                        std::thread::sleep(NAP);
+                        continue;
+                    };
+                    let result = build_one(&mut build, &snapshot, &robot);
+                    let SnapshotBytes { header, bytes } = snapshot;
+                    // There is room: the next job is only given once this one was collected.
+                    let _ = done.push(Built { id, header, bytes, result });
+                }
+            })?;
         Ok(Builder { jobs: Some(jobs), built, scrap, thread: Some(thread), waiting: None, busy: false })
     }
 

@@ -8,6 +8,7 @@
 //!   stream states at another rate; the action then meets a state up to one period older.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use hdrhistogram::Histogram;
 use rtrb::{Consumer, Producer};
@@ -43,6 +44,8 @@ pub(crate) struct CycleSettings {
     pub(crate) spin: u64,
     /// Ticks until the loop stops by itself.
     pub(crate) ticks: Option<u64>,
+    /// Time after which the loop stops, however many ticks it has made.
+    pub(crate) longest: Option<u64>,
     /// Ticks of braking after which the loop ends anyway.
     pub(crate) stop_ticks: u64,
     pub(crate) allocations: Option<CountAllocations>,
@@ -55,6 +58,8 @@ pub(crate) struct Ends<T: Tick> {
     pub(crate) records: Producer<Record>,
     pub(crate) slot: Slot<Loaded<T>>,
     pub(crate) bell: Arc<Bell>,
+    /// The plant counts as gone.
+    pub(crate) gone: Arc<AtomicBool>,
 }
 
 /// The loop with everything it ever needs.
@@ -66,6 +71,8 @@ pub(crate) struct Cycle<T: Tick> {
     fresh: Option<StateMessage>,
     action: ActionMessage,
     stopping: u64,
+    /// When the loop stops, however many ticks it has made.
+    deadline: u64,
     /// Sleeps for a state that was late.
     late_waits: u64,
     dropped: (u64, u64),
@@ -96,6 +103,7 @@ impl<T: Tick> Cycle<T> {
             fresh: None,
             action: ActionMessage::zeroed(),
             stopping: 0,
+            deadline: u64::MAX,
             late_waits: 0,
             dropped: (0, 0),
             wake: histogram(),
@@ -109,6 +117,7 @@ impl<T: Tick> Cycle<T> {
     /// Runs until a stop was asked for and the plant stands still.
     pub(crate) fn run(mut self) -> CycleEnd<T> {
         self.core.start(clock::now());
+        self.deadline = self.settings.longest.map_or(u64::MAX, |longest| clock::now() + longest);
         let count = self.settings.allocations;
         let (mut usage, mut late_waits) = (Usage::of_this_thread(count), 0);
         while !self.is_over() {
@@ -128,7 +137,12 @@ impl<T: Tick> Cycle<T> {
     }
 
     fn is_stopping(&self) -> bool {
-        self.stop.is_requested() || self.settings.ticks.is_some_and(|n| self.core.record.tick >= n)
+        self.is_told_to_stop() || self.settings.ticks.is_some_and(|n| self.core.record.tick >= n)
+    }
+
+    /// By whatever does not count ticks.
+    fn is_told_to_stop(&self) -> bool {
+        self.stop.is_requested() || self.ends.gone.load(Ordering::Acquire) || clock::now() >= self.deadline
     }
 
     fn is_over(&self) -> bool {
@@ -153,7 +167,7 @@ impl<T: Tick> Cycle<T> {
     /// when the state is late by more than a quarter of a period does it sleep again.
     fn wait_for_state(&mut self) {
         let (core, spin) = (&self.settings.core, self.settings.spin);
-        let last = clock::now() + core.age_limit;
+        let last = (clock::now() + core.age_limit).min(self.deadline);
         let expected = self.core.record.state.header.stamp + core.period;
         let awake = match spin {
             0 => 0..0,
@@ -162,7 +176,7 @@ impl<T: Tick> Cycle<T> {
         loop {
             let seen = self.ends.bell.seen();
             let now = clock::now();
-            if !self.ends.states.is_empty() || now >= last {
+            if !self.ends.states.is_empty() || now >= last || self.ends.gone.load(Ordering::Acquire) {
                 return;
             }
             if awake.contains(&now) {
@@ -186,7 +200,7 @@ impl<T: Tick> Cycle<T> {
     fn update(&mut self) {
         let begin = clock::now();
         // The tick that is beginning is counted already; a stop by their number comes after the last of them.
-        let stop = self.stop.is_requested() || self.settings.ticks.is_some_and(|n| self.core.record.tick > n);
+        let stop = self.is_told_to_stop() || self.settings.ticks.is_some_and(|n| self.core.record.tick > n);
         self.fresh = None;
         while let Ok(state) = self.ends.states.pop() {
             self.fresh = Some(state);

@@ -139,7 +139,7 @@ impl FaultPlan {
     /// One sentence with the file, also for a fault of the way between the two.
     pub fn load(path: &Path) -> Result<FaultPlan, FaultPlanError> {
         let fail = |reason: String| FaultPlanError { file: path.display().to_string(), reason };
-        let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
+        let text = nearl_constraints::read_text(path).map_err(|e| fail(e.to_string()))?;
         let plan: FaultPlan = serde_json::from_str(&text).map_err(|e| fail(crate::snapshot::one_line(&e)))?;
         match plan.faults.iter().position(|f| f.kind.is_of_the_way()) {
             Some(i) => Err(fail(format!(

@@ -10,6 +10,7 @@ use hdrhistogram::Histogram;
 use rtrb::{Consumer, Producer};
 
 use crate::clock::{self, Bell};
+use crate::link::torn;
 use crate::link::{
     ActionMessage, HealthMessage, Message, RobotMessage, RuntimeLink, StateMessage, TallyMessage,
     TransitionMessage,
@@ -43,6 +44,9 @@ pub(crate) struct Io<B: Build> {
     pub(crate) snapshots: SnapshotInbox<B>,
     pub(crate) log: Option<LogQueue>,
     pub(crate) explore: Option<u64>,
+    /// Set once the plant counts as gone, after so long without a state [ns].
+    pub(crate) gone: Arc<AtomicBool>,
+    pub(crate) gone_after: u64,
     pub(crate) period: u64,
     pub(crate) polls_always: bool,
     /// That of the real-time thread.
@@ -73,8 +77,12 @@ impl<B: Build> Io<B> {
     pub(crate) fn run(mut self, over: &AtomicBool) -> Io<B> {
         // Who polls without a pause would take a core for itself at a real-time priority.
         crate::thread::be_prompt(self.priority.filter(|_| !self.polls_always));
+        self.traffic.last_state = clock::now();
         loop {
             let is_over = over.load(Ordering::Acquire);
+            if torn::is_torn() {
+                self.end();
+            }
             let moved = self.move_states() | self.move_actions() | self.move_records();
             if self.has_time() {
                 self.attend();
@@ -177,6 +185,7 @@ impl<B: Build> Io<B> {
             }
         }
         self.hear_tally();
+        self.look_for_the_plant();
         let Io { link, log, robot, snapshots, traffic, .. } = self;
         snapshots.pump(&mut Surroundings { link, log, robot, tick: traffic.tick });
         let now = clock::now();
@@ -188,6 +197,21 @@ impl<B: Build> Io<B> {
             message.rolled_back = self.snapshots.rolled_back;
             message.log_drops = self.log.as_ref().map_or(0, LogQueue::dropped);
             self.link.send_health(&mut message);
+        }
+    }
+
+    /// A plant that keeps real time and is silent is gone. One in lockstep may take its time, as long as its process lives.
+    fn look_for_the_plant(&self) {
+        let is_silent = clock::now() > self.traffic.last_state + self.gone_after;
+        if is_silent && !(self.robot.is_lockstep() && is_alive(self.robot.pid)) {
+            self.end();
+        }
+    }
+
+    /// Has the loop brake and end: there is nobody to drive, or nothing to drive it over.
+    fn end(&self) {
+        if !self.gone.swap(true, Ordering::AcqRel) {
+            self.bell.ring();
         }
     }
 
@@ -208,6 +232,11 @@ impl<B: Build> Io<B> {
 fn fits(robot: &RobotMessage, state: &StateMessage) -> bool {
     state.header.epoch == robot.header.epoch
         && (state.nq, state.nv, state.n_obs) == (robot.nq, robot.nv, robot.n_obs)
+}
+
+/// True if a process with this number exists.
+fn is_alive(pid: u32) -> bool {
+    std::path::Path::new("/proc").join(pid.to_string()).exists()
 }
 
 /// The transition from one record to the state that followed it.

@@ -66,6 +66,12 @@ codes! {
         Starved = "starved", "Overruns did not end although the loop was braking; latched.",
             "Stop what takes the processor, then start the runtime again.";
         Stop = "stop", "A stop was asked for, by a signal or because the time was over.", "Nothing to do.";
+        PlantGone = "plant-gone", "No state came for so long that the plant counts as gone; the run ended by itself.",
+            "Start the plant again, then the runtime; --plant-patience is how long the loop waits for one that comes back.";
+        MemoryTorn = "memory-torn", "A file of shared memory was made shorter while it was in use; the robot was braked and the process ended by itself.",
+            "Find the program that truncates files under /dev/shm, then start plant and runtime again.";
+        LoopGone = "loop-gone", "No action came for so long that the runtime counts as gone; the plant braked and ended by itself.",
+            "Start the plant again, then the runtime; without --loop-patience a plant brakes and waits for the next runtime.";
     }
 }
 

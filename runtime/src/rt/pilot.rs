@@ -8,6 +8,7 @@ use crate::link::{
     LedgerNumbers, MAX_JOINTS, MAX_OBS, Robot, RobotMessage, SnapshotBytes, StateMessage, Verdict, hash_names,
 };
 use crate::rt::brake::Brake;
+use crate::rt::pinned::{Pinned, UNITS, above};
 use crate::rt::tick::{Build, MAX_ROWS, Outcome, Refusal, Row, Step, Tick};
 use crate::snapshot::{Manifest, Snapshot, SnapshotError};
 
@@ -41,6 +42,7 @@ impl Pilot {
         let refuse = |error: SnapshotError| Refusal { verdict: Verdict::of(&error), text: error.to_string() };
         let controller = Controller::new(snapshot).map_err(refuse)?;
         compare(&describe_controller(&controller, &snapshot.manifest), robot)?;
+        compare_limits(&controller, robot)?;
         let layout = controller.layout();
         Ok(Pilot {
             brake: Brake::new(&snapshot.manifest).map_err(refuse)?,
@@ -289,9 +291,12 @@ pub fn numbers(ledger: &Ledger) -> LedgerNumbers {
     }
 }
 
-/// Builds [`Pilot`]s from snapshot bytes.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct PilotBuilder;
+/// Builds [`Pilot`]s from snapshot bytes, within the limits that are fixed, if any are.
+#[derive(Debug, Default)]
+pub struct PilotBuilder {
+    /// What no snapshot may loosen.
+    pub pinned: Option<Pinned>,
+}
 
 impl Build for PilotBuilder {
     type Controller = Pilot;
@@ -299,6 +304,9 @@ impl Build for PilotBuilder {
     fn build(&mut self, snapshot: &SnapshotBytes, robot: &RobotMessage) -> Result<Pilot, Refusal> {
         let parsed = Snapshot::from_bytes(&snapshot.bytes);
         let snapshot = parsed.map_err(|e| Refusal { verdict: Verdict::of(&e), text: e.to_string() })?;
+        if let Some(pinned) = &self.pinned {
+            pinned.admit(&snapshot.manifest)?;
+        }
         Pilot::new(&snapshot, robot)
     }
 }
@@ -309,7 +317,8 @@ impl Build for PilotBuilder {
 /// [`SnapshotError::Unusable`] with the sentence of the layer that refused robot, layout or limits.
 pub fn describe(manifest: &Manifest, lockstep: bool) -> Result<Robot, SnapshotError> {
     let parts = crate::controller::Parts::new(manifest)?;
-    Ok(Robot { lockstep, ..robot(&parts.model, parts.layout.names(), manifest) })
+    let stated = Some(parts.projector.limits().clone());
+    Ok(Robot { lockstep, stated, ..robot(&parts.model, parts.layout.names(), manifest) })
 }
 
 fn describe_controller(controller: &Controller, manifest: &Manifest) -> Robot {
@@ -321,6 +330,7 @@ fn robot(model: &nearl_constraints::Model, observation: &[String], manifest: &Ma
         joints: model.joints().iter().map(|j| j.name.clone()).collect(),
         observation: observation.to_vec(),
         limits: limits_digest(model, manifest),
+        stated: None,
         nq: model.nq(),
         nv: model.nv(),
         nu: manifest.action_lower.len(),
@@ -389,4 +399,37 @@ fn compare(own: &Robot, plant: &RobotMessage) -> Result<(), Refusal> {
         return refuse(Verdict::ForeignRobot, text.into());
     }
     Ok(())
+}
+
+/// Refuses a snapshot that allows a joint more than the plant states.
+fn compare_limits(controller: &Controller, plant: &RobotMessage) -> Result<(), Refusal> {
+    if !plant.states_limits() {
+        return Ok(());
+    }
+    let (own, model) = (controller.limits(), controller.model());
+    let mut found = Vec::new();
+    for &i in controller.layout().controllable() {
+        let joint = model.dof_name(i);
+        let kinds = [
+            ("velocity", own.velocity[i], plant.velocity[i], UNITS[1]),
+            ("torque", own.effort[i], plant.effort[i], UNITS[3]),
+            ("acceleration", own.acceleration[i], plant.acceleration[i], UNITS[2]),
+            ("highest position", own.q_upper[i], plant.q_upper[i], UNITS[0]),
+            ("lowest position below zero by", -own.q_lower[i], -plant.q_lower[i], UNITS[0]),
+        ];
+        let looser = kinds.into_iter().filter(|(_, is, was, _)| above(*is, *was));
+        found.extend(looser.map(|(what, is, was, unit)| {
+            format!("{what} of joint '{joint}' {is} {unit} in the snapshot, {was} on the plant")
+        }));
+    }
+    if found.is_empty() {
+        return Ok(());
+    }
+    let (shown, more) = (found.len().min(3), found.len().saturating_sub(3));
+    let more = if more > 0 { format!("; and {more} more") } else { String::new() };
+    let text = format!(
+        "the snapshot allows more than the plant: {}{more}; train within the plant's limits, or start the plant with the snapshot's task",
+        found[..shown].join("; ")
+    );
+    Err(Refusal { verdict: Verdict::Looser, text })
 }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::path::PathBuf;
 
 use serde::Serialize;
 
@@ -71,6 +72,8 @@ pub struct RunReport {
     pub rolled_back: u64,
     /// Page faults, context switches and, where they are counted, allocations of the real-time thread after its first 300 ticks.
     pub usage: Usage,
+    /// The flight log; another name than was asked for if that was taken.
+    pub log: Option<PathBuf>,
     /// Records the flight log lost.
     pub log_drops: u64,
     /// Why the flight log stopped, if it did.
@@ -137,6 +140,9 @@ impl fmt::Display for RunReport {
             self.refused_snapshots,
             self.rolled_back
         )?;
+        if let Some(log) = &self.log {
+            writeln!(f, "  flight log       {}, {} records dropped", log.display(), self.log_drops)?;
+        }
         for text in self.refusals.iter().chain(&self.warnings).chain(&self.log_error) {
             writeln!(f, "  note             {text}")?;
         }

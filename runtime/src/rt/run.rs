@@ -10,6 +10,9 @@ use std::time::Duration;
 use rtrb::RingBuffer;
 
 use crate::clock::{self, Bell};
+use crate::controller::Parts;
+use crate::holding;
+use crate::link::torn;
 use crate::link::{LinkError, Message, RobotMessage, RobotName, RuntimeLink, StateMessage, TallyMessage};
 use crate::log::{LogError, LogQueue, LogSummary};
 use crate::percentiles::percentiles;
@@ -21,10 +24,11 @@ use crate::rt::inbox::SnapshotInbox;
 use crate::rt::io::{Health, Io, Traffic};
 use crate::rt::mode::ModeLimits;
 use crate::rt::pilot::{Pilot, PilotBuilder};
+use crate::rt::pinned::Pinned;
 use crate::rt::receive::SnapshotReceiver;
 use crate::rt::report::{PlantSummary, RunReport};
 use crate::rt::residual::RollbackSettings;
-use crate::rt::tick::{Build, Tick};
+use crate::rt::tick::{Build, Refusal, Tick};
 use crate::rt::{Mode, Reason, swap};
 use crate::snapshot::{Snapshot, SnapshotError, in_run};
 use crate::stop::Stop;
@@ -32,6 +36,9 @@ use crate::thread::{CountAllocations, ThreadSettings, prepare};
 
 /// Records between loop and I/O thread.
 const RECORDS: usize = 256;
+
+/// So much longer than its seconds of ticks may a run take when its plant keeps real time, but not in time [s].
+const GRACE: f64 = 1.0;
 
 /// Settings of a run.
 #[derive(Clone, Debug)]
@@ -44,12 +51,15 @@ pub struct RunSettings {
     pub age_limit: Option<f64>,
     /// So long before a state is due, the real-time thread wakes up to poll for it [s]; 0 sleeps until it comes.
     pub spin: f64,
-    /// Seconds of ticks until the loop stops by itself, if `ticks` is not given.
+    /// Seconds until the loop stops by itself, if `ticks` is not given: so many ticks, and of a plant that keeps real time no more than a
+    /// second of the wall's beyond.
     pub seconds: Option<f64>,
     /// Ticks until the loop stops by itself.
     pub ticks: Option<u64>,
     /// How long to wait for the plant at start [s].
     pub patience: f64,
+    /// So long without a state, and a plant that keeps real time is gone, or one in lockstep whose process has ended: the run ends [s].
+    pub plant_patience: f64,
     /// Largest speed entry that counts as standing still [rad/s or m/s].
     pub stop_speed: f64,
     /// Longest braking before the loop ends anyway [s].
@@ -64,6 +74,10 @@ pub struct RunSettings {
     pub explore: Option<u64>,
     /// When a swapped-in snapshot is taken back.
     pub rollback: RollbackSettings,
+    /// TOML file with a section `[constraints]`: the limits of the loop in place of its first snapshot's ([`run`] only).
+    pub limits: Option<PathBuf>,
+    /// Snapshots may bring looser limits: nothing is fixed ([`run`] only).
+    pub allow_looser: bool,
     /// Faults to rehearse.
     pub faults: FaultPlan,
     /// Wishes for the real-time thread.
@@ -90,6 +104,7 @@ impl Default for RunSettings {
             seconds: None,
             ticks: None,
             patience: 5.0,
+            plant_patience: 5.0,
             stop_speed: 1e-2,
             stop_patience: 1.0,
             jump: 3.0,
@@ -97,6 +112,8 @@ impl Default for RunSettings {
             modes: ModeLimits::default(),
             explore: None,
             rollback: RollbackSettings::default(),
+            limits: None,
+            allow_looser: false,
             faults: FaultPlan::default(),
             thread: ThreadSettings::default(),
             strict: false,
@@ -169,6 +186,8 @@ pub fn run(
         SnapshotError::Unreadable { .. } => RunError::Snapshot(e.to_string()),
         other => refused(other.to_string()),
     })?;
+    check_holding(&snapshot).map_err(refused)?;
+    let pinned = pin(settings, &snapshot, &file)?;
     let (link, robot) = connect(plant, settings.patience)?;
     let first = Pilot::new(&snapshot, &robot).map_err(|e| refused(e.text))?;
     let mut settings = settings.clone();
@@ -187,7 +206,35 @@ pub fn run(
     ];
     settings.first = snapshot.to_bytes();
     settings.metadata.extend(facts.map(|(key, value)| (key.to_owned(), value)));
-    run_loop(link, robot, first, PilotBuilder, &settings, stop)
+    if let Some(pinned) = &pinned {
+        settings.metadata.insert("limits".into(), pinned.to_json());
+    }
+    run_loop(link, robot, first, PilotBuilder { pinned }, &settings, stop)
+}
+
+/// Refuses a robot whose motors cannot hold it within its limits: it would brake until it fell.
+fn check_holding(snapshot: &Snapshot) -> Result<(), String> {
+    let parts = Parts::new(&snapshot.manifest).map_err(|e| e.to_string())?;
+    let period = snapshot.manifest.task.period();
+    let limits = parts.projector.limits();
+    holding::refusal(&parts.model, limits, parts.layout.controllable(), &period).map_or(Ok(()), Err)
+}
+
+/// The limits of the loop: those of `--limits`, which the first snapshot must keep too, else those of the first snapshot.
+fn pin(settings: &RunSettings, first: &Snapshot, file: &Path) -> Result<Option<Pinned>, RunError> {
+    let refused = |e: SnapshotError| RunError::Snapshot(e.to_string());
+    match (&settings.limits, settings.allow_looser) {
+        (_, true) => Ok(None),
+        (None, false) => Pinned::of(&first.manifest, &format!("its first snapshot, {}", file.display()))
+            .map(Some)
+            .map_err(refused),
+        (Some(limits), false) => {
+            let pinned = Pinned::read(limits, &first.manifest).map_err(refused)?;
+            let looser = |e: Refusal| RunError::Snapshot(format!("{}: {}", file.display(), e.text));
+            pinned.admit(&first.manifest).map_err(looser)?;
+            Ok(Some(pinned))
+        }
+    }
 }
 
 /// Runs `first` on the plant behind `link` until `stop` (or the settings' ticks), taking in new snapshots through
@@ -200,6 +247,7 @@ pub fn run_loop<B: Build>(
     settings: &RunSettings,
     stop: &Stop,
 ) -> Result<RunReport, RunError> {
+    torn::watch();
     let begin = clock::now();
     let version = first.version();
     let name = link.name().to_string();
@@ -235,8 +283,8 @@ fn assemble<B: Build>(
     let (actions, actions_out) = RingBuffer::new(8);
     let (records, records_out) = RingBuffer::new(RECORDS);
     let (swap, slot) = swap::slot();
-    let bell = Arc::new(Bell::default());
-    let ends = Ends { states, actions, records, slot, bell: Arc::clone(&bell) };
+    let (bell, gone) = (Arc::new(Bell::default()), Arc::new(AtomicBool::new(false)));
+    let ends = Ends { states, actions, records, slot, bell: Arc::clone(&bell), gone: Arc::clone(&gone) };
     let first = Box::new(Loaded { id: 0, controller: first });
     let cycle = Cycle::new(cycle_settings, first, settings.faults.clone(), ends, stop.clone());
     let health = Health::new().map_err(|e| RunError::Snapshot(e.to_string()))?;
@@ -253,6 +301,8 @@ fn assemble<B: Build>(
         snapshots: SnapshotInbox::new(receiver, builder, swap, settings.rollback),
         log,
         explore: settings.explore,
+        gone,
+        gone_after: clock::nanoseconds(settings.plant_patience),
         health,
         traffic: Traffic::default(),
         tally: None,
@@ -278,6 +328,10 @@ fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings
         },
         spin: if robot.is_lockstep() { 0 } else { clock::nanoseconds(settings.spin) },
         ticks: settings.ticks.or(settings.seconds.map(|s| (s / robot.dt).round() as u64)),
+        longest: settings
+            .seconds
+            .filter(|_| settings.ticks.is_none() && !robot.is_lockstep())
+            .map(|s| clock::nanoseconds(s + GRACE)),
         stop_ticks: (settings.stop_patience / robot.dt).ceil() as u64,
         allocations: settings.allocations,
     }
@@ -343,6 +397,7 @@ fn report<B: Build>(
 ) -> RunReport {
     let seconds = (clock::now() - begin) as f64 * 1e-9;
     let tally = io.last_tally(end.last.state.tick);
+    let path = io.log.as_ref().map(|log| log.path().to_owned());
     let log = io.log.take().map_or_else(LogSummary::default, LogQueue::finish);
     let counters = end.last.counters;
     let refused_snapshots = io.snapshots.refused();
@@ -354,7 +409,12 @@ fn report<B: Build>(
         seconds,
         ticks: end.last.tick,
         last_mode: end.last.mode,
-        reason: if end.last.tick == 0 { Reason::Stop } else { end.last.reason },
+        reason: match io.gone.load(Ordering::Acquire) {
+            true if torn::is_torn() => Reason::MemoryTorn,
+            true => Reason::PlantGone,
+            false if end.last.tick == 0 => Reason::Stop,
+            false => end.last.reason,
+        },
         modes: Mode::ALL.iter().copied().map(mode_count).collect(),
         counters,
         refused_states: io.traffic.refused_states + io.link.refused_states(),
@@ -363,6 +423,7 @@ fn report<B: Build>(
         versions: std::iter::once((0, version)).chain(io.snapshots.accepted).collect(),
         refused_snapshots,
         refusals: io.snapshots.refusals,
+        log: path,
         log_drops: log.dropped + log.dropped_snapshots,
         log_error: log.error,
         rolled_back: io.snapshots.rolled_back,

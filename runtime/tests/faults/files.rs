@@ -3,11 +3,13 @@
 use std::time::{Duration, Instant};
 
 use nearl_constraints::Model;
+use nearl_runtime::snapshot::digest;
 use nearl_runtime::{Snapshot, SnapshotError};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
 use crate::arm::*;
 
-/// A small snapshot: the robot file makes most of it.
+/// A small snapshot: the robot makes most of it.
 fn bytes() -> Vec<u8> {
     snapshot(1, |_| {}).to_bytes()
 }
@@ -17,8 +19,8 @@ fn fault_10_every_flipped_byte_is_refused() {
     let good = bytes();
     assert!(Snapshot::from_bytes(&good).is_ok());
     let mut damaged = good.clone();
-    // A prime step, so that every kind of byte (header, manifest, weights) is met; all of them take a minute.
-    for at in (0..good.len()).step_by(13) {
+    // Every byte, and a bit of it: header, manifest and weights.
+    for at in 0..good.len() {
         damaged[at] ^= 1 << (at % 8);
         let error = Snapshot::from_bytes(&damaged).err();
         assert!(error.is_some(), "byte {at} of {} was flipped and not missed", good.len());
@@ -27,6 +29,125 @@ fn fault_10_every_flipped_byte_is_refused() {
     let last = good.len() - 1;
     damaged[last] ^= 1;
     assert_eq!(Snapshot::from_bytes(&damaged).unwrap_err().code(), "snapshot-digest");
+}
+
+/// A tensor as it lies in a file: name, type, shape, bytes.
+type Tensor = (String, Dtype, Vec<usize>, Vec<u8>);
+
+/// The file of `good` with other tensors, or another manifest, and a digest that is right for them.
+fn rewritten(good: &[u8], change: impl FnOnce(&mut Vec<Tensor>, &mut String)) -> Vec<u8> {
+    let file = SafeTensors::deserialize(good).unwrap();
+    let (_, header) = SafeTensors::read_metadata(good).unwrap();
+    let text = header.metadata().as_ref().unwrap()["nearl"].clone();
+    let mut manifest = text.split_once('\n').unwrap().1.to_owned();
+    let mut tensors: Vec<Tensor> = file
+        .tensors()
+        .into_iter()
+        .map(|(n, v)| (n, v.dtype(), v.shape().to_vec(), v.data().to_vec()))
+        .collect();
+    change(&mut tensors, &mut manifest);
+    let parsed = tensors.iter().map(|(n, _, shape, data)| (n.as_str(), shape.as_slice(), data.as_slice()));
+    let header = format!("{}\n{manifest}", digest(&manifest, parsed));
+    let views = tensors
+        .iter()
+        .map(|(n, dtype, shape, data)| (n.clone(), TensorView::new(*dtype, shape.clone(), data).unwrap()));
+    safetensors::serialize(views, Some([("nearl".to_owned(), header)].into())).unwrap()
+}
+
+fn code(bytes: &[u8]) -> (&'static str, String) {
+    let error =
+        Snapshot::from_bytes(bytes).and_then(|s| nearl_runtime::Controller::new(&s).map(|_| ())).unwrap_err();
+    (error.code(), error.to_string())
+}
+
+/// Every tensor in turn is missing, renamed, of another type, of another shape; every file whole and with its right digest.
+#[test]
+fn fault_09_every_tensor_that_is_missing_or_of_another_type_or_shape_is_refused_by_name() {
+    let good = bytes();
+    assert_eq!(rewritten(&good, |_, _| {}).len(), good.len(), "the digest is made as the file's own is");
+    assert!(Snapshot::from_bytes(&rewritten(&good, |_, _| {})).is_ok());
+    let names: Vec<String> =
+        SafeTensors::deserialize(&good).unwrap().names().into_iter().map(str::to_owned).collect();
+    assert!(names.len() > 6, "{names:?}");
+    for name in &names {
+        let place = |tensors: &[Tensor]| tensors.iter().position(|t| t.0 == *name).unwrap();
+        let missing = rewritten(&good, |tensors, _| drop(tensors.remove(place(tensors))));
+        let renamed = rewritten(&good, |tensors, _| {
+            let at = place(tensors);
+            tensors[at].0.push('x');
+        });
+        for file in [missing, renamed] {
+            let (code, text) = code(&file);
+            // A layer that is gone leaves a network of another shape.
+            assert!(["snapshot-missing-tensor", "snapshot-shape"].contains(&code), "{name}: {text}");
+        }
+        let typed = rewritten(&good, |tensors, _| {
+            let at = place(tensors);
+            let tensor = &mut tensors[at];
+            tensor.1 = if tensor.1 == Dtype::F32 { Dtype::I32 } else { Dtype::I64 };
+        });
+        let longer = rewritten(&good, |tensors, _| {
+            let at = place(tensors);
+            let width = if tensors[at].1 == Dtype::F32 { 4 } else { 8 };
+            let tensor = &mut tensors[at];
+            tensor.2[0] += 1;
+            let row: usize = tensor.2[1..].iter().product();
+            let one = if width == 4 { 1_f32.to_le_bytes().to_vec() } else { 1_f64.to_le_bytes().to_vec() };
+            tensor.3.extend(one.repeat(row));
+        });
+        for file in [typed, longer] {
+            let (code, text) = code(&file);
+            assert_eq!(code, "snapshot-shape", "{name}: {text}");
+            let network = name.split('.').next().unwrap();
+            assert!(text.contains(network), "'{network}' is not in: {text}");
+        }
+    }
+}
+
+#[test]
+fn fault_11_every_number_that_is_none_or_far_too_large_is_refused_with_its_place() {
+    let good = bytes();
+    let names: Vec<String> =
+        SafeTensors::deserialize(&good).unwrap().names().into_iter().map(str::to_owned).collect();
+    for name in names.iter().filter(|name| !name.ends_with("log_std")) {
+        for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 3e38, -1e30] {
+            let bad = rewritten(&good, |tensors, _| {
+                let tensor = tensors.iter_mut().find(|t| t.0 == *name).unwrap();
+                match tensor.1 {
+                    Dtype::F32 => tensor.3[4..8].copy_from_slice(&(value as f32).to_le_bytes()),
+                    _ => tensor.3[8..16].copy_from_slice(&value.to_le_bytes()),
+                }
+            });
+            let (code, text) = code(&bad);
+            assert_eq!(code, "snapshot-value", "{name} = {value}: {text}");
+            assert!(text.contains(name.as_str()) && text.contains("index 1"), "{text}");
+        }
+    }
+    for name in ["normaliser.std", "normaliser.scale"] {
+        for value in [0.0_f64, -0.0, -1.0] {
+            let bad = rewritten(&good, |tensors, _| {
+                let tensor = tensors.iter_mut().find(|t| t.0 == name).unwrap();
+                tensor.3[8..16].copy_from_slice(&value.to_le_bytes());
+            });
+            assert_eq!(code(&bad).0, "snapshot-value", "{name} = {value}");
+        }
+    }
+}
+
+/// A manifest that is nested without end, and numbers without end, behind a digest that is right.
+#[test]
+fn fault_39_a_manifest_nested_beyond_measure_is_refused_and_overflows_no_stack() {
+    let good = bytes();
+    for (open, close) in [("[", "]"), ("{\"a\":", "}")] {
+        let deep = format!("{}1{}", open.repeat(200_000), close.repeat(200_000));
+        let bad = rewritten(&good, |_, manifest| {
+            *manifest = manifest.replacen("\"train\":{", &format!("\"train\":{{\"deep\":{deep},"), 1);
+            assert!(manifest.len() > 400_000);
+        });
+        let (code, text) = code(&bad);
+        assert_eq!(code, "snapshot-foreign", "{text}");
+        assert!(text.contains("recursion limit"), "{text}");
+    }
 }
 
 #[test]

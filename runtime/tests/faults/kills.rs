@@ -2,6 +2,7 @@
 //! from the seed `NEARL_SEED`. `NEARL_KILLS=250 cargo test --release -p nearl-runtime --test faults fault_17 -- --nocapture`.
 
 use std::path::Path;
+use std::process::Stdio;
 use std::time::Duration;
 
 use nearl_runtime::link::*;
@@ -9,7 +10,7 @@ use nearl_runtime::rt::*;
 
 use crate::arm::*;
 use crate::stage::*;
-use crate::system::{signal, until};
+use crate::system::{command_of, signal, skip, until};
 use crate::toy::{self, DT};
 
 use crate::ROUNDING;
@@ -255,4 +256,76 @@ fn a_second_signal_is_immediate() {
     assert_eq!(runtime.wait().unwrap().code(), Some(130));
     released.request();
     plant.join().unwrap();
+}
+
+/// System calls that change what lies in shared memory, at any of which a start may be killed.
+const CALLS: [&str; 9] = [
+    "openat",
+    "mkdir",
+    "ftruncate",
+    "fallocate",
+    "mmap",
+    "write",
+    "fchmod",
+    "rename,renameat,renameat2",
+    "unlink,unlinkat",
+];
+
+/// Starts plant and runtime in a process that is killed at the `when`-th call of a kind; true if it got through before that.
+fn start_killed_at(name: &toy::Name, call: &str, when: usize) -> bool {
+    let inner = command_of("start", name);
+    let mut outer = std::process::Command::new("strace");
+    outer.args(["-f", "-qq", "-o", "/dev/null", "-e", &format!("trace={call}")]);
+    outer.args(["-e", &format!("inject={call}:signal=SIGKILL:when={when}")]);
+    outer.arg(inner.get_program()).args(inner.get_args());
+    inner.get_envs().for_each(|(key, value)| {
+        outer.env(key, value.unwrap());
+    });
+    outer.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap().success()
+}
+
+/// Every `NEARL_KILL_STRIDE`-th point (13 by default, 1 for all of them), alone and beside a process that stays.
+#[test]
+fn fault_43_a_start_killed_at_any_system_call_stands_in_the_way_of_none_after_it() {
+    let traced = std::process::Command::new("strace").args(["-qq", "true"]).stderr(Stdio::null()).status();
+    if !traced.is_ok_and(|status| status.success()) {
+        return skip("strace is missing, or may not trace here");
+    }
+    let stride = number("NEARL_KILL_STRIDE", 13) as usize;
+    let (mut points, mut slowest) = (0, Duration::ZERO);
+    for survivor in [false, true] {
+        for call in CALLS {
+            let mut when = 1 + call.len() % stride;
+            loop {
+                let name = toy::Name::new(&format!("point{points}"));
+                let mut stays = survivor.then(|| TrainerLink::open(&name.0).unwrap());
+                if start_killed_at(&name, call, when) {
+                    break;
+                }
+                let left = remains().into_iter().find(|r| r.name == name.0.as_str());
+                assert!(survivor || left.is_none_or(|r| r.is_stale()), "what only the dead left is named so");
+                let begin = std::time::Instant::now();
+                let mut next = command_of("start", &name).spawn().unwrap();
+                let mut ended = None;
+                until(&format!("a start after a kill at {call} number {when}, survivor {survivor}"), || {
+                    ended = next.try_wait().unwrap();
+                    ended.is_some()
+                });
+                assert!(
+                    ended.unwrap().success(),
+                    "after a kill at {call} number {when}, survivor {survivor}"
+                );
+                slowest = slowest.max(begin.elapsed());
+                if let Some(stays) = &mut stays {
+                    let _ = stays.health();
+                } else {
+                    let left = remains().into_iter().find(|r| r.name == name.0.as_str());
+                    assert!(left.is_none(), "the next one cleared up: {left:?}");
+                }
+                (points, when) = (points + 1, when + stride);
+            }
+        }
+    }
+    println!("{points} points, the slowest start after one took {slowest:?}");
+    assert!(points > 10, "{points}");
 }

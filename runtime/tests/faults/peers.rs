@@ -24,10 +24,11 @@ impl Rogue {
     fn new(name: &RobotName) -> Rogue {
         // SAFETY: plain call.
         let user = unsafe { libc::geteuid() };
-        let folder = std::env::temp_dir().join(format!("nearl-{user}")).join(name.as_str());
+        let folder = std::path::Path::new("/dev/shm").join(format!("nearl-{user}")).join(name.as_str());
+        let token = std::fs::read_to_string(folder.join("token")).unwrap();
         let mut config = Config::default();
         config.global.set_root_path(&Path::new(folder.to_str().unwrap().as_bytes()).unwrap());
-        config.global.prefix = FileName::new(format!("nearl.{name}.").as_bytes()).unwrap();
+        config.global.prefix = FileName::new(format!("nearl.{name}.{token}.").as_bytes()).unwrap();
         let node = NodeBuilder::new().config(&config).create::<Ipc>().unwrap();
         let topic = ServiceName::new(&format!("nearl/{name}/snapshot")).unwrap();
         let service = node.service_builder(&topic).publish_subscribe::<[u8]>();

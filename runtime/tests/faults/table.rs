@@ -8,6 +8,8 @@ type Row = (u32, &'static str, &'static str, &'static [&'static str], &'static s
 
 const HERE: &str = "runtime/tests/faults/main.rs";
 const FILES: &str = "runtime/tests/faults/files.rs";
+const LIMITS: &str = "runtime/tests/faults/limits.rs";
+const SECURITY: &str = "runtime/tests/faults/security.rs";
 const KILLS: &str = "runtime/tests/faults/kills.rs";
 const PEERS: &str = "runtime/tests/faults/peers.rs";
 const SOLVER: &str = "runtime/tests/faults/solver.rs";
@@ -25,9 +27,9 @@ pub const ROWS: &[Row] = &[
     (6, "solver hits its iteration cap or deadline", "used only if the checker accepts, else brakes", &["braked-no-certified-answer"], SOLVER, "fault_06_an_answer_cut_by_cap_or_deadline_is_used_only_if_the_checker_accepts"),
     (7, "solver fails numerically", "brakes in that tick, the next is as if new", &["braked-non-finite-dynamics"], SOLVER, "fault_07_a_failed_solve_leaves_the_next_one_healthy"),
     (8, "controller or solver panics", "caught, discarded, latched; the robot model brakes", &["panic"], HERE, "fault_08_a_panic_is_latched_and_the_robot_model_brakes"),
-    (9, "policy file of wrong shape, type, name", "refused, the loop keeps the last good one", &["snapshot-shape", "snapshot-missing-tensor", "foreign-shape"], "runtime/tests/suite/panda.rs", "foreign_and_damaged_snapshots_are_refused_by_reason_while_the_loop_runs"),
+    (9, "policy file of wrong shape, type, name", "refused, the loop keeps the last good one", &["snapshot-shape", "snapshot-missing-tensor"], FILES, "fault_09_every_tensor_that_is_missing_or_of_another_type_or_shape_is_refused_by_name"),
     (10, "bit flips", "refused", &["snapshot-digest", "corrupt"], FILES, "fault_10_every_flipped_byte_is_refused"),
-    (11, "NaN or huge weights, zero standard deviation", "refused", &["snapshot-value", "not-finite"], PROCESSES, "snapshots_that_do_not_fit_are_refused_with_their_reason_and_a_good_one_is_swapped_in"),
+    (11, "NaN or huge weights, zero standard deviation", "refused", &["snapshot-value", "not-finite"], FILES, "fault_11_every_number_that_is_none_or_far_too_large_is_refused_with_its_place"),
     (12, "truncated file", "refused at every length, the next good one is taken", &["snapshot-malformed"], FILES, "fault_12_every_truncation_is_refused"),
     (13, "file is a link, pipe, folder, device, unreadable", "refused at once without opening it", &["snapshot-unreadable"], FILES, "fault_13_what_is_no_regular_file_is_refused_at_once"),
     (14, "trainer killed while it publishes", "the loop goes on, nothing is torn, a new trainer attaches", &["accepted"], KILLS, "fault_14_a_trainer_killed_while_it_publishes_tears_nothing"),
@@ -54,6 +56,15 @@ pub const ROWS: &[Row] = &[
     (35, "opposite weights swapped in every 10 ms", "one version a tick, every limit holds", &["active"], HERE, "fault_35_opposite_policies_every_ten_ticks_obey_every_limit"),
     (36, "torque beyond the motors: speed, payload, singular inertia", "brakes; what is sent is within the motors' range", &["braked-no-certified-answer", "no-certified-answers"], SOLVER, "fault_36_a_wrong_payload_and_a_singular_inertia_brake"),
     (37, "denormal numbers", "no effect: the same work in every tick", &["none"], SOLVER, "fault_37_denormal_numbers_change_nothing"),
+    (38, "pushed snapshot with looser or missing limits, another robot, or a policy that projects nothing", "the limits are the loop's: refused by joint and number; a tighter one is taken", &["looser-limits"], LIMITS, "fault_38_a_pushed_snapshot_may_tighten_the_limits_but_never_loosen_them"),
+    (39, "manifest nested beyond measure behind a right digest; a push larger than a file may be", "refused, no stack overflows", &["snapshot-foreign", "corrupt"], FILES, "fault_39_a_manifest_nested_beyond_measure_is_refused_and_overflows_no_stack"),
+    (40, "pipe, device, folder, link, endless file at a path that is opened; long TMPDIR", "refused at once, by name", &["link-foreign", "snapshot-unreadable"], SECURITY, "fault_40_what_is_no_file_is_refused_at_once_at_every_path_that_is_opened"),
+    (41, "another user made the files first, or opens ours", "refused by name, owner and mode; nothing of ours can be opened", &["link-foreign"], SECURITY, "fault_41_another_user_can_open_nothing_and_what_another_user_made_is_refused_by_name"),
+    (42, "mapped file made shorter while in use", "plant and loop brake and end by name", &["memory-torn"], SECURITY, "fault_42_files_truncated_in_use_brake_the_plant_and_end_both_by_name"),
+    (43, "kill at any system call of a start", "the next start begins anew, alone or beside a survivor", &["doctor-links"], KILLS, "fault_43_a_start_killed_at_any_system_call_stands_in_the_way_of_none_after_it"),
+    (44, "log file exists", "a new name; never written over", &["active"], LIMITS, "fault_44_a_log_that_is_there_is_never_written_over"),
+    (45, "plant or loop gone; plant slower than the wall", "the other side ends by name with its own exit code; the wall's time counts", &["plant-gone", "loop-gone"], LIMITS, "fault_45_a_plant_or_a_loop_that_is_gone_ends_the_other_with_its_own_code"),
+    (46, "motors too weak to hold the arm within its limits", "doctor and run refuse, by joint, needed and available force", &["doctor-holding"], LIMITS, "fault_46_motors_too_weak_to_hold_the_arm_are_refused_by_joint_and_number"),
 ];
 
 fn root() -> PathBuf {
@@ -76,7 +87,7 @@ fn page() -> String {
 #[test]
 fn the_table_is_complete_and_its_tests_exist() {
     let numbers: Vec<u32> = ROWS.iter().map(|r| r.0).collect();
-    assert_eq!(numbers, (1..=37).collect::<Vec<_>>());
+    assert_eq!(numbers, (1..=46).collect::<Vec<_>>());
     for (number, _, _, codes, file, test) in ROWS {
         let source = std::fs::read_to_string(root().join(file)).unwrap();
         let is_python = file.ends_with(".py");

@@ -62,12 +62,16 @@ fn what_hangs_in_its_creation_is_cleared_away() {
     use std::os::unix::fs::PermissionsExt;
     let name = Name::new("hangs");
     let user = std::fs::metadata("/proc/self").map(|m| std::os::unix::fs::MetadataExt::uid(&m)).unwrap();
-    let services = std::env::temp_dir().join(format!("nearl-{user}/{}/services", name.0));
+    let services = std::path::PathBuf::from(format!("/dev/shm/nearl-{user}/{}/services", name.0));
+    // While somebody has links of the robot nothing may be begun anew.
+    let _plant = PlantLink::open(&name.0, &robot(false)).unwrap();
     let listed = || std::fs::read_dir(&services).unwrap().map(|f| f.unwrap().path()).collect::<Vec<_>>();
     let link = RuntimeLink::open(&name.0).unwrap();
-    let files = listed();
+    let mut files = listed();
     drop(link);
-    assert!(files.len() >= 5 && listed().is_empty(), "{files:?}");
+    let left = listed();
+    files.retain(|file| !left.contains(file));
+    assert!(files.len() >= 4 && !left.is_empty(), "{files:?} {left:?}");
     // As a process leaves it that is killed between creating a service and finishing its description.
     std::fs::write(&files[0], "").unwrap();
     std::fs::set_permissions(&files[0], PermissionsExt::from_mode(0o600)).unwrap();

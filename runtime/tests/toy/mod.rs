@@ -147,6 +147,7 @@ pub fn robot(lockstep: bool) -> Robot {
         joints: vec!["slide".into()],
         observation: vec!["q.slide".into()],
         limits: 0,
+        stated: None,
         nq: 1,
         nv: 1,
         nu: 1,

@@ -12,7 +12,7 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             eprintln!("nearl: {e}");
-            ExitCode::FAILURE
+            ExitCode::from(nearl_runtime::cli::exit_code(&e))
         }
     }
 }

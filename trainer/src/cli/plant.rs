@@ -5,8 +5,9 @@ use crate::plant::MujocoPlant;
 use crate::tasks;
 use crate::train::complete;
 use clap::Args;
-use nearl_runtime::link::{METERS, PlantLink, PlantRunner, PlantSettings, RobotName};
-use nearl_runtime::rt::{FaultPlan, FaultyPlant, Stop};
+use nearl_runtime::cli::{Ended, LOOP_GONE, MEMORY_TORN};
+use nearl_runtime::link::{METERS, PlantLink, PlantReport, PlantRunner, PlantSettings, RobotName};
+use nearl_runtime::rt::{FaultPlan, FaultyPlant, Reason, Stop};
 use std::collections::BTreeMap;
 use std::io::Write;
 
@@ -26,6 +27,9 @@ pub(super) struct PlantCommand {
     /// SCHED_FIFO priority, 1 to 99, if the system allows it; best that of the runtime.
     #[arg(long, value_parser = clap::value_parser!(i32).range(1..=99), conflicts_with = "lockstep")]
     priority: Option<i32>,
+    /// End with exit code 4 after so long without an action, instead of waiting for the next runtime [s].
+    #[arg(long, value_parser = nearl_runtime::cli::seconds)]
+    loop_patience: Option<f64>,
     /// Let the robot go on instead of starting episodes anew.
     #[arg(long)]
     endless: bool,
@@ -55,6 +59,7 @@ impl PlantCommand {
         let mut settings =
             if self.lockstep { PlantSettings::lockstep(dt) } else { PlantSettings::simulator(dt) };
         settings.priority = self.priority;
+        settings.loop_patience = self.loop_patience;
         settings.ticks = self.seconds.map(|s| (s / dt).round() as u64);
         let stop = Stop::on_signals()?;
         if !self.json {
@@ -78,7 +83,7 @@ impl PlantCommand {
             say(
                 serde_json::json!({ "report": report, "violations": violations, "worst": worst, "not_measured": not_measured }),
             );
-            return Ok(());
+            return ended(&report, &name);
         }
         say(format!(
             "{} ticks, {} late, {} braked, watchdog {}",
@@ -95,6 +100,15 @@ impl PlantCommand {
                 None => format!("{what:<12} not measured"),
             });
         }
-        Ok(())
+        ended(&report, &name)
+    }
+}
+
+/// What ended the plant by itself, with its exit code.
+fn ended(report: &PlantReport, name: &RobotName) -> Result<(), Failure> {
+    match (report.memory_torn, report.loop_gone) {
+        (true, _) => Err(Ended::failure(MEMORY_TORN, Reason::MemoryTorn, name.as_str())),
+        (_, true) => Err(Ended::failure(LOOP_GONE, Reason::LoopGone, name.as_str())),
+        _ => Ok(()),
     }
 }

@@ -11,7 +11,7 @@ use nearl_runtime::constraints::{Model, Projector, Proposal, Target};
 use nearl_runtime::controller::Parts;
 use serde::Deserialize;
 use std::collections::BTreeSet;
-use std::io::BufRead;
+use std::io::{BufRead, Read};
 
 #[derive(Args)]
 pub(super) struct Project {
@@ -31,19 +31,37 @@ struct Line {
     v_proposal: Vec<f64>,
 }
 
+/// Longest line of input [bytes].
+const MOST_LINE: u64 = 1 << 20;
+
+/// The next line; none at the end. One without an end is refused before it fills the memory.
+fn next_line(input: &mut impl BufRead) -> Result<Option<String>, String> {
+    let mut line = Vec::new();
+    let read = input.take(MOST_LINE + 1).read_until(b'\n', &mut line).map_err(|e| e.to_string())?;
+    match read as u64 {
+        0 => Ok(None),
+        n if n > MOST_LINE => Err(format!("it is longer than {MOST_LINE} bytes; write one object a line")),
+        _ => {
+            String::from_utf8(line).map(Some).map_err(|e| format!("it is not UTF-8 text: {}", e.utf8_error()))
+        }
+    }
+}
+
 impl Project {
     pub(super) fn run(self) -> Result<(), Failure> {
         let mut manifest = tasks::load(&self.task, &self.set)?;
         let (model, mut projector) = robot(&mut manifest)?;
         let (mut target, names) = (Target::new(&model), projector.row_names());
-        for (i, line) in std::io::stdin().lock().lines().enumerate() {
-            let line = line.map_err(|e| format!("standard input, line {}: {e}", i + 1))?;
+        let mut input = std::io::stdin().lock();
+        for i in 0.. {
+            let line = next_line(&mut input).map_err(|e| format!("standard input, line {}: {e}", i + 1))?;
+            let Some(line) = line else { break };
             if line.trim().is_empty() {
                 continue;
             }
-            let input = parse(&line, &model).map_err(|e| format!("standard input, line {}: {e}", i + 1))?;
-            let proposal = Proposal { q: input.q_proposal, v: input.v_proposal };
-            projector.project(&input.q, &input.v, &proposal, &mut target);
+            let line = parse(&line, &model).map_err(|e| format!("standard input, line {}: {e}", i + 1))?;
+            let proposal = Proposal { q: line.q_proposal, v: line.v_proposal };
+            projector.project(&line.q, &line.v, &proposal, &mut target);
             let l = &target.ledger;
             let active: Vec<_> = l
                 .active

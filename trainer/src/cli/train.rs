@@ -118,6 +118,9 @@ impl Train {
             (None, Some(name)) => Experience::Served(RobotName::new(name)?, Arc::clone(&stop)),
             (None, None) => Experience::Here,
         };
+        for line in nearl_runtime::doctor::advice(&manifest)? {
+            eprintln!("nearl: warning: {line}");
+        }
         let bar = bar(self.json, run.steps);
         let (mut last, mut faults, mut lines) = (None, 0, Lines::new(self.json));
         let report = |p: &Progress, _| {

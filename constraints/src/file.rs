@@ -1,0 +1,54 @@
+//! Reading files that somebody else may have prepared.
+
+use std::fs::{File, OpenOptions};
+use std::io::{Error, Read, Result};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+
+use rustix::fs::OFlags;
+
+/// Largest robot, task, fault or limits file that is read [bytes].
+pub const MAX_TEXT_BYTES: u64 = 16 << 20;
+
+/// Opens a regular file for reading, without ever waiting: a pipe, a device or a folder is refused, whatever it would do when read.
+/// With `links`, the last part of the path may be a symbolic link.
+///
+/// # Errors
+/// What the system said, or what the path is instead of a file.
+pub fn open_regular(path: &Path, links: bool) -> Result<File> {
+    // Looked at before it is opened too: to open some devices already does something.
+    let named = if links { std::fs::metadata(path)? } else { std::fs::symlink_metadata(path)? };
+    let odd = || Error::other("it is not a regular file");
+    if !named.is_file() {
+        return Err(odd());
+    }
+    let mut flags = OFlags::NONBLOCK | OFlags::NOCTTY;
+    flags.set(OFlags::NOFOLLOW, !links);
+    let file = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path)?;
+    if file.metadata()?.is_file() { Ok(file) } else { Err(odd()) }
+}
+
+/// The content of a regular file of at most `limit` bytes; what grows while it is read is cut off by the same limit.
+///
+/// # Errors
+/// As [`open_regular`]; a file that is larger.
+pub fn read_bounded(path: &Path, limit: u64, links: bool) -> Result<Vec<u8>> {
+    let file = open_regular(path, links)?;
+    let length = file.metadata()?.len();
+    let too_large = |length| Error::other(format!("it has {length} bytes, more than the limit of {limit}"));
+    if length > limit {
+        return Err(too_large(length));
+    }
+    let mut bytes = Vec::with_capacity(length as usize);
+    let read = file.take(limit + 1).read_to_end(&mut bytes)? as u64;
+    if read > limit { Err(too_large(read)) } else { Ok(bytes) }
+}
+
+/// The text of a regular file of at most [`MAX_TEXT_BYTES`].
+///
+/// # Errors
+/// As [`read_bounded`]; a file that is not UTF-8.
+pub fn read_text(path: &Path) -> Result<String> {
+    let bytes = read_bounded(path, MAX_TEXT_BYTES, true)?;
+    String::from_utf8(bytes).map_err(|e| Error::other(format!("it is not UTF-8 text: {}", e.utf8_error())))
+}
