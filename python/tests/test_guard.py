@@ -1,5 +1,8 @@
 """`nearl.Guard`, and environments whose actions pass the constraints: what is promised is measured on the environment's own state."""
 
+import importlib.util
+import pathlib
+
 import numpy as np
 import pytest
 
@@ -135,3 +138,39 @@ def test_actions_of_an_unknown_meaning_are_refused():
         nearl.make_vec("Panda-reach", 1, actions="change")
     with pytest.raises(ValueError, match="without constraints"):
         gymnasium.make("nearl/Panda-reach", actions="guarded")
+
+
+@pytest.fixture
+def example():
+    spec = importlib.util.spec_from_file_location("sb3_guarded", pathlib.Path(__file__).parents[2] / "examples/python/sb3_guarded.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_learner_on_the_arm_improves_and_breaks_nothing(example):
+    """Hill climbing on a linear policy: what stands in for a learner of another library."""
+    env = example.make("arm")
+    rng = np.random.default_rng(1)
+    n_obs, n_act = env.observation_space.shape[0], env.action_space.shape[0]
+
+    def score(policy):
+        return example.run(env, lambda obs: np.clip(policy @ obs, -1, 1), 1)
+
+    best = np.zeros((n_act, n_obs))
+    first, broken = score(best)
+    best_return = first
+    for _ in range(15):
+        trial = best + 0.1 * rng.normal(size=best.shape)
+        value, outside = score(trial)
+        broken += outside
+        if value > best_return:
+            best, best_return = trial, value
+    assert broken == 0 and best_return > first, (first, best_return)
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "ppo"])
+def test_stable_baselines3_trains_behind_the_limits(example, algorithm, capsys):
+    pytest.importorskip("stable_baselines3")
+    example.main(algorithm, "arm", "300")
+    assert capsys.readouterr().out.count(", 0 ticks outside") == 2

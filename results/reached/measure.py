@@ -1,0 +1,69 @@
+"""Reached states outside the limits, without and with the simulator's guard, beside the share that no sampled action avoids.
+
+    python results/reached/measure.py TASK SNAPSHOT TICKS >> results/reached/reached.csv
+
+The policy runs without noise in Gymnasium's own environment; limits are those of the task file.
+"""
+
+import pathlib
+import sys
+import time
+import tomllib
+
+import gymnasium
+import numpy as np
+
+import nearl
+
+TASKS = pathlib.Path(__file__).parents[2] / "examples/tasks"
+SAMPLES = 400
+
+
+def limits(task: str) -> dict:
+    """Position margin and velocity limits of the task file, as `nearl.Guard` takes them."""
+    given = tomllib.loads((TASKS / f"{task}.toml").read_text())["constraints"]
+    return {name: given[name] for name in ("position", "velocity") if name in given}
+
+
+def avoidable(guard: nearl.Guard, action: np.ndarray, rng: np.random.Generator) -> bool:
+    """Whether one of the sampled actions (near the chosen one, anywhere, at the corners) ends inside."""
+    for k in range(SAMPLES):
+        draw = rng.uniform(-1.0, 1.0, len(action))
+        sample = (np.clip(action + draw**3, -1, 1), draw, np.clip(action + 0.3 * rng.normal(size=len(action)), -1, 1), np.sign(draw))[k % 4]
+        if guard._excess(guard._foresee(guard._middle + guard._half * sample)) <= 0.0:
+            return True
+    return False
+
+
+def measure(task: str, snapshot: str, ticks: int, guarded: bool) -> str:
+    """One line of the table: whole episodes, at least ``ticks`` control ticks."""
+    controller = nearl.Controller.load(snapshot)
+    env = gymnasium.make(task.replace("-velocity", "-v5"))
+    guard, rng = nearl.Guard(env, limits(task)), np.random.default_rng(0)
+    count, returns, spent, n = np.zeros((2, 3), int), [], 0.0, 0
+    while n < ticks:
+        obs, over, total = env.reset(seed=100 + len(returns))[0], False, 0.0
+        controller.reset()
+        while not over:
+            began = not guard.outside
+            start = time.perf_counter()
+            action = np.clip(np.asarray(controller.act(obs), np.float32), -1, 1)
+            if guarded:
+                action, _ = guard.safe(action)
+            spent += time.perf_counter() - start
+            out = guard._excess(guard._foresee(np.asarray(action, float))) > 0.0
+            lost = out and not avoidable(guard, action, rng)
+            start = time.perf_counter()
+            obs, reward, terminated, truncated, _ = env.step(action)
+            spent += time.perf_counter() - start
+            count += np.outer([1, began], [1, out, lost])
+            total, over, n = total + float(reward), terminated or truncated, n + 1
+        returns.append(total)
+    (all_ticks, out, lost), (began, out_inside, lost_inside) = count
+    word = "simulator" if guarded else "none"
+    return f"{task},{word},{all_ticks},{out},{lost},{began},{out_inside},{lost_inside},{np.mean(returns):.1f},{len(returns)},{n / spent:.0f}"
+
+
+if __name__ == "__main__":
+    for guarded in (False, True):
+        print(measure(sys.argv[1], sys.argv[2], int(sys.argv[3]), guarded), flush=True)
