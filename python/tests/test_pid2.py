@@ -8,10 +8,10 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-import tomllib
 from conftest import ROOT
 
 import nearl
+from nearl.runs import tomllib
 
 CART_POLE = str(ROOT / "examples" / "tasks" / "cart-pole.toml")
 
