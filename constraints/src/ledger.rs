@@ -194,7 +194,7 @@ pub struct Ledger {
     pub active: Vec<ActiveRow>,
     /// Weighted distance between proposal and target [weight rad/s].
     pub moved: f64,
-    /// Largest violation left by the target, as a share of its limit; 0 unless braking or recovering.
+    /// Largest share of its limit by which the target exceeds one: a soft one that gives way, or any while braking or recovering.
     pub slack: f64,
     /// Iterations of the active-set stage and of Clarabel.
     pub iterations: u32,

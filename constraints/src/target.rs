@@ -165,9 +165,13 @@ pub struct Settings {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Braking {
+    /// `Stored` where a hard limit on torque by speed, frame speed or energy asks for it, or one on torque for which
+    /// [`certify_braking`](crate::certify_braking) leaves less than 3 % of some motor, if every joint has an acceleration limit and is
+    /// controllable; else `Certified`. Decided when the projector is built.
+    #[default]
+    Auto,
     /// The braking decelerations are within the motors' reach everywhere, which
     /// [`certify_braking`](crate::certify_braking) tells; nothing is done in a tick.
-    #[default]
     Certified,
     /// Each tick verifies a whole brake from the new state by inverse dynamics; where none is found, the last one that
     /// was verified is executed.
@@ -175,7 +179,7 @@ pub enum Braking {
 }
 
 impl Settings {
-    /// Kinematic, ladder, unit weights.
+    /// Kinematic, ladder, unit weights, the way of braking that holds every hard limit.
     pub fn new(dt: f64, sub_steps: u32) -> Settings {
         Settings {
             dt,
@@ -185,7 +189,7 @@ impl Settings {
             velocity_weight: None,
             max_iter: 50,
             deadline: None,
-            braking: Braking::Certified,
+            braking: Braking::Auto,
         }
     }
 

@@ -11,7 +11,7 @@ __version__: str
 
 _Floats = NDArray[np.float64]
 _Path = str | os.PathLike[str]
-_PerJoint = float | Mapping[str, float]
+_PerJoint = float | Mapping[str, float] | Sequence[float]
 _Soft = tuple[float, float]
 _Status = Literal["unchanged", "clamped", "solved", "slowed", "recovering", "braked", "refused"]
 
@@ -316,7 +316,7 @@ class Projector:
         solver: Literal["ladder", "clarabel"] = "ladder",
         sub_steps: int = 1,
         velocity_weight: Sequence[float] | None = None,
-        braking: Literal["certified", "stored"] = "certified",
+        braking: Literal["auto", "certified", "stored"] = "auto",
         deadline: float | None = None,
     ) -> Projector: ...
     def project(

@@ -39,7 +39,7 @@ pub(crate) fn add_to(module: &Bound<'_, PyModule>) -> PyResult<()> {
 
 /// What every limit is: pass a list of them to `Projector`. `name` is what `Projector.set_enabled` takes.
 #[pyclass(module = "nearl._core", frozen, subclass)]
-pub(crate) struct Limit(Arc<dyn constraints::Limit>);
+pub(crate) struct Limit(Arc<dyn constraints::Limit>, Vec<String>);
 
 #[pymethods]
 impl Limit {
@@ -98,12 +98,29 @@ impl constraints::Limit for Shared {
 }
 
 /// The Rust limits behind a list of Python ones.
-pub(crate) fn boxed(limits: &[Bound<'_, PyAny>]) -> PyResult<Vec<Box<dyn constraints::Limit>>> {
-    limits.iter().enumerate().map(|(i, limit)| one(i, limit)).collect()
+pub(crate) fn boxed(
+    limits: &[Bound<'_, PyAny>],
+    robot: &constraints::Model,
+) -> PyResult<Vec<Box<dyn constraints::Limit>>> {
+    limits.iter().enumerate().map(|(i, limit)| one(i, limit, robot)).collect()
 }
 
-fn one(i: usize, limit: &Bound<'_, PyAny>) -> PyResult<Box<dyn constraints::Limit>> {
+/// Names of a robot's joints.
+fn joints(robot: &constraints::Model) -> Vec<String> {
+    robot.joints().iter().map(|joint| joint.name.clone()).collect()
+}
+
+fn one(
+    i: usize,
+    limit: &Bound<'_, PyAny>,
+    robot: &constraints::Model,
+) -> PyResult<Box<dyn constraints::Limit>> {
     match limit.cast::<Limit>() {
+        Ok(limit) if limit.get().1 != joints(robot) => Err(errors::value(format!(
+            "limits[{i}], {}, was made for another robot, with joints {}; build it with this one's model",
+            limit.get().0.label(),
+            limit.get().1.join(", ")
+        ))),
         Ok(limit) => Ok(Box::new(Shared(limit.get().0.clone()))),
         Err(_) => Err(PyTypeError::new_err(format!(
             "limits[{i}] is {}, not a limit; pass objects such as nearl.PositionLimit(model)",
@@ -124,13 +141,14 @@ fn checked<P: PyClass<BaseType = Limit>>(
         .and_then(|()| limit.rows(robot, &[]).map(|_| ()))
         .and_then(|()| limit.cone(robot, &[]).map(|_| ()));
     tried.map_err(errors::value)?;
-    Ok(PyClassInitializer::from(Limit(Arc::new(limit))).add_subclass(own))
+    Ok(PyClassInitializer::from(Limit(Arc::new(limit), joints(robot))).add_subclass(own))
 }
 
-/// One number for every joint, or numbers by joint name.
+/// One number for every joint, numbers by joint name, or one for each dof.
 enum Values {
     All(f64),
     Joints(BTreeMap<String, f64>),
+    Each(Vec<f64>),
 }
 
 impl<'a, 'py> FromPyObject<'a, 'py> for Values {
@@ -138,8 +156,11 @@ impl<'a, 'py> FromPyObject<'a, 'py> for Values {
 
     fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
         let all = given.extract().map(Values::All);
-        all.or_else(|_| given.extract().map(Values::Joints)).map_err(|_: PyErr| {
-            expected("a number for all joints, or numbers by name: {\"elbow\": 1.5}", &given)
+        let named = all.or_else(|_: PyErr| given.extract().map(Values::Joints));
+        named.or_else(|_: PyErr| given.extract().map(Values::Each)).map_err(|_: PyErr| {
+            let what =
+                "a number for all joints, numbers by name: {\"elbow\": 1.5}, or one for each dof: [1.5, 2.0]";
+            expected(what, &given)
         })
     }
 }
@@ -166,6 +187,7 @@ impl Values {
         match self {
             Values::All(value) => PerJoint::All(value),
             Values::Joints(map) => PerJoint::Joints(map),
+            Values::Each(list) => PerJoint::Each(list),
         }
     }
 }

@@ -32,7 +32,7 @@ use crate::target::{Target, Targets};
 ///     sub_steps (int): how the plant moves within a period: n semi-implicit Euler steps of a simulator (1, as MuJoCo's Euler with one step
 ///         a period), or 0 for constant acceleration: a real robot, or Runge-Kutta.
 ///     velocity_weight (list[float] | None): w of each velocity (nv), from 0.001 to 1000; 1 each by default.
-///     braking ("certified" | "stored"): what makes sure that a way to stop is left; see docs/LIMITS.md.
+///     braking ("auto" | "certified" | "stored"): what makes sure that a way to stop is left; see docs/LIMITS.md.
 ///     deadline (float | None): time after which Clarabel gives up [s].
 #[pyclass(module = "nearl._core", frozen)]
 pub(crate) struct Projector {
@@ -58,7 +58,7 @@ type Problem<'py> = (
 #[pymethods]
 impl Projector {
     #[new]
-    #[pyo3(signature = (model, limits, dt, controllable=None, consistency="kinematic", solver="ladder", sub_steps=1, velocity_weight=None, braking="certified", deadline=None))]
+    #[pyo3(signature = (model, limits, dt, controllable=None, consistency="kinematic", solver="ladder", sub_steps=1, velocity_weight=None, braking="auto", deadline=None))]
     fn new(
         py: Python<'_>,
         model: Py<Model>,
@@ -81,8 +81,11 @@ impl Projector {
             )?,
             choice("solver", solver, &[("ladder", Solver::Ladder), ("clarabel", Solver::Clarabel)])?,
         );
-        let braking =
-            choice("braking", braking, &[("certified", Braking::Certified), ("stored", Braking::Stored)])?;
+        let braking = choice(
+            "braking",
+            braking,
+            &[("auto", Braking::Auto), ("certified", Braking::Certified), ("stored", Braking::Stored)],
+        )?;
         let deadline = match deadline.map(Duration::try_from_secs_f64) {
             None => None,
             Some(Ok(deadline)) => Some(deadline),
@@ -99,11 +102,15 @@ impl Projector {
             ..Settings::new(dt, sub_steps)
         };
         let controllable = dofs(robot, controllable)?;
-        let limits = limits::boxed(&limits)?;
+        let limits = limits::boxed(&limits, robot)?;
         let first = py
             .detach(|| constraints::Projector::new(robot, &limits, &controllable, settings.clone()))
             .map_err(errors::value)?;
-        let names = first.row_names();
+        let (names, settings) = (first.row_names(), first.settings().clone());
+        for note in first.notes() {
+            let category = py.get_type::<pyo3::exceptions::PyUserWarning>();
+            PyErr::warn(py, &category, &std::ffi::CString::new(note.as_str()).unwrap_or_default(), 1)?;
+        }
         let sizes = (robot.nq(), robot.nv());
         Ok(Projector {
             names,

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use nearl_constraints::{Braking, Model, certify_braking};
+use nearl_constraints::{Model, Projector, certify_braking};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
@@ -147,16 +147,22 @@ fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
     }
     match Parts::new(&snapshot.manifest) {
         Ok(parts) => {
-            checks.extend([notes(&parts.model), projection(m), holding(m, &parts), braking(m, parts)]);
+            checks.extend([
+                notes(&parts.model, &parts.projector),
+                projection(m),
+                holding(m, &parts),
+                braking(m, parts),
+            ]);
         }
         Err(e) => checks.push(fail(CheckCode::Braking, e.to_string())),
     }
     (Some(snapshot), checks)
 }
 
-/// What the robot file has that projection and inverse dynamics do not reckon with.
-fn notes(model: &Model) -> Check {
-    match model.notes() {
+/// What the robot file has that projection and inverse dynamics do not reckon with, and limits that are hardly meant.
+fn notes(model: &Model, projector: &Projector) -> Check {
+    let notes = [model.notes(), projector.notes()].concat();
+    match &notes[..] {
         [] => ok(CheckCode::Model, "the model holds what the robot file describes".into()),
         notes => warn(CheckCode::Model, notes.join("; ")),
     }
@@ -218,7 +224,7 @@ fn braking(m: &Manifest, parts: Parts) -> Check {
             if c.holds() {
                 return ok(CheckCode::Braking, found);
             }
-            if m.task.constraints.braking == Braking::Stored {
+            if projector.stores_a_brake() {
                 let kept = "each tick verifies a way to stop before it takes a state (constraints.braking = \"stored\")";
                 return ok(CheckCode::Braking, format!("{found}: too little, so {kept}"));
             }

@@ -67,7 +67,17 @@ impl Limit for AccelerationLimit {
         let Some(braking) = &self.settings.braking else { return Ok(()) };
         let values = braking.values(model, "acceleration braking", |x| x > 0.0, domain)?;
         for &i in controllable {
-            set.braking[i] = set.braking[i].min(values[i].unwrap_or(f64::INFINITY));
+            let (stated, most) = (values[i].unwrap_or(set.acceleration[i]), set.acceleration[i]);
+            if stated > most {
+                return Err(LimitError::Unusable {
+                    what: format!(
+                        "acceleration braking of joint '{}' is {stated} rad/s² or m/s², above its acceleration limit of {most}",
+                        model.dof_name(i)
+                    ),
+                    next: "brake with at most the limit less its margin",
+                });
+            }
+            set.braking[i] = set.braking[i].min(stated);
         }
         Ok(())
     }

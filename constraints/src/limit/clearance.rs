@@ -23,8 +23,8 @@ const RECOVERY: f64 = 2.0;
 /// A state this far outside the set is inside [m].
 const ROUNDING: f64 = 1e-10;
 
-/// Beyond the boundary this much [m] is taken back in [`RETURN`] periods.
-const CREEP: f64 = 1e-4;
+/// Beyond the boundary this much [m] is taken back in [`RETURN`] periods; brakes that slide along it are allowed as much.
+pub(super) const CREEP: f64 = 1e-4;
 
 /// See [`CREEP`].
 const RETURN: f64 = 20.0;

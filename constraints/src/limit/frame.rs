@@ -1,7 +1,7 @@
 //! Where a point of a frame may be: below a plane, inside a box.
 
 use super::Limit;
-use super::clearance::{Ahead, Clearance};
+use super::clearance::{Ahead, CREEP, Clearance};
 use crate::kinematics::{dot, norm};
 use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
 use crate::{FrameId, Kind, LimitError, Model, Period, PointMotion, Soft};
@@ -259,12 +259,12 @@ impl Rows for FrameRows {
         }
     }
 
-    /// Metres beyond the plane.
+    /// Metres beyond the plane and what may creep over it.
     fn breach(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
         let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
         let at = then.point(self.frame, self.point);
         for (x, plane) in out.iter_mut().zip(&self.planes) {
-            *x = dot(plane.n, at.position) - plane.offset;
+            *x = dot(plane.n, at.position) - plane.offset - CREEP;
         }
     }
 }

@@ -17,7 +17,7 @@ pub struct ConstraintSettings {
     pub consistency: Consistency,
     /// `"ladder"` (default) or `"clarabel"`.
     pub solver: Solver,
-    /// `"certified"` (default) or `"stored"`.
+    /// `"auto"` (default), `"certified"` or `"stored"`.
     pub braking: Braking,
     /// `true`: actions of a policy and of a learned inverse model lead to a projected state too.
     #[serde(skip_serializing_if = "Guard::is_off")]
@@ -66,14 +66,19 @@ pub struct ConstraintSettings {
     pub rows: Vec<UserRowSettings>,
 }
 
-/// One number for every joint, or numbers by joint name.
+/// One number for every joint, numbers by joint name, or one number for each dof in the order of a velocity.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "expected a number, or a table of numbers by joint")]
+#[serde(
+    untagged,
+    expecting = "expected a number, a table of numbers by joint, or a list of one number for each joint"
+)]
 pub enum PerJoint {
     /// The same for all joints.
     All(f64),
     /// By joint; joints that are not named get nothing from it.
     Joints(BTreeMap<String, f64>),
+    /// Dof by dof (nv).
+    Each(Vec<f64>),
 }
 
 impl PerJoint {
@@ -95,6 +100,19 @@ impl PerJoint {
         let mut values = vec![None; model.nv()];
         match self {
             PerJoint::All(value) => values.fill(Some(checked(limit.to_string(), *value)?)),
+            PerJoint::Each(list) if list.len() != model.nv() => {
+                let (given, nv) = (list.len(), model.nv());
+                return Err(LimitError::Unusable {
+                    what: format!("{limit} is a list of {given} numbers for a robot of {nv} dofs"),
+                    next: "give one number for each dof, one for all, or a table by joint",
+                });
+            }
+            PerJoint::Each(list) => {
+                for (i, value) in list.iter().enumerate() {
+                    let of = || format!("{limit} of joint '{}'", model.dof_name(i));
+                    values[i] = Some(checked(of(), *value)?);
+                }
+            }
             PerJoint::Joints(map) => {
                 for (name, value) in map {
                     let unknown = |near| LimitError::UnknownJoint { limit, name: name.clone(), near };

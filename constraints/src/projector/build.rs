@@ -2,6 +2,7 @@
 
 use super::active_set::ActiveSet;
 use super::backup::Backup;
+use super::choice;
 use super::conic::Conic;
 use super::coupled::Coupled;
 use super::polish::Polish;
@@ -37,8 +38,12 @@ impl Projector {
         }
         let switches = switches(model, limits, &dofs.controllable)?;
         let (each, limits) = (limits, LimitSet::collect(model, limits, &dofs.controllable)?);
-        check_combination(model, &limits, &dofs, (settings.consistency, settings.braking))?;
         let period = Period::new(settings.dt, settings.sub_steps);
+        let checker = Checker::new(model, each, &dofs.controllable, period, settings.consistency)?;
+        let mut notes = choice::doubts(model, &limits, &dofs, &settings);
+        let braking = choice::braking(model, &limits, &dofs, &settings, &checker, &mut notes);
+        let settings = Settings { braking, ..settings };
+        check_combination(model, &limits, &dofs, (settings.consistency, settings.braking))?;
         let weight: Vec<f64> = match &settings.velocity_weight {
             Some(w) => w.iter().map(|w| w * w).collect(),
             None => vec![1.0; nv],
@@ -53,7 +58,8 @@ impl Projector {
         let zero = || vec![0.0; nv];
         Ok(Projector {
             dynamics: Dynamics::new(model),
-            checker: Checker::new(model, each, &dofs.controllable, period, settings.consistency)?,
+            checker,
+            notes,
             coupled: stages(model, each, &limits, &dofs, &weight, &settings)?,
             switches,
             external: zero(),

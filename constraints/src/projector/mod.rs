@@ -5,6 +5,7 @@
 mod active_set;
 mod backup;
 mod build;
+mod choice;
 mod conic;
 mod coupled;
 mod gradient;
@@ -53,8 +54,8 @@ const NEARLY: f64 = 0.98;
 /// velocity change they propose.
 ///
 /// Nothing allocates after [`Projector::new`] but one small buffer inside each Clarabel solve. Given the same input, the
-/// output has the same bits, whatever was projected before; what limits on jerk and torque rates know of the tick before is
-/// an input too, see [`Projector::set_previous`].
+/// output has the same bits, whatever was projected before; what limits on jerk and torque rates know of the tick before, and
+/// the brake that is stored, are inputs too, see [`Projector::set_previous`] and [`Projector::memory`].
 pub struct Projector {
     model: Model,
     dynamics: Dynamics,
@@ -76,6 +77,8 @@ pub struct Projector {
     external: Vec<f64>,
     previous: History,
     backup: Backup,
+    /// What looks odd about the limits.
+    notes: Vec<String>,
     /// `q_hat (-) q` (nv).
     displacement: Vec<f64>,
     /// Unconstrained optimum of v' (nv).
@@ -199,7 +202,12 @@ impl Projector {
         &self.dofs.controllable
     }
 
-    /// The settings it was built with.
+    /// What is allowed and hardly meant, or not held: a sentence each, with joint, value and unit.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
+    }
+
+    /// The settings it was built with; [`Braking::Auto`] has become what was chosen.
     pub fn settings(&self) -> &Settings {
         &self.settings
     }
@@ -257,13 +265,14 @@ impl Projector {
     ) -> Status {
         let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
         target.ledger.violations = verdict.counts;
-        target.ledger.slack = verdict.worst;
+        let soft = target.ledger.active.iter().fold(0.0, |most: f64, row| most.max(row.slack));
+        target.ledger.slack = verdict.worst.max(soft);
         let outside = &target.ledger.outside;
         let is_joint_outside = outside.iter().any(|row| *row < v.len());
         if verdict.accepts() || (is_joint_outside && verdict.counts.torque + verdict.counts.other == 0) {
             let status = if outside.is_empty() { status } else { Status::Recovering };
             return match self.settings.braking {
-                Braking::Certified => status,
+                Braking::Auto | Braking::Certified => status,
                 Braking::Stored => self.keep_a_brake(q, v, proposal, target, status),
             };
         }

@@ -17,7 +17,8 @@ fn settings_with(line: &str) -> ConstraintSettings {
 fn projector(constraints: &ConstraintSettings, solver: Solver) -> Projector {
     let model = panda();
     let limits = build_limits(constraints, &model).unwrap();
-    let settings = Settings { solver, ..Settings::new(0.001, 1) };
+    // Each kind by itself, without a stored brake.
+    let settings = Settings { solver, braking: Braking::Certified, ..Settings::new(0.001, 1) };
     Projector::new(&model, &limits, &[0, 1, 2, 3, 4, 5, 6], settings).unwrap()
 }
 

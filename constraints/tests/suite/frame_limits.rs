@@ -67,6 +67,11 @@ fn judge(rows: &mut dyn Rows, model: &Model, q: &[f64], v: &[f64], y: &[f64], pe
     excess
 }
 
+/// What rows and cones do by themselves, without a stored brake.
+fn rows_alone(dt: f64, sub_steps: u32) -> Settings {
+    Settings { braking: Braking::Certified, ..Settings::new(dt, sub_steps) }
+}
+
 /// A little beyond the row's bound the judge says so, a little inside it accepts. The judge uses no Jacobian.
 #[test]
 fn rows_and_judge_draw_the_same_line() {
@@ -165,7 +170,7 @@ fn no_proposal_closes_a_distance() {
     let m = panda();
     let mut limits = panda_limits(None);
     limits.push(Box::new(panda_collision(40, 0.8)));
-    let mut projector = Projector::new(&m, &limits, &[0, 1, 2, 3, 4, 5, 6], Settings::new(DT, 1)).unwrap();
+    let mut projector = Projector::new(&m, &limits, &[0, 1, 2, 3, 4, 5, 6], rows_alone(DT, 1)).unwrap();
     let bodies = panda_solids();
     let mut k = Kinematics::new(&m);
     let mut least = |q: &[f64]| {
@@ -220,7 +225,7 @@ fn a_hand_stops_in_front_of_a_plane() {
     for sub_steps in [0, 1, 4] {
         let mut limits = panda_limits(None);
         limits.push(Box::new(FrameLimit::half_space("panda_hand", [0.0, 0.0, -1.0], [0.0, 0.0, 0.2], 1.5)));
-        let settings = Settings::new(DT, sub_steps);
+        let settings = rows_alone(DT, sub_steps);
         let mut projector = Projector::new(&m, &limits, &[0, 1, 2, 3, 4, 5, 6], settings).unwrap();
         let (mut random, mut target, mut k) = (Random(9), Target::new(&m), Kinematics::new(&m));
         let hand = m.frame("panda_hand").unwrap();
@@ -254,7 +259,7 @@ fn a_ball_stops_in_front_of_a_floor_however_fast_the_joints_turn() {
     let mut limits = panda_limits(None);
     let near = CollisionSettings { braking: 0.5, influence: 8.0, margin: 0.0, ..settings(&[ball, floor]) };
     limits.push(Box::new(CollisionLimit::new(near)));
-    let mut projector = Projector::new(&m, &limits, &[0, 1, 2, 3, 4, 5, 6], Settings::new(dt, 1)).unwrap();
+    let mut projector = Projector::new(&m, &limits, &[0, 1, 2, 3, 4, 5, 6], rows_alone(dt, 1)).unwrap();
     let (mut random, mut target, mut k) = (Random(4), Target::new(&m), Kinematics::new(&m));
     let (hand, mut lowest, mut active) = (m.frame("panda_hand").unwrap(), f64::INFINITY, 0);
     for _ in 0..40 {
@@ -289,8 +294,7 @@ fn cones_hold_speed_and_energy() {
     for (cone, kind) in cones {
         let mut limits = panda_limits(None);
         limits.push(cone);
-        let mut projector =
-            Projector::new(&m, &limits, &[0, 1, 2, 3, 4, 5, 6], Settings::new(DT, 1)).unwrap();
+        let mut projector = Projector::new(&m, &limits, &[0, 1, 2, 3, 4, 5, 6], rows_alone(DT, 1)).unwrap();
         let (mut random, mut target) = (Random(2), Target::new(&m));
         let (mut k, mut dynamics) = (Kinematics::new(&m), Dynamics::new(&m));
         let (mut q, mut v) = (vec![0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0], vec![0.0; 7]);

@@ -6,6 +6,7 @@ mod common;
 mod attack;
 mod certify;
 mod conformance;
+mod defaults;
 mod errors;
 mod frame_limits;
 mod geometry;

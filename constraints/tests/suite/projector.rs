@@ -236,7 +236,8 @@ fn wrong_lengths_are_refused() {
 #[test]
 fn history_leaves_no_trace() {
     for solver in [Solver::Ladder, Solver::Clarabel] {
-        let fresh = || panda_projector(Some(0.6), Settings { solver, ..settings() });
+        let alone = Settings { solver, braking: Braking::Certified, ..settings() };
+        let fresh = || panda_projector(Some(0.6), alone.clone());
         let (mut used, mut random) = (fresh(), Random(6));
         let mut target = Target::new(used.model());
         for k in 0..40 {

@@ -109,6 +109,13 @@ impl CommandSection {
             Some(PerJoint::Joints(map)) => map.keys().cloned().collect(),
             _ => Vec::new(),
         };
+        for (key, values) in [("stiffness", &self.stiffness), ("damping", &self.damping)] {
+            if let Some(PerJoint::Each(_)) = values {
+                return Err(format!(
+                    "[command.{key}] is a list; give one number, or a table of numbers by joint"
+                ));
+            }
+        }
         let named = [
             ("interface", interface.into_iter().cloned().collect()),
             ("stiffness", of(&self.stiffness)),
@@ -130,5 +137,6 @@ fn number(values: Option<&PerJoint>, joint: &str) -> Option<f64> {
     match values? {
         PerJoint::All(value) => Some(*value),
         PerJoint::Joints(map) => map.get(joint).copied(),
+        PerJoint::Each(_) => None,
     }
 }

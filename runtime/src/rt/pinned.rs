@@ -124,8 +124,13 @@ impl Pinned {
         let loses_guard = old.guards() && !keeps(new);
         say(loses_guard, "its actions are not guarded where those of the loop are".into());
         let (kept, brought) = (&self.constraints, &new.task.constraints);
-        let loses_brake = kept.braking == Braking::Stored && brought.braking != Braking::Stored;
-        say(loses_brake, "braking = \"certified\" where the loop has \"stored\"".into());
+        // Of a braking that is chosen nobody knows here whether it is the stored one.
+        let worth =
+            |braking| [Braking::Certified, Braking::Auto, Braking::Stored].iter().position(|b| *b == braking);
+        let loses_brake = worth(brought.braking) < worth(kept.braking);
+        let name = |braking: Braking| format!("{braking:?}").to_lowercase();
+        let (was, is) = (name(kept.braking), name(brought.braking));
+        say(loses_brake, format!("braking = \"{is}\" where the loop has \"{was}\""));
         let splits =
             kept.consistency == Consistency::Kinematic && brought.consistency != Consistency::Kinematic;
         say(splits, "consistency = \"free\" where the loop has \"kinematic\"".into());

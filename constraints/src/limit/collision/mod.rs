@@ -2,7 +2,7 @@
 
 mod pairs;
 
-use super::clearance::Ahead;
+use super::clearance::{Ahead, CREEP};
 use super::frame::check;
 use super::{Limit, quoted_names};
 use crate::geometry::{Placement, Shape};
@@ -308,6 +308,6 @@ impl Rows for CollisionRows {
     fn breach(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
         out.fill(f64::NEG_INFINITY);
         let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
-        out[0] = self.margin - self.pairs.least(then);
+        out[0] = self.margin - self.pairs.least(then) - CREEP;
     }
 }

@@ -1,0 +1,110 @@
+//! Which way of braking a projector takes where none is asked for, and what looks odd about its limits.
+
+use super::Dofs;
+use crate::checker::Checker;
+use crate::viability::{Kind, Period};
+use crate::{Braking, Consistency, LimitSet, Model, Settings, certify_braking};
+
+/// States looked at, and their seed.
+const SAMPLES: (usize, u64) = (2000, 7);
+
+/// Share of a motor's force that certified braking must leave: the search is no proof.
+const MARGIN: f64 = 0.03;
+
+/// A joint that needs longer than this to stop has an acceleration limit nobody meant [s].
+const LONGEST_STOP: f64 = 30.0;
+
+/// A joint that is faster than this is stated in degrees [rad/s or m/s].
+const FASTEST: f64 = 60.0;
+
+/// A joint of a wider range is stated in degrees [rad or m].
+const WIDEST: f64 = 60.0;
+
+/// A longer control period controls nothing [s].
+const LONGEST: f64 = 0.5;
+
+/// The way of braking that `settings` ask for, or that holds every hard limit.
+pub(super) fn braking(
+    model: &Model,
+    limits: &LimitSet,
+    dofs: &Dofs,
+    settings: &Settings,
+    judge: &Checker,
+    notes: &mut Vec<String>,
+) -> Braking {
+    if settings.braking != Braking::Auto {
+        return settings.braking;
+    }
+    let kinds = judge.hard_kinds();
+    if settings.consistency == Consistency::Free || kinds.is_empty() {
+        return Braking::Certified; // the boxes of single joints keep themselves
+    }
+    let names = |list: Vec<usize>| {
+        list.iter().map(|i| format!("'{}'", model.dof_name(*i))).collect::<Vec<_>>().join(", ")
+    };
+    let endless: Vec<usize> =
+        dofs.controllable.iter().copied().filter(|i| limits.braking[*i].is_infinite()).collect();
+    if !endless.is_empty() {
+        let names = names(endless);
+        notes.push(format!(
+            "no brake can be stored without an acceleration limit on {names}: {} may be broken when something forces a stop; add one",
+            listed(&kinds)
+        ));
+        return Braking::Certified;
+    }
+    if !dofs.fixed.is_empty() {
+        return Braking::Certified; // of a base that nobody drives no brake is known
+    }
+    // Planes, bodies and rows of one's own bring a braking of their own, and a stored brake where something else needs one.
+    let asks =
+        |kind: &Kind| matches!(kind, Kind::Torque | Kind::TorqueSpeed | Kind::FrameSpeed | Kind::Energy);
+    if !kinds.iter().any(asks) {
+        return Braking::Certified;
+    }
+    if kinds.iter().filter(|kind| asks(kind)).all(|kind| *kind == Kind::Torque) {
+        let period = Period::new(settings.dt, settings.sub_steps);
+        let (samples, seed) = SAMPLES;
+        let found = certify_braking(model, limits, &dofs.controllable, &period, samples, seed);
+        if found.is_ok_and(|c| c.margin >= MARGIN) {
+            return Braking::Certified;
+        }
+    }
+    Braking::Stored
+}
+
+fn listed(kinds: &[Kind]) -> String {
+    let mut names: Vec<_> = kinds.iter().map(|kind| kind.name()).collect();
+    names.dedup();
+    names.join(", ")
+}
+
+/// One sentence for each number that is allowed and hardly meant.
+pub(super) fn doubts(model: &Model, limits: &LimitSet, dofs: &Dofs, settings: &Settings) -> Vec<String> {
+    let mut notes = Vec::new();
+    if settings.dt > LONGEST {
+        let dt = settings.dt;
+        notes.push(format!(
+            "the control period is {dt} s, between two ticks nobody looks; is it milliseconds?"
+        ));
+    }
+    for &i in &dofs.controllable {
+        let (name, v, a) = (model.dof_name(i), limits.velocity[i], limits.acceleration[i]);
+        let stated = model.velocity_limit()[i];
+        if v.is_finite() && (v > 5.0 * stated || v > FASTEST) {
+            let file =
+                if stated.is_finite() { format!(", the robot file says {stated}") } else { String::new() };
+            notes.push(format!("the velocity limit of '{name}' is {v} rad/s or m/s{file}; is it degrees?"));
+        }
+        if a.is_finite() && v.is_finite() && v / a > LONGEST_STOP {
+            let time = v / a;
+            notes.push(format!(
+                "the acceleration limit of '{name}' is {a} rad/s² or m/s²: from {v} rad/s or m/s it needs {time:.0} s to stop"
+            ));
+        }
+        let range = limits.q_upper[i] - limits.q_lower[i];
+        if range.is_finite() && range > WIDEST {
+            notes.push(format!("the range of '{name}' is {range:.1} rad or m; is it degrees?"));
+        }
+    }
+    notes
+}
