@@ -93,8 +93,8 @@ impl Pinned {
         let unusable = |e: SnapshotError| Refusal { verdict: Verdict::of(&e), text: e.to_string() };
         let parts = Parts::new(manifest).map_err(unusable)?;
         let names: Vec<String> = (0..parts.model.nv()).map(|i| parts.model.dof_name(i)).collect();
-        if names != self.joints {
-            // Another robot altogether: named joint by joint where the plant is compared.
+        if names != self.joints || manifest.task.time.dt != self.manifest.task.time.dt {
+            // Another robot or period altogether: named where the plant is compared, which refuses it.
             return Ok(());
         }
         let mut found = self.ways(manifest);

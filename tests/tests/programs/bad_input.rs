@@ -357,12 +357,23 @@ fn the_doctor_checks_snapshot_machine_and_plant() {
     assert_eq!(code, Some(0), "{out}");
     let looked: Vec<&str> = lines.iter().map(|(_, check)| check.as_str()).collect();
     let all = [
-        "snapshot", "canary", "model", "braking", "memory", "links", "priority", "lock", "clock", "wake-up",
+        "snapshot",
+        "canary",
+        "model",
+        "projection",
+        "holding",
+        "braking",
+        "memory",
+        "links",
+        "priority",
+        "lock",
+        "clock",
+        "wake-up",
         "plant",
     ];
     assert_eq!(looked, all, "{out}");
     assert!(lines.iter().all(|(finding, _)| finding == "ok" || finding == "warn"), "{out}");
-    assert!(lines[10].0 == "ok" && out.contains("7 joints"), "{out}");
+    assert!(lines[12].0 == "ok" && out.contains("7 joints"), "{out}");
     plant.end();
 
     // Another robot, and no robot.
