@@ -19,6 +19,9 @@ pub fn open_regular(path: &Path, links: bool) -> Result<File> {
     // Looked at before it is opened too: to open some devices already does something.
     let named = if links { std::fs::metadata(path)? } else { std::fs::symlink_metadata(path)? };
     let odd = || Error::other("it is not a regular file");
+    if named.is_dir() {
+        return Err(Error::other("it is a directory, not a regular file"));
+    }
     if !named.is_file() {
         return Err(odd());
     }

@@ -41,9 +41,7 @@ fn next_line(input: &mut impl BufRead) -> Result<Option<String>, String> {
     match read as u64 {
         0 => Ok(None),
         n if n > MOST_LINE => Err(format!("it is longer than {MOST_LINE} bytes; write one object a line")),
-        _ => {
-            String::from_utf8(line).map(Some).map_err(|e| format!("it is not UTF-8 text: {}", e.utf8_error()))
-        }
+        _ => String::from_utf8(line).map(Some).map_err(|_| "stream did not contain valid UTF-8".into()),
     }
 }
 
