@@ -1,8 +1,11 @@
 # NEARL: set-up, demo and tests of a checkout. Every target does what it needs first and may be run any number of times.
 
-PYTHON ?= python3.11
+# Any Python from 3.10 to 3.14.
+PYTHON ?= python3
 VENV := .venv
-MUJOCO := lib/python3.11/site-packages/mujoco/libmujoco.so.3.17.0
+# Where pip puts packages, under a name without the Python version: .cargo/config.toml says it.
+SITE := $(VENV)/site-packages
+MUJOCO := site-packages/mujoco/libmujoco.so.3.17.0
 # The stamp carries the digest of the requirements, so a changed list installs again and an old one does not.
 STAMP := $(VENV)/.requirements-$(shell sha256sum python/requirements.txt | cut -c1-16)
 LINKS := $(VENV)/mujoco-link/libmujoco.so $(VENV)/mujoco-link/libmujoco.so.3.17.0
@@ -14,39 +17,61 @@ export CARGO_TARGET_DIR := $(CURDIR)/target
 # Steps of the demo's training: about two minutes on two cores.
 DEMO_STEPS ?= 3000000
 
-.PHONY: setup build package demo test
-setup: $(LINKS)
+.PHONY: setup build wheel package demo docs test check
+setup: $(LINKS) $(SITE)
 
 build: setup
+	@echo "== building the programs (the first time three to five minutes)"
 	cargo build --release --locked --bins
 
-# The Python package, built from this checkout into .venv.
-package: setup
-	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(PIP) --no-deps --no-build-isolation ./python
+# One wheel for Python 3.10 to 3.14 in target/wheel: the package, the extension and the `nearl` program.
+wheel: build
+	@echo "== building the Python package from the same crates"
+	@PATH="$(CURDIR)/$(VENV)/bin:$$PATH" python/build-wheel
+
+# The wheel of this checkout, installed into .venv.
+package: wheel
+	$(PIP) --no-deps --force-reinstall target/wheel/nearl-*.whl
 
 # The main job: train with constraints, run the result and a bundled arm as separate processes, and report.
-demo: build package
+demo: package
 	rm -rf demo
+	@echo "== training HalfCheetah, $(DEMO_STEPS) steps (two minutes for 3,000,000)"
 	$(NEARL) train HalfCheetah-v5 --algo pid2-ib --steps $(DEMO_STEPS) --out demo/train
+	@echo "== running it and a bundled arm as processes of their own, and writing the report"
 	$(NEARL) demo --run demo/train --out demo
 	@echo "open demo/report.html in a browser"
 
-test: build package
+# The site of all pages in target/site, with the Rust and the Python reference; fails on a dead link.
+docs: package
+	cargo doc --quiet --no-deps --release --locked -p nearl-constraints -p nearl-controller -p nearl-runtime -p nearl-trainer
+	$(VENV)/bin/python docs/build.py target/site
+
+test: package
 	cargo test --release --locked --no-fail-fast
 	$(VENV)/bin/python -m pytest python/tests -q
 
+# Everything that must hold before a change lands.
+check:
+	.ci/run
+
 $(VENV)/bin/python:
-	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) was not found: install Python 3.11 or say 'make setup PYTHON=/path/to/python3.11'" >&2; exit 1; }
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) was not found: install Python 3.10 to 3.14 or say 'make setup PYTHON=/path/to/python'" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' || { echo "$(PYTHON) is $$($(PYTHON) --version 2>&1), but Python 3.10 to 3.14 is needed: say 'make setup PYTHON=/path/to/python'" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	@test -d $(VENV)/lib/python3.11 || { rm -rf $(VENV); echo "$(PYTHON) is not Python 3.11, which .cargo/config.toml expects: say 'make setup PYTHON=/path/to/python3.11'" >&2; exit 1; }
 
 $(STAMP): | $(VENV)/bin/python
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --requirement python/requirements.txt
+	@echo "== fetching MuJoCo, Pinocchio and the tools of the tests into $(VENV)"
+	$(PIP) --requirement python/requirements.txt
 	@rm -f $(VENV)/.requirements-*
 	@touch $@
 
+# A link of the folder's own: a `lib/python3.*` without packages, left by another Python, is not it.
+$(SITE): | $(VENV)/bin/python
+	ln -sfn "$$($(VENV)/bin/python -c 'import os, sysconfig; print(os.path.relpath(sysconfig.get_paths()["purelib"], "$(VENV)"))')" $@
+
 # The wheel ships the library under its full version only; linkers ask for libmujoco.so, programs for the full name.
-$(LINKS): | $(STAMP)
+$(LINKS): | $(STAMP) $(SITE)
 	@mkdir -p $(@D)
 	ln -sfn ../$(MUJOCO) $@
 	@test -e $@ || { rm -f $@; echo "$(VENV)/$(MUJOCO) is missing: does python/requirements.txt still say mujoco==3.17.0?" >&2; exit 1; }

@@ -1,18 +1,16 @@
-//! Compiles the C++ shim (`cpp/`) against Pinocchio's headers and links Pinocchio's libraries, both from the
-//! wheels under `NEARL_SITE_PACKAGES` (set in `.cargo/config.toml`, filled by `make setup`).
+//! Compiles the C++ shim (`cpp/`) against Pinocchio's headers and links Pinocchio's library. Where they are is looked for in this
+//! order: the Python packages under `NEARL_SITE_PACKAGES` (set in `.cargo/config.toml`, filled by `make setup`), `PINOCCHIO_PREFIX`,
+//! `pkg-config`, a conda environment, ROS, and the packages of `python3`.
 //!
 //! `cargo:rustc-link-arg` reaches only this crate's own tests and examples. A crate that links the final binary
 //! repeats it from the metadata this script publishes; see the crate documentation, section "Linking".
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::{env, fs};
 
-/// What the wheels must hold, with the package that brings it.
-const NEEDED: [(&str, &str); 3] = [
-    ("include/pinocchio/config.hpp", "libpinocchio"),
-    ("include/eigen3/Eigen/Core", "cmeel-eigen"),
-    ("lib/libpinocchio_default.so", "libpinocchio"),
-];
+/// What makes a folder an installation of Pinocchio.
+const NEEDED: [&str; 2] = ["include/pinocchio/config.hpp", "lib/libpinocchio_default.so"];
 
 /// Exported CMake targets that carry the compile definitions of the wheels.
 const TARGETS: [&str; 2] = ["lib/cmake/pinocchio/pinocchioTargets.cmake", "lib/cmake/coal/coalTargets.cmake"];
@@ -20,7 +18,9 @@ const TARGETS: [&str; 2] = ["lib/cmake/pinocchio/pinocchioTargets.cmake", "lib/c
 const SOURCES: [&str; 3] = ["cpp/build.cpp", "cpp/dynamics.cpp", "cpp/kinematics.cpp"];
 
 fn main() {
-    println!("cargo:rerun-if-env-changed=NEARL_SITE_PACKAGES");
+    for variable in ["NEARL_SITE_PACKAGES", "PINOCCHIO_PREFIX", "CONDA_PREFIX", "ROS_DISTRO"] {
+        println!("cargo:rerun-if-env-changed={variable}");
+    }
     println!("cargo:rerun-if-changed=build.rs");
     println!("cargo:rerun-if-changed=cpp");
 
@@ -28,6 +28,8 @@ fn main() {
     let include = prefix.join("include");
     let mut build = cc::Build::new();
     build.cpp(true).std("c++17").warnings(false).flag("-w").opt_level(2).debug(false).files(SOURCES);
+    // Messages of failed assertions name the header's place in Pinocchio, not the folder of the machine that built.
+    build.flag(format!("-ffile-prefix-map={}=pinocchio", prefix.display()));
     for folder in ["", "eigen3"] {
         build.flag("-isystem").flag(include.join(folder));
     }
@@ -47,21 +49,40 @@ fn main() {
     println!("cargo:lib={}", lib.display()); // DEP_NEARL_PINOCCHIO_LIB in the build scripts of dependants
 }
 
-/// The folder `cmeel.prefix` of the wheels.
+/// Where Pinocchio is installed. What the two variables name is used or refused; what else is found is used.
 fn prefix() -> PathBuf {
-    let site = env::var("NEARL_SITE_PACKAGES").unwrap_or_else(|_| {
-        panic!("NEARL_SITE_PACKAGES is not set: run cargo inside the repository after `make setup`, or set it to the `.venv/lib/python3.11/site-packages` there")
-    });
-    let prefix = Path::new(&site).join("cmeel.prefix");
-    for (file, package) in NEEDED {
-        let path = prefix.join(file);
-        assert!(
-            path.exists(),
-            "{} is missing (Python package {package}): run `make setup` first",
-            path.display()
-        );
+    for (variable, below) in [("NEARL_SITE_PACKAGES", "cmeel.prefix"), ("PINOCCHIO_PREFIX", "")] {
+        let Some(folder) = env::var_os(variable) else { continue };
+        let prefix = Path::new(&folder).join(below);
+        if let Some(file) = NEEDED.iter().find(|file| !prefix.join(file).exists()) {
+            let missing = prefix.join(file);
+            panic!(
+                "{variable} is set, but {} is missing: run `make setup`, or name another folder",
+                missing.display()
+            );
+        }
+        return fs::canonicalize(&prefix).unwrap_or(prefix);
     }
-    fs::canonicalize(&prefix).unwrap_or(prefix)
+    let found = said_by("pkg-config", &["--variable=prefix", "pinocchio"])
+        .into_iter()
+        .chain(env::var_os("CONDA_PREFIX").map(PathBuf::from))
+        .chain(env::var_os("ROS_DISTRO").map(|name| Path::new("/opt/ros").join(name)))
+        .chain(said_by(
+            "python3",
+            &["-c", "import sysconfig; print(sysconfig.get_paths()['purelib'] + '/cmeel.prefix')"],
+        ));
+    found.into_iter().find(|prefix| NEEDED.iter().all(|file| prefix.join(file).exists())).unwrap_or_else(|| {
+        panic!(
+            "Pinocchio was found neither by NEARL_SITE_PACKAGES, PINOCCHIO_PREFIX, pkg-config, conda and ROS nor in python3's packages: \
+             `pip install libpinocchio==4.1.0 cmeel-eigen==3.4.1`, or set PINOCCHIO_PREFIX to the folder that has include/pinocchio"
+        )
+    })
+}
+
+/// The folder that a program prints, if there is such a program and it succeeds.
+fn said_by(program: &str, arguments: &[&str]) -> Option<PathBuf> {
+    let run = Command::new(program).args(arguments).output().ok().filter(|run| run.status.success())?;
+    Some(PathBuf::from(String::from_utf8(run.stdout).ok()?.trim()))
 }
 
 /// The definitions the wheels were built with; they decide the memory layout, so they are read and never typed in.
@@ -69,6 +90,9 @@ fn exported_definitions(prefix: &Path) -> Vec<String> {
     let mut found = Vec::new();
     for target in TARGETS {
         let path = prefix.join(target);
+        if target.contains("coal") && !path.exists() {
+            continue; // outside the wheels it may be installed elsewhere; without it Pinocchio has no definitions of its
+        }
         println!("cargo:rerun-if-changed={}", path.display());
         let text = fs::read_to_string(&path)
             .unwrap_or_else(|error| panic!("{}: {error}: run `make setup` again", path.display()));

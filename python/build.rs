@@ -1,8 +1,8 @@
 //! Tells the extension where MuJoCo's and Pinocchio's libraries are at run time.
 //!
 //! Installed, `nearl/_core.abi3.so` lies beside the Python packages that carry them (`mujoco/` and `cmeel.prefix/lib/`), so
-//! both are found relative to it, one mapped copy each, whether or not `import mujoco` came first. In a source tree
-//! (`maturin develop`) they are not beside it: the last entry is where they were when it was built.
+//! both are found relative to it, one mapped copy each, whether or not `import mujoco` came first. No path of the machine that
+//! builds is left inside.
 
 fn main() {
     println!("cargo::rerun-if-env-changed=NEARL_SITE_PACKAGES");
@@ -12,15 +12,12 @@ fn main() {
         );
         return;
     };
-    for (installed, package) in [("mujoco", "mujoco==3.17.0"), ("cmeel.prefix/lib", "libpinocchio==4.1.0")] {
+    for (installed, package) in [("cmeel.prefix/lib", "libpinocchio==4.1.0"), ("mujoco", "mujoco==3.17.0")] {
         let here = format!("{site_packages}/{installed}");
         if !std::path::Path::new(&here).is_dir() {
             println!("cargo::error={here} is missing (Python package {package}): run `make setup` first");
         }
         println!("cargo::rustc-link-arg=-Wl,-rpath,$ORIGIN/../{installed}");
         println!("cargo::rustc-link-arg=-Wl,-rpath-link,{here}");
-    }
-    for installed in ["mujoco", "cmeel.prefix/lib"] {
-        println!("cargo::rustc-link-arg=-Wl,-rpath,{site_packages}/{installed}");
     }
 }

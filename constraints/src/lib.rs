@@ -36,15 +36,12 @@
 //!
 //! # Linking
 //!
-//! The shared libraries of Pinocchio are in the Python wheels. A crate that links a binary, a test or an extension
-//! with this one needs them in its run path, through a `build.rs` of its own and this crate as a dependency:
+//! The build script looks for Pinocchio by `NEARL_SITE_PACKAGES`, `PINOCCHIO_PREFIX`, pkg-config, conda, ROS and the packages of
+//! `python3`, in this order. A crate that links a binary, a test or an extension with this one needs the library in its run path: one
+//! line in a `build.rs` of its own, with this crate as a dependency.
 //!
 //! ```text
-//! fn main() {
-//!     if let Ok(lib) = std::env::var("DEP_NEARL_PINOCCHIO_LIB") {
-//!         println!("cargo:rustc-link-arg=-Wl,-rpath,{lib}");
-//!     }
-//! }
+//! fn main() { println!("cargo:rustc-link-arg=-Wl,-rpath,{}", std::env::var("DEP_NEARL_PINOCCHIO_LIB").unwrap()); }
 //! ```
 
 mod assemble;
