@@ -34,6 +34,7 @@ from nearl._core import (
     VelocityLimit,
     VelocityProfileLimit,
     __version__,
+    algorithms,
     tasks,
 )
 from nearl.link import Link
@@ -64,6 +65,7 @@ __all__ = [
     "VelocityLimit",
     "VelocityProfileLimit",
     "__version__",
+    "algorithms",
     "tasks",
 ]
 

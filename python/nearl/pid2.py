@@ -28,10 +28,11 @@ class PID2:
 
     Args:
         task: Name of the task, one of ``nearl.tasks()``, or a task file (TOML).
-        algo: ``"pid2-ib"``, ``"pid2-gan"``, ``"nearl"`` or ``"ppo"``; see ``nearl train --help``.
+        algo: Name of the algorithm, one of ``nearl.algorithms()``.
         seed: Of everything random; the same seed gives the same weights whatever the number of threads.
         threads: At least 1; all cores by default.
         settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.scale": 0.8}``.
+        preset: Settings by name, ``"paper"`` or ``"strong"``; ``settings`` come after them.
         run: Run folder to write as ``nearl train`` does; none by default.
 
     Raises:
@@ -47,12 +48,13 @@ class PID2:
         seed: int = 0,
         threads: int | None = None,
         settings: Mapping[str, Any] | None = None,
+        preset: str | None = None,
         run: str | os.PathLike[str] | None = None,
     ):
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
         if not 0 <= seed < 2**64:
             raise ValueError(f"seed is {seed}; give a whole number from 0 to 2**64 - 1")
-        self._training: _core.Training | None = _core.Training(os.fspath(task), algo, seed, _threads(threads), overrides, run)
+        self._training: _core.Training | None = _core.Training(os.fspath(task), algo, seed, _threads(threads), overrides, run, preset)
         self.task, self.algo, self.seed = self._training.task, algo, seed
         self._begin(self._training.controller())
 

@@ -38,7 +38,7 @@ mod _core {
     #[pymodule_export]
     use super::target::{Ledger, Target, Targets};
     #[pymodule_export]
-    use super::training::Training;
+    use super::training::{Training, algorithms};
     #[pymodule_export]
     use super::vec_env::VecEnv;
 

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use nearl_trainer::checkpoint::{self, Checkpoint};
+use nearl_trainer::learn::ALGORITHMS;
+use nearl_trainer::preset::Preset;
 use nearl_trainer::run_folder::{self, RunFolder};
 use nearl_trainer::tasks;
 use nearl_trainer::train::{self, COLUMNS, Request, TrainError, complete};
@@ -12,6 +14,12 @@ use pyo3::types::PyDict;
 
 use crate::controller::Controller;
 use crate::errors;
+
+/// Names of the algorithms, in the paper's order, with a line about each.
+#[pyfunction]
+pub(crate) fn algorithms() -> Vec<(&'static str, &'static str)> {
+    ALGORITHMS.iter().map(|e| (e.name, e.about)).collect()
+}
 
 struct Inner {
     training: train::Training,
@@ -31,8 +39,9 @@ pub(crate) struct Training {
 
 #[pymethods]
 impl Training {
-    /// `settings`: overrides of the task file, `key=value`. `out`: run folder to write, as `nearl train` does.
+    /// `settings`: overrides of the task file, `key=value`, after those of `preset`. `out`: run folder to write, as `nearl train` does.
     #[new]
+    #[pyo3(signature = (task, algo, seed, threads, settings, out, preset=None))]
     fn new(
         py: Python<'_>,
         task: &str,
@@ -41,11 +50,17 @@ impl Training {
         threads: usize,
         settings: Vec<String>,
         out: Option<PathBuf>,
+        preset: Option<String>,
     ) -> PyResult<Training> {
         py.detach(|| {
-            let mut manifest = tasks::load(task, &settings).map_err(errors::task)?;
+            let preset = preset
+                .map(|name| name.parse::<Preset>())
+                .transpose()
+                .map_err(|e| errors::value(e.to_string()))?;
+            let mut manifest = tasks::load_with(task, preset, &settings).map_err(errors::task)?;
             complete(&mut manifest).map_err(errors::train)?;
-            let request = Request { manifest, algo: algo.into(), steps: 0, seed, threads: threads.max(1) };
+            let algo = algo.parse().map_err(|e| errors::train(TrainError::Algorithm(e)))?;
+            let request = Request { manifest, algo, steps: 0, seed, threads: threads.max(1) };
             let training = train::Training::new(&request).map_err(errors::train)?;
             if let Some(out) = &out {
                 RunFolder::create(out, &training.snapshot().manifest, seed, COLUMNS).map_err(run)?;

@@ -207,7 +207,9 @@ def test_a_second_learn_at_the_same_time_is_refused() -> None:
 
 def test_rows_of_a_prediction_do_not_hear_of_each_other(tmp_path: Path) -> None:
     task = edited(tmp_path, 'consistency = "free"', 'consistency = "kinematic"\njerk = { limit = { slider = 50.0 } }')
-    agent = nearl.PID2(task, algo="pid2-ib", threads=1)
+    with pytest.raises(ValueError, match="straight-through"):
+        nearl.PID2(task, algo="pid2-ib", threads=1)
+    agent = nearl.PID2(task, algo="pid2-ib", threads=1, settings={"train.pid2.gradient": "straight-through"})
     assert agent.controller.remembers
     obs = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 5))
     actions, state = agent.predict(obs)
@@ -216,3 +218,13 @@ def test_rows_of_a_prediction_do_not_hear_of_each_other(tmp_path: Path) -> None:
     begun, state = agent.predict(obs, state, np.ones(8, bool))
     assert np.array_equal(begun, actions)
     assert not np.array_equal(agent.predict(-obs, state)[0], agent.predict(-obs)[0])
+
+
+def test_presets_and_algorithms_are_those_of_the_trainer() -> None:
+    names = [name for name, _ in nearl.algorithms()]
+    assert names[0] == "ppo" and {"nearl", "pid2-gan", "pid2-ib", "ppo-combined"} <= set(names)
+    with pytest.raises(ValueError, match="no preset 'weak'; give one of paper, strong"):
+        nearl.PID2(CART_POLE, preset="weak")
+    agent = nearl.PID2(CART_POLE, preset="strong", threads=1, settings={"train.n_envs": 2, "train.n_steps": 256})
+    agent.learn(1)
+    assert agent.num_timesteps == 512

@@ -22,7 +22,8 @@ pub fn request(task: &str, algo: &str, seed: u64, threads: usize, set: &[&str]) 
     let set: Vec<String> = set.iter().map(|s| (*s).to_string()).collect();
     let mut manifest = tasks::load(task, &set).unwrap_or_else(|e| panic!("{task}: {e}"));
     complete(&mut manifest).unwrap_or_else(|e| panic!("{task}: {e}"));
-    Request { manifest, algo: algo.into(), steps: 1_000_000, seed, threads }
+    let algo = algo.parse().unwrap_or_else(|e| panic!("{e}"));
+    Request { manifest, algo, steps: 1_000_000, seed, threads }
 }
 
 /// A snapshot of the task whose policy is a random network with weights of size `gain`: the worst policy there is.
@@ -41,7 +42,7 @@ pub fn random_policy(task: &str, seed: u64, gain: f32) -> Snapshot {
         weight: weight(l.n_in * l.n_out),
         bias: weight(l.n_out),
     });
-    networks.policy = Dense { layers: layers.collect() };
+    networks.policy = Dense { layers: layers.collect(), skip: None };
     assert_ne!(snapshot.manifest.policy, PolicyKind::Direct);
     snapshot
 }

@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
 /// Version of the file format.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 const KEY: &str = "nearl-checkpoint";
 /// Largest file that is read: far above what the widest networks need, and below what a wrong file would fill memory with.
 const MAX_BYTES: u64 = 8 << 30;

@@ -3,6 +3,7 @@
 mod bench;
 mod bench_serve;
 mod demo;
+mod demos;
 mod eval;
 mod plant;
 mod process;
@@ -45,6 +46,9 @@ enum Command {
     Eval(eval::Eval),
     /// Plant and runtime as two processes, a hot swap, and the report.
     Demo(demo::Demo),
+    /// Demonstrations: record and check them.
+    #[command(subcommand)]
+    Demos(demos::Demos),
     /// Project proposals read as JSON lines.
     Project(project::Project),
     /// Measure this machine.
@@ -80,6 +84,7 @@ impl Cli {
             Command::Sweep(c) => c.run(),
             Command::Eval(c) => c.run(),
             Command::Demo(c) => c.run(),
+            Command::Demos(c) => c.run(),
             Command::Project(c) => c.run(),
             Command::Bench(c) => c.run(),
             Command::Plant(c) => c.run(),

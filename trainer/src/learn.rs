@@ -4,9 +4,11 @@
 //! bits for any number of threads.
 
 mod adam;
+mod algorithm;
 mod batch;
 mod combined;
 mod discriminator;
+mod epochs;
 mod gae;
 mod gaussian;
 mod init;
@@ -25,10 +27,13 @@ mod reference;
 mod value;
 
 pub use adam::Adam;
-pub use batch::Batch;
+pub use algorithm::{ALGORITHMS, Algorithm, UnknownAlgorithm};
+pub use batch::{Batch, Stretch};
 pub use combined::{Gradient, Kind};
+pub use epochs::Pace;
 pub use gae::{Advantages, advantages};
 pub use gaussian::MOST_OUTPUTS;
+pub use inverse::Reading;
 pub use nearl::{Nearl, NearlSettings};
 pub use net::{Net, Tape};
 pub use nets::NetSettings;
@@ -68,14 +73,36 @@ pub trait Learner: Send {
     fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String>;
     /// Value of each row of `x` (n x n_obs).
     fn values(&mut self, x: &[f32]) -> Vec<f32>;
-    /// Learns from a batch; `rate` scales every learning rate, `rng` orders the minibatches and draws latent noise.
-    fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics;
+    /// Learns from a batch at the pace of the run's schedule; `rng` orders the minibatches and draws noise. Log probabilities, advantages
+    /// and returns of the batch may be estimated again on the way.
+    fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics;
 }
 
-/// The inverse model's mean squared error before and after an update, and whether it learned.
-fn idm_metrics(before: Option<f64>, after: Option<f64>, learned: bool) -> Metrics {
+/// The inverse model's mean squared error before and after an update, the part of the actions' variance that it explains, and
+/// whether it learned.
+fn idm_metrics(before: Option<f64>, after: Option<f64>, learned: bool, actions: f64) -> Metrics {
     let (Some(before), Some(after)) = (before, after) else { return Metrics::new() };
-    vec![("idm/mse_before", before), ("idm/mse_after", after), ("idm/updated", f64::from(u8::from(learned)))]
+    let explained = |error: f64| if actions > 0.0 { 1.0 - error / actions } else { f64::NAN };
+    vec![
+        ("idm/mse_before", before),
+        ("idm/mse_after", after),
+        ("idm/r2_before", explained(before)),
+        ("idm/r2_after", explained(after)),
+        ("idm/updated", f64::from(u8::from(learned))),
+    ]
+}
+
+/// Variance of each column of `x` (rows of `width` numbers), averaged over the columns.
+fn variance(x: &[f32], width: usize) -> f64 {
+    let (mut mean, mut square) = (vec![0.0; width], vec![0.0; width]);
+    for (n, row) in x.chunks_exact(width.max(1)).enumerate() {
+        for ((mean, square), &x) in mean.iter_mut().zip(&mut square).zip(row) {
+            let d = f64::from(x) - *mean;
+            *mean += d / (n + 1) as f64;
+            *square += d * (f64::from(x) - *mean);
+        }
+    }
+    square.iter().sum::<f64>() / x.len().max(1) as f64
 }
 
 /// Mean and standard deviation, for tests.
@@ -85,4 +112,19 @@ pub(crate) fn stats_of(x: &[f32]) -> (f64, f64) {
     let mean = x.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
     let variance = x.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n;
     (mean, variance.sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{idm_metrics, variance};
+
+    /// Columns 1 3 (variance 1) and 10 30 (variance 100); a model with the error 10.1 explains four fifths.
+    #[test]
+    fn what_the_inverse_model_explains_is_by_hand() {
+        let actions = variance(&[1.0, 10.0, 3.0, 30.0], 2);
+        assert!((actions - 50.5).abs() < 1e-12, "{actions}");
+        let metrics = idm_metrics(Some(50.5), Some(10.1), true, actions);
+        let of = |name: &str| metrics.iter().find(|(n, _)| *n == name).map_or(f64::NAN, |m| m.1);
+        assert!(of("idm/r2_before").abs() < 1e-12 && (of("idm/r2_after") - 0.8).abs() < 1e-12);
+    }
 }

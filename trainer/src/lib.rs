@@ -5,6 +5,7 @@
 pub mod allocations;
 pub mod checkpoint;
 pub mod cli;
+pub mod demos;
 pub mod env;
 pub mod evaluate;
 pub mod foresight;
@@ -12,6 +13,7 @@ pub mod learn;
 pub mod mj;
 pub mod online;
 pub mod plant;
+pub mod preset;
 pub mod robot;
 pub mod rollout;
 pub mod run_folder;

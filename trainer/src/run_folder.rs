@@ -273,6 +273,14 @@ impl RunFolder {
         }
     }
 
+    /// Writes `checkpoints/<name>.safetensors` whole, beside the newest.
+    ///
+    /// # Errors
+    /// [`SnapshotError`] with what the system said.
+    pub fn keep(&self, name: &str, snapshot: &Snapshot) -> Result<(), SnapshotError> {
+        snapshot.save(&self.path.join("checkpoints").join(format!("{name}.safetensors")))
+    }
+
     /// The folder.
     pub fn path(&self) -> &Path {
         &self.path

@@ -41,8 +41,12 @@ pub struct TrainSettings {
     pub gae_lambda: f64,
     /// Divide rewards by the running standard deviation of the discounted return.
     pub scale_reward: bool,
-    /// Lower the learning rate linearly to zero over the run.
+    /// Lower the learning rates of policy and value linearly over the run.
     pub anneal: bool,
+    /// What is left of them at its end.
+    pub anneal_to: f64,
+    /// Policy and value see observations less their running mean, in units of their standard deviation.
+    pub normalise_obs: bool,
     /// Unit of a proposed change.
     pub change_scale: ChangeScale,
     /// What is Gaussian.
@@ -51,10 +55,18 @@ pub struct TrainSettings {
     /// constraints act in deployment only (a controller that loads the snapshot always projects; `nearl eval --compare
     /// raw,projected` shows both).
     pub project_in_training: bool,
+    /// Share of the run over which limits come in: that of the environments that project while collecting rises linearly from none to all.
+    pub limits_in: f64,
     /// The learner's reward is lowered by this for each unit of weighted distance that the projection moved the target
     /// [1 / (weight rad/s)], summed over the ticks of a policy step. Returns and metrics stay the environment's own. No
     /// effect where nothing is projected: `ppo`, or `project_in_training = false`.
     pub moved_penalty: f64,
+    /// Steps from one evaluation without noise to the next; the best networks are kept as `checkpoints/best.safetensors`. 0: none.
+    pub eval_every: u64,
+    /// Episodes of an evaluation.
+    pub eval_episodes: usize,
+    /// Steps from one kept snapshot to the next, `checkpoints/step_<steps>.safetensors`. 0: only the newest is kept.
+    pub save_every: u64,
     /// Sizes of the networks.
     pub nets: NetSettings,
     /// Settings of the clipped surrogate, for every algorithm.
@@ -74,10 +86,16 @@ impl Default for TrainSettings {
             gae_lambda: 0.95,
             scale_reward: true,
             anneal: true,
+            anneal_to: 0.0,
+            normalise_obs: true,
             change_scale: ChangeScale::default(),
             exploration: Exploration::default(),
             project_in_training: true,
+            limits_in: 0.0,
             moved_penalty: 0.0,
+            eval_every: 0,
+            eval_episodes: 10,
+            save_every: 0,
             nets: NetSettings::default(),
             ppo: PpoSettings::default(),
             nearl: NearlSettings::default(),
@@ -94,11 +112,19 @@ impl TrainSettings {
     pub fn read(table: &toml::Table) -> Result<Self, String> {
         let settings: Self = serde_path_to_error::deserialize(table.clone())
             .map_err(|e| format!("[train.{}]: {}", e.path(), suggest(e.inner().message())))?;
+        if settings.eval_episodes == 0 {
+            return Err("[train.eval_episodes]: 0 measures nothing; give at least 1".into());
+        }
         let positive = [("n_envs", settings.n_envs), ("n_steps", settings.n_steps)];
         if let Some((key, _)) = positive.iter().find(|(_, v)| *v == 0) {
             return Err(format!("[train.{key}]: 0 collects nothing; give at least 1"));
         }
-        for (key, v) in [("gamma", settings.gamma), ("gae_lambda", settings.gae_lambda)] {
+        for (key, v) in [
+            ("gamma", settings.gamma),
+            ("gae_lambda", settings.gae_lambda),
+            ("anneal_to", settings.anneal_to),
+            ("limits_in", settings.limits_in),
+        ] {
             if !(0.0..=1.0).contains(&v) {
                 return Err(format!("[train.{key}]: {v} is outside [0, 1]"));
             }
@@ -128,7 +154,12 @@ impl TrainSettings {
         let single = f64::from;
         for (key, value, (allowed, domain)) in [
             ("ppo.lr", single(ppo.lr), positive),
+            ("ppo.value_lr", single(ppo.value_lr), not_negative),
             ("ppo.clip_range", single(ppo.clip_range), positive),
+            ("ppo.clip_to", single(ppo.clip_to), positive),
+            ("ppo.clip_value", single(ppo.clip_value), not_negative),
+            ("ppo.target_kl", single(ppo.target_kl), not_negative),
+            ("ppo.desired_kl", single(ppo.desired_kl), not_negative),
             ("ppo.vf_coef", single(ppo.vf_coef), not_negative),
             ("ppo.ent_coef", single(ppo.ent_coef), not_negative),
             ("ppo.max_grad_norm", single(ppo.max_grad_norm), (norm, "above 0, or inf for none")),
@@ -137,6 +168,8 @@ impl TrainSettings {
             ("pid2.idm_lr", single(pid2.idm_lr), positive),
             ("pid2.discriminator_lr", single(pid2.discriminator_lr), positive),
             ("pid2.generator_weight", single(pid2.generator_weight), not_negative),
+            ("pid2.generator_lr", single(pid2.generator_lr), not_negative),
+            ("pid2.gradient_penalty", single(pid2.gradient_penalty), not_negative),
             ("pid2.i_c", single(pid2.i_c), not_negative),
             ("pid2.beta", single(pid2.beta), not_negative),
             ("pid2.alpha", single(pid2.alpha), not_negative),
@@ -189,7 +222,7 @@ mod tests {
                 value => compare("## `[train]`", key, value),
             }
         }
-        assert_eq!(keys, 36);
+        assert_eq!(keys, 55);
         for column in crate::train::COLUMNS {
             assert!(page.contains(&format!("`{column}`")), "{column}");
         }

@@ -11,9 +11,11 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use crate::checkpoint::{self, Checkpoint};
+use crate::learn::Algorithm;
+use crate::preset::Preset;
 use crate::run_folder::{self, RunError};
 use crate::tasks::{self, TaskLoadError};
-use crate::train::{ALGORITHMS, TrainError, complete};
+use crate::train::{TrainError, complete};
 
 pub use summary::{Row, Summary};
 pub use worker::{Event, run};
@@ -24,13 +26,15 @@ pub struct Sweep {
     /// Task names or files.
     pub tasks: Vec<String>,
     /// Algorithms.
-    pub algos: Vec<String>,
+    pub algos: Vec<Algorithm>,
     /// Seeds.
     pub seeds: Vec<u64>,
     /// Environment steps of each run.
     pub steps: u64,
     /// Folder of all runs.
     pub out: PathBuf,
+    /// Settings by name, before `set`.
+    pub preset: Option<Preset>,
     /// Overrides of every task file.
     pub set: Vec<String>,
 }
@@ -43,7 +47,7 @@ pub struct Run {
     /// Name in the task file.
     pub name: String,
     /// Algorithm.
-    pub algo: String,
+    pub algo: Algorithm,
     /// Seed.
     pub seed: u64,
     /// Run folder.
@@ -74,9 +78,6 @@ pub enum SweepError {
     /// Its environment.
     #[error(transparent)]
     Train(#[from] TrainError),
-    /// An algorithm that does not exist.
-    #[error("no algorithm '{0}'; give some of {1}")]
-    Algorithm(String, String),
     /// A list with nothing in it, or with something twice.
     #[error("{0}")]
     List(String),
@@ -120,22 +121,16 @@ impl Sweep {
                 return Err(SweepError::List(format!("a sweep needs at least one {what}")));
             }
         }
-        for algo in &self.algos {
-            if !ALGORITHMS.iter().any(|(name, _)| name == algo) {
-                let all: Vec<_> = ALGORITHMS.iter().map(|(name, _)| *name).collect();
-                return Err(SweepError::Algorithm(algo.clone(), all.join(", ")));
-            }
-        }
         let mut files = Vec::new();
         for task in &self.tasks {
-            let mut manifest = tasks::load(task, &self.set)?;
+            let mut manifest = tasks::load_with(task, self.preset, &self.set)?;
             complete(&mut manifest)?;
             files.push((task, manifest.task.name.clone(), run_folder::task_file(&manifest).0));
         }
         let mut runs: Vec<Run> = Vec::new();
         for &seed in &self.seeds {
             for (task, name, text) in &files {
-                for algo in &self.algos {
+                for &algo in &self.algos {
                     let folder = self.out.join(name).join(format!("{algo}_{seed}"));
                     if runs.iter().any(|r| r.folder == folder) {
                         return Err(SweepError::List(format!(
@@ -143,14 +138,7 @@ impl Sweep {
                         )));
                     }
                     let found = self.found(&folder, text)?;
-                    runs.push(Run {
-                        task: (*task).clone(),
-                        name: name.clone(),
-                        algo: algo.clone(),
-                        seed,
-                        folder,
-                        found,
-                    });
+                    runs.push(Run { task: (*task).clone(), name: name.clone(), algo, seed, folder, found });
                 }
             }
         }

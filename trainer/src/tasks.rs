@@ -1,6 +1,7 @@
 //! Bundled tasks and robots, and how a task name or file becomes a manifest.
 
 use crate::env::{self, Env, EnvError};
+use crate::preset::Preset;
 use crate::robot::{self, RobotError};
 use nearl_runtime::net::Activation;
 use nearl_runtime::snapshot::{FORMAT, Simulation};
@@ -151,6 +152,20 @@ fn robot_file(task: &Task, path: &Path, is_bundled: bool) -> Result<(Simulation,
     let folder = names_files.then(|| robot::folder_of(&beside));
     let is_copy = robot(file).is_some_and(|bundled| bundled == text);
     Ok((Simulation { format, text, folder }, is_copy))
+}
+
+/// The same with the settings of a preset, which come before `overrides`.
+///
+/// # Errors
+/// [`TaskLoadError`] in one sentence.
+pub fn load_with(
+    task: &str,
+    preset: Option<Preset>,
+    overrides: &[String],
+) -> Result<Manifest, TaskLoadError> {
+    let plain = load(task, overrides)?;
+    let Some(preset) = preset else { return Ok(plain) };
+    load(task, &[&preset.overrides(&plain.task.name), overrides].concat())
 }
 
 /// Makes the environment of a bundled task or a TOML file.

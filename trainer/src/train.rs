@@ -14,7 +14,8 @@ pub use setup::{complete, limit_scale};
 pub use source::{Experience, Source, SourceError};
 
 use crate::checkpoint::CheckpointError;
-use crate::learn::{Batch, Dims, Learner, Metrics, advantages};
+use crate::evaluate::evaluate;
+use crate::learn::{Algorithm, Batch, Dims, Learner, Metrics, Pace, Stretch, UnknownAlgorithm};
 use crate::rollout::{Collected, RolloutError, Segment, Tally, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
@@ -27,23 +28,12 @@ use rand_chacha::ChaCha8Rng;
 use setup::{check_minibatch, check_outputs, check_reward, learner, policy_kind};
 use std::time::Instant;
 
-/// Names of the algorithms.
-pub const ALGORITHMS: &[(&str, &str)] = &[
-    ("ppo", "the paper's RL-Pure: a Gaussian policy on actions, nothing proposed or projected"),
-    (
-        "nearl",
-        "supervised meta policy and inverse model, policy gradient on the pair (the paper's Algorithm 1)",
-    ),
-    ("pid2-gan", "policy, inverse dynamics and a discriminator without a bottleneck"),
-    ("pid2-ib", "policy, inverse dynamics and a discriminator with the information bottleneck"),
-];
-
 /// Why a training could not start or go on.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// An algorithm that does not exist.
-    #[error("no algorithm '{0}'; give one of ppo, nearl, pid2-gan, pid2-ib")]
-    Algorithm(String),
+    #[error(transparent)]
+    Algorithm(#[from] UnknownAlgorithm),
     /// The `[train]` section, or what does not fit the task.
     #[error("{0}")]
     Settings(String),
@@ -69,8 +59,8 @@ pub enum TrainError {
 pub struct Request {
     /// The task with its robot.
     pub manifest: Manifest,
-    /// Name of the algorithm.
-    pub algo: String,
+    /// Algorithm.
+    pub algo: Algorithm,
     /// Environment steps (policy steps).
     pub steps: u64,
     /// Seed of everything random.
@@ -100,12 +90,16 @@ pub struct Progress {
 
 /// A training in progress.
 pub struct Training {
+    algo: Algorithm,
     settings: TrainSettings,
     snapshot: Snapshot,
     learner: Box<dyn Learner>,
     source: Box<dyn Source>,
     /// The last batch: its memory is used again.
     batch: Batch,
+    /// Return of the best networks so far without noise, and whether they are the present ones.
+    best: Option<f64>,
+    is_best: bool,
     dims: Dims,
     obs_stats: RunningStats,
     change_stats: RunningStats,
@@ -120,6 +114,11 @@ pub struct Training {
     earlier: f64,
     learning_seconds: f64,
 }
+
+/// Column of what an evaluation on the way finds.
+pub(crate) const EVALUATED: &str = "eval/ep_rew_mean";
+/// Seeds of evaluations on the way differ from those of training in these bits.
+const EVALUATION: u64 = 0x6576_616c;
 
 /// Random streams of a seed beyond the environments' own.
 const LEARNER_STREAM: u64 = u64::MAX;
@@ -141,8 +140,8 @@ impl Training {
         let mut manifest = request.manifest.clone();
         check_reward(&manifest.task)?;
         let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
-        manifest.algo.clone_from(&request.algo);
-        manifest.policy = policy_kind(&request.algo, &settings, manifest.task.idm.kind)?;
+        manifest.algo = request.algo.to_string();
+        manifest.policy = policy_kind(request.algo, &settings, &manifest.task)?;
         complete(&mut manifest)?;
         let parts = Parts::new(&manifest)?;
         let seen = seen_entries(&manifest, &parts.layout)?;
@@ -158,7 +157,7 @@ impl Training {
         check_minibatch(settings.ppo.batch_size, batch)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);
         manifest.activation = settings.nets.activation;
-        let learner = learner(&manifest, &settings, dims.clone(), request.threads, &mut rng);
+        let learner = learner(request.algo, &manifest, &settings, dims.clone(), request.threads, &mut rng);
         let mut normaliser = Normaliser::identity(dims.n_obs, dims.n_state);
         if settings.change_scale == ChangeScale::Limits {
             normaliser.scale = limit_scale(&parts, &manifest)?;
@@ -171,11 +170,14 @@ impl Training {
             obs_stats: RunningStats::new(dims.n_obs),
             change_stats: RunningStats::new(dims.n_state),
             return_stats: RunningStats::new(1),
+            algo: request.algo,
             settings,
             snapshot,
             learner,
             source,
             batch: Batch::default(),
+            best: None,
+            is_best: false,
             dims,
             rng,
             total: request.steps,
@@ -206,6 +208,8 @@ impl Training {
     /// # Errors
     /// [`TrainError::Source`].
     pub fn step(&mut self) -> Result<Option<Progress>, TrainError> {
+        self.is_best = false;
+        self.source.project(self.limits());
         if !self.source.collect(&self.snapshot)? {
             return Ok(None);
         }
@@ -232,13 +236,13 @@ impl Training {
         self.recent.drain(..excess);
         self.recent_costs.extend_from_slice(&tally.costs);
         self.recent_costs.drain(..excess);
-        let rate = if self.settings.anneal { 1.0 - self.fraction() as f32 } else { 1.0 };
+        let pace = self.pace();
         let learns = self.snapshot.manifest.steps > 0;
         self.merge_statistics();
         let mut metrics = if learns {
             self.fill_batch();
             let start = Instant::now();
-            let metrics = self.learner.update(&self.batch, rate, &mut self.rng);
+            let metrics = self.learner.update(&mut self.batch, pace, &mut self.rng);
             self.learning_seconds += start.elapsed().as_secs_f64();
             metrics
         } else {
@@ -248,6 +252,9 @@ impl Training {
         self.snapshot.manifest.steps += (self.settings.n_envs * self.settings.n_steps) as u64;
         self.snapshot.manifest.version += 1;
         self.refresh();
+        if self.passed(self.settings.eval_every) {
+            metrics.push((EVALUATED, self.evaluate()?));
+        }
         let mean =
             |f: fn(&(f64, usize)) -> f64| self.recent.iter().map(f).sum::<f64>() / self.recent.len() as f64;
         Ok(Some(Progress {
@@ -296,6 +303,42 @@ impl Training {
         self.learning_seconds
     }
 
+    /// Whether the last iteration passed a multiple of `every` steps; never with 0.
+    fn passed(&self, every: u64) -> bool {
+        let (steps, batch) =
+            (self.snapshot.manifest.steps, (self.settings.n_envs * self.settings.n_steps) as u64);
+        every > 0 && steps / every > (steps - batch) / every
+    }
+
+    /// Mean return of episodes without noise, the same ones each time; under the limits wherever the policy proposes.
+    fn evaluate(&mut self) -> Result<f64, TrainError> {
+        let found = evaluate(&self.snapshot, self.settings.eval_episodes, self.seed ^ EVALUATION, true)?
+            .mean_return();
+        self.is_best = found.is_finite() && self.best.is_none_or(|best| found > best);
+        if self.is_best {
+            self.best = Some(found);
+        }
+        Ok(found)
+    }
+
+    /// What the schedules of the run say now.
+    fn pace(&self) -> Pace {
+        let (s, done) = (&self.settings, self.fraction());
+        let towards = |end: f64| (1.0 - done * (1.0 - end)) as f32;
+        let rate = if s.anneal { towards(s.anneal_to) } else { 1.0 };
+        Pace { rate, clip: towards(f64::from(s.ppo.clip_to)) }
+    }
+
+    /// Share of the environments that project while collecting.
+    fn limits(&self) -> f64 {
+        let s = &self.settings;
+        match (s.project_in_training, s.limits_in > 0.0) {
+            (false, _) => 0.0,
+            (true, false) => 1.0,
+            (true, true) => (self.fraction() / s.limits_in).min(1.0),
+        }
+    }
+
     fn merge_statistics(&mut self) {
         for g in self.source.gathered() {
             self.obs_stats.merge(&g.obs_stats);
@@ -310,7 +353,11 @@ impl Training {
             ChangeScale::Running => self.change_stats.std(1e-4),
             ChangeScale::Limits => self.snapshot.networks.normaliser.scale.clone(),
         };
-        let normaliser = Normaliser::new(self.obs_stats.mean.clone(), self.obs_stats.std(1e-4), scale);
+        let (mean, std) = match self.settings.normalise_obs {
+            true => (self.obs_stats.mean.clone(), self.obs_stats.std(1e-4)),
+            false => (vec![0.0; self.dims.n_obs], vec![1.0; self.dims.n_obs]),
+        };
+        let normaliser = Normaliser::new(mean, std, scale);
         self.snapshot.networks = self.learner.networks(&normaliser);
     }
 
@@ -322,7 +369,6 @@ impl Training {
         b.clear();
         b.n = self.settings.n_envs * n_steps;
         let scale = if self.settings.scale_reward { 1.0 / self.return_stats.std(1e-8)[0] } else { 1.0 };
-        let mut cuts = Vec::new();
         for g in self.source.gathered() {
             let s = &g.segment;
             b.obs.extend_from_slice(&s.x);
@@ -337,20 +383,12 @@ impl Training {
             b.action.extend_from_slice(&s.action);
             b.log_prob.extend_from_slice(&s.log_prob);
             let reward: Vec<f32> = s.reward.iter().map(|r| (r * scale).clamp(-10.0, 10.0) as f32).collect();
-            let finals: Vec<f32> = s.final_x.iter().flat_map(|(_, x)| x.iter().copied()).collect();
-            cuts.push((reward, finals, s.terminated.clone(), s.truncated.clone()));
+            let final_obs = s.final_x.iter().flat_map(|(_, x)| x.iter().copied()).collect();
+            let (terminated, truncated) = (s.terminated.clone(), s.truncated.clone());
+            b.stretches.push(Stretch { reward, terminated, truncated, final_obs });
         }
-        let values = self.learner.values(&b.obs);
-        let mut first = 0;
-        for (reward, finals, terminated, truncated) in &cuts {
-            let final_values = self.learner.values(finals);
-            let (gamma, lambda) = (self.settings.gamma as f32, self.settings.gae_lambda as f32);
-            let value = &values[first..][..reward.len()];
-            first += reward.len();
-            let a = advantages(reward, value, terminated, truncated, &final_values, gamma, lambda);
-            b.advantage.extend(a.advantage);
-            b.returns.extend(a.returns);
-        }
+        b.discount = (self.settings.gamma as f32, self.settings.gae_lambda as f32);
+        b.estimate(|x| self.learner.values(x));
         debug_assert_eq!(b.obs.len(), b.n * self.dims.n_obs);
     }
 }

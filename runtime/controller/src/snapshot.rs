@@ -403,6 +403,9 @@ impl Networks {
                 out.push(f32s(format!("{prefix}.{i}.weight"), vec![l.n_out, l.n_in], &l.weight));
                 out.push(f32s(format!("{prefix}.{i}.bias"), vec![l.n_out], &l.bias));
             }
+            if let Some(skip) = &dense.skip {
+                out.push(f32s(format!("{prefix}.skip"), vec![dense.n_out(), dense.n_in()], skip));
+            }
             out.push(f32s(format!("{prefix}.log_std"), vec![log_std.len()], log_std));
         };
         net("policy", &self.policy, &self.policy_log_std);
@@ -524,5 +527,18 @@ fn read_net(views: &[(String, TensorView<'_>)], prefix: &str) -> Result<(Dense, 
         }
         layers.push(crate::net::DenseLayer { n_in, n_out: shape[0], weight, bias });
     }
-    Ok((Dense { layers }, read_f32(views, &format!("{prefix}.log_std"), 1)?.0))
+    let mut net = Dense { layers, skip: None };
+    let name = format!("{prefix}.skip");
+    if views.iter().any(|(n, _)| *n == name) {
+        let (weight, shape) = read_f32(views, &name, 2)?;
+        if shape != [net.n_out(), net.n_in()] {
+            return Err(SnapshotError::Shape {
+                name,
+                expected: format!("[{}, {}]", net.n_out(), net.n_in()),
+                actual: format!("{shape:?}"),
+            });
+        }
+        net.skip = Some(weight);
+    }
+    Ok((net, read_f32(views, &format!("{prefix}.log_std"), 1)?.0))
 }

@@ -62,7 +62,7 @@ pub fn snapshot(version: u64, change: impl FnOnce(&mut Manifest)) -> Snapshot {
         weight: weights(seed, n_in * n_out),
         bias: weights(seed + 1, n_out),
     };
-    let policy = Dense { layers: vec![layer(version, n, 16), layer(version + 7, 16, n)] };
+    let policy = Dense { layers: vec![layer(version, n, 16), layer(version + 7, 16, n)], skip: None };
     let normaliser = Normaliser::new(vec![0.0; n], vec![1.0; n], vec![0.5; n]);
     Snapshot { manifest, networks: Networks { normaliser, policy, policy_log_std: vec![], idm: None } }
 }

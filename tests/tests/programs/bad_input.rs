@@ -187,7 +187,11 @@ fn the_unchanged_task_file_projects() {
 /// Arguments and what the message must say.
 const COMMANDS: &[(&[&str], &[&str])] = &[
     (&["train", "HalfCheeta-v5"], &["'HalfCheeta-v5'", "did you mean 'HalfCheetah-v5'"]),
-    (&["train", "Hopper-v5", "--algo", "pid3"], &["'pid3'", "pid2-ib"]),
+    (
+        &["train", "Hopper-v5", "--algo", "pid2-bi"],
+        &["no algorithm 'pid2-bi'", "did you mean 'pid2-ib'?", "pid2-gan"],
+    ),
+    (&["bench", "train", "Hopper-v5", "--algo", "sac"], &["no algorithm 'sac'; give one of ppo"]),
     (
         &["train", "Hopper-v5", "--set", "train.ppo.batch_size=100"],
         &["train.ppo.batch_size", "100", "multiple of 32"],

@@ -1,6 +1,7 @@
 //! What crosses crates, within one process.
 
 mod architecture;
+mod demos;
 mod determinism;
 mod env_mujoco;
 mod env_parity;
@@ -11,4 +12,5 @@ mod networks;
 mod prior_in_training;
 mod resume;
 mod robots;
+mod schedules;
 mod user_tasks;

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use nearl_runtime::Controller;
 use nearl_tests::random_policy;
 use nearl_trainer::env::{self, Env};
+use nearl_trainer::learn::Algorithm;
 use nearl_trainer::rollout::{make_env, stream};
 use nearl_trainer::train::{Request, Training, complete, train};
 use nearl_trainer::{evaluate, tasks};
@@ -152,7 +153,7 @@ fn a_reward_that_is_no_number_ends_the_training() {
     let odd = "[reward]\nodd = \"0.0 * log(q.slider + 0.5)\"";
     let mut manifest = tasks::load(&edited(folder.path(), "[reward]", odd), &[]).expect("task");
     complete(&mut manifest).expect("environment");
-    let request = Request { manifest, algo: "ppo".into(), steps: 100_000, seed: 0, threads: 1 };
+    let request = Request { manifest, algo: Algorithm::Ppo, steps: 100_000, seed: 0, threads: 1 };
     let error = train(&request, &run, |_, _| true).expect_err("a reward of NaN").to_string();
     assert!(error.contains("a reward of 'cart-pole' came out as NaN after"), "{error}");
     assert!(run.join("checkpoints/latest.safetensors").is_file());
@@ -169,7 +170,7 @@ fn a_start_that_is_undefined_for_some_draws_ends_the_training_and_keeps_what_was
     let task = edited(folder.path(), "0.1 * uniform", "0.2 * sqrt(0.99 + uniform)");
     let mut manifest = tasks::load(&task, &[]).expect("task");
     complete(&mut manifest).expect("manifest");
-    let request = Request { manifest, algo: "ppo".into(), steps: 1_000_000, seed: 0, threads: 2 };
+    let request = Request { manifest, algo: Algorithm::Ppo, steps: 1_000_000, seed: 0, threads: 2 };
     let out = folder.path().join("run");
     let error = train(&request, &out, |_, _| true).expect_err("a root of what is negative").to_string();
     assert!(error.contains("task 'cart-pole' [reset]: qpos[1] came out as NaN"), "{error}");
@@ -262,7 +263,7 @@ fn more_outputs_than_can_be_learned_are_refused_by_number() {
     let task = edited(folder.path(), "\"v.hinge\"]", &format!("\"v.hinge\"{more}]"));
     let mut manifest = tasks::load(&task, &["train.exploration=proposal".into()]).expect("task");
     complete(&mut manifest).expect("manifest");
-    let request = Request { manifest, algo: "pid2-ib".into(), steps: 1024, seed: 0, threads: 1 };
+    let request = Request { manifest, algo: Algorithm::Pid2Ib, steps: 1024, seed: 0, threads: 1 };
     let error = Training::new(&request).map(|_| ()).expect_err("305 entries").to_string();
     assert!(error.contains("'cart-pole' has 305 proposed entries, and"), "{error}");
 }
@@ -322,8 +323,14 @@ fn trained(task: &str, algo: &str, steps: u64, set: &[&str]) -> (Training, Vec<f
     let set: Vec<String> = set.iter().map(|s| (*s).to_string()).collect();
     let mut manifest = tasks::load(task, &set).unwrap_or_else(|e| panic!("{e}"));
     complete(&mut manifest).expect("manifest");
-    let mut training = Training::new(&Request { manifest, algo: algo.into(), steps, seed: 0, threads: 2 })
-        .expect("training");
+    let mut training = Training::new(&Request {
+        manifest,
+        algo: algo.parse().expect("algorithm"),
+        steps,
+        seed: 0,
+        threads: 2,
+    })
+    .expect("training");
     let mut returns = Vec::new();
     while !training.is_done() {
         returns.push(training.iterate().return_mean);

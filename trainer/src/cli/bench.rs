@@ -2,6 +2,8 @@
 
 use super::{Failure, cores, say};
 use crate::allocations::allocations;
+use crate::learn::Algorithm;
+use crate::preset::Preset;
 use crate::rollout::{make_env, stream};
 use crate::train::{Request, Training, complete};
 use crate::{env, tasks};
@@ -39,9 +41,10 @@ struct TrainBench {
     /// Task.
     #[arg(default_value = "HalfCheetah-v5")]
     task: String,
-    /// Algorithm.
-    #[arg(long, default_value = "pid2-ib")]
-    algo: String,
+    #[arg(long, default_value = "pid2-ib", help = super::train::one_of())]
+    algo: Algorithm,
+    #[arg(long, help = super::train::one_preset())]
+    preset: Option<Preset>,
     /// Seconds of training in each repetition.
     #[arg(long, default_value_t = 5.0)]
     seconds: f64,
@@ -88,15 +91,15 @@ impl Bench {
     }
 }
 
-fn request(task: &str, algo: &str, set: &[String]) -> Result<Request, Failure> {
-    let mut manifest = tasks::load(task, set)?;
+fn request(task: &str, algo: Algorithm, preset: Option<Preset>, set: &[String]) -> Result<Request, Failure> {
+    let mut manifest = tasks::load_with(task, preset, set)?;
     complete(&mut manifest)?;
-    Ok(Request { manifest, algo: algo.into(), steps: u64::MAX, seed: 0, threads: cores() })
+    Ok(Request { manifest, algo, steps: u64::MAX, seed: 0, threads: cores() })
 }
 
 impl TrainBench {
     fn run(self) -> Result<(), Failure> {
-        let request = request(&self.task, &self.algo, &self.set)?;
+        let request = request(&self.task, self.algo, self.preset, &self.set)?;
         let ticks = request.manifest.task.time.policy_every as f64;
         let (mut rates, mut ceilings, mut shares) = (Vec::new(), Vec::new(), Vec::new());
         for _ in 0..self.repeat.max(1) {
@@ -125,7 +128,7 @@ impl TrainBench {
         let ceiling = median(&mut ceilings);
         if self.json {
             say(
-                serde_json::json!({ "task": self.task, "algo": self.algo, "threads": cores(), "steps_per_s": rate,
+                serde_json::json!({ "task": self.task, "algo": self.algo.name(), "threads": cores(), "steps_per_s": rate,
                 "physics_steps_per_s": ceiling, "fraction": ceiling.map(|c| rate / c), "update_share": share }),
             );
         } else {
@@ -146,8 +149,8 @@ impl TrainBench {
 
 impl Ticks {
     fn run(self, whole: bool) -> Result<(), Failure> {
-        let algo = "pid2-ib";
-        let training = Training::new(&request(&self.task, algo, &self.set)?)?;
+        let algo = Algorithm::Pid2Ib;
+        let training = Training::new(&request(&self.task, algo, None, &self.set)?)?;
         let snapshot = training.snapshot().clone();
         let Measured { update, projection, allocations, solves } = measure(&snapshot, self.ticks)?;
         let floor = timer(self.ticks);

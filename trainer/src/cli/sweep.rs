@@ -8,6 +8,8 @@ use clap::Args;
 use indicatif::ProgressBar;
 
 use super::{Failure, at_least_one, cores, say};
+use crate::learn::Algorithm;
+use crate::preset::Preset;
 use crate::sweep::{Event, Found, Row, Run, Summary, Sweep, run};
 
 #[derive(Args)]
@@ -15,9 +17,8 @@ pub(super) struct SweepCommand {
     /// Tasks or task files, separated by commas.
     #[arg(long, value_delimiter = ',', required = true)]
     tasks: Vec<String>,
-    /// Algorithms, separated by commas.
-    #[arg(long, value_delimiter = ',', default_value = "ppo,pid2-ib")]
-    algos: Vec<String>,
+    #[arg(long, value_delimiter = ',', default_value = "ppo,pid2-ib", help = several())]
+    algos: Vec<Algorithm>,
     /// Seeds: `0,1,2` or `0-2`.
     #[arg(long, default_value = "0-2", value_parser = seeds)]
     seeds: Seeds,
@@ -30,12 +31,18 @@ pub(super) struct SweepCommand {
     /// Runs at a time, one thread each; all cores when absent.
     #[arg(long, value_parser = at_least_one)]
     jobs: Option<usize>,
+    #[arg(long, help = super::train::one_preset())]
+    preset: Option<Preset>,
     /// Overrides of every task file, e.g. `train.n_envs=32`.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
+}
+
+fn several() -> String {
+    format!("Algorithms, separated by commas: {}", Algorithm::names())
 }
 
 #[derive(Clone)]
@@ -65,6 +72,7 @@ impl SweepCommand {
             seeds,
             steps: self.steps,
             out: self.out,
+            preset: self.preset,
             set: self.set,
         };
         let _lock = sweep.lock()?;

@@ -2,6 +2,8 @@
 
 use super::{Failure, at_least_one, cores, say, unstable};
 use crate::checkpoint::{self, Checkpoint};
+use crate::learn::Algorithm;
+use crate::preset::Preset;
 use crate::train::{Experience, Progress, Request, resume_on, train_on};
 use crate::{run_folder, tasks};
 use clap::Args;
@@ -17,10 +19,9 @@ use std::time::{Duration, Instant};
 pub(super) struct Train {
     /// Task name (see `nearl tasks`) or TOML file.
     task: String,
-    /// Algorithm: ppo, nearl, pid2-gan or pid2-ib.
-    #[arg(long, default_value = "pid2-ib", conflicts_with = "resume")]
-    algo: String,
-    /// Environment steps; 1_000_000 and 1e6 are both read. 1e6 when absent, with --resume what the run was started with.
+    #[arg(long, default_value = "pid2-ib", conflicts_with = "resume", help = one_of())]
+    algo: Algorithm,
+    /// Environment steps; 1_000_000, 1e6, 200k and 1M are read. 1e6 when absent, with --resume what the run was started with.
     #[arg(long, value_parser = steps)]
     steps: Option<u64>,
     /// Seed of everything random; the same seed gives the same weights.
@@ -44,6 +45,8 @@ pub(super) struct Train {
     /// Threads; all cores when absent. The result does not depend on it.
     #[arg(long, value_parser = at_least_one)]
     threads: Option<usize>,
+    #[arg(long, conflicts_with = "resume", help = one_preset())]
+    preset: Option<Preset>,
     /// Overrides of the task file, e.g. `constraints.velocity.scale=0.8`.
     #[arg(long = "set", value_name = "KEY=VALUE", conflicts_with = "resume")]
     set: Vec<String>,
@@ -52,11 +55,24 @@ pub(super) struct Train {
     json: bool,
 }
 
+/// What `--preset` may be.
+pub(super) fn one_preset() -> String {
+    format!("Settings by name, before those of --set: {}", Preset::names())
+}
+
+/// What `--algo` may be.
+pub(super) fn one_of() -> String {
+    format!("Algorithm: {}", Algorithm::names())
+}
+
 pub(super) fn steps(text: &str) -> Result<u64, String> {
     let clean = text.replace('_', "");
-    match clean.parse::<f64>() {
+    let units = [("k", 1e3), ("K", 1e3), ("M", 1e6)];
+    let with_unit = |(unit, factor): &(&str, f64)| Some((clean.strip_suffix(unit)?, *factor));
+    let (digits, factor) = units.iter().find_map(with_unit).unwrap_or((&clean, 1.0));
+    match digits.parse::<f64>().map(|n| n * factor) {
         Ok(n) if n >= 1.0 && n.fract() == 0.0 && n < 1e15 => Ok(n as u64),
-        _ => Err(format!("'{text}' is not a number of steps; write 1000000 or 1e6")),
+        _ => Err(format!("'{text}' is not a number of steps; write 1000000, 1e6, 200k or 1M")),
     }
 }
 
@@ -66,7 +82,7 @@ const STEPS: u64 = 1_000_000;
 /// What is told about a run.
 struct Run {
     name: String,
-    algo: String,
+    algo: Algorithm,
     steps: u64,
     done: u64,
 }
@@ -83,20 +99,20 @@ impl Run {
             )
             .into());
         }
-        let (algo, done) = (header.manifest.algo, header.manifest.steps);
+        let (algo, done) = (header.manifest.algo.parse()?, header.manifest.steps);
         Ok(Self { name, algo, steps: steps.unwrap_or(header.total), done })
     }
 }
 
 impl Train {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let mut manifest = tasks::load(&self.task, &self.set)?;
+        let mut manifest = tasks::load_with(&self.task, self.preset, &self.set)?;
         crate::train::complete(&mut manifest)?;
         let run = match &self.resume {
             Some(folder) => Run::resumed(folder, &manifest.task.name, self.steps)?,
             None => Run {
                 name: manifest.task.name.clone(),
-                algo: self.algo.clone(),
+                algo: self.algo,
                 steps: self.steps.unwrap_or(STEPS),
                 done: 0,
             },
@@ -133,7 +149,7 @@ impl Train {
         let saved = match &self.resume {
             Some(folder) => resume_on(folder, &experience, self.steps, threads, report)?,
             None => {
-                let (algo, steps) = (run.algo.clone(), run.steps);
+                let (algo, steps) = (run.algo, run.steps);
                 let request = Request { manifest, algo, steps, seed: self.seed, threads };
                 train_on(&request, &experience, &out, report)?
             }
@@ -236,4 +252,21 @@ fn show(bar: &ProgressBar, json: bool, p: &Progress) {
 /// The mean return and `of` what; in words while no episode has ended.
 fn returned(mean: f64, of: &str) -> String {
     if mean.is_nan() { "no episode ended".to_owned() } else { format!("return {mean:.0}{of}") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::steps;
+
+    #[test]
+    fn steps_are_read_as_people_write_them() {
+        let all = ["1000000", "1_000_000", "1e6", "1M", "1.5M", "200k", "2.5e3"];
+        assert_eq!(
+            all.map(|s| steps(s).unwrap_or(0)),
+            [1_000_000, 1_000_000, 1_000_000, 1_000_000, 1_500_000, 200_000, 2_500]
+        );
+        for wrong in ["", "k", "0", "-1", "0.5", "1.5", "1e20", "1m", "nan"] {
+            assert!(steps(wrong).is_err(), "{wrong}");
+        }
+    }
 }

@@ -1,5 +1,7 @@
 //! One batch of experience in network space, row by row.
 
+use super::gae::advantages;
+
 /// `n` samples; names as in `docs/ARCHITECTURE.md`, "Network space". `ppo` proposes nothing: what is of the proposal and its
 /// projection may be empty there.
 #[derive(Clone, Debug, Default)]
@@ -28,6 +30,23 @@ pub struct Batch {
     pub advantage: Vec<f32>,
     /// Target of the value network (n).
     pub returns: Vec<f32>,
+    /// What advantages are estimated from; together n rows.
+    pub stretches: Vec<Stretch>,
+    /// Discount and lambda of the estimate.
+    pub discount: (f32, f32),
+}
+
+/// Rows of one environment, one after another.
+#[derive(Clone, Debug, Default)]
+pub struct Stretch {
+    /// Rewards as the learner sees them.
+    pub reward: Vec<f32>,
+    /// The episode ended in a terminal state.
+    pub terminated: Vec<bool>,
+    /// The episode was cut.
+    pub truncated: Vec<bool>,
+    /// Normalised final observation of each cut row (cuts x n_obs).
+    pub final_obs: Vec<f32>,
 }
 
 impl Batch {
@@ -38,5 +57,25 @@ impl Batch {
         let actions = [&mut self.reached, &mut self.sampled, &mut self.action];
         let numbers = [&mut self.log_prob, &mut self.advantage, &mut self.returns];
         states.into_iter().chain(actions).chain(numbers).for_each(Vec::clear);
+        self.stretches.clear();
+    }
+
+    /// Advantages and returns under the values that `value` gives for rows of observations. Without stretches they stay.
+    pub fn estimate(&mut self, mut value: impl FnMut(&[f32]) -> Vec<f32>) {
+        if self.stretches.is_empty() {
+            return;
+        }
+        self.advantage.clear();
+        self.returns.clear();
+        let (values, (gamma, lambda)) = (value(&self.obs), self.discount);
+        let mut first = 0;
+        for s in &self.stretches {
+            let own = &values[first..][..s.reward.len()];
+            first += s.reward.len();
+            let finals = value(&s.final_obs);
+            let a = advantages(&s.reward, own, &s.terminated, &s.truncated, &finals, gamma, lambda);
+            self.advantage.extend(a.advantage);
+            self.returns.extend(a.returns);
+        }
     }
 }

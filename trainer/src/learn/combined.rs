@@ -11,7 +11,7 @@ mod gradient;
 use super::Dims;
 use super::batch::Batch;
 use super::inverse::{InverseModel, InverseWork};
-use super::losses::{mean_std, set_lanes, widths};
+use super::losses::{in_parts, mean_std, set_lanes, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
 use super::optimise::{Group, PhaseReport, Rows, TILE, Tile};
@@ -122,7 +122,7 @@ impl Combined {
         });
         let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
         policy.mlp.write_dense(&init::orthogonal(&policy.mlp.widths(), 0.01, rng), &mut group.p);
-        let (value, value_group) = Value::new(&dims, nets, ppo.vf_coef, rng);
+        let (value, value_group) = Value::new(&dims, nets, &ppo, rng);
         if let Some(range) = &policy_log_std {
             set_lanes(&mut group.p[range.clone()], s, ppo.log_std);
         }
@@ -153,6 +153,11 @@ impl Combined {
     /// Where the inverse model's network lies; empty with analytic inverse dynamics.
     pub(super) fn inverse_range(&self) -> Range<usize> {
         self.inverse.as_ref().map_or(0..0, |(model, _)| model.range())
+    }
+
+    /// Where the policy's network and its spread lie.
+    pub(super) fn proposal_range(&self) -> Range<usize> {
+        0..self.policy_log_std.as_ref().map_or(self.policy_range.end, |spread| spread.end)
     }
 
     /// Buffers for a tile.
@@ -208,6 +213,40 @@ impl Combined {
         if let (Some((model, _)), Some(work)) = (&self.inverse, &mut w.inverse) {
             model.tile(group, t, &self.dims, work, grad);
         }
+    }
+
+    /// Log probability of what was sampled in each row of the batch, under the current networks.
+    pub(super) fn log_probs(&self, group: &Group, batch: &Batch, threads: usize) -> Vec<f32> {
+        let mut out = vec![0.0f32; batch.n];
+        in_parts(&mut out, TILE, threads, |first, out| {
+            let (mut w, mut idx) = (self.work(), [0u32; TILE]);
+            for (start, out) in (first..).step_by(TILE).zip(out.chunks_mut(TILE)) {
+                for (k, i) in idx.iter_mut().enumerate() {
+                    *i = (start + k).min(batch.n - 1) as u32;
+                }
+                let tile = Tile { batch, idx: &idx, scale: 1.0, advantage: (0.0, 1.0), clip: 1.0 };
+                gradient::log_prob(self, group, &tile, &mut w, out);
+            }
+        });
+        out
+    }
+
+    /// Mean proposal of each row of the batch (n x n_state), in the order of the rows.
+    pub(super) fn proposals(&self, group: &Group, batch: &Batch, threads: usize, out: &mut Vec<f32>) {
+        let (s, sv) = (self.dims.n_state, self.dims.n_state.div_ceil(LANES));
+        out.resize(batch.n * s, 0.0);
+        in_parts(out, TILE * s, threads, |first, out| {
+            let (mut w, mut idx) = (self.work(), [0u32; TILE]);
+            for (start, out) in (first / s..).step_by(TILE).zip(out.chunks_mut(TILE * s)) {
+                for (k, i) in idx.iter_mut().enumerate() {
+                    *i = (start + k).min(batch.n - 1) as u32;
+                }
+                let tile = Tile { batch, idx: &idx, scale: 1.0, advantage: (0.0, 1.0), clip: 1.0 };
+                self.propose(group, &tile, &mut w);
+                let rows = scalars(w.policy.output()).chunks_exact(sv * LANES);
+                out.chunks_exact_mut(s).zip(rows).for_each(|(to, u)| to.copy_from_slice(&u[..s]));
+            }
+        });
     }
 
     /// Log standard deviations of what explores: the action's where it is Gaussian, else the proposal's.

@@ -6,7 +6,8 @@ use super::ppo::PpoSettings;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, exp, scalars, scalars_mut};
 use std::ops::Range;
 
-const MOST_VECTORS: usize = 16;
+/// Vectors of [`MOST_OUTPUTS`].
+pub(super) const MOST_VECTORS: usize = 16;
 /// Most outputs of a Gaussian network.
 pub const MOST_OUTPUTS: usize = MOST_VECTORS * LANES;
 
@@ -171,7 +172,7 @@ pub(super) fn likelihood_ratio<const N: usize>(
     for (g, inverse) in policy.iter_mut().zip(&inverse) {
         residuals(g.d, g.sampled, g.mean, &inverse[..g.log_std.len()], log_prob);
     }
-    let sums = surrogate(log_prob, old, advantage, settings.clip_range, t.scale);
+    let sums = surrogate(log_prob, old, advantage, t.clip, t.scale);
     for (g, inverse) in policy.iter_mut().zip(&inverse) {
         let grad = &mut grad[g.log_std.clone()];
         residuals_back(g.d, &inverse[..g.log_std.len()], log_prob, Some(&mut *grad), g.n);

@@ -11,7 +11,14 @@ pub(super) fn orthogonal(widths: &[usize], last: f64, rng: &mut ChaCha8Rng) -> D
         let gain = if i + 1 == n { last } else { std::f64::consts::SQRT_2 };
         DenseLayer { n_in: d[0], n_out: d[1], weight: matrix(d[1], d[0], gain, rng), bias: vec![0.0; d[1]] }
     };
-    Dense { layers: widths.windows(2).enumerate().map(layer).collect() }
+    Dense { layers: widths.windows(2).enumerate().map(layer).collect(), skip: None }
+}
+
+/// An orthogonal linear map of gain `gain` beside a network whose last layer is zero: it begins as the map alone.
+pub(super) fn linear_beside(widths: &[usize], gain: f64, rng: &mut ChaCha8Rng) -> Dense {
+    let (n_in, n_out) = (widths[0], widths[widths.len() - 1]);
+    let skip = Some(matrix(n_out, n_in, gain, rng));
+    Dense { skip, ..orthogonal(widths, 0.0, rng) }
 }
 
 /// (rows x cols), row-major, with orthonormal rows or columns (whichever are fewer) times `gain`.

@@ -11,10 +11,30 @@ use super::optimise::{Group, Rows, TILE, Tile, add_sums};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars_mut};
 use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
 /// Network inputs beyond this many standard deviations are clipped, as in the controller.
 pub(super) const CLIP: f32 = nearl_runtime::normaliser::CLIP as f32;
+
+/// What of a row of actions the inverse model's squared error is compared with the threshold.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Reading {
+    /// The mean over its entries.
+    #[default]
+    Entry,
+    /// Their sum.
+    Row,
+}
+
+impl Reading {
+    /// Whether a mean squared error of `error` an entry, of `n` entries, is at least `threshold`.
+    pub fn exceeds(self, error: f64, n: usize, threshold: f64) -> bool {
+        let factor = if self == Self::Row { n as f64 } else { 1.0 };
+        error * factor >= threshold
+    }
+}
 
 /// Mean of I: `[x_c, w_c] -> a`, and where it lies in its parameter group.
 pub(super) struct InverseModel {
@@ -41,7 +61,8 @@ impl InverseModel {
     pub(super) fn new(dims: &Dims, nets: &NetSettings, at: &mut usize, transposed: &mut usize) -> Self {
         let start = *at;
         let widths = widths(2 * dims.seen_obs.len(), &nets.idm, dims.n_act);
-        let net = Net::new(&widths, nets.activation, 2 * dims.seen_obs.len(), at, transposed);
+        let make = if nets.idm_residual && !nets.idm.is_empty() { Net::with_skip } else { Net::new };
+        let net = make(&widths, nets.activation, 2 * dims.seen_obs.len(), at, transposed);
         Self { net, start, end: *at }
     }
 
@@ -56,7 +77,8 @@ impl InverseModel {
 
     /// Orthogonal weights; the first mean action is near zero.
     pub(super) fn init(&self, p: &mut [V], rng: &mut ChaCha8Rng) {
-        let dense = init::orthogonal(&self.net.mlp.widths(), 0.01, rng);
+        let make = if self.net.mlp.skip.is_some() { init::linear_beside } else { init::orthogonal };
+        let dense = make(&self.net.mlp.widths(), 0.01, rng);
         self.net.mlp.write_dense(&dense, p);
     }
 
@@ -170,3 +192,15 @@ fn error_body(
     *out = sum.sum();
 }
 multiversion!(fn squared_error(m: &InverseModel, p: &[V], b: &Batch, idx: &[u32], dims: &Dims, w: &mut InverseWork, n: usize, out: &mut f32) = error_body);
+
+#[cfg(test)]
+mod tests {
+    use super::Reading;
+
+    /// 0.3 an entry is 2.4 a row of eight: below the paper's 0.5 as one reading, above it as the other.
+    #[test]
+    fn the_threshold_has_two_readings() {
+        assert!(!Reading::Entry.exceeds(0.3, 8, 0.5) && Reading::Row.exceeds(0.3, 8, 0.5));
+        assert!(Reading::Entry.exceeds(0.5, 8, 0.5) && !Reading::Row.exceeds(0.06, 8, 0.5));
+    }
+}

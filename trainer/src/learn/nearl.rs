@@ -2,19 +2,21 @@
 //!
 //! ```text
 //! collect with the combined policy                       (`rollout`)
-//! meta policy on reached transitions (s, s'), supervised
 //! inverse model on (s, s', a), supervised, above a threshold
+//! meta policy on reached transitions (s, s'), supervised
 //! policy gradient on the combined policy, Eq. 1
 //! ```
 //!
-//! The losses run on each minibatch in the order of [`IMITATE`], [`INVERSE`], [`ACTOR`], [`VALUE`], each with its own optimiser: run one
-//! after another over the whole batch, the first two would leave PPO's ratio far from 1 before its first step. What was
+//! [`INVERSE`] comes first, over the whole batch, whose log probabilities are then those of the model that learned: PPO's ratio begins
+//! at 1. The other losses run on each minibatch in the order of [`IMITATE`], [`ACTOR`], [`VALUE`], each with its own optimiser. What was
 //! reached is possible but not optimal, so the first loss pulls against the last; PID^2 replaces it by an adversary.
 
 use super::combined::{Combined, CombinedWork, Gradient, Kind};
+use super::epochs::{Pace, Update};
 use super::gaussian::gather;
+use super::inverse::Reading;
 use super::nets::NetSettings;
-use super::optimise::{Group, Params, Phases, Rows, Schedule, Tile, add_sums, optimise};
+use super::optimise::{Group, Params, Phases, Rows, Tile, add_sums, optimise};
 use super::pid2::Pid2Settings;
 use super::ppo::PpoSettings;
 use super::value::ValueWork;
@@ -34,6 +36,8 @@ pub struct NearlSettings {
     pub policy_lr: f32,
     /// The inverse model learns from reached transitions while its mean squared error is at least this ([sigma_I]).
     pub idm_threshold: f64,
+    /// What of a row of actions is compared with the threshold.
+    pub idm_threshold_per: Reading,
     /// Learning rate of the inverse model's supervised loss.
     pub idm_lr: f32,
     /// How the policy gradient passes the projection.
@@ -42,8 +46,15 @@ pub struct NearlSettings {
 
 impl Default for NearlSettings {
     fn default() -> Self {
-        let Pid2Settings { idm_threshold, idm_lr, gradient, .. } = Pid2Settings::default();
-        Self { policy_lr: 3e-4, idm_threshold, idm_lr, gradient }
+        let Pid2Settings { idm_threshold, idm_threshold_per, idm_lr, gradient, .. } = Pid2Settings::default();
+        Self { policy_lr: 3e-4, idm_threshold, idm_threshold_per, idm_lr, gradient }
+    }
+}
+
+impl NearlSettings {
+    /// Without the two supervised losses: PPO on the combined policy.
+    pub fn without_supervision(&self) -> Self {
+        Self { policy_lr: 0.0, idm_threshold: f64::INFINITY, ..self.clone() }
     }
 }
 
@@ -84,15 +95,15 @@ impl Nearl {
         threads: usize,
         rng: &mut ChaCha8Rng,
     ) -> Self {
-        let lr = ppo.lr;
+        let (lr, value_lr) = (ppo.lr, ppo.rate_of_value());
         let (combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
         let adam = vec![
             Adam::new(combined.policy_range.len(), settings.policy_lr),
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
             Adam::new(combined.len, lr),
-            Adam::new(combined.value.len, lr),
+            Adam::new(combined.value.len, value_lr),
         ];
-        let params = Params { groups: vec![actor, critic], adam, beta: 0.0 };
+        let params = Params { groups: vec![actor, critic], adam, beta: 0.0, adapted: 1.0 };
         Self { nets: Nets { settings, combined }, params, threads }
     }
 
@@ -103,30 +114,43 @@ impl Nearl {
 
 impl Learner for Nearl {
     /// One round of Algorithm 1 on the collected batch.
-    fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics {
-        let s = &self.nets.combined.ppo;
-        let schedule = Schedule { epochs: s.n_epochs, minibatch: s.batch_size, threads: self.threads, rate };
-        let before = self.nets.combined.idm_error(self.actor(), batch, self.threads);
-        let inverse_learns = before.is_some_and(|e| e >= self.nets.settings.idm_threshold);
+    fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
+        let (ppo, threads) = (self.nets.combined.ppo.clone(), self.threads);
+        let before = self.nets.combined.idm_error(self.actor(), batch, threads);
+        let (s, n_act) = (&self.nets.settings, self.nets.combined.dims.n_act);
+        let learns = |e| s.idm_threshold_per.exceeds(e, n_act, s.idm_threshold);
+        let inverse_learns = before.is_some_and(learns);
         let mut phases = Vec::new();
         if self.nets.settings.policy_lr > 0.0 {
             phases.push(IMITATE);
         }
-        if inverse_learns {
-            phases.push(INVERSE);
-        }
         phases.extend([ACTOR, VALUE]);
-        let report = optimise(&self.nets, &mut self.params, batch, &phases, schedule, rng);
+        let update = Update { ppo: &ppo, pace, threads, phases: &phases, actor: ACTOR };
+        if inverse_learns {
+            optimise(&self.nets, &mut self.params, batch, &[INVERSE], update.schedule(), rng);
+            batch.log_prob = self.nets.combined.log_probs(&self.params.groups[COMBINED], batch, threads);
+        }
+        let again = ppo.recompute_advantages;
+        let passes =
+            update.run(&mut self.nets, &mut self.params, batch, rng, again, |pass, n, params, batch, _| {
+                if again && pass > 0 {
+                    batch.estimate(|x| n.combined.value.of(&params.groups[CRITIC], x, threads));
+                }
+            });
+        let report = passes.reports;
         let of = |phase| phases.iter().position(|p| *p == phase).map(|i| &report[i]);
         let mut metrics = Metrics::new();
         if let (Some(actor), Some(value)) = (of(ACTOR), of(VALUE)) {
             metrics = self.nets.combined.metrics(self.actor(), actor, value);
+            metrics.push(("train/epochs", passes.epochs as f64));
+            metrics.push(("train/learning_rate", f64::from(ppo.lr * pace.rate * self.params.adapted)));
         }
         if let Some(imitate) = of(IMITATE) {
             metrics.push(("train/policy_mse", imitate.mean[0] / self.nets.combined.dims.n_state as f64));
         }
         let after = self.nets.combined.idm_error(self.actor(), batch, self.threads);
-        metrics.extend(super::idm_metrics(before, after, inverse_learns));
+        let actions = super::variance(&batch.action, n_act);
+        metrics.extend(super::idm_metrics(before, after, inverse_learns, actions));
         metrics
     }
 
@@ -210,6 +234,9 @@ impl Phases for Nets {
             VALUE => self.combined.value.refresh(group),
             _ => self.combined.refresh(group),
         }
+    }
+    fn is_paced(&self, phase: usize) -> bool {
+        phase != INVERSE
     }
     fn max_norm(&self, phase: usize) -> f32 {
         if matches!(phase, ACTOR | VALUE) { self.combined.ppo.max_grad_norm } else { f32::INFINITY }

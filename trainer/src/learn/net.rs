@@ -11,6 +11,8 @@ pub struct Net {
     pub mlp: Mlp,
     /// Of each layer whose input's gradient is wanted: where they start, and vectors of that gradient.
     transposed: Vec<Option<(usize, usize)>>,
+    /// The same of the linear map beside the layers.
+    transposed_skip: Option<(usize, usize)>,
 }
 
 /// Activations of one tile of rows.
@@ -18,6 +20,8 @@ pub struct Net {
 pub struct Tape {
     rows: usize,
     outputs: Vec<Vec<V>>,
+    /// What went into the activation after each hidden layer; empty where its output is enough.
+    inputs: Vec<Vec<V>>,
     grads: [Vec<V>; 2],
 }
 
@@ -37,7 +41,21 @@ impl Net {
         at: &mut usize,
         transposed_at: &mut usize,
     ) -> Self {
-        let mlp = Mlp::new(widths, activation, at);
+        Self::of(Mlp::new(widths, activation, at), input_grad, transposed_at)
+    }
+
+    /// The same with a linear map from input to output beside the layers.
+    pub fn with_skip(
+        widths: &[usize],
+        activation: Activation,
+        input_grad: usize,
+        at: &mut usize,
+        transposed_at: &mut usize,
+    ) -> Self {
+        Self::of(Mlp::with_skip(widths, activation, at), input_grad, transposed_at)
+    }
+
+    fn of(mlp: Mlp, input_grad: usize, transposed_at: &mut usize) -> Self {
         let place = |(i, l): (usize, &Layer)| {
             let k = if i > 0 { l.k_vectors() } else { input_grad.div_ceil(LANES) };
             (k > 0).then(|| {
@@ -46,20 +64,24 @@ impl Net {
                 (here, k)
             })
         };
-        let transposed = mlp.layers.iter().enumerate().map(place).collect();
-        Self { mlp, transposed }
+        let mut place = place;
+        let transposed = mlp.layers.iter().enumerate().map(&mut place).collect();
+        let transposed_skip = mlp.skip.as_ref().and_then(|l| place((0, l)));
+        Self { mlp, transposed, transposed_skip }
     }
 
     /// Buffers for `rows` rows, a multiple of 8.
     pub fn tape(&self, rows: usize) -> Tape {
         let widest = self.mlp.layers.iter().map(|l| l.n_vectors().max(l.k_vectors())).max().unwrap_or(0);
-        let outputs = self.mlp.layers.iter().map(|l| vec![ZERO; rows * l.n_vectors()]).collect();
-        Tape { rows, outputs, grads: [vec![ZERO; rows * widest], vec![ZERO; rows * widest]] }
+        let outputs: Vec<Vec<V>> = self.mlp.layers.iter().map(|l| vec![ZERO; rows * l.n_vectors()]).collect();
+        let inputs = if self.mlp.activation.keeps_input() { outputs.clone() } else { Vec::new() };
+        Tape { rows, outputs, inputs, grads: [vec![ZERO; rows * widest], vec![ZERO; rows * widest]] }
     }
 
     /// Refreshes the transposed weights; call after each change of the parameters `p`.
     pub fn transpose(&self, p: &[V], transposed: &mut [V]) {
-        for (l, place) in self.mlp.layers.iter().zip(&self.transposed) {
+        let beside = self.mlp.skip.iter().zip(std::iter::once(&self.transposed_skip));
+        for (l, place) in self.mlp.layers.iter().zip(&self.transposed).chain(beside) {
             let (Some((at, k)), n) = (*place, l.n_vectors()) else { continue };
             transpose(&p[l.w..l.b], n, &mut transposed[at..at + n * LANES * k], k);
         }
@@ -68,6 +90,7 @@ impl Net {
     /// Output rows for the input rows `x` (padded with zeros).
     pub fn forward<'t>(&self, p: &[V], x: &[V], tape: &'t mut Tape) -> &'t [V] {
         let last = self.mlp.layers.len() - 1;
+        let (f, keeps) = (self.mlp.activation, self.mlp.activation.keeps_input());
         for (i, l) in self.mlp.layers.iter().enumerate() {
             let (before, after) = tape.outputs.split_at_mut(i);
             let input = if i == 0 { x } else { &before[i - 1] };
@@ -82,9 +105,30 @@ impl Net {
                 b: &p[l.w..],
                 ldb: l.n_vectors(),
                 ldc: l.n_vectors(),
-                out: if i < last { Out::BiasThen(bias, self.mlp.activation) } else { Out::Bias(bias) },
+                out: if i < last && !keeps { Out::BiasThen(bias, f) } else { Out::Bias(bias) },
             };
-            gemm(&product, &mut after[0]);
+            if i < last && keeps {
+                gemm(&product, &mut tape.inputs[i]);
+                activate(&tape.inputs[i], &mut after[0], f);
+            } else {
+                gemm(&product, &mut after[0]);
+            }
+        }
+        if let Some(l) = &self.mlp.skip {
+            let n = l.n_vectors();
+            let product = Gemm {
+                m: tape.rows,
+                k: l.k,
+                n,
+                a: scalars(x),
+                rs: l.k_vectors() * LANES,
+                cs: 1,
+                b: &p[l.w..],
+                ldb: n,
+                ldc: n,
+                out: Out::Accumulate,
+            };
+            gemm(&product, &mut tape.outputs[last]);
         }
         &tape.outputs[last]
     }
@@ -105,40 +149,28 @@ impl Net {
         let [mut current, mut next] = std::mem::take(&mut tape.grads);
         let last = self.mlp.layers.len() - 1;
         for (i, l) in self.mlp.layers.iter().enumerate().rev() {
-            let (n, k) = (l.n_vectors(), l.k_vectors());
+            let n = l.n_vectors();
             let source = if i == 0 { x } else { &tape.outputs[i - 1] };
             let d = if i == last { &dy[..rows * n] } else { &current[..rows * n] };
             if let Some(g) = grad.as_deref_mut() {
-                let product = Gemm {
-                    m: l.k_padded(),
-                    k: rows,
-                    n,
-                    a: scalars(source),
-                    rs: 1,
-                    cs: k * LANES,
-                    b: d,
-                    ldb: n,
-                    ldc: n,
-                    out: Out::Accumulate,
-                };
-                gemm(&product, &mut g[l.w..l.b]);
+                gemm(&weight_gradient(l, rows, source, d), &mut g[l.w..l.b]);
                 column_sums(d, n, &mut g[l.b..l.b + n]);
             }
-            if let Some((at, k)) = self.transposed[i].filter(|_| i > 0 || input) {
-                let product = Gemm {
-                    m: rows,
-                    k: l.n,
-                    n: k,
-                    a: scalars(d),
-                    rs: n * LANES,
-                    cs: 1,
-                    b: &transposed[at..],
-                    ldb: k,
-                    ldc: k,
-                    out: if i > 0 { Out::TimesDerivative(source, self.mlp.activation) } else { Out::Store },
-                };
+            if let Some((start, k)) = self.transposed[i].filter(|_| i > 0 || input) {
+                let at = if i > 0 && !tape.inputs.is_empty() { &tape.inputs[i - 1] } else { source };
+                let out = if i > 0 { Out::TimesDerivative(at, self.mlp.activation) } else { Out::Store };
+                let product = input_gradient(l, rows, d, &transposed[start..], k, out);
                 gemm(&product, &mut next);
                 std::mem::swap(&mut current, &mut next);
+            }
+        }
+        if let Some(l) = &self.mlp.skip {
+            let n = l.n_vectors();
+            if let Some(g) = grad {
+                gemm(&weight_gradient(l, rows, x, &dy[..rows * n]), &mut g[l.w..l.b]);
+            }
+            if let Some((start, k)) = self.transposed_skip.filter(|_| input) {
+                gemm(&input_gradient(l, rows, dy, &transposed[start..], k, Out::Accumulate), &mut current);
             }
         }
         tape.grads = [current, next];
@@ -146,6 +178,42 @@ impl Net {
         &tape.grads[0][..rows * wanted]
     }
 }
+
+/// `dW += x' d` over `rows` rows of input `x` and output gradient `d`.
+fn weight_gradient<'a>(l: &Layer, rows: usize, x: &'a [V], d: &'a [V]) -> Gemm<'a> {
+    let n = l.n_vectors();
+    Gemm {
+        m: l.k_padded(),
+        k: rows,
+        n,
+        a: scalars(x),
+        rs: 1,
+        cs: l.k_vectors() * LANES,
+        b: d,
+        ldb: n,
+        ldc: n,
+        out: Out::Accumulate,
+    }
+}
+
+/// `dx = d W'` over `rows` rows, the first `k` vectors of each.
+fn input_gradient<'a>(
+    l: &Layer,
+    rows: usize,
+    d: &'a [V],
+    transposed: &'a [V],
+    k: usize,
+    out: Out<'a>,
+) -> Gemm<'a> {
+    let rs = l.n_vectors() * LANES;
+    Gemm { m: rows, k: l.n, n: k, a: scalars(d), rs, cs: 1, b: transposed, ldb: k, ldc: k, out }
+}
+
+#[inline(always)]
+fn apply(x: &[V], y: &mut [V], f: Activation) {
+    y.iter_mut().zip(x).for_each(|(y, &x)| *y = f.apply(x));
+}
+multiversion!(fn activate(x: &[V], y: &mut [V], f: Activation) = apply);
 
 /// Rows of `w` (n vectors each) to columns of `t` (k vectors a row), in squares of 16 x 16; rows beyond the last are zero.
 #[inline(always)]

@@ -12,11 +12,13 @@ pub struct NetSettings {
     pub policy: Vec<usize>,
     /// Inverse dynamics model.
     pub idm: Vec<usize>,
+    /// The inverse model is an affine map plus a network of these widths that begins at zero.
+    pub idm_residual: bool,
     /// Value.
     pub value: Vec<usize>,
     /// Discriminator: the first half (rounded up) before the latent z, the rest behind it.
     pub discriminator: Vec<usize>,
-    /// `tanh` or `relu`.
+    /// `tanh`, `relu`, `elu` or `silu`.
     pub activation: Activation,
 }
 
@@ -26,6 +28,7 @@ impl Default for NetSettings {
         Self {
             policy: hidden(),
             idm: hidden(),
+            idm_residual: false,
             value: hidden(),
             discriminator: hidden(),
             activation: Activation::Tanh,

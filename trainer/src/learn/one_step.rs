@@ -3,7 +3,7 @@
 
 use super::nearl::{Nearl, NearlSettings};
 use super::pid2::{Pid2, Pid2Settings};
-use super::{Batch, Dims, Kind, Learner, NetSettings, Ppo, PpoSettings};
+use super::{Batch, Dims, Kind, Learner, NetSettings, Pace, Ppo, PpoSettings};
 use nearl_runtime::Networks;
 use nearl_runtime::net::{Activation, Forward};
 use nearl_runtime::normaliser::Normaliser;
@@ -114,12 +114,12 @@ fn train(
     let actor = |l: &dyn Learner| Actor { kind, activation: nets.activation, nets: l.networks(&normaliser) };
     let mut first = f64::NAN;
     for round in 0..rounds {
-        let (batch, miss) = collect(&actor(&*learner), 1024, &mut rng);
+        let (mut batch, miss) = collect(&actor(&*learner), 1024, &mut rng);
         if round == 0 {
             first = miss;
         }
-        let rate = 1.0 - round as f32 / rounds as f32;
-        learner.update(&batch, rate, &mut rng);
+        let pace = Pace { rate: 1.0 - round as f32 / rounds as f32, clip: 1.0 };
+        learner.update(&mut batch, pace, &mut rng);
     }
     (first, collect(&actor(&*learner), 1024, &mut rng).1)
 }
@@ -134,7 +134,7 @@ fn nets(activation: Activation) -> NetSettings {
 
 #[test]
 fn ppo_solves_it_with_every_activation() {
-    for f in [Activation::Tanh, Activation::Relu] {
+    for f in [Activation::Tanh, Activation::Relu, Activation::Elu, Activation::Silu] {
         let n = nets(f);
         let got = train(None, &n, 40, |d, s, rng| Box::new(Ppo::new(d, &n, s, 1, rng)));
         solves(&format!("ppo {f:?}"), got);

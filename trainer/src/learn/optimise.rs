@@ -41,6 +41,8 @@ pub struct Params {
     pub adam: Vec<Adam>,
     /// Multiplier of the information bottleneck.
     pub beta: f32,
+    /// Factor on the rates of policy and value that holds the divergence of an update (`train.ppo.desired_kl`).
+    pub adapted: f32,
 }
 
 /// What a tile of rows needs: the batch, the rows, and numbers of the whole minibatch.
@@ -54,6 +56,8 @@ pub struct Tile<'a> {
     pub scale: f32,
     /// Mean and inverse standard deviation of the minibatch's advantages.
     pub advantage: (f32, f32),
+    /// Clip range of the probability ratio.
+    pub clip: f32,
 }
 
 /// Sums over rows that a phase reports, beside its gradient: lanes of one vector.
@@ -73,6 +77,8 @@ pub trait Phases: Sync {
     fn tile(&self, phase: usize, params: &Params, tile: Tile<'_>, work: &mut Self::Work, grad: &mut [V]);
     /// Refreshes transposed weights after phase `k` changed its parameters.
     fn refresh(&self, phase: usize, params: &mut Params);
+    /// Whether the rate of phase `k` follows the schedule of the run; the others are constant.
+    fn is_paced(&self, phase: usize) -> bool;
     /// Largest norm of the gradient of phase `k`.
     fn max_norm(&self, phase: usize) -> f32;
     /// The phase before or after `k` whose gradient is clipped as one vector with that of `k`.
@@ -100,8 +106,10 @@ pub struct Schedule {
     pub minibatch: usize,
     /// Threads.
     pub threads: usize,
-    /// Factor on every learning rate.
+    /// Factor on the learning rates of the phases that follow the schedule of the run.
     pub rate: f32,
+    /// Clip range of the probability ratio.
+    pub clip: f32,
 }
 
 /// What a phase reported, averaged over all minibatches.
@@ -114,8 +122,14 @@ pub struct PhaseReport {
 }
 
 impl PhaseReport {
-    /// From sums over `steps` minibatches to means.
-    fn average(&mut self, steps: f64) {
+    /// Adds another report.
+    pub(super) fn add(&mut self, other: &Self) {
+        self.mean.iter_mut().zip(other.mean).for_each(|(sum, m)| *sum += m);
+        self.norm += other.norm;
+    }
+
+    /// From a sum over `steps` to a mean.
+    pub(super) fn average(&mut self, steps: f64) {
         self.mean.iter_mut().for_each(|m| *m /= steps);
         self.norm /= steps;
     }
@@ -363,7 +377,8 @@ impl<P: Phases> Run<'_, P> {
             // after the last tile of a shard comes the first of this thread's next one
             let next = if at + TILE < (s + 1) * rows { at + TILE } else { (s + self.threads) * rows };
             rows::prefetch(&self.rows[k], all.get(next..next + TILE).unwrap_or(&[]));
-            let tile = Tile { batch: self.batch, idx: &all[at..at + TILE], scale, advantage };
+            let clip = self.schedule.clip;
+            let tile = Tile { batch: self.batch, idx: &all[at..at + TILE], scale, advantage, clip };
             self.algorithm.tile(self.phases[k], params, tile, work, &mut grad[..len]);
         }
     }
@@ -386,8 +401,9 @@ impl<P: Phases> Run<'_, P> {
         let mean = reported.0.map(|x| x / self.schedule.minibatch as f32);
         let limit = self.algorithm.max_norm(phase);
         let scale = if length > limit { limit / length } else { 1.0 };
+        let rate = if self.algorithm.is_paced(phase) { self.schedule.rate * params.adapted } else { 1.0 };
         let group = &mut params.groups[self.group(k)];
-        params.adam[phase].step(&mut group.p[self.algorithm.range(phase)], grad, scale, self.schedule.rate);
+        params.adam[phase].step(&mut group.p[self.algorithm.range(phase)], grad, scale, rate);
         self.algorithm.refresh(phase, params);
         self.algorithm.after(phase, &mean, params);
         report.norm += f64::from(length);

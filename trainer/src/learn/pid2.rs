@@ -2,27 +2,32 @@
 //!
 //! ```text
 //! collect with constraints                                        (line 8; `rollout`)
-//! discriminator, bottleneck, and policy against them, Eq. 2       (line 9)
 //! inverse model on reached transitions, Eq. 4, above a threshold  (lines 10 to 12)
+//! discriminator, bottleneck, and policy against them, Eq. 2       (line 9)
 //! policy gradient on the combined policy, Eq. 1, and the value    (line 13)
 //! ```
 //!
-//! The losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`DISCRIMINATOR`], [`INVERSE`]. The gradient of
+//! [`INVERSE`] comes first, over the whole batch, whose log probabilities are then those of the model that learned: PPO's ratio begins
+//! at 1. The other losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`GENERATOR`], [`DISCRIMINATOR`]. The gradient of
 //! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the
 //! bounds, zero where the projection clamped. The adversarial loss pulls at the proposal as a whole, or only at what the action
 //! leaves free of it ([`null_space`]).
 
 mod adversary;
+mod fakes;
 mod null_space;
 
 use super::combined::{Combined, CombinedWork, Gradient, Kind};
 use super::discriminator::{Discriminator, DiscriminatorWork, LATENT};
+use super::epochs::{Pace, Update};
+use super::inverse::Reading;
 use super::nets::NetSettings;
-use super::optimise::{Group, Params, Phases, Rows, SUMS, Schedule, Tile, add_sums, optimise};
+use super::optimise::{Group, Params, Phases, Rows, SUMS, Tile, add_sums, optimise};
 use super::ppo::PpoSettings;
 use super::value::ValueWork;
 use super::{Adam, Batch, Dims, Learner, Metrics};
 use adversary::{fool_discriminator, judge};
+use fakes::Fakes;
 use nearl_runtime::net::kernel::{V, ZERO};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Networks, multiversion};
@@ -38,12 +43,23 @@ use std::ops::Range;
 pub struct Pid2Settings {
     /// The inverse model learns from reached transitions while its mean squared error is at least this ([sigma_I]).
     pub idm_threshold: f64,
+    /// What of a row of actions is compared with the threshold.
+    pub idm_threshold_per: Reading,
     /// Learning rate of the inverse model's supervised loss.
     pub idm_lr: f32,
     /// Learning rate of the discriminator.
     pub discriminator_lr: f32,
     /// Weight of the adversarial loss in the policy's gradient; 0 leaves the adversary out.
     pub generator_weight: f32,
+    /// Learning rate of the adversarial loss of the policy with an optimiser of its own, which no clipped ratio hands the whole step;
+    /// 0: it shares that of the policy gradient.
+    pub generator_lr: f32,
+    /// Weight of the squared slope of the discriminator by the reached change.
+    pub gradient_penalty: f32,
+    /// Proposals are judged with noise like that of what was reached, so that the right one cannot be told from it.
+    pub match_noise: bool,
+    /// Judge the proposals of the current policy, made anew before each pass over the batch.
+    pub fresh_fakes: bool,
     /// The adversary moves a proposal only where the mean action stays as it is. No effect where the policy does not learn
     /// through the inverse model (`exploration = "proposal"`).
     pub null_space: bool,
@@ -61,9 +77,14 @@ impl Default for Pid2Settings {
     fn default() -> Self {
         Self {
             idm_threshold: 0.5,
+            idm_threshold_per: Reading::default(),
             idm_lr: 3e-4,
             discriminator_lr: 3e-4,
             generator_weight: 0.1,
+            generator_lr: 0.0,
+            gradient_penalty: 0.0,
+            match_noise: false,
+            fresh_fakes: true,
             null_space: false,
             i_c: 0.5,
             beta: 0.1,
@@ -73,7 +94,7 @@ impl Default for Pid2Settings {
     }
 }
 
-/// Phase of the policy gradient and the adversarial loss of the policy.
+/// Phase of the policy gradient, and of the adversarial loss of the policy where it shares the optimiser.
 pub const ACTOR: usize = 0;
 /// Phase of the value.
 pub const VALUE: usize = 1;
@@ -81,6 +102,8 @@ pub const VALUE: usize = 1;
 pub const DISCRIMINATOR: usize = 2;
 /// Phase of the supervised inverse model.
 pub const INVERSE: usize = 3;
+/// Phase of the adversarial loss of the policy with an optimiser of its own.
+pub const GENERATOR: usize = 4;
 
 /// The learner.
 pub struct Pid2 {
@@ -95,6 +118,8 @@ struct Nets {
     discriminator: Discriminator,
     /// Latent noise (n x LATENT), read by three passes: see [`Nets::noise_shift`].
     noise: Vec<f32>,
+    /// What is judged beside the reached changes.
+    fakes: Fakes,
 }
 
 /// A pass through the bottleneck.
@@ -148,7 +173,7 @@ impl Pid2 {
         threads: usize,
         rng: &mut ChaCha8Rng,
     ) -> Self {
-        let lr = ppo.lr;
+        let (lr, value_lr) = (ppo.lr, ppo.rate_of_value());
         let discriminator = Discriminator::new(dims.n_state, dims.n_obs, nets, bottleneck);
         let (combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
         let d = &discriminator;
@@ -157,12 +182,13 @@ impl Pid2 {
         d.refresh(&judge.p, &mut judge.transposed);
         let adam = vec![
             Adam::new(combined.len, lr),
-            Adam::new(combined.value.len, lr),
+            Adam::new(combined.value.len, value_lr),
             Adam::new(d.len, settings.discriminator_lr),
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
+            Adam::new(combined.proposal_range().len(), settings.generator_lr),
         ];
-        let params = Params { groups: vec![actor, critic, judge], adam, beta: settings.beta };
-        let nets = Nets { settings, combined, discriminator, noise: Vec::new() };
+        let params = Params { groups: vec![actor, critic, judge], adam, beta: settings.beta, adapted: 1.0 };
+        let nets = Nets { settings, combined, discriminator, noise: Vec::new(), fakes: Fakes::default() };
         Self { nets, params, threads }
     }
 
@@ -173,26 +199,54 @@ impl Pid2 {
 
 impl Learner for Pid2 {
     /// One round of Algorithm 2 on the collected batch.
-    fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics {
-        self.nets.noise.resize(batch.n * LATENT, 0.0);
-        self.nets.noise.fill_with(|| StandardNormal.sample(&mut *rng));
-        let s = &self.nets.combined.ppo;
-        let schedule = Schedule { epochs: s.n_epochs, minibatch: s.batch_size, threads: self.threads, rate };
-        let before = self.nets.combined.idm_error(self.actor(), batch, self.threads);
-        let inverse_learns = before.is_some_and(|e| e >= self.nets.settings.idm_threshold);
+    fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
+        let (ppo, threads) = (self.nets.combined.ppo.clone(), self.threads);
+        let (s, n_act) = (self.nets.settings.clone(), self.nets.combined.dims.n_act);
+        let before = self.nets.combined.idm_error(self.actor(), batch, threads);
+        let inverse_learns = before.is_some_and(|e| s.idm_threshold_per.exceeds(e, n_act, s.idm_threshold));
+        let judged = s.generator_weight > 0.0;
         let mut phases = vec![ACTOR, VALUE];
-        if self.nets.settings.generator_weight > 0.0 {
+        if judged && s.generator_lr > 0.0 {
+            phases.push(GENERATOR);
+        }
+        if judged {
             phases.push(DISCRIMINATOR);
         }
+        let update = Update { ppo: &ppo, pace, threads, phases: &phases, actor: ACTOR };
         if inverse_learns {
-            phases.push(INVERSE);
+            optimise(&self.nets, &mut self.params, batch, &[INVERSE], update.schedule(), rng);
+            batch.log_prob = self.nets.combined.log_probs(&self.params.groups[COMBINED], batch, threads);
         }
-        let report = optimise(&self.nets, &mut self.params, batch, &phases, schedule, rng);
+        if judged {
+            self.nets.noise.resize(batch.n * LATENT, 0.0);
+            self.nets.noise.fill_with(|| StandardNormal.sample(&mut *rng));
+            self.nets.fakes = Fakes::new(&s, &self.nets.combined, batch, rng);
+        }
+        let (again, fresh) = (ppo.recompute_advantages, judged && s.fresh_fakes);
+        let passes = update.run(
+            &mut self.nets,
+            &mut self.params,
+            batch,
+            rng,
+            again || fresh,
+            |pass, n, params, batch, rng| {
+                if again && pass > 0 {
+                    batch.estimate(|x| n.combined.value.of(&params.groups[CRITIC], x, threads));
+                }
+                if fresh && pass > 0 {
+                    n.fakes.renew(&n.combined, &params.groups[COMBINED], batch, threads, rng);
+                }
+            },
+        );
+        let report = passes.reports;
         let mut metrics = self.nets.combined.metrics(self.actor(), &report[0], &report[1]);
-        if phases.contains(&DISCRIMINATOR) {
-            let judge = &report[2].mean;
+        metrics.push(("train/epochs", passes.epochs as f64));
+        metrics.push(("train/learning_rate", f64::from(ppo.lr * pace.rate * self.params.adapted)));
+        if judged {
+            let judge = &report[phases.len() - 1].mean;
+            let generator = if s.generator_lr > 0.0 { report[2].mean[0] } else { report[0].mean[4] };
             metrics.extend([
-                ("train/generator_loss", report[0].mean[4]),
+                ("train/generator_loss", generator),
                 ("discriminator/loss", judge[0]),
                 ("discriminator/kl", judge[1]),
                 ("discriminator/accuracy", judge[2]),
@@ -200,7 +254,8 @@ impl Learner for Pid2 {
             ]);
         }
         let after = self.nets.combined.idm_error(self.actor(), batch, self.threads);
-        metrics.extend(super::idm_metrics(before, after, inverse_learns));
+        let actions = super::variance(&batch.action, n_act);
+        metrics.extend(super::idm_metrics(before, after, inverse_learns, actions));
         metrics
     }
 
@@ -229,13 +284,28 @@ fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [
     let group = &params.groups[COMBINED];
     let [loss, kl, clipped, clamped] = n.combined.policy_gradient(group, &t, &mut w.actor, grad);
     let mut generator = 0.0;
-    if n.settings.generator_weight > 0.0 {
-        generator = fool_discriminator(n, params, &t, w);
+    if n.settings.generator_weight > 0.0 && n.settings.generator_lr == 0.0 {
+        generator = fool_discriminator(n, params, &t, w, grad);
     }
     n.combined.learn(group, &mut w.actor, grad);
     add_sums(grad, &[loss, kl, clipped, clamped, generator]);
 }
 
+/// The adversarial loss of the policy (Eq. 2) alone.
+#[inline(always)]
+fn generator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
+    let group = &params.groups[COMBINED];
+    n.combined.propose(group, &t, &mut w.actor);
+    if w.null_space.is_some() {
+        n.combined.invert(group, &t, &mut w.actor);
+    }
+    w.actor.d_change.fill(ZERO);
+    let loss = fool_discriminator(n, params, &t, w, grad);
+    n.combined.learn(group, &mut w.actor, grad);
+    add_sums(grad, &[loss]);
+}
+
+multiversion!(fn generator(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = generator_body);
 multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = actor_body);
 
 impl Phases for Nets {
@@ -262,12 +332,14 @@ impl Phases for Nets {
             ACTOR => 0..self.combined.len,
             VALUE => 0..self.combined.value.len,
             INVERSE => self.combined.inverse_range(),
+            GENERATOR => self.combined.proposal_range(),
             _ => 0..self.discriminator.len,
         }
     }
     fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
         match phase {
             ACTOR => actor(self, params, t, w, grad),
+            GENERATOR => generator(self, params, t, w, grad),
             VALUE => self.combined.value.tile(&params.groups[CRITIC], &t, &mut w.value, grad),
             INVERSE => self.combined.idm_tile(&params.groups[COMBINED], &t, &mut w.actor, grad),
             _ => judge(self, params, t, w, grad),
@@ -275,7 +347,7 @@ impl Phases for Nets {
     }
     fn refresh(&self, phase: usize, params: &mut Params) {
         match phase {
-            ACTOR => self.combined.refresh(&mut params.groups[COMBINED]),
+            ACTOR | GENERATOR => self.combined.refresh(&mut params.groups[COMBINED]),
             VALUE => self.combined.value.refresh(&mut params.groups[CRITIC]),
             INVERSE => self.combined.refresh_inverse(&mut params.groups[COMBINED]),
             _ => {
@@ -284,11 +356,14 @@ impl Phases for Nets {
             }
         }
     }
+    fn is_paced(&self, phase: usize) -> bool {
+        !matches!(phase, INVERSE | DISCRIMINATOR)
+    }
     fn max_norm(&self, phase: usize) -> f32 {
         if matches!(phase, ACTOR | VALUE) { self.combined.ppo.max_grad_norm } else { f32::INFINITY }
     }
     fn clipped_with(&self, phase: usize) -> Option<usize> {
-        [Some(VALUE), Some(ACTOR), None, None][phase]
+        [Some(VALUE), Some(ACTOR), None, None, None][phase]
     }
     fn lane(&self, phase: usize) -> usize {
         usize::from(matches!(phase, VALUE | DISCRIMINATOR))
@@ -310,10 +385,11 @@ impl Phases for Nets {
             }
             VALUE => self.combined.value.rows(batch),
             INVERSE => self.combined.idm_rows(batch),
+            GENERATOR => vec![Rows::new(&batch.obs, d.n_obs), noise(Pass::Generator)],
             _ => vec![
                 Rows::new(&batch.obs, d.n_obs),
                 Rows::new(&batch.reached, d.n_state),
-                Rows::new(&batch.proposal, d.n_state),
+                Rows::new(self.fakes.judged(batch), d.n_state),
                 noise(Pass::Real),
                 noise(Pass::Proposed),
             ],

@@ -2,12 +2,13 @@
 //! the side, so that its loss can be plotted beside the others.
 
 use super::batch::Batch;
+use super::epochs::{Pace, Update};
 use super::gaussian::{Gaussian, gather, likelihood_ratio};
 use super::inverse::InverseModel;
 use super::losses::{mean_std, set_lanes, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
-use super::optimise::{Group, Params, Phases, Rows, Schedule, TILE, Tile, add_sums, optimise};
+use super::optimise::{Group, Params, Phases, Rows, TILE, Tile, add_sums};
 use super::value::{Value, ValueWork};
 use super::{Adam, Dims, Learner, Metrics, init};
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars};
@@ -21,14 +22,27 @@ use std::ops::Range;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PpoSettings {
-    /// Learning rate.
+    /// Learning rate of the policy.
     pub lr: f32,
+    /// Learning rate of the value; 0: as that of the policy.
+    pub value_lr: f32,
     /// Passes over a batch.
     pub n_epochs: usize,
     /// Rows of a minibatch; a multiple of 32 that divides the batch.
     pub batch_size: usize,
     /// Clip range of the probability ratio.
     pub clip_range: f32,
+    /// Factor on the clip range at the end of the run, reached linearly.
+    pub clip_to: f32,
+    /// The value's step is clipped to this distance from what it was, in scaled returns; 0: not at all.
+    pub clip_value: f32,
+    /// No further pass over a batch once the divergence from the policy that collected is 1.5 times this; 0: all passes.
+    pub target_kl: f32,
+    /// The rate is lowered after an update whose last pass diverged by more than twice this, and raised below half of it;
+    /// 0: it is not.
+    pub desired_kl: f32,
+    /// Estimate advantages and returns anew before each pass over the batch.
+    pub recompute_advantages: bool,
     /// Weight of the value loss.
     pub vf_coef: f32,
     /// Weight of the entropy bonus.
@@ -43,14 +57,27 @@ impl Default for PpoSettings {
     fn default() -> Self {
         Self {
             lr: 3e-4,
+            value_lr: 0.0,
             n_epochs: 10,
             batch_size: 64,
             clip_range: 0.2,
+            clip_to: 1.0,
+            clip_value: 0.0,
+            target_kl: 0.0,
+            desired_kl: 0.0,
+            recompute_advantages: false,
             vf_coef: 0.5,
             ent_coef: 0.0,
             max_grad_norm: 0.5,
             log_std: 0.0,
         }
+    }
+}
+
+impl PpoSettings {
+    /// Learning rate of the value.
+    pub(super) fn rate_of_value(&self) -> f32 {
+        if self.value_lr > 0.0 { self.value_lr } else { self.lr }
     }
 }
 
@@ -109,15 +136,16 @@ impl Ppo {
         at = log_std.end;
         let mut actor = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
         policy.mlp.write_dense(&init::orthogonal(&policy.mlp.widths(), 0.01, rng), &mut actor.p);
-        let (value, value_group) = Value::new(&dims, nets, settings.vf_coef, rng);
+        let (value, value_group) = Value::new(&dims, nets, &settings, rng);
         set_lanes(&mut actor.p[log_std.clone()], a, settings.log_std);
         let mut aside = rng.clone(); // so that the policy learns the same with any inverse model beside it
         aside.set_stream(rng.get_stream() ^ (1 << 63)); // far from those of environments
         let (inverse, inverse_group) = InverseModel::alone(&dims, nets, &mut aside);
         let groups = vec![actor, value_group, inverse_group];
-        let adam = groups.iter().map(|g| Adam::new(g.p.len(), settings.lr)).collect();
+        let rates = [settings.lr, settings.rate_of_value(), settings.lr];
+        let adam = groups.iter().zip(rates).map(|(g, lr)| Adam::new(g.p.len(), lr)).collect();
         let nets = Nets { dims, settings, policy, log_std, value, inverse, len: at };
-        let mut params = Params { groups, adam, beta: 0.0 };
+        let mut params = Params { groups, adam, beta: 0.0, adapted: 1.0 };
         [ACTOR, VALUE, INVERSE].iter().for_each(|&phase| nets.refresh(phase, &mut params));
         Self { nets, params, threads }
     }
@@ -148,11 +176,18 @@ impl Learner for Ppo {
         self.nets.value.of(&self.params.groups[VALUE], x, self.threads)
     }
 
-    fn update(&mut self, batch: &Batch, rate: f32, rng: &mut ChaCha8Rng) -> Metrics {
-        let s = &self.nets.settings;
-        let before = self.nets.idm_error(&self.params, batch, self.threads);
-        let schedule = Schedule { epochs: s.n_epochs, minibatch: s.batch_size, threads: self.threads, rate };
-        let report = optimise(&self.nets, &mut self.params, batch, &[ACTOR, VALUE, INVERSE], schedule, rng);
+    fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
+        let (ppo, threads) = (self.nets.settings.clone(), self.threads);
+        let before = self.nets.idm_error(&self.params, batch, threads);
+        let update = Update { ppo: &ppo, pace, threads, phases: &[ACTOR, VALUE, INVERSE], actor: ACTOR };
+        let again = ppo.recompute_advantages;
+        let passes =
+            update.run(&mut self.nets, &mut self.params, batch, rng, again, |pass, n, params, batch, _| {
+                if again && pass > 0 {
+                    batch.estimate(|x| n.value.of(&params.groups[VALUE], x, threads));
+                }
+            });
+        let report = passes.reports;
         let after = self.nets.idm_error(&self.params, batch, self.threads);
         let p = &self.params.groups[ACTOR].p;
         let log_std = &scalars(&p[self.nets.log_std.clone()])[..self.nets.dims.n_act];
@@ -163,8 +198,11 @@ impl Learner for Ppo {
             ("train/value_loss", report[1].mean[0]),
             ("train/grad_norm", report[0].norm),
             ("train/std", mean_std(log_std)),
+            ("train/epochs", passes.epochs as f64),
+            ("train/learning_rate", f64::from(ppo.lr * pace.rate * self.params.adapted)),
         ];
-        metrics.extend(super::idm_metrics(Some(before), Some(after), true));
+        let actions = super::variance(&batch.action, self.nets.dims.n_act);
+        metrics.extend(super::idm_metrics(Some(before), Some(after), true, actions));
         metrics
     }
 }
@@ -225,6 +263,9 @@ impl Phases for Nets {
             VALUE => self.value.refresh(group),
             _ => self.inverse.net.transpose(&group.p, &mut group.transposed),
         }
+    }
+    fn is_paced(&self, phase: usize) -> bool {
+        phase != INVERSE
     }
     fn max_norm(&self, _: usize) -> f32 {
         self.settings.max_grad_norm

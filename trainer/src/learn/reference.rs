@@ -11,6 +11,8 @@ use nearl_runtime::net::{Activation, Dense};
 #[derive(Clone)]
 pub(super) struct Net64 {
     layers: Vec<(Vec<f64>, Vec<f64>)>,
+    /// A linear map from input to output beside the layers; empty where there is none.
+    skip: Vec<f64>,
     between: fn(f64) -> f64,
 }
 
@@ -20,8 +22,15 @@ impl Net64 {
         let between = match activation {
             Activation::Tanh => f64::tanh,
             Activation::Relu => |x: f64| x.max(0.0),
+            Activation::Elu => |x: f64| if x > 0.0 { x } else { x.exp_m1() },
+            Activation::Silu => |x: f64| x / (1.0 + (-x).exp()),
         };
-        Self { layers: dense.layers.iter().map(|l| (wide(&l.weight), wide(&l.bias))).collect(), between }
+        let skip = dense.skip.as_ref().map_or(Vec::new(), |s| wide(s));
+        Self {
+            layers: dense.layers.iter().map(|l| (wide(&l.weight), wide(&l.bias))).collect(),
+            skip,
+            between,
+        }
     }
 
     /// The textbook sums.
@@ -33,18 +42,26 @@ impl Net64 {
                 b.iter().enumerate().map(|(n, b)| b + (0..n_in).map(|k| w[n * n_in + k] * h[k]).sum::<f64>());
             h = if i + 1 < self.layers.len() { y.map(self.between).collect() } else { y.collect() };
         }
+        for (h, row) in h.iter_mut().zip(self.skip.chunks_exact(x.len())) {
+            *h += row.iter().zip(x).map(|(w, x)| w * x).sum::<f64>();
+        }
         h
     }
 
     /// Parameters one after another: weight, bias of each layer.
     pub(super) fn flat(&mut self) -> Vec<&mut f64> {
-        self.layers.iter_mut().flat_map(|(w, b)| w.iter_mut().chain(b.iter_mut())).collect()
+        self.layers
+            .iter_mut()
+            .flat_map(|(w, b)| w.iter_mut().chain(b.iter_mut()))
+            .chain(&mut self.skip)
+            .collect()
     }
 }
 
 /// The parameters in the order of [`Net64::flat`].
 pub(super) fn flat32(dense: &Dense) -> Vec<f64> {
-    dense.layers.iter().flat_map(|l| l.weight.iter().chain(&l.bias)).map(|&v| f64::from(v)).collect()
+    let layers = dense.layers.iter().flat_map(|l| l.weight.iter().chain(&l.bias));
+    layers.chain(dense.skip.iter().flatten()).map(|&v| f64::from(v)).collect()
 }
 
 pub(super) fn row(x: &[f32], i: usize, n: usize) -> Vec<f64> {
@@ -114,7 +131,7 @@ pub(super) fn spread(p: &mut [V], nets: &[&Net]) {
 /// The whole batch as one tile.
 pub(super) fn tile<'a>(batch: &'a Batch, idx: &'a [u32]) -> Tile<'a> {
     let (mean, std) = stats_of(&batch.advantage);
-    Tile { batch, idx, scale: 1.0 / batch.n as f32, advantage: (mean as f32, (1.0 / std) as f32) }
+    Tile { batch, idx, scale: 1.0 / batch.n as f32, advantage: (mean as f32, (1.0 / std) as f32), clip: 0.2 }
 }
 
 /// One minibatch of random experience.
@@ -139,6 +156,7 @@ pub(super) fn batch(d: &Dims, n: usize, seed: u64) -> Batch {
         log_prob: draw(1, 1.0).iter().map(|x| x - 4.0).collect(),
         advantage: draw(1, 1.0),
         returns: draw(1, 1.0),
+        ..Batch::default()
     };
     batch.target = draw(d.n_state, 1.0);
     batch

@@ -6,6 +6,7 @@ use super::losses::{in_parts, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
 use super::optimise::{Group, Rows, TILE, Tile, add_sums};
+use super::ppo::PpoSettings;
 use super::{Batch, Dims};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, ZERO};
@@ -18,6 +19,8 @@ pub(super) struct Value {
     pub(super) len: usize,
     n_obs: usize,
     weight: f32,
+    /// Furthest step from what it was; 0: any.
+    clip: f32,
 }
 
 /// Buffers of one thread.
@@ -25,17 +28,22 @@ pub(super) struct ValueWork {
     tape: Tape,
     obs: Vec<V>,
     slope: Vec<V>,
-    rows: [Vec<V>; 3],
+    rows: [Vec<V>; 4],
 }
 
 impl Value {
-    /// A fresh network and its parameter group; its loss has the weight `weight`.
-    pub(super) fn new(dims: &Dims, nets: &NetSettings, weight: f32, rng: &mut ChaCha8Rng) -> (Self, Group) {
+    /// A fresh network and its parameter group.
+    pub(super) fn new(
+        dims: &Dims,
+        nets: &NetSettings,
+        ppo: &PpoSettings,
+        rng: &mut ChaCha8Rng,
+    ) -> (Self, Group) {
         let (mut at, mut transposed) = (0, 0);
         let net = Net::new(&widths(dims.n_obs, &nets.value, 1), nets.activation, 0, &mut at, &mut transposed);
         let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
         net.mlp.write_dense(&init::orthogonal(&net.mlp.widths(), 1.0, rng), &mut group.p);
-        let value = Self { net, len: at, n_obs: dims.n_obs, weight };
+        let value = Self { net, len: at, n_obs: dims.n_obs, weight: ppo.vf_coef, clip: ppo.clip_value };
         value.refresh(&mut group);
         (value, group)
     }
@@ -86,7 +94,7 @@ impl Value {
 fn body(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) {
     gather(&mut w.obs, v.n_obs.div_ceil(LANES), 0, &t.batch.obs, v.n_obs, t.idx);
     let value = v.net.forward(&group.p, &w.obs, &mut w.tape);
-    let [value_of, target, slope] = &mut w.rows;
+    let [value_of, target, slope, old] = &mut w.rows;
     heads(value_of, value);
     gather_one(target, &t.batch.returns, t.idx);
     let mut squares = ZERO;
@@ -95,8 +103,28 @@ fn body(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V
         squares = squares.fma(e, e);
         slope[i] = e * V::splat(2.0 * v.weight * t.scale);
     }
+    if v.clip > 0.0 {
+        hold(v.clip, value_of, target, old, t, slope);
+    }
     set_heads(&mut w.slope, slope);
     v.net.backward(&group.transposed, &w.obs, &w.slope, &mut w.tape, Some(grad), false);
     add_sums(grad, &[squares.sum()]);
 }
+/// `max((V - R)^2, (clip(V, V_old +- range) - R)^2)`, as PPO's own code has it: no slope where the clipped error is larger.
+/// What the value was is the return less the advantage.
+#[inline(always)]
+fn hold(range: f32, value: &[V], target: &[V], old: &mut [V], t: &Tile<'_>, slope: &mut [V]) {
+    gather_one(old, &t.batch.advantage, t.idx);
+    for i in 0..value.len() {
+        for l in 0..LANES {
+            let (v, r) = (value[i].0[l], target[i].0[l]);
+            let before = r - old[i].0[l];
+            let held = v.clamp(before - range, before + range);
+            if (held - r).abs() > (v - r).abs() {
+                slope[i].0[l] = 0.0;
+            }
+        }
+    }
+}
+
 multiversion!(fn squared_error(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) = body);

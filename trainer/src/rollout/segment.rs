@@ -14,7 +14,8 @@ pub struct Segment {
     pub change: Vec<f32>,
     /// Projected change (n_steps x n_state).
     pub target_change: Vec<f32>,
-    /// Bounds of the projection (n_steps x n_state).
+    /// Bounds of the projection (n_steps x n_state): `clamp(change, lower, upper)` is the target. Where more than bounds moved an entry
+    /// both are the target.
     pub lower: Vec<f32>,
     /// See `lower`.
     pub upper: Vec<f32>,
@@ -42,8 +43,11 @@ impl Segment {
         self.x.extend_from_slice(&out.x);
         self.change.extend_from_slice(&out.change);
         self.target_change.extend_from_slice(&out.target_change);
-        self.lower.extend_from_slice(&out.lower);
-        self.upper.extend_from_slice(&out.upper);
+        for (k, (&u, &target)) in out.change.iter().zip(&out.target_change).enumerate() {
+            let (lower, upper) = held(u, target, (out.lower[k], out.upper[k]));
+            self.lower.push(lower);
+            self.upper.push(upper);
+        }
         self.sampled.extend_from_slice(&out.sampled);
         self.action.extend(out.action.iter().map(|&a| a as f32));
         self.log_prob.push((out.log_prob_proposal + out.log_prob_action) as f32);
@@ -62,6 +66,13 @@ impl Segment {
         self.truncated.clear();
         self.final_x.clear();
     }
+}
+
+/// The bounds that take `u` to `target`: those of its own entry, or the target alone where rows, cones or the other half of its joint
+/// moved it too.
+fn held(u: f32, target: f32, (lower, upper): (f32, f32)) -> (f32, f32) {
+    let alone = u.max(lower).min(upper);
+    if (alone - target).abs() > 1e-5 * (1.0 + target.abs()) { (target, target) } else { (lower, upper) }
 }
 
 /// What was counted while collecting.

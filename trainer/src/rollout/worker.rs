@@ -4,6 +4,7 @@ mod stream;
 
 use super::resume::Episode;
 use super::{Period, RolloutError, Rows};
+use crate::demos;
 use crate::env::{Env, EnvError, Fault};
 use crate::foresight::{Foresight, Verdict};
 use crate::plant::watched_limits;
@@ -141,6 +142,9 @@ impl Worker {
     pub(crate) fn go_on(&mut self, n: usize) -> Result<(), EnvError> {
         for _ in 0..n.min(self.left) {
             self.left -= 1;
+            if self.episode.1 == 0 {
+                self.rows.collected.obs_stats.push(&self.state.obs);
+            }
             self.draw(true);
             let (reward, terminated) = self.policy_step();
             let truncated = self.ticks >= self.env.spec().max_episode_steps;
@@ -172,6 +176,33 @@ impl Worker {
                 self.rows.collected.tally.costs.push(self.cost);
                 self.restart()?;
                 return Ok(episode);
+            }
+        }
+    }
+
+    /// One episode without noise as a demonstration, and its return.
+    ///
+    /// # Errors
+    /// [`EnvError`] of a reset.
+    pub fn demonstrate(&mut self) -> Result<(demos::Episode, f64), EnvError> {
+        self.rows.clear();
+        self.draw(false);
+        let mut e = demos::Episode::default();
+        let look = |worker: &Self, e: &mut demos::Episode| {
+            e.observations.extend_from_slice(&worker.state.obs);
+            e.qpos.extend_from_slice(worker.env.qpos());
+            e.qvel.extend_from_slice(worker.env.qvel());
+        };
+        look(self, &mut e);
+        loop {
+            let (_, terminated) = self.policy_step();
+            e.actions.extend_from_slice(&self.out.action);
+            e.length += 1;
+            look(self, &mut e);
+            if terminated || self.ticks >= self.env.spec().max_episode_steps {
+                let total = self.episode.0;
+                self.restart()?;
+                return Ok((e, total));
             }
         }
     }

@@ -90,7 +90,8 @@ fn difference(a: &Value, b: &Value) -> Option<String> {
 
 /// True if a controller of `known` can take the networks of `new`.
 fn has_shape(known: &Snapshot, new: &Snapshot) -> bool {
-    let layers = |net: &Dense| net.layers.iter().map(|l| (l.n_in, l.n_out)).collect::<Vec<_>>();
+    let layers =
+        |net: &Dense| (net.layers.iter().map(|l| (l.n_in, l.n_out)).collect::<Vec<_>>(), net.skip.is_some());
     let shape = |n: &Networks| {
         let lists = [
             n.normaliser.mean.len(),

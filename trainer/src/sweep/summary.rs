@@ -67,7 +67,7 @@ impl Row {
         };
         Row {
             task: run.name.clone(),
-            algo: run.algo.clone(),
+            algo: run.algo.to_string(),
             seed: run.seed,
             run: run.folder.display().to_string(),
             steps: end.get("time/total_timesteps").and_then(|v| v.last().copied()),

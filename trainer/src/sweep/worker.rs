@@ -99,8 +99,9 @@ fn start(sweep: &Sweep, run: &Run) -> Result<Child, String> {
     if run.found == Found::Resumable {
         command.arg("--resume").arg(&run.folder);
     } else {
-        command.args(["--algo", &run.algo, "--seed", &run.seed.to_string()]);
+        command.args(["--algo", run.algo.name(), "--seed", &run.seed.to_string()]);
         command.args(["--steps", &sweep.steps.to_string()]).arg("--out").arg(&run.folder);
+        command.args(sweep.preset.iter().flat_map(|preset| ["--preset", preset.name()]));
         command.args(sweep.set.iter().flat_map(|set| ["--set", set]));
     }
     command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());

@@ -1,6 +1,7 @@
 //! The columns of `metrics.csv` and how an iteration fills them.
 
 use super::{Progress, Training};
+use crate::learn::Algorithm;
 
 const REACHED: &str = "constraints/reached_violations";
 
@@ -12,6 +13,7 @@ pub const COLUMNS: &[&str] = &[
     "rollout/ep_rew_mean",
     "rollout/ep_len_mean",
     "rollout/ep_cost_mean",
+    super::EVALUATED,
     "constraints/raw_violations",
     "constraints/target_violations",
     "constraints/recovering",
@@ -24,6 +26,8 @@ pub const COLUMNS: &[&str] = &[
     "idm/threshold",
     "idm/mse_before",
     "idm/mse_after",
+    "idm/r2_before",
+    "idm/r2_after",
     "idm/updated",
     "train/policy_gradient_loss",
     "train/approx_kl",
@@ -35,6 +39,8 @@ pub const COLUMNS: &[&str] = &[
     "train/std",
     "train/proposal_std",
     "train/policy_mse",
+    "train/epochs",
+    "train/learning_rate",
     "discriminator/loss",
     "discriminator/kl",
     "discriminator/accuracy",
@@ -67,8 +73,8 @@ impl Training {
             "constraints/avoided" => t.avoided as f64 / t.raw_violations as f64,
             "constraints/active_rows" => per_tick(t.active_rows),
             "idm/residual" => t.residual / t.ticks.max(1) as f64,
-            "idm/threshold" => match self.snapshot.manifest.algo.as_str() {
-                "nearl" => self.settings.nearl.idm_threshold,
+            "idm/threshold" => match self.algo {
+                Algorithm::Nearl => self.settings.nearl.idm_threshold,
                 _ => self.settings.pid2.idm_threshold,
             },
             other => p.metrics.iter().find(|(n, _)| *n == other).map_or(f64::NAN, |(_, v)| *v),

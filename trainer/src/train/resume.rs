@@ -35,12 +35,14 @@ impl Training {
             put(format!("adam.{i}.v"), f32s(&adam.v));
         }
         put("beta".into(), Values::F32(vec![params.beta]));
+        put("adapted".into(), Values::F32(vec![params.adapted]));
         put("stats.obs".into(), Values::F64(self.obs_stats.to_vec()));
         put("stats.change".into(), Values::F64(self.change_stats.to_vec()));
         put("stats.return".into(), Values::F64(self.return_stats.to_vec()));
         let recent = self.recent.iter().flat_map(|&(r, n)| [r, n as f64]).collect();
         put("recent".into(), Values::F64(recent));
         put("recent_costs".into(), Values::F64(self.recent_costs.clone()));
+        put("best".into(), Values::F64(self.best.into_iter().collect()));
         put("seconds".into(), Values::F64(vec![self.seconds()]));
         self.source.save(&mut to)?;
         Ok(to)
@@ -73,7 +75,7 @@ impl Training {
         let header = &from.header;
         let request = Request {
             manifest: header.manifest.clone(),
-            algo: header.manifest.algo.clone(),
+            algo: header.manifest.algo.parse().map_err(TrainError::Algorithm)?,
             steps: steps.unwrap_or(header.total),
             seed: header.seed,
             threads,
@@ -94,6 +96,7 @@ impl Training {
             let n = stats.to_vec().len();
             stats.set(&from.take_f64(name, Some(n))?);
         }
+        self.best = from.take_f64("best", None)?.first().copied();
         self.recent_costs = from.take_f64("recent_costs", None)?;
         let recent = from.take_f64("recent", None)?;
         self.recent = recent.as_chunks::<2>().0.iter().map(|&[r, n]| (r, n as usize)).collect();
@@ -139,6 +142,7 @@ fn restore_params(params: &mut Params, from: &mut Checkpoint) -> Result<(), Stri
         fill(format!("adam.{i}.v"), &mut adam.v)?;
     }
     params.beta = from.take_f32("beta", 1)?[0];
+    params.adapted = from.take_f32("adapted", 1)?[0];
     let (have, need) = (from.header.adam.len(), params.adam.len());
     if have != need {
         return Err(format!("it has {have} optimisers where the algorithm has {need}"));

@@ -111,6 +111,13 @@ impl Training {
             }
         };
         folder.row(&self.row(&progress))?;
+        let kept = [
+            (self.is_best, "best".to_string()),
+            (self.passed(self.settings.save_every), format!("step_{}", progress.steps)),
+        ];
+        for (_, name) in kept.into_iter().filter(|(due, _)| *due) {
+            folder.keep(&name, self.snapshot())?;
+        }
         if !self.is_done() && folder.is_due(progress.steps, self.total) {
             self.save(folder)?;
         }

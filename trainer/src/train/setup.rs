@@ -1,19 +1,20 @@
 //! From a manifest and its settings to what is trained.
 
-use super::{ALGORITHMS, TrainError};
+use super::TrainError;
 use crate::env::Env;
-use crate::learn::{Dims, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Ppo};
+use crate::learn::{Algorithm, Dims, Gradient, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Ppo};
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
-use nearl_runtime::constraints::{Drive, Guard};
+use nearl_runtime::constraints::{Consistency, Drive, Guard};
 use nearl_runtime::controller::Parts;
 use nearl_runtime::motors::Motors;
 use nearl_runtime::task::{IdmKind, Task};
 use nearl_runtime::{Manifest, PolicyKind};
 use rand_chacha::ChaCha8Rng;
 
-/// Fresh networks of the manifest's algorithm.
+/// Fresh networks of the algorithm.
 pub(super) fn learner(
+    algo: Algorithm,
     manifest: &Manifest,
     settings: &TrainSettings,
     dims: Dims,
@@ -25,25 +26,51 @@ pub(super) fn learner(
         stochastic: manifest.policy == PolicyKind::Stochastic,
         learned: manifest.task.idm.kind == IdmKind::Learned,
     };
-    match manifest.algo.as_str() {
-        "ppo" => Box::new(Ppo::new(dims, nets, ppo, threads, rng)),
-        "nearl" => Box::new(Nearl::new(dims, nets, ppo, settings.nearl.clone(), kind, threads, rng)),
-        name => {
-            let bottleneck = name == "pid2-ib";
-            Box::new(Pid2::new(dims, nets, ppo, settings.pid2.clone(), kind, bottleneck, threads, rng))
-        }
+    let nearl = |settings, rng: &mut ChaCha8Rng| {
+        Box::new(Nearl::new(dims.clone(), nets, ppo.clone(), settings, kind, threads, rng))
+    };
+    let pid2 = |bottleneck, rng: &mut ChaCha8Rng| {
+        Box::new(Pid2::new(
+            dims.clone(),
+            nets,
+            ppo.clone(),
+            settings.pid2.clone(),
+            kind,
+            bottleneck,
+            threads,
+            rng,
+        ))
+    };
+    match algo {
+        Algorithm::Ppo => Box::new(Ppo::new(dims, nets, ppo, threads, rng)),
+        Algorithm::PpoCombined => nearl(settings.nearl.without_supervision(), rng),
+        Algorithm::Nearl => nearl(settings.nearl.clone(), rng),
+        Algorithm::Pid2Gan => pid2(false, rng),
+        Algorithm::Pid2Ib => pid2(true, rng),
     }
 }
 
 pub(super) fn policy_kind(
-    algo: &str,
+    algo: Algorithm,
     settings: &TrainSettings,
-    idm: IdmKind,
+    task: &Task,
 ) -> Result<PolicyKind, TrainError> {
-    match (algo, settings.exploration, idm) {
-        ("ppo", ..) => Ok(PolicyKind::Direct),
-        (name, ..) if !ALGORITHMS.iter().any(|(n, _)| *n == name) => Err(TrainError::Algorithm(name.into())),
+    let gradient = match algo {
+        Algorithm::Nearl | Algorithm::PpoCombined => settings.nearl.gradient,
+        _ => settings.pid2.gradient,
+    };
+    let coupled = task.constraints.consistency == Consistency::Kinematic;
+    match (algo, settings.exploration, task.idm.kind) {
+        (algo, ..) if algo.is_direct() => Ok(PolicyKind::Direct),
         (_, Exploration::Proposal, _) => Ok(PolicyKind::Stochastic),
+        (_, Exploration::Action, IdmKind::Learned) if coupled && gradient != Gradient::StraightThrough => {
+            Err(TrainError::Settings(format!(
+                "[constraints.consistency]: 'kinematic' moves position and velocity of '{}' together, and the policy gradient through a learned \
+                 inverse model passes clamped entries alone; use consistency = \"free\", or gradient = \"straight-through\" under [train.pid2] \
+                 and [train.nearl]",
+                task.name
+            )))
+        }
         (_, Exploration::Action, IdmKind::Learned) => Ok(PolicyKind::Deterministic),
         (_, Exploration::Action, IdmKind::Pinocchio) => Err(TrainError::Settings(
             "[train.exploration]: 'action' needs a learned inverse model, but idm.kind is 'pinocchio'; use exploration = \"proposal\"".into(),

@@ -44,6 +44,8 @@ pub trait Source: Send {
     /// # Errors
     /// [`SourceError`] in one sentence.
     fn collect(&mut self, snapshot: &Snapshot) -> Result<bool, SourceError>;
+    /// Lets that share of the environments project while they collect, where they are of this process.
+    fn project(&mut self, _share: f64) {}
     /// What was collected last.
     fn gathered(&mut self) -> Vec<&Collected>;
     /// Numbers of its own for the metrics.
@@ -72,6 +74,11 @@ impl Source for Collector {
         self.set_networks(&snapshot.networks);
         Collector::collect(self)?;
         Ok(true)
+    }
+
+    fn project(&mut self, share: f64) {
+        let projecting = (share * self.workers().count() as f64).round() as usize;
+        self.workers().enumerate().for_each(|(i, worker)| worker.set_projection(i < projecting));
     }
 
     fn gathered(&mut self) -> Vec<&Collected> {
@@ -109,7 +116,6 @@ impl Experience {
                 let (n_envs, n_steps) = (settings.n_envs, settings.n_steps);
                 let mut collector = Collector::new(snapshot, n_envs, n_steps, threads, settings.gamma, seed)?;
                 for worker in collector.workers() {
-                    worker.set_projection(settings.project_in_training);
                     worker.set_moved_penalty(settings.moved_penalty);
                 }
                 Ok(Box::new(collector))

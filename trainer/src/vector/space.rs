@@ -63,12 +63,7 @@ pub(super) fn task_snapshot(task: &str) -> Result<Snapshot, VectorError> {
     let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
     let normaliser = Normaliser::identity(n_obs, n_state);
     Ok(open(Snapshot {
-        networks: Networks {
-            normaliser,
-            policy: Dense { layers: Vec::new() },
-            policy_log_std: Vec::new(),
-            idm: None,
-        },
+        networks: Networks { normaliser, policy: Dense::default(), policy_log_std: Vec::new(), idm: None },
         manifest,
     }))
 }
@@ -95,7 +90,7 @@ pub(super) fn agent_snapshot(task: &str, file: &str) -> Result<Snapshot, VectorE
 fn open(mut snapshot: Snapshot) -> Snapshot {
     let (n_obs, n_state) =
         (snapshot.networks.normaliser.mean.len(), snapshot.networks.normaliser.scale.len());
-    snapshot.networks.policy = Dense { layers: vec![zeros(n_obs, n_state)] };
+    snapshot.networks.policy = Dense { layers: vec![zeros(n_obs, n_state)], skip: None };
     snapshot.networks.policy_log_std = vec![0.0; n_state];
     snapshot.manifest.policy = PolicyKind::Stochastic;
     snapshot.manifest.functions.clear();
@@ -112,7 +107,7 @@ pub(super) fn guarded_snapshot(task: &str) -> Result<Snapshot, VectorError> {
     let n_obs = manifest.task.state.observation.len();
     let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
     let n_act = manifest.action_lower.len();
-    let policy = Dense { layers: vec![zeros(n_obs, n_act)] };
+    let policy = Dense { layers: vec![zeros(n_obs, n_act)], skip: None };
     let normaliser = Normaliser::identity(n_obs, n_state);
     let networks = Networks { normaliser, policy, policy_log_std: vec![0.0; n_act], idm: None };
     Ok(Snapshot { manifest, networks })

@@ -18,6 +18,8 @@ pub struct DenseLayer {
 pub struct Dense {
     /// First to last.
     pub layers: Vec<DenseLayer>,
+    /// Linear map from input to output beside the layers, added to what they give (n_out x n_in, row-major).
+    pub skip: Option<Vec<f32>>,
 }
 
 impl Dense {

@@ -31,7 +31,8 @@ impl Forward {
         assert_eq!(dense.layers.len(), functions.len(), "one function a layer");
         let mut len = 0;
         // the layout alone is used; what follows a layer is ours
-        let mlp = Mlp::new(&dense.widths(), Activation::default(), &mut len);
+        let make = if dense.skip.is_some() { Mlp::with_skip } else { Mlp::new };
+        let mlp = make(&dense.widths(), Activation::default(), &mut len);
         let mut params = vec![ZERO; len];
         mlp.write_dense(dense, &mut params);
         let activations = dense.widths().iter().map(|w| vec![ZERO; w.div_ceil(LANES)]).collect();
@@ -65,6 +66,21 @@ fn body(net: &mut Forward) {
     for (i, (layer, &function)) in net.mlp.layers.iter().zip(&net.functions).enumerate() {
         let (before, after) = net.activations.split_at_mut(i + 1);
         affine(layer, &net.params, scalars(&before[i]), &mut after[0], function);
+    }
+    if let Some(l) = &net.mlp.skip {
+        let (x, y) = net.activations.split_at_mut(net.mlp.layers.len());
+        add_linear(l, &net.params, scalars(&x[0]), &mut y[0]);
+    }
+}
+
+/// `y += W' x`, each sum over the inputs in order.
+#[inline(always)]
+fn add_linear(l: &Layer, params: &[V], x: &[f32], y: &mut [V]) {
+    let n = l.n_vectors();
+    for (k, &x) in x[..l.k].iter().enumerate() {
+        for j in 0..n {
+            y[j] = y[j].fma(V::splat(x), params[l.w + k * n + j]);
+        }
     }
 }
 
@@ -112,7 +128,7 @@ mod tests {
             weight: (0..d[0] * d[1]).map(|_| next()).collect(),
             bias: (0..d[1]).map(|_| next()).collect(),
         };
-        Dense { layers: widths.windows(2).map(|d| layer(d, &mut next)).collect() }
+        Dense { layers: widths.windows(2).map(|d| layer(d, &mut next)).collect(), skip: None }
     }
 
     /// The textbook sum in f64 with the library's functions.
@@ -167,7 +183,7 @@ mod tests {
         };
         let mut h: Vec<f64> = x.iter().map(|&v| f64::from(v)).collect();
         for (l, &f) in net.layers.iter().zip(functions) {
-            let one = Dense { layers: vec![l.clone()] };
+            let one = Dense { layers: vec![l.clone()], skip: None };
             let x32: Vec<f32> = h.iter().map(|&v| v as f32).collect();
             h = reference(&one, |x| x, &x32).into_iter().map(|v| exact(f, v)).collect();
         }
@@ -190,6 +206,29 @@ mod tests {
                     );
                 }
             }
+        }
+    }
+
+    /// `f(x) + W x`, and zero beside the layers is as if it were not there.
+    #[test]
+    fn a_linear_map_beside_the_layers_is_added() {
+        for widths in [&[5, 7, 3][..], &[19, 3], &[40, 32, 32, 17]] {
+            let plain = network(widths);
+            let (n_in, n_out) = (plain.n_in(), plain.n_out());
+            let skip: Vec<f32> = (0..n_in * n_out).map(|i| ((i * 7) % 11) as f32 * 0.1 - 0.5).collect();
+            let both = Dense { skip: Some(skip.clone()), ..plain.clone() };
+            let x: Vec<f32> = (0..n_in).map(|i| (i as f32 * 0.7).sin()).collect();
+            let y = Forward::new(&plain, Activation::Tanh).forward(&x).to_vec();
+            let z = Forward::new(&both, Activation::Tanh).forward(&x).to_vec();
+            for n in 0..n_out {
+                let linear: f64 = (0..n_in).map(|k| f64::from(skip[n * n_in + k]) * f64::from(x[k])).sum();
+                assert!((f64::from(z[n]) - f64::from(y[n]) - linear).abs() < 1e-5, "{widths:?}, output {n}");
+            }
+            let mut len = 0;
+            let mlp = Mlp::with_skip(widths, Activation::Tanh, &mut len);
+            let mut p = vec![ZERO; len];
+            mlp.write_dense(&both, &mut p);
+            assert_eq!(mlp.to_dense(&p), both);
         }
     }
 

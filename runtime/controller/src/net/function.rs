@@ -4,7 +4,7 @@ use super::activation::Activation;
 use super::kernel::{V, ZERO, exp, tanh};
 use serde::{Deserialize, Serialize};
 
-/// An element's function after an affine layer. Training knows [`Activation`] alone; networks made elsewhere may have any of these,
+/// An element's function after an affine layer. Training knows those of [`Activation`] alone; networks made elsewhere may have any of these,
 /// another one after each layer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -31,6 +31,8 @@ impl From<Activation> for Function {
         match activation {
             Activation::Tanh => Self::Tanh,
             Activation::Relu => Self::Relu,
+            Activation::Elu => Self::Elu,
+            Activation::Silu => Self::Silu,
         }
     }
 }

@@ -146,7 +146,7 @@ pub enum Out<'a> {
     Store,
     /// Add to what is there.
     Accumulate,
-    /// Times the activation's derivative at its output `h` (same layout as the product).
+    /// Times the activation's derivative at `h`, its output or its input (same layout as the product).
     TimesDerivative(&'a [V], Activation),
 }
 

@@ -120,7 +120,7 @@ pub(super) fn at_rate(snapshot: &Snapshot, rate: f64) -> Result<Snapshot, Failur
 pub(super) fn ballast(megabytes: usize) -> (Dense, Vec<f32>) {
     let (n_in, n_out) = (1000, 250 * megabytes);
     let layer = DenseLayer { n_in, n_out, weight: vec![0.5; n_in * n_out], bias: vec![0.0; n_out] };
-    (Dense { layers: vec![layer] }, vec![0.0; n_out])
+    (Dense { layers: vec![layer], skip: None }, vec![0.0; n_out])
 }
 
 /// The policy that wants the reverse.

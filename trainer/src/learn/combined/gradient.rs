@@ -1,10 +1,11 @@
 //! The policy gradient of the combined policy (Eq. 1) as PPO's surrogate, and its way back through the inverse model and
 //! the projection into the meta policy.
 
-use super::super::gaussian::{Gaussian, gather, likelihood_ratio};
+use super::super::gaussian::{Gaussian, MOST_VECTORS, gather, inverse_sigma, likelihood_ratio, residuals};
 use super::super::inverse::{CLIP, InverseModel, gather_input};
 use super::super::optimise::{Group, Tile};
 use super::{Combined, CombinedWork};
+use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars, scalars_mut};
 use std::ops::Range;
 
@@ -62,24 +63,9 @@ impl Combined {
         let (d, a, s) = (&self.dims, self.dims.n_act, self.dims.n_state);
         let seen = d.seen_obs.len();
         let (xv, av, sv) = ((2 * seen).div_ceil(LANES), a.div_ceil(LANES), s.div_ceil(LANES));
+        let clamped = self.project_again(t, w);
         let Some(inv) = &mut w.inverse else { unreachable!("made with the model") };
-        // project again with the current policy
         let u = scalars(w.policy.output());
-        let rows = scalars_mut(&mut inv.input).chunks_exact_mut(xv * LANES).zip(u.chunks_exact(sv * LANES));
-        let mut clamped = 0u32;
-        for ((row, u), &i) in rows.zip(t.idx) {
-            let i = i as usize;
-            let (lower, upper) = (&t.batch.lower[i * s..][..s], &t.batch.upper[i * s..][..s]);
-            let obs = &t.batch.obs[i * d.n_obs..][..d.n_obs];
-            let (x, w) = row.split_at_mut(seen);
-            for (x, &o) in x.iter_mut().zip(&d.seen_obs) {
-                *x = obs[o];
-            }
-            for (w, &k) in w.iter_mut().zip(&d.seen_state) {
-                *w = u[k].max(lower[k]).min(upper[k]).clamp(-CLIP, CLIP);
-                clamped += u32::from(*w != u[k]);
-            }
-        }
         gather(&mut inv.action, av, 0, &t.batch.sampled, a, t.idx);
         let mean = model.net.forward(&group.p, &inv.input, &mut inv.tape);
         let action =
@@ -97,6 +83,76 @@ impl Combined {
             }
         }
         (sums, clamped as f32)
+    }
+
+    /// Input rows of the inverse model from the policy's current output, projected as when it was collected; returns how many
+    /// entries were moved.
+    #[inline(always)]
+    fn project_again(&self, t: &Tile<'_>, w: &mut CombinedWork) -> u32 {
+        let (d, s, seen) = (&self.dims, self.dims.n_state, self.dims.seen_obs.len());
+        let (xv, sv) = ((2 * seen).div_ceil(LANES), s.div_ceil(LANES));
+        let Some(inv) = &mut w.inverse else { return 0 };
+        let u = scalars(w.policy.output());
+        let rows = scalars_mut(&mut inv.input).chunks_exact_mut(xv * LANES).zip(u.chunks_exact(sv * LANES));
+        let mut clamped = 0u32;
+        for ((row, u), &i) in rows.zip(t.idx) {
+            let i = i as usize;
+            let (lower, upper) = (&t.batch.lower[i * s..][..s], &t.batch.upper[i * s..][..s]);
+            let obs = &t.batch.obs[i * d.n_obs..][..d.n_obs];
+            let (x, w) = row.split_at_mut(seen);
+            for (x, &o) in x.iter_mut().zip(&d.seen_obs) {
+                *x = obs[o];
+            }
+            for (w, &k) in w.iter_mut().zip(&d.seen_state) {
+                *w = u[k].max(lower[k]).min(upper[k]).clamp(-CLIP, CLIP);
+                clamped += u32::from(*w != u[k]);
+            }
+        }
+        clamped
+    }
+
+    /// Passes the projected proposals of [`Combined::propose`] through the inverse model.
+    #[inline(always)]
+    pub(in super::super) fn invert(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedWork) {
+        self.project_again(t, w);
+        if let (Some((model, _)), Some(inv)) = (&self.inverse, &mut w.inverse) {
+            model.net.forward(&group.p, &inv.input, &mut inv.tape);
+        }
+    }
+
+    /// Log probability of what was sampled, under the current networks.
+    #[inline(always)]
+    fn log_prob_body(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedWork, out: &mut [f32]) {
+        let (d, s, a) = (&self.dims, self.dims.n_state, self.dims.n_act);
+        self.propose(group, t, w);
+        let mut constant = 0.0;
+        let mut inverse = [[ZERO; MOST_VECTORS]; 2];
+        let [log_prob, ..] = &mut w.rows;
+        if let Some(pi) = &self.policy_log_std {
+            constant += inverse_sigma(&mut inverse[0][..pi.len()], &group.p[pi.clone()], s);
+        }
+        if let Some((_, spread)) = &self.inverse {
+            constant += inverse_sigma(&mut inverse[1][..spread.len()], &group.p[spread.clone()], a);
+        }
+        log_prob.fill(V::splat(constant as f32));
+        if let Some(pi) = &self.policy_log_std {
+            gather(&mut w.change, s.div_ceil(LANES), 0, &t.batch.proposal, s, t.idx);
+            residuals(&mut w.d_change, &w.change, w.policy.output(), &inverse[0][..pi.len()], log_prob);
+        }
+        if let Some((model, spread)) = &self.inverse {
+            match &self.policy_log_std {
+                None => drop(self.project_again(t, w)),
+                Some(_) => {
+                    let Some(inv) = &mut w.inverse else { return };
+                    gather_input(&mut inv.input, t.batch, &t.batch.target, t.idx, d);
+                }
+            }
+            let (Some(inv), [log_prob, ..]) = (&mut w.inverse, &mut w.rows) else { return };
+            gather(&mut inv.action, a.div_ceil(LANES), 0, &t.batch.sampled, a, t.idx);
+            let mean = model.net.forward(&group.p, &inv.input, &mut inv.tape);
+            residuals(&mut inv.slope, &inv.action, mean, &inverse[1][..spread.len()], log_prob);
+        }
+        out.copy_from_slice(&scalars(&w.rows[0])[..out.len()]);
     }
 
     /// Ratio on `log pi(u | s) + log I(a | s_c, w_c)` with the target `w` as it was.
@@ -152,4 +208,14 @@ impl Combined {
         };
         likelihood_ratio([proposal], &self.ppo, t, &mut w.rows, &group.p, grad)
     }
+}
+
+multiversion!(
+    /// See [`Combined::log_prob_body`].
+    pub(super) fn log_prob(c: &Combined, group: &Group, t: &Tile<'_>, w: &mut CombinedWork, out: &mut [f32]) = body
+);
+
+#[inline(always)]
+fn body(c: &Combined, group: &Group, t: &Tile<'_>, w: &mut CombinedWork, out: &mut [f32]) {
+    c.log_prob_body(group, t, w, out);
 }

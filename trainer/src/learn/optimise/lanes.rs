@@ -170,8 +170,8 @@ impl Lane<'_> {
 #[cfg(test)]
 mod tests {
     use crate::learn::{
-        Batch, Dims, Gradient, Kind, Learner, Nearl, NearlSettings, NetSettings, Pid2, Pid2Settings, Ppo,
-        PpoSettings, reference,
+        Batch, Dims, Gradient, Kind, Learner, Nearl, NearlSettings, NetSettings, Pace, Pid2, Pid2Settings,
+        Ppo, PpoSettings, reference,
     };
 
     fn dims() -> Dims {
@@ -207,7 +207,7 @@ mod tests {
         let (mut learner, mut rng) = (learner(algo, threads), crate::rollout::stream(2, 2));
         let mut reports = Vec::new();
         for _ in 0..3 {
-            let metrics = learner.update(batch, 1.0, &mut rng);
+            let metrics = learner.update(&mut batch.clone(), Pace::default(), &mut rng);
             reports.extend(metrics.iter().map(|(_, value)| value.to_bits()));
         }
         let params = learner.params();
@@ -225,8 +225,9 @@ mod tests {
             (NetSettings::default(), PpoSettings { clip_range: -0.2, ..PpoSettings::default() });
         let (mut rng, kind) = (crate::rollout::stream(1, 1), Kind { stochastic: false, learned: true });
         let mut learner = Pid2::new(dims(), &nets, ppo, Pid2Settings::default(), kind, true, 2, &mut rng);
-        let batch = reference::batch(&dims(), 1024, 3);
-        let update = std::panic::AssertUnwindSafe(|| drop(learner.update(&batch, 1.0, &mut rng)));
+        let mut batch = reference::batch(&dims(), 1024, 3);
+        let update =
+            std::panic::AssertUnwindSafe(|| drop(learner.update(&mut batch, Pace::default(), &mut rng)));
         assert!(std::panic::catch_unwind(update).is_err());
     }
 

@@ -1,5 +1,6 @@
 //! Every gradient of PID^2 against central differences of the textbook losses in f64.
 
+use super::fakes::Fakes;
 use super::*;
 use crate::learn::Net;
 use crate::learn::optimise::TILE;
@@ -24,6 +25,7 @@ fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2,
         value: vec![7],
         discriminator: vec![6, 5],
         activation,
+        idm_residual: activation == TANH, // plain networks with the other
     };
     let ppo = PpoSettings { log_std: -0.3, ..PpoSettings::default() };
     // Of the three, only this is the derivative of a loss.
@@ -45,6 +47,7 @@ fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2,
     let batch = batch(&dims(), TILE, 3);
     l.nets.noise.resize(batch.n * LATENT, 0.0);
     l.nets.noise.fill_with(|| StandardNormal.sample(&mut rng));
+    l.nets.fakes = Fakes::new(&l.nets.settings, &l.nets.combined, &batch, &mut rng);
     (l, batch)
 }
 
@@ -115,7 +118,12 @@ fn actor_loss(l: &Pid2, b: &Batch, n: &Nets64) -> f64 {
             None => log_normal(&row(&b.proposal, i, d.n_state), &u, &n.log_std),
         };
         let e = n.value.forward(&obs)[0] - f64::from(b.returns[i]);
-        let x = [u, obs].concat();
+        // a stochastic proposal is judged as it is sampled: the loss reaches its spread
+        let judged = |(k, u): (usize, &f64)| match l.nets.fakes.normal(i) {
+            [] => *u,
+            z => u + n.log_std[k].exp() * f64::from(z[k]),
+        };
+        let x = [u.iter().enumerate().map(judged).collect(), obs].concat();
         let noise = noise(l, Pass::Generator, i);
         let (logit, _) = judge(&n.enc, &n.dec, &x, &noise, true);
         reference::surrogate(b, i, log_prob, 0.2) + 0.5 * e * e + 0.7 * softplus(-logit)
@@ -130,7 +138,14 @@ fn check(name: &str, net: &Net64, dense: &Dense, loss: impl Fn(&Net64) -> f64) {
 
 #[test]
 fn actor_gradients_equal_central_differences() {
-    for (stochastic, activation) in [(false, TANH), (true, TANH), (false, RELU), (true, RELU)] {
+    for (stochastic, activation) in [
+        (false, TANH),
+        (true, TANH),
+        (false, RELU),
+        (true, RELU),
+        (false, Activation::Elu),
+        (false, Activation::Silu),
+    ] {
         let (l, b) = learner(stochastic, true, activation);
         let (grad, sums) = gradient(&l, &b, ACTOR);
         let (value_grad, _) = gradient(&l, &b, VALUE);
@@ -158,6 +173,139 @@ fn actor_gradients_equal_central_differences() {
             let analytic = f64::from(scalars(&grad[range.clone()])[k]);
             assert!((slope - analytic).abs() < 1e-4 * (1.0 + slope.abs()), "log std {k}: {slope} {analytic}");
         }
+    }
+}
+
+/// With an optimiser of its own the adversarial loss is a phase of its own: together they are what one phase was.
+#[test]
+fn the_generator_apart_has_the_same_gradient() {
+    for (stochastic, null_space) in [(false, false), (true, false), (false, true)] {
+        let (mut l, b) = learner(stochastic, true, TANH);
+        l.nets.settings.null_space = null_space;
+        let (both, _) = gradient(&l, &b, ACTOR);
+        l.nets.settings.generator_lr = 1e-3;
+        let (actor, _) = gradient(&l, &b, ACTOR);
+        let (generator, sums) = gradient(&l, &b, GENERATOR);
+        let range = l.nets.combined.proposal_range();
+        let (both, actor, own) =
+            (scalars(&both[range.clone()]), scalars(&actor[range.clone()]), scalars(&generator[range]));
+        let size = own.iter().map(|g| g * g).sum::<f32>().sqrt();
+        assert!(sums[0] > 0.0 && size > 1e-3, "{size}");
+        for ((both, actor), own) in both.iter().zip(actor).zip(own) {
+            assert!((both - actor - own).abs() < 1e-5 * (1.0 + size), "{both} {actor} {own}");
+        }
+    }
+}
+
+/// `gamma |d D / d s'|^2 / 2` on the reached changes: its gradient by the parameters, both slopes by central differences.
+#[test]
+fn the_gradient_penalty_is_the_slope_of_the_squared_slope() {
+    let (mut l, b) = learner(false, true, TANH);
+    let (without, _) = gradient(&l, &b, DISCRIMINATOR);
+    l.nets.settings.gradient_penalty = 2.0;
+    let (with, _) = gradient(&l, &b, DISCRIMINATOR);
+    let penalty: Vec<V> = with.iter().zip(&without).map(|(&a, &b)| a - b).collect();
+    let (n, d) = (nets64(&l), dims());
+    let loss = |enc: &Net64, dec: &Net64| {
+        let one = |i: usize| {
+            let (change, obs) = (row(&b.reached, i, d.n_state), row(&b.obs, i, d.n_obs));
+            let slope = |k: usize| {
+                let at = |x: f64| {
+                    let mut change = change.clone();
+                    change[k] += x;
+                    judge(enc, dec, &[change, obs.clone()].concat(), &noise(&l, Pass::Real, i), true).0
+                };
+                (at(1e-4) - at(-1e-4)) / 2e-4
+            };
+            (0..d.n_state).map(|k| slope(k).powi(2)).sum::<f64>()
+        };
+        (0..b.n).map(one).sum::<f64>() / b.n as f64
+    };
+    let (enc, dec) = l.nets.discriminator.nets();
+    let errors = [
+        relative_error(&n.enc, &flat32(&enc.mlp.to_dense(&penalty)), |p| loss(p, &n.dec)),
+        relative_error(&n.dec, &flat32(&dec.mlp.to_dense(&penalty)), |p| loss(&n.enc, p)),
+    ];
+    assert!(errors.iter().all(|e| *e < 5e-3), "encoder, decoder: {errors:?}");
+}
+
+/// Reached changes are `f(s) + B noise`, proposals exactly `f(s)`: as they are a discriminator finds them out, with matched noise it
+/// does not.
+#[test]
+fn right_proposals_cannot_be_told_from_what_was_reached() {
+    let accuracy = |match_noise: bool| {
+        let (mut rng, d) = (crate::rollout::stream(5, 0), dims());
+        let settings = Pid2Settings {
+            match_noise,
+            fresh_fakes: false,
+            discriminator_lr: 3e-3,
+            alpha: 0.0,
+            beta: 0.0,
+            ..Pid2Settings::default()
+        };
+        let ppo = PpoSettings { lr: 1e-12, batch_size: 512, ..PpoSettings::default() };
+        let kind = Kind { stochastic: false, learned: true };
+        let mut l = Pid2::new(dims(), &NetSettings::default(), ppo, settings, kind, false, 1, &mut rng);
+        let mut last = f64::NAN;
+        for round in 0..12 {
+            let mut b = batch(&dims(), 2048, 10 + round);
+            for i in 0..b.n {
+                let z: [f32; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut rng));
+                for k in 0..d.n_state {
+                    b.proposal[i * d.n_state + k] = 0.8 * b.obs[i * d.n_obs + k];
+                    let noise = [
+                        0.5 * z[0],
+                        0.5 * z[1],
+                        0.3 * z[0] + 0.3 * z[1],
+                        0.4 * z[0] - 0.2 * z[1],
+                        -0.5 * z[1],
+                    ][k];
+                    b.reached[i * d.n_state + k] = b.proposal[i * d.n_state + k] + noise;
+                }
+            }
+            let metrics = l.update(&mut b, Pace::default(), &mut rng);
+            last = metrics.iter().find(|(name, _)| *name == "discriminator/accuracy").expect("judged").1;
+        }
+        last
+    };
+    let (bare, matched) = (accuracy(false), accuracy(true));
+    assert!(bare > 0.9, "a bare proposal is found out: {bare}");
+    assert!((matched - 0.5).abs() < 0.05, "a noisy one is not: {matched}");
+}
+
+/// With policy and spread held, whatever the inverse model learns must leave PPO's ratio at 1.
+#[test]
+fn what_the_inverse_model_learns_does_not_move_the_ratio() {
+    for stochastic in [false, true] {
+        let mut rng = crate::rollout::stream(5, 0);
+        let settings = Pid2Settings {
+            idm_threshold: 0.0,
+            idm_lr: 1e-2,
+            generator_weight: 0.0,
+            ..Pid2Settings::default()
+        };
+        let ppo = PpoSettings { lr: 1e-12, log_std: -1.0, ..PpoSettings::default() };
+        let kind = Kind { stochastic, learned: true };
+        let mut l = Pid2::new(dims(), &NetSettings::default(), ppo, settings, kind, true, 1, &mut rng);
+        let mut b = batch(&dims(), 256, 3);
+        b.log_prob = l.nets.combined.log_probs(&l.params.groups[COMBINED], &b, 1);
+        let metrics = l.update(&mut b, Pace::default(), &mut rng);
+        let of = |name: &str| metrics.iter().find(|(n, _)| *n == name).expect(name).1;
+        assert!(of("idm/mse_after") < 0.99 * of("idm/mse_before"), "it learned");
+        assert!(of("train/approx_kl").abs() < 1e-5, "stochastic {stochastic}: {}", of("train/approx_kl"));
+    }
+}
+
+/// Fresh proposals are those of the policy as it is, to the bit where nothing is added.
+#[test]
+fn renewed_fakes_are_the_proposals_of_the_current_policy() {
+    let (mut l, b) = learner(false, true, TANH);
+    let (n, d, mut rng) = (nets64(&l), dims(), crate::rollout::stream(9, 0));
+    l.nets.fakes.renew(&l.nets.combined, &l.params.groups[COMBINED], &b, 1, &mut rng);
+    for i in 0..b.n {
+        let u = n.policy.forward(&row(&b.obs, i, d.n_obs));
+        let judged = row(l.nets.fakes.judged(&b), i, d.n_state);
+        assert!(u.iter().zip(&judged).all(|(u, j)| (u - j).abs() < 1e-4), "row {i}: {u:?} {judged:?}");
     }
 }
 

@@ -10,7 +10,7 @@ fn dims() -> Dims {
 
 #[test]
 fn gradients_equal_central_differences() {
-    [Activation::Tanh, Activation::Relu].into_iter().for_each(gradients);
+    [Activation::Tanh, Activation::Relu, Activation::Elu, Activation::Silu].into_iter().for_each(gradients);
 }
 
 fn gradients(activation: Activation) {
@@ -70,7 +70,7 @@ fn gradients_of_policy_and_value_are_clipped_as_one_vector() {
         let settings = PpoSettings { max_grad_norm, n_epochs: 1, batch_size: TILE, ..PpoSettings::default() };
         let mut rng = crate::rollout::stream(1, 1);
         let mut l = Ppo::new(dims(), &NetSettings::default(), settings, 1, &mut rng);
-        l.update(&batch(&dims(), TILE, 3), 1.0, &mut rng);
+        l.update(&mut batch(&dims(), TILE, 3), Pace::default(), &mut rng);
         [ACTOR, VALUE].map(|phase| {
             let m = scalars(&l.params.adam[phase].m);
             10.0 * m.iter().map(|&m| f64::from(m).powi(2)).sum::<f64>().sqrt()
@@ -90,8 +90,121 @@ fn the_inverse_model_on_the_side_changes_nothing() {
         let settings = PpoSettings { n_epochs: 2, batch_size: TILE, ..PpoSettings::default() };
         let mut rng = crate::rollout::stream(1, 1);
         let mut l = Ppo::new(dims(), &nets, settings, 1, &mut rng);
-        l.update(&batch(&dims(), 2 * TILE, 3), 1.0, &mut rng);
+        l.update(&mut batch(&dims(), 2 * TILE, 3), Pace::default(), &mut rng);
         [ACTOR, VALUE].map(|phase| scalars(&l.params.groups[phase].p).to_vec())
     };
     assert!(learned(vec![]) == learned(vec![32, 32]), "other weights of policy or value");
+}
+
+/// What a setting makes of three updates on one batch: numbers of the last, and how many passes it took.
+fn last_of(settings: PpoSettings) -> (Ppo, Metrics) {
+    let mut rng = crate::rollout::stream(1, 1);
+    let mut l = Ppo::new(dims(), &NetSettings::default(), settings, 1, &mut rng);
+    let mut metrics = Metrics::new();
+    for _ in 0..3 {
+        metrics = l.update(&mut batch(&dims(), 4 * TILE, 3), Pace::default(), &mut rng);
+    }
+    (l, metrics)
+}
+
+fn of(metrics: &Metrics, name: &str) -> f64 {
+    metrics.iter().find(|(n, _)| *n == name).unwrap_or_else(|| panic!("{name}")).1
+}
+
+#[test]
+fn passes_end_where_the_divergence_is_reached() {
+    let settings = PpoSettings { batch_size: TILE, ..PpoSettings::default() };
+    let (_, all) = last_of(settings.clone());
+    let (_, few) = last_of(PpoSettings { target_kl: 1e-6, ..settings.clone() });
+    let (_, wide) = last_of(PpoSettings { target_kl: 1e6, ..settings });
+    assert_eq!([&all, &few, &wide].map(|m| of(m, "train/epochs")), [10.0, 1.0, 10.0]);
+    assert_eq!(
+        of(&all, "train/approx_kl"),
+        of(&wide, "train/approx_kl"),
+        "passes apart are passes in one go"
+    );
+}
+
+#[test]
+fn the_rate_follows_the_divergence() {
+    let settings = PpoSettings { batch_size: TILE, ..PpoSettings::default() };
+    let rate =
+        |desired_kl| of(&last_of(PpoSettings { desired_kl, ..settings.clone() }).1, "train/learning_rate");
+    let third = |factor: f64| 3e-4 * factor.powi(3);
+    assert!((rate(1e-9) / third(1.0 / 1.5) - 1.0).abs() < 1e-5, "three times slower: {}", rate(1e-9));
+    assert!((rate(1e9) / third(1.5) - 1.0).abs() < 1e-5, "three times faster: {}", rate(1e9));
+    assert_eq!(rate(0.0), f64::from(3e-4f32), "held");
+}
+
+#[test]
+fn the_value_has_a_rate_of_its_own() {
+    let settings = PpoSettings { batch_size: TILE, max_grad_norm: f32::INFINITY, ..PpoSettings::default() };
+    let value = |s: PpoSettings| scalars(&last_of(s).0.params.groups[VALUE].p).to_vec();
+    let same = value(settings.clone());
+    assert!(same == value(PpoSettings { value_lr: 3e-4, ..settings.clone() }), "0 is the policy's");
+    assert!(same != value(PpoSettings { value_lr: 1e-3, ..settings }));
+}
+
+/// `max((V - R)^2, (clip(V, V_old +- range) - R)^2)` by central differences; the value was the return less the advantage.
+#[test]
+fn the_clipped_value_loss_equals_central_differences() {
+    let range = 0.4;
+    let nets = NetSettings { value: vec![4, 6], ..NetSettings::default() };
+    let settings = PpoSettings { clip_value: range, ..PpoSettings::default() };
+    let mut l = Ppo::new(dims(), &nets, settings, 1, &mut crate::rollout::stream(1, 1));
+    spread(&mut l.params.groups[VALUE].p, &[&l.nets.value.net]);
+    l.nets.refresh(VALUE, &mut l.params);
+    let (b, d) = (batch(&dims(), TILE, 3), dims());
+    let idx: Vec<u32> = (0..b.n as u32).collect();
+    let mut grad = vec![ZERO; l.params.groups[VALUE].p.len() + 1];
+    l.nets.tile(VALUE, &l.params, tile(&b, &idx), &mut l.nets.work(), &mut grad);
+    let value = Net64::of(&l.nets.value.net.mlp.to_dense(&l.params.groups[VALUE].p), Activation::Tanh);
+    let error = |net: &Net64, i: usize| {
+        let (v, r) = (net.forward(&row(&b.obs, i, d.n_obs))[0], f64::from(b.returns[i]));
+        let before = r - f64::from(b.advantage[i]);
+        let held = v.clamp(before - f64::from(range), before + f64::from(range));
+        ((v - r).powi(2), (held - r).powi(2))
+    };
+    let held = (0..b.n).filter(|&i| error(&value, i).1 > error(&value, i).0).count();
+    assert!(held > 2 && held < b.n - 2, "some are held, some are not: {held}");
+    let loss =
+        |net: &Net64| (0..b.n).map(|i| 0.5 * error(net, i).0.max(error(net, i).1)).sum::<f64>() / b.n as f64;
+    let error = relative_error(&value, &flat32(&l.nets.value.net.mlp.to_dense(&grad)), loss);
+    assert!(error < 2e-4, "relative error {error:e}");
+}
+
+/// Anew under the values of the network as it learns, and by hand where that is zero: a stretch of two steps, gamma = lambda = 1.
+#[test]
+fn advantages_are_estimated_anew_before_each_pass() {
+    let learn = |recompute_advantages| {
+        let settings =
+            PpoSettings { batch_size: TILE, n_epochs: 3, recompute_advantages, ..PpoSettings::default() };
+        let mut rng = crate::rollout::stream(1, 1);
+        let mut l = Ppo::new(dims(), &NetSettings::default(), settings, 1, &mut rng);
+        let mut b = batch(&dims(), TILE, 3);
+        b.discount = (1.0, 1.0);
+        for _ in 0..TILE / 2 {
+            let (reward, terminated, truncated) = (vec![1.0, 2.0], vec![false, true], vec![false; 2]);
+            b.stretches.push(super::super::Stretch { reward, terminated, truncated, final_obs: Vec::new() });
+        }
+        b.estimate(|x| vec![0.0; x.len() / dims().n_obs]);
+        assert_eq!(b.returns[..4], [3.0, 2.0, 3.0, 2.0]);
+        l.update(&mut b, Pace::default(), &mut rng);
+        let values = l.values(&b.obs);
+        (b, values)
+    };
+    let (still, _) = learn(false);
+    assert_eq!(still.advantage[..2], [3.0, 2.0]);
+    let (anew, values) = learn(true);
+    let near = |got: f32, want: f32| (got - want).abs() < 1e-5;
+    assert!(
+        near(anew.returns[0], 3.0) && near(anew.returns[1], 2.0),
+        "with lambda 1 returns do not depend on values"
+    );
+    assert!(
+        (anew.advantage[0] - (3.0 - values[0])).abs() < 0.1 && anew.advantage[0] != 3.0,
+        "{:?} {:?}",
+        &anew.advantage[..2],
+        &values[..2]
+    );
 }

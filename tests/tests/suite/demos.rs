@@ -1,0 +1,121 @@
+//! Demonstrations: what is recorded comes back bit for bit, is what NumPy reads and writes, and bad files are refused by name.
+
+use nearl_tests::training;
+use nearl_trainer::demos::npz::{self, Array, Values};
+use nearl_trainer::demos::{Demonstrations, record};
+use nearl_trainer::{env, tasks};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+fn recorded(folder: &Path, task: &str) -> (PathBuf, Demonstrations) {
+    let snapshot = training(task, "pid2-ib", 3, 1, &[]).snapshot().clone();
+    let (demos, _) = record(&snapshot, 3, 1).expect("episodes");
+    let file = folder.join("demos.npz");
+    demos.save(&file).expect("saved");
+    (file, demos)
+}
+
+#[test]
+fn what_is_recorded_comes_back_and_is_of_its_task() {
+    let folder = tempfile::tempdir().expect("folder");
+    for task in ["Hopper-v5", "HalfCheetah-v5", "Ant-v5"] {
+        let (file, demos) = recorded(folder.path(), task);
+        assert_eq!(Demonstrations::load(&file).expect("read"), demos, "{task}");
+        let manifest = tasks::load(task, &[]).expect("task");
+        let mut env = env::of_task(&manifest, task).expect("environment");
+        demos.check(&mut *env, manifest.task.time.dt).unwrap_or_else(|e| panic!("{task}: {e}"));
+        let e = &demos.episodes[0];
+        assert_eq!(e.observations.len(), (e.length + 1) * demos.names.len());
+        // the same actions from the first state lead to the same states
+        let (nq, nv, n_act) = (env.qpos().len(), env.qvel().len(), e.actions.len() / e.length);
+        env.set_state(&e.qpos[..nq], &e.qvel[..nv]).expect("first state");
+        for t in 0..e.length.min(20) {
+            env.step(&e.actions[t * n_act..][..n_act]);
+            assert_eq!(env.qpos(), &e.qpos[(t + 1) * nq..][..nq], "{task}, step {t}");
+        }
+        let error = demos.check(&mut *env, 2.0 * manifest.task.time.dt).expect_err("another period");
+        assert!(error.contains("its period is"), "{error}");
+        let mut odd = demos.clone();
+        odd.episodes[1].qpos[2] += 0.1;
+        let error = odd.check(&mut *env, manifest.task.time.dt).expect_err("another state");
+        assert!(error.starts_with("episode 1 begins with "), "{error}");
+    }
+}
+
+/// NumPy reads what is written here, and what NumPy writes is read here.
+#[test]
+fn numpy_reads_and_writes_the_same_file() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, demos) = recorded(folder.path(), "Hopper-v5");
+    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join("../.venv/bin/python");
+    let script = "import numpy, sys\nd = dict(numpy.load(sys.argv[1]))\nassert d['observations'].dtype == numpy.float64 and d['dt'].shape == ()\n\
+                  d['lengths'] = d['lengths'].astype(numpy.int64)\nnumpy.savez(sys.argv[2], **d)\n\
+                  d['qvel'] = d['qvel'].astype(numpy.float32)\nnumpy.savez_compressed(sys.argv[3], **d)";
+    let [again, packed] = ["again.npz", "packed.npz"].map(|name| folder.path().join(name));
+    let status =
+        Command::new(python).args(["-c", script]).args([&file, &again, &packed]).status().expect("python");
+    assert!(status.success());
+    assert_eq!(Demonstrations::load(&again).expect("read"), demos);
+    let error = Demonstrations::load(&packed).expect_err("compressed").to_string();
+    assert!(error.contains("is compressed; write the file with numpy.savez"), "{error}");
+}
+
+#[test]
+fn columns_are_found_by_name() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (_, demos) = recorded(folder.path(), "Hopper-v5");
+    let mut names = demos.names.clone();
+    names.reverse();
+    let turned = demos.columns(&names).expect("all there");
+    let n = names.len();
+    let rows =
+        demos.episodes[0].observations.chunks_exact(n).zip(turned.episodes[0].observations.chunks_exact(n));
+    assert!(rows.into_iter().all(|(a, b)| a.iter().eq(b.iter().rev())));
+    let error = demos.columns(&["q.wing".to_string()]).expect_err("missing");
+    assert!(error.starts_with("it has no column 'q.wing'; it has "), "{error}");
+}
+
+type Arrays = std::collections::BTreeMap<String, Array>;
+
+#[test]
+fn bad_files_are_refused_by_array_column_and_episode() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, demos) = recorded(folder.path(), "Hopper-v5");
+    let whole = npz::read(&std::fs::read(&file).expect("file")).expect("arrays");
+    let with = |edit: &dyn Fn(&mut Arrays)| {
+        let mut arrays = whole.clone();
+        edit(&mut arrays);
+        let list: Vec<(&str, Array)> = arrays.iter().map(|(n, a)| (n.as_str(), a.clone())).collect();
+        std::fs::write(&file, npz::write(&list)).expect("file");
+        Demonstrations::load(&file).expect_err("refused").to_string()
+    };
+    let numbers = |a: &mut Array, at: usize, x: f64| {
+        let Values::Numbers(values) = &mut a.values else { panic!("numbers") };
+        values[at] = x;
+    };
+    let (n, first) = (demos.names.len(), demos.episodes[0].length + 1);
+    let error = with(&|a| numbers(a.get_mut("observations").expect("there"), (first + 2) * n + 4, f64::NAN));
+    let want = format!("'observations' is NaN in episode 1, row 2, column '{}'", demos.names[4]);
+    assert!(error.contains(&want) && error.contains("demos.npz"), "{error}");
+    let cases: [(&dyn Fn(&mut Arrays), &str); 5] = [
+        (&|a| drop(a.remove("qpos")), "has no array 'qpos'"),
+        (&|a| numbers(a.get_mut("lengths").expect("there"), 1, 0.5), "episode 1 has the length 0.5"),
+        (&|a| numbers(a.get_mut("lengths").expect("there"), 0, 1.0), "rows where 'lengths' asks for"),
+        (&|a| numbers(a.get_mut("dt").expect("there"), 0, -1.0), "'dt' is -1"),
+        (
+            &|a| drop(a.insert("action".into(), a["dt"].clone())),
+            "array 'action' is none that demonstrations have",
+        ),
+    ];
+    for (edit, want) in cases {
+        let error = with(edit);
+        assert!(error.contains(want), "{error}");
+    }
+    let bytes = npz::write(&[("dt", Array { shape: vec![], values: Values::Numbers(vec![1.0]) })]);
+    for cut in 0..bytes.len() {
+        assert!(npz::read(&bytes[..cut]).is_err(), "cut after {cut} bytes");
+    }
+    let mut flipped = bytes.clone();
+    flipped[60] ^= 1;
+    assert!(npz::read(&flipped).expect_err("damaged").contains("checksum"));
+}

@@ -1,0 +1,105 @@
+//! `nearl demos`.
+
+use super::{Failure, at_least_one, say};
+use crate::demos::{Demonstrations, record};
+use crate::{env, run_folder, tasks};
+use clap::{Args, Subcommand};
+use nearl_runtime::Snapshot;
+use std::path::PathBuf;
+
+#[derive(Subcommand)]
+pub(super) enum Demos {
+    /// Write episodes of a run's policy, without noise, as demonstrations.
+    Record(Record),
+    /// Say what a file of demonstrations holds, and whether it is of a task.
+    Check(Check),
+}
+
+#[derive(Args)]
+pub(super) struct Record {
+    /// Run folder or snapshot file.
+    run: PathBuf,
+    /// File to write.
+    #[arg(long, default_value = "demos.npz")]
+    out: PathBuf,
+    /// Episodes.
+    #[arg(long, default_value = "10", value_parser = at_least_one)]
+    episodes: usize,
+    /// Seed of the resets.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Args)]
+pub(super) struct Check {
+    /// Demonstrations (.npz).
+    file: PathBuf,
+    /// Task whose states they should be.
+    #[arg(long)]
+    task: Option<String>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Demos {
+    pub(super) fn run(self) -> Result<(), Failure> {
+        match self {
+            Self::Record(c) => c.run(),
+            Self::Check(c) => c.run(),
+        }
+    }
+}
+
+impl Record {
+    fn run(self) -> Result<(), Failure> {
+        let file = run_folder::snapshot_of(&self.run)?;
+        let snapshot = Snapshot::load(&file).map_err(|e| format!("{}: {e}", file.display()))?;
+        let (demos, returns) = record(&snapshot, self.episodes, self.seed)?;
+        demos.save(&self.out)?;
+        let mean = returns.iter().sum::<f64>() / returns.len() as f64;
+        let (out, lengths) =
+            (self.out.display(), demos.episodes.iter().map(|e| e.length).collect::<Vec<_>>());
+        if self.json {
+            say(serde_json::json!({ "file": self.out, "returns": returns, "lengths": lengths }));
+        } else {
+            let steps: usize = lengths.iter().sum();
+            say(format!("{out}: {} episodes, {steps} steps, return {mean:.1}", lengths.len()));
+        }
+        Ok(())
+    }
+}
+
+impl Check {
+    fn run(self) -> Result<(), Failure> {
+        let demos = Demonstrations::load(&self.file)?;
+        if let Some(task) = &self.task {
+            let manifest = tasks::load(task, &[])?;
+            let mut env = env::of_task(&manifest, task)?;
+            let period = manifest.task.time.dt * manifest.task.time.policy_every as f64;
+            demos
+                .check(&mut *env, period)
+                .map_err(|e| format!("demonstrations '{}': {e}", self.file.display()))?;
+        }
+        let lengths: Vec<usize> = demos.episodes.iter().map(|e| e.length).collect();
+        let actions = demos.episodes.iter().all(|e| !e.actions.is_empty());
+        if self.json {
+            say(
+                serde_json::json!({ "file": self.file, "names": demos.names, "dt": demos.dt, "lengths": lengths, "actions": actions }),
+            );
+        } else {
+            let (n, steps, with) =
+                (lengths.len(), lengths.iter().sum::<usize>(), if actions { "with" } else { "without" });
+            say(format!(
+                "{}: {n} episodes, {steps} steps of {} s, {with} actions",
+                self.file.display(),
+                demos.dt
+            ));
+            say(demos.names.join(" "));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,256 @@
+//! Demonstrations: states of an expert, episode by episode, in one `.npz` file.
+//!
+//! | array | shape | is |
+//! |---|---|---|
+//! | `observations` | sum (length + 1) x n_obs | raw observations; each episode has one more than steps |
+//! | `qpos`, `qvel` | sum (length + 1) x nq, nv | what `Env::set_state` takes |
+//! | `lengths` | episodes | policy steps of each |
+//! | `dt` | | policy period [s] |
+//! | `names` | n_obs | what each column of `observations` is |
+//! | `actions` | sum length x n_act | optional |
+
+pub mod npz;
+
+use crate::env::Env;
+use crate::rollout::{RolloutError, Worker, make_env, stream};
+use nearl_runtime::Snapshot;
+use nearl_runtime::snapshot::write_whole;
+use npz::{Array, Values};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Why demonstrations cannot be used.
+#[derive(Clone, Debug, thiserror::Error)]
+#[error("demonstrations '{file}': {reason}")]
+pub struct DemoError {
+    /// Path.
+    pub file: String,
+    /// One sentence naming array, column and episode.
+    pub reason: String,
+}
+
+/// One episode.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Episode {
+    /// Raw observations ((length + 1) x n_obs).
+    pub observations: Vec<f64>,
+    /// Configurations ((length + 1) x nq).
+    pub qpos: Vec<f64>,
+    /// Velocities ((length + 1) x nv).
+    pub qvel: Vec<f64>,
+    /// Actions (length x n_act); empty where the file has none.
+    pub actions: Vec<f64>,
+    /// Policy steps.
+    pub length: usize,
+}
+
+/// Every episode of a file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Demonstrations {
+    /// Name of each observation entry (n_obs).
+    pub names: Vec<String>,
+    /// Policy period [s].
+    pub dt: f64,
+    /// Episodes.
+    pub episodes: Vec<Episode>,
+}
+
+impl Demonstrations {
+    /// Reads a file whole and checks it.
+    ///
+    /// # Errors
+    /// [`DemoError`] naming array, column and episode; nothing is half read.
+    pub fn load(path: &Path) -> Result<Self, DemoError> {
+        let wrong = |reason| DemoError { file: path.display().to_string(), reason };
+        let bytes = std::fs::read(path).map_err(|e| wrong(format!("it cannot be read: {e}")))?;
+        let arrays = npz::read(&bytes).map_err(|e| wrong(format!("{e}; write it with numpy.savez")))?;
+        Self::of(arrays).map_err(wrong)
+    }
+
+    fn of(mut arrays: BTreeMap<String, Array>) -> Result<Self, String> {
+        let names = match arrays.remove("names").ok_or("it has no array 'names'")?.values {
+            Values::Words(names) => names,
+            Values::Numbers(_) => {
+                return Err("array 'names' holds numbers; give the name of each observation".into());
+            }
+        };
+        if let Some((i, name)) = names.iter().enumerate().find(|(i, n)| names[..*i].contains(n)) {
+            return Err(format!("column {i} of 'names' is '{name}' a second time"));
+        }
+        let dt = numbers(&mut arrays, "dt")?.1.first().copied().unwrap_or(f64::NAN);
+        if !(dt.is_finite() && dt > 0.0) {
+            return Err(format!("'dt' is {dt}; give the policy period in seconds"));
+        }
+        let lengths = numbers(&mut arrays, "lengths")?.1;
+        if let Some((i, l)) = lengths.iter().enumerate().find(|(_, l)| !(**l >= 1.0 && l.fract() == 0.0)) {
+            return Err(format!("episode {i} has the length {l}; give whole numbers of steps, at least 1"));
+        }
+        let lengths: Vec<usize> = lengths.into_iter().map(|l| l as usize).collect();
+        if lengths.is_empty() {
+            return Err("'lengths' is empty; give at least one episode".into());
+        }
+        let mut episodes: Vec<Episode> =
+            lengths.iter().map(|&length| Episode { length, ..Episode::default() }).collect();
+        let column = |k: usize| names.get(k).cloned().unwrap_or_else(|| k.to_string());
+        let plain = |k: usize| k.to_string();
+        type Part = (&'static str, usize, fn(&mut Episode) -> &mut Vec<f64>);
+        let parts: [Part; 4] = [
+            ("observations", 1, |e| &mut e.observations),
+            ("qpos", 1, |e| &mut e.qpos),
+            ("qvel", 1, |e| &mut e.qvel),
+            ("actions", 0, |e| &mut e.actions),
+        ];
+        for (name, more, of) in parts {
+            if name == "actions" && !arrays.contains_key(name) {
+                continue;
+            }
+            let (shape, values) = numbers(&mut arrays, name)?;
+            let rows: usize = lengths.iter().map(|l| l + more).sum();
+            let [found, width] = shape[..] else {
+                return Err(format!("array '{name}' has {} dimensions, not 2", shape.len()));
+            };
+            if found != rows {
+                return Err(format!("array '{name}' has {found} rows where 'lengths' asks for {rows}"));
+            }
+            if name == "observations" && width != names.len() {
+                return Err(format!("array '{name}' has {width} columns and 'names' {}", names.len()));
+            }
+            let mut first = 0;
+            for (i, e) in episodes.iter_mut().enumerate() {
+                let own = &values[first * width..][..(e.length + more) * width];
+                first += e.length + more;
+                if let Some(at) = own.iter().position(|x| !x.is_finite()) {
+                    let called = if name == "observations" { column(at % width) } else { plain(at % width) };
+                    return Err(format!(
+                        "'{name}' is {} in episode {i}, row {}, column '{called}'",
+                        own[at],
+                        at / width
+                    ));
+                }
+                of(e).extend_from_slice(own);
+            }
+        }
+        match arrays.keys().next() {
+            Some(name) => Err(format!("array '{name}' is none that demonstrations have")),
+            None => Ok(Self { names, dt, episodes }),
+        }
+    }
+
+    /// Writes the file whole.
+    ///
+    /// # Errors
+    /// [`DemoError`] with what the system said.
+    pub fn save(&self, path: &Path) -> Result<(), DemoError> {
+        let flat = |of: fn(&Episode) -> &Vec<f64>| {
+            self.episodes.iter().flat_map(|e| of(e).iter().copied()).collect::<Vec<f64>>()
+        };
+        let rows: usize = self.episodes.iter().map(|e| e.length + 1).sum();
+        let steps = rows - self.episodes.len();
+        let table = |rows: usize, values: Vec<f64>| Array {
+            shape: vec![rows, values.len() / rows.max(1)],
+            values: Values::Numbers(values),
+        };
+        let lengths: Vec<f64> = self.episodes.iter().map(|e| e.length as f64).collect();
+        let mut arrays = vec![
+            ("observations", table(rows, flat(|e| &e.observations))),
+            ("qpos", table(rows, flat(|e| &e.qpos))),
+            ("qvel", table(rows, flat(|e| &e.qvel))),
+            ("lengths", Array { shape: vec![lengths.len()], values: Values::Numbers(lengths) }),
+            ("dt", Array { shape: Vec::new(), values: Values::Numbers(vec![self.dt]) }),
+            ("names", Array { shape: vec![self.names.len()], values: Values::Words(self.names.clone()) }),
+        ];
+        let actions = flat(|e| &e.actions);
+        if !actions.is_empty() {
+            arrays.push(("actions", table(steps, actions)));
+        }
+        let wrong = |e: std::io::Error| DemoError {
+            file: path.display().to_string(),
+            reason: format!("it cannot be written: {e}; give another path with --out"),
+        };
+        write_whole(path, &npz::write(&arrays)).map_err(wrong)
+    }
+
+    /// The same with the columns of `names`, in that order; whatever else the file has is left out.
+    ///
+    /// # Errors
+    /// One sentence naming a column that is missing.
+    pub fn columns(&self, names: &[String]) -> Result<Self, String> {
+        let place = |name: &String| {
+            let found = self.names.iter().position(|n| n == name);
+            found.ok_or_else(|| format!("it has no column '{name}'; it has {}", self.names.join(" ")))
+        };
+        let places = names.iter().map(place).collect::<Result<Vec<_>, _>>()?;
+        let episodes = self.episodes.iter().map(|e| {
+            let rows = e.observations.chunks_exact(self.names.len());
+            let observations = rows.flat_map(|row| places.iter().map(|&k| row[k])).collect();
+            Episode { observations, ..e.clone() }
+        });
+        Ok(Self { names: names.to_vec(), dt: self.dt, episodes: episodes.collect() })
+    }
+
+    /// Whether the states are those of this environment: period, columns and sizes, and in each episode the first observation.
+    ///
+    /// # Errors
+    /// One sentence naming what differs, and the episode.
+    pub fn check(&self, env: &mut dyn Env, period: f64) -> Result<(), String> {
+        if (self.dt - period).abs() > 1e-9 * period {
+            return Err(format!("its period is {} s, that of the task {period} s", self.dt));
+        }
+        let (nq, nv, names) = (env.qpos().len(), env.qvel().len(), env.spec().obs.clone());
+        let own = self.columns(&names)?;
+        let mut obs = vec![0.0; names.len()];
+        for (i, e) in own.episodes.iter().enumerate() {
+            let rows = e.length + 1;
+            if (e.qpos.len(), e.qvel.len()) != (rows * nq, rows * nv) {
+                let (q, v) = (e.qpos.len() / rows, e.qvel.len() / rows);
+                return Err(format!(
+                    "'qpos' and 'qvel' have {q} and {v} columns where the robot has {nq} and {nv}"
+                ));
+            }
+            env.set_state(&e.qpos[..nq], &e.qvel[..nv]).map_err(|error| format!("episode {i}: {error}"))?;
+            env.observe(&mut obs);
+            // contact forces follow from the step before and are not of the state alone
+            let far = |k: &usize| {
+                (obs[*k] - e.observations[*k]).abs() > 1e-6 * (1.0 + obs[*k].abs())
+                    && !names[*k].starts_with("cfrc.")
+            };
+            if let Some(k) = (0..obs.len()).find(far) {
+                return Err(format!(
+                    "episode {i} begins with {} = {} where its 'qpos' and 'qvel' give {}",
+                    names[k], e.observations[k], obs[k]
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Episodes of a policy without noise, from ordinary resets, under its limits.
+///
+/// # Errors
+/// [`RolloutError`].
+pub fn record(
+    snapshot: &Snapshot,
+    episodes: usize,
+    seed: u64,
+) -> Result<(Demonstrations, Vec<f64>), RolloutError> {
+    let mut worker = Worker::new(make_env(snapshot)?, snapshot, 1.0, stream(seed, 0))?;
+    let task = &snapshot.manifest.task;
+    let (mut all, mut returns) = (Vec::new(), Vec::new());
+    for _ in 0..episodes {
+        let (episode, total) = worker.demonstrate().map_err(RolloutError::from)?;
+        all.push(episode);
+        returns.push(total);
+    }
+    let dt = task.time.dt * task.time.policy_every as f64;
+    Ok((Demonstrations { names: task.state.observation.clone(), dt, episodes: all }, returns))
+}
+
+/// Takes an array of numbers: its shape and entries.
+fn numbers(arrays: &mut BTreeMap<String, Array>, name: &str) -> Result<(Vec<usize>, Vec<f64>), String> {
+    let Array { shape, values } = arrays.remove(name).ok_or(format!("it has no array '{name}'"))?;
+    match values {
+        Values::Numbers(values) => Ok((shape, values)),
+        Values::Words(_) => Err(format!("array '{name}' holds text; give numbers")),
+    }
+}

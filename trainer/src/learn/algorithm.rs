@@ -1,0 +1,157 @@
+//! The algorithms by name. The command line, Python, the page about training and the tests read this one table.
+
+use std::fmt;
+use std::str::FromStr;
+
+/// What is learned, and by which losses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Algorithm {
+    /// See [`ppo`](super::ppo).
+    Ppo,
+    /// The same loss on the combined policy.
+    PpoCombined,
+    /// See [`nearl`](super::nearl).
+    Nearl,
+    /// See [`pid2`](super::pid2), without the bottleneck.
+    Pid2Gan,
+    /// See [`pid2`](super::pid2).
+    Pid2Ib,
+}
+
+/// One line of the table.
+#[derive(Clone, Copy, Debug)]
+pub struct Entry {
+    /// Which.
+    pub algorithm: Algorithm,
+    /// As it is written.
+    pub name: &'static str,
+    /// What it is, in one line.
+    pub about: &'static str,
+}
+
+/// Every algorithm, in the order of the paper.
+pub const ALGORITHMS: &[Entry] = &[
+    Entry {
+        algorithm: Algorithm::Ppo,
+        name: "ppo",
+        about: "a Gaussian policy on actions, nothing proposed or projected; an inverse model learns on the side",
+    },
+    Entry {
+        algorithm: Algorithm::PpoCombined,
+        name: "ppo-combined",
+        about: "PPO on the paper's two networks, policy and inverse model, without any other loss (its RL-Pure)",
+    },
+    Entry {
+        algorithm: Algorithm::Nearl,
+        name: "nearl",
+        about: "supervised meta policy and inverse model, policy gradient on the pair (the paper's Algorithm 1)",
+    },
+    Entry {
+        algorithm: Algorithm::Pid2Gan,
+        name: "pid2-gan",
+        about: "policy, inverse dynamics and a discriminator without a bottleneck",
+    },
+    Entry {
+        algorithm: Algorithm::Pid2Ib,
+        name: "pid2-ib",
+        about: "policy, inverse dynamics and a discriminator with the information bottleneck (the paper's Algorithm 2)",
+    },
+];
+
+/// A name that no algorithm has.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("no algorithm '{name}'{near}; give one of {all}")]
+pub struct UnknownAlgorithm {
+    /// As given.
+    pub name: String,
+    /// `; did you mean ...`.
+    pub near: String,
+    /// All names.
+    pub all: String,
+}
+
+impl Algorithm {
+    /// As it is written.
+    pub fn name(self) -> &'static str {
+        self.entry().name
+    }
+
+    /// What it is, in one line.
+    pub fn about(self) -> &'static str {
+        self.entry().about
+    }
+
+    fn entry(self) -> &'static Entry {
+        let found = ALGORITHMS.iter().find(|e| e.algorithm == self);
+        found.unwrap_or_else(|| unreachable!("{self:?} has no line in the table"))
+    }
+
+    /// All names, with commas between them.
+    pub fn names() -> String {
+        ALGORITHMS.iter().map(|e| e.name).collect::<Vec<_>>().join(", ")
+    }
+
+    /// Whether the policy is one on actions: it proposes nothing.
+    pub fn is_direct(self) -> bool {
+        self == Self::Ppo
+    }
+}
+
+impl fmt::Display for Algorithm {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for Algorithm {
+    type Err = UnknownAlgorithm;
+
+    fn from_str(name: &str) -> Result<Self, UnknownAlgorithm> {
+        if let Some(e) = ALGORITHMS.iter().find(|e| e.name == name) {
+            return Ok(e.algorithm);
+        }
+        let alike = |e: &Entry| (strsim::jaro_winkler(e.name, &name.to_lowercase()), e.name);
+        let near =
+            ALGORITHMS.iter().map(alike).max_by(|a, b| a.0.total_cmp(&b.0)).filter(|(score, _)| *score > 0.7);
+        Err(UnknownAlgorithm {
+            name: name.into(),
+            near: near.map_or(String::new(), |(_, near)| format!("; did you mean '{near}'?")),
+            all: Self::names(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_name_reads_back_and_stands_on_the_page_about_training() {
+        let page = include_str!("../../../docs/TRAINING.md");
+        for e in ALGORITHMS {
+            assert_eq!(e.name.parse(), Ok(e.algorithm));
+            assert_eq!(e.algorithm.to_string(), e.name);
+            assert!(
+                page.contains(&format!("| `{}` | {} |", e.name, e.about)),
+                "{} is not on the page",
+                e.name
+            );
+        }
+    }
+
+    #[test]
+    fn an_unknown_name_is_refused_with_the_nearest_one() {
+        let refused = |name: &str| name.parse::<Algorithm>().unwrap_err().to_string();
+        assert!(
+            refused("pid2").starts_with("no algorithm 'pid2'; did you mean 'pid2-"),
+            "{}",
+            refused("pid2")
+        );
+        assert!(refused("PPO").contains("did you mean 'ppo'?"));
+        let far = refused("xyz");
+        assert!(
+            far.starts_with("no algorithm 'xyz'; give one of ppo, ") && far.ends_with("pid2-ib"),
+            "{far}"
+        );
+    }
+}

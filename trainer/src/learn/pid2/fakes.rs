@@ -1,0 +1,137 @@
+//! What is judged beside the reached changes: proposals, with the noise that the reached ones have too.
+//!
+//! What was reached is the mean that a proposal should be, plus what exploration and the plant add to it. A bare proposal can be
+//! told from that even where it is exactly right, so it is judged with the residual of another row,
+//!
+//! ```text
+//! r = reached - (m + b u),    b = cov(reached, u) / var(u) within [0, 1]
+//! ```
+//!
+//! with a coefficient for each entry: residuals of proposals that are right are the noise around them, those of proposals that
+//! say nothing are what was reached itself, and no noise is larger than that. A row's entries keep each other company, as the noise
+//! of one action moves several of them.
+
+use super::super::Batch;
+use super::super::combined::Combined;
+use super::super::inverse::CLIP;
+use super::super::optimise::Group;
+use super::Pid2Settings;
+use nearl_runtime::net::kernel::scalars;
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+/// Tables of one update, row by row of the batch.
+#[derive(Default)]
+pub(super) struct Fakes {
+    n_state: usize,
+    /// Residuals (n x n_state); empty where proposals are judged as they are.
+    residual: Vec<f32>,
+    /// Standard normal noise of a stochastic proposal (n x n_state); empty where it is deterministic.
+    normal: Vec<f32>,
+    /// What the discriminator sees (n x n_state); empty: the batch's own proposals.
+    judged: Vec<f32>,
+    /// Rows between a proposal and the residual it is judged with: by the discriminator, by the policy.
+    shift: [usize; 2],
+}
+
+impl Fakes {
+    /// Tables of the batch, whose proposals are those of the current policy.
+    pub(super) fn new(s: &Pid2Settings, combined: &Combined, batch: &Batch, rng: &mut ChaCha8Rng) -> Self {
+        let n_state = combined.dims.n_state;
+        let mut fakes = Self { n_state, ..Self::default() };
+        if combined.policy_log_std.is_some() {
+            fakes.normal = (0..batch.n * n_state).map(|_| StandardNormal.sample(&mut *rng)).collect();
+        }
+        if s.match_noise {
+            fakes.residual = residuals(batch, n_state);
+            fakes.judged.clone_from(&batch.proposal);
+            fakes.disturb(batch.n, rng);
+        }
+        fakes
+    }
+
+    /// The same with the proposals of the current policy, sampled anew where it is stochastic.
+    pub(super) fn renew(
+        &mut self,
+        combined: &Combined,
+        group: &Group,
+        batch: &Batch,
+        threads: usize,
+        rng: &mut ChaCha8Rng,
+    ) {
+        combined.proposals(group, batch, threads, &mut self.judged);
+        if let Some(spread) = &combined.policy_log_std {
+            let spread: Vec<f32> =
+                scalars(&group.p[spread.clone()])[..self.n_state].iter().map(|l| l.exp()).collect();
+            for row in self.judged.chunks_exact_mut(self.n_state) {
+                for (u, spread) in row.iter_mut().zip(&spread) {
+                    let z: f32 = StandardNormal.sample(&mut *rng);
+                    *u += spread * z;
+                }
+            }
+        }
+        self.disturb(batch.n, rng);
+    }
+
+    /// Adds the residuals of other rows to what is judged.
+    fn disturb(&mut self, n: usize, rng: &mut ChaCha8Rng) {
+        if self.residual.is_empty() {
+            return;
+        }
+        self.shift = std::array::from_fn(|_| rng.random_range(0..n));
+        let (first, second) = self.residual.split_at(self.shift[0] * self.n_state);
+        for (u, r) in self.judged.iter_mut().zip(second.iter().chain(first)) {
+            *u += r;
+        }
+    }
+
+    /// What the discriminator sees.
+    pub(super) fn judged<'a>(&'a self, batch: &'a Batch) -> &'a [f32] {
+        if self.judged.is_empty() { &batch.proposal } else { &self.judged }
+    }
+
+    /// Noise of a stochastic proposal of row `i`, for the policy against the discriminator.
+    #[inline(always)]
+    pub(super) fn normal(&self, i: usize) -> &[f32] {
+        if self.normal.is_empty() { &[] } else { &self.normal[i * self.n_state..][..self.n_state] }
+    }
+
+    /// The residual with which row `i` is judged for the policy.
+    #[inline(always)]
+    pub(super) fn residual(&self, i: usize) -> &[f32] {
+        if self.residual.is_empty() {
+            return &[];
+        }
+        let at = (i + self.shift[1]) * self.n_state % self.residual.len();
+        &self.residual[at..at + self.n_state]
+    }
+}
+
+/// Within what is judged, as reached changes are.
+#[inline(always)]
+pub(super) fn within(u: f32) -> f32 {
+    u.clamp(-CLIP, CLIP)
+}
+
+/// `reached - (m + b u)` of each row, entry by entry.
+fn residuals(batch: &Batch, n_state: usize) -> Vec<f32> {
+    let n = batch.n as f64;
+    let mut out = vec![0.0; batch.n * n_state];
+    for k in 0..n_state {
+        let rows = || (0..batch.n).map(|i| i * n_state + k);
+        let mean = |x: &[f32]| rows().map(|at| f64::from(x[at])).sum::<f64>() / n;
+        let (u, r) = (mean(&batch.proposal), mean(&batch.reached));
+        let (mut both, mut own) = (0.0, 0.0);
+        for at in rows() {
+            let d = f64::from(batch.proposal[at]) - u;
+            both += d * (f64::from(batch.reached[at]) - r);
+            own += d * d;
+        }
+        let b = if own > 0.0 { (both / own).clamp(0.0, 1.0) } else { 0.0 };
+        for at in rows() {
+            out[at] = (f64::from(batch.reached[at]) - r - b * (f64::from(batch.proposal[at]) - u)) as f32;
+        }
+    }
+    out
+}
