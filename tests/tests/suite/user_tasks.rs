@@ -354,7 +354,7 @@ fn the_example_learns_to_balance() {
 #[test]
 fn a_velocity_prior_holds_in_every_target() {
     let (training, _) =
-        trained("HalfCheetah-velocity", "pid2-ib", 8192, &["constraints.velocity.limit.rootx=0.01"]);
+        trained("HalfCheetah-velocity", "pid2-ib", 16_384, &["constraints.velocity.limit.rootx=0.01"]);
     let e = evaluate::evaluate(training.snapshot(), 2, 0, true).expect("evaluation");
     assert!(e.raw_violations > e.ticks / 2, "proposals are faster than a centimetre a second");
     assert_eq!(e.target_violations, 0);
