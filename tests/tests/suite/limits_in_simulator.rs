@@ -55,11 +55,7 @@ fn run_at(seed: u64, projection: bool, ticks: usize, dt: f64) -> Outcome {
         inverse.force(env.sim(), &mut force).expect("an inverse");
         meter.observe(env.qpos(), env.qvel(), Some(&force));
     }
-    let [p, v, a, t] = meter.records().map(|found| found.expect("all four are measured"));
-    eprintln!(
-        "EXCESS p {:e} v {:e} a {:e} ({}) t {:e} ({})",
-        p.excess, v.excess, a.excess, a.states, t.excess, t.states
-    );
+    let [p, v, _, t] = meter.records().map(|found| found.expect("all four are measured"));
     let worst = p.excess.max(v.excess).max(t.excess);
     Outcome { position: p.states, velocity: v.states, torque: t.states, worst, refused, braked }
 }
