@@ -23,6 +23,7 @@ from nearl._core import (
     Limit,
     LockedJoints,
     Model,
+    Policy,
     PositionLimit,
     Projector,
     RowLimit,
@@ -37,8 +38,10 @@ from nearl._core import (
     algorithms,
     tasks,
 )
+from nearl.importers import import_onnx, import_sb3, import_torch
 from nearl.link import Link
 from nearl.pid2 import PID2
+from nearl.plant import Loop, Plant
 
 __all__ = [
     "AccelerationLimit",
@@ -52,8 +55,11 @@ __all__ = [
     "Limit",
     "Link",
     "LockedJoints",
+    "Loop",
     "Model",
     "PID2",
+    "Plant",
+    "Policy",
     "PositionLimit",
     "Projector",
     "RowLimit",
@@ -66,6 +72,9 @@ __all__ = [
     "VelocityProfileLimit",
     "__version__",
     "algorithms",
+    "import_onnx",
+    "import_sb3",
+    "import_torch",
     "tasks",
 ]
 

@@ -392,6 +392,77 @@ class Controller:
     def digest(self) -> str: ...
 
 @final
+class Plant:
+    def __new__(
+        cls,
+        name: str,
+        joints: Sequence[str],
+        observation: Sequence[str],
+        dt: float,
+        nu: int,
+        *,
+        nq: int | None = None,
+        nv: int | None = None,
+        watchdog: float = 0.02,
+        lockstep: bool = False,
+    ) -> Plant: ...
+    def exchange(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        obs: ArrayLike,
+        patience: float,
+        *,
+        time: float = 0.0,
+        episode: int = 0,
+        begins: bool = False,
+    ) -> tuple[str, _Floats | None]: ...
+    @property
+    def attached(self) -> bool: ...
+    def close(self) -> None: ...
+
+@final
+class LoopThread:
+    def __new__(
+        cls,
+        snapshot: _Path,
+        name: str,
+        *,
+        seconds: float | None = None,
+        log: _Path | None = None,
+        patience: float = 5.0,
+        ramp: float = 0.2,
+        priority: int | None = None,
+    ) -> LoopThread: ...
+    @property
+    def running(self) -> bool: ...
+    def end(self, wait: bool = False) -> str: ...
+
+@final
+class Policy:
+    @staticmethod
+    def from_onnx(path: _Path, output: str | None = None) -> Policy: ...
+    @staticmethod
+    def from_layers(
+        layers: Sequence[tuple[ArrayLike, ArrayLike, str]],
+        mean: ArrayLike,
+        std: ArrayLike,
+        clip: tuple[float, float],
+        output_clip: tuple[float, float],
+    ) -> Policy: ...
+    def __call__(self, obs: ArrayLike) -> _Floats: ...
+    def controller(self, robot: _Path, recipe: _Path | None = None, name: str = "policy") -> Controller: ...
+    def in_task(self, task: str, settings: Sequence[str] = ...) -> Controller: ...
+    @property
+    def n_in(self) -> int: ...
+    @property
+    def n_out(self) -> int: ...
+    @property
+    def functions(self) -> list[str]: ...
+    @property
+    def metadata(self) -> dict[str, str]: ...
+
+@final
 class Training:
     def __new__(
         cls, task: str, algo: str, seed: int, threads: int, settings: Sequence[str], out: _Path | None, preset: str | None = None

@@ -125,7 +125,7 @@ impl Controller {
         let py = obs.py();
         if let Some(joint) = &self.unseen {
             return Err(errors::value(format!(
-                "the observation of '{}' has no 'q.{joint}' or no 'v.{joint}', which analytic inverse dynamics needs; use update(q, v, obs)",
+                "the observation of '{}' has no 'q.{joint}' or no 'v.{joint}', which analytic inverse dynamics or the policy's own observation needs; use update(q, v, obs)",
                 self.task
             )));
         }
@@ -249,7 +249,8 @@ impl Controller {
         let stochastic = manifest.policy == PolicyKind::Stochastic;
         let n_noise = if stochastic { noise.proposal.len() } else { noise.action.len() };
         let analytic = manifest.task.idm.kind == IdmKind::Pinocchio && manifest.policy != PolicyKind::Direct;
-        let unseen = if analytic { first_unseen(&controller) } else { None };
+        let computes = manifest.task.policy.as_ref().is_some_and(|p| !p.observation.is_empty());
+        let unseen = if analytic || computes { first_unseen(&controller) } else { None };
         let (task, algo, digest) = (manifest.task.name.clone(), manifest.algo.clone(), snapshot.digest());
         let inner = Mutex::new(Inner { controller, state, noise, out, stochastic });
         let snapshot = snapshot.clone();

@@ -12,6 +12,8 @@ mod link;
 mod loop_link;
 mod model;
 mod nearest;
+mod plant;
+mod policy;
 mod projector;
 mod target;
 mod training;
@@ -33,6 +35,10 @@ mod _core {
     use super::model::Model;
     #[pymodule_export]
     use super::nearest::nearest_action;
+    #[pymodule_export]
+    use super::plant::{LoopThread, Plant};
+    #[pymodule_export]
+    use super::policy::Policy;
     #[pymodule_export]
     use super::projector::Projector;
     #[pymodule_export]

@@ -145,6 +145,9 @@ fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
             return (None, checks);
         }
     }
+    if let Some(policy) = &snapshot.manifest.task.policy {
+        checks.push(ok(CheckCode::Recipe, policy.to_string()));
+    }
     match Parts::new(&snapshot.manifest) {
         Ok(parts) => {
             checks.extend([

@@ -24,4 +24,6 @@ pub use nearl_controller::constraints;
 pub use nearl_controller::{
     Controller, Excess, Manifest, Networks, Noise, Output, PolicyKind, Snapshot, SnapshotError, State, Task,
 };
-pub use nearl_controller::{command, controller, idm, motors, multiversion, net, normaliser, snapshot, task};
+pub use nearl_controller::{
+    command, controller, file_kind, idm, motors, multiversion, net, normaliser, recipe, snapshot, task,
+};

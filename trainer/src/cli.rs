@@ -5,6 +5,8 @@ mod bench_serve;
 mod demo;
 mod demos;
 mod eval;
+mod export;
+mod import;
 mod plant;
 mod process;
 mod project;
@@ -42,6 +44,10 @@ enum Command {
     Train(train::Train),
     /// Train tasks x algorithms x seeds on all cores.
     Sweep(sweep::SweepCommand),
+    /// Make a snapshot of a policy in an ONNX file.
+    Import(import::Import),
+    /// Write a snapshot's policy as an ONNX file.
+    Export(export::Export),
     /// Run episodes without noise, raw and projected.
     Eval(eval::Eval),
     /// Plant and runtime as two processes, a hot swap, and the report.
@@ -82,6 +88,8 @@ impl Cli {
         match self.command {
             Command::Train(c) => c.run(),
             Command::Sweep(c) => c.run(),
+            Command::Import(c) => c.run(),
+            Command::Export(c) => c.run(),
             Command::Eval(c) => c.run(),
             Command::Demo(c) => c.run(),
             Command::Demos(c) => c.run(),

@@ -10,6 +10,7 @@
 //! Training, evaluation, the real-time loop and replay all call [`Controller::update`]. Noise is an
 //! input: zero on the robot. Nothing is allocated after [`Controller::new`] but Clarabel's one block.
 
+mod foreign;
 mod guard;
 mod maths;
 mod noise;
@@ -22,6 +23,7 @@ use crate::net::{Activation, Forward, Function};
 use crate::normaliser::Normaliser;
 use crate::snapshot::{Networks, PolicyKind, Snapshot, SnapshotError};
 use crate::task::IdmKind;
+use foreign::Foreign;
 use guard::Guard;
 use maths::{hermite, sample};
 use nearl_constraints::{
@@ -53,7 +55,7 @@ pub struct Noise {
 /// Everything a tick produced: what the rollout buffer stores, the log records and the link sends.
 #[derive(Clone, Debug)]
 pub struct Output {
-    /// Network input (n_obs).
+    /// Network input (n_obs, or as many as `[policy] observation` has).
     pub x: Vec<f32>,
     /// Proposed normalised change (n_state), as sampled.
     pub change: Vec<f32>,
@@ -124,6 +126,7 @@ pub struct Controller {
     activation: Activation,
     functions: Vec<Function>,
     normaliser: Normaliser,
+    foreign: Foreign,
     policy: Forward,
     policy_log_std: Vec<f32>,
     action_log_std: Vec<f32>,
@@ -156,7 +159,8 @@ impl Controller {
         let (m, n) = (&snapshot.manifest, &snapshot.networks);
         let n_act = m.action_lower.len();
         let kind = m.policy;
-        check_sizes(m, n, &layout)?;
+        let foreign = Foreign::new(m, &model, &layout)?;
+        check_sizes(m, n, &layout, foreign.n_seen(&layout))?;
         let (inverse, action_log_std) = match (kind, m.task.idm.kind, &n.idm) {
             (PolicyKind::Direct, ..) => (Inverse::Direct, n.policy_log_std.clone()),
             (_, IdmKind::Pinocchio, _) => {
@@ -182,6 +186,7 @@ impl Controller {
             kind,
             activation: m.activation,
             normaliser: n.normaliser.clone(),
+            foreign,
             policy: Forward::layered(&n.policy, m.policy_functions(n.policy.layers.len())),
             functions: m.policy_functions(n.policy.layers.len()),
             policy_log_std: n.policy_log_std.clone(),
@@ -252,11 +257,12 @@ impl Controller {
         if !out.policy_tick {
             return;
         }
-        self.normaliser.observation(&self.held.obs, &mut out.x);
+        self.foreign.see(&self.held, self.tick as f64 * self.dt, &self.normaliser, &mut out.x);
         let mean = self.policy.forward(&out.x);
         self.mean[..mean.len()].copy_from_slice(mean);
         out.log_prob_proposal = 0.0;
         if self.kind == PolicyKind::Direct {
+            self.foreign.command(&mut self.mean[..self.action_range.len()]);
             return;
         }
         let n = self.layout.n_state();
@@ -427,6 +433,7 @@ impl Controller {
     /// Starts a new episode: the next tick is a policy tick.
     pub fn reset(&mut self) {
         self.tick = 0;
+        self.foreign.reset();
         self.projector().forget();
     }
 
@@ -515,7 +522,7 @@ impl Controller {
     /// a brake is stored.
     pub fn remembers(&self) -> bool {
         let last = self.last_word();
-        self.policy_every > 1 || last.needs_previous() || last.stores_a_brake()
+        self.policy_every > 1 || self.foreign.remembers() || last.needs_previous() || last.stores_a_brake()
     }
     /// Limits by degree of freedom.
     pub fn limits(&self) -> &LimitSet {
@@ -563,9 +570,9 @@ impl Controller {
     }
     /// An output of the right sizes.
     pub fn output(&self) -> Output {
-        let (o, s, a) = (self.layout.n_obs(), self.layout.n_state(), self.n_act());
+        let (s, a) = (self.layout.n_state(), self.n_act());
         Output {
-            x: vec![0.0; o],
+            x: vec![0.0; self.policy.n_in()],
             change: vec![0.0; s],
             proposal: vec![0.0; s],
             target: vec![0.0; s],

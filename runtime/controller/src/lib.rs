@@ -5,10 +5,12 @@
 pub mod codes;
 pub mod command;
 pub mod controller;
+pub mod file_kind;
 pub mod idm;
 pub mod motors;
 pub mod net;
 pub mod normaliser;
+pub mod recipe;
 pub mod snapshot;
 pub mod task;
 

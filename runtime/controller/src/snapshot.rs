@@ -6,6 +6,7 @@
 mod first;
 
 use crate::codes::SnapshotCode;
+use crate::file_kind::FileKind;
 use crate::net::{Activation, Dense, Function};
 use crate::normaliser::Normaliser;
 use crate::task::{IdmKind, Task};
@@ -161,6 +162,14 @@ pub enum SnapshotError {
         /// What the reader said.
         reason: String,
     },
+    /// Another kind of file.
+    #[error("the file is {kind}, not a snapshot; {next}")]
+    Kind {
+        /// What it is, with an article.
+        kind: &'static str,
+        /// What to do with it.
+        next: &'static str,
+    },
     /// The manifest is missing or not ours.
     #[error("snapshot has no manifest of this program: {reason}; write it with 'nearl train'")]
     Foreign {
@@ -230,7 +239,7 @@ impl SnapshotError {
     pub fn code(&self) -> &'static str {
         match self {
             Self::Unreadable { .. } | Self::Unwritable { .. } => SnapshotCode::Unreadable,
-            Self::Malformed { .. } => SnapshotCode::Malformed,
+            Self::Malformed { .. } | Self::Kind { .. } => SnapshotCode::Malformed,
             Self::Foreign { .. } => SnapshotCode::Foreign,
             Self::Digest { .. } => SnapshotCode::Digest,
             Self::MissingTensor { .. } => SnapshotCode::MissingTensor,
@@ -320,6 +329,9 @@ impl Snapshot {
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
         let malformed = |e: safetensors::SafeTensorError| SnapshotError::Malformed { reason: one_line(&e) };
         let foreign = |reason: String| SnapshotError::Foreign { reason: one_line(&reason) };
+        if let Some(kind) = FileKind::of(bytes).filter(|kind| *kind != FileKind::Safetensors) {
+            return Err(SnapshotError::Kind { kind: kind.name(), next: kind.next() });
+        }
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(malformed)?;
         let file = SafeTensors::deserialize(bytes).map_err(malformed)?;
         let text = header

@@ -3,6 +3,7 @@
 //! An unknown key, a wrong type or a value out of range is one sentence with file, line and key.
 
 use crate::command::CommandSection;
+use crate::recipe::PolicySection;
 use crate::snapshot::ModelFormat;
 use nearl_constraints::{ConstraintSettings, Period};
 use serde::{Deserialize, Serialize};
@@ -41,6 +42,9 @@ pub struct Task {
     /// What the joints are commanded.
     #[serde(default, skip_serializing_if = "CommandSection::is_effort")]
     pub command: CommandSection,
+    /// How a policy made elsewhere sees the state, and what its outputs mean.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub policy: Option<PolicySection>,
     /// Prior constraints.
     pub constraints: ConstraintSettings,
     /// Inverse dynamics.

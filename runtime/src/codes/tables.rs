@@ -40,6 +40,8 @@ codes! {
             "Train with an algorithm that proposes states, not with `ppo`.";
         Holding = "doctor-holding", "Can the motors hold the robot still everywhere within its position limits?",
             "Raise constraints.torque.scale, or narrow the position limits to where the motors can.";
+        Recipe = "doctor-recipe", "What does a policy made elsewhere see, and what do its outputs mean?",
+            "Import the policy again with another recipe.";
         Braking = "doctor-braking", "Can the motors give the decelerations that the position limits count on?",
             "Set constraints.braking = \"stored\", or multiply constraints.acceleration.limit by the number in the sentence.";
         Memory = "doctor-memory", "Is there room for the links in /dev/shm?", "Free space there or remount it larger.";

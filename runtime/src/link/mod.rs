@@ -15,6 +15,7 @@ mod board;
 mod crossing;
 mod debris;
 mod error;
+mod exchange;
 mod home;
 mod memory;
 mod messages;
@@ -35,6 +36,7 @@ pub use bench::{RoundTrip, bench_round_trip};
 #[cfg(feature = "cli")]
 pub(crate) use crossing::{CROSSING, Crossing};
 pub use error::LinkError;
+pub use exchange::{Exchange, Turn};
 #[cfg(feature = "cli")]
 pub(crate) use home::of_user as home_of_user;
 pub use memory::remove_files;

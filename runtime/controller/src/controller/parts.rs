@@ -155,8 +155,14 @@ pub fn seen_entries(m: &Manifest, layout: &StateLayout) -> Result<Vec<usize>, Sn
     }
 }
 
-pub(super) fn check_sizes(m: &Manifest, n: &Networks, layout: &StateLayout) -> Result<(), SnapshotError> {
-    let (o, s, a) = (layout.n_obs(), layout.n_state(), m.action_lower.len());
+/// `o` is the number of entries that the policy sees.
+pub(super) fn check_sizes(
+    m: &Manifest,
+    n: &Networks,
+    layout: &StateLayout,
+    o: usize,
+) -> Result<(), SnapshotError> {
+    let (s, a) = (layout.n_state(), m.action_lower.len());
     let direct = m.policy == PolicyKind::Direct;
     let out = if direct { a } else { s };
     let mut want = vec![

@@ -1,0 +1,197 @@
+"""Policies made elsewhere, as controllers of this package.
+
+    controller = nearl.import_onnx("policy.onnx", robot="go1.xml", recipe="go1.toml")
+    controller.save("go1.safetensors")                 # for nearl run, nearl doctor, nearl plant
+
+    model = stable_baselines3.PPO("MlpPolicy", "nearl/HalfCheetah-v5").learn(1_000_000)
+    controller = nearl.import_sb3(model, task="HalfCheetah-v5")
+
+Live objects are read, never files of theirs: the library that wrote a file loads it, and its weights come over as arrays.
+"""
+
+import math
+import os
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from nearl._core import Controller, Policy
+
+_Path = str | os.PathLike[str]
+_Layer = tuple[np.ndarray, np.ndarray, str]
+
+# What follows a layer, by the name of the module's class.
+_FUNCTIONS = {"Identity": "identity", "Tanh": "tanh", "ReLU": "relu", "SiLU": "silu", "Sigmoid": "sigmoid", "ELU": "elu", "Softplus": "softplus"}
+# Modules that do nothing when a policy acts.
+_NOTHING = ("Identity", "Flatten", "Dropout", "FlattenExtractor")
+
+
+def import_onnx(path: _Path, robot: _Path, recipe: _Path | None = None, output: str | None = None, name: str = "policy") -> Controller:
+    """The controller of the policy in an ONNX file.
+
+    Args:
+        path: The file; external data lies beside it.
+        robot: URDF or MJCF file.
+        recipe: TOML file that says what the policy sees and what its outputs mean, where the file's metadata does not.
+        output: Which of several outputs is the action.
+        name: Of the task.
+
+    Raises:
+        ValueError: the file is no policy, names a node that is not read, or something does not fit robot or recipe.
+    """
+    return Policy.from_onnx(path, output).controller(robot, recipe, name)
+
+
+def import_torch(
+    module: Any,
+    robot: _Path | None = None,
+    recipe: _Path | None = None,
+    *,
+    task: str | None = None,
+    mean: Any = None,
+    std: Any = None,
+    clip: float = math.inf,
+    output_clip: tuple[float, float] = (-math.inf, math.inf),
+    name: str = "policy",
+) -> Controller:
+    """The controller of a policy that is a ``torch.nn.Sequential`` of linear layers, or that has one as its ``actor``.
+
+    Args:
+        module: The live object. An ``actor_obs_normalizer`` of rsl_rl is read with it.
+        robot: URDF or MJCF file; or ``task``.
+        recipe: As for :func:`import_onnx`.
+        task: Task of this package whose environment gives the observation, in place of robot and recipe.
+        mean: Of each observation entry; 0 if not given.
+        std: Of each observation entry, with the normaliser's epsilon; 1 if not given.
+        clip: Network inputs are cut to this many standard deviations.
+        output_clip: Outputs are cut to this range before scale and offset.
+        name: Of the task made of robot and recipe.
+
+    Raises:
+        ValueError: a module that is no layer of a policy, by name.
+    """
+    policy = _policy(_layers(getattr(module, "actor", module)), *_normaliser(module, mean, std), clip, output_clip)
+    return _place(policy, robot, recipe, task, name)
+
+
+def import_sb3(
+    model: Any,
+    vec_normalize: Any = None,
+    *,
+    task: str | None = None,
+    robot: _Path | None = None,
+    recipe: _Path | None = None,
+    name: str = "policy",
+) -> Controller:
+    """The controller of a Stable-Baselines3 model (PPO, A2C, SAC, TD3, DDPG): its mean action.
+
+    Args:
+        model: The live object.
+        vec_normalize: The ``VecNormalize`` it was trained with.
+        task: Task of this package whose environment gives the observation; or ``robot`` and ``recipe``.
+        robot: URDF or MJCF file.
+        recipe: As for :func:`import_onnx`.
+        name: Of the task made of robot and recipe.
+
+    Raises:
+        ValueError: a part of the policy that is no layer, by name.
+    """
+    space, policy = model.action_space, model.policy
+    low, high = np.asarray(space.low, float).ravel(), np.asarray(space.high, float).ravel()
+    actor = getattr(policy, "actor", None)
+    if actor is None:  # PPO, A2C: the action is cut to its range
+        layers = [*_layers(policy.mlp_extractor.policy_net), *_layers(policy.action_net)]
+        squashed = bool(getattr(policy, "squash_output", False))
+    elif hasattr(actor, "latent_pi"):  # SAC: the mean is squashed
+        layers, squashed = [*_layers(actor.latent_pi), *_layers(actor.mu), _squash(len(low))], True
+    else:  # TD3, DDPG: the network ends with a tanh
+        layers, squashed = _layers(actor.mu), True
+    if squashed:
+        layers = [*layers, (np.diag((high - low) / 2), (high + low) / 2, "identity")]
+    mean = std = None
+    clip = math.inf
+    if vec_normalize is not None and vec_normalize.norm_obs:
+        rms = vec_normalize.obs_rms
+        mean, std = rms.mean, np.sqrt(np.asarray(rms.var) + vec_normalize.epsilon)
+        clip = float(vec_normalize.clip_obs)
+    size = np.shape(layers[0][0])[1]
+    mean, std = _moments(mean, std, size)
+    made = _policy(layers, mean, std, clip, (-math.inf, math.inf))
+    return _place(made, robot, recipe, task, name)
+
+
+def _place(policy: Policy, robot: _Path | None, recipe: _Path | None, task: str | None, name: str) -> Controller:
+    if task is not None and robot is None:
+        return policy.in_task(task)
+    if robot is None or task is not None:
+        raise ValueError("give either task=, or robot= and recipe=")
+    return policy.controller(robot, recipe, name)
+
+
+def _policy(layers: list[_Layer], mean: Any, std: Any, clip: float, output_clip: tuple[float, float]) -> Policy:
+    if not layers:
+        raise ValueError("the module has no linear layer; give the policy's network")
+    mean, std = _moments(mean, std, np.shape(layers[0][0])[1])
+    return Policy.from_layers(layers, mean, std, (-clip, clip), output_clip)
+
+
+def _moments(mean: Any, std: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
+    mean = np.zeros(size) if mean is None else _numbers(mean).ravel()
+    std = np.ones(size) if std is None else _numbers(std).ravel()
+    return mean, std
+
+
+def _normaliser(module: Any, mean: Any, std: Any) -> tuple[Any, Any]:
+    """Of rsl_rl: ``(x - mean) / (std + eps)``."""
+    normaliser = getattr(module, "actor_obs_normalizer", None)
+    if mean is not None or std is not None or normaliser is None or not hasattr(normaliser, "_mean"):
+        return mean, std
+    return normaliser._mean, _numbers(normaliser._std) + float(normaliser.eps)
+
+
+def _squash(n: int) -> _Layer:
+    return np.eye(n), np.zeros(n), "tanh"
+
+
+def _layers(module: Any) -> list[_Layer]:
+    """The linear layers of a module with what follows each, in the order in which a Sequential runs them."""
+    layers: list[_Layer] = []
+    for part in _flat(module):
+        kind = type(part).__name__
+        if kind == "Linear":
+            weight = _numbers(part.weight)
+            bias = np.zeros(len(weight)) if part.bias is None else _numbers(part.bias)
+            layers.append((weight, bias, "identity"))
+        elif kind in _NOTHING:
+            continue
+        elif kind in _FUNCTIONS:
+            if getattr(part, "alpha", 1.0) != 1.0 or getattr(part, "beta", 1.0) != 1.0:
+                raise ValueError(f"module {part} has another alpha or beta than 1, which is not known")
+            if not layers:
+                raise ValueError(f"module {part} stands before the first linear layer; give the policy's network alone")
+            if layers[-1][2] != "identity":
+                n = len(layers[-1][1])
+                layers.append((np.eye(n), np.zeros(n), "identity"))
+            layers[-1] = (*layers[-1][:2], _FUNCTIONS[kind])
+        else:
+            raise ValueError(f"module {kind} is none that a policy's layers consist of; export the policy as ONNX if it is made of them")
+    return layers
+
+
+def _flat(module: Any) -> Iterable[Any]:
+    """Parts in order. Only a Sequential says in which order its parts run."""
+    kind = type(module).__name__
+    if kind == "Sequential" or isinstance(module, list | tuple) or (kind == "MLP" and hasattr(module, "__iter__")):
+        for part in module:
+            yield from _flat(part)
+    else:
+        yield module
+
+
+def _numbers(value: Any) -> np.ndarray:
+    """A tensor of torch, or anything NumPy accepts, as an array."""
+    for step in ("detach", "cpu", "numpy"):
+        if hasattr(value, step):
+            value = getattr(value, step)()
+    return np.asarray(value, float)

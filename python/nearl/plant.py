@@ -1,0 +1,154 @@
+"""A robot's driver in Python, and the loop beside it.
+
+with nearl.Plant("arm", joints=["slide"], observation=["q.slide", "v.slide"], dt=0.01, nu=1) as plant:
+    while True:
+        turn, action = plant.exchange(q, v, [*q, *v], patience=0.006)
+        ...                                  # "act" and "hold" give an action; at "brake" the driver stops the robot
+
+with nearl.Loop("policy.safetensors", "arm") as loop:     # in place of `nearl run` in another terminal
+    ...
+print(loop.report["counters"])
+"""
+
+import json
+import os
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any
+
+from numpy.typing import ArrayLike, NDArray
+
+from nearl import _core
+
+
+class Plant:
+    """A robot or a simulator in front of a loop, up to a few hundred hertz.
+
+    Args:
+        name: As in ``nearl run SNAPSHOT --plant NAME``.
+        joints: Names in the order of v.
+        observation: Names of the observation's entries.
+        dt: Control period [s].
+        nu: Entries of an action.
+        nq: Entries of a configuration; as many as joints if not given.
+        nv: Entries of a velocity; as many as joints if not given.
+        watchdog: Time without a fresh action after which :meth:`exchange` says "brake" [s].
+        lockstep: Time stands still until an action comes, as for a simulator.
+
+    Raises:
+        ConnectionError: another plant has this name, or the links cannot be made.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        joints: Sequence[str],
+        observation: Sequence[str],
+        dt: float,
+        nu: int,
+        *,
+        nq: int | None = None,
+        nv: int | None = None,
+        watchdog: float = 0.02,
+        lockstep: bool = False,
+    ) -> None:
+        self._plant = _core.Plant(name, list(joints), list(observation), dt, nu, nq=nq, nv=nv, watchdog=watchdog, lockstep=lockstep)
+
+    def exchange(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        obs: ArrayLike,
+        patience: float,
+        *,
+        time: float = 0.0,
+        episode: int = 0,
+        begins: bool = False,
+    ) -> tuple[str, NDArray[Any] | None]:
+        """Gives a state to the loop and waits for its action.
+
+        Args:
+            q: Configuration (nq), in Pinocchio's convention.
+            v: Velocity (nv).
+            obs: Observation (n_obs).
+            patience: Longest wait [s]; without a loop there is none, except in lockstep.
+            time: The plant's own clock [s].
+            episode: Number of the episode.
+            begins: This state begins an episode.
+
+        Returns:
+            ``("act", action)``, ``("hold", action)`` with the action of before as none came in time, or ``("brake", None)``: there is no loop, it
+            is silent, or it leaves braking to the plant. Bring the robot to rest then.
+        """
+        return self._plant.exchange(q, v, obs, patience, time=time, episode=episode, begins=begins)
+
+    @property
+    def attached(self) -> bool:
+        """Whether a loop answers."""
+        return self._plant.attached
+
+    def close(self) -> None:
+        """Leaves; the loop sees that the plant is gone."""
+        self._plant.close()
+
+    def __enter__(self) -> "Plant":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+class Loop:
+    """``nearl run`` on threads of this process; Python does not take part in its ticks, but shares its cores.
+
+    Args:
+        snapshot: File or run folder.
+        name: Of the plant.
+        seconds: Of ticks after which it stops by itself.
+        log: Flight log (MCAP).
+        patience: How long to wait for the plant [s].
+        ramp: Time over which the first motion is let in [s].
+        priority: SCHED_FIFO priority, with memory locked.
+    """
+
+    def __init__(
+        self,
+        snapshot: str | os.PathLike[str],
+        name: str,
+        *,
+        seconds: float | None = None,
+        log: str | os.PathLike[str] | None = None,
+        patience: float = 5.0,
+        ramp: float = 0.2,
+        priority: int | None = None,
+    ) -> None:
+        self.report: dict[str, Any] | None = None
+        self._thread = _core.LoopThread(snapshot, name, seconds=seconds, log=log, patience=patience, ramp=ramp, priority=priority)
+
+    @property
+    def running(self) -> bool:
+        """Whether it still runs."""
+        return self._thread.running
+
+    def stop(self) -> dict[str, Any]:
+        """Brings the robot to rest, ends the loop and returns its report.
+
+        Raises:
+            RuntimeError: the snapshot or the plant was refused, with the sentence.
+        """
+        return self._end(wait=False)
+
+    def wait(self) -> dict[str, Any]:
+        """Waits until it has stopped by itself (``seconds``) and returns its report."""
+        return self._end(wait=True)
+
+    def _end(self, wait: bool) -> dict[str, Any]:
+        if self.report is None:
+            self.report = json.loads(self._thread.end(wait))
+        return self.report
+
+    def __enter__(self) -> "Loop":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.stop()

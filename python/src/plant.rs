@@ -1,0 +1,179 @@
+//! A robot's driver, and the loop beside it, from Python (see `nearl.Plant` and `nearl.Loop`).
+
+use std::path::PathBuf;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+
+use nearl_runtime::link::{Exchange, LinkError, Robot, RobotName, STATE_RESET, Turn};
+use nearl_runtime::rt::{RunError, RunReport, RunSettings, Stop, ThreadSettings, run};
+use numpy::PyArray1;
+use pyo3::exceptions::{PyConnectionError, PyRuntimeError};
+use pyo3::prelude::*;
+
+use crate::arrays::{array, vector};
+use crate::errors;
+
+fn error(error: LinkError) -> PyErr {
+    match error {
+        LinkError::Name(_) => errors::value(error),
+        other => PyConnectionError::new_err(other.to_string()),
+    }
+}
+
+/// A robot or simulator in front of a loop.
+#[pyclass(module = "nearl._core", frozen)]
+pub(crate) struct Plant {
+    exchange: Mutex<Option<Exchange>>,
+    /// nq, nv, n_obs, nu.
+    sizes: [usize; 4],
+}
+
+type Told<'py> = (&'static str, Option<Bound<'py, PyArray1<f64>>>);
+
+#[pymethods]
+impl Plant {
+    /// Announces the robot; joints in the order of v. After `watchdog` [s] without a fresh action the plant is told to brake.
+    #[new]
+    #[pyo3(signature = (name, joints, observation, dt, nu, *, nq=None, nv=None, watchdog=0.02, lockstep=false))]
+    fn new(
+        name: &str,
+        joints: Vec<String>,
+        observation: Vec<String>,
+        dt: f64,
+        nu: usize,
+        nq: Option<usize>,
+        nv: Option<usize>,
+        watchdog: f64,
+        lockstep: bool,
+    ) -> PyResult<Plant> {
+        for (what, value) in [("dt", dt), ("watchdog", watchdog)] {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(errors::value(format!("{what} is {value} s; give a positive number of seconds")));
+            }
+        }
+        let (nq, nv, n_obs) = (nq.unwrap_or(joints.len()), nv.unwrap_or(joints.len()), observation.len());
+        let robot = Robot { joints, observation, limits: 0, stated: None, nq, nv, nu, dt, lockstep };
+        let name = RobotName::new(name).map_err(errors::value)?;
+        let mut exchange = Exchange::open(&name, &robot, watchdog).map_err(error)?;
+        let state = exchange.state();
+        (state.nq, state.nv, state.n_obs, state.nu) = (nq as u32, nv as u32, n_obs as u32, nu as u32);
+        Ok(Plant { exchange: Mutex::new(Some(exchange)), sizes: [nq, nv, n_obs, nu] })
+    }
+
+    /// Gives the state to the loop and waits at most `patience` [s]: ("act", action), ("hold", the action before) or ("brake", None).
+    #[pyo3(signature = (q, v, obs, patience, *, time=0.0, episode=0, begins=false))]
+    fn exchange<'py>(
+        &self,
+        q: &Bound<'py, PyAny>,
+        v: &Bound<'py, PyAny>,
+        obs: &Bound<'py, PyAny>,
+        patience: f64,
+        time: f64,
+        episode: u64,
+        begins: bool,
+    ) -> PyResult<Told<'py>> {
+        let py = q.py();
+        let [nq, nv, n_obs, nu] = self.sizes;
+        let (q, v, obs) = (vector("q", q, nq)?, vector("v", v, nv)?, vector("obs", obs, n_obs)?);
+        if !(0.0..=1e6).contains(&patience) {
+            return Err(errors::value(format!("patience is {patience} s; give 0 to 1e6 seconds")));
+        }
+        let told = py.detach(|| {
+            let mut open = self.open();
+            let exchange = open.as_mut()?;
+            let state = exchange.state();
+            state.q[..nq].copy_from_slice(&q);
+            state.v[..nv].copy_from_slice(&v);
+            state.obs[..n_obs].copy_from_slice(&obs);
+            (state.time, state.episode, state.bits) = (time, episode, if begins { STATE_RESET } else { 0 });
+            let told = match exchange.tick(patience) {
+                Turn::Act(action) if action.len() == nu => ("act", Some(action.to_vec())),
+                Turn::Hold(action) if action.len() == nu => ("hold", Some(action.to_vec())),
+                _ => ("brake", None),
+            };
+            if let Some(action) = &told.1 {
+                exchange.state().applied[..nu].copy_from_slice(action);
+            }
+            Some(told)
+        });
+        let (turn, action) =
+            told.ok_or_else(|| PyRuntimeError::new_err("the plant is closed; open another one"))?;
+        Ok((turn, action.map(|a| array(py, &a))))
+    }
+
+    /// Whether a loop answers.
+    #[getter]
+    fn attached(&self) -> bool {
+        self.open().as_ref().is_some_and(Exchange::is_attached)
+    }
+
+    /// Leaves; the loop sees that the plant is gone.
+    fn close(&self) {
+        *self.open() = None;
+    }
+}
+
+impl Plant {
+    fn open(&self) -> MutexGuard<'_, Option<Exchange>> {
+        self.exchange.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+type Running = JoinHandle<Result<RunReport, RunError>>;
+
+/// `nearl run` on threads of this process.
+#[pyclass(module = "nearl._core", frozen)]
+pub(crate) struct LoopThread {
+    stop: Stop,
+    running: Mutex<Option<Running>>,
+}
+
+#[pymethods]
+impl LoopThread {
+    /// Starts the loop of a snapshot on the plant `name`.
+    #[new]
+    #[pyo3(signature = (snapshot, name, *, seconds=None, log=None, patience=5.0, ramp=0.2, priority=None))]
+    fn new(
+        snapshot: PathBuf,
+        name: &str,
+        seconds: Option<f64>,
+        log: Option<PathBuf>,
+        patience: f64,
+        ramp: f64,
+        priority: Option<i32>,
+    ) -> PyResult<LoopThread> {
+        let name = RobotName::new(name).map_err(errors::value)?;
+        let thread = ThreadSettings { priority, cpu: None, lock_memory: priority.is_some() };
+        let settings = RunSettings { seconds, log, patience, ramp, thread, ..RunSettings::default() };
+        let stop = Stop::new();
+        let running = std::thread::Builder::new().name("nearl-loop".into()).spawn({
+            let stop = stop.clone();
+            move || run(&settings, &snapshot, &name, &stop)
+        });
+        let running =
+            running.map_err(|e| PyRuntimeError::new_err(format!("no thread could be started: {e}")))?;
+        Ok(LoopThread { stop, running: Mutex::new(Some(running)) })
+    }
+
+    /// Whether it still runs.
+    #[getter]
+    fn running(&self) -> bool {
+        let held = self.running.lock().unwrap_or_else(PoisonError::into_inner);
+        held.as_ref().is_some_and(|thread| !thread.is_finished())
+    }
+
+    /// Asks it to stop (unless `wait`), waits for its end and returns the report as JSON.
+    #[pyo3(signature = (wait=false))]
+    fn end(&self, py: Python<'_>, wait: bool) -> PyResult<String> {
+        if !wait {
+            self.stop.request();
+        }
+        let taken = self.running.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let thread = taken.ok_or_else(|| PyRuntimeError::new_err("the loop has ended; start another one"))?;
+        let report = py
+            .detach(|| thread.join())
+            .map_err(|_| PyRuntimeError::new_err("the loop panicked; report it"))?;
+        let report = report.map_err(|e| PyRuntimeError::new_err(e.to_string()))?;
+        serde_json::to_string(&report).map_err(errors::value)
+    }
+}

@@ -1,0 +1,373 @@
+"""Policies made elsewhere give what onnxruntime gives, and what is no policy is refused by name."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from conftest import ROOT, planar_urdf
+
+import nearl
+
+onnx = pytest.importorskip("onnx")
+onnxruntime = pytest.importorskip("onnxruntime")
+from onnx import TensorProto, helper, numpy_helper  # noqa: E402
+
+RNG = np.random.default_rng(7)
+NEARL = ROOT / "target" / "release" / "nearl"
+
+
+class Net:
+    """A graph that grows node by node."""
+
+    def __init__(self, n_in: int) -> None:
+        self.n_in, self.value, self.nodes, self.constants = n_in, "obs", [], []
+
+    def constant(self, array, name: str) -> str:
+        self.constants.append(numpy_helper.from_array(np.asarray(array), name))
+        return name
+
+    def add(self, op: str, *arrays, outputs: int = 1, first: bool = True, **attributes) -> "Net":
+        k = len(self.nodes)
+        names = [a if isinstance(a, str) else self.constant(a, f"c{k}_{i}") for i, a in enumerate(arrays)]
+        out = [f"x{k}_{i}" for i in range(outputs)]
+        self.nodes.append(helper.make_node(op, [self.value, *names] if first else [*names, self.value], out, f"{op}{k}", **attributes))
+        self.value = out[0]
+        return self
+
+    def gemm(self, n_in: int, n_out: int, **attributes) -> "Net":
+        shape = (n_out, n_in) if attributes.get("transB") else (n_in, n_out)
+        return self.add("Gemm", f32(RNG.normal(size=shape) / np.sqrt(n_in)), f32(RNG.normal(size=n_out)), **attributes)
+
+    def save(self, path, n_out: int, opset: int = 17):
+        self.nodes[-1].output[0] = "actions"
+        value = lambda name, n: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, n])  # noqa: E731
+        graph = helper.make_graph(self.nodes, "policy", [value("obs", self.n_in)], [value("actions", n_out)], self.constants)
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
+        onnx.checker.check_model(model)
+        onnx.save(model, path)
+        return path
+
+
+def f32(x) -> np.ndarray:
+    return np.asarray(x, np.float32)
+
+
+def rsl_rl() -> tuple[Net, int]:
+    """As rsl_rl exports: normaliser, ELU, transposed weights."""
+    net = Net(48).add("Sub", f32(RNG.normal(size=(1, 48)))).add("Div", f32(0.1 + RNG.random((1, 48))))
+    for n_in, n_out in ((48, 512), (512, 256), (256, 128)):
+        net.gemm(n_in, n_out, transB=1, alpha=0.5, beta=2.0).add("Elu", alpha=1.0)
+    return net.gemm(128, 12, transB=1), 12
+
+
+def brax() -> tuple[Net, int]:
+    """As Playground's notebook exports: swish, the first half, tanh."""
+    net = Net(52).add("Sub", f32(RNG.normal(size=52))).add("Mul", f32(0.1 + RNG.random(52)))
+    for n_in, n_out in ((52, 128), (128, 64)):
+        net.gemm(n_in, n_out)
+        x = net.value
+        net.add("Sigmoid").add("Mul", x)
+    return net.gemm(64, 24).add("Split", outputs=2, axis=-1, num_outputs=2).add("Tanh"), 12
+
+
+def everything() -> tuple[Net, int]:
+    """Clips, shapes, arithmetic of constants, a function of its own after each layer, a scaled and shifted output."""
+    net = Net(9).add("Reshape", np.array([1, -1])).add("Clip", f32(-2.0), f32(3.0)).add("Sub", f32(RNG.normal(size=9)))
+    var, eps = net.constant(f32(RNG.random(9)), "var"), net.constant(f32(1e-8), "eps")
+    net.nodes.append(helper.make_node("Add", [var, eps], ["var_eps"]))
+    net.nodes.append(helper.make_node("Sqrt", ["var_eps"], ["std"]))
+    net.add("Div", "std").add("Clip", f32(-5.0), f32(5.0))
+    net.add("MatMul", f32(RNG.normal(size=(9, 16)) / 3)).add("Add", f32(RNG.normal(size=16))).add("Softplus")
+    net.gemm(16, 15).add("Relu").add("Identity").gemm(15, 14).add("Sigmoid").gemm(14, 20).add("Tanh")
+    net.add("Slice", np.array([2]), np.array([9]), np.array([1])).add("Mul", f32(RNG.normal(size=7))).add("Neg")
+    return net.add("Sub", f32(0.3), first=False).add("Min", f32(0.9)).add("Max", f32(-0.8)).add("Flatten"), 7
+
+
+@pytest.mark.parametrize("make", [rsl_rl, brax, everything])
+def test_outputs_are_those_of_onnxruntime(tmp_path, make) -> None:
+    net, n_out = make()
+    path = net.save(tmp_path / "policy.onnx", n_out, opset=18)
+    policy, session = nearl.Policy.from_onnx(path), onnxruntime.InferenceSession(path)
+    assert (policy.n_in, policy.n_out) == (net.n_in, n_out)
+    for scale in (0.1, 1.0, 10.0):
+        for _ in range(50):
+            obs = f32(scale * RNG.normal(size=net.n_in))
+            (want,) = session.run(None, {"obs": obs[None]})
+            np.testing.assert_allclose(policy(obs), want[0], rtol=0, atol=1e-5 * max(1.0, np.abs(want).max()))
+
+
+def test_external_data_lies_beside_the_file(tmp_path) -> None:
+    net, n_out = rsl_rl()
+    path = net.save(tmp_path / "policy.onnx", n_out)
+    obs = f32(RNG.normal(size=48))
+    want = nearl.Policy.from_onnx(path)(obs)
+    onnx.save(onnx.load(path), path, save_as_external_data=True, location="policy.onnx.data", size_threshold=0)
+    np.testing.assert_array_equal(nearl.Policy.from_onnx(path)(obs), want)
+    (tmp_path / "policy.onnx.data").unlink()
+    with pytest.raises(ValueError, match=r"constant '.*' lies in 'policy.onnx.data', which cannot be read"):
+        nearl.Policy.from_onnx(path)
+
+
+def unknown(net: Net) -> Net:
+    return net.gemm(4, 3).add("LeakyRelu")
+
+
+def left(net: Net) -> Net:
+    return net.gemm(4, 4).add("Gemm", f32(np.eye(4)), first=False, transB=1)
+
+
+def between(net: Net) -> Net:
+    return net.gemm(4, 3).add("Tanh").add("Clip", f32(-0.5), f32(0.5)).gemm(3, 3)
+
+
+def alpha(net: Net) -> Net:
+    return net.gemm(4, 3).add("Elu", alpha=0.5)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (unknown, r"node 'LeakyRelu1' \(LeakyRelu\) is none that a policy's layers consist of"),
+        (left, r"node 'Gemm1' \(Gemm\) multiplies from the left"),
+        (between, r"node 'Gemm3' \(Gemm\) follows a clip between two layers"),
+        (alpha, r"node 'Elu1' \(Elu\) has alpha = 0.5, where 1 is known"),
+        (lambda net: net.add("Tanh"), "no layer"),
+    ],
+)
+def test_what_is_not_read_is_named(tmp_path, make, said) -> None:
+    path = make(Net(4)).save(tmp_path / "policy.onnx", 4 if make is left or "lambda" in make.__name__ else 3)
+    with pytest.raises(ValueError, match=said):
+        nearl.Policy.from_onnx(path)
+
+
+def test_a_node_that_the_action_does_not_need_is_no_matter(tmp_path) -> None:
+    net = Net(4).gemm(4, 3)
+    net.nodes.append(helper.make_node("LeakyRelu", ["obs"], ["beside"]))
+    net.nodes.reverse()
+    net.nodes[-1].output[0] = "actions"
+    net.nodes.insert(0, net.nodes.pop())
+    value = lambda name, n: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, n])  # noqa: E731
+    graph = helper.make_graph(net.nodes, "p", [value("obs", 4)], [value("beside", 4), value("actions", 3)], net.constants)
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), tmp_path / "p.onnx")
+    assert nearl.Policy.from_onnx(tmp_path / "p.onnx").n_out == 3
+    with pytest.raises(ValueError, match="it has no output 'other'; its outputs are 'beside', 'actions'"):
+        nearl.Policy.from_onnx(tmp_path / "p.onnx", "other")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"PK\x03\x04 archive", "is a zip archive.*nearl.import_sb3"),
+        (b"\x80\x04\x95 pickle", "is a Python pickle, which is never opened"),
+        (b"<robot name='x'/>", "is an XML file.*--robot"),
+        (b"nothing that anybody knows", "of an unknown kind, or damaged"),
+        (b"\x08\x08\x12\x03abc", "of an unknown kind, or damaged"),
+    ],
+)
+def test_files_that_are_no_policy_are_named(tmp_path, content, said) -> None:
+    file = tmp_path / "policy.onnx"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=said):
+        nearl.Policy.from_onnx(file)
+
+
+RECIPE = """
+[time]
+dt = 0.01
+[policy]
+joints = ["joint2", "joint0", "joint1"]
+pose = [0.3, 0.1, 0.2]
+action = { scale = [1.0, 2.0, 3.0], offset = 0.0 }
+observation = [{ term = "joint_pos_rel", clip = [-0.5, 0.5] }, { term = "joint_vel", scale = 0.1, history = 2 }, { term = "actions" },
+               { term = "command", entries = ["command.x", "command.y"] }]
+"""
+
+
+def planar(tmp_path) -> dict:
+    (tmp_path / "planar.urdf").write_text(planar_urdf())
+    (tmp_path / "recipe.toml").write_text(RECIPE)
+    return {"robot": tmp_path / "planar.urdf", "recipe": tmp_path / "recipe.toml"}
+
+
+def test_the_recipe_is_computed_from_the_state(tmp_path) -> None:
+    """Three ticks of an imported policy against NumPy and onnxruntime."""
+    net = Net(14).gemm(14, 8).add("Tanh").gemm(8, 3).add("Tanh")
+    path = net.save(tmp_path / "policy.onnx", 3)
+    controller = nearl.import_onnx(path, **planar(tmp_path))
+    assert controller.obs_names == [*(f"{k}.joint{i}" for k in "qv" for i in range(3)), "command.x", "command.y"]
+    session, order, pose = onnxruntime.InferenceSession(path), [2, 0, 1], np.array([0.3, 0.1, 0.2])
+    last, before = np.zeros(3), None
+    for _ in range(3):
+        q, v, command = RNG.normal(size=3), RNG.normal(size=3), RNG.normal(size=2)
+        now = 0.1 * v[order]
+        obs = np.concatenate([np.clip(q[order] - pose, -0.5, 0.5), now if before is None else before, now, last, command])
+        before = now
+        (out,) = session.run(None, {"obs": f32(obs)[None]})
+        last = out[0]
+        want = np.zeros(3)
+        want[order] = last * [1.0, 2.0, 3.0]
+        action, _ = controller.update(q, v, np.concatenate([q, v, command]))
+        np.testing.assert_allclose(action, np.clip(want, [-35, -13, -2.6], [35, 13, 2.6]), atol=1e-5)
+
+
+def test_a_recipe_that_does_not_fit_is_refused_by_name(tmp_path) -> None:
+    files = planar(tmp_path)
+    path = Net(14).gemm(14, 3).save(tmp_path / "policy.onnx", 3)
+
+    def refused(change: tuple[str, str], said: str) -> None:
+        files["recipe"].write_text(RECIPE.replace(*change))
+        with pytest.raises(ValueError, match=said):
+            nearl.import_onnx(path, **files)
+
+    refused(("joint_pos_rel", "height_scan"), r"recipe.toml: \[policy.observation\[0\].term\] unknown variant `height_scan`")
+    refused(("joint_pos_rel", "projected_gravity"), r"term 1 \('projected_gravity'\): the robot's base is fixed")
+    refused(('"joint2"', '"elbow"'), "elbow")
+    refused((", history = 2", ""), r"has 11 entries \(joint_pos 3, joint_vel 3, last_action 3, command 2\), but the policy's input 'obs' has 14")
+    refused(("dt = 0.01", ""), "the control period is not known")
+    refused(("scale = 0.1", "scale = [1, 2]"), r"term 2 \('joint_vel'\): its scale has 2 numbers for 3 entries")
+    files["recipe"] = None
+    with pytest.raises(ValueError, match="does not say what the 14 entries of its input 'obs' are; give them with --recipe"):
+        nearl.import_onnx(path, **files)
+
+
+def test_the_metadata_of_mjlab_is_a_recipe(tmp_path) -> None:
+    path = Net(12).gemm(12, 3).save(tmp_path / "policy.onnx", 3)
+    model = onnx.load(path)
+    said = {
+        "joint_names": "joint0,joint1,joint2",
+        "joint_stiffness": "20.000,30.000,40.000",
+        "joint_damping": "1.000,2.000,3.000",
+        "default_joint_pos": "0.100,0.200,0.300",
+        "action_scale": "0.5",
+        "observation_names": "joint_pos,joint_vel,actions,command",
+        "command_names": "twist",
+    }
+    helper.set_model_props(model, said)
+    onnx.save(model, path)
+    files = planar(tmp_path)
+    files["recipe"].write_text("[time]\ndt = 0.02\n[command]\ninterface = 'effort'\n")
+    controller = nearl.import_onnx(path, **files)
+    assert controller.obs_names[-3:] == ["command.lin_vel_x", "command.lin_vel_y", "command.ang_vel_z"]
+    helper.set_model_props(model, said | {"observation_names": "joint_pos,height_scan"})
+    onnx.save(model, path)
+    with pytest.raises(ValueError, match="metadata 'observation_names': term 'height_scan' is none"):
+        nearl.import_onnx(path, **files)
+
+
+def test_the_command_line_imports_and_run_says_what_an_onnx_file_is(tmp_path) -> None:
+    path = Net(14).gemm(14, 3).save(tmp_path / "policy.onnx", 3)
+    files = planar(tmp_path)
+    run = lambda *args: subprocess.run([NEARL, *args], capture_output=True, text=True, check=False)  # noqa: E731
+    out = tmp_path / "policy.safetensors"
+    done = run("import", path, "--robot", files["robot"], "--recipe", files["recipe"], "--out", out)
+    assert done.returncode == 0 and "14 inputs" in done.stdout, done.stderr
+    assert nearl.Controller.load(out).algo == "import"
+    refused = run("run", path, "--plant", "nobody")
+    assert refused.returncode != 0 and "is an ONNX model" in refused.stderr and "nearl import" in refused.stderr
+    report = run("doctor", out)
+    assert "joint_vel" in report.stdout and "scale 0.1" in report.stdout and "history 2" in report.stdout, report.stdout
+
+
+@pytest.mark.parametrize("kind", ["direct", "proposing", "imported"])
+def test_export_is_the_policy(tmp_path, kind) -> None:
+    """Through onnxruntime, and back through import."""
+    snapshot = tmp_path / "policy.safetensors"
+    if kind == "imported":
+        net, files = Net(14).gemm(14, 8).add("Tanh").gemm(8, 3).add("Clip", f32(-0.7), f32(0.6)), planar(tmp_path)
+        source = nearl.Policy.from_onnx(net.save(tmp_path / "source.onnx", 3))
+        source.controller(**files).save(snapshot)
+    else:
+        algo = "ppo" if kind == "direct" else "nearl"
+        subprocess.run([NEARL, "train", "HalfCheetah-v5", "--algo", algo, "--steps", "4096", "--out", tmp_path / "run"], check=True)
+        nearl.Controller.load(tmp_path / "run").save(snapshot)
+    path = tmp_path / "exported.onnx"
+    subprocess.run([NEARL, "export", snapshot, "--out", path], check=True)
+    onnx.checker.check_model(onnx.load(path))
+    session, controller = onnxruntime.InferenceSession(path), nearl.Controller.load(snapshot)
+    n_in = session.get_inputs()[0].shape[1]
+    for _ in range(50):
+        obs = f32(3.0 * RNG.normal(size=n_in))
+        (out,) = session.run(None, {"obs": obs[None]})
+        if kind == "imported":
+            np.testing.assert_allclose(out[0], source(obs), atol=1e-5)
+        elif kind == "direct":
+            np.testing.assert_allclose(np.clip(out[0], -1, 1), controller.act(obs), atol=1e-5)
+        else:
+            controller.act(obs)
+            np.testing.assert_allclose(out[0], controller.proposal - obs, atol=1e-4)
+    if kind != "proposing":
+        back = nearl.Policy.from_onnx(path)
+        obs = f32(RNG.normal(size=n_in))
+        (out,) = session.run(None, {"obs": obs[None]})
+        np.testing.assert_allclose(back(obs), out[0], atol=1e-5)
+        assert back.metadata["joint_names"] and "dt = " in back.metadata["nearl_recipe"]
+    if kind == "imported":
+        again = nearl.import_onnx(path, robot=files["robot"])
+        q, v = RNG.normal(size=3), RNG.normal(size=3)
+        both = [c.update(q, v, np.concatenate([q, v, [0.1, 0.2]]))[0] for c in (again, controller)]
+        np.testing.assert_allclose(*both, atol=1e-5)
+
+
+class Linear:
+    def __init__(self, n_in: int, n_out: int) -> None:
+        self.weight, self.bias = RNG.normal(size=(n_out, n_in)), RNG.normal(size=n_out)
+
+    def __call__(self, x):
+        return self.weight @ x + self.bias
+
+
+class Tanh:
+    def __call__(self, x):
+        return np.tanh(x)
+
+
+class ReLU:
+    def __call__(self, x):
+        return np.maximum(x, 0)
+
+
+class LayerNorm:
+    pass
+
+
+class Sequential(list):
+    def __call__(self, x):
+        for part in self:
+            x = part(x)
+        return x
+
+
+def test_live_modules_are_read(tmp_path) -> None:
+    files = planar(tmp_path)
+    net = Sequential([Linear(14, 9), Sequential([Tanh(), Linear(9, 5)]), ReLU(), Linear(5, 3)])
+    mean, std = RNG.normal(size=14), 0.5 + RNG.random(14)
+    nearl.import_torch(net, **files, mean=mean, std=std, clip=2.0).save(tmp_path / "p.safetensors")
+    subprocess.run([NEARL, "export", tmp_path / "p.safetensors", "--out", tmp_path / "p.onnx"], check=True)
+    policy = nearl.Policy.from_onnx(tmp_path / "p.onnx")
+    for _ in range(20):
+        obs = 2 * RNG.normal(size=14)
+        np.testing.assert_allclose(policy(obs), net(np.clip((obs - mean) / std, -2, 2)), rtol=1e-5, atol=1e-5)
+    with pytest.raises(ValueError, match="module LayerNorm is none that a policy's layers consist of"):
+        nearl.import_torch(Sequential([Linear(14, 3), LayerNorm()]), **files)
+
+
+def test_the_actors_of_stable_baselines_are_read() -> None:
+    """Objects with SB3's attributes; its own are too large a requirement for every test run."""
+    box = SimpleNamespace(low=np.full(6, -1.0), high=np.full(6, 1.0))
+    norm = SimpleNamespace(norm_obs=True, clip_obs=10.0, epsilon=1e-8, obs_rms=SimpleNamespace(mean=RNG.normal(size=17), var=0.5 + RNG.random(17)))
+    latent, head = Sequential([Linear(17, 8), Tanh(), Linear(8, 8), Tanh()]), Linear(8, 6)
+    squash = lambda x: np.tanh(x)  # noqa: E731
+    policies = {
+        "ppo": (SimpleNamespace(mlp_extractor=SimpleNamespace(policy_net=latent), action_net=head), lambda x: np.clip(x, -1, 1)),
+        "sac": (SimpleNamespace(actor=SimpleNamespace(latent_pi=latent, mu=head)), squash),
+        "td3": (SimpleNamespace(actor=SimpleNamespace(mu=Sequential([*latent, head, Tanh()]))), squash),
+    }
+    for name, (policy, end) in policies.items():
+        controller = nearl.import_sb3(SimpleNamespace(policy=policy, action_space=box), norm, task="HalfCheetah-v5")
+        for _ in range(10):
+            obs = 3 * RNG.normal(size=17)
+            x = np.clip((obs - norm.obs_rms.mean) / np.sqrt(norm.obs_rms.var + 1e-8), -10, 10)
+            np.testing.assert_allclose(controller.act(obs), end(head(latent(x))), atol=2e-5, err_msg=name)
+    assert sys.modules.get("torch") is None

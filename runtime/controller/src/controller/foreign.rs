@@ -1,0 +1,66 @@
+//! What stands around a policy made elsewhere: its observation, and the meaning of its outputs.
+
+use super::State;
+use super::parts::unusable;
+use crate::normaliser::Normaliser;
+use crate::recipe::{ActionMap, Observer};
+use crate::snapshot::{Manifest, PolicyKind, SnapshotError};
+use nearl_constraints::{Model, StateLayout};
+
+/// `[policy]` of a task, ready for ticks. A task without the section has neither.
+#[derive(Default)]
+pub(super) struct Foreign {
+    observer: Option<Observer>,
+    map: Option<ActionMap>,
+}
+
+impl Foreign {
+    /// # Errors
+    /// [`SnapshotError::Unusable`] naming the term, joint or key.
+    pub(super) fn new(m: &Manifest, model: &Model, layout: &StateLayout) -> Result<Self, SnapshotError> {
+        let Some(policy) = &m.task.policy else { return Ok(Self::default()) };
+        if m.policy != PolicyKind::Direct {
+            return Err(unusable(
+                &"[policy] is for policies of actions, and this one proposes states; take the section out",
+            ));
+        }
+        let observer = Observer::new(policy, model, layout).map_err(|e| unusable(&e))?;
+        let map = ActionMap::new(policy, model, layout).map_err(|e| unusable(&e))?;
+        Ok(Self { observer, map: Some(map) })
+    }
+
+    /// Number of entries that the policy sees.
+    pub(super) fn n_seen(&self, layout: &StateLayout) -> usize {
+        self.observer.as_ref().map_or(layout.n_obs(), Observer::len)
+    }
+
+    /// Writes the network input at `time` [s] since the reset to `x` (n_seen).
+    pub(super) fn see(&mut self, state: &State, time: f64, normaliser: &Normaliser, x: &mut [f32]) {
+        match &mut self.observer {
+            Some(observer) => normaliser.observation(observer.observe(state, time), x),
+            None => normaliser.observation(&state.obs, x),
+        }
+    }
+
+    /// Turns the outputs of a policy of actions (n_act) into commands.
+    pub(super) fn command(&mut self, outputs: &mut [f32]) {
+        let Some(map) = &mut self.map else { return };
+        map.clip(outputs);
+        if let Some(observer) = &mut self.observer {
+            observer.acted(outputs);
+        }
+        map.command(outputs);
+    }
+
+    /// A new episode.
+    pub(super) fn reset(&mut self) {
+        if let Some(observer) = &mut self.observer {
+            observer.reset();
+        }
+    }
+
+    /// Whether a tick depends on the ones before.
+    pub(super) fn remembers(&self) -> bool {
+        self.observer.is_some()
+    }
+}

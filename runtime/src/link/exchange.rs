@@ -1,0 +1,129 @@
+//! One tick of a plant that keeps its own time: a robot's driver calls [`Exchange::tick`] once in each control period.
+//!
+//! [`PlantRunner`](super::PlantRunner) drives a simulator on a time grid; a real robot often has the clock, and its driver the loop.
+
+use super::{ActionMessage, LinkError, Message, PlantLink, Robot, RobotName, StateMessage};
+use crate::clock;
+
+/// What the driver is to do in this period.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Turn<'a> {
+    /// Apply this action, computed from the state just sent.
+    Act(&'a [f64]),
+    /// Apply the action before once more: none came in time.
+    Hold(&'a [f64]),
+    /// Bring the robot to rest: there is no loop, none answered for the watchdog's time, or it leaves braking to the plant.
+    Brake,
+}
+
+/// The plant announces itself this often [ns].
+const ANNOUNCE: u64 = 100_000_000;
+/// Polls between looks at the clock before a loop was ever seen [ns].
+const SLOW_POLL: u64 = 30_000;
+
+/// A plant's link with its watchdog.
+pub struct Exchange {
+    link: PlantLink,
+    state: StateMessage,
+    last: ActionMessage,
+    /// Time without a fresh action after which the plant brakes [ns].
+    watchdog: u64,
+    last_fresh: u64,
+    is_attached: bool,
+    lockstep: bool,
+    next_announce: u64,
+}
+
+impl Exchange {
+    /// Opens the plant's topics and announces `robot`. After `watchdog` [s] without a fresh action the plant is told to brake.
+    ///
+    /// # Errors
+    /// [`LinkError`]; a second plant of the name is refused.
+    pub fn open(name: &RobotName, robot: &Robot, watchdog: f64) -> Result<Exchange, LinkError> {
+        Ok(Exchange {
+            link: PlantLink::open(name, robot)?,
+            state: StateMessage::zeroed(),
+            last: ActionMessage::zeroed(),
+            watchdog: clock::nanoseconds(watchdog),
+            last_fresh: 0,
+            is_attached: false,
+            lockstep: robot.lockstep,
+            next_announce: 0,
+        })
+    }
+
+    /// The state to be sent next. The link's own numbers (header, tick, due, late, watchdog) are filled in by [`Exchange::tick`].
+    pub fn state(&mut self) -> &mut StateMessage {
+        &mut self.state
+    }
+
+    /// Sends the state and waits at most `patience` [s] for its action. Without a loop it does not wait at all, unless time stands still
+    /// meanwhile (lockstep).
+    pub fn tick(&mut self, patience: f64) -> Turn<'_> {
+        let now = clock::now();
+        if now >= self.next_announce {
+            self.link.announce();
+            self.next_announce = now + ANNOUNCE;
+        }
+        self.state.due = now;
+        self.link.send_state(&mut self.state);
+        self.state.tick += 1;
+        if self.wait(now + clock::nanoseconds(patience)) {
+            self.last_fresh = clock::now();
+            return if self.last.nu > 0 { Turn::Act(self.last.action()) } else { Turn::Brake };
+        }
+        if self.is_attached && clock::now() < self.last_fresh + self.watchdog && self.last.nu > 0 {
+            self.state.late += 1;
+            return Turn::Hold(self.last.action());
+        }
+        if std::mem::take(&mut self.is_attached) {
+            self.state.watchdog += 1;
+        }
+        Turn::Brake
+    }
+
+    /// Whether the action of the state just sent came before `until`.
+    fn wait(&mut self, until: u64) -> bool {
+        loop {
+            let header = self.state.header;
+            if let Some(action) = self.link.newest_action() {
+                let ours = action.state_epoch == header.epoch;
+                if ours && action.is_farewell() {
+                    self.is_attached = false;
+                    return false;
+                }
+                if ours && action.state_seq == header.seq {
+                    self.last = *action;
+                    self.is_attached = true;
+                    return true;
+                }
+                if ours && !self.is_attached {
+                    // an answer to a state of before: there is a loop, which the next states are waited for
+                    (self.is_attached, self.last_fresh) = (true, clock::now());
+                    self.last = *action;
+                }
+            }
+            let now = clock::now();
+            if !self.is_attached {
+                self.link.attend();
+                if !self.lockstep {
+                    return false;
+                }
+            }
+            if now >= until {
+                return false;
+            }
+            if self.is_attached { std::thread::yield_now() } else { clock::sleep_until(now + SLOW_POLL) }
+        }
+    }
+
+    /// Whether a loop answers.
+    pub fn is_attached(&self) -> bool {
+        self.is_attached
+    }
+
+    /// The robot's name.
+    pub fn name(&self) -> &RobotName {
+        self.link.name()
+    }
+}

@@ -1,0 +1,83 @@
+//! Policies made elsewhere: an ONNX file becomes the networks of a snapshot.
+//!
+//! ```text
+//!     bytes -> ModelProto -> chain of steps (graph.rs) -> normaliser and layers (network.rs) -> snapshot (assemble.rs)
+//! ```
+//!
+//! Only what a fully connected policy consists of is read; whatever else lies on the way from the observation to the action is refused by
+//! its name. Nothing of the file is run.
+
+mod assemble;
+mod chain;
+mod elementwise;
+mod file;
+mod graph;
+pub(crate) mod metadata;
+mod network;
+mod tensor;
+
+pub use assemble::{Setting, for_task, snapshot};
+pub use file::{onnx, read};
+pub use network::ImportedNetwork;
+
+/// Why a policy was not imported; one sentence.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ImportError {
+    /// The file cannot be read.
+    #[error("cannot read policy '{file}': {reason}")]
+    Unreadable {
+        /// Path as given.
+        file: String,
+        /// What the system said.
+        reason: String,
+    },
+    /// Another kind of file.
+    #[error("'{file}' is {kind}, not an ONNX policy; {next}")]
+    Kind {
+        /// Path as given.
+        file: String,
+        /// What it is.
+        kind: String,
+        /// What to do.
+        next: String,
+    },
+    /// A node that is none of a policy's, or one with arguments a policy's node does not have.
+    #[error(
+        "node '{name}' ({op}) {reason}; export the policy alone, without what comes before and after its layers"
+    )]
+    Node {
+        /// Name of the node, else of its output.
+        name: String,
+        /// Its operator.
+        op: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Nothing says what the inputs are.
+    #[error(
+        "the file does not say what the {n_in} entries of its input '{input}' are; give them with --recipe FILE, see docs/POLICIES.md"
+    )]
+    NoRecipe {
+        /// Name of the input.
+        input: String,
+        /// Its width.
+        n_in: usize,
+    },
+    /// Metadata that cannot be used.
+    #[error("metadata '{key}': {reason}")]
+    Metadata {
+        /// Its key.
+        key: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A recipe that cannot be used, with the name of its file.
+    #[error("{0}")]
+    Recipe(String),
+    /// A robot file that cannot be used.
+    #[error("{0}")]
+    Robot(String),
+    /// The graph as a whole is no policy.
+    #[error("the graph is no policy: {0}")]
+    Graph(String),
+}

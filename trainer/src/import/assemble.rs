@@ -1,0 +1,309 @@
+//! From an imported network, a robot and a recipe to a snapshot.
+
+use super::metadata;
+use super::{ImportError, ImportedNetwork};
+use crate::robot::{describe, folder_of};
+use nearl_runtime::constraints::{Drive, Model, StateLayout};
+use nearl_runtime::net::Activation;
+use nearl_runtime::normaliser::Normaliser;
+use nearl_runtime::recipe::{Numbers, Observer, PolicySection};
+use nearl_runtime::snapshot::{FORMAT, ModelFormat, Simulation};
+use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, Task};
+use std::path::Path;
+use toml::{Table, Value};
+
+/// Outputs of a network without a clip are taken up to this size; those of a trained policy are a few.
+const MOST: f64 = 100.0;
+/// Logarithm of the standard deviation of a policy that says none: no noise.
+const NO_NOISE: f32 = -20.0;
+
+/// What a policy is imported with.
+#[derive(Clone, Copy, Debug)]
+pub struct Setting<'a> {
+    /// Name of the task; letters of the policy's file.
+    pub name: &'a str,
+    /// Robot file, URDF or MJCF.
+    pub robot: &'a Path,
+    /// Recipe file: a task file of which only `[time] dt` and `[policy]` are needed.
+    pub recipe: Option<&'a Path>,
+}
+
+/// The snapshot of a policy of actions. Whatever the recipe does not say is taken from the file's metadata.
+///
+/// # Errors
+/// [`ImportError`]: what is missing, or what does not fit.
+pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snapshot, ImportError> {
+    let mut table = metadata::recipe(network)?;
+    let mut said_by = "the policy's metadata".to_string();
+    if let Some(path) = setting.recipe {
+        said_by = path.display().to_string();
+        let text = read(path)?;
+        let over = toml::from_str(&text)
+            .map_err(|e| recipe(&said_by, e.message().lines().next().unwrap_or_default()))?;
+        merge(&mut table, over);
+    }
+    if !table.contains_key("policy") {
+        return Err(ImportError::NoRecipe { input: network.input_name.clone(), n_in: network.n_in() });
+    }
+    let model_text = read(setting.robot)?;
+    let model_format = if model_text.contains("<mujoco") { ModelFormat::Mjcf } else { ModelFormat::Urdf };
+    complete(&mut table, setting, model_format);
+    let free = table.get("model").and_then(|m| m.get("free_flyer")).and_then(Value::as_bool).unwrap_or(false);
+    let names_files = model_text.contains("file=") || model_text.contains("filename=");
+    let simulation = Simulation {
+        format: model_format,
+        text: model_text,
+        folder: names_files.then(|| folder_of(setting.robot)),
+    };
+    let unusable =
+        |e: &dyn std::fmt::Display| ImportError::Robot(format!("{}: {e}", setting.robot.display()));
+    let robot = describe(&simulation, free).map_err(|e| unusable(&e))?;
+    let model = Model::from_description(robot.clone()).map_err(|e| unusable(&e))?;
+    state(&mut table, &model, &said_by)?;
+    let mut task =
+        Task::parse(&said_by, &table.to_string(), &[]).map_err(|e| ImportError::Recipe(e.to_string()))?;
+    let mut section = task.policy.take().unwrap_or_default();
+    take_clip(&mut section, network).map_err(|e| recipe(&said_by, &e))?;
+    let layout = layout(&model, &task).map_err(|e| recipe(&said_by, &e))?;
+    check_widths(&section, network, &model, &layout).map_err(|e| recipe(&said_by, &e))?;
+    let (action_lower, action_upper) =
+        ranges(&section, &task, &model, &layout).map_err(|e| recipe(&said_by, &e))?;
+    task.policy = Some(section);
+    let manifest = Manifest {
+        format: FORMAT,
+        task,
+        robot,
+        simulation: Some(simulation),
+        algo: "import".into(),
+        policy: PolicyKind::Direct,
+        activation: Activation::default(),
+        functions: network.functions.clone(),
+        version: 0,
+        steps: 0,
+        action_lower,
+        action_upper,
+    };
+    let snapshot = Snapshot { networks: networks(network, layout.n_state()), manifest };
+    Controller::new(&snapshot).map_err(|e| ImportError::Recipe(format!("{said_by}: {e}")))?;
+    Ok(snapshot)
+}
+
+/// The snapshot of a policy of actions in a task whose environment gives the observation and takes the action; `manifest` is complete.
+///
+/// # Errors
+/// [`ImportError`] where sizes differ.
+pub fn for_task(network: &ImportedNetwork, mut manifest: Manifest) -> Result<Snapshot, ImportError> {
+    let task = manifest.task.name.clone();
+    let (n_in, n_obs) = (network.n_in(), manifest.task.state.observation.len());
+    let (n_out, n_act) = (network.n_out(), manifest.action_lower.len());
+    if (n_in, n_out) != (n_obs, n_act) {
+        let reason = format!(
+            "the policy takes {n_in} entries and gives {n_out}, but the task has {n_obs} observation and {n_act} action entries"
+        );
+        return Err(recipe(&task, &reason));
+    }
+    for (i, [lower, upper]) in network.output.iter().enumerate() {
+        manifest.action_lower[i] = manifest.action_lower[i].max(*lower);
+        manifest.action_upper[i] = manifest.action_upper[i].min(*upper);
+    }
+    manifest.policy = PolicyKind::Direct;
+    manifest.functions.clone_from(&network.functions);
+    manifest.algo = "import".into();
+    let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
+    let snapshot = Snapshot { networks: networks(network, n_state), manifest };
+    Controller::new(&snapshot).map_err(|e| recipe(&task, &e.to_string()))?;
+    Ok(snapshot)
+}
+
+fn recipe(said_by: &str, reason: &str) -> ImportError {
+    ImportError::Recipe(format!("{said_by}: {reason}"))
+}
+
+fn read(path: &Path) -> Result<String, ImportError> {
+    std::fs::read_to_string(path)
+        .map_err(|e| ImportError::Unreadable { file: path.display().to_string(), reason: e.to_string() })
+}
+
+/// What `over` says, and what only `base` says.
+fn merge(base: &mut Table, over: Table) {
+    for (key, value) in over {
+        match (base.get_mut(&key), value) {
+            (Some(Value::Table(inner)), Value::Table(value)) => merge(inner, value),
+            (_, value) => drop(base.insert(key, value)),
+        }
+    }
+}
+
+/// Keys that follow from the files.
+fn complete(table: &mut Table, setting: &Setting<'_>, format: ModelFormat) {
+    let mut default = |key: &str, value: Value| {
+        table.entry(key).or_insert(value);
+    };
+    default("name", setting.name.into());
+    default("model", Table::new().into());
+    default("time", Table::new().into());
+    default("idm", Table::from_iter([("kind".to_string(), Value::from("pinocchio"))]).into());
+    let torque = Table::from_iter([("scale".to_string(), Value::from(1.0))]);
+    let constraints = [("guard".to_string(), Value::from(true)), ("torque".to_string(), Value::from(torque))];
+    default("constraints", Table::from_iter(constraints).into());
+    let key = if format == ModelFormat::Mjcf { "mjcf" } else { "urdf" };
+    if let Some(model) = table.get_mut("model").and_then(Value::as_table_mut) {
+        model.insert(key.into(), setting.robot.display().to_string().into());
+    }
+    if let Some(time) = table.get_mut("time").and_then(Value::as_table_mut) {
+        time.entry("sim_dt").or_insert(Value::from(0.0));
+    }
+}
+
+/// `[state]`: positions and velocities of the policy's joints in the robot's order, and what the terms read of the plant.
+fn state(table: &mut Table, model: &Model, said_by: &str) -> Result<(), ImportError> {
+    let missing = |what: &str| recipe(said_by, what);
+    if table.get("time").and_then(|t| t.get("dt")).is_none() {
+        return Err(missing(
+            "the control period is not known; give a recipe with [time] dt = 0.02, in seconds",
+        ));
+    }
+    let policy = table.get("policy").cloned().unwrap_or(Table::new().into());
+    let policy: PolicySection = serde_path_to_error::deserialize(policy)
+        .map_err(|e| missing(&format!("[policy.{}] {}", e.path(), e.inner().to_string().trim_end())))?;
+    let state = table.entry("state").or_insert(Table::new().into());
+    let Some(state) = state.as_table_mut() else { return Err(missing("[state] is no section")) };
+    let mut joints = Vec::new();
+    for name in &policy.joints {
+        joints.push(model.joint(name).map_err(|e| missing(&format!("[policy.joints] {e}")))?);
+    }
+    joints.sort_by_key(|j| j.idx_v);
+    joints.dedup_by_key(|j| j.idx_v);
+    let strings = |names: &[String]| Value::Array(names.iter().map(|n| Value::from(n.as_str())).collect());
+    let names = |kind: &str| joints.iter().map(|j| format!("{kind}.{}", j.name)).collect::<Vec<_>>();
+    let proposed = [names("q"), names("v")].concat();
+    state.entry("propose").or_insert(strings(&proposed));
+    let controllable: Vec<String> = joints.iter().map(|j| j.name.clone()).collect();
+    state.entry("controllable").or_insert(strings(&controllable));
+    if state.contains_key("observation") {
+        return Ok(());
+    }
+    if policy.observation.is_empty() {
+        return Err(missing(
+            "[policy] has no observation and [state] neither; give the terms of the policy's observation, or state.observation with the \
+             entries that the plant gives in its order",
+        ));
+    }
+    let mut observed = proposed;
+    for name in policy.observation.iter().flat_map(|t| &t.entries) {
+        if !observed.contains(name) {
+            observed.push(name.clone());
+        }
+    }
+    state.insert("observation".into(), strings(&observed));
+    Ok(())
+}
+
+fn layout(model: &Model, task: &Task) -> Result<StateLayout, String> {
+    let s = &task.state;
+    StateLayout::new(model, &s.observation, s.propose.as_deref(), s.controllable.as_deref())
+        .map_err(|e| e.to_string())
+}
+
+/// The clip that the network ends with, within the one of the recipe.
+fn take_clip(section: &mut PolicySection, network: &ImportedNetwork) -> Result<(), String> {
+    const FAR: f64 = 1e30; // stands for no clip: numbers in a task file are finite
+    if network.output.iter().all(|[l, u]| l.is_infinite() && u.is_infinite()) {
+        return Ok(());
+    }
+    let n = network.n_out();
+    let side = |side: usize| network.output.iter().map(|c| c[side].clamp(-FAR, FAR)).collect::<Vec<f64>>();
+    let (mut lower, mut upper) = (side(0), side(1));
+    if let Some([l, u]) = &section.action.clip {
+        let (l, u) = (l.spread("policy.action.clip", n)?, u.spread("policy.action.clip", n)?);
+        (0..n).for_each(|i| (lower[i], upper[i]) = (lower[i].max(l[i]), upper[i].min(u[i])));
+    }
+    section.action.clip = Some([Numbers::Each(lower), Numbers::Each(upper)]);
+    Ok(())
+}
+
+/// The recipe's terms and joints against the network's inputs and outputs.
+fn check_widths(
+    section: &PolicySection,
+    network: &ImportedNetwork,
+    model: &Model,
+    layout: &StateLayout,
+) -> Result<(), String> {
+    let (joints, n_out) = (section.joints.len(), network.n_out());
+    if joints != n_out {
+        return Err(format!(
+            "[policy] has {joints} joints, but the policy's output '{}' has {n_out} entries",
+            network.output_name
+        ));
+    }
+    let observer = Observer::new(section, model, layout)?;
+    let (seen, n_in) = (observer.as_ref().map_or(layout.n_obs(), Observer::len), network.n_in());
+    if seen == n_in {
+        return Ok(());
+    }
+    let widths = observer.map_or(String::new(), |o| {
+        let each = section.observation.iter().zip(o.widths()).map(|(t, n)| format!("{} {n}", t.term.name()));
+        format!(" ({})", each.collect::<Vec<_>>().join(", "))
+    });
+    Err(format!(
+        "the observation has {seen} entries{widths}, but the policy's input '{}' has {n_in}",
+        network.input_name
+    ))
+}
+
+/// Lowest and highest command of each controllable joint: the motor's for a force, what the policy can ask for otherwise.
+fn ranges(
+    section: &PolicySection,
+    task: &Task,
+    model: &Model,
+    layout: &StateLayout,
+) -> Result<(Vec<f64>, Vec<f64>), String> {
+    let n = section.joints.len();
+    let scale = section.action.scale.spread("policy.action.scale", n)?;
+    let pose = if section.pose.is_empty() { vec![0.0; n] } else { section.pose.clone() };
+    let offset =
+        section.action.offset.clone().unwrap_or(Numbers::Each(pose)).spread("policy.action.offset", n)?;
+    let clip = match &section.action.clip {
+        None => vec![[-MOST, MOST]; n],
+        Some([l, u]) => {
+            let (l, u) = (l.spread("policy.action.clip", n)?, u.spread("policy.action.clip", n)?);
+            l.into_iter().zip(u).map(|(l, u)| [l.max(-MOST), u.min(MOST)]).collect()
+        }
+    };
+    let drives = task.command.drives(model, layout.controllable())?;
+    let (mut lower, mut upper) = (Vec::new(), Vec::new());
+    for &dof in layout.controllable() {
+        let joint = model.dof_name(dof);
+        let at = section.joints.iter().position(|j| *j == joint);
+        let i =
+            at.ok_or_else(|| format!("the policy gives no command for the controllable joint '{joint}'"))?;
+        let effort = model.effort_limit()[dof];
+        let ends = match drives[dof] {
+            Drive::Effort if effort.is_finite() => [-effort, effort],
+            Drive::Effort => {
+                return Err(format!(
+                    "the robot file does not say how strong the motor of joint '{joint}' is; give its effort limit"
+                ));
+            }
+            _ => clip[i].map(|x| offset[i] + scale[i] * x),
+        };
+        lower.push(ends[0].min(ends[1]));
+        upper.push(ends[0].max(ends[1]));
+    }
+    Ok((lower, upper))
+}
+
+fn networks(network: &ImportedNetwork, n_state: usize) -> Networks {
+    let clip = network.clip.clone();
+    Networks {
+        normaliser: Normaliser {
+            mean: network.mean.clone(),
+            std: network.std.clone(),
+            scale: vec![1.0; n_state],
+            clip,
+        },
+        policy: network.dense.clone(),
+        policy_log_std: vec![NO_NOISE; network.n_out()],
+        idm: None,
+    }
+}

@@ -1,0 +1,394 @@
+//! From the nodes of a file to a chain of steps.
+
+use super::ImportError;
+use super::chain::{Live, Step};
+use super::network::ImportedNetwork;
+use super::tensor::Tensor;
+use nearl_runtime::net::Function;
+use rten_onnx::onnx::{AttributeProto, GraphProto, NodeProto};
+use std::collections::HashMap;
+use std::path::Path;
+
+/// What a name of the graph stands for.
+#[derive(Clone)]
+enum Value {
+    Constant(Tensor),
+    /// Depends on an input: number of its last step.
+    Live(usize),
+    /// Cannot be read; only said if the action depends on it.
+    Refused(ImportError),
+}
+
+/// Outputs that hold the action where a file has several.
+const ACTIONS: [&str; 6] = ["actions", "action", "continuous_actions", "mu", "mean", "output"];
+
+/// The values of a graph, node by node.
+pub(super) struct Graph<'a> {
+    values: HashMap<&'a str, Value>,
+    lives: Vec<Live>,
+    outputs: Vec<&'a str>,
+    beside: Option<&'a Path>,
+}
+
+impl<'a> Graph<'a> {
+    /// Reads constants and inputs, then every node in order.
+    pub(super) fn new(graph: &'a GraphProto, beside: Option<&'a Path>) -> Self {
+        let outputs = graph.output.iter().filter_map(|o| o.name.as_deref()).collect();
+        let mut this = Self { values: HashMap::new(), lives: Vec::new(), outputs, beside };
+        for constant in &graph.initializer {
+            let name = constant.name.as_deref().unwrap_or_default();
+            let value = Tensor::read(constant, beside).map_or_else(
+                |reason| Value::Refused(ImportError::Graph(format!("constant '{name}' {reason}"))),
+                Value::Constant,
+            );
+            this.values.insert(name, value);
+        }
+        for input in &graph.input {
+            let Some(name) = input.name.as_deref() else { continue };
+            let shape =
+                input.r#type.as_ref().and_then(|t| t.tensor_type.as_ref()).and_then(|t| t.shape.as_ref());
+            let last = shape.and_then(|s| s.dim.last()).and_then(|d| d.dim_value);
+            let width = last.and_then(|d| usize::try_from(d).ok()).filter(|&d| d > 0);
+            if !this.values.contains_key(name) {
+                let live = this.push(None, Step::Input(name.into(), width), name, "input");
+                this.values.insert(name, live);
+            }
+        }
+        graph.node.iter().for_each(|node| this.node(node));
+        this
+    }
+
+    /// The policy whose action is `output`, or the one output that can be it.
+    pub(super) fn policy(self, output: Option<&str>) -> Result<ImportedNetwork, ImportError> {
+        let names = || self.outputs.iter().map(|o| format!("'{o}'")).collect::<Vec<_>>().join(", ");
+        let chosen = match (output, &self.outputs[..]) {
+            (Some(name), all) => all.iter().copied().find(|o| *o == name).ok_or_else(|| {
+                ImportError::Graph(format!("it has no output '{name}'; its outputs are {}", names()))
+            })?,
+            (None, [only]) => only,
+            (None, all) => ACTIONS.iter().copied().find(|a| all.contains(a)).ok_or_else(|| {
+                ImportError::Graph(format!(
+                    "none of its outputs {} is called actions; name one with --output",
+                    names()
+                ))
+            })?,
+        };
+        match self.values.get(chosen) {
+            Some(Value::Live(last)) => ImportedNetwork::of_chain(&self.chain(*last), chosen),
+            Some(Value::Refused(error)) => Err(error.clone()),
+            Some(Value::Constant(_)) => {
+                Err(ImportError::Graph(format!("its output '{chosen}' is a constant")))
+            }
+            None => Err(ImportError::Graph(format!("nothing computes its output '{chosen}'"))),
+        }
+    }
+
+    /// From the input to step `last`.
+    fn chain(&self, last: usize) -> Vec<&Live> {
+        let mut chain: Vec<&Live> =
+            std::iter::successors(Some(last), |&i| self.lives[i].before).map(|i| &self.lives[i]).collect();
+        chain.reverse();
+        chain
+    }
+
+    fn push(&mut self, before: Option<usize>, step: Step, name: &str, op: &str) -> Value {
+        self.lives.push(Live { before, step, name: name.into(), op: op.into() });
+        Value::Live(self.lives.len() - 1)
+    }
+
+    fn node(&mut self, node: &'a NodeProto) {
+        let op = node.op_type.as_deref().unwrap_or_default();
+        let first = node.output.first().map_or("", String::as_str);
+        let name = node.name.as_deref().filter(|n| !n.is_empty()).unwrap_or(first);
+        let inputs: Vec<Option<Value>> =
+            node.input.iter().map(|i| self.values.get(i.as_str()).cloned()).collect();
+        let refused = inputs.iter().flatten().find_map(|v| match v {
+            Value::Refused(e) => Some(e.clone()),
+            _ => None,
+        });
+        let result = match refused {
+            Some(error) => Err(error),
+            None => self.evaluate(node, op, name, &inputs).map_err(|reason| ImportError::Node {
+                name: name.into(),
+                op: op.into(),
+                reason,
+            }),
+        };
+        for (i, output) in node.output.iter().enumerate() {
+            let value = match &result {
+                Ok(values) => values.get(i).cloned().unwrap_or_else(|| {
+                    Value::Refused(ImportError::Node {
+                        name: name.into(),
+                        op: op.into(),
+                        reason: format!("has an output '{output}' that is not read"),
+                    })
+                }),
+                Err(error) => Value::Refused(error.clone()),
+            };
+            self.values.insert(output, value);
+        }
+    }
+
+    /// The node's outputs, or what is wrong with it.
+    fn evaluate(
+        &mut self,
+        node: &NodeProto,
+        op: &str,
+        name: &str,
+        inputs: &[Option<Value>],
+    ) -> Result<Vec<Value>, String> {
+        if node.domain.as_deref().is_some_and(|d| !d.is_empty() && d != "ai.onnx") {
+            return Err("is not one of ONNX's own".into());
+        }
+        if op == "Constant" {
+            let attribute = node.attribute.first().ok_or("has no value")?;
+            return Ok(vec![Value::Constant(Tensor::of_attribute(attribute, self.beside)?)]);
+        }
+        match inputs.first() {
+            Some(Some(Value::Constant(x))) if constants(inputs).is_some() => {
+                let all = constants(inputs).unwrap_or_default();
+                fold(op, x, &all).map(|t| vec![Value::Constant(t)])
+            }
+            _ => self.step(node, op, name, inputs),
+        }
+    }
+
+    /// A node with an input that depends on the observation.
+    fn step(
+        &mut self,
+        node: &NodeProto,
+        op: &str,
+        name: &str,
+        inputs: &[Option<Value>],
+    ) -> Result<Vec<Value>, String> {
+        if let ("Mul", [Some(Value::Live(a)), Some(Value::Live(b))]) = (op, inputs) {
+            return self.swish(*a, *b, name).map(|v| vec![v]);
+        }
+        let at = inputs.iter().position(|v| matches!(v, Some(Value::Live(_))));
+        let Some((at, Some(Value::Live(x)))) = at.map(|at| (at, inputs[at].clone())) else {
+            return Err("has no input that this program knows".into());
+        };
+        let constant = |i: usize| match inputs.get(i) {
+            Some(Some(Value::Constant(t))) => Some(t),
+            _ => None,
+        };
+        let steps = steps(&Node { node, op, at, constant: &constant })?;
+        Ok(steps.into_iter().map(|step| self.push(Some(x), step, name, op)).collect())
+    }
+
+    /// `x sigmoid(x)`, in either order.
+    fn swish(&mut self, a: usize, b: usize, name: &str) -> Result<Value, String> {
+        let of = |x: usize, s: usize| {
+            matches!(self.lives[s].step, Step::Function(Function::Sigmoid)) && self.lives[s].before == Some(x)
+        };
+        let x = match (of(a, b), of(b, a)) {
+            (true, _) => a,
+            (_, true) => b,
+            _ => return Err("multiplies two values that both depend on the observation".into()),
+        };
+        Ok(self.push(Some(x), Step::Function(Function::Silu), name, "Mul"))
+    }
+}
+
+/// All inputs, if each is a constant.
+fn constants(inputs: &[Option<Value>]) -> Option<Vec<&Tensor>> {
+    let of = |v: &'_ Option<Value>| match v {
+        Some(Value::Constant(_)) => true,
+        Some(_) => false,
+        None => true,
+    };
+    inputs.iter().all(of).then(|| {
+        let tensor = |v| match v {
+            &Some(Value::Constant(ref t)) => Some(t),
+            _ => None,
+        };
+        inputs.iter().filter_map(tensor).collect()
+    })
+}
+
+/// A node with its constants; `at` is the place of the input that depends on the observation.
+struct Node<'a> {
+    node: &'a NodeProto,
+    op: &'a str,
+    at: usize,
+    constant: &'a dyn Fn(usize) -> Option<&'a Tensor>,
+}
+
+impl Node<'_> {
+    fn attribute(&self, name: &str) -> Option<&AttributeProto> {
+        self.node.attribute.iter().find(|a| a.name.as_deref() == Some(name))
+    }
+    fn float(&self, name: &str, default: f32) -> f64 {
+        f64::from(self.attribute(name).and_then(|a| a.f).unwrap_or(default))
+    }
+    fn integer(&self, name: &str, default: i64) -> i64 {
+        self.attribute(name).and_then(|a| a.i).unwrap_or(default)
+    }
+    /// Input `i` as a constant row.
+    fn row(&self, i: usize) -> Result<Vec<f64>, String> {
+        let tensor = (self.constant)(i).ok_or("needs a constant for its other input")?;
+        let row = tensor
+            .row()
+            .ok_or_else(|| format!("has a constant of shape {:?}, where one row is read", tensor.dims))?;
+        Ok(row.to_vec())
+    }
+    /// Whole numbers from input `i`, else from the attribute.
+    fn integers(&self, i: usize, name: &str) -> Option<Vec<i64>> {
+        let listed = || self.attribute(name).map(|a| a.ints.clone()).filter(|l| !l.is_empty());
+        (self.constant)(i).map(Tensor::integers).or_else(listed)
+    }
+    /// A bound from input `i`, else from the attribute, else none.
+    fn bound(&self, i: usize, name: &str, none: f64) -> Result<Vec<f64>, String> {
+        match (self.constant)(i) {
+            Some(_) => self.row(i),
+            None => Ok(vec![self.attribute(name).and_then(|a| a.f).map_or(none, f64::from)]),
+        }
+    }
+}
+
+/// What the node does to the value that depends on the observation: one step for each output.
+fn steps(n: &Node<'_>) -> Result<Vec<Step>, String> {
+    let one = |step| Ok(vec![step]);
+    let function = |f| one(Step::Function(f));
+    match n.op {
+        "Identity" | "Dropout" | "Flatten" | "Squeeze" | "Unsqueeze" | "Cast" => one(Step::Same),
+        "Reshape" => reshape(n),
+        "Tanh" => function(Function::Tanh),
+        "Relu" => function(Function::Relu),
+        "Sigmoid" => function(Function::Sigmoid),
+        "Softplus" => function(Function::Softplus),
+        "Elu" | "Swish" => {
+            let (alpha, f) =
+                (n.float("alpha", 1.0), if n.op == "Elu" { Function::Elu } else { Function::Silu });
+            if alpha == 1.0 { function(f) } else { Err(format!("has alpha = {alpha}, where 1 is known")) }
+        }
+        "Gemm" => gemm(n),
+        "MatMul" => {
+            if n.at != 0 {
+                return Err("multiplies from the left".into());
+            }
+            let w = (n.constant)(1).ok_or("needs a constant matrix")?;
+            dense(&w.transposed().ok_or("needs a constant matrix")?, None, 1.0, 1.0).map(|s| vec![s])
+        }
+        "Add" => one(Step::Affine(vec![1.0], n.row(1 - n.at.min(1))?)),
+        "Sub" if n.at == 0 => one(Step::Affine(vec![1.0], n.row(1)?.iter().map(|x| -x).collect())),
+        "Sub" => one(Step::Affine(vec![-1.0], n.row(0)?)),
+        "Mul" => one(Step::Affine(n.row(1 - n.at.min(1))?, vec![0.0])),
+        "Div" if n.at == 0 => one(Step::Affine(n.row(1)?.iter().map(|x| 1.0 / x).collect(), vec![0.0])),
+        "Neg" => one(Step::Affine(vec![-1.0], vec![0.0])),
+        "Clip" => one(Step::Clip(n.bound(1, "min", f64::NEG_INFINITY)?, n.bound(2, "max", f64::INFINITY)?)),
+        "Max" => one(Step::Clip(n.row(1 - n.at.min(1))?, vec![f64::INFINITY])),
+        "Min" => one(Step::Clip(vec![f64::NEG_INFINITY], n.row(1 - n.at.min(1))?)),
+        "Split" => split(n),
+        "Slice" => slice(n),
+        _ => Err("is none that a policy's layers consist of".into()),
+    }
+}
+
+/// `alpha x W + beta c`.
+fn gemm(n: &Node<'_>) -> Result<Vec<Step>, String> {
+    if n.at != 0 || n.integer("transA", 0) != 0 {
+        return Err("multiplies from the left".into());
+    }
+    let w = (n.constant)(1).ok_or("needs a constant matrix")?;
+    let w = if n.integer("transB", 0) == 0 { w.transposed() } else { w.matrix().map(|_| w.clone()) };
+    let bias = (n.constant)(2).map(|_| n.row(2)).transpose()?;
+    dense(&w.ok_or("needs a constant matrix")?, bias, n.float("alpha", 1.0), n.float("beta", 1.0))
+        .map(|s| vec![s])
+}
+
+fn dense(w: &Tensor, bias: Option<Vec<f64>>, alpha: f64, beta: f64) -> Result<Step, String> {
+    let (n_out, n_in) = w.matrix().ok_or("needs a constant matrix")?;
+    let bias = match bias {
+        None => vec![0.0; n_out],
+        Some(b) if b.len() == 1 => vec![beta * b[0]; n_out],
+        Some(b) if b.len() == n_out => b.iter().map(|x| beta * x).collect(),
+        Some(b) => return Err(format!("adds {} numbers to {n_out}", b.len())),
+    };
+    Ok(Step::Dense { n_in, n_out, weight: w.values.iter().map(|x| alpha * x).collect(), bias })
+}
+
+/// A shape of one row is none of a policy's business; another one would mix what belongs to one entry.
+fn reshape(n: &Node<'_>) -> Result<Vec<Step>, String> {
+    let shape = n.integers(1, "shape").ok_or("needs a constant shape")?;
+    let rest = shape.split_last().map_or(&[][..], |(_, rest)| rest);
+    if rest.iter().all(|&d| (-1..=1).contains(&d)) {
+        return Ok(vec![Step::Same]);
+    }
+    Err(format!("makes the shape {shape:?}, where one row is read"))
+}
+
+/// The last axis, or the second of two.
+fn is_last(axis: i64) -> bool {
+    axis == -1 || axis == 1
+}
+
+fn split(n: &Node<'_>) -> Result<Vec<Step>, String> {
+    let axis = n.integer("axis", 0);
+    if !is_last(axis) {
+        return Err(format!("splits axis {axis}, where the last is read"));
+    }
+    let outputs = n.node.output.len();
+    let Some(sizes) = n.integers(1, "split") else {
+        // equal parts: their size is known once the width is
+        return Ok((0..outputs).map(|i| Step::Part(i, outputs)).collect());
+    };
+    let mut at = 0;
+    let ranges = sizes.iter().map(|&size| {
+        let start = at;
+        at += usize::try_from(size).unwrap_or(0);
+        Step::Select(start..at)
+    });
+    Ok(ranges.collect())
+}
+
+fn slice(n: &Node<'_>) -> Result<Vec<Step>, String> {
+    let (starts, ends) = (n.integers(1, "starts"), n.integers(2, "ends"));
+    let (Some(starts), Some(ends)) = (starts, ends) else { return Err("needs constant bounds".into()) };
+    let axes = n.integers(3, "axes").unwrap_or_else(|| (0..starts.len() as i64).collect());
+    let steps = (n.constant)(4).map(Tensor::integers).unwrap_or_default();
+    if steps.iter().any(|&s| s != 1) {
+        return Err(format!("takes every {steps:?}th entry, where neighbours are read"));
+    }
+    let mut range = None;
+    for ((&axis, &start), &end) in axes.iter().zip(&starts).zip(&ends) {
+        match (is_last(axis), axis, start) {
+            (true, ..) => range = Some(Step::Slice(start, end)),
+            (_, 0, 0) if end >= 1 => {}
+            _ => return Err(format!("cuts axis {axis}, where the last is read")),
+        }
+    }
+    Ok(vec![range.unwrap_or(Step::Same)])
+}
+
+/// A node of constants alone.
+fn fold(op: &str, x: &Tensor, all: &[&Tensor]) -> Result<Tensor, String> {
+    let map = |f: fn(f64) -> f64| {
+        Ok(Tensor { dims: x.dims.clone(), values: x.values.iter().map(|&v| f(v)).collect() })
+    };
+    let pair = |f: fn(f64, f64) -> f64| {
+        let other = all.get(1).ok_or("has one input")?;
+        x.zip(other, f).ok_or_else(|| "has constants of shapes that do not fit".to_string())
+    };
+    match op {
+        "Add" => pair(|a, b| a + b),
+        "Sub" => pair(|a, b| a - b),
+        "Mul" => pair(|a, b| a * b),
+        "Div" => pair(|a, b| a / b),
+        "Pow" => pair(f64::powf),
+        "Max" => pair(f64::max),
+        "Min" => pair(f64::min),
+        "Sqrt" => map(f64::sqrt),
+        "Exp" => map(f64::exp),
+        "Neg" => map(|v| -v),
+        "Reciprocal" => map(|v| 1.0 / v),
+        "Identity" | "Cast" => Ok(x.clone()),
+        "Squeeze" => Ok(Tensor {
+            dims: x.dims.iter().copied().filter(|&d| d != 1).collect(),
+            values: x.values.clone(),
+        }),
+        "Unsqueeze" => Ok(Tensor { dims: [&[1], &x.dims[..]].concat(), values: x.values.clone() }),
+        "Transpose" => x.transposed().ok_or_else(|| "has no two axes".into()),
+        _ => Err("is none that this program computes from constants".into()),
+    }
+}
