@@ -35,13 +35,20 @@ pub fn onnx(snapshot: &Snapshot) -> Result<Vec<u8>, SnapshotError> {
     graph.row("Div", "std", &norm.std);
     let clip = if norm.clip.is_empty() { vec![[-CLIP, CLIP]; norm.mean.len()] } else { norm.clip.clone() };
     graph.clip("input", &clip);
-    let layers = &snapshot.networks.policy.layers;
+    let (layers, x) = (&snapshot.networks.policy.layers, graph.value.clone());
     let functions = snapshot.manifest.policy_functions(layers.len());
     for (i, (layer, function)) in layers.iter().zip(functions).enumerate() {
         let weight = graph.constant(&format!("policy.{i}.weight"), &[layer.n_out, layer.n_in], &layer.weight);
         let bias = graph.constant(&format!("policy.{i}.bias"), &[layer.n_out], &layer.bias);
         graph.node("Gemm", &[&weight, &bias], vec![integer("transB", 1)]);
         graph.function(function);
+    }
+    if let (Some(skip), Some(last)) = (&snapshot.networks.policy.skip, layers.last()) {
+        // the linear map beside the layers: y + S x
+        let weight = graph.constant("policy.skip.weight", &[last.n_out, norm.mean.len()], skip);
+        graph.node("Identity", &[], Vec::new());
+        let y = std::mem::replace(&mut graph.value, x);
+        graph.node("Gemm", &[&weight, &y], vec![integer("transB", 1)]);
     }
     if snapshot.manifest.policy != PolicyKind::Direct {
         graph.row("Mul", "scale", &norm.scale);

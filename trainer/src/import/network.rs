@@ -218,7 +218,7 @@ impl Build {
             bias: f32s(&l.bias),
         });
         ImportedNetwork {
-            dense: Dense { layers: layers.collect() },
+            dense: Dense { layers: layers.collect(), skip: None },
             functions,
             output: self.tail.lower.iter().zip(&self.tail.upper).map(|(&l, &u)| [l, u]).collect(),
             mean,
