@@ -39,9 +39,17 @@ pub struct Pilot {
 impl Pilot {
     /// Builds and validates the controller of `snapshot` for `robot`. Allocates and parses the robot file.
     pub fn new(snapshot: &Snapshot, robot: &RobotMessage) -> Result<Pilot, Refusal> {
+        Pilot::within(snapshot, robot, None)
+    }
+
+    /// [`Pilot::new`] of a snapshot that may not loosen what is `pinned`. Another robot's snapshot is refused as such first.
+    fn within(snapshot: &Snapshot, robot: &RobotMessage, pinned: Option<&Pinned>) -> Result<Pilot, Refusal> {
         let refuse = |error: SnapshotError| Refusal { verdict: Verdict::of(&error), text: error.to_string() };
         let controller = Controller::new(snapshot).map_err(refuse)?;
         compare(&describe_controller(&controller, &snapshot.manifest), robot)?;
+        if let Some(pinned) = pinned {
+            pinned.admit(&snapshot.manifest)?;
+        }
         compare_limits(&controller, robot)?;
         let layout = controller.layout();
         Ok(Pilot {
@@ -304,10 +312,7 @@ impl Build for PilotBuilder {
     fn build(&mut self, snapshot: &SnapshotBytes, robot: &RobotMessage) -> Result<Pilot, Refusal> {
         let parsed = Snapshot::from_bytes(&snapshot.bytes);
         let snapshot = parsed.map_err(|e| Refusal { verdict: Verdict::of(&e), text: e.to_string() })?;
-        if let Some(pinned) = &self.pinned {
-            pinned.admit(&snapshot.manifest)?;
-        }
-        Pilot::new(&snapshot, robot)
+        Pilot::within(&snapshot, robot, self.pinned.as_ref())
     }
 }
 

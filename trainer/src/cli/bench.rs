@@ -42,7 +42,7 @@ struct TrainBench {
     #[arg(default_value = "HalfCheetah-v5")]
     task: String,
     #[arg(long, default_value = "pid2-ib", help = super::train::one_of())]
-    algo: Algorithm,
+    algo: String,
     #[arg(long, help = super::train::one_preset())]
     preset: Option<Preset>,
     /// Seconds of training in each repetition.
@@ -99,7 +99,8 @@ fn request(task: &str, algo: Algorithm, preset: Option<Preset>, set: &[String]) 
 
 impl TrainBench {
     fn run(self) -> Result<(), Failure> {
-        let request = request(&self.task, self.algo, self.preset, &self.set)?;
+        let algo: Algorithm = self.algo.parse()?;
+        let request = request(&self.task, algo, self.preset, &self.set)?;
         let ticks = request.manifest.task.time.policy_every as f64;
         let (mut rates, mut ceilings, mut shares) = (Vec::new(), Vec::new(), Vec::new());
         for _ in 0..self.repeat.max(1) {
@@ -128,7 +129,7 @@ impl TrainBench {
         let ceiling = median(&mut ceilings);
         if self.json {
             say(
-                serde_json::json!({ "task": self.task, "algo": self.algo.name(), "threads": cores(), "steps_per_s": rate,
+                serde_json::json!({ "task": self.task, "algo": algo.name(), "threads": cores(), "steps_per_s": rate,
                 "physics_steps_per_s": ceiling, "fraction": ceiling.map(|c| rate / c), "update_share": share }),
             );
         } else {
@@ -138,7 +139,7 @@ impl TrainBench {
             say(format!(
                 "{} {} on {} threads: {rate:.0} steps/s,{beside} updates take {:.0} % of the time",
                 self.task,
-                self.algo,
+                algo,
                 cores(),
                 100.0 * share
             ));

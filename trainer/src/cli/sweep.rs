@@ -18,7 +18,7 @@ pub(super) struct SweepCommand {
     #[arg(long, value_delimiter = ',', required = true)]
     tasks: Vec<String>,
     #[arg(long, value_delimiter = ',', default_value = "ppo,pid2-ib", help = several())]
-    algos: Vec<Algorithm>,
+    algos: Vec<String>,
     /// Seeds: `0,1,2` or `0-2`.
     #[arg(long, default_value = "0-2", value_parser = seeds)]
     seeds: Seeds,
@@ -68,7 +68,7 @@ impl SweepCommand {
         let Seeds(seeds) = self.seeds;
         let sweep = Sweep {
             tasks: self.tasks,
-            algos: self.algos,
+            algos: self.algos.iter().map(|name| name.parse()).collect::<Result<_, _>>()?,
             seeds,
             steps: self.steps,
             out: self.out,

@@ -20,7 +20,7 @@ pub(super) struct Train {
     /// Task name (see `nearl tasks`) or TOML file.
     task: String,
     #[arg(long, default_value = "pid2-ib", conflicts_with = "resume", help = one_of())]
-    algo: Algorithm,
+    algo: String,
     /// Environment steps; 1_000_000, 1e6, 200k and 1M are read. 1e6 when absent, with --resume what the run was started with.
     #[arg(long, value_parser = steps)]
     steps: Option<u64>,
@@ -112,7 +112,7 @@ impl Train {
             Some(folder) => Run::resumed(folder, &manifest.task.name, self.steps)?,
             None => Run {
                 name: manifest.task.name.clone(),
-                algo: self.algo,
+                algo: self.algo.parse()?,
                 steps: self.steps.unwrap_or(STEPS),
                 done: 0,
             },
