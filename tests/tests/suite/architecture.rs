@@ -8,6 +8,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("nearl-constraints", &[]),
     ("nearl-controller", &["nearl-constraints"]),
     ("nearl-runtime", &["nearl-constraints", "nearl-controller"]),
+    ("nearl-c", &["nearl-runtime"]),
     ("nearl-rollout-protocol", &["nearl-runtime"]),
     ("nearl-trainer", &["nearl-runtime", "nearl-rollout-protocol"]),
     ("nearl-python", &["nearl-constraints", "nearl-runtime", "nearl-trainer"]),

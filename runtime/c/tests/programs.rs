@@ -1,0 +1,184 @@
+//! C and C++ programs, compiled by the system's compilers, against a real loop.
+
+#[allow(dead_code)] // its main
+#[path = "../examples/driver.rs"]
+mod driver;
+
+use nearl_runtime::constraints::Model;
+use nearl_runtime::link::RobotName;
+use nearl_runtime::net::{Activation, Dense, DenseLayer};
+use nearl_runtime::normaliser::Normaliser;
+use nearl_runtime::rt::{RunReport, RunSettings, Stop, ThreadSettings, run};
+use nearl_runtime::snapshot::FORMAT;
+
+use nearl_runtime::{Manifest, Networks, PolicyKind, Snapshot, Task};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+const URDF: &str = r#"<robot name="carriage"><link name="rail"/><link name="carriage"><inertial><mass value="2"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="slide" type="prismatic"><parent link="rail"/><child link="carriage"/><axis xyz="1 0 0"/>
+<limit lower="-0.3" upper="0.4" velocity="0.8" effort="40"/></joint></robot>"#;
+const TASK: &str = r#"name = "carriage"
+[model]
+urdf = "carriage.urdf"
+[time]
+dt = 0.001
+policy_every = 5
+sim_dt = 0.001
+[state]
+observation = ["q.slide", "v.slide"]
+[constraints]
+position = { margin = 0.0 }
+velocity = { scale = 1.0 }
+acceleration = { limit = 15.0 }
+torque = { scale = 1.0 }
+[idm]
+kind = "pinocchio"
+"#;
+
+/// A policy that wants to go far beyond every limit, to and fro.
+fn snapshot() -> Snapshot {
+    let manifest = Manifest {
+        format: FORMAT,
+        task: Task::parse("carriage", TASK, &[]).expect("task"),
+        robot: Model::from_urdf_text(URDF).expect("robot").description().clone(),
+        simulation: None,
+        algo: "by hand".into(),
+        policy: PolicyKind::Deterministic,
+        activation: Activation::default(),
+        functions: Vec::new(),
+        version: 1,
+        steps: 0,
+        action_lower: vec![-40.0],
+        action_upper: vec![40.0],
+    };
+    let layer = |weight: Vec<f32>, bias: Vec<f32>| DenseLayer { n_in: 2, n_out: 2, weight, bias };
+    // towards the limit it is moving to
+    let policy = Dense {
+        skip: None,
+        layers: vec![
+            layer(vec![0.0, 60.0, 0.0, 60.0], vec![0.1; 2]),
+            layer(vec![5.0, 0.0, 0.0, 9.0], vec![0.0; 2]),
+        ],
+    };
+    let normaliser = Normaliser::new(vec![0.0; 2], vec![1.0; 2], vec![0.5; 2]);
+    Snapshot { manifest, networks: Networks { normaliser, policy, policy_log_std: vec![], idm: None } }
+}
+
+/// Where cargo put the library: beside this test.
+fn library() -> PathBuf {
+    let deps = std::env::current_exe().expect("this test").parent().expect("a folder").to_path_buf();
+    let found = [deps.clone(), deps.join("..")].into_iter().find(|d| d.join("libnearl_c.so").is_file());
+    found.unwrap_or_else(|| panic!("no libnearl_c.so in or above {}", deps.display()))
+}
+
+fn compile(compiler: &str, source: &str, standard: &str, folder: &Path) -> PathBuf {
+    let (root, lib) = (Path::new(env!("CARGO_MANIFEST_DIR")), library());
+    let out = folder.join(Path::new(source).file_stem().expect("a name"));
+    let done = Command::new(compiler)
+        .args([standard, "-Wall", "-Wextra", "-Wno-missing-field-initializers", "-Werror", "-O1", "-I"])
+        .arg(root.join("include"))
+        .arg(root.join("examples").join(source))
+        .arg("-o")
+        .arg(&out)
+        .arg("-L")
+        .arg(&lib)
+        .arg(format!("-Wl,-rpath,{}", lib.display()))
+        .args(["-lnearl_c", "-lm"])
+        .output()
+        .unwrap_or_else(|e| panic!("{compiler}: {e}"));
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    out
+}
+
+fn numbers(text: &[u8]) -> Vec<f64> {
+    String::from_utf8_lossy(text).split_whitespace().filter_map(|w| w.parse().ok()).collect()
+}
+
+/// A driver of so many ticks against a loop that runs until the driver has had enough.
+fn against_a_loop(test: &str, driver: impl FnOnce(&str, u64) -> Vec<f64>) -> (Vec<f64>, RunReport) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("carriage.safetensors");
+    snapshot().save(&file).expect("saves");
+    let name = RobotName::new(&format!("c{}-{test}", std::process::id())).expect("a name");
+    let stop = Stop::new();
+    let running = {
+        let (name, stop) = (name.clone(), stop.clone());
+        let thread = ThreadSettings { priority: None, cpu: None, lock_memory: false };
+        let settings = RunSettings { patience: 30.0, ramp: 0.0, thread, ..RunSettings::default() };
+        std::thread::spawn(move || run(&settings, &file, &name, &stop))
+    };
+    let found = driver(&name.to_string(), 3000);
+    stop.request();
+    (found, running.join().expect("the loop").expect("a report"))
+}
+
+fn obeys(found: &[f64], report: &RunReport) {
+    let [acted, _, farthest, fastest] = found[..] else { panic!("{found:?}") };
+    assert_eq!(acted, 3000.0);
+    assert!(report.counters.raw_violations > 100, "the policy must ask for too much: {:?}", report.counters);
+    assert!(farthest > 0.25 && farthest <= 0.4 + 1e-6, "{farthest} m");
+    assert!(fastest > 0.5 && fastest <= 0.8 + 1e-6, "{fastest} m/s");
+}
+
+#[test]
+fn a_driver_in_c_obeys_the_limits() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let program = compile("cc", "driver.c", "-std=c11", folder.path());
+    let (found, report) = against_a_loop("c", |name, ticks| {
+        let done = Command::new(program).arg(name).arg(ticks.to_string()).output().expect("the driver runs");
+        assert!(
+            done.status.success(),
+            "{} {}",
+            String::from_utf8_lossy(&done.stdout),
+            String::from_utf8_lossy(&done.stderr)
+        );
+        numbers(&done.stdout)
+    });
+    obeys(&found, &report);
+}
+
+/// The same driver in Rust.
+#[test]
+fn a_driver_in_rust_obeys_the_limits() {
+    let (found, report) =
+        against_a_loop("rust", |name, ticks| driver::drive(name, ticks).expect("a loop").to_vec());
+    obeys(&found, &report);
+}
+
+#[test]
+fn a_controller_in_cpp_obeys_the_limits_and_refuses_by_sentence() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let program = compile("c++", "controller.cpp", "-std=c++17", folder.path());
+    let file = folder.path().join("carriage.safetensors");
+    snapshot().save(&file).expect("saves");
+    let done = Command::new(&program).arg(&file).output().expect("runs");
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let found = numbers(&done.stdout);
+    assert!(
+        found[0] > 0.25 && found[0] <= 0.4 + 1e-6 && found[1] > 0.5 && found[1] <= 0.8 + 1e-6,
+        "{found:?}"
+    );
+    let refused = Command::new(&program).arg("none.safetensors").output().expect("runs");
+    assert!(!refused.status.success());
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("cannot read snapshot 'none.safetensors'"));
+}
+
+/// Every function that the library exports is declared, and the other way round.
+#[test]
+fn the_header_names_exactly_what_is_defined() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let read = |path: &str| std::fs::read_to_string(root.join(path)).expect("a source");
+    let names = |text: &str, before: &str| -> std::collections::BTreeSet<String> {
+        let starts = text.match_indices(before).map(|(at, found)| &text[at + found.len() - "nearl_".len()..]);
+        let name = |rest: &str| {
+            rest.split(|c: char| !(c.is_alphanumeric() || c == '_')).next().unwrap_or_default().to_string()
+        };
+        starts.filter(|rest| rest[name(rest).len()..].starts_with('(')).map(name).collect()
+    };
+    let header = names(&read("include/nearl.h"), "nearl_");
+    let defined: String = ["src/lib.rs", "src/plant.rs", "src/controller.rs"].map(read).concat();
+    assert_eq!(header, names(&defined, "extern \"C\" fn nearl_"));
+    assert!(header.len() >= 10, "{header:?}");
+}

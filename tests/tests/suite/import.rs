@@ -1,0 +1,60 @@
+//! A policy goes out as ONNX and comes back; damaged files are refused and never break the program.
+
+use nearl_runtime::Controller;
+use nearl_tests::training;
+use nearl_trainer::export;
+use nearl_trainer::import::{for_task, onnx};
+use rand::RngExt;
+
+const SHORT: [&str; 3] = ["train.n_envs=4", "train.n_steps=32", "train.ppo.batch_size=64"];
+
+#[test]
+fn what_was_exported_comes_back() {
+    let mut t = training("HalfCheetah-v5", "ppo", 0, 1, &SHORT);
+    (0..3).for_each(|_| drop(t.iterate()));
+    let snapshot = t.snapshot().clone();
+    let bytes = export::onnx(&snapshot).expect("exports");
+    let network = onnx("policy.onnx", &bytes, None, None).expect("imports");
+    assert_eq!(network.dense, snapshot.networks.policy, "weights are the same numbers");
+    let back = for_task(&network, snapshot.manifest.clone()).expect("fits");
+    let mut both = [&snapshot, &back].map(|s| Controller::new(s).expect("controller"));
+    let mut rng = nearl_trainer::rollout::stream(3, 0);
+    for _ in 0..100 {
+        let actions = both.each_mut().map(|controller| {
+            let (mut state, mut out) = (controller.state(), controller.output());
+            let mut same = rng.clone();
+            state.obs.iter_mut().for_each(|x| *x = 20.0 * (same.random::<f64>() - 0.5));
+            controller.update(&state, &controller.noise(), &mut out);
+            out.action
+        });
+        let _: f64 = rng.random();
+        let differs = |(a, b): (&f64, &f64)| (a - b).abs() > 1e-6;
+        assert!(!actions[0].iter().zip(&actions[1]).any(differs), "{actions:?}");
+    }
+}
+
+#[test]
+fn damaged_files_are_refused_in_a_sentence() {
+    let snapshot = training("HalfCheetah-v5", "ppo", 0, 1, &SHORT).snapshot().clone();
+    let good = export::onnx(&snapshot).expect("exports");
+    let mut rng = nearl_trainer::rollout::stream(5, 0);
+    let (mut refused, mut read) = (0, 0);
+    for _ in 0..2000 {
+        let mut bytes = good.clone();
+        for _ in 0..rng.random_range(1..4) {
+            let at = rng.random_range(0..bytes.len().min(3000));
+            bytes[at] = rng.random();
+        }
+        if rng.random::<f64>() < 0.2 {
+            bytes.truncate(rng.random_range(0..good.len()));
+        }
+        match onnx("policy.onnx", &bytes, None, None) {
+            Ok(network) => read += usize::from(network.n_in() > 0),
+            Err(error) => {
+                refused += 1;
+                assert_eq!(error.to_string().lines().count(), 1, "{error}");
+            }
+        }
+    }
+    assert!(refused > 200 && read > 200, "{refused} refused, {read} read");
+}
