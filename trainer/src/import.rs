@@ -14,6 +14,7 @@ mod file;
 mod graph;
 pub(crate) mod metadata;
 mod network;
+mod sound;
 mod tensor;
 
 pub use assemble::{Setting, for_task, snapshot};
@@ -80,4 +81,18 @@ pub enum ImportError {
     /// The graph as a whole is no policy.
     #[error("the graph is no policy: {0}")]
     Graph(String),
+}
+
+impl ImportError {
+    /// Names quoted from a file may hold line breaks and other signs that are not printed.
+    fn in_one_line(self) -> Self {
+        let plain = |text: String| text.replace(char::is_control, " ");
+        match self {
+            Self::Node { name, op, reason } => {
+                Self::Node { name: plain(name), op: plain(op), reason: plain(reason) }
+            }
+            Self::Graph(reason) => Self::Graph(plain(reason)),
+            other => other,
+        }
+    }
 }

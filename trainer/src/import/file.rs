@@ -3,6 +3,7 @@
 use super::ImportError;
 use super::graph::Graph;
 use super::network::ImportedNetwork;
+use super::sound::is_sound;
 use nearl_runtime::file_kind::FileKind;
 use nearl_runtime::snapshot::MAX_BYTES;
 use rten_onnx::onnx::ModelProto;
@@ -40,9 +41,12 @@ pub fn onnx(
     if kind.is_some_and(|kind| kind != FileKind::Onnx) {
         return Err(other(file, kind));
     }
+    if !is_sound(bytes) {
+        return Err(other(file, None));
+    }
     let model = ModelProto::parse_buf(bytes).map_err(|_| other(file, None))?;
     let graph = model.graph.as_ref().filter(|g| !g.node.is_empty()).ok_or_else(|| other(file, None))?;
-    let mut network = Graph::new(graph, beside).policy(output)?;
+    let mut network = Graph::new(graph, beside).policy(output).map_err(ImportError::in_one_line)?;
     let pairs = model.metadata_props.iter();
     network.metadata =
         pairs.filter_map(|p| Some((p.key.clone()?, p.value.clone().unwrap_or_default()))).collect();
