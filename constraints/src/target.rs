@@ -93,6 +93,9 @@ pub enum Guard {
     /// `false`: the action of a policy, or of a learned inverse model, goes to the actuators as it is.
     #[default]
     Off,
+    /// `"drive"`: the targets of drives keep the drives' forces within the torque limits, and their change within the torque rate, in closed form;
+    /// nothing is promised of the motion. For robots on legs.
+    Drive,
     /// `"simulator"`: where a simulator is at hand (training, evaluation, `nearl plant`) it is asked where the action leads, contacts included.
     Simulator,
     /// `true`: the state that the robot model says it leads to is projected, and the action of the projected state is sent.
@@ -101,7 +104,7 @@ pub enum Guard {
 
 /// How a task file writes a [`Guard`].
 #[derive(Serialize, Deserialize)]
-#[serde(untagged, expecting = "expected true, false or \"simulator\"")]
+#[serde(untagged, expecting = "expected true, false, \"drive\" or \"simulator\"")]
 enum GuardWord {
     Plain(bool),
     Named(GuardName),
@@ -110,6 +113,7 @@ enum GuardWord {
 #[derive(Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum GuardName {
+    Drive,
     Simulator,
 }
 
@@ -118,6 +122,7 @@ impl From<GuardWord> for Guard {
         match word {
             GuardWord::Plain(false) => Guard::Off,
             GuardWord::Plain(true) => Guard::Model,
+            GuardWord::Named(GuardName::Drive) => Guard::Drive,
             GuardWord::Named(GuardName::Simulator) => Guard::Simulator,
         }
     }
@@ -128,6 +133,7 @@ impl From<Guard> for GuardWord {
         match guard {
             Guard::Off => GuardWord::Plain(false),
             Guard::Model => GuardWord::Plain(true),
+            Guard::Drive => GuardWord::Named(GuardName::Drive),
             Guard::Simulator => GuardWord::Named(GuardName::Simulator),
         }
     }

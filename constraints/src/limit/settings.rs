@@ -82,6 +82,15 @@ pub enum PerJoint {
 }
 
 impl PerJoint {
+    /// The value of a joint by its name; `None` where nothing is said, and for a list by dof.
+    pub fn of(&self, joint: &str) -> Option<f64> {
+        match self {
+            PerJoint::All(value) => Some(*value),
+            PerJoint::Joints(map) => map.get(joint).copied(),
+            PerJoint::Each(_) => None,
+        }
+    }
+
     /// One value per dof (nv), `None` where nothing is said.
     ///
     /// # Errors

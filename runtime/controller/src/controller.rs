@@ -10,6 +10,7 @@
 //! Training, evaluation, the real-time loop and replay all call [`Controller::update`]. Noise is an
 //! input: zero on the robot. Nothing is allocated after [`Controller::new`] but Clarabel's one block.
 
+mod drive_box;
 mod foreign;
 mod guard;
 mod maths;
@@ -23,6 +24,7 @@ use crate::net::{Activation, Forward, Function};
 use crate::normaliser::Normaliser;
 use crate::snapshot::{Networks, PolicyKind, Snapshot, SnapshotError};
 use crate::task::IdmKind;
+use drive_box::DriveBox;
 use foreign::Foreign;
 use guard::Guard;
 use maths::{hermite, sample};
@@ -133,6 +135,7 @@ pub struct Controller {
     projector: Projector,
     inverse: Inverse,
     guard: Option<Guard>,
+    drive_box: Option<DriveBox>,
     action_range: Vec<(f64, f64)>,
     dt: f64,
     policy_every: usize,
@@ -179,6 +182,9 @@ impl Controller {
             }
         };
         let guard = if m.guards() { Some(Guard::new(m, &model, &layout)?) } else { None };
+        let bounds = m.bounds_drives();
+        let drive_box = bounds.then(|| DriveBox::new(m, &model, layout.controllable(), &projector));
+        let drive_box = drive_box.transpose()?;
         let zero = |n| vec![0.0; n];
         let rest = State { q: model.neutral(), v: zero(model.nv()), obs: zero(layout.n_obs()) };
         let proposal = Proposal { q: model.neutral(), v: zero(model.nv()) };
@@ -194,6 +200,7 @@ impl Controller {
             projector,
             inverse,
             guard,
+            drive_box,
             action_range: m.action_lower.iter().copied().zip(m.action_upper.iter().copied()).collect(),
             dt: m.task.time.dt,
             policy_every: m.task.time.policy_every,
@@ -396,6 +403,9 @@ impl Controller {
     /// The action of the nearest allowed state in place of one that leads elsewhere. Of a direct policy, where its action leads is what it
     /// proposes.
     fn guard(&mut self, out: &mut Output) {
+        if let Some(drives) = &mut self.drive_box {
+            drives.update(&self.held.q, &self.held.v, &mut out.action, &mut out.next, self.projection);
+        }
         let Some(guard) = &mut self.guard else { return };
         guard.update(&self.held.q, &self.held.v, &mut out.action, &mut out.next, self.projection);
         for (a, &(lower, upper)) in out.action.iter_mut().zip(&self.action_range) {
@@ -435,6 +445,9 @@ impl Controller {
         self.tick = 0;
         self.foreign.reset();
         self.projector().forget();
+        if let Some(drives) = &mut self.drive_box {
+            drives.forget();
+        }
     }
 
     /// Whether the policy runs in the next tick.
@@ -444,12 +457,17 @@ impl Controller {
 
     /// What the next policy tick depends on beside its arguments, as plain numbers; see [`Projector::memory`].
     pub fn memory(&self) -> Vec<f64> {
-        self.last_word().memory()
+        let mut memory = Vec::new();
+        self.write_memory(&mut memory);
+        memory
     }
 
     /// Appends [`Controller::memory`] to `memory`; allocates only where that has no room.
     pub fn write_memory(&self, memory: &mut Vec<f64>) {
         self.last_word().write_memory(memory);
+        if let Some(drives) = &self.drive_box {
+            drives.write_memory(memory);
+        }
     }
 
     /// The projector that decides what happens: the guard's where there is one.
@@ -468,7 +486,20 @@ impl Controller {
     /// When it has another length.
     pub fn set_memory(&mut self, memory: &[f64]) {
         self.reset();
-        self.projector().set_memory(memory);
+        self.take_memory(memory);
+    }
+
+    /// Takes what [`Controller::memory`] gave, in the middle of a policy period too: a controller that takes over from another.
+    ///
+    /// # Panics
+    /// When it has another length.
+    pub fn take_memory(&mut self, memory: &[f64]) {
+        let own = self.drive_box.as_ref().map_or(0, DriveBox::memory_len);
+        let (projector, drives) = memory.split_at(memory.len() - own);
+        self.projector().set_memory(projector);
+        if let Some(own) = &mut self.drive_box {
+            own.set_memory(drives);
+        }
     }
 
     /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.
@@ -522,7 +553,11 @@ impl Controller {
     /// a brake is stored.
     pub fn remembers(&self) -> bool {
         let last = self.last_word();
-        self.policy_every > 1 || self.foreign.remembers() || last.needs_previous() || last.stores_a_brake()
+        self.drive_box.is_some()
+            || self.policy_every > 1
+            || self.foreign.remembers()
+            || last.needs_previous()
+            || last.stores_a_brake()
     }
     /// Limits by degree of freedom.
     pub fn limits(&self) -> &LimitSet {

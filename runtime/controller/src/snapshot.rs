@@ -109,6 +109,12 @@ impl Manifest {
         network && self.task.constraints.guard == Guard::Model
     }
 
+    /// Whether the forces of its drives are bounded ([`Guard::Drive`]).
+    pub fn bounds_drives(&self) -> bool {
+        let network = self.policy == PolicyKind::Direct || self.task.idm.kind == IdmKind::Learned;
+        network && self.task.constraints.guard == Guard::Drive
+    }
+
     /// Whether a state is proposed in each tick, by the policy or by the guard on its behalf.
     pub fn proposes(&self) -> bool {
         self.policy != PolicyKind::Direct || self.guards()

@@ -197,7 +197,7 @@ impl Tick for Pilot {
     fn load_memory(&mut self, memory: &[f64]) {
         // A way to stop within other limits is none within these.
         if memory.first() == Some(&self.limits) && memory.len() == self.memory_len {
-            self.controller.projector().set_memory(&memory[1..]);
+            self.controller.take_memory(&memory[1..]);
             self.share(false);
         }
     }

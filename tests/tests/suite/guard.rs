@@ -2,7 +2,7 @@
 
 use nearl_runtime::constraints::drive::{Arrival, Held};
 use nearl_runtime::constraints::{Drive, Dynamics, Model, Period, PeriodDynamics, Rung};
-use nearl_runtime::net::Dense;
+use nearl_runtime::net::{Dense, Forward};
 use nearl_runtime::{Controller, Snapshot};
 use nearl_tests::training;
 use nearl_trainer::env::{Env, Meter};
@@ -147,6 +147,35 @@ fn a_guard_without_torque_limits_is_refused_in_a_sentence() {
     let without = "constraints={ position = {}, acceleration = { limit = 10.0 }, guard = true }";
     let text = refuse("Panda-reach", &[without]);
     assert!(text.contains("torque = { scale = 1.0 }"), "{text}");
+}
+
+/// To the learner the guard is a part of the environment: the likelihood is that of what the policy sampled, not of what was executed.
+#[test]
+fn ppo_trains_through_the_guard() {
+    let short = ["train.n_envs=4", "train.n_steps=64", "train.ppo.batch_size=64"];
+    let mut training = training("Panda-reach", "ppo", 0, 1, &[&short[..], &[ON]].concat());
+    for _ in 0..3 {
+        let acting = training.snapshot().clone();
+        let mut net = Forward::new(&acting.networks.policy, acting.manifest.activation);
+        let log_std = acting.networks.policy_log_std.clone();
+        let p = training.iterate();
+        assert!(p.tally.raw_violations > 0 && p.tally.moved > 0);
+        assert_eq!((p.tally.projected_violations, p.tally.reached_violations), (0, 0));
+        let mut replaced = 0;
+        for s in training.segments() {
+            for (row, x) in s.x.chunks_exact(20).enumerate() {
+                let (sampled, action) = (&s.sampled[7 * row..][..7], &s.action[7 * row..][..7]);
+                replaced += usize::from(sampled != action);
+                let terms = net.forward(x).iter().zip(sampled).zip(&log_std).map(|((mean, a), log_std)| {
+                    let z = f64::from(a - mean) / f64::from(log_std.exp());
+                    -0.5 * z * z - f64::from(*log_std) - 0.5 * std::f64::consts::TAU.ln()
+                });
+                let (ours, theirs) = (terms.sum::<f64>(), f64::from(s.log_prob[row]));
+                assert!((ours - theirs).abs() < 1e-3, "row {row}: {ours} and {theirs}");
+            }
+        }
+        assert!(replaced > 50, "{replaced} executed actions differ from those sampled");
+    }
 }
 
 fn panda() -> Model {

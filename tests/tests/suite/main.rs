@@ -3,6 +3,7 @@
 mod architecture;
 mod demos;
 mod determinism;
+mod drives;
 mod env_mujoco;
 mod env_parity;
 mod env_suite;

@@ -1,0 +1,134 @@
+//! The guard of robots whose balance nobody can promise: the forces of their drives, in closed form.
+
+use super::Parts;
+use super::parts::unusable;
+use crate::snapshot::{Manifest, SnapshotError};
+use nearl_constraints::{Drive, Model, Projector, Status, Target};
+
+/// Targets of drives that keep each drive's force, and its change from tick to tick, within the limits, whatever the rest of the robot does. With
+/// `tau_before` the force at the start of the tick before, of effort `E` and rate `R`:
+///
+/// ```text
+///     start:  |K (q* - q) - D v| <= E       and   |K (q* - q) - D v - tau_before| <= R T
+///     end:    |K (q* - q - T v) - D v| <= E - (D T + K T^2 / 2) A
+/// ```
+///
+/// That is an interval of `q*` for each joint, and `tau_before` is always in the one of the start. `A` is the acceleration limit, where there is
+/// one: by how much the joint may leave the path of its velocity within the tick. Where the end asks for more than the start allows, the start decides.
+pub(super) struct DriveBox {
+    joints: Vec<Joint>,
+    dt: f64,
+    /// Force at the start of the tick before (n_act); not known at the start of an episode, when no rate holds.
+    before: Vec<f64>,
+    known: bool,
+}
+
+struct Joint {
+    /// Place in the action.
+    at: usize,
+    dof: usize,
+    idx_q: usize,
+    stiffness: f64,
+    damping: f64,
+    effort: f64,
+    rate: f64,
+    acceleration: f64,
+}
+
+impl DriveBox {
+    /// For a task whose controllable joints all have drives.
+    ///
+    /// # Errors
+    /// [`SnapshotError::Unusable`] naming the joint that has none, or no torque limit.
+    pub(super) fn new(
+        m: &Manifest,
+        model: &Model,
+        dofs: &[usize],
+        projector: &Projector,
+    ) -> Result<DriveBox, SnapshotError> {
+        let (drives, limits) = (Parts::drives(m, model, dofs)?, projector.limits());
+        let motors = Parts::motors(model, dofs, &drives);
+        let rates = m.task.constraints.torque_rate.as_ref().map(|rate| &rate.limit);
+        let joint = |(k, &dof): (usize, &usize)| {
+            let name = model.dof_name(dof);
+            let Drive::Pd { stiffness, damping } = drives[dof] else {
+                return Err(unusable(&format!(
+                    "[constraints] guard = \"drive\" needs drives, but joint '{name}' is commanded {}; write [command] interface = \"pd\" with \
+                     stiffness and damping",
+                    drives[dof].name()
+                )));
+            };
+            let effort = limits.effort[dof];
+            if !effort.is_finite() {
+                return Err(unusable(&format!(
+                    "[constraints] guard = \"drive\" has no torque limit to keep for joint '{name}'; add torque = {{ scale = 1.0 }}"
+                )));
+            }
+            let rate = rates.and_then(|rate| rate.of(&name)).unwrap_or(f64::INFINITY);
+            let acceleration = Some(limits.acceleration[dof]).filter(|a| a.is_finite()).unwrap_or(0.0);
+            let idx_q = model.joint_of_dof(dof).idx_q;
+            let at = motors.as_ref().map_err(Clone::clone)?.place(k);
+            Ok(Joint { at, dof, idx_q, stiffness, damping, effort, rate, acceleration })
+        };
+        let joints = dofs.iter().enumerate().map(joint).collect::<Result<Vec<_>, _>>()?;
+        Ok(DriveBox { dt: m.task.time.dt, before: vec![0.0; joints.len()], known: false, joints })
+    }
+
+    /// Puts the targets in `action` (n_act) into their intervals; the ledger of `next` says by how much the furthest was moved [rad or m].
+    pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], next: &mut Target, hold: bool) {
+        let mut moved = 0.0_f64;
+        for (joint, before) in self.joints.iter().zip(&mut self.before) {
+            let action = &mut action[joint.at];
+            let (at, v) = (q[joint.idx_q], v[joint.dof]);
+            let (low, high) = joint.forces(v, self.dt, self.known.then_some(*before));
+            let asked = joint.stiffness * (*action - at) - joint.damping * v;
+            let force = if hold { asked.clamp(low, high) } else { asked };
+            if force != asked {
+                let target = at + (force + joint.damping * v) / joint.stiffness;
+                moved = moved.max((target - *action).abs());
+                *action = target;
+            }
+            *before = force;
+        }
+        self.known = true;
+        next.ledger.moved = moved;
+        next.ledger.status = if moved > 0.0 { Status::Clamped } else { Status::Unchanged };
+    }
+
+    pub(super) fn forget(&mut self) {
+        self.known = false;
+    }
+
+    /// Appends what the next tick depends on beside its arguments.
+    pub(super) fn write_memory(&self, memory: &mut Vec<f64>) {
+        memory.push(f64::from(u8::from(self.known)));
+        memory.extend_from_slice(&self.before);
+    }
+
+    /// Takes what [`DriveBox::write_memory`] gave.
+    pub(super) fn set_memory(&mut self, memory: &[f64]) {
+        self.known = memory[0] != 0.0;
+        self.before.copy_from_slice(&memory[1..]);
+    }
+
+    /// Entries of its memory.
+    pub(super) fn memory_len(&self) -> usize {
+        1 + self.before.len()
+    }
+}
+
+impl Joint {
+    /// Least and largest force at the start of a tick.
+    fn forces(&self, v: f64, dt: f64, before: Option<f64>) -> (f64, f64) {
+        let step = self.rate * dt;
+        let (mut low, mut high) = (-self.effort, self.effort);
+        if let Some(before) = before {
+            (low, high) = ((before - step).clamp(low, high), (before + step).clamp(low, high));
+        }
+        let falls = self.stiffness * dt * v;
+        let room = self.effort - (self.damping + 0.5 * self.stiffness * dt) * self.acceleration * dt;
+        let (end_low, end_high) = (falls - room, falls + room);
+        let narrowed = (low.max(end_low), high.min(end_high));
+        if narrowed.0 <= narrowed.1 { narrowed } else { (low, high) }
+    }
+}
