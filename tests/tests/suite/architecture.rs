@@ -2,6 +2,7 @@
 
 use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, NodeDep};
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
 
 /// Crate -> the workspace crates it may import.
 const ARROWS: &[(&str, &[&str])] = &[

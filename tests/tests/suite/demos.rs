@@ -77,6 +77,9 @@ fn columns_are_found_by_name() {
 
 type Arrays = std::collections::BTreeMap<String, Array>;
 
+/// What somebody did to a file.
+type Damage<'a> = &'a dyn Fn(&mut Arrays);
+
 #[test]
 fn bad_files_are_refused_by_array_column_and_episode() {
     let folder = tempfile::tempdir().expect("folder");
@@ -97,7 +100,7 @@ fn bad_files_are_refused_by_array_column_and_episode() {
     let error = with(&|a| numbers(a.get_mut("observations").expect("there"), (first + 2) * n + 4, f64::NAN));
     let want = format!("'observations' is NaN in episode 1, row 2, column '{}'", demos.names[4]);
     assert!(error.contains(&want) && error.contains("demos.npz"), "{error}");
-    let cases: [(&dyn Fn(&mut Arrays), &str); 5] = [
+    let cases: [(Damage, &str); 5] = [
         (&|a| drop(a.remove("qpos")), "has no array 'qpos'"),
         (&|a| numbers(a.get_mut("lengths").expect("there"), 1, 0.5), "episode 1 has the length 0.5"),
         (&|a| numbers(a.get_mut("lengths").expect("there"), 0, 1.0), "rows where 'lengths' asks for"),

@@ -62,7 +62,7 @@ fn policy(seed: u64, guard: &str) -> Snapshot {
         weight: (0..n_in * n_out).map(|_| gain * (2.0 * rng.random::<f32>() - 1.0)).collect(),
         bias: (0..n_out).map(|_| gain * (2.0 * rng.random::<f32>() - 1.0)).collect(),
     };
-    let mut net = Dense { layers: vec![layer(24, 32, 0.5), layer(32, 12, 0.3)] };
+    let mut net = Dense { layers: vec![layer(24, 32, 0.5), layer(32, 12, 0.3)], skip: None };
     for (i, bias) in net.layers[1].bias.iter_mut().enumerate() {
         *bias += POSE[i % 3] as f32;
     }
