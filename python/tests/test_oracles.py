@@ -30,7 +30,7 @@ class Oracle:
             nearl.RowLimit(model, "equal", {f"v.{name[2]}": 1.0, f"v.{name[3]}": -0.5}, equals=0.0),
             nearl.RowLimit(model, "hard", {f"v.{name[4]}": 1.0, f"v.{name[5]}": 1.0}, upper=0.25),
         ]
-        self.projector = nearl.Projector(model, limits, dt=DT, sub_steps=1)
+        self.projector = nearl.Projector(model, limits, dt=DT, sub_steps=1, braking="certified")
 
     def solve(self, q: Array, v: Array, q_hat: Array, v_hat: Array) -> Array | None:
         """The optimum by quadprog, over y and the slack s of the soft row as a share of its bound."""

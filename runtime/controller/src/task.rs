@@ -259,6 +259,13 @@ impl Task {
         }
         let mut task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
             let key = e.path().to_string();
+            let below = overrides.iter().find(|set| set.trim_start().starts_with(&format!("{key}.")));
+            if let (Some(set), Some(last)) = (below, key.rsplit('.').next())
+                && e.inner().message().starts_with("invalid type: map")
+            {
+                let reason = format!("'{last}' is a value, not a section");
+                return TaskError::Override { set: set.clone(), reason };
+            }
             at(bracket(&key), suggest(e.into_inner().message()))
         })?;
         task.state_time(own);

@@ -57,7 +57,6 @@ fn loosenings() -> Vec<(&'static str, Change)> {
             m.task.constraints.frame[0].half_space.as_mut().unwrap().through[2] = 0.01;
         }),
         ("physics steps", |m| m.task.time.sim_dt = 0.0005),
-        ("action 0", |m| m.action_upper[0] += 1.0),
         ("another robot", |m| m.robot.bodies.iter_mut().for_each(|body| body.mass *= 1.5)),
     ]
 }
@@ -90,6 +89,10 @@ fn fault_38_a_pushed_snapshot_may_tighten_the_limits_but_never_loosen_them() {
         assert_eq!(verdict, Verdict::Looser, "{word}: {text}");
         assert!(text.contains(word), "'{word}' is not in: {text}");
     }
+    // Motors of another range are another robot's, whatever the limits.
+    let (verdict, text) = push(&|version| with(version, |m| m.action_upper[0] += 1.0));
+    assert_eq!(verdict, Verdict::ForeignRobot, "{text}");
+    assert!(text.contains("actuator ranges differ"), "{text}");
     let mut direct = with(0, |m| m.policy = PolicyKind::Direct);
     direct.networks.policy.layers[1].n_out = N;
     direct.networks.policy.layers[1].weight.truncate(16 * N);

@@ -15,8 +15,8 @@ const ROLE: &str = "NEARL_TEST_CLIENT_TO_KILL";
 const SIGN: &str = "NEARL_TEST_SIGN_OF_LIFE";
 /// Far more than any test waits for.
 const ENDLESS: u64 = 1_000_000;
-/// What a server without clients holds: data of replies and receipts, three services, the counter of nodes, its role; itself.
-const ALONE: (usize, usize) = (7, 1);
+/// What a server without clients holds: data of replies and receipts, three services, the counter of nodes; itself.
+const ALONE: (usize, usize) = (6, 1);
 /// Response buffers of one client: it uses them in turn.
 const BUFFERS: usize = 5;
 
