@@ -8,13 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, PercentFormatter
 
-from nearl import algorithms, curves
+from nearl import algorithms as all_algorithms
+from nearl import curves
 from nearl.report.read import ReadError, Run, read_run
 from nearl.report.style import CURVES, DEADLINE, steps_axis
 from nearl.report.training import band, grouped
 
 # The order in which the paper lists them; others follow.
-ORDER = [name for name, _ in algorithms()]
+ORDER = [name for name, _ in all_algorithms()]
 RETURN, LOSS, COST = "rollout/ep_rew_mean", "idm/mse_after", "rollout/ep_cost_mean"
 RAW, TARGET, REACHED = (f"constraints/{kind}_violations" for kind in ("raw", "target", "reached"))
 CAPTION = (
