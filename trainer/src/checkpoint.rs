@@ -6,7 +6,7 @@
 use nearl_runtime::snapshot::{Manifest, digest, write_whole};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Version of the file format.
@@ -137,7 +137,7 @@ impl Checkpoint {
         }
         let header = serde_json::to_string(&self.header).unwrap_or_else(|e| unreachable!("header: {e}"));
         let sum = digest(&header, views.iter().map(|(n, v)| (n.as_str(), v.shape(), v.data())));
-        let metadata = HashMap::from([(KEY.to_string(), format!("{sum}\n{header}"))]);
+        let metadata = [(KEY.to_string(), format!("{sum}\n{header}"))].into_iter().collect();
         safetensors::serialize(views, Some(metadata)).unwrap_or_else(|e| unreachable!("safetensors: {e}"))
     }
 

@@ -13,7 +13,6 @@ use crate::task::{IdmKind, Task};
 use nearl_constraints::{Guard, RobotDescription};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use std::collections::HashMap;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
@@ -324,7 +323,7 @@ impl Snapshot {
             serde_json::to_string(&self.manifest).unwrap_or_else(|e| unreachable!("manifest: {e}"));
         let parsed = views.iter().map(|(n, v)| (n.as_str(), v.shape(), v.data()));
         let header = format!("{}\n{manifest}", digest(&manifest, parsed));
-        safetensors::serialize(views, Some(HashMap::from([(KEY.to_string(), header)])))
+        safetensors::serialize(views, Some([(KEY.to_string(), header)].into_iter().collect()))
             .unwrap_or_else(|e| unreachable!("safetensors: {e}"))
     }
 
