@@ -8,6 +8,7 @@ mod collision;
 use crate::ModelError;
 use crate::description::{Body, Frame, JointDescription, JointKind, Motor, Range, RobotDescription};
 use crate::geometry::Placement;
+pub(crate) use check::ROUNDING;
 use check::{check_joint, check_link, check_tree};
 use roxmltree::{Document, Node, ParsingOptions};
 use std::collections::HashMap;

@@ -3,6 +3,7 @@
 use super::{Body, JointDescription, JointKind, Motor, Range, RobotDescription};
 use crate::ModelError;
 use crate::geometry::Placement;
+use crate::urdf::ROUNDING;
 use std::collections::{HashMap, HashSet};
 
 /// Larger robots are refused before anything is built: the mass matrix grows with the square of the dofs.
@@ -140,7 +141,7 @@ fn check_body(body: &Body, wrong: &mut Vec<String>) {
     if body.com.iter().chain(&body.inertia).any(|x| !x.is_finite()) {
         wrong.push(format!("body '{name}' has a centre of mass or an inertia that is not finite"));
     }
-    if [0, 3, 5].iter().any(|k| body.inertia[*k] < 0.0) {
+    if [0, 3, 5].iter().any(|k| body.inertia[*k] < -ROUNDING) {
         wrong.push(format!("body '{name}' has a negative moment of inertia"));
     }
     for joint in &body.joints {

@@ -3,6 +3,9 @@
 use roxmltree::Node;
 use std::collections::{BTreeMap, BTreeSet};
 
+/// A moment of inertia that is negative by less is 0 as a program wrote it [kg·m²].
+pub(crate) const ROUNDING: f64 = 1e-12;
+
 /// Types of joints that URDF has.
 const KINDS: [&str; 6] = ["revolute", "continuous", "prismatic", "fixed", "floating", "planar"];
 
@@ -63,7 +66,7 @@ pub(super) fn check_link(link: Node, wrong: &mut Vec<String>) {
                 ));
             } else if part.has_tag_name("mass") && value < 0.0 {
                 wrong.push(format!("link '{name}' mass is {value} kg"));
-            } else if matches!(a.name(), "ixx" | "iyy" | "izz") && value < 0.0 {
+            } else if matches!(a.name(), "ixx" | "iyy" | "izz") && value < -ROUNDING {
                 wrong.push(format!("link '{name}' inertia {} is {value} kg m²", a.name()));
             }
         }

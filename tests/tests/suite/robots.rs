@@ -3,6 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
+use nearl_runtime::Snapshot;
 use nearl_runtime::constraints::convention as c;
 use nearl_runtime::constraints::description::{Command, RobotDescription};
 use nearl_runtime::constraints::{Dynamics, Model};
@@ -310,4 +311,84 @@ fn motor_strength_through_default_classes_is_mujoco_s() {
         *(if theirs.is_finite() { &mut finite } else { &mut infinite }) += 1;
     }
     assert!(finite > 10 && infinite > 5, "{finite} {infinite}: this proves nothing");
+}
+
+/// A robot of several files belongs to its task wherever the task goes: into a run's folder and into a snapshot.
+#[test]
+fn a_task_finds_what_its_robot_includes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("a file");
+    write("wedge.obj", "v 0 0 0\nv 0.2 0 0\nv 0 0.1 0\nv 0 0 0.3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n");
+    write(
+        "link.xml",
+        r#"<mujocoinclude><body name="link"><joint name="hinge" axis="0 1 0" damping="0.2"/><geom type="mesh" mesh="wedge"/></body></mujocoinclude>"#,
+    );
+    write(
+        "robot.xml",
+        r#"<mujoco><asset><mesh name="wedge" file="wedge.obj"/></asset><worldbody><include file="link.xml"/></worldbody>
+        <actuator><motor joint="hinge" gear="2" ctrlrange="-3 3"/></actuator></mujoco>"#,
+    );
+    let task = std::fs::read_to_string(root().join("tests/fixtures/two_link.toml")).expect("task");
+    let task = task
+        .replace("two_link.xml", "robot.xml")
+        .replace("v.elbow", "v.hinge")
+        .replace("position = { margin = 0.02 }\n", "");
+    write("task.toml", &task.replace("dt = 0.01\nsim_dt = 0.01", "dt = 0.002\nsim_dt = 0.002"));
+    let snapshot = nearl_tests::random_policy(&folder.path().join("task.toml").display().to_string(), 1, 1.0);
+    assert_eq!(snapshot.manifest.robot.bodies[0].name, "link");
+    let again = Snapshot::from_bytes(&snapshot.to_bytes()).expect("a snapshot");
+    assert_eq!(again.manifest.robot, snapshot.manifest.robot);
+    nearl_trainer::rollout::make_env(&again).expect("the environment of a snapshot");
+    let run = tempfile::tempdir().expect("a folder");
+    let file =
+        nearl_trainer::run_folder::write_task(run.path(), "task", &snapshot.manifest).expect("a task file");
+    let loaded = nearl_trainer::tasks::load(&file.display().to_string(), &[]).expect("the task of a run");
+    assert_eq!(loaded.robot, snapshot.manifest.robot);
+}
+
+/// A snapshot of the first format carried its robot as text: of a URDF it is read, of an MJCF it says what to do.
+#[test]
+fn snapshots_of_the_first_format() {
+    let old = std::fs::read(root().join("fuzz/corpus/snapshot/stochastic")).expect("a snapshot of format 1");
+    let snapshot = Snapshot::from_bytes(&old).expect("a URDF robot");
+    assert_eq!(snapshot.manifest.format, 2);
+    let urdf = Model::from_urdf(&root().join("examples/robots/panda/panda.urdf")).expect("the same robot");
+    assert_eq!(&snapshot.manifest.robot, urdf.description());
+    nearl_runtime::Controller::new(&snapshot).expect("a controller");
+    assert!(!String::from_utf8_lossy(&snapshot.to_bytes()).contains("<robot"), "no XML in today's format");
+
+    let foreign = resigned(&old, "\"model_format\":\"urdf\"", "\"model_format\":\"mjcf\"");
+    let text = Snapshot::from_bytes(&foreign).expect_err("an MJCF robot").to_string();
+    assert!(text.contains("format 1 with an MJCF robot") && text.contains("train again"), "{text}");
+    let newer = resigned(&old, "\"format\":1", "\"format\":3");
+    let text = Snapshot::from_bytes(&newer).expect_err("another format").to_string();
+    assert!(text.contains("format 3 where this program reads 2"), "{text}");
+}
+
+/// The file with other words in its manifest, and a digest that fits.
+fn resigned(file: &[u8], from: &str, to: &str) -> Vec<u8> {
+    let length = u64::from_le_bytes(file[..8].try_into().expect("a length")) as usize;
+    let mut header: serde_json::Value = serde_json::from_slice(&file[8..8 + length]).expect("a header");
+    let old = header["__metadata__"]["nearl"].as_str().expect("a manifest").to_string();
+    let (_, manifest) = old.split_once('\n').expect("a digest");
+    assert!(manifest.contains(from), "{from}");
+    let manifest = manifest.replacen(from, to, 1);
+    let tensors: Vec<(String, Vec<usize>, Vec<u8>)> = header
+        .as_object()
+        .expect("an object")
+        .iter()
+        .filter(|(name, _)| *name != "__metadata__")
+        .map(|(name, entry)| {
+            let numbers =
+                |key: &str| serde_json::from_value::<Vec<usize>>(entry[key].clone()).expect("numbers");
+            let place = numbers("data_offsets");
+            let data = &file[8 + length..];
+            (name.clone(), numbers("shape"), data[place[0]..place[1]].to_vec())
+        })
+        .collect();
+    let parts = tensors.iter().map(|(name, shape, data)| (name.as_str(), shape.as_slice(), data.as_slice()));
+    let sum = nearl_runtime::snapshot::digest(&manifest, parts);
+    header["__metadata__"]["nearl"] = format!("{sum}\n{manifest}").into();
+    let header = serde_json::to_vec(&header).expect("a header");
+    [&(header.len() as u64).to_le_bytes()[..], &header, &file[8 + length..]].concat()
 }

@@ -1,0 +1,58 @@
+"""Reads the same files with our reader and compares: writes runs.jsonl and table.md beside this script."""
+
+import json
+import pathlib
+import sys
+
+import numpy as np
+
+import nearl
+
+HERE = pathlib.Path(__file__).parent
+
+
+def off(ours: np.ndarray, theirs: np.ndarray) -> float:
+    return float(np.abs(ours - theirs).max() / max(1e-3, np.abs(theirs).max()))
+
+
+def compare(path: pathlib.Path, theirs: dict) -> dict:
+    row = {"file": theirs["file"], "theirs": theirs.get("refused", "loads")}
+    try:
+        model = nearl.Model.from_urdf(path)
+    except (ValueError, OSError) as error:
+        return {**row, "ours": str(error).replace(str(path), path.name)}
+    row |= {"ours": "loads", "nv": model.nv, "notes": model.notes}
+    if "refused" in theirs:
+        return row
+    if model.joint_names != theirs["joints"] or (model.nq, model.nv) != (theirs["nq"], theirs["nv"]):
+        return {**row, "different": "joints"}
+    worst = {"mass": 0.0, "nle": 0.0}
+    for state in theirs["states"]:
+        mass = np.array(state["mass"]).reshape(model.nv, model.nv)
+        worst["mass"] = max(worst["mass"], off(model.mass_matrix(state["q"]), mass))
+        worst["nle"] = max(worst["nle"], off(model.nle(state["q"], state["v"]), np.array(state["nle"])))
+    return row | worst
+
+
+def table(rows: list[dict]) -> str:
+    loads = [r for r in rows if r["ours"] == "loads"]
+    compared = [r for r in loads if "mass" in r]
+    worst = max(max(r["mass"], r["nle"]) for r in compared)
+    lines = [
+        f"{len(rows)} URDFs of example-robot-data 6.0.0: {len(loads)} load, {len(compared)} of them are compared with Pinocchio 4.1.0's own parser "
+        f"(mass matrix, non-linear effects at three random states): the largest difference is {worst:.1e} of the largest entry.",
+        "", "Refused:", "", "| file | why |", "|---|---|",
+    ]
+    lines += [f"| {r['file']} | {r['ours']} |" for r in rows if r["ours"] != "loads"]
+    lines += ["", "Loaded:", "", "| file | dofs | mass matrix | nle | notes |", "|---|---|---|---|---|"]
+    for r in loads:
+        numbers = [f"{r[k]:.0e}" if k in r else (r.get("different") or "refused by Pinocchio") for k in ("mass", "nle")]
+        lines.append(f"| {r['file']} | {r['nv']} | {numbers[0]} | {numbers[1]} | {len(r['notes']) or ''} |")
+    return "\n".join(lines) + "\n"
+
+
+root, references = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]).read_text().splitlines()
+rows = [compare(root / theirs["file"], theirs) for theirs in map(json.loads, references)]
+(HERE / "runs.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+(HERE / "table.md").write_text(table(rows))
+print((HERE / "table.md").read_text())

@@ -1,0 +1,33 @@
+"""Prints what Pinocchio's own parser makes of every URDF below a folder: joints, and dynamics at three random states, one JSON line each."""
+
+import json
+import pathlib
+import sys
+
+import numpy as np
+import pinocchio as pin
+
+STATES = 3
+
+
+def robot(path: pathlib.Path) -> dict:
+    try:
+        model = pin.buildModelFromUrdf(str(path))
+    except Exception as error:  # whatever it throws is its answer
+        return {"refused": str(error).splitlines()[0]}
+    if model.nv == 0:
+        return {"refused": "no movable joint"}
+    data, rng, states = model.createData(), np.random.default_rng(5), []
+    for _ in range(STATES):
+        q = pin.integrate(model, pin.neutral(model), rng.uniform(-1, 1, model.nv))
+        v = rng.normal(size=model.nv)
+        mass = pin.crba(model, data, q)
+        mass = np.triu(mass) + np.triu(mass, 1).T
+        states.append({"q": q.tolist(), "v": v.tolist(), "mass": mass.ravel().tolist(),
+                       "nle": pin.nonLinearEffects(model, data, q, v).tolist()})
+    return {"joints": list(model.names)[1:], "nq": model.nq, "nv": model.nv, "states": states}
+
+
+root = pathlib.Path(sys.argv[1])
+for path in sorted(root.rglob("*.urdf")):
+    print(json.dumps({"file": str(path.relative_to(root)), **robot(path)}))
