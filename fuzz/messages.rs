@@ -85,7 +85,7 @@ pub fn with_core(fuzz: impl FnOnce(&dyn Fn(&[u8]))) {
         core.update(&Inputs { due: 0, begin: *tick * 1_000_000 + 10_000, stop: false, fresh: Some(&state) });
         core.close(*tick * 1_000_000 + 50_000);
         let record = &core.record;
-        let action = &record.step.action[..record.step.nu as usize];
+        let action = &record.output.action[..record.output.nu as usize];
         assert!(action.iter().zip(&effort).all(|(a, e)| a.is_finite() && a.abs() <= *e), "{action:?}");
         assert_ne!(record.reason, Reason::Panic);
     });

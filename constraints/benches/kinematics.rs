@@ -5,7 +5,7 @@ mod common;
 
 use common::solids::panda_collision;
 use common::*;
-use nearl_constraints::row::{Motion, RowsMut, Tick};
+use nearl_constraints::row::{Motion, RowsMut, TickStart};
 use nearl_constraints::*;
 use std::time::Instant;
 
@@ -42,13 +42,13 @@ fn rows(name: &str, limit: &dyn Limit) {
         let q = &configuration(k);
         let (mass, motors, bias, previous) = (&[][..], &[][..], &[][..], None);
         let kinematics = &mut kinematics;
-        let mut tick = Tick { q, v: &v, period: &period, mass, motors, bias, kinematics, previous };
+        let mut tick = TickStart { q, v: &v, period: &period, mass, motors, bias, kinematics, previous };
         g.fill(0.0);
         upper.fill(f64::INFINITY);
         let (g, lower, upper, outside) = (&mut g[..], &mut lower[..], &mut upper[..], &mut outside[..]);
         rows.fill(&mut tick, &mut RowsMut { g, lower, upper, outside, nv: 7 });
     });
-    time(&format!("{name}, {n} rows: judge"), |k| {
+    time(&format!("{name}, {n} rows: checker"), |k| {
         let q = &configuration(k);
         let (q_next, v_next, acceleration, torque) = (q, &v, &[0.0; 7], &[]);
         let (period, kinematics, previous) = (&period, &mut kinematics, None);

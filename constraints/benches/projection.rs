@@ -1,4 +1,4 @@
-//! Whole ticks in thread CPU time, with allocations: assembly, Pinocchio, solve, judge and ledger, by the rung that answered.
+//! Whole ticks in thread CPU time, with allocations: assembly, Pinocchio, solve, checker and ledger, by the rung that answered.
 //! `cargo bench -p nearl-constraints --bench projection`
 
 #[path = "../tests/common/mod.rs"]

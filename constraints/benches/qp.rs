@@ -3,7 +3,7 @@
 //! `cargo bench -p nearl-constraints --bench qp -- FILE.bin...` prints percentiles; with `--out FOLDER` it also writes the time of each
 //! problem, for `benches/qp/table.py` to set beside other solvers.
 
-use nearl_constraints::{LoneStages, Numbers};
+use nearl_constraints::{CoupledStages, Numbers};
 use rustix::time::{ClockId, clock_gettime};
 use std::path::{Path, PathBuf};
 
@@ -70,7 +70,7 @@ struct Times {
 }
 
 fn time(problems: &Problems, how: How, passes: usize) -> Times {
-    let (mut stages, clock) = (LoneStages::new(&problems.all[0]).expect("a problem"), clock());
+    let (mut stages, clock) = (CoupledStages::new(&problems.all[0]).expect("a problem"), clock());
     let mut times = vec![Vec::with_capacity(passes); problems.all.len()];
     let (mut iterations, mut failed, mut furthest) = (vec![], 0, 0.0f64);
     for pass in 0..passes {

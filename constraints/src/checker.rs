@@ -1,4 +1,4 @@
-//! The independent judge: evaluates the limits themselves at a next state. It shares no code with the projector's
+//! The independent checker evaluates the limits themselves at a next state. It shares no code with the projector's
 //! assembly: no boxes, no rows, no mass matrix; the motor force comes from inverse dynamics. When in the period that is
 //! taken is one definition for both ([`Period::lag`], [`Period::resistance`]), which tests compare with MuJoCo.
 
@@ -41,7 +41,7 @@ impl Verdict {
     }
 }
 
-/// What rows and cones are judged for.
+/// What rows and cones are checked for.
 enum Meant<'a> {
     /// What they ask of a target, with the tick before.
     Asked(Option<Previous<'a>>),
@@ -49,7 +49,7 @@ enum Meant<'a> {
     Kept,
 }
 
-/// Scratch and constants of the judge.
+/// Scratch and constants of the checker.
 pub struct Checker {
     dynamics: Dynamics,
     kinematics: Kinematics,
@@ -84,7 +84,7 @@ struct ConeOf {
 }
 
 impl Checker {
-    /// A judge of `limits` on the `controllable` dofs.
+    /// A checker of `limits` on the `controllable` dofs.
     ///
     /// # Errors
     /// Those of the limits.
@@ -127,7 +127,7 @@ impl Checker {
         })
     }
 
-    /// Judges going from (`q`, `v`) to (`q_next`, `v_next`) in one period; configurations nq, velocities nv. `external`:
+    /// Checks going from (`q`, `v`) to (`q_next`, `v_next`) in one period; configurations nq, velocities nv. `external`:
     /// generalised forces on the robot beside its motors (nv).
     pub fn check(
         &mut self,
@@ -176,7 +176,7 @@ impl Checker {
         }
     }
 
-    /// Judges the step of a brake like [`Checker::check`], its rows and cones for what they keep ([`Rows::breach`]) and no more.
+    /// Checks the step of a brake like [`Checker::check`], its rows and cones for what they keep ([`Rows::breach`]) and no more.
     pub fn check_brake(
         &mut self,
         q: &[f64],
@@ -232,7 +232,7 @@ impl Checker {
         rows.chain(self.cones.iter().filter(|c| c.hard).map(|c| c.cone.kind())).collect()
     }
 
-    /// Motor forces of the last motion judged, by inverse dynamics (nv); zero when no limit needs them.
+    /// Motor forces of the last motion checked, by inverse dynamics (nv); zero when no limit needs them.
     pub fn torque(&self) -> &[f64] {
         &self.tau
     }

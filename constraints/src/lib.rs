@@ -24,7 +24,7 @@
 //! 1. [`viability`]: why position, velocity and acceleration limits never contradict each other;
 //! 2. [`limit`]: what a limit is and how to add one;
 //! 3. [`Projector`] (`projector/mod.rs`): the tick; then `projector/coupled.rs` (the rows), `active_set/`, `conic.rs`;
-//! 4. [`checker`]: the judge that shares no code with the above; [`certify_braking`]: whether the motors can brake;
+//! 4. [`checker`]: checks a target once more and shares no code with the above; [`certify_braking`]: whether the motors can brake;
 //! 5. [`Model`], [`Dynamics`], [`Kinematics`], [`convention`]: the robot, and how it meets MuJoCo; [`geometry`]: distances between solids.
 //!
 //! # What is promised
@@ -80,7 +80,7 @@ pub use limit::*;
 pub use model::{FrameId, Joint, Model};
 pub use period_dynamics::PeriodDynamics;
 #[doc(hidden)]
-pub use projector::{LoneStages, Numbers};
+pub use projector::{CoupledStages, Numbers};
 pub use projector::{Problem, ProblemCone, Projector};
 pub use row::{Cone, Rows, Soft};
 pub use target::{Bounds, Braking, Consistency, Guard, Proposal, Settings, Solver, Target};

@@ -2,14 +2,14 @@
 //!
 //! A limit that ties several dofs together hands the projector a [`Rows`] or a [`Cone`]. Both are asked twice a tick: `fill`
 //! writes the constraint for the solver, and `excess` evaluates what was meant at the final target for the
-//! [`checker`](crate::checker). The two must not share their formula: rows come from Jacobians and mass matrices, the judge from
+//! [`checker`](crate::checker). The two must not share their formula: rows come from Jacobians and mass matrices, the checker from
 //! forward kinematics and inverse dynamics.
 
 use crate::{Kind, Kinematics, Period};
 use serde::{Deserialize, Serialize};
 
 /// What is known at the start of a tick. Lengths nq and nv; units rad or m, s, N·m or N.
-pub struct Tick<'a> {
+pub struct TickStart<'a> {
     /// Configuration (nq).
     pub q: &'a [f64],
     /// Velocity (nv).
@@ -29,7 +29,7 @@ pub struct Tick<'a> {
     pub previous: Option<Previous<'a>>,
 }
 
-impl Tick<'_> {
+impl TickStart<'_> {
     /// Writes `g` (nv), by which the force of motor `i` rises for a unit of velocity change: row `i` of `motors / T`.
     pub fn motor(&self, i: usize, g: &mut [f64]) {
         let (nv, t) = (self.v.len(), self.period.dt);
@@ -48,7 +48,7 @@ pub struct Previous<'a> {
     pub torque: &'a [f64],
 }
 
-/// The step from measured state to target, for the judge.
+/// The step from measured state to target, for the checker.
 pub struct Motion<'a> {
     /// Measured configuration (nq).
     pub q: &'a [f64],
@@ -71,7 +71,7 @@ pub struct Motion<'a> {
     pub previous: Option<Previous<'a>>,
 }
 
-/// What of a [`Tick`] and a [`Motion`] a limit reads; the rest is not computed.
+/// What of a [`TickStart`] and a [`Motion`] a limit reads; the rest is not computed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Needs {
     /// Mass matrix.
@@ -125,7 +125,7 @@ pub trait Rows: Send {
     }
 
     /// Writes the rows of the tick. Must not allocate.
-    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>);
+    fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>);
 
     /// Writes by how much the motion exceeds the limit of each row, as a share of its size; negative inside. Must not allocate.
     fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]);
@@ -156,7 +156,7 @@ pub trait Cone: Send {
     fn needs(&self) -> Needs;
 
     /// Writes `G` (dimension x nv, row-major, zero before) and `c` (dimension), and returns the radius. Must not allocate.
-    fn fill(&mut self, tick: &mut Tick<'_>, g: &mut [f64], c: &mut [f64]) -> f64;
+    fn fill(&mut self, tick: &mut TickStart<'_>, g: &mut [f64], c: &mut [f64]) -> f64;
 
     /// By how much the motion exceeds the cone, as a share of its size; negative inside. Must not allocate.
     fn excess(&mut self, motion: &mut Motion<'_>) -> f64;

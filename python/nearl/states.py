@@ -36,7 +36,7 @@ class States:
         period_tick: Ticks since the policy ran (n).
         log_prob_proposal, log_prob_action: As sampled (n).
         moved: Distance between proposal and target (n).
-        raw_violations, projected_violations: Limits broken by proposal and target (n).
+        raw_violations, target_violations: Limits broken by proposal and target (n).
         terminated, truncated, reset: The next state ends the episode, is cut by time, or begins the next one (n).
         lost: Ticks lost since the link was opened, because they were not read in time.
     """
@@ -62,7 +62,7 @@ class States:
     log_prob_action: Floats
     moved: Floats
     raw_violations: Integers
-    projected_violations: Integers
+    target_violations: Integers
     terminated: Bools
     truncated: Bools
     reset: Bools

@@ -81,9 +81,9 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         """One action (num_envs x n_act) each; an environment whose episode ended begins a new one, see the autoreset mode."""
         if self._reward is None and self._termination is None:
             return self._native.step(actions)
-        return self._judged(np.asarray(actions, float))
+        return self._scored(np.asarray(actions, float))
 
-    def _judged(self, actions: Floats) -> Step:
+    def _scored(self, actions: Floats) -> Step:
         """A step whose reward or termination the caller's functions give."""
         obs, rewards, terminated, truncated, info = self._native.step(actions)
         reached = obs.copy()  # the states the actions led to, also where a new episode began at once

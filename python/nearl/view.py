@@ -111,7 +111,7 @@ def panel(names: list[str], low: Floats, high: Floats, states: States) -> str:
             f'<tr><td>{html.escape(name)}</td><td style="width:90px;border:1px solid #d0d5dd">{bar}</td>'
             f"<td>{q[i + shift]:.2f}</td><td>{v[i]:.2f}</td><td>{f'{pull[i]:+.2g}' if held else ''}</td></tr>"
         )
-    raw, target = int(states.raw_violations.sum()), int(states.projected_violations.sum())
+    raw, target = int(states.raw_violations.sum()), int(states.target_violations.sum())
     head = "<tr><th>joint</th><th>in its range</th><th>q</th><th>v</th><th>held back by [rad/s]</th></tr>"
     now = f"<b>{html.escape(str(states.mode[-1]))}</b>, tick {int(states.tick[-1]):,}, policy {int(states.version[-1])}"
     return (

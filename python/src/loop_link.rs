@@ -144,7 +144,7 @@ const INTEGERS: [(&str, Integer); 11] = [
     ("mode", |t| u64::from(t.mode)),
     ("period_tick", |t| u64::from(t.period_tick)),
     ("raw_violations", |t| u64::from(t.ledger.raw_violations)),
-    ("projected_violations", |t| u64::from(t.ledger.projected_violations)),
+    ("target_violations", |t| u64::from(t.ledger.target_violations)),
 ];
 const NUMBERS: [(&str, Number); 3] = [
     ("log_prob_proposal", |t| t.log_prob_proposal),

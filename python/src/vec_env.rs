@@ -206,7 +206,7 @@ fn info<'py>(py: Python<'py>, vector: &Vector) -> PyResult<Bound<'py, PyDict>> {
             PyArray1::from_vec(py, vector.lanes().map(|l| f(&l) as u32).collect::<Vec<u32>>())
         };
         info.set_item("raw_violations", counts(|l| l.tally.raw_violations))?;
-        info.set_item("target_violations", counts(|l| l.tally.projected_violations))?;
+        info.set_item("target_violations", counts(|l| l.tally.target_violations))?;
         info.set_item("moved", array(py, &vector.lanes().map(|l| l.moved).collect::<Vec<_>>()))?;
     }
     Ok(info)

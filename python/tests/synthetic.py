@@ -71,7 +71,7 @@ def flight_log(path: Path, ticks: int = 3000, metadata: dict[str, str] | None = 
                 "proposal_q": q_hat.tolist(), "proposal_v": v_hat.tolist(), "target_q": target.q.tolist(), "target_v": target.v.tolist(),
                 "action": [0.0] * 7,
                 "ledger": {"status": 1, "rung": RUNGS.index(target.rung), "active": len(target.active), "iterations": target.iterations,
-                           "raw_violations": sum(target.raw_violations.values()), "projected_violations": sum(target.violations.values()),
+                           "raw_violations": sum(target.raw_violations.values()), "target_violations": sum(target.violations.values()),
                            "moved": target.moved, "slack": target.slack, "residual": target.residual, "duration_ns": target.duration_ns},
                 "overruns": 0, "stale": 0, "lost_states": 0,
             }  # fmt: skip
@@ -99,7 +99,7 @@ def evaluations(path: Path) -> Path:
 def summary(path: Path) -> Path:
     times = {"count": 30000, "p50": 9_100, "p99": 14_000, "p999": 31_000, "max": 320_000}
     loop = {"robot": "panda", "ticks": 30000, "seconds": 30.0, "dt": 1e-3, "wake": times, "compute": times,
-            "counters": {"overruns": 1, "raw_violations": 8123, "projected_violations": 0}}  # fmt: skip
+            "counters": {"overruns": 1, "raw_violations": 8123, "target_violations": 0}}  # fmt: skip
     loop["plant"] = {"late": 2, "violations": {"position": 0, "velocity": 3}, "worst": {"position": 0.0, "velocity": 0.012}}
     receipts = [{"version": 4, "accepted": True, "text": "in use"}, {"version": 5, "accepted": False, "text": "snapshot digest mismatch"}]
     path.write_text(json.dumps([{"run": loop}, {"task": "HalfCheetah-v5", "run": loop, "swap": receipts}]))

@@ -93,5 +93,5 @@ def test_the_loop_runs_on_while_python_holds_its_lock(tmp_path: Path) -> None:
     free = starts[(starts < begin) | (starts > finish)]
     outside = len(free) / (starts[-1] - starts[0] - (finish - begin))
     assert inside > 0.8 * outside, f"{inside * 1e9:.0f} ticks a second while the lock was held, {outside * 1e9:.0f} without"
-    assert report["modes"]["fault"] == 0 and report["counters"]["projected_violations"] == 0, report
+    assert report["modes"]["fault"] == 0 and report["counters"]["target_violations"] == 0, report
     assert moved["violations"]["torque"] == 0, moved

@@ -64,7 +64,7 @@ def test_a_chunk_is_what_the_controller_does(server: str) -> None:
     action = controller.act(chunk.obs[0])
     assert np.allclose(controller.proposal, chunk.proposal[0], atol=1e-9)
     assert action.shape == chunk.action[0].shape and np.isfinite(chunk.action).all()
-    assert (chunk.ledger["ticks"] >= 1).all() and not chunk.ledger["projected_violations"].any()
+    assert (chunk.ledger["ticks"] >= 1).all() and not chunk.ledger["target_violations"].any()
     assert chunk.version == controller.version and len(chunk.ledger) == 11
 
 
@@ -73,8 +73,8 @@ def test_without_constraints_the_targets_break_them(server: str) -> None:
         own = list(link.rollout(seed=2, n_steps=400))
         off = list(link.rollout(seed=2, n_steps=400, constraints=False))
         same = list(link.rollout(seed=2, n_steps=400, constraints=own[0].constraints))
-    assert sum(c.ledger["projected_violations"].sum() for c in own) == 0
-    assert sum(c.ledger["projected_violations"].sum() for c in off) > 0
+    assert sum(c.ledger["target_violations"].sum() for c in own) == 0
+    assert sum(c.ledger["target_violations"].sum() for c in off) > 0
     assert all(np.array_equal(a.action, b.action) for a, b in zip(own, same, strict=True))
 
 

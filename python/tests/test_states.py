@@ -45,7 +45,7 @@ def test_states_are_ticks_in_order_within_the_limits(arm: str) -> None:
     last = parts[-1]
     assert last.q.shape == last.target_q.shape == (len(last), 7) and last.obs.shape == (len(last), len(controller.obs_names))
     assert last.action.shape == (len(last), 7) and np.isfinite(last.action).all()
-    assert not any(p.projected_violations.any() for p in parts) and any(p.raw_violations.any() for p in parts)
+    assert not any(p.target_violations.any() for p in parts) and any(p.raw_violations.any() for p in parts)
     for p in parts:
         follows = (p.next_sequence[:-1] == p.sequence[1:]) & ~p.reset[:-1]
         # Analytic inverse dynamics: the state reached is the target.

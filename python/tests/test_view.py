@@ -13,7 +13,7 @@ from nearl import _core, view
 
 def tick(q, v_proposal, v_target) -> SimpleNamespace:
     one = {"q": q, "v": v_target, "proposal_v": v_proposal, "target_v": v_target}
-    counts = {"raw_violations": [3, 4], "projected_violations": [0, 0], "tick": [7, 8], "version": [1, 1]}
+    counts = {"raw_violations": [3, 4], "target_violations": [0, 0], "tick": [7, 8], "version": [1, 1]}
     return SimpleNamespace(mode=["active", "active"], **{k: np.array([x, x]) for k, x in one.items()}, **{k: np.array(x) for k, x in counts.items()})
 
 

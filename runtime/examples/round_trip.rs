@@ -14,7 +14,7 @@ const OPENING: Duration = Duration::from_millis(300);
 
 #[repr(C)]
 #[derive(Clone, Copy, Debug, ZeroCopySend)]
-struct Tick {
+struct Packet {
     seq: u64,
     data: [u64; 66],
 }
@@ -74,7 +74,7 @@ fn publish_subscribe() -> Result<(), Box<dyn Error>> {
     let open = |way: &str| -> Result<_, Box<dyn Error>> {
         let node = NodeBuilder::new().create::<ipc::Service>()?;
         let service = node.service_builder(&format!("{name}/{way}").as_str().try_into()?);
-        Ok((service.publish_subscribe::<Tick>().open_or_create()?, node))
+        Ok((service.publish_subscribe::<Packet>().open_or_create()?, node))
     };
     let answer = || {
         let ((there, _a), (back, _b)) = (open("there")?, open("back")?);
@@ -85,7 +85,7 @@ fn publish_subscribe() -> Result<(), Box<dyn Error>> {
                 None => spin_loop(),
                 Some(tick) => {
                     seq = tick.seq;
-                    to.loan_uninit()?.write_payload(Tick { seq, data: [1; 66] }).send()?;
+                    to.loan_uninit()?.write_payload(Packet { seq, data: [1; 66] }).send()?;
                 }
             }
         }
@@ -96,7 +96,7 @@ fn publish_subscribe() -> Result<(), Box<dyn Error>> {
         let (to, from) = (there.publisher_builder().create()?, back.subscriber_builder().create()?);
         std::thread::sleep(OPENING);
         let round = |seq| -> Result<(), Box<dyn Error>> {
-            to.loan_uninit()?.write_payload(Tick { seq, data: [2; 66] }).send()?;
+            to.loan_uninit()?.write_payload(Packet { seq, data: [2; 66] }).send()?;
             while from.receive()?.is_none_or(|tick| tick.seq != seq) {
                 spin_loop();
             }
@@ -112,7 +112,7 @@ fn blackboard() -> Result<(), Box<dyn Error>> {
     let node = NodeBuilder::new().create::<ipc::Service>()?;
     let create = |way: &str| -> Result<_, Box<dyn Error>> {
         let service = node.service_builder(&format!("{name}/board/{way}").as_str().try_into()?);
-        Ok(service.blackboard_creator::<u64>().add::<Tick>(0, Tick { seq: 0, data: [0; 66] }).create()?)
+        Ok(service.blackboard_creator::<u64>().add::<Packet>(0, Packet { seq: 0, data: [0; 66] }).create()?)
     };
     let (there, back) = (create("there")?, create("back")?);
     let name = &name;
@@ -124,7 +124,7 @@ fn blackboard() -> Result<(), Box<dyn Error>> {
         };
         let (reader, writer) =
             (open("there")?.reader_builder().create()?, open("back")?.writer_builder().create()?);
-        let (from, to) = (reader.entry::<Tick>(&0)?, writer.entry::<Tick>(&0)?);
+        let (from, to) = (reader.entry::<Packet>(&0)?, writer.entry::<Packet>(&0)?);
         let mut last = from.get();
         while last.seq < ROUNDS {
             if from.is_up_to_date(&last) {
@@ -132,16 +132,16 @@ fn blackboard() -> Result<(), Box<dyn Error>> {
                 continue;
             }
             last = from.get();
-            to.update_with_copy(Tick { seq: last.seq, data: [1; 66] });
+            to.update_with_copy(Packet { seq: last.seq, data: [1; 66] });
         }
         Ok(())
     };
     both(answer, || {
         let (writer, reader) = (there.writer_builder().create()?, back.reader_builder().create()?);
-        let (to, from) = (writer.entry::<Tick>(&0)?, reader.entry::<Tick>(&0)?);
+        let (to, from) = (writer.entry::<Packet>(&0)?, reader.entry::<Packet>(&0)?);
         let mut last = from.get();
         report("blackboard", |seq| {
-            to.update_with_copy(Tick { seq, data: [2; 66] });
+            to.update_with_copy(Packet { seq, data: [2; 66] });
             while last.seq != seq {
                 if from.is_up_to_date(&last) {
                     spin_loop();

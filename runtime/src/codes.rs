@@ -11,12 +11,15 @@ pub use tables::{CheckCode, LinkCode};
 use crate::link::Verdict;
 use crate::rt::{Mode, Reason};
 
-/// Every code of loop, links, snapshots and doctor, in the order of the groups.
+/// Every code of loop, links, snapshots and doctor, in the order of the groups. A reason that is the name of a tick's status, several
+/// times in a row, is explained by that status.
 pub fn all() -> Vec<Explanation> {
+    let statuses = LedgerStatus::explanations();
+    let is_reason_alone = |reason: &Explanation| statuses.iter().all(|status| status.code != reason.code);
     [
         Mode::explanations(),
-        Reason::explanations(),
-        LedgerStatus::explanations(),
+        Reason::explanations().into_iter().filter(is_reason_alone).collect(),
+        statuses.clone(),
         Verdict::explanations(),
         SnapshotCode::explanations(),
         LinkCode::explanations(),
@@ -63,6 +66,15 @@ mod tests {
             assert_eq!(find(&all, e.code).unwrap(), *e);
         }
         assert!(all.len() > 50);
+    }
+
+    /// What made a tick brake has one name, in the tick's status and as the reason of the mode it led to.
+    #[test]
+    fn the_reason_of_a_mode_has_the_name_of_the_status_behind_it() {
+        let braked = LedgerStatus::ALL.iter().filter(|status| status.name().starts_with("braked-"));
+        for status in braked {
+            assert!(Reason::ALL.iter().any(|reason| reason.name() == status.name()), "{status}");
+        }
     }
 
     #[test]

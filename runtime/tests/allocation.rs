@@ -53,20 +53,20 @@ struct Watched {
     allocates: bool,
 }
 
-impl Tick for Watched {
+impl LoopController for Watched {
     fn version(&self) -> u64 {
         self.version
     }
-    fn tick(&mut self, state: &StateMessage, step: &mut Step) -> Outcome {
+    fn tick(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome {
         IS_LOOP.set(true);
-        step.nu = 1;
-        step.action[0] = -state.q()[0];
+        output.nu = 1;
+        output.action[0] = -state.q()[0];
         if self.allocates {
             drop(std::hint::black_box(Box::new(state.q()[0])));
         }
         Outcome::Acted
     }
-    fn brake(&mut self, _: &StateMessage, _: &mut Step) -> Outcome {
+    fn brake(&mut self, _: &StateMessage, _: &mut TickOutput) -> Outcome {
         IS_LOOP.set(false);
         Outcome::Refused
     }
@@ -92,7 +92,7 @@ fn calls_of_a_run(test: &str, allocates: bool, swaps: u64) -> u64 {
     let running = std::thread::spawn({
         let stop = stop.clone();
         let first = Watched { version: 1, allocates };
-        // Nothing is taken back: these controllers give no targets, and how far the body swings is not judged here.
+        // Nothing is taken back: these controllers give no targets, and how far the body swings is not compared here.
         let rollback = RollbackSettings { window: 0, ..RollbackSettings::default() };
         let settings = RunSettings { rollback, ..settings() };
         move || run_loop(link, robot, first, Any, &settings, &stop).unwrap()

@@ -131,13 +131,13 @@ pub trait Env: Send {
     /// cannot be believed, and nothing is written.
     fn foresee(&mut self, action: &[f64], qpos: &mut [f64], qvel: &mut [f64]) -> bool;
 
-    /// What a control period would have given that led from `from` to `to` under `action` (n_act): the task's own judgement
+    /// What a control period would have given that led from `from` to `to` under `action` (n_act): the task's own reward and end
     /// of what happened elsewhere, on a robot or in another process. The environment is left in `to`, with its goal. Rewards of
     /// contact forces are those of `to` at rest in its contacts, as far as MuJoCo can tell from the state alone.
     ///
     /// # Errors
     /// [`EnvError::Physics`] for a wrong length or an entry that is not finite.
-    fn judge(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError>;
+    fn score(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError>;
 
     /// Writes the observation (n_obs), in the order of [`Spec::obs`].
     fn observe(&self, obs: &mut [f64]);

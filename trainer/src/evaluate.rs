@@ -111,7 +111,7 @@ pub fn evaluate(
         e.ticks += t.ticks;
         e.raw_violations += t.raw_violations;
         e.recovering += t.recovering;
-        e.target_violations += t.projected_violations;
+        e.target_violations += t.target_violations;
         e.reached_violations += t.reached_violations;
         e.faults += t.faults;
         e.residual += t.residual;

@@ -57,7 +57,7 @@ pub struct Foresight {
 
 /// A position or a velocity that has limits.
 struct Row {
-    of: Entry,
+    of: Coordinate,
     lower: f64,
     upper: f64,
     /// What its excess is measured by.
@@ -65,7 +65,7 @@ struct Row {
 }
 
 #[derive(Clone, Copy)]
-enum Entry {
+enum Coordinate {
     Position(usize),
     Velocity(usize),
 }
@@ -78,11 +78,11 @@ impl Foresight {
         for (i, (&lower, &upper)) in limits.lower_position.iter().zip(&limits.upper_position).enumerate() {
             if lower.is_finite() || upper.is_finite() {
                 let size = if (upper - lower).is_finite() { (upper - lower).max(1e-6) } else { 1.0 };
-                rows.push(Row { of: Entry::Position(i), lower, upper, size });
+                rows.push(Row { of: Coordinate::Position(i), lower, upper, size });
             }
         }
         for (i, &most) in limits.velocity.iter().enumerate().filter(|(_, most)| most.is_finite()) {
-            rows.push(Row { of: Entry::Velocity(i), lower: -most, upper: most, size: most.max(1e-6) });
+            rows.push(Row { of: Coordinate::Velocity(i), lower: -most, upper: most, size: most.max(1e-6) });
         }
         let range: Vec<(f64, f64)> = spec
             .actuators
@@ -240,8 +240,8 @@ impl Foresight {
 impl Row {
     fn value(&self, q: &[f64], v: &[f64]) -> f64 {
         match self.of {
-            Entry::Position(i) => q[i],
-            Entry::Velocity(i) => v[i],
+            Coordinate::Position(i) => q[i],
+            Coordinate::Velocity(i) => v[i],
         }
     }
 }

@@ -13,7 +13,7 @@ pub enum Preset {
 
 /// What one of them sets.
 #[derive(Clone, Copy, Debug)]
-pub struct Entry {
+pub struct PresetEntry {
     /// Which.
     pub preset: Preset,
     /// As it is written.
@@ -27,8 +27,8 @@ pub struct Entry {
 }
 
 /// Every preset.
-pub const PRESETS: &[Entry] = &[
-    Entry {
+pub const PRESETS: &[PresetEntry] = &[
+    PresetEntry {
         preset: Preset::Paper,
         name: "paper",
         about: "32 x 32 for all networks, the inverse model affine plus a residual; batch 2048, minibatch 64",
@@ -41,7 +41,7 @@ pub const PRESETS: &[Entry] = &[
         ],
         tasks: &[],
     },
-    Entry {
+    PresetEntry {
         preset: Preset::Strong,
         name: "strong",
         about: "64 x 64, batch 16384, minibatch 512, a first spread of e^-1: what single trials did best with, not a search with seeds",
@@ -69,7 +69,7 @@ impl Preset {
         self.entry().name
     }
 
-    fn entry(self) -> &'static Entry {
+    fn entry(self) -> &'static PresetEntry {
         let found = PRESETS.iter().find(|e| e.preset == self);
         found.unwrap_or_else(|| unreachable!("{self:?} has no line in the table"))
     }

@@ -373,8 +373,8 @@ impl Training {
             let s = &g.segment;
             b.obs.extend_from_slice(&s.x);
             if proposes {
-                b.proposal.extend_from_slice(&s.change);
-                b.target.extend_from_slice(&s.target_change);
+                b.change.extend_from_slice(&s.change);
+                b.target_change.extend_from_slice(&s.target_change);
                 b.lower.extend_from_slice(&s.lower);
                 b.upper.extend_from_slice(&s.upper);
             }

@@ -164,9 +164,9 @@ fn stopping(d: f64, w: f64, a: f64, b: f64, period: &Period) -> f64 {
 mod tests {
     use super::*;
 
-    /// The judge accepts the bound itself and refuses a little more, whatever the state; it shares no formula with it.
+    /// The checker accepts the bound itself and refuses a little more, whatever the state; it shares no formula with it.
     #[test]
-    fn the_judge_draws_the_line_where_the_bound_is() {
+    fn the_checker_draws_the_line_where_the_bound_is() {
         let mut lines = 0;
         for sub_steps in [0, 1, 5] {
             for dt in [0.001, 0.01] {

@@ -1,7 +1,7 @@
 //! Motor force limits of joints with drives, at both ends of a period.
 
 use super::{Limit, TorqueLimit};
-use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Drive, Kind, LimitError, Model, Soft};
 
 /// `|K (q* - q) - D v| <= effort` at the start and at the end of a period. The force of a drive changes while its target is held:
@@ -81,7 +81,7 @@ impl Rows for DriveTorqueRows {
     /// ```text
     ///     start = tau + K (h v + c a) + D h a          end = start - K (e v + e T a / 2) - D e a
     /// ```
-    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+    fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let period = *tick.period;
         let (t, lag, sag) = (period.dt, period.lag(), period.sag());
         let end = t - period.tau;

@@ -3,7 +3,7 @@
 use super::Limit;
 use super::frame::check;
 use super::margin::{is_zero, less};
-use crate::row::{Cone, Motion, Needs, Tick};
+use crate::row::{Cone, Motion, Needs, TickStart};
 use crate::{Dynamics, Kind, Kinematics, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
@@ -51,9 +51,9 @@ impl Limit for EnergyLimit {
     fn cone(&self, model: &Model, _controllable: &[usize]) -> Result<Option<Box<dyn Cone>>, LimitError> {
         check("energy limit", self.settings.limit, self.settings.limit > 0.0, "above 0 J")?;
         let limit = less("energy margin", self.settings.limit, self.settings.margin)?;
-        let (nv, dynamics, judge) = (model.nv(), Dynamics::new(model), Kinematics::new(model));
+        let (nv, dynamics, checker) = (model.nv(), Dynamics::new(model), Kinematics::new(model));
         let (q, step, mass) = (model.neutral(), vec![0.0; nv], vec![0.0; nv * nv]);
-        Ok(Some(Box::new(EnergyCone { nv, limit, dynamics, judge, q, step, mass })))
+        Ok(Some(Box::new(EnergyCone { nv, limit, dynamics, checker, q, step, mass })))
     }
 
     fn soft(&self) -> Option<Soft> {
@@ -65,7 +65,7 @@ struct EnergyCone {
     nv: usize,
     limit: f64,
     dynamics: Dynamics,
-    judge: Kinematics,
+    checker: Kinematics,
     /// `q (+) T v` (nq), `T v` (nv), mass matrix (nv x nv).
     q: Vec<f64>,
     step: Vec<f64>,
@@ -101,7 +101,7 @@ impl Cone for EnergyCone {
         Needs::default()
     }
 
-    fn fill(&mut self, tick: &mut Tick<'_>, g: &mut [f64], c: &mut [f64]) -> f64 {
+    fn fill(&mut self, tick: &mut TickStart<'_>, g: &mut [f64], c: &mut [f64]) -> f64 {
         self.look_ahead(tick.q, tick.v, tick.period.dt);
         self.dynamics.mass(&self.q, &mut self.mass);
         factor(self.nv, &self.mass, g);
@@ -113,12 +113,12 @@ impl Cone for EnergyCone {
 
     fn excess(&mut self, motion: &mut Motion<'_>) -> f64 {
         self.look_ahead(motion.q, motion.v, motion.period.dt);
-        let energy = self.judge.kinetic_energy(&self.q, motion.v_next);
+        let energy = self.checker.kinetic_energy(&self.q, motion.v_next);
         (energy / self.limit).sqrt() - 1.0
     }
 
     fn breach(&mut self, motion: &mut Motion<'_>) -> f64 {
-        let energy = self.judge.kinetic_energy(motion.q_next, motion.v_next);
+        let energy = self.checker.kinetic_energy(motion.q_next, motion.v_next);
         (energy / self.limit).sqrt() - 1.0
     }
 }

@@ -3,7 +3,7 @@
 use super::Limit;
 use super::clearance::{Ahead, CREEP, Clearance};
 use crate::kinematics::{dot, norm};
-use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{FrameId, Kind, LimitError, Model, Period, PointMotion, Soft};
 use serde::{Deserialize, Serialize};
 
@@ -234,7 +234,7 @@ impl Rows for FrameRows {
         Needs::default()
     }
 
-    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+    fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (nv, j, period) = (rows.nv, &mut self.jacobian, tick.period);
         let kinematics = self.ahead.look(tick.q, tick.v, period.dt);
         let at = kinematics.point(self.frame, self.point);

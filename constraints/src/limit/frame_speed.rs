@@ -5,7 +5,7 @@ use super::clearance::Ahead;
 use super::frame::{check, frame_of};
 use super::margin::{is_zero, less};
 use crate::kinematics::norm;
-use crate::row::{Cone, Motion, Needs, Tick};
+use crate::row::{Cone, Motion, Needs, TickStart};
 use crate::{FrameId, Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
@@ -76,7 +76,7 @@ impl Limit for FrameSpeedLimit {
             point: s.point,
             limit,
             ahead: Ahead::new(model),
-            judge: Ahead::new(model),
+            checker: Ahead::new(model),
         })))
     }
 
@@ -91,8 +91,8 @@ struct SpeedCone {
     point: [f64; 3],
     limit: f64,
     ahead: Ahead,
-    /// Frames at the next velocity, for the judge.
-    judge: Ahead,
+    /// Frames at the next velocity, for the checker.
+    checker: Ahead,
 }
 
 impl Cone for SpeedCone {
@@ -116,7 +116,7 @@ impl Cone for SpeedCone {
         Needs::default()
     }
 
-    fn fill(&mut self, tick: &mut Tick<'_>, g: &mut [f64], c: &mut [f64]) -> f64 {
+    fn fill(&mut self, tick: &mut TickStart<'_>, g: &mut [f64], c: &mut [f64]) -> f64 {
         self.ahead.look(tick.q, tick.v, tick.period.dt).point_jacobian(self.frame, self.point, g);
         for (c, row) in c.iter_mut().zip(g.chunks_exact(tick.v.len())) {
             *c = row.iter().zip(tick.v).map(|(g, v)| g * v).sum();
@@ -125,12 +125,12 @@ impl Cone for SpeedCone {
     }
 
     fn excess(&mut self, motion: &mut Motion<'_>) -> f64 {
-        self.judge.look_at_frames(motion.q, motion.v, motion.period.dt);
-        norm(self.judge.turn(motion.v_next).point(self.frame, self.point).velocity) / self.limit - 1.0
+        self.checker.look_at_frames(motion.q, motion.v, motion.period.dt);
+        norm(self.checker.turn(motion.v_next).point(self.frame, self.point).velocity) / self.limit - 1.0
     }
 
     fn breach(&mut self, motion: &mut Motion<'_>) -> f64 {
-        let then = self.judge.look_at_frames(motion.q_next, motion.v_next, 0.0);
+        let then = self.checker.look_at_frames(motion.q_next, motion.v_next, 0.0);
         norm(then.point(self.frame, self.point).velocity) / self.limit - 1.0
     }
 }

@@ -104,7 +104,7 @@ pub enum Form {
 }
 
 /// One kind of limit.
-pub struct Entry {
+pub struct LimitEntry {
     /// Name in the task file.
     pub name: &'static str,
     /// What a line of the task file looks like, with the joints of a Panda.
@@ -116,86 +116,86 @@ pub struct Entry {
 }
 
 /// All kinds of limits by their name in the task file.
-pub const REGISTRY: &[Entry] = &[
-    Entry {
+pub const REGISTRY: &[LimitEntry] = &[
+    LimitEntry {
         name: "position",
         example: "position = { margin = 0.01 }",
         form: Form::Hard,
         build: |s, _| Ok(one(&s.position, PositionLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "velocity",
         example: "velocity = { scale = 0.8 }",
         form: Form::Hard,
         build: |s, _| Ok(one(&s.velocity, VelocityLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "acceleration",
         example: "acceleration = { limit = 10.0 }",
         form: Form::Hard,
         build: |s, _| Ok(one(&s.acceleration, AccelerationLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "torque",
         example: "torque = { scale = 0.9 }",
         form: Form::Either,
         build: |s, _| Ok(one(&s.torque, TorqueLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "jerk",
         example: "jerk = { limit = 500.0 }",
         form: Form::Soft,
         build: |s, _| Ok(one(&s.jerk, JerkLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "torque_speed",
         example: "torque_speed = { stall = 80.0, no_load = 3.0 }",
         form: Form::Either,
         build: |s, _| Ok(one(&s.torque_speed, TorqueSpeedLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "torque_rate",
         example: "torque_rate = { limit = 1000.0 }",
         form: Form::Soft,
         build: |s, _| Ok(one(&s.torque_rate, TorqueRateLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "velocity_profile",
         example: "velocity_profile = \"fr3\"",
         form: Form::Hard,
         build: |s, _| Ok(one(&s.velocity_profile, VelocityProfileLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "locked",
         example: "locked = [\"panda_joint7\"]",
         form: Form::Hard,
         build: |s, _| Ok(one(&(!s.locked.is_empty()).then(|| s.locked.clone()), LockedJoints::new)),
     },
-    Entry {
+    LimitEntry {
         name: "frame",
         example: "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.1] }, braking = 5.0 }]",
         form: Form::Either,
         build: |s, _| Ok(each(&s.frame, FrameLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "frame_speed",
         example: "frame_speed = [{ frame = \"panda_hand\", limit = 0.25 }]",
         form: Form::Either,
         build: |s, _| Ok(each(&s.frame_speed, FrameSpeedLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "energy",
         example: "energy = { limit = 2.0 }",
         form: Form::Either,
         build: |s, _| Ok(one(&s.energy, EnergyLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "collision",
         example: "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \"floor\", shape = \"half_space\" }], braking = 2.0 }",
         form: Form::Either,
         build: |s, _| Ok(one(&s.collision, CollisionLimit::new)),
     },
-    Entry {
+    LimitEntry {
         name: "rows",
         example: "rows = [{ name = \"elbow up\", terms = { \"q.panda_joint4\" = 1.0 }, upper = -0.5, braking = 2.0 }]",
         form: Form::Either,

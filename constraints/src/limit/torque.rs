@@ -2,7 +2,7 @@
 
 use super::margin::less_each;
 use super::{Limit, LimitSet, PerJoint, quoted};
-use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
@@ -116,7 +116,7 @@ impl Rows for TorqueRows {
         Needs { motors: true, ..Needs::default() }
     }
 
-    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+    fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         for (r, &(i, effort, _)) in self.motors.iter().enumerate() {
             tick.motor(i, rows.row(r));
             (rows.lower[r], rows.upper[r]) = (-effort - tick.bias[i], effort - tick.bias[i]);

@@ -2,7 +2,7 @@
 
 use super::margin::less_each;
 use super::{Limit, PerJoint};
-use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
@@ -76,7 +76,7 @@ impl Rows for TorqueRateRows {
         Needs { motors: true, previous: true, ..Needs::default() }
     }
 
-    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+    fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let Some(previous) = tick.previous else { return };
         let t = tick.period.dt;
         for (r, &(i, limit, _)) in self.dofs.iter().enumerate() {

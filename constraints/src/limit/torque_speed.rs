@@ -2,7 +2,7 @@
 
 use super::margin::less_each;
 use super::{Limit, PerJoint};
-use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
@@ -94,7 +94,7 @@ impl Rows for TorqueSpeedRows {
         Needs { motors: true, ..Needs::default() }
     }
 
-    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+    fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         for (r, m) in self.motors.iter().enumerate() {
             let i = m.dof;
             tick.motor(i, rows.row(r));

@@ -2,7 +2,7 @@
 
 use super::Limit;
 use super::margin::is_zero;
-use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::viability::{POSITION_TOLERANCE, approach};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
@@ -219,7 +219,7 @@ impl Rows for Row {
         self.equality && self.braking.is_none()
     }
 
-    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+    fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (t, kappa) = (tick.period.dt, tick.period.kappa);
         if let Some(braking) = self.braking {
             let (s, w) = self.sum(tick.q, tick.v);
@@ -290,6 +290,6 @@ impl Rows for Row {
     }
 }
 
-fn bound(d: f64, w: f64, braking: f64, tick: &Tick<'_>) -> f64 {
+fn bound(d: f64, w: f64, braking: f64, tick: &TickStart<'_>) -> f64 {
     if d.is_finite() { approach(d, w, braking, tick.period) } else { f64::INFINITY }
 }

@@ -65,7 +65,7 @@ pub(crate) struct Backup {
     deceleration: Vec<f64>,
     /// The index into [`TRIED`] that passed last.
     favourite: usize,
-    judge: Checker,
+    checker: Checker,
     dynamics: Dynamics,
     /// By how much each row may be broken (hard rows): what the measured state breaks already.
     allowed: Vec<f64>,
@@ -97,7 +97,7 @@ impl Backup {
         let zero = || vec![0.0; model.nv()];
         let state = || State { q: model.neutral(), v: zero() };
         let period = Period::new(settings.dt, settings.sub_steps);
-        let judge = Checker::new(model, limits, controllable, period, settings.consistency)?;
+        let checker = Checker::new(model, limits, controllable, period, settings.consistency)?;
         let of_state = |kind: &Kind| {
             matches!(kind, Kind::Frame | Kind::FrameSpeed | Kind::Energy | Kind::Collision | Kind::User)
         };
@@ -106,16 +106,16 @@ impl Backup {
             deceleration: zero(),
             favourite: 0,
             dynamics: Dynamics::new(model),
-            allowed: vec![0.0; judge.hard()],
-            of_state: judge.hard_kinds().iter().map(of_state).collect(),
+            allowed: vec![0.0; checker.hard()],
+            of_state: checker.hard_kinds().iter().map(of_state).collect(),
             trial: zero(),
             now: state(),
             next: state(),
             way: zero(),
             cuts: Vec::with_capacity(2 * model.nv() + 1),
             ticks: Vec::with_capacity(MOST as usize),
-            breach: vec![0.0; judge.hard() * MOST as usize],
-            judge,
+            breach: vec![0.0; checker.hard() * MOST as usize],
+            checker,
         })
     }
 
@@ -138,7 +138,7 @@ impl Backup {
 
     /// Switches the rows and cones of a limit.
     pub(crate) fn enable(&mut self, limit: usize, on: bool, left: &LimitSet) {
-        self.judge.enable(limit, on, left);
+        self.checker.enable(limit, on, left);
     }
 
     /// A tick begins: nothing is beyond its limit.
@@ -148,7 +148,7 @@ impl Backup {
 
     /// Allows what the state breaks already, so that it may come back; true when that is anything.
     pub(crate) fn excuse(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
-        self.judge.breaches((q, v), (q, v), with.external, &mut self.allowed);
+        self.checker.breaches((q, v), (q, v), with.external, &mut self.allowed);
         for (allowed, of_state) in self.allowed.iter_mut().zip(&self.of_state) {
             *allowed = if *of_state { allowed.max(0.0) } else { 0.0 };
         }
@@ -159,7 +159,7 @@ impl Backup {
     pub(crate) fn allows(&mut self, with: &With<'_>, from: (&[f64], &[f64]), to: (&[f64], &[f64])) -> bool {
         let rows = self.allowed.len();
         let breach = &mut self.breach[..rows];
-        self.judge.breaches(from, to, with.external, breach);
+        self.checker.breaches(from, to, with.external, breach);
         breach.iter().zip(&self.allowed).all(|(breach, allowed)| *breach <= allowed + ROUNDING)
     }
 
@@ -310,7 +310,7 @@ impl Backup {
         let rows = self.allowed.len();
         let (now, next) = (&self.now, &self.next);
         let breach = &mut self.breach[n * rows..(n + 1) * rows];
-        self.judge.breaches((&now.q, &now.v), (&next.q, &next.v), with.external, breach);
+        self.checker.breaches((&now.q, &now.v), (&next.q, &next.v), with.external, breach);
     }
 
     /// Writes the state after `k` ticks of the planned brake to `next`.

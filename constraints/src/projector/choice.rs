@@ -29,13 +29,13 @@ pub(super) fn braking(
     limits: &LimitSet,
     dofs: &Dofs,
     settings: &Settings,
-    judge: &Checker,
+    checker: &Checker,
     notes: &mut Vec<String>,
 ) -> Braking {
     if settings.braking != Braking::Auto {
         return settings.braking;
     }
-    let kinds = judge.hard_kinds();
+    let kinds = checker.hard_kinds();
     if settings.consistency == Consistency::Free || kinds.is_empty() {
         return Braking::Certified; // the boxes of single joints keep themselves
     }

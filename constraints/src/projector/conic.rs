@@ -1,4 +1,4 @@
-//! Clarabel: for cones, and as the judge of last resort; built once and updated in place.
+//! Clarabel: for cones, and as the last resort; built once and updated in place.
 //!
 //! Variables are `u = y / sigma`, the lifted `z = G u`, one per row, and a slack `s` for each soft row and cone; without the lifting
 //! each dense row would stand in the factor twice:

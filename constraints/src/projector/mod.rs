@@ -19,7 +19,7 @@ mod switch;
 
 pub use coupled::{Problem, ProblemCone};
 #[doc(hidden)]
-pub use stages::{LoneStages, Numbers};
+pub use stages::{CoupledStages, Numbers};
 
 use crate::checker::Checker;
 use crate::ledger::{BrakeReason, RefuseReason, Rung, Status};
@@ -181,7 +181,7 @@ impl Projector {
             Consistency::Free => self.free(v, proposal, target),
         };
         match outcome {
-            Ok(status) => self.judge(q, v, proposal, target, status),
+            Ok(status) => self.check_target(q, v, proposal, target, status),
             Err(reason) => self.brake(q, v, Some(proposal), target, reason),
         }
     }
@@ -255,7 +255,7 @@ impl Projector {
     }
 
     /// The independent checker has the last word.
-    fn judge(
+    fn check_target(
         &mut self,
         q: &[f64],
         v: &[f64],

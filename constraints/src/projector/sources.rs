@@ -2,7 +2,7 @@
 
 use super::Dofs;
 use super::coupled::Coupled;
-use crate::row::{Cone, Needs, Previous, Rows, RowsMut, Tick};
+use crate::row::{Cone, Needs, Previous, Rows, RowsMut, TickStart};
 use crate::{Dynamics, Kind, Kinematics, Limit, LimitError, Model, Period, Soft};
 
 /// Where rows come from, and the memory they are written to.
@@ -156,7 +156,8 @@ impl Sources {
         }
         let (mass, motors, bias) = (&s.mass[..], &s.motors[..], &s.bias[..]);
         let previous = measured.previous;
-        let mut tick = Tick { q, v, period, mass, motors, bias, kinematics: &mut self.kinematics, previous };
+        let mut tick =
+            TickStart { q, v, period, mass, motors, bias, kinematics: &mut self.kinematics, previous };
         let nv = v.len();
         self.outside.fill(false);
         for block in &mut self.blocks {

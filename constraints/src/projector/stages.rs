@@ -29,23 +29,23 @@ pub struct Numbers {
 }
 
 /// Both stages on problems of one shape: hessian, softness and equalities stay those of the first.
-pub struct LoneStages {
+pub struct CoupledStages {
     problem: Coupled,
     active_set: ActiveSet,
     conic: Conic,
 }
 
-impl LoneStages {
+impl CoupledStages {
     /// # Errors
     /// Clarabel refuses the problem.
-    pub fn new(first: &Numbers) -> Result<LoneStages, LimitError> {
+    pub fn new(first: &Numbers) -> Result<CoupledStages, LimitError> {
         let (soft, equality) = (first.soft.clone(), first.equality.clone());
         let mut problem = Coupled::new(first.hessian.clone(), soft, equality, &[], 0);
         put(&mut problem, first);
         let width = |k: usize| ((first.upper[k] - first.lower[k]) / 2.0).clamp(1e-3, 1e3);
         let sigma = (0..problem.n).map(width).collect();
         let conic = Conic::new(&problem, sigma, 50, None)?;
-        Ok(LoneStages { active_set: ActiveSet::new(problem.n, problem.m), problem, conic })
+        Ok(CoupledStages { active_set: ActiveSet::new(problem.n, problem.m), problem, conic })
     }
 
     /// Takes over the numbers of the next problem.

@@ -11,7 +11,7 @@ const PERIODS: [f64; 4] = [0.001, 0.002, 0.01, 0.02];
 #[derive(Debug, Default)]
 struct Seen {
     ticks: usize,
-    /// Ticks that the judge finds outside.
+    /// Ticks that the checker finds outside.
     broken: usize,
     slowed: usize,
     braked: usize,

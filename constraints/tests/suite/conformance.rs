@@ -1,7 +1,7 @@
 //! What must hold for every kind of limit in the registry.
 
 use crate::common::*;
-use nearl_constraints::limit::{Entry, Form, REGISTRY};
+use nearl_constraints::limit::{Form, LimitEntry, REGISTRY};
 use nearl_constraints::*;
 
 /// The example of one kind, on top of the limits of single joints.
@@ -23,7 +23,7 @@ fn projector(constraints: &ConstraintSettings, solver: Solver) -> Projector {
 }
 
 /// The example of a kind with one more setting, such as `("margin", 0.1)` or `("soft", table)`, in its first limit.
-fn with_setting(entry: &Entry, key: &str, value: impl Into<toml::Value>) -> String {
+fn with_setting(entry: &LimitEntry, key: &str, value: impl Into<toml::Value>) -> String {
     let mut section: toml::Table = toml::from_str(entry.example).unwrap();
     let limit = match section.iter_mut().next().unwrap().1 {
         toml::Value::Array(limits) => &mut limits[0],
@@ -37,7 +37,7 @@ fn with_setting(entry: &Entry, key: &str, value: impl Into<toml::Value>) -> Stri
     format!("{key} = {value}")
 }
 
-fn softened(entry: &Entry) -> String {
+fn softened(entry: &LimitEntry) -> String {
     let soft = toml::Table::from_iter([("linear".into(), 0.1.into()), ("quadratic".into(), 5.0.into())]);
     with_setting(entry, "soft", soft)
 }

@@ -1,11 +1,11 @@
-//! Limits on frames, energy and collisions: rows against finite differences, the judge against the rows, closed loops that never
+//! Limits on frames, energy and collisions: rows against finite differences, the checker against the rows, closed loops that never
 //! break them, messages.
 
 use crate::common::solids::*;
 use crate::common::*;
 use nearl_constraints::geometry::{Shape, separation};
 use nearl_constraints::limit::{CollisionSettings, FrameSettings};
-use nearl_constraints::row::{Motion, RowsMut, Tick};
+use nearl_constraints::row::{Motion, RowsMut, TickStart};
 use nearl_constraints::*;
 
 const DT: f64 = 1e-3;
@@ -34,15 +34,30 @@ fn fill(rows: &mut dyn Rows, model: &Model, q: &[f64], v: &[f64], period: &Perio
     kinematics.update(q, v, &vec![0.0; nv]);
     let mut f =
         Filled { g: vec![0.0; n * nv], lower: vec![f64::NEG_INFINITY; n], upper: vec![f64::INFINITY; n] };
-    let mut tick =
-        Tick { q, v, period, mass: &[], motors: &[], bias: &[], kinematics: &mut kinematics, previous: None };
+    let mut tick = TickStart {
+        q,
+        v,
+        period,
+        mass: &[],
+        motors: &[],
+        bias: &[],
+        kinematics: &mut kinematics,
+        previous: None,
+    };
     let (g, lower, upper) = (&mut f.g[..], &mut f.lower[..], &mut f.upper[..]);
     let outside = &mut vec![false; n][..];
     rows.fill(&mut tick, &mut RowsMut { g, lower, upper, outside, nv });
     f
 }
 
-fn judge(rows: &mut dyn Rows, model: &Model, q: &[f64], v: &[f64], y: &[f64], period: &Period) -> Vec<f64> {
+fn excess_of(
+    rows: &mut dyn Rows,
+    model: &Model,
+    q: &[f64],
+    v: &[f64],
+    y: &[f64],
+    period: &Period,
+) -> Vec<f64> {
     let nv = model.nv();
     let a: Vec<f64> = y.iter().map(|y| y / period.dt).collect();
     let v_next: Vec<f64> = (0..nv).map(|i| v[i] + y[i]).collect();
@@ -72,9 +87,9 @@ fn rows_alone(dt: f64, sub_steps: u32) -> Settings {
     Settings { braking: Braking::Certified, ..Settings::new(dt, sub_steps) }
 }
 
-/// A little beyond the row's bound the judge says so, a little inside it accepts. The judge uses no Jacobian.
+/// A little beyond the row's bound the checker says so, a little inside it accepts. The checker uses no Jacobian.
 #[test]
-fn rows_and_judge_draw_the_same_line() {
+fn rows_and_checker_draw_the_same_line() {
     let m = panda();
     let frame = FrameLimit::inside("panda_hand", [0.2, -0.4, 0.1], [0.7, 0.4, 0.8], 3.0);
     let tilted = FrameLimit::new(FrameSettings {
@@ -103,7 +118,7 @@ fn rows_and_judge_draw_the_same_line() {
                     // The nearest acceleration whose row stands `beyond` its bound.
                     let to = (f.upper[r] + beyond * size.max(f.upper[r].abs()) - value) / length;
                     let y: Vec<f64> = (0..7).map(|i| a[i] * DT + to * g[i]).collect();
-                    let excess = judge(&mut *rows, &m, &q, &v, &y, &period)[r];
+                    let excess = excess_of(&mut *rows, &m, &q, &v, &y, &period)[r];
                     let name = &rows.names()[r];
                     assert_eq!(
                         excess > 1e-9,

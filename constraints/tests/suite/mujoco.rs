@@ -60,7 +60,7 @@ fn joints_ranges_and_mass_are_mujoco_s() {
     }
 }
 
-/// The projector's rows and what its judge asks for; with several physics steps in a period a mass matrix alone would not do.
+/// The projector's rows and what its checker asks for; with several physics steps in a period a mass matrix alone would not do.
 #[test]
 fn rows_of_the_motors_are_the_motors() {
     for (name, robot, model) in robots() {
@@ -74,13 +74,13 @@ fn rows_of_the_motors_are_the_motors() {
             c::v_from_mujoco(&model, &q, &numbers(&state["qvel"]), &mut v);
             c::a_from_mujoco(&model, &q, &v, &numbers(&state["qacc"]), &mut a);
             let period = Period::new(0.01, sub_steps);
-            let (mut rows, mut tau, mut judged) = (vec![0.0; nv * nv], vec![0.0; nv], vec![0.0; nv]);
+            let (mut rows, mut tau, mut checked) = (vec![0.0; nv * nv], vec![0.0; nv], vec![0.0; nv]);
             dynamics.motor_rows(&period, &q, &v, &mut rows, &mut tau);
             tau.iter_mut().zip(rows.chunks(nv)).for_each(|(tau, row)| {
                 *tau += row.iter().zip(&a).map(|(r, a)| r * a).sum::<f64>();
             });
-            dynamics.motors(&period, &q, &v, &a, &mut judged);
-            let off = relative(&tau, &judged);
+            dynamics.motors(&period, &q, &v, &a, &mut checked);
+            let off = relative(&tau, &checked);
             assert!(off < 1e-11, "{name}, {sub_steps} sub-steps: {off:e}");
         }
     }

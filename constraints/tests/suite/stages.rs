@@ -2,7 +2,7 @@
 
 use crate::common::Random;
 use nalgebra::{DMatrix, DVector};
-use nearl_constraints::{LoneStages, Numbers, Soft};
+use nearl_constraints::{CoupledStages, Numbers, Soft};
 
 /// What a random problem is like.
 #[derive(Clone, Copy)]
@@ -110,7 +110,7 @@ fn the_stages_agree() {
     for _ in 0..600 {
         let kind = shapes(&mut random);
         let first = random_problem(kind, false, &mut random);
-        let mut stages = LoneStages::new(&first).unwrap();
+        let mut stages = CoupledStages::new(&first).unwrap();
         stages.put(&first);
         tried += 1;
         let exact = stages.exact();
@@ -209,7 +209,7 @@ fn brute_force_finds_nothing_better() {
         let n = 1 + k % 3;
         let kind = Kind { n, m: 1 + k % 2, soft: 0.4, equal: 0.2, degenerate: k % 5 < 2 };
         let p = random_problem(kind, k % 8 == 7, &mut random);
-        let mut stages = LoneStages::new(&p).unwrap();
+        let mut stages = CoupledStages::new(&p).unwrap();
         stages.put(&p);
         let exact = stages.exact();
         match brute_force(&p) {
@@ -237,7 +237,7 @@ fn what_is_empty_is_found_empty() {
         let kind = shapes(&mut random);
         let kind = Kind { m: kind.m.max(1), ..kind };
         let p = random_problem(kind, true, &mut random);
-        let mut stages = LoneStages::new(&p).unwrap();
+        let mut stages = CoupledStages::new(&p).unwrap();
         stages.put(&p);
         assert!(!stages.exact());
         shown += usize::from(stages.empty());
@@ -256,7 +256,7 @@ fn a_warm_start_changes_no_bit() {
     for path in 0..150 {
         let kind = Kind { n: 1 + path % 14, m: path % 17, soft: 0.2, equal: 0.05, degenerate: path % 3 == 0 };
         let mut p = random_problem(kind, false, &mut random);
-        let (mut warm, mut cold) = (LoneStages::new(&p).unwrap(), LoneStages::new(&p).unwrap());
+        let (mut warm, mut cold) = (CoupledStages::new(&p).unwrap(), CoupledStages::new(&p).unwrap());
         for tick in 0..60 {
             let jump = if tick % 10 == 9 { 1.0 } else { 0.01 };
             let move_ = |x: &mut f64, random: &mut Random| *x += jump * random.between(-1.0, 1.0);

@@ -186,7 +186,7 @@ def _broken_row(name: str, s: dict[str, Any]) -> list[str]:
     return [
         name,
         _count(counters.get("raw_violations")),
-        _count(counters.get("projected_violations")),
+        _count(counters.get("target_violations")),
         _count(sum(broken.values()) if broken else None),
         ", ".join(excess) or "–",
     ]

@@ -78,7 +78,7 @@ _NUMBERS = {
     "seq": ("state", "seq"),
     "episode": ("state", "episode"),
     "raw_violations": ("ledger", "raw_violations"),
-    "target_violations": ("ledger", "projected_violations"),
+    "target_violations": ("ledger", "target_violations"),
     "moved": ("ledger", "moved"),
     "active": ("ledger", "active"),
     "iterations": ("ledger", "iterations"),

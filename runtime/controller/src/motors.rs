@@ -14,11 +14,11 @@ use nearl_constraints::{Drive, Model};
 #[derive(Clone, Debug, PartialEq)]
 pub struct Motors {
     /// By controllable joint.
-    entries: Vec<Entry>,
+    by_joint: Vec<OneMotor>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Entry {
+struct OneMotor {
     /// Place in the action.
     at: usize,
     law: Option<Law>,
@@ -40,21 +40,21 @@ impl Motors {
     pub fn new(model: &Model, dofs: &[usize], drives: &[Drive]) -> Result<Motors, String> {
         let motors = dofs.iter().map(|&dof| one(model, dof)).collect::<Result<Vec<_>, _>>()?;
         let place = |motor: &Motor| motors.iter().filter(|other| other.order < motor.order).count();
-        let entry = |(&dof, motor): (&usize, &&Motor)| {
+        let one_motor = |(&dof, motor): (&usize, &&Motor)| {
             let law = if drives[dof] == Drive::Effort { law(motor)? } else { None };
-            Ok(Entry { at: place(motor), law })
+            Ok(OneMotor { at: place(motor), law })
         };
-        Ok(Motors { entries: dofs.iter().zip(&motors).map(entry).collect::<Result<_, String>>()? })
+        Ok(Motors { by_joint: dofs.iter().zip(&motors).map(one_motor).collect::<Result<_, String>>()? })
     }
 
     /// Where in the action the `k`-th controllable joint's entry is.
     pub fn place(&self, k: usize) -> usize {
-        self.entries[k].at
+        self.by_joint[k].at
     }
 
     /// The action entry for a command to the `k`-th controllable joint; of motors the torque [N·m or N].
     pub fn action(&self, k: usize, command: f64) -> f64 {
-        match self.entries[k].law {
+        match self.by_joint[k].law {
             None => command,
             Some(law) => (command / law.gear - law.bias) / law.gain,
         }
@@ -62,7 +62,7 @@ impl Motors {
 
     /// The command that an action entry is: the inverse of [`Motors::action`].
     pub fn command(&self, k: usize, action: f64) -> f64 {
-        match self.entries[k].law {
+        match self.by_joint[k].law {
             None => action,
             Some(law) => law.gear * (law.gain * action + law.bias),
         }

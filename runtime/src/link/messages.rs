@@ -186,7 +186,7 @@ pub struct LedgerNumbers {
     /// Limits the raw proposal broke.
     pub raw_violations: u32,
     /// Limits the projected target breaks, by the independent check.
-    pub projected_violations: u32,
+    pub target_violations: u32,
     /// Weighted distance between proposal and target.
     pub moved: f64,
     /// Largest slack of a soft row.
@@ -327,7 +327,7 @@ message! {
         /// Limits the raw proposals broke.
         raw_violations: u64,
         /// Limits the projected targets broke.
-        projected_violations: u64,
+        target_violations: u64,
         /// Wake-up latency p50, p99, p99.9, max [ns].
         wake: [u64; 4],
         /// Compute time p50, p99, p99.9, max [ns].

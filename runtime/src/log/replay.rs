@@ -201,7 +201,7 @@ impl<B: Build> Replayer<B> {
         core.close(json.end_ns);
         // What only the loop's threads know: how long the projection took, and what found a ring full.
         let record = &mut core.record;
-        record.step.ledger.duration = if record.step.nu > 0 { json.duration() } else { 0 };
+        record.output.ledger.duration = if record.output.nu > 0 { json.duration() } else { 0 };
         record.counters.dropped_actions = json.counters.dropped_actions;
         record.counters.dropped_records = json.counters.dropped_records;
         encode(record, &mut self.line).map_err(|e| e.to_string())?;

@@ -11,7 +11,7 @@ use crate::link::{Message, StateMessage};
 use crate::rt::{Counters, Mode, Reason, Record, Row, Sensed};
 
 /// Version of the tick messages; replay reads this one only.
-pub const SCHEMA_VERSION: u32 = 3;
+pub const SCHEMA_VERSION: u32 = 4;
 
 /// JSON schema of the `tick` topic.
 pub(crate) const SCHEMA: &str = r#"{
@@ -33,7 +33,7 @@ pub(crate) const SCHEMA: &str = r#"{
     "log_prob_proposal": {"type": "number"}, "log_prob_action": {"type": "number"},
     "ledger": {"type": "object", "properties": {
       "status": {"type": "integer"}, "rung": {"type": "integer"}, "active": {"type": "integer"}, "iterations": {"type": "integer"},
-      "raw_violations": {"type": "integer"}, "projected_violations": {"type": "integer"}, "moved": {"type": "number"},
+      "raw_violations": {"type": "integer"}, "target_violations": {"type": "integer"}, "moved": {"type": "number"},
       "slack": {"type": "number"}, "residual": {"type": "number"}, "duration_ns": {"type": "integer"},
       "active_rows": {"type": "array", "items": {"type": "object", "properties": {
         "kind": {"type": "string"}, "row": {"type": "integer"}, "side": {"type": "string"}, "multiplier": {"type": "number"},
@@ -136,7 +136,7 @@ struct LedgerJson {
     active: u32,
     iterations: u32,
     raw_violations: u32,
-    projected_violations: u32,
+    target_violations: u32,
     #[serde(deserialize_with = "number")]
     moved: f64,
     #[serde(deserialize_with = "number")]
@@ -166,8 +166,8 @@ pub(crate) fn encode(record: &Record, out: &mut Vec<u8>) -> serde_json::Result<(
 }
 
 fn tick(record: &Record) -> TickJson<'_> {
-    let (step, state, counters) = (&record.step, &record.state, &record.counters);
-    let acted = step.nu > 0;
+    let (output, state, counters) = (&record.output, &record.state, &record.counters);
+    let acted = output.nu > 0;
     let (nq, nv) = if acted { (state.q().len(), state.v().len()) } else { (0, 0) };
     TickJson {
         tick: record.tick,
@@ -186,13 +186,13 @@ fn tick(record: &Record) -> TickJson<'_> {
         ramp: record.ramp,
         noise: record.noise,
         state: state_json(state),
-        proposal_q: step.proposal_q[..nq].into(),
-        proposal_v: step.proposal_v[..nv].into(),
-        target_q: step.target_q[..nq].into(),
-        target_v: step.target_v[..nv].into(),
-        action: step.action[..(step.nu as usize).min(step.action.len())].into(),
-        log_prob_proposal: if acted { step.log_prob_proposal } else { 0.0 },
-        log_prob_action: if acted { step.log_prob_action } else { 0.0 },
+        proposal_q: output.proposal_q[..nq].into(),
+        proposal_v: output.proposal_v[..nv].into(),
+        target_q: output.target_q[..nq].into(),
+        target_v: output.target_v[..nv].into(),
+        action: output.action[..(output.nu as usize).min(output.action.len())].into(),
+        log_prob_proposal: if acted { output.log_prob_proposal } else { 0.0 },
+        log_prob_action: if acted { output.log_prob_action } else { 0.0 },
         ledger: if acted { ledger_json(record) } else { ledger_json(&Record::new()) },
         counters: *counters,
         overruns: counters.overruns,
@@ -222,7 +222,7 @@ fn state_json(state: &StateMessage) -> StateJson<'_> {
 }
 
 fn ledger_json(record: &Record) -> LedgerJson {
-    let ledger = record.step.ledger;
+    let ledger = record.output.ledger;
     let row = |row: &Row| RowJson {
         kind: Kind::ALL[usize::from(row.kind)].name().into(),
         row: row.row,
@@ -236,12 +236,12 @@ fn ledger_json(record: &Record) -> LedgerJson {
         active: ledger.active,
         iterations: ledger.iterations,
         raw_violations: ledger.raw_violations,
-        projected_violations: ledger.projected_violations,
+        target_violations: ledger.target_violations,
         moved: ledger.moved,
         slack: ledger.slack,
         residual: ledger.residual,
         duration_ns: ledger.duration,
-        active_rows: record.step.rows().iter().map(row).collect(),
+        active_rows: record.output.rows().iter().map(row).collect(),
     }
 }
 
@@ -280,8 +280,8 @@ mod tests {
     fn schema_names_exactly_the_fields_that_are_written() {
         let schema: serde_json::Value = serde_json::from_str(SCHEMA).unwrap();
         let mut record = Record::new();
-        record.step.nu = 1;
-        record.step.ledger.active = 1;
+        record.output.nu = 1;
+        record.output.ledger.active = 1;
         let mut out = Vec::new();
         encode(&record, &mut out).unwrap();
         let tick: serde_json::Value = serde_json::from_slice(&out).unwrap();

@@ -16,7 +16,7 @@ use crate::link::{Message, StateMessage};
 use crate::rt::Sync;
 use crate::rt::faults::FaultPlan;
 use crate::rt::mode::{Event, Mode, ModeLimits, Modes, Reason};
-use crate::rt::tick::{Outcome, Record, Sensed, Step, Tick};
+use crate::rt::tick::{LoopController, Outcome, Record, Sensed, TickOutput};
 
 /// Settings of a tick; times in [ns].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -65,7 +65,7 @@ pub struct Loaded<T> {
 }
 
 /// The loop's memory from tick to tick.
-pub struct Core<T: Tick> {
+pub struct Core<T: LoopController> {
     settings: CoreSettings,
     /// The controller in use.
     pub controller: Box<Loaded<T>>,
@@ -87,7 +87,7 @@ pub struct Core<T: Tick> {
     brake_broken: bool,
 }
 
-impl<T: Tick> Core<T> {
+impl<T: LoopController> Core<T> {
     /// Begins in Hold; `start` is the first slot of the loop's own clock [ns].
     pub fn new(settings: CoreSettings, controller: Box<Loaded<T>>, start: u64, faults: FaultPlan) -> Core<T> {
         let mut memory = Vec::new();
@@ -184,9 +184,9 @@ impl<T: Tick> Core<T> {
             }
         }
         if record.mode.acts() {
-            record.counters.raw_violations += u64::from(record.step.ledger.raw_violations);
-            record.counters.projected_violations += u64::from(record.step.ledger.projected_violations);
-            let is_unprojected = record.step.ledger.status == LedgerStatus::NotProjected.number();
+            record.counters.raw_violations += u64::from(record.output.ledger.raw_violations);
+            record.counters.target_violations += u64::from(record.output.ledger.target_violations);
+            let is_unprojected = record.output.ledger.status == LedgerStatus::NotProjected.number();
             record.counters.unprojected += u64::from(is_unprojected);
         }
         record.counters.mode_ticks[record.mode.code() as usize] += 1;
@@ -201,7 +201,7 @@ impl<T: Tick> Core<T> {
 
     /// Lets the controller act or brake; without an answer `nu` is 0 and the plant brakes by itself.
     fn act(&mut self) {
-        self.record.step.nu = 0;
+        self.record.output.nu = 0;
         self.record.ramp = 1.0;
         self.record.noise = self.faults.noise(self.record.tick);
         let stop = self.record.stop;
@@ -220,7 +220,7 @@ impl<T: Tick> Core<T> {
             self.record.mode = self.modes.escalate(Event::Panicked, stop);
         }
         self.record.reason = self.modes.reason();
-        if self.record.step.nu > 0 {
+        if self.record.output.nu > 0 {
             self.controller.controller.save_memory(&mut self.memory);
         }
     }
@@ -246,7 +246,7 @@ impl<T: Tick> Core<T> {
             Some(Outcome::Braked) => {
                 self.record.counters.braked += 1;
                 if self.braked >= self.settings.modes.braked_ticks {
-                    return Event::Refused(braked_reason(self.record.step.ledger.status));
+                    return Event::Refused(braked_reason(self.record.output.ledger.status));
                 }
             }
             Some(Outcome::Acted) => self.soften(),
@@ -260,16 +260,16 @@ impl<T: Tick> Core<T> {
         }
         self.ramped += 1;
         self.record.ramp = f64::from(self.ramped) / f64::from(self.settings.ramp + 1);
-        let (share, step) = (self.record.ramp, &mut self.record.step);
-        self.controller.controller.soften(&self.estimate, share, step);
+        let (share, output) = (self.record.ramp, &mut self.record.output);
+        self.controller.controller.soften(&self.estimate, share, output);
     }
 
     /// Calls a verb of the controller; `None` if it panicked.
-    fn call(&mut self, verb: fn(&mut T, &StateMessage, &mut Step) -> Outcome) -> Option<Outcome> {
-        let (controller, step) = (&mut self.controller.controller, &mut self.record.step);
-        let outcome = catch_unwind(AssertUnwindSafe(|| verb(controller, &self.estimate, step))).ok();
+    fn call(&mut self, verb: fn(&mut T, &StateMessage, &mut TickOutput) -> Outcome) -> Option<Outcome> {
+        let (controller, output) = (&mut self.controller.controller, &mut self.record.output);
+        let outcome = catch_unwind(AssertUnwindSafe(|| verb(controller, &self.estimate, output))).ok();
         if !matches!(outcome, Some(Outcome::Acted | Outcome::Braked)) {
-            self.record.step.nu = 0;
+            self.record.output.nu = 0;
         }
         outcome
     }
@@ -301,11 +301,11 @@ impl<T: Tick> Core<T> {
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);
         let gap = if is_next && self.settings.real_time { missed.min(lost) } else { 0 };
         self.record.state = *state;
-        self.judge(is_frozen, gap)
+        self.event_of_state(is_frozen, gap)
     }
 
     /// What the state just taken is worth.
-    fn judge(&mut self, is_frozen: bool, gap: u64) -> Event {
+    fn event_of_state(&mut self, is_frozen: bool, gap: u64) -> Event {
         let (state, counters) = (&self.record.state, &mut self.record.counters);
         if !state.is_finite() {
             counters.bad_states += 1;
@@ -349,11 +349,11 @@ impl<T: Tick> Core<T> {
 
     /// Puts a predicted state in place of the one that is missing, if that may be done once more.
     fn hold(&mut self, reason: Reason) -> Event {
-        let has_acted = self.record.step.nu > 0 && self.modes.mode().acts();
+        let has_acted = self.record.output.nu > 0 && self.modes.mode().acts();
         match self.held {
             Some(held) if held < self.settings.modes.hold_states && has_acted => {
                 self.held = Some(held + 1);
-                self.controller.controller.predict(&mut self.estimate, &self.record.step);
+                self.controller.controller.predict(&mut self.estimate, &self.record.output);
                 self.estimate.tick += 1;
                 Event::Held(reason)
             }

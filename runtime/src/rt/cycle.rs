@@ -19,7 +19,7 @@ use crate::rt::core::{Core, CoreSettings, Inputs, Loaded};
 use crate::rt::faults::FaultPlan;
 use crate::rt::mode::Mode;
 use crate::rt::swap::Slot;
-use crate::rt::tick::{Record, Sensed, Tick};
+use crate::rt::tick::{LoopController, Record, Sensed};
 use crate::stop::Stop;
 use crate::thread::{CountAllocations, Usage};
 
@@ -52,7 +52,7 @@ pub(crate) struct CycleSettings {
 }
 
 /// The ends of the rings that belong to this thread.
-pub(crate) struct Ends<T: Tick> {
+pub(crate) struct Ends<T: LoopController> {
     pub(crate) states: Consumer<StateMessage>,
     pub(crate) actions: Producer<ActionMessage>,
     pub(crate) records: Producer<Record>,
@@ -63,7 +63,7 @@ pub(crate) struct Ends<T: Tick> {
 }
 
 /// The loop with everything it ever needs.
-pub(crate) struct Cycle<T: Tick> {
+pub(crate) struct Cycle<T: LoopController> {
     settings: CycleSettings,
     ends: Ends<T>,
     stop: Stop,
@@ -81,7 +81,7 @@ pub(crate) struct Cycle<T: Tick> {
 }
 
 /// What is left when the loop has ended; dropped by another thread.
-pub(crate) struct CycleEnd<T: Tick> {
+pub(crate) struct CycleEnd<T: LoopController> {
     pub(crate) last: Record,
     pub(crate) wake: Histogram<u64>,
     pub(crate) compute: Histogram<u64>,
@@ -90,7 +90,7 @@ pub(crate) struct CycleEnd<T: Tick> {
     _rest: (Core<T>, Ends<T>),
 }
 
-impl<T: Tick> Cycle<T> {
+impl<T: LoopController> Cycle<T> {
     pub(crate) fn new(
         settings: CycleSettings,
         first: Box<Loaded<T>>,
@@ -220,8 +220,8 @@ impl<T: Tick> Cycle<T> {
         (self.action.state_seq, self.action.state_epoch) = (header.seq, header.epoch);
         self.action.mode = record.mode.code();
         self.action.policy_version = record.policy_version;
-        self.action.nu = record.step.nu;
-        self.action.action = record.step.action;
+        self.action.nu = record.output.nu;
+        self.action.action = record.output.action;
         self.dropped.0 += u64::from(self.ends.actions.push(self.action).is_err());
     }
 

@@ -8,7 +8,7 @@ use crate::rt::core::Loaded;
 use crate::rt::receive::SnapshotReceiver;
 use crate::rt::residual::{Residual, RollbackSettings};
 use crate::rt::swap::Sender;
-use crate::rt::tick::{Build, Record, Tick};
+use crate::rt::tick::{Build, LoopController, Record};
 
 /// How many refusals are kept as text for the report.
 const KEPT: usize = 32;
@@ -99,45 +99,45 @@ impl<B: Build> SnapshotInbox<B> {
     }
 
     /// Moves every snapshot one stage on.
-    pub(crate) fn pump(&mut self, desk: &mut Surroundings<'_>) {
-        self.settle(desk);
+    pub(crate) fn pump(&mut self, around: &mut Surroundings<'_>) {
+        self.settle(around);
         while let Some(snapshot) = self.receiver.next() {
-            self.receive(desk, snapshot);
+            self.receive(around, snapshot);
         }
         if let Some(built) = self.builder.collect() {
-            self.take(desk, built);
+            self.take(around, built);
         }
         self.offer();
     }
 
-    fn receive(&mut self, desk: &mut Surroundings<'_>, snapshot: SnapshotBytes) {
+    fn receive(&mut self, around: &mut Surroundings<'_>, snapshot: SnapshotBytes) {
         let (sender, version) = (snapshot.header.header.epoch, snapshot.header.version);
         if sender == self.newest.0 && version <= self.newest.1 {
             let text = format!(
                 "snapshot version {version} came after version {}: give each push a higher version",
                 self.newest.1
             );
-            return self.refuse(desk.link, &snapshot.header, Verdict::Outdated, &text);
+            return self.refuse(around.link, &snapshot.header, Verdict::Outdated, &text);
         }
         self.newest = (sender, version);
         self.received += 1;
-        if let Some(replaced) = self.builder.take(self.received, snapshot, *desk.robot) {
-            supersede(desk.link, &replaced);
+        if let Some(replaced) = self.builder.take(self.received, snapshot, *around.robot) {
+            supersede(around.link, &replaced);
         }
     }
 
-    fn take(&mut self, desk: &mut Surroundings<'_>, built: Built<B::Controller>) {
+    fn take(&mut self, around: &mut Surroundings<'_>, built: Built<B::Controller>) {
         let controller = match built.result {
             Ok(controller) => *controller,
-            Err(refusal) => return self.refuse(desk.link, &built.header, refusal.verdict, &refusal.text),
+            Err(refusal) => return self.refuse(around.link, &built.header, refusal.verdict, &refusal.text),
         };
-        match desk.log {
+        match around.log {
             Some(log) => log.push_snapshot(built.id, controller.version(), built.bytes),
             None => self.builder.discard(Box::new(built.bytes)),
         }
         let loaded = Box::new(Loaded { id: built.id, controller });
         if let Some((header, loaded)) = self.ready.replace((built.header, loaded)) {
-            supersede(desk.link, &header);
+            supersede(around.link, &header);
             self.builder.discard(loaded);
         }
     }
@@ -164,17 +164,17 @@ impl<B: Build> SnapshotInbox<B> {
     }
 
     /// The old controller came back: the new one is in use. The one before the old is no longer needed.
-    fn settle(&mut self, desk: &mut Surroundings<'_>) {
+    fn settle(&mut self, around: &mut Surroundings<'_>) {
         let Some(old) = self.swap.collect() else { return };
         let Some(Offer { header, version }) = self.offered.take() else { return self.builder.discard(old) };
-        self.accepted.push((desk.tick, version));
+        self.accepted.push((around.tick, version));
         let condemned = self.condemned.take();
         let Some(header) = header else {
             self.builder.discard(old);
             if let (Some(bad), Some(text)) = (self.current.take(), condemned) {
                 self.rolled_back += 1;
                 self.note(&text);
-                reply(desk.link, &bad, desk.tick, Verdict::RolledBack, &text);
+                reply(around.link, &bad, around.tick, Verdict::RolledBack, &text);
             }
             return;
         };
@@ -184,7 +184,7 @@ impl<B: Build> SnapshotInbox<B> {
             self.builder.discard(scrap);
         }
         self.current = Some(header);
-        reply(desk.link, &header, desk.tick, Verdict::Accepted, "in use");
+        reply(around.link, &header, around.tick, Verdict::Accepted, "in use");
     }
 
     fn refuse(&mut self, link: &mut RuntimeLink, header: &SnapshotHeader, verdict: Verdict, text: &str) {

@@ -133,7 +133,7 @@ impl<B: Build> Io<B> {
                 self.snapshots.observe(previous, record);
                 // What was predicted or could not be used was not experienced.
                 let is_measured = previous.sensed == Sensed::Measured && record.sensed == Sensed::Measured;
-                if previous.step.nu > 0 && is_measured {
+                if previous.output.nu > 0 && is_measured {
                     self.link.send_transition(&mut transition(previous, &record.state, self.explore));
                 }
             }
@@ -242,7 +242,7 @@ fn is_alive(pid: u32) -> bool {
 /// The transition from one record to the state that followed it.
 fn transition(record: &Record, next: &StateMessage, explore: Option<u64>) -> TransitionMessage {
     let mut m = TransitionMessage::zeroed();
-    let (state, step) = (&record.state, &record.step);
+    let (state, output) = (&record.state, &record.output);
     m.tick = record.tick;
     m.state_epoch = state.header.epoch;
     m.state_seq = state.header.seq;
@@ -252,14 +252,14 @@ fn transition(record: &Record, next: &StateMessage, explore: Option<u64>) -> Tra
     m.next_bits = next.bits;
     m.mode = record.mode.code();
     (m.explores, m.explore) = (u32::from(explore.is_some()), explore.unwrap_or(0));
-    (m.period_tick, m.time) = (step.period_tick, state.time);
-    (m.nq, m.nv, m.nu, m.n_obs) = (state.nq, state.nv, step.nu, state.n_obs);
-    (m.log_prob_proposal, m.log_prob_action) = (step.log_prob_proposal, step.log_prob_action);
-    m.ledger = step.ledger;
+    (m.period_tick, m.time) = (output.period_tick, state.time);
+    (m.nq, m.nv, m.nu, m.n_obs) = (state.nq, state.nv, output.nu, state.n_obs);
+    (m.log_prob_proposal, m.log_prob_action) = (output.log_prob_proposal, output.log_prob_action);
+    m.ledger = output.ledger;
     (m.q, m.v, m.obs) = (state.q, state.v, state.obs);
-    (m.proposal_q, m.proposal_v) = (step.proposal_q, step.proposal_v);
-    (m.target_q, m.target_v) = (step.target_q, step.target_v);
-    m.action = step.action;
+    (m.proposal_q, m.proposal_v) = (output.proposal_q, output.proposal_v);
+    (m.target_q, m.target_v) = (output.target_q, output.target_v);
+    m.action = output.action;
     m
 }
 
@@ -288,7 +288,7 @@ impl Health {
         (last.stale, last.swaps) = (counters.stale, counters.swaps);
         last.lost_states = counters.lost_states;
         last.raw_violations = counters.raw_violations;
-        last.projected_violations = counters.projected_violations;
+        last.target_violations = counters.target_violations;
         if record.fresh {
             self.wake.saturating_record(record.begin.saturating_sub(record.due));
             self.compute.saturating_record(record.end - record.begin);

@@ -42,4 +42,6 @@ pub use pinned::Pinned;
 pub use report::{PlantSummary, RunReport};
 pub use residual::RollbackSettings;
 pub use run::{RunError, RunSettings, connect, run, run_loop};
-pub use tick::{Build, Counters, MAX_ROWS, Outcome, Record, Refusal, Row, Sensed, Step, Tick};
+pub use tick::{
+    Build, Counters, LoopController, MAX_ROWS, Outcome, Record, Refusal, Row, Sensed, TickOutput,
+};

@@ -51,13 +51,13 @@ codes! {
             "Check encoders and joint order of the plant, then start the runtime again.";
         Controller = "controller", "The controller refused the state: it gave no checked target.",
             "See the status of the tick in the flight log, then `nearl explain STATUS`.";
-        NonFiniteProposal = "non-finite-proposals", "The policy proposed NaN or infinity several ticks in a row.",
+        NonFiniteProposal = "braked-non-finite-proposal", "The policy proposed NaN or infinity several ticks in a row.",
             "Go back to an earlier snapshot: the training diverged.";
-        NoVerifiedBrake = "no-verified-brakes", "Several ticks in a row no way to stop could be verified; the stored brake ran.",
+        NoVerifiedBrake = "braked-no-verified-brake", "Several ticks in a row no way to stop could be verified; the stored brake ran.",
             "Lower acceleration or the proposals' size.";
-        NoCertifiedAnswer = "no-certified-answers", "Several ticks in a row no target passed the checker.",
+        NoCertifiedAnswer = "braked-no-certified-answer", "Several ticks in a row no target passed the checker.",
             "The limits leave nothing to do there: run `nearl doctor SNAPSHOT` and loosen what it names.";
-        NonFiniteDynamics = "non-finite-dynamics", "Several ticks in a row the dynamics gave NaN or infinity.",
+        NonFiniteDynamics = "braked-non-finite-dynamics", "Several ticks in a row the dynamics gave NaN or infinity.",
             "Check the robot file's masses and the plant's velocities.";
         Panic = "panic", "The controller panicked; it is discarded and the robot model alone brakes; latched.",
             "Report it with the flight log, and go back to an earlier snapshot.";

@@ -9,7 +9,7 @@ use crate::link::{
 };
 use crate::rt::brake::Brake;
 use crate::rt::pinned::{Pinned, UNITS, above};
-use crate::rt::tick::{Build, MAX_ROWS, Outcome, Refusal, Row, Step, Tick};
+use crate::rt::tick::{Build, LoopController, MAX_ROWS, Outcome, Refusal, Row, TickOutput};
 use crate::snapshot::{Manifest, Snapshot, SnapshotError};
 
 /// A controller with its inputs and outputs, checked against the plant it drives.
@@ -18,7 +18,7 @@ pub struct Pilot {
     brake: Option<Brake>,
     state: State,
     noise: Noise,
-    output: Output,
+    out: Output,
     /// Which proposed entry is which (n_state).
     entries: Vec<Entry>,
     /// What each observation entry measures (n_obs).
@@ -56,7 +56,7 @@ impl Pilot {
             brake: Brake::new(&snapshot.manifest).map_err(refuse)?,
             state: controller.state(),
             noise: controller.noise(),
-            output: controller.output(),
+            out: controller.output(),
             entries: (0..layout.n_state()).map(|k| layout.state_entry(k)).collect(),
             observed: layout.entries().to_vec(),
             checked: checked(&controller),
@@ -79,34 +79,34 @@ impl Pilot {
         to.set_memory(memory);
     }
 
-    fn write(&self, step: &mut Step) {
-        let (state, output) = (&self.state, &self.output);
+    fn write(&self, output: &mut TickOutput) {
+        let (state, out) = (&self.state, &self.out);
         let (nq, nv) = (state.q.len(), state.v.len());
-        step.nu = output.action.len() as u32;
-        step.action[..output.action.len()].copy_from_slice(&output.action);
-        step.period_tick = self.period_tick;
-        step.log_prob_proposal = output.log_prob_proposal;
-        step.log_prob_action = output.log_prob_action;
-        for q in [&mut step.proposal_q, &mut step.target_q] {
+        output.nu = out.action.len() as u32;
+        output.action[..out.action.len()].copy_from_slice(&out.action);
+        output.period_tick = self.period_tick;
+        output.log_prob_proposal = out.log_prob_proposal;
+        output.log_prob_action = out.log_prob_action;
+        for q in [&mut output.proposal_q, &mut output.target_q] {
             q[..nq].copy_from_slice(&state.q);
         }
-        for v in [&mut step.proposal_v, &mut step.target_v] {
+        for v in [&mut output.proposal_v, &mut output.target_v] {
             v[..nv].copy_from_slice(&state.v);
         }
         let status = LedgerStatus::NotProjected.number();
-        step.ledger = LedgerNumbers { status, duration: output.duration_ns, ..LedgerNumbers::default() };
+        output.ledger = LedgerNumbers { status, duration: out.duration_ns, ..LedgerNumbers::default() };
         if self.proposes {
-            step.target_q[..nq].copy_from_slice(&output.next.q);
-            step.target_v[..nv].copy_from_slice(&output.next.v);
-            for (entry, value) in self.entries.iter().zip(&output.proposal) {
+            output.target_q[..nq].copy_from_slice(&out.next.q);
+            output.target_v[..nv].copy_from_slice(&out.next.v);
+            for (entry, value) in self.entries.iter().zip(&out.proposal) {
                 match *entry {
-                    Entry::Position { idx_q, .. } => step.proposal_q[idx_q] = *value,
-                    Entry::Velocity { dof } => step.proposal_v[dof] = *value,
+                    Entry::Position { idx_q, .. } => output.proposal_q[idx_q] = *value,
+                    Entry::Velocity { dof } => output.proposal_v[dof] = *value,
                     Entry::Other => {}
                 }
             }
-            step.ledger = numbers(&output.next.ledger);
-            write_rows(&output.next.ledger, step);
+            output.ledger = numbers(&out.next.ledger);
+            write_rows(&out.next.ledger, output);
         }
     }
 }
@@ -140,45 +140,45 @@ fn number_of(limits: &LimitSet) -> f64 {
     f64::from(u32::from_le_bytes([0, 1, 2, 3].map(|k| bytes.as_bytes()[k])))
 }
 
-fn write_rows(ledger: &Ledger, step: &mut Step) {
-    for (row, active) in step.rows.iter_mut().zip(ledger.active.iter().take(MAX_ROWS)) {
+fn write_rows(ledger: &Ledger, output: &mut TickOutput) {
+    for (row, active) in output.rows.iter_mut().zip(ledger.active.iter().take(MAX_ROWS)) {
         let side = u8::from(active.side == Side::Upper);
         let (kind, number) = (active.kind as u8, active.row as u16);
         *row = Row { kind, side, row: number, multiplier: active.multiplier, slack: active.slack };
     }
 }
 
-impl Tick for Pilot {
+impl LoopController for Pilot {
     fn version(&self) -> u64 {
         self.controller.version()
     }
 
-    fn tick(&mut self, state: &StateMessage, step: &mut Step) -> Outcome {
+    fn tick(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome {
         self.state.q.copy_from_slice(state.q());
         self.state.v.copy_from_slice(state.v());
         self.state.obs.copy_from_slice(state.obs());
-        let status = self.controller.update(&self.state, &self.noise, &mut self.output);
-        self.period_tick = if self.output.policy_tick { 0 } else { self.period_tick + 1 };
-        self.write(step);
+        let status = self.controller.update(&self.state, &self.noise, &mut self.out);
+        self.period_tick = if self.out.policy_tick { 0 } else { self.period_tick + 1 };
+        self.write(output);
         self.share(false);
         if self.proposes { outcome(status) } else { refused_or_acted(status) }
     }
 
-    fn brake(&mut self, state: &StateMessage, step: &mut Step) -> Outcome {
+    fn brake(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome {
         let Some(brake) = &mut self.brake else { return Outcome::Refused };
         let (nq, nv) = (state.q().len(), state.v().len());
         let (status, action) = brake.update(state.q(), state.v());
-        step.nu = action.len() as u32;
-        step.action[..action.len()].copy_from_slice(action);
-        (step.log_prob_proposal, step.log_prob_action) = (0.0, 0.0);
-        for q in [&mut step.proposal_q, &mut step.target_q] {
+        output.nu = action.len() as u32;
+        output.action[..action.len()].copy_from_slice(action);
+        (output.log_prob_proposal, output.log_prob_action) = (0.0, 0.0);
+        for q in [&mut output.proposal_q, &mut output.target_q] {
             q[..nq].copy_from_slice(&brake.target.q);
         }
-        for v in [&mut step.proposal_v, &mut step.target_v] {
+        for v in [&mut output.proposal_v, &mut output.target_v] {
             v[..nv].copy_from_slice(&brake.target.v);
         }
-        step.ledger = numbers(&brake.target.ledger);
-        write_rows(&brake.target.ledger, step);
+        output.ledger = numbers(&brake.target.ledger);
+        write_rows(&brake.target.ledger, output);
         self.share(true);
         outcome(status)
     }
@@ -212,13 +212,13 @@ impl Tick for Pilot {
         }
     }
 
-    fn predict(&self, state: &mut StateMessage, step: &Step) {
-        (state.q, state.v) = (step.target_q, step.target_v);
+    fn predict(&self, state: &mut StateMessage, output: &TickOutput) {
+        (state.q, state.v) = (output.target_q, output.target_v);
         let count = self.observed.len().min(state.obs.len());
         for (value, entry) in state.obs[..count].iter_mut().zip(&self.observed) {
             match *entry {
-                Entry::Position { idx_q, .. } => *value = step.target_q[idx_q],
-                Entry::Velocity { dof } => *value = step.target_v[dof],
+                Entry::Position { idx_q, .. } => *value = output.target_q[idx_q],
+                Entry::Velocity { dof } => *value = output.target_v[dof],
                 Entry::Other => {}
             }
         }
@@ -234,20 +234,20 @@ impl Tick for Pilot {
         self.checked.iter().find(jumped).map(|joint| joint.0)
     }
 
-    fn soften(&mut self, state: &StateMessage, share: f64, step: &mut Step) {
+    fn soften(&mut self, state: &StateMessage, share: f64, output: &mut TickOutput) {
         let Some(brake) = &mut self.brake else { return };
         let (nq, nv) = (state.q().len(), state.v().len());
         let (status, action) =
-            brake.approach(state.q(), state.v(), &step.target_q[..nq], &step.target_v[..nv], share);
+            brake.approach(state.q(), state.v(), &output.target_q[..nq], &output.target_v[..nv], share);
         if outcome(status) != Outcome::Acted {
             return;
         }
-        step.action[..action.len()].copy_from_slice(action);
-        step.target_q[..nq].copy_from_slice(&brake.target.q);
-        step.target_v[..nv].copy_from_slice(&brake.target.v);
-        let raw_violations = step.ledger.raw_violations;
-        step.ledger = LedgerNumbers { raw_violations, ..numbers(&brake.target.ledger) };
-        write_rows(&brake.target.ledger, step);
+        output.action[..action.len()].copy_from_slice(action);
+        output.target_q[..nq].copy_from_slice(&brake.target.q);
+        output.target_v[..nv].copy_from_slice(&brake.target.v);
+        let raw_violations = output.ledger.raw_violations;
+        output.ledger = LedgerNumbers { raw_violations, ..numbers(&brake.target.ledger) };
+        write_rows(&brake.target.ledger, output);
         self.share(true);
     }
 }
@@ -291,7 +291,7 @@ pub fn numbers(ledger: &Ledger) -> LedgerNumbers {
         active: ledger.active.len() as u32,
         iterations: ledger.iterations,
         raw_violations: ledger.raw_violations.total(),
-        projected_violations: ledger.violations.total(),
+        target_violations: ledger.violations.total(),
         moved: ledger.moved,
         slack: ledger.slack,
         residual: ledger.residual,

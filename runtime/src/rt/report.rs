@@ -88,7 +88,7 @@ impl RunReport {
     /// What proposals and targets broke; a policy that proposes nothing breaks nothing either, which says nothing.
     fn projected(&self) -> String {
         let c = &self.counters;
-        let counts = format!("raw proposal {}, projected {}", c.raw_violations, c.projected_violations);
+        let counts = format!("raw proposal {}, projected {}", c.raw_violations, c.target_violations);
         match c.unprojected {
             0 => counts,
             all if all == c.mode_ticks[Mode::Active.code() as usize] + c.mode_ticks[Mode::Degraded.code() as usize] => {

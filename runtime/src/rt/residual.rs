@@ -32,7 +32,7 @@ impl Default for RollbackSettings {
 pub(crate) struct Residual {
     settings: RollbackSettings,
     window: VecDeque<f64>,
-    /// Mean before the swap that is being judged.
+    /// Mean before the swap that is being watched.
     before: Option<f64>,
 }
 
@@ -78,11 +78,11 @@ impl Residual {
 fn residual(previous: &Record, record: &Record) -> Option<f64> {
     let (old, new) = (&previous.state, &record.state);
     let follows = record.fresh && new.episode == old.episode && new.tick == old.tick + 1 && new.is_finite();
-    if !(follows && previous.mode.acts() && previous.step.nu > 0) {
+    if !(follows && previous.mode.acts() && previous.output.nu > 0) {
         return None;
     }
     let nv = new.v().len();
-    let squares = new.v().iter().zip(&previous.step.target_v).map(|(v, target)| (v - target).powi(2));
+    let squares = new.v().iter().zip(&previous.output.target_v).map(|(v, target)| (v - target).powi(2));
     Some((squares.sum::<f64>() / nv.max(1) as f64).sqrt())
 }
 
@@ -93,7 +93,7 @@ mod tests {
 
     fn tick(n: u64, error: f64, snapshot: u64) -> Record {
         let mut record = Record::new();
-        (record.mode, record.fresh, record.snapshot, record.step.nu) = (Mode::Active, true, snapshot, 1);
+        (record.mode, record.fresh, record.snapshot, record.output.nu) = (Mode::Active, true, snapshot, 1);
         (record.state.nv, record.state.tick) = (1, n);
         record.state.v[0] = error; // the target is 0
         record

@@ -28,7 +28,7 @@ use crate::rt::pinned::Pinned;
 use crate::rt::receive::SnapshotReceiver;
 use crate::rt::report::{PlantSummary, RunReport};
 use crate::rt::residual::RollbackSettings;
-use crate::rt::tick::{Build, Refusal, Tick};
+use crate::rt::tick::{Build, LoopController, Refusal};
 use crate::rt::{Mode, Reason, swap};
 use crate::snapshot::{Snapshot, SnapshotError, in_run};
 use crate::stop::Stop;
@@ -355,7 +355,7 @@ fn open_log(
 }
 
 /// Starts the real-time thread and waits for its end.
-fn start_cycle<T: Tick>(
+fn start_cycle<T: LoopController>(
     cycle: Cycle<T>,
     settings: &RunSettings,
 ) -> Result<(CycleEnd<T>, Vec<String>), RunError> {

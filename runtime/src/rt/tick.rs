@@ -5,14 +5,14 @@ use crate::rt::{Mode, Reason};
 
 /// A controller as the loop sees it. `tick`, `brake` and `reset` run in the real-time thread: no allocation beyond
 /// what the solver cannot avoid, no lock, no system call.
-pub trait Tick: Send + 'static {
+pub trait LoopController: Send + 'static {
     /// Version of the snapshot behind it.
     fn version(&self) -> u64;
     /// Computes the action for `state`.
-    fn tick(&mut self, state: &StateMessage, step: &mut Step) -> Outcome;
+    fn tick(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome;
     /// Computes an action that brings the velocity to zero; [`Outcome::Refused`] leaves braking to the plant. Also
     /// called after a panic in `tick`: it must not rely on what `tick` may have left half done.
-    fn brake(&mut self, state: &StateMessage, step: &mut Step) -> Outcome;
+    fn brake(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome;
     /// The next state begins a new episode, or follows a swap.
     fn reset(&mut self);
     /// Sets every entry of the proposal's noise; 0 on a robot unless a rehearsed fault asks for another number.
@@ -24,21 +24,21 @@ pub trait Tick: Send + 'static {
     fn save_memory(&self, _memory: &mut Vec<f64>) {}
     /// Takes what another controller of the same robot saved in the tick before, if it fits.
     fn load_memory(&mut self, _memory: &[f64]) {}
-    /// Moves `state` on by one period, to where the action in `step` was to take it.
-    fn predict(&self, _state: &mut StateMessage, _step: &Step) {}
+    /// Moves `state` on by one period, to where the action in `output` was to take it.
+    fn predict(&self, _state: &mut StateMessage, _output: &TickOutput) {}
     /// The first degree of freedom of `new` that cannot have come from `old` in `age` [s], allowing `jump` times its speed.
     fn implausible(&self, _old: &StateMessage, _new: &StateMessage, _age: f64, _jump: f64) -> Option<usize> {
         None
     }
-    /// Takes `step` back towards standing still: `share` in (0, 1) of the way to its target is left. Only where a model
+    /// Takes `output` back towards standing still: `share` in (0, 1) of the way to its target is left. Only where a model
     /// of the robot knows the action for that; the others stay as they are.
-    fn soften(&mut self, _state: &StateMessage, _share: f64, _step: &mut Step) {}
+    fn soften(&mut self, _state: &StateMessage, _share: f64, _output: &mut TickOutput) {}
 }
 
 /// How a tick of the controller ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    /// `step.action` is checked and may be applied.
+    /// `output.action` is checked and may be applied.
     Acted,
     /// The same, but the proposal was discarded and every joint brakes; the ledger's status says why.
     Braked,
@@ -49,7 +49,7 @@ pub enum Outcome {
 /// Builds controllers from snapshot bytes; runs on a thread of its own, so it may take its time.
 pub trait Build: Send + 'static {
     /// What it builds.
-    type Controller: Tick;
+    type Controller: LoopController;
     /// Validates everything (digest, names, shapes, finite numbers, period, a trial tick) against `robot`.
     fn build(&mut self, snapshot: &SnapshotBytes, robot: &RobotMessage) -> Result<Self::Controller, Refusal>;
 }
@@ -65,7 +65,7 @@ pub struct Refusal {
 
 /// A controller's answer to one state. Vectors hold as many entries as the state says (nq, nv) and `nu` actions.
 #[derive(Clone, Copy, Debug)]
-pub struct Step {
+pub struct TickOutput {
     /// Entries used in `action`.
     pub nu: u32,
     /// Proposed configuration (nq).
@@ -90,7 +90,7 @@ pub struct Step {
     pub rows: [Row; MAX_ROWS],
 }
 
-/// Active rows a step has room for: a box row and two torque rows for each of 32 joints.
+/// Active rows an output has room for: a box row and two torque rows for each of 32 joints.
 pub const MAX_ROWS: usize = 96;
 
 /// A row that holds the target back, as plain numbers.
@@ -113,11 +113,11 @@ impl Row {
     pub const SIDES: [&str; 2] = ["lower", "upper"];
 }
 
-impl Step {
+impl TickOutput {
     /// All numbers zero.
-    pub fn zeroed() -> Step {
+    pub fn zeroed() -> TickOutput {
         let zero = [0.0; MAX_JOINTS];
-        Step {
+        TickOutput {
             nu: 0,
             proposal_q: zero,
             proposal_v: zero,
@@ -174,7 +174,7 @@ pub struct Counters {
     /// Limits the raw proposals broke, summed over ticks.
     pub raw_violations: u64,
     /// Limits the projected targets broke, summed over ticks.
-    pub projected_violations: u64,
+    pub target_violations: u64,
     /// Ticks that acted on what no projection has seen: their policy gives actions and proposes no state.
     pub unprojected: u64,
     /// Ticks in each mode, by code.
@@ -228,8 +228,8 @@ pub struct Record {
     pub noise: f32,
     /// The newest state, as measured.
     pub state: StateMessage,
-    /// The controller's answer; meaningless if `step.nu` is 0.
-    pub step: Step,
+    /// The controller's answer; meaningless if `output.nu` is 0.
+    pub output: TickOutput,
     /// Counts up to and with this tick.
     pub counters: Counters,
 }
@@ -253,7 +253,7 @@ impl Record {
             ramp: 1.0,
             noise: 0.0,
             state: StateMessage::zeroed(),
-            step: Step::zeroed(),
+            output: TickOutput::zeroed(),
             counters: Counters::default(),
         }
     }

@@ -134,7 +134,7 @@ impl Flight {
         let spent = (self.core.rehearsed_periods() * PERIOD as f64) as u64;
         self.core.close(begin + spent.max(5_000));
         let record = self.core.record;
-        (self.action.nu, self.action.action) = (record.step.nu, record.step.action);
+        (self.action.nu, self.action.action) = (record.output.nu, record.output.action);
         self.records.push(record);
     }
 

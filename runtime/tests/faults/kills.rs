@@ -63,7 +63,7 @@ fn fault_14_a_trainer_killed_while_it_publishes_tears_nothing() {
         (0, 0, 0),
         "{report}"
     );
-    assert_eq!((report.modes["degraded"], report.counters.projected_violations), (0, 0), "{report}");
+    assert_eq!((report.modes["degraded"], report.counters.target_violations), (0, 0), "{report}");
     assert!(arm.worst.iter().all(|e| *e <= ROUNDING), "{:?}", arm.worst);
 }
 

@@ -72,7 +72,7 @@ fn fault_03_a_start_outside_the_limits_only_returns() {
         assert!(flight.panda.v[0].abs() <= flight.panda.velocity[0] + ROUNDING);
         excess = now.max(0.0);
     }
-    assert_eq!(flight.records[0].step.ledger.status, LedgerStatus::Recovering.number());
+    assert_eq!(flight.records[0].output.ledger.status, LedgerStatus::Recovering.number());
     assert_eq!(excess, 0.0, "it is back inside");
 }
 
@@ -81,7 +81,7 @@ fn fault_04_the_first_motion_is_let_in() {
     let flight = Flight::of(&[], 200);
     let ramps: Vec<f64> = flight.records[..51].iter().map(|r| r.ramp).collect();
     assert!(ramps.windows(2).all(|w| w[0] < w[1]) && ramps[50] == 1.0, "{ramps:?}");
-    assert!(flight.records[0].step.ledger.raw_violations > 0, "the first proposal is far away");
+    assert!(flight.records[0].output.ledger.raw_violations > 0, "the first proposal is far away");
     let without = {
         let mut flight =
             Flight::new(&stochastic(1), CoreSettings { ramp: 0, ..settings() }, FaultPlan::default());
@@ -97,7 +97,10 @@ fn fault_08_a_panic_is_latched_and_the_robot_model_brakes() {
     let flight = Flight::of(&[(400, 1, FaultKind::Panic)], 1200);
     assert_eq!(flight.at(400), (Mode::Fault, Reason::Panic));
     assert_eq!(flight.at(1200), (Mode::Fault, Reason::Panic));
-    assert!(flight.records[400].step.nu > 0, "it brakes by the robot model, not by leaving it to the plant");
+    assert!(
+        flight.records[400].output.nu > 0,
+        "it brakes by the robot model, not by leaving it to the plant"
+    );
     assert!(*flight.panda.speeds.last().unwrap() < 1e-2);
     flight.assert_within_limits(ROUNDING);
 }
@@ -182,7 +185,7 @@ fn fault_35_opposite_policies_every_ten_ticks_obey_every_limit() {
     for pair in flight.records.windows(2).skip(100) {
         assert_eq!(pair[1].swapped, pair[0].policy_version != pair[1].policy_version);
     }
-    assert_eq!(flight.counters().projected_violations, 0);
+    assert_eq!(flight.counters().target_violations, 0);
     flight.assert_within_limits(ROUNDING);
 }
 
@@ -199,7 +202,7 @@ fn no_hot_swap_leads_to_a_state_without_a_certified_answer() {
             flight.fly(50 + (seed * 7919 + version * 104_729) % 500);
         }
         let counters = flight.counters();
-        assert_eq!(counters.projected_violations, 0, "seed {seed}: {:?} {counters:?}", flight.panda.worst);
+        assert_eq!(counters.target_violations, 0, "seed {seed}: {:?} {counters:?}", flight.panda.worst);
         flight.assert_within_limits(ROUNDING);
     }
 }

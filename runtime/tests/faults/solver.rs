@@ -20,9 +20,9 @@ fn torque_limits_that_leave_nothing_brake_and_name_the_status() {
     weak.manifest.task.constraints.torque.as_mut().expect("the task has torque rows").scale = 0.01;
     let mut flight = Flight::new(&weak, settings(), FaultPlan::default());
     flight.fly(100);
-    let ledger = flight.records[0].step.ledger;
+    let ledger = flight.records[0].output.ledger;
     assert_eq!(ledger.status, LedgerStatus::BrakedNoCertifiedAnswer.number());
-    assert!(ledger.projected_violations > 0, "what the brake cannot keep is counted");
+    assert!(ledger.target_violations > 0, "what the brake cannot keep is counted");
     assert_eq!(flight.first(Mode::Braking).unwrap().1, Reason::NoCertifiedAnswer);
     assert!(flight.panda.worst[2] <= ROUNDING, "the motors' own limits hold: {:?}", flight.panda.worst);
 }
@@ -52,12 +52,12 @@ fn fault_05_contradicting_soft_rows_give_way_by_name_and_hard_ones_brake() {
     assert!(soft.records[1..].iter().all(|r| r.mode == Mode::Active), "{:?}", soft.counters());
     for record in &soft.records {
         let gave_way = |r: &&Row| Kind::ALL[r.kind as usize] == Kind::User && r.slack > 0.0;
-        assert!(record.step.rows().iter().any(|r| gave_way(&r)), "the row that gave way is reported");
+        assert!(record.output.rows().iter().any(|r| gave_way(&r)), "the row that gave way is reported");
     }
     soft.assert_within_limits(ROUNDING);
     let mut hard = Flight::new(&contradiction(None), settings(), FaultPlan::default());
     hard.fly(100);
-    let ledger = hard.records[0].step.ledger;
+    let ledger = hard.records[0].output.ledger;
     assert_eq!(ledger.status, LedgerStatus::BrakedNoCertifiedAnswer.number());
     assert_eq!(hard.first(Mode::Braking).unwrap().1, Reason::NoCertifiedAnswer);
     assert!(hard.panda.worst.iter().all(|excess| *excess <= ROUNDING), "{:?}", hard.panda.worst);
@@ -140,11 +140,11 @@ fn fault_36_torques_beyond_the_motors_are_never_sent() {
         let (effort, before) = (flight.panda.effort.clone(), flight.records.len());
         flight.fly(20);
         for record in &flight.records[before..] {
-            let action = &record.step.action[..record.step.nu as usize];
+            let action = &record.output.action[..record.output.nu as usize];
             assert!(action.iter().zip(&effort).all(|(a, e)| a.abs() <= *e), "{action:?}");
         }
     }
-    assert!(flight.records.iter().any(|r| !matches!(r.step.ledger.status, 0..=2)), "no tick was hard");
+    assert!(flight.records.iter().any(|r| !matches!(r.output.ledger.status, 0..=2)), "no tick was hard");
 }
 
 /// The robot model carries a payload that its motors cannot hold up, or links of nearly no mass, so that the inertia
@@ -160,7 +160,7 @@ fn fault_36_a_wrong_payload_and_a_singular_inertia_brake() {
     let mut heavy = Flight::new(&loaded(60.0), settings(), FaultPlan::default());
     heavy.fly(100);
     assert_eq!(
-        heavy.records[0].step.ledger.status,
+        heavy.records[0].output.ledger.status,
         LedgerStatus::BrakedNoCertifiedAnswer.number(),
         "no torque within the motors' range holds it"
     );
@@ -175,7 +175,7 @@ fn fault_36_a_wrong_payload_and_a_singular_inertia_brake() {
     singular.fly(300);
     for flight in [&heavy, &singular] {
         for record in &flight.records {
-            let action = &record.step.action[..record.step.nu as usize];
+            let action = &record.output.action[..record.output.nu as usize];
             let within = action.iter().zip(&flight.panda.effort).all(|(a, e)| a.abs() <= *e);
             assert!(within, "{action:?}");
         }
@@ -198,12 +198,13 @@ fn fault_37_denormal_numbers_change_nothing() {
     assert!(with.records[0].state.v().iter().all(|v| v.is_subnormal()));
     assert!(with.records.iter().all(|r| r.noise.is_subnormal()));
     for (a, b) in with.records.iter().zip(&without.records) {
-        let work = |r: &Record| (r.mode, r.step.ledger.rung, r.step.ledger.iterations, r.step.ledger.status);
+        let work =
+            |r: &Record| (r.mode, r.output.ledger.rung, r.output.ledger.iterations, r.output.ledger.status);
         assert_eq!(work(a), work(b), "tick {}", a.tick);
     }
     let difference = |a: &[f64], b: &[f64]| a.iter().zip(b).fold(0.0, |m, (a, b)| f64::max(m, (a - b).abs()));
     assert!(difference(&with.panda.q, &without.panda.q) < 1e-9);
-    let time = |flight: &Flight| flight.records.iter().map(|r| r.step.ledger.duration).sum::<u64>();
+    let time = |flight: &Flight| flight.records.iter().map(|r| r.output.ledger.duration).sum::<u64>();
     let (tiny, plain) = (time(&with), time(&without));
     println!("projections with denormal numbers: {:.2} of the time without", tiny as f64 / plain as f64);
     with.assert_within_limits(ROUNDING);

@@ -19,11 +19,11 @@ const SYSTEM: &str = "runtime/tests/faults/system.rs";
 /// All faults.
 #[rustfmt::skip]
 pub const ROWS: &[Row] = &[
-    (1, "policy proposes NaN, infinity, 1e300", "brakes in the same tick, leaves the policy after 5 of them, counted", &["non-finite-proposals", "braked-non-finite-proposal"], HERE, "fault_01_odd_proposals_brake_and_are_counted"),
+    (1, "policy proposes NaN, infinity, 1e300", "brakes in the same tick, leaves the policy after 5 of them, counted", &["braked-non-finite-proposal"], HERE, "fault_01_odd_proposals_brake_and_are_counted"),
     (2, "measured state is NaN or infinite", "3 are bridged by prediction, then the plant brakes, after 8 latched", &["bad-state", "bad-states"], HERE, "fault_02_a_state_that_is_not_finite_is_bridged_then_braked_then_latched"),
     (3, "start outside limits", "only motion that returns, at limited speed", &["recovering"], HERE, "fault_03_a_start_outside_the_limits_only_returns"),
     (4, "first proposal far away", "the first motion is let in over 0.2 s, within every rate limit", &["active"], HERE, "fault_04_the_first_motion_is_let_in"),
-    (5, "constraint set empty", "soft rows give way and are named; hard ones: brakes as far as the motors can", &["no-certified-answers", "braked-no-certified-answer"], SOLVER, "fault_05_contradicting_soft_rows_give_way_by_name_and_hard_ones_brake"),
+    (5, "constraint set empty", "soft rows give way and are named; hard ones: brakes as far as the motors can", &["braked-no-certified-answer"], SOLVER, "fault_05_contradicting_soft_rows_give_way_by_name_and_hard_ones_brake"),
     (6, "solver hits its iteration cap or deadline", "used only if the checker accepts, else brakes", &["braked-no-certified-answer"], SOLVER, "fault_06_an_answer_cut_by_cap_or_deadline_is_used_only_if_the_checker_accepts"),
     (7, "solver fails numerically", "brakes in that tick, the next is as if new", &["braked-non-finite-dynamics"], SOLVER, "fault_07_a_failed_solve_leaves_the_next_one_healthy"),
     (8, "controller or solver panics", "caught, discarded, latched; the robot model brakes", &["panic"], HERE, "fault_08_a_panic_is_latched_and_the_robot_model_brakes"),
@@ -54,7 +54,7 @@ pub const ROWS: &[Row] = &[
     (33, "peer with wrong schema, lying lengths, NaN, old version, flood", "refused, counted, the loop keeps its mode", &["corrupt", "not-finite", "outdated", "superseded"], PEERS, "fault_33_a_peer_with_lies_and_a_flood_is_refused_and_counted"),
     (34, "Python holds its lock for a second", "no effect: the loop is another process and knows no Python", &["none"], "python/tests/test_gil.py", "test_the_loop_runs_on_while_python_holds_its_lock"),
     (35, "opposite weights swapped in every 10 ms", "one version a tick, every limit holds", &["active"], HERE, "fault_35_opposite_policies_every_ten_ticks_obey_every_limit"),
-    (36, "torque beyond the motors: speed, payload, singular inertia", "brakes; what is sent is within the motors' range", &["braked-no-certified-answer", "no-certified-answers"], SOLVER, "fault_36_a_wrong_payload_and_a_singular_inertia_brake"),
+    (36, "torque beyond the motors: speed, payload, singular inertia", "brakes; what is sent is within the motors' range", &["braked-no-certified-answer"], SOLVER, "fault_36_a_wrong_payload_and_a_singular_inertia_brake"),
     (37, "denormal numbers", "no effect: the same work in every tick", &["none"], SOLVER, "fault_37_denormal_numbers_change_nothing"),
     (38, "pushed snapshot with looser or missing limits, another robot, or a policy that projects nothing", "the limits are the loop's: refused by joint and number; a tighter one is taken", &["looser-limits"], LIMITS, "fault_38_a_pushed_snapshot_may_tighten_the_limits_but_never_loosen_them"),
     (39, "manifest nested beyond measure behind a right digest; a push larger than a file may be", "refused, no stack overflows", &["snapshot-foreign", "corrupt"], FILES, "fault_39_a_manifest_nested_beyond_measure_is_refused_and_overflows_no_stack"),

@@ -36,7 +36,7 @@ fn random_weights_swapped_in_motion_break_no_limit_and_the_stop_ends_at_rest() {
     assert_eq!(report.counters.swaps, 5);
     assert_eq!(report.versions.iter().map(|v| v.1).collect::<Vec<_>>(), [1, 2, 3, 4, 5, 6]);
     assert!(report.counters.raw_violations > 1000, "the raw policy must break limits: {:?}", report.counters);
-    assert_eq!(report.counters.projected_violations, 0);
+    assert_eq!(report.counters.target_violations, 0);
     assert_eq!(counted.late, 0);
     assert!(
         plant.worst.iter().all(|excess| *excess <= 1e-9),
@@ -81,7 +81,7 @@ fn random_torques_are_guarded_in_the_loop() {
     stop.request();
     let report = running.join().unwrap().unwrap();
     let (plant, counted) = plant.end();
-    assert_eq!((report.counters.swaps, report.counters.projected_violations, counted.late), (3, 0, 0));
+    assert_eq!((report.counters.swaps, report.counters.target_violations, counted.late), (3, 0, 0));
     assert!(report.counters.raw_violations > 1000, "{:?}", report.counters);
     assert!(
         plant.worst.iter().all(|excess| *excess <= 1e-9),
@@ -121,7 +121,7 @@ fn position_commands_lead_within_the_limits_and_are_refused_by_a_robot_that_take
     let report = running.join().unwrap().unwrap();
     let (plant, counted) = plant.end();
     assert!(report.counters.raw_violations > 500, "the raw policy must break limits: {:?}", report.counters);
-    assert_eq!((report.counters.projected_violations, counted.late), (0, 0));
+    assert_eq!((report.counters.target_violations, counted.late), (0, 0));
     assert!(plant.worst[..2].iter().all(|excess| *excess <= 1e-9), "position, velocity: {:?}", plant.worst);
     assert!(plant.accelerated <= 10.0 + 1e-5, "acceleration: {} rad/s^2", plant.accelerated);
     let fastest = plant.speeds.iter().copied().fold(0.0, f64::max);

@@ -81,29 +81,29 @@ pub struct Spring {
     pub resets: Arc<AtomicU64>,
 }
 
-impl Tick for Spring {
+impl LoopController for Spring {
     fn version(&self) -> u64 {
         self.version
     }
 
-    fn tick(&mut self, state: &StateMessage, step: &mut Step) -> Outcome {
+    fn tick(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome {
         self.ticks += 1;
         if self.panics_at == Some(self.ticks) {
             panic!("scripted panic of the test controller");
         }
-        step.nu = 1;
-        step.proposal_q[0] = 0.0;
-        step.action[0] = -(self.version as f64) * state.q()[0];
+        output.nu = 1;
+        output.proposal_q[0] = 0.0;
+        output.action[0] = -(self.version as f64) * state.q()[0];
         let miss = if self.version == MISSES { 1.0 } else { 0.0 };
-        step.target_v[0] = state.v()[0] + step.action[0] * DT + miss;
-        step.target_q[0] = state.q()[0] + step.target_v[0] * DT;
-        step.ledger.raw_violations = 1;
+        output.target_v[0] = state.v()[0] + output.action[0] * DT + miss;
+        output.target_q[0] = state.q()[0] + output.target_v[0] * DT;
+        output.ledger.raw_violations = 1;
         Outcome::Acted
     }
 
-    fn brake(&mut self, state: &StateMessage, step: &mut Step) -> Outcome {
-        step.nu = 1;
-        step.action[0] = -state.v()[0] / DT;
+    fn brake(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome {
+        output.nu = 1;
+        output.action[0] = -state.v()[0] / DT;
         Outcome::Acted
     }
 

@@ -41,12 +41,12 @@ impl Sent {
 /// The reward computed from two states is the one the simulator gave on the way. Ant's contact forces are not part of a state:
 /// its reward is not asked for here, its termination is, and that its free joint comes back whole.
 #[test]
-fn what_happened_elsewhere_is_judged_as_if_it_had_happened_here() {
+fn what_happened_elsewhere_is_scored_as_if_it_had_happened_here() {
     let cart_pole = repository().join("examples/tasks/cart-pole.toml");
     let cart_pole = cart_pole.to_str().expect("UTF-8");
     for task in ["HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Panda-reach", cart_pole, "Ant-v5"] {
         let mut env = tasks::env(task).expect(task);
-        let mut judge = env.another().expect(task);
+        let mut scoring = env.another().expect(task);
         let mut rng = stream(3, 1);
         let (mut ended, mut total) = (0, 0.0);
         for _ in 0..3 {
@@ -57,16 +57,16 @@ fn what_happened_elsewhere_is_judged_as_if_it_had_happened_here() {
                 let before = Sent::by(&*env);
                 let step = env.step(&action);
                 let after = Sent::by(&*env);
-                let judged = judge.judge(&before.moment(), &after.moment(), &action).expect(task);
-                assert_eq!(judged.terminated, step.terminated, "{task}");
+                let scored = scoring.score(&before.moment(), &after.moment(), &action).expect(task);
+                assert_eq!(scored.terminated, step.terminated, "{task}");
                 if task == "Ant-v5" {
                     let worst =
-                        judge.qpos().iter().zip(env.qpos()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                        scoring.qpos().iter().zip(env.qpos()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                     let fastest =
-                        judge.qvel().iter().zip(env.qvel()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                        scoring.qvel().iter().zip(env.qvel()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                     assert!(worst < 1e-12 && fastest < 1e-9, "{task}: {worst} {fastest}");
                 } else {
-                    assert!((judged.reward - step.reward).abs() < 1e-9, "{task}: {judged:?} {step:?}");
+                    assert!((scored.reward - step.reward).abs() < 1e-9, "{task}: {scored:?} {step:?}");
                 }
                 total += step.reward.abs();
                 if step.terminated {
@@ -169,7 +169,7 @@ fn a_trainer_learns_from_a_running_loop_which_outlives_it() {
 
     let run = runtime.end();
     assert_eq!(
-        (&run["counters"]["projected_violations"], &run["modes"]["fault"]),
+        (&run["counters"]["target_violations"], &run["modes"]["fault"]),
         (&0.into(), &0.into()),
         "{run}"
     );
@@ -194,7 +194,7 @@ fn exploration_is_in_the_log() {
         let run = ["run", panda, "--plant", name.0.as_str(), "--seconds", "0.4", "--log", log, "--json"];
         let run = Process::nearl(&[&run, seed].concat()).json();
         assert_eq!(
-            (&run["log_drops"], &run["counters"]["projected_violations"]),
+            (&run["log_drops"], &run["counters"]["target_violations"]),
             (&0.into(), &0.into()),
             "{run}"
         );

@@ -88,7 +88,7 @@ fn two_seconds_of_panda_in_lockstep_break_no_limit() {
     // The ticks that brake to rest at the end come on top.
     assert_eq!(run["modes"]["active"], 2000, "{run}");
     assert_eq!((&run["modes"]["fault"], &run["counters"]["stale"]), (&0.into(), &0.into()), "{run}");
-    assert_eq!(run["counters"]["projected_violations"], 0, "{run}");
+    assert_eq!(run["counters"]["target_violations"], 0, "{run}");
     assert!(number(&run["counters"]["raw_violations"]) > 0, "the policy never left the limits: {run}");
     assert_eq!((&run["log_error"], &run["refused_states"]), (&Value::Null, &Value::from(0)));
     assert!(number(&plant["report"]["fresh"]) >= 2000, "{plant}");

@@ -211,8 +211,8 @@ fn noise_and_projection_are_what_the_request_says() {
     let own = Request::new(5, 400);
     let projected = counts(&mut client, &own);
     let raw = counts(&mut client, &Request { constraints: Constraints::Off, ..own });
-    assert_eq!(projected["projected_violations"], 0.0);
-    assert!(projected["raw_violations"] > 0.0 && raw["projected_violations"] > 0.0, "{projected:?} {raw:?}");
+    assert_eq!(projected["target_violations"], 0.0);
+    assert!(projected["raw_violations"] > 0.0 && raw["target_violations"] > 0.0, "{projected:?} {raw:?}");
     let id = constraint_set(&snapshot().manifest);
     let by_id =
         Request { constraints: Constraints::Id(id), version: Some(snapshot().manifest.version), ..own };

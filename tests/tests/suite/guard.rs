@@ -160,7 +160,7 @@ fn ppo_trains_through_the_guard() {
         let log_std = acting.networks.policy_log_std.clone();
         let p = training.iterate();
         assert!(p.tally.raw_violations > 0 && p.tally.moved > 0);
-        assert_eq!((p.tally.projected_violations, p.tally.reached_violations), (0, 0));
+        assert_eq!((p.tally.target_violations, p.tally.reached_violations), (0, 0));
         let mut replaced = 0;
         for s in training.segments() {
             for (row, x) in s.x.chunks_exact(20).enumerate() {

@@ -41,11 +41,11 @@ fn the_ledger_is_in_the_metrics() {
 #[test]
 fn without_projection_in_training_nothing_is_moved_nor_avoided() {
     let (t, p) = first("pid2-ib", &[TIGHT, "train.project_in_training=false"]);
-    assert!(p.tally.raw_violations > 0 && p.tally.projected_violations > 0);
+    assert!(p.tally.raw_violations > 0 && p.tally.target_violations > 0);
     assert_eq!((p.tally.avoided, p.tally.moved, p.tally.active_rows), (0, 0, 0));
     // the controller that loads the snapshot projects all the same
     let (_, projected) = first("pid2-ib", &[TIGHT]);
-    assert_eq!(projected.tally.projected_violations, 0);
+    assert_eq!(projected.tally.target_violations, 0);
     let report = nearl_trainer::evaluate::evaluate(t.snapshot(), 1, 0, true).expect("episodes");
     assert_eq!(report.target_violations, 0);
 }

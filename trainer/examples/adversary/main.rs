@@ -5,7 +5,7 @@
 //! TICKS are shared out over robots, ways of braking and attacks; `FOLDER/table.md` and `FOLDER/counts.jsonl` are written.
 //!
 //! The plant: MuJoCo at 1 kHz, one semi-implicit Euler step a tick, no joint stops, no clamp on motor forces. The motors get the
-//! inverse dynamics of the target. What is judged is the simulator's own state, against the limits of the robot file.
+//! inverse dynamics of the target. What is counted is the simulator's own state, against the limits of the robot file.
 
 mod attack;
 mod victim;
@@ -63,7 +63,7 @@ impl Counts {
         }
     }
 
-    fn judge(&mut self, excess: [f64; 4]) {
+    fn count(&mut self, excess: [f64; 4]) {
         for (k, excess) in excess.into_iter().enumerate() {
             self.broken[k] += u64::from(excess > TOLERANCE || excess.is_nan());
             self.worst[k] = self.worst[k].max(excess);
@@ -97,7 +97,7 @@ fn run(job: &Job) -> Result<Counts, Box<dyn Error>> {
         plant.read(&mut q, &mut v);
         counts.unstable += u64::from(plant.unstable());
         let worst = excess(victim, (&q, &v), &before, &tau);
-        counts.judge(worst);
+        counts.count(worst);
         if target.ledger.status == Status::Braked(BrakeReason::NoCertifiedAnswer)
             || worst.iter().any(|e| *e > TOLERANCE || e.is_nan())
         {

@@ -9,7 +9,7 @@ pub const LEDGER: [&str; 11] = [
     "ticks",
     "raw_violations",
     "recovering",
-    "projected_violations",
+    "target_violations",
     "moved",
     "distance",
     "avoided",

@@ -242,7 +242,7 @@ fn show(bar: &ProgressBar, json: bool, p: &Progress) {
         let numbers: serde_json::Map<_, _> =
             p.metrics.iter().map(|(k, v)| ((*k).to_string(), serde_json::json!(v))).collect();
         say(serde_json::json!({ "steps": p.steps, "seconds": p.seconds, "return": p.return_mean,
-            "raw_violations": t.raw_violations, "target_violations": t.projected_violations, "ticks": t.ticks, "metrics": numbers }));
+            "raw_violations": t.raw_violations, "target_violations": t.target_violations, "ticks": t.ticks, "metrics": numbers }));
         return;
     }
     bar.set_position(p.steps.min(bar.length().unwrap_or(0)));

@@ -49,7 +49,7 @@ pub(super) trait Rules: Clone + Send + 'static {
 
     /// Reward of the period that ends in `sim`'s state, and whether the episode ends there. `before` is what
     /// [`Rules::progress`] was when it began.
-    fn judge(&self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool);
+    fn score(&self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool);
 
     /// Writes the observation.
     fn observe(&self, sim: &Sim, obs: &mut [f64]);

@@ -145,7 +145,7 @@ impl<R: Rules> Env for Simulated<R> {
         if self.sim.take_unstable() {
             return self.faulty(Fault::Unstable);
         }
-        let (reward, terminated) = self.rules.judge(&self.spec, &self.sim, before, action);
+        let (reward, terminated) = self.rules.score(&self.spec, &self.sim, before, action);
         Step { reward, cost: 0.0, terminated, fault: Fault::None }
     }
 
@@ -162,13 +162,13 @@ impl<R: Rules> Env for Simulated<R> {
         true
     }
 
-    fn judge(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
+    fn score(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
         self.place(from)?;
         self.rules.begin(&self.sim);
         let before = self.rules.progress(&self.sim);
         self.place(to)?;
         self.rules.finish(&mut self.sim).map_err(self.physics())?;
-        let (reward, terminated) = self.rules.judge(&self.spec, &self.sim, before, action);
+        let (reward, terminated) = self.rules.score(&self.spec, &self.sim, before, action);
         Ok(Step { reward, cost: 0.0, terminated, fault: Fault::None })
     }
 

@@ -223,7 +223,7 @@ impl Rules for User {
         sim.update_kinematics()
     }
 
-    fn judge(&self, spec: &Spec, sim: &Sim, _: f64, action: &[f64]) -> (f64, bool) {
+    fn score(&self, spec: &Spec, sim: &Sim, _: f64, action: &[f64]) -> (f64, bool) {
         let outcome = Outcome { sim, before: &self.before, action, dt: spec.dt };
         let reward = self.reward.iter().map(|e| e.value(|q| outcome.read(q))).sum();
         (reward, self.termination.iter().any(|e| e.holds(|q| outcome.read(q))))

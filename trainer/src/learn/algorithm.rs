@@ -20,7 +20,7 @@ pub enum Algorithm {
 
 /// One line of the table.
 #[derive(Clone, Copy, Debug)]
-pub struct Entry {
+pub struct AlgorithmEntry {
     /// Which.
     pub algorithm: Algorithm,
     /// As it is written.
@@ -30,28 +30,28 @@ pub struct Entry {
 }
 
 /// Every algorithm, in the order of the paper.
-pub const ALGORITHMS: &[Entry] = &[
-    Entry {
+pub const ALGORITHMS: &[AlgorithmEntry] = &[
+    AlgorithmEntry {
         algorithm: Algorithm::Ppo,
         name: "ppo",
         about: "a Gaussian policy on actions, nothing proposed or projected; an inverse model learns on the side",
     },
-    Entry {
+    AlgorithmEntry {
         algorithm: Algorithm::PpoCombined,
         name: "ppo-combined",
         about: "PPO on the paper's two networks, policy and inverse model, without any other loss (its RL-Pure)",
     },
-    Entry {
+    AlgorithmEntry {
         algorithm: Algorithm::Nearl,
         name: "nearl",
         about: "supervised meta policy and inverse model, policy gradient on the pair (the paper's Algorithm 1)",
     },
-    Entry {
+    AlgorithmEntry {
         algorithm: Algorithm::Pid2Gan,
         name: "pid2-gan",
         about: "policy, inverse dynamics and a discriminator without a bottleneck",
     },
-    Entry {
+    AlgorithmEntry {
         algorithm: Algorithm::Pid2Ib,
         name: "pid2-ib",
         about: "policy, inverse dynamics and a discriminator with the information bottleneck (the paper's Algorithm 2)",
@@ -81,7 +81,7 @@ impl Algorithm {
         self.entry().about
     }
 
-    fn entry(self) -> &'static Entry {
+    fn entry(self) -> &'static AlgorithmEntry {
         let found = ALGORITHMS.iter().find(|e| e.algorithm == self);
         found.unwrap_or_else(|| unreachable!("{self:?} has no line in the table"))
     }
@@ -110,7 +110,7 @@ impl FromStr for Algorithm {
         if let Some(e) = ALGORITHMS.iter().find(|e| e.name == name) {
             return Ok(e.algorithm);
         }
-        let alike = |e: &Entry| (strsim::jaro_winkler(e.name, &name.to_lowercase()), e.name);
+        let alike = |e: &AlgorithmEntry| (strsim::jaro_winkler(e.name, &name.to_lowercase()), e.name);
         let near =
             ALGORITHMS.iter().map(alike).max_by(|a, b| a.0.total_cmp(&b.0)).filter(|(score, _)| *score > 0.7);
         Err(UnknownAlgorithm {

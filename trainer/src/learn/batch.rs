@@ -10,10 +10,10 @@ pub struct Batch {
     pub n: usize,
     /// Normalised observation (n x n_obs).
     pub obs: Vec<f32>,
-    /// Sampled proposal u (n x n_state).
-    pub proposal: Vec<f32>,
+    /// Sampled proposal u, a normalised change (n x n_state).
+    pub change: Vec<f32>,
     /// Projected change w (n x n_state).
-    pub target: Vec<f32>,
+    pub target_change: Vec<f32>,
     /// Lowest change the projection lets through (n x n_state).
     pub lower: Vec<f32>,
     /// Highest change the projection lets through (n x n_state).
@@ -53,7 +53,8 @@ impl Batch {
     /// Forgets every row; keeps the memory.
     pub fn clear(&mut self) {
         self.n = 0;
-        let states = [&mut self.obs, &mut self.proposal, &mut self.target, &mut self.lower, &mut self.upper];
+        let states =
+            [&mut self.obs, &mut self.change, &mut self.target_change, &mut self.lower, &mut self.upper];
         let actions = [&mut self.reached, &mut self.sampled, &mut self.action];
         let numbers = [&mut self.log_prob, &mut self.advantage, &mut self.returns];
         states.into_iter().chain(actions).chain(numbers).for_each(Vec::clear);

@@ -10,7 +10,7 @@ mod gradient;
 
 use super::Dims;
 use super::batch::Batch;
-use super::inverse::{InverseModel, InverseWork};
+use super::inverse::{InverseModel, InverseScratch};
 use super::losses::{in_parts, mean_std, set_lanes, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
@@ -82,9 +82,9 @@ pub(super) struct Combined {
 }
 
 /// Buffers of one thread.
-pub(super) struct CombinedWork {
+pub(super) struct CombinedScratch {
     pub(super) policy: Tape,
-    pub(super) inverse: Option<InverseWork>,
+    pub(super) inverse: Option<InverseScratch>,
     /// Observation rows.
     pub(super) obs: Vec<V>,
     /// Rows of a change of state.
@@ -161,11 +161,11 @@ impl Combined {
     }
 
     /// Buffers for a tile.
-    pub(super) fn work(&self) -> CombinedWork {
+    pub(super) fn scratch(&self) -> CombinedScratch {
         let (ov, sv) = (self.dims.n_obs.div_ceil(LANES), self.dims.n_state.div_ceil(LANES));
-        CombinedWork {
+        CombinedScratch {
             policy: self.policy.tape(TILE),
-            inverse: self.inverse.as_ref().map(|(m, _)| m.work()),
+            inverse: self.inverse.as_ref().map(|(m, _)| m.scratch()),
             obs: vec![ZERO; TILE * ov],
             change: vec![ZERO; TILE * sv],
             d_change: vec![ZERO; TILE * sv],
@@ -193,7 +193,7 @@ impl Combined {
         }
         match self.policy_log_std {
             None => rows.extend([&batch.lower, &batch.upper].map(|b| Rows::new(b, d.n_state))),
-            Some(_) => rows.extend([&batch.proposal, &batch.target].map(|b| Rows::new(b, d.n_state))),
+            Some(_) => rows.extend([&batch.change, &batch.target_change].map(|b| Rows::new(b, d.n_state))),
         }
         rows
     }
@@ -209,9 +209,9 @@ impl Combined {
     }
 
     /// The supervised loss of the inverse model (Eq. 4).
-    pub(super) fn idm_tile(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) {
-        if let (Some((model, _)), Some(work)) = (&self.inverse, &mut w.inverse) {
-            model.tile(group, t, &self.dims, work, grad);
+    pub(super) fn idm_tile(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedScratch, grad: &mut [V]) {
+        if let (Some((model, _)), Some(scratch)) = (&self.inverse, &mut w.inverse) {
+            model.tile(group, t, &self.dims, scratch, grad);
         }
     }
 
@@ -219,7 +219,7 @@ impl Combined {
     pub(super) fn log_probs(&self, group: &Group, batch: &Batch, threads: usize) -> Vec<f32> {
         let mut out = vec![0.0f32; batch.n];
         in_parts(&mut out, TILE, threads, |first, out| {
-            let (mut w, mut idx) = (self.work(), [0u32; TILE]);
+            let (mut w, mut idx) = (self.scratch(), [0u32; TILE]);
             for (start, out) in (first..).step_by(TILE).zip(out.chunks_mut(TILE)) {
                 for (k, i) in idx.iter_mut().enumerate() {
                     *i = (start + k).min(batch.n - 1) as u32;
@@ -236,7 +236,7 @@ impl Combined {
         let (s, sv) = (self.dims.n_state, self.dims.n_state.div_ceil(LANES));
         out.resize(batch.n * s, 0.0);
         in_parts(out, TILE * s, threads, |first, out| {
-            let (mut w, mut idx) = (self.work(), [0u32; TILE]);
+            let (mut w, mut idx) = (self.scratch(), [0u32; TILE]);
             for (start, out) in (first / s..).step_by(TILE).zip(out.chunks_mut(TILE * s)) {
                 for (k, i) in idx.iter_mut().enumerate() {
                     *i = (start + k).min(batch.n - 1) as u32;

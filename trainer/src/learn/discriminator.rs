@@ -25,7 +25,7 @@ pub(super) struct Discriminator {
 }
 
 /// Buffers of one thread.
-pub(super) struct DiscriminatorWork {
+pub(super) struct DiscriminatorScratch {
     encoder: Tape,
     decoder: Tape,
     /// Input rows `[change, x]`.
@@ -71,9 +71,9 @@ impl Discriminator {
     }
 
     /// Buffers for a tile.
-    pub(super) fn work(&self) -> DiscriminatorWork {
+    pub(super) fn scratch(&self) -> DiscriminatorScratch {
         let n_in = self.encoder.mlp.n_in().div_ceil(LANES);
-        DiscriminatorWork {
+        DiscriminatorScratch {
             encoder: self.encoder.tape(TILE),
             decoder: self.decoder.tape(TILE),
             input: vec![ZERO; TILE * n_in],
@@ -88,7 +88,7 @@ impl Discriminator {
     /// `z = mu + sigma noise`, then the decoder; logits are in `w.logit`. Returns the sum of KL[E || N(0, 1)] over rows:
     /// `sum (sigma^2 + mu^2 - 1) / 2 - log sigma`.
     #[inline(always)]
-    pub(super) fn forward(&self, p: &[V], w: &mut DiscriminatorWork) -> f32 {
+    pub(super) fn forward(&self, p: &[V], w: &mut DiscriminatorScratch) -> f32 {
         let code = self.encoder.forward(p, &w.input, &mut w.encoder);
         let mut kl = ZERO;
         for ((z, c), &noise) in w.z.iter_mut().zip(code.chunks_exact(2)).zip(&w.noise) {
@@ -110,7 +110,7 @@ impl Discriminator {
     pub(super) fn backward<'w>(
         &self,
         transposed: &[V],
-        w: &'w mut DiscriminatorWork,
+        w: &'w mut DiscriminatorScratch,
         kl_weight: f32,
         mut grad: Option<&mut [V]>,
         input: bool,

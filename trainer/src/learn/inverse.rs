@@ -45,7 +45,7 @@ pub(super) struct InverseModel {
 }
 
 /// Buffers of one thread.
-pub(super) struct InverseWork {
+pub(super) struct InverseScratch {
     /// Activations.
     pub(super) tape: Tape,
     /// Input rows.
@@ -88,9 +88,9 @@ impl InverseModel {
     }
 
     /// Buffers for a tile.
-    pub(super) fn work(&self) -> InverseWork {
+    pub(super) fn scratch(&self) -> InverseScratch {
         let (n_in, n_out) = (self.net.mlp.n_in().div_ceil(LANES), self.net.mlp.n_out().div_ceil(LANES));
-        InverseWork {
+        InverseScratch {
             tape: self.net.tape(TILE),
             input: vec![ZERO; TILE * n_in],
             action: vec![ZERO; TILE * n_out],
@@ -109,7 +109,14 @@ impl InverseModel {
 
     /// `L_I = sum |a - I(s_c, s'_c)|^2 / 2` on reached transitions (Eq. 4 of the paper for the mean of the Gaussian; its
     /// spread is left to the policy gradient, which needs it to explore).
-    pub(super) fn tile(&self, group: &Group, t: &Tile<'_>, dims: &Dims, w: &mut InverseWork, grad: &mut [V]) {
+    pub(super) fn tile(
+        &self,
+        group: &Group,
+        t: &Tile<'_>,
+        dims: &Dims,
+        w: &mut InverseScratch,
+        grad: &mut [V],
+    ) {
         supervised(self, group, t, dims, w, grad);
     }
 
@@ -117,7 +124,7 @@ impl InverseModel {
     pub(super) fn error(&self, p: &[V], batch: &Batch, dims: &Dims, threads: usize) -> f64 {
         let mut sums = vec![0.0f32; batch.n.div_ceil(TILE)];
         in_parts(&mut sums, 1, threads, |first, sums| {
-            let (mut w, mut idx) = (self.work(), [0u32; TILE]);
+            let (mut w, mut idx) = (self.scratch(), [0u32; TILE]);
             for (tile, sum) in (first..).zip(sums) {
                 let start = tile * TILE;
                 for (k, i) in idx.iter_mut().enumerate() {
@@ -152,7 +159,7 @@ fn supervised_body(
     group: &Group,
     t: &Tile<'_>,
     dims: &Dims,
-    w: &mut InverseWork,
+    w: &mut InverseScratch,
     grad: &mut [V],
 ) {
     let vectors = dims.n_act.div_ceil(LANES);
@@ -168,7 +175,7 @@ fn supervised_body(
     m.net.backward(&group.transposed, &w.input, &w.slope, &mut w.tape, Some(grad), false);
     add_sums(grad, &[sum.sum()]);
 }
-multiversion!(fn supervised(m: &InverseModel, group: &Group, t: &Tile<'_>, dims: &Dims, w: &mut InverseWork, grad: &mut [V]) = supervised_body);
+multiversion!(fn supervised(m: &InverseModel, group: &Group, t: &Tile<'_>, dims: &Dims, w: &mut InverseScratch, grad: &mut [V]) = supervised_body);
 
 #[inline(always)]
 fn error_body(
@@ -177,7 +184,7 @@ fn error_body(
     b: &Batch,
     idx: &[u32],
     dims: &Dims,
-    w: &mut InverseWork,
+    w: &mut InverseScratch,
     n: usize,
     out: &mut f32,
 ) {
@@ -191,7 +198,7 @@ fn error_body(
     }
     *out = sum.sum();
 }
-multiversion!(fn squared_error(m: &InverseModel, p: &[V], b: &Batch, idx: &[u32], dims: &Dims, w: &mut InverseWork, n: usize, out: &mut f32) = error_body);
+multiversion!(fn squared_error(m: &InverseModel, p: &[V], b: &Batch, idx: &[u32], dims: &Dims, w: &mut InverseScratch, n: usize, out: &mut f32) = error_body);
 
 #[cfg(test)]
 mod tests {

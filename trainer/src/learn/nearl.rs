@@ -11,7 +11,7 @@
 //! at 1. The other losses run on each minibatch in the order of [`IMITATE`], [`ACTOR`], [`VALUE`], each with its own optimiser. What was
 //! reached is possible but not optimal, so the first loss pulls against the last; PID^2 replaces it by an adversary.
 
-use super::combined::{Combined, CombinedWork, Gradient, Kind};
+use super::combined::{Combined, CombinedScratch, Gradient, Kind};
 use super::epochs::{Pace, Update};
 use super::gaussian::gather;
 use super::inverse::Reading;
@@ -19,7 +19,7 @@ use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, Tile, add_sums, optimise};
 use super::pid2::Pid2Settings;
 use super::ppo::PpoSettings;
-use super::value::ValueWork;
+use super::value::ValueScratch;
 use super::{Adam, Batch, Dims, Learner, Metrics};
 use nearl_runtime::net::kernel::{LANES, V, ZERO};
 use nearl_runtime::normaliser::Normaliser;
@@ -175,7 +175,7 @@ impl Learner for Nearl {
 
 /// `L_pi = sum |(s' - s) / scale - pi(s)|^2 / 2` on reached transitions (for the mean, where the policy is stochastic).
 #[inline(always)]
-fn imitate_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) {
+fn imitate_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedScratch, grad: &mut [V]) {
     let (c, group) = (&n.combined, &params.groups[COMBINED]);
     let s = c.dims.n_state;
     c.propose(group, &t, w);
@@ -192,20 +192,20 @@ fn imitate_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedWork, gr
 
 /// Policy gradient on the combined policy (Eq. 1).
 #[inline(always)]
-fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) {
+fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedScratch, grad: &mut [V]) {
     let sums = n.combined.policy_gradient(&params.groups[COMBINED], &t, w, grad);
     n.combined.learn(&params.groups[COMBINED], w, grad);
     add_sums(grad, &sums);
 }
 
-multiversion!(fn imitate(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) = imitate_body);
-multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedWork, grad: &mut [V]) = actor_body);
+multiversion!(fn imitate(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedScratch, grad: &mut [V]) = imitate_body);
+multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut CombinedScratch, grad: &mut [V]) = actor_body);
 
 impl Phases for Nets {
-    type Work = (CombinedWork, ValueWork);
+    type Scratch = (CombinedScratch, ValueScratch);
 
-    fn work(&self) -> Self::Work {
-        (self.combined.work(), self.combined.value.work())
+    fn scratch(&self) -> Self::Scratch {
+        (self.combined.scratch(), self.combined.value.scratch())
     }
     fn group(&self, phase: usize) -> usize {
         if phase == VALUE { CRITIC } else { COMBINED }
@@ -218,7 +218,7 @@ impl Phases for Nets {
             _ => 0..self.combined.len,
         }
     }
-    fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Self::Work, grad: &mut [V]) {
+    fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Self::Scratch, grad: &mut [V]) {
         let (w, value) = w;
         match phase {
             IMITATE => imitate(self, params, t, w, grad),

@@ -85,8 +85,8 @@ fn collect(actor: &Actor, n: usize, rng: &mut ChaCha8Rng) -> (Batch, f64) {
         let g = goal(x);
         let reward = -(0..2).map(|k| (s.action[k] - g[k]).powi(2)).sum::<f32>();
         b.obs.extend(x);
-        b.proposal.extend(s.proposal);
-        b.target.extend(s.proposal);
+        b.change.extend(s.proposal);
+        b.target_change.extend(s.proposal);
         b.reached.extend(reached(s.action));
         b.sampled.extend(s.action);
         b.action.extend(s.action);

@@ -66,15 +66,22 @@ pub const SUMS: usize = LANES;
 /// An algorithm as its phases. Phases run in order on each minibatch.
 pub trait Phases: Sync {
     /// Buffers of one thread.
-    type Work;
+    type Scratch;
     /// Buffers for tiles of [`TILE`] rows.
-    fn work(&self) -> Self::Work;
+    fn scratch(&self) -> Self::Scratch;
     /// Parameter group that phase `k` changes.
     fn group(&self, phase: usize) -> usize;
     /// Part of the group that phase `k` changes.
     fn range(&self, phase: usize) -> Range<usize>;
     /// Adds the gradient of a tile to `grad` (of the whole group) and its sums to the last vector of `grad`.
-    fn tile(&self, phase: usize, params: &Params, tile: Tile<'_>, work: &mut Self::Work, grad: &mut [V]);
+    fn tile(
+        &self,
+        phase: usize,
+        params: &Params,
+        tile: Tile<'_>,
+        scratch: &mut Self::Scratch,
+        grad: &mut [V],
+    );
     /// Refreshes transposed weights after phase `k` changed its parameters.
     fn refresh(&self, phase: usize, params: &mut Params);
     /// Whether the rate of phase `k` follows the schedule of the run; the others are constant.
@@ -281,14 +288,14 @@ struct Run<'a, P: Phases> {
 impl<P: Phases> Run<'_, P> {
     fn worker(&self, thread: usize, params: &mut Params) -> Vec<PhaseReport> {
         let _watch = self.barrier.alarm.watch();
-        let mut work = self.algorithm.work();
+        let mut scratch = self.algorithm.scratch();
         let (mut sums, mut reports, mut round) = (self.sums(params), self.reports(), 0);
         for idx in self.minibatches() {
             let advantage = moments(self.batch, idx);
             for k in 0..self.phases.len() {
                 let len = params.groups[self.group(k)].p.len() + 1;
                 for s in (thread..self.shards).step_by(self.threads) {
-                    self.shard(s, k, idx, advantage, params, &mut work, round % 2, len);
+                    self.shard(s, k, idx, advantage, params, &mut scratch, round % 2, len);
                 }
                 let odd = round % 2;
                 round += 1;
@@ -365,7 +372,7 @@ impl<P: Phases> Run<'_, P> {
         idx: &[u32],
         advantage: (f32, f32),
         params: &Params,
-        work: &mut P::Work,
+        scratch: &mut P::Scratch,
         odd: usize,
         len: usize,
     ) {
@@ -379,7 +386,7 @@ impl<P: Phases> Run<'_, P> {
             rows::prefetch(&self.rows[k], all.get(next..next + TILE).unwrap_or(&[]));
             let clip = self.schedule.clip;
             let tile = Tile { batch: self.batch, idx: &all[at..at + TILE], scale, advantage, clip };
-            self.algorithm.tile(self.phases[k], params, tile, work, &mut grad[..len]);
+            self.algorithm.tile(self.phases[k], params, tile, scratch, &mut grad[..len]);
         }
     }
 

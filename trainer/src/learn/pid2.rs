@@ -17,16 +17,16 @@ mod adversary;
 mod fakes;
 mod null_space;
 
-use super::combined::{Combined, CombinedWork, Gradient, Kind};
-use super::discriminator::{Discriminator, DiscriminatorWork, LATENT};
+use super::combined::{Combined, CombinedScratch, Gradient, Kind};
+use super::discriminator::{Discriminator, DiscriminatorScratch, LATENT};
 use super::epochs::{Pace, Update};
 use super::inverse::Reading;
 use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, SUMS, Tile, add_sums, optimise};
 use super::ppo::PpoSettings;
-use super::value::ValueWork;
+use super::value::ValueScratch;
 use super::{Adam, Batch, Dims, Learner, Metrics};
-use adversary::{fool_discriminator, judge};
+use adversary::{discriminate, fool_discriminator};
 use fakes::Fakes;
 use nearl_runtime::net::kernel::{V, ZERO};
 use nearl_runtime::normaliser::Normaliser;
@@ -56,9 +56,9 @@ pub struct Pid2Settings {
     pub generator_lr: f32,
     /// Weight of the squared slope of the discriminator by the reached change.
     pub gradient_penalty: f32,
-    /// Proposals are judged with noise like that of what was reached, so that the right one cannot be told from it.
+    /// Proposals are shown to the discriminator with noise like that of what was reached, so that the right one cannot be told from it.
     pub match_noise: bool,
-    /// Judge the proposals of the current policy, made anew before each pass over the batch.
+    /// Show the discriminator the proposals of the current policy, made anew before each pass over the batch.
     pub fresh_fakes: bool,
     /// The adversary moves a proposal only where the mean action stays as it is. No effect where the policy does not learn
     /// through the inverse model (`exploration = "proposal"`).
@@ -118,7 +118,7 @@ struct Nets {
     discriminator: Discriminator,
     /// Latent noise (n x LATENT), read by three passes: see [`Nets::noise_shift`].
     noise: Vec<f32>,
-    /// What is judged beside the reached changes.
+    /// What the discriminator sees beside the reached changes.
     fakes: Fakes,
 }
 
@@ -146,10 +146,10 @@ impl Nets {
 }
 
 /// Buffers of one thread.
-struct Work {
-    actor: CombinedWork,
-    value: ValueWork,
-    discriminator: DiscriminatorWork,
+struct Scratch {
+    actor: CombinedScratch,
+    value: ValueScratch,
+    discriminator: DiscriminatorScratch,
     /// Where the adversary is held to it.
     null_space: Option<NullSpace>,
 }
@@ -159,7 +159,7 @@ const COMBINED: usize = 0;
 /// Parameter group of the value.
 const CRITIC: usize = 1;
 /// Parameter group of the discriminator.
-const JUDGE: usize = 2;
+const ADVERSARY: usize = 2;
 
 impl Pid2 {
     /// Fresh networks. `bottleneck` off is `pid2-gan`.
@@ -177,9 +177,9 @@ impl Pid2 {
         let discriminator = Discriminator::new(dims.n_state, dims.n_obs, nets, bottleneck);
         let (combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
         let d = &discriminator;
-        let mut judge = Group { p: vec![ZERO; d.len], transposed: vec![ZERO; d.transposed] };
-        d.init(&mut judge.p, rng);
-        d.refresh(&judge.p, &mut judge.transposed);
+        let mut adversary = Group { p: vec![ZERO; d.len], transposed: vec![ZERO; d.transposed] };
+        d.init(&mut adversary.p, rng);
+        d.refresh(&adversary.p, &mut adversary.transposed);
         let adam = vec![
             Adam::new(combined.len, lr),
             Adam::new(combined.value.len, value_lr),
@@ -187,7 +187,8 @@ impl Pid2 {
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
             Adam::new(combined.proposal_range().len(), settings.generator_lr),
         ];
-        let params = Params { groups: vec![actor, critic, judge], adam, beta: settings.beta, adapted: 1.0 };
+        let params =
+            Params { groups: vec![actor, critic, adversary], adam, beta: settings.beta, adapted: 1.0 };
         let nets = Nets { settings, combined, discriminator, noise: Vec::new(), fakes: Fakes::default() };
         Self { nets, params, threads }
     }
@@ -204,12 +205,12 @@ impl Learner for Pid2 {
         let (s, n_act) = (self.nets.settings.clone(), self.nets.combined.dims.n_act);
         let before = self.nets.combined.idm_error(self.actor(), batch, threads);
         let inverse_learns = before.is_some_and(|e| s.idm_threshold_per.exceeds(e, n_act, s.idm_threshold));
-        let judged = s.generator_weight > 0.0;
+        let opposed = s.generator_weight > 0.0;
         let mut phases = vec![ACTOR, VALUE];
-        if judged && s.generator_lr > 0.0 {
+        if opposed && s.generator_lr > 0.0 {
             phases.push(GENERATOR);
         }
-        if judged {
+        if opposed {
             phases.push(DISCRIMINATOR);
         }
         let update = Update { ppo: &ppo, pace, threads, phases: &phases, actor: ACTOR };
@@ -217,12 +218,12 @@ impl Learner for Pid2 {
             optimise(&self.nets, &mut self.params, batch, &[INVERSE], update.schedule(), rng);
             batch.log_prob = self.nets.combined.log_probs(&self.params.groups[COMBINED], batch, threads);
         }
-        if judged {
+        if opposed {
             self.nets.noise.resize(batch.n * LATENT, 0.0);
             self.nets.noise.fill_with(|| StandardNormal.sample(&mut *rng));
             self.nets.fakes = Fakes::new(&s, &self.nets.combined, batch, rng);
         }
-        let (again, fresh) = (ppo.recompute_advantages, judged && s.fresh_fakes);
+        let (again, fresh) = (ppo.recompute_advantages, opposed && s.fresh_fakes);
         let passes = update.run(
             &mut self.nets,
             &mut self.params,
@@ -242,14 +243,14 @@ impl Learner for Pid2 {
         let mut metrics = self.nets.combined.metrics(self.actor(), &report[0], &report[1]);
         metrics.push(("train/epochs", passes.epochs as f64));
         metrics.push(("train/learning_rate", f64::from(ppo.lr * pace.rate * self.params.adapted)));
-        if judged {
-            let judge = &report[phases.len() - 1].mean;
+        if opposed {
+            let means = &report[phases.len() - 1].mean;
             let generator = if s.generator_lr > 0.0 { report[2].mean[0] } else { report[0].mean[4] };
             metrics.extend([
                 ("train/generator_loss", generator),
-                ("discriminator/loss", judge[0]),
-                ("discriminator/kl", judge[1]),
-                ("discriminator/accuracy", judge[2]),
+                ("discriminator/loss", means[0]),
+                ("discriminator/kl", means[1]),
+                ("discriminator/accuracy", means[2]),
                 ("discriminator/beta", f64::from(self.params.beta)),
             ]);
         }
@@ -280,7 +281,7 @@ impl Learner for Pid2 {
 
 /// Policy gradient on the combined policy (Eq. 1), and the adversarial loss of the policy (Eq. 2).
 #[inline(always)]
-fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
+fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) {
     let group = &params.groups[COMBINED];
     let [loss, kl, clipped, clamped] = n.combined.policy_gradient(group, &t, &mut w.actor, grad);
     let mut generator = 0.0;
@@ -293,7 +294,7 @@ fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [
 
 /// The adversarial loss of the policy (Eq. 2) alone.
 #[inline(always)]
-fn generator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
+fn generator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) {
     let group = &params.groups[COMBINED];
     n.combined.propose(group, &t, &mut w.actor);
     if w.null_space.is_some() {
@@ -305,17 +306,17 @@ fn generator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &m
     add_sums(grad, &[loss]);
 }
 
-multiversion!(fn generator(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = generator_body);
-multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = actor_body);
+multiversion!(fn generator(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) = generator_body);
+multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) = actor_body);
 
 impl Phases for Nets {
-    type Work = Work;
+    type Scratch = Scratch;
 
-    fn work(&self) -> Work {
-        Work {
-            actor: self.combined.work(),
-            value: self.combined.value.work(),
-            discriminator: self.discriminator.work(),
+    fn scratch(&self) -> Scratch {
+        Scratch {
+            actor: self.combined.scratch(),
+            value: self.combined.value.scratch(),
+            discriminator: self.discriminator.scratch(),
             null_space: (self.settings.null_space && self.combined.policy_log_std.is_none())
                 .then(|| NullSpace::new(&self.combined.dims)),
         }
@@ -323,7 +324,7 @@ impl Phases for Nets {
     fn group(&self, phase: usize) -> usize {
         match phase {
             VALUE => CRITIC,
-            DISCRIMINATOR => JUDGE,
+            DISCRIMINATOR => ADVERSARY,
             _ => COMBINED,
         }
     }
@@ -336,13 +337,13 @@ impl Phases for Nets {
             _ => 0..self.discriminator.len,
         }
     }
-    fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
+    fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) {
         match phase {
             ACTOR => actor(self, params, t, w, grad),
             GENERATOR => generator(self, params, t, w, grad),
             VALUE => self.combined.value.tile(&params.groups[CRITIC], &t, &mut w.value, grad),
             INVERSE => self.combined.idm_tile(&params.groups[COMBINED], &t, &mut w.actor, grad),
-            _ => judge(self, params, t, w, grad),
+            _ => discriminate(self, params, t, w, grad),
         }
     }
     fn refresh(&self, phase: usize, params: &mut Params) {
@@ -351,7 +352,7 @@ impl Phases for Nets {
             VALUE => self.combined.value.refresh(&mut params.groups[CRITIC]),
             INVERSE => self.combined.refresh_inverse(&mut params.groups[COMBINED]),
             _ => {
-                let Group { p, transposed } = &mut params.groups[JUDGE];
+                let Group { p, transposed } = &mut params.groups[ADVERSARY];
                 self.discriminator.refresh(p, transposed);
             }
         }
@@ -370,7 +371,7 @@ impl Phases for Nets {
     }
     /// The policy's phase asks the discriminator what it thinks of the proposals, unless its loss has no weight.
     fn read_across(&self) -> Option<usize> {
-        (self.settings.generator_weight > 0.0).then_some(JUDGE)
+        (self.settings.generator_weight > 0.0).then_some(ADVERSARY)
     }
     fn rows<'b>(&'b self, phase: usize, batch: &'b Batch) -> Vec<Rows<'b>> {
         let d = &self.combined.dims;
@@ -389,7 +390,7 @@ impl Phases for Nets {
             _ => vec![
                 Rows::new(&batch.obs, d.n_obs),
                 Rows::new(&batch.reached, d.n_state),
-                Rows::new(self.fakes.judged(batch), d.n_state),
+                Rows::new(self.fakes.shown(batch), d.n_state),
                 noise(Pass::Real),
                 noise(Pass::Proposed),
             ],

@@ -9,7 +9,7 @@ use super::losses::{mean_std, set_lanes, widths};
 use super::net::{Net, Tape};
 use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, TILE, Tile, add_sums};
-use super::value::{Value, ValueWork};
+use super::value::{Value, ValueScratch};
 use super::{Adam, Dims, Learner, Metrics, init};
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars};
 use nearl_runtime::normaliser::Normaliser;
@@ -105,10 +105,10 @@ impl Nets {
 }
 
 /// Buffers of one thread.
-pub struct Work {
+pub struct Scratch {
     policy: Tape,
-    value: ValueWork,
-    inverse: super::inverse::InverseWork,
+    value: ValueScratch,
+    inverse: super::inverse::InverseScratch,
     obs: Vec<V>,
     action: Vec<V>,
     d_action: Vec<V>,
@@ -208,7 +208,7 @@ impl Learner for Ppo {
 }
 
 #[inline(always)]
-fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
+fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) {
     let (s, a) = (&n.settings, n.dims.n_act);
     let (ov, av) = (n.dims.n_obs.div_ceil(LANES), a.div_ceil(LANES));
     let group = &params.groups[ACTOR];
@@ -222,17 +222,17 @@ fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [
     add_sums(grad, &[loss, kl, clipped]);
 }
 
-multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = actor_body);
+multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) = actor_body);
 
 impl Phases for Nets {
-    type Work = Work;
+    type Scratch = Scratch;
 
-    fn work(&self) -> Work {
+    fn scratch(&self) -> Scratch {
         let (ov, av) = (self.dims.n_obs.div_ceil(LANES), self.dims.n_act.div_ceil(LANES));
-        Work {
+        Scratch {
             policy: self.policy.tape(TILE),
-            value: self.value.work(),
-            inverse: self.inverse.work(),
+            value: self.value.scratch(),
+            inverse: self.inverse.scratch(),
             obs: vec![ZERO; TILE * ov],
             action: vec![ZERO; TILE * av],
             d_action: vec![ZERO; TILE * av],
@@ -249,7 +249,7 @@ impl Phases for Nets {
             _ => self.inverse.range(),
         }
     }
-    fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
+    fn tile(&self, phase: usize, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) {
         match phase {
             ACTOR => actor(self, params, t, w, grad),
             VALUE => self.value.tile(&params.groups[VALUE], &t, &mut w.value, grad),

@@ -146,8 +146,8 @@ pub(super) fn batch(d: &Dims, n: usize, seed: u64) -> Batch {
     let mut batch = Batch {
         n,
         obs: draw(d.n_obs, 1.0),
-        proposal: draw(d.n_state, 1.0),
-        target: Vec::new(),
+        change: draw(d.n_state, 1.0),
+        target_change: Vec::new(),
         lower: draw(d.n_state, 0.3).iter().map(|x| x - 0.3).collect(),
         upper: draw(d.n_state, 0.3).iter().map(|x| x + 0.6).collect(),
         reached: draw(d.n_state, 1.0),
@@ -158,6 +158,6 @@ pub(super) fn batch(d: &Dims, n: usize, seed: u64) -> Batch {
         returns: draw(1, 1.0),
         ..Batch::default()
     };
-    batch.target = draw(d.n_state, 1.0);
+    batch.target_change = draw(d.n_state, 1.0);
     batch
 }

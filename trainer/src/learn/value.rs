@@ -24,7 +24,7 @@ pub(super) struct Value {
 }
 
 /// Buffers of one thread.
-pub(super) struct ValueWork {
+pub(super) struct ValueScratch {
     tape: Tape,
     obs: Vec<V>,
     slope: Vec<V>,
@@ -54,8 +54,8 @@ impl Value {
     }
 
     /// Buffers for a tile.
-    pub(super) fn work(&self) -> ValueWork {
-        ValueWork {
+    pub(super) fn scratch(&self) -> ValueScratch {
+        ValueScratch {
             tape: self.net.tape(TILE),
             obs: vec![ZERO; TILE * self.n_obs.div_ceil(LANES)],
             slope: vec![ZERO; TILE],
@@ -69,7 +69,7 @@ impl Value {
     }
 
     /// Squared error from the returns; its sum over rows is the tile's first sum.
-    pub(super) fn tile(&self, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) {
+    pub(super) fn tile(&self, group: &Group, t: &Tile<'_>, w: &mut ValueScratch, grad: &mut [V]) {
         squared_error(self, group, t, w, grad);
     }
 
@@ -78,7 +78,7 @@ impl Value {
         let (n_obs, vectors) = (self.n_obs, self.n_obs.div_ceil(LANES));
         let mut out = vec![0.0; x.len() / n_obs];
         in_parts(&mut out, TILE, threads, |first, out| {
-            let mut w = self.work();
+            let mut w = self.scratch();
             for (start, out) in (first..).step_by(TILE).zip(out.chunks_mut(TILE)) {
                 let idx: Vec<u32> = (start..start + out.len()).map(|i| i as u32).collect();
                 gather(&mut w.obs, vectors, 0, x, n_obs, &idx);
@@ -91,7 +91,7 @@ impl Value {
 }
 
 #[inline(always)]
-fn body(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) {
+fn body(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueScratch, grad: &mut [V]) {
     gather(&mut w.obs, v.n_obs.div_ceil(LANES), 0, &t.batch.obs, v.n_obs, t.idx);
     let value = v.net.forward(&group.p, &w.obs, &mut w.tape);
     let [value_of, target, slope, old] = &mut w.rows;
@@ -127,4 +127,4 @@ fn hold(range: f32, value: &[V], target: &[V], old: &mut [V], t: &Tile<'_>, slop
     }
 }
 
-multiversion!(fn squared_error(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueWork, grad: &mut [V]) = body);
+multiversion!(fn squared_error(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueScratch, grad: &mut [V]) = body);

@@ -30,7 +30,7 @@ pub enum OnlineError {
     /// The link.
     #[error(transparent)]
     Link(#[from] LinkError),
-    /// The task cannot judge a state.
+    /// The task cannot score a state.
     #[error(transparent)]
     Env(#[from] EnvError),
     /// The loop does not want the snapshot.

@@ -77,7 +77,7 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// A stream for the snapshot's task, judged by `env`.
+    /// A stream for the snapshot's task, scored by `env`.
     ///
     /// # Errors
     /// [`SnapshotError`].
@@ -121,7 +121,7 @@ impl Stream {
     /// Takes the next transition.
     ///
     /// # Errors
-    /// [`EnvError`] where the task cannot judge its state.
+    /// [`EnvError`] where the task cannot score its state.
     pub fn take(&mut self, next: &TransitionMessage) -> Result<(), EnvError> {
         if let Some(last) = self.last.take() {
             if follows(&last, next) {
@@ -161,7 +161,7 @@ impl Stream {
             tally.reached_violations += u64::from(self.controller.excess(&self.state) != [None; 2]);
             tally.residual += self.controller.residual(next.obs(), &self.out);
         }
-        let step = self.env.judge(&moment(last), &moment(next), last.action())?;
+        let step = self.env.score(&moment(last), &moment(next), last.action())?;
         self.sums.reward += step.reward;
         self.episode.total += step.reward;
         self.episode.cost += step.cost;

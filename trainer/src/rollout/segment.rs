@@ -89,7 +89,7 @@ pub struct Tally {
     /// Ticks that began with a controllable joint already outside its limits: the projection can only lead it back.
     pub recovering: u64,
     /// Ticks that began inside and whose target broke a constraint, by the independent checker.
-    pub projected_violations: u64,
+    pub target_violations: u64,
     /// Ticks in which the projection moved the proposal.
     pub moved: u64,
     /// Sum of the weighted distances moved [weight rad/s].
@@ -113,7 +113,7 @@ impl Tally {
         self.ticks += 1;
         self.raw_violations += u64::from(raw);
         self.recovering += u64::from(!ledger.outside.is_empty());
-        self.projected_violations += u64::from(left && ledger.outside.is_empty());
+        self.target_violations += u64::from(left && ledger.outside.is_empty());
         self.moved += u64::from(ledger.moved > 0.0);
         self.distance += ledger.moved;
         self.avoided += u64::from(raw && !left);
@@ -122,10 +122,10 @@ impl Tally {
 
     /// Counts and sums over ticks, in the order of [`LEDGER`].
     pub(crate) fn ledger(&self) -> [f64; LEDGER.len()] {
-        let Self { ticks, raw_violations, recovering, projected_violations, moved, distance, .. } = *self;
+        let Self { ticks, raw_violations, recovering, target_violations, moved, distance, .. } = *self;
         let Self { avoided, active_rows, reached_violations, residual, faults, .. } = *self;
         let [ticks, raw, recovering, left, moved] =
-            [ticks, raw_violations, recovering, projected_violations, moved].map(|n| n as f64);
+            [ticks, raw_violations, recovering, target_violations, moved].map(|n| n as f64);
         let [avoided, rows, reached, faults] =
             [avoided, active_rows, reached_violations, faults].map(|n| n as f64);
         [ticks, raw, recovering, left, moved, distance, avoided, rows, reached, residual, faults]
@@ -135,7 +135,7 @@ impl Tally {
     pub(crate) fn of_ledger(ledger: [f64; LEDGER.len()]) -> Self {
         let [ticks, raw, recovering, left, moved, distance, avoided, rows, reached, residual, faults] =
             ledger;
-        let [ticks, raw_violations, recovering, projected_violations, moved] =
+        let [ticks, raw_violations, recovering, target_violations, moved] =
             [ticks, raw, recovering, left, moved].map(|n| n as u64);
         let [avoided, active_rows, reached_violations, faults] =
             [avoided, rows, reached, faults].map(|n| n as u64);
@@ -145,7 +145,7 @@ impl Tally {
             ticks,
             raw_violations,
             recovering,
-            projected_violations,
+            target_violations,
             moved,
             distance,
             avoided,
@@ -162,7 +162,7 @@ impl Tally {
         self.ticks += other.ticks;
         self.raw_violations += other.raw_violations;
         self.recovering += other.recovering;
-        self.projected_violations += other.projected_violations;
+        self.target_violations += other.target_violations;
         self.moved += other.moved;
         self.distance += other.distance;
         self.avoided += other.avoided;

@@ -5,7 +5,7 @@
 //! A client may also learn: it keeps its environments, and pushes the policy they act by ([`training`], [`policy`]).
 //! One thread talks to the clients; the others simulate one chunk at a time, and [`turns`] says whose.
 
-mod desk;
+mod dispatcher;
 mod job;
 mod policy;
 mod pool;
@@ -112,34 +112,34 @@ pub fn serve(
     }
     std::thread::scope(|scope| {
         let mut pool = pool::Pool::start(scope, snapshot, settings.threads)?;
-        let mut desk = desk::Desk::new(snapshot, settings, pool.layout())?;
+        let mut dispatcher = dispatcher::Dispatcher::new(snapshot, settings, pool.layout())?;
         let mut server = RolloutServer::open(name)?;
         begin();
         let mut searched = Instant::now();
         while !stop.is_requested() {
             while let Some(caller) = server.receive() {
                 // What was pushed before the request is in use with it.
-                take_policies(&mut server, &mut desk);
-                desk.admit(caller);
+                take_policies(&mut server, &mut dispatcher);
+                dispatcher.admit(caller);
             }
-            take_policies(&mut server, &mut desk);
+            take_policies(&mut server, &mut dispatcher);
             if searched.elapsed() > SEARCH {
-                desk.keep_only(&server.survivors());
+                dispatcher.keep_only(&server.survivors());
                 searched = Instant::now();
             }
-            desk.attend();
-            desk.hand_out(&mut pool);
-            if let Some(outcome) = pool.wait(if desk.is_awaited() { SHORT_WAIT } else { WAIT }) {
-                desk.take_back(outcome);
+            dispatcher.attend();
+            dispatcher.hand_out(&mut pool);
+            if let Some(outcome) = pool.wait(if dispatcher.is_awaited() { SHORT_WAIT } else { WAIT }) {
+                dispatcher.take_back(outcome);
             }
         }
-        Ok(desk.close())
+        Ok(dispatcher.close())
     })
 }
 
-fn take_policies(server: &mut RolloutServer, desk: &mut desk::Desk) {
+fn take_policies(server: &mut RolloutServer, dispatcher: &mut dispatcher::Dispatcher) {
     while let Some(bytes) = server.snapshot() {
-        let (verdict, text) = desk.take_policy(&bytes);
+        let (verdict, text) = dispatcher.take_policy(&bytes);
         server.receipt(&bytes.header, verdict, &text);
     }
 }

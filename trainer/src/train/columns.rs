@@ -65,7 +65,7 @@ impl Training {
             "rollout/ep_len_mean" => p.length_mean,
             "rollout/ep_cost_mean" => p.cost_mean,
             "constraints/raw_violations" => per_tick(t.raw_violations),
-            "constraints/target_violations" => per_tick(t.projected_violations),
+            "constraints/target_violations" => per_tick(t.target_violations),
             "constraints/recovering" => per_tick(t.recovering),
             REACHED => per_tick(t.reached_violations),
             "constraints/moved" => per_tick(t.moved),

@@ -253,7 +253,7 @@ impl Proposing {
             let verdict = foresight.update(env, &mut self.out.action);
             tally.ticks += 1;
             tally.raw_violations += u64::from(verdict != Verdict::Kept);
-            tally.projected_violations += u64::from(verdict == Verdict::Outside);
+            tally.target_violations += u64::from(verdict == Verdict::Outside);
             return env.step(&self.out.action);
         }
         env.observe(&mut self.state.obs);

@@ -6,7 +6,7 @@ use super::clearance::{Ahead, CREEP};
 use super::frame::check;
 use super::{Limit, quoted_names};
 use crate::geometry::{Placement, Shape};
-use crate::row::{Motion, Needs, Rows, RowsMut, Tick};
+use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{FrameId, Kind, LimitError, Model, Soft};
 use pairs::{Body, Pairs, Reach};
 use serde::{Deserialize, Serialize};
@@ -274,7 +274,7 @@ impl Rows for CollisionRows {
         Needs::default()
     }
 
-    fn fill(&mut self, tick: &mut Tick<'_>, rows: &mut RowsMut<'_>) {
+    fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (scale, period) = (1.0 / tick.period.dt, tick.period);
         self.pairs.begin(self.ahead.look_at_frames(tick.q, tick.v, 0.0));
         let kinematics = self.ahead.look(tick.q, tick.v, period.dt);

@@ -39,7 +39,7 @@ impl ActiveSet {
         good
     }
 
-    /// No other active set is optimal. Multipliers are judged by how far they move what they act on.
+    /// No other active set is optimal. Multipliers count by how far they move what they act on.
     pub(super) fn is_strict(&self, p: &Coupled) -> bool {
         let mut strict = self.factor.conditioning() > INDEPENDENT;
         for k in 0..p.n {

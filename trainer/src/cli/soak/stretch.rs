@@ -36,7 +36,7 @@ impl Stretch {
         let (run, c) = (&self.run, &self.run.counters);
         let states: u64 = run.modes.values().sum();
         let mut kept = json!({
-            "projected targets within limits": c.projected_violations == 0,
+            "projected targets within limits": c.target_violations == 0,
             "plant within limits": self.plant["violations"].as_object().is_some_and(|v| v.values().all(|n| n == 0)),
             "no allocation": run.usage.allocations == Some(0),
             "no page fault": (run.usage.minor_faults, run.usage.major_faults) == (0, 0),

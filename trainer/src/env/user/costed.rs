@@ -56,11 +56,11 @@ impl Env for Costed {
         self.inner.foresee(action, qpos, qvel)
     }
 
-    fn judge(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
-        // The state before is judged on its own first, so that what it began with can be remembered.
-        self.inner.judge(from, from, action)?;
+    fn score(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
+        // The state before is scored on its own first, so that what it began with can be remembered.
+        self.inner.score(from, from, action)?;
         self.before.remember(self.inner.sim());
-        let step = self.inner.judge(from, to, action)?;
+        let step = self.inner.score(from, to, action)?;
         Ok(self.with_cost(step, action))
     }
 

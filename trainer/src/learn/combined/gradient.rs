@@ -4,7 +4,7 @@
 use super::super::gaussian::{Gaussian, MOST_VECTORS, gather, inverse_sigma, likelihood_ratio, residuals};
 use super::super::inverse::{CLIP, InverseModel, gather_input};
 use super::super::optimise::{Group, Tile};
-use super::{Combined, CombinedWork};
+use super::{Combined, CombinedScratch};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars, scalars_mut};
 use std::ops::Range;
@@ -15,7 +15,7 @@ pub(in super::super) type ActorSums = [f32; 4];
 impl Combined {
     /// Output of the policy for the rows of the tile.
     #[inline(always)]
-    pub(in super::super) fn propose(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedWork) {
+    pub(in super::super) fn propose(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedScratch) {
         let n = self.dims.n_obs;
         gather(&mut w.obs, n.div_ceil(LANES), 0, &t.batch.obs, n, t.idx);
         self.policy.forward(&group.p, &w.obs, &mut w.policy);
@@ -28,7 +28,7 @@ impl Combined {
         &self,
         group: &Group,
         t: &Tile<'_>,
-        w: &mut CombinedWork,
+        w: &mut CombinedScratch,
         grad: &mut [V],
     ) -> ActorSums {
         self.propose(group, t, w);
@@ -45,7 +45,7 @@ impl Combined {
 
     /// From `dL / du` in `w.d_change` to the policy's parameters.
     #[inline(always)]
-    pub(in super::super) fn learn(&self, group: &Group, w: &mut CombinedWork, grad: &mut [V]) {
+    pub(in super::super) fn learn(&self, group: &Group, w: &mut CombinedScratch, grad: &mut [V]) {
         self.policy.backward(&group.transposed, &w.obs, &w.d_change, &mut w.policy, Some(grad), false);
     }
 
@@ -57,7 +57,7 @@ impl Combined {
         log_std: &Range<usize>,
         group: &Group,
         t: &Tile<'_>,
-        w: &mut CombinedWork,
+        w: &mut CombinedScratch,
         grad: &mut [V],
     ) -> ([f32; 3], f32) {
         let (d, a, s) = (&self.dims, self.dims.n_act, self.dims.n_state);
@@ -88,7 +88,7 @@ impl Combined {
     /// Input rows of the inverse model from the policy's current output, projected as when it was collected; returns how many
     /// entries were moved.
     #[inline(always)]
-    fn project_again(&self, t: &Tile<'_>, w: &mut CombinedWork) -> u32 {
+    fn project_again(&self, t: &Tile<'_>, w: &mut CombinedScratch) -> u32 {
         let (d, s, seen) = (&self.dims, self.dims.n_state, self.dims.seen_obs.len());
         let (xv, sv) = ((2 * seen).div_ceil(LANES), s.div_ceil(LANES));
         let Some(inv) = &mut w.inverse else { return 0 };
@@ -113,7 +113,7 @@ impl Combined {
 
     /// Passes the projected proposals of [`Combined::propose`] through the inverse model.
     #[inline(always)]
-    pub(in super::super) fn invert(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedWork) {
+    pub(in super::super) fn invert(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedScratch) {
         self.project_again(t, w);
         if let (Some((model, _)), Some(inv)) = (&self.inverse, &mut w.inverse) {
             model.net.forward(&group.p, &inv.input, &mut inv.tape);
@@ -122,7 +122,7 @@ impl Combined {
 
     /// Log probability of what was sampled, under the current networks.
     #[inline(always)]
-    fn log_prob_body(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedWork, out: &mut [f32]) {
+    fn log_prob_body(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedScratch, out: &mut [f32]) {
         let (d, s, a) = (&self.dims, self.dims.n_state, self.dims.n_act);
         self.propose(group, t, w);
         let mut constant = 0.0;
@@ -136,7 +136,7 @@ impl Combined {
         }
         log_prob.fill(V::splat(constant as f32));
         if let Some(pi) = &self.policy_log_std {
-            gather(&mut w.change, s.div_ceil(LANES), 0, &t.batch.proposal, s, t.idx);
+            gather(&mut w.change, s.div_ceil(LANES), 0, &t.batch.change, s, t.idx);
             residuals(&mut w.d_change, &w.change, w.policy.output(), &inverse[0][..pi.len()], log_prob);
         }
         if let Some((model, spread)) = &self.inverse {
@@ -144,7 +144,7 @@ impl Combined {
                 None => drop(self.project_again(t, w)),
                 Some(_) => {
                     let Some(inv) = &mut w.inverse else { return };
-                    gather_input(&mut inv.input, t.batch, &t.batch.target, t.idx, d);
+                    gather_input(&mut inv.input, t.batch, &t.batch.target_change, t.idx, d);
                 }
             }
             let (Some(inv), [log_prob, ..]) = (&mut w.inverse, &mut w.rows) else { return };
@@ -164,13 +164,13 @@ impl Combined {
         log_std: &Range<usize>,
         group: &Group,
         t: &Tile<'_>,
-        w: &mut CombinedWork,
+        w: &mut CombinedScratch,
         grad: &mut [V],
     ) -> [f32; 3] {
         let (d, s, a) = (&self.dims, self.dims.n_state, self.dims.n_act);
         let Some(inv) = &mut w.inverse else { unreachable!("made with the model") };
-        gather(&mut w.change, s.div_ceil(LANES), 0, &t.batch.proposal, s, t.idx);
-        gather_input(&mut inv.input, t.batch, &t.batch.target, t.idx, d);
+        gather(&mut w.change, s.div_ceil(LANES), 0, &t.batch.change, s, t.idx);
+        gather_input(&mut inv.input, t.batch, &t.batch.target_change, t.idx, d);
         gather(&mut inv.action, a.div_ceil(LANES), 0, &t.batch.sampled, a, t.idx);
         let mean = model.net.forward(&group.p, &inv.input, &mut inv.tape);
         let proposal = Gaussian {
@@ -194,11 +194,11 @@ impl Combined {
         pi: &Range<usize>,
         group: &Group,
         t: &Tile<'_>,
-        w: &mut CombinedWork,
+        w: &mut CombinedScratch,
         grad: &mut [V],
     ) -> [f32; 3] {
         let s = self.dims.n_state;
-        gather(&mut w.change, s.div_ceil(LANES), 0, &t.batch.proposal, s, t.idx);
+        gather(&mut w.change, s.div_ceil(LANES), 0, &t.batch.change, s, t.idx);
         let proposal = Gaussian {
             log_std: pi.clone(),
             n: s,
@@ -212,10 +212,10 @@ impl Combined {
 
 multiversion!(
     /// See [`Combined::log_prob_body`].
-    pub(super) fn log_prob(c: &Combined, group: &Group, t: &Tile<'_>, w: &mut CombinedWork, out: &mut [f32]) = body
+    pub(super) fn log_prob(c: &Combined, group: &Group, t: &Tile<'_>, w: &mut CombinedScratch, out: &mut [f32]) = body
 );
 
 #[inline(always)]
-fn body(c: &Combined, group: &Group, t: &Tile<'_>, w: &mut CombinedWork, out: &mut [f32]) {
+fn body(c: &Combined, group: &Group, t: &Tile<'_>, w: &mut CombinedScratch, out: &mut [f32]) {
     c.log_prob_body(group, t, w, out);
 }

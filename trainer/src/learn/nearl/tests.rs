@@ -35,7 +35,7 @@ fn learner(kind: Kind, activation: Activation) -> Nearl {
 fn gradient(l: &Nearl, batch: &Batch, phase: usize) -> Vec<V> {
     let mut grad = vec![ZERO; l.params.groups[l.nets.group(phase)].p.len() + 1];
     let idx: Vec<u32> = (0..batch.n as u32).collect();
-    l.nets.tile(phase, &l.params, tile(batch, &idx), &mut l.nets.work(), &mut grad);
+    l.nets.tile(phase, &l.params, tile(batch, &idx), &mut l.nets.scratch(), &mut grad);
     grad
 }
 
@@ -68,8 +68,8 @@ fn imitation_gradient_equals_central_differences() {
 /// `log pi(u | s) + log I(a | s_c, w)` of a row.
 fn log_prob(b: &Batch, i: usize, policy: &Net64, inverse: &Net64, log_std: &[Vec<f64>; 2]) -> f64 {
     let d = dims();
-    let input = inverse_input(b, i, &d, &row(&b.target, i, d.n_state));
-    log_normal(&row(&b.proposal, i, d.n_state), &policy.forward(&row(&b.obs, i, d.n_obs)), &log_std[0])
+    let input = inverse_input(b, i, &d, &row(&b.target_change, i, d.n_state));
+    log_normal(&row(&b.change, i, d.n_state), &policy.forward(&row(&b.obs, i, d.n_obs)), &log_std[0])
         + log_normal(&row(&b.sampled, i, d.n_act), &inverse.forward(&input), &log_std[1])
 }
 

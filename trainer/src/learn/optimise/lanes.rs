@@ -119,7 +119,7 @@ impl<P: Phases> Run<'_, P> {
         before: impl Fn(usize, &mut Params),
     ) -> Vec<PhaseReport> {
         let _watch = self.barrier.alarm.watch();
-        let mut work = self.algorithm.work();
+        let mut scratch = self.algorithm.scratch();
         let mut lane = Lane { index, lengths, sums: self.sums(params), reports: self.reports(), held: None };
         for (step, idx) in self.minibatches().enumerate() {
             before(step, params);
@@ -129,7 +129,7 @@ impl<P: Phases> Run<'_, P> {
                     lane.release(self, step, params);
                 }
                 let len = params.groups[self.group(k)].p.len() + 1;
-                self.shard(0, k, idx, advantage, params, &mut work, index, len);
+                self.shard(0, k, idx, advantage, params, &mut scratch, index, len);
                 self.gather(&mut lane.sums[k][..len], index);
                 if self.partner(k).is_some_and(|p| !mine.contains(&p)) {
                     let square = self.squared(k, &lane.sums[k], params);
@@ -218,7 +218,7 @@ mod tests {
         (bits, reports)
     }
 
-    /// A clip range below zero panics in the policy's lane; the judge's would wait for it forever.
+    /// A clip range below zero panics in the policy's lane; the discriminator's would wait for it forever.
     #[test]
     fn a_panic_in_one_lane_ends_the_other() {
         let (nets, ppo) =

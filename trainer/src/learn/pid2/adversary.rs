@@ -1,11 +1,11 @@
 //! The adversary of PID^2 (Eq. 2): reached transitions are real, proposed ones are not.
 
-use super::super::discriminator::{DiscriminatorWork, logit_slope, softplus_sum};
+use super::super::discriminator::{DiscriminatorScratch, logit_slope, softplus_sum};
 use super::super::gaussian::MOST_OUTPUTS;
 use super::super::gaussian::{copy, gather};
 use super::super::optimise::{Group, Params, TILE, Tile, add_sums};
 use super::fakes::within;
-use super::{COMBINED, JUDGE, Nets, Pass, Work};
+use super::{ADVERSARY, COMBINED, Nets, Pass, Scratch};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, scalars, scalars_mut};
 
@@ -22,10 +22,10 @@ pub(super) fn fool_discriminator(
     n: &Nets,
     params: &Params,
     t: &Tile<'_>,
-    w: &mut Work,
+    w: &mut Scratch,
     grad: &mut [V],
 ) -> f32 {
-    let judge = &params.groups[JUDGE];
+    let adversary = &params.groups[ADVERSARY];
     let (o, s) = (n.combined.dims.n_obs, n.combined.dims.n_state);
     let (xv, sv) = ((o + s).div_ceil(LANES), s.div_ceil(LANES));
     let d = &mut w.discriminator;
@@ -44,10 +44,10 @@ pub(super) fn fool_discriminator(
         }
         x[..s].iter_mut().for_each(|x| *x = within(*x));
     }
-    n.discriminator.forward(&judge.p, d);
+    n.discriminator.forward(&adversary.p, d);
     let loss = softplus_sum(&d.logit, 1.0);
     logit_slope(&mut d.logit, 1.0, n.settings.generator_weight * t.scale);
-    let dx = n.discriminator.backward(&judge.transposed, d, 0.0, None, true);
+    let dx = n.discriminator.backward(&adversary.transposed, d, 0.0, None, true);
     let rows = scalars_mut(&mut w.actor.d_change)
         .chunks_exact_mut(sv * LANES)
         .zip(scalars(dx).chunks_exact(sv * LANES));
@@ -76,16 +76,16 @@ pub(super) fn fool_discriminator(
 
 /// Real transitions against proposed ones through the bottleneck (Eq. 2).
 #[inline(always)]
-fn discriminator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) {
+fn discriminator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) {
     let (o, s) = (n.combined.dims.n_obs, n.combined.dims.n_state);
     let xv = (o + s).div_ceil(LANES);
-    let (group, d) = (&params.groups[JUDGE], &mut w.discriminator);
+    let (group, d) = (&params.groups[ADVERSARY], &mut w.discriminator);
     let (mut loss, mut kl, mut right) = (0.0, 0.0, 0.0);
     gather(&mut d.input, xv, s, &t.batch.obs, o, t.idx);
     for (real, sign) in [(true, 1.0), (false, -1.0)] {
         let (change, pass) = match real {
             true => (&t.batch.reached[..], Pass::Real),
-            false => (n.fakes.judged(t.batch), Pass::Proposed),
+            false => (n.fakes.shown(t.batch), Pass::Proposed),
         };
         gather(&mut d.input, xv, 0, change, s, t.idx);
         if !real {
@@ -113,7 +113,7 @@ const STEP: f32 = 0.05;
 /// Adds the gradient of `gamma |d D / d s'|^2 / 2` on the reached changes in `d` (Mescheder et al. 2018, R1): the slope of `v . d D / d s'`
 /// with `v` held is `(D'(s' + h v) - D'(s' - h v)) / 2 h`, with `D'` the gradient by the parameters.
 #[inline(always)]
-fn flatten(n: &Nets, group: &Group, t: &Tile<'_>, d: &mut DiscriminatorWork, grad: &mut [V]) {
+fn flatten(n: &Nets, group: &Group, t: &Tile<'_>, d: &mut DiscriminatorScratch, grad: &mut [V]) {
     let (o, s) = (n.combined.dims.n_obs, n.combined.dims.n_state);
     let (xv, sv) = ((o + s).div_ceil(LANES), s.div_ceil(LANES));
     n.discriminator.forward(&group.p, d);
@@ -142,5 +142,5 @@ fn flatten(n: &Nets, group: &Group, t: &Tile<'_>, d: &mut DiscriminatorWork, gra
 
 multiversion!(
     /// The discriminator's loss, its bottleneck included.
-    pub(super) fn judge(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Work, grad: &mut [V]) = discriminator_body
+    pub(super) fn discriminate(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) = discriminator_body
 );

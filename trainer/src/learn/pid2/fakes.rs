@@ -1,7 +1,7 @@
-//! What is judged beside the reached changes: proposals, with the noise that the reached ones have too.
+//! What the discriminator sees beside the reached changes: proposals, with the noise that the reached ones have too.
 //!
 //! What was reached is the mean that a proposal should be, plus what exploration and the plant add to it. A bare proposal can be
-//! told from that even where it is exactly right, so it is judged with the residual of another row,
+//! told from that even where it is exactly right, so it is shown with the residual of another row,
 //!
 //! ```text
 //! r = reached - (m + b u),    b = cov(reached, u) / var(u) within [0, 1]
@@ -25,13 +25,13 @@ use rand_distr::{Distribution, StandardNormal};
 #[derive(Default)]
 pub(super) struct Fakes {
     n_state: usize,
-    /// Residuals (n x n_state); empty where proposals are judged as they are.
+    /// Residuals (n x n_state); empty where proposals are shown as they are.
     residual: Vec<f32>,
     /// Standard normal noise of a stochastic proposal (n x n_state); empty where it is deterministic.
     normal: Vec<f32>,
     /// What the discriminator sees (n x n_state); empty: the batch's own proposals.
-    judged: Vec<f32>,
-    /// Rows between a proposal and the residual it is judged with: by the discriminator, by the policy.
+    shown: Vec<f32>,
+    /// Rows between a proposal and the residual it is shown with: in the pass of the discriminator, in that of the policy.
     shift: [usize; 2],
 }
 
@@ -45,7 +45,7 @@ impl Fakes {
         }
         if s.match_noise {
             fakes.residual = residuals(batch, n_state);
-            fakes.judged.clone_from(&batch.proposal);
+            fakes.shown.clone_from(&batch.change);
             fakes.disturb(batch.n, rng);
         }
         fakes
@@ -60,11 +60,11 @@ impl Fakes {
         threads: usize,
         rng: &mut ChaCha8Rng,
     ) {
-        combined.proposals(group, batch, threads, &mut self.judged);
+        combined.proposals(group, batch, threads, &mut self.shown);
         if let Some(spread) = &combined.policy_log_std {
             let spread: Vec<f32> =
                 scalars(&group.p[spread.clone()])[..self.n_state].iter().map(|l| l.exp()).collect();
-            for row in self.judged.chunks_exact_mut(self.n_state) {
+            for row in self.shown.chunks_exact_mut(self.n_state) {
                 for (u, spread) in row.iter_mut().zip(&spread) {
                     let z: f32 = StandardNormal.sample(&mut *rng);
                     *u += spread * z;
@@ -74,21 +74,21 @@ impl Fakes {
         self.disturb(batch.n, rng);
     }
 
-    /// Adds the residuals of other rows to what is judged.
+    /// Adds the residuals of other rows to what is shown.
     fn disturb(&mut self, n: usize, rng: &mut ChaCha8Rng) {
         if self.residual.is_empty() {
             return;
         }
         self.shift = std::array::from_fn(|_| rng.random_range(0..n));
         let (first, second) = self.residual.split_at(self.shift[0] * self.n_state);
-        for (u, r) in self.judged.iter_mut().zip(second.iter().chain(first)) {
+        for (u, r) in self.shown.iter_mut().zip(second.iter().chain(first)) {
             *u += r;
         }
     }
 
     /// What the discriminator sees.
-    pub(super) fn judged<'a>(&'a self, batch: &'a Batch) -> &'a [f32] {
-        if self.judged.is_empty() { &batch.proposal } else { &self.judged }
+    pub(super) fn shown<'a>(&'a self, batch: &'a Batch) -> &'a [f32] {
+        if self.shown.is_empty() { &batch.change } else { &self.shown }
     }
 
     /// Noise of a stochastic proposal of row `i`, for the policy against the discriminator.
@@ -97,7 +97,7 @@ impl Fakes {
         if self.normal.is_empty() { &[] } else { &self.normal[i * self.n_state..][..self.n_state] }
     }
 
-    /// The residual with which row `i` is judged for the policy.
+    /// The residual with which row `i` is shown in the pass of the policy.
     #[inline(always)]
     pub(super) fn residual(&self, i: usize) -> &[f32] {
         if self.residual.is_empty() {
@@ -108,7 +108,7 @@ impl Fakes {
     }
 }
 
-/// Within what is judged, as reached changes are.
+/// Within the range of what is shown, as reached changes are.
 #[inline(always)]
 pub(super) fn within(u: f32) -> f32 {
     u.clamp(-CLIP, CLIP)
@@ -121,16 +121,16 @@ fn residuals(batch: &Batch, n_state: usize) -> Vec<f32> {
     for k in 0..n_state {
         let rows = || (0..batch.n).map(|i| i * n_state + k);
         let mean = |x: &[f32]| rows().map(|at| f64::from(x[at])).sum::<f64>() / n;
-        let (u, r) = (mean(&batch.proposal), mean(&batch.reached));
+        let (u, r) = (mean(&batch.change), mean(&batch.reached));
         let (mut both, mut own) = (0.0, 0.0);
         for at in rows() {
-            let d = f64::from(batch.proposal[at]) - u;
+            let d = f64::from(batch.change[at]) - u;
             both += d * (f64::from(batch.reached[at]) - r);
             own += d * d;
         }
         let b = if own > 0.0 { (both / own).clamp(0.0, 1.0) } else { 0.0 };
         for at in rows() {
-            out[at] = (f64::from(batch.reached[at]) - r - b * (f64::from(batch.proposal[at]) - u)) as f32;
+            out[at] = (f64::from(batch.reached[at]) - r - b * (f64::from(batch.change[at]) - u)) as f32;
         }
     }
     out

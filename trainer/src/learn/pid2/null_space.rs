@@ -5,7 +5,7 @@
 //! Jacobian `J = d I(s_c, w_c) / d u` of the row; its columns are zero where the projection clamped.
 
 use super::super::Dims;
-use super::super::inverse::{InverseModel, InverseWork};
+use super::super::inverse::{InverseModel, InverseScratch};
 use super::super::optimise::{Group, TILE};
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars, scalars_mut};
 
@@ -63,7 +63,7 @@ impl NullSpace {
         d: &Dims,
         model: &InverseModel,
         group: &Group,
-        inverse: &mut InverseWork,
+        inverse: &mut InverseScratch,
         u: &[V],
         dx: &[V],
         du: &mut [V],

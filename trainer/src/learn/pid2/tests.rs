@@ -40,7 +40,7 @@ fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2,
     spread(&mut l.params.groups[COMBINED].p, &actor);
     spread(&mut l.params.groups[CRITIC].p, &[&c.value.net]);
     let (encoder, decoder) = l.nets.discriminator.nets();
-    spread(&mut l.params.groups[JUDGE].p, &[encoder, decoder]);
+    spread(&mut l.params.groups[ADVERSARY].p, &[encoder, decoder]);
     for phase in [ACTOR, VALUE, DISCRIMINATOR] {
         l.nets.refresh(phase, &mut l.params);
     }
@@ -56,13 +56,13 @@ fn gradient(l: &Pid2, batch: &Batch, phase: usize) -> (Vec<V>, [f32; SUMS]) {
     let len = l.params.groups[l.nets.group(phase)].p.len();
     let mut grad = vec![ZERO; len + 1];
     let idx: Vec<u32> = (0..batch.n as u32).collect();
-    l.nets.tile(phase, &l.params, tile(batch, &idx), &mut l.nets.work(), &mut grad);
+    l.nets.tile(phase, &l.params, tile(batch, &idx), &mut l.nets.scratch(), &mut grad);
     let sums = grad[len].0;
     (grad, sums)
 }
 
 /// Discriminator on `[change, obs]` with given latent noise: logit and KL.
-fn judge(enc: &Net64, dec: &Net64, x: &[f64], noise: &[f64], bottleneck: bool) -> (f64, f64) {
+fn discriminate(enc: &Net64, dec: &Net64, x: &[f64], noise: &[f64], bottleneck: bool) -> (f64, f64) {
     let code = enc.forward(x);
     let (mut z, mut kl) = (vec![0.0; LATENT], 0.0);
     for j in 0..LATENT {
@@ -90,7 +90,7 @@ struct Nets64 {
 }
 
 fn nets64(l: &Pid2) -> Nets64 {
-    let [a, v, d] = [COMBINED, CRITIC, JUDGE].map(|group| &l.params.groups[group].p);
+    let [a, v, d] = [COMBINED, CRITIC, ADVERSARY].map(|group| &l.params.groups[group].p);
     let (enc, dec) = l.nets.discriminator.nets();
     let of = |dense: &Dense| Net64::of(dense, enc.mlp.activation);
     Nets64 {
@@ -115,17 +115,17 @@ fn actor_loss(l: &Pid2, b: &Batch, n: &Nets64) -> f64 {
                 let mean = inverse.forward(&inverse_input(b, i, &d, &w));
                 log_normal(&row(&b.sampled, i, d.n_act), &mean, &n.log_std)
             }
-            None => log_normal(&row(&b.proposal, i, d.n_state), &u, &n.log_std),
+            None => log_normal(&row(&b.change, i, d.n_state), &u, &n.log_std),
         };
         let e = n.value.forward(&obs)[0] - f64::from(b.returns[i]);
-        // a stochastic proposal is judged as it is sampled: the loss reaches its spread
-        let judged = |(k, u): (usize, &f64)| match l.nets.fakes.normal(i) {
+        // a stochastic proposal is shown as it is sampled: the loss reaches its spread
+        let shown = |(k, u): (usize, &f64)| match l.nets.fakes.normal(i) {
             [] => *u,
             z => u + n.log_std[k].exp() * f64::from(z[k]),
         };
-        let x = [u.iter().enumerate().map(judged).collect(), obs].concat();
+        let x = [u.iter().enumerate().map(shown).collect(), obs].concat();
         let noise = noise(l, Pass::Generator, i);
-        let (logit, _) = judge(&n.enc, &n.dec, &x, &noise, true);
+        let (logit, _) = discriminate(&n.enc, &n.dec, &x, &noise, true);
         reference::surrogate(b, i, log_prob, 0.2) + 0.5 * e * e + 0.7 * softplus(-logit)
     };
     (0..b.n).map(one).sum::<f64>() / b.n as f64
@@ -213,7 +213,7 @@ fn the_gradient_penalty_is_the_slope_of_the_squared_slope() {
                 let at = |x: f64| {
                     let mut change = change.clone();
                     change[k] += x;
-                    judge(enc, dec, &[change, obs.clone()].concat(), &noise(&l, Pass::Real, i), true).0
+                    discriminate(enc, dec, &[change, obs.clone()].concat(), &noise(&l, Pass::Real, i), true).0
                 };
                 (at(1e-4) - at(-1e-4)) / 2e-4
             };
@@ -252,7 +252,7 @@ fn right_proposals_cannot_be_told_from_what_was_reached() {
             for i in 0..b.n {
                 let z: [f32; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut rng));
                 for k in 0..d.n_state {
-                    b.proposal[i * d.n_state + k] = 0.8 * b.obs[i * d.n_obs + k];
+                    b.change[i * d.n_state + k] = 0.8 * b.obs[i * d.n_obs + k];
                     let noise = [
                         0.5 * z[0],
                         0.5 * z[1],
@@ -260,11 +260,15 @@ fn right_proposals_cannot_be_told_from_what_was_reached() {
                         0.4 * z[0] - 0.2 * z[1],
                         -0.5 * z[1],
                     ][k];
-                    b.reached[i * d.n_state + k] = b.proposal[i * d.n_state + k] + noise;
+                    b.reached[i * d.n_state + k] = b.change[i * d.n_state + k] + noise;
                 }
             }
             let metrics = l.update(&mut b, Pace::default(), &mut rng);
-            last = metrics.iter().find(|(name, _)| *name == "discriminator/accuracy").expect("judged").1;
+            last = metrics
+                .iter()
+                .find(|(name, _)| *name == "discriminator/accuracy")
+                .expect("a discriminator")
+                .1;
         }
         last
     };
@@ -304,8 +308,8 @@ fn renewed_fakes_are_the_proposals_of_the_current_policy() {
     l.nets.fakes.renew(&l.nets.combined, &l.params.groups[COMBINED], &b, 1, &mut rng);
     for i in 0..b.n {
         let u = n.policy.forward(&row(&b.obs, i, d.n_obs));
-        let judged = row(l.nets.fakes.judged(&b), i, d.n_state);
-        assert!(u.iter().zip(&judged).all(|(u, j)| (u - j).abs() < 1e-4), "row {i}: {u:?} {judged:?}");
+        let shown = row(l.nets.fakes.shown(&b), i, d.n_state);
+        assert!(u.iter().zip(&shown).all(|(u, j)| (u - j).abs() < 1e-4), "row {i}: {u:?} {shown:?}");
     }
 }
 
@@ -319,9 +323,9 @@ fn discriminator_gradients_equal_central_differences() {
             let one = |i: usize| {
                 let obs = row(&b.obs, i, d.n_obs);
                 let real = [row(&b.reached, i, d.n_state), obs.clone()].concat();
-                let fake = [row(&b.proposal, i, d.n_state), obs].concat();
-                let (lr, kr) = judge(enc, dec, &real, &noise(&l, Pass::Real, i), bottleneck);
-                let (lf, kf) = judge(enc, dec, &fake, &noise(&l, Pass::Proposed, i), bottleneck);
+                let fake = [row(&b.change, i, d.n_state), obs].concat();
+                let (lr, kr) = discriminate(enc, dec, &real, &noise(&l, Pass::Real, i), bottleneck);
+                let (lf, kf) = discriminate(enc, dec, &fake, &noise(&l, Pass::Proposed, i), bottleneck);
                 softplus(-lr) + softplus(lf) + 0.2 * 0.5 * (kr + kf)
             };
             (0..b.n).map(one).sum::<f64>() / b.n as f64
@@ -354,7 +358,7 @@ fn inverse_gradient_equals_central_differences() {
 
 /// `dL / du` of the policy, row by row, and the proposals.
 fn slopes(l: &Pid2, b: &Batch) -> (Vec<V>, Vec<V>) {
-    let (mut w, idx) = (l.nets.work(), (0..b.n as u32).collect::<Vec<_>>());
+    let (mut w, idx) = (l.nets.scratch(), (0..b.n as u32).collect::<Vec<_>>());
     let mut grad = vec![ZERO; l.params.groups[COMBINED].p.len() + 1];
     l.nets.tile(ACTOR, &l.params, tile(b, &idx), &mut w, &mut grad);
     (w.actor.d_change, w.actor.policy.output().to_vec())

@@ -24,7 +24,7 @@ fn gradients(activation: Activation) {
     let idx: Vec<u32> = (0..b.n as u32).collect();
     let gradient = |phase: usize| {
         let mut grad = vec![ZERO; l.params.groups[phase].p.len() + 1];
-        l.nets.tile(phase, &l.params, tile(&b, &idx), &mut l.nets.work(), &mut grad);
+        l.nets.tile(phase, &l.params, tile(&b, &idx), &mut l.nets.scratch(), &mut grad);
         grad
     };
     let (grad, value_grad) = (gradient(ACTOR), gradient(VALUE));
@@ -157,7 +157,7 @@ fn the_clipped_value_loss_equals_central_differences() {
     let (b, d) = (batch(&dims(), TILE, 3), dims());
     let idx: Vec<u32> = (0..b.n as u32).collect();
     let mut grad = vec![ZERO; l.params.groups[VALUE].p.len() + 1];
-    l.nets.tile(VALUE, &l.params, tile(&b, &idx), &mut l.nets.work(), &mut grad);
+    l.nets.tile(VALUE, &l.params, tile(&b, &idx), &mut l.nets.scratch(), &mut grad);
     let value = Net64::of(&l.nets.value.net.mlp.to_dense(&l.params.groups[VALUE].p), Activation::Tanh);
     let error = |net: &Net64, i: usize| {
         let (v, r) = (net.forward(&row(&b.obs, i, d.n_obs))[0], f64::from(b.returns[i]));

@@ -16,7 +16,7 @@ use nearl_runtime::link::{SnapshotBytes, Verdict};
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
 
-pub(super) struct Desk {
+pub(super) struct Dispatcher {
     jobs: BTreeMap<u64, Job>,
     /// Answers that end a request at once, and wait for room.
     refusals: Vec<Refusal>,
@@ -35,13 +35,17 @@ pub(super) struct Desk {
     report: Report,
 }
 
-impl Desk {
-    pub(super) fn new(snapshot: &Snapshot, settings: &Settings, layout: Layout) -> Result<Desk, ServeError> {
+impl Dispatcher {
+    pub(super) fn new(
+        snapshot: &Snapshot,
+        settings: &Settings,
+        layout: Layout,
+    ) -> Result<Dispatcher, ServeError> {
         let (manifest, width) = (&snapshot.manifest, layout.width());
         if width > MAX_CHUNK {
             return Err(ServeError::Wide { task: manifest.task.name.clone(), width });
         }
-        Ok(Desk {
+        Ok(Dispatcher {
             jobs: BTreeMap::new(),
             refusals: Vec::new(),
             turns: Turns::new(),
@@ -224,7 +228,7 @@ impl Desk {
         }
     }
 
-    /// Takes a simulated chunk; [`Desk::attend`] sends it and queues the request again.
+    /// Takes a simulated chunk; [`Dispatcher::attend`] sends it and queues the request again.
     pub(super) fn take_back(&mut self, outcome: Outcome) {
         let Outcome { slot, place, rows, result } = outcome;
         let Some(job) = self.jobs.get_mut(&slot).filter(|j| j.stage == Stage::Running) else {
