@@ -25,7 +25,7 @@ use nearl_runtime::controller::{Parts, seen_entries};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
-use setup::{check_minibatch, check_outputs, check_reward, learner, policy_kind};
+use setup::{check_experience, check_minibatch, check_outputs, check_reward, learner, policy_kind};
 use std::time::Instant;
 
 /// Why a training could not start or go on.
@@ -153,6 +153,7 @@ impl Training {
             seen_state: seen,
         };
         check_outputs(&manifest.task.name, &dims)?;
+        check_experience(&settings, experience)?;
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);

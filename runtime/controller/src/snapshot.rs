@@ -18,6 +18,8 @@ use std::path::{Path, PathBuf};
 
 /// Version of the file format.
 pub const FORMAT: u32 = 2;
+/// Version that a file says whose networks have a linear part beside their layers: programs that know [`FORMAT`] alone would leave it out.
+const FORMAT_WITH_SKIP: u32 = 3;
 /// Larger files are refused before they are read, in [byte].
 pub const MAX_BYTES: u64 = 256 << 20;
 const KEY: &str = "nearl";
@@ -319,8 +321,9 @@ impl Snapshot {
                 (t.name.clone(), view.unwrap_or_else(|e| unreachable!("tensor '{}': {e}", t.name)))
             })
             .collect();
-        let manifest =
-            serde_json::to_string(&self.manifest).unwrap_or_else(|e| unreachable!("manifest: {e}"));
+        let format = if self.networks.have_skip() { FORMAT_WITH_SKIP } else { self.manifest.format };
+        let manifest = Manifest { format, ..self.manifest.clone() };
+        let manifest = serde_json::to_string(&manifest).unwrap_or_else(|e| unreachable!("manifest: {e}"));
         let parsed = views.iter().map(|(n, v)| (n.as_str(), v.shape(), v.data()));
         let header = format!("{}\n{manifest}", digest(&manifest, parsed));
         safetensors::serialize(views, Some([(KEY.to_string(), header)].into_iter().collect()))
@@ -362,6 +365,9 @@ impl Snapshot {
             return Err(foreign(format!("an action range from {lower} to {upper}")));
         }
         let networks = Networks::read(&views, manifest.policy)?;
+        if let Some((name, _)) = views.iter().find(|(name, _)| !Networks::knows(name)) {
+            return Err(foreign(format!("a tensor '{name}' that this program does not know")));
+        }
         let (said, layers) = (manifest.functions.len(), networks.policy.layers.len());
         if said != 0 && said != layers {
             return Err(foreign(format!("functions after {said} layers of a policy that has {layers}")));
@@ -404,6 +410,23 @@ fn f64s(name: &str, values: &[f64]) -> Tensor {
 }
 
 impl Networks {
+    fn have_skip(&self) -> bool {
+        self.policy.skip.is_some() || self.idm.as_ref().is_some_and(|(dense, _)| dense.skip.is_some())
+    }
+
+    /// Whether a tensor of this name is one of a snapshot.
+    fn knows(name: &str) -> bool {
+        let (net, rest) = name.split_once('.').unwrap_or((name, ""));
+        match net {
+            "normaliser" => ["mean", "std", "scale", "lower", "upper"].contains(&rest),
+            "policy" | "idm" => {
+                let layer = rest.strip_suffix(".weight").or_else(|| rest.strip_suffix(".bias"));
+                ["skip", "log_std"].contains(&rest) || layer.is_some_and(|i| i.parse::<usize>().is_ok())
+            }
+            _ => false,
+        }
+    }
+
     fn tensors(&self) -> Vec<Tensor> {
         let mut out = vec![
             f64s("normaliser.mean", &self.normaliser.mean),

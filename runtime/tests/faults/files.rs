@@ -105,6 +105,19 @@ fn fault_09_every_tensor_that_is_missing_or_of_another_type_or_shape_is_refused_
 }
 
 #[test]
+fn a_tensor_that_no_snapshot_has_is_refused_by_name() {
+    let good = bytes();
+    for name in ["idm.gate", "policy.0.scale", "critic.0.weight"] {
+        let file = rewritten(&good, |tensors, _| {
+            tensors.push((name.into(), Dtype::F32, vec![1], 1_f32.to_le_bytes().to_vec()));
+        });
+        let (code, text) = code(&file);
+        assert_eq!(code, "snapshot-foreign", "{name}: {text}");
+        assert!(text.contains(&format!("a tensor '{name}'")), "{text}");
+    }
+}
+
+#[test]
 fn fault_11_every_number_that_is_none_or_far_too_large_is_refused_with_its_place() {
     let good = bytes();
     let names: Vec<String> =

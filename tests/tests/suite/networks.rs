@@ -89,6 +89,33 @@ fn an_unknown_activation_is_refused_and_an_absent_one_is_tanh() {
     assert_eq!(old.networks, t.snapshot().networks);
 }
 
+/// The format of a file, as its manifest says.
+fn format_of(snapshot: &Snapshot) -> u64 {
+    let bytes = snapshot.to_bytes();
+    let header: serde_json::Value =
+        serde_json::from_slice(&bytes[8..8 + bytes_head(&bytes)]).expect("header");
+    let text = header["__metadata__"]["nearl"].as_str().expect("text");
+    let manifest = text.split_once('\n').expect("digest and manifest").1;
+    serde_json::from_str::<serde_json::Value>(manifest).expect("manifest")["format"].as_u64().expect("format")
+}
+
+/// A program that knows format 2 alone reads no linear part beside the layers: it has to refuse the file.
+#[test]
+fn a_linear_part_beside_the_layers_is_of_a_later_format() {
+    let nets = ["train.nets.idm=[8]", "train.nets.idm_residual=true"];
+    let plain = training("HalfCheetah-v5", "pid2-ib", 0, 1, &nets[..1]);
+    let beside = training("HalfCheetah-v5", "pid2-ib", 0, 1, &nets);
+    assert_eq!((format_of(plain.snapshot()), format_of(beside.snapshot())), (2, 3));
+    let loaded = Snapshot::from_bytes(&beside.snapshot().to_bytes()).expect("loads");
+    assert_eq!(loaded.networks, beside.snapshot().networks);
+    assert!(loaded.networks.idm.as_ref().is_some_and(|(net, _)| net.skip.is_some()));
+    assert_eq!(loaded.to_bytes(), beside.snapshot().to_bytes());
+    let earlier = with_manifest(beside.snapshot(), "\"format\":3", "\"format\":2").expect("written before");
+    assert_eq!(earlier.networks, loaded.networks);
+    let later = with_manifest(beside.snapshot(), "\"format\":3", "\"format\":4").expect_err("unknown");
+    assert!(later.to_string().contains("format 4 where this program reads 1 to 3"), "{later}");
+}
+
 #[test]
 fn a_manifest_that_no_task_file_could_give_is_refused() {
     let t = training("Panda-reach", "pid2-ib", 0, 1, &[]);

@@ -1,8 +1,11 @@
 //! What changes over a run: rates, limits that come in, statistics, evaluations and kept snapshots on the way.
 
 use nearl_runtime::Snapshot;
+use nearl_runtime::link::RobotName;
 use nearl_tests::{request, training};
-use nearl_trainer::train::{COLUMNS, Progress, Request, Training, train};
+use nearl_trainer::train::{COLUMNS, Experience, Progress, Request, Training, train};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 const SHORT: [&str; 4] =
     ["train.n_envs=4", "train.n_steps=64", "train.ppo.batch_size=64", "train.ppo.n_epochs=2"];
@@ -43,6 +46,22 @@ fn limits_come_in_environment_by_environment() {
     assert_eq!(moved[0], 0.0, "none at first");
     assert!(moved[1] > 0.0 && moved[1] < 0.5 * all[1], "one of four: {} beside {}", moved[1], all[1]);
     assert!(moved[4] > 0.8 * all[4], "all at the end: {} beside {}", moved[4], all[4]);
+}
+
+/// Limits come in environment by environment: where the environments are another process's, the setting is refused by name.
+#[test]
+fn limits_that_come_in_are_refused_where_environments_are_elsewhere() {
+    let name = || RobotName::new("nobody").expect("name");
+    let stop = || Arc::new(AtomicBool::new(false));
+    let elsewhere = [Experience::Loop(name(), stop()), Experience::Served(name(), stop())];
+    for (experience, way) in elsewhere.iter().zip(["--from", "--collect"]) {
+        let asked = request("HalfCheetah-v5", "pid2-ib", 0, 1, &["train.limits_in=0.3"]);
+        let refused = Training::on(&asked, experience).map(|_| ()).expect_err("refused").to_string();
+        assert!(refused.contains("[train.limits_in]: 0.3") && refused.contains(way), "{refused}");
+    }
+    let asked = request("HalfCheetah-v5", "pid2-ib", 0, 1, &["train.project_in_training=false"]);
+    let refused = Training::on(&asked, &elsewhere[0]).map(|_| ()).expect_err("refused").to_string();
+    assert!(refused.contains("[train.project_in_training]"), "{refused}");
 }
 
 /// A joint with position and velocity that belong together: the pair is refused, and where the gradient passes straight through,

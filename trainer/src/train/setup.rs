@@ -1,6 +1,6 @@
 //! From a manifest and its settings to what is trained.
 
-use super::TrainError;
+use super::{Experience, TrainError};
 use crate::env::Env;
 use crate::learn::{Algorithm, Dims, Gradient, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Ppo};
 use crate::rollout::RolloutError;
@@ -160,6 +160,28 @@ pub(super) fn check_outputs(task: &str, dims: &Dims) -> Result<(), TrainError> {
             "'{task}' has {n} {what}, and {MOST_OUTPUTS} can be learned; name fewer under state.propose"
         ))),
     }
+}
+
+/// Settings that environments of this process alone can follow.
+pub(super) fn check_experience(settings: &TrainSettings, experience: &Experience) -> Result<(), TrainError> {
+    let (source, next) = match experience {
+        Experience::Here => return Ok(()),
+        Experience::Loop(name, _) => (format!("the loop of '{name}'"), "--from"),
+        Experience::Served(name, _) => (format!("the rollout server '{name}'"), "--collect"),
+    };
+    if settings.limits_in > 0.0 {
+        return Err(TrainError::Settings(format!(
+            "[train.limits_in]: {} asks for limits that come in one environment after another, and {source} projects in all of them; set it to 0, \
+             or train without {next}",
+            settings.limits_in
+        )));
+    }
+    if !settings.project_in_training && matches!(experience, Experience::Loop(..)) {
+        return Err(TrainError::Settings(format!(
+            "[train.project_in_training]: {source} projects every target of a robot; set it to true, or train without {next}"
+        )));
+    }
+    Ok(())
 }
 
 pub(super) fn check_minibatch(minibatch: usize, batch: usize) -> Result<(), TrainError> {

@@ -1,6 +1,6 @@
 //! The manifest of a file of this format or of the first, which carried the robot as the text of its file.
 
-use super::{FORMAT, Manifest, ModelFormat};
+use super::{FORMAT, FORMAT_WITH_SKIP, Manifest, ModelFormat};
 use nearl_constraints::Model;
 use serde_json::{Map, Value};
 
@@ -17,8 +17,11 @@ pub(super) fn read(text: &str) -> Result<Manifest, String> {
     let version: Version = serde_json::from_str(text).map_err(words)?;
     match version.format {
         FORMAT => serde_json::from_str(text).map_err(words),
+        FORMAT_WITH_SKIP => {
+            serde_json::from_str(text).map(|m| Manifest { format: FORMAT, ..m }).map_err(words)
+        }
         1 => translate(serde_json::from_str(text).map_err(words)?),
-        other => Err(format!("format {other} where this program reads {FORMAT}")),
+        other => Err(format!("format {other} where this program reads 1 to {FORMAT_WITH_SKIP}")),
     }
 }
 
