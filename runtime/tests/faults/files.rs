@@ -78,8 +78,12 @@ fn fault_09_every_tensor_that_is_missing_or_of_another_type_or_shape_is_refused_
         });
         for file in [missing, renamed] {
             let (code, text) = code(&file);
-            // A layer that is gone leaves a network of another shape.
-            assert!(["snapshot-missing-tensor", "snapshot-shape"].contains(&code), "{name}: {text}");
+            // A layer that is gone leaves a network of another shape, a layer by another name one that nobody reads.
+            let unread = code == "snapshot-foreign" && text.contains(&format!("'{name}x'"));
+            assert!(
+                unread || ["snapshot-missing-tensor", "snapshot-shape"].contains(&code),
+                "{name}: {text}"
+            );
         }
         let typed = rewritten(&good, |tensors, _| {
             let at = place(tensors);
@@ -107,7 +111,7 @@ fn fault_09_every_tensor_that_is_missing_or_of_another_type_or_shape_is_refused_
 #[test]
 fn a_tensor_that_no_snapshot_has_is_refused_by_name() {
     let good = bytes();
-    for name in ["idm.gate", "policy.0.scale", "critic.0.weight"] {
+    for name in ["policy.gate", "policy.0.scale", "critic.0.weight"] {
         let file = rewritten(&good, |tensors, _| {
             tensors.push((name.into(), Dtype::F32, vec![1], 1_f32.to_le_bytes().to_vec()));
         });
