@@ -60,15 +60,21 @@ fn a_killed_runtime_trips_the_watchdog_and_its_successor_takes_over() {
     let body = PointMass { q: 1.0, v: 1.0, ..PointMass::default() };
     let plant = PlantThread::start(&name, body, PlantSettings::real_time(DT));
     let mut viewer = TrainerLink::open(&name.0).unwrap();
-    for kills in 1..=3 {
-        let mut runtime = start("runtime", &name);
-        until(|| viewer.state().is_some_and(|s| s.v()[0] != 0.0));
+    for _ in 0..3 {
+        let (mut runtime, mut tripped) = (start("runtime", &name), 0);
+        // A loop that waits for a core trips it too: only what comes after the kill counts.
+        until(|| {
+            viewer.state().is_some_and(|s| {
+                tripped = s.watchdog;
+                s.v()[0] != 0.0
+            })
+        });
         runtime.kill().unwrap();
         runtime.wait().unwrap();
-        until(|| viewer.state().is_some_and(|s| s.watchdog == kills && s.v()[0] == 0.0));
+        until(|| viewer.state().is_some_and(|s| s.watchdog > tripped && s.v()[0] == 0.0));
     }
     let (_, report) = plant.end();
-    assert_eq!(report.watchdog, 3);
+    assert!(report.watchdog >= 3, "{report:?}");
 }
 
 #[test]
