@@ -68,6 +68,7 @@ pub fn with_core(fuzz: impl FnOnce(&dyn Fn(&[u8]))) {
         ramp: 50,
         modes: ModeLimits::default(),
         explore: Some(3),
+        proposer: None,
     };
     let core = Core::new(settings, Box::new(Loaded { id: 0, controller }), 0, FaultPlan::default());
     let core = std::cell::RefCell::new((core, 0_u64));
@@ -82,7 +83,13 @@ pub fn with_core(fuzz: impl FnOnce(&dyn Fn(&[u8]))) {
             state.header = Header { schema: 0, epoch: 1, seq: *tick, stamp: *tick * 1_000_000 };
         }
         core.swap(false);
-        core.update(&Inputs { due: 0, begin: *tick * 1_000_000 + 10_000, stop: false, fresh: Some(&state) });
+        core.update(&Inputs {
+            due: 0,
+            begin: *tick * 1_000_000 + 10_000,
+            stop: false,
+            fresh: Some(&state),
+            proposal: None,
+        });
         core.close(*tick * 1_000_000 + 50_000);
         let record = &core.record;
         let action = &record.output.action[..record.output.nu as usize];

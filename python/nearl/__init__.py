@@ -42,6 +42,7 @@ from nearl.importers import import_onnx, import_sb3, import_torch
 from nearl.link import Link
 from nearl.pid2 import PID2
 from nearl.plant import Loop, Plant
+from nearl.proposer import Proposer, blank
 
 __all__ = [
     "AccelerationLimit",
@@ -62,6 +63,7 @@ __all__ = [
     "Policy",
     "PositionLimit",
     "Projector",
+    "Proposer",
     "RowLimit",
     "Target",
     "Targets",
@@ -72,6 +74,7 @@ __all__ = [
     "VelocityProfileLimit",
     "__version__",
     "algorithms",
+    "blank",
     "import_onnx",
     "import_sb3",
     "import_torch",

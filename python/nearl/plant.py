@@ -109,6 +109,8 @@ class Loop:
         patience: How long to wait for the plant [s].
         ramp: Time over which the first motion is let in [s].
         priority: SCHED_FIFO priority, with memory locked.
+        proposal_age: Another process proposes (:class:`nearl.Proposer`) in place of the policy; age at which a proposal is only held [s].
+        proposal_hold: So long is it held before the loop brakes [s].
     """
 
     def __init__(
@@ -121,9 +123,21 @@ class Loop:
         patience: float = 5.0,
         ramp: float = 0.2,
         priority: int | None = None,
+        proposal_age: float | None = None,
+        proposal_hold: float = 0.1,
     ) -> None:
         self.report: dict[str, Any] | None = None
-        self._thread = _core.LoopThread(snapshot, name, seconds=seconds, log=log, patience=patience, ramp=ramp, priority=priority)
+        self._thread = _core.LoopThread(
+            snapshot,
+            name,
+            seconds=seconds,
+            log=log,
+            patience=patience,
+            ramp=ramp,
+            priority=priority,
+            proposal_age=proposal_age,
+            proposal_hold=proposal_hold,
+        )
 
     @property
     def running(self) -> bool:

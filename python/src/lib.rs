@@ -15,6 +15,7 @@ mod nearest;
 mod plant;
 mod policy;
 mod projector;
+mod proposer;
 mod target;
 mod training;
 mod vec_env;
@@ -41,6 +42,8 @@ mod _core {
     use super::policy::Policy;
     #[pymodule_export]
     use super::projector::Projector;
+    #[pymodule_export]
+    use super::proposer::{ProposerClient, blank};
     #[pymodule_export]
     use super::target::{Ledger, Target, Targets};
     #[pymodule_export]

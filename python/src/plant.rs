@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use nearl_runtime::link::{Exchange, LinkError, Robot, RobotName, STATE_RESET, Turn};
-use nearl_runtime::rt::{RunError, RunReport, RunSettings, Stop, ThreadSettings, run};
+use nearl_runtime::rt::{ProposerSettings, RunError, RunReport, RunSettings, Stop, ThreadSettings, run};
 use numpy::PyArray1;
 use pyo3::exceptions::{PyConnectionError, PyRuntimeError};
 use pyo3::prelude::*;
@@ -132,7 +132,8 @@ pub(crate) struct LoopThread {
 impl LoopThread {
     /// Starts the loop of a snapshot on the plant `name`.
     #[new]
-    #[pyo3(signature = (snapshot, name, *, seconds=None, log=None, patience=5.0, ramp=0.2, priority=None))]
+    #[pyo3(signature = (snapshot, name, *, seconds=None, log=None, patience=5.0, ramp=0.2, priority=None, proposal_age=None,
+                        proposal_hold=0.1))]
     fn new(
         snapshot: PathBuf,
         name: &str,
@@ -141,10 +142,22 @@ impl LoopThread {
         patience: f64,
         ramp: f64,
         priority: Option<i32>,
+        proposal_age: Option<f64>,
+        proposal_hold: f64,
     ) -> PyResult<LoopThread> {
+        for (what, value) in [("proposal_age", proposal_age.unwrap_or(1.0)), ("proposal_hold", proposal_hold)]
+        {
+            if !(0.0..=1e6).contains(&value) {
+                return Err(errors::value(format!("{what} is {value} s; give 0 to 1e6 seconds")));
+            }
+        }
+        let nanoseconds = |s: f64| (s * 1e9) as u64;
+        let proposer = proposal_age
+            .map(|age| ProposerSettings { age_limit: nanoseconds(age), hold: nanoseconds(proposal_hold) });
         let name = RobotName::new(name).map_err(errors::value)?;
         let thread = ThreadSettings { priority, cpu: None, lock_memory: priority.is_some() };
-        let settings = RunSettings { seconds, log, patience, ramp, thread, ..RunSettings::default() };
+        let settings =
+            RunSettings { seconds, log, patience, ramp, thread, proposer, ..RunSettings::default() };
         let stop = Stop::new();
         let running = std::thread::Builder::new().name("nearl-loop".into()).spawn({
             let stop = stop.clone();

@@ -6,11 +6,13 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
+use crate::clock::nanoseconds;
 use crate::codes::{self, Explanation};
 use crate::link::{RobotName, bench_round_trip};
 use crate::log::replay;
 use crate::rt::{
-    FaultPlan, PRIORITY, Percentiles, Reason, RunSettings, Stop, ThreadSettings, bench_wake, run,
+    FaultPlan, PRIORITY, Percentiles, ProposerSettings, Reason, RunSettings, Stop, ThreadSettings,
+    bench_wake, run,
 };
 pub use limits::LimitOptions;
 
@@ -46,6 +48,15 @@ pub struct RunCommand {
     /// Explore: act with the policy's own noise, drawn from this seed, for a trainer that learns from the loop. Every limit still holds.
     #[arg(long, value_name = "SEED")]
     pub explore: Option<u64>,
+    /// States or actions come from another process (`nearl.Proposer`), in place of the snapshot's policy.
+    #[arg(long, conflicts_with = "explore")]
+    pub proposer: bool,
+    /// Age at which a proposal of that process is only held, counted from the state it answers [s].
+    #[arg(long, value_parser = seconds, default_value_t = 0.1)]
+    pub proposal_age: f64,
+    /// So long is its last proposal held before the loop brakes [s].
+    #[arg(long, value_parser = seconds, default_value_t = 0.1)]
+    pub proposal_hold: f64,
     /// The limits of this loop, in place of its first snapshot's: a task file, or any TOML file with a section [constraints]. No
     /// snapshot may loosen them, the first included.
     #[arg(long = "limits", value_name = "FILE", conflicts_with = "allow_looser")]
@@ -211,6 +222,10 @@ impl RunCommand {
             modes,
             rollback,
             explore: self.explore,
+            proposer: self.proposer.then(|| ProposerSettings {
+                age_limit: nanoseconds(self.proposal_age),
+                hold: nanoseconds(self.proposal_hold),
+            }),
             age_limit: self.age_limit,
             plant_patience: self.plant_patience,
             ramp: self.ramp,

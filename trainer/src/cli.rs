@@ -2,6 +2,7 @@
 
 mod bench;
 mod bench_serve;
+mod blank;
 mod demo;
 mod demos;
 mod eval;
@@ -48,6 +49,8 @@ enum Command {
     Import(import::Import),
     /// Write a snapshot's policy as an ONNX file.
     Export(export::Export),
+    /// Write a task as a snapshot without a policy, for a process that proposes in its place.
+    Blank(blank::Blank),
     /// Run episodes without noise, raw and projected.
     Eval(eval::Eval),
     /// Plant and runtime as two processes, a hot swap, and the report.
@@ -90,6 +93,7 @@ impl Cli {
             Command::Sweep(c) => c.run(),
             Command::Import(c) => c.run(),
             Command::Export(c) => c.run(),
+            Command::Blank(c) => c.run(),
             Command::Eval(c) => c.run(),
             Command::Demo(c) => c.run(),
             Command::Demos(c) => c.run(),

@@ -3,6 +3,7 @@
 //! [`train`] is the loop of every algorithm; [`learn::pid2`] is the paper's.
 
 pub mod allocations;
+pub mod blank;
 pub mod checkpoint;
 pub mod cli;
 pub mod demos;

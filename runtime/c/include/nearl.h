@@ -54,6 +54,33 @@ int nearl_plant_exchange(nearl_plant *plant, const nearl_state *state, double pa
 /* Leaves; the loop sees that the plant is gone. NULL is allowed. */
 void nearl_plant_close(nearl_plant *plant);
 
+/* ---- proposer ---------------------------------------------------------------------------------------------------- */
+
+/* A process that proposes in place of the policy of `nearl run SNAPSHOT --plant NAME --proposer`, at its own rate. */
+typedef struct nearl_proposer nearl_proposer;
+
+/* Waits at most `patience` seconds for the loop of `name`; NULL and a sentence where there is none, or it has a proposer. */
+nearl_proposer *nearl_proposer_open(const char *name, double patience, char *error, size_t error_size);
+
+/* How many entries a proposal has. */
+size_t nearl_proposer_entries(const nearl_proposer *proposer);
+
+/* Name of the k-th: "q.JOINT", "v.JOINT" of a state, "JOINT" of an action. It lasts as long as the handle; NULL beyond the end. */
+const char *nearl_proposer_entry(const nearl_proposer *proposer, size_t k);
+
+/* 1 where a proposal is an action, 0 where it is a state to be reached; below 0 for NULL. */
+int nearl_proposer_is_action(const nearl_proposer *proposer);
+
+/* The newest state that was not read before, waiting at most `patience` seconds: 1, or 0 where none came. What is proposed next answers it.
+ * Each array has the robot's length, or length 0 where it is not wanted; any other is refused, below 0. */
+int nearl_proposer_state(nearl_proposer *proposer, double patience, double *q, size_t nq, double *v, size_t nv, double *obs, size_t n_obs);
+
+/* Proposes n values in the order of the entries: 0, or below 0 where their number is another one. */
+int nearl_proposer_propose(nearl_proposer *proposer, const double *values, size_t n);
+
+/* Leaves: the loop holds the last proposal for a while, then brakes. NULL is allowed. */
+void nearl_proposer_close(nearl_proposer *proposer);
+
 /* ---- controller -------------------------------------------------------------------------------------------------- */
 
 typedef struct nearl_controller nearl_controller;

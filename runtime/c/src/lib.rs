@@ -4,6 +4,7 @@
 
 mod controller;
 mod plant;
+mod proposer;
 
 use std::ffi::{CStr, c_char, c_int};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -13,6 +14,10 @@ pub use controller::{
     nearl_controller_sizes, nearl_controller_update, nearl_status_name,
 };
 pub use plant::{RobotIn, StateIn, nearl_plant_close, nearl_plant_exchange, nearl_plant_open};
+pub use proposer::{
+    nearl_proposer_close, nearl_proposer_entries, nearl_proposer_entry, nearl_proposer_is_action,
+    nearl_proposer_open, nearl_proposer_propose, nearl_proposer_state,
+};
 
 /// What a call with a null pointer, or one that panicked, returns.
 const REFUSED: c_int = -1;

@@ -5,15 +5,16 @@
 mod driver;
 
 use nearl_runtime::constraints::Model;
-use nearl_runtime::link::RobotName;
+use nearl_runtime::link::{Exchange, Robot, RobotName, Turn};
 use nearl_runtime::net::{Activation, Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
-use nearl_runtime::rt::{RunReport, RunSettings, Stop, ThreadSettings, run};
+use nearl_runtime::rt::{ProposerSettings, RunReport, RunSettings, Stop, ThreadSettings, run};
 use nearl_runtime::snapshot::FORMAT;
 
 use nearl_runtime::{Manifest, Networks, PolicyKind, Snapshot, Task};
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 
 const URDF: &str = r#"<robot name="carriage"><link name="rail"/><link name="carriage"><inertial><mass value="2"/>
 <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -98,6 +99,14 @@ fn numbers(text: &[u8]) -> Vec<f64> {
 
 /// A driver of so many ticks against a loop that runs until the driver has had enough.
 fn against_a_loop(test: &str, driver: impl FnOnce(&str, u64) -> Vec<f64>) -> (Vec<f64>, RunReport) {
+    against(test, RunSettings::default(), driver)
+}
+
+fn against(
+    test: &str,
+    settings: RunSettings,
+    driver: impl FnOnce(&str, u64) -> Vec<f64>,
+) -> (Vec<f64>, RunReport) {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("carriage.safetensors");
     snapshot().save(&file).expect("saves");
@@ -106,7 +115,7 @@ fn against_a_loop(test: &str, driver: impl FnOnce(&str, u64) -> Vec<f64>) -> (Ve
     let running = {
         let (name, stop) = (name.clone(), stop.clone());
         let thread = ThreadSettings { priority: None, cpu: None, lock_memory: false };
-        let settings = RunSettings { patience: 30.0, ramp: 0.0, thread, ..RunSettings::default() };
+        let settings = RunSettings { patience: 30.0, ramp: 0.0, thread, ..settings };
         std::thread::spawn(move || run(&settings, &file, &name, &stop))
     };
     let found = driver(&name.to_string(), 3000);
@@ -147,6 +156,66 @@ fn a_driver_in_rust_obeys_the_limits() {
     obeys(&found, &report);
 }
 
+/// The carriage of the examples, which waits at rest until somebody proposes: ticks acted, how far and how fast it went [m, m/s].
+fn patient_carriage(name: &str, ticks: u64) -> Vec<f64> {
+    let robot = Robot {
+        joints: vec!["slide".into()],
+        observation: vec!["q.slide".into(), "v.slide".into()],
+        limits: 0,
+        stated: None,
+        nq: 1,
+        nv: 1,
+        nu: 1,
+        dt: 0.001,
+        lockstep: true,
+    };
+    let mut plant = Exchange::open(&RobotName::new(name).expect("a name"), &robot, 0.02).expect("a plant");
+    let (mut q, mut v, mut acted, mut farthest, mut fastest) = (0.0_f64, 0.0_f64, 0, 0.0_f64, 0.0_f64);
+    let end = Instant::now() + Duration::from_secs(60);
+    while acted < ticks && Instant::now() < end {
+        let state = plant.state();
+        (state.nq, state.nv, state.nu, state.n_obs) = (1, 1, 1, 2);
+        (state.q[0], state.v[0], state.obs[0], state.obs[1], state.time) = (q, v, q, v, acted as f64 * 0.001);
+        let force = match plant.tick(0.3) {
+            Turn::Act(action) => (action[0], acted += 1).0,
+            Turn::Hold(action) => action[0],
+            Turn::Brake => {
+                std::thread::sleep(Duration::from_millis(1));
+                -2.0 * v / 0.001
+            }
+        };
+        v += 0.001 * force.clamp(-40.0, 40.0) / 2.0;
+        q += 0.001 * v;
+        (farthest, fastest) = (farthest.max(q.abs()), fastest.max(v.abs()));
+    }
+    vec![acted as f64, farthest, fastest]
+}
+
+/// The driver in Rust, the loop, and a process in C that proposes in place of its policy.
+#[test]
+fn a_proposer_in_c_is_kept_within_the_limits() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let program = compile("cc", "proposer.c", "-std=c11", folder.path());
+    // Generous: a machine with other work may leave the process out for long.
+    let proposer = Some(ProposerSettings { age_limit: 500_000_000, hold: 500_000_000 });
+    let settings = RunSettings { proposer, ..RunSettings::default() };
+    let (found, report) = against("proposer", settings, |name, ticks| {
+        let child =
+            Command::new(program).args([name, "1000000"]).stdout(Stdio::piped()).spawn().expect("runs");
+        let found = patient_carriage(name, ticks);
+        let done = child.wait_with_output().expect("ends");
+        assert!(numbers(&done.stdout)[0] > 50.0, "{done:?}");
+        found
+    });
+    let c = &report.counters;
+    assert!(c.proposals > 50 && c.refused_proposals == 0, "{report}");
+    assert!(c.raw_violations > 100 && c.target_violations == 0, "{report}");
+    let [acted, farthest, fastest] = found[..] else { panic!("{found:?}") };
+    assert_eq!(acted, 3000.0);
+    assert!(farthest > 0.25 && farthest <= 0.4 + 1e-6, "{farthest} m");
+    assert!(fastest > 0.5 && fastest <= 0.8 + 1e-6, "{fastest} m/s");
+}
+
 #[test]
 fn a_controller_in_cpp_obeys_the_limits_and_refuses_by_sentence() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -178,7 +247,8 @@ fn the_header_names_exactly_what_is_defined() {
         starts.filter(|rest| rest[name(rest).len()..].starts_with('(')).map(name).collect()
     };
     let header = names(&read("include/nearl.h"), "nearl_");
-    let defined: String = ["src/lib.rs", "src/plant.rs", "src/controller.rs"].map(read).concat();
+    let defined: String =
+        ["src/lib.rs", "src/plant.rs", "src/proposer.rs", "src/controller.rs"].map(read).concat();
     assert_eq!(header, names(&defined, "extern \"C\" fn nearl_"));
     assert!(header.len() >= 10, "{header:?}");
 }

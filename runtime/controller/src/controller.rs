@@ -12,6 +12,7 @@
 
 mod drive_box;
 mod foreign;
+mod given;
 mod guard;
 mod maths;
 mod noise;
@@ -26,6 +27,7 @@ use crate::snapshot::{Networks, PolicyKind, Snapshot, SnapshotError};
 use crate::task::IdmKind;
 use drive_box::DriveBox;
 use foreign::Foreign;
+use given::Given;
 use guard::Guard;
 use maths::{hermite, sample};
 use nearl_constraints::{
@@ -144,6 +146,9 @@ pub struct Controller {
     idx_q: Vec<usize>,
     halves: Vec<(usize, Half)>,
     tick: usize,
+    /// Tick in which the first policy period of this rhythm began.
+    begun: usize,
+    given: Given,
     version: u64,
     mean: Vec<f32>,
     held: State,
@@ -208,6 +213,8 @@ impl Controller {
             idx_q: idx_q(&model),
             halves: halves(&layout),
             tick: 0,
+            begun: 0,
+            given: Given::new(if kind == PolicyKind::Direct { n_act } else { layout.n_state() }),
             version: m.version,
             mean: vec![0.0; layout.n_state().max(n_act)],
             held: rest.clone(),
@@ -260,11 +267,18 @@ impl Controller {
 
     /// The policy's next state: `proposal_k = s_k + scale_k u_k`, with `u = pi(x) (+ sigma noise)`.
     fn propose(&mut self, noise: &Noise, out: &mut Output) {
-        out.policy_tick = self.tick.is_multiple_of(self.policy_every);
+        if self.given.is_new() {
+            self.begun = self.tick;
+        }
+        out.policy_tick = self.begins_period();
         if !out.policy_tick {
             return;
         }
         self.foreign.see(&self.held, self.tick as f64 * self.dt, &self.normaliser, &mut out.x);
+        if self.given.is_set() {
+            self.propose_given(out);
+            return;
+        }
         let mean = self.policy.forward(&out.x);
         self.mean[..mean.len()].copy_from_slice(mean);
         out.log_prob_proposal = 0.0;
@@ -355,7 +369,7 @@ impl Controller {
     /// policy tick to the proposed state, `tick % policy_every + 1` control periods along.
     fn interpolate(&mut self) {
         let k = self.policy_every;
-        let j = self.tick % k + 1;
+        let j = (self.tick - self.begun) % k + 1;
         if j == k {
             self.proposal.q.copy_from_slice(&self.goal.q);
             self.proposal.v.copy_from_slice(&self.goal.v);
@@ -442,7 +456,8 @@ impl Controller {
 
     /// Starts a new episode: the next tick is a policy tick.
     pub fn reset(&mut self) {
-        self.tick = 0;
+        (self.tick, self.begun) = (0, 0);
+        self.given.forget();
         self.foreign.reset();
         self.projector().forget();
         if let Some(drives) = &mut self.drive_box {
@@ -452,7 +467,7 @@ impl Controller {
 
     /// Whether the policy runs in the next tick.
     pub fn begins_period(&self) -> bool {
-        self.tick.is_multiple_of(self.policy_every)
+        (self.tick - self.begun).is_multiple_of(self.policy_every)
     }
 
     /// What the next policy tick depends on beside its arguments, as plain numbers; see [`Projector::memory`].

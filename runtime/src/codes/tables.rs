@@ -13,7 +13,9 @@ codes! {
             "Start `nearl plant TASK --name NAME` first, or correct --plant.";
         NoRuntime = "link-no-runtime", "No runtime of this name answers on this machine.",
             "Start `nearl run SNAPSHOT --plant NAME` first.";
-        Taken = "link-taken", "The robot already has a plant, runtime or trainer.",
+        NoQuestion = "link-no-question", "No loop of this name asks for proposals.",
+            "Start `nearl run SNAPSHOT --plant NAME --proposer` first.";
+        Taken = "link-taken", "The robot already has a plant, runtime, trainer or proposer.",
             "Stop that process first, or use another name.";
         Full = "link-full", "There is no free place for another reader.", "Close a viewer or log reader.";
         Schema = "link-schema", "The other end was built with another message layout.",

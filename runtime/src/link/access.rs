@@ -51,6 +51,7 @@ slices!(StateMessage {
     applied, applied_mut: applied[nu];
 });
 slices!(ActionMessage { action, action_mut: action[nu]; });
+slices!(ProposalMessage { values, values_mut: values[n]; });
 slices!(TransitionMessage {
     q, q_mut: q[nq];
     v, v_mut: v[nv];
@@ -82,27 +83,50 @@ impl ActionMessage {
     }
 }
 
+/// The names of a list, each of which is followed by a line break.
+fn read_names(bytes: &[u8]) -> Vec<String> {
+    let end = bytes.iter().rposition(|&b| b == b'\n').unwrap_or(0);
+    let text = String::from_utf8_lossy(&bytes[..end]);
+    if text.is_empty() { Vec::new() } else { text.split('\n').map(str::to_owned).collect() }
+}
+
+/// Writes as many names as there is room for.
+fn write_names<S: AsRef<str>>(names: &[S], bytes: &mut [u8]) {
+    bytes.fill(0);
+    let mut at = 0;
+    for name in names.iter().map(AsRef::as_ref) {
+        if at + name.len() + 1 > bytes.len() {
+            break;
+        }
+        bytes[at..at + name.len()].copy_from_slice(name.as_bytes());
+        bytes[at + name.len()] = b'\n';
+        at += name.len() + 1;
+    }
+}
+
+impl AskedMessage {
+    /// Names of what is asked for, in order; those beyond the capacity are missing (the hash covers all).
+    pub fn entries(&self) -> Vec<String> {
+        read_names(&self.names)
+    }
+
+    /// Writes the names, their number and their hash.
+    pub fn set_entries<S: AsRef<str>>(&mut self, names: &[S]) {
+        (self.n, self.hash) = (names.len() as u32, super::hash_names(names));
+        write_names(names, &mut self.names);
+    }
+}
+
 impl RobotMessage {
     /// Joint names in order; those beyond the capacity are missing (the hash covers all).
     pub fn joint_names(&self) -> Vec<String> {
-        let end = self.names.iter().rposition(|&b| b == b'\n').unwrap_or(0);
-        let text = String::from_utf8_lossy(&self.names[..end]);
-        if text.is_empty() { Vec::new() } else { text.split('\n').map(str::to_owned).collect() }
+        read_names(&self.names)
     }
 
     /// Writes the joint names and their hash.
     pub fn set_joint_names<S: AsRef<str>>(&mut self, names: &[S]) {
         self.joints = super::hash_names(names);
-        self.names = [0; MAX_NAMES];
-        let mut at = 0;
-        for name in names.iter().map(AsRef::as_ref) {
-            if at + name.len() + 1 > MAX_NAMES {
-                break;
-            }
-            self.names[at..at + name.len()].copy_from_slice(name.as_bytes());
-            self.names[at + name.len()] = b'\n';
-            at += name.len() + 1;
-        }
+        write_names(names, &mut self.names);
     }
 
     /// Writes the limits of the joints, as many as a message holds.

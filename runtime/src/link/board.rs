@@ -221,6 +221,13 @@ impl<M: Message + Arrays> BoardReader<M> {
     }
 }
 
+impl<M: Message + Arrays> BoardReader<M> {
+    /// The message read last; all numbers zero before the first.
+    pub(crate) fn last(&self) -> &M {
+        &self.message
+    }
+}
+
 /// Copies the entries in use; the others stay zero.
 #[inline]
 fn copy<M: Message + Arrays>(place: &[AtomicU64], message: &mut M) {

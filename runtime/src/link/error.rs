@@ -34,12 +34,15 @@ pub enum LinkError {
     /// Nobody runs the loop.
     #[error("no runtime for `{0}` answers on this machine: start `nearl run SNAPSHOT --plant {0}` first")]
     NoRuntime(RobotName),
+    /// The loop there is asks nobody for proposals, or there is none.
+    #[error("no loop of `{0}` asks for proposals: start `nearl run SNAPSHOT --plant {0} --proposer` first")]
+    NoQuestion(RobotName),
     /// The single owner of a topic exists already.
     #[error("robot `{name}` already has a {role}: stop that process first, or use another --name")]
     Taken {
         /// Robot.
         name: RobotName,
-        /// `plant`, `runtime` or `trainer`.
+        /// `plant`, `runtime`, `trainer` or `proposer`.
         role: &'static str,
     },
     /// Too many readers.
@@ -122,6 +125,7 @@ impl LinkError {
             Self::Capacity { .. } => LinkCode::Capacity,
             Self::NoPlant(_) => LinkCode::NoPlant,
             Self::NoRuntime(_) => LinkCode::NoRuntime,
+            Self::NoQuestion(_) => LinkCode::NoQuestion,
             Self::Taken { .. } => LinkCode::Taken,
             Self::Full { .. } => LinkCode::Full,
             Self::Schema { .. } => LinkCode::Schema,

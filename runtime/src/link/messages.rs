@@ -10,6 +10,8 @@
 //! | `snapshot` | trainer -> runtime | bytes with [`SnapshotHeader`] |
 //! | `receipt` | runtime -> trainer | [`ReceiptMessage`] |
 //! | `health` | runtime -> anyone | [`HealthMessage`] |
+//! | `proposal` | proposer -> runtime, the newest alone | [`ProposalMessage`] |
+//! | `asked` | runtime -> proposer | [`AskedMessage`] |
 
 use super::schema::message;
 
@@ -19,6 +21,8 @@ pub const MAX_JOINTS: usize = 64;
 pub const MAX_OBS: usize = 128;
 /// Capacity of the joint name list in [`RobotMessage`] [bytes].
 pub const MAX_NAMES: usize = 2048;
+/// Capacity of the list of names in an [`AskedMessage`] [bytes].
+pub const MAX_ASKED: usize = 4096;
 /// Capacity of the text in a [`ReceiptMessage`] [bytes].
 pub const MAX_TEXT: usize = 256;
 
@@ -32,6 +36,11 @@ pub const STATE_TRUNCATED: u32 = 4;
 pub const ROBOT_LOCKSTEP: u32 = 1;
 /// The plant states its limits by number; infinite is none.
 pub const ROBOT_LIMITS: u32 = 2;
+
+/// What is proposed: entries of the state.
+pub const PROPOSES_STATES: u32 = 0;
+/// What is proposed: commands of the joints.
+pub const PROPOSES_ACTIONS: u32 = 1;
 
 /// Limits that a plant may measure, by their place in a [`TallyMessage`].
 pub const METERS: [&str; 4] = ["position", "velocity", "acceleration", "torque"];
@@ -288,6 +297,62 @@ message! {
         length: u32,
         /// One sentence.
         text: [u8; MAX_TEXT],
+    }
+}
+
+message! {
+    /// What a process beside the loop proposes in place of its policy.
+    ProposalMessage, "proposal", version 1 {
+        /// `header.epoch` of the state it was computed from.
+        state_epoch: u64,
+        /// `header.seq` of that state.
+        state_seq: u64,
+        /// `header.stamp` of that state [ns]: its age counts from there.
+        state_stamp: u64,
+        /// [`hash_names`](crate::link::hash_names) of what is proposed, in order.
+        names: u64,
+        /// `PROPOSES_*`.
+        kind: u32,
+        /// Entries used in `values`.
+        n: u32,
+        /// The proposal.
+        values: [f64; MAX_OBS],
+    }
+}
+
+message! {
+    /// What a loop asks of its proposer, and what has become of the proposals so far; about ten times a second.
+    AskedMessage, "asked", version 1, beside ProposalMessage, buffer 1, history 1, subscribers 8 {
+        /// `PROPOSES_*`.
+        kind: u32,
+        /// Number of entries.
+        n: u32,
+        /// Hash of their names in order.
+        hash: u64,
+        /// Control period [s].
+        dt: f64,
+        /// Control ticks in which a proposed state is to be reached.
+        policy_every: u64,
+        /// Age of a proposal from which on it is held [s].
+        age_limit: f64,
+        /// So long is it held before the loop brakes [s].
+        hold: f64,
+        /// Proposals taken.
+        taken: u64,
+        /// Proposals that a newer one overtook before the loop read them.
+        overtaken: u64,
+        /// Proposals refused: of other names or sizes, of another episode, with numbers that are not finite.
+        refused: u64,
+        /// Ticks that acted on a proposal older than the age limit.
+        held: u64,
+        /// Ticks without a usable proposal.
+        silent: u64,
+        /// [`crate::rt::Mode`] as a number.
+        mode: u32,
+        /// Fills the line.
+        reserved: u32,
+        /// Names of what is asked for, each followed by a line break, as UTF-8, zero padded.
+        names: [u8; MAX_ASKED],
     }
 }
 

@@ -18,6 +18,9 @@ pub struct RuntimeLink {
     transition: Outbox<TransitionMessage>,
     receipt: Outbox<ReceiptMessage>,
     health: Outbox<HealthMessage>,
+    proposal: BoardReader<ProposalMessage>,
+    /// Made where proposals are asked for.
+    asked: Option<Outbox<AskedMessage>>,
     _owner: Owner,
     bus: Bus,
 }
@@ -33,6 +36,8 @@ impl RuntimeLink {
             receipt: bus.outbox()?,
             health: bus.outbox()?,
             state: BoardReader::open(name),
+            proposal: BoardReader::open(name),
+            asked: None,
             robot: bus.inbox()?,
             tally: bus.inbox()?,
             snapshots: Some(bus.bytes_inbox()?),
@@ -85,6 +90,26 @@ impl RuntimeLink {
     /// The snapshots, for a thread of its own; `None` if they were taken before.
     pub fn take_snapshots(&mut self) -> Option<SnapshotReader> {
         self.snapshots.take()
+    }
+
+    /// Opens the topic on which proposals are asked for.
+    ///
+    /// # Errors
+    /// [`LinkError`] of the transport.
+    pub fn ask(&mut self) -> Result<(), LinkError> {
+        self.asked = Some(self.bus.outbox()?);
+        self.bus.reserve()
+    }
+
+    /// Says what is asked for, and looks for a proposer that came; false where [`RuntimeLink::ask`] was not called or nothing was sent.
+    pub fn send_asked(&mut self, message: &mut AskedMessage) -> bool {
+        self.proposal.attend();
+        self.asked.as_mut().is_some_and(|asked| asked.send(message))
+    }
+
+    /// The newest proposal, if it was not read before.
+    pub fn newest_proposal(&mut self) -> Option<&ProposalMessage> {
+        self.proposal.newest()
     }
 
     /// Sends the action of a tick.

@@ -197,7 +197,9 @@ impl<B: Build> Replayer<B> {
         }
         core.swap(json.swapped);
         let fresh = (json.fresh || json.ignored).then_some(&state);
-        core.update(&Inputs { due: core.due(), begin: json.begin_ns, stop: json.stop, fresh });
+        let proposal = json.proposal().ok_or_else(|| format!("the proposal of tick {at} is too long"))?;
+        let proposal = proposal.as_ref();
+        core.update(&Inputs { due: core.due(), begin: json.begin_ns, stop: json.stop, fresh, proposal });
         core.close(json.end_ns);
         // What only the loop's threads know: how long the projection took, and what found a ring full.
         let record = &mut core.record;

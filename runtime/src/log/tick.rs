@@ -7,7 +7,7 @@ use std::borrow::Cow;
 use nearl_constraints::Kind;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::link::{Message, StateMessage};
+use crate::link::{Message, ProposalMessage, StateMessage};
 use crate::rt::{Counters, Mode, Reason, Record, Row, Sensed};
 
 /// Version of the tick messages; replay reads this one only.
@@ -21,6 +21,7 @@ pub(crate) const SCHEMA: &str = r#"{
     "mode": {"type": "string"}, "reason": {"type": "string"}, "policy_version": {"type": "integer"}, "snapshot": {"type": "integer"},
     "fresh": {"type": "boolean"}, "ignored": {"type": "boolean"}, "swapped": {"type": "boolean"}, "stop": {"type": "boolean"},
     "sensed": {"type": "string"}, "ramp": {"type": "number"}, "noise": {"type": ["number", "null"]},
+    "proposed": {"type": ["object", "null"]}, "proposal_age_ns": {"type": ["integer", "null"]},
     "state": {"type": "object", "properties": {
       "epoch": {"type": "integer"}, "seq": {"type": "integer"}, "stamp_ns": {"type": "integer"}, "tick": {"type": "integer"}, "time": {"type": "number"},
       "episode": {"type": "integer"}, "episode_tick": {"type": "integer"}, "bits": {"type": "integer"}, "saturated": {"type": "integer"},
@@ -90,6 +91,12 @@ pub(crate) struct TickJson<'a> {
     ramp: f64,
     #[serde(deserialize_with = "single")]
     noise: f32,
+    /// What another process proposed, in the tick in which it came.
+    #[serde(default)]
+    proposed: Option<ProposedJson<'a>>,
+    /// Age of the proposal acted upon.
+    #[serde(default)]
+    proposal_age_ns: Option<u64>,
     state: StateJson<'a>,
     proposal_q: Numbers<'a>,
     proposal_v: Numbers<'a>,
@@ -105,6 +112,20 @@ pub(crate) struct TickJson<'a> {
     overruns: u64,
     stale: u64,
     lost_states: u64,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ProposedJson<'a> {
+    epoch: u64,
+    seq: u64,
+    stamp_ns: u64,
+    state_epoch: u64,
+    state_seq: u64,
+    state_stamp_ns: u64,
+    kind: u32,
+    names: u64,
+    values: Numbers<'a>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -185,6 +206,8 @@ fn tick(record: &Record) -> TickJson<'_> {
         sensed: record.sensed,
         ramp: record.ramp,
         noise: record.noise,
+        proposed: record.heard.then(|| proposed_json(&record.proposal)),
+        proposal_age_ns: Some(record.proposal_age).filter(|age| *age != u64::MAX),
         state: state_json(state),
         proposal_q: output.proposal_q[..nq].into(),
         proposal_v: output.proposal_v[..nv].into(),
@@ -198,6 +221,20 @@ fn tick(record: &Record) -> TickJson<'_> {
         overruns: counters.overruns,
         stale: counters.stale,
         lost_states: counters.lost_states,
+    }
+}
+
+fn proposed_json(proposal: &ProposalMessage) -> ProposedJson<'_> {
+    ProposedJson {
+        epoch: proposal.header.epoch,
+        seq: proposal.header.seq,
+        stamp_ns: proposal.header.stamp,
+        state_epoch: proposal.state_epoch,
+        state_seq: proposal.state_seq,
+        state_stamp_ns: proposal.state_stamp,
+        kind: proposal.kind,
+        names: proposal.names,
+        values: proposal.values().into(),
     }
 }
 
@@ -249,6 +286,21 @@ impl TickJson<'_> {
     /// Time of the projection [ns]: measured, so replay takes it over.
     pub(crate) fn duration(&self) -> u64 {
         self.ledger.duration_ns
+    }
+
+    /// The proposal that came in the tick, if one did; `None` if it is longer than a message holds.
+    pub(crate) fn proposal(&self) -> Option<Option<ProposalMessage>> {
+        let Some(json) = &self.proposed else { return Some(None) };
+        let mut proposal = ProposalMessage::zeroed();
+        let header = &mut proposal.header;
+        (header.epoch, header.seq, header.stamp) = (json.epoch, json.seq, json.stamp_ns);
+        (proposal.state_epoch, proposal.state_seq) = (json.state_epoch, json.state_seq);
+        proposal.state_stamp = json.state_stamp_ns;
+        (proposal.kind, proposal.names) = (json.kind, json.names);
+        let values = &json.values.0;
+        proposal.values.get_mut(..values.len())?.copy_from_slice(values);
+        proposal.n = u32::try_from(values.len()).ok()?;
+        Some(Some(proposal))
     }
 
     /// The state of the tick; `None` if a vector is longer than a message holds.

@@ -12,9 +12,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::codes::LedgerStatus;
 use crate::grid::Grid;
-use crate::link::{Message, StateMessage};
+use crate::link::{Message, ProposalMessage, StateMessage};
 use crate::rt::Sync;
 use crate::rt::faults::FaultPlan;
+use crate::rt::heard::Heard;
 use crate::rt::mode::{Event, Mode, ModeLimits, Modes, Reason};
 use crate::rt::tick::{LoopController, Outcome, Record, Sensed, TickOutput};
 
@@ -41,6 +42,19 @@ pub struct CoreSettings {
     /// Seed of the exploration noise; without one there is none.
     #[serde(default)]
     pub explore: Option<u64>,
+    /// What counts as a proposal of another process, in place of the policy's; without it the policy proposes.
+    #[serde(default)]
+    pub proposer: Option<ProposerSettings>,
+}
+
+/// How long a proposal of another process counts [ns].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ProposerSettings {
+    /// A proposal whose state is older than this is held.
+    pub age_limit: u64,
+    /// So long is it held, in Degraded, before the loop brakes.
+    pub hold: u64,
 }
 
 /// What the world brought to a tick: with the history, everything it depends on.
@@ -54,6 +68,8 @@ pub struct Inputs<'a> {
     pub stop: bool,
     /// The newest state, if one came.
     pub fresh: Option<&'a StateMessage>,
+    /// The newest proposal of another process, if one came.
+    pub proposal: Option<&'a ProposalMessage>,
 }
 
 /// A controller and the number of its snapshot.
@@ -76,6 +92,8 @@ pub struct Core<T: LoopController> {
     faults: FaultPlan,
     /// The state acted upon: the measured one, or a prediction.
     estimate: StateMessage,
+    /// What another process proposed.
+    heard: Heard,
     /// What the controller saved in the tick before, for the one swapped in after it.
     memory: Vec<f64>,
     /// States predicted in a row; none can be before the first was measured.
@@ -98,6 +116,7 @@ impl<T: LoopController> Core<T> {
             grid: Grid::new(start, settings.period),
             record: Record::new(),
             estimate: StateMessage::zeroed(),
+            heard: Heard::new(),
             held: None,
             braked: 0,
             ramped: 0,
@@ -140,6 +159,7 @@ impl<T: LoopController> Core<T> {
         if swapped {
             self.controller.controller.reset();
             self.controller.controller.load_memory(&self.memory);
+            self.heard.repeat(&mut self.controller.controller);
             self.brake_broken = false;
             self.record.counters.swaps += 1;
         }
@@ -156,7 +176,8 @@ impl<T: LoopController> Core<T> {
             record.due = inputs.due;
         }
         let event = self.sense(inputs.fresh);
-        self.record.mode = self.modes.update(event, self.overran, inputs.stop);
+        let told = self.listen(event, inputs);
+        self.record.mode = self.modes.update(told, self.overran, inputs.stop);
         self.record.sensed = match event {
             Event::Good if self.held == Some(0) => Sensed::Measured,
             Event::Good => Sensed::Predicted,
@@ -190,6 +211,27 @@ impl<T: LoopController> Core<T> {
             record.counters.unprojected += u64::from(is_unprojected);
         }
         record.counters.mode_ticks[record.mode.code() as usize] += 1;
+    }
+
+    /// What a tick is worth whose state was worth `event`, with the proposal it has to act on.
+    fn listen(&mut self, event: Event, inputs: &Inputs<'_>) -> Event {
+        let Some(settings) = self.settings.proposer else { return event };
+        self.record.heard = inputs.proposal.is_some();
+        if let Some(proposal) = inputs.proposal {
+            self.record.proposal = *proposal;
+            self.heard.take(proposal, &mut self.record, &mut self.controller.controller);
+        }
+        let age = self.heard.age(self.record.begin);
+        self.record.proposal_age = age.unwrap_or(u64::MAX);
+        let is_held = age.is_some_and(|age| age > settings.age_limit);
+        let is_silent = age.is_none_or(|age| age > settings.age_limit.saturating_add(settings.hold));
+        self.record.counters.silent_proposer += u64::from(is_silent);
+        self.record.counters.held_proposals += u64::from(is_held && !is_silent);
+        match event {
+            Event::Good | Event::Held(_) if is_silent => Event::Refused(Reason::SilentProposer),
+            Event::Good if is_held => Event::Held(Reason::SilentProposer),
+            event => event,
+        }
     }
 
     fn count(&mut self, event: Event) {
@@ -295,6 +337,7 @@ impl<T: LoopController> Core<T> {
         if !is_next || state.episode != self.record.state.episode {
             self.controller.controller.reset();
             self.memory.clear();
+            self.heard.begin(state.header.seq);
             self.held = None;
         }
         let is_frozen = is_next && self.is_frozen(state);

@@ -14,7 +14,7 @@ use hdrhistogram::Histogram;
 use rtrb::{Consumer, Producer};
 
 use crate::clock::{self, Bell};
-use crate::link::{ActionMessage, Message, StateMessage};
+use crate::link::{ActionMessage, Message, ProposalMessage, StateMessage};
 use crate::rt::core::{Core, CoreSettings, Inputs, Loaded};
 use crate::rt::faults::FaultPlan;
 use crate::rt::mode::Mode;
@@ -54,6 +54,7 @@ pub(crate) struct CycleSettings {
 /// The ends of the rings that belong to this thread.
 pub(crate) struct Ends<T: LoopController> {
     pub(crate) states: Consumer<StateMessage>,
+    pub(crate) proposals: Consumer<ProposalMessage>,
     pub(crate) actions: Producer<ActionMessage>,
     pub(crate) records: Producer<Record>,
     pub(crate) slot: Slot<Loaded<T>>,
@@ -69,6 +70,7 @@ pub(crate) struct Cycle<T: LoopController> {
     stop: Stop,
     core: Core<T>,
     fresh: Option<StateMessage>,
+    proposal: Option<ProposalMessage>,
     action: ActionMessage,
     stopping: u64,
     /// When the loop stops, however many ticks it has made.
@@ -78,6 +80,27 @@ pub(crate) struct Cycle<T: LoopController> {
     dropped: (u64, u64),
     pub(crate) wake: Histogram<u64>,
     pub(crate) compute: Histogram<u64>,
+    answers: Answers,
+}
+
+/// How quickly another process answers.
+pub(crate) struct Answers {
+    /// From the state to the tick that first acts on the proposal [ns].
+    pub(crate) answer: Histogram<u64>,
+    /// From the sending of a proposal to that tick [ns].
+    pub(crate) link: Histogram<u64>,
+}
+
+impl Answers {
+    fn new() -> Answers {
+        Answers { answer: histogram(), link: histogram() }
+    }
+
+    fn take(&mut self, record: &Record) {
+        let proposal = &record.proposal;
+        self.answer.saturating_record(record.begin.saturating_sub(proposal.state_stamp));
+        self.link.saturating_record(record.begin.saturating_sub(proposal.header.stamp));
+    }
 }
 
 /// What is left when the loop has ended; dropped by another thread.
@@ -85,6 +108,7 @@ pub(crate) struct CycleEnd<T: LoopController> {
     pub(crate) last: Record,
     pub(crate) wake: Histogram<u64>,
     pub(crate) compute: Histogram<u64>,
+    pub(crate) answers: Answers,
     pub(crate) usage: Usage,
     /// Only carried, so that another thread drops it.
     _rest: (Core<T>, Ends<T>),
@@ -101,6 +125,7 @@ impl<T: LoopController> Cycle<T> {
         Cycle {
             core: Core::new(settings.core, first, 0, faults),
             fresh: None,
+            proposal: None,
             action: ActionMessage::zeroed(),
             stopping: 0,
             deadline: u64::MAX,
@@ -108,6 +133,7 @@ impl<T: LoopController> Cycle<T> {
             dropped: (0, 0),
             wake: histogram(),
             compute: histogram(),
+            answers: Answers::new(),
             settings,
             ends,
             stop,
@@ -132,8 +158,8 @@ impl<T: LoopController> Cycle<T> {
         }
         let mut usage = Usage::of_this_thread(count).since(usage);
         usage.late_waits = self.late_waits - late_waits;
-        let Cycle { wake, compute, core, ends, .. } = self;
-        CycleEnd { last: core.record, wake, compute, usage, _rest: (core, ends) }
+        let Cycle { wake, compute, answers, core, ends, .. } = self;
+        CycleEnd { last: core.record, wake, compute, answers, usage, _rest: (core, ends) }
     }
 
     fn is_stopping(&self) -> bool {
@@ -205,7 +231,12 @@ impl<T: LoopController> Cycle<T> {
         while let Ok(state) = self.ends.states.pop() {
             self.fresh = Some(state);
         }
-        let inputs = Inputs { due: self.core.due(), begin, stop, fresh: self.fresh.as_ref() };
+        self.proposal = None;
+        while let Ok(proposal) = self.ends.proposals.pop() {
+            self.proposal = Some(proposal);
+        }
+        let (fresh, proposal) = (self.fresh.as_ref(), self.proposal.as_ref());
+        let inputs = Inputs { due: self.core.due(), begin, stop, fresh, proposal };
         self.core.update(&inputs);
         let periods = self.core.rehearsed_periods();
         if periods > 0.0 {
@@ -232,6 +263,9 @@ impl<T: LoopController> Cycle<T> {
         if record.fresh || self.settings.core.sync == Sync::Clock {
             self.wake.saturating_record(record.begin.saturating_sub(record.due));
             self.compute.saturating_record(record.end - record.begin);
+        }
+        if record.heard {
+            self.answers.take(record);
         }
         self.dropped.1 += u64::from(self.ends.records.push(*record).is_err());
         self.stopping += u64::from(self.core.record.stop);

@@ -12,8 +12,8 @@ use rtrb::{Consumer, Producer};
 use crate::clock::{self, Bell};
 use crate::link::torn;
 use crate::link::{
-    ActionMessage, HealthMessage, Message, RobotMessage, RuntimeLink, StateMessage, TallyMessage,
-    TransitionMessage,
+    ActionMessage, AskedMessage, HealthMessage, Message, ProposalMessage, RobotMessage, RuntimeLink,
+    StateMessage, TallyMessage, TransitionMessage,
 };
 use crate::log::LogQueue;
 use crate::percentiles::percentiles;
@@ -38,6 +38,9 @@ pub(crate) struct Io<B: Build> {
     pub(crate) link: RuntimeLink,
     pub(crate) robot: RobotMessage,
     pub(crate) states: Producer<StateMessage>,
+    pub(crate) proposals: Producer<ProposalMessage>,
+    /// What is asked of another process, where one proposes.
+    pub(crate) asked: Option<Box<AskedMessage>>,
     pub(crate) actions: Consumer<ActionMessage>,
     pub(crate) records: Consumer<Record>,
     pub(crate) bell: Arc<Bell>,
@@ -83,6 +86,7 @@ impl<B: Build> Io<B> {
             if torn::is_torn() {
                 self.end();
             }
+            self.move_proposals();
             let moved = self.move_states() | self.move_actions() | self.move_records();
             if self.has_time() {
                 self.attend();
@@ -112,6 +116,15 @@ impl<B: Build> Io<B> {
         }
         self.bell.ring();
         true
+    }
+
+    /// A proposal that finds the ring full is overtaken by the next one.
+    fn move_proposals(&mut self) {
+        if self.asked.is_some()
+            && let Some(proposal) = self.link.newest_proposal()
+        {
+            let _ = self.proposals.push(*proposal);
+        }
     }
 
     fn move_actions(&mut self) -> bool {
@@ -197,6 +210,10 @@ impl<B: Build> Io<B> {
             message.rolled_back = self.snapshots.rolled_back;
             message.log_drops = self.log.as_ref().map_or(0, LogQueue::dropped);
             self.link.send_health(&mut message);
+            if let Some(asked) = &mut self.asked {
+                self.health.account(asked);
+                self.link.send_asked(asked);
+            }
         }
     }
 
@@ -267,6 +284,8 @@ fn transition(record: &Record, next: &StateMessage, explore: Option<u64>) -> Tra
 pub(crate) struct Health {
     next: u64,
     last: HealthMessage,
+    /// Proposals taken, overtaken, refused; ticks that held one, and without one.
+    proposals: [u64; 5],
     wake: Histogram<u64>,
     compute: Histogram<u64>,
 }
@@ -276,7 +295,7 @@ impl Health {
         let histogram = || Histogram::new_with_bounds(1, 100_000_000_000, 2);
         let mut last = HealthMessage::zeroed();
         last.pid = std::process::id();
-        Ok(Health { next: 0, last, wake: histogram()?, compute: histogram()? })
+        Ok(Health { next: 0, last, proposals: [0; 5], wake: histogram()?, compute: histogram()? })
     }
 
     fn take(&mut self, record: &Record) {
@@ -287,12 +306,24 @@ impl Health {
         (last.overruns, last.skipped) = (counters.overruns, counters.skipped);
         (last.stale, last.swaps) = (counters.stale, counters.swaps);
         last.lost_states = counters.lost_states;
+        self.proposals = [
+            counters.proposals,
+            counters.overtaken_proposals,
+            counters.refused_proposals,
+            counters.held_proposals,
+            counters.silent_proposer,
+        ];
         last.raw_violations = counters.raw_violations;
         last.target_violations = counters.target_violations;
         if record.fresh {
             self.wake.saturating_record(record.begin.saturating_sub(record.due));
             self.compute.saturating_record(record.end - record.begin);
         }
+    }
+
+    fn account(&self, asked: &mut AskedMessage) {
+        [asked.taken, asked.overtaken, asked.refused, asked.held, asked.silent] = self.proposals;
+        asked.mode = self.last.mode;
     }
 
     fn message(&self) -> HealthMessage {

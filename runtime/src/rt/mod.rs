@@ -14,6 +14,7 @@ mod build;
 pub mod core;
 mod cycle;
 pub mod faults;
+mod heard;
 mod inbox;
 mod io;
 mod mode;
@@ -33,15 +34,15 @@ pub use crate::stop::Stop;
 pub use crate::thread::{CountAllocations, PRIORITY, ThreadSettings, Usage, prepare};
 pub use bench::bench_wake;
 pub use brake::Brake;
-pub use core::{Core, CoreSettings, Inputs, Loaded};
+pub use core::{Core, CoreSettings, Inputs, Loaded, ProposerSettings};
 pub use cycle::Sync;
 pub use faults::{Fault, FaultKind, FaultPlan, FaultyPlant, Odd};
 pub use mode::{Event, Mode, ModeLimits, Modes, Reason};
 pub use pilot::{Pilot, PilotBuilder, describe, numbers};
 pub use pinned::Pinned;
-pub use report::{PlantSummary, RunReport};
+pub use report::{PlantSummary, ProposerSummary, RunReport};
 pub use residual::RollbackSettings;
 pub use run::{RunError, RunSettings, connect, run, run_loop};
 pub use tick::{
-    Build, Counters, LoopController, MAX_ROWS, Outcome, Record, Refusal, Row, Sensed, TickOutput,
+    Build, Counters, LoopController, MAX_ROWS, Outcome, Question, Record, Refusal, Row, Sensed, TickOutput,
 };

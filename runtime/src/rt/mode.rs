@@ -49,6 +49,8 @@ codes! {
             "Check encoder and wiring of the plant; the sample was not used.";
         ImplausibleStates = "implausible-states", "More implausible states in a row than allowed; latched.",
             "Check encoders and joint order of the plant, then start the runtime again.";
+        SilentProposer = "silent-proposer", "The process that proposes has said nothing usable for longer than the age limit.",
+            "Look at that process; --proposal-age and --proposal-hold are how long its last proposal counts.";
         Controller = "controller", "The controller refused the state: it gave no checked target.",
             "See the status of the tick in the flight log, then `nearl explain STATUS`.";
         NonFiniteProposal = "braked-non-finite-proposal", "The policy proposed NaN or infinity several ticks in a row.",

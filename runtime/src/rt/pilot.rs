@@ -5,12 +5,13 @@ use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, RefuseReason, Side
 use crate::codes::LedgerStatus;
 use crate::controller::{Controller, Noise, Output, State};
 use crate::link::{
-    LedgerNumbers, MAX_JOINTS, MAX_OBS, Robot, RobotMessage, SnapshotBytes, StateMessage, Verdict, hash_names,
+    LedgerNumbers, MAX_JOINTS, MAX_OBS, PROPOSES_ACTIONS, PROPOSES_STATES, Robot, RobotMessage,
+    SnapshotBytes, StateMessage, Verdict, hash_names,
 };
 use crate::rt::brake::Brake;
 use crate::rt::pinned::{Pinned, UNITS, above};
-use crate::rt::tick::{Build, LoopController, MAX_ROWS, Outcome, Refusal, Row, TickOutput};
-use crate::snapshot::{Manifest, Snapshot, SnapshotError};
+use crate::rt::tick::{Build, LoopController, MAX_ROWS, Outcome, Question, Refusal, Row, TickOutput};
+use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError};
 
 /// A controller with its inputs and outputs, checked against the plant it drives.
 pub struct Pilot {
@@ -34,6 +35,8 @@ pub struct Pilot {
     memory_len: usize,
     /// Ticks since the policy ran.
     period_tick: u32,
+    /// What another process may propose: kind, hash of the names, their number.
+    takes: Option<(u32, u64, usize)>,
 }
 
 impl Pilot {
@@ -51,8 +54,14 @@ impl Pilot {
             pinned.admit(&snapshot.manifest)?;
         }
         compare_limits(&controller, robot)?;
+        let kind = match snapshot.manifest.policy {
+            PolicyKind::Direct => PROPOSES_ACTIONS,
+            _ => PROPOSES_STATES,
+        };
+        let names = controller.given_names().filter(|names| names.len() <= MAX_OBS);
         let layout = controller.layout();
         Ok(Pilot {
+            takes: names.map(|names| (kind, hash_names(&names), names.len())),
             brake: Brake::new(&snapshot.manifest).map_err(refuse)?,
             state: controller.state(),
             noise: controller.noise(),
@@ -200,6 +209,20 @@ impl LoopController for Pilot {
             self.controller.take_memory(&memory[1..]);
             self.share(false);
         }
+    }
+
+    fn question(&self) -> Option<Question> {
+        let (kind, ..) = self.takes?;
+        let policy_every = self.controller.policy_every();
+        Some(Question { kind, names: self.controller.given_names()?, policy_every })
+    }
+
+    fn takes(&self, kind: u32, names: u64, n: usize) -> bool {
+        self.takes == Some((kind, names, n))
+    }
+
+    fn give(&mut self, values: &[f64]) {
+        self.controller.give(values);
     }
 
     fn set_noise(&mut self, noise: f32) {

@@ -35,6 +35,15 @@ pub struct PlantSummary {
     pub episode_return: f64,
 }
 
+/// How quickly another process proposed; how many proposals were taken and lost is in the counters.
+#[derive(Clone, Debug, Serialize)]
+pub struct ProposerSummary {
+    /// From the state it was computed from to the first tick that acts on a proposal.
+    pub answer: Percentiles,
+    /// From the sending of a proposal to that tick.
+    pub link: Percentiles,
+}
+
 /// What happened between start and stop.
 #[derive(Clone, Debug, Serialize)]
 pub struct RunReport {
@@ -80,6 +89,8 @@ pub struct RunReport {
     pub log_error: Option<String>,
     /// What the operating system refused: priority, memory, core.
     pub warnings: Vec<String>,
+    /// The process that proposed in place of the policy, where one was asked.
+    pub proposer: Option<ProposerSummary>,
     /// The plant's own account.
     pub plant: PlantSummary,
 }
@@ -118,6 +129,15 @@ impl fmt::Display for RunReport {
         let others = self.plant.not_measured.iter().map(|kind| format!("{kind} not measured"));
         let plant: Vec<String> = measured.chain(others).collect();
         writeln!(f, "  on the plant     {}", plant.join(", "))?;
+        if let Some(proposer) = &self.proposer {
+            writeln!(
+                f,
+                "  proposals        taken {}, overtaken {}, refused {}; ticks on a held one {}, without one {}",
+                c.proposals, c.overtaken_proposals, c.refused_proposals, c.held_proposals, c.silent_proposer
+            )?;
+            writeln!(f, "  state to answer  {}", proposer.answer)?;
+            writeln!(f, "  sent to answer   {}", proposer.link)?;
+        }
         let u = &self.usage;
         writeln!(
             f,

@@ -13,11 +13,13 @@ use crate::clock::{self, Bell};
 use crate::controller::Parts;
 use crate::holding;
 use crate::link::torn;
-use crate::link::{LinkError, Message, RobotMessage, RobotName, RuntimeLink, StateMessage, TallyMessage};
+use crate::link::{
+    AskedMessage, LinkError, Message, RobotMessage, RobotName, RuntimeLink, StateMessage, TallyMessage,
+};
 use crate::log::{LogError, LogQueue, LogSummary};
 use crate::percentiles::percentiles;
 use crate::rt::build::Builder;
-use crate::rt::core::{CoreSettings, Loaded};
+use crate::rt::core::{CoreSettings, Loaded, ProposerSettings};
 use crate::rt::cycle::{Cycle, CycleEnd, CycleSettings, Ends, Sync};
 use crate::rt::faults::FaultPlan;
 use crate::rt::inbox::SnapshotInbox;
@@ -26,7 +28,7 @@ use crate::rt::mode::ModeLimits;
 use crate::rt::pilot::{Pilot, PilotBuilder};
 use crate::rt::pinned::Pinned;
 use crate::rt::receive::SnapshotReceiver;
-use crate::rt::report::{PlantSummary, RunReport};
+use crate::rt::report::{PlantSummary, ProposerSummary, RunReport};
 use crate::rt::residual::RollbackSettings;
 use crate::rt::tick::{Build, LoopController, Refusal};
 use crate::rt::{Mode, Reason, swap};
@@ -72,6 +74,8 @@ pub struct RunSettings {
     pub modes: ModeLimits,
     /// Seed of the exploration noise; without one the policy acts without noise.
     pub explore: Option<u64>,
+    /// Another process proposes in place of the policy.
+    pub proposer: Option<ProposerSettings>,
     /// When a swapped-in snapshot is taken back.
     pub rollback: RollbackSettings,
     /// TOML file with a section `[constraints]`: the limits of the loop in place of its first snapshot's ([`run`] only).
@@ -111,6 +115,7 @@ impl Default for RunSettings {
             ramp: 0.2,
             modes: ModeLimits::default(),
             explore: None,
+            proposer: None,
             rollback: RollbackSettings::default(),
             limits: None,
             allow_looser: false,
@@ -161,6 +166,17 @@ pub enum RunError {
         /// The system's reason.
         reason: String,
     },
+    /// Another process was to propose, and the limits would not hold for what it says.
+    #[error(
+        "--proposer: this snapshot holds no limits for actions that come from elsewhere; write guard = true under [constraints] of its task, or take a \
+         snapshot that proposes states"
+    )]
+    NoQuestion,
+    /// Noise is the policy's.
+    #[error(
+        "--proposer and --explore exclude each other: another process proposes, and the policy that would explore does not run"
+    )]
+    Explores,
     /// A bug in the loop itself.
     #[error("thread `{0}` panicked: report it with the message above")]
     Panicked(&'static str),
@@ -274,17 +290,20 @@ fn assemble<B: Build>(
     stop: &Stop,
 ) -> Result<(Cycle<B::Controller>, Io<B>), RunError> {
     let Some(reader) = link.take_snapshots() else { return Err(RunError::NoSnapshots(link.name().clone())) };
+    let asked = asked(&mut link, &robot, &first, settings)?;
     let cycle_settings = cycle_settings(&robot, settings);
     let log = open_log(&robot, first.version(), &cycle_settings.core, settings)?;
     let thread_error = |name| move |e: std::io::Error| RunError::Thread { name, reason: e.to_string() };
     let builder = Builder::start(build).map_err(thread_error("nearl-build"))?;
     let receiver = SnapshotReceiver::start(reader).map_err(thread_error("nearl-receive"))?;
     let (states_in, states) = RingBuffer::new(8);
+    let (proposals_in, proposals) = RingBuffer::new(4);
     let (actions, actions_out) = RingBuffer::new(8);
     let (records, records_out) = RingBuffer::new(RECORDS);
     let (swap, slot) = swap::slot();
     let (bell, gone) = (Arc::new(Bell::default()), Arc::new(AtomicBool::new(false)));
-    let ends = Ends { states, actions, records, slot, bell: Arc::clone(&bell), gone: Arc::clone(&gone) };
+    let ends =
+        Ends { states, proposals, actions, records, slot, bell: Arc::clone(&bell), gone: Arc::clone(&gone) };
     let first = Box::new(Loaded { id: 0, controller: first });
     let cycle = Cycle::new(cycle_settings, first, settings.faults.clone(), ends, stop.clone());
     let health = Health::new().map_err(|e| RunError::Snapshot(e.to_string()))?;
@@ -295,6 +314,8 @@ fn assemble<B: Build>(
         priority: settings.thread.priority,
         robot,
         states: states_in,
+        proposals: proposals_in,
+        asked,
         actions: actions_out,
         records: records_out,
         bell,
@@ -308,6 +329,27 @@ fn assemble<B: Build>(
         tally: None,
     };
     Ok((cycle, io))
+}
+
+/// Opens the topic on which another process is asked for proposals, if one is to make them.
+fn asked<T: LoopController>(
+    link: &mut RuntimeLink,
+    robot: &RobotMessage,
+    first: &T,
+    settings: &RunSettings,
+) -> Result<Option<Box<AskedMessage>>, RunError> {
+    let Some(proposer) = settings.proposer else { return Ok(None) };
+    if settings.explore.is_some() {
+        return Err(RunError::Explores);
+    }
+    let question = first.question().ok_or(RunError::NoQuestion)?;
+    let mut asked = Box::new(AskedMessage::zeroed());
+    asked.set_entries(&question.names);
+    (asked.kind, asked.policy_every) = (question.kind, question.policy_every as u64);
+    (asked.dt, asked.age_limit, asked.hold) =
+        (robot.dt, proposer.age_limit as f64 * 1e-9, proposer.hold as f64 * 1e-9);
+    link.ask()?;
+    Ok(Some(asked))
 }
 
 fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings {
@@ -325,6 +367,7 @@ fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings
             ramp: (settings.ramp / robot.dt).round() as u32,
             modes: settings.modes,
             explore: settings.explore,
+            proposer: settings.proposer,
         },
         spin: if robot.is_lockstep() { 0 } else { clock::nanoseconds(settings.spin) },
         ticks: settings.ticks.or(settings.seconds.map(|s| (s / robot.dt).round() as u64)),
@@ -429,6 +472,10 @@ fn report<B: Build>(
         rolled_back: io.snapshots.rolled_back,
         usage: end.usage,
         warnings,
+        proposer: io.asked.is_some().then(|| ProposerSummary {
+            answer: percentiles(&end.answers.answer),
+            link: percentiles(&end.answers.link),
+        }),
         plant: plant_summary(&end.last.state, tally.as_ref()),
     }
 }

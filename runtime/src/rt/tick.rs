@@ -1,6 +1,8 @@
 //! What the loop needs from a controller, and the record it leaves of each tick.
 
-use crate::link::{LedgerNumbers, MAX_JOINTS, Message, RobotMessage, SnapshotBytes, StateMessage, Verdict};
+use crate::link::{
+    LedgerNumbers, MAX_JOINTS, Message, ProposalMessage, RobotMessage, SnapshotBytes, StateMessage, Verdict,
+};
 use crate::rt::{Mode, Reason};
 
 /// A controller as the loop sees it. `tick`, `brake` and `reset` run in the real-time thread: no allocation beyond
@@ -15,6 +17,16 @@ pub trait LoopController: Send + 'static {
     fn brake(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome;
     /// The next state begins a new episode, or follows a swap.
     fn reset(&mut self);
+    /// What it takes from another process in place of its policy; none where it takes nothing. Allocates; not for the real-time thread.
+    fn question(&self) -> Option<Question> {
+        None
+    }
+    /// Whether [`LoopController::question`] asks for these names (by their hash) and this many entries.
+    fn takes(&self, _kind: u32, _names: u64, _n: usize) -> bool {
+        false
+    }
+    /// Proposes `values` from the next tick on.
+    fn give(&mut self, _values: &[f64]) {}
     /// Sets every entry of the proposal's noise; 0 on a robot unless a rehearsed fault asks for another number.
     fn set_noise(&mut self, _noise: f32) {}
     /// Draws the noise of `tick` from `seed`, if the policy runs in it.
@@ -33,6 +45,17 @@ pub trait LoopController: Send + 'static {
     /// Takes `output` back towards standing still: `share` in (0, 1) of the way to its target is left. Only where a model
     /// of the robot knows the action for that; the others stay as they are.
     fn soften(&mut self, _state: &StateMessage, _share: f64, _output: &mut TickOutput) {}
+}
+
+/// What a controller can be given in place of its policy's output.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Question {
+    /// `PROPOSES_*` of the link.
+    pub kind: u32,
+    /// Names of the entries in order.
+    pub names: Vec<String>,
+    /// Control ticks in which a proposed state is to be reached.
+    pub policy_every: usize,
 }
 
 /// How a tick of the controller ended.
@@ -177,6 +200,16 @@ pub struct Counters {
     pub target_violations: u64,
     /// Ticks that acted on what no projection has seen: their policy gives actions and proposes no state.
     pub unprojected: u64,
+    /// Proposals of another process that were taken.
+    pub proposals: u64,
+    /// Its proposals that a newer one overtook.
+    pub overtaken_proposals: u64,
+    /// Its proposals of other names or sizes, of another episode, or with numbers that are not finite.
+    pub refused_proposals: u64,
+    /// Ticks that acted on a proposal older than the age limit.
+    pub held_proposals: u64,
+    /// Ticks without a usable proposal.
+    pub silent_proposer: u64,
     /// Ticks in each mode, by code.
     pub mode_ticks: [u64; Mode::ALL.len()],
 }
@@ -226,6 +259,12 @@ pub struct Record {
     pub ramp: f64,
     /// Noise of the proposal, in every entry.
     pub noise: f32,
+    /// A proposal of another process came in this tick.
+    pub heard: bool,
+    /// That proposal; without one that of an earlier tick.
+    pub proposal: ProposalMessage,
+    /// Age of the proposal acted upon, from the state it was computed from [ns]; `u64::MAX` without one.
+    pub proposal_age: u64,
     /// The newest state, as measured.
     pub state: StateMessage,
     /// The controller's answer; meaningless if `output.nu` is 0.
@@ -252,6 +291,9 @@ impl Record {
             sensed: Sensed::Missing,
             ramp: 1.0,
             noise: 0.0,
+            heard: false,
+            proposal: ProposalMessage::zeroed(),
+            proposal_age: u64::MAX,
             state: StateMessage::zeroed(),
             output: TickOutput::zeroed(),
             counters: Counters::default(),

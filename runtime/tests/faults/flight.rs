@@ -14,6 +14,8 @@ pub struct Flight {
     pub records: Vec<Record>,
     pub panda: Panda,
     pub sequence: Sequence,
+    /// What another process proposes in the next period.
+    pub proposal: Option<ProposalMessage>,
     plan: FaultPlan,
     brake: Brake,
     robot: RobotMessage,
@@ -36,6 +38,7 @@ pub fn settings() -> CoreSettings {
         ramp: 50,
         modes: ModeLimits::default(),
         explore: None,
+        proposer: None,
     }
 }
 
@@ -55,6 +58,7 @@ impl Flight {
             records: Vec::new(),
             panda: Panda::new(),
             sequence: Sequence::default(),
+            proposal: None,
             brake: Brake::new(&snapshot.manifest).unwrap().unwrap(),
             plan,
             robot,
@@ -130,7 +134,9 @@ impl Flight {
     fn compute(&mut self, state: &StateMessage, swapped: bool) {
         let begin = self.now + 10_000;
         self.core.swap(swapped);
-        self.core.update(&Inputs { due: 0, begin, stop: false, fresh: Some(state) });
+        let proposal = self.proposal.take();
+        let (fresh, proposal) = (Some(state), proposal.as_ref());
+        self.core.update(&Inputs { due: 0, begin, stop: false, fresh, proposal });
         let spent = (self.core.rehearsed_periods() * PERIOD as f64) as u64;
         self.core.close(begin + spent.max(5_000));
         let record = self.core.record;

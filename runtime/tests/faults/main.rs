@@ -10,6 +10,7 @@ mod flight;
 mod kills;
 mod limits;
 mod peers;
+mod proposers;
 mod security;
 mod solver;
 mod stage;

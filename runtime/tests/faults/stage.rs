@@ -98,6 +98,7 @@ fn child() {
                 trainer.push(version, &snapshot.to_bytes()).unwrap();
             }
         }
+        Ok("proposer") => crate::proposers::propose(&name),
         role => panic!("no such role: {role:?}"),
     }
 }
@@ -118,6 +119,11 @@ impl Stage {
 
     pub fn file(&self) -> PathBuf {
         self.folder.0.join("first.safetensors")
+    }
+
+    /// Where a flight log may lie.
+    pub fn log(&self) -> PathBuf {
+        self.folder.0.join("run.mcap")
     }
 
     pub fn start(&self, role: &str) -> Child {

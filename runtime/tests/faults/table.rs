@@ -14,6 +14,7 @@ const KILLS: &str = "runtime/tests/faults/kills.rs";
 const PEERS: &str = "runtime/tests/faults/peers.rs";
 const SOLVER: &str = "runtime/tests/faults/solver.rs";
 const PROCESSES: &str = "tests/tests/programs/processes.rs";
+const PROPOSERS: &str = "runtime/tests/faults/proposers.rs";
 const SYSTEM: &str = "runtime/tests/faults/system.rs";
 
 /// All faults.
@@ -65,6 +66,7 @@ pub const ROWS: &[Row] = &[
     (44, "log file exists", "a new name; never written over", &["active"], LIMITS, "fault_44_a_log_that_is_there_is_never_written_over"),
     (45, "plant or loop gone; plant slower than the wall", "the other side ends by name with its own exit code; the wall's time counts", &["plant-gone", "loop-gone"], LIMITS, "fault_45_a_plant_or_a_loop_that_is_gone_ends_the_other_with_its_own_code"),
     (46, "motors too weak to hold the arm within its limits", "doctor and run refuse, by joint, needed and available force", &["doctor-holding"], LIMITS, "fault_46_motors_too_weak_to_hold_the_arm_are_refused_by_joint_and_number"),
+    (47, "proposing process killed, stopped, slow, or proposing nonsense", "its last proposal is held for a while, then brakes; a successor is taken up; nonsense is refused and counted", &["silent-proposer"], PROPOSERS, "fault_47_a_proposer_killed_or_stopped_is_held_then_braked_and_its_successor_taken_up"),
 ];
 
 fn root() -> PathBuf {
@@ -87,7 +89,7 @@ fn page() -> String {
 #[test]
 fn the_table_is_complete_and_its_tests_exist() {
     let numbers: Vec<u32> = ROWS.iter().map(|r| r.0).collect();
-    assert_eq!(numbers, (1..=46).collect::<Vec<_>>());
+    assert_eq!(numbers, (1..=47).collect::<Vec<_>>());
     for (number, _, _, codes, file, test) in ROWS {
         let source = std::fs::read_to_string(root().join(file)).unwrap();
         let is_python = file.ends_with(".py");

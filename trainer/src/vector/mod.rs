@@ -4,7 +4,7 @@
 
 mod lane;
 mod pool;
-mod space;
+pub(crate) mod space;
 
 use std::sync::MutexGuard;
 

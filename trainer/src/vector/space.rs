@@ -59,13 +59,33 @@ pub(super) fn task_snapshot(task: &str) -> Result<Snapshot, VectorError> {
         )));
     }
     train::complete(&mut manifest)?;
-    let n_obs = manifest.task.state.observation.len();
-    let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
+    Ok(open(still(manifest)))
+}
+
+/// A policy that proposes the state it is in; `manifest` is complete.
+pub(crate) fn still(manifest: Manifest) -> Snapshot {
+    let (n_obs, n_state) = sizes(&manifest);
+    let policy = Dense { layers: vec![zeros(n_obs, n_state)], skip: None };
     let normaliser = Normaliser::identity(n_obs, n_state);
-    Ok(open(Snapshot {
-        networks: Networks { normaliser, policy: Dense::default(), policy_log_std: Vec::new(), idm: None },
+    Snapshot { networks: Networks { normaliser, policy, policy_log_std: Vec::new(), idm: None }, manifest }
+}
+
+/// A policy whose actions are zero; `manifest` is complete.
+pub(crate) fn idle(mut manifest: Manifest) -> Snapshot {
+    manifest.policy = PolicyKind::Direct;
+    let ((n_obs, n_state), n_act) = (sizes(&manifest), manifest.action_lower.len());
+    let policy = Dense { layers: vec![zeros(n_obs, n_act)], skip: None };
+    let normaliser = Normaliser::identity(n_obs, n_state);
+    Snapshot {
+        networks: Networks { normaliser, policy, policy_log_std: vec![0.0; n_act], idm: None },
         manifest,
-    }))
+    }
+}
+
+/// Entries of the observation and of a proposed state.
+fn sizes(manifest: &Manifest) -> (usize, usize) {
+    let n_obs = manifest.task.state.observation.len();
+    (n_obs, manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len))
 }
 
 /// A trained agent with its inverse model, its policy replaced by the caller.
@@ -103,14 +123,7 @@ pub(super) fn guarded_snapshot(task: &str) -> Result<Snapshot, VectorError> {
     let by_model = manifest.task.idm.kind == IdmKind::Pinocchio;
     manifest.task.constraints.guard = if by_model { Guard::Model } else { Guard::Simulator };
     train::complete(&mut manifest)?;
-    manifest.policy = PolicyKind::Direct;
-    let n_obs = manifest.task.state.observation.len();
-    let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
-    let n_act = manifest.action_lower.len();
-    let policy = Dense { layers: vec![zeros(n_obs, n_act)], skip: None };
-    let normaliser = Normaliser::identity(n_obs, n_state);
-    let networks = Networks { normaliser, policy, policy_log_std: vec![0.0; n_act], idm: None };
-    Ok(Snapshot { manifest, networks })
+    Ok(idle(manifest))
 }
 
 fn zeros(n_in: usize, n_out: usize) -> DenseLayer {

@@ -74,6 +74,11 @@ impl DriveBox {
         Ok(DriveBox { dt: m.task.time.dt, before: vec![0.0; joints.len()], known: false, joints })
     }
 
+    /// Where in the action the `k`-th controllable joint's command is.
+    pub(super) fn place(&self, k: usize) -> usize {
+        self.joints[k].at
+    }
+
     /// Puts the targets in `action` (n_act) into their intervals; the ledger of `next` says by how much the furthest was moved [rad or m].
     pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], next: &mut Target, hold: bool) {
         let mut moved = 0.0_f64;

@@ -124,6 +124,11 @@ impl Guard {
         self.dofs.iter().any(differs)
     }
 
+    /// Where in the action the `k`-th controllable joint's command is.
+    pub(super) fn place(&self, k: usize) -> usize {
+        self.motors.place(k)
+    }
+
     pub(super) fn bounds(&self) -> &Bounds {
         self.projector.bounds()
     }

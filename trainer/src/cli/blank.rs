@@ -1,0 +1,30 @@
+//! `nearl blank`: a task as a snapshot without a policy.
+
+use super::{Failure, say};
+use clap::Args;
+use std::path::PathBuf;
+
+#[derive(Args)]
+pub(super) struct Blank {
+    /// Bundled task or TOML file.
+    task: String,
+    /// Where the snapshot goes.
+    #[arg(long)]
+    out: PathBuf,
+    /// What is proposed are commands of the joints, guarded, in place of states.
+    #[arg(long)]
+    actions: bool,
+}
+
+impl Blank {
+    pub(super) fn run(self) -> Result<(), Failure> {
+        let snapshot = crate::blank::snapshot(&self.task, self.actions)?;
+        snapshot.save(&self.out)?;
+        let what = if self.actions { "actions" } else { "states" };
+        say(format!(
+            "{}: no policy; start the loop with `nearl run {0} --plant NAME --proposer`, and propose {what}",
+            self.out.display()
+        ));
+        Ok(())
+    }
+}
