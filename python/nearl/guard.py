@@ -35,6 +35,8 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
         constraints: ``position``: ``{"margin": 0.0}`` keeps every joint with a range inside it [rad or m], or a table by joint;
             ``velocity``: ``{"limit": 25.0}`` [rad/s or m/s], one number for all hinges and slides with a range, or a table by joint.
         ctrl: What the environment hands to its actuators for an action; the action itself by default.
+        unavoidable: Where no action found ends inside: ``"least"`` takes the one that ends least far outside; ``"kept"`` leaves the action as it is, for a
+            policy that was not trained behind the guard and rests on soft joint stops, from which nothing comes back in one step.
         seed: Of the drawn actions: the same state and action give the same result.
 
     Raises:
@@ -47,10 +49,14 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
         constraints: Mapping[str, Mapping[str, PerJoint]],
         ctrl: Callable[[Floats], ArrayLike] | None = None,
         seed: int = 0,
+        unavoidable: str = "least",
     ):
         import mujoco
 
         super().__init__(env)
+        if unavoidable not in ("least", "kept"):
+            raise ValueError(f"unavoidable is '{unavoidable}'; give 'least' or 'kept'")
+        self._keeps = unavoidable == "kept"
         inner: Any = env.unwrapped
         missing = [name for name in ("model", "data", "frame_skip") if not hasattr(inner, name)]
         if missing or not isinstance(env.action_space, gymnasium.spaces.Box):
@@ -86,11 +92,13 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
         best, least = self._by_slopes(asked, at, first)
         if least > 0.0:
             best, least = self._by_draws(asked, best, least)
-        if least >= first:
+        if least >= first or (self._keeps and least > 0.0):
             return given, "outside"
         # What the space's own type makes of it is what the environment gets.
         safe = (self._middle + self._half * best).astype(self.env.action_space.dtype)
         inside = self._excess(self._foresee(safe.astype(float))) <= 0.0
+        if self._keeps and not inside:
+            return given, "outside"
         return safe, "replaced" if inside else "outside"
 
     @property

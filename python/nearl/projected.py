@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
 from nearl.env import Env
+from nearl.render import Frame, Renderer
 
 
 class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
@@ -17,18 +18,40 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     ``info`` has ``raw_violations`` and ``target_violations`` (control ticks in which what was asked for, and what was done about it, broke a
     limit), ``cost`` where the task has one, and ``fault`` if the physics could not be believed.
 
-    Args: see :func:`nearl.make_vec`.
+    Args:
+        task: A bundled task or a TOML file.
+        constraints: See :func:`nearl.make_vec`.
+        actions: See :func:`nearl.make_vec`.
+        render_mode: ``"rgb_array"``, or none.
+        max_episode_steps: Control periods after which an episode is cut, the task's own by default. What ``gymnasium.make`` takes under this
+            name it keeps for itself, counts in steps, and can only make episodes shorter.
+        width: Of a picture [pixel].
+        height: Of a picture [pixel].
+        camera: Of the robot file; one that follows the robot by default.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # as Gymnasium declares it
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(
-        self, task: str | os.PathLike[str], constraints: str | os.PathLike[str] = "task", actions: str = "state", render_mode: str | None = None
+        self,
+        task: str | os.PathLike[str],
+        constraints: str | os.PathLike[str] = "task",
+        actions: str = "state",
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        width: int = 480,
+        height: int = 480,
+        camera: str | None = None,
     ):
-        if render_mode is not None:
-            raise ValueError(f"render_mode is '{render_mode}', but projected environments do not render; leave it out")
-        # The time limit, in control ticks, is the task's own; that of Gymnasium's wrapper, in steps, is never shorter.
-        self._native = _core.VecEnv(os.fspath(task), 1, os.fspath(constraints), 0, 1, None, False, actions)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode is '{render_mode}'; give 'rgb_array', or leave it out")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps is {max_episode_steps}; give at least one control period")
+        self.render_mode = render_mode
+        self._picture = (width, height), camera
+        self._renderer: Renderer | None = None
+        self._task = os.fspath(task)
+        self._native = _core.VecEnv(self._task, 1, os.fspath(constraints), 0, 1, max_episode_steps, False, actions)
         low, high = self._native.action_low, self._native.action_high
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self._native.n_obs,), np.float64)
@@ -52,6 +75,24 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         obs, rewards, terminated, truncated, infos = self._native.step(np.asarray(action, float)[None])
         info = {key: values[0] for key, values in infos.items() if not key.startswith("_")}
         return obs[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> Frame | None:  # type: ignore[override]
+        """The robot as a picture (height x width x 3); None without ``render_mode="rgb_array"``.
+
+        Raises:
+            VideoError: MuJoCo cannot render on this machine; the message says what is missing.
+        """
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            self._renderer = Renderer(_core.Env(self._task), *self._picture)
+        return self._renderer.frame(self._native.qpos[0], self._native.qvel[0])
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
     @property
     def native(self) -> _core.VecEnv:

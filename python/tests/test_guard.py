@@ -140,6 +140,38 @@ def test_actions_of_an_unknown_meaning_are_refused():
         gymnasium.make("nearl/Panda-reach", actions="guarded")
 
 
+def test_an_action_that_nothing_helps_is_kept_where_that_is_asked_for():
+    """Limits that no action obeys: the least far outside is another action, and is not taken."""
+    impossible = {"velocity": {"limit": 1e-6}}
+    least, kept = (nearl.Guard(gymnasium.make("Hopper-v5"), impossible, unavoidable=how) for how in ("least", "kept"))
+    for env in (least, kept):
+        env.reset(seed=3)
+    action = np.full(3, 0.9, np.float32)
+    other, verdict = least.safe(action)
+    assert verdict == "outside" and not np.array_equal(other, action)
+    same, verdict = kept.safe(action)
+    assert verdict == "outside" and np.array_equal(same, action)
+    with pytest.raises(ValueError, match="unavoidable is 'never'"):
+        nearl.Guard(gymnasium.make("Hopper-v5"), impossible, unavoidable="never")
+
+
+def test_a_projected_environment_has_a_length_of_its_own_and_draws_itself():
+    env = nearl.ProjectedEnv("Panda-reach", max_episode_steps=60, render_mode="rgb_array", width=96, height=64)
+    env.reset(seed=1)
+    ends = [env.step(env.action_space.sample())[3] for _ in range(3)]
+    assert ends == [False, False, True], "three policy periods of 20 control periods"
+    try:
+        picture = env.render()
+    except nearl.render.VideoError as error:
+        pytest.skip(str(error))
+    assert picture.shape == (64, 96, 3) and picture.std() > 5
+    env.close()
+    with pytest.raises(ValueError, match="max_episode_steps is 0"):
+        nearl.ProjectedEnv("Panda-reach", max_episode_steps=0)
+    with pytest.raises(ValueError, match="give 'rgb_array'"):
+        gymnasium.make("nearl/Panda-reach", constraints="task", render_mode="human")
+
+
 @pytest.fixture
 def example():
     spec = importlib.util.spec_from_file_location("sb3_guarded", pathlib.Path(__file__).parents[2] / "examples/python/sb3_guarded.py")

@@ -83,6 +83,45 @@ def test_mistakes_are_named(tmp_path) -> None:
         loop.stop()
 
 
+def nearl_command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "nearl", *map(str, arguments)]
+
+
+def test_an_imported_policy_without_a_reward_is_its_own_plant(tmp_path) -> None:
+    """``nearl plant SNAPSHOT`` simulates the robot that travels in the snapshot, from the start that its recipe says."""
+    (tmp_path / "carriage.urdf").write_text(CARRIAGE)
+    (tmp_path / "recipe.toml").write_text(RECIPE.replace("dt = 0.001", "dt = 0.002") + "[reset]\nq = { slide = 0.2 }\n")
+    policy = nearl.Policy.from_layers([([[-2.0, -0.5]], [0.0], "identity")], [0, 0], [1, 1], (-np.inf, np.inf), (-np.inf, np.inf))
+    snapshot = tmp_path / "spring.safetensors"
+    policy.controller(tmp_path / "carriage.urdf", tmp_path / "recipe.toml", "spring").save(snapshot)
+    plant = subprocess.Popen(nearl_command("plant", snapshot, "--name", name("own"), "--lockstep"), stdout=subprocess.DEVNULL)
+    q: list[float] = []
+    try:
+        with nearl.Loop(snapshot, name("own"), patience=30.0, ramp=0.0), nearl.Link(name("own")) as link:
+            while len(q) < 3000:
+                states = link.states()
+                q += list(states.q[:, 0])
+                assert states.lost == 0 or len(q) > 100
+    finally:
+        plant.terminate()
+        assert plant.wait(20) == 0
+    assert max(q) <= 0.2 + 1e-9 and abs(q[-1]) < 0.02 and min(q) > -0.2
+
+
+def test_a_guard_that_only_a_simulator_has_is_said(tmp_path) -> None:
+    (tmp_path / "recipe.toml").write_text(RECIPE + '[constraints]\nguard = "simulator"\n')
+    (tmp_path / "carriage.urdf").write_text(CARRIAGE)
+    policy = nearl.Policy.from_layers([([[-2.0, -0.5]], [0.0], "identity")], [0, 0], [1, 1], (-np.inf, np.inf), (-np.inf, np.inf))
+    snapshot = tmp_path / "spring.safetensors"
+    policy.controller(tmp_path / "carriage.urdf", tmp_path / "recipe.toml", "spring").save(snapshot)
+    said = subprocess.run(nearl_command("doctor", snapshot), capture_output=True, text=True, check=False).stdout
+    assert "a robot's driver has not" in said, said
+    with open_plant("unguarded", lockstep=True) as plant, nearl.Loop(snapshot, name("unguarded"), ramp=0.0) as loop:
+        for _ in range(20):
+            plant.exchange([0.1], [0.0], [0.1, 0.0], patience=1.0)
+    assert loop.report is not None and any("a robot's driver has not" in warning for warning in loop.report["warnings"])
+
+
 def test_the_driver_of_the_page(tmp_path) -> None:
     """``examples/driver.py`` beside a loop; Rust and C have the same in runtime/c/tests."""
     with nearl.Loop(spring(tmp_path), name("page"), patience=20.0, ramp=0.0):

@@ -173,6 +173,9 @@ fn notes(model: &Model, projector: &Projector) -> Check {
 
 /// Does anything keep the limits at all?
 fn projection(m: &Manifest) -> Check {
+    if let Some(text) = m.without_simulator() {
+        return warn(CheckCode::Projection, text.into());
+    }
     match m.proposes() {
         false => warn(
             CheckCode::Projection,

@@ -24,14 +24,16 @@ pub fn snapshot(task: &str, actions: bool) -> Result<Snapshot, VectorError> {
     if actions {
         manifest.task.constraints.guard = Guard::Model;
     }
-    let of = &manifest.task;
-    let is_native = env::REGISTRY.iter().any(|e| e.name == of.name);
-    if is_native || of.env.is_some() || !of.reward.is_empty() {
-        train::complete(&mut manifest)?;
-    } else {
-        range(&mut manifest)?;
-    }
+    complete(&mut manifest)?;
     Ok(if actions { space::idle(manifest) } else { space::still(manifest) })
+}
+
+/// Fills in what the environment of the task knows, or what follows from the robot where it is none.
+///
+/// # Errors
+/// As [`snapshot`].
+pub fn complete(manifest: &mut Manifest) -> Result<(), VectorError> {
+    if env::is_known(&manifest.task) { Ok(train::complete(manifest)?) } else { range(manifest) }
 }
 
 /// The range of the actions: what the motors give, and where drives may be sent.

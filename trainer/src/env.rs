@@ -315,6 +315,14 @@ pub fn of_task(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvErr
     user::with_cost(env, task, origin)
 }
 
+/// The environment of a plant: that of the task, or a robot without reward, which starts anew only where it cannot be simulated.
+///
+/// # Errors
+/// As [`of_task`].
+pub fn of_plant(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvError> {
+    if is_known(&manifest.task) { of_task(manifest, origin) } else { user::build(manifest, origin) }
+}
+
 /// Whether a task file describes or names an environment: by `[reward]`, by `env`, or by the name of a native one.
 pub fn is_known(task: &Task) -> bool {
     user::is_own(task) || task.env.is_some() || entry(&task.name).is_ok()

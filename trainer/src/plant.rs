@@ -94,7 +94,7 @@ impl MujocoPlant {
     /// # Errors
     /// [`PlantError`].
     pub fn new(manifest: &Manifest, seed: u64, resets: bool) -> Result<Self, PlantError> {
-        let mut env = crate::env::of_task(manifest, &manifest.task.name)?;
+        let mut env = crate::env::of_plant(manifest, &manifest.task.name)?;
         let Parts { model, projector, .. } = Parts::new(manifest)?;
         let mut rng = stream(seed, 0);
         env.reset(&mut rng)?;

@@ -116,6 +116,15 @@ impl Manifest {
         network && self.task.constraints.guard == Guard::Drive
     }
 
+    /// What a loop cannot do for this policy: its task asks for a guard that steps a simulator, which a robot does not have.
+    pub fn without_simulator(&self) -> Option<&'static str> {
+        let network = self.policy == PolicyKind::Direct || self.task.idm.kind == IdmKind::Learned;
+        (network && self.task.constraints.guard == Guard::Simulator).then_some(
+            "constraints.guard is \"simulator\", which `nearl plant` and training have and a robot's driver has not: there its actions go to the motors as they are; \
+             for a robot write guard = true or guard = \"drive\"",
+        )
+    }
+
     /// Whether a state is proposed in each tick, by the policy or by the guard on its behalf.
     pub fn proposes(&self) -> bool {
         self.policy != PolicyKind::Direct || self.guards()

@@ -225,7 +225,9 @@ pub fn run(
     if let Some(pinned) = &pinned {
         settings.metadata.insert("limits".into(), pinned.to_json());
     }
-    run_loop(link, robot, first, PilotBuilder { pinned }, &settings, stop)
+    let mut report = run_loop(link, robot, first, PilotBuilder { pinned }, &settings, stop)?;
+    report.warnings.extend(snapshot.manifest.without_simulator().map(str::to_owned));
+    Ok(report)
 }
 
 /// Refuses a robot whose motors cannot hold it within its limits: it would brake until it fell.

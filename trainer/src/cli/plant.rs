@@ -1,19 +1,22 @@
 //! `nearl plant`: MuJoCo as the robot, over shared memory.
 
 use super::{Failure, say};
+use crate::blank::complete;
 use crate::plant::MujocoPlant;
 use crate::tasks;
-use crate::train::complete;
 use clap::Args;
 use nearl_runtime::cli::{Ended, LOOP_GONE, MEMORY_TORN};
 use nearl_runtime::link::{METERS, PlantLink, PlantReport, PlantRunner, PlantSettings, RobotName};
 use nearl_runtime::rt::{FaultPlan, FaultyPlant, Reason, Stop};
+use nearl_runtime::snapshot::in_run;
+use nearl_runtime::{Manifest, Snapshot};
 use std::collections::BTreeMap;
 use std::io::Write;
+use std::path::Path;
 
 #[derive(Args)]
 pub(super) struct PlantCommand {
-    /// Task name (see `nearl tasks`) or TOML file.
+    /// Task name (see `nearl tasks`), TOML file, or snapshot: also of a robot without a reward, as an imported policy's.
     task: String,
     /// Name of the robot; the runtime says the same with `--plant`.
     #[arg(long)]
@@ -49,8 +52,7 @@ pub(super) struct PlantCommand {
 
 impl PlantCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let mut manifest = tasks::load(&self.task, &self.set)?;
-        complete(&mut manifest)?;
+        let manifest = self.manifest()?;
         let plan = self.faults.as_deref().map(FaultPlan::load).transpose()?.unwrap_or_default();
         let plant = MujocoPlant::new(&manifest, self.seed, !self.endless)?;
         let dt = plant.dt();
@@ -101,6 +103,22 @@ impl PlantCommand {
             });
         }
         ended(&report, &name)
+    }
+}
+
+impl PlantCommand {
+    /// The robot and its task.
+    fn manifest(&self) -> Result<Manifest, Failure> {
+        let file = in_run(Path::new(&self.task));
+        if file.extension().is_some_and(|e| e == "safetensors") {
+            if !self.set.is_empty() {
+                return Err("--set changes task files, and this is a snapshot; make another one, or give the task file".into());
+            }
+            return Ok(Snapshot::load(&file)?.manifest);
+        }
+        let mut manifest = tasks::load(&self.task, &self.set)?;
+        complete(&mut manifest)?;
+        Ok(manifest)
     }
 }
 
