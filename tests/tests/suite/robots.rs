@@ -349,7 +349,8 @@ fn a_task_finds_what_its_robot_includes() {
 /// A snapshot of the first format carried its robot as text: of a URDF it is read, of an MJCF it says what to do.
 #[test]
 fn snapshots_of_the_first_format() {
-    let old = std::fs::read(root().join("tests/fixtures/format_1.safetensors")).expect("a snapshot of format 1");
+    let old =
+        std::fs::read(root().join("tests/fixtures/format_1.safetensors")).expect("a snapshot of format 1");
     let snapshot = Snapshot::from_bytes(&old).expect("a URDF robot");
     assert_eq!(snapshot.manifest.format, 2);
     let urdf = Model::from_urdf(&root().join("examples/robots/panda/panda.urdf")).expect("the same robot");
