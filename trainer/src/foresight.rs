@@ -3,6 +3,7 @@
 //! Every other action costs nothing but a copy of the state: its step is taken over as it was foreseen. Limits are those on positions and
 //! velocities of joints, of the state that is reached, contacts included; one period is looked ahead.
 
+mod interior;
 mod nearest;
 
 pub use nearest::Nearest;

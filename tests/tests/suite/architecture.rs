@@ -21,7 +21,7 @@ const NOT_EMBEDDED: &[&str] = &["iceoryx2", "clap", "mcap", "rtrb", "signal-hook
 
 /// Libraries that only these crates may name.
 const OWNED: &[(&str, &[&str])] = &[
-    ("clarabel", &["nearl-constraints"]),
+    ("clarabel", &["nearl-constraints", "nearl-trainer"]),
     ("iceoryx2", &["nearl-runtime", "nearl-rollout-protocol"]),
     ("mujoco-rs", &["nearl-trainer"]),
     ("pyo3", &["nearl-python"]),

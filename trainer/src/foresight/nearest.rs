@@ -1,7 +1,9 @@
 //! The nearest action by linearised dynamics: a small quadratic programme whose rows may give way.
 
+use super::interior;
+
 /// Sweeps over the rows.
-const SWEEPS: usize = 500;
+const SWEEPS: usize = 100;
 /// What a row's excess costs, in units of the distance: rows give way only where they cannot all hold.
 const WORTH: f64 = 1e3;
 /// Change of a multiplier that ends the sweeps.
@@ -13,8 +15,8 @@ const SMALL: f64 = 1e-9;
 ///     min_u 1/2 |u - asked|^2 + WORTH sum s      s.t.  lower - s <= S (u - trial) <= upper + s,   -1 <= u <= 1
 /// ```
 ///
-/// with rows scaled to unit length, by coordinate ascent on the dual (Hildreth 1957): a multiplier that would pass `WORTH` stays there. Exact in the
-/// limit; an answer counts only after a step of the simulator.
+/// with rows scaled to unit length, by coordinate ascent on the dual (Hildreth 1957): a multiplier that would pass `WORTH` stays there. Where the sweeps have not settled,
+/// because rows contradict each other, Clarabel solves it. An answer counts only after a step of the simulator.
 pub struct Nearest {
     n: usize,
     u: Vec<f64>,
@@ -34,16 +36,43 @@ impl Nearest {
         &self.u
     }
 
-    /// Solves with `slope` (rows x n) at `trial` (n); `bounds` of a row are those of its change from there.
+    /// Solves with `slope` (rows x n) at `trial` (n); `bounds` of a row are those of its change from there. Allocates only where the sweeps do not settle.
     pub fn solve(&mut self, asked: &[f64], trial: &[f64], slope: &[f64], bounds: impl Fn(usize) -> [f64; 2]) {
+        if self.ascend_all(asked, trial, slope, &bounds) {
+            return;
+        }
+        let unit: Vec<f64> = slope
+            .chunks_exact(self.n)
+            .zip(&self.scale)
+            .flat_map(|(row, scale)| row.iter().map(move |g| if *scale < 1e-12 { 0.0 } else { g / scale }))
+            .collect();
+        let of_value = |(r, row): (usize, &[f64])| {
+            let at: f64 = row.iter().zip(trial).map(|(g, t)| g * t).sum();
+            bounds(r).map(|b| b / self.scale[r].max(1e-12) + at)
+        };
+        let bounds: Vec<[f64; 2]> = unit.chunks_exact(self.n).enumerate().map(of_value).collect();
+        if let Some(found) = interior::solve(asked, &unit, &bounds, WORTH) {
+            self.u = found;
+        }
+    }
+
+    /// The sweeps alone; whether they settled.
+    fn ascend_all(
+        &mut self,
+        asked: &[f64],
+        trial: &[f64],
+        slope: &[f64],
+        bounds: impl Fn(usize) -> [f64; 2],
+    ) -> bool {
         let (n, rows) = (self.n, self.scale.len());
         self.u.copy_from_slice(asked);
         self.multiplier.fill(0.0);
         for (scale, row) in self.scale.iter_mut().zip(slope.chunks_exact(n)) {
             *scale = row.iter().map(|g| g * g).sum::<f64>().sqrt();
         }
+        let mut change = 0.0_f64;
         for _ in 0..SWEEPS {
-            let mut change = 0.0_f64;
+            change = 0.0;
             for r in 0..rows {
                 let (row, scale) = (&slope[r * n..(r + 1) * n], self.scale[r]);
                 if scale < 1e-12 {
@@ -71,6 +100,7 @@ impl Nearest {
             }
         }
         self.u.iter_mut().for_each(|u| *u = u.clamp(-1.0, 1.0));
+        change < SMALL
     }
 }
 
@@ -100,58 +130,27 @@ mod tests {
         assert!((u[0] - 0.75).abs() < 1e-9 && (u[1] - 0.25).abs() < 1e-9, "{u:?}");
     }
 
-    /// The programme of [`Nearest`] with its excesses written out, by an interior point method. Its value.
-    fn by_clarabel(asked: &[f64], trial: &[f64], slope: &[f64], bounds: &[[f64; 2]]) -> f64 {
-        use clarabel::algebra::CscMatrix;
-        use clarabel::solver::{DefaultSettings, DefaultSolver, IPSolver, SupportedConeT};
-        let (n, rows) = (asked.len(), bounds.len());
-        // Variables: the action, then an excess for each row.
-        let mut p = vec![vec![0.0; n + rows]; n + rows];
-        (0..n).for_each(|k| p[k][k] = 1.0);
-        let cost: Vec<f64> = asked.iter().map(|a| -a).chain(vec![WORTH; rows]).collect();
-        let (mut a, mut b) = (Vec::new(), Vec::new());
-        for (r, [lower, upper]) in bounds.iter().enumerate() {
-            let row = &slope[r * n..(r + 1) * n];
+    /// Value of the programme at `u`.
+    fn value(u: &[f64], asked: &[f64], trial: &[f64], slope: &[f64], bounds: &[[f64; 2]]) -> f64 {
+        let way = u.iter().zip(asked).map(|(u, a)| (u - a) * (u - a)).sum::<f64>();
+        let excess = slope.chunks_exact(u.len()).zip(bounds).map(|(row, [lower, upper])| {
             let size = row.iter().map(|g| g * g).sum::<f64>().sqrt();
-            let at: f64 = row.iter().zip(trial).map(|(g, t)| g * t).sum();
-            for (side, bound) in [(1.0, upper + at), (-1.0, -lower - at)] {
-                let mut line: Vec<f64> = row.iter().map(|g| side * g / size).collect();
-                line.extend((0..rows).map(|k| if k == r { -1.0 } else { 0.0 }));
-                (a.push(line), b.push(bound / size));
-            }
-            let line: Vec<f64> = (0..n + rows).map(|k| if k == n + r { -1.0 } else { 0.0 }).collect();
-            (a.push(line), b.push(0.0));
-        }
-        for k in 0..n {
-            for side in [1.0, -1.0] {
-                let line: Vec<f64> = (0..n + rows).map(|i| if i == k { side } else { 0.0 }).collect();
-                (a.push(line), b.push(1.0));
-            }
-        }
-        let settings = DefaultSettings {
-            verbose: false,
-            tol_gap_abs: 1e-10,
-            tol_gap_rel: 1e-10,
-            tol_feas: 1e-10,
-            ..DefaultSettings::default()
-        };
-        let cones = [SupportedConeT::NonnegativeConeT(b.len())];
-        let (p, a) = (CscMatrix::from(p.iter()).to_triu(), CscMatrix::from(a.iter()));
-        let mut solver = DefaultSolver::new(&p, &cost, &a, &b, &cones, settings).expect("a programme");
-        solver.solve();
-        solver.solution.obj_val + 0.5 * asked.iter().map(|x| x * x).sum::<f64>()
+            let at: f64 = row.iter().zip(u.iter().zip(trial)).map(|(g, (u, t))| g * (u - t)).sum();
+            (lower - at).max(at - upper).max(0.0) / size
+        });
+        0.5 * way + WORTH * excess.sum::<f64>()
     }
 
-    /// Against Clarabel, whose value is the least there is: random programmes of the sizes of the guard's, half of them with rows that cannot all hold. Prints the
-    /// times of both with `--nocapture`.
+    /// No point near the solution has a lower value: random programmes of the sizes of the guard's, half of them with rows that cannot all hold. Prints with
+    /// `--nocapture` what both ways take, and what the ascent alone is worth.
     #[test]
-    fn the_value_is_that_of_an_interior_point_method() {
+    fn no_point_has_a_lower_value() {
         use rand::RngExt;
         use rand_chacha::ChaCha8Rng;
         use rand_chacha::rand_core::SeedableRng;
         use std::time::Instant;
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let (mut ours, mut theirs, mut worst, mut torn) = (0.0, 0.0, 0.0_f64, 0);
+        let (mut seconds, mut counts, mut worst) = ([0.0; 2], [0; 2], [0.0_f64; 2]);
         for problem in 0..300 {
             let (n, rows) = (3 + problem % 6, 6 + problem % 11);
             let mut draw =
@@ -161,27 +160,31 @@ mod tests {
             let bounds: Vec<[f64; 2]> = draw(rows, 1.0).iter().map(|x| [x - width, x + width]).collect();
             let mut nearest = Nearest::new(n, rows);
             let begin = Instant::now();
+            let converged = nearest.ascend_all(&asked, &trial, &slope, |r| bounds[r]);
+            let alone = value(nearest.solution(), &asked, &trial, &slope, &bounds);
+            let middle = Instant::now();
             nearest.solve(&asked, &trial, &slope, |r| bounds[r]);
-            ours += begin.elapsed().as_secs_f64();
-            let begin = Instant::now();
-            let least = by_clarabel(&asked, &trial, &slope, &bounds);
-            theirs += begin.elapsed().as_secs_f64();
-            let u = nearest.solution();
-            let mut value = 0.5 * u.iter().zip(&asked).map(|(u, a)| (u - a) * (u - a)).sum::<f64>();
-            for (row, [lower, upper]) in slope.chunks_exact(n).zip(&bounds) {
-                let size = row.iter().map(|g| g * g).sum::<f64>().sqrt();
-                let at: f64 = row.iter().zip(u.iter().zip(&trial)).map(|(g, (u, t))| g * (u - t)).sum();
-                value += WORTH * (lower - at).max(at - upper).max(0.0) / size;
+            let which = usize::from(!converged);
+            seconds[which] += if converged { begin.elapsed() / 2 } else { middle.elapsed() }.as_secs_f64();
+            counts[which] += 1;
+            let u = nearest.solution().to_vec();
+            let found = value(&u, &asked, &trial, &slope, &bounds);
+            worst[which] = worst[which].max((alone - found) / found.max(1.0));
+            for step in 0..60 {
+                let size = 0.3_f64.powi(1 + step % 6);
+                let beside: Vec<f64> =
+                    u.iter().zip(draw(n, size)).map(|(u, d)| (u + d).clamp(-1.0, 1.0)).collect();
+                let least = value(&beside, &asked, &trial, &slope, &bounds);
+                assert!(least > found - 1e-5 * found.max(1.0), "problem {problem}: {least} < {found}");
             }
-            torn += usize::from(least > 1.0 + n as f64 * 2.0);
-            worst = worst.max((value - least) / least.max(1.0));
         }
+        let each = [0, 1].map(|k| 1e6 * seconds[k] / f64::from(counts[k]));
         println!(
-            "{:.1} us each, Clarabel {:.1} us; {torn} torn, worst {worst:.1e}",
-            ours / 3e-4,
-            theirs / 3e-4
+            "{} by ascent, {:.1} us each; {} go on to Clarabel, {:.1} us each, where the ascent alone is up to {:.1} times worse",
+            counts[0], each[0], counts[1], each[1], worst[1]
         );
-        assert!(torn > 100 && worst < 1e-3, "{worst}");
+        assert!(counts[0] > 100 && counts[1] > 50, "{counts:?}");
+        assert!(worst[0] < 1e-6 && worst[1] > 0.1, "{worst:?}");
     }
 
     /// A row that the box forbids gives way as little as it can, and the other still holds.
