@@ -65,7 +65,7 @@ enum Command {
     /// MuJoCo as the robot, in real time, over shared memory.
     Plant(plant::PlantCommand),
     /// Run a snapshot on a plant in real time.
-    Run(nearl_runtime::cli::RunCommand),
+    Run(Box<nearl_runtime::cli::RunCommand>),
     /// Constrained rollouts for other processes, over shared memory.
     Serve(serve::Serve),
     /// Compute every tick of a flight log again and compare it bit for bit.

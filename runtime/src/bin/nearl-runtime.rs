@@ -17,7 +17,7 @@ struct Arguments {
 #[derive(Subcommand)]
 enum Command {
     /// Run a snapshot on a plant in real time.
-    Run(RunCommand),
+    Run(Box<RunCommand>),
     /// Compute every tick of a flight log again and compare it bit for bit.
     Replay(ReplayCommand),
     /// Say what a code means and what to do.
