@@ -33,6 +33,7 @@ class PID2:
         threads: At least 1; all cores by default.
         settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.scale": 0.8}``.
         preset: Settings by name, ``"paper"`` or ``"strong"``; ``settings`` come after them.
+        demos: Demonstrations (``.npz``) for ``bc``, ``soil``, ``dapg`` and ``pid2-il``; ``nearl demos record RUN`` writes some.
         run: Run folder to write as ``nearl train`` does; none by default.
 
     Raises:
@@ -49,9 +50,12 @@ class PID2:
         threads: int | None = None,
         settings: Mapping[str, Any] | None = None,
         preset: str | None = None,
+        demos: str | os.PathLike[str] | None = None,
         run: str | os.PathLike[str] | None = None,
     ):
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
+        if demos is not None:
+            overrides.append(f"train.demos.file={_toml(os.path.abspath(demos))}")
         if not 0 <= seed < 2**64:
             raise ValueError(f"seed is {seed}; give a whole number from 0 to 2**64 - 1")
         self._training: _core.Training | None = _core.Training(os.fspath(task), algo, seed, _threads(threads), overrides, run, preset)

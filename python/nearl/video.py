@@ -1,6 +1,7 @@
-"""A video of a trained policy, through MuJoCo's own renderer, on a machine without a screen.
+"""A video of a trained policy or of demonstrations, through MuJoCo's own renderer, on a machine without a screen.
 
     python -m nearl.video runs/HalfCheetah-v5/pid2-ib_0 cheetah.mp4
+    python -m nearl.video demos.npz demos.mp4 --task HalfCheetah-v5
 """
 
 import argparse
@@ -9,6 +10,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from nearl import _core
 from nearl.pid2 import PID2
@@ -25,11 +28,12 @@ def record(
     size: tuple[int, int] = (640, 480),
     camera: str | None = None,
     seed: int = 0,
+    task: str | os.PathLike[str] | None = None,
 ) -> int:
-    """Writes episodes without exploration as a video.
+    """Writes episodes without exploration, or demonstrated ones, as a video.
 
     Args:
-        run: Run folder or snapshot file.
+        run: Run folder, snapshot file, or demonstrations (``.npz``).
         out: ``.mp4`` (needs imageio-ffmpeg) or ``.gif``.
         episodes: Number of episodes.
         seconds: Cuts each episode after so much simulated time [s].
@@ -37,6 +41,7 @@ def record(
         size: Width and height [pixel].
         camera: A camera of the robot file; by default its ``track``, else one that follows the robot.
         seed: Of the first initial state.
+        task: Of the demonstrations, name or file.
 
     Returns:
         Number of frames.
@@ -44,15 +49,21 @@ def record(
     Raises:
         VideoError: no renderer, or no encoder.
         OSError: the run cannot be read.
+        ValueError: demonstrations without their task, or of another robot.
     """
-    agent, env = PID2.load(run), _core.Env.of_snapshot(run)
-    stride = max(1, round(1.0 / (fps * env.dt)))
-    frames = _frames(agent, env, episodes, seconds, stride, size, camera, seed)
+    if Path(run).suffix == ".npz":
+        if task is None:
+            raise ValueError(f"'{run}' are demonstrations; say of which task with task= (--task)")
+        frames, period = _demonstrated(run, _core.Env(os.fspath(task)), episodes, seconds, fps, size, camera)
+    else:
+        agent, env = PID2.load(run), _core.Env.of_snapshot(run)
+        stride = max(1, round(1.0 / (fps * env.dt)))
+        frames, period = _frames(agent, env, episodes, seconds, stride, size, camera, seed), stride * env.dt
     try:
         import imageio
 
         options: dict[str, Any] = {"loop": 0} if Path(out).suffix == ".gif" else {"macro_block_size": 2}
-        with imageio.get_writer(out, fps=1.0 / (stride * env.dt), **options) as writer:
+        with imageio.get_writer(out, fps=1.0 / period, **options) as writer:
             n = 0
             for frame in frames:
                 writer.append_data(frame)
@@ -88,10 +99,34 @@ def _frames(
         renderer.close()
 
 
+def _demonstrated(
+    file: str | os.PathLike[str], env: _core.Env, episodes: int, seconds: float | None, fps: float, size: tuple[int, int], camera: str | None
+) -> tuple[Iterator[Frame], float]:
+    """States of the first episodes of a file, and the time between two frames [s]."""
+    with np.load(file, allow_pickle=False) as data:
+        qpos, qvel, lengths, dt = data["qpos"], data["qvel"], data["lengths"].astype(int), float(data["dt"])
+    if (qpos.shape[1], qvel.shape[1]) != (env.nq, env.nv):
+        raise ValueError(f"'{file}' has {qpos.shape[1]} positions and {qvel.shape[1]} velocities a state; the robot of '{env.task}' has {env.nq} and {env.nv}")
+    stride = max(1, round(1.0 / (fps * dt)))
+    firsts = np.concatenate([[0], np.cumsum(lengths + 1)[:-1]])[:episodes]
+    most = max(lengths) + 1 if seconds is None else round(seconds / dt)
+
+    def frames() -> Iterator[Frame]:
+        renderer = Renderer(env, size, camera)
+        try:
+            for first, length in zip(firsts, lengths):
+                for row in range(first, first + min(length + 1, most), stride):
+                    yield renderer.frame(qpos[row], qvel[row])
+        finally:
+            renderer.close()
+
+    return frames(), stride * dt
+
+
 def main(arguments: list[str] | None = None) -> int:
     """0 on success, 1 with one sentence on standard error otherwise."""
-    parser = argparse.ArgumentParser(prog="python -m nearl.video", description="A video of a trained policy.")
-    parser.add_argument("run", metavar="RUN", help="run folder or snapshot file")
+    parser = argparse.ArgumentParser(prog="python -m nearl.video", description="A video of a trained policy, or of demonstrations.")
+    parser.add_argument("run", metavar="RUN", help="run folder, snapshot file, or demonstrations (.npz)")
     parser.add_argument("out", metavar="FILE", help=".mp4 or .gif")
     parser.add_argument("--episodes", type=int, default=1)
     parser.add_argument("--seconds", type=float, help="cut each episode after so much simulated time")
@@ -99,6 +134,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--camera", help="a camera of the robot file")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--task", help="of the demonstrations, name or file")
     given: dict[str, Any] = vars(parser.parse_args(arguments))
     given["size"] = tuple(given["size"])
     try:

@@ -10,6 +10,11 @@
 //! | `actions` | sum length x n_act | optional |
 
 pub mod npz;
+mod rows;
+mod settings;
+
+pub use rows::Frame;
+pub use settings::DemoSettings;
 
 use crate::env::Env;
 use crate::rollout::{RolloutError, Worker, make_env, stream};

@@ -6,11 +6,14 @@
 mod adam;
 mod algorithm;
 mod batch;
+pub mod bc;
 mod combined;
+pub mod dapg;
 mod discriminator;
 mod epochs;
 mod gae;
 mod gaussian;
+mod imitation;
 mod init;
 mod inverse;
 mod losses;
@@ -21,25 +24,33 @@ mod nets;
 mod one_step;
 pub mod optimise;
 pub mod pid2;
+pub mod pid2_il;
 pub mod ppo;
 #[cfg(test)]
 mod reference;
+mod rescale;
+pub mod soil;
 mod value;
 
 pub use adam::Adam;
 pub use algorithm::{ALGORITHMS, Algorithm, UnknownAlgorithm};
 pub use batch::{Batch, Stretch};
+pub use bc::Bc;
 pub use combined::{Gradient, Kind};
+pub use dapg::Dapg;
 pub use epochs::Pace;
 pub use gae::{Advantages, advantages};
 pub use gaussian::MOST_OUTPUTS;
+pub use imitation::Imitator;
 pub use inverse::Reading;
 pub use nearl::{Nearl, NearlSettings};
 pub use net::{Net, Tape};
 pub use nets::NetSettings;
 pub use optimise::{Params, Schedule};
 pub use pid2::{Pid2, Pid2Settings};
+pub use pid2_il::Pid2Il;
 pub use ppo::{Ppo, PpoSettings};
+pub use soil::Soil;
 
 use nearl_runtime::Networks;
 use nearl_runtime::normaliser::Normaliser;
@@ -76,6 +87,10 @@ pub trait Learner: Send {
     /// Learns from a batch at the pace of the run's schedule; `rng` orders the minibatches and draws noise. Log probabilities, advantages
     /// and returns of the batch may be estimated again on the way.
     fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics;
+    /// Itself, if it learns from demonstrations.
+    fn imitator(&mut self) -> Option<&mut dyn Imitator> {
+        None
+    }
 }
 
 /// The inverse model's mean squared error before and after an update, the part of the actions' variance that it explains, and

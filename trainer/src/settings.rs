@@ -1,5 +1,6 @@
 //! `[train]` of the task file: how experience is collected, and the learner's own sections.
 
+use crate::demos::DemoSettings;
 use crate::learn::{NearlSettings, NetSettings, Pid2Settings, PpoSettings};
 use nearl_runtime::task::suggest;
 use serde::{Deserialize, Serialize};
@@ -73,8 +74,10 @@ pub struct TrainSettings {
     pub ppo: PpoSettings,
     /// Settings of `nearl`.
     pub nearl: NearlSettings,
-    /// Settings of `pid2-ib` and `pid2-gan`.
+    /// Settings of `pid2-ib`, `pid2-gan` and `pid2-il`.
     pub pid2: Pid2Settings,
+    /// Demonstrations, and what is learned from them.
+    pub demos: DemoSettings,
 }
 
 impl Default for TrainSettings {
@@ -100,6 +103,7 @@ impl Default for TrainSettings {
             ppo: PpoSettings::default(),
             nearl: NearlSettings::default(),
             pid2: Pid2Settings::default(),
+            demos: DemoSettings::default(),
         }
     }
 }
@@ -137,6 +141,7 @@ impl TrainSettings {
             ));
         }
         settings.nets.check()?;
+        settings.demos.check()?;
         Ok(settings)
     }
 
@@ -222,7 +227,7 @@ mod tests {
                 value => compare("## `[train]`", key, value),
             }
         }
-        assert_eq!(keys, 55);
+        assert_eq!(keys, 66);
         for column in crate::train::COLUMNS {
             assert!(page.contains(&format!("`{column}`")), "{column}");
         }

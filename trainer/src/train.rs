@@ -1,6 +1,7 @@
 //! `nearl train`: collect, estimate advantages, update, write. The loop of every algorithm.
 
 mod columns;
+mod imitation;
 mod resume;
 mod run;
 mod served;
@@ -14,12 +15,14 @@ pub use setup::{complete, limit_scale};
 pub use source::{Experience, Source, SourceError};
 
 use crate::checkpoint::CheckpointError;
+use crate::demos::DemoError;
 use crate::evaluate::evaluate;
 use crate::learn::{Algorithm, Batch, Dims, Learner, Metrics, Pace, Stretch, UnknownAlgorithm};
 use crate::rollout::{Collected, RolloutError, Segment, Tally, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
+use imitation::Imitation;
 use nearl_rollout_protocol::Layout;
 use nearl_runtime::controller::{Parts, seen_entries};
 use nearl_runtime::normaliser::Normaliser;
@@ -37,6 +40,9 @@ pub enum TrainError {
     /// The `[train]` section, or what does not fit the task.
     #[error("{0}")]
     Settings(String),
+    /// Demonstrations.
+    #[error(transparent)]
+    Demos(#[from] DemoError),
     /// Rollouts.
     #[error(transparent)]
     Rollout(#[from] RolloutError),
@@ -95,6 +101,7 @@ pub struct Training {
     snapshot: Snapshot,
     learner: Box<dyn Learner>,
     source: Box<dyn Source>,
+    imitation: Option<Imitation>,
     /// The last batch: its memory is used again.
     batch: Batch,
     /// Return of the best networks so far without noise, and whether they are the present ones.
@@ -156,6 +163,8 @@ impl Training {
         check_experience(&settings, experience)?;
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
+        let imitation =
+            Imitation::read(request.algo, &settings, &manifest, parts.layout.state(), request.steps)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);
         manifest.activation = settings.nets.activation;
         let learner = learner(request.algo, &manifest, &settings, dims.clone(), request.threads, &mut rng);
@@ -166,16 +175,23 @@ impl Training {
         let networks = learner.networks(&normaliser);
         let snapshot = Snapshot { manifest, networks };
         let sizes = Layout { n_obs: dims.n_obs, n_state: dims.n_state, n_act: dims.n_act };
-        let source = experience.open(&snapshot, sizes, &settings, request.threads, request.seed)?;
+        let mut source = experience.open(&snapshot, sizes, &settings, request.threads, request.seed)?;
+        let (mut obs_stats, mut change_stats) =
+            (RunningStats::new(dims.n_obs), RunningStats::new(dims.n_state));
+        if let Some(imitation) = &imitation {
+            imitation.place(&mut *source)?;
+            imitation.seed(&mut obs_stats, &mut change_stats);
+        }
         Ok(Self {
-            obs_stats: RunningStats::new(dims.n_obs),
-            change_stats: RunningStats::new(dims.n_state),
+            obs_stats,
+            change_stats,
             return_stats: RunningStats::new(1),
             algo: request.algo,
             settings,
             snapshot,
             learner,
             source,
+            imitation,
             batch: Batch::default(),
             best: None,
             is_best: false,
@@ -243,7 +259,7 @@ impl Training {
         let mut metrics = if learns {
             self.fill_batch();
             let start = Instant::now();
-            let metrics = self.learner.update(&mut self.batch, pace, &mut self.rng);
+            let metrics = self.learn(pace);
             self.learning_seconds += start.elapsed().as_secs_f64();
             metrics
         } else {
@@ -253,6 +269,7 @@ impl Training {
         self.snapshot.manifest.steps += (self.settings.n_envs * self.settings.n_steps) as u64;
         self.snapshot.manifest.version += 1;
         self.refresh();
+        metrics.extend(self.pretrain());
         if self.passed(self.settings.eval_every) {
             metrics.push((EVALUATED, self.evaluate()?));
         }
@@ -267,6 +284,36 @@ impl Training {
             tally,
             metrics,
         }))
+    }
+
+    /// An update from the batch, or in the warm-up of the inverse model alone.
+    fn learn(&mut self, pace: Pace) -> Metrics {
+        let (Some(imitation), iterations) = (&self.imitation, self.snapshot.manifest.version) else {
+            return self.learner.update(&mut self.batch, pace, &mut self.rng);
+        };
+        if let Some(imitator) = self.learner.imitator() {
+            if imitation.warms_up(iterations) {
+                return imitator.warm_up(&self.batch, &mut self.rng);
+            }
+            let rows = imitation.batch(&self.snapshot.networks.normaliser);
+            imitator.see(rows, imitation.weight(iterations));
+        }
+        let mut metrics = self.learner.update(&mut self.batch, pace, &mut self.rng);
+        metrics.push(("demos/weight", imitation.weight(iterations)));
+        metrics
+    }
+
+    /// Learns from the demonstrations alone, once, when the warm-up is over.
+    fn pretrain(&mut self) -> Metrics {
+        let now = self.imitation.as_ref().filter(|i| i.pretrains(self.snapshot.manifest.version));
+        let (Some(imitation), Some(imitator)) = (now, self.learner.imitator()) else {
+            return Metrics::new();
+        };
+        let normaliser = &self.snapshot.networks.normaliser;
+        imitator.see(imitation.batch(normaliser), 0.0);
+        let metrics = imitator.pretrain(&mut self.rng);
+        self.snapshot.networks = self.learner.networks(normaliser);
+        metrics
     }
 
     /// Asks for `steps` more than were done so far.
@@ -348,8 +395,21 @@ impl Training {
         }
     }
 
-    /// New networks and statistics for the next collection.
+    /// New networks and statistics for the next collection. What was learned from demonstrations stays what it was.
     fn refresh(&mut self) {
+        let normaliser = self.normaliser();
+        let iterations = self.snapshot.manifest.version;
+        if self.imitation.is_some()
+            && Imitation::carries(iterations)
+            && let Some(imitator) = self.learner.imitator()
+        {
+            imitator.rescale(&self.snapshot.networks.normaliser, &normaliser);
+        }
+        self.snapshot.networks = self.learner.networks(&normaliser);
+    }
+
+    /// The statistics as they are.
+    fn normaliser(&self) -> Normaliser {
         let scale = match self.settings.change_scale {
             ChangeScale::Running => self.change_stats.std(1e-4),
             ChangeScale::Limits => self.snapshot.networks.normaliser.scale.clone(),
@@ -358,8 +418,7 @@ impl Training {
             true => (self.obs_stats.mean.clone(), self.obs_stats.std(1e-4)),
             false => (vec![0.0; self.dims.n_obs], vec![1.0; self.dims.n_obs]),
         };
-        let normaliser = Normaliser::new(mean, std, scale);
-        self.snapshot.networks = self.learner.networks(&normaliser);
+        Normaliser::new(mean, std, scale)
     }
 
     /// The collected segments as one batch with advantages.

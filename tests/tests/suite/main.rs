@@ -8,6 +8,7 @@ mod env_mujoco;
 mod env_parity;
 mod env_suite;
 mod guard;
+mod imitation;
 mod import;
 mod limits_in_simulator;
 mod networks;

@@ -31,6 +31,8 @@ pub(super) struct SweepCommand {
     /// Runs at a time, one thread each; all cores when absent.
     #[arg(long, value_parser = at_least_one)]
     jobs: Option<usize>,
+    #[arg(long, value_name = "FILE", help = super::train::demonstrations())]
+    demos: Option<PathBuf>,
     #[arg(long, help = super::train::one_preset())]
     preset: Option<Preset>,
     /// Overrides of every task file, e.g. `train.n_envs=32`.
@@ -73,7 +75,7 @@ impl SweepCommand {
             steps: self.steps,
             out: self.out,
             preset: self.preset,
-            set: self.set,
+            set: super::train::overrides(self.demos.as_deref(), &self.set)?,
         };
         let _lock = sweep.lock()?;
         let runs = sweep.plan()?;

@@ -45,6 +45,8 @@ pub(super) struct Train {
     /// Threads; all cores when absent. The result does not depend on it.
     #[arg(long, value_parser = at_least_one)]
     threads: Option<usize>,
+    #[arg(long, value_name = "FILE", conflicts_with = "resume", help = demonstrations())]
+    demos: Option<PathBuf>,
     #[arg(long, conflicts_with = "resume", help = one_preset())]
     preset: Option<Preset>,
     /// Overrides of the task file, e.g. `constraints.velocity.scale=0.8`.
@@ -58,6 +60,25 @@ pub(super) struct Train {
 /// What `--preset` may be.
 pub(super) fn one_preset() -> String {
     format!("Settings by name, before those of --set: {}", Preset::names())
+}
+
+/// What `--demos` is for.
+pub(super) fn demonstrations() -> String {
+    format!("Demonstrations (.npz) for {}; 'nearl demos record RUN' writes some", Algorithm::imitating())
+}
+
+/// `--demos` and `--set` as overrides of the task file.
+///
+/// # Errors
+/// A path that is no text.
+pub(super) fn overrides(demos: Option<&Path>, set: &[String]) -> Result<Vec<String>, Failure> {
+    let mut all = set.to_vec();
+    if let Some(file) = demos {
+        let path = std::path::absolute(file)?;
+        let path = path.to_str().ok_or_else(|| format!("--demos: '{}' is no text", path.display()))?;
+        all.push(format!("train.demos.file={}", toml::Value::String(path.to_string())));
+    }
+    Ok(all)
 }
 
 /// What `--algo` may be.
@@ -106,7 +127,8 @@ impl Run {
 
 impl Train {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let mut manifest = tasks::load_with(&self.task, self.preset, &self.set)?;
+        let set = overrides(self.demos.as_deref(), &self.set)?;
+        let mut manifest = tasks::load_with(&self.task, self.preset, &set)?;
         crate::train::complete(&mut manifest)?;
         let run = match &self.resume {
             Some(folder) => Run::resumed(folder, &manifest.task.name, self.steps)?,

@@ -16,6 +16,14 @@ pub enum Algorithm {
     Pid2Gan,
     /// See [`pid2`](super::pid2).
     Pid2Ib,
+    /// See [`bc`](super::bc).
+    Bc,
+    /// See [`soil`](super::soil).
+    Soil,
+    /// See [`dapg`](super::dapg).
+    Dapg,
+    /// See [`pid2_il`](super::pid2_il).
+    Pid2Il,
 }
 
 /// One line of the table.
@@ -56,6 +64,26 @@ pub const ALGORITHMS: &[AlgorithmEntry] = &[
         name: "pid2-ib",
         about: "policy, inverse dynamics and a discriminator with the information bottleneck (the paper's Algorithm 2)",
     },
+    AlgorithmEntry {
+        algorithm: Algorithm::Bc,
+        name: "bc",
+        about: "the meta policy clones demonstrated states, the inverse model learns from own experience; no reward is read",
+    },
+    AlgorithmEntry {
+        algorithm: Algorithm::Soil,
+        name: "soil",
+        about: "PPO on actions with demonstrations whose actions an inverse model infers",
+    },
+    AlgorithmEntry {
+        algorithm: Algorithm::Dapg,
+        name: "dapg",
+        about: "PPO on actions, cloned first, with demonstrated actions in its gradient",
+    },
+    AlgorithmEntry {
+        algorithm: Algorithm::Pid2Il,
+        name: "pid2-il",
+        about: "`pid2-ib`, cloned first, whose discriminator takes demonstrated states for real too (Algorithm 2 whole)",
+    },
 ];
 
 /// A name that no algorithm has.
@@ -93,7 +121,18 @@ impl Algorithm {
 
     /// Whether the policy is one on actions: it proposes nothing.
     pub fn is_direct(self) -> bool {
-        self == Self::Ppo
+        matches!(self, Self::Ppo | Self::Soil | Self::Dapg)
+    }
+
+    /// Whether it learns from demonstrations; the others take none.
+    pub fn imitates(self) -> bool {
+        matches!(self, Self::Bc | Self::Soil | Self::Dapg | Self::Pid2Il)
+    }
+
+    /// Names of those that learn from demonstrations.
+    pub fn imitating() -> String {
+        let names = ALGORITHMS.iter().filter(|e| e.algorithm.imitates()).map(|e| e.name);
+        names.collect::<Vec<_>>().join(", ")
     }
 }
 
@@ -150,7 +189,7 @@ mod tests {
         assert!(refused("PPO").contains("did you mean 'ppo'?"));
         let far = refused("xyz");
         assert!(
-            far.starts_with("no algorithm 'xyz'; give one of ppo, ") && far.ends_with("pid2-ib"),
+            far.starts_with("no algorithm 'xyz'; give one of ppo, ") && far.ends_with("pid2-il"),
             "{far}"
         );
     }

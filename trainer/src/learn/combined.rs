@@ -16,6 +16,7 @@ use super::net::{Net, Tape};
 use super::nets::NetSettings;
 use super::optimise::{Group, PhaseReport, Rows, TILE, Tile};
 use super::ppo::PpoSettings;
+use super::rescale::{Inputs, carry, outputs};
 use super::value::Value;
 use super::{Metrics, init};
 use nearl_runtime::Networks;
@@ -147,6 +148,16 @@ impl Combined {
     pub(super) fn refresh_inverse(&self, group: &mut Group) {
         if let Some((model, _)) = &self.inverse {
             model.net.transpose(&group.p, &mut group.transposed);
+        }
+    }
+
+    /// Carries the networks over to other statistics; transposed weights are the caller's to refresh.
+    pub(super) fn rescale(&self, actor: &mut Group, value: &mut Group, from: &Normaliser, to: &Normaliser) {
+        let (d, obs) = (&self.dims, Inputs::observation(from, to));
+        carry(&self.policy, &mut actor.p, &obs, &outputs(from, to));
+        carry(&self.value.net, &mut value.p, &obs, &[]);
+        if let Some((model, _)) = &self.inverse {
+            carry(&model.net, &mut actor.p, &Inputs::seen(from, to, &d.seen_obs, &d.seen_state), &[]);
         }
     }
 

@@ -3,7 +3,8 @@
 
 use super::nearl::{Nearl, NearlSettings};
 use super::pid2::{Pid2, Pid2Settings};
-use super::{Batch, Dims, Kind, Learner, NetSettings, Pace, Ppo, PpoSettings};
+use super::{Batch, Bc, Dapg, Dims, Kind, Learner, NetSettings, Pace, Pid2Il, Ppo, PpoSettings, Soil};
+use crate::demos::DemoSettings;
 use nearl_runtime::Networks;
 use nearl_runtime::net::{Activation, Forward};
 use nearl_runtime::normaliser::Normaliser;
@@ -169,4 +170,101 @@ fn pid2_solves_it_with_and_without_bottleneck() {
         Box::new(Pid2::new(d, &n, s, settings.clone(), DETERMINISTIC, true, 1, rng))
     });
     solves("pid2, null space", got);
+}
+
+/// An expert: from `x` the best action, and the state it leads to.
+fn demonstrated(n: usize, rng: &mut ChaCha8Rng) -> Batch {
+    let mut b = Batch { n, advantage: vec![0.0; n], ..Batch::default() };
+    for _ in 0..n {
+        let x: [f32; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut *rng));
+        b.obs.extend(x);
+        b.reached.extend(reached(goal(x)));
+        b.action.extend(goal(x));
+    }
+    b
+}
+
+/// Affine networks: what is to be found can be found exactly.
+fn affine() -> NetSettings {
+    NetSettings { policy: vec![], idm: vec![], ..NetSettings::default() }
+}
+
+fn plain() -> (Dims, PpoSettings, DemoSettings) {
+    let dims = Dims { n_obs: 2, n_state: 2, n_act: 2, seen_obs: vec![0, 1], seen_state: vec![0, 1] };
+    let demos = DemoSettings { epochs: 200, lr: 1e-2, ..DemoSettings::default() };
+    (dims, PpoSettings { lr: 1e-3, n_epochs: 100, ..PpoSettings::default() }, demos)
+}
+
+/// Behaviour cloning of states finds the shift that the expert's actions make, and with an inverse model from random actions acts like it.
+#[test]
+fn bc_recovers_the_known_shift() {
+    let (dims, ppo, demos) = plain();
+    let (n, mut rng) = (affine(), crate::rollout::stream(4, 0));
+    let settings = Pid2Settings { idm_lr: 1e-2, ..Pid2Settings::default() };
+    let pid2 = Pid2::new(dims, &n, ppo, settings, DETERMINISTIC, true, 1, &mut rng);
+    let mut bc = Bc::new(pid2, demos);
+    let normaliser = Normaliser::identity(2, 2);
+    let actor = |l: &dyn Learner| Actor {
+        kind: Some(DETERMINISTIC),
+        activation: n.activation,
+        nets: l.networks(&normaliser),
+    };
+    let (batch, first) = collect(&actor(&bc), 1024, &mut rng);
+    let imitator = bc.imitator().expect("it imitates");
+    imitator.warm_up(&batch, &mut rng);
+    imitator.see(demonstrated(1024, &mut rng), 0.0);
+    imitator.pretrain(&mut rng);
+    let cloned = actor(&bc);
+    for x in [[0.0, 0.0], [1.0, -0.5], [-2.0, 1.0]] {
+        let (proposed, shift) = (cloned.act(x, || 0.0).proposal, reached(goal(x)));
+        assert!((0..2).all(|k| (proposed[k] - shift[k]).abs() < 1e-3), "{x:?}: {proposed:?} {shift:?}");
+    }
+    solves("bc", (first, collect(&cloned, 1024, &mut rng).1));
+}
+
+/// Under linear dynamics an affine inverse model fills in the expert's own actions.
+#[test]
+fn soil_relabels_exactly_under_linear_dynamics() {
+    let (dims, ppo, _) = plain();
+    let mut rng = crate::rollout::stream(4, 0);
+    let mut ppo = Ppo::new(dims, &affine(), PpoSettings { lr: 1e-2, ..ppo }, 1, &mut rng);
+    let normaliser = Normaliser::identity(2, 2);
+    let actor = Actor { kind: None, activation: affine().activation, nets: ppo.networks(&normaliser) };
+    let (batch, _) = collect(&actor, 1024, &mut rng);
+    ppo.learn_inverse(&batch, &mut rng);
+    let mut demos = demonstrated(100, &mut rng);
+    let actions = std::mem::take(&mut demos.action);
+    ppo.relabel(&mut demos);
+    assert_eq!(demos.action.len(), actions.len());
+    for (inferred, own) in demos.action.iter().zip(&actions) {
+        assert!((inferred - own).abs() < 1e-3, "{inferred} {own}");
+    }
+}
+
+/// With a part of demonstrations, of actions or without, and the reward beside it.
+#[test]
+fn dapg_soil_and_pid2_il_solve_it() {
+    let n = nets(Activation::Tanh);
+    let demos = || DemoSettings { epochs: 5, ..DemoSettings::default() };
+    let with = |mut learner: Box<dyn Learner>, rng: &mut ChaCha8Rng| {
+        let imitator = learner.imitator().expect("it imitates");
+        imitator.see(demonstrated(512, rng), 0.01);
+        imitator.pretrain(rng);
+        learner
+    };
+    let dapg =
+        train(None, &n, 40, |d, s, rng| with(Box::new(Dapg::new(Ppo::new(d, &n, s, 1, rng), demos())), rng));
+    assert!(dapg.0 < 0.1, "cloned actions are good from the first: {dapg:?}");
+    assert!(dapg.1 < 0.01, "{dapg:?}");
+    solves(
+        "soil",
+        train(None, &n, 40, |d, s, rng| with(Box::new(Soil::new(Ppo::new(d, &n, s, 1, rng))), rng)),
+    );
+    solves(
+        "pid2-il",
+        train(Some(DETERMINISTIC), &n, 50, |d, s, rng| {
+            let pid2 = Pid2::new(d, &n, s, Pid2Settings::default(), DETERMINISTIC, true, 1, rng);
+            with(Box::new(Pid2Il::new(pid2, demos())), rng)
+        }),
+    );
 }

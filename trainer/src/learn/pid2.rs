@@ -14,6 +14,7 @@
 //! leaves free of it ([`null_space`]).
 
 mod adversary;
+mod demonstrated;
 mod fakes;
 mod null_space;
 
@@ -120,6 +121,8 @@ struct Nets {
     noise: Vec<f32>,
     /// What the discriminator sees beside the reached changes.
     fakes: Fakes,
+    /// Own and demonstrated transitions in equal parts, where the adversary sees both: what it takes for real.
+    union: Option<Batch>,
 }
 
 /// A pass through the bottleneck.
@@ -189,7 +192,14 @@ impl Pid2 {
         ];
         let params =
             Params { groups: vec![actor, critic, adversary], adam, beta: settings.beta, adapted: 1.0 };
-        let nets = Nets { settings, combined, discriminator, noise: Vec::new(), fakes: Fakes::default() };
+        let nets = Nets {
+            settings,
+            combined,
+            discriminator,
+            noise: Vec::new(),
+            fakes: Fakes::default(),
+            union: None,
+        };
         Self { nets, params, threads }
     }
 
@@ -222,6 +232,9 @@ impl Learner for Pid2 {
             self.nets.noise.resize(batch.n * LATENT, 0.0);
             self.nets.noise.fill_with(|| StandardNormal.sample(&mut *rng));
             self.nets.fakes = Fakes::new(&s, &self.nets.combined, batch, rng);
+            if self.nets.union.is_some() {
+                self.nets.renew(&self.params.groups[COMBINED], batch, threads, rng);
+            }
         }
         let (again, fresh) = (ppo.recompute_advantages, opposed && s.fresh_fakes);
         let passes = update.run(
@@ -235,7 +248,7 @@ impl Learner for Pid2 {
                     batch.estimate(|x| n.combined.value.of(&params.groups[CRITIC], x, threads));
                 }
                 if fresh && pass > 0 {
-                    n.fakes.renew(&n.combined, &params.groups[COMBINED], batch, threads, rng);
+                    n.renew(&params.groups[COMBINED], batch, threads, rng);
                 }
             },
         );
@@ -285,16 +298,28 @@ fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mu
     let group = &params.groups[COMBINED];
     let [loss, kl, clipped, clamped] = n.combined.policy_gradient(group, &t, &mut w.actor, grad);
     let mut generator = 0.0;
-    if n.settings.generator_weight > 0.0 && n.settings.generator_lr == 0.0 {
+    let shared = n.settings.generator_weight > 0.0 && n.settings.generator_lr == 0.0;
+    if shared && n.union.is_none() {
         generator = fool_discriminator(n, params, &t, w, grad);
     }
     n.combined.learn(group, &mut w.actor, grad);
+    if shared && n.union.is_some() {
+        generator = generate(n, params, t, w, grad);
+    }
     add_sums(grad, &[loss, kl, clipped, clamped, generator]);
 }
 
 /// The adversarial loss of the policy (Eq. 2) alone.
 #[inline(always)]
 fn generator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) {
+    let loss = generate(n, params, t, w, grad);
+    add_sums(grad, &[loss]);
+}
+
+/// Its gradient, through the proposals for what the discriminator sees; returns its sum.
+#[inline(always)]
+fn generate(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) -> f32 {
+    let t = n.shown(t);
     let group = &params.groups[COMBINED];
     n.combined.propose(group, &t, &mut w.actor);
     if w.null_space.is_some() {
@@ -303,7 +328,7 @@ fn generator_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad:
     w.actor.d_change.fill(ZERO);
     let loss = fool_discriminator(n, params, &t, w, grad);
     n.combined.learn(group, &mut w.actor, grad);
-    add_sums(grad, &[loss]);
+    loss
 }
 
 multiversion!(fn generator(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) = generator_body);
@@ -343,7 +368,7 @@ impl Phases for Nets {
             GENERATOR => generator(self, params, t, w, grad),
             VALUE => self.combined.value.tile(&params.groups[CRITIC], &t, &mut w.value, grad),
             INVERSE => self.combined.idm_tile(&params.groups[COMBINED], &t, &mut w.actor, grad),
-            _ => discriminate(self, params, t, w, grad),
+            _ => discriminate(self, params, self.shown(t), w, grad),
         }
     }
     fn refresh(&self, phase: usize, params: &mut Params) {
@@ -376,6 +401,7 @@ impl Phases for Nets {
     fn rows<'b>(&'b self, phase: usize, batch: &'b Batch) -> Vec<Rows<'b>> {
         let d = &self.combined.dims;
         let noise = |pass| Rows::shifted(&self.noise, LATENT, self.noise_shift(pass));
+        let shown = self.union.as_ref().unwrap_or(batch);
         match phase {
             ACTOR => {
                 let mut rows = self.combined.rows(batch);
@@ -386,11 +412,11 @@ impl Phases for Nets {
             }
             VALUE => self.combined.value.rows(batch),
             INVERSE => self.combined.idm_rows(batch),
-            GENERATOR => vec![Rows::new(&batch.obs, d.n_obs), noise(Pass::Generator)],
+            GENERATOR => vec![Rows::new(&shown.obs, d.n_obs), noise(Pass::Generator)],
             _ => vec![
-                Rows::new(&batch.obs, d.n_obs),
-                Rows::new(&batch.reached, d.n_state),
-                Rows::new(self.fakes.shown(batch), d.n_state),
+                Rows::new(&shown.obs, d.n_obs),
+                Rows::new(&shown.reached, d.n_state),
+                Rows::new(self.fakes.shown(shown), d.n_state),
                 noise(Pass::Real),
                 noise(Pass::Proposed),
             ],

@@ -1,5 +1,7 @@
 //! PPO (Schulman et al. 2017): the paper's RL-Pure. An ordinary Gaussian policy on actions; an inverse model learns on
-//! the side, so that its loss can be plotted beside the others.
+//! the side, so that its loss can be plotted beside the others. [`demonstrated`] is what demonstrations add to it.
+
+mod demonstrated;
 
 use super::batch::Batch;
 use super::epochs::{Pace, Update};
@@ -11,6 +13,7 @@ use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, TILE, Tile, add_sums};
 use super::value::{Value, ValueScratch};
 use super::{Adam, Dims, Learner, Metrics, init};
+use demonstrated::{Term, demonstrated};
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Networks, multiversion};
@@ -96,6 +99,8 @@ struct Nets {
     value: Value,
     inverse: InverseModel,
     len: usize,
+    /// Demonstrations in the policy gradient, where there are some.
+    term: Option<Term>,
 }
 
 impl Nets {
@@ -144,7 +149,7 @@ impl Ppo {
         let groups = vec![actor, value_group, inverse_group];
         let rates = [settings.lr, settings.rate_of_value(), settings.lr];
         let adam = groups.iter().zip(rates).map(|(g, lr)| Adam::new(g.p.len(), lr)).collect();
-        let nets = Nets { dims, settings, policy, log_std, value, inverse, len: at };
+        let nets = Nets { dims, settings, policy, log_std, value, inverse, len: at, term: None };
         let mut params = Params { groups, adam, beta: 0.0, adapted: 1.0 };
         [ACTOR, VALUE, INVERSE].iter().for_each(|&phase| nets.refresh(phase, &mut params));
         Self { nets, params, threads }
@@ -177,9 +182,25 @@ impl Learner for Ppo {
     }
 
     fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
+        let before = self.nets.idm_error(&self.params, batch, self.threads);
+        let mut metrics = self.passes(batch, pace, rng, &[ACTOR, VALUE, INVERSE]);
+        let after = self.nets.idm_error(&self.params, batch, self.threads);
+        let actions = super::variance(&batch.action, self.nets.dims.n_act);
+        metrics.extend(super::idm_metrics(Some(before), Some(after), true, actions));
+        metrics
+    }
+}
+
+impl Ppo {
+    /// An update of policy and value alone.
+    pub(super) fn update_policy(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
+        self.passes(batch, pace, rng, &[ACTOR, VALUE])
+    }
+
+    /// Passes of `phases`, of which the policy's and the value's are the first.
+    fn passes(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng, phases: &[usize]) -> Metrics {
         let (ppo, threads) = (self.nets.settings.clone(), self.threads);
-        let before = self.nets.idm_error(&self.params, batch, threads);
-        let update = Update { ppo: &ppo, pace, threads, phases: &[ACTOR, VALUE, INVERSE], actor: ACTOR };
+        let update = Update { ppo: &ppo, pace, threads, phases, actor: ACTOR };
         let again = ppo.recompute_advantages;
         let passes =
             update.run(&mut self.nets, &mut self.params, batch, rng, again, |pass, n, params, batch, _| {
@@ -188,7 +209,6 @@ impl Learner for Ppo {
                 }
             });
         let report = passes.reports;
-        let after = self.nets.idm_error(&self.params, batch, self.threads);
         let p = &self.params.groups[ACTOR].p;
         let log_std = &scalars(&p[self.nets.log_std.clone()])[..self.nets.dims.n_act];
         let mut metrics = vec![
@@ -201,8 +221,9 @@ impl Learner for Ppo {
             ("train/epochs", passes.epochs as f64),
             ("train/learning_rate", f64::from(ppo.lr * pace.rate * self.params.adapted)),
         ];
-        let actions = super::variance(&batch.action, self.nets.dims.n_act);
-        metrics.extend(super::idm_metrics(Some(before), Some(after), true, actions));
+        if self.nets.term.is_some() {
+            metrics.push(("demos/loss", report[0].mean[3]));
+        }
         metrics
     }
 }
@@ -219,7 +240,8 @@ fn actor_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mu
     let action = Gaussian { log_std: n.log_std.clone(), n: a, sampled: &w.action, mean, d: &mut w.d_action };
     let [loss, kl, clipped] = likelihood_ratio([action], s, &t, &mut w.rows, &group.p, grad);
     n.policy.backward(&group.transposed, &w.obs, &w.d_action, &mut w.policy, Some(grad), false);
-    add_sums(grad, &[loss, kl, clipped]);
+    let demos = demonstrated(n, params, &t, w, grad);
+    add_sums(grad, &[loss, kl, clipped, demos]);
 }
 
 multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) = actor_body);

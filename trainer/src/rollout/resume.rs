@@ -52,6 +52,9 @@ impl Worker {
         put("sums", vec![self.episode.0, self.rows.discounted, self.cost]);
         put("obs", self.state.obs.clone());
         put("projector", self.controller.memory());
+        if self.frames.is_some() {
+            put("from_frame", vec![f64::from(u8::from(self.from_frame))]);
+        }
         Ok(())
     }
 
@@ -72,6 +75,9 @@ impl Worker {
         };
         let (sums, obs) = (take("sums", Some(3))?, take("obs", Some(self.state.obs.len()))?);
         let memory = take("projector", Some(self.controller.memory().len()))?;
+        if self.frames.is_some() {
+            self.from_frame = take("from_frame", Some(1))? == [1.0];
+        }
         let changed =
             || format!("environment {i} does not repeat its episode: task, robot or MuJoCo changed");
         let e = &self.history;

@@ -4,15 +4,17 @@ mod stream;
 
 use super::resume::Episode;
 use super::{Period, RolloutError, Rows};
-use crate::demos;
+use crate::demos::{self, Frame};
 use crate::env::{Env, EnvError, Fault};
 use crate::foresight::{Foresight, Verdict};
 use crate::plant::watched_limits;
 use nearl_runtime::constraints::{Guard, LimitSet};
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Excess, Networks, Noise, Output, PolicyKind, Snapshot, State};
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
+use std::sync::Arc;
 
 /// One environment with its controller and its random stream.
 pub struct Worker {
@@ -43,6 +45,10 @@ pub struct Worker {
     /// Policy steps left in the segment.
     left: usize,
     pub(super) history: Episode,
+    /// Demonstrated states, and the share of the episodes that begin in one.
+    pub(super) frames: Option<(Arc<[Frame]>, f64)>,
+    /// The present episode began in one: its return counts nowhere.
+    pub(super) from_frame: bool,
     /// What was collected in the segment.
     pub rows: Rows,
 }
@@ -83,6 +89,8 @@ impl Worker {
             beyond: None,
             left: 0,
             history: Episode::default(),
+            frames: None,
+            from_frame: false,
         };
         worker.restart()?;
         Ok(worker)
@@ -105,8 +113,21 @@ impl Worker {
         self.rows.moved_penalty = penalty;
     }
 
+    /// Lets that share of the episodes to come begin in one of the frames.
+    pub(crate) fn begin_in(&mut self, frames: Arc<[Frame]>, share: f64) {
+        self.frames = (!frames.is_empty()).then_some((frames, share));
+    }
+
     fn restart(&mut self) -> Result<(), EnvError> {
         self.env.reset(&mut self.rng)?;
+        self.from_frame = false;
+        if let Some((frames, share)) = &self.frames
+            && self.rng.random::<f64>() < *share
+        {
+            let Frame { qpos, qvel } = &frames[self.rng.random_range(0..frames.len())];
+            self.env.set_state(qpos, qvel)?;
+            self.from_frame = true;
+        }
         self.history.begin(&*self.env);
         self.controller.reset();
         self.rows.interrupt();
@@ -152,8 +173,10 @@ impl Worker {
             let period = Period { out: &self.out, before, after, reward, moved, terminated, truncated };
             self.rows.push(&period, self.controller.normaliser());
             if terminated || truncated {
-                self.rows.collected.tally.episodes.push(self.episode);
-                self.rows.collected.tally.costs.push(self.cost);
+                if !self.from_frame {
+                    self.rows.collected.tally.episodes.push(self.episode);
+                    self.rows.collected.tally.costs.push(self.cost);
+                }
                 self.restart()?;
             } else if self.left == 0 {
                 self.rows.cut();

@@ -45,6 +45,9 @@ pub const COLUMNS: &[&str] = &[
     "discriminator/kl",
     "discriminator/accuracy",
     "discriminator/beta",
+    "demos/cloning_mse",
+    "demos/weight",
+    "demos/loss",
 ];
 
 impl Training {

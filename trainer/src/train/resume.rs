@@ -44,6 +44,9 @@ impl Training {
         put("recent_costs".into(), Values::F64(self.recent_costs.clone()));
         put("best".into(), Values::F64(self.best.into_iter().collect()));
         put("seconds".into(), Values::F64(vec![self.seconds()]));
+        if let Some(imitation) = &self.imitation {
+            put("demos".into(), Values::F64(vec![imitation.fingerprint()]));
+        }
         self.source.save(&mut to)?;
         Ok(to)
     }
@@ -101,13 +104,19 @@ impl Training {
         let recent = from.take_f64("recent", None)?;
         self.recent = recent.as_chunks::<2>().0.iter().map(|&[r, n]| (r, n as usize)).collect();
         self.earlier = from.take_f64("seconds", Some(1))?[0];
+        if let Some(imitation) = &self.imitation
+            && from.take_f64("demos", Some(1))? != [imitation.fingerprint()]
+        {
+            let file = imitation.file();
+            return Err(format!("it learned from other demonstrations than '{file}' holds now"));
+        }
         self.rng.set_word_pos(from.header.rng.into());
         self.source.restore(from)?;
         if let Some(name) = from.tensors.keys().next() {
             return Err(format!("tensor '{name}' belongs to nothing"));
         }
         if self.snapshot.manifest.steps > 0 {
-            self.refresh();
+            self.snapshot.networks = self.learner.networks(&self.normaliser());
         }
         Ok(())
     }

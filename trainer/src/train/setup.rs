@@ -2,7 +2,9 @@
 
 use super::{Experience, TrainError};
 use crate::env::Env;
-use crate::learn::{Algorithm, Dims, Gradient, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Ppo};
+use crate::learn::{
+    Algorithm, Bc, Dapg, Dims, Gradient, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Pid2Il, Ppo, Soil,
+};
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
 use nearl_runtime::constraints::{Consistency, Drive, Guard};
@@ -30,23 +32,20 @@ pub(super) fn learner(
         Box::new(Nearl::new(dims.clone(), nets, ppo.clone(), settings, kind, threads, rng))
     };
     let pid2 = |bottleneck, rng: &mut ChaCha8Rng| {
-        Box::new(Pid2::new(
-            dims.clone(),
-            nets,
-            ppo.clone(),
-            settings.pid2.clone(),
-            kind,
-            bottleneck,
-            threads,
-            rng,
-        ))
+        Pid2::new(dims.clone(), nets, ppo.clone(), settings.pid2.clone(), kind, bottleneck, threads, rng)
     };
+    let direct = |rng: &mut ChaCha8Rng| Ppo::new(dims.clone(), nets, ppo.clone(), threads, rng);
+    let demos = settings.demos.clone();
     match algo {
-        Algorithm::Ppo => Box::new(Ppo::new(dims, nets, ppo, threads, rng)),
+        Algorithm::Ppo => Box::new(direct(rng)),
         Algorithm::PpoCombined => nearl(settings.nearl.without_supervision(), rng),
         Algorithm::Nearl => nearl(settings.nearl.clone(), rng),
-        Algorithm::Pid2Gan => pid2(false, rng),
-        Algorithm::Pid2Ib => pid2(true, rng),
+        Algorithm::Pid2Gan => Box::new(pid2(false, rng)),
+        Algorithm::Pid2Ib => Box::new(pid2(true, rng)),
+        Algorithm::Bc => Box::new(Bc::new(pid2(true, rng), demos)),
+        Algorithm::Soil => Box::new(Soil::new(direct(rng))),
+        Algorithm::Dapg => Box::new(Dapg::new(direct(rng), demos)),
+        Algorithm::Pid2Il => Box::new(Pid2Il::new(pid2(true, rng), demos)),
     }
 }
 

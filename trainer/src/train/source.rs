@@ -2,6 +2,7 @@
 
 use super::served::{ServedError, ServedSource};
 use crate::checkpoint::Checkpoint;
+use crate::demos::Frame;
 use crate::online::{LoopSource, OnlineError};
 use crate::rollout::{Collected, Collector, RolloutError};
 use crate::settings::TrainSettings;
@@ -46,6 +47,10 @@ pub trait Source: Send {
     fn collect(&mut self, snapshot: &Snapshot) -> Result<bool, SourceError>;
     /// Lets that share of the environments project while they collect, where they are of this process.
     fn project(&mut self, _share: f64) {}
+    /// Lets that share of the episodes begin in one of the frames; false where they begin elsewhere.
+    fn begin_in(&mut self, _frames: &Arc<[Frame]>, _share: f64) -> bool {
+        false
+    }
     /// What was collected last.
     fn gathered(&mut self) -> Vec<&Collected>;
     /// Numbers of its own for the metrics.
@@ -79,6 +84,11 @@ impl Source for Collector {
     fn project(&mut self, share: f64) {
         let projecting = (share * self.workers().count() as f64).round() as usize;
         self.workers().enumerate().for_each(|(i, worker)| worker.set_projection(i < projecting));
+    }
+
+    fn begin_in(&mut self, frames: &Arc<[Frame]>, share: f64) -> bool {
+        self.workers().for_each(|worker| worker.begin_in(Arc::clone(frames), share));
+        true
     }
 
     fn gathered(&mut self) -> Vec<&Collected> {

@@ -415,3 +415,118 @@ fn in_the_null_space_the_adversary_leaves_the_mean_action_as_it_is() {
         );
     }
 }
+
+/// A learner whose adversary sees demonstrations too.
+fn united() -> (Pid2, Batch) {
+    let (mut l, b) = learner(false, true, TANH);
+    l.nets.settings.generator_lr = 1e-3;
+    let mut rng = crate::rollout::stream(7, 0);
+    l.unite(&b, &batch(&dims(), 2 * TILE, 12), &mut rng);
+    l.nets.renew(&l.params.groups[COMBINED], &b, 1, &mut rng);
+    (l, b)
+}
+
+/// Rows of both in nearly equal parts, each with the proposal for its own state; discriminator and generator by central differences.
+#[test]
+fn gradients_of_the_union_equal_central_differences() {
+    let (l, b) = united();
+    let (n, d, union) = (nets64(&l), dims(), l.nets.union.as_ref().expect("united"));
+    let own = (0..b.n).filter(|&i| row(&union.obs, i, d.n_obs) == row(&b.obs, i, d.n_obs)).count();
+    assert!((b.n / 4..=3 * b.n / 4).contains(&own), "{own} of {} rows are own ones", b.n);
+    let mean = |one: &dyn Fn(usize) -> f64| (0..b.n).map(one).sum::<f64>() / b.n as f64;
+    let fake = |policy: &Net64, i: usize| {
+        let obs = row(&union.obs, i, d.n_obs);
+        [policy.forward(&obs), obs].concat()
+    };
+    let judging = |enc: &Net64, dec: &Net64| {
+        mean(&|i| {
+            let real = [row(&union.reached, i, d.n_state), row(&union.obs, i, d.n_obs)].concat();
+            let (lr, kr) = discriminate(enc, dec, &real, &noise(&l, Pass::Real, i), true);
+            let (lf, kf) = discriminate(enc, dec, &fake(&n.policy, i), &noise(&l, Pass::Proposed, i), true);
+            softplus(-lr) + softplus(lf) + 0.2 * 0.5 * (kr + kf)
+        })
+    };
+    let (grad, _) = gradient(&l, &b, DISCRIMINATOR);
+    let (enc, dec) = l.nets.discriminator.nets();
+    check("encoder", &n.enc, &enc.mlp.to_dense(&grad), |p| judging(p, &n.dec));
+    check("decoder", &n.dec, &dec.mlp.to_dense(&grad), |p| judging(&n.enc, p));
+    let fooling = |policy: &Net64| {
+        mean(&|i| {
+            0.7 * softplus(
+                -discriminate(&n.enc, &n.dec, &fake(policy, i), &noise(&l, Pass::Generator, i), true).0,
+            )
+        })
+    };
+    let (grad, _) = gradient(&l, &b, GENERATOR);
+    check("policy", &n.policy, &l.nets.combined.policy.mlp.to_dense(&grad), fooling);
+}
+
+/// With the optimiser of the policy gradient the adversary's part is the same as with its own.
+#[test]
+fn the_union_is_fooled_alike_with_one_optimiser_and_with_two() {
+    let (mut l, b) = united();
+    let [actor, generator] = [ACTOR, GENERATOR].map(|phase| gradient(&l, &b, phase).0);
+    l.nets.settings.generator_lr = 0.0;
+    let (both, _) = gradient(&l, &b, ACTOR);
+    let range = l.nets.combined.proposal_range();
+    for ((both, a), g) in both[range.clone()].iter().zip(&actor[range.clone()]).zip(&generator[range]) {
+        for k in 0..LANES {
+            assert!((both.0[k] - a.0[k] - g.0[k]).abs() < 1e-5 * (1.0 + both.0[k].abs()));
+        }
+    }
+}
+
+/// A discriminator that tells by `s` alone has nothing to say about `s'`.
+#[test]
+fn a_discriminator_that_ignores_the_next_state_leaves_no_signal() {
+    let (mut l, b) = united();
+    let (encoder, _) = l.nets.discriminator.nets();
+    let mut dense = encoder.mlp.to_dense(&l.params.groups[ADVERSARY].p);
+    for row in dense.layers[0].weight.chunks_exact_mut(dims().n_state + dims().n_obs) {
+        row[..dims().n_state].fill(0.0);
+    }
+    let slope = |l: &Pid2| {
+        let (grad, sums) = gradient(l, &b, GENERATOR);
+        (scalars(&grad[l.nets.combined.proposal_range()]).iter().fold(0.0f32, |m, g| m.max(g.abs())), sums[0])
+    };
+    assert!(slope(&l).0 > 1e-3);
+    encoder.mlp.write_dense(&dense, &mut l.params.groups[ADVERSARY].p);
+    l.nets.refresh(DISCRIMINATOR, &mut l.params);
+    let (largest, loss) = slope(&l);
+    assert!(largest == 0.0 && loss > 0.0, "{largest} {loss}");
+}
+
+/// Whatever statistics become, proposal and action in the robot's units stay.
+#[test]
+fn policy_and_inverse_model_stay_what_they_were_when_statistics_move() {
+    use nearl_runtime::net::Forward;
+    let (mut l, d) = (learner(false, true, TANH).0, dims());
+    let from = Normaliser::new(vec![0.1; d.n_obs], vec![1.2; d.n_obs], vec![0.5; d.n_state]);
+    let entry = |k: usize| 0.3 * (k as f64 + 1.0);
+    let to = Normaliser::new(
+        (0..d.n_obs).map(|k| 0.2 * entry(k)).collect(),
+        (0..d.n_obs).map(|k| 0.8 + entry(k)).collect(),
+        (0..d.n_state).map(entry).collect(),
+    );
+    let act = |l: &Pid2, n: &Normaliser, obs: &[f64]| {
+        let nets = l.networks(n);
+        let mut x = vec![0.0; d.n_obs];
+        n.observation(obs, &mut x);
+        let u = Forward::new(&nets.policy, TANH).forward(&x).to_vec();
+        let change: Vec<f64> = u.iter().zip(&n.scale).map(|(&u, s)| f64::from(u) * s).collect();
+        let seen: Vec<f32> =
+            d.seen_obs.iter().map(|&o| x[o]).chain(d.seen_state.iter().map(|&k| u[k])).collect();
+        let (idm, _) = nets.idm.as_ref().expect("learned");
+        let action = Forward::new(idm, TANH).forward(&seen).iter().map(|&a| f64::from(a)).collect::<Vec<_>>();
+        ([change, action].concat(), l.nets.combined.value.of(&l.params.groups[CRITIC], &x, 1)[0])
+    };
+    let observations: Vec<Vec<f64>> =
+        (0..20).map(|i| (0..d.n_obs).map(|k| (0.7 * f64::from(i) + k as f64).sin()).collect()).collect();
+    let before: Vec<_> = observations.iter().map(|o| act(&l, &from, o)).collect();
+    l.rescale(&from, &to);
+    for (o, (was, value)) in observations.iter().zip(before) {
+        let (is, now) = act(&l, &to, o);
+        assert!(was.iter().zip(&is).all(|(a, b)| (a - b).abs() < 1e-4 * (1.0 + a.abs())), "{was:?} {is:?}");
+        assert!((value - now).abs() < 1e-4 * (1.0 + value.abs()), "{value} {now}");
+    }
+}

@@ -208,3 +208,51 @@ fn advantages_are_estimated_anew_before_each_pass() {
         &values[..2]
     );
 }
+
+/// `-weight mean log pi(a | s)` over the demonstrations that go with the rows, by the network and by its spread.
+#[test]
+fn the_demonstration_term_equals_central_differences() {
+    let nets = NetSettings { policy: vec![6, 5], ..NetSettings::default() };
+    let settings = PpoSettings { log_std: -0.3, ..PpoSettings::default() };
+    let (d, b, demos) = (dims(), batch(&dims(), TILE, 3), batch(&dims(), 3 * TILE, 8));
+    let mut rng = crate::rollout::stream(1, 1);
+    let mut l = Ppo::new(dims(), &nets, settings, 1, &mut rng);
+    spread(&mut l.params.groups[ACTOR].p, &[&l.nets.policy]);
+    l.nets.refresh(ACTOR, &mut l.params);
+    let idx: Vec<u32> = (0..b.n as u32).collect();
+    let gradient = |l: &Ppo| {
+        let mut grad = vec![ZERO; l.params.groups[ACTOR].p.len() + 1];
+        l.nets.tile(ACTOR, &l.params, tile(&b, &idx), &mut l.nets.scratch(), &mut grad);
+        grad
+    };
+    let without = gradient(&l);
+    l.augment(demos.clone(), 0.25, b.n, &mut rng);
+    let with = gradient(&l);
+    let own: Vec<V> = with.iter().zip(&without).map(|(&a, &b)| a - b).collect();
+    let (term, p) = (l.nets.term.as_ref().expect("just given"), &l.params.groups[ACTOR].p);
+    assert!((term.weight - 0.75).abs() < 1e-6, "three demonstrated rows for an own one, a quarter each");
+    assert!(term.with.iter().any(|&k| k as usize >= b.n), "they come from all over the demonstrations");
+    let spread: Vec<f64> =
+        scalars(&p[l.nets.log_std.clone()])[..d.n_act].iter().map(|&v| f64::from(v)).collect();
+    let loss = |policy: &Net64, log_std: &[f64]| {
+        let one = |&k: &u32| {
+            let mean = policy.forward(&row(&demos.obs, k as usize, d.n_obs));
+            log_normal(&row(&demos.action, k as usize, d.n_act), &mean, log_std)
+        };
+        -0.75 * term.with.iter().map(one).sum::<f64>() / b.n as f64
+    };
+    let policy = Net64::of(&l.nets.policy.mlp.to_dense(p), nets.activation);
+    let error = relative_error(&policy, &flat32(&l.nets.policy.mlp.to_dense(&own)), |n| loss(n, &spread));
+    assert!(error < 2e-4, "relative error {error:e}");
+    for k in 0..d.n_act {
+        let at = |x: f64| {
+            let mut s = spread.clone();
+            s[k] += x;
+            loss(&policy, &s)
+        };
+        let (slope, analytic) = ((at(1e-5) - at(-1e-5)) / 2e-5, scalars(&own[l.nets.log_std.clone()])[k]);
+        assert!((slope - f64::from(analytic)).abs() < 1e-4 * (1.0 + slope.abs()), "{k}: {slope} {analytic}");
+    }
+    let sum = with[with.len() - 1].0[3] / b.n as f32;
+    assert!((f64::from(sum) - loss(&policy, &spread)).abs() < 1e-4, "what is reported is the loss");
+}

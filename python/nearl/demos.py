@@ -1,0 +1,282 @@
+"""Demonstrations of others as a file for ``bc``, ``soil``, ``dapg`` and ``pid2-il``: CSV, Minari, LeRobot, robomimic and motion clips.
+
+Every source is a table of joint positions and velocities by name, ``q.<joint>`` and ``v.<joint>`` as the task's observation has them. The observations
+of the file are those of the task's own environment in these states, so that they are always of it::
+
+    nearl.demos.from_csv("task.toml", "walk.csv", "walk.npz", dt=0.02)
+
+A position that the task does not observe (where a planar runner is) may be missing and is 0; a velocity that is missing is the
+difference of positions.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nearl import _core
+
+Floats = NDArray[np.float64]
+FilePath = str | os.PathLike[str]
+_BASE_Q = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_BASE_V = ("x", "y", "z", "wx", "wy", "wz")
+_SAME = 1e-6  # part of a period by which two may differ
+
+
+class BadDemonstrations(ValueError):
+    """A source that does not fit the task: the message names file, column and episode."""
+
+
+def from_columns(
+    task: FilePath,
+    episodes: Iterable[Mapping[str, ArrayLike]],
+    out: FilePath,
+    *,
+    dt: float,
+    actions: Sequence[str] = (),
+    period: float | None = None,
+    source: str = "the columns",
+) -> Path:
+    """Writes one file of demonstrations from columns by name.
+
+    Args:
+        task: Name of a bundled task, or a task file.
+        episodes: For each episode a column (n) by name: ``q.<joint>``, and ``v.<joint>`` where it is known [rad or m, per s]. The base of a robot that floats
+            is ``q.<joint>.x y z qw qx qy qz`` and ``v.<joint>.x y z wx wy wz`` (rotation in the body's frame). Columns of other names are left out.
+        out: File to write (``.npz``).
+        dt: Time between two rows [s]. States are interpolated where it is not the task's period.
+        actions: Columns of actions, in the order of the task's actuators; none by default. Their last row is left out.
+        period: Policy period of the task [s]; its control period by default.
+        source: What messages call the source.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        BadDemonstrations: a column is missing, not finite or of another length, or an episode has less than two rows.
+    """
+    env = _core.Env(os.fspath(task))
+    period = env.dt if period is None else period
+    if not (dt > 0 and np.isfinite(dt)):
+        raise BadDemonstrations(f"{source}: dt is {dt}; give the time between two rows in seconds")
+    if actions and abs(dt - period) > _SAME * period:
+        raise BadDemonstrations(f"{source}: its rows are {dt} s apart and the task's period is {period} s; actions cannot be interpolated, leave them out")
+    parts: dict[str, list[Floats]] = {name: [] for name in ("observations", "qpos", "qvel", "actions")}
+    lengths = []
+    for i, columns in enumerate(episodes):
+        qpos, qvel = _states(env, columns, dt, f"{source}, episode {i}")
+        if abs(dt - period) > _SAME * period:
+            qpos, qvel = _resampled(qpos, dt, period), _resampled(qvel, dt, period)
+            _unit(env, qpos)
+        if len(qpos) < 2:
+            raise BadDemonstrations(f"{source}, episode {i}: {len(qpos)} rows make no transition; give at least 2")
+        parts["observations"].append(np.stack([env.set_state(q, v) for q, v in zip(qpos, qvel)]))
+        parts["qpos"].append(qpos)
+        parts["qvel"].append(qvel)
+        if actions:
+            parts["actions"].append(np.stack([_column(columns, name, len(qpos), f"{source}, episode {i}") for name in actions], 1)[:-1])
+        lengths.append(len(qpos) - 1)
+    if not lengths:
+        raise BadDemonstrations(f"{source}: it has no episode")
+    arrays = {name: np.concatenate(rows) for name, rows in parts.items() if rows}
+    Path(out).parent.mkdir(parents=True, exist_ok=True)
+    with open(out, "wb") as file:
+        np.savez(file, lengths=np.array(lengths), dt=np.array(period), names=np.array(env.obs_names), **arrays)  # type: ignore[arg-type]
+    return Path(out)
+
+
+def from_csv(task: FilePath, file: FilePath, out: FilePath, *, dt: float, episode: str = "episode", **options: Any) -> Path:
+    """Reads a CSV file with a heading; rows of one episode have the same value in the column ``episode`` (all rows are one where there is none)."""
+    with open(file, newline="") as lines:
+        heading = [name.strip() for name in lines.readline().strip().lstrip("\ufeff").split(",")]
+        try:
+            rows = np.loadtxt(lines, delimiter=",", ndmin=2)
+        except ValueError as error:
+            raise BadDemonstrations(f"'{file}': {error}") from None
+    if rows.shape[1] != len(heading):
+        raise BadDemonstrations(f"'{file}': {rows.shape[1]} columns below a heading of {len(heading)}")
+    table = dict(zip(heading, rows.T))
+    return from_columns(task, _split(table, table.get(episode)), out, dt=dt, source=f"'{file}'", **options)
+
+
+def from_minari(task: FilePath, dataset: Any, out: FilePath, *, dt: float | None = None, names: Sequence[str] | None = None, **options: Any) -> Path:
+    """Reads a Minari dataset (``minari.load_dataset``) whose observations are those of the task, or have the columns ``names``."""
+    env = _core.Env(os.fspath(task))
+    names = env.obs_names if names is None else names
+    episodes = []
+    for i, e in enumerate(dataset.iterate_episodes()):
+        observations = np.asarray(e.observations, float)
+        if observations.ndim != 2 or observations.shape[1] != len(names):
+            raise BadDemonstrations(f"Minari dataset, episode {i}: observations of shape {observations.shape} where {len(names)} columns have names")
+        columns = dict(zip(names, observations.T))
+        given = np.asarray(e.actions, float).reshape(len(observations) - 1, -1)
+        columns |= dict(zip(env.actuator_names, np.vstack([given, given[-1:]]).T))
+        episodes.append(columns)
+    options.setdefault("actions", env.actuator_names)
+    return from_columns(task, episodes, out, dt=env.dt if dt is None else dt, source="Minari dataset", **options)
+
+
+def from_robomimic(task: FilePath, file: FilePath, out: FilePath, *, dt: float, columns: Mapping[str, tuple[str, int]], **options: Any) -> Path:
+    """Reads robomimic's HDF5; ``columns`` says which entry of which observation each name is: ``{"q.panda_joint1": ("robot0_joint_pos", 0)}``."""
+    import h5py
+
+    episodes = []
+    with h5py.File(file) as data:
+        demos = sorted(data["data"], key=lambda name: int(name.rpartition("_")[2]))
+        for i, demo in enumerate(demos):
+            obs = data["data"][demo]["obs"]
+            for name, (key, k) in columns.items():
+                if key not in obs or k >= obs[key].shape[1]:
+                    raise BadDemonstrations(f"'{file}', episode {i} ({demo}): no observation '{key}' with entry {k} for '{name}'; it has {', '.join(obs)}")
+            episodes.append({name: np.asarray(obs[key][:, k], float) for name, (key, k) in columns.items()})
+    return from_columns(task, episodes, out, dt=dt, source=f"'{file}'", **options)
+
+
+def from_lerobot(
+    task: FilePath, folder: FilePath, out: FilePath, *, names: Sequence[str] | None = None, key: str = "observation.state", **options: Any
+) -> Path:
+    """Reads a LeRobot dataset (v3) from its folder: ``key`` frame by frame, at the rate of ``meta/info.json``.
+
+    ``names`` are the entries of ``key``; by default the dataset's own, of which ``shoulder.pos`` and ``shoulder`` are the joint ``shoulder``.
+    """
+    from pyarrow import parquet
+
+    info = json.loads((Path(folder) / "meta" / "info.json").read_text())
+    if key not in info["features"]:
+        raise BadDemonstrations(f"'{folder}': no feature '{key}'; it has {', '.join(info['features'])}")
+    if names is None:
+        given = info["features"][key].get("names") or []
+        given = given.get("motors", []) if isinstance(given, dict) else given
+        names = [name if name.startswith(("q.", "v.")) else "q." + name.removesuffix(".pos") for name in given]
+    rows, of = [], []
+    for file in sorted((Path(folder) / "data").rglob("*.parquet")):
+        table = parquet.read_table(file, columns=[key, "episode_index"])
+        rows += table[key].to_pylist()
+        of += table["episode_index"].to_pylist()
+    values = np.array(rows, float)
+    if values.ndim != 2 or values.shape[1] != len(names):
+        raise BadDemonstrations(f"'{folder}': '{key}' has shape {values.shape} and {len(names)} names; give names=")
+    return from_columns(task, _split(dict(zip(names, values.T)), np.array(of)), out, dt=1 / info["fps"], source=f"'{folder}'", **options)
+
+
+def from_motion(task: FilePath, file: FilePath, out: FilePath, *, joints: Sequence[str] | None = None, base: str = "root", **options: Any) -> Path:
+    """Reads a motion clip (``.npz``) as retargeting tools write it: ``fps``, ``joint_pos`` (n x joints) and ``joint_names``.
+
+    A base that floats is seven entries before the joints in ``joint_pos``, or the first body of ``body_pos_w`` and ``body_quat_w``.
+    """
+    with np.load(file, allow_pickle=False) as data:
+        clip = {name: data[name] for name in data.files}
+    missing = [name for name in ("fps", "joint_pos") if name not in clip]
+    if missing:
+        raise BadDemonstrations(f"'{file}': no array '{missing[0]}'; it has {', '.join(clip)}")
+    if joints is None:
+        if "joint_names" not in clip:
+            raise BadDemonstrations(f"'{file}': no array 'joint_names'; give joints=, the joints in the order of 'joint_pos'")
+        joints = [str(name) for name in clip["joint_names"]]
+    q = np.asarray(clip["joint_pos"], float)
+    extra = q.shape[1] - len(joints)
+    if extra not in (0, 7):
+        raise BadDemonstrations(f"'{file}': 'joint_pos' has {q.shape[1]} columns for {len(joints)} joints; 7 more would be the base")
+    columns = {f"q.{name}": q[:, extra + k] for k, name in enumerate(joints)}
+    if extra == 7:
+        columns |= {f"q.{base}.{entry}": q[:, k] for k, entry in enumerate(_BASE_Q)}
+    elif "body_pos_w" in clip and "body_quat_w" in clip:
+        pose = np.hstack([np.asarray(clip[name], float)[:, 0] for name in ("body_pos_w", "body_quat_w")])
+        columns |= {f"q.{base}.{entry}": pose[:, k] for k, entry in enumerate(_BASE_Q)}
+    return from_columns(task, [columns], out, dt=1 / float(np.ravel(clip["fps"])[0]), source=f"'{file}'", **options)
+
+
+def _split(table: Mapping[str, Floats], of: ArrayLike | None) -> list[dict[str, Floats]]:
+    """The rows of each episode, in the order in which they begin."""
+    if of is None:
+        return [dict(table)]
+    of = np.asarray(of)
+    firsts = sorted(np.unique(of, return_index=True)[1])
+    return [{name: column[of == of[first]] for name, column in table.items()} for first in firsts]
+
+
+def _column(columns: Mapping[str, ArrayLike], name: str, n: int, where: str) -> Floats:
+    if name not in columns:
+        raise BadDemonstrations(f"{where}: no column '{name}'; it has {', '.join(columns)}")
+    column = np.asarray(columns[name], float)
+    if column.shape != (n,):
+        raise BadDemonstrations(f"{where}: column '{name}' has shape {column.shape} where the others have {n} rows")
+    bad = np.flatnonzero(~np.isfinite(column))
+    if len(bad):
+        raise BadDemonstrations(f"{where}: column '{name}' is {column[bad[0]]} in row {bad[0]}")
+    return column
+
+
+def _entries(env: _core.Env) -> tuple[list[str], list[str]]:
+    """Names of the entries of qpos and qvel."""
+    floats = [joint for joint in env.joint_names if any(name.startswith(f"q.{joint}.") for name in env.obs_names)]
+    if not floats and env.nq == len(env.joint_names) + 6:
+        floats = env.joint_names[:1]
+    q = [f"q.{joint}{entry}" for joint in env.joint_names for entry in ([f".{e}" for e in _BASE_Q] if joint in floats else [""])]
+    v = [f"v.{joint}{entry}" for joint in env.joint_names for entry in ([f".{e}" for e in _BASE_V] if joint in floats else [""])]
+    if (len(q), len(v)) != (env.nq, env.nv):
+        raise BadDemonstrations(f"the robot of '{env.task}' has joints that turn about a point; write its file with numpy.savez")
+    return q, v
+
+
+def _states(env: _core.Env, columns: Mapping[str, ArrayLike], dt: float, where: str) -> tuple[Floats, Floats]:
+    """qpos (n x nq) and qvel (n x nv) of an episode."""
+    q_names, v_names = _entries(env)
+    given = [name for name in (*q_names, *v_names) if name in columns]
+    if not given:
+        raise BadDemonstrations(f"{where}: none of the task's columns ({', '.join(q_names)}); it has {', '.join(columns)}")
+    n = len(np.asarray(columns[given[0]]))
+    # a place that the task does not observe is of no matter; a joint's angle is
+    of_no_matter = lambda name: not any(name in observed for observed in env.obs_names)  # noqa: E731
+    qpos = np.stack([np.zeros(n) if name not in columns and of_no_matter(name) else _column(columns, name, n, where) for name in q_names], 1)
+    _unit(env, qpos)
+    qvel = _differences(q_names, v_names, qpos, dt)
+    for k, name in enumerate(v_names):
+        if name in columns:
+            qvel[:, k] = _column(columns, name, n, where)
+    return qpos, qvel
+
+
+def _unit(env: _core.Env, qpos: Floats) -> None:
+    """Quaternions of length one, each on the side of the one before, so that between two of them lies a rotation."""
+    for k, name in enumerate(_entries(env)[0]):
+        if name.endswith(".qw"):
+            turn = qpos[:, k : k + 4]
+            turn /= np.maximum(np.linalg.norm(turn, axis=1, keepdims=True), 1e-12)
+            flips = np.sum(turn[1:] * turn[:-1], axis=1) < 0
+            turn[1:][np.cumsum(flips) % 2 == 1] *= -1
+
+
+def _differences(q_names: Sequence[str], v_names: Sequence[str], qpos: Floats, dt: float) -> Floats:
+    """Velocities from one row to the next; the last row has that of the row before."""
+    qvel = np.zeros((len(qpos), len(v_names)))
+    if len(qpos) < 2:
+        return qvel
+    for k, name in enumerate(v_names):
+        if (place := "q" + name[1:]) in q_names:
+            qvel[:-1, k] = np.diff(qpos[:, q_names.index(place)]) / dt
+        elif name.endswith(".wx"):
+            at = q_names.index("q" + name[1:].removesuffix("wx") + "qw")
+            qvel[:-1, k : k + 3] = _turned(qpos[:-1, at : at + 4], qpos[1:, at : at + 4]) / dt
+    qvel[-1] = qvel[-2]
+    return qvel
+
+
+def _turned(a: Floats, b: Floats) -> Floats:
+    """Rotation vectors, in the body's frame, from the unit quaternions ``a`` to ``b`` (w first)."""
+    w = np.sum(a * b, axis=1)
+    xyz = a[:, :1] * b[:, 1:] - b[:, :1] * a[:, 1:] - np.cross(a[:, 1:], b[:, 1:])
+    xyz, w = np.where(w[:, None] < 0, -xyz, xyz), np.abs(w)
+    sine = np.linalg.norm(xyz, axis=1)
+    return xyz * (2 * np.arctan2(sine, w) / np.maximum(sine, 1e-12))[:, None]
+
+
+def _resampled(rows: Floats, dt: float, period: float) -> Floats:
+    """Rows at multiples of ``period``, interpolated."""
+    times = np.arange(len(rows)) * dt
+    at = np.arange(int(times[-1] / period + _SAME) + 1) * period
+    return np.stack([np.interp(at, times, column) for column in rows.T], 1)

@@ -1,0 +1,187 @@
+"""Converters of demonstrations: what other tools write becomes states of the task, or is refused by file, column and episode."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import nearl
+from nearl import _core, demos
+
+NEARL = ROOT / "target" / "release" / "nearl"
+
+
+def episode(n: int = 30, seed: int = 0) -> dict[str, np.ndarray]:
+    """States of Hopper's own simulation, by column, with its actions."""
+    env, rng = _core.Env("Hopper-v5"), np.random.default_rng(seed)
+    env.reset(seed)
+    rows = []
+    for _ in range(n):
+        action = rng.uniform(-0.3, 0.3, 3)
+        rows.append([*env.qpos, *env.qvel, *action])
+        env.step(action)
+    q = [f"q.{joint}" for joint in env.joint_names]
+    return dict(zip([*q, *("v" + name[1:] for name in q), "a", "b", "c"], np.array(rows).T))
+
+
+def checked(file: Path, task: str = "Hopper-v5") -> dict[str, np.ndarray]:
+    """The arrays, once the trainer itself has found them to be of the task."""
+    told = subprocess.run([NEARL, "demos", "check", file, "--task", task], capture_output=True, text=True)
+    assert told.returncode == 0, told.stderr
+    with np.load(file) as data:
+        return dict(data)
+
+
+def test_columns_become_states_bit_for_bit(tmp_path: Path) -> None:
+    first, second = episode(), episode(20, 1)
+    out = demos.from_columns("Hopper-v5", [first, second], tmp_path / "a.npz", dt=0.008, actions=("a", "b", "c"))
+    data = checked(out)
+    assert data["lengths"].tolist() == [29, 19] and data["actions"].shape == (48, 3)
+    assert np.array_equal(data["qvel"][30:, 5], second["v.foot_joint"]) and np.array_equal(data["qpos"][:30, 2], first["q.rooty"])
+    env = _core.Env("Hopper-v5")
+    assert np.array_equal(data["observations"][7], env.set_state(data["qpos"][7], data["qvel"][7]))
+
+
+def test_what_is_not_observed_may_be_missing_and_velocities_are_differences(tmp_path: Path) -> None:
+    columns = {name: column for name, column in episode().items() if name.startswith("q.") and name != "q.rootx"}
+    data = checked(demos.from_columns("Hopper-v5", [columns], tmp_path / "a.npz", dt=0.008))
+    assert not data["qpos"][:, 0].any()
+    assert np.allclose(data["qvel"][:-1, 4], np.diff(columns["q.leg_joint"]) / 0.008)
+    with pytest.raises(demos.BadDemonstrations, match="episode 0: no column 'q.leg_joint'"):
+        demos.from_columns("Hopper-v5", [{k: v for k, v in columns.items() if k != "q.leg_joint"}], tmp_path / "b.npz", dt=0.008)
+
+
+def test_another_period_is_interpolated_and_a_turning_base_has_the_right_velocity(tmp_path: Path) -> None:
+    t = np.arange(40) * 0.02
+    rate = 1.5  # rad/s about the body's own z axis
+    columns = {f"q.{joint}": 0.1 * t for joint in _core.Env("Ant-v5").joint_names[1:]}
+    columns |= {f"q.root.{e}": x for e, x in zip(("x", "y", "z", "qx", "qy"), (0.3 * t, 0 * t, 0.75 + 0 * t, 0 * t, 0 * t))}
+    columns |= {"q.root.qw": -np.cos(rate * t / 2), "q.root.qz": -np.sin(rate * t / 2)}  # the other sign is the same rotation
+    columns["q.root.qw"][20:] *= -1
+    columns["q.root.qz"][20:] *= -1
+    data = checked(demos.from_columns("Ant-v5", [columns], tmp_path / "a.npz", dt=0.02), "Ant-v5")
+    assert float(data["dt"]) == 0.05 and data["lengths"].tolist() == [15]
+    assert np.allclose(data["qvel"][:, :6], [0.3, 0, 0, 0, 0, rate], atol=1e-9)
+    assert np.allclose(np.linalg.norm(data["qpos"][:, 3:7], axis=1), 1) and np.allclose(data["qvel"][:, 6:], 0.1)
+
+
+def test_csv(tmp_path: Path) -> None:
+    parts = [episode(), episode(20, 1)]
+    table = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]} | {"episode": np.repeat([4, 2], [30, 20])}
+    file = tmp_path / "walk.csv"
+    np.savetxt(file, np.stack(list(table.values()), 1), delimiter=",", header=",".join(table), comments="", fmt="%.17g")
+    data = checked(demos.from_csv("Hopper-v5", file, tmp_path / "a.npz", dt=0.008, actions=("a", "b", "c")))
+    assert data["lengths"].tolist() == [29, 19] and np.array_equal(data["qpos"][30:, 3], parts[1]["q.thigh_joint"])
+    file.write_text(file.read_text().replace("\n", ",1\n", 2).replace(",1\n", "\n", 1))
+    with pytest.raises(demos.BadDemonstrations, match=r"walk.csv"):
+        demos.from_csv("Hopper-v5", file, tmp_path / "b.npz", dt=0.008)
+    columns = episode()
+    columns["q.rooty"][11] = np.nan
+    with pytest.raises(demos.BadDemonstrations, match="episode 0: column 'q.rooty' is nan in row 11"):
+        demos.from_columns("Hopper-v5", [columns], tmp_path / "b.npz", dt=0.008)
+    with pytest.raises(demos.BadDemonstrations, match="actions cannot be interpolated"):
+        demos.from_columns("Hopper-v5", [episode()], tmp_path / "b.npz", dt=0.01, actions=("a", "b", "c"))
+
+
+def test_motion_clips(tmp_path: Path) -> None:
+    columns = episode()
+    joints = [name[2:] for name in columns if name.startswith("q.")]
+    file = tmp_path / "clip.npz"
+    positions = np.stack([columns[f"q.{joint}"] for joint in joints], 1)
+    np.savez(file, fps=np.array([125]), joint_pos=positions, joint_names=np.array(joints))
+    data = checked(demos.from_motion("Hopper-v5", file, tmp_path / "a.npz"))
+    assert np.array_equal(data["qpos"], positions)
+    np.savez(file, fps=np.array([125]), joint_vel=positions)
+    with pytest.raises(demos.BadDemonstrations, match="clip.npz': no array 'joint_pos'; it has fps, joint_vel"):
+        demos.from_motion("Hopper-v5", file, tmp_path / "b.npz")
+
+
+def test_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dataset of Gymnasium's Hopper that Minari itself wrote."""
+    minari, gymnasium = pytest.importorskip("minari"), pytest.importorskip("gymnasium")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    env, buffers = gymnasium.make("Hopper-v5"), []
+    env.action_space.seed(3)
+    for k in range(2):
+        observations, actions, rewards = [env.reset(seed=k)[0]], [], []
+        for _ in range(12):
+            actions.append(0.3 * env.action_space.sample())
+            observation, reward, *_ = env.step(actions[-1])
+            observations.append(observation)
+            rewards.append(reward)
+        cut = [False] * 11 + [True]
+        lists = {"observations": np.array(observations), "actions": np.array(actions), "rewards": rewards, "terminations": [False] * 12, "truncations": cut}
+        buffers.append(minari.data_collector.EpisodeBuffer(id=k, **lists))
+    dataset = minari.create_dataset_from_buffers("nearl/hopper-v0", buffers, env=env)
+    env.close()
+    data = checked(demos.from_minari("Hopper-v5", dataset, tmp_path / "a.npz"))
+    e = next(iter(dataset.iterate_episodes()))
+    n = len(e.actions)
+    assert data["lengths"][0] == n and np.allclose(data["observations"][: n + 1], e.observations) and np.array_equal(data["actions"][:n], e.actions)
+
+
+def test_robomimic(tmp_path: Path) -> None:
+    """Its layout: `data/demo_<k>/obs/<key>`, demonstration 10 after 9."""
+    h5py = pytest.importorskip("h5py")
+    parts = {f"demo_{k}": episode(12, k) for k in (0, 2, 10)}
+    joints = [name for name in parts["demo_0"] if name.startswith("q.")]
+    with h5py.File(tmp_path / "low_dim.hdf5", "w") as file:
+        for name, columns in parts.items():
+            group = file.create_group(f"data/{name}")
+            group.attrs["num_samples"] = 12
+            group["obs/joint_pos"] = np.stack([columns[joint] for joint in joints], 1)
+    which = {name: ("joint_pos", k) for k, name in enumerate(joints)}
+    data = checked(demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "a.npz", dt=0.008, columns=which))
+    assert data["lengths"].tolist() == [11] * 3 and np.array_equal(data["qpos"][24:, 4], parts["demo_10"]["q.leg_joint"])
+    with pytest.raises(demos.BadDemonstrations, match=r"episode 0 \(demo_0\): no observation 'arm'"):
+        demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "b.npz", dt=0.008, columns={"q.rooty": ("arm", 0)})
+
+
+def test_lerobot(tmp_path: Path) -> None:
+    """Its layout of version 3: `meta/info.json` and several episodes in one `data/chunk-*/file-*.parquet`."""
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    parts = [episode(12, k) for k in (0, 1)]
+    joints = [name for name in parts[0] if name.startswith("q.")]
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "data" / "chunk-000").mkdir(parents=True)
+    names = [f"{name[2:]}.pos" for name in joints]
+    feature = {"dtype": "float32", "shape": [len(names)], "names": names}
+    (tmp_path / "meta" / "info.json").write_text(json.dumps({"codebase_version": "v3.0", "fps": 125, "features": {"observation.state": feature}}))
+    rows = np.concatenate([np.stack([p[name] for name in joints], 1) for p in parts]).astype(np.float32)
+    table = {"observation.state": pa.array(rows.tolist(), pa.list_(pa.float32())), "episode_index": np.repeat([0, 1], 12)}
+    parquet.write_table(pa.table(table), tmp_path / "data" / "chunk-000" / "file-000.parquet")
+    data = checked(demos.from_lerobot("Hopper-v5", tmp_path, tmp_path / "a.npz"))
+    assert data["lengths"].tolist() == [11, 11] and np.allclose(data["qpos"][12:, 5], parts[1]["q.foot_joint"], atol=1e-6)
+    with pytest.raises(demos.BadDemonstrations, match=r"no feature 'state'; it has observation.state"):
+        demos.from_lerobot("Hopper-v5", tmp_path, tmp_path / "b.npz", key="state")
+
+
+def test_an_agent_learns_from_them(tmp_path: Path) -> None:
+    file = demos.from_columns("Hopper-v5", [episode(), episode(20, 1)], tmp_path / "a.npz", dt=0.008)
+    small = {"train.n_envs": 2, "train.n_steps": 64, "train.ppo.n_epochs": 1, "train.demos.warmup": 128, "train.demos.epochs": 2}
+    seen: list[dict[str, float]] = []
+    agent = nearl.PID2("Hopper-v5", algo="pid2-il", demos=file, settings=small)
+    agent.learn(512, callback=lambda _, metrics: seen.append(metrics))
+    assert sum("demos/cloning_mse" in m for m in seen) == 1 and "discriminator/loss" in seen[-1]
+    with pytest.raises(ValueError, match="'ppo' takes no demonstrations"):
+        nearl.PID2("Hopper-v5", algo="ppo", demos=file)
+
+
+def test_demonstrations_can_be_looked_at(tmp_path: Path) -> None:
+    imageio = pytest.importorskip("imageio.v3")
+    file = demos.from_columns("Hopper-v5", [episode(), episode(20, 1)], tmp_path / "a.npz", dt=0.008)
+    film = lambda *more: subprocess.run(  # noqa: E731
+        [sys.executable, "-m", "nearl.video", file, tmp_path / "a.mp4", *more], capture_output=True, text=True, env={**os.environ, "MUJOCO_GL": "egl"}
+    )
+    done = film("--task", "Hopper-v5", "--episodes", "2", "--size", "96", "96")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip().endswith(": 25 frames"), "every other of 30 and of 20 states"
+    assert np.stack(list(imageio.imiter(tmp_path / "a.mp4"))).std() > 5, "not an empty picture"
+    for more, words in (((), "say of which task"), (("--task", "Ant-v5"), "the robot of 'Ant-v5' has 15 and 14")):
+        failed = film(*more)
+        assert failed.returncode == 1 and words in failed.stderr, failed.stderr

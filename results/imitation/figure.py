@@ -1,0 +1,98 @@
+"""The data, table and figure of runs with evaluations on the way: `curves.csv`, `table.md`, `figure.png`.
+
+    .venv/bin/python results/imitation/figure.py RUNS FOLDER --experts EXPERTS [--variants]
+
+RUNS has `<task>/<algo>_<seed>`, or with --variants `<variant>/<task>/<algo>_<seed>`. Returns are without noise and from ordinary resets.
+"""
+
+import argparse
+import csv
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+from matplotlib import pyplot as plt
+
+from nearl.curves import bootstrap_band, interquartile_mean
+
+RETURN, R2, UPDATED = "eval/ep_rew_mean", "idm/r2_before", "idm/updated"
+
+
+def read(runs: Path, variants: bool) -> dict[tuple[str, str], dict[int, dict[str, np.ndarray]]]:
+    """Columns of each run, by task and name, then by seed."""
+    found: dict = defaultdict(dict)
+    for file in sorted(runs.glob(f"{'*/' if variants else ''}*/*_*/metrics.csv")):
+        name, seed = file.parent.name.rsplit("_", 1)
+        if variants:
+            name = file.parents[2].name
+        with open(file) as text:
+            rows = list(csv.DictReader(text))
+        number = lambda cell: float(cell) if cell else np.nan  # noqa: E731
+        columns = {k: np.array([number(row[k]) for row in rows]) for k in ("time/total_timesteps", RETURN, R2, UPDATED)}
+        found[file.parents[1].name, name][int(seed)] = columns
+    return found
+
+
+def curve(columns: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and returns where there was an evaluation."""
+    there = np.isfinite(columns[RETURN])
+    return columns["time/total_timesteps"][there], columns[RETURN][there]
+
+
+def mean(columns: list[np.ndarray]) -> float:
+    """Over everything that was measured; NaN where nothing was."""
+    values = np.concatenate(columns)
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("runs", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--experts", type=Path, required=True)
+    parser.add_argument("--variants", action="store_true")
+    args = parser.parse_args()
+    found = read(args.runs, args.variants)
+    tasks = sorted({task for task, _ in found})
+    expert = {task: float(np.mean(json.loads((args.experts / f"{task}.json").read_text())["returns"])) for task in tasks}
+    lines = ["| task | | seeds | mean over the run | at its half | at its end | share of the expert | R² of the inverse model | it learned by itself |"]
+    lines.append("|---|---|---|---|---|---|---|---|---|")
+    rows = []
+    figure, axes = plt.subplots(1, len(tasks), figsize=(5.2 * len(tasks), 3.8), squeeze=False)
+    for axis, task in zip(axes[0], tasks):
+        for (_, name), seeds in sorted((k, v) for k, v in found.items() if k[0] == task):
+            curves = {seed: curve(c) for seed, c in seeds.items()}
+            n = min(len(steps) for steps, _ in curves.values())
+            if n == 0:
+                continue
+            steps = next(iter(curves.values()))[0][:n]
+            values = np.stack([y[:n] for _, y in curves.values()])
+            for seed, (xs, ys) in curves.items():
+                rows += [{"task": task, "name": name, "seed": seed, "steps": int(x), "return": f"{y:.5g}"} for x, y in zip(xs, ys)]
+            centre = interquartile_mean(values)
+            (line,) = axis.plot(steps, centre, label=f"{name} ({len(values)})")
+            if len(values) > 1:
+                axis.fill_between(steps, *bootstrap_band(values), color=line.get_color(), alpha=0.15, lw=0)
+            r2, updated = (mean([c[k] for c in seeds.values()]) for k in (R2, UPDATED))
+            speed, half, end = interquartile_mean(values.mean(axis=1)), centre[(n - 1) // 2], centre[-1]
+            share = end / expert[task]
+            lines.append(f"| {task} | {name} | {len(values)} | {speed:.0f} | {half:.0f} | {end:.0f} | {share:.2f} | {r2:.2f} | {updated:.2f} |")
+        axis.axhline(expert[task], color="black", lw=0.8, ls="--", label="expert")
+        axis.set(title=task, xlabel="steps", ylabel="return without noise")
+        axis.legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(args.folder / "figure.png", dpi=100)
+    with open(args.folder / "curves.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    (args.folder / "table.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

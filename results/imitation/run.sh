@@ -1,0 +1,19 @@
+#!/usr/bin/env bash
+# Speed of learning with demonstrations (the paper's figure 4): DAPG, PID2-IL, SOIL and PPO, noise-free return from ordinary resets.
+#     results/imitation/run.sh [SEEDS [STEPS [TASKS]]]      e.g. 0-4 1M "Hopper-v5 HalfCheetah-v5"
+# Finished runs are skipped, broken ones go on.
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+seeds=${1:-0-4} steps=${2:-1M} tasks=${3:-Hopper-v5 HalfCheetah-v5 Walker2d-v5 Ant-v5}
+runs=runs/imitation
+common=(--seeds "$seeds" --steps "$steps" --preset strong --set train.n_steps=64 --set train.ppo.batch_size=128
+    --set train.eval_every=20000 --set train.eval_episodes=3 --out $runs --jobs "${JOBS:-2}")
+
+mkdir -p $runs
+for task in $tasks; do
+    demos=$runs/$task.npz
+    [ -f $demos ] || target/release/nearl demos record results/imitation/experts/$task.safetensors --out $demos --json > results/imitation/experts/$task.json
+    target/release/nearl sweep --tasks $task --algos ppo "${common[@]}"
+    target/release/nearl sweep --tasks $task --algos pid2-il,soil,dapg --demos $demos "${common[@]}"
+done
+.venv/bin/python results/imitation/figure.py $runs results/imitation --experts results/imitation/experts

@@ -1,0 +1,143 @@
+//! Learning from demonstrations: where episodes begin, resuming, what is not read, and what is refused.
+
+use nearl_tests::{request, training};
+use nearl_trainer::checkpoint::Values;
+use nearl_trainer::demos::{Demonstrations, record};
+use nearl_trainer::train::{Request, TrainError, Training};
+use std::path::{Path, PathBuf};
+
+const TASK: &str = "Hopper-v5";
+
+/// Demonstrations of a fresh policy: whatever they are worth, they are states of the task.
+fn demos(folder: &Path) -> (PathBuf, Demonstrations) {
+    let snapshot = training(TASK, "pid2-ib", 3, 1, &[]).snapshot().clone();
+    let (demos, _) = record(&snapshot, 4, 1).expect("episodes");
+    let file = folder.join("demos.npz");
+    demos.save(&file).expect("saved");
+    (file, demos)
+}
+
+/// A small training with these demonstrations.
+fn asked(algo: &str, file: &Path, more: &[&str]) -> Request {
+    let file = format!("train.demos.file='{}'", file.display());
+    let set = [
+        "train.n_envs=4",
+        "train.n_steps=160",
+        "train.ppo.batch_size=320",
+        "train.ppo.n_epochs=2",
+        "train.demos.epochs=2",
+        "train.demos.warmup=640",
+        &file,
+    ];
+    Request { steps: 8 * 640, ..request(TASK, algo, 5, 1, &[set.as_slice(), more].concat()) }
+}
+
+#[test]
+fn episodes_begin_in_states_of_the_file_bit_for_bit() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, demos) = demos(folder.path());
+    let mut training = Training::new(&asked("soil", &file, &["train.demos.resets=1.0"])).expect("training");
+    training.iterate();
+    training.iterate();
+    let checkpoint = training.checkpoint().expect("checkpoint");
+    let of = |name: &str| match &checkpoint.tensors[name] {
+        Values::F64(v) => v.clone(),
+        Values::F32(_) => panic!("{name} is narrow"),
+    };
+    let e = &demos.episodes;
+    let (nq, nv) = (e[0].qpos.len() / (e[0].length + 1), e[0].qvel.len() / (e[0].length + 1));
+    let begun: Vec<usize> = (0..4).filter(|i| of(&format!("env.{i}.from_frame")) == [1.0]).collect();
+    assert!(begun.len() >= 2, "a fresh policy falls within 320 steps: {begun:?}");
+    for i in begun {
+        let (qpos, qvel) = (of(&format!("env.{i}.qpos")), of(&format!("env.{i}.qvel")));
+        let is_there = e.iter().any(|e| {
+            let states = e.qpos.chunks_exact(nq).zip(e.qvel.chunks_exact(nv)).take(e.length);
+            states.into_iter().any(|(q, v)| q == qpos && v == qvel)
+        });
+        assert!(is_there, "environment {i} began in no state of the file");
+    }
+}
+
+/// Weights, statistics and what was reported, without the clock.
+fn bits(training: &mut Training) -> Vec<u64> {
+    let tensors = training.checkpoint().expect("checkpoint").tensors;
+    let timeless = tensors.into_iter().filter(|(name, _)| name != "seconds");
+    timeless
+        .flat_map(|(_, values)| match values {
+            Values::F32(v) => v.into_iter().map(|x| u64::from(x.to_bits())).collect::<Vec<_>>(),
+            Values::F64(v) => v.into_iter().map(f64::to_bits).collect(),
+        })
+        .collect()
+}
+
+/// Stopped in the warm-up and after it: the pre-training comes once, and everything is as without a stop.
+#[test]
+fn resuming_gives_the_same_bits() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, _) = demos(folder.path());
+    for algo in ["bc", "soil", "dapg", "pid2-il"] {
+        let request = asked(algo, &file, &[]);
+        let mut whole = Training::new(&request).expect("training");
+        (0..5).for_each(|_| drop(whole.iterate()));
+        for stop in [1, 2, 4] {
+            let mut first = Training::new(&request).expect("training");
+            (0..stop).for_each(|_| drop(first.iterate()));
+            let checkpoint = first.checkpoint().expect("checkpoint");
+            let mut second = Training::resume(checkpoint, Path::new("run"), None, 2).expect("resumed");
+            (stop..5).for_each(|_| drop(second.iterate()));
+            assert!(bits(&mut whole) == bits(&mut second), "{algo}: other bits after a stop at {stop}");
+        }
+    }
+}
+
+/// Actions are read by `dapg` alone.
+#[test]
+fn other_actions_change_nothing_where_states_alone_are_learned_from() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, mut demos) = demos(folder.path());
+    let learned = |algo: &str| {
+        let mut training = Training::new(&asked(algo, &file, &[])).expect("training");
+        (0..4).for_each(|_| drop(training.iterate()));
+        bits(&mut training)
+    };
+    let algos = ["bc", "soil", "pid2-il", "dapg"];
+    let before = algos.map(learned);
+    demos.episodes.iter_mut().flat_map(|e| &mut e.actions).for_each(|a| *a = 0.3 - *a);
+    demos.save(&file).expect("saved");
+    let after = algos.map(learned);
+    assert_eq!([0, 1, 2].map(|k| before[k] == after[k]), [true; 3], "a state-only run read actions");
+    assert!(before[3] != after[3], "dapg reads them");
+}
+
+#[test]
+fn what_does_not_fit_is_refused_by_name() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, demos) = demos(folder.path());
+    let refused = |request: &Request, words: &[&str]| {
+        let error = match Training::new(request) {
+            Err(e @ (TrainError::Settings(_) | TrainError::Demos(_))) => e.to_string(),
+            Err(e) => panic!("refused elsewhere: {e}"),
+            Ok(_) => panic!("it was taken; {words:?}"),
+        };
+        assert!(words.iter().all(|w| error.contains(w)) && !error.contains('\n'), "{error}");
+    };
+    refused(&asked("ppo", &file, &[]), &["'ppo' takes no demonstrations", "bc, soil, dapg, pid2-il"]);
+    refused(&asked("soil", Path::new(""), &[]), &["'soil' learns from demonstrations", "--demos"]);
+    refused(&asked("bc", &folder.path().join("none.npz"), &[]), &["none.npz", "cannot be read"]);
+    let other =
+        |task: &str| request(task, "pid2-il", 1, 1, &[&format!("train.demos.file='{}'", file.display())]);
+    refused(&other("HalfCheetah-v5"), &["demos.npz", "its period is 0.008 s, that of the task 0.05 s"]);
+    refused(&other("Walker2d-v5"), &["demos.npz", "it has no column"]);
+    let mut bare = demos;
+    bare.episodes.iter_mut().for_each(|e| e.actions.clear());
+    bare.save(&file).expect("saved");
+    refused(&asked("dapg", &file, &[]), &["demos.npz", "episode 0 has no 'actions'", "soil or pid2-il"]);
+    assert!(Training::new(&asked("soil", &file, &[])).is_ok(), "it needs none");
+    let mut stopped = Training::new(&asked("bc", &file, &[])).expect("training");
+    stopped.iterate();
+    let checkpoint = stopped.checkpoint().expect("checkpoint");
+    bare.episodes.truncate(2);
+    bare.save(&file).expect("saved");
+    let error = Training::resume(checkpoint, Path::new("run"), None, 1).map(drop).expect_err("other file");
+    assert!(error.to_string().contains("it learned from other demonstrations than"), "{error}");
+}

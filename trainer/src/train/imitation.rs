@@ -1,0 +1,164 @@
+//! Demonstrations in a training: read and checked before it begins, then handed to the learner in the units of the day.
+
+use super::{Source, TrainError};
+use crate::demos::{DemoError, DemoSettings, Demonstrations};
+use crate::learn::{Algorithm, Batch};
+use crate::rollout::RolloutError;
+use crate::settings::TrainSettings;
+use crate::stats::RunningStats;
+use nearl_runtime::Manifest;
+use nearl_runtime::normaliser::Normaliser;
+use std::path::Path;
+
+/// What a training keeps of its demonstrations.
+pub(super) struct Imitation {
+    demos: Demonstrations,
+    settings: DemoSettings,
+    /// Observation index of each proposed entry.
+    state: Vec<usize>,
+    /// Batches from which the inverse model alone learns, after the first.
+    warm_ups: u64,
+    /// Updates of the run.
+    updates: u64,
+    begins_in_frames: bool,
+}
+
+impl Imitation {
+    /// The demonstrations of an algorithm that learns from some; nothing of one that does not.
+    ///
+    /// # Errors
+    /// [`TrainError`]: none where they are needed, some where they are of no use, or of another task.
+    pub(super) fn read(
+        algo: Algorithm,
+        settings: &TrainSettings,
+        manifest: &Manifest,
+        state: &[usize],
+        steps: u64,
+    ) -> Result<Option<Self>, TrainError> {
+        let own = settings.demos.clone();
+        match (algo.imitates(), own.file.is_empty()) {
+            (false, true) => return Ok(None),
+            (false, false) => {
+                return Err(TrainError::Settings(format!(
+                    "[train.demos.file]: '{algo}' takes no demonstrations; give one of {} with --algo, or leave --demos out",
+                    Algorithm::imitating()
+                )));
+            }
+            (true, true) => {
+                return Err(TrainError::Settings(format!(
+                    "'{algo}' learns from demonstrations and was given none; give a file with --demos ('nearl demos record RUN' writes one)"
+                )));
+            }
+            (true, false) => {}
+        }
+        let wrong = |reason| TrainError::Demos(DemoError { file: own.file.clone(), reason });
+        let demos = Demonstrations::load(Path::new(&own.file))?.first(own.episodes);
+        let task = &manifest.task;
+        let mut env = crate::env::of_task(manifest, &task.name).map_err(RolloutError::from)?;
+        demos.check(&mut *env, task.time.dt * task.time.policy_every as f64).map_err(wrong)?;
+        let demos = demos.columns(&task.state.observation).map_err(wrong)?;
+        if algo == Algorithm::Dapg {
+            check_actions(&demos, manifest.action_lower.len()).map_err(wrong)?;
+        }
+        let batch = (settings.n_envs * settings.n_steps) as u64;
+        let is_dapg = algo == Algorithm::Dapg;
+        let warm_ups = if is_dapg { 0 } else { own.warmup.div_ceil(batch) };
+        Ok(Some(Self {
+            demos,
+            settings: own,
+            state: state.to_vec(),
+            warm_ups,
+            updates: (steps / batch).saturating_sub(warm_ups + 1),
+            begins_in_frames: !is_dapg,
+        }))
+    }
+
+    /// Lets episodes begin in the demonstrations' states.
+    ///
+    /// # Errors
+    /// [`TrainError::Settings`] where the experience comes from elsewhere.
+    pub(super) fn place(&self, source: &mut dyn Source) -> Result<(), TrainError> {
+        if !self.begins_in_frames || self.settings.resets == 0.0 {
+            return Ok(());
+        }
+        if source.begin_in(&self.demos.frames().into(), self.settings.resets) {
+            return Ok(());
+        }
+        Err(TrainError::Settings(
+            "[train.demos.resets]: episodes can begin in demonstrated states in environments of this process alone; leave --from and --collect \
+             out, or set it to 0"
+                .into(),
+        ))
+    }
+
+    /// Adds what was demonstrated to the statistics of observations and of changes.
+    pub(super) fn seed(&self, obs: &mut RunningStats, change: &mut RunningStats) {
+        let width = self.demos.names.len();
+        let mut step = vec![0.0; self.state.len()];
+        for e in &self.demos.episodes {
+            e.observations.chunks_exact(width).for_each(|row| obs.push(row));
+            for pair in e.observations.windows(2 * width).step_by(width) {
+                let (now, next) = pair.split_at(width);
+                step.iter_mut().zip(&self.state).for_each(|(step, &k)| *step = next[k] - now[k]);
+                change.push(&step);
+            }
+        }
+    }
+
+    /// The transitions as rows of the networks.
+    pub(super) fn batch(&self, normaliser: &Normaliser) -> Batch {
+        self.demos.batch(normaliser, &self.state, self.settings.batch_size)
+    }
+
+    /// What a row of them weighs in the policy gradient after `iterations` of the training.
+    pub(super) fn weight(&self, iterations: u64) -> f64 {
+        self.settings.weight(iterations.saturating_sub(self.warm_ups + 1), self.updates)
+    }
+
+    /// Whether the batch after `iterations` is one for the inverse model alone.
+    pub(super) fn warms_up(&self, iterations: u64) -> bool {
+        iterations <= self.warm_ups
+    }
+
+    /// Whether the demonstrations alone are learned from once `iterations` are done.
+    pub(super) fn pretrains(&self, iterations: u64) -> bool {
+        iterations == self.warm_ups + 1
+    }
+
+    /// Whether networks are carried over to the statistics of these iterations: those of the first are no longer of unit 1.
+    pub(super) fn carries(iterations: u64) -> bool {
+        iterations > 1
+    }
+
+    /// What tells these demonstrations from others: a sum over every number in them but the actions.
+    pub(super) fn fingerprint(&self) -> f64 {
+        let mut hash = crc32fast::Hasher::new();
+        for e in &self.demos.episodes {
+            for list in [&e.observations, &e.qpos, &e.qvel] {
+                list.iter().for_each(|x| hash.update(&x.to_le_bytes()));
+            }
+        }
+        f64::from(hash.finalize())
+    }
+
+    /// The file, for messages.
+    pub(super) fn file(&self) -> &str {
+        &self.settings.file
+    }
+}
+
+/// Every episode has an action of `n_act` entries a step.
+fn check_actions(demos: &Demonstrations, n_act: usize) -> Result<(), String> {
+    for (i, e) in demos.episodes.iter().enumerate() {
+        if e.actions.is_empty() {
+            return Err(format!(
+                "episode {i} has no 'actions', which dapg clones; record them with 'nearl demos record', or take soil or pid2-il, which need none"
+            ));
+        }
+        let width = e.actions.len() / e.length;
+        if width != n_act {
+            return Err(format!("'actions' has {width} columns where the robot has {n_act} actuators"));
+        }
+    }
+    Ok(())
+}
