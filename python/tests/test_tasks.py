@@ -197,6 +197,18 @@ def test_an_environment_without_mujoco_has_no_robot(tmp_path: Path) -> None:
         nearl.from_gymnasium("CartPole-v1", tmp_path)
 
 
+@pytest.mark.parametrize("env_id", ["InvertedDoublePendulum-v5", "Swimmer-v5", "Reacher-v5", "Pusher-v5"])
+def test_every_task_of_gymnasium_trains(env_id: str, tmp_path: Path) -> None:
+    """A few iterations through the environment, the constraints and the learner: weights move and stay numbers."""
+    agent = nearl.PID2(nearl.from_gymnasium(env_id, tmp_path), settings={"train.n_envs": 4, "train.n_steps": 64})
+    obs = np.linspace(-0.1, 0.1, len(agent.controller.obs_names))
+    before, rows = agent.predict(obs)[0], []
+    agent.learn(768, callback=lambda _, metrics: rows.append(dict(metrics)))
+    after = agent.predict(obs)[0]
+    assert len(rows) == 3 and np.isfinite(after).all() and not np.array_equal(before, after)
+    assert all(np.isfinite(value) for row in rows for value in row.values())
+
+
 def test_a_task_from_gymnasium_learns(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\[reward\] of 'Humanoid' is 0 whatever happens"):
         nearl.PID2(nearl.from_gymnasium("Humanoid-v5", tmp_path))

@@ -1,6 +1,8 @@
 """Reached states outside the limits, without and with the simulator's guard, beside the share that no sampled action avoids.
 
-    python results/reached/measure.py TASK SNAPSHOT TICKS >> results/reached/reached.csv
+    python results/reached/measure.py TASK SNAPSHOT TICKS [MARGIN] >> results/reached/reached.csv
+
+With MARGIN [rad] the guard keeps that distance from the joints' stops, and what is counted are still the limits of the task file.
 
 The policy runs without noise in Gymnasium's own environment; limits are those of the task file.
 """
@@ -35,11 +37,12 @@ def avoidable(guard: nearl.Guard, action: np.ndarray, rng: np.random.Generator) 
     return False
 
 
-def measure(task: str, snapshot: str, ticks: int, guarded: bool) -> str:
+def measure(task: str, snapshot: str, ticks: int, guarded: bool, margin: float | None = None) -> str:
     """One line of the table: whole episodes, at least ``ticks`` control ticks."""
     controller = nearl.Controller.load(snapshot)
     env = gymnasium.make(task.replace("-velocity", "-v5"))
     guard, rng = nearl.Guard(env, limits(task)), np.random.default_rng(0)
+    keeping = guard if margin is None else nearl.Guard(env, {**limits(task), "position": {"margin": margin}})
     count, returns, spent, n = np.zeros((2, 3), int), [], 0.0, 0
     while n < ticks:
         obs, over, total = env.reset(seed=100 + len(returns))[0], False, 0.0
@@ -49,7 +52,7 @@ def measure(task: str, snapshot: str, ticks: int, guarded: bool) -> str:
             start = time.perf_counter()
             action = np.clip(np.asarray(controller.act(obs), np.float32), -1, 1)
             if guarded:
-                action, _ = guard.safe(action)
+                action, _ = keeping.safe(action)
             spent += time.perf_counter() - start
             out = guard._excess(guard._foresee(np.asarray(action, float))) > 0.0
             lost = out and not avoidable(guard, action, rng)
@@ -66,4 +69,4 @@ def measure(task: str, snapshot: str, ticks: int, guarded: bool) -> str:
 
 if __name__ == "__main__":
     for guarded in (False, True):
-        print(measure(sys.argv[1], sys.argv[2], int(sys.argv[3]), guarded), flush=True)
+        print(measure(sys.argv[1], sys.argv[2], int(sys.argv[3]), guarded, *map(float, sys.argv[4:5])), flush=True)

@@ -1,0 +1,61 @@
+"""A process that proposes, beside a loop at 1 kHz: how old its answers are, what is lost, and what the limits say.
+
+    python results/doors/proposer.py > results/doors/proposer.md
+
+`nearl plant Panda-reach` waits for each action (a busy machine would be late otherwise), the loop runs on threads of this process, and the proposer is a process of its own that answers each state it reads with a wild one (up to three
+radians away), after the time that a model would take.
+"""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import nearl
+
+SECONDS = 20.0
+MODEL = """
+import sys, time
+import numpy as np
+import nearl
+random, think = np.random.default_rng(0), float(sys.argv[2])
+with nearl.Proposer(sys.argv[1], patience=60.0) as proposer:
+    for state in proposer.states(patience=3.0):
+        time.sleep(think)
+        here = np.concatenate([state.q, state.v])
+        proposer.propose(here + random.uniform(-3.0, 3.0, len(here)))
+"""
+
+
+def row(snapshot: Path, think: float) -> str:
+    name = f"door-{round(1e3 * think)}"
+    plant = subprocess.Popen([sys.executable, "-m", "nearl", "plant", "Panda-reach", "--name", name, "--endless", "--lockstep"], stdout=subprocess.DEVNULL)
+    model = subprocess.Popen([sys.executable, "-c", MODEL, name, str(think)])
+    try:
+        with nearl.Loop(snapshot, name, seconds=SECONDS, patience=30.0, proposal_age=0.1, proposal_hold=0.1) as loop:
+            report = loop.wait()
+    finally:
+        model.kill(), plant.terminate()
+        model.wait(), plant.wait()
+    c, p = report["counters"], report["proposer"]
+    answer, link = (f"{p[key]['p50'] / 1e6:.2f}, {p[key]['p99'] / 1e6:.2f}" for key in ("answer", "link"))
+    modes = ", ".join(f"{mode} {n}" for mode, n in report["modes"].items() if n)
+    outside = sum(report["plant"]["violations"].values())
+    return (
+        f"| {1e3 * think:.0f} | {c['proposals']} | {c['overtaken_proposals']} | {answer} | {link} | {modes} | "
+        f"{c['raw_violations']} | {c['target_violations']} | {outside} |"
+    )
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        snapshot = Path(scratch) / "arm.safetensors"
+        nearl.blank("Panda-reach", snapshot)
+        print("| model takes [ms] | taken | overtaken | state to answer p50, p99 [ms] | sent to answer p50, p99 [ms] | ticks by mode | raw violations | of targets | on the plant |")
+        print("|---|---|---|---|---|---|---|---|---|")
+        for think in (0.0, 0.005, 0.02, 0.05, 0.15, 0.3):
+            print(row(snapshot, think), flush=True)
+
+
+if __name__ == "__main__":
+    main()

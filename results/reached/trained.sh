@@ -1,0 +1,22 @@
+#!/bin/sh
+# Hopper without the simulator's guard and trained behind it, 0.05 rad before the joints' soft stops: results/reached/trained.sh [STEPS] [TICKS] writes
+# trained.csv. RUNS may hold the trainings.
+set -eu
+cd "$(dirname "$0")/../.."
+steps=${1:-200000}
+ticks=${2:-2000}
+runs=${RUNS:-$(mktemp -d)}
+nearl=${NEARL:-target/release/nearl}
+python=${PYTHON:-.venv/bin/python}
+out=results/reached/trained.csv
+echo "trained,task,guard,ticks,outside,unavoidable,began_inside,outside_from_inside,unavoidable_from_inside,mean_return,episodes,steps_per_second" > "$out"
+train() {
+    name=$1
+    shift
+    [ -d "$runs/$name" ] || "$nearl" train Hopper-v5 --algo pid2-ib --steps "$steps" --seed 1 "$@" --out "$runs/$name" > "$runs/$name.log" 2>&1
+}
+train without
+train behind --set 'constraints.guard="simulator"' --set constraints.position.margin=0.05
+for name in without behind; do
+    "$python" results/reached/measure.py Hopper-v5 "$runs/$name/checkpoints/final.safetensors" "$ticks" 0.05 | sed "s/^/$name,/" >> "$out"
+done
