@@ -53,7 +53,7 @@ def main() -> None:
         nearl.blank("Panda-reach", snapshot)
         print("| model takes [ms] | taken | overtaken | state to answer p50, p99 [ms] | sent to answer p50, p99 [ms] | ticks by mode | raw violations | of targets | on the plant |")
         print("|---|---|---|---|---|---|---|---|---|")
-        for think in (0.0, 0.005, 0.02, 0.05, 0.15, 0.3):
+        for think in (0.0, 0.005, 0.02, 0.05, 0.15):
             print(row(snapshot, think), flush=True)
 
 
