@@ -24,9 +24,13 @@ nav:
   - Tasks: docs/TASKS.md
   - Limits: docs/LIMITS.md
   - Training: docs/TRAINING.md
+  - Demonstrations: docs/DEMONSTRATIONS.md
   - Environments: docs/ENVIRONMENTS.md
+  - Policies made elsewhere: docs/POLICIES.md
+  - Connecting a robot: docs/CONNECT.md
   - Embedding in Rust: docs/EMBED.md
   - Faults: docs/FAULTS.md
+  - Security: docs/SECURITY.md
   - Words: docs/GLOSSARY.md
   - Architecture: docs/ARCHITECTURE.md
   - Python: docs/PYTHON.md

@@ -5,8 +5,6 @@ use std::io::{Error, Read, Result};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-use rustix::fs::OFlags;
-
 /// Largest robot, task, fault or limits file that is read [bytes].
 pub const MAX_TEXT_BYTES: u64 = 16 << 20;
 
@@ -25,9 +23,9 @@ pub fn open_regular(path: &Path, links: bool) -> Result<File> {
     if !named.is_file() {
         return Err(odd());
     }
-    let mut flags = OFlags::NONBLOCK | OFlags::NOCTTY;
-    flags.set(OFlags::NOFOLLOW, !links);
-    let file = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path)?;
+    let at_the_link = if links { 0 } else { libc::O_NOFOLLOW };
+    let flags = libc::O_NONBLOCK | libc::O_NOCTTY | at_the_link;
+    let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
     if file.metadata()?.is_file() { Ok(file) } else { Err(odd()) }
 }
 

@@ -242,7 +242,7 @@ fn gains(snapshot: &Snapshot, joints: &[String], controller: &Controller) -> Opt
 fn recipe(snapshot: &Snapshot, section: PolicySection) -> String {
     let mut task = snapshot.manifest.task.clone();
     task.policy = Some(section);
-    let mut table: toml::Table = toml::from_str(&task.to_toml()).unwrap_or_default();
+    let mut table: toml::Table = toml::from_str(&crate::run_folder::to_toml(&task)).unwrap_or_default();
     for key in ["env", "reward", "cost", "termination", "reset", "train"] {
         table.remove(key);
     }

@@ -3,6 +3,7 @@
 use crate::checkpoint;
 use crate::robot;
 use nearl_runtime::snapshot::{in_run, write_whole};
+use nearl_runtime::task::Task;
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -71,7 +72,12 @@ pub fn task_file(manifest: &Manifest) -> (String, Option<(String, String)>) {
             }
         }
     }
-    (task.to_toml(), copy)
+    (to_toml(&task), copy)
+}
+
+/// The effective task as the text of a task file.
+pub(crate) fn to_toml(task: &Task) -> String {
+    toml::to_string(task).unwrap_or_else(|e| unreachable!("a task was read from TOML: {e}"))
 }
 
 /// Writes the effective task file as `<name>.toml` with its robot file beside it; returns its path.

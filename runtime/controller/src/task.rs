@@ -304,11 +304,6 @@ impl Task {
         })
     }
 
-    /// The effective file as TOML, for the run folder.
-    pub fn to_toml(&self) -> String {
-        toml::to_string(self).unwrap_or_else(|e| format!("# cannot be written as TOML: {e}\n"))
-    }
-
     /// Physics sub-steps in one control period; 0 for a zero-order-hold plant.
     pub fn sub_steps(&self) -> usize {
         if self.time.sim_dt == 0.0 { 0 } else { (self.time.dt / self.time.sim_dt).round() as usize }

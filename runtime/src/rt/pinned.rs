@@ -255,3 +255,21 @@ pub(crate) fn above(is: f64, was: f64) -> bool {
 
 /// Units of position, velocity, acceleration and force of a degree of freedom.
 pub(crate) const UNITS: [&str; 4] = ["rad or m", "rad/s or m/s", "rad/s² or m/s²", "N m or N"];
+
+#[cfg(test)]
+mod tests {
+    use super::SECTIONS;
+    use nearl_constraints::limit::REGISTRY;
+
+    /// Kinds whose whole effect is in the box of single joints, or that [`Pinned::ways`](super::Pinned) compares.
+    const IN_THE_BOX: [&str; 5] = ["position", "velocity", "acceleration", "velocity_profile", "locked"];
+
+    /// A kind that is compared nowhere could be loosened by a pushed snapshot without a word.
+    #[test]
+    fn every_kind_of_limit_is_compared() {
+        for entry in REGISTRY {
+            let compared = SECTIONS.contains(&entry.name) || IN_THE_BOX.contains(&entry.name);
+            assert!(compared, "'{}' belongs to SECTIONS or to the box of single joints", entry.name);
+        }
+    }
+}

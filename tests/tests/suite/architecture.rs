@@ -3,6 +3,7 @@
 use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, NodeDep};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 /// Crate -> the workspace crates it may import.
 const ARROWS: &[(&str, &[&str])] = &[
@@ -78,6 +79,24 @@ fn the_controller_is_embedded_without_links_threads_and_command_lines() {
     assert!(controller.contains("nearl-constraints") && controller.len() > 10, "{controller:?}");
     let found: Vec<_> = NOT_EMBEDDED.iter().filter(|library| controller.contains(**library)).collect();
     assert!(found.is_empty(), "nearl-controller builds {found:?}");
+}
+
+/// Packages that building the controller takes, itself included; 156 while it was a part of the runtime's crate.
+const MOST_PACKAGES: usize = 78;
+
+/// As `cargo tree -p nearl-controller -e normal` lists them, each version once.
+#[test]
+fn the_controller_is_built_from_few_packages() {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let tree = ["tree", "-p", "nearl-controller", "-e", "normal", "--prefix", "none", "--locked"];
+    let output = Command::new(cargo).args(tree).current_dir(env!("CARGO_MANIFEST_DIR")).output();
+    let output = output.expect("cargo tree runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8(output.stdout).expect("names");
+    let name_and_version = |line: &str| line.split(' ').take(2).collect::<Vec<_>>().join(" ");
+    let packages: BTreeSet<_> = text.lines().map(name_and_version).collect();
+    let found = packages.len();
+    assert!((10..=MOST_PACKAGES).contains(&found), "{found} packages: which of them is new? {packages:?}");
 }
 
 #[test]
