@@ -361,9 +361,9 @@ fn snapshots_of_the_first_format() {
     let foreign = resigned(&old, "\"model_format\":\"urdf\"", "\"model_format\":\"mjcf\"");
     let text = Snapshot::from_bytes(&foreign).expect_err("an MJCF robot").to_string();
     assert!(text.contains("format 1 with an MJCF robot") && text.contains("train again"), "{text}");
-    let newer = resigned(&old, "\"format\":1", "\"format\":3");
+    let newer = resigned(&old, "\"format\":1", "\"format\":4");
     let text = Snapshot::from_bytes(&newer).expect_err("another format").to_string();
-    assert!(text.contains("format 3 where this program reads 2"), "{text}");
+    assert!(text.contains("format 4 where this program reads 1 to 3"), "{text}");
 }
 
 /// The file with other words in its manifest, and a digest that fits.
