@@ -9,7 +9,7 @@ use clap::{Args, Subcommand};
 use crate::clock::nanoseconds;
 use crate::codes::{self, Explanation};
 use crate::link::{RobotName, bench_round_trip};
-use crate::log::replay;
+use crate::log::{Gap, replay};
 use crate::rt::{
     FaultPlan, PRIORITY, Percentiles, ProposerSettings, Reason, RunSettings, Stop, ThreadSettings,
     bench_wake, run,
@@ -168,6 +168,12 @@ fn hertz(text: &str) -> Result<f64, String> {
     }
 }
 
+/// What the wall clock is ahead of the monotonic one [ns]: read once, before the loop starts.
+fn ahead() -> u64 {
+    let wall = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX).saturating_sub(crate::clock::now())
+}
+
 /// Any failure, as one sentence.
 pub type Failure = Box<dyn std::error::Error + Send + Sync>;
 
@@ -236,6 +242,7 @@ impl RunCommand {
             rate: self.rate,
             seconds: self.seconds,
             log: self.log,
+            wall: ahead(),
             thread,
             strict: self.strict,
             ..RunSettings::default()
@@ -275,6 +282,12 @@ impl ReplayCommand {
                 "{file}: {} ticks and {} swaps, bit for bit the same{end}",
                 found.ticks, found.swaps
             ));
+            if found.brief > 0 {
+                say(format!("  {} of them by their digest: the disk was too slow for more", found.brief));
+            }
+            for Gap { from, to, lost } in &found.gaps {
+                say(format!("  ticks {from} to {to} could not be computed: {lost} of them were dropped"));
+            }
         }
         Ok(())
     }

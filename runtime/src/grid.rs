@@ -19,6 +19,16 @@ impl Grid {
         Grid { start, period: period.max(1), slot: 0, overruns: 0, skipped: 0 }
     }
 
+    /// Start [ns], slot, overruns and skipped slots, for [`Grid::resume`].
+    pub fn place(&self) -> [u64; 4] {
+        [self.start, self.slot, self.overruns, self.skipped]
+    }
+
+    /// Goes on where another grid of the same period was.
+    pub fn resume(&mut self, place: [u64; 4]) {
+        [self.start, self.slot, self.overruns, self.skipped] = place;
+    }
+
     /// Number of the slot that is waited for.
     pub fn slot(&self) -> u64 {
         self.slot

@@ -176,6 +176,11 @@ impl Backup {
         false
     }
 
+    /// The decelerations of the stored brake (nv), if one is stored.
+    pub(crate) fn decelerations(&self) -> Option<&[f64]> {
+        self.stored.then_some(&self.deceleration)
+    }
+
     /// Velocity of dof `i` after one tick of the stored brake.
     pub(crate) fn next_velocity(&self, i: usize, v: f64, period: &Period) -> f64 {
         v - v.signum() * (self.deceleration[i] * period.dt).min(v.abs())

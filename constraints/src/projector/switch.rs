@@ -86,6 +86,12 @@ impl Projector {
         self.settings.braking == crate::Braking::Stored
     }
 
+    /// The way to stop that was verified last (nv): the deceleration of each controllable dof until it stands [rad/s² or m/s²]. `None`
+    /// where none is stored.
+    pub fn stored_brake(&self) -> Option<&[f64]> {
+        self.backup.decelerations().filter(|_| self.stores_a_brake())
+    }
+
     /// Acceleration (nv) and motor force (nv) of the tick before, for limits on their change; `None`: not known, and
     /// those limits do not hold in the next tick.
     ///

@@ -485,6 +485,17 @@ impl Controller {
         }
     }
 
+    /// The way to stop that was verified last (nv), see [`Projector::stored_brake`].
+    pub fn stored_brake(&self) -> Option<&[f64]> {
+        self.last_word().stored_brake()
+    }
+
+    /// Whether the next tick depends on [`Controller::memory`] and its arguments alone: a policy period begins, and no observation of
+    /// earlier ticks is kept.
+    pub fn is_memory_whole(&self) -> bool {
+        self.begins_period() && !self.foreign.remembers()
+    }
+
     /// The projector that decides what happens: the guard's where there is one.
     fn last_word(&self) -> &Projector {
         self.guard.as_ref().map_or(&self.projector, |guard| &guard.projector)

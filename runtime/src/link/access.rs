@@ -63,6 +63,39 @@ slices!(TransitionMessage {
     action, action_mut: action[nu];
 });
 
+slices!(TickMessage {
+    q, q_mut: q[nq];
+    v, v_mut: v[nv];
+    proposal_q, proposal_q_mut: proposal_q[nq];
+    proposal_v, proposal_v_mut: proposal_v[nv];
+    target_q, target_q_mut: target_q[nq];
+    target_v, target_v_mut: target_v[nv];
+    action, action_mut: action[nu];
+    brake, brake_mut: brake[n_brake];
+    multipliers, multipliers_mut: multipliers[n_active];
+    slacks, slacks_mut: slacks[n_active];
+});
+
+impl RowsMessage {
+    /// Row names by number.
+    pub fn row_names(&self) -> Vec<String> {
+        let length = (self.length as usize).min(MAX_ROW_NAMES);
+        String::from_utf8_lossy(&self.names[..length]).lines().map(str::to_owned).collect()
+    }
+
+    /// Writes the names of the rows, as many as there is room for; a line break within one becomes a space.
+    pub fn set_row_names<S: AsRef<str>>(&mut self, names: &[S]) {
+        let mut at = 0;
+        for name in names.iter().map(|name| name.as_ref().replace('\n', " ")) {
+            let Some(room) = self.names.get_mut(at..=at + name.len()) else { break };
+            room[..name.len()].copy_from_slice(name.as_bytes());
+            room[name.len()] = b'\n';
+            at += name.len() + 1;
+        }
+        self.length = at as u64;
+    }
+}
+
 impl StateMessage {
     /// True if all used numbers are finite.
     pub fn is_finite(&self) -> bool {
@@ -260,6 +293,17 @@ mod tests {
         receipt.set(Verdict::Corrupt, &"\u{e9}".repeat(200));
         assert_eq!(receipt.text(), "\u{e9}".repeat(128));
         assert_eq!(receipt.verdict(), Verdict::Corrupt);
+    }
+
+    #[test]
+    fn row_names_that_do_not_fit_are_left_out_whole() {
+        let mut rows = RowsMessage::zeroed();
+        rows.set_row_names(&["elbow", "hand in\nfront of wall"]);
+        assert_eq!(rows.row_names(), ["elbow", "hand in front of wall"]);
+        rows.set_row_names(&vec!["x".repeat(1000); 20]);
+        assert_eq!(rows.row_names(), vec!["x".repeat(1000); 8]);
+        rows.length = u64::MAX;
+        assert!(rows.row_names().len() >= 8);
     }
 
     #[test]

@@ -12,6 +12,8 @@
 //! | `health` | runtime -> anyone | [`HealthMessage`] |
 //! | `proposal` | proposer -> runtime, the newest alone | [`ProposalMessage`] |
 //! | `asked` | runtime -> proposer | [`AskedMessage`] |
+//! | `tick` | runtime -> viewers | [`TickMessage`] |
+//! | `rows` | runtime -> viewers | [`RowsMessage`] |
 
 use super::schema::message;
 
@@ -23,6 +25,10 @@ pub const MAX_OBS: usize = 128;
 pub const MAX_NAMES: usize = 2048;
 /// Capacity of the list of names in an [`AskedMessage`] [bytes].
 pub const MAX_ASKED: usize = 4096;
+/// Active rows a [`TickMessage`] has room for.
+pub const MAX_ACTIVE: usize = 96;
+/// Capacity of the row names in a [`RowsMessage`] [bytes].
+pub const MAX_ROW_NAMES: usize = 8192;
 /// Capacity of the text in a [`ReceiptMessage`] [bytes].
 pub const MAX_TEXT: usize = 256;
 
@@ -397,5 +403,89 @@ message! {
         wake: [u64; 4],
         /// Compute time p50, p99, p99.9, max [ns].
         compute: [u64; 4],
+    }
+}
+
+message! {
+    /// What a tick did, for those who look on: what holds the target back and how hard, and the way to stop that is stored.
+    TickMessage, "tick", version 1, buffer 32, history 0, subscribers 4 {
+        /// Tick of the runtime.
+        tick: u64,
+        /// When it was due, began, and handed its action over [ns].
+        due: u64,
+        /// See `due`.
+        begin: u64,
+        /// See `due`.
+        end: u64,
+        /// Control period: the next tick is due that long after this one [ns].
+        period: u64,
+        /// Version of the snapshot in use.
+        policy_version: u64,
+        /// Number of that snapshot, as in a [`RowsMessage`].
+        snapshot: u64,
+        /// Number of the episode.
+        episode: u64,
+        /// Ticks so far that ended after the next slot was due.
+        overruns: u64,
+        /// Limits so far that raw proposals broke.
+        raw_violations: u64,
+        /// Limits so far that projected targets broke.
+        target_violations: u64,
+        /// [`crate::rt::Mode`] as a number.
+        mode: u32,
+        /// [`crate::rt::Reason`] as a number.
+        reason: u32,
+        /// Entries used in q.
+        nq: u32,
+        /// Entries used in v.
+        nv: u32,
+        /// Entries used in `action`; 0 where the plant brakes by itself, and then proposal, target, ledger and rows say nothing.
+        nu: u32,
+        /// Entries used in the arrays of the active rows; `ledger.active` counts all.
+        n_active: u32,
+        /// Entries used in `brake`; 0 where no way to stop is stored.
+        n_brake: u32,
+        /// Fills the line.
+        reserved: u32,
+        /// Projection of the tick.
+        ledger: LedgerNumbers,
+        /// Measured configuration.
+        q: [f64; MAX_JOINTS],
+        /// Measured velocity.
+        v: [f64; MAX_JOINTS],
+        /// Proposed configuration.
+        proposal_q: [f64; MAX_JOINTS],
+        /// Proposed velocity.
+        proposal_v: [f64; MAX_JOINTS],
+        /// Projected configuration.
+        target_q: [f64; MAX_JOINTS],
+        /// Projected velocity.
+        target_v: [f64; MAX_JOINTS],
+        /// Action.
+        action: [f64; MAX_JOINTS],
+        /// Deceleration of each degree of freedom until it stands: the stored way to stop [rad/s² or m/s²].
+        brake: [f64; MAX_JOINTS],
+        /// Number of each active row, as [`RowsMessage`] names them.
+        rows: [u32; MAX_ACTIVE],
+        /// Its kind, place in [`Kind::ALL`](nearl_constraints::Kind::ALL).
+        kinds: [u32; MAX_ACTIVE],
+        /// 0 for its lower, 1 for its upper bound.
+        sides: [u32; MAX_ACTIVE],
+        /// How hard it is leaned on, see [`nearl_constraints::ActiveRow`].
+        multipliers: [f64; MAX_ACTIVE],
+        /// By how much a soft row is exceeded, as a share of its size.
+        slacks: [f64; MAX_ACTIVE],
+    }
+}
+
+message! {
+    /// What the rows of the snapshot in use are of, about ten times a second.
+    RowsMessage, "rows", version 1, buffer 1, history 1, subscribers 4 {
+        /// Number of the snapshot, in the order they were received.
+        snapshot: u64,
+        /// Bytes used in `names`.
+        length: u64,
+        /// Row names by number, each followed by a line break, as UTF-8; those beyond the capacity are missing.
+        names: [u8; MAX_ROW_NAMES],
     }
 }

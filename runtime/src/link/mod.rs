@@ -31,6 +31,7 @@ pub mod schema;
 pub mod service;
 pub(crate) mod torn;
 mod trainer;
+mod view;
 
 pub use access::Verdict;
 pub use bench::{RoundTrip, bench_round_trip};
@@ -56,3 +57,4 @@ pub use schema::{Header, Message, Queued, hash_names};
 #[cfg(feature = "cli")]
 pub(crate) use service::SHARED_MEMORY;
 pub use trainer::TrainerLink;
+pub use view::ViewLink;

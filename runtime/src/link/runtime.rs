@@ -21,6 +21,8 @@ pub struct RuntimeLink {
     proposal: BoardReader<ProposalMessage>,
     /// Made where proposals are asked for.
     asked: Option<Outbox<AskedMessage>>,
+    tick: Outbox<TickMessage>,
+    rows: Outbox<RowsMessage>,
     _owner: Owner,
     bus: Bus,
 }
@@ -35,6 +37,8 @@ impl RuntimeLink {
             transition: bus.outbox()?,
             receipt: bus.outbox()?,
             health: bus.outbox()?,
+            tick: bus.outbox()?,
+            rows: bus.outbox()?,
             state: BoardReader::open(name),
             proposal: BoardReader::open(name),
             asked: None,
@@ -125,6 +129,16 @@ impl RuntimeLink {
     /// Answers a snapshot.
     pub fn send_receipt(&mut self, message: &mut ReceiptMessage) -> bool {
         self.receipt.send(message)
+    }
+
+    /// Sends what a tick did.
+    pub fn send_tick(&mut self, message: &mut TickMessage) -> bool {
+        self.tick.send(message)
+    }
+
+    /// Sends what the rows of the snapshot in use are of.
+    pub fn send_rows(&mut self, message: &mut RowsMessage) -> bool {
+        self.rows.send(message)
     }
 
     /// Sends the health of the loop.

@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use nearl_constraints::Rung;
+use nearl_constraints::{Kind, Rung};
 use serde::{Deserialize, Serialize};
 
 use super::tick::SCHEMA_VERSION;
+use crate::codes::LedgerStatus;
 use crate::link::{Message, ROBOT_LIMITS, RobotMessage};
-use crate::rt::{CoreSettings, FaultPlan};
+use crate::rt::{CoreSettings, FaultPlan, Mode};
 
 /// The plant's description as readable facts.
 #[derive(Debug, Serialize, Deserialize)]
@@ -24,6 +25,20 @@ struct RobotFacts {
     n_obs: u32,
     bits: u32,
 }
+
+/// Units of the numbers of a tick; those of the vectors are for a hinge, and m in place of rad for a slide.
+const UNITS: [(&str, &str); 10] = [
+    ("q", "rad"),
+    ("v", "rad/s"),
+    ("proposal_q, target_q", "rad"),
+    ("proposal_v, target_v", "rad/s"),
+    ("action, applied", "N m, or as the task commands the joints"),
+    ("brake", "rad/s^2"),
+    ("multiplier of a joint's row", "rad/s"),
+    ("multiplier of another row", "(rad/s)^2 per unit of the row"),
+    ("time", "s"),
+    ("*_ns", "ns of the monotonic clock; `clock` is what the wall clock was ahead of it"),
+];
 
 /// What [`read`] finds again.
 #[derive(Debug)]
@@ -61,6 +76,13 @@ pub(crate) fn facts(
         ("dt".to_owned(), robot.dt.to_string()),
         ("joints".to_owned(), joints.join(",")),
         ("rungs".to_owned(), Rung::ALL.map(Rung::name).join(",")),
+        json(
+            "statuses",
+            &LedgerStatus::ALL.iter().map(|s| (s.number(), s.name())).collect::<BTreeMap<_, _>>(),
+        ),
+        json("kinds", &Kind::ALL.map(Kind::name)),
+        json("modes", &Mode::ALL.iter().map(|mode| mode.name()).collect::<Vec<_>>()),
+        json("units", &BTreeMap::from(UNITS)),
         json("robot", &described),
         json("settings", core),
         json("faults", faults),
@@ -73,7 +95,9 @@ pub(crate) fn read(facts: &BTreeMap<String, String>) -> Result<Session, String> 
     let get = |key: &str| facts.get(key).ok_or_else(|| format!("its metadata has no `{key}`"));
     let version = get("schema")?;
     if *version != SCHEMA_VERSION.to_string() {
-        return Err(format!("its schema is {version}, this build replays {SCHEMA_VERSION}"));
+        return Err(format!(
+            "its schema is {version}, this build replays {SCHEMA_VERSION}; replay it with the build that wrote it"
+        ));
     }
     fn parse<T: for<'de> Deserialize<'de>>(key: &str, text: &str) -> Result<T, String> {
         serde_json::from_str(text).map_err(|e| format!("its metadata `{key}` is damaged: {e}"))

@@ -15,11 +15,12 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use serde::Serialize;
 use serde_json::Value;
 
+use super::brief::{BriefJson, MemoryJson, digest};
 use super::facts::{self, Session};
-use super::queue::{SNAPSHOT_TOPIC, SnapshotEntry, TICK_TOPIC, attachment_name};
 use super::tick::{TickJson, encode};
-use crate::link::{Message, SnapshotBytes, SnapshotHeader};
-use crate::rt::{Build, Core, Inputs, Loaded, PilotBuilder};
+use super::writer::{BRIEF_TOPIC, MEMORY_TOPIC, SNAPSHOT_TOPIC, SnapshotEntry, TICK_TOPIC, attachment_name};
+use crate::link::{Message, ProposalMessage, SnapshotBytes, SnapshotHeader, StateMessage};
+use crate::rt::{Build, Core, Inputs, Loaded, PilotBuilder, Record};
 use crate::snapshot::one_line;
 
 /// Bytes read at a time: a log may be larger than memory.
@@ -32,10 +33,25 @@ pub struct Replay {
     pub ticks: u64,
     /// Controllers swapped in on the way.
     pub swaps: u64,
+    /// Those of them of which the log has only what replay needs.
+    pub brief: u64,
+    /// Ticks that the log lost, and those after them up to the next memory.
+    pub gaps: Vec<Gap>,
     /// The log was closed by the runtime, not cut by its death.
     pub complete: bool,
     /// Where log and replay first differ.
     pub difference: Option<Difference>,
+}
+
+/// Ticks that could not be computed again: the log lost some of them, and what the loop remembered.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Gap {
+    /// First of them.
+    pub from: u64,
+    /// Last of them, after which replay went on; the last of the log if it did not.
+    pub to: u64,
+    /// How many of them the log does not have.
+    pub lost: u64,
 }
 
 /// The first tick and field that differ.
@@ -105,7 +121,28 @@ struct Replayer<B: Build> {
     snapshots: HashMap<u64, SnapshotEntry>,
     running: Option<(Session, Core<B::Controller>)>,
     line: Vec<u8>,
+    /// The tick read last.
+    at: u64,
+    /// The gap that replay is in, and the tick read last, from which it may go on.
+    gap: Option<Gap>,
+    last: Option<Box<Record>>,
     found: Replay,
+}
+
+/// What a tick's message says beside what is computed.
+struct Given<'a> {
+    tick: u64,
+    due: u64,
+    begin: u64,
+    end: u64,
+    snapshot: u64,
+    has_state: bool,
+    swapped: bool,
+    stop: bool,
+    duration: u64,
+    dropped: (u64, u64),
+    state: &'a StateMessage,
+    proposal: Option<&'a ProposalMessage>,
 }
 
 impl<B: Build> Replayer<B> {
@@ -118,7 +155,17 @@ impl<B: Build> Replayer<B> {
             snapshots: HashMap::new(),
             running: None,
             line: Vec::new(),
-            found: Replay { ticks: 0, swaps: 0, complete: false, difference: None },
+            at: 0,
+            gap: None,
+            last: None,
+            found: Replay {
+                ticks: 0,
+                swaps: 0,
+                brief: 0,
+                gaps: Vec::new(),
+                complete: false,
+                difference: None,
+            },
         }
     }
 
@@ -150,9 +197,10 @@ impl<B: Build> Replayer<B> {
                 return Ok(self.found);
             }
         }
-        if self.found.ticks == 0 {
+        if self.at == 0 {
             return Err("it holds no ticks".into());
         }
+        self.found.gaps.extend(self.gap.take());
         Ok(self.found)
     }
 
@@ -167,6 +215,8 @@ impl<B: Build> Replayer<B> {
             }
             Part::Message { header, data } => match self.topics.get(&header.channel_id).map(String::as_str) {
                 Some(TICK_TOPIC) => self.tick(&data)?,
+                Some(BRIEF_TOPIC) => self.brief(&data)?,
+                Some(MEMORY_TOPIC) => self.memory(&data)?,
                 Some(SNAPSHOT_TOPIC) => {
                     let entry: SnapshotEntry = serde_json::from_slice(&data).map_err(|e| one_line(&e))?;
                     self.snapshots.insert(entry.id, entry);
@@ -178,43 +228,135 @@ impl<B: Build> Replayer<B> {
         Ok(())
     }
 
+    /// A whole tick: everything in it is compared.
     fn tick(&mut self, logged: &[u8]) -> Result<(), String> {
-        let at = self.found.ticks + 1;
-        let parse = serde_json::from_slice::<TickJson<'_>>(logged);
-        let json = parse.map_err(|e| format!("the message of tick {at} is damaged: {}", one_line(&e)))?;
-        if json.tick != at {
-            self.differ(at, "tick", json.tick.to_string(), format!("{at}: the ticks before were dropped"));
-            return Ok(());
-        }
-        let state = json.state().ok_or_else(|| format!("a vector of tick {at} is too long"))?;
-        let (session, mut core) = match self.running.take() {
-            Some(running) => running,
-            None => self.start(&json)?,
+        let at = self.at + 1;
+        let damaged = |e| format!("the message of tick {at} is damaged: {}", one_line(&e));
+        let json = serde_json::from_slice::<TickJson<'_>>(logged).map_err(damaged)?;
+        let too_long = |what: &str| format!("a {what} of tick {} is too long", json.tick);
+        let record = json.record().ok_or_else(|| too_long("vector"))?;
+        let proposal = json.proposal().ok_or_else(|| too_long("proposal"))?;
+        let given = Given {
+            tick: json.tick,
+            due: json.due_ns,
+            begin: json.begin_ns,
+            end: json.end_ns,
+            snapshot: json.snapshot,
+            has_state: json.fresh || json.ignored,
+            swapped: json.swapped,
+            stop: json.stop,
+            duration: json.duration(),
+            dropped: (json.counters.dropped_actions, json.counters.dropped_records),
+            state: &record.state,
+            proposal: proposal.as_ref(),
         };
-        if json.swapped {
-            core.controller = self.load(json.snapshot, &session)?;
-            self.found.swaps += 1;
+        if self.advance(&given)? {
+            self.compare(json.tick, logged)?;
         }
-        core.swap(json.swapped);
-        let fresh = (json.fresh || json.ignored).then_some(&state);
-        let proposal = json.proposal().ok_or_else(|| format!("the proposal of tick {at} is too long"))?;
-        let proposal = proposal.as_ref();
-        core.update(&Inputs { due: core.due(), begin: json.begin_ns, stop: json.stop, fresh, proposal });
-        core.close(json.end_ns);
-        // What only the loop's threads know: how long the projection took, and what found a ring full.
-        let record = &mut core.record;
-        record.output.ledger.duration = if record.output.nu > 0 { json.duration() } else { 0 };
-        record.counters.dropped_actions = json.counters.dropped_actions;
-        record.counters.dropped_records = json.counters.dropped_records;
-        encode(record, &mut self.line).map_err(|e| e.to_string())?;
-        self.running = Some((session, core));
-        self.compare(at, logged)
+        let mut record = record;
+        record.snapshot = json.snapshot;
+        self.last = Some(Box::new(record));
+        Ok(())
     }
 
-    fn start(&mut self, first: &TickJson<'_>) -> Result<(Session, Core<B::Controller>), String> {
+    /// A tick in brief: a digest over everything in it is compared.
+    fn brief(&mut self, logged: &[u8]) -> Result<(), String> {
+        let at = self.at + 1;
+        let damaged = |e| format!("the brief message of tick {at} is damaged: {}", one_line(&e));
+        let json = serde_json::from_slice::<BriefJson<'_>>(logged).map_err(damaged)?;
+        let state =
+            json.state.message().ok_or_else(|| format!("a vector of tick {} is too long", json.tick))?;
+        let given = Given {
+            tick: json.tick,
+            due: json.due_ns,
+            begin: json.begin_ns,
+            end: json.end_ns,
+            snapshot: json.snapshot,
+            has_state: json.fresh || json.ignored,
+            swapped: json.swapped,
+            stop: json.stop,
+            duration: json.duration_ns,
+            dropped: (json.dropped_actions, json.dropped_records),
+            state: &state,
+            proposal: None, // a tick that one came in is written whole
+        };
+        if self.advance(&given)? {
+            let own = digest(&self.line);
+            match own == json.digest {
+                true => (self.found.ticks, self.found.brief) = (self.found.ticks + 1, self.found.brief + 1),
+                false => self.differ(json.tick, "digest", json.digest.into_owned(), own),
+            }
+        }
+        Ok(())
+    }
+
+    /// Within a gap, replay goes on from here.
+    fn memory(&mut self, logged: &[u8]) -> Result<(), String> {
+        let Some(gap) = self.gap.take() else { return Ok(()) };
+        let json = serde_json::from_slice::<MemoryJson<'_>>(logged).map_err(|e| one_line(&e))?;
+        let resume = json.resume().ok_or_else(|| format!("the memory of tick {} is too long", json.tick))?;
+        let Some(mut record) = self.last.take().filter(|last| last.tick == json.tick) else {
+            self.gap = Some(gap);
+            return Ok(());
+        };
+        record.resume = resume;
+        let session = facts::read(&self.facts)?;
+        let controller = self.load(record.snapshot, &session)?;
+        let mut core = Core::new(session.core, controller, 0, session.faults.clone());
+        core.resume(&record);
+        self.running = Some((session, core));
+        self.found.gaps.push(gap);
+        Ok(())
+    }
+
+    /// Computes a tick and writes its message to `line`; false within a gap.
+    fn advance(&mut self, given: &Given<'_>) -> Result<bool, String> {
+        let lost = given.tick.saturating_sub(self.at + 1);
+        if given.tick <= self.at {
+            self.differ(
+                given.tick,
+                "tick",
+                given.tick.to_string(),
+                format!("{}: ticks only rise", self.at + 1),
+            );
+            return Ok(false);
+        }
+        if lost > 0 {
+            self.running = None;
+            let gap = self.gap.get_or_insert(Gap { from: self.at + 1, to: 0, lost: 0 });
+            gap.lost += lost;
+        }
+        self.at = given.tick;
+        if let Some(gap) = &mut self.gap {
+            gap.to = given.tick;
+            return Ok(false);
+        }
+        let (session, mut core) = match self.running.take() {
+            Some(running) => running,
+            None => self.start(given)?,
+        };
+        if given.swapped {
+            core.controller = self.load(given.snapshot, &session)?;
+            self.found.swaps += 1;
+        }
+        core.swap(given.swapped);
+        let fresh = given.has_state.then_some(given.state);
+        let proposal = given.proposal;
+        core.update(&Inputs { due: core.due(), begin: given.begin, stop: given.stop, fresh, proposal });
+        core.close(given.end);
+        // What only the loop's threads know: how long the projection took, and what found a ring full.
+        let record = &mut core.record;
+        record.output.ledger.duration = if record.output.nu > 0 { given.duration } else { 0 };
+        (record.counters.dropped_actions, record.counters.dropped_records) = given.dropped;
+        encode(record, &mut self.line).map_err(|e| e.to_string())?;
+        self.running = Some((session, core));
+        Ok(true)
+    }
+
+    fn start(&mut self, first: &Given<'_>) -> Result<(Session, Core<B::Controller>), String> {
         let session = facts::read(&self.facts)?;
         let controller = self.load(if first.swapped { 0 } else { first.snapshot }, &session)?;
-        let core = Core::new(session.core, controller, first.due_ns, session.faults.clone());
+        let core = Core::new(session.core, controller, first.due, session.faults.clone());
         Ok((session, core))
     }
 

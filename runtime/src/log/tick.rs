@@ -11,7 +11,7 @@ use crate::link::{Message, ProposalMessage, StateMessage};
 use crate::rt::{Counters, Mode, Reason, Record, Row, Sensed};
 
 /// Version of the tick messages; replay reads this one only.
-pub const SCHEMA_VERSION: u32 = 4;
+pub const SCHEMA_VERSION: u32 = 5;
 
 /// JSON schema of the `tick` topic.
 pub(crate) const SCHEMA: &str = r#"{
@@ -31,7 +31,8 @@ pub(crate) const SCHEMA: &str = r#"{
     "proposal_q": {"type": "array", "items": {"type": "number"}}, "proposal_v": {"type": "array", "items": {"type": "number"}},
     "target_q": {"type": "array", "items": {"type": "number"}}, "target_v": {"type": "array", "items": {"type": "number"}},
     "action": {"type": "array", "items": {"type": "number"}},
-    "log_prob_proposal": {"type": "number"}, "log_prob_action": {"type": "number"},
+    "log_prob_proposal": {"type": "number"}, "log_prob_action": {"type": "number"}, "period_tick": {"type": "integer"},
+    "brake": {"type": "array", "items": {"type": "number"}},
     "ledger": {"type": "object", "properties": {
       "status": {"type": "integer"}, "rung": {"type": "integer"}, "active": {"type": "integer"}, "iterations": {"type": "integer"},
       "raw_violations": {"type": "integer"}, "target_violations": {"type": "integer"}, "moved": {"type": "number"},
@@ -47,7 +48,7 @@ pub(crate) const SCHEMA: &str = r#"{
 /// A list of numbers, `null` for those JSON does not have.
 #[derive(Serialize)]
 #[serde(transparent)]
-struct Numbers<'a>(Cow<'a, [f64]>);
+pub(super) struct Numbers<'a>(pub(super) Cow<'a, [f64]>);
 
 impl<'de> Deserialize<'de> for Numbers<'_> {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
@@ -97,7 +98,7 @@ pub(crate) struct TickJson<'a> {
     /// Age of the proposal acted upon.
     #[serde(default)]
     proposal_age_ns: Option<u64>,
-    state: StateJson<'a>,
+    pub(super) state: StateJson<'a>,
     proposal_q: Numbers<'a>,
     proposal_v: Numbers<'a>,
     target_q: Numbers<'a>,
@@ -107,6 +108,8 @@ pub(crate) struct TickJson<'a> {
     log_prob_proposal: f64,
     #[serde(deserialize_with = "number")]
     log_prob_action: f64,
+    period_tick: u32,
+    brake: Numbers<'a>,
     ledger: LedgerJson,
     pub(crate) counters: Counters,
     overruns: u64,
@@ -130,7 +133,7 @@ struct ProposedJson<'a> {
 
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct StateJson<'a> {
+pub(super) struct StateJson<'a> {
     epoch: u64,
     seq: u64,
     stamp_ns: u64,
@@ -216,6 +219,8 @@ fn tick(record: &Record) -> TickJson<'_> {
         action: output.action[..(output.nu as usize).min(output.action.len())].into(),
         log_prob_proposal: if acted { output.log_prob_proposal } else { 0.0 },
         log_prob_action: if acted { output.log_prob_action } else { 0.0 },
+        period_tick: output.period_tick,
+        brake: if acted { output.brake().into() } else { [].as_slice().into() },
         ledger: if acted { ledger_json(record) } else { ledger_json(&Record::new()) },
         counters: *counters,
         overruns: counters.overruns,
@@ -238,7 +243,7 @@ fn proposed_json(proposal: &ProposalMessage) -> ProposedJson<'_> {
     }
 }
 
-fn state_json(state: &StateMessage) -> StateJson<'_> {
+pub(super) fn state_json(state: &StateMessage) -> StateJson<'_> {
     StateJson {
         epoch: state.header.epoch,
         seq: state.header.seq,
@@ -284,12 +289,12 @@ fn ledger_json(record: &Record) -> LedgerJson {
 
 impl TickJson<'_> {
     /// Time of the projection [ns]: measured, so replay takes it over.
-    pub(crate) fn duration(&self) -> u64 {
+    pub(super) fn duration(&self) -> u64 {
         self.ledger.duration_ns
     }
 
     /// The proposal that came in the tick, if one did; `None` if it is longer than a message holds.
-    pub(crate) fn proposal(&self) -> Option<Option<ProposalMessage>> {
+    pub(super) fn proposal(&self) -> Option<Option<ProposalMessage>> {
         let Some(json) = &self.proposed else { return Some(None) };
         let mut proposal = ProposalMessage::zeroed();
         let header = &mut proposal.header;
@@ -303,9 +308,25 @@ impl TickJson<'_> {
         Some(Some(proposal))
     }
 
-    /// The state of the tick; `None` if a vector is longer than a message holds.
-    pub(crate) fn state(&self) -> Option<StateMessage> {
-        let json = &self.state;
+    /// The record as far as the next tick depends on it; `None` if a vector is longer than a message holds.
+    pub(super) fn record(&self) -> Option<Record> {
+        let mut record = Record::new();
+        (record.tick, record.mode, record.reason) = (self.tick, self.mode, self.reason);
+        (record.fresh, record.sensed) = (self.fresh, self.sensed);
+        (record.state, record.counters) = (self.state.message()?, self.counters);
+        let output = &mut record.output;
+        output.nu = u32::try_from(self.action.0.len()).ok()?;
+        output.period_tick = self.period_tick;
+        output.target_q.get_mut(..self.target_q.0.len())?.copy_from_slice(&self.target_q.0);
+        output.target_v.get_mut(..self.target_v.0.len())?.copy_from_slice(&self.target_v.0);
+        Some(record)
+    }
+}
+
+impl StateJson<'_> {
+    /// The state; `None` if a vector is longer than a message holds.
+    pub(super) fn message(&self) -> Option<StateMessage> {
+        let json = self;
         let mut state = StateMessage::zeroed();
         (state.header.epoch, state.header.seq, state.header.stamp) = (json.epoch, json.seq, json.stamp_ns);
         (state.tick, state.time) = (json.tick, json.time);
@@ -357,7 +378,7 @@ mod tests {
         encode(&record, &mut out).unwrap();
         let read: TickJson<'_> = serde_json::from_slice(&out).unwrap();
         let bits = |v: &[f64]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
-        assert_eq!(bits(read.state().unwrap().v()), bits(&odd));
+        assert_eq!(bits(read.state.message().unwrap().v()), bits(&odd));
     }
 
     #[test]
@@ -368,6 +389,6 @@ mod tests {
         let mut out = Vec::new();
         encode(&record, &mut out).unwrap();
         let read: TickJson<'_> = serde_json::from_slice(&out).unwrap();
-        assert!(read.state().unwrap().q().iter().all(|x| !x.is_finite()));
+        assert!(read.state.message().unwrap().q().iter().all(|x| !x.is_finite()));
     }
 }

@@ -211,6 +211,40 @@ impl<T: LoopController> Core<T> {
             record.counters.unprojected += u64::from(is_unprojected);
         }
         record.counters.mode_ticks[record.mode.code() as usize] += 1;
+        self.note_resume();
+    }
+
+    /// Goes on after the tick of `record`, which said so in [`Record::resume`].
+    pub fn resume(&mut self, record: &Record) {
+        let Record { resume, .. } = record;
+        self.record = *record;
+        self.estimate = record.state;
+        self.modes.resume(record.mode, record.reason, resume.modes);
+        self.grid.resume(resume.grid);
+        self.held = Some(0);
+        (self.braked, self.ramped) = (resume.braked, resume.ramped);
+        (self.overran, self.brake_broken) = (resume.overran, resume.brake_broken);
+        self.memory.clear();
+        self.memory.extend_from_slice(resume.memory());
+        self.controller.controller.reset();
+        self.controller.controller.load_memory(&self.memory);
+    }
+
+    /// Notes what a replay can go on from.
+    fn note_resume(&mut self) {
+        let resume = &mut self.record.resume;
+        let is_plain =
+            self.record.sensed == Sensed::Measured && self.held == Some(0) && !self.memory.is_empty();
+        resume.is_set = is_plain
+            && self.settings.proposer.is_none()
+            && self.record.output.nu > 0
+            && self.controller.controller.is_memory_whole()
+            && resume.set_memory(&self.memory);
+        if resume.is_set {
+            (resume.modes, resume.grid) = (self.modes.counts(), self.grid.place());
+            (resume.braked, resume.ramped) = (self.braked, self.ramped);
+            (resume.overran, resume.brake_broken) = (self.overran, self.brake_broken);
+        }
     }
 
     /// What a tick is worth whose state was worth `event`, with the proposal it has to act on.

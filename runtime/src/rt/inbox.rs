@@ -1,7 +1,9 @@
 //! Snapshots on their way into the loop: from bytes to a built controller to the swap, with one receipt for each. The
 //! one before is kept and swapped back in when the robot no longer gets where the targets say.
 
-use crate::link::{ReceiptMessage, RobotMessage, RuntimeLink, SnapshotBytes, SnapshotHeader, Verdict};
+use crate::link::{
+    Message, ReceiptMessage, RobotMessage, RowsMessage, RuntimeLink, SnapshotBytes, SnapshotHeader, Verdict,
+};
 use crate::log::LogQueue;
 use crate::rt::build::{Builder, Built};
 use crate::rt::core::Loaded;
@@ -33,6 +35,8 @@ pub(crate) struct SnapshotInbox<B: Build> {
     received: u64,
     /// Sender and version of the newest snapshot that came.
     newest: (u64, u64),
+    /// What the rows of the one in use are of.
+    pub(crate) rows: Box<RowsMessage>,
     /// Versions taken into use: (first tick at the latest, version of the controller).
     pub(crate) accepted: Vec<(u64, u64)>,
     /// Sentences of refusals, the first ones.
@@ -47,6 +51,8 @@ struct Offer {
     /// Header of a new snapshot; none when the previous one is offered again.
     header: Option<SnapshotHeader>,
     version: u64,
+    /// Its number, and what its rows are of.
+    rows: (u64, Vec<String>),
 }
 
 /// What a look at the snapshots needs of the I/O thread.
@@ -77,6 +83,7 @@ impl<B: Build> SnapshotInbox<B> {
             condemned: None,
             received: 0,
             newest: (0, 0),
+            rows: Box::new(RowsMessage::zeroed()),
             accepted: Vec::new(),
             refusals: Vec::new(),
             refused: 0,
@@ -87,6 +94,12 @@ impl<B: Build> SnapshotInbox<B> {
     /// Snapshots refused so far, those with a header that did not fit included.
     pub(crate) fn refused(&self) -> u64 {
         self.refused + self.receiver.refused()
+    }
+
+    /// The rows of snapshot `id` are of `names` from now on.
+    pub(crate) fn set_rows(&mut self, id: u64, names: &[String]) {
+        self.rows.snapshot = id;
+        self.rows.set_row_names(names);
     }
 
     /// Takes in a tick and the one before it.
@@ -132,7 +145,9 @@ impl<B: Build> SnapshotInbox<B> {
             Err(refusal) => return self.refuse(around.link, &built.header, refusal.verdict, &refusal.text),
         };
         match around.log {
-            Some(log) => log.push_snapshot(built.id, controller.version(), built.bytes),
+            Some(log) => {
+                log.push_snapshot(built.id, controller.version(), built.bytes, controller.row_names());
+            }
             None => self.builder.discard(Box::new(built.bytes)),
         }
         let loaded = Box::new(Loaded { id: built.id, controller });
@@ -155,9 +170,9 @@ impl<B: Build> SnapshotInbox<B> {
             },
             (None, None) => return,
         };
-        let version = loaded.controller.version();
+        let (version, rows) = (loaded.controller.version(), (loaded.id, loaded.controller.row_names()));
         match (self.swap.offer(loaded), header) {
-            (Ok(()), header) => self.offered = Some(Offer { header, version }),
+            (Ok(()), header) => self.offered = Some(Offer { header, version, rows }),
             (Err(loaded), Some(header)) => self.ready = Some((header, loaded)),
             (Err(loaded), None) => self.previous = Some(loaded),
         }
@@ -166,7 +181,10 @@ impl<B: Build> SnapshotInbox<B> {
     /// The old controller came back: the new one is in use. The one before the old is no longer needed.
     fn settle(&mut self, around: &mut Surroundings<'_>) {
         let Some(old) = self.swap.collect() else { return };
-        let Some(Offer { header, version }) = self.offered.take() else { return self.builder.discard(old) };
+        let Some(Offer { header, version, rows }) = self.offered.take() else {
+            return self.builder.discard(old);
+        };
+        self.set_rows(rows.0, &rows.1);
         self.accepted.push((around.tick, version));
         let condemned = self.condemned.take();
         let Some(header) = header else {

@@ -13,7 +13,7 @@ use crate::clock::{self, Bell};
 use crate::link::torn;
 use crate::link::{
     ActionMessage, AskedMessage, HealthMessage, Message, ProposalMessage, RobotMessage, RuntimeLink,
-    StateMessage, TallyMessage, TransitionMessage,
+    StateMessage, TallyMessage, TickMessage, TransitionMessage,
 };
 use crate::log::LogQueue;
 use crate::percentiles::percentiles;
@@ -55,6 +55,8 @@ pub(crate) struct Io<B: Build> {
     /// That of the real-time thread.
     pub(crate) priority: Option<i32>,
     pub(crate) health: Health,
+    /// The message of the tick, filled anew for each.
+    pub(crate) tick: Box<TickMessage>,
     pub(crate) traffic: Traffic,
     /// What the plant counted, as far as it said.
     pub(crate) tally: Option<TallyMessage>,
@@ -138,6 +140,8 @@ impl<B: Build> Io<B> {
         let Ok(record) = self.records.peek() else { return false };
         self.traffic.tick = record.tick;
         self.health.take(record);
+        fill_tick(&mut self.tick, record);
+        self.link.send_tick(&mut self.tick);
         if let Some(log) = &mut self.log {
             log.push(record);
         }
@@ -214,6 +218,7 @@ impl<B: Build> Io<B> {
                 self.health.account(asked);
                 self.link.send_asked(asked);
             }
+            self.link.send_rows(&mut self.snapshots.rows);
         }
     }
 
@@ -254,6 +259,37 @@ fn fits(robot: &RobotMessage, state: &StateMessage) -> bool {
 /// True if a process with this number exists.
 fn is_alive(pid: u32) -> bool {
     std::path::Path::new("/proc").join(pid.to_string()).exists()
+}
+
+/// What viewers are told of a tick.
+fn fill_tick(m: &mut TickMessage, record: &Record) {
+    let (state, output, counters) = (&record.state, &record.output, &record.counters);
+    (m.tick, m.due, m.begin, m.end) = (record.tick, record.due, record.begin, record.end);
+    (m.policy_version, m.snapshot, m.episode) = (record.policy_version, record.snapshot, state.episode);
+    (m.mode, m.reason) = (record.mode.code(), record.reason.code());
+    m.overruns = counters.overruns;
+    (m.raw_violations, m.target_violations) = (counters.raw_violations, counters.target_violations);
+    (m.nq, m.nv, m.nu) = (state.nq, state.nv, output.nu);
+    m.q_mut().copy_from_slice(state.q());
+    m.v_mut().copy_from_slice(state.v());
+    (m.n_active, m.n_brake) = (0, 0);
+    if output.nu == 0 {
+        return;
+    }
+    m.ledger = output.ledger;
+    (m.n_active, m.n_brake) = (output.rows().len() as u32, output.n_brake);
+    let (nq, nv) = (state.q().len(), state.v().len());
+    m.proposal_q_mut().copy_from_slice(&output.proposal_q[..nq]);
+    m.proposal_v_mut().copy_from_slice(&output.proposal_v[..nv]);
+    m.target_q_mut().copy_from_slice(&output.target_q[..nq]);
+    m.target_v_mut().copy_from_slice(&output.target_v[..nv]);
+    let nu = m.action().len();
+    m.action_mut().copy_from_slice(&output.action[..nu]);
+    m.brake_mut().copy_from_slice(output.brake());
+    for (k, row) in output.rows().iter().enumerate() {
+        (m.rows[k], m.kinds[k], m.sides[k]) = (u32::from(row.row), u32::from(row.kind), u32::from(row.side));
+        (m.multipliers[k], m.slacks[k]) = (row.multiplier, row.slack);
+    }
 }
 
 /// The transition from one record to the state that followed it.

@@ -23,6 +23,7 @@ mod pinned;
 mod receive;
 mod report;
 mod residual;
+mod resume;
 mod run;
 pub mod swap;
 mod tick;
@@ -42,6 +43,7 @@ pub use pilot::{Pilot, PilotBuilder, describe, numbers};
 pub use pinned::Pinned;
 pub use report::{PlantSummary, ProposerSummary, RunReport};
 pub use residual::RollbackSettings;
+pub use resume::{MAX_MEMORY, Resume};
 pub use run::{RunError, RunSettings, connect, run, run_loop};
 pub use tick::{
     Build, Counters, LoopController, MAX_ROWS, Outcome, Question, Record, Refusal, Row, Sensed, TickOutput,

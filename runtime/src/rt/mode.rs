@@ -179,6 +179,17 @@ impl Modes {
         self.reason
     }
 
+    /// Good, unusable and late ticks in a row, for [`Modes::resume`].
+    pub fn counts(&self) -> [u32; 3] {
+        [self.good, self.bad, self.late]
+    }
+
+    /// Goes on in `mode` for `reason`, after so many good, unusable and late ticks in a row.
+    pub fn resume(&mut self, mode: Mode, reason: Reason, counts: [u32; 3]) {
+        (self.mode, self.reason) = (mode, reason);
+        [self.good, self.bad, self.late] = counts;
+    }
+
     /// Takes in what a tick brought; `overran` if the tick before ended late, `stop` once a stop was asked for.
     pub fn update(&mut self, event: Event, overran: bool, stop: bool) -> Mode {
         self.count(event, overran);

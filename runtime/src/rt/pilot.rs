@@ -91,6 +91,7 @@ impl Pilot {
     fn write(&self, output: &mut TickOutput) {
         let (state, out) = (&self.state, &self.out);
         let (nq, nv) = (state.q.len(), state.v.len());
+        output.set_brake(self.controller.stored_brake());
         output.nu = out.action.len() as u32;
         output.action[..out.action.len()].copy_from_slice(&out.action);
         output.period_tick = self.period_tick;
@@ -188,6 +189,7 @@ impl LoopController for Pilot {
         }
         output.ledger = numbers(&brake.target.ledger);
         write_rows(&brake.target.ledger, output);
+        output.set_brake(brake.projector().stored_brake());
         self.share(true);
         outcome(status)
     }
@@ -201,6 +203,14 @@ impl LoopController for Pilot {
         memory.clear();
         memory.push(self.limits);
         self.controller.write_memory(memory);
+    }
+
+    fn is_memory_whole(&self) -> bool {
+        self.controller.is_memory_whole()
+    }
+
+    fn row_names(&self) -> Vec<String> {
+        self.controller.row_names()
     }
 
     fn load_memory(&mut self, memory: &[f64]) {
@@ -271,6 +281,7 @@ impl LoopController for Pilot {
         let raw_violations = output.ledger.raw_violations;
         output.ledger = LedgerNumbers { raw_violations, ..numbers(&brake.target.ledger) };
         write_rows(&brake.target.ledger, output);
+        output.set_brake(brake.projector().stored_brake());
         self.share(true);
     }
 }

@@ -85,6 +85,8 @@ pub struct RunReport {
     pub log: Option<PathBuf>,
     /// Records the flight log lost.
     pub log_drops: u64,
+    /// Ticks of which a disk too slow for all of it has only what replay needs.
+    pub log_brief: u64,
     /// Why the flight log stopped, if it did.
     pub log_error: Option<String>,
     /// What the operating system refused: priority, memory, core.
@@ -161,7 +163,9 @@ impl fmt::Display for RunReport {
             self.rolled_back
         )?;
         if let Some(log) = &self.log {
-            writeln!(f, "  flight log       {}, {} records dropped", log.display(), self.log_drops)?;
+            let brief =
+                if self.log_brief > 0 { format!(", {} in brief", self.log_brief) } else { String::new() };
+            writeln!(f, "  flight log       {}, {} records dropped{brief}", log.display(), self.log_drops)?;
         }
         for text in self.refusals.iter().chain(&self.warnings).chain(&self.log_error) {
             writeln!(f, "  note             {text}")?;

@@ -15,6 +15,7 @@ use crate::holding;
 use crate::link::torn;
 use crate::link::{
     AskedMessage, LinkError, Message, RobotMessage, RobotName, RuntimeLink, StateMessage, TallyMessage,
+    TickMessage,
 };
 use crate::log::{LogError, LogQueue, LogSummary};
 use crate::percentiles::percentiles;
@@ -90,6 +91,8 @@ pub struct RunSettings {
     pub strict: bool,
     /// Counts the heap allocations of the real-time thread, in a program whose allocator can.
     pub allocations: Option<CountAllocations>,
+    /// What the wall clock is ahead of the monotonic one, for the times of day in the flight log [ns]; the loop itself never reads it.
+    pub wall: u64,
     /// Flight log file.
     pub log: Option<PathBuf>,
     /// Facts written into the flight log (snapshot digest, command).
@@ -123,6 +126,7 @@ impl Default for RunSettings {
             thread: ThreadSettings::default(),
             strict: false,
             allocations: None,
+            wall: 0,
             log: None,
             metadata: BTreeMap::new(),
             first: Vec::new(),
@@ -294,7 +298,8 @@ fn assemble<B: Build>(
     let Some(reader) = link.take_snapshots() else { return Err(RunError::NoSnapshots(link.name().clone())) };
     let asked = asked(&mut link, &robot, &first, settings)?;
     let cycle_settings = cycle_settings(&robot, settings);
-    let log = open_log(&robot, first.version(), &cycle_settings.core, settings)?;
+    let rows = first.row_names();
+    let log = open_log(&robot, (first.version(), &rows), &cycle_settings.core, settings)?;
     let thread_error = |name| move |e: std::io::Error| RunError::Thread { name, reason: e.to_string() };
     let builder = Builder::start(build).map_err(thread_error("nearl-build"))?;
     let receiver = SnapshotReceiver::start(reader).map_err(thread_error("nearl-receive"))?;
@@ -308,6 +313,10 @@ fn assemble<B: Build>(
         Ends { states, proposals, actions, records, slot, bell: Arc::clone(&bell), gone: Arc::clone(&gone) };
     let first = Box::new(Loaded { id: 0, controller: first });
     let cycle = Cycle::new(cycle_settings, first, settings.faults.clone(), ends, stop.clone());
+    let mut snapshots = SnapshotInbox::new(receiver, builder, swap, settings.rollback);
+    snapshots.set_rows(0, &rows);
+    let mut tick = Box::new(TickMessage::zeroed());
+    tick.period = clock::nanoseconds(robot.dt);
     let health = Health::new().map_err(|e| RunError::Snapshot(e.to_string()))?;
     let io = Io {
         link,
@@ -321,12 +330,13 @@ fn assemble<B: Build>(
         actions: actions_out,
         records: records_out,
         bell,
-        snapshots: SnapshotInbox::new(receiver, builder, swap, settings.rollback),
+        snapshots,
         log,
         explore: settings.explore,
         gone,
         gone_after: clock::nanoseconds(settings.plant_patience),
         health,
+        tick,
         traffic: Traffic::default(),
         tally: None,
     };
@@ -385,16 +395,18 @@ fn cycle_settings(robot: &RobotMessage, settings: &RunSettings) -> CycleSettings
 /// The flight log with everything its replay needs but the ticks.
 fn open_log(
     robot: &RobotMessage,
-    version: u64,
+    (version, rows): (u64, &[String]),
     core: &CoreSettings,
     settings: &RunSettings,
 ) -> Result<Option<LogQueue>, LogError> {
     let Some(path) = settings.log.as_deref() else { return Ok(None) };
     let mut facts = settings.metadata.clone();
     facts.extend(crate::log::facts(robot, core, &settings.faults));
-    let mut log = LogQueue::create(path, &facts)?;
+    facts.insert("clock".into(), settings.wall.to_string());
+    facts.insert("rows".into(), serde_json::json!(rows).to_string());
+    let mut log = LogQueue::create(path, &facts, settings.wall)?;
     if !settings.first.is_empty() {
-        log.push_snapshot(0, version, settings.first.clone());
+        log.push_snapshot(0, version, settings.first.clone(), rows.to_vec());
     }
     Ok(Some(log))
 }
@@ -470,6 +482,7 @@ fn report<B: Build>(
         refusals: io.snapshots.refusals,
         log: path,
         log_drops: log.dropped + log.dropped_snapshots,
+        log_brief: log.brief,
         log_error: log.error,
         rolled_back: io.snapshots.rolled_back,
         usage: end.usage,

@@ -3,7 +3,7 @@
 use crate::link::{
     LedgerNumbers, MAX_JOINTS, Message, ProposalMessage, RobotMessage, SnapshotBytes, StateMessage, Verdict,
 };
-use crate::rt::{Mode, Reason};
+use crate::rt::{Mode, Reason, Resume};
 
 /// A controller as the loop sees it. `tick`, `brake` and `reset` run in the real-time thread: no allocation beyond
 /// what the solver cannot avoid, no lock, no system call.
@@ -34,6 +34,14 @@ pub trait LoopController: Send + 'static {
     /// What the next tick depends on beside its state, in place of what is in `memory`; a way to stop that was verified, for one.
     /// Allocates only where `memory` has no room.
     fn save_memory(&self, _memory: &mut Vec<f64>) {}
+    /// Whether [`LoopController::save_memory`] says everything that the next tick depends on beside its state: a loop can go on from there.
+    fn is_memory_whole(&self) -> bool {
+        false
+    }
+    /// What the rows of a ledger are of, by their number. Not for the real-time thread: it allocates.
+    fn row_names(&self) -> Vec<String> {
+        Vec::new()
+    }
     /// Takes what another controller of the same robot saved in the tick before, if it fits.
     fn load_memory(&mut self, _memory: &[f64]) {}
     /// Moves `state` on by one period, to where the action in `output` was to take it.
@@ -111,6 +119,11 @@ pub struct TickOutput {
     pub ledger: LedgerNumbers,
     /// The first active rows, as many as fit; `ledger.active` counts all.
     pub rows: [Row; MAX_ROWS],
+    /// Entries used in `brake`; 0 where no way to stop is stored.
+    pub n_brake: u32,
+    /// The stored way to stop from the target (nv): the deceleration of each controllable degree of freedom until it stands [rad/s² or
+    /// m/s²]; 0 for the others.
+    pub brake: [f64; MAX_JOINTS],
 }
 
 /// Active rows an output has room for: a box row and two torque rows for each of 32 joints.
@@ -152,7 +165,21 @@ impl TickOutput {
             log_prob_action: 0.0,
             ledger: LedgerNumbers::default(),
             rows: [Row::default(); MAX_ROWS],
+            n_brake: 0,
+            brake: zero,
         }
+    }
+
+    /// Takes the decelerations of a stored brake (nv).
+    pub fn set_brake(&mut self, decelerations: Option<&[f64]>) {
+        let decelerations = decelerations.filter(|b| b.len() <= MAX_JOINTS).unwrap_or_default();
+        self.n_brake = decelerations.len() as u32;
+        self.brake[..decelerations.len()].copy_from_slice(decelerations);
+    }
+
+    /// The decelerations of the stored brake; empty where none is stored.
+    pub fn brake(&self) -> &[f64] {
+        &self.brake[..(self.n_brake as usize).min(MAX_JOINTS)]
     }
 
     /// The active rows that fitted.
@@ -226,7 +253,7 @@ pub enum Sensed {
     Missing,
 }
 
-/// Everything about one tick. Passed by value through a ring; about 8 kB.
+/// Everything about one tick. Passed by value through a ring; about 11 kB.
 #[derive(Clone, Copy, Debug)]
 pub struct Record {
     /// Tick of the runtime, from 1.
@@ -271,6 +298,8 @@ pub struct Record {
     pub output: TickOutput,
     /// Counts up to and with this tick.
     pub counters: Counters,
+    /// What a replay can go on from after this tick, at some ticks.
+    pub resume: Resume,
 }
 
 impl Record {
@@ -297,6 +326,7 @@ impl Record {
             state: StateMessage::zeroed(),
             output: TickOutput::zeroed(),
             counters: Counters::default(),
+            resume: Resume::none(),
         }
     }
 }

@@ -73,6 +73,73 @@ fn python_reads_every_tick_bit_for_bit() {
 #[test]
 fn a_log_that_cannot_be_created_is_refused_by_name() {
     let error =
-        nearl_runtime::log::LogQueue::create(Path::new("/dev/full"), &Default::default()).err().unwrap();
+        nearl_runtime::log::LogQueue::create(Path::new("/dev/full"), &Default::default(), 0).err().unwrap();
     assert!(error.to_string().contains("/dev/full"), "{error}");
+}
+
+/// What a stranger with Python's `mcap` package finds: names for every number, the time of day, and numbers that agree with each other.
+const STRANGER: &str = r#"
+import datetime, json, sys
+from mcap.reader import make_reader
+with open(sys.argv[1], "rb") as f:
+    reader = make_reader(f)
+    facts = {k: v for m in reader.iter_metadata() for k, v in m.metadata.items()}
+    joints, rows, units = facts["joints"].split(","), json.loads(facts["rows"]), json.loads(facts["units"])
+    statuses, kinds = json.loads(facts["statuses"]), json.loads(facts["kinds"])
+    assert joints[6] == "panda_joint7" and rows[:7] == joints, (joints, rows)
+    assert units["v"] == "rad/s" and statuses["13"] == "braked-no-verified-brake" and "torque" in kinds
+    ahead, named, brakes = int(facts["clock"]), set(), 0
+    for schema, channel, message in reader.iter_messages(topics=["tick"]):
+        m = json.loads(message.data)
+        assert (message.publish_time, message.log_time) == (m["begin_ns"] + ahead, m["end_ns"] + ahead)
+        assert datetime.datetime.fromtimestamp(message.log_time / 1e9, datetime.timezone.utc).year == 2033
+        assert str(m["ledger"]["status"]) in statuses
+        for row in m["ledger"]["active_rows"]:
+            assert row["kind"] in kinds and row["multiplier"] >= 0
+            named.add(rows[row["row"]])
+        brakes += len(m["brake"]) == 7 and all(0 <= b <= 10 for b in m["brake"])
+    entry = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=["snapshot"])][0]
+    assert entry["rows"] == rows
+    assert named and named <= set(joints), named
+    print(brakes)
+"#;
+
+#[test]
+fn a_stranger_finds_names_times_of_day_and_ways_to_stop_in_half_the_bytes() {
+    let (name, folder) = (Name::new("named-log"), Scratch::new("named-log"));
+    let first = crate::arm::snapshot(1, |_| {});
+    let file = crate::arm::File::new("named-log", &first);
+    let plant = crate::arm::start(&name, &first);
+    let (log, ticks) = (folder.0.join("arm.mcap"), 2000);
+    // In 2033, by the monotonic clock of a machine that was not started before 2000.
+    let wall = 2_000_000_000_000_000_000;
+    let settings = RunSettings { ticks: Some(ticks), log: Some(log.clone()), wall, ..settings() };
+    let (mut rows, mut shown) = (Vec::new(), Vec::new());
+    let running = crate::arm::execute_with(&name, &file.0, &nearl_runtime::rt::Stop::new(), settings);
+    {
+        let mut view = nearl_runtime::link::ViewLink::open(&name.0).unwrap();
+        if let Ok(message) = view.wait_for_rows(crate::arm::PATIENCE) {
+            rows = message.row_names();
+        }
+        while !running.is_finished() {
+            shown.extend(std::iter::from_fn(|| view.tick()));
+        }
+    }
+    let report = running.join().unwrap().unwrap();
+    plant.end();
+    assert_eq!((report.log_drops, report.log_brief, report.log_error.as_deref()), (0, 0, None), "{report}");
+    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join("../.venv/bin/python");
+    let output = Command::new(python).args(["-c", STRANGER]).arg(&log).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let brakes: u64 = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
+    assert!(brakes >= ticks - 10, "{brakes} ticks with a way to stop");
+    let each = (std::fs::metadata(&log).unwrap().len() - first.to_bytes().len() as u64) / ticks;
+    assert!(each <= 1450, "{each} bytes a tick");
+    let replayed = nearl_runtime::log::replay(&log).unwrap();
+    assert!(replayed.difference.is_none() && replayed.ticks >= ticks, "{replayed:?}");
+    // A viewer was told the same.
+    assert_eq!(rows.len(), 14, "seven joints and their torques: {rows:?}");
+    let tick = shown.iter().rfind(|tick| tick.n_active > 0 && tick.nu > 0).expect("a tick with active rows");
+    assert!(tick.multipliers().iter().all(|x| *x > 0.0) && tick.brake().len() == 7, "{tick:?}");
+    assert!(usize::try_from(tick.rows[0]).unwrap() < rows.len() && tick.end >= tick.begin);
 }

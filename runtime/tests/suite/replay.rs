@@ -9,7 +9,7 @@ use std::time::Duration;
 use crate::arm::*;
 use crate::toy::Name;
 use nearl_runtime::link::*;
-use nearl_runtime::log::replay;
+use nearl_runtime::log::{Gap, replay};
 use nearl_runtime::rt::*;
 use serde_json::Value;
 
@@ -158,8 +158,31 @@ fn an_edited_log_is_found_out_at_its_tick_and_field() {
         true
     };
     assert_eq!(found(260, &moved).unwrap().tick, 260);
-    let gap = found(270, &|_| false).unwrap();
-    assert_eq!((gap.tick, gap.field.as_str(), gap.log.as_str()), (270, "tick", "271"), "{gap}");
+}
+
+#[test]
+fn after_a_lost_tick_replay_goes_on_from_the_next_memory() {
+    let folder = Scratch::new("gap");
+    let (log, report) = record("gap", &folder.0);
+    let copy = folder.0.join("copy.mcap");
+    edit(&log, &copy, 270, &|_| false);
+    let found = replay(&copy).unwrap();
+    assert_eq!(found.difference, None);
+    let [Gap { from, to, lost }] = found.gaps[..] else { panic!("one gap: {:?}", found.gaps) };
+    assert_eq!((from, lost), (270, 1));
+    assert!(
+        (1000..1100).contains(&to),
+        "a memory is written every 1000 ticks, at the end of a policy period: {to}"
+    );
+    assert_eq!(found.ticks, report.ticks - (to - from + 1));
+    // What comes after is compared as what was before.
+    let late = to + 30;
+    edit(&copy, &log, late, &|m| {
+        m["target_v"][1] = (m["target_v"][1].as_f64().unwrap() + 1e-12).into();
+        true
+    });
+    let difference = replay(&log).unwrap().difference.expect("a changed target");
+    assert_eq!((difference.tick, difference.field.as_str()), (late, "target_v[1]"), "{difference}");
 }
 
 #[test]
