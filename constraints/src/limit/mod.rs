@@ -4,6 +4,7 @@
 //! [`REGISTRY`]. Limits of single joints narrow the [`LimitSet`]; limits that tie joints together hand out [`Rows`] or a [`Cone`].
 
 mod acceleration;
+mod action;
 mod clearance;
 mod collision;
 mod drive;
@@ -24,6 +25,7 @@ mod velocity;
 mod velocity_profile;
 
 pub use acceleration::{AccelerationLimit, AccelerationSettings};
+pub use action::{ActionLimit, ActionReport, ActionSettings};
 pub use collision::{CollisionLimit, CollisionSettings, SolidSettings};
 pub use drive::DriveTorqueLimit;
 pub use energy::{EnergyLimit, EnergySettings};
@@ -216,9 +218,15 @@ fn each<S: Clone, L: Limit + 'static>(settings: &[S], new: fn(S) -> L) -> Vec<Bo
 /// The limits that a task file's `[constraints]` asks for, checked against all joints of `model` they name.
 ///
 /// # Errors
-/// Unknown joints and values out of their domain. Limits that the robot file lacks are found by
+/// Unknown joints and values out of their domain; [`ActionSettings`], which are no limits of a state. Limits that the robot file lacks are found by
 /// [`Projector::new`](crate::Projector::new), which knows the controllable dofs.
 pub fn build_limits(settings: &ConstraintSettings, model: &Model) -> Result<Vec<Box<dyn Limit>>, LimitError> {
+    if settings.action.is_some() {
+        return Err(LimitError::Unusable {
+            what: "action limits what a network gives the motors, and no state is proposed here".into(),
+            next: "leave [constraints.action] to a controller with a policy on actions or a learned inverse model",
+        });
+    }
     let mut limits = Vec::new();
     for entry in REGISTRY {
         limits.extend((entry.build)(settings, model)?);

@@ -1,9 +1,9 @@
 //! The `[constraints]` section of a task file.
 
 use super::{
-    AccelerationSettings, CollisionSettings, EnergySettings, FrameSettings, FrameSpeedSettings, JerkSettings,
-    PositionSettings, TorqueRateSettings, TorqueSettings, TorqueSpeedSettings, UserRowSettings,
-    VelocityProfileSettings, VelocitySettings,
+    AccelerationSettings, ActionSettings, CollisionSettings, EnergySettings, FrameSettings,
+    FrameSpeedSettings, JerkSettings, PositionSettings, TorqueRateSettings, TorqueSettings,
+    TorqueSpeedSettings, UserRowSettings, VelocityProfileSettings, VelocitySettings,
 };
 use crate::{Braking, Consistency, Guard, LimitError, Model, Solver};
 use serde::{Deserialize, Serialize};
@@ -61,6 +61,9 @@ pub struct ConstraintSettings {
     /// `collision = { shapes, urdf, ignore, adjacent, braking, margin, influence, rows, soft }`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub collision: Option<CollisionSettings>,
+    /// `action = { power = 20.0 }`; of policies whose actions come out of a network, see [`ActionLimit`](crate::ActionLimit).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub action: Option<ActionSettings>,
     /// `rows = [{ name, terms, lower, upper, equals, braking, soft }]`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub rows: Vec<UserRowSettings>,

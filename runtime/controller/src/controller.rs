@@ -31,7 +31,8 @@ use given::Given;
 use guard::Guard;
 use maths::{hermite, sample};
 use nearl_constraints::{
-    Bounds, Entry, LimitSet, Model, Projector, Proposal, RefuseReason, StateLayout, Status, Target,
+    ActionLimit, Bounds, Entry, LimitSet, Model, Projector, Proposal, RefuseReason, StateLayout, Status,
+    Target,
 };
 use parts::{check_sizes, halves, idx_q};
 use std::time::Instant;
@@ -138,6 +139,7 @@ pub struct Controller {
     inverse: Inverse,
     guard: Option<Guard>,
     drive_box: Option<DriveBox>,
+    action_limit: Option<ActionLimit>,
     action_range: Vec<(f64, f64)>,
     dt: f64,
     policy_every: usize,
@@ -190,6 +192,7 @@ impl Controller {
         let bounds = m.bounds_drives();
         let drive_box = bounds.then(|| DriveBox::new(m, &model, layout.controllable(), &projector));
         let drive_box = drive_box.transpose()?;
+        let action_limit = Parts::action_limit(m, &model)?;
         let zero = |n| vec![0.0; n];
         let rest = State { q: model.neutral(), v: zero(model.nv()), obs: zero(layout.n_obs()) };
         let proposal = Proposal { q: model.neutral(), v: zero(model.nv()) };
@@ -206,6 +209,7 @@ impl Controller {
             inverse,
             guard,
             drive_box,
+            action_limit,
             action_range: m.action_lower.iter().copied().zip(m.action_upper.iter().copied()).collect(),
             dt: m.task.time.dt,
             policy_every: m.task.time.policy_every,
@@ -245,6 +249,7 @@ impl Controller {
         self.project(out);
         self.invert(noise, out);
         self.guard(out);
+        self.limit_action(out);
         self.tick += 1;
         out.duration_ns = begin.elapsed().as_nanos() as u64;
         if held {
@@ -440,6 +445,20 @@ impl Controller {
         }
     }
 
+    /// The nearest action that the task's limits on actions allow; the ledger counts it, and what was broken before.
+    fn limit_action(&mut self, out: &mut Output) {
+        let Some(limit) = &mut self.action_limit else { return };
+        let report = limit.project(&self.held.v, &mut out.action, self.projection);
+        let ledger = &mut out.next.ledger;
+        if self.kind == PolicyKind::Direct {
+            (ledger.raw_violations.other, ledger.violations.other, ledger.moved) = (0, 0, 0.0);
+            ledger.status = if report.moved > 0.0 { Status::Clamped } else { Status::Unchanged };
+        }
+        ledger.raw_violations.other += report.raw_violations;
+        ledger.violations.other += report.violations;
+        ledger.moved += report.moved;
+    }
+
     /// One inference at rest must give numbers.
     fn canary(&mut self) -> Result<(), SnapshotError> {
         let mut out = self.output();
@@ -463,6 +482,9 @@ impl Controller {
         if let Some(drives) = &mut self.drive_box {
             drives.forget();
         }
+        if let Some(limit) = &mut self.action_limit {
+            limit.forget();
+        }
     }
 
     /// Whether the policy runs in the next tick.
@@ -482,6 +504,9 @@ impl Controller {
         self.last_word().write_memory(memory);
         if let Some(drives) = &self.drive_box {
             drives.write_memory(memory);
+        }
+        if let Some(limit) = &self.action_limit {
+            limit.write_memory(memory);
         }
     }
 
@@ -520,6 +545,11 @@ impl Controller {
     /// # Panics
     /// When it has another length.
     pub fn take_memory(&mut self, memory: &[f64]) {
+        let of_limit = self.action_limit.as_ref().map_or(0, ActionLimit::memory_len);
+        let (memory, limit) = memory.split_at(memory.len() - of_limit);
+        if let Some(own) = &mut self.action_limit {
+            own.set_memory(limit);
+        }
         let own = self.drive_box.as_ref().map_or(0, DriveBox::memory_len);
         let (projector, drives) = memory.split_at(memory.len() - own);
         self.projector().set_memory(projector);
@@ -580,6 +610,7 @@ impl Controller {
     pub fn remembers(&self) -> bool {
         let last = self.last_word();
         self.drive_box.is_some()
+            || self.action_limit.as_ref().is_some_and(ActionLimit::remembers)
             || self.policy_every > 1
             || self.foreign.remembers()
             || last.needs_previous()

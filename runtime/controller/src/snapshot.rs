@@ -103,6 +103,11 @@ impl Manifest {
         }
     }
 
+    /// Whether the task limits the action itself: `[constraints.action]`.
+    pub fn limits_actions(&self) -> bool {
+        self.task.constraints.action.is_some()
+    }
+
     /// Whether the controller of this snapshot guards its actions: those of a network, where the task asks for it. Analytic inverse dynamics
     /// of a projected state needs no guard.
     pub fn guards(&self) -> bool {

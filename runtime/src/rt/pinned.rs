@@ -19,8 +19,18 @@ use crate::task::{IdmKind, Task};
 /// Numbers that differ by less than this share are the same: a robot file may have been written anew.
 const SAME: f64 = 1e-9;
 /// Kinds that narrow more than the box of single joints; what they ask for is compared section by section.
-const SECTIONS: [&str; 9] =
-    ["torque", "jerk", "torque_speed", "torque_rate", "frame", "frame_speed", "energy", "collision", "rows"];
+const SECTIONS: [&str; 10] = [
+    "action",
+    "torque",
+    "jerk",
+    "torque_speed",
+    "torque_rate",
+    "frame",
+    "frame_speed",
+    "energy",
+    "collision",
+    "rows",
+];
 /// States in which two robots are compared, and by how much their motor forces may differ [share of the largest].
 const STATES: usize = 5;
 

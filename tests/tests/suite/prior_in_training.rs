@@ -68,3 +68,47 @@ fn the_penalty_is_the_distance_moved() {
     let error = negative.map(|_| ()).expect_err("refused").to_string();
     assert!(error.contains("[train.moved_penalty]: -1"), "{error}");
 }
+
+/// Limits on actions hold for a policy on actions and for a learned inverse model, while collecting and in evaluation; where each action is within
+/// them is found from the formula and the velocities that Gymnasium's observation has.
+#[test]
+fn limits_on_actions_hold_while_collecting() {
+    let tight = "constraints.action.power=2.0";
+    for algo in ["ppo", "pid2-ib"] {
+        let (t, p) = first(algo, &[tight, "train.ppo.log_std=0.5"]);
+        let of = |column| cell(&t, &p, column);
+        assert!(of("constraints/raw_violations") > 0.3, "{algo}: {}", of("constraints/raw_violations"));
+        assert_eq!(of("constraints/target_violations"), 0.0, "{algo}");
+        assert!(of("constraints/distance") > 0.1, "{algo}");
+        let mut t = training("HalfCheetah-v5", algo, 0, 1, &[&SHORT[..], &[tight]].concat());
+        t.iterate();
+        let mut held = 0;
+        for s in t.segments() {
+            // the first batch: observations are not normalised yet
+            for (x, a) in s.x.chunks_exact(17).zip(s.action.chunks_exact(6)) {
+                let power: f32 = x[11..].iter().zip(a).map(|(w, a)| (w * a).abs()).sum();
+                assert!(power <= 2.0 + 1e-4, "{algo}: {power}");
+                held += u32::from(power > 2.0 - 1e-4);
+            }
+        }
+        assert!(held > 10, "{algo}: {held} on the limit");
+        let mut tighter = t.snapshot().clone();
+        tighter.manifest.task.constraints.action = toml::from_str("square = 1e-6").expect("settings");
+        let report = nearl_trainer::evaluate::evaluate(&tighter, 1, 0, true).expect("episodes");
+        assert!(report.raw_violations > 0 && report.target_violations == 0, "{algo}: {report:?}");
+    }
+}
+
+/// Where another stage has the last word on the action, limits on actions are refused by name.
+#[test]
+fn limits_on_actions_are_refused_where_the_action_is_decided_already() {
+    for (task, algo, set, words) in [
+        ("Panda-reach", "pid2-ib", "constraints.action.square=1.0", "pinocchio"),
+        ("Panda-reach", "ppo", "constraints.guard=true", "guard"),
+    ] {
+        let set = [set, "constraints.action.square=1.0"];
+        let asked = request(task, algo, 0, 1, &set);
+        let refused = Training::new(&asked).map(|_| ()).expect_err(task).to_string();
+        assert!(refused.contains("[constraints.action]") && refused.contains(words), "{refused}");
+    }
+}

@@ -50,10 +50,11 @@ impl Eval {
         );
         for e in &results {
             let percent = |n: u64| 100.0 * n as f64 / e.ticks.max(1) as f64;
-            // A policy on actions without a guard proposes nothing.
-            let proposes = snapshot.manifest.proposes();
-            let of_targets = |text: String| if proposes { text } else { "-".into() };
-            let share = |n: u64| of_targets(format!("{:.2} %", percent(n)));
+            // A policy on actions without a guard proposes nothing, and may have limits on actions.
+            let m = &snapshot.manifest;
+            let where_so = |is: bool, text: String| if is { text } else { "-".into() };
+            let of_targets = |text: String| where_so(m.proposes(), text);
+            let share = |n: u64| where_so(m.proposes() || m.limits_actions(), format!("{:.2} %", percent(n)));
             say(format!(
                 "{:<10}{:>8.1} ± {:<8.1}{:>10.1}{:>16}{:>9}{:>15.2} %{:>17}{:>20}",
                 e.mode,

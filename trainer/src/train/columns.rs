@@ -57,10 +57,11 @@ impl Training {
         let per_tick = |n: u64| n as f64 / t.ticks.max(1) as f64;
         // A policy on actions without a guard proposes nothing: nothing is projected, and no target is missed.
         let proposes = self.snapshot.manifest.proposes();
-        let of_targets =
-            |name: &str| name == "idm/residual" || name.starts_with("constraints/") && name != REACHED;
+        let is_limited = proposes || self.snapshot.manifest.limits_actions();
+        let of_limits = |name: &str| name.starts_with("constraints/") && name != REACHED;
         let value = |name: &str| match name {
-            name if !proposes && of_targets(name) => f64::NAN,
+            "idm/residual" if !proposes => f64::NAN,
+            name if !is_limited && of_limits(name) => f64::NAN,
             "time/total_timesteps" => p.steps as f64,
             "time/seconds" => p.seconds,
             "time/fps" => p.steps as f64 / p.seconds,

@@ -5,8 +5,8 @@ use crate::motors::Motors;
 use crate::snapshot::{Manifest, Networks, PolicyKind, SnapshotError};
 use crate::task::{IdmInput, IdmKind};
 use nearl_constraints::{
-    Consistency, Drive, DriveTorqueLimit, Entry, Model, Projector, Settings, StateLayout, TorqueLimit,
-    build_limits,
+    ActionLimit, Consistency, ConstraintSettings, Drive, DriveTorqueLimit, Entry, Model, Projector, Settings,
+    StateLayout, TorqueLimit, build_limits,
 };
 
 /// Robot, layout and projector of a task: what a controller needs beside its networks.
@@ -82,13 +82,37 @@ impl Parts {
         Motors::new(model, controllable, drives).map_err(|e| unusable(&e))
     }
 
+    /// What the task allows of actions, if it says so.
+    ///
+    /// # Errors
+    /// [`SnapshotError::Unusable`] where another stage has the last word on the action, and as [`Parts::new`].
+    pub fn action_limit(m: &Manifest, model: &Model) -> Result<Option<ActionLimit>, SnapshotError> {
+        let Some(settings) = &m.task.constraints.action else { return Ok(None) };
+        let analytic = m.policy != PolicyKind::Direct && m.task.idm.kind == IdmKind::Pinocchio;
+        let other = match m.task.constraints.guard {
+            _ if analytic => Some("idm.kind = \"pinocchio\" gives the one torque that leads to the target"),
+            guard if !guard.is_off() => {
+                Some("[constraints] guard gives the one action that leads to an allowed state")
+            }
+            _ => None,
+        };
+        if let Some(other) = other {
+            return Err(unusable(&format!(
+                "[constraints.action] would change an action that is already decided: {other}; leave one of the two out"
+            )));
+        }
+        let range = m.action_lower.iter().copied().zip(m.action_upper.iter().copied()).collect();
+        ActionLimit::new(settings, model, range).map(Some).map_err(|e| unusable(&e))
+    }
+
     fn projector_of(
         m: &Manifest,
         model: &Model,
         controllable: &[usize],
         consistency: Consistency,
     ) -> Result<Projector, SnapshotError> {
-        let mut limits = build_limits(&m.task.constraints, model).map_err(|e| unusable(&e))?;
+        let of_states = ConstraintSettings { action: None, ..m.task.constraints.clone() };
+        let mut limits = build_limits(&of_states, model).map_err(|e| unusable(&e))?;
         let drives = Self::drives(m, model, controllable)?;
         let is_pd = |drive: &Drive| matches!(drive, Drive::Pd { .. });
         if let Some(torque) = m.task.constraints.torque.clone().filter(|_| drives.iter().any(is_pd)) {

@@ -14,7 +14,11 @@ enum Way {
 }
 
 /// Keys whose numbers have an order; whatever else a section says must stay as it is.
-const WAYS: [(&str, Way); 9] = [
+const WAYS: [(&str, Way); 13] = [
+    ("power", Way::Loosens),
+    ("delivered", Way::Loosens),
+    ("square", Way::Loosens),
+    ("rate", Way::Loosens),
     ("limit", Way::Loosens),
     ("scale", Way::Loosens),
     ("stall", Way::Loosens),
