@@ -11,6 +11,7 @@ mod guard;
 mod imitation;
 mod import;
 mod limits_in_simulator;
+mod meters;
 mod networks;
 mod prior_in_training;
 mod recipe;
