@@ -70,12 +70,12 @@ fn memory(name: &RobotName) {
     }
 }
 
-/// The disk has room for 400 kB of log: the limit on the size of files stands in for it.
+/// The disk has room for 60 kB of log: the limit on the size of files stands in for it.
 fn full_disk(name: &RobotName) {
     let log = std::env::temp_dir().join(format!("nearl-full-{}.mcap", std::process::id()));
     let (link, robot) = connect(name, 20.0).unwrap();
     let (drops, _dropped) = std::sync::mpsc::channel();
-    let limit = libc::rlimit { rlim_cur: 400_000, rlim_max: 400_000 };
+    let limit = libc::rlimit { rlim_cur: 60_000, rlim_max: 60_000 };
     // SAFETY: plain calls; this process ends after the run.
     unsafe {
         // As it is in any process: that the log's thread does not end it is the log's doing.
