@@ -8,7 +8,7 @@ use nearl_trainer::learn::ALGORITHMS;
 use nearl_trainer::preset::Preset;
 use nearl_trainer::run_folder::{self, RunFolder};
 use nearl_trainer::tasks;
-use nearl_trainer::train::{self, COLUMNS, Request, TrainError, complete};
+use nearl_trainer::train::{self, Request, TrainError, complete};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -63,7 +63,8 @@ impl Training {
             let request = Request { manifest, algo, steps: 0, seed, threads: threads.max(1) };
             let training = train::Training::new(&request).map_err(errors::train)?;
             if let Some(out) = &out {
-                RunFolder::create(out, &training.snapshot().manifest, seed, COLUMNS).map_err(run)?;
+                RunFolder::create(out, &training.snapshot().manifest, seed, &training.columns())
+                    .map_err(run)?;
             }
             Ok(Training::of(training, out))
         })
@@ -103,7 +104,8 @@ impl Training {
                         manifest.steps
                     )));
                 }
-                let folder = RunFolder::reopen(out, held, COLUMNS, manifest.steps, manifest.version);
+                let (steps, version) = (manifest.steps, manifest.version);
+                let folder = RunFolder::reopen(out, held, &inner.training.columns(), steps, version);
                 inner.folder = Some(folder.map_err(run)?);
             }
             inner.training.extend(steps);
@@ -123,10 +125,11 @@ impl Training {
             };
             let stopped = || errors::value("the source of experience was stopped");
             let progress = progress.map_err(errors::train)?.ok_or_else(stopped)?;
-            Ok::<_, PyErr>(training.row(&progress))
+            let columns: Vec<String> = training.columns().into_iter().map(str::to_owned).collect();
+            Ok::<_, PyErr>(columns.into_iter().zip(training.row(&progress)).collect::<Vec<_>>())
         })?;
         let metrics = PyDict::new(py);
-        for (name, value) in COLUMNS.iter().zip(row).filter(|(_, value)| value.is_finite()) {
+        for (name, value) in row.into_iter().filter(|(_, value)| value.is_finite()) {
             metrics.set_item(name, value)?;
         }
         Ok(metrics)

@@ -169,6 +169,27 @@ pub trait Env: Send {
     /// [`EnvError::Goal`] when the task has none or one of another length; [`EnvError::Physics`] when it is not finite.
     fn set_goal(&mut self, goal: &[f64]) -> Result<(), EnvError>;
 
+    /// What the present episode drew beside its start and its goal; empty where a task draws nothing else. With `qpos`, `qvel` and the goal
+    /// it makes an episode repeatable.
+    fn circumstances(&self) -> Vec<f64> {
+        Vec::new()
+    }
+
+    /// Sets what [`Env::circumstances`] gave, for the episode that [`Env::set_state`] begins next.
+    fn set_circumstances(&mut self, _circumstances: &[f64]) {}
+
+    /// Puts the task's curriculum, if it has one, at its start; from then on it rises and falls with the episodes. Without this call
+    /// everything is drawn as at the curriculum's top.
+    fn start_curriculum(&mut self) {}
+
+    /// Writes what the value alone may see, in the order of [`Spec::privileged`].
+    fn privileged(&self, _to: &mut [f64]) {}
+
+    /// Sums of the named parts of the reward since the episode began, and what else is told of it, in the order of [`Spec::notes`].
+    fn notes(&self) -> &[f64] {
+        &[]
+    }
+
     /// Counts since the environment was made.
     fn counters(&self) -> Counters;
 

@@ -20,6 +20,7 @@ pub mod preset;
 pub mod robot;
 pub mod rollout;
 pub mod run_folder;
+pub mod scene;
 pub mod serve;
 pub mod settings;
 pub mod stats;

@@ -8,6 +8,8 @@ mod describe;
 mod guard;
 mod inverse;
 mod motors;
+mod perturb;
+mod scene;
 mod sim;
 
 use std::path::Path;
@@ -20,6 +22,8 @@ use mujoco_rs::wrappers::mj_model::{MjModel, MjtBias, MjtDyn, MjtGain, MjtJoint,
 
 pub use guard::{last_warning, warnings};
 pub use inverse::Inverse;
+pub use perturb::Physique;
+pub use scene::{Foot, PdDrive, Scene};
 pub use sim::Sim;
 
 /// Why MuJoCo could not do what was asked.
@@ -151,13 +155,30 @@ impl Model {
         folder: Option<&Path>,
         options: Options,
     ) -> Result<Model, MjError> {
+        Model::with_scene(text, format, folder, options, &Scene::default())
+    }
+
+    /// The same with what a task puts beside the robot.
+    ///
+    /// # Errors
+    /// As [`Model::from_text`]; [`MjError::NoBody`] for a foot on no body.
+    pub fn with_scene(
+        text: &str,
+        format: ModelFormat,
+        folder: Option<&Path>,
+        options: Options,
+        scene: &Scene,
+    ) -> Result<Model, MjError> {
         let text = match format {
             ModelFormat::Mjcf => text.to_owned(),
             ModelFormat::Urdf if options.floats => keep_fixed_links(&set_afloat(text)?),
             ModelFormat::Urdf => keep_fixed_links(text),
         };
-        let loaded = guard::counting_warnings(|| compile(&text, folder));
-        let mut model = loaded.map_err(|e| MjError::Load(guard::one_line(&e.to_string())))?;
+        let loaded = guard::counting_warnings(|| match scene.is_empty() {
+            true => compile(&text, folder).map_err(|e| MjError::Load(guard::one_line(&e.to_string()))),
+            false => scene::compile(&text, folder, scene),
+        });
+        let mut model = loaded?;
         let opt = model.opt_mut();
         if let Some(sim_dt) = options.sim_dt {
             opt.timestep = sim_dt;
@@ -271,6 +292,11 @@ impl Model {
             MjtBias::mjBIAS_AFFINE if linear && bias[0] == 0.0 => Some([gain[0], bias[1], bias[2]]),
             _ => None,
         }
+    }
+
+    /// How far from where its joint is a position drive has to be sent for its largest force \[rad or m\].
+    pub fn reach(&self, id: usize) -> f64 {
+        self.0.actuator_forcerange()[id][1] / self.0.actuator_gainprm()[id][0]
     }
 
     fn is_plain(&self, id: usize) -> bool {

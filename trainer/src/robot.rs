@@ -7,7 +7,7 @@ use nearl_runtime::constraints::description::{JointKind, Range, RobotDescription
 use nearl_runtime::constraints::{Model, ModelError};
 use nearl_runtime::snapshot::{ModelFormat, Simulation};
 
-use crate::mj::{self, MjError, Options};
+use crate::mj::{self, MjError, Options, Scene};
 
 /// Why a robot file has no description.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -36,11 +36,17 @@ pub fn describe(file: &Simulation, floats: bool) -> Result<RobotDescription, Rob
 ///
 /// # Errors
 /// [`RobotError`].
-pub fn describe_simulated(file: &Simulation, floats: bool) -> Result<RobotDescription, RobotError> {
-    let mut robot = compile(file, floats)?.describe()?;
+pub fn describe_simulated(
+    file: &Simulation,
+    floats: bool,
+    options: &SceneOptions,
+) -> Result<RobotDescription, RobotError> {
+    let mut robot = compile_in(file, floats, options)?.describe()?;
     if file.format == ModelFormat::Mjcf {
         return Ok(robot);
     }
+    // Drives of the scene are what [command] says of the file's motors.
+    robot.solids.retain(|solid| solid.body.is_some() || options.scene.floor.is_none());
     let stated = read_urdf(&file.text, floats)?;
     for joint in robot.bodies.iter_mut().flat_map(|body| &mut body.joints) {
         let Some(own) = stated.joints().find(|own| own.name == joint.name) else { continue };
@@ -105,6 +111,24 @@ pub fn folder_of(file: &Path) -> PathBuf {
 pub fn compile(file: &Simulation, floats: bool) -> Result<mj::Model, MjError> {
     let options = Options { floats, ..Options::default() };
     mj::Model::from_text_in(&file.text, file.format, file.folder.as_deref(), options)
+}
+
+/// What a task adds to its robot file, and the physics step that it states \[s\].
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct SceneOptions {
+    /// Floor, feet and drives.
+    pub scene: Scene,
+    /// Physics step; the file's own when absent.
+    pub sim_dt: Option<f64>,
+}
+
+/// Compiles a robot file for simulation with what its task adds.
+///
+/// # Errors
+/// [`MjError::Load`], [`MjError::NoBody`].
+pub fn compile_in(file: &Simulation, floats: bool, add: &SceneOptions) -> Result<mj::Model, MjError> {
+    let options = Options { floats, sim_dt: add.sim_dt, ..Options::default() };
+    mj::Model::with_scene(&file.text, file.format, file.folder.as_deref(), options, &add.scene)
 }
 
 /// The robot file of a manifest: its own, else the bundled one that its task names.

@@ -125,7 +125,9 @@ impl Collector {
                 };
                 return Err(full(what, free));
             }
-            workers.push(Mutex::new(Worker::new(first.another()?, snapshot, gamma, stream(seed, i as u64))?));
+            let mut env = first.another()?;
+            env.start_curriculum();
+            workers.push(Mutex::new(Worker::new(env, snapshot, gamma, stream(seed, i as u64))?));
         }
         Ok(Self { workers, threads: threads.clamp(1, n_envs.max(1)), n_steps })
     }

@@ -3,6 +3,7 @@
 use crate::env::{self, Env, EnvError};
 use crate::preset::Preset;
 use crate::robot::{self, RobotError};
+use crate::scene;
 use nearl_runtime::net::Activation;
 use nearl_runtime::snapshot::{FORMAT, Simulation};
 use nearl_runtime::task::{Task, TaskError};
@@ -105,7 +106,14 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
     let floats = parsed.model.free_flyer;
     let described = match parsed.reward.is_empty() {
         true => robot::describe(&simulation, floats),
-        false => robot::describe_simulated(&simulation, floats),
+        false => {
+            let add = scene::of(&parsed, &simulation).map_err(|m| EnvError::Task {
+                origin: task.into(),
+                key: m.key,
+                reason: m.reason,
+            })?;
+            robot::describe_simulated(&simulation, floats, &add)
+        }
     };
     let description = described.map_err(|source| TaskLoadError::Description {
         task: parsed.name.clone(),

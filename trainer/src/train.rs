@@ -24,11 +24,11 @@ use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
 use imitation::Imitation;
 use nearl_rollout_protocol::Layout;
-use nearl_runtime::controller::{Parts, seen_entries};
+use nearl_runtime::controller::Parts;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
-use setup::{check_experience, check_minibatch, check_outputs, check_reward, learner, policy_kind};
+use setup::{check_experience, check_minibatch, check_outputs, check_reward, dims, learner, policy_kind};
 use std::time::Instant;
 
 /// Why a training could not start or go on.
@@ -116,6 +116,8 @@ pub struct Training {
     seed: u64,
     recent: Vec<(f64, usize)>,
     recent_costs: Vec<f64>,
+    /// What the environment tells of its episodes, by name.
+    notes: Vec<String>,
     begin: Instant,
     /// Seconds of this training in earlier processes.
     earlier: f64,
@@ -149,16 +151,9 @@ impl Training {
         let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
         manifest.algo = request.algo.to_string();
         manifest.policy = policy_kind(request.algo, &settings, &manifest.task)?;
-        complete(&mut manifest)?;
+        let notes = complete(&mut manifest)?.notes;
         let parts = Parts::new(&manifest)?;
-        let seen = seen_entries(&manifest, &parts.layout)?;
-        let dims = Dims {
-            n_obs: parts.layout.n_obs(),
-            n_state: parts.layout.n_state(),
-            n_act: manifest.action_lower.len(),
-            seen_obs: seen.iter().map(|&k| parts.layout.state()[k]).collect(),
-            seen_state: seen,
-        };
+        let dims = dims(&manifest, &parts)?;
         check_outputs(&manifest.task.name, &dims)?;
         check_experience(&settings, experience)?;
         let batch = settings.n_envs * settings.n_steps;
@@ -201,6 +196,7 @@ impl Training {
             seed: request.seed,
             recent: Vec::new(),
             recent_costs: Vec::new(),
+            notes,
             begin: Instant::now(),
             earlier: 0.0,
             learning_seconds: 0.0,

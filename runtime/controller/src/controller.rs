@@ -151,6 +151,8 @@ pub struct Controller {
     /// Tick in which the first policy period of this rhythm began.
     begun: usize,
     given: Given,
+    /// Ticks of the episode before `tick` counted from 0: those of the controller that this one took over from.
+    earlier: usize,
     version: u64,
     mean: Vec<f32>,
     held: State,
@@ -219,6 +221,7 @@ impl Controller {
             tick: 0,
             begun: 0,
             given: Given::new(if kind == PolicyKind::Direct { n_act } else { layout.n_state() }),
+            earlier: 0,
             version: m.version,
             mean: vec![0.0; layout.n_state().max(n_act)],
             held: rest.clone(),
@@ -279,7 +282,8 @@ impl Controller {
         if !out.policy_tick {
             return;
         }
-        self.foreign.see(&self.held, self.tick as f64 * self.dt, &self.normaliser, &mut out.x);
+        let time = self.time();
+        self.foreign.see(&self.held, time, &self.normaliser, &mut out.x);
         if self.given.is_set() {
             self.propose_given(out);
             return;
@@ -288,7 +292,7 @@ impl Controller {
         self.mean[..mean.len()].copy_from_slice(mean);
         out.log_prob_proposal = 0.0;
         if self.kind == PolicyKind::Direct {
-            self.foreign.command(&mut self.mean[..self.action_range.len()]);
+            self.command(noise, out);
             return;
         }
         let n = self.layout.n_state();
@@ -302,6 +306,17 @@ impl Controller {
             out.proposal[k] = s + self.normaliser.scale[k] * f64::from(out.change[k]);
         }
         self.set_goal(out);
+    }
+
+    /// The commands of a policy of actions whose outputs stand for them: exploration is in the outputs, and the policy sees what it did.
+    fn command(&mut self, noise: &Noise, out: &mut Output) {
+        if !self.foreign.has_map() {
+            return;
+        }
+        let n = self.action_range.len();
+        out.log_prob_action = sample(&self.mean[..n], &self.action_log_std, &noise.action, &mut out.sampled);
+        self.mean[..n].copy_from_slice(&out.sampled);
+        self.foreign.command(&mut self.mean[..n]);
     }
 
     /// Scatters the proposed entries into configuration and velocity. Of a controllable joint with one half proposed the
@@ -398,6 +413,7 @@ impl Controller {
     fn invert(&mut self, noise: &Noise, out: &mut Output) {
         let n = out.action.len();
         match &mut self.inverse {
+            Inverse::Direct if self.foreign.has_map() => {}
             Inverse::Direct => {
                 out.log_prob_action =
                     sample(&self.mean[..n], &self.action_log_std, &noise.action, &mut out.sampled);
@@ -411,9 +427,10 @@ impl Controller {
                 idm.action(&self.held.q, &self.held.v, &out.next, &mut out.action);
             }
         }
+        let given = if self.foreign.has_map() { &self.mean[..n] } else { &out.sampled[..] };
         for (i, (a, &(lower, upper))) in out.action.iter_mut().zip(&self.action_range).enumerate() {
             if !matches!(self.inverse, Inverse::Analytic(_)) {
-                *a = f64::from(out.sampled[i]);
+                *a = f64::from(given[i]);
             }
             *a = if a.is_finite() { a.clamp(lower, upper) } else { 0.0 };
         }
@@ -475,7 +492,7 @@ impl Controller {
 
     /// Starts a new episode: the next tick is a policy tick.
     pub fn reset(&mut self) {
-        (self.tick, self.begun) = (0, 0);
+        (self.tick, self.begun, self.earlier) = (0, 0, 0);
         self.given.forget();
         self.foreign.reset();
         self.projector().forget();
@@ -508,6 +525,7 @@ impl Controller {
         if let Some(limit) = &self.action_limit {
             limit.write_memory(memory);
         }
+        self.foreign.write_memory(self.earlier + self.tick, memory);
     }
 
     /// The way to stop that was verified last (nv), see [`Projector::stored_brake`].
@@ -545,6 +563,8 @@ impl Controller {
     /// # Panics
     /// When it has another length.
     pub fn take_memory(&mut self, memory: &[f64]) {
+        let (memory, seen) = memory.split_at(memory.len() - self.foreign.memory_len());
+        self.earlier = self.foreign.set_memory(seen).saturating_sub(self.tick);
         let of_limit = self.action_limit.as_ref().map_or(0, ActionLimit::memory_len);
         let (memory, limit) = memory.split_at(memory.len() - of_limit);
         if let Some(own) = &mut self.action_limit {
@@ -615,6 +635,18 @@ impl Controller {
             || self.foreign.remembers()
             || last.needs_previous()
             || last.stores_a_brake()
+    }
+    /// Number of entries that the policy sees.
+    pub fn n_seen(&self) -> usize {
+        self.policy.n_in()
+    }
+    /// Writes what the policy would see in `state` if it ran in the next tick, before the normaliser (n_seen).
+    pub fn peek(&self, state: &State, seen: &mut [f64]) {
+        self.foreign.peek(state, self.time(), seen);
+    }
+    /// Time since the reset [s].
+    fn time(&self) -> f64 {
+        (self.earlier + self.tick) as f64 * self.dt
     }
     /// Limits by degree of freedom.
     pub fn limits(&self) -> &LimitSet {

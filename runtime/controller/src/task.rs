@@ -39,6 +39,30 @@ pub struct Task {
     /// How an episode starts.
     #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
     pub reset: toml::Table,
+    /// Floor, feet and drives beside the robot file, for the trainer as the four sections above.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub scene: toml::Table,
+    /// What the robot is asked to do, drawn as an episode goes on.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub commands: toml::Table,
+    /// Sudden changes of velocity.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub pushes: toml::Table,
+    /// How the robot differs from episode to episode.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub random: toml::Table,
+    /// What is added to what is measured of the robot.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub noise: toml::Table,
+    /// How late actions arrive and the state is known.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub delay: toml::Table,
+    /// When what is drawn becomes harder.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub curriculum: toml::Table,
+    /// Named expressions that are told of each episode beside the reward.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub metrics: toml::Table,
     /// What the joints are commanded.
     #[serde(default, skip_serializing_if = "CommandSection::is_effort")]
     pub command: CommandSection,
@@ -127,6 +151,9 @@ pub struct StateSection {
     /// Every observation entry, in the environment's order; the environment's own names when absent.
     #[serde(default)]
     pub observation: Vec<String>,
+    /// Expressions that the value sees beside what the policy sees, in training alone.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub privileged: Vec<String>,
     /// Entries the policy proposes; all when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub propose: Option<Vec<String>>,

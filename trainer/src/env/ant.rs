@@ -77,7 +77,7 @@ impl Rules for Ant {
         sim.compute_contact_forces()
     }
 
-    fn score(&self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool) {
+    fn score(&mut self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool) {
         let healthy = healthy(sim);
         let speed = (sim.position(TORSO)[0] - before) / spec.dt;
         let contact: f64 = sim.contact_forces().iter().flatten().map(|f| f.clamp(-1.0, 1.0).powi(2)).sum();

@@ -43,7 +43,7 @@ impl Rules for HalfCheetah {
         sim.qpos()[0]
     }
 
-    fn score(&self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool) {
+    fn score(&mut self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool) {
         let speed = planar::speed(spec, before, sim.qpos()[0]);
         (speed - CONTROL_COST * squared(action), false)
     }

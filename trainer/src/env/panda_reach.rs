@@ -170,7 +170,7 @@ impl Rules for PandaReach {
         sim.update_kinematics()
     }
 
-    fn score(&self, spec: &Spec, sim: &Sim, _: f64, _: &[f64]) -> (f64, bool) {
+    fn score(&mut self, spec: &Spec, sim: &Sim, _: f64, _: &[f64]) -> (f64, bool) {
         let d = self.distance(sim);
         (spec.dt * (BONUS * (-(d / NEAR).powi(2)).exp() - SLOPE * d), false)
     }

@@ -30,6 +30,14 @@ pub(super) trait Rules: Clone + Send + 'static {
         qvel: &mut [f64],
     ) -> Result<(), MjError>;
 
+    /// Changes the robot as the episode that begins wants it, before its state is set.
+    fn prepare(&mut self, _sim: &mut Sim) -> Result<(), MjError> {
+        Ok(())
+    }
+
+    /// The episode begins in `sim`'s state.
+    fn began(&mut self, _sim: &Sim) {}
+
     /// Remembers what a period begins with, for the rules that compare more than [`Rules::progress`].
     fn begin(&mut self, _sim: &Sim) {}
 
@@ -47,9 +55,15 @@ pub(super) trait Rules: Clone + Send + 'static {
         Ok(())
     }
 
+    /// Follows a period that was simulated and ended in `sim`'s state.
+    fn follow(&mut self, _sim: &Sim, _action: &[f64]) {}
+
+    /// What happens between this period and the next, after it was judged.
+    fn advance(&mut self, _sim: &mut Sim) {}
+
     /// Reward of the period that ends in `sim`'s state, and whether the episode ends there. `before` is what
     /// [`Rules::progress`] was when it began.
-    fn score(&self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool);
+    fn score(&mut self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool);
 
     /// Writes the observation.
     fn observe(&self, sim: &Sim, obs: &mut [f64]);
@@ -67,6 +81,35 @@ pub(super) trait Rules: Clone + Send + 'static {
     /// Where to write a new goal.
     fn goal_mut(&mut self) -> &mut [f64] {
         &mut []
+    }
+
+    /// See [`Env::circumstances`](super::Env::circumstances).
+    fn circumstances(&self) -> Vec<f64> {
+        Vec::new()
+    }
+
+    /// See [`Env::set_circumstances`](super::Env::set_circumstances).
+    fn set_circumstances(&mut self, _circumstances: &[f64]) {}
+
+    /// See [`Env::start_curriculum`](super::Env::start_curriculum).
+    fn start_curriculum(&mut self) {}
+
+    /// See [`Env::privileged`](super::Env::privileged).
+    fn privileged(&self, _sim: &Sim, _to: &mut [f64]) {}
+
+    /// Configuration and velocity as they are measured, MuJoCo's convention; none where they are known as they are.
+    fn measured(&self) -> Option<(&[f64], &[f64])> {
+        None
+    }
+
+    /// Whether the robot differs from episode to episode, so that each simulation needs one of its own.
+    fn changes_robot(&self) -> bool {
+        false
+    }
+
+    /// See [`Env::notes`](super::Env::notes).
+    fn notes(&self) -> &[f64] {
+        &[]
     }
 }
 

@@ -110,7 +110,11 @@ impl<R: Rules> Env for Simulated<R> {
         qpos.copy_from_slice(self.sim.model().qpos0());
         qvel.fill(0.0);
         let started = self.rules.start(rng, &mut self.sim, qpos, qvel);
-        started.and_then(|()| self.sim.set_state(qpos, qvel)).map_err(|e| match e {
+        let set = started
+            .and_then(|()| self.rules.prepare(&mut self.sim))
+            .and_then(|()| self.sim.set_state(qpos, qvel));
+        self.rules.began(&self.sim);
+        set.map_err(|e| match e {
             MjError::NotFinite { what, index, value } => EnvError::Task {
                 origin: format!("task '{}'", self.spec.name),
                 key: "reset".into(),
@@ -124,7 +128,9 @@ impl<R: Rules> Env for Simulated<R> {
 
     fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError> {
         self.foreseen.clear();
-        self.sim.set_state(qpos, qvel).map_err(self.physics())
+        let set = self.rules.prepare(&mut self.sim).and_then(|()| self.sim.set_state(qpos, qvel));
+        self.rules.began(&self.sim);
+        set.map_err(self.physics())
     }
 
     fn step(&mut self, action: &[f64]) -> Step {
@@ -145,7 +151,9 @@ impl<R: Rules> Env for Simulated<R> {
         if self.sim.take_unstable() {
             return self.faulty(Fault::Unstable);
         }
+        self.rules.follow(&self.sim, action);
         let (reward, terminated) = self.rules.score(&self.spec, &self.sim, before, action);
+        self.rules.advance(&mut self.sim);
         Step { reward, cost: 0.0, terminated, fault: Fault::None }
     }
 
@@ -177,8 +185,9 @@ impl<R: Rules> Env for Simulated<R> {
     }
 
     fn state(&self, q: &mut [f64], v: &mut [f64]) {
-        q.copy_from_slice(self.sim.qpos());
-        v.copy_from_slice(self.sim.qvel());
+        let (qpos, qvel) = self.rules.measured().unwrap_or((self.sim.qpos(), self.sim.qvel()));
+        q.copy_from_slice(qpos);
+        v.copy_from_slice(qvel);
         for joint in &self.spec.joints {
             match joint.kind {
                 JointKind::Slide | JointKind::Hinge => {}
@@ -214,6 +223,26 @@ impl<R: Rules> Env for Simulated<R> {
         Ok(())
     }
 
+    fn circumstances(&self) -> Vec<f64> {
+        self.rules.circumstances()
+    }
+
+    fn set_circumstances(&mut self, circumstances: &[f64]) {
+        self.rules.set_circumstances(circumstances);
+    }
+
+    fn start_curriculum(&mut self) {
+        self.rules.start_curriculum();
+    }
+
+    fn privileged(&self, to: &mut [f64]) {
+        self.rules.privileged(&self.sim, to);
+    }
+
+    fn notes(&self) -> &[f64] {
+        self.rules.notes()
+    }
+
     fn counters(&self) -> Counters {
         self.counters
     }
@@ -231,7 +260,8 @@ impl<R: Rules> Env for Simulated<R> {
     }
 
     fn another(&self) -> Result<Box<dyn Env>, EnvError> {
-        let sim = Sim::new(self.sim.model()).map_err(self.physics())?;
+        let make = if self.rules.changes_robot() { Sim::apart } else { Sim::new };
+        let sim = make(self.sim.model()).map_err(self.physics())?;
         Ok(Simulated::boxed(self.spec.clone(), self.robot.clone(), self.rules.clone(), sim))
     }
 }

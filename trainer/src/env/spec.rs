@@ -29,6 +29,10 @@ pub struct Spec {
     pub max_episode_steps: usize,
     /// Whether [`Step::cost`](super::Step::cost) means anything.
     pub has_cost: bool,
+    /// What the value alone may see ([`Env::privileged`](super::Env::privileged)).
+    pub privileged: Vec<String>,
+    /// What [`Env::notes`](super::Env::notes) are, as columns of `metrics.csv`.
+    pub notes: Vec<String>,
 }
 
 impl Spec {
@@ -66,6 +70,8 @@ impl Spec {
             semi_implicit_euler: model.is_euler(),
             max_episode_steps: task.max_episode_steps,
             has_cost: false,
+            privileged: Vec::new(),
+            notes: Vec::new(),
         }
     }
 }

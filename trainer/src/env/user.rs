@@ -6,39 +6,63 @@
 //! arithmetic that of [`expression`]. Entries of `state.observation` are expressions too; without any, all positions and
 //! velocities are observed.
 
+mod commands;
+mod contacts;
 mod costed;
+mod course;
+mod curriculum;
 mod expression;
 mod lexer;
+mod measured;
+mod notes;
+mod pushes;
 mod quantity;
+mod random;
 mod settings;
 
 use nearl_runtime::Manifest;
 use nearl_runtime::constraints::RobotDescription;
 use nearl_runtime::constraints::description::Motor;
 use nearl_runtime::task::Task;
-use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, StandardNormal};
 
 use super::rules::{Robot, Rules, joint_names};
 use super::simulated::Simulated;
 use super::spec::{Constants, EPISODE, Spec};
 use super::{Env, EnvError};
 use crate::mj::{Actuator, JointKind, MjError, Model, ModelFormat, Sim};
-use crate::robot;
+use crate::{robot, scene};
+use commands::Commands;
+use contacts::Contacts;
 use costed::Costed;
+use course::Course;
+use curriculum::Curriculum;
 use expression::Expression;
-use quantity::{Before, Names, Outcome, Place, Quantity, read_state};
-use settings::{Mistake, Start, mistake, starts, terms};
+use measured::Measured;
+use notes::Notes;
+use pushes::Pushes;
+use quantity::{Before, Names, Outcome, Own, Place, Quantity, Seen, base};
+use random::Random;
+use settings::{Mistake, Start, Term, mistake, starts, terms};
 
 /// The rules of a task file.
 #[derive(Clone)]
 struct User {
     observation: Vec<Expression<Quantity>>,
-    reward: Vec<Expression<Quantity>>,
-    termination: Vec<Expression<Quantity>>,
+    reward: Vec<Term>,
+    termination: Vec<Term>,
     start: Vec<Start>,
     before: Before,
+    course: Course,
+    /// Where the commands are in the observation, if they stand there together.
+    seen_commands: std::ops::Range<usize>,
+    /// What is told of the episode.
+    notes: Notes,
+    privileged: Vec<Expression<Quantity>>,
+    /// What lies between the robot and its controller, and the random numbers of its noise.
+    measured: Option<Measured>,
+    noise: ChaCha8Rng,
+    max_episode_steps: usize,
     dt: f64,
     /// Motors that MuJoCo's model does not have; without any, the action is its control.
     drives: Vec<Drive>,
@@ -62,7 +86,8 @@ pub(super) fn with_cost(env: Box<dyn Env>, task: &Task, origin: &str) -> Result<
     if task.cost.is_empty() {
         return Ok(env);
     }
-    let names = Names::new(env.sim().model(), Place::Outcome);
+    let own = Own { actuators: &env.spec().actuators, ..Own::default() };
+    let names = Names::new(env.sim().model(), own, Place::Outcome);
     let cost = terms("cost", &task.cost, &names).map_err(|m| refused(origin, m))?;
     Ok(Box::new(Costed::new(env, task.name.clone(), cost)))
 }
@@ -76,9 +101,11 @@ pub(super) fn build(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, E
             "the snapshot holds no robot file for the simulator; give the run's folder or the task file";
         return Err(refused(origin, mistake("model", reason)));
     };
-    let model = robot::compile(&file, task.model.free_flyer).map_err(physics)?;
+    let add = scene::of(task, &file).map_err(|m| refused(origin, m))?;
+    let model = robot::compile_in(&file, task.model.free_flyer, &add).map_err(physics)?;
     let (spec, rules) = parse(manifest, file.format, &model).map_err(|m| refused(origin, m))?;
-    let sim = Sim::new(&model).map_err(physics)?;
+    let make = if rules.changes_robot() { Sim::apart } else { Sim::new };
+    let sim = make(&model).map_err(physics)?;
     let robot = Robot { text: file.text.into(), format: file.format };
     with_cost(Simulated::boxed(spec, robot, rules, sim), task, origin)
 }
@@ -92,28 +119,76 @@ fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spe
     let sub_steps = sub_steps(task, model)?;
     let (actuators, drives) = match format {
         ModelFormat::Mjcf => (model.joint_actuators().map_err(|e| mistake("model.mjcf", e))?, Vec::new()),
+        ModelFormat::Urdf if model.nu() > 0 => (pd_actuators(model), Vec::new()),
         ModelFormat::Urdf => drives(&manifest.robot, model).map_err(|e| mistake("model.urdf", e))?,
     };
-    let listed =
-        if task.state.observation.is_empty() { all_names(model) } else { task.state.observation.clone() };
-    let seen = Names::new(model, Place::Observation);
+    let joints = model.joints();
+    let (start, dt) = (Names::new(model, Own::default(), Place::Start), model.sim_dt() * sub_steps as f64);
+    let driven = actuators.iter().map(|actuator| actuator.dof).collect();
+    let mut course = Course::new(dt, driven, base(&joints).map(|joint| (joint.idx_q, joint.idx_v)));
+    course.commands = Commands::read(&task.commands, &start, dt)?;
+    course.pushes = Pushes::read(&task.pushes, &joints, &start, dt)?;
+    course.random = Random::read(&task.random, model, &actuators, &start)?;
+    let drawn = course.random.as_ref().map_or(Vec::new(), Random::names);
+    let measured = Measured::read(&task.noise, &task.delay, &joints, &start)?;
+    course.draws_more = measured.is_some();
+    let commands = course.commands.names().to_vec();
+    let own = Own { actuators: &actuators, commands: &commands, drawn: &drawn, follows: true };
+    let names = Names::new(model, own, Place::Outcome);
+    let seen = Names::new(model, own, Place::Observation);
+    let listed = observed(task, model, &commands);
     let observe =
         |name: &String| seen.compile(name).or_else(|e| seen.compile(&format!("{{{name}}}")).map_err(|_| e));
-    let observation = listed.iter().map(observe).collect::<Result<_, _>>();
-    let names = Names::new(model, Place::Outcome);
+    let observation: Result<Vec<_>, _> = listed.iter().map(observe).collect();
+    let observation = observation.map_err(|e| mistake("state.observation", e))?;
+    let (reward, termination) =
+        (terms("reward", &task.reward, &names)?, terms("termination", &task.termination, &names)?);
+    let privileged: Result<Vec<_>, _> = task.state.privileged.iter().map(observe).collect();
+    let privileged = privileged.map_err(|e| mistake("state.privileged", e))?;
+    course.curriculum = Curriculum::read(&task.curriculum, &reward)?;
+    let climbs = course.curriculum.is_some();
+    let notes = Notes::read(&task.metrics, &reward, &names, drawn, measured.is_some(), climbs)?;
+    let told = reward.iter().chain(&termination).map(|term| &term.of).chain(notes.expressions());
+    course.contacts = Contacts::of(model, told.chain(&observation).chain(&privileged));
     let max_episode_steps = task.time.max_episode_steps.unwrap_or(EPISODE);
     let constants = Constants { name: task.name.clone(), sub_steps, max_episode_steps };
-    let spec = Spec::new(model, constants, listed, actuators);
+    let seen_commands = place_of(&commands, &listed);
+    let mut spec = Spec::new(model, constants, listed, actuators);
+    spec.notes = notes.names().to_vec();
+    spec.privileged.clone_from(&task.state.privileged);
     let rules = User {
-        observation: observation.map_err(|e| mistake("state.observation", e))?,
-        reward: terms("reward", &task.reward, &names)?,
-        termination: terms("termination", &task.termination, &names)?,
-        start: starts(task, &spec.joints, &Names::new(model, Place::Start))?,
+        observation,
+        notes,
+        privileged,
+        measured,
+        noise: course.noise(),
+        max_episode_steps,
+        reward,
+        termination,
+        start: starts(task, &spec.joints, &start)?,
         before: Before::new(model),
+        course,
+        seen_commands,
         dt: spec.dt,
         drives,
     };
     Ok((spec, rules))
+}
+
+/// What the task observes: what it lists, else all positions, then all velocities, then the commands.
+fn observed(task: &Task, model: &Model, commands: &[String]) -> Vec<String> {
+    if !task.state.observation.is_empty() {
+        return task.state.observation.clone();
+    }
+    let commands = commands.iter().map(|name| format!("command.{name}"));
+    all_names(model).into_iter().chain(commands).collect()
+}
+
+/// Where the commands stand in the observation, one after another; an empty range where they do not.
+fn place_of(commands: &[String], listed: &[String]) -> std::ops::Range<usize> {
+    let names: Vec<String> = commands.iter().map(|name| format!("command.{name}")).collect();
+    let at = listed.windows(names.len().max(1)).position(|window| window == names);
+    at.map_or(0..0, |at| at..at + names.len())
 }
 
 /// The motors of a URDF, which MuJoCo does not know: actions within their ranges, and the joints they drive.
@@ -148,6 +223,21 @@ fn drives(robot: &RobotDescription, model: &Model) -> Result<(Vec<Actuator>, Vec
     }
 }
 
+/// The drives that the scene gave the joints of a URDF. Their targets range over all that may ask for the whole effort somewhere.
+fn pd_actuators(model: &Model) -> Vec<Actuator> {
+    let joints = model.joints();
+    let mut actuators = model.actuators();
+    for (id, actuator) in actuators.iter_mut().enumerate() {
+        let ([low, high], reach) = match joints.iter().find(|joint| joint.idx_v == actuator.dof) {
+            Some(joint) => (joint.range, model.reach(id)),
+            None => ([f64::NEG_INFINITY, f64::INFINITY], 0.0),
+        };
+        let turns = 2.0 * std::f64::consts::PI;
+        (actuator.low, actuator.high) = (low.max(-turns) - reach, high.min(turns) + reach);
+    }
+    actuators
+}
+
 /// Physics steps in a control period, by the robot file's own step.
 fn sub_steps(task: &Task, model: &Model) -> Result<usize, Mistake> {
     let (t, sim_dt) = (&task.time, model.sim_dt());
@@ -180,7 +270,20 @@ fn all_names(model: &Model) -> Vec<String> {
     if model.joints().iter().all(|j| matches!(j.kind, JointKind::Slide | JointKind::Hinge)) {
         return joint_names(model, 0);
     }
-    Names::new(model, Place::Observation).states()
+    Names::new(model, Own::default(), Place::Observation).states()
+}
+
+impl User {
+    /// Measures the present state, where noise or a delay lies before it.
+    fn measure(&mut self, sim: &Sim) {
+        let (course, dt, observation) = (&self.course, self.dt, &self.observation);
+        let Some(measured) = &mut self.measured else { return };
+        measured.measure(sim, &mut self.noise, course.level, |q, v, obs| {
+            let seen = Seen { sim, q, v, dt, course: Some(course) };
+            obs.clear();
+            obs.extend(observation.iter().map(|e| e.value(|quantity| seen.read(quantity))));
+        });
+    }
 }
 
 impl Rules for User {
@@ -191,13 +294,30 @@ impl Rules for User {
         qpos: &mut [f64],
         qvel: &mut [f64],
     ) -> Result<(), MjError> {
+        self.course.end(self.notes.sums(), self.max_episode_steps);
         for entry in &self.start {
-            let (uniform, normal) = (rng.random_range(-1.0..1.0), StandardNormal.sample(rng));
-            let value = entry.value.value(|q| if q == Quantity::Uniform { uniform } else { normal });
+            let value = commands::drawn(&entry.value, rng, self.course.level);
             let to = if entry.velocity { &mut qvel[entry.index] } else { &mut qpos[entry.index] };
             *to = if entry.replace { value } else { *to + value };
         }
+        self.course.draw(rng);
         Ok(())
+    }
+
+    fn prepare(&mut self, sim: &mut Sim) -> Result<(), MjError> {
+        self.course.prepare(sim)
+    }
+
+    fn began(&mut self, sim: &Sim) {
+        self.course.begin();
+        self.noise = self.course.noise();
+        let level = self.course.level;
+        if let Some(measured) = &mut self.measured {
+            measured.begin(self.course.rng(), level);
+        }
+        let delay = self.measured.as_ref().map(Measured::delay);
+        self.notes.begin(self.course.random.as_ref().map_or(&[], Random::notes), delay, level);
+        self.measure(sim);
     }
 
     fn begin(&mut self, sim: &Sim) {
@@ -205,12 +325,15 @@ impl Rules for User {
     }
 
     fn actuate(&self, _: &Spec, sim: &mut Sim, action: &[f64]) {
+        let action = self.measured.as_ref().map_or(action, |measured| measured.arriving(action));
         if self.drives.is_empty() {
             return sim.ctrl_mut().copy_from_slice(action);
         }
-        for (drive, action) in self.drives.iter().zip(action) {
+        let strength = self.course.random.as_ref().map(|random| &random.strength);
+        for (i, (drive, action)) in self.drives.iter().zip(action).enumerate() {
             let (q, v) = (sim.qpos()[drive.idx_q], sim.qvel()[drive.idx_v]);
-            sim.force_mut()[drive.idx_v] = drive.motor.torque(*action, q, v);
+            let strength = strength.map_or(1.0, |strength| strength[i]);
+            sim.force_mut()[drive.idx_v] = strength * drive.motor.torque(*action, q, v);
         }
     }
 
@@ -223,15 +346,82 @@ impl Rules for User {
         sim.update_kinematics()
     }
 
-    fn score(&self, spec: &Spec, sim: &Sim, _: f64, action: &[f64]) -> (f64, bool) {
-        let outcome = Outcome { sim, before: &self.before, action, dt: spec.dt };
-        let reward = self.reward.iter().map(|e| e.value(|q| outcome.read(q))).sum();
-        (reward, self.termination.iter().any(|e| e.holds(|q| outcome.read(q))))
+    fn follow(&mut self, sim: &Sim, action: &[f64]) {
+        self.course.follow(sim, action);
+        if let Some(measured) = &mut self.measured {
+            measured.ask(action);
+        }
+    }
+
+    fn advance(&mut self, sim: &mut Sim) {
+        self.course.advance(sim);
+        self.measure(sim);
+    }
+
+    fn score(&mut self, spec: &Spec, sim: &Sim, _: f64, action: &[f64]) -> (f64, bool) {
+        let (before, course) = (&self.before, Some(&self.course));
+        let outcome = Outcome { sim, before, action, dt: spec.dt, course };
+        let mut reward = 0.0;
+        for (i, term) in self.reward.iter().enumerate() {
+            let value = term.weight * term.of.value(|q| outcome.read(q));
+            self.notes.add(i, value);
+            reward += value;
+        }
+        self.notes.measure(self.course.ticks(), |q| outcome.read(q));
+        (reward, self.termination.iter().any(|term| term.of.holds(|q| outcome.read(q))))
     }
 
     fn observe(&self, sim: &Sim, obs: &mut [f64]) {
-        for (o, e) in obs.iter_mut().zip(&self.observation) {
-            *o = e.value(|q| read_state(sim, self.dt, q));
+        if let Some(reading) = self.measured.as_ref().and_then(Measured::reading) {
+            return obs.copy_from_slice(&reading.obs);
         }
+        let seen = Seen { sim, q: sim.qpos(), v: sim.qvel(), dt: self.dt, course: Some(&self.course) };
+        for (o, e) in obs.iter_mut().zip(&self.observation) {
+            *o = e.value(|q| seen.read(q));
+        }
+    }
+
+    fn goal(&self) -> &[f64] {
+        self.course.commands.values()
+    }
+
+    fn goal_mut(&mut self) -> &mut [f64] {
+        self.course.commands.values_mut()
+    }
+
+    fn goal_in_observation(&self) -> std::ops::Range<usize> {
+        self.seen_commands.clone()
+    }
+
+    fn circumstances(&self) -> Vec<f64> {
+        self.course.circumstances()
+    }
+
+    fn set_circumstances(&mut self, circumstances: &[f64]) {
+        self.course.set_circumstances(circumstances);
+    }
+
+    fn start_curriculum(&mut self) {
+        self.course.start_curriculum();
+    }
+
+    fn privileged(&self, sim: &Sim, to: &mut [f64]) {
+        let seen = Seen { sim, q: sim.qpos(), v: sim.qvel(), dt: self.dt, course: Some(&self.course) };
+        for (to, e) in to.iter_mut().zip(&self.privileged) {
+            *to = e.value(|q| seen.read(q));
+        }
+    }
+
+    fn measured(&self) -> Option<(&[f64], &[f64])> {
+        let reading = self.measured.as_ref().and_then(Measured::reading)?;
+        Some((&reading.q, &reading.v))
+    }
+
+    fn changes_robot(&self) -> bool {
+        self.course.random.is_some()
+    }
+
+    fn notes(&self) -> &[f64] {
+        self.notes.values()
     }
 }

@@ -46,7 +46,7 @@ impl Rules for Walker2d {
         sim.qpos()[0]
     }
 
-    fn score(&self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool) {
+    fn score(&mut self, spec: &Spec, sim: &Sim, before: f64, action: &[f64]) -> (f64, bool) {
         let healthy = healthy(sim);
         let speed = planar::speed(spec, before, sim.qpos()[0]);
         (speed + f64::from(u8::from(healthy)) - CONTROL_COST * squared(action), !healthy)

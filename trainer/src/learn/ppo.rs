@@ -104,8 +104,10 @@ struct Nets {
 }
 
 impl Nets {
-    fn idm_error(&self, params: &Params, batch: &Batch, threads: usize) -> f64 {
-        self.inverse.error(&params.groups[INVERSE].p, batch, &self.dims, threads)
+    /// `None` where no inverse model learns beside the policy.
+    fn idm_error(&self, params: &Params, batch: &Batch, threads: usize) -> Option<f64> {
+        let learns = !self.dims.seen_obs.is_empty();
+        learns.then(|| self.inverse.error(&params.groups[INVERSE].p, batch, &self.dims, threads))
     }
 }
 
@@ -183,10 +185,11 @@ impl Learner for Ppo {
 
     fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
         let before = self.nets.idm_error(&self.params, batch, self.threads);
-        let mut metrics = self.passes(batch, pace, rng, &[ACTOR, VALUE, INVERSE]);
+        let phases: &[usize] = if before.is_some() { &[ACTOR, VALUE, INVERSE] } else { &[ACTOR, VALUE] };
+        let mut metrics = self.passes(batch, pace, rng, phases);
         let after = self.nets.idm_error(&self.params, batch, self.threads);
         let actions = super::variance(&batch.action, self.nets.dims.n_act);
-        metrics.extend(super::idm_metrics(Some(before), Some(after), true, actions));
+        metrics.extend(super::idm_metrics(before, after, true, actions));
         metrics
     }
 }

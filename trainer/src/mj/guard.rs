@@ -18,6 +18,7 @@ type Handler = unsafe extern "C-unwind" fn(*const MjLogMessage);
 
 unsafe extern "C-unwind" {
     pub(super) fn mj_copyData(to: *mut mjData, m: *const mjModel, from: *const mjData) -> *mut mjData;
+    pub(super) fn mj_setConst(m: *mut mjModel, d: *mut mjData);
     pub(super) fn mj_resetData(m: *const mjModel, d: *mut mjData);
     pub(super) fn mj_forward(m: *const mjModel, d: *mut mjData);
     pub(super) fn mj_inverse(m: *const mjModel, d: *mut mjData);

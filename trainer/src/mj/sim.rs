@@ -185,6 +185,11 @@ impl Sim {
         self.state.qvel()
     }
 
+    /// Velocity (nv) to be changed between two steps: a push.
+    pub fn qvel_mut(&mut self) -> &mut [f64] {
+        self.state.qvel_mut()
+    }
+
     /// Acceleration (nv) of the last evaluation.
     pub fn acceleration(&self) -> &[f64] {
         self.state.qacc()
@@ -216,6 +221,25 @@ impl Sim {
         let (actuators, applied) = (self.state.qfrc_actuator(), self.state.qfrc_applied());
         for (i, f) in force.iter_mut().enumerate() {
             *f = actuators[i] + applied[i];
+        }
+    }
+
+    /// What drove one degree of freedom in the last physics step: the entry of [`Sim::applied_force`].
+    pub fn applied_force_of(&self, dof: usize) -> f64 {
+        self.state.qfrc_actuator()[dof] + self.state.qfrc_applied()[dof]
+    }
+
+    /// Writes the sum of the normal forces of each body's contacts \[N\] (n_bodies), as of the last evaluation.
+    pub fn contact_loads(&self, load: &mut [f64]) {
+        load.fill(0.0);
+        let body_of = self.model.0.geom_bodyid();
+        for (i, contact) in self.state.contact().iter().enumerate() {
+            let normal = self.state.contact_force(i)[0];
+            for geom in contact.geom {
+                if let Some(body) = usize::try_from(geom).ok().and_then(|geom| body_of.get(geom)) {
+                    load[*body as usize] += normal;
+                }
+            }
         }
     }
 
@@ -252,6 +276,11 @@ impl Sim {
     /// Spring and damper forces (nv) of the last evaluation.
     pub fn passive(&self) -> &[f64] {
         self.state.qfrc_passive()
+    }
+
+    /// [`Sim::call`] with a robot to be changed, which must be this simulation's own.
+    pub(super) fn call_with_model(&mut self, run: impl Fn(*mut mjModel, *mut mjData)) -> Result<(), MjError> {
+        self.call(|m, d| run(m.cast_mut(), d))
     }
 
     /// Runs MuJoCo on this simulation; after a fatal error the state is reset, because it was left half computed.

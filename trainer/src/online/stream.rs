@@ -58,6 +58,8 @@ pub struct Stream {
     state: State,
     noise: Noise,
     out: Output,
+    /// What the policy sees at the end of a period, before the normaliser (n_seen).
+    seen: Vec<f64>,
     known: VecDeque<(u64, Networks)>,
     /// Version of the controller's networks.
     acting: Option<u64>,
@@ -94,6 +96,7 @@ impl Stream {
             state: controller.state(),
             noise: controller.noise(),
             out: controller.output(),
+            seen: vec![0.0; controller.n_seen()],
             known: VecDeque::new(),
             acting: None,
             wanted: 0,
@@ -154,9 +157,10 @@ impl Stream {
             self.episode = Episode { whole: true, ..Episode::default() };
             return Ok(());
         }
+        self.state.q.copy_from_slice(next.q());
+        self.state.v.copy_from_slice(next.v());
+        self.state.obs.copy_from_slice(next.obs());
         if self.counted {
-            self.state.q.copy_from_slice(next.q());
-            self.state.v.copy_from_slice(next.v());
             let tally = &mut self.rows.collected.tally;
             tally.reached_violations += u64::from(self.controller.excess(&self.state) != [None; 2]);
             tally.residual += self.controller.residual(next.obs(), &self.out);
@@ -174,10 +178,12 @@ impl Stream {
             if last.policy_version == self.wanted && whole && !self.sums.spoiled {
                 let Sums { before, reward, moved, .. } = &self.sums;
                 let (reward, moved) = (*reward, *moved);
+                self.controller.peek(&self.state, &mut self.seen);
                 let period = Period {
                     out: &self.out,
                     before,
                     after: next.obs(),
+                    seen: &self.seen,
                     reward,
                     moved,
                     terminated,

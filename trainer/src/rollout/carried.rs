@@ -19,6 +19,7 @@ impl Collected {
         push(numbers, s.final_x.iter().flat_map(|(_, x)| x).map(|&x| f64::from(x)));
         push(numbers, t.episodes.iter().flat_map(|&(total, length)| [total, length as f64]));
         push(numbers, t.costs.iter().copied());
+        push(numbers, t.notes.iter().copied());
         push(numbers, t.ledger().into_iter());
         for stats in [&self.obs_stats, &self.change_stats, &self.return_stats] {
             push(numbers, stats.to_vec().into_iter());
@@ -44,10 +45,11 @@ impl Collected {
         for (&t, x) in cuts.iter().zip(final_x) {
             s.final_x.push((t as usize, x.iter().map(|&x| x as f32).collect()));
         }
-        let (episodes, costs) = (pull(from)?.as_chunks::<2>().0, pull(from)?);
+        let (episodes, costs, notes) = (pull(from)?.as_chunks::<2>().0, pull(from)?, pull(from)?);
         let tally = Tally {
             episodes: episodes.iter().map(|&[total, length]| (total, length as usize)).collect(),
             costs: costs.to_vec(),
+            notes: notes.to_vec(),
             ..Tally::of_ledger(pull(from)?.try_into().ok()?)
         };
         let mut stats = |n: usize| {

@@ -13,6 +13,7 @@ pub(super) struct Episode {
     qpos: Vec<f64>,
     qvel: Vec<f64>,
     goal: Vec<f64>,
+    circumstances: Vec<f64>,
     /// Every action so far (ticks x n_act).
     actions: Vec<f64>,
 }
@@ -27,6 +28,7 @@ impl Episode {
         set(&mut self.qpos, env.qpos());
         set(&mut self.qvel, env.qvel());
         set(&mut self.goal, env.goal());
+        self.circumstances = env.circumstances();
         self.actions.clear();
     }
 
@@ -48,6 +50,7 @@ impl Worker {
         put("qpos", e.qpos.clone());
         put("qvel", e.qvel.clone());
         put("goal", e.goal.clone());
+        put("circumstances", e.circumstances.clone());
         put("actions", e.actions.clone());
         put("sums", vec![self.episode.0, self.rows.discounted, self.cost]);
         put("obs", self.state.obs.clone());
@@ -71,6 +74,7 @@ impl Worker {
             qpos: take("qpos", Some(spec.nq))?,
             qvel: take("qvel", Some(spec.nv))?,
             goal: take("goal", Some(self.env.goal().len()))?,
+            circumstances: take("circumstances", Some(self.env.circumstances().len()))?,
             actions: take("actions", ticks.checked_mul(n_act))?,
         };
         let (sums, obs) = (take("sums", Some(3))?, take("obs", Some(self.state.obs.len()))?);
@@ -81,6 +85,7 @@ impl Worker {
         let changed =
             || format!("environment {i} does not repeat its episode: task, robot or MuJoCo changed");
         let e = &self.history;
+        self.env.set_circumstances(&e.circumstances);
         if !e.goal.is_empty() {
             self.env.set_goal(&e.goal).map_err(|e| e.to_string())?;
         }

@@ -28,6 +28,8 @@ pub struct Period<'a> {
     pub before: &'a [f64],
     /// Observation at its end (n_obs).
     pub after: &'a [f64],
+    /// What the policy sees of its end, before the normaliser (n_seen).
+    pub seen: &'a [f64],
     /// The task's reward.
     pub reward: f64,
     /// Distance the projection moved the targets.
@@ -43,13 +45,13 @@ impl Rows {
     pub fn new(controller: &Controller, gamma: f64, moved_penalty: f64) -> Self {
         let layout = controller.layout();
         Self {
-            collected: Collected::new(layout.n_obs(), layout.n_state()),
+            collected: Collected::new(controller.n_seen(), layout.n_state()),
             state: layout.state().to_vec(),
             gamma,
             moved_penalty,
             discounted: 0.0,
             change: vec![0.0; layout.n_state()],
-            after: vec![0.0; layout.n_obs()],
+            after: vec![0.0; controller.n_seen()],
         }
     }
 
@@ -76,8 +78,8 @@ impl Rows {
             *change = p.after[i] - p.before[i];
         }
         let change = (&self.change[..], &normaliser.scale[..]);
-        self.collected.push(p.out, change, p.after, (reward, self.discounted), (p.terminated, false));
-        normaliser.observation(p.after, &mut self.after);
+        self.collected.push(p.out, change, p.seen, (reward, self.discounted), (p.terminated, false));
+        normaliser.observation(p.seen, &mut self.after);
         if p.truncated && !p.terminated {
             self.cut();
         }

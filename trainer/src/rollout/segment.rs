@@ -82,6 +82,8 @@ pub struct Tally {
     pub episodes: Vec<(f64, usize)>,
     /// Cost of each finished episode.
     pub costs: Vec<f64>,
+    /// What the environment told of the finished episodes, summed ([`Env::notes`](crate::env::Env::notes)).
+    pub notes: Vec<f64>,
     /// Control ticks.
     pub ticks: u64,
     /// Ticks whose raw proposal broke a constraint.
@@ -142,6 +144,7 @@ impl Tally {
         Self {
             episodes: Vec::new(),
             costs: Vec::new(),
+            notes: Vec::new(),
             ticks,
             raw_violations,
             recovering,
@@ -156,9 +159,16 @@ impl Tally {
         }
     }
 
+    /// Adds what the environment tells of an episode that ended.
+    pub(crate) fn note(&mut self, notes: &[f64]) {
+        self.notes.resize(self.notes.len().max(notes.len()), 0.0);
+        self.notes.iter_mut().zip(notes).for_each(|(sum, note)| *sum += note);
+    }
+
     pub(crate) fn add(&mut self, other: &Self) {
         self.episodes.extend_from_slice(&other.episodes);
         self.costs.extend_from_slice(&other.costs);
+        self.note(&other.notes);
         self.ticks += other.ticks;
         self.raw_violations += other.raw_violations;
         self.recovering += other.recovering;
@@ -200,7 +210,7 @@ impl Collected {
         }
     }
 
-    /// Adds a policy step that led to the observation `after` by the change of state `change`; `discounted` is the return so far,
+    /// Adds a policy step that led to what the policy sees as `after` by the change of state `change`; `discounted` is the return so far,
     /// `truncated` that nothing follows in this stretch.
     pub(super) fn push(
         &mut self,

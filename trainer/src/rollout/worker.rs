@@ -31,6 +31,8 @@ pub struct Worker {
     pub(super) state: State,
     /// Observation at the begin of this policy step.
     before: Vec<f64>,
+    /// What the policy sees at its end, before the normaliser.
+    seen: Vec<f64>,
     noise: Noise,
     out: Output,
     /// Distance the projection moved the targets of this policy step.
@@ -75,6 +77,7 @@ impl Worker {
             learned: snapshot.manifest.task.idm.kind == IdmKind::Learned,
             state: controller.state(),
             before: vec![0.0; controller.layout().n_obs()],
+            seen: vec![0.0; controller.n_seen()],
             noise: controller.noise(),
             out: controller.output(),
             rows: Rows::new(&controller, gamma, 0.0),
@@ -164,18 +167,22 @@ impl Worker {
         for _ in 0..n.min(self.left) {
             self.left -= 1;
             if self.episode.1 == 0 {
-                self.rows.collected.obs_stats.push(&self.state.obs);
+                self.controller.peek(&self.state, &mut self.seen);
+                self.rows.collected.obs_stats.push(&self.seen);
             }
             self.draw(true);
             let (reward, terminated) = self.policy_step();
             let truncated = self.ticks >= self.env.spec().max_episode_steps;
-            let (before, after, moved) = (&self.before[..], &self.state.obs[..], self.moved);
-            let period = Period { out: &self.out, before, after, reward, moved, terminated, truncated };
+            self.controller.peek(&self.state, &mut self.seen);
+            let (before, after, seen, moved) =
+                (&self.before[..], &self.state.obs[..], &self.seen[..], self.moved);
+            let period = Period { out: &self.out, before, after, seen, reward, moved, terminated, truncated };
             self.rows.push(&period, self.controller.normaliser());
             if terminated || truncated {
                 if !self.from_frame {
                     self.rows.collected.tally.episodes.push(self.episode);
                     self.rows.collected.tally.costs.push(self.cost);
+                    self.rows.collected.tally.note(self.env.notes());
                 }
                 self.restart()?;
             } else if self.left == 0 {
@@ -197,6 +204,7 @@ impl Worker {
             if terminated || self.ticks >= self.env.spec().max_episode_steps {
                 let episode = self.episode;
                 self.rows.collected.tally.costs.push(self.cost);
+                self.rows.collected.tally.note(self.env.notes());
                 self.restart()?;
                 return Ok(episode);
             }

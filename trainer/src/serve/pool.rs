@@ -173,7 +173,9 @@ fn portion(
     let mut worker = match worker {
         Some(worker) => worker,
         None => {
-            let (env, rng) = (env.another().map_err(|e| e.to_string())?, stream(start.seed, start.stream));
+            let (mut env, rng) =
+                (env.another().map_err(|e| e.to_string())?, stream(start.seed, start.stream));
+            env.start_curriculum();
             let mut worker = Worker::new(env, snapshot, start.gamma, rng).map_err(|e| e.to_string())?;
             worker.set_projection(start.projection);
             worker.set_moved_penalty(start.moved_penalty);

@@ -83,6 +83,13 @@ impl Training {
             },
             other => p.metrics.iter().find(|(n, _)| *n == other).map_or(f64::NAN, |(_, v)| *v),
         };
-        COLUMNS.iter().map(|c| value(c)).collect()
+        let episodes = t.episodes.len() as f64;
+        let notes = (0..self.notes.len()).map(|i| t.notes.get(i).map_or(f64::NAN, |sum| sum / episodes));
+        COLUMNS.iter().map(|c| value(c)).chain(notes).collect()
+    }
+
+    /// Columns of this training's `metrics.csv`: [`COLUMNS`], and what its environment tells of its episodes.
+    pub fn columns(&self) -> Vec<&str> {
+        COLUMNS.iter().copied().chain(self.notes.iter().map(String::as_str)).collect()
     }
 }

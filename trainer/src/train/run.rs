@@ -1,6 +1,6 @@
 //! A training in its run folder: rows of metrics, checkpoints on the way, the snapshot at the end.
 
-use super::{COLUMNS, Experience, Progress, Request, TrainError, Training};
+use super::{Experience, Progress, Request, TrainError, Training};
 use crate::checkpoint::{self, Checkpoint};
 use crate::run_folder::{self, RunFolder};
 use std::path::{Path, PathBuf};
@@ -28,7 +28,7 @@ pub fn train_on(
     report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
     let training = Training::on(request, experience)?;
-    let folder = RunFolder::create(out, &training.snapshot().manifest, request.seed, COLUMNS)?;
+    let folder = RunFolder::create(out, &training.snapshot().manifest, request.seed, &training.columns())?;
     run(training, folder, report)
 }
 
@@ -73,7 +73,7 @@ pub fn resume_on(
     if training.is_done() && last.is_file() {
         return Ok(last);
     }
-    let folder = RunFolder::reopen(path, held, COLUMNS, manifest.steps, manifest.version)?;
+    let folder = RunFolder::reopen(path, held, &training.columns(), manifest.steps, manifest.version)?;
     run(training, folder, report)
 }
 

@@ -1,15 +1,16 @@
 //! From a manifest and its settings to what is trained.
 
 use super::{Experience, TrainError};
-use crate::env::Env;
+use crate::env::{Env, Spec};
 use crate::learn::{
     Algorithm, Bc, Dapg, Dims, Gradient, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Pid2Il, Ppo, Soil,
 };
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
 use nearl_runtime::constraints::{Consistency, Drive, Guard};
-use nearl_runtime::controller::Parts;
+use nearl_runtime::controller::{Parts, seen_entries};
 use nearl_runtime::motors::Motors;
+use nearl_runtime::recipe::Observer;
 use nearl_runtime::task::{IdmKind, Task};
 use nearl_runtime::{Manifest, PolicyKind};
 use rand_chacha::ChaCha8Rng;
@@ -49,6 +50,25 @@ pub(super) fn learner(
     }
 }
 
+/// Sizes of the networks. A policy with a recipe sees what that computes, in which an inverse model would not find the state.
+pub(super) fn dims(manifest: &Manifest, parts: &Parts) -> Result<Dims, TrainError> {
+    let (layout, policy) = (&parts.layout, manifest.task.policy.as_ref());
+    let unusable = |reason| TrainError::Settings(format!("[policy] of '{}': {reason}", manifest.task.name));
+    let observer = policy.map(|policy| Observer::new(policy, &parts.model, layout)).transpose();
+    let observer = observer.map_err(unusable)?.flatten();
+    let seen = match observer {
+        Some(_) => Vec::new(),
+        None => seen_entries(manifest, layout).map_err(RolloutError::from)?,
+    };
+    Ok(Dims {
+        n_obs: observer.map_or(layout.n_obs(), |observer| observer.len()),
+        n_state: layout.n_state(),
+        n_act: manifest.action_lower.len(),
+        seen_obs: seen.iter().map(|&k| layout.state()[k]).collect(),
+        seen_state: seen,
+    })
+}
+
 pub(super) fn policy_kind(
     algo: Algorithm,
     settings: &TrainSettings,
@@ -77,11 +97,11 @@ pub(super) fn policy_kind(
     }
 }
 
-/// Fills what the environment knows: observation names and the actuators' range.
+/// Fills what the environment knows: observation names and the actuators' range. Returns the environment's constants.
 ///
 /// # Errors
 /// [`TrainError::Rollout`] when there is no such environment.
-pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
+pub fn complete(manifest: &mut Manifest) -> Result<Spec, TrainError> {
     let env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
     let spec = env.spec();
     if manifest.task.state.observation.is_empty() {
@@ -93,7 +113,7 @@ pub fn complete(manifest: &mut Manifest) -> Result<(), TrainError> {
     if manifest.task.idm.kind == IdmKind::Pinocchio || guards {
         check_motors(manifest, env.as_ref())?;
     }
-    Ok(())
+    Ok(spec.clone())
 }
 
 /// Analytic inverse dynamics, and a guard, give one command a controllable joint: the actuators have to be these joints' motors or drives.

@@ -42,6 +42,19 @@ impl Foreign {
         }
     }
 
+    /// Writes what the policy would see in `state` at `time` [s] since the reset, before the normaliser (n_seen).
+    pub(super) fn peek(&self, state: &State, time: f64, to: &mut [f64]) {
+        match &self.observer {
+            Some(observer) => observer.peek(state, time, to),
+            None => to.copy_from_slice(&state.obs),
+        }
+    }
+
+    /// Whether outputs become commands: exploration is then in the outputs.
+    pub(super) fn has_map(&self) -> bool {
+        self.map.is_some()
+    }
+
     /// Turns the outputs of a policy of actions (n_act) into commands.
     pub(super) fn command(&mut self, outputs: &mut [f32]) {
         let Some(map) = &mut self.map else { return };
@@ -62,5 +75,27 @@ impl Foreign {
     /// Whether a tick depends on the ones before.
     pub(super) fn remembers(&self) -> bool {
         self.observer.is_some()
+    }
+
+    /// Appends what the next policy tick depends on; `ticks` were since the reset.
+    pub(super) fn write_memory(&self, ticks: usize, memory: &mut Vec<f64>) {
+        if let Some(observer) = &self.observer {
+            memory.push(ticks as f64);
+            observer.write_memory(memory);
+        }
+    }
+
+    /// Takes what [`Foreign::write_memory`] gave; returns the ticks since the reset.
+    pub(super) fn set_memory(&mut self, memory: &[f64]) -> usize {
+        let (Some(observer), Some((ticks, rest))) = (&mut self.observer, memory.split_first()) else {
+            return 0;
+        };
+        observer.set_memory(rest);
+        *ticks as usize
+    }
+
+    /// Entries of its memory.
+    pub(super) fn memory_len(&self) -> usize {
+        self.observer.as_ref().map_or(0, |observer| 1 + observer.memory_len())
     }
 }

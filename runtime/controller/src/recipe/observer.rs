@@ -71,8 +71,23 @@ impl Observer {
 
     /// The observation at `time` [s] since the reset; to be called once in each policy tick.
     pub fn observe(&mut self, state: &State, time: f64) -> &[f64] {
+        let mut observation = std::mem::take(&mut self.observation);
+        self.shift_in(state, time, &mut observation);
+        self.observation = observation;
+        self.is_fresh = false;
+        &self.observation
+    }
+
+    /// Writes what [`Observer::observe`] would give in `state` to `to` (len), and remembers nothing of it.
+    pub fn peek(&self, state: &State, time: f64, to: &mut [f64]) {
+        to.copy_from_slice(&self.observation);
+        self.shift_in(state, time, to);
+    }
+
+    /// Replaces the oldest values of each term by those of `state`.
+    fn shift_in(&self, state: &State, time: f64, observation: &mut [f64]) {
         for part in &self.parts {
-            let all = &mut self.observation[part.at.clone()];
+            let all = &mut observation[part.at.clone()];
             all.copy_within(part.width.., 0);
             let start = all.len() - part.width;
             let (before, now) = all.split_at_mut(start);
@@ -84,8 +99,6 @@ impl Observer {
                 before.chunks_exact_mut(part.width.max(1)).for_each(|old| old.copy_from_slice(now));
             }
         }
-        self.is_fresh = false;
-        &self.observation
     }
 
     /// What the policy gave for it.
@@ -97,5 +110,29 @@ impl Observer {
     pub fn reset(&mut self) {
         self.last.fill(0.0);
         self.is_fresh = true;
+    }
+
+    /// Appends what the next policy tick depends on beside its arguments: the terms of the ticks before and the last outputs.
+    pub fn write_memory(&self, memory: &mut Vec<f64>) {
+        memory.push(f64::from(u8::from(self.is_fresh)));
+        memory.extend_from_slice(&self.observation);
+        memory.extend(self.last.iter().map(|&x| f64::from(x)));
+    }
+
+    /// Takes what [`Observer::write_memory`] gave.
+    ///
+    /// # Panics
+    /// When it has another length than [`Observer::memory_len`].
+    pub fn set_memory(&mut self, memory: &[f64]) {
+        let (observation, last) = memory[1..].split_at(self.observation.len());
+        self.is_fresh = memory[0] != 0.0;
+        self.observation.copy_from_slice(observation);
+        assert_eq!(last.len(), self.last.len(), "the memory of another policy");
+        self.last.iter_mut().zip(last).for_each(|(x, &value)| *x = value as f32);
+    }
+
+    /// Entries of its memory.
+    pub fn memory_len(&self) -> usize {
+        1 + self.observation.len() + self.last.len()
     }
 }

@@ -2,8 +2,8 @@
 
 use rand_chacha::ChaCha8Rng;
 
-use super::expression::Expression;
-use super::quantity::{Before, Outcome, Quantity};
+use super::quantity::{Before, Outcome};
+use super::settings::Term;
 use crate::env::{Counters, Env, EnvError, Fault, Moment, Spec, Step};
 use crate::mj::{MjError, ModelFormat, Sim};
 
@@ -11,12 +11,12 @@ use crate::mj::{MjError, ModelFormat, Sim};
 pub(super) struct Costed {
     inner: Box<dyn Env>,
     spec: Spec,
-    cost: Vec<Expression<Quantity>>,
+    cost: Vec<Term>,
     before: Before,
 }
 
 impl Costed {
-    pub(super) fn new(inner: Box<dyn Env>, name: String, cost: Vec<Expression<Quantity>>) -> Costed {
+    pub(super) fn new(inner: Box<dyn Env>, name: String, cost: Vec<Term>) -> Costed {
         let before = Before::new(inner.sim().model());
         Costed { spec: Spec { name, has_cost: true, ..inner.spec().clone() }, before, inner, cost }
     }
@@ -24,8 +24,9 @@ impl Costed {
 
 impl Costed {
     fn with_cost(&self, step: Step, action: &[f64]) -> Step {
-        let outcome = Outcome { sim: self.inner.sim(), before: &self.before, action, dt: self.spec.dt };
-        let cost = self.cost.iter().map(|e| e.value(|q| outcome.read(q))).sum();
+        let outcome =
+            Outcome { sim: self.inner.sim(), before: &self.before, action, dt: self.spec.dt, course: None };
+        let cost = self.cost.iter().map(|t| t.weight * t.of.value(|q| outcome.read(q))).sum();
         Step { cost, ..step }
     }
 }
@@ -82,6 +83,26 @@ impl Env for Costed {
 
     fn set_goal(&mut self, goal: &[f64]) -> Result<(), EnvError> {
         self.inner.set_goal(goal)
+    }
+
+    fn circumstances(&self) -> Vec<f64> {
+        self.inner.circumstances()
+    }
+
+    fn set_circumstances(&mut self, circumstances: &[f64]) {
+        self.inner.set_circumstances(circumstances);
+    }
+
+    fn start_curriculum(&mut self) {
+        self.inner.start_curriculum();
+    }
+
+    fn privileged(&self, to: &mut [f64]) {
+        self.inner.privileged(to);
+    }
+
+    fn notes(&self) -> &[f64] {
+        self.inner.notes()
     }
 
     fn counters(&self) -> Counters {

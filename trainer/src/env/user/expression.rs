@@ -55,6 +55,11 @@ impl<Q: Copy> Expression<Q> {
         }
     }
 
+    /// The quantities it names.
+    pub(super) fn quantities(&self) -> impl Iterator<Item = Q> {
+        self.0.iter().filter_map(|op| if let Op::Load(quantity) = op { Some(*quantity) } else { None })
+    }
+
     /// The value where `read` gives each quantity its own.
     pub(super) fn value(&self, read: impl Fn(Q) -> f64) -> f64 {
         let (mut stack, mut top) = ([0.0; DEPTH], 0);

@@ -1,10 +1,11 @@
 //! What a name in an expression stands for.
 
-use crate::mj::{JointKind, Model, Sim};
+use crate::mj::{Actuator, Joint, JointKind, Model, Sim};
 
+use super::course::Course;
 use super::expression::Expression;
 
-/// Something measured in the simulation or chosen by the policy.
+/// Something measured in the simulation, drawn for the episode or chosen by the policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Quantity {
     /// `q.<joint>`: entry of `qpos` \[rad or m\].
@@ -17,17 +18,51 @@ pub(super) enum Quantity {
     Place(usize, usize),
     /// `vx.<body>`, `vy.`, `vz.`: change of it over the control period, per second \[m/s\].
     Speed(usize, usize),
+    /// `base.vx`, `base.vy`, `base.vz`: velocity of the free base in its own axes \[m/s\].
+    BaseLinear(usize),
+    /// `base.wx`, `base.wy`, `base.wz`: its angular velocity there \[rad/s\].
+    BaseAngular(usize),
+    /// `gravity.x`, `gravity.y`, `gravity.z`: unit vector of gravity in the base's axes.
+    Gravity(usize),
+    /// `load.<body>`: sum of the normal forces of a body's contacts \[N\].
+    Load(usize),
+    /// `contact.<body>`: 1 where that is not 0.
+    Contact(usize),
+    /// `air.<body>`: time since the body's last contact \[s\].
+    Air(usize),
+    /// `landed.<body>`: in the control period of its first contact the time that it was in the air before \[s\], else 0.
+    Landed(usize),
     /// `u.<actuator>`: entry of the action, as it was asked for.
     Action(usize),
     /// `u.squared`: sum of the squares of the action.
     Effort,
+    /// `du.squared`: sum of the squares of the action's change since the control period before.
+    ActionChange,
+    /// `torque.<actuator>`: force on its joint in the last physics step \[N·m or N\]; index of the degree of freedom.
+    Torque(usize),
+    /// `torque.squared`: sum of the squares of all.
+    TorqueSquared,
+    /// `power`: sum of the magnitudes of force times velocity over the actuators \[W\].
+    Power,
+    /// `dv.squared`: sum of the squares of the driven joints' mean accelerations over the control period \[rad²/s⁴ or m²/s⁴\].
+    Acceleration,
+    /// `command.<name>`: what the robot is asked to do.
+    Command(usize),
+    /// `torque.max`: largest magnitude of a force of an actuator \[N·m or N\].
+    TorqueMax,
+    /// `dtorque.max`: largest magnitude of its change since the control period before, per second \[N·m/s or N/s\].
+    TorqueRateMax,
+    /// `random.<what>`: mean of what was drawn for the robot of this episode.
+    Drawn(usize),
+    /// `level`: how far the curriculum has come, 0 to 1.
+    Level,
     /// Time since the episode began \[s\].
     Time,
     /// Control period \[s\].
     Period,
-    /// Uniform in \[-1, 1), one draw for each entry of a reset.
+    /// Uniform in \[-1, 1), one draw for each entry.
     Uniform,
-    /// Standard normal, one draw for each entry of a reset.
+    /// Standard normal, one draw for each entry.
     Normal,
 }
 
@@ -42,48 +77,113 @@ pub(super) enum Place {
     Start,
 }
 
+/// What an environment has beside MuJoCo's model.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Own<'a> {
+    /// Entries of the action.
+    pub(super) actuators: &'a [Actuator],
+    /// Names of the commands.
+    pub(super) commands: &'a [String],
+    /// Columns of what is drawn for the robot.
+    pub(super) drawn: &'a [String],
+    /// Contacts and forces are followed from step to step.
+    pub(super) follows: bool,
+}
+
 /// The names of a robot.
 pub(super) struct Names(Vec<(String, Quantity)>);
 
+const AXES: [&str; 3] = ["x", "y", "z"];
+
 impl Names {
-    pub(super) fn new(model: &Model, place: Place) -> Names {
-        let mut names = Vec::new();
-        let mut put = |name: String, quantity: Quantity| names.push((name, quantity));
+    pub(super) fn new(model: &Model, own: Own<'_>, place: Place) -> Names {
+        let mut names = Names(Vec::new());
         if place == Place::Start {
-            put("uniform".into(), Quantity::Uniform);
-            put("normal".into(), Quantity::Normal);
-            return Names(names);
+            names.put("uniform", Quantity::Uniform);
+            names.put("normal", Quantity::Normal);
+            names.put("level", Quantity::Level);
+            return names;
         }
         let outcome = place == Place::Outcome;
-        for joint in model.joints() {
+        names.put_joints(&model.joints(), own.follows, outcome);
+        names.put_bodies(model, own.follows, outcome);
+        if outcome {
+            names.put_actions(own);
+        }
+        for (i, name) in own.commands.iter().enumerate() {
+            names.put(format!("command.{name}"), Quantity::Command(i));
+        }
+        if own.follows {
+            names.put("level", Quantity::Level);
+            for (i, column) in own.drawn.iter().enumerate() {
+                names.put(column.replacen('/', ".", 1), Quantity::Drawn(i));
+            }
+        }
+        names.put("time", Quantity::Time);
+        names.put("dt", Quantity::Period);
+        names
+    }
+
+    fn put(&mut self, name: impl Into<String>, quantity: Quantity) {
+        self.0.push((name.into(), quantity));
+    }
+
+    fn put_joints(&mut self, joints: &[Joint], follows: bool, outcome: bool) {
+        for joint in joints {
             let (positions, velocities) = parts(joint.kind);
             for (k, part) in positions.iter().enumerate() {
-                put(format!("q.{}{part}", joint.name), Quantity::Position(joint.idx_q + k));
+                self.put(format!("q.{}{part}", joint.name), Quantity::Position(joint.idx_q + k));
                 if outcome {
-                    put(format!("dq.{}{part}", joint.name), Quantity::Change(joint.idx_q + k));
+                    self.put(format!("dq.{}{part}", joint.name), Quantity::Change(joint.idx_q + k));
                 }
             }
             for (k, part) in velocities.iter().enumerate() {
-                put(format!("v.{}{part}", joint.name), Quantity::Velocity(joint.idx_v + k));
+                self.put(format!("v.{}{part}", joint.name), Quantity::Velocity(joint.idx_v + k));
             }
         }
+        if follows && base(joints).is_some() {
+            for (axis, letter) in AXES.iter().enumerate() {
+                self.put(format!("base.v{letter}"), Quantity::BaseLinear(axis));
+                self.put(format!("base.w{letter}"), Quantity::BaseAngular(axis));
+                self.put(format!("gravity.{letter}"), Quantity::Gravity(axis));
+            }
+        }
+    }
+
+    fn put_bodies(&mut self, model: &Model, follows: bool, outcome: bool) {
         for body in 1..model.n_bodies() {
-            for (axis, letter) in ["x", "y", "z"].iter().enumerate() {
-                put(format!("{letter}.{}", model.body_name(body)), Quantity::Place(body, axis));
+            let name = model.body_name(body);
+            for (axis, letter) in AXES.iter().enumerate() {
+                self.put(format!("{letter}.{name}"), Quantity::Place(body, axis));
                 if outcome {
-                    put(format!("v{letter}.{}", model.body_name(body)), Quantity::Speed(body, axis));
+                    self.put(format!("v{letter}.{name}"), Quantity::Speed(body, axis));
                 }
             }
-        }
-        if outcome {
-            for (i, actuator) in model.actuators().iter().enumerate() {
-                put(format!("u.{}", actuator.name), Quantity::Action(i));
+            if follows {
+                self.put(format!("load.{name}"), Quantity::Load(body));
+                self.put(format!("contact.{name}"), Quantity::Contact(body));
+                self.put(format!("air.{name}"), Quantity::Air(body));
+                self.put(format!("landed.{name}"), Quantity::Landed(body));
             }
-            put("u.squared".into(), Quantity::Effort);
         }
-        put("time".into(), Quantity::Time);
-        put("dt".into(), Quantity::Period);
-        Names(names)
+    }
+
+    fn put_actions(&mut self, own: Own<'_>) {
+        for (i, actuator) in own.actuators.iter().enumerate() {
+            self.put(format!("u.{}", actuator.name), Quantity::Action(i));
+            if own.follows {
+                self.put(format!("torque.{}", actuator.name), Quantity::Torque(actuator.dof));
+            }
+        }
+        self.put("u.squared", Quantity::Effort);
+        if own.follows {
+            self.put("du.squared", Quantity::ActionChange);
+            self.put("torque.squared", Quantity::TorqueSquared);
+            self.put("torque.max", Quantity::TorqueMax);
+            self.put("dtorque.max", Quantity::TorqueRateMax);
+            self.put("dv.squared", Quantity::Acceleration);
+            self.put("power", Quantity::Power);
+        }
     }
 
     /// Names of all positions, then of all velocities.
@@ -119,8 +219,13 @@ impl Names {
     }
 }
 
+/// The joint by which the robot's base floats, if it does.
+pub(super) fn base(joints: &[Joint]) -> Option<&Joint> {
+    joints.iter().find(|joint| joint.kind == JointKind::Free)
+}
+
 /// Suffixes of a joint's positions and velocities in MuJoCo's convention.
-fn parts(kind: JointKind) -> (&'static [&'static str], &'static [&'static str]) {
+pub(super) fn parts(kind: JointKind) -> (&'static [&'static str], &'static [&'static str]) {
     match kind {
         JointKind::Slide | JointKind::Hinge => (&[""], &[""]),
         JointKind::Ball => (&[".qw", ".qx", ".qy", ".qz"], &[".wx", ".wy", ".wz"]),
@@ -134,16 +239,19 @@ fn parts(kind: JointKind) -> (&'static [&'static str], &'static [&'static str]) 
 #[derive(Debug, Clone, Default)]
 pub(super) struct Before {
     q: Vec<f64>,
+    v: Vec<f64>,
     x: Vec<[f64; 3]>,
 }
 
 impl Before {
     pub(super) fn new(model: &Model) -> Before {
-        Before { q: vec![0.0; model.nq()], x: vec![[0.0; 3]; model.n_bodies()] }
+        let (q, v) = (vec![0.0; model.nq()], vec![0.0; model.nv()]);
+        Before { q, v, x: vec![[0.0; 3]; model.n_bodies()] }
     }
 
     pub(super) fn remember(&mut self, sim: &Sim) {
         self.q.copy_from_slice(sim.qpos());
+        self.v.copy_from_slice(sim.qvel());
         self.x.copy_from_slice(sim.positions());
     }
 }
@@ -154,30 +262,76 @@ pub(super) struct Outcome<'a> {
     pub(super) before: &'a Before,
     pub(super) action: &'a [f64],
     pub(super) dt: f64,
+    /// What is followed from step to step; a cost beside another environment's reward has none.
+    pub(super) course: Option<&'a Course>,
 }
 
 impl Outcome<'_> {
     pub(super) fn read(&self, quantity: Quantity) -> f64 {
+        let (sim, before) = (self.sim, self.before);
         match quantity {
-            Quantity::Change(i) => self.sim.qpos()[i] - self.before.q[i],
-            Quantity::Speed(body, axis) => {
-                (self.sim.positions()[body][axis] - self.before.x[body][axis]) / self.dt
-            }
+            Quantity::Change(i) => sim.qpos()[i] - before.q[i],
+            Quantity::Speed(body, axis) => (sim.positions()[body][axis] - before.x[body][axis]) / self.dt,
             Quantity::Action(i) => self.action[i],
             Quantity::Effort => super::super::rules::squared(self.action),
-            state => read_state(self.sim, self.dt, state),
+            Quantity::ActionChange => self.course.map_or(0.0, |course| course.action_change),
+            Quantity::Torque(dof) => sim.applied_force_of(dof),
+            Quantity::TorqueSquared => self.sum_over_drives(|dof| sim.applied_force_of(dof).powi(2)),
+            Quantity::TorqueMax => self.course.map_or(0.0, |course| course.forces.largest),
+            Quantity::TorqueRateMax => self.course.map_or(0.0, |course| course.forces.fastest / self.dt),
+            Quantity::Power => {
+                self.sum_over_drives(|dof| (sim.applied_force_of(dof) * sim.qvel()[dof]).abs())
+            }
+            Quantity::Acceleration => {
+                self.sum_over_drives(|dof| ((sim.qvel()[dof] - before.v[dof]) / self.dt).powi(2))
+            }
+            state => Seen { sim, q: sim.qpos(), v: sim.qvel(), dt: self.dt, course: self.course }.read(state),
         }
+    }
+
+    fn sum_over_drives(&self, of: impl Fn(usize) -> f64) -> f64 {
+        self.course.map_or(0.0, |course| course.driven.iter().map(|&dof| of(dof)).sum())
     }
 }
 
 /// Reads what is known of a state alone; NaN for what is not.
-pub(super) fn read_state(sim: &Sim, dt: f64, quantity: Quantity) -> f64 {
-    match quantity {
-        Quantity::Position(i) => sim.qpos()[i],
-        Quantity::Velocity(i) => sim.qvel()[i],
-        Quantity::Place(body, axis) => sim.positions()[body][axis],
-        Quantity::Time => sim.time(),
-        Quantity::Period => dt,
-        _ => f64::NAN,
+pub(super) struct Seen<'a> {
+    pub(super) sim: &'a Sim,
+    /// Configuration (nq) and velocity (nv) in MuJoCo's convention, as they are or as they are measured.
+    pub(super) q: &'a [f64],
+    pub(super) v: &'a [f64],
+    pub(super) dt: f64,
+    pub(super) course: Option<&'a Course>,
+}
+
+impl Seen<'_> {
+    pub(super) fn read(&self, quantity: Quantity) -> f64 {
+        let Some(course) = self.course else { return self.read_state(quantity) };
+        match quantity {
+            Quantity::Load(body) => course.contacts.load[body],
+            Quantity::Contact(body) => f64::from(u8::from(course.contacts.load[body] > 0.0)),
+            Quantity::Air(body) => course.contacts.air[body],
+            Quantity::Landed(body) => course.contacts.landed[body],
+            Quantity::Command(i) => course.commands.values()[i],
+            Quantity::Level => course.level,
+            Quantity::Drawn(i) => course.random.as_ref().map_or(f64::NAN, |random| random.notes()[i]),
+            Quantity::BaseLinear(axis) => {
+                course.to_base(self.q, [0, 1, 2].map(|i| self.v[course.base.1 + i]))[axis]
+            }
+            Quantity::BaseAngular(axis) => self.v[course.base.1 + 3 + axis],
+            Quantity::Gravity(axis) => course.to_base(self.q, [0.0, 0.0, -1.0])[axis],
+            state => self.read_state(state),
+        }
+    }
+
+    fn read_state(&self, quantity: Quantity) -> f64 {
+        match quantity {
+            Quantity::Position(i) => self.q[i],
+            Quantity::Velocity(i) => self.v[i],
+            Quantity::Place(body, axis) => self.sim.positions()[body][axis],
+            Quantity::Time => self.sim.time(),
+            Quantity::Period => self.dt,
+            _ => f64::NAN,
+        }
     }
 }

@@ -6,12 +6,14 @@ use nearl_runtime::task::{Task, suggest};
 use serde::Deserialize;
 
 use super::expression::Expression;
-use super::quantity::{Names, Quantity};
+use super::quantity::{Names, Quantity, parts};
+use crate::mj::Joint;
+use crate::scene;
 
 /// A number or an expression.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(untagged)]
-enum Text {
+pub(super) enum Text {
     Number(f64),
     Expression(String),
 }
@@ -30,36 +32,64 @@ struct Reset {
     v: BTreeMap<String, Text>,
 }
 
-/// A mistake in a task file: the key, and a sentence.
-pub(super) struct Mistake {
-    pub(super) key: String,
-    pub(super) reason: String,
-}
+pub(super) use scene::Mistake;
 
 pub(super) fn mistake(key: impl Into<String>, reason: impl Into<String>) -> Mistake {
     Mistake { key: key.into(), reason: reason.into() }
 }
 
+/// A named expression and its weight.
+#[derive(Debug, Clone)]
+pub(super) struct Term {
+    pub(super) name: String,
+    pub(super) of: Expression<Quantity>,
+    pub(super) weight: f64,
+}
+
+/// `{ weight = 0.5, of = "..." }`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Weighted {
+    weight: f64,
+    of: String,
+}
+
 /// Named expressions of `[reward]`, `[cost]` or `[termination]`, in the order of their names.
-pub(super) fn terms(
-    section: &str,
-    table: &toml::Table,
-    names: &Names,
-) -> Result<Vec<Expression<Quantity>>, Mistake> {
+pub(super) fn terms(section: &str, table: &toml::Table, names: &Names) -> Result<Vec<Term>, Mistake> {
     let compile = |(name, value): (&String, &toml::Value)| {
         let key = format!("{section}.{name}");
-        let text: Text = value.clone().try_into().map_err(|_| {
-            mistake(
-                &key,
-                "it is neither a number nor an expression in quotes; write for example \"vx.torso - 0.1\"",
-            )
-        })?;
-        text.compile(names).map_err(|e| mistake(key, e))
+        let (weight, of) = match value {
+            toml::Value::Table(table) if section != "termination" => {
+                let weighted: Weighted = serde_path_to_error::deserialize(table.clone())
+                    .map_err(|e| mistake(&key, suggest(e.inner().message())))?;
+                if !weighted.weight.is_finite() {
+                    return Err(mistake(key, format!("the weight {} is no number", weighted.weight)));
+                }
+                (weighted.weight, Text::Expression(weighted.of).compile(names).map_err(|e| mistake(&key, e))?)
+            }
+            value => (1.0, Text::read(&key, value, names)?),
+        };
+        Ok(Term { name: name.clone(), of, weight })
     };
     table.iter().map(compile).collect()
 }
 
 impl Text {
+    /// Compiles the value of `key`.
+    pub(super) fn read(
+        key: &str,
+        value: &toml::Value,
+        names: &Names,
+    ) -> Result<Expression<Quantity>, Mistake> {
+        let text: Text = value.clone().try_into().map_err(|_| {
+            mistake(
+                key,
+                "it is neither a number nor an expression in quotes; write for example \"vx.torso - 0.1\"",
+            )
+        })?;
+        text.compile(names).map_err(|e| mistake(key, e))
+    }
+
     fn compile(&self, names: &Names) -> Result<Expression<Quantity>, String> {
         match self {
             Text::Number(x) if !x.is_finite() => Err(format!("{x} is not finite")),
@@ -79,10 +109,10 @@ pub(super) struct Start {
 }
 
 /// The starts of an episode, in the order they are drawn.
-pub(super) fn starts(task: &Task, joints: &[crate::mj::Joint], names: &Names) -> Result<Vec<Start>, Mistake> {
+pub(super) fn starts(task: &Task, joints: &[Joint], names: &Names) -> Result<Vec<Start>, Mistake> {
     let reset: Reset = serde_path_to_error::deserialize(task.reset.clone())
         .map_err(|e| mistake(format!("reset.{}", e.path()), suggest(e.inner().message())))?;
-    let size = |width: fn(&crate::mj::Joint) -> usize| joints.iter().map(width).sum::<usize>();
+    let size = |width: fn(&Joint) -> usize| joints.iter().map(width).sum::<usize>();
     let mut entries = Vec::new();
     for (key, text, velocity, n) in [
         ("position", &reset.position, false, size(|j| j.nq)),
@@ -95,18 +125,32 @@ pub(super) fn starts(task: &Task, joints: &[crate::mj::Joint], names: &Names) ->
     for (letter, given, velocity) in [("q", &reset.q, false), ("v", &reset.v, true)] {
         for (name, text) in given {
             let key = format!("reset.{letter}.{name}");
-            let single = joints.iter().filter(|j| j.nq == 1);
-            let joint = single.clone().find(|j| j.name == *name).ok_or_else(|| {
-                let near = single.map(|j| (strsim::jaro_winkler(&j.name, name), &j.name));
-                let near = near
-                    .max_by(|a, b| a.0.total_cmp(&b.0))
-                    .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));
-                mistake(&key, format!("the robot has no joint '{name}' with one degree of freedom{near}"))
-            })?;
-            let index = if velocity { joint.idx_v } else { joint.idx_q };
+            let index = entry(joints, name, velocity).map_err(|e| mistake(&key, e))?;
             let value = text.compile(names).map_err(|e| mistake(key, e))?;
             entries.push(Start { velocity, index, replace: true, value });
         }
     }
     Ok(entries)
+}
+
+/// Where the entry `name` is in `qpos` or `qvel`: a joint with one degree of freedom, or a part of another, `root.z`. The four parts of a
+/// rotation depend on each other and are left out.
+fn entry(joints: &[Joint], name: &str, velocity: bool) -> Result<usize, String> {
+    let mut known = Vec::new();
+    for joint in joints {
+        let (positions, velocities) = parts(joint.kind);
+        let (first, parts) = if velocity { (joint.idx_v, velocities) } else { (joint.idx_q, positions) };
+        let whole = parts.iter().enumerate().filter(|(_, part)| !part.starts_with(".q"));
+        known.extend(whole.map(|(k, part)| (format!("{}{part}", joint.name), first + k)));
+    }
+    if let Some((_, index)) = known.iter().find(|(known, _)| known == name) {
+        return Ok(*index);
+    }
+    let near = known.iter().map(|(known, _)| (strsim::jaro_winkler(known, name), known));
+    let near = near
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));
+    Err(format!(
+        "the robot has no joint '{name}' with one degree of freedom, nor such a part of a joint{near}"
+    ))
 }

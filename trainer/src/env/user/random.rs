@@ -1,0 +1,238 @@
+//! `[random]`: a robot that is a little different in every episode.
+//!
+//! ```toml
+//! [random]
+//! mass = "1 + 0.2 * uniform"                    # factor on mass and inertia of every body, one draw a body
+//! com = { base = "0.03 * uniform" }             # m, added to every axis of the centre of mass of this body
+//! friction = { all = "0.8 + 0.4 * uniform" }    # factor, one draw for all
+//! strength = "0.9 + 0.1 * uniform"              # factor on the force of every motor
+//! ```
+
+use rand_chacha::ChaCha8Rng;
+
+use super::commands::drawn;
+use super::expression::Expression;
+use super::quantity::{Names, Quantity};
+use super::settings::{Mistake, Text, mistake};
+use crate::mj::{Actuator, Model, Physique};
+
+/// What differs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Mass,
+    Inertia,
+    Centre,
+    Friction,
+    Strength,
+    Stiffness,
+    Damping,
+    Armature,
+}
+
+const KINDS: [(&str, Kind); 8] = [
+    ("mass", Kind::Mass),
+    ("inertia", Kind::Inertia),
+    ("com", Kind::Centre),
+    ("friction", Kind::Friction),
+    ("strength", Kind::Strength),
+    ("stiffness", Kind::Stiffness),
+    ("damping", Kind::Damping),
+    ("armature", Kind::Armature),
+];
+
+/// One expression and what it is drawn for.
+#[derive(Clone)]
+struct Draw {
+    kind: Kind,
+    /// Bodies, solids or actuators.
+    entries: Vec<usize>,
+    /// One draw for all of them.
+    together: bool,
+    of: Expression<Quantity>,
+}
+
+/// The robot as its file has it, and how it differs in this episode.
+#[derive(Clone)]
+pub(super) struct Random {
+    nominal: Physique,
+    pub(super) physique: Physique,
+    /// Degree of freedom of each actuator.
+    dofs: Vec<usize>,
+    /// Factor on the force of each entry of the action, for motors that MuJoCo does not know.
+    pub(super) strength: Vec<f64>,
+    draws: Vec<Draw>,
+    /// Mean of what was drawn in this episode, by draw.
+    means: Vec<f64>,
+}
+
+impl Random {
+    /// Reads the section; none where the task has none.
+    pub(super) fn read(
+        section: &toml::Table,
+        model: &Model,
+        actuators: &[Actuator],
+        start: &Names,
+    ) -> Result<Option<Random>, Mistake> {
+        if section.is_empty() {
+            return Ok(None);
+        }
+        let mut draws = Vec::new();
+        for (name, value) in section {
+            let key = format!("random.{name}");
+            let Some((_, kind)) = KINDS.iter().find(|(known, _)| known == name) else {
+                let known: Vec<_> = KINDS.iter().map(|(known, _)| *known).collect();
+                return Err(mistake(
+                    key,
+                    format!("nothing of that name can differ; there are {}", known.join(", ")),
+                ));
+            };
+            if matches!(kind, Kind::Stiffness | Kind::Damping) && model.nu() == 0 {
+                let reason =
+                    "the robot has motors of torques and no drives; take it out, or command the joints 'pd'";
+                return Err(mistake(key, reason));
+            }
+            let names = kind.names(model, actuators);
+            match value {
+                toml::Value::Table(by_name) => {
+                    for (entry, value) in by_name {
+                        let key = format!("{key}.{entry}");
+                        draws.push(Draw::read(&key, *kind, entry, value, &names, start)?);
+                    }
+                }
+                value => {
+                    let of = Text::read(&key, value, start)?;
+                    let together = *kind == Kind::Friction;
+                    draws.push(Draw { kind: *kind, entries: (0..names.len()).collect(), together, of });
+                }
+            }
+        }
+        let nominal = model.physique();
+        Ok(Some(Random {
+            physique: nominal.clone(),
+            nominal,
+            dofs: actuators.iter().map(|actuator| actuator.dof).collect(),
+            strength: vec![1.0; actuators.len()],
+            means: vec![f64::NAN; draws.len()],
+            draws,
+        }))
+    }
+
+    /// Names of [`Random::notes`].
+    pub(super) fn names(&self) -> Vec<String> {
+        let mut names: Vec<String> = Vec::new();
+        for draw in &self.draws {
+            let name = KINDS.iter().find(|(_, kind)| *kind == draw.kind).map_or("", |(name, _)| name);
+            let before = names.iter().filter(|n| n.starts_with(&format!("random/{name}"))).count();
+            names.push(if before == 0 {
+                format!("random/{name}")
+            } else {
+                format!("random/{name}_{before}")
+            });
+        }
+        names
+    }
+
+    /// Mean of what was drawn for the present episode, draw by draw.
+    pub(super) fn notes(&self) -> &[f64] {
+        &self.means
+    }
+
+    /// Draws the robot of an episode.
+    pub(super) fn draw(&mut self, rng: &mut ChaCha8Rng, level: f64) {
+        self.physique.clone_from(&self.nominal);
+        self.strength.fill(1.0);
+        for (draw, mean) in self.draws.iter().zip(&mut self.means) {
+            let (mut sum, mut count) = (0.0, 0.0);
+            let mut value = 0.0;
+            for (i, &entry) in draw.entries.iter().enumerate() {
+                let axes = if draw.kind == Kind::Centre { 3 } else { 1 };
+                for axis in 0..axes {
+                    if !(draw.together && i > 0) {
+                        value = draw.kind.within(drawn(&draw.of, rng, level));
+                    }
+                    (sum, count) = (sum + value, count + 1.0);
+                    let (physique, strength) = (&mut self.physique, &mut self.strength);
+                    draw.kind.apply(physique, strength, &self.dofs, entry, axis, value);
+                }
+            }
+            *mean = sum / count;
+        }
+    }
+}
+
+impl Draw {
+    fn read(
+        key: &str,
+        kind: Kind,
+        entry: &str,
+        value: &toml::Value,
+        names: &[String],
+        start: &Names,
+    ) -> Result<Draw, Mistake> {
+        let of = Text::read(key, value, start)?;
+        if entry == "all" {
+            return Ok(Draw { kind, entries: (0..names.len()).collect(), together: true, of });
+        }
+        let at = names.iter().position(|name| name == entry).ok_or_else(|| {
+            let near = names.iter().map(|name| (strsim::jaro_winkler(name, entry), name));
+            let near = near
+                .max_by(|a, b| a.0.total_cmp(&b.0))
+                .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));
+            mistake(key, format!("there is no '{entry}' of which it could be{near}"))
+        })?;
+        Ok(Draw { kind, entries: vec![at], together: false, of })
+    }
+}
+
+impl Kind {
+    /// Names of what may differ, by entry.
+    fn names(self, model: &Model, actuators: &[Actuator]) -> Vec<String> {
+        match self {
+            Kind::Mass | Kind::Inertia | Kind::Centre => model.body_names(),
+            Kind::Friction => (0..model.physique().friction.len()).map(|i| format!("solid{i}")).collect(),
+            _ => actuators.iter().map(|actuator| actuator.name.clone()).collect(),
+        }
+    }
+
+    /// A factor that physics can have.
+    fn within(self, value: f64) -> f64 {
+        match self {
+            Kind::Centre => value,
+            Kind::Mass | Kind::Inertia => value.max(0.01),
+            _ => value.max(0.0),
+        }
+    }
+
+    fn apply(
+        self,
+        p: &mut Physique,
+        strength: &mut [f64],
+        dofs: &[usize],
+        entry: usize,
+        axis: usize,
+        value: f64,
+    ) {
+        let by = |x: &mut f64| *x *= value;
+        match self {
+            Kind::Mass => {
+                by(&mut p.mass[entry]);
+                p.inertia[entry].iter_mut().for_each(by);
+            }
+            Kind::Inertia => p.inertia[entry].iter_mut().for_each(by),
+            Kind::Centre => p.centre[entry][axis] += value,
+            Kind::Friction => by(&mut p.friction[entry][0]),
+            Kind::Armature => by(&mut p.armature[dofs[entry]]),
+            Kind::Strength if p.gain.is_empty() => by(&mut strength[entry]),
+            Kind::Strength => {
+                by(&mut p.gain[entry]);
+                p.bias[entry].iter_mut().for_each(by);
+                p.force_range[entry].iter_mut().for_each(by);
+            }
+            Kind::Stiffness => {
+                by(&mut p.gain[entry]);
+                by(&mut p.bias[entry][1]);
+            }
+            Kind::Damping => by(&mut p.bias[entry][2]),
+        }
+    }
+}

@@ -1,0 +1,113 @@
+//! A robot of a simulation's own whose masses, frictions and drives change from episode to episode.
+
+use mujoco_rs::mujoco_c::mjModel;
+
+use super::{MjError, Model, Sim, guard};
+
+/// Those numbers of a compiled robot that a task may change, in MuJoCo's order.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Physique {
+    /// Mass of each body \[kg\], the world included.
+    pub mass: Vec<f64>,
+    /// Principal moments of inertia of each body \[kg m²\].
+    pub inertia: Vec<[f64; 3]>,
+    /// Centre of mass of each body in its frame \[m\].
+    pub centre: Vec<[f64; 3]>,
+    /// Sliding, torsional and rolling friction of each solid.
+    pub friction: Vec<[f64; 3]>,
+    /// Rotor inertia of each degree of freedom \[kg m² or kg\].
+    pub armature: Vec<f64>,
+    /// Gain of each actuator.
+    pub gain: Vec<f64>,
+    /// Constant, position and velocity coefficient of each actuator's force.
+    pub bias: Vec<[f64; 3]>,
+    /// Smallest and largest force of each actuator \[N·m or N\].
+    pub force_range: Vec<[f64; 2]>,
+}
+
+impl Model {
+    /// A copy that shares nothing: only such a robot may be changed.
+    pub fn copied(&self) -> Model {
+        Model((*self.0).clone().into())
+    }
+
+    /// Names of the bodies, the world included.
+    pub fn body_names(&self) -> Vec<String> {
+        (0..self.n_bodies()).map(|body| self.body_name(body)).collect()
+    }
+
+    /// What may be changed, as it is now.
+    pub fn physique(&self) -> Physique {
+        let m = &self.0;
+        let first_three = |list: &[f64]| [list[0], list[1], list[2]];
+        Physique {
+            mass: m.body_mass().to_vec(),
+            inertia: m.body_inertia().to_vec(),
+            centre: m.body_ipos().to_vec(),
+            friction: m.geom_friction().to_vec(),
+            armature: m.dof_armature().to_vec(),
+            gain: m.actuator_gainprm().iter().map(|gain| gain[0]).collect(),
+            bias: m.actuator_biasprm().iter().map(|bias| first_three(bias)).collect(),
+            force_range: m.actuator_forcerange().to_vec(),
+        }
+    }
+}
+
+impl Sim {
+    /// A simulation of a robot of its own, which [`Sim::change`] may change.
+    ///
+    /// # Errors
+    /// As [`Sim::new`].
+    pub fn apart(model: &Model) -> Result<Sim, MjError> {
+        Sim::new(&model.copied())
+    }
+
+    /// Gives the robot these numbers and evaluates what MuJoCo derives from them; the state is to be set afterwards. Only for a simulation
+    /// [`Sim::apart`] and those made for its own robot, on one thread.
+    ///
+    /// # Errors
+    /// [`MjError::Engine`].
+    ///
+    /// # Panics
+    /// When the numbers are of another robot.
+    pub fn change(&mut self, to: &Physique) -> Result<(), MjError> {
+        let now = self.model().physique();
+        let same = (now.mass.len(), now.friction.len(), now.armature.len(), now.gain.len())
+            == (to.mass.len(), to.friction.len(), to.armature.len(), to.gain.len());
+        assert!(same, "the numbers of another robot");
+        self.call_with_model(|m, d| {
+            // SAFETY: the arrays have the lengths compared above, and nothing else reads this robot meanwhile.
+            unsafe {
+                write(m, to);
+                guard::mj_setConst(m, d);
+            }
+        })
+    }
+}
+
+/// # Safety
+/// `to` has the lengths of the robot's arrays.
+unsafe fn write(m: *mut mjModel, to: &Physique) {
+    // SAFETY: the caller's promise.
+    unsafe {
+        for (i, mass) in to.mass.iter().enumerate() {
+            *(*m).body_mass.add(i) = *mass;
+            for k in 0..3 {
+                *(*m).body_inertia.add(3 * i + k) = to.inertia[i][k];
+                *(*m).body_ipos.add(3 * i + k) = to.centre[i][k];
+            }
+        }
+        for (i, friction) in to.friction.iter().enumerate() {
+            (0..3).for_each(|k| *(*m).geom_friction.add(3 * i + k) = friction[k]);
+        }
+        for (i, armature) in to.armature.iter().enumerate() {
+            *(*m).dof_armature.add(i) = *armature;
+        }
+        for (i, gain) in to.gain.iter().enumerate() {
+            *(*m).actuator_gainprm.add(i * mujoco_rs::mujoco_c::mjNGAIN as usize) = *gain;
+            let bias = (*m).actuator_biasprm.add(i * mujoco_rs::mujoco_c::mjNBIAS as usize);
+            (0..3).for_each(|k| *bias.add(k) = to.bias[i][k]);
+            (0..2).for_each(|k| *(*m).actuator_forcerange.add(2 * i + k) = to.force_range[i][k]);
+        }
+    }
+}
