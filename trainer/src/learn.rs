@@ -61,6 +61,8 @@ use rand_chacha::ChaCha8Rng;
 pub struct Dims {
     /// Observation entries.
     pub n_obs: usize,
+    /// Entries that the value alone sees beside them.
+    pub n_privileged: usize,
     /// Proposed entries.
     pub n_state: usize,
     /// Action entries.

@@ -109,6 +109,7 @@ pub struct Training {
     is_best: bool,
     dims: Dims,
     obs_stats: RunningStats,
+    privileged_stats: RunningStats,
     change_stats: RunningStats,
     return_stats: RunningStats,
     rng: ChaCha8Rng,
@@ -151,11 +152,11 @@ impl Training {
         let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
         manifest.algo = request.algo.to_string();
         manifest.policy = policy_kind(request.algo, &settings, &manifest.task)?;
-        let notes = complete(&mut manifest)?.notes;
+        let spec = complete(&mut manifest)?;
         let parts = Parts::new(&manifest)?;
-        let dims = dims(&manifest, &parts)?;
+        let dims = dims(&manifest, &parts, spec.privileged.len())?;
         check_outputs(&manifest.task.name, &dims)?;
-        check_experience(&settings, experience)?;
+        check_experience(&settings, &manifest.task, experience)?;
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
         let imitation =
@@ -179,6 +180,7 @@ impl Training {
         }
         Ok(Self {
             obs_stats,
+            privileged_stats: RunningStats::new(dims.n_privileged),
             change_stats,
             return_stats: RunningStats::new(1),
             algo: request.algo,
@@ -196,7 +198,7 @@ impl Training {
             seed: request.seed,
             recent: Vec::new(),
             recent_costs: Vec::new(),
-            notes,
+            notes: spec.notes,
             begin: Instant::now(),
             earlier: 0.0,
             learning_seconds: 0.0,
@@ -388,6 +390,8 @@ impl Training {
             self.obs_stats.merge(&g.obs_stats);
             self.change_stats.merge(&g.change_stats);
             self.return_stats.merge(&g.return_stats);
+            let rows = g.segment.privileged.chunks_exact(self.dims.n_privileged.max(1));
+            rows.for_each(|row| self.privileged_stats.push(row));
         }
     }
 
@@ -424,10 +428,23 @@ impl Training {
         let b = &mut self.batch;
         b.clear();
         b.n = self.settings.n_envs * n_steps;
+        let (n_obs, n_privileged) = (self.dims.n_obs, self.dims.n_privileged);
+        let stats = (&self.privileged_stats.mean, self.privileged_stats.std(1e-4));
+        let for_value = |x: &[f32], privileged: &[f64], to: &mut Vec<f32>| {
+            let moments = stats.0.iter().zip(&stats.1);
+            to.extend_from_slice(x);
+            to.extend(
+                privileged.iter().zip(moments).map(|(p, (m, s))| ((p - m) / s).clamp(-10.0, 10.0) as f32),
+            );
+        };
         let scale = if self.settings.scale_reward { 1.0 / self.return_stats.std(1e-8)[0] } else { 1.0 };
         for g in self.source.gathered() {
             let s = &g.segment;
             b.obs.extend_from_slice(&s.x);
+            if n_privileged > 0 {
+                let rows = s.x.chunks_exact(n_obs).zip(s.privileged.chunks_exact(n_privileged));
+                rows.for_each(|(x, privileged)| for_value(x, privileged, &mut b.seen_by_value));
+            }
             if proposes {
                 b.change.extend_from_slice(&s.change);
                 b.target_change.extend_from_slice(&s.target_change);
@@ -439,7 +456,10 @@ impl Training {
             b.action.extend_from_slice(&s.action);
             b.log_prob.extend_from_slice(&s.log_prob);
             let reward: Vec<f32> = s.reward.iter().map(|r| (r * scale).clamp(-10.0, 10.0) as f32).collect();
-            let final_obs = s.final_x.iter().flat_map(|(_, x)| x.iter().copied()).collect();
+            let mut final_obs = Vec::with_capacity(s.final_x.len() * (n_obs + n_privileged));
+            for (i, (_, x)) in s.final_x.iter().enumerate() {
+                for_value(x, &s.final_privileged[i * n_privileged..][..n_privileged], &mut final_obs);
+            }
             let (terminated, truncated) = (s.terminated.clone(), s.truncated.clone());
             b.stretches.push(Stretch { reward, terminated, truncated, final_obs });
         }

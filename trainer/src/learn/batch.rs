@@ -10,6 +10,8 @@ pub struct Batch {
     pub n: usize,
     /// Normalised observation (n x n_obs).
     pub obs: Vec<f32>,
+    /// The same with the privileged entries behind it (n x (n_obs + n_privileged)), which the value sees; empty where there are none.
+    pub seen_by_value: Vec<f32>,
     /// Sampled proposal u, a normalised change (n x n_state).
     pub change: Vec<f32>,
     /// Projected change w (n x n_state).
@@ -45,7 +47,7 @@ pub struct Stretch {
     pub terminated: Vec<bool>,
     /// The episode was cut.
     pub truncated: Vec<bool>,
-    /// Normalised final observation of each cut row (cuts x n_obs).
+    /// What the value sees of the final state of each cut row (cuts x (n_obs + n_privileged)).
     pub final_obs: Vec<f32>,
 }
 
@@ -58,7 +60,13 @@ impl Batch {
         let actions = [&mut self.reached, &mut self.sampled, &mut self.action];
         let numbers = [&mut self.log_prob, &mut self.advantage, &mut self.returns];
         states.into_iter().chain(actions).chain(numbers).for_each(Vec::clear);
+        self.seen_by_value.clear();
         self.stretches.clear();
+    }
+
+    /// What the value sees.
+    pub fn of_value(&self) -> &[f32] {
+        if self.seen_by_value.is_empty() { &self.obs } else { &self.seen_by_value }
     }
 
     /// Advantages and returns under the values that `value` gives for rows of observations. Without stretches they stay.
@@ -68,7 +76,7 @@ impl Batch {
         }
         self.advantage.clear();
         self.returns.clear();
-        let (values, (gamma, lambda)) = (value(&self.obs), self.discount);
+        let (values, (gamma, lambda)) = (value(self.of_value()), self.discount);
         let mut first = 0;
         for s in &self.stretches {
             let own = &values[first..][..s.reward.len()];

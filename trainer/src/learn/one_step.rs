@@ -107,7 +107,14 @@ fn train(
     rounds: usize,
     make: impl FnOnce(Dims, PpoSettings, &mut ChaCha8Rng) -> Box<dyn Learner>,
 ) -> (f64, f64) {
-    let dims = Dims { n_obs: 2, n_state: 2, n_act: 2, seen_obs: vec![0, 1], seen_state: vec![0, 1] };
+    let dims = Dims {
+        n_obs: 2,
+        n_privileged: 0,
+        n_state: 2,
+        n_act: 2,
+        seen_obs: vec![0, 1],
+        seen_state: vec![0, 1],
+    };
     let mut rng = crate::rollout::stream(4, 0);
     let settings = PpoSettings { lr: 1e-3, log_std: -0.5, ..PpoSettings::default() };
     let mut learner = make(dims, settings, &mut rng);
@@ -190,7 +197,7 @@ fn affine() -> NetSettings {
 }
 
 fn plain() -> (Dims, PpoSettings, DemoSettings) {
-    let dims = Dims { n_obs: 2, n_state: 2, n_act: 2, seen_obs: vec![0, 1], seen_state: vec![0, 1] };
+    let dims = Dims { n_obs: 2, n_privileged: 0, n_state: 2, n_act: 2, seen_obs: vec![0, 1], seen_state: vec![0, 1] };
     let demos = DemoSettings { epochs: 200, lr: 1e-2, ..DemoSettings::default() };
     (dims, PpoSettings { lr: 1e-3, n_epochs: 100, ..PpoSettings::default() }, demos)
 }

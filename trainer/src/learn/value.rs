@@ -17,6 +17,7 @@ pub(super) struct Value {
     pub(super) net: Net,
     /// Vectors of its parameters.
     pub(super) len: usize,
+    /// Entries that it sees, the privileged ones included.
     n_obs: usize,
     weight: f32,
     /// Furthest step from what it was; 0: any.
@@ -40,10 +41,22 @@ impl Value {
         rng: &mut ChaCha8Rng,
     ) -> (Self, Group) {
         let (mut at, mut transposed) = (0, 0);
-        let net = Net::new(&widths(dims.n_obs, &nets.value, 1), nets.activation, 0, &mut at, &mut transposed);
+        let net = Net::new(
+            &widths(dims.n_obs + dims.n_privileged, &nets.value, 1),
+            nets.activation,
+            0,
+            &mut at,
+            &mut transposed,
+        );
         let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
         net.mlp.write_dense(&init::orthogonal(&net.mlp.widths(), 1.0, rng), &mut group.p);
-        let value = Self { net, len: at, n_obs: dims.n_obs, weight: ppo.vf_coef, clip: ppo.clip_value };
+        let value = Self {
+            net,
+            len: at,
+            n_obs: dims.n_obs + dims.n_privileged,
+            weight: ppo.vf_coef,
+            clip: ppo.clip_value,
+        };
         value.refresh(&mut group);
         (value, group)
     }
@@ -65,7 +78,7 @@ impl Value {
 
     /// The rows that [`Value::tile`] reads.
     pub(super) fn rows<'b>(&self, batch: &'b Batch) -> Vec<Rows<'b>> {
-        vec![Rows::new(&batch.obs, self.n_obs)]
+        vec![Rows::new(batch.of_value(), self.n_obs)]
     }
 
     /// Squared error from the returns; its sum over rows is the tile's first sum.
@@ -92,7 +105,7 @@ impl Value {
 
 #[inline(always)]
 fn body(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueScratch, grad: &mut [V]) {
-    gather(&mut w.obs, v.n_obs.div_ceil(LANES), 0, &t.batch.obs, v.n_obs, t.idx);
+    gather(&mut w.obs, v.n_obs.div_ceil(LANES), 0, t.batch.of_value(), v.n_obs, t.idx);
     let value = v.net.forward(&group.p, &w.obs, &mut w.tape);
     let [value_of, target, slope, old] = &mut w.rows;
     heads(value_of, value);

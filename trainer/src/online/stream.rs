@@ -184,6 +184,7 @@ impl Stream {
                     before,
                     after: next.obs(),
                     seen: &self.seen,
+                    privileged: [&[], &[]],
                     reward,
                     moved,
                     terminated,

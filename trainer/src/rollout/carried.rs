@@ -17,6 +17,8 @@ impl Collected {
         }
         push(numbers, s.final_x.iter().map(|(t, _)| *t as f64));
         push(numbers, s.final_x.iter().flat_map(|(_, x)| x).map(|&x| f64::from(x)));
+        push(numbers, s.privileged.iter().copied());
+        push(numbers, s.final_privileged.iter().copied());
         push(numbers, t.episodes.iter().flat_map(|&(total, length)| [total, length as f64]));
         push(numbers, t.costs.iter().copied());
         push(numbers, t.notes.iter().copied());
@@ -45,6 +47,8 @@ impl Collected {
         for (&t, x) in cuts.iter().zip(final_x) {
             s.final_x.push((t as usize, x.iter().map(|&x| x as f32).collect()));
         }
+        s.privileged = pull(from)?.to_vec();
+        s.final_privileged = pull(from)?.to_vec();
         let (episodes, costs, notes) = (pull(from)?.as_chunks::<2>().0, pull(from)?, pull(from)?);
         let tally = Tally {
             episodes: episodes.iter().map(|&[total, length]| (total, length as usize)).collect(),
@@ -58,8 +62,10 @@ impl Collected {
             Some(stats)
         };
         let (obs_stats, change_stats, return_stats) = (stats(n_obs)?, stats(n_state)?, stats(1)?);
+        let (n, cuts) = (s.privileged.len(), s.final_x.len());
+        let privileged_fit = n % n_steps.max(1) == 0 && s.final_privileged.len() * n_steps == n * cuts;
         let cuts_fit = s.final_x.iter().all(|(t, _)| *t < n_steps);
-        (from.is_empty() && cuts_fit).then_some(Self {
+        (from.is_empty() && cuts_fit && privileged_fit).then_some(Self {
             segment: s,
             tally,
             obs_stats,

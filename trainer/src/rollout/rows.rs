@@ -16,8 +16,9 @@ pub struct Rows {
     /// Discounted return of the episode so far.
     pub(super) discounted: f64,
     change: Vec<f64>,
-    /// Network input of the state after the last row.
+    /// Network input of the state after the last row, and what the value alone sees of it.
     after: Vec<f32>,
+    after_privileged: Vec<f64>,
 }
 
 /// One policy step.
@@ -30,6 +31,8 @@ pub struct Period<'a> {
     pub after: &'a [f64],
     /// What the policy sees of its end, before the normaliser (n_seen).
     pub seen: &'a [f64],
+    /// What the value alone sees at its begin and at its end (n_privileged each).
+    pub privileged: [&'a [f64]; 2],
     /// The task's reward.
     pub reward: f64,
     /// Distance the projection moved the targets.
@@ -52,6 +55,7 @@ impl Rows {
             discounted: 0.0,
             change: vec![0.0; layout.n_state()],
             after: vec![0.0; controller.n_seen()],
+            after_privileged: Vec::new(),
         }
     }
 
@@ -80,6 +84,10 @@ impl Rows {
         let change = (&self.change[..], &normaliser.scale[..]);
         self.collected.push(p.out, change, p.seen, (reward, self.discounted), (p.terminated, false));
         normaliser.observation(p.seen, &mut self.after);
+        let [before, after] = p.privileged;
+        self.collected.segment.privileged.extend_from_slice(before);
+        self.after_privileged.clear();
+        self.after_privileged.extend_from_slice(after);
         if p.truncated && !p.terminated {
             self.cut();
         }
@@ -94,6 +102,7 @@ impl Rows {
         if last > 0 && !s.terminated[last - 1] && !s.truncated[last - 1] {
             s.truncated[last - 1] = true;
             s.final_x.push((last - 1, self.after.clone()));
+            s.final_privileged.extend_from_slice(&self.after_privileged);
         }
     }
 

@@ -33,6 +33,10 @@ pub struct Segment {
     pub terminated: Vec<bool>,
     /// The episode was cut, by time or by the end of the segment (n_steps).
     pub truncated: Vec<bool>,
+    /// What the value alone sees at the begin of each step (n_steps x n_privileged), as the simulator has it.
+    pub privileged: Vec<f64>,
+    /// The same at the end of each cut step (cuts x n_privileged).
+    pub final_privileged: Vec<f64>,
     /// Network input of the true final observation of each cut step: step and (n_obs).
     pub final_x: Vec<(usize, Vec<f32>)>,
 }
@@ -65,6 +69,8 @@ impl Segment {
         self.terminated.clear();
         self.truncated.clear();
         self.final_x.clear();
+        self.privileged.clear();
+        self.final_privileged.clear();
     }
 }
 

@@ -33,6 +33,8 @@ pub struct Worker {
     before: Vec<f64>,
     /// What the policy sees at its end, before the normaliser.
     seen: Vec<f64>,
+    /// What the value alone sees at its begin and at its end.
+    privileged: [Vec<f64>; 2],
     noise: Noise,
     out: Output,
     /// Distance the projection moved the targets of this policy step.
@@ -78,6 +80,7 @@ impl Worker {
             state: controller.state(),
             before: vec![0.0; controller.layout().n_obs()],
             seen: vec![0.0; controller.n_seen()],
+            privileged: [(); 2].map(|()| vec![0.0; env.spec().privileged.len()]),
             noise: controller.noise(),
             out: controller.output(),
             rows: Rows::new(&controller, gamma, 0.0),
@@ -171,12 +174,25 @@ impl Worker {
                 self.rows.collected.obs_stats.push(&self.seen);
             }
             self.draw(true);
+            self.env.privileged(&mut self.privileged[0]);
             let (reward, terminated) = self.policy_step();
             let truncated = self.ticks >= self.env.spec().max_episode_steps;
             self.controller.peek(&self.state, &mut self.seen);
             let (before, after, seen, moved) =
                 (&self.before[..], &self.state.obs[..], &self.seen[..], self.moved);
-            let period = Period { out: &self.out, before, after, seen, reward, moved, terminated, truncated };
+            self.env.privileged(&mut self.privileged[1]);
+            let privileged = self.privileged.each_ref().map(Vec::as_slice);
+            let period = Period {
+                out: &self.out,
+                before,
+                after,
+                seen,
+                privileged,
+                reward,
+                moved,
+                terminated,
+                truncated,
+            };
             self.rows.push(&period, self.controller.normaliser());
             if terminated || truncated {
                 if !self.from_frame {

@@ -37,6 +37,9 @@ impl Training {
         put("beta".into(), Values::F32(vec![params.beta]));
         put("adapted".into(), Values::F32(vec![params.adapted]));
         put("stats.obs".into(), Values::F64(self.obs_stats.to_vec()));
+        if self.dims.n_privileged > 0 {
+            put("stats.privileged".into(), Values::F64(self.privileged_stats.to_vec()));
+        }
         put("stats.change".into(), Values::F64(self.change_stats.to_vec()));
         put("stats.return".into(), Values::F64(self.return_stats.to_vec()));
         let recent = self.recent.iter().flat_map(|&(r, n)| [r, n as f64]).collect();
@@ -98,6 +101,10 @@ impl Training {
         ] {
             let n = stats.to_vec().len();
             stats.set(&from.take_f64(name, Some(n))?);
+        }
+        if self.dims.n_privileged > 0 {
+            let n = self.privileged_stats.to_vec().len();
+            self.privileged_stats.set(&from.take_f64("stats.privileged", Some(n))?);
         }
         self.best = from.take_f64("best", None)?.first().copied();
         self.recent_costs = from.take_f64("recent_costs", None)?;

@@ -51,7 +51,7 @@ pub(super) fn learner(
 }
 
 /// Sizes of the networks. A policy with a recipe sees what that computes, in which an inverse model would not find the state.
-pub(super) fn dims(manifest: &Manifest, parts: &Parts) -> Result<Dims, TrainError> {
+pub(super) fn dims(manifest: &Manifest, parts: &Parts, n_privileged: usize) -> Result<Dims, TrainError> {
     let (layout, policy) = (&parts.layout, manifest.task.policy.as_ref());
     let unusable = |reason| TrainError::Settings(format!("[policy] of '{}': {reason}", manifest.task.name));
     let observer = policy.map(|policy| Observer::new(policy, &parts.model, layout)).transpose();
@@ -62,6 +62,7 @@ pub(super) fn dims(manifest: &Manifest, parts: &Parts) -> Result<Dims, TrainErro
     };
     Ok(Dims {
         n_obs: observer.map_or(layout.n_obs(), |observer| observer.len()),
+        n_privileged,
         n_state: layout.n_state(),
         n_act: manifest.action_lower.len(),
         seen_obs: seen.iter().map(|&k| layout.state()[k]).collect(),
@@ -182,7 +183,11 @@ pub(super) fn check_outputs(task: &str, dims: &Dims) -> Result<(), TrainError> {
 }
 
 /// Settings that environments of this process alone can follow.
-pub(super) fn check_experience(settings: &TrainSettings, experience: &Experience) -> Result<(), TrainError> {
+pub(super) fn check_experience(
+    settings: &TrainSettings,
+    task: &Task,
+    experience: &Experience,
+) -> Result<(), TrainError> {
     let (source, next) = match experience {
         Experience::Here => return Ok(()),
         Experience::Loop(name, _) => (format!("the loop of '{name}'"), "--from"),
@@ -193,6 +198,11 @@ pub(super) fn check_experience(settings: &TrainSettings, experience: &Experience
             "[train.limits_in]: {} asks for limits that come in one environment after another, and {source} projects in all of them; set it to 0, \
              or train without {next}",
             settings.limits_in
+        )));
+    }
+    if !task.state.privileged.is_empty() && matches!(experience, Experience::Loop(..)) {
+        return Err(TrainError::Settings(format!(
+            "[state.privileged]: {source} knows no more of a robot than its policy sees; take it out, or train without {next}"
         )));
     }
     if !settings.project_in_training && matches!(experience, Experience::Loop(..)) {

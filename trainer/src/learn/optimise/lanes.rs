@@ -175,7 +175,14 @@ mod tests {
     };
 
     fn dims() -> Dims {
-        Dims { n_obs: 7, n_state: 5, n_act: 3, seen_obs: vec![1, 2, 6], seen_state: vec![0, 2, 4] }
+        Dims {
+            n_obs: 7,
+            n_privileged: 0,
+            n_state: 5,
+            n_act: 3,
+            seen_obs: vec![1, 2, 6],
+            seen_state: vec![0, 2, 4],
+        }
     }
 
     fn learner(algo: &str, threads: usize) -> Box<dyn Learner> {

@@ -14,7 +14,14 @@ const TANH: Activation = Activation::Tanh;
 const RELU: Activation = Activation::Relu;
 
 fn dims() -> Dims {
-    Dims { n_obs: 7, n_state: 5, n_act: 2, seen_obs: vec![1, 2, 6], seen_state: vec![0, 2, 4] }
+    Dims {
+        n_obs: 7,
+        n_privileged: 0,
+        n_state: 5,
+        n_act: 2,
+        seen_obs: vec![1, 2, 6],
+        seen_state: vec![0, 2, 4],
+    }
 }
 
 /// A learner with weights far from zero, and a minibatch.

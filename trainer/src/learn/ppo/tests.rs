@@ -5,7 +5,14 @@ use crate::learn::reference::{self, *};
 use nearl_runtime::net::Activation;
 
 fn dims() -> Dims {
-    Dims { n_obs: 7, n_state: 5, n_act: 3, seen_obs: vec![1, 2, 6], seen_state: vec![0, 2, 4] }
+    Dims {
+        n_obs: 7,
+        n_privileged: 0,
+        n_state: 5,
+        n_act: 3,
+        seen_obs: vec![1, 2, 6],
+        seen_state: vec![0, 2, 4],
+    }
 }
 
 #[test]
