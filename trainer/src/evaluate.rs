@@ -18,6 +18,17 @@ pub struct Worst {
     pub beyond_margin: f64,
 }
 
+/// Something that the environment tells of its episodes.
+#[derive(Clone, Debug, Serialize)]
+pub struct Told {
+    /// Its column: `reward/...`, `metrics/...`, `random/...`.
+    pub name: String,
+    /// Mean over the episodes.
+    pub mean: f64,
+    /// Largest of the episodes.
+    pub largest: f64,
+}
+
 /// Mean results of some episodes.
 #[derive(Clone, Debug, Serialize)]
 pub struct Evaluation {
@@ -47,6 +58,8 @@ pub struct Evaluation {
     pub worst: Vec<Worst>,
     /// Control periods that could not be simulated: each ended its episode with the reward 0.
     pub faults: u64,
+    /// What a task of one's own tells of its episodes.
+    pub told: Vec<Told>,
     /// Mean over ticks and controllable entries of |reached - target|, in standard deviations of change.
     pub residual: f64,
 }
@@ -100,11 +113,15 @@ pub fn evaluate(
         unavoided: 0,
         worst: Vec::new(),
         faults: 0,
+        told: Vec::new(),
         residual: 0.0,
     };
+    let names = worker.notes().to_vec();
+    let mut told = Vec::new();
     for _ in 0..episodes {
         let (ret, length) = worker.evaluate().map_err(RolloutError::from)?;
         let t = &worker.rows.collected.tally;
+        told.push(t.notes.clone());
         e.returns.push(ret);
         e.costs.extend_from_slice(&t.costs);
         e.lengths.push(length);
@@ -117,6 +134,11 @@ pub fn evaluate(
         e.residual += t.residual;
     }
     [e.replaced, e.unavoided] = worker.foreseen;
+    e.told = names
+        .into_iter()
+        .enumerate()
+        .map(|(i, name)| tell(name, told.iter().map(|notes| notes[i])))
+        .collect();
     e.residual /= e.ticks.max(1) as f64;
     let beyond = worker.beyond.as_ref().map_or([None; 2], |(_, most)| *most);
     for ((limit, excess), own) in ["position", "velocity"].into_iter().zip(worker.excess).zip(beyond) {
@@ -125,6 +147,12 @@ pub fn evaluate(
         e.worst.extend(excess.map(|x| Worst { limit, joint: joint(x.dof), by: x.by, beyond_margin }));
     }
     Ok(e)
+}
+
+fn tell(name: String, values: impl ExactSizeIterator<Item = f64>) -> Told {
+    let n = values.len().max(1) as f64;
+    let (sum, largest) = values.fold((0.0, f64::NEG_INFINITY), |(sum, most), x| (sum + x, x.max(most)));
+    Told { name, mean: sum / n, largest }
 }
 
 /// The position and velocity limits of the task with no margin and the robot's whole speed.

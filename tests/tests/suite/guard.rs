@@ -134,7 +134,7 @@ fn a_guard_without_torque_limits_is_refused_in_a_sentence() {
         let mut manifest = tasks::load(task, &set).expect("task");
         match nearl_trainer::train::complete(&mut manifest) {
             Err(e) => e.to_string(),
-            Ok(()) => {
+            Ok(_) => {
                 let mut snapshot = direct(1, 1.0, &[]);
                 snapshot.manifest.task.constraints = manifest.task.constraints;
                 Controller::new(&snapshot).map(|_| ()).expect_err("refused").to_string()

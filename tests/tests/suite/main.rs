@@ -13,6 +13,7 @@ mod import;
 mod limits_in_simulator;
 mod meters;
 mod networks;
+mod own_draws;
 mod own_robots;
 mod prior_in_training;
 mod recipe;

@@ -77,7 +77,7 @@ fn velocity_and_gravity_of_a_base_are_in_its_axes() {
 #[test]
 fn a_fall_lasts_as_long_as_gravity_says_and_the_foot_carries_the_robot() {
     let more =
-        ["commands={}", "pushes={}", "termination={}", "command.stiffness=400.0", "command.damping=10.0"];
+        ["commands={}", "pushes={}", "termination={}", "reward={ alive = 1.0 }", "command.stiffness=400.0", "command.damping=10.0"];
     let mut env = leg_observing(&["air.foot", "landed.foot", "load.foot", "contact.foot", "z.foot"], &more);
     let mut q = vec![0.0; 9];
     (q[2], q[3]) = (0.6 + 0.05 + 0.1, 1.0);
@@ -104,7 +104,7 @@ fn a_fall_lasts_as_long_as_gravity_says_and_the_foot_carries_the_robot() {
 /// `K (u - q) - D v`, held to the effort of the URDF, at the state in which the tick begins.
 #[test]
 fn drives_of_a_urdf_are_what_the_command_section_says() {
-    let mut env = leg_observing(&[], &["commands={}", "pushes={}"]);
+    let mut env = leg_observing(&[], &["commands={}", "pushes={}", "reward={ alive = 1.0 }"]);
     let mut rng = stream(2, 0);
     env.reset(&mut rng).expect("reset");
     let mut bounded = 0;
@@ -247,7 +247,7 @@ fn commands_and_pushes_repeat_with_their_seed() {
     }
     assert!(told[0] == told[1]);
     let changes: Vec<usize> = (1..120).filter(|&t| told[0][t].0 != told[0][t - 1].0).collect();
-    assert_eq!(changes, [29, 59, 89], "every 0.15 s");
+    assert_eq!(changes, [29, 59, 89, 119], "every 0.15 s");
     let values: Vec<f64> = [10, 40, 70, 100].map(|t| told[0][t].0[0]).to_vec();
     assert!(values.iter().all(|v| v.abs() <= 1.0));
     other.reset(&mut stream(9, 3)).expect("reset");

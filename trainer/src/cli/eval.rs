@@ -5,6 +5,7 @@ use crate::evaluate::evaluate;
 use crate::run_folder;
 use clap::Args;
 use nearl_runtime::Snapshot;
+use nearl_runtime::task::Task;
 use std::path::PathBuf;
 
 #[derive(Args)]
@@ -20,6 +21,9 @@ pub(super) struct Eval {
     /// Seed of the initial states.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Another robot than the one of the training: `random.mass=1.2`, `delay.action=2`, of the sections that a task of one's own simulates by.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -31,7 +35,8 @@ impl Eval {
             return Err("--episodes 0 measures nothing; give at least 1".into());
         }
         let file = run_folder::snapshot_of(&self.run)?;
-        let snapshot = Snapshot::load(&file).map_err(|e| format!("{}: {e}", file.display()))?;
+        let mut snapshot = Snapshot::load(&file).map_err(|e| format!("{}: {e}", file.display()))?;
+        elsewhere(&mut snapshot, &self.set)?;
         let results = self
             .compare
             .iter()
@@ -85,9 +90,37 @@ impl Eval {
                 e.mode, w.joint, w.limit, w.by
             ));
         }
+        for e in &results {
+            for told in &e.told {
+                let (name, mean, largest) = (&told.name, told.mean, told.largest);
+                say(format!("{}: {name} {mean:.4}, at most {largest:.4} in an episode", e.mode));
+            }
+        }
         for e in results.iter().filter(|e| e.faults > 0) {
             say(format!("{}: {}", e.mode, unstable(e.faults)));
         }
         Ok(())
     }
+}
+
+/// Sections that say what is simulated, and nothing of the controller.
+const SIMULATED: [&str; 10] =
+    ["reset", "termination", "metrics", "scene", "commands", "pushes", "random", "noise", "delay", "reward"];
+
+/// Changes what is simulated; networks, limits and the controller's own robot stay.
+fn elsewhere(snapshot: &mut Snapshot, set: &[String]) -> Result<(), Failure> {
+    if set.is_empty() {
+        return Ok(());
+    }
+    let section = |set: &String| set.split(['.', '=']).next().unwrap_or_default().trim().to_string();
+    if let Some(other) = set.iter().find(|set| !SIMULATED.contains(&section(set).as_str())) {
+        return Err(format!(
+            "--set {other}: an evaluation changes what is simulated and no controller; there are {}",
+            SIMULATED.join(", ")
+        )
+        .into());
+    }
+    let task = &snapshot.manifest.task;
+    snapshot.manifest.task = Task::parse(&task.name, &task.to_toml(), set)?;
+    Ok(())
 }

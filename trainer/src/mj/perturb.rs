@@ -1,8 +1,14 @@
 //! A robot of a simulation's own whose masses, frictions and drives change from episode to episode.
 
-use mujoco_rs::mujoco_c::mjModel;
+use mujoco_rs::mujoco_c::{mjModel, mjtByte, mjtSameFrame};
+use mujoco_rs::wrappers::mj_model::MjModel;
 
 use super::{MjError, Model, Sim, guard};
+
+/// What a frame coincides with.
+const NONE: mjtByte = mjtSameFrame::mjSAMEFRAME_NONE as mjtByte;
+const INERTIA: mjtByte = mjtSameFrame::mjSAMEFRAME_INERTIA as mjtByte;
+const INERTIA_ROTATION: mjtByte = mjtSameFrame::mjSAMEFRAME_INERTIAROT as mjtByte;
 
 /// Those numbers of a compiled robot that a task may change, in MuJoCo's order.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,9 +32,29 @@ pub struct Physique {
 }
 
 impl Model {
-    /// A copy that shares nothing: only such a robot may be changed.
+    /// A copy that shares nothing and takes no short cut where a centre of mass is a frame's origin: only such a robot may be changed.
     pub fn copied(&self) -> Model {
-        Model((*self.0).clone().into())
+        let copy: MjModel = (*self.0).clone();
+        let m: *mut mjModel = std::ptr::from_ref(copy.ffi()).cast_mut();
+        // SAFETY: the arrays are this copy's own and have these lengths.
+        unsafe {
+            for body in 0..(*m).nbody as usize {
+                *(*m).body_sameframe.add(body) = NONE;
+            }
+            for (list, n) in [((*m).geom_sameframe, (*m).ngeom), ((*m).site_sameframe, (*m).nsite)] {
+                for i in 0..n as usize {
+                    if *list.add(i) == INERTIA || *list.add(i) == INERTIA_ROTATION {
+                        *list.add(i) = NONE;
+                    }
+                }
+            }
+        }
+        Model(copy.into())
+    }
+
+    /// Whether MuJoCo counts on a body's centre of mass being where it is.
+    pub fn is_simple(&self, body: usize) -> bool {
+        self.0.body_simple()[body] != 0
     }
 
     /// Names of the bodies, the world included.

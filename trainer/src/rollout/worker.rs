@@ -102,6 +102,11 @@ impl Worker {
         Ok(worker)
     }
 
+    /// What the environment tells of its episodes, by name.
+    pub fn notes(&self) -> &[String] {
+        &self.env.spec().notes
+    }
+
     /// Hands new networks to the controller.
     pub fn set_networks(&mut self, networks: &Networks) {
         self.controller.set_networks(networks);

@@ -96,13 +96,13 @@ impl Random {
                 toml::Value::Table(by_name) => {
                     for (entry, value) in by_name {
                         let key = format!("{key}.{entry}");
-                        draws.push(Draw::read(&key, *kind, entry, value, &names, start)?);
+                        draws.push(Draw::read(&key, *kind, entry, value, (model, &names), start)?);
                     }
                 }
                 value => {
                     let of = Text::read(&key, value, start)?;
                     let together = *kind == Kind::Friction;
-                    draws.push(Draw { kind: *kind, entries: (0..names.len()).collect(), together, of });
+                    draws.push(Draw { kind: *kind, entries: kind.all(model, names.len()), together, of });
                 }
             }
         }
@@ -166,12 +166,12 @@ impl Draw {
         kind: Kind,
         entry: &str,
         value: &toml::Value,
-        names: &[String],
+        (model, names): (&Model, &[String]),
         start: &Names,
     ) -> Result<Draw, Mistake> {
         let of = Text::read(key, value, start)?;
         if entry == "all" {
-            return Ok(Draw { kind, entries: (0..names.len()).collect(), together: true, of });
+            return Ok(Draw { kind, entries: kind.all(model, names.len()), together: true, of });
         }
         let at = names.iter().position(|name| name == entry).ok_or_else(|| {
             let near = names.iter().map(|name| (strsim::jaro_winkler(name, entry), name));
@@ -180,6 +180,12 @@ impl Draw {
                 .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));
             mistake(key, format!("there is no '{entry}' of which it could be{near}"))
         })?;
+        if !kind.all(model, names.len()).contains(&at) {
+            let reason = format!(
+                "'{entry}' cannot differ in it: it is the world, or a body alone whose inertia MuJoCo simplifies"
+            );
+            return Err(mistake(key, reason));
+        }
         Ok(Draw { kind, entries: vec![at], together: false, of })
     }
 }
@@ -191,6 +197,15 @@ impl Kind {
             Kind::Mass | Kind::Inertia | Kind::Centre => model.body_names(),
             Kind::Friction => (0..model.physique().friction.len()).map(|i| format!("solid{i}")).collect(),
             _ => actuators.iter().map(|actuator| actuator.name.clone()).collect(),
+        }
+    }
+
+    /// Which of the `n` entries may differ: every body but the world, and centres of mass where MuJoCo counts on none at the joint.
+    fn all(self, model: &Model, n: usize) -> Vec<usize> {
+        match self {
+            Kind::Mass | Kind::Inertia => (1..n).collect(),
+            Kind::Centre => (1..n).filter(|body| !model.is_simple(*body)).collect(),
+            _ => (0..n).collect(),
         }
     }
 
