@@ -33,7 +33,11 @@ pub fn snapshot(task: &str, actions: bool) -> Result<Snapshot, VectorError> {
 /// # Errors
 /// As [`snapshot`].
 pub fn complete(manifest: &mut Manifest) -> Result<(), VectorError> {
-    if env::is_known(&manifest.task) { Ok(train::complete(manifest)?) } else { range(manifest) }
+    if !env::is_known(&manifest.task) {
+        return range(manifest);
+    }
+    train::complete(manifest)?;
+    Ok(())
 }
 
 /// The range of the actions: what the motors give, and where drives may be sent.

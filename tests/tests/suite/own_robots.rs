@@ -76,8 +76,14 @@ fn velocity_and_gravity_of_a_base_are_in_its_axes() {
 /// Dropped with its leg held stiff, the foot falls for sqrt(2 h / g), then carries the robot.
 #[test]
 fn a_fall_lasts_as_long_as_gravity_says_and_the_foot_carries_the_robot() {
-    let more =
-        ["commands={}", "pushes={}", "termination={}", "reward={ alive = 1.0 }", "command.stiffness=400.0", "command.damping=10.0"];
+    let more = [
+        "commands={}",
+        "pushes={}",
+        "termination={}",
+        "reward={ alive = 1.0 }",
+        "command.stiffness=400.0",
+        "command.damping=10.0",
+    ];
     let mut env = leg_observing(&["air.foot", "landed.foot", "load.foot", "contact.foot", "z.foot"], &more);
     let mut q = vec![0.0; 9];
     (q[2], q[3]) = (0.6 + 0.05 + 0.1, 1.0);

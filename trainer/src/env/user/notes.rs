@@ -83,12 +83,10 @@ impl Notes {
     /// A new episode of the robot, delays and level that were drawn.
     pub(super) fn begin(&mut self, drawn: &[f64], delay: Option<[usize; 2]>, level: f64) {
         self.values.fill(0.0);
-        let mut at = self.terms + self.metrics.len();
+        let drawn_at = self.terms + self.metrics.len();
         let delay = delay.filter(|_| self.tells_delay).into_iter().flatten().map(|periods| periods as f64);
-        for value in drawn.iter().copied().chain(delay).chain(self.tells_level.then_some(level)) {
-            self.values[at] = value;
-            at += 1;
-        }
+        let told = drawn.iter().copied().chain(delay).chain(self.tells_level.then_some(level));
+        self.values[drawn_at..].iter_mut().zip(told).for_each(|(to, value)| *to = value);
     }
 
     /// Adds what a term of the reward gave.
