@@ -22,6 +22,7 @@ nav:
   - Ten minutes from nothing: docs/START.md
   - Commands: docs/COMMANDS.md
   - Tasks: docs/TASKS.md
+  - Train for your own robot: docs/OWN_ROBOT.md
   - Limits: docs/LIMITS.md
   - Training: docs/TRAINING.md
   - Demonstrations: docs/DEMONSTRATIONS.md

@@ -121,6 +121,7 @@ fn elsewhere(snapshot: &mut Snapshot, set: &[String]) -> Result<(), Failure> {
         .into());
     }
     let task = &snapshot.manifest.task;
-    snapshot.manifest.task = Task::parse(&task.name, &task.to_toml(), set)?;
+    snapshot.manifest.task = Task::parse(&task.name, &run_folder::to_toml(task), set)?;
+    snapshot.manifest.task.state.privileged.clear(); // of the value, which an evaluation does not have
     Ok(())
 }

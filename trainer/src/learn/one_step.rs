@@ -197,7 +197,14 @@ fn affine() -> NetSettings {
 }
 
 fn plain() -> (Dims, PpoSettings, DemoSettings) {
-    let dims = Dims { n_obs: 2, n_privileged: 0, n_state: 2, n_act: 2, seen_obs: vec![0, 1], seen_state: vec![0, 1] };
+    let dims = Dims {
+        n_obs: 2,
+        n_privileged: 0,
+        n_state: 2,
+        n_act: 2,
+        seen_obs: vec![0, 1],
+        seen_state: vec![0, 1],
+    };
     let demos = DemoSettings { epochs: 200, lr: 1e-2, ..DemoSettings::default() };
     (dims, PpoSettings { lr: 1e-3, n_epochs: 100, ..PpoSettings::default() }, demos)
 }

@@ -60,7 +60,7 @@ impl Ppo {
         optimise(&self.nets, &mut self.params, batch, &[INVERSE], schedule, rng);
         let after = self.nets.idm_error(&self.params, batch, threads);
         let actions = super::super::variance(&batch.action, self.nets.dims.n_act);
-        super::super::idm_metrics(Some(before), Some(after), true, actions)
+        super::super::idm_metrics(before, after, true, actions)
     }
 
     /// Writes into each row the action that the inverse model infers from its transition.
