@@ -124,6 +124,12 @@ pub trait Rows: Send {
         false
     }
 
+    /// True when the rows ask for more than [`breach`](Rows::breach) keeps, so that a way to stop is left: where a stored brake is
+    /// verified for that, a tick may do without them.
+    fn asks_more(&self) -> bool {
+        false
+    }
+
     /// Writes the rows of the tick. Must not allocate.
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>);
 

@@ -23,8 +23,12 @@ const RECOVERY: f64 = 2.0;
 /// A state this far outside the set is inside [m].
 const ROUNDING: f64 = 1e-10;
 
-/// Beyond the boundary this much [m] is taken back in [`RETURN`] periods; brakes that slide along it are allowed as much.
-pub(super) const CREEP: f64 = 1e-4;
+/// Rows keep this far inside the boundary [m]: what the linearisation creeps beyond theirs is within it, and taken back in [`RETURN`]
+/// periods.
+const CREEP: f64 = 1e-4;
+
+/// A state this far beyond the boundary rests at it [m].
+const AT: f64 = 1e-9;
 
 /// See [`CREEP`].
 const RETURN: f64 = 20.0;
@@ -90,12 +94,12 @@ impl Clearance {
     pub(super) fn ahead(distance: f64, speed: f64, c: f64, period: &Period) -> Clearance {
         let t = period.dt;
         let w = speed - (t + 0.5 * period.tau) * c;
-        Clearance { d: distance + t * w + period.kappa * t * t * c, w, ahead: speed, c }
+        Clearance { d: distance - CREEP + t * w + period.kappa * t * t * c, w, ahead: speed, c }
     }
 
-    /// Further beyond the boundary than what creeps over it.
+    /// Beyond the boundary itself.
     pub(super) fn is_outside(&self) -> bool {
-        self.d < -CREEP
+        self.d < -CREEP - AT
     }
 
     /// Upper bound of `r y / T` [m/s²].

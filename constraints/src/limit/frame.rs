@@ -1,7 +1,7 @@
 //! Where a point of a frame may be: below a plane, inside a box.
 
 use super::Limit;
-use super::clearance::{Ahead, CREEP, Clearance};
+use super::clearance::{Ahead, Clearance};
 use crate::kinematics::{dot, norm};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{FrameId, Kind, LimitError, Model, Period, PointMotion, Soft};
@@ -234,6 +234,10 @@ impl Rows for FrameRows {
         Needs::default()
     }
 
+    fn asks_more(&self) -> bool {
+        true
+    }
+
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (nv, j, period) = (rows.nv, &mut self.jacobian, tick.period);
         let kinematics = self.ahead.look(tick.q, tick.v, period.dt);
@@ -259,12 +263,12 @@ impl Rows for FrameRows {
         }
     }
 
-    /// Metres beyond the plane and what may creep over it.
+    /// Metres beyond the plane.
     fn breach(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
         let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
         let at = then.point(self.frame, self.point);
         for (x, plane) in out.iter_mut().zip(&self.planes) {
-            *x = dot(plane.n, at.position) - plane.offset - CREEP;
+            *x = dot(plane.n, at.position) - plane.offset;
         }
     }
 }

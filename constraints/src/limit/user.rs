@@ -219,6 +219,10 @@ impl Rows for Row {
         self.equality && self.braking.is_none()
     }
 
+    fn asks_more(&self) -> bool {
+        self.braking.is_some()
+    }
+
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (t, kappa) = (tick.period.dt, tick.period.kappa);
         if let Some(braking) = self.braking {

@@ -13,10 +13,15 @@
 //! By induction there is always a way to stop: either the new state has a verified brake, or the old one has, and the first tick of
 //! that brake leads to a state whose brake is the rest of it.
 
+mod refusal;
+mod stopping;
+
 use super::Dofs;
 use crate::checker::Checker;
 use crate::viability::{Dof, Kind, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model};
+pub(crate) use refusal::{Refusal, Step};
+use stopping::least_deceleration;
 
 /// A breach up to this is rounding.
 const ROUNDING: f64 = 1e-10;
@@ -80,8 +85,13 @@ pub(crate) struct Backup {
     /// Ticks looked at in a stretch, and the breach of each row there.
     ticks: Vec<u32>,
     breach: Vec<f64>,
+    /// Breach of each row where a target was refused.
+    found: Vec<f64>,
+    /// A state next to it.
+    near: State,
 }
 
+#[derive(Default)]
 struct State {
     q: Vec<f64>,
     v: Vec<f64>,
@@ -115,6 +125,8 @@ impl Backup {
             cuts: Vec::with_capacity(2 * model.nv() + 1),
             ticks: Vec::with_capacity(MOST as usize),
             breach: vec![0.0; checker.hard() * MOST as usize],
+            found: vec![0.0; checker.hard()],
+            near: state(),
             checker,
         })
     }
@@ -353,62 +365,4 @@ pub(crate) struct With<'a> {
     pub(crate) dofs: &'a Dofs,
     pub(crate) period: &'a Period,
     pub(crate) external: &'a [f64],
-}
-
-/// The least deceleration that stops a dof before its position limit and below its speed profile; infinite where none does.
-fn least_deceleration(dof: &Dof, q: f64, v: f64, period: &Period) -> f64 {
-    let (room, profile, at) = match v > 0.0 {
-        true => (dof.upper - q, dof.profile[1], 1.0),
-        false => (q - dof.lower, dof.profile[0], -1.0),
-    };
-    let mut least = stopping(room, v.abs(), period).max(smooth(room, v.abs(), period));
-    if let Some(p) = profile {
-        // Braking with the deceleration of the parabola that leads from here to the end of the profile stays below the profile.
-        let needed = (v.abs() + p.offset).powi(2) / (2.0 * (at * (p.at - q)).max(f64::MIN_POSITIVE));
-        least = least.max(needed.min(p.deceleration).min(dof.braking(period)));
-    }
-    least
-}
-
-/// The least deceleration that stops within `room` from `speed` in whole ticks and a shorter one: with `k` whole ticks
-///
-/// ```text
-///     speed T (k + 1 - kappa) - b T^2 k (k + 1) / 2 = room,   k = floor(speed / (b T))
-/// ```
-fn stopping(room: f64, speed: f64, period: &Period) -> f64 {
-    let t = period.dt;
-    if room == f64::INFINITY {
-        return 0.0;
-    }
-    if room < speed * t * (1.0 - period.kappa) - ROUNDING {
-        return f64::INFINITY;
-    }
-    let with = |k: f64| (speed * t * (k + 1.0 - period.kappa) - room) / (0.5 * t * t * k * (k + 1.0));
-    // Of a brake without ticks, which needs a little less; then the whole ticks that are the largest deceleration.
-    let rough = speed * speed / (2.0 * room.max(0.0) + speed * period.tau).max(f64::MIN_POSITIVE);
-    let whole = speed / (rough * t);
-    if whole > MANY {
-        return rough * (1.0 + 1.0 / MANY); // the ticks make less of a difference than this
-    }
-    let mut k = whole.floor().max(1.0);
-    let mut least = with(k);
-    for step in [-1.0, 1.0] {
-        while k + step >= 1.0 && with(k + step) > least {
-            k += step;
-            least = with(k);
-        }
-    }
-    // Not more than what stops within one tick.
-    least.clamp(0.0, speed / t)
-}
-
-/// The least deceleration `b` that keeps the joint in the set of [`interval`](crate::viability::interval): the smaller root of
-/// `(speed - b tau / 2)^2 = 2 b room`. That set is left a little later than the ticks need between some of them.
-fn smooth(room: f64, speed: f64, period: &Period) -> f64 {
-    if room == f64::INFINITY {
-        return 0.0;
-    }
-    let half = speed * period.tau + 2.0 * room.max(0.0);
-    let root = (half * half - (period.tau * speed).powi(2)).max(0.0).sqrt();
-    2.0 * speed * speed / (half + root).max(f64::MIN_POSITIVE)
 }

@@ -5,6 +5,7 @@ use super::backup::Backup;
 use super::choice;
 use super::conic::Conic;
 use super::coupled::Coupled;
+use super::nearer::Nearer;
 use super::polish::Polish;
 use super::sources::{Measured, Sources};
 use super::{Dofs, History, Projector, Stages, Switch};
@@ -217,7 +218,23 @@ fn stages(
     let polish = Polish::new(&problem);
     let dropped = vec![(0.0, 0.0); m + cones.len()];
     let (active_set, y) = (ActiveSet::new(n, m), vec![0.0; n]);
-    Ok(Some(Stages { sources, labels, problem, active_set, conic, polish, y, exact: false, dropped }))
+    let nearer = Nearer::new(&problem, sources.asks_more());
+    let (slopes, slope) = (vec![0.0; (m + cones.len()) * n], vec![0.0; n]);
+    let exact = false;
+    Ok(Some(Stages {
+        sources,
+        labels,
+        problem,
+        active_set,
+        conic,
+        polish,
+        y,
+        exact,
+        dropped,
+        nearer,
+        slopes,
+        slope,
+    }))
 }
 
 /// A velocity change of the size to expect in one period [rad/s or m/s].

@@ -53,15 +53,18 @@ pub(super) fn braking(
         return Braking::Certified;
     }
     if !dofs.fixed.is_empty() {
-        return Braking::Certified; // of a base that nobody drives no brake is known
-    }
-    // Planes, bodies and rows of one's own bring a braking of their own, and a stored brake where something else needs one.
-    let asks =
-        |kind: &Kind| matches!(kind, Kind::Torque | Kind::TorqueSpeed | Kind::FrameSpeed | Kind::Energy);
-    if !kinds.iter().any(asks) {
+        let mut joints: Vec<_> =
+            dofs.fixed.iter().map(|i| format!("'{}'", model.joint_of_dof(*i).name)).collect();
+        joints.dedup();
+        let (joints, verb) = (joints.join(", "), if joints.len() == 1 { "is" } else { "are" });
+        notes.push(format!(
+            "no brake is stored because {joints} {verb} not controllable: {} may be broken when something forces a stop; braking = \"stored\" \
+             verifies one as if nothing else moved",
+            listed(&kinds)
+        ));
         return Braking::Certified;
     }
-    if kinds.iter().filter(|kind| asks(kind)).all(|kind| *kind == Kind::Torque) {
+    if kinds.iter().all(|kind| *kind == Kind::Torque) {
         let period = Period::new(settings.dt, settings.sub_steps);
         let (samples, seed) = SAMPLES;
         let found = certify_braking(model, limits, &dofs.controllable, &period, samples, seed);

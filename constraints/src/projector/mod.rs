@@ -9,9 +9,11 @@ mod choice;
 mod conic;
 mod coupled;
 mod gradient;
+mod keep;
 mod kkt;
 mod ladder;
 mod modes;
+mod nearer;
 mod polish;
 mod sources;
 mod stages;
@@ -28,15 +30,13 @@ use crate::target::{Bounds, Braking, Consistency, Proposal, Settings, Target};
 use crate::viability::{Dof, Interval, Kind, Period, interval};
 use crate::{Dynamics, LimitSet, Model};
 use active_set::ActiveSet;
-use backup::{Backup, With};
+use backup::Backup;
 use conic::Conic;
 use coupled::Coupled;
+use nearer::Nearer;
 use polish::Polish;
 use sources::{Label, Sources};
 use std::time::Instant;
-
-/// Share of the way to a target that is tried first where the target itself is refused: rows are linear, what they keep is not quite.
-const NEARLY: f64 = 0.98;
 
 /// Projects proposals for one robot at one control period.
 ///
@@ -125,6 +125,10 @@ struct Stages {
     exact: bool,
     /// Bounds of soft rows (m) and radii of soft cones while they are left out.
     dropped: Vec<(f64, f64)>,
+    nearer: Nearer,
+    /// How what a target breaks changes with each dof (hard rows x n), and one of its rows (n).
+    slopes: Vec<f64>,
+    slope: Vec<f64>,
 }
 
 /// One limit, and whether it holds.
@@ -182,6 +186,9 @@ impl Projector {
         };
         match outcome {
             Ok(status) => self.check_target(q, v, proposal, target, status),
+            Err(BrakeReason::NoCertifiedAnswer) if self.settings.braking == Braking::Stored => {
+                self.without_an_answer(q, v, proposal, target)
+            }
             Err(reason) => self.brake(q, v, Some(proposal), target, reason),
         }
     }
@@ -269,90 +276,14 @@ impl Projector {
         target.ledger.slack = verdict.worst.max(soft);
         let outside = &target.ledger.outside;
         let is_joint_outside = outside.iter().any(|row| *row < v.len());
-        if verdict.accepts() || (is_joint_outside && verdict.counts.torque + verdict.counts.other == 0) {
-            let status = if outside.is_empty() { status } else { Status::Recovering };
-            return match self.settings.braking {
-                Braking::Auto | Braking::Certified => status,
-                Braking::Stored => self.keep_a_brake(q, v, proposal, target, status),
-            };
+        let accepted =
+            verdict.accepts() || (is_joint_outside && verdict.counts.torque + verdict.counts.other == 0);
+        let status = if outside.is_empty() { status } else { Status::Recovering };
+        match self.settings.braking {
+            _ if !accepted => self.brake(q, v, Some(proposal), target, BrakeReason::NoCertifiedAnswer),
+            Braking::Stored => self.keep_a_brake(q, v, proposal, target, status),
+            _ => status,
         }
-        self.brake(q, v, Some(proposal), target, BrakeReason::NoCertifiedAnswer)
-    }
-
-    /// Takes the target if it breaks nothing and a brake from it is verified, else the furthest such state on the way from one tick of the
-    /// stored brake to the target, else that tick.
-    fn keep_a_brake(
-        &mut self,
-        q: &[f64],
-        v: &[f64],
-        proposal: &Proposal,
-        target: &mut Target,
-        status: Status,
-    ) -> Status {
-        self.backup.begin();
-        if self.leads_to_a_brake(q, v, target) {
-            return status;
-        }
-        let outside = self.excuse(q, v);
-        if outside && self.leads_to_a_brake(q, v, target) {
-            return status;
-        }
-        if !self.backup.stored && !self.verify(q, v) {
-            return self.brake(q, v, Some(proposal), target, BrakeReason::NoVerifiedBrake);
-        }
-        let (mut good, mut bad) = (0.0, 1.0);
-        self.v_wanted.copy_from_slice(&target.v);
-        self.stop(q, v, target, true);
-        self.v_stop.copy_from_slice(&self.v_next);
-        for k in 0..4 {
-            let share = if k == 0 { NEARLY } else { 0.5 * (good + bad) };
-            self.blend(share);
-            self.write(q, v, Some(proposal), target);
-            let leads = self.leads_to_a_brake(q, v, target);
-            *(if leads { &mut good } else { &mut bad }) = share;
-            if leads && k == 0 {
-                break;
-            }
-        }
-        self.blend(good);
-        self.write(q, v, Some(proposal), target);
-        self.report_rung(q, v, target, Rung::StoredBrake);
-        match good == 0.0 {
-            true => Status::Braked(BrakeReason::NoVerifiedBrake),
-            false if target.ledger.outside.is_empty() => Status::Slowed,
-            false => Status::Recovering,
-        }
-    }
-
-    /// The step to the target breaks no hard row or cone, and a brake from it is verified, which is then stored.
-    fn leads_to_a_brake(&mut self, q: &[f64], v: &[f64], target: &Target) -> bool {
-        let with =
-            With { limits: &self.limits, dofs: &self.dofs, period: &self.period, external: &self.external };
-        self.backup.allows(&with, (q, v), (&target.q, &target.v))
-            && self.backup.verify(&with, &target.q, &target.v)
-    }
-
-    /// Allows brakes what the measured state breaks already; true when that is anything.
-    fn excuse(&mut self, q: &[f64], v: &[f64]) -> bool {
-        let with =
-            With { limits: &self.limits, dofs: &self.dofs, period: &self.period, external: &self.external };
-        self.backup.excuse(&with, q, v)
-    }
-
-    /// `v_next` between one tick of the stored brake (0) and the wanted velocities (1).
-    fn blend(&mut self, share: f64) {
-        self.consistent.fill(false);
-        self.v_next.copy_from_slice(&self.v_wanted);
-        for &i in &self.dofs.controllable {
-            let mixed = self.v_stop[i] + share * (self.v_wanted[i] - self.v_stop[i]);
-            self.v_next[i] = mixed.clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
-        }
-    }
-
-    fn verify(&mut self, q: &[f64], v: &[f64]) -> bool {
-        let with =
-            With { limits: &self.limits, dofs: &self.dofs, period: &self.period, external: &self.external };
-        self.backup.verify(&with, q, v)
     }
 
     /// Reports a target that is not the nearest allowed one.

@@ -115,6 +115,11 @@ impl Sources {
         self.blocks.iter().flat_map(|b| vec![b.rows.equality() && b.soft.is_none(); b.sizes.len()]).collect()
     }
 
+    /// Which rows ask for more than they keep.
+    pub(crate) fn asks_more(&self) -> Vec<bool> {
+        self.blocks.iter().flat_map(|b| vec![b.rows.asks_more(); b.sizes.len()]).collect()
+    }
+
     /// Rows of the matrix of each cone, and its softness.
     pub(crate) fn cones(&self) -> Vec<(usize, Option<Soft>)> {
         self.cones.iter().map(|c| (c.cone.dimension(), c.soft)).collect()

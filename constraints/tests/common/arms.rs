@@ -97,3 +97,22 @@ pub fn rail_arm() -> Model {
     ];
     Model::from_urdf_text(&urdf("rail_arm", &links, 1.0, 0.0)).unwrap()
 }
+
+/// An arm of `joints` turning joints about random axes, with random lengths, masses, ranges and motors.
+pub fn random_arm(seed: u64, joints: usize) -> Model {
+    let mut random = super::Random(seed);
+    let mut links = Vec::new();
+    for k in 0..joints {
+        let axis = ["0 0 1", "0 1 0", "1 0 0"][if k == 0 { 0 } else { 1 + (random.next() * 1.6) as usize }];
+        let at = [random.between(-0.05, 0.05), random.between(-0.05, 0.05), random.between(0.12, 0.35)];
+        let limits = [random.between(-2.8, -1.2), random.between(1.0, 2.6)];
+        let mass = random.between(0.4, 4.0) / (1.0 + k as f64);
+        let com = [random.between(-0.03, 0.03), random.between(-0.03, 0.03), random.between(0.05, 0.15)];
+        let effort = random.between(60.0, 160.0) / (1.0 + 0.5 * k as f64);
+        links.push(Link {
+            velocity: random.between(1.5, 4.0),
+            ..turning(axis, at, limits, effort, mass, com)
+        });
+    }
+    Model::from_urdf_text(&urdf("random_arm", &links, random.between(0.0, 0.5), 0.0)).unwrap()
+}

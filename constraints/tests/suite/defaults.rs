@@ -48,6 +48,27 @@ fn what_is_chosen_depends_on_what_could_break() {
     assert_eq!(endless.settings().braking, Braking::Certified);
     let notes = endless.notes().join("; ");
     assert!(notes.contains("'panda_joint1'") && notes.contains("frame_speed"), "{notes}");
+    let below: Vec<Box<dyn Limit>> =
+        vec![Box::new(FrameLimit::half_space("panda_hand", [0.0, 0.0, 1.0], [0.0, 0.0, 0.8], 2.0))];
+    let plane = panda_with(PerJoint::All(10.0), below, Settings::new(0.001, 1));
+    assert_eq!(plane.settings().braking, Braking::Stored);
+}
+
+/// A base that nobody drives left the choice at `certified` without a word.
+#[test]
+fn a_robot_that_cannot_store_a_brake_says_so() {
+    let model = free("solo12/solo12.urdf");
+    let limits: Vec<Box<dyn Limit>> = vec![
+        Box::new(PositionLimit::default()),
+        Box::new(VelocityLimit::values(PerJoint::All(15.0))),
+        Box::new(AccelerationLimit::uniform(100.0)),
+        Box::new(TorqueLimit::scaled(0.5)),
+    ];
+    let legs: Vec<usize> = (6..model.nv()).collect();
+    let projector = Projector::new(&model, &limits, &legs, Settings::new(0.001, 1)).unwrap();
+    assert_eq!(projector.settings().braking, Braking::Certified);
+    let base = format!("because '{}' is not controllable: torque may be broken", model.joints()[0].name);
+    assert!(projector.notes().iter().any(|note| note.contains(&base)), "{:?}", projector.notes());
 }
 
 #[test]

@@ -122,7 +122,8 @@ fn an_equal_row_couples_two_joints() {
 fn a_sum_of_positions_stops_in_front_of_its_bound() {
     let mut settings = row("sum", &[("q.panda_joint1", 1.0), ("q.panda_joint3", 1.0)]);
     (settings.upper, settings.lower, settings.braking) = (Some(0.9), Some(-0.8), Some(3.0));
-    let mut projector = with(vec![Box::new(UserRow::new(settings))], Settings::new(0.001, 1));
+    let by_itself = Settings { braking: Braking::Certified, ..Settings::new(0.001, 1) };
+    let mut projector = with(vec![Box::new(UserRow::new(settings))], by_itself);
     let (mut highest, mut lowest, mut braked) = (f64::MIN, f64::MAX, 0);
     storm(&mut projector, 20_000, 4, |_, _, target| {
         let sum = target.q[0] + target.q[2];

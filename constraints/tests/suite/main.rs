@@ -1,5 +1,8 @@
 //! The tests of the constraints, as one program.
 
+#[path = "../../examples/attack/mod.rs"]
+#[allow(dead_code, unreachable_pub)]
+mod attack_scenes;
 #[path = "../common/mod.rs"]
 mod common;
 
@@ -13,6 +16,7 @@ mod frame_limits;
 mod geometry;
 mod gradient;
 mod huge_proposals;
+mod kept;
 mod kinds;
 mod kinematics;
 mod motors;

@@ -2,7 +2,7 @@
 
 mod pairs;
 
-use super::clearance::{Ahead, CREEP};
+use super::clearance::Ahead;
 use super::frame::check;
 use super::{Limit, quoted_names};
 use crate::geometry::{Placement, Shape};
@@ -274,6 +274,10 @@ impl Rows for CollisionRows {
         Needs::default()
     }
 
+    fn asks_more(&self) -> bool {
+        true
+    }
+
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (scale, period) = (1.0 / tick.period.dt, tick.period);
         self.pairs.begin(self.ahead.look_at_frames(tick.q, tick.v, 0.0));
@@ -308,6 +312,6 @@ impl Rows for CollisionRows {
     fn breach(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
         out.fill(f64::NEG_INFINITY);
         let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
-        out[0] = self.margin - self.pairs.least(then) - CREEP;
+        out[0] = self.margin - self.pairs.least(then);
     }
 }

@@ -1,0 +1,162 @@
+//! By how much a step breaks a limit, in the words of the limit and by nothing of the projector: kinematics, inverse dynamics and arithmetic.
+
+use nearl_constraints::*;
+
+/// Rounding of positions [rad or m] and shares that is no excess.
+pub const ROUNDING: f64 = 1e-9;
+
+/// A part of the robot that is a ball around the origin of a frame.
+pub struct Ball {
+    pub frame: FrameId,
+    pub radius: f64,
+}
+
+/// Largest speed of a joint in front of its ends, as in [`limit::JointProfile`].
+#[derive(Clone, Copy)]
+pub struct Curve {
+    pub limit: f64,
+    pub offset: f64,
+    pub squared: f64,
+    pub lower: f64,
+    pub upper: f64,
+}
+
+/// What is measured; every result is a share of the limit or, of positions, rad or m.
+pub enum Meter {
+    /// Position, velocity and acceleration of each joint.
+    Joints { acceleration: f64 },
+    /// Motor forces as share of the robot file's.
+    Torque { share: f64 },
+    /// Force at standstill and speed without load of each motor.
+    TorqueSpeed { line: Vec<(f64, f64)> },
+    /// Speed that falls in front of a position.
+    Profile { curves: Vec<Curve> },
+    /// A joint that stands where it stood.
+    Locked { joint: usize, at: f64 },
+    /// A point in a box.
+    Frame { frame: FrameId, lower: [f64; 3], upper: [f64; 3] },
+    /// Speed of a point.
+    FrameSpeed { frame: FrameId, limit: f64 },
+    /// Kinetic energy.
+    Energy { limit: f64 },
+    /// Two balls of the robot, one that stands still, and a floor.
+    Collision { tool: Ball, elbow: Ball, post: [f64; 3], radius: f64, floor: f64 },
+    /// `q_a + 0.7 q_b` between two bounds, `|v_a + v_b|` below one.
+    Rows { joints: [usize; 2], lower: f64, upper: f64, most: f64 },
+}
+
+/// What the measures need.
+pub struct Gauge {
+    pub model: Model,
+    pub period: Period,
+    dynamics: Dynamics,
+    kinematics: Kinematics,
+    a: Vec<f64>,
+    tau: Vec<f64>,
+}
+
+/// A step from one state to the next.
+#[derive(Clone, Copy)]
+pub struct Step<'a> {
+    pub q: &'a [f64],
+    pub v: &'a [f64],
+    pub q_next: &'a [f64],
+    pub v_next: &'a [f64],
+}
+
+impl Gauge {
+    pub fn new(model: &Model, period: Period) -> Gauge {
+        let zero = vec![0.0; model.nv()];
+        Gauge {
+            dynamics: Dynamics::new(model),
+            kinematics: Kinematics::new(model),
+            a: zero.clone(),
+            tau: zero,
+            model: model.clone(),
+            period,
+        }
+    }
+
+    /// The largest excess of all measures; negative inside.
+    pub fn worst(&mut self, meters: &[Meter], step: Step<'_>) -> f64 {
+        for (a, (to, from)) in self.a.iter_mut().zip(step.v_next.iter().zip(step.v)) {
+            *a = (to - from) / self.period.dt;
+        }
+        meters.iter().fold(f64::NEG_INFINITY, |worst, meter| worst.max(self.excess(meter, step)))
+    }
+
+    fn excess(&mut self, meter: &Meter, step: Step<'_>) -> f64 {
+        let each = |of: &dyn Fn(usize) -> f64| (0..step.v.len()).map(of).fold(f64::NEG_INFINITY, f64::max);
+        match meter {
+            Meter::Joints { acceleration } => each(&|i| self.joint(i, *acceleration, step)),
+            Meter::Torque { share } => {
+                self.motors(step);
+                each(&|i| self.tau[i].abs() / (share * self.model.effort_limit()[i]) - 1.0)
+            }
+            Meter::TorqueSpeed { line } => {
+                self.motors(step);
+                each(&|i| {
+                    let (stall, no_load) = line[i];
+                    (self.tau[i] / stall + step.v_next[i] / no_load).abs() - 1.0
+                })
+            }
+            Meter::Profile { curves } => each(&|i| {
+                let (c, q, v) = (&curves[i], step.q_next[i], step.v_next[i]);
+                let most = |room: f64| ((c.squared * room.max(0.0)).sqrt() - c.offset).max(0.0).min(c.limit);
+                (v - most(c.upper - q)).max(-v - most(q - c.lower))
+            }),
+            Meter::Locked { joint, at } => (step.q_next[*joint] - at).abs(),
+            Meter::Frame { frame, lower, upper } => {
+                let p = self.point(*frame, step).position;
+                (0..3).map(|k| (p[k] - upper[k]).max(lower[k] - p[k])).fold(f64::NEG_INFINITY, f64::max)
+            }
+            Meter::FrameSpeed { frame, limit } => norm(self.point(*frame, step).velocity) / limit - 1.0,
+            Meter::Energy { limit } => self.kinematics.kinetic_energy(step.q_next, step.v_next) / limit - 1.0,
+            Meter::Collision { tool, elbow, post, radius, floor } => {
+                let at = |ball: &Ball, gauge: &mut Gauge| gauge.point(ball.frame, step).position;
+                let (p, e) = (at(tool, self), at(elbow, self));
+                let apart = |x: [f64; 3]| norm([x[0] - post[0], x[1] - post[1], x[2] - post[2]]);
+                let post = (tool.radius + radius - apart(p)).max(elbow.radius + radius - apart(e));
+                post.max(floor + tool.radius - p[2])
+            }
+            Meter::Rows { joints: [a, b], lower, upper, most } => {
+                let sum = step.q_next[*a] + 0.7 * step.q_next[*b];
+                let speed = (step.v_next[*a] + step.v_next[*b]).abs();
+                (sum - upper).max(lower - sum).max(speed / most - 1.0)
+            }
+        }
+    }
+
+    /// Of one joint: position at the end of every physics step or, without them, at the turning point; speed; acceleration.
+    fn joint(&self, i: usize, acceleration: f64, step: Step<'_>) -> f64 {
+        let (low, high) = (self.model.lower_position_limit()[i], self.model.upper_position_limit()[i]);
+        let a = self.a[i];
+        let mut beyond = (step.q_next[i] - high).max(low - step.q_next[i]);
+        let (mut q, mut v) = (step.q[i], step.v[i]);
+        for _ in 1..self.period.sub_steps {
+            v += a * self.period.tau;
+            q += v * self.period.tau;
+            beyond = beyond.max(q - high).max(low - q);
+        }
+        let turn = -v / a;
+        if self.period.sub_steps == 0 && turn > 0.0 && turn < self.period.dt {
+            let extreme = step.q[i] + 0.5 * step.v[i] * turn;
+            beyond = beyond.max(extreme - high).max(low - extreme);
+        }
+        let speed = step.v_next[i].abs() / self.model.velocity_limit()[i] - 1.0;
+        beyond.max(speed).max(a.abs() / acceleration - 1.0)
+    }
+
+    fn motors(&mut self, step: Step<'_>) {
+        self.dynamics.motors(&self.period, step.q, step.v, &self.a, &mut self.tau);
+    }
+
+    fn point(&mut self, frame: FrameId, step: Step<'_>) -> PointMotion {
+        self.kinematics.update_frames(step.q_next, step.v_next, &self.a);
+        self.kinematics.point(frame, [0.0; 3])
+    }
+}
+
+fn norm(x: [f64; 3]) -> f64 {
+    x.iter().map(|x| x * x).sum::<f64>().sqrt()
+}

@@ -1,0 +1,6 @@
+//! What the command and the tests attack with.
+
+pub mod attacker;
+pub mod meter;
+pub mod run;
+pub mod scene;

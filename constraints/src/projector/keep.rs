@@ -1,0 +1,199 @@
+//! A target is taken only when its step and a whole verified brake from it keep every hard limit.
+
+use super::Projector;
+use super::backup::{Refusal, Step, With};
+use crate::ledger::{BrakeReason, Rung, Status};
+use crate::target::{Proposal, Target};
+
+/// Projections with rows of what was refused, in a tick.
+const ROUNDS: usize = 3;
+
+/// Share of the way to a target that is tried first where nothing was found near it.
+const NEARLY: f64 = 0.98;
+
+/// Tries on the way from one tick of the stored brake to the target.
+const TRIES: usize = 4;
+
+/// The bits of the projector that a brake is planned with, while the brakes themselves are borrowed.
+macro_rules! with {
+    ($projector:ident) => {
+        With {
+            limits: &$projector.limits,
+            dofs: &$projector.dofs,
+            period: &$projector.period,
+            external: &$projector.external,
+        }
+    };
+}
+
+impl Projector {
+    /// Takes the target if it breaks nothing and a brake from it is verified; else the nearest for which that is so as far as its rows
+    /// are linear; else the furthest such state on the way from one tick of the stored brake to the target; else that tick.
+    pub(super) fn keep_a_brake(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        proposal: &Proposal,
+        target: &mut Target,
+        status: Status,
+    ) -> Status {
+        self.backup.begin();
+        if self.leads_to_a_brake(q, v, target) {
+            return self.taken(q, v, target, status);
+        }
+        let outside = self.backup.excuse(&with!(self), q, v);
+        if outside && self.leads_to_a_brake(q, v, target) {
+            return self.taken(q, v, target, status);
+        }
+        if !self.backup.stored && !self.backup.verify(&with!(self), q, v) {
+            return self.brake(q, v, Some(proposal), target, BrakeReason::NoVerifiedBrake);
+        }
+        self.v_wanted.copy_from_slice(&target.v);
+        if !self.project_again(q, v, proposal, target) && !self.go_part_of_the_way(q, v, proposal, target) {
+            self.report_rung(q, v, target, Rung::StoredBrake);
+            return Status::Braked(BrakeReason::NoVerifiedBrake);
+        }
+        self.report_rung(q, v, target, Rung::StoredBrake);
+        if target.ledger.outside.is_empty() { Status::Slowed } else { Status::Recovering }
+    }
+
+    /// The rows left no answer: what they ask for may be more than what they keep. Rows that no brake can keep are not left out.
+    pub(super) fn without_an_answer(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        proposal: &Proposal,
+        target: &mut Target,
+    ) -> Status {
+        for &i in &self.dofs.controllable {
+            self.v_next[i] = self.goal[i].clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
+        }
+        self.v_wanted.copy_from_slice(&self.v_next);
+        self.begin_again(v);
+        if !self.take_nearer(v) {
+            return self.brake(q, v, Some(proposal), target, BrakeReason::NoCertifiedAnswer);
+        }
+        self.write(q, v, Some(proposal), target);
+        target.ledger.rung = Rung::StoredBrake;
+        self.keep_a_brake(q, v, proposal, target, Status::Slowed)
+    }
+
+    /// A target that is not the nearest allowed state is checked for what its limits keep.
+    fn taken(&mut self, q: &[f64], v: &[f64], target: &mut Target, status: Status) -> Status {
+        if status == Status::Slowed {
+            self.report_rung(q, v, target, Rung::StoredBrake);
+        }
+        status
+    }
+
+    /// The step to the target breaks no hard row or cone, and a brake from it is verified, which is then stored.
+    fn leads_to_a_brake(&mut self, q: &[f64], v: &[f64], target: &Target) -> bool {
+        let with = with!(self);
+        self.backup.allows(&with, (q, v), (&target.q, &target.v))
+            && self.backup.verify(&with, &target.q, &target.v)
+    }
+
+    /// Projects with what was refused as rows, a few times; true when `target` then leads to a brake.
+    fn project_again(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) -> bool {
+        if self.dofs.curved || self.coupled.is_none() {
+            return false;
+        }
+        self.begin_again(v);
+        for _ in 0..ROUNDS {
+            let step = Step { from: (q, v), to: (&target.q, &target.v) };
+            let Some(refusal) = self.backup.refusal(&with!(self), step) else { return false };
+            self.change(v, &target.v);
+            if !self.cut(refusal, step) || !self.take_nearer(v) {
+                return false;
+            }
+            self.write(q, v, Some(proposal), target);
+            self.v_wanted.copy_from_slice(&target.v);
+            if self.leads_to_a_brake(q, v, target) {
+                return true;
+            }
+        }
+        false
+    }
+
+    /// The second projection begins at `v_wanted`.
+    fn begin_again(&mut self, v: &[f64]) {
+        if let Some(stages) = &mut self.coupled {
+            for (y, &i) in stages.y.iter_mut().zip(&self.dofs.controllable) {
+                *y = self.v_wanted[i] - v[i];
+            }
+            stages.nearer.begin(&stages.problem, &stages.y);
+        }
+    }
+
+    /// The velocity change to `to`, of the controllable dofs, becomes the stages' `y`.
+    fn change(&mut self, v: &[f64], to: &[f64]) {
+        if let Some(stages) = &mut self.coupled {
+            for (y, &i) in stages.y.iter_mut().zip(&self.dofs.controllable) {
+                *y = to[i] - v[i];
+            }
+        }
+    }
+
+    /// A row for each hard row that is broken at `refusal`; true when there is any.
+    fn cut(&mut self, refusal: Refusal, step: Step<'_>) -> bool {
+        let with = with!(self);
+        let Some(stages) = &mut self.coupled else { return false };
+        let n = self.dofs.controllable.len();
+        let rows = stages.slopes.len() / n;
+        let hard = self.backup.found().count().min(rows);
+        for (k, &i) in self.dofs.controllable.iter().enumerate() {
+            let slopes = &mut stages.slopes[k * rows..k * rows + hard];
+            if !self.backup.slopes(&with, (refusal, step), i, slopes) {
+                return false;
+            }
+        }
+        let mut any = false;
+        for (r, breach) in self.backup.found().enumerate().filter(|(_, breach)| *breach > 0.0) {
+            (0..n).for_each(|k| stages.slope[k] = stages.slopes[k * rows + r]);
+            any |= stages.nearer.cut(breach, &stages.slope, &stages.y);
+        }
+        any
+    }
+
+    /// `v_next` from the second projection; false when that has no answer.
+    fn take_nearer(&mut self, v: &[f64]) -> bool {
+        let Some(stages) = &mut self.coupled else { return false };
+        let Some(y) = stages.nearer.solve() else { return false };
+        self.consistent.fill(false);
+        for (y, &i) in y.iter().zip(&self.dofs.controllable) {
+            self.v_next[i] = (v[i] + y).clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
+        }
+        true
+    }
+
+    /// The furthest state that leads to a brake, on the way from one tick of the stored brake to the wanted velocities; false when that
+    /// is the tick itself.
+    fn go_part_of_the_way(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) -> bool {
+        let (mut good, mut bad) = (0.0, 1.0);
+        self.stop(q, v, target, true);
+        self.v_stop.copy_from_slice(&self.v_next);
+        for k in 0..TRIES {
+            let share = if k == 0 { NEARLY } else { 0.5 * (good + bad) };
+            self.blend(share);
+            self.write(q, v, Some(proposal), target);
+            let leads = self.leads_to_a_brake(q, v, target);
+            *(if leads { &mut good } else { &mut bad }) = share;
+            if leads && k == 0 {
+                break;
+            }
+        }
+        self.blend(good);
+        self.write(q, v, Some(proposal), target);
+        good > 0.0
+    }
+
+    /// `v_next` between one tick of the stored brake (0) and the wanted velocities (1).
+    fn blend(&mut self, share: f64) {
+        self.consistent.fill(false);
+        self.v_next.copy_from_slice(&self.v_wanted);
+        for &i in &self.dofs.controllable {
+            let mixed = self.v_stop[i] + share * (self.v_wanted[i] - self.v_stop[i]);
+            self.v_next[i] = mixed.clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
+        }
+    }
+}

@@ -1,0 +1,45 @@
+//! Every kind of limit, alone and all together, at every period and number of physics steps, kept under attack on arms nobody has built.
+
+use crate::attack_scenes::run::{Seen, attack};
+use crate::attack_scenes::scene::{KINDS, Scene};
+use crate::common::arms::random_arm;
+use nearl_constraints::*;
+use std::sync::Mutex;
+
+const PERIODS: [f64; 4] = [0.001, 0.002, 0.01, 0.02];
+const SUB_STEPS: [u32; 3] = [0, 1, 5];
+
+/// Ticks of each kind at each period and number of physics steps: 1e5 in all.
+const TICKS: usize = 400;
+
+#[test]
+fn every_kind_is_kept_alone_and_together() {
+    let cells = KINDS.iter().flat_map(|kind| {
+        PERIODS.iter().flat_map(move |dt| SUB_STEPS.iter().map(move |steps| (*kind, *dt, *steps)))
+    });
+    let cells = Mutex::new(cells.enumerate().collect::<Vec<_>>());
+    let (ticks, held) = (Mutex::new(0), Mutex::new([0usize; 2]));
+    std::thread::scope(|scope| {
+        for _ in 0..2 {
+            scope.spawn(|| {
+                while let Some((k, (kind, dt, sub_steps))) = { cells.lock().unwrap().pop() } {
+                    for arm in 0..2 {
+                        let model = random_arm(1000 * arm + k as u64, 5 + arm as usize);
+                        let settings = Settings { braking: Braking::Stored, ..Settings::new(dt, sub_steps) };
+                        let scene = Scene::new(&model, "tool", kind);
+                        let seen: Seen = attack(&model, &scene, &settings, TICKS, k as u64);
+                        assert_eq!(seen.over, 0, "{kind}, {sub_steps} steps of {dt} s: {seen:?}");
+                        let moves = seen.braked * 10 < seen.ticks * 9;
+                        assert!(moves, "{kind}, {sub_steps} steps of {dt} s stands: {seen:?}");
+                        *ticks.lock().unwrap() += seen.ticks;
+                        let mut held = held.lock().unwrap();
+                        *held = [held[0] + seen.slowed, held[1] + seen.braked];
+                    }
+                }
+            });
+        }
+    });
+    let (ticks, held) = (*ticks.lock().unwrap(), *held.lock().unwrap());
+    println!("{ticks} ticks, {held:?} slowed and braked");
+    assert!(ticks >= 100_000 && held[0] > 1000, "{ticks} {held:?}: this shows nothing");
+}
