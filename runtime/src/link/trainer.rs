@@ -2,11 +2,13 @@
 
 use std::time::Duration;
 
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+
 use super::board::BoardReader;
 use super::owner::Owner;
 use super::port::{BytesOutbox, Inbox};
 use super::runtime::poll_for;
-use super::service::Bus;
+use super::service::{Bus, Ipc};
 use super::*;
 
 /// Reads states, transitions, receipts and health of one robot, and pushes snapshots.
@@ -18,6 +20,8 @@ pub struct TrainerLink {
     robot: Inbox<RobotMessage>,
     tally: Inbox<TallyMessage>,
     snapshot: Option<(BytesOutbox, Owner)>,
+    /// Not read, but held: a topic of a runtime that is killed while it goes stays whole beside one who stays.
+    _held: (PortFactory<Ipc, TickMessage, ()>, PortFactory<Ipc, RowsMessage, ()>),
     bus: Bus,
 }
 
@@ -33,6 +37,7 @@ impl TrainerLink {
             robot: bus.inbox()?,
             tally: bus.inbox()?,
             snapshot: None,
+            _held: (bus.service()?, bus.service()?),
             bus,
         };
         link.bus.reserve()?;
