@@ -132,7 +132,7 @@ pub enum LimitError {
 
 /// "; did you mean 'a' or 'b'?" for the names closest to `name`, else the whole list.
 pub(crate) fn near_names<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> String {
-    let mut scored: Vec<(f64, &str)> = known.map(|k| (strsim::jaro_winkler(name, k), k)).collect();
+    let mut scored: Vec<(f64, &str)> = known.map(|k| (strsim::jaro(name, k), k)).collect();
     scored.sort_by(|a, b| b.0.total_cmp(&a.0));
     let close: Vec<String> =
         scored.iter().take(3).filter(|(s, _)| *s > 0.75).map(|(_, k)| format!("'{k}'")).collect();

@@ -161,7 +161,8 @@ pub struct Settings {
     pub velocity_weight: Option<Vec<f64>>,
     /// Iterations allowed to Clarabel.
     pub max_iter: u32,
-    /// Time allowed to one solve of Clarabel; its answer then counts only if it obeys everything. `None`: as long as it takes.
+    /// Time allowed to one solve of Clarabel; its answer then counts only if it obeys everything, and nothing further is
+    /// tried. `None`: as long as it takes.
     pub deadline: Option<Duration>,
     /// What makes sure that a way to stop is left.
     pub braking: Braking,

@@ -44,7 +44,7 @@ pub fn find(all: &[Explanation], code: &str) -> Result<Explanation, UnknownCode>
     if let Some(found) = all.iter().find(|e| e.code == code) {
         return Ok(*found);
     }
-    let like = |e: &&Explanation| (strsim::jaro_winkler(e.code, code) * 1e6) as u64;
+    let like = |e: &&Explanation| (strsim::jaro(e.code, code) * 1e6) as u64;
     let nearest = all.iter().max_by_key(like).map_or("none", |e| e.code);
     Err(UnknownCode { asked: code.to_owned(), nearest })
 }

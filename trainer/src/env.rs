@@ -398,7 +398,7 @@ fn check_robot(manifest: &Manifest, env: &dyn Env, origin: &str) -> Result<(), E
 
 fn near_names(name: &str) -> Vec<&'static str> {
     let asked = name.to_lowercase();
-    let mut scored: Vec<_> = names().map(|n| (strsim::jaro_winkler(&asked, &n.to_lowercase()), n)).collect();
+    let mut scored: Vec<_> = names().map(|n| (strsim::jaro(&asked, &n.to_lowercase()), n)).collect();
     scored.retain(|(score, _)| *score > 0.75);
     scored.sort_by(|a, b| b.0.total_cmp(&a.0));
     scored.into_iter().map(|(_, n)| n).take(2).collect()

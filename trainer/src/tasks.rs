@@ -198,7 +198,7 @@ pub fn about(name: &str) -> &'static str {
 fn unknown(task: &str) -> TaskLoadError {
     let near = names()
         .into_iter()
-        .map(|n| (strsim::jaro_winkler(&n.to_lowercase(), &task.to_lowercase()), n))
+        .map(|n| (strsim::jaro(&n.to_lowercase(), &task.to_lowercase()), n))
         .max_by(|a, b| a.0.total_cmp(&b.0))
         .filter(|(score, _)| *score > 0.7)
         .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));

@@ -317,6 +317,9 @@ impl Training {
     /// Asks for `steps` more than were done so far.
     pub fn extend(&mut self, steps: u64) {
         self.total = self.snapshot.manifest.steps + steps;
+        if let Some(imitation) = &mut self.imitation {
+            imitation.extend(self.total);
+        }
     }
 
     /// Whether the requested steps are done.

@@ -159,14 +159,20 @@ impl Projector {
     pub fn project(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) -> Status {
         let start = Instant::now();
         target.ledger.reset();
-        let status = self.ladder(q, v, proposal, target);
+        let status = self.ladder(start, (q, v), proposal, target);
         target.ledger.status = status;
         self.last = (status, target.ledger.rung);
         target.ledger.duration_ns = start.elapsed().as_nanos() as u64;
         status
     }
 
-    fn ladder(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) -> Status {
+    fn ladder(
+        &mut self,
+        start: Instant,
+        (q, v): (&[f64], &[f64]),
+        proposal: &Proposal,
+        target: &mut Target,
+    ) -> Status {
         if !self.lengths_fit(q, v, proposal, target) {
             return Status::Refused(RefuseReason::WrongLength);
         }
@@ -186,11 +192,17 @@ impl Projector {
         };
         match outcome {
             Ok(status) => self.check_target(q, v, proposal, target, status),
-            Err(BrakeReason::NoCertifiedAnswer) if self.settings.braking == Braking::Stored => {
+            Err(BrakeReason::NoCertifiedAnswer) if self.searches_on(start) => {
                 self.without_an_answer(q, v, proposal, target)
             }
             Err(reason) => self.brake(q, v, Some(proposal), target, reason),
         }
+    }
+
+    /// There is a stored brake to search with, and time left for it.
+    fn searches_on(&self, start: Instant) -> bool {
+        self.settings.braking == Braking::Stored
+            && self.settings.deadline.is_none_or(|deadline| start.elapsed() < deadline)
     }
 
     /// The box of the last tick, per dof.

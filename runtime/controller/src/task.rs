@@ -441,7 +441,7 @@ pub fn suggest(message: &str) -> String {
     let message = first_line(message);
     let mut quoted = message.split('`').skip(1).step_by(2);
     let Some(unknown) = quoted.next().filter(|_| message.starts_with("unknown ")) else { return message };
-    let near = quoted.map(|k| (strsim::jaro_winkler(unknown, k), k)).max_by(|a, b| a.0.total_cmp(&b.0));
+    let near = quoted.map(|k| (strsim::jaro(unknown, k), k)).max_by(|a, b| a.0.total_cmp(&b.0));
     match near {
         Some((score, key)) if score > 0.7 => format!("{message}; did you mean '{key}'?"),
         _ => message,

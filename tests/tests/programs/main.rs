@@ -4,7 +4,9 @@
 mod common;
 
 mod bad_input;
+mod examples;
 mod online;
+mod printed;
 mod processes;
 mod serve;
 mod serve_clients;

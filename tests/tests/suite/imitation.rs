@@ -141,3 +141,22 @@ fn what_does_not_fit_is_refused_by_name() {
     let error = Training::resume(checkpoint, Path::new("run"), None, 1).map(drop).expect_err("other file");
     assert!(error.to_string().contains("it learned from other demonstrations than"), "{error}");
 }
+
+/// A training that is told how long it is after it has been made, as one from Python is, decays its demonstrations as one that knew.
+#[test]
+fn demonstrations_decay_over_the_steps_that_are_asked_for_later() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, _) = demos(folder.path());
+    let known = asked("dapg", &file, &["train.demos.decay_over_run=true"]);
+    let weights = |request: &Request, later: u64| -> Vec<f64> {
+        let mut training = Training::new(request).expect("training");
+        training.extend(later);
+        training.iterate();
+        let weight =
+            |metrics: Vec<(&str, f64)>| metrics.iter().find(|m| m.0 == "demos/weight").expect("a weight").1;
+        (0..2).map(|_| weight(training.iterate().metrics)).collect()
+    };
+    let later = weights(&Request { steps: 0, ..known.clone() }, known.steps);
+    assert_eq!(later, weights(&known, known.steps));
+    assert!(later[1] > 1e-3, "{later:?}");
+}

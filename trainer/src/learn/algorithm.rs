@@ -149,7 +149,7 @@ impl FromStr for Algorithm {
         if let Some(e) = ALGORITHMS.iter().find(|e| e.name == name) {
             return Ok(e.algorithm);
         }
-        let alike = |e: &AlgorithmEntry| (strsim::jaro_winkler(e.name, &name.to_lowercase()), e.name);
+        let alike = |e: &AlgorithmEntry| (strsim::jaro(e.name, &name.to_lowercase()), e.name);
         let near =
             ALGORITHMS.iter().map(alike).max_by(|a, b| a.0.total_cmp(&b.0)).filter(|(score, _)| *score > 0.7);
         Err(UnknownAlgorithm {

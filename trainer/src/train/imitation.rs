@@ -18,9 +18,15 @@ pub(super) struct Imitation {
     state: Vec<usize>,
     /// Batches from which the inverse model alone learns, after the first.
     warm_ups: u64,
-    /// Updates of the run.
+    /// Updates of the run, and steps of each.
     updates: u64,
+    batch: u64,
     begins_in_frames: bool,
+}
+
+/// Updates of a run of `steps` whose batches have `batch`, after `warm_ups` and the first.
+fn updates(steps: u64, batch: u64, warm_ups: u64) -> u64 {
+    (steps / batch).saturating_sub(warm_ups + 1)
 }
 
 impl Imitation {
@@ -68,9 +74,15 @@ impl Imitation {
             settings: own,
             state: state.to_vec(),
             warm_ups,
-            updates: (steps / batch).saturating_sub(warm_ups + 1),
+            updates: updates(steps, batch, warm_ups),
+            batch,
             begins_in_frames: !is_dapg,
         }))
+    }
+
+    /// The run ends after `steps` in all.
+    pub(super) fn extend(&mut self, steps: u64) {
+        self.updates = updates(steps, self.batch, self.warm_ups);
     }
 
     /// Lets episodes begin in the demonstrations' states.

@@ -207,7 +207,7 @@ impl Names {
     }
 
     fn near(&self, name: &str) -> String {
-        let scored = self.0.iter().map(|(n, _)| (strsim::jaro_winkler(n, name), n));
+        let scored = self.0.iter().map(|(n, _)| (strsim::jaro(n, name), n));
         match scored.max_by(|a, b| a.0.total_cmp(&b.0)) {
             Some((score, near)) if score > 0.75 => format!("; did you mean '{near}'?"),
             _ => {

@@ -174,7 +174,7 @@ impl Draw {
             return Ok(Draw { kind, entries: kind.all(model, names.len()), together: true, of });
         }
         let at = names.iter().position(|name| name == entry).ok_or_else(|| {
-            let near = names.iter().map(|name| (strsim::jaro_winkler(name, entry), name));
+            let near = names.iter().map(|name| (strsim::jaro(name, entry), name));
             let near = near
                 .max_by(|a, b| a.0.total_cmp(&b.0))
                 .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));

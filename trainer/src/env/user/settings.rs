@@ -146,7 +146,7 @@ fn entry(joints: &[Joint], name: &str, velocity: bool) -> Result<usize, String> 
     if let Some((_, index)) = known.iter().find(|(known, _)| known == name) {
         return Ok(*index);
     }
-    let near = known.iter().map(|(known, _)| (strsim::jaro_winkler(known, name), known));
+    let near = known.iter().map(|(known, _)| (strsim::jaro(known, name), known));
     let near = near
         .max_by(|a, b| a.0.total_cmp(&b.0))
         .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));

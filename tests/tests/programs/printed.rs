@@ -1,0 +1,49 @@
+//! What commands print about limits and returns, read as a user reads it.
+
+use crate::common::*;
+use nearl_runtime::link::{RobotName, remove_files};
+use serde_json::Value;
+
+fn text(process: Process) -> String {
+    let output = process.output();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).expect("text")
+}
+
+/// A policy of actions breaks no limit of a projection that there is not: the run says so in place of "0 broken".
+#[test]
+fn a_run_without_a_projection_says_that_nothing_was_projected() {
+    let name = format!("unprojected-{}", std::process::id());
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("hopper.safetensors");
+    nearl_tests::training("Hopper-v5", "ppo", 1, 1, &[]).snapshot().save(&file).expect("a snapshot");
+    let file = file.to_str().expect("UTF-8");
+    let plant = Process::nearl(&["plant", "Hopper-v5", "--name", &name, "--lockstep"]);
+    let printed = text(Process::nearl(&["run", file, "--plant", &name, "--seconds", "0.5"]));
+    plant.signal(libc::SIGTERM);
+    plant.output();
+    let again = Process::nearl(&["plant", "Hopper-v5", "--name", &name, "--lockstep", "--json"]);
+    let json = Process::nearl(&["run", file, "--plant", &name, "--seconds", "0.5", "--json"]).json();
+    again.end();
+    remove_files(&RobotName::new(&name).expect("a name"));
+    let line = printed.lines().find(|line| line.contains("limits broken")).expect("a line about limits");
+    assert!(line.contains("nothing was projected") && !line.contains("projected 0"), "{line}");
+    assert_eq!(json["counters"]["unprojected"], json["modes"]["active"], "{json}");
+}
+
+/// The table of `nearl eval` has the mean and the spread of the returns that its JSON lists.
+#[test]
+fn an_evaluation_prints_mean_and_spread() {
+    let panda = panda();
+    let arguments = ["eval", panda.to_str().expect("UTF-8"), "--episodes", "3", "--compare", "raw"];
+    let printed = text(Process::nearl(&arguments));
+    let json: Value =
+        serde_json::from_str(&text(Process::nearl(&[&arguments[..], &["--json"]].concat()))).expect("JSON");
+    let returns: Vec<f64> =
+        json[0]["returns"].as_array().expect("returns").iter().filter_map(Value::as_f64).collect();
+    let mean = returns.iter().sum::<f64>() / 3.0;
+    let spread = (returns.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / 2.0).sqrt();
+    let row = printed.lines().find(|line| line.starts_with("raw ")).expect("a row");
+    let words: Vec<&str> = row.split_whitespace().collect();
+    assert_eq!(words[1..4], [format!("{mean:.1}").as_str(), "±", format!("{spread:.1}").as_str()], "{row}");
+}
