@@ -60,8 +60,7 @@ fn corpus_is_of_the_present_format() {
 fn write_all() {
     write("snapshot", "deterministic", &snapshot(1, |_| {}).to_bytes());
     write("snapshot", "stochastic", &stochastic(2).to_bytes());
-    let mut learned = snapshot(3, |m| m.task.idm.kind = nearl_runtime::task::IdmKind::Learned);
-    learned.networks.idm = Some((learned.networks.policy.clone(), vec![0.0; 2 * N]));
+    let learned = nearl_tests::training("Hopper-v5", "pid2-ib", 3, 1, &[]).snapshot().clone();
     write("snapshot", "learned-inverse", &learned.to_bytes());
     let rows = "rows = [{ name = \"sum\", terms = { \"q.panda_joint1\" = 1.0, \"v.panda_joint2\" = -0.5 }, lower = -1.0, upper = 1.0, braking = 2.0, soft = { linear = 1.0, quadratic = 10.0 } }]";
     let more = "jerk = { limit = 500.0 }\ntorque_rate = { limit = 1000.0 }\nenergy = { limit = 2.0 }\nlocked = [\"panda_joint7\"]\nvelocity_profile = \"fr3\"";

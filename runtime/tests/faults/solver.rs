@@ -2,7 +2,7 @@
 
 use nearl_constraints::limit::UserRowSettings;
 use nearl_constraints::{
-    BrakeReason, Kind, Projector, Proposal, Rung, Settings, Soft, Solver, Status, Target,
+    BrakeReason, Braking, Kind, Projector, Proposal, Rung, Settings, Soft, Solver, Status, Target,
 };
 use nearl_runtime::codes::LedgerStatus;
 use nearl_runtime::controller::Parts;
@@ -91,6 +91,7 @@ fn fault_06_an_answer_cut_by_cap_or_deadline_is_used_only_if_the_checker_accepts
         let mut cap = 0;
         let (mut capped, start) = panda_projector(|s| {
             s.solver = Solver::Clarabel;
+            s.braking = Braking::Certified; // a stored brake finds a nearer state in place of this brake
             cut(s);
             cap = s.max_iter;
         });

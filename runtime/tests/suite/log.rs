@@ -43,13 +43,15 @@ with open(sys.argv[1], "rb") as f:
     reader = make_reader(f)
     metadata = [m for m in reader.iter_metadata()]
     assert metadata[0].metadata["digest"] == "abc", metadata
-    ticks, q, v = [], 1.0, 0.0
-    for schema, channel, message in reader.iter_messages(topics=["tick"]):
-        assert (schema.name, schema.encoding, channel.message_encoding) == ("nearl.Tick", "jsonschema", "json")
+    ticks, mode, q, v = [], "none", 1.0, 0.0
+    names = {"tick": "nearl.Tick", "brief": "nearl.Brief"}
+    for schema, channel, message in reader.iter_messages(topics=list(names)):
+        assert (schema.name, schema.encoding, channel.message_encoding) == (names[channel.topic], "jsonschema", "json")
         m = json.loads(message.data)
         ticks.append(m["tick"])
-        if m["mode"] == "active":
-            assert m["state"]["q"] == [q] and m["state"]["v"] == [v] and m["action"] == [-q], (m, q, v)
+        mode = m.get("mode", mode)  # a busy disk leaves what replay computes out, not the state
+        if mode == "active":
+            assert m["state"]["q"] == [q] and m["state"]["v"] == [v] and m.get("action", [-q]) == [-q], (m, q, v)
             v += -q * 1e-3
             q += v * 1e-3
     assert ticks == list(range(1, len(ticks) + 1)), "ticks are missing"
