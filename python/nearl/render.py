@@ -33,6 +33,12 @@ class Renderer:
         try:
             import mujoco
 
+            if backend == "egl":
+                # Whoever imported mujoco before the variable was set has chosen another context, or none.
+                from mujoco.egl import GLContext
+                from mujoco.rendering.classic import gl_context
+
+                gl_context.GLContext = GLContext
             self._mujoco = mujoco
             self._model = mujoco.MjModel.from_xml_string(env.model_text)
             self._model.vis.global_.offwidth, self._model.vis.global_.offheight = size
