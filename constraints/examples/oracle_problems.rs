@@ -6,7 +6,11 @@
 //! (frame speed, kinetic energy, torque limits): states, proposals and targets of COUNT ticks in which a row or a cone held the
 //! target back. One JSON object a line; nothing of our matrices is written.
 
+#[path = "../src/random.rs"]
+mod random;
+
 use nearl_constraints::*;
+use random::Random;
 use serde_json::json;
 use std::error::Error;
 use std::io::Write;
@@ -27,23 +31,6 @@ const CASES: [Case; 7] = [
     Case("g1", "scale = 0.1", 200.0, 0.9, "left_wrist_yaw_link", 0.8, 1.0),
     Case("simple_humanoid", "scale = 0.5", 100.0, 0.9, "l_wrist", 0.5, 1.0),
 ];
-
-/// Seeded uniform numbers (splitmix64).
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.next()
-    }
-}
 
 /// The `[constraints]` section of a case.
 fn constraints(case: &Case, model: &Model, cones: bool) -> String {

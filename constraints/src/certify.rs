@@ -1,5 +1,6 @@
 //! Is the braking that the viability box counts on within the motors' reach?
 
+use crate::random::Random;
 use crate::viability::{Dof, Period};
 use crate::{Dynamics, LimitError, LimitSet, Model};
 
@@ -76,7 +77,7 @@ struct Search<'a> {
     model: &'a Model,
     period: &'a Period,
     dynamics: Dynamics,
-    random: u64,
+    random: Random,
     q: Vec<f64>,
     v: Vec<f64>,
     motors: Vec<f64>,
@@ -109,7 +110,7 @@ impl<'a> Search<'a> {
             model,
             period,
             dynamics: Dynamics::new(model),
-            random: seed,
+            random: Random(seed),
             q: model.neutral(),
             v: zero.clone(),
             motors: vec![0.0; nv * nv],
@@ -149,25 +150,16 @@ impl<'a> Search<'a> {
                 let or = |x: f64, otherwise: f64| if x.is_finite() { x } else { otherwise };
                 let low = or(self.limits.q_lower[i], -std::f64::consts::PI);
                 let high = or(self.limits.q_upper[i], std::f64::consts::PI);
-                let share = (1.1 * self.uniform() - 0.05).clamp(0.0, 1.0);
+                let share = (1.1 * self.random.next() - 0.05).clamp(0.0, 1.0);
                 let q = low + share * (high - low);
                 self.q[joint.idx_q] = q;
                 let dof = Dof::of(self.limits, i);
                 let a = dof.braking(self.period);
-                let room = if self.uniform() < 0.5 { dof.upper - q } else { q - dof.lower };
+                let room = if self.random.next() < 0.5 { dof.upper - q } else { q - dof.lower };
                 reach = v_max.min((2.0 * a * room.max(0.0)).sqrt() + 0.5 * a * self.period.tau);
             }
-            let share = (4.0 * self.uniform() - 2.0).clamp(-1.0, 1.0);
+            let share = self.random.between(-2.0, 2.0).clamp(-1.0, 1.0);
             self.v[i] = share * reach;
         }
-    }
-
-    /// Seeded uniform number in [0, 1) (splitmix64, Steele, Lea and Flood 2014).
-    fn uniform(&mut self) -> f64 {
-        self.random = self.random.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.random;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
     }
 }

@@ -62,6 +62,7 @@ mod model;
 mod period_dynamics;
 mod pinocchio;
 mod projector;
+mod random;
 pub mod row;
 mod target;
 mod urdf;

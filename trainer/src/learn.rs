@@ -41,7 +41,7 @@ pub use dapg::Dapg;
 pub use epochs::Pace;
 pub use gae::{Advantages, advantages};
 pub use gaussian::MOST_OUTPUTS;
-pub use imitation::Imitator;
+pub use imitation::{Base, Imitating, Imitator, Method, Seen};
 pub use inverse::Reading;
 pub use nearl::{Nearl, NearlSettings};
 pub use net::{Net, Tape};

@@ -8,10 +8,13 @@
 
 mod attacker;
 mod meter;
+#[path = "../../src/random.rs"]
+mod random;
 mod run;
 mod scene;
 
 use nearl_constraints::*;
+use random::Random;
 use run::{Seen, attack};
 use scene::{KINDS, Scene};
 use std::error::Error;

@@ -4,3 +4,5 @@ pub mod attacker;
 pub mod meter;
 pub mod run;
 pub mod scene;
+
+use crate::common::Random;

@@ -1,28 +1,12 @@
 //! Closed loop against an adversarial policy: the box is never empty and no position, sub-step positions included, is
 //! beyond its limit.
 
+use crate::common::Random;
 use nearl_constraints::viability::{Dof, Period, interval};
 use nearl_constraints::{
     AccelerationLimit, Limit, Model, PositionLimit, Projector, Proposal, Settings, Target, VelocityLimit,
 };
 use std::path::Path;
-
-/// Seeded uniform numbers (splitmix64).
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.next()
-    }
-}
 
 /// Moves one period with constant acceleration; returns the state and the extreme positions on the way.
 fn advance(q: f64, v: f64, a: f64, p: &Period) -> (f64, f64, f64, f64) {

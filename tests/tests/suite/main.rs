@@ -10,6 +10,7 @@ mod env_suite;
 mod guard;
 mod imitation;
 mod import;
+mod leg;
 mod limits_in_simulator;
 mod meters;
 mod networks;

@@ -1,31 +1,14 @@
 //! What an episode of a task of one's own draws: random robots beside MuJoCo's own fields and a file that states them, noise and delay beside
 //! arithmetic, a curriculum by hand, and a value that sees more than the policy.
 
-use std::path::Path;
-
-use nearl_tests::{request, training};
-use nearl_trainer::env::{self, Env};
+use crate::leg::{columns_of_a_run_that_resumes_bit_for_bit, env_of, fixture, leg, refuses_each};
+use nearl_tests::training;
+use nearl_trainer::env::Env;
 use nearl_trainer::rollout::{Worker, make_env, stream};
-use nearl_trainer::tasks;
-use nearl_trainer::train::{resume, train};
-
-fn fixture(name: &str) -> std::path::PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures").join(name)
-}
-
-fn leg() -> String {
-    fixture("leg.toml").display().to_string()
-}
 
 const CALM: [&str; 4] = ["commands={}", "pushes={}", "termination={}", "reward={ alive = 1.0 }"];
 const SEEN: &str =
     "state.observation=[\"q.hip\", \"q.knee\", \"v.hip\", \"v.knee\", \"gravity.x\", \"base.wx\"]";
-
-fn env_of(task: &str, more: &[&str]) -> Box<dyn Env> {
-    let set: Vec<String> = more.iter().map(|s| (*s).to_string()).collect();
-    let manifest = tasks::load(task, &set).unwrap_or_else(|e| panic!("{e}"));
-    env::of_task(&manifest, "leg").unwrap_or_else(|e| panic!("{e}"))
-}
 
 fn calm(more: &[&str]) -> Box<dyn Env> {
     env_of(&leg(), &[&CALM[..], &[SEEN], more].concat())
@@ -254,26 +237,10 @@ const ALL: [&str; 11] = [
 
 #[test]
 fn a_resumed_training_draws_what_the_whole_one_did() {
-    let folder = tempfile::tempdir().expect("folder");
-    let (whole, parts) = (folder.path().join("whole"), folder.path().join("parts"));
-    let mut asked = request(&leg(), "ppo", 5, 1, &ALL);
-    asked.steps = 5 * 17 * 32;
-    train(&asked, &whole, |_, _| true).expect("uninterrupted");
-    let mut left = 3;
-    let mut few = asked.clone();
-    few.threads = 2;
-    train(&few, &parts, |_, _| {
-        left -= 1;
-        left > 0
-    })
-    .expect("first part");
-    resume(&parts, None, 1, |_, _| true).expect("resume");
-    let last = |run: &Path| std::fs::read(run.join("checkpoints/final.safetensors")).expect("final");
-    assert!(last(&whole) == last(&parts), "other weights after resuming");
-    let text = std::fs::read_to_string(parts.join("metrics.csv")).expect("metrics");
+    let columns = columns_of_a_run_that_resumes_bit_for_bit(&ALL);
     for column in ["random/mass", "random/action_delay", "curriculum/level", "metrics/miss", "metrics/torque"]
     {
-        assert!(text.lines().next().is_some_and(|l| l.split(',').any(|c| c == column)), "{column}");
+        assert!(columns.iter().any(|c| c == column), "{column} is not among {columns:?}");
     }
 }
 
@@ -317,11 +284,5 @@ const MISTAKES: &[(&str, &[&str])] = &[
 
 #[test]
 fn mistakes_are_named_with_their_key() {
-    for (set, says) in MISTAKES {
-        let message = match tasks::load(&leg(), &[(*set).to_string()]) {
-            Ok(_) => panic!("{set} is taken"),
-            Err(e) => e.to_string(),
-        };
-        says.iter().for_each(|part| assert!(message.contains(part), "'{part}' is not in: {message}"));
-    }
+    refuses_each(MISTAKES);
 }

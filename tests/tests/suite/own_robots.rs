@@ -1,28 +1,19 @@
 //! Tasks of one's own on floating robots with drives: what is measured of them by hand arithmetic, what training sees by the runtime's own
 //! controller, and everything that is drawn by its seed.
 
-use std::path::Path;
-
+use crate::leg::{columns_of_a_run_that_resumes_bit_for_bit, env_of, leg, refuses_each};
 use nearl_runtime::{Controller, State};
-use nearl_tests::{request, training};
-use nearl_trainer::env::{self, Env};
+use nearl_tests::training;
+use nearl_trainer::env::Env;
 use nearl_trainer::rollout::{Worker, make_env, stream};
-use nearl_trainer::tasks;
-use nearl_trainer::train::{resume, train};
 use rand::RngExt;
-
-fn leg() -> String {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/leg.toml").display().to_string()
-}
 
 /// The leg with the expressions of `observed` as its observation.
 fn leg_observing(observed: &[&str], more: &[&str]) -> Box<dyn Env> {
     let list: Vec<String> =
         ["q.hip", "v.hip", "q.knee", "v.knee"].iter().chain(observed).map(|e| format!("\"{e}\"")).collect();
-    let mut set = vec![format!("state.observation=[{}]", list.join(", "))];
-    set.extend(more.iter().map(|s| (*s).to_string()));
-    let manifest = tasks::load(&leg(), &set).unwrap_or_else(|e| panic!("{e}"));
-    env::of_task(&manifest, "leg").unwrap_or_else(|e| panic!("{e}"))
+    let observation = format!("state.observation=[{}]", list.join(", "));
+    env_of(&leg(), &[&[observation.as_str()], more].concat())
 }
 
 fn seen(env: &dyn Env) -> Vec<f64> {
@@ -200,25 +191,10 @@ fn look(env: &dyn Env, state: &mut State) {
 /// History, last action, commands, pushes and whatever else an episode draws.
 #[test]
 fn a_resumed_training_is_the_whole_one_bit_for_bit() {
-    let folder = tempfile::tempdir().expect("folder");
-    let (whole, parts) = (folder.path().join("whole"), folder.path().join("parts"));
-    let mut asked =
-        request(&leg(), "ppo", 5, 1, &["train.n_steps=17", "train.n_envs=32", "train.ppo.batch_size=32"]);
-    asked.steps = 5 * 17 * 32;
-    train(&asked, &whole, |_, _| true).expect("uninterrupted");
-    let mut left = 3;
-    train(&asked, &parts, |_, _| {
-        left -= 1;
-        left > 0
-    })
-    .expect("first part");
-    resume(&parts, None, 2, |_, _| true).expect("resume");
-    let last = |run: &Path| std::fs::read(run.join("checkpoints/final.safetensors")).expect("final");
-    assert!(last(&whole) == last(&parts), "other weights after resuming");
-    let text = std::fs::read_to_string(whole.join("metrics.csv")).expect("metrics");
-    let header = text.lines().next().expect("header");
+    let set = ["train.n_steps=17", "train.n_envs=32", "train.ppo.batch_size=32"];
+    let columns = columns_of_a_run_that_resumes_bit_for_bit(&set);
     for column in ["reward/alive", "reward/track", "reward/air", "reward/effort"] {
-        assert!(header.split(',').any(|c| c == column), "{header}");
+        assert!(columns.iter().any(|c| c == column), "{column} is not among {columns:?}");
     }
 }
 
@@ -298,11 +274,5 @@ const MISTAKES: &[(&str, &[&str])] = &[
 
 #[test]
 fn mistakes_are_named_with_their_key() {
-    for (set, says) in MISTAKES {
-        let message = match tasks::load(&leg(), &[(*set).to_string()]) {
-            Ok(_) => panic!("{set} is taken"),
-            Err(e) => e.to_string(),
-        };
-        says.iter().for_each(|part| assert!(message.contains(part), "'{part}' is not in: {message}"));
-    }
+    refuses_each(MISTAKES);
 }

@@ -1,27 +1,7 @@
 //! Proposals of somebody who wants a limit broken.
 
+use crate::random::Random;
 use nearl_runtime::constraints::{Dynamics, LimitSet, Model, Proposal};
-
-/// Seeded uniform numbers (splitmix64, Steele, Lea and Flood 2014).
-pub(crate) struct Random(pub(crate) u64);
-
-impl Random {
-    pub(crate) fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    pub(crate) fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.next()
-    }
-
-    pub(crate) fn below(&mut self, n: usize) -> usize {
-        (self.next() * n as f64) as usize
-    }
-}
 
 /// Kinds of attack.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -137,8 +117,8 @@ impl<'a> Attack<'a> {
 
     fn gradient(&mut self, tick: usize, q: &[f64], v: &[f64], out: &mut Proposal) {
         if tick.is_multiple_of(400) {
-            self.objective = self.random.below(4);
-            self.joint = self.random.below(self.n);
+            self.objective = below(&mut self.random, 4);
+            self.joint = below(&mut self.random, self.n);
             self.sign = if self.random.next() < 0.5 { -1.0 } else { 1.0 };
         }
         self.dynamics.mass(q, &mut self.mass);
@@ -175,7 +155,7 @@ impl<'a> Attack<'a> {
             [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e300, -1e300, 1e12, f64::MIN_POSITIVE];
         self.bang_bang(tick, q, out);
         if self.burst == 0 && self.random.next() < 1.0 / 40.0 {
-            self.burst = 1 + self.random.below(20);
+            self.burst = 1 + below(&mut self.random, 20);
         }
         if self.burst == 0 {
             return;
@@ -184,7 +164,11 @@ impl<'a> Attack<'a> {
         let finite = self.random.next() < 0.5;
         for k in 0..2 * self.n {
             if self.random.next() < 0.3 {
-                let bad = BAD[if finite { 3 + self.random.below(4) } else { self.random.below(BAD.len()) }];
+                let bad = BAD[if finite {
+                    3 + below(&mut self.random, 4)
+                } else {
+                    below(&mut self.random, BAD.len())
+                }];
                 if k < self.n { out.q[k] = bad } else { out.v[k - self.n] = bad }
             }
         }
@@ -197,4 +181,9 @@ impl<'a> Attack<'a> {
     fn width(&self, i: usize) -> f64 {
         self.limits.q_upper[i] - self.limits.q_lower[i]
     }
+}
+
+/// A whole number below `n`.
+fn below(random: &mut Random, n: usize) -> usize {
+    (random.next() * n as f64) as usize
 }

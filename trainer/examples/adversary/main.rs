@@ -8,10 +8,13 @@
 //! inverse dynamics of the target. What is counted is the simulator's own state, against the limits of the robot file.
 
 mod attack;
+#[path = "../../../constraints/src/random.rs"]
+mod random;
 mod victim;
 
-use attack::{Attack, Kind, Random};
+use attack::{Attack, Kind};
 use nearl_runtime::constraints::{BrakeReason, Braking, Dynamics, Proposal, Status, Target};
+use random::Random;
 use serde_json::json;
 use std::collections::BTreeMap;
 use std::error::Error;

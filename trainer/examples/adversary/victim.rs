@@ -1,6 +1,6 @@
 //! A robot with its limits, twice: the projector's model and MuJoCo's plant.
 
-use crate::attack::Random;
+use crate::random::Random;
 use nearl_runtime::constraints::limit::AccelerationSettings;
 use nearl_runtime::constraints::*;
 use nearl_trainer::mj;

@@ -11,8 +11,9 @@ use super::batch::Batch;
 use super::gaussian::gather;
 use super::net::{Net, Tape};
 use super::optimise::{Group, Params, Phases, Rows, Schedule, TILE, Tile, add_sums, optimise};
-use super::{Adam, Metrics};
+use super::{Adam, Learner, Metrics, Pace};
 use crate::demos::DemoSettings;
+use nearl_runtime::Networks;
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, ZERO};
 use nearl_runtime::normaliser::Normaliser;
@@ -29,6 +30,93 @@ pub trait Imitator {
     fn pretrain(&mut self, rng: &mut ChaCha8Rng) -> Metrics;
     /// Changes the first and last layers so that what goes out stays the same in the robot's units.
     fn rescale(&mut self, from: &Normaliser, to: &Normaliser);
+}
+
+/// A learner as the imitating algorithms take it for their networks.
+pub trait Base: Learner {
+    /// Learns the inverse model alone.
+    fn learn_inverse(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics;
+    /// Behaviour cloning: the policy takes on what the demonstrations have where it puts out states, or actions.
+    fn clone_demos(&mut self, demos: &Batch, settings: &DemoSettings, rng: &mut ChaCha8Rng) -> Metrics;
+    /// See [`Imitator::rescale`].
+    fn rescale(&mut self, from: &Normaliser, to: &Normaliser);
+}
+
+/// Demonstrations as an update finds them.
+#[derive(Default)]
+pub struct Seen {
+    /// Rows in the units of the batch.
+    pub demos: Batch,
+    /// What a row of them weighs in the policy gradient beside one of the batch.
+    pub weight: f64,
+}
+
+/// How an imitating algorithm uses a batch and the demonstrations: what it has of its own.
+pub trait Method: Send + Sized {
+    /// What holds its networks.
+    type Base: Base;
+    /// Learns from a batch; see [`Learner::update`].
+    fn update(
+        imitating: &mut Imitating<Self>,
+        batch: &mut Batch,
+        pace: Pace,
+        rng: &mut ChaCha8Rng,
+    ) -> Metrics;
+    /// Learns from the demonstrations alone, once.
+    fn pretrain(imitating: &mut Imitating<Self>, rng: &mut ChaCha8Rng) -> Metrics {
+        let Imitating { base, settings, seen } = imitating;
+        base.clone_demos(&seen.demos, settings, rng)
+    }
+}
+
+/// The learner of a [`Method`].
+pub struct Imitating<M: Method> {
+    pub(super) base: M::Base,
+    pub(super) settings: DemoSettings,
+    pub(super) seen: Seen,
+}
+
+impl<M: Method> Imitating<M> {
+    /// With the networks of `base`.
+    pub fn new(base: M::Base, settings: DemoSettings) -> Self {
+        Self { base, settings, seen: Seen::default() }
+    }
+}
+
+impl<M: Method> Learner for Imitating<M> {
+    fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
+        M::update(self, batch, pace, rng)
+    }
+    fn networks(&self, normaliser: &Normaliser) -> Networks {
+        self.base.networks(normaliser)
+    }
+    fn params(&self) -> &Params {
+        self.base.params()
+    }
+    fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
+        self.base.restore(f)
+    }
+    fn values(&mut self, x: &[f32]) -> Vec<f32> {
+        self.base.values(x)
+    }
+    fn imitator(&mut self) -> Option<&mut dyn Imitator> {
+        Some(self)
+    }
+}
+
+impl<M: Method> Imitator for Imitating<M> {
+    fn see(&mut self, demos: Batch, weight: f64) {
+        self.seen = Seen { demos, weight };
+    }
+    fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
+        self.base.learn_inverse(batch, rng)
+    }
+    fn pretrain(&mut self, rng: &mut ChaCha8Rng) -> Metrics {
+        M::pretrain(self, rng)
+    }
+    fn rescale(&mut self, from: &Normaliser, to: &Normaliser) {
+        self.base.rescale(from, to);
+    }
 }
 
 /// Column of the squared error of behaviour cloning, an entry.

@@ -3,7 +3,9 @@
 
 use super::nearl::{Nearl, NearlSettings};
 use super::pid2::{Pid2, Pid2Settings};
-use super::{Batch, Bc, Dapg, Dims, Kind, Learner, NetSettings, Pace, Pid2Il, Ppo, PpoSettings, Soil};
+use super::{
+    Base, Batch, Bc, Dapg, Dims, Imitating, Kind, Learner, NetSettings, Pace, Pid2Il, Ppo, PpoSettings, Soil,
+};
 use crate::demos::DemoSettings;
 use nearl_runtime::Networks;
 use nearl_runtime::net::{Activation, Forward};
@@ -216,7 +218,7 @@ fn bc_recovers_the_known_shift() {
     let (n, mut rng) = (affine(), crate::rollout::stream(4, 0));
     let settings = Pid2Settings { idm_lr: 1e-2, ..Pid2Settings::default() };
     let pid2 = Pid2::new(dims, &n, ppo, settings, DETERMINISTIC, true, 1, &mut rng);
-    let mut bc = Bc::new(pid2, demos);
+    let mut bc = Imitating::<Bc>::new(pid2, demos);
     let normaliser = Normaliser::identity(2, 2);
     let actor = |l: &dyn Learner| Actor {
         kind: Some(DETERMINISTIC),
@@ -266,19 +268,22 @@ fn dapg_soil_and_pid2_il_solve_it() {
         imitator.pretrain(rng);
         learner
     };
-    let dapg =
-        train(None, &n, 40, |d, s, rng| with(Box::new(Dapg::new(Ppo::new(d, &n, s, 1, rng), demos())), rng));
+    let dapg = train(None, &n, 40, |d, s, rng| {
+        with(Box::new(Imitating::<Dapg>::new(Ppo::new(d, &n, s, 1, rng), demos())), rng)
+    });
     assert!(dapg.0 < 0.1, "cloned actions are good from the first: {dapg:?}");
     assert!(dapg.1 < 0.01, "{dapg:?}");
     solves(
         "soil",
-        train(None, &n, 40, |d, s, rng| with(Box::new(Soil::new(Ppo::new(d, &n, s, 1, rng))), rng)),
+        train(None, &n, 40, |d, s, rng| {
+            with(Box::new(Imitating::<Soil>::new(Ppo::new(d, &n, s, 1, rng), demos())), rng)
+        }),
     );
     solves(
         "pid2-il",
         train(Some(DETERMINISTIC), &n, 50, |d, s, rng| {
             let pid2 = Pid2::new(d, &n, s, Pid2Settings::default(), DETERMINISTIC, true, 1, rng);
-            with(Box::new(Pid2Il::new(pid2, demos())), rng)
+            with(Box::new(Imitating::<Pid2Il>::new(pid2, demos())), rng)
         }),
     );
 }

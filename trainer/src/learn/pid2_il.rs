@@ -9,71 +9,20 @@
 //!
 //! Episodes begin in frames of the demonstrations now and then (`train.demos.resets`).
 
-use super::epochs::Pace;
-use super::imitation::Imitator;
-use super::{Batch, Learner, Metrics, Params, Pid2};
-use crate::demos::DemoSettings;
-use nearl_runtime::Networks;
-use nearl_runtime::normaliser::Normaliser;
+use super::imitation::{Imitating, Method};
+use super::{Batch, Learner, Metrics, Pace, Pid2};
 use rand_chacha::ChaCha8Rng;
 
-/// The learner.
-pub struct Pid2Il {
-    pid2: Pid2,
-    settings: DemoSettings,
-    demos: Batch,
-}
+/// The method, on PID^2.
+pub struct Pid2Il;
 
-impl Pid2Il {
-    /// With a fresh PID^2.
-    pub fn new(pid2: Pid2, settings: DemoSettings) -> Self {
-        Self { pid2, settings, demos: Batch::default() }
-    }
-}
+impl Method for Pid2Il {
+    type Base = Pid2;
 
-impl Learner for Pid2Il {
-    fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
-        if self.settings.in_discriminator {
-            self.pid2.unite(batch, &self.demos, rng);
+    fn update(l: &mut Imitating<Self>, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
+        if l.settings.in_discriminator {
+            l.base.unite(batch, &l.seen.demos, rng);
         }
-        self.pid2.update(batch, pace, rng)
-    }
-
-    fn networks(&self, normaliser: &Normaliser) -> Networks {
-        self.pid2.networks(normaliser)
-    }
-
-    fn params(&self) -> &Params {
-        self.pid2.params()
-    }
-
-    fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
-        self.pid2.restore(f)
-    }
-
-    fn values(&mut self, x: &[f32]) -> Vec<f32> {
-        self.pid2.values(x)
-    }
-
-    fn imitator(&mut self) -> Option<&mut dyn Imitator> {
-        Some(self)
-    }
-}
-
-impl Imitator for Pid2Il {
-    fn see(&mut self, demos: Batch, _: f64) {
-        self.demos = demos;
-    }
-
-    fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
-        self.pid2.learn_inverse(batch, rng)
-    }
-
-    fn pretrain(&mut self, rng: &mut ChaCha8Rng) -> Metrics {
-        self.pid2.clone_states(&self.demos, &self.settings, rng)
-    }
-
-    fn rescale(&mut self, from: &Normaliser, to: &Normaliser) {
-        self.pid2.rescale(from, to);
+        l.base.update(batch, pace, rng)
     }
 }

@@ -7,74 +7,28 @@
 //!                  g = sum_own A grad log pi(a | s) + sum_demo lambda0 lambda1^k grad log pi(a | s)
 //! ```
 
-use super::epochs::Pace;
-use super::imitation::Imitator;
-use super::{Batch, Learner, Metrics, Params, Ppo};
-use nearl_runtime::Networks;
-use nearl_runtime::normaliser::Normaliser;
+use super::imitation::{Base, Imitating, Method};
+use super::{Batch, Metrics, Pace, Ppo};
 use rand_chacha::ChaCha8Rng;
 
-/// The learner.
-pub struct Soil {
-    ppo: Ppo,
-    demos: Batch,
-    weight: f64,
-}
+/// The method, on PPO.
+pub struct Soil;
 
-impl Soil {
-    /// With a fresh PPO.
-    pub fn new(ppo: Ppo) -> Self {
-        Self { ppo, demos: Batch::default(), weight: 0.0 }
-    }
-}
+impl Method for Soil {
+    type Base = Ppo;
 
-impl Learner for Soil {
-    fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
-        let inverse = self.ppo.learn_inverse(batch, rng);
-        let mut demos = self.demos.clone();
-        self.ppo.relabel(&mut demos);
-        self.ppo.augment(demos, self.weight, batch.n, rng);
-        let mut metrics = self.ppo.update_policy(batch, pace, rng);
+    fn update(l: &mut Imitating<Self>, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
+        let inverse = l.base.learn_inverse(batch, rng);
+        let mut demos = l.seen.demos.clone();
+        l.base.relabel(&mut demos);
+        l.base.augment(demos, l.seen.weight, batch.n, rng);
+        let mut metrics = l.base.update_policy(batch, pace, rng);
         metrics.extend(inverse);
         metrics
     }
 
-    fn networks(&self, normaliser: &Normaliser) -> Networks {
-        self.ppo.networks(normaliser)
-    }
-
-    fn params(&self) -> &Params {
-        self.ppo.params()
-    }
-
-    fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
-        self.ppo.restore(f)
-    }
-
-    fn values(&mut self, x: &[f32]) -> Vec<f32> {
-        self.ppo.values(x)
-    }
-
-    fn imitator(&mut self) -> Option<&mut dyn Imitator> {
-        Some(self)
-    }
-}
-
-impl Imitator for Soil {
-    fn see(&mut self, demos: Batch, weight: f64) {
-        (self.demos, self.weight) = (demos, weight);
-    }
-
-    fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
-        self.ppo.learn_inverse(batch, rng)
-    }
-
     /// Without actions there is nothing to clone yet.
-    fn pretrain(&mut self, _: &mut ChaCha8Rng) -> Metrics {
+    fn pretrain(_: &mut Imitating<Self>, _: &mut ChaCha8Rng) -> Metrics {
         Metrics::new()
-    }
-
-    fn rescale(&mut self, from: &Normaliser, to: &Normaliser) {
-        self.ppo.rescale(from, to);
     }
 }

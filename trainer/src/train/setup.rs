@@ -3,7 +3,8 @@
 use super::{Experience, TrainError};
 use crate::env::{Env, Spec};
 use crate::learn::{
-    Algorithm, Bc, Dapg, Dims, Gradient, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Pid2Il, Ppo, Soil,
+    Algorithm, Bc, Dapg, Dims, Gradient, Imitating, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Pid2Il, Ppo,
+    Soil,
 };
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
@@ -43,10 +44,10 @@ pub(super) fn learner(
         Algorithm::Nearl => nearl(settings.nearl.clone(), rng),
         Algorithm::Pid2Gan => Box::new(pid2(false, rng)),
         Algorithm::Pid2Ib => Box::new(pid2(true, rng)),
-        Algorithm::Bc => Box::new(Bc::new(pid2(true, rng), demos)),
-        Algorithm::Soil => Box::new(Soil::new(direct(rng))),
-        Algorithm::Dapg => Box::new(Dapg::new(direct(rng), demos)),
-        Algorithm::Pid2Il => Box::new(Pid2Il::new(pid2(true, rng), demos)),
+        Algorithm::Bc => Box::new(Imitating::<Bc>::new(pid2(true, rng), demos)),
+        Algorithm::Soil => Box::new(Imitating::<Soil>::new(direct(rng), demos)),
+        Algorithm::Dapg => Box::new(Imitating::<Dapg>::new(direct(rng), demos)),
+        Algorithm::Pid2Il => Box::new(Imitating::<Pid2Il>::new(pid2(true, rng), demos)),
     }
 }
 

@@ -1,43 +1,32 @@
 use super::*;
 use crate::Soft;
+use crate::random::Random;
 use nalgebra::{DMatrix, DVector};
 use std::cell::Cell;
-
-/// Seeded uniform numbers between -1 and 1 (splitmix64).
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
-    }
-}
 
 /// A problem with a point inside everything hard: a box, `m` rows and two cones, every second one of them soft.
 fn random_problem(n: usize, m: usize, random: &mut Random) -> Coupled {
     let soft = Soft { linear: 0.05, quadratic: 2.0 };
     let every_second = |r: usize| (r % 2 == 1).then_some(soft);
-    let hessian = (0..n).map(|_| 1.5 + random.next()).collect();
+    let hessian = (0..n).map(|_| 1.5 + random.between(-1.0, 1.0)).collect();
     let softness = (0..m).map(every_second).collect();
     let cones = [(3, None), (n, Some(soft))];
     let mut p = Coupled::new(hessian, softness, vec![false; m], &cones, 0);
-    let inside: Vec<f64> = (0..n).map(|_| random.next()).collect();
+    let inside: Vec<f64> = (0..n).map(|_| random.between(-1.0, 1.0)).collect();
     for k in 0..n {
-        (p.lower[k], p.upper[k]) = (inside[k] - 1.0 - random.next(), inside[k] + 1.0 + random.next());
-        p.goal[k] = 4.0 * random.next();
+        (p.lower[k], p.upper[k]) =
+            (inside[k] - 1.0 - random.between(-1.0, 1.0), inside[k] + 1.0 + random.between(-1.0, 1.0));
+        p.goal[k] = 4.0 * random.between(-1.0, 1.0);
     }
-    p.rows.iter_mut().for_each(|g| *g = random.next());
+    p.rows.iter_mut().for_each(|g| *g = random.between(-1.0, 1.0));
     for r in 0..m {
         let value = p.row(r, &inside);
         (p.row_lower[r], p.row_upper[r]) =
-            (value - 0.6 - 0.5 * random.next(), value + 0.6 + 0.5 * random.next());
+            (value - 0.6 - 0.5 * random.between(-1.0, 1.0), value + 0.6 + 0.5 * random.between(-1.0, 1.0));
     }
     for c in 0..2 {
         let cone = &mut p.cones[c];
-        cone.g.iter_mut().chain(&mut cone.c).for_each(|g| *g = random.next());
+        cone.g.iter_mut().chain(&mut cone.c).for_each(|g| *g = random.between(-1.0, 1.0));
         cone.radius = cone.norm(&inside) * 1.05;
     }
     p

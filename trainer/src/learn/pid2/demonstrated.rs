@@ -4,7 +4,7 @@
 //! demonstrated one, by a coin, anew for each update. What it sees beside a row is the proposal for that row's own state, `(s_demo,
 //! pi(s_demo))` where it is demonstrated; otherwise the states alone would tell both apart, and nothing would be learned about `s'`.
 
-use super::super::imitation::{CLONED, Cloning, Wanted};
+use super::super::imitation::{Base, CLONED, Cloning, Wanted};
 use super::super::inverse::CLIP;
 use super::super::optimise::{Group, Schedule, Tile, optimise};
 use super::super::{Batch, Metrics};
@@ -51,21 +51,18 @@ impl Pid2 {
         }
         self.nets.union = Some(union);
     }
+}
 
-    /// Behaviour cloning of the demonstrated changes by the meta policy.
-    pub(in super::super) fn clone_states(
-        &mut self,
-        demos: &Batch,
-        s: &DemoSettings,
-        rng: &mut ChaCha8Rng,
-    ) -> Metrics {
+impl Base for Pid2 {
+    /// The meta policy takes on the demonstrated changes.
+    fn clone_demos(&mut self, demos: &Batch, s: &DemoSettings, rng: &mut ChaCha8Rng) -> Metrics {
         let (c, group) = (&self.nets.combined, &mut self.params.groups[COMBINED]);
         let cloning = Cloning { net: &c.policy, range: c.policy_range.clone(), wanted: Wanted::Change };
         vec![(CLONED, cloning.run(group, demos, s, self.threads, rng))]
     }
 
-    /// The inverse model alone, whatever its threshold.
-    pub(in super::super) fn learn_inverse(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
+    /// Whatever the threshold of the inverse model.
+    fn learn_inverse(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
         let (c, threads) = (&self.nets.combined, self.threads);
         let before = c.idm_error(self.actor(), batch, threads);
         if before.is_some() {
@@ -78,8 +75,8 @@ impl Pid2 {
         super::super::idm_metrics(before, after, true, actions)
     }
 
-    /// Carries policy, inverse model and value over to other statistics; the discriminator learns anew in each update.
-    pub(in super::super) fn rescale(&mut self, from: &Normaliser, to: &Normaliser) {
+    /// All but the discriminator, which learns anew in each update.
+    fn rescale(&mut self, from: &Normaliser, to: &Normaliser) {
         let groups = &mut self.params.groups;
         let (actor, rest) = groups.split_at_mut(CRITIC);
         self.nets.combined.rescale(&mut actor[COMBINED], &mut rest[0], from, to);

@@ -2,9 +2,9 @@
 
 use super::fakes::Fakes;
 use super::*;
-use crate::learn::Net;
 use crate::learn::optimise::TILE;
 use crate::learn::reference::{self, *};
+use crate::learn::{Base, Net};
 use nalgebra::{DMatrix, DVector};
 use nearl_runtime::net::kernel::{LANES, scalars};
 use nearl_runtime::net::{Activation, Dense};

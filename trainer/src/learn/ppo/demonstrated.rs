@@ -8,7 +8,7 @@
 //! batch is given a row of the demonstrations at random, anew for each update, so that a minibatch estimates both means.
 
 use super::super::gaussian::{MOST_VECTORS, gather, inverse_sigma, residuals, residuals_back};
-use super::super::imitation::{CLONED, Cloning, Wanted};
+use super::super::imitation::{Base, CLONED, Cloning, Wanted};
 use super::super::inverse::gather_input;
 use super::super::optimise::{Schedule, TILE, Tile, optimise};
 use super::super::rescale::{Inputs, carry};
@@ -39,30 +39,6 @@ impl Ppo {
         self.nets.term = Some(Term { demos, weight, with });
     }
 
-    /// Behaviour cloning of the demonstrations' actions by the mean of the policy.
-    pub(in super::super) fn clone_actions(
-        &mut self,
-        demos: &Batch,
-        s: &DemoSettings,
-        rng: &mut ChaCha8Rng,
-    ) -> Metrics {
-        let n = &self.nets;
-        let cloning = Cloning { net: &n.policy, range: 0..n.log_std.start, wanted: Wanted::Action };
-        vec![(CLONED, cloning.run(&mut self.params.groups[ACTOR], demos, s, self.threads, rng))]
-    }
-
-    /// The inverse model alone.
-    pub(in super::super) fn learn_inverse(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
-        let (s, threads) = (&self.nets.settings, self.threads);
-        let before = self.nets.idm_error(&self.params, batch, threads);
-        let (epochs, minibatch) = (s.n_epochs, s.batch_size);
-        let schedule = Schedule { epochs, minibatch, threads, rate: 1.0, clip: 1.0 };
-        optimise(&self.nets, &mut self.params, batch, &[INVERSE], schedule, rng);
-        let after = self.nets.idm_error(&self.params, batch, threads);
-        let actions = super::super::variance(&batch.action, self.nets.dims.n_act);
-        super::super::idm_metrics(before, after, true, actions)
-    }
-
     /// Writes into each row the action that the inverse model infers from its transition.
     pub(in super::super) fn relabel(&self, demos: &mut Batch) {
         let (n, group) = (&self.nets, &self.params.groups[INVERSE]);
@@ -77,9 +53,28 @@ impl Ppo {
             rows.for_each(|row| demos.action.extend_from_slice(&row[..a]));
         }
     }
+}
 
-    /// Carries all networks over to other statistics.
-    pub(in super::super) fn rescale(&mut self, from: &Normaliser, to: &Normaliser) {
+impl Base for Ppo {
+    fn learn_inverse(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
+        let (s, threads) = (&self.nets.settings, self.threads);
+        let before = self.nets.idm_error(&self.params, batch, threads);
+        let (epochs, minibatch) = (s.n_epochs, s.batch_size);
+        let schedule = Schedule { epochs, minibatch, threads, rate: 1.0, clip: 1.0 };
+        optimise(&self.nets, &mut self.params, batch, &[INVERSE], schedule, rng);
+        let after = self.nets.idm_error(&self.params, batch, threads);
+        let actions = super::super::variance(&batch.action, self.nets.dims.n_act);
+        super::super::idm_metrics(before, after, true, actions)
+    }
+
+    /// The mean of the policy takes on the demonstrations' actions.
+    fn clone_demos(&mut self, demos: &Batch, s: &DemoSettings, rng: &mut ChaCha8Rng) -> Metrics {
+        let n = &self.nets;
+        let cloning = Cloning { net: &n.policy, range: 0..n.log_std.start, wanted: Wanted::Action };
+        vec![(CLONED, cloning.run(&mut self.params.groups[ACTOR], demos, s, self.threads, rng))]
+    }
+
+    fn rescale(&mut self, from: &Normaliser, to: &Normaliser) {
         let (n, groups) = (&self.nets, &mut self.params.groups);
         let obs = Inputs::observation(from, to);
         carry(&n.policy, &mut groups[ACTOR].p, &obs, &[]);
