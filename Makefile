@@ -42,9 +42,9 @@ demo: package
 	$(NEARL) demo --run demo/train --out demo
 	@echo "open demo/report.html in a browser"
 
-# The site of all pages in target/site, with the Rust and the Python reference; fails on a dead link.
+# The site of all pages in target/site, with the Rust and the Python reference; fails on a dead link and on any warning of rustdoc.
 docs: package
-	cargo doc --quiet --no-deps --release --locked -p nearl-constraints -p nearl-controller -p nearl-runtime -p nearl-trainer
+	RUSTDOCFLAGS="-D warnings" cargo doc --quiet --no-deps --release --locked -p nearl-constraints -p nearl-controller -p nearl-runtime -p nearl-trainer
 	$(VENV)/bin/python docs/build.py target/site
 
 test: package

@@ -62,7 +62,8 @@ fn write_all() {
     write("snapshot", "stochastic", &stochastic(2).to_bytes());
     let learned = nearl_tests::training("Hopper-v5", "pid2-ib", 3, 1, &[]).snapshot().clone();
     write("snapshot", "learned-inverse", &learned.to_bytes());
-    let rows = "rows = [{ name = \"sum\", terms = { \"q.panda_joint1\" = 1.0, \"v.panda_joint2\" = -0.5 }, lower = -1.0, upper = 1.0, braking = 2.0, soft = { linear = 1.0, quadratic = 10.0 } }]";
+    let rows = "rows = [{ name = \"sum\", terms = { \"q.panda_joint1\" = 1.0, \"v.panda_joint2\" = -0.5 }, \
+                lower = -1.0, upper = 1.0, braking = 2.0, soft = { linear = 1.0, quadratic = 10.0 } }]";
     let more = "jerk = { limit = 500.0 }\ntorque_rate = { limit = 1000.0 }\nenergy = { limit = 2.0 }\nlocked = [\"panda_joint7\"]\nvelocity_profile = \"fr3\"";
     let text =
         TASK.replace("torque = { scale = 0.95 }", &format!("{rows}\n{more}\ntorque = {{ scale = 0.95 }}"));

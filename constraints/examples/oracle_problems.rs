@@ -45,7 +45,8 @@ fn constraints(case: &Case, model: &Model, cones: bool) -> String {
     }
     let j = |k: usize| &model.joints()[k].name;
     text + &format!(
-        "rows = [{{ name = \"soft\", terms = {{ \"v.{}\" = 1.0, \"v.{}\" = -0.5 }}, lower = -0.1, upper = 0.1, soft = {{ linear = 0.3, quadratic = 20.0 }} }},\n\
+        "rows = [{{ name = \"soft\", terms = {{ \"v.{}\" = 1.0, \"v.{}\" = -0.5 }}, lower = -0.1, upper = 0.1, \
+         soft = {{ linear = 0.3, quadratic = 20.0 }} }},\n\
          {{ name = \"equal\", terms = {{ \"v.{}\" = 1.0, \"v.{}\" = -0.5 }}, equals = 0.0 }},\n\
          {{ name = \"hard\", terms = {{ \"v.{}\" = 1.0, \"v.{}\" = 1.0 }}, upper = 0.25 }}]\n",
         j(0),

@@ -1,4 +1,5 @@
-//! Is the braking that the viability box counts on within the motors' reach?
+//! Checks whether the motors can give the deceleration that position limits count on ([`viability`](crate::viability)), by inverse dynamics
+//! at random states within the limits.
 
 use crate::random::Random;
 use crate::viability::{Dof, Period};

@@ -1,4 +1,4 @@
-//! What a joint is commanded for a period, and what its drive makes of it.
+//! Commands of a joint for one period (force, position, velocity or target of a drive), and the force that its drive makes of them.
 
 use crate::Period;
 

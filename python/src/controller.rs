@@ -125,7 +125,8 @@ impl Controller {
         let py = obs.py();
         if let Some(joint) = &self.unseen {
             return Err(errors::value(format!(
-                "the observation of '{}' has no 'q.{joint}' or no 'v.{joint}', which analytic inverse dynamics or the policy's own observation needs; use update(q, v, obs)",
+                "the observation of '{}' has no 'q.{joint}' or no 'v.{joint}', which analytic inverse dynamics or the policy's own \
+                 observation needs; use update(q, v, obs)",
                 self.task
             )));
         }

@@ -58,7 +58,10 @@ type Problem<'py> = (
 #[pymethods]
 impl Projector {
     #[new]
-    #[pyo3(signature = (model, limits, dt, controllable=None, consistency="kinematic", solver="ladder", sub_steps=1, velocity_weight=None, braking="auto", deadline=None))]
+    #[pyo3(signature = (
+        model, limits, dt, controllable=None, consistency="kinematic", solver="ladder", sub_steps=1, velocity_weight=None, braking="auto",
+        deadline=None
+    ))]
     fn new(
         py: Python<'_>,
         model: Py<Model>,

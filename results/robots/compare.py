@@ -18,10 +18,10 @@ def off(ours: np.ndarray, theirs: np.ndarray) -> float:
 def compare(path: pathlib.Path, theirs: dict) -> dict:
     row = {"file": theirs["file"], "theirs": theirs.get("refused", "loads")}
     try:
-        model = nearl.Model.from_urdf(path)
+        model = nearl.Model.from_urdf(path, free_flyer=theirs.get("floating", False))
     except (ValueError, OSError) as error:
         return {**row, "ours": str(error).replace(str(path), path.name)}
-    row |= {"ours": "loads", "nv": model.nv, "notes": model.notes}
+    row |= {"ours": "loads", "nv": model.nv, "floating": theirs.get("floating", False), "notes": model.notes}
     if "refused" in theirs:
         return row
     if model.joint_names != theirs["joints"] or (model.nq, model.nv) != (theirs["nq"], theirs["nv"]):
@@ -39,15 +39,15 @@ def table(rows: list[dict]) -> str:
     compared = [r for r in loads if "mass" in r]
     worst = max(max(r["mass"], r["nle"]) for r in compared)
     lines = [
-        f"{len(rows)} URDFs of example-robot-data 6.0.0: {len(loads)} load, {len(compared)} of them are compared with Pinocchio 4.1.0's own parser "
-        f"(mass matrix, non-linear effects at three random states): the largest difference is {worst:.1e} of the largest entry.",
+        f"{len(rows)} URDFs of example-robot-data 6.0.0: {len(loads)} load, {len(compared)} of them are compared with Pinocchio 4.1.0's own",
+        f"parser (mass matrix, non-linear effects at three random states): the largest difference is {worst:.1e} of the largest entry.",
         "", "Refused:", "", "| file | why |", "|---|---|",
     ]
     lines += [f"| {r['file']} | {r['ours']} |" for r in rows if r["ours"] != "loads"]
     lines += ["", "Loaded:", "", "| file | dofs | mass matrix | nle | notes |", "|---|---|---|---|---|"]
     for r in loads:
         numbers = [f"{r[k]:.0e}" if k in r else (r.get("different") or "refused by Pinocchio") for k in ("mass", "nle")]
-        lines.append(f"| {r['file']} | {r['nv']} | {numbers[0]} | {numbers[1]} | {len(r['notes']) or ''} |")
+        lines.append(f"| {r['file']} | {r['nv']}{' (floating base)' if r['floating'] else ''} | {numbers[0]} | {numbers[1]} | {len(r['notes']) or ''} |")
     return "\n".join(lines) + "\n"
 
 

@@ -13,10 +13,11 @@ STATES = 3
 def robot(path: pathlib.Path) -> dict:
     try:
         model = pin.buildModelFromUrdf(str(path))
+        floating = model.nv == 0  # a body that flies: without a floating base nothing of it moves
+        if floating:
+            model = pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
     except Exception as error:  # whatever it throws is its answer
-        return {"refused": str(error).splitlines()[0]}
-    if model.nv == 0:
-        return {"refused": "no movable joint"}
+        return {"refused": str(error).splitlines()[0].replace(str(path), path.name)}
     data, rng, states = model.createData(), np.random.default_rng(5), []
     for _ in range(STATES):
         q = pin.integrate(model, pin.neutral(model), rng.uniform(-1, 1, model.nv))
@@ -25,7 +26,7 @@ def robot(path: pathlib.Path) -> dict:
         mass = np.triu(mass) + np.triu(mass, 1).T
         states.append({"q": q.tolist(), "v": v.tolist(), "mass": mass.ravel().tolist(),
                        "nle": pin.nonLinearEffects(model, data, q, v).tolist()})
-    return {"joints": list(model.names)[1:], "nq": model.nq, "nv": model.nv, "states": states}
+    return {"floating": floating, "joints": list(model.names)[1:], "nq": model.nq, "nv": model.nv, "states": states}
 
 
 root = pathlib.Path(sys.argv[1])

@@ -1,4 +1,4 @@
-//! `nearl doctor`: is this snapshot, this machine and this plant ready to run? One line a check.
+//! `nearl doctor`: checks whether a snapshot, the machine and the plant are ready to run, and prints one line for each check.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -179,7 +179,9 @@ fn projection(m: &Manifest) -> Check {
     match m.proposes() {
         false => warn(
             CheckCode::Projection,
-            "its policy is direct and not guarded: nothing is projected, so no limit of the task is kept; set constraints.guard, or train with an algorithm other than ppo".into(),
+            "its policy is direct and not guarded: nothing is projected, so no limit of the task is kept; set constraints.guard, or train \
+             with an algorithm other than ppo"
+                .into(),
         ),
         true => ok(CheckCode::Projection, "every target is projected into the limits of the task".into()),
     }

@@ -1,4 +1,4 @@
-//! Can the motors hold the robot at all? Gravity alone, over every configuration within the limits.
+//! Checks whether the motors can hold the robot still against gravity, over configurations within the position limits.
 
 use nearl_constraints::{Dynamics, LimitSet, Model, Period};
 

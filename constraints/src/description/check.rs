@@ -33,7 +33,7 @@ impl RobotDescription {
         self.check_places(&mut wrong);
         self.check_motors(&mut wrong);
         if self.joints().next().is_none() {
-            wrong.push("it has no movable joint".to_string());
+            wrong.push("it has no movable joint (a body that flies needs free_flyer = true)".to_string());
         }
         if wrong.is_empty() {
             return Ok(());

@@ -1,4 +1,4 @@
-//! What is kept below a limit, and what cannot be soft.
+//! Margins: a limit less the distance that is kept from it. And the refusal of a soft limit where only a hard one can be kept.
 
 use super::PerJoint;
 use crate::{LimitError, Model};

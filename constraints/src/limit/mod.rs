@@ -193,7 +193,8 @@ pub const REGISTRY: &[LimitEntry] = &[
     },
     LimitEntry {
         name: "collision",
-        example: "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \"floor\", shape = \"half_space\" }], braking = 2.0 }",
+        example: "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, \
+                  { name = \"floor\", shape = \"half_space\" }], braking = 2.0 }",
         form: Form::Either,
         build: |s, _| Ok(one(&s.collision, CollisionLimit::new)),
     },

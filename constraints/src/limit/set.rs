@@ -1,4 +1,4 @@
-//! The numbers that limits of single joints boil down to.
+//! Limits of single joints as plain numbers: range, speed, acceleration and braking of each.
 
 use super::{Limit, listed};
 use crate::viability::Profile;

@@ -1,7 +1,8 @@
 //! Derivative of the target with respect to the proposal, as a vector-Jacobian product.
 //!
-//! The optimality conditions of the last tick (`kkt.rs`) change with the goal as `K (dy, dlambda) = (H dgoal, 0)`, so for a cotangent w of y the cotangent of the goal is `H z` with `z = (K^-1)(w, 0)`: the weighted projector onto the null space
-//! of the active rows. `goal = v + (y_q + y_v) / 2` then hands half of it to the velocity and `1 / (2 kappa T)` to the position
+//! The optimality conditions of the last tick (`kkt.rs`) change with the goal as `K (dy, dlambda) = (H dgoal, 0)`, so for a cotangent w
+//! of y the cotangent of the goal is `H z` with `z = (K^-1)(w, 0)`: the weighted projector onto the null space of the active rows.
+//! `goal = v + (y_q + y_v) / 2` then hands half of it to the velocity and `1 / (2 kappa T)` to the position
 //! proposed. Where the active set changes there is no derivative; this is then one of its one-sided ones.
 
 use super::coupled::Coupled;

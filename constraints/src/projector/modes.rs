@@ -1,4 +1,6 @@
-//! The two ways in which a proposal of 2 n numbers meets n dofs, and how the target is written.
+//! A proposal gives each joint a position and a velocity, but within one period a joint has a single freedom, its acceleration. Here are
+//! the two ways to deal with that: `free` clamps position and velocity apart, `kinematic` looks for one velocity change that serves
+//! both, and the position follows from it. Then the target is written.
 
 use super::Projector;
 use crate::ledger::{ActiveRow, BrakeReason, Side, Status};

@@ -1,11 +1,11 @@
-//! A second projection, where no brake leads from the nearest allowed state: what the step or its brake breaks becomes a row more, linear
-//! in the velocity change as far as a difference tells, and cones become their tangents:
+//! A second projection, for ticks in which no brake leads from the nearest allowed state. Each limit that the step or its brake breaks
+//! becomes one more row: linear in the velocity change `y`, with a slope found by differences. Cones become their tangents:
 //!
 //! ```text
 //!     min 1/2 sum_i h_i (y_i - goal_i)^2   s.t.   the box, the rows of the tick,   breach + slope (y - y_refused) <= 0
 //! ```
 //!
-//! Rows that ask for more than they keep ([`Rows::asks_more`](crate::Rows::asks_more)) are left out where they leave no answer.
+//! Some rows demand more than their limit needs ([`Rows::asks_more`](crate::Rows::asks_more)); where they leave no answer, they are left out.
 
 use super::active_set::ActiveSet;
 use super::coupled::Coupled;

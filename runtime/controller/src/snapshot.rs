@@ -125,8 +125,8 @@ impl Manifest {
     pub fn without_simulator(&self) -> Option<&'static str> {
         let network = self.policy == PolicyKind::Direct || self.task.idm.kind == IdmKind::Learned;
         (network && self.task.constraints.guard == Guard::Simulator).then_some(
-            "constraints.guard is \"simulator\", which `nearl plant` and training have and a robot's driver has not: there its actions go to the motors as they are; \
-             for a robot write guard = true or guard = \"drive\"",
+            "constraints.guard is \"simulator\", which `nearl plant` and training have and a robot's driver has not: there its \
+             actions go to the motors as they are; for a robot write guard = true or guard = \"drive\"",
         )
     }
 

@@ -1,4 +1,4 @@
-//! The ends of those who look on and say nothing.
+//! The viewers' ends of the links: they read topics and send nothing.
 
 use std::time::Duration;
 

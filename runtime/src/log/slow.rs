@@ -1,4 +1,4 @@
-//! A disk that stands still for a while: what it costs, and that replay finds its way again.
+//! Tests of a disk that stands still for a while: what is left out of the log, and that replay goes on after the gap.
 
 use std::collections::BTreeMap;
 use std::fs::File;

@@ -1,4 +1,4 @@
-//! Does the robot get where the targets say? Watched before and after a swap, to go back when it no longer does.
+//! Watches how far the robot stays from its targets, before and after a swap. When that grows, the loop takes the earlier snapshot back.
 
 use std::collections::VecDeque;
 

@@ -1,9 +1,9 @@
-//! Requests whose client has left, kept until letting go of them harms nobody.
+//! Requests whose client has left. Each is kept until dropping it cannot end a request of another client.
 //!
-//! iceoryx2 0.10 finds the way back to a client by the client's place in the list of clients, and numbers the requests of
-//! every client from 0. Dropping an `ActiveRequest` closes the stream of that place with that number: once another client has
-//! the place, it may be the other's stream. So a request is dropped while its client is listed, and thus has the place, or
-//! once no stream with its number is open there.
+//! iceoryx2 0.10 knows a client by its place in a list, and numbers the requests of every client from 0. Dropping an `ActiveRequest`
+//! closes the stream that has its place and its number. When a client leaves, a new one may take its place, and the stream that is
+//! closed may then be the new client's. So a request is dropped only in two cases: its client is still listed, and has the place
+//! itself; or no stream with that place and number is open.
 
 use std::collections::HashSet;
 use std::sync::{Mutex, PoisonError};

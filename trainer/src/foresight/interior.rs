@@ -1,4 +1,4 @@
-//! The programme of [`Nearest`](super::Nearest) by Clarabel: where its rows contradict each other, the dual ascent crawls.
+//! The programme of [`Nearest`](super::Nearest) by Clarabel, for rows that contradict each other: there the dual ascent converges too slowly.
 
 use clarabel::algebra::CscMatrix;
 use clarabel::solver::{DefaultSettings, DefaultSolver, IPSolver, SolverStatus, SupportedConeT};

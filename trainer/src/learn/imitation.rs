@@ -4,7 +4,7 @@
 //! fill the statistics with demonstrations and a first batch
 //! warm up: the inverse model on the fresh networks' own noise
 //! pre-train: behaviour cloning                                   (Algorithm 2, lines 1 to 5)
-//! update after update, with the demonstrations in the units of the day
+//! update after update, with the demonstrations normalised by the statistics of that moment
 //! ```
 
 use super::batch::Batch;

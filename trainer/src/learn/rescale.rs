@@ -1,4 +1,4 @@
-//! Statistics move while a policy learns; a network that was taught in the old units is carried over to the new ones.
+//! The normaliser changes while a policy learns. Here the layers of a network are changed with it, so that its function stays the same.
 //!
 //! With `x_old = a x_new + c` for what goes in and `y_new = g y_old` for what comes out, `W <- W diag(a)` and `b <- b + W c` in the first
 //! layer, `W <- diag(g) W` and `b <- diag(g) b` in the last, and both in a linear map beside them: the function stays the same.

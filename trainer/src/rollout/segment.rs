@@ -1,4 +1,4 @@
-//! What collecting leaves behind: rows for the learner, counts for the metrics.
+//! What one environment collected: rows for the learner, counts for the metrics.
 
 use crate::stats::RunningStats;
 use nearl_rollout_protocol::LEDGER;

@@ -1,4 +1,4 @@
-//! Demonstrations in a training: read and checked before it begins, then handed to the learner in the units of the day.
+//! Demonstrations in a training: read and checked before it begins, then handed to the learner, normalised by the present statistics.
 
 use super::{Source, TrainError};
 use crate::demos::{DemoError, DemoSettings, Demonstrations};

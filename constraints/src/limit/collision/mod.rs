@@ -82,8 +82,8 @@ pub struct SolidSettings {
 ///     n' (J_A - J_B) y / T  <=  approach(d, w) - c
 /// ```
 ///
-/// as for a [`FrameLimit`](super::FrameLimit), with the change `c` of the closing speed from `q` to there per second, for every pair within `influence` (at most `rows` of them, the nearest
-/// first; the others have none).
+/// as for a [`FrameLimit`](super::FrameLimit), with the change `c` of the closing speed from `q` to there per second, for every pair within
+/// `influence` (at most `rows` of them, the nearest first; the others have none).
 ///
 /// # How exact
 ///

@@ -1,4 +1,5 @@
-//! What has to hold of an answer.
+//! The optimality conditions that an answer of the active-set stage must meet before it is used: bounds, rows, and the signs of the
+//! multipliers. And whether another active set could be optimal too.
 
 use super::{ActiveSet, pinned};
 use crate::projector::coupled::Coupled;

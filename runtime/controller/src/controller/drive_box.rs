@@ -1,4 +1,5 @@
-//! The guard of robots whose balance nobody can promise: the forces of their drives, in closed form.
+//! `guard = "drive"`: keeps the force of every drive, and its change, within what its motor allows, by bounds on the drive's target in
+//! closed form. It is for robots on legs, and promises nothing about their motion or balance.
 
 use super::Parts;
 use super::parts::unusable;

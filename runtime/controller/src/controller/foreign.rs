@@ -1,4 +1,4 @@
-//! What stands around a policy made elsewhere: its observation, and the meaning of its outputs.
+//! Around a policy made elsewhere: computes its observation from the state, and turns its outputs into commands.
 
 use super::State;
 use super::parts::unusable;

@@ -52,8 +52,8 @@ impl Controller {
         fits
     }
 
-    /// Names of what [`Controller::give`] takes: the proposed entries of the state, or the joints whose commands an action is, in its order. `None` for actions that no
-    /// limit is held for.
+    /// Names of what [`Controller::give`] takes: the proposed entries of the state, or the joints whose commands an action is, in its
+    /// order. `None` for actions that no limit is held for.
     pub fn given_names(&self) -> Option<Vec<String>> {
         if self.kind != PolicyKind::Direct {
             return Some((0..self.layout.n_state()).map(|k| self.layout.state_name(k).to_owned()).collect());

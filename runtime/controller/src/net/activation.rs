@@ -1,4 +1,4 @@
-//! What lies between the layers of a network.
+//! Activation functions between the layers of a network.
 
 use super::function::Function;
 use super::kernel::{V, exp, tanh};

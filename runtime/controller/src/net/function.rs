@@ -1,4 +1,4 @@
-//! What follows one layer of a network in the loop.
+//! The function that the loop applies to the outputs of one layer of a network.
 
 use super::activation::Activation;
 use super::kernel::{V, ZERO, exp, tanh};

@@ -1,4 +1,5 @@
-//! The manifest of a file of this format or of the first, which carried the robot as the text of its file.
+//! Reads the manifest of a snapshot, of today's format or of format 1. A snapshot of format 1 carried the robot as the text of its
+//! file in place of numbers.
 
 use super::{FORMAT, FORMAT_WITH_SKIP, Manifest, ModelFormat};
 use nearl_constraints::Model;

@@ -1,4 +1,4 @@
-//! Is a section of `[constraints]` at least as tight as another? Number by number, by what each key means.
+//! Decides whether one section of `[constraints]` is at least as tight as another: number by number, by what each key means.
 
 use serde_json::{Map, Value};
 

@@ -1,4 +1,4 @@
-//! Rows of a batch on their way from memory: a minibatch reads them in random order, which no processor foresees.
+//! Prefetches the rows of a batch: a minibatch reads them in random order, which the processor cannot predict.
 
 use super::{Batch, Phases};
 use nearl_runtime::net::kernel::LANES;

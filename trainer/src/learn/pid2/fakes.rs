@@ -1,15 +1,15 @@
-//! What the discriminator sees beside the reached changes: proposals, with the noise that the reached ones have too.
+//! The proposals that the discriminator sees beside the reached changes, with noise like that of the reached ones.
 //!
-//! What was reached is the mean that a proposal should be, plus what exploration and the plant add to it. A bare proposal can be
-//! told from that even where it is exactly right, so it is shown with the residual of another row,
+//! A reached change is the proposal that would have been right, plus what exploration and the plant add to it. Without such noise the
+//! discriminator could tell even an exactly right proposal from a reached change. So a proposal is shown with the residual of another row,
 //!
 //! ```text
 //! r = reached - (m + b u),    b = cov(reached, u) / var(u) within [0, 1]
 //! ```
 //!
 //! with a coefficient for each entry: residuals of proposals that are right are the noise around them, those of proposals that
-//! say nothing are what was reached itself, and no noise is larger than that. A row's entries keep each other company, as the noise
-//! of one action moves several of them.
+//! say nothing are what was reached itself, and no noise is larger than that. All entries of a residual come from the same row,
+//! because the noise of one action moves several of them together.
 
 use super::super::Batch;
 use super::super::combined::Combined;
