@@ -10,10 +10,10 @@ PROGRAM = Path(__file__).parent / "bin" / "nearl"
 def main() -> None:
     """Becomes the program, with the arguments of this command line; ``nearl demo`` draws its report with this very Python.
 
-    ``nearl view`` is Python: it shows a running loop in a browser.
+    ``nearl view`` is Python: it shows a running loop or a training in a browser.
     """
     if sys.argv[1:2] == ["view"]:
-        from nearl.view import main as view
+        from nearl.view.__main__ import main as view
 
         sys.exit(view(sys.argv[2:]))
     if not PROGRAM.is_file():

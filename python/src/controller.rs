@@ -9,6 +9,7 @@ use nearl_runtime::{self as runtime, Noise, Output, PolicyKind, Snapshot, State}
 use nearl_trainer::run_folder;
 use numpy::PyArray1;
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 
 use crate::arrays::{array, vector};
 use crate::errors;
@@ -183,6 +184,30 @@ impl Controller {
             let layout = inner.controller.layout();
             (0..layout.n_state()).map(|k| layout.state_name(k).to_owned()).collect()
         })
+    }
+
+    /// Names of the rows that a ledger speaks of by number; the first are the degrees of freedom.
+    #[getter]
+    fn row_names(&self) -> Vec<String> {
+        self.names.clone()
+    }
+
+    /// Limits of the degrees of freedom (nv each), infinite where there is none, by name: lower_position, upper_position [rad or m],
+    /// velocity [rad/s or m/s], acceleration [rad/s² or m/s²], effort [N·m or N].
+    #[getter]
+    fn limits<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let limits = self.with(py, |inner| inner.controller.limits().clone());
+        let out = PyDict::new(py);
+        for (name, values) in [
+            ("lower_position", &limits.q_lower),
+            ("upper_position", &limits.q_upper),
+            ("velocity", &limits.velocity),
+            ("acceleration", &limits.acceleration),
+            ("effort", &limits.effort),
+        ] {
+            out.set_item(name, array(py, values))?;
+        }
+        Ok(out)
     }
 
     /// Control period [s].

@@ -19,6 +19,7 @@ mod proposer;
 mod target;
 mod training;
 mod vec_env;
+mod view_link;
 
 use pyo3::prelude::*;
 
@@ -50,6 +51,8 @@ mod _core {
     use super::training::{Training, algorithms};
     #[pymodule_export]
     use super::vec_env::VecEnv;
+    #[pymodule_export]
+    use super::view_link::ViewClient;
 
     use pyo3::prelude::*;
 

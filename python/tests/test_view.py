@@ -1,69 +1,254 @@
-"""The live view: what it says about a tick, and that a browser shows the robot where the loop says it is."""
+"""The live view: what it says about a tick, what it hears of a running loop and of a training, and what a browser shows."""
 
+import contextlib
+import io
+import re
 import shutil
 import socket
-from types import SimpleNamespace
+import subprocess
+import uuid
+from collections.abc import Iterator
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
+from conftest import ROOT
 
+import nearl
 from nearl import _core, view
+from nearl.view.show import PROPOSAL, ROBOT, TARGET, source_of
+
+SNAPSHOT = ROOT / "examples" / "snapshots" / "panda-reach.safetensors"
+NEARL = ROOT / "target" / "release" / "nearl"
+LEDGER = {"status": "solved", "rung": "active set", "active": 1, "iterations": 3, "moved": 0.5, "slack": 0.0, "residual": 1e-12, "duration_ns": 4200}
 
 
-def tick(q, v_proposal, v_target) -> SimpleNamespace:
-    one = {"q": q, "v": v_target, "proposal_v": v_proposal, "target_v": v_target}
-    counts = {"raw_violations": [3, 4], "target_violations": [0, 0], "tick": [7, 8], "version": [1, 1]}
-    return SimpleNamespace(mode=["active", "active"], **{k: np.array([x, x]) for k, x in one.items()}, **{k: np.array(x) for k, x in counts.items()})
+def arm(n_rows: int = 2) -> view.Robot:
+    rows = ["elbow", "wrist", *(f"wall {i}" for i in range(n_rows))]
+    limits = {
+        "lower_position": np.array([-1.0, 0.0]), "upper_position": np.array([1.0, np.inf]), "velocity": np.array([2.0, np.inf]),
+        "acceleration": np.array([10.0, np.inf]), "effort": np.array([5.0, np.inf]),
+    }  # fmt: skip
+    return view.Robot(_core.Env("Panda-reach"), rows[:2], rows, limits)
 
 
-def test_the_panel_says_what_holds_a_joint_back() -> None:
-    words = view.panel(["elbow", "wrist"], np.array([-1.0, 0.0]), np.array([1.0, 2.0]), tick([0.5, 1.0], [2.0, 0.1], [0.5, 0.1]))
-    assert "7 by proposals, 0 by targets" in words and "tick 8" in words
-    elbow, wrist = words.split("<tr>")[2:4]
-    assert "width:75%" in elbow and "+1.5" in elbow and "#0072B2" in elbow
-    assert "width:50%" in wrist and "#98a2b3" in wrist
+def picture(**given) -> view.Picture:
+    q, v = np.array([0.5, 1.0]), np.array([-1.0, 0.0])
+    quiet = view.Picture("active", "none", 8, 3, 1, 50, q, v, (q, v), (q, v + [0.005, 0.0]), 0.001, [], LEDGER, 7, 0, 70, 0, np.array([2e-4, 4e-4]), 0)
+    return replace(quiet, **given)
 
 
-def test_a_free_joint_has_its_w_where_mujoco_wants_it() -> None:
+def cells(words: str, name: str) -> list[str]:
+    """The cells after the first of the line of ``name``."""
+    return re.search(rf'<tr><td title="{name}">{name}</td>(.*?)</tr>', words)[1].split("</td>")[:-1]
+
+
+def test_a_bar_stands_where_the_joint_is_within_its_limits() -> None:
+    words = view.Panel(arm()).html(picture(), {})
+    position, speed, acceleration = cells(words, "elbow")
+    assert "left:75.0%" in position and "0.50" in position, "0.5 from -1 to 1"
+    assert "left:25.0%" in speed and "-1.00" in speed, "-1 of 2"
+    assert "left:75.0%" in acceleration and "5.00" in acceleration, "0.005 in a millisecond, of 10"
+    assert all('class="bar' not in cell for cell in cells(words, "wrist")), "no limit, no bar"
+    assert " lit" not in words.split("</style>")[1] and "ACTIVE" in words and "70 by proposals, 0 by targets" in words
+
+
+@pytest.mark.parametrize("kind, place", [("position", 0), ("viability", 0), ("velocity", 1), ("velocity_profile", 1), ("acceleration", 2), ("jerk", 2)])
+def test_the_bar_of_an_active_row_is_lit_with_its_multiplier(kind: str, place: int) -> None:
+    words = view.Panel(arm()).html(picture(held=[view.Held(0, "elbow", kind, "upper", 1.25, 4)]), {})
+    lit = ["bar lit" in cell for cell in cells(words, "elbow")]
+    assert lit == [i == place for i in range(3)] and "↑1.2" in cells(words, "elbow")[place]
+
+
+def test_every_kind_of_a_single_joint_has_a_bar() -> None:
+    """The projector's own rows of the Panda: what it names by a joint's number lights one of that joint's bars."""
+    model = nearl.Model.from_urdf(ROOT / "examples/robots/panda/panda.urdf")
+    limits = [nearl.PositionLimit(model, 0.01), nearl.VelocityLimit(model, scale=0.9), nearl.AccelerationLimit(model, 10.0), nearl.JerkLimit(model, 500.0)]
+    projector, rng, seen = nearl.Projector(model, limits, dt=0.001), np.random.default_rng(0), set()
+    low, high = model.lower_position_limit, model.upper_position_limit
+    for _ in range(300):
+        q, v = rng.uniform(low, high), rng.uniform(-2, 2, 7)
+        for row in projector.project(q, v, q, v + rng.uniform(-4, 4, 7), previous=(v, 0 * v) if projector.row_names else None).ledger.active:
+            seen.add(row["kind"]) if row["row"] < 7 else None
+    assert {"velocity", "acceleration"} <= seen <= view.panel.BARS.keys(), seen
+
+
+def test_rows_over_several_joints_have_a_line_each_and_the_active_ones_come_first() -> None:
+    held = [view.Held(31, "wall 29", "user", "lower", 0.5, 2), view.Held(5, "wall 3", "user", "upper", 2.0, 2)]
+    words = view.Panel(arm(40)).html(picture(held=held), {})
+    assert "bar lit" in cells(words, "wall 29")[0] and "width:25%" in cells(words, "wall 29")[0], "a quarter of the largest"
+    assert "width:100%" in cells(words, "wall 3")[0] and "user ↑ <b>2</b>" in cells(words, "wall 3")[1]
+    assert "and 24 rows more, 0 of them active" in words
+
+
+def test_latency_stands_against_the_deadline() -> None:
+    panel = view.Panel(arm())
+    quiet, late = panel.html(picture(), {}), panel.html(picture(latency=np.array([2e-4, 1.5e-3]), overruns=1), {})
+    assert "largest 400 µs, deadline 1,000 µs, late so far 0" in quiet and quiet.count("<rect") == 1
+    assert late.count("<rect") == 2 and late.count('fill="#b91c1c"') == 1, "the late one alone is red"
+    assert "deadline" not in view.Panel(arm()).html(picture(latency=None, overruns=None), {}), "a training keeps no real time"
+
+
+def test_a_free_joint_has_its_w_where_mujoco_wants_it_and_stays_where_it_is_ahead_in_time() -> None:
     model = mujoco.MjModel.from_xml_string(_core.Env("Ant-v5").model_text)
     q = np.arange(15.0)
     assert view.qpos_of(model, q).tolist() == [0, 1, 2, 6, 3, 4, 5, *range(7, 15)]
+    assert view.led(q, np.ones(14), 0.5).tolist() == [*range(7), *(x + 0.5 for x in range(7, 15))]
+    assert view.led(np.zeros(2), np.array([1.0, -2.0]), 0.25).tolist() == [0.25, -0.5]
 
 
-def test_a_browser_shows_the_robot_where_it_is() -> None:
-    viser, sync_api = pytest.importorskip("viser"), pytest.importorskip("playwright.sync_api")
+@contextlib.contextmanager
+def loop() -> Iterator[str]:
+    """A Panda in MuJoCo and the loop that runs it, in processes of their own."""
+    if not NEARL.exists():
+        pytest.fail(f"{NEARL} was not built: run 'make build'")
+    name = f"view-{uuid.uuid4().hex[:12]}"
+    plant = subprocess.Popen([NEARL, "plant", "Panda-reach", "--name", name], stdout=subprocess.DEVNULL)
+    run = subprocess.Popen([NEARL, "run", SNAPSHOT, "--plant", name], stdout=subprocess.DEVNULL)
+    try:
+        yield name
+    finally:
+        for process in (run, plant):
+            process.terminate()
+        for process in (run, plant):
+            process.wait(timeout=30)
+
+
+def test_a_running_loop_says_its_task_limits_rows_and_what_holds_it() -> None:
+    controller = nearl.Controller.load(SNAPSHOT)
+    with loop() as name:
+        source = view.Loop(name, None)
+        pictures = [p for p in (source.next(0.1) for _ in range(30)) if p is not None]
+        source.close()
+    assert source.robot.env.task == "Panda-reach" and source.robot.rows == controller.row_names
+    for what, values in controller.limits.items():
+        np.testing.assert_array_equal(source.robot.limits[what], values)
+    ticks = [p.tick for p in pictures]
+    assert len(pictures) > 20 and ticks == sorted(ticks) and sum(p.ticks for p in pictures) + pictures[-1].lost >= ticks[-1] - ticks[0]
+    acting = [p for p in pictures if p.proposal is not None]
+    held = [h for p in acting for h in p.held]
+    assert acting and held and all(h.multiplier > 0 and h.name == source.robot.rows[h.row] for h in held)
+    assert all(len(p.latency) == p.ticks and (p.latency > 0).all() and p.period == 0.001 for p in acting)
+    assert all(p.broken == 0 for p in acting) and max(p.raw_total for p in acting) > 0
+
+
+def test_a_loop_that_is_not_there_is_named() -> None:
+    with pytest.raises(ConnectionError, match="nobody-here"):
+        view.Loop("nobody-here", None, patience=0.2)
+    with pytest.raises(view.ViewError, match="no folder 'runs/nothing'"):
+        source_of("runs/nothing", None)
+
+
+def test_a_training_is_shown_with_its_newest_policy_and_its_curves(tmp_path) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(view.ViewError, match="not a run folder"):
+        view.Training(tmp_path)
+    train = [NEARL, "train", "HalfCheetah-v5", "--algo", "pid2-ib", "--out", out, "--steps", "12000", "--set", "train.n_steps=256"]
+    subprocess.run([*train, "--set", "train.n_envs=8"], check=True, capture_output=True)
+    source = view.Training(out)
+    first = source.next(0.1)
+    assert first.mode == "training" and first.latency is None and first.ticks == round(0.1 / source.robot.env.dt)
+    assert first.proposal is not None and first.q.shape == (9,) and set(source.curves()) >= {"proposals outside", "reached outside"}
+    low, high, velocity = (source.robot.limits[k] for k in ("lower_position", "upper_position", "velocity"))
+    for _ in range(20):
+        p = source.next(0.02)
+        q, v = p.target
+        assert (q >= low - 1e-9).all() and (q <= high + 1e-9).all() and (np.abs(v) <= velocity + 1e-9).all()
+    assert source.next(0.02).raw_total >= p.raw_total and p.broken_total == 0
+    before = source.next(0.02).version
+    subprocess.run([NEARL, "train", "HalfCheetah-v5", "--resume", out, "--steps", "20000"], check=True, capture_output=True)
+    source._looked = 0.0
+    assert source.next(0.02).version > before, "the newer policy took over"
+
+
+@contextlib.contextmanager
+def browser_at(port: int, size: tuple[int, int]) -> Iterator:
+    sync_api = pytest.importorskip("playwright.sync_api")
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
-        pytest.skip("no Chromium here")
+        pytest.skip("no Chromium here: apt-get install chromium")
+    arguments = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        page.goto(f"http://127.0.0.1:{port}")
+        yield page
+        browser.close()
+
+
+@contextlib.contextmanager
+def page_of(source: view.Loop) -> Iterator[view.Page]:
+    viser = pytest.importorskip("viser")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
-    model = mujoco.MjModel.from_xml_string(_core.Env("Panda-reach").model_text)
-    figure = view.Figure(server, "robot", model, view.ROBOT, 1.0)
-    server.initial_camera.position, server.initial_camera.look_at = (2.0, 0.0, 0.8), (0.0, 0.0, 0.5)
-    pictures = []
-    arguments = ["--no-sandbox", "--use-gl=swiftshader", "--enable-unsafe-swiftshader"]
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
-        page = browser.new_page(viewport={"width": 600, "height": 500})
-        page.goto(f"http://127.0.0.1:{port}")
-        for q in ([0, 0, 0, -1.5, 0, 1.5, 0], [1.2, 0.8, 0, -0.8, 0, 1.5, 0]):
-            figure.show(np.array(q, float))
-            page.wait_for_timeout(4000)
-            pictures.append(page.screenshot())
-        browser.close()
+    yield view.Page(server, source)
     server.stop()
-    first, second = (orange(picture) for picture in pictures)
-    assert first.sum() > 300 and second.sum() > 300, "the arm is in both pictures"
-    assert (first != second).sum() > 300, "and moved"
 
 
-def orange(png: bytes) -> np.ndarray:
-    import io
+class Still:
+    """A source of pictures that are made by hand."""
 
+    def __init__(self) -> None:
+        env = _core.Env("Panda-reach")
+        controller = nearl.Controller.load(SNAPSHOT)
+        self.robot, self.title = view.Robot(env, env.joint_names, controller.row_names, controller.limits), "still"
+
+    def curves(self) -> dict:
+        return {}
+
+    def picture(self, q: list[float], held: list[view.Held], ahead: float) -> view.Picture:
+        at, still = np.array(q), np.zeros(7)
+        led = (at + ahead, still)
+        return view.Picture("active", None, 1, 1, 0, 50, at, still, led, (at - ahead, still), 0.001, held, LEDGER, 0, 0, 0, 0, np.array([1e-4]), 0)
+
+
+def pixels(png: bytes) -> np.ndarray:
     from PIL import Image
 
-    r, g, b = np.moveaxis(np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int), 2, 0)
-    return (r > g + 30) & (g > b)
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+def near(image: np.ndarray, colour: tuple[int, int, int], by: int = 12) -> int:
+    """Pixels of that colour."""
+    return int((np.abs(image - colour) <= by).all(axis=2).sum())
+
+
+def tinted(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    """Where the picture has the hue of ``colour``, whatever the light."""
+    import colorsys
+
+    wanted = colorsys.rgb_to_hsv(*(c / 255 for c in colour))[0]
+    high, low = image.max(axis=2), image.min(axis=2)
+    spread = np.maximum(high - low, 1)
+    r, g, b = np.moveaxis(image, 2, 0)
+    hue = np.where(high == r, ((g - b) / spread) % 6, np.where(high == g, (b - r) / spread + 2, (r - g) / spread + 4)) / 6
+    apart = np.abs((hue - wanted + 0.5) % 1 - 0.5)
+    return (apart < 0.035) & (spread > 40)
+
+
+def test_a_browser_shows_robot_ghosts_and_lit_bars() -> None:
+    """Four screenshots of one page: a quiet arm, the same with a row active, with proposal and target elsewhere, and moved."""
+    still, rest = Still(), [0, 0, 0, -1.5, 0, 1.5, 0]
+    row = view.Held(3, "panda_joint4", "velocity", "upper", 1.5, 9)
+    scenes = [(rest, [], 0.0), (rest, [row], 0.0), (rest, [], 0.6), ([1.2, 0.8, 0, -0.8, 0, 1.5, 0], [], 0.0)]
+    shots = []
+    with page_of(still) as page:
+        page.show(still.picture(*scenes[0]))
+        with browser_at(page.server.get_port(), (1280, 900)) as tab:
+            tab.wait_for_selector(".nearl", timeout=30_000)
+            for scene in scenes:
+                page.show(still.picture(*scene))
+                tab.wait_for_timeout(3000)
+                shots.append(pixels(tab.screenshot()))
+            wide = tab.evaluate("(() => { const e = document.querySelector('.nearl'); return e.scrollWidth - e.clientWidth })()")
+    quiet, lit, apart, moved = shots
+    assert wide <= 0, "nothing runs over the edge of the panel"
+    assert near(quiet, (255, 176, 0)) == 0 and near(lit, (255, 176, 0)) > 200, "the bar of the active row is lit"
+    scene = np.s_[:, :800]
+    assert tinted(quiet[scene], ROBOT).sum() > 1000, "the robot is there"
+    for colour in (PROPOSAL, TARGET):
+        assert tinted(apart[scene], colour).sum() > tinted(quiet[scene], colour).sum() + 500, "a ghost is where it was proposed"
+    assert (tinted(quiet[scene], ROBOT) != tinted(moved[scene], ROBOT)).sum() > 1000, "and the robot moved"

@@ -76,7 +76,43 @@ slices!(TickMessage {
     slacks, slacks_mut: slacks[n_active];
 });
 
+slices!(RowsMessage {
+    q_lower, q_lower_mut: q_lower[n_limits];
+    q_upper, q_upper_mut: q_upper[n_limits];
+    velocity, velocity_mut: velocity[n_limits];
+    acceleration, acceleration_mut: acceleration[n_limits];
+    effort, effort_mut: effort[n_limits];
+});
+
 impl RowsMessage {
+    /// Name of the task.
+    pub fn task_name(&self) -> String {
+        let length = (self.task_length as usize).min(MAX_TASK);
+        String::from_utf8_lossy(&self.task[..length]).into_owned()
+    }
+
+    /// Writes the name of the task, as much of it as there is room for.
+    pub fn set_task_name(&mut self, name: &str) {
+        let length = name.floor_char_boundary(MAX_TASK);
+        self.task.fill(0);
+        self.task[..length].copy_from_slice(&name.as_bytes()[..length]);
+        self.task_length = length as u64;
+    }
+
+    /// Writes the limits of the degrees of freedom; none for a robot with more than a message holds.
+    pub fn set_limits(&mut self, limits: &nearl_constraints::LimitSet) {
+        let n = limits.velocity.len();
+        if n > MAX_JOINTS {
+            return;
+        }
+        self.n_limits = n as u64;
+        self.q_lower_mut().copy_from_slice(&limits.q_lower);
+        self.q_upper_mut().copy_from_slice(&limits.q_upper);
+        self.velocity_mut().copy_from_slice(&limits.velocity);
+        self.acceleration_mut().copy_from_slice(&limits.acceleration);
+        self.effort_mut().copy_from_slice(&limits.effort);
+    }
+
     /// Row names by number.
     pub fn row_names(&self) -> Vec<String> {
         let length = (self.length as usize).min(MAX_ROW_NAMES);
@@ -304,6 +340,19 @@ mod tests {
         assert_eq!(rows.row_names(), vec!["x".repeat(1000); 8]);
         rows.length = u64::MAX;
         assert!(rows.row_names().len() >= 8);
+    }
+
+    #[test]
+    fn a_task_name_that_is_too_long_is_cut_between_letters() {
+        let mut rows = RowsMessage::zeroed();
+        rows.set_task_name(&"\u{e9}".repeat(MAX_TASK));
+        assert_eq!(rows.task_name(), "\u{e9}".repeat(MAX_TASK / 2));
+        rows.set_task_name("arm");
+        assert_eq!(rows.task_name(), "arm");
+        rows.task_length = u64::MAX;
+        assert!(rows.task_name().starts_with("arm"));
+        rows.n_limits = u64::MAX;
+        assert_eq!(rows.velocity().len(), MAX_JOINTS);
     }
 
     #[test]

@@ -29,6 +29,8 @@ pub const MAX_ASKED: usize = 4096;
 pub const MAX_ACTIVE: usize = 96;
 /// Capacity of the row names in a [`RowsMessage`] [bytes].
 pub const MAX_ROW_NAMES: usize = 8192;
+/// Capacity of the task's name in a [`RowsMessage`] [bytes].
+pub const MAX_TASK: usize = 128;
 /// Capacity of the text in a [`ReceiptMessage`] [bytes].
 pub const MAX_TEXT: usize = 256;
 
@@ -479,12 +481,28 @@ message! {
 }
 
 message! {
-    /// What the rows of the snapshot in use are of, about ten times a second.
-    RowsMessage, "rows", version 1, buffer 1, history 1, subscribers 4 {
+    /// What the snapshot in use was made for, what its rows are of and which limits it keeps, about ten times a second.
+    RowsMessage, "rows", version 2, buffer 1, history 1, subscribers 4 {
         /// Number of the snapshot, in the order they were received.
         snapshot: u64,
         /// Bytes used in `names`.
         length: u64,
+        /// Bytes used in `task`.
+        task_length: u64,
+        /// Degrees of freedom whose limits are given; they are those of the first rows. 0 where none are known.
+        n_limits: u64,
+        /// Lowest position that the projection allows, infinite where there is no limit; as the next four [rad or m].
+        q_lower: [f64; MAX_JOINTS],
+        /// Highest position [rad or m].
+        q_upper: [f64; MAX_JOINTS],
+        /// Largest speed [rad/s or m/s].
+        velocity: [f64; MAX_JOINTS],
+        /// Largest acceleration [rad/s² or m/s²].
+        acceleration: [f64; MAX_JOINTS],
+        /// Largest motor force [N m or N].
+        effort: [f64; MAX_JOINTS],
+        /// Name of the task, as UTF-8, zero padded; cut where it is longer.
+        task: [u8; MAX_TASK],
         /// Row names by number, each followed by a line break, as UTF-8; those beyond the capacity are missing.
         names: [u8; MAX_ROW_NAMES],
     }

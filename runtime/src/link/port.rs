@@ -3,6 +3,8 @@
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::service::port_factory::PortFactory as _;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::schema::Queued;
 use super::service::Ipc;
@@ -13,13 +15,23 @@ use crate::snapshot::MAX_BYTES;
 /// Sending end of a topic. One heap allocation per message inside iceoryx2: not for the real-time thread.
 pub struct Outbox<M: Queued> {
     port: Publisher<Ipc, M, ()>,
+    service: PortFactory<Ipc, M, ()>,
     epoch: u64,
     seq: u64,
 }
 
 impl<M: Queued> Outbox<M> {
-    pub(crate) fn new(port: Publisher<Ipc, M, ()>, epoch: u64) -> Outbox<M> {
-        Outbox { port, epoch, seq: 0 }
+    pub(crate) fn new(
+        port: Publisher<Ipc, M, ()>,
+        service: PortFactory<Ipc, M, ()>,
+        epoch: u64,
+    ) -> Outbox<M> {
+        Outbox { port, service, epoch, seq: 0 }
+    }
+
+    /// Those who read the topic.
+    pub fn readers(&self) -> usize {
+        self.service.dynamic_config().number_of_subscribers()
     }
 
     /// Numbers, stamps and sends `message`; false if it could not be sent.

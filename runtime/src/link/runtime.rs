@@ -131,6 +131,11 @@ impl RuntimeLink {
         self.receipt.send(message)
     }
 
+    /// Whether somebody reads what ticks do.
+    pub fn is_watched(&self) -> bool {
+        self.tick.readers() > 0
+    }
+
     /// Sends what a tick did.
     pub fn send_tick(&mut self, message: &mut TickMessage) -> bool {
         self.tick.send(message)

@@ -129,7 +129,7 @@ impl Bus {
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|e| self.publisher_error(M::TOPIC, &e))?;
-        Ok(Outbox::new(port, self.epoch))
+        Ok(Outbox::new(port, service, self.epoch))
     }
 
     /// A subscriber of `M`.

@@ -35,7 +35,7 @@ pub(crate) struct SnapshotInbox<B: Build> {
     received: u64,
     /// Sender and version of the newest snapshot that came.
     newest: (u64, u64),
-    /// What the rows of the one in use are of.
+    /// What viewers are told of the one in use.
     pub(crate) rows: Box<RowsMessage>,
     /// Versions taken into use: (first tick at the latest, version of the controller).
     pub(crate) accepted: Vec<(u64, u64)>,
@@ -51,8 +51,8 @@ struct Offer {
     /// Header of a new snapshot; none when the previous one is offered again.
     header: Option<SnapshotHeader>,
     version: u64,
-    /// Its number, and what its rows are of.
-    rows: (u64, Vec<String>),
+    /// Its number, and what viewers are told of it.
+    rows: (u64, Box<RowsMessage>),
 }
 
 /// What a look at the snapshots needs of the I/O thread.
@@ -96,10 +96,10 @@ impl<B: Build> SnapshotInbox<B> {
         self.refused + self.receiver.refused()
     }
 
-    /// The rows of snapshot `id` are of `names` from now on.
-    pub(crate) fn set_rows(&mut self, id: u64, names: &[String]) {
+    /// Snapshot `id` is in use from now on, and viewers are told `rows` of it.
+    pub(crate) fn set_rows(&mut self, id: u64, rows: Box<RowsMessage>) {
+        self.rows = rows;
         self.rows.snapshot = id;
-        self.rows.set_row_names(names);
     }
 
     /// Takes in a tick and the one before it.
@@ -170,7 +170,7 @@ impl<B: Build> SnapshotInbox<B> {
             },
             (None, None) => return,
         };
-        let (version, rows) = (loaded.controller.version(), (loaded.id, loaded.controller.row_names()));
+        let (version, rows) = (loaded.controller.version(), (loaded.id, loaded.controller.told()));
         match (self.swap.offer(loaded), header) {
             (Ok(()), header) => self.offered = Some(Offer { header, version, rows }),
             (Err(loaded), Some(header)) => self.ready = Some((header, loaded)),
@@ -184,7 +184,7 @@ impl<B: Build> SnapshotInbox<B> {
         let Some(Offer { header, version, rows }) = self.offered.take() else {
             return self.builder.discard(old);
         };
-        self.set_rows(rows.0, &rows.1);
+        self.set_rows(rows.0, rows.1);
         self.accepted.push((around.tick, version));
         let condemned = self.condemned.take();
         let Some(header) = header else {

@@ -140,8 +140,10 @@ impl<B: Build> Io<B> {
         let Ok(record) = self.records.peek() else { return false };
         self.traffic.tick = record.tick;
         self.health.take(record);
-        fill_tick(&mut self.tick, record);
-        self.link.send_tick(&mut self.tick);
+        if self.link.is_watched() {
+            fill_tick(&mut self.tick, record);
+            self.link.send_tick(&mut self.tick);
+        }
         if let Some(log) = &mut self.log {
             log.push(record);
         }

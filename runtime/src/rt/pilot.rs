@@ -5,8 +5,8 @@ use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, RefuseReason, Side
 use crate::codes::LedgerStatus;
 use crate::controller::{Controller, Noise, Output, State};
 use crate::link::{
-    LedgerNumbers, MAX_JOINTS, MAX_OBS, PROPOSES_ACTIONS, PROPOSES_STATES, Robot, RobotMessage,
-    SnapshotBytes, StateMessage, Verdict, hash_names,
+    LedgerNumbers, MAX_JOINTS, MAX_OBS, Message, PROPOSES_ACTIONS, PROPOSES_STATES, Robot, RobotMessage,
+    RowsMessage, SnapshotBytes, StateMessage, Verdict, hash_names,
 };
 use crate::rt::brake::Brake;
 use crate::rt::pinned::{Pinned, UNITS, above};
@@ -37,6 +37,8 @@ pub struct Pilot {
     period_tick: u32,
     /// What another process may propose: kind, hash of the names, their number.
     takes: Option<(u32, u64, usize)>,
+    /// Name of the task.
+    task: String,
 }
 
 impl Pilot {
@@ -74,6 +76,7 @@ impl Pilot {
             memory_len: 1 + controller.memory().len(),
             memory: controller.memory(),
             period_tick: 0,
+            task: snapshot.manifest.task.name.clone(),
             controller,
         })
     }
@@ -211,6 +214,14 @@ impl LoopController for Pilot {
 
     fn row_names(&self) -> Vec<String> {
         self.controller.row_names()
+    }
+
+    fn told(&self) -> Box<RowsMessage> {
+        let mut told = Box::new(RowsMessage::zeroed());
+        told.set_row_names(&self.row_names());
+        told.set_task_name(&self.task);
+        told.set_limits(self.controller.limits());
+        told
     }
 
     fn load_memory(&mut self, memory: &[f64]) {

@@ -298,8 +298,8 @@ fn assemble<B: Build>(
     let Some(reader) = link.take_snapshots() else { return Err(RunError::NoSnapshots(link.name().clone())) };
     let asked = asked(&mut link, &robot, &first, settings)?;
     let cycle_settings = cycle_settings(&robot, settings);
-    let rows = first.row_names();
-    let log = open_log(&robot, (first.version(), &rows), &cycle_settings.core, settings)?;
+    let told = first.told();
+    let log = open_log(&robot, (first.version(), &first.row_names()), &cycle_settings.core, settings)?;
     let thread_error = |name| move |e: std::io::Error| RunError::Thread { name, reason: e.to_string() };
     let builder = Builder::start(build).map_err(thread_error("nearl-build"))?;
     let receiver = SnapshotReceiver::start(reader).map_err(thread_error("nearl-receive"))?;
@@ -314,7 +314,7 @@ fn assemble<B: Build>(
     let first = Box::new(Loaded { id: 0, controller: first });
     let cycle = Cycle::new(cycle_settings, first, settings.faults.clone(), ends, stop.clone());
     let mut snapshots = SnapshotInbox::new(receiver, builder, swap, settings.rollback);
-    snapshots.set_rows(0, &rows);
+    snapshots.set_rows(0, told);
     let mut tick = Box::new(TickMessage::zeroed());
     tick.period = clock::nanoseconds(robot.dt);
     let health = Health::new().map_err(|e| RunError::Snapshot(e.to_string()))?;

@@ -1,7 +1,8 @@
 //! What the loop needs from a controller, and the record it leaves of each tick.
 
 use crate::link::{
-    LedgerNumbers, MAX_JOINTS, Message, ProposalMessage, RobotMessage, SnapshotBytes, StateMessage, Verdict,
+    LedgerNumbers, MAX_JOINTS, Message, ProposalMessage, RobotMessage, RowsMessage, SnapshotBytes,
+    StateMessage, Verdict,
 };
 use crate::rt::{Mode, Reason, Resume};
 
@@ -41,6 +42,12 @@ pub trait LoopController: Send + 'static {
     /// What the rows of a ledger are of, by their number. Not for the real-time thread: it allocates.
     fn row_names(&self) -> Vec<String> {
         Vec::new()
+    }
+    /// What viewers are told of it. Not for the real-time thread: it allocates.
+    fn told(&self) -> Box<RowsMessage> {
+        let mut told = Box::new(RowsMessage::zeroed());
+        told.set_row_names(&self.row_names());
+        told
     }
     /// Takes what another controller of the same robot saved in the tick before, if it fits.
     fn load_memory(&mut self, _memory: &[f64]) {}

@@ -25,6 +25,23 @@ fn a_second_owner_is_refused_by_role() {
     assert_eq!(second.push(1, b"b"), Err(LinkError::Taken { name: name.0.clone(), role: "trainer" }));
 }
 
+/// What a tick did is told only where somebody reads it; a trainer holds the topic without reading.
+#[test]
+fn a_loop_knows_whether_somebody_looks_on() {
+    let name = Name::new("watched");
+    let mut runtime = RuntimeLink::open(&name.0).unwrap();
+    let _trainer = TrainerLink::open(&name.0).unwrap();
+    assert!(!runtime.is_watched());
+    let mut view = ViewLink::open(&name.0).unwrap();
+    assert!(runtime.is_watched());
+    let mut tick = TickMessage::zeroed();
+    tick.tick = 7;
+    assert!(runtime.send_tick(&mut tick));
+    assert_eq!(view.tick().map(|t| t.tick), Some(7));
+    drop(view);
+    assert!(!runtime.is_watched());
+}
+
 #[test]
 fn a_missing_peer_is_named_with_what_to_start() {
     let name = Name::new("alone");

@@ -116,13 +116,11 @@ fn a_stranger_finds_names_times_of_day_and_ways_to_stop_in_half_the_bytes() {
     // In 2033, by the monotonic clock of a machine that was not started before 2000.
     let wall = 2_000_000_000_000_000_000;
     let settings = RunSettings { ticks: Some(ticks), log: Some(log.clone()), wall, ..settings() };
-    let (mut rows, mut shown) = (Vec::new(), Vec::new());
+    let (mut told, mut shown) = (None, Vec::new());
     let running = crate::arm::execute_with(&name, &file.0, &nearl_runtime::rt::Stop::new(), settings);
     {
         let mut view = nearl_runtime::link::ViewLink::open(&name.0).unwrap();
-        if let Ok(message) = view.wait_for_rows(crate::arm::PATIENCE) {
-            rows = message.row_names();
-        }
+        told = view.wait_for_rows(crate::arm::PATIENCE).ok().or(told);
         while !running.is_finished() {
             shown.extend(std::iter::from_fn(|| view.tick()));
         }
@@ -139,7 +137,13 @@ fn a_stranger_finds_names_times_of_day_and_ways_to_stop_in_half_the_bytes() {
     assert!(each <= 1450, "{each} bytes a tick");
     let replayed = nearl_runtime::log::replay(&log).unwrap();
     assert!(replayed.difference.is_none() && replayed.ticks >= ticks, "{replayed:?}");
-    // A viewer was told the same.
+    // A viewer was told the same, and which limits the projection keeps.
+    let told = told.expect("rows");
+    let rows = told.row_names();
+    let limits = nearl_runtime::Controller::new(&first).unwrap().limits().clone();
+    assert_eq!((told.task_name(), told.velocity()), (first.manifest.task.name.clone(), &limits.velocity[..]));
+    assert_eq!((told.q_lower(), told.q_upper()), (&limits.q_lower[..], &limits.q_upper[..]));
+    assert_eq!((told.acceleration(), told.effort()), (&limits.acceleration[..], &limits.effort[..]));
     assert_eq!(rows.len(), 14, "seven joints and their torques: {rows:?}");
     let tick = shown.iter().rfind(|tick| tick.n_active > 0 && tick.nu > 0).expect("a tick with active rows");
     assert!(tick.multipliers().iter().all(|x| *x > 0.0) && tick.brake().len() == 7, "{tick:?}");

@@ -1,0 +1,186 @@
+"""What the live view shows, and a running loop as where it comes from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nearl import _core
+
+Floats = NDArray[np.float64]
+
+
+class ViewError(RuntimeError):
+    """Nothing can be shown; the message says what is missing."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """A row that held targets back since the last picture.
+
+    Attributes:
+        row: Its number; those of the degrees of freedom come first.
+        name: Its name.
+        kind: Of the limit behind it.
+        side: ``lower`` or ``upper``.
+        multiplier: The largest.
+        ticks: In so many of the ticks.
+    """
+
+    row: int
+    name: str
+    kind: str
+    side: str
+    multiplier: float
+    ticks: int
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The newest tick, and what the ticks since the last picture did.
+
+    Attributes:
+        mode: Mode of the loop, or ``training``.
+        reason: Why the loop is in it; None where there is none.
+        tick, version, episode: Of the tick.
+        ticks: Ticks since the last picture.
+        q, v: Measured (nq, nv).
+        proposal, target: Configuration and velocity (nq, nv) each; None in a tick that acts on nothing, or without a proposal.
+        period: Control period [s].
+        held: Rows that held a target back.
+        ledger: What the projector said of the tick by name; None where it projected nothing.
+        raw, broken: Limits broken by proposals and by targets since the last picture.
+        raw_total, broken_total: The same since the start.
+        latency: Time from when each tick was due until its action was handed over [s]; None where nothing keeps real time.
+        overruns: Ticks that ended after the next was due; None as ``latency``.
+        lost: Ticks that this view did not read in time.
+    """
+
+    mode: str
+    reason: str | None
+    tick: int
+    version: int
+    episode: int
+    ticks: int
+    q: Floats
+    v: Floats
+    proposal: tuple[Floats, Floats] | None
+    target: tuple[Floats, Floats] | None
+    period: float
+    held: Sequence[Held]
+    ledger: dict[str, Any] | None
+    raw: int
+    broken: int
+    raw_total: int
+    broken_total: int
+    latency: Floats | None = None
+    overruns: int | None = None
+    lost: int = 0
+
+
+@dataclass
+class Robot:
+    """What does not change from picture to picture.
+
+    Attributes:
+        env: The native environment, whose robot is drawn.
+        joints: Names of the degrees of freedom (nv).
+        rows: Names of all rows by number; the first are the joints.
+        limits: By name (nv each), infinite where there is none.
+    """
+
+    env: _core.Env
+    joints: list[str]
+    rows: list[str]
+    limits: dict[str, Floats]
+
+
+class Source(Protocol):
+    """Where pictures come from."""
+
+    robot: Robot
+    title: str
+
+    def next(self, span: float) -> Picture | None:
+        """What happened in the next ``span`` [s]; None where nothing did."""
+
+    def curves(self) -> dict[str, tuple[Floats, Floats]]:
+        """Steps and values by name, of a training."""
+
+    def close(self) -> None:
+        """Leaves."""
+
+
+class Loop:
+    """A running loop, over the link.
+
+    Args:
+        name: As in ``nearl run --plant NAME``.
+        task: Name of the task or task file whose robot is drawn; None takes the name that the loop says.
+
+    Raises:
+        ViewError: the task's robot is not known here.
+        ConnectionError: there is no loop.
+    """
+
+    def __init__(self, name: str, task: str | None, patience: float = 5.0):
+        self.title = name
+        self._client = _core.ViewClient(name, patience)
+        self._told = self._client.told()
+        wanted = task or self._told["task"]
+        try:
+            env = _core.Env(wanted)
+        except (ValueError, OSError) as error:
+            self._client.close()
+            if task is not None:
+                raise
+            raise ViewError(f"the loop of `{name}` runs a policy of task '{wanted}', which is none of the bundled ones; give its file: --task FILE") from error
+        joints = self._told["rows"][: len(self._told["velocity"])]
+        if len(env.state()[1]) != len(joints):
+            self._client.close()
+            raise ViewError(f"the robot of '{wanted}' has {len(env.state()[1])} degrees of freedom, that of the loop of `{name}` {len(joints)}; give --task")
+        self.robot = Robot(env, joints, self._told["rows"], self._limits())
+
+    def next(self, span: float) -> Picture | None:
+        seen = self._client.look(span)
+        if seen is None:
+            return None
+        if self._told["snapshot"] != seen["snapshot"]:
+            self._told = self._client.told()
+            self.robot.rows, self.robot.limits = self._told["rows"], self._limits()
+        names = self._told["rows"] if self._told["snapshot"] == seen["snapshot"] else []
+        held = [Held(r["row"], names[r["row"]], r["kind"], r["side"], r["multiplier"], r["ticks"]) for r in seen["active"] if r["row"] < len(names)]
+        acts = seen["acts"]
+        return Picture(
+            mode=seen["mode"],
+            reason=seen["reason"],
+            tick=seen["tick"],
+            version=seen["version"],
+            episode=seen["episode"],
+            ticks=seen["ticks"],
+            q=seen["q"],
+            v=seen["v"],
+            proposal=(seen["proposal_q"], seen["proposal_v"]) if acts else None,
+            target=(seen["target_q"], seen["target_v"]) if acts else None,
+            period=seen["period_ns"] * 1e-9,
+            held=held,
+            ledger=seen["ledger"],
+            raw=seen["raw"],
+            broken=seen["target"],
+            raw_total=seen["raw_total"],
+            broken_total=seen["target_total"],
+            latency=seen["latency_ns"] * 1e-9,
+            overruns=seen["overruns"],
+            lost=seen["lost"],
+        )
+
+    def curves(self) -> dict[str, tuple[Floats, Floats]]:
+        return {}
+
+    def close(self) -> None:
+        self._client.close()
+
+    def _limits(self) -> dict[str, Floats]:
+        return {k: v for k, v in self._told.items() if isinstance(v, np.ndarray)}

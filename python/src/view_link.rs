@@ -1,0 +1,233 @@
+//! One who looks on at a running loop (see `nearl.view`).
+
+use std::collections::BTreeMap;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use nearl_constraints::{Kind, Rung};
+use nearl_runtime::codes::LedgerStatus;
+use nearl_runtime::link::{LinkError, RobotName, RowsMessage, TickMessage, ViewLink};
+use nearl_runtime::rt::{Mode, Reason};
+use numpy::PyArray1;
+use pyo3::exceptions::PyConnectionError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arrays::array;
+use crate::errors;
+use crate::link::{SIGNALS, seconds};
+
+/// Pause when the stream is empty: the topic keeps 32 ticks, which is so much at 10 kHz.
+const NAP: Duration = Duration::from_millis(2);
+
+/// Reads the ticks of a loop and the names and limits of its rows; the loop does not wait for it.
+#[pyclass(module = "nearl._core", frozen)]
+pub(crate) struct ViewClient {
+    inner: Mutex<Option<Inner>>,
+    name: RobotName,
+}
+
+struct Inner {
+    link: ViewLink,
+    rows: RowsMessage,
+}
+
+/// The hardest that a row was leaned on.
+#[derive(Clone, Copy, Default)]
+struct Held {
+    ticks: u64,
+    multiplier: f64,
+    slack: f64,
+}
+
+/// What the ticks of one picture did.
+#[derive(Default)]
+struct Seen {
+    newest: Option<TickMessage>,
+    ticks: u64,
+    raw: u64,
+    target: u64,
+    latency: Vec<u64>,
+    /// By number, kind and side of the row.
+    held: BTreeMap<(u32, u32, u32), Held>,
+}
+
+impl Seen {
+    fn take(&mut self, tick: &TickMessage) {
+        self.ticks += 1;
+        if self.newest.as_ref().is_some_and(|newest| newest.snapshot != tick.snapshot) {
+            // Numbers of rows are those of their snapshot.
+            self.held.clear();
+        }
+        self.newest = Some(*tick);
+        self.latency.push(tick.end.saturating_sub(tick.due));
+        if tick.nu == 0 {
+            return;
+        }
+        self.raw += u64::from(tick.ledger.raw_violations);
+        self.target += u64::from(tick.ledger.target_violations);
+        let numbers = tick.rows.iter().zip(&tick.kinds).zip(&tick.sides);
+        let pulls = tick.multipliers().iter().zip(tick.slacks());
+        for (((row, kind), side), (multiplier, slack)) in numbers.zip(pulls) {
+            let held = self.held.entry((*row, *kind, *side)).or_default();
+            held.ticks += 1;
+            held.multiplier = held.multiplier.max(*multiplier);
+            held.slack = held.slack.max(*slack);
+        }
+    }
+}
+
+#[pymethods]
+impl ViewClient {
+    /// Waits up to `patience` [s] for the loop of `name`.
+    #[new]
+    fn new(py: Python<'_>, name: &str, patience: f64) -> PyResult<ViewClient> {
+        let name = RobotName::new(name).map_err(errors::value)?;
+        let patience = seconds(patience)?;
+        let opened = py.detach(|| {
+            let mut link = ViewLink::open(&name)?;
+            let rows = link.wait_for_rows(patience)?;
+            Ok(Inner { link, rows })
+        });
+        let inner = opened.map_err(|e| match e {
+            LinkError::Name(_) => errors::value(e),
+            other => PyConnectionError::new_err(other.to_string()),
+        })?;
+        Ok(ViewClient { inner: Mutex::new(Some(inner)), name })
+    }
+
+    /// Task, row names and limits of the snapshot in use: a dict.
+    fn told<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        self.with(|inner| {
+            let (rows, out) = (&inner.rows, PyDict::new(py));
+            out.set_item("task", rows.task_name())?;
+            out.set_item("rows", rows.row_names())?;
+            out.set_item("snapshot", rows.snapshot)?;
+            let limits = [
+                ("lower_position", rows.q_lower()),
+                ("upper_position", rows.q_upper()),
+                ("velocity", rows.velocity()),
+                ("acceleration", rows.acceleration()),
+                ("effort", rows.effort()),
+            ];
+            for (name, values) in limits {
+                out.set_item(name, array(py, values))?;
+            }
+            Ok(out)
+        })?
+    }
+
+    /// What the ticks of the next `span` [s] did, as a dict; none where no tick came.
+    fn look<'py>(&self, py: Python<'py>, span: f64) -> PyResult<Option<Bound<'py, PyDict>>> {
+        let (start, span) = (Instant::now(), seconds(span)?);
+        let mut seen = Seen::default();
+        loop {
+            let wait = SIGNALS.min(span.saturating_sub(start.elapsed()));
+            py.detach(|| self.with(|inner| watch(inner, &mut seen, wait)))?;
+            if start.elapsed() >= span {
+                break;
+            }
+            py.check_signals()?;
+        }
+        let Some(tick) = &seen.newest else { return Ok(None) };
+        let lost = self.with(|inner| inner.link.lost())?;
+        picture(py, tick, &seen, lost).map(Some)
+    }
+
+    /// Leaves.
+    fn close(&self, py: Python<'_>) {
+        py.detach(|| drop(self.inner.lock().unwrap_or_else(PoisonError::into_inner).take()));
+    }
+}
+
+impl ViewClient {
+    fn with<T>(&self, use_it: impl FnOnce(&mut Inner) -> T) -> PyResult<T> {
+        let name = &self.name;
+        let closed = || PyConnectionError::new_err(format!("the view of `{name}` is closed: open another"));
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner).as_mut().map(use_it).ok_or_else(closed)
+    }
+}
+
+fn watch(inner: &mut Inner, seen: &mut Seen, span: Duration) {
+    let end = Instant::now() + span;
+    loop {
+        if let Some(rows) = inner.link.rows() {
+            inner.rows = rows;
+        }
+        while let Some(tick) = inner.link.tick() {
+            seen.take(&tick);
+        }
+        if Instant::now() >= end {
+            return;
+        }
+        std::thread::sleep(NAP);
+    }
+}
+
+fn picture<'py>(py: Python<'py>, tick: &TickMessage, seen: &Seen, lost: u64) -> PyResult<Bound<'py, PyDict>> {
+    let out = PyDict::new(py);
+    let acts = tick.nu > 0;
+    out.set_item("acts", acts)?;
+    out.set_item("mode", Mode::from_code(tick.mode).name())?;
+    out.set_item("reason", Reason::ALL.get(tick.reason as usize).map(|reason| reason.name()))?;
+    let numbers = [
+        ("tick", tick.tick),
+        ("version", tick.policy_version),
+        ("snapshot", tick.snapshot),
+        ("episode", tick.episode),
+        ("period_ns", tick.period),
+        ("overruns", tick.overruns),
+        ("raw_total", tick.raw_violations),
+        ("target_total", tick.target_violations),
+        ("raw", seen.raw),
+        ("target", seen.target),
+        ("ticks", seen.ticks),
+        ("lost", lost),
+    ];
+    for (name, value) in numbers {
+        out.set_item(name, value)?;
+    }
+    out.set_item("latency_ns", PyArray1::from_slice(py, &seen.latency))?;
+    out.set_item("q", array(py, tick.q()))?;
+    out.set_item("v", array(py, tick.v()))?;
+    for (name, values) in [
+        ("proposal_q", tick.proposal_q()),
+        ("proposal_v", tick.proposal_v()),
+        ("target_q", tick.target_q()),
+        ("target_v", tick.target_v()),
+        ("action", tick.action()),
+    ] {
+        out.set_item(name, acts.then(|| array(py, values)))?;
+    }
+    out.set_item("ledger", if acts { Some(ledger(py, tick)?) } else { None })?;
+    out.set_item("active", active(py, seen)?)?;
+    Ok(out)
+}
+
+fn ledger<'py>(py: Python<'py>, tick: &TickMessage) -> PyResult<Bound<'py, PyDict>> {
+    let (l, out) = (&tick.ledger, PyDict::new(py));
+    let status = LedgerStatus::ALL.iter().find(|status| status.number() == l.status);
+    out.set_item("status", status.map_or("unknown", |status| status.name()))?;
+    out.set_item("rung", Rung::ALL.get(l.rung as usize).map_or("unknown", |rung| rung.name()))?;
+    out.set_item("active", l.active)?;
+    out.set_item("iterations", l.iterations)?;
+    out.set_item("moved", l.moved)?;
+    out.set_item("slack", l.slack)?;
+    out.set_item("residual", l.residual)?;
+    out.set_item("duration_ns", l.duration)?;
+    Ok(out)
+}
+
+fn active<'py>(py: Python<'py>, seen: &Seen) -> PyResult<Vec<Bound<'py, PyDict>>> {
+    let row = |(&(row, kind, side), held): (&(u32, u32, u32), &Held)| {
+        let out = PyDict::new(py);
+        out.set_item("row", row)?;
+        out.set_item("kind", Kind::ALL.get(kind as usize).map_or("unknown", |kind| kind.name()))?;
+        out.set_item("side", if side == 0 { "lower" } else { "upper" })?;
+        out.set_item("multiplier", held.multiplier)?;
+        out.set_item("slack", held.slack)?;
+        out.set_item("ticks", held.ticks)?;
+        Ok(out)
+    };
+    seen.held.iter().map(row).collect()
+}
