@@ -63,6 +63,15 @@ def read_run(path: Path) -> Run:
     return Run(path, task or "task", algo, seed, metrics)
 
 
+def demonstrations_of(path: Path) -> Path | None:
+    """The file of demonstrations that a run folder learned from, as its task file says; None where there is none."""
+    if not (path / "task.toml").is_file():
+        return None
+    task = tomllib.loads((path / "task.toml").read_text())
+    file = task.get("train", {}).get("demos", {}).get("file")
+    return path / file if file else None
+
+
 def _number(cell: str) -> float:
     try:
         return float(cell)

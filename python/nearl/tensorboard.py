@@ -1,6 +1,7 @@
 """Metrics for TensorBoard, under SB3's tags.
 
     python -m nearl.tensorboard runs/HalfCheetah-v5/pid2-ib_0      # event files beside metrics.csv; then: tensorboard --logdir runs
+    python -m nearl.tensorboard --follow runs/HalfCheetah-v5/pid2-ib_0   # while it is trained
 
     agent.learn(1_000_000, callback=nearl.tensorboard.Writer("runs/mine"))
 """
@@ -8,6 +9,7 @@
 import argparse
 import os
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +40,17 @@ class Writer:
     def __call__(self, agent: Any, metrics: dict[str, float]) -> None:
         """Writes ``metrics`` at their own number of steps."""
         self.write(metrics)
-        self._writer.flush()
+        self.flush()
 
     def write(self, metrics: dict[str, float]) -> None:
         """The same without waiting for the disk."""
         for tag, value in metrics.items():
             if tag != STEPS and np.isfinite(value):
                 self._writer.add_scalar(tag, value, int(metrics[STEPS]))
+
+    def flush(self) -> None:
+        """Puts what was written on the disk."""
+        self._writer.flush()
 
     def close(self) -> None:
         """Ends the file."""
@@ -67,24 +73,61 @@ def convert(run: str | os.PathLike[str], folder: str | os.PathLike[str] | None =
         ReadError: ``run`` is not a run folder.
     """
     metrics = read_run(Path(run)).metrics
-    folder = Path(run if folder is None else folder)
-    for old in folder.glob("events.out.tfevents.*"):
-        old.unlink()
     n = len(metrics[STEPS])
-    with Writer(folder) as writer:
+    with Writer(_emptied(run, folder)) as writer:
         for i in range(n):
             writer.write({tag: float(values[i]) for tag, values in metrics.items()})
     return n
+
+
+def follow(run: str | os.PathLike[str], folder: str | os.PathLike[str] | None = None, every: float = 5.0, seconds: float | None = None) -> int:
+    """:func:`convert`, and then each new row of a training that goes on, until its steps are done.
+
+    Args:
+        run: Run folder.
+        folder: As for :func:`convert`.
+        every: Time between two looks [s].
+        seconds: How long at most; None until the training is done.
+
+    Returns:
+        Number of rows.
+    """
+    end = None if seconds is None else time.monotonic() + seconds
+    n = 0
+    with Writer(_emptied(run, folder)) as writer:
+        while True:
+            is_done = (Path(run) / "checkpoints" / "final.safetensors").is_file()  # before the rows, so that none is missed
+            metrics = read_run(Path(run)).metrics
+            for i in range(n, len(metrics[STEPS])):
+                writer.write({tag: float(values[i]) for tag, values in metrics.items()})
+            n = len(metrics[STEPS])
+            writer.flush()
+            if is_done or (end is not None and time.monotonic() >= end):
+                return n
+            time.sleep(every)
+
+
+def _emptied(run: str | os.PathLike[str], folder: str | os.PathLike[str] | None) -> Path:
+    """Where the event file goes, without older ones."""
+    folder = Path(run if folder is None else folder)
+    for old in folder.glob("events.out.tfevents.*"):
+        old.unlink()
+    return folder
 
 
 def main(arguments: list[str] | None = None) -> int:
     """0 on success, 1 with one sentence on standard error otherwise."""
     parser = argparse.ArgumentParser(prog="python -m nearl.tensorboard", description="Event files from run folders of 'nearl train'.")
     parser.add_argument("runs", metavar="RUN_FOLDER", nargs="+", type=Path)
+    parser.add_argument("--follow", action="store_true", help="go on with each new row of one training until it is done")
     given = parser.parse_args(arguments)
+    if given.follow and len(given.runs) > 1:
+        parser.error("--follow takes one run folder")
     try:
         for run in given.runs:
-            print(f"{run}: {convert(run)} rows")
+            print(f"{run}: {follow(run) if given.follow else convert(run)} rows")
+    except KeyboardInterrupt:
+        return 0
     except (ReadError, ImportError, OSError) as error:
         print(f"nearl.tensorboard: {error}", file=sys.stderr)
         return 1

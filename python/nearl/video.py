@@ -123,11 +123,30 @@ def _demonstrated(
     return frames(), stride * dt
 
 
+def check() -> None:
+    """Draws one picture and asks for the encoder.
+
+    Raises:
+        VideoError: no renderer, or no encoder.
+    """
+    try:
+        import imageio
+        import imageio_ffmpeg
+
+        imageio_ffmpeg.get_ffmpeg_exe()
+        assert imageio
+    except (ImportError, RuntimeError) as error:
+        raise VideoError(f"writing a video needs imageio and imageio-ffmpeg: pip install 'nearl[video]' ({error})") from error
+    renderer = Renderer(_core.Env("HalfCheetah-v5"), (64, 48))
+    renderer.close()
+
+
 def main(arguments: list[str] | None = None) -> int:
     """0 on success, 1 with one sentence on standard error otherwise."""
     parser = argparse.ArgumentParser(prog="python -m nearl.video", description="A video of a trained policy, or of demonstrations.")
-    parser.add_argument("run", metavar="RUN", help="run folder, snapshot file, or demonstrations (.npz)")
-    parser.add_argument("out", metavar="FILE", help=".mp4 or .gif")
+    parser.add_argument("run", metavar="RUN", nargs="?", help="run folder, snapshot file, or demonstrations (.npz)")
+    parser.add_argument("out", metavar="FILE", nargs="?", help=".mp4 or .gif")
+    parser.add_argument("--check", action="store_true", help="write none, and say what is missing for one")
     parser.add_argument("--episodes", type=int, default=1)
     parser.add_argument("--seconds", type=float, help="cut each episode after so much simulated time")
     parser.add_argument("--fps", type=float, default=50.0, help="at most; the video plays in real time")
@@ -137,7 +156,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--task", help="of the demonstrations, name or file")
     given: dict[str, Any] = vars(parser.parse_args(arguments))
     given["size"] = tuple(given["size"])
+    is_check = given.pop("check")
+    if not is_check and given["out"] is None:
+        parser.error("give RUN and FILE")
     try:
+        if is_check:
+            check()
+            return 0
         n = record(given["run"], given["out"], **{k: v for k, v in given.items() if k not in ("run", "out")})
     except (VideoError, OSError, ValueError) as error:
         print(f"nearl.video: {error}", file=sys.stderr)

@@ -49,9 +49,10 @@ EXAMPLES = sorted((ROOT / "examples" / "python").glob("*.py"))
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_python_examples(example, tmp_path):
     assert len(example.read_text().splitlines()) < 60
-    arguments = {"record_video": [str(tmp_path)], "sb3_vec_env": ["4096"]}.get(example.stem, [])
-    if example.stem == "sb3_vec_env":
-        pytest.importorskip("stable_baselines3")
+    arguments = {"record_video": [str(tmp_path)], "sb3_vec_env": ["4096"], "wandb_callback": [str(tmp_path)]}.get(example.stem, [])
+    needed = {"sb3_vec_env": "stable_baselines3", "wandb_callback": "wandb"}.get(example.stem)
+    if needed is not None:
+        pytest.importorskip(needed, reason=f"{example.name} needs {needed}: pip install {needed}")
     run = subprocess.run([sys.executable, example, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0 and run.stdout, run.stderr
     if example.stem == "record_video":

@@ -11,6 +11,7 @@ mod import;
 mod plant;
 mod process;
 mod project;
+mod python;
 mod robot;
 mod serve;
 mod soak;

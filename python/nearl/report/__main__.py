@@ -18,11 +18,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--log", metavar="FILE.mcap", help="flight logs of 'nearl run --log'", **several)
     parser.add_argument("--eval", metavar="FILE.json", help="output of 'nearl eval --json'", **several)
     parser.add_argument("--summary", metavar="FILE.json", help="output of 'nearl run --json', or summary.json of 'nearl demo'", **several)
+    parser.add_argument("--demos", metavar="FILE.npz", help="demonstrations; those of a --run are shown anyway", **several)
+    parser.add_argument("--task", help="name or file of the task whose robot the demonstrations are of, for pictures")
     parser.add_argument("--title", default="NEARL report")
     parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE.html")
     given = parser.parse_args(arguments)
     try:
-        build(given.out, runs=given.run, logs=given.log, evals=given.eval, summaries=given.summary, sweeps=given.sweeps, title=given.title)
+        build(given.out, runs=given.run, logs=given.log, evals=given.eval, summaries=given.summary, sweeps=given.sweeps, demos=given.demos, task=given.task,
+              title=given.title)  # fmt: skip
     except (ReadError, OSError) as error:
         print(f"nearl.report: {error}", file=sys.stderr)
         return 1

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from nearl._core import __version__
-from nearl.report import flight, sweep, training
+from nearl.report import demonstrations, flight, sweep, training
 from nearl.report.promise import promise
 from nearl.report.read import Log, ReadError, Run, Summary, read_json, read_log, read_run
 from nearl.report.style import image
@@ -19,7 +19,7 @@ CSS = """
 :root { color-scheme: light dark; --ink: #1d2939; --soft: #475467; --page: #f9fafb; --card: #fff; --line: #e4e7ec; --good: #067647; }
 @media (prefers-color-scheme: dark) {
   :root { --ink: #e6e9ef; --soft: #a3adbd; --page: #12161d; --card: #1b212b; --line: #333c4a; --good: #4cc38a; }
-  figure { background: #fff; } figure figcaption { color: #475467; }
+  figure:not(.photo) img { filter: invert(1) hue-rotate(180deg); mix-blend-mode: screen; }
 }
 * { box-sizing: border-box; }
 body { font: 15px/1.55 system-ui, "Segoe UI", Roboto, sans-serif; color: var(--ink); background: var(--page); margin: 0; }
@@ -47,6 +47,8 @@ def build(
     evals: Paths = (),
     summaries: Paths = (),
     sweeps: Paths = (),
+    demos: Paths = (),
+    task: str | None = None,
     title: str = "NEARL report",
 ) -> Path:
     """Writes the report.
@@ -58,6 +60,8 @@ def build(
         evals: Output files of ``nearl eval --json``.
         summaries: Output files of ``nearl run --json``, or ``summary.json`` of ``nearl demo``.
         sweeps: Folders of many runs, as ``nearl sweep`` makes them: drawn in one figure, which is also written as a PNG beside the page.
+        demos: Demonstrations (``.npz``); those that a run of ``runs`` learned from are shown anyway.
+        task: Name or file of the task whose robot ``demos`` are pictures of; None draws their joints alone.
         title: Heading.
 
     Raises:
@@ -68,17 +72,22 @@ def build(
     flights = [read_log(Path(p)) for p in logs]
     programs = [read_json(Path(p)) for p in (*evals, *summaries)]
     swept = [run for folder in sweeps for run in sweep.read_sweep(Path(folder))]
-    if not (trained or flights or programs or swept):
-        raise ReadError("there is nothing to report; give a folder of runs, or at least one of --run, --log, --eval and --summary")
+    shown = [demonstrations.read_demonstrations(Path(p), task) for p in demos]
+    shown += {d.path.resolve(): d for run in trained if (d := demonstrations.of_run(run.path))}.values()
+    if not (trained or flights or programs or swept or shown):
+        raise ReadError("there is nothing to report; give a folder of runs, or at least one of --run, --log, --eval, --summary and --demos")
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     sections = [("All runs", _sweep(swept, out.with_suffix(".png")))] if swept else []
-    sections += _sections(trained, programs, flights)
+    picture, on_top = _picture(trained, flights)
+    sections += _sections(trained, programs, flights, on_top)
+    sections += [("Demonstrations", "".join(_demonstrations(d) for d in shown))] if shown else []
     body = "".join(f"<section><h2>{html.escape(name)}</h2>{content}</section>" for name, content in sections if content)
+    first = _first_screen(trained + swept, programs, flights) + picture
     page = (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{html.escape(title)}</title><style>{CSS}</style></head><body><main><h1>{html.escape(title)}</h1>"
-        f'<p class="lead">{html.escape(_about(swept + trained, flights))}</p>{_first_screen(trained, programs, flights)}{body}</main></body></html>\n'
+        f'<p class="lead">{html.escape(_about(swept + trained, flights))}</p>{first}{body}</main></body></html>\n'
     )
     out.write_text(page, encoding="utf-8")
     return out
@@ -91,24 +100,36 @@ def _sweep(runs: list[Run], picture: Path) -> str:
 
 
 def _first_screen(trained: list[Run], programs: list[Summary], flights: list[Log]) -> str:
-    """The promise in three measured numbers, and the picture of a flight in which the projection had work."""
+    """The promise in three measured numbers."""
     cards = "".join(
         f'<div><strong class="{"good" if good else ""}">{html.escape(number)}</strong>{html.escape(words)}</div>'
         for number, words, good in promise(trained, programs, flights)
     )
-    picture = next((drawn for log in flights if (drawn := flight.states(log, at_most=2))), "")
-    return (f'<div class="promise">{cards}</div>' if cards else "") + picture
+    return f'<div class="promise">{cards}</div>' if cards else ""
 
 
-def _sections(trained: list[Run], programs: list[Summary], flights: list[Log]) -> list[tuple[str, str]]:
-    """What was measured; a section without content is left out."""
+def _picture(trained: list[Run], flights: list[Log]) -> tuple[str, bool]:
+    """The picture of the first screen: a flight in which the projection had work, else what the trainings' limits came to; whether it is
+    the latter."""
+    flown = next((drawn for log in flights if (drawn := flight.states(log, at_most=2))), "")
+    broken = "" if flown else "".join(training.violations(trained))
+    return flown or broken, bool(broken)
+
+
+def _sections(trained: list[Run], programs: list[Summary], flights: list[Log], on_top: bool) -> list[tuple[str, str]]:
+    """What was measured; a section without content is left out, and so is what stands ``on_top`` of the page."""
     return [
         ("Results", _results(trained, programs, flights)),
         ("Learning", "".join(training.learning_curves(trained))),
         ("Inverse dynamics", "".join(training.idm_loss(trained))),
-        ("Constraints while training", "".join(training.violations(trained))),
+        ("Constraints while training", "" if on_top else "".join(training.violations(trained))),
         *_flights(flights),
     ]
+
+
+def _demonstrations(demos: demonstrations.Demonstrations) -> str:
+    head, cells = demonstrations.facts(demos)
+    return _table("", head, [cells]) + demonstrations.pictures(demos) + demonstrations.joints(demos)
 
 
 def _about(runs: list[Run], logs: list[Log]) -> str:
@@ -214,7 +235,8 @@ def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], wor
         return "".join(f'<td class="words">{html.escape(c)}</td>' if i == words else f"<td>{html.escape(c)}</td>" for i, c in enumerate(row))
 
     lines = "".join(f"<tr>{line(row)}</tr>" for row in rows)
-    return f"<h3>{html.escape(caption)}</h3><table><thead><tr>{cells}</tr></thead><tbody>{lines}</tbody></table>"
+    heading = f"<h3>{html.escape(caption)}</h3>" if caption else ""
+    return f"{heading}<table><thead><tr>{cells}</tr></thead><tbody>{lines}</tbody></table>"
 
 
 def _flights(logs: list[Log]) -> list[tuple[str, str]]:

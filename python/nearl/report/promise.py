@@ -10,11 +10,13 @@ Card = tuple[str, str, bool]
 
 def promise(trained: list[Run], programs: list[Summary], flights: list[Log]) -> list[Card]:
     """At most three of: proposals outside, targets outside, reached states outside, time of a tick; ``(number, words, is good)``."""
-    shares = _of_evaluations(programs) or _of_flights(flights) or _of_trainings(trained)
+    shares, of = _of_evaluations(programs) or _of_flights(flights), ""
+    if not shares:
+        shares, of = _of_trainings(trained)
     cards = [
         (f"{100 * shares[kind]:.2f} %", words, kind != "raw" and shares[kind] == 0)
         for kind, words in (
-            ("raw", "of raw proposals broke a limit"),
+            ("raw", f"of raw proposals broke a limit{of}"),
             ("target", "of projected targets did"),
             ("reached", "of the reached states did"),
         )
@@ -43,13 +45,13 @@ def _of_flights(flights: list[Log]) -> dict[str, float]:
     return {}
 
 
-def _of_trainings(trained: list[Run]) -> dict[str, float]:
-    """Means over the last ten rows of the first training that projects."""
-    for run in trained:
-        found = {kind: run.column(f"constraints/{kind}_violations") for kind in ("raw", "target", "reached")}
-        if found["raw"] is not None:
-            return {kind: float(np.mean(column[1][-10:])) for kind, column in found.items() if column is not None}
-    return {}
+def _of_trainings(trained: list[Run]) -> tuple[dict[str, float], str]:
+    """Means over the last ten rows of all trainings that project, and words for how many they are."""
+    columns = [{kind: run.column(f"constraints/{kind}_violations") for kind in ("raw", "target", "reached")} for run in trained]
+    projecting = [found for found in columns if found["raw"] is not None]
+    ends = {kind: [np.mean(c[1][-10:]) for found in projecting if (c := found[kind]) is not None] for kind in ("raw", "target", "reached")}
+    of = f" at the end of {len(projecting)} trainings" if len(projecting) > 1 else " at the end of the training"
+    return {kind: float(np.mean(values)) for kind, values in ends.items() if values}, of
 
 
 def _times(programs: list[Summary], flights: list[Log]) -> tuple[float, str] | None:

@@ -59,6 +59,10 @@ class Log:
         """Names of the projection's stages, each at the place of its number in the log."""
         return [x for x in self.metadata.get("rungs", "").split(",") if x]
 
+    def row_names(self) -> list[str]:
+        """Names of the rows by number, as the metadata gives them; none where it does not."""
+        return [str(name) for name in json.loads(self.metadata["rows"])] if "rows" in self.metadata else []
+
     def names(self, n: int) -> list[str]:
         """Names of the degrees of freedom: the metadata's ``joints``, else the bundled task's, else numbers."""
         given = [x for x in re.split(r"[,\s]+", self.metadata.get("joints", "")) if x]
@@ -102,10 +106,13 @@ def read_log(path: Path) -> Log:
         ticks = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=["tick"])]
         for record in reader.iter_metadata():
             metadata.update(record.metadata)
+        swapped = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=["snapshot"])]
     except (McapError, ValueError, OSError, EOFError, struct.error) as error:
         raise ReadError(f"'{path}' is not a flight log that can be read ({error}); give a file written by 'nearl run --log'") from error
     if not ticks:
         raise ReadError(f"'{path}' holds no ticks; the loop never ran")
+    if any("rows" in entry and json.dumps(entry["rows"]) != json.dumps(json.loads(metadata.get("rows", "[]"))) for entry in swapped):
+        metadata.pop("rows", None)  # a later snapshot numbers its rows otherwise
     columns = {name: np.array([_at(tick, keys) for tick in ticks]) for name, keys in _NUMBERS.items()}
     table = {key: _table([tick.get(key) for tick in ticks]) for key in ("proposal_q", "proposal_v", "target_q", "target_v")}
     state = {key: _table([tick.get("state", {}).get(key) for tick in ticks]) for key in ("q", "v")}

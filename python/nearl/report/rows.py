@@ -36,7 +36,7 @@ def _recorded(log: Log) -> Rows:
             key = (int(row["row"]), str(row["kind"]), str(row["side"]))
             table.setdefault(key, np.full(len(log), np.nan))[tick] = row["multiplier"]
     keys = sorted(table)
-    of = dict(enumerate(names))
+    of = dict(enumerate(log.row_names() or names))
     label = [f"{of.get(row, f'row {row}')} {kind} {_arrow(side)}" for row, kind, side in keys]
     return Rows(label, np.array([table[k] for k in keys]).reshape(len(keys), len(log)), "multiplier")
 

@@ -56,8 +56,8 @@ def steps_axis(axes: Axes) -> None:
     axes.margins(x=0)
 
 
-def image(figure: Figure, caption: str) -> str:
-    """An HTML figure with the picture inside; closes ``figure``."""
+def image(figure: Figure, caption: str, photo: bool = False) -> str:
+    """An HTML figure with the picture inside, which turns dark with the page unless it is a ``photo``; closes ``figure``."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=170, facecolor="white")
     width = round(figure.get_size_inches()[0] * 96)
@@ -65,6 +65,6 @@ def image(figure: Figure, caption: str) -> str:
     data = base64.b64encode(buffer.getvalue()).decode()
     caption = html.escape(caption)
     return (
-        f'<figure><img width="{width}" alt="{caption}" src="data:image/png;base64,{data}">'
+        f'<figure{" class=photo" if photo else ""}><img width="{width}" alt="{caption}" src="data:image/png;base64,{data}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )

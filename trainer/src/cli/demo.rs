@@ -1,6 +1,7 @@
 //! `nearl demo`: plant and runtime as two processes over shared memory, a hot swap while they run, and the report.
 
 use super::process::Process;
+use super::python::Python;
 use super::{Failure, say};
 use crate::evaluate::evaluate;
 use crate::run_folder::{self, write_task};
@@ -8,8 +9,8 @@ use clap::Args;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{RobotName, TrainerLink, Verdict, remove_files};
 use serde_json::{Value, json};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 /// The bundled snapshot: Panda-reach, trained with the command in `examples/snapshots/README.md`.
@@ -107,29 +108,15 @@ impl Demo {
 
     fn report(&self, summary: &Path, shows: &[Value]) -> Result<PathBuf, Failure> {
         let out = self.out.join("report.html");
-        let venv = || Some(PathBuf::from(".venv/bin/python")).filter(|python| python.exists());
-        let package = || std::env::var_os("NEARL_PYTHON").map(PathBuf::from);
-        let python = self.python.clone().or_else(package).or_else(venv).unwrap_or_else(|| "python3".into());
-        let mut command = Command::new(&python);
-        command.args(["-m", "nearl.report", "--summary"]).arg(summary).arg("--out").arg(&out);
+        let mut arguments: Vec<OsString> =
+            ["--summary".into(), summary.into(), "--out".into(), out.clone().into()].into();
         for run in self.runs.iter().filter(|r| r.is_dir()) {
-            command.arg("--run").arg(run);
+            arguments.extend(["--run".into(), run.into()]);
         }
         for log in shows.iter().filter_map(|s| s["log"].as_str()) {
-            command.arg("--log").arg(log);
+            arguments.extend(["--log".into(), log.into()]);
         }
-        let run = command
-            .output()
-            .map_err(|e| format!("cannot start '{}': {e}; give --python", python.display()))?;
-        if !run.status.success() {
-            let why = String::from_utf8_lossy(&run.stderr);
-            let last = why.trim().lines().last().unwrap_or("no message").to_string();
-            return Err(format!(
-                "'{} -m nearl.report' failed: {last}; install the package with 'make package' or give --python",
-                python.display()
-            )
-            .into());
-        }
+        Python::of(self.python.as_deref()).module("nearl.report", &arguments)?;
         Ok(out)
     }
 }

@@ -1,5 +1,6 @@
 //! `nearl train`.
 
+use super::python::Python;
 use super::{Failure, at_least_one, cores, say, unstable};
 use crate::checkpoint::{self, Checkpoint};
 use crate::learn::Algorithm;
@@ -55,7 +56,14 @@ pub(super) struct Train {
     /// Print one JSON object an iteration instead of a progress bar.
     #[arg(long)]
     json: bool,
+    /// At the end, write ten seconds of the policy without exploration as `video.mp4` of the run folder. The Python package does it:
+    /// pip install 'nearl[video]'.
+    #[arg(long)]
+    video: bool,
 }
+
+/// Simulated time of a video [s].
+const VIDEO: &str = "10";
 
 /// What `--preset` may be.
 pub(super) fn one_preset() -> String {
@@ -151,6 +159,11 @@ impl Train {
             signal_hook::flag::register_conditional_shutdown(signal, 1, Arc::clone(&stop))?;
             signal_hook::flag::register(signal, Arc::clone(&stop))?;
         }
+        let python = self.video.then(|| Python::of(None));
+        if let Some(python) = &python {
+            // What is missing is said before hours of training.
+            python.module("nearl.video", &["--check"])?;
+        }
         let experience = match (&self.from, &self.collect) {
             (Some(name), _) => Experience::Loop(RobotName::new(name)?, Arc::clone(&stop)),
             (None, Some(name)) => Experience::Served(RobotName::new(name)?, Arc::clone(&stop)),
@@ -210,6 +223,16 @@ impl Train {
                 out.display(),
                 run_folder::snapshot_of(&out)?.display()
             ));
+        }
+        if let Some(python) = python {
+            let video = out.join("video.mp4");
+            python.module(
+                "nearl.video",
+                &[out.as_os_str(), video.as_os_str(), "--seconds".as_ref(), VIDEO.as_ref()],
+            )?;
+            if !self.json {
+                say(format!("video {}", video.display()));
+            }
         }
         if stop.load(Ordering::Relaxed) && steps < run.steps {
             say(format!(
