@@ -192,6 +192,15 @@ impl Controller {
         self.names.clone()
     }
 
+    /// Kind of each row by number; None for those of the degrees of freedom, which several limits share.
+    #[getter]
+    fn row_kinds(&self, py: Python<'_>) -> Vec<Option<&'static str>> {
+        self.with(py, |inner| inner.controller.row_kinds())
+            .iter()
+            .map(|kind| kind.map(|k| k.name()))
+            .collect()
+    }
+
     /// Limits of the degrees of freedom (nv each), infinite where there is none, by name: lower_position, upper_position [rad or m],
     /// velocity [rad/s or m/s], acceleration [rad/s² or m/s²], effort [N·m or N].
     #[getter]

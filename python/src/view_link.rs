@@ -102,6 +102,10 @@ impl ViewClient {
             let (rows, out) = (&inner.rows, PyDict::new(py));
             out.set_item("task", rows.task_name())?;
             out.set_item("rows", rows.row_names())?;
+            out.set_item(
+                "kinds",
+                rows.row_kinds().iter().map(|kind| kind.map(Kind::name)).collect::<Vec<_>>(),
+            )?;
             out.set_item("snapshot", rows.snapshot)?;
             let limits = [
                 ("lower_position", rows.q_lower()),

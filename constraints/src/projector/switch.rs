@@ -4,7 +4,7 @@ use super::Projector;
 use super::build::check_combination;
 use crate::row::Previous;
 use crate::viability::Dof;
-use crate::{LimitError, LimitSet, Proposal, Target};
+use crate::{Kind, LimitError, LimitSet, Proposal, Target};
 
 impl Projector {
     /// Switches every limit with that label (see [`Limit::label`](crate::Limit::label)) on or off, for the ticks to come.
@@ -165,6 +165,13 @@ impl Projector {
     pub fn row_names(&self) -> Vec<String> {
         let dofs = (0..self.model.nv()).map(|i| self.model.dof_name(i));
         let labels = self.coupled.iter().flat_map(|stages| stages.labels.iter().map(|l| l.name.clone()));
+        dofs.chain(labels).collect()
+    }
+
+    /// Kind of each row by its number; none for those of single joints, which several limits share.
+    pub fn row_kinds(&self) -> Vec<Option<Kind>> {
+        let dofs = (0..self.model.nv()).map(|_| None);
+        let labels = self.coupled.iter().flat_map(|stages| stages.labels.iter().map(|l| Some(l.kind)));
         dofs.chain(labels).collect()
     }
 

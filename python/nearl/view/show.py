@@ -34,7 +34,8 @@ class Page:
 
         self.server, self._source = server, source
         model = mujoco.MjModel.from_xml_string(source.robot.env.model_text)
-        server.gui.configure_theme(control_width="large", control_layout="fixed", show_logo=False, show_share_button=False)
+        server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
         server.scene.add_grid("/floor", width=20.0, height=20.0)
         self._robot = Figure(server, "robot", model, ROBOT, 1.0)
         self._ghosts = [Figure(server, "proposal", model, PROPOSAL, 0.35), Figure(server, "target", model, TARGET, 0.35)]

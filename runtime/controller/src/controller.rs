@@ -656,6 +656,10 @@ impl Controller {
     pub fn row_names(&self) -> Vec<String> {
         self.last_word().row_names()
     }
+    /// Kind of each row; none for those of single joints.
+    pub fn row_kinds(&self) -> Vec<Option<nearl_constraints::Kind>> {
+        self.last_word().row_kinds()
+    }
     /// Robot model.
     pub fn model(&self) -> &Model {
         &self.model

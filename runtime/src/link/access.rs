@@ -3,6 +3,8 @@
 use std::mem::offset_of;
 use std::ops::Range;
 
+use nearl_constraints::Kind;
+
 use super::messages::*;
 use super::schema::{Arrays, WORD};
 use crate::snapshot::SnapshotError;
@@ -97,6 +99,23 @@ impl RowsMessage {
         self.task.fill(0);
         self.task[..length].copy_from_slice(&name.as_bytes()[..length]);
         self.task_length = length as u64;
+    }
+
+    /// Kind of each row; none for one of a single joint.
+    pub fn row_kinds(&self) -> Vec<Option<Kind>> {
+        let n = (self.n_kinds as usize).min(MAX_KINDS);
+        self.kinds[..n]
+            .iter()
+            .map(|code| Kind::ALL.get(usize::from(*code).wrapping_sub(1)).copied())
+            .collect()
+    }
+
+    /// Writes the kinds of the rows, as many as there is room for.
+    pub fn set_row_kinds(&mut self, kinds: &[Option<Kind>]) {
+        for (to, from) in self.kinds.iter_mut().zip(kinds) {
+            *to = from.map_or(0, |kind| kind as u8 + 1);
+        }
+        self.n_kinds = kinds.len().min(MAX_KINDS) as u64;
     }
 
     /// Writes the limits of the degrees of freedom; none for a robot with more than a message holds.
@@ -343,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn a_task_name_that_is_too_long_is_cut_between_letters() {
+    fn what_viewers_are_told_fits_its_message_whatever_a_peer_says() {
         let mut rows = RowsMessage::zeroed();
         rows.set_task_name(&"\u{e9}".repeat(MAX_TASK));
         assert_eq!(rows.task_name(), "\u{e9}".repeat(MAX_TASK / 2));
@@ -351,6 +370,11 @@ mod tests {
         assert_eq!(rows.task_name(), "arm");
         rows.task_length = u64::MAX;
         assert!(rows.task_name().starts_with("arm"));
+        rows.set_row_kinds(&[None, Some(Kind::Position), Some(Kind::VelocityProfile)]);
+        assert_eq!(rows.row_kinds(), [None, Some(Kind::Position), Some(Kind::VelocityProfile)]);
+        rows.kinds[0] = 255;
+        rows.n_kinds = u64::MAX;
+        assert_eq!((rows.row_kinds().len(), rows.row_kinds()[0]), (MAX_KINDS, None));
         rows.n_limits = u64::MAX;
         assert_eq!(rows.velocity().len(), MAX_JOINTS);
     }

@@ -29,6 +29,8 @@ pub const MAX_ASKED: usize = 4096;
 pub const MAX_ACTIVE: usize = 96;
 /// Capacity of the row names in a [`RowsMessage`] [bytes].
 pub const MAX_ROW_NAMES: usize = 8192;
+/// Rows whose kind a [`RowsMessage`] has room for.
+pub const MAX_KINDS: usize = 512;
 /// Capacity of the task's name in a [`RowsMessage`] [bytes].
 pub const MAX_TASK: usize = 128;
 /// Capacity of the text in a [`ReceiptMessage`] [bytes].
@@ -489,6 +491,8 @@ message! {
         length: u64,
         /// Bytes used in `task`.
         task_length: u64,
+        /// Entries used in `kinds`.
+        n_kinds: u64,
         /// Degrees of freedom whose limits are given; they are those of the first rows. 0 where none are known.
         n_limits: u64,
         /// Lowest position that the projection allows, infinite where there is no limit; as the next four [rad or m].
@@ -501,6 +505,8 @@ message! {
         acceleration: [f64; MAX_JOINTS],
         /// Largest motor force [N m or N].
         effort: [f64; MAX_JOINTS],
+        /// Kind of each row, one more than its place in [`Kind::ALL`](nearl_constraints::Kind::ALL); 0 for a row of a single joint.
+        kinds: [u8; MAX_KINDS],
         /// Name of the task, as UTF-8, zero padded; cut where it is longer.
         task: [u8; MAX_TASK],
         /// Row names by number, each followed by a line break, as UTF-8; those beyond the capacity are missing.

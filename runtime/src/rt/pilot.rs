@@ -219,6 +219,7 @@ impl LoopController for Pilot {
     fn told(&self) -> Box<RowsMessage> {
         let mut told = Box::new(RowsMessage::zeroed());
         told.set_row_names(&self.row_names());
+        told.set_row_kinds(&self.controller.row_kinds());
         told.set_task_name(&self.task);
         told.set_limits(self.controller.limits());
         told

@@ -144,6 +144,11 @@ fn a_stranger_finds_names_times_of_day_and_ways_to_stop_in_half_the_bytes() {
     assert_eq!((told.task_name(), told.velocity()), (first.manifest.task.name.clone(), &limits.velocity[..]));
     assert_eq!((told.q_lower(), told.q_upper()), (&limits.q_lower[..], &limits.q_upper[..]));
     assert_eq!((told.acceleration(), told.effort()), (&limits.acceleration[..], &limits.effort[..]));
+    let kinds = told.row_kinds();
+    assert!(
+        kinds[..7].iter().all(Option::is_none)
+            && kinds[7..].iter().all(|kind| *kind == Some(nearl_constraints::Kind::Torque))
+    );
     assert_eq!(rows.len(), 14, "seven joints and their torques: {rows:?}");
     let tick = shown.iter().rfind(|tick| tick.n_active > 0 && tick.nu > 0).expect("a tick with active rows");
     assert!(tick.multipliers().iter().all(|x| *x > 0.0) && tick.brake().len() == 7, "{tick:?}");
