@@ -1,7 +1,9 @@
 """The report from a synthetic run: what must be in it, and what is said where something is missing."""
 
+import io
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from conftest import ROOT
 
+import nearl
 from nearl import curves, report
 from nearl.report import rows
 from nearl.report.read import ReadError, read_log, read_run
@@ -150,3 +154,95 @@ def test_curves_meet_where_all_seeds_have_values() -> None:
     with pytest.raises(ValueError, match="no steps in common"):
         curves.over_seeds([([0, 1], [0, 0]), ([5, 6], [0, 0])])
     assert np.array_equal(curves.smooth([1, 2, 3, 4], 2), [1, 1.5, 2.5, 3.5])
+
+
+def demonstrations(path: Path) -> Path:
+    """Three episodes of a hopper that bends its knee."""
+    env = nearl._core.Env("Hopper-v5")
+    rng, rows = np.random.default_rng(0), []
+    lengths = [40, 60, 50]
+    for length in lengths:
+        for step in range(length + 1):
+            qpos = np.array([0.1 * step, 1.25 - 0.002 * step, 0, -0.01 * step, -0.02 * step, 0]) + 1e-3 * rng.normal(size=6)
+            rows.append((env.set_state(qpos, np.zeros(6)), qpos, np.zeros(6)))
+    obs, qpos, qvel = (np.array(part) for part in zip(*rows, strict=True))
+    np.savez(path, observations=obs, qpos=qpos, qvel=qvel, lengths=lengths, dt=0.008, names=env.obs_names)
+    return path
+
+
+def test_demonstrations_can_be_looked_at(tmp_path) -> None:
+    file = demonstrations(tmp_path / "hops.npz")
+    page = report.build(tmp_path / "r.html", demos=[file]).read_text()
+    assert re.findall("<h2>(.*?)</h2>", page) == ["Demonstrations"] and page.count("data:image/png") == 1
+    assert [x in page for x in ("<td>3</td>", "<td>40 .. 60</td>", "<td>8</td>", "<td>1.2</td>", "<td>no</td>")] == [True] * 5
+    # of a run that learned from them, with pictures of the robot, once however many runs read the file
+    for seed in range(2):
+        run = synthetic.run_folder(tmp_path, "Hopper-v5", "soil", seed, 900)
+        (run / "task.toml").write_text((ROOT / "examples/tasks/Hopper-v5.toml").read_text() + f'\n[train.demos]\nfile = "{file}"\n')
+    runs = [tmp_path / "Hopper-v5" / f"soil_{seed}" for seed in range(2)]
+    shown = report.build(tmp_path / "r.html", runs=runs).read_text()
+    assert shown.count("The first episode of hops.npz at 0.00, 0.06, 0.13, 0.19, 0.26, 0.32 s.") == 2, "as text and caption"
+    assert shown.count('class="photo"') == 1
+    with pytest.raises(ReadError, match=r"of another robot than 'HalfCheetah-v5'"):
+        report.build(tmp_path / "r.html", demos=[file], task="HalfCheetah-v5")
+    np.savez(tmp_path / "half.npz", qpos=np.zeros((3, 6)))
+    with pytest.raises(ReadError, match=r"half\.npz' has no array 'observations'"):
+        report.build(tmp_path / "r.html", demos=[tmp_path / "half.npz"])
+    (tmp_path / "no.npz").write_bytes(b"no archive")
+    with pytest.raises(ReadError, match=r"no\.npz' are no demonstrations that can be read"):
+        report.build(tmp_path / "r.html", demos=[tmp_path / "no.npz"])
+
+
+def test_a_sweep_and_a_training_begin_with_three_numbers_and_a_picture(inputs, tmp_path) -> None:
+    runs = inputs["runs"][:3]
+    ends = [[read_run(r).column(f"constraints/{kind}_violations")[1][-1] for r in runs] for kind in ("raw", "target", "reached")]
+    wanted = [f"{100 * np.mean(end):.2f} %" for end in ends]
+    for given in ({"runs": runs}, {"sweeps": [runs[0].parent]}):
+        page = report.build(tmp_path / "r.html", **given).read_text()
+        assert re.findall(r"<strong[^>]*>(.*?)</strong>", page) == wanted and "at the end of 3 trainings" in page
+        table = page.index("<table>")
+        assert page.index('class="drawn"') < table, "a picture comes before the tables"
+
+
+def test_the_table_ends_where_the_curve_ends(inputs, tmp_path) -> None:
+    run = inputs["runs"][0]
+    page = report.build(tmp_path / "r.html", runs=[run]).read_text()
+    assert f"<td>{read_run(run).column('rollout/ep_rew_mean')[1][-1]:.1f}</td>" in page
+
+
+def test_rows_of_a_flight_have_the_names_of_its_snapshot(tmp_path) -> None:
+    names = [f"joint {i}" for i in range(7)] + [f"motor {i}" for i in range(7)]
+    given = {"joints": "a b c d e f g", "dt": "0.001", "rows": json.dumps(names)}
+    log = read_log(synthetic.flight_log(tmp_path / "named.mcap", 300, given))
+    row = {"kind": "torque", "side": "upper", "multiplier": 0.5}
+    log.active = [[{**row, "row": 9}, {**row, "row": 1, "kind": "velocity"}] if tick == 40 else [] for tick in range(len(log))]
+    found = rows.active_rows(log)
+    assert found.names == ["joint 1 velocity ↑", "motor 2 torque ↑"] and np.isfinite(found.multiplier).sum(axis=1).tolist() == [1, 1]
+
+
+def test_nothing_runs_over_the_edge_at_1200_pixels(inputs, tmp_path) -> None:
+    """In Chromium, light and dark: no element is wider than the page, and the figures turn dark with it."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium here: apt-get install chromium")
+    pages = [report.build(tmp_path / "all.html", **inputs), report.build(tmp_path / "sweep.html", sweeps=[inputs["runs"][0].parent])]
+    wider = """[...document.querySelectorAll('body *')].filter(e => e.getBoundingClientRect().right > innerWidth + 1
+        || (e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display != 'inline')).map(e => e.tagName + ' ' + e.textContent.slice(0, 60))"""
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        for scheme, is_dark in (("light", False), ("dark", True)):
+            tab = browser.new_page(viewport={"width": 1200, "height": 900}, color_scheme=scheme)
+            for page in pages:
+                tab.goto(page.as_uri())
+                assert tab.evaluate(wider) == []
+                for place in ("h1", "figure.drawn"):
+                    shot = tab.locator(place).first.screenshot()
+                    assert (np.median(plt_gray(shot)) < 0.4) == is_dark, (page.name, scheme, place)
+        browser.close()
+
+
+def plt_gray(png: bytes) -> np.ndarray:
+    import matplotlib.image
+
+    return matplotlib.image.imread(io.BytesIO(png))[..., :3].mean(axis=2)

@@ -19,7 +19,7 @@ CSS = """
 :root { color-scheme: light dark; --ink: #1d2939; --soft: #475467; --page: #f9fafb; --card: #fff; --line: #e4e7ec; --good: #067647; }
 @media (prefers-color-scheme: dark) {
   :root { --ink: #e6e9ef; --soft: #a3adbd; --page: #12161d; --card: #1b212b; --line: #333c4a; --good: #4cc38a; }
-  figure:not(.photo) img { filter: invert(1) hue-rotate(180deg); mix-blend-mode: screen; }
+  figure.drawn img { filter: invert(1) hue-rotate(180deg); mix-blend-mode: screen; }
 }
 * { box-sizing: border-box; }
 body { font: 15px/1.55 system-ui, "Segoe UI", Roboto, sans-serif; color: var(--ink); background: var(--page); margin: 0; }
@@ -149,7 +149,7 @@ def _results(runs: list[Run], programs: list[Summary], logs: list[Log]) -> str:
         parts.append(_table("Return and broken limits [share of ticks]", head, [_evaluation_row(*e) for e in evaluations]))
     if runs:
         head = ["training", "seed", "steps", "return at the end", "raw proposals outside", "targets outside", "reached outside", "steps/s"]
-        parts.append(_table("Trainings", head, [_run_row(run) for run in runs]))
+        parts.append(_table("Trainings, where their curves end", head, [_run_row(run) for run in runs]))
     loops = [_loop_row(*loop) for p in programs for loop in p.loops] or [_log_row(log) for log in logs]
     if loops:
         head = ["loop", "ticks", "compute p50", "p99", "p99.9", "max", "wake p50", "p99", "overruns", "late on the robot"]
@@ -173,7 +173,7 @@ def _evaluation_row(name: str, e: dict[str, Any]) -> list[str]:
 def _run_row(run: Run) -> list[str]:
     def last(column: str) -> float | None:
         found = run.column(column)
-        return None if found is None else float(np.mean(found[1][-10:]))
+        return None if found is None else float(found[1][-1])
 
     end = training.final_return(run)
     shares = [last(f"constraints/{kind}_violations") for kind in ("raw", "target", "reached")]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nearl import _core
 from nearl.report.read import ReadError
-from nearl.report.style import MUTED, PROJECTED, image
+from nearl.report.style import MUTED, PROJECTED, image, strip
 from nearl.runs import demonstrations_of
 
 Floats = NDArray[np.float64]
@@ -100,6 +100,7 @@ def joints(demos: Demonstrations) -> str:
             axes.plot(np.arange(len(values)) * demos.dt, values, **look)
         axes.set_title(demos.names[column].removeprefix("q."))
         axes.margins(x=0)
+        axes.tick_params(labelbottom=True)
     for axes in panels.flat[len(chosen) :]:
         axes.remove()
     for axes in panels[-1, :]:
@@ -124,10 +125,7 @@ def pictures(demos: Demonstrations) -> str:
         return f'<p class="lead">No pictures of the robot: {error}.</p>'
     first = demos.episodes()[0]
     rows = np.linspace(first.start, first.stop - 1, PICTURES).astype(int)
-    figure, panels = plt.subplots(1, PICTURES, figsize=(10.2, 1.75), squeeze=False)
-    for axes, row in zip(panels[0], rows):
-        axes.imshow(renderer.frame(demos.qpos[row], demos.qvel[row]))
-        axes.set_title(f"{(row - first.start) * demos.dt:.2f} s", fontweight="normal")
-        axes.set_axis_off()
+    frames = [renderer.frame(demos.qpos[row], demos.qvel[row]) for row in rows]
     renderer.close()
-    return image(figure, f"The first episode of {demos.path.name}.", photo=True)
+    times = ", ".join(f"{(row - first.start) * demos.dt:.2f}" for row in rows)
+    return strip(frames, f"The first episode of {demos.path.name} at {times} s.")

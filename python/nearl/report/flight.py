@@ -42,7 +42,7 @@ def timeline(log: Log) -> tuple[str | None, str]:
     bar.ax.yaxis.set_major_formatter(lambda x, _: f"{x:g}")
     bar.ax.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if high < 20 * low else "")
     left_out = f" The {len(rows.names) - len(busy)} least busy rows are left out." if len(busy) < len(rows.names) else ""
-    caption = f"Rows that hold the target back, coloured by how hard they are leaned on (white: not active; arrow: which bound).{left_out}"
+    caption = f"Rows that hold the target back, coloured by how hard they are leaned on (empty: not active; arrow: which bound).{left_out}"
     return image(figure, caption), ""
 
 

@@ -46,10 +46,10 @@ def _of_flights(flights: list[Log]) -> dict[str, float]:
 
 
 def _of_trainings(trained: list[Run]) -> tuple[dict[str, float], str]:
-    """Means over the last ten rows of all trainings that project, and words for how many they are."""
+    """Means of the last rows of all trainings that project, and words for how many they are."""
     columns = [{kind: run.column(f"constraints/{kind}_violations") for kind in ("raw", "target", "reached")} for run in trained]
     projecting = [found for found in columns if found["raw"] is not None]
-    ends = {kind: [np.mean(c[1][-10:]) for found in projecting if (c := found[kind]) is not None] for kind in ("raw", "target", "reached")}
+    ends = {kind: [c[1][-1] for found in projecting if (c := found[kind]) is not None] for kind in ("raw", "target", "reached")}
     of = f" at the end of {len(projecting)} trainings" if len(projecting) > 1 else " at the end of the training"
     return {kind: float(np.mean(values)) for kind, values in ends.items() if values}, of
 

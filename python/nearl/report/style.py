@@ -3,13 +3,16 @@
 import base64
 import html
 import io
+from collections.abc import Sequence
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 # Okabe and Ito's palette: told apart by colour-blind readers and on paper.
 PREDICTED, PROJECTED, REACHED = "#D55E00", "#0072B2", "#1a1a1a"
@@ -56,15 +59,26 @@ def steps_axis(axes: Axes) -> None:
     axes.margins(x=0)
 
 
-def image(figure: Figure, caption: str, photo: bool = False) -> str:
-    """An HTML figure with the picture inside, which turns dark with the page unless it is a ``photo``; closes ``figure``."""
+def image(figure: Figure, caption: str) -> str:
+    """An HTML figure with the picture inside, which turns dark with the page; closes ``figure``."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=170, facecolor="white")
     width = round(figure.get_size_inches()[0] * 96)
     plt.close(figure)
-    data = base64.b64encode(buffer.getvalue()).decode()
-    caption = html.escape(caption)
-    return (
-        f'<figure{" class=photo" if photo else ""}><img width="{width}" alt="{caption}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
+    return _html(buffer, width, caption, "drawn")
+
+
+def strip(frames: Sequence[NDArray[np.uint8]], caption: str, gap: int = 8) -> str:
+    """Pictures (height x width x 3) of one size side by side as an HTML figure, whose colours stay as they are."""
+    clear = np.zeros((*frames[0].shape[:1], gap, 4), np.uint8)
+    opaque = [np.dstack([frame, np.full(frame.shape[:2], 255, np.uint8)]) for frame in frames]
+    row = np.hstack([part for frame in opaque for part in (frame, clear)][:-1])
+    buffer = io.BytesIO()
+    plt.imsave(buffer, row, format="png")
+    return _html(buffer, row.shape[1], caption, "photo")
+
+
+def _html(buffer: io.BytesIO, width: int, caption: str, kind: str) -> str:
+    data, caption = base64.b64encode(buffer.getvalue()).decode(), html.escape(caption)
+    picture = f'<img width="{width}" alt="{caption}" src="data:image/png;base64,{data}">'
+    return f'<figure class="{kind}">{picture}<figcaption>{caption}</figcaption></figure>'

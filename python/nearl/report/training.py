@@ -3,7 +3,6 @@
 from collections import defaultdict
 
 import matplotlib.pyplot as plt
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter
 
@@ -82,7 +81,7 @@ def idm_loss(runs: list[Run]) -> list[str]:
             axes.plot(*threshold, color=DEADLINE, linestyle=(0, (5, 3)), linewidth=1.3, label="threshold")
         axes.set(title=task, yscale="log")
         axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.legend(loc="upper right")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=3)
         steps_axis(axes)
     panels[0, 0].set_ylabel("squared error of the action")
     caption = "Loss of the inverse model before and after each update. Above the threshold it is trained until it is below; below, it is left alone."
@@ -115,9 +114,7 @@ def violations(runs: list[Run]) -> list[str]:
     return [image(figure, "Share of control ticks in which at least one limit was broken. What is proposed may break limits; what is aimed at may not.")]
 
 
-def final_return(run: Run, window: int = 10) -> tuple[float, float] | None:
-    """Mean return of the last rows, and steps at the end."""
+def final_return(run: Run) -> tuple[float, float] | None:
+    """Mean return of the last 100 episodes, and steps at the end: the last point of the curve."""
     column = run.column("rollout/ep_rew_mean")
-    if column is None:
-        return None
-    return float(np.mean(column[1][-window:])), float(column[0][-1])
+    return None if column is None else (float(column[1][-1]), float(column[0][-1]))

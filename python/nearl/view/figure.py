@@ -47,10 +47,11 @@ class Figure:
             self._mujoco.mju_mat2Quat(quat, rotation)
             part.position, part.wxyz = position, quat.copy()
 
-    def centre(self) -> Floats:
-        """Middle of the boxes around its parts where it was shown last (3) [m]."""
+    def room(self) -> tuple[Floats, float]:
+        """Middle of the box around the centres of its parts where it was shown last (3), and the length of its diagonal [m]."""
         at = np.array([position for position, _ in self._places()] or [np.zeros(3)])
-        return (at.min(axis=0) + at.max(axis=0)) / 2
+        low, high = at.min(axis=0), at.max(axis=0)
+        return (low + high) / 2, float(np.linalg.norm(high - low))
 
     def _places(self) -> list[tuple[Floats, Floats]]:
         data = self._data

@@ -25,8 +25,10 @@ def arrow(held: Held) -> str:
 
 
 def mark(at: float | None, lit: Sequence[Held], words: str) -> str:
-    """A cell with a mark at ``at`` (0 to 1), lit where rows hold the target back; the words alone where there is no limit."""
-    pull = "".join(f" <b>{arrow(h)}{h.multiplier:.2g}</b>" for h in lit)
+    """A cell with a mark at ``at`` (0 to 1), lit where rows hold the target back, with the largest multiplier; the words alone where there is
+    no limit."""
+    hardest = max(lit, key=lambda h: h.multiplier, default=None)
+    pull = "" if hardest is None else f" <b>{arrow(hardest)}{hardest.multiplier:.2g}</b>"
     title = escape("; ".join(f"{h.name}, {h.kind} {h.side}: multiplier {h.multiplier:.3g}, {h.ticks} ticks" for h in lit))
     if at is None:
         return f'<td title="{title or "no limit"}">{words}{pull}</td>'

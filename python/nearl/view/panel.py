@@ -25,6 +25,9 @@ STYLE = """<style>
 .nearl .bar{position:relative;height:10px;background:#98a2b340;border:1px solid #98a2b3;border-radius:2px;overflow:hidden}
 .nearl .bar i{position:absolute;top:0;bottom:0;background:#667085}
 .nearl .lit{background:#ffb000;border-color:#b45309}
+.nearl .told td:first-child{width:34%}
+.nearl .rows td:nth-child(2){width:34%}
+.nearl .rows td:nth-child(3){width:20%}
 .nearl .lit i{background:#7c2d12}
 </style>"""
 
@@ -80,7 +83,7 @@ class Panel:
             for k in range(len(shown)):
                 lit = [h for h in p.held if h.row == i and BARS.get(h.kind) == k]
                 value = places[k][0]
-                cells.append(mark(share(*places[k]) if np.isfinite(value) else None, lit, f"{value:.2f}" if np.isfinite(value) else ""))
+                cells.append(mark(share(*places[k]) if np.isfinite(value) else None, lit, f"{value:.{2 - k // 2}f}" if np.isfinite(value) else ""))
             lines.append(f'<tr><td title="{escape(name)}">{escape(name)}</td>{"".join(cells)}</tr>')
         head = "".join(f"<th>{h}</th>" for h in shown)
         words = "Joints within their limits; a lit bar holds the target back, by its multiplier"
@@ -95,13 +98,13 @@ class Panel:
         lines = []
         for row in order[:SHOWN_ROWS]:
             h = active.get(row)
-            words = "" if h is None else f"{h.kind.replace('_', ' ')} {arrow(h)} <b>{h.multiplier:.2g}</b>"
+            words = "" if h is None else f"{arrow(h)} <b>{h.multiplier:.2g}</b>"
             part = 0.0 if h is None or self._largest == 0.0 else h.multiplier / self._largest
             lines.append(f'<tr><td title="{escape(names[row])}">{escape(names[row])}</td>{length(part, h is not None)}<td>{words}</td></tr>')
         hidden = order[SHOWN_ROWS:]
         more = f"and {len(hidden)} rows more, {sum(row in active for row in hidden)} of them active" if hidden else ""
         words = "Rows over several joints; the bar is the multiplier as a share of the largest so far"
-        return f"<h4>{words}</h4><table>{''.join(lines)}</table>{more}" if lines else ""
+        return f"<h4>{words}</h4><table class=rows>{''.join(lines)}</table>{more}" if lines else ""
 
     def _ledger(self, p: Picture) -> str:
         if p.ledger is None:
@@ -111,10 +114,10 @@ class Panel:
             "status": escape(str(told["status"])),
             "answered by": f"{escape(str(told['rung']))}, {told['iterations']} iterations",
             "active rows": told["active"],
-            "target moved by": f"{told['moved']:.3g}",
+            "moved by": f"{told['moved']:.3g}",
             "slack": f"{told['slack']:.3g}",
             "residual": f"{told['residual']:.1e}",
             "projection took": f"{told['duration_ns'] / 1e3:.1f} µs",
             f"broken in {p.ticks:,} ticks": f"{p.raw:,} by proposals, {p.broken:,} by targets",
         }
-        return "<h4>Ledger of the newest tick</h4><table>" + "".join(f"<tr><td>{k}</td><td>{v}</td></tr>" for k, v in lines.items()) + "</table>"
+        return "<h4>Ledger of the newest tick</h4><table class=told>" + "".join(f"<tr><td>{k}</td><td>{v}</td></tr>" for k, v in lines.items()) + "</table>"

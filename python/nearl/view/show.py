@@ -16,6 +16,7 @@ from nearl.view.training import Training
 Floats = NDArray[np.float64]
 ROBOT, PROPOSAL, TARGET = (208, 116, 58), (0, 114, 178), (0, 158, 115)
 PATIENCE = 5.0  # [s] without a tick until the loop counts as gone
+APART = 0.02  # [rad or m] from the robot within which a ghost would only stain it
 AHEAD = 0.25  # [s] by which proposal and target are drawn ahead
 LEGEND = """<div style="font:12px system-ui,sans-serif;padding:6px 10px"><b style="color:#d0743a">●</b> robot
 <b style="color:#0072b2">●</b> what the policy proposes <b style="color:#009e73">●</b> its projection</div>"""
@@ -46,14 +47,16 @@ class Page:
 
     def show(self, picture: Picture) -> None:
         """Puts the newest picture on the page."""
-        self._robot.show(picture.q)
-        for figure, state in zip(self._ghosts, (picture.proposal, picture.target)):
-            figure.show(None if state is None else led(*state, self._ahead.value))
-        self._board.content = self._panel.html(picture, self._source.curves())
+        with self.server.atomic():
+            self._robot.show(picture.q)
+            for figure, state in zip(self._ghosts, (picture.proposal, picture.target)):
+                ahead = None if state is None else led(*state, self._ahead.value)
+                figure.show(None if ahead is None or np.abs(ahead - picture.q).max() < APART else ahead)
+            self._board.content = self._panel.html(picture, self._source.curves())
         if not self._aimed:
-            self._aimed, centre, extent = True, self._robot.centre(), 2.5
+            self._aimed, (centre, size) = True, self._robot.room()
             camera = self.server.initial_camera
-            camera.look_at, camera.position = tuple(centre), tuple(centre + extent * np.array([0.8, -0.7, 0.35]))
+            camera.look_at, camera.position = tuple(centre), tuple(centre + (0.6 + 1.3 * size) * np.array([0.8, -0.7, 0.35]))
 
 
 def source_of(name: str, task: str | None) -> Source:

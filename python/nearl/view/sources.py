@@ -97,6 +97,11 @@ class Robot:
     limits: dict[str, Floats]
 
 
+def labels(names: Sequence[str], kinds: Sequence[str | None]) -> list[str]:
+    """Names of rows that differ: those over several joints with their kind."""
+    return [name if kind is None else f"{name} {kind.replace('_', ' ')}" for name, kind in zip(names, kinds)] + list(names[len(kinds) :])
+
+
 class Source(Protocol):
     """Where pictures come from."""
 
@@ -141,7 +146,7 @@ class Loop:
         if len(env.state()[1]) != len(joints):
             self._client.close()
             raise ViewError(f"the robot of '{wanted}' has {len(env.state()[1])} degrees of freedom, that of the loop of `{name}` {len(joints)}; give --task")
-        self.robot = Robot(env, joints, self._told["rows"], self._limits())
+        self.robot = Robot(env, joints, self._rows(), self._limits())
 
     def next(self, span: float) -> Picture | None:
         seen = self._client.look(span)
@@ -149,8 +154,8 @@ class Loop:
             return None
         if self._told["snapshot"] != seen["snapshot"]:
             self._told = self._client.told()
-            self.robot.rows, self.robot.limits = self._told["rows"], self._limits()
-        names = self._told["rows"] if self._told["snapshot"] == seen["snapshot"] else []
+            self.robot.rows, self.robot.limits = self._rows(), self._limits()
+        names = self.robot.rows if self._told["snapshot"] == seen["snapshot"] else []
         held = [Held(r["row"], names[r["row"]], r["kind"], r["side"], r["multiplier"], r["ticks"]) for r in seen["active"] if r["row"] < len(names)]
         acts = seen["acts"]
         return Picture(
@@ -181,6 +186,9 @@ class Loop:
 
     def close(self) -> None:
         self._client.close()
+
+    def _rows(self) -> list[str]:
+        return labels(self._told["rows"], self._told["kinds"])
 
     def _limits(self) -> dict[str, Floats]:
         return {k: v for k, v in self._told.items() if isinstance(v, np.ndarray)}

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nearl import _core
 from nearl.runs import ReadError, read_run
-from nearl.view.sources import Held, Picture, Robot, ViewError
+from nearl.view.sources import Held, Picture, Robot, ViewError, labels
 
 Floats = NDArray[np.float64]
 REREAD = 2.0  # [s] between two looks at a run folder
@@ -101,7 +101,7 @@ class Training:
         if not stamps or stamps[0] == self._stamp:
             return False
         self._controller, self._stamp, self._over = _core.Controller.load(self._folder), stamps[0], True
-        self._names = self._controller.row_names
+        self._names = labels(self._controller.row_names, self._controller.row_kinds)
         return True
 
     def _begin_where_it_ended(self) -> None:
@@ -118,7 +118,7 @@ class Training:
             key = (row["row"], row["kind"], row["side"])
             before = window.held.get(key)
             multiplier, ticks = max(row["multiplier"], before.multiplier if before else 0.0), 1 + (before.ticks if before else 0)
-            window.held[key] = Held(row["row"], row["name"], row["kind"], row["side"], multiplier, ticks)
+            window.held[key] = Held(row["row"], self._names[row["row"]], row["kind"], row["side"], multiplier, ticks)
 
     def _state(self, q: Floats, v: Floats, entries: Floats) -> tuple[Floats, Floats] | None:
         """The state with the proposed entries in their places; None without any."""
