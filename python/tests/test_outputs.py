@@ -6,6 +6,8 @@ import re
 import struct
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +129,29 @@ def test_tensorboard_follows_a_training(tmp_path: Path) -> None:
     assert [step for step, _ in events(tmp_path)["train/approx_kl"]] == [2048, 3072, 4096, 5120]
 
 
+def test_tensorboard_goes_along_with_a_run_folder(tmp_path: Path) -> None:
+    """Rows that come later are written too, each once, and the last before it ends."""
+    pytest.importorskip("tensorboardX")
+    run, final = tmp_path / "ppo_0", tmp_path / "ppo_0" / "checkpoints" / "final.safetensors"
+    final.parent.mkdir(parents=True)
+    (run / "metrics.csv").write_text("time/total_timesteps,train/loss\n10,1\n20,2\n")
+
+    def train() -> None:
+        time.sleep(0.5)
+        with (run / "metrics.csv").open("a") as rows:
+            rows.write("30,3\n")
+        time.sleep(0.3)
+        with (run / "metrics.csv").open("a") as rows:
+            rows.write("40,4\n")
+        final.touch()
+
+    trainer = threading.Thread(target=train)
+    trainer.start()
+    assert nearl.tensorboard.follow(run, every=0.1, seconds=60.0) == 4
+    trainer.join()
+    assert events(run)["train/loss"] == [(10, 1.0), (20, 2.0), (30, 3.0), (40, 4.0)]
+
+
 def test_a_sentence_where_tensorboard_x_is_missing(trained: Path) -> None:
     code = f"import sys; sys.modules['tensorboardX'] = None; import nearl.tensorboard; sys.exit(nearl.tensorboard.main([{str(trained)!r}]))"
     failed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
@@ -166,6 +191,21 @@ def test_a_sentence_where_nothing_can_render(trained: Path, tmp_path: Path) -> N
     assert "Traceback" not in failed.stderr
     failed = video(str(trained), str(tmp_path / "x.mp4"), "--camera", "side")
     assert failed.returncode == 1 and "the robot has no camera 'side'; it has track" in failed.stderr
+
+
+def test_a_training_ends_with_a_video_in_its_run_folder(tmp_path: Path) -> None:
+    import imageio.v3 as imageio
+
+    program = ROOT / "target" / "release" / "nearl"
+    train = [str(program), "train", CART_POLE, "--algo", "ppo", "--steps", "4096", "--video", "--out"]
+    done = subprocess.run([*train, str(tmp_path / "run")], capture_output=True, text=True, env={**os.environ, "NEARL_PYTHON": sys.executable})
+    assert done.returncode == 0 and f"video {tmp_path / 'run' / 'video.mp4'}" in done.stdout, done.stderr
+    assert imageio.imread(tmp_path / "run" / "video.mp4", index=0).std() > 5
+    # what is missing is said before the training
+    failed = subprocess.run([*train, str(tmp_path / "none")], capture_output=True, text=True, env={**os.environ, "NEARL_PYTHON": "/no/python"})
+    assert failed.returncode == 1 and "cannot start '/no/python'" in failed.stderr and not (tmp_path / "none").exists()
+    check = video("--check", MUJOCO_EGL_DEVICE_ID="99")
+    assert check.returncode == 1 and "MuJoCo cannot render" in check.stderr and video("--check").returncode == 0
 
 
 def ray_example() -> Any:

@@ -57,17 +57,16 @@ def read_demonstrations(path: Path, task: str | None = None) -> Demonstrations:
             missing = [name for name in NEEDED if name not in data.files]
             if missing:
                 raise ReadError(f"'{path}' has no array '{missing[0]}'; give a file written by 'nearl demos record'")
-            tables = [np.asarray(data[name], float) for name in NEEDED[:3]]
-            found = Demonstrations(
-                path, task, *tables, data["lengths"].astype(int), float(data["dt"]), [str(n) for n in data["names"]], "actions" in data.files
-            )
+            observations, qpos, qvel = (np.asarray(data[name], float) for name in NEEDED[:3])
+            lengths, names = data["lengths"].astype(int), [str(n) for n in data["names"]]
+            found = Demonstrations(path, task, observations, qpos, qvel, lengths, float(data["dt"]), names, "actions" in data.files)
     except (zipfile.BadZipFile, ValueError, EOFError) as error:
         if isinstance(error, ReadError):
             raise
         raise ReadError(f"'{path}' are no demonstrations that can be read ({error}); give a file written by 'nearl demos record'") from error
     rows = int((found.lengths + 1).sum())
-    if not len(found.lengths) or any(len(table) != rows for table in tables):
-        raise ReadError(f"'{path}' has {len(tables[0])} rows, its lengths ask for {rows}; check it with 'nearl demos check'")
+    if not len(found.lengths) or any(len(table) != rows for table in (observations, qpos, qvel)):
+        raise ReadError(f"'{path}' has {len(observations)} rows, its lengths ask for {rows}; check it with 'nearl demos check'")
     return found
 
 

@@ -45,7 +45,9 @@ class Training:
     def __init__(self, folder: Path, wait: float = 60.0):
         self.title, self._folder, self._looked = str(folder), folder, 0.0
         self._stamp: tuple[str, int] | None = None
-        self._totals, self._curves = _Totals(), {}
+        self._totals = _Totals()
+        self._curves: dict[str, tuple[Floats, Floats]] = {}
+        self._names: list[str] = []
         end = time.monotonic() + wait
         while not self._newer():
             if not (folder / "task.toml").is_file():
