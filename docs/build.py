@@ -26,10 +26,12 @@ nav:
   - Limits: docs/LIMITS.md
   - Training: docs/TRAINING.md
   - Demonstrations: docs/DEMONSTRATIONS.md
+  - From a recording to a running loop: docs/IMITATION.md
   - Environments: docs/ENVIRONMENTS.md
   - Policies made elsewhere: docs/POLICIES.md
   - Connecting a robot: docs/CONNECT.md
   - Embedding in Rust: docs/EMBED.md
+  - Reading a flight log: docs/FLIGHT_LOG.md
   - Faults: docs/FAULTS.md
   - Security: docs/SECURITY.md
   - Words: docs/GLOSSARY.md

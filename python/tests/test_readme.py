@@ -1,6 +1,7 @@
 """Every command and every example of README.md and of the pages in docs/ runs. `make` itself is what runs the tests, so its lines are
 not repeated."""
 
+import json
 import re
 import subprocess
 import sys
@@ -41,6 +42,20 @@ def test_every_command_line_is_covered():
     targets = set(re.findall(r"^    make (\w+)", README, re.MULTILINE))
     makefile = (ROOT / "Makefile").read_text()
     assert targets and all(re.search(rf"^{t}:", makefile, re.MULTILINE) for t in targets)
+
+
+NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks(notebook, tmp_path):
+    """Their cells in order in one process, from the folder of the notebook; no output is kept in the file."""
+    cells = [cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"]
+    assert len(cells) > 3 and all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
+    program = tmp_path / "notebook.py"
+    program.write_text("import matplotlib\nmatplotlib.use('Agg')\n" + "\n".join("".join(cell["source"]) for cell in cells))
+    run = subprocess.run([sys.executable, program], cwd=notebook.parent, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr
 
 
 EXAMPLES = sorted((ROOT / "examples" / "python").glob("*.py"))
