@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -119,13 +120,13 @@ def dead_links(site: Path) -> list[str]:
 
 def main(site: Path) -> int:
     """Builds the site into ``site``; 1 where a link is dead."""
-    work = site.parent / "docs"
-    shutil.rmtree(work, ignore_errors=True)
-    stage(work / "pages")
-    reference(work / "pages" / "docs" / "PYTHON.md")
-    settings = f"site_name: NEARL\ndocs_dir: pages\nsite_dir: {site.resolve()}\nuse_directory_urls: false\ntheme:\n  name: mkdocs\n  color_mode: auto\n"
-    (work / "mkdocs.yml").write_text(settings + "plugins: []\n" + NAV)
-    subprocess.run([sys.executable, "-m", "mkdocs", "build", "--quiet", "--config-file", work / "mkdocs.yml"], check=True)
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        stage(work / "pages")
+        reference(work / "pages" / "docs" / "PYTHON.md")
+        settings = f"site_name: NEARL\ndocs_dir: pages\nsite_dir: {site.resolve()}\nuse_directory_urls: false\ntheme:\n  name: mkdocs\n  color_mode: auto\n"
+        (work / "mkdocs.yml").write_text(settings + "plugins: []\n" + NAV)
+        subprocess.run([sys.executable, "-m", "mkdocs", "build", "--quiet", "--config-file", work / "mkdocs.yml"], check=True)
     if (rust := ROOT / "target" / "doc").is_dir():
         shutil.copytree(rust, site / "rust", dirs_exist_ok=True)
     dead = dead_links(site)
@@ -134,4 +135,6 @@ def main(site: Path) -> int:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
+        sys.exit("docs/build.py: say the folder of the site: python docs/build.py target/site")
     sys.exit(main(Path(sys.argv[1])))
