@@ -1,7 +1,7 @@
 """The extension module: Rust objects for Python. Shapes are in each docstring; every array is float64 unless it says otherwise."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypedDict, final
 
 import numpy as np
@@ -483,13 +483,27 @@ class Policy:
 @final
 class Training:
     def __new__(
-        cls, task: str, algo: str, seed: int, threads: int, settings: Sequence[str], out: _Path | None, preset: str | None = None
+        cls,
+        task: str,
+        algo: str,
+        seed: int,
+        threads: int,
+        settings: Sequence[str],
+        out: _Path | None,
+        preset: str | None = None,
+        judge: Callable[[_Floats, _Floats, _Floats], tuple[float | None, bool]] | None = None,
+        rewards: bool = False,
     ) -> Training: ...
     def begin(self, steps: int) -> None: ...
     def end(self) -> None: ...
     def iterate(self) -> dict[str, float]: ...
     @staticmethod
-    def resume(path: _Path, threads: int) -> Training: ...
+    def resume(
+        path: _Path,
+        threads: int,
+        judge: Callable[[_Floats, _Floats, _Floats], tuple[float | None, bool]] | None = None,
+        rewards: bool = False,
+    ) -> Training: ...
     def controller(self) -> Controller: ...
     @property
     def done(self) -> bool: ...

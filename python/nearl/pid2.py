@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.outcome import Outcome, ask
 
 Floats = NDArray[np.float64]
 Callback = Callable[["PID2", dict[str, float]], bool | None]
@@ -35,6 +36,10 @@ class PID2:
         preset: Settings by name, ``"paper"`` or ``"strong"``; ``settings`` come after them.
         demos: Demonstrations (``.npz``) for ``bc``, ``soil``, ``dapg`` and ``pid2-il``; ``nearl demos record RUN`` writes some.
         run: Run folder to write as ``nearl train`` does; none by default.
+        reward: ``reward(obs, actions, next_obs)``, arrays of n rows in, (n,) out, replaces the task's, as in :func:`nearl.make_vec`; here it is
+            asked once a control period of each environment, with one row, from several threads in any order: the same arguments must give
+            the same answer.
+        termination: Likewise, true where an episode ends: beside the task's own.
 
     Raises:
         ValueError: unknown task, algorithm or setting; the message names it.
@@ -52,13 +57,17 @@ class PID2:
         preset: str | None = None,
         demos: str | os.PathLike[str] | None = None,
         run: str | os.PathLike[str] | None = None,
+        reward: Outcome | None = None,
+        termination: Outcome | None = None,
     ):
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
         if demos is not None:
             overrides.append(f"train.demos.file={_toml(os.path.abspath(demos))}")
         if not 0 <= seed < 2**64:
             raise ValueError(f"seed is {seed}; give a whole number from 0 to 2**64 - 1")
-        self._training: _core.Training | None = _core.Training(os.fspath(task), algo, seed, _threads(threads), overrides, run, preset)
+        self._training: _core.Training | None = _core.Training(
+            os.fspath(task), algo, seed, _threads(threads), overrides, run, preset, _judge(reward, termination), reward is not None
+        )
         self.task, self.algo, self.seed = self._training.task, algo, seed
         self._begin(self._training.controller())
 
@@ -153,23 +162,42 @@ class PID2:
         self._controller.save(path)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], threads: int | None = None) -> "PID2":
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        threads: int | None = None,
+        reward: Outcome | None = None,
+        termination: Outcome | None = None,
+    ) -> "PID2":
         """A policy to predict with, from a snapshot file; from a run folder, one that can also learn on, exactly where it stopped.
 
-        A run that was stopped ``n`` steps before its end gives, after ``learn(n)``, the same weights as one that was not stopped.
+        A run that was stopped ``n`` steps before its end gives, after ``learn(n)``, the same weights as one that was not stopped. One that learned
+        from Python functions needs them again, as ``reward`` and ``termination``.
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: it is not a snapshot, or was damaged.
+            ValueError: it is not a snapshot, was damaged, or learned from functions that are not given again.
         """
         agent = cls.__new__(cls)
         agent._training, agent.seed = None, 0
         if (Path(path) / "checkpoints" / "resume.safetensors").is_file():
-            agent._training = _core.Training.resume(path, _threads(threads))
+            agent._training = _core.Training.resume(path, _threads(threads), _judge(reward, termination), reward is not None)
         controller = _core.Controller.load(path) if agent._training is None else agent._training.controller()
         agent.task, agent.algo = controller.task, controller.algo
         agent._begin(controller)
         return agent
+
+
+def _judge(reward: Outcome | None, termination: Outcome | None) -> Callable[[Floats, Floats, Floats], tuple[float | None, bool]] | None:
+    """Both functions as one, of a single control period (1 x n arrays)."""
+    if reward is None and termination is None:
+        return None
+
+    def judge(obs: Floats, actions: Floats, next_obs: Floats) -> tuple[float | None, bool]:
+        worth = None if reward is None else float(ask("reward", reward, obs, actions, next_obs, float)[0])
+        return worth, termination is not None and bool(ask("termination", termination, obs, actions, next_obs, bool)[0])
+
+    return judge
 
 
 def _threads(threads: int | None) -> int:

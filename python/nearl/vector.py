@@ -1,7 +1,7 @@
 """Many environments in one call."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.outcome import Floats, Outcome, ask
 
-Floats = NDArray[np.float64]
-Outcome = Callable[[Floats, Floats, Floats], ArrayLike]
 Step = tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
@@ -91,9 +90,9 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
             reached[i] = info["final_obs"][i]
         began = self._over
         if self._reward is not None:
-            rewards = np.where(began, 0.0, self._ask("reward", self._reward, actions, reached, float))
+            rewards = np.where(began, 0.0, ask("reward", self._reward, self._obs, actions, reached, float))
         if self._termination is not None:
-            ends = self._ask("termination", self._termination, actions, reached, bool) & ~began
+            ends = ask("termination", self._termination, self._obs, actions, reached, bool) & ~began
             fresh = ends & ~terminated & ~truncated
             terminated, truncated = terminated | ends, truncated & ~ends
             if fresh.any():
@@ -104,17 +103,6 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         self._over = over & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         self._obs = obs.copy()
         return obs, rewards, terminated, truncated, info
-
-    def _ask(self, name: str, function: Outcome, actions: Floats, reached: Floats, dtype: type) -> NDArray[Any]:
-        answer = np.asarray(function(self._obs, actions, reached))
-        if answer.shape != (self.num_envs,):
-            raise ValueError(f"{name}(obs, actions, next_obs) gave shape {answer.shape}; give one value an environment, ({self.num_envs},)")
-        if dtype is bool and answer.dtype != bool:
-            raise ValueError(f"{name}(obs, actions, next_obs) gave {answer.dtype} values, such as {answer[0]!r}; give True or False, e.g. `next_obs[:, 0] > 1`")
-        if dtype is float and not np.isfinite(answer.astype(float)).all():
-            i = int(np.flatnonzero(~np.isfinite(answer.astype(float)))[0])
-            raise ValueError(f"{name}(obs, actions, next_obs)[{i}] is {answer[i]}: every entry must be finite")
-        return answer.astype(dtype)
 
     def set_state(self, index: int, qpos: ArrayLike, qvel: ArrayLike) -> None:
         """Begins an episode of environment ``index`` at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention."""

@@ -1,17 +1,20 @@
 //! A training in this process.
 
 use std::path::PathBuf;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use nearl_trainer::checkpoint::{self, Checkpoint};
+use nearl_trainer::env::Step;
 use nearl_trainer::learn::ALGORITHMS;
 use nearl_trainer::preset::Preset;
+use nearl_trainer::rollout::Judge;
 use nearl_trainer::run_folder::{self, RunFolder};
 use nearl_trainer::tasks;
-use nearl_trainer::train::{self, Request, TrainError, complete};
+use nearl_trainer::train::{self, Experience, Request, TrainError, complete};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+use crate::arrays;
 use crate::controller::Controller;
 use crate::errors;
 
@@ -35,13 +38,43 @@ pub(crate) struct Training {
     inner: Mutex<Inner>,
     task: String,
     out: Option<PathBuf>,
+    raised: Raised,
+}
+
+/// What a function of the caller raised first.
+type Raised = Arc<Mutex<Option<PyErr>>>;
+
+/// Environments of this process; with `judge(obs, action, next_obs)` (1 x n each), which gives a reward or None and whether the episode ends,
+/// these take the task's place. `rewards`: it gives rewards.
+fn experience(judge: Option<Py<PyAny>>, rewards: bool) -> (Experience, Raised) {
+    let raised = Raised::default();
+    let Some(judge) = judge else { return (Experience::Here, raised) };
+    let kept = Arc::clone(&raised);
+    let judge = Judge::new(rewards, move |obs, action, next_obs, step| {
+        let asked = Python::attach(|py| {
+            let row = |x: &[f64]| arrays::array2(py, x.to_vec(), x.len());
+            judge.call1(py, (row(obs)?, row(action)?, row(next_obs)?))?.extract::<(Option<f64>, bool)>(py)
+        });
+        match asked {
+            Ok((reward, ends)) => Step {
+                reward: reward.unwrap_or(step.reward),
+                terminated: step.terminated || ends,
+                ..step
+            },
+            Err(error) => {
+                kept.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+                Step { reward: f64::NAN, terminated: true, ..step }
+            }
+        }
+    });
+    (Experience::Judged(judge), raised)
 }
 
 #[pymethods]
 impl Training {
     /// `settings`: overrides of the task file, `key=value`, after those of `preset`. `out`: run folder to write, as `nearl train` does.
     #[new]
-    #[pyo3(signature = (task, algo, seed, threads, settings, out, preset=None))]
+    #[pyo3(signature = (task, algo, seed, threads, settings, out, preset=None, judge=None, rewards=false))]
     fn new(
         py: Python<'_>,
         task: &str,
@@ -51,8 +84,11 @@ impl Training {
         settings: Vec<String>,
         out: Option<PathBuf>,
         preset: Option<String>,
+        judge: Option<Py<PyAny>>,
+        rewards: bool,
     ) -> PyResult<Training> {
         py.detach(|| {
+            let (experience, raised) = experience(judge, rewards);
             let preset = preset
                 .map(|name| name.parse::<Preset>())
                 .transpose()
@@ -61,24 +97,31 @@ impl Training {
             complete(&mut manifest).map_err(errors::train)?;
             let algo = algo.parse().map_err(|e| errors::train(TrainError::Algorithm(e)))?;
             let request = Request { manifest, algo, steps: 0, seed, threads: threads.max(1) };
-            let training = train::Training::new(&request).map_err(errors::train)?;
+            let training = train::Training::on(&request, &experience).map_err(errors::train)?;
             if let Some(out) = &out {
                 RunFolder::create(out, &training.snapshot().manifest, seed, &training.columns())
                     .map_err(run)?;
             }
-            Ok(Training::of(training, out))
+            Ok(Training::of(training, out, raised))
         })
     }
 
     /// The training of a run folder where it stopped, to go on in it.
     #[staticmethod]
-    fn resume(py: Python<'_>, path: PathBuf, threads: usize) -> PyResult<Training> {
+    #[pyo3(signature = (path, threads, judge=None, rewards=false))]
+    fn resume(
+        py: Python<'_>,
+        path: PathBuf,
+        threads: usize,
+        judge: Option<Py<PyAny>>,
+        rewards: bool,
+    ) -> PyResult<Training> {
         py.detach(|| {
+            let (experience, raised) = experience(judge, rewards);
             let file = checkpoint::path_in(&path);
             let from = Checkpoint::load(&file).map_err(|e| errors::train(e.into()))?;
-            let training =
-                train::Training::resume(from, &file, None, threads.max(1)).map_err(errors::train)?;
-            Ok(Training::of(training, Some(path)))
+            let training = train::Training::resume_on(from, &file, &experience, None, threads.max(1));
+            Ok(Training::of(training.map_err(errors::train)?, Some(path), raised))
         })
     }
 
@@ -123,6 +166,10 @@ impl Training {
                 Some(folder) => training.step_in(folder),
                 None => training.step(),
             };
+            // What a function of the caller raised says more than what came of it.
+            if let Some(raised) = self.raised.lock().unwrap_or_else(PoisonError::into_inner).take() {
+                return Err(raised);
+            }
             let stopped = || errors::value("the source of experience was stopped");
             let progress = progress.map_err(errors::train)?.ok_or_else(stopped)?;
             let columns: Vec<String> = training.columns().into_iter().map(str::to_owned).collect();
@@ -170,9 +217,9 @@ impl Training {
 }
 
 impl Training {
-    fn of(training: train::Training, out: Option<PathBuf>) -> Training {
+    fn of(training: train::Training, out: Option<PathBuf>, raised: Raised) -> Training {
         let task = training.snapshot().manifest.task.name.clone();
-        Training { inner: Mutex::new(Inner { training, learns: false, folder: None }), task, out }
+        Training { inner: Mutex::new(Inner { training, learns: false, folder: None }), task, out, raised }
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {

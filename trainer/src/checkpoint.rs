@@ -33,6 +33,9 @@ pub struct Header {
     pub adam: Vec<i32>,
     /// One entry an environment.
     pub workers: Vec<WorkerHeader>,
+    /// Reward or end of a control period were somebody else's code: without it the training cannot go on.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub judged: bool,
 }
 
 /// Whole numbers of one environment.

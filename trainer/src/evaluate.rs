@@ -1,6 +1,6 @@
 //! Episodes without noise, raw and projected, and what they were worth.
 
-use crate::rollout::{RolloutError, Worker, make_env, stream};
+use crate::rollout::{Judge, RolloutError, Worker, make_env, stream};
 use nearl_runtime::constraints::{ConstraintSettings, LimitSet, Model, PerJoint, build_limits};
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use serde::Serialize;
@@ -93,7 +93,21 @@ pub fn evaluate(
     seed: u64,
     projection: bool,
 ) -> Result<Evaluation, RolloutError> {
+    evaluate_by(None, snapshot, episodes, seed, projection)
+}
+
+/// The same with rewards and ends of somebody else's, where there is a judge.
+pub(crate) fn evaluate_by(
+    judge: Option<Judge>,
+    snapshot: &Snapshot,
+    episodes: usize,
+    seed: u64,
+    projection: bool,
+) -> Result<Evaluation, RolloutError> {
     let mut worker = Worker::new(make_env(snapshot)?, snapshot, 1.0, stream(seed, 0))?;
+    if let Some(judge) = judge {
+        worker.set_judge(judge);
+    }
     worker.set_projection(projection);
     let (model, layout) = (worker.controller.model(), worker.controller.layout());
     let own = without_margins(&snapshot.manifest, model, layout.controllable());

@@ -4,11 +4,13 @@
 //! same bits whatever the number of threads.
 
 mod carried;
+mod judge;
 mod resume;
 mod rows;
 mod segment;
 mod worker;
 
+pub use judge::Judge;
 pub use rows::{Period, Rows};
 pub use segment::{Collected, Segment, Tally};
 pub use worker::Worker;

@@ -16,9 +16,9 @@ pub use source::{Experience, Source, SourceError};
 
 use crate::checkpoint::CheckpointError;
 use crate::demos::DemoError;
-use crate::evaluate::evaluate;
+use crate::evaluate::evaluate_by;
 use crate::learn::{Algorithm, Batch, Dims, Learner, Metrics, Pace, Stretch, UnknownAlgorithm};
-use crate::rollout::{Collected, RolloutError, Segment, Tally, stream};
+use crate::rollout::{Collected, Judge, RolloutError, Segment, Tally, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
@@ -102,6 +102,8 @@ pub struct Training {
     learner: Box<dyn Learner>,
     source: Box<dyn Source>,
     imitation: Option<Imitation>,
+    /// What gives rewards in the task's place.
+    judge: Option<Judge>,
     /// The last batch: its memory is used again.
     batch: Batch,
     /// Return of the best networks so far without noise, and whether they are the present ones.
@@ -148,7 +150,7 @@ impl Training {
     /// [`TrainError`] in one sentence.
     pub fn on(request: &Request, experience: &Experience) -> Result<Self, TrainError> {
         let mut manifest = request.manifest.clone();
-        check_reward(&manifest.task)?;
+        check_reward(&manifest.task, experience)?;
         let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
         manifest.algo = request.algo.to_string();
         manifest.policy = policy_kind(request.algo, &settings, &manifest.task)?;
@@ -189,6 +191,10 @@ impl Training {
             learner,
             source,
             imitation,
+            judge: match experience {
+                Experience::Judged(judge) => Some(judge.clone()),
+                _ => None,
+            },
             batch: Batch::default(),
             best: None,
             is_best: false,
@@ -361,8 +367,8 @@ impl Training {
 
     /// Mean return of episodes without noise, the same ones each time; under the limits wherever the policy proposes.
     fn evaluate(&mut self) -> Result<f64, TrainError> {
-        let found = evaluate(&self.snapshot, self.settings.eval_episodes, self.seed ^ EVALUATION, true)?
-            .mean_return();
+        let (judge, episodes) = (self.judge.clone(), self.settings.eval_episodes);
+        let found = evaluate_by(judge, &self.snapshot, episodes, self.seed ^ EVALUATION, true)?.mean_return();
         self.is_best = found.is_finite() && self.best.is_none_or(|best| found > best);
         if self.is_best {
             self.best = Some(found);

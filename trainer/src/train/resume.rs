@@ -24,6 +24,7 @@ impl Training {
             rng,
             adam: params.adam.iter().map(|a| a.t).collect(),
             workers: Vec::new(),
+            judged: self.judge.is_some(),
         };
         let mut to = Checkpoint { header, tensors: BTreeMap::new() };
         let mut put = |name: String, values: Values| to.tensors.insert(name, values);
@@ -79,6 +80,13 @@ impl Training {
         threads: usize,
     ) -> Result<Self, TrainError> {
         let header = &from.header;
+        if header.judged && !matches!(experience, Experience::Judged(_)) {
+            return Err(TrainError::Settings(format!(
+                "the training in '{}' has its reward or its termination from Python functions, which no file holds; go on in Python with \
+                 nearl.PID2.load(run, reward=..., termination=...)",
+                file.display()
+            )));
+        }
         let request = Request {
             manifest: header.manifest.clone(),
             algo: header.manifest.algo.parse().map_err(TrainError::Algorithm)?,

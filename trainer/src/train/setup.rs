@@ -162,7 +162,10 @@ fn check_motors(manifest: &Manifest, env: &dyn Env) -> Result<(), TrainError> {
     Ok(())
 }
 
-pub(super) fn check_reward(task: &Task) -> Result<(), TrainError> {
+pub(super) fn check_reward(task: &Task, experience: &Experience) -> Result<(), TrainError> {
+    if matches!(experience, Experience::Judged(judge) if judge.rewards) {
+        return Ok(());
+    }
     let is_nothing = |v: &toml::Value| v.as_float() == Some(0.0) || v.as_integer() == Some(0);
     if task.reward.is_empty() || !task.reward.values().all(is_nothing) {
         return Ok(());
@@ -190,7 +193,7 @@ pub(super) fn check_experience(
     experience: &Experience,
 ) -> Result<(), TrainError> {
     let (source, next) = match experience {
-        Experience::Here => return Ok(()),
+        Experience::Here | Experience::Judged(_) => return Ok(()),
         Experience::Loop(name, _) => (format!("the loop of '{name}'"), "--from"),
         Experience::Served(name, _) => (format!("the rollout server '{name}'"), "--collect"),
     };

@@ -4,7 +4,7 @@ use super::served::{ServedError, ServedSource};
 use crate::checkpoint::Checkpoint;
 use crate::demos::Frame;
 use crate::online::{LoopSource, OnlineError};
-use crate::rollout::{Collected, Collector, RolloutError};
+use crate::rollout::{Collected, Collector, Judge, RolloutError};
 use crate::settings::TrainSettings;
 use nearl_rollout_protocol::Layout;
 use nearl_runtime::Snapshot;
@@ -32,6 +32,8 @@ pub enum Experience {
     /// Environments of this process.
     #[default]
     Here,
+    /// The same, but reward and end of a control period are somebody else's.
+    Judged(Judge),
     /// The running loop of this robot, until the flag is set.
     Loop(RobotName, Arc<AtomicBool>),
     /// The rollout server of this name, until the flag is set.
@@ -122,11 +124,14 @@ impl Experience {
         seed: u64,
     ) -> Result<Box<dyn Source>, SourceError> {
         match self {
-            Self::Here => {
+            Self::Here | Self::Judged(_) => {
                 let (n_envs, n_steps) = (settings.n_envs, settings.n_steps);
                 let mut collector = Collector::new(snapshot, n_envs, n_steps, threads, settings.gamma, seed)?;
                 for worker in collector.workers() {
                     worker.set_moved_penalty(settings.moved_penalty);
+                    if let Self::Judged(judge) = self {
+                        worker.set_judge(judge.clone());
+                    }
                 }
                 Ok(Box::new(collector))
             }

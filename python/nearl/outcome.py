@@ -1,0 +1,28 @@
+"""Rewards and terminations that are functions of the caller."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+# (obs, actions, next_obs), arrays of n rows, to (n,)
+Outcome = Callable[[Floats, Floats, Floats], ArrayLike]
+
+
+def ask(name: str, function: Outcome, obs: Floats, actions: Floats, next_obs: Floats, dtype: type) -> NDArray[Any]:
+    """What the function gives for each row.
+
+    Raises:
+        ValueError: not one value a row, a reward that is not finite, or a termination that is no truth value.
+    """
+    answer = np.asarray(function(obs, actions, next_obs))
+    if answer.shape != (len(obs),):
+        raise ValueError(f"{name}(obs, actions, next_obs) gave shape {answer.shape}; give one value an environment, ({len(obs)},)")
+    if dtype is bool and answer.dtype != bool:
+        raise ValueError(f"{name}(obs, actions, next_obs) gave {answer.dtype} values, such as {answer[0]!r}; give True or False, e.g. `next_obs[:, 0] > 1`")
+    if dtype is float and not np.isfinite(answer.astype(float)).all():
+        i = int(np.flatnonzero(~np.isfinite(answer.astype(float)))[0])
+        raise ValueError(f"{name}(obs, actions, next_obs)[{i}] is {answer[i]}: every entry must be finite")
+    return answer.astype(dtype)
