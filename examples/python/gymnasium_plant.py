@@ -22,19 +22,18 @@ def play(snapshot: str, seeds: list[int], name: str = "cheetah") -> list[float]:
     env = gymnasium.make("HalfCheetah-v5")
     data, low, high = env.unwrapped.data, env.action_space.low, env.action_space.high
     returns: list[float] = []
-    with nearl.Plant(name, JOINTS, OBSERVATION, dt=0.05, nu=6, watchdog=5.0, lockstep=True) as plant:
-        with nearl.Loop(snapshot, name, patience=30.0, ramp=0.0):
-            for episode, seed in enumerate(seeds):
-                obs, over, total, begins = env.reset(seed=seed)[0], False, 0.0, True
-                while not over:
-                    turn, action = plant.exchange(data.qpos, data.qvel, obs, patience=30.0, episode=episode, begins=begins)
-                    if turn != "act":
-                        if begins:
-                            continue  # the loop is not there yet
-                        raise RuntimeError(f"the loop said '{turn}' in the middle of episode {episode}")
-                    obs, reward, terminated, truncated, _ = env.step(np.clip(action, low, high).astype(np.float32))
-                    total, begins, over = total + float(reward), False, terminated or truncated
-                returns.append(total)
+    with nearl.Plant(name, JOINTS, OBSERVATION, dt=0.05, nu=6, watchdog=5.0, lockstep=True) as plant, nearl.Loop(snapshot, name, patience=30.0, ramp=0.0):
+        for episode, seed in enumerate(seeds):
+            obs, over, total, begins = env.reset(seed=seed)[0], False, 0.0, True
+            while not over:
+                turn, action = plant.exchange(data.qpos, data.qvel, obs, patience=30.0, episode=episode, begins=begins)
+                if turn != "act":
+                    if begins:
+                        continue  # the loop is not there yet
+                    raise RuntimeError(f"the loop said '{turn}' in the middle of episode {episode}")
+                obs, reward, terminated, truncated, _ = env.step(np.clip(action, low, high).astype(np.float32))
+                total, begins, over = total + float(reward), False, terminated or truncated
+            returns.append(total)
     return returns
 
 

@@ -6,8 +6,9 @@
     robot.connect()
     sent = robot.send_action(policy_action)          # what went to the motors; LeRobot records it
 
-Policies, teleoperators and `lerobot-record` meet the same features. Limits hold for the goals that are sent, one after the other in time: how well motors follow them is
-theirs to say. A joint's key is `<joint of the URDF>.pos`; keys of no such joint (a gripper) go through as they are.
+Policies, teleoperators and `lerobot-record` meet the same features. Limits hold for the goals that are sent, one after the other in time:
+how well motors follow them is theirs to say. A joint's key is `<joint of the URDF>.pos`; keys of no such joint (a gripper) go through as
+they are.
 """
 
 import math

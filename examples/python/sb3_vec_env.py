@@ -44,7 +44,8 @@ class NearlVecEnv(VecEnv):
         return [False] * self.num_envs
 
 
-steps = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
-model = PPO("MlpPolicy", NearlVecEnv("HalfCheetah-v5", 8), n_steps=256, seed=0, device="cpu")
-model.learn(steps)
-print(f"learned from {model.num_timesteps} steps")
+if __name__ == "__main__":
+    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
+    model = PPO("MlpPolicy", NearlVecEnv("HalfCheetah-v5", 8), n_steps=256, seed=0, device="cpu")
+    model.learn(steps)
+    print(f"learned from {model.num_timesteps} steps")

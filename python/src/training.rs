@@ -56,11 +56,9 @@ fn experience(judge: Option<Py<PyAny>>, rewards: bool) -> (Experience, Raised) {
             judge.call1(py, (row(obs)?, row(action)?, row(next_obs)?))?.extract::<(Option<f64>, bool)>(py)
         });
         match asked {
-            Ok((reward, ends)) => Step {
-                reward: reward.unwrap_or(step.reward),
-                terminated: step.terminated || ends,
-                ..step
-            },
+            Ok((reward, ends)) => {
+                Step { reward: reward.unwrap_or(step.reward), terminated: step.terminated || ends, ..step }
+            }
             Err(error) => {
                 kept.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
                 Step { reward: f64::NAN, terminated: true, ..step }

@@ -200,10 +200,3 @@ def test_a_learner_on_the_arm_improves_and_breaks_nothing(example):
         if value > best_return:
             best, best_return = trial, value
     assert broken == 0 and best_return > first, (first, best_return)
-
-
-@pytest.mark.parametrize("algorithm", ["sac", "ppo"])
-def test_stable_baselines3_trains_behind_the_limits(example, algorithm, capsys):
-    pytest.importorskip("stable_baselines3")
-    example.main(algorithm, "arm", "300")
-    assert capsys.readouterr().out.count(", 0 ticks outside") == 2

@@ -8,7 +8,7 @@ import pytest
 from conftest import ROOT, planar_urdf
 
 pytest.importorskip("lerobot", reason="lerobot is not installed (it brings torch)")
-from lerobot.robots import Robot, RobotConfig  # noqa: E402
+from lerobot.robots import Robot, RobotConfig
 
 JOINTS = ["joint0", "joint1", "joint2"]
 LOW, HIGH, SPEED, ACCELERATION, FPS = -2.0, 1.8, np.array([3.0, 4.0, 5.0]), 8.0, 100.0

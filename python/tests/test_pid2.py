@@ -1,6 +1,7 @@
 """SB3's five lines: learn, predict, save, load; the same weights as `nearl train`; Ctrl-C keeps what was learned."""
 
 import _thread
+import itertools
 import signal
 import threading
 from pathlib import Path
@@ -228,3 +229,79 @@ def test_presets_and_algorithms_are_those_of_the_trainer() -> None:
     agent = nearl.PID2(CART_POLE, preset="strong", threads=1, settings={"train.n_envs": 2, "train.n_steps": 256})
     agent.learn(1)
     assert agent.num_timesteps == 512
+
+
+
+SMALL = {"train.n_envs": 4, "train.n_steps": 64, "train.ppo.batch_size": 64}
+
+
+@pytest.mark.parametrize("algo", ["ppo", "pid2-ib"])
+def test_rewards_and_ends_may_be_functions(algo) -> None:
+    """What the functions say is what episodes are worth and how long they are, whatever the task says."""
+    agent = nearl.PID2(CART_POLE, algo, settings=SMALL, reward=lambda obs, actions, next_obs: 3.0 + 0.0 * obs[:, 0])
+    metrics: list[dict[str, float]] = []
+    agent.learn(2048, callback=lambda agent, row: metrics.append(row))
+    last = metrics[-1]
+    assert last["rollout/ep_rew_mean"] == pytest.approx(3.0 * last["rollout/ep_len_mean"], rel=1e-9)
+    short = nearl.PID2(CART_POLE, algo, settings=SMALL, termination=lambda obs, actions, next_obs: np.abs(next_obs[:, 0]) < np.inf)
+    short.learn(1024, callback=lambda agent, row: metrics.append(row))
+    assert metrics[-1]["rollout/ep_len_mean"] == 1.0
+
+
+def test_functions_that_say_what_the_task_says_give_the_same_weights() -> None:
+    """Their arguments are the observations before and after, and the action: the reward of a period of HalfCheetah is made of these."""
+
+    def cheetah(obs, actions, next_obs):
+        return 0.0 * next_obs[:, 8] - 0.1 * (actions**2).sum(axis=1)
+
+    seen: list[tuple[np.ndarray, ...]] = []
+    settings = {"train.n_envs": 1, "train.n_steps": 64, "train.ppo.batch_size": 64}
+    keep = lambda *arguments: seen.append([np.array(a) for a in arguments]) or cheetah(*arguments)  # noqa: E731
+    nearl.PID2("HalfCheetah-v5", "ppo", settings=settings, reward=keep, threads=1).learn(64)
+    env = nearl.Env("HalfCheetah-v5")
+    assert len(seen) == 64 and all(a.shape == (1, n) for step in seen for a, n in zip(step, (17, 6, 17)))
+    for (_, _, after), (before, _, _) in itertools.pairwise(seen):
+        np.testing.assert_array_equal(after, before)
+    # The same actions from the same start in an environment of its own.
+    q = np.concatenate([[0.0], seen[0][0][0, :8]])
+    env.reset(seed=0)
+    obs = env.set_state(q, seen[0][0][0, 8:])
+    for before, action, after in seen[:20]:
+        np.testing.assert_allclose(obs, before[0], atol=1e-9)
+        obs = env.step(action[0])[0]
+        np.testing.assert_allclose(obs, after[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("functions", "said"),
+    [
+        ({"reward": lambda obs, actions, next_obs: [1.0, 2.0]}, r"reward\(obs, actions, next_obs\) gave shape \(2,\)"),
+        ({"reward": lambda obs, actions, next_obs: obs[:, 0] + np.nan}, r"reward\(obs, actions, next_obs\)\[0\] is nan"),
+        ({"termination": lambda obs, actions, next_obs: next_obs[:, 0]}, "gave float64 values"),
+    ],
+)
+def test_functions_that_say_nothing_usable_are_named(functions, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        nearl.PID2(CART_POLE, "ppo", settings=SMALL, **functions).learn(512)
+
+
+def test_what_a_function_raises_is_raised() -> None:
+    def broken(obs, actions, next_obs):
+        raise KeyError("no such sensor")
+
+    with pytest.raises(KeyError, match="no such sensor"):
+        nearl.PID2(CART_POLE, "ppo", settings=SMALL, reward=broken).learn(512)
+
+
+def test_a_training_from_functions_goes_on_with_them_alone(tmp_path) -> None:
+    """Bit for bit, and not in silence with the task's own reward."""
+    reward = lambda obs, actions, next_obs: -np.abs(next_obs[:, 0])  # noqa: E731
+    agent = nearl.PID2(CART_POLE, "ppo", settings=SMALL, reward=reward, run=tmp_path / "whole")
+    agent.learn(1024)
+    half = nearl.PID2(CART_POLE, "ppo", settings=SMALL, reward=reward, run=tmp_path / "half")
+    half.learn(1024, callback=lambda agent, row: agent.num_timesteps < 512)
+    with pytest.raises(ValueError, match=r"from Python functions, which no file holds; go on in Python with nearl.PID2.load"):
+        nearl.PID2.load(tmp_path / "half")
+    again = nearl.PID2.load(tmp_path / "half", reward=reward).learn(512)
+    obs = np.random.default_rng(0).normal(size=(20, len(agent.controller.obs_names)))
+    np.testing.assert_array_equal(agent.predict(obs)[0], again.predict(obs)[0])

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 import nearl
 
 TASK = "HalfCheetah-v5"
-SEEDS = [0, 1, 2]
+SEEDS = [0]
 EXAMPLES = Path(__file__).parents[2] / "examples/python"
 
 
@@ -56,7 +56,7 @@ def returns(env: gymnasium.Env, act, seeds=SEEDS) -> list[float]:
 
 def policies(steps: int) -> None:
     """Every kind of policy that import_sb3 reads: the numbers of SB3 beside those of a loop on the same environment of Gymnasium's."""
-    print("| model | steps | largest difference of an action, 500 observations | mean return in SB3 | in the loop | largest difference of an episode's return |")
+    print("| model | steps | largest difference of an action, 500 observations | return in SB3 | in the loop | largest difference of an episode's return |")
     print("|---|---|---|---|---|---|")
     off = {"learning_starts": 500, "buffer_size": 20_000}
     kinds = {"PPO": {"n_steps": 512}, "A2C": {}, "SAC": off, "TD3": off, "DDPG": off}
@@ -121,7 +121,7 @@ class CountArm(gymnasium.Wrapper):
 
 def learners(ppo_steps: int, sac_steps: int) -> None:
     """PPO and SAC on the cheetah without and behind nearl.Guard, and on the arm behind the projection."""
-    print("| learner | environment | steps | seconds | ticks outside while learning | outside without noise, 3 episodes | return before | after |")
+    print("| learner | environment | steps | seconds | ticks outside while learning | outside in an episode without noise | return before | after |")
     print("|---|---|---|---|---|---|---|---|")
     cheetah = lambda: gymnasium.make(TASK)  # noqa: E731
     environments = {
