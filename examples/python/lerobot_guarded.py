@@ -58,9 +58,9 @@ class GuardedRobot(Robot):
         speed = np.sign(way) * np.minimum(np.abs(way) / self.dt, np.sqrt(self.config.acceleration * np.abs(way)))
         target = self.projector.project(self.q, self.v, q_proposal=self.q + self.dt * speed, v_proposal=speed)
         self.q, self.v = np.array(target.q), np.array(target.v)
-        self.next = time.perf_counter() + self.dt
         goals = {**action, **dict(zip(self.keys, (self.q / self.config.unit).tolist()))}
         self.robot.send_action(goals)
+        self.next = time.perf_counter() + self.dt
         return goals
 
     def connect(self, calibrate: bool = True) -> None:

@@ -46,7 +46,7 @@ class Recorder(Robot):
     def configure(self): ...
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def example():
     spec = importlib.util.spec_from_file_location("lerobot_guarded", ROOT / "examples/python/lerobot_guarded.py")
     module = importlib.util.module_from_spec(spec)
@@ -67,7 +67,7 @@ def test_wild_goals_reach_the_motors_within_the_limits(tmp_path, example):
     assert not inner.is_connected and inner.grips == list(map(float, range(300)))
     q, dt = np.radians(inner.goals), 1.0 / FPS
     v = np.diff(q, axis=0, prepend=q[:1]) / dt
-    assert (q >= LOW - 1e-9).all() and (q <= HIGH + 1e-9).all() and np.ptp(q, axis=0).min() > 2.0, "and it moves"
+    assert (q >= LOW - 1e-9).all() and (q <= HIGH + 1e-9).all() and np.ptp(q, axis=0).min() > 1.5, "and it moves"
     assert (np.abs(v) <= SPEED + 1e-6).all()
     # The difference of two means over a period is the acceleration between their middles.
     assert (np.abs(np.diff(v, axis=0)) <= ACCELERATION * dt + 1e-6).all()
