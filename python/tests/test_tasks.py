@@ -209,6 +209,20 @@ def test_every_task_of_gymnasium_trains(env_id: str, tmp_path: Path) -> None:
     assert all(np.isfinite(value) for row in rows for value in row.values())
 
 
+@pytest.mark.parametrize("env_id", ["Humanoid-v5", "HumanoidStandup-v5"])
+def test_tasks_whose_reward_is_code_train_with_functions(env_id: str, tmp_path: Path) -> None:
+    agent = nearl.PID2(
+        nearl.from_gymnasium(env_id, tmp_path),
+        "ppo",
+        settings={"train.n_envs": 4, "train.n_steps": 64},
+        reward=lambda obs, actions, next_obs: next_obs[:, 2] - 0.1 * (actions**2).sum(axis=1),
+        termination=lambda obs, actions, next_obs: next_obs[:, 2] < 0.05,
+    )
+    rows: list[dict[str, float]] = []
+    agent.learn(768, callback=lambda _, metrics: rows.append(dict(metrics)))
+    assert len(rows) == 3 and all(np.isfinite(value) for row in rows for value in row.values())
+
+
 def test_a_task_from_gymnasium_learns(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\[reward\] of 'Humanoid' is 0 whatever happens"):
         nearl.PID2(nearl.from_gymnasium("Humanoid-v5", tmp_path))
