@@ -48,7 +48,7 @@ class Recorder(Robot):
 
 @pytest.fixture(scope="module")
 def example():
-    spec = importlib.util.spec_from_file_location("lerobot_guarded", ROOT / "examples/python/lerobot_guarded.py")
+    spec = importlib.util.spec_from_file_location("guarded_robot", ROOT / "examples/lerobot/guarded_robot.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import ROOT, planar_urdf
 
-rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed; examples/python/ros2_bridge.py says how")
+rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed; examples/ros2/bridge.py says how")
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
@@ -64,7 +64,7 @@ class Robot(threading.Thread):
 
 
 def test_a_robot_of_ros_obeys_and_rests_when_the_loop_goes(tmp_path):
-    spec = importlib.util.spec_from_file_location("ros2_bridge", ROOT / "examples/python/ros2_bridge.py")
+    spec = importlib.util.spec_from_file_location("bridge", ROOT / "examples/ros2/bridge.py")
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
     (tmp_path / "planar.urdf").write_text(planar_urdf())

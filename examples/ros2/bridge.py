@@ -1,7 +1,7 @@
 """A ROS 2 robot as the plant of a loop: `sensor_msgs/JointState` in, `std_msgs/Float64MultiArray` out, as ros2_control's forward controllers take it.
 
     pip install ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp ros-rmw-implementation ros-fastdds ros-sensor-msgs     # or a ROS 2 of the system
-    python examples/python/ros2_bridge.py arm policy.safetensors        # beside: nearl run policy.safetensors --plant arm
+    python examples/ros2/bridge.py arm policy.safetensors        # beside: nearl run policy.safetensors --plant arm
 
 Positions are commanded (`[command] interface = "position"` in the task file): the projected target is the command, and a brake holds the
 last one. For 50 to 200 Hz: a message through ROS takes a millisecond or two, and now and then ten. Joints are joined by name, whatever
