@@ -63,6 +63,12 @@ pub struct Checker {
     excess: Vec<f64>,
     a: Vec<f64>,
     tau: Vec<f64>,
+    /// Largest speed [rad/s or m/s] and how fast a dof may speed up [rad/s² or m/s²] (nv), where limits were moved.
+    speed: Vec<f64>,
+    faster: Vec<f64>,
+    moved: bool,
+    /// By how much what each hard row keeps may be broken on the way to where it was moved ([`Checker::hard`]).
+    allowed: Vec<f64>,
 }
 
 /// Rows of one limit: which one, whether they are hard and switched on, their first row's number.
@@ -81,6 +87,21 @@ struct ConeOf {
     hard: bool,
     enabled: bool,
     row: usize,
+    /// Share of its size that is asked for, and that is in force on the way there.
+    share: f64,
+    in_force: f64,
+}
+
+impl ConeOf {
+    /// [`Cone::excess`] of the share that is in force.
+    fn excess(&mut self, motion: &mut Motion<'_>) -> f64 {
+        self.cone.excess(motion) + (1.0 - self.in_force)
+    }
+
+    /// [`Cone::breach`] of the share that is asked for.
+    fn breach(&mut self, motion: &mut Motion<'_>) -> f64 {
+        self.cone.breach(motion) + (1.0 - self.share)
+    }
 }
 
 impl Checker {
@@ -106,12 +127,18 @@ impl Checker {
         }
         for (limit, l) in limits.iter().enumerate() {
             if let Some(cone) = l.cone(model, controllable)? {
-                cones.push(ConeOf { cone, limit, hard: l.soft().is_none(), enabled: true, row: first });
+                let (hard, enabled, share, in_force) = (l.soft().is_none(), true, 1.0, 1.0);
+                cones.push(ConeOf { cone, limit, hard, enabled, row: first, share, in_force });
                 first += 1;
             }
         }
         let needs = rows.iter().map(|r| r.rows.needs()).chain(cones.iter().map(|c| c.cone.needs()));
+        let hard_rows = rows.iter().filter(|r| r.hard).map(|r| r.count).sum::<usize>();
         Ok(Checker {
+            speed: vec![f64::INFINITY; model.nv()],
+            faster: vec![f64::INFINITY; model.nv()],
+            moved: false,
+            allowed: vec![0.0; hard_rows + cones.iter().filter(|c| c.hard).count()],
             needs: needs.fold(Needs::default(), Needs::and),
             excess: vec![0.0; rows.iter().map(|r| r.count).max().unwrap_or(0)],
             rows,
@@ -151,6 +178,11 @@ impl Checker {
             let (i, iq) = self.dofs[k];
             let a = (v_next[i] - v[i]) / self.period.dt;
             verdict.see(Kind::Velocity, i, v_next[i].abs(), self.limits.velocity[i]);
+            if self.moved {
+                let faster = speeding_up(v[i], v_next[i]) / self.period.dt;
+                verdict.see(Kind::Velocity, i, v_next[i].abs(), self.speed[i]);
+                verdict.see(Kind::Acceleration, i, faster, self.faster[i]);
+            }
             verdict.see(Kind::Acceleration, i, a.abs(), self.limits.acceleration[i]);
             if self.limits.has_position(i) {
                 self.positions(i, (q[iq], v[i]), (q_next[iq], v_next[i]), verdict);
@@ -220,7 +252,7 @@ impl Checker {
         }
         for block in self.cones.iter_mut().filter(|c| c.hard) {
             if block.enabled {
-                out[first] = block.cone.breach(&mut motion);
+                out[first] = block.breach(&mut motion);
             }
             first += 1;
         }
@@ -240,6 +272,73 @@ impl Checker {
     /// What the rows and cones need beside the state.
     pub(crate) fn needs(&self) -> Needs {
         self.needs
+    }
+
+    /// Asks for `share` of the size of cone `c`, and for rows of that limit to lie `inset` [m] further inside.
+    pub(crate) fn ask(&mut self, limit: usize, share: f64, inset: f64) {
+        for block in self.cones.iter_mut().filter(|c| c.limit == limit) {
+            (block.share, block.in_force) = (share, share);
+        }
+        self.rows.iter_mut().filter(|r| r.limit == limit).for_each(|r| {
+            r.rows.inset(inset);
+        });
+    }
+
+    /// What is in force on the way to moved limits: positions, speeds and how fast a dof may speed up (nv).
+    pub(crate) fn hold(&mut self, limits: &LimitSet, speed: &[f64], faster: &[f64]) {
+        self.limits.q_lower.copy_from_slice(&limits.q_lower);
+        self.limits.q_upper.copy_from_slice(&limits.q_upper);
+        self.speed.copy_from_slice(speed);
+        self.faster.copy_from_slice(faster);
+    }
+
+    /// Begins or ends to hold moved limits; those of the build come back in full.
+    pub(crate) fn move_limits(&mut self, on: bool, limits: &LimitSet) {
+        self.limits.clear();
+        self.limits.tighten(limits);
+        self.moved = on;
+        self.allowed.fill(0.0);
+    }
+
+    /// By how much what hard rows keep may be broken ([`Checker::hard`]).
+    pub(crate) fn allow(&mut self, allowed: &[f64]) {
+        self.allowed.copy_from_slice(allowed);
+    }
+
+    /// The share of its size that cone `c` has in force.
+    pub(crate) fn set_in_force(&mut self, c: usize, share: f64) {
+        self.cones[c].in_force = share;
+    }
+
+    /// The row of cone `c` in reports.
+    pub(crate) fn cone_row(&self, c: usize) -> usize {
+        self.cones[c].row
+    }
+
+    /// The share of its size that a motion makes of each hard cone that is switched on, at its end and as it is asked for; 0 for others.
+    pub(crate) fn shares(
+        &mut self,
+        (q, v): (&[f64], &[f64]),
+        (q_next, v_next): (&[f64], &[f64]),
+        external: &[f64],
+        out: &mut [f64],
+    ) {
+        self.prepare(q, v, v_next, external);
+        let (acceleration, torque, period, previous) = (&self.a[..], &self.tau[..], &self.period, None);
+        let kinematics = &mut self.kinematics;
+        let mut motion = Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous };
+        for (out, block) in out.iter_mut().zip(&mut self.cones) {
+            *out = match block.hard && block.enabled {
+                true => 1.0 + block.cone.excess(&mut motion).max(block.cone.breach(&mut motion)),
+                false => 0.0,
+            };
+        }
+    }
+
+    /// Rows of reports of the hard rows, then of the hard cones ([`Checker::hard`]).
+    pub(crate) fn hard_row(&self, hard: usize) -> usize {
+        let rows = self.rows.iter().filter(|r| r.hard).flat_map(|r| r.first..r.first + r.count);
+        rows.chain(self.cones.iter().filter(|c| c.hard).map(|c| c.row)).nth(hard).unwrap_or(usize::MAX)
     }
 
     /// Switches the rows and cones of a limit, and takes over what is left of the limits of single joints.
@@ -265,18 +364,25 @@ impl Checker {
         let (acceleration, torque, period) = (&self.a[..], &self.tau[..], &self.period);
         let kinematics = &mut self.kinematics;
         let mut motion = Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous };
-        for block in self.rows.iter_mut().filter(|r| r.hard && r.enabled) {
-            let excess = &mut self.excess[..block.count];
+        let mut allowed = self.allowed.iter();
+        for block in self.rows.iter_mut().filter(|r| r.hard) {
+            let (excess, allowed) = (&mut self.excess[..block.count], allowed.by_ref().take(block.count));
             match kept {
+                _ if !block.enabled => excess.fill(f64::NEG_INFINITY),
                 true => block.rows.breach(&mut motion, excess),
                 false => block.rows.excess(&mut motion, excess),
             }
-            for (r, excess) in excess.iter().enumerate() {
-                verdict.see(block.rows.kind(), block.first + r, *excess, 0.0);
+            for (r, (excess, allowed)) in excess.iter().zip(allowed).enumerate() {
+                let excess = if kept { excess - allowed } else { *excess };
+                verdict.see(block.rows.kind(), block.first + r, excess, 0.0);
             }
         }
-        for block in self.cones.iter_mut().filter(|c| c.hard && c.enabled) {
-            let excess = if kept { block.cone.breach(&mut motion) } else { block.cone.excess(&mut motion) };
+        for (block, allowed) in self.cones.iter_mut().filter(|c| c.hard).zip(allowed) {
+            let excess = match kept {
+                _ if !block.enabled => continue,
+                true => block.breach(&mut motion) - allowed,
+                false => block.excess(&mut motion),
+            };
             verdict.see(block.cone.kind(), block.row, excess, 0.0);
         }
     }
@@ -330,4 +436,9 @@ impl Checker {
         self.dynamics.motors(&self.period, q, v, &self.a, &mut self.tau);
         self.tau.iter_mut().zip(external).for_each(|(tau, external)| *tau -= external);
     }
+}
+
+/// By how much a dof gains speed, away from standstill where it turns round.
+fn speeding_up(v: f64, v_next: f64) -> f64 {
+    if v * v_next > 0.0 { v_next.abs() - v.abs() } else { v_next.abs() }
 }

@@ -12,11 +12,13 @@
 
 mod check;
 mod motor;
+mod payload;
 
 use crate::geometry::{Placement, Shape};
 use serde::{Deserialize, Serialize};
 
 pub use motor::{Command, Motor};
+pub use payload::Payload;
 
 /// A robot: bodies with their joints, depth first, and what stands on them. Serialisable; [`RobotDescription::check`] says whether it can be.
 ///

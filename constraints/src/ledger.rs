@@ -16,6 +16,9 @@ pub enum Status {
     /// A joint, a point of a frame, a pair of bodies or a row is outside its limits, see [`Ledger::outside`]: it may only come back
     /// or brake, the rest follows the proposal.
     Recovering,
+    /// The state is outside limits that were moved ([`Projector::move_limits`](crate::Projector::move_limits)), see [`Ledger::outside`]: it
+    /// is on the declared way to them, and inside all others.
+    Tightening,
     /// The proposal was not used: every controllable joint brakes.
     Braked(BrakeReason),
     /// The target must not be used, though it is finite: it stands still at the measured or neutral position.
@@ -36,6 +39,7 @@ impl Status {
             Status::Solved => "solved",
             Status::Slowed => "slowed",
             Status::Recovering => "recovering",
+            Status::Tightening => "tightening",
             Status::Braked(_) => "braked",
             Status::Refused(_) => "refused",
         }
@@ -48,6 +52,9 @@ impl Status {
             Status::Slowed => "no way to stop could be verified from the nearest allowed state",
             Status::Recovering => {
                 "the measured state is outside what `outside` names, which may only come back or brake"
+            }
+            Status::Tightening => {
+                "limits were moved, and the state is on the declared way to those that `outside` names"
             }
             Status::Braked(BrakeReason::NonFiniteProposal) => "the proposal holds NaN or infinity",
             Status::Braked(BrakeReason::NoCertifiedAnswer) => "no answer passed the checker",
@@ -206,7 +213,7 @@ pub struct Ledger {
     pub raw_violations: Counts,
     /// What the target violates, by the independent checker; zero unless braking or recovering.
     pub violations: Counts,
-    /// What the measured state is beyond already, as in [`ActiveRow::row`]: dofs, then hard coupled rows.
+    /// What the measured state, or the brake in force where limits were moved, is beyond already, as in [`ActiveRow::row`]: dofs, then hard coupled rows.
     pub outside: Vec<usize>,
 }
 

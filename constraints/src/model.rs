@@ -1,7 +1,7 @@
 //! The robot: joints, limits, inertias. Constants only; scratch is in [`Dynamics`](crate::Dynamics).
 
 use crate::assemble::assemble;
-use crate::description::{Motor, RobotDescription};
+use crate::description::{Motor, Payload, RobotDescription};
 use crate::error::{ModelError, near_names};
 use crate::pinocchio::RawModel;
 use crate::urdf;
@@ -81,6 +81,16 @@ impl Model {
     pub fn from_description(description: RobotDescription) -> Result<Model, ModelError> {
         let file = format!("the robot '{}'", description.name);
         Ok(Model(Arc::new(assemble(description, &file)?)))
+    }
+
+    /// The robot with a payload in one of its frames: a model of its own, as everything built from the one without knows nothing of it.
+    ///
+    /// # Errors
+    /// [`RobotDescription::carry`].
+    pub fn with_payload(&self, payload: &Payload) -> Result<Model, ModelError> {
+        let mut description = self.0.description.clone();
+        description.carry(payload)?;
+        Model::from_description(description)
     }
 
     /// Reads a URDF file; the base is fixed to the world.

@@ -185,7 +185,10 @@ impl Limit for FrameLimit {
         check(&of("point"), s.point.iter().sum(), true, "finite, in m")?;
         let planes = self.planes()?;
         let (jacobian, ahead) = (vec![0.0; 3 * model.nv()], Ahead::new(model));
-        Ok(Some(Box::new(FrameRows { frame, point: s.point, planes, braking: s.braking, jacobian, ahead })))
+        let sides = s.inside.map_or([f64::INFINITY; 3], |b| std::array::from_fn(|k| b.upper[k] - b.lower[k]));
+        let room = 0.5 * sides.into_iter().fold(f64::INFINITY, f64::min) - s.margin;
+        let (point, braking, inset) = (s.point, s.braking, 0.0);
+        Ok(Some(Box::new(FrameRows { frame, point, planes, braking, jacobian, ahead, inset, room })))
     }
 
     fn soft(&self) -> Option<Soft> {
@@ -207,12 +210,16 @@ struct FrameRows {
     /// Of the point (3 x nv).
     jacobian: Vec<f64>,
     ahead: Ahead,
+    /// Every plane lies this far further inside than it was built [m].
+    inset: f64,
+    /// Half the narrowest side of the box, less its margin [m].
+    room: f64,
 }
 
 impl Plane {
-    /// Of a point looked at ahead.
-    fn clearance(&self, p: &PointMotion, period: &Period) -> Clearance {
-        let (d, c) = (self.offset - dot(self.n, p.position), dot(self.n, p.acceleration));
+    /// Of a point looked at ahead, to the plane `inset` further inside.
+    fn clearance(&self, inset: f64, p: &PointMotion, period: &Period) -> Clearance {
+        let (d, c) = (self.offset - inset - dot(self.n, p.position), dot(self.n, p.acceleration));
         Clearance::ahead(d, dot(self.n, p.velocity), c, period)
     }
 }
@@ -238,6 +245,15 @@ impl Rows for FrameRows {
         true
     }
 
+    fn inset(&mut self, by: f64) -> bool {
+        self.inset = by;
+        true
+    }
+
+    fn most_inset(&self) -> f64 {
+        self.room
+    }
+
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (nv, j, period) = (rows.nv, &mut self.jacobian, tick.period);
         let kinematics = self.ahead.look(tick.q, tick.v, period.dt);
@@ -247,7 +263,7 @@ impl Rows for FrameRows {
             for (i, g) in rows.row(r).iter_mut().enumerate() {
                 *g = dot(plane.n, [j[i], j[nv + i], j[2 * nv + i]]) / period.dt;
             }
-            let clearance = plane.clearance(&at, period);
+            let clearance = plane.clearance(self.inset, &at, period);
             rows.upper[r] = clearance.bound(self.braking, period);
             rows.outside[r] = clearance.is_outside();
         }
@@ -258,7 +274,7 @@ impl Rows for FrameRows {
             self.ahead.look_at_frames(motion.q, motion.v, motion.period.dt).point(self.frame, self.point);
         let then = self.ahead.turn(motion.v_next).point(self.frame, self.point);
         for (x, plane) in out.iter_mut().zip(&self.planes) {
-            let clearance = plane.clearance(&at, motion.period);
+            let clearance = plane.clearance(self.inset, &at, motion.period);
             *x = clearance.excess(dot(plane.n, then.velocity), self.braking, motion.period);
         }
     }
@@ -268,7 +284,7 @@ impl Rows for FrameRows {
         let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
         let at = then.point(self.frame, self.point);
         for (x, plane) in out.iter_mut().zip(&self.planes) {
-            *x = dot(plane.n, at.position) - plane.offset;
+            *x = dot(plane.n, at.position) - plane.offset + self.inset;
         }
     }
 }

@@ -98,7 +98,7 @@ impl PerJoint {
     ///
     /// # Errors
     /// A joint the model does not have, or a value outside the domain (`allowed`, described by `domain`).
-    pub(super) fn values(
+    pub(crate) fn values(
         &self,
         model: &Model,
         limit: &'static str,

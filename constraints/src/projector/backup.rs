@@ -49,6 +49,9 @@ const FAR: f64 = 0.4;
 /// Ticks looked at in a stretch at most; a brake that is not settled then does not count.
 const MOST: u32 = 65;
 
+/// A brake that goes further than this beyond a moved limit is not over with it [m, or share of a size].
+const FURTHER: f64 = 1e-6;
+
 /// A brake of more ticks than this is as good as one without ticks.
 const MANY: f64 = 1e5;
 
@@ -66,6 +69,8 @@ enum Plan {
 pub(crate) struct Backup {
     /// A brake is stored.
     pub(crate) stored: bool,
+    /// It was verified within what is asked for, and does not depend on what moved limits allow on the way to them.
+    within: bool,
     /// Its decelerations (nv).
     deceleration: Vec<f64>,
     /// The index into [`TRIED`] that passed last.
@@ -74,6 +79,9 @@ pub(crate) struct Backup {
     dynamics: Dynamics,
     /// By how much each row may be broken (hard rows): what the measured state breaks already.
     allowed: Vec<f64>,
+    /// By how much the stored brake breaks each row that was moved (hard rows), and by how much the state does.
+    on_the_way: Vec<f64>,
+    here: Vec<f64>,
     /// Rows of which a state, not a motion, is beyond the limit.
     of_state: Vec<bool>,
     trial: Vec<f64>,
@@ -113,10 +121,13 @@ impl Backup {
         };
         Ok(Backup {
             stored: false,
+            within: false,
             deceleration: zero(),
             favourite: 0,
             dynamics: Dynamics::new(model),
             allowed: vec![0.0; checker.hard()],
+            on_the_way: vec![0.0; checker.hard()],
+            here: vec![0.0; checker.hard()],
             of_state: checker.hard_kinds().iter().map(of_state).collect(),
             trial: zero(),
             now: state(),
@@ -133,17 +144,18 @@ impl Backup {
 
     /// As new: what is tried first next depends on nothing that was.
     pub(crate) fn forget(&mut self) {
-        (self.stored, self.favourite) = (false, 0);
+        (self.stored, self.within, self.favourite) = (false, false, 0);
     }
 
-    /// Stored or not, what passed last, and the decelerations.
+    /// Not stored (0), stored (1) or stored on the way to moved limits (2), what passed last, and the decelerations.
     pub(crate) fn write_memory(&self, memory: &mut Vec<f64>) {
-        memory.extend_from_slice(&[f64::from(u8::from(self.stored)), self.favourite as f64]);
+        let stored = if self.within { 1 } else { 2 };
+        memory.extend_from_slice(&[f64::from(stored * u8::from(self.stored)), self.favourite as f64]);
         memory.extend_from_slice(&self.deceleration);
     }
 
     pub(crate) fn set_memory(&mut self, memory: &[f64]) {
-        self.stored = memory[0] != 0.0;
+        (self.stored, self.within) = (memory[0] != 0.0, memory[0] == 1.0);
         self.favourite = memory[1] as usize % TRIED.len();
         self.deceleration.copy_from_slice(&memory[2..]);
     }
@@ -153,9 +165,57 @@ impl Backup {
         self.checker.enable(limit, on, left);
     }
 
-    /// A tick begins: nothing is beyond its limit.
+    /// A tick begins: nothing is beyond its limit but what the brake in force is, where limits were moved.
     pub(crate) fn begin(&mut self) {
-        self.allowed.fill(0.0);
+        self.allowed.copy_from_slice(&self.on_the_way);
+    }
+
+    /// Asks for `share` of the size of a limit's cones, and for its rows to lie `inset` [m] further inside.
+    pub(crate) fn ask(&mut self, limit: usize, share: f64, inset: f64) {
+        self.checker.ask(limit, share, inset);
+        self.within = false;
+        self.on_the_way.fill(0.0);
+    }
+
+    /// Finds by how much the stored brake, verified for limits that were moved since, breaks each hard row at most, which is what the way to
+    /// the new ones may break from here on ([`Backup::on_the_way`]); true when that is anything.
+    pub(crate) fn measure_the_way(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
+        self.on_the_way.fill(0.0);
+        if self.within || !self.stored {
+            return false;
+        }
+        let rows = self.allowed.len();
+        self.trial.copy_from_slice(&self.deceleration);
+        self.find_cuts(with, v);
+        let mut first = 0;
+        for k in 0..=self.cuts.len() {
+            let last = match self.cuts.get(k) {
+                Some(end) if *end <= first => continue,
+                Some(end) => end - 1,
+                None => first, // at rest
+            };
+            self.look_over(with, q, v, (first, last), FEWEST + MOST / 4);
+            for r in 0..rows {
+                let most = self.highest(r);
+                if self.of_state[r] && most > ROUNDING {
+                    self.on_the_way[r] = self.on_the_way[r].max(most);
+                }
+            }
+            first = last + 1;
+        }
+        self.checker.breaches((q, v), (q, v), with.external, &mut self.here);
+        self.on_the_way.iter().any(|most| *most > 0.0)
+    }
+
+    /// By how much each hard row may be broken on the way to moved limits, and whether the brake in force goes further beyond it than
+    /// the state is.
+    pub(crate) fn on_the_way(&self) -> impl Iterator<Item = (f64, bool)> {
+        self.on_the_way.iter().zip(&self.here).map(|(most, here)| (*most, *most > here.max(0.0) + FURTHER))
+    }
+
+    /// The same alone.
+    pub(crate) fn allowed_on_the_way(&self) -> &[f64] {
+        &self.on_the_way
     }
 
     /// Allows what the state breaks already, so that it may come back; true when that is anything.
@@ -164,7 +224,12 @@ impl Backup {
         for (allowed, of_state) in self.allowed.iter_mut().zip(&self.of_state) {
             *allowed = if *of_state { allowed.max(0.0) } else { 0.0 };
         }
-        self.allowed.iter().any(|allowed| *allowed > 0.0)
+        let mut more = false;
+        for (allowed, on_the_way) in self.allowed.iter_mut().zip(&self.on_the_way) {
+            more |= *allowed > *on_the_way;
+            *allowed = allowed.max(*on_the_way);
+        }
+        more
     }
 
     /// The motion breaks no hard row or cone.
@@ -181,6 +246,7 @@ impl Backup {
             let index = (self.favourite + k) % TRIED.len();
             if self.plan(with, q, v, TRIED[index]) && self.within_reach(with, q, v) {
                 (self.favourite, self.stored) = (index, true);
+                self.within = self.allowed.iter().all(|allowed| *allowed <= 0.0);
                 self.deceleration.copy_from_slice(&self.trial);
                 return true;
             }
@@ -241,6 +307,20 @@ impl Backup {
 
     /// Every hard row and cone holds in every tick of the planned brake.
     fn within_reach(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
+        self.find_cuts(with, v);
+        let mut first = 0;
+        for k in 0..self.cuts.len() {
+            let end = self.cuts[k];
+            if end > first && !self.stretch(with, q, v, (first, end - 1)) {
+                return false;
+            }
+            first = end;
+        }
+        self.stretch(with, q, v, (first, first)) // at rest
+    }
+
+    /// Finds the ticks at which some acceleration of the planned brake changes.
+    fn find_cuts(&mut self, with: &With<'_>, v: &[f64]) {
         self.cuts.clear();
         for &i in &with.dofs.controllable {
             let (full, left) = self.full(i, v[i], with.period.dt);
@@ -252,15 +332,33 @@ impl Backup {
         }
         self.cuts.sort_unstable();
         self.cuts.dedup();
-        let mut first = 0;
-        for k in 0..self.cuts.len() {
-            let end = self.cuts[k];
-            if end > first && !self.stretch(with, q, v, (first, end - 1)) {
-                return false;
-            }
-            first = end;
+    }
+
+    /// Looks at the planned brake in at most `looks` ticks of `first` to `last`.
+    fn look_over(&mut self, with: &With<'_>, q: &[f64], v: &[f64], (first, last): (u32, u32), looks: u32) {
+        let length = last - first;
+        let count = looks.min(length + 1);
+        self.ticks.clear();
+        for n in 0..count {
+            let at = if count > length { n } else { (length * n + (count - 1) / 2) / (count - 1) };
+            self.ticks.push(first + at);
+            self.look(with, q, v, first + at, n as usize);
         }
-        self.stretch(with, q, v, (first, first)) // at rest
+    }
+
+    /// The most that row `r` is broken by in the ticks last looked over and, by the bound of [`Backup::between`], between them.
+    fn highest(&self, r: usize) -> f64 {
+        let (rows, count) = (self.allowed.len(), self.ticks.len());
+        let at = |n: usize| self.breach[n * rows + r];
+        let apart = |n: usize| f64::from(self.ticks[n + 1] - self.ticks[n]);
+        let bend = |n: usize| {
+            let slopes = (at(n + 1) - at(n)) / apart(n) - (at(n) - at(n - 1)) / apart(n - 1);
+            slopes.abs() * apart(n).max(apart(n - 1))
+        };
+        let most = (0..count).fold(f64::NEG_INFINITY, |most, n| most.max(at(n)));
+        let bends = (1..count.saturating_sub(1)).fold(0.0, |most: f64, n| most.max(bend(n)));
+        let all = (1..count).all(|n| self.ticks[n] - self.ticks[n - 1] == 1);
+        if all || !most.is_finite() { most } else { most + 0.5 * bends }
     }
 
     /// Every hard row and cone holds from tick `first` to tick `last`, between which no acceleration changes: looked at in ever more

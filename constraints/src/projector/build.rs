@@ -5,6 +5,7 @@ use super::backup::Backup;
 use super::choice;
 use super::conic::Conic;
 use super::coupled::Coupled;
+use super::moved::Moving;
 use super::nearer::Nearer;
 use super::polish::Polish;
 use super::sources::{Measured, Sources};
@@ -57,11 +58,15 @@ impl Projector {
             outside: None,
         };
         let zero = || vec![0.0; nv];
+        let coupled = stages(model, each, &limits, &dofs, &weight, &settings)?;
+        let cones = coupled.as_ref().map_or(0, |stages| stages.sources.cone_limits().count());
         Ok(Projector {
             dynamics: Dynamics::new(model),
             checker,
             notes,
-            coupled: stages(model, each, &limits, &dofs, &weight, &settings)?,
+            moving: Moving::new(&limits, switches.len(), cones),
+            in_force: limits.clone(),
+            coupled,
             switches,
             external: zero(),
             previous: History { known: false, acceleration: zero(), torque: zero() },
@@ -132,7 +137,7 @@ fn switches(
     let switch = |limit: &dyn Limit| {
         let mut set = LimitSet::unlimited(model.nv());
         limit.restrict(model, controllable, &mut set)?;
-        Ok(Switch { label: limit.label().to_string(), set, enabled: true })
+        Ok(Switch { kind: limit.name(), label: limit.label().to_string(), set, enabled: true })
     };
     limits.iter().map(|limit| switch(&**limit)).collect()
 }

@@ -18,7 +18,7 @@ const TRIES: usize = 4;
 macro_rules! with {
     ($projector:ident) => {
         With {
-            limits: &$projector.limits,
+            limits: &$projector.in_force,
             dofs: &$projector.dofs,
             period: &$projector.period,
             external: &$projector.external,
@@ -41,7 +41,9 @@ impl Projector {
         if self.leads_to_a_brake(q, v, target) {
             return self.taken(q, v, target, status);
         }
-        let outside = self.backup.excuse(&with!(self), q, v);
+        // On the way to moved limits, what the brake in force breaks is all that may be broken.
+        let on_the_way = self.moving.coupled && self.backup.stored;
+        let outside = !on_the_way && self.backup.excuse(&with!(self), q, v);
         if outside && self.leads_to_a_brake(q, v, target) {
             return self.taken(q, v, target, status);
         }
@@ -54,7 +56,7 @@ impl Projector {
             return Status::Braked(BrakeReason::NoVerifiedBrake);
         }
         self.report_rung(q, v, target, Rung::StoredBrake);
-        if target.ledger.outside.is_empty() { Status::Slowed } else { Status::Recovering }
+        if target.ledger.outside.is_empty() { Status::Slowed } else { self.named(v, &target.ledger.outside) }
     }
 
     /// The rows left no answer: what they ask for may be more than what they keep. Rows that no brake can keep are not left out.

@@ -13,6 +13,7 @@ mod keep;
 mod kkt;
 mod ladder;
 mod modes;
+mod moved;
 mod nearer;
 mod polish;
 mod sources;
@@ -33,6 +34,7 @@ use active_set::ActiveSet;
 use backup::Backup;
 use conic::Conic;
 use coupled::Coupled;
+use moved::Moving;
 use nearer::Nearer;
 use polish::Polish;
 use sources::{Label, Sources};
@@ -71,6 +73,10 @@ pub struct Projector {
     intervals: Vec<Interval>,
     checker: Checker,
     coupled: Option<Stages>,
+    /// What limits are moved to.
+    moving: Moving,
+    /// What a brake may count on: `limits`, or what is in force on the way to where they were moved.
+    in_force: LimitSet,
     /// The limits one by one, to switch them on and off.
     switches: Vec<Switch>,
     /// Generalised forces beside the motors' (nv) [N·m or N].
@@ -133,6 +139,7 @@ struct Stages {
 
 /// One limit, and whether it holds.
 struct Switch {
+    kind: &'static str,
     label: String,
     set: LimitSet,
     enabled: bool,
@@ -180,6 +187,9 @@ impl Projector {
             return self.refuse(q, target);
         }
         self.update_bounds(q, v, target);
+        if self.moving.on {
+            self.move_coupled(q, v, &mut target.ledger.outside);
+        }
         if !(finite(&proposal.q) && finite(&proposal.v)) {
             return self.brake(q, v, None, target, BrakeReason::NonFiniteProposal);
         }
@@ -240,21 +250,30 @@ impl Projector {
     fn update_bounds(&mut self, q: &[f64], v: &[f64], target: &mut Target) {
         let (t, kappa) = (self.period.dt, self.period.kappa);
         let free = self.settings.consistency == Consistency::Free;
-        for &i in &self.dofs.controllable {
+        self.moving.beyond = false;
+        for k in 0..self.dofs.controllable.len() {
+            let i = self.dofs.controllable[k];
             let mut dof = Dof::of(&self.limits, i);
             dof.whole = self.settings.braking == Braking::Stored;
             if dof.acceleration.is_infinite() {
                 // Free mode without braking: the cut below is all there is.
                 (dof.lower, dof.upper) = (f64::NEG_INFINITY, f64::INFINITY);
             }
-            let x = interval(&dof, self.dofs.single[i].map_or(0.0, |iq| q[iq]), v[i], &self.period);
+            let mut x = interval(&dof, self.dofs.single[i].map_or(0.0, |iq| q[iq]), v[i], &self.period);
             let exact =
                 |kind: Kind, bound: f64, v_max: f64| match kind == Kind::Velocity && x.outside.is_none() {
                     true => v_max,
                     false => v[i] + t * bound,
                 };
-            let v_lower = exact(x.lower_kind, x.lower, -dof.velocity);
-            let v_upper = exact(x.upper_kind, x.upper, dof.velocity).max(v_lower);
+            let mut v_lower = exact(x.lower_kind, x.lower, -dof.velocity);
+            let mut v_upper = exact(x.upper_kind, x.upper, dof.velocity).max(v_lower);
+            let (mut outside, at) = (x.outside.is_some(), self.dofs.single[i].map_or(0.0, |iq| q[iq]));
+            self.moving.beyond |= outside;
+            if self.moving.on {
+                let (aim, hard, behind) = self.move_dof((at, v[i]), i, x);
+                ([v_lower, v_upper], x) = (hard, aim);
+                outside |= behind;
+            }
             (self.bounds.v_lower[i], self.bounds.v_upper[i]) = (v_lower, v_upper);
             if let Some(iq) = self.dofs.single[i] {
                 let reach = |v_next: f64| q[iq] + (t * v[i] + kappa * t * (v_next - v[i]));
@@ -266,7 +285,7 @@ impl Projector {
                 }
                 (self.bounds.q_lower[i], self.bounds.q_upper[i]) = (lower, upper);
             }
-            if x.outside.is_some() {
+            if outside {
                 target.ledger.outside.push(i);
             }
             self.intervals[i] = x;
@@ -287,10 +306,9 @@ impl Projector {
         let soft = target.ledger.active.iter().fold(0.0, |most: f64, row| most.max(row.slack));
         target.ledger.slack = verdict.worst.max(soft);
         let outside = &target.ledger.outside;
-        let is_joint_outside = outside.iter().any(|row| *row < v.len());
         let accepted =
-            verdict.accepts() || (is_joint_outside && verdict.counts.torque + verdict.counts.other == 0);
-        let status = if outside.is_empty() { status } else { Status::Recovering };
+            verdict.accepts() || (self.moving.beyond && verdict.counts.torque + verdict.counts.other == 0);
+        let status = if outside.is_empty() { status } else { self.named(v, outside) };
         match self.settings.braking {
             _ if !accepted => self.brake(q, v, Some(proposal), target, BrakeReason::NoCertifiedAnswer),
             Braking::Stored => self.keep_a_brake(q, v, proposal, target, status),

@@ -73,6 +73,7 @@ impl Projector {
         target: &mut Target,
     ) -> Result<Status, BrakeReason> {
         self.find_goal(q, v, proposal);
+        self.aim(v);
         self.v_next.copy_from_slice(&proposal.v);
         for &i in &self.dofs.controllable {
             self.v_next[i] = self.goal[i].clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);

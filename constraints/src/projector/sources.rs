@@ -33,6 +33,8 @@ struct Block {
     sizes: Vec<f64>,
     soft: Option<Soft>,
     enabled: bool,
+    /// It was moved inside.
+    moved: bool,
 }
 
 struct ConeBlock {
@@ -41,6 +43,8 @@ struct ConeBlock {
     size: f64,
     soft: Option<Soft>,
     enabled: bool,
+    /// Share of the radius that is in force.
+    share: f64,
 }
 
 /// The measured state and what acts on the robot beside its motors.
@@ -70,14 +74,14 @@ impl Sources {
             if let Some(rows) = l.rows(model, controllable)? {
                 let (sizes, soft) = (rows.sizes(), l.soft());
                 check_sizes(&sizes, rows.names().len(), soft, l.label())?;
-                let block = Block { first, limit, soft, enabled: true, rows, sizes };
+                let block = Block { first, limit, soft, enabled: true, moved: false, rows, sizes };
                 first += block.sizes.len();
                 blocks.push(block);
             }
             if let Some(cone) = l.cone(model, controllable)? {
                 let (size, soft) = (cone.size(), l.soft());
                 check_sizes(&[size], 1, soft, l.label())?;
-                cones.push(ConeBlock { limit, size, soft, enabled: true, cone });
+                cones.push(ConeBlock { limit, size, soft, enabled: true, share: 1.0, cone });
             }
         }
         let needs = blocks.iter().map(|b| b.rows.needs()).chain(cones.iter().map(|c| c.cone.needs()));
@@ -137,6 +141,35 @@ impl Sources {
         self.cones.iter_mut().filter(|c| c.limit == limit).for_each(|c| c.enabled = on);
     }
 
+    /// Moves the rows of a limit inside by `inset` [m].
+    pub(crate) fn inset(&mut self, limit: usize, inset: f64) {
+        for block in self.blocks.iter_mut().filter(|b| b.limit == limit) {
+            block.moved = block.rows.inset(inset) && inset > 0.0;
+        }
+    }
+
+    /// The largest inset of the rows of a limit [m], and whether they are hard; `None` where it has no rows that move.
+    pub(crate) fn most_inset(&self, limit: usize) -> Option<(f64, bool)> {
+        let block = self.blocks.iter().find(|b| b.limit == limit)?;
+        let most = block.rows.most_inset();
+        (most > 0.0).then_some((most, block.soft.is_none()))
+    }
+
+    /// The row is of a limit that was moved.
+    pub(crate) fn is_moved(&self, row: usize) -> bool {
+        self.blocks.iter().any(|b| b.moved && (b.first..b.first + b.sizes.len()).contains(&row))
+    }
+
+    /// Which limit each cone is of, its size, and whether it is hard.
+    pub(crate) fn cone_limits(&self) -> impl Iterator<Item = (usize, f64, bool)> {
+        self.cones.iter().map(|c| (c.limit, c.size, c.soft.is_none()))
+    }
+
+    /// The share of its radius that cone `c` has in the ticks to come.
+    pub(crate) fn set_share(&mut self, c: usize, share: f64) {
+        self.cones[c].share = share;
+    }
+
     /// Writes the rows and cones of the tick, as shares of their sizes; `y` (nv) holds the velocity change of the dofs
     /// that are not controllable.
     pub(crate) fn fill(
@@ -188,7 +221,7 @@ impl Sources {
             cone.c.fill(0.0);
             cone.radius = f64::INFINITY;
             if block.enabled {
-                cone.radius = block.cone.fill(&mut tick, g, &mut cone.c) / block.size;
+                cone.radius = block.share * block.cone.fill(&mut tick, g, &mut cone.c) / block.size;
             }
             cone.take(g, nv, block.size, dofs, y);
         }

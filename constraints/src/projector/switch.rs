@@ -43,6 +43,7 @@ impl Projector {
             self.checker.enable(limit, switch.enabled, &self.limits);
             self.backup.enable(limit, switch.enabled, &self.limits);
         }
+        self.take_moved();
         Ok(())
     }
 
@@ -175,7 +176,7 @@ impl Projector {
         dofs.chain(labels).collect()
     }
 
-    /// All limits that hold now, of single joints.
+    /// All limits of single joints, as they were built; [`Projector::moved`] says which are tighter for now.
     pub fn limits(&self) -> &LimitSet {
         &self.limits
     }

@@ -20,6 +20,7 @@ mod kept;
 mod kinds;
 mod kinematics;
 mod motors;
+mod moving;
 mod mujoco;
 mod projector;
 mod stages;

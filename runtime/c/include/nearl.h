@@ -121,7 +121,7 @@ void nearl_controller_reset(nearl_controller *controller);
 /* NULL is allowed. */
 void nearl_controller_free(nearl_controller *controller);
 
-/* "unchanged", "clamped", "solved", "recovering", "slowed", "braked", "refused"; "unknown" for any other number. */
+/* "unchanged", "clamped", "solved", "recovering", "slowed", "braked", "tightening", "refused"; "unknown" for any other number. */
 const char *nearl_status_name(int status);
 
 /* Version of the library, as "0.1.0". */

@@ -44,8 +44,8 @@ pub struct InProcess {
 }
 
 /// Names by number; what is refused has [`REFUSED`].
-const NAMES: [&std::ffi::CStr; 6] =
-    [c"unchanged", c"clamped", c"solved", c"recovering", c"slowed", c"braked"];
+const NAMES: [&std::ffi::CStr; 7] =
+    [c"unchanged", c"clamped", c"solved", c"recovering", c"slowed", c"braked", c"tightening"];
 
 fn number(status: Status) -> c_int {
     match status {
@@ -55,6 +55,7 @@ fn number(status: Status) -> c_int {
         Status::Recovering => 3,
         Status::Slowed => 4,
         Status::Braked(_) => 5,
+        Status::Tightening => 6,
         Status::Refused(_) => REFUSED,
     }
 }

@@ -320,6 +320,7 @@ fn status(status: Status) -> LedgerStatus {
         Status::Solved => LedgerStatus::Solved,
         Status::Recovering => LedgerStatus::Recovering,
         Status::Slowed => LedgerStatus::Slowed,
+        Status::Tightening => LedgerStatus::Tightening,
         Status::Braked(BrakeReason::NoVerifiedBrake) => LedgerStatus::BrakedNoVerifiedBrake,
         Status::Braked(BrakeReason::NonFiniteProposal) => LedgerStatus::BrakedNonFiniteProposal,
         Status::Braked(BrakeReason::NoCertifiedAnswer) => LedgerStatus::BrakedNoCertifiedAnswer,

@@ -24,11 +24,13 @@ codes! {
             "Train with an algorithm that proposes states (`nearl train TASK --algo pid2-ib`) where limits matter.";
         RefusedWrongLength = "refused-wrong-length", "The state does not have the robot's number of entries.",
             "Start plant and runtime with the same robot file.";
+        Tightening = "tightening", "Limits were moved, and the robot is on the declared way to them.",
+            "Nothing to do; what is not reached is in `outside` of the ledger, and a joint behind a position comes back with the proposal.";
     }
 }
 
 impl LedgerStatus {
-    /// The number in messages: 0 to 4 projected, 5 not, 10 and up braked, 20 and up refused.
+    /// The number in messages: 0 to 4 and 6 projected, 5 not, 10 and up braked, 20 and up refused.
     pub fn number(self) -> u32 {
         match self {
             LedgerStatus::BrakedNonFiniteProposal => 10,
@@ -36,6 +38,7 @@ impl LedgerStatus {
             LedgerStatus::BrakedNonFiniteDynamics => 12,
             LedgerStatus::BrakedNoVerifiedBrake => 13,
             LedgerStatus::NotProjected => 5,
+            LedgerStatus::Tightening => 6,
             LedgerStatus::RefusedNonFiniteState => 20,
             LedgerStatus::RefusedWrongLength => 21,
             plain => plain.code(),

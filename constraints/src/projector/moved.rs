@@ -1,0 +1,288 @@
+//! Limits that move while the robot does.
+//!
+//! The limits of the build and those they are moved to can each be kept for ever; the way from one to the other is neither. On that way
+//! the limit in force is the tightest that the brake in force keeps: the stored one, or the deceleration `A_b` of each joint where none is
+//! stored. With `s` the next velocity by that brake and `r` the position where it comes to rest,
+//!
+//! ```text
+//!     |v'| <= max(V, |s|),    q <= max(q_max, r),    rows and cones: as far as that brake goes, and no further
+//! ```
+//!
+//! The brake obeys all of it, so that there is always an answer; the next brake is verified for it, so that it never moves back; and the
+//! goal is put where the fastest way leads: joints that are too fast, or could not stop in front of their new position, slow down by `A_b`;
+//! where a frame, its plane or the energy is behind, all joints slow down in proportion, as fast as one of them can.
+
+mod numbers;
+mod way;
+
+use super::Projector;
+use super::backup::With;
+use crate::ledger::Status;
+use crate::limit::Moved;
+use crate::target::Braking;
+use crate::viability::{Dof, Interval, POSITION_TOLERANCE};
+use crate::{LimitError, LimitSet};
+use way::{gain, rest, way};
+
+/// A speed above its limit by this share is rounding.
+const ROUNDING: f64 = 1e-9;
+
+/// What limits are moved to, and what is in force on the way.
+pub(super) struct Moving {
+    /// Some limit is moved.
+    pub(super) on: bool,
+    /// As [`Projector::moved`].
+    numbers: Vec<f64>,
+    /// Some hard row or cone is moved.
+    pub(super) coupled: bool,
+    /// Positions and speeds asked for, of the build where those are tighter.
+    wanted: LimitSet,
+    /// How fast each dof may speed up (nv) [rad/s² or m/s²].
+    faster: Vec<f64>,
+    /// Velocities that the fastest way allows (nv) [rad/s or m/s].
+    lower: Vec<f64>,
+    upper: Vec<f64>,
+    /// In force: speeds (nv), how fast a dof may speed up (nv).
+    speed: Vec<f64>,
+    speeding: Vec<f64>,
+    /// Share of its size that each cone is asked for, and that it would have (cones).
+    shares: Vec<f64>,
+    reached: Vec<f64>,
+    /// The goal is this share of the velocity, as a row or cone is behind.
+    slow: Option<f64>,
+    /// Some joint is beyond the limits of the build.
+    pub(super) beyond: bool,
+}
+
+impl Moving {
+    pub(super) fn new(limits: &LimitSet, switches: usize, cones: usize) -> Moving {
+        let nv = limits.velocity.len();
+        let infinite = || vec![f64::INFINITY; nv];
+        let mut moving = Moving {
+            on: false,
+            numbers: vec![0.0; 4 * nv + 2 * switches],
+            coupled: false,
+            wanted: limits.clone(),
+            faster: infinite(),
+            lower: infinite(),
+            upper: infinite(),
+            speed: infinite(),
+            speeding: infinite(),
+            shares: vec![1.0; cones],
+            reached: vec![0.0; cones],
+            slow: None,
+            beyond: false,
+        };
+        moving.still();
+        moving
+    }
+
+    /// Nothing is moved.
+    fn still(&mut self) {
+        let nv = self.faster.len();
+        self.numbers.fill(f64::INFINITY);
+        self.numbers[2 * nv..3 * nv].fill(f64::NEG_INFINITY);
+        let switches = (self.numbers.len() - 4 * nv) / 2;
+        self.numbers[4 * nv..4 * nv + switches].fill(0.0);
+        self.numbers[4 * nv + switches..].fill(1.0);
+    }
+}
+
+impl Projector {
+    /// Moves limits inside those of the build, or back towards them, for the ticks to come; what `moved` does not name is as it was built.
+    /// Where the robot is outside of what is asked for, it goes there on the way that docs/LIMITS.md declares, with
+    /// [`Status::Tightening`](crate::Status::Tightening). Allocates.
+    ///
+    /// # Errors
+    /// Limits wider than those of the build or without room to stop, unknown names, hard rows and cones without a stored brake, the free
+    /// consistency; nothing is changed then.
+    pub fn move_limits(&mut self, moved: &Moved) -> Result<(), LimitError> {
+        let numbers = self.moved_numbers(moved)?;
+        self.set_moved(&numbers);
+        Ok(())
+    }
+
+    /// Where limits are moved to, as plain numbers: largest speed, largest gain of speed, lowest and highest position of each dof (4 nv), then
+    /// how far inside the rows of each limit lie [m] and the share that its cone has (2 for each limit).
+    pub fn moved(&self) -> &[f64] {
+        &self.moving.numbers
+    }
+
+    /// Takes what [`Projector::moved`] or [`Projector::moved_numbers`] gave, of a projector with the same limits. Does not allocate.
+    ///
+    /// # Panics
+    /// When it has another length.
+    pub fn set_moved(&mut self, numbers: &[f64]) {
+        self.moving.numbers.copy_from_slice(numbers);
+        self.take_moved();
+    }
+
+    /// Takes over the numbers, beside the limits of the build that hold now.
+    pub(super) fn take_moved(&mut self) {
+        let (nv, switches) = (self.model.nv(), self.switches.len());
+        let m = &mut self.moving;
+        m.wanted.clear();
+        m.wanted.tighten(&self.limits);
+        for i in 0..nv {
+            m.wanted.velocity[i] = m.wanted.velocity[i].min(m.numbers[i]);
+            m.faster[i] = m.numbers[nv + i].min(self.limits.acceleration[i]);
+            m.wanted.q_lower[i] = m.wanted.q_lower[i].max(m.numbers[2 * nv + i]);
+            m.wanted.q_upper[i] = m.wanted.q_upper[i].min(m.numbers[3 * nv + i]);
+        }
+        let (insets, shares) = m.numbers[4 * nv..].split_at(switches);
+        let joints = m.numbers[..2 * nv].iter().chain(&m.numbers[3 * nv..4 * nv]).any(|x| x.is_finite())
+            || m.numbers[2 * nv..3 * nv].iter().any(|x| x.is_finite());
+        m.coupled = insets.iter().any(|by| *by > 0.0) || shares.iter().any(|share| *share < 1.0);
+        m.on = joints || m.coupled;
+        m.slow = None;
+        for limit in 0..switches {
+            self.checker.ask(limit, shares[limit], insets[limit]);
+            self.backup.ask(limit, shares[limit], insets[limit]);
+            if let Some(stages) = &mut self.coupled {
+                stages.sources.inset(limit, insets[limit]);
+            }
+        }
+        if let Some(stages) = &mut self.coupled {
+            for c in 0..m.shares.len() {
+                let limit = stages.sources.cone_limits().nth(c).map_or(0, |(limit, ..)| limit);
+                m.shares[c] = shares[limit];
+                stages.sources.set_share(c, shares[limit]);
+            }
+        }
+        self.checker.move_limits(m.on, &self.limits);
+        self.in_force.clear();
+        self.in_force.tighten(&self.limits);
+    }
+
+    /// Box, aim and what is in force of dof `i`, whose box by the limits of the build is `built`.
+    pub(super) fn move_dof(
+        &mut self,
+        (q, v): (f64, f64),
+        i: usize,
+        built: Interval,
+    ) -> (Interval, [f64; 2], bool) {
+        let (t, limits) = (self.period.dt, &self.limits);
+        let dof =
+            |limits: &LimitSet| Dof { whole: self.settings.braking == Braking::Stored, ..Dof::of(limits, i) };
+        let (dof, wanted) = (dof(limits), dof(&self.moving.wanted));
+        let stored = (self.settings.braking == Braking::Stored && self.backup.stored)
+            .then(|| self.backup.next_velocity(i, v, &self.period));
+        let way = way((&dof, &wanted), (q, v), built, stored, self.moving.faster[i], &self.period);
+        let deceleration =
+            stored.and_then(|_| self.backup.decelerations()).map_or(dof.braking(&self.period), |d| d[i]);
+        let rest = rest(v, deceleration, &self.period);
+        let m = &mut self.moving;
+        let aim = [v + t * way.aim.lower, v + t * way.aim.upper];
+        (m.lower[i], m.upper[i]) = (aim[0], aim[1]);
+        let hard = [aim[0].min(way.stop), aim[1].max(way.stop)];
+        m.speed[i] = wanted.velocity.max(way.stop.abs());
+        m.speeding[i] = m.faster[i].max(gain(v, way.stop) / t);
+        let f = &mut self.in_force;
+        f.q_upper[i] = wanted.upper.max((q + rest.max(0.0)).min(dof.upper));
+        f.q_lower[i] = wanted.lower.min((q + rest.min(0.0)).max(dof.lower));
+        let beyond = |x: f64, limit: f64| x > limit + POSITION_TOLERANCE;
+        let behind = beyond(f.q_upper[i], wanted.upper) || beyond(-f.q_lower[i], -wanted.lower);
+        (way.aim, hard, !way.arrived || behind)
+    }
+
+    /// What is in force of rows and cones, and whether all joints slow down; `rows` gets the reports of those on their way.
+    pub(super) fn move_coupled(&mut self, q: &[f64], v: &[f64], rows: &mut Vec<usize>) {
+        let m = &mut self.moving;
+        m.slow = None;
+        self.checker.hold(&self.in_force, &m.speed, &m.speeding);
+        if !m.coupled {
+            return;
+        }
+        let with =
+            With { limits: &self.in_force, dofs: &self.dofs, period: &self.period, external: &self.external };
+        let mut further = false;
+        if self.settings.braking == Braking::Stored {
+            self.backup.measure_the_way(&with, q, v);
+            for (k, (most, on)) in self.backup.on_the_way().enumerate() {
+                if most > 0.0 {
+                    name(rows, self.checker.hard_row(k));
+                }
+                further |= on;
+            }
+            self.checker.allow(self.backup.allowed_on_the_way());
+        }
+        let Some(stages) = &mut self.coupled else { return };
+        let m = &mut self.moving;
+        // As it is, and after a tick of the brake in force.
+        self.tangent.iter_mut().zip(v).for_each(|(step, v)| *step = self.period.dt * v);
+        self.dynamics.integrate(q, &self.tangent, &mut self.integrated);
+        self.checker.shares((q, v), (&self.integrated, v), &self.external, &mut m.reached);
+        let mut slowest: f64 = 1.0;
+        for c in 0..m.shares.len() {
+            if m.reached[c] > m.shares[c] * (1.0 + ROUNDING) {
+                slowest = slowest.min(m.shares[c] / m.reached[c]);
+                name(rows, self.checker.cone_row(c));
+            }
+        }
+        self.v_stop.copy_from_slice(v);
+        for &i in &self.dofs.controllable {
+            self.v_stop[i] = match self.settings.braking == Braking::Stored && self.backup.stored {
+                true => self.backup.next_velocity(i, v[i], &self.period),
+                false => v[i] - v[i].signum() * (self.braking[i] * self.period.dt).min(v[i].abs()),
+            };
+            self.tangent[i] = self.period.dt * (v[i] + self.period.kappa * (self.v_stop[i] - v[i]));
+        }
+        self.dynamics.integrate(q, &self.tangent, &mut self.integrated);
+        self.checker.shares((q, v), (&self.integrated, &self.v_stop), &self.external, &mut m.reached);
+        for c in 0..m.shares.len() {
+            let in_force = m.shares[c].max(m.reached[c].min(1.0));
+            stages.sources.set_share(c, in_force);
+            self.checker.set_in_force(c, in_force);
+            if in_force > m.shares[c] * (1.0 + ROUNDING) {
+                name(rows, self.checker.cone_row(c));
+            }
+        }
+        if slowest < 1.0 || further {
+            let quickest = self.dofs.controllable.iter().filter(|i| v[**i] != 0.0);
+            let most =
+                quickest.fold(1.0, |most: f64, &i| most.min(self.braking[i] * self.period.dt / v[i].abs()));
+            let least = if further { 0.0 } else { slowest };
+            m.slow = Some((1.0 - most).max(least));
+        }
+    }
+
+    /// Puts the goal where the fastest way leads.
+    pub(super) fn aim(&mut self, v: &[f64]) {
+        if !self.moving.on {
+            return;
+        }
+        for &i in &self.dofs.controllable {
+            let m = &self.moving;
+            let mut goal = m.slow.map_or(self.goal[i], |share| share * v[i]);
+            // What the box bounds, it clamps and reports by itself.
+            if m.lower[i] > self.bounds.v_lower[i] {
+                goal = goal.max(m.lower[i]);
+            }
+            if m.upper[i] < self.bounds.v_upper[i] {
+                goal = goal.min(m.upper[i]);
+            }
+            self.consistent[i] &= goal == self.goal[i];
+            self.goal[i] = goal;
+        }
+    }
+
+    /// The status of a tick whose state or brake is outside of something.
+    pub(super) fn named(&self, v: &[f64], outside: &[usize]) -> Status {
+        let built = |row: &usize| {
+            let stages = self.coupled.as_ref().filter(|_| *row >= v.len());
+            stages.is_some_and(|stages| {
+                let r = row - v.len();
+                r < stages.problem.m && !stages.sources.is_moved(r)
+            })
+        };
+        let recovering = !self.moving.on || self.moving.beyond || outside.iter().any(built);
+        if recovering { Status::Recovering } else { Status::Tightening }
+    }
+}
+
+/// Adds a row that is not there yet.
+fn name(rows: &mut Vec<usize>, row: usize) {
+    if !rows.contains(&row) {
+        rows.push(row);
+    }
+}

@@ -1,0 +1,425 @@
+//! Limits that move while the robot does: what is declared of the way holds under attack, and the way is as fast as it can be.
+
+use crate::common::arms::{rail_arm, random_arm, small_arm};
+use crate::common::*;
+use nearl_constraints::*;
+
+const SUB_STEPS: [u32; 3] = [0, 1, 5];
+const PERIODS: [f64; 4] = [0.001, 0.002, 0.01, 0.02];
+
+fn moved() -> Moved {
+    Moved::default()
+}
+
+fn by_joint(model: &Model, value: impl Fn(usize) -> f64) -> Option<PerJoint> {
+    Some(PerJoint::Each((0..model.nv()).map(value).collect()))
+}
+
+/// Bang-bang for a while, joint by joint.
+struct Attack {
+    random: Random,
+    side: Vec<f64>,
+}
+
+impl Attack {
+    fn new(seed: u64, nv: usize) -> Attack {
+        Attack { random: Random(seed), side: vec![1.0; nv] }
+    }
+
+    fn propose(&mut self, model: &Model, dt: f64, q: &[f64], out: &mut Proposal) {
+        for i in 0..model.nv() {
+            if self.random.next() < dt / 0.3 {
+                self.side[i] = if self.random.next() < 0.5 { -1.0 } else { 1.0 };
+            }
+            let speed = 3.0 * self.side[i] * model.velocity_limit()[i];
+            (out.q[i], out.v[i]) = (q[i] + dt * speed, speed);
+        }
+    }
+}
+
+fn joints(acceleration: f64, torque: Option<f64>) -> Vec<Box<dyn Limit>> {
+    let mut limits: Vec<Box<dyn Limit>> = vec![
+        Box::new(PositionLimit::default()),
+        Box::new(VelocityLimit::default()),
+        Box::new(AccelerationLimit::uniform(acceleration)),
+    ];
+    limits.extend(torque.map(|scale| Box::new(TorqueLimit::scaled(scale)) as Box<dyn Limit>));
+    limits
+}
+
+fn middle(model: &Model) -> Vec<f64> {
+    let (low, high) = (model.lower_position_limit(), model.upper_position_limit());
+    (0..model.nv()).map(|i| 0.5 * (low[i] + high[i])).collect()
+}
+
+/// What was asked for last, as a test reads it.
+struct Asked {
+    speed: Vec<f64>,
+    gain: Vec<f64>,
+    lower: Vec<f64>,
+    upper: Vec<f64>,
+}
+
+/// Limits of single joints at random, tighter and looser again.
+fn draw(model: &Model, acceleration: f64, random: &mut Random) -> (Moved, Asked) {
+    let (low, high) = (model.lower_position_limit(), model.upper_position_limit());
+    let n = model.nv();
+    let mut asked = Asked {
+        speed: model.velocity_limit().to_vec(),
+        gain: vec![acceleration; n],
+        lower: low.to_vec(),
+        upper: high.to_vec(),
+    };
+    let mut moved = moved();
+    if random.next() < 0.6 {
+        moved.speed = random.between(0.02, 1.0);
+        asked.speed.iter_mut().for_each(|v| *v *= moved.speed);
+    }
+    if random.next() < 0.4 {
+        let value = random.between(0.05, 1.0) * acceleration;
+        moved.acceleration = Some(PerJoint::All(value));
+        asked.gain.fill(value);
+    }
+    if random.next() < 0.6 {
+        for i in 0..n {
+            let (a, b) = (random.between(low[i], high[i]), random.between(low[i], high[i]));
+            let gap = 0.3 - (a - b).abs();
+            let wide = gap.max(0.0);
+            (asked.lower[i], asked.upper[i]) =
+                ((a.min(b) - wide).max(low[i]), (a.max(b) + wide).min(high[i]));
+        }
+        moved.lower = by_joint(model, |i| asked.lower[i]);
+        moved.upper = by_joint(model, |i| asked.upper[i]);
+    }
+    (moved, asked)
+}
+
+/// Ticks outside what is declared, ticks on the way and ticks that moved limits hold something back.
+#[derive(Debug, Default)]
+struct Seen {
+    outside: usize,
+    on_the_way: usize,
+    arrivals: usize,
+}
+
+fn attack_joints(
+    model: &Model,
+    limits: &[Box<dyn Limit>],
+    settings: Settings,
+    ticks: usize,
+    seed: u64,
+) -> Seen {
+    let (all, dt, a): (Vec<usize>, f64, f64) = ((0..model.nv()).collect(), settings.dt, 10.0);
+    let mut projector = Projector::new(model, limits, &all, settings).unwrap();
+    let period = Period::new(dt, projector.settings().sub_steps);
+    let (mut raw, mut target) = (Proposal::new(model), Target::new(model));
+    let (mut q, mut v) = (middle(model), vec![0.0; model.nv()]);
+    let (mut attack, mut random) = (Attack::new(seed, model.nv()), Random(seed + 100));
+    let (_, mut asked) = draw(model, a, &mut Random(1));
+    asked.speed.fill(f64::INFINITY);
+    asked.lower.fill(f64::NEG_INFINITY);
+    asked.upper.fill(f64::INFINITY);
+    asked.gain.fill(f64::INFINITY);
+    let mut dynamics = Dynamics::new(model);
+    let (mut tau, mut seen) = (vec![0.0; model.nv()], Seen::default());
+    let with_torque = limits.len() > 3;
+    for tick in 0..ticks {
+        if random.next() < dt / 0.2 {
+            let (moved, new) = draw(model, a, &mut random);
+            if projector.move_limits(&moved).is_ok() {
+                asked = new;
+            }
+        }
+        attack.propose(model, dt, &q, &mut raw);
+        let status = projector.project(&q, &v, &raw, &mut target);
+        let mut wrong = Vec::new();
+        let mut check = |name: &str, i: usize, value: f64, limit: f64| {
+            if value > limit + 1e-9 * limit.abs().max(1.0) {
+                wrong.push(format!("{name} {i}: {value} of {limit}"));
+            }
+        };
+        let mut away = false;
+        for i in 0..model.nv() {
+            let (v, v_next) = (v[i], target.v[i]);
+            let (before, after) = (v.abs(), v_next.abs());
+            check("built speed", i, after, model.velocity_limit()[i]);
+            check("built position", i, target.q[i], model.upper_position_limit()[i]);
+            check("built position", i, -target.q[i], -model.lower_position_limit()[i]);
+            check("acceleration", i, (v_next - v).abs(), a * dt);
+            // Where no brake is stored, the last period of braking may turn a joint round in front of a position.
+            let turned = if projector.stores_a_brake() || v * v_next > 0.0 { 0.0 } else { a * dt - before };
+            // Never faster than asked for, and slower in each tick until then.
+            let known = if before > asked.speed[i] { before } else { asked.speed[i] };
+            check("speed", i, after, known.max(turned));
+            let gain = if v * v_next > 0.0 { after - before } else { after };
+            check("gain", i, gain, (asked.gain[i] * dt).max(turned));
+            // Behind a position it never moves further out once it stands, and stops in time to the best of the motors.
+            for (d, limit) in [(1.0, asked.upper[i]), (-1.0, -asked.lower[i])] {
+                if d * q[i] > limit + 1e-9 {
+                    check("outward", i, d * v_next, (d * v).max(0.0));
+                    away = true;
+                }
+            }
+            away |= before > asked.speed[i] * (1.0 + 1e-9);
+        }
+        if with_torque {
+            dynamics.motors(&period, &q, &v, &target.acceleration, &mut tau);
+            for (i, tau) in tau.iter().enumerate() {
+                check("torque", i, tau.abs(), model.effort_limit()[i]);
+            }
+        }
+        let named = !target.ledger.outside.is_empty();
+        if away && !named {
+            wrong.push("outside, and not named".into());
+        }
+        if target.ledger.violations.total() > 0 {
+            wrong.push(format!("the checker finds {:?}", target.ledger.violations));
+        }
+        if named && !matches!(status, Status::Tightening | Status::Braked(BrakeReason::NoVerifiedBrake)) {
+            wrong.push("another status".into());
+        }
+        if !wrong.is_empty() && seen.outside < 3 {
+            println!("tick {tick} {status:?}: {wrong:?} {:?}", target.ledger);
+        }
+        seen.outside += usize::from(!wrong.is_empty());
+        seen.arrivals += usize::from(seen.on_the_way > 0 && !named);
+        seen.on_the_way += usize::from(named);
+        (q, v) = (target.q.clone(), target.v.clone());
+    }
+    seen
+}
+
+#[test]
+fn joints_keep_what_is_declared_on_the_way_to_moved_limits() {
+    let robots = [("small", small_arm()), ("rail", rail_arm()), ("random", random_arm(4, 5))];
+    for (name, model) in &robots {
+        for sub_steps in SUB_STEPS {
+            for dt in PERIODS {
+                let ticks = if dt < 0.005 { 6000 } else { 3000 };
+                let settings = Settings { braking: Braking::Certified, ..Settings::new(dt, sub_steps) };
+                let seen = attack_joints(model, &joints(10.0, None), settings, ticks, 5);
+                println!("{name} {sub_steps} {dt}: {seen:?}");
+                assert_eq!(seen.outside, 0, "{name}, {sub_steps} steps of {dt} s: {seen:?}");
+                assert!(seen.on_the_way > 20 && seen.arrivals > 20, "{name}, {dt}: {seen:?} shows nothing");
+            }
+        }
+    }
+}
+
+#[test]
+fn joints_with_torque_keep_what_is_declared_on_the_way_to_moved_limits() {
+    let robots = [("small", small_arm(), 0.45), ("rail", rail_arm(), 0.8)];
+    for (name, model, torque) in &robots {
+        for sub_steps in SUB_STEPS {
+            for dt in PERIODS {
+                let ticks = if dt < 0.005 { 3000 } else { 1000 };
+                let settings = Settings { braking: Braking::Stored, ..Settings::new(dt, sub_steps) };
+                let seen = attack_joints(model, &joints(10.0, Some(*torque)), settings, ticks, 5);
+                println!("{name} {sub_steps} {dt}: {seen:?}");
+                assert_eq!(seen.outside, 0, "{name}, {sub_steps} steps of {dt} s: {seen:?}");
+                assert!(seen.on_the_way > 20 && seen.arrivals > 20, "{name}, {dt}: {seen:?} shows nothing");
+            }
+        }
+    }
+}
+
+/// A point below a plane, its speed and the energy, all of which move.
+#[test]
+fn frames_speeds_and_energy_keep_what_is_declared_on_the_way_to_moved_limits() {
+    for (name, model, torque) in [("small", small_arm(), 0.6), ("rail", rail_arm(), 0.9)] {
+        let frame = model.frame("tool").unwrap();
+        let (mut kinematics, zero) = (Kinematics::new(&model), vec![0.0; model.nv()]);
+        let q0 = middle(&model);
+        kinematics.update(&q0, &zero, &zero);
+        let x0 = kinematics.point(frame, [0.0; 3]).position[0];
+        for (sub_steps, dt) in [(0, 0.001), (1, 0.001), (1, 0.002), (5, 0.01), (1, 0.02)] {
+            let mut limits = joints(10.0, Some(torque));
+            limits.push(Box::new(FrameLimit::half_space("tool", [1.0, 0.0, 0.0], [x0 + 0.3, 0.0, 0.0], 3.0)));
+            limits.push(Box::new(FrameSpeedLimit::of("tool", 0.8)));
+            limits.push(Box::new(EnergyLimit::of(4.0)));
+            let all: Vec<usize> = (0..model.nv()).collect();
+            let mut projector = Projector::new(&model, &limits, &all, Settings::new(dt, sub_steps)).unwrap();
+            assert!(projector.stores_a_brake());
+            let (mut raw, mut target) = (Proposal::new(&model), Target::new(&model));
+            let (mut q, mut v) = (q0.clone(), zero.clone());
+            let (mut attack, mut random) = (Attack::new(3, model.nv()), Random(17));
+            let (mut inset, mut speed, mut energy): (f64, f64, f64) = (0.0, 0.8, 4.0);
+            let (mut on_the_way, mut outside, mut arrived, mut braked) = (0, 0, 0, 0);
+            let ticks = if dt < 0.005 { 3000 } else { 1000 };
+            for tick in 0..ticks {
+                if random.next() < dt / 0.3 {
+                    let mut moved = moved();
+                    (inset, speed, energy) = (0.0, 0.8, 4.0);
+                    if random.next() < 0.5 {
+                        inset = random.between(0.0, 0.4);
+                        moved.frame.insert("tool".into(), inset);
+                    }
+                    if random.next() < 0.5 {
+                        speed = random.between(0.05, 0.8);
+                        moved.frame_speed.insert("tool".into(), speed);
+                    }
+                    if random.next() < 0.5 {
+                        energy = random.between(0.02, 4.0);
+                        moved.energy = Some(energy);
+                    }
+                    projector.move_limits(&moved).unwrap();
+                }
+                attack.propose(&model, dt, &q, &mut raw);
+                let status = projector.project(&q, &v, &raw, &mut target);
+                kinematics.update(&target.q, &target.v, &zero);
+                let at = kinematics.point(frame, [0.0; 3]);
+                let fast = at.velocity.iter().map(|x| x * x).sum::<f64>().sqrt();
+                let joule = kinematics.kinetic_energy(&target.q, &target.v);
+                let named = !target.ledger.outside.is_empty();
+                let mut wrong = vec![];
+                let mut check = |name: &str, value: f64, limit: f64| {
+                    if value > limit * (1.0 + 1e-9) + 1e-9 {
+                        wrong.push(format!("{name}: {value} of {limit}"));
+                    }
+                };
+                check("built plane", at.position[0], x0 + 0.3);
+                check("built speed", fast, 0.8);
+                check("built energy", joule, 4.0);
+                if !named {
+                    check("plane", at.position[0], x0 + 0.3 - inset);
+                    check("speed", fast, speed);
+                    check("energy", joule, energy);
+                }
+                if target.ledger.violations.total() > 0 {
+                    wrong.push(format!("the checker finds {:?}", target.ledger.violations));
+                }
+                braked += usize::from(named && !status.is_ok());
+                if !wrong.is_empty() && outside < 3 {
+                    println!("tick {tick} {status:?}: {wrong:?} {:?}", target.ledger);
+                }
+                outside += usize::from(!wrong.is_empty());
+                arrived += usize::from(on_the_way > 0 && !named);
+                on_the_way += usize::from(named);
+                (q, v) = (target.q.clone(), target.v.clone());
+            }
+            println!(
+                "{name} {sub_steps} {dt}: {outside} outside, {on_the_way} on the way ({braked} braked), {arrived} after"
+            );
+            assert_eq!(outside, 0, "{name}, {sub_steps} steps of {dt} s");
+            assert!(on_the_way > 20 && arrived > 20, "{name}, {dt} shows nothing");
+        }
+    }
+}
+
+/// From `v` to `v_new` at the braking deceleration: `(v - v_new) / A`, to the tick.
+#[test]
+fn a_slower_speed_is_reached_in_the_time_it_takes() {
+    for (dt, share) in [(0.001, 0.3), (0.002, 0.5), (0.01, 0.25)] {
+        let model = rail_arm();
+        let all: Vec<usize> = (0..model.nv()).collect();
+        let settings = Settings { braking: Braking::Certified, ..Settings::new(dt, 1) };
+        let mut projector = Projector::new(&model, &joints(4.0, None), &all, settings).unwrap();
+        let (mut raw, mut target) = (Proposal::new(&model), Target::new(&model));
+        let (mut q, mut v) = (middle(&model), vec![0.0; model.nv()]);
+        q[0] = -0.9;
+        let mut run = |projector: &mut Projector, count: usize| {
+            let mut ticks = 0;
+            for _ in 0..count {
+                (raw.q.clone_from(&q), raw.v.fill(0.0));
+                (raw.q[0], raw.v[0]) = (q[0] + 5.0 * dt, 5.0);
+                let status = projector.project(&q, &v, &raw, &mut target);
+                assert_eq!(target.ledger.violations.total(), 0);
+                (q, v) = (target.q.clone(), target.v.clone());
+                ticks += usize::from(status == Status::Tightening);
+            }
+            let held = target.ledger.active.iter().any(|row| row.row == 0 && row.kind == Kind::Velocity);
+            (v[0], ticks, held)
+        };
+        let top = model.velocity_limit()[0];
+        assert_eq!(run(&mut projector, (0.4 / dt) as usize), (top, 0, true));
+        projector.move_limits(&Moved::speed(share)).unwrap();
+        let best = ((top - share * top) / (4.0 * dt) - 1e-9).ceil() as usize;
+        let (reached, took, _) = run(&mut projector, best);
+        assert!((reached - share * top).abs() < 1e-12 && took == best, "{reached} in {took} of {best} ticks");
+        let (_, late, held) = run(&mut projector, 5);
+        assert!(late == 0 && held, "{late} {held}: a moved limit is reported as any other");
+        projector.move_limits(&moved()).unwrap();
+        assert!(run(&mut projector, best).0 > share * top);
+    }
+}
+
+#[test]
+fn what_was_built_is_not_loosened_and_what_is_unknown_is_named() {
+    let model = small_arm();
+    let all: Vec<usize> = (0..6).collect();
+    let mut limits = joints(10.0, Some(0.6));
+    limits.push(Box::new(FrameSpeedLimit::of("tool", 0.8)));
+    limits.push(Box::new(FrameLimit::inside("tool", [-1.0; 3], [1.0, 1.0, 0.5], 3.0)));
+    let mut projector = Projector::new(&model, &limits, &all, Settings::new(0.001, 1)).unwrap();
+    let one = |name: &str, value: f64| Some(PerJoint::Joints([(name.to_string(), value)].into()));
+    let named = |name: &str, value: f64| [(name.to_string(), value)].into();
+    let before = projector.moved().to_vec();
+    let cases = [
+        (Moved::speed(1.5), vec!["speed", "1.5", "at most 1"]),
+        (Moved::speed(f64::NAN), vec!["speed"]),
+        (Moved { velocity: one("j2", 7.0), ..moved() }, vec!["velocity 7", "'j2'", "3.1", "rad/s"]),
+        (Moved { velocity: one("j9", 1.0), ..moved() }, vec!["'j9'"]),
+        (Moved { upper: one("j2", 3.5), ..moved() }, vec!["upper 3.5", "'j2'", "2.9", "rad"]),
+        (
+            Moved { lower: one("j2", 2.0), upper: one("j2", 1.0), ..moved() },
+            vec!["'j2'", "above 2", "below 1"],
+        ),
+        (Moved { acceleration: one("j2", 11.0), ..moved() }, vec!["acceleration 11", "'j2'", "10"]),
+        (Moved { acceleration: one("j2", f64::INFINITY), ..moved() }, vec!["acceleration", "'j2'"]),
+        (Moved { frame: named("tool", 0.9), ..moved() }, vec!["0.9 m", "'tool'", "0.75"]),
+        (Moved { frame: named("tol", 0.1), ..moved() }, vec!["'tol'", "tool"]),
+        (Moved { frame_speed: named("tool", 0.9), ..moved() }, vec!["frame_speed 0.9 m/s", "'tool'", "0.8"]),
+        (Moved { energy: Some(1.0), ..moved() }, vec!["energy"]),
+    ];
+    for (moved, words) in cases {
+        let error = projector.move_limits(&moved).unwrap_err().to_string();
+        assert!(words.iter().all(|word| error.contains(word)), "{error}: {words:?}");
+        assert_eq!(projector.moved(), before);
+    }
+    let certified = Settings { braking: Braking::Certified, ..Settings::new(0.001, 1) };
+    let mut projector = Projector::new(&model, &limits, &all, certified).unwrap();
+    let error = projector.move_limits(&Moved::speed(0.5)).unwrap_err().to_string();
+    assert!(error.contains("frame_speed 'tool'") && error.contains("stored"), "{error}");
+}
+
+/// A payload is what a link of the URDF is that hangs fixed in the same place.
+#[test]
+fn a_payload_weighs_what_a_fixed_link_does() {
+    let (x, y, z, roll, yaw) = (0.03, -0.02, 0.11, 0.4, -0.7);
+    let inertia = [0.004, 0.0003, -0.0002, 0.005, 0.0001, 0.006];
+    let [xx, xy, xz, yy, yz, zz] = inertia;
+    let text = crate::common::arms::small_arm_text(0.0);
+    // Where the tool is, turned, so that the axes of payload and body differ.
+    let tool = "<origin xyz=\"0.1 0 0\"/></joint></robot>";
+    assert!(text.contains(tool));
+    let turned = format!("<origin xyz=\"0.1 0 0\" rpy=\"{roll} 0 {yaw}\"/></joint>");
+    let held = format!(
+        "<link name=\"load\"><inertial><origin xyz=\"{x} {y} {z}\"/><mass value=\"1.7\"/><inertia ixx=\"{xx}\" ixy=\"{xy}\" \
+         ixz=\"{xz}\" iyy=\"{yy}\" iyz=\"{yz}\" izz=\"{zz}\"/></inertial></link><joint name=\"hold\" type=\"fixed\">\
+         <parent link=\"tool\"/><child link=\"load\"/></joint></robot>"
+    );
+    let bare = Model::from_urdf_text(&text.replace(tool, &format!("{turned}</robot>"))).unwrap();
+    let loaded = Model::from_urdf_text(&text.replace(tool, &format!("{turned}{held}"))).unwrap();
+    let payload = description::Payload { frame: "tool".into(), mass: 1.7, com: [x, y, z], inertia };
+    let carrying = bare.with_payload(&payload).unwrap();
+    let (mut one, mut other, mut random) = (Dynamics::new(&loaded), Dynamics::new(&carrying), Random(3));
+    let (mut tau, mut same, mut less) = ([0.0; 6], [0.0; 6], [0.0; 6]);
+    for _ in 0..200 {
+        let mut draw = || std::array::from_fn::<f64, 6, _>(|_| random.between(-2.0, 2.0));
+        let (q, v, a) = (draw(), draw(), draw());
+        one.rnea(&q, &v, &a, &mut tau);
+        other.rnea(&q, &v, &a, &mut same);
+        Dynamics::new(&bare).rnea(&q, &v, &a, &mut less);
+        for i in 0..6 {
+            assert!((tau[i] - same[i]).abs() < 1e-10 * tau[i].abs().max(1.0), "{i}: {tau:?} {same:?}");
+        }
+        assert!((0..6).any(|i| (tau[i] - less[i]).abs() > 0.1));
+    }
+    let wrong = |frame: &str, mass: f64| {
+        let payload = description::Payload { frame: frame.into(), mass, com: [0.0; 3], inertia: [0.0; 6] };
+        bare.with_payload(&payload).err().unwrap().to_string()
+    };
+    assert!(wrong("tol", 1.0).contains("no frame 'tol'") && wrong("tol", 1.0).contains("tool"));
+    assert!(wrong("tool", -1.0).contains("mass -1 kg") && wrong("tool", f64::NAN).contains("NaN"));
+    assert!(wrong("base", 1.0).contains("'base' is fixed to the world"), "{}", wrong("base", 1.0));
+}
