@@ -1,6 +1,7 @@
 //! Subcommands of a robot's program: `nearl-runtime` has them, and `nearl` has the same.
 
 mod limits;
+mod moved;
 
 use std::path::PathBuf;
 
@@ -15,6 +16,7 @@ use crate::rt::{
     bench_wake, run,
 };
 pub use limits::LimitOptions;
+pub use moved::LimitsCommand;
 
 /// Run a snapshot on a plant in real time.
 #[derive(Args, Debug)]

@@ -69,6 +69,8 @@ enum Command {
     Run(Box<nearl_runtime::cli::RunCommand>),
     /// Constrained rollouts for other processes, over shared memory.
     Serve(serve::Serve),
+    /// Move the limits of a running loop inside those it was started with, or back to them.
+    Limits(nearl_runtime::cli::LimitsCommand),
     /// Compute every tick of a flight log again and compare it bit for bit.
     Replay(nearl_runtime::cli::ReplayCommand),
     /// Say what a code in a report, a log or a refusal means, and what to do.
@@ -103,6 +105,7 @@ impl Cli {
             Command::Plant(c) => c.run(),
             Command::Run(c) => c.run(),
             Command::Serve(c) => c.run(),
+            Command::Limits(c) => c.run(),
             Command::Replay(c) => c.run(),
             Command::Explain(c) => c.run(crate::rollout_protocol::Answer::explanations()),
             Command::Doctor(c) => c.run(),

@@ -133,6 +133,7 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
         steps: 0,
         action_lower: Vec::new(),
         action_upper: Vec::new(),
+        moved: None,
     };
     let of = &manifest.task;
     if !(of.reward.is_empty() && of.cost.is_empty() && of.env.is_none()) {

@@ -53,6 +53,7 @@ fn snapshot() -> Snapshot {
         steps: 0,
         action_lower: vec![-40.0],
         action_upper: vec![40.0],
+        moved: None,
     };
     let layer = |weight: Vec<f32>, bias: Vec<f32>| DenseLayer { n_in: 2, n_out: 2, weight, bias };
     // towards the limit it is moving to

@@ -10,7 +10,7 @@ use crate::file_kind::FileKind;
 use crate::net::{Activation, Dense, Function};
 use crate::normaliser::Normaliser;
 use crate::task::{IdmKind, Task};
-use nearl_constraints::{Guard, RobotDescription};
+use nearl_constraints::{Guard, Moved, RobotDescription};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::io::Write;
@@ -91,6 +91,9 @@ pub struct Manifest {
     pub action_lower: Vec<f64>,
     /// Highest action the actuators take (n_act).
     pub action_upper: Vec<f64>,
+    /// Where an operator has moved the limits of the loop that runs it; as they were built in files.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub moved: Option<Moved>,
 }
 
 impl Manifest {

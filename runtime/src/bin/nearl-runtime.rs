@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use nearl_runtime::cli::{ExplainCommand, LoopBench, ReplayCommand, RunCommand, exit_code};
+use nearl_runtime::cli::{ExplainCommand, LimitsCommand, LoopBench, ReplayCommand, RunCommand, exit_code};
 use nearl_runtime::doctor::DoctorCommand;
 use nearl_runtime::tunnel::TunnelCommand;
 
@@ -18,6 +18,8 @@ struct Arguments {
 enum Command {
     /// Run a snapshot on a plant in real time.
     Run(Box<RunCommand>),
+    /// Move the limits of a running loop inside those it was started with, or back to them.
+    Limits(LimitsCommand),
     /// Compute every tick of a flight log again and compare it bit for bit.
     Replay(ReplayCommand),
     /// Say what a code means and what to do.
@@ -36,6 +38,7 @@ enum Command {
 fn main() -> ExitCode {
     let result = match Arguments::parse().command {
         Command::Run(command) => command.run(),
+        Command::Limits(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Explain(command) => command.run(Vec::new()),
         Command::Doctor(command) => command.run(),

@@ -151,6 +151,25 @@ impl RowsMessage {
     }
 }
 
+impl LimitsMessage {
+    /// What is asked for.
+    ///
+    /// # Errors
+    /// What is wrong with the text, in one line.
+    pub fn moved(&self) -> Result<nearl_constraints::Moved, String> {
+        let length = (self.length as usize).min(MAX_MOVED);
+        serde_json::from_slice(&self.text[..length]).map_err(|e| crate::snapshot::one_line(&e))
+    }
+
+    /// Writes the text; false, and nothing is written, where there is no room for it.
+    pub(crate) fn set_text(&mut self, text: &[u8]) -> bool {
+        let Some(room) = self.text.get_mut(..text.len()) else { return false };
+        room.copy_from_slice(text);
+        self.length = text.len() as u64;
+        true
+    }
+}
+
 impl StateMessage {
     /// True if all used numbers are finite.
     pub fn is_finite(&self) -> bool {

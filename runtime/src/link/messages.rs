@@ -8,7 +8,8 @@
 //! | `tally` | plant -> all | [`TallyMessage`] |
 //! | `transition` | runtime -> trainer | [`TransitionMessage`] |
 //! | `snapshot` | trainer -> runtime | bytes with [`SnapshotHeader`] |
-//! | `receipt` | runtime -> trainer | [`ReceiptMessage`] |
+//! | `receipt` | runtime -> trainer, operator | [`ReceiptMessage`] |
+//! | `limits` | operator -> runtime | [`LimitsMessage`] |
 //! | `health` | runtime -> anyone | [`HealthMessage`] |
 //! | `proposal` | proposer -> runtime, the newest alone | [`ProposalMessage`] |
 //! | `asked` | runtime -> proposer | [`AskedMessage`] |
@@ -33,6 +34,8 @@ pub const MAX_ROW_NAMES: usize = 8192;
 pub const MAX_KINDS: usize = 512;
 /// Capacity of the task's name in a [`RowsMessage`] [bytes].
 pub const MAX_TASK: usize = 128;
+/// Capacity of the text in a [`LimitsMessage`] [bytes].
+pub const MAX_MOVED: usize = 8192;
 /// Capacity of the text in a [`ReceiptMessage`] [bytes].
 pub const MAX_TEXT: usize = 256;
 
@@ -293,9 +296,21 @@ impl Default for SnapshotHeader {
 }
 
 message! {
-    /// The runtime's reply to one snapshot.
+    /// Where an operator moves the limits of the loop.
+    LimitsMessage, "limits", version 1, buffer 4, history 0, subscribers 2 {
+        /// Counts the orders of one operator upwards.
+        version: u64,
+        /// Bytes used in `text`.
+        length: u64,
+        /// [`Moved`](nearl_constraints::Moved) as JSON.
+        text: [u8; MAX_MOVED],
+    }
+}
+
+message! {
+    /// The runtime's reply to one snapshot, or to limits that were moved.
     ReceiptMessage, "receipt", version 1, buffer 8, history 1, subscribers 8 {
-        /// `header.epoch` of the trainer that sent the snapshot.
+        /// `header.epoch` of the trainer that sent the snapshot, or of the operator.
         trainer_epoch: u64,
         /// Version of the snapshot replied to.
         version: u64,

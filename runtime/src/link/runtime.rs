@@ -14,6 +14,7 @@ pub struct RuntimeLink {
     robot: Inbox<RobotMessage>,
     tally: Inbox<TallyMessage>,
     snapshots: Option<SnapshotReader>,
+    limits: Inbox<LimitsMessage>,
     action: Board<ActionMessage>,
     transition: Outbox<TransitionMessage>,
     receipt: Outbox<ReceiptMessage>,
@@ -45,6 +46,7 @@ impl RuntimeLink {
             robot: bus.inbox()?,
             tally: bus.inbox()?,
             snapshots: Some(bus.bytes_inbox()?),
+            limits: bus.inbox()?,
             bus,
             _owner: owner,
         };
@@ -94,6 +96,11 @@ impl RuntimeLink {
     /// The snapshots, for a thread of its own; `None` if they were taken before.
     pub fn take_snapshots(&mut self) -> Option<SnapshotReader> {
         self.snapshots.take()
+    }
+
+    /// The next limits that an operator asks for.
+    pub fn limits(&mut self) -> Option<LimitsMessage> {
+        self.limits.next()
     }
 
     /// Opens the topic on which proposals are asked for.

@@ -11,6 +11,13 @@ use super::runtime::poll_for;
 use super::service::{Bus, Ipc};
 use super::*;
 
+/// Topics of others.
+type Held = (
+    PortFactory<Ipc, TickMessage, ()>,
+    PortFactory<Ipc, RowsMessage, ()>,
+    PortFactory<Ipc, LimitsMessage, ()>,
+);
+
 /// Reads states, transitions, receipts and health of one robot, and pushes snapshots.
 pub struct TrainerLink {
     state: BoardReader<StateMessage>,
@@ -21,7 +28,7 @@ pub struct TrainerLink {
     tally: Inbox<TallyMessage>,
     snapshot: Option<(BytesOutbox, Owner)>,
     /// Not read, but held: a topic of a runtime that is killed while it goes stays whole beside one who stays.
-    _held: (PortFactory<Ipc, TickMessage, ()>, PortFactory<Ipc, RowsMessage, ()>),
+    _held: Held,
     bus: Bus,
 }
 
@@ -37,7 +44,7 @@ impl TrainerLink {
             robot: bus.inbox()?,
             tally: bus.inbox()?,
             snapshot: None,
-            _held: (bus.service()?, bus.service()?),
+            _held: (bus.service()?, bus.service()?, bus.service()?),
             bus,
         };
         link.bus.reserve()?;

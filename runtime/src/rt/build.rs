@@ -4,9 +4,11 @@
 //! in the middle of a send: at a real-time priority it may keep the very core that the sender needs to go on.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use nearl_constraints::Moved;
 use rtrb::{Consumer, Producer, RingBuffer};
 
 use crate::link::{RobotMessage, SnapshotBytes, SnapshotHeader, Verdict};
@@ -18,7 +20,9 @@ pub(crate) struct Built<T> {
     /// Number of the snapshot, in the order they were received.
     pub(crate) id: u64,
     pub(crate) header: SnapshotHeader,
+    /// With the limits moved as `source` says: what the controller was built from.
     pub(crate) bytes: Vec<u8>,
+    pub(crate) source: Source,
     pub(crate) result: Result<Box<T>, Refusal>,
 }
 
@@ -41,9 +45,21 @@ const STACK: usize = 16 << 20;
 /// Time between two looks for a job.
 const NAP: Duration = Duration::from_millis(1);
 
+/// What a controller is made of.
+#[derive(Clone)]
+pub(crate) struct Source {
+    /// The snapshot as it came.
+    pub(crate) bytes: Arc<Vec<u8>>,
+    /// Where its limits are moved.
+    pub(crate) moved: Moved,
+    /// Only the limits are new.
+    pub(crate) is_order: bool,
+}
+
 struct Job {
     id: u64,
-    snapshot: SnapshotBytes,
+    header: SnapshotHeader,
+    source: Source,
     robot: RobotMessage,
 }
 
@@ -59,17 +75,16 @@ impl<B: Build> Builder<B> {
                     while let Ok(scrap) = scraps.pop() {
                         drop(scrap);
                     }
-                    let Ok(Job { id, snapshot, robot }) = work.pop() else {
+                    let Ok(Job { id, header, source, robot }) = work.pop() else {
                         if work.is_abandoned() {
                             return;
                         }
                         std::thread::sleep(NAP);
                         continue;
                     };
-                    let result = build_one(&mut build, &snapshot, &robot);
-                    let SnapshotBytes { header, bytes } = snapshot;
+                    let (bytes, result) = build_one(&mut build, header, &source, &robot);
                     // There is room: the next job is only given once this one was collected.
-                    let _ = done.push(Built { id, header, bytes, result });
+                    let _ = done.push(Built { id, header, bytes, source, result });
                 }
             })?;
         Ok(Builder { jobs: Some(jobs), built, scrap, thread: Some(thread), waiting: None, busy: false })
@@ -79,10 +94,11 @@ impl<B: Build> Builder<B> {
     pub(crate) fn take(
         &mut self,
         id: u64,
-        snapshot: SnapshotBytes,
+        header: SnapshotHeader,
+        source: Source,
         robot: RobotMessage,
     ) -> Option<SnapshotHeader> {
-        let replaced = self.waiting.replace(Job { id, snapshot, robot }).map(|old| old.snapshot.header);
+        let replaced = self.waiting.replace(Job { id, header, source, robot }).map(|old| old.header);
         self.feed();
         replaced
     }
@@ -98,6 +114,11 @@ impl<B: Build> Builder<B> {
         self.busy = false;
         self.feed();
         Some(built)
+    }
+
+    /// Nothing waits, is built, or waits to be collected.
+    pub(crate) fn is_idle(&self) -> bool {
+        !self.busy && self.waiting.is_none()
     }
 
     fn feed(&mut self) {
@@ -119,15 +140,24 @@ impl<B: Build> Drop for Builder<B> {
     }
 }
 
-/// A panic in a validation is a refusal, not the end of the loop.
+/// The bytes with the limits moved, and the controller. A panic in a validation is a refusal, not the end of the loop.
 fn build_one<B: Build>(
     build: &mut B,
-    snapshot: &SnapshotBytes,
+    header: SnapshotHeader,
+    source: &Source,
     robot: &RobotMessage,
-) -> Result<Box<B::Controller>, Refusal> {
-    catch_unwind(AssertUnwindSafe(|| build.build(snapshot, robot).map(Box::new))).unwrap_or_else(|_| {
-        let text =
-            format!("snapshot version {} broke its validation: export it again", snapshot.header.version);
+) -> (Vec<u8>, Result<Box<B::Controller>, Refusal>) {
+    let mut made = SnapshotBytes { header, bytes: Vec::new() };
+    let mut both = || {
+        made.bytes = match source.moved == Moved::default() {
+            true => source.bytes.to_vec(),
+            false => build.with_limits(&source.bytes, &source.moved)?,
+        };
+        build.build(&made, robot).map(Box::new)
+    };
+    let result = catch_unwind(AssertUnwindSafe(&mut both)).unwrap_or_else(|_| {
+        let text = format!("snapshot version {} broke its validation: export it again", header.version);
         Err(Refusal { verdict: Verdict::Other, text })
-    })
+    });
+    (made.bytes, result)
 }

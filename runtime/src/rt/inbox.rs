@@ -1,11 +1,19 @@
 //! Snapshots on their way into the loop: from bytes to a built controller to the swap, with one receipt for each. The
 //! one before is kept and swapped back in when the robot no longer gets where the targets say.
+//!
+//! Limits that an operator moves take the same way: the snapshot in use is built again with them, and a snapshot that comes later is built
+//! with them too. Nothing overtakes such an order, and nothing with other limits is kept to go back to.
+
+use std::sync::Arc;
+
+use nearl_constraints::Moved;
 
 use crate::link::{
-    Message, ReceiptMessage, RobotMessage, RowsMessage, RuntimeLink, SnapshotBytes, SnapshotHeader, Verdict,
+    LimitsMessage, Message, ReceiptMessage, RobotMessage, RowsMessage, RuntimeLink, SnapshotBytes,
+    SnapshotHeader, Verdict,
 };
 use crate::log::LogQueue;
-use crate::rt::build::{Builder, Built};
+use crate::rt::build::{Builder, Built, Source};
 use crate::rt::core::Loaded;
 use crate::rt::receive::SnapshotReceiver;
 use crate::rt::residual::{Residual, RollbackSettings};
@@ -21,11 +29,17 @@ pub(crate) struct SnapshotInbox<B: Build> {
     builder: Builder<B>,
     swap: Sender<Loaded<B::Controller>>,
     /// Built, not yet offered to the loop.
-    ready: Option<(SnapshotHeader, Box<Loaded<B::Controller>>)>,
+    ready: Option<(SnapshotHeader, Made<B::Controller>)>,
     /// In the slot, not yet taken by the loop.
     offered: Option<Offer>,
+    /// What the one in use is made of.
+    in_use: Source,
+    /// An operator's order that is under way: nothing else is begun until it is answered.
+    order: Option<SnapshotHeader>,
+    /// The next one, which waits for what was begun before it.
+    next_order: Option<(SnapshotHeader, Moved)>,
     /// In use before the current one.
-    previous: Option<Box<Loaded<B::Controller>>>,
+    previous: Option<Made<B::Controller>>,
     /// Header of the one in use; none for the first.
     current: Option<SnapshotHeader>,
     residual: Residual,
@@ -46,10 +60,14 @@ pub(crate) struct SnapshotInbox<B: Build> {
     pub(crate) rolled_back: u64,
 }
 
+/// A controller with what it is made of.
+type Made<T> = (Source, Box<Loaded<T>>);
+
 /// What the loop is about to take.
 struct Offer {
     /// Header of a new snapshot; none when the previous one is offered again.
     header: Option<SnapshotHeader>,
+    source: Source,
     version: u64,
     /// Its number, and what viewers are told of it.
     rows: (u64, Box<RowsMessage>),
@@ -70,6 +88,7 @@ impl<B: Build> SnapshotInbox<B> {
         builder: Builder<B>,
         swap: Sender<Loaded<B::Controller>>,
         rollback: RollbackSettings,
+        first: Vec<u8>,
     ) -> SnapshotInbox<B> {
         SnapshotInbox {
             receiver,
@@ -77,6 +96,9 @@ impl<B: Build> SnapshotInbox<B> {
             swap,
             ready: None,
             offered: None,
+            in_use: Source { bytes: Arc::new(first), moved: Moved::default(), is_order: false },
+            order: None,
+            next_order: None,
             previous: None,
             current: None,
             residual: Residual::new(rollback),
@@ -114,7 +136,12 @@ impl<B: Build> SnapshotInbox<B> {
     /// Moves every snapshot one stage on.
     pub(crate) fn pump(&mut self, around: &mut Surroundings<'_>) {
         self.settle(around);
-        while let Some(snapshot) = self.receiver.next() {
+        while let Some(order) = around.link.limits() {
+            self.hear(around.link, &order);
+        }
+        self.begin_order(around);
+        while self.order.is_none() && self.next_order.is_none() {
+            let Some(snapshot) = self.receiver.next() else { break };
             self.receive(around, snapshot);
         }
         if let Some(built) = self.builder.collect() {
@@ -134,15 +161,56 @@ impl<B: Build> SnapshotInbox<B> {
         }
         self.newest = (sender, version);
         self.received += 1;
-        if let Some(replaced) = self.builder.take(self.received, snapshot, *around.robot) {
+        let SnapshotBytes { header, bytes } = snapshot;
+        let source = Source { bytes: Arc::new(bytes), moved: self.in_use.moved.clone(), is_order: false };
+        if let Some(replaced) = self.builder.take(self.received, header, source, *around.robot) {
             supersede(around.link, &replaced);
         }
+    }
+
+    /// Takes in what an operator asks for.
+    fn hear(&mut self, link: &mut RuntimeLink, order: &LimitsMessage) {
+        let mut header = SnapshotHeader { version: order.version, ..SnapshotHeader::default() };
+        header.header = order.header;
+        match order.moved() {
+            Ok(moved) => {
+                if let Some((replaced, _)) = self.next_order.replace((header, moved)) {
+                    reply(
+                        link,
+                        &replaced,
+                        0,
+                        Verdict::Superseded,
+                        "newer limits were asked for before these",
+                    );
+                }
+            }
+            Err(text) => {
+                self.refuse(link, &header, Verdict::Other, &format!("limits that cannot be read: {text}"))
+            }
+        }
+    }
+
+    /// Begins with the next order once nothing else is under way.
+    fn begin_order(&mut self, around: &mut Surroundings<'_>) {
+        if !self.builder.is_idle() || self.ready.is_some() || self.offered.is_some() || self.order.is_some() {
+            return;
+        }
+        let Some((header, moved)) = self.next_order.take() else { return };
+        self.received += 1;
+        self.order = Some(header);
+        let source = Source { bytes: Arc::clone(&self.in_use.bytes), moved, is_order: true };
+        self.builder.take(self.received, header, source, *around.robot); // it was idle: nothing is replaced
     }
 
     fn take(&mut self, around: &mut Surroundings<'_>, built: Built<B::Controller>) {
         let controller = match built.result {
             Ok(controller) => *controller,
-            Err(refusal) => return self.refuse(around.link, &built.header, refusal.verdict, &refusal.text),
+            Err(refusal) => {
+                if built.source.is_order {
+                    self.order = None;
+                }
+                return self.refuse(around.link, &built.header, refusal.verdict, &refusal.text);
+            }
         };
         match around.log {
             Some(log) => {
@@ -151,9 +219,10 @@ impl<B: Build> SnapshotInbox<B> {
             None => self.builder.discard(Box::new(built.bytes)),
         }
         let loaded = Box::new(Loaded { id: built.id, controller });
-        if let Some((header, loaded)) = self.ready.replace((built.header, loaded)) {
+        let made = (built.source, loaded);
+        if let Some((header, replaced)) = self.ready.replace((built.header, made)) {
             supersede(around.link, &header);
-            self.builder.discard(loaded);
+            self.builder.discard(Box::new(replaced));
         }
     }
 
@@ -162,33 +231,37 @@ impl<B: Build> SnapshotInbox<B> {
             return;
         }
         // A new snapshot replaces a condemned one; without a new one, the previous is the better.
-        let (header, loaded) = match (self.ready.take(), &self.condemned) {
-            (Some((header, loaded)), _) => (Some(header), loaded),
+        let (header, source, loaded) = match (self.ready.take(), &self.condemned) {
+            (Some((header, (source, loaded))), _) => (Some(header), source, loaded),
             (None, Some(_)) => match self.previous.take() {
-                Some(loaded) => (None, loaded),
+                Some((source, loaded)) => (None, source, loaded),
                 None => return,
             },
             (None, None) => return,
         };
         let (version, rows) = (loaded.controller.version(), (loaded.id, loaded.controller.told()));
         match (self.swap.offer(loaded), header) {
-            (Ok(()), header) => self.offered = Some(Offer { header, version, rows }),
-            (Err(loaded), Some(header)) => self.ready = Some((header, loaded)),
-            (Err(loaded), None) => self.previous = Some(loaded),
+            (Ok(()), header) => self.offered = Some(Offer { header, source, version, rows }),
+            (Err(loaded), Some(header)) => self.ready = Some((header, (source, loaded))),
+            (Err(loaded), None) => self.previous = Some((source, loaded)),
         }
     }
 
     /// The old controller came back: the new one is in use. The one before the old is no longer needed.
     fn settle(&mut self, around: &mut Surroundings<'_>) {
         let Some(old) = self.swap.collect() else { return };
-        let Some(Offer { header, version, rows }) = self.offered.take() else {
+        let Some(Offer { header, source, version, rows }) = self.offered.take() else {
             return self.builder.discard(old);
         };
         self.set_rows(rows.0, rows.1);
-        self.accepted.push((around.tick, version));
         let condemned = self.condemned.take();
+        let is_order = source.is_order;
+        if !is_order {
+            self.accepted.push((around.tick, version));
+        }
+        let before = std::mem::replace(&mut self.in_use, Source { is_order: false, ..source });
         let Some(header) = header else {
-            self.builder.discard(old);
+            self.builder.discard(Box::new((before, old)));
             if let (Some(bad), Some(text)) = (self.current.take(), condemned) {
                 self.rolled_back += 1;
                 self.note(&text);
@@ -196,10 +269,19 @@ impl<B: Build> SnapshotInbox<B> {
             }
             return;
         };
+        if is_order {
+            // Nothing with other limits is kept; what is run has the weights that it had.
+            self.order = None;
+            let previous = self.previous.take();
+            previous.into_iter().for_each(|scrap| self.builder.discard(Box::new(scrap)));
+            self.builder.discard(old);
+            return reply(around.link, &header, around.tick, Verdict::Accepted, "in force");
+        }
         // What was condemned is nothing to go back to.
-        let scrap = if condemned.is_none() { self.previous.replace(old) } else { Some(old) };
+        let kept = (before, old);
+        let scrap = if condemned.is_none() { self.previous.replace(kept) } else { Some(kept) };
         if let Some(scrap) = scrap {
-            self.builder.discard(scrap);
+            self.builder.discard(Box::new(scrap));
         }
         self.current = Some(header);
         reply(around.link, &header, around.tick, Verdict::Accepted, "in use");

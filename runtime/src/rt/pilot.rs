@@ -1,6 +1,6 @@
 //! The controller of a snapshot in the loop: states in, [`Controller::update`], numbers out.
 
-use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, RefuseReason, Side, Status};
+use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, Moved, RefuseReason, Side, Status};
 
 use crate::codes::LedgerStatus;
 use crate::controller::{Controller, Noise, Output, State};
@@ -360,6 +360,20 @@ impl Build for PilotBuilder {
         let parsed = Snapshot::from_bytes(&snapshot.bytes);
         let snapshot = parsed.map_err(|e| Refusal { verdict: Verdict::of(&e), text: e.to_string() })?;
         Pilot::within(&snapshot, robot, self.pinned.as_ref())
+    }
+
+    fn with_limits(&mut self, bytes: &[u8], moved: &Moved) -> Result<Vec<u8>, Refusal> {
+        let refuse = |verdict, text: String| Err(Refusal { verdict, text });
+        let mut snapshot = match Snapshot::from_bytes(bytes) {
+            Ok(snapshot) => snapshot,
+            Err(e) => return refuse(Verdict::of(&e), e.to_string()),
+        };
+        if !snapshot.manifest.proposes() {
+            let text = "the snapshot in use gives actions that nothing projects, so that no limit of it can be moved; write guard = true under [constraints] of its task";
+            return refuse(Verdict::Other, text.into());
+        }
+        snapshot.manifest.moved = Some(moved.clone());
+        Ok(snapshot.to_bytes())
     }
 }
 

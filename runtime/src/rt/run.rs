@@ -313,7 +313,8 @@ fn assemble<B: Build>(
         Ends { states, proposals, actions, records, slot, bell: Arc::clone(&bell), gone: Arc::clone(&gone) };
     let first = Box::new(Loaded { id: 0, controller: first });
     let cycle = Cycle::new(cycle_settings, first, settings.faults.clone(), ends, stop.clone());
-    let mut snapshots = SnapshotInbox::new(receiver, builder, swap, settings.rollback);
+    let mut snapshots =
+        SnapshotInbox::new(receiver, builder, swap, settings.rollback, settings.first.clone());
     snapshots.set_rows(0, told);
     let mut tick = Box::new(TickMessage::zeroed());
     tick.period = clock::nanoseconds(robot.dt);

@@ -5,6 +5,7 @@ use crate::link::{
     StateMessage, Verdict,
 };
 use crate::rt::{Mode, Reason, Resume};
+use nearl_constraints::Moved;
 
 /// A controller as the loop sees it. `tick`, `brake` and `reset` run in the real-time thread: no allocation beyond
 /// what the solver cannot avoid, no lock, no system call.
@@ -90,6 +91,17 @@ pub trait Build: Send + 'static {
     type Controller: LoopController;
     /// Validates everything (digest, names, shapes, finite numbers, period, a trial tick) against `robot`.
     fn build(&mut self, snapshot: &SnapshotBytes, robot: &RobotMessage) -> Result<Self::Controller, Refusal>;
+
+    /// The bytes of a snapshot with its limits moved.
+    ///
+    /// # Errors
+    /// What cannot be moved, by name; of controllers without limits, everything.
+    fn with_limits(&mut self, bytes: &[u8], moved: &Moved) -> Result<Vec<u8>, Refusal> {
+        let _ = (bytes, moved);
+        let text =
+            "this loop has no limits that could be moved; run a snapshot that proposes states".to_owned();
+        Err(Refusal { verdict: Verdict::Other, text })
+    }
 }
 
 /// Why a snapshot was not taken.

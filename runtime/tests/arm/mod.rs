@@ -53,6 +53,7 @@ pub fn snapshot(version: u64, change: impl FnOnce(&mut Manifest)) -> Snapshot {
         steps: 0,
         action_lower: effort.iter().map(|e| -e).collect(),
         action_upper: effort,
+        moved: None,
     };
     change(&mut manifest);
     let n = 2 * N;

@@ -7,6 +7,7 @@ mod toy;
 
 mod crash;
 mod cycle;
+mod limits;
 mod link;
 mod log;
 mod panda;

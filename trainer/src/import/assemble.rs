@@ -82,6 +82,7 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
         steps: 0,
         action_lower,
         action_upper,
+        moved: None,
     };
     let snapshot = Snapshot { networks: networks(network, layout.n_state()), manifest };
     Controller::new(&snapshot).map_err(|e| ImportError::Recipe(format!("{said_by}: {e}")))?;

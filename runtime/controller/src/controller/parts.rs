@@ -124,7 +124,12 @@ impl Parts {
             braking: m.task.constraints.braking,
             ..Settings::new(m.task.time.dt, m.task.sub_steps() as u32)
         };
-        Projector::new(model, &limits, controllable, settings).map_err(|e| unusable(&e))
+        let mut projector =
+            Projector::new(model, &limits, controllable, settings).map_err(|e| unusable(&e))?;
+        if let Some(moved) = &m.moved {
+            projector.move_limits(moved).map_err(|e| unusable(&e))?;
+        }
+        Ok(projector)
     }
 }
 
