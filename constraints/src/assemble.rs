@@ -4,10 +4,10 @@
 //! axis stands still in its joint's frame, which Pinocchio's derivatives take for granted.
 
 use crate::ModelError;
-use crate::description::{Body, JointDescription, JointKind, Range, RobotDescription};
+use crate::description::{Body, JointDescription, JointKind, Onset, Range, RobotDescription};
 use crate::geometry::Placement;
 use crate::model::{Inner, Joint, ModelFrame};
-use crate::pinocchio::RawModel;
+use crate::pinocchio::{self, RawData, RawModel};
 
 /// Where a body is: the joint of Pinocchio's it moves with, its number among the moving bodies, and its place in that joint's frame.
 type Place = (Option<usize>, Option<usize>, Placement);
@@ -93,6 +93,7 @@ impl Tree {
             stiffness: zero.clone(),
             spring_reference: zero.clone(),
             friction: zero,
+            onset: vec![None; nv],
             total_mass: self.raw.mass(),
             neutral: self.raw.neutral(),
             frames: self.frames,
@@ -102,6 +103,7 @@ impl Tree {
         };
         description.joints().for_each(|joint| inner.add(joint));
         inner.raw.set_armature(&inner.armature);
+        inner.rub(description);
         inner
     }
 }
@@ -123,10 +125,39 @@ impl Inner {
             self.damping[i] = joint.damping;
             self.stiffness[i] = joint.stiffness;
             self.spring_reference[i] = joint.spring_reference;
-            self.friction[i] = joint.friction;
+            self.friction[i] = if nv == 1 { joint.friction } else { 0.0 };
+            self.onset[i] = joint.friction_onset;
         }
         self.joints.push(Joint { name: joint.name.clone(), idx_q, nq, idx_v, nv });
         self.range_missing.push(joint.range == Range::NotStated);
+    }
+}
+
+impl Inner {
+    /// How friction sets in where the description does not say: by what a unit of force does with every joint at its reference.
+    fn rub(&mut self, description: &RobotDescription) {
+        let nv = self.nv;
+        let (zero, mut reference) = (vec![0.0; nv], self.neutral.clone());
+        for (joint, stated) in self.joints.iter().zip(description.joints()).filter(|(j, _)| j.nq == 1) {
+            reference[joint.idx_q] = stated.reference;
+        }
+        let mut data = RawData::new(&self.raw);
+        let mut accelerate = |force: &[f64]| {
+            let mut a = vec![f64::NAN; nv];
+            let (q, v, tau, out) = (reference.as_ptr(), zero.as_ptr(), force.as_ptr(), a.as_mut_ptr());
+            // SAFETY: every length is the model's own. Where Pinocchio throws, the numbers are left.
+            unsafe { pinocchio::nc_aba(self.raw.as_ptr(), data.as_ptr(), q, v, tau, out) };
+            a
+        };
+        for i in 0..nv {
+            if self.friction[i] == 0.0 || self.onset[i].is_some() {
+                continue;
+            }
+            let mut unit = vec![0.0; nv];
+            unit[i] = 1.0;
+            let mobility = accelerate(&unit)[i] - accelerate(&zero)[i];
+            self.onset[i] = (mobility.is_finite() && mobility > 0.0).then(|| Onset::usual(mobility));
+        }
     }
 }
 

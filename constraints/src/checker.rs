@@ -431,9 +431,9 @@ impl Checker {
         }
     }
 
-    /// [`Dynamics::motors`] less the external forces.
+    /// [`Dynamics::motors_without_friction`] less the external forces.
     fn motors(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
-        self.dynamics.motors(&self.period, q, v, &self.a, &mut self.tau);
+        self.dynamics.motors_without_friction(&self.period, q, v, &self.a, &mut self.tau);
         self.tau.iter_mut().zip(external).for_each(|(tau, external)| *tau -= external);
     }
 }

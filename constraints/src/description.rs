@@ -17,6 +17,7 @@ mod payload;
 use crate::geometry::{Placement, Shape};
 use serde::{Deserialize, Serialize};
 
+pub use crate::friction::Onset;
 pub use motor::{Command, Motor};
 pub use payload::Payload;
 
@@ -91,6 +92,9 @@ pub struct JointDescription {
     pub armature: f64,
     /// Dry friction: the force that the joint withstands before it moves [N·m or N].
     pub friction: f64,
+    /// How dry friction sets in; MuJoCo's usual way where nothing is stated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub friction_onset: Option<Onset>,
 }
 
 /// What a joint lets move, and how many numbers say where it is and how fast.
@@ -182,6 +186,7 @@ impl JointDescription {
             spring_reference: 0.0,
             armature: 0.0,
             friction: 0.0,
+            friction_onset: None,
         }
     }
 }

@@ -117,7 +117,38 @@ impl Dynamics {
         }
     }
 
-    /// What the motors supply (nv) to keep acceleration `a` over a period that begins at `q`, `v`, without external forces. With the
+    /// What the motors supply (nv) to keep acceleration `a` over a period that begins at `q`, `v`, without external forces:
+    /// [`Dynamics::motors_without_friction`], and what makes up for the dry friction of the joints, at most [`Model::friction`], as
+    /// [`Onset`](crate::description::Onset) says.
+    pub fn motors(&mut self, period: &Period, q: &[f64], v: &[f64], a: &[f64], tau: &mut [f64]) {
+        self.motors_without_friction(period, q, v, a, tau);
+        if self.model.friction().iter().all(|f| *f == 0.0) {
+            return;
+        }
+        let mut m = std::mem::take(&mut self.middle);
+        self.before_dampers(period, q, v, a, &mut m);
+        for (i, tau) in tau.iter_mut().enumerate() {
+            let f = self.model.friction()[i];
+            if let Some(onset) = self.model.friction_onset()[i].filter(|_| f > 0.0) {
+                *tau += onset.mean(f, period, v[i], a[i], m.step[i]);
+            }
+        }
+        self.middle = m;
+    }
+
+    /// `step = M^-1 (M + tau_s D) a`: the acceleration that an Euler step implicit in the damping begins with to end with `a`.
+    fn before_dampers(&mut self, period: &Period, q: &[f64], v: &[f64], a: &[f64], m: &mut Middle) {
+        m.step.copy_from_slice(a);
+        if period.tau > 0.0 && self.model.damping().iter().any(|d| *d > 0.0) {
+            self.rnea(q, v, a, &mut m.force);
+            for (i, force) in m.force.iter_mut().enumerate() {
+                *force += period.tau * self.model.damping()[i] * a[i];
+            }
+            self.aba(q, v, &m.force, &mut m.step);
+        }
+    }
+
+    /// What the motors would supply (nv) if no joint rubbed. With the
     /// configuration `q* = q (+) h v` and the velocity `v + h a` at which the plant evaluates its forces on average (`h` is
     /// [`Period::lag`], 0 with one physics step in the period):
     ///
@@ -127,7 +158,14 @@ impl Dynamics {
     ///
     /// It is linear in `a`, as the rows of the projector are ([`Dynamics::motor_rows`]), and off by `O(T^2)`; springs and dampers are
     /// averaged exactly.
-    pub fn motors(&mut self, period: &Period, q: &[f64], v: &[f64], a: &[f64], tau: &mut [f64]) {
+    pub fn motors_without_friction(
+        &mut self,
+        period: &Period,
+        q: &[f64],
+        v: &[f64],
+        a: &[f64],
+        tau: &mut [f64],
+    ) {
         self.check(q, &[v, a, tau]);
         let mut m = std::mem::take(&mut self.middle);
         let lag = period.lag();
@@ -147,7 +185,7 @@ impl Dynamics {
         self.middle = m;
     }
 
-    /// [`Dynamics::motors`] for any acceleration: `tau = rows a + bias`, with `rows` (nv x nv, row-major) and `bias` (nv).
+    /// [`Dynamics::motors_without_friction`] for any acceleration: `tau = rows a + bias`, with `rows` (nv x nv, row-major) and `bias` (nv).
     pub fn motor_rows(&mut self, period: &Period, q: &[f64], v: &[f64], rows: &mut [f64], bias: &mut [f64]) {
         self.check(q, &[v, bias]);
         let mut m = std::mem::take(&mut self.middle);

@@ -53,6 +53,7 @@ pub mod drive;
 mod dynamics;
 mod error;
 mod file;
+mod friction;
 pub mod geometry;
 mod kinematics;
 mod layout;

@@ -1,7 +1,7 @@
 //! The robot: joints, limits, inertias. Constants only; scratch is in [`Dynamics`](crate::Dynamics).
 
 use crate::assemble::assemble;
-use crate::description::{Motor, Payload, RobotDescription};
+use crate::description::{Motor, Onset, Payload, RobotDescription};
 use crate::error::{ModelError, near_names};
 use crate::pinocchio::RawModel;
 use crate::urdf;
@@ -57,6 +57,8 @@ pub(crate) struct Inner {
     pub(crate) stiffness: Vec<f64>,
     pub(crate) spring_reference: Vec<f64>,
     pub(crate) friction: Vec<f64>,
+    /// Of the dofs with friction.
+    pub(crate) onset: Vec<Option<Onset>>,
     pub(crate) total_mass: f64,
     pub(crate) neutral: Vec<f64>,
     pub(crate) frames: Vec<ModelFrame>,
@@ -225,9 +227,14 @@ impl Model {
         &self.0.spring_reference
     }
 
-    /// Dry friction (nv) [N·m or N]: the force that a joint withstands before it moves.
+    /// Dry friction (nv) [N·m or N]: the force that a joint withstands before it moves. Joints with several dofs have none here.
     pub fn friction(&self) -> &[f64] {
         &self.0.friction
+    }
+
+    /// How the dry friction of each dof sets in (nv); of those that have some.
+    pub fn friction_onset(&self) -> &[Option<Onset>] {
+        &self.0.onset
     }
 
     /// Mass of everything that moves [kg].

@@ -103,7 +103,7 @@ impl PeriodDynamics {
 
 /// Gaussian elimination with partial pivoting: `matrix` (n x n, row-major) is spoilt, `x` is the right side and then the solution; NaN for
 /// a singular matrix.
-fn solve(n: usize, matrix: &mut [f64], x: &mut [f64]) {
+pub(crate) fn solve(n: usize, matrix: &mut [f64], x: &mut [f64]) {
     for k in 0..n {
         let size = |r: &usize| matrix[r * n + k].abs();
         let pivot = (k..n).max_by(|a, b| size(a).total_cmp(&size(b))).unwrap_or(k);

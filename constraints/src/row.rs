@@ -60,7 +60,8 @@ pub struct Motion<'a> {
     pub v_next: &'a [f64],
     /// `(v' - v) / T` (nv).
     pub acceleration: &'a [f64],
-    /// Motor force for that acceleration by inverse dynamics (nv), [`Dynamics::motors`](crate::Dynamics::motors) less the external forces;
+    /// Motor force for that acceleration by inverse dynamics (nv),
+    /// [`Dynamics::motors_without_friction`](crate::Dynamics::motors_without_friction) less the external forces;
     /// zero unless some row has [`Needs::motors`].
     pub torque: &'a [f64],
     /// The control period.

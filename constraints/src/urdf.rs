@@ -210,9 +210,6 @@ impl Reader {
     /// What the description leaves out, and links that move and weigh nothing.
     fn notes(&mut self, root: Node) {
         let robot = &mut self.robot;
-        if robot.joints().any(|joint| joint.friction > 0.0) {
-            robot.notes.push("dry joint friction is not modelled".to_string());
-        }
         robot.notes.extend(children(root, "joint").filter_map(mimic));
         let mut weighs: Vec<bool> = robot.bodies.iter().map(|body| body.mass > 0.0).collect();
         for k in (0..robot.bodies.len()).rev().filter(|k| robot.bodies[*k].joints.is_empty()) {

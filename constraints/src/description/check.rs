@@ -178,6 +178,10 @@ fn check_joint(joint: &JointDescription, wrong: &mut Vec<String>) {
     for (what, value) in never_negative.into_iter().filter(|(_, x)| !(x.is_finite() && *x >= 0.0)) {
         wrong.push(format!("joint '{name}' {what} is {value}"));
     }
+    let onset = joint.friction_onset.map_or([1.0, 1.0], |onset| [onset.inertia, onset.time]);
+    for (what, value) in ["inertia", "time"].iter().zip(onset).filter(|(_, x)| !(x.is_finite() && *x > 0.0)) {
+        wrong.push(format!("joint '{name}' friction onset {what} is {value}"));
+    }
     let any = [
         ("stiffness", joint.stiffness),
         ("spring reference", joint.spring_reference),

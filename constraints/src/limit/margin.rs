@@ -32,6 +32,19 @@ pub(super) fn less_each(
     Ok(())
 }
 
+/// What is left of the largest force of the motor of dof `i` where the joint's dry friction may take its share either way.
+pub(super) fn less_friction(model: &Model, i: usize, effort: f64) -> Result<f64, LimitError> {
+    let friction = model.friction()[i];
+    if friction < effort {
+        return Ok(effort - friction);
+    }
+    let joint = model.dof_name(i);
+    let what = format!(
+        "the motor of '{joint}' may give {effort} N·m or N, no more than the joint's dry friction of {friction} N·m or N"
+    );
+    Err(LimitError::Unusable { what, next: "allow it more force, or mend the friction in the robot file" })
+}
+
 /// What a margin must be.
 const BELOW: &str = "at least 0 and below the limit it is kept from";
 

@@ -1,6 +1,6 @@
 //! Motor force limits of the robot file.
 
-use super::margin::less_each;
+use super::margin::{less_each, less_friction};
 use super::{Limit, LimitSet, PerJoint, quoted};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
@@ -26,7 +26,8 @@ impl Default for TorqueSettings {
     }
 }
 
-/// `|tau| <= scale * effort - margin`, with the motor forces of a whole period, [`Dynamics::motors`](crate::Dynamics::motors).
+/// `|tau| <= scale * effort - margin - friction`, with the motor forces of a whole period,
+/// [`Dynamics::motors_without_friction`](crate::Dynamics::motors_without_friction): whichever way a joint rubs, its motor can make up for it.
 #[derive(Debug, Clone, Default)]
 pub struct TorqueLimit {
     settings: TorqueSettings,
@@ -90,7 +91,11 @@ impl TorqueLimit {
         }
         let mut efforts: Vec<_> = stated.iter().map(|effort| Some(scale * effort)).collect();
         less_each(model, "torque margin", &mut efforts, self.settings.margin.as_ref(), controllable)?;
-        Ok(controllable.iter().filter_map(|i| Some((*i, efforts[*i]?))).collect())
+        controllable
+            .iter()
+            .filter_map(|&i| Some((i, efforts[i]?)))
+            .map(|(i, effort)| Ok((i, less_friction(model, i, effort)?)))
+            .collect()
     }
 }
 

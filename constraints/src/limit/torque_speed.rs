@@ -1,6 +1,6 @@
 //! Motors whose force falls with speed.
 
-use super::margin::less_each;
+use super::margin::{less_each, less_friction};
 use super::{Limit, PerJoint};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
@@ -53,6 +53,9 @@ impl Limit for TorqueSpeedLimit {
             self.settings.no_load.values(model, "torque_speed no_load", positive, "above 0 rad/s or m/s")?;
         let mut most = stall.clone();
         less_each(model, "torque_speed margin", &mut most, self.settings.margin.as_ref(), controllable)?;
+        for (i, most) in most.iter_mut().enumerate() {
+            *most = most.map(|most| less_friction(model, i, most)).transpose()?;
+        }
         let motor = |i: &usize| {
             let (most, slope) = (most[*i]?, stall[*i]? / no_load[*i]?);
             Some(Motor { dof: *i, most, slope, joint: model.dof_name(*i) })

@@ -3,7 +3,7 @@
 use super::Dofs;
 use crate::checker::Checker;
 use crate::viability::{Kind, Period};
-use crate::{Braking, Consistency, LimitSet, Model, Settings, certify_braking};
+use crate::{Braking, Consistency, LimitSet, Model, Settings, certify_braking, friction};
 
 /// States looked at, and their seed.
 const SAMPLES: (usize, u64) = (2000, 7);
@@ -109,5 +109,27 @@ pub(super) fn doubts(model: &Model, limits: &LimitSet, dofs: &Dofs, settings: &S
             notes.push(format!("the range of '{name}' is {range:.1} rad or m; is it degrees?"));
         }
     }
+    notes.extend(rubbing(model, limits, dofs, &Period::new(settings.dt, settings.sub_steps)));
     notes
+}
+
+/// What dry friction may do to the accelerations that are kept, by joint.
+fn rubbing(model: &Model, limits: &LimitSet, dofs: &Dofs, period: &Period) -> Option<String> {
+    if model.friction().iter().all(|f| *f == 0.0) {
+        return None;
+    }
+    let off = friction::doubt(model, limits, period);
+    let joint = |&i: &usize| {
+        let (name, f, a) = (model.dof_name(i), model.friction()[i], limits.acceleration[i]);
+        let limit = if a.is_finite() { format!(" of {a}") } else { String::new() };
+        format!("'{name}' ({f} N·m or N) by {:.3}{limit}", off[i])
+    };
+    let joints: Vec<String> = dofs.controllable.iter().filter(|i| off[**i] > 0.0).map(joint).collect();
+    (!joints.is_empty()).then(|| {
+        format!(
+            "dry friction is made up for as MuJoCo has it; where joints rub otherwise, accelerations leave what is asked for, and their limits, by at \
+             most so many rad/s² or m/s²: {}; measure the friction and write it into the robot file",
+            joints.join(", ")
+        )
+    })
 }

@@ -7,6 +7,7 @@ mod drives;
 mod env_mujoco;
 mod env_parity;
 mod env_suite;
+mod friction;
 mod guard;
 mod imitation;
 mod import;

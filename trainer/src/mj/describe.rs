@@ -2,7 +2,7 @@
 //! MuJoCo has already resolved.
 
 use nearl_runtime::constraints::description::{
-    Body, Frame, JointDescription, JointKind as Kind, Range, RobotDescription, Solid,
+    Body, Frame, JointDescription, JointKind as Kind, Onset, Range, RobotDescription, Solid,
 };
 use nearl_runtime::constraints::geometry::{Placement, Shape};
 
@@ -93,8 +93,21 @@ impl Model {
             spring_reference: if one { m.qpos_spring()[q] } else { 0.0 },
             armature: m.dof_armature()[v],
             friction,
+            friction_onset: (one && friction > 0.0).then(|| self.onset(v)),
             ..JointDescription::new(&joint.name, Kind::Hinge)
         }
+    }
+
+    /// MuJoCo's impedance of the friction of dof `v`, with its names: `force = D (a + b v)`, `D = imp / (1 - imp) / diagApprox`,
+    /// `b = 2 / (dmax timeconst)`.
+    fn onset(&self, v: usize) -> Onset {
+        let m = &self.0;
+        let [imp, dmax] = [0, 1].map(|k| m.dof_solimp()[v][k].clamp(1e-4, 0.9999));
+        let [constant, damping] = [0, 1].map(|k| m.dof_solref()[v][k]);
+        let shortest =
+            if self.disables(mjtDisableBit::mjDSBL_REFSAFE) { 0.0 } else { 2.0 * m.opt().timestep };
+        let time = if constant > 0.0 { 0.5 * dmax * constant.max(shortest) } else { dmax / -damping };
+        Onset { inertia: imp / (1.0 - imp) / m.dof_invweight0()[v], time }
     }
 
     fn sites(&self) -> Vec<Frame> {
@@ -173,7 +186,8 @@ impl Model {
         note(m.neq() > 0, "equality constraints are not modelled");
         note(m.ntendon() > 0, "tendons are not modelled");
         note(m.nflex() > 0, "flexible bodies are not modelled");
-        note(m.dof_frictionloss().iter().any(|x| *x != 0.0), "joint frictionloss is not modelled");
+        let several = |id: usize| self.joint(id).nv > 1 && m.dof_frictionloss()[self.joint(id).idx_v] != 0.0;
+        note((0..m.jnt_type().len()).any(several), "frictionloss of free and ball joints is not modelled");
         let option = m.opt();
         let air = option.density != 0.0 || option.viscosity != 0.0;
         note(air, "fluid forces are not modelled");
