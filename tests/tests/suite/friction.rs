@@ -28,7 +28,8 @@ const FRICTION: [f64; 3] = [1.0, 2.0, 1.0];
 
 fn plant(text: &str, sim_dt: f64) -> mj::Sim {
     let options = mj::Options { sim_dt: Some(sim_dt), without_contacts: true, ..mj::Options::default() };
-    mj::Sim::new(&mj::Model::from_text(text, mj::ModelFormat::Urdf, options).expect("plant")).expect("simulation")
+    mj::Sim::new(&mj::Model::from_text(text, mj::ModelFormat::Urdf, options).expect("plant"))
+        .expect("simulation")
 }
 
 /// splitmix64 in [-1, 1).
@@ -49,7 +50,10 @@ fn a_urdf_s_friction_sets_in_as_the_simulator_has_it() {
     assert_eq!(ours.friction(), FRICTION);
     for i in 0..3 {
         let (a, b) = (ours.friction_onset()[i].expect("onset"), theirs.friction_onset()[i].expect("onset"));
-        assert!((a.inertia / b.inertia - 1.0).abs() < 1e-9 && (a.time / b.time - 1.0).abs() < 1e-12, "{a:?} {b:?}");
+        assert!(
+            (a.inertia / b.inertia - 1.0).abs() < 1e-9 && (a.time / b.time - 1.0).abs() < 1e-12,
+            "{a:?} {b:?}"
+        );
     }
     // The light joint's friction is a damper at any speed allowed here: D (a + v / time) stays below 1 N m.
     assert!(ours.friction_onset()[2].expect("onset").inertia * (10.0 + 3.0 / 0.0095) < 1.0);
@@ -95,8 +99,10 @@ fn attacked(text: &str, known: &str, sub_steps: u32, dt: f64) -> [f64; 3] {
         Box::new(AccelerationLimit::uniform(10.0)),
         Box::new(TorqueLimit::default()),
     ];
-    let mut projector = Projector::new(&model, &limits, &[0, 1, 2], Settings::new(dt, sub_steps)).expect("projector");
-    let (mut dynamics, mut sim, mut seed) = (Dynamics::new(&model), plant(text, dt / f64::from(sub_steps)), 3);
+    let mut projector =
+        Projector::new(&model, &limits, &[0, 1, 2], Settings::new(dt, sub_steps)).expect("projector");
+    let (mut dynamics, mut sim, mut seed) =
+        (Dynamics::new(&model), plant(text, dt / f64::from(sub_steps)), 3);
     let (mut proposal, mut target) = (Proposal::new(&model), Target::new(&model));
     let mut worst = [f64::NEG_INFINITY; 3];
     let mut sign = [1.0; 3];
@@ -155,5 +161,10 @@ fn what_friction_may_do_is_said_by_joint_and_number() {
     assert!(note.contains("'slide' (3 N·m or N) by 3.000 of 10"), "{note}");
     assert_eq!(projector.limits().effort, [27.0]);
     let refusal = Projector::new(&model, &limits(0.1), &[0], Settings::new(0.001, 1)).err().expect("refused");
-    assert!(refusal.to_string().contains("'slide' may give 3 N·m or N, no more than the joint's dry friction of 3"), "{refusal}");
+    assert!(
+        refusal
+            .to_string()
+            .contains("'slide' may give 3 N·m or N, no more than the joint's dry friction of 3"),
+        "{refusal}"
+    );
 }
