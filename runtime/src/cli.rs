@@ -2,6 +2,7 @@
 
 mod limits;
 mod moved;
+mod verify;
 
 use std::path::PathBuf;
 
@@ -17,6 +18,7 @@ use crate::rt::{
 };
 pub use limits::LimitOptions;
 pub use moved::LimitsCommand;
+pub use verify::{UNVERIFIED, Unverified, VerifyCommand};
 
 /// Run a snapshot on a plant in real time.
 #[derive(Args, Debug)]
@@ -205,7 +207,11 @@ impl Ended {
 
 /// The exit code that a program ends with after `failure`: 1 unless it has one of its own.
 pub fn exit_code(failure: &Failure) -> u8 {
-    failure.downcast_ref::<Ended>().map_or(1, |ended| ended.code)
+    match failure.downcast_ref::<Ended>() {
+        Some(ended) => ended.code,
+        None if failure.is::<Unverified>() => UNVERIFIED,
+        None => 1,
+    }
 }
 
 impl RunCommand {

@@ -73,6 +73,8 @@ enum Command {
     Limits(nearl_runtime::cli::LimitsCommand),
     /// Compute every tick of a flight log again and compare it bit for bit.
     Replay(nearl_runtime::cli::ReplayCommand),
+    /// Confirm from a flight log alone that limits held, answers were optimal and a way to stop existed.
+    Verify(nearl_runtime::cli::VerifyCommand),
     /// Say what a code in a report, a log or a refusal means, and what to do.
     Explain(nearl_runtime::cli::ExplainCommand),
     /// Check that a snapshot, this machine and a plant are ready.
@@ -107,6 +109,7 @@ impl Cli {
             Command::Serve(c) => c.run(),
             Command::Limits(c) => c.run(),
             Command::Replay(c) => c.run(),
+            Command::Verify(c) => c.run(),
             Command::Explain(c) => c.run(crate::rollout_protocol::Answer::explanations()),
             Command::Doctor(c) => c.run(),
             Command::Tunnel(c) => c.run(),

@@ -3,7 +3,9 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use nearl_runtime::cli::{ExplainCommand, LimitsCommand, LoopBench, ReplayCommand, RunCommand, exit_code};
+use nearl_runtime::cli::{
+    ExplainCommand, LimitsCommand, LoopBench, ReplayCommand, RunCommand, VerifyCommand, exit_code,
+};
 use nearl_runtime::doctor::DoctorCommand;
 use nearl_runtime::tunnel::TunnelCommand;
 
@@ -22,6 +24,8 @@ enum Command {
     Limits(LimitsCommand),
     /// Compute every tick of a flight log again and compare it bit for bit.
     Replay(ReplayCommand),
+    /// Confirm from a flight log alone that limits held, answers were optimal and a way to stop existed.
+    Verify(VerifyCommand),
     /// Say what a code means and what to do.
     Explain(ExplainCommand),
     /// Check that a snapshot, this machine and a plant are ready.
@@ -40,6 +44,7 @@ fn main() -> ExitCode {
         Command::Run(command) => command.run(),
         Command::Limits(command) => command.run(),
         Command::Replay(command) => command.run(),
+        Command::Verify(command) => command.run(),
         Command::Explain(command) => command.run(Vec::new()),
         Command::Doctor(command) => command.run(),
         Command::Tunnel(command) => command.run(),

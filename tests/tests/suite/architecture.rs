@@ -9,7 +9,8 @@ use std::process::Command;
 const ARROWS: &[(&str, &[&str])] = &[
     ("nearl-constraints", &[]),
     ("nearl-controller", &["nearl-constraints"]),
-    ("nearl-runtime", &["nearl-constraints", "nearl-controller"]),
+    ("nearl-verify", &[]),
+    ("nearl-runtime", &["nearl-constraints", "nearl-controller", "nearl-verify"]),
     ("nearl-c", &["nearl-runtime"]),
     ("nearl-rollout-protocol", &["nearl-runtime"]),
     ("nearl-trainer", &["nearl-runtime", "nearl-rollout-protocol"]),

@@ -1,0 +1,185 @@
+//! Whether the step from a state to its target keeps every hard limit.
+
+use crate::collision::Gap;
+use crate::limits::{Bounds, Limits};
+use crate::motion::Machine;
+use crate::period::Period;
+use crate::rows::{Step, is_beyond};
+
+/// A limit is broken above this share of it (of 1 where it is smaller), in m and rad alike.
+pub(crate) const TOLERANCE: f64 = 1e-8;
+
+/// A value that is not what it should be, as the subject of a sentence.
+#[derive(Clone, Debug)]
+pub(crate) struct Breach {
+    pub(crate) what: String,
+    pub(crate) value: f64,
+    pub(crate) limit: f64,
+    pub(crate) unit: String,
+}
+
+/// Why something is neither confirmed nor refuted.
+#[derive(Clone, Debug)]
+pub(crate) enum Fault {
+    Broken(Breach),
+    Unknown(String),
+}
+
+pub(crate) fn broken<T>(what: impl Into<String>, value: f64, limit: f64, unit: impl Into<String>) -> Result<T, Fault> {
+    Err(Fault::Broken(Breach { what: what.into(), value, limit, unit: unit.into() }))
+}
+
+/// Beyond a limit by more than rounding.
+pub(crate) fn is_above(value: f64, limit: f64) -> bool {
+    !(value <= limit + TOLERANCE * limit.abs().max(1.0))
+}
+
+/// How a limit of a joint is kept from both sides.
+struct Sided {
+    /// From the position to the limit.
+    room: f64,
+    v: f64,
+    v1: f64,
+    limit: f64,
+    sign: f64,
+    profile: Option<crate::limits::Profile>,
+}
+
+fn sides(j: &Bounds, q: f64, v: f64, v1: f64) -> [Sided; 2] {
+    [
+        Sided { room: q - j.lower, v: -v, v1: -v1, limit: j.lower, sign: -1.0, profile: j.profile[0] },
+        Sided { room: j.upper - q, v, v1, limit: j.upper, sign: 1.0, profile: j.profile[1] },
+    ]
+}
+
+impl Bounds {
+    /// The deceleration that braking in front of a position counts on: a whole period of it may not carry a slow joint beyond the other end.
+    pub(crate) fn brake(&self, p: &Period) -> f64 {
+        let half = p.dt - 0.5 * p.tau;
+        let room = (self.upper - self.lower) / (p.kappa * p.dt * p.dt + 0.5 * half * half);
+        self.braking.min(self.acceleration).min(self.velocity / p.dt).min(room)
+    }
+
+    /// The highest speed that a profile leaves `way` in front of where it ends.
+    pub(crate) fn profile_speed(profile: &crate::limits::Profile, way: f64) -> f64 {
+        ((2.0 * profile.deceleration * way.max(0.0)).sqrt() - profile.offset).max(0.0)
+    }
+
+    /// Whether the joint at `q`, `v` is beyond its limits, or cannot stop in front of one.
+    pub(crate) fn is_outside(&self, p: &Period, q: Option<f64>, v: f64, whole: bool) -> bool {
+        let b = self.brake(p);
+        let is_late = q.is_some_and(|q| {
+            sides(self, q, v, v).iter().any(|s| {
+                let way = if whole { p.stopping(s.v, b).max(p.stopping_whole(s.v.max(0.0), b)) } else { p.stopping(s.v, b) };
+                s.room < 0.0 || (b.is_finite() && s.room.is_finite() && way > s.room)
+            })
+        });
+        is_late || v.abs() > self.velocity
+    }
+
+    /// Whether going on from `v` to `v1` breaks a limit of this kind on the side of `sign`.
+    pub(crate) fn breaks(&self, kind: &str, sign: f64, p: &Period, q: Option<f64>, v: f64, v1: f64, whole: bool) -> bool {
+        let [low, high] = sides(self, q.unwrap_or(0.0), v, v1);
+        let s = if sign > 0.0 { high } else { low };
+        let (gone, b) = (p.way(s.v, s.v1), self.brake(p));
+        match kind {
+            "velocity" => s.v1 > self.velocity,
+            "acceleration" => s.v1 - s.v > self.acceleration * p.dt,
+            "position" => p.farthest(s.v, (s.v1 - s.v) / p.dt) > s.room || (s.room < 0.0 && s.v1 > 0.0),
+            "viability" => {
+                let left = s.room - gone;
+                p.stopping(s.v1, b) > left || (whole && p.stopping_whole(s.v1.max(0.0), b) > left)
+            }
+            "velocity_profile" => s.profile.is_some_and(|profile| {
+                let way = sign * (profile.at - q.unwrap_or(0.0)) - gone;
+                let least = crate::limits::Profile { deceleration: profile.deceleration.min(b), ..profile };
+                s.v1 > 0.0 && (s.v1 + least.offset).powi(2) > 2.0 * least.deceleration * way
+            }),
+            "locked" => s.v1 > (s.v - b * p.dt).max(0.0),
+            _ => false,
+        }
+    }
+}
+
+/// Names a limit of a joint in a sentence.
+fn of(what: &str, joint: &str) -> String {
+    format!("{what} of joint '{joint}'")
+}
+
+/// The limits of single joints, at a step.
+///
+/// # Errors
+/// The first that is broken. A joint that was outside at the start may brake or come back.
+pub(crate) fn joints(l: &Limits, machine: &Machine, dofs: &[usize], p: &Period, step: &Step<'_>, excused: bool) -> Result<(), Fault> {
+    for &i in dofs {
+        let j = &l.joints[i];
+        let (v, v1, a, unit) = (step.v[i], step.v1[i], step.a[i], j.length);
+        let position = machine.single(i).map(|at| (step.q[at], step.q1[at]));
+        if is_above(a.abs(), j.acceleration) {
+            return broken(of("acceleration", &j.name), a, a.signum() * j.acceleration, format!("{unit}/s^2"));
+        }
+        let was = position.map(|(q, _)| q);
+        if excused && j.is_outside(p, was, v, true) {
+            returns(j, p, was, v, v1)?;
+            continue;
+        }
+        if is_above(v1.abs(), j.velocity) {
+            return broken(of("speed", &j.name), v1, v1.signum() * j.velocity, format!("{unit}/s"));
+        }
+        if j.is_locked && is_above(v1.abs(), (v.abs() - j.brake(p) * p.dt).max(0.0)) {
+            return broken(of("speed", &j.name) + ", which is locked,", v1, 0.0, format!("{unit}/s"));
+        }
+        let Some((q, q1)) = position else { continue };
+        for s in sides(j, q, v, v1) {
+            let most = p.farthest(s.v, (s.v1 - s.v) / p.dt).max(s.sign * (q1 - q));
+            if s.room.is_finite() && is_above(most, s.room) {
+                return broken(of("position", &j.name), q + s.sign * most, s.limit, unit);
+            }
+            if let Some(profile) = s.profile {
+                let fast = Bounds::profile_speed(&profile, s.sign * (profile.at - q1));
+                if is_above(s.v1, fast) {
+                    return broken(of("speed", &j.name) + " in its profile", v1, s.sign * fast, format!("{unit}/s"));
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// A joint outside its limits does not go further out than braking takes it.
+fn returns(j: &Bounds, p: &Period, q: Option<f64>, v: f64, v1: f64) -> Result<(), Fault> {
+    let slower = (v.abs() - j.brake(p) * p.dt).max(0.0);
+    for s in q.map(|q| sides(j, q, v, v1)).into_iter().flatten() {
+        if s.room < 0.0 && is_above(s.v1, (s.v - j.brake(p) * p.dt).max(0.0)) {
+            return broken(of("speed", &j.name) + ", which is outside,", v1, s.sign * slower, format!("{}/s", j.length));
+        }
+    }
+    if v.abs() > j.velocity && is_above(v1.abs(), v.abs().max(j.velocity)) {
+        return broken(of("speed", &j.name) + ", which is too fast,", v1, v, format!("{}/s", j.length));
+    }
+    Ok(())
+}
+
+/// Hard rows, cones and distances: with a stored brake what they keep, else what they ask of the step.
+///
+/// # Errors
+/// The first that is broken. What the state at the start is beyond already, a recovering step may still be beyond.
+pub(crate) fn rows(l: &Limits, machine: &mut Machine, p: &Period, step: &Step<'_>, stored: bool, excused: bool) -> Result<(), Fault> {
+    for row in l.rows.iter().filter(|row| row.soft.is_none()) {
+        let asked = |m: &mut Machine| row.excess(m, p, step).into_iter().fold(f64::NEG_INFINITY, f64::max);
+        let by = if stored { row.breach(machine, p, step).unwrap_or_else(|| asked(machine)) } else { asked(machine) };
+        if is_above(by, 0.0) && !(excused && row.is_of_state() && is_beyond(row, machine, step.q, step.v)) {
+            let (value, limit, unit) = row.value(machine, p, step);
+            return broken(format!("{} of '{}'", row.kind, row.name), value, limit, unit);
+        }
+    }
+    let Some(collision) = l.collision.as_ref().filter(|c| c.is_hard) else { return Ok(()) };
+    machine.go(step.q, step.v);
+    let is_near = excused && !matches!(collision.gap(machine, collision.margin), Gap::Kept);
+    machine.go(step.q1, step.v1);
+    match collision.gap(machine, collision.margin - TOLERANCE) {
+        Gap::Near(pair, gap) if !is_near => broken(format!("distance of {pair}"), gap, collision.margin, "m"),
+        Gap::Open(pair) => Err(Fault::Unknown(format!("the distance of {pair} could not be bounded"))),
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,551 @@
+//! The limits of a snapshot, read from `[constraints]` of its task: numbers for each joint, and rows over several.
+
+use std::collections::BTreeMap;
+
+use serde::Deserialize;
+
+use crate::collision::Collision;
+use crate::motion::Machine;
+use crate::robot::{Range, Robot, Shape};
+use crate::rows::{Row, Rule, Soft, Term};
+use crate::space::{Vec3, dot, norm, times};
+
+/// `[constraints]`. A key that is not known here is not verified, and refused by name.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Section {
+    #[serde(default)]
+    pub(crate) consistency: Consistency,
+    #[serde(default)]
+    #[allow(dead_code)] // any stage must give the same answer
+    solver: serde::de::IgnoredAny,
+    #[serde(default)]
+    pub(crate) braking: Way,
+    #[serde(default)]
+    pub(crate) guard: serde_json::Value,
+    position: Option<Position>,
+    velocity: Option<Velocity>,
+    acceleration: Option<Acceleration>,
+    torque: Option<Torque>,
+    jerk: Option<Rate>,
+    torque_speed: Option<TorqueSpeed>,
+    torque_rate: Option<Rate>,
+    velocity_profile: Option<Profiles>,
+    #[serde(default)]
+    locked: Vec<String>,
+    #[serde(default)]
+    frame: Vec<FrameSection>,
+    #[serde(default)]
+    frame_speed: Vec<FrameSpeed>,
+    energy: Option<Energy>,
+    collision: Option<CollisionSection>,
+    /// Limits on actions; no limit of a state.
+    pub(crate) action: Option<serde_json::Value>,
+    #[serde(default)]
+    rows: Vec<UserRow>,
+}
+
+/// How position and velocity of a proposal belong together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Consistency {
+    #[default]
+    Kinematic,
+    Free,
+}
+
+/// What makes sure that a way to stop is left.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Way {
+    #[default]
+    Auto,
+    Certified,
+    Stored,
+}
+
+/// A number for every joint, by name, or in the order of the dofs.
+#[derive(Debug, Deserialize)]
+#[serde(untagged)]
+pub(crate) enum PerJoint {
+    All(f64),
+    Named(BTreeMap<String, f64>),
+    Each(Vec<f64>),
+}
+
+impl PerJoint {
+    pub(crate) fn of(&self, dof: usize, joint: &str) -> Option<f64> {
+        match self {
+            PerJoint::All(x) => Some(*x),
+            PerJoint::Named(map) => map.get(joint).copied(),
+            PerJoint::Each(list) => list.get(dof).copied(),
+        }
+    }
+}
+
+/// `x` less a margin of the same joint.
+fn less(x: f64, margin: &Option<PerJoint>, dof: usize, joint: &str) -> f64 {
+    x - margin.as_ref().and_then(|m| m.of(dof, joint)).unwrap_or(0.0)
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Position {
+    margin: Option<PerJoint>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Velocity {
+    scale: Option<f64>,
+    limit: Option<PerJoint>,
+    margin: Option<PerJoint>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Acceleration {
+    limit: PerJoint,
+    braking: Option<PerJoint>,
+    margin: Option<PerJoint>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Torque {
+    #[serde(default = "one")]
+    scale: f64,
+    margin: Option<PerJoint>,
+    soft: Option<Soft>,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+/// `jerk` and `torque_rate`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Rate {
+    limit: PerJoint,
+    margin: Option<PerJoint>,
+    #[serde(default)]
+    soft: Soft,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct TorqueSpeed {
+    stall: PerJoint,
+    no_load: PerJoint,
+    margin: Option<PerJoint>,
+    soft: Option<Soft>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(untagged)]
+enum Profiles {
+    Robot(String),
+    RobotLess { robot: String, margin: f64 },
+    Joints(BTreeMap<String, JointProfile>),
+}
+
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct JointProfile {
+    limit: f64,
+    offset: f64,
+    squared: f64,
+    lower: f64,
+    upper: f64,
+    #[serde(default)]
+    margin: f64,
+}
+
+/// Limits for Franka Research 3, Franka Control Interface documentation: limit, offset, squared, lower, upper of joints 1 to 7.
+const FR3: [[f64; 5]; 7] = [
+    [2.62, 0.30, 12.0, -2.7501, 2.7501],
+    [2.62, 0.20, 5.17, -1.7918, 1.7918],
+    [2.62, 0.20, 7.00, -2.9065, 2.9065],
+    [2.62, 0.30, 8.00, -3.0481, -0.1458],
+    [5.26, 0.35, 34.0, -2.8101, 2.8101],
+    [4.18, 0.35, 11.0, 0.54092, 4.5205],
+    [5.26, 0.35, 34.0, -3.0196, 3.0196],
+];
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FrameSection {
+    #[allow(dead_code)] // a name to switch it by
+    name: Option<String>,
+    frame: String,
+    #[serde(default)]
+    point: Vec3,
+    half_space: Option<HalfSpace>,
+    #[serde(rename = "box")]
+    inside: Option<FrameBox>,
+    braking: f64,
+    #[serde(default)]
+    margin: f64,
+    soft: Option<Soft>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct HalfSpace {
+    normal: Vec3,
+    through: Vec3,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FrameBox {
+    /// JSON has no infinity: `null` is no face.
+    lower: [Option<f64>; 3],
+    upper: [Option<f64>; 3],
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FrameSpeed {
+    #[allow(dead_code)] // a name to switch it by
+    name: Option<String>,
+    frame: String,
+    #[serde(default)]
+    point: Vec3,
+    limit: f64,
+    #[serde(default)]
+    margin: f64,
+    soft: Option<Soft>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Energy {
+    limit: f64,
+    #[serde(default)]
+    margin: f64,
+    soft: Option<Soft>,
+}
+
+/// `collision`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct CollisionSection {
+    #[serde(default)]
+    pub(crate) shapes: Vec<SolidSection>,
+    #[serde(default)]
+    pub(crate) urdf: bool,
+    #[serde(default)]
+    pub(crate) ignore: Vec<[String; 2]>,
+    #[serde(default)]
+    pub(crate) adjacent: bool,
+    pub(crate) braking: f64,
+    #[serde(default)]
+    pub(crate) margin: f64,
+    #[allow(dead_code)] // a limit of the way it is kept, not of what is kept
+    influence: Option<f64>,
+    #[serde(default = "sixteen")]
+    pub(crate) rows: usize,
+    pub(crate) soft: Option<Soft>,
+}
+
+fn sixteen() -> usize {
+    16
+}
+
+/// One solid of `collision`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct SolidSection {
+    pub(crate) name: Option<String>,
+    pub(crate) frame: Option<String>,
+    pub(crate) shape: Shape,
+    #[serde(default)]
+    pub(crate) position: Vec3,
+    #[serde(default)]
+    pub(crate) rpy: Vec3,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct UserRow {
+    name: String,
+    terms: BTreeMap<String, f64>,
+    lower: Option<f64>,
+    upper: Option<f64>,
+    equals: Option<f64>,
+    braking: Option<f64>,
+    #[serde(default)]
+    margin: f64,
+    soft: Option<Soft>,
+}
+
+/// A speed limit in front of a position: `v <= -offset + sqrt(2 deceleration (at - q))`, or 0.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Profile {
+    pub(crate) at: f64,
+    pub(crate) deceleration: f64,
+    pub(crate) offset: f64,
+}
+
+/// The limits of one joint; infinite is none.
+#[derive(Clone, Debug)]
+pub(crate) struct Bounds {
+    pub(crate) name: String,
+    /// A slide's numbers are in m, a hinge's in rad.
+    pub(crate) length: &'static str,
+    pub(crate) lower: f64,
+    pub(crate) upper: f64,
+    pub(crate) velocity: f64,
+    pub(crate) acceleration: f64,
+    /// What braking counts on.
+    pub(crate) braking: f64,
+    /// In front of the lowest and the highest position.
+    pub(crate) profile: [Option<Profile>; 2],
+    pub(crate) is_locked: bool,
+}
+
+/// Everything `[constraints]` holds.
+pub(crate) struct Limits {
+    /// By dof (nv).
+    pub(crate) joints: Vec<Bounds>,
+    /// Rows, then cones, in the order of their numbers in the log, which begin at nv.
+    pub(crate) rows: Vec<Row>,
+    pub(crate) collision: Option<Collision>,
+}
+
+/// What limits are read for.
+pub(crate) struct Of<'a> {
+    pub(crate) robot: &'a Robot,
+    pub(crate) machine: &'a Machine,
+    /// Ascending.
+    pub(crate) controllable: &'a [usize],
+    /// Stiffness and damping of the joints that are sent the target of their drive, by dof.
+    pub(crate) drives: &'a [Option<[f64; 2]>],
+}
+
+impl Of<'_> {
+    fn name(&self, dof: usize) -> &str {
+        self.robot.joints().nth(dof).map_or("", |joint| &joint.name)
+    }
+
+    fn dof(&self, name: &str) -> Result<usize, String> {
+        self.robot.joints().position(|j| j.name == name).ok_or_else(|| format!("its limits name joint '{name}', which the robot does not have"))
+    }
+
+    fn spot(&self, name: &str) -> Result<crate::motion::Spot, String> {
+        self.machine.spot(name).ok_or_else(|| format!("its limits name frame '{name}', which the robot does not have"))
+    }
+}
+
+impl Section {
+    /// The numbers that hold for the robot.
+    ///
+    /// # Errors
+    /// A clause that names what cannot be verified.
+    pub(crate) fn limits(&self, of: &Of<'_>) -> Result<Limits, String> {
+        let mut joints: Vec<Bounds> = of.robot.joints().enumerate().map(|(dof, joint)| self.joint(of, dof, joint)).collect();
+        if let Some(profiles) = &self.velocity_profile {
+            profiles.apply(of, &mut joints)?;
+        }
+        for name in &self.locked {
+            let dof = of.dof(name)?;
+            joints[dof].is_locked = of.controllable.contains(&dof);
+        }
+        let mut rows = Vec::new();
+        let mut efforts = Vec::new();
+        if let Some(torque) = &self.torque {
+            for &dof in of.controllable {
+                let joint = of.robot.joints().nth(dof).ok_or("a joint is missing")?;
+                let effort = less(torque.scale * of.robot.effort(joint), &torque.margin, dof, &joint.name);
+                efforts.push((dof, effort));
+                rows.push(Row::new("torque", &joint.name, effort, torque.soft, Rule::Torque { dof, most: effort }));
+            }
+        }
+        self.rates(of, &mut rows);
+        for frame in &self.frame {
+            frame.rows(of, &mut rows)?;
+        }
+        let collision = self.collision.as_ref().map(|section| Collision::new(section, of)).transpose()?;
+        if let (Some(pairs), Some(section)) = (&collision, &self.collision) {
+            for name in pairs.row_names() {
+                rows.push(Row::new("collision", &name, section.braking, section.soft, Rule::Pair));
+            }
+        }
+        for row in &self.rows {
+            rows.push(row.row(of)?);
+        }
+        let soft = self.torque.as_ref().and_then(|torque| torque.soft);
+        for &(dof, effort) in &efforts {
+            let Some([stiffness, damping]) = of.drives[dof] else { continue };
+            for (at_end, at) in [(false, "start"), (true, "end")] {
+                let rule = Rule::Drive { dof, most: effort, stiffness, damping, at_end };
+                rows.push(Row::new("torque", &format!("{} at the {at}", of.name(dof)), effort, soft, rule));
+            }
+        }
+        for speed in &self.frame_speed {
+            let (spot, limit) = (of.spot(&speed.frame)?, speed.limit - speed.margin);
+            rows.push(Row::new("frame_speed", &speed.frame, limit, speed.soft, Rule::Speed { spot, point: speed.point, most: limit }));
+        }
+        if let Some(energy) = &self.energy {
+            let most = energy.limit - energy.margin;
+            rows.push(Row::new("energy", "robot", (2.0 * most).sqrt(), energy.soft, Rule::Energy { most }));
+        }
+        Ok(Limits { joints, rows, collision })
+    }
+
+    fn joint(&self, of: &Of<'_>, dof: usize, joint: &crate::robot::Joint) -> Bounds {
+        let name = joint.name.as_str();
+        let is_slide = joint.kind == crate::robot::JointKind::Slide;
+        let none = f64::INFINITY;
+        let mut bounds = Bounds {
+            name: joint.name.clone(),
+            length: if is_slide { "m" } else { "rad" },
+            lower: -none,
+            upper: none,
+            velocity: none,
+            acceleration: none,
+            braking: none,
+            profile: [None; 2],
+            is_locked: false,
+        };
+        if !of.controllable.contains(&dof) {
+            return bounds;
+        }
+        if let (Some(position), Range::Limited(lower, upper), Some(_)) = (&self.position, joint.range, of.machine.single(dof)) {
+            let margin = -less(0.0, &position.margin, dof, name);
+            (bounds.lower, bounds.upper) = (lower + margin, upper - margin);
+        }
+        if let Some(velocity) = &self.velocity {
+            let file = joint.velocity.unwrap_or(none);
+            let own = velocity.limit.as_ref().and_then(|limit| limit.of(dof, name));
+            let scaled = match (velocity.scale, &velocity.limit) {
+                (Some(scale), _) => scale * file,
+                (None, None) => file,
+                (None, Some(_)) => if own.is_none() { file } else { none },
+            };
+            bounds.velocity = less(own.unwrap_or(none).min(scaled), &velocity.margin, dof, name);
+        }
+        if let Some(acceleration) = &self.acceleration {
+            if let Some(limit) = acceleration.limit.of(dof, name) {
+                bounds.acceleration = less(limit, &acceleration.margin, dof, name);
+            }
+            let stated = acceleration.braking.as_ref().and_then(|braking| braking.of(dof, name));
+            bounds.braking = stated.unwrap_or(none).min(bounds.acceleration);
+        }
+        bounds
+    }
+
+    /// Rows of single joints beside the torque: jerk, torque by speed, torque rate.
+    fn rates(&self, of: &Of<'_>, rows: &mut Vec<Row>) {
+        let each = |rate: &Rate| -> Vec<(usize, f64)> {
+            let value = |dof: &usize| Some((*dof, less(rate.limit.of(*dof, of.name(*dof))?, &rate.margin, *dof, of.name(*dof))));
+            of.controllable.iter().filter_map(value).collect()
+        };
+        if let Some(jerk) = &self.jerk {
+            let row = |(dof, most)| Row::new("jerk", of.name(dof), most, Some(jerk.soft), Rule::Jerk { dof, most });
+            rows.extend(each(jerk).into_iter().map(row));
+        }
+        if let Some(motor) = &self.torque_speed {
+            for &dof in of.controllable {
+                let joint = of.name(dof);
+                if let (Some(stall), Some(no_load)) = (motor.stall.of(dof, joint), motor.no_load.of(dof, joint)) {
+                    let most = less(stall, &motor.margin, dof, joint);
+                    rows.push(Row::new("torque_speed", joint, most, motor.soft, Rule::TorqueSpeed { dof, most, slope: stall / no_load }));
+                }
+            }
+        }
+        if let Some(rate) = &self.torque_rate {
+            let row = |(dof, most)| Row::new("torque_rate", of.name(dof), most, Some(rate.soft), Rule::TorqueRate { dof, most });
+            rows.extend(each(rate).into_iter().map(row));
+        }
+    }
+}
+
+impl Profiles {
+    fn apply(&self, of: &Of<'_>, joints: &mut [Bounds]) -> Result<(), String> {
+        let mut put = |dof: usize, [limit, offset, squared, lower, upper]: [f64; 5], margin: f64| {
+            if of.controllable.contains(&dof) {
+                let curve = |at| Some(Profile { at, deceleration: 0.5 * squared, offset: offset + margin });
+                joints[dof].velocity = joints[dof].velocity.min(limit - margin);
+                joints[dof].profile = [curve(lower), curve(upper)];
+            }
+        };
+        let (robot, margin) = match self {
+            Profiles::Joints(map) => {
+                for (name, j) in map {
+                    put(of.dof(name)?, [j.limit, j.offset, j.squared, j.lower, j.upper], j.margin);
+                }
+                return Ok(());
+            }
+            Profiles::Robot(robot) => (robot, 0.0),
+            Profiles::RobotLess { robot, margin } => (robot, *margin),
+        };
+        if robot != "fr3" {
+            return Err(format!("its velocity_profile is of '{robot}', which is not known here"));
+        }
+        for (dof, joint) in of.robot.joints().enumerate() {
+            let number = joint.name.rsplit_once("joint").and_then(|(_, end)| end.parse::<usize>().ok());
+            if let Some(curve) = number.and_then(|k| FR3.get(k.wrapping_sub(1))) {
+                put(dof, *curve, margin);
+            }
+        }
+        Ok(())
+    }
+}
+
+impl FrameSection {
+    fn rows(&self, of: &Of<'_>, rows: &mut Vec<Row>) -> Result<(), String> {
+        let spot = of.spot(&self.frame)?;
+        let mut plane = |name: &str, n: Vec3, offset: f64| {
+            let rule = Rule::Plane { spot, point: self.point, n, offset: offset - self.margin, braking: self.braking };
+            rows.push(Row::new("frame", name, self.braking, self.soft, rule));
+        };
+        if let Some(half) = &self.half_space {
+            let n = times(1.0 / norm(half.normal), half.normal);
+            plane(&self.frame, n, dot(n, half.through));
+        }
+        if let Some(inside) = &self.inside {
+            for (k, axis) in ["x", "y", "z"].iter().enumerate() {
+                for (sign, end, side) in [(1.0, inside.upper[k], "below"), (-1.0, inside.lower[k], "above")] {
+                    let mut n = [0.0; 3];
+                    n[k] = sign;
+                    if let Some(end) = end {
+                        plane(&format!("{} {side} {axis} = {end}", self.frame), n, sign * end);
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl UserRow {
+    fn row(&self, of: &Of<'_>) -> Result<Row, String> {
+        let term = |(name, c): (&String, &f64)| -> Result<Term, String> {
+            let unknown = || format!("its row '{}' names '{name}', which is no state of the robot", self.name);
+            let (letter, joint) = name.split_once('.').ok_or_else(unknown)?;
+            let dof = of.dof(joint)?;
+            match letter {
+                "q" => Ok(Term { dof, position: of.machine.single(dof).map(|iq| (iq, *c)), velocity: 0.0, acceleration: 0.0 }),
+                "v" => Ok(Term { dof, position: None, velocity: *c, acceleration: 0.0 }),
+                "a" => Ok(Term { dof, position: None, velocity: 0.0, acceleration: *c }),
+                _ => Err(unknown()),
+            }
+        };
+        let terms = self.terms.iter().map(term).collect::<Result<Vec<_>, _>>()?;
+        let none = f64::INFINITY;
+        let lower = self.equals.or(self.lower.map(|x| x + self.margin)).unwrap_or(-none);
+        let upper = self.equals.or(self.upper.map(|x| x - self.margin)).unwrap_or(none);
+        let largest = [lower, upper].into_iter().filter(|x| x.is_finite()).fold(0.0, |most: f64, x| most.max(x.abs()));
+        let size = match self.braking {
+            Some(braking) => braking,
+            None if largest > 0.0 => largest,
+            None => self.terms.values().fold(0.0, |most: f64, c| most.max(c.abs())),
+        };
+        let is_equality = self.equals.is_some();
+        let rule = Rule::User { terms, lower, upper, braking: self.braking, is_equality };
+        Ok(Row::new("user", &self.name, size, self.soft, rule))
+    }
+}

@@ -1,0 +1,164 @@
+//! Whether a target is the nearest allowed state: the Karush-Kuhn-Tucker conditions of
+//!
+//! ```text
+//!     min sum_i (v'_i - goal_i)²    within the joints' limits and the rows,
+//! ```
+//!
+//! with the multipliers of the log. What pulls the target to the proposal must be what the active rows push back, each row must push the way
+//! it can, and only where it is at its bound: where a little more would break it. The problem is convex, so this is all there is to show.
+
+use crate::limit_check::{Fault, TOLERANCE, broken};
+use crate::promise::Promise;
+use crate::rows::{Row, Step};
+use crate::tick::Ledger;
+
+/// A limit is active when this share of the largest velocity change of a period would break it.
+const NEAR: f64 = 1e-4;
+/// Share of its size by which a row may be away from its bound and still push.
+const AT: f64 = 1e-6;
+/// Pull that is rounding [rad/s or m/s, and as a share of the goal].
+const ROUNDING: f64 = 1e-9;
+/// The same for an answer of Clarabel, which leaves out multipliers of a millionth.
+const CONIC: f64 = 2e-5;
+/// A goal so many times its box away was brought nearer before it was solved for.
+const FAR: f64 = 1e5;
+
+/// Number of the rung without soft rows, and of Clarabel.
+const RELAXED: u32 = 4;
+const CLARABEL: u32 = 2;
+
+/// The conditions of a tick; the largest pull that is left, as a share of what is rounding.
+///
+/// `goals` are the unconstrained optima of `v'` (nv): the two that differ by rounding.
+pub(crate) fn confirm(promise: &mut Promise, step: &Step<'_>, goals: [&[f64]; 2], ledger: &Ledger, whole: bool) -> Result<f64, Fault> {
+    let unknown = |why: &str| Err(Fault::Unknown(why.to_owned()));
+    if ledger.active != ledger.active_rows.len() {
+        return unknown("more rows were active than a record has room for");
+    }
+    let Promise { machine, limits, controllable, period, worth, .. } = promise;
+    let has_rows = !limits.rows.is_empty();
+    if has_rows && controllable.iter().any(|&i| (goals[0][i] - step.v1[i]).abs() > FAR) {
+        return unknown("the proposal is further away than numbers are exact");
+    }
+    if limits.rows.iter().any(Row::needs_before) && step.before.is_none() {
+        return unknown("the tick before is not known, of which jerk and torque rate speak");
+    }
+    let nv = step.v.len();
+    let is_of_force = ledger.active_rows.iter().filter_map(|a| limits.rows.get(a.row.checked_sub(nv)?)).any(Row::is_of_force);
+    let forces = if is_of_force { forces(machine, period, step) } else { Vec::new() };
+    let mut push = vec![0.0; nv];
+    let mut size = vec![0.0f64; nv];
+    for (n, active) in ledger.active_rows.iter().enumerate() {
+        let side = match active.side.as_str() {
+            "lower" => -1.0,
+            "upper" => 1.0,
+            other => return broken(format!("side '{other}' of active row {n}"), f64::NAN, 0.0, ""),
+        };
+        let multiplier = active.multiplier;
+        if !(multiplier >= 0.0 && multiplier.is_finite()) {
+            return broken(format!("multiplier of active row {n}"), multiplier, 0.0, "or more");
+        }
+        if active.row < nv {
+            let (i, joint) = (active.row, &limits.joints[active.row]);
+            let named = format!("active {} row of joint '{}'", active.kind, joint.name);
+            if !controllable.contains(&i) || active.slack != 0.0 {
+                return broken(format!("slack of the {named}"), active.slack, 0.0, "");
+            }
+            push[i] += side * multiplier;
+            size[i] += multiplier;
+            let q = machine.single(i).map(|at| step.q[at]);
+            let most = joint.acceleration.min(2.0 * joint.velocity / period.dt) * period.dt;
+            let more = step.v1[i] + side * NEAR * if most.is_finite() { most } else { 1.0 };
+            if multiplier > 0.0 && !joint.breaks(&active.kind, side, period, q, step.v[i], more, whole) {
+                return broken(format!("velocity after the {named}, which holds nothing there,"), step.v1[i], more, "rad/s or m/s at least");
+            }
+            continue;
+        }
+        let Some(row) = limits.rows.get(active.row - nv).filter(|row| row.kind == active.kind) else {
+            return broken(format!("number of the active {} row {n}", active.kind), active.row as f64, (nv + limits.rows.len()) as f64, "rows");
+        };
+        if row.kind == "collision" {
+            return unknown("a row of a distance was active, whose nearest points are the projection's own");
+        }
+        let slope = row.slope(machine, period, step, &forces);
+        for &i in controllable.iter() {
+            push[i] += side * multiplier * slope[i];
+            size[i] += (multiplier * slope[i]).abs();
+        }
+        let excess = row.excess(machine, period, step)[usize::from(side > 0.0)];
+        let steepest = slope.iter().fold(0.0, |most: f64, s| most.max(s.abs()));
+        belongs(row, (multiplier, excess, active.slack), steepest, (*worth, ledger.rung))?;
+    }
+    all_hold(promise, step, ledger)?;
+    let coarse = if matches!(ledger.rung, CLARABEL | RELAXED) { CONIC } else { ROUNDING };
+    let mut worst = 0.0f64;
+    for &i in &promise.controllable {
+        let left = |goal: f64| (2.0 * (step.v1[i] - goal) + push[i]).abs();
+        let least = left(goals[0][i]).min(left(goals[1][i]));
+        let far = 1.0 + goals[0][i].abs() + step.v[i].abs() + size[i];
+        if !(least <= 2.0 * coarse * far) {
+            let joint = &promise.limits.joints[i];
+            let what = format!("pull on joint '{}' that no active row balances", joint.name);
+            return broken(what, 0.5 * least, coarse * far, format!("{}/s", joint.length));
+        }
+        worst = worst.max(least / (2.0 * coarse * far));
+    }
+    Ok(worst)
+}
+
+/// Motor forces for a unit of each acceleration (nv x nv, by rows): they are linear in it.
+fn forces(machine: &mut crate::motion::Machine, period: &crate::period::Period, step: &Step<'_>) -> Vec<f64> {
+    let nv = step.v.len();
+    let (mut a, mut still, mut with) = (vec![0.0; nv], vec![0.0; nv], vec![0.0; nv]);
+    machine.motors(period, step.q, step.v, &a, &mut still);
+    let mut all = vec![0.0; nv * nv];
+    for j in 0..nv {
+        a.fill(0.0);
+        a[j] = 1.0;
+        machine.motors(period, step.q, step.v, &a, &mut with);
+        (0..nv).for_each(|i| all[i * nv + j] = with[i] - still[i]);
+    }
+    all
+}
+
+/// A row pushes only at its bound; a soft one beyond it as hard as it gives way.
+fn belongs(row: &Row, (multiplier, excess, slack): (f64, f64, f64), steepest: f64, (worth, rung): (f64, u32)) -> Result<(), Fault> {
+    let of = |what: &str| format!("{what} of the active {} row of '{}'", row.kind, row.name);
+    let coarse = if rung == CLARABEL || rung == RELAXED { 1e-4 } else { AT };
+    // What the row is away from its bound by, as a velocity.
+    let away = excess.abs() * row.size / steepest.max(f64::MIN_POSITIVE);
+    let is_at = excess.abs() <= coarse || away <= 1e-9;
+    let Some(soft) = row.soft else {
+        return match is_at || multiplier * steepest <= ROUNDING {
+            true if slack == 0.0 => Ok(()),
+            true => broken(of("slack"), slack, 0.0, "of its size"),
+            false => broken(of("distance from the bound"), excess, 0.0, "of its size"),
+        };
+    };
+    if (slack - excess.max(0.0)).abs() > coarse * (1.0 + excess.abs()) {
+        return broken(of("slack"), slack, excess.max(0.0), "of its size");
+    }
+    if rung == RELAXED {
+        return Ok(()); // soft rows were left out
+    }
+    let force = multiplier * row.size / worth;
+    let wanted = soft.linear + soft.quadratic * excess.max(0.0);
+    let near = 1e-5 * (1.0 + wanted) + soft.quadratic * coarse;
+    let is_right = if excess > coarse { (force - wanted).abs() <= near } else { is_at && force <= wanted + near };
+    if is_right || multiplier * steepest <= CONIC { Ok(()) } else { broken(of("multiplier"), force, wanted, "of its weights") }
+}
+
+/// Every hard row is kept as the projection has to keep it, and a soft one that gives way is named.
+fn all_hold(promise: &mut Promise, step: &Step<'_>, ledger: &Ledger) -> Result<(), Fault> {
+    let nv = step.v.len();
+    let Promise { machine, limits, period, .. } = promise;
+    for (r, row) in limits.rows.iter().enumerate() {
+        let excess = row.excess(machine, period, step).into_iter().fold(f64::NEG_INFINITY, f64::max);
+        let is_named = || ledger.active_rows.iter().any(|active| active.row == nv + r);
+        let most = if row.soft.is_some() { 10.0 * TOLERANCE } else { AT.max(TOLERANCE) };
+        if excess > most && (row.soft.is_none() || !is_named()) {
+            return broken(format!("{} row of '{}', which is not named as active,", row.kind, row.name), excess, 0.0, "of its size beyond its bound");
+        }
+    }
+    Ok(())
+}

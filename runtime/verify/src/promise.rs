@@ -1,0 +1,276 @@
+//! What a snapshot promises: robot, limits, and what the numbers of a tick mean.
+
+use serde::Deserialize;
+use serde_json::Value;
+
+use crate::limits::{Consistency, Limits, Of, PerJoint, Section, Way};
+use crate::motion::Machine;
+use crate::period::Period;
+use crate::robot::Robot;
+
+/// The parts of a snapshot's manifest that are read.
+#[derive(Deserialize)]
+struct Manifest {
+    task: Task,
+    robot: Robot,
+    policy: String,
+    action_lower: Vec<f64>,
+    action_upper: Vec<f64>,
+}
+
+#[derive(Deserialize)]
+struct Task {
+    time: Time,
+    state: State,
+    constraints: Value,
+    idm: Idm,
+    #[serde(default)]
+    command: Command,
+}
+
+#[derive(Deserialize)]
+struct Time {
+    dt: f64,
+    #[serde(default = "one")]
+    policy_every: u32,
+    sim_dt: f64,
+}
+
+fn one() -> u32 {
+    1
+}
+
+#[derive(Deserialize)]
+struct State {
+    #[serde(default)]
+    observation: Vec<String>,
+    propose: Option<Vec<String>>,
+    controllable: Option<Vec<String>>,
+}
+
+#[derive(Deserialize)]
+struct Idm {
+    kind: String,
+}
+
+#[derive(Default, Deserialize)]
+struct Command {
+    interface: Option<Interfaces>,
+    stiffness: Option<PerJoint>,
+    damping: Option<PerJoint>,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Interfaces {
+    All(String),
+    Joints(std::collections::BTreeMap<String, String>),
+}
+
+/// An entry of a proposal.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Entry {
+    Position { dof: usize, at: usize },
+    Velocity { dof: usize },
+}
+
+/// What a joint is sent.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Sent {
+    Force,
+    Position,
+    Velocity,
+    Target { stiffness: f64, damping: f64 },
+}
+
+/// A controllable joint's entry of the action: `u = (torque / gear - bias) / gain` of a force, others as they are.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Action {
+    pub(crate) dof: usize,
+    pub(crate) place: usize,
+    pub(crate) sent: Sent,
+    pub(crate) gear: f64,
+    pub(crate) gain: f64,
+    pub(crate) bias: f64,
+    pub(crate) range: [f64; 2],
+}
+
+/// What is known of the way from a proposal to a target.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Projects {
+    /// The point of a cubic from the state at the policy tick to the proposal.
+    Proposals,
+    /// The state that an action of the policy leads to, which the log has.
+    Actions,
+    /// The state that an action of an inverse model leads to, which it has not.
+    Unlogged,
+    /// Nothing.
+    Nothing,
+}
+
+/// A snapshot's promise.
+pub(crate) struct Promise {
+    pub(crate) machine: Machine,
+    pub(crate) limits: Limits,
+    pub(crate) controllable: Vec<usize>,
+    pub(crate) period: Period,
+    pub(crate) policy_every: u32,
+    pub(crate) proposed: Vec<Entry>,
+    pub(crate) projects: Projects,
+    pub(crate) consistency: Consistency,
+    pub(crate) way: Way,
+    /// Of analytic inverse dynamics; empty where a network gives the action.
+    pub(crate) actions: Vec<Action>,
+    /// Limits on actions change `moved`.
+    pub(crate) limits_actions: bool,
+    /// A unit of softness: the weighted squared distance of the largest velocity change of one period.
+    pub(crate) worth: f64,
+}
+
+/// The manifest of a snapshot's bytes (safetensors), as text.
+///
+/// # Errors
+/// A clause.
+fn manifest(bytes: &[u8]) -> Result<String, String> {
+    let length = bytes.first_chunk::<8>().map(|b| u64::from_le_bytes(*b)).ok_or("it is shorter than a header")?;
+    let end = usize::try_from(length).ok().and_then(|n| n.checked_add(8));
+    let header = end.and_then(|end| bytes.get(8..end)).ok_or("its header is longer than the file")?;
+    let header: Value = serde_json::from_slice(header).map_err(|e| format!("its header is damaged: {e}"))?;
+    let text = header["__metadata__"]["nearl"].as_str().ok_or("it has no manifest")?;
+    text.split_once('\n').map(|(_, manifest)| manifest.to_owned()).ok_or_else(|| "its manifest is cut".to_owned())
+}
+
+impl Promise {
+    /// The promise of a snapshot, given as the bytes of its file; `pinned` takes the place of its limits.
+    ///
+    /// # Errors
+    /// A clause that says what of it is not known here.
+    pub(crate) fn read(bytes: &[u8], pinned: Option<&Value>) -> Result<Promise, String> {
+        let manifest: Manifest = serde_json::from_str(&manifest(bytes)?).map_err(|e| format!("its manifest is damaged: {e}"))?;
+        Promise::of(&manifest, pinned)
+    }
+
+    fn of(m: &Manifest, pinned: Option<&Value>) -> Result<Promise, String> {
+        let machine = Machine::new(&m.robot)?;
+        let section = pinned.unwrap_or(&m.task.constraints);
+        let section = Section::deserialize(section).map_err(|e| format!("its limits hold what is not known here: {e}"))?;
+        let joint = |name: &str| m.robot.joints().position(|j| j.name == name);
+        let entry = |name: &String| {
+            let (letter, rest) = name.split_once('.')?;
+            let dof = joint(rest)?;
+            match letter {
+                "q" => machine.single(dof).map(|at| Entry::Position { dof, at }),
+                "v" => Some(Entry::Velocity { dof }),
+                _ => None,
+            }
+        };
+        let state = &m.task.state;
+        let proposed: Vec<Entry> = state.propose.as_ref().unwrap_or(&state.observation).iter().filter_map(entry).collect();
+        let of = |e: &Entry| match e {
+            Entry::Position { dof, .. } | Entry::Velocity { dof } => *dof,
+        };
+        let mut controllable: Vec<usize> = match &state.controllable {
+            Some(names) => names.iter().filter_map(|name| joint(name)).collect(),
+            None => proposed.iter().map(of).collect(),
+        };
+        controllable.sort_unstable();
+        controllable.dedup();
+        let sub_steps = if m.task.time.sim_dt == 0.0 { 0 } else { (m.task.time.dt / m.task.time.sim_dt).round() as u32 };
+        let period = Period::new(m.task.time.dt, sub_steps);
+        let sent: Vec<Sent> = m.robot.joints().enumerate().map(|(dof, j)| m.task.command.sent(dof, &j.name)).collect::<Result<_, _>>()?;
+        let drives: Vec<_> = sent
+            .iter()
+            .map(|sent| match sent {
+                Sent::Target { stiffness, damping } => Some([*stiffness, *damping]),
+                _ => None,
+            })
+            .collect();
+        let limits = section.limits(&Of { robot: &m.robot, machine: &machine, controllable: &controllable, drives: &drives })?;
+        let (is_direct, is_analytic) = (m.policy == "direct", m.task.idm.kind == "pinocchio");
+        let guards = section.guard.as_bool() == Some(true);
+        let projects = match (is_direct, is_analytic) {
+            (false, true) => Projects::Proposals,
+            (true, _) if guards => Projects::Actions,
+            (true, _) => Projects::Nothing,
+            (false, false) if guards => Projects::Unlogged,
+            (false, false) => Projects::Proposals,
+        };
+        let is_known = (is_analytic && !is_direct) || (guards && controllable.len() == machine.nv());
+        let actions = if is_known { m.actions(&controllable, &sent)? } else { Vec::new() };
+        let change = |dof: &usize| {
+            let joint = &limits.joints[*dof];
+            match (joint.acceleration.is_finite(), joint.velocity.is_finite()) {
+                (true, _) => joint.acceleration * period.dt,
+                (false, true) => joint.velocity,
+                (false, false) => 1.0,
+            }
+        };
+        let worth = controllable.iter().map(change).fold(0.0, |most: f64, x| most.max(2.0 * x * x));
+        let consistency = if projects == Projects::Proposals { section.consistency } else { Consistency::Kinematic };
+        Ok(Promise {
+            machine,
+            limits,
+            controllable,
+            period,
+            policy_every: m.task.time.policy_every.max(1),
+            proposed,
+            projects,
+            consistency,
+            way: section.braking,
+            actions,
+            limits_actions: section.action.is_some(),
+            worth,
+        })
+    }
+
+    /// The limits that the snapshot itself states, to compare with those of a loop.
+    pub(crate) fn stated(bytes: &[u8]) -> Result<Value, String> {
+        let manifest: Value = serde_json::from_str(&manifest(bytes)?).map_err(|e| e.to_string())?;
+        Ok(manifest["task"]["constraints"].clone())
+    }
+
+    /// Whether a dof is proposed as a position, and as a velocity.
+    pub(crate) fn halves(&self, dof: usize) -> (bool, bool) {
+        let has = |want: &dyn Fn(&Entry) -> bool| self.proposed.iter().any(want);
+        let position = has(&|e| matches!(e, Entry::Position { dof: d, .. } if *d == dof));
+        (position, has(&|e| matches!(e, Entry::Velocity { dof: d } if *d == dof)))
+    }
+}
+
+impl Command {
+    fn sent(&self, dof: usize, joint: &str) -> Result<Sent, String> {
+        let interface = match &self.interface {
+            None => "effort",
+            Some(Interfaces::All(all)) => all,
+            Some(Interfaces::Joints(map)) => map.get(joint).map_or("effort", String::as_str),
+        };
+        let number = |values: &Option<PerJoint>| values.as_ref().and_then(|values| values.of(dof, joint));
+        match interface {
+            "effort" => Ok(Sent::Force),
+            "position" => Ok(Sent::Position),
+            "velocity" => Ok(Sent::Velocity),
+            "pd" => {
+                let damping = number(&self.damping).unwrap_or(0.0);
+                Ok(number(&self.stiffness).map_or(Sent::Force, |stiffness| Sent::Target { stiffness, damping }))
+            }
+            other => Err(format!("joint '{joint}' is sent '{other}', which is not known here")),
+        }
+    }
+}
+
+impl Manifest {
+    /// Entries of the action in the order of the controllable joints.
+    fn actions(&self, controllable: &[usize], sent: &[Sent]) -> Result<Vec<Action>, String> {
+        let motors = controllable.iter().map(|&dof| {
+            let joint = self.robot.joints().nth(dof).map_or("", |j| &j.name);
+            self.robot.motors.iter().find(|m| m.joint == joint).ok_or_else(|| format!("joint '{joint}' has no motor"))
+        });
+        let motors = motors.collect::<Result<Vec<_>, _>>()?;
+        let action = |(dof, motor): (&usize, &&crate::robot::Motor)| {
+            let place = motors.iter().filter(|other| other.order < motor.order).count();
+            let range = [self.action_lower.get(place), self.action_upper.get(place)].map(|end| end.copied().unwrap_or(f64::NAN));
+            Action { dof: *dof, place, sent: sent[*dof], gear: motor.gear, gain: motor.gain, bias: motor.bias[0], range }
+        };
+        Ok(controllable.iter().zip(&motors).map(action).collect())
+    }
+}

@@ -1,0 +1,339 @@
+//! Limits that tie joints together: what they ask of a step, what they keep, and how they change with it.
+
+use serde::Deserialize;
+
+use crate::motion::{Machine, Spot};
+use crate::period::Period;
+use crate::space::{Vec3, dot, minus, norm, times};
+
+/// Weights of a soft limit.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct Soft {
+    pub(crate) linear: f64,
+    pub(crate) quadratic: f64,
+}
+
+impl Default for Soft {
+    fn default() -> Soft {
+        Soft { linear: 1.0, quadratic: 100.0 }
+    }
+}
+
+/// A row or a cone of the projection.
+#[derive(Debug)]
+pub(crate) struct Row {
+    /// As the log names it.
+    pub(crate) kind: &'static str,
+    /// What it is of: a joint, a frame.
+    pub(crate) name: String,
+    /// What its excess is a share of, in its own unit.
+    pub(crate) size: f64,
+    /// `None` is hard.
+    pub(crate) soft: Option<Soft>,
+    pub(crate) rule: Rule,
+}
+
+/// One summand of a user's row.
+#[derive(Debug)]
+pub(crate) struct Term {
+    pub(crate) dof: usize,
+    /// Configuration entry and coefficient.
+    pub(crate) position: Option<(usize, f64)>,
+    pub(crate) velocity: f64,
+    pub(crate) acceleration: f64,
+}
+
+/// What a row says.
+#[derive(Debug)]
+pub(crate) enum Rule {
+    /// `|tau| <= most`.
+    Torque { dof: usize, most: f64 },
+    /// `|tau + slope v'| <= most`.
+    TorqueSpeed { dof: usize, most: f64, slope: f64 },
+    /// `|a - a_before| / T <= most`.
+    Jerk { dof: usize, most: f64 },
+    /// `|tau - tau_before| / T <= most`.
+    TorqueRate { dof: usize, most: f64 },
+    /// The force of a drive at one end of the period.
+    Drive { dof: usize, most: f64, stiffness: f64, damping: f64, at_end: bool },
+    /// `n . p <= offset`, and `braking` stops the point in front of it.
+    Plane { spot: Spot, point: Vec3, n: Vec3, offset: f64, braking: f64 },
+    /// A sum of positions, velocities and accelerations.
+    User { terms: Vec<Term>, lower: f64, upper: f64, braking: Option<f64>, is_equality: bool },
+    /// A pair of bodies, see [`Collision`](crate::collision::Collision).
+    Pair,
+    /// Speed of a point.
+    Speed { spot: Spot, point: Vec3, most: f64 },
+    /// Kinetic energy.
+    Energy { most: f64 },
+}
+
+/// From the state that a tick acted upon to its target.
+#[derive(Clone, Copy)]
+pub(crate) struct Step<'a> {
+    pub(crate) q: &'a [f64],
+    pub(crate) v: &'a [f64],
+    pub(crate) q1: &'a [f64],
+    pub(crate) v1: &'a [f64],
+    /// `(v1 - v) / T`.
+    pub(crate) a: &'a [f64],
+    /// Motor forces on average over the period.
+    pub(crate) tau: &'a [f64],
+    /// Acceleration and motor forces of the tick before.
+    pub(crate) before: Option<(&'a [f64], &'a [f64])>,
+}
+
+/// Frames and bodies keep this far inside their boundary, for what a straight row misses of a curved way [m]; a projection's own choice.
+const CREEP: f64 = 1e-4;
+/// What is beyond it comes back in so many periods.
+const RETURN: f64 = 20.0;
+/// In front of a plane a row asks for at most so many times its braking.
+const RECOVERY: f64 = 2.0;
+/// A state so far outside what can stop is inside [rad or m].
+const ROUNDING: f64 = 1e-10;
+
+impl Row {
+    pub(crate) fn new(kind: &'static str, name: &str, size: f64, soft: Option<Soft>, rule: Rule) -> Row {
+        Row { kind, name: name.to_owned(), size, soft, rule }
+    }
+
+    /// Whether motor forces are in it.
+    pub(crate) fn is_of_force(&self) -> bool {
+        matches!(self.rule, Rule::Torque { .. } | Rule::TorqueSpeed { .. } | Rule::TorqueRate { .. } | Rule::Drive { .. })
+    }
+
+    /// Whether it speaks of the tick before.
+    pub(crate) fn needs_before(&self) -> bool {
+        matches!(self.rule, Rule::Jerk { .. } | Rule::TorqueRate { .. })
+    }
+
+    /// Whether a state, not a motion, is beyond it: a measured state may be so already.
+    pub(crate) fn is_of_state(&self) -> bool {
+        matches!(self.rule, Rule::Plane { .. } | Rule::User { .. } | Rule::Speed { .. } | Rule::Energy { .. })
+    }
+
+    /// Value, limit and unit of what the state after a step keeps, for messages.
+    pub(crate) fn value(&self, m: &mut Machine, p: &Period, step: &Step<'_>) -> (f64, f64, &'static str) {
+        match &self.rule {
+            Rule::Torque { dof, most } => (step.tau[*dof], *most, "N m or N"),
+            Rule::TorqueSpeed { dof, most, slope } => (step.tau[*dof] + slope * step.v1[*dof], *most, "N m or N"),
+            Rule::Drive { most, .. } => (self.excess(m, p, step)[1] * most + most, *most, "N m or N"),
+            Rule::Jerk { most, .. } => (self.excess(m, p, step)[1] * most + most, *most, "rad/s^3 or m/s^3"),
+            Rule::TorqueRate { most, .. } => (self.excess(m, p, step)[1] * most + most, *most, "N m/s or N/s"),
+            Rule::Plane { spot, point, n, offset, .. } => {
+                m.go(step.q1, step.v1);
+                (dot(*n, m.place(spot).point(*point)), *offset, "m")
+            }
+            Rule::User { lower, upper, .. } => {
+                let value = self.sum(step);
+                (value, if value > *upper { *upper } else { *lower }, "in the unit of the row")
+            }
+            Rule::Speed { spot, point, most } => {
+                m.go(step.q1, step.v1);
+                (m.speed(spot, *point), *most, "m/s")
+            }
+            Rule::Energy { most } => (m.energy(step.q1, step.v1), *most, "J"),
+            Rule::Pair => (0.0, 0.0, "m"),
+        }
+    }
+
+    /// Sum of the terms after the step.
+    fn sum(&self, step: &Step<'_>) -> f64 {
+        let Rule::User { terms, .. } = &self.rule else { return 0.0 };
+        let each = |t: &Term| {
+            let at = t.position.map_or(0.0, |(iq, c)| c * step.q1[iq]);
+            at + t.velocity * step.v1[t.dof] + t.acceleration * step.a[t.dof]
+        };
+        terms.iter().map(each).sum()
+    }
+
+    /// By how much a step is beyond the lower and the upper bound that the projection has to keep, as shares of the size; negative inside.
+    pub(crate) fn excess(&self, m: &mut Machine, p: &Period, step: &Step<'_>) -> [f64; 2] {
+        let both = |value: f64, most: f64| [-value / most - 1.0, value / most - 1.0];
+        let none = f64::NEG_INFINITY;
+        match &self.rule {
+            Rule::Torque { dof, most } => both(step.tau[*dof], *most),
+            Rule::TorqueSpeed { dof, most, slope } => both(step.tau[*dof] + slope * step.v1[*dof], *most),
+            Rule::Jerk { dof, most } => step.before.map_or([none; 2], |(a, _)| both((step.a[*dof] - a[*dof]) / p.dt, *most)),
+            Rule::TorqueRate { dof, most } => {
+                step.before.map_or([none; 2], |(_, tau)| both((step.tau[*dof] - tau[*dof]) / p.dt, *most))
+            }
+            Rule::Drive { dof, most, stiffness, damping, at_end } => {
+                let [still, by] = drive(p, *stiffness, *damping, *at_end, step.v[*dof]);
+                both(step.tau[*dof] + still + by * step.a[*dof], *most)
+            }
+            Rule::Plane { spot, point, n, offset, braking } => {
+                let mut ahead = Vec::new();
+                m.moved(step.q, step.v, p.dt, &mut ahead);
+                m.go(&ahead, step.v);
+                let at = m.point(spot, m.place(spot).point(*point));
+                m.go(&ahead, step.v1);
+                let then = dot(*n, m.point(spot, m.place(spot).point(*point)).velocity);
+                let (speed, c) = (dot(*n, at.velocity), dot(*n, at.acceleration));
+                [none, plane(p, offset - dot(*n, at.at), speed, c, then, *braking)]
+            }
+            Rule::User { terms, lower, upper, braking, .. } => match braking {
+                None => {
+                    let value = self.sum(step);
+                    [(lower - value) / self.size, (value - upper) / self.size]
+                }
+                Some(b) => {
+                    let sum = |x: &dyn Fn(&Term) -> f64| terms.iter().map(x).sum::<f64>();
+                    let weight = |t: &Term| t.position.map_or(0.0, |(_, c)| c);
+                    let s = sum(&|t| t.position.map_or(0.0, |(iq, c)| c * step.q[iq]));
+                    let (w, a) = (sum(&|t| weight(t) * step.v[t.dof]), sum(&|t| weight(t) * step.a[t.dof]));
+                    let beyond = |d: f64, w: f64, a: f64| if d.is_finite() { (a - in_front(p, d, w, *b)) / b } else { none };
+                    [beyond(s - lower, -w, -a), beyond(upper - s, w, a)]
+                }
+            },
+            Rule::Speed { spot, point, most } => {
+                let mut ahead = Vec::new();
+                m.moved(step.q, step.v, p.dt, &mut ahead);
+                m.go(&ahead, step.v1);
+                [none, m.speed(spot, *point) / most - 1.0]
+            }
+            Rule::Energy { most } => {
+                let mut ahead = Vec::new();
+                m.moved(step.q, step.v, p.dt, &mut ahead);
+                [none, (m.energy(&ahead, step.v1) / most).sqrt() - 1.0]
+            }
+            Rule::Pair => [none; 2],
+        }
+    }
+
+    /// By how much the motion, or the state that it ends in, is beyond the limit itself: a share of it, of a plane metres. `None` where no
+    /// brake could keep it.
+    pub(crate) fn breach(&self, m: &mut Machine, p: &Period, step: &Step<'_>) -> Option<f64> {
+        Some(match &self.rule {
+            Rule::Plane { spot, point, n, offset, .. } => {
+                m.go(step.q1, step.v1);
+                dot(*n, m.place(spot).point(*point)) - offset
+            }
+            Rule::Speed { spot, point, most } => {
+                m.go(step.q1, step.v1);
+                m.speed(spot, *point) / most - 1.0
+            }
+            Rule::Energy { most } => (m.energy(step.q1, step.v1) / most).sqrt() - 1.0,
+            Rule::User { terms, lower, upper, braking, is_equality } => {
+                let stands = *lower <= 0.0 && *upper >= 0.0;
+                let of_positions = terms.iter().any(|t| t.position.is_some());
+                if braking.is_none() && (*is_equality || !(of_positions || stands)) {
+                    return None;
+                }
+                let value = self.sum(step);
+                (value - upper).max(lower - value) / self.size
+            }
+            Rule::Pair => return None,
+            _ => self.excess(m, p, step).into_iter().fold(f64::NEG_INFINITY, f64::max),
+        })
+    }
+
+    /// How the row's value changes with the velocity change of each dof (nv), in the row's unit. `forces` are the motors' forces for a unit of
+    /// each acceleration (nv x nv), where the row is of forces.
+    pub(crate) fn slope(&self, m: &mut Machine, p: &Period, step: &Step<'_>, forces: &[f64]) -> Vec<f64> {
+        let nv = step.v.len();
+        let mut out = vec![0.0; nv];
+        let mut force = |dof: usize, scale: f64| (0..nv).for_each(|j| out[j] = scale * forces[dof * nv + j] / p.dt);
+        match &self.rule {
+            Rule::Torque { dof, .. } => force(*dof, 1.0),
+            Rule::TorqueRate { dof, .. } => force(*dof, 1.0 / p.dt),
+            Rule::TorqueSpeed { dof, slope, .. } => {
+                force(*dof, 1.0);
+                out[*dof] += slope;
+            }
+            Rule::Drive { dof, stiffness, damping, at_end, .. } => {
+                force(*dof, 1.0);
+                out[*dof] += drive(p, *stiffness, *damping, *at_end, 0.0)[1] / p.dt;
+            }
+            Rule::Jerk { dof, .. } => out[*dof] = 1.0 / (p.dt * p.dt),
+            Rule::Plane { spot, point, n, .. } => {
+                let mut ahead = Vec::new();
+                m.moved(step.q, step.v, p.dt, &mut ahead);
+                m.go(&ahead, step.v);
+                m.add_row(spot, m.place(spot).point(*point), *n, 1.0 / p.dt, &mut out);
+            }
+            Rule::User { terms, braking, .. } => {
+                for t in terms {
+                    let by_position = if braking.is_some() { 1.0 / p.dt } else { p.kappa * p.dt };
+                    out[t.dof] += t.position.map_or(0.0, |(_, c)| c * by_position) + t.velocity + t.acceleration / p.dt;
+                }
+            }
+            Rule::Speed { spot, point, .. } => {
+                let mut ahead = Vec::new();
+                m.moved(step.q, step.v, p.dt, &mut ahead);
+                m.go(&ahead, step.v1);
+                let at = m.place(spot).point(*point);
+                let velocity = m.point(spot, at).velocity;
+                m.add_row(spot, at, times(1.0 / norm(velocity).max(f64::MIN_POSITIVE), velocity), 1.0, &mut out);
+            }
+            Rule::Energy { .. } => {
+                let mut ahead = Vec::new();
+                m.moved(step.q, step.v, p.dt, &mut ahead);
+                m.mass_times(&ahead, step.v1, &mut out);
+                let energy: f64 = out.iter().zip(step.v1).map(|(p, v)| p * v).sum();
+                out.iter_mut().for_each(|x| *x /= energy.sqrt().max(f64::MIN_POSITIVE));
+            }
+            Rule::Pair => {}
+        }
+        out
+    }
+}
+
+/// A drive's force at the start or the last evaluation of a period, less the mean: its part without acceleration, and per acceleration.
+/// The mean is that of `K (q* - q) - D v` over the evaluations.
+fn drive(p: &Period, stiffness: f64, damping: f64, at_end: bool, v: f64) -> [f64; 2] {
+    let (lag, sag) = (0.5 * (p.dt - p.tau), (p.dt * p.dt - p.tau * p.tau) / 6.0);
+    let start = [stiffness * lag * v, stiffness * sag + damping * lag];
+    if !at_end {
+        return start;
+    }
+    let end = p.dt - p.tau;
+    [start[0] - stiffness * end * v, start[1] - (0.5 * stiffness * p.dt + damping) * end]
+}
+
+/// The largest acceleration of a sum towards a bound at distance `d`, at speed `w`: it stops in front of it with `b`, or brakes with `b` if it still can.
+fn in_front(p: &Period, d: f64, w: f64, b: f64) -> f64 {
+    if d <= 0.0 {
+        return (-w / p.dt).clamp(-b, b);
+    }
+    let most = p.approach(d, w, b);
+    if p.stopping(w, b) <= d + ROUNDING { most.max(-b) } else { most }
+}
+
+/// By how much closing in on a plane with the speed `then` at the end of a period is more than allowed, as a share of `b`. Distance, closing
+/// speed and closing acceleration are those at `q + T v`, from which the joint-like motion begins a period earlier.
+fn plane(p: &Period, distance: f64, speed: f64, c: f64, then: f64, b: f64) -> f64 {
+    let w = speed - (p.dt + 0.5 * p.tau) * c;
+    let d = distance - CREEP + p.dt * w + p.kappa * p.dt * p.dt * c;
+    let a = c + (then - speed) / p.dt;
+    let allowed = if d <= 0.0 {
+        ((d.max(-CREEP) / (RETURN * p.dt) - w) / p.dt).clamp(-b, b)
+    } else {
+        let always = if p.stopping(w, b) <= d + ROUNDING { -b } else { -RECOVERY * b };
+        p.approach(d, w, b).max(always)
+    };
+    (a - allowed) / b
+}
+
+/// Whether a point of a plane is beyond it already.
+pub(crate) fn is_beyond(row: &Row, m: &mut Machine, q: &[f64], v: &[f64]) -> bool {
+    let zero = vec![0.0; v.len()];
+    let step = Step { q, v, q1: q, v1: v, a: &zero, tau: &zero, before: None };
+    match &row.rule {
+        Rule::Plane { spot, point, n, offset, .. } => {
+            m.go(q, v);
+            dot(*n, minus(m.place(spot).point(*point), times(*offset, *n))) > 0.0
+        }
+        Rule::User { lower, upper, .. } => {
+            let value = row.sum(&step);
+            value > *upper || value < *lower
+        }
+        Rule::Speed { spot, point, most } => {
+            m.go(q, v);
+            m.speed(spot, *point) > *most
+        }
+        Rule::Energy { most } => m.energy(q, v) > *most,
+        _ => false,
+    }
+}

@@ -1,0 +1,482 @@
+//! From tick to tick: what a loop acted upon, what it was asked for, and which of its claims are confirmed.
+
+use std::collections::{BTreeMap, HashMap};
+
+use serde_json::Value;
+
+use crate::limit_check::{self, Breach, Fault, broken};
+use crate::limits::{Consistency, Way};
+use crate::optimum;
+use crate::promise::{Entry as Proposed, Projects, Promise, Sent};
+use crate::report::{Report, Violation};
+use crate::rows::{Row, Step};
+use crate::stop;
+use crate::tick::{Entry, Status, Tick};
+
+/// Version of the tick messages that are read.
+const SCHEMA: &str = "5";
+/// A target's position is where its velocity leads, up to this share [rad or m].
+const CONSISTENT: f64 = 1e-9;
+/// A proposal's position and velocity belong together up to this [rad or m].
+const BELONGS: f64 = 1e-11;
+/// Velocities of proposals count up to this [rad/s or m/s].
+const HUGE: f64 = 1e12;
+/// Share of its size by which an action may differ from the one that leads to the target.
+const ACTION: f64 = 1e-7;
+
+/// What the tick before left.
+struct Past {
+    target: (Vec<f64>, Vec<f64>),
+    /// Acceleration and motor forces, where they are what the next tick was told.
+    told: Option<(Vec<f64>, Vec<f64>)>,
+}
+
+/// The state in which a policy period began, and what was proposed then.
+struct Begun {
+    start: (Vec<f64>, Vec<f64>),
+    goal: (Vec<f64>, Vec<f64>),
+}
+
+/// What has been read of a log.
+#[derive(Default)]
+pub(crate) struct Session {
+    facts: BTreeMap<String, String>,
+    /// Bytes of attachments by their name.
+    attachments: HashMap<String, Vec<u8>>,
+    entries: HashMap<u64, Entry>,
+    /// Promises by snapshot: its own, then what the loop pinned beside it.
+    promises: HashMap<u64, (Promise, Option<Promise>)>,
+    past: Option<Past>,
+    begun: Option<Begun>,
+    at: u64,
+    pub(crate) report: Report,
+}
+
+/// A tick with what it acted upon.
+struct Case<'a> {
+    tick: &'a Tick,
+    /// What the snapshot's own limits, or those that the loop pinned.
+    is_own: bool,
+    q: &'a [f64],
+    v: &'a [f64],
+    status: Status,
+    by_policy: bool,
+    /// What was projected, or why it is not known.
+    proposal: Result<(Vec<f64>, Vec<f64>), String>,
+}
+
+impl Session {
+    pub(crate) fn fact(&mut self, facts: BTreeMap<String, String>) {
+        self.facts.extend(facts);
+    }
+
+    /// Keeps a snapshot's bytes, if they are what their name says.
+    pub(crate) fn attach(&mut self, name: &str, bytes: Vec<u8>) -> Result<(), String> {
+        let digest = blake3::hash(&bytes).to_hex().to_string();
+        if name != format!("{digest}.safetensors") {
+            return Err(format!("the attached snapshot '{name}' is damaged: its digest is {digest}"));
+        }
+        self.attachments.insert(digest, bytes);
+        Ok(())
+    }
+
+    pub(crate) fn enter(&mut self, entry: Entry) {
+        self.entries.insert(entry.id, entry);
+    }
+
+    /// Notes that the log has message `tick`.
+    fn arrive(&mut self, tick: u64) -> Result<(), String> {
+        if self.at == 0 {
+            let schema = self.facts.get("schema").ok_or("its metadata has no `schema`")?;
+            if schema != SCHEMA {
+                return Err(format!("its schema is {schema}, this build reads {SCHEMA}; use the build that wrote it"));
+            }
+        }
+        if tick <= self.at {
+            return Err(format!("tick {tick} comes after tick {}: ticks only rise", self.at));
+        }
+        let lost = tick - self.at - 1;
+        if lost > 0 {
+            self.skip("the log does not have them", lost);
+            (self.past, self.begun) = (None, None);
+        }
+        self.at = tick;
+        self.report.ticks += 1;
+        Ok(())
+    }
+
+    fn skip(&mut self, why: &str, ticks: u64) {
+        *self.report.not_verified.entry(why.to_owned()).or_default() += ticks;
+    }
+
+    /// A tick of which only its inputs are there.
+    pub(crate) fn brief(&mut self, tick: u64) -> Result<(), String> {
+        self.arrive(tick)?;
+        self.skip("the disk was too slow for more than their inputs", 1);
+        (self.past, self.begun) = (None, None);
+        Ok(())
+    }
+
+    /// A tick in full.
+    pub(crate) fn tick(&mut self, tick: &Tick) -> Result<(), String> {
+        self.arrive(tick.tick)?;
+        if tick.swapped {
+            self.begun = None;
+            self.past.iter_mut().for_each(|past| past.told = None);
+        }
+        if tick.action.is_empty() {
+            self.report.idle += 1;
+            self.past = None;
+            return Ok(());
+        }
+        let mut promises = match self.promises.remove(&tick.snapshot) {
+            Some(promises) => promises,
+            None => self.promise(tick.snapshot)?,
+        };
+        let told = match self.judge(&mut promises, tick) {
+            Ok(told) => told,
+            Err(Fault::Broken(Breach { what, value, limit, unit })) => {
+                self.report.add(Violation { tick: tick.tick, what, value, limit, unit });
+                None
+            }
+            Err(Fault::Unknown(why)) => {
+                self.skip(&why, 1);
+                None
+            }
+        };
+        self.promises.insert(tick.snapshot, promises);
+        self.past = Some(Past { target: (tick.target_q.clone(), tick.target_v.clone()), told });
+        Ok(())
+    }
+
+    /// What snapshot `id` promises, and what the loop pinned.
+    fn promise(&self, id: u64) -> Result<(Promise, Option<Promise>), String> {
+        let entry = self.entries.get(&id).ok_or_else(|| format!("snapshot number {id} is not in it"))?;
+        let bytes = self.attachments.get(&entry.digest).ok_or_else(|| format!("snapshot number {id} is not in it"))?;
+        let of = |e: String| format!("snapshot number {id}: {e}");
+        let own = Promise::read(bytes, None).map_err(of)?;
+        let names: Vec<&str> = own.limits.joints.iter().map(|j| j.name.as_str()).chain(own.limits.rows.iter().map(|r| r.name.as_str())).collect();
+        if own.projects != Projects::Nothing && own.consistency == Consistency::Kinematic && names != entry.rows {
+            return Err(format!("the rows of snapshot number {id} are {:?} in the log, and {names:?} by its limits", entry.rows));
+        }
+        let pinned = match self.facts.get("limits") {
+            None => None,
+            Some(text) => {
+                let pinned: Value = serde_json::from_str(text).map_err(|e| format!("its metadata `limits` is damaged: {e}"))?;
+                (pinned != Promise::stated(bytes)?).then(|| Promise::read(bytes, Some(&pinned))).transpose().map_err(of)?
+            }
+        };
+        Ok((own, pinned))
+    }
+
+    /// Confirms a tick's claims; what the next one is told of it.
+    fn judge(&mut self, (own, pinned): &mut (Promise, Option<Promise>), tick: &Tick) -> Result<Option<(Vec<f64>, Vec<f64>)>, Fault> {
+        let unknown = |why: &str| Err(Fault::Unknown(why.to_owned()));
+        let (nq, nv) = (own.machine.nq(), own.machine.nv());
+        for (what, found, length) in [
+            ("state.q", &tick.state.q, nq),
+            ("state.v", &tick.state.v, nv),
+            ("target_q", &tick.target_q, nq),
+            ("target_v", &tick.target_v, nv),
+            ("proposal_q", &tick.proposal_q, nq),
+            ("proposal_v", &tick.proposal_v, nv),
+        ] {
+            if found.len() != length {
+                return broken(format!("length of {what}"), found.len() as f64, length as f64, "numbers");
+            }
+        }
+        let Some(status) = tick.ledger.status() else {
+            return broken("ledger.status", f64::from(tick.ledger.status), 0.0, "as the list in the metadata has it");
+        };
+        if own.projects == Projects::Nothing || status == Status::NotProjected {
+            return unknown("their policy gives actions that nothing was projected for");
+        }
+        let finite = |what: &str, x: &[f64]| match x.iter().position(|x| !x.is_finite()) {
+            Some(k) => broken(format!("{what}[{k}]"), x[k], 0.0, "a number"),
+            None => Ok(()),
+        };
+        finite("target_q", &tick.target_q)?;
+        finite("target_v", &tick.target_v)?;
+        finite("action", &tick.action)?;
+        let by_policy = matches!(tick.mode.as_str(), "active" | "degraded");
+        let (q, v) = match (tick.sensed.as_str(), &self.past) {
+            ("measured", _) => (tick.state.q.clone(), tick.state.v.clone()),
+            ("predicted", Some(past)) => past.target.clone(),
+            ("predicted", None) => return unknown("they acted on a state predicted from a tick that the log does not have"),
+            (other, _) => return broken(format!("action, while the state is '{other}',"), tick.action[0], 0.0, ""),
+        };
+        finite("state.q", &q)?;
+        finite("state.v", &v)?;
+        let begins = by_policy && tick.period_tick == 0;
+        if begins {
+            self.begun = Some(Begun { goal: goal(own, tick, &q, &v), start: (q.clone(), v.clone()) });
+        }
+        let proposal = self.proposal(own, tick, by_policy, (&q, &v));
+        let mut case = Case { tick, is_own: true, q: &q, v: &v, status, by_policy, proposal };
+        let told = self.confirm(own, &case)?;
+        if let Some(pinned) = pinned {
+            case.is_own = false;
+            self.confirm(pinned, &case)?;
+        }
+        self.report.verified += 1;
+        self.report.recovering += u64::from(status == Status::Recovering);
+        // What a first motion's softening or a brake asks for is projected by itself, and the next tick is told of the target before.
+        Ok(told.filter(|_| by_policy && tick.ramp >= 1.0))
+    }
+
+    /// What was projected in this tick, where it is known.
+    fn proposal(&self, own: &Promise, tick: &Tick, by_policy: bool, (q, v): (&[f64], &[f64])) -> Result<(Vec<f64>, Vec<f64>), String> {
+        let no = |why: &str| Err(why.to_owned());
+        if own.consistency == Consistency::Free {
+            return no("positions and velocities are clamped apart (consistency = \"free\")");
+        }
+        let p = &own.period;
+        let (mut pq, mut pv) = (q.to_vec(), v.to_vec());
+        if !by_policy {
+            // The loop's own brake proposes rest.
+            for &i in &own.controllable {
+                pv[i] = 0.0;
+                if let Some(at) = own.machine.single(i) {
+                    pq[at] = q[at] + p.way(v[i], 0.0);
+                }
+            }
+            return Ok((pq, pv));
+        }
+        if tick.ramp < 1.0 {
+            return no("the first motion was let in, by a share of a target that is not in the log");
+        }
+        if own.projects == Projects::Unlogged {
+            return no("where a learned inverse model's action leads is not in the log");
+        }
+        if own.projects == Projects::Actions {
+            let all = own.controllable.iter().all(|&i| own.halves(i) == (true, true));
+            return if all { Ok((tick.proposal_q.clone(), tick.proposal_v.clone())) } else { no("not every joint's position and velocity is proposed") };
+        }
+        let Some(Begun { start, goal }) = &self.begun else { return no("the tick in which their policy ran is not in the log") };
+        let is_held = tick.proposal_age_ns.is_some() && tick.proposed.is_none();
+        if is_held && own.controllable.iter().any(|&i| own.halves(i) != (true, true)) {
+            return no("a proposal of another process was held, of which the log has one half");
+        }
+        let (j, k) = (tick.period_tick + 1, own.policy_every);
+        if j >= k {
+            return Ok(goal.clone());
+        }
+        let (s, length) = (f64::from(j) / f64::from(k), f64::from(k) * p.dt);
+        for &i in &own.controllable {
+            let Some(at) = own.machine.single(i) else { return no("a continuous joint follows no cubic") };
+            (pq[at], pv[i]) = cubic(s, length, (start.0[at], start.1[i]), (goal.0[at], goal.1[i]));
+        }
+        Ok((pq, pv))
+    }
+
+    /// Limits, action, optimum and way to stop of one promise.
+    fn confirm(&mut self, promise: &mut Promise, case: &Case<'_>) -> Result<Option<(Vec<f64>, Vec<f64>)>, Fault> {
+        let (tick, p, nv) = (case.tick, promise.period, case.v.len());
+        let a: Vec<f64> = (0..nv).map(|i| (tick.target_v[i] - case.v[i]) / p.dt).collect();
+        let mut tau = vec![0.0; nv];
+        promise.machine.motors(&p, case.q, case.v, &a, &mut tau);
+        let before = self.past.as_ref().and_then(|past| past.told.as_ref()).map(|(a, tau)| (&a[..], &tau[..]));
+        let step = Step { q: case.q, v: case.v, q1: &tick.target_q, v1: &tick.target_v, a: &a, tau: &tau, before };
+        let is_stored = !tick.brake.is_empty();
+        let excused = case.status == Status::Recovering;
+        if promise.consistency == Consistency::Kinematic {
+            follows(promise, &step)?;
+        }
+        limit_check::joints(&promise.limits, &promise.machine, &promise.controllable, &p, &step, excused)?;
+        limit_check::rows(&promise.limits, &mut promise.machine, &p, &step, is_stored, excused)?;
+        if !case.is_own {
+            return Ok(None);
+        }
+        if excused && !is_outside(promise, case, is_stored) {
+            return broken("joints, frames, bodies and rows outside at the start of a tick that says it is recovering", 0.0, 1.0, "or more");
+        }
+        if tick.ledger.target_violations > 0 && !excused && case.status != Status::Braked {
+            return broken("ledger.target_violations of a target within all limits", f64::from(tick.ledger.target_violations), 0.0, "");
+        }
+        actions(promise, &step, &tick.action)?;
+        self.optimum(promise, case, &step, is_stored)?;
+        self.stop(promise, case, is_stored)?;
+        Ok(Some((a, tau)))
+    }
+
+    fn optimum(&mut self, promise: &mut Promise, case: &Case<'_>, step: &Step<'_>, is_stored: bool) -> Result<(), Fault> {
+        let mut without = |why: &str| {
+            *self.report.not_compared.entry(why.to_owned()).or_default() += 1;
+            Ok(())
+        };
+        match case.status {
+            Status::Recovering => return without("the robot was outside its limits"),
+            Status::Slowed => return without("no way to stop was found from the nearest allowed state (slowed)"),
+            Status::Braked | Status::Refused => return without("the proposal was not used: braked"),
+            _ => {}
+        }
+        let proposal = match &case.proposal {
+            Ok(proposal) => proposal,
+            Err(why) => return without(why),
+        };
+        let (one, other) = unconstrained(promise, step, proposal);
+        if !case.by_policy && promise.limits.rows.iter().any(Row::needs_before) {
+            return without("a brake is not told of the tick before, of which jerk and torque rate speak");
+        }
+        // Half a period more where a stored brake stops in whole ones.
+        let whole = is_stored;
+        match optimum::confirm(promise, step, [&one, &other], &case.tick.ledger, whole) {
+            Ok(worst) => {
+                self.report.optimal += 1;
+                self.report.unbalanced = self.report.unbalanced.max(worst);
+            }
+            Err(Fault::Unknown(why)) => return without(&why),
+            Err(fault) => return Err(fault),
+        }
+        let said = case.tick.ledger.moved;
+        let found = distance(promise, step, proposal, &other);
+        if !promise.limits_actions && !((said - found).abs() <= 1e-6 * (1e-3 + found)) {
+            return broken("ledger.moved", said, found, "rad/s or m/s");
+        }
+        Ok(())
+    }
+
+    fn stop(&mut self, promise: &mut Promise, case: &Case<'_>, is_stored: bool) -> Result<(), Fault> {
+        let (q, v) = (&case.tick.target_q, &case.tick.target_v);
+        let mut without = |why: &str| {
+            *self.report.not_stopped.entry(why.to_owned()).or_default() += 1;
+            Ok(())
+        };
+        if case.status == Status::Recovering {
+            return without("the robot was outside its limits");
+        }
+        if promise.consistency == Consistency::Free {
+            return without("consistency = \"free\" promises none");
+        }
+        let found = if is_stored {
+            stop::stored(promise, q, v, &case.tick.brake)
+        } else if promise.way == Way::Stored {
+            return broken("number of stored decelerations", 0.0, v.len() as f64, "");
+        } else {
+            stop::certified(promise, q, v)
+        };
+        match found {
+            Ok(()) => self.report.stoppable += 1,
+            Err(Fault::Unknown(why)) => return without(&why),
+            Err(fault) => return Err(fault),
+        }
+        Ok(())
+    }
+}
+
+/// The proposed state at a policy tick; of a joint with one half proposed the other follows at constant acceleration.
+fn goal(own: &Promise, tick: &Tick, q: &[f64], v: &[f64]) -> (Vec<f64>, Vec<f64>) {
+    let (mut gq, mut gv) = (q.to_vec(), v.to_vec());
+    for entry in &own.proposed {
+        match *entry {
+            Proposed::Position { at, .. } => gq[at] = tick.proposal_q[at],
+            Proposed::Velocity { dof } => gv[dof] = tick.proposal_v[dof],
+        }
+    }
+    let length = f64::from(own.policy_every) * own.period.dt;
+    for &i in &own.controllable {
+        let Some(at) = own.machine.single(i) else { continue };
+        match own.halves(i) {
+            (false, true) => gq[at] = q[at] + 0.5 * length * (v[i] + gv[i]),
+            (true, false) => gv[i] = 2.0 * (gq[at] - q[at]) / length - v[i],
+            _ => {}
+        }
+    }
+    (gq, gv)
+}
+
+/// Position and velocity at share `s` of the cubic from one state to another that takes `length` [s].
+fn cubic(s: f64, length: f64, (q0, v0): (f64, f64), (q1, v1): (f64, f64)) -> (f64, f64) {
+    let (stay, go) = (1.0 - s, s);
+    let q = stay * stay * ((1.0 + 2.0 * s) * q0 + s * length * v0) + go * go * ((3.0 - 2.0 * s) * q1 - stay * length * v1);
+    let v = 6.0 * s * stay * (q1 - q0) / length + stay * (1.0 - 3.0 * s) * v0 + go * (3.0 * s - 2.0) * v1;
+    (q, v)
+}
+
+/// The next velocities nearest to a proposal without limits: where its position would lead and where its velocity does count alike. Twice: where the
+/// two are one but for rounding, the second is the velocity.
+fn unconstrained(own: &Promise, step: &Step<'_>, (pq, pv): &(Vec<f64>, Vec<f64>)) -> (Vec<f64>, Vec<f64>) {
+    let (p, q, v) = (&own.period, step.q, step.v);
+    let (mut one, mut other) = (v.to_vec(), v.to_vec());
+    for &i in &own.controllable {
+        let by_velocity = (pv[i] - v[i]).clamp(-HUGE, HUGE);
+        let Some(at) = own.machine.single(i) else {
+            (one[i], other[i]) = (pv[i], pv[i]);
+            continue;
+        };
+        let by_position = ((pq[at] - q[at] - p.dt * v[i]) / (p.kappa * p.dt)).clamp(-HUGE, HUGE);
+        one[i] = v[i] + 0.5 * (by_position + by_velocity);
+        let belong = (p.kappa * p.dt * (by_position - by_velocity)).abs() <= 2.0 * BELONGS * q[at].abs().max(1.0);
+        other[i] = if belong { pv[i] } else { one[i] };
+    }
+    (one, other)
+}
+
+/// The distance from proposal to target: positions divided by a period, so that both are velocities. Of a joint that has what it was asked for
+/// it is rounding.
+fn distance(own: &Promise, step: &Step<'_>, (pq, pv): &(Vec<f64>, Vec<f64>), goal: &[f64]) -> f64 {
+    let p = &own.period;
+    let each = own.controllable.iter().map(|&i| {
+        let dv = step.v1[i] - pv[i];
+        let Some(at) = own.machine.single(i).filter(|_| !(goal[i] == pv[i] && dv == 0.0)) else { return 0.0 };
+        let dq = (step.q[at] + p.way(step.v[i], step.v1[i]) - pq[at]) / (p.kappa * p.dt);
+        dq * dq + dv * dv
+    });
+    each.sum::<f64>().sqrt()
+}
+
+/// The target's position is where its velocity leads.
+fn follows(promise: &Promise, step: &Step<'_>) -> Result<(), Fault> {
+    let p = &promise.period;
+    for &i in &promise.controllable {
+        let Some(at) = promise.machine.single(i) else { continue };
+        let leads = step.q[at] + p.way(step.v[i], step.v1[i]);
+        if !((step.q1[at] - leads).abs() <= CONSISTENT * leads.abs().max(1.0)) {
+            let j = &promise.limits.joints[i];
+            return broken(format!("target position of joint '{}'", j.name), step.q1[at], leads, j.length);
+        }
+    }
+    Ok(())
+}
+
+/// Something is outside its limits at the start of the tick.
+fn is_outside(promise: &mut Promise, case: &Case<'_>, whole: bool) -> bool {
+    let Promise { machine, limits, controllable, period, .. } = promise;
+    let joint = |&i: &usize| limits.joints[i].is_outside(period, machine.single(i).map(|at| case.q[at]), case.v[i], whole);
+    if controllable.iter().any(joint) {
+        return true;
+    }
+    let (q, v) = (case.q, case.v);
+    if limits.rows.iter().any(|row| row.is_of_state() && crate::rows::is_beyond(row, machine, q, v)) {
+        return true;
+    }
+    let Some(collision) = &limits.collision else { return false };
+    machine.go(q, v);
+    !matches!(collision.gap(machine, collision.margin), crate::collision::Gap::Kept)
+}
+
+/// The action is the one that leads to the target.
+fn actions(promise: &Promise, step: &Step<'_>, found: &[f64]) -> Result<(), Fault> {
+    let p = &promise.period;
+    let (lag, sag) = (0.5 * (p.dt - p.tau), (p.dt * p.dt - p.tau * p.tau) / 6.0);
+    for action in &promise.actions {
+        let (i, joint) = (action.dof, &promise.limits.joints[action.dof].name);
+        let Some(at) = promise.machine.single(i) else { continue };
+        let (v, a, tau) = (step.v[i], step.a[i], step.tau[i]);
+        let (sent, unit) = match action.sent {
+            Sent::Force => ((tau / action.gear - action.bias) / action.gain, "N m or N"),
+            Sent::Position => (step.q1[at], "rad or m"),
+            Sent::Velocity => (step.v1[i], "rad/s or m/s"),
+            Sent::Target { stiffness, damping } => {
+                (step.q[at] + lag * v + sag * a + (tau + damping * (v + lag * a)) / stiffness, "rad or m")
+            }
+        };
+        let leads = sent.max(action.range[0]).min(action.range[1]);
+        let is = found.get(action.place).copied().unwrap_or(f64::NAN);
+        let size = 1.0 + leads.abs().max(action.range[1].abs().min(1e3));
+        if !((is - leads).abs() <= ACTION * size) {
+            return broken(format!("action for joint '{joint}'"), is, leads, unit);
+        }
+    }
+    Ok(())
+}
