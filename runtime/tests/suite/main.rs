@@ -2,6 +2,8 @@
 
 #[path = "../arm/mod.rs"]
 mod arm;
+#[path = "../attack/mod.rs"]
+mod attack;
 #[path = "../toy/mod.rs"]
 mod toy;
 
@@ -12,3 +14,4 @@ mod link;
 mod log;
 mod panda;
 mod replay;
+mod verify;

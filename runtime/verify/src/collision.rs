@@ -46,7 +46,9 @@ impl Collision {
         let mut bodies = Vec::new();
         for s in &section.shapes {
             let spot = match &s.frame {
-                Some(frame) => of.machine.spot(frame).ok_or_else(|| format!("collision names frame '{frame}', which the robot does not have"))?,
+                Some(frame) => of.machine.spot(frame).ok_or_else(|| {
+                    format!("collision names frame '{frame}', which the robot does not have")
+                })?,
                 None => Spot { link: None, place: Place::HERE },
             };
             let [roll, pitch, yaw] = s.rpy;
@@ -59,19 +61,30 @@ impl Collision {
             let frame = solid.body.and_then(|k| of.robot.bodies.get(k)).map_or("universe", |body| &body.name);
             let (Some(spot), Some(shape)) = (of.machine.spot(frame), solid.shape) else { continue };
             let place = spot.place.then(&solid.placement);
-            bodies.push(Body { name: frame.to_owned(), frame: Some(frame.to_owned()), spot: Spot { place, ..spot }, shape });
+            bodies.push(Body {
+                name: frame.to_owned(),
+                frame: Some(frame.to_owned()),
+                spot: Spot { place, ..spot },
+                shape,
+            });
         }
         let called = |body: &Body, name: &str| body.name == name || body.frame.as_deref() == Some(name);
         let meet = |a: &Body, b: &Body| {
-            let listed = |[x, y]: &[String; 2]| (called(a, x) && called(b, y)) || (called(a, y) && called(b, x));
+            let listed =
+                |[x, y]: &[String; 2]| (called(a, x) && called(b, y)) || (called(a, y) && called(b, x));
             let linked = a.frame.is_some() && b.frame.is_some() && !section.adjacent;
-            let excused = (linked && of.machine.are_neighbours(&a.spot, &b.spot)) || section.ignore.iter().any(listed);
-            let moved = of.controllable.iter().any(|i| of.machine.moves(*i, &a.spot) != of.machine.moves(*i, &b.spot));
+            let excused =
+                (linked && of.machine.are_neighbours(&a.spot, &b.spot)) || section.ignore.iter().any(listed);
+            let moved = of
+                .controllable
+                .iter()
+                .any(|i| of.machine.moves(*i, &a.spot) != of.machine.moves(*i, &b.spot));
             let planes = matches!((a.shape, b.shape), (Shape::HalfSpace, Shape::HalfSpace));
             moved && !excused && !planes
         };
         let each = |a: usize| (a + 1..bodies.len()).map(move |b| [a, b]);
-        let pairs: Vec<_> = (0..bodies.len()).flat_map(each).filter(|[a, b]| meet(&bodies[*a], &bodies[*b])).collect();
+        let pairs: Vec<_> =
+            (0..bodies.len()).flat_map(each).filter(|[a, b]| meet(&bodies[*a], &bodies[*b])).collect();
         let slots = section.rows.min(pairs.len());
         Ok(Collision { bodies, pairs, margin: section.margin, slots, is_hard: section.soft.is_none() })
     }
@@ -124,7 +137,9 @@ impl Solid {
         let own = match self.shape {
             Shape::Sphere { .. } => [0.0; 3],
             Shape::Capsule { length, .. } => [0.0, 0.0, c.clamp(-0.5 * length, 0.5 * length)],
-            Shape::Box { size: [x, y, z] } => [a.clamp(-0.5 * x, 0.5 * x), b.clamp(-0.5 * y, 0.5 * y), c.clamp(-0.5 * z, 0.5 * z)],
+            Shape::Box { size: [x, y, z] } => {
+                [a.clamp(-0.5 * x, 0.5 * x), b.clamp(-0.5 * y, 0.5 * y), c.clamp(-0.5 * z, 0.5 * z)]
+            }
             Shape::Cylinder { radius, length } => {
                 let out = a.hypot(b);
                 let share = if out > radius { radius / out } else { 1.0 };
@@ -191,9 +206,14 @@ mod tests {
     /// Distances by hand.
     #[test]
     fn distances_are_those_of_plane_geometry() {
-        let cube = |x: f64, angle: f64| solid(Shape::Box { size: [1.0; 3] }, [x, 0.0, 0.0], turn(ONE[2], angle));
+        let cube =
+            |x: f64, angle: f64| solid(Shape::Box { size: [1.0; 3] }, [x, 0.0, 0.0], turn(ONE[2], angle));
         let ball = solid(Shape::Sphere { radius: 0.2 }, [2.0, 0.0, 0.0], ONE);
-        let rod = solid(Shape::Capsule { radius: 0.1, length: 1.0 }, [0.0, 0.0, 2.0], turn(ONE[0], std::f64::consts::FRAC_PI_2));
+        let rod = solid(
+            Shape::Capsule { radius: 0.1, length: 1.0 },
+            [0.0, 0.0, 2.0],
+            turn(ONE[0], std::f64::consts::FRAC_PI_2),
+        );
         let floor = solid(Shape::HalfSpace, [0.0, 0.0, -1.0], ONE);
         let drum = solid(Shape::Cylinder { radius: 0.5, length: 2.0 }, [3.0, 0.0, 0.0], ONE);
         let quarter = std::f64::consts::FRAC_PI_4;

@@ -25,13 +25,28 @@ pub(crate) enum Fault {
     Unknown(String),
 }
 
-pub(crate) fn broken<T>(what: impl Into<String>, value: f64, limit: f64, unit: impl Into<String>) -> Result<T, Fault> {
+pub(crate) fn broken<T>(
+    what: impl Into<String>,
+    value: f64,
+    limit: f64,
+    unit: impl Into<String>,
+) -> Result<T, Fault> {
     Err(Fault::Broken(Breach { what: what.into(), value, limit, unit: unit.into() }))
 }
 
 /// Beyond a limit by more than rounding.
 pub(crate) fn is_above(value: f64, limit: f64) -> bool {
-    !(value <= limit + TOLERANCE * limit.abs().max(1.0))
+    value.is_nan() || value > limit + TOLERANCE * limit.abs().max(1.0)
+}
+
+/// Within `by` of each other; what is no number is not.
+pub(crate) fn are_near(a: f64, b: f64, by: f64) -> bool {
+    (a - b).abs() <= by
+}
+
+/// The larger of two excesses; what is no number is beyond everything.
+pub(crate) fn worst([low, high]: [f64; 2]) -> f64 {
+    if low.is_nan() || high.is_nan() { f64::INFINITY } else { low.max(high) }
 }
 
 /// How a limit of a joint is kept from both sides.
@@ -70,7 +85,11 @@ impl Bounds {
         let b = self.brake(p);
         let is_late = q.is_some_and(|q| {
             sides(self, q, v, v).iter().any(|s| {
-                let way = if whole { p.stopping(s.v, b).max(p.stopping_whole(s.v.max(0.0), b)) } else { p.stopping(s.v, b) };
+                let way = if whole {
+                    p.stopping(s.v, b).max(p.stopping_whole(s.v.max(0.0), b))
+                } else {
+                    p.stopping(s.v, b)
+                };
                 s.room < 0.0 || (b.is_finite() && s.room.is_finite() && way > s.room)
             })
         });
@@ -78,7 +97,16 @@ impl Bounds {
     }
 
     /// Whether going on from `v` to `v1` breaks a limit of this kind on the side of `sign`.
-    pub(crate) fn breaks(&self, kind: &str, sign: f64, p: &Period, q: Option<f64>, v: f64, v1: f64, whole: bool) -> bool {
+    pub(crate) fn breaks(
+        &self,
+        kind: &str,
+        sign: f64,
+        p: &Period,
+        q: Option<f64>,
+        v: f64,
+        v1: f64,
+        whole: bool,
+    ) -> bool {
         let [low, high] = sides(self, q.unwrap_or(0.0), v, v1);
         let s = if sign > 0.0 { high } else { low };
         let (gone, b) = (p.way(s.v, s.v1), self.brake(p));
@@ -110,13 +138,25 @@ fn of(what: &str, joint: &str) -> String {
 ///
 /// # Errors
 /// The first that is broken. A joint that was outside at the start may brake or come back.
-pub(crate) fn joints(l: &Limits, machine: &Machine, dofs: &[usize], p: &Period, step: &Step<'_>, excused: bool) -> Result<(), Fault> {
+pub(crate) fn joints(
+    l: &Limits,
+    machine: &Machine,
+    dofs: &[usize],
+    p: &Period,
+    step: &Step<'_>,
+    excused: bool,
+) -> Result<(), Fault> {
     for &i in dofs {
         let j = &l.joints[i];
         let (v, v1, a, unit) = (step.v[i], step.v1[i], step.a[i], j.length);
         let position = machine.single(i).map(|at| (step.q[at], step.q1[at]));
         if is_above(a.abs(), j.acceleration) {
-            return broken(of("acceleration", &j.name), a, a.signum() * j.acceleration, format!("{unit}/s^2"));
+            return broken(
+                of("acceleration", &j.name),
+                a,
+                a.signum() * j.acceleration,
+                format!("{unit}/s^2"),
+            );
         }
         let was = position.map(|(q, _)| q);
         if excused && j.is_outside(p, was, v, true) {
@@ -138,7 +178,12 @@ pub(crate) fn joints(l: &Limits, machine: &Machine, dofs: &[usize], p: &Period, 
             if let Some(profile) = s.profile {
                 let fast = Bounds::profile_speed(&profile, s.sign * (profile.at - q1));
                 if is_above(s.v1, fast) {
-                    return broken(of("speed", &j.name) + " in its profile", v1, s.sign * fast, format!("{unit}/s"));
+                    return broken(
+                        of("speed", &j.name) + " in its profile",
+                        v1,
+                        s.sign * fast,
+                        format!("{unit}/s"),
+                    );
                 }
             }
         }
@@ -151,7 +196,12 @@ fn returns(j: &Bounds, p: &Period, q: Option<f64>, v: f64, v1: f64) -> Result<()
     let slower = (v.abs() - j.brake(p) * p.dt).max(0.0);
     for s in q.map(|q| sides(j, q, v, v1)).into_iter().flatten() {
         if s.room < 0.0 && is_above(s.v1, (s.v - j.brake(p) * p.dt).max(0.0)) {
-            return broken(of("speed", &j.name) + ", which is outside,", v1, s.sign * slower, format!("{}/s", j.length));
+            return broken(
+                of("speed", &j.name) + ", which is outside,",
+                v1,
+                s.sign * slower,
+                format!("{}/s", j.length),
+            );
         }
     }
     if v.abs() > j.velocity && is_above(v1.abs(), v.abs().max(j.velocity)) {
@@ -164,10 +214,21 @@ fn returns(j: &Bounds, p: &Period, q: Option<f64>, v: f64, v1: f64) -> Result<()
 ///
 /// # Errors
 /// The first that is broken. What the state at the start is beyond already, a recovering step may still be beyond.
-pub(crate) fn rows(l: &Limits, machine: &mut Machine, p: &Period, step: &Step<'_>, stored: bool, excused: bool) -> Result<(), Fault> {
+pub(crate) fn rows(
+    l: &Limits,
+    machine: &mut Machine,
+    p: &Period,
+    step: &Step<'_>,
+    stored: bool,
+    excused: bool,
+) -> Result<(), Fault> {
     for row in l.rows.iter().filter(|row| row.soft.is_none()) {
-        let asked = |m: &mut Machine| row.excess(m, p, step).into_iter().fold(f64::NEG_INFINITY, f64::max);
-        let by = if stored { row.breach(machine, p, step).unwrap_or_else(|| asked(machine)) } else { asked(machine) };
+        let asked = |m: &mut Machine| worst(row.excess(m, p, step));
+        let by = if stored {
+            row.breach(machine, p, step).unwrap_or_else(|| asked(machine))
+        } else {
+            asked(machine)
+        };
         if is_above(by, 0.0) && !(excused && row.is_of_state() && is_beyond(row, machine, step.q, step.v)) {
             let (value, limit, unit) = row.value(machine, p, step);
             return broken(format!("{} of '{}'", row.kind, row.name), value, limit, unit);

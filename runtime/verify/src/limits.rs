@@ -331,11 +331,16 @@ impl Of<'_> {
     }
 
     fn dof(&self, name: &str) -> Result<usize, String> {
-        self.robot.joints().position(|j| j.name == name).ok_or_else(|| format!("its limits name joint '{name}', which the robot does not have"))
+        self.robot
+            .joints()
+            .position(|j| j.name == name)
+            .ok_or_else(|| format!("its limits name joint '{name}', which the robot does not have"))
     }
 
     fn spot(&self, name: &str) -> Result<crate::motion::Spot, String> {
-        self.machine.spot(name).ok_or_else(|| format!("its limits name frame '{name}', which the robot does not have"))
+        self.machine
+            .spot(name)
+            .ok_or_else(|| format!("its limits name frame '{name}', which the robot does not have"))
     }
 }
 
@@ -345,7 +350,8 @@ impl Section {
     /// # Errors
     /// A clause that names what cannot be verified.
     pub(crate) fn limits(&self, of: &Of<'_>) -> Result<Limits, String> {
-        let mut joints: Vec<Bounds> = of.robot.joints().enumerate().map(|(dof, joint)| self.joint(of, dof, joint)).collect();
+        let mut joints: Vec<Bounds> =
+            of.robot.joints().enumerate().map(|(dof, joint)| self.joint(of, dof, joint)).collect();
         if let Some(profiles) = &self.velocity_profile {
             profiles.apply(of, &mut joints)?;
         }
@@ -360,7 +366,13 @@ impl Section {
                 let joint = of.robot.joints().nth(dof).ok_or("a joint is missing")?;
                 let effort = less(torque.scale * of.robot.effort(joint), &torque.margin, dof, &joint.name);
                 efforts.push((dof, effort));
-                rows.push(Row::new("torque", &joint.name, effort, torque.soft, Rule::Torque { dof, most: effort }));
+                rows.push(Row::new(
+                    "torque",
+                    &joint.name,
+                    effort,
+                    torque.soft,
+                    Rule::Torque { dof, most: effort },
+                ));
             }
         }
         self.rates(of, &mut rows);
@@ -386,7 +398,13 @@ impl Section {
         }
         for speed in &self.frame_speed {
             let (spot, limit) = (of.spot(&speed.frame)?, speed.limit - speed.margin);
-            rows.push(Row::new("frame_speed", &speed.frame, limit, speed.soft, Rule::Speed { spot, point: speed.point, most: limit }));
+            rows.push(Row::new(
+                "frame_speed",
+                &speed.frame,
+                limit,
+                speed.soft,
+                Rule::Speed { spot, point: speed.point, most: limit },
+            ));
         }
         if let Some(energy) = &self.energy {
             let most = energy.limit - energy.margin;
@@ -413,7 +431,9 @@ impl Section {
         if !of.controllable.contains(&dof) {
             return bounds;
         }
-        if let (Some(position), Range::Limited(lower, upper), Some(_)) = (&self.position, joint.range, of.machine.single(dof)) {
+        if let (Some(position), Range::Limited(lower, upper), Some(_)) =
+            (&self.position, joint.range, of.machine.single(dof))
+        {
             let margin = -less(0.0, &position.margin, dof, name);
             (bounds.lower, bounds.upper) = (lower + margin, upper - margin);
         }
@@ -423,7 +443,13 @@ impl Section {
             let scaled = match (velocity.scale, &velocity.limit) {
                 (Some(scale), _) => scale * file,
                 (None, None) => file,
-                (None, Some(_)) => if own.is_none() { file } else { none },
+                (None, Some(_)) => {
+                    if own.is_none() {
+                        file
+                    } else {
+                        none
+                    }
+                }
             };
             bounds.velocity = less(own.unwrap_or(none).min(scaled), &velocity.margin, dof, name);
         }
@@ -440,24 +466,37 @@ impl Section {
     /// Rows of single joints beside the torque: jerk, torque by speed, torque rate.
     fn rates(&self, of: &Of<'_>, rows: &mut Vec<Row>) {
         let each = |rate: &Rate| -> Vec<(usize, f64)> {
-            let value = |dof: &usize| Some((*dof, less(rate.limit.of(*dof, of.name(*dof))?, &rate.margin, *dof, of.name(*dof))));
+            let value = |dof: &usize| {
+                Some((*dof, less(rate.limit.of(*dof, of.name(*dof))?, &rate.margin, *dof, of.name(*dof))))
+            };
             of.controllable.iter().filter_map(value).collect()
         };
         if let Some(jerk) = &self.jerk {
-            let row = |(dof, most)| Row::new("jerk", of.name(dof), most, Some(jerk.soft), Rule::Jerk { dof, most });
+            let row =
+                |(dof, most)| Row::new("jerk", of.name(dof), most, Some(jerk.soft), Rule::Jerk { dof, most });
             rows.extend(each(jerk).into_iter().map(row));
         }
         if let Some(motor) = &self.torque_speed {
             for &dof in of.controllable {
                 let joint = of.name(dof);
-                if let (Some(stall), Some(no_load)) = (motor.stall.of(dof, joint), motor.no_load.of(dof, joint)) {
+                if let (Some(stall), Some(no_load)) =
+                    (motor.stall.of(dof, joint), motor.no_load.of(dof, joint))
+                {
                     let most = less(stall, &motor.margin, dof, joint);
-                    rows.push(Row::new("torque_speed", joint, most, motor.soft, Rule::TorqueSpeed { dof, most, slope: stall / no_load }));
+                    rows.push(Row::new(
+                        "torque_speed",
+                        joint,
+                        most,
+                        motor.soft,
+                        Rule::TorqueSpeed { dof, most, slope: stall / no_load },
+                    ));
                 }
             }
         }
         if let Some(rate) = &self.torque_rate {
-            let row = |(dof, most)| Row::new("torque_rate", of.name(dof), most, Some(rate.soft), Rule::TorqueRate { dof, most });
+            let row = |(dof, most)| {
+                Row::new("torque_rate", of.name(dof), most, Some(rate.soft), Rule::TorqueRate { dof, most })
+            };
             rows.extend(each(rate).into_iter().map(row));
         }
     }
@@ -499,7 +538,13 @@ impl FrameSection {
     fn rows(&self, of: &Of<'_>, rows: &mut Vec<Row>) -> Result<(), String> {
         let spot = of.spot(&self.frame)?;
         let mut plane = |name: &str, n: Vec3, offset: f64| {
-            let rule = Rule::Plane { spot, point: self.point, n, offset: offset - self.margin, braking: self.braking };
+            let rule = Rule::Plane {
+                spot,
+                point: self.point,
+                n,
+                offset: offset - self.margin,
+                braking: self.braking,
+            };
             rows.push(Row::new("frame", name, self.braking, self.soft, rule));
         };
         if let Some(half) = &self.half_space {
@@ -524,11 +569,17 @@ impl FrameSection {
 impl UserRow {
     fn row(&self, of: &Of<'_>) -> Result<Row, String> {
         let term = |(name, c): (&String, &f64)| -> Result<Term, String> {
-            let unknown = || format!("its row '{}' names '{name}', which is no state of the robot", self.name);
+            let unknown =
+                || format!("its row '{}' names '{name}', which is no state of the robot", self.name);
             let (letter, joint) = name.split_once('.').ok_or_else(unknown)?;
             let dof = of.dof(joint)?;
             match letter {
-                "q" => Ok(Term { dof, position: of.machine.single(dof).map(|iq| (iq, *c)), velocity: 0.0, acceleration: 0.0 }),
+                "q" => Ok(Term {
+                    dof,
+                    position: of.machine.single(dof).map(|iq| (iq, *c)),
+                    velocity: 0.0,
+                    acceleration: 0.0,
+                }),
                 "v" => Ok(Term { dof, position: None, velocity: *c, acceleration: 0.0 }),
                 "a" => Ok(Term { dof, position: None, velocity: 0.0, acceleration: *c }),
                 _ => Err(unknown()),
@@ -538,7 +589,8 @@ impl UserRow {
         let none = f64::INFINITY;
         let lower = self.equals.or(self.lower.map(|x| x + self.margin)).unwrap_or(-none);
         let upper = self.equals.or(self.upper.map(|x| x - self.margin)).unwrap_or(none);
-        let largest = [lower, upper].into_iter().filter(|x| x.is_finite()).fold(0.0, |most: f64, x| most.max(x.abs()));
+        let largest =
+            [lower, upper].into_iter().filter(|x| x.is_finite()).fold(0.0, |most: f64, x| most.max(x.abs()));
         let size = match self.braking {
             Some(braking) => braking,
             None if largest > 0.0 => largest,

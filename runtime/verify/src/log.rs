@@ -20,7 +20,9 @@ const WORDS: usize = 300;
 
 /// Why a log cannot be verified.
 #[derive(Debug, thiserror::Error)]
-#[error("flight log '{file}' cannot be verified: {reason}; give a file written by `nearl run --log` of this build")]
+#[error(
+    "flight log '{file}' cannot be verified: {reason}; give a file written by `nearl run --log` of this build"
+)]
 pub struct VerifyError {
     file: PathBuf,
     reason: String,
@@ -54,8 +56,10 @@ fn open(file: &Path) -> Result<(BufReader<File>, usize), String> {
 
 fn read(mut log: impl Read, length: usize) -> Result<Report, String> {
     // No part is longer than the file: a damaged length is refused before memory is taken for it.
-    let options =
-        LinearReaderOptions::default().with_skip_end_magic(true).with_validate_chunk_crcs(true).with_record_length_limit(length);
+    let options = LinearReaderOptions::default()
+        .with_skip_end_magic(true)
+        .with_validate_chunk_crcs(true)
+        .with_record_length_limit(length);
     let mut reader = LinearReader::new_with_options(options);
     let (mut session, mut topics) = (Session::default(), HashMap::new());
     while let Some(event) = reader.next_event() {
@@ -94,7 +98,9 @@ fn take(session: &mut Session, topics: &mut HashMap<u16, String>, part: Part<'_>
             Some("brief") => session.brief(parse::<Brief>("brief", &data)?.tick)?,
             Some("snapshot") => session.enter(parse::<Entry>("snapshot", &data)?),
             Some("memory") => {} // what a replay goes on from
-            other => return Err(format!("it has messages of topic {other:?}, which this build does not know")),
+            other => {
+                return Err(format!("it has messages of topic {other:?}, which this build does not know"));
+            }
         },
         _ => {}
     }

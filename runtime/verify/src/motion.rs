@@ -128,7 +128,10 @@ impl Link {
 
     /// Momentum of a twist: `(I w + m c x v, m v - m c x w)`.
     fn momentum(&self, [w, v]: Twist) -> Twist {
-        [plus(apply(&self.inertia, w), cross(self.moment, v)), minus(times(self.mass, v), cross(self.moment, w))]
+        [
+            plus(apply(&self.inertia, w), cross(self.moment, v)),
+            minus(times(self.mass, v), cross(self.moment, w)),
+        ]
     }
 }
 
@@ -150,7 +153,9 @@ impl Machine {
         for (number, body) in robot.bodies.iter().enumerate() {
             let parent = match body.parent {
                 None => fixed,
-                Some(k) => *places.get(k).ok_or_else(|| format!("body '{}' hangs on one that comes later", body.name))?,
+                Some(k) => *places
+                    .get(k)
+                    .ok_or_else(|| format!("body '{}' hangs on one that comes later", body.name))?,
             };
             let mut spot = Spot { link: parent.link, place: parent.place.then(&body.placement) };
             for joint in &body.joints {
@@ -294,7 +299,14 @@ impl Machine {
     /// ```text
     ///     M(q + h v) a + c(q + h v, v) + h (dc / dv) a + D (v + kappa T a) + K (q + h v + (T² - tau²) / 6 a - rest)
     /// ```
-    pub(crate) fn motors(&mut self, period: &crate::Period, q: &[f64], v: &[f64], a: &[f64], tau: &mut [f64]) {
+    pub(crate) fn motors(
+        &mut self,
+        period: &crate::Period,
+        q: &[f64],
+        v: &[f64],
+        a: &[f64],
+        tau: &mut [f64],
+    ) {
         let lag = 0.5 * (period.dt - period.tau);
         let sag = (period.dt * period.dt - period.tau * period.tau) / 6.0;
         let (gravity, mut ahead) = (self.gravity, std::mem::take(&mut self.ahead));
@@ -302,7 +314,8 @@ impl Machine {
         self.inverse(&ahead, v, a, gravity, tau);
         if lag > 0.0 {
             // The velocity forces are a quadratic form: half of c(v + x) - c(v - x) is its derivative along x, whatever the length of x.
-            let (mut shifted, mut still) = (std::mem::take(&mut self.shifted), std::mem::take(&mut self.still));
+            let (mut shifted, mut still) =
+                (std::mem::take(&mut self.shifted), std::mem::take(&mut self.still));
             let mut side = vec![0.0; v.len()];
             for sign in [1.0, -1.0] {
                 shifted.iter_mut().zip(v.iter().zip(a)).for_each(|(x, (v, a))| *x = v + sign * lag * a);
@@ -394,6 +407,8 @@ impl Machine {
             let first = self.links.iter().find(|l| l.body == own)?;
             Some(body(first.parent))
         };
-        body(a.link) == body(b.link) || before(a.link) == Some(body(b.link)) || before(b.link) == Some(body(a.link))
+        body(a.link) == body(b.link)
+            || before(a.link) == Some(body(b.link))
+            || before(b.link) == Some(body(a.link))
     }
 }

@@ -7,7 +7,7 @@
 //! with the multipliers of the log. What pulls the target to the proposal must be what the active rows push back, each row must push the way
 //! it can, and only where it is at its bound: where a little more would break it. The problem is convex, so this is all there is to show.
 
-use crate::limit_check::{Fault, TOLERANCE, broken};
+use crate::limit_check::{Fault, TOLERANCE, broken, worst};
 use crate::promise::Promise;
 use crate::rows::{Row, Step};
 use crate::tick::Ledger;
@@ -30,7 +30,13 @@ const CLARABEL: u32 = 2;
 /// The conditions of a tick; the largest pull that is left, as a share of what is rounding.
 ///
 /// `goals` are the unconstrained optima of `v'` (nv): the two that differ by rounding.
-pub(crate) fn confirm(promise: &mut Promise, step: &Step<'_>, goals: [&[f64]; 2], ledger: &Ledger, whole: bool) -> Result<f64, Fault> {
+pub(crate) fn confirm(
+    promise: &mut Promise,
+    step: &Step<'_>,
+    goals: [&[f64]; 2],
+    ledger: &Ledger,
+    whole: bool,
+) -> Result<f64, Fault> {
     let unknown = |why: &str| Err(Fault::Unknown(why.to_owned()));
     if ledger.active != ledger.active_rows.len() {
         return unknown("more rows were active than a record has room for");
@@ -44,7 +50,11 @@ pub(crate) fn confirm(promise: &mut Promise, step: &Step<'_>, goals: [&[f64]; 2]
         return unknown("the tick before is not known, of which jerk and torque rate speak");
     }
     let nv = step.v.len();
-    let is_of_force = ledger.active_rows.iter().filter_map(|a| limits.rows.get(a.row.checked_sub(nv)?)).any(Row::is_of_force);
+    let is_of_force = ledger
+        .active_rows
+        .iter()
+        .filter_map(|a| limits.rows.get(a.row.checked_sub(nv)?))
+        .any(Row::is_of_force);
     let forces = if is_of_force { forces(machine, period, step) } else { Vec::new() };
     let mut push = vec![0.0; nv];
     let mut size = vec![0.0f64; nv];
@@ -55,7 +65,7 @@ pub(crate) fn confirm(promise: &mut Promise, step: &Step<'_>, goals: [&[f64]; 2]
             other => return broken(format!("side '{other}' of active row {n}"), f64::NAN, 0.0, ""),
         };
         let multiplier = active.multiplier;
-        if !(multiplier >= 0.0 && multiplier.is_finite()) {
+        if multiplier.is_nan() || multiplier < 0.0 || multiplier.is_infinite() {
             return broken(format!("multiplier of active row {n}"), multiplier, 0.0, "or more");
         }
         if active.row < nv {
@@ -70,12 +80,22 @@ pub(crate) fn confirm(promise: &mut Promise, step: &Step<'_>, goals: [&[f64]; 2]
             let most = joint.acceleration.min(2.0 * joint.velocity / period.dt) * period.dt;
             let more = step.v1[i] + side * NEAR * if most.is_finite() { most } else { 1.0 };
             if multiplier > 0.0 && !joint.breaks(&active.kind, side, period, q, step.v[i], more, whole) {
-                return broken(format!("velocity after the {named}, which holds nothing there,"), step.v1[i], more, "rad/s or m/s at least");
+                return broken(
+                    format!("velocity after the {named}, which holds nothing there,"),
+                    step.v1[i],
+                    more,
+                    "rad/s or m/s at least",
+                );
             }
             continue;
         }
         let Some(row) = limits.rows.get(active.row - nv).filter(|row| row.kind == active.kind) else {
-            return broken(format!("number of the active {} row {n}", active.kind), active.row as f64, (nv + limits.rows.len()) as f64, "rows");
+            return broken(
+                format!("number of the active {} row {n}", active.kind),
+                active.row as f64,
+                (nv + limits.rows.len()) as f64,
+                "rows",
+            );
         };
         if row.kind == "collision" {
             return unknown("a row of a distance was active, whose nearest points are the projection's own");
@@ -91,19 +111,19 @@ pub(crate) fn confirm(promise: &mut Promise, step: &Step<'_>, goals: [&[f64]; 2]
     }
     all_hold(promise, step, ledger)?;
     let coarse = if matches!(ledger.rung, CLARABEL | RELAXED) { CONIC } else { ROUNDING };
-    let mut worst = 0.0f64;
+    let mut largest = 0.0f64;
     for &i in &promise.controllable {
         let left = |goal: f64| (2.0 * (step.v1[i] - goal) + push[i]).abs();
         let least = left(goals[0][i]).min(left(goals[1][i]));
         let far = 1.0 + goals[0][i].abs() + step.v[i].abs() + size[i];
-        if !(least <= 2.0 * coarse * far) {
+        if least.is_nan() || least > 2.0 * coarse * far {
             let joint = &promise.limits.joints[i];
             let what = format!("pull on joint '{}' that no active row balances", joint.name);
             return broken(what, 0.5 * least, coarse * far, format!("{}/s", joint.length));
         }
-        worst = worst.max(least / (2.0 * coarse * far));
+        largest = largest.max(least / (2.0 * coarse * far));
     }
-    Ok(worst)
+    Ok(largest)
 }
 
 /// Motor forces for a unit of each acceleration (nv x nv, by rows): they are linear in it.
@@ -122,7 +142,12 @@ fn forces(machine: &mut crate::motion::Machine, period: &crate::period::Period, 
 }
 
 /// A row pushes only at its bound; a soft one beyond it as hard as it gives way.
-fn belongs(row: &Row, (multiplier, excess, slack): (f64, f64, f64), steepest: f64, (worth, rung): (f64, u32)) -> Result<(), Fault> {
+fn belongs(
+    row: &Row,
+    (multiplier, excess, slack): (f64, f64, f64),
+    steepest: f64,
+    (worth, rung): (f64, u32),
+) -> Result<(), Fault> {
     let of = |what: &str| format!("{what} of the active {} row of '{}'", row.kind, row.name);
     let coarse = if rung == CLARABEL || rung == RELAXED { 1e-4 } else { AT };
     // What the row is away from its bound by, as a velocity.
@@ -144,8 +169,13 @@ fn belongs(row: &Row, (multiplier, excess, slack): (f64, f64, f64), steepest: f6
     let force = multiplier * row.size / worth;
     let wanted = soft.linear + soft.quadratic * excess.max(0.0);
     let near = 1e-5 * (1.0 + wanted) + soft.quadratic * coarse;
-    let is_right = if excess > coarse { (force - wanted).abs() <= near } else { is_at && force <= wanted + near };
-    if is_right || multiplier * steepest <= CONIC { Ok(()) } else { broken(of("multiplier"), force, wanted, "of its weights") }
+    let is_right =
+        if excess > coarse { (force - wanted).abs() <= near } else { is_at && force <= wanted + near };
+    if is_right || multiplier * steepest <= CONIC {
+        Ok(())
+    } else {
+        broken(of("multiplier"), force, wanted, "of its weights")
+    }
 }
 
 /// Every hard row is kept as the projection has to keep it, and a soft one that gives way is named.
@@ -153,11 +183,16 @@ fn all_hold(promise: &mut Promise, step: &Step<'_>, ledger: &Ledger) -> Result<(
     let nv = step.v.len();
     let Promise { machine, limits, period, .. } = promise;
     for (r, row) in limits.rows.iter().enumerate() {
-        let excess = row.excess(machine, period, step).into_iter().fold(f64::NEG_INFINITY, f64::max);
+        let excess = worst(row.excess(machine, period, step));
         let is_named = || ledger.active_rows.iter().any(|active| active.row == nv + r);
         let most = if row.soft.is_some() { 10.0 * TOLERANCE } else { AT.max(TOLERANCE) };
         if excess > most && (row.soft.is_none() || !is_named()) {
-            return broken(format!("{} row of '{}', which is not named as active,", row.kind, row.name), excess, 0.0, "of its size beyond its bound");
+            return broken(
+                format!("{} row of '{}', which is not named as active,", row.kind, row.name),
+                excess,
+                0.0,
+                "of its size beyond its bound",
+            );
         }
     }
     Ok(())

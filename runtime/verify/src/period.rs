@@ -113,7 +113,11 @@ mod tests {
                 }
                 most
             };
-            assert!(rest(a) <= d + 1e-12 && rest(a) > d - 0.25 * b * p.tau * p.tau, "{sub_steps} {a} {}", rest(a));
+            assert!(
+                rest(a) <= d + 1e-12 && rest(a) > d - 0.25 * b * p.tau * p.tau,
+                "{sub_steps} {a} {}",
+                rest(a)
+            );
         }
     }
 }

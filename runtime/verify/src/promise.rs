@@ -132,12 +132,15 @@ pub(crate) struct Promise {
 /// # Errors
 /// A clause.
 fn manifest(bytes: &[u8]) -> Result<String, String> {
-    let length = bytes.first_chunk::<8>().map(|b| u64::from_le_bytes(*b)).ok_or("it is shorter than a header")?;
+    let length =
+        bytes.first_chunk::<8>().map(|b| u64::from_le_bytes(*b)).ok_or("it is shorter than a header")?;
     let end = usize::try_from(length).ok().and_then(|n| n.checked_add(8));
     let header = end.and_then(|end| bytes.get(8..end)).ok_or("its header is longer than the file")?;
     let header: Value = serde_json::from_slice(header).map_err(|e| format!("its header is damaged: {e}"))?;
     let text = header["__metadata__"]["nearl"].as_str().ok_or("it has no manifest")?;
-    text.split_once('\n').map(|(_, manifest)| manifest.to_owned()).ok_or_else(|| "its manifest is cut".to_owned())
+    text.split_once('\n')
+        .map(|(_, manifest)| manifest.to_owned())
+        .ok_or_else(|| "its manifest is cut".to_owned())
 }
 
 impl Promise {
@@ -146,14 +149,16 @@ impl Promise {
     /// # Errors
     /// A clause that says what of it is not known here.
     pub(crate) fn read(bytes: &[u8], pinned: Option<&Value>) -> Result<Promise, String> {
-        let manifest: Manifest = serde_json::from_str(&manifest(bytes)?).map_err(|e| format!("its manifest is damaged: {e}"))?;
+        let manifest: Manifest =
+            serde_json::from_str(&manifest(bytes)?).map_err(|e| format!("its manifest is damaged: {e}"))?;
         Promise::of(&manifest, pinned)
     }
 
     fn of(m: &Manifest, pinned: Option<&Value>) -> Result<Promise, String> {
         let machine = Machine::new(&m.robot)?;
         let section = pinned.unwrap_or(&m.task.constraints);
-        let section = Section::deserialize(section).map_err(|e| format!("its limits hold what is not known here: {e}"))?;
+        let section = Section::deserialize(section)
+            .map_err(|e| format!("its limits hold what is not known here: {e}"))?;
         let joint = |name: &str| m.robot.joints().position(|j| j.name == name);
         let entry = |name: &String| {
             let (letter, rest) = name.split_once('.')?;
@@ -165,7 +170,8 @@ impl Promise {
             }
         };
         let state = &m.task.state;
-        let proposed: Vec<Entry> = state.propose.as_ref().unwrap_or(&state.observation).iter().filter_map(entry).collect();
+        let proposed: Vec<Entry> =
+            state.propose.as_ref().unwrap_or(&state.observation).iter().filter_map(entry).collect();
         let of = |e: &Entry| match e {
             Entry::Position { dof, .. } | Entry::Velocity { dof } => *dof,
         };
@@ -175,9 +181,18 @@ impl Promise {
         };
         controllable.sort_unstable();
         controllable.dedup();
-        let sub_steps = if m.task.time.sim_dt == 0.0 { 0 } else { (m.task.time.dt / m.task.time.sim_dt).round() as u32 };
+        let sub_steps =
+            if m.task.time.sim_dt == 0.0 { 0 } else { (m.task.time.dt / m.task.time.sim_dt).round() as u32 };
+        if sub_steps > 1000 || m.task.time.dt.is_nan() || m.task.time.dt <= 0.0 {
+            return Err(format!("its control period of {} s has {sub_steps} physics steps", m.task.time.dt));
+        }
         let period = Period::new(m.task.time.dt, sub_steps);
-        let sent: Vec<Sent> = m.robot.joints().enumerate().map(|(dof, j)| m.task.command.sent(dof, &j.name)).collect::<Result<_, _>>()?;
+        let sent: Vec<Sent> = m
+            .robot
+            .joints()
+            .enumerate()
+            .map(|(dof, j)| m.task.command.sent(dof, &j.name))
+            .collect::<Result<_, _>>()?;
         let drives: Vec<_> = sent
             .iter()
             .map(|sent| match sent {
@@ -185,7 +200,12 @@ impl Promise {
                 _ => None,
             })
             .collect();
-        let limits = section.limits(&Of { robot: &m.robot, machine: &machine, controllable: &controllable, drives: &drives })?;
+        let limits = section.limits(&Of {
+            robot: &m.robot,
+            machine: &machine,
+            controllable: &controllable,
+            drives: &drives,
+        })?;
         let (is_direct, is_analytic) = (m.policy == "direct", m.task.idm.kind == "pinocchio");
         let guards = section.guard.as_bool() == Some(true);
         let projects = match (is_direct, is_analytic) {
@@ -206,7 +226,8 @@ impl Promise {
             }
         };
         let worth = controllable.iter().map(change).fold(0.0, |most: f64, x| most.max(2.0 * x * x));
-        let consistency = if projects == Projects::Proposals { section.consistency } else { Consistency::Kinematic };
+        let consistency =
+            if projects == Projects::Proposals { section.consistency } else { Consistency::Kinematic };
         Ok(Promise {
             machine,
             limits,
@@ -251,7 +272,8 @@ impl Command {
             "velocity" => Ok(Sent::Velocity),
             "pd" => {
                 let damping = number(&self.damping).unwrap_or(0.0);
-                Ok(number(&self.stiffness).map_or(Sent::Force, |stiffness| Sent::Target { stiffness, damping }))
+                Ok(number(&self.stiffness)
+                    .map_or(Sent::Force, |stiffness| Sent::Target { stiffness, damping }))
             }
             other => Err(format!("joint '{joint}' is sent '{other}', which is not known here")),
         }
@@ -263,13 +285,26 @@ impl Manifest {
     fn actions(&self, controllable: &[usize], sent: &[Sent]) -> Result<Vec<Action>, String> {
         let motors = controllable.iter().map(|&dof| {
             let joint = self.robot.joints().nth(dof).map_or("", |j| &j.name);
-            self.robot.motors.iter().find(|m| m.joint == joint).ok_or_else(|| format!("joint '{joint}' has no motor"))
+            self.robot
+                .motors
+                .iter()
+                .find(|m| m.joint == joint)
+                .ok_or_else(|| format!("joint '{joint}' has no motor"))
         });
         let motors = motors.collect::<Result<Vec<_>, _>>()?;
         let action = |(dof, motor): (&usize, &&crate::robot::Motor)| {
             let place = motors.iter().filter(|other| other.order < motor.order).count();
-            let range = [self.action_lower.get(place), self.action_upper.get(place)].map(|end| end.copied().unwrap_or(f64::NAN));
-            Action { dof: *dof, place, sent: sent[*dof], gear: motor.gear, gain: motor.gain, bias: motor.bias[0], range }
+            let range = [self.action_lower.get(place), self.action_upper.get(place)]
+                .map(|end| end.copied().unwrap_or(f64::NAN));
+            Action {
+                dof: *dof,
+                place,
+                sent: sent[*dof],
+                gear: motor.gear,
+                gain: motor.gain,
+                bias: motor.bias[0],
+                range,
+            }
         };
         Ok(controllable.iter().zip(&motors).map(action).collect())
     }

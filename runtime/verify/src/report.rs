@@ -83,7 +83,11 @@ impl Report {
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{} ticks, {} of them without an action", self.ticks, self.idle)?;
-        writeln!(f, "  limits held in {}; {} of these were outside at their start, and came back or braked", self.verified, self.recovering)?;
+        writeln!(
+            f,
+            "  limits held in {}; {} of these were outside at their start, and came back or braked",
+            self.verified, self.recovering
+        )?;
         writeln!(f, "  the target was the nearest allowed state in {}", self.optimal)?;
         for (reason, count) in &self.not_compared {
             writeln!(f, "    not compared in {count}: {reason}")?;

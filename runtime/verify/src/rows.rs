@@ -2,6 +2,7 @@
 
 use serde::Deserialize;
 
+use crate::limit_check::worst;
 use crate::motion::{Machine, Spot};
 use crate::period::Period;
 use crate::space::{Vec3, dot, minus, norm, times};
@@ -100,7 +101,10 @@ impl Row {
 
     /// Whether motor forces are in it.
     pub(crate) fn is_of_force(&self) -> bool {
-        matches!(self.rule, Rule::Torque { .. } | Rule::TorqueSpeed { .. } | Rule::TorqueRate { .. } | Rule::Drive { .. })
+        matches!(
+            self.rule,
+            Rule::Torque { .. } | Rule::TorqueSpeed { .. } | Rule::TorqueRate { .. } | Rule::Drive { .. }
+        )
     }
 
     /// Whether it speaks of the tick before.
@@ -117,10 +121,14 @@ impl Row {
     pub(crate) fn value(&self, m: &mut Machine, p: &Period, step: &Step<'_>) -> (f64, f64, &'static str) {
         match &self.rule {
             Rule::Torque { dof, most } => (step.tau[*dof], *most, "N m or N"),
-            Rule::TorqueSpeed { dof, most, slope } => (step.tau[*dof] + slope * step.v1[*dof], *most, "N m or N"),
+            Rule::TorqueSpeed { dof, most, slope } => {
+                (step.tau[*dof] + slope * step.v1[*dof], *most, "N m or N")
+            }
             Rule::Drive { most, .. } => (self.excess(m, p, step)[1] * most + most, *most, "N m or N"),
             Rule::Jerk { most, .. } => (self.excess(m, p, step)[1] * most + most, *most, "rad/s^3 or m/s^3"),
-            Rule::TorqueRate { most, .. } => (self.excess(m, p, step)[1] * most + most, *most, "N m/s or N/s"),
+            Rule::TorqueRate { most, .. } => {
+                (self.excess(m, p, step)[1] * most + most, *most, "N m/s or N/s")
+            }
             Rule::Plane { spot, point, n, offset, .. } => {
                 m.go(step.q1, step.v1);
                 (dot(*n, m.place(spot).point(*point)), *offset, "m")
@@ -155,7 +163,9 @@ impl Row {
         match &self.rule {
             Rule::Torque { dof, most } => both(step.tau[*dof], *most),
             Rule::TorqueSpeed { dof, most, slope } => both(step.tau[*dof] + slope * step.v1[*dof], *most),
-            Rule::Jerk { dof, most } => step.before.map_or([none; 2], |(a, _)| both((step.a[*dof] - a[*dof]) / p.dt, *most)),
+            Rule::Jerk { dof, most } => {
+                step.before.map_or([none; 2], |(a, _)| both((step.a[*dof] - a[*dof]) / p.dt, *most))
+            }
             Rule::TorqueRate { dof, most } => {
                 step.before.map_or([none; 2], |(_, tau)| both((step.tau[*dof] - tau[*dof]) / p.dt, *most))
             }
@@ -183,7 +193,9 @@ impl Row {
                     let weight = |t: &Term| t.position.map_or(0.0, |(_, c)| c);
                     let s = sum(&|t| t.position.map_or(0.0, |(iq, c)| c * step.q[iq]));
                     let (w, a) = (sum(&|t| weight(t) * step.v[t.dof]), sum(&|t| weight(t) * step.a[t.dof]));
-                    let beyond = |d: f64, w: f64, a: f64| if d.is_finite() { (a - in_front(p, d, w, *b)) / b } else { none };
+                    let beyond = |d: f64, w: f64, a: f64| {
+                        if d.is_finite() { (a - in_front(p, d, w, *b)) / b } else { none }
+                    };
                     [beyond(s - lower, -w, -a), beyond(upper - s, w, a)]
                 }
             },
@@ -225,7 +237,7 @@ impl Row {
                 (value - upper).max(lower - value) / self.size
             }
             Rule::Pair => return None,
-            _ => self.excess(m, p, step).into_iter().fold(f64::NEG_INFINITY, f64::max),
+            _ => worst(self.excess(m, p, step)),
         })
     }
 
@@ -234,7 +246,8 @@ impl Row {
     pub(crate) fn slope(&self, m: &mut Machine, p: &Period, step: &Step<'_>, forces: &[f64]) -> Vec<f64> {
         let nv = step.v.len();
         let mut out = vec![0.0; nv];
-        let mut force = |dof: usize, scale: f64| (0..nv).for_each(|j| out[j] = scale * forces[dof * nv + j] / p.dt);
+        let mut force =
+            |dof: usize, scale: f64| (0..nv).for_each(|j| out[j] = scale * forces[dof * nv + j] / p.dt);
         match &self.rule {
             Rule::Torque { dof, .. } => force(*dof, 1.0),
             Rule::TorqueRate { dof, .. } => force(*dof, 1.0 / p.dt),
@@ -256,7 +269,8 @@ impl Row {
             Rule::User { terms, braking, .. } => {
                 for t in terms {
                     let by_position = if braking.is_some() { 1.0 / p.dt } else { p.kappa * p.dt };
-                    out[t.dof] += t.position.map_or(0.0, |(_, c)| c * by_position) + t.velocity + t.acceleration / p.dt;
+                    out[t.dof] +=
+                        t.position.map_or(0.0, |(_, c)| c * by_position) + t.velocity + t.acceleration / p.dt;
                 }
             }
             Rule::Speed { spot, point, .. } => {
@@ -265,7 +279,13 @@ impl Row {
                 m.go(&ahead, step.v1);
                 let at = m.place(spot).point(*point);
                 let velocity = m.point(spot, at).velocity;
-                m.add_row(spot, at, times(1.0 / norm(velocity).max(f64::MIN_POSITIVE), velocity), 1.0, &mut out);
+                m.add_row(
+                    spot,
+                    at,
+                    times(1.0 / norm(velocity).max(f64::MIN_POSITIVE), velocity),
+                    1.0,
+                    &mut out,
+                );
             }
             Rule::Energy { .. } => {
                 let mut ahead = Vec::new();

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use serde_json::Value;
 
-use crate::limit_check::{self, Breach, Fault, broken};
+use crate::limit_check::{self, Breach, Fault, are_near, broken};
 use crate::limits::{Consistency, Way};
 use crate::optimum;
 use crate::promise::{Entry as Proposed, Projects, Promise, Sent};
@@ -89,7 +89,9 @@ impl Session {
         if self.at == 0 {
             let schema = self.facts.get("schema").ok_or("its metadata has no `schema`")?;
             if schema != SCHEMA {
-                return Err(format!("its schema is {schema}, this build reads {SCHEMA}; use the build that wrote it"));
+                return Err(format!(
+                    "its schema is {schema}, this build reads {SCHEMA}; use the build that wrote it"
+                ));
             }
         }
         if tick <= self.at {
@@ -152,25 +154,48 @@ impl Session {
     /// What snapshot `id` promises, and what the loop pinned.
     fn promise(&self, id: u64) -> Result<(Promise, Option<Promise>), String> {
         let entry = self.entries.get(&id).ok_or_else(|| format!("snapshot number {id} is not in it"))?;
-        let bytes = self.attachments.get(&entry.digest).ok_or_else(|| format!("snapshot number {id} is not in it"))?;
+        let bytes = self
+            .attachments
+            .get(&entry.digest)
+            .ok_or_else(|| format!("snapshot number {id} is not in it"))?;
         let of = |e: String| format!("snapshot number {id}: {e}");
         let own = Promise::read(bytes, None).map_err(of)?;
-        let names: Vec<&str> = own.limits.joints.iter().map(|j| j.name.as_str()).chain(own.limits.rows.iter().map(|r| r.name.as_str())).collect();
-        if own.projects != Projects::Nothing && own.consistency == Consistency::Kinematic && names != entry.rows {
-            return Err(format!("the rows of snapshot number {id} are {:?} in the log, and {names:?} by its limits", entry.rows));
+        let names: Vec<&str> = own
+            .limits
+            .joints
+            .iter()
+            .map(|j| j.name.as_str())
+            .chain(own.limits.rows.iter().map(|r| r.name.as_str()))
+            .collect();
+        if own.projects != Projects::Nothing
+            && own.consistency == Consistency::Kinematic
+            && names != entry.rows
+        {
+            return Err(format!(
+                "the rows of snapshot number {id} are {:?} in the log, and {names:?} by its limits",
+                entry.rows
+            ));
         }
         let pinned = match self.facts.get("limits") {
             None => None,
             Some(text) => {
-                let pinned: Value = serde_json::from_str(text).map_err(|e| format!("its metadata `limits` is damaged: {e}"))?;
-                (pinned != Promise::stated(bytes)?).then(|| Promise::read(bytes, Some(&pinned))).transpose().map_err(of)?
+                let pinned: Value = serde_json::from_str(text)
+                    .map_err(|e| format!("its metadata `limits` is damaged: {e}"))?;
+                (pinned != Promise::stated(bytes)?)
+                    .then(|| Promise::read(bytes, Some(&pinned)))
+                    .transpose()
+                    .map_err(of)?
             }
         };
         Ok((own, pinned))
     }
 
     /// Confirms a tick's claims; what the next one is told of it.
-    fn judge(&mut self, (own, pinned): &mut (Promise, Option<Promise>), tick: &Tick) -> Result<Option<(Vec<f64>, Vec<f64>)>, Fault> {
+    fn judge(
+        &mut self,
+        (own, pinned): &mut (Promise, Option<Promise>),
+        tick: &Tick,
+    ) -> Result<Option<(Vec<f64>, Vec<f64>)>, Fault> {
         let unknown = |why: &str| Err(Fault::Unknown(why.to_owned()));
         let (nq, nv) = (own.machine.nq(), own.machine.nv());
         for (what, found, length) in [
@@ -186,7 +211,12 @@ impl Session {
             }
         }
         let Some(status) = tick.ledger.status() else {
-            return broken("ledger.status", f64::from(tick.ledger.status), 0.0, "as the list in the metadata has it");
+            return broken(
+                "ledger.status",
+                f64::from(tick.ledger.status),
+                0.0,
+                "as the list in the metadata has it",
+            );
         };
         if own.projects == Projects::Nothing || status == Status::NotProjected {
             return unknown("their policy gives actions that nothing was projected for");
@@ -202,8 +232,12 @@ impl Session {
         let (q, v) = match (tick.sensed.as_str(), &self.past) {
             ("measured", _) => (tick.state.q.clone(), tick.state.v.clone()),
             ("predicted", Some(past)) => past.target.clone(),
-            ("predicted", None) => return unknown("they acted on a state predicted from a tick that the log does not have"),
-            (other, _) => return broken(format!("action, while the state is '{other}',"), tick.action[0], 0.0, ""),
+            ("predicted", None) => {
+                return unknown("they acted on a state predicted from a tick that the log does not have");
+            }
+            (other, _) => {
+                return broken(format!("action, while the state is '{other}',"), tick.action[0], 0.0, "");
+            }
         };
         finite("state.q", &q)?;
         finite("state.v", &v)?;
@@ -225,7 +259,13 @@ impl Session {
     }
 
     /// What was projected in this tick, where it is known.
-    fn proposal(&self, own: &Promise, tick: &Tick, by_policy: bool, (q, v): (&[f64], &[f64])) -> Result<(Vec<f64>, Vec<f64>), String> {
+    fn proposal(
+        &self,
+        own: &Promise,
+        tick: &Tick,
+        by_policy: bool,
+        (q, v): (&[f64], &[f64]),
+    ) -> Result<(Vec<f64>, Vec<f64>), String> {
         let no = |why: &str| Err(why.to_owned());
         if own.consistency == Consistency::Free {
             return no("positions and velocities are clamped apart (consistency = \"free\")");
@@ -250,9 +290,15 @@ impl Session {
         }
         if own.projects == Projects::Actions {
             let all = own.controllable.iter().all(|&i| own.halves(i) == (true, true));
-            return if all { Ok((tick.proposal_q.clone(), tick.proposal_v.clone())) } else { no("not every joint's position and velocity is proposed") };
+            return if all {
+                Ok((tick.proposal_q.clone(), tick.proposal_v.clone()))
+            } else {
+                no("not every joint's position and velocity is proposed")
+            };
         }
-        let Some(Begun { start, goal }) = &self.begun else { return no("the tick in which their policy ran is not in the log") };
+        let Some(Begun { start, goal }) = &self.begun else {
+            return no("the tick in which their policy ran is not in the log");
+        };
         let is_held = tick.proposal_age_ns.is_some() && tick.proposed.is_none();
         if is_held && own.controllable.iter().any(|&i| own.halves(i) != (true, true)) {
             return no("a proposal of another process was held, of which the log has one half");
@@ -270,13 +316,19 @@ impl Session {
     }
 
     /// Limits, action, optimum and way to stop of one promise.
-    fn confirm(&mut self, promise: &mut Promise, case: &Case<'_>) -> Result<Option<(Vec<f64>, Vec<f64>)>, Fault> {
+    fn confirm(
+        &mut self,
+        promise: &mut Promise,
+        case: &Case<'_>,
+    ) -> Result<Option<(Vec<f64>, Vec<f64>)>, Fault> {
         let (tick, p, nv) = (case.tick, promise.period, case.v.len());
         let a: Vec<f64> = (0..nv).map(|i| (tick.target_v[i] - case.v[i]) / p.dt).collect();
         let mut tau = vec![0.0; nv];
         promise.machine.motors(&p, case.q, case.v, &a, &mut tau);
-        let before = self.past.as_ref().and_then(|past| past.told.as_ref()).map(|(a, tau)| (&a[..], &tau[..]));
-        let step = Step { q: case.q, v: case.v, q1: &tick.target_q, v1: &tick.target_v, a: &a, tau: &tau, before };
+        let told = self.past.as_ref().and_then(|past| past.told.clone());
+        let before = told.as_ref().map(|(a, tau)| (&a[..], &tau[..]));
+        let step =
+            Step { q: case.q, v: case.v, q1: &tick.target_q, v1: &tick.target_v, a: &a, tau: &tau, before };
         let is_stored = !tick.brake.is_empty();
         let excused = case.status == Status::Recovering;
         if promise.consistency == Consistency::Kinematic {
@@ -288,10 +340,20 @@ impl Session {
             return Ok(None);
         }
         if excused && !is_outside(promise, case, is_stored) {
-            return broken("joints, frames, bodies and rows outside at the start of a tick that says it is recovering", 0.0, 1.0, "or more");
+            return broken(
+                "joints, frames, bodies and rows outside at the start of a tick that says it is recovering",
+                0.0,
+                1.0,
+                "or more",
+            );
         }
         if tick.ledger.target_violations > 0 && !excused && case.status != Status::Braked {
-            return broken("ledger.target_violations of a target within all limits", f64::from(tick.ledger.target_violations), 0.0, "");
+            return broken(
+                "ledger.target_violations of a target within all limits",
+                f64::from(tick.ledger.target_violations),
+                0.0,
+                "",
+            );
         }
         actions(promise, &step, &tick.action)?;
         self.optimum(promise, case, &step, is_stored)?;
@@ -299,14 +361,22 @@ impl Session {
         Ok(Some((a, tau)))
     }
 
-    fn optimum(&mut self, promise: &mut Promise, case: &Case<'_>, step: &Step<'_>, is_stored: bool) -> Result<(), Fault> {
+    fn optimum(
+        &mut self,
+        promise: &mut Promise,
+        case: &Case<'_>,
+        step: &Step<'_>,
+        is_stored: bool,
+    ) -> Result<(), Fault> {
         let mut without = |why: &str| {
             *self.report.not_compared.entry(why.to_owned()).or_default() += 1;
             Ok(())
         };
         match case.status {
             Status::Recovering => return without("the robot was outside its limits"),
-            Status::Slowed => return without("no way to stop was found from the nearest allowed state (slowed)"),
+            Status::Slowed => {
+                return without("no way to stop was found from the nearest allowed state (slowed)");
+            }
             Status::Braked | Status::Refused => return without("the proposal was not used: braked"),
             _ => {}
         }
@@ -330,7 +400,7 @@ impl Session {
         }
         let said = case.tick.ledger.moved;
         let found = distance(promise, step, proposal, &other);
-        if !promise.limits_actions && !((said - found).abs() <= 1e-6 * (1e-3 + found)) {
+        if !promise.limits_actions && !are_near(said, found, 1e-6 * (1e-3 + found)) {
             return broken("ledger.moved", said, found, "rad/s or m/s");
         }
         Ok(())
@@ -388,7 +458,8 @@ fn goal(own: &Promise, tick: &Tick, q: &[f64], v: &[f64]) -> (Vec<f64>, Vec<f64>
 /// Position and velocity at share `s` of the cubic from one state to another that takes `length` [s].
 fn cubic(s: f64, length: f64, (q0, v0): (f64, f64), (q1, v1): (f64, f64)) -> (f64, f64) {
     let (stay, go) = (1.0 - s, s);
-    let q = stay * stay * ((1.0 + 2.0 * s) * q0 + s * length * v0) + go * go * ((3.0 - 2.0 * s) * q1 - stay * length * v1);
+    let q = stay * stay * ((1.0 + 2.0 * s) * q0 + s * length * v0)
+        + go * go * ((3.0 - 2.0 * s) * q1 - stay * length * v1);
     let v = 6.0 * s * stay * (q1 - q0) / length + stay * (1.0 - 3.0 * s) * v0 + go * (3.0 * s - 2.0) * v1;
     (q, v)
 }
@@ -406,7 +477,8 @@ fn unconstrained(own: &Promise, step: &Step<'_>, (pq, pv): &(Vec<f64>, Vec<f64>)
         };
         let by_position = ((pq[at] - q[at] - p.dt * v[i]) / (p.kappa * p.dt)).clamp(-HUGE, HUGE);
         one[i] = v[i] + 0.5 * (by_position + by_velocity);
-        let belong = (p.kappa * p.dt * (by_position - by_velocity)).abs() <= 2.0 * BELONGS * q[at].abs().max(1.0);
+        let belong =
+            (p.kappa * p.dt * (by_position - by_velocity)).abs() <= 2.0 * BELONGS * q[at].abs().max(1.0);
         other[i] = if belong { pv[i] } else { one[i] };
     }
     (one, other)
@@ -431,7 +503,7 @@ fn follows(promise: &Promise, step: &Step<'_>) -> Result<(), Fault> {
     for &i in &promise.controllable {
         let Some(at) = promise.machine.single(i) else { continue };
         let leads = step.q[at] + p.way(step.v[i], step.v1[i]);
-        if !((step.q1[at] - leads).abs() <= CONSISTENT * leads.abs().max(1.0)) {
+        if !are_near(step.q1[at], leads, CONSISTENT * leads.abs().max(1.0)) {
             let j = &promise.limits.joints[i];
             return broken(format!("target position of joint '{}'", j.name), step.q1[at], leads, j.length);
         }
@@ -442,7 +514,9 @@ fn follows(promise: &Promise, step: &Step<'_>) -> Result<(), Fault> {
 /// Something is outside its limits at the start of the tick.
 fn is_outside(promise: &mut Promise, case: &Case<'_>, whole: bool) -> bool {
     let Promise { machine, limits, controllable, period, .. } = promise;
-    let joint = |&i: &usize| limits.joints[i].is_outside(period, machine.single(i).map(|at| case.q[at]), case.v[i], whole);
+    let joint = |&i: &usize| {
+        limits.joints[i].is_outside(period, machine.single(i).map(|at| case.q[at]), case.v[i], whole)
+    };
     if controllable.iter().any(joint) {
         return true;
     }
@@ -474,7 +548,7 @@ fn actions(promise: &Promise, step: &Step<'_>, found: &[f64]) -> Result<(), Faul
         let leads = sent.max(action.range[0]).min(action.range[1]);
         let is = found.get(action.place).copied().unwrap_or(f64::NAN);
         let size = 1.0 + leads.abs().max(action.range[1].abs().min(1e3));
-        if !((is - leads).abs() <= ACTION * size) {
+        if !are_near(is, leads, ACTION * size) {
             return broken(format!("action for joint '{joint}'"), is, leads, unit);
         }
     }

@@ -20,8 +20,13 @@ pub(crate) fn stored(promise: &mut Promise, q: &[f64], v: &[f64], brake: &[f64])
     let p = promise.period;
     for &i in &promise.controllable {
         let j = &promise.limits.joints[i];
-        if is_above(brake[i], j.brake(&p)) || !(brake[i] > 0.0 || v[i] == 0.0) {
-            return broken(format!("stored deceleration of joint '{}'", j.name), brake[i], j.brake(&p), format!("{}/s^2", j.length));
+        if is_above(brake[i], j.brake(&p)) || (v[i] != 0.0 && brake[i] <= 0.0) {
+            return broken(
+                format!("stored deceleration of joint '{}'", j.name),
+                brake[i],
+                j.brake(&p),
+                format!("{}/s^2", j.length),
+            );
         }
     }
     run(promise, q, v, brake, true)
@@ -36,13 +41,23 @@ pub(crate) fn certified(promise: &mut Promise, q: &[f64], v: &[f64]) -> Result<(
         let j = &promise.limits.joints[i];
         brake[i] = j.brake(&p);
         if brake[i].is_infinite() {
-            return Err(Fault::Unknown(format!("joint '{}' has no acceleration limit to brake with", j.name)));
+            return Err(Fault::Unknown(format!(
+                "joint '{}' has no acceleration limit to brake with",
+                j.name
+            )));
         }
         let Some(at) = promise.machine.single(i) else { continue };
-        for (speed, room, limit, sign) in [(v[i], j.upper - q[at], j.upper, 1.0), (-v[i], q[at] - j.lower, j.lower, -1.0)] {
+        for (speed, room, limit, sign) in
+            [(v[i], j.upper - q[at], j.upper, 1.0), (-v[i], q[at] - j.lower, j.lower, -1.0)]
+        {
             let way = p.stopping(speed, brake[i]);
             if room.is_finite() && is_above(way, room) {
-                return broken(format!("position of joint '{}' where it can stop", j.name), q[at] + sign * way, limit, j.length);
+                return broken(
+                    format!("position of joint '{}' where it can stop", j.name),
+                    q[at] + sign * way,
+                    limit,
+                    j.length,
+                );
             }
         }
     }
@@ -86,7 +101,8 @@ fn run(promise: &mut Promise, q: &[f64], v: &[f64], brake: &[f64], positions: bo
 fn joints(promise: &Promise, q: &[f64], v: &[f64], period: u32) -> Result<(), Fault> {
     for &i in &promise.controllable {
         let j = &promise.limits.joints[i];
-        let of = |what: &str| format!("{what} of joint '{}' in period {} of its way to stop", j.name, period + 1);
+        let of =
+            |what: &str| format!("{what} of joint '{}' in period {} of its way to stop", j.name, period + 1);
         if is_above(v[i].abs(), j.velocity) {
             return broken(of("speed"), v[i], v[i].signum() * j.velocity, format!("{}/s", j.length));
         }
@@ -110,13 +126,23 @@ fn rows(promise: &mut Promise, step: &Step<'_>, period: u32) -> Result<(), Fault
     for row in limits.rows.iter().filter(|row| row.soft.is_none()) {
         if row.breach(machine, p, step).is_some_and(|by| is_above(by, 0.0)) {
             let (value, limit, unit) = row.value(machine, p, step);
-            return broken(format!("{} of '{}' in period {} of the way to stop", row.kind, row.name, period + 1), value, limit, unit);
+            return broken(
+                format!("{} of '{}' in period {} of the way to stop", row.kind, row.name, period + 1),
+                value,
+                limit,
+                unit,
+            );
         }
     }
     let Some(collision) = limits.collision.as_ref().filter(|c| c.is_hard) else { return Ok(()) };
     machine.go(step.q1, step.v1);
     match collision.gap(machine, collision.margin - TOLERANCE) {
-        Gap::Near(pair, gap) => broken(format!("distance of {pair} in period {} of the way to stop", period + 1), gap, collision.margin, "m"),
+        Gap::Near(pair, gap) => broken(
+            format!("distance of {pair} in period {} of the way to stop", period + 1),
+            gap,
+            collision.margin,
+            "m",
+        ),
         Gap::Open(pair) => Err(Fault::Unknown(format!("the distance of {pair} could not be bounded"))),
         Gap::Kept => Ok(()),
     }
