@@ -1,0 +1,174 @@
+//! A robot whose policy is noise, on a plant that is the model itself, recorded by a real loop.
+#![allow(dead_code, unreachable_pub)] // each program uses a part of it
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use nearl_constraints::drive::Held;
+use nearl_constraints::{Model, PeriodDynamics};
+use nearl_runtime::link::*;
+use nearl_runtime::net::{Activation, Dense, DenseLayer};
+use nearl_runtime::normaliser::Normaliser;
+use nearl_runtime::rt::*;
+use nearl_runtime::snapshot::FORMAT;
+use nearl_runtime::{Manifest, Networks, PolicyKind, Snapshot, Task};
+
+/// What is attacked, and for how long.
+#[derive(Clone)]
+pub struct Attack {
+    /// Robot (URDF).
+    pub urdf: String,
+    /// Where it starts (nq).
+    pub start: Vec<f64>,
+    /// `[constraints]`, as TOML without its heading.
+    pub constraints: String,
+    /// Control period [s].
+    pub dt: f64,
+    /// Physics steps in it; 0 for constant acceleration.
+    pub sub_steps: u32,
+    pub policy_every: usize,
+    pub seed: u64,
+    pub ticks: u64,
+    /// Time that the plant takes to measure: a lockstep loop is faster than its log.
+    pub pause: Duration,
+}
+
+fn weights(seed: u64, n: usize) -> Vec<f32> {
+    let mut x = seed;
+    let mut next = || {
+        x = x.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (x >> 40) as f32 / (1 << 23) as f32 - 1.0
+    };
+    (0..n).map(|_| next()).collect()
+}
+
+impl Attack {
+    pub fn model(&self) -> Model {
+        Model::from_urdf_text(&self.urdf).unwrap()
+    }
+
+    /// A snapshot of random weights and a wide spread, `version` of them.
+    pub fn snapshot(&self, version: u64) -> Snapshot {
+        let model = self.model();
+        let names =
+            |letter: &'static str| model.joints().iter().map(move |j| format!("\"{letter}.{}\"", j.name));
+        let state = names("q").chain(names("v")).collect::<Vec<_>>().join(", ");
+        let sim_dt = if self.sub_steps == 0 { 0.0 } else { self.dt / f64::from(self.sub_steps) };
+        let text = format!(
+            "name = \"attack\"\n[model]\nurdf = \"robot.urdf\"\n[time]\ndt = {:?}\nsim_dt = {sim_dt:?}\npolicy_every = {}\n[state]\nobservation = [{state}]\n\
+             [idm]\nkind = \"pinocchio\"\n[constraints]\n{}\n",
+            self.dt, self.policy_every, self.constraints
+        );
+        let task = Task::parse("attack.toml", &text, &[]).unwrap();
+        let effort = model.effort_limit().to_vec();
+        let manifest = Manifest {
+            format: FORMAT,
+            task,
+            robot: model.description().clone(),
+            simulation: None,
+            algo: "random".into(),
+            policy: PolicyKind::Stochastic,
+            activation: Activation::default(),
+            functions: Vec::new(),
+            version,
+            steps: 0,
+            action_lower: effort.iter().map(|e| -e).collect(),
+            action_upper: effort,
+        };
+        let n = 2 * model.nv();
+        let seed = self.seed.wrapping_mul(1000).wrapping_add(version);
+        let layer = |seed, n_in, n_out| DenseLayer {
+            n_in,
+            n_out,
+            weight: weights(seed, n_in * n_out),
+            bias: weights(seed + 1, n_out),
+        };
+        let policy = Dense { layers: vec![layer(seed, n, 16), layer(seed + 7, 16, n)], skip: None };
+        let normaliser = Normaliser::new(vec![0.0; n], vec![1.0; n], vec![0.5; n]);
+        Snapshot {
+            manifest,
+            networks: Networks { normaliser, policy, policy_log_std: vec![0.0; n], idm: None },
+        }
+    }
+
+    /// Records a flight into `folder` and returns its log.
+    pub fn record(&self, name: &RobotName, folder: &Path) -> (PathBuf, RunReport) {
+        let first = self.snapshot(1);
+        let file = folder.join("attack.safetensors");
+        first.save(&file).unwrap();
+        let log = folder.join("attack.mcap");
+        let link = PlantLink::open(name, &describe(&first.manifest, true).unwrap()).unwrap();
+        let stop = Stop::new();
+        let plant = std::thread::spawn({
+            let (stop, mut twin, dt) = (stop.clone(), Twin::new(self), self.dt);
+            move || PlantRunner::new(link, PlantSettings::lockstep(dt)).unwrap().run(&mut twin, &stop)
+        });
+        let settings = RunSettings {
+            log: Some(log.clone()),
+            ticks: Some(self.ticks),
+            explore: Some(self.seed),
+            thread: ThreadSettings { priority: None, cpu: None, lock_memory: false },
+            ..RunSettings::default()
+        };
+        let report = run(&settings, &file, name, &Stop::new()).unwrap();
+        stop.request();
+        plant.join().unwrap();
+        (log, report)
+    }
+}
+
+/// The plant that the model says it is: forces are held for a period.
+struct Twin {
+    dynamics: PeriodDynamics,
+    q: Vec<f64>,
+    v: Vec<f64>,
+    a: Vec<f64>,
+    held: Vec<Held>,
+    pause: Duration,
+}
+
+impl Twin {
+    fn new(attack: &Attack) -> Twin {
+        let model = attack.model();
+        let all: Vec<usize> = (0..model.nv()).collect();
+        let period = nearl_constraints::Period::new(attack.dt, attack.sub_steps);
+        let zero = vec![0.0; model.nv()];
+        Twin {
+            dynamics: PeriodDynamics::new(&model, &all, period),
+            q: attack.start.clone(),
+            v: zero.clone(),
+            a: zero,
+            held: vec![Held::Force(0.0); model.nv()],
+            pause: attack.pause,
+        }
+    }
+}
+
+impl Plant for Twin {
+    fn observe(&mut self, state: &mut StateMessage) {
+        std::thread::sleep(self.pause);
+        let n = self.v.len() as u32;
+        (state.nq, state.nv, state.nu, state.n_obs) = (n, n, n, 2 * n);
+        state.q_mut().copy_from_slice(&self.q);
+        state.v_mut().copy_from_slice(&self.v);
+        let n = self.v.len();
+        state.obs_mut()[..n].copy_from_slice(&self.q);
+        state.obs_mut()[n..].copy_from_slice(&self.v);
+    }
+
+    fn apply(&mut self, action: &ActionMessage) {
+        self.held.iter_mut().zip(action.action()).for_each(|(held, tau)| *held = Held::Force(*tau));
+        let zero = vec![0.0; self.v.len()];
+        self.dynamics.update(&self.q, &self.v, &zero);
+        self.dynamics.accelerate(&self.held, &mut self.a);
+        let (dt, kappa) = (self.dynamics.period().dt, self.dynamics.period().kappa);
+        for i in 0..self.v.len() {
+            self.q[i] += dt * self.v[i] + kappa * dt * dt * self.a[i];
+            self.v[i] += dt * self.a[i];
+        }
+    }
+
+    fn brake(&mut self) {
+        self.v.fill(0.0);
+    }
+}

@@ -1,0 +1,452 @@
+//! What a flight log says is confirmed from the log alone, and a log that was changed is found out.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use nearl_runtime::Snapshot;
+use nearl_verify::{Report, verify};
+use serde_json::{Value, json};
+
+use crate::arm::Scratch;
+use crate::attack::Attack;
+use crate::toy::Name;
+
+const PANDA: &str = include_str!("../../../examples/robots/panda/panda.urdf");
+
+/// Joints, torque, and what ties joints together.
+const LIMITS: &str = "position = { margin = 0.01 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 10.0 }\ntorque = { scale = 0.6 }\nbraking = \"stored\"";
+
+fn attack(constraints: &str, dt: f64, sub_steps: u32, policy_every: usize) -> Attack {
+    Attack {
+        urdf: PANDA.into(),
+        start: vec![0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8],
+        constraints: constraints.into(),
+        dt,
+        sub_steps,
+        policy_every,
+        seed: 5,
+        ticks: 1500,
+        pause: Duration::from_micros(300),
+    }
+}
+
+fn record(test: &str, attack: &Attack) -> (Scratch, PathBuf) {
+    let folder = Scratch::new(test);
+    let (log, report) = attack.record(&Name::new(test).0, &folder.0);
+    assert_eq!((report.log_drops, report.log_error.as_deref()), (0, None), "{report}");
+    (folder, log)
+}
+
+/// Changes a message of a topic; false leaves it out.
+type Change<'a> = &'a dyn Fn(&str, &mut Value) -> bool;
+
+/// Copies a log with messages, snapshots and metadata changed; digests are made anew, so that the copy is a sound file.
+fn copy(
+    from: &Path,
+    to: &Path,
+    change: Change<'_>,
+    snapshot: &dyn Fn(Vec<u8>) -> Vec<u8>,
+    facts: &dyn Fn(&mut BTreeMap<String, String>),
+) {
+    use mcap::records::{MessageHeader, Record as Part};
+    let bytes = std::fs::read(from).unwrap();
+    let file = std::io::BufWriter::new(std::fs::File::create(to).unwrap());
+    let mut writer = mcap::WriteOptions::new().compression(None).create(file).unwrap();
+    let (mut channels, mut digests) = (BTreeMap::<u16, (u16, String)>::new(), BTreeMap::new());
+    let mut is_over = false;
+    for part in mcap::read::ChunkFlattener::new(&bytes).unwrap() {
+        match part.unwrap() {
+            Part::DataEnd(_) => is_over = true,
+            _ if is_over => {}
+            Part::Metadata(mut m) => {
+                facts(&mut m.metadata);
+                writer.write_metadata(&m).unwrap();
+            }
+            Part::Attachment { header, data, .. } => {
+                let data = snapshot(data.into_owned());
+                let digest = blake3::hash(&data).to_hex().to_string();
+                digests.insert(header.name.trim_end_matches(".safetensors").to_owned(), digest.clone());
+                let name = format!("{digest}.safetensors");
+                let attachment = mcap::Attachment {
+                    log_time: 0,
+                    create_time: 0,
+                    name,
+                    media_type: header.media_type,
+                    data: Cow::Owned(data),
+                };
+                writer.attach(&attachment).unwrap();
+            }
+            Part::Channel(c) => {
+                let schema = writer.add_schema(&c.topic, "jsonschema", b"{}").unwrap();
+                let id = writer.add_channel(schema, &c.topic, "json", &BTreeMap::new()).unwrap();
+                channels.insert(c.id, (id, c.topic));
+            }
+            Part::Message { header, data } => {
+                let (channel_id, topic) = &channels[&header.channel_id];
+                let mut value: Value = serde_json::from_slice(&data).unwrap();
+                if topic == "snapshot" {
+                    let digest = value["digest"].as_str().unwrap();
+                    value["digest"] = digests[digest].clone().into();
+                }
+                let header = MessageHeader { channel_id: *channel_id, ..header };
+                if change(topic, &mut value) {
+                    writer.write_to_known_channel(&header, value.to_string().as_bytes()).unwrap();
+                }
+            }
+            _ => {}
+        }
+    }
+    writer.finish().unwrap();
+}
+
+/// Every message of the ticks.
+fn ticks(log: &Path) -> Vec<Value> {
+    let bytes = std::fs::read(log).unwrap();
+    let messages = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap);
+    messages.filter(|m| m.channel.topic == "tick").map(|m| serde_json::from_slice(&m.data).unwrap()).collect()
+}
+
+/// Everything that was claimed holds, and most of it was claimed.
+fn holds(report: &Report, ticks: u64) {
+    println!("{report}");
+    assert_eq!(report.found, 0, "{report}");
+    assert!(report.is_whole(), "{report}");
+    assert_eq!(report.ticks, ticks, "{report}");
+    assert!(report.verified + report.idle == ticks && report.verified > ticks - 20, "{report}");
+    assert!(report.stoppable == report.verified && report.optimal > ticks / 4, "{report}");
+}
+
+#[test]
+fn a_flight_under_attack_is_verified_tick_by_tick() {
+    let (_folder, log) = record("verify", &attack(LIMITS, 0.001, 1, 20));
+    holds(&verify(&log).unwrap(), 1500);
+}
+
+#[test]
+fn every_convention_of_sub_steps_and_every_way_to_brake_is_verified() {
+    for (sub_steps, dt, limits) in [
+        (0, 0.001, LIMITS.to_owned()),
+        (5, 0.01, LIMITS.to_owned()),
+        (1, 0.02, LIMITS.to_owned()),
+        (1, 0.002, LIMITS.replace("stored", "certified").replace("10.0", "3.0").replace("0.6", "1.0")),
+        (0, 0.002, LIMITS.replace("stored", "certified").replace("10.0", "3.0").replace("0.6", "1.0")),
+    ] {
+        let (_folder, log) = record("verify-steps", &attack(&limits, dt, sub_steps, 5));
+        holds(&verify(&log).unwrap(), 1500);
+    }
+}
+
+/// What ties joints together: planes, the speed of the hand, energy, bodies, a motor's line, a user's rows, soft rates.
+const COUPLED: [&str; 7] = [
+    "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.4] }, braking = 2.0 }]",
+    "frame_speed = [{ frame = \"panda_hand\", limit = 0.3 }]",
+    "energy = { limit = 0.5 }",
+    "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \"floor\", shape = \"half_space\", position = [0, 0, 0.3] }, \
+     { name = \"post\", shape = { box = { size = [0.1, 0.1, 1.0] } }, position = [0.5, 0.3, 0.5] }], braking = 0.8 }",
+    "torque_speed = { stall = 80.0, no_load = 3.0 }",
+    "rows = [{ name = \"elbow\", terms = { \"q.panda_joint4\" = 1.0, \"q.panda_joint2\" = 0.5 }, upper = -1.9, braking = 2.0 }, \
+     { name = \"together\", terms = { \"v.panda_joint1\" = 1.0, \"v.panda_joint3\" = -1.0 }, upper = 0.3, lower = -0.3 }]",
+    "jerk = { limit = 500.0 }\ntorque_rate = { limit = 2000.0 }",
+];
+
+#[test]
+fn every_kind_of_limit_is_verified_alone_and_together() {
+    for kinds in COUPLED.iter().map(|kind| (*kind).to_owned()).chain([COUPLED[..3].join("\n")]) {
+        let (_folder, log) = record("verify-kinds", &attack(&format!("{LIMITS}\n{kinds}"), 0.002, 1, 5));
+        let report = verify(&log).unwrap();
+        println!("{kinds}\n{report}");
+        assert_eq!((report.found, report.is_whole()), (0, true), "{kinds}\n{report}");
+        assert!(report.verified + report.idle == 1500 && report.optimal > 200, "{kinds}\n{report}");
+    }
+}
+
+/// What is done to the message of one tick.
+type Edit = Box<dyn Fn(&mut Value)>;
+
+fn add(value: &mut Value, by: f64) {
+    *value = (value.as_f64().unwrap() + by).into();
+}
+
+/// Place of the first active row whose number is at least `from`.
+fn first(m: &Value, from: u64) -> usize {
+    let rows = m["ledger"]["active_rows"].as_array().unwrap();
+    rows.iter().position(|row| row["row"].as_u64().unwrap() >= from).unwrap()
+}
+
+/// A tick in the middle in which rows of torque and of joints are active, and its joint of each.
+fn busy(all: &[Value]) -> (u64, usize, usize) {
+    let has = |tick: &Value, from: u64, to: u64| {
+        let rows = tick["ledger"]["active_rows"].as_array().unwrap();
+        let strong = |row: &&Value| {
+            (from..to).contains(&row["row"].as_u64().unwrap()) && row["multiplier"].as_f64().unwrap() > 1e-3
+        };
+        rows.iter().find(strong).map(|row| row["row"].as_u64().unwrap() as usize)
+    };
+    let found = all.iter().find_map(|tick| {
+        let (joint, torque) = (has(tick, 0, 7)?, has(tick, 7, 14)?);
+        let number = tick["tick"].as_u64().unwrap();
+        (number > 400 && tick["ledger"]["status"] == 2).then_some((number, joint, torque - 7))
+    });
+    found.expect("a tick in which a joint and a motor are at their limits")
+}
+
+#[test]
+fn every_seeded_corruption_is_named_at_its_tick() {
+    let (folder, log) = record("verify-edited", &attack(LIMITS, 0.001, 1, 20));
+    let (at, joint, _) = busy(&ticks(&log));
+    let other = folder.0.join("copy.mcap");
+    let found = |change: &dyn Fn(&mut Value)| {
+        let edit = |topic: &str, value: &mut Value| {
+            if topic == "tick" && value["tick"] == at {
+                change(value);
+            }
+            true
+        };
+        copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+        verify(&other).unwrap()
+    };
+    assert_eq!(found(&|_| {}).found, 0);
+    let cases: Vec<(&str, &str, Edit)> = vec![
+        ("target_q", "position", Box::new(move |m: &mut Value| add(&mut m["target_q"][joint], 1e-7))),
+        ("target_v", "joint", Box::new(move |m: &mut Value| add(&mut m["target_v"][joint], 1e-5))),
+        ("action", "action for joint", Box::new(move |m: &mut Value| add(&mut m["action"][3], 1e-3))),
+        (
+            "action sign",
+            "action for joint",
+            Box::new(move |m: &mut Value| m["action"][1] = (-m["action"][1].as_f64().unwrap()).into()),
+        ),
+        ("state q", "joint", Box::new(move |m: &mut Value| add(&mut m["state"]["q"][1], 1e-4))),
+        ("state v", "joint", Box::new(move |m: &mut Value| add(&mut m["state"]["v"][1], 1e-4))),
+        (
+            "multiplier",
+            "no active row balances",
+            Box::new(move |m: &mut Value| add(&mut m["ledger"]["active_rows"][0]["multiplier"], 1e-4)),
+        ),
+        (
+            "multiplier below zero",
+            "multiplier",
+            Box::new(move |m: &mut Value| m["ledger"]["active_rows"][0]["multiplier"] = (-1.0).into()),
+        ),
+        (
+            "row left out",
+            "no active row balances",
+            Box::new(move |m: &mut Value| {
+                m["ledger"]["active_rows"].as_array_mut().unwrap().remove(0);
+                m["ledger"]["active"] = (m["ledger"]["active"].as_u64().unwrap() - 1).into();
+            }),
+        ),
+        (
+            "row of another motor",
+            "row",
+            Box::new(move |m: &mut Value| {
+                let k = first(m, 7);
+                let row = m["ledger"]["active_rows"][k]["row"].as_u64().unwrap();
+                m["ledger"]["active_rows"][k]["row"] = (7 + (row - 6) % 7).into();
+            }),
+        ),
+        (
+            "side of a row",
+            "",
+            Box::new(move |m: &mut Value| {
+                let k = first(m, 7);
+                let side = if m["ledger"]["active_rows"][k]["side"] == "upper" { "lower" } else { "upper" };
+                m["ledger"]["active_rows"][k]["side"] = side.into();
+            }),
+        ),
+        (
+            "kind of a row",
+            "number of the active",
+            Box::new(move |m: &mut Value| {
+                let k = first(m, 7);
+                m["ledger"]["active_rows"][k]["kind"] = "frame".into();
+            }),
+        ),
+        (
+            "slack of a row",
+            "slack",
+            Box::new(move |m: &mut Value| m["ledger"]["active_rows"][0]["slack"] = 0.1.into()),
+        ),
+        ("moved", "moved", Box::new(move |m: &mut Value| add(&mut m["ledger"]["moved"], 0.1))),
+        ("status", "status", Box::new(move |m: &mut Value| m["ledger"]["status"] = 77.into())),
+        ("recovering", "recovering", Box::new(move |m: &mut Value| m["ledger"]["status"] = 3.into())),
+        (
+            "violations",
+            "target_violations",
+            Box::new(move |m: &mut Value| m["ledger"]["target_violations"] = 3.into()),
+        ),
+        ("brake left out", "stored decelerations", Box::new(move |m: &mut Value| m["brake"] = json!([]))),
+        (
+            "brake beyond the motors",
+            "stored deceleration",
+            Box::new(move |m: &mut Value| m["brake"][0] = 10.1.into()),
+        ),
+        ("brake too weak", "way to stop", Box::new(move |m: &mut Value| m["brake"] = json!(vec![1e-3; 7]))),
+        ("not a number", "target_v[2]", Box::new(move |m: &mut Value| m["target_v"][2] = Value::Null)),
+        ("cut", "length of target_q", Box::new(move |m: &mut Value| m["target_q"] = json!([0.0]))),
+    ];
+    for (name, word, change) in &cases {
+        let report = found(&**change);
+        let told: Vec<String> = report.violations.iter().map(ToString::to_string).collect();
+        println!("{name}: {}", told.first().map_or("", String::as_str));
+        assert!(report.found > 0, "{name} was not seen\n{report}");
+        let is_named = |v: &String| v.starts_with(&format!("tick {at}: ")) && v.contains(word);
+        assert!(told.iter().any(is_named), "{name}: {told:?}");
+    }
+    // A proposal is that of the tick in which the policy ran, for all of its period.
+    let all = ticks(&log);
+    let started =
+        all.iter().rfind(|m| m["tick"].as_u64().unwrap() <= at && m["period_tick"] == 0).unwrap()["tick"]
+            .clone();
+    let edit = |topic: &str, value: &mut Value| {
+        if topic == "tick" && value["tick"] == started {
+            add(&mut value["proposal_v"][joint], 1e-3);
+        }
+        true
+    };
+    copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+    assert!(verify(&other).unwrap().found > 0, "a proposal was changed");
+}
+
+/// What a change cannot be seen in: nothing of it is claimed by the projection, or it says less than before.
+#[test]
+fn what_cannot_be_seen_is_what_is_written_in_the_page() {
+    let (folder, log) = record("verify-unseen", &attack(LIMITS, 0.001, 1, 20));
+    let (at, ..) = busy(&ticks(&log));
+    let other = folder.0.join("copy.mcap");
+    let edit = |topic: &str, m: &mut Value| {
+        if topic == "tick" && m["tick"] == at {
+            for time in ["due_ns", "begin_ns", "end_ns", "overruns", "stale", "lost_states", "policy_version"]
+            {
+                m[time] = (m[time].as_u64().unwrap() + 1).into();
+            }
+            m["reason"] = "stale-state".into();
+            m["state"]["obs"][0] = 9.0.into();
+            m["state"]["applied"][0] = 9.0.into();
+            m["ledger"]["residual"] = 1.0.into();
+            m["ledger"]["iterations"] = 99.into();
+            m["ledger"]["duration_ns"] = 1.into();
+            m["ledger"]["raw_violations"] = 40.into();
+            m["log_prob_proposal"] = 3.0.into();
+            m["noise"] = 1.0.into();
+        }
+        true
+    };
+    copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+    holds(&verify(&other).unwrap(), 1500);
+    // A tick that says less is not found out, and is not counted as more than it says.
+    let edit = |topic: &str, m: &mut Value| {
+        if topic == "tick" && m["tick"] == at {
+            m["ledger"]["status"] = 4.into();
+        }
+        true
+    };
+    copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+    let (before, after) = (verify(&log).unwrap(), verify(&other).unwrap());
+    assert_eq!((after.found, after.optimal), (0, before.optimal - 1), "{after}");
+}
+
+/// The bytes of a snapshot with another limit, its own digest right.
+fn with_limit(bytes: Vec<u8>, change: &dyn Fn(&mut Value)) -> Vec<u8> {
+    let mut snapshot = Snapshot::from_bytes(&bytes).unwrap();
+    let mut constraints = serde_json::to_value(&snapshot.manifest.task.constraints).unwrap();
+    change(&mut constraints);
+    snapshot.manifest.task.constraints = serde_json::from_value(constraints).unwrap();
+    snapshot.to_bytes()
+}
+
+#[test]
+fn a_limit_that_was_changed_in_the_log_is_found_out_looser_or_tighter() {
+    let (folder, log) = record("verify-limits", &attack(LIMITS, 0.001, 1, 20));
+    let other = folder.0.join("copy.mcap");
+    for (section, key, values) in [
+        ("velocity", "scale", [0.45, 0.55]),
+        ("acceleration", "limit", [9.0, 11.0]),
+        ("torque", "scale", [0.5, 0.7]),
+        ("position", "margin", [1.5, 1.4]),
+    ] {
+        for value in values {
+            let change = |constraints: &mut Value| constraints[section][key] = value.into();
+            let facts = |facts: &mut BTreeMap<String, String>| {
+                let mut limits: Value = serde_json::from_str(&facts["limits"]).unwrap();
+                change(&mut limits);
+                facts.insert("limits".into(), limits.to_string());
+            };
+            copy(&log, &other, &|_, _| true, &|bytes| with_limit(bytes, &change), &facts);
+            let report = verify(&other).unwrap();
+            assert!(report.found > 0, "{section}.{key} = {value}\n{report}");
+        }
+    }
+    // What the loop pinned holds too, whatever its snapshot says.
+    let facts = |facts: &mut BTreeMap<String, String>| {
+        let mut limits: Value = serde_json::from_str(&facts["limits"]).unwrap();
+        limits["velocity"]["scale"] = 0.3.into();
+        facts.insert("limits".into(), limits.to_string());
+    };
+    copy(&log, &other, &|_, _| true, &|bytes| bytes, &facts);
+    assert!(verify(&other).unwrap().violations[0].what.contains("speed of joint"));
+}
+
+#[test]
+fn what_a_log_does_not_have_is_not_verified_and_a_damaged_one_is_refused_by_name() {
+    let (folder, log) = record("verify-gaps", &attack(LIMITS, 0.001, 1, 20));
+    let other = folder.0.join("copy.mcap");
+    let edit =
+        |topic: &str, m: &mut Value| topic != "tick" || !(600..650).contains(&m["tick"].as_u64().unwrap());
+    copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+    let report = verify(&other).unwrap();
+    assert_eq!((report.found, report.unverified(), report.is_whole()), (0, 50, false), "{report}");
+    assert!(
+        report.ticks == 1450 && report.to_string().contains("50 ticks, the log does not have them"),
+        "{report}"
+    );
+
+    let refused = |what: &str| {
+        let text = verify(&other).unwrap_err().to_string();
+        assert!(text.contains(what) && text.contains("copy.mcap"), "{what}: {text}");
+    };
+    copy(&log, &other, &|_, _| true, &|bytes| bytes, &|facts| _ = facts.insert("schema".into(), "4".into()));
+    refused("its schema is 4, this build reads 5");
+    copy(&log, &other, &|topic, _| topic != "snapshot", &|bytes| bytes, &|_| {});
+    refused("snapshot number 0 is not in it");
+    copy(
+        &log,
+        &other,
+        &|topic, m| {
+            if topic == "snapshot" {
+                m["digest"] = "00".into();
+            }
+            true
+        },
+        &|bytes| bytes,
+        &|_| {},
+    );
+    refused("snapshot number 0 is not in it");
+    copy(
+        &log,
+        &other,
+        &|topic, m| {
+            if topic == "tick" && m["tick"] == 9 {
+                m["state"] = 3.into();
+            }
+            true
+        },
+        &|bytes| bytes,
+        &|_| {},
+    );
+    refused("a message of topic `tick` is damaged");
+    std::fs::write(&other, b"no log at all, but long enough for a header").unwrap();
+    refused("");
+    std::fs::write(&other, b"").unwrap();
+    refused("it is empty");
+    std::fs::remove_file(&other).unwrap();
+    std::fs::create_dir(&other).unwrap();
+    refused("it is not a regular file");
+
+    let whole = std::fs::read(&log).unwrap();
+    let cut = folder.0.join("cut.mcap");
+    std::fs::write(&cut, &whole[..whole.len() / 2]).unwrap();
+    let report = verify(&cut).unwrap();
+    assert!(report.found == 0 && !report.complete && !report.is_whole() && report.verified > 100, "{report}");
+}
