@@ -412,3 +412,69 @@ impl Machine {
             || before(b.link) == Some(body(a.link))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::period::Period;
+
+    /// Two hinges about y, 1 kg point masses 1 m and 0.5 m below their axes, the second axis 1 m below the first.
+    fn pendulum() -> Machine {
+        let body = |name: &str, parent: &str, z: f64, com: f64| {
+            format!(
+                r#"{{"name":"{name}","parent":{parent},"placement":{{"position":[0,0,{z:?}],"rotation":[[1,0,0],[0,1,0],[0,0,1]]}},"mass":1.0,
+                "com":[0,0,{com:?}],"inertia":[0,0,0,0,0,0],"joints":[{{"name":"j{name}","kind":"hinge","axis":[0,1,0],"anchor":[0,0,0],"reference":0.0,
+                "range":"unlimited","velocity":null,"effort":null,"damping":0.0,"stiffness":0.0,"spring_reference":0.0,"armature":0.0}}]}}"#
+            )
+        };
+        let text = format!(
+            r#"{{"gravity":[0,0,-10],"bodies":[{},{}],"frames":[],"solids":[],"motors":[]}}"#,
+            body("a", "null", 0.0, -1.0),
+            body("b", "0", -1.0, -0.5)
+        );
+        Machine::new(&serde_json::from_str(&text).unwrap()).unwrap()
+    }
+
+    /// Lagrange's equations of the double pendulum, by hand: lengths 1 and 1/2, masses 1.
+    #[test]
+    fn forces_and_energy_are_those_of_a_double_pendulum() {
+        let mut machine = pendulum();
+        let (q, v, a) = ([0.4, -0.9], [1.3, 0.7], [2.0, -3.0]);
+        let (c, s) = (q[1].cos(), q[1].sin());
+        let mass = [[2.0 + c + 0.25, 0.25 + 0.5 * c], [0.25 + 0.5 * c, 0.25]];
+        let turning = [-0.5 * s * v[1] * (2.0 * v[0] + v[1]), 0.5 * s * v[0] * v[0]];
+        let weight = 10.0 * 0.5 * (q[0] + q[1]).sin();
+        let gravity = [10.0 * 2.0 * q[0].sin() + weight, weight];
+        let mut tau = [0.0; 2];
+        machine.motors(&Period::new(0.001, 1), &q, &v, &a, &mut tau);
+        for i in 0..2 {
+            let by_hand = mass[i][0] * a[0] + mass[i][1] * a[1] + turning[i] + gravity[i];
+            assert!((tau[i] - by_hand).abs() < 1e-12, "{i}: {} {by_hand}", tau[i]);
+        }
+        let energy: f64 = (0..2).map(|i| 0.5 * v[i] * (mass[i][0] * v[0] + mass[i][1] * v[1])).sum();
+        assert!((machine.energy(&q, &v) - energy).abs() < 1e-12);
+    }
+
+    /// The motion of the lower mass, and its Jacobian, by differences of its place.
+    #[test]
+    fn a_point_moves_as_its_place_does() {
+        let mut machine = pendulum();
+        let spot = machine.spot("b").unwrap();
+        let (q, v) = ([0.4, -0.9], [1.3, 0.7]);
+        let mut place = |time: f64| {
+            machine.go(&[q[0] + time * v[0], q[1] + time * v[1]], &v);
+            machine.place(&spot).point([0.0, 0.0, -0.5])
+        };
+        let (h, now) = (1e-4, place(0.0));
+        let (ahead, behind) = (place(h), place(-h));
+        machine.go(&q, &v);
+        let point = machine.point(&spot, now);
+        let mut row = [0.0; 2];
+        machine.add_row(&spot, now, [1.0, 0.0, 0.0], 1.0, &mut row);
+        assert!((row[0] * v[0] + row[1] * v[1] - point.velocity[0]).abs() < 1e-12);
+        for k in 0..3 {
+            assert!((point.velocity[k] - (ahead[k] - behind[k]) / (2.0 * h)).abs() < 1e-7);
+            assert!((point.acceleration[k] - (ahead[k] - 2.0 * now[k] + behind[k]) / (h * h)).abs() < 1e-5);
+        }
+    }
+}
