@@ -9,10 +9,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use nearl_constraints::Model;
-use nearl_runtime::link::RobotName;
 
-/// Every joint at half its speed and three fifths of its force, with a stored brake.
-const LIMITS: &str = "position = { margin = 0.01 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 10.0 }\ntorque = { scale = 0.6 }\nbraking = \"stored\"";
+/// Every joint at half its speed and four fifths of its force, with a stored brake.
+const LIMITS: &str = "position = { margin = 0.01 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 10.0 }\ntorque = { scale = 0.8 }\nbraking = \"stored\"";
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().collect();
@@ -33,11 +32,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         policy_every: 20,
         seed: 1,
         ticks: ticks.parse()?,
-        pause: Duration::from_micros(100),
+        pause: Duration::ZERO,
     };
     let begin = Instant::now();
-    let (log, report) = attack.record(&RobotName::new("recorded")?, Path::new(folder));
-    println!("{}: {} ticks in {:.0} s", log.display(), report.ticks, begin.elapsed().as_secs_f64());
-    println!("{report}");
+    let (log, summary) = attack.fly(Path::new(folder));
+    println!(
+        "{}: {} ticks in {:.0} s, {} in brief",
+        log.display(),
+        summary.written,
+        begin.elapsed().as_secs_f64(),
+        summary.brief
+    );
     Ok(())
 }

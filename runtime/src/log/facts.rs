@@ -49,11 +49,7 @@ pub(crate) struct Session {
 }
 
 /// Facts of a run as strings, as MCAP metadata has them.
-pub(crate) fn facts(
-    robot: &RobotMessage,
-    core: &CoreSettings,
-    faults: &FaultPlan,
-) -> BTreeMap<String, String> {
+pub fn facts(robot: &RobotMessage, core: &CoreSettings, faults: &FaultPlan) -> BTreeMap<String, String> {
     let joints = robot.joint_names();
     let described = RobotFacts {
         joints: joints.clone(),

@@ -16,7 +16,7 @@ mod slow;
 mod tick;
 mod writer;
 
-pub(crate) use facts::facts;
+pub use facts::facts;
 pub use queue::{LogError, LogQueue, LogSummary};
 pub use replay::{Difference, Gap, Replay, ReplayError, replay, replay_with};
 pub use tick::SCHEMA_VERSION;

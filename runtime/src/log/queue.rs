@@ -109,7 +109,7 @@ impl LogQueue {
     }
 
     /// Adds a snapshot before the first record that uses it; drops and counts it if too many bytes wait.
-    pub(crate) fn push_snapshot(&mut self, id: u64, version: u64, bytes: Vec<u8>, rows: Vec<String>) {
+    pub fn push_snapshot(&mut self, id: u64, version: u64, bytes: Vec<u8>, rows: Vec<String>) {
         let (shared, length) = (&self.shared, bytes.len() as u64);
         let has_room = shared.snapshot_bytes.load(Ordering::Acquire) + length <= SNAPSHOT_BYTES;
         shared.snapshot_bytes.fetch_add(length, Ordering::AcqRel);
@@ -125,8 +125,7 @@ impl LogQueue {
     }
 
     /// Records that wait for the file.
-    #[cfg(test)]
-    pub(super) fn waiting(&self) -> usize {
+    pub fn waiting(&self) -> usize {
         CAPACITY - self.records.slots()
     }
 

@@ -7,6 +7,7 @@ use std::time::Duration;
 use nearl_constraints::drive::Held;
 use nearl_constraints::{Model, PeriodDynamics};
 use nearl_runtime::link::*;
+use nearl_runtime::log::{LogQueue, LogSummary, facts};
 use nearl_runtime::net::{Activation, Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::rt::*;
@@ -117,6 +118,53 @@ impl Attack {
     }
 }
 
+impl Attack {
+    /// Records a flight into `folder` without threads and links, as fast as its log is written.
+    pub fn fly(&self, folder: &Path) -> (PathBuf, LogSummary) {
+        let first = self.snapshot(1);
+        let robot = describe(&first.manifest, true).unwrap();
+        let robot = robot.message(&RobotName::new("flight").unwrap()).unwrap();
+        let controller = Pilot::new(&first, &robot).unwrap();
+        let period = (self.dt * 1e9).round() as u64;
+        let settings = CoreSettings {
+            period,
+            sync: Sync::Plant,
+            age_limit: 20 * period,
+            real_time: false,
+            stop_speed: 1e-2,
+            jump: 0.0,
+            ramp: 50,
+            modes: ModeLimits::default(),
+            explore: Some(self.seed),
+            proposer: None,
+        };
+        let mut facts = facts(&robot, &settings, &FaultPlan::default());
+        facts.insert("limits".into(), Pinned::of(&first.manifest, "the snapshot").unwrap().to_json());
+        let path = folder.join("attack.mcap");
+        let mut log = LogQueue::create(&path, &facts, 0).unwrap();
+        log.push_snapshot(0, 1, first.to_bytes(), controller.row_names());
+        let mut core = Core::new(settings, Box::new(Loaded { id: 0, controller }), 0, FaultPlan::default());
+        let mut twin = Twin::new(self);
+        for tick in 1..=self.ticks {
+            let mut state = StateMessage::zeroed();
+            twin.measure(&mut state);
+            (state.header.epoch, state.header.seq, state.header.stamp) = (1, tick, tick * period);
+            state.tick = tick;
+            core.swap(false);
+            let (begin, fresh) = (tick * period, Some(&state));
+            core.update(&Inputs { due: 0, begin, stop: false, fresh, proposal: None });
+            core.close(begin + 1000);
+            log.push(&core.record);
+            while log.waiting() > 100 {
+                std::thread::sleep(Duration::from_micros(100));
+            }
+            let output = &core.record.output;
+            twin.act(&output.action[..output.nu as usize]);
+        }
+        (path, log.finish())
+    }
+}
+
 /// The plant that the model says it is: forces are held for a period.
 struct Twin {
     dynamics: PeriodDynamics,
@@ -144,9 +192,8 @@ impl Twin {
     }
 }
 
-impl Plant for Twin {
-    fn observe(&mut self, state: &mut StateMessage) {
-        std::thread::sleep(self.pause);
+impl Twin {
+    fn measure(&self, state: &mut StateMessage) {
         let n = self.v.len() as u32;
         (state.nq, state.nv, state.nu, state.n_obs) = (n, n, n, 2 * n);
         state.q_mut().copy_from_slice(&self.q);
@@ -156,8 +203,12 @@ impl Plant for Twin {
         state.obs_mut()[n..].copy_from_slice(&self.v);
     }
 
-    fn apply(&mut self, action: &ActionMessage) {
-        self.held.iter_mut().zip(action.action()).for_each(|(held, tau)| *held = Held::Force(*tau));
+    /// A period under these motor forces; none, and the motors hold it where it stands.
+    fn act(&mut self, forces: &[f64]) {
+        if forces.is_empty() {
+            return;
+        }
+        self.held.iter_mut().zip(forces).for_each(|(held, tau)| *held = Held::Force(*tau));
         let zero = vec![0.0; self.v.len()];
         self.dynamics.update(&self.q, &self.v, &zero);
         self.dynamics.accelerate(&self.held, &mut self.a);
@@ -166,6 +217,17 @@ impl Plant for Twin {
             self.q[i] += dt * self.v[i] + kappa * dt * dt * self.a[i];
             self.v[i] += dt * self.a[i];
         }
+    }
+}
+
+impl Plant for Twin {
+    fn observe(&mut self, state: &mut StateMessage) {
+        std::thread::sleep(self.pause);
+        self.measure(state);
+    }
+
+    fn apply(&mut self, action: &ActionMessage) {
+        self.act(action.action());
     }
 
     fn brake(&mut self) {
