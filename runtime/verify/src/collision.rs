@@ -8,6 +8,8 @@ use crate::space::{ONE, Place, Vec3, apply, apply_back, dot, minus, norm, produc
 
 /// Projections in turn at most.
 const MOST: usize = 2000;
+/// Solids at most: pairs are looked at one by one.
+const BODIES: usize = 500;
 /// Cores so near touch [m].
 const TOUCHING: f64 = 1e-9;
 
@@ -67,6 +69,9 @@ impl Collision {
                 spot: Spot { place, ..spot },
                 shape,
             });
+        }
+        if bodies.len() > BODIES {
+            return Err(format!("collision has {} solids, more than {BODIES}", bodies.len()));
         }
         let called = |body: &Body, name: &str| body.name == name || body.frame.as_deref() == Some(name);
         let meet = |a: &Body, b: &Body| {

@@ -71,7 +71,7 @@ impl Report {
 
     /// Ticks that are neither verified, idle nor found in violation.
     pub fn unverified(&self) -> u64 {
-        self.not_verified.values().sum()
+        self.not_verified.values().fold(0, |sum, ticks| sum.saturating_add(*ticks))
     }
 
     /// Everything that was claimed was verified, and something was.

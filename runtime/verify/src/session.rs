@@ -303,7 +303,7 @@ impl Session {
         if is_held && own.controllable.iter().any(|&i| own.halves(i) != (true, true)) {
             return no("a proposal of another process was held, of which the log has one half");
         }
-        let (j, k) = (tick.period_tick + 1, own.policy_every);
+        let (j, k) = (tick.period_tick.saturating_add(1), own.policy_every);
         if j >= k {
             return Ok(goal.clone());
         }

@@ -7,7 +7,7 @@ use crate::promise::Promise;
 use crate::rows::Step;
 
 /// Periods that a brake may take.
-const LONGEST: u32 = 1_000_000;
+const LONGEST: u32 = 100_000;
 /// What is left of a speed after the last whole period is rounding below this share of a period's change.
 const REST: f64 = 1e-9;
 
