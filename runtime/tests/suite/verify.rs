@@ -375,7 +375,7 @@ fn a_limit_that_was_changed_in_the_log_is_found_out_looser_or_tighter() {
     for (section, key, values) in [
         ("velocity", "scale", [0.45, 0.55]),
         ("acceleration", "limit", [9.0, 11.0]),
-        ("torque", "scale", [0.5, 0.7]),
+        ("torque", "scale", [0.7, 0.9]),
         ("position", "margin", [1.5, 1.4]),
     ] {
         for value in values {
