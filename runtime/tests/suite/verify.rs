@@ -15,7 +15,8 @@ use crate::toy::Name;
 const PANDA: &str = include_str!("../../../examples/robots/panda/panda.urdf");
 
 /// Joints, torque, and what ties joints together.
-const LIMITS: &str = "position = { margin = 0.01 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 10.0 }\ntorque = { scale = 0.8 }\nbraking = \"stored\"";
+const LIMITS: &str = "position = { margin = 0.01 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 10.0 }\n\
+     torque = { scale = 0.8 }\nbraking = \"stored\"";
 
 fn attack(constraints: &str, dt: f64, sub_steps: u32, policy_every: usize) -> Attack {
     Attack {
@@ -147,7 +148,8 @@ const COUPLED: [&str; 7] = [
     "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.4] }, braking = 2.0 }]",
     "frame_speed = [{ frame = \"panda_hand\", limit = 0.3 }]",
     "energy = { limit = 0.5 }",
-    "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \"floor\", shape = \"half_space\", position = [0, 0, 0.3] }, \
+    "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, \
+     { name = \"floor\", shape = \"half_space\", position = [0, 0, 0.3] }, \
      { name = \"post\", shape = { box = { size = [0.1, 0.1, 1.0] } }, position = [0.5, 0.3, 0.5] }], braking = 0.8 }",
     "torque_speed = { stall = 80.0, no_load = 3.0 }",
     "rows = [{ name = \"elbow\", terms = { \"q.panda_joint4\" = 1.0, \"q.panda_joint2\" = 0.5 }, upper = -1.9, braking = 2.0 }, \
