@@ -13,6 +13,8 @@ use crate::robot::Robot;
 struct Manifest {
     task: Task,
     robot: Robot,
+    /// Where an operator has moved the limits.
+    moved: Option<Value>,
     policy: String,
     action_lower: Vec<f64>,
     action_upper: Vec<f64>,
@@ -123,6 +125,8 @@ pub(crate) struct Promise {
     pub(crate) actions: Vec<Action>,
     /// Limits on actions change `moved`.
     pub(crate) limits_actions: bool,
+    /// An operator has moved its limits, which is not known here.
+    pub(crate) is_moved: bool,
     /// A unit of softness: the weighted squared distance of the largest velocity change of one period.
     pub(crate) worth: f64,
 }
@@ -240,6 +244,7 @@ impl Promise {
             way: section.braking,
             actions,
             limits_actions: section.action.is_some(),
+            is_moved: m.moved.is_some(),
             worth,
         })
     }

@@ -221,6 +221,9 @@ impl Session {
         if own.projects == Projects::Nothing || status == Status::NotProjected {
             return unknown("their policy gives actions that nothing was projected for");
         }
+        if own.is_moved || status == Status::Tightening {
+            return unknown("an operator had moved their limits, which is not known here");
+        }
         let finite = |what: &str, x: &[f64]| match x.iter().position(|x| !x.is_finite()) {
             Some(k) => broken(format!("{what}[{k}]"), x[k], 0.0, "a number"),
             None => Ok(()),

@@ -101,6 +101,8 @@ pub(crate) enum Status {
     Slowed,
     /// Every joint brakes.
     Braked,
+    /// Limits were moved, and the robot is on its way to them.
+    Tightening,
     /// Nothing was projected.
     NotProjected,
     /// No target is meant to be used.
@@ -115,6 +117,7 @@ impl Ledger {
             3 => Status::Recovering,
             4 => Status::Slowed,
             5 => Status::NotProjected,
+            6 => Status::Tightening,
             10..=13 => Status::Braked,
             20 | 21 => Status::Refused,
             _ => return None,
