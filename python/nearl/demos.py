@@ -1,4 +1,4 @@
-"""Demonstrations of others as a file for ``bc``, ``soil``, ``dapg`` and ``pid2-il``: CSV, Minari, LeRobot, robomimic and motion clips.
+"""Demonstrations of others as a file for the algorithms that learn from them: CSV, Minari, LeRobot, robomimic and motion clips.
 
 Every source is a table of joint positions and velocities by name, ``q.<joint>`` and ``v.<joint>`` as the task's observation has them. The observations
 of the file are those of the task's own environment in these states, so that they are always of it::

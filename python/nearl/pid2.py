@@ -34,7 +34,7 @@ class PID2:
         threads: At least 1; all cores by default.
         settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.scale": 0.8}``.
         preset: Settings by name, ``"paper"`` or ``"strong"``; ``settings`` come after them.
-        demos: Demonstrations (``.npz``) for ``bc``, ``soil``, ``dapg`` and ``pid2-il``; ``nearl demos record RUN`` writes some.
+        demos: Demonstrations (``.npz``) for ``bc``, ``soil``, ``dapg``, ``pid2-il``, ``bco`` and ``gaifo``; ``nearl demos record RUN`` writes some.
         run: Run folder to write as ``nearl train`` does; none by default.
         reward: ``reward(obs, actions, next_obs)``, arrays of n rows in, (n,) out, replaces the task's, as in :func:`nearl.make_vec`; here it is
             asked once a control period of each environment, with one row, from several threads in any order: the same arguments must give

@@ -17,8 +17,10 @@ declare -A half=(
 go() { # name of the variant, then what it sets
     local name=$1 task=$2
     shift 2
-    target/release/nearl sweep --tasks $task --algos pid2-il --demos $demos/$task.npz --seeds "$seeds" --steps "$steps" --preset strong \
-        --set train.n_steps=64 --set train.ppo.batch_size=128 --set train.eval_every=20000 --set train.eval_episodes=3 --jobs "${JOBS:-2}" --out runs/ablation/$name "$@"
+    target/release/nearl sweep --tasks $task --algos pid2-il --demos $demos/$task.npz --seeds "$seeds" --steps "$steps" --set train.n_envs=64 \
+        --set train.n_steps=64 --set train.ppo.batch_size=128 --set train.ppo.log_std=-1.0 --set train.nets.policy=[64,64] \
+        --set train.nets.value=[64,64] --set train.nets.discriminator=[64,64] --set train.eval_every=20000 --set train.eval_episodes=3 \
+        --jobs "${JOBS:-2}" --out runs/ablation/$name "$@"
 }
 
 for task in $tasks; do

@@ -6,7 +6,8 @@ set -euo pipefail
 cd "$(dirname "$0")/../.."
 seeds=${1:-0-4} steps=${2:-1M} tasks=${3:-Hopper-v5 HalfCheetah-v5 Walker2d-v5 Ant-v5}
 runs=runs/imitation
-common=(--seeds "$seeds" --steps "$steps" --preset strong --set train.n_steps=64 --set train.ppo.batch_size=128
+common=(--seeds "$seeds" --steps "$steps" --set train.n_envs=64 --set train.n_steps=64 --set train.ppo.batch_size=128 --set train.ppo.log_std=-1.0
+    --set train.nets.policy=[64,64] --set train.nets.value=[64,64] --set train.nets.discriminator=[64,64]
     --set train.eval_every=20000 --set train.eval_episodes=3 --out $runs --jobs "${JOBS:-2}")
 
 mkdir -p $runs

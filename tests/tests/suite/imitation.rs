@@ -75,7 +75,7 @@ fn bits(training: &mut Training) -> Vec<u64> {
 fn resuming_gives_the_same_bits() {
     let folder = tempfile::tempdir().expect("folder");
     let (file, _) = demos(folder.path());
-    for algo in ["bc", "soil", "dapg", "pid2-il"] {
+    for algo in ["bc", "soil", "dapg", "pid2-il", "bco", "gaifo"] {
         let request = asked(algo, &file, &[]);
         let mut whole = Training::new(&request).expect("training");
         (0..5).for_each(|_| drop(whole.iterate()));
@@ -100,13 +100,13 @@ fn other_actions_change_nothing_where_states_alone_are_learned_from() {
         (0..4).for_each(|_| drop(training.iterate()));
         bits(&mut training)
     };
-    let algos = ["bc", "soil", "pid2-il", "dapg"];
+    let algos = ["bc", "soil", "pid2-il", "bco", "gaifo", "dapg"];
     let before = algos.map(learned);
     demos.episodes.iter_mut().flat_map(|e| &mut e.actions).for_each(|a| *a = 0.3 - *a);
     demos.save(&file).expect("saved");
     let after = algos.map(learned);
-    assert_eq!([0, 1, 2].map(|k| before[k] == after[k]), [true; 3], "a state-only run read actions");
-    assert!(before[3] != after[3], "dapg reads them");
+    assert_eq!([0, 1, 2, 3, 4].map(|k| before[k] == after[k]), [true; 5], "a state-only run read actions");
+    assert!(before[5] != after[5], "dapg reads them");
 }
 
 #[test]
@@ -121,7 +121,10 @@ fn what_does_not_fit_is_refused_by_name() {
         };
         assert!(words.iter().all(|w| error.contains(w)) && !error.contains('\n'), "{error}");
     };
-    refused(&asked("ppo", &file, &[]), &["'ppo' takes no demonstrations", "bc, soil, dapg, pid2-il"]);
+    refused(
+        &asked("ppo", &file, &[]),
+        &["'ppo' takes no demonstrations", "bc, soil, dapg, pid2-il, bco, gaifo"],
+    );
     refused(&asked("soil", Path::new(""), &[]), &["'soil' learns from demonstrations", "--demos"]);
     refused(&asked("bc", &folder.path().join("none.npz"), &[]), &["none.npz", "cannot be read"]);
     let other =

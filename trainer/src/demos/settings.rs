@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// `[train.demos]`, read by `bc`, `soil`, `dapg` and `pid2-il`.
+/// `[train.demos]`, read by the algorithms that learn from demonstrations.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DemoSettings {
@@ -10,11 +10,11 @@ pub struct DemoSettings {
     pub file: String,
     /// Episodes of the file that are used, the first ones; 0: all.
     pub episodes: usize,
-    /// Share of the episodes that begin in a random frame of the demonstrations; no effect for `dapg`.
+    /// Share of the episodes that begin in a random frame of the demonstrations, for `bc`, `soil` and `pid2-il`.
     pub resets: f64,
-    /// Steps of the fresh networks' own noise from which the inverse model learns before anything else; no effect for `dapg`.
+    /// Steps of the fresh networks' own noise from which the inverse model learns before anything else; no effect for `dapg` and `gaifo`.
     pub warmup: u64,
-    /// Passes of behaviour cloning over the demonstrations before the first update; no effect for `soil`.
+    /// Passes of behaviour cloning over the demonstrations before the first update; no effect for `soil` and `gaifo`.
     pub epochs: usize,
     /// Learning rate of behaviour cloning.
     pub lr: f32,

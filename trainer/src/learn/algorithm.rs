@@ -24,6 +24,10 @@ pub enum Algorithm {
     Dapg,
     /// See [`pid2_il`](super::pid2_il).
     Pid2Il,
+    /// See [`bco`](super::bco).
+    Bco,
+    /// See [`gaifo`](super::gaifo).
+    Gaifo,
 }
 
 /// One line of the table.
@@ -37,7 +41,7 @@ pub struct AlgorithmEntry {
     pub about: &'static str,
 }
 
-/// Every algorithm, in the order of the paper.
+/// Every algorithm, in the order of the paper; behind them what it is compared with.
 pub const ALGORITHMS: &[AlgorithmEntry] = &[
     AlgorithmEntry {
         algorithm: Algorithm::Ppo,
@@ -84,6 +88,16 @@ pub const ALGORITHMS: &[AlgorithmEntry] = &[
         name: "pid2-il",
         about: "`pid2-ib`, cloned first, whose discriminator takes demonstrated states for real too (Algorithm 2 whole)",
     },
+    AlgorithmEntry {
+        algorithm: Algorithm::Bco,
+        name: "bco",
+        about: "a policy on actions clones demonstrated states, whose actions an inverse model infers; no reward is read",
+    },
+    AlgorithmEntry {
+        algorithm: Algorithm::Gaifo,
+        name: "gaifo",
+        about: "PPO on actions whose reward is how much a transition looks demonstrated; the task's reward is not read",
+    },
 ];
 
 /// A name that no algorithm has.
@@ -121,12 +135,22 @@ impl Algorithm {
 
     /// Whether the policy is one on actions: it proposes nothing.
     pub fn is_direct(self) -> bool {
-        matches!(self, Self::Ppo | Self::Soil | Self::Dapg)
+        matches!(self, Self::Ppo | Self::Soil | Self::Dapg | Self::Bco | Self::Gaifo)
     }
 
     /// Whether it learns from demonstrations; the others take none.
     pub fn imitates(self) -> bool {
-        matches!(self, Self::Bc | Self::Soil | Self::Dapg | Self::Pid2Il)
+        matches!(self, Self::Bc | Self::Soil | Self::Dapg | Self::Pid2Il | Self::Bco | Self::Gaifo)
+    }
+
+    /// Whether its inverse model learns alone, from noise, before anything else.
+    pub fn warms_up(self) -> bool {
+        self.imitates() && !matches!(self, Self::Dapg | Self::Gaifo)
+    }
+
+    /// Whether its episodes begin in demonstrated states now and then; those that it is compared with were published without.
+    pub fn begins_in_demonstrations(self) -> bool {
+        matches!(self, Self::Bc | Self::Soil | Self::Pid2Il)
     }
 
     /// Names of those that learn from demonstrations.
@@ -188,9 +212,6 @@ mod tests {
         );
         assert!(refused("PPO").contains("did you mean 'ppo'?"));
         let far = refused("xyz");
-        assert!(
-            far.starts_with("no algorithm 'xyz'; give one of ppo, ") && far.ends_with("pid2-il"),
-            "{far}"
-        );
+        assert!(far.starts_with("no algorithm 'xyz'; give one of ppo, ") && far.ends_with("gaifo"), "{far}");
     }
 }

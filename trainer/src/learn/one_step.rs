@@ -4,7 +4,8 @@
 use super::nearl::{Nearl, NearlSettings};
 use super::pid2::{Pid2, Pid2Settings};
 use super::{
-    Base, Batch, Bc, Dapg, Dims, Imitating, Kind, Learner, NetSettings, Pace, Pid2Il, Ppo, PpoSettings, Soil,
+    Base, Batch, Bc, Bco, Dapg, Dims, Gaifo, Imitating, Kind, Learner, NetSettings, Pace, Pid2Il, Ppo,
+    PpoSettings, Soil, Stretch,
 };
 use crate::demos::DemoSettings;
 use nearl_runtime::Networks;
@@ -286,4 +287,56 @@ fn dapg_soil_and_pid2_il_solve_it() {
             with(Box::new(Imitating::<Pid2Il>::new(pid2, demos())), rng)
         }),
     );
+}
+
+/// Under linear dynamics the inferred actions are the expert's own; the reward is NaN and nobody reads it.
+#[test]
+fn bco_acts_like_the_expert() {
+    let (dims, ppo, demos) = plain();
+    let (n, mut rng) = (affine(), crate::rollout::stream(4, 0));
+    let mut bco =
+        Imitating::<Bco>::new(Ppo::new(dims, &n, PpoSettings { lr: 1e-2, ..ppo }, 1, &mut rng), demos);
+    let normaliser = Normaliser::identity(2, 2);
+    let actor =
+        |l: &dyn Learner| Actor { kind: None, activation: n.activation, nets: l.networks(&normaliser) };
+    let (mut batch, first) = collect(&actor(&bco), 1024, &mut rng);
+    batch.advantage.fill(f32::NAN);
+    let imitator = bco.imitator().expect("it imitates");
+    imitator.warm_up(&batch, &mut rng);
+    imitator.see(demonstrated(1024, &mut rng), 0.0);
+    imitator.pretrain(&mut rng);
+    bco.update(&mut batch, Pace::default(), &mut rng);
+    solves("bco", (first, collect(&actor(&bco), 1024, &mut rng).1));
+}
+
+/// The expert's own spread is what a discriminator cannot tell from the learner's: with none demonstrated, the policy comes close.
+#[test]
+fn gaifo_comes_close_without_the_reward() {
+    let n = nets(Activation::Tanh);
+    let (dims, _, _) = plain();
+    let mut rng = crate::rollout::stream(4, 0);
+    let settings = PpoSettings { lr: 1e-3, log_std: -0.5, ..PpoSettings::default() };
+    let ppo = Ppo::new(dims.clone(), &n, settings, 1, &mut rng);
+    let mut gaifo = Gaifo::new(ppo, &dims, &n, 1e-3, &mut rng);
+    let normaliser = Normaliser::identity(2, 2);
+    let actor =
+        |l: &dyn Learner| Actor { kind: None, activation: n.activation, nets: l.networks(&normaliser) };
+    let first = collect(&actor(&gaifo), 1024, &mut rng).1;
+    gaifo.imitator().expect("it imitates").see(demonstrated(1024, &mut rng), 0.0);
+    let rounds = 60;
+    for round in 0..rounds {
+        let (mut batch, _) = collect(&actor(&gaifo), 1024, &mut rng);
+        batch.stretches = (0..batch.n)
+            .map(|_| Stretch {
+                reward: vec![f32::NAN],
+                terminated: vec![true],
+                truncated: vec![false],
+                final_obs: Vec::new(),
+            })
+            .collect();
+        let pace = Pace { rate: 1.0 - round as f32 / rounds as f32, clip: 1.0 };
+        gaifo.update(&mut batch, pace, &mut rng);
+    }
+    let last = collect(&actor(&gaifo), 1024, &mut rng).1;
+    assert!(first > 0.2 && last < 0.1 * first, "squared distance {first} at first, {last} at last");
 }

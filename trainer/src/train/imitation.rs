@@ -67,8 +67,7 @@ impl Imitation {
             check_actions(&demos, manifest.action_lower.len()).map_err(wrong)?;
         }
         let batch = (settings.n_envs * settings.n_steps) as u64;
-        let is_dapg = algo == Algorithm::Dapg;
-        let warm_ups = if is_dapg { 0 } else { own.warmup.div_ceil(batch) };
+        let warm_ups = if algo.warms_up() { own.warmup.div_ceil(batch) } else { 0 };
         Ok(Some(Self {
             demos,
             settings: own,
@@ -76,7 +75,7 @@ impl Imitation {
             warm_ups,
             updates: updates(steps, batch, warm_ups),
             batch,
-            begins_in_frames: !is_dapg,
+            begins_in_frames: algo.begins_in_demonstrations(),
         }))
     }
 

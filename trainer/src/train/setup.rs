@@ -3,8 +3,8 @@
 use super::{Experience, TrainError};
 use crate::env::{Env, Spec};
 use crate::learn::{
-    Algorithm, Bc, Dapg, Dims, Gradient, Imitating, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2, Pid2Il, Ppo,
-    Soil,
+    Algorithm, Bc, Bco, Dapg, Dims, Gaifo, Gradient, Imitating, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2,
+    Pid2Il, Ppo, Soil,
 };
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
@@ -48,6 +48,10 @@ pub(super) fn learner(
         Algorithm::Soil => Box::new(Imitating::<Soil>::new(direct(rng), demos)),
         Algorithm::Dapg => Box::new(Imitating::<Dapg>::new(direct(rng), demos)),
         Algorithm::Pid2Il => Box::new(Imitating::<Pid2Il>::new(pid2(true, rng), demos)),
+        Algorithm::Bco => Box::new(Imitating::<Bco>::new(direct(rng), demos)),
+        Algorithm::Gaifo => {
+            Box::new(Gaifo::new(direct(rng), &dims, nets, settings.pid2.discriminator_lr, rng))
+        }
     }
 }
 
