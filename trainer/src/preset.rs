@@ -65,7 +65,6 @@ pub const PRESETS: &[PresetEntry] = &[
                 "train.ppo.log_std=-1.0",
                 "train.ppo.lr=1e-3",
                 "train.ppo.target_kl=0.0",
-                "train.nets.idm=[]",
             ],
         )],
     },
