@@ -2,7 +2,8 @@
 
     .venv/bin/python results/imitation/figure.py RUNS FOLDER --experts EXPERTS [--variants]
 
-RUNS has `<task>/<algo>_<seed>`, or with --variants `<variant>/<task>/<algo>_<seed>`. Returns are without noise and from ordinary resets.
+RUNS has `<task>/<algo>_<seed>`, or with --variants `<variant>/<task>/<algo>_<seed>`. Returns are without noise and from ordinary resets. Tasks that
+RUNS does not have stay what they are in the data of FOLDER.
 """
 
 import argparse
@@ -50,6 +51,40 @@ def mean(columns: list[np.ndarray]) -> float:
     return float(values.mean()) if len(values) else float("nan")
 
 
+def kept(folder: Path, tasks: set[str]) -> tuple[list[dict], list[str]]:
+    """Rows of the curves and lines of the table that are there already, of other tasks than these."""
+    if not (folder / "curves.csv").is_file():
+        return [], []
+    with open(folder / "curves.csv", newline="") as text:
+        rows = [row for row in csv.DictReader(text) if row["task"] not in tasks]
+    lines = (folder / "table.md").read_text().splitlines()[2:]
+    return rows, [line for line in lines if line.split("|")[1].strip() not in tasks]
+
+
+def draw(rows: list[dict], expert: dict[str, float], file: Path) -> None:
+    """A panel for each task: interquartile means over the seeds and their bands."""
+    found: dict = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    for row in rows:
+        found[row["task"]][row["name"]][row["seed"]].append((int(row["steps"]), float(row["return"])))
+    across = min(len(found), 2)
+    figure, axes = plt.subplots(-(-len(found) // across), across, figsize=(5.2 * across, 3.8 * -(-len(found) // across)), squeeze=False)
+    for axis, (task, names) in zip(axes.flat, sorted(found.items())):
+        for name, seeds in sorted(names.items()):
+            n = min(len(points) for points in seeds.values())
+            steps = [x for x, _ in next(iter(seeds.values()))[:n]]
+            values = np.array([[y for _, y in points[:n]] for points in seeds.values()])
+            (line,) = axis.plot(steps, interquartile_mean(values), label=f"{name} ({len(values)})")
+            if len(values) > 1:
+                axis.fill_between(steps, *bootstrap_band(values), color=line.get_color(), alpha=0.15, lw=0)
+        axis.axhline(expert[task], color="black", lw=0.8, ls="--", label="expert")
+        axis.set(title=task, xlabel="steps", ylabel="return without noise")
+        axis.legend(fontsize=7)
+    for axis in axes.flat[len(found) :]:
+        axis.set_visible(False)
+    figure.tight_layout()
+    figure.savefig(file, dpi=100)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("runs", type=Path)
@@ -58,40 +93,27 @@ def main() -> None:
     parser.add_argument("--variants", action="store_true")
     args = parser.parse_args()
     found = read(args.runs, args.variants)
-    tasks = sorted({task for task, _ in found})
-    expert = {task: float(np.mean(json.loads((args.experts / f"{task}.json").read_text())["returns"])) for task in tasks}
-    lines = ["| task | | seeds | mean over the run | at its half | at its end | share of the expert | R² of the inverse model | it learned by itself |"]
-    lines.append("|---|---|---|---|---|---|---|---|---|")
-    rows = []
-    figure, axes = plt.subplots(1, len(tasks), figsize=(5.2 * len(tasks), 3.8), squeeze=False)
-    for axis, task in zip(axes[0], tasks):
-        for (_, name), seeds in sorted((k, v) for k, v in found.items() if k[0] == task):
-            curves = {seed: curve(c) for seed, c in seeds.items()}
-            n = min(len(steps) for steps, _ in curves.values())
-            if n == 0:
-                continue
-            steps = next(iter(curves.values()))[0][:n]
-            values = np.stack([y[:n] for _, y in curves.values()])
-            for seed, (xs, ys) in curves.items():
-                rows += [{"task": task, "name": name, "seed": seed, "steps": int(x), "return": f"{y:.5g}"} for x, y in zip(xs, ys)]
-            centre = interquartile_mean(values)
-            (line,) = axis.plot(steps, centre, label=f"{name} ({len(values)})")
-            if len(values) > 1:
-                axis.fill_between(steps, *bootstrap_band(values), color=line.get_color(), alpha=0.15, lw=0)
-            r2, updated = (mean([c[k] for c in seeds.values()]) for k in (R2, UPDATED))
-            speed, half, end = interquartile_mean(values.mean(axis=1)), centre[(n - 1) // 2], centre[-1]
-            share = end / expert[task]
-            lines.append(f"| {task} | {name} | {len(values)} | {speed:.0f} | {half:.0f} | {end:.0f} | {share:.2f} | {r2:.2f} | {updated:.2f} |")
-        axis.axhline(expert[task], color="black", lw=0.8, ls="--", label="expert")
-        axis.set(title=task, xlabel="steps", ylabel="return without noise")
-        axis.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(args.folder / "figure.png", dpi=100)
+    expert = {file.stem: float(np.mean(json.loads(file.read_text())["returns"])) for file in args.experts.glob("*.json")}
+    rows, lines = kept(args.folder, {task for task, _ in found})
+    for (task, name), seeds in sorted(found.items()):
+        curves = {seed: curve(c) for seed, c in seeds.items()}
+        n = min(len(steps) for steps, _ in curves.values())
+        if n == 0:
+            continue
+        for seed, (xs, ys) in curves.items():
+            rows += [{"task": task, "name": name, "seed": seed, "steps": int(x), "return": f"{y:.5g}"} for x, y in zip(xs, ys)]
+        values = np.stack([y[:n] for _, y in curves.values()])
+        centre, (r2, updated) = interquartile_mean(values), (mean([c[k] for c in seeds.values()]) for k in (R2, UPDATED))
+        speed, half, end = interquartile_mean(values.mean(axis=1)), centre[(n - 1) // 2], centre[-1]
+        share = end / expert[task]
+        lines.append(f"| {task} | {name} | {len(values)} | {speed:.0f} | {half:.0f} | {end:.0f} | {share:.2f} | {r2:.2f} | {updated:.2f} |")
+    draw(rows, expert, args.folder / "figure.png")
     with open(args.folder / "curves.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
-    (args.folder / "table.md").write_text("\n".join(lines) + "\n")
+        writer.writerows(sorted(rows, key=lambda row: (row["task"], row["name"], int(row["seed"]), int(row["steps"]))))
+    head = "| task | | seeds | mean over the run | at its half | at its end | share of the expert | R² of the inverse model | it learned by itself |"
+    (args.folder / "table.md").write_text("\n".join([head, "|---|---|---|---|---|---|---|---|---|", *sorted(lines)]) + "\n")
 
 
 if __name__ == "__main__":
