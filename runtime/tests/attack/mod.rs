@@ -75,6 +75,7 @@ impl Attack {
             steps: 0,
             action_lower: effort.iter().map(|e| -e).collect(),
             action_upper: effort,
+            moved: None,
         };
         let n = 2 * model.nv();
         let seed = self.seed.wrapping_mul(1000).wrapping_add(version);
