@@ -30,6 +30,8 @@ pub(crate) struct ViewClient {
 struct Inner {
     link: ViewLink,
     rows: RowsMessage,
+    /// The plant waits for every action, so no tick has a deadline.
+    is_lockstep: bool,
 }
 
 /// The hardest that a row was leaned on.
@@ -87,7 +89,8 @@ impl ViewClient {
         let opened = py.detach(|| {
             let mut link = ViewLink::open(&name)?;
             let rows = link.wait_for_rows(patience)?;
-            Ok(Inner { link, rows })
+            let is_lockstep = link.wait_for_plant(patience)?.is_lockstep();
+            Ok(Inner { link, rows, is_lockstep })
         });
         let inner = opened.map_err(|e| match e {
             LinkError::Name(_) => errors::value(e),
@@ -96,7 +99,7 @@ impl ViewClient {
         Ok(ViewClient { inner: Mutex::new(Some(inner)), name })
     }
 
-    /// Task, row names and limits of the snapshot in use: a dict.
+    /// Task, row names and limits of the snapshot in use, and whether the plant waits for every action: a dict.
     fn told<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         self.with(|inner| {
             let (rows, out) = (&inner.rows, PyDict::new(py));
@@ -107,6 +110,7 @@ impl ViewClient {
                 rows.row_kinds().iter().map(|kind| kind.map(Kind::name)).collect::<Vec<_>>(),
             )?;
             out.set_item("snapshot", rows.snapshot)?;
+            out.set_item("lockstep", inner.is_lockstep)?;
             let limits = [
                 ("lower_position", rows.q_lower()),
                 ("upper_position", rows.q_upper()),

@@ -102,12 +102,12 @@ def test_a_free_joint_has_its_w_where_mujoco_wants_it_and_stays_where_it_is_ahea
 
 
 @contextlib.contextmanager
-def loop() -> Iterator[str]:
+def loop(*options: str) -> Iterator[str]:
     """A Panda in MuJoCo and the loop that runs it, in processes of their own."""
     if not NEARL.exists():
         pytest.fail(f"{NEARL} was not built: run 'make build'")
     name = f"view-{uuid.uuid4().hex[:12]}"
-    plant = subprocess.Popen([NEARL, "plant", "Panda-reach", "--name", name], stdout=subprocess.DEVNULL)
+    plant = subprocess.Popen([NEARL, "plant", "Panda-reach", "--name", name, *options], stdout=subprocess.DEVNULL)
     run = subprocess.Popen([NEARL, "run", SNAPSHOT, "--plant", name], stdout=subprocess.DEVNULL)
     try:
         yield name
@@ -134,6 +134,14 @@ def test_a_running_loop_says_its_task_limits_rows_and_what_holds_it() -> None:
     assert acting and held and all(h.multiplier > 0 and h.name == source.robot.rows[h.row] and h.kind in {*BARS, "torque"} for h in held)
     assert all(len(p.latency) == p.ticks and (p.latency > 0).all() and p.period == 0.001 for p in acting)
     assert all(p.broken == 0 for p in acting) and max(p.raw_total for p in acting) > 0
+
+
+def test_a_plant_in_lockstep_has_no_deadline() -> None:
+    with loop("--lockstep") as name:
+        source = view.Loop(name, "Panda-reach")
+        shown = next(p for p in (source.next(0.1) for _ in range(50)) if p is not None)
+        source.close()
+    assert shown.latency is None and shown.overruns is None and "deadline" not in view.Panel(source.robot).html(shown, {})
 
 
 def test_a_loop_that_is_not_there_is_named() -> None:

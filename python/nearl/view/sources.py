@@ -176,8 +176,8 @@ class Loop:
             broken=seen["target"],
             raw_total=seen["raw_total"],
             broken_total=seen["target_total"],
-            latency=seen["latency_ns"] * 1e-9,
-            overruns=seen["overruns"],
+            latency=None if self._told["lockstep"] else seen["latency_ns"] * 1e-9,
+            overruns=None if self._told["lockstep"] else seen["overruns"],
             lost=seen["lost"],
         )
 
