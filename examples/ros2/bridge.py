@@ -5,7 +5,9 @@
 
 Positions are commanded (`[command] interface = "position"` in the task file): the projected target is the command, and a brake holds the
 last one. For 50 to 200 Hz: a message through ROS takes a millisecond or two, and now and then ten. Joints are joined by name, whatever
-order the robot publishes them in.
+order the robot publishes them in. Each command is within a period's motion of the measured position that it answers; where messages are
+late by a period, two of them may reach the robot in one, and its speed is up to twice the limit for that period: give velocities a scale
+that leaves room, or use a control PC that keeps time.
 """
 
 import sys

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::link::{ActionMessage, Plant, StateMessage};
+use crate::link::{ActionMessage, Plant, StateMessage, TallyMessage};
 
 /// What is to go wrong, and when.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -225,5 +225,8 @@ impl<P: Plant> Plant for FaultyPlant<P> {
     }
     fn brake(&mut self) {
         self.plant.brake();
+    }
+    fn tally(&self, tally: &mut TallyMessage) {
+        self.plant.tally(tally);
     }
 }
