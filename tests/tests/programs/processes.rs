@@ -95,7 +95,6 @@ fn two_seconds_of_panda_in_lockstep_break_no_limit() {
     assert_no_limit_broken(&plant);
     // What the plant counted is in the loop's report too.
     assert_no_limit_broken(&run["plant"]);
-    assert_eq!(run["plant"]["episodes"], 1, "{run}");
 }
 
 #[test]
