@@ -9,8 +9,8 @@ use nearl_trainer::run_folder::RunError;
 use nearl_trainer::tasks::TaskLoadError;
 use nearl_trainer::train::TrainError;
 use nearl_trainer::vector::VectorError;
-use pyo3::PyErr;
-use pyo3::exceptions::{PyOSError, PyValueError};
+use pyo3::exceptions::{PyOSError, PyUserWarning, PyValueError};
+use pyo3::prelude::*;
 
 /// What the user gave is wrong.
 pub(crate) fn value(error: impl std::fmt::Display) -> PyErr {
@@ -72,4 +72,10 @@ pub(crate) fn snapshot(error: SnapshotError) -> PyErr {
         }
         other => value(other),
     }
+}
+
+/// Says as a `UserWarning` what is allowed and hardly meant.
+pub(crate) fn warn(py: Python<'_>, text: &str) -> PyResult<()> {
+    let text = std::ffi::CString::new(text).unwrap_or_default();
+    PyErr::warn(py, &py.get_type::<PyUserWarning>(), &text, 1)
 }

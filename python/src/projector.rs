@@ -110,10 +110,7 @@ impl Projector {
             .detach(|| constraints::Projector::new(robot, &limits, &controllable, settings.clone()))
             .map_err(errors::value)?;
         let (names, settings) = (first.row_names(), first.settings().clone());
-        for note in first.notes() {
-            let category = py.get_type::<pyo3::exceptions::PyUserWarning>();
-            PyErr::warn(py, &category, &std::ffi::CString::new(note.as_str()).unwrap_or_default(), 1)?;
-        }
+        robot.notes().iter().chain(first.notes()).try_for_each(|note| errors::warn(py, note))?;
         let sizes = (robot.nq(), robot.nv());
         Ok(Projector {
             names,

@@ -96,11 +96,16 @@ impl Training {
             let algo = algo.parse().map_err(|e| errors::train(TrainError::Algorithm(e)))?;
             let request = Request { manifest, algo, steps: 0, seed, threads: threads.max(1) };
             let training = train::Training::on(&request, &experience).map_err(errors::train)?;
+            let advice = train::advice(&request.manifest).map_err(errors::train)?;
             if let Some(out) = &out {
                 RunFolder::create(out, &training.snapshot().manifest, seed, &training.columns())
                     .map_err(run)?;
             }
-            Ok(Training::of(training, out, raised))
+            Ok((Training::of(training, out, raised), advice))
+        })
+        .and_then(|(training, advice)| {
+            advice.iter().try_for_each(|line| errors::warn(py, line))?;
+            Ok(training)
         })
     }
 

@@ -109,7 +109,8 @@ pub fn examine(file: &Path, plant: Option<&str>) -> Vec<Check> {
 /// As [`Parts::new`].
 pub fn advice(manifest: &Manifest) -> Result<Vec<String>, SnapshotError> {
     let parts = Parts::new(manifest)?;
-    let checks = [holding(manifest, &parts), braking(manifest, parts)];
+    let notes = notes(&parts.model, &parts.projector);
+    let checks = [notes, holding(manifest, &parts), braking(manifest, parts)];
     let odd = checks.into_iter().filter(|check| check.finding != Finding::Ok);
     Ok(odd.map(|check| format!("{} [{}]", check.text, check.code)).collect())
 }

@@ -1,5 +1,6 @@
 //! `nearl train`: collect, estimate advantages, update, write. The loop of every algorithm.
 
+mod advice;
 mod columns;
 mod imitation;
 mod resume;
@@ -8,6 +9,7 @@ mod served;
 mod setup;
 mod source;
 
+pub use advice::advice;
 pub use columns::COLUMNS;
 pub use run::{resume, resume_on, train, train_on};
 pub use served::{ServedError, ServedSource};

@@ -180,6 +180,7 @@ fn hard_rows_without_a_state_brake_and_soft_ones_give_way() {
     assert_eq!(status, Status::Solved);
     assert_eq!(slack.iter().map(|r| names[r.row].as_str()).collect::<Vec<_>>(), ["low", "high"]);
     assert!(slack.iter().all(|r| (r.slack - 1.0).abs() < 0.05), "{slack:?}");
+    assert_eq!(target.ledger.slack, slack.iter().fold(0.0, |most, r| f64::max(most, r.slack)));
 }
 
 /// Deceleration 10 rad/s^2 is more than the motors give in some states: torque rows then leave nothing, unless a verified brake

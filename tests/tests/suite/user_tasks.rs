@@ -8,7 +8,7 @@ use nearl_tests::random_policy;
 use nearl_trainer::env::{self, Env};
 use nearl_trainer::learn::Algorithm;
 use nearl_trainer::rollout::{make_env, stream};
-use nearl_trainer::train::{Request, Training, complete, train};
+use nearl_trainer::train::{Request, Training, advice, complete, train};
 use nearl_trainer::{evaluate, tasks};
 use rand::RngExt;
 
@@ -419,5 +419,47 @@ fn a_urdf_robot_has_a_task_of_its_own() {
     assert!(
         (3.9..4.0 + 1e-9).contains(&fastest),
         "{fastest} rad/s of 4: the limit was not reached, or broken"
+    );
+}
+
+/// A range of 1.4 m less the margin of the task, and a start drawn from 1.5 times it: the joint, the number and what is allowed are said, and
+/// nothing where episodes begin inside.
+#[test]
+fn episodes_that_begin_outside_the_limits_are_named_before_training() {
+    let folder = tempfile::tempdir().expect("folder");
+    let lines = |from: &str, to: &str| {
+        let mut manifest = tasks::load(&edited(folder.path(), from, to)).expect("task");
+        complete(&mut manifest).expect("environment");
+        let lines = advice(&manifest).expect("advice");
+        lines.into_iter().filter(|line| line.contains("begin with")).collect::<Vec<_>>()
+    };
+    assert_eq!(lines("q = { hinge", "q = { hinge"), [] as [&str; 0]);
+    let found = lines("q = { hinge", "q = { slider = \"3.0\", hinge");
+    assert_eq!(found.len(), 1, "{found:?}");
+    for part in [
+        "64 of 64 episodes",
+        "'slider'",
+        "at 3.0000 rad or m",
+        "is allowed",
+        "[reset]",
+        "constraints.position",
+    ] {
+        assert!(found[0].contains(part), "{part}: {}", found[0]);
+    }
+    let fast = lines("velocity = \"0.05 * uniform\"", "velocity = \"4.5 * uniform\"");
+    assert!(fast.len() == 1 && fast[0].contains("'slider'") && fast[0].contains("-3 to 3"), "{fast:?}");
+}
+
+/// What the robot file lacks is said before a training, not only by the doctor.
+#[test]
+fn a_limit_that_looks_like_degrees_is_said_before_training() {
+    let folder = tempfile::tempdir().expect("folder");
+    let file = edited(folder.path(), "velocity = { limit = 3.0 }", "velocity = { limit = 160.0 }");
+    let mut manifest = tasks::load(&file).expect("task");
+    complete(&mut manifest).expect("environment");
+    let lines = advice(&manifest).expect("advice");
+    assert!(
+        lines.iter().any(|l| l.contains("'slider' is 160 rad/s or m/s") && l.contains("doctor-model")),
+        "{lines:?}"
     );
 }

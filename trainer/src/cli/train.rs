@@ -169,7 +169,7 @@ impl Train {
             (None, Some(name)) => Experience::Served(RobotName::new(name)?, Arc::clone(&stop)),
             (None, None) => Experience::Here,
         };
-        for line in nearl_runtime::doctor::advice(&manifest)? {
+        for line in crate::train::advice(&manifest)? {
             eprintln!("nearl: warning: {line}");
         }
         let bar = bar(self.json, run.steps);

@@ -1,0 +1,73 @@
+//! What is said before a training begins.
+
+use super::TrainError;
+use crate::env::{ChaCha8Rng, SeedableRng};
+use crate::rollout::RolloutError;
+use nearl_runtime::{Manifest, Parts};
+
+/// Resets looked at, and their seed.
+const RESETS: (usize, u64) = (64, 1);
+
+/// One sentence for each thing about the task that runs and is hardly meant, with what to change: what [`doctor::advice`] finds, and joints that
+/// an episode may begin with outside their limits. `manifest` is [`complete`](super::complete).
+///
+/// # Errors
+/// [`TrainError`] of a task that cannot be trained at all.
+///
+/// [`doctor::advice`]: nearl_runtime::doctor::advice
+pub fn advice(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
+    let mut lines = nearl_runtime::doctor::advice(manifest)?;
+    lines.extend(beginnings(manifest)?);
+    Ok(lines)
+}
+
+/// Where a joint began furthest outside, and in how many resets.
+#[derive(Clone, Copy, Default)]
+struct Outside {
+    by: f64,
+    value: f64,
+    resets: usize,
+}
+
+fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
+    let Parts { model, layout, projector } = Parts::new(manifest)?;
+    let limits = projector.limits();
+    let mut env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(RESETS.1);
+    let (mut q, mut v) = (vec![0.0; model.nq()], vec![0.0; model.nv()]);
+    let mut found = vec![[Outside::default(); 2]; model.nv()];
+    for _ in 0..RESETS.0 {
+        env.reset(&mut rng).map_err(RolloutError::from)?;
+        env.state(&mut q, &mut v);
+        for &i in layout.controllable() {
+            let at = q[model.joint_of_dof(i).idx_q];
+            let by = [(limits.q_lower[i] - at).max(at - limits.q_upper[i]), v[i].abs() - limits.velocity[i]];
+            for (outside, (by, value)) in found[i].iter_mut().zip(by.into_iter().zip([at, v[i]])) {
+                if by > 1e-9 {
+                    outside.resets += 1;
+                    if by > outside.by {
+                        (outside.by, outside.value) = (by, value);
+                    }
+                }
+            }
+        }
+    }
+    let mut lines = Vec::new();
+    for &i in layout.controllable() {
+        let (name, [position, velocity]) = (model.dof_name(i), found[i]);
+        let mut say = |outside: Outside, unit: &str, range: String, key: &str| {
+            if outside.resets > 0 {
+                lines.push(format!(
+                    "{} of {} episodes begin with joint '{name}' outside its limits, furthest at {:.4} {unit} where {range} is allowed: it comes back \
+                     before it does anything else; draw it inside in [reset], or widen constraints.{key}",
+                    outside.resets, RESETS.0, outside.value
+                ));
+            }
+        };
+        let range = format!("{} to {}", limits.q_lower[i], limits.q_upper[i]);
+        say(position, "rad or m", range, "position");
+        let range = format!("-{0} to {0}", limits.velocity[i]);
+        say(velocity, "rad/s or m/s", range, "velocity");
+    }
+    Ok(lines)
+}
