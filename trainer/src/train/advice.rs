@@ -3,7 +3,8 @@
 use super::TrainError;
 use crate::env::{ChaCha8Rng, SeedableRng};
 use crate::rollout::RolloutError;
-use nearl_runtime::{Manifest, Parts};
+use nearl_runtime::Manifest;
+use nearl_runtime::controller::Parts;
 
 /// Resets looked at, and their seed.
 const RESETS: (usize, u64) = (64, 1);
