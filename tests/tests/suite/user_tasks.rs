@@ -428,7 +428,7 @@ fn a_urdf_robot_has_a_task_of_its_own() {
 fn episodes_that_begin_outside_the_limits_are_named_before_training() {
     let folder = tempfile::tempdir().expect("folder");
     let lines = |from: &str, to: &str| {
-        let mut manifest = tasks::load(&edited(folder.path(), from, to)).expect("task");
+        let mut manifest = tasks::load(&edited(folder.path(), from, to), &[]).expect("task");
         complete(&mut manifest).expect("environment");
         let lines = advice(&manifest).expect("advice");
         lines.into_iter().filter(|line| line.contains("begin with")).collect::<Vec<_>>()
@@ -455,7 +455,7 @@ fn episodes_that_begin_outside_the_limits_are_named_before_training() {
 fn a_limit_that_looks_like_degrees_is_said_before_training() {
     let folder = tempfile::tempdir().expect("folder");
     let file = edited(folder.path(), "velocity = { limit = 3.0 }", "velocity = { limit = 160.0 }");
-    let mut manifest = tasks::load(&file).expect("task");
+    let mut manifest = tasks::load(&file, &[]).expect("task");
     complete(&mut manifest).expect("environment");
     let lines = advice(&manifest).expect("advice");
     assert!(
