@@ -1,8 +1,8 @@
 //! Dry friction: motors make up for MuJoCo's, limits hold whichever way a joint rubs, and what may be wrong is said in numbers.
 
 use nearl_constraints::{
-    AccelerationLimit, Dynamics, Limit, Model, Period, PositionLimit, Projector, Proposal, Settings, Target,
-    TorqueLimit, VelocityLimit,
+    AccelerationLimit, Dynamics, Limit, Model, PerJoint, Period, PositionLimit, Projector, Proposal,
+    Settings, Target, TorqueLimit, VelocityLimit,
 };
 use nearl_trainer::mj;
 
@@ -90,53 +90,221 @@ fn motors_make_up_for_the_simulator_s_friction() {
     }
 }
 
-/// Bang-bang proposals in a closed loop with MuJoCo: largest acceleration, speed and motor force beyond their limits.
-fn attacked(text: &str, known: &str, sub_steps: u32, dt: f64) -> [f64; 3] {
+/// What an attacked arm did: ticks outside, and the largest acceleration, speed, position and motor force beyond their limits.
+struct Seen {
+    over: usize,
+    worst: [f64; 4],
+}
+
+/// Physics steps of a Coulomb plant [s].
+const FINE: f64 = 2e-5;
+
+/// The arm that is attacked: MuJoCo with its own friction, or without any and with Coulomb's in steps of [`FINE`].
+struct Arm {
+    sim: mj::Sim,
+    steps: u32,
+    coulomb: Option<(Dynamics, Vec<f64>)>,
+}
+
+impl Arm {
+    fn new(text: &str, dt: f64, sub_steps: u32, coulomb: bool) -> Arm {
+        if coulomb {
+            let model = Model::from_urdf_text(text).expect("model");
+            let friction = model.friction().to_vec();
+            let sim = plant(&smooth(text), FINE);
+            return Arm {
+                sim,
+                steps: (dt / FINE).round() as u32,
+                coulomb: Some((Dynamics::new(&model), friction)),
+            };
+        }
+        let steps = sub_steps.max(1);
+        let runge_kutta =
+            r#"<mujoco><compiler fusestatic="false"/><option integrator="RK4"/></mujoco></robot>"#;
+        let text = if sub_steps == 0 { text.replace("</robot>", runge_kutta) } else { text.to_string() };
+        Arm { sim: plant(&text, dt / f64::from(steps)), steps, coulomb: None }
+    }
+
+    /// A period under motor forces `tau`.
+    fn step(&mut self, tau: &[f64]) {
+        self.sim.force_mut().copy_from_slice(tau);
+        let Some((dynamics, friction)) = &mut self.coulomb else {
+            return self.sim.step(self.steps as usize).expect("steps");
+        };
+        for _ in 0..self.steps {
+            let (q, v, nv) = (self.sim.qpos().to_vec(), self.sim.qvel().to_vec(), tau.len());
+            // Each joint's friction is what would stop it in this step, at most its own: projected Gauss-Seidel over
+            // v' = v + h (M + h D)^-1 (tau - nle - D v - friction).
+            let (mut rows, mut bias) = (vec![0.0; nv * nv], vec![0.0; nv]);
+            dynamics.motor_rows(&Period::new(FINE, 1), &q, &v, &mut rows, &mut bias);
+            let column = |i: usize| {
+                let mut unit = vec![0.0; nv];
+                unit[i] = 1.0;
+                solved(nv, &rows, unit)
+            };
+            let mobility: Vec<Vec<f64>> = (0..nv).map(column).collect();
+            let free = solved(nv, &rows, tau.iter().zip(&bias).map(|(t, b)| t - b).collect());
+            let mut force = vec![0.0; nv];
+            for _ in 0..50 {
+                for i in 0..nv {
+                    let a = free[i] - (0..nv).map(|j| mobility[j][i] * force[j]).sum::<f64>();
+                    force[i] =
+                        (force[i] + (v[i] / FINE + a) / mobility[i][i]).clamp(-friction[i], friction[i]);
+                }
+            }
+            (0..nv).for_each(|i| self.sim.force_mut()[i] = tau[i] - force[i]);
+            self.sim.step(1).expect("step");
+        }
+    }
+}
+
+/// `matrix^-1 x` by Gaussian elimination of a positive matrix (n x n, row-major).
+fn solved(n: usize, matrix: &[f64], mut x: Vec<f64>) -> Vec<f64> {
+    let mut m = matrix.to_vec();
+    for k in 0..n {
+        for r in k + 1..n {
+            let share = m[r * n + k] / m[k * n + k];
+            (k..n).for_each(|c| m[r * n + c] -= share * m[k * n + c]);
+            x[r] -= share * x[k];
+        }
+    }
+    for k in (0..n).rev() {
+        let known: f64 = (k + 1..n).map(|c| m[k * n + c] * x[c]).sum();
+        x[k] = (x[k] - known) / m[k * n + k];
+    }
+    x
+}
+
+/// The same robot without friction.
+fn smooth(text: &str) -> String {
+    let mut parts = text.split("friction=\"");
+    let mut out = parts.next().unwrap_or_default().to_string();
+    for part in parts {
+        out += "friction=\"0\"";
+        out += part.split_once('"').expect("a closing quote").1;
+    }
+    out
+}
+
+/// Bang-bang proposals, a third of the time to stand, in a closed loop with `arm`; the projector and the inverse dynamics are of the robot
+/// `known`.
+fn attacked(arm: &mut Arm, known: &str, sub_steps: u32, dt: f64, ticks: usize) -> Seen {
     let model = Model::from_urdf_text(known).expect("model");
+    let (nv, period) = (model.nv(), Period::new(dt, sub_steps));
     let limits: Vec<Box<dyn Limit>> = vec![
         Box::new(PositionLimit::default()),
-        Box::new(VelocityLimit::default()),
+        Box::new(VelocityLimit::values(PerJoint::All(3.0))),
         Box::new(AccelerationLimit::uniform(10.0)),
         Box::new(TorqueLimit::default()),
     ];
+    let dofs: Vec<usize> = (0..nv).collect();
     let mut projector =
-        Projector::new(&model, &limits, &[0, 1, 2], Settings::new(dt, sub_steps)).expect("projector");
-    let (mut dynamics, mut sim, mut seed) =
-        (Dynamics::new(&model), plant(text, dt / f64::from(sub_steps)), 3);
+        Projector::new(&model, &limits, &dofs, Settings::new(dt, sub_steps)).expect("projector");
+    let (mut dynamics, mut seed) = (Dynamics::new(&model), 3);
+    let (low, high) = (model.lower_position_limit(), model.upper_position_limit());
+    let middle: Vec<f64> = low.iter().zip(high).map(|(l, h)| 0.5 * (l + h)).collect();
+    arm.sim.set_state(&middle, &vec![0.0; nv]).expect("state");
     let (mut proposal, mut target) = (Proposal::new(&model), Target::new(&model));
-    let mut worst = [f64::NEG_INFINITY; 3];
-    let mut sign = [1.0; 3];
-    for tick in 0..3000 {
-        let (q, v) = (sim.qpos().to_vec(), sim.qvel().to_vec());
-        for i in 0..3 {
-            if (tick + 37 * i) % 150 == 0 {
+    let mut seen = Seen { over: 0, worst: [f64::NEG_INFINITY; 4] };
+    let (mut sign, mut tau) = (vec![1.0; nv], vec![0.0; nv]);
+    let hold = (0.15 / dt).round() as usize;
+    for tick in 0..ticks {
+        let (q, v) = (arm.sim.qpos().to_vec(), arm.sim.qvel().to_vec());
+        for i in 0..nv {
+            if (tick + 37 * i) % hold == 0 {
                 sign[i] = uniform(&mut seed).signum();
             }
-            // A third of the time a joint is to stand, where the sign of its velocity is noise.
-            let wish = if tick % 450 < 150 { 0.0 } else { sign[i] * 100.0 };
+            // Standing, the sign of a velocity is noise.
+            let wish = if tick % (3 * hold) < hold { 0.0 } else { sign[i] * 100.0 };
             (proposal.v[i], proposal.q[i]) = (wish, q[i] + dt * wish);
         }
         projector.project(&q, &v, &proposal, &mut target);
-        let mut tau = [0.0; 3];
-        dynamics.motors(&Period::new(dt, sub_steps), &q, &v, &target.acceleration, &mut tau);
-        sim.force_mut().copy_from_slice(&tau);
-        sim.step(sub_steps as usize).expect("step");
-        for i in 0..3 {
-            worst[0] = worst[0].max(((sim.qvel()[i] - v[i]) / dt).abs() - 10.0);
-            worst[1] = worst[1].max(sim.qvel()[i].abs() - 3.0);
-            worst[2] = worst[2].max(tau[i].abs() - 30.0);
+        dynamics.motors(&period, &q, &v, &target.acceleration, &mut tau);
+        arm.step(&tau);
+        let mut beyond = [f64::NEG_INFINITY; 4];
+        for i in 0..nv {
+            let (q1, v1) = (arm.sim.qpos()[i], arm.sim.qvel()[i]);
+            let at = [
+                ((v1 - v[i]) / dt).abs() - 10.0,
+                v1.abs() - 3.0,
+                (low[i] - q1).max(q1 - high[i]),
+                tau[i].abs() - model.effort_limit()[i],
+            ];
+            (0..4).for_each(|k| beyond[k] = f64::max(beyond[k], at[k]));
         }
+        seen.over += usize::from(beyond[0] > 0.1 || beyond[1..].iter().any(|x| *x > 1e-3));
+        (0..4).for_each(|k| seen.worst[k] = seen.worst[k].max(beyond[k]));
     }
-    worst
+    seen
 }
 
 #[test]
 fn a_joint_that_rubs_keeps_its_limits_under_attack() {
     let text = arm(FRICTION, 0.5);
-    let [a, v, tau] = attacked(&text, &text, 1, 0.001);
-    assert!(a < 1e-6 && v < 1e-9 && tau < 1e-9, "{a} rad/s², {v} rad/s, {tau} N m beyond");
-    let [a, ..] = attacked(&text, &arm([0.0; 3], 0.5), 1, 0.001);
+    let attack = |known: &str| attacked(&mut Arm::new(&text, 0.001, 1, false), known, 1, 0.001, 3000);
+    let [a, v, q, tau] = attack(&text).worst;
+    assert!(
+        a < 1e-6 && v < 1e-9 && q < 1e-9 && tau < 1e-9,
+        "{a} rad/s², {v} rad/s, {q} rad, {tau} N m beyond"
+    );
+    let [a, ..] = attack(&smooth(&text)).worst;
     assert!(a > 1.0, "the attack would see nothing: {a}");
+}
+
+/// The table of `results/friction`, of the URDF file that `NEARL_ROBOT` names.
+#[test]
+#[ignore = "a table of minutes; results/friction/run.sh writes it"]
+fn table() {
+    let file = std::env::var("NEARL_ROBOT").expect("NEARL_ROBOT names a URDF file");
+    let text = std::fs::read_to_string(&file).expect("robot");
+    let ticks: usize = std::env::var("NEARL_TICKS").map_or(4000, |n| n.parse().expect("a number of ticks"));
+    let text = without_solids(&text);
+    println!(
+        "| period | steps | friction of plant, model | ticks over | acceleration | velocity | position | torque |"
+    );
+    println!("|---|---|---|---|---|---|---|---|");
+    for (dt, sub_steps) in [0.001, 0.002, 0.01].into_iter().flat_map(|dt| [1, 5, 0].map(|n| (dt, n))) {
+        for (rubs, known, coulomb) in [
+            (false, false, false),
+            (true, false, false),
+            (true, true, false),
+            (true, false, true),
+            (true, true, true),
+        ] {
+            if coulomb && sub_steps != 0 {
+                continue;
+            }
+            let of = |rubs: bool| if rubs { text.clone() } else { smooth(&text) };
+            let mut arm = Arm::new(&of(rubs), dt, sub_steps, coulomb);
+            let seen = attacked(&mut arm, &of(known), sub_steps, dt, ticks);
+            let plant = if coulomb {
+                "Coulomb's"
+            } else if rubs {
+                "MuJoCo's"
+            } else {
+                "none"
+            };
+            let model = if known { "modelled" } else { "none" };
+            let [a, v, q, tau] = seen.worst;
+            let share = 100.0 * seen.over as f64 / ticks as f64;
+            println!(
+                "| {} ms | {sub_steps} | {plant}, {model} | {share:.2} % | {a:.2} | {v:.1e} | {q:.1e} | {tau:.2} |",
+                1000.0 * dt
+            );
+        }
+    }
+}
+
+/// A URDF without what is drawn and touched, whose meshes may be elsewhere.
+fn without_solids(text: &str) -> String {
+    let mut text = text.to_string();
+    for tag in ["visual", "collision"] {
+        while let (Some(begin), Some(end)) = (text.find(&format!("<{tag}>")), text.find(&format!("</{tag}>")))
+        {
+            text.replace_range(begin..end + tag.len() + 3, "");
+        }
+    }
+    text
 }
 
 #[test]
