@@ -13,7 +13,7 @@ _Floats = NDArray[np.float64]
 _Path = str | os.PathLike[str]
 _PerJoint = float | Mapping[str, float] | Sequence[float]
 _Soft = tuple[float, float]
-_Status = Literal["unchanged", "clamped", "solved", "slowed", "recovering", "braked", "refused"]
+_Status = Literal["unchanged", "clamped", "solved", "slowed", "recovering", "tightening", "braked", "refused"]
 
 def tasks() -> list[tuple[str, str]]: ...
 def nearest_action(
@@ -58,6 +58,7 @@ class Model:
     @staticmethod
     def from_description(text: str) -> Model: ...
     def description(self) -> str: ...
+    def with_payload(self, frame: str, mass: float, com: Sequence[float] = (0.0, 0.0, 0.0), inertia: Sequence[float] = ...) -> Model: ...
     @property
     def frame_names(self) -> list[str]: ...
     def external_forces(self, q: ArrayLike, wrenches: Mapping[str, Sequence[float]]) -> _Floats: ...
@@ -345,6 +346,18 @@ class Projector:
         threads: int | None = None,
     ) -> tuple[_Floats, _Floats]: ...
     def set_enabled(self, name: str, on: bool) -> None: ...
+    def move_limits(
+        self,
+        *,
+        speed: float = 1.0,
+        velocity: _PerJoint | None = None,
+        acceleration: _PerJoint | None = None,
+        lower: _PerJoint | None = None,
+        upper: _PerJoint | None = None,
+        frame: dict[str, float] | None = None,
+        frame_speed: dict[str, float] | None = None,
+        energy: float | None = None,
+    ) -> None: ...
     def set_external_forces(self, forces: ArrayLike) -> None: ...
     @property
     def enabled(self) -> dict[str, bool]: ...
@@ -610,6 +623,19 @@ class LoopClient:
     def __init__(self, name: str, patience: float) -> None: ...
     def transitions(self, patience: float) -> tuple[dict[str, Any], int]: ...
     def push(self, bytes: bytes, patience: float) -> tuple[bool, str, str, int]: ...
+    def move_limits(
+        self,
+        patience: float,
+        *,
+        speed: float = 1.0,
+        velocity: _PerJoint | None = None,
+        acceleration: _PerJoint | None = None,
+        lower: _PerJoint | None = None,
+        upper: _PerJoint | None = None,
+        frame: dict[str, float] | None = None,
+        frame_speed: dict[str, float] | None = None,
+        energy: float | None = None,
+    ) -> tuple[bool, str, str, int]: ...
     def close(self) -> None: ...
 
 @final

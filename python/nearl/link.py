@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,6 +200,17 @@ class Link:
         """
         data = snapshot if isinstance(snapshot, bytes) else Path(snapshot).read_bytes()
         return Receipt(*self._running().push(data, self._patience))
+
+    def move_limits(self, **moved: Any) -> Receipt:
+        """Moves the limits of the running loop inside those it was started with, or back to them; without arguments, back.
+
+        The arguments are those of ``Projector.move_limits``: ``speed``, ``velocity``, ``acceleration``, ``lower``, ``upper``, ``frame``,
+        ``frame_speed``, ``energy``. The limits hold until others are asked for, whoever leaves.
+
+        Raises:
+            ConnectionError: there is no loop, no answer came, or another operator moves its limits.
+        """
+        return Receipt(*self._running().move_limits(self._patience, **moved))
 
     def _running(self) -> _core.LoopClient:
         if self._loop is None:

@@ -145,7 +145,7 @@ fn checked<P: PyClass<BaseType = Limit>>(
 }
 
 /// One number for every joint, numbers by joint name, or one for each dof.
-enum Values {
+pub(crate) enum Values {
     All(f64),
     Joints(BTreeMap<String, f64>),
     Each(Vec<f64>),
@@ -183,13 +183,26 @@ fn expected(what: &str, given: &Bound<'_, PyAny>) -> PyErr {
 }
 
 impl Values {
-    fn per_joint(self) -> PerJoint {
+    pub(crate) fn per_joint(self) -> PerJoint {
         match self {
             Values::All(value) => PerJoint::All(value),
             Values::Joints(map) => PerJoint::Joints(map),
             Values::Each(list) => PerJoint::Each(list),
         }
     }
+}
+
+/// Where limits are moved: velocity, acceleration, lowest and highest position by joint, and those that have names.
+pub(crate) fn moved(
+    speed: f64,
+    joints: [Option<Values>; 4],
+    frame: Option<BTreeMap<String, f64>>,
+    frame_speed: Option<BTreeMap<String, f64>>,
+    energy: Option<f64>,
+) -> constraints::Moved {
+    let [velocity, acceleration, lower, upper] = joints.map(|values| values.map(Values::per_joint));
+    let (frame, frame_speed) = (frame.unwrap_or_default(), frame_speed.unwrap_or_default());
+    constraints::Moved { speed, velocity, acceleration, lower, upper, frame, frame_speed, energy }
 }
 
 /// `(linear, quadratic)` weights.

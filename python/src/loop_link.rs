@@ -1,15 +1,17 @@
 //! The client of a running loop (see `nearl.Link`).
 
+use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use nearl_runtime::link::{LinkError, RobotName, TrainerLink, TransitionMessage};
+use nearl_runtime::link::{LinkError, OperatorLink, RobotName, TrainerLink, TransitionMessage};
 use numpy::{PyArray1, PyArray2, PyArrayMethods};
 use pyo3::exceptions::PyConnectionError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::errors;
+use crate::limits;
 use crate::link::{SIGNALS, seconds};
 
 /// Pause when the stream is empty.
@@ -26,6 +28,8 @@ struct Inner {
     link: TrainerLink,
     /// Snapshots pushed.
     pushed: u64,
+    /// Once limits were moved.
+    operator: Option<OperatorLink>,
 }
 
 fn error(error: LinkError) -> PyErr {
@@ -47,7 +51,7 @@ impl LoopClient {
             link.wait_for_runtime(patience)?;
             Ok(link)
         });
-        let inner = Inner { link: link.map_err(error)?, pushed: 0 };
+        let inner = Inner { link: link.map_err(error)?, pushed: 0, operator: None };
         Ok(LoopClient { inner: Mutex::new(Some(inner)), name })
     }
 
@@ -75,13 +79,44 @@ impl LoopClient {
     ) -> PyResult<(bool, &'static str, String, u64)> {
         let patience = seconds(patience)?;
         let receipt = py.detach(|| {
-            self.with(|Inner { link, pushed }| {
+            self.with(|Inner { link, pushed, .. }| {
                 *pushed += 1;
                 link.push(*pushed, &bytes)?;
                 link.wait_for_receipt(*pushed, patience)
             })
         })?;
         let receipt = receipt.map_err(error)?;
+        let verdict = receipt.verdict();
+        Ok((verdict == nearl_runtime::link::Verdict::Accepted, verdict.name(), receipt.text(), receipt.tick))
+    }
+
+    /// Moves the loop's limits: whether it took them, the code of its answer, its sentence, and the first tick.
+    #[pyo3(signature = (patience, *, speed=1.0, velocity=None, acceleration=None, lower=None, upper=None, frame=None, frame_speed=None, energy=None))]
+    fn move_limits(
+        &self,
+        py: Python<'_>,
+        patience: f64,
+        speed: f64,
+        velocity: Option<limits::Values>,
+        acceleration: Option<limits::Values>,
+        lower: Option<limits::Values>,
+        upper: Option<limits::Values>,
+        frame: Option<BTreeMap<String, f64>>,
+        frame_speed: Option<BTreeMap<String, f64>>,
+        energy: Option<f64>,
+    ) -> PyResult<(bool, &'static str, String, u64)> {
+        let patience = seconds(patience)?;
+        let moved = limits::moved(speed, [velocity, acceleration, lower, upper], frame, frame_speed, energy);
+        let receipt = py.detach(|| {
+            self.with(|Inner { operator, .. }| {
+                if operator.is_none() {
+                    *operator = Some(OperatorLink::open(&self.name, patience)?);
+                }
+                operator.as_mut().map(|link| link.move_limits(&moved, patience)).transpose()
+            })
+        })?;
+        let closed = || LinkError::NoRuntime(self.name.clone());
+        let receipt = receipt.and_then(|receipt| receipt.ok_or_else(closed)).map_err(error)?;
         let verdict = receipt.verdict();
         Ok((verdict == nearl_runtime::link::Verdict::Accepted, verdict.name(), receipt.text(), receipt.tick))
     }

@@ -78,6 +78,19 @@ impl Model {
         serde_json::to_string(self.model.description()).map_err(errors::value)
     }
 
+    /// The robot with a body held fast in one of its frames: a model of its own, for which projectors are built anew.
+    ///
+    /// Args:
+    ///     frame (str): a link or site of the robot file.
+    ///     mass (float): [kg].
+    ///     com (3): centre of mass in the frame's axes [m].
+    ///     inertia (6): about the centre of mass in the frame's axes, xx, xy, xz, yy, yz, zz [kg m²].
+    #[pyo3(signature = (frame, mass, com=[0.0; 3], inertia=[0.0; 6]))]
+    fn with_payload(&self, frame: &str, mass: f64, com: [f64; 3], inertia: [f64; 6]) -> PyResult<Model> {
+        let payload = constraints::description::Payload { frame: frame.to_string(), mass, com, inertia };
+        self.model.with_payload(&payload).map(Model::of).map_err(errors::model)
+    }
+
     /// Dry friction (nv) [N·m or N]: the force that a joint withstands before it moves.
     #[getter]
     fn friction<'py>(&self, py: Python<'py>) -> Vector<'py> {

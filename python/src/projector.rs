@@ -1,5 +1,6 @@
 //! The projector: the nearest next state that every limit allows.
 
+use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
@@ -248,6 +249,39 @@ impl Projector {
         projectors.iter_mut().try_for_each(|p| p.set_enabled(name, on)).map_err(errors::value)
     }
 
+    /// Moves limits inside those of the build, or back towards them, for all projections to come; what is not named is as it was built. A
+    /// state outside of what is asked for has the status "tightening": it goes there on the way that docs/LIMITS.md declares.
+    ///
+    /// Args:
+    ///     speed (float): share of every limit on speed, in (0, 1]: of joints and frames; kinetic energy has its square.
+    ///     velocity (float | array (nv) | dict): largest speed by joint [rad/s, m/s].
+    ///     acceleration (float | array (nv) | dict): how fast a joint may speed up [rad/s², m/s²]; slowing down keeps that of the build.
+    ///     lower (float | array (nv) | dict): lowest position [rad, m].
+    ///     upper (float | array (nv) | dict): highest position [rad, m].
+    ///     frame (dict): by the name of a FrameLimit, how far inside all its planes lie [m].
+    ///     frame_speed (dict): by the name of a FrameSpeedLimit, largest speed [m/s].
+    ///     energy (float): largest kinetic energy [J].
+    ///
+    /// Raises:
+    ///     ValueError: a limit would be wider than it was built or leaves no room to stop; a name is unknown; a hard limit on frames or energy
+    ///         without a stored brake; nothing is changed then.
+    #[pyo3(signature = (*, speed=1.0, velocity=None, acceleration=None, lower=None, upper=None, frame=None, frame_speed=None, energy=None))]
+    fn move_limits(
+        &self,
+        speed: f64,
+        velocity: Option<limits::Values>,
+        acceleration: Option<limits::Values>,
+        lower: Option<limits::Values>,
+        upper: Option<limits::Values>,
+        frame: Option<BTreeMap<String, f64>>,
+        frame_speed: Option<BTreeMap<String, f64>>,
+        energy: Option<f64>,
+    ) -> PyResult<()> {
+        let moved = limits::moved(speed, [velocity, acceleration, lower, upper], frame, frame_speed, energy);
+        let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
+        projectors.iter_mut().try_for_each(|p| p.move_limits(&moved)).map_err(errors::value)
+    }
+
     /// Names of the limits and whether they hold.
     #[getter]
     fn enabled<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -371,6 +405,7 @@ impl Projector {
                 projectors[0].enabled().filter(|(_, on)| !on).map(|(name, _)| name.to_string()).collect();
             off.iter().try_for_each(|name| new.set_enabled(name, false))?;
             new.set_external_forces(projectors[0].external_forces());
+            new.set_moved(projectors[0].moved());
             projectors.push(new);
         }
         Ok(())

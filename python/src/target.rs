@@ -32,13 +32,13 @@ pub(crate) struct Ledger {
 
 #[pymethods]
 impl Ledger {
-    /// "unchanged", "clamped", "solved", "slowed", "recovering", "braked" or "refused".
+    /// "unchanged", "clamped", "solved", "slowed", "recovering", "tightening", "braked" or "refused".
     #[getter]
     fn status(&self) -> &'static str {
         self.ledger.status.name()
     }
 
-    /// Why the status is "slowed", "recovering", "braked" or "refused".
+    /// Why the status is "slowed", "recovering", "tightening", "braked" or "refused".
     #[getter]
     fn reason(&self) -> Option<&'static str> {
         self.ledger.status.reason()
