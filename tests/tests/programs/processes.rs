@@ -314,3 +314,57 @@ fn a_short_soak_keeps_what_does_not_depend_on_the_machine() {
         assert_eq!(kept["replay bit-equal"], true, "{report}");
     }
 }
+
+/// `nearl limits` against plant and loop as processes: the plant's own count stays clean, the loop goes on.
+#[test]
+fn limits_are_moved_from_the_command_line() {
+    let name = Name::new("move-limits");
+    let plant = name.plant(&["--lockstep"]);
+    let runtime = name.runtime(&[]);
+    let mut link = name.link();
+    let limits = |more: &[&str]| {
+        let output = Command::new(program("nearl"))
+            .args(["limits", name.text()])
+            .args(more)
+            .output()
+            .expect("nearl limits");
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        (output.status.success(), text(&output.stdout) + &text(&output.stderr))
+    };
+    let (moved, text) = limits(&["--speed", "0.1"]);
+    assert!(moved && text.contains("in force at tick"), "{text}");
+    let built = nearl_runtime::controller::Controller::new(&snapshot())
+        .expect("controller")
+        .limits()
+        .velocity
+        .clone();
+    let from = until("health", || link.health()).tick;
+    // The Panda's fastest joint stops from full speed in 2.61 / 10 s.
+    let mut slow = 0;
+    while slow < 500 {
+        let Some(t) = link.transition() else { continue };
+        if t.tick > from + 300 {
+            let over = t.target_v().iter().zip(&built).any(|(v, limit)| v.abs() > 0.1 * limit * (1.0 + 1e-9));
+            assert!(!over, "{:?} at tick {}", t.target_v(), t.tick);
+            slow += 1;
+        }
+    }
+    for (more, says) in [
+        (&["--speed", "2"][..], "speed"),
+        (&["--set", "upper = { panda_joint9 = 1.0 }"], "panda_joint9"),
+        (&["--set", "upper = { panda_joint2 = 9.0 }"], "upper 9 rad or m of joint 'panda_joint2'"),
+        (&["--set", "uper = 1.0"], "uper"),
+    ] {
+        let (moved, text) = limits(more);
+        assert!(!moved && text.contains(says), "{says}: {text}");
+    }
+    let (moved, text) = limits(&["--reset"]);
+    assert!(moved, "{text}");
+    let run = runtime.end();
+    assert_eq!(
+        (&run["counters"]["swaps"], &run["counters"]["target_violations"]),
+        (&2.into(), &0.into()),
+        "{run}"
+    );
+    assert_no_limit_broken(&plant.end());
+}
