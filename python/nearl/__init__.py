@@ -43,6 +43,7 @@ from nearl.link import Link
 from nearl.pid2 import PID2
 from nearl.plant import Loop, Plant
 from nearl.proposer import Proposer, blank
+from nearl.ranks import Ranks
 
 __all__ = [
     "AccelerationLimit",
@@ -64,6 +65,7 @@ __all__ = [
     "PositionLimit",
     "Projector",
     "Proposer",
+    "Ranks",
     "RowLimit",
     "Target",
     "Targets",

@@ -7,6 +7,8 @@ from typing import Any, Literal, TypedDict, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nearl.ranks import Gather
+
 __version__: str
 
 _Floats = NDArray[np.float64]
@@ -506,6 +508,7 @@ class Training:
         preset: str | None = None,
         judge: Callable[[_Floats, _Floats, _Floats], tuple[float | None, bool]] | None = None,
         rewards: bool = False,
+        ranks: Gather | None = None,
     ) -> Training: ...
     def begin(self, steps: int) -> None: ...
     def end(self) -> None: ...
@@ -516,6 +519,7 @@ class Training:
         threads: int,
         judge: Callable[[_Floats, _Floats, _Floats], tuple[float | None, bool]] | None = None,
         rewards: bool = False,
+        ranks: Gather | None = None,
     ) -> Training: ...
     def controller(self) -> Controller: ...
     @property

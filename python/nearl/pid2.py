@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
 from nearl.outcome import Outcome, ask
+from nearl.ranks import Gather
 
 Floats = NDArray[np.float64]
 Callback = Callable[["PID2", dict[str, float]], bool | None]
@@ -35,11 +36,13 @@ class PID2:
         settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.scale": 0.8}``.
         preset: Settings by name, ``"paper"`` or ``"strong"``; ``settings`` come after them.
         demos: Demonstrations (``.npz``) for ``bc``, ``soil``, ``dapg``, ``pid2-il``, ``bco`` and ``gaifo``; ``nearl demos record RUN`` writes some.
-        run: Run folder to write as ``nearl train`` does; none by default.
+        run: Run folder to write as ``nearl train`` does; none by default. Of several ranks the first writes it.
         reward: ``reward(obs, actions, next_obs)``, arrays of n rows in, (n,) out, replaces the task's, as in :func:`nearl.make_vec`; here it is
             asked once a control period of each environment, with one row, from several threads in any order: the same arguments must give
             the same answer.
         termination: Likewise, true where an episode ends: beside the task's own.
+        ranks: The other processes of a training on several hosts, ``nearl.Ranks()``. Every one makes the same agent and learns the same steps;
+            without ``reward`` and ``termination``.
 
     Raises:
         ValueError: unknown task, algorithm or setting; the message names it.
@@ -59,14 +62,16 @@ class PID2:
         run: str | os.PathLike[str] | None = None,
         reward: Outcome | None = None,
         termination: Outcome | None = None,
+        ranks: Gather | None = None,
     ):
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
         if demos is not None:
             overrides.append(f"train.demos.file={_toml(os.path.abspath(demos))}")
         if not 0 <= seed < 2**64:
             raise ValueError(f"seed is {seed}; give a whole number from 0 to 2**64 - 1")
+        run = run if ranks is None or ranks.rank == 0 else None
         self._training: _core.Training | None = _core.Training(
-            os.fspath(task), algo, seed, _threads(threads), overrides, run, preset, _judge(reward, termination), reward is not None
+            os.fspath(task), algo, seed, _threads(threads), overrides, run, preset, _judge(reward, termination), reward is not None, ranks
         )
         self.task, self.algo, self.seed = self._training.task, algo, seed
         self._begin(self._training.controller())
@@ -168,8 +173,11 @@ class PID2:
         threads: int | None = None,
         reward: Outcome | None = None,
         termination: Outcome | None = None,
+        ranks: Gather | None = None,
     ) -> "PID2":
         """A policy to predict with, from a snapshot file; from a run folder, one that can also learn on, exactly where it stopped.
+
+        With ``ranks`` it is a run folder, which rank 0 reads for all; the number of ranks may be another than before.
 
         A run that was stopped ``n`` steps before its end gives, after ``learn(n)``, the same weights as one that was not stopped. One that learned
         from Python functions needs them again, as ``reward`` and ``termination``.
@@ -180,8 +188,8 @@ class PID2:
         """
         agent = cls.__new__(cls)
         agent._training, agent.seed = None, 0
-        if (Path(path) / "checkpoints" / "resume.safetensors").is_file():
-            agent._training = _core.Training.resume(path, _threads(threads), _judge(reward, termination), reward is not None)
+        if ranks is not None or (Path(path) / "checkpoints" / "resume.safetensors").is_file():
+            agent._training = _core.Training.resume(path, _threads(threads), _judge(reward, termination), reward is not None, ranks)
         controller = _core.Controller.load(path) if agent._training is None else agent._training.controller()
         agent.task, agent.algo = controller.task, controller.algo
         agent._begin(controller)

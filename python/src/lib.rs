@@ -16,6 +16,7 @@ mod plant;
 mod policy;
 mod projector;
 mod proposer;
+mod ranks;
 mod target;
 mod training;
 mod vec_env;

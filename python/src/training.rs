@@ -7,6 +7,7 @@ use nearl_trainer::checkpoint::{self, Checkpoint};
 use nearl_trainer::env::Step;
 use nearl_trainer::learn::ALGORITHMS;
 use nearl_trainer::preset::Preset;
+use nearl_trainer::ranks::{Ranks, from_first};
 use nearl_trainer::rollout::Judge;
 use nearl_trainer::run_folder::{self, RunFolder};
 use nearl_trainer::tasks;
@@ -16,7 +17,7 @@ use pyo3::types::PyDict;
 
 use crate::arrays;
 use crate::controller::Controller;
-use crate::errors;
+use crate::{errors, ranks};
 
 /// Names of the algorithms, in the paper's order, with a line about each.
 #[pyfunction]
@@ -45,10 +46,23 @@ pub(crate) struct Training {
 type Raised = Arc<Mutex<Option<PyErr>>>;
 
 /// Environments of this process; with `judge(obs, action, next_obs)` (1 x n each), which gives a reward or None and whether the episode ends,
-/// these take the task's place. `rewards`: it gives rewards.
-fn experience(judge: Option<Py<PyAny>>, rewards: bool) -> (Experience, Raised) {
+/// these take the task's place. `rewards`: it gives rewards. With `ranks` those of the other ranks too.
+fn experience(
+    judge: Option<Py<PyAny>>,
+    rewards: bool,
+    ranks: Option<&Arc<Ranks>>,
+) -> PyResult<(Experience, Raised)> {
     let raised = Raised::default();
-    let Some(judge) = judge else { return (Experience::Here, raised) };
+    let judge = match (judge, ranks) {
+        (None, None) => return Ok((Experience::Here, raised)),
+        (None, Some(ranks)) => return Ok((Experience::Ranks(Arc::clone(ranks)), raised)),
+        (Some(judge), None) => judge,
+        (Some(_), Some(_)) => {
+            return Err(errors::value(
+                "reward and termination are functions of one process, and ranks are several; write them into the task file, or leave ranks out",
+            ));
+        }
+    };
     let kept = Arc::clone(&raised);
     let judge = Judge::new(rewards, move |obs, action, next_obs, step| {
         let asked = Python::attach(|py| {
@@ -65,14 +79,15 @@ fn experience(judge: Option<Py<PyAny>>, rewards: bool) -> (Experience, Raised) {
             }
         }
     });
-    (Experience::Judged(judge), raised)
+    Ok((Experience::Judged(judge), raised))
 }
 
 #[pymethods]
 impl Training {
     /// `settings`: overrides of the task file, `key=value`, after those of `preset`. `out`: run folder to write, as `nearl train` does.
+    /// `ranks`: those of a training on several hosts.
     #[new]
-    #[pyo3(signature = (task, algo, seed, threads, settings, out, preset=None, judge=None, rewards=false))]
+    #[pyo3(signature = (task, algo, seed, threads, settings, out, preset=None, judge=None, rewards=false, ranks=None))]
     fn new(
         py: Python<'_>,
         task: &str,
@@ -84,9 +99,11 @@ impl Training {
         preset: Option<String>,
         judge: Option<Py<PyAny>>,
         rewards: bool,
+        ranks: Option<Py<PyAny>>,
     ) -> PyResult<Training> {
+        let ranks = ranks::read(py, ranks)?;
         py.detach(|| {
-            let (experience, raised) = experience(judge, rewards);
+            let (experience, raised) = experience(judge, rewards, ranks.as_ref())?;
             let preset = preset
                 .map(|name| name.parse::<Preset>())
                 .transpose()
@@ -109,22 +126,34 @@ impl Training {
         })
     }
 
-    /// The training of a run folder where it stopped, to go on in it.
+    /// The training of a run folder where it stopped, to go on in it. Of several ranks, the first alone reads and writes the folder.
     #[staticmethod]
-    #[pyo3(signature = (path, threads, judge=None, rewards=false))]
+    #[pyo3(signature = (path, threads, judge=None, rewards=false, ranks=None))]
     fn resume(
         py: Python<'_>,
         path: PathBuf,
         threads: usize,
         judge: Option<Py<PyAny>>,
         rewards: bool,
+        ranks: Option<Py<PyAny>>,
     ) -> PyResult<Training> {
+        let ranks = ranks::read(py, ranks)?;
         py.detach(|| {
-            let (experience, raised) = experience(judge, rewards);
+            let (experience, raised) = experience(judge, rewards, ranks.as_ref())?;
             let file = checkpoint::path_in(&path);
-            let from = Checkpoint::load(&file).map_err(|e| errors::train(e.into()))?;
+            let load = || Checkpoint::load(&file).map_err(|e| errors::train(e.into()));
+            let (from, out) = match &ranks {
+                None => (load()?, Some(path.clone())),
+                Some(ranks) => {
+                    let first = ranks.rank() == 0;
+                    let own = if first { load()?.to_bytes() } else { Vec::new() };
+                    let bytes = from_first(ranks, own).map_err(|e| errors::value(e.to_string()))?;
+                    let from = Checkpoint::from_bytes(&format!("{} of rank 0", file.display()), &bytes);
+                    (from.map_err(|e| errors::train(e.into()))?, first.then(|| path.clone()))
+                }
+            };
             let training = train::Training::resume_on(from, &file, &experience, None, threads.max(1));
-            Ok(Training::of(training.map_err(errors::train)?, Some(path), raised))
+            Ok(Training::of(training.map_err(errors::train)?, out, raised))
         })
     }
 

@@ -131,7 +131,8 @@ impl Checkpoint {
         })
     }
 
-    fn to_bytes(&self) -> Vec<u8> {
+    /// The file as it is written.
+    pub fn to_bytes(&self) -> Vec<u8> {
         let bytes: Vec<_> = self.tensors.iter().map(|(name, values)| (name, values.bytes())).collect();
         let mut views: Vec<(String, TensorView<'_>)> = Vec::with_capacity(bytes.len());
         for (name, (dtype, n, bytes)) in &bytes {
@@ -156,7 +157,11 @@ impl Checkpoint {
         Self::from_bytes(&file, &bytes)
     }
 
-    fn from_bytes(file: &str, bytes: &[u8]) -> Result<Self, CheckpointError> {
+    /// [`Checkpoint::load`] from the bytes of a file, which messages call `file`.
+    ///
+    /// # Errors
+    /// [`CheckpointError`].
+    pub fn from_bytes(file: &str, bytes: &[u8]) -> Result<Self, CheckpointError> {
         let damaged = |reason: String| CheckpointError::Damaged { file: file.into(), reason };
         let foreign = |reason: String| CheckpointError::Foreign { file: file.into(), reason };
         let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|e| damaged(e.to_string()))?;

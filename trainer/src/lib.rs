@@ -17,6 +17,7 @@ pub mod mj;
 pub mod online;
 pub mod plant;
 pub mod preset;
+pub mod ranks;
 pub mod robot;
 pub mod rollout;
 pub mod run_folder;

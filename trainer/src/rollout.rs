@@ -19,6 +19,7 @@ use crate::env::{Env, EnvError};
 use nearl_runtime::{Networks, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
+use std::ops::Range;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -97,33 +98,33 @@ fn memory() -> Option<[u64; 2]> {
 }
 
 impl Collector {
-    /// `n_envs` environments that collect `n_steps` policy steps each, on `threads` threads.
+    /// The environments `envs` of a training, which collect `n_steps` policy steps each, on `threads` threads.
     ///
     /// # Errors
     /// [`RolloutError`].
     pub fn new(
         snapshot: &Snapshot,
-        n_envs: usize,
+        envs: Range<usize>,
         n_steps: usize,
         threads: usize,
         gamma: f64,
         seed: u64,
     ) -> Result<Self, RolloutError> {
-        let first = make_env(snapshot)?;
+        let (first, n_envs) = (make_env(snapshot)?, envs.len());
         // Float32 numbers of a row, in the workers and once more in the batch.
         let row =
             8 * (first.spec().n_obs() + 6 * (first.spec().nq + first.spec().nv) + 3 * first.spec().n_act());
         let batch = (n_envs as u64).saturating_mul(n_steps as u64).saturating_mul(row as u64) >> 20;
         let (mut workers, full) =
             (Vec::new(), |what: String, free| RolloutError::Memory { n_envs, n_steps, what, free });
-        for i in 0..n_envs {
-            if let Some([free, total]) = (i % 64 == 0).then(memory).flatten()
+        for i in envs {
+            if let Some([free, total]) = (workers.len() % 64 == 0).then(memory).flatten()
                 && free < batch + total / 16
             {
-                let what = if i == 0 {
+                let what = if workers.is_empty() {
                     format!("a batch of {batch} MB")
                 } else {
-                    format!("environments after the first {i}")
+                    format!("environments after the first {}", workers.len())
                 };
                 return Err(full(what, free));
             }

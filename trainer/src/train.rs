@@ -3,6 +3,7 @@
 mod advice;
 mod columns;
 mod imitation;
+mod ranked;
 mod resume;
 mod run;
 mod served;
@@ -11,6 +12,7 @@ mod source;
 
 pub use advice::advice;
 pub use columns::COLUMNS;
+pub use ranked::RankedSource;
 pub use run::{resume, resume_on, train, train_on};
 pub use served::{ServedError, ServedSource};
 pub use setup::{complete, limit_scale};
@@ -19,7 +21,7 @@ pub use source::{Experience, Source, SourceError};
 use crate::checkpoint::CheckpointError;
 use crate::demos::DemoError;
 use crate::evaluate::evaluate_by;
-use crate::learn::{Algorithm, Batch, Dims, Learner, Metrics, Pace, Stretch, UnknownAlgorithm};
+use crate::learn::{Algorithm, Batch, Dims, Learner, Metrics, Pace, Params, Stretch, UnknownAlgorithm};
 use crate::rollout::{Collected, Judge, RolloutError, Segment, Tally, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
@@ -31,6 +33,7 @@ use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 use setup::{check_experience, check_minibatch, check_outputs, check_reward, dims, learner, policy_kind};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Why a training could not start or go on.
@@ -167,7 +170,15 @@ impl Training {
             Imitation::read(request.algo, &settings, &manifest, parts.layout.state(), request.steps)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);
         manifest.activation = settings.nets.activation;
-        let learner = learner(request.algo, &manifest, &settings, dims.clone(), request.threads, &mut rng);
+        let mut learner =
+            learner(request.algo, &manifest, &settings, dims.clone(), request.threads, &mut rng);
+        if let Experience::Ranks(ranks) = experience {
+            let join = |params: &mut Params| {
+                params.ranks = Some(Arc::clone(ranks));
+                Ok(())
+            };
+            learner.restore(&mut { join }).map_err(TrainError::Settings)?;
+        }
         let mut normaliser = Normaliser::identity(dims.n_obs, dims.n_state);
         if settings.change_scale == ChangeScale::Limits {
             normaliser.scale = limit_scale(&parts, &manifest)?;

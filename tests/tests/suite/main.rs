@@ -18,6 +18,7 @@ mod networks;
 mod own_draws;
 mod own_robots;
 mod prior_in_training;
+mod ranks;
 mod recipe;
 mod resume;
 mod robots;

@@ -80,7 +80,7 @@ impl ServeBench {
     /// Served and collected steps per second, by the clock and by processor time, round by round.
     fn measure(&self, snapshot: &Snapshot, name: &RobotName) -> Result<Vec<[[f64; 2]; 2]>, Failure> {
         let threads = self.threads.unwrap_or_else(cores).max(1);
-        let mut collector = Collector::new(snapshot, self.clients, self.steps, threads, 0.99, 0)?;
+        let mut collector = Collector::new(snapshot, 0..self.clients, self.steps, threads, 0.99, 0)?;
         let settings = Settings {
             threads,
             requests: self.clients,

@@ -3,18 +3,23 @@
 //! A minibatch is cut into a number of shards that depends on its size alone. Each thread computes some shards; after a
 //! barrier every thread adds all shards in order and applies the same step to its own replica of the parameters. A minibatch
 //! too small to be cut runs its phases in two lanes side by side instead ([`lanes`]). Nothing is allocated per minibatch.
+//!
+//! Where a training has several [`Ranks`], each computes some shards, and gradients of shards go from rank to rank ([`share`]).
 
 mod lanes;
 mod rows;
+mod share;
 
 pub use rows::Rows;
 
 use super::adam::{Adam, square};
 use super::batch::Batch;
+use crate::ranks::Ranks;
 use nearl_runtime::net::kernel::{LANES, V, ZERO};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::ops::Range;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering, fence};
 use std::sync::{Condvar, Mutex, PoisonError, RwLock};
 
@@ -43,6 +48,8 @@ pub struct Params {
     pub beta: f32,
     /// Factor on the rates of policy and value that holds the divergence of an update (`train.ppo.desired_kl`).
     pub adapted: f32,
+    /// The other ranks of the training, which compute some of the shards.
+    pub ranks: Option<Arc<Ranks>>,
 }
 
 /// What a tile of rows needs: the batch, the rows, and numbers of the whole minibatch.
@@ -150,6 +157,17 @@ struct Barrier {
 }
 
 impl Barrier {
+    /// For one of the threads: each call waits until all threads have called equally often.
+    fn rounds(&self) -> impl FnMut() + '_ {
+        let mut round = 0;
+        move || {
+            round += 1;
+            if self.threads > 1 {
+                self.wait(round);
+            }
+        }
+    }
+
     fn wait(&self, round: usize) {
         self.arrived.fetch_add(1, Ordering::AcqRel);
         self.alarm.ring();
@@ -236,7 +254,9 @@ pub fn optimise<P: Phases>(
     let orders: Vec<Vec<u32>> = (0..schedule.epochs).map(|_| shuffled(batch.n, rng)).collect();
     let shards = if mb.is_multiple_of(SHARD) { mb / SHARD } else { 1 };
     let longest = longest(params);
-    let threads = schedule.threads.clamp(1, shards);
+    let ranks = params.ranks.clone().filter(|_| shards > 1);
+    let (rank, n_ranks) = ranks.as_ref().map_or((0, 1), |r| (r.rank(), r.size()));
+    let threads = schedule.threads.clamp(1, shards.div_ceil(n_ranks));
     let run = Run {
         algorithm,
         batch,
@@ -245,6 +265,9 @@ pub fn optimise<P: Phases>(
         orders: &orders,
         rows: rows::scattered(algorithm, phases, batch),
         shards,
+        ranks,
+        rank,
+        n_ranks,
         threads,
         // two buffers a shard: one barrier an optimiser step
         gradients: (0..shards).map(|_| std::array::from_fn(|_| RwLock::new(vec![ZERO; longest]))).collect(),
@@ -280,6 +303,10 @@ struct Run<'a, P: Phases> {
     /// What is fetched ahead of its use, for each phase.
     rows: Vec<Vec<Rows<'a>>>,
     shards: usize,
+    /// The ranks that shards are shared out to, if there are several of both; this one, and their number.
+    ranks: Option<Arc<Ranks>>,
+    rank: usize,
+    n_ranks: usize,
     threads: usize,
     gradients: Vec<[RwLock<Vec<V>>; 2]>,
     barrier: Barrier,
@@ -290,17 +317,27 @@ impl<P: Phases> Run<'_, P> {
         let _watch = self.barrier.alarm.watch();
         let mut scratch = self.algorithm.scratch();
         let (mut sums, mut reports, mut round) = (self.sums(params), self.reports(), 0);
+        let mut meet = self.barrier.rounds();
         for idx in self.minibatches() {
             let advantage = moments(self.batch, idx);
             for k in 0..self.phases.len() {
                 let len = params.groups[self.group(k)].p.len() + 1;
-                for s in (thread..self.shards).step_by(self.threads) {
-                    self.shard(s, k, idx, advantage, params, &mut scratch, round % 2, len);
-                }
                 let odd = round % 2;
                 round += 1;
-                if self.threads > 1 {
-                    self.barrier.wait(round);
+                let mut compute = |shards: &mut dyn Iterator<Item = usize>| {
+                    shards.for_each(|s| self.shard(s, k, idx, advantage, params, &mut scratch, odd, len));
+                };
+                compute(&mut self.own(thread));
+                meet();
+                if self.ranks.is_some() {
+                    if thread == 0 {
+                        self.share(k, odd, params);
+                    }
+                    meet();
+                    if self.is_alone() {
+                        compute(&mut self.missing(thread));
+                        meet();
+                    }
                 }
                 self.gather(&mut sums[k][..len], odd);
                 self.settle(k, &sums, params, &mut reports);
@@ -382,7 +419,8 @@ impl<P: Phases> Run<'_, P> {
         let (scale, all) = (1.0 / self.schedule.minibatch as f32, idx);
         for at in (s * rows..(s + 1) * rows).step_by(TILE) {
             // after the last tile of a shard comes the first of this thread's next one
-            let next = if at + TILE < (s + 1) * rows { at + TILE } else { (s + self.threads) * rows };
+            let next =
+                if at + TILE < (s + 1) * rows { at + TILE } else { (s + self.n_ranks * self.threads) * rows };
             rows::prefetch(&self.rows[k], all.get(next..next + TILE).unwrap_or(&[]));
             let clip = self.schedule.clip;
             let tile = Tile { batch: self.batch, idx: &all[at..at + TILE], scale, advantage, clip };

@@ -190,8 +190,13 @@ impl Pid2 {
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
             Adam::new(combined.proposal_range().len(), settings.generator_lr),
         ];
-        let params =
-            Params { groups: vec![actor, critic, adversary], adam, beta: settings.beta, adapted: 1.0 };
+        let params = Params {
+            groups: vec![actor, critic, adversary],
+            adam,
+            beta: settings.beta,
+            adapted: 1.0,
+            ranks: None,
+        };
         let nets = Nets {
             settings,
             combined,

@@ -197,7 +197,7 @@ pub(super) fn check_experience(
     experience: &Experience,
 ) -> Result<(), TrainError> {
     let (source, next) = match experience {
-        Experience::Here | Experience::Judged(_) => return Ok(()),
+        Experience::Here | Experience::Judged(_) | Experience::Ranks(_) => return Ok(()),
         Experience::Loop(name, _) => (format!("the loop of '{name}'"), "--from"),
         Experience::Served(name, _) => (format!("the rollout server '{name}'"), "--collect"),
     };

@@ -1,9 +1,11 @@
 //! Where experience comes from: environments of this process or of a rollout server, or a running loop.
 
+use super::ranked::RankedSource;
 use super::served::{ServedError, ServedSource};
 use crate::checkpoint::Checkpoint;
 use crate::demos::Frame;
 use crate::online::{LoopSource, OnlineError};
+use crate::ranks::{RankError, Ranks};
 use crate::rollout::{Collected, Collector, Judge, RolloutError};
 use crate::settings::TrainSettings;
 use nearl_rollout_protocol::Layout;
@@ -24,6 +26,12 @@ pub enum SourceError {
     /// A rollout server.
     #[error(transparent)]
     Served(#[from] ServedError),
+    /// The other ranks.
+    #[error(transparent)]
+    Ranks(#[from] RankError),
+    /// What the ranks handed round.
+    #[error("{0}")]
+    Gathered(String),
 }
 
 /// What the user chose.
@@ -38,6 +46,8 @@ pub enum Experience {
     Loop(RobotName, Arc<AtomicBool>),
     /// The rollout server of this name, until the flag is set.
     Served(RobotName, Arc<AtomicBool>),
+    /// Environments of this process, and of the other ranks of the training.
+    Ranks(Arc<Ranks>),
 }
 
 /// A source of experience. A batch has `n_envs n_steps` rows, in any number of stretches in a fixed order.
@@ -126,7 +136,8 @@ impl Experience {
         match self {
             Self::Here | Self::Judged(_) => {
                 let (n_envs, n_steps) = (settings.n_envs, settings.n_steps);
-                let mut collector = Collector::new(snapshot, n_envs, n_steps, threads, settings.gamma, seed)?;
+                let mut collector =
+                    Collector::new(snapshot, 0..n_envs, n_steps, threads, settings.gamma, seed)?;
                 for worker in collector.workers() {
                     worker.set_moved_penalty(settings.moved_penalty);
                     if let Self::Judged(judge) = self {
@@ -137,6 +148,10 @@ impl Experience {
             }
             Self::Loop(name, stop) => {
                 Ok(Box::new(LoopSource::open(name, snapshot, settings, Arc::clone(stop))?))
+            }
+            Self::Ranks(ranks) => {
+                let ranks = Arc::clone(ranks);
+                Ok(Box::new(RankedSource::open(ranks, snapshot, sizes, settings, threads, seed)?))
             }
             Self::Served(name, stop) => {
                 Ok(Box::new(ServedSource::open(name, settings, sizes, seed, Arc::clone(stop))?))
