@@ -25,7 +25,7 @@ pub(crate) fn fault_name(fault: Fault) -> Option<&'static str> {
 
 /// Names of the tasks that [`Env`] can make, with a line about each.
 #[pyfunction]
-pub(crate) fn tasks() -> Vec<(&'static str, &'static str)> {
+pub(crate) fn tasks() -> Vec<(&'static str, String)> {
     task_files::names().into_iter().map(|name| (name, task_files::about(name))).collect()
 }
 

@@ -186,12 +186,14 @@ pub fn env(task: &str) -> Result<Box<dyn Env>, TaskLoadError> {
     Ok(env::of_task(&manifest, task)?)
 }
 
-/// What a bundled task is, in one line.
-pub fn about(name: &str) -> &'static str {
-    let native = env::REGISTRY.iter().find(|e| e.name == name).map(|e| e.about);
+/// What a bundled task is, in one sentence: that of its environment, or the first of its file.
+pub fn about(name: &str) -> String {
+    let native = env::REGISTRY.iter().find(|e| e.name == name).map(|e| e.about.to_owned());
     let comment = || {
         let text = TASKS.iter().find(|(n, _)| n.trim_end_matches(".toml") == name).map_or("", |(_, t)| t);
-        text.lines().next().unwrap_or_default().trim_start_matches("# ")
+        let words: Vec<_> = text.lines().map_while(|line| line.strip_prefix("# ")).collect();
+        let words = words.join(" ");
+        words.split_once(". ").map_or(words.trim_end_matches('.'), |(first, _)| first).to_owned()
     };
     native.unwrap_or_else(comment)
 }

@@ -14,7 +14,7 @@ use super::{Env, EnvError};
 use crate::mj::{MjError, Model, ModelFormat, Options, Sim};
 
 pub(super) const NAME: &str = "Ant-v5";
-pub(super) const ABOUT: &str = "quadruped on a free base, walk forward; 105 observations, 8 actions";
+pub(super) const ABOUT: &str = "quadruped on a free base, walk forward";
 const ROBOT: Robot = Robot {
     text: Cow::Borrowed(include_str!("../../../examples/robots/gymnasium/ant.xml")),
     format: ModelFormat::Mjcf,

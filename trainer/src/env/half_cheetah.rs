@@ -10,7 +10,7 @@ use super::{Env, EnvError, planar};
 use crate::mj::{MjError, Sim};
 
 pub(super) const NAME: &str = "HalfCheetah-v5";
-pub(super) const ABOUT: &str = "planar cheetah, run forward; 17 observations, 6 actions";
+pub(super) const ABOUT: &str = "planar cheetah, run forward";
 const ROBOT: &str = include_str!("../../../examples/robots/gymnasium/half_cheetah.xml");
 const RESET_NOISE: f64 = 0.1;
 const CONTROL_COST: f64 = 0.1;

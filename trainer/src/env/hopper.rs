@@ -11,7 +11,7 @@ use super::{Env, EnvError, planar};
 use crate::mj::{MjError, Sim};
 
 pub(super) const NAME: &str = "Hopper-v5";
-pub(super) const ABOUT: &str = "planar one-legged hopper, hop forward; 11 observations, 3 actions";
+pub(super) const ABOUT: &str = "planar one-legged hopper, hop forward";
 const ROBOT: &str = include_str!("../../../examples/robots/gymnasium/hopper.xml");
 const RESET_NOISE: f64 = 5e-3;
 const CONTROL_COST: f64 = 1e-3;

@@ -24,8 +24,7 @@ use super::{Env, EnvError};
 use crate::mj::{Actuator, Joint, MjError, Model, ModelFormat, Options, Sim};
 
 pub(super) const NAME: &str = "Panda-reach";
-pub(super) const ABOUT: &str =
-    "seven-joint arm under torque control, reach a point; 20 observations, 7 actions";
+pub(super) const ABOUT: &str = "seven-joint arm under torque control, reach a point";
 const ROBOT: Robot = Robot {
     text: Cow::Borrowed(include_str!("../../../examples/robots/panda/panda.urdf")),
     format: ModelFormat::Urdf,

@@ -11,7 +11,7 @@ use super::{Env, EnvError, planar};
 use crate::mj::{MjError, Sim};
 
 pub(super) const NAME: &str = "Walker2d-v5";
-pub(super) const ABOUT: &str = "planar biped, walk forward; 17 observations, 6 actions";
+pub(super) const ABOUT: &str = "planar biped, walk forward";
 const ROBOT: &str = include_str!("../../../examples/robots/gymnasium/walker2d_v5.xml");
 const RESET_NOISE: f64 = 5e-3;
 const CONTROL_COST: f64 = 1e-3;
