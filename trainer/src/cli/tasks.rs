@@ -23,7 +23,7 @@ impl Tasks {
                 let cost = if needs.has_cost { ", a cost" } else { "" };
                 say(format!("{name:<22}{}", tasks::about(name)));
                 say(format!(
-                    "{:<22}{} observations, {} actions, a policy step of {} ms, episodes of {} control periods, {} inverse model{cost}",
+                    "{:<22}{} observations, {} actions, a policy step of {} ms, episodes of {} control periods, inverse model: {}{cost}",
                     "", needs.n_obs, needs.n_act, needs.step_ms, needs.episode, needs.inverse_model
                 ));
             }
@@ -49,8 +49,8 @@ fn needs(name: &str) -> Result<Needs, Failure> {
     let (task, env) = (tasks::load(name, &[])?.task, tasks::env(name)?);
     let spec = env.spec();
     let inverse_model = match task.idm.kind {
-        IdmKind::Learned => "a learned",
-        IdmKind::Pinocchio => "an analytic",
+        IdmKind::Learned => "learned",
+        IdmKind::Pinocchio => "analytic",
     };
     // in microseconds first, so that 50 ms is not 49.99999
     let step_ms = (1e6 * spec.dt * task.time.policy_every as f64).round() * 1e-3;
