@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use nearl_constraints::Model;
 
 /// Every joint at half its speed and four fifths of its force, with a stored brake.
-const LIMITS: &str = "position = { margin = 0.01 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 10.0 }\n\
+const LIMITS: &str = "position = { margin = 0.01 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 25.0 }\n\
      torque = { scale = 0.8 }\nbraking = \"stored\"";
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {

@@ -364,7 +364,9 @@ impl Section {
         if let Some(torque) = &self.torque {
             for &dof in of.controllable {
                 let joint = of.robot.joints().nth(dof).ok_or("a joint is missing")?;
-                let effort = less(torque.scale * of.robot.effort(joint), &torque.margin, dof, &joint.name);
+                // Whichever way a joint rubs, its motor can make up for it.
+                let most = torque.scale * of.robot.effort(joint) - joint.friction;
+                let effort = less(most, &torque.margin, dof, &joint.name);
                 efforts.push((dof, effort));
                 rows.push(Row::new(
                     "torque",
@@ -482,7 +484,8 @@ impl Section {
                 if let (Some(stall), Some(no_load)) =
                     (motor.stall.of(dof, joint), motor.no_load.of(dof, joint))
                 {
-                    let most = less(stall, &motor.margin, dof, joint);
+                    let friction = of.robot.joints().nth(dof).map_or(0.0, |joint| joint.friction);
+                    let most = less(stall, &motor.margin, dof, joint) - friction;
                     rows.push(Row::new(
                         "torque_speed",
                         joint,

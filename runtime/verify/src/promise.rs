@@ -94,6 +94,8 @@ pub(crate) struct Action {
     pub(crate) gear: f64,
     pub(crate) gain: f64,
     pub(crate) bias: f64,
+    /// Of the joint: the motor makes up for some of it [N·m or N].
+    pub(crate) friction: f64,
     pub(crate) range: [f64; 2],
 }
 
@@ -308,6 +310,7 @@ impl Manifest {
                 gear: motor.gear,
                 gain: motor.gain,
                 bias: motor.bias[0],
+                friction: self.robot.joints().nth(*dof).map_or(0.0, |joint| joint.friction),
                 range,
             }
         };

@@ -43,6 +43,9 @@ pub(crate) struct Joint {
     pub(crate) stiffness: f64,
     pub(crate) spring_reference: f64,
     pub(crate) armature: f64,
+    /// Dry friction [N·m or N].
+    #[serde(default)]
+    pub(crate) friction: f64,
 }
 
 /// What a joint lets move.

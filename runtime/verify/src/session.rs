@@ -532,7 +532,7 @@ fn is_outside(promise: &mut Promise, case: &Case<'_>, whole: bool) -> bool {
     !matches!(collision.gap(machine, collision.margin), crate::collision::Gap::Kept)
 }
 
-/// The action is the one that leads to the target.
+/// The action is the one that leads to the target; where a joint rubs, to within its dry friction.
 fn actions(promise: &Promise, step: &Step<'_>, found: &[f64]) -> Result<(), Fault> {
     let p = &promise.period;
     let (lag, sag) = (0.5 * (p.dt - p.tau), (p.dt * p.dt - p.tau * p.tau) / 6.0);
@@ -540,18 +540,22 @@ fn actions(promise: &Promise, step: &Step<'_>, found: &[f64]) -> Result<(), Faul
         let (i, joint) = (action.dof, &promise.limits.joints[action.dof].name);
         let Some(at) = promise.machine.single(i) else { continue };
         let (v, a, tau) = (step.v[i], step.a[i], step.tau[i]);
-        let (sent, unit) = match action.sent {
-            Sent::Force => ((tau / action.gear - action.bias) / action.gain, "N m or N"),
-            Sent::Position => (step.q1[at], "rad or m"),
-            Sent::Velocity => (step.v1[i], "rad/s or m/s"),
+        let (sent, by_friction, unit) = match action.sent {
+            Sent::Force => {
+                let share = action.gear * action.gain;
+                ((tau / action.gear - action.bias) / action.gain, action.friction / share.abs(), "N m or N")
+            }
+            Sent::Position => (step.q1[at], 0.0, "rad or m"),
+            Sent::Velocity => (step.v1[i], 0.0, "rad/s or m/s"),
             Sent::Target { stiffness, damping } => {
-                (step.q[at] + lag * v + sag * a + (tau + damping * (v + lag * a)) / stiffness, "rad or m")
+                let target = step.q[at] + lag * v + sag * a + (tau + damping * (v + lag * a)) / stiffness;
+                (target, action.friction / stiffness, "rad or m")
             }
         };
         let leads = sent.max(action.range[0]).min(action.range[1]);
         let is = found.get(action.place).copied().unwrap_or(f64::NAN);
         let size = 1.0 + leads.abs().max(action.range[1].abs().min(1e3));
-        if !are_near(is, leads, ACTION * size) {
+        if !are_near(is, leads, by_friction + ACTION * size) {
             return broken(format!("action for joint '{joint}'"), is, leads, unit);
         }
     }
