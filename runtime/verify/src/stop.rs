@@ -10,6 +10,8 @@ use crate::rows::Step;
 const LONGEST: u32 = 100_000;
 /// What is left of a speed after the last whole period is rounding below this share of a period's change.
 const REST: f64 = 1e-9;
+/// A joint so slow stands: a measured standstill is one to rounding, and its stored deceleration may be as small [rad/s or m/s].
+const STANDS: f64 = 1e-12;
 
 /// The brake that is stored in the log: a constant deceleration of each controllable joint until it stands, and every hard limit in every period
 /// of it.
@@ -20,7 +22,7 @@ pub(crate) fn stored(promise: &mut Promise, q: &[f64], v: &[f64], brake: &[f64])
     let p = promise.period;
     for &i in &promise.controllable {
         let j = &promise.limits.joints[i];
-        if is_above(brake[i], j.brake(&p)) || (v[i] != 0.0 && brake[i] <= 0.0) {
+        if is_above(brake[i], j.brake(&p)) || (v[i].abs() > STANDS && brake[i] <= 0.0) {
             return broken(
                 format!("stored deceleration of joint '{}'", j.name),
                 brake[i],
@@ -75,7 +77,7 @@ fn run(promise: &mut Promise, q: &[f64], v: &[f64], brake: &[f64], positions: bo
         for &i in &promise.controllable {
             let change = brake[i] * p.dt;
             let left = v[i].abs() - change;
-            v1[i] = if left > REST * change { v[i].signum() * left } else { 0.0 };
+            v1[i] = if left > (REST * change).max(STANDS) { v[i].signum() * left } else { 0.0 };
             a[i] = (v1[i] - v[i]) / p.dt;
             way[i] = p.way(v[i], v1[i]);
             moves |= v[i] != 0.0;
@@ -94,7 +96,7 @@ fn run(promise: &mut Promise, q: &[f64], v: &[f64], brake: &[f64], positions: bo
         std::mem::swap(&mut q, &mut q1);
         v.copy_from_slice(&v1);
     }
-    broken("length of the stored brake", f64::from(LONGEST), f64::from(LONGEST), "periods or more")
+    broken("length of a brake that has not come to rest", f64::from(LONGEST), 0.0, "periods")
 }
 
 /// Positions and speeds after a period of a brake.
