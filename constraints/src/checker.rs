@@ -166,14 +166,20 @@ impl Checker {
         previous: Option<Previous<'_>>,
     ) -> Verdict {
         let mut verdict = Verdict::default();
-        self.boxes(&mut verdict, (q, v), (q_next, v_next));
+        self.boxes(&mut verdict, (q, v), (q_next, v_next), previous);
         self.prepare(q, v, v_next, external);
         self.coupled(&mut verdict, (q, v), (q_next, v_next), Meant::Asked(previous));
         verdict
     }
 
     /// The limits of single joints.
-    fn boxes(&mut self, verdict: &mut Verdict, (q, v): (&[f64], &[f64]), (q_next, v_next): (&[f64], &[f64])) {
+    fn boxes(
+        &mut self,
+        verdict: &mut Verdict,
+        (q, v): (&[f64], &[f64]),
+        (q_next, v_next): (&[f64], &[f64]),
+        previous: Option<Previous<'_>>,
+    ) {
         for k in 0..self.dofs.len() {
             let (i, iq) = self.dofs[k];
             let a = (v_next[i] - v[i]) / self.period.dt;
@@ -184,11 +190,13 @@ impl Checker {
                 verdict.see(Kind::Acceleration, i, faster, self.faster[i]);
             }
             verdict.see(Kind::Acceleration, i, a.abs(), self.limits.acceleration[i]);
+            let before = previous.map_or(if v[i] == 0.0 { 0.0 } else { a }, |previous| previous.acceleration[i]);
+            verdict.see(Kind::Jerk, i, (a - before).abs() / self.period.dt, self.limits.jerk[i]);
             if self.limits.has_position(i) {
                 self.positions(i, (q[iq], v[i]), (q_next[iq], v_next[i]), verdict);
             }
             self.profile(i, q_next[iq], v_next[i], verdict);
-            if self.limits.locked[i] {
+            if self.limits.locked[i] && self.limits.jerk[i].is_infinite() {
                 let slower = v[i].abs() - self.limits.braking[i] * self.period.dt;
                 verdict.see(Kind::Locked, i, v_next[i].abs(), slower.max(0.0));
             }
@@ -216,9 +224,10 @@ impl Checker {
         q_next: &[f64],
         v_next: &[f64],
         external: &[f64],
+        previous: Option<Previous<'_>>,
     ) -> Verdict {
         let mut verdict = Verdict::default();
-        self.boxes(&mut verdict, (q, v), (q_next, v_next));
+        self.boxes(&mut verdict, (q, v), (q_next, v_next), previous);
         self.prepare(q, v, v_next, external);
         self.coupled(&mut verdict, (q, v), (q_next, v_next), Meant::Kept);
         verdict
@@ -271,7 +280,7 @@ impl Checker {
 
     /// What the rows and cones need beside the state.
     pub(crate) fn needs(&self) -> Needs {
-        self.needs
+        Needs { previous: self.needs.previous || self.limits.has_jerk(), ..self.needs }
     }
 
     /// Asks for `share` of the size of cone `c`, and for rows of that limit to lie `inset` [m] further inside.
@@ -405,7 +414,10 @@ impl Checker {
         let (t, tau) = (self.period.dt, self.period.tau);
         // A whole period of braking from standstill must not carry the dof beyond the limits on the other side.
         let room = (high - low) / (self.period.kappa * t * t + 0.5 * (t - 0.5 * tau).powi(2));
-        let a_max = self.limits.braking[i].min(self.limits.velocity[i] / t).min(room);
+        let a_max = match self.limits.jerk[i].is_finite() {
+            true => self.limits.acceleration[i], // what no brake of bounded jerk stops sooner than
+            false => self.limits.braking[i].min(self.limits.velocity[i] / t).min(room),
+        };
         let (mut highest, mut lowest) = (next.0, next.0);
         if kinematic {
             let (mut q, mut v) = now;

@@ -55,6 +55,7 @@ mod error;
 mod file;
 mod friction;
 pub mod geometry;
+pub mod jerk;
 mod kinematics;
 mod layout;
 pub mod ledger;

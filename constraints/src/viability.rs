@@ -164,6 +164,8 @@ pub struct Dof {
     pub acceleration: f64,
     /// Deceleration that braking may count on, at most A [rad/s² or m/s²].
     pub deceleration: f64,
+    /// Largest jerk J that is hard [rad/s³ or m/s³]: [`jerk::interval`](crate::jerk::interval) keeps it, [`interval`] knows nothing of it.
+    pub jerk: f64,
     /// Speed limits in front of a lowest and a highest position.
     pub profile: [Option<Profile>; 2],
     /// The dof stops and stays.
@@ -188,6 +190,7 @@ impl Dof {
         velocity: f64::INFINITY,
         acceleration: f64::INFINITY,
         deceleration: f64::INFINITY,
+        jerk: f64::INFINITY,
         profile: [None, None],
         locked: false,
         whole: false,
@@ -198,7 +201,8 @@ impl Dof {
         let (lower, upper) = (limits.q_lower[i], limits.q_upper[i]);
         let (acceleration, deceleration) = (limits.acceleration[i], limits.braking[i]);
         let (velocity, profile, locked) = (limits.velocity[i], limits.profile[i], limits.locked[i]);
-        Dof { lower, upper, velocity, acceleration, deceleration, profile, locked, whole: false }
+        let jerk = limits.jerk[i];
+        Dof { lower, upper, velocity, acceleration, deceleration, jerk, profile, locked, whole: false }
     }
 
     /// The deceleration that braking counts on: the one stated, or less where a whole period of it would turn the dof round and

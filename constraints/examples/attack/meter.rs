@@ -41,6 +41,8 @@ pub enum Meter {
     Energy { limit: f64 },
     /// Two balls of the robot, one that stands still, and a floor.
     Collision { tool: Ball, elbow: Ball, post: [f64; 3], radius: f64, floor: f64 },
+    /// Change of acceleration from tick to tick.
+    Jerk { limit: f64 },
     /// `q_a + 0.7 q_b` between two bounds, `|v_a + v_b|` below one.
     Rows { joints: [usize; 2], lower: f64, upper: f64, most: f64 },
 }
@@ -49,6 +51,8 @@ pub enum Meter {
 pub struct Gauge {
     pub model: Model,
     pub period: Period,
+    /// Accelerations of the tick before (nv).
+    pub before: Vec<f64>,
     dynamics: Dynamics,
     kinematics: Kinematics,
     a: Vec<f64>,
@@ -71,6 +75,7 @@ impl Gauge {
             dynamics: Dynamics::new(model),
             kinematics: Kinematics::new(model),
             a: zero.clone(),
+            before: zero.clone(),
             tau: zero,
             model: model.clone(),
             period,
@@ -118,6 +123,9 @@ impl Gauge {
                 let apart = |x: [f64; 3]| norm([x[0] - post[0], x[1] - post[1], x[2] - post[2]]);
                 let post = (tool.radius + radius - apart(p)).max(elbow.radius + radius - apart(e));
                 post.max(floor + tool.radius - p[2])
+            }
+            Meter::Jerk { limit } => {
+                each(&|i| (self.a[i] - self.before[i]).abs() / self.period.dt / limit - 1.0)
             }
             Meter::Rows { joints: [a, b], lower, upper, most } => {
                 let sum = step.q_next[*a] + 0.7 * step.q_next[*b];

@@ -43,12 +43,18 @@ pub fn attack(model: &Model, scene: &Scene, settings: &Settings, ticks: usize, s
         if tick % EPISODE == 0 {
             q.copy_from_slice(&scene.start);
             v.fill(0.0);
+            gauge.before.fill(0.0);
             projector.forget();
+            without.forget();
         }
         let numbers = attacker.propose(&mut gauge, &scene.meters, (&q, &v), &mut raw);
         let status = projector.project(&q, &v, &raw, &mut target);
         let step = Step { q: &q, v: &v, q_next: &target.q, v_next: &target.v };
         let excess = gauge.worst(&scene.meters, step);
+        gauge.before.copy_from_slice(&target.acceleration);
+        if projector.needs_previous() {
+            projector.remember(&target);
+        }
         seen.ticks += 1;
         if excess > ROUNDING || excess.is_nan() {
             if seen.over == 0 && std::env::var_os("SHOW").is_some() {
@@ -59,17 +65,19 @@ pub fn attack(model: &Model, scene: &Scene, settings: &Settings, ticks: usize, s
         seen.worst = seen.worst.max(excess);
         seen.recovering += usize::from(status == Status::Recovering);
         let held = match status {
-            Status::Slowed => &mut seen.slowed,
-            Status::Braked(_) if numbers => &mut seen.braked,
-            _ => {
-                (q, v) = (target.q.clone(), target.v.clone());
-                continue;
-            }
+            Status::Slowed => Some(&mut seen.slowed),
+            Status::Braked(_) if numbers => Some(&mut seen.braked),
+            _ => None,
         };
-        *held += 1;
-        if without.project(&q, &v, &raw, &mut best).is_ok() {
-            let more = (target.ledger.moved - best.ledger.moved) / unit;
-            seen.further = (seen.further.0 + more, seen.further.1.max(more));
+        if let Some(held) = held {
+            *held += 1;
+            if without.project(&q, &v, &raw, &mut best).is_ok() {
+                let more = (target.ledger.moved - best.ledger.moved) / unit;
+                seen.further = (seen.further.0 + more, seen.further.1.max(more));
+            }
+        }
+        if without.needs_previous() {
+            without.remember(&target);
         }
         (q, v) = (target.q.clone(), target.v.clone());
     }

@@ -6,8 +6,9 @@ use nearl_constraints::limit::{CollisionSettings, JointProfile, SolidSettings, V
 use nearl_constraints::*;
 use std::collections::BTreeMap;
 
-/// Kinds of limits, each attacked alone and all together; the joints' own limits hold in every scene.
-pub const KINDS: [&str; 11] = [
+/// Kinds of limits, each attacked alone and together; the joints' own limits hold in every scene. Hard jerk is not kept together with speed
+/// profiles, so `all` is without it and `jerk+all` without those.
+pub const KINDS: [&str; 13] = [
     "joints",
     "torque",
     "torque_speed",
@@ -19,10 +20,15 @@ pub const KINDS: [&str; 11] = [
     "collision",
     "rows",
     "all",
+    "jerk",
+    "jerk+all",
 ];
 
 /// Largest acceleration of every joint [rad/s² or m/s²].
 pub const ACCELERATION: f64 = 10.0;
+
+/// Largest jerk of every joint where that is limited [rad/s³ or m/s³].
+pub const JERK: f64 = 300.0;
 
 /// Limits, what measures them, and where a run starts.
 pub struct Scene {
@@ -42,12 +48,14 @@ struct Robot<'a> {
 }
 
 impl Scene {
-    /// The limits of `kind` on a fixed-base `model` whose joints have one dof each; `frame` is its tool.
+    /// The limits of `kind`, one of [`KINDS`] or several with `+` between them, on a fixed-base `model` whose joints have one dof each; `frame` is its tool.
     pub fn new(model: &Model, frame: &str, kind: &str) -> Scene {
         let robot = Robot::new(model, frame);
         let mut scene = Scene { limits: Vec::new(), meters: Vec::new(), start: robot.start.clone() };
         robot.joints(&mut scene);
-        for name in KINDS.iter().filter(|name| kind == **name || kind == "all") {
+        let asked = |name: &str| kind.split('+').any(|part| part == name);
+        let apart = if asked("jerk") { "velocity_profile" } else { "jerk" };
+        for name in KINDS.iter().filter(|name| asked(name) || (asked("all") && **name != apart)) {
             robot.add(name, &mut scene);
         }
         scene
@@ -114,6 +122,10 @@ impl<'a> Robot<'a> {
             }
             "collision" => self.bodies(scene),
             "rows" => self.rows(scene),
+            "jerk" => {
+                limits.push(Box::new(JerkLimit::hard(JERK)));
+                meters.push(Meter::Jerk { limit: JERK });
+            }
             _ => {}
         }
     }

@@ -1,29 +1,60 @@
 //! Jerk limits.
 
 use super::margin::less_each;
-use super::{Limit, PerJoint};
+use super::{Limit, LimitSet, PerJoint};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 
-/// `jerk = { limit }` or `jerk = { limit, soft = { linear, quadratic } }`.
+/// `jerk = { limit }`, `jerk = { limit, soft = { linear, quadratic } }` or `jerk = { limit, hard = true }`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(try_from = "Written", into = "Written")]
 pub struct JerkSettings {
     /// Largest jerk J [rad/s³ or m/s³].
     pub limit: PerJoint,
     /// Jerk kept below the limit [rad/s³ or m/s³].
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub margin: Option<PerJoint>,
-    /// How much it resists.
-    #[serde(default)]
-    pub soft: Soft,
+    /// How much it resists; `None` is hard.
+    pub soft: Option<Soft>,
 }
 
-/// `|y / T - a_previous| / T <= J`, always soft.
+/// As in the task file, where it is soft unless something else is said.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Written {
+    limit: PerJoint,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    margin: Option<PerJoint>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    soft: Option<Soft>,
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    hard: bool,
+}
+
+impl TryFrom<Written> for JerkSettings {
+    type Error = &'static str;
+
+    fn try_from(w: Written) -> Result<JerkSettings, &'static str> {
+        let soft = match (w.hard, w.soft) {
+            (true, Some(_)) => return Err("jerk is hard and has weights of a soft one; drop hard or soft"),
+            (true, None) => None,
+            (false, soft) => Some(soft.unwrap_or_default()),
+        };
+        Ok(JerkSettings { limit: w.limit, margin: w.margin, soft })
+    }
+}
+
+impl From<JerkSettings> for Written {
+    fn from(s: JerkSettings) -> Written {
+        Written { limit: s.limit, margin: s.margin, soft: s.soft, hard: s.soft.is_none() }
+    }
+}
+
+/// `|y / T - a_previous| / T <= J`, soft or hard.
 ///
-/// It has no viable set of its own: braking in front of a position limit may need the acceleration at once, and comes
-/// first. What a tick exceeds is reported as slack. Without a tick before it does not hold (see
+/// Soft, braking in front of a position limit comes first: it may need the acceleration at once. What a tick exceeds is reported as slack.
+/// Hard, the joint has a viable set of its own ([`jerk`](crate::jerk)) and brakes in front of everything with its jerk. Without a
+/// tick before, a soft one does not hold, and a hard one not for joints that move (see
 /// [`Projector::set_previous`](crate::Projector::set_previous)).
 #[derive(Debug, Clone)]
 pub struct JerkLimit {
@@ -35,6 +66,19 @@ impl JerkLimit {
     pub fn new(settings: JerkSettings) -> JerkLimit {
         JerkLimit { settings }
     }
+
+    /// A hard limit [rad/s³ or m/s³] for every joint.
+    pub fn hard(limit: f64) -> JerkLimit {
+        JerkLimit { settings: JerkSettings { limit: PerJoint::All(limit), margin: None, soft: None } }
+    }
+
+    /// Limits less margins of the dofs that have one.
+    fn values(&self, model: &Model, controllable: &[usize]) -> Result<Vec<Option<f64>>, LimitError> {
+        let mut values =
+            self.settings.limit.values(model, "jerk limit", |x| x > 0.0, "above 0 rad/s³ or m/s³")?;
+        less_each(model, "jerk margin", &mut values, self.settings.margin.as_ref(), controllable)?;
+        Ok(values)
+    }
 }
 
 impl Limit for JerkLimit {
@@ -42,16 +86,28 @@ impl Limit for JerkLimit {
         "jerk"
     }
 
+    fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
+        if self.settings.soft.is_some() {
+            return Ok(());
+        }
+        let values = self.values(model, controllable)?;
+        for &i in controllable {
+            set.jerk[i] = set.jerk[i].min(values[i].unwrap_or(f64::INFINITY));
+        }
+        Ok(())
+    }
+
     fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
-        let mut values =
-            self.settings.limit.values(model, "jerk limit", |x| x > 0.0, "above 0 rad/s³ or m/s³")?;
-        less_each(model, "jerk margin", &mut values, self.settings.margin.as_ref(), controllable)?;
+        if self.settings.soft.is_none() {
+            return Ok(None);
+        }
+        let values = self.values(model, controllable)?;
         let rows = controllable.iter().filter_map(|i| values[*i].map(|j| (*i, j, model.dof_name(*i))));
         Ok(Some(Box::new(JerkRows { dofs: rows.collect() })))
     }
 
     fn soft(&self) -> Option<Soft> {
-        Some(self.settings.soft)
+        self.settings.soft
     }
 }
 

@@ -101,7 +101,7 @@ type Build = fn(&ConstraintSettings, &Model) -> Result<Vec<Box<dyn Limit>>, Limi
 pub enum Form {
     /// Always hard: braking counts on it.
     Hard,
-    /// Always soft: braking comes first.
+    /// Soft: braking comes first. `jerk` is hard with `hard = true`.
     Soft,
     /// Hard unless `soft` is given.
     Either,

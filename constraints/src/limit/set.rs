@@ -17,6 +17,8 @@ pub struct LimitSet {
     pub acceleration: Vec<f64>,
     /// Deceleration braking may count on, at most A [rad/s² or m/s²].
     pub braking: Vec<f64>,
+    /// Largest jerk that is hard [rad/s³ or m/s³].
+    pub jerk: Vec<f64>,
     /// Largest motor force [N·m or N].
     pub effort: Vec<f64>,
     /// Speed limits in front of a lowest and a highest position.
@@ -35,6 +37,7 @@ impl LimitSet {
             velocity: none.clone(),
             acceleration: none.clone(),
             braking: none.clone(),
+            jerk: none.clone(),
             effort: none,
             profile: vec![[None, None]; nv],
             locked: vec![false; nv],
@@ -76,6 +79,7 @@ impl LimitSet {
             &mut self.velocity,
             &mut self.acceleration,
             &mut self.braking,
+            &mut self.jerk,
             &mut self.effort,
         ] {
             x.fill(f64::INFINITY);
@@ -93,11 +97,17 @@ impl LimitSet {
         least(&mut self.velocity, &other.velocity);
         least(&mut self.acceleration, &other.acceleration);
         least(&mut self.braking, &other.braking);
+        least(&mut self.jerk, &other.jerk);
         least(&mut self.effort, &other.effort);
         for (own, other) in self.profile.iter_mut().zip(&other.profile) {
             *own = [own[0].or(other[0]), own[1].or(other[1])];
         }
         self.locked.iter_mut().zip(&other.locked).for_each(|(x, y)| *x |= y);
+    }
+
+    /// True when the jerk of some dof is hard.
+    pub fn has_jerk(&self) -> bool {
+        self.jerk.iter().any(|jerk| jerk.is_finite())
     }
 
     /// True when the dof has a lower or an upper position limit.

@@ -34,7 +34,7 @@ pub struct ConstraintSettings {
     /// `torque = { scale = 0.9 }`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub torque: Option<TorqueSettings>,
-    /// `jerk = { limit = 500.0 }`; soft.
+    /// `jerk = { limit = 500.0 }`, soft, or `jerk = { limit = 500.0, hard = true }`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub jerk: Option<JerkSettings>,
     /// `torque_speed = { stall = 80.0, no_load = 3.0 }`.

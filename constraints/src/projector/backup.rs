@@ -7,7 +7,8 @@
 //!     v_k = v - k b T,   q_k = q + k T v - b T^2 (k (k - 1) / 2 + kappa k)     (k <= N_i, sign of v)
 //! ```
 //!
-//! and in the last one the rest of the speed is taken off, so that no joint turns round. A brake counts when each joint stands before
+//! and in the last one the rest of the speed is taken off, so that no joint turns round. A joint of hard jerk has `b_i` as its largest
+//! deceleration and brakes as in [`jerk`](crate::jerk). A brake counts when each joint stands before
 //! its position limit in these very ticks, stays below its speed profile, and every hard row and cone holds
 //! ([`Rows::breach`](crate::Rows::breach)) at the ticks looked at and, by the bound of [`Backup::between`], at those between them.
 //! By induction there is always a way to stop: either the new state has a verified brake, or the old one has, and the first tick of
@@ -18,10 +19,11 @@ mod stopping;
 
 use super::Dofs;
 use crate::checker::Checker;
+use crate::jerk::{Brake, Stop};
 use crate::viability::{Dof, Kind, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model};
 pub(crate) use refusal::{Refusal, Step};
-use stopping::least_deceleration;
+use stopping::{least_deceleration, soonest};
 
 /// A breach up to this is rounding.
 const ROUNDING: f64 = 1e-10;
@@ -85,6 +87,8 @@ pub(crate) struct Backup {
     /// Rows of which a state, not a motion, is beyond the limit.
     of_state: Vec<bool>,
     trial: Vec<f64>,
+    /// The planned motion of each dof of hard jerk (nv).
+    stops: Vec<Option<Stop>>,
     now: State,
     next: State,
     way: Vec<f64>,
@@ -103,6 +107,8 @@ pub(crate) struct Backup {
 struct State {
     q: Vec<f64>,
     v: Vec<f64>,
+    /// Acceleration of the tick before, where it is asked for.
+    a: Vec<f64>,
 }
 
 impl Backup {
@@ -113,7 +119,7 @@ impl Backup {
         settings: &crate::Settings,
     ) -> Result<Backup, LimitError> {
         let zero = || vec![0.0; model.nv()];
-        let state = || State { q: model.neutral(), v: zero() };
+        let state = || State { q: model.neutral(), v: zero(), a: zero() };
         let period = Period::new(settings.dt, settings.sub_steps);
         let checker = Checker::new(model, limits, controllable, period, settings.consistency)?;
         let of_state = |kind: &Kind| {
@@ -130,10 +136,11 @@ impl Backup {
             here: vec![0.0; checker.hard()],
             of_state: checker.hard_kinds().iter().map(of_state).collect(),
             trial: zero(),
+            stops: vec![None; model.nv()],
             now: state(),
             next: state(),
             way: zero(),
-            cuts: Vec::with_capacity(2 * model.nv() + 1),
+            cuts: Vec::with_capacity(3 * model.nv() + 1),
             ticks: Vec::with_capacity(MOST as usize),
             breach: vec![0.0; checker.hard() * MOST as usize],
             found: vec![0.0; checker.hard()],
@@ -240,11 +247,11 @@ impl Backup {
         breach.iter().zip(&self.allowed).all(|(breach, allowed)| *breach <= allowed + ROUNDING)
     }
 
-    /// Looks for a brake from the state and stores it; the old one stays when there is none.
-    pub(crate) fn verify(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
+    /// Looks for a brake from the state after a tick at acceleration `a` and stores it; the old one stays when there is none.
+    pub(crate) fn verify(&mut self, with: &With<'_>, (q, v): (&[f64], &[f64]), a: &[f64]) -> bool {
         for k in 0..TRIED.len() {
             let index = (self.favourite + k) % TRIED.len();
-            if self.plan(with, q, v, TRIED[index]) && self.within_reach(with, q, v) {
+            if self.plan(with, (q, v), a, TRIED[index]) && self.within_reach(with, q, v) {
                 (self.favourite, self.stored) = (index, true);
                 self.within = self.allowed.iter().all(|allowed| *allowed <= 0.0);
                 self.deceleration.copy_from_slice(&self.trial);
@@ -259,20 +266,38 @@ impl Backup {
         self.stored.then_some(&self.deceleration)
     }
 
-    /// Velocity of dof `i` after one tick of the stored brake.
-    pub(crate) fn next_velocity(&self, i: usize, v: f64, period: &Period) -> f64 {
-        v - v.signum() * (self.deceleration[i] * period.dt).min(v.abs())
+    /// Deceleration of dof `i` in the stored brake.
+    pub(crate) fn deceleration(&self, i: usize) -> f64 {
+        self.deceleration[i]
     }
 
-    /// Decelerations of a brake from the state; false when some joint cannot stand before its limit.
-    fn plan(&mut self, with: &With<'_>, q: &[f64], v: &[f64], plan: Plan) -> bool {
+    /// Decelerations of a brake from the state after a tick at acceleration `a`; false when some joint cannot stand before its limit.
+    fn plan(&mut self, with: &With<'_>, (q, v): (&[f64], &[f64]), a: &[f64], plan: Plan) -> bool {
         let dt = with.period.dt;
-        let most = |i: usize| Dof::of(with.limits, i).braking(with.period);
+        let most = |i: usize| {
+            let dof = Dof::of(with.limits, i);
+            if dof.jerk.is_finite() { Brake::most(&dof) } else { dof.braking(with.period) }
+        };
         let quickest = with.dofs.controllable.iter().map(|&i| v[i].abs() / (most(i) * dt));
         let quickest = quickest.fold(0.0, f64::max);
         for &i in &with.dofs.controllable {
             let dof = Dof::of(with.limits, i);
             let (most, speed) = (most(i), v[i].abs());
+            self.stops[i] = None;
+            if dof.jerk.is_finite() {
+                let wanted = match plan {
+                    _ if dof.locked => most,
+                    Plan::Together(late) => speed / ((late * quickest - 1e-9).ceil().max(1.0) * dt),
+                    Plan::Apart(share) => (LEAST + share * (1.0 - LEAST)) * most,
+                };
+                let at = with.dofs.single[i].map(|iq| q[iq]);
+                let Some(b) = soonest(&dof, at, (v[i], a[i]), wanted.clamp(LEAST * most, most), with.period) else {
+                    return false;
+                };
+                self.trial[i] = b;
+                self.stops[i] = Some(Brake::new(&dof, b, with.period).stop(v[i], a[i]));
+                continue;
+            }
             let least = match with.dofs.single[i] {
                 _ if dof.locked => most,
                 Some(iq) if speed > 0.0 => least_deceleration(&dof, q[iq], v[i], with.period),
@@ -323,6 +348,10 @@ impl Backup {
     fn find_cuts(&mut self, with: &With<'_>, v: &[f64]) {
         self.cuts.clear();
         for &i in &with.dofs.controllable {
+            if let Some(stop) = &self.stops[i] {
+                self.cuts.extend(stop.cuts().map(|tick| tick.min(1e6) as u32));
+                continue;
+            }
             let (full, left) = self.full(i, v[i], with.period.dt);
             let full = full.min(1e6) as u32;
             self.cuts.push(full);
@@ -361,7 +390,7 @@ impl Backup {
         if all || !most.is_finite() { most } else { most + 0.5 * bends }
     }
 
-    /// Every hard row and cone holds from tick `first` to tick `last`, between which no acceleration changes: looked at in ever more
+    /// Every hard row and cone holds from tick `first` to tick `last`, between which no acceleration changes but evenly: looked at in ever more
     /// ticks until the bound on those between them settles it.
     fn stretch(&mut self, with: &With<'_>, q: &[f64], v: &[f64], (first, last): (u32, u32)) -> bool {
         let rows = self.allowed.len();
@@ -434,6 +463,10 @@ impl Backup {
         self.way.fill(0.0);
         self.next.v.copy_from_slice(v);
         for &i in &with.dofs.controllable {
+            if let Some(stop) = &self.stops[i] {
+                (self.way[i], self.next.v[i]) = stop.at(f64::from(k));
+                continue;
+            }
             let (b, speed) = (self.trial[i], v[i].abs());
             let (full, rest) = self.full(i, v[i], dt);
             let ticks = f64::from(k).min(full);

@@ -70,6 +70,7 @@ impl Projector {
             switches,
             external: zero(),
             previous: History { known: false, acceleration: zero(), torque: zero() },
+            before: zero(),
             braking: (0..nv).map(|i| Dof::of(&limits, i).braking(&period)).collect(),
             bounds: Bounds::new(nv),
             intervals: vec![none; nv],
@@ -128,6 +129,26 @@ impl Dofs {
     }
 }
 
+/// What a hard jerk needs, and what it is not kept together with.
+fn check_jerk(
+    limits: &LimitSet,
+    consistency: Consistency,
+    names: &dyn Fn(&dyn Fn(usize) -> bool) -> String,
+) -> Result<(), LimitError> {
+    let hard = |i: usize| limits.jerk[i].is_finite();
+    let refused = |wrong: &dyn Fn(usize) -> bool, why: &str, next: &'static str| {
+        let joints = names(&|i| hard(i) && wrong(i));
+        let what = format!("hard jerk of {joints} {why}");
+        if joints.is_empty() { Ok(()) } else { Err(LimitError::Unusable { what, next }) }
+    };
+    let next = "add acceleration = { limit = ... } for them, or drop hard";
+    refused(&|i| limits.acceleration[i].is_infinite(), "has no acceleration limit to brake with", next)?;
+    let next = "set consistency = \"kinematic\" or drop the jerk limit";
+    refused(&|_| consistency == Consistency::Free, "does not exist in free mode, where no acceleration is decided", next)?;
+    let next = "drop velocity_profile for them, or hard";
+    refused(&|i| limits.profile[i] != [None, None], "is not kept together with a velocity profile", next)
+}
+
 /// The limits one by one.
 fn switches(
     model: &Model,
@@ -153,6 +174,7 @@ pub(super) fn check_combination(
         let list = dofs.controllable.iter().filter(|i| wrong(**i));
         list.map(|i| format!("'{}'", model.dof_name(*i))).collect::<Vec<_>>().join(", ")
     };
+    check_jerk(limits, consistency, &names)?;
     match consistency {
         Consistency::Kinematic => {
             let joints = names(&|i| limits.has_position(i) && limits.acceleration[i].is_infinite());

@@ -67,7 +67,12 @@ pub(super) fn braking(
     if kinds.iter().all(|kind| *kind == Kind::Torque) {
         let period = Period::new(settings.dt, settings.sub_steps);
         let (samples, seed) = SAMPLES;
-        let found = certify_braking(model, limits, &dofs.controllable, &period, samples, seed);
+        // A brake of bounded jerk has every acceleration between the limits on its way.
+        let mut all = limits.clone();
+        for i in (0..model.nv()).filter(|i| limits.jerk[*i].is_finite()) {
+            all.braking[i] = limits.acceleration[i];
+        }
+        let found = certify_braking(model, &all, &dofs.controllable, &period, samples, seed);
         if found.is_ok_and(|c| c.margin >= MARGIN) {
             return Braking::Certified;
         }

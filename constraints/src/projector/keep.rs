@@ -47,7 +47,7 @@ impl Projector {
         if outside && self.leads_to_a_brake(q, v, target) {
             return self.taken(q, v, target, status);
         }
-        if !self.backup.stored && !self.backup.verify(&with!(self), q, v) {
+        if !self.backup.stored && !self.backup.verify(&with!(self), (q, v), &self.before) {
             return self.brake(q, v, Some(proposal), target, BrakeReason::NoVerifiedBrake);
         }
         self.v_wanted.copy_from_slice(&target.v);
@@ -92,7 +92,7 @@ impl Projector {
     fn leads_to_a_brake(&mut self, q: &[f64], v: &[f64], target: &Target) -> bool {
         let with = with!(self);
         self.backup.allows(&with, (q, v), (&target.q, &target.v))
-            && self.backup.verify(&with, &target.q, &target.v)
+            && self.backup.verify(&with, (&target.q, &target.v), &target.acceleration)
     }
 
     /// Projects with what was refused as rows, a few times; true when `target` then leads to a brake.
@@ -102,7 +102,7 @@ impl Projector {
         }
         self.begin_again(v);
         for _ in 0..ROUNDS {
-            let step = Step { from: (q, v), to: (&target.q, &target.v) };
+            let step = Step { from: (q, v), to: (&target.q, &target.v), acceleration: &target.acceleration };
             let Some(refusal) = self.backup.refusal(&with!(self), step) else { return false };
             self.change(v, &target.v);
             if !self.cut(refusal, step) || !self.take_nearer(v) {

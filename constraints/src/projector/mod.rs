@@ -25,6 +25,7 @@ pub use coupled::{Problem, ProblemCone};
 pub use stages::{CoupledStages, Numbers};
 
 use crate::checker::Checker;
+use crate::jerk;
 use crate::ledger::{BrakeReason, RefuseReason, Rung, Status};
 use crate::row::Previous;
 use crate::target::{Bounds, Braking, Consistency, Proposal, Settings, Target};
@@ -82,6 +83,8 @@ pub struct Projector {
     /// Generalised forces beside the motors' (nv) [N·m or N].
     external: Vec<f64>,
     previous: History,
+    /// Acceleration before this tick; where it is not known, 0 for what stands and what a brake would have had for what moves (nv).
+    before: Vec<f64>,
     backup: Backup,
     /// What looks odd about the limits.
     notes: Vec<String>,
@@ -259,15 +262,22 @@ impl Projector {
                 // Free mode without braking: the cut below is all there is.
                 (dof.lower, dof.upper) = (f64::NEG_INFINITY, f64::INFINITY);
             }
-            let mut x = interval(&dof, self.dofs.single[i].map_or(0.0, |iq| q[iq]), v[i], &self.period);
-            let exact =
-                |kind: Kind, bound: f64, v_max: f64| match kind == Kind::Velocity && x.outside.is_none() {
+            let at = self.dofs.single[i].map_or(0.0, |iq| q[iq]);
+            let hard_jerk = dof.jerk.is_finite();
+            let mut x = match hard_jerk {
+                true => self.jerk_interval(&dof, i, at, v[i]),
+                false => interval(&dof, at, v[i], &self.period),
+            };
+            let exact = |kind: Kind, bound: f64, v_max: f64| match kind == Kind::Velocity
+                && x.outside.is_none()
+                && !hard_jerk
+            {
                     true => v_max,
                     false => v[i] + t * bound,
                 };
             let mut v_lower = exact(x.lower_kind, x.lower, -dof.velocity);
             let mut v_upper = exact(x.upper_kind, x.upper, dof.velocity).max(v_lower);
-            let (mut outside, at) = (x.outside.is_some(), self.dofs.single[i].map_or(0.0, |iq| q[iq]));
+            let mut outside = x.outside.is_some();
             self.moving.beyond |= outside;
             if self.moving.on {
                 let (aim, hard, behind) = self.move_dof((at, v[i]), i, x);
@@ -290,6 +300,14 @@ impl Projector {
             }
             self.intervals[i] = x;
         }
+    }
+
+    /// The box of dof `i` whose jerk is hard, and the acceleration before this tick.
+    fn jerk_interval(&mut self, dof: &Dof, i: usize, q: f64, v: f64) -> Interval {
+        let known = self.previous.get().map(|previous| previous.acceleration[i]).or((v == 0.0).then_some(0.0));
+        let brake = jerk::Brake::new(dof, jerk::Brake::most(dof), &self.period);
+        self.before[i] = known.unwrap_or_else(|| brake.curve(v));
+        jerk::interval(dof, q, v, known, &self.period)
     }
 
     /// The independent checker has the last word.
@@ -327,7 +345,9 @@ impl Projector {
         target.ledger.active.clear();
         let (checker, to) = (&mut self.checker, (&target.q[..], &target.v[..]));
         let verdict = match target.ledger.rung {
-            Rung::StoredBrake => checker.check_brake(q, v, to.0, to.1, &self.external),
+            Rung::StoredBrake => {
+                checker.check_brake(q, v, to.0, to.1, &self.external, self.previous.get())
+            }
             _ => checker.check(q, v, to.0, to.1, &self.external, self.previous.get()),
         };
         target.ledger.violations = verdict.counts;
@@ -353,13 +373,19 @@ impl Projector {
         Status::Braked(reason)
     }
 
-    /// `v_next` after a tick of the stored brake, as it was verified, or of `-sgn(v) min(A_b, |v| / T)` where none is stored: inside the
-    /// box and, if `rows`, the nearest to it that the coupled rows allow, should they allow any.
+    /// `v_next` after a tick of the stored brake, as it was verified, or of the brake of each joint, `-sgn(v) min(A_b, |v| / T)` where its
+    /// jerk is free, where none is stored: inside the box and, if `rows`, the nearest to it that the coupled rows allow, should they allow any.
     fn stop(&mut self, q: &[f64], v: &[f64], target: &mut Target, rows: bool) {
         let stored = self.settings.braking == Braking::Stored && self.backup.stored;
         for &i in &self.dofs.controllable {
+            let dof = Dof::of(&self.limits, i);
+            let most = if stored { self.backup.deceleration(i) } else { jerk::Brake::most(&dof) };
             let stop = match stored {
-                true => self.backup.next_velocity(i, v[i], &self.period),
+                _ if dof.jerk.is_finite() => {
+                    let brake = jerk::Brake::new(&dof, most, &self.period);
+                    v[i] + self.period.dt * brake.next(v[i], self.before[i])
+                }
+                true => v[i] - v[i].signum() * (most * self.period.dt).min(v[i].abs()),
                 false => v[i] - v[i].signum() * (self.braking[i] * self.period.dt).min(v[i].abs()),
             };
             self.v_next[i] = stop.clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);

@@ -22,6 +22,8 @@ pub(crate) enum Refusal {
 pub(crate) struct Step<'a> {
     pub(crate) from: (&'a [f64], &'a [f64]),
     pub(crate) to: (&'a [f64], &'a [f64]),
+    /// Acceleration of the step (nv).
+    pub(crate) acceleration: &'a [f64],
 }
 
 impl Backup {
@@ -33,7 +35,7 @@ impl Backup {
             return Some(Refusal::Step);
         }
         let (q, v) = step.to;
-        if !self.plan(with, q, v, self.tried_first()) {
+        if !self.plan(with, (q, v), step.acceleration, self.tried_first()) {
             return None;
         }
         if self.within_reach(with, q, v) {
@@ -76,15 +78,17 @@ impl Backup {
         let mut near = std::mem::take(&mut self.near);
         near.q.copy_from_slice(q);
         near.v.copy_from_slice(v);
+        near.a.copy_from_slice(step.acceleration);
         near.q[iq] += with.period.kappa * dt * probe;
         near.v[i] += probe;
+        near.a[i] += probe / dt;
         let known = match refusal {
             Refusal::Step => {
                 self.allows(with, step.from, (&near.q, &near.v));
                 true
             }
             Refusal::Brake(tick) => {
-                let planned = self.plan(with, &near.q, &near.v, self.tried_first());
+                let planned = self.plan(with, (&near.q, &near.v), &near.a, self.tried_first());
                 if planned {
                     self.look(with, &near.q, &near.v, tick, 0);
                 }

@@ -1,6 +1,7 @@
 //! How hard a joint has to brake, at least, in whole periods.
 
 use super::{MANY, ROUNDING};
+use crate::jerk::Brake;
 use crate::viability::{Dof, Period};
 
 /// The least deceleration that stops a dof before its position limit and below its speed profile; infinite where none does.
@@ -16,6 +17,32 @@ pub(super) fn least_deceleration(dof: &Dof, q: f64, v: f64, period: &Period) -> 
         least = least.max(needed.min(p.deceleration).min(dof.braking(period)));
     }
     least
+}
+
+/// Steps of the search of [`soonest`].
+const STEPS: usize = 10;
+
+/// The least deceleration found, from `wanted` on, with which a dof of hard jerk stops before its position limits after a tick at
+/// acceleration `a`; `None` where the largest does not.
+pub(super) fn soonest(dof: &Dof, q: Option<f64>, (v, a): (f64, f64), wanted: f64, period: &Period) -> Option<f64> {
+    let Some(q) = q else { return Some(wanted) };
+    let stops = |b: f64| {
+        let brake = Brake::new(dof, b, period);
+        let (high, low) = (brake.stop(v, a).highest(), brake.stop(-v, -a).highest());
+        high <= (dof.upper - q).max(0.0) + ROUNDING && low <= (q - dof.lower).max(0.0) + ROUNDING
+    };
+    if stops(wanted) {
+        return Some(wanted);
+    }
+    let (mut fails, mut least) = (wanted, Brake::most(dof));
+    if !stops(least) {
+        return None;
+    }
+    for _ in 0..STEPS {
+        let middle = 0.5 * (fails + least);
+        *(if stops(middle) { &mut least } else { &mut fails }) = middle;
+    }
+    Some(least)
 }
 
 /// The least deceleration that stops within `room` from `speed` in whole ticks and a shorter one: with `k` whole ticks
