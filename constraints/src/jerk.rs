@@ -47,6 +47,11 @@ impl Brake {
         Brake { period: *period, step: dof.jerk * period.dt, most }
     }
 
+    /// Braking of `dof` with all it may count on.
+    pub(crate) fn of(dof: &Dof, period: &Period) -> Brake {
+        Brake::new(dof, Brake::most(dof), period)
+    }
+
     /// The largest deceleration that `dof` may count on.
     pub(crate) fn most(dof: &Dof) -> f64 {
         dof.deceleration.min(dof.acceleration)
@@ -153,8 +158,9 @@ impl Brake {
 /// velocity `v` [rad/s or m/s], after a period at acceleration `before` [rad/s² or m/s²]; where that is not known, the jerk of the next
 /// period is free. Never empty: braking is in it.
 pub fn interval(dof: &Dof, q: f64, v: f64, before: Option<f64>, period: &Period) -> Interval {
-    let brake = Brake::new(dof, Brake::most(dof), period);
-    let within = |most: f64, from: f64| if most < from { (most, Kind::Acceleration) } else { (from, Kind::Jerk) };
+    let brake = Brake::of(dof, period);
+    let within =
+        |most: f64, from: f64| if most < from { (most, Kind::Acceleration) } else { (from, Kind::Jerk) };
     let (a, step) = (dof.acceleration, brake.step);
     // From an acceleration beyond the limit, which comes first, the way back.
     let known = before.map(|before| before.clamp(-a - step, a + step));

@@ -367,14 +367,16 @@ fn whole_floor(bound: f64, d: f64, v: f64, a: f64, p: &Period) -> f64 {
 /// ```
 ///
 /// Without sub-steps, the end of the period or the turning point inside it:
-/// `a3 = 2 (d - T v) / T^2` if `v <= 0` or `a3 > -v / T`, else `min(-v^2 / 2 d, -v / T)`.
+/// `a3 = 2 (d - T v) / T^2` if `v <= 0` or `a3 > -v / T`, else `min(-v^2 / 2 d, -v / T)`; minus infinity where no `a` is enough.
 fn position_bound(d: f64, v: f64, a: f64, p: &Period) -> f64 {
     if p.sub_steps == 0 {
         let a3 = 2.0 * (d - p.dt * v) / (p.dt * p.dt);
         return match v <= 0.0 || a3 > -v / p.dt {
             true => a3,
             false if d > 0.0 => (-v * v / (2.0 * d)).min(-v / p.dt),
-            false => -a,
+            // At the limit and moving on: turned round within the tolerance, or outside.
+            false if v * v <= 2.0 * a * (d + POSITION_TOLERANCE) => -a,
+            false => f64::NEG_INFINITY,
         };
     }
     let mut bound = f64::INFINITY;

@@ -137,7 +137,13 @@ class AccelerationLimit(Limit):
 @final
 class JerkLimit(Limit):
     def __new__(
-        cls, model: Model, limit: _PerJoint, soft: _Soft | None = None, *, margin: _PerJoint | None = None
+        cls,
+        model: Model,
+        limit: _PerJoint,
+        soft: _Soft | None = None,
+        *,
+        margin: _PerJoint | None = None,
+        hard: bool = False,
     ) -> JerkLimit: ...
 
 @final

@@ -11,7 +11,7 @@ use nearl_constraints::limit::{
 };
 use nearl_constraints::{self as constraints, Cone, LimitError, LimitSet, PerJoint, Rows, Soft};
 use pyo3::PyClass;
-use pyo3::exceptions::PyTypeError;
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 
 use crate::errors;
@@ -330,22 +330,27 @@ impl AccelerationLimit {
     }
 }
 
-/// Jerk limits [rad/s³ or m/s³], less `margin`, always soft, with `soft = (linear, quadratic)` weights. They need the tick before: see
-/// `previous` of `Projector.project`.
+/// Jerk limits [rad/s³ or m/s³], less `margin`; soft, with `soft = (linear, quadratic)` weights, unless `hard`: then position, velocity,
+/// acceleration and jerk hold at once. They need the tick before: see `previous` of `Projector.project`.
 #[pyclass(module = "nearl._core", frozen, extends = Limit)]
 pub(crate) struct JerkLimit;
 
 #[pymethods]
 impl JerkLimit {
     #[new]
-    #[pyo3(signature = (model, limit, soft=None, *, margin=None))]
+    #[pyo3(signature = (model, limit, soft=None, *, margin=None, hard=false))]
     fn new(
         model: &Model,
         limit: Values,
         soft: Option<Weights>,
         margin: Option<Values>,
+        hard: bool,
     ) -> PyResult<PyClassInitializer<Self>> {
-        let soft = soft.map_or_else(Soft::default, self::soft);
+        if hard && soft.is_some() {
+            let text = "the jerk limit is hard and has weights of a soft one; drop hard or soft";
+            return Err(PyValueError::new_err(text));
+        }
+        let soft = (!hard).then(|| soft.map_or_else(Soft::default, self::soft));
         let (limit, margin) = (limit.per_joint(), margin.map(Values::per_joint));
         checked(model, Self, constraints::JerkLimit::new(JerkSettings { limit, margin, soft }))
     }

@@ -279,3 +279,26 @@ def test_what_is_outside_is_named_and_what_is_no_configuration_is_refused() -> N
     for call, arrays in (("project_batch", rows), ("vjp_batch", (*rows, zero[None], zero[None])), ("problem", (q, zero, q, zero))):
         with pytest.raises(ValueError, match="needs the tick before, which .* does not have; .*build a projector without it"):
             getattr(jerk, call)(*arrays)
+
+
+def test_hard_jerk_holds_with_position_velocity_and_acceleration(panda):
+    """The robot is where the target says; each proposal asks for thrice the largest speed, to and fro."""
+    limits = [nearl.PositionLimit(panda), nearl.VelocityLimit(panda), nearl.AccelerationLimit(panda, 10.0), nearl.JerkLimit(panda, 300.0, hard=True)]
+    projector, dt, random = nearl.Projector(panda, limits, 1e-3), 1e-3, np.random.default_rng(1)
+    q, v, a = 0.5 * (panda.lower_position_limit + panda.upper_position_limit), np.zeros(7), np.zeros(7)
+    side, most = np.ones(7), np.zeros(4)
+    for tick in range(3000):
+        side = np.where(random.random(7) < 0.004, -side, side)
+        wish = 3 * side * panda.velocity_limit
+        target = projector.project(q, v, q + dt * wish, wish, previous=(a, np.zeros(7)))
+        assert sum(target.ledger.violations.values()) == 0, tick
+        beyond = np.maximum(target.q - panda.upper_position_limit, panda.lower_position_limit - target.q)
+        jerk = np.abs(target.acceleration - a) / dt / 300 - 1
+        seen = [beyond, np.abs(target.v) / panda.velocity_limit - 1, np.abs(target.acceleration) / 10 - 1, jerk]
+        most = np.maximum(most, [x.max() for x in seen])
+        q, v, a = target.q, target.v, target.acceleration
+    assert (most < 1e-9).all() and np.abs(v).max() > 0.5, most
+    with pytest.raises(ValueError, match="hard and has weights of a soft one; drop hard or soft"):
+        nearl.JerkLimit(panda, 300.0, (1.0, 100.0), hard=True)
+    with pytest.raises(ValueError, match="hard jerk of .*'panda_joint1'.* has no acceleration limit to brake with"):
+        nearl.Projector(panda, [limits[-1]], 1e-3)

@@ -41,8 +41,10 @@ pub enum Meter {
     Energy { limit: f64 },
     /// Two balls of the robot, one that stands still, and a floor.
     Collision { tool: Ball, elbow: Ball, post: [f64; 3], radius: f64, floor: f64 },
-    /// Change of acceleration from tick to tick.
-    Jerk { limit: f64 },
+    /// Change of acceleration from tick to tick; a soft limit says nothing of the first tick.
+    Jerk { limit: f64, soft: bool },
+    /// Change of motor force from tick to tick.
+    TorqueRate { limits: Vec<f64> },
     /// `q_a + 0.7 q_b` between two bounds, `|v_a + v_b|` below one.
     Rows { joints: [usize; 2], lower: f64, upper: f64, most: f64 },
 }
@@ -51,8 +53,9 @@ pub enum Meter {
 pub struct Gauge {
     pub model: Model,
     pub period: Period,
-    /// Accelerations of the tick before (nv).
-    pub before: Vec<f64>,
+    /// Accelerations and motor forces of the tick before (nv), and whether there was one.
+    before: (Vec<f64>, Vec<f64>),
+    known: bool,
     dynamics: Dynamics,
     kinematics: Kinematics,
     a: Vec<f64>,
@@ -75,18 +78,38 @@ impl Gauge {
             dynamics: Dynamics::new(model),
             kinematics: Kinematics::new(model),
             a: zero.clone(),
-            before: zero.clone(),
+            before: (zero.clone(), zero.clone()),
+            known: false,
             tau: zero,
             model: model.clone(),
             period,
         }
     }
 
-    /// The largest excess of all measures; negative inside.
-    pub fn worst(&mut self, meters: &[Meter], step: Step<'_>) -> f64 {
+    /// The robot stands, and there is no tick before.
+    pub fn begin(&mut self) {
+        self.before.0.fill(0.0);
+        self.known = false;
+    }
+
+    /// The step was taken: it becomes the tick before.
+    pub fn take(&mut self, step: Step<'_>) {
+        self.accelerate(step);
+        self.motors(step);
+        self.before.0.copy_from_slice(&self.a);
+        self.before.1.copy_from_slice(&self.tau);
+        self.known = true;
+    }
+
+    fn accelerate(&mut self, step: Step<'_>) {
         for (a, (to, from)) in self.a.iter_mut().zip(step.v_next.iter().zip(step.v)) {
             *a = (to - from) / self.period.dt;
         }
+    }
+
+    /// The largest excess of all measures; negative inside.
+    pub fn worst(&mut self, meters: &[Meter], step: Step<'_>) -> f64 {
+        self.accelerate(step);
         meters.iter().fold(f64::NEG_INFINITY, |worst, meter| worst.max(self.excess(meter, step)))
     }
 
@@ -124,8 +147,13 @@ impl Gauge {
                 let post = (tool.radius + radius - apart(p)).max(elbow.radius + radius - apart(e));
                 post.max(floor + tool.radius - p[2])
             }
-            Meter::Jerk { limit } => {
-                each(&|i| (self.a[i] - self.before[i]).abs() / self.period.dt / limit - 1.0)
+            Meter::Jerk { soft: true, .. } | Meter::TorqueRate { .. } if !self.known => f64::NEG_INFINITY,
+            Meter::Jerk { limit, .. } => {
+                each(&|i| (self.a[i] - self.before.0[i]).abs() / self.period.dt / limit - 1.0)
+            }
+            Meter::TorqueRate { limits } => {
+                self.motors(step);
+                each(&|i| (self.tau[i] - self.before.1[i]).abs() / self.period.dt / limits[i] - 1.0)
             }
             Meter::Rows { joints: [a, b], lower, upper, most } => {
                 let sum = step.q_next[*a] + 0.7 * step.q_next[*b];

@@ -43,7 +43,7 @@ pub fn attack(model: &Model, scene: &Scene, settings: &Settings, ticks: usize, s
         if tick % EPISODE == 0 {
             q.copy_from_slice(&scene.start);
             v.fill(0.0);
-            gauge.before.fill(0.0);
+            gauge.begin();
             projector.forget();
             without.forget();
         }
@@ -51,7 +51,7 @@ pub fn attack(model: &Model, scene: &Scene, settings: &Settings, ticks: usize, s
         let status = projector.project(&q, &v, &raw, &mut target);
         let step = Step { q: &q, v: &v, q_next: &target.q, v_next: &target.v };
         let excess = gauge.worst(&scene.meters, step);
-        gauge.before.copy_from_slice(&target.acceleration);
+        gauge.take(step);
         if projector.needs_previous() {
             projector.remember(&target);
         }

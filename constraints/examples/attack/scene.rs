@@ -24,6 +24,9 @@ pub const KINDS: [&str; 13] = [
     "jerk+all",
 ];
 
+/// What is worth something and no promise, attacked by the command alone.
+pub const SOFT: [&str; 2] = ["soft_jerk", "torque_rate"];
+
 /// Largest acceleration of every joint [rad/s² or m/s²].
 pub const ACCELERATION: f64 = 10.0;
 
@@ -55,7 +58,8 @@ impl Scene {
         robot.joints(&mut scene);
         let asked = |name: &str| kind.split('+').any(|part| part == name);
         let apart = if asked("jerk") { "velocity_profile" } else { "jerk" };
-        for name in KINDS.iter().filter(|name| asked(name) || (asked("all") && **name != apart)) {
+        let all = |name: &str| asked("all") && name != apart && !SOFT.contains(&name);
+        for name in KINDS.iter().chain(&SOFT).filter(|name| asked(name) || all(name)) {
             robot.add(name, &mut scene);
         }
         scene
@@ -124,8 +128,14 @@ impl<'a> Robot<'a> {
             "rows" => self.rows(scene),
             "jerk" => {
                 limits.push(Box::new(JerkLimit::hard(JERK)));
-                meters.push(Meter::Jerk { limit: JERK });
+                meters.push(Meter::Jerk { limit: JERK, soft: false });
             }
+            "soft_jerk" => {
+                let (limit, soft) = (PerJoint::All(JERK), Some(Soft::default()));
+                limits.push(Box::new(JerkLimit::new(limit::JerkSettings { limit, margin: None, soft })));
+                meters.push(Meter::Jerk { limit: JERK, soft: true });
+            }
+            "torque_rate" => self.torque_rate(scene),
             _ => {}
         }
     }
@@ -138,6 +148,17 @@ impl<'a> Robot<'a> {
     /// A value for each joint by its name.
     fn each<T>(&self, of: impl Fn(usize) -> T) -> Vec<(String, T)> {
         (0..self.model.nv()).map(|i| (self.model.dof_name(i), of(i))).collect()
+    }
+
+    /// From nothing to the robot file's torque in 50 ms.
+    fn torque_rate(&self, scene: &mut Scene) {
+        let most = |i: usize| 20.0 * self.model.effort_limit()[i];
+        scene.limits.push(Box::new(TorqueRateLimit::new(limit::TorqueRateSettings {
+            limit: PerJoint::Joints(self.each(most).into_iter().collect()),
+            margin: None,
+            soft: Soft::default(),
+        })));
+        scene.meters.push(Meter::TorqueRate { limits: (0..self.model.nv()).map(most).collect() });
     }
 
     fn motors(&self, scene: &mut Scene) {

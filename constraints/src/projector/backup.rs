@@ -291,7 +291,8 @@ impl Backup {
                     Plan::Apart(share) => (LEAST + share * (1.0 - LEAST)) * most,
                 };
                 let at = with.dofs.single[i].map(|iq| q[iq]);
-                let Some(b) = soonest(&dof, at, (v[i], a[i]), wanted.clamp(LEAST * most, most), with.period) else {
+                let Some(b) = soonest(&dof, at, (v[i], a[i]), wanted.clamp(LEAST * most, most), with.period)
+                else {
                     return false;
                 };
                 self.trial[i] = b;

@@ -144,7 +144,11 @@ fn check_jerk(
     let next = "add acceleration = { limit = ... } for them, or drop hard";
     refused(&|i| limits.acceleration[i].is_infinite(), "has no acceleration limit to brake with", next)?;
     let next = "set consistency = \"kinematic\" or drop the jerk limit";
-    refused(&|_| consistency == Consistency::Free, "does not exist in free mode, where no acceleration is decided", next)?;
+    refused(
+        &|_| consistency == Consistency::Free,
+        "does not exist in free mode, where no acceleration is decided",
+        next,
+    )?;
     let next = "drop velocity_profile for them, or hard";
     refused(&|i| limits.profile[i] != [None, None], "is not kept together with a velocity profile", next)
 }

@@ -265,7 +265,12 @@ impl Projector {
             let at = self.dofs.single[i].map_or(0.0, |iq| q[iq]);
             let hard_jerk = dof.jerk.is_finite();
             let mut x = match hard_jerk {
-                true => self.jerk_interval(&dof, i, at, v[i]),
+                true => {
+                    let known = self.previous.get().map(|previous| previous.acceleration[i]);
+                    let known = known.or((v[i] == 0.0).then_some(0.0));
+                    self.before[i] = known.unwrap_or_else(|| jerk::Brake::of(&dof, &self.period).curve(v[i]));
+                    jerk::interval(&dof, at, v[i], known, &self.period)
+                }
                 false => interval(&dof, at, v[i], &self.period),
             };
             let exact = |kind: Kind, bound: f64, v_max: f64| match kind == Kind::Velocity
@@ -300,14 +305,6 @@ impl Projector {
             }
             self.intervals[i] = x;
         }
-    }
-
-    /// The box of dof `i` whose jerk is hard, and the acceleration before this tick.
-    fn jerk_interval(&mut self, dof: &Dof, i: usize, q: f64, v: f64) -> Interval {
-        let known = self.previous.get().map(|previous| previous.acceleration[i]).or((v == 0.0).then_some(0.0));
-        let brake = jerk::Brake::new(dof, jerk::Brake::most(dof), &self.period);
-        self.before[i] = known.unwrap_or_else(|| brake.curve(v));
-        jerk::interval(dof, q, v, known, &self.period)
     }
 
     /// The independent checker has the last word.
@@ -345,9 +342,7 @@ impl Projector {
         target.ledger.active.clear();
         let (checker, to) = (&mut self.checker, (&target.q[..], &target.v[..]));
         let verdict = match target.ledger.rung {
-            Rung::StoredBrake => {
-                checker.check_brake(q, v, to.0, to.1, &self.external, self.previous.get())
-            }
+            Rung::StoredBrake => checker.check_brake(q, v, to.0, to.1, &self.external, self.previous.get()),
             _ => checker.check(q, v, to.0, to.1, &self.external, self.previous.get()),
         };
         target.ledger.violations = verdict.counts;

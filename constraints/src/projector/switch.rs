@@ -2,6 +2,7 @@
 
 use super::Projector;
 use super::build::check_combination;
+use crate::jerk::Brake;
 use crate::row::Previous;
 use crate::viability::Dof;
 use crate::{Kind, LimitError, LimitSet, Proposal, Target};
@@ -91,6 +92,18 @@ impl Projector {
     /// where none is stored.
     pub fn stored_brake(&self) -> Option<&[f64]> {
         self.backup.decelerations().filter(|_| self.stores_a_brake())
+    }
+
+    /// The velocity to propose for dof `i` at `v` that is to stand [rad/s or m/s]: 0, or where its jerk is hard that of its brake after the next
+    /// period, since to come nearest to standing in each tick would swing about it.
+    pub fn rest(&self, i: usize, v: f64) -> f64 {
+        let dof = Dof::of(&self.limits, i);
+        if dof.jerk.is_infinite() {
+            return 0.0;
+        }
+        let brake = Brake::of(&dof, &self.period);
+        let known = self.previous.get().map_or(brake.curve(v), |previous| previous.acceleration[i]);
+        v + self.period.dt * brake.next(v, known)
     }
 
     /// Acceleration (nv) and motor force (nv) of the tick before, for limits on their change; `None`: not known, and

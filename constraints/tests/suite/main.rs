@@ -16,6 +16,7 @@ mod frame_limits;
 mod geometry;
 mod gradient;
 mod huge_proposals;
+mod jerk;
 mod kept;
 mod kinds;
 mod kinematics;

@@ -72,6 +72,32 @@ fn one_joint_never_leaves_its_set() {
     }
 }
 
+/// A joint within the tolerance of its limit that moved on was inside, and got 2e-7 rad beyond it before it stood.
+#[test]
+fn a_joint_that_cannot_stop_in_front_of_its_limit_is_named() {
+    let (mut random, mut named, mut kept) = (Random(13), 0, 0);
+    for case in 0..20_000 {
+        let p = Period::new(PERIODS[case % 3], SUB_STEPS[case / 3 % 5]);
+        let deceleration = 10f64.powf(random.between(0.0, 2.5));
+        let (acceleration, whole) = (deceleration * random.between(1.0, 5.0), case % 2 == 0);
+        let dof =
+            Dof { lower: -1.0, upper: 1.0, velocity: 3.0, acceleration, deceleration, whole, ..Dof::FREE };
+        let (mut q, mut v) = (1.0 + random.between(-1e-9, 1e-9), 10f64.powf(random.between(-9.0, -2.5)));
+        if interval(&dof, q, v, &p).outside.is_some() {
+            named += 1;
+            continue;
+        }
+        kept += 1;
+        for _ in 0..300 {
+            let (start, high) = ((q, v), &mut 0.0);
+            let upper = interval(&dof, q, v, &p).upper;
+            (q, v, _, *high) = advance(q, v, upper, &p);
+            assert!(*high <= 1.0 + 2e-9, "{high} from {start:?}: {dof:?}, {p:?}");
+        }
+    }
+    assert!(named > 1000 && kept > 1000, "{named} {kept}: this shows nothing");
+}
+
 #[test]
 fn many_joints_never_leave_their_sets() {
     let mut random = Random(11);

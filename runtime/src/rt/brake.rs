@@ -57,8 +57,8 @@ impl Brake {
         &mut self.projector
     }
 
-    /// Proposes rest, `v' = 0` and `q' = q + T v - kappa T v`, and returns the command (of motors the torque [N m]) for the
-    /// nearest allowed state. Joints that are not controllable keep their velocity.
+    /// Proposes rest, `v' = 0` and `q' = q + T v - kappa T v`, or with hard jerk what leads there, and returns the command (of motors the torque
+    /// [N m]) for the nearest allowed state. Joints that are not controllable keep their velocity.
     pub fn update(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
         self.propose_rest(q, v);
         self.act(q, v)
@@ -87,13 +87,17 @@ impl Brake {
         self.proposal.q.copy_from_slice(q);
         self.proposal.v.copy_from_slice(v);
         for &(dof, idx_q) in &self.joints {
-            self.proposal.v[dof] = 0.0;
-            self.proposal.q[idx_q] = q[idx_q] + dt * v[dof] - kappa * dt * v[dof];
+            let rest = self.projector.rest(dof, v[dof]);
+            self.proposal.v[dof] = rest;
+            self.proposal.q[idx_q] = q[idx_q] + dt * v[dof] + kappa * dt * (rest - v[dof]);
         }
     }
 
     fn act(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
         let status = self.projector.project(q, v, &self.proposal, &mut self.target);
+        if self.projector.needs_previous() {
+            self.projector.remember(&self.target);
+        }
         self.idm.action(q, v, &self.target, &mut self.action);
         for (action, &(lower, upper)) in self.action.iter_mut().zip(&self.range) {
             *action = if action.is_finite() { action.clamp(lower, upper) } else { 0.0 };

@@ -24,7 +24,13 @@ const STEPS: usize = 10;
 
 /// The least deceleration found, from `wanted` on, with which a dof of hard jerk stops before its position limits after a tick at
 /// acceleration `a`; `None` where the largest does not.
-pub(super) fn soonest(dof: &Dof, q: Option<f64>, (v, a): (f64, f64), wanted: f64, period: &Period) -> Option<f64> {
+pub(super) fn soonest(
+    dof: &Dof,
+    q: Option<f64>,
+    (v, a): (f64, f64),
+    wanted: f64,
+    period: &Period,
+) -> Option<f64> {
     let Some(q) = q else { return Some(wanted) };
     let stops = |b: f64| {
         let brake = Brake::new(dof, b, period);

@@ -77,6 +77,9 @@ fn entry(old: &Map<String, Value>, new: &Map<String, Value>, joints: &[&str]) ->
             ("soft", None, Some(_)) => Some("soft where the loop has a hard one".into()),
             ("soft", Some(_), None) => None,
             ("soft", Some(was), Some(is)) => weaker(was, is).then(|| "softer than in the loop".into()),
+            // Written for kinds that are soft without it.
+            ("hard", None, Some(_)) => None,
+            ("hard", Some(_), None) => Some("soft where the loop has a hard one".into()),
             (key, was, is) => match WAYS.iter().find(|(name, _)| *name == key) {
                 Some((_, way)) => number(key, *way, was, is, joints),
                 None => Some(format!("another '{key}'")),
@@ -152,6 +155,10 @@ mod tests {
         assert_eq!(found(soft(1.0), json!({"limit": 1.0})), None);
         assert_eq!(found(soft(1.0), soft(2.0)), None);
         assert!(found(soft(2.0), soft(1.0)).is_some());
+        let hard = json!({"limit": 1.0, "hard": true});
+        assert_eq!(found(soft(1.0), hard.clone()), None);
+        assert!(found(hard.clone(), soft(1.0)).unwrap().contains("soft"));
+        assert!(found(hard, json!({"limit": 1.0})).unwrap().contains("soft"));
     }
 
     #[test]

@@ -1,0 +1,252 @@
+//! Hard jerk of one joint: nothing is exceeded in closed loop, and the box is what it says: all that a brake of bounded jerk keeps, found by
+//! another, slower brake, and inside the largest set that any motion can keep, found by Clarabel.
+
+use crate::common::*;
+use clarabel::algebra::CscMatrix;
+use clarabel::solver::{DefaultSettingsBuilder, DefaultSolver, IPSolver, SolverStatus, SupportedConeT};
+use nearl_constraints::jerk::interval;
+use nearl_constraints::viability::Dof;
+use nearl_constraints::*;
+
+const PERIODS: [f64; 4] = [0.001, 0.002, 0.01, 0.02];
+const SUB_STEPS: [u32; 3] = [0, 1, 5];
+
+/// A period at acceleration `a`: the state after it, the lowest and the highest position of its physics steps or, without them, of all of it.
+fn advance(q: f64, v: f64, a: f64, p: &Period) -> (f64, f64, f64, f64) {
+    let (mut x, mut w, mut low, mut high) = (q, v, f64::INFINITY, f64::NEG_INFINITY);
+    if p.sub_steps == 0 {
+        let (end, turn) = (q + p.dt * v + 0.5 * p.dt * p.dt * a, -v / a);
+        (low, high) = (end, end);
+        if turn > 0.0 && turn < p.dt {
+            let extreme = q + v * turn + 0.5 * a * turn * turn;
+            (low, high) = (low.min(extreme), high.max(extreme));
+        }
+        return (end, v + p.dt * a, low, high);
+    }
+    for _ in 0..p.sub_steps {
+        w += p.tau * a;
+        x += p.tau * w;
+        (low, high) = (low.min(x), high.max(x));
+    }
+    (x, w, low, high)
+}
+
+fn any_dof(random: &mut Random) -> Dof {
+    let half = 10f64.powf(random.between(-2.0, 0.6));
+    let a = 10f64.powf(random.between(0.0, 2.0));
+    Dof {
+        lower: -half,
+        upper: half,
+        velocity: 10f64.powf(random.between(-1.0, 1.0)),
+        acceleration: a,
+        deceleration: a * random.between(0.2, 1.5).min(1.0),
+        jerk: a * 10f64.powf(random.between(0.0, 2.5)),
+        ..Dof::FREE
+    }
+}
+
+/// A joint in closed loop that presses against one side for a while, asks for anything now and then, and what that came to.
+struct Joint {
+    q: f64,
+    v: f64,
+    before: f64,
+    side: f64,
+    /// Largest excess of position [rad]; of velocity, acceleration and jerk as shares.
+    worst: [f64; 4],
+}
+
+impl Joint {
+    fn new() -> Joint {
+        Joint { q: 0.0, v: 0.0, before: 0.0, side: 1.0, worst: [f64::NEG_INFINITY; 4] }
+    }
+
+    fn wish(&mut self, dof: &Dof, random: &mut Random) -> f64 {
+        if random.next() < 0.01 {
+            self.side = -self.side;
+        }
+        let a = dof.acceleration;
+        if random.next() < 0.8 { 1e9 * self.side } else { random.between(-a, a) }
+    }
+
+    fn go(&mut self, dof: &Dof, a: f64, p: &Period) {
+        let was = self.v;
+        let (low, high);
+        (self.q, self.v, low, high) = advance(self.q, self.v, a, p);
+        let reached = (self.v - was) / p.dt;
+        let seen = [
+            (high - dof.upper).max(dof.lower - low),
+            self.v.abs() / dof.velocity - 1.0,
+            reached.abs() / dof.acceleration - 1.0,
+            (reached - self.before).abs() / (dof.jerk * p.dt) - 1.0,
+        ];
+        (0..4).for_each(|k| self.worst[k] = self.worst[k].max(seen[k]));
+        self.before = reached;
+    }
+}
+
+#[test]
+fn position_velocity_acceleration_and_jerk_of_a_joint_hold_at_once() {
+    let mut random = Random(5);
+    let (mut ticks, mut at_the_limit) = (0, 0);
+    for case in 0..480 {
+        let p = Period::new(PERIODS[case % 4], SUB_STEPS[case / 4 % 3]);
+        let (dof, mut joint) = (any_dof(&mut random), Joint::new());
+        for _ in 0..1000 {
+            let x = interval(&dof, joint.q, joint.v, Some(joint.before), &p);
+            assert!(x.outside.is_none() && x.lower <= x.upper, "{x:?}, {dof:?}, {p:?}");
+            let wish = joint.wish(&dof, &mut random);
+            at_the_limit += usize::from(wish > x.upper && x.upper_kind == Kind::Viability);
+            joint.go(&dof, wish.clamp(x.lower, x.upper), &p);
+            ticks += 1;
+        }
+        assert!(joint.worst.iter().all(|worst| *worst < 1e-9), "{:?}, {dof:?}, {p:?}", joint.worst);
+    }
+    assert!(at_the_limit > ticks / 50, "{at_the_limit} of {ticks}: this shows nothing");
+}
+
+/// The largest excess of a joint that brakes tick by tick: as hard as it may so that the deceleration still falls to zero before the joint
+/// turns round, which is tried.
+fn brakes(dof: &Dof, (mut q, mut v, mut a): (f64, f64, f64), p: &Period) -> f64 {
+    let (step, most) = (dof.jerk * p.dt, dof.deceleration.min(dof.acceleration));
+    let falls = |from: f64| {
+        let (mut speed, mut left) = (0.0, from);
+        while left > 0.0 {
+            (speed, left) = (speed + p.dt * left, left - step);
+        }
+        speed
+    };
+    let mut worst = f64::NEG_INFINITY;
+    loop {
+        let (mut low, mut high) = (0.0, most);
+        for _ in 0..60 {
+            let middle = 0.5 * (low + high);
+            *(if falls(middle) <= v.abs() { &mut low } else { &mut high }) = middle;
+        }
+        a = (-low * v.signum()).clamp(a - step, a + step);
+        let (least, furthest);
+        (q, v, least, furthest) = advance(q, v, a, p);
+        let beyond = (furthest - dof.upper).max(dof.lower - least).max(v.abs() - dof.velocity);
+        worst = worst.max(beyond).max(a.abs() - dof.acceleration);
+        if v.abs() < 1e-12 && a.abs() <= step {
+            return worst;
+        }
+    }
+}
+
+#[test]
+fn the_box_holds_what_the_brake_keeps_and_nothing_else() {
+    let mut random = Random(6);
+    let (mut inside, mut outside) = (0, 0);
+    for case in 0..240 {
+        let p = Period::new(PERIODS[2 + case % 2], SUB_STEPS[case / 2 % 3]);
+        let (dof, mut joint) = (any_dof(&mut random), Joint::new());
+        for tick in 0..600 {
+            let x = interval(&dof, joint.q, joint.v, Some(joint.before), &p);
+            let step = dof.jerk * p.dt;
+            let low = (joint.before - step).max(-dof.acceleration);
+            let high = (joint.before + step).min(dof.acceleration);
+            for k in (0..11).filter(|_| tick % 60 == 59) {
+                let a =
+                    [x.lower, x.upper].get(k).copied().unwrap_or(low + (high - low) * (k as f64 - 2.0) / 8.0);
+                let (q, v, least, furthest) = advance(joint.q, joint.v, a, &p);
+                let now = (furthest - dof.upper).max(dof.lower - least).max(v.abs() - dof.velocity);
+                let excess = now.max(brakes(&dof, (q, v, a), &p));
+                if a >= x.lower && a <= x.upper {
+                    assert!(excess < 1e-9, "{a} in {x:?} breaks by {excess:e}: {dof:?} {p:?}");
+                    inside += 1;
+                } else if (x.lower - a).max(a - x.upper) > 1e-6 * dof.acceleration {
+                    assert!(excess > -1e-9, "{a} outside {x:?} keeps {excess:e}: {dof:?} {p:?}");
+                    outside += 1;
+                }
+            }
+            let wish = joint.wish(&dof, &mut random);
+            joint.go(&dof, wish.clamp(x.lower, x.upper), &p);
+        }
+    }
+    assert!(inside > 5000 && outside > 2000, "{inside} {outside}: this shows nothing");
+}
+
+/// The largest first acceleration of any motion of `n` periods from the state to rest that keeps the limits, positions at the ends of
+/// periods alone; `side` -1: less the lowest.
+fn largest(dof: &Dof, (q, v, before): (f64, f64, f64), p: &Period, n: usize, side: f64) -> f64 {
+    let (mut columns, mut right, step) = (vec![Vec::new(); n], Vec::new(), dof.jerk * p.dt);
+    let mut row = |of: &dyn Fn(usize) -> f64, at_most: f64| {
+        let size = (0..n).fold(0.0, |size: f64, k| size.max(of(k).abs()));
+        (0..n).filter(|k| of(*k) != 0.0).for_each(|k| columns[k].push((right.len(), of(k) / size)));
+        right.push(at_most / size);
+    };
+    let unit = |k: usize, j: usize| f64::from(u8::from(k == j));
+    row(&|_| p.dt, -v); // at rest in the end
+    row(&|k| unit(k, n - 1), 0.0);
+    for j in 0..n {
+        for s in [1.0, -1.0] {
+            row(&|k| s * unit(k, j), dof.acceleration);
+            row(&|k| s * p.dt * f64::from(u8::from(k <= j)), dof.velocity - s * v);
+            let first = if j == 0 { before } else { 0.0 };
+            row(&|k| s * (unit(k, j) - if j > 0 { unit(k, j - 1) } else { 0.0 }), step + s * first);
+            let room = if s > 0.0 { dof.upper - q } else { q - dof.lower };
+            let ways = |k: usize| if k <= j { (j - k) as f64 + p.kappa } else { 0.0 };
+            row(&|k| s * p.dt * p.dt * ways(k), room - s * (j as f64 + 1.0) * p.dt * v);
+        }
+    }
+    let (mut starts, mut rows, mut values) = (vec![0], Vec::new(), Vec::new());
+    for column in &columns {
+        column.iter().for_each(|(r, x)| (rows.push(*r), values.push(*x)).1);
+        starts.push(rows.len());
+    }
+    let g = CscMatrix::new(right.len(), n, starts, rows, values);
+    let cones = [SupportedConeT::ZeroConeT(2), SupportedConeT::NonnegativeConeT(right.len() - 2)];
+    let mut goal = vec![0.0; n];
+    goal[0] = -side;
+    let settings = DefaultSettingsBuilder::default().verbose(false).build().unwrap();
+    let mut solver =
+        DefaultSolver::new(&CscMatrix::zeros((n, n)), &goal, &g, &right, &cones, settings).unwrap();
+    solver.solve();
+    assert_eq!(solver.solution.status, SolverStatus::Solved);
+    side * solver.solution.x[0]
+}
+
+/// What no motion at all can keep is not allowed, and little of what some motion can keep is left out.
+#[test]
+fn the_box_lies_in_the_largest_set_that_can_be_kept() {
+    let (mut random, mut ends, mut gap, mut moved) = (Random(7), 0, 0.0, [0.0f64; 2]);
+    for case in 0..36 {
+        let p = Period::new(0.02, SUB_STEPS[case % 3]);
+        let dof = Dof {
+            lower: -0.8,
+            upper: 0.6,
+            velocity: random.between(0.8, 2.5),
+            acceleration: 10.0,
+            deceleration: 10.0,
+            jerk: random.between(60.0, 400.0),
+            ..Dof::FREE
+        };
+        let mut joint = Joint::new();
+        for tick in 0..300 {
+            let x = interval(&dof, joint.q, joint.v, Some(joint.before), &p);
+            let wish = joint.wish(&dof, &mut random);
+            let a = wish.clamp(x.lower, x.upper);
+            let kind = if wish > a { x.upper_kind } else { x.lower_kind };
+            if a != wish && tick % 3 == 0 {
+                let side = (wish - a).signum();
+                let best = match kind {
+                    Kind::Viability | Kind::Velocity => {
+                        largest(&dof, (joint.q, joint.v, joint.before), &p, 70, side)
+                    }
+                    _ => side * a,
+                };
+                let more = (best - side * a) / (dof.jerk * p.dt);
+                assert!(more > -1e-5, "{a} is {more:e} steps beyond {best}: {x:?}");
+                (ends, gap) = (ends + 1, gap + more.max(0.0));
+                let far = wish.clamp(-dof.acceleration, dof.acceleration);
+                moved = [moved[0] + (far - a).abs(), moved[1] + (far - side * best).abs()];
+            }
+            joint.go(&dof, a, &p);
+        }
+    }
+    let (gap, further) = (gap / f64::from(ends), 100.0 * (moved[0] / moved[1] - 1.0));
+    println!(
+        "{ends} ends: {gap:.3} of a step of acceleration inside the largest set; {further:.2} % further from the proposal"
+    );
+    assert!(ends > 1000 && further < 5.0, "{ends} {further}");
+}
