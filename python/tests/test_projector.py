@@ -281,8 +281,9 @@ def test_what_is_outside_is_named_and_what_is_no_configuration_is_refused() -> N
             getattr(jerk, call)(*arrays)
 
 
-def test_hard_jerk_holds_with_position_velocity_and_acceleration(panda):
+def test_hard_jerk_holds_with_position_velocity_and_acceleration():
     """The robot is where the target says; each proposal asks for thrice the largest speed, to and fro."""
+    panda = nearl.Model.from_urdf("examples/robots/panda/panda.urdf")
     limits = [nearl.PositionLimit(panda), nearl.VelocityLimit(panda), nearl.AccelerationLimit(panda, 10.0), nearl.JerkLimit(panda, 300.0, hard=True)]
     projector, dt, random = nearl.Projector(panda, limits, 1e-3), 1e-3, np.random.default_rng(1)
     q, v, a = 0.5 * (panda.lower_position_limit + panda.upper_position_limit), np.zeros(7), np.zeros(7)

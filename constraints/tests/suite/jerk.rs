@@ -210,7 +210,7 @@ fn largest(dof: &Dof, (q, v, before): (f64, f64, f64), p: &Period, n: usize, sid
 #[test]
 fn the_box_lies_in_the_largest_set_that_can_be_kept() {
     let (mut random, mut ends, mut gap, mut moved) = (Random(7), 0, 0.0, [0.0f64; 2]);
-    for case in 0..36 {
+    for case in 0..12 {
         let p = Period::new(0.02, SUB_STEPS[case % 3]);
         let dof = Dof {
             lower: -0.8,
@@ -222,16 +222,16 @@ fn the_box_lies_in_the_largest_set_that_can_be_kept() {
             ..Dof::FREE
         };
         let mut joint = Joint::new();
-        for tick in 0..300 {
+        for tick in 0..150 {
             let x = interval(&dof, joint.q, joint.v, Some(joint.before), &p);
             let wish = joint.wish(&dof, &mut random);
             let a = wish.clamp(x.lower, x.upper);
             let kind = if wish > a { x.upper_kind } else { x.lower_kind };
-            if a != wish && tick % 3 == 0 {
+            if a != wish && tick % 4 == 0 {
                 let side = (wish - a).signum();
                 let best = match kind {
                     Kind::Viability | Kind::Velocity => {
-                        largest(&dof, (joint.q, joint.v, joint.before), &p, 70, side)
+                        largest(&dof, (joint.q, joint.v, joint.before), &p, 50, side)
                     }
                     _ => side * a,
                 };
@@ -248,5 +248,5 @@ fn the_box_lies_in_the_largest_set_that_can_be_kept() {
     println!(
         "{ends} ends: {gap:.3} of a step of acceleration inside the largest set; {further:.2} % further from the proposal"
     );
-    assert!(ends > 1000 && further < 5.0, "{ends} {further}");
+    assert!(ends > 200 && further < 5.0, "{ends} {further}");
 }

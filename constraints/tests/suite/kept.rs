@@ -9,7 +9,7 @@ use std::sync::Mutex;
 const PERIODS: [f64; 4] = [0.001, 0.002, 0.01, 0.02];
 const SUB_STEPS: [u32; 3] = [0, 1, 5];
 
-/// Ticks of each kind at each period and number of physics steps: 2e5 in all.
+/// Ticks of each kind at each period and number of physics steps: 1.6e5 in all.
 const TICKS: usize = 400;
 
 /// Hard jerk with each kind it is kept together with.
@@ -35,7 +35,8 @@ fn every_kind_is_kept_alone_and_together() {
         for _ in 0..2 {
             scope.spawn(|| {
                 while let Some((k, (kind, dt, sub_steps))) = { cells.lock().unwrap().pop() } {
-                    for arm in 0..2 {
+                    let arms = if WITH_JERK.contains(&kind) { 1 } else { 2 };
+                    for arm in 0..arms {
                         let model = random_arm(1000 * arm + k as u64, 5 + arm as usize);
                         let settings = Settings { braking: Braking::Stored, ..Settings::new(dt, sub_steps) };
                         let scene = Scene::new(&model, "tool", kind);
@@ -53,5 +54,5 @@ fn every_kind_is_kept_alone_and_together() {
     });
     let (ticks, held) = (*ticks.lock().unwrap(), *held.lock().unwrap());
     println!("{ticks} ticks, {held:?} slowed and braked");
-    assert!(ticks >= 200_000 && held[0] > 1000, "{ticks} {held:?}: this shows nothing");
+    assert!(ticks >= 160_000 && held[0] > 1000, "{ticks} {held:?}: this shows nothing");
 }
