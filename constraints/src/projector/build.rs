@@ -129,15 +129,22 @@ impl Dofs {
     }
 }
 
+/// "'a', 'b'" over the controllable dofs that are `wrong`.
+fn named(model: &Model, dofs: &Dofs, wrong: impl Fn(usize) -> bool) -> String {
+    let list = dofs.controllable.iter().filter(|i| wrong(**i));
+    list.map(|i| format!("'{}'", model.dof_name(*i))).collect::<Vec<_>>().join(", ")
+}
+
 /// What a hard jerk needs, and what it is not kept together with.
 fn check_jerk(
+    model: &Model,
     limits: &LimitSet,
+    dofs: &Dofs,
     consistency: Consistency,
-    names: &dyn Fn(&dyn Fn(usize) -> bool) -> String,
 ) -> Result<(), LimitError> {
     let hard = |i: usize| limits.jerk[i].is_finite();
     let refused = |wrong: &dyn Fn(usize) -> bool, why: &str, next: &'static str| {
-        let joints = names(&|i| hard(i) && wrong(i));
+        let joints = named(model, dofs, |i| hard(i) && wrong(i));
         let what = format!("hard jerk of {joints} {why}");
         if joints.is_empty() { Ok(()) } else { Err(LimitError::Unusable { what, next }) }
     };
@@ -174,11 +181,8 @@ pub(super) fn check_combination(
     dofs: &Dofs,
     (consistency, braking): (Consistency, Braking),
 ) -> Result<(), LimitError> {
-    let names = |wrong: &dyn Fn(usize) -> bool| -> String {
-        let list = dofs.controllable.iter().filter(|i| wrong(**i));
-        list.map(|i| format!("'{}'", model.dof_name(*i))).collect::<Vec<_>>().join(", ")
-    };
-    check_jerk(limits, consistency, &names)?;
+    let names = |wrong: &dyn Fn(usize) -> bool| named(model, dofs, wrong);
+    check_jerk(model, limits, dofs, consistency)?;
     match consistency {
         Consistency::Kinematic => {
             let joints = names(&|i| limits.has_position(i) && limits.acceleration[i].is_infinite());
