@@ -190,9 +190,11 @@ impl Checker {
                 verdict.see(Kind::Acceleration, i, faster, self.faster[i]);
             }
             verdict.see(Kind::Acceleration, i, a.abs(), self.limits.acceleration[i]);
-            let before =
-                previous.map_or(if v[i] == 0.0 { 0.0 } else { a }, |previous| previous.acceleration[i]);
-            verdict.see(Kind::Jerk, i, (a - before).abs() / self.period.dt, self.limits.jerk[i]);
+            if self.limits.jerk[i].is_finite() {
+                let unknown = if v[i] == 0.0 { 0.0 } else { a };
+                let before = previous.map_or(unknown, |previous| previous.acceleration[i]);
+                verdict.see(Kind::Jerk, i, (a - before).abs() / self.period.dt, self.limits.jerk[i]);
+            }
             if self.limits.has_position(i) {
                 self.positions(i, (q[iq], v[i]), (q_next[iq], v_next[i]), verdict);
             }

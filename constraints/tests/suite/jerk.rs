@@ -250,3 +250,115 @@ fn the_box_lies_in_the_largest_set_that_can_be_kept() {
     );
     assert!(ends > 200 && further < 5.0, "{ends} {further}");
 }
+
+/// Panda's limits of joints with a hard jerk, and a projector of them.
+fn panda_with_jerk(
+    jerk: f64,
+    more: Vec<Box<dyn Limit>>,
+    settings: Settings,
+) -> Result<Projector, LimitError> {
+    let mut limits: Vec<Box<dyn Limit>> = vec![
+        Box::new(PositionLimit::default()),
+        Box::new(VelocityLimit::default()),
+        Box::new(AccelerationLimit::uniform(10.0)),
+        Box::new(JerkLimit::hard(jerk)),
+    ];
+    limits.extend(more);
+    Projector::new(&panda(), &limits, &[0, 1, 2, 3, 4, 5, 6], settings)
+}
+
+/// A robot that starts too fast, beyond a limit, and unaccelerated for all anybody knows comes back with its jerk.
+#[test]
+fn from_outside_a_joint_comes_back_with_bounded_jerk() {
+    for (dt, sub_steps) in [(0.001, 1), (0.002, 0), (0.01, 5)] {
+        let mut projector = panda_with_jerk(300.0, Vec::new(), Settings::new(dt, sub_steps)).unwrap();
+        let model = panda();
+        let (mut raw, mut target) = (Proposal::new(&model), Target::new(&model));
+        let mut q: Vec<f64> = (0..7).map(|i| model.upper_position_limit()[i] + 0.02).collect();
+        let (mut v, mut before) = (vec![0.3; 7], vec![0.0; 7]);
+        v[0] = 1.2 * model.velocity_limit()[0];
+        q[0] = 0.0;
+        let torque = vec![0.0; 7];
+        for tick in 0..(4.0 / dt) as usize {
+            for i in 0..7 {
+                raw.v[i] = if tick % 2 == 0 && tick < 300 { 3.0 } else { -0.2 };
+                raw.q[i] = q[i] + dt * raw.v[i];
+            }
+            projector.set_previous(Some(row::Previous { acceleration: &before, torque: &torque }));
+            let status = projector.project(&q, &v, &raw, &mut target);
+            assert!(
+                tick > 0 || (status == Status::Recovering && target.ledger.outside == [0, 1, 2, 3, 4, 5, 6])
+            );
+            for i in 0..7 {
+                let jerk = (target.acceleration[i] - before[i]).abs() / dt;
+                assert!(jerk <= 300.0 * (1.0 + 1e-9), "tick {tick}, joint {i}: {jerk} rad/s³");
+                assert!(target.acceleration[i].abs() <= 10.0 * (1.0 + 1e-9), "tick {tick}, joint {i}");
+            }
+            (q, v, before) = (target.q.clone(), target.v.clone(), target.acceleration.clone());
+        }
+        for i in 0..7 {
+            assert!(q[i] <= model.upper_position_limit()[i] + 1e-9, "joint {i} stays at {} ({dt})", q[i]);
+            assert!(v[i].abs() <= model.velocity_limit()[i], "joint {i}: {}", v[i]);
+        }
+    }
+}
+
+/// To come nearest to standing in each tick would swing about it.
+#[test]
+fn a_joint_that_is_to_stand_stands() {
+    let mut projector = panda_with_jerk(100.0, Vec::new(), Settings::new(0.001, 1)).unwrap();
+    let model = panda();
+    let (mut raw, mut target) = (Proposal::new(&model), Target::new(&model));
+    let mut q: Vec<f64> =
+        (0..7).map(|i| 0.5 * (model.lower_position_limit()[i] + model.upper_position_limit()[i])).collect();
+    let mut v: Vec<f64> = (0..7).map(|i| 0.1 * f64::from(i)).collect();
+    for _ in 0..1000 {
+        for i in 0..7 {
+            raw.v[i] = projector.rest(i, v[i]);
+            raw.q[i] = q[i] + 0.001 * raw.v[i];
+        }
+        projector.project(&q, &v, &raw, &mut target);
+        projector.remember(&target);
+        (q, v) = (target.q.clone(), target.v.clone());
+    }
+    assert!(v.iter().all(|v| v.abs() < 1e-12) && target.acceleration.iter().all(|a| a.abs() < 1e-9), "{v:?}");
+}
+
+#[test]
+fn what_hard_jerk_is_not_kept_with_is_refused_by_name() {
+    let said = |result: Result<Projector, LimitError>| result.err().expect("it was accepted").to_string();
+    let profile = VelocityProfileLimit::new(limit::VelocityProfileSettings::Joints(
+        [(
+            "panda_joint2".to_string(),
+            limit::JointProfile {
+                limit: 1.0,
+                offset: 0.0,
+                squared: 4.0,
+                lower: -1.5,
+                upper: 1.5,
+                margin: 0.0,
+            },
+        )]
+        .into(),
+    ));
+    let text = said(panda_with_jerk(300.0, vec![Box::new(profile)], Settings::new(0.001, 1)));
+    assert!(
+        text.contains("hard jerk of 'panda_joint2' is not kept together with a velocity profile"),
+        "{text}"
+    );
+    let free = Settings { consistency: Consistency::Free, ..Settings::new(0.001, 1) };
+    let text = said(panda_with_jerk(300.0, Vec::new(), free));
+    assert!(text.contains("does not exist in free mode"), "{text}");
+    let alone: [Box<dyn Limit>; 1] = [Box::new(JerkLimit::hard(300.0))];
+    let text = said(Projector::new(&panda(), &alone, &[0, 3], Settings::new(0.001, 1)));
+    assert!(text.contains("hard jerk of 'panda_joint1', 'panda_joint4' has no acceleration limit"), "{text}");
+    let both = "{ \"limit\": 1.0, \"hard\": true, \"soft\": { \"linear\": 1.0 } }";
+    let text = serde_json::from_str::<limit::JerkSettings>(both).unwrap_err().to_string();
+    assert!(text.contains("drop hard or soft"), "{text}");
+    for settings in
+        ["{\"limit\":1.0,\"hard\":true}", "{\"limit\":1.0,\"soft\":{\"linear\":1.0,\"quadratic\":100.0}}"]
+    {
+        let read: limit::JerkSettings = serde_json::from_str(settings).unwrap();
+        assert_eq!(serde_json::to_string(&read).unwrap(), settings);
+    }
+}
