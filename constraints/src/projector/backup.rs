@@ -266,6 +266,11 @@ impl Backup {
         self.stored.then_some(&self.deceleration)
     }
 
+    /// Velocity of dof `i`, whose jerk is free, after one tick of the stored brake.
+    pub(crate) fn next_velocity(&self, i: usize, v: f64, period: &Period) -> f64 {
+        v - v.signum() * (self.deceleration[i] * period.dt).min(v.abs())
+    }
+
     /// Deceleration of dof `i` in the stored brake.
     pub(crate) fn deceleration(&self, i: usize) -> f64 {
         self.deceleration[i]

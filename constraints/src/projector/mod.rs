@@ -277,9 +277,9 @@ impl Projector {
                 && x.outside.is_none()
                 && !hard_jerk
             {
-                    true => v_max,
-                    false => v[i] + t * bound,
-                };
+                true => v_max,
+                false => v[i] + t * bound,
+            };
             let mut v_lower = exact(x.lower_kind, x.lower, -dof.velocity);
             let mut v_upper = exact(x.upper_kind, x.upper, dof.velocity).max(v_lower);
             let mut outside = x.outside.is_some();
@@ -380,7 +380,7 @@ impl Projector {
                     let brake = jerk::Brake::new(&dof, most, &self.period);
                     v[i] + self.period.dt * brake.next(v[i], self.before[i])
                 }
-                true => v[i] - v[i].signum() * (most * self.period.dt).min(v[i].abs()),
+                true => self.backup.next_velocity(i, v[i], &self.period),
                 false => v[i] - v[i].signum() * (self.braking[i] * self.period.dt).min(v[i].abs()),
             };
             self.v_next[i] = stop.clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);

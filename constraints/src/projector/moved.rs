@@ -94,8 +94,8 @@ impl Projector {
     /// [`Status::Tightening`](crate::Status::Tightening). Allocates.
     ///
     /// # Errors
-    /// Limits wider than those of the build or without room to stop, unknown names, hard rows and cones without a stored brake, the free
-    /// consistency; nothing is changed then.
+    /// Limits wider than those of the build or without room to stop, unknown names, hard rows and cones without a stored brake, hard
+    /// jerk, the free consistency; nothing is changed then.
     pub fn move_limits(&mut self, moved: &Moved) -> Result<(), LimitError> {
         let numbers = self.moved_numbers(moved)?;
         self.set_moved(&numbers);

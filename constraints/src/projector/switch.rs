@@ -33,6 +33,14 @@ impl Projector {
                 (self.settings.consistency, self.settings.braking),
             )
         });
+        let sound = match self.moving.on && self.limits.has_jerk() {
+            true => Err(LimitError::Unusable {
+                what: "jerk would become hard while limits are moved, from which no way is declared with it"
+                    .into(),
+                next: "move the limits back first",
+            }),
+            false => sound,
+        };
         if let Err(error) = sound {
             self.collect_enabled(label, !on); // limits of one label are always alike
             return Err(error);

@@ -24,6 +24,13 @@ impl Projector {
                 next: "set consistency = \"kinematic\", or build another projector with tighter limits",
             });
         }
+        if self.limits.has_jerk() {
+            return Err(LimitError::Unusable {
+                what: "limits are moved while jerk is hard, for which no way to other limits is declared"
+                    .into(),
+                next: "drop hard from jerk, or build another projector with tighter limits",
+            });
+        }
         let share = moved.speed;
         if !(share > 0.0 && share <= 1.0) {
             let domain = "above 0 and at most 1";
