@@ -320,7 +320,8 @@ fn a_slower_speed_is_reached_in_the_time_it_takes() {
         let mut run = |projector: &mut Projector, count: usize| {
             let mut ticks = 0;
             for _ in 0..count {
-                (raw.q.clone_from(&q), raw.v.fill(0.0));
+                raw.q.clone_from(&q);
+                raw.v.fill(0.0);
                 (raw.q[0], raw.v[0]) = (q[0] + 5.0 * dt, 5.0);
                 let status = projector.project(&q, &v, &raw, &mut target);
                 assert_eq!(target.ledger.violations.total(), 0);

@@ -439,7 +439,7 @@ mod tests {
     #[test]
     fn forces_and_energy_are_those_of_a_double_pendulum() {
         let mut machine = pendulum();
-        let (q, v, a) = ([0.4, -0.9], [1.3, 0.7], [2.0, -3.0]);
+        let (q, v, a): ([f64; 2], [f64; 2], [f64; 2]) = ([0.4, -0.9], [1.3, 0.7], [2.0, -3.0]);
         let (c, s) = (q[1].cos(), q[1].sin());
         let mass = [[2.0 + c + 0.25, 0.25 + 0.5 * c], [0.25 + 0.5 * c, 0.25]];
         let turning = [-0.5 * s * v[1] * (2.0 * v[0] + v[1]), 0.5 * s * v[0] * v[0]];

@@ -24,11 +24,14 @@ const HUGE: f64 = 1e12;
 /// Share of its size by which an action may differ from the one that leads to the target.
 const ACTION: f64 = 1e-7;
 
+/// An acceleration [rad/s² or m/s²] and motor forces [N m or N], of each dof.
+type Told = (Vec<f64>, Vec<f64>);
+
 /// What the tick before left.
 struct Past {
     target: (Vec<f64>, Vec<f64>),
     /// Acceleration and motor forces, where they are what the next tick was told.
-    told: Option<(Vec<f64>, Vec<f64>)>,
+    told: Option<Told>,
 }
 
 /// The state in which a policy period began, and what was proposed then.
@@ -195,7 +198,7 @@ impl Session {
         &mut self,
         (own, pinned): &mut (Promise, Option<Promise>),
         tick: &Tick,
-    ) -> Result<Option<(Vec<f64>, Vec<f64>)>, Fault> {
+    ) -> Result<Option<Told>, Fault> {
         let unknown = |why: &str| Err(Fault::Unknown(why.to_owned()));
         let (nq, nv) = (own.machine.nq(), own.machine.nv());
         for (what, found, length) in [
@@ -319,11 +322,7 @@ impl Session {
     }
 
     /// Limits, action, optimum and way to stop of one promise.
-    fn confirm(
-        &mut self,
-        promise: &mut Promise,
-        case: &Case<'_>,
-    ) -> Result<Option<(Vec<f64>, Vec<f64>)>, Fault> {
+    fn confirm(&mut self, promise: &mut Promise, case: &Case<'_>) -> Result<Option<Told>, Fault> {
         let (tick, p, nv) = (case.tick, promise.period, case.v.len());
         let a: Vec<f64> = (0..nv).map(|i| (tick.target_v[i] - case.v[i]) / p.dt).collect();
         let mut tau = vec![0.0; nv];
