@@ -84,6 +84,9 @@ impl Projector {
     fn taken(&mut self, q: &[f64], v: &[f64], target: &mut Target, status: Status) -> Status {
         if status == Status::Slowed {
             self.report_rung(q, v, target, Rung::StoredBrake);
+            if !target.ledger.outside.is_empty() {
+                return self.named(v, &target.ledger.outside);
+            }
         }
         status
     }
