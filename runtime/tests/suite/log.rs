@@ -43,7 +43,7 @@ with open(sys.argv[1], "rb") as f:
     reader = make_reader(f)
     metadata = [m for m in reader.iter_metadata()]
     assert metadata[0].metadata["digest"] == "abc", metadata
-    ticks, mode, q, v = [], "none", 1.0, 0.0
+    ticks, mode, q, v = [], "active", 1.0, 0.0
     names = {"tick": "nearl.Tick", "brief": "nearl.Brief"}
     for schema, channel, message in reader.iter_messages(topics=list(names)):
         assert (schema.name, schema.encoding, channel.message_encoding) == (names[channel.topic], "jsonschema", "json")

@@ -169,12 +169,14 @@ impl Train {
             (None, Some(name)) => Experience::Served(RobotName::new(name)?, Arc::clone(&stop)),
             (None, None) => Experience::Here,
         };
-        for line in crate::train::advice(&manifest)? {
-            eprintln!("nearl: warning: {line}");
-        }
+        // Said with the first batch: a training that is refused says why, and nothing else.
+        let mut advice = crate::train::advice(&manifest)?;
         let bar = bar(self.json, run.steps);
         let (mut last, mut faults, mut lines) = (None, 0, Lines::new(self.json));
         let report = |p: &Progress, _| {
+            for line in advice.drain(..) {
+                bar.suspend(|| eprintln!("nearl: warning: {line}"));
+            }
             show(&bar, self.json, p);
             lines.show(p, run.steps);
             faults += p.tally.faults;
