@@ -52,9 +52,9 @@ pub struct Body {
     pub parent: Option<usize>,
     /// Its place in the parent's axes with every joint at its reference.
     pub placement: Placement,
-    /// Mass [kg]; 0 for a frame that weighs nothing.
+    /// Mass \[kg\]; 0 for a frame that weighs nothing.
     pub mass: f64,
-    /// Centre of mass in own axes [m].
+    /// Centre of mass in own axes \[m\].
     pub com: [f64; 3],
     /// Inertia about the centre of mass in own axes, `xx, xy, xz, yy, yz, zz` [kg·m²].
     pub inertia: [f64; 6],
@@ -72,7 +72,7 @@ pub struct JointDescription {
     pub kind: JointKind,
     /// Direction of a hinge's or slide's axis in the body's axes (length 1); the others have none and say `[0, 0, 1]`.
     pub axis: [f64; 3],
-    /// A point of the axis, or the centre of a ball, in the body's axes [m].
+    /// A point of the axis, or the centre of a ball, in the body's axes \[m\].
     pub anchor: [f64; 3],
     /// Position at which the body stands at its placement [rad or m]; of hinges and slides only.
     pub reference: f64,

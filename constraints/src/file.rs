@@ -5,7 +5,7 @@ use std::io::{Error, Read, Result};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-/// Largest robot, task, fault or limits file that is read [bytes].
+/// Largest robot, task, fault or limits file that is read \[bytes\].
 pub const MAX_TEXT_BYTES: u64 = 16 << 20;
 
 /// Opens a regular file for reading, without ever waiting: a pipe, a device or a folder is refused, whatever it would do when read.

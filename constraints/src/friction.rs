@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 pub struct Onset {
     /// Force for a unit of acceleration [kg·m² or kg], above 0.
     pub inertia: f64,
-    /// A velocity asks for as much as the acceleration that stops it in this time would [s], above 0.
+    /// A velocity asks for as much as the acceleration that stops it in this time would \[s\], above 0.
     pub time: f64,
 }
 

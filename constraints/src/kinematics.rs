@@ -21,7 +21,7 @@ pub struct Kinematics {
 /// A frame at the state last given to [`Kinematics::update`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameMotion {
-    /// Origin [m].
+    /// Origin \[m\].
     pub position: [f64; 3],
     /// Rotation matrix by rows: `x_world = position + rotation x_frame`.
     pub rotation: [[f64; 3]; 3],
@@ -38,7 +38,7 @@ pub struct FrameMotion {
 /// A point fixed to a frame, at the state last given to [`Kinematics::update`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointMotion {
-    /// Position [m].
+    /// Position \[m\].
     pub position: [f64; 3],
     /// Velocity [m/s].
     pub velocity: [f64; 3],
@@ -93,7 +93,7 @@ impl Kinematics {
         }
     }
 
-    /// Position, velocity and acceleration of the point that has coordinates `local` [m] in `frame`.
+    /// Position, velocity and acceleration of the point that has coordinates `local` \[m\] in `frame`.
     pub fn point(&mut self, frame: FrameId, local: [f64; 3]) -> PointMotion {
         let at = self.frame(frame);
         let position = at.place(local);
@@ -111,7 +111,7 @@ impl Kinematics {
         }
     }
 
-    /// Jacobian (3 x nv, row-major) of the point that has coordinates `local` [m] in `frame`.
+    /// Jacobian (3 x nv, row-major) of the point that has coordinates `local` \[m\] in `frame`.
     pub fn point_jacobian(&mut self, frame: FrameId, local: [f64; 3], jacobian: &mut [f64]) {
         let nv = self.model.nv();
         assert_eq!(jacobian.len(), 3 * nv, "point Jacobian: 3 * nv numbers");
@@ -124,7 +124,7 @@ impl Kinematics {
         self.add_row(frame, point, [0.0, 0.0, 1.0], 1.0, z);
     }
 
-    /// Adds `scale n' J_p` to `row` (nv), with `J_p` the Jacobian of the point of `frame` that is at `point` [m] in the
+    /// Adds `scale n' J_p` to `row` (nv), with `J_p` the Jacobian of the point of `frame` that is at `point` \[m\] in the
     /// world. A column with linear part `s_v` at the world's origin and angular part `s_w` moves the point by
     /// `s_v + s_w x p`, so the entry is `n . s_v + (p x n) . s_w`.
     pub fn add_row(&self, frame: FrameId, point: [f64; 3], n: [f64; 3], scale: f64, row: &mut [f64]) {
@@ -138,7 +138,7 @@ impl Kinematics {
 
     /// Adds to `tau` (nv) [N·m or N] what a wrench on `frame` does to the joints: `tau += J' f`.
     ///
-    /// `wrench`: force [N], then moment about the frame's origin [N·m], both in world axes, from the environment on the
+    /// `wrench`: force \[N\], then moment about the frame's origin [N·m], both in world axes, from the environment on the
     /// robot. With it the equations of motion are `M a + nle = tau_motor + passive + J' f`.
     pub fn add_wrench(&mut self, frame: FrameId, wrench: [f64; 6], tau: &mut [f64]) {
         let nv = self.model.nv();
@@ -151,7 +151,7 @@ impl Kinematics {
         self.jacobian = j;
     }
 
-    /// Kinetic energy [J] at (`q`, `v`), rotor inertias included. Leaves all frames at `q`, `v`; update before asking
+    /// Kinetic energy \[J\] at (`q`, `v`), rotor inertias included. Leaves all frames at `q`, `v`; update before asking
     /// for accelerations.
     pub fn kinetic_energy(&mut self, q: &[f64], v: &[f64]) -> f64 {
         self.check(q, &[v]);
@@ -179,12 +179,12 @@ impl Kinematics {
 }
 
 impl FrameMotion {
-    /// Where in the world [m] the point with coordinates `local` [m] is.
+    /// Where in the world \[m\] the point with coordinates `local` \[m\] is.
     pub fn place(&self, local: [f64; 3]) -> [f64; 3] {
         plus(self.position, self.rotation.map(|row| dot(row, local)))
     }
 
-    /// Motion of the point fixed to this frame that is at `point` [m] in the world:
+    /// Motion of the point fixed to this frame that is at `point` \[m\] in the world:
     /// `v + w x r` and `a + dw x r + w x (w x r)`.
     pub fn carry(&self, point: [f64; 3]) -> PointMotion {
         let (r, w) = (minus(point, self.position), self.angular_velocity);

@@ -207,7 +207,7 @@ pub struct Ledger {
     pub iterations: u32,
     /// Largest violation of the optimality conditions [weight² rad/s]; 0 for the closed form.
     pub residual: f64,
-    /// Time the projection took [ns].
+    /// Time the projection took \[ns\].
     pub duration_ns: u64,
     /// What the raw proposal would have violated.
     pub raw_violations: Counts,

@@ -237,7 +237,7 @@ impl Model {
         &self.0.onset
     }
 
-    /// Mass of everything that moves [kg].
+    /// Mass of everything that moves \[kg\].
     pub fn total_mass(&self) -> f64 {
         self.0.total_mass
     }

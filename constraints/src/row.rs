@@ -131,14 +131,14 @@ pub trait Rows: Send {
         false
     }
 
-    /// Moves what the rows keep this far [m] further inside than it was built, for the ticks to come; false, and nothing is done, where that
+    /// Moves what the rows keep this far \[m\] further inside than it was built, for the ticks to come; false, and nothing is done, where that
     /// means nothing. Must not allocate.
     fn inset(&mut self, by: f64) -> bool {
         let _ = by;
         false
     }
 
-    /// The largest [`Rows::inset`] that leaves anything [m]; 0 where that means nothing.
+    /// The largest [`Rows::inset`] that leaves anything \[m\]; 0 where that means nothing.
     fn most_inset(&self) -> f64 {
         0.0
     }

@@ -149,7 +149,7 @@ impl Guard {
 /// Settings of a projector.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
-    /// Control period T [s].
+    /// Control period T \[s\].
     pub dt: f64,
     /// Semi-implicit Euler sub-steps of the plant in one period; 0 for constant acceleration or Runge-Kutta.
     pub sub_steps: u32,

@@ -113,11 +113,11 @@ pub struct Profile {
 /// How the plant moves during one control period.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Period {
-    /// Control period T [s].
+    /// Control period T \[s\].
     pub dt: f64,
     /// Number n of semi-implicit Euler sub-steps; 0 for a plant that moves with constant acceleration (or Runge-Kutta).
     pub sub_steps: u32,
-    /// Sub-step length `tau = T / n` [s]; 0 when there are none.
+    /// Sub-step length `tau = T / n` \[s\]; 0 when there are none.
     pub tau: f64,
     /// `q' = q + T v + kappa T y`: `(n + 1) / (2 n)`, or 1/2.
     pub kappa: f64,
@@ -131,13 +131,13 @@ impl Period {
         Period { dt, sub_steps, tau, kappa }
     }
 
-    /// How long after the start of the period the plant evaluates its forces, on average: `(T - tau) / 2` [s].
+    /// How long after the start of the period the plant evaluates its forces, on average: `(T - tau) / 2` \[s\].
     pub fn lag(&self) -> f64 {
         0.5 * (self.dt - self.tau)
     }
 
     /// How far an acceleration `a` has moved the configuration at which the plant evaluates its forces, on average:
-    /// `(T^2 - tau^2) / 6 a` [s²].
+    /// `(T^2 - tau^2) / 6 a` \[s²\].
     pub fn sag(&self) -> f64 {
         (self.dt * self.dt - self.tau * self.tau) / 6.0
     }

@@ -7,7 +7,7 @@ use rustix::time::{ClockId, Timespec, clock_gettime};
 
 const SECOND: u64 = 1_000_000_000;
 
-/// Monotonic time [ns]; the same clock in every process of the machine.
+/// Monotonic time \[ns\]; the same clock in every process of the machine.
 pub fn now() -> u64 {
     let t = clock_gettime(ClockId::Monotonic);
     t.tv_sec as u64 * SECOND + t.tv_nsec as u64
@@ -17,7 +17,7 @@ fn timespec(at: u64) -> Timespec {
     Timespec { tv_sec: (at / SECOND) as i64, tv_nsec: (at % SECOND) as _ }
 }
 
-/// Sleeps until the monotonic time `at` [ns]. Signals do not shorten the sleep.
+/// Sleeps until the monotonic time `at` \[ns\]. Signals do not shorten the sleep.
 pub fn sleep_until(at: u64) {
     let at = timespec(at);
     while rustix::thread::clock_nanosleep_absolute(ClockId::Monotonic, &at).is_err() {}
@@ -44,7 +44,7 @@ impl Bell {
         self.0.load(Ordering::Acquire)
     }
 
-    /// Waits for a ring after `seen`, at the latest until the monotonic time `until` [ns].
+    /// Waits for a ring after `seen`, at the latest until the monotonic time `until` \[ns\].
     pub fn wait(&self, seen: u32, until: u64) {
         let until = timespec(until);
         let any = std::num::NonZeroU32::MAX;

@@ -1,6 +1,6 @@
 //! The absolute time grid: slot n is due at `start + n dt`, whatever happened before.
 
-/// Slots of a fixed period [ns]. Holds no clock: time is passed in.
+/// Slots of a fixed period \[ns\]. Holds no clock: time is passed in.
 ///
 /// A tick that ends after its successor was due is an overrun. The slots that have passed are skipped, never made up
 /// for: the next slot is the first one in the future.
@@ -14,12 +14,12 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// First slot at `start`, one every `period` [ns] (at least 1).
+    /// First slot at `start`, one every `period` \[ns\] (at least 1).
     pub fn new(start: u64, period: u64) -> Grid {
         Grid { start, period: period.max(1), slot: 0, overruns: 0, skipped: 0 }
     }
 
-    /// Start [ns], slot, overruns and skipped slots, for [`Grid::resume`].
+    /// Start \[ns\], slot, overruns and skipped slots, for [`Grid::resume`].
     pub fn place(&self) -> [u64; 4] {
         [self.start, self.slot, self.overruns, self.skipped]
     }
@@ -34,7 +34,7 @@ impl Grid {
         self.slot
     }
 
-    /// Time at which the slot is due [ns].
+    /// Time at which the slot is due \[ns\].
     pub fn due(&self) -> u64 {
         self.start + self.slot * self.period
     }

@@ -4,6 +4,8 @@
 //! `tunnel`.
 
 #[cfg(feature = "cli")]
+// Help texts name units in brackets, which are no links.
+#[allow(rustdoc::broken_intra_doc_links)]
 pub mod cli;
 pub mod clock;
 pub mod codes;

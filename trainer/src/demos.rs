@@ -5,7 +5,7 @@
 //! | `observations` | sum (length + 1) x n_obs | raw observations; each episode has one more than steps |
 //! | `qpos`, `qvel` | sum (length + 1) x nq, nv | what `Env::set_state` takes |
 //! | `lengths` | episodes | policy steps of each |
-//! | `dt` | | policy period [s] |
+//! | `dt` | | policy period \[s\] |
 //! | `names` | n_obs | what each column of `observations` is |
 //! | `actions` | sum length x n_act | optional |
 
@@ -54,7 +54,7 @@ pub struct Episode {
 pub struct Demonstrations {
     /// Name of each observation entry (n_obs).
     pub names: Vec<String>,
-    /// Policy period [s].
+    /// Policy period \[s\].
     pub dt: f64,
     /// Episodes.
     pub episodes: Vec<Episode>,

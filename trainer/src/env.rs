@@ -349,7 +349,7 @@ pub fn is_known(task: &Task) -> bool {
     user::is_own(task) || task.env.is_some() || entry(&task.name).is_ok()
 }
 
-/// Control period and physics step [s] of the native environment that a task names, the step 0 where it is none that the projector can
+/// Control period and physics step \[s\] of the native environment that a task names, the step 0 where it is none that the projector can
 /// count on; `None` for a task of one's own and for one without an environment.
 pub fn own_time(task: &Task) -> Option<(f64, f64)> {
     if user::is_own(task) {

@@ -124,7 +124,7 @@ impl MujocoPlant {
         Robot { lockstep, ..self.robot.clone() }
     }
 
-    /// Control period in [s].
+    /// Control period in \[s\].
     pub fn dt(&self) -> f64 {
         self.env.spec().dt
     }

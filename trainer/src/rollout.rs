@@ -1,4 +1,4 @@
-//! Vectorised constrained rollouts: many environments, each through its own [`Controller`], on all cores.
+//! Vectorised constrained rollouts: many environments, each through its own `Controller`, on all cores.
 //!
 //! Every environment has its own random stream and nothing is shared while they run, so a seed gives the
 //! same bits whatever the number of threads.
@@ -43,7 +43,7 @@ pub enum RolloutError {
         n_steps: usize,
         /// What does not fit.
         what: String,
-        /// Free memory [MB].
+        /// Free memory \[MB\].
         free: u64,
     },
     /// The task's observation is not the environment's.

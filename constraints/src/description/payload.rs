@@ -11,9 +11,9 @@ use serde::{Deserialize, Serialize};
 pub struct Payload {
     /// A link or site of the robot file.
     pub frame: String,
-    /// Mass [kg].
+    /// Mass \[kg\].
     pub mass: f64,
-    /// Centre of mass in the frame's axes [m].
+    /// Centre of mass in the frame's axes \[m\].
     #[serde(default)]
     pub com: [f64; 3],
     /// Inertia about the centre of mass in the frame's axes, `xx, xy, xz, yy, yz, zz` [kg·m²].

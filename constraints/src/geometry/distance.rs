@@ -16,15 +16,15 @@ const TOUCHING: f64 = 1e-7;
 /// How two solids stand to each other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Separation {
-    /// Distance [m]; negative when they overlap: then the least motion found that parts them.
+    /// Distance \[m\]; negative when they overlap: then the least motion found that parts them.
     pub distance: f64,
     /// Unit vector from the first to the second.
     pub normal: [f64; 3],
-    /// The nearest point of each [m].
+    /// The nearest point of each \[m\].
     pub points: [[f64; 3]; 2],
 }
 
-/// How solid `a` at `at_a` stands to solid `b` at `at_b`, `None` when they are farther apart than `within` [m] or both are
+/// How solid `a` at `at_a` stands to solid `b` at `at_b`, `None` when they are farther apart than `within` \[m\] or both are
 /// half-spaces.
 ///
 /// Exact to rounding between spheres, capsules and half-spaces; relative 5e-8 where a box or a cylinder takes part. The

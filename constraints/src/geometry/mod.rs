@@ -18,26 +18,26 @@ use serde::{Deserialize, Serialize};
 pub enum Shape {
     /// A ball.
     Sphere {
-        /// Radius [m].
+        /// Radius \[m\].
         radius: f64,
     },
     /// All points within `radius` of a segment along z.
     Capsule {
-        /// Radius [m].
+        /// Radius \[m\].
         radius: f64,
-        /// Length of the segment, between the centres of the two caps [m].
+        /// Length of the segment, between the centres of the two caps \[m\].
         length: f64,
     },
     /// A cylinder along z.
     Cylinder {
-        /// Radius [m].
+        /// Radius \[m\].
         radius: f64,
-        /// Height [m].
+        /// Height \[m\].
         length: f64,
     },
     /// A cuboid.
     Box {
-        /// Edge lengths along x, y and z [m].
+        /// Edge lengths along x, y and z \[m\].
         size: [f64; 3],
     },
     /// Everything with `z <= 0`: a floor, a wall.
@@ -48,7 +48,7 @@ pub enum Shape {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Placement {
-    /// Origin [m].
+    /// Origin \[m\].
     pub position: [f64; 3],
     /// Rotation matrix by rows: `x_parent = position + rotation x`.
     pub rotation: [[f64; 3]; 3],
@@ -59,7 +59,7 @@ impl Placement {
     pub const IDENTITY: Placement =
         Placement { position: [0.0; 3], rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]] };
 
-    /// From a position [m] and URDF's roll, pitch, yaw [rad]: `R = Rz(yaw) Ry(pitch) Rx(roll)`.
+    /// From a position \[m\] and URDF's roll, pitch, yaw \[rad\]: `R = Rz(yaw) Ry(pitch) Rx(roll)`.
     pub fn new(position: [f64; 3], rpy: [f64; 3]) -> Placement {
         let [(sr, cr), (sp, cp), (sy, cy)] = rpy.map(f64::sin_cos);
         let rotation = [
@@ -80,7 +80,7 @@ impl Placement {
         }
     }
 
-    /// Where in the parent [m] the point with coordinates `local` [m] is.
+    /// Where in the parent \[m\] the point with coordinates `local` \[m\] is.
     pub fn place(&self, local: [f64; 3]) -> [f64; 3] {
         plus(self.position, self.rotation.map(|row| dot(row, local)))
     }
@@ -118,7 +118,7 @@ impl Shape {
         }
     }
 
-    /// Radius of the ball around the origin that holds the solid [m]; infinite for a half-space.
+    /// Radius of the ball around the origin that holds the solid \[m\]; infinite for a half-space.
     pub fn bounding_radius(&self) -> f64 {
         match *self {
             Shape::Sphere { radius } => radius,

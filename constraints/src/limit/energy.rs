@@ -11,9 +11,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnergySettings {
-    /// Largest kinetic energy of the whole robot, rotors included [J].
+    /// Largest kinetic energy of the whole robot, rotors included \[J\].
     pub limit: f64,
-    /// Energy kept below the limit [J].
+    /// Energy kept below the limit \[J\].
     #[serde(default, skip_serializing_if = "is_zero")]
     pub margin: f64,
     /// How much it resists; hard when absent.
@@ -37,7 +37,7 @@ impl EnergyLimit {
         EnergyLimit { settings }
     }
 
-    /// At most `limit` [J].
+    /// At most `limit` \[J\].
     pub fn of(limit: f64) -> EnergyLimit {
         EnergyLimit { settings: EnergySettings { limit, margin: 0.0, soft: None } }
     }

@@ -16,7 +16,7 @@ pub struct FrameSettings {
     pub name: Option<String>,
     /// A link, joint or site of the robot file.
     pub frame: String,
-    /// The point, in the frame's axes [m].
+    /// The point, in the frame's axes \[m\].
     #[serde(default)]
     pub point: [f64; 3],
     /// The point stays in this half-space.
@@ -27,7 +27,7 @@ pub struct FrameSettings {
     pub inside: Option<FrameBox>,
     /// Deceleration of the point that may be counted on to stop in front of a plane [m/s²].
     pub braking: f64,
-    /// Distance kept from every plane [m].
+    /// Distance kept from every plane \[m\].
     #[serde(default)]
     pub margin: f64,
     /// How much it resists; hard when absent.
@@ -41,7 +41,7 @@ pub struct FrameSettings {
 pub struct HalfSpace {
     /// Direction in the world; any length.
     pub normal: [f64; 3],
-    /// A point of the plane in the world [m].
+    /// A point of the plane in the world \[m\].
     pub through: [f64; 3],
 }
 
@@ -49,9 +49,9 @@ pub struct HalfSpace {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FrameBox {
-    /// Lowest x, y, z [m].
+    /// Lowest x, y, z \[m\].
     pub lower: [f64; 3],
-    /// Highest x, y, z [m].
+    /// Highest x, y, z \[m\].
     pub upper: [f64; 3],
 }
 
@@ -79,13 +79,13 @@ impl FrameLimit {
         FrameLimit { settings }
     }
 
-    /// The origin of `frame` stays where `normal . (p - through) <= 0` [m], braking by `braking` [m/s²].
+    /// The origin of `frame` stays where `normal . (p - through) <= 0` \[m\], braking by `braking` [m/s²].
     pub fn half_space(frame: &str, normal: [f64; 3], through: [f64; 3], braking: f64) -> FrameLimit {
         let half_space = Some(HalfSpace { normal, through });
         FrameLimit { settings: FrameSettings { half_space, ..FrameLimit::bare(frame, braking) } }
     }
 
-    /// The origin of `frame` stays between `lower` and `upper` [m] in world axes, braking by `braking` [m/s²].
+    /// The origin of `frame` stays between `lower` and `upper` \[m\] in world axes, braking by `braking` [m/s²].
     pub fn inside(frame: &str, lower: [f64; 3], upper: [f64; 3], braking: f64) -> FrameLimit {
         let inside = Some(FrameBox { lower, upper });
         FrameLimit { settings: FrameSettings { inside, ..FrameLimit::bare(frame, braking) } }

@@ -18,7 +18,7 @@ pub struct FrameSpeedSettings {
     pub name: Option<String>,
     /// A link, joint or site of the robot file.
     pub frame: String,
-    /// The point, in the frame's axes [m].
+    /// The point, in the frame's axes \[m\].
     #[serde(default)]
     pub point: [f64; 3],
     /// Largest speed [m/s].

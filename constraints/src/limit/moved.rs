@@ -23,13 +23,13 @@ pub struct Moved {
     /// Highest position [rad or m].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub upper: Option<PerJoint>,
-    /// By the name of a `frame` limit: how far inside of where they were built all its planes lie [m].
+    /// By the name of a `frame` limit: how far inside of where they were built all its planes lie \[m\].
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub frame: BTreeMap<String, f64>,
     /// By the name of a `frame_speed` limit: largest speed [m/s].
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub frame_speed: BTreeMap<String, f64>,
-    /// Largest kinetic energy [J].
+    /// Largest kinetic energy \[J\].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub energy: Option<f64>,
 }

@@ -103,7 +103,7 @@ impl Projector {
     }
 
     /// Where limits are moved to, as plain numbers: largest speed, largest gain of speed, lowest and highest position of each dof (4 nv), then
-    /// how far inside the rows of each limit lie [m] and the share that its cone has (2 for each limit).
+    /// how far inside the rows of each limit lie \[m\] and the share that its cone has (2 for each limit).
     pub fn moved(&self) -> &[f64] {
         &self.moving.numbers
     }

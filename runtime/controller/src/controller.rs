@@ -86,7 +86,7 @@ pub struct Output {
     pub next: Target,
     /// Whether the policy ran in this tick.
     pub policy_tick: bool,
-    /// Duration of the update in [ns].
+    /// Duration of the update in \[ns\].
     pub duration_ns: u64,
 }
 
@@ -676,7 +676,7 @@ impl Controller {
     pub fn version(&self) -> u64 {
         self.version
     }
-    /// Control period in [s].
+    /// Control period in \[s\].
     pub fn dt(&self) -> f64 {
         self.dt
     }

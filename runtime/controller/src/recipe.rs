@@ -119,13 +119,13 @@ pub struct Term {
     /// Policy ticks that are seen, the current one last. The first one after a reset stands for those before it.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub history: usize,
-    /// Duration of a cycle of `phase` [s].
+    /// Duration of a cycle of `phase` \[s\].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub period: Option<f64>,
     /// Shifts of the `phase`s, in cycles: `cos` of each, then `sin` of each; one phase without shift when absent.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub shifts: Vec<f64>,
-    /// Point of the base whose velocity `base_lin_vel` is, in the base's axes [m]; its origin when absent.
+    /// Point of the base whose velocity `base_lin_vel` is, in the base's axes \[m\]; its origin when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub point: Option<[f64; 3]>,
 }

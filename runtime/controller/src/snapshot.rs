@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 pub const FORMAT: u32 = 2;
 /// Version that a file says whose networks have a linear part beside their layers: programs that know [`FORMAT`] alone would leave it out.
 const FORMAT_WITH_SKIP: u32 = 3;
-/// Larger files are refused before they are read, in [byte].
+/// Larger files are refused before they are read, in \[byte\].
 pub const MAX_BYTES: u64 = 256 << 20;
 const KEY: &str = "nearl";
 

@@ -105,13 +105,13 @@ impl ModelSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct TimeSection {
-    /// Control period in [s]; of a native environment its own when absent.
+    /// Control period in \[s\]; of a native environment its own when absent.
     #[serde(default = "unstated", deserialize_with = "stated")]
     pub dt: f64,
     /// The policy proposes every k-th control tick; its proposal is for the end of those k ticks.
     #[serde(default = "one")]
     pub policy_every: usize,
-    /// Physics step of the plant in [s]; 0 for a zero-order-hold plant (a robot, or RK4). Of a native environment its own when absent.
+    /// Physics step of the plant in \[s\]; 0 for a zero-order-hold plant (a robot, or RK4). Of a native environment its own when absent.
     #[serde(default = "unstated", deserialize_with = "stated")]
     pub sim_dt: f64,
     /// Control ticks after which an episode of the user's own environment is cut.
@@ -140,7 +140,7 @@ fn stated<'de, D: serde::Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     }
 }
 
-/// Control period and physics step [s] of the environment that a task names, for those that its file does not state; `None` where the file
+/// Control period and physics step \[s\] of the environment that a task names, for those that its file does not state; `None` where the file
 /// has to state them.
 pub type OwnTime<'a> = &'a dyn Fn(&Task) -> Option<(f64, f64)>;
 

@@ -14,7 +14,7 @@ const JOINTS: usize = 7;
 /// Wait for the other end [ns].
 const PATIENCE: u64 = 1_000_000_000;
 
-/// Round trips in [ns].
+/// Round trips in \[ns\].
 #[derive(Clone, Debug, Serialize)]
 pub struct RoundTrip {
     /// Joints of the robot whose states and actions were sent; its observation is their positions and velocities.

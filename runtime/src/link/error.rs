@@ -74,9 +74,9 @@ pub enum LinkError {
         name: RobotName,
         /// Folder.
         path: &'static str,
-        /// Free [MB].
+        /// Free \[MB\].
         available: u64,
-        /// Needed [MB].
+        /// Needed \[MB\].
         needed: u64,
     },
     /// Shared memory cannot be written.

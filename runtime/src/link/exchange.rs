@@ -35,7 +35,7 @@ pub struct Exchange {
 }
 
 impl Exchange {
-    /// Opens the plant's topics and announces `robot`. After `watchdog` [s] without a fresh action the plant is told to brake.
+    /// Opens the plant's topics and announces `robot`. After `watchdog` \[s\] without a fresh action the plant is told to brake.
     ///
     /// # Errors
     /// [`LinkError`]; a second plant of the name is refused.
@@ -57,7 +57,7 @@ impl Exchange {
         &mut self.state
     }
 
-    /// Sends the state and waits at most `patience` [s] for its action. Without a loop it does not wait at all, unless time stands still
+    /// Sends the state and waits at most `patience` \[s\] for its action. Without a loop it does not wait at all, unless time stands still
     /// meanwhile (lockstep).
     pub fn tick(&mut self, patience: f64) -> Turn<'_> {
         let now = clock::now();

@@ -22,21 +22,21 @@ use super::schema::message;
 pub const MAX_JOINTS: usize = 64;
 /// Capacity of the observation vector in a message.
 pub const MAX_OBS: usize = 128;
-/// Capacity of the joint name list in [`RobotMessage`] [bytes].
+/// Capacity of the joint name list in [`RobotMessage`] \[bytes\].
 pub const MAX_NAMES: usize = 2048;
-/// Capacity of the list of names in an [`AskedMessage`] [bytes].
+/// Capacity of the list of names in an [`AskedMessage`] \[bytes\].
 pub const MAX_ASKED: usize = 4096;
 /// Active rows a [`TickMessage`] has room for.
 pub const MAX_ACTIVE: usize = 96;
-/// Capacity of the row names in a [`RowsMessage`] [bytes].
+/// Capacity of the row names in a [`RowsMessage`] \[bytes\].
 pub const MAX_ROW_NAMES: usize = 8192;
 /// Rows whose kind a [`RowsMessage`] has room for.
 pub const MAX_KINDS: usize = 512;
-/// Capacity of the task's name in a [`RowsMessage`] [bytes].
+/// Capacity of the task's name in a [`RowsMessage`] \[bytes\].
 pub const MAX_TASK: usize = 128;
-/// Capacity of the text in a [`LimitsMessage`] [bytes].
+/// Capacity of the text in a [`LimitsMessage`] \[bytes\].
 pub const MAX_MOVED: usize = 8192;
-/// Capacity of the text in a [`ReceiptMessage`] [bytes].
+/// Capacity of the text in a [`ReceiptMessage`] \[bytes\].
 pub const MAX_TEXT: usize = 256;
 
 /// This state begins an episode. For learning; the loop goes by the episode's number.
@@ -63,9 +63,9 @@ message! {
     StateMessage, "state", version 2 {
         /// Tick of the plant since its start.
         tick: u64,
-        /// Grid time of the tick, monotonic [ns].
+        /// Grid time of the tick, monotonic \[ns\].
         due: u64,
-        /// Time of the plant's own clock (simulated time in MuJoCo) [s].
+        /// Time of the plant's own clock (simulated time in MuJoCo) \[s\].
         time: f64,
         /// Entries used in `q`.
         nq: u32,
@@ -127,7 +127,7 @@ message! {
         observation: u64,
         /// Hash of the limits the plant enforces.
         limits: u64,
-        /// Control period [s].
+        /// Control period \[s\].
         dt: f64,
         /// Number of configuration entries.
         nq: u32,
@@ -215,7 +215,7 @@ pub struct LedgerNumbers {
     pub slack: f64,
     /// Residual of the independent check.
     pub residual: f64,
-    /// Time of the projection [ns].
+    /// Time of the projection \[ns\].
     pub duration: u64,
 }
 
@@ -252,7 +252,7 @@ message! {
         period_tick: u32,
         /// Seed of the noise: [`Noise::draw`](crate::Noise::draw) with it and the last tick in which the policy ran gives the noise again.
         explore: u64,
-        /// Time of the plant's own clock [s].
+        /// Time of the plant's own clock \[s\].
         time: f64,
         /// Log probability of the proposal.
         log_prob_proposal: f64,
@@ -332,7 +332,7 @@ message! {
         state_epoch: u64,
         /// `header.seq` of that state.
         state_seq: u64,
-        /// `header.stamp` of that state [ns]: its age counts from there.
+        /// `header.stamp` of that state \[ns\]: its age counts from there.
         state_stamp: u64,
         /// [`hash_names`](crate::link::hash_names) of what is proposed, in order.
         names: u64,
@@ -354,13 +354,13 @@ message! {
         n: u32,
         /// Hash of their names in order.
         hash: u64,
-        /// Control period [s].
+        /// Control period \[s\].
         dt: f64,
         /// Control ticks in which a proposed state is to be reached.
         policy_every: u64,
-        /// Age of a proposal from which on it is held [s].
+        /// Age of a proposal from which on it is held \[s\].
         age_limit: f64,
-        /// So long is it held before the loop brakes [s].
+        /// So long is it held before the loop brakes \[s\].
         hold: f64,
         /// Proposals taken.
         taken: u64,
@@ -418,9 +418,9 @@ message! {
         raw_violations: u64,
         /// Limits the projected targets broke.
         target_violations: u64,
-        /// Wake-up latency p50, p99, p99.9, max [ns].
+        /// Wake-up latency p50, p99, p99.9, max \[ns\].
         wake: [u64; 4],
-        /// Compute time p50, p99, p99.9, max [ns].
+        /// Compute time p50, p99, p99.9, max \[ns\].
         compute: [u64; 4],
     }
 }
@@ -430,13 +430,13 @@ message! {
     TickMessage, "tick", version 1, buffer 32, history 0, subscribers 4 {
         /// Tick of the runtime.
         tick: u64,
-        /// When it was due, began, and handed its action over [ns].
+        /// When it was due, began, and handed its action over \[ns\].
         due: u64,
         /// See `due`.
         begin: u64,
         /// See `due`.
         end: u64,
-        /// Control period: the next tick is due that long after this one [ns].
+        /// Control period: the next tick is due that long after this one \[ns\].
         period: u64,
         /// Version of the snapshot in use.
         policy_version: u64,

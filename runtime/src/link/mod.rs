@@ -1,4 +1,4 @@
-//! Links between plant, runtime and trainer over shared memory: state and action as the newest of each ([`board`]), everything else as
+//! Links between plant, runtime and trainer over shared memory: state and action as the newest of each (`board`), everything else as
 //! iceoryx2 publish-subscribe.
 //!
 //! Every robot name has its own segments and files, so robots (and tests) never meet. Messages are plain numbers with

@@ -25,7 +25,7 @@ pub struct Robot {
     pub nv: usize,
     /// Number of action entries.
     pub nu: usize,
-    /// Control period [s].
+    /// Control period \[s\].
     pub dt: f64,
     /// The plant waits for the action of every state instead of keeping real time.
     pub lockstep: bool,

@@ -20,13 +20,13 @@ pub struct Asked {
     pub is_action: bool,
     /// Names of the entries, in the order of a proposal.
     pub entries: Vec<String>,
-    /// Control period [s].
+    /// Control period \[s\].
     pub dt: f64,
     /// Control ticks in which a proposed state is to be reached.
     pub policy_every: usize,
-    /// Age of a proposal from which on it is held [s].
+    /// Age of a proposal from which on it is held \[s\].
     pub age_limit: f64,
-    /// So long is it held before the loop brakes [s].
+    /// So long is it held before the loop brakes \[s\].
     pub hold: f64,
 }
 

@@ -19,7 +19,7 @@ pub struct Remains {
     pub alive: usize,
     /// Processes that died without leaving.
     pub dead: usize,
-    /// Memory taken [bytes].
+    /// Memory taken \[bytes\].
     pub bytes: u64,
     /// A process has links of the robot now.
     pub held: bool,

@@ -41,17 +41,17 @@ pub enum Pace {
 /// Settings of a plant process.
 #[derive(Clone, Copy, Debug)]
 pub struct PlantSettings {
-    /// Control period [s].
+    /// Control period \[s\].
     pub dt: f64,
     /// Who waits for whom.
     pub pace: Pace,
     /// The action must come within this fraction of the period; above 1 the plant's time may stretch.
     pub deadline: f64,
-    /// Time without a fresh action after which the plant brakes [s].
+    /// Time without a fresh action after which the plant brakes \[s\].
     pub watchdog: f64,
     /// Ticks until the plant stops by itself.
     pub ticks: Option<u64>,
-    /// Time without an action, from the start or the last one, after which the runtime counts as gone and the plant ends [s]; without it the
+    /// Time without an action, from the start or the last one, after which the runtime counts as gone and the plant ends \[s\]; without it the
     /// plant brakes and waits for the next runtime.
     pub loop_patience: Option<f64>,
     /// SCHED_FIFO priority, if the system allows it; it polls without a pause in lockstep, which needs none.

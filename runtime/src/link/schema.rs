@@ -51,7 +51,7 @@ pub struct Header {
     pub epoch: u64,
     /// Counts the messages of one sender and topic from 1; a gap means lost messages.
     pub seq: u64,
-    /// Monotonic time of sending [ns].
+    /// Monotonic time of sending \[ns\].
     pub stamp: u64,
 }
 

@@ -65,7 +65,7 @@ pub struct LogQueue {
 
 impl LogQueue {
     /// Creates the file, with a number behind its name if there is one already, and starts its thread; `metadata` (snapshot digest, seed, command)
-    /// goes into the file. `wall` is what the wall clock is ahead of the monotonic one [ns]: readers of logs show times of day.
+    /// goes into the file. `wall` is what the wall clock is ahead of the monotonic one \[ns\]: readers of logs show times of day.
     ///
     /// # Errors
     /// [`LogError`] for a path that cannot be written.

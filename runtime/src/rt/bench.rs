@@ -6,7 +6,7 @@ use crate::percentiles::{Percentiles, percentiles};
 use crate::stop::Stop;
 use crate::thread::{ThreadSettings, prepare};
 
-/// Sleeps through `ticks` slots of `dt` [s] on a thread with `settings`, or until `stop`, and returns how late [ns] it woke, with one
+/// Sleeps through `ticks` slots of `dt` \[s\] on a thread with `settings`, or until `stop`, and returns how late \[ns\] it woke, with one
 /// sentence for each thing the operating system refused.
 pub fn bench_wake(
     dt: f64,

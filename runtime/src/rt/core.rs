@@ -19,7 +19,7 @@ use crate::rt::heard::Heard;
 use crate::rt::mode::{Event, Mode, ModeLimits, Modes, Reason};
 use crate::rt::tick::{LoopController, Outcome, Record, Sensed, TickOutput};
 
-/// Settings of a tick; times in [ns].
+/// Settings of a tick; times in \[ns\].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CoreSettings {
@@ -47,7 +47,7 @@ pub struct CoreSettings {
     pub proposer: Option<ProposerSettings>,
 }
 
-/// How long a proposal of another process counts [ns].
+/// How long a proposal of another process counts \[ns\].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProposerSettings {
@@ -60,9 +60,9 @@ pub struct ProposerSettings {
 /// What the world brought to a tick: with the history, everything it depends on.
 #[derive(Clone, Copy, Debug)]
 pub struct Inputs<'a> {
-    /// When it was due by the loop's own clock [ns]; not used if the plant keeps time.
+    /// When it was due by the loop's own clock \[ns\]; not used if the plant keeps time.
     pub due: u64,
-    /// When it began [ns].
+    /// When it began \[ns\].
     pub begin: u64,
     /// A stop had been asked for.
     pub stop: bool,
@@ -106,7 +106,7 @@ pub struct Core<T: LoopController> {
 }
 
 impl<T: LoopController> Core<T> {
-    /// Begins in Hold; `start` is the first slot of the loop's own clock [ns].
+    /// Begins in Hold; `start` is the first slot of the loop's own clock \[ns\].
     pub fn new(settings: CoreSettings, controller: Box<Loaded<T>>, start: u64, faults: FaultPlan) -> Core<T> {
         let mut memory = Vec::new();
         controller.controller.save_memory(&mut memory);
@@ -128,7 +128,7 @@ impl<T: LoopController> Core<T> {
         }
     }
 
-    /// Moves the first slot of the loop's own clock [ns].
+    /// Moves the first slot of the loop's own clock \[ns\].
     pub fn start(&mut self, start: u64) {
         self.grid = Grid::new(start, self.settings.period);
     }
@@ -138,7 +138,7 @@ impl<T: LoopController> Core<T> {
         &self.settings
     }
 
-    /// When the next slot of the loop's own clock is due [ns].
+    /// When the next slot of the loop's own clock is due \[ns\].
     pub fn due(&self) -> u64 {
         self.grid.due()
     }
@@ -189,7 +189,7 @@ impl<T: LoopController> Core<T> {
         self.act();
     }
 
-    /// Ends the tick at `end` [ns] on its grid.
+    /// Ends the tick at `end` \[ns\] on its grid.
     pub fn close(&mut self, end: u64) {
         let record = &mut self.record;
         record.end = end;

@@ -96,7 +96,7 @@ pub enum FaultKind {
     Duplicate,
     /// A state comes after the next one.
     Reorder,
-    /// A state is so old when it comes [s].
+    /// A state is so old when it comes \[s\].
     Late {
         /// Age.
         age: f64,

@@ -92,7 +92,7 @@ pub enum Event {
     Panicked,
 }
 
-/// When to change the mode [ticks].
+/// When to change the mode \[ticks\].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "cli", derive(clap::Args))]
 #[serde(deny_unknown_fields)]
@@ -156,7 +156,7 @@ pub struct Modes {
 }
 
 impl Modes {
-    /// Begins in Hold; `period` [ns].
+    /// Begins in Hold; `period` \[ns\].
     pub fn new(limits: ModeLimits, period: u64) -> Modes {
         Modes {
             limits,

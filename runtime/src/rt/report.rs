@@ -51,9 +51,9 @@ pub struct RunReport {
     pub robot: String,
     /// Who kept time.
     pub sync: Sync,
-    /// Control period [s].
+    /// Control period \[s\].
     pub dt: f64,
-    /// Duration [s].
+    /// Duration \[s\].
     pub seconds: f64,
     /// Ticks.
     pub ticks: u64,

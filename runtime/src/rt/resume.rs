@@ -11,7 +11,7 @@ pub struct Resume {
     pub is_set: bool,
     /// Good, unusable and late ticks in a row.
     pub modes: [u32; 3],
-    /// Start [ns], slot, overruns and skipped slots of the loop's own clock.
+    /// Start \[ns\], slot, overruns and skipped slots of the loop's own clock.
     pub grid: [u64; 4],
     /// Ticks in a row in which the projector braked.
     pub braked: u32,

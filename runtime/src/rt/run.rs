@@ -48,28 +48,28 @@ const GRACE: f64 = 1.0;
 pub struct RunSettings {
     /// Who keeps time.
     pub sync: Sync,
-    /// The loop's own rate [Hz]; it must be the plant's and makes the loop keep its own time ([`run`] only).
+    /// The loop's own rate \[Hz\]; it must be the plant's and makes the loop keep its own time ([`run`] only).
     pub rate: Option<f64>,
-    /// Age at which a state is stale [s]; the default is 5 periods, at least 20 ms.
+    /// Age at which a state is stale \[s\]; the default is 5 periods, at least 20 ms.
     pub age_limit: Option<f64>,
-    /// So long before a state is due, the real-time thread wakes up to poll for it [s]; 0 sleeps until it comes.
+    /// So long before a state is due, the real-time thread wakes up to poll for it \[s\]; 0 sleeps until it comes.
     pub spin: f64,
     /// Seconds until the loop stops by itself, if `ticks` is not given: so many ticks, and of a plant that keeps real time no more than a
     /// second of the wall's beyond.
     pub seconds: Option<f64>,
     /// Ticks until the loop stops by itself.
     pub ticks: Option<u64>,
-    /// How long to wait for the plant at start [s].
+    /// How long to wait for the plant at start \[s\].
     pub patience: f64,
-    /// So long without a state, and a plant that keeps real time is gone, or one in lockstep whose process has ended: the run ends [s].
+    /// So long without a state, and a plant that keeps real time is gone, or one in lockstep whose process has ended: the run ends \[s\].
     pub plant_patience: f64,
     /// Largest speed entry that counts as standing still [rad/s or m/s].
     pub stop_speed: f64,
-    /// Longest braking before the loop ends anyway [s].
+    /// Longest braking before the loop ends anyway \[s\].
     pub stop_patience: f64,
     /// A joint may move so many times further than its speed allows before its sample is implausible; 0 is no check.
     pub jump: f64,
-    /// Time over which the first motion is let in, where a robot model knows the way to stand still [s].
+    /// Time over which the first motion is let in, where a robot model knows the way to stand still \[s\].
     pub ramp: f64,
     /// When to brake and when to come back.
     pub modes: ModeLimits,
@@ -91,7 +91,7 @@ pub struct RunSettings {
     pub strict: bool,
     /// Counts the heap allocations of the real-time thread, in a program whose allocator can.
     pub allocations: Option<CountAllocations>,
-    /// What the wall clock is ahead of the monotonic one, for the times of day in the flight log [ns]; the loop itself never reads it.
+    /// What the wall clock is ahead of the monotonic one, for the times of day in the flight log \[ns\]; the loop itself never reads it.
     pub wall: u64,
     /// Flight log file.
     pub log: Option<PathBuf>,
@@ -151,9 +151,9 @@ pub enum RunError {
         "--rate {rate} Hz, but snapshot and plant run at {own} Hz: leave --rate out to follow the plant, or give {own}"
     )]
     Rate {
-        /// As asked [Hz].
+        /// As asked \[Hz\].
         rate: f64,
-        /// Of snapshot and plant [Hz].
+        /// Of snapshot and plant \[Hz\].
         own: f64,
     },
     /// Somebody took the link's snapshots.

@@ -54,7 +54,7 @@ pub trait LoopController: Send + 'static {
     fn load_memory(&mut self, _memory: &[f64]) {}
     /// Moves `state` on by one period, to where the action in `output` was to take it.
     fn predict(&self, _state: &mut StateMessage, _output: &TickOutput) {}
-    /// The first degree of freedom of `new` that cannot have come from `old` in `age` [s], allowing `jump` times its speed.
+    /// The first degree of freedom of `new` that cannot have come from `old` in `age` \[s\], allowing `jump` times its speed.
     fn implausible(&self, _old: &StateMessage, _new: &StateMessage, _age: f64, _jump: f64) -> Option<usize> {
         None
     }
@@ -277,11 +277,11 @@ pub enum Sensed {
 pub struct Record {
     /// Tick of the runtime, from 1.
     pub tick: u64,
-    /// When the tick was due: the grid slot, or the stamp of the state it waited for [ns].
+    /// When the tick was due: the grid slot, or the stamp of the state it waited for \[ns\].
     pub due: u64,
-    /// When it began [ns].
+    /// When it began \[ns\].
     pub begin: u64,
-    /// When the action was handed over [ns].
+    /// When the action was handed over \[ns\].
     pub end: u64,
     /// Mode of the tick.
     pub mode: Mode,
@@ -309,7 +309,7 @@ pub struct Record {
     pub heard: bool,
     /// That proposal; without one that of an earlier tick.
     pub proposal: ProposalMessage,
-    /// Age of the proposal acted upon, from the state it was computed from [ns]; `u64::MAX` without one.
+    /// Age of the proposal acted upon, from the state it was computed from \[ns\]; `u64::MAX` without one.
     pub proposal_age: u64,
     /// The newest state, as measured.
     pub state: StateMessage,

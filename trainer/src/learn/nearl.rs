@@ -34,7 +34,7 @@ use std::ops::Range;
 pub struct NearlSettings {
     /// Learning rate of the meta policy's supervised loss; 0 leaves it out.
     pub policy_lr: f32,
-    /// The inverse model learns from reached transitions while its mean squared error is at least this ([sigma_I]).
+    /// The inverse model learns from reached transitions while its mean squared error is at least this (\[sigma_I\]).
     pub idm_threshold: f64,
     /// What of a row of actions is compared with the threshold.
     pub idm_threshold_per: Reading,

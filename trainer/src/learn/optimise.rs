@@ -2,9 +2,9 @@
 //!
 //! A minibatch is cut into a number of shards that depends on its size alone. Each thread computes some shards; after a
 //! barrier every thread adds all shards in order and applies the same step to its own replica of the parameters. A minibatch
-//! too small to be cut runs its phases in two lanes side by side instead ([`lanes`]). Nothing is allocated per minibatch.
+//! too small to be cut runs its phases in two lanes side by side instead (`lanes`). Nothing is allocated per minibatch.
 //!
-//! Where a training has several [`Ranks`], each computes some shards, and gradients of shards go from rank to rank ([`share`]).
+//! Where a training has several [`Ranks`], each computes some shards, and gradients of shards go from rank to rank (`share`).
 
 mod lanes;
 mod rows;

@@ -11,7 +11,7 @@
 //! at 1. The other losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`GENERATOR`], [`DISCRIMINATOR`]. The gradient of
 //! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the
 //! bounds, zero where the projection clamped. The adversarial loss pulls at the proposal as a whole, or only at what the action
-//! leaves free of it ([`null_space`]).
+//! leaves free of it (`null_space`).
 
 mod adversary;
 mod demonstrated;
@@ -42,7 +42,7 @@ use std::ops::Range;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pid2Settings {
-    /// The inverse model learns from reached transitions while its mean squared error is at least this ([sigma_I]).
+    /// The inverse model learns from reached transitions while its mean squared error is at least this (\[sigma_I\]).
     pub idm_threshold: f64,
     /// What of a row of actions is compared with the threshold.
     pub idm_threshold_per: Reading,
@@ -64,7 +64,7 @@ pub struct Pid2Settings {
     /// The adversary moves a proposal only where the mean action stays as it is. No effect where the policy does not learn
     /// through the inverse model (`exploration = "proposal"`).
     pub null_space: bool,
-    /// Information the bottleneck may pass, in [nat] (I_c).
+    /// Information the bottleneck may pass, in \[nat\] (I_c).
     pub i_c: f32,
     /// Multiplier of the bottleneck at the start.
     pub beta: f32,

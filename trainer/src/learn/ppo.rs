@@ -1,5 +1,5 @@
 //! PPO (Schulman et al. 2017): the paper's RL-Pure. An ordinary Gaussian policy on actions; an inverse model learns on
-//! the side, so that its loss can be plotted beside the others. [`demonstrated`] is what demonstrations add to it.
+//! the side, so that its loss can be plotted beside the others. `demonstrated` is what demonstrations add to it.
 
 mod demonstrated;
 

@@ -57,7 +57,7 @@ pub enum OnlineError {
     Unusable {
         /// Robot.
         name: RobotName,
-        /// Patience [s].
+        /// Patience \[s\].
         seconds: f64,
         /// What was left out.
         left_out: LeftOut,

@@ -2,8 +2,8 @@
 //!
 //! Every request has an environment and a controller of its own, through the same [`Worker`](crate::rollout::Worker) as
 //! training, with the random stream of its seed: its transitions do not depend on who else asks or on the number of threads.
-//! A client may also learn: it keeps its environments, and pushes the policy they act by ([`training`], [`policy`]).
-//! One thread talks to the clients; the others simulate one chunk at a time, and [`turns`] says whose.
+//! A client may also learn: it keeps its environments, and pushes the policy they act by (`training`, `policy`).
+//! One thread talks to the clients; the others simulate one chunk at a time, and `turns` says whose.
 
 mod dispatcher;
 mod job;

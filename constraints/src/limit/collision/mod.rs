@@ -30,10 +30,10 @@ pub struct CollisionSettings {
     pub adjacent: bool,
     /// Deceleration of a closing distance that may be counted on [m/s²].
     pub braking: f64,
-    /// Distance kept [m].
+    /// Distance kept \[m\].
     #[serde(default)]
     pub margin: f64,
-    /// Pairs farther apart than this get no row [m].
+    /// Pairs farther apart than this get no row \[m\].
     #[serde(default = "influence")]
     pub influence: f64,
     /// At most this many pairs have a row in a tick, the nearest first.
@@ -65,10 +65,10 @@ pub struct SolidSettings {
     /// `{ sphere = { radius } }`, `{ capsule = { radius, length } }`, `{ cylinder = { radius, length } }`,
     /// `{ box = { size = [x, y, z] } }` or `"half_space"` (everything with z <= 0).
     pub shape: Shape,
-    /// Its origin in the frame's axes [m].
+    /// Its origin in the frame's axes \[m\].
     #[serde(default)]
     pub position: [f64; 3],
-    /// Its roll, pitch and yaw in the frame's axes [rad].
+    /// Its roll, pitch and yaw in the frame's axes \[rad\].
     #[serde(default)]
     pub rpy: [f64; 3],
 }

@@ -69,7 +69,7 @@ impl Observer {
         self.observation.is_empty()
     }
 
-    /// The observation at `time` [s] since the reset; to be called once in each policy tick.
+    /// The observation at `time` \[s\] since the reset; to be called once in each policy tick.
     pub fn observe(&mut self, state: &State, time: f64) -> &[f64] {
         let mut observation = std::mem::take(&mut self.observation);
         self.shift_in(state, time, &mut observation);
