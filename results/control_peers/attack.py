@@ -1,7 +1,8 @@
-"""The adversary of `trainer/examples/adversary` against the rules of others, on the same plant: a Panda in MuJoCo.
+"""The adversary of `trainer/examples/adversary` against the rules of others, on the same plant: an arm in MuJoCo.
 
-python attack.py TICKS [SEED]
+python attack.py ROBOT TICKS [SEED]
 
+ROBOT is `panda` or `z1`.
 TICKS for each rule and attack. All rules meet the same seeds, starts and attacks; what they are asked for depends on where they went.
 Where a rule has no answer, or one that is no number, its joints brake by what the motors can always give; what the proposal holds that
 is no number reaches the rule as it is.
@@ -14,7 +15,8 @@ import warnings
 import mujoco
 import numpy as np
 import pinocchio as pin
-from rules import DT, panda, plant, rules
+
+from rules import DT, arm, make, plant, rules
 
 EPISODE, TOLERANCE = 5000, 1e-9
 ATTACKS = ("network", "bang-bang", "gradient", "bursts")
@@ -82,9 +84,9 @@ def start(limits, model, rng):
             return q
 
 
-def run(rule, kind, ticks, seed):
-    model, limits = panda()
-    sim = plant()
+def run(robot, rule, kind, ticks, seed):
+    model, limits = arm(robot)
+    sim = plant(robot)
     state, dynamics = mujoco.MjData(sim), model.createData()
     rng, attack = np.random.default_rng(seed + 1000), Attack(kind, limits, model, seed)
     broken, worst, silent = np.zeros(4, int), np.full(4, -np.inf), 0
@@ -120,12 +122,12 @@ def run(rule, kind, ticks, seed):
 def main() -> None:
     warnings.simplefilter("ignore")
     logging.disable(logging.CRITICAL)
-    ticks, seed = int(float(sys.argv[1])), int(sys.argv[2]) if len(sys.argv) > 2 else 1
+    robot, ticks, seed = sys.argv[1], int(float(sys.argv[2])), int(sys.argv[3]) if len(sys.argv) > 3 else 1
     print("| rule | attack | ticks | position | velocity | acceleration | torque | worst: position, velocity, acceleration, torque [share] | no answer |")
     print("|---|---|---|---|---|---|---|---|---|")
-    for name, rule in rules().items():
+    for name in rules(robot):
         for k, kind in enumerate(ATTACKS):
-            broken, worst, silent = run(rule, kind, ticks, seed + k)
+            broken, worst, silent = run(robot, make(robot, name), kind, ticks, seed + k)
             excess = ", ".join(f"{max(w, 0):.1g}" for w in worst)
             print(f"| {name} | {kind} | {ticks} | " + " | ".join(map(str, broken)) + f" | {excess} | {silent} |", flush=True)
 
