@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use nearl_runtime::link::{LinkError, OperatorLink, RobotName, TrainerLink, TransitionMessage};
+use nearl_runtime::link::{
+    LinkError, OperatorLink, ReceiptMessage, RobotName, TrainerLink, TransitionMessage, Verdict,
+};
 use numpy::{PyArray1, PyArray2, PyArrayMethods};
 use pyo3::exceptions::PyConnectionError;
 use pyo3::prelude::*;
@@ -86,8 +88,7 @@ impl LoopClient {
             })
         })?;
         let receipt = receipt.map_err(error)?;
-        let verdict = receipt.verdict();
-        Ok((verdict == nearl_runtime::link::Verdict::Accepted, verdict.name(), receipt.text(), receipt.tick))
+        Ok(answer(&receipt))
     }
 
     /// Moves the loop's limits: whether it took them, the code of its answer, its sentence, and the first tick.
@@ -117,8 +118,7 @@ impl LoopClient {
         })?;
         let closed = || LinkError::NoRuntime(self.name.clone());
         let receipt = receipt.and_then(|receipt| receipt.ok_or_else(closed)).map_err(error)?;
-        let verdict = receipt.verdict();
-        Ok((verdict == nearl_runtime::link::Verdict::Accepted, verdict.name(), receipt.text(), receipt.tick))
+        Ok(answer(&receipt))
     }
 
     /// Leaves.
@@ -213,4 +213,10 @@ fn arrays<'py>(py: Python<'py>, all: &[TransitionMessage]) -> PyResult<Bound<'py
 #[pyfunction]
 pub(crate) fn loop_modes() -> Vec<&'static str> {
     nearl_runtime::rt::Mode::ALL.iter().map(|mode| mode.name()).collect()
+}
+
+/// Whether the loop took it, the code of its answer, its sentence, and the first tick.
+fn answer(receipt: &ReceiptMessage) -> (bool, &'static str, String, u64) {
+    let verdict = receipt.verdict();
+    (verdict == Verdict::Accepted, verdict.name(), receipt.text(), receipt.tick)
 }

@@ -98,3 +98,45 @@ pub fn consistent(projector: &Projector, q: &[f64], v: &[f64], y: &[f64]) -> Pro
         v: (0..v.len()).map(|i| v[i] + y[i]).collect(),
     }
 }
+
+/// Bang-bang for a while, joint by joint; at times towards a limit, at times to and fro.
+pub struct Attack {
+    random: Random,
+    side: Vec<f64>,
+}
+
+impl Attack {
+    pub fn new(seed: u64, nv: usize) -> Attack {
+        Attack { random: Random(seed), side: vec![1.0; nv] }
+    }
+
+    pub fn propose(&mut self, model: &Model, dt: f64, q: &[f64], out: &mut Proposal) {
+        for i in 0..model.nv() {
+            if self.random.next() < dt / 0.3 {
+                self.side[i] = if self.random.next() < 0.5 { -1.0 } else { 1.0 };
+            }
+            let speed = 3.0 * self.side[i] * model.velocity_limit()[i];
+            (out.q[i], out.v[i]) = (q[i] + dt * speed, speed);
+        }
+    }
+}
+
+/// A period at acceleration `a`: the state after it, the lowest and the highest position of its physics steps or, without them, of all of it.
+pub fn advance(q: f64, v: f64, a: f64, p: &Period) -> (f64, f64, f64, f64) {
+    let (mut x, mut w, mut low, mut high) = (q, v, f64::INFINITY, f64::NEG_INFINITY);
+    if p.sub_steps == 0 {
+        let (end, turn) = (q + p.dt * v + 0.5 * p.dt * p.dt * a, -v / a);
+        (low, high) = (end, end);
+        if turn > 0.0 && turn < p.dt {
+            let extreme = q + v * turn + 0.5 * a * turn * turn;
+            (low, high) = (low.min(extreme), high.max(extreme));
+        }
+        return (end, v + p.dt * a, low, high);
+    }
+    for _ in 0..p.sub_steps {
+        w += p.tau * a;
+        x += p.tau * w;
+        (low, high) = (low.min(x), high.max(x));
+    }
+    (x, w, low, high)
+}

@@ -22,28 +22,6 @@ struct Seen {
     measured: f64,
 }
 
-struct Attack {
-    random: Random,
-    side: Vec<f64>,
-}
-
-impl Attack {
-    fn new(seed: u64, nv: usize) -> Attack {
-        Attack { random: Random(seed), side: vec![1.0; nv] }
-    }
-
-    /// Bang-bang for a while, joint by joint; at times towards a limit, at times to and fro.
-    fn propose(&mut self, model: &Model, dt: f64, q: &[f64], out: &mut Proposal) {
-        for i in 0..model.nv() {
-            if self.random.next() < dt / 0.3 {
-                self.side[i] = if self.random.next() < 0.5 { -1.0 } else { 1.0 };
-            }
-            let speed = 3.0 * self.side[i] * model.velocity_limit()[i];
-            (out.q[i], out.v[i]) = (q[i] + dt * speed, speed);
-        }
-    }
-}
-
 /// A state to start from, in the middle of everything.
 fn middle(model: &Model) -> Vec<f64> {
     let (low, high) = (model.lower_position_limit(), model.upper_position_limit());

@@ -11,26 +11,6 @@ use nearl_constraints::*;
 const PERIODS: [f64; 4] = [0.001, 0.002, 0.01, 0.02];
 const SUB_STEPS: [u32; 3] = [0, 1, 5];
 
-/// A period at acceleration `a`: the state after it, the lowest and the highest position of its physics steps or, without them, of all of it.
-fn advance(q: f64, v: f64, a: f64, p: &Period) -> (f64, f64, f64, f64) {
-    let (mut x, mut w, mut low, mut high) = (q, v, f64::INFINITY, f64::NEG_INFINITY);
-    if p.sub_steps == 0 {
-        let (end, turn) = (q + p.dt * v + 0.5 * p.dt * p.dt * a, -v / a);
-        (low, high) = (end, end);
-        if turn > 0.0 && turn < p.dt {
-            let extreme = q + v * turn + 0.5 * a * turn * turn;
-            (low, high) = (low.min(extreme), high.max(extreme));
-        }
-        return (end, v + p.dt * a, low, high);
-    }
-    for _ in 0..p.sub_steps {
-        w += p.tau * a;
-        x += p.tau * w;
-        (low, high) = (low.min(x), high.max(x));
-    }
-    (x, w, low, high)
-}
-
 fn any_dof(random: &mut Random) -> Dof {
     let half = 10f64.powf(random.between(-2.0, 0.6));
     let a = 10f64.powf(random.between(0.0, 2.0));

@@ -15,28 +15,6 @@ fn by_joint(model: &Model, value: impl Fn(usize) -> f64) -> Option<PerJoint> {
     Some(PerJoint::Each((0..model.nv()).map(value).collect()))
 }
 
-/// Bang-bang for a while, joint by joint.
-struct Attack {
-    random: Random,
-    side: Vec<f64>,
-}
-
-impl Attack {
-    fn new(seed: u64, nv: usize) -> Attack {
-        Attack { random: Random(seed), side: vec![1.0; nv] }
-    }
-
-    fn propose(&mut self, model: &Model, dt: f64, q: &[f64], out: &mut Proposal) {
-        for i in 0..model.nv() {
-            if self.random.next() < dt / 0.3 {
-                self.side[i] = if self.random.next() < 0.5 { -1.0 } else { 1.0 };
-            }
-            let speed = 3.0 * self.side[i] * model.velocity_limit()[i];
-            (out.q[i], out.v[i]) = (q[i] + dt * speed, speed);
-        }
-    }
-}
-
 fn joints(acceleration: f64, torque: Option<f64>) -> Vec<Box<dyn Limit>> {
     let mut limits: Vec<Box<dyn Limit>> = vec![
         Box::new(PositionLimit::default()),

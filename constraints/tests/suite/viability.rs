@@ -8,24 +8,10 @@ use nearl_constraints::{
 };
 use std::path::Path;
 
-/// Moves one period with constant acceleration; returns the state and the extreme positions on the way.
+/// A period at acceleration `a`, as [`common::advance`](crate::common::advance) makes it; the extremes count the state before too.
 fn advance(q: f64, v: f64, a: f64, p: &Period) -> (f64, f64, f64, f64) {
-    let (mut x, mut w, mut low, mut high) = (q, v, q, q);
-    if p.sub_steps == 0 {
-        let (end, turn) = (q + p.dt * v + 0.5 * p.dt * p.dt * a, -v / a);
-        (low, high) = (low.min(end), high.max(end));
-        if turn > 0.0 && turn < p.dt {
-            let extreme = q + v * turn + 0.5 * a * turn * turn;
-            (low, high) = (low.min(extreme), high.max(extreme));
-        }
-        return (end, v + p.dt * a, low, high);
-    }
-    for _ in 0..p.sub_steps {
-        w += p.tau * a;
-        x += p.tau * w;
-        (low, high) = (low.min(x), high.max(x));
-    }
-    (x, w, low, high)
+    let (x, w, low, high) = crate::common::advance(q, v, a, p);
+    (x, w, low.min(q), high.max(q))
 }
 
 /// Runs `steps` periods on one dof: presses against one side most of the time, changes its mind now and then, asks for
