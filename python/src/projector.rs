@@ -132,7 +132,7 @@ impl Projector {
     ///     q_proposal (nq): configuration wanted at the end of the period.
     ///     v_proposal (nv): velocity wanted at the end of the period.
     ///     previous: acceleration (nv) [rad/s²] and motor force (nv) [N m, N] of the tick before, `(target.acceleration, tau)`: without it,
-    ///         limits on jerk and on the rate of torque do not hold in this tick.
+    ///         limits on jerk and on the rate of torque do not hold in this tick; hard jerk does for joints that stand.
     ///
     /// Returns:
     ///     Target: `q` (nq), `v` (nv), `acceleration` (nv), and the ledger's fields (`status`, `active`, `moved`, ...).
