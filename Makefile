@@ -57,7 +57,8 @@ check:
 
 $(VENV)/bin/python:
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) was not found: install Python 3.10 to 3.14 or say 'make setup PYTHON=/path/to/python'" >&2; exit 1; }
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' || { echo "$(PYTHON) is $$($(PYTHON) --version 2>&1), but Python 3.10 to 3.14 is needed: say 'make setup PYTHON=/path/to/python'" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' || { \
+	echo "$(PYTHON) is $$($(PYTHON) --version 2>&1), but Python 3.10 to 3.14 is needed: say 'make setup PYTHON=/path/to/python'" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
 $(STAMP): | $(VENV)/bin/python

@@ -11,13 +11,17 @@ nearl=$PWD/target/release/nearl
 out=$PWD/runs/two_hosts
 pace=${PACE:---lockstep} # PACE="--priority 40": in real time, where the system allows a real-time priority
 seconds=${SECONDS_OF_FLIGHT:-60} # of flight; learning takes about half of it
-command -v iox2-link-tunnel-zenoh >/dev/null || { echo "iox2-link-tunnel-zenoh was not found: install it as the head of this file says, and put it on the PATH" >&2; exit 1; }
+command -v iox2-link-tunnel-zenoh >/dev/null || {
+    echo "iox2-link-tunnel-zenoh was not found: install it as the head of this file says, and put it on the PATH" >&2
+    exit 1
+}
 [ "$(id -u)" = 0 ] || { echo "namespaces need root: run this with sudo" >&2; exit 1; }
 rm -rf "$out"
 mkdir -p "$out"
 
 host() { # a namespace that lives until the script ends
-    unshare --net --mount --pid --fork --kill-child sh -c 'mount -t tmpfs tmpfs /dev/shm && mount -t tmpfs tmpfs /tmp && ip link set lo up && exec sleep 100000' >/dev/null 2>&1 &
+    unshare --net --mount --pid --fork --kill-child \
+        sh -c 'mount -t tmpfs tmpfs /dev/shm && mount -t tmpfs tmpfs /tmp && ip link set lo up && exec sleep 100000' >/dev/null 2>&1 &
 }
 host; holder_a=$!
 host; holder_b=$!
@@ -39,7 +43,8 @@ robot "$nearl" tunnel arm --listen tcp/0.0.0.0:7447 --out "$out/robot" > "$out/t
 
 # trainer: the tunnel that connects, and learning from the loop
 trainer "$nearl" tunnel arm --connect tcp/10.77.0.1:7447 --out "$out/trainer" > "$out/tunnel-trainer.log" 2>&1 &
-trainer "$nearl" train Panda-reach --from arm --steps 1024 --set train.n_steps=8 --set train.ppo.batch_size=64 --out "$out/train" || echo "the training ended early" >&2
+trainer "$nearl" train Panda-reach --from arm --steps 1024 --set train.n_steps=8 --set train.ppo.batch_size=64 --out "$out/train" \
+    || echo "the training ended early" >&2
 
 wait $loop
 pkill -TERM -P "$(pgrep -P $plant)" # shell, nsenter, plant; in lockstep the plant's time stands still without a loop

@@ -7,8 +7,9 @@ MUJOCO_PLAYGROUND is a checkout; nothing of it is part of this repository. Its G
 - *its own simulation*: the loop of its `play_go1_joystick.py` (observation, onnxruntime, position targets, five physics steps a policy tick);
 - *nearl*: the policy imported with a recipe, in a loop of 250 Hz (a policy tick every fifth) on MuJoCo as a plant process.
 
-Then the two policies "walk" and "walk backwards as fast as it can" (the same network under another command) are switched every 0.3 s, in the simulation of the first, with targets
-as they are (raw), clipped to the joints' ranges (clamped), and behind `guard = "drive"` with a torque rate (guarded). Needs mujoco and onnxruntime.
+Then the two policies "walk" and "walk backwards as fast as it can" (the same network under another command) are switched every 0.3 s, in the simulation of
+the first, with targets as they are (raw), clipped to the joints' ranges (clamped), and behind `guard = "drive"` with a torque rate (guarded). Needs mujoco
+and onnxruntime.
 """
 
 import re
@@ -40,8 +41,8 @@ COMMANDS = [(1.0, 0.0, 0.0), (0.0, 0.4, 0.0), (0.5, 0.0, 1.0)]
 def robot(playground: Path, folder: Path) -> Path:
     """The robot without its meshes (its feet alone collide), on a plane, beginning at the height of its own start.
 
-    ``own.xml`` is that of its own simulation. Ours is without the option ``eulerdamp="disable"``, with which MuJoCo's step is not the one a controller reckons with, and with MuJoCo's own
-    number of solver iterations in place of one: with implicit damping one does not hold the feet.
+    ``own.xml`` is that of its own simulation. Ours is without the option ``eulerdamp="disable"``, with which MuJoCo's step is not the one a controller
+    reckons with, and with MuJoCo's own number of solver iterations in place of one: with implicit damping one does not hold the feet.
     """
     text = (playground / GO1 / "go1_mjx_feetonly.xml").read_text()
     text = re.sub(r"<geom class=\"visual\"[^>]*/>", "", text)

@@ -2,8 +2,8 @@
 
     python results/doors/precision.py FOLDER > results/doors/precision.md
 
-FOLDER holds .onnx files, as for policies.py. Both compute in single precision and sum in another order; what the order costs is seen against a reference that does not
-round. Errors are shares of the largest output that the policy gives on the same observations (a scale, the same for both).
+FOLDER holds .onnx files, as for policies.py. Both compute in single precision and sum in another order; what the order costs is seen against a reference
+that does not round. Errors are shares of the largest output that the policy gives on the same observations (a scale, the same for both).
 """
 
 import sys

@@ -2,8 +2,8 @@
 
     python results/doors/proposer.py > results/doors/proposer.md
 
-`nearl plant Panda-reach` waits for each action (a busy machine would be late otherwise), the loop runs on threads of this process, and the proposer is a process of its own that answers each state it reads with a wild one (up to three
-radians away), after the time that a model would take.
+`nearl plant Panda-reach` waits for each action (a busy machine would be late otherwise), the loop runs on threads of this process, and the proposer is a
+process of its own that answers each state it reads with a wild one (up to three radians away), after the time that a model would take.
 """
 
 import subprocess
@@ -51,7 +51,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         snapshot = Path(scratch) / "arm.safetensors"
         nearl.blank("Panda-reach", snapshot)
-        print("| model takes [ms] | taken | overtaken | state to answer p50, p99 [ms] | sent to answer p50, p99 [ms] | ticks by mode | raw violations | of targets | on the plant |")
+        columns = ["model takes [ms]", "taken", "overtaken", "state to answer p50, p99 [ms]", "sent to answer p50, p99 [ms]", "ticks by mode"]
+        print(f"| {' | '.join([*columns, 'raw violations', 'of targets', 'on the plant'])} |")
         print("|---|---|---|---|---|---|---|---|---|")
         for think in (0.0, 0.005, 0.02, 0.05, 0.15):
             print(row(snapshot, think), flush=True)

@@ -3,7 +3,8 @@
     python results/doors/sb3.py policies STEPS > results/doors/sb3_policies.md
     python results/doors/sb3.py learners PPO_STEPS SAC_STEPS > results/doors/sb3_learners.md
 
-Needs `pip install stable-baselines3==2.9.2 "gymnasium[mujoco]==1.4.0"` beside nearl. One seed and few steps: what is measured is whether policies come over whole and whether
+Needs `pip install stable-baselines3==2.9.2 "gymnasium[mujoco]==1.4.0"` beside nearl.
+One seed and few steps: what is measured is whether policies come over whole and whether
 limits hold, not how well SB3 learns.
 """
 
@@ -77,7 +78,8 @@ def policies(steps: int) -> None:
             here, there = returns(gymnasium.make(TASK), act), plant.play(snapshot, SEEDS, f"sb3{name}")
         log(here, there)
         furthest = max(abs(a - b) for a, b in zip(here, there))
-        print(f"| {name}{', VecNormalize' if on_policy else ''} | {of} | {worst:.0e} | {np.mean(here):.3f} | {np.mean(there):.3f} | {furthest:.0e} |", flush=True)
+        row = f"{name}{', VecNormalize' if on_policy else ''}"
+        print(f"| {row} | {of} | {worst:.0e} | {np.mean(here):.3f} | {np.mean(there):.3f} | {furthest:.0e} |", flush=True)
 
 
 class Count(gymnasium.Wrapper):
@@ -101,7 +103,8 @@ class Count(gymnasium.Wrapper):
 
 
 class CountArm(gymnasium.Wrapper):
-    """Control ticks of the projected arm whose raw proposal and whose target broke a limit, and states outside: by the URDF's numbers and the task's shares of them."""
+    """Control ticks of the projected arm whose raw proposal and whose target broke a limit, and states
+    outside: by the URDF's numbers and the task's shares of them."""
 
     def __init__(self, env: gymnasium.Env):
         super().__init__(env)

@@ -25,6 +25,7 @@ rounds = [json.loads(line) for line in open(file)]
 rate = [r["steps"] / r["seconds"] for r in rounds]
 ratio = sorted(there / here for here, there in zip(rate[::2], rate[1::2]))
 middle = lambda x: sorted(x)[len(x) // 2]
-print(f"| {task} | {middle(rate[::2]) / 1e3:.1f} k | {middle(rate[1::2]) / 1e3:.1f} k | {100 * middle(ratio):.0f} % ({100 * ratio[0]:.0f} .. {100 * ratio[-1]:.0f}) |")
+paired = f"{100 * middle(ratio):.0f} % ({100 * ratio[0]:.0f} .. {100 * ratio[-1]:.0f})"
+print(f"| {task} | {middle(rate[::2]) / 1e3:.1f} k | {middle(rate[1::2]) / 1e3:.1f} k | {paired} |")
 PYTHON
 done
