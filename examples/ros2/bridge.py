@@ -5,13 +5,17 @@
 
 Positions are commanded (`[command] interface = "position"` in the task file): the projected target is the command, and a brake holds the
 last one. For 50 to 200 Hz: a message through ROS takes a millisecond or two, and now and then ten. Joints are joined by name, whatever
-order the robot publishes them in. Each command is within a period's motion of the measured position that it answers; where messages are
-late by a period, two of them may reach the robot in one, and its speed is up to twice the limit for that period: give velocities a scale
-that leaves room, or use a control PC that keeps time.
+order the robot publishes them in. Each command answers a measured position and lies within a period's motion of it. Where messages are late or
+come in bunches that is not yet a bound from one command to the next, so the bridge adds one: it moves a command by no more than the speed
+limits allow in the time since the one before, and in one period at most. A late message therefore costs speed. What the network does to commands
+on their way to the robot it cannot know.
 """
 
+import math
 import sys
+import time
 
+import numpy as np
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -26,10 +30,19 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 class Bridge(Node):
     """One exchange with the loop for each measurement that ROS brings."""
 
-    def __init__(self, name: str, joints: list[str], dt: float, states: str = "joint_states", commands: str = "forward_position_controller/commands"):
+    def __init__(
+        self,
+        name: str,
+        joints: list[str],
+        dt: float,
+        speed: np.ndarray,
+        states: str = "joint_states",
+        commands: str = "forward_position_controller/commands",
+    ):
         super().__init__(f"nearl_{name}".replace("-", "_"))
-        self.joints, self.dt, self.turns = joints, dt, {"act": 0, "hold": 0, "brake": 0}
-        self.command: list[float] | None = None
+        self.joints, self.dt, self.speed, self.turns = joints, dt, speed, {"act": 0, "hold": 0, "brake": 0}
+        self.command: np.ndarray | None = None
+        self.sent = -math.inf  # s, when the last command went out
         observation = [f"q.{joint}" for joint in joints] + [f"v.{joint}" for joint in joints]
         self.plant = nearl.Plant(name, joints, observation, dt, len(joints), watchdog=10 * dt)
         self.sender = self.create_publisher(Float64MultiArray, commands, NEWEST)
@@ -41,14 +54,19 @@ class Bridge(Node):
             raise ValueError(f"joint_states has no '{missing[0]}'; it has {', '.join(message.name)}")
         q = [message.position[place[joint]] for joint in self.joints]
         v = [message.velocity[place[joint]] for joint in self.joints]
-        time = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        turn, action = self.plant.exchange(q, v, [*q, *v], patience=0.6 * self.dt, time=time)
+        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        turn, action = self.plant.exchange(q, v, [*q, *v], patience=0.6 * self.dt, time=stamp)
         self.turns[turn] += 1
-        if turn != "brake":
-            self.command = [float(x) for x in action]
-        elif self.command is None:  # nobody has led it yet
-            self.command = list(q)
-        self.sender.publish(Float64MultiArray(data=self.command))
+        if self.command is None:  # nobody has led it yet
+            self.command = np.array(q)
+        self.send(self.command if turn == "brake" else action)
+
+    def send(self, goal: np.ndarray) -> None:
+        """The goal, or what of the way there the speed limits allow since the command before."""
+        now = time.monotonic()
+        reach = self.speed * min(self.dt, now - self.sent)
+        self.command, self.sent = np.clip(goal, self.command - reach, self.command + reach), now
+        self.sender.publish(Float64MultiArray(data=self.command.tolist()))
 
     def destroy_node(self) -> None:
         self.plant.close()
@@ -59,7 +77,7 @@ def main(name: str, snapshot: str) -> None:
     controller = nearl.Controller.load(snapshot)
     joints = [entry[2:] for entry in controller.obs_names if entry.startswith("q.")]
     rclpy.init()
-    bridge = Bridge(name, joints, controller.dt)
+    bridge = Bridge(name, joints, controller.dt, controller.limits["velocity"])
     try:
         rclpy.spin(bridge)
     except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):

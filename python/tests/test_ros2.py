@@ -38,7 +38,7 @@ kind = "pinocchio"
 
 
 class Robot(threading.Thread):
-    """Publishes its joints in an order of its own and reaches what is commanded within a period."""
+    """Publishes its joints in an order of its own and reaches what is commanded within a period. Every ninth message is late and comes with the next."""
 
     def __init__(self, node):
         super().__init__(daemon=True)
@@ -59,6 +59,8 @@ class Robot(threading.Thread):
             self.q, self.v = goal, (goal - self.q) / DT
             message = JointState(name=["joint2", "joint0", "joint1"], position=self.q[[2, 0, 1]].tolist(), velocity=self.v[[2, 0, 1]].tolist())
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(round(k * DT * 1e9), 10**9)
+            if k % 9 == 8:
+                time.sleep(0.9 * DT)  # on its way
             self.sender.publish(message)
             time.sleep(max(0.0, begin + (k + 1) * DT - time.monotonic()))
 
@@ -74,7 +76,9 @@ def test_a_robot_of_ros_obeys_and_rests_when_the_loop_goes(tmp_path):
     name = f"ros{os.getpid()}"
     rclpy.init(domain_id=os.getpid() % 100)
     node = rclpy.create_node("robot")
-    robot, bridge, executor = Robot(node), example.Bridge(name, ["joint0", "joint1", "joint2"], DT), SingleThreadedExecutor()
+    robot, bridge, executor = Robot(node), example.Bridge(name, ["joint0", "joint1", "joint2"], DT, SPEED), SingleThreadedExecutor()
+    sent, publish = [], bridge.sender.publish
+    bridge.sender.publish = lambda message: (sent.append((bridge.sent, *message.data)), publish(message))  # with the time on which it was computed
     executor.add_node(node)
     executor.add_node(bridge)
     spinning = threading.Thread(target=executor.spin, daemon=True)
@@ -101,4 +105,8 @@ def test_a_robot_of_ros_obeys_and_rests_when_the_loop_goes(tmp_path):
     q = np.array(robot.commands)
     assert bridge.turns["act"] > 200, bridge.turns
     assert (q >= LOW - 1e-6).all() and (q <= HIGH + 1e-6).all() and np.ptp(q, axis=0).min() > 1.0, "within the limits, and it moves"
+    times, sent = np.array(sent)[:, 0], np.array(sent)[:, 1:]
+    allowed = SPEED * np.minimum(DT, np.diff(times))[:, None]
+    assert (np.abs(np.diff(sent, axis=0)) <= allowed + 1e-9).all(), "no faster than the speed limits, however late messages are"
+    assert (np.diff(times) < 0.5 * DT).any(), "and some came in bunches"
     assert len(rest) > 10 and np.ptp(rest, axis=0).max() == 0.0, "without a loop it holds one position"
