@@ -161,6 +161,23 @@ def test_lerobot(tmp_path: Path) -> None:
         demos.from_lerobot("Hopper-v5", tmp_path, tmp_path / "b.npz", key="state")
 
 
+def test_lerobot_as_lerobot_writes_it(tmp_path: Path) -> None:
+    """Two episodes that LeRobot itself recorded and closed."""
+    datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot is not installed (it brings torch)")
+    parts = [episode(12, 0), episode(9, 1)]
+    joints = [name for name in parts[0] if name.startswith("q.")]
+    feature = {"dtype": "float32", "shape": (len(joints),), "names": [f"{name[2:]}.pos" for name in joints]}
+    recorded = datasets.LeRobotDataset.create("nearl/hopper", fps=125, features={"observation.state": feature}, root=tmp_path / "set", use_videos=False)
+    for columns in parts:
+        for row in np.stack([columns[name] for name in joints], 1).astype(np.float32):
+            recorded.add_frame({"observation.state": row, "task": "hop"})
+        recorded.save_episode()
+    recorded.finalize()
+    data = checked(demos.from_lerobot("Hopper-v5", tmp_path / "set", tmp_path / "a.npz"))
+    assert data["lengths"].tolist() == [11, 8] and float(data["dt"]) == 0.008
+    assert np.array_equal(data["qpos"][12:, 5].astype(np.float32), parts[1]["q.foot_joint"].astype(np.float32))
+
+
 def test_an_agent_learns_from_them(tmp_path: Path) -> None:
     file = demos.from_columns("Hopper-v5", [episode(), episode(20, 1)], tmp_path / "a.npz", dt=0.008)
     small = {"train.n_envs": 2, "train.n_steps": 64, "train.ppo.n_epochs": 1, "train.demos.warmup": 128, "train.demos.epochs": 2}

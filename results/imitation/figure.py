@@ -2,7 +2,7 @@
 
     .venv/bin/python results/imitation/figure.py RUNS FOLDER --experts EXPERTS [--variants]
 
-RUNS has `<task>/<algo>_<seed>`, or with --variants `<variant>/<task>/<algo>_<seed>`. Returns are without noise and from ordinary resets. Tasks that
+RUNS has `<task>/<algo>_<seed>`, or with --variants `<variant>/<task>/<algo>_<seed>`. Returns are without noise and from ordinary resets. Seeds that
 RUNS does not have stay what they are in the data of FOLDER.
 """
 
@@ -24,9 +24,11 @@ RETURN, R2, UPDATED = "eval/ep_rew_mean", "idm/r2_before", "idm/updated"
 
 
 def read(runs: Path, variants: bool) -> dict[tuple[str, str], dict[int, dict[str, np.ndarray]]]:
-    """Columns of each run, by task and name, then by seed."""
+    """Columns of each finished run, by task and name, then by seed."""
     found: dict = defaultdict(dict)
     for file in sorted(runs.glob(f"{'*/' if variants else ''}*/*_*/metrics.csv")):
+        if not (file.parent / "checkpoints" / "final.safetensors").is_file():
+            continue
         name, seed = file.parent.name.rsplit("_", 1)
         if variants:
             name = file.parents[2].name
@@ -51,14 +53,22 @@ def mean(columns: list[np.ndarray]) -> float:
     return float(values.mean()) if len(values) else float("nan")
 
 
-def kept(folder: Path, tasks: set[str]) -> tuple[list[dict], list[str]]:
-    """Rows of the curves and lines of the table that are there already, of other tasks than these."""
+def kept(folder: Path, found: set[tuple[str, str, str]]) -> tuple[list[dict], dict[tuple[str, str], list[str]]]:
+    """Rows of the curves that are there already, of other tasks, names and seeds than `found`, and the cells of the table by task and name."""
     if not (folder / "curves.csv").is_file():
-        return [], []
+        return [], {}
     with open(folder / "curves.csv", newline="") as text:
-        rows = [row for row in csv.DictReader(text) if row["task"] not in tasks]
-    lines = (folder / "table.md").read_text().splitlines()[2:]
-    return rows, [line for line in lines if line.split("|")[1].strip() not in tasks]
+        rows = [row for row in csv.DictReader(text) if (row["task"], row["name"], row["seed"]) not in found]
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in (folder / "table.md").read_text().splitlines()[2:]]
+    return rows, {(cells[0], cells[1]): cells[2:] for cells in lines}
+
+
+def together(new: list[float], n_kept: int, cells: list[str], place: int) -> float:
+    """Mean of a column over the seeds that were measured now and those that were before, of which the table has the mean; all have equally many rows."""
+    before = float(cells[place]) if n_kept else 0.0
+    if n_kept and int(cells[0]) != n_kept:
+        raise SystemExit(f"{n_kept} of the {cells[0]} seeds in the table would stay, and it has their mean alone: measure all of them again, or none")
+    return (sum(new) + n_kept * before) / (len(new) + n_kept)
 
 
 def draw(rows: list[dict], expert: dict[str, float], file: Path) -> None:
@@ -94,16 +104,22 @@ def main() -> None:
     args = parser.parse_args()
     found = read(args.runs, args.variants)
     expert = {file.stem: float(np.mean(json.loads(file.read_text())["returns"])) for file in args.experts.glob("*.json")}
-    rows, lines = kept(args.folder, {task for task, _ in found})
-    for (task, name), seeds in sorted(found.items()):
-        curves = {seed: curve(c) for seed, c in seeds.items()}
-        n = min(len(steps) for steps, _ in curves.values())
-        if n == 0:
-            continue
-        for seed, (xs, ys) in curves.items():
+    rows, table = kept(args.folder, {(task, name, str(seed)) for (task, name), seeds in found.items() for seed in seeds})
+    lines = []
+    for (task, name), seeds in found.items():
+        for seed, (xs, ys) in ((seed, curve(columns)) for seed, columns in seeds.items()):
             rows += [{"task": task, "name": name, "seed": seed, "steps": int(x), "return": f"{y:.5g}"} for x, y in zip(xs, ys)]
-        values = np.stack([y[:n] for _, y in curves.values()])
-        centre, (r2, updated) = interquartile_mean(values), (mean([c[k] for c in seeds.values()]) for k in (R2, UPDATED))
+    for task, name in sorted({(row["task"], row["name"]) for row in rows}):
+        by_seed: dict = defaultdict(list)
+        for row in rows:
+            if (row["task"], row["name"]) == (task, name):
+                by_seed[row["seed"]].append(float(row["return"]))
+        n = min(len(returns) for returns in by_seed.values())
+        values = np.stack([returns[:n] for returns in by_seed.values()])
+        new = list(found.get((task, name), {}).values())
+        n_kept, cells = len(values) - len(new), table.get((task, name), [])
+        r2, updated = (together([mean([columns[k]]) for columns in new], n_kept, cells, place) for k, place in ((R2, 5), (UPDATED, 6)))
+        centre = interquartile_mean(values)
         speed, half, end = interquartile_mean(values.mean(axis=1)), centre[(n - 1) // 2], centre[-1]
         share = end / expert[task]
         lines.append(f"| {task} | {name} | {len(values)} | {speed:.0f} | {half:.0f} | {end:.0f} | {share:.2f} | {r2:.2f} | {updated:.2f} |")
