@@ -2,6 +2,7 @@
 
 import os
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,7 +41,7 @@ class Renderer:
 
                 gl_context.GLContext = GLContext
             self._mujoco = mujoco
-            self._model = mujoco.MjModel.from_xml_string(env.model_text)
+            self._model = _compiled(mujoco, env)
             self._model.vis.global_.offwidth, self._model.vis.global_.offheight = size
             self._data = mujoco.MjData(self._model)
             self._renderer = mujoco.Renderer(self._model, size[1], size[0])
@@ -55,7 +56,7 @@ class Renderer:
         self._data.qpos[:], self._data.qvel[:] = qpos, qvel
         self._mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._view)
-        if self._model.ngeom == 0:
+        if self._model.ngeom < self._model.nbody // 2:
             self._skeleton(self._renderer.scene)
         return self._renderer.render().copy()
 
@@ -75,7 +76,7 @@ class Renderer:
         return view
 
     def _skeleton(self, scene: Any) -> None:
-        """A robot file without shapes (a URDF stripped of its meshes) is drawn as capsules between its bodies."""
+        """A robot file with hardly a shape (a URDF stripped of its meshes) is drawn as capsules between its bodies."""
         capsule = self._mujoco.mjtGeom.mjGEOM_CAPSULE
         for body in range(2, self._model.nbody):
             ends = self._data.xpos[self._model.body_parentid[body]], self._data.xpos[body]
@@ -85,3 +86,21 @@ class Renderer:
                 self._mujoco.mjv_initGeom(geom, capsule, np.zeros(3), np.zeros(3), np.zeros(9), colour)
                 self._mujoco.mjv_connector(geom, capsule, 0.03, *ends)
                 scene.ngeom += 1
+
+
+def _compiled(mujoco: Any, env: _core.Env) -> Any:
+    """MuJoCo's model of the robot file; where the task lets a URDF's base float, with that joint and a floor."""
+    spec = mujoco.MjSpec.from_string(env.model_text)
+    model = spec.compile()
+    if (model.nq, model.nv) == (env.nq, env.nv):
+        return model
+    robot = ElementTree.fromstring(env.model_text)
+    children = {child.get("link") for child in robot.iter("child")}
+    root = next(link.get("name") for link in robot.iter("link") if link.get("name") not in children)
+    ElementTree.SubElement(robot, "link", name="world")
+    joint = ElementTree.SubElement(robot, "joint", name="root_joint", type="floating")
+    ElementTree.SubElement(joint, "parent", link="world")
+    ElementTree.SubElement(joint, "child", link=str(root))
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], rgba=[0.6, 0.65, 0.7, 1.0])
+    return spec.compile()

@@ -202,3 +202,19 @@ def test_demonstrations_can_be_looked_at(tmp_path: Path) -> None:
     for more, words in (((), "say of which task"), (("--task", "Ant-v5"), "the robot of 'Ant-v5' has 15 and 14")):
         failed = film(*more)
         assert failed.returncode == 1 and words in failed.stderr, failed.stderr
+
+
+def test_a_robot_whose_base_floats_is_drawn_where_it_is() -> None:
+    """A URDF says nothing of the floating base: the task does."""
+    pytest.importorskip("mujoco")
+    from nearl.render import Renderer
+
+    env = _core.Env(str(ROOT / "examples" / "tasks" / "anymal-walk.toml"))
+    env.reset(0)
+    renderer = Renderer(env, (96, 96))
+    stands, lies = env.qpos.copy(), env.qpos.copy()
+    lies[2:7] = [0.1, 0.0, 1.0, 0.0, 0.0]  # on its back
+    pictures = [renderer.frame(qpos, env.qvel).astype(float) for qpos in (stands, lies)]
+    renderer.close()
+    assert all(picture.std() > 5 for picture in pictures), "not an empty picture"
+    assert np.abs(pictures[0] - pictures[1]).mean() > 2
