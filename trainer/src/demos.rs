@@ -14,7 +14,7 @@ mod rows;
 mod settings;
 
 pub use rows::Frame;
-pub use settings::DemoSettings;
+pub use settings::{DemoReward, DemoSettings};
 
 use crate::env::Env;
 use crate::rollout::{RolloutError, Worker, make_env, stream};

@@ -18,6 +18,7 @@ mod gaussian;
 mod imitation;
 mod init;
 mod inverse;
+mod likeness;
 mod losses;
 pub mod nearl;
 mod net;

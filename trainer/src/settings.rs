@@ -227,7 +227,7 @@ mod tests {
                 value => compare("## `[train]`", key, value),
             }
         }
-        assert_eq!(keys, 66);
+        assert_eq!(keys, 67);
         for column in crate::train::COLUMNS {
             assert!(page.contains(&format!("`{column}`")), "{column}");
         }

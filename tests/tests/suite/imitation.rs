@@ -3,7 +3,9 @@
 use nearl_tests::{request, training};
 use nearl_trainer::checkpoint::Values;
 use nearl_trainer::demos::{Demonstrations, record};
-use nearl_trainer::train::{Request, TrainError, Training};
+use nearl_trainer::env::Step;
+use nearl_trainer::rollout::Judge;
+use nearl_trainer::train::{Experience, Request, TrainError, Training};
 use std::path::{Path, PathBuf};
 
 const TASK: &str = "Hopper-v5";
@@ -75,8 +77,9 @@ fn bits(training: &mut Training) -> Vec<u64> {
 fn resuming_gives_the_same_bits() {
     let folder = tempfile::tempdir().expect("folder");
     let (file, _) = demos(folder.path());
-    for algo in ["bc", "soil", "dapg", "pid2-il", "bco", "gaifo"] {
-        let request = asked(algo, &file, &[]);
+    let task = ["bc", "soil", "dapg", "pid2-il", "bco", "gaifo"].map(|algo| (algo, "task"));
+    for (algo, reward) in task.into_iter().chain([("pid2-il", "likeness")]) {
+        let request = asked(algo, &file, &[&format!("train.demos.reward='{reward}'")]);
         let mut whole = Training::new(&request).expect("training");
         (0..5).for_each(|_| drop(whole.iterate()));
         for stop in [1, 2, 4] {
@@ -85,9 +88,37 @@ fn resuming_gives_the_same_bits() {
             let checkpoint = first.checkpoint().expect("checkpoint");
             let mut second = Training::resume(checkpoint, Path::new("run"), None, 2).expect("resumed");
             (stop..5).for_each(|_| drop(second.iterate()));
-            assert!(bits(&mut whole) == bits(&mut second), "{algo}: other bits after a stop at {stop}");
+            assert!(
+                bits(&mut whole) == bits(&mut second),
+                "{algo}, {reward}: other bits after a stop at {stop}"
+            );
         }
     }
+}
+
+/// What learns without the reward of the task has the same networks whatever that is.
+#[test]
+fn without_the_reward_of_the_task_another_one_changes_nothing() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, _) = demos(folder.path());
+    let other = Judge::new(true, |obs, _, _, step| Step { reward: 3.0 - obs[0] * step.reward, ..step });
+    let learned = |request: &Request, experience: &Experience| {
+        let mut training = Training::on(request, experience).expect("training");
+        (0..5).for_each(|_| drop(training.iterate()));
+        training.snapshot().networks.clone()
+    };
+    let differs = |algo: &str, reward: &str| {
+        let request = asked(algo, &file, &[&format!("train.demos.reward='{reward}'")]);
+        learned(&request, &Experience::Here) != learned(&request, &Experience::Judged(other.clone()))
+    };
+    assert!(differs("pid2-il", "task"), "with the reward of the task another one matters");
+    assert!(!differs("pid2-il", "likeness"), "it read the reward of the task");
+    assert!(!differs("gaifo", "task"), "it has no reward but likeness");
+    let likeness = "train.demos.reward='likeness'";
+    let mut training = Training::new(&asked("pid2-il", &file, &[likeness])).expect("training");
+    let told: Vec<_> = (0..4).flat_map(|_| training.iterate().metrics).collect();
+    let rewards: Vec<f64> = told.iter().filter(|m| m.0 == "likeness/reward").map(|m| m.1).collect();
+    assert!(rewards.len() == 2 && rewards.iter().all(|r| *r > 0.0), "{rewards:?}");
 }
 
 /// Actions are read by `dapg` alone.
@@ -131,6 +162,10 @@ fn what_does_not_fit_is_refused_by_name() {
         |task: &str| request(task, "pid2-il", 1, 1, &[&format!("train.demos.file='{}'", file.display())]);
     refused(&other("HalfCheetah-v5"), &["demos.npz", "its period is 0.008 s, that of the task 0.05 s"]);
     refused(&other("Walker2d-v5"), &["demos.npz", "it has no column"]);
+    refused(
+        &asked("soil", &file, &["train.demos.reward='likeness'"]),
+        &["[train.demos.reward]: \"likeness\" is for pid2-il and gaifo, and 'soil'"],
+    );
     let mut bare = demos;
     bare.episodes.iter_mut().for_each(|e| e.actions.clear());
     bare.save(&file).expect("saved");

@@ -2,6 +2,17 @@
 
 use serde::{Deserialize, Serialize};
 
+/// What an algorithm that imitates is rewarded by.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DemoReward {
+    /// The reward of the task.
+    #[default]
+    Task,
+    /// How much a transition of states looks demonstrated, as `gaifo`; the reward of the task is not read.
+    Likeness,
+}
+
 /// `[train.demos]`, read by the algorithms that learn from demonstrations.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -10,6 +21,8 @@ pub struct DemoSettings {
     pub file: String,
     /// Episodes of the file that are used, the first ones; 0: all.
     pub episodes: usize,
+    /// What `pid2-il` is rewarded by.
+    pub reward: DemoReward,
     /// Share of the episodes that begin in a random frame of the demonstrations, for `bc`, `soil` and `pid2-il`.
     pub resets: f64,
     /// Steps of the fresh networks' own noise from which the inverse model learns before anything else; no effect for `dapg` and `gaifo`.
@@ -35,6 +48,7 @@ impl Default for DemoSettings {
         Self {
             file: String::new(),
             episodes: 0,
+            reward: DemoReward::default(),
             resets: 0.5,
             warmup: 16_384,
             epochs: 20,

@@ -4,14 +4,16 @@
 //! fill the statistics with demonstrations and a first batch
 //! warm up: the inverse model on the fresh networks' own noise
 //! pre-train: behaviour cloning                                   (Algorithm 2, lines 1 to 5)
-//! update after update, with the demonstrations normalised by the statistics of that moment
+//! update after update, with the demonstrations normalised by the statistics of that moment, and where likeness is the reward with that
 //! ```
 
 use super::batch::Batch;
 use super::gaussian::gather;
+use super::likeness::Likeness;
 use super::net::{Net, Tape};
+use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, Schedule, TILE, Tile, add_sums, optimise};
-use super::{Adam, Learner, Metrics, Pace};
+use super::{Adam, Dims, Learner, Metrics, Pace};
 use crate::demos::DemoSettings;
 use nearl_runtime::Networks;
 use nearl_runtime::multiversion;
@@ -40,6 +42,8 @@ pub trait Base: Learner {
     fn clone_demos(&mut self, demos: &Batch, settings: &DemoSettings, rng: &mut ChaCha8Rng) -> Metrics;
     /// See [`Imitator::rescale`].
     fn rescale(&mut self, from: &Normaliser, to: &Normaliser);
+    /// Everything an update changes.
+    fn params_mut(&mut self) -> &mut Params;
 }
 
 /// Demonstrations as an update finds them.
@@ -64,7 +68,7 @@ pub trait Method: Send + Sized {
     ) -> Metrics;
     /// Learns from the demonstrations alone, once.
     fn pretrain(imitating: &mut Imitating<Self>, rng: &mut ChaCha8Rng) -> Metrics {
-        let Imitating { base, settings, seen } = imitating;
+        let Imitating { base, settings, seen, .. } = imitating;
         base.clone_demos(&seen.demos, settings, rng)
     }
 }
@@ -74,18 +78,45 @@ pub struct Imitating<M: Method> {
     pub(super) base: M::Base,
     pub(super) settings: DemoSettings,
     pub(super) seen: Seen,
+    /// What gives the reward, where it is not the task's.
+    pub(super) likeness: Option<Likeness>,
 }
 
 impl<M: Method> Imitating<M> {
     /// With the networks of `base`.
     pub fn new(base: M::Base, settings: DemoSettings) -> Self {
-        Self { base, settings, seen: Seen::default() }
+        Self { base, settings, seen: Seen::default(), likeness: None }
+    }
+
+    /// With a fresh discriminator for its reward, which learns at the rate `lr` from minibatches of so many rows.
+    pub fn by_likeness(
+        mut self,
+        dims: &Dims,
+        nets: &NetSettings,
+        lr: f32,
+        minibatch: usize,
+        threads: usize,
+        rng: &mut ChaCha8Rng,
+    ) -> Self {
+        self.likeness = Some(Likeness::new(self.base.params_mut(), dims, nets, lr, minibatch, threads, rng));
+        self
+    }
+
+    /// Rewards by likeness in place of those of the task, where it is asked for.
+    fn rewarded(&mut self, batch: &mut Batch, rng: &mut ChaCha8Rng) -> Metrics {
+        let Some(likeness) = &self.likeness else { return Metrics::new() };
+        let metrics = likeness.reward(self.base.params_mut(), batch, &self.seen.demos, rng);
+        batch.estimate(|x| self.base.values(x));
+        metrics
     }
 }
 
 impl<M: Method> Learner for Imitating<M> {
     fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
-        M::update(self, batch, pace, rng)
+        let told = self.rewarded(batch, rng);
+        let mut metrics = M::update(self, batch, pace, rng);
+        metrics.extend(told);
+        metrics
     }
     fn networks(&self, normaliser: &Normaliser) -> Networks {
         self.base.networks(normaliser)
@@ -94,7 +125,11 @@ impl<M: Method> Learner for Imitating<M> {
         self.base.params()
     }
     fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String> {
-        self.base.restore(f)
+        self.base.restore(f)?;
+        if let Some(likeness) = &self.likeness {
+            likeness.refresh(self.base.params_mut());
+        }
+        Ok(())
     }
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
         self.base.values(x)

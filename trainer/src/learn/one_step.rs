@@ -317,7 +317,8 @@ fn gaifo_comes_close_without_the_reward() {
     let mut rng = crate::rollout::stream(4, 0);
     let settings = PpoSettings { lr: 1e-3, log_std: -0.5, ..PpoSettings::default() };
     let ppo = Ppo::new(dims.clone(), &n, settings, 1, &mut rng);
-    let mut gaifo = Gaifo::new(ppo, &dims, &n, 1e-3, &mut rng);
+    let gaifo = Imitating::<Gaifo>::new(ppo, DemoSettings::default());
+    let mut gaifo = gaifo.by_likeness(&dims, &n, 1e-3, 64, 1, &mut rng);
     let normaliser = Normaliser::identity(2, 2);
     let actor =
         |l: &dyn Learner| Actor { kind: None, activation: n.activation, nets: l.networks(&normaliser) };

@@ -87,8 +87,8 @@ impl PpoSettings {
 /// Policy, value and inverse model, each in a parameter group of its own.
 pub struct Ppo {
     nets: Nets,
-    pub(super) params: Params,
-    pub(super) threads: usize,
+    params: Params,
+    threads: usize,
 }
 
 struct Nets {
@@ -195,11 +195,6 @@ impl Learner for Ppo {
 }
 
 impl Ppo {
-    /// Rows of a minibatch.
-    pub(super) fn minibatch(&self) -> usize {
-        self.nets.settings.batch_size
-    }
-
     /// An update of policy and value alone.
     pub(super) fn update_policy(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
         self.passes(batch, pace, rng, &[ACTOR, VALUE])

@@ -48,6 +48,9 @@ pub const COLUMNS: &[&str] = &[
     "demos/cloning_mse",
     "demos/weight",
     "demos/loss",
+    "likeness/loss",
+    "likeness/accuracy",
+    "likeness/reward",
 ];
 
 impl Training {

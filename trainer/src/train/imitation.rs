@@ -1,7 +1,7 @@
 //! Demonstrations in a training: read and checked before it begins, then handed to the learner, normalised by the present statistics.
 
 use super::{Source, TrainError};
-use crate::demos::{DemoError, DemoSettings, Demonstrations};
+use crate::demos::{DemoError, DemoReward, DemoSettings, Demonstrations};
 use crate::learn::{Algorithm, Batch};
 use crate::rollout::RolloutError;
 use crate::settings::TrainSettings;
@@ -56,6 +56,11 @@ impl Imitation {
                 )));
             }
             (true, false) => {}
+        }
+        if own.reward == DemoReward::Likeness && !matches!(algo, Algorithm::Pid2Il | Algorithm::Gaifo) {
+            return Err(TrainError::Settings(format!(
+                "[train.demos.reward]: \"likeness\" is for pid2-il and gaifo, and '{algo}' has no use for it; leave it out, or take one of these"
+            )));
         }
         let wrong = |reason| TrainError::Demos(DemoError { file: own.file.clone(), reason });
         let demos = Demonstrations::load(Path::new(&own.file))?.first(own.episodes);

@@ -1,6 +1,7 @@
 //! From a manifest and its settings to what is trained.
 
 use super::{Experience, TrainError};
+use crate::demos::DemoReward;
 use crate::env::{Env, Spec};
 use crate::learn::{
     Algorithm, Bc, Bco, Dapg, Dims, Gaifo, Gradient, Imitating, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2,
@@ -38,6 +39,7 @@ pub(super) fn learner(
     };
     let direct = |rng: &mut ChaCha8Rng| Ppo::new(dims.clone(), nets, ppo.clone(), threads, rng);
     let demos = settings.demos.clone();
+    let (rows, likeness_lr) = (ppo.batch_size, settings.pid2.discriminator_lr);
     match algo {
         Algorithm::Ppo => Box::new(direct(rng)),
         Algorithm::PpoCombined => nearl(settings.nearl.without_supervision(), rng),
@@ -47,10 +49,18 @@ pub(super) fn learner(
         Algorithm::Bc => Box::new(Imitating::<Bc>::new(pid2(true, rng), demos)),
         Algorithm::Soil => Box::new(Imitating::<Soil>::new(direct(rng), demos)),
         Algorithm::Dapg => Box::new(Imitating::<Dapg>::new(direct(rng), demos)),
-        Algorithm::Pid2Il => Box::new(Imitating::<Pid2Il>::new(pid2(true, rng), demos)),
+        Algorithm::Pid2Il => {
+            let likeness = demos.reward == DemoReward::Likeness;
+            let imitating = Imitating::<Pid2Il>::new(pid2(true, rng), demos);
+            Box::new(match likeness {
+                true => imitating.by_likeness(&dims, nets, likeness_lr, rows, threads, rng),
+                false => imitating,
+            })
+        }
         Algorithm::Bco => Box::new(Imitating::<Bco>::new(direct(rng), demos)),
         Algorithm::Gaifo => {
-            Box::new(Gaifo::new(direct(rng), &dims, nets, settings.pid2.discriminator_lr, rng))
+            let imitating = Imitating::<Gaifo>::new(direct(rng), demos);
+            Box::new(imitating.by_likeness(&dims, nets, likeness_lr, rows, threads, rng))
         }
     }
 }

@@ -6,7 +6,7 @@
 
 use super::super::imitation::{Base, CLONED, Cloning, Wanted};
 use super::super::inverse::CLIP;
-use super::super::optimise::{Group, Schedule, Tile, optimise};
+use super::super::optimise::{Group, Params, Schedule, Tile, optimise};
 use super::super::{Batch, Metrics};
 use super::{ACTOR, COMBINED, CRITIC, DISCRIMINATOR, INVERSE, Nets, Phases, Pid2, VALUE};
 use crate::demos::DemoSettings;
@@ -73,6 +73,10 @@ impl Base for Pid2 {
         let after = self.nets.combined.idm_error(self.actor(), batch, threads);
         let actions = super::super::variance(&batch.action, self.nets.combined.dims.n_act);
         super::super::idm_metrics(before, after, true, actions)
+    }
+
+    fn params_mut(&mut self) -> &mut Params {
+        &mut self.params
     }
 
     /// All but the discriminator, which learns anew in each update.

@@ -74,6 +74,10 @@ impl Base for Ppo {
         vec![(CLONED, cloning.run(&mut self.params.groups[ACTOR], demos, s, self.threads, rng))]
     }
 
+    fn params_mut(&mut self) -> &mut Params {
+        &mut self.params
+    }
+
     fn rescale(&mut self, from: &Normaliser, to: &Normaliser) {
         let (n, groups) = (&self.nets, &mut self.params.groups);
         let obs = Inputs::observation(from, to);
