@@ -24,6 +24,9 @@ nav:
   - Commands: docs/COMMANDS.md
   - Tasks: docs/TASKS.md
   - Train for your own robot: docs/OWN_ROBOT.md
+  - Guard your policy: docs/GUARD.md
+  - Write a limit: docs/OWN_LIMIT.md
+  - Examples: examples/README.md
   - Limits: docs/LIMITS.md
   - Training: docs/TRAINING.md
   - Demonstrations: docs/DEMONSTRATIONS.md

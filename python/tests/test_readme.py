@@ -61,14 +61,46 @@ def test_notebooks(notebook, tmp_path):
 EXAMPLES = sorted((ROOT / "examples" / "python").glob("*.py"))
 
 
+NEEDED = {"sb3_vec_env": "stable_baselines3", "wandb_callback": "wandb"}
+# What each prints where it does what it says.
+SAID = {
+    "project_state": "clamped", "wrap_env": "0 targets", "train": "the pole stood for", "imitate": "the pole stood for 500 periods of 500",
+    "wrong_prior": "0.1 kg, not told, margin 0.05 rad/s: of 4000 ticks 0 targets and 0 reached", "own_limit": "= 1.0000 rad, allowed 1",
+    "import_policy": "allowed 2", "control_loop": "torque of joint 2", "server_client": "1000 steps", "flight_log": "bit for bit the same",
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_python_examples(example, tmp_path):
     assert len(example.read_text().splitlines()) < 60
-    arguments = {"record_video": [str(tmp_path)], "sb3_vec_env": ["4096"], "wandb_callback": [str(tmp_path)]}.get(example.stem, [])
-    needed = {"sb3_vec_env": "stable_baselines3", "wandb_callback": "wandb"}.get(example.stem)
+    folder = str(tmp_path)
+    arguments = {
+        "record_video": [folder], "sb3_vec_env": ["4096"], "wandb_callback": [folder], "imitate": [folder], "import_policy": [folder],
+        "flight_log": [f"{folder}/arm.mcap"],
+    }.get(example.stem, [])  # fmt: skip
+    needed = NEEDED.get(example.stem)
     if needed is not None:
         pytest.importorskip(needed, reason=f"{example.name} needs {needed}: pip install {needed}")
     run = subprocess.run([sys.executable, example, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0 and run.stdout, run.stderr
+    assert SAID.get(example.stem, "") in run.stdout, run.stdout
     if example.stem == "record_video":
         assert [file.suffix for file in tmp_path.iterdir()].count(".mp4") == 1
+
+
+def test_the_same_ten_examples_are_there_in_both_languages():
+    """By name, in the index, and run by the tests of both."""
+    index = (ROOT / "examples" / "README.md").read_text()
+    rust_tests = (ROOT / "tests" / "tests" / "programs" / "examples.rs").read_text()
+    assert len(SAID) == 10
+    for name in SAID:
+        assert f"(python/{name}.py)" in index and f"{name}.rs)" in index, name
+        assert (ROOT / "examples" / "python" / f"{name}.py").is_file() and (ROOT / "examples" / "rust" / f"{name}.rs").is_file(), name
+        assert f'run("{name}"' in rust_tests, name
+
+
+@pytest.mark.parametrize("block", blocks("rust"))
+def test_rust_of_a_page_is_of_a_program_that_the_tests_run(block):
+    """README's is the control loop with the robot's own calls."""
+    programs = [*(ROOT / "examples" / "rust").glob("*.rs"), *(ROOT / "runtime").rglob("examples/*.rs")]
+    assert "robot.measure" in block or any(block in program.read_text() for program in programs)

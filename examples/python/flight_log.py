@@ -1,0 +1,29 @@
+"""A plant and a loop for half a second, with a flight log, and what the log says: Foxglove opens the same file."""
+
+import json
+import os
+import subprocess
+import sys
+from collections import Counter
+
+from mcap.reader import make_reader
+
+file = sys.argv[1] if len(sys.argv) > 1 else "runs/arm.mcap"
+nearl = [sys.executable, "-m", "nearl"]
+name = f"example{os.getpid()}"
+plant = subprocess.Popen([*nearl, "plant", "Panda-reach", "--name", name, "--lockstep", "--seconds", "5"], stdout=subprocess.DEVNULL)
+try:
+    run = ["run", "examples/snapshots/panda-reach.safetensors", "--plant", name, "--seconds", "0.5", "--log", file]
+    subprocess.run([*nearl, *run], check=True)
+finally:
+    plant.terminate()
+    plant.wait()
+
+with open(file, "rb") as log:
+    reader = make_reader(log)
+    facts = {key: value for record in reader.iter_metadata() for key, value in record.metadata.items()}
+    ticks = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=["tick"])]
+statuses = json.loads(facts["statuses"])
+print(len(ticks), "ticks:", dict(Counter(statuses[str(tick["ledger"]["status"])] for tick in ticks if tick["action"])))
+assert not any(tick["ledger"]["target_violations"] for tick in ticks if tick["action"])
+subprocess.run([*nearl, "replay", file], check=True)  # every one computed again, bit for bit

@@ -1,0 +1,1 @@
+../../runtime/examples/control_loop.rs
