@@ -61,7 +61,7 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float64], dict[str, Any]]:
-        """Begins an episode; ``seed`` restarts the random stream."""
+        """Begins an episode; ``seed`` restarts the random stream. Returns the observation (n_obs) and info."""
         if options:
             raise ValueError(f"reset options {sorted(options)} are not known; this environment takes none")
         super().reset(seed=seed)
@@ -71,7 +71,7 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         return self._native.reset([seed])[0], {}
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
-        """One policy period."""
+        """One policy period under ``action`` (n_act): observation (n_obs), reward, terminated, truncated, info."""
         obs, rewards, terminated, truncated, infos = self._native.step(np.asarray(action, float)[None])
         info = {key: values[0] for key, values in infos.items() if not key.startswith("_")}
         return obs[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info

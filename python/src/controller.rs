@@ -91,7 +91,8 @@ impl Controller {
         })
     }
 
-    /// One control tick without noise: the action (n_act) and the ledger. `q` and `v` in Pinocchio's convention. With NaN or infinity in
+    /// One control tick without noise: the action (n_act) [N m or N, or what `[command]` says] and the ledger. `q` (nq) [rad or m] and `v` (nv)
+    /// [rad/s or m/s] in Pinocchio's convention, `obs` (n_obs). With NaN or infinity in
     /// them the ledger says "refused", and the action is the one that the last finite state asked for: right for a tick or two, so
     /// brake if it lasts.
     fn update<'py>(

@@ -71,7 +71,7 @@ impl Env {
         Ok(Env::around(env))
     }
 
-    /// Starts an episode from the task's own distribution; `seed` restarts the random stream. Returns the observation.
+    /// Starts an episode from the task's own distribution; `seed` restarts the random stream. Returns the observation (n_obs).
     #[pyo3(signature = (seed=None))]
     fn reset<'py>(&self, py: Python<'py>, seed: Option<u64>) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let obs = self.with(py, |inner| {
@@ -83,7 +83,7 @@ impl Env {
         Ok(array(py, &obs.map_err(errors::value)?))
     }
 
-    /// Starts an episode from `qpos` (nq) and `qvel` (nv), MuJoCo's convention. Returns the observation.
+    /// Starts an episode from `qpos` (nq) and `qvel` (nv), MuJoCo's convention. Returns the observation (n_obs).
     fn set_state<'py>(
         &self,
         py: Python<'py>,
@@ -95,7 +95,7 @@ impl Env {
         Ok(array(py, &obs.map_err(errors::value)?))
     }
 
-    /// Simulates one control period. Returns observation, reward, cost, terminated, and the fault's name if the physics failed.
+    /// Simulates one control period under `action` (n_act). Returns observation (n_obs), reward, cost, terminated, and the fault's name if the physics failed.
     fn step<'py>(&self, py: Python<'py>, action: &Bound<'py, PyAny>) -> PyResult<Stepped<'py>> {
         let action = vector("action", action, self.spec.n_act())?;
         if let Some(i) = action.iter().position(|a| !a.is_finite()) {
@@ -121,6 +121,22 @@ impl Env {
         (array(py, &q), array(py, &v))
     }
 
+    /// Forces of the motors (nv) [N m or N] under `action` (n_act) in a state `q` (nq), `v` (nv) of Pinocchio's convention; the
+    /// environment stays as it is.
+    fn motor_forces<'py>(
+        &self,
+        py: Python<'py>,
+        q: &Bound<'py, PyAny>,
+        v: &Bound<'py, PyAny>,
+        action: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let (q, v) = (vector("q", q, self.spec.nq)?, vector("v", v, self.spec.nv)?);
+        let action = vector("action", action, self.spec.n_act())?;
+        let mut force = vec![0.0; self.spec.nv];
+        self.with(py, |inner| inner.env.motor_forces(&q, &v, &action, &mut force)).map_err(errors::value)?;
+        Ok(array(py, &force))
+    }
+
     /// Configuration (nq), MuJoCo's convention.
     #[getter]
     fn qpos<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
@@ -133,7 +149,7 @@ impl Env {
         array(py, &self.with(py, |inner| inner.env.qvel().to_vec()))
     }
 
-    /// What the task asks for; empty where it has no goal.
+    /// What the task asks for (n_goal); empty where it has no goal.
     #[getter]
     fn goal<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         array(py, &self.with(py, |inner| inner.env.goal().to_vec()))

@@ -102,8 +102,8 @@ type Numbers<'py> = (u64, u64, u64, u64, Bound<'py, PyArray2<f64>>, Vec<(&'stati
 
 #[pymethods]
 impl Rollouts {
-    /// The next chunk: its number, its first step, the versions of policy and constraints, the rows, and the names and widths
-    /// of their columns. None at the end.
+    /// The next chunk: its number, its first step, the versions of policy and constraints, the rows (rows x
+    /// columns), and the names and widths of their columns. None at the end.
     fn next<'py>(&self, py: Python<'py>, patience: f64) -> PyResult<Option<Numbers<'py>>> {
         let (start, patience) = (Instant::now(), seconds(patience)?);
         loop {

@@ -200,7 +200,7 @@ impl Model {
         Ok(self.tangent(v.py(), |d, out| d.nle(&q, &v_, out)))
     }
 
-    /// Inverse dynamics `tau = M a + nle` (nv), without springs and dampers; `motors` has them.
+    /// Inverse dynamics `tau = M a + nle` (nv) [N m or N] of q (nq) [rad or m], v (nv) [rad/s or m/s], a (nv) [rad/s² or m/s²], without springs and dampers; `motors` has them.
     fn rnea<'py>(
         &self,
         q: &Bound<'py, PyAny>,
@@ -211,7 +211,7 @@ impl Model {
         Ok(self.tangent(v.py(), |d, out| d.rnea(&q, &v_, &a, out)))
     }
 
-    /// Forward dynamics `a = M^-1 (tau - nle)` (nv).
+    /// Forward dynamics `a = M^-1 (tau - nle)` (nv) [rad/s² or m/s²] of q (nq) [rad or m], v (nv) [rad/s or m/s], tau (nv) [N m or N].
     fn aba<'py>(
         &self,
         q: &Bound<'py, PyAny>,

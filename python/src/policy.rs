@@ -34,7 +34,8 @@ impl Policy {
         Ok(Policy::of(network))
     }
 
-    /// Layers as arrays, first to last; `clip` holds the lowest and highest network input, `output_clip` the lowest and highest output.
+    /// Layers as arrays, first to last: weight (n_out x n_in), bias (n_out) and the function that follows. `mean` and `std` (n_in) are those of
+    /// the observation; `clip` holds the lowest and highest network input, `output_clip` the lowest and highest output.
     #[staticmethod]
     fn from_layers<'py>(
         layers: Vec<LayerIn<'py>>,

@@ -162,7 +162,8 @@ impl Projector {
         Target::of(py, target, &self.names)
     }
 
-    /// The same for n rows at once, on `threads` threads (all cores by default). The order of rows does not matter: each begins with no
+    /// The same for n rows at once, q and q_proposal (n x nq) [rad or m], v and v_proposal (n x nv) [rad/s or m/s], on `threads` threads (all
+    /// cores by default). The order of rows does not matter: each begins with no
     /// stored brake. Limits on jerk and on the rate of torque are refused: they need the tick before, which a batch does not have.
     #[pyo3(signature = (q, v, q_proposal, v_proposal, threads=None))]
     fn project_batch(
@@ -185,8 +186,9 @@ impl Projector {
     }
 
     /// The problem of such a projection, for other solvers: `H, c, G, h, A, b` of `min 1/2 x'H x + c'x` s.t. `G x <= h` and
-    /// `A x = b`, with x the changes `v' - v` of the controllable dofs, then a slack for each soft row. Cones are not in it. Limits on jerk
-    /// and on the rate of torque are refused as in a batch.
+    /// `A x = b`, with x the changes `v' - v` of the controllable dofs, then a slack for each soft row: of n entries, m inequalities and e
+    /// equalities, H (n x n), c (n), G (m x n), h (m), A (e x n), b (e). Cones are not in it. Limits on jerk and on the rate of torque are
+    /// refused as in a batch.
     fn problem<'py>(
         &self,
         q: &Bound<'py, PyAny>,

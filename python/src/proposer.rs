@@ -45,7 +45,7 @@ impl ProposerClient {
         Ok((asked.is_action, asked.entries, asked.dt, asked.policy_every, asked.age_limit, asked.hold))
     }
 
-    /// The newest state that was not read before: q, v, obs, time [s], tick, episode; waits up to `patience` [s] for one.
+    /// The newest state that was not read before: q (nq), v (nv), obs (n_obs), time [s], tick, episode; waits up to `patience` [s] for one.
     fn state<'py>(&self, py: Python<'py>, patience: f64) -> PyResult<Option<Seen<'py>>> {
         let (start, patience) = (Instant::now(), seconds(patience)?);
         loop {
@@ -63,7 +63,7 @@ impl ProposerClient {
         }
     }
 
-    /// Proposes, as an answer to the state read last.
+    /// Proposes `values` (n_entries), as an answer to the state read last.
     fn propose(&self, values: &Bound<'_, PyAny>) -> PyResult<()> {
         let values = vector("values", values, self.n)?;
         self.with(|link| link.propose(&values)).map(|_| ())

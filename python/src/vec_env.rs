@@ -78,7 +78,8 @@ impl VecEnv {
         self.observations(py)
     }
 
-    /// One step everywhere: observations, rewards, terminations, truncations and `info`.
+    /// One step everywhere under `actions` (num_envs x n_act): observations (num_envs x n_obs), rewards, terminations and truncations
+    /// (num_envs) and `info`.
     fn step<'py>(&self, py: Python<'py>, actions: &Bound<'py, PyAny>) -> PyResult<Stepped<'py>> {
         let (n, width) = self.of(|vector| (vector.n(), vector.action_names().len()));
         let actions = matrix("actions", actions, n, width)?;
@@ -129,13 +130,13 @@ impl VecEnv {
         self.of(|vector| vector.action_names().to_vec())
     }
 
-    /// Smallest action.
+    /// Smallest action (n_act).
     #[getter]
     fn action_low<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.of(|vector| array(py, vector.action_range().0))
     }
 
-    /// Largest action.
+    /// Largest action (n_act).
     #[getter]
     fn action_high<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.of(|vector| array(py, vector.action_range().1))

@@ -39,6 +39,7 @@ def arm(n_rows: int = 2) -> view.Robot:
 def picture(**given) -> view.Picture:
     q, v = np.array([0.5, 1.0]), np.array([-1.0, 0.0])
     quiet = view.Picture("active", "none", 8, 3, 1, 50, q, v, (q, v), (q, v + [0.005, 0.0]), 0.001, [], LEDGER, 7, 0, 70, 0, np.array([2e-4, 4e-4]), 0)
+    quiet = replace(quiet, force=np.array([-2.0, 1.0]))
     return replace(quiet, **given)
 
 
@@ -49,10 +50,11 @@ def cells(words: str, name: str) -> list[str]:
 
 def test_a_bar_stands_where_the_joint_is_within_its_limits() -> None:
     words = view.Panel(arm()).html(picture(), {})
-    position, speed, acceleration = cells(words, "elbow")
+    position, speed, acceleration, force = cells(words, "elbow")
     assert "left:75.0%" in position and "0.50" in position, "0.5 from -1 to 1"
     assert "left:25.0%" in speed and "-1.00" in speed, "-1 of 2"
     assert "left:75.0%" in acceleration and "</div>5.0" in acceleration, "0.005 in a millisecond, of 10"
+    assert "left:30.0%" in force and "</div>-2.0" in force, "-2 of 5"
     assert all('class="bar' not in cell for cell in cells(words, "wrist")), "no limit, no bar"
     assert "bar lit" not in words and "ACTIVE" in words and "70 by proposals, 0 by targets" in words
 
@@ -61,7 +63,36 @@ def test_a_bar_stands_where_the_joint_is_within_its_limits() -> None:
 def test_the_bar_of_an_active_row_is_lit_with_its_multiplier(kind: str, place: int) -> None:
     words = view.Panel(arm()).html(picture(held=[view.Held(0, "elbow", kind, "upper", 1.25, 4)]), {})
     lit = ["bar lit" in cell for cell in cells(words, "elbow")]
-    assert lit == [i == place for i in range(3)] and "↑1.2" in cells(words, "elbow")[place]
+    assert lit == [i == place for i in range(4)] and "↑1.2" in cells(words, "elbow")[place]
+
+
+@pytest.mark.parametrize("kind", ["torque", "torque_rate", "torque_speed"])
+def test_a_row_of_a_motor_lights_the_bar_of_its_force(kind: str) -> None:
+    robot = arm(0)
+    robot.rows = labels([*robot.joints, *robot.joints], [None, None, kind, kind])
+    words = view.Panel(robot).html(picture(held=[view.Held(3, robot.rows[3], kind, "lower", 0.5, 1)]), {})
+    assert ["bar lit" in cell for cell in cells(words, "elbow")] == [False] * 4
+    assert "↓0.5" in cells(words, "wrist")[3], "it has no limit, hence no bar"
+    words = view.Panel(robot).html(picture(held=[view.Held(2, robot.rows[2], kind, "lower", 0.5, 1)]), {})
+    assert ["bar lit" in cell for cell in cells(words, "elbow")] == [False, False, False, True]
+
+
+def test_forces_of_motors_are_gear_times_action_or_those_of_drives(rng: np.random.Generator) -> None:
+    """Gears and gains as the robot's and the task's file say them."""
+    cheetah = _core.Env("HalfCheetah-v5")
+    before = cheetah.qpos.copy()
+    action = rng.uniform(-2, 2, 6)
+    force = cheetah.motor_forces(rng.uniform(-0.1, 0.1, 9), np.zeros(9), action)
+    np.testing.assert_allclose(force, [0, 0, 0, *(np.array([120, 90, 60, 120, 60, 30]) * np.clip(action, -1, 1))])
+    assert (cheetah.qpos == before).all(), "beside the environment"
+    panda, torque = _core.Env("Panda-reach"), rng.uniform(-30, 30, 7)
+    effort = nearl.Model.from_urdf(ROOT / "examples/robots/panda/panda.urdf").effort_limit
+    np.testing.assert_allclose(panda.motor_forces(np.zeros(7), np.zeros(7), torque), np.clip(torque, -effort, effort))
+    anymal = _core.Env(str(ROOT / "examples/tasks/anymal-walk.toml"))
+    q, v, wanted = np.zeros(19), rng.uniform(-0.5, 0.5, 18), rng.uniform(-0.3, 0.3, 12)
+    q[2], q[6], q[7:] = 1.0, 1.0, rng.uniform(-0.3, 0.3, 12)
+    of = np.array([anymal.joint_names.index(name) + 5 for name in anymal.actuator_names])  # degree of freedom of each drive
+    np.testing.assert_allclose(anymal.motor_forces(q, v, wanted)[of], 80.0 * (wanted - q[of + 1]) - 2.0 * v[of], atol=1e-9)
 
 
 def test_every_kind_of_a_single_joint_has_a_bar() -> None:
@@ -133,6 +164,7 @@ def test_a_running_loop_says_its_task_limits_rows_and_what_holds_it() -> None:
     held = [h for p in acting for h in p.held]
     assert acting and held and all(h.multiplier > 0 and h.name == source.robot.rows[h.row] and h.kind in {*BARS, "torque"} for h in held)
     assert all(len(p.latency) == p.ticks and (p.latency > 0).all() and p.period == 0.001 for p in acting)
+    assert all((np.abs(p.force) <= controller.limits["effort"] + 1e-9).all() and p.force.any() for p in acting)
     assert all(p.broken == 0 for p in acting) and max(p.raw_total for p in acting) > 0
 
 

@@ -131,6 +131,22 @@ pub trait Env: Send {
     /// cannot be believed, and nothing is written.
     fn foresee(&mut self, action: &[f64], qpos: &mut [f64], qvel: &mut [f64]) -> bool;
 
+    /// Writes what the motors do (nv) [N·m or N] under `action` (n_act) in a state `q` (nq), `v` (nv) of Pinocchio's convention, beside the
+    /// environment, which stays as it is.
+    ///
+    /// # Errors
+    /// [`EnvError::Physics`] for a wrong length or an entry that is not finite.
+    ///
+    /// # Panics
+    /// When `action` has not [`Spec::n_act`] entries.
+    fn motor_forces(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        action: &[f64],
+        force: &mut [f64],
+    ) -> Result<(), EnvError>;
+
     /// What a control period would have given that led from `from` to `to` under `action` (n_act): the task's own reward and end
     /// of what happened elsewhere, on a robot or in another process. The environment is left in `to`, with its goal. Rewards of
     /// contact forces are those of `to` at rest in its contacts, as far as MuJoCo can tell from the state alone.

@@ -14,7 +14,9 @@ Floats = NDArray[np.float64]
 MODES = {"active": "#15803d", "training": "#15803d", "degraded": "#b45309", "braking": "#b45309", "fault": "#b91c1c"}
 # Which bar of its joint a row of a single joint lights, by kind.
 BARS = {"position": 0, "viability": 0, "locked": 0, "velocity": 1, "velocity_profile": 1, "acceleration": 2, "jerk": 2}
-HEADS = ("position", "speed", "acceleration")
+# Rows of one motor each, named after its joint, light the bar of its force.
+OF_MOTORS = ("torque", "torque rate", "torque speed")
+HEADS = ("position", "speed", "acceleration", "force")
 SHOWN_ROWS = 16
 STYLE = """<style>
 .nearl{font:12px/1.3 system-ui,sans-serif;padding:6px 10px}
@@ -42,6 +44,7 @@ class Panel:
 
     def __init__(self, robot: Robot, pictures: int = 120):
         self._robot, self._pictures = robot, pictures
+        self._motors = {f"{joint} {kind}": (i, HEADS.index("force")) for i, joint in enumerate(robot.joints) for kind in OF_MOTORS}
         self._latencies: deque[float] = deque(maxlen=pictures)
         self._largest = 0.0
 
@@ -71,23 +74,31 @@ class Panel:
     def _joints(self, p: Picture) -> str:
         limits, shift, lines = self._robot.limits, len(p.q) - len(p.v), []
         reached = np.full(len(p.v), np.nan) if p.target is None else (p.target[1] - p.v) / p.period
-        shown = HEADS if np.isfinite(limits["acceleration"]).any() else HEADS[:2]
+        force = np.full(len(p.v), np.nan) if p.force is None else p.force
+        shown = [k for k in range(len(HEADS)) if k < 2 or np.isfinite(limits[("acceleration", "effort")[k - 2]]).any()]
         for i, name in enumerate(self._robot.joints):
-            speed, bound = limits["velocity"][i], limits["acceleration"][i]
+            speed, bound, effort = (limits[what][i] for what in ("velocity", "acceleration", "effort"))
             places = [
                 (p.q[i + shift], limits["lower_position"][i], limits["upper_position"][i]),
                 (p.v[i], -speed, speed),
                 (reached[i], -bound, bound),
+                (force[i], -effort, effort),
             ]
             cells = []
-            for k in range(len(shown)):
-                lit = [h for h in p.held if h.row == i and BARS.get(h.kind) == k]
+            for k in shown:
+                lit = [h for h in p.held if self._bar(h) == (i, k)]
                 value = places[k][0]
                 cells.append(mark(share(*places[k]) if np.isfinite(value) else None, lit, f"{value:.{2 - k // 2}f}" if np.isfinite(value) else ""))
             lines.append(f'<tr><td title="{escape(name)}">{escape(name)}</td>{"".join(cells)}</tr>')
-        head = "".join(f"<th>{h}</th>" for h in shown)
+        head = "".join(f"<th>{HEADS[k]}</th>" for k in shown)
         words = "Joints within their limits; a lit bar holds the target back, by its multiplier"
         return f"<h4>{words}</h4><table><tr><th></th>{head}</tr>{''.join(lines)}</table>"
+
+    def _bar(self, held: Held) -> tuple[int, int | None]:
+        """Joint and bar that a row lights."""
+        if held.row < len(self._robot.joints):
+            return held.row, BARS.get(held.kind)
+        return self._motors.get(held.name, (-1, None))
 
     def _rows(self, held: Sequence[Held]) -> str:
         first, names = len(self._robot.joints), self._robot.rows

@@ -56,6 +56,7 @@ class Picture:
         latency: Time from when each tick was due until its action was handed over [s]; None where nothing keeps real time.
         overruns: Ticks that ended after the next was due; None as ``latency``.
         lost: Ticks that this view did not read in time.
+        force: What the action makes the motors do on each degree of freedom (nv) [N m or N]; None in a tick without an action.
     """
 
     mode: str
@@ -78,6 +79,7 @@ class Picture:
     latency: Floats | None = None
     overruns: int | None = None
     lost: int = 0
+    force: Floats | None = None
 
 
 @dataclass
@@ -179,6 +181,7 @@ class Loop:
             latency=None if self._told["lockstep"] else seen["latency_ns"] * 1e-9,
             overruns=None if self._told["lockstep"] else seen["overruns"],
             lost=seen["lost"],
+            force=self._force(seen["q"], seen["v"], seen["action"]) if acts else None,
         )
 
     def curves(self) -> dict[str, tuple[Floats, Floats]]:
@@ -186,6 +189,10 @@ class Loop:
 
     def close(self) -> None:
         self._client.close()
+
+    def _force(self, q: Floats, v: Floats, action: Floats) -> Floats | None:
+        """None where the robot that is drawn takes no such action."""
+        return self.robot.env.motor_forces(q, v, action) if len(action) == len(self.robot.env.actuator_names) else None
 
     def _rows(self) -> list[str]:
         return labels(self._told["rows"], self._told["kinds"])

@@ -80,7 +80,7 @@ class Training:
         t = self._totals
         return Picture(
             "training", None, t.tick, self._controller.version, t.episode, n, q, v, proposal, target, self._env.dt, list(window.held.values()),
-            told if proposal else None, window.raw, window.broken, t.raw, t.broken,
+            told if proposal else None, window.raw, window.broken, t.raw, t.broken, force=self._env.motor_forces(q, v, action),
         )  # fmt: skip
 
     def curves(self) -> dict[str, tuple[Floats, Floats]]:

@@ -47,9 +47,9 @@ impl<R: Rules> Simulated<R> {
         Step { reward: 0.0, cost: 0.0, terminated: true, fault }
     }
 
-    /// Puts the robot where a plant said it was.
-    fn place(&mut self, at: &Moment<'_>) -> Result<(), EnvError> {
-        let (mut qpos, mut qvel) = (at.q.to_vec(), at.v.to_vec());
+    /// Configuration and velocity in MuJoCo's convention; as they are where their lengths are wrong.
+    fn to_mujoco(&self, q: &[f64], v: &[f64]) -> (Vec<f64>, Vec<f64>) {
+        let (mut qpos, mut qvel) = (q.to_vec(), v.to_vec());
         if (qpos.len(), qvel.len()) == (self.spec.nq, self.spec.nv) {
             for joint in &self.spec.joints {
                 match joint.kind {
@@ -63,6 +63,12 @@ impl<R: Rules> Simulated<R> {
                 }
             }
         }
+        (qpos, qvel)
+    }
+
+    /// Puts the robot where a plant said it was.
+    fn place(&mut self, at: &Moment<'_>) -> Result<(), EnvError> {
+        let (qpos, qvel) = self.to_mujoco(at.q, at.v);
         self.foreseen.clear();
         self.sim.set_state(&qpos, &qvel).map_err(self.physics())?;
         self.sim.set_time(at.time);
@@ -89,11 +95,7 @@ impl<R: Rules> Simulated<R> {
 
     /// A control period under `action` from the present state, in [`Simulated::ahead`].
     fn look_ahead(&mut self, action: &[f64]) -> Result<(), MjError> {
-        let ahead = match &mut self.ahead {
-            Some(ahead) => ahead,
-            none => none.insert(Sim::new(self.sim.model())?),
-        };
-        ahead.copy_from(&self.sim)?;
+        let ahead = copied(&mut self.ahead, &self.sim)?;
         self.rules.actuate(&self.spec, ahead, action);
         ahead.step(self.spec.sub_steps)
     }
@@ -168,6 +170,25 @@ impl<R: Rules> Env for Simulated<R> {
         qvel.copy_from_slice(ahead.qvel());
         self.foreseen.extend_from_slice(action);
         true
+    }
+
+    fn motor_forces(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        action: &[f64],
+        force: &mut [f64],
+    ) -> Result<(), EnvError> {
+        assert_eq!(action.len(), self.spec.n_act(), "the action of '{}' has another length", self.spec.name);
+        let (qpos, qvel) = self.to_mujoco(q, v);
+        self.foreseen.clear();
+        let failed = self.physics();
+        let ahead = copied(&mut self.ahead, &self.sim).map_err(&failed)?;
+        ahead.set_state(&qpos, &qvel).map_err(&failed)?;
+        self.rules.actuate(&self.spec, ahead, action);
+        ahead.forward().map_err(&failed)?;
+        ahead.applied_force(force);
+        Ok(())
     }
 
     fn score(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
@@ -264,6 +285,16 @@ impl<R: Rules> Env for Simulated<R> {
         let sim = make(self.sim.model()).map_err(self.physics())?;
         Ok(Simulated::boxed(self.spec.clone(), self.robot.clone(), self.rules.clone(), sim))
     }
+}
+
+/// `place`, made where there is none, as a copy of `sim`.
+fn copied<'a>(place: &'a mut Option<Sim>, sim: &Sim) -> Result<&'a mut Sim, MjError> {
+    let copy = match place {
+        Some(copy) => copy,
+        none => none.insert(Sim::new(sim.model())?),
+    };
+    copy.copy_from(sim)?;
+    Ok(copy)
 }
 
 /// `w x y z` (of any length) to `x y z w` (of length one).

@@ -57,6 +57,16 @@ impl Env for Costed {
         self.inner.foresee(action, qpos, qvel)
     }
 
+    fn motor_forces(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        action: &[f64],
+        force: &mut [f64],
+    ) -> Result<(), EnvError> {
+        self.inner.motor_forces(q, v, action, force)
+    }
+
     fn score(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
         // The state before is scored on its own first, so that what it began with can be remembered.
         self.inner.score(from, from, action)?;

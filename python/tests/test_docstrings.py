@@ -1,0 +1,106 @@
+"""Whoever reads `help(nearl...)` is told the shape of every array, and the unit of every count and quantity."""
+
+import ast
+import importlib.resources
+import inspect
+import re
+import subprocess
+from collections.abc import Iterator
+
+import pytest
+from conftest import ROOT
+
+import nearl
+from nearl import _core
+
+# (nq), (n x nv), (3), (rows x nv), (n_envs, n_obs), (n,): words and numbers.
+SHAPE = re.compile(r"\(\s*[\w+ ]+(?:\s*[x,]\s*[\w+ ]*)*\)")
+ARRAYS = {"ArrayLike", "_Floats", "Floats", "NDArray", "Array"}
+
+
+def is_array(annotation: ast.expr | None) -> bool:
+    """Functions that are handed over take arrays themselves; what these are stands where the functions are told of."""
+    if annotation is None or "Callable" in ast.unparse(annotation):
+        return False
+    return any(isinstance(node, ast.Name) and node.id in ARRAYS for node in ast.walk(annotation))
+
+
+def functions(tree: ast.Module) -> Iterator[tuple[str, ast.FunctionDef]]:
+    """Public functions and methods by their name with a dot."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            yield node.name, node
+        if isinstance(node, ast.ClassDef):
+            yield from ((f"{node.name}.{f.name}", f) for f in node.body if isinstance(f, ast.FunctionDef) and (f.name[0] != "_" or f.name == "__new__"))
+
+
+def public() -> dict[str, tuple[ast.FunctionDef, str]]:
+    """Every public callable of the package with an array in its annotations, and what is written about it."""
+    found = {}
+    for module in ("_core.pyi", "controller", "env", "guard", "importers", "link", "pid2", "plant", "projected", "proposer", "vector", "jax", "torch"):
+        name = module if module.endswith(".pyi") else f"{module}.py"
+        file = importlib.resources.files("nearl").joinpath(name)
+        if not file.is_file():
+            continue
+        owner = _core if module == "_core.pyi" else None
+        tree = ast.parse(file.read_text())
+        classes = {node.name: ast.get_docstring(node) or "" for node in tree.body if isinstance(node, ast.ClassDef)}
+        for label, node in functions(tree):
+            arguments = [*node.args.args, *node.args.kwonlyargs]
+            if not any(is_array(a.annotation) for a in arguments) and not is_array(node.returns):
+                continue
+            if owner is None:
+                text = (ast.get_docstring(node) or "") + classes.get(label.split(".")[0], "")
+            else:
+                head, _, member = label.partition(".")
+                thing = getattr(owner, head if head != "_Report" else "Target", None)
+                value = getattr(thing, member, None) if member and member != "__new__" else thing
+                text = (inspect.getdoc(value) or "") + (inspect.getdoc(thing) or "" if member == "__new__" else "")
+            found[f"{module.removesuffix('.pyi')}: {label}"] = (node, text)
+    return found
+
+
+PUBLIC = public()
+
+
+def test_there_is_something_to_look_at() -> None:
+    assert len(PUBLIC) > 60
+    assert {"Projector", "Controller", "Model"} <= {label.split(": ")[1].split(".")[0] for label in PUBLIC}
+
+
+@pytest.mark.parametrize("label", PUBLIC)
+def test_arrays_have_their_shapes(label: str) -> None:
+    _, text = PUBLIC[label]
+    assert SHAPE.search(text), f"{label} takes or returns an array and says no shape:\n{text}"
+
+
+@pytest.mark.parametrize("thing", [nearl.Projector.project, nearl.Projector.project_batch, nearl.Controller.update, nearl.Model.rnea, nearl.Model.aba])
+def test_states_have_units(thing: object) -> None:
+    text = inspect.getdoc(thing) or ""
+    assert re.search(r"\[[^\]]*rad", text) or re.search(r"\brad\b", text), text
+
+
+def test_nearest_says_its_metric_and_planes_say_their_side() -> None:
+    assert "((q' - q_proposal) / (kappa dt))²" in (nearl.Projector.__doc__ or ""), nearl.Projector.__doc__
+    assert "normal . (p - through) <= 0" in (nearl.FrameLimit.__doc__ or ""), nearl.FrameLimit.__doc__
+
+
+def test_counts_say_what_they_count() -> None:
+    for thing in (nearl.ProjectedEnv, nearl.make_vec, nearl.VecEnv):
+        text = inspect.getdoc(thing) or ""
+        assert "max_episode_steps" not in text or "period" in text.split("max_episode_steps", 1)[1][:120], text
+    assert "environment steps" in (nearl.PID2.learn.__doc__ or "")
+
+
+def test_every_task_says_what_it_needs() -> None:
+    """`nearl tasks`: sizes as the environment has them, the inverse model, and whether there is a cost."""
+    program = ROOT / "target" / "release" / "nearl"
+    if not program.exists():
+        pytest.fail(f"{program} was not built: run 'make build'")
+    told = subprocess.run([program, "tasks"], capture_output=True, text=True, check=True).stdout
+    for name, about in nearl.tasks():
+        env, lines = _core.Env(name), re.search(rf"^{name} +(.*\n +.*)$", told, re.MULTILINE)
+        assert lines and about in lines[1], name
+        for fact in (f"{len(env.obs_names)} observations", f"{len(env.actuator_names)} actions", f"{env.max_episode_steps} control periods", "inverse model: "):
+            assert fact in lines[1], (name, lines[1])
+        assert lines[1].endswith(", a cost") == env.has_cost, (name, lines[1])
