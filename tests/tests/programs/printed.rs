@@ -46,4 +46,25 @@ fn an_evaluation_prints_mean_and_spread() {
     let row = printed.lines().find(|line| line.starts_with("raw ")).expect("a row");
     let words: Vec<&str> = row.split_whitespace().collect();
     assert_eq!(words[1..4], [format!("{mean:.1}").as_str(), "±", format!("{spread:.1}").as_str()], "{row}");
+    assert!(row.contains("not projected"), "a proposal that is followed as it is has no target: {row}");
+}
+
+/// `--json` is JSON to the last line, whatever ends the training.
+#[test]
+fn a_training_stopped_by_a_signal_prints_json_to_the_end() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = folder.path().join("run");
+    let out = run.to_str().expect("UTF-8");
+    let process =
+        Process::nearl(&["train", "Hopper-v5", "--steps", "1e9", "--json", "--threads", "1", "--out", out]);
+    until("the run folder", || run.join("metrics.csv").is_file().then_some(()));
+    std::thread::sleep(std::time::Duration::from_millis(200));
+    process.signal(libc::SIGTERM);
+    let printed = text(process);
+    let rows: Vec<Value> = printed
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap_or_else(|e| panic!("{e}: {line}")))
+        .collect();
+    let last = rows.last().expect("a last line");
+    assert_eq!((&last["stopped"], &last["run"]), (&Value::Bool(true), &Value::from(out)), "{last}");
 }

@@ -48,10 +48,10 @@ impl Eval {
         }
         say(format!("{}, {} episodes", snapshot.manifest.task.name, self.episodes));
         say(
-            "                                         raw proposals   targets   reached states   already outside   |reached - target|",
+            "                                         raw proposals         targets   reached states   already outside   |reached - target|",
         );
         say(
-            "mode        return ± spread        cost  outside limits  outside          outside     (recovering)     [std of change]",
+            "mode        return ± spread        cost  outside limits         outside          outside     (recovering)     [std of change]",
         );
         for e in &results {
             let percent = |n: u64| 100.0 * n as f64 / e.ticks.max(1) as f64;
@@ -60,14 +60,17 @@ impl Eval {
             let where_so = |is: bool, text: String| if is { text } else { "-".into() };
             let of_targets = |text: String| where_so(m.proposes(), text);
             let share = |n: u64| where_so(m.proposes() || m.limits_actions(), format!("{:.2} %", percent(n)));
+            // There are no targets beside the proposals then, and what begins outside would not count.
+            let projected = e.mode == "projected" || !m.proposes();
+            let targets = if projected { share(e.target_violations) } else { "not projected".into() };
             say(format!(
-                "{:<10}{:>8.1} ± {:<8.1}{:>10.1}{:>16}{:>9}{:>15.2} %{:>17}{:>20}",
+                "{:<10}{:>8.1} ± {:<8.1}{:>10.1}{:>16}{:>16}{:>15.2} %{:>17}{:>20}",
                 e.mode,
                 e.mean_return(),
                 e.std_return(),
                 e.mean_cost(),
                 share(e.raw_violations),
-                share(e.target_violations),
+                targets,
                 percent(e.reached_violations),
                 share(e.recovering),
                 of_targets(format!("{:.3}", e.residual)),

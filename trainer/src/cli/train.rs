@@ -195,22 +195,26 @@ impl Train {
         if faults > 0 {
             eprintln!("nearl: {}", unstable(faults));
         }
+        let stopped = stop.load(Ordering::Relaxed);
         let Some((steps, seconds, mean)) = last else {
-            if stop.load(Ordering::Relaxed) {
-                say(format!("stopped by a signal before the first batch; run folder {}", out.display()));
-                return Ok(());
-            }
             let done = run.done;
-            say(format!(
-                "{} has {done} of {} steps already; give more with --steps",
-                out.display(),
-                run.steps
-            ));
+            if self.json {
+                say(
+                    serde_json::json!({ "run": out, "snapshot": null, "steps": done, "seconds": 0.0, "return": null, "stopped": stopped }),
+                );
+            } else if stopped {
+                say(format!("stopped by a signal before the first batch; run folder {}", out.display()));
+            } else {
+                let (out, steps) = (out.display(), run.steps);
+                say(format!("{out} has {done} of {steps} steps already; give more with --steps"));
+            }
             return Ok(());
         };
+        let stopped = stopped && steps < run.steps;
         if self.json {
             say(
-                serde_json::json!({ "run": out, "snapshot": saved, "steps": steps, "seconds": seconds, "return": mean }),
+                serde_json::json!({ "run": out, "snapshot": saved, "steps": steps, "seconds": seconds, "return": mean,
+                "stopped": stopped }),
             );
         } else {
             say(format!(
@@ -236,7 +240,7 @@ impl Train {
                 say(format!("video {}", video.display()));
             }
         }
-        if stop.load(Ordering::Relaxed) && steps < run.steps {
+        if stopped && !self.json {
             say(format!(
                 "stopped by a signal after {steps} of {} steps; go on with 'nearl train {} --resume {}'",
                 run.steps,
