@@ -103,4 +103,5 @@ def _compiled(mujoco: Any, env: _core.Env) -> Any:
     ElementTree.SubElement(joint, "child", link=str(root))
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], rgba=[0.6, 0.65, 0.7, 1.0])
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.7] * 3
     return spec.compile()
