@@ -42,27 +42,36 @@ impl Verdict {
 }
 
 /// What rows and cones are checked for.
-enum Meant<'a> {
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Meant {
     /// What they ask of a target, with the tick before.
-    Asked(Option<Previous<'a>>),
+    Asked,
     /// What they are there to keep.
     Kept,
 }
 
-/// Scratch and constants of the checker.
-pub struct Checker {
+/// What rows and cones read of a motion, reckoned anew for each.
+struct Reckoned {
     dynamics: Dynamics,
     kinematics: Kinematics,
+    period: Period,
+    /// What of it some row or cone needs; the rest is left as it was.
+    needs: Needs,
+    /// Acceleration and motor forces (nv).
+    a: Vec<f64>,
+    tau: Vec<f64>,
+}
+
+/// Scratch and constants of the checker.
+pub struct Checker {
+    reckoned: Reckoned,
     limits: LimitSet,
     dofs: Vec<(usize, usize)>,
     period: Period,
     consistency: Consistency,
     rows: Vec<RowsOf>,
     cones: Vec<ConeOf>,
-    needs: Needs,
     excess: Vec<f64>,
-    a: Vec<f64>,
-    tau: Vec<f64>,
     /// Largest speed [rad/s or m/s] and how fast a dof may speed up [rad/s² or m/s²] (nv), where limits were moved.
     speed: Vec<f64>,
     faster: Vec<f64>,
@@ -133,24 +142,28 @@ impl Checker {
             }
         }
         let needs = rows.iter().map(|r| r.rows.needs()).chain(cones.iter().map(|c| c.cone.needs()));
+        let reckoned = Reckoned {
+            dynamics: Dynamics::new(model),
+            kinematics: Kinematics::new(model),
+            period,
+            needs: needs.fold(Needs::default(), Needs::and),
+            a: zero(),
+            tau: zero(),
+        };
         let hard_rows = rows.iter().filter(|r| r.hard).map(|r| r.count).sum::<usize>();
         Ok(Checker {
             speed: vec![f64::INFINITY; model.nv()],
             faster: vec![f64::INFINITY; model.nv()],
             moved: false,
             allowed: vec![0.0; hard_rows + cones.iter().filter(|c| c.hard).count()],
-            needs: needs.fold(Needs::default(), Needs::and),
             excess: vec![0.0; rows.iter().map(|r| r.count).max().unwrap_or(0)],
             rows,
             cones,
-            dynamics: Dynamics::new(model),
-            kinematics: Kinematics::new(model),
+            reckoned,
             limits: LimitSet::collect(model, limits, controllable)?,
             dofs: controllable.iter().map(|i| (*i, model.joint_of_dof(*i).idx_q)).collect(),
             period,
             consistency,
-            a: zero(),
-            tau: zero(),
         })
     }
 
@@ -165,11 +178,7 @@ impl Checker {
         external: &[f64],
         previous: Option<Previous<'_>>,
     ) -> Verdict {
-        let mut verdict = Verdict::default();
-        self.boxes(&mut verdict, (q, v), (q_next, v_next), previous);
-        self.prepare(q, v, v_next, external);
-        self.coupled(&mut verdict, (q, v), (q_next, v_next), Meant::Asked(previous));
-        verdict
+        self.examine((q, v), (q_next, v_next), external, previous, Meant::Asked)
     }
 
     /// The limits of single joints.
@@ -206,19 +215,6 @@ impl Checker {
         }
     }
 
-    /// Acceleration, motor forces and frames of a motion.
-    fn prepare(&mut self, q: &[f64], v: &[f64], v_next: &[f64], external: &[f64]) {
-        for i in 0..v.len() {
-            self.a[i] = (v_next[i] - v[i]) / self.period.dt;
-        }
-        if self.needs.motors {
-            self.motors(q, v, external);
-        }
-        if self.needs.kinematics {
-            self.kinematics.update(q, v, &self.a);
-        }
-    }
-
     /// Checks the step of a brake like [`Checker::check`], its rows and cones for what they keep ([`Rows::breach`]) and no more.
     pub fn check_brake(
         &mut self,
@@ -229,11 +225,7 @@ impl Checker {
         external: &[f64],
         previous: Option<Previous<'_>>,
     ) -> Verdict {
-        let mut verdict = Verdict::default();
-        self.boxes(&mut verdict, (q, v), (q_next, v_next), previous);
-        self.prepare(q, v, v_next, external);
-        self.coupled(&mut verdict, (q, v), (q_next, v_next), Meant::Kept);
-        verdict
+        self.examine((q, v), (q_next, v_next), external, previous, Meant::Kept)
     }
 
     /// Number of hard rows and cones.
@@ -245,15 +237,12 @@ impl Checker {
     /// Writes the breach of each hard row, then of each hard cone ([`Checker::hard`]); minus infinity where it is switched off.
     pub(crate) fn breaches(
         &mut self,
-        (q, v): (&[f64], &[f64]),
-        (q_next, v_next): (&[f64], &[f64]),
+        now: (&[f64], &[f64]),
+        next: (&[f64], &[f64]),
         external: &[f64],
         out: &mut [f64],
     ) {
-        self.prepare(q, v, v_next, external);
-        let (acceleration, torque, period, previous) = (&self.a[..], &self.tau[..], &self.period, None);
-        let kinematics = &mut self.kinematics;
-        let mut motion = Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous };
+        let mut motion = self.reckoned.motion(now, next, external, None);
         out.fill(f64::NEG_INFINITY);
         let mut first = 0;
         for block in self.rows.iter_mut().filter(|r| r.hard) {
@@ -278,12 +267,12 @@ impl Checker {
 
     /// Motor forces of the last motion checked, by inverse dynamics (nv); zero when no limit needs them.
     pub fn torque(&self) -> &[f64] {
-        &self.tau
+        &self.reckoned.tau
     }
 
     /// What the rows and cones need beside the state.
     pub(crate) fn needs(&self) -> Needs {
-        Needs { previous: self.needs.previous || self.limits.has_jerk(), ..self.needs }
+        Needs { previous: self.reckoned.needs.previous || self.limits.has_jerk(), ..self.reckoned.needs }
     }
 
     /// Asks for `share` of the size of cone `c`, and for rows of that limit to lie `inset` [m] further inside.
@@ -330,15 +319,12 @@ impl Checker {
     /// The share of its size that a motion makes of each hard cone that is switched on, at its end and as it is asked for; 0 for others.
     pub(crate) fn shares(
         &mut self,
-        (q, v): (&[f64], &[f64]),
-        (q_next, v_next): (&[f64], &[f64]),
+        now: (&[f64], &[f64]),
+        next: (&[f64], &[f64]),
         external: &[f64],
         out: &mut [f64],
     ) {
-        self.prepare(q, v, v_next, external);
-        let (acceleration, torque, period, previous) = (&self.a[..], &self.tau[..], &self.period, None);
-        let kinematics = &mut self.kinematics;
-        let mut motion = Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous };
+        let mut motion = self.reckoned.motion(now, next, external, None);
         for (out, block) in out.iter_mut().zip(&mut self.cones) {
             *out = match block.hard && block.enabled {
                 true => 1.0 + block.cone.excess(&mut motion).max(block.cone.breach(&mut motion)),
@@ -361,21 +347,18 @@ impl Checker {
         self.limits.tighten(left);
     }
 
-    fn coupled(
+    fn examine(
         &mut self,
-        verdict: &mut Verdict,
-        (q, v): (&[f64], &[f64]),
-        (q_next, v_next): (&[f64], &[f64]),
-        meant: Meant<'_>,
-    ) {
-        let previous = match meant {
-            Meant::Asked(previous) => previous,
-            Meant::Kept => None,
-        };
-        let kept = matches!(meant, Meant::Kept);
-        let (acceleration, torque, period) = (&self.a[..], &self.tau[..], &self.period);
-        let kinematics = &mut self.kinematics;
-        let mut motion = Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous };
+        now: (&[f64], &[f64]),
+        next: (&[f64], &[f64]),
+        external: &[f64],
+        previous: Option<Previous<'_>>,
+        meant: Meant,
+    ) -> Verdict {
+        let mut verdict = Verdict::default();
+        self.boxes(&mut verdict, now, next, previous);
+        let kept = meant == Meant::Kept;
+        let mut motion = self.reckoned.motion(now, next, external, previous.filter(|_| !kept));
         let mut allowed = self.allowed.iter();
         for block in self.rows.iter_mut().filter(|r| r.hard) {
             let (excess, allowed) = (&mut self.excess[..block.count], allowed.by_ref().take(block.count));
@@ -397,6 +380,7 @@ impl Checker {
             };
             verdict.see(block.cone.kind(), block.row, excess, 0.0);
         }
+        verdict
     }
 
     /// The next speed is below the curves at the next position.
@@ -445,11 +429,32 @@ impl Checker {
             verdict.see(Kind::Viability, i, stop(-next.1) - next.0, (-low).max(-next.0));
         }
     }
+}
 
-    /// [`Dynamics::motors_without_friction`] less the external forces.
-    fn motors(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
-        self.dynamics.motors_without_friction(&self.period, q, v, &self.a, &mut self.tau);
-        self.tau.iter_mut().zip(external).for_each(|(tau, external)| *tau -= external);
+impl Reckoned {
+    /// The motion from `now` to `next`, configurations (nq) and velocities (nv), with its acceleration, motor forces and frames, as far as a row or a cone
+    /// needs them.
+    fn motion<'m>(
+        &'m mut self,
+        now: (&'m [f64], &'m [f64]),
+        next: (&'m [f64], &'m [f64]),
+        external: &[f64],
+        previous: Option<Previous<'m>>,
+    ) -> Motion<'m> {
+        let ((q, v), (q_next, v_next)) = (now, next);
+        for i in 0..v.len() {
+            self.a[i] = (v_next[i] - v[i]) / self.period.dt;
+        }
+        if self.needs.motors {
+            self.dynamics.motors_without_friction(&self.period, q, v, &self.a, &mut self.tau);
+            self.tau.iter_mut().zip(external).for_each(|(tau, external)| *tau -= external);
+        }
+        if self.needs.kinematics {
+            self.kinematics.update(q, v, &self.a);
+        }
+        let (acceleration, torque, period, kinematics) =
+            (&self.a[..], &self.tau[..], &self.period, &mut self.kinematics);
+        Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous }
     }
 }
 

@@ -87,4 +87,4 @@ pub use projector::{CoupledStages, Numbers};
 pub use projector::{Problem, ProblemCone, Projector};
 pub use row::{Cone, Rows, Soft};
 pub use target::{Bounds, Braking, Consistency, Guard, Proposal, Settings, Solver, Target};
-pub use viability::{Kind, Period};
+pub use viability::Period;

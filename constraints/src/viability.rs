@@ -12,85 +12,8 @@
 //! Control of Robot Manipulators", RA-L 2018. The familiar `v' <= sqrt(2 A d)` is the same parabola at the wrong end
 //! of the step, and conflicts with the acceleration limit near the position limit.
 
+pub use crate::limit::Kind;
 use crate::{LimitSet, Model};
-
-/// What set a bound, or what a violation violates.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[repr(u8)]
-pub enum Kind {
-    /// Position limit within the period.
-    Position,
-    /// Velocity limit.
-    Velocity,
-    /// Acceleration limit.
-    Acceleration,
-    /// Braking in front of a position limit.
-    Viability,
-    /// Motor force limit.
-    Torque,
-    /// Change of acceleration.
-    Jerk,
-    /// Motor force that falls with speed.
-    TorqueSpeed,
-    /// Change of motor force.
-    TorqueRate,
-    /// A point of a frame in front of a plane.
-    Frame,
-    /// Speed of a frame.
-    FrameSpeed,
-    /// Kinetic energy.
-    Energy,
-    /// Distance between two bodies.
-    Collision,
-    /// A row of the task file's own.
-    User,
-    /// A joint that must not move.
-    Locked,
-    /// Speed limit that depends on the position.
-    VelocityProfile,
-}
-
-impl Kind {
-    /// All kinds, in the order of their numbers.
-    pub const ALL: [Kind; 15] = [
-        Kind::Position,
-        Kind::Velocity,
-        Kind::Acceleration,
-        Kind::Viability,
-        Kind::Torque,
-        Kind::Jerk,
-        Kind::TorqueSpeed,
-        Kind::TorqueRate,
-        Kind::Frame,
-        Kind::FrameSpeed,
-        Kind::Energy,
-        Kind::Collision,
-        Kind::User,
-        Kind::Locked,
-        Kind::VelocityProfile,
-    ];
-
-    /// Its name in reports: `"torque_speed"`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Kind::Position => "position",
-            Kind::Velocity => "velocity",
-            Kind::Acceleration => "acceleration",
-            Kind::Viability => "viability",
-            Kind::Torque => "torque",
-            Kind::Jerk => "jerk",
-            Kind::TorqueSpeed => "torque_speed",
-            Kind::TorqueRate => "torque_rate",
-            Kind::Frame => "frame",
-            Kind::FrameSpeed => "frame_speed",
-            Kind::Energy => "energy",
-            Kind::Collision => "collision",
-            Kind::User => "user",
-            Kind::Locked => "locked",
-            Kind::VelocityProfile => "velocity_profile",
-        }
-    }
-}
 
 /// A speed limit that falls in front of a position, as robot makers state it:
 ///

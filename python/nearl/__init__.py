@@ -11,34 +11,22 @@ With Gymnasium installed, importing this module registers ``nearl/HalfCheetah-v5
 vectors of them.
 """
 
+from nearl import limits as _limits
 from nearl._core import (
-    AccelerationLimit,
-    CollisionLimit,
     Controller,
-    EnergyLimit,
-    FrameLimit,
-    FrameSpeedLimit,
-    JerkLimit,
     Ledger,
     Limit,
-    LockedJoints,
     Model,
     Policy,
-    PositionLimit,
     Projector,
-    RowLimit,
     Target,
     Targets,
-    TorqueLimit,
-    TorqueRateLimit,
-    TorqueSpeedLimit,
-    VelocityLimit,
-    VelocityProfileLimit,
     __version__,
     algorithms,
     tasks,
 )
 from nearl.importers import import_onnx, import_sb3, import_torch
+from nearl.limits import *  # noqa: F403
 from nearl.link import Link
 from nearl.pid2 import PID2
 from nearl.plant import Loop, Plant
@@ -46,34 +34,20 @@ from nearl.proposer import Proposer, blank
 from nearl.ranks import Ranks
 
 __all__ = [
-    "AccelerationLimit",
-    "CollisionLimit",
     "Controller",
-    "EnergyLimit",
-    "FrameLimit",
-    "FrameSpeedLimit",
-    "JerkLimit",
     "Ledger",
     "Limit",
     "Link",
-    "LockedJoints",
     "Loop",
     "Model",
     "PID2",
     "Plant",
     "Policy",
-    "PositionLimit",
     "Projector",
     "Proposer",
     "Ranks",
-    "RowLimit",
     "Target",
     "Targets",
-    "TorqueLimit",
-    "TorqueRateLimit",
-    "TorqueSpeedLimit",
-    "VelocityLimit",
-    "VelocityProfileLimit",
     "__version__",
     "algorithms",
     "blank",
@@ -82,6 +56,7 @@ __all__ = [
     "import_torch",
     "tasks",
 ]
+__all__ += _limits.__all__
 
 try:
     import gymnasium as _gymnasium  # noqa: F401

@@ -2,19 +2,18 @@
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, TypedDict, final
+from typing import Any, Literal, Self, TypedDict, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nearl.limits import PerJoint, RowKind
 from nearl.ranks import Gather
 
 __version__: str
 
 _Floats = NDArray[np.float64]
 _Path = str | os.PathLike[str]
-_PerJoint = float | Mapping[str, float] | Sequence[float]
-_Soft = tuple[float, float]
 _Status = Literal["unchanged", "clamped", "solved", "slowed", "recovering", "tightening", "braked", "refused"]
 
 def tasks() -> list[tuple[str, str]]: ...
@@ -24,23 +23,7 @@ def nearest_action(
 def algorithms() -> list[tuple[str, str]]: ...
 
 class ActiveRow(TypedDict):
-    kind: Literal[
-        "position",
-        "velocity",
-        "acceleration",
-        "viability",
-        "torque",
-        "jerk",
-        "torque_speed",
-        "torque_rate",
-        "frame",
-        "frame_speed",
-        "energy",
-        "collision",
-        "user",
-        "locked",
-        "velocity_profile",
-    ]
+    kind: RowKind
     row: int
     name: str
     side: Literal["lower", "upper"]
@@ -104,146 +87,9 @@ class Model:
     def tau_to_mujoco(self, q: ArrayLike, tau: ArrayLike) -> _Floats: ...
 
 class Limit:
+    def __new__(cls, model: Model, kind: str, settings: dict[str, Any]) -> Self: ...
     @property
     def name(self) -> str: ...
-
-@final
-class PositionLimit(Limit):
-    def __new__(cls, model: Model, margin: _PerJoint = 0.0) -> PositionLimit: ...
-
-@final
-class VelocityLimit(Limit):
-    def __new__(
-        cls,
-        model: Model,
-        limit: _PerJoint | None = None,
-        *,
-        scale: float | None = None,
-        margin: _PerJoint | None = None,
-    ) -> VelocityLimit: ...
-
-@final
-class VelocityProfileLimit(Limit):
-    def __new__(
-        cls, model: Model, profile: Literal["fr3"] | Mapping[str, Mapping[str, float]], *, margin: float = 0.0
-    ) -> VelocityProfileLimit: ...
-
-@final
-class AccelerationLimit(Limit):
-    def __new__(
-        cls, model: Model, limit: _PerJoint, braking: _PerJoint | None = None, *, margin: _PerJoint | None = None
-    ) -> AccelerationLimit: ...
-
-@final
-class JerkLimit(Limit):
-    def __new__(
-        cls,
-        model: Model,
-        limit: _PerJoint,
-        soft: _Soft | None = None,
-        *,
-        margin: _PerJoint | None = None,
-        hard: bool = False,
-    ) -> JerkLimit: ...
-
-@final
-class TorqueLimit(Limit):
-    def __new__(
-        cls, model: Model, scale: float = 1.0, *, margin: _PerJoint | None = None, soft: _Soft | None = None
-    ) -> TorqueLimit: ...
-
-@final
-class TorqueSpeedLimit(Limit):
-    def __new__(
-        cls,
-        model: Model,
-        stall: _PerJoint,
-        no_load: _PerJoint,
-        soft: _Soft | None = None,
-        *,
-        margin: _PerJoint | None = None,
-    ) -> TorqueSpeedLimit: ...
-
-@final
-class TorqueRateLimit(Limit):
-    def __new__(
-        cls, model: Model, limit: _PerJoint, soft: _Soft | None = None, *, margin: _PerJoint | None = None
-    ) -> TorqueRateLimit: ...
-
-@final
-class LockedJoints(Limit):
-    def __new__(cls, model: Model, joints: Sequence[str]) -> LockedJoints: ...
-
-@final
-class FrameLimit(Limit):
-    def __new__(
-        cls,
-        model: Model,
-        frame: str,
-        braking: float,
-        *,
-        normal: Sequence[float] | None = None,
-        through: Sequence[float] | None = None,
-        lower: Sequence[float] | None = None,
-        upper: Sequence[float] | None = None,
-        point: Sequence[float] = ...,
-        margin: float = 0.0,
-        soft: _Soft | None = None,
-        name: str | None = None,
-    ) -> FrameLimit: ...
-
-@final
-class FrameSpeedLimit(Limit):
-    def __new__(
-        cls,
-        model: Model,
-        frame: str,
-        limit: float,
-        *,
-        point: Sequence[float] = ...,
-        name: str | None = None,
-        margin: float = 0.0,
-        soft: _Soft | None = None,
-    ) -> FrameSpeedLimit: ...
-
-@final
-class EnergyLimit(Limit):
-    def __new__(
-        cls, model: Model, limit: float, *, margin: float = 0.0, soft: _Soft | None = None
-    ) -> EnergyLimit: ...
-
-@final
-class CollisionLimit(Limit):
-    def __new__(
-        cls,
-        model: Model,
-        shapes: Sequence[Mapping[str, Any]],
-        braking: float,
-        *,
-        margin: float = 0.0,
-        urdf: bool = False,
-        ignore: Sequence[tuple[str, str]] = ...,
-        adjacent: bool = False,
-        influence: float = 0.2,
-        rows: int = 16,
-        soft: _Soft | None = None,
-    ) -> CollisionLimit: ...
-
-@final
-class RowLimit(Limit):
-    def __new__(
-        cls,
-        model: Model,
-        name: str,
-        terms: Mapping[str, float],
-        *,
-        lower: float | None = None,
-        upper: float | None = None,
-        equals: float | None = None,
-        braking: float | None = None,
-        soft: _Soft | None = None,
-        margin: float = 0.0,
-    ) -> RowLimit: ...
 
 class _Report:
     @property
@@ -358,10 +204,10 @@ class Projector:
         self,
         *,
         speed: float = 1.0,
-        velocity: _PerJoint | None = None,
-        acceleration: _PerJoint | None = None,
-        lower: _PerJoint | None = None,
-        upper: _PerJoint | None = None,
+        velocity: PerJoint | None = None,
+        acceleration: PerJoint | None = None,
+        lower: PerJoint | None = None,
+        upper: PerJoint | None = None,
         frame: dict[str, float] | None = None,
         frame_speed: dict[str, float] | None = None,
         energy: float | None = None,
@@ -639,10 +485,10 @@ class LoopClient:
         patience: float,
         *,
         speed: float = 1.0,
-        velocity: _PerJoint | None = None,
-        acceleration: _PerJoint | None = None,
-        lower: _PerJoint | None = None,
-        upper: _PerJoint | None = None,
+        velocity: PerJoint | None = None,
+        acceleration: PerJoint | None = None,
+        lower: PerJoint | None = None,
+        upper: PerJoint | None = None,
         frame: dict[str, float] | None = None,
         frame_speed: dict[str, float] | None = None,
         energy: float | None = None,

@@ -127,7 +127,8 @@ pub fn refusal(model: &Model, limits: &LimitSet, controllable: &[usize], period:
         .collect();
     (!weak.is_empty()).then(|| {
         format!(
-            "the motors cannot hold the robot still everywhere within its position limits: {}; raise constraints.torque.scale, or narrow the position limits to where they can",
+            "the motors cannot hold the robot still everywhere within its position limits: {}; \
+             raise constraints.torque.scale, or narrow the position limits to where they can",
             weak.join("; ")
         )
     })

@@ -105,7 +105,7 @@ impl<'a> Robot<'a> {
             "velocity_profile" => self.profile(scene),
             "locked" => {
                 let joint = self.middle();
-                limits.push(Box::new(LockedJoints::new(vec![self.model.dof_name(joint)])));
+                limits.push(Box::new(LockedJoints::of(vec![self.model.dof_name(joint)])));
                 meters.push(Meter::Locked { joint, at: self.start[joint] });
             }
             "frame" => {

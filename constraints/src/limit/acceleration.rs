@@ -1,9 +1,29 @@
 //! Acceleration limits, which are also what braking counts on.
 
 use super::margin::less_each;
-use super::{AlwaysHard, Limit, LimitSet, PerJoint};
+use super::{About, AlwaysHard, Argument, Form, Limit, LimitSet, PerJoint, Takes};
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "AccelerationLimit",
+    promise: "Acceleration stays below `limit` [rad/s², m/s²]. `braking` is the deceleration that position limits count on, \
+        at most `limit`, which is also its default.",
+    example: "acceleration = { limit = 10.0 }",
+    form: Form::Hard,
+    margin: "[rad/s², m/s²]; `braking` is as it is written",
+    stricter: Some([
+        "acceleration = { limit = 10.0, braking = 4.0, margin = { panda_joint1 = 3.0 } }",
+        "acceleration = { limit = { panda_joint1 = 7.0, panda_joint2 = 10.0, panda_joint3 = 10.0, panda_joint4 = 10.0, \
+        panda_joint5 = 10.0, panda_joint6 = 10.0, panda_joint7 = 10.0 }, braking = 4.0 }",
+    ]),
+    arguments: &[
+        Argument::needed("limit", Takes::PerJoint),
+        Argument::or("braking", Takes::PerJoint, "None"),
+        Argument::MARGINS,
+    ],
+};
 
 /// `acceleration = { limit }` or `acceleration = { limit, braking }`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

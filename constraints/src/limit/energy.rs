@@ -1,11 +1,22 @@
 //! How much kinetic energy the robot may carry.
 
-use super::Limit;
 use super::frame::check;
 use super::margin::{is_zero, less};
+use super::{About, Argument, Form, Limit, Takes};
 use crate::row::{Cone, Motion, Needs, TickStart};
 use crate::{Dynamics, Kind, Kinematics, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "EnergyLimit",
+    promise: "The kinetic energy of the whole robot stays below `limit` [J]: a second-order cone.",
+    example: "energy = { limit = 2.0 }",
+    form: Form::Either,
+    margin: "[J]",
+    stricter: Some(["energy = { limit = 2.0, margin = 1.5 }", "energy = { limit = 0.5 }"]),
+    arguments: &[Argument::needed("limit", Takes::Number), Argument::MARGIN, Argument::SOFT],
+};
 
 /// `energy = { limit = 2.0 }`, also with `margin` and `soft`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,11 +1,40 @@
 //! Where a point of a frame may be: below a plane, inside a box.
 
-use super::Limit;
 use super::clearance::{Ahead, Clearance};
+use super::{About, Argument, Form, Limit, Takes};
 use crate::kinematics::{dot, norm};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{FrameId, Kind, LimitError, Model, Period, PointMotion, Soft};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "FrameLimit",
+    promise: "A point of a frame stops in front of a plane, `normal . (p - through) <= 0`, or inside a box of world axes, \
+        `lower <= p <= upper`, as far as `braking` [m/s²] can be delivered. `point` is in the frame's axes [m].",
+    example: "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.1] }, braking = 5.0 \
+        }]",
+    form: Form::Either,
+    margin: "from every plane [m]",
+    stricter: Some([
+        "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.1] }, braking = \
+        5.0, margin = 0.3 }]",
+        "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.4] }, braking = 5.0 \
+        }]",
+    ]),
+    arguments: &[
+        Argument::needed("frame", Takes::Text),
+        Argument::needed("braking", Takes::Number),
+        Argument::named("normal", Takes::Vector, "None").at("half_space.normal"),
+        Argument::named("through", Takes::Vector, "None").at("half_space.through"),
+        Argument::named("lower", Takes::Vector, "None").at("box.lower"),
+        Argument::named("upper", Takes::Vector, "None").at("box.upper"),
+        Argument::POINT,
+        Argument::MARGIN,
+        Argument::SOFT,
+        Argument::NAME,
+    ],
+};
 
 /// `frame = [{ frame = "hand", half_space = { normal = [0, 0, -1], through = [0, 0, 0.1] }, braking = 5.0 }]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

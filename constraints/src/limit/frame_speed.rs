@@ -1,13 +1,35 @@
 //! How fast a point of a frame may move.
 
-use super::Limit;
 use super::clearance::Ahead;
 use super::frame::{check, frame_of};
 use super::margin::{is_zero, less};
+use super::{About, Argument, Form, Limit, Takes};
 use crate::kinematics::norm;
 use crate::row::{Cone, Motion, Needs, TickStart};
 use crate::{FrameId, Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "FrameSpeedLimit",
+    promise: "The speed of a point of a frame stays below `limit` [m/s] in every direction: a second-order cone. `point` is \
+        in the frame's axes [m].",
+    example: "frame_speed = [{ frame = \"panda_hand\", limit = 0.25 }]",
+    form: Form::Either,
+    margin: "[m/s]",
+    stricter: Some([
+        "frame_speed = [{ frame = \"panda_hand\", limit = 0.25, margin = 0.1 }]",
+        "frame_speed = [{ frame = \"panda_hand\", limit = 0.15 }]",
+    ]),
+    arguments: &[
+        Argument::needed("frame", Takes::Text),
+        Argument::needed("limit", Takes::Number),
+        Argument::POINT,
+        Argument::NAME,
+        Argument::MARGIN,
+        Argument::SOFT,
+    ],
+};
 
 /// `frame_speed = [{ frame = "hand", limit = 0.25 }]`, also with `margin` and `soft`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

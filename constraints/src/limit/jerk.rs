@@ -1,10 +1,27 @@
 //! Jerk limits.
 
 use super::margin::less_each;
-use super::{Limit, LimitSet, PerJoint};
+use super::{About, Argument, Form, Limit, LimitSet, PerJoint, Takes};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "JerkLimit",
+    promise: "Change of acceleration in a second [rad/s³, m/s³]. Soft, braking comes first. With `hard`, position, \
+        velocity, acceleration and jerk of a joint hold at once. It needs the tick before.",
+    example: "jerk = { limit = 500.0 }",
+    form: Form::Soft,
+    margin: "[rad/s³, m/s³]; hard with `hard = true`",
+    stricter: Some(["jerk = { limit = 600.0, margin = 100.0 }", "jerk = { limit = 500.0 }"]),
+    arguments: &[
+        Argument::needed("limit", Takes::PerJoint),
+        Argument::or("soft", Takes::Soft, "None"),
+        Argument::MARGINS,
+        Argument::named("hard", Takes::Flag, "False"),
+    ],
+};
 
 /// `jerk = { limit }`, `jerk = { limit, soft = { linear, quadratic } }` or `jerk = { limit, hard = true }`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

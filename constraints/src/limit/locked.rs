@@ -1,18 +1,43 @@
 //! Joints that must not move.
 
-use super::{Limit, LimitSet};
+use super::{About, Argument, Form, Limit, LimitSet, Takes};
 use crate::{LimitError, Model};
+use serde::{Deserialize, Serialize};
+
+/// `locked`, as it describes itself.
+pub(super) const ABOUT: About = About {
+    class: "LockedJoints",
+    promise: "The joint brakes to standstill and stays.",
+    example: "locked = [\"panda_joint7\"]",
+    form: Form::Hard,
+    margin: "has no bound",
+    stricter: None,
+    arguments: &[Argument::needed("joints", Takes::Names).at("")],
+};
+
+/// Names of joints.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct LockedSettings {
+    /// The joints by name.
+    pub joints: Vec<String>,
+}
 
 /// `locked = ["joint", ...]`: these joints brake to standstill and stay, whatever is proposed.
 #[derive(Debug, Clone)]
 pub struct LockedJoints {
-    joints: Vec<String>,
+    settings: LockedSettings,
 }
 
 impl LockedJoints {
+    /// From the task file's settings.
+    pub fn new(settings: LockedSettings) -> LockedJoints {
+        LockedJoints { settings }
+    }
+
     /// The joints by name.
-    pub fn new(joints: Vec<String>) -> LockedJoints {
-        LockedJoints { joints }
+    pub fn of(joints: Vec<String>) -> LockedJoints {
+        LockedJoints { settings: LockedSettings { joints } }
     }
 }
 
@@ -22,7 +47,7 @@ impl Limit for LockedJoints {
     }
 
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
-        for name in &self.joints {
+        for name in &self.settings.joints {
             let unknown = |near| LimitError::UnknownJoint { limit: "locked", name: name.clone(), near };
             let joint = model.find(name).map_err(unknown)?;
             for i in joint.idx_v..joint.idx_v + joint.nv {

@@ -1,8 +1,9 @@
 //! Limits: what a task file may ask for, one implementation a file.
 //!
-//! A new one is a file with a type implementing [`Limit`], a field in [`ConstraintSettings`] and a line in
-//! [`REGISTRY`]. Limits of single joints narrow the [`LimitSet`]; limits that tie joints together hand out [`Rows`] or a [`Cone`].
+//! A new one is a file with a type implementing [`Limit`] and what it says [`About`] itself, and its line of the
+//! registry below. Limits of single joints narrow the [`LimitSet`]; limits that tie joints together hand out [`Rows`] or a [`Cone`].
 
+mod about;
 mod acceleration;
 mod action;
 mod clearance;
@@ -16,6 +17,7 @@ mod locked;
 mod margin;
 mod moved;
 mod position;
+mod registry;
 mod set;
 mod settings;
 mod torque;
@@ -25,6 +27,7 @@ mod user;
 mod velocity;
 mod velocity_profile;
 
+pub use about::{About, Argument, Form, Takes};
 pub use acceleration::{AccelerationLimit, AccelerationSettings};
 pub use action::{ActionLimit, ActionReport, ActionSettings};
 pub use collision::{CollisionLimit, CollisionSettings, SolidSettings};
@@ -33,12 +36,13 @@ pub use energy::{EnergyLimit, EnergySettings};
 pub use frame::{FrameBox, FrameLimit, FrameSettings, HalfSpace};
 pub use frame_speed::{FrameSpeedLimit, FrameSpeedSettings};
 pub use jerk::{JerkLimit, JerkSettings};
-pub use locked::LockedJoints;
+pub use locked::{LockedJoints, LockedSettings};
 pub use margin::AlwaysHard;
 pub use moved::Moved;
 pub use position::{PositionLimit, PositionSettings};
+pub use registry::LimitEntry;
 pub use set::LimitSet;
-pub use settings::{ConstraintSettings, PerJoint};
+pub use settings::PerJoint;
 pub use torque::{TorqueLimit, TorqueSettings};
 pub use torque_rate::{TorqueRateLimit, TorqueRateSettings};
 pub use torque_speed::{TorqueSpeedLimit, TorqueSpeedSettings};
@@ -93,129 +97,22 @@ pub trait Limit: Send + Sync + std::fmt::Debug {
     }
 }
 
-/// Makes the limits of one kind from the task file's section.
-type Build = fn(&ConstraintSettings, &Model) -> Result<Vec<Box<dyn Limit>>, LimitError>;
-
-/// Whether a kind of limit forbids or resists.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Form {
-    /// Always hard: braking counts on it.
-    Hard,
-    /// Soft: braking comes first. `jerk` is hard with `hard = true`.
-    Soft,
-    /// Hard unless `soft` is given.
-    Either,
-}
-
-/// One kind of limit.
-pub struct LimitEntry {
-    /// Name in the task file.
-    pub name: &'static str,
-    /// What a line of the task file looks like, with the joints of a Panda.
-    pub example: &'static str,
-    /// Hard, soft or either.
-    pub form: Form,
-    /// Makes the limits.
-    pub build: Build,
-}
-
-/// All kinds of limits by their name in the task file.
-pub const REGISTRY: &[LimitEntry] = &[
-    LimitEntry {
-        name: "position",
-        example: "position = { margin = 0.01 }",
-        form: Form::Hard,
-        build: |s, _| Ok(one(&s.position, PositionLimit::new)),
-    },
-    LimitEntry {
-        name: "velocity",
-        example: "velocity = { scale = 0.8 }",
-        form: Form::Hard,
-        build: |s, _| Ok(one(&s.velocity, VelocityLimit::new)),
-    },
-    LimitEntry {
-        name: "acceleration",
-        example: "acceleration = { limit = 10.0 }",
-        form: Form::Hard,
-        build: |s, _| Ok(one(&s.acceleration, AccelerationLimit::new)),
-    },
-    LimitEntry {
-        name: "torque",
-        example: "torque = { scale = 0.9 }",
-        form: Form::Either,
-        build: |s, _| Ok(one(&s.torque, TorqueLimit::new)),
-    },
-    LimitEntry {
-        name: "jerk",
-        example: "jerk = { limit = 500.0 }",
-        form: Form::Soft,
-        build: |s, _| Ok(one(&s.jerk, JerkLimit::new)),
-    },
-    LimitEntry {
-        name: "torque_speed",
-        example: "torque_speed = { stall = 80.0, no_load = 3.0 }",
-        form: Form::Either,
-        build: |s, _| Ok(one(&s.torque_speed, TorqueSpeedLimit::new)),
-    },
-    LimitEntry {
-        name: "torque_rate",
-        example: "torque_rate = { limit = 1000.0 }",
-        form: Form::Soft,
-        build: |s, _| Ok(one(&s.torque_rate, TorqueRateLimit::new)),
-    },
-    LimitEntry {
-        name: "velocity_profile",
-        example: "velocity_profile = \"fr3\"",
-        form: Form::Hard,
-        build: |s, _| Ok(one(&s.velocity_profile, VelocityProfileLimit::new)),
-    },
-    LimitEntry {
-        name: "locked",
-        example: "locked = [\"panda_joint7\"]",
-        form: Form::Hard,
-        build: |s, _| Ok(one(&(!s.locked.is_empty()).then(|| s.locked.clone()), LockedJoints::new)),
-    },
-    LimitEntry {
-        name: "frame",
-        example: "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.1] }, braking = 5.0 }]",
-        form: Form::Either,
-        build: |s, _| Ok(each(&s.frame, FrameLimit::new)),
-    },
-    LimitEntry {
-        name: "frame_speed",
-        example: "frame_speed = [{ frame = \"panda_hand\", limit = 0.25 }]",
-        form: Form::Either,
-        build: |s, _| Ok(each(&s.frame_speed, FrameSpeedLimit::new)),
-    },
-    LimitEntry {
-        name: "energy",
-        example: "energy = { limit = 2.0 }",
-        form: Form::Either,
-        build: |s, _| Ok(one(&s.energy, EnergyLimit::new)),
-    },
-    LimitEntry {
-        name: "collision",
-        example: "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, \
-                  { name = \"floor\", shape = \"half_space\" }], braking = 2.0 }",
-        form: Form::Either,
-        build: |s, _| Ok(one(&s.collision, CollisionLimit::new)),
-    },
-    LimitEntry {
-        name: "rows",
-        example: "rows = [{ name = \"elbow up\", terms = { \"q.panda_joint4\" = 1.0 }, upper = -0.5, braking = 2.0 }]",
-        form: Form::Either,
-        build: |s, _| Ok(each(&s.rows, UserRow::new)),
-    },
-];
-
-/// The limit a setting asks for, if any.
-fn one<S: Clone, L: Limit + 'static>(settings: &Option<S>, new: fn(S) -> L) -> Vec<Box<dyn Limit>> {
-    each(settings.as_slice(), new)
-}
-
-/// A limit for each setting.
-fn each<S: Clone, L: Limit + 'static>(settings: &[S], new: fn(S) -> L) -> Vec<Box<dyn Limit>> {
-    settings.iter().map(|s| Box::new(new(s.clone())) as Box<dyn Limit>).collect()
+// Key of the task file, settings, where the limit is, its kind with the number in logs and the name in reports.
+registry::limits! {
+    position: Option<PositionSettings> => position::PositionLimit, Position = 0 "position";
+    velocity: Option<VelocitySettings> => velocity::VelocityLimit, Velocity = 1 "velocity";
+    acceleration: Option<AccelerationSettings> => acceleration::AccelerationLimit, Acceleration = 2 "acceleration";
+    torque: Option<TorqueSettings> => torque::TorqueLimit, Torque = 4 "torque";
+    jerk: Option<JerkSettings> => jerk::JerkLimit, Jerk = 5 "jerk";
+    torque_speed: Option<TorqueSpeedSettings> => torque_speed::TorqueSpeedLimit, TorqueSpeed = 6 "torque_speed";
+    torque_rate: Option<TorqueRateSettings> => torque_rate::TorqueRateLimit, TorqueRate = 7 "torque_rate";
+    velocity_profile: Option<VelocityProfileSettings> => velocity_profile::VelocityProfileLimit, VelocityProfile = 14 "velocity_profile";
+    locked: Option<LockedSettings> => locked::LockedJoints, Locked = 13 "locked";
+    frame: Vec<FrameSettings> => frame::FrameLimit, Frame = 8 "frame";
+    frame_speed: Vec<FrameSpeedSettings> => frame_speed::FrameSpeedLimit, FrameSpeed = 9 "frame_speed";
+    energy: Option<EnergySettings> => energy::EnergyLimit, Energy = 10 "energy";
+    collision: Option<CollisionSettings> => collision::CollisionLimit, Collision = 11 "collision";
+    rows: Vec<UserRowSettings> => user::UserRow, User = 12 "user";
 }
 
 /// The limits that a task file's `[constraints]` asks for, checked against all joints of `model` they name.
@@ -232,7 +129,7 @@ pub fn build_limits(settings: &ConstraintSettings, model: &Model) -> Result<Vec<
     }
     let mut limits = Vec::new();
     for entry in REGISTRY {
-        limits.extend((entry.build)(settings, model)?);
+        limits.extend((entry.build)(settings));
     }
     for limit in &limits {
         limit.restrict(model, &[], &mut LimitSet::unlimited(model.nv()))?;

@@ -1,8 +1,20 @@
 //! Position limits of the robot file.
 
-use super::{AlwaysHard, Limit, LimitSet, PerJoint, quoted};
+use super::{About, AlwaysHard, Argument, Form, Limit, LimitSet, PerJoint, Takes, quoted};
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "PositionLimit",
+    promise: "The joint can always stop in front of the limits of the robot file, at any period and number of physics \
+        steps. `margin` is kept inside them.",
+    example: "position = { margin = 0.01 }",
+    form: Form::Hard,
+    margin: "from both ends [rad, m]",
+    stricter: None,
+    arguments: &[Argument::or("margin", Takes::PerJoint, "0.0")],
+};
 
 /// `position = { margin }`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

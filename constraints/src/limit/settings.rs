@@ -1,72 +1,32 @@
-//! The `[constraints]` section of a task file.
+//! What settings of several kinds are made of.
 
-use super::{
-    AccelerationSettings, ActionSettings, CollisionSettings, EnergySettings, FrameSettings,
-    FrameSpeedSettings, JerkSettings, PositionSettings, TorqueRateSettings, TorqueSettings,
-    TorqueSpeedSettings, UserRowSettings, VelocityProfileSettings, VelocitySettings,
-};
-use crate::{Braking, Consistency, Guard, LimitError, Model, Solver};
+use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// `[constraints]`: how proposals are made consistent and which limits hold. A limit that is not named does not hold.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ConstraintSettings {
-    /// `"kinematic"` (default) or `"free"`.
-    pub consistency: Consistency,
-    /// `"ladder"` (default) or `"clarabel"`.
-    pub solver: Solver,
-    /// `"auto"` (default), `"certified"` or `"stored"`.
-    pub braking: Braking,
-    /// `true`: actions of a policy and of a learned inverse model lead to a projected state too.
-    #[serde(skip_serializing_if = "Guard::is_off")]
-    pub guard: Guard,
-    /// `position = { margin = 0.01 }`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub position: Option<PositionSettings>,
-    /// `velocity = { scale = 0.8 }` or `velocity = { limit = 2.0 }`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub velocity: Option<VelocitySettings>,
-    /// `acceleration = { limit = 10.0 }` or `acceleration = { limit = { elbow = 10.0 } }`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub acceleration: Option<AccelerationSettings>,
-    /// `torque = { scale = 0.9 }`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub torque: Option<TorqueSettings>,
-    /// `jerk = { limit = 500.0 }`, soft, or `jerk = { limit = 500.0, hard = true }`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub jerk: Option<JerkSettings>,
-    /// `torque_speed = { stall = 80.0, no_load = 3.0 }`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub torque_speed: Option<TorqueSpeedSettings>,
-    /// `torque_rate = { limit = 1000.0 }`; soft.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub torque_rate: Option<TorqueRateSettings>,
-    /// `velocity_profile = "fr3"` or curves by joint.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub velocity_profile: Option<VelocityProfileSettings>,
-    /// `locked = ["joint"]`.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub locked: Vec<String>,
-    /// `frame = [{ frame, point, half_space, box, braking, margin, soft }]`.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub frame: Vec<FrameSettings>,
-    /// `frame_speed = [{ frame, point, limit }]`.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub frame_speed: Vec<FrameSpeedSettings>,
-    /// `energy = { limit = 2.0 }`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub energy: Option<EnergySettings>,
-    /// `collision = { shapes, urdf, ignore, adjacent, braking, margin, influence, rows, soft }`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub collision: Option<CollisionSettings>,
-    /// `action = { power = 20.0 }`; of policies whose actions come out of a network, see [`ActionLimit`](crate::ActionLimit).
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub action: Option<ActionSettings>,
-    /// `rows = [{ name, terms, lower, upper, equals, braking, soft }]`.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub rows: Vec<UserRowSettings>,
+/// Settings of one kind: of one limit or none, or of a list.
+pub(super) trait Section {
+    /// A list.
+    const MANY: bool;
+
+    /// Nothing is asked for.
+    fn is_absent(&self) -> bool;
+}
+
+impl<S> Section for Option<S> {
+    const MANY: bool = false;
+
+    fn is_absent(&self) -> bool {
+        self.is_none()
+    }
+}
+
+impl<S> Section for Vec<S> {
+    const MANY: bool = true;
+
+    fn is_absent(&self) -> bool {
+        self.is_empty()
+    }
 }
 
 /// One number for every joint, numbers by joint name, or one number for each dof in the order of a velocity.

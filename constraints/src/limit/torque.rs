@@ -1,10 +1,26 @@
 //! Motor force limits of the robot file.
 
 use super::margin::{less_each, less_friction};
-use super::{Limit, LimitSet, PerJoint, quoted};
+use super::{About, Argument, Form, Limit, LimitSet, PerJoint, Takes, quoted};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "TorqueLimit",
+    promise: "Motor forces by Pinocchio, on average over the period, stay below `scale`, a share in (0, 1] of the robot \
+        file's limits. What is soft is nothing that a certified or stored brake may count on.",
+    example: "torque = { scale = 0.9 }",
+    form: Form::Either,
+    margin: "[N·m, N]",
+    stricter: Some([
+        "torque = { scale = 0.55, margin = { panda_joint1 = 8.7, panda_joint2 = 8.7, panda_joint3 = 8.7, panda_joint4 \
+        = 8.7, panda_joint5 = 1.2, panda_joint6 = 1.2, panda_joint7 = 1.2 } }",
+        "torque = { scale = 0.45 }",
+    ]),
+    arguments: &[Argument::or("scale", Takes::Number, "1.0"), Argument::MARGINS, Argument::SOFT],
+};
 
 /// `torque = { scale }`, also with `margin` and `soft`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

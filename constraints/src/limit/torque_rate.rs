@@ -1,10 +1,25 @@
 //! Limits on how fast motor forces change.
 
 use super::margin::less_each;
-use super::{Limit, PerJoint};
+use super::{About, Argument, Form, Limit, PerJoint, Takes};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "TorqueRateLimit",
+    promise: "Change of motor forces in a second. Always soft: braking comes first. It needs the tick before.",
+    example: "torque_rate = { limit = 1000.0 }",
+    form: Form::Soft,
+    margin: "[N·m/s, N/s]",
+    stricter: Some(["torque_rate = { limit = 1500.0, margin = 500.0 }", "torque_rate = { limit = 1000.0 }"]),
+    arguments: &[
+        Argument::needed("limit", Takes::PerJoint),
+        Argument::or("soft", Takes::Soft, "None"),
+        Argument::MARGINS,
+    ],
+};
 
 /// `torque_rate = { limit }` or `torque_rate = { limit, soft = { linear, quadratic } }`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,10 +1,30 @@
 //! Motors whose force falls with speed.
 
 use super::margin::{less_each, less_friction};
-use super::{Limit, PerJoint};
+use super::{About, Argument, Form, Limit, PerJoint, Takes};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "TorqueSpeedLimit",
+    promise: "The line of a direct-current motor: `|tau + stall / no_load v| <= stall - margin` in [N·m, N] and [rad/s, \
+        m/s].",
+    example: "torque_speed = { stall = 80.0, no_load = 3.0 }",
+    form: Form::Either,
+    margin: "of force, at every speed [N·m, N]",
+    stricter: Some([
+        "torque_speed = { stall = 80.0, no_load = 3.0, margin = 40.0 }",
+        "torque_speed = { stall = 40.0, no_load = 1.5 }",
+    ]),
+    arguments: &[
+        Argument::needed("stall", Takes::PerJoint),
+        Argument::needed("no_load", Takes::PerJoint),
+        Argument::or("soft", Takes::Soft, "None"),
+        Argument::MARGINS,
+    ],
+};
 
 /// `torque_speed = { stall, no_load }`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

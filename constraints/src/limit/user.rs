@@ -1,12 +1,37 @@
 //! Linear rows of the task file's own, by state names.
 
-use super::Limit;
 use super::margin::is_zero;
+use super::{About, Argument, Form, Limit, Takes};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::viability::{POSITION_TOLERANCE, approach};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "RowLimit",
+    promise: "A linear row over `q.`, `v.` and `a.` of joints of the next state: `lower`, `upper` or `equals`. With \
+        `braking` a sum of positions stops in front of its bounds.",
+    example: "rows = [{ name = \"elbow up\", terms = { \"q.panda_joint4\" = 1.0 }, upper = -0.5, braking = 2.0 }]",
+    form: Form::Either,
+    margin: "from `lower` and `upper`, in the unit of the sum; not with `equals`",
+    stricter: Some([
+        "rows = [{ name = \"r\", terms = { \"q.panda_joint4\" = 1.0 }, braking = 2.0, upper = -0.5, lower = -2.8, \
+        margin = 0.9 }]",
+        "rows = [{ name = \"r\", terms = { \"q.panda_joint4\" = 1.0 }, braking = 2.0, upper = -1.4, lower = -1.9 }]",
+    ]),
+    arguments: &[
+        Argument::needed("name", Takes::Text),
+        Argument::needed("terms", Takes::Numbers),
+        Argument::named("lower", Takes::Number, "None"),
+        Argument::named("upper", Takes::Number, "None"),
+        Argument::named("equals", Takes::Number, "None"),
+        Argument::named("braking", Takes::Number, "None"),
+        Argument::SOFT,
+        Argument::MARGIN,
+    ],
+};
 
 /// `rows = [{ name, terms = { "q.joint" = 1.0, "v.joint" = -0.5 }, lower, upper, equals, braking, margin, soft }]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

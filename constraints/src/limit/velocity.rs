@@ -1,9 +1,25 @@
 //! Speed limits: the robot file's, scaled, or the task file's own.
 
 use super::margin::less_each;
-use super::{AlwaysHard, Limit, LimitSet, PerJoint, quoted};
+use super::{About, AlwaysHard, Argument, Form, Limit, LimitSet, PerJoint, Takes, quoted};
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "VelocityLimit",
+    promise: "Speed stays below `scale`, a share in (0, 1] of the robot file's limits, or below `limit` [rad/s, m/s]; the \
+        smaller holds where both are given.",
+    example: "velocity = { scale = 0.8 }",
+    form: Form::Hard,
+    margin: "[rad/s, m/s]",
+    stricter: Some(["velocity = { limit = 0.9, margin = 0.3 }", "velocity = { limit = 0.6 }"]),
+    arguments: &[
+        Argument::or("limit", Takes::PerJoint, "None"),
+        Argument::named("scale", Takes::Number, "None"),
+        Argument::MARGINS,
+    ],
+};
 
 /// `velocity = { scale }` or `velocity = { limit }`, less `margin`; with both, the smaller holds; with none, `scale = 1`. Joints that
 /// `limit` does not name keep the robot file's.

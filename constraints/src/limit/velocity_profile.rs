@@ -1,11 +1,29 @@
 //! Speed limits that depend on the position, as robot makers state them.
 
 use super::margin::{is_zero, less};
-use super::{Limit, LimitSet};
+use super::{About, Argument, Form, Limit, LimitSet, Takes};
 use crate::viability::Profile;
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "VelocityProfileLimit",
+    promise: "The speed limit falls in front of a position: Franka's published rule for a Research 3, or by joint `limit`, \
+        `offset` [rad/s], `squared` [rad/s²], `lower` and `upper` [rad] in `v <= min(limit, -offset + sqrt(squared \
+        (upper - q)))`.",
+    example: "velocity_profile = \"fr3\"",
+    form: Form::Hard,
+    margin: "[rad/s, m/s], also `{ robot = \"fr3\", margin = 0.05 }`",
+    stricter: Some([
+        "velocity_profile = { panda_joint4 = { squared = 0.5, lower = -2.2, upper = -1.4, limit = 1.0, offset = 0.05, \
+        margin = 0.1 } }",
+        "velocity_profile = { panda_joint4 = { squared = 0.5, lower = -2.2, upper = -1.4, limit = 0.9, offset = 0.15 } \
+        }",
+    ]),
+    arguments: &[Argument::needed("profile", Takes::Curves).at(""), Argument::MARGIN],
+};
 
 /// `velocity_profile = "fr3"`, `{ robot = "fr3", margin = 0.05 }`, or the curves joint by joint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

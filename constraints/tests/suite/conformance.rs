@@ -24,7 +24,7 @@ fn projector(constraints: &ConstraintSettings, solver: Solver) -> Projector {
 
 /// The example of a kind with one more setting, such as `("margin", 0.1)` or `("soft", table)`, in its first limit.
 fn with_setting(entry: &LimitEntry, key: &str, value: impl Into<toml::Value>) -> String {
-    let mut section: toml::Table = toml::from_str(entry.example).unwrap();
+    let mut section: toml::Table = toml::from_str(entry.about.example).unwrap();
     let limit = match section.iter_mut().next().unwrap().1 {
         toml::Value::Array(limits) => &mut limits[0],
         limit => limit,
@@ -72,7 +72,7 @@ fn walk(
 #[test]
 fn every_kind_reads_its_example_and_stays_finite_and_inside() {
     for entry in REGISTRY {
-        let mut projector = projector(&settings_with(entry.example), Solver::Ladder);
+        let mut projector = projector(&settings_with(entry.about.example), Solver::Ladder);
         let (mut solved, mut braked) = (0, 0);
         walk(&mut projector, 4000, 3, |_, _, _, target| {
             assert!(target.q.iter().chain(&target.v).chain(&target.acceleration).all(|x| x.is_finite()));
@@ -91,16 +91,14 @@ fn every_kind_binds_somewhere_and_not_when_it_is_switched_off() {
         let kinds = |projector: &mut Projector| {
             let mut active = 0;
             walk(projector, 4000, 3, |_, _, _, target| {
-                let own = |row: &&ActiveRow| {
-                    row.kind.name() == entry.name || (row.kind, entry.name) == (Kind::User, "rows")
-                };
+                let own = |row: &&ActiveRow| row.kind == entry.kind;
                 active += target.ledger.active.iter().filter(own).count();
             });
             active
         };
         let line = match entry.name {
             "torque" => "torque = { scale = 0.45 }",
-            _ => entry.example,
+            _ => entry.about.example,
         };
         let mut projector = projector(&settings_with(line), Solver::Ladder);
         let label = projector.enabled().map(|(l, _)| l.to_string()).last().unwrap();
@@ -117,16 +115,15 @@ fn every_kind_binds_somewhere_and_not_when_it_is_switched_off() {
 
 #[test]
 fn every_kind_is_hard_or_soft_as_the_registry_says() {
-    let model = panda();
     for entry in REGISTRY.iter().filter(|e| e.name != "locked") {
         let read = |line: &str| -> Result<Option<Soft>, String> {
             let section: ConstraintSettings = toml::from_str(line).map_err(|e| e.to_string())?;
-            let limits = (entry.build)(&section, &model).map_err(|e| e.to_string())?;
+            let limits = (entry.build)(&section);
             Ok(limits[0].soft())
         };
-        let (plain, soft) = (read(entry.example).unwrap(), read(&softened(entry)));
+        let (plain, soft) = (read(entry.about.example).unwrap(), read(&softened(entry)));
         let given = Some(Soft { linear: 0.1, quadratic: 5.0 });
-        match entry.form {
+        match entry.about.form {
             Form::Hard => {
                 let error = soft.expect_err(entry.name);
                 assert!(plain.is_none() && error.contains("always hard"), "{}: {error}", entry.name);
@@ -142,7 +139,7 @@ fn every_kind_is_hard_or_soft_as_the_registry_says() {
 /// A soft limit gives way to a pull stronger than its price and says by how much; it is no violation, and both solvers find the same.
 #[test]
 fn soft_kinds_give_way_and_say_so() {
-    for entry in REGISTRY.iter().filter(|e| e.form == Form::Either) {
+    for entry in REGISTRY.iter().filter(|e| e.about.form == Form::Either) {
         let line = match entry.name {
             "torque" => "torque = { scale = 0.45, soft = { linear = 0.1, quadratic = 5.0 } }".to_string(),
             "torque_speed" => {
@@ -173,73 +170,10 @@ fn soft_kinds_give_way_and_say_so() {
 /// A limit with a margin is the limit that is stricter by it.
 #[test]
 fn a_margin_is_kept_for_every_kind_with_a_bound() {
-    let hand = "frame = \"panda_hand\"";
-    let profile = |rest: &str| {
-        format!(
-            "velocity_profile = {{ panda_joint4 = {{ squared = 0.5, lower = -2.2, upper = -1.4, {rest} }} }}"
-        )
-    };
-    let solids = |radius: f64, rest: &str| {
-        format!(
-            "collision = {{ shapes = [{{ {hand}, shape = {{ sphere = {{ radius = {radius} }} }} }}, \
-             {{ name = \"floor\", shape = \"half_space\" }}], braking = 2.0, {rest} }}"
-        )
-    };
-    let plane = |z: f64, rest: &str| {
-        format!(
-            "frame = [{{ {hand}, half_space = {{ normal = [0, 0, -1], through = [0, 0, {z}] }}, braking = 5.0{rest} }}]"
-        )
-    };
-    let row = |rest: &str| {
-        format!("rows = [{{ name = \"r\", terms = {{ \"q.panda_joint4\" = 1.0 }}, braking = 2.0, {rest} }}]")
-    };
-    let efforts = "panda_joint1 = 8.7, panda_joint2 = 8.7, panda_joint3 = 8.7, panda_joint4 = 8.7, \
-                   panda_joint5 = 1.2, panda_joint6 = 1.2, panda_joint7 = 1.2";
-    let pairs: Vec<(&str, String, String)> = vec![
-        ("velocity", "velocity = { limit = 0.9, margin = 0.3 }".into(), "velocity = { limit = 0.6 }".into()),
-        (
-            "acceleration",
-            "acceleration = { limit = 10.0, braking = 4.0, margin = { panda_joint1 = 3.0 } }".into(),
-            format!(
-                "acceleration = {{ limit = {{ panda_joint1 = 7.0{} }}, braking = 4.0 }}",
-                (2..8).map(|k| format!(", panda_joint{k} = 10.0")).collect::<String>()
-            ),
-        ),
-        (
-            "torque",
-            format!("torque = {{ scale = 0.55, margin = {{ {efforts} }} }}"),
-            "torque = { scale = 0.45 }".into(),
-        ),
-        ("jerk", "jerk = { limit = 600.0, margin = 100.0 }".into(), "jerk = { limit = 500.0 }".into()),
-        (
-            "torque_speed",
-            "torque_speed = { stall = 80.0, no_load = 3.0, margin = 40.0 }".into(),
-            "torque_speed = { stall = 40.0, no_load = 1.5 }".into(),
-        ),
-        (
-            "torque_rate",
-            "torque_rate = { limit = 1500.0, margin = 500.0 }".into(),
-            "torque_rate = { limit = 1000.0 }".into(),
-        ),
-        (
-            "velocity_profile",
-            profile("limit = 1.0, offset = 0.05, margin = 0.1"),
-            profile("limit = 0.9, offset = 0.15"),
-        ),
-        ("frame", plane(0.1, ", margin = 0.3"), plane(0.4, "")),
-        (
-            "frame_speed",
-            format!("frame_speed = [{{ {hand}, limit = 0.25, margin = 0.1 }}]"),
-            format!("frame_speed = [{{ {hand}, limit = 0.15 }}]"),
-        ),
-        ("energy", "energy = { limit = 2.0, margin = 1.5 }".into(), "energy = { limit = 0.5 }".into()),
-        ("collision", solids(0.1, "margin = 0.3, influence = 0.5"), solids(0.4, "influence = 0.2")),
-        ("rows", row("upper = -0.5, lower = -2.8, margin = 0.9"), row("upper = -1.4, lower = -1.9")),
-    ];
-    let covered = |name: &str| pairs.iter().any(|(known, ..)| *known == name);
-    let bare = ["position", "locked"]; // in projector.rs; no bound
-    assert!(REGISTRY.iter().all(|e| covered(e.name) || bare.contains(&e.name)));
-    for (name, margin, strict) in &pairs {
+    let bare: Vec<&str> = REGISTRY.iter().filter(|e| e.about.stricter.is_none()).map(|e| e.name).collect();
+    assert_eq!(bare, ["position", "locked"], "position is in projector.rs; what is locked has no bound");
+    for (entry, [margin, strict]) in REGISTRY.iter().filter_map(|e| Some((e, e.about.stricter?))) {
+        let name = entry.name;
         let mut with = projector(&settings_with(margin), Solver::Ladder);
         let mut without = projector(&settings_with(strict), Solver::Ladder);
         let (mut other, mut furthest, mut held) = (Target::new(with.model()), 0.0f64, 0);
@@ -248,8 +182,7 @@ fn a_margin_is_kept_for_every_kind_with_a_bound() {
             if without.needs_previous() {
                 without.remember(target);
             }
-            let own =
-                |row: &&ActiveRow| row.kind.name() == *name || (row.kind, *name) == (Kind::User, "rows");
+            let own = |row: &&ActiveRow| row.kind == entry.kind;
             held += usize::from(target.ledger.active.iter().any(|row| own(&row)));
             furthest = (0..7).fold(furthest, |most, i| most.max((other.v[i] - target.v[i]).abs()));
         });
@@ -261,7 +194,7 @@ fn a_margin_is_kept_for_every_kind_with_a_bound() {
 #[test]
 fn both_solvers_agree_on_every_kind() {
     for entry in REGISTRY {
-        let constraints = settings_with(entry.example);
+        let constraints = settings_with(entry.about.example);
         let mut ladder = projector(&constraints, Solver::Ladder);
         let mut clarabel = projector(&constraints, Solver::Clarabel);
         let mut other = Target::new(ladder.model());
@@ -283,7 +216,7 @@ fn both_solvers_agree_on_every_kind() {
 #[test]
 fn projecting_twice_changes_nothing_for_every_kind() {
     for entry in REGISTRY {
-        let constraints = settings_with(entry.example);
+        let constraints = settings_with(entry.about.example);
         let mut first = projector(&constraints, Solver::Ladder);
         let mut second = projector(&constraints, Solver::Ladder);
         let mut again = Target::new(first.model());
@@ -354,25 +287,5 @@ fn impossible_numbers_are_refused_by_name() {
             limits.and_then(|l| Projector::new(&model, &l, &[0, 1, 2, 3, 4, 5, 6], Settings::new(0.001, 1)));
         let error = built.err().unwrap_or_else(|| panic!("{line} was accepted")).to_string();
         assert!(error.contains(expected), "{line}: {error}");
-    }
-}
-
-#[test]
-fn the_page_about_limits_names_every_kind_with_its_example() {
-    let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/LIMITS.md")).unwrap();
-    for entry in REGISTRY {
-        assert!(
-            page.contains(&format!("| `{}` |", entry.example)),
-            "docs/LIMITS.md lacks `{}`",
-            entry.example
-        );
-        let form = match entry.form {
-            Form::Hard => "hard",
-            Form::Soft => "soft",
-            Form::Either => "hard or soft",
-        };
-        let line =
-            page.lines().find(|l| l.starts_with(&format!("| `{}` |", entry.name))).unwrap_or("no line");
-        assert!(line.contains(&format!("| {form} |")), "docs/LIMITS.md says of {}: {line}", entry.name);
     }
 }

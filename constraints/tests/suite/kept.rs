@@ -1,8 +1,9 @@
 //! Every kind of limit, alone and all together, at every period and number of physics steps, kept under attack on arms nobody has built.
 
 use crate::attack_scenes::run::{Seen, attack};
-use crate::attack_scenes::scene::{KINDS, Scene};
+use crate::attack_scenes::scene::{KINDS, SOFT, Scene};
 use crate::common::arms::random_arm;
+use nearl_constraints::limit::REGISTRY;
 use nearl_constraints::*;
 use std::sync::Mutex;
 
@@ -23,6 +24,15 @@ const WITH_JERK: [&str; 8] = [
     "jerk+collision",
     "jerk+rows",
 ];
+
+/// A new kind has to be measured (`examples/attack/meter.rs`) and attacked.
+#[test]
+fn every_kind_of_the_registry_is_attacked() {
+    let joints = ["position", "velocity", "acceleration"];
+    let attacked = |name: &str| KINDS.iter().chain(&SOFT).chain(&joints).any(|known| *known == name);
+    let missing: Vec<&str> = REGISTRY.iter().map(|entry| entry.name).filter(|name| !attacked(name)).collect();
+    assert!(missing.is_empty(), "nothing attacks {missing:?}: add it to examples/attack/scene.rs");
+}
 
 #[test]
 fn every_kind_is_kept_alone_and_together() {

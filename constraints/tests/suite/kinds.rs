@@ -84,7 +84,7 @@ fn the_fr3_rule_holds_at_every_tick() {
 #[test]
 fn a_locked_joint_brakes_and_stays() {
     let mut projector =
-        with(vec![Box::new(LockedJoints::new(vec!["panda_joint3".into()]))], Settings::new(0.001, 1));
+        with(vec![Box::new(LockedJoints::of(vec!["panda_joint3".into()]))], Settings::new(0.001, 1));
     let (q, mut v) = (vec![0.1, -0.4, 0.2, -1.8, 0.1, 1.9, 0.3], vec![0.0; 7]);
     v[2] = 0.01;
     let raw = Proposal { q: q.clone(), v: vec![0.005; 7] };

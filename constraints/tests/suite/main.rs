@@ -27,3 +27,4 @@ mod projector;
 mod stages;
 mod stored_brake;
 mod viability;
+mod written;

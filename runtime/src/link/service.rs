@@ -1,8 +1,8 @@
 //! Opening iceoryx2 services with the same settings on every end.
 //!
-//! Only publish-subscribe is used; state and action need no service (`super::board`). Whoever starts first creates the service, the others open it, so start order does
-//! not matter. Who may publish is decided by [`Owner`]; a topic has a second publisher's place for a tunnel to another host.
-//! What a killed process left is removed when the next node joins.
+//! Only publish-subscribe is used; state and action need no service (`super::board`). Whoever starts first creates the service, the others open it, so start
+//! order does not matter. Who may publish is decided by [`Owner`]; a topic has a second publisher's place for a tunnel to another host. What a killed process
+//! left is removed when the next node joins.
 
 use std::time::Duration;
 

@@ -4,8 +4,8 @@
 //! written so that reading them gives the same bits. What rows, joints, statuses and units are called stands once, in the metadata
 //! and with each snapshot. Snapshots are attachments, and topic `snapshot` says which number is which.
 //!
-//! If the disk is slow, what replay computes is left out of the ticks first (topic `brief`); then, or where the disk is full, whole records are dropped and counted; the loop never
-//! notices. [`replay()`] computes a log again, and after a gap goes on from the next memory (topic `memory`).
+//! If the disk is slow, what replay computes is left out of the ticks first (topic `brief`); then, or where the disk is full, whole records are dropped and
+//! counted; the loop never notices. [`replay()`] computes a log again, and after a gap goes on from the next memory (topic `memory`).
 
 mod brief;
 mod facts;

@@ -145,6 +145,23 @@ struct Given<'a> {
     proposal: Option<&'a ProposalMessage>,
 }
 
+/// [`Given`] of a message, whole or in brief, which call the same things by the same names.
+macro_rules! given {
+    ($json:ident, $($own:ident: $value:expr,)*) => {
+        Given {
+            tick: $json.tick,
+            due: $json.due_ns,
+            begin: $json.begin_ns,
+            end: $json.end_ns,
+            snapshot: $json.snapshot,
+            has_state: $json.fresh || $json.ignored,
+            swapped: $json.swapped,
+            stop: $json.stop,
+            $($own: $value,)*
+        }
+    };
+}
+
 impl<B: Build> Replayer<B> {
     fn new(build: B) -> Self {
         Replayer {
@@ -236,20 +253,12 @@ impl<B: Build> Replayer<B> {
         let too_long = |what: &str| format!("a {what} of tick {} is too long", json.tick);
         let record = json.record().ok_or_else(|| too_long("vector"))?;
         let proposal = json.proposal().ok_or_else(|| too_long("proposal"))?;
-        let given = Given {
-            tick: json.tick,
-            due: json.due_ns,
-            begin: json.begin_ns,
-            end: json.end_ns,
-            snapshot: json.snapshot,
-            has_state: json.fresh || json.ignored,
-            swapped: json.swapped,
-            stop: json.stop,
+        let given = given!(json,
             duration: json.duration(),
             dropped: (json.counters.dropped_actions, json.counters.dropped_records),
             state: &record.state,
             proposal: proposal.as_ref(),
-        };
+        );
         if self.advance(&given)? {
             self.compare(json.tick, logged)?;
         }
@@ -266,20 +275,12 @@ impl<B: Build> Replayer<B> {
         let json = serde_json::from_slice::<BriefJson<'_>>(logged).map_err(damaged)?;
         let state =
             json.state.message().ok_or_else(|| format!("a vector of tick {} is too long", json.tick))?;
-        let given = Given {
-            tick: json.tick,
-            due: json.due_ns,
-            begin: json.begin_ns,
-            end: json.end_ns,
-            snapshot: json.snapshot,
-            has_state: json.fresh || json.ignored,
-            swapped: json.swapped,
-            stop: json.stop,
+        let given = given!(json,
             duration: json.duration_ns,
             dropped: (json.dropped_actions, json.dropped_records),
             state: &state,
             proposal: None, // a tick that one came in is written whole
-        };
+        );
         if self.advance(&given)? {
             let own = digest(&self.line);
             match own == json.digest {

@@ -6,7 +6,8 @@
 //! trainer ──snapshot──> receiver ──> I/O ──> builder ──> I/O ──slot──> real-time thread ──old controller──> I/O ──> builder (dropped there)
 //! ```
 //!
-//! The pages to read are `core.rs`, a tick without threads and clocks, and `cycle.rs`, the thread around it. A run is [`run`]: a snapshot file on a plant by name.
+//! The pages to read are `core.rs`, a tick without threads and clocks, and `cycle.rs`, the thread around it. A run is [`run`]: a snapshot file on a plant by
+//! name.
 
 mod bench;
 mod brake;

@@ -369,7 +369,8 @@ impl Build for PilotBuilder {
             Err(e) => return refuse(Verdict::of(&e), e.to_string()),
         };
         if !snapshot.manifest.proposes() {
-            let text = "the snapshot in use gives actions that nothing projects, so that no limit of it can be moved; write guard = true under [constraints] of its task";
+            let text = "the snapshot in use gives actions that nothing projects, so that no limit of it can be moved; \
+                        write guard = true under [constraints] of its task";
             return refuse(Verdict::Other, text.into());
         }
         snapshot.manifest.moved = Some(moved.clone());

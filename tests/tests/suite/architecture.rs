@@ -136,3 +136,44 @@ fn no_room_of_the_runtime_imports_one_above_it() {
         }
     }
 }
+
+/// Widest line of a page or a source file [characters].
+const WIDTH: usize = 160;
+
+/// Tables and logs that programs of `results` wrote.
+const AS_THEY_ARE: [&str; 5] = ["table.md", "log.md", "compare-panda.md", "compare-z1.md", "proposer.md"];
+
+/// Pages and sources below a folder, none of what is built or installed.
+fn written(folder: &Path, found: &mut Vec<PathBuf>) {
+    for entry in std::fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("a file").path()) {
+        let name = entry.file_name().expect("a name").to_string_lossy().into_owned();
+        let is_built = matches!(&name[..], "target" | "runs" | "demo") || name.starts_with('.');
+        if is_built || AS_THEY_ARE.contains(&&name[..]) || entry.is_symlink() {
+            continue;
+        }
+        if entry.is_dir() {
+            written(&entry, found);
+        } else if ["md", "rs", "py", "pyi", "sh", "c", "h", "cpp", "hpp"]
+            .iter()
+            .any(|end| name.ends_with(&format!(".{end}")))
+        {
+            found.push(entry);
+        }
+    }
+}
+
+#[test]
+fn pages_and_sources_keep_their_width() {
+    let mut files = Vec::new();
+    written(&Path::new(env!("CARGO_MANIFEST_DIR")).join(".."), &mut files);
+    let wide: Vec<String> = files
+        .iter()
+        .flat_map(|file| {
+            let text = std::fs::read_to_string(file).expect("text");
+            let wide = text.lines().enumerate().filter(|(_, line)| line.chars().count() > WIDTH);
+            wide.map(|(number, _)| format!("{}:{}", file.display(), number + 1)).collect::<Vec<_>>()
+        })
+        .collect();
+    assert!(files.len() > 500, "{} files: this shows nothing", files.len());
+    assert!(wide.is_empty(), "wider than {WIDTH}: break the line, or turn the table: {}", wide.join(", "));
+}

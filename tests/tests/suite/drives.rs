@@ -41,7 +41,8 @@ fn task(guard: &str) -> Task {
     let text = format!(
         "name = \"quadruped\"\n[model]\nmjcf = \"quadruped.xml\"\n[time]\ndt = {DT}\nsim_dt = 0.0005\npolicy_every = 20\n\
          [state]\nobservation = [{}, {}]\n[command]\ninterface = \"pd\"\nstiffness = {k:?}\ndamping = {d:?}\n\
-         [constraints]\nguard = {guard}\ntorque = {{}}\nacceleration = {{ limit = 3000.0 }}\ntorque_rate = {{ limit = {rate:?} }}\n[idm]\nkind = \"pinocchio\"\n",
+         [constraints]\nguard = {guard}\ntorque = {{}}\nacceleration = {{ limit = 3000.0 }}\ntorque_rate = {{ limit = {rate:?} }}\n\
+         [idm]\nkind = \"pinocchio\"\n",
         entries("q"),
         entries("v")
     );

@@ -233,7 +233,8 @@ fn collection() -> tempfile::TempDir {
               <body name="elbow" pos="0 0 0.33" quat="1 -1 0 0"><joint name="elbow" range="-1.8 1.8" ref="0.4" springref="0.1" stiffness="2"/>
                 <joint name="elbow_roll" axis="1 2 -1" pos="0.01 0.02 0.03" actuatorfrcrange="-5 5"/><geom type="capsule" size="0.04 0.1"/>
                 <include file="parts/finger.xml"/></body></body></frame>
-          <body name="second" pos="1 0 0"><joint name="slide_x" type="slide" axis="1 0 0" ref="-0.3"/><joint name="pole" type="ball" pos="0 0 0.1" damping="0.1"/>
+          <body name="second" pos="1 0 0"><joint name="slide_x" type="slide" axis="1 0 0" ref="-0.3"/>
+            <joint name="pole" type="ball" pos="0 0 0.1" damping="0.1"/>
             <geom type="cylinder" size="0.02 0.4" mass="0.7"/></body>
           <replicate count="3" offset="0 0.5 0" sep="_"><body name="cube" pos="0 0 2"><freejoint/><geom type="box" size="0.05 0.06 0.07"/></body></replicate>
         </worldbody>

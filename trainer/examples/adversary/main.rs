@@ -220,7 +220,8 @@ fn write(folder: &Path, jobs: &[Job], done: &BTreeMap<usize, Counts>) -> std::io
 }
 
 const HEAD: &str = "\
-| robot | braking | attack | ticks | position | velocity | acceleration | torque | worst excess | empty sets | stored brake | non-finite | other brakes | solved % | missed q, v, a |
+| robot | braking | attack | ticks | position | velocity | acceleration | torque | worst excess | \
+empty sets | stored brake | non-finite | other brakes | solved % | missed q, v, a |
 |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|";
 
 fn line(job: &Job, c: &Counts) -> String {

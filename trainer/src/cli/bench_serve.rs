@@ -131,7 +131,8 @@ impl ServeBench {
         for (clock, per) in ["s", "processor s"].iter().enumerate() {
             let (served, collected, ratio) = (rate(0, clock), rate(1, clock), 100.0 * ratio(clock));
             say(format!(
-                "{task}, {clients} clients: served {served:.0} steps/{per}, collected in this process {collected:.0} steps/{per}: {ratio:.0} % (median of {} rounds)",
+                "{task}, {clients} clients: served {served:.0} steps/{per}, \
+                 collected in this process {collected:.0} steps/{per}: {ratio:.0} % (median of {} rounds)",
                 rounds.len()
             ));
         }

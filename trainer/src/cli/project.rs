@@ -71,8 +71,8 @@ impl Project {
                 .collect();
             let outside: Vec<_> = l.outside.iter().map(|row| &names[*row]).collect();
             say(serde_json::json!({
-                "q": target.q, "v": target.v, "status": l.status.name(), "reason": l.status.reason(), "rung": l.rung.name(), "active": active, "outside": outside,
-                "moved": l.moved, "slack": l.slack, "iterations": l.iterations, "residual": l.residual,
+                "q": target.q, "v": target.v, "status": l.status.name(), "reason": l.status.reason(), "rung": l.rung.name(),
+                "active": active, "outside": outside, "moved": l.moved, "slack": l.slack, "iterations": l.iterations, "residual": l.residual,
                 "raw_violations": l.raw_violations.total(), "violations": l.violations.total(), "duration_ns": l.duration_ns,
             }));
         }

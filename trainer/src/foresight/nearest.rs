@@ -15,8 +15,8 @@ const SMALL: f64 = 1e-9;
 ///     min_u 1/2 |u - asked|^2 + WORTH sum s      s.t.  lower - s <= S (u - trial) <= upper + s,   -1 <= u <= 1
 /// ```
 ///
-/// with rows scaled to unit length, by coordinate ascent on the dual (Hildreth 1957): a multiplier that would pass `WORTH` stays there. Where the sweeps have not settled,
-/// because rows contradict each other, Clarabel solves it. An answer counts only after a step of the simulator.
+/// with rows scaled to unit length, by coordinate ascent on the dual (Hildreth 1957): a multiplier that would pass `WORTH` stays there. Where the sweeps have
+/// not settled, because rows contradict each other, Clarabel solves it. An answer counts only after a step of the simulator.
 pub struct Nearest {
     n: usize,
     u: Vec<f64>,

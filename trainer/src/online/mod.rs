@@ -52,7 +52,9 @@ pub enum OnlineError {
     NoNoise(RobotName),
     /// Transitions come, but none is usable.
     #[error(
-        "the loop of `{name}` sent no usable step for {seconds:.0} s; left out so far: {} of foreign versions, {} replaced, {} not active, {} in broken periods, {} with other targets, {} gaps: see `nearl run --json` for the loop's mode", left_out.foreign, left_out.stale, left_out.inactive, left_out.partial, left_out.unlike, left_out.gaps
+        "the loop of `{name}` sent no usable step for {seconds:.0} s; left out so far: {} of foreign versions, {} replaced, \
+         {} not active, {} in broken periods, {} with other targets, {} gaps: see `nearl run --json` for the loop's mode",
+        left_out.foreign, left_out.stale, left_out.inactive, left_out.partial, left_out.unlike, left_out.gaps
     )]
     Unusable {
         /// Robot.

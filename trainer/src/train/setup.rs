@@ -264,7 +264,8 @@ pub fn limit_scale(parts: &Parts, manifest: &Manifest) -> Result<Vec<f64>, Train
                 Ok(scale)
             } else {
                 Err(TrainError::Settings(format!(
-                    "[train.change_scale]: 'limits' needs a velocity and an acceleration limit for '{name}'; set [constraints] or use change_scale = \"running\""
+                    "[train.change_scale]: 'limits' needs a velocity and an acceleration limit for '{name}'; \
+                     set [constraints] or use change_scale = \"running\""
                 )))
             }
         })

@@ -4,12 +4,41 @@ mod pairs;
 
 use super::clearance::Ahead;
 use super::frame::check;
-use super::{Limit, quoted_names};
+use super::{About, Argument, Form, Limit, Takes, quoted_names};
 use crate::geometry::{Placement, Shape};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{FrameId, Kind, LimitError, Model, Soft};
 use pairs::{Body, Pairs, Reach};
 use serde::{Deserialize, Serialize};
+
+/// What it says of itself.
+pub(super) const ABOUT: About = About {
+    class: "CollisionLimit",
+    promise: "Bodies keep `margin` apart, as far as `braking` [m/s²] can be delivered; `influence` [m] must exceed `margin \
+        + w² / (2 braking)` at closing speed w. `urdf` adds the robot file's own spheres, boxes, cylinders and \
+        capsules.",
+    example: "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \
+        \"floor\", shape = \"half_space\" }], braking = 2.0 }",
+    form: Form::Either,
+    margin: "[m]",
+    stricter: Some([
+        "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \
+        \"floor\", shape = \"half_space\" }], braking = 2.0, margin = 0.3, influence = 0.5 }",
+        "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.4 } } }, { name = \
+        \"floor\", shape = \"half_space\" }], braking = 2.0, influence = 0.2 }",
+    ]),
+    arguments: &[
+        Argument::needed("shapes", Takes::Solids),
+        Argument::needed("braking", Takes::Number),
+        Argument::MARGIN,
+        Argument::named("urdf", Takes::Flag, "False"),
+        Argument::named("ignore", Takes::Pairs, "()"),
+        Argument::named("adjacent", Takes::Flag, "False"),
+        Argument::named("influence", Takes::Number, "0.2"),
+        Argument::named("rows", Takes::Count, "16"),
+        Argument::SOFT,
+    ],
+};
 
 /// `collision = { shapes = [{ frame = "hand", shape = { sphere = { radius = 0.1 } } }, { name = "floor", shape = "half_space" }],
 /// braking = 2.0 }`.
