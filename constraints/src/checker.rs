@@ -1,6 +1,6 @@
 //! The independent checker evaluates the limits themselves at a next state. It shares no code with the projector's
-//! assembly: no boxes, no rows, no mass matrix; the motor force comes from inverse dynamics. When in the period that is
-//! taken is one definition for both ([`Period::lag`], [`Period::resistance`]), which tests compare with MuJoCo.
+//! assembly: no boxes, no rows, no mass matrix; the motor force comes from inverse dynamics. At which moment of the period that
+//! force is taken is one definition for both ([`Period::lag`], [`Period::resistance`]), which tests compare with MuJoCo.
 
 use crate::ledger::Counts;
 use crate::row::{Cone, Motion, Needs, Previous, Rows};

@@ -1,0 +1,63 @@
+"""Limits by name: what a class hands on is what a task file would say, and what is wrong is refused where it is written."""
+
+import numpy as np
+import pytest
+from conftest import ROBOTS
+
+import nearl
+
+
+@pytest.fixture(scope="module")
+def panda() -> nearl.Model:
+    return nearl.Model.from_urdf(ROBOTS / "panda" / "panda.urdf")
+
+
+def test_every_class_is_public_and_a_limit() -> None:
+    from nearl import limits
+
+    assert len(limits.__all__) >= 14
+    for name in limits.__all__:
+        kind = getattr(nearl, name)
+        assert issubclass(kind, nearl.Limit) and kind.__doc__ and name in nearl.__all__, name
+
+
+def test_a_kind_by_its_name_is_its_class(panda) -> None:
+    for limit, kind, settings in [
+        (nearl.VelocityLimit(panda, scale=0.5), "velocity", {"scale": 0.5}),
+        (nearl.JerkLimit(panda, {"panda_joint1": 9.0}, hard=True), "jerk", {"limit": {"panda_joint1": 9.0}, "hard": True}),
+        (nearl.LockedJoints(panda, ["panda_joint2"]), "locked", {"joints": ["panda_joint2"]}),
+        (nearl.RowLimit(panda, "r", {"q.panda_joint1": 2.0}, equals=0.5), "rows", {"name": "r", "terms": {"q.panda_joint1": 2.0}, "equals": 0.5}),
+    ]:
+        named = nearl.Limit(panda, kind, settings)
+        assert (repr(named), named.name) == (repr(limit), limit.name)
+
+
+def test_what_an_argument_leaves_out_is_filled_in(panda) -> None:
+    box = repr(nearl.FrameLimit(panda, "panda_hand", 2.0, lower=np.array([0.0, -1.0, 0.1])))
+    assert "lower: [0.0, -1.0, 0.1], upper: [inf, inf, inf]" in box and "half_space: None" in box
+    plane = repr(nearl.FrameLimit(panda, "panda_hand", 2.0, normal=(0, 0, -1)))
+    assert "normal: [0.0, 0.0, -1.0], through: [0.0, 0.0, 0.0]" in plane and "inside: None" in plane
+    curve = {"limit": 1.0, "offset": 0.1, "squared": 2.0, "lower": -1.0, "upper": 1.0}
+    profile = repr(nearl.VelocityProfileLimit(panda, {"panda_joint1": curve, "panda_joint2": curve}, margin=0.25))
+    assert profile.count("margin: 0.25") == 2 and profile.count("squared: 2.0") == 2
+    soft = repr(nearl.TorqueLimit(panda, soft=(2.0, 3.0)))
+    assert "linear: 2.0, quadratic: 3.0" in soft and "scale: 1.0" in soft
+    shapes = [{"frame": "panda_hand", "shape": {"sphere": {"radius": 0.1}}}, {"name": "floor", "shape": "half_space"}]
+    shapes.append({"name": "post", "shape": {"sphere": {"radius": 0.2}}, "position": [1, 0, 0]})
+    bodies = repr(nearl.CollisionLimit(panda, shapes, 2.0, ignore=[("panda_hand", "floor")], rows=3))
+    assert "radius: 0.1" in bodies and "HalfSpace" in bodies and '["panda_hand", "floor"]' in bodies and "rows: 3" in bodies
+
+
+def test_what_is_wrong_is_refused_by_name(panda) -> None:
+    for build, error, words in [
+        (lambda: nearl.Limit(panda, "velocty", {}), ValueError, "no limit of kind 'velocty'; choose one of position, velocity"),
+        (lambda: nearl.Limit(panda, "energy", {"limt": 2.0}), TypeError, "EnergyLimit takes no 'limt'; it takes limit, margin, soft"),
+        (lambda: nearl.Limit(panda, "energy", {}), TypeError, "EnergyLimit needs 'limit'"),
+        (lambda: nearl.FrameLimit(panda, "panda_hand", 2.0, through=[0, 0, 1]), ValueError, "through needs normal"),
+        (lambda: nearl.FrameLimit(panda, 3, 2.0, normal=[0, 0, 1]), TypeError, "expected a text; got int, as 'frame'"),
+        (lambda: nearl.EnergyLimit(panda, float("nan")), ValueError, "energy limit is NaN"),
+        (lambda: nearl.CollisionLimit(panda, [{"shape": "cone"}], 2.0), ValueError, "limit 'collision': .*cone"),
+        (lambda: nearl.VelocityProfileLimit(panda, "fr4"), ValueError, 'limit \'velocity_profile\': .*"fr3"'),
+    ]:
+        with pytest.raises(error, match=f"(?s){words}"):
+            build()
