@@ -160,8 +160,11 @@ pub trait Env: Send {
 
     /// Writes `q` (nq) and `v` (nv) in Pinocchio's convention, joints in MuJoCo's order ([`Spec::joints`]): equal to
     /// [`Env::qpos`] and [`Env::qvel`] but for a free joint, whose quaternion is `x y z w` (and of unit length) and whose
-    /// linear velocity is in the body's frame.
+    /// linear velocity is in the body's frame. With noise or a delay it is what is measured.
     fn state(&self, q: &mut [f64], v: &mut [f64]);
+
+    /// The same as it is, whatever lies between the robot and its controller.
+    fn actual_state(&self, q: &mut [f64], v: &mut [f64]);
 
     /// Configuration (nq), MuJoCo's convention.
     fn qpos(&self) -> &[f64] {
@@ -171,6 +174,11 @@ pub trait Env: Send {
     /// Velocity (nv), MuJoCo's convention.
     fn qvel(&self) -> &[f64] {
         self.sim().qvel()
+    }
+
+    /// Whether the forces of the motors cannot be found again from motion and robot file: the robot is another one, or somebody pushes it.
+    fn is_disturbed(&self) -> bool {
+        false
     }
 
     /// The simulation, for those who watch it: the plant process, the limit meter, tests.

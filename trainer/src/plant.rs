@@ -155,8 +155,14 @@ impl MujocoPlant {
             e.bits |= STATE_TRUNCATED;
         }
         let sim = self.env.sim();
-        // A motion that MuJoCo cannot go back from is one of no known force.
-        let known = self.inverse.as_mut().is_some_and(|inverse| inverse.force(sim, &mut self.force).is_ok());
+        let known = if self.env.is_disturbed() {
+            self.force.fill(0.0);
+            self.env.spec().actuators.iter().for_each(|a| self.force[a.dof] = sim.applied_force_of(a.dof));
+            true
+        } else {
+            // A motion that MuJoCo cannot go back from is one of no known force.
+            self.inverse.as_mut().is_some_and(|inverse| inverse.force(sim, &mut self.force).is_ok())
+        };
         self.meter.observe(self.env.qpos(), self.env.qvel(), known.then_some(&self.force[..]));
     }
 

@@ -58,6 +58,37 @@ fn the_plants_acceleration_is_that_of_mujoco() {
     assert!((found.excess - most).abs() < 1e-9 * limit, "{} instead of {most}", found.excess);
 }
 
+/// A push is no force of a motor, and a heavier robot than the file's needs no other one: the plant counts what its motors exert.
+#[test]
+fn the_plants_torque_is_that_of_its_motors() {
+    let set = [
+        "pushes={ every = 0.05, base = \"3 * uniform\", joints = \"3 * uniform\" }",
+        "random={ mass = 1.4 }",
+        "constraints.torque.scale=0.6",
+        "termination={}",
+    ];
+    let mut manifest = tasks::load(&crate::leg::leg(), &set.map(String::from)).expect("a task");
+    train::complete(&mut manifest).expect("a whole task");
+    let mut plant = MujocoPlant::new(&manifest, 4, false).expect("a plant");
+    let mut twin = env::of_task(&manifest, "leg").expect("the same environment");
+    twin.reset(&mut rollout::stream(4, 0)).expect("the same start");
+    let (mut beyond, mut most) = (0, 0.0_f64);
+    for tick in 0..200_u64 {
+        let target = [0.4 + 0.3 * (0.1 * tick as f64).sin(), -0.8 + 0.3 * (0.2 * tick as f64).cos()];
+        let mut action = ActionMessage::zeroed();
+        action.action[..2].copy_from_slice(&target);
+        plant.apply(&action);
+        twin.step(&target);
+        let excess = [(6, 0.6 * 20.0), (7, 0.6 * 15.0)]
+            .map(|(dof, most)| twin.sim().applied_force_of(dof).abs() - most);
+        beyond += u64::from(excess.iter().any(|e| *e > 1e-9));
+        most = most.max(excess[0]).max(excess[1]);
+    }
+    let found = plant.meter().records()[3].expect("torque is measured");
+    assert!(beyond > 10 && beyond < 190, "{beyond} of 200 ticks are beyond the limit");
+    assert_eq!((found.states, found.excess), (beyond, most));
+}
+
 fn raw(file: &str, seed: u64) -> (Snapshot, Evaluation) {
     let snapshot = random_policy(file, seed, 3.0);
     let found = evaluate(&snapshot, 4, 0, false).expect("an evaluation");

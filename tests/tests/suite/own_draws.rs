@@ -4,6 +4,7 @@
 use crate::leg::{columns_of_a_run_that_resumes_bit_for_bit, env_of, fixture, leg, refuses_each};
 use nearl_tests::training;
 use nearl_trainer::env::Env;
+use nearl_trainer::evaluate::evaluate;
 use nearl_trainer::rollout::{Worker, make_env, stream};
 
 const CALM: [&str; 4] = ["commands={}", "pushes={}", "termination={}", "reward={ alive = 1.0 }"];
@@ -171,6 +172,10 @@ fn noise_lies_on_what_is_told_and_on_nothing_else() {
             noisy.state(&mut q, &mut v);
             plain.observe(&mut exact);
             assert_eq!([obs[0], obs[1], obs[2], obs[5]], [q[7], q[8], v[6], v[3]], "one measurement");
+            let mut states = [(); 2].map(|()| (vec![0.0; 9], vec![0.0; 8]));
+            noisy.actual_state(&mut states[0].0, &mut states[0].1);
+            plain.state(&mut states[1].0, &mut states[1].1);
+            assert!(states[0] == states[1], "as it is");
             bias += (obs[0] - exact[0]) / 60.0;
             q_off.push(obs[0] - exact[0]);
             v_off.push(obs[2] - exact[2]);
@@ -185,6 +190,25 @@ fn noise_lies_on_what_is_told_and_on_nothing_else() {
     about(variance(&tilt), 0.02 * 0.02);
     about(variance(&q_off), 0.01 * 0.01 + 0.05 * 0.05 / 3.0);
     assert!(biases.iter().all(|b| b.abs() < 0.056) && variance(&biases) > 4e-4, "{biases:?}");
+}
+
+/// Noise far beyond the limits breaks none: what counts is where the robot is.
+#[test]
+fn what_is_reached_is_counted_without_noise() {
+    let fast = |limit: &str| {
+        let set = [
+            "constraints={ velocity = { limit = LIMIT } }".replace("LIMIT", limit),
+            "noise={ q = \"1e4 * normal\", v = \"1e4 * normal\" }".into(),
+        ];
+        let set: Vec<&str> = set.iter().map(String::as_str).collect();
+        let snapshot = training(&leg(), "ppo", 3, 1, &set).snapshot().clone();
+        let e = evaluate(&snapshot, 3, 0, true).expect("evaluation");
+        assert!(e.ticks > 30, "{}", e.ticks);
+        (e.reached_violations, e.worst.len())
+    };
+    assert_eq!(fast("1e3"), (0, 0));
+    let (ticks, limits) = fast("1e-3");
+    assert!(ticks > 0 && limits == 1, "{ticks} {limits}");
 }
 
 /// The level rises by its step after episodes that were long enough, falls after short ones, and stands at 1 where nobody learns.

@@ -119,6 +119,29 @@ fn drives_of_a_urdf_are_what_the_command_section_says() {
     assert!(bounded > 10, "the comparison covers the effort");
 }
 
+/// The largest and the squares of what the drives did, from the states and forces of the simulation.
+#[test]
+fn what_drives_did_is_told_by_the_largest_and_by_squares() {
+    let reward = "reward={ first = \"dv.max\", second = \"1e-3 * dv.squared\", third = \"torque.max\", fourth = \"power\" }";
+    let mut env = leg_observing(&[], &["commands={}", "pushes={}", "termination={}", reward]);
+    let mut rng = stream(5, 0);
+    env.reset(&mut rng).expect("reset");
+    let mut larger = [0, 0];
+    for t in 0..100 {
+        let action = [rng.random_range(-2.0..2.0), rng.random_range(-3.0..1.0)];
+        let before = env.qvel().to_vec();
+        let reward = env.step(&action).reward;
+        let v = env.qvel();
+        let [hip, knee] = [6, 7].map(|i| ((v[i] - before[i]) / 0.005).abs());
+        let force = [6, 7].map(|i| env.sim().applied_force_of(i).abs());
+        larger[usize::from(knee > hip)] += 1;
+        let power = force[0] * v[6].abs() + force[1] * v[7].abs();
+        let expected = hip.max(knee) + 1e-3 * (hip * hip + knee * knee) + force[0].max(force[1]) + power;
+        assert!((reward - expected).abs() < 1e-9 * expected, "step {t}: {reward} {expected}");
+    }
+    assert!(larger[0] > 10 && larger[1] > 10, "either joint is the faster one at times");
+}
+
 /// The network input of every row is the one that the controller of the same snapshot computes from the states alone, and the likelihood of
 /// what was sampled is that of the policy at this input: what training stacks, the runtime stacks.
 #[test]

@@ -107,6 +107,11 @@ pub(super) trait Rules: Clone + Send + 'static {
         false
     }
 
+    /// Whether velocities change by something that is no force.
+    fn pushes(&self) -> bool {
+        false
+    }
+
     /// See [`Env::notes`](super::Env::notes).
     fn notes(&self) -> &[f64] {
         &[]

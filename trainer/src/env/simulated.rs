@@ -206,20 +206,16 @@ impl<R: Rules> Env for Simulated<R> {
     }
 
     fn state(&self, q: &mut [f64], v: &mut [f64]) {
-        let (qpos, qvel) = self.rules.measured().unwrap_or((self.sim.qpos(), self.sim.qvel()));
-        q.copy_from_slice(qpos);
-        v.copy_from_slice(qvel);
-        for joint in &self.spec.joints {
-            match joint.kind {
-                JointKind::Slide | JointKind::Hinge => {}
-                JointKind::Ball => rotate_left(&mut q[joint.idx_q..][..4]),
-                JointKind::Free => {
-                    let quaternion = &mut q[joint.idx_q + 3..][..4];
-                    rotate_left(quaternion);
-                    to_body(quaternion, &mut v[joint.idx_v..][..3]);
-                }
-            }
-        }
+        let measured = self.rules.measured();
+        convert(&self.spec, measured.unwrap_or((self.sim.qpos(), self.sim.qvel())), q, v);
+    }
+
+    fn actual_state(&self, q: &mut [f64], v: &mut [f64]) {
+        convert(&self.spec, (self.sim.qpos(), self.sim.qvel()), q, v);
+    }
+
+    fn is_disturbed(&self) -> bool {
+        self.rules.changes_robot() || self.rules.pushes()
     }
 
     fn sim(&self) -> &Sim {
@@ -295,6 +291,23 @@ fn copied<'a>(place: &'a mut Option<Sim>, sim: &Sim) -> Result<&'a mut Sim, MjEr
     };
     copy.copy_from(sim)?;
     Ok(copy)
+}
+
+/// Writes a state of MuJoCo's convention as one of Pinocchio's.
+fn convert(spec: &Spec, (qpos, qvel): (&[f64], &[f64]), q: &mut [f64], v: &mut [f64]) {
+    q.copy_from_slice(qpos);
+    v.copy_from_slice(qvel);
+    for joint in &spec.joints {
+        match joint.kind {
+            JointKind::Slide | JointKind::Hinge => {}
+            JointKind::Ball => rotate_left(&mut q[joint.idx_q..][..4]),
+            JointKind::Free => {
+                let quaternion = &mut q[joint.idx_q + 3..][..4];
+                rotate_left(quaternion);
+                to_body(quaternion, &mut v[joint.idx_v..][..3]);
+            }
+        }
+    }
 }
 
 /// `w x y z` (of any length) to `x y z w` (of length one).

@@ -421,6 +421,10 @@ impl Rules for User {
         self.course.random.is_some()
     }
 
+    fn pushes(&self) -> bool {
+        self.course.pushes.is_some()
+    }
+
     fn notes(&self) -> &[f64] {
         self.notes.values()
     }

@@ -31,6 +31,8 @@ pub struct Worker {
     /// Actions that [`Foresight`] replaced, and those for which it found none.
     pub(crate) foreseen: [u64; 2],
     pub(super) state: State,
+    /// Configuration and velocity as the simulator has them, where noise or a delay lies before `state`; its observation is never read.
+    actual: State,
     /// Observation at the begin of this policy step.
     before: Vec<f64>,
     /// What the policy sees at its end, before the normaliser.
@@ -81,6 +83,7 @@ impl Worker {
             kind: snapshot.manifest.policy,
             learned: snapshot.manifest.task.idm.kind == IdmKind::Learned,
             state: controller.state(),
+            actual: controller.state(),
             before: vec![0.0; controller.layout().n_obs()],
             seen: vec![0.0; controller.n_seen()],
             privileged: [(); 2].map(|()| vec![0.0; env.spec().privileged.len()]),
@@ -321,13 +324,14 @@ impl Worker {
         tally.count(ledger);
         self.moved += ledger.moved;
         tally.faults += u64::from(step.fault != Fault::None);
-        let excess = self.controller.excess(&self.state);
+        self.env.actual_state(&mut self.actual.q, &mut self.actual.v);
+        let excess = self.controller.excess(&self.actual);
         tally.reached_violations += u64::from(excess != [None; 2]);
         tally.residual += self.controller.residual(&self.state.obs, &self.out);
         let larger = |most: &[_; 2], new: [_; 2]| [0, 1].map(|k| Excess::larger(most[k], new[k]));
         self.excess = larger(&self.excess, excess);
         if let Some((limits, most)) = &mut self.beyond {
-            *most = larger(most, self.controller.excess_over(limits, &self.state));
+            *most = larger(most, self.controller.excess_over(limits, &self.actual));
         }
         (step.reward, step.terminated)
     }

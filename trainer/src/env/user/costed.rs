@@ -83,6 +83,14 @@ impl Env for Costed {
         self.inner.state(q, v);
     }
 
+    fn actual_state(&self, q: &mut [f64], v: &mut [f64]) {
+        self.inner.actual_state(q, v);
+    }
+
+    fn is_disturbed(&self) -> bool {
+        self.inner.is_disturbed()
+    }
+
     fn sim(&self) -> &Sim {
         self.inner.sim()
     }

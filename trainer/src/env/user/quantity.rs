@@ -46,6 +46,8 @@ pub(super) enum Quantity {
     Power,
     /// `dv.squared`: sum of the squares of the driven joints' mean accelerations over the control period \[rad²/s⁴ or m²/s⁴\].
     Acceleration,
+    /// `dv.max`: largest magnitude of a driven joint's mean acceleration over the control period \[rad/s² or m/s²\].
+    AccelerationMax,
     /// `command.<name>`: what the robot is asked to do.
     Command(usize),
     /// `torque.max`: largest magnitude of a force of an actuator \[N·m or N\].
@@ -182,6 +184,7 @@ impl Names {
             self.put("torque.max", Quantity::TorqueMax);
             self.put("dtorque.max", Quantity::TorqueRateMax);
             self.put("dv.squared", Quantity::Acceleration);
+            self.put("dv.max", Quantity::AccelerationMax);
             self.put("power", Quantity::Power);
         }
     }
@@ -276,21 +279,27 @@ impl Outcome<'_> {
             Quantity::Effort => super::super::rules::squared(self.action),
             Quantity::ActionChange => self.course.map_or(0.0, |course| course.action_change),
             Quantity::Torque(dof) => sim.applied_force_of(dof),
-            Quantity::TorqueSquared => self.sum_over_drives(|dof| sim.applied_force_of(dof).powi(2)),
+            Quantity::TorqueSquared => self.over_drives(|dof| sim.applied_force_of(dof).powi(2)).sum(),
             Quantity::TorqueMax => self.course.map_or(0.0, |course| course.forces.largest),
             Quantity::TorqueRateMax => self.course.map_or(0.0, |course| course.forces.fastest / self.dt),
             Quantity::Power => {
-                self.sum_over_drives(|dof| (sim.applied_force_of(dof) * sim.qvel()[dof]).abs())
+                self.over_drives(|dof| (sim.applied_force_of(dof) * sim.qvel()[dof]).abs()).sum()
             }
-            Quantity::Acceleration => {
-                self.sum_over_drives(|dof| ((sim.qvel()[dof] - before.v[dof]) / self.dt).powi(2))
+            Quantity::Acceleration => self.over_drives(|dof| self.acceleration(dof).powi(2)).sum(),
+            Quantity::AccelerationMax => {
+                self.over_drives(|dof| self.acceleration(dof).abs()).fold(0.0, f64::max)
             }
             state => Seen { sim, q: sim.qpos(), v: sim.qvel(), dt: self.dt, course: self.course }.read(state),
         }
     }
 
-    fn sum_over_drives(&self, of: impl Fn(usize) -> f64) -> f64 {
-        self.course.map_or(0.0, |course| course.driven.iter().map(|&dof| of(dof)).sum())
+    fn over_drives(&self, of: impl Fn(usize) -> f64) -> impl Iterator<Item = f64> {
+        self.course.into_iter().flat_map(|course| &course.driven).map(move |&dof| of(dof))
+    }
+
+    /// Mean acceleration of a degree of freedom over the control period.
+    fn acceleration(&self, dof: usize) -> f64 {
+        (self.sim.qvel()[dof] - self.before.v[dof]) / self.dt
     }
 }
 
