@@ -28,6 +28,9 @@ use stopping::{least_deceleration, soonest};
 /// A breach up to this is rounding.
 const ROUNDING: f64 = 1e-10;
 
+/// What is broken already may be broken by so much more: in 10,000 ticks it adds up to [`ROUNDING`].
+const NOISE: f64 = 1e-14;
+
 /// Ways of braking, tried from the one that passed last on.
 const TRIED: [Plan; 7] = [
     Plan::Together(1.0),
@@ -229,7 +232,7 @@ impl Backup {
     pub(crate) fn excuse(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
         self.checker.breaches((q, v), (q, v), with.external, &mut self.allowed);
         for (allowed, of_state) in self.allowed.iter_mut().zip(&self.of_state) {
-            *allowed = if *of_state { allowed.max(0.0) } else { 0.0 };
+            *allowed = if *of_state && *allowed > ROUNDING { *allowed } else { 0.0 };
         }
         let mut more = false;
         for (allowed, on_the_way) in self.allowed.iter_mut().zip(&self.on_the_way) {
@@ -244,7 +247,7 @@ impl Backup {
         let rows = self.allowed.len();
         let breach = &mut self.breach[..rows];
         self.checker.breaches(from, to, with.external, breach);
-        breach.iter().zip(&self.allowed).all(|(breach, allowed)| *breach <= allowed + ROUNDING)
+        breach.iter().zip(&self.allowed).all(holds)
     }
 
     /// Looks for a brake from the state after a tick at acceleration `a` and stores it; the old one stays when there is none.
@@ -414,7 +417,6 @@ impl Backup {
                 self.ticks.push(first + at);
                 self.look(with, q, v, first + at, n as usize);
                 let seen = &self.breach[n as usize * rows..(n as usize + 1) * rows];
-                let holds = |(breach, allowed): (&f64, &f64)| *breach <= allowed + ROUNDING;
                 if !seen.iter().zip(&self.allowed).all(holds) {
                     return false;
                 }
@@ -494,6 +496,11 @@ impl Backup {
             }
         }
     }
+}
+
+/// A row is broken by no more than is allowed, or by rounding: not by both, or what rests at its limit would creep beyond it tick by tick.
+fn holds((breach, allowed): (&f64, &f64)) -> bool {
+    *breach <= ROUNDING.max(allowed * (1.0 + NOISE) + NOISE)
 }
 
 /// What a brake is planned with.

@@ -3,6 +3,7 @@
 use crate::attack_scenes::run::{Seen, attack};
 use crate::attack_scenes::scene::{KINDS, SOFT, Scene};
 use crate::common::arms::random_arm;
+use crate::common::robot;
 use nearl_constraints::limit::REGISTRY;
 use nearl_constraints::*;
 use std::sync::Mutex;
@@ -65,4 +66,14 @@ fn every_kind_is_kept_alone_and_together() {
     let (ticks, held) = (*ticks.lock().unwrap(), *held.lock().unwrap());
     println!("{ticks} ticks, {held:?} slowed and braked");
     assert!(ticks >= 160_000 && held[0] > 1000, "{ticks} {held:?}: this shows nothing");
+}
+
+/// An episode at the limit of the energy: what rounding lets it be beyond in a tick does not add up.
+#[test]
+fn what_stays_at_a_limit_does_not_creep_beyond_it() {
+    let model = robot("ur5/ur5.urdf");
+    let settings = Settings { braking: Braking::Stored, ..Settings::new(0.001, 0) };
+    let seen = attack(&model, &Scene::new(&model, "tool0", "energy"), &settings, 2500, 1);
+    println!("{seen:?}");
+    assert!(seen.worst < 2.1e-10, "1e-10 of the speed is 2e-10 of the energy: {seen:?}");
 }
