@@ -200,7 +200,8 @@ impl Model {
         Ok(self.tangent(v.py(), |d, out| d.nle(&q, &v_, out)))
     }
 
-    /// Inverse dynamics `tau = M a + nle` (nv) [N m or N] of q (nq) [rad or m], v (nv) [rad/s or m/s], a (nv) [rad/s² or m/s²], without springs and dampers; `motors` has them.
+    /// Inverse dynamics `tau = M a + nle` (nv) [N m or N] of q (nq) [rad or m], v (nv) [rad/s or m/s],
+    /// a (nv) [rad/s² or m/s²], without springs and dampers; `motors` has them.
     fn rnea<'py>(
         &self,
         q: &Bound<'py, PyAny>,

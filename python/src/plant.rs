@@ -60,7 +60,8 @@ impl Plant {
         Ok(Plant { exchange: Mutex::new(Some(exchange)), sizes: [nq, nv, n_obs, nu] })
     }
 
-    /// Gives the state q (nq) [rad or m], v (nv) [rad/s or m/s], obs (n_obs) to the loop and waits at most `patience` [s] for an action (nu): ("act", action), ("hold", the action before) or ("brake", None).
+    /// Gives the state q (nq) [rad or m], v (nv) [rad/s or m/s], obs (n_obs) to the loop and waits at most `patience` [s] for an action
+    /// (nu): ("act", action), ("hold", the action before) or ("brake", None).
     #[pyo3(signature = (q, v, obs, patience, *, time=0.0, episode=0, begins=false))]
     fn exchange<'py>(
         &self,

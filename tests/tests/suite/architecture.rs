@@ -141,7 +141,8 @@ fn no_room_of_the_runtime_imports_one_above_it() {
 const WIDTH: usize = 160;
 
 /// Tables and logs that programs of `results` wrote.
-const AS_THEY_ARE: [&str; 5] = ["table.md", "log.md", "compare-panda.md", "compare-z1.md", "proposer.md"];
+const AS_THEY_ARE: [&str; 6] =
+    ["table.md", "log.md", "compare-panda.md", "compare-z1.md", "proposer.md", "franka.md"];
 
 /// Pages and sources below a folder, none of what is built or installed.
 fn written(folder: &Path, found: &mut Vec<PathBuf>) {
