@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nearl_constraints::drive::Held;
-use nearl_constraints::{Model, PeriodDynamics};
+use nearl_constraints::{Model, Moved, PeriodDynamics};
 use nearl_runtime::link::*;
 use nearl_runtime::log::{LogQueue, LogSummary, facts};
 use nearl_runtime::net::{Activation, Dense, DenseLayer};
@@ -30,6 +30,8 @@ pub struct Attack {
     pub policy_every: usize,
     pub seed: u64,
     pub ticks: u64,
+    /// From which tick on limits are moved, and where to; of [`Attack::fly`].
+    pub moves: Vec<(u64, Moved)>,
     /// Time that the plant takes to measure: a lockstep loop is faster than its log.
     pub pause: Duration,
 }
@@ -151,7 +153,16 @@ impl Attack {
             twin.measure(&mut state);
             (state.header.epoch, state.header.seq, state.header.stamp) = (1, tick, tick * period);
             state.tick = tick;
-            core.swap(false);
+            let moved = self.moves.iter().find(|(at, _)| *at == tick);
+            if let Some((_, moved)) = moved {
+                let mut next = self.snapshot(1);
+                next.manifest.moved = Some(moved.clone());
+                let controller = Pilot::new(&next, &robot).unwrap();
+                let id = core.controller.id + 1;
+                log.push_snapshot(id, 1, next.to_bytes(), controller.row_names());
+                *core.controller = Loaded { id, controller };
+            }
+            core.swap(moved.is_some());
             let (begin, fresh) = (tick * period, Some(&state));
             core.update(&Inputs { due: 0, begin, stop: false, fresh, proposal: None });
             core.close(begin + 1000);

@@ -5,6 +5,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use nearl_constraints::description::{JointDescription, JointKind};
+use nearl_constraints::{Moved, PerJoint};
 use nearl_runtime::Snapshot;
 use nearl_verify::{Report, verify};
 use serde_json::{Value, json};
@@ -29,6 +31,7 @@ fn attack(constraints: &str, dt: f64, sub_steps: u32, policy_every: usize) -> At
         policy_every,
         seed: 5,
         ticks: 1500,
+        moves: Vec::new(),
         pause: Duration::ZERO,
     }
 }
@@ -176,6 +179,191 @@ fn every_kind_of_limit_is_verified_alone_and_together() {
     }
 }
 
+/// What is done to something of a log.
+type Alter<'a, T> = &'a dyn Fn(&mut T);
+
+/// Orders of an operator every 0.2 s, and back: speeds, positions, how fast a joint may speed up, and what ties joints together.
+fn orders(dt: f64, kinds: &str) -> Vec<(u64, Moved)> {
+    let named = |joint: &str, x: f64| Some(PerJoint::Joints([(joint.to_owned(), x)].into()));
+    let mut all = vec![
+        Moved::speed(0.3),
+        Moved::default(),
+        Moved {
+            upper: named("panda_joint4", -2.0),
+            lower: named("panda_joint1", -0.1),
+            acceleration: named("panda_joint2", 2.0),
+            ..Moved::default()
+        },
+        Moved { velocity: named("panda_joint6", 0.1), ..Moved::speed(0.6) },
+        Moved::default(),
+        Moved::speed(0.02),
+        Moved::default(),
+    ];
+    let hand = |x: f64| [("panda_hand".to_owned(), x)].into();
+    for moved in &mut all {
+        if *moved == Moved::default() {
+            continue;
+        }
+        if kinds.contains("\nframe = [") {
+            moved.frame = hand(0.05);
+        }
+        if kinds.contains("frame_speed") {
+            moved.frame_speed = hand(0.1);
+        }
+        if kinds.contains("energy = ") {
+            moved.energy = Some(0.1);
+        }
+    }
+    let every = (0.2 / dt) as u64;
+    all.into_iter().enumerate().map(|(k, moved)| ((k as u64 + 1) * every, moved)).collect()
+}
+
+#[test]
+fn limits_that_an_operator_moves_are_verified_on_the_way_and_where_they_lead() {
+    let certified = LIMITS.replace("stored", "certified").replace("25.0", "3.0").replace("0.8", "1.0");
+    let tied = |kinds: &[&str]| format!("{LIMITS}\n{}", kinds.join("\n"));
+    for (limits, dt, sub_steps) in [
+        (LIMITS.to_owned(), 0.001, 1),
+        (certified.clone(), 0.002, 1),
+        (certified, 0.002, 0),
+        (LIMITS.to_owned(), 0.01, 5),
+        (tied(&COUPLED[..1]), 0.002, 1),
+        (tied(&COUPLED[1..2]), 0.002, 0),
+        (tied(&COUPLED[2..3]), 0.002, 1),
+        (tied(&COUPLED[..4]), 0.002, 1),
+    ] {
+        let flight = Attack { moves: orders(dt, &limits), ..attack(&limits, dt, sub_steps, 5) };
+        let (_folder, log) = record("verify-moved", &flight);
+        let report = verify(&log).unwrap();
+        println!("{limits}, {sub_steps} steps of {dt} s\n{report}");
+        assert_eq!((report.found, report.is_whole()), (0, true), "{limits} {dt}\n{report}");
+        let on_the_way = report.not_compared.iter().find(|(why, _)| why.contains("on its way"));
+        assert!(
+            on_the_way.is_some_and(|(_, ticks)| *ticks > 5),
+            "{limits} {dt}: nothing was on its way\n{report}"
+        );
+        assert!(report.verified + report.idle == 1500 && report.optimal > 150, "{limits} {dt}\n{report}");
+    }
+}
+
+#[test]
+fn a_tick_beyond_the_way_to_moved_limits_is_named() {
+    let flight = Attack { moves: orders(0.001, ""), ..attack(LIMITS, 0.001, 1, 20) };
+    let (folder, log) = record("verify-moved-edited", &flight);
+    let other = folder.0.join("copy.mcap");
+    // As if the operator had asked for less than the loop was built with.
+    let tighter = |bytes: Vec<u8>, change: &dyn Fn(&mut Moved)| {
+        let mut snapshot = Snapshot::from_bytes(&bytes).unwrap();
+        snapshot.manifest.moved.iter_mut().filter(|moved| **moved != Moved::default()).for_each(change);
+        snapshot.to_bytes()
+    };
+    let cases: [(&str, Alter<Moved>); 4] = [
+        ("speed of joint", &|moved| moved.speed *= 0.9),
+        ("gain of speed of joint", &|moved| moved.acceleration = Some(PerJoint::All(1.5))),
+        ("position of joint 'panda_joint2'", &|moved| {
+            moved.upper = Some(PerJoint::Joints([("panda_joint2".to_owned(), -1.0)].into()));
+        }),
+        ("position of joint 'panda_joint4'", &|moved| {
+            moved.lower = Some(PerJoint::Joints([("panda_joint4".to_owned(), -1.9)].into()));
+        }),
+    ];
+    for (word, change) in cases {
+        copy(&log, &other, &|_, _| true, &|bytes| tighter(bytes, change), &|_| {});
+        let report = verify(&other).unwrap();
+        println!("{word}: {report}");
+        assert!(
+            report.found > 0 && report.violations.iter().any(|v| v.what.contains(word)),
+            "{word}\n{report}"
+        );
+    }
+    // A tick that says it is on the way to limits that nobody moved.
+    let (folder, log) = record("verify-not-moved", &Attack { ticks: 300, ..attack(LIMITS, 0.001, 1, 20) });
+    let other = folder.0.join("copy.mcap");
+    let edit = |topic: &str, m: &mut Value| {
+        if topic == "tick" && m["tick"] == 200 {
+            m["ledger"]["status"] = 6.into();
+        }
+        true
+    };
+    copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+    let report = verify(&other).unwrap();
+    assert!(report.found == 1 && report.violations[0].tick == 200, "{report}");
+}
+
+#[test]
+fn hard_jerk_is_verified_alone_and_with_what_ties_joints_together() {
+    let jerk = format!("{LIMITS}\njerk = {{ limit = 600.0, hard = true }}");
+    let certified = jerk.replace("stored", "certified").replace("25.0", "3.0").replace("0.8", "1.0");
+    for (limits, dt, sub_steps) in [
+        (jerk.clone(), 0.001, 1),
+        (certified.clone(), 0.001, 1),
+        (certified, 0.01, 1),
+        (jerk.clone(), 0.01, 5),
+        (jerk.clone() + "\nlocked = [\"panda_joint3\"]", 0.002, 1),
+        (format!("{jerk}\n{}", COUPLED[0]), 0.002, 1),
+        (format!("{jerk}\n{}", COUPLED[1]), 0.002, 0),
+    ] {
+        let (_folder, log) = record("verify-jerk", &attack(&limits, dt, sub_steps, 5));
+        let report = verify(&log).unwrap();
+        println!("{limits}, {sub_steps} steps of {dt} s\n{report}");
+        assert_eq!((report.found, report.is_whole()), (0, true), "{limits} {dt}\n{report}");
+        assert!(report.stoppable == report.verified && report.optimal > 150, "{limits} {dt}\n{report}");
+    }
+    // Another jerk than the loop was built with is found out, looser or tighter.
+    let (folder, log) = record("verify-jerk-edited", &attack(&jerk, 0.002, 1, 5));
+    let other = folder.0.join("copy.mcap");
+    for jerk in [550.0, 650.0] {
+        let change = |constraints: &mut Value| constraints["jerk"]["limit"] = jerk.into();
+        let facts = |facts: &mut BTreeMap<String, String>| {
+            let mut limits: Value = serde_json::from_str(&facts["limits"]).unwrap();
+            change(&mut limits);
+            facts.insert("limits".into(), limits.to_string());
+        };
+        copy(&log, &other, &|_, _| true, &|bytes| with_limit(bytes, &change), &facts);
+        let report = verify(&other).unwrap();
+        assert!(report.found > 0, "jerk {jerk}\n{report}");
+    }
+}
+
+#[test]
+fn positions_and_velocities_that_are_clamped_apart_are_verified() {
+    let free = "consistency = \"free\"\nposition = { margin = 0.01 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 3.0 }\n\
+         braking = \"certified\"";
+    let (folder, log) = record("verify-free", &attack(free, 0.002, 1, 5));
+    let report = verify(&log).unwrap();
+    println!("{report}");
+    assert_eq!((report.found, report.is_whole()), (0, true), "{report}");
+    assert!(report.optimal > 1400, "{report}");
+    let at = ticks(&log)
+        .iter()
+        .rfind(|m| !m["ledger"]["active_rows"].as_array().unwrap().is_empty())
+        .unwrap()["tick"]
+        .as_u64()
+        .unwrap();
+    let other = folder.0.join("copy.mcap");
+    let cases: [(&str, Alter<Value>); 4] = [
+        ("target", &|m| add(&mut m["target_q"][0], 1e-5)),
+        ("target", &|m| add(&mut m["target_v"][0], 1e-4)),
+        ("multiplier", &|m| add(&mut m["ledger"]["active_rows"][0]["multiplier"], 0.1)),
+        ("no active row", &|m| {
+            m["ledger"]["active_rows"].as_array_mut().unwrap().remove(0);
+            m["ledger"]["active"] = (m["ledger"]["active"].as_u64().unwrap() - 1).into();
+        }),
+    ];
+    for (word, change) in cases {
+        let edit = |topic: &str, m: &mut Value| {
+            if topic == "tick" && m["tick"] == at {
+                change(m);
+            }
+            true
+        };
+        copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+        let report = verify(&other).unwrap();
+        println!("{word}: {:?}", report.violations.first());
+        assert!(report.found > 0 && report.violations[0].tick == at, "{word}\n{report}");
+    }
+}
+
 /// What is done to the message of one tick.
 type Edit = Box<dyn Fn(&mut Value)>;
 
@@ -296,7 +484,7 @@ fn every_seeded_corruption_is_named_at_its_tick() {
             "stored deceleration",
             Box::new(move |m: &mut Value| m["brake"][0] = 25.1.into()),
         ),
-        ("brake too weak", "way to stop", Box::new(move |m: &mut Value| m["brake"] = json!(vec![1e-3; 7]))),
+        ("brake too weak", "way to stop", Box::new(move |m: &mut Value| m["brake"] = json!(vec![2e-2; 7]))),
         ("not a number", "target_v[2]", Box::new(move |m: &mut Value| m["target_v"][2] = Value::Null)),
         ("cut", "length of target_q", Box::new(move |m: &mut Value| m["target_q"] = json!([0.0]))),
     ];
@@ -400,6 +588,55 @@ fn a_limit_that_was_changed_in_the_log_is_found_out_looser_or_tighter() {
     };
     copy(&log, &other, &|_, _| true, &|bytes| bytes, &facts);
     assert!(verify(&other).unwrap().violations[0].what.contains("speed of joint"));
+}
+
+/// A log that is sound and made to cost much: it is refused or its ticks are not verified, by a reason, in bounded time.
+#[test]
+fn a_log_that_is_made_to_cost_much_ends_with_a_reason() {
+    let (folder, log) = record("verify-hostile", &Attack { ticks: 200, ..attack(LIMITS, 0.001, 1, 20) });
+    let other = folder.0.join("copy.mcap");
+    let braked = |log: &Path, brake: &dyn Fn(f64) -> f64| {
+        let edit = |topic: &str, m: &mut Value| {
+            if topic == "tick" {
+                let speeds = m["target_v"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap().abs());
+                m["brake"] = json!(speeds.map(brake).collect::<Vec<_>>());
+            }
+            true
+        };
+        copy(log, &other, &edit, &|bytes| bytes, &|_| {});
+        verify(&other).unwrap()
+    };
+    // Brakes of minutes in every tick.
+    let report = braked(&log, &|_| 1e-3);
+    assert!(report.found > 100 && report.to_string().contains("comes to rest"), "{report}");
+    // Just short enough to be looked at, and nothing that they break: steps of work run out.
+    let roomy = "velocity = { scale = 0.5 }\nacceleration = { limit = 25.0 }\ntorque = { scale = 1.0 }\nbraking = \"stored\"";
+    let (_folder, slow) = record("verify-slow", &Attack { ticks: 150, ..attack(roomy, 0.001, 1, 20) });
+    let report = braked(&slow, &|speed| (speed / 90.0).max(1e-9));
+    println!("{report}");
+    assert!(report.not_stopped.values().sum::<u64>() > 50, "{report}");
+    assert!(report.to_string().contains("takes longer than a log of this length is given"), "{report}");
+    // More joints than are verified, and one with several degrees of freedom.
+    let refused = |change: &dyn Fn(&mut Snapshot), word: &str| {
+        let changed = |bytes: Vec<u8>| {
+            let mut snapshot = Snapshot::from_bytes(&bytes).unwrap();
+            change(&mut snapshot);
+            snapshot.to_bytes()
+        };
+        copy(&log, &other, &|_, _| true, &changed, &|_| {});
+        let text = verify(&other).unwrap_err().to_string();
+        assert!(text.contains(word), "{text}");
+    };
+    let many = |snapshot: &mut Snapshot| {
+        let joints = (0..300).map(|k| JointDescription::new(&format!("more {k}"), JointKind::Hinge));
+        snapshot.manifest.robot.bodies.last_mut().unwrap().joints.extend(joints);
+    };
+    refused(&many, "joints, more than the 256 that are verified");
+    let ball = |snapshot: &mut Snapshot| {
+        let joint = snapshot.manifest.robot.bodies.iter_mut().find_map(|body| body.joints.first_mut());
+        joint.unwrap().kind = JointKind::Ball;
+    };
+    refused(&ball, "joint 'panda_joint1' has several degrees of freedom");
 }
 
 #[test]

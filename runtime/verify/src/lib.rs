@@ -6,10 +6,12 @@
 //! multipliers that the log carries. What is not known here is refused by name, and a tick that cannot be confirmed is counted so.
 
 mod collision;
+mod jerk;
 mod limit_check;
 mod limits;
 mod log;
 mod motion;
+mod moved;
 mod optimum;
 mod period;
 mod promise;

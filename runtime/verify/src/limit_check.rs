@@ -1,8 +1,9 @@
 //! Whether the step from a state to its target keeps every hard limit.
 
 use crate::collision::Gap;
+use crate::jerk::Brake;
 use crate::limits::{Bounds, Limits};
-use crate::motion::Machine;
+use crate::motion::{Machine, SPENT};
 use crate::period::Period;
 use crate::rows::{Step, is_beyond};
 
@@ -75,13 +76,49 @@ impl Bounds {
         self.braking.min(self.acceleration).min(self.velocity / p.dt).min(room)
     }
 
+    /// The deceleration of a stop: where limits were moved that of the build, of hard jerk the largest.
+    pub(crate) fn stops(&self, p: &Period) -> f64 {
+        if self.jerk.is_finite() {
+            return self.braking.min(self.acceleration);
+        }
+        self.built_brake.unwrap_or_else(|| self.brake(p))
+    }
+
+    /// How the joint brakes where its jerk is hard.
+    pub(crate) fn smooth(&self, p: &Period) -> Option<Brake> {
+        self.jerk.is_finite().then(|| Brake::new(self.jerk, self.stops(p), p))
+    }
+
+    /// The acceleration before a tick: of what stands, none where it is not known.
+    pub(crate) fn before(v: f64, known: Option<f64>) -> Option<f64> {
+        known.or((v == 0.0).then_some(0.0))
+    }
+
     /// The highest speed that a profile leaves `way` in front of where it ends.
     pub(crate) fn profile_speed(profile: &crate::limits::Profile, way: f64) -> f64 {
         ((2.0 * profile.deceleration * way.max(0.0)).sqrt() - profile.offset).max(0.0)
     }
 
     /// Whether the joint at `q`, `v` is beyond its limits, or cannot stop in front of one.
-    pub(crate) fn is_outside(&self, p: &Period, q: Option<f64>, v: f64, whole: bool) -> bool {
+    pub(crate) fn is_outside(
+        &self,
+        p: &Period,
+        q: Option<f64>,
+        (v, before): (f64, Option<f64>),
+        whole: bool,
+    ) -> bool {
+        if let Some(own) = self.smooth(p) {
+            let a = Bounds::before(v, before);
+            return sides(self, q.unwrap_or(0.0), v, v).iter().any(|s| {
+                // Braking begins with the acceleration before, where that is known.
+                let (far, fast) = match a {
+                    Some(a) => own.highest(s.v, s.sign * a),
+                    None => own.highest(s.v, own.step + own.next(s.v, own.step)),
+                };
+                let is_late = q.is_some() && s.room.is_finite() && (s.room < 0.0 || far > s.room);
+                is_late || fast > self.velocity
+            }) || a.is_some_and(|a| a.abs() > self.acceleration);
+        }
         let b = self.brake(p);
         let is_late = q.is_some_and(|q| {
             sides(self, q, v, v).iter().any(|s| {
@@ -103,16 +140,29 @@ impl Bounds {
         sign: f64,
         p: &Period,
         q: Option<f64>,
-        v: f64,
+        (v, before): (f64, Option<f64>),
         v1: f64,
         whole: bool,
     ) -> bool {
         let [low, high] = sides(self, q.unwrap_or(0.0), v, v1);
         let s = if sign > 0.0 { high } else { low };
         let (gone, b) = (p.way(s.v, s.v1), self.brake(p));
+        if let Some(own) = self.smooth(p) {
+            let (a, known) = ((s.v1 - s.v) / p.dt, Bounds::before(v, before).map(|a| sign * a));
+            match kind {
+                "jerk" => return known.is_some_and(|known| a - known > own.step),
+                "velocity" => return s.v1.max(s.v + own.adds(a)) > self.velocity,
+                "viability" => return p.farthest(s.v, a).max(gone + own.highest(s.v1, a).0) > s.room,
+                "locked" => return known.is_some_and(|known| s.v1 > s.v + p.dt * own.next(s.v, known)),
+                _ => {}
+            }
+        }
         match kind {
             "velocity" => s.v1 > self.velocity,
-            "acceleration" => s.v1 - s.v > self.acceleration * p.dt,
+            "acceleration" => {
+                let gains = if s.v > 0.0 { s.v1 - s.v } else { s.v1 };
+                s.v1 - s.v > self.acceleration * p.dt || (s.v1 > 0.0 && gains > self.faster * p.dt)
+            }
             "position" => p.farthest(s.v, (s.v1 - s.v) / p.dt) > s.room || (s.room < 0.0 && s.v1 > 0.0),
             "viability" => {
                 let left = s.room - gone;
@@ -158,20 +208,37 @@ pub(crate) fn joints(
                 format!("{unit}/s^2"),
             );
         }
-        let was = position.map(|(q, _)| q);
-        if excused && j.is_outside(p, was, v, true) {
-            returns(j, p, was, v, v1)?;
+        let (was, known) = (position.map(|(q, _)| q), step.last.map(|last| last[i]));
+        let before = Bounds::before(v, known);
+        let known_before = before.filter(|before| j.jerk.is_finite() && before.abs() <= j.acceleration);
+        if let Some(jerk) =
+            known_before.map(|before| (a - before) / p.dt).filter(|x| is_above(x.abs(), j.jerk))
+        {
+            return broken(of("jerk", &j.name), jerk, jerk.signum() * j.jerk, format!("{unit}/s^3"));
+        }
+        if excused && j.is_outside(p, was, (v, known), true) {
+            returns(j, p, was, (v, before), v1)?;
             continue;
+        }
+        let gains = if v * v1 > 0.0 { v1.abs() - v.abs() } else { v1.abs() };
+        if is_above(gains / p.dt, j.faster) {
+            return broken(of("gain of speed", &j.name), gains / p.dt, j.faster, format!("{unit}/s^2"));
         }
         if is_above(v1.abs(), j.velocity) {
             return broken(of("speed", &j.name), v1, v1.signum() * j.velocity, format!("{unit}/s"));
         }
-        if j.is_locked && is_above(v1.abs(), (v.abs() - j.brake(p) * p.dt).max(0.0)) {
+        let slower = match (j.smooth(p), before) {
+            (None, _) => (v.abs() - j.brake(p) * p.dt).max(0.0),
+            (Some(own), Some(before)) => (v + p.dt * own.next(v, before)).abs(),
+            (Some(_), None) => f64::INFINITY,
+        };
+        if j.is_locked && is_above(v1.abs(), slower) {
             return broken(of("speed", &j.name) + ", which is locked,", v1, 0.0, format!("{unit}/s"));
         }
         let Some((q, q1)) = position else { continue };
         for s in sides(j, q, v, v1) {
-            let most = p.farthest(s.v, (s.v1 - s.v) / p.dt).max(s.sign * (q1 - q));
+            let gone = s.sign * (q1 - q);
+            let most = if step.is_free { gone } else { p.farthest(s.v, (s.v1 - s.v) / p.dt).max(gone) };
             if s.room.is_finite() && is_above(most, s.room) {
                 return broken(of("position", &j.name), q + s.sign * most, s.limit, unit);
             }
@@ -192,7 +259,25 @@ pub(crate) fn joints(
 }
 
 /// A joint outside its limits does not go further out than braking takes it.
-fn returns(j: &Bounds, p: &Period, q: Option<f64>, v: f64, v1: f64) -> Result<(), Fault> {
+fn returns(
+    j: &Bounds,
+    p: &Period,
+    q: Option<f64>,
+    (v, before): (f64, Option<f64>),
+    v1: f64,
+) -> Result<(), Fault> {
+    if let Some(own) = j.smooth(p) {
+        // Its brake, from the acceleration that it has, is the least that it may go on.
+        let Some(before) = before.filter(|_| q.is_some()) else { return Ok(()) };
+        for s in q.map(|q| sides(j, q, v, v1)).into_iter().flatten() {
+            let least = (s.v + p.dt * own.next(s.v, s.sign * before)).max(0.0);
+            if s.room < 0.0 && is_above(s.v1, least) {
+                let named = of("speed", &j.name) + ", which is outside,";
+                return broken(named, v1, s.sign * least, format!("{}/s", j.length));
+            }
+        }
+        return Ok(());
+    }
     let slower = (v.abs() - j.brake(p) * p.dt).max(0.0);
     for s in q.map(|q| sides(j, q, v, v1)).into_iter().flatten() {
         if s.room < 0.0 && is_above(s.v1, (s.v - j.brake(p) * p.dt).max(0.0)) {
@@ -229,7 +314,12 @@ pub(crate) fn rows(
         } else {
             asked(machine)
         };
-        if is_above(by, 0.0) && !(excused && row.is_of_state() && is_beyond(row, machine, step.q, step.v)) {
+        if machine.is_spent() {
+            return Err(Fault::Unknown(SPENT.into()));
+        }
+        if is_above(by, if stored { row.allowed } else { 0.0 })
+            && !(excused && row.is_of_state() && is_beyond(row, machine, step.q, step.v))
+        {
             let (value, limit, unit) = row.value(machine, p, step);
             return broken(format!("{} of '{}'", row.kind, row.name), value, limit, unit);
         }

@@ -1,6 +1,7 @@
 //! The limits of a snapshot, read from `[constraints]` of its task: numbers for each joint, and rows over several.
 
 use std::collections::BTreeMap;
+use std::rc::Rc;
 
 use serde::Deserialize;
 
@@ -27,7 +28,7 @@ pub(crate) struct Section {
     velocity: Option<Velocity>,
     acceleration: Option<Acceleration>,
     torque: Option<Torque>,
-    jerk: Option<Rate>,
+    jerk: Option<Jerk>,
     torque_speed: Option<TorqueSpeed>,
     torque_rate: Option<Rate>,
     velocity_profile: Option<Profiles>,
@@ -123,7 +124,18 @@ fn one() -> f64 {
     1.0
 }
 
-/// `jerk` and `torque_rate`.
+/// `jerk`: soft unless it is said to be hard.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Jerk {
+    limit: PerJoint,
+    margin: Option<PerJoint>,
+    soft: Option<Soft>,
+    #[serde(default)]
+    hard: bool,
+}
+
+/// `torque_rate`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Rate {
@@ -176,7 +188,6 @@ const FR3: [[f64; 5]; 7] = [
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FrameSection {
-    #[allow(dead_code)] // a name to switch it by
     name: Option<String>,
     frame: String,
     #[serde(default)]
@@ -208,7 +219,6 @@ struct FrameBox {
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FrameSpeed {
-    #[allow(dead_code)] // a name to switch it by
     name: Option<String>,
     frame: String,
     #[serde(default)]
@@ -243,11 +253,16 @@ pub(crate) struct CollisionSection {
     pub(crate) braking: f64,
     #[serde(default)]
     pub(crate) margin: f64,
-    #[allow(dead_code)] // a limit of the way it is kept, not of what is kept
-    influence: Option<f64>,
+    /// Pairs farther apart have no row.
+    #[serde(default = "fifth")]
+    pub(crate) influence: f64,
     #[serde(default = "sixteen")]
     pub(crate) rows: usize,
     pub(crate) soft: Option<Soft>,
+}
+
+fn fifth() -> f64 {
+    0.2
 }
 
 fn sixteen() -> usize {
@@ -304,15 +319,22 @@ pub(crate) struct Bounds {
     /// In front of the lowest and the highest position.
     pub(crate) profile: [Option<Profile>; 2],
     pub(crate) is_locked: bool,
+    /// Where it is hard [rad/s³ or m/s³].
+    pub(crate) jerk: f64,
+    /// How fast it may speed up, where that was moved [rad/s² or m/s²].
+    pub(crate) faster: f64,
+    /// What it brakes with where limits were moved: as it was built.
+    pub(crate) built_brake: Option<f64>,
 }
 
 /// Everything `[constraints]` holds.
+#[derive(Clone)]
 pub(crate) struct Limits {
     /// By dof (nv).
     pub(crate) joints: Vec<Bounds>,
     /// Rows, then cones, in the order of their numbers in the log, which begin at nv.
     pub(crate) rows: Vec<Row>,
-    pub(crate) collision: Option<Collision>,
+    pub(crate) collision: Option<Rc<Collision>>,
 }
 
 /// What limits are read for.
@@ -381,7 +403,8 @@ impl Section {
         for frame in &self.frame {
             frame.rows(of, &mut rows)?;
         }
-        let collision = self.collision.as_ref().map(|section| Collision::new(section, of)).transpose()?;
+        let collision =
+            self.collision.as_ref().map(|section| Collision::new(section, of)).transpose()?.map(Rc::new);
         if let (Some(pairs), Some(section)) = (&collision, &self.collision) {
             for name in pairs.row_names() {
                 rows.push(Row::new("collision", &name, section.braking, section.soft, Rule::Pair));
@@ -400,13 +423,9 @@ impl Section {
         }
         for speed in &self.frame_speed {
             let (spot, limit) = (of.spot(&speed.frame)?, speed.limit - speed.margin);
-            rows.push(Row::new(
-                "frame_speed",
-                &speed.frame,
-                limit,
-                speed.soft,
-                Rule::Speed { spot, point: speed.point, most: limit },
-            ));
+            let rule = Rule::Speed { spot, point: speed.point, most: limit };
+            let row = Row::new("frame_speed", &speed.frame, limit, speed.soft, rule);
+            rows.push(Row { label: speed.name.clone().unwrap_or_else(|| speed.frame.clone()), ..row });
         }
         if let Some(energy) = &self.energy {
             let most = energy.limit - energy.margin;
@@ -429,6 +448,9 @@ impl Section {
             braking: none,
             profile: [None; 2],
             is_locked: false,
+            jerk: none,
+            faster: none,
+            built_brake: None,
         };
         if !of.controllable.contains(&dof) {
             return bounds;
@@ -462,21 +484,24 @@ impl Section {
             let stated = acceleration.braking.as_ref().and_then(|braking| braking.of(dof, name));
             bounds.braking = stated.unwrap_or(none).min(bounds.acceleration);
         }
+        let jerk = self.jerk.as_ref().filter(|jerk| jerk.hard);
+        if let Some((jerk, limit)) = jerk.and_then(|jerk| Some((jerk, jerk.limit.of(dof, name)?))) {
+            bounds.jerk = less(limit, &jerk.margin, dof, name);
+        }
         bounds
     }
 
     /// Rows of single joints beside the torque: jerk, torque by speed, torque rate.
     fn rates(&self, of: &Of<'_>, rows: &mut Vec<Row>) {
-        let each = |rate: &Rate| -> Vec<(usize, f64)> {
-            let value = |dof: &usize| {
-                Some((*dof, less(rate.limit.of(*dof, of.name(*dof))?, &rate.margin, *dof, of.name(*dof))))
-            };
+        let each = |limit: &PerJoint, margin: &Option<PerJoint>| -> Vec<(usize, f64)> {
+            let value =
+                |dof: &usize| Some((*dof, less(limit.of(*dof, of.name(*dof))?, margin, *dof, of.name(*dof))));
             of.controllable.iter().filter_map(value).collect()
         };
-        if let Some(jerk) = &self.jerk {
-            let row =
-                |(dof, most)| Row::new("jerk", of.name(dof), most, Some(jerk.soft), Rule::Jerk { dof, most });
-            rows.extend(each(jerk).into_iter().map(row));
+        if let Some(jerk) = self.jerk.as_ref().filter(|jerk| !jerk.hard) {
+            let soft = Some(jerk.soft.unwrap_or_default());
+            let row = |(dof, most)| Row::new("jerk", of.name(dof), most, soft, Rule::Jerk { dof, most });
+            rows.extend(each(&jerk.limit, &jerk.margin).into_iter().map(row));
         }
         if let Some(motor) = &self.torque_speed {
             for &dof in of.controllable {
@@ -500,7 +525,7 @@ impl Section {
             let row = |(dof, most)| {
                 Row::new("torque_rate", of.name(dof), most, Some(rate.soft), Rule::TorqueRate { dof, most })
             };
-            rows.extend(each(rate).into_iter().map(row));
+            rows.extend(each(&rate.limit, &rate.margin).into_iter().map(row));
         }
     }
 }
@@ -548,7 +573,8 @@ impl FrameSection {
                 offset: offset - self.margin,
                 braking: self.braking,
             };
-            rows.push(Row::new("frame", name, self.braking, self.soft, rule));
+            let row = Row::new("frame", name, self.braking, self.soft, rule);
+            rows.push(Row { label: self.name.clone().unwrap_or_else(|| self.frame.clone()), ..row });
         };
         if let Some(half) = &self.half_space {
             let n = times(1.0 / norm(half.normal), half.normal);

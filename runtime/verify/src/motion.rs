@@ -1,6 +1,8 @@
 //! Rigid-body dynamics: the recursive Newton-Euler equations over the bodies' own axes (Featherstone, *Rigid Body Dynamics Algorithms*,
 //! 2008, table 5.1), and what follows from the same recursion: places, velocities, kinetic energy.
 
+use std::cell::Cell;
+
 use crate::robot::{Joint, JointKind, Robot};
 use crate::space::{Place, Vec3, apply, apply_back, cross, dot, minus, norm, plus, times, turn};
 
@@ -62,7 +64,17 @@ pub(crate) struct Machine {
     ahead: Vec<f64>,
     shifted: Vec<f64>,
     still: Vec<f64>,
+    /// Steps of work that are left, see [`Machine::grant`].
+    left: Cell<i64>,
 }
+
+/// Joints at most: what is done in a tick grows with their square.
+const JOINTS: usize = 256;
+/// Steps of work (a link moved, a distance looked at) that a tick may take on average, and more of them at first.
+const EACH: i64 = 500_000;
+const FIRST: i64 = 20_000_000;
+/// Why a tick is not verified for which no steps are left.
+pub(crate) const SPENT: &str = "verifying them takes longer than a log of this length is given";
 
 impl Link {
     fn new(parent: Option<usize>, base: Place, joint: &Joint, idx_q: usize, body: usize) -> Link {
@@ -162,7 +174,12 @@ impl Machine {
                 let size = match joint.kind {
                     JointKind::Hinge | JointKind::Slide => 1,
                     JointKind::Continuous => 2,
-                    _ => return Err(format!("joint '{}' has several degrees of freedom", joint.name)),
+                    _ => {
+                        return Err(format!(
+                            "joint '{}' has several degrees of freedom, and the recursion here is of joints with one",
+                            joint.name
+                        ));
+                    }
                 };
                 links.push(Link::new(spot.link, spot.place, joint, nq, number));
                 nq += size;
@@ -184,6 +201,9 @@ impl Machine {
             spots.push((frame.name.clone(), false, Spot { place: on.place.then(&frame.placement), ..on }));
         }
         let n = links.len();
+        if n > JOINTS {
+            return Err(format!("it has {n} joints, more than the {JOINTS} that are verified"));
+        }
         let (place, twist) = (vec![Place::HERE; n], vec![[[0.0; 3]; 2]; n]);
         Ok(Machine {
             links,
@@ -198,7 +218,23 @@ impl Machine {
             ahead: vec![0.0; nq],
             shifted: vec![0.0; n],
             still: vec![0.0; n],
+            left: Cell::new(FIRST),
         })
+    }
+
+    /// A tick more is to be verified.
+    pub(crate) fn grant(&self) {
+        self.left.set(self.left.get().saturating_add(EACH).min(1000 * FIRST));
+    }
+
+    /// Counts steps of work.
+    pub(crate) fn spend(&self, steps: usize) {
+        self.left.set(self.left.get().saturating_sub(steps as i64));
+    }
+
+    /// No steps of work are left.
+    pub(crate) fn is_spent(&self) -> bool {
+        self.left.get() <= 0
     }
 
     /// Number of degrees of freedom, one for each joint.
@@ -250,6 +286,7 @@ impl Machine {
 
     /// Velocities and accelerations, outwards. Gravity is an acceleration of the world upwards.
     fn sweep(&mut self, q: &[f64], v: &[f64], a: Option<&[f64]>, gravity: Vec3) {
+        self.spend(self.links.len());
         for k in 0..self.links.len() {
             let link = &self.links[k];
             let place = link.at(q);

@@ -7,9 +7,11 @@
 //! with the multipliers of the log. What pulls the target to the proposal must be what the active rows push back, each row must push the way
 //! it can, and only where it is at its bound: where a little more would break it. The problem is convex, so this is all there is to show.
 
-use crate::limit_check::{Fault, TOLERANCE, broken, worst};
+use crate::collision::Told;
+use crate::limit_check::{Fault, TOLERANCE, are_near, broken, worst};
+use crate::motion::SPENT;
 use crate::promise::Promise;
-use crate::rows::{Row, Step};
+use crate::rows::{Row, Rule, Step};
 use crate::tick::Ledger;
 
 /// A limit is active when this share of the largest velocity change of a period would break it.
@@ -22,6 +24,10 @@ const ROUNDING: f64 = 1e-9;
 const CONIC: f64 = 2e-5;
 /// A goal so many times its box away was brought nearer before it was solved for.
 const FAR: f64 = 1e5;
+/// A proposal is the same as another up to this share: it is computed anew.
+const SAME: f64 = 1e-12;
+/// Why such a tick is not compared.
+const TOO_FAR: &str = "the proposal is further away than numbers are exact";
 
 /// Number of the rung without soft rows, and of Clarabel.
 const RELAXED: u32 = 4;
@@ -44,7 +50,7 @@ pub(crate) fn confirm(
     let Promise { machine, limits, controllable, period, worth, .. } = promise;
     let has_rows = !limits.rows.is_empty();
     if has_rows && controllable.iter().any(|&i| (goals[0][i] - step.v1[i]).abs() > FAR) {
-        return unknown("the proposal is further away than numbers are exact");
+        return unknown(TOO_FAR);
     }
     if limits.rows.iter().any(Row::needs_before) && step.before.is_none() {
         return unknown("the tick before is not known, of which jerk and torque rate speak");
@@ -79,7 +85,10 @@ pub(crate) fn confirm(
             let q = machine.single(i).map(|at| step.q[at]);
             let most = joint.acceleration.min(2.0 * joint.velocity / period.dt) * period.dt;
             let more = step.v1[i] + side * NEAR * if most.is_finite() { most } else { 1.0 };
-            if multiplier > 0.0 && !joint.breaks(&active.kind, side, period, q, step.v[i], more, whole) {
+            let known = step.last.map(|last| last[i]);
+            if multiplier > 0.0
+                && !joint.breaks(&active.kind, side, period, q, (step.v[i], known), more, whole)
+            {
                 return broken(
                     format!("velocity after the {named}, which holds nothing there,"),
                     step.v1[i],
@@ -97,26 +106,49 @@ pub(crate) fn confirm(
                 "rows",
             );
         };
-        if row.kind == "collision" {
-            return unknown("a row of a distance was active, whose nearest points are the projection's own");
-        }
-        let slope = row.slope(machine, period, step, &forces);
+        let (slope, excess) = match (&limits.collision, &row.rule) {
+            (Some(bodies), Rule::Pair) => {
+                match bodies.row(machine, period, step, active.row - nv - first_pair(&limits.rows)) {
+                    Told::Row(excess, slope) => (slope, excess),
+                    Told::Unknown(why) => return unknown(&why),
+                    Told::None => {
+                        let what = format!("distance of the active row {n} of bodies");
+                        return broken(what, f64::INFINITY, bodies.influence(), "m at most");
+                    }
+                }
+            }
+            _ => {
+                let slope = row.slope(machine, period, step, &forces);
+                (slope, row.excess(machine, period, step)[usize::from(side > 0.0)])
+            }
+        };
         for &i in controllable.iter() {
             push[i] += side * multiplier * slope[i];
             size[i] += (multiplier * slope[i]).abs();
         }
-        let excess = row.excess(machine, period, step)[usize::from(side > 0.0)];
         let steepest = slope.iter().fold(0.0, |most: f64, s| most.max(s.abs()));
         belongs(row, (multiplier, excess, active.slack), steepest, (*worth, ledger.rung))?;
     }
     all_hold(promise, step, ledger)?;
     let coarse = if matches!(ledger.rung, CLARABEL | RELAXED) { CONIC } else { ROUNDING };
     let mut largest = 0.0f64;
+    // The widest side of the box, at most: what a period may change of a velocity.
+    let sides = promise.controllable.iter().map(|&i| {
+        let joint = &promise.limits.joints[i];
+        2.0 * promise.period.dt * joint.acceleration.min(joint.jerk * promise.period.dt)
+    });
+    let widest = sides.filter(|side| side.is_finite()).fold(1e-6, f64::max).min(1.0);
+    // Clarabel's scaling bears less.
+    let most = if coarse == CONIC { 1e-2 * FAR * widest } else { FAR * widest };
+    let is_far = has_rows && promise.controllable.iter().any(|&i| (goals[0][i] - step.v1[i]).abs() > most);
     for &i in &promise.controllable {
         let left = |goal: f64| (2.0 * (step.v1[i] - goal) + push[i]).abs();
         let least = left(goals[0][i]).min(left(goals[1][i]));
         let far = 1.0 + goals[0][i].abs() + step.v[i].abs() + size[i];
         if least.is_nan() || least > 2.0 * coarse * far {
+            if is_far {
+                return unknown(TOO_FAR);
+            }
             let joint = &promise.limits.joints[i];
             let what = format!("pull on joint '{}' that no active row balances", joint.name);
             return broken(what, 0.5 * least, coarse * far, format!("{}/s", joint.length));
@@ -124,6 +156,84 @@ pub(crate) fn confirm(
         largest = largest.max(least / (2.0 * coarse * far));
     }
     Ok(largest)
+}
+
+/// The first row of a distance.
+fn first_pair(rows: &[Row]) -> usize {
+    rows.iter().position(|row| matches!(row.rule, Rule::Pair)).unwrap_or(0)
+}
+
+/// The conditions of a tick whose positions and velocities are clamped apart: each is the proposal's, or the end of what the joint can reach in a
+/// period that is nearest to it, which an active row names with the distance as multiplier.
+pub(crate) fn apart(
+    promise: &Promise,
+    step: &Step<'_>,
+    (pq, pv): &(Vec<f64>, Vec<f64>),
+    ledger: &Ledger,
+    whole: bool,
+) -> Result<(), Fault> {
+    if ledger.active != ledger.active_rows.len() {
+        return Err(Fault::Unknown("more rows were active than a record has room for".into()));
+    }
+    let (p, mut named) = (&promise.period, 0);
+    let weight = (p.kappa * p.dt).powi(-2);
+    for &i in &promise.controllable {
+        let joint = &promise.limits.joints[i];
+        let at = promise.machine.single(i);
+        let q = at.map(|at| step.q[at]);
+        let most = joint.acceleration.min(2.0 * joint.velocity / p.dt) * p.dt;
+        let near = NEAR * if most.is_finite() { most } else { 1.0 };
+        let mut rows = ledger.active_rows.iter().filter(|row| row.row == i).peekable();
+        let place = at.map(|at| (pq[at], step.q1[at], true));
+        for (asked, got, is_place) in [Some((pv[i], step.v1[i], false)), place].into_iter().flatten() {
+            if are_near(asked, got, SAME * asked.abs().max(1.0)) {
+                // The same but for rounding: a row may name it all the same.
+                let weight = if is_place { weight } else { 1.0 };
+                named += usize::from(
+                    rows.next_if(|row| row.multiplier <= weight * SAME * asked.abs().max(1.0)).is_some(),
+                );
+                continue;
+            }
+            let what = if is_place { "position" } else { "velocity" };
+            let Some(row) = rows.next() else {
+                let what = format!("target {what} of joint '{}', which no active row holds,", joint.name);
+                return broken(what, got, asked, "as proposed");
+            };
+            named += 1;
+            let (sign, side) = if asked > got { (1.0, "upper") } else { (-1.0, "lower") };
+            let force = (asked - got).abs() * if is_place { weight } else { 1.0 };
+            if row.side != side || !are_near(row.multiplier, force, 1e-6 * (1e-9 + force)) {
+                let what = format!("multiplier of the active {} row of joint '{}'", row.kind, joint.name);
+                return broken(what, sign * row.multiplier, sign * force, "of its own unit");
+            }
+            // The velocity with which it would be reached, a little further.
+            let from = q.unwrap_or(0.0);
+            let reached =
+                if is_place { step.v[i] + ((got - from) / p.dt - step.v[i]) / p.kappa } else { got };
+            let is_end = match row.kind.as_str() {
+                "position" if is_place => {
+                    are_near(got, if sign > 0.0 { joint.upper } else { joint.lower }, TOLERANCE)
+                }
+                kind => joint.breaks(kind, sign, p, q, (step.v[i], None), reached + sign * near, whole),
+            };
+            if !is_end {
+                let what = format!(
+                    "target {what} of joint '{}', which the {} row holds too early,",
+                    joint.name, row.kind
+                );
+                return broken(what, got, asked, "as proposed");
+            }
+        }
+    }
+    match named == ledger.active_rows.len() {
+        true => Ok(()),
+        false => broken(
+            "number of active rows",
+            ledger.active_rows.len() as f64,
+            named as f64,
+            "that hold something",
+        ),
+    }
 }
 
 /// Motor forces for a unit of each acceleration (nv x nv, by rows): they are linear in it.
@@ -183,7 +293,19 @@ fn all_hold(promise: &mut Promise, step: &Step<'_>, ledger: &Ledger) -> Result<(
     let nv = step.v.len();
     let Promise { machine, limits, period, .. } = promise;
     for (r, row) in limits.rows.iter().enumerate() {
-        let excess = worst(row.excess(machine, period, step));
+        let excess = match (&limits.collision, &row.rule) {
+            (Some(bodies), Rule::Pair) => {
+                match bodies.row(machine, period, step, r - first_pair(&limits.rows)) {
+                    Told::Row(excess, _) => excess,
+                    // That bodies keep apart is looked at by itself. A row that is not known and holds nothing back is no matter here.
+                    Told::None | Told::Unknown(_) => f64::NEG_INFINITY,
+                }
+            }
+            _ => worst(row.excess(machine, period, step)),
+        };
+        if machine.is_spent() {
+            return Err(Fault::Unknown(SPENT.into()));
+        }
         let is_named = || ledger.active_rows.iter().any(|active| active.row == nv + r);
         let most = if row.soft.is_some() { 10.0 * TOLERANCE } else { AT.max(TOLERANCE) };
         if excess > most && (row.soft.is_none() || !is_named()) {

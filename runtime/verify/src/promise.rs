@@ -5,6 +5,7 @@ use serde_json::Value;
 
 use crate::limits::{Consistency, Limits, Of, PerJoint, Section, Way};
 use crate::motion::Machine;
+use crate::moved::{Moved, Moving};
 use crate::period::Period;
 use crate::robot::Robot;
 
@@ -14,7 +15,7 @@ struct Manifest {
     task: Task,
     robot: Robot,
     /// Where an operator has moved the limits.
-    moved: Option<Value>,
+    moved: Option<Moved>,
     policy: String,
     action_lower: Vec<f64>,
     action_upper: Vec<f64>,
@@ -127,8 +128,8 @@ pub(crate) struct Promise {
     pub(crate) actions: Vec<Action>,
     /// Limits on actions change `moved`.
     pub(crate) limits_actions: bool,
-    /// An operator has moved its limits, which is not known here.
-    pub(crate) is_moved: bool,
+    /// Where an operator has moved its limits; `limits` are then those in force for a tick.
+    pub(crate) moving: Option<Moving>,
     /// A unit of softness: the weighted squared distance of the largest velocity change of one period.
     pub(crate) worth: f64,
 }
@@ -231,6 +232,7 @@ impl Promise {
                 (false, false) => 1.0,
             }
         };
+        let moving = m.moved.as_ref().map(|moved| Moving::new(limits.clone(), moved, &period, &controllable));
         let worth = controllable.iter().map(change).fold(0.0, |most: f64, x| most.max(2.0 * x * x));
         let consistency =
             if projects == Projects::Proposals { section.consistency } else { Consistency::Kinematic };
@@ -246,7 +248,7 @@ impl Promise {
             way: section.braking,
             actions,
             limits_actions: section.action.is_some(),
-            is_moved: m.moved.is_some(),
+            moving,
             worth,
         })
     }
@@ -255,6 +257,11 @@ impl Promise {
     pub(crate) fn stated(bytes: &[u8]) -> Result<Value, String> {
         let manifest: Value = serde_json::from_str(&manifest(bytes)?).map_err(|e| e.to_string())?;
         Ok(manifest["task"]["constraints"].clone())
+    }
+
+    /// The limits as they were built.
+    pub(crate) fn built(&self) -> &Limits {
+        self.moving.as_ref().map_or(&self.limits, |moving| &moving.built)
     }
 
     /// Whether a dof is proposed as a position, and as a velocity.

@@ -22,7 +22,7 @@ impl Default for Soft {
 }
 
 /// A row or a cone of the projection.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Row {
     /// As the log names it.
     pub(crate) kind: &'static str,
@@ -33,10 +33,14 @@ pub(crate) struct Row {
     /// `None` is hard.
     pub(crate) soft: Option<Soft>,
     pub(crate) rule: Rule,
+    /// Name of its limit.
+    pub(crate) label: String,
+    /// What is kept may be broken by so much, on the way to where it was moved ([`Row::breach`]).
+    pub(crate) allowed: f64,
 }
 
 /// One summand of a user's row.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Term {
     pub(crate) dof: usize,
     /// Configuration entry and coefficient.
@@ -46,7 +50,7 @@ pub(crate) struct Term {
 }
 
 /// What a row says.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) enum Rule {
     /// `|tau| <= most`.
     Torque { dof: usize, most: f64 },
@@ -83,6 +87,10 @@ pub(crate) struct Step<'a> {
     pub(crate) tau: &'a [f64],
     /// Acceleration and motor forces of the tick before.
     pub(crate) before: Option<(&'a [f64], &'a [f64])>,
+    /// Acceleration that led to the state (nv), where the log has the tick before.
+    pub(crate) last: Option<&'a [f64]>,
+    /// Position and velocity are targets apart.
+    pub(crate) is_free: bool,
 }
 
 /// Frames and bodies keep this far inside their boundary, for what a straight row misses of a curved way [m]; a projection's own choice.
@@ -96,7 +104,7 @@ const ROUNDING: f64 = 1e-10;
 
 impl Row {
     pub(crate) fn new(kind: &'static str, name: &str, size: f64, soft: Option<Soft>, rule: Rule) -> Row {
-        Row { kind, name: name.to_owned(), size, soft, rule }
+        Row { kind, name: name.to_owned(), size, soft, rule, label: String::new(), allowed: 0.0 }
     }
 
     /// Whether motor forces are in it.
@@ -158,6 +166,9 @@ impl Row {
 
     /// By how much a step is beyond the lower and the upper bound that the projection has to keep, as shares of the size; negative inside.
     pub(crate) fn excess(&self, m: &mut Machine, p: &Period, step: &Step<'_>) -> [f64; 2] {
+        if matches!(self.rule, Rule::Plane { .. } | Rule::User { .. }) {
+            m.spend(100 * (1 + p.sub_steps as usize));
+        }
         let both = |value: f64, most: f64| [-value / most - 1.0, value / most - 1.0];
         let none = f64::NEG_INFINITY;
         match &self.rule {
@@ -239,6 +250,16 @@ impl Row {
             Rule::Pair => return None,
             _ => worst(self.excess(m, p, step)),
         })
+    }
+
+    /// By how much less another row of the same rule allows, in the measure of [`Row::breach`].
+    pub(crate) fn looser(&self, other: &Row) -> f64 {
+        match (&self.rule, &other.rule) {
+            (Rule::Plane { offset, .. }, Rule::Plane { offset: wide, .. }) => wide - offset,
+            (Rule::Speed { most, .. }, Rule::Speed { most: wide, .. }) => wide / most - 1.0,
+            (Rule::Energy { most }, Rule::Energy { most: wide }) => (wide / most).sqrt() - 1.0,
+            _ => 0.0,
+        }
     }
 
     /// How the row's value changes with the velocity change of each dof (nv), in the row's unit. `forces` are the motors' forces for a unit of
@@ -323,7 +344,7 @@ fn in_front(p: &Period, d: f64, w: f64, b: f64) -> f64 {
 
 /// By how much closing in on a plane with the speed `then` at the end of a period is more than allowed, as a share of `b`. Distance, closing
 /// speed and closing acceleration are those at `q + T v`, from which the joint-like motion begins a period earlier.
-fn plane(p: &Period, distance: f64, speed: f64, c: f64, then: f64, b: f64) -> f64 {
+pub(crate) fn plane(p: &Period, distance: f64, speed: f64, c: f64, then: f64, b: f64) -> f64 {
     let w = speed - (p.dt + 0.5 * p.tau) * c;
     let d = distance - CREEP + p.dt * w + p.kappa * p.dt * p.dt * c;
     let a = c + (then - speed) / p.dt;
@@ -339,7 +360,7 @@ fn plane(p: &Period, distance: f64, speed: f64, c: f64, then: f64, b: f64) -> f6
 /// Whether a point of a plane is beyond it already.
 pub(crate) fn is_beyond(row: &Row, m: &mut Machine, q: &[f64], v: &[f64]) -> bool {
     let zero = vec![0.0; v.len()];
-    let step = Step { q, v, q1: q, v1: v, a: &zero, tau: &zero, before: None };
+    let step = Step { q, v, q1: q, v1: v, a: &zero, tau: &zero, before: None, last: None, is_free: false };
     match &row.rule {
         Rule::Plane { spot, point, n, offset, .. } => {
             m.go(q, v);

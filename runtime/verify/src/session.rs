@@ -5,7 +5,8 @@ use std::collections::{BTreeMap, HashMap};
 use serde_json::Value;
 
 use crate::limit_check::{self, Breach, Fault, are_near, broken};
-use crate::limits::{Consistency, Way};
+use crate::limits::{Consistency, Limits, Way};
+use crate::moved::Moving;
 use crate::optimum;
 use crate::promise::{Entry as Proposed, Projects, Promise, Sent};
 use crate::report::{Report, Violation};
@@ -29,7 +30,11 @@ type Told = (Vec<f64>, Vec<f64>);
 
 /// What the tick before left.
 struct Past {
+    episode: u64,
     target: (Vec<f64>, Vec<f64>),
+    /// Its acceleration, and the brake that it stored; empty where it stored none.
+    a: Vec<f64>,
+    brake: Vec<f64>,
     /// Acceleration and motor forces, where they are what the next tick was told.
     told: Option<Told>,
 }
@@ -64,6 +69,8 @@ struct Case<'a> {
     v: &'a [f64],
     status: Status,
     by_policy: bool,
+    /// Acceleration of the tick before.
+    last: Option<Vec<f64>>,
     /// What was projected, or why it is not known.
     proposal: Result<(Vec<f64>, Vec<f64>), String>,
 }
@@ -138,6 +145,11 @@ impl Session {
             Some(promises) => promises,
             None => self.promise(tick.snapshot)?,
         };
+        if self.past.as_ref().is_some_and(|past| past.episode != tick.state.episode) {
+            self.past = None;
+        }
+        promises.0.machine.grant();
+        promises.1.iter().for_each(|pinned| pinned.machine.grant());
         let told = match self.judge(&mut promises, tick) {
             Ok(told) => told,
             Err(Fault::Broken(Breach { what, value, limit, unit })) => {
@@ -149,8 +161,15 @@ impl Session {
                 None
             }
         };
+        let dt = promises.0.period.dt;
         self.promises.insert(tick.snapshot, promises);
-        self.past = Some(Past { target: (tick.target_q.clone(), tick.target_v.clone()), told });
+        let v = match (&tick.sensed[..], self.past.take()) {
+            ("predicted", Some(past)) => past.target.1,
+            _ => tick.state.v.clone(),
+        };
+        let a = tick.target_v.iter().zip(&v).map(|(to, from)| (to - from) / dt).collect();
+        let target = (tick.target_q.clone(), tick.target_v.clone());
+        self.past = Some(Past { episode: tick.state.episode, target, a, brake: tick.brake.clone(), told });
         Ok(())
     }
 
@@ -164,11 +183,11 @@ impl Session {
         let of = |e: String| format!("snapshot number {id}: {e}");
         let own = Promise::read(bytes, None).map_err(of)?;
         let names: Vec<&str> = own
-            .limits
+            .built()
             .joints
             .iter()
             .map(|j| j.name.as_str())
-            .chain(own.limits.rows.iter().map(|r| r.name.as_str()))
+            .chain(own.built().rows.iter().map(|r| r.name.as_str()))
             .collect();
         if own.projects != Projects::Nothing
             && own.consistency == Consistency::Kinematic
@@ -224,8 +243,8 @@ impl Session {
         if own.projects == Projects::Nothing || status == Status::NotProjected {
             return unknown("their policy gives actions that nothing was projected for");
         }
-        if own.is_moved || status == Status::Tightening {
-            return unknown("an operator had moved their limits, which is not known here");
+        if own.moving.is_none() && status == Status::Tightening {
+            return broken("limits moved by an operator, of a tick on the way to such,", 0.0, 1.0, "or more");
         }
         let finite = |what: &str, x: &[f64]| match x.iter().position(|x| !x.is_finite()) {
             Some(k) => broken(format!("{what}[{k}]"), x[k], 0.0, "a number"),
@@ -252,7 +271,8 @@ impl Session {
             self.begun = Some(Begun { goal: goal(own, tick, &q, &v), start: (q.clone(), v.clone()) });
         }
         let proposal = self.proposal(own, tick, by_policy, (&q, &v));
-        let mut case = Case { tick, is_own: true, q: &q, v: &v, status, by_policy, proposal };
+        let last = self.past.as_ref().map(|past| past.a.clone());
+        let mut case = Case { tick, is_own: true, q: &q, v: &v, status, by_policy, last, proposal };
         let told = self.confirm(own, &case)?;
         if let Some(pinned) = pinned {
             case.is_own = false;
@@ -273,17 +293,21 @@ impl Session {
         (q, v): (&[f64], &[f64]),
     ) -> Result<(Vec<f64>, Vec<f64>), String> {
         let no = |why: &str| Err(why.to_owned());
-        if own.consistency == Consistency::Free {
-            return no("positions and velocities are clamped apart (consistency = \"free\")");
-        }
         let p = &own.period;
         let (mut pq, mut pv) = (q.to_vec(), v.to_vec());
         if !by_policy {
-            // The loop's own brake proposes rest.
+            // The loop's own brake proposes rest, of hard jerk what leads there.
             for &i in &own.controllable {
-                pv[i] = 0.0;
+                let joint = &own.built().joints[i];
+                pv[i] = match (joint.smooth(p), &self.past) {
+                    (None, _) => 0.0,
+                    (Some(smooth), Some(past)) => v[i] + p.dt * smooth.next(v[i], past.a[i]),
+                    (Some(_), None) => {
+                        return no("the tick before their brake is not known, of which jerk speaks");
+                    }
+                };
                 if let Some(at) = own.machine.single(i) {
-                    pq[at] = q[at] + p.way(v[i], 0.0);
+                    pq[at] = q[at] + p.way(v[i], pv[i]);
                 }
             }
             return Ok((pq, pv));
@@ -329,15 +353,34 @@ impl Session {
         promise.machine.motors(&p, case.q, case.v, &a, &mut tau);
         let told = self.past.as_ref().and_then(|past| past.told.clone());
         let before = told.as_ref().map(|(a, tau)| (&a[..], &tau[..]));
-        let step =
-            Step { q: case.q, v: case.v, q1: &tick.target_q, v1: &tick.target_v, a: &a, tau: &tau, before };
+        let step = Step {
+            q: case.q,
+            v: case.v,
+            q1: &tick.target_q,
+            v1: &tick.target_v,
+            a: &a,
+            tau: &tau,
+            before,
+            last: case.last.as_deref(),
+            is_free: promise.consistency == Consistency::Free,
+        };
         let is_stored = !tick.brake.is_empty();
         let excused = case.status == Status::Recovering;
         if promise.consistency == Consistency::Kinematic {
             follows(promise, &step)?;
         }
-        limit_check::joints(&promise.limits, &promise.machine, &promise.controllable, &p, &step, excused)?;
-        limit_check::rows(&promise.limits, &mut promise.machine, &p, &step, is_stored, excused)?;
+        if let Some(mut moving) = promise.moving.take() {
+            // What was built holds on any way, then what is in force on this one.
+            promise.limits.clone_from(&moving.built);
+            let held = holds(promise, &step, is_stored, excused);
+            let in_force = self.in_force(promise, &mut moving, case);
+            promise.moving = Some(moving);
+            held?;
+            promise.limits = in_force?;
+        }
+        if promise.moving.is_none() || !excused {
+            holds(promise, &step, is_stored, excused)?;
+        }
         if !case.is_own {
             return Ok(None);
         }
@@ -359,8 +402,26 @@ impl Session {
         }
         actions(promise, &step, &tick.action)?;
         self.optimum(promise, case, &step, is_stored)?;
-        self.stop(promise, case, is_stored)?;
+        self.stop(promise, case, &a, is_stored)?;
         Ok(Some((a, tau)))
+    }
+
+    /// The limits in force at a tick whose limits were moved: those asked for where the tick says that they are reached.
+    fn in_force(&self, promise: &mut Promise, moving: &mut Moving, case: &Case<'_>) -> Result<Limits, Fault> {
+        if case.status == Status::Nearest {
+            return Ok(moving.wanted.clone());
+        }
+        let is_stored = promise.way == Way::Stored || !case.tick.brake.is_empty();
+        let brake = match &self.past {
+            None if is_stored => {
+                let why =
+                    "their limits were moved, and the brake in force is of a tick that the log does not have";
+                return Err(Fault::Unknown(why.into()));
+            }
+            past => past.as_ref().map(|past| &past.brake[..]).filter(|brake| brake.len() == case.v.len()),
+        };
+        let Promise { machine, period, controllable, .. } = promise;
+        Ok(moving.in_force(machine, (period, controllable), (case.q, case.v), brake))
     }
 
     fn optimum(
@@ -376,6 +437,9 @@ impl Session {
         };
         match case.status {
             Status::Recovering => return without("the robot was outside its limits"),
+            Status::Tightening => {
+                return without("the robot was on its way to limits that an operator moved");
+            }
             Status::Slowed => {
                 return without("no way to stop was found from the nearest allowed state (slowed)");
             }
@@ -386,6 +450,14 @@ impl Session {
             Ok(proposal) => proposal,
             Err(why) => return without(why),
         };
+        if step.is_free {
+            match optimum::apart(promise, step, proposal, &case.tick.ledger, is_stored) {
+                Ok(()) => self.report.optimal += 1,
+                Err(Fault::Unknown(why)) => return without(&why),
+                Err(fault) => return Err(fault),
+            }
+            return Ok(());
+        }
         let (one, other) = unconstrained(promise, step, proposal);
         if !case.by_policy && promise.limits.rows.iter().any(Row::needs_before) {
             return without("a brake is not told of the tick before, of which jerk and torque rate speak");
@@ -408,7 +480,13 @@ impl Session {
         Ok(())
     }
 
-    fn stop(&mut self, promise: &mut Promise, case: &Case<'_>, is_stored: bool) -> Result<(), Fault> {
+    fn stop(
+        &mut self,
+        promise: &mut Promise,
+        case: &Case<'_>,
+        a: &[f64],
+        is_stored: bool,
+    ) -> Result<(), Fault> {
         let (q, v) = (&case.tick.target_q, &case.tick.target_v);
         let mut without = |why: &str| {
             *self.report.not_stopped.entry(why.to_owned()).or_default() += 1;
@@ -421,11 +499,11 @@ impl Session {
             return without("consistency = \"free\" promises none");
         }
         let found = if is_stored {
-            stop::stored(promise, q, v, &case.tick.brake)
+            stop::stored(promise, q, v, a, &case.tick.brake)
         } else if promise.way == Way::Stored {
             return broken("number of stored decelerations", 0.0, v.len() as f64, "");
         } else {
-            stop::certified(promise, q, v)
+            stop::certified(promise, q, v, a)
         };
         match found {
             Ok(()) => self.report.stoppable += 1,
@@ -499,6 +577,13 @@ fn distance(own: &Promise, step: &Step<'_>, (pq, pv): &(Vec<f64>, Vec<f64>), goa
     each.sum::<f64>().sqrt()
 }
 
+/// The limits of joints, then what ties joints together.
+fn holds(promise: &mut Promise, step: &Step<'_>, stored: bool, excused: bool) -> Result<(), Fault> {
+    let Promise { machine, limits, controllable, period, .. } = promise;
+    limit_check::joints(limits, machine, controllable, period, step, excused)?;
+    limit_check::rows(limits, machine, period, step, stored, excused)
+}
+
 /// The target's position is where its velocity leads.
 fn follows(promise: &Promise, step: &Step<'_>) -> Result<(), Fault> {
     let p = &promise.period;
@@ -517,7 +602,8 @@ fn follows(promise: &Promise, step: &Step<'_>) -> Result<(), Fault> {
 fn is_outside(promise: &mut Promise, case: &Case<'_>, whole: bool) -> bool {
     let Promise { machine, limits, controllable, period, .. } = promise;
     let joint = |&i: &usize| {
-        limits.joints[i].is_outside(period, machine.single(i).map(|at| case.q[at]), case.v[i], whole)
+        let known = case.last.as_ref().map(|last| last[i]);
+        limits.joints[i].is_outside(period, machine.single(i).map(|at| case.q[at]), (case.v[i], known), whole)
     };
     if controllable.iter().any(joint) {
         return true;

@@ -1,8 +1,11 @@
 //! Whether a way to stop leads from a target: period by period, as the plant would make it.
 
 use crate::collision::Gap;
+use crate::jerk::Brake;
 use crate::limit_check::{Fault, TOLERANCE, broken, is_above};
-use crate::limits::Bounds;
+use crate::limits::{Bounds, Limits};
+use crate::motion::{Machine, SPENT};
+use crate::period::Period;
 use crate::promise::Promise;
 use crate::rows::Step;
 
@@ -13,42 +16,141 @@ const REST: f64 = 1e-9;
 /// A joint so slow stands: a measured standstill is one to rounding, and its stored deceleration may be as small [rad/s or m/s].
 const STANDS: f64 = 1e-12;
 
-/// The brake that is stored in the log: a constant deceleration of each controllable joint until it stands, and every hard limit in every period
-/// of it.
-pub(crate) fn stored(promise: &mut Promise, q: &[f64], v: &[f64], brake: &[f64]) -> Result<(), Fault> {
+/// A motion to rest, period by period.
+pub(crate) struct Coast {
+    q: Vec<f64>,
+    v: Vec<f64>,
+    /// Acceleration of the period before, then of this one.
+    a: Vec<f64>,
+    q1: Vec<f64>,
+    v1: Vec<f64>,
+    way: Vec<f64>,
+    tau: Vec<f64>,
+    periods: u32,
+}
+
+impl Coast {
+    /// From `q`, `v` after a period at the accelerations `a`.
+    pub(crate) fn new(q: &[f64], v: &[f64], a: &[f64]) -> Coast {
+        let (q, v, zero) = (q.to_vec(), v.to_vec(), vec![0.0; v.len()]);
+        let (q1, v1) = (q.clone(), v.clone());
+        Coast { q, v, a: a.to_vec(), q1, v1, way: zero.clone(), tau: zero, periods: 0 }
+    }
+
+    /// Goes a period on, each joint with its deceleration `brake`, or as its hard jerk lets it; false when all stood at its start. Joints that are
+    /// not controllable keep their velocity and place.
+    pub(crate) fn period(
+        &mut self,
+        machine: &Machine,
+        limits: &Limits,
+        (p, dofs): (&Period, &[usize]),
+        brake: &[f64],
+    ) -> bool {
+        let mut moves = false;
+        self.periods += 1;
+        machine.spend(dofs.len());
+        for &i in dofs {
+            let (v, joint) = (self.v[i], &limits.joints[i]);
+            if joint.jerk.is_finite() {
+                let own = Brake::new(joint.jerk, brake[i], p);
+                let rests = own.rests(v, self.a[i]);
+                self.a[i] = if rests { 0.0 } else { own.next(v, self.a[i]) };
+                self.v1[i] = own.velocity(v, self.a[i]);
+                moves |= !rests;
+            } else {
+                let change = brake[i] * p.dt;
+                let left = v.abs() - change;
+                self.v1[i] = if left > (REST * change).max(STANDS) { v.signum() * left } else { 0.0 };
+                self.a[i] = (self.v1[i] - v) / p.dt;
+                moves |= v != 0.0;
+            }
+            self.way[i] = p.way(v, self.v1[i]);
+        }
+        machine.moved(&self.q, &self.way, 1.0, &mut self.q1);
+        moves
+    }
+
+    /// The period just gone; without motor forces.
+    pub(crate) fn step(&self) -> Step<'_> {
+        let Coast { q, v, a, q1, v1, tau, .. } = self;
+        Step { q, v, q1, v1, a, tau, before: None, last: None, is_free: false }
+    }
+
+    /// The next period begins where this one ended.
+    pub(crate) fn go_on(&mut self) {
+        std::mem::swap(&mut self.q, &mut self.q1);
+        self.v.copy_from_slice(&self.v1);
+    }
+
+    /// It has taken more periods, or more steps of the machine, than are looked at.
+    pub(crate) fn is_too_long(&self, machine: &Machine) -> bool {
+        self.periods >= LONGEST || machine.is_spent()
+    }
+}
+
+/// The way to rest from a speed with deceleration `b` in whole periods and a shorter last one, never less than without periods.
+pub(crate) fn rest(speed: f64, b: f64, p: &Period) -> f64 {
+    if speed <= STANDS {
+        return 0.0;
+    }
+    if b <= 0.0 {
+        return f64::INFINITY;
+    }
+    p.stopping_whole(speed, b).max(p.stopping(speed, b))
+}
+
+/// The brake that is stored in the log: a constant deceleration of each controllable joint until it stands, of hard jerk a largest one, and every
+/// hard limit in every period of it. `a` are the accelerations that led to `q`, `v`.
+pub(crate) fn stored(
+    promise: &mut Promise,
+    q: &[f64],
+    v: &[f64],
+    a: &[f64],
+    brake: &[f64],
+) -> Result<(), Fault> {
     if brake.len() != v.len() {
         return broken("number of stored decelerations", brake.len() as f64, v.len() as f64, "");
     }
     let p = promise.period;
     for &i in &promise.controllable {
         let j = &promise.limits.joints[i];
-        if is_above(brake[i], j.brake(&p)) || (v[i].abs() > STANDS && brake[i] <= 0.0) {
+        let stands = v[i].abs() <= STANDS && (j.jerk.is_infinite() || a[i] == 0.0);
+        if is_above(brake[i], j.stops(&p)) || (!stands && brake[i] <= 0.0) {
             return broken(
                 format!("stored deceleration of joint '{}'", j.name),
                 brake[i],
-                j.brake(&p),
+                j.stops(&p),
                 format!("{}/s^2", j.length),
             );
         }
+        if j.jerk.is_infinite() && v[i].abs() > STANDS && v[i].abs() / (brake[i] * p.dt) > f64::from(LONGEST)
+        {
+            return broken(
+                format!("time in which joint '{}' comes to rest", j.name),
+                v[i].abs() / brake[i],
+                f64::from(LONGEST) * p.dt,
+                "s",
+            );
+        }
     }
-    run(promise, q, v, brake, true)
+    run(promise, q, v, a, brake, true)
 }
 
 /// What is certified: each joint may brake by itself with what its limits count on. Positions are kept by the set that it never leaves; forces are
 /// looked at in every period.
-pub(crate) fn certified(promise: &mut Promise, q: &[f64], v: &[f64]) -> Result<(), Fault> {
+pub(crate) fn certified(promise: &mut Promise, q: &[f64], v: &[f64], a: &[f64]) -> Result<(), Fault> {
     let p = promise.period;
     let mut brake = vec![0.0; v.len()];
     for &i in &promise.controllable {
         let j = &promise.limits.joints[i];
-        brake[i] = j.brake(&p);
+        brake[i] = j.stops(&p);
         if brake[i].is_infinite() {
             return Err(Fault::Unknown(format!(
                 "joint '{}' has no acceleration limit to brake with",
                 j.name
             )));
         }
-        let Some(at) = promise.machine.single(i) else { continue };
+        let Some(at) = promise.machine.single(i).filter(|_| j.jerk.is_infinite()) else { continue };
         for (speed, room, limit, sign) in
             [(v[i], j.upper - q[at], j.upper, 1.0), (-v[i], q[at] - j.lower, j.lower, -1.0)]
         {
@@ -63,59 +165,69 @@ pub(crate) fn certified(promise: &mut Promise, q: &[f64], v: &[f64]) -> Result<(
             }
         }
     }
-    run(promise, q, v, &brake, false)
+    run(promise, q, v, a, &brake, false)
 }
 
-/// Runs a brake to rest. Joints that are not controllable are taken to keep their velocity and place.
-fn run(promise: &mut Promise, q: &[f64], v: &[f64], brake: &[f64], positions: bool) -> Result<(), Fault> {
-    let (p, nv) = (promise.period, v.len());
-    let (mut q, mut v) = (q.to_vec(), v.to_vec());
-    let (mut v1, mut way, mut a, mut tau) = (v.clone(), vec![0.0; nv], vec![0.0; nv], vec![0.0; nv]);
-    let mut q1 = q.clone();
-    for period in 0..LONGEST {
-        let mut moves = false;
-        for &i in &promise.controllable {
-            let change = brake[i] * p.dt;
-            let left = v[i].abs() - change;
-            v1[i] = if left > (REST * change).max(STANDS) { v[i].signum() * left } else { 0.0 };
-            a[i] = (v1[i] - v[i]) / p.dt;
-            way[i] = p.way(v[i], v1[i]);
-            moves |= v[i] != 0.0;
+/// Runs a brake to rest.
+fn run(
+    promise: &mut Promise,
+    q: &[f64],
+    v: &[f64],
+    a: &[f64],
+    brake: &[f64],
+    positions: bool,
+) -> Result<(), Fault> {
+    let p = promise.period;
+    let is_of_force = promise.limits.rows.iter().any(crate::rows::Row::is_of_force);
+    let mut coast = Coast::new(q, v, a);
+    for period in 0.. {
+        let moves = coast.period(&promise.machine, &promise.limits, (&p, &promise.controllable), brake);
+        if is_of_force {
+            promise.machine.motors(&p, &coast.q, &coast.v, &coast.a, &mut coast.tau);
         }
-        promise.machine.moved(&q, &way, 1.0, &mut q1);
-        if promise.limits.rows.iter().any(crate::rows::Row::is_of_force) {
-            promise.machine.motors(&p, &q, &v, &a, &mut tau);
-        }
-        if positions {
-            joints(promise, &q1, &v1, period)?;
-        }
-        rows(promise, &Step { q: &q, v: &v, q1: &q1, v1: &v1, a: &a, tau: &tau, before: None }, period)?;
+        joints(promise, &coast.step(), period, positions)?;
+        rows(promise, &coast.step(), period)?;
         if !moves {
             return Ok(());
         }
-        std::mem::swap(&mut q, &mut q1);
-        v.copy_from_slice(&v1);
+        if promise.machine.is_spent() {
+            return Err(Fault::Unknown(SPENT.into()));
+        }
+        if coast.is_too_long(&promise.machine) {
+            break;
+        }
+        coast.go_on();
     }
     broken("length of a brake that has not come to rest", f64::from(LONGEST), 0.0, "periods")
 }
 
-/// Positions and speeds after a period of a brake.
-fn joints(promise: &Promise, q: &[f64], v: &[f64], period: u32) -> Result<(), Fault> {
+/// Positions and speeds after a period of a brake; of hard jerk also within it, and the acceleration.
+fn joints(promise: &Promise, step: &Step<'_>, period: u32, positions: bool) -> Result<(), Fault> {
     for &i in &promise.controllable {
-        let j = &promise.limits.joints[i];
+        let (j, v) = (&promise.limits.joints[i], step.v1[i]);
+        let is_smooth = j.jerk.is_finite();
+        if !(positions || is_smooth) {
+            continue;
+        }
         let of =
             |what: &str| format!("{what} of joint '{}' in period {} of its way to stop", j.name, period + 1);
-        if is_above(v[i].abs(), j.velocity) {
-            return broken(of("speed"), v[i], v[i].signum() * j.velocity, format!("{}/s", j.length));
+        if is_above(v.abs(), j.velocity) {
+            return broken(of("speed"), v, v.signum() * j.velocity, format!("{}/s", j.length));
+        }
+        if is_smooth && is_above(step.a[i].abs(), j.acceleration) {
+            return broken(of("acceleration"), step.a[i], j.acceleration, format!("{}/s^2", j.length));
         }
         let Some(at) = promise.machine.single(i) else { continue };
+        let (from, to) = (step.q[at], step.q1[at]);
         for (sign, limit, profile) in [(1.0, j.upper, j.profile[1]), (-1.0, j.lower, j.profile[0])] {
-            if limit.is_finite() && is_above(sign * q[at], sign * limit) {
-                return broken(of("position"), q[at], limit, j.length);
+            let within = || from + sign * promise.period.farthest(sign * step.v[i], sign * step.a[i]);
+            let far = if is_smooth { sign * (sign * to).max(sign * within()) } else { to };
+            if limit.is_finite() && is_above(sign * far, sign * limit) {
+                return broken(of("position"), far, limit, j.length);
             }
-            let fast = profile.map(|profile| Bounds::profile_speed(&profile, sign * (profile.at - q[at])));
-            if let Some(fast) = fast.filter(|fast| is_above(sign * v[i], *fast)) {
-                return broken(of("speed in the profile"), v[i], sign * fast, format!("{}/s", j.length));
+            let fast = profile.map(|profile| Bounds::profile_speed(&profile, sign * (profile.at - to)));
+            if let Some(fast) = fast.filter(|fast| is_above(sign * v, *fast)) {
+                return broken(of("speed in the profile"), v, sign * fast, format!("{}/s", j.length));
             }
         }
     }
@@ -126,7 +238,7 @@ fn joints(promise: &Promise, q: &[f64], v: &[f64], period: u32) -> Result<(), Fa
 fn rows(promise: &mut Promise, step: &Step<'_>, period: u32) -> Result<(), Fault> {
     let Promise { machine, limits, period: p, .. } = promise;
     for row in limits.rows.iter().filter(|row| row.soft.is_none()) {
-        if row.breach(machine, p, step).is_some_and(|by| is_above(by, 0.0)) {
+        if row.breach(machine, p, step).is_some_and(|by| is_above(by, row.allowed)) {
             let (value, limit, unit) = row.value(machine, p, step);
             return broken(
                 format!("{} of '{}' in period {} of the way to stop", row.kind, row.name, period + 1),

@@ -44,6 +44,8 @@ pub(crate) struct Tick {
 /// The measured state.
 #[derive(Debug, Deserialize)]
 pub(crate) struct State {
+    #[serde(default)]
+    pub(crate) episode: u64,
     #[serde(deserialize_with = "numbers")]
     pub(crate) q: Vec<f64>,
     #[serde(deserialize_with = "numbers")]
