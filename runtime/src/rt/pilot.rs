@@ -1,5 +1,7 @@
 //! The controller of a snapshot in the loop: states in, [`Controller::update`], numbers out.
 
+use std::cell::Cell;
+
 use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, Moved, RefuseReason, Side, Status};
 
 use crate::codes::LedgerStatus;
@@ -33,6 +35,8 @@ pub struct Pilot {
     /// Scratch, with room for what is shared.
     memory: Vec<f64>,
     memory_len: usize,
+    /// A tick was begun whose answer is not taken yet: the brake has the memory from before it.
+    tried: Cell<bool>,
     /// Ticks since the policy ran.
     period_tick: u32,
     /// What another process may propose: kind, hash of the names, their number.
@@ -75,6 +79,7 @@ impl Pilot {
             limits: number_of(controller.limits()),
             memory_len: 1 + controller.memory().len(),
             memory: controller.memory(),
+            tried: Cell::new(false),
             period_tick: 0,
             task: snapshot.manifest.task.name.clone(),
             controller,
@@ -170,14 +175,19 @@ impl LoopController for Pilot {
         self.state.q.copy_from_slice(state.q());
         self.state.v.copy_from_slice(state.v());
         self.state.obs.copy_from_slice(state.obs());
+        // What softens this tick, or brakes in its place, knows of the tick before and not of this one's target.
+        self.share(false);
+        self.tried.set(true);
         let status = self.controller.update(&self.state, &self.noise, &mut self.out);
         self.period_tick = if self.out.policy_tick { 0 } else { self.period_tick + 1 };
         self.write(output);
-        self.share(false);
         if self.proposes { outcome(status) } else { refused_or_acted(status) }
     }
 
     fn brake(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome {
+        if !self.tried.get() {
+            self.share(false);
+        }
         let Some(brake) = &mut self.brake else { return Outcome::Refused };
         let (nq, nv) = (state.q().len(), state.v().len());
         let (status, action) = brake.update(state.q(), state.v());
@@ -203,6 +213,7 @@ impl LoopController for Pilot {
     }
 
     fn save_memory(&self, memory: &mut Vec<f64>) {
+        self.tried.set(false);
         memory.clear();
         memory.push(self.limits);
         self.controller.write_memory(memory);
