@@ -66,13 +66,6 @@ fn expected(snapshot: &Snapshot, seed: u64) -> Vec<u64> {
     row.iter().map(|x| x.to_bits()).collect()
 }
 
-/// Resident memory of a process without what it shares \[kB\].
-fn resident(id: u32) -> u64 {
-    let status = std::fs::read_to_string(format!("/proc/{id}/status")).expect("status of the server");
-    let line = status.lines().find(|l| l.starts_with("RssAnon:")).expect("RssAnon");
-    line.split_whitespace().nth(1).and_then(|n| n.parse().ok()).expect("a number of kB")
-}
-
 /// What a server without clients holds: data of replies and receipts, three services, the counter of nodes; the files of services and
 /// node, its role, the lock of the living and the token; itself.
 const ALONE: (usize, usize, usize) = (6, 16, 1);

@@ -28,8 +28,8 @@ pub type Ipc = ipc_threadsafe::Service;
 
 /// Waits between attempts at a service that another process may be creating, or died creating [ms].
 const BACK_OFF: [u64; 5] = [20, 60, 180, 540, 1000];
-/// The owner, and a tunnel.
-const PUBLISHERS: usize = 2;
+/// Those who may publish a topic at once: the owner, and a tunnel.
+pub const PUBLISHERS: usize = 2;
 /// What the links of one robot may occupy in shared memory [bytes].
 pub(crate) const SHARED_MEMORY: u64 = 24 << 20;
 

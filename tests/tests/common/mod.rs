@@ -1,6 +1,7 @@
 //! The real `nearl` binary as child processes, for the tests of processes and of bad input.
 #![allow(dead_code, unreachable_pub)] // each test binary uses a part of it
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -106,6 +107,20 @@ impl Drop for Process {
             let _ = child.wait();
         }
     }
+}
+
+/// Says what is not tested here, past the harness that keeps what a test prints; with `NEARL_NO_SKIPS`, as where every means is at hand,
+/// that is a failure.
+pub fn skip(reason: &str) {
+    assert!(std::env::var_os("NEARL_NO_SKIPS").is_none(), "not tested: {reason}");
+    let _ = writeln!(std::io::stderr(), "SKIPPED, not tested: {reason}");
+}
+
+/// Resident memory of a process without what it shares [kB].
+pub fn resident(id: u32) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{id}/status")).expect("status of a process");
+    let line = status.lines().find(|l| l.starts_with("RssAnon:")).expect("RssAnon");
+    line.split_whitespace().nth(1).and_then(|n| n.parse().ok()).expect("a number of kB")
 }
 
 /// Waits until `take` answers; fails the test with `what` after 30 s.

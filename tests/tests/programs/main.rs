@@ -9,6 +9,7 @@ mod online;
 mod printed;
 mod processes;
 mod serve;
+mod serve_attack;
 mod serve_clients;
 mod serve_training;
 mod sweep;

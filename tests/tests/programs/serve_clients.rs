@@ -21,24 +21,29 @@ const ALONE: (usize, usize) = (6, 1);
 const BUFFERS: usize = 5;
 
 /// A server process with a name of its own; nothing is left of it at the end.
-struct Server(RobotName, Option<Process>);
+pub(crate) struct Server(pub(crate) RobotName, Option<Process>);
 
 impl Server {
     fn start(what: &str) -> Server {
+        Server::start_with(what, &[])
+    }
+
+    /// With further options.
+    pub(crate) fn start_with(what: &str, options: &[&str]) -> Server {
         let name = RobotName::new(&format!("{what}-{}", std::process::id())).expect("name");
         let panda = panda();
         let arguments = ["serve", panda.to_str().expect("UTF-8"), "--name", name.as_str(), "--json"];
-        let process = Process::nearl(&arguments);
+        let process = Process::nearl(&[&arguments, options].concat());
         let server = Server(name, Some(process));
         drop(server.client());
         server
     }
 
-    fn client(&self) -> RolloutClient {
+    pub(crate) fn client(&self) -> RolloutClient {
         RolloutClient::open(&self.0, PATIENCE).expect("a server")
     }
 
-    fn process(&self) -> &Process {
+    pub(crate) fn process(&self) -> &Process {
         self.1.as_ref().expect("a running server")
     }
 
@@ -52,7 +57,12 @@ impl Server {
         (segments, holders.map_or(0, |r| r.alive + r.dead))
     }
 
-    fn end(mut self) -> serde_json::Value {
+    /// Waits until nothing of any client is left.
+    pub(crate) fn alone(&self) {
+        until("the server alone", || (self.held() == ALONE).then_some(()));
+    }
+
+    pub(crate) fn end(mut self) -> serde_json::Value {
         self.1.take().expect("a running server").end()
     }
 }
@@ -167,6 +177,6 @@ fn requests_of_clients_that_left_before_they_were_read_leave_nothing() {
     // One more leaves with its request under way, for which the server must find room, too.
     reader(&server).kill();
     drop(server.client());
-    until("the server alone", || (server.held() == ALONE).then_some(()));
+    server.alone();
     assert_eq!(server.end()["malformed"], 150);
 }

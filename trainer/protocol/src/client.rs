@@ -58,7 +58,7 @@ impl Waiting {
 /// Asks a rollout server of this machine. Requests may overlap, two at a time.
 pub struct RolloutClient {
     port: Client<Ipc, Envelope, (), [f64], ReplyMessage>,
-    factory: Factory,
+    factory: Arc<Factory>,
     bus: Arc<Bus>,
     requests: u64,
 }
@@ -104,7 +104,7 @@ impl RolloutClient {
     /// [`RequestError::NoServer`], or [`RequestError::Link`].
     pub fn open(name: &RobotName, patience: Duration) -> Result<RolloutClient, RequestError> {
         let bus = Bus::join(name)?;
-        let factory = service::open(&bus)?;
+        let factory = Arc::new(service::open(&bus)?);
         let port = factory
             .client_builder()
             .backpressure_strategy(BackpressureStrategy::DiscardData)
@@ -155,8 +155,9 @@ impl RolloutClient {
         loop {
             if let Some(pending) = self.deliver(envelope)? {
                 let (bus, client) = (Arc::clone(&self.bus), service::client_number(self.port.id().value()));
-                let pending = Some(pending);
-                return Ok(Rollouts { pending, bus, client, request, chunks: 0, steps: 0, cancelled: false });
+                let (pending, factory) = (Some(pending), Arc::clone(&self.factory));
+                let (chunks, steps, cancelled) = (0, 0, false);
+                return Ok(Rollouts { pending, factory, bus, client, request, chunks, steps, cancelled });
             }
             if waiting.is_suspicious() {
                 self.bus.node().try_cleanup_dead_nodes();
@@ -197,6 +198,7 @@ type Pending = PendingResponse<Ipc, Envelope, (), [f64], ReplyMessage>;
 pub struct Rollouts {
     /// `None` once the stream is over: the client may then ask for another.
     pending: Option<Pending>,
+    factory: Arc<Factory>,
     bus: Arc<Bus>,
     /// This client, as the server's replies name it.
     client: u64,
@@ -211,8 +213,8 @@ impl Rollouts {
     /// The next chunk; `None` after the last one, or after [`Rollouts::cancel`] once the server agreed.
     ///
     /// # Errors
-    /// [`RequestError::Refused`] with the server's answer, [`RequestError::ServerGone`], or [`RequestError::Silent`]
-    /// after `patience` without a reply. Every error but the last ends the stream.
+    /// [`RequestError::Refused`] with the server's answer, [`RequestError::ServerGone`], [`RequestError::GivenUp`], or
+    /// [`RequestError::Silent`] after `patience` without a reply. Every error but the last ends the stream.
     pub fn next(&mut self, patience: Duration) -> Result<Option<Chunk>, RequestError> {
         match self.next_piece(patience)? {
             None => Ok(None),
@@ -249,6 +251,15 @@ impl Rollouts {
         self.pending.iter().for_each(PendingResponse::set_disconnect_hint);
     }
 
+    /// Why nothing more comes.
+    fn lost(&self) -> RequestError {
+        let name = self.bus.name().clone();
+        match self.factory.dynamic_config().number_of_servers() {
+            0 => RequestError::ServerGone(name),
+            _ => RequestError::GivenUp(name),
+        }
+    }
+
     fn broken(&self, what: String) -> RequestError {
         RequestError::Broken { name: self.bus.name().clone(), what }
     }
@@ -275,7 +286,7 @@ impl Rollouts {
                 self.bus.node().try_cleanup_dead_nodes();
                 // Its last reply may have come between the look into the buffer and here.
                 if !pending.is_connected() && !pending.has_response() {
-                    return Err(RequestError::ServerGone(self.bus.name().clone()));
+                    return Err(self.lost());
                 }
             }
             waiting.nap();

@@ -30,6 +30,12 @@ pub enum RequestError {
         "the rollout server `{0}` is gone: start `nearl serve SNAPSHOT --name {0}` again and repeat the request"
     )]
     ServerGone(RobotName),
+    /// A server is there, but works on the request no more.
+    #[error(
+        "the rollout server `{0}` gave this request up: it was started again, or this client read nothing for longer than its --patience; ask \
+         again, and read sooner"
+    )]
+    GivenUp(RobotName),
     /// Nothing came in time.
     #[error("the rollout server `{name}` sent nothing for {seconds} s: wait longer, or ask for less at once")]
     Silent {

@@ -14,7 +14,7 @@ use super::departed::{Active, Departed};
 use super::messages::{Answer, Envelope, MAX_CHUNK, ReplyMessage};
 use super::service;
 use nearl_runtime::clock;
-use nearl_runtime::link::service::{Bus, Ipc};
+use nearl_runtime::link::service::{Bus, Ipc, PUBLISHERS};
 use nearl_runtime::link::{
     Header, LinkError, Message, Outbox, Owner, ReceiptMessage, RobotName, SnapshotBytes, SnapshotHeader,
     SnapshotReader, Verdict,
@@ -71,9 +71,10 @@ impl RolloutServer {
         Ok(RolloutServer { snapshots, receipts, _owner: owner, port, departed, bus })
     }
 
-    /// The next snapshot that was pushed to the name. One that was pushed before a request was sent is here once the request is.
-    pub fn snapshot(&mut self) -> Option<SnapshotBytes> {
-        self.snapshots.next()
+    /// The snapshots that were pushed to the name and not yet taken, one of each sender at most. One that was pushed before a request was
+    /// sent is here once the request is.
+    pub fn snapshots(&mut self) -> Vec<SnapshotBytes> {
+        (0..PUBLISHERS).map_while(|_| self.snapshots.next()).collect()
     }
 
     /// Answers a snapshot.
@@ -81,16 +82,19 @@ impl RolloutServer {
         self.receipts.send(&mut ReceiptMessage::answer(header, verdict, text));
     }
 
-    /// The next request, whatever its bytes are; those whose client no longer waits are left out.
-    pub fn receive(&mut self) -> Option<Caller> {
-        loop {
-            let active = ManuallyDrop::new(self.port.receive().ok().flatten()?);
+    /// The next requests, whatever their bytes are; those whose client no longer waits are left out. Looks at no more than may be under way
+    /// at once: clients that ask and leave without end do not keep the server from everything else.
+    pub fn receive(&mut self) -> Vec<Caller> {
+        let mut callers = Vec::new();
+        for _ in 0..service::AT_ONCE {
+            let Some(active) = self.port.receive().ok().flatten() else { break };
             let (departed, epoch) = (Arc::clone(&self.departed), self.bus.epoch());
-            let caller = Caller { active, departed, epoch, seq: 0 };
+            let caller = Caller { active: ManuallyDrop::new(active), departed, epoch, seq: 0 };
             if caller.is_connected() {
-                return Some(caller);
+                callers.push(caller);
             }
         }
+        callers
     }
 
     /// Removes what killed processes left, and returns the clients that are still there; costs some file accesses.

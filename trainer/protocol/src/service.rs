@@ -14,6 +14,8 @@ use nearl_runtime::link::service::{Bus, Ipc};
 const CLIENTS: usize = 24;
 /// Requests under way for one client.
 const ACTIVE: usize = 2;
+/// Requests under way over all clients.
+pub(super) const AT_ONCE: usize = CLIENTS * ACTIVE;
 /// Replies that wait for a client that is behind.
 const BUFFER: usize = 4;
 

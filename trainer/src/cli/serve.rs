@@ -24,10 +24,10 @@ pub(super) struct Serve {
     /// Requests under way at once; further ones are answered busy.
     #[arg(long, default_value_t = 16)]
     requests: usize,
-    /// Policy steps of one request at most.
+    /// Policy steps of one request at most, and of all trainings together.
     #[arg(long, default_value_t = 1_000_000)]
     max_steps: u64,
-    /// Environments of a client that learns (`nearl train TASK --collect NAME`) at most.
+    /// Environments at most that are kept for all clients that learn (`nearl train TASK --collect NAME`).
     #[arg(long, default_value_t = 256)]
     max_envs: u64,
     /// A client that takes nothing for so long loses its place [s].

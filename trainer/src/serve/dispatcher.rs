@@ -1,10 +1,10 @@
 //! Takes requests in, decides whose chunk is simulated next, and sends what is ready.
 
 use super::job::{Job, Rollout, Stage, Subject};
-use super::policy::Policies;
+use super::policy::{Policies, has_shape};
 use super::pool::{Outcome, Pool};
 use super::refusal::Refusal;
-use super::training::Session;
+use super::training::{Load, Session};
 use super::turns::Turns;
 use super::{Report, ServeError, Settings};
 use crate::rollout::Worker;
@@ -130,19 +130,45 @@ impl Dispatcher {
         policy: Arc<Snapshot>,
     ) -> Result<Subject, (Answer, String)> {
         let Some(training) = &request.training else { return Ok(Subject::Rollout(Rollout::default())) };
+        let (client, n_envs) = (caller.client(), training.n_envs);
+        self.has_room(client, Load { n_envs, steps: request.n_steps.saturating_mul(n_envs) })?;
         if training.begins {
+            // What it began before is given up, and its memory with it.
+            self.sessions.remove(&client);
             return Ok(Subject::Training(Session::begin(request, training, policy)));
         }
-        let (client, n_envs) = (caller.client(), training.n_envs);
-        let fits = self.sessions.get(&client).is_some_and(|s| s.n_envs() as u64 == n_envs);
-        let Some(mut session) = fits.then(|| self.sessions.remove(&client)).flatten() else {
-            return Err((
-                Answer::BadRequest,
-                format!("this client has no training of {n_envs} environments to go on with: begin one"),
+        let bad = |text: String| Err((Answer::BadRequest, text));
+        let Some(session) = self.sessions.get(&client).filter(|s| s.n_envs() as u64 == n_envs) else {
+            return bad(format!(
+                "this client has no training of {n_envs} environments to go on with: begin one"
             ));
+        };
+        if !has_shape(session.snapshot(), &policy) {
+            return bad("the policy has other networks than the training began with: begin one".into());
+        }
+        let Some(mut session) = self.sessions.remove(&client) else {
+            return bad("it is gone: begin one".into());
         };
         session.go_on(request, policy);
         Ok(Subject::Training(session))
+    }
+
+    /// Refuses what would keep more than the server allows for all trainings together; what the client itself keeps between two requests
+    /// is given up, or taken up again.
+    fn has_room(&self, client: u128, wish: Load) -> Result<(), (Answer, String)> {
+        let others = self.sessions.iter().filter(|(id, _)| **id != client).map(|(_, s)| s.load());
+        let kept: Load = self.jobs.values().map(Job::load).chain(others).chain([wish]).sum();
+        let Settings { max_envs, max_steps, .. } = self.settings;
+        if kept.n_envs <= max_envs && kept.steps <= max_steps {
+            return Ok(());
+        }
+        Err((
+            Answer::Busy,
+            format!(
+                "with this, trainings would keep {} environments and {} steps, {max_envs} and {max_steps} at most: ask again later",
+                kept.n_envs, kept.steps
+            ),
+        ))
     }
 
     fn accept(&mut self, caller: Caller, number: u64, request: Request, subject: Subject) {

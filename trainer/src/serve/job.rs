@@ -1,7 +1,7 @@
 //! One accepted request: how far it is, and what is still to be sent.
 
 use super::pool::{Order, Start, Task};
-use super::training::Session;
+use super::training::{Load, Session};
 use crate::rollout::Worker;
 use nearl_rollout_protocol::{Answer, Caller, Constraints, Delivery, MAX_CHUNK, ReplyMessage, Request};
 use std::collections::VecDeque;
@@ -191,6 +191,14 @@ impl Job {
     /// Since when the client's buffer is full, if it is.
     pub(super) fn stuck(&self) -> Option<Instant> {
         self.stuck
+    }
+
+    /// What a training keeps.
+    pub(super) fn load(&self) -> Load {
+        match &self.subject {
+            Subject::Training(session) => session.load(),
+            Subject::Rollout(_) => Load::default(),
+        }
     }
 
     /// What is left once the request is over.

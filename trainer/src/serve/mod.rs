@@ -28,9 +28,9 @@ pub struct Settings {
     pub threads: usize,
     /// Requests under way at once; further ones are answered busy.
     pub requests: usize,
-    /// Policy steps of one request at most.
+    /// Policy steps of one request at most, and of all trainings together: what they collect is kept until it is sent.
     pub max_steps: u64,
-    /// Environments of a client that learns at most.
+    /// Environments at most that are kept for all clients that learn.
     pub max_envs: u64,
     /// A client that takes nothing for so long loses its place.
     pub patience: Duration,
@@ -45,9 +45,9 @@ pub struct Report {
     pub done: u64,
     /// Requests cancelled by their client.
     pub cancelled: u64,
-    /// Requests refused because all places were taken.
+    /// Requests refused because all places, or all environments of trainings, were taken.
     pub busy: u64,
-    /// Requests refused for too many steps.
+    /// Requests refused for too many steps or environments.
     pub limit: u64,
     /// Requests refused for a wrong length, schema or value.
     pub malformed: u64,
@@ -117,12 +117,13 @@ pub fn serve(
         begin();
         let mut searched = Instant::now();
         while !stop.is_requested() {
-            while let Some(caller) = server.receive() {
-                // What was pushed before the request is in use with it.
-                take_policies(&mut server, &mut dispatcher);
-                dispatcher.admit(caller);
+            let callers = server.receive();
+            // What was pushed before a request is in use with it.
+            for bytes in server.snapshots() {
+                let (verdict, text) = dispatcher.take_policy(&bytes);
+                server.receipt(&bytes.header, verdict, &text);
             }
-            take_policies(&mut server, &mut dispatcher);
+            callers.into_iter().for_each(|caller| dispatcher.admit(caller));
             if searched.elapsed() > SEARCH {
                 dispatcher.keep_only(&server.survivors());
                 searched = Instant::now();
@@ -135,11 +136,4 @@ pub fn serve(
         }
         Ok(dispatcher.close())
     })
-}
-
-fn take_policies(server: &mut RolloutServer, dispatcher: &mut dispatcher::Dispatcher) {
-    while let Some(bytes) = server.snapshot() {
-        let (verdict, text) = dispatcher.take_policy(&bytes);
-        server.receipt(&bytes.header, verdict, &text);
-    }
 }

@@ -7,6 +7,9 @@ use nearl_runtime::{Controller, Manifest, Networks, Snapshot, SnapshotError};
 use serde_json::Value;
 use std::sync::Arc;
 
+/// Room of the thread that validates a pushed snapshot: parsers recurse as deep as its robot is nested [bytes].
+const STACK: usize = 16 << 20;
+
 pub(super) struct Policies {
     own: Arc<Snapshot>,
     pushed: Option<(u64, Arc<Snapshot>)>,
@@ -47,7 +50,8 @@ impl Policies {
 
     /// Takes a snapshot of the server's own task.
     pub(super) fn push(&mut self, bytes: &SnapshotBytes) -> Result<(), (Verdict, String)> {
-        let snapshot = Snapshot::from_bytes(&bytes.bytes).map_err(refused)?;
+        let version = bytes.header.version;
+        let snapshot = guarded(version, || Snapshot::from_bytes(&bytes.bytes).map_err(refused))?;
         if let Some(section) = difference(&self.task, &shared(&snapshot.manifest)) {
             let task = &self.own.manifest.task.name;
             return Err((
@@ -59,23 +63,41 @@ impl Policies {
         }
         let has_shape = |known: &(u64, Arc<Snapshot>)| has_shape(&known.1, &snapshot);
         if !self.pushed.as_ref().is_some_and(has_shape) {
-            Controller::new(&snapshot).map_err(refused)?;
+            guarded(version, || Controller::new(&snapshot).map(|_| ()).map_err(refused))?;
         }
-        self.pushed = Some((bytes.header.version, Arc::new(snapshot)));
+        self.pushed = Some((version, Arc::new(snapshot)));
         Ok(())
     }
+}
+
+/// Does what a hostile snapshot might break on a thread with room; a panic there is a refusal, not the end of the server.
+fn guarded<T: Send>(
+    version: u64,
+    validation: impl FnOnce() -> Result<T, (Verdict, String)> + Send,
+) -> Result<T, (Verdict, String)> {
+    let broke = || {
+        let text = format!("snapshot version {version} broke its validation: export it again");
+        Err((Verdict::Other, text))
+    };
+    std::thread::scope(|scope| {
+        let thread = std::thread::Builder::new().stack_size(STACK).spawn_scoped(scope, validation);
+        thread.map_or_else(|_| broke(), |thread| thread.join().unwrap_or_else(|_| broke()))
+    })
 }
 
 fn refused(e: SnapshotError) -> (Verdict, String) {
     (Verdict::of(&e), e.to_string())
 }
 
-/// The task without the learner's settings, and the robot.
+/// The task without the learner's settings, the robot, and the range of its motors.
 fn shared(manifest: &Manifest) -> Value {
     let mut task = serde_json::to_value(&manifest.task).unwrap_or_default();
     if let Value::Object(sections) = &mut task {
         sections.remove("train");
         sections.insert("robot file".into(), serde_json::to_value(&manifest.robot).unwrap_or_default());
+        let range = (&manifest.action_lower, &manifest.action_upper);
+        sections.insert("range of its actuators".into(), serde_json::to_value(range).unwrap_or_default());
+        sections.insert("moved limits".into(), serde_json::to_value(&manifest.moved).unwrap_or_default());
     }
     task
 }
@@ -89,7 +111,7 @@ fn difference(a: &Value, b: &Value) -> Option<String> {
 }
 
 /// True if a controller of `known` can take the networks of `new`.
-fn has_shape(known: &Snapshot, new: &Snapshot) -> bool {
+pub(super) fn has_shape(known: &Snapshot, new: &Snapshot) -> bool {
     let layers =
         |net: &Dense| (net.layers.iter().map(|l| (l.n_in, l.n_out)).collect::<Vec<_>>(), net.skip.is_some());
     let shape = |n: &Networks| {

@@ -12,8 +12,28 @@ pub(super) struct Session {
     /// The networks they act by.
     snapshot: Arc<Snapshot>,
     n_steps: usize,
+    /// The longest segment so far: room for it is kept.
+    most: usize,
     /// What the environments that have none yet begin with.
     start: Start,
+}
+
+/// What trainings keep of the server's memory.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Load {
+    /// Environments.
+    pub(super) n_envs: u64,
+    /// Policy steps of all of them.
+    pub(super) steps: u64,
+}
+
+impl std::iter::Sum for Load {
+    fn sum<I: Iterator<Item = Load>>(loads: I) -> Load {
+        loads.fold(Load::default(), |a, b| Load {
+            n_envs: a.n_envs.saturating_add(b.n_envs),
+            steps: a.steps.saturating_add(b.steps),
+        })
+    }
 }
 
 /// One environment with its share of the request under way.
@@ -42,19 +62,31 @@ impl Session {
         let Training { stream, gamma, moved_penalty, .. } = *training;
         let projection = request.constraints != Constraints::Off;
         let start = Start { seed: request.seed, stream, projection, gamma, moved_penalty };
-        Session { places: places.collect(), snapshot, n_steps, start }
+        Session { places: places.collect(), snapshot, n_steps, most: n_steps, start }
     }
 
     /// Goes on with `request`.
     pub(super) fn go_on(&mut self, request: &Request, snapshot: Arc<Snapshot>) {
         self.snapshot = snapshot;
         self.n_steps = usize::try_from(request.n_steps).unwrap_or(usize::MAX);
+        self.most = self.most.max(self.n_steps);
         self.places.iter_mut().for_each(|place| place.stage = Stage::Left(self.n_steps));
     }
 
     /// Environments.
     pub(super) fn n_envs(&self) -> usize {
         self.places.len()
+    }
+
+    /// The networks it acts by.
+    pub(super) fn snapshot(&self) -> &Snapshot {
+        &self.snapshot
+    }
+
+    /// Environments, and steps that there is room for.
+    pub(super) fn load(&self) -> Load {
+        let n_envs = self.n_envs() as u64;
+        Load { n_envs, steps: n_envs.saturating_mul(self.most as u64) }
     }
 
     /// True while an environment waits for its next portion.
