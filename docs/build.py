@@ -36,6 +36,7 @@ nav:
   - Connecting a robot: docs/CONNECT.md
   - Embedding in Rust: docs/EMBED.md
   - Reading a flight log: docs/FLIGHT_LOG.md
+  - What the doctor says: docs/DOCTOR.md
   - Faults: docs/FAULTS.md
   - Security: docs/SECURITY.md
   - Words: docs/GLOSSARY.md

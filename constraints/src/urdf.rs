@@ -19,9 +19,21 @@ const GRAVITY: [f64; 3] = [0.0, 0.0, -9.81];
 /// Larger files are refused while they are read.
 const MOST_NODES: u32 = 1_000_000;
 
+/// The parser compares the attributes of an element with each other: longer tags are refused before it [bytes].
+const MOST_OF_A_TAG: usize = 4096;
+
+/// Lengths of the tags, comments and declarations aside.
+fn tags(xml: &str) -> impl Iterator<Item = usize> {
+    let parts = xml.split('<').skip(1).filter(|part| !part.starts_with(['!', '?']));
+    parts.map(|part| part.find('>').unwrap_or(part.len()))
+}
+
 /// Reads a text called `file` in messages; with `free_flyer` the root link floats on a joint called `root_joint`.
 pub(crate) fn read(xml: &str, file: &str, free_flyer: bool) -> Result<RobotDescription, ModelError> {
     let malformed = |reason: String| ModelError::Malformed { file: file.to_string(), format: "URDF", reason };
+    if let Some(length) = tags(xml).find(|length| *length > MOST_OF_A_TAG) {
+        return Err(malformed(format!("one of its tags has {length} bytes, more than {MOST_OF_A_TAG}")));
+    }
     let options = ParsingOptions { nodes_limit: MOST_NODES, ..ParsingOptions::default() };
     let document = Document::parse_with_options(xml, options).map_err(|e| malformed(e.to_string()))?;
     let root = document.root_element();

@@ -60,6 +60,9 @@ pub struct Demonstrations {
     pub episodes: Vec<Episode>,
 }
 
+/// Larger files are refused before they are read [bytes].
+const MAX_BYTES: u64 = 4 << 30;
+
 impl Demonstrations {
     /// Reads a file whole and checks it.
     ///
@@ -67,7 +70,8 @@ impl Demonstrations {
     /// [`DemoError`] naming array, column and episode; nothing is half read.
     pub fn load(path: &Path) -> Result<Self, DemoError> {
         let wrong = |reason| DemoError { file: path.display().to_string(), reason };
-        let bytes = std::fs::read(path).map_err(|e| wrong(format!("it cannot be read: {e}")))?;
+        let bytes = nearl_runtime::constraints::read_bounded(path, MAX_BYTES, true);
+        let bytes = bytes.map_err(|e| wrong(format!("it cannot be read: {e}")))?;
         let arrays = npz::read(&bytes).map_err(|e| wrong(format!("{e}; write it with numpy.savez")))?;
         Self::of(arrays).map_err(wrong)
     }

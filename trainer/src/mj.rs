@@ -11,6 +11,7 @@ mod motors;
 mod perturb;
 mod scene;
 mod sim;
+mod sizes;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -174,6 +175,7 @@ impl Model {
             ModelFormat::Urdf if options.floats => keep_fixed_links(&set_afloat(text)?),
             ModelFormat::Urdf => keep_fixed_links(text),
         };
+        sizes::check(&text, folder).map_err(MjError::Load)?;
         let loaded = guard::counting_warnings(|| match scene.is_empty() {
             true => compile(&text, folder).map_err(|e| MjError::Load(guard::one_line(&e.to_string()))),
             false => scene::compile(&text, folder, scene),

@@ -127,6 +127,7 @@ pub fn build_limits(settings: &ConstraintSettings, model: &Model) -> Result<Vec<
             next: "leave [constraints.action] to a controller with a policy on actions or a learned inverse model",
         });
     }
+    check_counts(settings)?;
     let mut limits = Vec::new();
     for entry in REGISTRY {
         limits.extend((entry.build)(settings));
@@ -137,6 +138,29 @@ pub fn build_limits(settings: &ConstraintSettings, model: &Model) -> Result<Vec<
         limit.cone(model, &[])?;
     }
     Ok(limits)
+}
+
+/// Entries of one list of `[constraints]`: the memory of a projector grows with their square.
+const MOST: usize = 500;
+
+/// Refuses lists that no robot needs and that would take all the memory there is.
+fn check_counts(s: &ConstraintSettings) -> Result<(), LimitError> {
+    let collision = s.collision.as_ref();
+    let lists = [
+        ("rows", s.rows.len()),
+        ("frame", s.frame.len()),
+        ("frame_speed", s.frame_speed.len()),
+        ("collision.shapes", collision.map_or(0, |c| c.shapes.len())),
+        ("collision.ignore", collision.map_or(0, |c| c.ignore.len())),
+        ("collision.rows", collision.map_or(0, |c| c.rows)),
+    ];
+    match lists.into_iter().find(|(_, count)| *count > MOST) {
+        None => Ok(()),
+        Some((list, count)) => Err(LimitError::Unusable {
+            what: format!("constraints.{list} has {count} entries, more than the {MOST} that are kept"),
+            next: "leave out those that others imply",
+        }),
+    }
 }
 
 /// "a; b; c" over dofs.

@@ -4,6 +4,8 @@
 mod common;
 
 mod bad_input;
+mod bombs;
+mod doubts;
 mod examples;
 mod online;
 mod printed;

@@ -121,7 +121,7 @@ fn recipe(said_by: &str, reason: &str) -> ImportError {
 }
 
 fn read(path: &Path) -> Result<String, ImportError> {
-    std::fs::read_to_string(path)
+    nearl_runtime::constraints::read_text(path)
         .map_err(|e| ImportError::Unreadable { file: path.display().to_string(), reason: e.to_string() })
 }
 

@@ -140,8 +140,12 @@ fn outside(proto: &TensorProto, beside: Option<&Path>) -> Result<Option<Vec<u8>>
         folder.ok_or_else(|| format!("lies in '{name}', which is not a file beside the policy's"))?;
     let number =
         |key: &str| entry(key).map(str::parse::<usize>).transpose().map_err(|_| format!("has no {key}"));
-    let bytes = std::fs::read(folder.join(name))
-        .map_err(|e| format!("lies in '{name}', which cannot be read ({e})"))?;
+    let bytes = nearl_runtime::constraints::read_bounded(
+        &folder.join(name),
+        nearl_runtime::snapshot::MAX_BYTES,
+        false,
+    )
+    .map_err(|e| format!("lies in '{name}', which cannot be read ({e})"))?;
     let start = number("offset")?.unwrap_or(0);
     let length = number("length")?.unwrap_or(bytes.len().saturating_sub(start));
     let range = start..start.saturating_add(length);

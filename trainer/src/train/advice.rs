@@ -54,14 +54,22 @@ fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
         }
     }
     let mut lines = Vec::new();
+    let is_own = !manifest.task.reward.is_empty();
+    let next = |key: &str| match is_own {
+        true => format!("draw it inside in [reset], or give constraints.{key} more room"),
+        false => format!(
+            "the bundled task draws it there, and no setting changes that: train on, or give constraints.{key} more room, or write a task of your own \
+             with [reward] and [reset] (docs: Train for your own robot)"
+        ),
+    };
     for &i in layout.controllable() {
         let (name, [position, velocity]) = (model.dof_name(i), found[i]);
         let mut say = |outside: Outside, unit: &str, range: String, key: &str| {
             if outside.resets > 0 {
                 lines.push(format!(
                     "{} of {} episodes begin with joint '{name}' outside its limits, furthest at {:.4} {unit} where {range} is allowed: it comes back \
-                     before it does anything else; draw it inside in [reset], or widen constraints.{key}",
-                    outside.resets, RESETS.0, outside.value
+                     before it does anything else; {}",
+                    outside.resets, RESETS.0, outside.value, next(key)
                 ));
             }
         };

@@ -13,6 +13,7 @@ use nearl_runtime::task::suggest;
 use serde::Deserialize;
 
 use super::expression::Expression;
+use super::lexer::quoted;
 use super::settings::{Mistake, Term, mistake};
 
 #[derive(Debug, Deserialize)]
@@ -68,7 +69,7 @@ impl Curriculum {
         };
         let compile = |key: &str, text: &str| {
             let key = format!("curriculum.{key}");
-            Expression::parse(text, resolve).map_err(|e| mistake(key, format!("\"{text}\": {e}")))
+            Expression::parse(text, resolve).map_err(|e| mistake(key, format!("\"{}\": {e}", quoted(text))))
         };
         Ok(Some(Curriculum {
             start: section.start,

@@ -25,6 +25,18 @@ impl fmt::Display for Token<'_> {
 /// Longer ones first.
 const SIGNS: [&str; 15] = ["<=", ">=", "==", "!=", "<", ">", "+", "-", "*", "/", "^", "(", ")", ",", "="];
 
+/// An expression as it is shown in a message: of a long one, its begin.
+pub(super) fn quoted(text: &str) -> String {
+    const SHOWN: usize = 200;
+    match text.char_indices().nth(SHOWN) {
+        Some((at, _)) => format!("{}...", &text[..at]),
+        None => text.to_owned(),
+    }
+}
+
+/// Words of one expression at most.
+const MOST: usize = 10_000;
+
 /// The words of a text with their places, counted in characters from 1.
 pub(super) struct Lexer<'t> {
     tokens: Vec<(usize, Token<'t>)>,
@@ -35,10 +47,14 @@ impl<'t> Lexer<'t> {
     /// # Errors
     /// A sentence about the first thing that is no word.
     pub(super) fn new(text: &'t str) -> Result<Self, String> {
-        let (mut tokens, mut rest) = (Vec::new(), text);
+        let (mut tokens, mut rest, mut at) = (Vec::new(), text, 1);
         loop {
-            rest = rest.trim_start();
-            let at = text[..text.len() - rest.len()].chars().count() + 1;
+            let word = rest.trim_start();
+            at += rest[..rest.len() - word.len()].chars().count();
+            rest = word;
+            if tokens.len() == MOST {
+                return Err(format!("it has more than {MOST} words; split it into several terms"));
+            }
             let Some(first) = rest.chars().next() else {
                 tokens.push((at, Token::End));
                 return Ok(Lexer { tokens, at: 0 });
@@ -62,6 +78,7 @@ impl<'t> Lexer<'t> {
                 (Token::Sign(sign), sign.len())
             };
             tokens.push((at, token));
+            at += rest[..length].chars().count();
             rest = &rest[length..];
         }
     }

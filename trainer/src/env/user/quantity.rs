@@ -4,6 +4,7 @@ use crate::mj::{Actuator, Joint, JointKind, Model, Sim};
 
 use super::course::Course;
 use super::expression::Expression;
+use super::lexer::quoted;
 
 /// Something measured in the simulation, drawn for the episode or chosen by the policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -204,9 +205,10 @@ impl Names {
     pub(super) fn compile(&self, text: &str) -> Result<Expression<Quantity>, String> {
         let resolve = |name: &str| {
             let found = self.0.iter().find(|(n, _)| n == name).map(|(_, q)| *q);
-            found.ok_or_else(|| format!("unknown name '{name}'{}", self.near(name)))
+            found
+                .ok_or_else(|| format!("unknown name '{}'{}", quoted(name), self.near(quoted(name).as_str())))
         };
-        Expression::parse(text, resolve).map_err(|e| format!("\"{text}\": {e}"))
+        Expression::parse(text, resolve).map_err(|e| format!("\"{}\": {e}", quoted(text)))
     }
 
     fn near(&self, name: &str) -> String {

@@ -54,8 +54,18 @@ struct Weighted {
     of: String,
 }
 
+/// Terms of a section at most.
+const MOST_TERMS: usize = 1000;
+
 /// Named expressions of `[reward]`, `[cost]` or `[termination]`, in the order of their names.
 pub(super) fn terms(section: &str, table: &toml::Table, names: &Names) -> Result<Vec<Term>, Mistake> {
+    if table.len() > MOST_TERMS {
+        let (n, key) = (table.len(), section.to_owned());
+        return Err(mistake(
+            key,
+            format!("it has {n} terms, more than the {MOST_TERMS} that are read; join some of them"),
+        ));
+    }
     let compile = |(name, value): (&String, &toml::Value)| {
         let key = format!("{section}.{name}");
         let (weight, of) = match value {

@@ -1,0 +1,299 @@
+//! Set-ups that are allowed and hardly meant, or not allowed, through the three doors: the Rust builder, a task file, and the doctor. Each says
+//! so by name, number and unit. What the doctor says of them is the table of `docs/DOCTOR.md`:
+//! `NEARL_WRITE=1 cargo test --release -p nearl-tests --test programs doubts`.
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use crate::common::repository;
+use nearl_runtime::constraints::limit::AccelerationSettings;
+use nearl_runtime::constraints::{
+    AccelerationLimit, Limit, Model, PerJoint, PositionLimit, Projector, Settings, TorqueLimit, VelocityLimit,
+};
+use nearl_runtime::controller::Parts;
+use nearl_runtime::doctor::{Check, Finding, examine};
+use nearl_trainer::tasks;
+use nearl_trainer::train::{Request, Training, advice, complete};
+
+/// Limits as they are built in Rust.
+struct Limits {
+    velocity: PerJoint,
+    acceleration: AccelerationSettings,
+    dt: f64,
+}
+
+fn usual() -> Limits {
+    let acceleration = AccelerationSettings::of(PerJoint::All(30.0), None);
+    Limits { velocity: PerJoint::All(4.0), acceleration, dt: 0.01 }
+}
+
+/// A change of a text: what is replaced, and by what.
+type Edit = (&'static str, &'static str);
+/// The robot as it is, or the task.
+const SAME: Edit = ("", "");
+
+struct SetUp {
+    /// What is odd about it, in the words of the page.
+    what: &'static str,
+    robot: Edit,
+    task: Edit,
+    /// The same from Rust; none where it is not a matter of limits.
+    limits: Option<fn(&mut Limits)>,
+    /// Words of what each door says; none for a good one.
+    says: &'static [&'static str],
+    is_refused: bool,
+    /// The check of the doctor that says it; none where no snapshot can hold it.
+    check: Option<&'static str>,
+}
+
+const VELOCITY: &str = "velocity = { limit = 4.0 }";
+const ACCELERATION: &str = "acceleration = { limit = 30.0 }";
+
+const SET_UPS: &[SetUp] = &[
+    SetUp {
+        what: "an arm with limits it can keep",
+        robot: SAME,
+        task: SAME,
+        limits: Some(|_| ()),
+        says: &[],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
+        what: "velocity limits in degrees: 160",
+        robot: SAME,
+        task: (VELOCITY, "velocity = { limit = 160.0 }"),
+        limits: Some(|l| l.velocity = PerJoint::All(160.0)),
+        says: &["velocity limit of 'shoulder' is 160 rad/s", "degrees"],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
+        what: "an acceleration limit of 0.001",
+        robot: SAME,
+        task: (ACCELERATION, "acceleration = { limit = 0.001 }"),
+        limits: Some(|l| l.acceleration = AccelerationSettings::of(PerJoint::All(0.001), None)),
+        says: &["acceleration limit of 'shoulder' is 0.001 rad/s²", "4000 s to stop"],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
+        what: "a range of 150 in the robot file",
+        robot: ("range=\"-2 2\"", "range=\"-75 75\""),
+        task: SAME,
+        limits: Some(|_| ()),
+        says: &["range of 'shoulder' is", "rad or m", "degrees"],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
+        what: "a control period of 5 s",
+        robot: SAME,
+        task: ("dt = 0.01\nsim_dt", "dt = 5.0\nsim_dt"),
+        limits: Some(|l| l.dt = 5.0),
+        says: &["control period is 5 s", "milliseconds"],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
+        what: "limits of another robot's joints",
+        robot: SAME,
+        task: (VELOCITY, "velocity = { limit = { panda_joint1 = 2.0 } }"),
+        limits: Some(|l| l.velocity = PerJoint::Joints([("panda_joint1".into(), 2.0)].into())),
+        says: &["velocity", "'panda_joint1'", "does not have"],
+        is_refused: true,
+        check: None,
+    },
+    SetUp {
+        what: "braking above the acceleration limit",
+        robot: SAME,
+        task: (ACCELERATION, "acceleration = { limit = 30.0, braking = 40.0 }"),
+        limits: Some(|l| {
+            l.acceleration = AccelerationSettings::of(PerJoint::All(30.0), Some(PerJoint::All(40.0)))
+        }),
+        says: &["braking of joint 'shoulder' is 40 rad/s²", "acceleration limit of 30"],
+        is_refused: true,
+        check: None,
+    },
+    SetUp {
+        what: "episodes that begin outside the limits",
+        robot: SAME,
+        task: ("[constraints]", "[reset]\nq = { elbow = 2.5 }\n\n[constraints]"),
+        limits: None,
+        says: &["64 of 64 episodes begin with joint 'elbow' outside", "2.5000 rad", "[reset]"],
+        is_refused: false,
+        check: None,
+    },
+    SetUp {
+        what: "a learned inverse model of targets that move position and velocity together",
+        robot: SAME,
+        task: (
+            "kind = \"pinocchio\"\n\n[train]\nexploration = \"proposal\"",
+            "kind = \"learned\"\n\n[train]\nexploration = \"action\"",
+        ),
+        limits: None,
+        says: &["'kinematic'", "learned inverse model", "consistency = \"free\""],
+        is_refused: true,
+        check: None,
+    },
+    SetUp {
+        what: "motors too weak to hold the arm",
+        robot: SAME,
+        task: ("torque = {}", "torque = { scale = 0.02 }"),
+        limits: None,
+        says: &["'shoulder'", "N m"],
+        is_refused: false,
+        check: Some("holding"),
+    },
+];
+
+fn edited(text: String, (from, to): Edit) -> String {
+    assert!(text.contains(from), "'{from}' is not there");
+    if from.is_empty() { text } else { text.replacen(from, to, 1) }
+}
+
+/// Writes robot and task of a set-up; returns the task file.
+fn write(folder: &Path, robot: Edit, task: Edit) -> PathBuf {
+    let fixture =
+        |name: &str| std::fs::read_to_string(repository().join("tests/fixtures").join(name)).expect(name);
+    std::fs::write(folder.join("two_link.xml"), edited(fixture("two_link.xml"), robot)).expect("robot");
+    let file = folder.join("two_link.toml");
+    std::fs::write(&file, edited(fixture("two_link.toml"), task)).expect("task");
+    file
+}
+
+/// A door's answer: what it warns of, or why it refuses.
+type Answer = Result<Vec<String>, String>;
+
+/// The Rust builder, with the robot of the task in `file`.
+fn build(file: &Path, change: fn(&mut Limits)) -> Answer {
+    let manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).expect("the usual task");
+    let model: Model = Parts::robot(&manifest).expect("robot");
+    let mut wish = usual();
+    change(&mut wish);
+    let limits: Vec<Box<dyn Limit>> = vec![
+        Box::new(PositionLimit::with_margin(0.02)),
+        Box::new(VelocityLimit::values(wish.velocity)),
+        Box::new(AccelerationLimit::new(wish.acceleration)),
+        Box::new(TorqueLimit::scaled(1.0)),
+    ];
+    let settings = Settings::new(wish.dt, 1);
+    let projector = Projector::new(&model, &limits, &[0, 1], settings).map_err(|e| e.to_string())?;
+    Ok([model.notes(), projector.notes()].concat())
+}
+
+/// The task file, as a training begins with it; its first snapshot goes to `snapshot`.
+fn train(file: &Path, snapshot: &Path) -> Answer {
+    let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).map_err(|e| e.to_string())?;
+    complete(&mut manifest).map_err(|e| e.to_string())?;
+    let lines = advice(&manifest).map_err(|e| e.to_string())?;
+    let algo = "pid2-ib".parse().expect("an algorithm");
+    let request = Request { manifest, algo, steps: 1000, seed: 0, threads: 1 };
+    let training = Training::new(&request).map_err(|e| e.to_string())?;
+    training.snapshot().save(snapshot).expect("snapshot");
+    Ok(lines)
+}
+
+fn hears(set_up: &SetUp, door: &str, answer: &Answer) {
+    let what = set_up.what;
+    let text = match answer {
+        Ok(lines) if set_up.is_refused => panic!("{what}: {door} does not refuse it: {lines:?}"),
+        Ok(lines) => lines.join("\n"),
+        Err(text) if set_up.is_refused => text.clone(),
+        Err(text) => panic!("{what}: {door} refuses it: {text}"),
+    };
+    for word in set_up.says {
+        assert!(text.contains(word), "{what}: '{word}' is not in what {door} says: {text}");
+    }
+    assert!(!set_up.says.is_empty() || text.is_empty(), "{what}: {door} says {text}");
+}
+
+/// Text in the lines of a list's entry.
+fn wrapped(text: &str) -> String {
+    let (mut out, mut width) = (String::new(), 0);
+    for word in text.split_whitespace() {
+        let length = word.chars().count() + 1;
+        if width == 0 || width + length > 150 {
+            (out, width) = (out + "\n ", 0);
+        }
+        out = out + " " + word;
+        width += length;
+    }
+    out
+}
+
+#[test]
+fn odd_set_ups_are_named_by_each_door_and_the_page_says_what_the_doctor_says() {
+    let mut page = String::from(
+        "# What the doctor says\n\n`nearl doctor SNAPSHOT` looks at a snapshot, its task and its robot; what it refuses is not run. \
+         `nearl train` and `nearl.Projector` say the same of\ntheir own. Written by `NEARL_WRITE=1 cargo test --release -p nearl-tests \
+         --test programs doubts`; a test fails when this page is old.\n\n| set-up | finding |\n|---|---|\n",
+    );
+    let mut lines = String::from("\n## What is said of each\n\n");
+    let mut tell = |what: &str, finding: &str, text: &str| {
+        writeln!(page, "| {what} | {finding} |").expect("a text");
+        writeln!(lines, "- {what}:{}", wrapped(text)).expect("a text");
+    };
+    for set_up in SET_UPS {
+        let folder = tempfile::tempdir().expect("folder");
+        let snapshot = folder.path().join("first.safetensors");
+        if let Some(change) = set_up.limits {
+            let plain = write(folder.path(), set_up.robot, SAME);
+            hears(set_up, "the builder", &build(&plain, change));
+        }
+        let file = write(folder.path(), set_up.robot, set_up.task);
+        let trained = train(&file, &snapshot);
+        hears(set_up, "the task file", &trained);
+        let Some(check) = set_up.check else {
+            let text = trained.map_or_else(|refusal| refusal, |lines| lines.join("; "));
+            let finding =
+                if set_up.is_refused { "refused by `nearl train`" } else { "said by `nearl train`" };
+            let text = text.replace(&folder.path().display().to_string(), "FOLDER").replace('\n', " ");
+            tell(set_up.what, finding, &text);
+            continue;
+        };
+        let checks = examine(&snapshot, None);
+        let found: &Check = checks.iter().find(|c| c.check == check).expect(check);
+        assert_eq!(found.finding == Finding::Ok, set_up.says.is_empty(), "{}: {}", set_up.what, found.text);
+        for word in set_up.says {
+            assert!(found.text.contains(word), "{}: '{word}' is not in: {}", set_up.what, found.text);
+        }
+        let finding = format!("{:?}", found.finding).to_lowercase();
+        tell(set_up.what, &finding, &found.text);
+    }
+    page += &lines;
+    let file = repository().join("docs/DOCTOR.md");
+    if std::env::var_os("NEARL_WRITE").is_some() {
+        std::fs::write(&file, &page).expect("page");
+    }
+    let found = std::fs::read_to_string(&file).unwrap_or_default();
+    assert!(found == page, "docs/DOCTOR.md is old: run the command in its fourth line");
+}
+
+/// A bundled task draws its own episodes: what it says is something that its user can do.
+#[test]
+fn a_bundled_task_advises_nothing_that_it_has_not() {
+    let mut manifest = tasks::load("Hopper-v5", &[]).expect("bundled");
+    complete(&mut manifest).expect("bundled");
+    let lines = advice(&manifest).expect("advice");
+    let line = lines.iter().find(|l| l.contains("'thigh_joint'")).unwrap_or_else(|| panic!("{lines:?}"));
+    assert!(line.contains("the bundled task draws it there") && !line.contains("draw it inside"), "{line}");
+}
+
+/// Links that move and weigh nothing are named by every door.
+#[test]
+fn a_moving_link_without_an_inertia_is_named() {
+    let text = std::fs::read_to_string(repository().join("tests/fixtures/leg.urdf")).expect("robot");
+    let at = text.find("<link name=\"shank\">").expect("shank");
+    let end = at + text[at..].find("</link>").expect("end");
+    let mut light = format!("{}<link name=\"shank\">{}", &text[..at], &text[end..]);
+    let foot = light.find("<link name=\"foot\">").expect("foot");
+    let end = foot + light[foot..].find("</link>").expect("end");
+    light.replace_range(foot + "<link name=\"foot\">".len()..end, "");
+    let model = Model::from_urdf_text(&light).expect("it is read");
+    let notes = model.notes().join("; ");
+    assert!(
+        notes.contains("'shank'") && notes.contains("no mass") && notes.contains("<inertial>"),
+        "{notes}"
+    );
+}
