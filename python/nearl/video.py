@@ -56,9 +56,9 @@ def record(
             raise ValueError(f"'{run}' are demonstrations; say of which task with task= (--task)")
         frames, period = _demonstrated(run, _core.Env(os.fspath(task)), episodes, seconds, fps, size, camera)
     else:
-        agent, env = PID2.load(run), _core.Env.of_snapshot(run)
+        controller, env = PID2.load(run).controller, _core.Env.of_snapshot(run)
         stride = max(1, round(1.0 / (fps * env.dt)))
-        frames, period = _frames(agent, env, episodes, seconds, stride, size, camera, seed), stride * env.dt
+        frames, period = _frames(controller, env, episodes, seconds, stride, size, camera, seed), stride * env.dt
     try:
         import imageio
 
@@ -78,7 +78,7 @@ def record(
 
 
 def _frames(
-    agent: PID2, env: _core.Env, episodes: int, seconds: float | None, stride: int, size: tuple[int, int], camera: str | None, seed: int
+    controller: _core.Controller, env: _core.Env, episodes: int, seconds: float | None, stride: int, size: tuple[int, int], camera: str | None, seed: int
 ) -> Iterator[Frame]:
     renderer = Renderer(env, size, camera)
     if seconds is not None and seconds <= 0:
@@ -86,13 +86,13 @@ def _frames(
     limit = env.max_episode_steps if seconds is None else min(env.max_episode_steps, round(seconds / env.dt))
     try:
         for episode in range(episodes):
-            obs, state, start = env.reset(seed + episode), None, True
+            obs = env.reset(seed + episode)
+            controller.reset()
             for step in range(limit):
                 if step % stride == 0:
                     yield renderer.frame(env.qpos, env.qvel)
-                action, state = agent.predict(obs, state, start)
+                action, _ = controller.update(*env.state(), obs)
                 obs, _, _, terminated, _ = env.step(action)
-                start = False
                 if terminated:
                     break
     finally:

@@ -24,6 +24,7 @@ from nearl.report import sweep
 from nearl.report.read import ReadError, read_run
 
 CART_POLE = str(ROOT / "examples" / "tasks" / "cart-pole.toml")
+ANYMAL = ROOT / "examples" / "snapshots" / "anymal-walk.safetensors"
 PANDA = ROOT / "examples" / "snapshots" / "panda-reach.safetensors"
 
 
@@ -174,6 +175,12 @@ def test_a_video_shows_the_robot_moving(trained: Path, tmp_path: Path, suffix: s
     assert done.stdout.strip() == f"{out}: 50 frames" and frames.shape[1:] == (128, 160, 3)
     assert len(frames) == 50 or suffix == ".gif", "50 frames of 20 ms; a GIF joins equal ones"
     assert frames[0].std() > 5 and np.abs(frames[0].astype(int) - frames[-1]).max() > 30
+
+
+def test_a_robot_that_floats_is_filmed_on_its_floor(tmp_path: Path) -> None:
+    """The policy sees the base's velocity, which is in no observation of the plant."""
+    done = video(str(ANYMAL), str(tmp_path / "walk.gif"), "--seconds", "0.2", "--size", "160", "128")
+    assert (done.returncode, done.stdout.strip()) == (0, f"{tmp_path}/walk.gif: 10 frames"), done.stderr
 
 
 def test_a_robot_without_shapes_is_drawn_as_a_skeleton(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
 """Every command and every example of README.md and of the pages in docs/ runs. `make` itself is what runs the tests, so its lines are
 not repeated."""
 
+import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -35,6 +37,27 @@ def test_examples(block, tmp_path):
     block = re.sub(r"\b(runs|demo)/", f"{tmp_path}/", block)
     run = subprocess.run([sys.executable, "-c", block], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stderr
+
+
+def test_a_robot_of_ones_own(tmp_path):
+    """docs/OWN_ROBOT.md from the page alone: its blocks are one task file, its commands run in order, with fewer steps."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    page = (ROOT / "docs/OWN_ROBOT.md").read_text()
+    there = {"cwd": tmp_path, "env": os.environ | {"PATH": f"{NEARL.parent}:{os.environ['PATH']}"}}
+    for toml, commands in re.findall(r"```toml\n(.*?)```|((?:^    (?:cp|nearl|wait)\b[^\n]*\n)+)", page, re.DOTALL | re.MULTILINE):
+        with open(tmp_path / "arm.toml", "a") as task:
+            task.write(toml)
+        script = re.sub(r"--steps \w+", "--steps 8k", commands)
+        run = subprocess.run(["bash", "-euo", "pipefail", "-c", script], capture_output=True, text=True, timeout=600, **there)
+        assert run.returncode == 0, f"{script}\n{run.stdout[-2000:]}\n{run.stderr[-2000:]}"
+    rows = {}
+    for name in ("arm", "random"):
+        with open(tmp_path / "runs" / name / "metrics.csv") as file:
+            rows[name] = list(csv.DictReader(file))
+    returns = [float(row["rollout/ep_rew_mean"]) for row in rows["arm"]]
+    assert returns[-1] > returns[0] + 0.5, returns
+    assert all(float(row["random/mass"]) > 0 for row in rows["random"]) and "random/mass" not in rows["arm"][0]
+    assert json.loads(run.stdout)[0]["lengths"] == [100, 100] and (tmp_path / "arm.mcap").stat().st_size > 10_000
 
 
 def test_every_command_line_is_covered():
