@@ -49,7 +49,7 @@ docs: package
 
 test: package
 	cargo test --release --locked --no-fail-fast
-	$(VENV)/bin/python -m pytest python/tests -q
+	$(VENV)/bin/python -m pytest python/tests -q -rs
 
 # Everything that must hold before a change lands.
 check:
