@@ -4,7 +4,7 @@
 //! axis stands still in its joint's frame, which Pinocchio's derivatives take for granted.
 
 use crate::ModelError;
-use crate::description::{Body, JointDescription, JointKind, Onset, Range, RobotDescription};
+use crate::description::{Body, FrictionLaw, JointDescription, JointKind, Onset, Range, RobotDescription};
 use crate::geometry::Placement;
 use crate::model::{Inner, Joint, ModelFrame};
 use crate::pinocchio::{self, RawData, RawModel};
@@ -94,6 +94,7 @@ impl Tree {
             spring_reference: zero.clone(),
             friction: zero,
             onset: vec![None; nv],
+            law: vec![FrictionLaw::default(); nv],
             total_mass: self.raw.mass(),
             neutral: self.raw.neutral(),
             frames: self.frames,
@@ -127,6 +128,7 @@ impl Inner {
             self.spring_reference[i] = joint.spring_reference;
             self.friction[i] = if nv == 1 { joint.friction } else { 0.0 };
             self.onset[i] = joint.friction_onset;
+            self.law[i] = joint.friction_law;
         }
         self.joints.push(Joint { name: joint.name.clone(), idx_q, nq, idx_v, nv });
         self.range_missing.push(joint.range == Range::NotStated);

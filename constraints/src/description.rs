@@ -17,7 +17,7 @@ mod payload;
 use crate::geometry::{Placement, Shape};
 use serde::{Deserialize, Serialize};
 
-pub use crate::friction::Onset;
+pub use crate::friction::{FrictionLaw, Onset};
 pub use motor::{Command, Motor};
 pub use payload::Payload;
 
@@ -95,6 +95,13 @@ pub struct JointDescription {
     /// How dry friction sets in; MuJoCo's usual way where nothing is stated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub friction_onset: Option<Onset>,
+    /// What dry friction is taken to be.
+    #[serde(default, skip_serializing_if = "is_mujoco")]
+    pub friction_law: FrictionLaw,
+}
+
+fn is_mujoco(law: &FrictionLaw) -> bool {
+    *law == FrictionLaw::Mujoco
 }
 
 /// What a joint lets move, and how many numbers say where it is and how fast.
@@ -187,6 +194,7 @@ impl JointDescription {
             armature: 0.0,
             friction: 0.0,
             friction_onset: None,
+            friction_law: FrictionLaw::default(),
         }
     }
 }

@@ -3,7 +3,40 @@
 use crate::{Dynamics, LimitSet, Model, Period};
 use serde::{Deserialize, Serialize};
 
-/// How dry friction `f` sets in. It opposes motion and what would become motion, as a constraint of MuJoCo's does (`frictionloss`):
+/// What dry friction is taken to be.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FrictionLaw {
+    /// MuJoCo's: it sets in evenly with what would become motion, see [`Onset`].
+    #[default]
+    Mujoco,
+    /// Coulomb's: all of `f` against any motion, and whatever holds a joint that stands, up to `f`. What counts is the velocity that a period
+    /// leads to, not a measured one, whose sign is noise where a joint stands:
+    ///
+    /// ```text
+    ///     force = -mean over the period of f clamp(v / 1e-6, -1, 1)
+    /// ```
+    ///
+    /// of the velocities at the ends of physics steps, or of all of the period where there are none.
+    Coulomb,
+}
+
+impl FrictionLaw {
+    /// What a motor adds (N·m or N) on average over a period by Coulomb's law. The joint begins at velocity `v` and accelerates with `a`.
+    pub(crate) fn coulomb(f: f64, period: &Period, v: f64, a: f64) -> f64 {
+        let force = |v: f64| f * (v / STANDS);
+        if period.sub_steps == 0 {
+            return mean_of_clamp(force(v), force(v + period.dt * a), f);
+        }
+        let steps = (1..=period.sub_steps).map(|k| force(v + f64::from(k) * period.tau * a).clamp(-f, f));
+        steps.sum::<f64>() / f64::from(period.sub_steps)
+    }
+}
+
+/// Below this speed a joint stands [rad/s or m/s].
+const STANDS: f64 = 1e-6;
+
+/// How MuJoCo's dry friction `f` sets in. It opposes motion and what would become motion, as a constraint of MuJoCo's does (`frictionloss`):
 ///
 /// ```text
 ///     force = -clamp(inertia (a + v / time), -f, f)
@@ -87,4 +120,25 @@ pub(crate) fn doubt(model: &Model, limits: &LimitSet, period: &Period) -> Vec<f6
         most.iter_mut().zip(&off).for_each(|(most, off)| *most = most.max(*off));
     }
     most
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: all of it against a motion, none of it at rest whatever the sign of the noise, the mean of both signs where it turns round.
+    #[test]
+    fn coulomb_s_friction_is_against_motion_and_knows_no_sign_at_rest() {
+        for sub_steps in [0, 1, 5] {
+            let p = Period::new(0.01, sub_steps);
+            assert_eq!(FrictionLaw::coulomb(2.0, &p, 1.0, 3.0), 2.0);
+            assert_eq!(FrictionLaw::coulomb(2.0, &p, -1.0, 3.0), -2.0);
+            assert_eq!(FrictionLaw::coulomb(2.0, &p, 0.0, 0.0), 0.0);
+            assert!(FrictionLaw::coulomb(2.0, &p, 1e-15, -1e-15).abs() < 1e-8);
+        }
+        // From 0.04 to -0.06: two of five periods forward; of five steps the first, the second stands, three are backward.
+        assert!((FrictionLaw::coulomb(2.0, &Period::new(0.01, 0), 0.04, -10.0) + 0.4).abs() < 1e-4);
+        assert!((FrictionLaw::coulomb(2.0, &Period::new(0.01, 5), 0.04, -10.0) + 0.8).abs() < 1e-9);
+        assert_eq!(FrictionLaw::coulomb(2.0, &Period::new(0.01, 1), 0.04, -10.0), -2.0);
+    }
 }

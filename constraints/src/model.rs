@@ -1,7 +1,7 @@
 //! The robot: joints, limits, inertias. Constants only; scratch is in [`Dynamics`](crate::Dynamics).
 
 use crate::assemble::assemble;
-use crate::description::{Motor, Onset, Payload, RobotDescription};
+use crate::description::{FrictionLaw, Motor, Onset, Payload, RobotDescription};
 use crate::error::{ModelError, near_names};
 use crate::pinocchio::RawModel;
 use crate::urdf;
@@ -59,6 +59,7 @@ pub(crate) struct Inner {
     pub(crate) friction: Vec<f64>,
     /// Of the dofs with friction.
     pub(crate) onset: Vec<Option<Onset>>,
+    pub(crate) law: Vec<FrictionLaw>,
     pub(crate) total_mass: f64,
     pub(crate) neutral: Vec<f64>,
     pub(crate) frames: Vec<ModelFrame>,
@@ -92,6 +93,18 @@ impl Model {
     pub fn with_payload(&self, payload: &Payload) -> Result<Model, ModelError> {
         let mut description = self.0.description.clone();
         description.carry(payload)?;
+        Model::from_description(description)
+    }
+
+    /// The robot with all its dry friction by this law: MuJoCo's of a simulation, Coulomb's of a robot. A model of its own.
+    ///
+    /// # Errors
+    /// [`RobotDescription::check`].
+    pub fn with_friction_law(&self, law: FrictionLaw) -> Result<Model, ModelError> {
+        let mut description = self.0.description.clone();
+        for joint in description.bodies.iter_mut().flat_map(|body| &mut body.joints) {
+            joint.friction_law = law;
+        }
         Model::from_description(description)
     }
 
@@ -235,6 +248,11 @@ impl Model {
     /// How the dry friction of each dof sets in (nv); of those that have some.
     pub fn friction_onset(&self) -> &[Option<Onset>] {
         &self.0.onset
+    }
+
+    /// What the dry friction of each dof is taken to be (nv).
+    pub fn friction_law(&self) -> &[FrictionLaw] {
+        &self.0.law
     }
 
     /// Mass of everything that moves \[kg\].

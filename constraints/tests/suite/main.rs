@@ -5,6 +5,9 @@
 mod attack_scenes;
 #[path = "../common/mod.rs"]
 mod common;
+#[path = "../../examples/coulomb/plant.rs"]
+#[allow(dead_code, unreachable_pub)]
+mod coulomb_plant;
 
 mod action;
 mod attack;
@@ -13,6 +16,7 @@ mod conformance;
 mod defaults;
 mod errors;
 mod frame_limits;
+mod friction;
 mod geometry;
 mod gradient;
 mod huge_proposals;

@@ -5,6 +5,7 @@
 use crate::command::CommandSection;
 use crate::recipe::PolicySection;
 use crate::snapshot::ModelFormat;
+use nearl_constraints::description::FrictionLaw;
 use nearl_constraints::{ConstraintSettings, Period};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -91,6 +92,13 @@ pub struct ModelSection {
     /// The base of the URDF floats instead of being fixed to the world.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub free_flyer: bool,
+    /// What the dry friction of the joints is taken to be: `mujoco` or `coulomb`.
+    #[serde(default, skip_serializing_if = "is_mujoco")]
+    pub friction: FrictionLaw,
+}
+
+fn is_mujoco(law: &FrictionLaw) -> bool {
+    *law == FrictionLaw::Mujoco
 }
 
 impl ModelSection {

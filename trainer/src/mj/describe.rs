@@ -2,7 +2,7 @@
 //! MuJoCo has already resolved.
 
 use nearl_runtime::constraints::description::{
-    Body, Frame, JointDescription, JointKind as Kind, Onset, Range, RobotDescription, Solid,
+    Body, Frame, FrictionLaw, JointDescription, JointKind as Kind, Onset, Range, RobotDescription, Solid,
 };
 use nearl_runtime::constraints::geometry::{Placement, Shape};
 
@@ -94,6 +94,7 @@ impl Model {
             armature: m.dof_armature()[v],
             friction,
             friction_onset: (one && friction > 0.0).then(|| self.onset(v)),
+            friction_law: FrictionLaw::Mujoco,
             ..JointDescription::new(&joint.name, Kind::Hinge)
         }
     }

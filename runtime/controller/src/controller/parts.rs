@@ -4,6 +4,7 @@ use super::Half;
 use crate::motors::Motors;
 use crate::snapshot::{Manifest, Networks, PolicyKind, SnapshotError};
 use crate::task::{IdmInput, IdmKind};
+use nearl_constraints::description::FrictionLaw;
 use nearl_constraints::{
     ActionLimit, Consistency, ConstraintSettings, Drive, DriveTorqueLimit, Entry, Model, Projector, Settings,
     StateLayout, TorqueLimit, build_limits,
@@ -39,7 +40,12 @@ impl Parts {
     /// # Errors
     /// As [`Parts::new`].
     pub fn robot(m: &Manifest) -> Result<Model, SnapshotError> {
-        Model::from_description(m.robot.clone()).map_err(|e| unusable(&e))
+        let model = Model::from_description(m.robot.clone());
+        match m.task.model.friction {
+            FrictionLaw::Mujoco => model,
+            law => model.and_then(|model| model.with_friction_law(law)),
+        }
+        .map_err(|e| unusable(&e))
     }
 
     /// The projector of the task's constraints for the dofs in `controllable`, ascending.
