@@ -371,3 +371,34 @@ def test_the_actors_of_stable_baselines_are_read() -> None:
             x = np.clip((obs - norm.obs_rms.mean) / np.sqrt(norm.obs_rms.var + 1e-8), -10, 10)
             np.testing.assert_allclose(controller.act(obs), end(head(latent(x))), atol=2e-5, err_msg=name)
     assert sys.modules.get("torch") is None
+
+
+def test_where_drives_alone_are_bounded_a_robot_need_not_hold_every_pose(tmp_path) -> None:
+    """On legs nothing is promised of the motion: motors too weak for some pose are a warning, where a promise rests on them a failure."""
+    path = Net(6).gemm(6, 3).save(tmp_path / "policy.onnx", 3)
+    (tmp_path / "planar.urdf").write_text(planar_urdf())
+    found = {}
+    for guard, limits in (('"drive"', ""), ("true", "acceleration = { limit = 10.0 }\nvelocity = { scale = 1.0 }\nposition = {}")):
+        recipe = tmp_path / "recipe.toml"
+        recipe.write_text(
+            f"""[time]
+dt = 0.004
+[command]
+interface = "pd"
+stiffness = 40.0
+damping = 1.0
+[constraints]
+torque = {{ scale = 0.2 }}
+guard = {guard}
+{limits}
+[policy]
+joints = ["joint0", "joint1", "joint2"]
+observation = [{{ term = "joint_pos" }}, {{ term = "joint_vel" }}]
+"""
+        )
+        snapshot = tmp_path / "policy.safetensors"
+        nearl.import_onnx(path, robot=tmp_path / "planar.urdf", recipe=recipe).save(snapshot)
+        report = subprocess.run([NEARL, "doctor", snapshot], capture_output=True, text=True, check=False)
+        found[guard] = {line.split()[1]: line.split()[0] for line in report.stdout.splitlines() if line[:4].strip() in ("ok", "warn", "fail")}
+    assert found["true"]["holding"] == "fail"
+    assert [found['"drive"'][check] for check in ("projection", "holding", "braking")] == ["ok", "warn", "ok"]

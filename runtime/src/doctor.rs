@@ -177,6 +177,10 @@ fn projection(m: &Manifest) -> Check {
     if let Some(text) = m.without_simulator() {
         return warn(CheckCode::Projection, text.into());
     }
+    if m.bounds_drives() {
+        let text = "the forces of its drives and their change are kept within the motors'; nothing is promised of the motion (guard = \"drive\")";
+        return ok(CheckCode::Projection, text.into());
+    }
     match m.proposes() {
         false => warn(
             CheckCode::Projection,
@@ -197,7 +201,11 @@ fn holding(m: &Manifest, parts: &Parts) -> Check {
     }
     let period = m.task.period();
     if let Some(text) = holding::refusal(model, limits, controllable, &period) {
-        return fail(CheckCode::Holding, text);
+        return if m.bounds_drives() {
+            warn(CheckCode::Holding, text)
+        } else {
+            fail(CheckCode::Holding, text)
+        };
     }
     let loads = holding::heaviest(model, limits, controllable, &period);
     let share = |l: &holding::Load| l.needed / l.effort;
@@ -219,6 +227,12 @@ fn braking(m: &Manifest, parts: Parts) -> Check {
     let (limits, controllable) = (projector.limits(), layout.controllable());
     if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {
         return ok(CheckCode::Braking, "the task has no torque limit, so there is nothing to certify".into());
+    }
+    if m.bounds_drives() {
+        return ok(
+            CheckCode::Braking,
+            "nothing is promised of the motion (guard = \"drive\"), so there is no brake to certify".into(),
+        );
     }
     let period = m.task.period();
     let (samples, seed) = SAMPLES;
