@@ -68,7 +68,7 @@ def over(x: float) -> float:
 
 COLUMNS = {
     "return": "return",
-    "late_distance": "distance, m",
+    "late_distance": "away, m",
     "outside": "outside, %",
     "position_excess": "position, rad",
     "velocity_excess": "speed, rad/s",
