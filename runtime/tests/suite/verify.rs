@@ -487,6 +487,8 @@ fn every_seeded_corruption_is_named_at_its_tick() {
         ("brake too weak", "way to stop", Box::new(move |m: &mut Value| m["brake"] = json!(vec![2e-2; 7]))),
         ("not a number", "target_v[2]", Box::new(move |m: &mut Value| m["target_v"][2] = Value::Null)),
         ("cut", "length of target_q", Box::new(move |m: &mut Value| m["target_q"] = json!([0.0]))),
+        ("speeds cut", "length of target_v", Box::new(move |m: &mut Value| m["target_v"] = json!([0.0]))),
+        ("state cut", "length of state.v", Box::new(move |m: &mut Value| m["state"]["v"] = json!([0.0]))),
     ];
     for (name, word, change) in &cases {
         let report = found(&**change);

@@ -161,12 +161,15 @@ impl Session {
                 None
             }
         };
-        let dt = promises.0.period.dt;
+        let (dt, nq, nv) = (promises.0.period.dt, promises.0.machine.nq(), promises.0.machine.nv());
         self.promises.insert(tick.snapshot, promises);
         let v = match (&tick.sensed[..], self.past.take()) {
             ("predicted", Some(past)) => past.target.1,
             _ => tick.state.v.clone(),
         };
+        if [tick.target_q.len(), tick.target_v.len(), v.len()] != [nq, nv, nv] {
+            return Ok(()); // it was named, and leaves nothing that the next tick could be judged by
+        }
         let a = tick.target_v.iter().zip(&v).map(|(to, from)| (to - from) / dt).collect();
         let target = (tick.target_q.clone(), tick.target_v.clone());
         self.past = Some(Past { episode: tick.state.episode, target, a, brake: tick.brake.clone(), told });
