@@ -43,6 +43,9 @@ pub struct RunCommand {
     /// So long without a state, and the plant is gone: the run ends with exit code 3 [s].
     #[arg(long, value_parser = seconds, default_value_t = 5.0)]
     pub plant_patience: f64,
+    /// So long without a new snapshot, and health and report say that the trainer is silent [s]; the loop goes on. Never if not given.
+    #[arg(long, value_parser = seconds)]
+    pub snapshot_age: Option<f64>,
     /// Time over which the first motion is let in [s]; 0 begins at once.
     #[arg(long, default_value_t = RunSettings::default().ramp)]
     pub ramp: f64,
@@ -242,6 +245,7 @@ impl RunCommand {
             }),
             age_limit: self.age_limit,
             plant_patience: self.plant_patience,
+            snapshot_age: self.snapshot_age,
             ramp: self.ramp,
             jump: self.jump,
             limits: self.limits_file,

@@ -383,7 +383,7 @@ message! {
 
 message! {
     /// How the loop is doing, about ten times a second.
-    HealthMessage, "health", version 2, buffer 2, history 1, subscribers 8 {
+    HealthMessage, "health", version 3, buffer 2, history 1, subscribers 8 {
         /// Ticks so far.
         tick: u64,
         /// [`crate::rt::Mode`] as a number.
@@ -410,8 +410,8 @@ message! {
         rolled_back: u64,
         /// [`crate::rt::Reason`] as a number.
         reason: u32,
-        /// Fills the line.
-        reserved: u32,
+        /// 1 while no new snapshot came for longer than `--snapshot-age`.
+        aged: u32,
         /// Flight log records dropped.
         log_drops: u64,
         /// Limits the raw proposals broke.

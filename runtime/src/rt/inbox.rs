@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use nearl_constraints::Moved;
 
+use crate::clock;
 use crate::link::{
     LimitsMessage, Message, ReceiptMessage, RobotMessage, RowsMessage, RuntimeLink, SnapshotBytes,
     SnapshotHeader, Verdict,
@@ -49,6 +50,8 @@ pub(crate) struct SnapshotInbox<B: Build> {
     received: u64,
     /// Sender and version of the newest snapshot that came.
     newest: (u64, u64),
+    /// When it came, or when the loop began [ns].
+    pub(crate) came: u64,
     /// What viewers are told of the one in use.
     pub(crate) rows: Box<RowsMessage>,
     /// Versions taken into use: (first tick at the latest, version of the controller).
@@ -105,6 +108,7 @@ impl<B: Build> SnapshotInbox<B> {
             condemned: None,
             received: 0,
             newest: (0, 0),
+            came: clock::now(),
             rows: Box::new(RowsMessage::zeroed()),
             accepted: Vec::new(),
             refusals: Vec::new(),
@@ -159,7 +163,7 @@ impl<B: Build> SnapshotInbox<B> {
             );
             return self.refuse(around.link, &snapshot.header, Verdict::Outdated, &text);
         }
-        self.newest = (sender, version);
+        (self.newest, self.came) = ((sender, version), clock::now());
         self.received += 1;
         let SnapshotBytes { header, bytes } = snapshot;
         let source = Source { bytes: Arc::new(bytes), moved: self.in_use.moved.clone(), is_order: false };

@@ -50,6 +50,8 @@ pub(crate) struct Io<B: Build> {
     /// Set once the plant counts as gone, after so long without a state [ns].
     pub(crate) gone: Arc<AtomicBool>,
     pub(crate) gone_after: u64,
+    /// So long without a new snapshot is said [ns].
+    pub(crate) snapshot_age: Option<u64>,
     pub(crate) period: u64,
     pub(crate) polls_always: bool,
     /// That of the real-time thread.
@@ -75,6 +77,9 @@ pub(crate) struct Traffic {
     next_attend: u64,
     previous: Option<Box<Record>>,
     pub(crate) tick: u64,
+    /// No new snapshot came for too long, and how often that was.
+    is_aged: bool,
+    pub(crate) aged: u64,
 }
 
 impl<B: Build> Io<B> {
@@ -208,12 +213,14 @@ impl<B: Build> Io<B> {
         let Io { link, log, robot, snapshots, traffic, .. } = self;
         snapshots.pump(&mut Surroundings { link, log, robot, tick: traffic.tick });
         let now = clock::now();
+        self.look_for_the_trainer(now);
         if now >= self.health.next {
             self.health.next = now + HEALTH;
             let mut message = self.health.message();
             message.refused_states = self.traffic.refused_states + self.link.refused_states();
             message.refused_snapshots = self.snapshots.refused();
             message.rolled_back = self.snapshots.rolled_back;
+            message.aged = u32::from(self.traffic.is_aged);
             message.log_drops = self.log.as_ref().map_or(0, LogQueue::dropped);
             self.link.send_health(&mut message);
             if let Some(asked) = &mut self.asked {
@@ -230,6 +237,15 @@ impl<B: Build> Io<B> {
         if is_silent && !(self.robot.is_lockstep() && is_alive(self.robot.pid)) {
             self.end();
         }
+    }
+
+    /// A trainer that pushes nothing for long is said to be silent; the loop goes on with what it has.
+    fn look_for_the_trainer(&mut self, now: u64) {
+        let is_aged = self.snapshot_age.is_some_and(|most| now > self.snapshots.came.saturating_add(most));
+        if is_aged && !self.traffic.is_aged {
+            self.traffic.aged += 1;
+        }
+        self.traffic.is_aged = is_aged;
     }
 
     /// Has the loop brake and end: there is nobody to drive, or nothing to drive it over.

@@ -79,6 +79,8 @@ pub struct RunReport {
     pub refusals: Vec<String>,
     /// Snapshots taken back because the robot no longer reached its targets.
     pub rolled_back: u64,
+    /// Times that no new snapshot came for longer than was asked for.
+    pub aged: u64,
     /// Page faults, context switches and, where they are counted, allocations of the real-time thread after its first 300 ticks.
     pub usage: Usage,
     /// The flight log; another name than was asked for if that was taken.

@@ -63,6 +63,8 @@ pub struct RunSettings {
     pub patience: f64,
     /// So long without a state, and a plant that keeps real time is gone, or one in lockstep whose process has ended: the run ends \[s\].
     pub plant_patience: f64,
+    /// So long without a new snapshot, and health and report say that nobody learns any more \[s\]; the loop goes on. None never says it.
+    pub snapshot_age: Option<f64>,
     /// Largest speed entry that counts as standing still [rad/s or m/s].
     pub stop_speed: f64,
     /// Longest braking before the loop ends anyway \[s\].
@@ -112,6 +114,7 @@ impl Default for RunSettings {
             ticks: None,
             patience: 5.0,
             plant_patience: 5.0,
+            snapshot_age: None,
             stop_speed: 1e-2,
             stop_patience: 1.0,
             jump: 3.0,
@@ -340,6 +343,7 @@ fn assemble<B: Build>(
         explore: settings.explore,
         gone,
         gone_after: clock::nanoseconds(settings.plant_patience),
+        snapshot_age: settings.snapshot_age.map(clock::nanoseconds),
         health,
         tick,
         traffic: Traffic::default(),
@@ -485,6 +489,7 @@ fn report<B: Build>(
         versions: std::iter::once((0, version)).chain(io.snapshots.accepted).collect(),
         refused_snapshots,
         refusals: io.snapshots.refusals,
+        aged: io.traffic.aged,
         log: path,
         log_drops: log.dropped + log.dropped_snapshots,
         log_brief: log.brief,

@@ -86,6 +86,9 @@ pub struct Panda {
     pub accelerated: f64,
     /// Time it takes to measure: lockstep is faster than a trainer can push.
     pub pause: Duration,
+    /// Physics steps in a period (0: constant acceleration), and the largest share by which a period is longer or shorter than told.
+    pub moves: (u32, f64),
+    pub periods: u64,
 }
 
 impl Panda {
@@ -105,6 +108,8 @@ impl Panda {
             follows_positions: false,
             accelerated: 0.0,
             pause: Duration::ZERO,
+            moves: (1, 0.0),
+            periods: 0,
         }
     }
 }
@@ -133,12 +138,25 @@ impl Plant for Panda {
             self.speeds.push(self.v.iter().fold(0.0, |m, v| f64::max(m, v.abs())));
             return;
         }
-        self.dynamics.passive(&self.q, &self.v, &mut passive);
-        let tau: Vec<f64> = action.action().iter().zip(&passive).map(|(t, p)| t + p).collect();
-        self.dynamics.aba(&self.q, &self.v, &tau, &mut a);
+        let (steps, jitter) = self.moves;
+        self.periods += 1;
+        let period = toy::DT * (1.0 + jitter * f64::from(weights(self.periods, 1)[0]));
+        for _ in 0..steps.max(1) {
+            self.dynamics.passive(&self.q, &self.v, &mut passive);
+            let tau: Vec<f64> = action.action().iter().zip(&passive).map(|(t, p)| t + p).collect();
+            self.dynamics.aba(&self.q, &self.v, &tau, &mut a);
+            for i in 0..N {
+                let h = period / f64::from(steps.max(1));
+                if steps == 0 {
+                    self.q[i] += h * self.v[i] + 0.5 * h * h * a[i];
+                    self.v[i] += h * a[i];
+                } else {
+                    self.v[i] += h * a[i];
+                    self.q[i] += h * self.v[i];
+                }
+            }
+        }
         for i in 0..N {
-            self.v[i] += toy::DT * a[i];
-            self.q[i] += toy::DT * self.v[i];
             let excess = [
                 (self.q[i] - self.upper[i]).max(self.lower[i] - self.q[i]),
                 self.v[i].abs() - self.velocity[i],

@@ -271,51 +271,89 @@ const CALLS: [&str; 9] = [
     "unlink,unlinkat",
 ];
 
-/// Starts plant and runtime in a process that is killed at the `when`-th call of a kind; true if it got through before that.
-fn start_killed_at(name: &toy::Name, call: &str, when: usize) -> bool {
-    let inner = command_of("start", name);
-    let mut outer = std::process::Command::new("strace");
-    outer.args(["-f", "-qq", "-o", "/dev/null", "-e", &format!("trace={call}")]);
-    outer.args(["-e", &format!("inject={call}:signal=SIGKILL:when={when}")]);
-    outer.arg(inner.get_program()).args(inner.get_args());
-    inner.get_envs().for_each(|(key, value)| {
-        outer.env(key, value.unwrap());
-    });
-    outer.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap().success()
+/// What kills a start at a chosen call.
+enum Killer {
+    Strace,
+    /// A library that is preloaded, built of `kill_at.c`.
+    Library(Scratch),
 }
 
-/// Every `NEARL_KILL_STRIDE`-th point (13 by default, 1 for all of them), alone and beside a process that stays.
-#[test]
-fn fault_43_a_start_killed_at_any_system_call_stands_in_the_way_of_none_after_it() {
-    let traced = std::process::Command::new("strace").args(["-qq", "true"]).stderr(Stdio::null()).status();
-    if !traced.is_ok_and(|status| status.success()) {
-        return skip("strace is missing, or may not trace here");
+impl Killer {
+    fn strace() -> Option<Killer> {
+        let mut traced = std::process::Command::new("strace");
+        let status = traced.args(["-qq", "true"]).stderr(Stdio::null()).status();
+        status.is_ok_and(|status| status.success()).then_some(Killer::Strace)
     }
-    let stride = number("NEARL_KILL_STRIDE", 13) as usize;
+
+    fn library(test: &str) -> Option<Killer> {
+        let folder = Scratch::new(test);
+        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/faults/kill_at.c");
+        let mut cc = std::process::Command::new("cc");
+        cc.args(["-shared", "-fPIC", "-o"]).arg(folder.0.join("kill_at.so")).arg(source).arg("-ldl");
+        cc.status().is_ok_and(|status| status.success()).then_some(Killer::Library(folder))
+    }
+
+    /// Starts plant and runtime in a process that is killed at the `when`-th call of a kind; true if it got through before that.
+    fn start(&self, name: &toy::Name, call: &str, when: usize) -> bool {
+        let inner = command_of("start", name);
+        let mut outer = match self {
+            Killer::Strace => std::process::Command::new("strace"),
+            Killer::Library(_) => std::process::Command::new(inner.get_program()),
+        };
+        match self {
+            Killer::Strace => {
+                outer.args(["-f", "-qq", "-o", "/dev/null", "-e", &format!("trace={call}")]);
+                outer.args(["-e", &format!("inject={call}:signal=SIGKILL:when={when}")]);
+                outer.arg(inner.get_program());
+            }
+            Killer::Library(folder) => {
+                let kind = call.split(',').next().unwrap();
+                outer.env("LD_PRELOAD", folder.0.join("kill_at.so"));
+                outer.env("NEARL_KILL_AT", format!("{kind}:{when}"));
+            }
+        }
+        outer.args(inner.get_args());
+        inner.get_envs().for_each(|(key, value)| {
+            outer.env(key, value.unwrap());
+        });
+        outer.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap().success()
+    }
+}
+
+/// How long a start takes.
+fn timed_start(name: &toy::Name) -> Duration {
+    let begin = std::time::Instant::now();
+    let mut next = command_of("start", name).spawn().unwrap();
+    let mut ended = None;
+    until("a start ends", || {
+        ended = next.try_wait().unwrap();
+        ended.is_some()
+    });
+    assert!(ended.unwrap().success(), "a start failed");
+    begin.elapsed()
+}
+
+/// Kills a start at every `stride`-th call of each kind, and looks at the start after it.
+fn kill_starts(killer: &Killer, test: &str, stride: usize, survivors: &[bool]) -> usize {
+    let clean = toy::Name::new(&format!("{test}-clean"));
+    let usual = (0..3).map(|_| timed_start(&clean)).max().unwrap();
     let (mut points, mut slowest) = (0, Duration::ZERO);
-    for survivor in [false, true] {
+    for survivor in survivors {
         for call in CALLS {
             let mut when = 1 + call.len() % stride;
             loop {
-                let name = toy::Name::new(&format!("point{points}"));
+                let name = toy::Name::new(&format!("{test}{points}"));
                 let mut stays = survivor.then(|| TrainerLink::open(&name.0).unwrap());
-                if start_killed_at(&name, call, when) {
+                if killer.start(&name, call, when) {
                     break;
                 }
                 let left = remains().into_iter().find(|r| r.name == name.0.as_str());
-                assert!(survivor || left.is_none_or(|r| r.is_stale()), "what only the dead left is named so");
-                let begin = std::time::Instant::now();
-                let mut next = command_of("start", &name).spawn().unwrap();
-                let mut ended = None;
-                until(&format!("a start after a kill at {call} number {when}, survivor {survivor}"), || {
-                    ended = next.try_wait().unwrap();
-                    ended.is_some()
-                });
                 assert!(
-                    ended.unwrap().success(),
-                    "after a kill at {call} number {when}, survivor {survivor}"
+                    *survivor || left.is_none_or(|r| r.is_stale()),
+                    "what only the dead left is named so"
                 );
-                slowest = slowest.max(begin.elapsed());
+                println!("killed at {call} number {when}, survivor {survivor}");
+                slowest = slowest.max(timed_start(&name));
                 if let Some(stays) = &mut stays {
                     let _ = stays.health();
                 } else {
@@ -326,6 +364,26 @@ fn fault_43_a_start_killed_at_any_system_call_stands_in_the_way_of_none_after_it
             }
         }
     }
-    println!("{points} points, the slowest start after one took {slowest:?}");
+    println!("{points} points, the slowest start after one took {slowest:?}, one after none {usual:?}");
+    points
+}
+
+/// Every `NEARL_KILL_STRIDE`-th point (13 by default, 1 for all of them), alone and beside a process that stays.
+#[test]
+fn fault_43_a_start_killed_at_any_system_call_stands_in_the_way_of_none_after_it() {
+    let Some(killer) = Killer::strace().or_else(|| Killer::library("kill-at")) else {
+        return skip("strace is missing, or may not trace here, and there is no cc to do without");
+    };
+    let stride = number("NEARL_KILL_STRIDE", 13) as usize;
+    let points = kill_starts(&killer, "point", stride, &[false, true]);
     assert!(points > 10, "{points}");
+}
+
+/// What stands in for strace, wherever both may be had.
+#[test]
+fn fault_43_a_start_killed_by_a_preloaded_library_stands_in_the_way_of_none_after_it() {
+    let Some(killer) = Killer::library("preloaded") else { return skip("no cc builds a library to preload") };
+    let stride = 4 * number("NEARL_KILL_STRIDE", 13) as usize;
+    let points = kill_starts(&killer, "preload", stride, &[false]);
+    assert!(points > 3, "{points}");
 }

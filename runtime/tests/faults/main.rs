@@ -207,3 +207,32 @@ fn no_hot_swap_leads_to_a_state_without_a_certified_answer() {
         flight.assert_within_limits(ROUNDING);
     }
 }
+
+/// The plant as told, then otherwise: half as long or half as much again. What half a period of acceleration adds to a speed, and half a
+/// period of speed to a position, is the most that it may come beyond.
+#[test]
+fn fault_48_a_plant_that_moves_otherwise_than_told_keeps_torque_and_nearly_the_rest() {
+    for steps in [0, 1, 4] {
+        let mut told = stochastic(1);
+        told.manifest.task.time.sim_dt = if steps == 0 { 0.0 } else { toy::DT / f64::from(steps) };
+        for jitter in [0.0, 0.5] {
+            let mut flight = Flight::new(&told, settings(), FaultPlan::default());
+            flight.panda.moves = (steps, jitter);
+            flight.fly(3000);
+            let [position, velocity, torque] = flight.panda.worst;
+            println!(
+                "{steps} steps, jitter {jitter}: {position:.1e} rad, {velocity:.1e} rad/s, {torque:.1e} N m beyond"
+            );
+            assert!(torque <= ROUNDING, "{steps} steps, jitter {jitter}: {torque} N m beyond");
+            assert_eq!(flight.first(Mode::Fault), None, "{steps} steps, jitter {jitter}");
+            let fastest = flight.panda.speeds.iter().fold(0.0_f64, |most, v| most.max(*v));
+            assert!(fastest > 0.3, "{steps} steps, jitter {jitter}: it hardly moves ({fastest} rad/s)");
+            let accelerates = 10.0;
+            let (most_q, most_v) = (0.5 * toy::DT * fastest, 0.5 * toy::DT * accelerates);
+            assert!(
+                position <= ROUNDING + most_q && velocity <= ROUNDING + most_v,
+                "{steps} steps, jitter {jitter}: {position} rad of {most_q}, {velocity} rad/s of {most_v}"
+            );
+        }
+    }
+}

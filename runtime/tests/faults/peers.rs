@@ -20,16 +20,26 @@ struct Rogue {
     _node: Node<Ipc>,
 }
 
+/// Where the links of a robot lie.
+fn folder_of(name: &RobotName) -> std::path::PathBuf {
+    // SAFETY: plain call.
+    let user = unsafe { libc::geteuid() };
+    std::path::Path::new("/dev/shm").join(format!("nearl-{user}")).join(name.as_str())
+}
+
+/// A node among those of the robot.
+fn join(name: &RobotName) -> Node<Ipc> {
+    let folder = folder_of(name);
+    let token = std::fs::read_to_string(folder.join("token")).unwrap();
+    let mut config = Config::default();
+    config.global.set_root_path(&Path::new(folder.to_str().unwrap().as_bytes()).unwrap());
+    config.global.prefix = FileName::new(format!("nearl.{name}.{token}.").as_bytes()).unwrap();
+    NodeBuilder::new().config(&config).create::<Ipc>().unwrap()
+}
+
 impl Rogue {
     fn new(name: &RobotName) -> Rogue {
-        // SAFETY: plain call.
-        let user = unsafe { libc::geteuid() };
-        let folder = std::path::Path::new("/dev/shm").join(format!("nearl-{user}")).join(name.as_str());
-        let token = std::fs::read_to_string(folder.join("token")).unwrap();
-        let mut config = Config::default();
-        config.global.set_root_path(&Path::new(folder.to_str().unwrap().as_bytes()).unwrap());
-        config.global.prefix = FileName::new(format!("nearl.{name}.{token}.").as_bytes()).unwrap();
-        let node = NodeBuilder::new().config(&config).create::<Ipc>().unwrap();
+        let node = join(name);
         let topic = ServiceName::new(&format!("nearl/{name}/snapshot")).unwrap();
         let service = node.service_builder(&topic).publish_subscribe::<[u8]>();
         let service = service.user_header::<SnapshotHeader>().open().unwrap();
@@ -103,4 +113,134 @@ fn fault_33_a_peer_with_lies_and_a_flood_is_refused_and_counted() {
         assert!(said.contains(words), "'{words}' is not in: {said}");
     }
     assert!(arm.worst.iter().all(|e| *e <= 1e-9), "position, velocity, torque: {:?}", arm.worst);
+}
+
+/// Words that lengths, numbers and texts lie with.
+const WORDS: [u64; 9] = [
+    0,
+    1,
+    u64::MAX,
+    u32::MAX as u64,
+    1 << 63,
+    0x7ff8_0000_0000_0000, // NaN
+    0x7ff0_0000_0000_0000, // infinity
+    0x7fef_ffff_ffff_ffff, // the largest number
+    0x0000_0000_0000_0001, // the smallest
+];
+
+/// Messages of one kind on their own topic: every word the same lie, or others by turns; with the right schema and with another.
+fn lie<M: Queued>(node: &Node<Ipc>, name: &RobotName) {
+    let topic = ServiceName::new(&format!("nearl/{name}/{}", M::TOPIC)).unwrap();
+    let service = node.service_builder(&topic).publish_subscribe::<M>().open().unwrap();
+    let port = service.publisher_builder().max_loaned_samples(1).create().unwrap();
+    let words = size_of::<M>() / 8;
+    for k in 0..20 * WORDS.len() {
+        let mut message = M::zeroed();
+        let into = std::ptr::from_mut(&mut message).cast::<u64>();
+        for at in 0..words {
+            let word = if k < WORDS.len() { WORDS[k] } else { WORDS[(at * 7 + k * k) % WORDS.len()] };
+            // SAFETY: a message is words for its whole size, and every bit pattern is a value.
+            unsafe { into.add(at).write_unaligned(word) };
+        }
+        let schema = if k % 5 == 4 { M::SCHEMA ^ 1 } else { M::SCHEMA };
+        *message.header_mut() =
+            Header { schema, epoch: 99 + k as u64 % 2, seq: WORDS[k % WORDS.len()], stamp: 0 };
+        port.loan_uninit().unwrap().write_payload(message).send().unwrap();
+        std::thread::sleep(Duration::from_micros(300));
+    }
+}
+
+/// A peer on every topic at once, beside those who belong there.
+#[test]
+fn fault_33_lies_on_every_topic_end_nothing_and_move_nothing() {
+    let name = Name::new("liar");
+    let first = snapshot(1, |_| {});
+    let file = File::new("liar", &first);
+    let plant = start_with(&name, &first, FaultPlan::default(), Duration::from_micros(300));
+    let stop = Stop::new();
+    let running = execute(&name, &file.0, &stop);
+    let mut viewer = TrainerLink::open(&name.0).unwrap();
+    viewer.wait_for_runtime(Duration::from_secs(30)).unwrap();
+    let mut ticks = ViewLink::open(&name.0).unwrap();
+    let node = join(&name.0);
+    lie::<RobotMessage>(&node, &name.0);
+    lie::<TallyMessage>(&node, &name.0);
+    lie::<LimitsMessage>(&node, &name.0);
+    for round in 0..3 {
+        lie::<TransitionMessage>(&node, &name.0);
+        lie::<ReceiptMessage>(&node, &name.0);
+        lie::<HealthMessage>(&node, &name.0);
+        lie::<TickMessage>(&node, &name.0);
+        lie::<RowsMessage>(&node, &name.0);
+        // Whoever reads them is told nonsense at the worst.
+        while let Some(t) = viewer.transition() {
+            assert!(t.q().len() <= MAX_JOINTS && t.action().len() <= MAX_JOINTS, "round {round}");
+        }
+        while let Some(receipt) = viewer.receipt() {
+            assert!(receipt.text().len() <= 3 * MAX_TEXT, "round {round}");
+        }
+        let _ = (viewer.health(), viewer.tally(), viewer.robot());
+        while let Some(tick) = ticks.tick() {
+            assert!(tick.q().len() <= MAX_JOINTS && tick.multipliers().len() <= MAX_ACTIVE, "round {round}");
+        }
+        let _ = ticks.rows().map(|rows| (rows.row_kinds(), rows.row_names(), rows.task_name()));
+    }
+    // The true words are heard after all that.
+    let version = 1 << 40;
+    viewer.push(version, &snapshot(version, |_| {}).to_bytes()).unwrap();
+    until("the push is in use", || {
+        viewer.receipt().is_some_and(|r| r.version == version && r.verdict() == Verdict::Accepted)
+    });
+    stop.request();
+    let report = running.join().unwrap().unwrap();
+    let (arm, _) = plant.end();
+    assert_eq!(
+        (report.modes["fault"], report.modes["degraded"], report.counters.swaps),
+        (0, 0, 1),
+        "{report}"
+    );
+    assert!(
+        report.refused_snapshots > 0 && report.refusals.join(" ").contains("limits that cannot be read"),
+        "{report}"
+    );
+    assert!(arm.worst.iter().all(|e| *e <= 1e-9), "position, velocity, torque: {:?}", arm.worst);
+}
+
+/// Random words in the live boards of state and action: nothing dies, no motor gets more than it takes, and all is well again after it.
+#[test]
+fn fault_33_random_words_in_live_boards_end_nothing() {
+    use std::os::unix::fs::FileExt;
+    let name = Name::new("scribbled");
+    let first = snapshot(1, |_| {});
+    let file = File::new("scribbled", &first);
+    let plant = start_with(&name, &first, FaultPlan::default(), Duration::from_micros(300));
+    let stop = Stop::new();
+    let modes = ModeLimits { recover_after: 1, ..ModeLimits::default() };
+    let running = execute_with(&name, &file.0, &stop, RunSettings { modes, ..crate::toy::settings() });
+    let mut viewer = TrainerLink::open(&name.0).unwrap();
+    viewer.wait_for_runtime(Duration::from_secs(30)).unwrap();
+    let mut seed = 1_u64;
+    let mut next = || {
+        seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        seed >> 16
+    };
+    for board in ["newest-state", "newest-action"] {
+        let board = std::fs::File::options().write(true).open(folder_of(&name.0).join(board)).unwrap();
+        let words = board.metadata().unwrap().len() / 8;
+        for k in 0..2000 {
+            let word = if k % 2 == 0 { WORDS[(next() % 9) as usize] } else { next() << 8 };
+            board.write_all_at(&word.to_le_bytes(), 8 * (next() % words)).unwrap();
+            if k % 20 == 0 {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }
+    }
+    let mut then = 0;
+    until("health", || viewer.health().map(|h| then = h.tick).is_some());
+    until("the loop goes on", || viewer.health().is_some_and(|h| h.tick > then + 100));
+    stop.request();
+    let report = running.join().unwrap().unwrap();
+    let (arm, _) = plant.end();
+    assert!(arm.worst[2] <= 1e-9, "torque: {:?}", arm.worst);
+    assert!(!report.warnings.iter().any(|w| w.contains("panic")), "{report}");
 }

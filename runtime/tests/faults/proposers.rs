@@ -160,7 +160,7 @@ fn actions_without_a_guard_are_not_asked_for() {
 }
 
 #[test]
-fn fault_47_a_proposer_killed_or_stopped_is_held_then_braked_and_its_successor_taken_up() {
+fn fault_49_a_proposer_killed_or_stopped_is_held_then_braked_and_its_successor_taken_up() {
     let stage = Stage::new("proposer");
     let plant = start_with(&stage.name, &stage.first, FaultPlan::default(), Duration::from_micros(500));
     let stop = Stop::new();
