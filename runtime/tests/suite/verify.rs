@@ -314,11 +314,7 @@ fn hard_jerk_is_verified_alone_and_with_what_ties_joints_together() {
     let other = folder.0.join("copy.mcap");
     for jerk in [550.0, 650.0] {
         let change = |constraints: &mut Value| constraints["jerk"]["limit"] = jerk.into();
-        let facts = |facts: &mut BTreeMap<String, String>| {
-            let mut limits: Value = serde_json::from_str(&facts["limits"]).unwrap();
-            change(&mut limits);
-            facts.insert("limits".into(), limits.to_string());
-        };
+        let facts = |facts: &mut _| limits_in(facts, &change);
         copy(&log, &other, &|_, _| true, &|bytes| with_limit(bytes, &change), &facts);
         let report = verify(&other).unwrap();
         assert!(report.found > 0, "jerk {jerk}\n{report}");
@@ -560,6 +556,13 @@ fn with_limit(bytes: Vec<u8>, change: &dyn Fn(&mut Value)) -> Vec<u8> {
     snapshot.to_bytes()
 }
 
+/// Changes the limits that a log says the loop pinned.
+fn limits_in(facts: &mut BTreeMap<String, String>, change: &dyn Fn(&mut Value)) {
+    let mut limits: Value = serde_json::from_str(&facts["limits"]).unwrap();
+    change(&mut limits);
+    facts.insert("limits".into(), limits.to_string());
+}
+
 #[test]
 fn a_limit_that_was_changed_in_the_log_is_found_out_looser_or_tighter() {
     let (folder, log) = record("verify-limits", &attack(LIMITS, 0.001, 1, 20));
@@ -572,22 +575,15 @@ fn a_limit_that_was_changed_in_the_log_is_found_out_looser_or_tighter() {
     ] {
         for value in values {
             let change = |constraints: &mut Value| constraints[section][key] = value.into();
-            let facts = |facts: &mut BTreeMap<String, String>| {
-                let mut limits: Value = serde_json::from_str(&facts["limits"]).unwrap();
-                change(&mut limits);
-                facts.insert("limits".into(), limits.to_string());
-            };
+            let facts = |facts: &mut _| limits_in(facts, &change);
             copy(&log, &other, &|_, _| true, &|bytes| with_limit(bytes, &change), &facts);
             let report = verify(&other).unwrap();
             assert!(report.found > 0, "{section}.{key} = {value}\n{report}");
         }
     }
     // What the loop pinned holds too, whatever its snapshot says.
-    let facts = |facts: &mut BTreeMap<String, String>| {
-        let mut limits: Value = serde_json::from_str(&facts["limits"]).unwrap();
-        limits["velocity"]["scale"] = 0.3.into();
-        facts.insert("limits".into(), limits.to_string());
-    };
+    let slower = |limits: &mut Value| limits["velocity"]["scale"] = 0.3.into();
+    let facts = |facts: &mut _| limits_in(facts, &slower);
     copy(&log, &other, &|_, _| true, &|bytes| bytes, &facts);
     assert!(verify(&other).unwrap().violations[0].what.contains("speed of joint"));
 }

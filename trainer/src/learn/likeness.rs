@@ -167,20 +167,9 @@ mod tests {
     use super::*;
     use crate::demos::DemoSettings;
     use crate::learn::imitation::{Base, Imitating};
-    use crate::learn::reference::{Net64, batch, flat32, relative_error, row, spread, tile};
+    use crate::learn::reference::{Net64, batch, dims, flat32, relative_error, row, spread, tile};
     use crate::learn::{Gaifo, Learner, Pace, Ppo, PpoSettings};
     use nearl_runtime::net::Activation;
-
-    fn dims() -> Dims {
-        Dims {
-            n_obs: 7,
-            n_privileged: 0,
-            n_state: 5,
-            n_act: 3,
-            seen_obs: vec![1, 2, 6],
-            seen_state: vec![0, 2, 4],
-        }
-    }
 
     /// A learner whose discriminator has weights far from zero, demonstrations for it, and what it sees.
     fn learner() -> (Imitating<Gaifo>, Batch, Batch) {

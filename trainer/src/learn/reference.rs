@@ -7,6 +7,18 @@ use super::{Dims, stats_of};
 use nearl_runtime::net::kernel::{V, scalars_mut};
 use nearl_runtime::net::{Activation, Dense};
 
+/// Dimensions of most tests: an adversary that sees three of each.
+pub(super) fn dims() -> Dims {
+    Dims {
+        n_obs: 7,
+        n_privileged: 0,
+        n_state: 5,
+        n_act: 3,
+        seen_obs: vec![1, 2, 6],
+        seen_state: vec![0, 2, 4],
+    }
+}
+
 /// A network in f64: weight (n_out x n_in) and bias of each layer, and the function between them.
 #[derive(Clone)]
 pub(super) struct Net64 {

@@ -6,17 +6,6 @@ use crate::learn::reference::{self, *};
 use nearl_runtime::net::Activation;
 use nearl_runtime::net::kernel::scalars;
 
-fn dims() -> Dims {
-    Dims {
-        n_obs: 7,
-        n_privileged: 0,
-        n_state: 5,
-        n_act: 3,
-        seen_obs: vec![1, 2, 6],
-        seen_state: vec![0, 2, 4],
-    }
-}
-
 /// A learner with weights far from zero.
 fn learner(kind: Kind, activation: Activation) -> Nearl {
     let nets = NetSettings {

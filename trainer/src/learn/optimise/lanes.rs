@@ -170,20 +170,9 @@ impl Lane<'_> {
 #[cfg(test)]
 mod tests {
     use crate::learn::{
-        Batch, Dims, Gradient, Kind, Learner, Nearl, NearlSettings, NetSettings, Pace, Pid2, Pid2Settings,
-        Ppo, PpoSettings, reference,
+        Batch, Gradient, Kind, Learner, Nearl, NearlSettings, NetSettings, Pace, Pid2, Pid2Settings, Ppo,
+        PpoSettings, reference, reference::dims,
     };
-
-    fn dims() -> Dims {
-        Dims {
-            n_obs: 7,
-            n_privileged: 0,
-            n_state: 5,
-            n_act: 3,
-            seen_obs: vec![1, 2, 6],
-            seen_state: vec![0, 2, 4],
-        }
-    }
 
     fn learner(algo: &str, threads: usize) -> Box<dyn Learner> {
         let (nets, ppo) = (NetSettings::default(), PpoSettings::default());

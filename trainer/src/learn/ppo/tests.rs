@@ -4,17 +4,6 @@ use super::*;
 use crate::learn::reference::{self, *};
 use nearl_runtime::net::Activation;
 
-fn dims() -> Dims {
-    Dims {
-        n_obs: 7,
-        n_privileged: 0,
-        n_state: 5,
-        n_act: 3,
-        seen_obs: vec![1, 2, 6],
-        seen_state: vec![0, 2, 4],
-    }
-}
-
 #[test]
 fn gradients_equal_central_differences() {
     [Activation::Tanh, Activation::Relu, Activation::Elu, Activation::Silu].into_iter().for_each(gradients);
