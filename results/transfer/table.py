@@ -23,6 +23,9 @@ PLANTS = {
     "motors x 0.8": ["random={ strength = { all = 0.8 } }"],
     "noise": [ALL[1]],
     "actions 2 ticks late": [ALL[2]],
+    "masses x 1.2, motors x 0.8": ALL[:1],
+    "the same, actions 2 ticks late": [ALL[0], ALL[2]],
+    "the same, noise": ALL[:2],
     "all at once": ALL,
 }
 # Limits of the task files: torque of each joint [N m], acceleration [rad/s²]

@@ -1,4 +1,6 @@
-"""A hundred episodes of 20 s of each snapshot, under pushes of several strengths: `evaluation.csv`, `episodes.csv`, and a table on the output.
+"""A hundred episodes of 20 s of each snapshot, under pushes of several strengths and on bumps of several heights.
+
+Writes `evaluation.csv` and `episodes.csv`, and a table on the output.
 
 .venv/bin/python results/walk/evaluate.py FOLDER SNAPSHOT...
 """
@@ -13,6 +15,9 @@ from pathlib import Path
 NEARL = os.environ.get("NEARL", str(Path(__file__).parents[2] / "target/release/nearl"))
 EPISODES, STEPS = 100, 1000
 PUSHES = {"none": "0", "up to 0.5 m/s": "0.5 * uniform", "up to 1 m/s": "1.0 * uniform"}
+FLAT = "flat"
+# height of the bumps and pushes on them
+GROUNDS = [(FLAT, "none"), (FLAT, "up to 0.5 m/s"), (FLAT, "up to 1 m/s"), ("0.04", "up to 0.5 m/s"), ("0.08", "up to 0.5 m/s"), ("0.12", "up to 0.5 m/s")]
 TORQUE, TORQUE_RATE = 80.0, 6000.0  # of the robot file [N m] and the task [N m/s]
 COLUMNS = {
     "falls": "episodes with a fall",
@@ -25,8 +30,10 @@ COLUMNS = {
 }
 
 
-def evaluate(snapshot: str, pushes: str) -> tuple[dict, list[dict]]:
+def evaluate(snapshot: str, bumps: str, pushes: str) -> tuple[dict, list[dict]]:
     command = [NEARL, "eval", snapshot, "--episodes", str(EPISODES), "--seed", "7", "--json", "--set", f'pushes.base="{pushes}"']
+    if bumps != FLAT:
+        command += ["--set", f"scene.floor={{ friction = 0.8, bumps = {bumps} }}"]
     e = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)[0]
     told = {t["name"].removeprefix("metrics/"): t for t in e["told"]}
     beyond = [told[name]["largest"] - limit for name, limit in (("torque", TORQUE), ("torque_rate", TORQUE_RATE))]
@@ -45,9 +52,9 @@ def evaluate(snapshot: str, pushes: str) -> tuple[dict, list[dict]]:
 def main(folder: Path, snapshots: list[str]) -> None:
     rows, episodes = [], []
     for snapshot in snapshots:
-        for pushes, of in PUSHES.items():
-            head = {"snapshot": Path(snapshot).name, "pushes": pushes}
-            row, each = evaluate(snapshot, of)
+        for bumps, pushes in GROUNDS:
+            head = {"snapshot": Path(snapshot).name, "bumps": bumps, "pushes": pushes}
+            row, each = evaluate(snapshot, bumps, PUSHES[pushes])
             rows.append(head | row)
             episodes += [head | episode for episode in each]
     for name, lines in (("evaluation.csv", rows), ("episodes.csv", episodes)):
@@ -55,7 +62,7 @@ def main(folder: Path, snapshots: list[str]) -> None:
             writer = csv.DictWriter(f, list(lines[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(lines)
-    heads = ["snapshot", "pushes an axis", *COLUMNS.values()]
+    heads = ["snapshot", "bumps, m", "pushes an axis", *COLUMNS.values()]
     print(f"| {' | '.join(heads)} |\n" + "|---" * len(heads) + "|")
     for row in rows:
         print(f"| {' | '.join(str(v) for v in row.values())} |")
