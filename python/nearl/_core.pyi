@@ -313,11 +313,11 @@ class LoopThread:
         *,
         seconds: float | None = None,
         log: _Path | None = None,
-        patience: float = 5.0,
-        ramp: float = 0.2,
+        patience: float | None = None,
+        ramp: float | None = None,
         priority: int | None = None,
         proposal_age: float | None = None,
-        proposal_hold: float = 0.1,
+        proposal_hold: float | None = None,
     ) -> LoopThread: ...
     @property
     def running(self) -> bool: ...
@@ -358,7 +358,7 @@ class Training:
         settings: Sequence[str],
         out: _Path | None,
         preset: str | None = None,
-        judge: Callable[[_Floats, _Floats, _Floats], tuple[float | None, bool]] | None = None,
+        scorer: Callable[[_Floats, _Floats, _Floats], tuple[float | None, bool]] | None = None,
         rewards: bool = False,
         ranks: Gather | None = None,
     ) -> Training: ...
@@ -369,7 +369,7 @@ class Training:
     def resume(
         path: _Path,
         threads: int,
-        judge: Callable[[_Floats, _Floats, _Floats], tuple[float | None, bool]] | None = None,
+        scorer: Callable[[_Floats, _Floats, _Floats], tuple[float | None, bool]] | None = None,
         rewards: bool = False,
         ranks: Gather | None = None,
     ) -> Training: ...

@@ -71,7 +71,7 @@ class PID2:
             raise ValueError(f"seed is {seed}; give a whole number from 0 to 2**64 - 1")
         run = run if ranks is None or ranks.rank == 0 else None
         self._training: _core.Training | None = _core.Training(
-            os.fspath(task), algo, seed, _threads(threads), overrides, run, preset, _judge(reward, termination), reward is not None, ranks
+            os.fspath(task), algo, seed, _threads(threads), overrides, run, preset, _scorer(reward, termination), reward is not None, ranks
         )
         self.task, self.algo, self.seed = self._training.task, algo, seed
         self._begin(self._training.controller())
@@ -189,23 +189,23 @@ class PID2:
         agent = cls.__new__(cls)
         agent._training, agent.seed = None, 0
         if ranks is not None or (Path(path) / "checkpoints" / "resume.safetensors").is_file():
-            agent._training = _core.Training.resume(path, _threads(threads), _judge(reward, termination), reward is not None, ranks)
+            agent._training = _core.Training.resume(path, _threads(threads), _scorer(reward, termination), reward is not None, ranks)
         controller = _core.Controller.load(path) if agent._training is None else agent._training.controller()
         agent.task, agent.algo = controller.task, controller.algo
         agent._begin(controller)
         return agent
 
 
-def _judge(reward: Outcome | None, termination: Outcome | None) -> Callable[[Floats, Floats, Floats], tuple[float | None, bool]] | None:
+def _scorer(reward: Outcome | None, termination: Outcome | None) -> Callable[[Floats, Floats, Floats], tuple[float | None, bool]] | None:
     """Both functions as one, of a single control period (1 x n arrays)."""
     if reward is None and termination is None:
         return None
 
-    def judge(obs: Floats, actions: Floats, next_obs: Floats) -> tuple[float | None, bool]:
+    def scorer(obs: Floats, actions: Floats, next_obs: Floats) -> tuple[float | None, bool]:
         worth = None if reward is None else float(ask("reward", reward, obs, actions, next_obs, float)[0])
         return worth, termination is not None and bool(ask("termination", termination, obs, actions, next_obs, bool)[0])
 
-    return judge
+    return scorer
 
 
 def _threads(threads: int | None) -> int:

@@ -101,6 +101,8 @@ class Plant:
 class Loop:
     """``nearl run`` on threads of this process; Python does not take part in its ticks, but shares its cores.
 
+    What is left out is as ``nearl run --help`` says.
+
     Args:
         snapshot: File or run folder.
         name: Of the plant.
@@ -120,11 +122,11 @@ class Loop:
         *,
         seconds: float | None = None,
         log: str | os.PathLike[str] | None = None,
-        patience: float = 5.0,
-        ramp: float = 0.2,
+        patience: float | None = None,
+        ramp: float | None = None,
         priority: int | None = None,
         proposal_age: float | None = None,
-        proposal_hold: float = 0.1,
+        proposal_hold: float | None = None,
     ) -> None:
         self.report: dict[str, Any] | None = None
         self._thread = _core.LoopThread(

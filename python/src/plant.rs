@@ -133,32 +133,34 @@ pub(crate) struct LoopThread {
 impl LoopThread {
     /// Starts the loop of a snapshot on the plant `name`.
     #[new]
-    #[pyo3(signature = (snapshot, name, *, seconds=None, log=None, patience=5.0, ramp=0.2, priority=None, proposal_age=None,
-                        proposal_hold=0.1))]
+    #[pyo3(signature = (snapshot, name, *, seconds=None, log=None, patience=None, ramp=None, priority=None, proposal_age=None,
+                        proposal_hold=None))]
     fn new(
         snapshot: PathBuf,
         name: &str,
         seconds: Option<f64>,
         log: Option<PathBuf>,
-        patience: f64,
-        ramp: f64,
+        patience: Option<f64>,
+        ramp: Option<f64>,
         priority: Option<i32>,
         proposal_age: Option<f64>,
-        proposal_hold: f64,
+        proposal_hold: Option<f64>,
     ) -> PyResult<LoopThread> {
-        for (what, value) in [("proposal_age", proposal_age.unwrap_or(1.0)), ("proposal_hold", proposal_hold)]
-        {
-            if !(0.0..=1e6).contains(&value) {
+        for (what, value) in [("proposal_age", proposal_age), ("proposal_hold", proposal_hold)] {
+            if let Some(value) = value.filter(|value| !(0.0..=1e6).contains(value)) {
                 return Err(errors::value(format!("{what} is {value} s; give 0 to 1e6 seconds")));
             }
         }
         let nanoseconds = |s: f64| (s * 1e9) as u64;
-        let proposer = proposal_age
-            .map(|age| ProposerSettings { age_limit: nanoseconds(age), hold: nanoseconds(proposal_hold) });
+        let proposer = proposal_age.map(|age| ProposerSettings {
+            age_limit: nanoseconds(age),
+            hold: proposal_hold.map_or(ProposerSettings::default().hold, nanoseconds),
+        });
         let name = RobotName::new(name).map_err(errors::value)?;
         let thread = ThreadSettings { priority, cpu: None, lock_memory: priority.is_some() };
-        let settings =
-            RunSettings { seconds, log, patience, ramp, thread, proposer, ..RunSettings::default() };
+        let unsaid = RunSettings::default();
+        let (patience, ramp) = (patience.unwrap_or(unsaid.patience), ramp.unwrap_or(unsaid.ramp));
+        let settings = RunSettings { seconds, log, patience, ramp, thread, proposer, ..unsaid };
         let stop = Stop::new();
         let running = std::thread::Builder::new().name("nearl-loop".into()).spawn({
             let stop = stop.clone();

@@ -8,7 +8,7 @@ use nearl_trainer::env::Step;
 use nearl_trainer::learn::ALGORITHMS;
 use nearl_trainer::preset::Preset;
 use nearl_trainer::ranks::{Ranks, from_first};
-use nearl_trainer::rollout::Judge;
+use nearl_trainer::rollout::Scorer;
 use nearl_trainer::run_folder::{self, RunFolder};
 use nearl_trainer::tasks;
 use nearl_trainer::train::{self, Experience, Request, TrainError, complete};
@@ -45,18 +45,18 @@ pub(crate) struct Training {
 /// What a function of the caller raised first.
 type Raised = Arc<Mutex<Option<PyErr>>>;
 
-/// Environments of this process; with `judge(obs, action, next_obs)` (1 x n each), which gives a reward or None and whether the episode ends,
+/// Environments of this process; with `scorer(obs, action, next_obs)` (1 x n each), which gives a reward or None and whether the episode ends,
 /// these take the task's place. `rewards`: it gives rewards. With `ranks` those of the other ranks too.
 fn experience(
-    judge: Option<Py<PyAny>>,
+    scorer: Option<Py<PyAny>>,
     rewards: bool,
     ranks: Option<&Arc<Ranks>>,
 ) -> PyResult<(Experience, Raised)> {
     let raised = Raised::default();
-    let judge = match (judge, ranks) {
+    let scorer = match (scorer, ranks) {
         (None, None) => return Ok((Experience::Here, raised)),
         (None, Some(ranks)) => return Ok((Experience::Ranks(Arc::clone(ranks)), raised)),
-        (Some(judge), None) => judge,
+        (Some(scorer), None) => scorer,
         (Some(_), Some(_)) => {
             return Err(errors::value(
                 "reward and termination are functions of one process, and ranks are several; write them into the task file, or leave ranks out",
@@ -64,10 +64,10 @@ fn experience(
         }
     };
     let kept = Arc::clone(&raised);
-    let judge = Judge::new(rewards, move |obs, action, next_obs, step| {
+    let scorer = Scorer::new(rewards, move |obs, action, next_obs, step| {
         let asked = Python::attach(|py| {
             let row = |x: &[f64]| arrays::array2(py, x.to_vec(), x.len());
-            judge.call1(py, (row(obs)?, row(action)?, row(next_obs)?))?.extract::<(Option<f64>, bool)>(py)
+            scorer.call1(py, (row(obs)?, row(action)?, row(next_obs)?))?.extract::<(Option<f64>, bool)>(py)
         });
         match asked {
             Ok((reward, ends)) => {
@@ -79,7 +79,7 @@ fn experience(
             }
         }
     });
-    Ok((Experience::Judged(judge), raised))
+    Ok((Experience::Scored(scorer), raised))
 }
 
 #[pymethods]
@@ -87,7 +87,7 @@ impl Training {
     /// `settings`: overrides of the task file, `key=value`, after those of `preset`. `out`: run folder to write, as `nearl train` does.
     /// `ranks`: those of a training on several hosts.
     #[new]
-    #[pyo3(signature = (task, algo, seed, threads, settings, out, preset=None, judge=None, rewards=false, ranks=None))]
+    #[pyo3(signature = (task, algo, seed, threads, settings, out, preset=None, scorer=None, rewards=false, ranks=None))]
     fn new(
         py: Python<'_>,
         task: &str,
@@ -97,13 +97,13 @@ impl Training {
         settings: Vec<String>,
         out: Option<PathBuf>,
         preset: Option<String>,
-        judge: Option<Py<PyAny>>,
+        scorer: Option<Py<PyAny>>,
         rewards: bool,
         ranks: Option<Py<PyAny>>,
     ) -> PyResult<Training> {
         let ranks = ranks::read(py, ranks)?;
         py.detach(|| {
-            let (experience, raised) = experience(judge, rewards, ranks.as_ref())?;
+            let (experience, raised) = experience(scorer, rewards, ranks.as_ref())?;
             let preset = preset
                 .map(|name| name.parse::<Preset>())
                 .transpose()
@@ -128,18 +128,18 @@ impl Training {
 
     /// The training of a run folder where it stopped, to go on in it. Of several ranks, the first alone reads and writes the folder.
     #[staticmethod]
-    #[pyo3(signature = (path, threads, judge=None, rewards=false, ranks=None))]
+    #[pyo3(signature = (path, threads, scorer=None, rewards=false, ranks=None))]
     fn resume(
         py: Python<'_>,
         path: PathBuf,
         threads: usize,
-        judge: Option<Py<PyAny>>,
+        scorer: Option<Py<PyAny>>,
         rewards: bool,
         ranks: Option<Py<PyAny>>,
     ) -> PyResult<Training> {
         let ranks = ranks::read(py, ranks)?;
         py.detach(|| {
-            let (experience, raised) = experience(judge, rewards, ranks.as_ref())?;
+            let (experience, raised) = experience(scorer, rewards, ranks.as_ref())?;
             let file = checkpoint::path_in(&path);
             let load = || Checkpoint::load(&file).map_err(|e| errors::train(e.into()));
             let (from, out) = match &ranks {

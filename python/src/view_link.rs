@@ -1,4 +1,4 @@
-//! One who looks on at a running loop (see `nearl.view`).
+//! The viewer of a running loop (see `nearl.view`).
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};

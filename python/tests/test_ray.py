@@ -48,3 +48,14 @@ def test_rollouts_are_the_same_whoever_plays_them(tmp_path: Path) -> None:
     one, two = (np.load(file) for file in files)
     assert set(one.files) == {"observations", "actions", "rewards", "lengths"}
     assert all((one[name] == two[name]).all() for name in one.files) and one["rewards"].shape == (one["lengths"].sum(),)
+
+
+def test_two_workers_of_ray_train_learn_the_weights_of_one_process(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="ray_train.py needs torch: pip install 'ray[train]' torch")
+    run(
+        "ray_train.py", "Hopper-v5", "--workers", 2, "--steps", 2048, "--n-envs", 8, "--n-steps", 64, "--batch-size", 512,
+        "--out", tmp_path / "two",
+    )  # fmt: skip
+    nearl.PID2("Hopper-v5", "pid2-ib", threads=1, settings=SMALL, run=tmp_path / "one").learn(2048)
+    one, two = (tmp_path / name / "checkpoints" / "final.safetensors" for name in ("one", "two"))
+    assert one.read_bytes() == two.read_bytes()

@@ -15,7 +15,7 @@ from conftest import ROOT
 
 import nearl
 from nearl import curves, report
-from nearl.report import rows
+from nearl.report import flight, rows
 from nearl.report.read import ReadError, read_log, read_run
 
 
@@ -78,6 +78,15 @@ def test_the_first_screen_is_the_promise_in_three_numbers(inputs, tmp_path) -> N
     (e,) = [e for e in (told if isinstance(told, list) else told["evaluations"]) if e["mode"] == "projected"][:1]
     share = {kind: f"{100 * e[f'{kind}_violations'] / e['ticks']:.2f} %" for kind in ("raw", "target", "reached")}
     assert shown == [share["raw"], share["target"], share["reached"]] and first.count("data:image/png") == 1
+    assert "of raw proposals broke a limit in eval" in first, "named by its file"
+
+
+@pytest.mark.parametrize("dt, ticks", [(1e-3, 600), (8e-3, 250), (0.05, 60)])
+def test_the_picture_of_a_flight_is_short_enough_to_read(dt: float, ticks: int, tmp_path) -> None:
+    """Two seconds, where these are neither too few ticks nor too many."""
+    log = read_log(synthetic.flight_log(tmp_path / "long.mcap", 1000, {"dt": str(dt)}))
+    window = flight._window(log)
+    assert log.dt == dt and window.stop - window.start == ticks
 
 
 def test_settings_of_a_loop_are_a_table_and_no_raw_json(tmp_path) -> None:

@@ -233,7 +233,7 @@ def driver(address: str, *words: str, **more) -> subprocess.Popen:
     return subprocess.Popen([DRIVER, address, *words], stdout=subprocess.PIPE, text=True, **more)
 
 
-class Judge:
+class Meter:
     """States against the limits, by numbers of the robot's URDF."""
 
     def __init__(self, urdf: str):
@@ -256,8 +256,8 @@ def attacked(kind: str, known: bool, ticks: int, folder: Path) -> dict:
     """A row of the first table."""
     arm = Arm()
     urdf = within_stops(driver(arm.address, "model").communicate()[0])
-    judge, robot = Judge(urdf), arm_file(urdf, folder, known)
-    file, name = snapshot(kind, robot, judge.speed, folder), f"franka{os.getpid()}"
+    meter, robot = Meter(urdf), arm_file(urdf, folder, known)
+    file, name = snapshot(kind, robot, meter.speed, folder), f"franka{os.getpid()}"
     proposer = subprocess.Popen([sys.executable, "-c", ATTACK, name]) if kind == "states" else None
     begin = len(arm.states)
     with driver(arm.address, "drive", name, "--simulated", "--braking", str(ACCELERATION)) as process:
@@ -270,7 +270,7 @@ def attacked(kind: str, known: bool, ticks: int, folder: Path) -> dict:
     if proposer:
         proposer.kill(), proposer.wait()
     arm.stop()
-    found, c = judge(arm.states[begin:]), report["counters"]
+    found, c = meter(arm.states[begin:]), report["counters"]
     print(report["modes"], said, found, arm.late, file=sys.stderr)
     cells = (
         "states of a process" if proposer else "torques of a network",
@@ -294,8 +294,8 @@ def killed(who: str, folder: Path, after: float) -> dict:
     """A row of the second table: `who` is killed in the midst of a wild motion."""
     arm = Arm()
     urdf = within_stops(driver(arm.address, "model").communicate()[0])
-    judge = Judge(urdf)
-    file, name = snapshot("torques", arm_file(urdf, folder, True), judge.speed, folder), f"franka{os.getpid()}"
+    meter = Meter(urdf)
+    file, name = snapshot("torques", arm_file(urdf, folder, True), meter.speed, folder), f"franka{os.getpid()}"
     process = driver(arm.address, "drive", name, "--simulated", "--braking", str(ACCELERATION))
     loop = subprocess.Popen([sys.executable, "-m", "nearl", "run", str(file), "--plant", name], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     begin = len(arm.states)
@@ -310,7 +310,7 @@ def killed(who: str, folder: Path, after: float) -> dict:
     for each in (loop, process):
         each.kill(), each.wait()
     arm.stop()
-    found, end = judge(arm.states[begin:]), np.array(arm.states[at:])
+    found, end = meter(arm.states[begin:]), np.array(arm.states[at:])
     fast = np.abs(end[:, 7:14]).max(1)
     still = int(np.flatnonzero(fast > REST)[-1]) + 1 if (fast > REST).any() else 0
     way = np.abs(end[-1, :7] - end[0, :7]).max()

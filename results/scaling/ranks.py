@@ -1,19 +1,23 @@
-"""What ranks say to each other: one training of pid2-ib, batch 16384, minibatch 2048, by one process and by two of torch.distributed (gloo).
+"""What ranks say to each other: one training of pid2-ib, batch 16384, minibatch 2048, by one process, and by two and four of torch.distributed (gloo).
 
     pip install torch
     python results/scaling/ranks.py --iterations 6 > results/scaling/ranks.md          # quiet machine
 
 Bytes are counted where they are handed over. Processor seconds of handing over are those of the thread that does it; seconds on the clock
-also hold the wait for the other rank, and tell of the machine where others use it too.
+also hold the wait for the other ranks, and tell of the machine where others use it too. More ranks than cores wait for each other in any
+case. All ranks of all sizes must end with the same weights, or there is no table.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import socket
 import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 SETTINGS = {"train.n_envs": 64, "train.n_steps": 256, "train.ppo.batch_size": 2048}
 
@@ -47,8 +51,11 @@ def rank(iterations: int) -> None:
         seen.append([*own, time.perf_counter(), time.process_time()])
 
     agent.learn((iterations + 2) * 16384, callback=look)
+    with tempfile.TemporaryDirectory() as folder:
+        agent.save(f"{folder}/weights.safetensors")
+        weights = hashlib.sha256(Path(folder, "weights.safetensors").read_bytes()).hexdigest()
     each = [(last - first) / iterations for first, last in zip(seen[1], seen[-1])]
-    print(json.dumps(dict(zip(("calls", "sent", "wall", "busy", "seconds", "processor"), each))))
+    print(json.dumps({"weights": weights, **dict(zip(("calls", "sent", "wall", "busy", "seconds", "processor"), each))}))
 
 
 def start(size: int, iterations: int) -> list[dict]:
@@ -72,8 +79,12 @@ def main() -> None:
     print(f"Means of {given.iterations} iterations after the first two; a thread a rank. Load of the machine: {os.getloadavg()[0]:.1f}.\n")
     print("| ranks | exchanges | sent by a rank [MB] | processor seconds of a rank | of it exchanging | seconds | of it exchanging and waiting |")
     print("|---|---|---|---|---|---|---|")
-    for size in (1, 2):
+    weights = set()
+    for size in (1, 2, 4):
         told = start(size, given.iterations)
+        weights |= {one.pop("weights") for one in told}
+        if len(weights) > 1:
+            sys.exit(f"ranks.py: the weights of {size} ranks are not those of fewer")
         mean = {name: sum(one[name] for one in told) / size for name in told[0]}
         shares = f"{100 * mean['busy'] / mean['processor']:.1f} %", f"{100 * mean['wall'] / mean['seconds']:.0f} %"
         cells = [size, f"{mean['calls']:.0f}", f"{mean['sent'] / 1e6:.1f}", f"{mean['processor']:.2f}", shares[0], f"{mean['seconds']:.2f}", shares[1]]

@@ -1,4 +1,4 @@
-"""Figures of a flight log: active constraints, predicted / projected / reached state, latency."""
+"""Figures of a flight log: active constraints, proposed / projected / reached state, latency."""
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from nearl.report.read import Floats, Log
 from nearl.report.rows import active_rows, tick_proposals
-from nearl.report.style import DEADLINE, GRID, MUTED, PREDICTED, PROJECTED, REACHED, image
+from nearl.report.style import DEADLINE, GRID, MUTED, PROJECTED, PROPOSED, REACHED, image
 
 COLUMNS_AT_MOST = 900
 ROWS_AT_MOST = 28
 JOINTS_AT_MOST = 7
-WINDOW_TICKS = 600
+# A window is long enough to see a motion, and short enough to tell its curves apart.
+TICKS_AT_MOST, TICKS_AT_LEAST, WINDOW_SECONDS = 600, 60, 2.0
 
 
 def timeline(log: Log) -> tuple[str | None, str]:
@@ -62,7 +63,7 @@ def has_targets(log: Log) -> bool:
 
 
 def states(log: Log, at_most: int = JOINTS_AT_MOST) -> str | None:
-    """Predicted, projected and reached position and velocity of the joints that were moved most."""
+    """Proposed, projected and reached position and velocity of the joints that were moved most."""
     if not has_targets(log):
         return None
     chosen, window = _joints(log, at_most), _window(log)
@@ -85,20 +86,20 @@ def states(log: Log, at_most: int = JOINTS_AT_MOST) -> str | None:
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
     caption = (
-        "What the policy predicted for the end of each tick, what the projection made of it, and where the robot got to, "
+        "What the policy proposed for the end of each tick, what the projection made of it, and where the robot got to, "
         f"{time[0]:.2f} s to {time[-1]:.2f} s: the ticks in which the projection had most to do."
     )
     return image(figure, caption)
 
 
-def _three(axes: plt.Axes, time: Floats, dt: float, predicted: Floats, projected: Floats, reached: Floats) -> None:
-    """Predictions are for the end of a tick, measurements for its beginning. The proposal may leave the picture."""
-    axes.plot(time + dt, predicted, color=PREDICTED, linewidth=1.0, alpha=0.85, label="predicted")
+def _three(axes: plt.Axes, time: Floats, dt: float, proposed: Floats, projected: Floats, reached: Floats) -> None:
+    """Proposals are for the end of a tick, measurements for its beginning. The proposal may leave the picture."""
+    axes.plot(time + dt, proposed, color=PROPOSED, linewidth=1.0, alpha=0.85, label="proposed")
     axes.plot(time + dt, projected, color=PROJECTED, linewidth=2.6, alpha=0.55, label="projected")
     axes.plot(time, reached, color=REACHED, linewidth=1.0, linestyle=(0, (3, 1.5)), label="reached")
     kept = np.concatenate([projected, reached])
     low, high = np.nanmin(kept), np.nanmax(kept)
-    wide_low, wide_high = np.nanpercentile(predicted, [1, 99])
+    wide_low, wide_high = np.nanpercentile(proposed, [1, 99])
     room = max(high - low, 0.3 * max(abs(low), abs(high)), 1e-3)
     axes.set_ylim(max(min(low, wide_low), low - room) - 0.08 * room, min(max(high, wide_high), high + room) + 0.08 * room)
     axes.margins(x=0)
@@ -122,16 +123,17 @@ def _joints(log: Log, at_most: int) -> NDArray[np.intp]:
 def _window(log: Log) -> slice:
     """The ticks with most to do, inside one episode where one is long enough."""
     total = _moved(log).sum(axis=1)
-    if len(total) <= WINDOW_TICKS:
+    length = min(TICKS_AT_MOST, max(TICKS_AT_LEAST, round(WINDOW_SECONDS / log.dt)))
+    if len(total) <= length:
         return slice(0, len(total))
     sums = np.concatenate([[0.0], np.cumsum(total)])
-    inside = sums[WINDOW_TICKS:] - sums[:-WINDOW_TICKS]
+    inside = sums[length:] - sums[:-length]
     episode = log.columns["episode"]
-    whole = episode[: len(inside)] == episode[WINDOW_TICKS - 1 :]
+    whole = episode[: len(inside)] == episode[length - 1 :]
     if whole.any():
         inside = np.where(whole, inside, -1.0)
     start = int(np.argmax(inside))
-    return slice(start, start + WINDOW_TICKS)
+    return slice(start, start + length)
 
 
 def ledger(log: Log) -> str:

@@ -6,13 +6,12 @@ from nearl.report.flight import percentiles
 from nearl.report.read import Log, Run, Summary
 
 Card = tuple[str, str, bool]
+Shares = tuple[dict[str, float], str]
 
 
 def promise(trained: list[Run], programs: list[Summary], flights: list[Log]) -> list[Card]:
     """At most three of: proposals outside, targets outside, reached states outside, time of a tick; ``(number, words, is good)``."""
-    shares, of = _of_evaluations(programs) or _of_flights(flights), ""
-    if not shares:
-        shares, of = _of_trainings(trained)
+    shares, of = next((found for found in (_of_evaluations(programs), _of_flights(flights), _of_trainings(trained)) if found[0]), ({}, ""))
     cards = [
         (f"{100 * shares[kind]:.2f} %", words, kind != "raw" and shares[kind] == 0)
         for kind, words in (
@@ -28,24 +27,24 @@ def promise(trained: list[Run], programs: list[Summary], flights: list[Log]) -> 
     return [*cards, (f"{times[0]:.0f} µs", f"99 of 100 ticks were computed within, of {times[1]}", True)]
 
 
-def _of_evaluations(programs: list[Summary]) -> dict[str, float]:
-    """The first evaluation with the projection on."""
-    for _, e in (found for p in programs for found in p.evaluations):
+def _of_evaluations(programs: list[Summary]) -> Shares:
+    """The first evaluation with the projection on, and words for what it is of."""
+    for name, e in (found for p in programs for found in p.evaluations):
         if e["mode"] == "projected" and e.get("ticks"):
             kinds = ("raw", "target", "reached")
-            return {kind: e[f"{kind}_violations"] / e["ticks"] for kind in kinds if e.get(f"{kind}_violations") is not None}
-    return {}
+            return {kind: e[f"{kind}_violations"] / e["ticks"] for kind in kinds if e.get(f"{kind}_violations") is not None}, f" in {name}"
+    return {}, ""
 
 
-def _of_flights(flights: list[Log]) -> dict[str, float]:
+def _of_flights(flights: list[Log]) -> Shares:
     for log in flights:
         acted = np.isfinite(log.target_v).all(axis=1) if log.target_v.size else np.zeros(len(log), bool)
         if acted.any():
-            return {kind: float(np.mean(log.columns[f"{kind}_violations"][acted] > 0)) for kind in ("raw", "target")}
-    return {}
+            return {kind: float(np.mean(log.columns[f"{kind}_violations"][acted] > 0)) for kind in ("raw", "target")}, f" in {log.path.name}"
+    return {}, ""
 
 
-def _of_trainings(trained: list[Run]) -> tuple[dict[str, float], str]:
+def _of_trainings(trained: list[Run]) -> Shares:
     """Means of the last rows of all trainings that project, and words for how many they are."""
     columns = [{kind: run.column(f"constraints/{kind}_violations") for kind in ("raw", "target", "reached")} for run in trained]
     projecting = [found for found in columns if found["raw"] is not None]

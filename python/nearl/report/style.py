@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 # Okabe and Ito's palette: told apart by colour-blind readers and on paper.
-PREDICTED, PROJECTED, REACHED = "#D55E00", "#0072B2", "#1a1a1a"
+PROPOSED, PROJECTED, REACHED = "#D55E00", "#0072B2", "#1a1a1a"
 CURVES = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000"]
 MUTED, GRID, DEADLINE = "#667085", "#e4e7ec", "#B42318"
 

@@ -8,7 +8,7 @@ from matplotlib.ticker import NullFormatter
 
 from nearl import curves
 from nearl.report.read import Run
-from nearl.report.style import CURVES, DEADLINE, MUTED, PREDICTED, PROJECTED, image, steps_axis
+from nearl.report.style import CURVES, DEADLINE, MUTED, PROJECTED, PROPOSED, image, steps_axis
 
 Groups = dict[str, dict[str, list[Run]]]
 
@@ -91,7 +91,7 @@ def idm_loss(runs: list[Run]) -> list[str]:
 def violations(runs: list[Run]) -> list[str]:
     """Share of control ticks in which a constraint was broken: as proposed, as projected, as reached."""
     rows = (
-        ("constraints/raw_violations", "raw proposals", PREDICTED),
+        ("constraints/raw_violations", "raw proposals", PROPOSED),
         ("constraints/reached_violations", "reached states", MUTED),
         ("constraints/target_violations", "projected targets", PROJECTED),
     )
