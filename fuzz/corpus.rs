@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use nearl_runtime::constraints::limit::REGISTRY;
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 use nearl_trainer::rollout_protocol::{Constraints, ReplyMessage, Request, Training};
@@ -57,17 +58,45 @@ fn corpus_is_of_the_present_format() {
     nearl_runtime::log::replay(&folder().join("log/flight.mcap")).expect("a log of the present schema");
 }
 
+/// Where the limits of a task file begin.
+const SECTION: &str = "[constraints]\n";
+
+/// The arm's task with the example of every kind of limit that it does not have.
+fn all_limits() -> String {
+    let stated = constraints_of(TASK.as_bytes());
+    let more = REGISTRY.iter().filter(|kind| !stated.contains_key(kind.name)).map(|kind| kind.about.example);
+    TASK.replace(SECTION, &format!("{SECTION}{}\n", more.collect::<Vec<_>>().join("\n")))
+}
+
+fn constraints_of(file: &[u8]) -> toml::Table {
+    let text = std::str::from_utf8(file).expect("UTF-8");
+    let mut task: toml::Table = text.parse().unwrap_or_else(|e| panic!("{text}: {e}"));
+    task.remove("constraints").and_then(|section| section.try_into().ok()).unwrap_or_default()
+}
+
+/// No kind of limit is left out of what is damaged.
+#[test]
+fn corpus_has_every_kind_of_limit() {
+    let file = std::fs::read(folder().join("task/all-limits.toml")).expect("a task of the corpus");
+    let stated = constraints_of(&file);
+    for kind in REGISTRY {
+        let name = kind.name;
+        assert!(
+            stated.contains_key(name),
+            "all-limits.toml lacks '{name}': write the corpus anew, see fuzz/README.md"
+        );
+    }
+}
+
 fn write_all() {
     write("snapshot", "deterministic", &snapshot(1, |_| {}).to_bytes());
     write("snapshot", "stochastic", &stochastic(2).to_bytes());
     let learned = nearl_tests::training("Hopper-v5", "pid2-ib", 3, 1, &[]).snapshot().clone();
     write("snapshot", "learned-inverse", &learned.to_bytes());
-    let rows = "rows = [{ name = \"sum\", terms = { \"q.panda_joint1\" = 1.0, \"v.panda_joint2\" = -0.5 }, \
-                lower = -1.0, upper = 1.0, braking = 2.0, soft = { linear = 1.0, quadratic = 10.0 } }]";
-    let more = "jerk = { limit = 500.0 }\ntorque_rate = { limit = 1000.0 }\nenergy = { limit = 2.0 }\nlocked = [\"panda_joint7\"]\nvelocity_profile = \"fr3\"";
-    let text =
-        TASK.replace("torque = { scale = 0.95 }", &format!("{rows}\n{more}\ntorque = {{ scale = 0.95 }}"));
-    write("task", "all-limits.toml", text.as_bytes());
+    let soft =
+        "frame_speed = [{ frame = \"panda_hand\", limit = 0.25, soft = { linear = 1.0, quadratic = 10.0 } }]";
+    write("task", "soft.toml", TASK.replace(SECTION, &format!("{SECTION}{soft}\n")).as_bytes());
+    write("task", "all-limits.toml", all_limits().as_bytes());
     let kind = |kind| Fault { tick: 100, count: 3, kind };
     let faults = vec![
         kind(FaultKind::State { number: Odd::Nan }),

@@ -1,5 +1,7 @@
 //! Everything that comes from outside, damaged: snapshots, task files, fault plans, messages, flight logs.
 //!
+//! A program of its own: a case that hangs ends the process, and the allocator counts the bytes that each thread holds.
+//!
 //! Each target takes a file of its folder in `corpus/`, damages it as the seed says, and reads it. A refusal must be one
 //! sentence; a panic, a hang, or memory beyond a bound fails and leaves the input in the temporary folder.
 //!

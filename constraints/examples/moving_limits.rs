@@ -1,4 +1,5 @@
-//! Limits that move, under attack: ticks outside of what is declared of the way, and the time it takes beside the shortest there is.
+//! Limits that move, under attack: counts the ticks that break the declared way to the new limits, and sets the time of that way beside the shortest
+//! possible.
 //!
 //! `cargo run --release -p nearl-constraints --example moving_limits > table.csv`, see `results/moving_limits`.
 

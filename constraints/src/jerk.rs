@@ -9,16 +9,16 @@
 //!     a'   = c(v) clamped to [a - D, a + D]
 //! ```
 //!
-//! it comes to rest in whole periods, at zero acceleration, and does not overshoot standstill where the start does not force it to. The
-//! set of states from which this very motion stays inside the limits is invariant: braking is always allowed. And the next
-//! accelerations that lead into the set are an interval, because the brake keeps order: of two joints with `v1 <= v2` and `a1 <= a2` the
-//! first never gets ahead. (`c` falls and `v + T c(v)` rises, so where the first has the larger acceleration it is at or below the curve `c`
-//! and the second at or above, and both stay there.) So the highest position and velocity on the way rise with the next acceleration, and
-//! each end of the interval is one number, found by a search whose result has been looked at.
+//! it comes to rest in whole periods, at zero acceleration, and does not overshoot standstill where the start does not force it to. The set of states
+//! from which this very motion stays inside the limits is invariant: braking is always allowed. And the next accelerations that lead into the set are
+//! an interval, because the brake keeps order: of two joints with `v1 <= v2` and `a1 <= a2` the first never gets ahead. (`c` falls and `v + T c(v)`
+//! rises, so where the first has the larger acceleration it is at or below the curve `c` and the second at or above, and both stay there.) So the
+//! highest position and velocity on the way rise with the next acceleration, and each end of the interval is one number, found by a search; its
+//! result is checked before it is used.
 //!
-//! The set is that of braking trajectories in Kiemel and Kröger, "Learning robot trajectories subject to kinematic joint
-//! constraints" (ICRA 2021), in whole control periods and for any number of physics steps in one. It ends at rest: a joint that would stop
-//! in front of its limit only to be thrown back is not let in.
+//! The set is that of braking trajectories in Kiemel and Kröger, "Learning robot trajectories subject to kinematic joint constraints" (ICRA 2021), in
+//! whole control periods and for any number of physics steps in one. It ends at rest: it leaves out states from which a joint stops in front of its
+//! limit but is then thrown back, because its acceleration cannot fall to zero in time.
 
 use crate::viability::{Dof, Interval, Kind, Period};
 

@@ -41,7 +41,7 @@ pub struct RunCommand {
     #[arg(long, value_parser = seconds)]
     pub age_limit: Option<f64>,
     /// So long without a state, and the plant is gone: the run ends with exit code 3 [s].
-    #[arg(long, value_parser = seconds, default_value_t = 5.0)]
+    #[arg(long, value_parser = seconds, default_value_t = RunSettings::default().plant_patience)]
     pub plant_patience: f64,
     /// So long without a new snapshot, and health and report say that the trainer is silent [s]; the loop goes on. Never if not given.
     #[arg(long, value_parser = seconds)]
@@ -59,10 +59,10 @@ pub struct RunCommand {
     #[arg(long, conflicts_with = "explore")]
     pub proposer: bool,
     /// Age at which a proposal of that process is only held, counted from the state it answers [s].
-    #[arg(long, value_parser = seconds, default_value_t = 0.1)]
+    #[arg(long, value_parser = seconds, default_value_t = ProposerSettings::default().age_limit as f64 / 1e9)]
     pub proposal_age: f64,
     /// So long is its last proposal held before the loop brakes [s].
-    #[arg(long, value_parser = seconds, default_value_t = 0.1)]
+    #[arg(long, value_parser = seconds, default_value_t = ProposerSettings::default().hold as f64 / 1e9)]
     pub proposal_hold: f64,
     /// The limits of this loop, in place of its first snapshot's: a task file, or any TOML file with a section [constraints]. No
     /// snapshot may loosen them, the first included.

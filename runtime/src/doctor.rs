@@ -11,6 +11,7 @@ use serde::Serialize;
 use crate::cli::{Failure, say};
 use crate::codes::CheckCode;
 use crate::controller::{Controller, Parts};
+use crate::gains;
 use crate::holding;
 use crate::link::{
     Remains, RobotMessage, RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, home_of_user,
@@ -110,7 +111,7 @@ pub fn examine(file: &Path, plant: Option<&str>) -> Vec<Check> {
 pub fn advice(manifest: &Manifest) -> Result<Vec<String>, SnapshotError> {
     let parts = Parts::new(manifest)?;
     let notes = notes(&parts.model, &parts.projector);
-    let checks = [notes, holding(manifest, &parts), braking(manifest, parts)];
+    let checks = [notes, holding(manifest, &parts), gains(manifest, &parts), braking(manifest, parts)];
     let odd = checks.into_iter().filter(|check| check.finding != Finding::Ok);
     Ok(odd.map(|check| format!("{} [{}]", check.text, check.code)).collect())
 }
@@ -155,6 +156,7 @@ fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
                 notes(&parts.model, &parts.projector),
                 projection(m),
                 holding(m, &parts),
+                gains(m, &parts),
                 braking(m, parts),
             ]);
         }
@@ -219,6 +221,55 @@ fn holding(m: &Manifest, parts: &Parts) -> Check {
             ),
         ),
     }
+}
+
+/// Share of a drive's gains that is hardly known better.
+const KNOWN: f64 = 0.2;
+
+/// How well must the gains of the joints' drives be known?
+fn gains(m: &Manifest, parts: &Parts) -> Check {
+    let Parts { model, layout, projector } = parts;
+    let controllable = layout.controllable();
+    let drives = match Parts::drives(m, model, controllable) {
+        Ok(drives) => drives,
+        Err(e) => return fail(CheckCode::Gains, e.to_string()),
+    };
+    if !m.proposes() || m.bounds_drives() {
+        return ok(CheckCode::Gains, "no limit of the motion counts on the gains of a drive".into());
+    }
+    let all = gains::tolerances(model, projector.limits(), controllable, &drives);
+    let Some(least) = all.iter().min_by(|a, b| a.share.total_cmp(&b.share)) else {
+        return ok(CheckCode::Gains, "no limit of the motion counts on the gains of a drive".into());
+    };
+    let percent = |share: f64| format!("{:.0} %", 100.0 * share);
+    if least.share >= KNOWN {
+        let text = format!(
+            "the gains of the drives may be off by {}, at joint '{}'",
+            percent(least.share),
+            least.joint
+        );
+        return ok(CheckCode::Gains, text);
+    }
+    let close: Vec<String> = all
+        .iter()
+        .filter(|t| t.share < KNOWN)
+        .map(|t| {
+            let gains::Tolerance { joint, share, damping, velocity, deceleration, inertia } = t;
+            format!(
+                "joint '{joint}' to {} (damping {damping} N m s/rad or N s/m, {velocity:.3} rad/s or m/s, {deceleration} rad/s² or m/s², \
+                 inertia {inertia:.3} kg m² or kg)",
+                percent(*share)
+            )
+        })
+        .collect();
+    warn(
+        CheckCode::Gains,
+        format!(
+            "the limits count on the gains of the drives: {}; where damping is less than stated by that much, or stiffness more, a joint at its \
+             speed limit cannot be braked",
+            close.join("; ")
+        ),
+    )
 }
 
 /// Can the motors give the decelerations that the position limits count on?

@@ -50,11 +50,7 @@ pub fn heaviest(model: &Model, limits: &LimitSet, controllable: &[usize], period
         .collect();
     let mut q = model.neutral();
     for start in 0..STARTS {
-        for (k, &(idx_q, low, high)) in ranges.iter().enumerate() {
-            // Additive recurrence (Roberts 2018), spread a little beyond the ends and cut back: the ends are where arms are heaviest.
-            let share = 1.2 * ((start + 1) as f64 * (1.0 / (k as f64 + 1.618)).fract()).fract() - 0.1;
-            q[idx_q] = low + share.clamp(0.0, 1.0) * (high - low);
-        }
+        spread(start, &ranges, &mut q);
         search.forces(&q);
         for load in &mut loads {
             search.take(load, &q);
@@ -64,8 +60,17 @@ pub fn heaviest(model: &Model, limits: &LimitSet, controllable: &[usize], period
     loads
 }
 
+/// The configuration `start` of a sequence that fills the ranges.
+pub(crate) fn spread(start: usize, ranges: &[(usize, f64, f64)], q: &mut [f64]) {
+    for (k, &(idx_q, low, high)) in ranges.iter().enumerate() {
+        // Additive recurrence (Roberts 2018), spread a little beyond the ends and cut back: the ends are where arms are heaviest.
+        let share = 1.2 * ((start + 1) as f64 * (1.0 / (k as f64 + 1.618)).fract()).fract() - 0.1;
+        q[idx_q] = low + share.clamp(0.0, 1.0) * (high - low);
+    }
+}
+
 /// Configuration index and range of each controllable joint of one degree of freedom.
-fn ranges(model: &Model, limits: &LimitSet, controllable: &[usize]) -> Vec<(usize, f64, f64)> {
+pub(crate) fn ranges(model: &Model, limits: &LimitSet, controllable: &[usize]) -> Vec<(usize, f64, f64)> {
     let or = |x: f64, otherwise: f64| if x.is_finite() { x } else { otherwise };
     let joints = model.joints().iter().filter(|j| j.nq == 1 && j.nv == 1 && controllable.contains(&j.idx_v));
     joints

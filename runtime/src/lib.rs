@@ -11,6 +11,7 @@ pub mod clock;
 pub mod codes;
 #[cfg(feature = "cli")]
 pub mod doctor;
+pub mod gains;
 mod grid;
 pub mod holding;
 pub mod link;

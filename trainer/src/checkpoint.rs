@@ -34,8 +34,8 @@ pub struct Header {
     /// One entry an environment.
     pub workers: Vec<WorkerHeader>,
     /// Reward or end of a control period were somebody else's code: without it the training cannot go on.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub judged: bool,
+    #[serde(default, alias = "judged", skip_serializing_if = "std::ops::Not::not")]
+    pub is_scored_elsewhere: bool,
 }
 
 /// Whole numbers of one environment.

@@ -1,6 +1,6 @@
-//! Episodes without noise, raw and projected, and what they were worth.
+//! Runs episodes without noise, raw and projected, and reports their returns and violations.
 
-use crate::rollout::{Judge, RolloutError, Worker, make_env, stream};
+use crate::rollout::{RolloutError, Scorer, Worker, make_env, stream};
 use nearl_runtime::constraints::{ConstraintSettings, LimitSet, Model, PerJoint, build_limits};
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use serde::Serialize;
@@ -96,17 +96,17 @@ pub fn evaluate(
     evaluate_by(None, snapshot, episodes, seed, projection)
 }
 
-/// The same with rewards and ends of somebody else's, where there is a judge.
+/// The same with rewards and ends of somebody else's, where there is a scorer.
 pub(crate) fn evaluate_by(
-    judge: Option<Judge>,
+    scorer: Option<Scorer>,
     snapshot: &Snapshot,
     episodes: usize,
     seed: u64,
     projection: bool,
 ) -> Result<Evaluation, RolloutError> {
     let mut worker = Worker::new(make_env(snapshot)?, snapshot, 1.0, stream(seed, 0))?;
-    if let Some(judge) = judge {
-        worker.set_judge(judge);
+    if let Some(scorer) = scorer {
+        worker.set_scorer(scorer);
     }
     worker.set_projection(projection);
     let (model, layout) = (worker.controller.model(), worker.controller.layout());

@@ -47,7 +47,7 @@ pub use gae::{Advantages, advantages};
 pub use gaifo::Gaifo;
 pub use gaussian::MOST_OUTPUTS;
 pub use imitation::{Base, Imitating, Imitator, Method, Seen};
-pub use inverse::Reading;
+pub use inverse::ThresholdPer;
 pub use nearl::{Nearl, NearlSettings};
 pub use net::{Net, Tape};
 pub use nets::NetSettings;

@@ -12,6 +12,7 @@ mod perturb;
 mod scene;
 mod sim;
 mod sizes;
+mod terrain;
 
 use std::path::Path;
 use std::sync::Arc;

@@ -4,14 +4,14 @@
 //! same bits whatever the number of threads.
 
 mod carried;
-mod judge;
 mod resume;
 mod rows;
+mod scorer;
 mod segment;
 mod worker;
 
-pub use judge::Judge;
 pub use rows::{Period, Rows};
+pub use scorer::Scorer;
 pub use segment::{Collected, Segment, Tally};
 pub use worker::Worker;
 

@@ -3,7 +3,7 @@
 //! ```toml
 //! [scene]
 //! timestep = 0.005                                                    # s, the physics step; the file's own when absent
-//! floor = { friction = 0.8 }                                          # a plane at z = 0
+//! floor = { friction = 0.8, bumps = 0.05 }                            # a plane at z = 0, and bumps of this height on it [m]
 //! feet = { bodies = ["LF_FOOT", "RF_FOOT"], radius = 0.03 }           # spheres, `position` in each body's frame [m]
 //! solids = false                                                      # the file's own solids touch nothing and weigh nothing
 //! armature = 0.05                                                     # kg m², rotors of the driven joints
@@ -50,6 +50,7 @@ impl Default for Section {
 #[serde(deny_unknown_fields)]
 struct Floor {
     friction: f64,
+    bumps: Option<f64>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -83,6 +84,7 @@ pub fn of(task: &Task, file: &Simulation) -> Result<SceneOptions, Mistake> {
     });
     let scene = Scene {
         floor: section.floor.as_ref().map(|floor| floor.friction),
+        bumps: section.floor.as_ref().and_then(|floor| floor.bumps),
         feet: feet.collect(),
         drives: drives(task, file)?,
         armature: section.armature,
@@ -104,6 +106,11 @@ fn check(section: &Section) -> Result<(), Mistake> {
             "scene.floor.friction",
             floor.as_ref().map(|f| f.friction),
             "a coefficient of friction; give a number above 0",
+        ),
+        (
+            "scene.floor.bumps",
+            floor.as_ref().and_then(|f| f.bumps),
+            "a height of bumps; give metres above 0, or leave it out",
         ),
         ("scene.feet.radius", feet.as_ref().map(|f| f.radius), "a radius; give metres above 0"),
         ("scene.armature", armature.filter(|a| *a != 0.0), "an inertia; give kg m² of at least 0"),

@@ -22,7 +22,7 @@ use crate::checkpoint::CheckpointError;
 use crate::demos::DemoError;
 use crate::evaluate::evaluate_by;
 use crate::learn::{Algorithm, Batch, Dims, Learner, Metrics, Pace, Params, Stretch, UnknownAlgorithm};
-use crate::rollout::{Collected, Judge, RolloutError, Segment, Tally, stream};
+use crate::rollout::{Collected, RolloutError, Scorer, Segment, Tally, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
@@ -108,7 +108,7 @@ pub struct Training {
     source: Box<dyn Source>,
     imitation: Option<Imitation>,
     /// What gives rewards in the task's place.
-    judge: Option<Judge>,
+    scorer: Option<Scorer>,
     /// The last batch: its memory is used again.
     batch: Batch,
     /// Return of the best networks so far without noise, and whether they are the present ones.
@@ -204,8 +204,8 @@ impl Training {
             learner,
             source,
             imitation,
-            judge: match experience {
-                Experience::Judged(judge) => Some(judge.clone()),
+            scorer: match experience {
+                Experience::Scored(scorer) => Some(scorer.clone()),
                 _ => None,
             },
             batch: Batch::default(),
@@ -380,8 +380,9 @@ impl Training {
 
     /// Mean return of episodes without noise, the same ones each time; under the limits wherever the policy proposes.
     fn evaluate(&mut self) -> Result<f64, TrainError> {
-        let (judge, episodes) = (self.judge.clone(), self.settings.eval_episodes);
-        let found = evaluate_by(judge, &self.snapshot, episodes, self.seed ^ EVALUATION, true)?.mean_return();
+        let (scorer, episodes) = (self.scorer.clone(), self.settings.eval_episodes);
+        let found =
+            evaluate_by(scorer, &self.snapshot, episodes, self.seed ^ EVALUATION, true)?.mean_return();
         self.is_best = found.is_finite() && self.best.is_none_or(|best| found > best);
         if self.is_best {
             self.best = Some(found);

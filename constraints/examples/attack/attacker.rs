@@ -1,7 +1,7 @@
-//! Proposals that ask for what hurts most.
+//! Proposals that ask, tick by tick, for the state that would exceed a limit most.
 
 use super::Random;
-use super::meter::{Gauge, Meter, Step};
+use super::meter::{Gauge, Meter, Passage};
 use nearl_constraints::*;
 
 #[derive(Clone, Copy)]
@@ -91,7 +91,7 @@ impl Attacker {
                 v_next.copy_from_slice(v);
                 v_next[i] += sign * 0.05 * gauge.model.velocity_limit()[i];
                 (0..v.len()).for_each(|j| q_next[j] = q[j] + h * v_next[j]);
-                *at = gauge.worst(&meters[1..], Step { q, v, q_next, v_next });
+                *at = gauge.worst(&meters[1..], Passage { q, v, q_next, v_next });
             }
             if at[0] != at[1] && at.iter().all(|x| x.is_finite()) {
                 self.side[i] = if at[1] > at[0] { 1.0 } else { -1.0 };

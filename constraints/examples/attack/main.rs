@@ -2,8 +2,8 @@
 //!
 //! `cargo run --release -p nearl-constraints --example attack -- ROBOT.urdf FRAME TICKS [KIND ...]`
 //!
-//! TICKS is for each line of the table. A KIND may be several, `jerk+torque`. `soft_jerk` and `torque_rate` are soft: by what they are exceeded
-//! says what they are worth.
+//! TICKS is for each line of the table. A KIND may be several, `jerk+torque`. `soft_jerk` and `torque_rate` are soft: the table says by how much they
+//! are exceeded.
 
 #![allow(unreachable_pub)]
 

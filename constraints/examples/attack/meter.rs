@@ -1,4 +1,4 @@
-//! By how much a step breaks a limit, in the words of the limit and by nothing of the projector: kinematics, inverse dynamics and arithmetic.
+//! By how much a passage breaks a limit, in the words of the limit and by nothing of the projector: kinematics, inverse dynamics and arithmetic.
 
 use nearl_constraints::*;
 
@@ -62,9 +62,9 @@ pub struct Gauge {
     tau: Vec<f64>,
 }
 
-/// A step from one state to the next.
+/// What lies between one state and the next, one control period later.
 #[derive(Clone, Copy)]
-pub struct Step<'a> {
+pub struct Passage<'a> {
     pub q: &'a [f64],
     pub v: &'a [f64],
     pub q_next: &'a [f64],
@@ -92,56 +92,58 @@ impl Gauge {
         self.known = false;
     }
 
-    /// The step was taken: it becomes the tick before.
-    pub fn take(&mut self, step: Step<'_>) {
-        self.accelerate(step);
-        self.motors(step);
+    /// The passage was taken: it becomes the tick before.
+    pub fn take(&mut self, passage: Passage<'_>) {
+        self.accelerate(passage);
+        self.motors(passage);
         self.before.0.copy_from_slice(&self.a);
         self.before.1.copy_from_slice(&self.tau);
         self.known = true;
     }
 
-    fn accelerate(&mut self, step: Step<'_>) {
-        for (a, (to, from)) in self.a.iter_mut().zip(step.v_next.iter().zip(step.v)) {
+    fn accelerate(&mut self, passage: Passage<'_>) {
+        for (a, (to, from)) in self.a.iter_mut().zip(passage.v_next.iter().zip(passage.v)) {
             *a = (to - from) / self.period.dt;
         }
     }
 
     /// The largest excess of all measures; negative inside.
-    pub fn worst(&mut self, meters: &[Meter], step: Step<'_>) -> f64 {
-        self.accelerate(step);
-        meters.iter().fold(f64::NEG_INFINITY, |worst, meter| worst.max(self.excess(meter, step)))
+    pub fn worst(&mut self, meters: &[Meter], passage: Passage<'_>) -> f64 {
+        self.accelerate(passage);
+        meters.iter().fold(f64::NEG_INFINITY, |worst, meter| worst.max(self.excess(meter, passage)))
     }
 
-    fn excess(&mut self, meter: &Meter, step: Step<'_>) -> f64 {
-        let each = |of: &dyn Fn(usize) -> f64| (0..step.v.len()).map(of).fold(f64::NEG_INFINITY, f64::max);
+    fn excess(&mut self, meter: &Meter, passage: Passage<'_>) -> f64 {
+        let each = |of: &dyn Fn(usize) -> f64| (0..passage.v.len()).map(of).fold(f64::NEG_INFINITY, f64::max);
         match meter {
-            Meter::Joints { acceleration } => each(&|i| self.joint(i, *acceleration, step)),
+            Meter::Joints { acceleration } => each(&|i| self.joint(i, *acceleration, passage)),
             Meter::Torque { share } => {
-                self.motors(step);
+                self.motors(passage);
                 each(&|i| self.tau[i].abs() / (share * self.model.effort_limit()[i]) - 1.0)
             }
             Meter::TorqueSpeed { line } => {
-                self.motors(step);
+                self.motors(passage);
                 each(&|i| {
                     let (stall, no_load) = line[i];
-                    (self.tau[i] / stall + step.v_next[i] / no_load).abs() - 1.0
+                    (self.tau[i] / stall + passage.v_next[i] / no_load).abs() - 1.0
                 })
             }
             Meter::Profile { curves } => each(&|i| {
-                let (c, q, v) = (&curves[i], step.q_next[i], step.v_next[i]);
+                let (c, q, v) = (&curves[i], passage.q_next[i], passage.v_next[i]);
                 let most = |room: f64| ((c.squared * room.max(0.0)).sqrt() - c.offset).max(0.0).min(c.limit);
                 (v - most(c.upper - q)).max(-v - most(q - c.lower))
             }),
-            Meter::Locked { joint, at } => (step.q_next[*joint] - at).abs(),
+            Meter::Locked { joint, at } => (passage.q_next[*joint] - at).abs(),
             Meter::Frame { frame, lower, upper } => {
-                let p = self.point(*frame, step).position;
+                let p = self.point(*frame, passage).position;
                 (0..3).map(|k| (p[k] - upper[k]).max(lower[k] - p[k])).fold(f64::NEG_INFINITY, f64::max)
             }
-            Meter::FrameSpeed { frame, limit } => norm(self.point(*frame, step).velocity) / limit - 1.0,
-            Meter::Energy { limit } => self.kinematics.kinetic_energy(step.q_next, step.v_next) / limit - 1.0,
+            Meter::FrameSpeed { frame, limit } => norm(self.point(*frame, passage).velocity) / limit - 1.0,
+            Meter::Energy { limit } => {
+                self.kinematics.kinetic_energy(passage.q_next, passage.v_next) / limit - 1.0
+            }
             Meter::Collision { tool, elbow, post, radius, floor } => {
-                let at = |ball: &Ball, gauge: &mut Gauge| gauge.point(ball.frame, step).position;
+                let at = |ball: &Ball, gauge: &mut Gauge| gauge.point(ball.frame, passage).position;
                 let (p, e) = (at(tool, self), at(elbow, self));
                 let apart = |x: [f64; 3]| norm([x[0] - post[0], x[1] - post[1], x[2] - post[2]]);
                 let post = (tool.radius + radius - apart(p)).max(elbow.radius + radius - apart(e));
@@ -152,23 +154,23 @@ impl Gauge {
                 each(&|i| (self.a[i] - self.before.0[i]).abs() / self.period.dt / limit - 1.0)
             }
             Meter::TorqueRate { limits } => {
-                self.motors(step);
+                self.motors(passage);
                 each(&|i| (self.tau[i] - self.before.1[i]).abs() / self.period.dt / limits[i] - 1.0)
             }
             Meter::Rows { joints: [a, b], lower, upper, most } => {
-                let sum = step.q_next[*a] + 0.7 * step.q_next[*b];
-                let speed = (step.v_next[*a] + step.v_next[*b]).abs();
+                let sum = passage.q_next[*a] + 0.7 * passage.q_next[*b];
+                let speed = (passage.v_next[*a] + passage.v_next[*b]).abs();
                 (sum - upper).max(lower - sum).max(speed / most - 1.0)
             }
         }
     }
 
     /// Of one joint: position at the end of every physics step or, without them, at the turning point; speed; acceleration.
-    fn joint(&self, i: usize, acceleration: f64, step: Step<'_>) -> f64 {
+    fn joint(&self, i: usize, acceleration: f64, passage: Passage<'_>) -> f64 {
         let (low, high) = (self.model.lower_position_limit()[i], self.model.upper_position_limit()[i]);
         let a = self.a[i];
-        let mut beyond = (step.q_next[i] - high).max(low - step.q_next[i]);
-        let (mut q, mut v) = (step.q[i], step.v[i]);
+        let mut beyond = (passage.q_next[i] - high).max(low - passage.q_next[i]);
+        let (mut q, mut v) = (passage.q[i], passage.v[i]);
         for _ in 1..self.period.sub_steps {
             v += a * self.period.tau;
             q += v * self.period.tau;
@@ -176,19 +178,19 @@ impl Gauge {
         }
         let turn = -v / a;
         if self.period.sub_steps == 0 && turn > 0.0 && turn < self.period.dt {
-            let extreme = step.q[i] + 0.5 * step.v[i] * turn;
+            let extreme = passage.q[i] + 0.5 * passage.v[i] * turn;
             beyond = beyond.max(extreme - high).max(low - extreme);
         }
-        let speed = step.v_next[i].abs() / self.model.velocity_limit()[i] - 1.0;
+        let speed = passage.v_next[i].abs() / self.model.velocity_limit()[i] - 1.0;
         beyond.max(speed).max(a.abs() / acceleration - 1.0)
     }
 
-    fn motors(&mut self, step: Step<'_>) {
-        self.dynamics.motors(&self.period, step.q, step.v, &self.a, &mut self.tau);
+    fn motors(&mut self, passage: Passage<'_>) {
+        self.dynamics.motors(&self.period, passage.q, passage.v, &self.a, &mut self.tau);
     }
 
-    fn point(&mut self, frame: FrameId, step: Step<'_>) -> PointMotion {
-        self.kinematics.update_frames(step.q_next, step.v_next, &self.a);
+    fn point(&mut self, frame: FrameId, passage: Passage<'_>) -> PointMotion {
+        self.kinematics.update_frames(passage.q_next, passage.v_next, &self.a);
         self.kinematics.point(frame, [0.0; 3])
     }
 }

@@ -1,4 +1,4 @@
-//! What the command and the tests attack with.
+//! The attacker, its meters and its scenes: the command and the tests share them.
 
 pub mod attacker;
 pub mod meter;

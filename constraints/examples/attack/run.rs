@@ -1,7 +1,7 @@
 //! One attack: a closed loop of a robot that goes where the target says.
 
 use super::attacker::Attacker;
-use super::meter::{Gauge, ROUNDING, Step};
+use super::meter::{Gauge, Passage, ROUNDING};
 use super::scene::Scene;
 use nearl_constraints::*;
 
@@ -49,9 +49,9 @@ pub fn attack(model: &Model, scene: &Scene, settings: &Settings, ticks: usize, s
         }
         let numbers = attacker.propose(&mut gauge, &scene.meters, (&q, &v), &mut raw);
         let status = projector.project(&q, &v, &raw, &mut target);
-        let step = Step { q: &q, v: &v, q_next: &target.q, v_next: &target.v };
-        let excess = gauge.worst(&scene.meters, step);
-        gauge.take(step);
+        let passage = Passage { q: &q, v: &v, q_next: &target.q, v_next: &target.v };
+        let excess = gauge.worst(&scene.meters, passage);
+        gauge.take(passage);
         if projector.needs_previous() {
             projector.remember(&target);
         }

@@ -1,4 +1,4 @@
-//! An arm that rubs by Coulomb's law under attack, its friction left out, taken for MuJoCo's, and for Coulomb's; writes a table.
+//! Attacks an arm with Coulomb friction three times and writes a table: its model states no friction, MuJoCo's friction, and Coulomb's.
 //!
 //! `cargo run --release -p nearl-constraints --example coulomb -- ROBOT.urdf TICKS`
 

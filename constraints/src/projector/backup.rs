@@ -7,12 +7,11 @@
 //!     v_k = v - k b T,   q_k = q + k T v - b T^2 (k (k - 1) / 2 + kappa k)     (k <= N_i, sign of v)
 //! ```
 //!
-//! and in the last one the rest of the speed is taken off, so that no joint turns round. A joint of hard jerk has `b_i` as its largest
-//! deceleration and brakes as in [`jerk`](crate::jerk). A brake counts when each joint stands before
-//! its position limit in these very ticks, stays below its speed profile, and every hard row and cone holds
-//! ([`Rows::breach`](crate::Rows::breach)) at the ticks looked at and, by the bound of [`Backup::between`], at those between them.
-//! By induction there is always a way to stop: either the new state has a verified brake, or the old one has, and the first tick of
-//! that brake leads to a state whose brake is the rest of it.
+//! and in the last one the rest of the speed is taken off, so that no joint turns round. A joint of hard jerk has `b_i` as its largest deceleration
+//! and brakes as in [`jerk`](crate::jerk). A brake is verified when each joint stands before its position limit in these very ticks, stays below its
+//! speed profile, and every hard row and cone holds ([`Rows::breach`](crate::Rows::breach)) at the ticks looked at and, by the bound of
+//! [`Backup::between`], at those between them. By induction there is always a way to stop: either the new state has a verified brake, or the old one
+//! has, and the first tick of that brake leads to a state whose brake is the rest of it.
 
 mod refusal;
 mod stopping;
@@ -22,7 +21,7 @@ use crate::checker::Checker;
 use crate::jerk::{Brake, Stop};
 use crate::viability::{Dof, Kind, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model};
-pub(crate) use refusal::{Refusal, Step};
+pub(crate) use refusal::{Passage, Refusal};
 use stopping::{least_deceleration, soonest};
 
 /// A breach up to this is rounding.

@@ -1,4 +1,4 @@
-//! Which way of braking a projector takes where none is asked for, and what looks odd about its limits.
+//! Chooses the way of braking where the settings ask for none, and warns of limits that look like mistakes.
 
 use super::Dofs;
 use crate::checker::Checker;

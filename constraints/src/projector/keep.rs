@@ -1,7 +1,7 @@
-//! A target is taken only when its step and a whole verified brake from it keep every hard limit.
+//! A target is taken only when its passage and a whole verified brake from it keep every hard limit.
 
 use super::Projector;
-use super::backup::{Refusal, Step, With};
+use super::backup::{Passage, Refusal, With};
 use crate::ledger::{BrakeReason, Rung, Status};
 use crate::target::{Proposal, Target};
 
@@ -91,7 +91,7 @@ impl Projector {
         status
     }
 
-    /// The step to the target breaks no hard row or cone, and a brake from it is verified, which is then stored.
+    /// The passage to the target breaks no hard row or cone, and a brake from it is verified, which is then stored.
     fn leads_to_a_brake(&mut self, q: &[f64], v: &[f64], target: &Target) -> bool {
         let with = with!(self);
         self.backup.allows(&with, (q, v), (&target.q, &target.v))
@@ -105,10 +105,11 @@ impl Projector {
         }
         self.begin_again(v);
         for _ in 0..ROUNDS {
-            let step = Step { from: (q, v), to: (&target.q, &target.v), acceleration: &target.acceleration };
-            let Some(refusal) = self.backup.refusal(&with!(self), step) else { return false };
+            let passage =
+                Passage { from: (q, v), to: (&target.q, &target.v), acceleration: &target.acceleration };
+            let Some(refusal) = self.backup.refusal(&with!(self), passage) else { return false };
             self.change(v, &target.v);
-            if !self.cut(refusal, step) || !self.take_nearer(v) {
+            if !self.cut(refusal, passage) || !self.take_nearer(v) {
                 return false;
             }
             self.write(q, v, Some(proposal), target);
@@ -140,7 +141,7 @@ impl Projector {
     }
 
     /// A row for each hard row that is broken at `refusal`; true when there is any.
-    fn cut(&mut self, refusal: Refusal, step: Step<'_>) -> bool {
+    fn cut(&mut self, refusal: Refusal, passage: Passage<'_>) -> bool {
         let with = with!(self);
         let Some(stages) = &mut self.coupled else { return false };
         let n = self.dofs.controllable.len();
@@ -148,7 +149,7 @@ impl Projector {
         let hard = self.backup.found().count().min(rows);
         for (k, &i) in self.dofs.controllable.iter().enumerate() {
             let slopes = &mut stages.slopes[k * rows..k * rows + hard];
-            if !self.backup.slopes(&with, (refusal, step), i, slopes) {
+            if !self.backup.slopes(&with, (refusal, passage), i, slopes) {
                 return false;
             }
         }

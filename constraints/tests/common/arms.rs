@@ -1,4 +1,4 @@
-//! Robots of no maker, written link by link.
+//! Invented robots, written link by link.
 
 use nearl_constraints::Model;
 use std::fmt::Write;

@@ -1,4 +1,4 @@
-//! A proposal that always asks for what hurts most, in closed loop, on robots and settings nothing was tuned for.
+//! Proposals that ask in each tick for the state that would exceed a limit most, in closed loop, on robots and settings that nothing was tuned for.
 
 use crate::common::arms::{rail_arm, small_arm};
 use crate::common::*;

@@ -1,4 +1,4 @@
-//! Without a word about braking the limits hold, and numbers nobody means are named.
+//! Limits hold where the settings say nothing of braking, and numbers that are probably mistakes are named in a warning.
 
 use crate::common::*;
 use nearl_constraints::limit::AccelerationSettings;

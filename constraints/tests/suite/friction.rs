@@ -1,4 +1,4 @@
-//! A robot that rubs by Coulomb's law, and is known to.
+//! A robot with Coulomb friction, which its model states.
 
 use crate::common::robot;
 use crate::coulomb_plant::attacked;

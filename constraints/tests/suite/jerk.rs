@@ -1,5 +1,5 @@
-//! Hard jerk of one joint: nothing is exceeded in closed loop, and the box is what it says: all that a brake of bounded jerk keeps, found by
-//! another, slower brake, and inside the largest set that any motion can keep, found by Clarabel.
+//! Hard jerk of one joint. In closed loop no limit is exceeded. The box holds all that a brake of bounded jerk can keep, which another, slower brake
+//! shows; and it lies inside the largest set that any motion can keep, which Clarabel finds.
 
 use crate::common::*;
 use clarabel::algebra::CscMatrix;

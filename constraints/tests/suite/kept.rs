@@ -1,4 +1,4 @@
-//! Every kind of limit, alone and all together, at every period and number of physics steps, kept under attack on arms nobody has built.
+//! Every kind of limit, alone and all together, at every period and number of physics steps, kept under attack on invented arms.
 
 use crate::attack_scenes::run::{Seen, attack};
 use crate::attack_scenes::scene::{KINDS, SOFT, Scene};

@@ -8,8 +8,11 @@ mod common;
 #[path = "../../examples/coulomb/plant.rs"]
 #[allow(dead_code, unreachable_pub)]
 mod coulomb_plant;
+#[path = "../common/counting.rs"]
+mod counting;
 
 mod action;
+mod allocation;
 mod attack;
 mod certify;
 mod conformance;

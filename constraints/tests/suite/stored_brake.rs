@@ -1,4 +1,4 @@
-//! The stored brake on a robot nobody can certify a braking deceleration for.
+//! The stored brake, on a robot for which no deceleration can be certified.
 
 use crate::common::*;
 use nearl_constraints::limit::AccelerationSettings;

@@ -636,6 +636,10 @@ impl Controller {
             || last.needs_previous()
             || last.stores_a_brake()
     }
+    /// Whether actions are kept within limits of their own: forces of drives, or `[constraints] action`.
+    pub fn bounds_actions(&self) -> bool {
+        self.drive_box.is_some() || self.action_limit.is_some()
+    }
     /// Number of entries that the policy sees.
     pub fn n_seen(&self) -> usize {
         self.policy.n_in()

@@ -44,11 +44,11 @@ impl VerifyCommand {
             say(format!("{file}: {}", report.to_string().trim_end()));
             say(format!("  {each:.1} us a tick"));
         }
-        judge(&file, &report)
+        conclude(&file, &report)
     }
 }
 
-fn judge(file: &str, report: &Report) -> Result<(), Failure> {
+fn conclude(file: &str, report: &Report) -> Result<(), Failure> {
     match report {
         _ if report.found > 0 => Err(format!(
             "{file}: {} of {} ticks do not hold what the log says; `nearl replay` tells a changed log from a loop that failed",

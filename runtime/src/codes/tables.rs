@@ -46,6 +46,8 @@ codes! {
             "Import the policy again with another recipe.";
         Braking = "doctor-braking", "Can the motors give the decelerations that the position limits count on?",
             "Set constraints.braking = \"stored\", or multiply constraints.acceleration.limit by the number in the sentence.";
+        Gains = "doctor-gains", "How well must the gains of the joints' drives be known?",
+            "Measure the gains, or lower the drives' damping or the speed limits, or raise constraints.acceleration.limit.";
         Memory = "doctor-memory", "Is there room for the links in /dev/shm?", "Free space there or remount it larger.";
         Links = "doctor-links", "Are there links that only dead processes hold?",
             "Start the robot again, which cleans up, or delete the files the sentence names.";

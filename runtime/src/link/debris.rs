@@ -1,4 +1,4 @@
-//! What a process left that was killed while it joined or while it was cleaned up after.
+//! Removes what a process left that was killed while it joined, or while another removed what it had left.
 //!
 //! Each node of iceoryx2 0.10 has two files: its details, which say where its other files are, and its monitor, by which others see
 //! that its process is dead. A node that is made writes the details before the monitor, and one that is removed loses the details

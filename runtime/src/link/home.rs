@@ -10,8 +10,8 @@
 //! /dev/shm/nearl.ROBOT.TOKEN.*   iceoryx2's segments, which it can keep nowhere else
 //! ```
 //!
-//! Whoever comes while nobody holds `alive` begins anew: what killed processes left, whole or half made, is removed before anything of it is
-//! opened, so that no start can hang on it. Whoever leaves last removes everything.
+//! A process that comes while nobody holds `alive` begins anew: it removes what killed processes left before it opens anything, so that no start can
+//! hang on a file that is half made. The process that leaves last removes everything.
 
 use std::fs::{DirBuilder, File, Metadata, OpenOptions, read_dir, symlink_metadata};
 use std::hash::{BuildHasher, Hasher};

@@ -1,6 +1,6 @@
 //! What happens when a file that is mapped is made shorter: reading beyond its end is a SIGBUS, which would end plant and loop in silence.
 //!
-//! Who calls [`watch`] reads zeros from there on instead, which no message is, and [`is_torn`] says that it happened: the loop and the
+//! After [`watch`] a reader gets zeros from there on instead, which are no valid message, and [`is_torn`] says that it happened: the loop and the
 //! plant's runner then brake and end with a code.
 
 use std::sync::Once;

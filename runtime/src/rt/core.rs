@@ -57,6 +57,12 @@ pub struct ProposerSettings {
     pub hold: u64,
 }
 
+impl Default for ProposerSettings {
+    fn default() -> Self {
+        ProposerSettings { age_limit: 100_000_000, hold: 100_000_000 }
+    }
+}
+
 /// What the world brought to a tick: with the history, everything it depends on.
 #[derive(Clone, Copy, Debug)]
 pub struct Inputs<'a> {
@@ -207,8 +213,10 @@ impl<T: LoopController> Core<T> {
         if record.mode.acts() {
             record.counters.raw_violations += u64::from(record.output.ledger.raw_violations);
             record.counters.target_violations += u64::from(record.output.ledger.target_violations);
-            let is_unprojected = record.output.ledger.status == LedgerStatus::NotProjected.number();
-            record.counters.unprojected += u64::from(is_unprojected);
+            let is = |status: LedgerStatus| u64::from(record.output.ledger.status == status.number());
+            let bounded = is(LedgerStatus::ActionsBounded);
+            record.counters.unprojected += is(LedgerStatus::NotProjected) + bounded;
+            record.counters.bounded_actions += bounded;
         }
         record.counters.mode_ticks[record.mode.code() as usize] += 1;
         self.note_resume();

@@ -1,4 +1,4 @@
-//! What another process proposed: whether it may be used, and how old it is.
+//! Proposals of another process: which of them may be used, and how old they are.
 
 use crate::link::{Header, Message, ProposalMessage};
 use crate::rt::tick::{LoopController, Record};

@@ -111,8 +111,7 @@ impl Pilot {
         for v in [&mut output.proposal_v, &mut output.target_v] {
             v[..nv].copy_from_slice(&state.v);
         }
-        let status = LedgerStatus::NotProjected.number();
-        output.ledger = LedgerNumbers { status, duration: out.duration_ns, ..LedgerNumbers::default() };
+        output.ledger = self.without_projection();
         if self.proposes {
             output.target_q[..nq].copy_from_slice(&out.next.q);
             output.target_v[..nv].copy_from_slice(&out.next.v);
@@ -125,6 +124,25 @@ impl Pilot {
             }
             output.ledger = numbers(&out.next.ledger);
             write_rows(&out.next.ledger, output);
+        }
+    }
+}
+
+impl Pilot {
+    /// The ledger of a tick in which nothing was projected: what was kept of the action's own limits, where it has any.
+    fn without_projection(&self) -> LedgerNumbers {
+        let (ledger, duration) = (&self.out.next.ledger, self.out.duration_ns);
+        if !self.controller.bounds_actions() {
+            let status = LedgerStatus::NotProjected.number();
+            return LedgerNumbers { status, duration, ..LedgerNumbers::default() };
+        }
+        LedgerNumbers {
+            status: LedgerStatus::ActionsBounded.number(),
+            raw_violations: ledger.raw_violations.other,
+            target_violations: ledger.violations.other,
+            moved: ledger.moved,
+            duration,
+            ..LedgerNumbers::default()
         }
     }
 }

@@ -104,9 +104,15 @@ impl RunReport {
     fn projected(&self) -> String {
         let c = &self.counters;
         let counts = format!("raw proposal {}, projected {}", c.raw_violations, c.target_violations);
+        let acted = c.mode_ticks[Mode::Active.code() as usize] + c.mode_ticks[Mode::Degraded.code() as usize];
         match c.unprojected {
             0 => counts,
-            all if all == c.mode_ticks[Mode::Active.code() as usize] + c.mode_ticks[Mode::Degraded.code() as usize] => {
+            all if all == acted && all == c.bounded_actions => format!(
+                "nothing was projected: the policy gives actions, and only their own limits or the forces of their drives were kept; limits on \
+                 actions broken: asked for {}, given {}",
+                c.raw_violations, c.target_violations
+            ),
+            all if all == acted && c.bounded_actions == 0 => {
                 "nothing was projected: the policy gives actions, and no limit was looked at but the actuators' range".into()
             }
             some => format!("{counts}; {some} ticks acted without a projection: their policy gives actions"),

@@ -207,6 +207,11 @@ impl TickOutput {
     }
 }
 
+/// Leaves a count out of logs that have nothing to say of it, so that they read as those of builds without it.
+fn is_zero(count: &u64) -> bool {
+    *count == 0
+}
+
 /// Counts of the loop since its start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Counters {
@@ -246,6 +251,9 @@ pub struct Counters {
     pub target_violations: u64,
     /// Ticks that acted on what no projection has seen: their policy gives actions and proposes no state.
     pub unprojected: u64,
+    /// Those of them whose action was kept within limits of its own, or within the forces that the drives' motors have.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub bounded_actions: u64,
     /// Proposals of another process that were taken.
     pub proposals: u64,
     /// Its proposals that a newer one overtook.

@@ -1,5 +1,5 @@
 //! Processes that die at random moments while the arm moves: `NEARL_KILLS` of each (a few by default), the moments drawn
-//! from the seed `NEARL_SEED`. `NEARL_KILLS=250 cargo test --release -p nearl-runtime --test faults fault_17 -- --nocapture`.
+//! from the seed `NEARL_SEED`. `NEARL_KILLS=250 cargo test --release -p nearl-runtime --test suite fault_17 -- --nocapture`.
 
 use std::path::Path;
 use std::process::Stdio;
@@ -8,12 +8,12 @@ use std::time::Duration;
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 
+use super::stage::*;
+use super::system::{command_of, signal, skip, until};
 use crate::arm::*;
-use crate::stage::*;
-use crate::system::{command_of, signal, skip, until};
 use crate::toy::{self, DT};
 
-use crate::ROUNDING;
+use super::ROUNDING;
 
 fn number(variable: &str, default: u64) -> u64 {
     std::env::var(variable).map_or(default, |text| text.parse().expect("a whole number"))

@@ -10,10 +10,10 @@ use nearl_runtime::rt::*;
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Manifest, PolicyKind, Snapshot};
 
-use crate::ROUNDING;
+use super::ROUNDING;
+use super::stage::{Stage, kill};
+use super::system::{command_of, until};
 use crate::arm::*;
-use crate::stage::{Stage, kill};
-use crate::system::{command_of, until};
 use crate::toy::{self, Name};
 
 /// The panda's task with a frame and its speed, so that kinds beyond the joints are there to be loosened.

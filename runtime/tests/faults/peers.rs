@@ -8,9 +8,9 @@ use iceoryx2::prelude::*;
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 
+use super::system::until;
 use crate::arm::*;
-use crate::system::until;
-use crate::toy::Name;
+use crate::toy::{Name, settings};
 
 type Ipc = ipc_threadsafe::Service;
 
@@ -18,6 +18,38 @@ type Ipc = ipc_threadsafe::Service;
 struct Rogue {
     port: Publisher<Ipc, [u8], SnapshotHeader>,
     _node: Node<Ipc>,
+}
+
+/// A loop with an arm, and one who looks on: what a peer comes to visit.
+struct Visited {
+    name: Name,
+    viewer: TrainerLink,
+    loop_and_arm: LoopAndArm,
+}
+
+struct LoopAndArm {
+    running: Running,
+    stop: Stop,
+    plant: ArmThread,
+    _file: File,
+}
+
+fn visited(test: &str, settings: RunSettings) -> Visited {
+    let (name, first, stop) = (Name::new(test), snapshot(1, |_| {}), Stop::new());
+    let file = File::new(test, &first);
+    let plant = start_with(&name, &first, FaultPlan::default(), Duration::from_micros(300));
+    let running = execute_with(&name, &file.0, &stop, settings);
+    let mut viewer = TrainerLink::open(&name.0).unwrap();
+    viewer.wait_for_runtime(Duration::from_secs(30)).unwrap();
+    Visited { name, viewer, loop_and_arm: LoopAndArm { running, stop, plant, _file: file } }
+}
+
+impl LoopAndArm {
+    fn end(self) -> (RunReport, Panda) {
+        self.stop.request();
+        let report = self.running.join().unwrap().unwrap();
+        (report, self.plant.end().0)
+    }
 }
 
 /// Where the links of a robot lie.
@@ -63,14 +95,7 @@ fn header(schema: u64, version: u64, length: u64) -> SnapshotHeader {
 
 #[test]
 fn fault_33_a_peer_with_lies_and_a_flood_is_refused_and_counted() {
-    let name = Name::new("rogue");
-    let first = snapshot(1, |_| {});
-    let file = File::new("rogue", &first);
-    let plant = start_with(&name, &first, FaultPlan::default(), Duration::from_micros(300));
-    let stop = Stop::new();
-    let running = execute(&name, &file.0, &stop);
-    let mut viewer = TrainerLink::open(&name.0).unwrap();
-    viewer.wait_for_runtime(Duration::from_secs(30)).unwrap();
+    let Visited { name, mut viewer, loop_and_arm } = visited("rogue", settings());
     let rogue = Rogue::new(&name.0);
     let refused = |viewer: &mut TrainerLink, more: u64, send: &dyn Fn()| {
         let mut before = None;
@@ -103,9 +128,7 @@ fn fault_33_a_peer_with_lies_and_a_flood_is_refused_and_counted() {
     let mut then = 0;
     until("health", || viewer.health().map(|h| then = h.tick).is_some());
     until("the loop goes on", || viewer.health().is_some_and(|h| h.tick > then + 100));
-    stop.request();
-    let report = running.join().unwrap().unwrap();
-    let (arm, _) = plant.end();
+    let (report, arm) = loop_and_arm.end();
     assert_eq!((report.counters.swaps, report.counters.stale), (0, 0), "{report}");
     assert_eq!((report.modes["degraded"], report.modes["fault"]), (0, 0), "{report}");
     let said = report.refusals.join("\n");
@@ -153,14 +176,7 @@ fn lie<M: Queued>(node: &Node<Ipc>, name: &RobotName) {
 /// A peer on every topic at once, beside those who belong there.
 #[test]
 fn fault_33_lies_on_every_topic_end_nothing_and_move_nothing() {
-    let name = Name::new("liar");
-    let first = snapshot(1, |_| {});
-    let file = File::new("liar", &first);
-    let plant = start_with(&name, &first, FaultPlan::default(), Duration::from_micros(300));
-    let stop = Stop::new();
-    let running = execute(&name, &file.0, &stop);
-    let mut viewer = TrainerLink::open(&name.0).unwrap();
-    viewer.wait_for_runtime(Duration::from_secs(30)).unwrap();
+    let Visited { name, mut viewer, loop_and_arm } = visited("liar", settings());
     let mut ticks = ViewLink::open(&name.0).unwrap();
     let node = join(&name.0);
     lie::<RobotMessage>(&node, &name.0);
@@ -191,9 +207,7 @@ fn fault_33_lies_on_every_topic_end_nothing_and_move_nothing() {
     until("the push is in use", || {
         viewer.receipt().is_some_and(|r| r.version == version && r.verdict() == Verdict::Accepted)
     });
-    stop.request();
-    let report = running.join().unwrap().unwrap();
-    let (arm, _) = plant.end();
+    let (report, arm) = loop_and_arm.end();
     assert_eq!(
         (report.modes["fault"], report.modes["degraded"], report.counters.swaps),
         (0, 0, 1),
@@ -210,15 +224,9 @@ fn fault_33_lies_on_every_topic_end_nothing_and_move_nothing() {
 #[test]
 fn fault_33_random_words_in_live_boards_end_nothing() {
     use std::os::unix::fs::FileExt;
-    let name = Name::new("scribbled");
-    let first = snapshot(1, |_| {});
-    let file = File::new("scribbled", &first);
-    let plant = start_with(&name, &first, FaultPlan::default(), Duration::from_micros(300));
-    let stop = Stop::new();
     let modes = ModeLimits { recover_after: 1, ..ModeLimits::default() };
-    let running = execute_with(&name, &file.0, &stop, RunSettings { modes, ..crate::toy::settings() });
-    let mut viewer = TrainerLink::open(&name.0).unwrap();
-    viewer.wait_for_runtime(Duration::from_secs(30)).unwrap();
+    let Visited { name, mut viewer, loop_and_arm } =
+        visited("scribbled", RunSettings { modes, ..settings() });
     let mut seed = 1_u64;
     let mut next = || {
         seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -238,9 +246,7 @@ fn fault_33_random_words_in_live_boards_end_nothing() {
     let mut then = 0;
     until("health", || viewer.health().map(|h| then = h.tick).is_some());
     until("the loop goes on", || viewer.health().is_some_and(|h| h.tick > then + 100));
-    stop.request();
-    let report = running.join().unwrap().unwrap();
-    let (arm, _) = plant.end();
+    let (report, arm) = loop_and_arm.end();
     assert!(arm.worst[2] <= 1e-9, "torque: {:?}", arm.worst);
     assert!(!report.warnings.iter().any(|w| w.contains("panic")), "{report}");
 }

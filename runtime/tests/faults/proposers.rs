@@ -1,4 +1,4 @@
-//! Another process proposes in place of the policy: what it says is within the limits once it is done, and its silence brakes.
+//! Another process proposes in place of the policy: whatever it proposes, the robot stays within its limits; when it falls silent, the robot brakes.
 
 use std::time::Duration;
 
@@ -6,11 +6,11 @@ use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 use nearl_runtime::{PolicyKind, Snapshot};
 
-use crate::ROUNDING;
+use super::ROUNDING;
+use super::flight::{Flight, plan, settings};
+use super::stage::*;
+use super::system::{signal, until};
 use crate::arm::*;
-use crate::flight::{Flight, plan, settings};
-use crate::stage::*;
-use crate::system::{signal, until};
 use crate::toy;
 
 const AGE: u64 = 30_000_000;

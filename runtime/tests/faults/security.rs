@@ -9,8 +9,8 @@ use nearl_runtime::log::replay;
 use nearl_runtime::rt::*;
 use nearl_runtime::{Snapshot, Task};
 
+use super::system::{command_of, skip, until};
 use crate::arm::*;
-use crate::system::{command_of, skip, until};
 use crate::toy::{self, Name};
 
 fn fifo(path: &Path) {

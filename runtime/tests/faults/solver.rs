@@ -1,4 +1,5 @@
-//! Faults of the projection and its solver: nothing to choose from, cut short, failed, beyond the motors, odd numbers.
+//! Faults of the projection and its solver: limits that leave no answer, a solver that is cut short or fails, states beyond what the motors can
+//! brake, odd numbers.
 
 use nearl_constraints::limit::UserRowSettings;
 use nearl_constraints::{
@@ -9,9 +10,10 @@ use nearl_runtime::controller::Parts;
 use nearl_runtime::rt::*;
 use nearl_runtime::{Manifest, Snapshot};
 
+use super::ROUNDING;
+use super::flight::{Flight, settings};
+use crate::arm;
 use crate::arm::*;
-use crate::flight::{Flight, settings};
-use crate::{ROUNDING, arm};
 
 /// Torque limits far below what holding still needs leave nothing to choose from.
 #[test]
@@ -189,7 +191,7 @@ fn fault_36_a_wrong_payload_and_a_singular_inertia_brake() {
 #[test]
 fn fault_37_denormal_numbers_change_nothing() {
     let fly = |tiny: f64, faults: &[(u64, u64, FaultKind)]| {
-        let mut flight = Flight::new(&stochastic(1), settings(), crate::flight::plan(faults));
+        let mut flight = Flight::new(&stochastic(1), settings(), super::flight::plan(faults));
         (flight.panda.q[0], flight.panda.v) = (tiny, vec![tiny; N]);
         flight.fly(600);
         flight

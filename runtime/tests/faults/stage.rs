@@ -9,9 +9,9 @@ use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 use serde_json::Value;
 
-use crate::ROUNDING;
+use super::ROUNDING;
+use super::system::{signal, until};
 use crate::arm::*;
-use crate::system::{signal, until};
 use crate::toy::{self, DT, Name};
 
 const ROLE: &str = "NEARL_KILL_ROLE";
@@ -98,7 +98,7 @@ fn child() {
                 trainer.push(version, &snapshot.to_bytes()).unwrap();
             }
         }
-        Ok("proposer") => crate::proposers::propose(&name),
+        Ok("proposer") => super::proposers::propose(&name),
         role => panic!("no such role: {role:?}"),
     }
 }
@@ -128,7 +128,7 @@ impl Stage {
 
     pub fn start(&self, role: &str) -> Child {
         let mut command = Command::new(std::env::current_exe().unwrap());
-        command.args(["--exact", "stage::child", "--ignored", "--nocapture"]);
+        command.args(["--exact", "faults::stage::child", "--ignored", "--nocapture"]);
         command.env(ROLE, role).env(NAME, self.name.0.as_str()).env(FOLDER, &self.folder.0);
         command.stdout(Stdio::null()).spawn().unwrap()
     }

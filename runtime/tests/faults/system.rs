@@ -192,7 +192,7 @@ pub fn command_of(role: &str, name: &Name) -> Command {
 
 fn command(role: &str, name: &Name) -> Command {
     let mut command = Command::new(std::env::current_exe().unwrap());
-    command.args(["--exact", "system::child", "--ignored", "--nocapture"]);
+    command.args(["--exact", "faults::system::child", "--ignored", "--nocapture"]);
     command.env(ROLE, role).env(NAME, name.0.as_str()).stdout(Stdio::null()).stderr(Stdio::null());
     command
 }

@@ -8,7 +8,7 @@ type Test = (&'static str, &'static str);
 /// Number, fault, what the runtime does, codes it gives, and the tests.
 type Row = (u32, &'static str, &'static str, &'static [&'static str], &'static [Test]);
 
-const HERE: &str = "runtime/tests/faults/main.rs";
+const HERE: &str = "runtime/tests/faults/mod.rs";
 const FILES: &str = "runtime/tests/faults/files.rs";
 const LIMITS: &str = "runtime/tests/faults/limits.rs";
 const SECURITY: &str = "runtime/tests/faults/security.rs";
@@ -416,7 +416,7 @@ fn root() -> PathBuf {
 fn page() -> String {
     let mut page = String::from(
         "# Faults\n\nWhat may go wrong, what the runtime does, and the test that shows it. `nearl explain CODE` says what to do about a code.\n\
-         Written by `NEARL_WRITE=1 cargo test --release -p nearl-runtime --test faults table`; a test fails when this page is old.\n\n\
+         Written by `NEARL_WRITE=1 cargo test --release -p nearl-runtime --test suite faults::table`; a test fails when this page is old.\n\n\
          | # | fault | the runtime |\n|---|---|---|\n",
     );
     for (number, fault, does, ..) in ROWS {

@@ -5,7 +5,7 @@ use crate::limits::{CollisionSection, Of};
 use crate::motion::{Machine, Spot};
 use crate::period::Period;
 use crate::robot::Shape;
-use crate::rows::{Step, plane};
+use crate::rows::{Passage, plane};
 use crate::space::{ONE, Place, Vec3, apply, apply_back, dot, minus, norm, product, times, turn};
 
 /// Projections in turn at most.
@@ -41,11 +41,11 @@ pub(crate) struct Collision {
     braking: f64,
 }
 
-/// What is known of the row of a pair at a step.
+/// What is known of the row of a pair at a passage.
 pub(crate) enum Told {
     /// The pair is too far apart to have one.
     None,
-    /// By how much the step is more than the row allows, as a share of its braking, and how that changes with each velocity (nv).
+    /// By how much the passage is more than the row allows, as a share of its braking, and how that changes with each velocity (nv).
     Row(f64, Vec<f64>),
     /// Why it is not known.
     Unknown(String),
@@ -191,11 +191,11 @@ impl Collision {
         }
     }
 
-    /// The row of a number at a step: where the bodies are nearest if no joint accelerates, they may close in as fast as `braking` stops.
-    pub(crate) fn row(&self, machine: &mut Machine, p: &Period, step: &Step<'_>, slot: usize) -> Told {
+    /// The row of a number at a passage: where the bodies are nearest if no joint accelerates, they may close in as fast as `braking` stops.
+    pub(crate) fn row(&self, machine: &mut Machine, p: &Period, passage: &Passage<'_>, slot: usize) -> Told {
         let mut ahead = Vec::new();
-        machine.moved(step.q, step.v, p.dt, &mut ahead);
-        machine.go(&ahead, step.v);
+        machine.moved(passage.q, passage.v, p.dt, &mut ahead);
+        machine.go(&ahead, passage.v);
         let pair = match self.pair_of(machine, slot) {
             Ok(Some(pair)) => pair,
             Ok(None) => return Told::None,
@@ -217,13 +217,13 @@ impl Collision {
         }
         let (velocity, acceleration) = apart(machine, &at);
         let speed = dot(at.normal, velocity);
-        let mut slope = vec![0.0; step.v.len()];
+        let mut slope = vec![0.0; passage.v.len()];
         for (k, sign) in [(0, 1.0), (1, -1.0)] {
             machine.add_row(&spots[k], at.points[k], at.normal, sign / p.dt, &mut slope);
         }
-        machine.go(&ahead, step.v1);
+        machine.go(&ahead, passage.v1);
         let then = dot(at.normal, apart(machine, &at).0);
-        machine.go(step.q, step.v);
+        machine.go(passage.q, passage.v);
         let Some(was) = here(machine) else { return several() };
         let before = dot(was.normal, apart(machine, &was).0);
         let most = norm(acceleration);

@@ -1,11 +1,11 @@
-//! Whether the step from a state to its target keeps every hard limit.
+//! Whether the passage from a state to its target keeps every hard limit.
 
 use crate::collision::Gap;
 use crate::jerk::Brake;
 use crate::limits::{Bounds, Limits};
 use crate::motion::{Machine, SPENT};
 use crate::period::Period;
-use crate::rows::{Step, is_beyond};
+use crate::rows::{Passage, is_beyond};
 
 /// A limit is broken above this share of it (of 1 where it is smaller), in m and rad alike.
 pub(crate) const TOLERANCE: f64 = 1e-8;
@@ -184,7 +184,7 @@ fn of(what: &str, joint: &str) -> String {
     format!("{what} of joint '{joint}'")
 }
 
-/// The limits of single joints, at a step.
+/// The limits of single joints, at a passage.
 ///
 /// # Errors
 /// The first that is broken. A joint that was outside at the start may brake or come back.
@@ -193,13 +193,13 @@ pub(crate) fn joints(
     machine: &Machine,
     dofs: &[usize],
     p: &Period,
-    step: &Step<'_>,
+    passage: &Passage<'_>,
     excused: bool,
 ) -> Result<(), Fault> {
     for &i in dofs {
         let j = &l.joints[i];
-        let (v, v1, a, unit) = (step.v[i], step.v1[i], step.a[i], j.length);
-        let position = machine.single(i).map(|at| (step.q[at], step.q1[at]));
+        let (v, v1, a, unit) = (passage.v[i], passage.v1[i], passage.a[i], j.length);
+        let position = machine.single(i).map(|at| (passage.q[at], passage.q1[at]));
         if is_above(a.abs(), j.acceleration) {
             return broken(
                 of("acceleration", &j.name),
@@ -208,7 +208,7 @@ pub(crate) fn joints(
                 format!("{unit}/s^2"),
             );
         }
-        let (was, known) = (position.map(|(q, _)| q), step.last.map(|last| last[i]));
+        let (was, known) = (position.map(|(q, _)| q), passage.last.map(|last| last[i]));
         let before = Bounds::before(v, known);
         let known_before = before.filter(|before| j.jerk.is_finite() && before.abs() <= j.acceleration);
         if let Some(jerk) =
@@ -238,7 +238,7 @@ pub(crate) fn joints(
         let Some((q, q1)) = position else { continue };
         for s in sides(j, q, v, v1) {
             let gone = s.sign * (q1 - q);
-            let most = if step.is_free { gone } else { p.farthest(s.v, (s.v1 - s.v) / p.dt).max(gone) };
+            let most = if passage.is_free { gone } else { p.farthest(s.v, (s.v1 - s.v) / p.dt).max(gone) };
             if s.room.is_finite() && is_above(most, s.room) {
                 return broken(of("position", &j.name), q + s.sign * most, s.limit, unit);
             }
@@ -295,22 +295,22 @@ fn returns(
     Ok(())
 }
 
-/// Hard rows, cones and distances: with a stored brake what they keep, else what they ask of the step.
+/// Hard rows, cones and distances: with a stored brake what they keep, else what they ask of the passage.
 ///
 /// # Errors
-/// The first that is broken. What the state at the start is beyond already, a recovering step may still be beyond.
+/// The first that is broken. What the state at the start is beyond already, a recovering passage may still be beyond.
 pub(crate) fn rows(
     l: &Limits,
     machine: &mut Machine,
     p: &Period,
-    step: &Step<'_>,
+    passage: &Passage<'_>,
     stored: bool,
     excused: bool,
 ) -> Result<(), Fault> {
     for row in l.rows.iter().filter(|row| row.soft.is_none()) {
-        let asked = |m: &mut Machine| worst(row.excess(m, p, step));
+        let asked = |m: &mut Machine| worst(row.excess(m, p, passage));
         let by = if stored {
-            row.breach(machine, p, step).unwrap_or_else(|| asked(machine))
+            row.breach(machine, p, passage).unwrap_or_else(|| asked(machine))
         } else {
             asked(machine)
         };
@@ -318,16 +318,16 @@ pub(crate) fn rows(
             return Err(Fault::Unknown(SPENT.into()));
         }
         if is_above(by, if stored { row.allowed } else { 0.0 })
-            && !(excused && row.is_of_state() && is_beyond(row, machine, step.q, step.v))
+            && !(excused && row.is_of_state() && is_beyond(row, machine, passage.q, passage.v))
         {
-            let (value, limit, unit) = row.value(machine, p, step);
+            let (value, limit, unit) = row.value(machine, p, passage);
             return broken(format!("{} of '{}'", row.kind, row.name), value, limit, unit);
         }
     }
     let Some(collision) = l.collision.as_ref().filter(|c| c.is_hard) else { return Ok(()) };
-    machine.go(step.q, step.v);
+    machine.go(passage.q, passage.v);
     let is_near = excused && !matches!(collision.gap(machine, collision.margin), Gap::Kept);
-    machine.go(step.q1, step.v1);
+    machine.go(passage.q1, passage.v1);
     match collision.gap(machine, collision.margin - TOLERANCE) {
         Gap::Near(pair, gap) if !is_near => broken(format!("distance of {pair}"), gap, collision.margin, "m"),
         Gap::Open(pair) => Err(Fault::Unknown(format!("the distance of {pair} could not be bounded"))),

@@ -11,7 +11,7 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
 use crate::report::Report;
 use crate::session::Session;
-use crate::tick::{Brief, Entry, Tick};
+use crate::tick::{Brief, Numbered, Tick};
 
 /// Bytes read at a time.
 const PORTION: usize = 1 << 20;
@@ -96,7 +96,7 @@ fn take(session: &mut Session, topics: &mut HashMap<u16, String>, part: Part<'_>
         Part::Message { header, data } => match topics.get(&header.channel_id).map(String::as_str) {
             Some("tick") => session.tick(&parse::<Tick>("tick", &data)?)?,
             Some("brief") => session.brief(parse::<Brief>("brief", &data)?.tick)?,
-            Some("snapshot") => session.enter(parse::<Entry>("snapshot", &data)?),
+            Some("snapshot") => session.number(parse::<Numbered>("snapshot", &data)?),
             Some("memory") => {} // what a replay goes on from
             other => {
                 return Err(format!("it has messages of topic {other:?}, which this build does not know"));

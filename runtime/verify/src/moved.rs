@@ -8,7 +8,7 @@ use serde::Deserialize;
 use crate::limits::{Limits, PerJoint};
 use crate::motion::Machine;
 use crate::period::Period;
-use crate::rows::{Rule, Step};
+use crate::rows::{Passage, Rule};
 use crate::stop::{Coast, rest};
 
 /// Looks at a brake in so many places, between which half of the second differences is allowed for.
@@ -147,8 +147,8 @@ impl Moving {
         loop {
             // What a state is, not what leads to it.
             let moves = coast.period(machine, &self.built, (p, dofs), brake);
-            let at = coast.step();
-            let still = Step { q: at.q, v: at.v, q1: at.q, v1: at.v, ..at };
+            let at = coast.passage();
+            let still = Passage { q: at.q, v: at.v, q1: at.q, v1: at.v, ..at };
             for &r in &rows {
                 if let Some(by) = self.wanted.rows[r].breach(machine, p, &still) {
                     self.seen[r].push(by);

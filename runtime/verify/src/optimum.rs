@@ -11,7 +11,7 @@ use crate::collision::Told;
 use crate::limit_check::{Fault, TOLERANCE, are_near, broken, worst};
 use crate::motion::SPENT;
 use crate::promise::Promise;
-use crate::rows::{Row, Rule, Step};
+use crate::rows::{Passage, Row, Rule};
 use crate::tick::Ledger;
 
 /// A limit is active when this share of the largest velocity change of a period would break it.
@@ -38,7 +38,7 @@ const CLARABEL: u32 = 2;
 /// `goals` are the unconstrained optima of `v'` (nv): the two that differ by rounding.
 pub(crate) fn confirm(
     promise: &mut Promise,
-    step: &Step<'_>,
+    passage: &Passage<'_>,
     goals: [&[f64]; 2],
     ledger: &Ledger,
     whole: bool,
@@ -49,19 +49,19 @@ pub(crate) fn confirm(
     }
     let Promise { machine, limits, controllable, period, worth, .. } = promise;
     let has_rows = !limits.rows.is_empty();
-    if has_rows && controllable.iter().any(|&i| (goals[0][i] - step.v1[i]).abs() > FAR) {
+    if has_rows && controllable.iter().any(|&i| (goals[0][i] - passage.v1[i]).abs() > FAR) {
         return unknown(TOO_FAR);
     }
-    if limits.rows.iter().any(Row::needs_before) && step.before.is_none() {
+    if limits.rows.iter().any(Row::needs_before) && passage.before.is_none() {
         return unknown("the tick before is not known, of which jerk and torque rate speak");
     }
-    let nv = step.v.len();
+    let nv = passage.v.len();
     let is_of_force = ledger
         .active_rows
         .iter()
         .filter_map(|a| limits.rows.get(a.row.checked_sub(nv)?))
         .any(Row::is_of_force);
-    let forces = if is_of_force { forces(machine, period, step) } else { Vec::new() };
+    let forces = if is_of_force { forces(machine, period, passage) } else { Vec::new() };
     let mut push = vec![0.0; nv];
     let mut size = vec![0.0f64; nv];
     for (n, active) in ledger.active_rows.iter().enumerate() {
@@ -82,16 +82,16 @@ pub(crate) fn confirm(
             }
             push[i] += side * multiplier;
             size[i] += multiplier;
-            let q = machine.single(i).map(|at| step.q[at]);
+            let q = machine.single(i).map(|at| passage.q[at]);
             let most = joint.acceleration.min(2.0 * joint.velocity / period.dt) * period.dt;
-            let more = step.v1[i] + side * NEAR * if most.is_finite() { most } else { 1.0 };
-            let known = step.last.map(|last| last[i]);
+            let more = passage.v1[i] + side * NEAR * if most.is_finite() { most } else { 1.0 };
+            let known = passage.last.map(|last| last[i]);
             if multiplier > 0.0
-                && !joint.breaks(&active.kind, side, period, q, (step.v[i], known), more, whole)
+                && !joint.breaks(&active.kind, side, period, q, (passage.v[i], known), more, whole)
             {
                 return broken(
                     format!("velocity after the {named}, which holds nothing there,"),
-                    step.v1[i],
+                    passage.v1[i],
                     more,
                     "rad/s or m/s at least",
                 );
@@ -108,7 +108,7 @@ pub(crate) fn confirm(
         };
         let (slope, excess) = match (&limits.collision, &row.rule) {
             (Some(bodies), Rule::Pair) => {
-                match bodies.row(machine, period, step, active.row - nv - first_pair(&limits.rows)) {
+                match bodies.row(machine, period, passage, active.row - nv - first_pair(&limits.rows)) {
                     Told::Row(excess, slope) => (slope, excess),
                     Told::Unknown(why) => return unknown(&why),
                     Told::None => {
@@ -118,8 +118,8 @@ pub(crate) fn confirm(
                 }
             }
             _ => {
-                let slope = row.slope(machine, period, step, &forces);
-                (slope, row.excess(machine, period, step)[usize::from(side > 0.0)])
+                let slope = row.slope(machine, period, passage, &forces);
+                (slope, row.excess(machine, period, passage)[usize::from(side > 0.0)])
             }
         };
         for &i in controllable.iter() {
@@ -129,7 +129,7 @@ pub(crate) fn confirm(
         let steepest = slope.iter().fold(0.0, |most: f64, s| most.max(s.abs()));
         belongs(row, (multiplier, excess, active.slack), steepest, (*worth, ledger.rung))?;
     }
-    all_hold(promise, step, ledger)?;
+    all_hold(promise, passage, ledger)?;
     let coarse = if matches!(ledger.rung, CLARABEL | RELAXED) { CONIC } else { ROUNDING };
     let mut largest = 0.0f64;
     // The widest side of the box, at most: what a period may change of a velocity.
@@ -140,11 +140,11 @@ pub(crate) fn confirm(
     let widest = sides.filter(|side| side.is_finite()).fold(1e-6, f64::max).min(1.0);
     // Clarabel's scaling bears less.
     let most = if coarse == CONIC { 1e-2 * FAR * widest } else { FAR * widest };
-    let is_far = has_rows && promise.controllable.iter().any(|&i| (goals[0][i] - step.v1[i]).abs() > most);
+    let is_far = has_rows && promise.controllable.iter().any(|&i| (goals[0][i] - passage.v1[i]).abs() > most);
     for &i in &promise.controllable {
-        let left = |goal: f64| (2.0 * (step.v1[i] - goal) + push[i]).abs();
+        let left = |goal: f64| (2.0 * (passage.v1[i] - goal) + push[i]).abs();
         let least = left(goals[0][i]).min(left(goals[1][i]));
-        let far = 1.0 + goals[0][i].abs() + step.v[i].abs() + size[i];
+        let far = 1.0 + goals[0][i].abs() + passage.v[i].abs() + size[i];
         if least.is_nan() || least > 2.0 * coarse * far {
             if is_far {
                 return unknown(TOO_FAR);
@@ -167,7 +167,7 @@ fn first_pair(rows: &[Row]) -> usize {
 /// period that is nearest to it, which an active row names with the distance as multiplier.
 pub(crate) fn apart(
     promise: &Promise,
-    step: &Step<'_>,
+    passage: &Passage<'_>,
     (pq, pv): &(Vec<f64>, Vec<f64>),
     ledger: &Ledger,
     whole: bool,
@@ -180,12 +180,12 @@ pub(crate) fn apart(
     for &i in &promise.controllable {
         let joint = &promise.limits.joints[i];
         let at = promise.machine.single(i);
-        let q = at.map(|at| step.q[at]);
+        let q = at.map(|at| passage.q[at]);
         let most = joint.acceleration.min(2.0 * joint.velocity / p.dt) * p.dt;
         let near = NEAR * if most.is_finite() { most } else { 1.0 };
         let mut rows = ledger.active_rows.iter().filter(|row| row.row == i).peekable();
-        let place = at.map(|at| (pq[at], step.q1[at], true));
-        for (asked, got, is_place) in [Some((pv[i], step.v1[i], false)), place].into_iter().flatten() {
+        let place = at.map(|at| (pq[at], passage.q1[at], true));
+        for (asked, got, is_place) in [Some((pv[i], passage.v1[i], false)), place].into_iter().flatten() {
             if are_near(asked, got, SAME * asked.abs().max(1.0)) {
                 // The same but for rounding: a row may name it all the same.
                 let weight = if is_place { weight } else { 1.0 };
@@ -209,12 +209,12 @@ pub(crate) fn apart(
             // The velocity with which it would be reached, a little further.
             let from = q.unwrap_or(0.0);
             let reached =
-                if is_place { step.v[i] + ((got - from) / p.dt - step.v[i]) / p.kappa } else { got };
+                if is_place { passage.v[i] + ((got - from) / p.dt - passage.v[i]) / p.kappa } else { got };
             let is_end = match row.kind.as_str() {
                 "position" if is_place => {
                     are_near(got, if sign > 0.0 { joint.upper } else { joint.lower }, TOLERANCE)
                 }
-                kind => joint.breaks(kind, sign, p, q, (step.v[i], None), reached + sign * near, whole),
+                kind => joint.breaks(kind, sign, p, q, (passage.v[i], None), reached + sign * near, whole),
             };
             if !is_end {
                 let what = format!(
@@ -237,15 +237,19 @@ pub(crate) fn apart(
 }
 
 /// Motor forces for a unit of each acceleration (nv x nv, by rows): they are linear in it.
-fn forces(machine: &mut crate::motion::Machine, period: &crate::period::Period, step: &Step<'_>) -> Vec<f64> {
-    let nv = step.v.len();
+fn forces(
+    machine: &mut crate::motion::Machine,
+    period: &crate::period::Period,
+    passage: &Passage<'_>,
+) -> Vec<f64> {
+    let nv = passage.v.len();
     let (mut a, mut still, mut with) = (vec![0.0; nv], vec![0.0; nv], vec![0.0; nv]);
-    machine.motors(period, step.q, step.v, &a, &mut still);
+    machine.motors(period, passage.q, passage.v, &a, &mut still);
     let mut all = vec![0.0; nv * nv];
     for j in 0..nv {
         a.fill(0.0);
         a[j] = 1.0;
-        machine.motors(period, step.q, step.v, &a, &mut with);
+        machine.motors(period, passage.q, passage.v, &a, &mut with);
         (0..nv).for_each(|i| all[i * nv + j] = with[i] - still[i]);
     }
     all
@@ -289,19 +293,19 @@ fn belongs(
 }
 
 /// Every hard row is kept as the projection has to keep it, and a soft one that gives way is named.
-fn all_hold(promise: &mut Promise, step: &Step<'_>, ledger: &Ledger) -> Result<(), Fault> {
-    let nv = step.v.len();
+fn all_hold(promise: &mut Promise, passage: &Passage<'_>, ledger: &Ledger) -> Result<(), Fault> {
+    let nv = passage.v.len();
     let Promise { machine, limits, period, .. } = promise;
     for (r, row) in limits.rows.iter().enumerate() {
         let excess = match (&limits.collision, &row.rule) {
             (Some(bodies), Rule::Pair) => {
-                match bodies.row(machine, period, step, r - first_pair(&limits.rows)) {
+                match bodies.row(machine, period, passage, r - first_pair(&limits.rows)) {
                     Told::Row(excess, _) => excess,
                     // That bodies keep apart is looked at by itself. A row that is not known and holds nothing back is no matter here.
                     Told::None | Told::Unknown(_) => f64::NEG_INFINITY,
                 }
             }
-            _ => worst(row.excess(machine, period, step)),
+            _ => worst(row.excess(machine, period, passage)),
         };
         if machine.is_spent() {
             return Err(Fault::Unknown(SPENT.into()));

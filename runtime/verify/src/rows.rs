@@ -1,4 +1,4 @@
-//! Limits that tie joints together: what they ask of a step, what they keep, and how they change with it.
+//! Limits that tie joints together: what they ask of a passage, what they keep, and how they change with it.
 
 use serde::Deserialize;
 
@@ -76,7 +76,7 @@ pub(crate) enum Rule {
 
 /// From the state that a tick acted upon to its target.
 #[derive(Clone, Copy)]
-pub(crate) struct Step<'a> {
+pub(crate) struct Passage<'a> {
     pub(crate) q: &'a [f64],
     pub(crate) v: &'a [f64],
     pub(crate) q1: &'a [f64],
@@ -125,85 +125,95 @@ impl Row {
         matches!(self.rule, Rule::Plane { .. } | Rule::User { .. } | Rule::Speed { .. } | Rule::Energy { .. })
     }
 
-    /// Value, limit and unit of what the state after a step keeps, for messages.
-    pub(crate) fn value(&self, m: &mut Machine, p: &Period, step: &Step<'_>) -> (f64, f64, &'static str) {
+    /// Value, limit and unit of what the state after a passage keeps, for messages.
+    pub(crate) fn value(
+        &self,
+        m: &mut Machine,
+        p: &Period,
+        passage: &Passage<'_>,
+    ) -> (f64, f64, &'static str) {
         match &self.rule {
-            Rule::Torque { dof, most } => (step.tau[*dof], *most, "N m or N"),
+            Rule::Torque { dof, most } => (passage.tau[*dof], *most, "N m or N"),
             Rule::TorqueSpeed { dof, most, slope } => {
-                (step.tau[*dof] + slope * step.v1[*dof], *most, "N m or N")
+                (passage.tau[*dof] + slope * passage.v1[*dof], *most, "N m or N")
             }
-            Rule::Drive { most, .. } => (self.excess(m, p, step)[1] * most + most, *most, "N m or N"),
-            Rule::Jerk { most, .. } => (self.excess(m, p, step)[1] * most + most, *most, "rad/s^3 or m/s^3"),
+            Rule::Drive { most, .. } => (self.excess(m, p, passage)[1] * most + most, *most, "N m or N"),
+            Rule::Jerk { most, .. } => {
+                (self.excess(m, p, passage)[1] * most + most, *most, "rad/s^3 or m/s^3")
+            }
             Rule::TorqueRate { most, .. } => {
-                (self.excess(m, p, step)[1] * most + most, *most, "N m/s or N/s")
+                (self.excess(m, p, passage)[1] * most + most, *most, "N m/s or N/s")
             }
             Rule::Plane { spot, point, n, offset, .. } => {
-                m.go(step.q1, step.v1);
+                m.go(passage.q1, passage.v1);
                 (dot(*n, m.place(spot).point(*point)), *offset, "m")
             }
             Rule::User { lower, upper, .. } => {
-                let value = self.sum(step);
+                let value = self.sum(passage);
                 (value, if value > *upper { *upper } else { *lower }, "in the unit of the row")
             }
             Rule::Speed { spot, point, most } => {
-                m.go(step.q1, step.v1);
+                m.go(passage.q1, passage.v1);
                 (m.speed(spot, *point), *most, "m/s")
             }
-            Rule::Energy { most } => (m.energy(step.q1, step.v1), *most, "J"),
+            Rule::Energy { most } => (m.energy(passage.q1, passage.v1), *most, "J"),
             Rule::Pair => (0.0, 0.0, "m"),
         }
     }
 
-    /// Sum of the terms after the step.
-    fn sum(&self, step: &Step<'_>) -> f64 {
+    /// Sum of the terms after the passage.
+    fn sum(&self, passage: &Passage<'_>) -> f64 {
         let Rule::User { terms, .. } = &self.rule else { return 0.0 };
         let each = |t: &Term| {
-            let at = t.position.map_or(0.0, |(iq, c)| c * step.q1[iq]);
-            at + t.velocity * step.v1[t.dof] + t.acceleration * step.a[t.dof]
+            let at = t.position.map_or(0.0, |(iq, c)| c * passage.q1[iq]);
+            at + t.velocity * passage.v1[t.dof] + t.acceleration * passage.a[t.dof]
         };
         terms.iter().map(each).sum()
     }
 
-    /// By how much a step is beyond the lower and the upper bound that the projection has to keep, as shares of the size; negative inside.
-    pub(crate) fn excess(&self, m: &mut Machine, p: &Period, step: &Step<'_>) -> [f64; 2] {
+    /// By how much a passage is beyond the lower and the upper bound that the projection has to keep, as shares of the size; negative inside.
+    pub(crate) fn excess(&self, m: &mut Machine, p: &Period, passage: &Passage<'_>) -> [f64; 2] {
         if matches!(self.rule, Rule::Plane { .. } | Rule::User { .. }) {
             m.spend(100 * (1 + p.sub_steps as usize));
         }
         let both = |value: f64, most: f64| [-value / most - 1.0, value / most - 1.0];
         let none = f64::NEG_INFINITY;
         match &self.rule {
-            Rule::Torque { dof, most } => both(step.tau[*dof], *most),
-            Rule::TorqueSpeed { dof, most, slope } => both(step.tau[*dof] + slope * step.v1[*dof], *most),
+            Rule::Torque { dof, most } => both(passage.tau[*dof], *most),
+            Rule::TorqueSpeed { dof, most, slope } => {
+                both(passage.tau[*dof] + slope * passage.v1[*dof], *most)
+            }
             Rule::Jerk { dof, most } => {
-                step.before.map_or([none; 2], |(a, _)| both((step.a[*dof] - a[*dof]) / p.dt, *most))
+                passage.before.map_or([none; 2], |(a, _)| both((passage.a[*dof] - a[*dof]) / p.dt, *most))
             }
-            Rule::TorqueRate { dof, most } => {
-                step.before.map_or([none; 2], |(_, tau)| both((step.tau[*dof] - tau[*dof]) / p.dt, *most))
-            }
+            Rule::TorqueRate { dof, most } => passage
+                .before
+                .map_or([none; 2], |(_, tau)| both((passage.tau[*dof] - tau[*dof]) / p.dt, *most)),
             Rule::Drive { dof, most, stiffness, damping, at_end } => {
-                let [still, by] = drive(p, *stiffness, *damping, *at_end, step.v[*dof]);
-                both(step.tau[*dof] + still + by * step.a[*dof], *most)
+                let [still, by] = drive(p, *stiffness, *damping, *at_end, passage.v[*dof]);
+                both(passage.tau[*dof] + still + by * passage.a[*dof], *most)
             }
             Rule::Plane { spot, point, n, offset, braking } => {
                 let mut ahead = Vec::new();
-                m.moved(step.q, step.v, p.dt, &mut ahead);
-                m.go(&ahead, step.v);
+                m.moved(passage.q, passage.v, p.dt, &mut ahead);
+                m.go(&ahead, passage.v);
                 let at = m.point(spot, m.place(spot).point(*point));
-                m.go(&ahead, step.v1);
+                m.go(&ahead, passage.v1);
                 let then = dot(*n, m.point(spot, m.place(spot).point(*point)).velocity);
                 let (speed, c) = (dot(*n, at.velocity), dot(*n, at.acceleration));
                 [none, plane(p, offset - dot(*n, at.at), speed, c, then, *braking)]
             }
             Rule::User { terms, lower, upper, braking, .. } => match braking {
                 None => {
-                    let value = self.sum(step);
+                    let value = self.sum(passage);
                     [(lower - value) / self.size, (value - upper) / self.size]
                 }
                 Some(b) => {
                     let sum = |x: &dyn Fn(&Term) -> f64| terms.iter().map(x).sum::<f64>();
                     let weight = |t: &Term| t.position.map_or(0.0, |(_, c)| c);
-                    let s = sum(&|t| t.position.map_or(0.0, |(iq, c)| c * step.q[iq]));
-                    let (w, a) = (sum(&|t| weight(t) * step.v[t.dof]), sum(&|t| weight(t) * step.a[t.dof]));
+                    let s = sum(&|t| t.position.map_or(0.0, |(iq, c)| c * passage.q[iq]));
+                    let (w, a) =
+                        (sum(&|t| weight(t) * passage.v[t.dof]), sum(&|t| weight(t) * passage.a[t.dof]));
                     let beyond = |d: f64, w: f64, a: f64| {
                         if d.is_finite() { (a - in_front(p, d, w, *b)) / b } else { none }
                     };
@@ -212,14 +222,14 @@ impl Row {
             },
             Rule::Speed { spot, point, most } => {
                 let mut ahead = Vec::new();
-                m.moved(step.q, step.v, p.dt, &mut ahead);
-                m.go(&ahead, step.v1);
+                m.moved(passage.q, passage.v, p.dt, &mut ahead);
+                m.go(&ahead, passage.v1);
                 [none, m.speed(spot, *point) / most - 1.0]
             }
             Rule::Energy { most } => {
                 let mut ahead = Vec::new();
-                m.moved(step.q, step.v, p.dt, &mut ahead);
-                [none, (m.energy(&ahead, step.v1) / most).sqrt() - 1.0]
+                m.moved(passage.q, passage.v, p.dt, &mut ahead);
+                [none, (m.energy(&ahead, passage.v1) / most).sqrt() - 1.0]
             }
             Rule::Pair => [none; 2],
         }
@@ -227,28 +237,28 @@ impl Row {
 
     /// By how much the motion, or the state that it ends in, is beyond the limit itself: a share of it, of a plane metres. `None` where no
     /// brake could keep it.
-    pub(crate) fn breach(&self, m: &mut Machine, p: &Period, step: &Step<'_>) -> Option<f64> {
+    pub(crate) fn breach(&self, m: &mut Machine, p: &Period, passage: &Passage<'_>) -> Option<f64> {
         Some(match &self.rule {
             Rule::Plane { spot, point, n, offset, .. } => {
-                m.go(step.q1, step.v1);
+                m.go(passage.q1, passage.v1);
                 dot(*n, m.place(spot).point(*point)) - offset
             }
             Rule::Speed { spot, point, most } => {
-                m.go(step.q1, step.v1);
+                m.go(passage.q1, passage.v1);
                 m.speed(spot, *point) / most - 1.0
             }
-            Rule::Energy { most } => (m.energy(step.q1, step.v1) / most).sqrt() - 1.0,
+            Rule::Energy { most } => (m.energy(passage.q1, passage.v1) / most).sqrt() - 1.0,
             Rule::User { terms, lower, upper, braking, is_equality } => {
                 let stands = *lower <= 0.0 && *upper >= 0.0;
                 let of_positions = terms.iter().any(|t| t.position.is_some());
                 if braking.is_none() && (*is_equality || !(of_positions || stands)) {
                     return None;
                 }
-                let value = self.sum(step);
+                let value = self.sum(passage);
                 (value - upper).max(lower - value) / self.size
             }
             Rule::Pair => return None,
-            _ => worst(self.excess(m, p, step)),
+            _ => worst(self.excess(m, p, passage)),
         })
     }
 
@@ -264,8 +274,14 @@ impl Row {
 
     /// How the row's value changes with the velocity change of each dof (nv), in the row's unit. `forces` are the motors' forces for a unit of
     /// each acceleration (nv x nv), where the row is of forces.
-    pub(crate) fn slope(&self, m: &mut Machine, p: &Period, step: &Step<'_>, forces: &[f64]) -> Vec<f64> {
-        let nv = step.v.len();
+    pub(crate) fn slope(
+        &self,
+        m: &mut Machine,
+        p: &Period,
+        passage: &Passage<'_>,
+        forces: &[f64],
+    ) -> Vec<f64> {
+        let nv = passage.v.len();
         let mut out = vec![0.0; nv];
         let mut force =
             |dof: usize, scale: f64| (0..nv).for_each(|j| out[j] = scale * forces[dof * nv + j] / p.dt);
@@ -283,8 +299,8 @@ impl Row {
             Rule::Jerk { dof, .. } => out[*dof] = 1.0 / (p.dt * p.dt),
             Rule::Plane { spot, point, n, .. } => {
                 let mut ahead = Vec::new();
-                m.moved(step.q, step.v, p.dt, &mut ahead);
-                m.go(&ahead, step.v);
+                m.moved(passage.q, passage.v, p.dt, &mut ahead);
+                m.go(&ahead, passage.v);
                 m.add_row(spot, m.place(spot).point(*point), *n, 1.0 / p.dt, &mut out);
             }
             Rule::User { terms, braking, .. } => {
@@ -296,8 +312,8 @@ impl Row {
             }
             Rule::Speed { spot, point, .. } => {
                 let mut ahead = Vec::new();
-                m.moved(step.q, step.v, p.dt, &mut ahead);
-                m.go(&ahead, step.v1);
+                m.moved(passage.q, passage.v, p.dt, &mut ahead);
+                m.go(&ahead, passage.v1);
                 let at = m.place(spot).point(*point);
                 let velocity = m.point(spot, at).velocity;
                 m.add_row(
@@ -310,9 +326,9 @@ impl Row {
             }
             Rule::Energy { .. } => {
                 let mut ahead = Vec::new();
-                m.moved(step.q, step.v, p.dt, &mut ahead);
-                m.mass_times(&ahead, step.v1, &mut out);
-                let energy: f64 = out.iter().zip(step.v1).map(|(p, v)| p * v).sum();
+                m.moved(passage.q, passage.v, p.dt, &mut ahead);
+                m.mass_times(&ahead, passage.v1, &mut out);
+                let energy: f64 = out.iter().zip(passage.v1).map(|(p, v)| p * v).sum();
                 out.iter_mut().for_each(|x| *x /= energy.sqrt().max(f64::MIN_POSITIVE));
             }
             Rule::Pair => {}
@@ -360,14 +376,15 @@ pub(crate) fn plane(p: &Period, distance: f64, speed: f64, c: f64, then: f64, b:
 /// Whether a point of a plane is beyond it already.
 pub(crate) fn is_beyond(row: &Row, m: &mut Machine, q: &[f64], v: &[f64]) -> bool {
     let zero = vec![0.0; v.len()];
-    let step = Step { q, v, q1: q, v1: v, a: &zero, tau: &zero, before: None, last: None, is_free: false };
+    let passage =
+        Passage { q, v, q1: q, v1: v, a: &zero, tau: &zero, before: None, last: None, is_free: false };
     match &row.rule {
         Rule::Plane { spot, point, n, offset, .. } => {
             m.go(q, v);
             dot(*n, minus(m.place(spot).point(*point), times(*offset, *n))) > 0.0
         }
         Rule::User { lower, upper, .. } => {
-            let value = row.sum(&step);
+            let value = row.sum(&passage);
             value > *upper || value < *lower
         }
         Rule::Speed { spot, point, most } => {

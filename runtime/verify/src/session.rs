@@ -8,11 +8,11 @@ use crate::limit_check::{self, Breach, Fault, are_near, broken};
 use crate::limits::{Consistency, Limits, Way};
 use crate::moved::Moving;
 use crate::optimum;
-use crate::promise::{Entry as Proposed, Projects, Promise, Sent};
+use crate::promise::{Entry, Projects, Promise, Sent};
 use crate::report::{Report, Violation};
-use crate::rows::{Row, Step};
+use crate::rows::{Passage, Row};
 use crate::stop;
-use crate::tick::{Entry, Status, Tick};
+use crate::tick::{Numbered, Status, Tick};
 
 /// Version of the tick messages that are read.
 const SCHEMA: &str = "5";
@@ -51,7 +51,7 @@ pub(crate) struct Session {
     facts: BTreeMap<String, String>,
     /// Bytes of attachments by their name.
     attachments: HashMap<String, Vec<u8>>,
-    entries: HashMap<u64, Entry>,
+    snapshots: HashMap<u64, Numbered>,
     /// Promises by snapshot: its own, then what the loop pinned beside it.
     promises: HashMap<u64, (Promise, Option<Promise>)>,
     past: Option<Past>,
@@ -90,8 +90,8 @@ impl Session {
         Ok(())
     }
 
-    pub(crate) fn enter(&mut self, entry: Entry) {
-        self.entries.insert(entry.id, entry);
+    pub(crate) fn number(&mut self, snapshot: Numbered) {
+        self.snapshots.insert(snapshot.id, snapshot);
     }
 
     /// Notes that the log has message `tick`.
@@ -150,7 +150,7 @@ impl Session {
         }
         promises.0.machine.grant();
         promises.1.iter().for_each(|pinned| pinned.machine.grant());
-        let told = match self.judge(&mut promises, tick) {
+        let told = match self.examine(&mut promises, tick) {
             Ok(told) => told,
             Err(Fault::Broken(Breach { what, value, limit, unit })) => {
                 self.report.add(Violation { tick: tick.tick, what, value, limit, unit });
@@ -168,7 +168,7 @@ impl Session {
             _ => tick.state.v.clone(),
         };
         if [tick.target_q.len(), tick.target_v.len(), v.len()] != [nq, nv, nv] {
-            return Ok(()); // it was named, and leaves nothing that the next tick could be judged by
+            return Ok(()); // it was named, and leaves nothing that the next tick could be confirmed by
         }
         let a = tick.target_v.iter().zip(&v).map(|(to, from)| (to - from) / dt).collect();
         let target = (tick.target_q.clone(), tick.target_v.clone());
@@ -178,10 +178,10 @@ impl Session {
 
     /// What snapshot `id` promises, and what the loop pinned.
     fn promise(&self, id: u64) -> Result<(Promise, Option<Promise>), String> {
-        let entry = self.entries.get(&id).ok_or_else(|| format!("snapshot number {id} is not in it"))?;
+        let numbered = self.snapshots.get(&id).ok_or_else(|| format!("snapshot number {id} is not in it"))?;
         let bytes = self
             .attachments
-            .get(&entry.digest)
+            .get(&numbered.digest)
             .ok_or_else(|| format!("snapshot number {id} is not in it"))?;
         let of = |e: String| format!("snapshot number {id}: {e}");
         let own = Promise::read(bytes, None).map_err(of)?;
@@ -194,11 +194,11 @@ impl Session {
             .collect();
         if own.projects != Projects::Nothing
             && own.consistency == Consistency::Kinematic
-            && names != entry.rows
+            && names != numbered.rows
         {
             return Err(format!(
                 "the rows of snapshot number {id} are {:?} in the log, and {names:?} by its limits",
-                entry.rows
+                numbered.rows
             ));
         }
         let pinned = match self.facts.get("limits") {
@@ -216,7 +216,7 @@ impl Session {
     }
 
     /// Confirms a tick's claims; what the next one is told of it.
-    fn judge(
+    fn examine(
         &mut self,
         (own, pinned): &mut (Promise, Option<Promise>),
         tick: &Tick,
@@ -356,7 +356,7 @@ impl Session {
         promise.machine.motors(&p, case.q, case.v, &a, &mut tau);
         let told = self.past.as_ref().and_then(|past| past.told.clone());
         let before = told.as_ref().map(|(a, tau)| (&a[..], &tau[..]));
-        let step = Step {
+        let passage = Passage {
             q: case.q,
             v: case.v,
             q1: &tick.target_q,
@@ -370,19 +370,19 @@ impl Session {
         let is_stored = !tick.brake.is_empty();
         let excused = case.status == Status::Recovering;
         if promise.consistency == Consistency::Kinematic {
-            follows(promise, &step)?;
+            follows(promise, &passage)?;
         }
         if let Some(mut moving) = promise.moving.take() {
             // What was built holds on any way, then what is in force on this one.
             promise.limits.clone_from(&moving.built);
-            let held = holds(promise, &step, is_stored, excused);
+            let held = holds(promise, &passage, is_stored, excused);
             let in_force = self.in_force(promise, &mut moving, case);
             promise.moving = Some(moving);
             held?;
             promise.limits = in_force?;
         }
         if promise.moving.is_none() || !excused {
-            holds(promise, &step, is_stored, excused)?;
+            holds(promise, &passage, is_stored, excused)?;
         }
         if !case.is_own {
             return Ok(None);
@@ -403,8 +403,8 @@ impl Session {
                 "",
             );
         }
-        actions(promise, &step, &tick.action)?;
-        self.optimum(promise, case, &step, is_stored)?;
+        actions(promise, &passage, &tick.action)?;
+        self.optimum(promise, case, &passage, is_stored)?;
         self.stop(promise, case, &a, is_stored)?;
         Ok(Some((a, tau)))
     }
@@ -431,7 +431,7 @@ impl Session {
         &mut self,
         promise: &mut Promise,
         case: &Case<'_>,
-        step: &Step<'_>,
+        passage: &Passage<'_>,
         is_stored: bool,
     ) -> Result<(), Fault> {
         let mut without = |why: &str| {
@@ -453,21 +453,21 @@ impl Session {
             Ok(proposal) => proposal,
             Err(why) => return without(why),
         };
-        if step.is_free {
-            match optimum::apart(promise, step, proposal, &case.tick.ledger, is_stored) {
+        if passage.is_free {
+            match optimum::apart(promise, passage, proposal, &case.tick.ledger, is_stored) {
                 Ok(()) => self.report.optimal += 1,
                 Err(Fault::Unknown(why)) => return without(&why),
                 Err(fault) => return Err(fault),
             }
             return Ok(());
         }
-        let (one, other) = unconstrained(promise, step, proposal);
+        let (one, other) = unconstrained(promise, passage, proposal);
         if !case.by_policy && promise.limits.rows.iter().any(Row::needs_before) {
             return without("a brake is not told of the tick before, of which jerk and torque rate speak");
         }
         // Half a period more where a stored brake stops in whole ones.
         let whole = is_stored;
-        match optimum::confirm(promise, step, [&one, &other], &case.tick.ledger, whole) {
+        match optimum::confirm(promise, passage, [&one, &other], &case.tick.ledger, whole) {
             Ok(worst) => {
                 self.report.optimal += 1;
                 self.report.unbalanced = self.report.unbalanced.max(worst);
@@ -476,7 +476,7 @@ impl Session {
             Err(fault) => return Err(fault),
         }
         let said = case.tick.ledger.moved;
-        let found = distance(promise, step, proposal, &other);
+        let found = distance(promise, passage, proposal, &other);
         if !promise.limits_actions && !are_near(said, found, 1e-6 * (1e-3 + found)) {
             return broken("ledger.moved", said, found, "rad/s or m/s");
         }
@@ -522,8 +522,8 @@ fn goal(own: &Promise, tick: &Tick, q: &[f64], v: &[f64]) -> (Vec<f64>, Vec<f64>
     let (mut gq, mut gv) = (q.to_vec(), v.to_vec());
     for entry in &own.proposed {
         match *entry {
-            Proposed::Position { at, .. } => gq[at] = tick.proposal_q[at],
-            Proposed::Velocity { dof } => gv[dof] = tick.proposal_v[dof],
+            Entry::Position { at, .. } => gq[at] = tick.proposal_q[at],
+            Entry::Velocity { dof } => gv[dof] = tick.proposal_v[dof],
         }
     }
     let length = f64::from(own.policy_every) * own.period.dt;
@@ -549,8 +549,12 @@ fn cubic(s: f64, length: f64, (q0, v0): (f64, f64), (q1, v1): (f64, f64)) -> (f6
 
 /// The next velocities nearest to a proposal without limits: where its position would lead and where its velocity does count alike. Twice: where the
 /// two are one but for rounding, the second is the velocity.
-fn unconstrained(own: &Promise, step: &Step<'_>, (pq, pv): &(Vec<f64>, Vec<f64>)) -> (Vec<f64>, Vec<f64>) {
-    let (p, q, v) = (&own.period, step.q, step.v);
+fn unconstrained(
+    own: &Promise,
+    passage: &Passage<'_>,
+    (pq, pv): &(Vec<f64>, Vec<f64>),
+) -> (Vec<f64>, Vec<f64>) {
+    let (p, q, v) = (&own.period, passage.q, passage.v);
     let (mut one, mut other) = (v.to_vec(), v.to_vec());
     for &i in &own.controllable {
         let by_velocity = (pv[i] - v[i]).clamp(-HUGE, HUGE);
@@ -569,33 +573,33 @@ fn unconstrained(own: &Promise, step: &Step<'_>, (pq, pv): &(Vec<f64>, Vec<f64>)
 
 /// The distance from proposal to target: positions divided by a period, so that both are velocities. Of a joint that has what it was asked for
 /// it is rounding.
-fn distance(own: &Promise, step: &Step<'_>, (pq, pv): &(Vec<f64>, Vec<f64>), goal: &[f64]) -> f64 {
+fn distance(own: &Promise, passage: &Passage<'_>, (pq, pv): &(Vec<f64>, Vec<f64>), goal: &[f64]) -> f64 {
     let p = &own.period;
     let each = own.controllable.iter().map(|&i| {
-        let dv = step.v1[i] - pv[i];
+        let dv = passage.v1[i] - pv[i];
         let Some(at) = own.machine.single(i).filter(|_| !(goal[i] == pv[i] && dv == 0.0)) else { return 0.0 };
-        let dq = (step.q[at] + p.way(step.v[i], step.v1[i]) - pq[at]) / (p.kappa * p.dt);
+        let dq = (passage.q[at] + p.way(passage.v[i], passage.v1[i]) - pq[at]) / (p.kappa * p.dt);
         dq * dq + dv * dv
     });
     each.sum::<f64>().sqrt()
 }
 
 /// The limits of joints, then what ties joints together.
-fn holds(promise: &mut Promise, step: &Step<'_>, stored: bool, excused: bool) -> Result<(), Fault> {
+fn holds(promise: &mut Promise, passage: &Passage<'_>, stored: bool, excused: bool) -> Result<(), Fault> {
     let Promise { machine, limits, controllable, period, .. } = promise;
-    limit_check::joints(limits, machine, controllable, period, step, excused)?;
-    limit_check::rows(limits, machine, period, step, stored, excused)
+    limit_check::joints(limits, machine, controllable, period, passage, excused)?;
+    limit_check::rows(limits, machine, period, passage, stored, excused)
 }
 
 /// The target's position is where its velocity leads.
-fn follows(promise: &Promise, step: &Step<'_>) -> Result<(), Fault> {
+fn follows(promise: &Promise, passage: &Passage<'_>) -> Result<(), Fault> {
     let p = &promise.period;
     for &i in &promise.controllable {
         let Some(at) = promise.machine.single(i) else { continue };
-        let leads = step.q[at] + p.way(step.v[i], step.v1[i]);
-        if !are_near(step.q1[at], leads, CONSISTENT * leads.abs().max(1.0)) {
+        let leads = passage.q[at] + p.way(passage.v[i], passage.v1[i]);
+        if !are_near(passage.q1[at], leads, CONSISTENT * leads.abs().max(1.0)) {
             let j = &promise.limits.joints[i];
-            return broken(format!("target position of joint '{}'", j.name), step.q1[at], leads, j.length);
+            return broken(format!("target position of joint '{}'", j.name), passage.q1[at], leads, j.length);
         }
     }
     Ok(())
@@ -621,22 +625,22 @@ fn is_outside(promise: &mut Promise, case: &Case<'_>, whole: bool) -> bool {
 }
 
 /// The action is the one that leads to the target; where a joint rubs, to within its dry friction.
-fn actions(promise: &Promise, step: &Step<'_>, found: &[f64]) -> Result<(), Fault> {
+fn actions(promise: &Promise, passage: &Passage<'_>, found: &[f64]) -> Result<(), Fault> {
     let p = &promise.period;
     let (lag, sag) = (0.5 * (p.dt - p.tau), (p.dt * p.dt - p.tau * p.tau) / 6.0);
     for action in &promise.actions {
         let (i, joint) = (action.dof, &promise.limits.joints[action.dof].name);
         let Some(at) = promise.machine.single(i) else { continue };
-        let (v, a, tau) = (step.v[i], step.a[i], step.tau[i]);
+        let (v, a, tau) = (passage.v[i], passage.a[i], passage.tau[i]);
         let (sent, by_friction, unit) = match action.sent {
             Sent::Force => {
                 let share = action.gear * action.gain;
                 ((tau / action.gear - action.bias) / action.gain, action.friction / share.abs(), "N m or N")
             }
-            Sent::Position => (step.q1[at], 0.0, "rad or m"),
-            Sent::Velocity => (step.v1[i], 0.0, "rad/s or m/s"),
+            Sent::Position => (passage.q1[at], 0.0, "rad or m"),
+            Sent::Velocity => (passage.v1[i], 0.0, "rad/s or m/s"),
             Sent::Target { stiffness, damping } => {
-                let target = step.q[at] + lag * v + sag * a + (tau + damping * (v + lag * a)) / stiffness;
+                let target = passage.q[at] + lag * v + sag * a + (tau + damping * (v + lag * a)) / stiffness;
                 (target, action.friction / stiffness, "rad or m")
             }
         };

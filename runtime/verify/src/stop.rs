@@ -7,7 +7,7 @@ use crate::limits::{Bounds, Limits};
 use crate::motion::{Machine, SPENT};
 use crate::period::Period;
 use crate::promise::Promise;
-use crate::rows::Step;
+use crate::rows::Passage;
 
 /// Periods that a brake may take.
 const LONGEST: u32 = 100_000;
@@ -71,9 +71,9 @@ impl Coast {
     }
 
     /// The period just gone; without motor forces.
-    pub(crate) fn step(&self) -> Step<'_> {
+    pub(crate) fn passage(&self) -> Passage<'_> {
         let Coast { q, v, a, q1, v1, tau, .. } = self;
-        Step { q, v, q1, v1, a, tau, before: None, last: None, is_free: false }
+        Passage { q, v, q1, v1, a, tau, before: None, last: None, is_free: false }
     }
 
     /// The next period begins where this one ended.
@@ -185,8 +185,8 @@ fn run(
         if is_of_force {
             promise.machine.motors(&p, &coast.q, &coast.v, &coast.a, &mut coast.tau);
         }
-        joints(promise, &coast.step(), period, positions)?;
-        rows(promise, &coast.step(), period)?;
+        joints(promise, &coast.passage(), period, positions)?;
+        rows(promise, &coast.passage(), period)?;
         if !moves {
             return Ok(());
         }
@@ -202,9 +202,9 @@ fn run(
 }
 
 /// Positions and speeds after a period of a brake; of hard jerk also within it, and the acceleration.
-fn joints(promise: &Promise, step: &Step<'_>, period: u32, positions: bool) -> Result<(), Fault> {
+fn joints(promise: &Promise, passage: &Passage<'_>, period: u32, positions: bool) -> Result<(), Fault> {
     for &i in &promise.controllable {
-        let (j, v) = (&promise.limits.joints[i], step.v1[i]);
+        let (j, v) = (&promise.limits.joints[i], passage.v1[i]);
         let is_smooth = j.jerk.is_finite();
         if !(positions || is_smooth) {
             continue;
@@ -214,13 +214,13 @@ fn joints(promise: &Promise, step: &Step<'_>, period: u32, positions: bool) -> R
         if is_above(v.abs(), j.velocity) {
             return broken(of("speed"), v, v.signum() * j.velocity, format!("{}/s", j.length));
         }
-        if is_smooth && is_above(step.a[i].abs(), j.acceleration) {
-            return broken(of("acceleration"), step.a[i], j.acceleration, format!("{}/s^2", j.length));
+        if is_smooth && is_above(passage.a[i].abs(), j.acceleration) {
+            return broken(of("acceleration"), passage.a[i], j.acceleration, format!("{}/s^2", j.length));
         }
         let Some(at) = promise.machine.single(i) else { continue };
-        let (from, to) = (step.q[at], step.q1[at]);
+        let (from, to) = (passage.q[at], passage.q1[at]);
         for (sign, limit, profile) in [(1.0, j.upper, j.profile[1]), (-1.0, j.lower, j.profile[0])] {
-            let within = || from + sign * promise.period.farthest(sign * step.v[i], sign * step.a[i]);
+            let within = || from + sign * promise.period.farthest(sign * passage.v[i], sign * passage.a[i]);
             let far = if is_smooth { sign * (sign * to).max(sign * within()) } else { to };
             if limit.is_finite() && is_above(sign * far, sign * limit) {
                 return broken(of("position"), far, limit, j.length);
@@ -235,11 +235,11 @@ fn joints(promise: &Promise, step: &Step<'_>, period: u32, positions: bool) -> R
 }
 
 /// What hard rows, cones and distances keep in a period of a brake.
-fn rows(promise: &mut Promise, step: &Step<'_>, period: u32) -> Result<(), Fault> {
+fn rows(promise: &mut Promise, passage: &Passage<'_>, period: u32) -> Result<(), Fault> {
     let Promise { machine, limits, period: p, .. } = promise;
     for row in limits.rows.iter().filter(|row| row.soft.is_none()) {
-        if row.breach(machine, p, step).is_some_and(|by| is_above(by, row.allowed)) {
-            let (value, limit, unit) = row.value(machine, p, step);
+        if row.breach(machine, p, passage).is_some_and(|by| is_above(by, row.allowed)) {
+            let (value, limit, unit) = row.value(machine, p, passage);
             return broken(
                 format!("{} of '{}' in period {} of the way to stop", row.kind, row.name, period + 1),
                 value,
@@ -249,7 +249,7 @@ fn rows(promise: &mut Promise, step: &Step<'_>, period: u32) -> Result<(), Fault
         }
     }
     let Some(collision) = limits.collision.as_ref().filter(|c| c.is_hard) else { return Ok(()) };
-    machine.go(step.q1, step.v1);
+    machine.go(passage.q1, passage.v1);
     match collision.gap(machine, collision.margin - TOLERANCE) {
         Gap::Near(pair, gap) => broken(
             format!("distance of {pair} in period {} of the way to stop", period + 1),

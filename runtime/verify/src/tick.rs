@@ -83,9 +83,9 @@ pub(crate) struct Brief {
     pub(crate) tick: u64,
 }
 
-/// Which snapshot number is which attachment.
+/// A snapshot by the number that ticks have of it, and which attachment it is.
 #[derive(Debug, Deserialize)]
-pub(crate) struct Entry {
+pub(crate) struct Numbered {
     pub(crate) id: u64,
     pub(crate) digest: String,
     #[serde(default)]
@@ -118,7 +118,7 @@ impl Ledger {
             0..=2 => Status::Nearest,
             3 => Status::Recovering,
             4 => Status::Slowed,
-            5 => Status::NotProjected,
+            5 | 7 => Status::NotProjected,
             6 => Status::Tightening,
             10..=13 => Status::Braked,
             20 | 21 => Status::Refused,

@@ -371,6 +371,7 @@ fn the_doctor_checks_snapshot_machine_and_plant() {
         "model",
         "projection",
         "holding",
+        "gains",
         "braking",
         "memory",
         "links",

@@ -1,6 +1,6 @@
-//! Tests that start the programs themselves, as one program: beside them runs nothing that takes the processor for long.
+//! Tests that start the programs themselves, as a program of their own: loops keep their period only while nothing beside them takes the
+//! processor for long, as the tests of `suite` do.
 
-#[path = "../common/mod.rs"]
 mod common;
 
 mod bad_input;
@@ -13,5 +13,6 @@ mod processes;
 mod serve;
 mod serve_attack;
 mod serve_clients;
+mod serve_stress;
 mod serve_training;
 mod sweep;

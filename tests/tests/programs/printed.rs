@@ -10,25 +10,46 @@ fn text(process: Process) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// A policy of actions breaks no limit of a projection that there is not: the run says so in place of "0 broken".
-#[test]
-fn a_run_without_a_projection_says_that_nothing_was_projected() {
-    let name = format!("unprojected-{}", std::process::id());
+/// The line about limits and the JSON of two short runs of an untrained PPO policy of `task`, in MuJoCo.
+fn runs(task: &str, test: &str) -> (String, Value) {
+    let name = format!("{test}-{}", std::process::id());
     let folder = tempfile::tempdir().expect("a folder");
-    let file = folder.path().join("hopper.safetensors");
-    nearl_tests::training("Hopper-v5", "ppo", 1, 1, &[]).snapshot().save(&file).expect("a snapshot");
+    let file = folder.path().join("policy.safetensors");
+    nearl_tests::training(task, "ppo", 1, 1, &[]).snapshot().save(&file).expect("a snapshot");
     let file = file.to_str().expect("UTF-8");
-    let plant = Process::nearl(&["plant", "Hopper-v5", "--name", &name, "--lockstep"]);
+    let plant = Process::nearl(&["plant", task, "--name", &name, "--lockstep"]);
     let printed = text(Process::nearl(&["run", file, "--plant", &name, "--seconds", "0.5"]));
     plant.signal(libc::SIGTERM);
     plant.output();
-    let again = Process::nearl(&["plant", "Hopper-v5", "--name", &name, "--lockstep", "--json"]);
+    let again = Process::nearl(&["plant", task, "--name", &name, "--lockstep", "--json"]);
     let json = Process::nearl(&["run", file, "--plant", &name, "--seconds", "0.5", "--json"]).json();
     again.end();
     remove_files(&RobotName::new(&name).expect("a name"));
     let line = printed.lines().find(|line| line.contains("limits broken")).expect("a line about limits");
+    (line.to_owned(), json)
+}
+
+/// A policy of actions breaks no limit of a projection that there is not: the run says so in place of "0 broken".
+#[test]
+fn a_run_without_a_projection_says_that_nothing_was_projected() {
+    let (line, json) = runs("Hopper-v5", "unprojected");
     assert!(line.contains("nothing was projected") && !line.contains("projected 0"), "{line}");
+    assert!(line.contains("no limit was looked at"), "{line}");
     assert_eq!(json["counters"]["unprojected"], json["modes"]["active"], "{json}");
+    assert_eq!(json["counters"]["bounded_actions"], Value::Null, "{json}");
+}
+
+/// Under `guard = "drive"` nothing is projected either, but forces are kept: the run says both.
+#[test]
+fn a_run_under_the_guard_of_drives_says_what_was_kept() {
+    let (line, json) = runs(concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/leg.toml"), "drives");
+    assert!(
+        line.contains("nothing was projected") && line.contains("the forces of their drives were kept"),
+        "{line}"
+    );
+    assert!(!line.contains("no limit was looked at"), "{line}");
+    assert!(json["modes"]["active"].as_u64() > Some(0), "{json}");
+    assert_eq!(json["counters"]["bounded_actions"], json["modes"]["active"], "{json}");
 }
 
 /// The table of `nearl eval` has the mean and the spread of the returns that its JSON lists.

@@ -1,4 +1,4 @@
-//! What one client's end leaves to the others and to the server: nothing.
+//! A client that ends takes nothing from other clients and leaves nothing behind in the server.
 //!
 //! Each test is a case in which iceoryx2 0.10 alone would let a reply, a request or a place be lost.
 

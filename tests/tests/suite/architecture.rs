@@ -19,7 +19,8 @@ const ARROWS: &[(&str, &[&str])] = &[
 ];
 
 /// What a program that embeds the controller must not have to build: links, command lines, logs, physics, Python.
-const NOT_EMBEDDED: &[&str] = &["iceoryx2", "clap", "mcap", "rtrb", "signal-hook", "mujoco-rs", "pyo3"];
+const NOT_EMBEDDED: &[&str] =
+    &["iceoryx2", "clap", "mcap", "rtrb", "rayon", "signal-hook", "mujoco-rs", "pyo3"];
 
 /// Libraries that only these crates may name.
 const OWNED: &[(&str, &[&str])] = &[
@@ -80,6 +81,12 @@ fn the_controller_is_embedded_without_links_threads_and_command_lines() {
     assert!(controller.contains("nearl-constraints") && controller.len() > 10, "{controller:?}");
     let found: Vec<_> = NOT_EMBEDDED.iter().filter(|library| controller.contains(**library)).collect();
     assert!(found.is_empty(), "nearl-controller builds {found:?}");
+    let own = files(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../runtime/controller/src"));
+    assert!(own.len() > 20, "{} files: this shows nothing", own.len());
+    for file in own {
+        let text = std::fs::read_to_string(&file).expect("a source file");
+        assert!(!text.contains("std::thread"), "{} names threads", file.display());
+    }
 }
 
 /// Packages that building the controller takes, itself included; 156 while it was a part of the runtime's crate.
@@ -133,6 +140,24 @@ fn no_room_of_the_runtime_imports_one_above_it() {
                 let named = above.iter().find(|other| line.contains(&format!("crate::{other}::")));
                 assert!(named.is_none(), "{}:{}: {line}", file.display(), number + 1);
             }
+        }
+    }
+}
+
+/// Programs of tests beside the one that a crate has: why is said in the first comment of each, and in CONTRIBUTING.md.
+const MORE_TESTS: &[(&str, &[&str])] =
+    &[("nearl-runtime", &["suite", "clock"]), ("nearl-tests", &["suite", "programs", "fuzz"])];
+
+/// Each program of tests is linked anew after every change of what is below it.
+#[test]
+fn tests_of_a_crate_are_one_program_where_nothing_forbids_it() {
+    let metadata = MetadataCommand::new().no_deps().exec().expect("cargo metadata runs");
+    for package in &metadata.packages {
+        let tests: BTreeSet<&str> =
+            package.targets.iter().filter(|t| t.is_test()).map(|t| t.name.as_str()).collect();
+        match MORE_TESTS.iter().find(|(name, _)| *name == package.name.as_str()) {
+            Some((name, most)) => assert_eq!(tests, most.iter().copied().collect(), "{name}"),
+            None => assert!(tests.len() <= 1, "{} has {tests:?}: make them modules of one", package.name),
         }
     }
 }

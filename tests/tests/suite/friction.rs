@@ -1,10 +1,14 @@
-//! Dry friction: motors make up for MuJoCo's, limits hold whichever way a joint rubs, and what may be wrong is said in numbers.
+//! Dry friction: motors make up for MuJoCo's, limits hold whichever way a joint rubs, and the doctor says by how much the friction may be wrong.
 
 use nearl_constraints::{
-    AccelerationLimit, Dynamics, Limit, Model, PerJoint, Period, PositionLimit, Projector, Proposal,
-    Settings, Target, TorqueLimit, VelocityLimit,
+    AccelerationLimit, Dynamics, Limit, Model, Period, Projector, Settings, TorqueLimit, VelocityLimit,
 };
 use nearl_trainer::mj;
+
+#[path = "../../../constraints/examples/coulomb/attack.rs"]
+#[allow(dead_code, unreachable_pub)]
+mod attack;
+use attack::{FINE, Rubs, Seen, rub, uniform};
 
 /// A URDF of three joints whose last one is light and rubs as much as the others.
 fn arm(friction: [f64; 3], damping: f64) -> String {
@@ -30,15 +34,6 @@ fn plant(text: &str, sim_dt: f64) -> mj::Sim {
     let options = mj::Options { sim_dt: Some(sim_dt), without_contacts: true, ..mj::Options::default() };
     mj::Sim::new(&mj::Model::from_text(text, mj::ModelFormat::Urdf, options).expect("plant"))
         .expect("simulation")
-}
-
-/// splitmix64 in [-1, 1).
-fn uniform(seed: &mut u64) -> f64 {
-    *seed = seed.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    let mut z = *seed;
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    ((z ^ (z >> 31)) >> 10) as f64 / (1u64 << 53) as f64 - 1.0
 }
 
 #[test]
@@ -90,15 +85,6 @@ fn motors_make_up_for_the_simulator_s_friction() {
     }
 }
 
-/// What an attacked arm did: ticks outside, and the largest acceleration, speed, position and motor force beyond their limits.
-struct Seen {
-    over: usize,
-    worst: [f64; 4],
-}
-
-/// Physics steps of a Coulomb plant [s].
-const FINE: f64 = 2e-5;
-
 /// The arm that is attacked: MuJoCo with its own friction, or without any and with Coulomb's in steps of [`FINE`].
 struct Arm {
     sim: mj::Sim,
@@ -124,55 +110,26 @@ impl Arm {
         let text = if sub_steps == 0 { text.replace("</robot>", runge_kutta) } else { text.to_string() };
         Arm { sim: plant(&text, dt / f64::from(steps)), steps, coulomb: None }
     }
+}
 
-    /// A period under motor forces `tau`.
-    fn step(&mut self, tau: &[f64]) {
+impl Rubs for Arm {
+    fn state(&self) -> (Vec<f64>, Vec<f64>) {
+        (self.sim.qpos().to_vec(), self.sim.qvel().to_vec())
+    }
+
+    fn go(&mut self, tau: &[f64]) {
         self.sim.force_mut().copy_from_slice(tau);
         let Some((dynamics, friction)) = &mut self.coulomb else {
             return self.sim.step(self.steps as usize).expect("steps");
         };
         for _ in 0..self.steps {
-            let (q, v, nv) = (self.sim.qpos().to_vec(), self.sim.qvel().to_vec(), tau.len());
-            // Each joint's friction is what would stop it in this step, at most its own: projected Gauss-Seidel over
-            // v' = v + h (M + h D)^-1 (tau - nle - D v - friction).
-            let (mut rows, mut bias) = (vec![0.0; nv * nv], vec![0.0; nv]);
-            dynamics.motor_rows(&Period::new(FINE, 1), &q, &v, &mut rows, &mut bias);
-            let column = |i: usize| {
-                let mut unit = vec![0.0; nv];
-                unit[i] = 1.0;
-                solved(nv, &rows, unit)
-            };
-            let mobility: Vec<Vec<f64>> = (0..nv).map(column).collect();
-            let free = solved(nv, &rows, tau.iter().zip(&bias).map(|(t, b)| t - b).collect());
-            let mut force = vec![0.0; nv];
-            for _ in 0..50 {
-                for i in 0..nv {
-                    let a = free[i] - (0..nv).map(|j| mobility[j][i] * force[j]).sum::<f64>();
-                    force[i] =
-                        (force[i] + (v[i] / FINE + a) / mobility[i][i]).clamp(-friction[i], friction[i]);
-                }
+            let [force, _] = rub(dynamics, (self.sim.qpos(), self.sim.qvel()), tau, friction);
+            for (motor, (tau, force)) in self.sim.force_mut().iter_mut().zip(tau.iter().zip(&force)) {
+                *motor = tau - force;
             }
-            (0..nv).for_each(|i| self.sim.force_mut()[i] = tau[i] - force[i]);
             self.sim.step(1).expect("step");
         }
     }
-}
-
-/// `matrix^-1 x` by Gaussian elimination of a positive matrix (n x n, row-major).
-fn solved(n: usize, matrix: &[f64], mut x: Vec<f64>) -> Vec<f64> {
-    let mut m = matrix.to_vec();
-    for k in 0..n {
-        for r in k + 1..n {
-            let share = m[r * n + k] / m[k * n + k];
-            (k..n).for_each(|c| m[r * n + c] -= share * m[k * n + c]);
-            x[r] -= share * x[k];
-        }
-    }
-    for k in (0..n).rev() {
-        let known: f64 = (k + 1..n).map(|c| m[k * n + c] * x[c]).sum();
-        x[k] = (x[k] - known) / m[k * n + k];
-    }
-    x
 }
 
 /// The same robot without friction.
@@ -186,56 +143,13 @@ fn smooth(text: &str) -> String {
     out
 }
 
-/// Bang-bang proposals, a third of the time to stand, in a closed loop with `arm`; the projector and the inverse dynamics are of the robot
-/// `known`.
+/// [`attack::attacked`] from the middle of the joints' ranges; the projector and the inverse dynamics are of the robot `known`.
 fn attacked(arm: &mut Arm, known: &str, sub_steps: u32, dt: f64, ticks: usize) -> Seen {
     let model = Model::from_urdf_text(known).expect("model");
-    let (nv, period) = (model.nv(), Period::new(dt, sub_steps));
-    let limits: Vec<Box<dyn Limit>> = vec![
-        Box::new(PositionLimit::default()),
-        Box::new(VelocityLimit::values(PerJoint::All(3.0))),
-        Box::new(AccelerationLimit::uniform(10.0)),
-        Box::new(TorqueLimit::default()),
-    ];
-    let dofs: Vec<usize> = (0..nv).collect();
-    let mut projector =
-        Projector::new(&model, &limits, &dofs, Settings::new(dt, sub_steps)).expect("projector");
-    let (mut dynamics, mut seed) = (Dynamics::new(&model), 3);
     let (low, high) = (model.lower_position_limit(), model.upper_position_limit());
     let middle: Vec<f64> = low.iter().zip(high).map(|(l, h)| 0.5 * (l + h)).collect();
-    arm.sim.set_state(&middle, &vec![0.0; nv]).expect("state");
-    let (mut proposal, mut target) = (Proposal::new(&model), Target::new(&model));
-    let mut seen = Seen { over: 0, worst: [f64::NEG_INFINITY; 4] };
-    let (mut sign, mut tau) = (vec![1.0; nv], vec![0.0; nv]);
-    let hold = (0.15 / dt).round() as usize;
-    for tick in 0..ticks {
-        let (q, v) = (arm.sim.qpos().to_vec(), arm.sim.qvel().to_vec());
-        for i in 0..nv {
-            if (tick + 37 * i) % hold == 0 {
-                sign[i] = uniform(&mut seed).signum();
-            }
-            // Standing, the sign of a velocity is noise.
-            let wish = if tick % (3 * hold) < hold { 0.0 } else { sign[i] * 100.0 };
-            (proposal.v[i], proposal.q[i]) = (wish, q[i] + dt * wish);
-        }
-        projector.project(&q, &v, &proposal, &mut target);
-        dynamics.motors(&period, &q, &v, &target.acceleration, &mut tau);
-        arm.step(&tau);
-        let mut beyond = [f64::NEG_INFINITY; 4];
-        for i in 0..nv {
-            let (q1, v1) = (arm.sim.qpos()[i], arm.sim.qvel()[i]);
-            let at = [
-                ((v1 - v[i]) / dt).abs() - 10.0,
-                v1.abs() - 3.0,
-                (low[i] - q1).max(q1 - high[i]),
-                tau[i].abs() - model.effort_limit()[i],
-            ];
-            (0..4).for_each(|k| beyond[k] = f64::max(beyond[k], at[k]));
-        }
-        seen.over += usize::from(beyond[0] > 0.1 || beyond[1..].iter().any(|x| *x > 1e-3));
-        (0..4).for_each(|k| seen.worst[k] = seen.worst[k].max(beyond[k]));
-    }
-    seen
+    arm.sim.set_state(&middle, &vec![0.0; model.nv()]).expect("state");
+    attack::attacked(arm, &model, (dt, sub_steps), ticks)
 }
 
 #[test]

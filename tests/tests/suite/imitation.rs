@@ -4,7 +4,7 @@ use nearl_tests::{request, training};
 use nearl_trainer::checkpoint::Values;
 use nearl_trainer::demos::{Demonstrations, record};
 use nearl_trainer::env::Step;
-use nearl_trainer::rollout::Judge;
+use nearl_trainer::rollout::Scorer;
 use nearl_trainer::train::{Experience, Request, TrainError, Training};
 use std::path::{Path, PathBuf};
 
@@ -101,7 +101,7 @@ fn resuming_gives_the_same_bits() {
 fn without_the_reward_of_the_task_another_one_changes_nothing() {
     let folder = tempfile::tempdir().expect("folder");
     let (file, _) = demos(folder.path());
-    let other = Judge::new(true, |obs, _, _, step| Step { reward: 3.0 - obs[0] * step.reward, ..step });
+    let other = Scorer::new(true, |obs, _, _, step| Step { reward: 3.0 - obs[0] * step.reward, ..step });
     let learned = |request: &Request, experience: &Experience| {
         let mut training = Training::on(request, experience).expect("training");
         (0..5).for_each(|_| drop(training.iterate()));
@@ -109,7 +109,7 @@ fn without_the_reward_of_the_task_another_one_changes_nothing() {
     };
     let differs = |algo: &str, reward: &str| {
         let request = asked(algo, &file, &[&format!("train.demos.reward='{reward}'")]);
-        learned(&request, &Experience::Here) != learned(&request, &Experience::Judged(other.clone()))
+        learned(&request, &Experience::Here) != learned(&request, &Experience::Scored(other.clone()))
     };
     assert!(differs("pid2-il", "task"), "with the reward of the task another one matters");
     assert!(!differs("pid2-il", "likeness"), "it read the reward of the task");

@@ -1,5 +1,7 @@
-//! What crosses crates, within one process.
+//! What crosses crates, within one process. Two programs beside it have a reason each, in the first comment of their `main.rs`: `programs` and
+//! `fuzz`.
 
+mod allocation;
 mod architecture;
 mod demos;
 mod determinism;
@@ -8,6 +10,7 @@ mod env_mujoco;
 mod env_parity;
 mod env_suite;
 mod friction;
+mod gains;
 mod guard;
 mod imitation;
 mod import;
@@ -23,4 +26,5 @@ mod recipe;
 mod resume;
 mod robots;
 mod schedules;
+mod terrain;
 mod user_tasks;

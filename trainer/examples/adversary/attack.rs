@@ -1,4 +1,4 @@
-//! Proposals of somebody who wants a limit broken.
+//! Proposals that try to break a limit.
 
 use crate::random::Random;
 use nearl_runtime::constraints::{Dynamics, LimitSet, Model, Proposal};

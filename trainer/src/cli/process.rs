@@ -1,4 +1,4 @@
-//! `nearl` as a process of its own, for what shows several of them at work.
+//! Starts `nearl` as a process of its own, for commands that show several of them at work.
 
 use super::Failure;
 use serde_json::Value;

@@ -1,11 +1,11 @@
-//! The way from the observation to an output, one step after another.
+//! The way from the observation to an output, one operation after another.
 
 use nearl_runtime::net::Function;
 use std::ops::Range;
 
-/// One step; a row has one number for each entry, or one for all.
+/// One operation; a row has one number for each entry, or one for all.
 #[derive(Clone, Debug)]
-pub(super) enum Step {
+pub(super) enum Operation {
     /// The observation itself, with its width where the file says it.
     Input(String, Option<usize>),
     /// `W x + b`, W row-major (n_out x n_in).
@@ -26,8 +26,8 @@ pub(super) enum Step {
     Same,
 }
 
-impl Step {
-    /// Which of `n` entries stay; `None` where the step is no choice.
+impl Operation {
+    /// Which of `n` entries stay; `None` where the operation is no choice.
     pub(super) fn range(&self, n: usize) -> Option<Range<usize>> {
         let from_end = |i: i64| if i < 0 { (i + n as i64).max(0) as usize } else { (i as usize).min(n) };
         match self {
@@ -39,10 +39,10 @@ impl Step {
     }
 }
 
-/// A step, and the one before.
+/// An operation, and the one before.
 pub(super) struct Live {
     pub(super) before: Option<usize>,
-    pub(super) step: Step,
+    pub(super) operation: Operation,
     /// Name of the node, for messages.
     pub(super) name: String,
     /// Operator of the node.

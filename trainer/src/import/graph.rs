@@ -1,7 +1,7 @@
-//! From the nodes of a file to a chain of steps.
+//! From the nodes of a file to a chain of operations.
 
 use super::ImportError;
-use super::chain::{Live, Step};
+use super::chain::{Live, Operation};
 use super::network::ImportedNetwork;
 use super::tensor::Tensor;
 use nearl_runtime::net::Function;
@@ -13,7 +13,7 @@ use std::path::Path;
 #[derive(Clone)]
 enum Value {
     Constant(Tensor),
-    /// Depends on an input: number of its last step.
+    /// Depends on an input: number of its last operation.
     Live(usize),
     /// Cannot be read; only said if the action depends on it.
     Refused(ImportError),
@@ -50,7 +50,7 @@ impl<'a> Graph<'a> {
             let last = shape.and_then(|s| s.dim.last()).and_then(|d| d.dim_value);
             let width = last.and_then(|d| usize::try_from(d).ok()).filter(|&d| d > 0);
             if !this.values.contains_key(name) {
-                let live = this.push(None, Step::Input(name.into(), width), name, "input");
+                let live = this.push(None, Operation::Input(name.into(), width), name, "input");
                 this.values.insert(name, live);
             }
         }
@@ -83,7 +83,7 @@ impl<'a> Graph<'a> {
         }
     }
 
-    /// From the input to step `last`.
+    /// From the input to operation `last`.
     fn chain(&self, last: usize) -> Vec<&Live> {
         let mut chain: Vec<&Live> =
             std::iter::successors(Some(last), |&i| self.lives[i].before).map(|i| &self.lives[i]).collect();
@@ -91,8 +91,8 @@ impl<'a> Graph<'a> {
         chain
     }
 
-    fn push(&mut self, before: Option<usize>, step: Step, name: &str, op: &str) -> Value {
-        self.lives.push(Live { before, step, name: name.into(), op: op.into() });
+    fn push(&mut self, before: Option<usize>, operation: Operation, name: &str, op: &str) -> Value {
+        self.lives.push(Live { before, operation, name: name.into(), op: op.into() });
         Value::Live(self.lives.len() - 1)
     }
 
@@ -149,12 +149,12 @@ impl<'a> Graph<'a> {
                 let all = constants(inputs).unwrap_or_default();
                 fold(op, x, &all).map(|t| vec![Value::Constant(t)])
             }
-            _ => self.step(node, op, name, inputs),
+            _ => self.operation(node, op, name, inputs),
         }
     }
 
     /// A node with an input that depends on the observation.
-    fn step(
+    fn operation(
         &mut self,
         node: &NodeProto,
         op: &str,
@@ -172,21 +172,22 @@ impl<'a> Graph<'a> {
             Some(Some(Value::Constant(t))) => Some(t),
             _ => None,
         };
-        let steps = steps(&Node { node, op, at, constant: &constant })?;
-        Ok(steps.into_iter().map(|step| self.push(Some(x), step, name, op)).collect())
+        let operations = operations(&Node { node, op, at, constant: &constant })?;
+        Ok(operations.into_iter().map(|operation| self.push(Some(x), operation, name, op)).collect())
     }
 
     /// `x sigmoid(x)`, in either order.
     fn swish(&mut self, a: usize, b: usize, name: &str) -> Result<Value, String> {
         let of = |x: usize, s: usize| {
-            matches!(self.lives[s].step, Step::Function(Function::Sigmoid)) && self.lives[s].before == Some(x)
+            matches!(self.lives[s].operation, Operation::Function(Function::Sigmoid))
+                && self.lives[s].before == Some(x)
         };
         let x = match (of(a, b), of(b, a)) {
             (true, _) => a,
             (_, true) => b,
             _ => return Err("multiplies two values that both depend on the observation".into()),
         };
-        Ok(self.push(Some(x), Step::Function(Function::Silu), name, "Mul"))
+        Ok(self.push(Some(x), Operation::Function(Function::Silu), name, "Mul"))
     }
 }
 
@@ -246,12 +247,12 @@ impl Node<'_> {
     }
 }
 
-/// What the node does to the value that depends on the observation: one step for each output.
-fn steps(n: &Node<'_>) -> Result<Vec<Step>, String> {
-    let one = |step| Ok(vec![step]);
-    let function = |f| one(Step::Function(f));
+/// What the node does to the value that depends on the observation: one operation for each output.
+fn operations(n: &Node<'_>) -> Result<Vec<Operation>, String> {
+    let one = |operation| Ok(vec![operation]);
+    let function = |f| one(Operation::Function(f));
     match n.op {
-        "Identity" | "Dropout" | "Flatten" | "Squeeze" | "Unsqueeze" | "Cast" => one(Step::Same),
+        "Identity" | "Dropout" | "Flatten" | "Squeeze" | "Unsqueeze" | "Cast" => one(Operation::Same),
         "Reshape" => reshape(n),
         "Tanh" => function(Function::Tanh),
         "Relu" => function(Function::Relu),
@@ -270,15 +271,17 @@ fn steps(n: &Node<'_>) -> Result<Vec<Step>, String> {
             let w = (n.constant)(1).ok_or("needs a constant matrix")?;
             dense(&w.transposed().ok_or("needs a constant matrix")?, None, 1.0, 1.0).map(|s| vec![s])
         }
-        "Add" => one(Step::Affine(vec![1.0], n.row(1 - n.at.min(1))?)),
-        "Sub" if n.at == 0 => one(Step::Affine(vec![1.0], n.row(1)?.iter().map(|x| -x).collect())),
-        "Sub" => one(Step::Affine(vec![-1.0], n.row(0)?)),
-        "Mul" => one(Step::Affine(n.row(1 - n.at.min(1))?, vec![0.0])),
-        "Div" if n.at == 0 => one(Step::Affine(n.row(1)?.iter().map(|x| 1.0 / x).collect(), vec![0.0])),
-        "Neg" => one(Step::Affine(vec![-1.0], vec![0.0])),
-        "Clip" => one(Step::Clip(n.bound(1, "min", f64::NEG_INFINITY)?, n.bound(2, "max", f64::INFINITY)?)),
-        "Max" => one(Step::Clip(n.row(1 - n.at.min(1))?, vec![f64::INFINITY])),
-        "Min" => one(Step::Clip(vec![f64::NEG_INFINITY], n.row(1 - n.at.min(1))?)),
+        "Add" => one(Operation::Affine(vec![1.0], n.row(1 - n.at.min(1))?)),
+        "Sub" if n.at == 0 => one(Operation::Affine(vec![1.0], n.row(1)?.iter().map(|x| -x).collect())),
+        "Sub" => one(Operation::Affine(vec![-1.0], n.row(0)?)),
+        "Mul" => one(Operation::Affine(n.row(1 - n.at.min(1))?, vec![0.0])),
+        "Div" if n.at == 0 => one(Operation::Affine(n.row(1)?.iter().map(|x| 1.0 / x).collect(), vec![0.0])),
+        "Neg" => one(Operation::Affine(vec![-1.0], vec![0.0])),
+        "Clip" => {
+            one(Operation::Clip(n.bound(1, "min", f64::NEG_INFINITY)?, n.bound(2, "max", f64::INFINITY)?))
+        }
+        "Max" => one(Operation::Clip(n.row(1 - n.at.min(1))?, vec![f64::INFINITY])),
+        "Min" => one(Operation::Clip(vec![f64::NEG_INFINITY], n.row(1 - n.at.min(1))?)),
         "Split" => split(n),
         "Slice" => slice(n),
         _ => Err("is none that a policy's layers consist of".into()),
@@ -286,7 +289,7 @@ fn steps(n: &Node<'_>) -> Result<Vec<Step>, String> {
 }
 
 /// `alpha x W + beta c`.
-fn gemm(n: &Node<'_>) -> Result<Vec<Step>, String> {
+fn gemm(n: &Node<'_>) -> Result<Vec<Operation>, String> {
     if n.at != 0 || n.integer("transA", 0) != 0 {
         return Err("multiplies from the left".into());
     }
@@ -297,7 +300,7 @@ fn gemm(n: &Node<'_>) -> Result<Vec<Step>, String> {
         .map(|s| vec![s])
 }
 
-fn dense(w: &Tensor, bias: Option<Vec<f64>>, alpha: f64, beta: f64) -> Result<Step, String> {
+fn dense(w: &Tensor, bias: Option<Vec<f64>>, alpha: f64, beta: f64) -> Result<Operation, String> {
     let (n_out, n_in) = w.matrix().ok_or("needs a constant matrix")?;
     let bias = match bias {
         None => vec![0.0; n_out],
@@ -305,15 +308,15 @@ fn dense(w: &Tensor, bias: Option<Vec<f64>>, alpha: f64, beta: f64) -> Result<St
         Some(b) if b.len() == n_out => b.iter().map(|x| beta * x).collect(),
         Some(b) => return Err(format!("adds {} numbers to {n_out}", b.len())),
     };
-    Ok(Step::Dense { n_in, n_out, weight: w.values.iter().map(|x| alpha * x).collect(), bias })
+    Ok(Operation::Dense { n_in, n_out, weight: w.values.iter().map(|x| alpha * x).collect(), bias })
 }
 
 /// A shape of one row is none of a policy's business; another one would mix what belongs to one entry.
-fn reshape(n: &Node<'_>) -> Result<Vec<Step>, String> {
+fn reshape(n: &Node<'_>) -> Result<Vec<Operation>, String> {
     let shape = n.integers(1, "shape").ok_or("needs a constant shape")?;
     let rest = shape.split_last().map_or(&[][..], |(_, rest)| rest);
     if rest.iter().all(|&d| (-1..=1).contains(&d)) {
-        return Ok(vec![Step::Same]);
+        return Ok(vec![Operation::Same]);
     }
     Err(format!("makes the shape {shape:?}, where one row is read"))
 }
@@ -323,7 +326,7 @@ fn is_last(axis: i64) -> bool {
     axis == -1 || axis == 1
 }
 
-fn split(n: &Node<'_>) -> Result<Vec<Step>, String> {
+fn split(n: &Node<'_>) -> Result<Vec<Operation>, String> {
     let axis = n.integer("axis", 0);
     if !is_last(axis) {
         return Err(format!("splits axis {axis}, where the last is read"));
@@ -331,18 +334,18 @@ fn split(n: &Node<'_>) -> Result<Vec<Step>, String> {
     let outputs = n.node.output.len();
     let Some(sizes) = n.integers(1, "split") else {
         // equal parts: their size is known once the width is
-        return Ok((0..outputs).map(|i| Step::Part(i, outputs)).collect());
+        return Ok((0..outputs).map(|i| Operation::Part(i, outputs)).collect());
     };
     let mut at = 0;
     let ranges = sizes.iter().map(|&size| {
         let start = at;
         at += usize::try_from(size).unwrap_or(0);
-        Step::Select(start..at)
+        Operation::Select(start..at)
     });
     Ok(ranges.collect())
 }
 
-fn slice(n: &Node<'_>) -> Result<Vec<Step>, String> {
+fn slice(n: &Node<'_>) -> Result<Vec<Operation>, String> {
     let (starts, ends) = (n.integers(1, "starts"), n.integers(2, "ends"));
     let (Some(starts), Some(ends)) = (starts, ends) else { return Err("needs constant bounds".into()) };
     let axes = n.integers(3, "axes").unwrap_or_else(|| (0..starts.len() as i64).collect());
@@ -353,12 +356,12 @@ fn slice(n: &Node<'_>) -> Result<Vec<Step>, String> {
     let mut range = None;
     for ((&axis, &start), &end) in axes.iter().zip(&starts).zip(&ends) {
         match (is_last(axis), axis, start) {
-            (true, ..) => range = Some(Step::Slice(start, end)),
+            (true, ..) => range = Some(Operation::Slice(start, end)),
             (_, 0, 0) if end >= 1 => {}
             _ => return Err(format!("cuts axis {axis}, where the last is read")),
         }
     }
-    Ok(vec![range.unwrap_or(Step::Same)])
+    Ok(vec![range.unwrap_or(Operation::Same)])
 }
 
 /// A node of constants alone.

@@ -1,7 +1,7 @@
-//! From a chain of steps to a normaliser and layers.
+//! From a chain of operations to a normaliser and layers.
 
 use super::ImportError;
-use super::chain::{Live, Step};
+use super::chain::{Live, Operation};
 use super::elementwise::{Elementwise, of};
 use nearl_runtime::net::{Dense, DenseLayer, Function};
 use std::collections::BTreeMap;
@@ -71,11 +71,11 @@ impl ImportedNetwork {
     }
 
     pub(super) fn of_chain(chain: &[&Live], output: &str) -> Result<Self, ImportError> {
-        let Some(Step::Input(input, said)) = chain.first().map(|live| &live.step) else {
+        let Some(Operation::Input(input, said)) = chain.first().map(|live| &live.operation) else {
             return Err(ImportError::Graph(format!("its output '{output}' does not come from an input")));
         };
-        let first = chain.iter().find_map(|live| match live.step {
-            Step::Dense { n_in, .. } => Some(n_in),
+        let first = chain.iter().find_map(|live| match live.operation {
+            Operation::Dense { n_in, .. } => Some(n_in),
             _ => None,
         });
         let n = first
@@ -89,7 +89,7 @@ impl ImportedNetwork {
         let mut build =
             Build { head: Elementwise::identity(n), layers: Vec::new(), tail: Elementwise::identity(0) };
         for live in &chain[1..] {
-            build.take(&live.step).map_err(|reason| ImportError::Node {
+            build.take(&live.operation).map_err(|reason| ImportError::Node {
                 name: live.name.clone(),
                 op: live.op.clone(),
                 reason,
@@ -104,7 +104,7 @@ impl Build {
         self.layers.last().map_or(self.head.a.len(), |l| l.bias.len())
     }
 
-    fn take(&mut self, step: &Step) -> Result<(), String> {
+    fn take(&mut self, operation: &Operation) -> Result<(), String> {
         let n = self.width();
         let fits = |row: &[f64]| {
             if row.len() == 1 || row.len() == n {
@@ -113,19 +113,21 @@ impl Build {
                 Err(format!("has {} numbers for {n} entries", row.len()))
             }
         };
-        match step {
-            Step::Input(..) | Step::Same => Ok(()),
-            Step::Dense { n_in, n_out, weight, bias } => self.dense(*n_in, *n_out, weight, bias),
-            Step::Affine(scale, shift) => fits(scale).and(fits(shift)).map(|()| self.affine(scale, shift)),
-            Step::Clip(lower, upper) => {
+        match operation {
+            Operation::Input(..) | Operation::Same => Ok(()),
+            Operation::Dense { n_in, n_out, weight, bias } => self.dense(*n_in, *n_out, weight, bias),
+            Operation::Affine(scale, shift) => {
+                fits(scale).and(fits(shift)).map(|()| self.affine(scale, shift))
+            }
+            Operation::Clip(lower, upper) => {
                 fits(lower).and(fits(upper))?;
                 let end = if self.layers.is_empty() { &mut self.head } else { &mut self.tail };
                 end.clip(lower, upper);
                 Ok(())
             }
-            Step::Function(function) => self.function(*function),
-            Step::Select(_) | Step::Part(..) | Step::Slice(..) => {
-                let range = step.range(n).filter(|r| r.start < r.end && r.end <= n);
+            Operation::Function(function) => self.function(*function),
+            Operation::Select(_) | Operation::Part(..) | Operation::Slice(..) => {
+                let range = operation.range(n).filter(|r| r.start < r.end && r.end <= n);
                 let range =
                     range.ok_or_else(|| format!("takes entries that the {n} before it do not have"))?;
                 self.select(range)

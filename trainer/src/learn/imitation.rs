@@ -4,7 +4,7 @@
 //! fill the statistics with demonstrations and a first batch
 //! warm up: the inverse model on the fresh networks' own noise
 //! pre-train: behaviour cloning                                   (Algorithm 2, lines 1 to 5)
-//! update after update, with the demonstrations normalised by the statistics of that moment, and where likeness is the reward with that
+//! for each batch: demonstrations normalised by the statistics of the moment; where likeness is the reward, it is learned and given first
 //! ```
 
 use super::batch::Batch;

@@ -20,7 +20,7 @@ pub(super) const CLIP: f32 = nearl_runtime::normaliser::CLIP as f32;
 /// What of a row of actions the inverse model's squared error is compared with the threshold.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Reading {
+pub enum ThresholdPer {
     /// The mean over its entries.
     #[default]
     Entry,
@@ -28,7 +28,7 @@ pub enum Reading {
     Row,
 }
 
-impl Reading {
+impl ThresholdPer {
     /// Whether a mean squared error of `error` an entry, of `n` entries, is at least `threshold`.
     pub fn exceeds(self, error: f64, n: usize, threshold: f64) -> bool {
         let factor = if self == Self::Row { n as f64 } else { 1.0 };
@@ -202,12 +202,12 @@ multiversion!(fn squared_error(m: &InverseModel, p: &[V], b: &Batch, idx: &[u32]
 
 #[cfg(test)]
 mod tests {
-    use super::Reading;
+    use super::ThresholdPer;
 
     /// 0.3 an entry is 2.4 a row of eight: below the paper's 0.5 as one reading, above it as the other.
     #[test]
     fn the_threshold_has_two_readings() {
-        assert!(!Reading::Entry.exceeds(0.3, 8, 0.5) && Reading::Row.exceeds(0.3, 8, 0.5));
-        assert!(Reading::Entry.exceeds(0.5, 8, 0.5) && !Reading::Row.exceeds(0.06, 8, 0.5));
+        assert!(!ThresholdPer::Entry.exceeds(0.3, 8, 0.5) && ThresholdPer::Row.exceeds(0.3, 8, 0.5));
+        assert!(ThresholdPer::Entry.exceeds(0.5, 8, 0.5) && !ThresholdPer::Row.exceeds(0.06, 8, 0.5));
     }
 }

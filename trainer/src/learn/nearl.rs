@@ -14,7 +14,7 @@
 use super::combined::{Combined, CombinedScratch, Gradient, Kind};
 use super::epochs::{Pace, Update};
 use super::gaussian::gather;
-use super::inverse::Reading;
+use super::inverse::ThresholdPer;
 use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, Tile, add_sums, optimise};
 use super::pid2::Pid2Settings;
@@ -37,7 +37,7 @@ pub struct NearlSettings {
     /// The inverse model learns from reached transitions while its mean squared error is at least this (\[sigma_I\]).
     pub idm_threshold: f64,
     /// What of a row of actions is compared with the threshold.
-    pub idm_threshold_per: Reading,
+    pub idm_threshold_per: ThresholdPer,
     /// Learning rate of the inverse model's supervised loss.
     pub idm_lr: f32,
     /// How the policy gradient passes the projection.

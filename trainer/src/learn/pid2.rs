@@ -21,7 +21,7 @@ mod null_space;
 use super::combined::{Combined, CombinedScratch, Gradient, Kind};
 use super::discriminator::{Discriminator, DiscriminatorScratch, LATENT};
 use super::epochs::{Pace, Update};
-use super::inverse::Reading;
+use super::inverse::ThresholdPer;
 use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, SUMS, Tile, add_sums, optimise};
 use super::ppo::PpoSettings;
@@ -45,7 +45,7 @@ pub struct Pid2Settings {
     /// The inverse model learns from reached transitions while its mean squared error is at least this (\[sigma_I\]).
     pub idm_threshold: f64,
     /// What of a row of actions is compared with the threshold.
-    pub idm_threshold_per: Reading,
+    pub idm_threshold_per: ThresholdPer,
     /// Learning rate of the inverse model's supervised loss.
     pub idm_lr: f32,
     /// Learning rate of the discriminator.
@@ -78,7 +78,7 @@ impl Default for Pid2Settings {
     fn default() -> Self {
         Self {
             idm_threshold: 0.5,
-            idm_threshold_per: Reading::default(),
+            idm_threshold_per: ThresholdPer::default(),
             idm_lr: 3e-4,
             discriminator_lr: 3e-4,
             generator_weight: 0.1,

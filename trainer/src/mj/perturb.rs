@@ -29,6 +29,8 @@ pub struct Physique {
     pub bias: Vec<[f64; 3]>,
     /// Smallest and largest force of each actuator \[N·m or N\].
     pub force_range: Vec<[f64; 2]>,
+    /// Height of each field of bumps \[m\].
+    pub bumps: Vec<f64>,
 }
 
 impl Model {
@@ -75,6 +77,7 @@ impl Model {
             gain: m.actuator_gainprm().iter().map(|gain| gain[0]).collect(),
             bias: m.actuator_biasprm().iter().map(|bias| first_three(bias)).collect(),
             force_range: m.actuator_forcerange().to_vec(),
+            bumps: m.hfield_size().iter().map(|size| size[2]).collect(),
         }
     }
 }
@@ -98,9 +101,9 @@ impl Sim {
     /// When the numbers are of another robot.
     pub fn change(&mut self, to: &Physique) -> Result<(), MjError> {
         let now = self.model().physique();
-        let same = (now.mass.len(), now.friction.len(), now.armature.len(), now.gain.len())
-            == (to.mass.len(), to.friction.len(), to.armature.len(), to.gain.len());
-        assert!(same, "the numbers of another robot");
+        let lengths =
+            |p: &Physique| [p.mass.len(), p.friction.len(), p.armature.len(), p.gain.len(), p.bumps.len()];
+        assert!(lengths(&now) == lengths(to), "the numbers of another robot");
         self.call_with_model(|m, d| {
             // SAFETY: the arrays have the lengths compared above, and nothing else reads this robot meanwhile.
             unsafe {
@@ -134,6 +137,9 @@ unsafe fn write(m: *mut mjModel, to: &Physique) {
             let bias = (*m).actuator_biasprm.add(i * mujoco_rs::mujoco_c::mjNBIAS as usize);
             (0..3).for_each(|k| *bias.add(k) = to.bias[i][k]);
             (0..2).for_each(|k| *(*m).actuator_forcerange.add(2 * i + k) = to.force_range[i][k]);
+        }
+        for (i, height) in to.bumps.iter().enumerate() {
+            *(*m).hfield_size.add(4 * i + 2) = *height;
         }
     }
 }

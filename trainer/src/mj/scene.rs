@@ -7,13 +7,15 @@ use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::mj_editing::{MjSpec, MjtLimited, PositionConfig, SpecItem};
 use mujoco_rs::wrappers::mj_model::{MjModel, MjtGeomBase, MjtJoint, MjtTrn};
 
-use super::{MjError, guard};
+use super::{MjError, guard, terrain};
 
 /// Things of a task that are not in its robot file. The default adds nothing.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Scene {
     /// A plane at z = 0 with this coefficient of friction.
     pub floor: Option<f64>,
+    /// Height of the bumps on it \[m\].
+    pub bumps: Option<f64>,
     /// Spheres on bodies of the robot, which touch the floor.
     pub feet: Vec<Foot>,
     /// Drives `K (u - q) - D v` of joints with one degree of freedom, in the order of the action.
@@ -86,6 +88,9 @@ impl Scene {
                 spec.world_body_mut().add_geom().with_name("floor").with_type(MjtGeomBase::mjGEOM_PLANE);
             floor.with_size([0.0, 0.0, 1.0]).with_friction([friction, 0.005, 1e-4]);
             floor.with_contype(1).with_conaffinity(1).with_condim(3);
+            if let Some(height) = self.bumps {
+                terrain::add_to(spec, height, friction);
+            }
         }
         for foot in &self.feet {
             let body = spec.body_mut(&foot.body).ok_or_else(|| MjError::NoBody(foot.body.clone()))?;

@@ -248,6 +248,11 @@ impl Sim {
         self.state.xpos()[body]
     }
 
+    /// MuJoCo's own state.
+    pub(super) fn data(&self) -> &MjData<Arc<MjModel>> {
+        &self.state
+    }
+
     /// Position of every body's frame in the world \[m\], the world included, as of the last evaluation.
     pub fn positions(&self) -> &[[f64; 3]] {
         self.state.xpos()

@@ -3,7 +3,7 @@
 mod stream;
 
 use super::resume::Episode;
-use super::{Judge, Period, RolloutError, Rows};
+use super::{Period, RolloutError, Rows, Scorer};
 use crate::demos::{self, Frame};
 use crate::env::{Env, EnvError, Fault};
 use crate::foresight::{Foresight, Verdict};
@@ -24,7 +24,7 @@ pub struct Worker {
     learned: bool,
     pub(super) rng: ChaCha8Rng,
     /// What gives reward and end of a control period in the task's place, and the observation at its begin.
-    judge: Option<(Judge, Vec<f64>)>,
+    scorer: Option<(Scorer, Vec<f64>)>,
     /// Asks the simulator where an action leads, if the task says so.
     foresight: Option<Foresight>,
     foresees: bool,
@@ -77,7 +77,7 @@ impl Worker {
         let limits = watched_limits(&*env, controller.model(), controller.limits());
         let mut worker = Self {
             foresight: asks.then(|| Foresight::new(&*env, &limits)),
-            judge: None,
+            scorer: None,
             foresees: true,
             foreseen: [0; 2],
             kind: snapshot.manifest.policy,
@@ -131,8 +131,8 @@ impl Worker {
     }
 
     /// Lets somebody else's code give reward and end of every control period to come.
-    pub fn set_judge(&mut self, judge: Judge) {
-        self.judge = Some((judge, vec![0.0; self.state.obs.len()]));
+    pub fn set_scorer(&mut self, scorer: Scorer) {
+        self.scorer = Some((scorer, vec![0.0; self.state.obs.len()]));
     }
 
     /// Lets that share of the episodes to come begin in one of the frames.
@@ -310,15 +310,15 @@ impl Worker {
             }
         }
         self.history.push(&self.out.action);
-        if let Some((_, obs)) = &mut self.judge {
+        if let Some((_, obs)) = &mut self.scorer {
             obs.copy_from_slice(&self.state.obs);
         }
         let mut step = self.env.step(&self.out.action);
         self.ticks += 1;
         self.cost += step.cost;
         self.observe();
-        if let Some((judge, obs)) = self.judge.as_ref().filter(|_| step.fault == Fault::None) {
-            step = judge.ask(obs, &self.out.action, &self.state.obs, step);
+        if let Some((scorer, obs)) = self.scorer.as_ref().filter(|_| step.fault == Fault::None) {
+            step = scorer.score(obs, &self.out.action, &self.state.obs, step);
         }
         let (ledger, tally) = (&self.out.next.ledger, &mut self.rows.collected.tally);
         tally.count(ledger);

@@ -24,7 +24,7 @@ impl Training {
             rng,
             adam: params.adam.iter().map(|a| a.t).collect(),
             workers: Vec::new(),
-            judged: self.judge.is_some(),
+            is_scored_elsewhere: self.scorer.is_some(),
         };
         let mut to = Checkpoint { header, tensors: BTreeMap::new() };
         let mut put = |name: String, values: Values| to.tensors.insert(name, values);
@@ -80,7 +80,7 @@ impl Training {
         threads: usize,
     ) -> Result<Self, TrainError> {
         let header = &from.header;
-        if header.judged && !matches!(experience, Experience::Judged(_)) {
+        if header.is_scored_elsewhere && !matches!(experience, Experience::Scored(_)) {
             return Err(TrainError::Settings(format!(
                 "the training in '{}' has its reward or its termination from Python functions, which no file holds; go on in Python with \
                  nearl.PID2.load(run, reward=..., termination=...)",

@@ -177,7 +177,7 @@ fn check_motors(manifest: &Manifest, env: &dyn Env) -> Result<(), TrainError> {
 }
 
 pub(super) fn check_reward(task: &Task, experience: &Experience) -> Result<(), TrainError> {
-    if matches!(experience, Experience::Judged(judge) if judge.rewards) {
+    if matches!(experience, Experience::Scored(scorer) if scorer.rewards) {
         return Ok(());
     }
     let is_nothing = |v: &toml::Value| v.as_float() == Some(0.0) || v.as_integer() == Some(0);
@@ -207,7 +207,7 @@ pub(super) fn check_experience(
     experience: &Experience,
 ) -> Result<(), TrainError> {
     let (source, next) = match experience {
-        Experience::Here | Experience::Judged(_) | Experience::Ranks(_) => return Ok(()),
+        Experience::Here | Experience::Scored(_) | Experience::Ranks(_) => return Ok(()),
         Experience::Loop(name, _) => (format!("the loop of '{name}'"), "--from"),
         Experience::Served(name, _) => (format!("the rollout server '{name}'"), "--collect"),
     };

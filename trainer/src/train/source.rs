@@ -6,7 +6,7 @@ use crate::checkpoint::Checkpoint;
 use crate::demos::Frame;
 use crate::online::{LoopSource, OnlineError};
 use crate::ranks::{RankError, Ranks};
-use crate::rollout::{Collected, Collector, Judge, RolloutError};
+use crate::rollout::{Collected, Collector, RolloutError, Scorer};
 use crate::settings::TrainSettings;
 use nearl_rollout_protocol::Layout;
 use nearl_runtime::Snapshot;
@@ -41,7 +41,7 @@ pub enum Experience {
     #[default]
     Here,
     /// The same, but reward and end of a control period are somebody else's.
-    Judged(Judge),
+    Scored(Scorer),
     /// The running loop of this robot, until the flag is set.
     Loop(RobotName, Arc<AtomicBool>),
     /// The rollout server of this name, until the flag is set.
@@ -134,14 +134,14 @@ impl Experience {
         seed: u64,
     ) -> Result<Box<dyn Source>, SourceError> {
         match self {
-            Self::Here | Self::Judged(_) => {
+            Self::Here | Self::Scored(_) => {
                 let (n_envs, n_steps) = (settings.n_envs, settings.n_steps);
                 let mut collector =
                     Collector::new(snapshot, 0..n_envs, n_steps, threads, settings.gamma, seed)?;
                 for worker in collector.workers() {
                     worker.set_moved_penalty(settings.moved_penalty);
-                    if let Self::Judged(judge) = self {
-                        worker.set_judge(judge.clone());
+                    if let Self::Scored(scorer) = self {
+                        worker.set_scorer(scorer.clone());
                     }
                 }
                 Ok(Box::new(collector))

@@ -1,4 +1,4 @@
-//! Threads that wait between the steps of a vector.
+//! Threads that step the environments of a vector, and wait in between.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};

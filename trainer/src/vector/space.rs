@@ -1,4 +1,4 @@
-//! What an action of a vector is, and the snapshots whose proposals are the caller's.
+//! What the numbers of an action mean in a vector, their bounds, and the snapshot behind environments whose caller proposes.
 
 use std::path::Path;
 

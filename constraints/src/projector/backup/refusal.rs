@@ -11,31 +11,31 @@ const LATER: u32 = 4;
 /// Where a target, or the brake that was planned from it, is furthest beyond some hard row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Refusal {
-    /// In the step to it.
-    Step,
+    /// In the passage to it.
+    Passage,
     /// In this tick of the brake.
     Brake(u32),
 }
 
-/// A step in one period.
+/// From one state to the next in one period.
 #[derive(Clone, Copy)]
-pub(crate) struct Step<'a> {
+pub(crate) struct Passage<'a> {
     pub(crate) from: (&'a [f64], &'a [f64]),
     pub(crate) to: (&'a [f64], &'a [f64]),
-    /// Acceleration of the step (nv).
+    /// Acceleration of the passage (nv).
     pub(crate) acceleration: &'a [f64],
 }
 
 impl Backup {
-    /// Why the target of `step` is refused: the step itself or a tick of the brake that is tried first; `None` where that shows nothing
+    /// Why the target of `passage` is refused: the passage itself or a tick of the brake that is tried first; `None` where that shows nothing
     /// wrong. The breaches of the rows there are [`Backup::found`].
-    pub(crate) fn refusal(&mut self, with: &With<'_>, step: Step<'_>) -> Option<Refusal> {
-        if !self.allows(with, step.from, step.to) {
+    pub(crate) fn refusal(&mut self, with: &With<'_>, passage: Passage<'_>) -> Option<Refusal> {
+        if !self.allows(with, passage.from, passage.to) {
             self.keep_found();
-            return Some(Refusal::Step);
+            return Some(Refusal::Passage);
         }
-        let (q, v) = step.to;
-        if !self.plan(with, (q, v), step.acceleration, self.tried_first()) {
+        let (q, v) = passage.to;
+        if !self.plan(with, (q, v), passage.acceleration, self.tried_first()) {
             return None;
         }
         if self.within_reach(with, q, v) {
@@ -66,25 +66,25 @@ impl Backup {
     pub(crate) fn slopes(
         &mut self,
         with: &With<'_>,
-        (refusal, step): (Refusal, Step<'_>),
+        (refusal, passage): (Refusal, Passage<'_>),
         i: usize,
         slopes: &mut [f64],
     ) -> bool {
         let Some(iq) = with.dofs.single[i] else { return false };
-        let (q, v) = step.to;
+        let (q, v) = passage.to;
         let dt = with.period.dt;
         // Towards standstill, where the number of ticks of a brake does not grow.
         let probe = -v[i].signum() * PROBE * with.limits.acceleration[i].min(1e6) * dt;
         let mut near = std::mem::take(&mut self.near);
         near.q.copy_from_slice(q);
         near.v.copy_from_slice(v);
-        near.a.copy_from_slice(step.acceleration);
+        near.a.copy_from_slice(passage.acceleration);
         near.q[iq] += with.period.kappa * dt * probe;
         near.v[i] += probe;
         near.a[i] += probe / dt;
         let known = match refusal {
-            Refusal::Step => {
-                self.allows(with, step.from, (&near.q, &near.v));
+            Refusal::Passage => {
+                self.allows(with, passage.from, (&near.q, &near.v));
                 true
             }
             Refusal::Brake(tick) => {

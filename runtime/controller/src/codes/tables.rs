@@ -20,6 +20,9 @@ codes! {
             "Check the robot file's masses and the plant's velocities.";
         RefusedNonFiniteState = "refused-non-finite-state", "The measured state held NaN or infinity.",
             "Check the plant's sensors.";
+        ActionsBounded = "actions-bounded",
+            "The policy gives actions, and these were kept within limits of their own or within what the drives' motors allow; nothing was projected.",
+            "Write `[constraints] guard = true` where limits on the motion matter.";
         NotProjected = "not-projected", "The policy gives actions and proposes no state: nothing was projected, and no limit was looked at.",
             "Train with an algorithm that proposes states (`nearl train TASK --algo pid2-ib`) where limits matter.";
         RefusedWrongLength = "refused-wrong-length", "The state does not have the robot's number of entries.",
@@ -30,7 +33,7 @@ codes! {
 }
 
 impl LedgerStatus {
-    /// The number in messages: 0 to 4 and 6 projected, 5 not, 10 and up braked, 20 and up refused.
+    /// The number in messages: 0 to 4 and 6 projected, 5 and 7 not, 10 and up braked, 20 and up refused.
     pub fn number(self) -> u32 {
         match self {
             LedgerStatus::BrakedNonFiniteProposal => 10,
@@ -39,6 +42,7 @@ impl LedgerStatus {
             LedgerStatus::BrakedNoVerifiedBrake => 13,
             LedgerStatus::NotProjected => 5,
             LedgerStatus::Tightening => 6,
+            LedgerStatus::ActionsBounded => 7,
             LedgerStatus::RefusedNonFiniteState => 20,
             LedgerStatus::RefusedWrongLength => 21,
             plain => plain.code(),

@@ -19,6 +19,8 @@ pub(super) enum Quantity {
     Place(usize, usize),
     /// `vx.<body>`, `vy.`, `vz.`: change of it over the control period, per second \[m/s\].
     Speed(usize, usize),
+    /// `ground.<body>`: height of the ground where the body is \[m\].
+    Ground(usize),
     /// `base.vx`, `base.vy`, `base.vz`: velocity of the free base in its own axes \[m/s\].
     BaseLinear(usize),
     /// `base.wx`, `base.wy`, `base.wz`: its angular velocity there \[rad/s\].
@@ -167,6 +169,7 @@ impl Names {
                 self.put(format!("contact.{name}"), Quantity::Contact(body));
                 self.put(format!("air.{name}"), Quantity::Air(body));
                 self.put(format!("landed.{name}"), Quantity::Landed(body));
+                self.put(format!("ground.{name}"), Quantity::Ground(body));
             }
         }
     }
@@ -340,6 +343,10 @@ impl Seen<'_> {
             Quantity::Position(i) => self.q[i],
             Quantity::Velocity(i) => self.v[i],
             Quantity::Place(body, axis) => self.sim.positions()[body][axis],
+            Quantity::Ground(body) => {
+                let [x, y, _] = self.sim.positions()[body];
+                self.sim.ground(x, y)
+            }
             Quantity::Time => self.sim.time(),
             Quantity::Period => self.dt,
             _ => f64::NAN,

@@ -6,6 +6,7 @@
 //! com = { base = "0.03 * uniform" }             # m, added to every axis of the centre of mass of this body
 //! friction = { all = "0.8 + 0.4 * uniform" }    # factor, one draw for all
 //! strength = "0.9 + 0.1 * uniform"              # factor on the force of every motor
+//! bumps = "level"                               # factor from 0 to 1 on the height of the floor's bumps
 //! ```
 
 use rand_chacha::ChaCha8Rng;
@@ -27,9 +28,10 @@ enum Kind {
     Stiffness,
     Damping,
     Armature,
+    Bumps,
 }
 
-const KINDS: [(&str, Kind); 8] = [
+const KINDS: [(&str, Kind); 9] = [
     ("mass", Kind::Mass),
     ("inertia", Kind::Inertia),
     ("com", Kind::Centre),
@@ -38,6 +40,7 @@ const KINDS: [(&str, Kind); 8] = [
     ("stiffness", Kind::Stiffness),
     ("damping", Kind::Damping),
     ("armature", Kind::Armature),
+    ("bumps", Kind::Bumps),
 ];
 
 /// One expression and what it is drawn for.
@@ -91,6 +94,10 @@ impl Random {
                     "the robot has motors of torques and no drives; take it out, or command the joints 'pd'";
                 return Err(mistake(key, reason));
             }
+            if *kind == Kind::Bumps && model.physique().bumps.is_empty() {
+                let reason = "the floor is flat; give it bumps (scene.floor.bumps, in m), or take this out";
+                return Err(mistake(key, reason));
+            }
             let names = kind.names(model, actuators);
             match value {
                 toml::Value::Table(by_name) => {
@@ -101,7 +108,7 @@ impl Random {
                 }
                 value => {
                     let of = Text::read(&key, value, start)?;
-                    let together = *kind == Kind::Friction;
+                    let together = matches!(kind, Kind::Friction | Kind::Bumps);
                     draws.push(Draw { kind: *kind, entries: kind.all(model, names.len()), together, of });
                 }
             }
@@ -196,6 +203,7 @@ impl Kind {
         match self {
             Kind::Mass | Kind::Inertia | Kind::Centre => model.body_names(),
             Kind::Friction => (0..model.physique().friction.len()).map(|i| format!("solid{i}")).collect(),
+            Kind::Bumps => (0..model.physique().bumps.len()).map(|i| format!("field{i}")).collect(),
             _ => actuators.iter().map(|actuator| actuator.name.clone()).collect(),
         }
     }
@@ -214,6 +222,8 @@ impl Kind {
         match self {
             Kind::Centre => value,
             Kind::Mass | Kind::Inertia => value.max(0.01),
+            // MuJoCo looks for contacts within the height that was compiled.
+            Kind::Bumps => value.clamp(0.0, 1.0),
             _ => value.max(0.0),
         }
     }
@@ -237,6 +247,7 @@ impl Kind {
             Kind::Centre => p.centre[entry][axis] += value,
             Kind::Friction => by(&mut p.friction[entry][0]),
             Kind::Armature => by(&mut p.armature[dofs[entry]]),
+            Kind::Bumps => by(&mut p.bumps[entry]),
             Kind::Strength if p.gain.is_empty() => by(&mut strength[entry]),
             Kind::Strength => {
                 by(&mut p.gain[entry]);

@@ -1,10 +1,7 @@
 //! A tick allocates nothing, except one buffer inside each Clarabel solve.
 
-mod common;
-#[path = "common/counting.rs"]
-mod counting;
-
-use common::*;
+use crate::common::*;
+use crate::counting;
 use nearl_constraints::*;
 
 /// Ticks by rung, allocations by rung.

@@ -9,13 +9,13 @@ type Function = dyn Fn(&[f64], &[f64], &[f64], Step) -> Step + Send + Sync;
 ///
 /// Environments ask from several threads at once and in any order: the same arguments must give the same answer.
 #[derive(Clone)]
-pub struct Judge {
+pub struct Scorer {
     function: Arc<Function>,
     /// Whether it gives the reward, so that the task's own counts for nothing.
     pub rewards: bool,
 }
 
-impl Judge {
+impl Scorer {
     /// `function(obs, action, next_obs, step)` (n_obs, n_act, n_obs) gives what the period is worth that the task gives as `step`.
     pub fn new(
         rewards: bool,
@@ -24,13 +24,13 @@ impl Judge {
         Self { function: Arc::new(function), rewards }
     }
 
-    pub(super) fn ask(&self, obs: &[f64], action: &[f64], next_obs: &[f64], step: Step) -> Step {
+    pub(super) fn score(&self, obs: &[f64], action: &[f64], next_obs: &[f64], step: Step) -> Step {
         (self.function)(obs, action, next_obs, step)
     }
 }
 
-impl std::fmt::Debug for Judge {
+impl std::fmt::Debug for Scorer {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Judge").field("rewards", &self.rewards).finish_non_exhaustive()
+        f.debug_struct("Scorer").field("rewards", &self.rewards).finish_non_exhaustive()
     }
 }

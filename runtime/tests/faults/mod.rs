@@ -1,10 +1,6 @@
 //! The faults of the design, one test each: what is injected, which code the loop gives, and that the arm stays within
 //! its limits. `docs/FAULTS.md` is written from [`table::ROWS`].
 
-#![allow(unreachable_pub)] // modules of a test program
-
-#[path = "../arm/mod.rs"]
-mod arm;
 mod files;
 mod flight;
 mod kills;
@@ -16,10 +12,9 @@ mod solver;
 mod stage;
 mod system;
 mod table;
-#[path = "../toy/mod.rs"]
-mod toy;
 
-use arm::*;
+use crate::arm::*;
+use crate::toy;
 use flight::{Flight, settings};
 use nearl_runtime::codes::LedgerStatus;
 use nearl_runtime::rt::*;

@@ -1,15 +1,13 @@
 //! The real-time thread neither allocates nor frees between its first and its last tick, swaps included.
 
-mod toy;
-
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use crate::toy::*;
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
-use toy::*;
 
 thread_local! {
     /// Set by the controller's first tick on the thread that runs it.

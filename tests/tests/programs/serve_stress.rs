@@ -1,8 +1,6 @@
 //! A rollout server under clients that leave, are killed, cancel, read slowly, and send what is no request.
 //!
-//! Five minutes of it: `NEARL_STRESS_SECONDS=300 cargo test --release -p nearl-tests --test serve_stress -- --nocapture`.
-
-mod common;
+//! Five minutes of it: `NEARL_STRESS_SECONDS=300 cargo test --release -p nearl-tests --test programs serve_stress -- --nocapture`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -10,7 +8,7 @@ use std::process::Command;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use common::*;
+use crate::common::*;
 use nearl_runtime::Snapshot;
 use nearl_runtime::link::{RobotName, remains, remove_files};
 use nearl_trainer::rollout::{Worker, make_env, stream};
@@ -187,8 +185,9 @@ fn killer(name: &Name, end: Instant) -> u64 {
     let (mut rng, mut killed) = (StdRng::seed_from_u64(99), 0);
     while Instant::now() < end {
         let mut command = Command::new(std::env::current_exe().expect("path of the test program"));
-        let client =
-            Process::start(command.args(["--exact", "client", "--ignored"]).env(ROLE, name.0.as_str()));
+        let client = Process::start(
+            command.args(["--exact", "serve_stress::client", "--ignored"]).env(ROLE, name.0.as_str()),
+        );
         std::thread::sleep(Duration::from_millis(rng.random_range(0..1000)));
         client.kill();
         killed += 1;
