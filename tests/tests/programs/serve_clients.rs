@@ -59,7 +59,15 @@ impl Server {
 
     /// Waits until nothing of any client is left.
     pub(crate) fn alone(&self) {
-        until("the server alone", || (self.held() == ALONE).then_some(()));
+        let mut last = None;
+        until("the server alone", || {
+            let held = Some(self.held());
+            if held != last {
+                println!("segments and holders: {:?}", held.unwrap_or_default());
+                last = held;
+            }
+            (held == Some(ALONE)).then_some(())
+        });
     }
 
     pub(crate) fn end(mut self) -> serde_json::Value {
