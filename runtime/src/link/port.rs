@@ -34,6 +34,12 @@ impl<M: Queued> Outbox<M> {
         self.service.dynamic_config().number_of_subscribers()
     }
 
+    /// Lets go of readers that are gone. Sending does the same; one who has nothing more to send would keep their segments.
+    pub fn update_readers(&mut self) {
+        // A failure leaves the connections as they are until the next call.
+        let _ = self.port.update_connections();
+    }
+
     /// Numbers, stamps and sends `message`; false if it could not be sent.
     pub fn send(&mut self, message: &mut M) -> bool {
         self.seq += 1;

@@ -102,6 +102,7 @@ impl RolloutServer {
         self.bus.clean();
         // A failure leaves the connections as they are until the next call.
         let _ = self.port.update_connections();
+        self.receipts.update_readers();
         self.departed.sweep();
         self.departed.listed()
     }
