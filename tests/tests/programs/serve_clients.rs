@@ -59,14 +59,14 @@ impl Server {
 
     /// Waits until nothing of any client is left.
     pub(crate) fn alone(&self) {
-        let mut last = None;
+        let mut last = (0, 0);
         until("the server alone", || {
-            let held = Some(self.held());
+            let held = self.held();
             if held != last {
-                println!("segments and holders: {:?}", held.unwrap_or_default());
+                println!("segments and holders: {held:?}");
                 last = held;
             }
-            (held == Some(ALONE)).then_some(())
+            (held == ALONE).then_some(())
         });
     }
 
