@@ -4,6 +4,8 @@
 //! show, then counts on; a reader copies the place that is shown and keeps the copy if the count is still the same. Nobody waits for
 //! anybody, there is no system call, and a process killed at any moment leaves the last whole message. Only the entries in use are copied.
 //!
+//! Beside each place stands a sum of its words and its number. A message that something else has written into does not have it, and is refused.
+//!
 //! The file gets its name when it is complete. A sender's successor puts its own in its place, which readers find when they
 //! [`attend`](BoardReader::attend); who may send is decided by [`Owner`](super::owner::Owner).
 //!
@@ -35,6 +37,9 @@ const COUNT: usize = APART;
 /// Where the first place begins [words].
 const PLACES: usize = 2 * APART;
 
+/// By which the first word counts in the sum of a message; odd, as those of the words after it are, which are two apart.
+const FACTOR: u64 = 0x9E37_79B9_7F4A_7C15;
+
 /// Words of a message.
 const fn words<M>() -> usize {
     assert!(size_of::<M>().is_multiple_of(WORD) && align_of::<M>() == WORD, "a message is a row of words");
@@ -51,9 +56,14 @@ struct Memory {
 unsafe impl Send for Memory {}
 
 impl Memory {
+    /// Words of a place: a message and its sum.
+    const fn place_length<M>() -> usize {
+        (words::<M>() + 1).next_multiple_of(APART)
+    }
+
     /// Words of the file of a message: schema, count, two places.
     const fn length<M>() -> usize {
-        PLACES + 2 * words::<M>().next_multiple_of(APART)
+        PLACES + 2 * Self::place_length::<M>()
     }
 
     fn map<M>(file: &File, rights: ProtFlags) -> io::Result<Memory> {
@@ -75,10 +85,10 @@ impl Memory {
         &self.all()[COUNT]
     }
 
-    /// The place of the message with this number.
-    fn place<M>(&self, number: u64) -> &[AtomicU64] {
-        let start = PLACES + (number % 2) as usize * words::<M>().next_multiple_of(APART);
-        &self.all()[start..start + words::<M>()]
+    /// The place of the message with this number, and that of its sum.
+    fn place<M>(&self, number: u64) -> (&[AtomicU64], &AtomicU64) {
+        let start = PLACES + (number % 2) as usize * Self::place_length::<M>();
+        (&self.all()[start..start + words::<M>()], &self.all()[start + words::<M>()])
     }
 }
 
@@ -129,7 +139,7 @@ impl<M: Message + Arrays> Board<M> {
         self.number += 1;
         *message.header_mut() =
             Header { schema: M::SCHEMA, epoch: self.epoch, seq: self.number, stamp: clock::now() };
-        let place = self.memory.place::<M>(self.number);
+        let (place, sum) = self.memory.place::<M>(self.number);
         // Whoever reads a word written from here on sees that the message before has been shown.
         fence(Ordering::Release);
         let words = words_of(message);
@@ -138,6 +148,7 @@ impl<M: Message + Arrays> Board<M> {
                 to.store(*from, Ordering::Relaxed);
             }
         }
+        sum.store(sum_of(self.number, message), Ordering::Relaxed);
         self.memory.count().store(self.number, Ordering::Release);
     }
 }
@@ -157,15 +168,17 @@ pub(crate) struct BoardReader<M: Message + Arrays> {
     file: u64,
     number: u64,
     message: Box<M>,
-    /// Messages of another layout, and files that are none of ours.
+    /// What is being read, and takes the place of the last message if it is whole.
+    read: Box<M>,
+    /// Messages of another layout or without their sum, and files that are none of ours.
     pub(crate) refused: u64,
 }
 
 impl<M: Message + Arrays> BoardReader<M> {
     /// Finds the sender if it is there; else [`BoardReader::attend`] will.
     pub(crate) fn open(name: &RobotName) -> BoardReader<M> {
-        let (path, message) = (path::<M>(name), Box::new(M::zeroed()));
-        let mut reader = BoardReader { path, memory: None, file: 0, number: 0, message, refused: 0 };
+        let (path, message, read) = (path::<M>(name), Box::new(M::zeroed()), Box::new(M::zeroed()));
+        let mut reader = BoardReader { path, memory: None, file: 0, number: 0, message, read, refused: 0 };
         reader.attend();
         reader
     }
@@ -202,21 +215,24 @@ impl<M: Message + Arrays> BoardReader<M> {
         if number == self.number {
             return None;
         }
-        loop {
-            copy(memory.place::<M>(number), &mut *self.message);
+        let sum = loop {
+            let (place, sum) = memory.place::<M>(number);
+            copy(place, &mut *self.read);
+            let sum = sum.load(Ordering::Relaxed);
             // Whatever of this was written after the next message was shown, that message is seen to be shown.
             fence(Ordering::Acquire);
             let now = memory.count().load(Ordering::Relaxed);
             if now == number {
-                break;
+                break sum;
             }
             number = now;
-        }
+        };
         self.number = number;
-        if self.message.header().schema != M::SCHEMA {
+        if self.read.header().schema != M::SCHEMA || sum != sum_of(number, &*self.read) {
             self.refused += 1;
             return None;
         }
+        std::mem::swap(&mut self.message, &mut self.read);
         Some(&self.message)
     }
 }
@@ -245,6 +261,15 @@ fn copy<M: Message + Arrays>(place: &[AtomicU64], message: &mut M) {
     for range in message.arrays() {
         take(message, range);
     }
+}
+
+/// The sum of a message's number and of the words in use, each times an odd number of its own: no word changes alone without changing it, and
+/// what is changed at random keeps it once in 2^64.
+fn sum_of<M: Message + Arrays>(number: u64, message: &M) -> u64 {
+    let words = words_of(message);
+    let used = std::iter::once(0..M::FIXED).chain(message.arrays()).flatten();
+    let weighed = used.map(|at| words[at].wrapping_mul(FACTOR.wrapping_add(2 * at as u64)));
+    weighed.fold(number.wrapping_mul(FACTOR), u64::wrapping_add)
 }
 
 fn words_of<M: Message>(message: &M) -> &[u64] {
@@ -339,6 +364,36 @@ mod tests {
     }
 
     #[test]
+    fn a_message_that_was_written_into_is_refused_whichever_word_it_was() {
+        let name = name("scribbled");
+        let _home = home::Home::enter(&name).unwrap();
+        let mut board = Board::create(&name, 1).unwrap();
+        let mut reader = BoardReader::<ActionMessage>::open(&name);
+        let mut action = ActionMessage::zeroed();
+        action.nu = 7;
+        action.action_mut().fill(0.25);
+        let used: Vec<usize> =
+            (0..ActionMessage::FIXED).chain(action.arrays().into_iter().flatten()).collect();
+        for (k, word) in used.iter().enumerate() {
+            for written in [f64::INFINITY.to_bits(), 1e200_f64.to_bits(), u64::MAX, 0] {
+                board.send(&mut action);
+                let place = &board.memory.place::<ActionMessage>(board.number).0[*word];
+                let was = place.swap(written, Ordering::Relaxed);
+                let refused = reader.refused;
+                assert_eq!(reader.newest().is_none(), was != written, "word {word}");
+                assert_eq!(reader.refused, refused + u64::from(was != written));
+                assert!(
+                    k == 0 || reader.last().action().iter().all(|x| *x == 0.25),
+                    "the last whole one is kept"
+                );
+            }
+            board.send(&mut action);
+            assert!(reader.newest().is_some(), "the next is whole");
+        }
+        remove_files(&name);
+    }
+
+    #[test]
     fn foreign_files_and_lying_lengths_are_refused_or_clamped() {
         let name = name("foreign");
         let _home = home::Home::enter(&name).unwrap();
@@ -357,16 +412,26 @@ mod tests {
 
         let board = Board::<StateMessage>::create(&name, 1).unwrap();
         reader.attend();
-        board.memory.place::<StateMessage>(9).iter().for_each(|word| word.store(u64::MAX, Ordering::Relaxed));
-        board.memory.count().store(9, Ordering::Release);
+        let mut lie = StateMessage::zeroed();
+        words_of_mut(&mut lie).fill(u64::MAX);
+        let show = |number: u64, message: &StateMessage, sum: u64| {
+            let (place, of_place) = board.memory.place::<StateMessage>(number);
+            place.iter().zip(words_of(message)).for_each(|(to, from)| to.store(*from, Ordering::Relaxed));
+            of_place.store(sum, Ordering::Relaxed);
+            board.memory.count().store(number, Ordering::Release);
+        };
+        show(9, &lie, sum_of(9, &lie));
         assert!(reader.newest().is_none(), "another schema");
         assert_eq!(reader.refused, 2);
-        board.memory.place::<StateMessage>(10)[1..]
-            .iter()
-            .for_each(|word| word.store(u64::MAX, Ordering::Relaxed));
-        board.memory.place::<StateMessage>(10)[0].store(StateMessage::SCHEMA, Ordering::Relaxed);
-        board.memory.count().store(10, Ordering::Release);
+        lie.header.schema = StateMessage::SCHEMA;
+        show(10, &lie, sum_of(10, &lie));
         assert_eq!(reader.newest().unwrap().obs().len(), MAX_OBS);
+        // Not its sum, and the sum of the same message with another number.
+        show(11, &lie, sum_of(11, &lie) ^ 1);
+        assert!(reader.newest().is_none());
+        show(12, &lie, sum_of(14, &lie));
+        assert!(reader.newest().is_none());
+        assert_eq!(reader.refused, 4);
 
         board.memory.all()[SCHEMA].store(7, Ordering::Relaxed);
         let mut late = BoardReader::<StateMessage>::open(&name);
