@@ -72,7 +72,8 @@ demo: wheel
 
 # The site of all pages in target/site, with the Rust and the Python reference; fails on a dead link and on any warning of rustdoc.
 docs: package
-	RUSTDOCFLAGS="-D warnings" cargo doc --quiet --no-deps --release --locked -p nearl-constraints -p nearl-controller -p nearl-runtime -p nearl-trainer
+	RUSTDOCFLAGS="-D warnings" cargo doc --quiet --no-deps --release --locked \
+	-p nearl-constraints -p nearl-controller -p nearl-verify -p nearl-runtime -p nearl-rollout-protocol -p nearl-trainer
 	$(VENV)/bin/python docs/build.py target/site
 
 test: package

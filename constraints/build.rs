@@ -18,11 +18,15 @@ const TARGETS: [&str; 2] = ["lib/cmake/pinocchio/pinocchioTargets.cmake", "lib/c
 const SOURCES: [&str; 3] = ["cpp/build.cpp", "cpp/dynamics.cpp", "cpp/kinematics.cpp"];
 
 fn main() {
-    for variable in ["NEARL_SITE_PACKAGES", "PINOCCHIO_PREFIX", "CONDA_PREFIX", "ROS_DISTRO"] {
+    for variable in ["NEARL_SITE_PACKAGES", "PINOCCHIO_PREFIX", "CONDA_PREFIX", "ROS_DISTRO", "DOCS_RS"] {
         println!("cargo:rerun-if-env-changed={variable}");
     }
     println!("cargo:rerun-if-changed=build.rs");
     println!("cargo:rerun-if-changed=cpp");
+    // Documentation alone, where no Pinocchio is: nothing is compiled against it, nothing is linked.
+    if env::var_os("DOCS_RS").is_some() {
+        return;
+    }
 
     let prefix = prefix();
     let include = prefix.join("include");
