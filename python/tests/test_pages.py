@@ -1,0 +1,148 @@
+"""What the pages show and no command of theirs runs: every block of TOML is built into the task that it is a part of, every block of C
+compiles against the header."""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import JOINT, ROOT, link
+from test_readme import PAGES
+
+import nearl
+from nearl import _core
+from nearl.runs import tomllib
+
+EXAMPLES = ROOT / "examples"
+TASKS = EXAMPLES / "tasks"
+
+
+def blocks(language: str) -> dict[str, list[str]]:
+    """Those of every page that has some."""
+    found = {page.stem: re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL) for page in PAGES}
+    return {page: of for page, of in found.items() if of}
+
+
+def sections(text: str) -> dict[str, str]:
+    """A task file by its sections, each with those below it; what stands before the first is called ''."""
+    found: dict[str, str] = {}
+    name = ""
+    for line in text.splitlines(keepends=True):
+        header = re.match(r"\[(\w+)", line)
+        name = header[1] if header else name
+        found[name] = found.get(name, "") + line
+    return found
+
+
+def task(folder: Path, base: Path, block: str) -> str:
+    """`base` with the sections of `block` in the place of its own."""
+    tomllib.loads(block)
+    text = "".join((sections(base.read_text()) | sections(block)).values())
+    for robot in ("../robots/anymal/anymal.urdf", "anymal.urdf"):
+        text = text.replace(f'"{robot}"', f'"{EXAMPLES}/robots/anymal/anymal.urdf"')
+    file = folder / base.name
+    file.write_text(text)
+    return str(file)
+
+
+def trains(base: str, algo: str) -> Callable[[Path, str], None]:
+    """Environment, networks and controllers of the whole task."""
+
+    def build(folder: Path, block: str) -> None:
+        nearl.PID2(task(folder, TASKS / base, block), algo=algo, settings={"train.n_envs": 2, "train.n_steps": 16, f"train.{algo}.batch_size": 16}).learn(32)
+
+    return build
+
+
+def limits(folder: Path, block: str) -> None:
+    """Those of a Panda, with the line `[constraints]` or without."""
+    block = block if block.startswith("[") else f"[constraints]\n{block}"
+    nearl.blank(task(folder, TASKS / "Panda-reach.toml", block), folder / "panda.safetensors")
+    nearl.Controller.load(folder / "panda.safetensors")
+
+
+def guarded_file(folder: Path, block: str) -> None:
+    """Those of a recipe."""
+    policies = EXAMPLES / "policies"
+    nearl.import_onnx(policies / "reacher.onnx", policies / "reacher.xml", task(folder, policies / "reacher.toml", block))
+
+
+def recipe(folder: Path, block: str) -> None:
+    """For a leg on a base that floats, and a network of the sizes that the recipe says."""
+    parts = ['<robot name="leg">', link("base", 0.4, 6.0)]
+    parent = "base"
+    for joint in ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint"):
+        shape = {"x": 0.2, "y": 0, "axis": "0 1 0", "low": -3.0, "high": 3.0, "speed": 20.0, "effort": 30.0, "damping": 0.1}
+        parts += [JOINT.format(name=joint, parent=parent, child=f"of_{joint}", **shape), link(f"of_{joint}", 0.2, 1.0)]
+        parent = f"of_{joint}"
+    (folder / "leg.urdf").write_text("\n".join([*parts, "</robot>"]))
+    (folder / "recipe.toml").write_text(block)
+    n_in, n_out = 3 + 3 + 3 + 3 + 3 * 5 + 3, 3
+    layers = [(np.zeros((n_out, n_in)), np.zeros(n_out), "identity")]
+    policy = _core.Policy.from_layers(layers, np.zeros(n_in), np.ones(n_in), (-10.0, 10.0), (-100.0, 100.0))
+    controller = policy.controller(folder / "leg.urdf", folder / "recipe.toml")
+    assert (controller.dt, controller.policy_every) == (0.004, 5)
+
+
+# What the blocks of a page are a part of, in the page's order. Those of OWN_ROBOT are one file, which test_readme.py trains.
+PARTS = {
+    "GUARD": [guarded_file],
+    "LIMITS": [limits, trains("HalfCheetah-v5.toml", "ppo"), trains("HalfCheetah-v5.toml", "ppo")],
+    "OWN_LIMIT": [limits],
+    "POLICIES": [recipe],
+    "TASKS": [trains("anymal-walk.toml", "ppo")] * 2,
+}
+TOML = blocks("toml")
+SHOWN = [pytest.param(build, block, id=f"{page}: {block.splitlines()[0][:40]}") for page in PARTS for build, block in zip(PARTS[page], TOML.get(page, []))]
+
+
+def test_every_block_of_toml_has_its_place() -> None:
+    assert {page: len(of) for page, of in TOML.items() if page != "OWN_ROBOT"} == {page: len(of) for page, of in PARTS.items()}
+
+
+@pytest.mark.parametrize(("build", "block"), SHOWN)
+def test_toml(build: Callable[[Path, str], None], block: str, tmp_path: Path) -> None:
+    build(tmp_path, block)
+
+
+@pytest.mark.parametrize(("build", "block"), SHOWN)
+def test_toml_with_a_key_that_is_none_is_refused(build: Callable[[Path, str], None], block: str, tmp_path: Path) -> None:
+    last = re.findall(r"^\w+(?= = )", block, re.MULTILINE)[-1]
+    with pytest.raises(ValueError, match="unheard_of"):
+        build(tmp_path, re.sub(rf"^{last}(?= = )", "unheard_of", block, flags=re.MULTILINE))
+
+
+def compiled(compiler: str, body: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """The lines of a driver in a function, with what a driver has beside them."""
+    program = f"""#include <nearl.h>
+extern void read_sensors(double *q, double *v);
+extern void my_brake(const double *q, const double *v, double *torque);
+extern void write_motors(const double *torque);
+extern void sleep_until_next_period(void);
+void drive(nearl_robot robot, nearl_state state, double *q, double *v, double *torque);
+void drive(nearl_robot robot, nearl_state state, double *q, double *v, double *torque) {{
+    char error[256];
+    {body}
+}}
+"""
+    file = folder / ("page.c" if compiler == "cc" else "page.cpp")
+    file.write_text(program)
+    command = [compiler, "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-I", ROOT / "runtime" / "c" / "include", file]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("compiler", ["cc", "c++"])
+@pytest.mark.parametrize("block", [block for of in blocks("c").values() for block in of])
+def test_c(compiler: str, block: str, tmp_path: Path) -> None:
+    assert shutil.which(compiler), f"{compiler} is needed to build NEARL"
+    run = compiled(compiler, block, tmp_path)
+    assert run.returncode == 0, run.stderr
+    for name in set(re.findall(r"\bnearl_plant_\w+|\bNEARL_[A-Z]+", block)):
+        assert compiled(compiler, block.replace(name, f"{name}_x"), tmp_path).returncode != 0, f"{name} may be anything"
+
+
+def test_there_is_c_to_compile() -> None:
+    assert "CONNECT" in blocks("c")
