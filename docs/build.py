@@ -1,10 +1,12 @@
-"""The documentation as a site that reads offline: the pages of the repository, the Python reference, and a check of every link.
+"""The documentation as a site that reads offline: the pages of the repository, the Python reference, and a check of every link and
+anchor.
 
     python docs/build.py target/site
 
 Pages keep their places, so their links work here as they do in the repository; files and folders they link to come along.
 """
 
+import ast
 import inspect
 import re
 import shutil
@@ -80,55 +82,97 @@ def stage(folder: Path) -> None:
             place.write_text(text)
 
 
+def stubs() -> dict[str, str]:
+    """Types of the extension, by a name with a dot, as the package's stub says them."""
+    found = {}
+    for node in ast.parse((ROOT / "python" / "nearl" / "_core.pyi").read_text()).body:
+        inside = node.body if isinstance(node, ast.ClassDef) else [node]
+        for function in (f for f in inside if isinstance(f, ast.FunctionDef)):
+            takes, gives = ast.unparse(function.args), f" -> {ast.unparse(function.returns)}" if function.returns else ""
+            name = f"{node.name}.{function.name}" if isinstance(node, ast.ClassDef) else function.name
+            is_value = any(isinstance(d, ast.Name) and d.id == "property" for d in function.decorator_list)
+            if function.name == "__new__":
+                name, gives = node.name, ""
+            found[name] = gives.replace(" -> ", ": ") if is_value else f"({re.sub(r'^(self|cls)(, )?', '', takes)}){gives}"
+    return found
+
+
+def described(name: str, thing: object, types: dict[str, str]) -> str:
+    """Its types and its docstring."""
+    typed = types.get(name)
+    if typed is None and callable(thing):
+        try:
+            typed = re.sub(r"\(self(, )?", "(", str(inspect.signature(thing)))
+        except ValueError:  # it cannot be made by a call
+            typed = ""
+    return f"```text\nnearl.{name}{typed or ''}\n\n{inspect.getdoc(thing) or ''}\n```"
+
+
 def reference(file: Path) -> None:
-    """The Python package, from its docstrings."""
+    """The Python package, from its docstrings and its stub."""
     import nearl
 
+    types = stubs()
     parts = ["# Python", inspect.getdoc(nearl) or ""]
     for name in sorted(n for n in nearl.__all__ if not n.startswith("_")):
         thing = getattr(nearl, name)
-        parts.append(f"## nearl.{name}\n\n```text\n{inspect.getdoc(thing) or ''}\n```")
+        parts.append(f"## nearl.{name}\n\n{described(name, thing, types)}")
         members = vars(thing).items() if inspect.isclass(thing) else ()
         for member, value in members:
-            text = inspect.getdoc(value)
-            if not member.startswith("_") and text:
-                parts.append(f"### {name}.{member}\n\n```text\n{text}\n```")
+            if not member.startswith("_") and inspect.getdoc(value):
+                parts.append(f"### {name}.{member}\n\n{described(f'{name}.{member}', value, types)}")
     file.write_text("\n\n".join(parts) + "\n")
 
 
 class Links(HTMLParser):
-    """Addresses inside one page."""
+    """Addresses inside one page, its anchors, and what it needs to be shown."""
 
     def __init__(self) -> None:
         super().__init__()
         self.found: list[str] = []
+        self.anchors: set[str] = set()
+        self.needed: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found += [value for key, value in attrs if key in ("href", "src") and value]
+        for key, value in attrs:
+            if value and key in ("href", "src"):
+                self.found.append(value)
+                self.needed += [value] if tag != "a" else []
+            if value and key in ("id", "name"):
+                self.anchors.add(value)
 
 
 def dead_links(site: Path) -> list[str]:
-    """Links of the site's pages that lead nowhere inside it."""
-    dead = []
+    """Links of the site's pages that lead nowhere inside it, and what a page would have to fetch from elsewhere."""
+    pages: dict[Path, Links] = {}
     for page in site.rglob("*.html"):
         if "rust" in page.relative_to(site).parts or page.name == "404.html":
             continue
-        links = Links()
-        links.feed(page.read_text())
+        pages[page] = Links()
+        pages[page].feed(page.read_text())
+    dead = []
+    for page, links in pages.items():
+        dead += [f"{page.relative_to(site)}: needs {link}, which is not in the site" for link in links.needed if link.startswith(("http", "//"))]
         for link in links.found:
-            path = unquote(link.split("#")[0].split("?")[0])
-            if "://" not in link and not link.startswith(("mailto:", "data:")) and path and not (page.parent / path).exists():
+            if "://" in link or link.startswith(("mailto:", "data:")):
+                continue
+            path, _, anchor = link.partition("#")
+            target = (page.parent / unquote(path.split("?")[0])).resolve() if path else page.resolve()
+            there = pages.get(target)
+            if not target.exists() or (there and anchor and unquote(anchor) not in there.anchors):
                 dead.append(f"{page.relative_to(site)}: {link}")
     return dead
 
 
 def main(site: Path) -> int:
     """Builds the site into ``site``; 1 where a link is dead."""
+    site = site.resolve()
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         stage(work / "pages")
         reference(work / "pages" / "docs" / "PYTHON.md")
-        settings = f"site_name: NEARL\ndocs_dir: pages\nsite_dir: {site.resolve()}\nuse_directory_urls: false\ntheme:\n  name: mkdocs\n  color_mode: auto\n"
+        settings = f"site_name: NEARL\ndocs_dir: pages\nsite_dir: {site}\nuse_directory_urls: false\ntheme:\n  name: mkdocs\n  color_mode: auto\n"
+        settings += "  highlightjs: false\n"  # it would come from another host
         (work / "mkdocs.yml").write_text(settings + "plugins: []\n" + NAV)
         subprocess.run([sys.executable, "-m", "mkdocs", "build", "--quiet", "--config-file", work / "mkdocs.yml"], check=True)
     if (rust := ROOT / "target" / "doc").is_dir():
