@@ -22,32 +22,42 @@ LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
 NAV = """\
 nav:
   - Start: README.md
-  - Ten minutes from nothing: docs/START.md
-  - Commands: docs/COMMANDS.md
-  - Tasks: docs/TASKS.md
-  - Train for your own robot: docs/OWN_ROBOT.md
-  - Guard your policy: docs/GUARD.md
-  - Write a limit: docs/OWN_LIMIT.md
-  - Examples: examples/README.md
-  - Limits: docs/LIMITS.md
-  - Training: docs/TRAINING.md
-  - Demonstrations: docs/DEMONSTRATIONS.md
-  - From a recording to a running loop: docs/IMITATION.md
-  - Environments: docs/ENVIRONMENTS.md
-  - Policies made elsewhere: docs/POLICIES.md
-  - Connecting a robot: docs/CONNECT.md
-  - Embedding in Rust: docs/EMBED.md
-  - Reading a flight log: docs/FLIGHT_LOG.md
-  - What the doctor says: docs/DOCTOR.md
-  - Faults: docs/FAULTS.md
-  - Security: docs/SECURITY.md
-  - Words: docs/GLOSSARY.md
-  - Architecture: docs/ARCHITECTURE.md
+  - Tutorials:
+    - Ten minutes from nothing: docs/START.md
+    - Your own robot: docs/OWN_ROBOT.md
+    - Your own task: docs/TASKS.md
+    - Guard your policy: docs/GUARD.md
+    - Connect your robot: docs/CONNECT.md
+    - From a recording to a running loop: docs/IMITATION.md
+    - Read a flight log: docs/FLIGHT_LOG.md
+    - Write a limit: docs/OWN_LIMIT.md
+    - Examples: examples/README.md
+  - Use:
+    - Commands: docs/COMMANDS.md
+    - Limits: docs/LIMITS.md
+    - Training: docs/TRAINING.md
+    - Demonstrations: docs/DEMONSTRATIONS.md
+    - Environments: docs/ENVIRONMENTS.md
+    - Policies made elsewhere: docs/POLICIES.md
+    - What the doctor says: docs/DOCTOR.md
+    - Faults: docs/FAULTS.md
+    - Security: docs/SECURITY.md
+    - Words: docs/GLOSSARY.md
   - Python: docs/PYTHON.md
-  - Results: results/README.md
-  - Contributing: CONTRIBUTING.md
-  - Changes: CHANGELOG.md
+  - Rust: docs/EMBED.md
+  - Project:
+    - Results: results/README.md
+    - Architecture: docs/ARCHITECTURE.md
+    - Contributing: CONTRIBUTING.md
+    - Changes: CHANGELOG.md
 """
+# Colours of code would come from another host and a search needs a server, but the theme's scripts ask for their elements all the same.
+MAIN = """\
+{% extends "base.html" %}
+{% block extrahead %}<link id="hljs-light"><link id="hljs-dark">{% endblock %}
+{% block content %}{{ super() }}<div class="modal" id="mkdocs_search_modal"><div id="mkdocs-search-results"></div></div>{% endblock %}
+"""
+THEME = "theme:\n  name: mkdocs\n  color_mode: auto\n  highlightjs: false\n  shortcuts:\n    search: 0\n  custom_dir: "
 
 
 def stage(folder: Path) -> None:
@@ -171,9 +181,10 @@ def main(site: Path) -> int:
         work = Path(folder)
         stage(work / "pages")
         reference(work / "pages" / "docs" / "PYTHON.md")
-        settings = f"site_name: NEARL\ndocs_dir: pages\nsite_dir: {site}\nuse_directory_urls: false\ntheme:\n  name: mkdocs\n  color_mode: auto\n"
-        settings += "  highlightjs: false\n"  # it would come from another host
-        (work / "mkdocs.yml").write_text(settings + "plugins: []\n" + NAV)
+        (work / "theme").mkdir()
+        (work / "theme" / "main.html").write_text(MAIN)
+        settings = f"site_name: NEARL\ndocs_dir: pages\nsite_dir: {site}\nuse_directory_urls: false\nplugins: []\n"
+        (work / "mkdocs.yml").write_text(f"{settings}{THEME}{work / 'theme'}\n{NAV}")
         subprocess.run([sys.executable, "-m", "mkdocs", "build", "--quiet", "--config-file", work / "mkdocs.yml"], check=True)
     if (rust := ROOT / "target" / "doc").is_dir():
         shutil.copytree(rust, site / "rust", dirs_exist_ok=True)
