@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from test_readme import PAGES
 
 import nearl
 from nearl import _core
+from nearl.pid2 import _toml
 from nearl.runs import tomllib
 
+Build = Callable[..., None]  # (folder, blocks)
 EXAMPLES = ROOT / "examples"
 TASKS = EXAMPLES / "tasks"
 
@@ -26,33 +29,29 @@ def blocks(language: str) -> dict[str, list[str]]:
     return {page: of for page, of in found.items() if of}
 
 
-def sections(text: str) -> dict[str, str]:
-    """A task file by its sections, each with those below it; what stands before the first is called ''."""
-    found: dict[str, str] = {}
-    name = ""
-    for line in text.splitlines(keepends=True):
-        header = re.match(r"\[(\w+)", line)
-        name = header[1] if header else name
-        found[name] = found.get(name, "") + line
-    return found
+def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Section by section, key by key."""
+    both = below | above
+    return both | {key: below[key] | above[key] for key in below.keys() & above.keys() if isinstance(above[key], dict)}
 
 
-def task(folder: Path, base: Path, block: str) -> str:
-    """`base` with the sections of `block` in the place of its own."""
-    tomllib.loads(block)
-    text = "".join((sections(base.read_text()) | sections(block)).values())
-    for robot in ("../robots/anymal/anymal.urdf", "anymal.urdf"):
-        text = text.replace(f'"{robot}"', f'"{EXAMPLES}/robots/anymal/anymal.urdf"')
+def task(folder: Path, base: Path, *given: str) -> str:
+    """`base` with the keys of the blocks in the place of its own."""
+    sections: dict[str, Any] = {}
+    for text in (base.read_text(), *given):
+        sections = merged(sections, tomllib.loads(text))
+    if sections.get("model", {}).get("urdf", "").endswith("anymal.urdf"):
+        sections["model"]["urdf"] = str(EXAMPLES / "robots" / "anymal" / "anymal.urdf")
     file = folder / base.name
-    file.write_text(text)
+    file.write_text("".join(f"{key} = {_toml(value)}\n" for key, value in sections.items()))
     return str(file)
 
 
-def trains(base: str, algo: str) -> Callable[[Path, str], None]:
+def trains(base: str) -> Build:
     """Environment, networks and controllers of the whole task."""
 
-    def build(folder: Path, block: str) -> None:
-        nearl.PID2(task(folder, TASKS / base, block), algo=algo, settings={"train.n_envs": 2, "train.n_steps": 16, f"train.{algo}.batch_size": 16}).learn(32)
+    def build(folder: Path, *given: str) -> None:
+        nearl.PID2(task(folder, TASKS / base, *given), algo="ppo", settings={"train.n_envs": 2, "train.n_steps": 32, "train.ppo.batch_size": 32}).learn(64)
 
     return build
 
@@ -88,31 +87,37 @@ def recipe(folder: Path, block: str) -> None:
 
 
 # What the blocks of a page are a part of, in the page's order. Those of OWN_ROBOT are one file, which test_readme.py trains.
-PARTS = {
+PARTS: dict[str, list[Build]] = {
     "GUARD": [guarded_file],
-    "LIMITS": [limits, trains("HalfCheetah-v5.toml", "ppo"), trains("HalfCheetah-v5.toml", "ppo")],
+    "LIMITS": [limits, trains("HalfCheetah-v5.toml"), trains("HalfCheetah-v5.toml")],
     "OWN_LIMIT": [limits],
     "POLICIES": [recipe],
-    "TASKS": [trains("anymal-walk.toml", "ppo")] * 2,
+    "TASKS": [trains("anymal-walk.toml")] * 2,
 }
+# A block of these goes with those before it.
+TOGETHER = {"TASKS"}
 TOML = blocks("toml")
-SHOWN = [pytest.param(build, block, id=f"{page}: {block.splitlines()[0][:40]}") for page in PARTS for build, block in zip(PARTS[page], TOML.get(page, []))]
+SHOWN = [
+    pytest.param(build, TOML[page][: i if page in TOGETHER else 0], block, id=f"{page}: {block.splitlines()[0][:40]}")
+    for page in PARTS
+    for i, (build, block) in enumerate(zip(PARTS[page], TOML.get(page, [])))
+]
 
 
 def test_every_block_of_toml_has_its_place() -> None:
     assert {page: len(of) for page, of in TOML.items() if page != "OWN_ROBOT"} == {page: len(of) for page, of in PARTS.items()}
 
 
-@pytest.mark.parametrize(("build", "block"), SHOWN)
-def test_toml(build: Callable[[Path, str], None], block: str, tmp_path: Path) -> None:
-    build(tmp_path, block)
+@pytest.mark.parametrize(("build", "before", "block"), SHOWN)
+def test_toml(build: Build, before: list[str], block: str, tmp_path: Path) -> None:
+    build(tmp_path, *before, block)
 
 
-@pytest.mark.parametrize(("build", "block"), SHOWN)
-def test_toml_with_a_key_that_is_none_is_refused(build: Callable[[Path, str], None], block: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("build", "before", "block"), SHOWN)
+def test_toml_with_a_key_that_is_none_is_refused(build: Build, before: list[str], block: str, tmp_path: Path) -> None:
     last = re.findall(r"^\w+(?= = )", block, re.MULTILINE)[-1]
     with pytest.raises(ValueError, match="unheard_of"):
-        build(tmp_path, re.sub(rf"^{last}(?= = )", "unheard_of", block, flags=re.MULTILINE))
+        build(tmp_path, *before, re.sub(rf"^{last}(?= = )", "unheard_of", block, flags=re.MULTILINE))
 
 
 def compiled(compiler: str, body: str, folder: Path) -> subprocess.CompletedProcess[str]:
