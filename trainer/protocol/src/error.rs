@@ -22,7 +22,7 @@ pub enum RequestError {
     Behind {
         /// Server.
         name: RobotName,
-        /// Time given [s].
+        /// Time given, in seconds.
         seconds: f64,
     },
     /// The server died or ended while it worked on a request.
@@ -41,7 +41,7 @@ pub enum RequestError {
     Silent {
         /// Server.
         name: RobotName,
-        /// Patience [s].
+        /// Patience, in seconds.
         seconds: f64,
     },
     /// An explicit refusal or end.

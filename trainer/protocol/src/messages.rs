@@ -7,7 +7,7 @@ use nearl_runtime::link_message as message;
 pub const MAX_CHUNK: usize = 4096;
 /// Bytes in one request at most; a well-formed one has the size of [`RequestMessage`].
 pub const MAX_REQUEST: usize = 1024;
-/// Capacity of the sentence in a [`ReplyMessage`] [bytes].
+/// Bytes that the sentence in a [`ReplyMessage`] has room for.
 pub const MAX_REPLY_TEXT: usize = 256;
 
 /// A request as it travels: any bytes, in a place of fixed size.
