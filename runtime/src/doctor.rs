@@ -183,15 +183,17 @@ fn projection(m: &Manifest) -> Check {
         let text = "the forces of its drives and their change are kept within the motors'; nothing is promised of the motion (guard = \"drive\")";
         return ok(CheckCode::Projection, text.into());
     }
-    match m.proposes() {
-        false => warn(
-            CheckCode::Projection,
-            "its policy is direct and not guarded: nothing is projected, so no limit of the task is kept; set constraints.guard, or train \
-             with an algorithm other than ppo"
-                .into(),
-        ),
-        true => ok(CheckCode::Projection, "every target is projected into the limits of the task".into()),
+    if m.proposes() {
+        return ok(CheckCode::Projection, "every target is projected into the limits of the task".into());
     }
+    let kept = if m.limits_actions() { "none is kept but [constraints.action]" } else { "none is kept" };
+    warn(
+        CheckCode::Projection,
+        format!(
+            "its policy is direct and not guarded: nothing is projected, so of the limits of the task {kept}; set constraints.guard, or train \
+             with an algorithm other than ppo"
+        ),
+    )
 }
 
 /// Can the motors hold the robot everywhere within its position limits?

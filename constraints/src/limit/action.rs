@@ -57,11 +57,11 @@ impl Sum {
 /// What became of an action.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ActionReport {
-    /// Euclidean distance from the action within the actuators' range to the one that is given [unit of the action].
+    /// Distance from the action within the actuators' range to the one that is given [unit of the action]; Euclidean for [`ActionLimit`].
     pub moved: f64,
-    /// Limits that the action broke before: each sum is one, and all rates are one.
+    /// Limits that the action broke before; for [`ActionLimit`] each sum is one, and all rates are one.
     pub raw_violations: u32,
-    /// Limits that the given one breaks by more than 1e-9, counted from the formulas above.
+    /// Limits that the given one breaks by more than 1e-9, counted from the formulas and not from how it was found.
     pub violations: u32,
 }
 

@@ -31,8 +31,8 @@ use given::Given;
 use guard::Guard;
 use maths::{hermite, sample};
 use nearl_constraints::{
-    ActionLimit, Bounds, Entry, LimitSet, Model, Projector, Proposal, RefuseReason, StateLayout, Status,
-    Target,
+    ActionLimit, ActionReport, Bounds, Entry, Ledger, LimitSet, Model, Projector, Proposal, RefuseReason,
+    StateLayout, Status, Target,
 };
 use parts::{check_sizes, halves, idx_q};
 use std::time::Instant;
@@ -440,7 +440,8 @@ impl Controller {
     /// proposes.
     fn guard(&mut self, out: &mut Output) {
         if let Some(drives) = &mut self.drive_box {
-            drives.update(&self.held.q, &self.held.v, &mut out.action, &mut out.next, self.projection);
+            let report = drives.update(&self.held.q, &self.held.v, &mut out.action, self.projection);
+            self.count(report, &mut out.next.ledger);
         }
         let Some(guard) = &mut self.guard else { return };
         guard.update(&self.held.q, &self.held.v, &mut out.action, &mut out.next, self.projection);
@@ -462,11 +463,15 @@ impl Controller {
         }
     }
 
-    /// The nearest action that the task's limits on actions allow; the ledger counts it, and what was broken before.
+    /// The nearest action that the task's limits on actions allow.
     fn limit_action(&mut self, out: &mut Output) {
         let Some(limit) = &mut self.action_limit else { return };
         let report = limit.project(&self.held.v, &mut out.action, self.projection);
-        let ledger = &mut out.next.ledger;
+        self.count(report, &mut out.next.ledger);
+    }
+
+    /// Adds to the ledger what was done to the action. Of a direct policy, whose state nothing projects, the ledger says nothing else.
+    fn count(&self, report: ActionReport, ledger: &mut Ledger) {
         if self.kind == PolicyKind::Direct {
             (ledger.raw_violations.other, ledger.violations.other, ledger.moved) = (0, 0, 0.0);
             ledger.status = if report.moved > 0.0 { Status::Clamped } else { Status::Unchanged };

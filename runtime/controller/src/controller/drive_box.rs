@@ -4,7 +4,10 @@
 use super::Parts;
 use super::parts::unusable;
 use crate::snapshot::{Manifest, SnapshotError};
-use nearl_constraints::{Drive, Model, Projector, Status, Target};
+use nearl_constraints::{ActionReport, Drive, Model, Projector};
+
+/// A force further than this beyond its interval [N·m or N] counts as a limit that was broken.
+const TOLERANCE: f64 = 1e-9;
 
 /// Targets of drives that keep each drive's force, and its change from tick to tick, within the limits, whatever the rest of the robot does. With
 /// `tau_before` the force at the start of the tick before, of effort `E` and rate `R`:
@@ -80,25 +83,28 @@ impl DriveBox {
         self.joints[k].at
     }
 
-    /// Puts the targets in `action` (n_act) into their intervals; the ledger of `next` says by how much the furthest was moved [rad or m].
-    pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], next: &mut Target, hold: bool) {
-        let mut moved = 0.0_f64;
+    /// Puts the targets in `action` (n_act) into their intervals. What it returns has the distance of the target that was moved furthest
+    /// [rad or m], and counts every drive that was asked for a force outside its interval. With `hold` off nothing is moved.
+    pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], hold: bool) -> ActionReport {
+        let mut report = ActionReport::default();
         for (joint, before) in self.joints.iter().zip(&mut self.before) {
             let action = &mut action[joint.at];
             let (at, v) = (q[joint.idx_q], v[joint.dof]);
             let (low, high) = joint.forces(v, self.dt, self.known.then_some(*before));
             let asked = joint.stiffness * (*action - at) - joint.damping * v;
+            let broken = u32::from(asked < low - TOLERANCE || asked > high + TOLERANCE);
+            report.raw_violations += broken;
+            report.violations += if hold { 0 } else { broken };
             let force = if hold { asked.clamp(low, high) } else { asked };
             if force != asked {
                 let target = at + (force + joint.damping * v) / joint.stiffness;
-                moved = moved.max((target - *action).abs());
+                report.moved = report.moved.max((target - *action).abs());
                 *action = target;
             }
             *before = force;
         }
         self.known = true;
-        next.ledger.moved = moved;
-        next.ledger.status = if moved > 0.0 { Status::Clamped } else { Status::Unchanged };
+        report
     }
 
     pub(super) fn forget(&mut self) {
