@@ -1,4 +1,4 @@
-//! Time of frames, distances and rows on the Panda. `cargo bench -p nearl-constraints --bench kinematics`
+//! Measures how long frames, distances and rows take on the Panda. `cargo bench -p nearl-constraints --bench kinematics`
 
 #[path = "../tests/common/mod.rs"]
 mod common;

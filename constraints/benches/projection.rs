@@ -1,4 +1,4 @@
-//! Whole ticks in thread CPU time, with allocations: assembly, Pinocchio, solve, checker and ledger, by the rung that answered.
+//! Measures the thread CPU time of whole ticks (assembly, Pinocchio, solve, checker, ledger) and counts their allocations, for each rung that answered.
 //! `cargo bench -p nearl-constraints --bench projection`
 
 #[path = "../tests/common/mod.rs"]

@@ -1,4 +1,4 @@
-//! Thread CPU time of the stages for coupled rows on closed-loop problems of `benches/qp/gen.py`.
+//! Measures the thread CPU time of each stage for coupled rows, on problems that `benches/qp/gen.py` took from closed loops.
 //!
 //! `cargo bench -p nearl-constraints --bench qp -- FILE.bin...` prints percentiles; with `--out FOLDER` it also writes the time of each
 //! problem, for `benches/qp/table.py` to set beside other solvers.

@@ -1,4 +1,4 @@
-//! What can be wrong with a model or a set of limits. One sentence each: what, where, how much, what to do.
+//! Errors of models and of sets of limits. Each is one sentence: what is wrong, where, by how much, and what to do.
 
 use std::path::PathBuf;
 

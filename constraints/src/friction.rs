@@ -1,4 +1,4 @@
-//! Dry friction of joints: what a motor makes up for, and how far off that may be.
+//! Dry friction of joints: how much of it a motor makes up for, and by how much that may be wrong.
 
 use crate::{Dynamics, LimitSet, Model, Period};
 use serde::{Deserialize, Serialize};

@@ -1,4 +1,4 @@
-//! The border to the C++ shim (`cpp/shim.h`): raw functions and two owners.
+//! The border to the C++ shim (`cpp/shim.h`): its raw functions, and the two types that own what it allocates.
 
 use crate::description::{Body, JointDescription, JointKind};
 use crate::geometry::Placement;

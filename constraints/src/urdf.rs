@@ -1,6 +1,6 @@
 //! A robot from a URDF: links become bodies, fixed joints frames, in Pinocchio's order (the joints of a link by name).
 //!
-//! What cannot be is refused, all of it in one sentence; what is not part of the description is noted.
+//! A file that describes no possible robot is refused, with everything that is wrong in one sentence. What a description cannot hold becomes a note.
 
 mod check;
 mod collision;

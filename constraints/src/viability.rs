@@ -10,7 +10,7 @@
 //! `d' - (v' - A tau / 2)^2 / (2 A) = d - (v - A tau / 2)^2 / (2 A)`.
 //! (`A` here is [`Dof::braking`].) With `tau = 0` it is the set of Del Prete, "Joint Position and Velocity Bounds in Discrete-Time Acceleration/Torque
 //! Control of Robot Manipulators", RA-L 2018. The familiar `v' <= sqrt(2 A d)` is the same parabola at the wrong end
-//! of the step, and conflicts with the acceleration limit near the position limit.
+//! of the step; near the position limit it conflicts with the acceleration limit.
 
 pub use crate::limit::Kind;
 use crate::{LimitSet, Model};

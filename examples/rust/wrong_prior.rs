@@ -1,4 +1,4 @@
-//! Prior knowledge that is wrong: an arm that carries a load of which its projector was not told. What is promised, what comes, what helps.
+//! Prior knowledge that is wrong: an arm carries a load of which its projector was not told. Prints what is promised, what happens, and what helps.
 
 use nearl_constraints::description::Payload;
 use nearl_constraints::*;

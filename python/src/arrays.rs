@@ -1,4 +1,4 @@
-//! Numbers in and out.
+//! Turns what NumPy accepts into vectors, and vectors into arrays.
 
 use numpy::{AllowTypeChange, PyArray1, PyArray2, PyArrayLikeDyn, PyArrayMethods, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;

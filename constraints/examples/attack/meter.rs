@@ -1,4 +1,5 @@
-//! By how much a passage breaks a limit, in the words of the limit and by nothing of the projector: kinematics, inverse dynamics and arithmetic.
+//! Measures by how much a passage exceeds a limit, from what the limit says. It uses kinematics, inverse dynamics and arithmetic, and nothing of
+//! the projector.
 
 use nearl_constraints::*;
 

@@ -1,4 +1,4 @@
-//! One attack: a closed loop of a robot that goes where the target says.
+//! One attack: a closed loop in which the robot goes exactly where each target says.
 
 use super::attacker::Attacker;
 use super::meter::{Gauge, Passage, ROUNDING};

@@ -1,4 +1,4 @@
-//! An attack on an arm whose joints rub, and Coulomb friction in small physics steps.
+//! Attacks an arm whose joints rub. The plant computes its Coulomb friction in small physics steps.
 
 use nearl_constraints::*;
 

@@ -1,4 +1,4 @@
-//! What a kind of limit says of itself: for the page about limits, for Python, for the tests that hold for every kind.
+//! What a kind of limit says of itself. The page about limits, the classes of Python and the tests of every kind are made from it.
 
 /// Whether a kind of limit forbids or resists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,4 +1,4 @@
-//! Margins: a limit less the distance that is kept from it. And the refusal of a soft limit where only a hard one can be kept.
+//! Margins make a limit tighter by the distance that is to be kept from it. This file also refuses soft limits of kinds that can only be hard.
 
 use super::PerJoint;
 use crate::{LimitError, Model};

@@ -1,5 +1,5 @@
-//! What the registry's lines become: the task file's section, the kinds of rows and [`REGISTRY`](super::REGISTRY), from which Python's classes, the
-//! page about limits and the tests of every kind are made.
+//! Makes of the registry's lines the task file's section, the kinds of rows and [`REGISTRY`](super::REGISTRY). Python's classes, the page about
+//! limits and the tests of every kind are made from that list.
 
 use super::{About, ConstraintSettings, Kind, Limit};
 

@@ -1,4 +1,4 @@
-//! What settings of several kinds are made of.
+//! Types that the settings of several kinds of limits share.
 
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};

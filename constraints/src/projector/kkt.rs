@@ -1,6 +1,6 @@
 //! The optimality conditions of an active set as linear equations, for Newton's method and for derivatives.
 //!
-//! With F the dofs off their bounds, A the rows and cone normals that hold back, and D the give of elastic ones:
+//! With F the dofs off their bounds, A the rows and cone normals that hold back, and D by how much the elastic ones of them give way:
 //!
 //! ```text
 //!     K = [ H + C   A' ]      C = nu (G_c'G_c - s s') / |G_c y + c|,   s = G_c' u,   u = (G_c y + c) / |G_c y + c|

@@ -1,16 +1,17 @@
 //! Limits that move while the robot does.
 //!
-//! The limits of the build and those they are moved to can each be kept for ever; the way from one to the other is neither. On that way
-//! the limit in force is the tightest that the brake in force keeps: the stored one, or the deceleration `A_b` of each joint where none is
+//! The limits of the build can be kept for ever, and so can those they are moved to. On the way from the one to the other it may be that neither
+//! can: a joint that moves fast when its limit becomes lower is outside that limit until it has slowed down. In each tick of the way the limit
+//! in force is therefore the tightest that the brake in force keeps: the stored brake, or the deceleration `A_b` of each joint where none is
 //! stored. With `s` the next velocity by that brake and `r` the position where it comes to rest,
 //!
 //! ```text
 //!     |v'| <= max(V, |s|),    q <= max(q_max, r),    rows and cones: as far as that brake goes, and no further
 //! ```
 //!
-//! The brake obeys all of it, so that there is always an answer; the next brake is verified for it, so that it never moves back; and the
-//! goal is put where the fastest way leads: joints that are too fast, or could not stop in front of their new position, slow down by `A_b`;
-//! where a frame, its plane or the energy is behind, all joints slow down in proportion, as fast as one of them can.
+//! The brake obeys all of it, so there is always an answer. The next brake is verified for the limit in force, so this limit never moves back.
+//! The goal is put where the fastest way leads: a joint that is too fast, or could not stop in front of its new position limit, slows down by
+//! `A_b`. Where the speed of a frame, a plane or the energy is what is late, all joints slow down in proportion, as fast as one of them can.
 
 mod numbers;
 mod way;

@@ -1,8 +1,9 @@
 //! Newton's method on the optimality conditions, from Clarabel's answer on.
 //!
-//! An interior point ends where its steps stop paying: up to 3e-4 of the largest velocity change from the optimum. From there each step
-//! solves `K (dy, lambda) = (H (goal - y), bound - A y)` (`kkt.rs`), then lets go what pulls the wrong way and takes up what is exceeded.
-//! The answer counts only when nothing is left to change; else, and when the steps or the time run out, Clarabel's stays.
+//! An interior-point method ends where further steps gain little, up to 3e-4 of the largest velocity change away from the optimum. From there
+//! each step solves `K (dy, lambda) = (H (goal - y), bound - A y)` (`kkt.rs`), then releases the rows whose multipliers have the wrong sign and
+//! adds those that are exceeded. The answer counts only when nothing is left to change; otherwise, and when the steps or the time run out,
+//! Clarabel's answer stays.
 
 use super::conic::Conic;
 use super::coupled::Coupled;

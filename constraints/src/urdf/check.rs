@@ -1,4 +1,4 @@
-//! The numbers and names of a URDF that cannot be, all of them in one sentence.
+//! Finds numbers and names of a URDF that no robot can have, and reports all of them in one sentence.
 
 use roxmltree::Node;
 use std::collections::{BTreeMap, BTreeSet};

@@ -1,4 +1,5 @@
-//! The stages for coupled rows on random problems: against each other, against brute force, and against their own past.
+//! The stages for coupled rows on random problems. Their answers are compared with each other and with brute force, and must not depend on what
+//! they solved before.
 
 use crate::common::Random;
 use nalgebra::{DMatrix, DVector};

@@ -1,4 +1,4 @@
-//! What a file that is no snapshot is, by its first bytes, so that a refusal can name it.
+//! Tells by its first bytes what a file is that is no snapshot, so that the refusal can name it.
 
 /// Kinds of files that hold policies, or are mistaken for one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

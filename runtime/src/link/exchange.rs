@@ -1,6 +1,6 @@
 //! One tick of a plant that keeps its own time: a robot's driver calls [`Exchange::tick`] once in each control period.
 //!
-//! [`PlantRunner`](super::PlantRunner) drives a simulator on a time grid; a real robot often has the clock, and its driver the loop.
+//! [`PlantRunner`](super::PlantRunner) drives a simulator on a time grid. A real robot often keeps the time, and its driver has a loop of its own.
 
 use super::{ActionMessage, LinkError, Message, PlantLink, Robot, RobotName, StateMessage};
 use crate::clock;

@@ -1,11 +1,12 @@
 //! Flight log: one message a tick in an MCAP file, written by a thread of its own with bounded memory.
 //!
-//! Messages are JSON with a JSON schema in compressed chunks, so any MCAP reader shows them, at the time of day they were made; numbers are
-//! written so that reading them gives the same bits. What rows, joints, statuses and units are called stands once, in the metadata
+//! Messages are JSON with a JSON schema in compressed chunks, so any MCAP reader shows them, at the time of day they were made. Numbers are
+//! written so that reading them gives the same bits. The names of rows, joints, statuses and units are written once, in the metadata
 //! and with each snapshot. Snapshots are attachments, and topic `snapshot` says which number is which.
 //!
-//! If the disk is slow, what replay computes is left out of the ticks first (topic `brief`); then, or where the disk is full, whole records are dropped and
-//! counted; the loop never notices. [`replay()`] computes a log again, and after a gap goes on from the next memory (topic `memory`).
+//! If the disk is slow, what replay can compute is left out of the ticks first (topic `brief`). If that is not enough, or the disk is full,
+//! whole records are dropped and counted; the loop never notices. [`replay()`] computes a log again, and after a gap goes on from the next
+//! memory (topic `memory`).
 
 mod brief;
 mod facts;

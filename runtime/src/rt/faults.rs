@@ -1,4 +1,4 @@
-//! A rehearsed failure: a seeded list of (cycle, fault, arguments), written into the flight log so that it replays.
+//! A fault plan rehearses failures: a seeded list of (cycle, fault, arguments), written into the flight log so that it replays.
 //!
 //! `nearl plant --faults FILE` and `nearl run --faults FILE` play the same file: the plant takes the faults of its
 //! sensors, the loop those of the policy and of time.

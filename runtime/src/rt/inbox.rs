@@ -1,8 +1,8 @@
 //! Snapshots on their way into the loop: from bytes to a built controller to the swap, with one receipt for each. The
-//! one before is kept and swapped back in when the robot no longer gets where the targets say.
+//! controller before is kept, and is swapped back in when the robot no longer reaches its targets.
 //!
 //! Limits that an operator moves take the same way: the snapshot in use is built again with them, and a snapshot that comes later is built
-//! with them too. Nothing overtakes such an order, and nothing with other limits is kept to go back to.
+//! with them too. No snapshot overtakes such an order, and no controller with other limits is kept to go back to.
 
 use std::sync::Arc;
 

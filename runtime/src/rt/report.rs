@@ -1,4 +1,4 @@
-//! What a run leaves behind.
+//! The report of a run: what it counted and measured between start and stop.
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -1,4 +1,4 @@
-//! A peer that speaks iceoryx2 on the robot's own services, but not this build's language.
+//! A peer on the robot's own iceoryx2 services whose messages are not those of this build.
 
 use std::time::Duration;
 

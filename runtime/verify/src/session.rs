@@ -1,4 +1,4 @@
-//! From tick to tick: what a loop acted upon, what it was asked for, and which of its claims are confirmed.
+//! Goes through a log tick by tick: what the loop acted upon, what it was asked for, and which of its claims are confirmed.
 
 use std::collections::{BTreeMap, HashMap};
 

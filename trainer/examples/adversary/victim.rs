@@ -1,4 +1,4 @@
-//! A robot with its limits, twice: the projector's model and MuJoCo's plant.
+//! A robot with its limits, built twice: as the projector's model and as MuJoCo's plant.
 
 use crate::random::Random;
 use nearl_runtime::constraints::limit::AccelerationSettings;

@@ -1,4 +1,4 @@
-//! Which number of a row is what.
+//! What each number of a row of transitions is.
 
 use std::ops::Range;
 

@@ -1,4 +1,4 @@
-//! How hard a joint has to brake, at least, in whole periods.
+//! The least deceleration by which a joint stops in time, in whole periods.
 
 use super::{MANY, ROUNDING};
 use crate::jerk::Brake;

@@ -1,4 +1,4 @@
-//! From what is asked for by name to plain numbers, and every reason why it is refused.
+//! Turns limits that are asked for by name into plain numbers, and refuses those that cannot be, with the reason.
 
 use super::Moving;
 use crate::limit::Moved;

@@ -1,3 +1,5 @@
+//! Newton's method from an answer that is near the optimum: it ends at the optimum, or leaves the answer alone.
+
 use super::*;
 use crate::Soft;
 use crate::random::Random;

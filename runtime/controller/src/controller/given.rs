@@ -1,7 +1,7 @@
 //! What another process proposes in place of the policy.
 //!
-//! A proposal begins a policy period of its own. Where none has come at the end of that period the last one is held: the positions it asked for, at
-//! rest; of velocities alone, the velocities; of commands, the commands.
+//! A proposal begins a policy period of its own. Where no other has come by the end of that period, the last one is held: the robot rests at the
+//! positions it asked for, keeps its velocities where it had velocities alone, or repeats its commands.
 
 use super::Controller;
 use crate::snapshot::PolicyKind;

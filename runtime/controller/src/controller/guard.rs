@@ -1,4 +1,5 @@
-//! The guard: an action that no projected state led to becomes one that such a state leads to.
+//! The guard of `guard = true`: forward dynamics say which state an action leads to, that state is projected, and inverse dynamics give the action
+//! that leads to what the projection made of it.
 
 use super::parts::unusable;
 use crate::motors::Motors;

@@ -1,4 +1,4 @@
-//! Exploration noise of the loop: a number for each tick, so that a log with the seed has the noise.
+//! Exploration noise of the loop. It follows from the seed and the number of the tick alone, so a log that has the seed has the noise.
 
 use super::Noise;
 

@@ -1,4 +1,4 @@
-//! Words of an expression.
+//! Splits an expression into its words.
 
 use std::fmt;
 
