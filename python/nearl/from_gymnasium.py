@@ -26,8 +26,7 @@ mjcf = "{robot}"
 [time]
 dt = {dt!r}
 sim_dt = {sim_dt!r}
-max_episode_steps = {steps}
-
+{steps}
 [state]
 controllable = [{joints}]
 
@@ -94,7 +93,8 @@ def from_gymnasium(env_id: str, folder: str | os.PathLike[str], **kwargs: Any) -
         if own
         else "the reward, the start and the end of an\n# episode are Python there and must be written here, or given to nearl.make_vec as functions."
     )
-    times = {"dt": dt, "sim_dt": timestep if euler else 0.0, "steps": steps or 1000}
+    length = f"max_episode_steps = {steps}\n" if steps else ""  # without a time limit there: the usual length here
+    times = {"dt": dt, "sim_dt": timestep if euler else 0.0, "steps": length}
     sections = as_toml(own) if own else EMPTY
     file.write_text(TEMPLATE.format(env_id=env_id, name=name, robot=robot.name, joints=joints, about=about, sections=sections, **times))
     env.close()

@@ -10,10 +10,6 @@ import gymnasium
 
 from nearl import _core
 
-# Control periods in an episode. (The native environments know theirs, but making one compiles its robot.)
-MAX_EPISODE_STEPS = {"Panda-reach": 2000}
-MAX_EPISODE_STEPS_ELSE = 1000
-
 
 def register(*task_files: str | os.PathLike[str]) -> list[str]:
     """Registers the bundled tasks, or the task files given; returns the ids, ``nearl/<name in the file>``.
@@ -25,7 +21,7 @@ def register(*task_files: str | os.PathLike[str]) -> list[str]:
         ValueError: a task file is wrong; the message names the key.
     """
     if not task_files:
-        return [_register(task, task, MAX_EPISODE_STEPS.get(task, MAX_EPISODE_STEPS_ELSE)) for task, _ in _core.tasks()]
+        return [_register(task, task, _core.max_episode_steps(task)) for task, _ in _core.tasks()]
     ids, bundled = [], {task for task, _ in _core.tasks()}
     for file in task_files:
         env = _core.Env(os.fspath(file))
@@ -36,7 +32,7 @@ def register(*task_files: str | os.PathLike[str]) -> list[str]:
     return ids
 
 
-def _register(name: str, task: str, max_episode_steps: int) -> str:
+def _register(name: str, task: str, max_episode_steps: int | None) -> str:
     env_id = f"nearl/{name}"
     if env_id not in gymnasium.registry:
         gymnasium.register(

@@ -29,6 +29,12 @@ pub(crate) fn tasks() -> Vec<(&'static str, String)> {
     task_files::names().into_iter().map(|name| (name, task_files::about(name))).collect()
 }
 
+/// Control periods in an episode of a bundled task; its environment is not made for it. None for any other name.
+#[pyfunction]
+pub(crate) fn max_episode_steps(task: &str) -> Option<usize> {
+    task_files::max_episode_steps(task)
+}
+
 struct Inner {
     env: Box<dyn env::Env>,
     rng: ChaCha8Rng,

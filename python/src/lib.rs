@@ -29,7 +29,7 @@ mod _core {
     #[pymodule_export]
     use super::controller::Controller;
     #[pymodule_export]
-    use super::env::{Env, tasks};
+    use super::env::{Env, max_episode_steps, tasks};
     #[pymodule_export]
     use super::link::{RolloutClient, Rollouts, rollout_ledger};
     #[pymodule_export]

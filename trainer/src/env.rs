@@ -33,6 +33,7 @@ use crate::robot;
 pub use meter::{Excess, LimitError, Limits, Meter, Worst};
 pub use rand_chacha::ChaCha8Rng;
 pub use rand_chacha::rand_core::SeedableRng;
+use spec::EPISODE;
 pub use spec::Spec;
 
 /// What one control period gave.
@@ -290,6 +291,8 @@ pub struct Registered {
     pub name: &'static str,
     /// What it is, in one line.
     pub about: &'static str,
+    /// Control periods in an episode.
+    pub max_episode_steps: usize,
     build: fn() -> Made,
     /// The same with a control period of one physics step of any length [s], where the task allows it.
     build_at: Option<fn(f64) -> Made>,
@@ -297,7 +300,7 @@ pub struct Registered {
 
 impl Registered {
     const fn fixed(name: &'static str, about: &'static str, build: fn() -> Made) -> Registered {
-        Registered { name, about, build, build_at: None }
+        Registered { name, about, max_episode_steps: EPISODE, build, build_at: None }
     }
 }
 
@@ -309,6 +312,7 @@ pub const REGISTRY: &[Registered] = &[
     Registered::fixed(ant::NAME, ant::ABOUT, ant::build),
     Registered {
         build_at: Some(panda_reach::build_at),
+        max_episode_steps: panda_reach::periods(panda_reach::DT),
         ..Registered::fixed(panda_reach::NAME, panda_reach::ABOUT, panda_reach::build)
     },
 ];
@@ -395,7 +399,9 @@ fn check_time(task: &Task, spec: &Spec, origin: &str) -> Result<(), EnvError> {
     } else {
         return Ok(());
     };
-    let reason = format!("{given} s, but the environment '{}' simulates {own} s; write that", spec.name);
+    let any = entry(&spec.name).is_ok_and(|entry| entry.build_at.is_some());
+    let or = if any { ", or the same number for time.dt and time.sim_dt" } else { "" };
+    let reason = format!("{given} s, but the environment '{}' simulates {own} s; write that{or}", spec.name);
     Err(EnvError::Task { origin: origin.into(), key: key.into(), reason })
 }
 

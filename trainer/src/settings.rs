@@ -20,8 +20,10 @@ pub enum ChangeScale {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Exploration {
-    /// Deterministic meta policy, Gaussian action (Eq. 1 of the paper); needs a learned inverse model.
+    /// `Action` where the inverse model is learned, `Proposal` where it is analytic.
     #[default]
+    Auto,
+    /// Deterministic meta policy, Gaussian action (Eq. 1 of the paper); needs a learned inverse model.
     Action,
     /// Stochastic meta policy; with a learned inverse model the action is Gaussian too. The only choice with analytic
     /// inverse dynamics. The ratio has as many dimensions as the state: expect slower learning.

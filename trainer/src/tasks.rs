@@ -78,6 +78,14 @@ pub fn names() -> Vec<&'static str> {
     TASKS.iter().map(|(n, _)| n.trim_end_matches(".toml")).collect()
 }
 
+/// Control periods in an episode of the bundled task `name`. Nothing is compiled for it.
+pub fn max_episode_steps(name: &str) -> Option<usize> {
+    let (_, text) = TASKS.iter().find(|(n, _)| n.trim_end_matches(".toml") == name)?;
+    let task: toml::Table = toml::from_str(text).ok()?;
+    let env = task.get("env").and_then(toml::Value::as_str).unwrap_or(name);
+    env::REGISTRY.iter().find(|entry| entry.name == env).map(|entry| entry.max_episode_steps)
+}
+
 /// Text of a bundled robot file, by its path or file name under `examples/robots`.
 pub fn robot(name: &str) -> Option<&'static str> {
     ROBOTS.iter().find(|(n, _)| *n == name || n.rsplit('/').next() == Some(name)).map(|(_, t)| *t)

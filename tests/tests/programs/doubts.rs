@@ -280,6 +280,27 @@ fn a_bundled_task_advises_nothing_that_it_has_not() {
     assert!(line.contains("the bundled task draws it there") && !line.contains("draw it inside"), "{line}");
 }
 
+/// Of the limits of a policy on actions those on actions are kept, and the doctor does not deny it.
+#[test]
+fn limits_on_actions_are_what_a_direct_policy_keeps() {
+    for (action, says) in
+        [("", "none is kept;"), ("action = { square = 9.0 }", "none is kept but [constraints.action];")]
+    {
+        let folder = tempfile::tempdir().expect("folder");
+        let file = write(folder.path(), SAME, ("torque = {}", action));
+        let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).expect("task");
+        complete(&mut manifest).expect("manifest");
+        let algo = "ppo".parse().expect("an algorithm");
+        let training =
+            Training::new(&Request { manifest, algo, steps: 1000, seed: 0, threads: 1 }).expect("training");
+        let snapshot = folder.path().join("first.safetensors");
+        training.snapshot().save(&snapshot).expect("snapshot");
+        let checks = examine(&snapshot, None);
+        let found = checks.iter().find(|c| c.check == "projection").expect("projection");
+        assert!(found.finding == Finding::Warn && found.text.contains(says), "{}", found.text);
+    }
+}
+
 /// Links that move and weigh nothing are named by every door.
 #[test]
 fn a_moving_link_without_an_inertia_is_named() {

@@ -1,6 +1,7 @@
 //! Robots on legs: whatever targets their drives are given, forces and their change stay within what the motors allow, also where one policy
 //! takes over from another. Balance is not promised; falls are counted.
 
+use nearl_constraints::Status;
 use nearl_runtime::command::CommandSection;
 use nearl_runtime::net::{Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
@@ -187,8 +188,10 @@ fn targets_within_the_intervals_are_not_touched() {
         state.obs[..12].copy_from_slice(&state.q[7..]);
         controller.reset();
         controller.update(&state, &noise, &mut out);
+        let mut broken = 0;
         for i in 0..12 {
             let asked = f64::from(out.sampled[i]);
+            broken += u32::from(out.action[i] != asked);
             let force = GAINS[0] * (asked - state.q[7 + i]);
             // What 3000 rad/s^2 may add within the tick is kept free.
             let room = EFFORT[i % 3] - (GAINS[1] + 0.5 * GAINS[0] * DT) * 3000.0 * DT;
@@ -196,6 +199,45 @@ fn targets_within_the_intervals_are_not_touched() {
             assert_eq!(allowed, out.action[i].to_bits() == asked.to_bits(), "{force} N m");
             same += usize::from(allowed);
         }
+        let ledger = &out.next.ledger;
+        assert_eq!((ledger.raw_violations.total(), ledger.violations.total()), (broken, 0));
+        assert_eq!(ledger.status == Status::Clamped, broken > 0);
     }
     assert!(same > 1000, "{same}");
+}
+
+/// A policy that proposes states is projected, and the drives of its learned inverse model are bounded besides: the ledger of the tick says what
+/// the projection did, and more was moved where drives were bounded.
+#[test]
+fn the_report_of_the_drives_does_not_hide_that_of_the_projection() {
+    let set = ["idm.kind=\"learned\"", "constraints.braking=\"certified\""];
+    let mut snapshot = training("Panda-reach", "pid2-ib", 1, 1, &set).snapshot().clone();
+    for layer in &mut snapshot.networks.policy.layers {
+        layer.weight.iter_mut().for_each(|w| *w *= 20.0);
+    }
+    let m = &mut snapshot.manifest;
+    assert_eq!(m.policy, PolicyKind::Stochastic);
+    m.task.command = section(r#"{"interface": "pd", "stiffness": 600.0, "damping": 40.0}"#);
+    let free = Controller::new(&snapshot);
+    snapshot.manifest.task.constraints.guard = serde_json::from_str("\"drive\"").expect("a guard");
+    let mut pair = [free, Controller::new(&snapshot)].map(|controller| controller.expect("controller"));
+    let (mut outs, noise) = (pair.each_ref().map(Controller::output), pair[0].noise());
+    let (mut state, mut rng, mut projected, mut bounded) = (pair[0].state(), stream(1, 4), 0, 0);
+    for _ in 0..200 {
+        for (i, q) in [0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8].iter().enumerate() {
+            state.q[i] = q + rng.random_range(-0.2..0.2);
+        }
+        state.obs[..7].copy_from_slice(&state.q);
+        for (controller, out) in pair.iter_mut().zip(&mut outs) {
+            controller.reset();
+            controller.update(&state, &noise, out);
+        }
+        let [free, guarded] = outs.each_ref().map(|out| &out.next.ledger);
+        assert_eq!(guarded.status, free.status);
+        assert_eq!(guarded.active, free.active);
+        assert!(guarded.moved >= free.moved && guarded.raw_violations.total() >= free.raw_violations.total());
+        projected += u32::from(free.status != Status::Unchanged);
+        bounded += u32::from(outs[0].action != outs[1].action);
+    }
+    assert!(projected > 100 && bounded > 100, "projected {projected}, bounded {bounded}");
 }

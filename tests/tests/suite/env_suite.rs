@@ -7,10 +7,23 @@ use nearl_trainer::env::{
     self, ChaCha8Rng, Env, EnvError, Excess, Fault, LimitError, Limits, Meter, SeedableRng,
 };
 use nearl_trainer::mj::Inverse;
+use nearl_trainer::tasks;
 use rand::RngExt;
 
 fn every_task() -> impl Iterator<Item = Box<dyn Env>> {
     env::names().map(|name| env::make(name).expect("a registered task can be made"))
+}
+
+/// Who lists the tasks need not compile a robot to know how long an episode is.
+#[test]
+fn the_registry_knows_how_long_an_episode_is() {
+    for entry in env::REGISTRY {
+        let spec = env::make(entry.name).expect("a registered task can be made");
+        assert_eq!(entry.max_episode_steps, spec.spec().max_episode_steps, "{}", entry.name);
+        assert_eq!(tasks::max_episode_steps(entry.name), Some(entry.max_episode_steps), "{}", entry.name);
+    }
+    assert_eq!(tasks::max_episode_steps("Hopper-velocity"), Some(1000), "the environment it names");
+    assert_eq!(tasks::max_episode_steps("cart-pole"), None);
 }
 
 fn seeded(seed: u64) -> ChaCha8Rng {

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use nearl_runtime::Controller;
+use nearl_runtime::{Controller, PolicyKind};
 use nearl_tests::random_policy;
 use nearl_trainer::env::{self, Env};
 use nearl_trainer::learn::Algorithm;
@@ -254,6 +254,40 @@ fn motors_with_gear_gain_and_bias_in_any_order_reach_what_was_projected() {
     );
     let apart = swings[0].iter().zip(&swings[1]).take(200).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
     assert!(apart < 1e-6, "the same policy moved the two arms {apart} rad/s apart");
+}
+
+/// Where the file says nothing of exploration, the one that the inverse model can have is taken.
+#[test]
+fn exploration_that_is_not_stated_fits_the_inverse_model() {
+    let folder = tempfile::tempdir().expect("folder");
+    for (kind, stated, policy) in [
+        ("pinocchio", "", Ok(PolicyKind::Stochastic)),
+        ("pinocchio", "exploration = \"action\"", Err("needs a learned inverse model")),
+        ("learned", "", Ok(PolicyKind::Deterministic)),
+        ("learned", "exploration = \"proposal\"", Ok(PolicyKind::Stochastic)),
+    ] {
+        let text = std::fs::read_to_string(fixture("two_link.toml")).expect("task");
+        let text = text.replace("kind = \"pinocchio\"", &format!("kind = \"{kind}\""));
+        let text = text.replace("exploration = \"proposal\"", stated);
+        let consistency = if kind == "learned" { "free" } else { "kinematic" };
+        let text = text.replace("\"kinematic\"", &format!("\"{consistency}\""));
+        std::fs::write(folder.path().join("two_link.toml"), text).expect("task");
+        std::fs::copy(fixture("two_link.xml"), folder.path().join("two_link.xml")).expect("robot");
+        let mut manifest =
+            tasks::load(&folder.path().join("two_link.toml").display().to_string(), &[]).expect("task");
+        complete(&mut manifest).expect("manifest");
+        let request = Request { manifest, algo: Algorithm::Pid2Ib, steps: 1024, seed: 0, threads: 1 };
+        let made = Training::new(&request);
+        match (policy, made) {
+            (Ok(policy), Ok(training)) => {
+                assert_eq!(training.snapshot().manifest.policy, policy, "{kind}, {stated}")
+            }
+            (Err(says), Err(e)) => assert!(e.to_string().contains(says), "{e}"),
+            (expected, made) => {
+                panic!("{kind}, {stated}: {expected:?}, {:?}", made.err().map(|e| e.to_string()))
+            }
+        }
+    }
 }
 
 #[test]

@@ -31,7 +31,7 @@ const ROBOT: Robot = Robot {
 };
 const HAND: &str = "panda_hand";
 /// Control period, unless the task file has another [s].
-const DT: f64 = 1e-3;
+pub(super) const DT: f64 = 1e-3;
 /// Length of an episode [s].
 const EPISODE: f64 = 2.0;
 /// Pose to start from \[rad\]: elbow bent, hand in front of the base and pointing down.
@@ -67,6 +67,11 @@ pub(super) fn build() -> Result<Box<dyn Env>, EnvError> {
     build_at(DT)
 }
 
+/// Control periods of `dt` [s] in an episode.
+pub(super) const fn periods(dt: f64) -> usize {
+    (EPISODE / dt).round() as usize
+}
+
 /// With another control period [s]; its episodes last as long.
 pub(super) fn build_at(dt: f64) -> Result<Box<dyn Env>, EnvError> {
     let physics = |source| EnvError::Physics { task: NAME.into(), source };
@@ -83,8 +88,7 @@ pub(super) fn build_at(dt: f64) -> Result<Box<dyn Env>, EnvError> {
     }
     let mut names = joint_names(&model, 0);
     names.extend(["goal.x", "goal.y", "goal.z", "error.x", "error.y", "error.z"].map(String::from));
-    let max_episode_steps = (EPISODE / dt).round() as usize;
-    let task = Constants { name: NAME.into(), sub_steps: 1, max_episode_steps };
+    let task = Constants { name: NAME.into(), sub_steps: 1, max_episode_steps: periods(dt) };
     let spec = Spec::new(&model, task, names, joints.iter().map(torque).collect());
     let ranges =
         std::array::from_fn(|j| [joints[j].range[0] + LIMIT_MARGIN, joints[j].range[1] - LIMIT_MARGIN]);

@@ -97,8 +97,8 @@ pub(super) fn policy_kind(
     let coupled = task.constraints.consistency == Consistency::Kinematic;
     match (algo, settings.exploration, task.idm.kind) {
         (algo, ..) if algo.is_direct() => Ok(PolicyKind::Direct),
-        (_, Exploration::Proposal, _) => Ok(PolicyKind::Stochastic),
-        (_, Exploration::Action, IdmKind::Learned) if coupled && gradient != Gradient::StraightThrough => {
+        (_, Exploration::Proposal, _) | (_, Exploration::Auto, IdmKind::Pinocchio) => Ok(PolicyKind::Stochastic),
+        (_, _, IdmKind::Learned) if coupled && gradient != Gradient::StraightThrough => {
             Err(TrainError::Settings(format!(
                 "[constraints.consistency]: 'kinematic' moves position and velocity of '{}' together, and the policy gradient through a learned \
                  inverse model passes clamped entries alone; use consistency = \"free\", or gradient = \"straight-through\" under [train.pid2] \
@@ -106,9 +106,9 @@ pub(super) fn policy_kind(
                 task.name
             )))
         }
-        (_, Exploration::Action, IdmKind::Learned) => Ok(PolicyKind::Deterministic),
+        (_, _, IdmKind::Learned) => Ok(PolicyKind::Deterministic),
         (_, Exploration::Action, IdmKind::Pinocchio) => Err(TrainError::Settings(
-            "[train.exploration]: 'action' needs a learned inverse model, but idm.kind is 'pinocchio'; use exploration = \"proposal\"".into(),
+            "[train.exploration]: 'action' needs a learned inverse model, but idm.kind is 'pinocchio'; take it out, or use exploration = \"proposal\"".into(),
         )),
     }
 }
