@@ -40,6 +40,13 @@ pub(crate) fn read(xml: &str, file: &str, free_flyer: bool) -> Result<RobotDescr
     if !root.has_tag_name("robot") {
         return Err(malformed(format!("its root element is <{}>, not <robot>", root.tag_name().name())));
     }
+    let is_macro = |node: &Node| node.tag_name().namespace().is_some_and(|space| space.ends_with("xacro"));
+    if let Some(node) = root.descendants().find(is_macro) {
+        let name = node.tag_name().name();
+        return Err(malformed(format!(
+            "it has macros (<xacro:{name}>), of which the program xacro makes a URDF"
+        )));
+    }
     let mut wrong = Vec::new();
     children(root, "link").for_each(|link| check_link(link, &mut wrong));
     check_tree(root, &mut wrong);

@@ -43,7 +43,9 @@ pub(super) fn check_tree(robot: Node, wrong: &mut Vec<String>) {
         }
     }
     let roots: Vec<_> = links.iter().filter(|link| !parents.contains_key(*link)).collect();
-    if roots.is_empty() {
+    if links.is_empty() {
+        wrong.push("it has no <link>".to_string());
+    } else if roots.is_empty() {
         wrong.push("every link is some joint's child, but one must be the root".to_string());
     }
     if roots.len() > 1 {

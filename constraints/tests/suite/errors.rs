@@ -37,6 +37,10 @@ fn models() {
     std::fs::remove_file(&empty).unwrap();
     refuse_model(Model::from_urdf_text("<robot>\n<link</robot>"), &["the URDF text", "2:"]);
     refuse_model(Model::from_urdf_text("<mujoco/>"), &["<mujoco>", "<robot>"]);
+    refuse_model(Model::from_urdf_text("<robot name=\"r\"/>"), &["it has no <link>"]);
+    let macros =
+        r#"<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="arm.xacro"/></robot>"#;
+    refuse_model(Model::from_urdf_text(macros), &["<xacro:include>", "the program xacro makes a URDF"]);
     let mass = |m: &str| Model::from_urdf_text(&urdf(GOOD, m));
     assert!(mass("1").is_ok());
     refuse_model(mass("-1"), &["link 'b' mass is -1 kg"]);
