@@ -64,7 +64,7 @@ pub fn with_core(fuzz: impl FnOnce(&dyn Fn(&[u8]))) {
         age_limit: 20_000_000,
         real_time: true,
         stop_speed: 1e-2,
-        jump: 3.0,
+        jump: RunSettings::default().jump,
         ramp: 50,
         modes: ModeLimits::default(),
         explore: Some(3),

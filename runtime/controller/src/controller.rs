@@ -7,14 +7,18 @@
 //! An action that comes out of a network takes the same way once more where the task asks for it (`[constraints] guard = true`): it proposes the
 //! state that it leads to.
 //!
+//! What it remembers from tick to tick is in `controller/memory.rs`, what it tells of itself in `controller/facts.rs`.
+//!
 //! Training, evaluation, the real-time loop and replay all call [`Controller::update`]. Noise is an
 //! input: zero on the robot. Nothing is allocated after [`Controller::new`] but Clarabel's one block.
 
 mod drive_box;
+mod facts;
 mod foreign;
 mod given;
 mod guard;
 mod maths;
+mod memory;
 mod noise;
 mod parts;
 
@@ -31,8 +35,8 @@ use given::Given;
 use guard::Guard;
 use maths::{hermite, sample};
 use nearl_constraints::{
-    ActionLimit, ActionReport, Bounds, Entry, Ledger, LimitSet, Model, Projector, Proposal, RefuseReason,
-    StateLayout, Status, Target,
+    ActionLimit, ActionReport, Bounds, Entry, Ledger, Model, Projector, Proposal, RefuseReason, StateLayout,
+    Status, Target,
 };
 use parts::{check_sizes, halves, idx_q};
 use std::time::Instant;
@@ -495,94 +499,6 @@ impl Controller {
         }
     }
 
-    /// Starts a new episode: the next tick is a policy tick.
-    pub fn reset(&mut self) {
-        (self.tick, self.begun, self.earlier) = (0, 0, 0);
-        self.given.forget();
-        self.foreign.reset();
-        self.projector().forget();
-        if let Some(drives) = &mut self.drive_box {
-            drives.forget();
-        }
-        if let Some(limit) = &mut self.action_limit {
-            limit.forget();
-        }
-    }
-
-    /// Whether the policy runs in the next tick.
-    pub fn begins_period(&self) -> bool {
-        (self.tick - self.begun).is_multiple_of(self.policy_every)
-    }
-
-    /// What the next policy tick depends on beside its arguments, as plain numbers; see [`Projector::memory`].
-    pub fn memory(&self) -> Vec<f64> {
-        let mut memory = Vec::new();
-        self.write_memory(&mut memory);
-        memory
-    }
-
-    /// Appends [`Controller::memory`] to `memory`; allocates only where that has no room.
-    pub fn write_memory(&self, memory: &mut Vec<f64>) {
-        self.last_word().write_memory(memory);
-        if let Some(drives) = &self.drive_box {
-            drives.write_memory(memory);
-        }
-        if let Some(limit) = &self.action_limit {
-            limit.write_memory(memory);
-        }
-        self.foreign.write_memory(self.earlier + self.tick, memory);
-    }
-
-    /// The way to stop that was verified last (nv), see [`Projector::stored_brake`].
-    pub fn stored_brake(&self) -> Option<&[f64]> {
-        self.last_word().stored_brake()
-    }
-
-    /// Whether the next tick depends on [`Controller::memory`] and its arguments alone: a policy period begins, and no observation of
-    /// earlier ticks is kept.
-    pub fn is_memory_whole(&self) -> bool {
-        self.begins_period() && !self.foreign.remembers()
-    }
-
-    /// The projector that decides what happens: the guard's where there is one.
-    fn last_word(&self) -> &Projector {
-        self.guard.as_ref().map_or(&self.projector, |guard| &guard.projector)
-    }
-
-    /// The same: what it knows of the tick before moves between those of one robot.
-    pub fn projector(&mut self) -> &mut Projector {
-        self.guard.as_mut().map_or(&mut self.projector, |guard| &mut guard.projector)
-    }
-
-    /// Begins in the middle of an episode, at a policy tick, with what [`Controller::memory`] gave.
-    ///
-    /// # Panics
-    /// When it has another length.
-    pub fn set_memory(&mut self, memory: &[f64]) {
-        self.reset();
-        self.take_memory(memory);
-    }
-
-    /// Takes what [`Controller::memory`] gave, in the middle of a policy period too: a controller that takes over from another.
-    ///
-    /// # Panics
-    /// When it has another length.
-    pub fn take_memory(&mut self, memory: &[f64]) {
-        let (memory, seen) = memory.split_at(memory.len() - self.foreign.memory_len());
-        self.earlier = self.foreign.set_memory(seen).saturating_sub(self.tick);
-        let of_limit = self.action_limit.as_ref().map_or(0, ActionLimit::memory_len);
-        let (memory, limit) = memory.split_at(memory.len() - of_limit);
-        if let Some(own) = &mut self.action_limit {
-            own.set_memory(limit);
-        }
-        let own = self.drive_box.as_ref().map_or(0, DriveBox::memory_len);
-        let (projector, drives) = memory.split_at(memory.len() - own);
-        self.projector().set_memory(projector);
-        if let Some(own) = &mut self.drive_box {
-            own.set_memory(drives);
-        }
-    }
-
     /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.
     pub fn set_networks(&mut self, networks: &Networks) {
         self.normaliser = networks.normaliser.clone();
@@ -601,128 +517,5 @@ impl Controller {
     /// Switches the projection off (or on again): the raw proposal becomes the target. For comparisons only.
     pub fn set_projection(&mut self, on: bool) {
         self.projection = on;
-    }
-    /// How far `state` is outside the limits of the controllable joints: the largest excess of a position and of a velocity; less than
-    /// 1e-9 is none.
-    pub fn excess(&self, state: &State) -> [Option<Excess>; 2] {
-        self.excess_over(self.limits(), state)
-    }
-    /// The same over limits of one's own, by degree of freedom.
-    pub fn excess_over(&self, l: &LimitSet, state: &State) -> [Option<Excess>; 2] {
-        let mut worst = [None::<Excess>; 2];
-        for &dof in self.layout.controllable() {
-            let (q, v) = (state.q[self.idx_q[dof]], state.v[dof]);
-            let by = [(l.q_lower[dof] - q).max(q - l.q_upper[dof]), v.abs() - l.velocity[dof]];
-            for (worst, by) in worst.iter_mut().zip(by) {
-                *worst = Excess::larger(*worst, (by > 1e-9).then_some(Excess { dof, by }));
-            }
-        }
-        worst
-    }
-    /// Mean `|reached - target|` over the entries of the controllable joints, in units of the scale of change: how far observation `obs`
-    /// (n_obs) is from what `out` asked for. 0 for a policy on actions without a guard, which asks for no state.
-    pub fn residual(&self, obs: &[f64], out: &Output) -> f64 {
-        if self.kind == PolicyKind::Direct && self.guard.is_none() {
-            return 0.0;
-        }
-        let seen = self.layout.controllable_state();
-        let miss =
-            |&k: &usize| (obs[self.layout.state()[k]] - out.target[k]).abs() / self.normaliser.scale[k];
-        seen.iter().map(miss).sum::<f64>() / seen.len().max(1) as f64
-    }
-    /// Whether what comes out of a tick depends on the ticks before: the policy proposes every few ticks, a limit speaks of the tick before, or
-    /// a brake is stored.
-    pub fn remembers(&self) -> bool {
-        let last = self.last_word();
-        self.drive_box.is_some()
-            || self.action_limit.as_ref().is_some_and(ActionLimit::remembers)
-            || self.policy_every > 1
-            || self.foreign.remembers()
-            || last.needs_previous()
-            || last.stores_a_brake()
-    }
-    /// Whether actions are kept within limits of their own: forces of drives, or `[constraints] action`.
-    pub fn bounds_actions(&self) -> bool {
-        self.drive_box.is_some() || self.action_limit.is_some()
-    }
-    /// Number of entries that the policy sees.
-    pub fn n_seen(&self) -> usize {
-        self.policy.n_in()
-    }
-    /// Writes what the policy would see in `state` if it ran in the next tick, before the normaliser (n_seen).
-    pub fn peek(&self, state: &State, seen: &mut [f64]) {
-        self.foreign.peek(state, self.time(), seen);
-    }
-    /// Time since the reset [s].
-    fn time(&self) -> f64 {
-        (self.earlier + self.tick) as f64 * self.dt
-    }
-    /// Limits by degree of freedom.
-    pub fn limits(&self) -> &LimitSet {
-        self.last_word().limits()
-    }
-    /// What the ledger's active rows are of: dofs, then coupled rows.
-    pub fn row_names(&self) -> Vec<String> {
-        self.last_word().row_names()
-    }
-    /// Kind of each row; none for those of single joints.
-    pub fn row_kinds(&self) -> Vec<Option<nearl_constraints::Kind>> {
-        self.last_word().row_kinds()
-    }
-    /// Robot model.
-    pub fn model(&self) -> &Model {
-        &self.model
-    }
-    /// State layout.
-    pub fn layout(&self) -> &StateLayout {
-        &self.layout
-    }
-    /// Observation normaliser and scale of change.
-    pub fn normaliser(&self) -> &Normaliser {
-        &self.normaliser
-    }
-    /// Version of the snapshot the networks came from.
-    pub fn version(&self) -> u64 {
-        self.version
-    }
-    /// Control period in \[s\].
-    pub fn dt(&self) -> f64 {
-        self.dt
-    }
-    /// Control ticks in one policy period.
-    pub fn policy_every(&self) -> usize {
-        self.policy_every
-    }
-    /// Size of the action.
-    pub fn n_act(&self) -> usize {
-        self.action_range.len()
-    }
-    /// A state of the right sizes, at rest in the neutral configuration.
-    pub fn state(&self) -> State {
-        State { q: self.model.neutral(), v: vec![0.0; self.model.nv()], obs: vec![0.0; self.layout.n_obs()] }
-    }
-    /// Zero noise of the right sizes.
-    pub fn noise(&self) -> Noise {
-        Noise { proposal: vec![0.0; self.layout.n_state()], action: vec![0.0; self.n_act()] }
-    }
-    /// An output of the right sizes.
-    pub fn output(&self) -> Output {
-        let (s, a) = (self.layout.n_state(), self.n_act());
-        Output {
-            x: vec![0.0; self.policy.n_in()],
-            change: vec![0.0; s],
-            proposal: vec![0.0; s],
-            target: vec![0.0; s],
-            target_change: vec![0.0; s],
-            lower: vec![f32::NEG_INFINITY; s],
-            upper: vec![f32::INFINITY; s],
-            sampled: vec![0.0; a],
-            action: vec![0.0; a],
-            log_prob_proposal: 0.0,
-            log_prob_action: 0.0,
-            next: Target::new(&self.model),
-            policy_tick: true,
-            duration_ns: 0,
-        }
     }
 }

@@ -34,7 +34,7 @@ pub fn settings() -> CoreSettings {
         age_limit: 20 * PERIOD,
         real_time: true,
         stop_speed: 1e-2,
-        jump: 3.0,
+        jump: RunSettings::default().jump,
         ramp: 50,
         modes: ModeLimits::default(),
         explore: None,

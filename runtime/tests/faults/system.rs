@@ -162,7 +162,7 @@ fn no_rights(name: &RobotName) {
         }
     }
     let strict = std::env::var(STRICT).is_ok();
-    let thread = ThreadSettings { priority: Some(40), cpu: None, lock_memory: true };
+    let thread = ThreadSettings { priority: Some(PRIORITY), cpu: None, lock_memory: true };
     let settings = RunSettings { thread, strict, ticks: Some(50), ..toy::settings() };
     let (drops, _dropped) = std::sync::mpsc::channel();
     let first = spring(1, &drops);
@@ -175,7 +175,8 @@ fn no_rights(name: &RobotName) {
         Err(error @ RunError::Strict(_)) if strict => error.to_string(),
         other => panic!("{other:?}"),
     };
-    assert!(said.contains("memory is not locked") && said.contains("no real-time priority 40"), "{said}");
+    let priority = format!("no real-time priority {PRIORITY}");
+    assert!(said.contains("memory is not locked") && said.contains(&priority), "{said}");
 }
 
 /// Says what is not tested here, past the harness that keeps what a test prints; with `NEARL_NO_SKIPS`, as where every means is at hand,

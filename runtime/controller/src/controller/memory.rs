@@ -1,0 +1,107 @@
+//! What a controller remembers from tick to tick, and how another controller takes it over.
+
+use super::Controller;
+use super::drive_box::DriveBox;
+use nearl_constraints::{ActionLimit, Projector};
+
+impl Controller {
+    /// Starts a new episode: the next tick is a policy tick.
+    pub fn reset(&mut self) {
+        (self.tick, self.begun, self.earlier) = (0, 0, 0);
+        self.given.forget();
+        self.foreign.reset();
+        self.projector().forget();
+        if let Some(drives) = &mut self.drive_box {
+            drives.forget();
+        }
+        if let Some(limit) = &mut self.action_limit {
+            limit.forget();
+        }
+    }
+
+    /// Whether the policy runs in the next tick.
+    pub fn begins_period(&self) -> bool {
+        (self.tick - self.begun).is_multiple_of(self.policy_every)
+    }
+
+    /// What the next policy tick depends on beside its arguments, as plain numbers; see [`Projector::memory`].
+    pub fn memory(&self) -> Vec<f64> {
+        let mut memory = Vec::new();
+        self.write_memory(&mut memory);
+        memory
+    }
+
+    /// Appends [`Controller::memory`] to `memory`; allocates only where that has no room.
+    pub fn write_memory(&self, memory: &mut Vec<f64>) {
+        self.last_word().write_memory(memory);
+        if let Some(drives) = &self.drive_box {
+            drives.write_memory(memory);
+        }
+        if let Some(limit) = &self.action_limit {
+            limit.write_memory(memory);
+        }
+        self.foreign.write_memory(self.earlier + self.tick, memory);
+    }
+
+    /// The way to stop that was verified last (nv), see [`Projector::stored_brake`].
+    pub fn stored_brake(&self) -> Option<&[f64]> {
+        self.last_word().stored_brake()
+    }
+
+    /// Whether the next tick depends on [`Controller::memory`] and its arguments alone: a policy period begins, and no observation of
+    /// earlier ticks is kept.
+    pub fn is_memory_whole(&self) -> bool {
+        self.begins_period() && !self.foreign.remembers()
+    }
+
+    /// The projector that decides what happens: the guard's where there is one.
+    pub(super) fn last_word(&self) -> &Projector {
+        self.guard.as_ref().map_or(&self.projector, |guard| &guard.projector)
+    }
+
+    /// The same: what it knows of the tick before moves between those of one robot.
+    pub fn projector(&mut self) -> &mut Projector {
+        self.guard.as_mut().map_or(&mut self.projector, |guard| &mut guard.projector)
+    }
+
+    /// Begins in the middle of an episode, at a policy tick, with what [`Controller::memory`] gave.
+    ///
+    /// # Panics
+    /// When it has another length.
+    pub fn set_memory(&mut self, memory: &[f64]) {
+        self.reset();
+        self.take_memory(memory);
+    }
+
+    /// Takes what [`Controller::memory`] gave, in the middle of a policy period too: a controller that takes over from another.
+    ///
+    /// # Panics
+    /// When it has another length.
+    pub fn take_memory(&mut self, memory: &[f64]) {
+        let (memory, seen) = memory.split_at(memory.len() - self.foreign.memory_len());
+        self.earlier = self.foreign.set_memory(seen).saturating_sub(self.tick);
+        let of_limit = self.action_limit.as_ref().map_or(0, ActionLimit::memory_len);
+        let (memory, limit) = memory.split_at(memory.len() - of_limit);
+        if let Some(own) = &mut self.action_limit {
+            own.set_memory(limit);
+        }
+        let own = self.drive_box.as_ref().map_or(0, DriveBox::memory_len);
+        let (projector, drives) = memory.split_at(memory.len() - own);
+        self.projector().set_memory(projector);
+        if let Some(own) = &mut self.drive_box {
+            own.set_memory(drives);
+        }
+    }
+
+    /// Whether what comes out of a tick depends on the ticks before: the policy proposes every few ticks, a limit speaks of the tick before, or
+    /// a brake is stored.
+    pub fn remembers(&self) -> bool {
+        let last = self.last_word();
+        self.drive_box.is_some()
+            || self.action_limit.as_ref().is_some_and(ActionLimit::remembers)
+            || self.policy_every > 1
+            || self.foreign.remembers()
+            || last.needs_previous()
+            || last.stores_a_brake()
+    }
+}
