@@ -12,7 +12,7 @@ use crate::limit_check::{Fault, TOLERANCE, are_near, broken, worst};
 use crate::motion::SPENT;
 use crate::promise::Promise;
 use crate::rows::{Passage, Row, Rule};
-use crate::tick::Ledger;
+use crate::tick::{Active, Ledger};
 
 /// A limit is active when this share of the largest velocity change of a period would break it.
 const NEAR: f64 = 1e-4;
@@ -33,6 +33,19 @@ const TOO_FAR: &str = "the proposal is further away than numbers are exact";
 const RELAXED: u32 = 4;
 const CLARABEL: u32 = 2;
 
+/// What the active rows push the target back by (nv), and the sum of the magnitudes of its parts.
+struct Push {
+    sum: Vec<f64>,
+    size: Vec<f64>,
+}
+
+impl Push {
+    fn add(&mut self, dof: usize, by: f64) {
+        self.sum[dof] += by;
+        self.size[dof] += by.abs();
+    }
+}
+
 /// The conditions of a tick; the largest pull that is left, as a share of what is rounding.
 ///
 /// `goals` are the unconstrained optima of `v'` (nv): the two that differ by rounding.
@@ -43,11 +56,10 @@ pub(crate) fn confirm(
     ledger: &Ledger,
     whole: bool,
 ) -> Result<f64, Fault> {
-    let unknown = |why: &str| Err(Fault::Unknown(why.to_owned()));
     if ledger.active != ledger.active_rows.len() {
         return unknown("more rows were active than a record has room for");
     }
-    let Promise { machine, limits, controllable, period, worth, .. } = promise;
+    let Promise { machine, limits, controllable, period, .. } = promise;
     let has_rows = !limits.rows.is_empty();
     if has_rows && controllable.iter().any(|&i| (goals[0][i] - passage.v1[i]).abs() > FAR) {
         return unknown(TOO_FAR);
@@ -62,76 +74,107 @@ pub(crate) fn confirm(
         .filter_map(|a| limits.rows.get(a.row.checked_sub(nv)?))
         .any(Row::is_of_force);
     let forces = if is_of_force { forces(machine, period, passage) } else { Vec::new() };
-    let mut push = vec![0.0; nv];
-    let mut size = vec![0.0f64; nv];
+    let mut push = Push { sum: vec![0.0; nv], size: vec![0.0; nv] };
     for (n, active) in ledger.active_rows.iter().enumerate() {
-        let side = match active.side.as_str() {
-            "lower" => -1.0,
-            "upper" => 1.0,
-            other => return broken(format!("side '{other}' of active row {n}"), f64::NAN, 0.0, ""),
-        };
-        let multiplier = active.multiplier;
-        if multiplier.is_nan() || multiplier < 0.0 || multiplier.is_infinite() {
-            return broken(format!("multiplier of active row {n}"), multiplier, 0.0, "or more");
+        let side = side_of(active, n)?;
+        match active.row < nv {
+            true => push_of_joint(promise, passage, active, side, whole, &mut push)?,
+            false => push_of_row(promise, passage, (n, active, side), ledger.rung, &forces, &mut push)?,
         }
-        if active.row < nv {
-            let (i, joint) = (active.row, &limits.joints[active.row]);
-            let named = format!("active {} row of joint '{}'", active.kind, joint.name);
-            if !controllable.contains(&i) || active.slack != 0.0 {
-                return broken(format!("slack of the {named}"), active.slack, 0.0, "");
-            }
-            push[i] += side * multiplier;
-            size[i] += multiplier;
-            let q = machine.single(i).map(|at| passage.q[at]);
-            let most = joint.acceleration.min(2.0 * joint.velocity / period.dt) * period.dt;
-            let more = passage.v1[i] + side * NEAR * if most.is_finite() { most } else { 1.0 };
-            let known = passage.last.map(|last| last[i]);
-            if multiplier > 0.0
-                && !joint.breaks(&active.kind, side, period, q, (passage.v[i], known), more, whole)
-            {
-                return broken(
-                    format!("velocity after the {named}, which holds nothing there,"),
-                    passage.v1[i],
-                    more,
-                    "rad/s or m/s at least",
-                );
-            }
-            continue;
-        }
-        let Some(row) = limits.rows.get(active.row - nv).filter(|row| row.kind == active.kind) else {
-            return broken(
-                format!("number of the active {} row {n}", active.kind),
-                active.row as f64,
-                (nv + limits.rows.len()) as f64,
-                "rows",
-            );
-        };
-        let (slope, excess) = match (&limits.collision, &row.rule) {
-            (Some(bodies), Rule::Pair) => {
-                match bodies.row(machine, period, passage, active.row - nv - first_pair(&limits.rows)) {
-                    Told::Row(excess, slope) => (slope, excess),
-                    Told::Unknown(why) => return unknown(&why),
-                    Told::None => {
-                        let what = format!("distance of the active row {n} of bodies");
-                        return broken(what, f64::INFINITY, bodies.influence(), "m at most");
-                    }
-                }
-            }
-            _ => {
-                let slope = row.slope(machine, period, passage, &forces);
-                (slope, row.excess(machine, period, passage)[usize::from(side > 0.0)])
-            }
-        };
-        for &i in controllable.iter() {
-            push[i] += side * multiplier * slope[i];
-            size[i] += (multiplier * slope[i]).abs();
-        }
-        let steepest = slope.iter().fold(0.0, |most: f64, s| most.max(s.abs()));
-        belongs(row, (multiplier, excess, active.slack), steepest, (*worth, ledger.rung))?;
     }
     all_hold(promise, passage, ledger)?;
-    let coarse = if matches!(ledger.rung, CLARABEL | RELAXED) { CONIC } else { ROUNDING };
-    let mut largest = 0.0f64;
+    balance(promise, passage, goals, ledger.rung, &push)
+}
+
+/// Which way an active row pushes, -1 for its lower bound; its multiplier has to be a number that can push.
+fn side_of(active: &Active, n: usize) -> Result<f64, Fault> {
+    let multiplier = active.multiplier;
+    let side = match active.side.as_str() {
+        "lower" => -1.0,
+        "upper" => 1.0,
+        other => return broken(format!("side '{other}' of active row {n}"), f64::NAN, 0.0, ""),
+    };
+    if multiplier.is_nan() || multiplier < 0.0 || multiplier.is_infinite() {
+        return broken(format!("multiplier of active row {n}"), multiplier, 0.0, "or more");
+    }
+    Ok(side)
+}
+
+/// Adds the push of an active limit of a single joint, which a velocity a little further on would break.
+fn push_of_joint(
+    promise: &Promise,
+    passage: &Passage<'_>,
+    active: &Active,
+    side: f64,
+    whole: bool,
+    push: &mut Push,
+) -> Result<(), Fault> {
+    let Promise { machine, limits, controllable, period, .. } = promise;
+    let (i, joint) = (active.row, &limits.joints[active.row]);
+    let named = format!("active {} row of joint '{}'", active.kind, joint.name);
+    if !controllable.contains(&i) || active.slack != 0.0 {
+        return broken(format!("slack of the {named}"), active.slack, 0.0, "");
+    }
+    push.add(i, side * active.multiplier);
+    let q = machine.single(i).map(|at| passage.q[at]);
+    let most = joint.acceleration.min(2.0 * joint.velocity / period.dt) * period.dt;
+    let more = passage.v1[i] + side * NEAR * if most.is_finite() { most } else { 1.0 };
+    let known = passage.last.map(|last| last[i]);
+    let holds = || joint.breaks(&active.kind, side, period, q, (passage.v[i], known), more, whole);
+    if active.multiplier > 0.0 && !holds() {
+        let what = format!("velocity after the {named}, which holds nothing there,");
+        return broken(what, passage.v1[i], more, "rad/s or m/s at least");
+    }
+    Ok(())
+}
+
+/// Adds the push of an active row over several joints.
+fn push_of_row(
+    promise: &mut Promise,
+    passage: &Passage<'_>,
+    (n, active, side): (usize, &Active, f64),
+    rung: u32,
+    forces: &[f64],
+    push: &mut Push,
+) -> Result<(), Fault> {
+    let Promise { machine, limits, controllable, period, worth, .. } = promise;
+    let nv = passage.v.len();
+    let Some(row) = limits.rows.get(active.row - nv).filter(|row| row.kind == active.kind) else {
+        let (what, all) = (format!("number of the active {} row {n}", active.kind), nv + limits.rows.len());
+        return broken(what, active.row as f64, all as f64, "rows");
+    };
+    let (slope, excess) = match (&limits.collision, &row.rule) {
+        (Some(bodies), Rule::Pair) => {
+            match bodies.row(machine, period, passage, active.row - nv - first_pair(&limits.rows)) {
+                Told::Row(excess, slope) => (slope, excess),
+                Told::Unknown(why) => return unknown(&why),
+                Told::None => {
+                    let what = format!("distance of the active row {n} of bodies");
+                    return broken(what, f64::INFINITY, bodies.influence(), "m at most");
+                }
+            }
+        }
+        _ => {
+            let slope = row.slope(machine, period, passage, forces);
+            (slope, row.excess(machine, period, passage)[usize::from(side > 0.0)])
+        }
+    };
+    for &i in controllable.iter() {
+        push.add(i, side * active.multiplier * slope[i]);
+    }
+    let steepest = slope.iter().fold(0.0, |most: f64, s| most.max(s.abs()));
+    belongs(row, (active.multiplier, excess, active.slack), steepest, (*worth, rung))
+}
+
+/// Whether what pulls each joint to its goal is what the active rows push back; the largest remainder, as a share of what is rounding.
+fn balance(
+    promise: &Promise,
+    passage: &Passage<'_>,
+    goals: [&[f64]; 2],
+    rung: u32,
+    push: &Push,
+) -> Result<f64, Fault> {
+    let coarse = if matches!(rung, CLARABEL | RELAXED) { CONIC } else { ROUNDING };
     // The widest side of the box, at most: what a period may change of a velocity.
     let sides = promise.controllable.iter().map(|&i| {
         let joint = &promise.limits.joints[i];
@@ -140,11 +183,13 @@ pub(crate) fn confirm(
     let widest = sides.filter(|side| side.is_finite()).fold(1e-6, f64::max).min(1.0);
     // Clarabel's scaling bears less.
     let most = if coarse == CONIC { 1e-2 * FAR * widest } else { FAR * widest };
+    let has_rows = !promise.limits.rows.is_empty();
     let is_far = has_rows && promise.controllable.iter().any(|&i| (goals[0][i] - passage.v1[i]).abs() > most);
+    let mut largest = 0.0f64;
     for &i in &promise.controllable {
-        let left = |goal: f64| (2.0 * (passage.v1[i] - goal) + push[i]).abs();
+        let left = |goal: f64| (2.0 * (passage.v1[i] - goal) + push.sum[i]).abs();
         let least = left(goals[0][i]).min(left(goals[1][i]));
-        let far = 1.0 + goals[0][i].abs() + passage.v[i].abs() + size[i];
+        let far = 1.0 + goals[0][i].abs() + passage.v[i].abs() + push.size[i];
         if least.is_nan() || least > 2.0 * coarse * far {
             if is_far {
                 return unknown(TOO_FAR);
@@ -156,6 +201,10 @@ pub(crate) fn confirm(
         largest = largest.max(least / (2.0 * coarse * far));
     }
     Ok(largest)
+}
+
+fn unknown<T>(why: &str) -> Result<T, Fault> {
+    Err(Fault::Unknown(why.to_owned()))
 }
 
 /// The first row of a distance.

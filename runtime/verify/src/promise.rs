@@ -126,7 +126,7 @@ pub(crate) struct Promise {
     pub(crate) way: Way,
     /// Of analytic inverse dynamics; empty where a network gives the action.
     pub(crate) actions: Vec<Action>,
-    /// Limits on actions change `moved`.
+    /// Limits on actions, and those of drives, change `moved`.
     pub(crate) limits_actions: bool,
     /// Where an operator has moved its limits; `limits` are then those in force for a tick.
     pub(crate) moving: Option<Moving>,
@@ -247,7 +247,7 @@ impl Promise {
             consistency,
             way: section.braking,
             actions,
-            limits_actions: section.action.is_some(),
+            limits_actions: section.action.is_some() || section.guard == "drive",
             moving,
             worth,
         })

@@ -150,25 +150,16 @@ impl Train {
         let out = self
             .resume
             .clone()
-            .or(self.out)
+            .or_else(|| self.out.clone())
             .unwrap_or_else(|| PathBuf::from(format!("runs/{}/{}_{}", run.name, run.algo, self.seed)));
         let threads = self.threads.unwrap_or_else(cores);
-        let stop = Arc::new(AtomicBool::new(false));
-        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-            // the second signal ends the program at once
-            signal_hook::flag::register_conditional_shutdown(signal, 1, Arc::clone(&stop))?;
-            signal_hook::flag::register(signal, Arc::clone(&stop))?;
-        }
+        let stop = on_signals()?;
         let python = self.video.then(|| Python::of(None));
         if let Some(python) = &python {
             // What is missing is said before hours of training.
             python.module("nearl.video", &["--check"])?;
         }
-        let experience = match (&self.from, &self.collect) {
-            (Some(name), _) => Experience::Loop(RobotName::new(name)?, Arc::clone(&stop)),
-            (None, Some(name)) => Experience::Served(RobotName::new(name)?, Arc::clone(&stop)),
-            (None, None) => Experience::Here,
-        };
+        let experience = self.experience(&stop)?;
         // Said with the first batch: a training that is refused says why, and nothing else.
         let mut advice = crate::train::advice(&manifest)?;
         let bar = bar(self.json, run.steps);
@@ -180,7 +171,7 @@ impl Train {
             show(&bar, self.json, p);
             lines.show(p, run.steps);
             faults += p.tally.faults;
-            last = Some((p.steps, p.seconds, p.return_mean));
+            last = Some(End { steps: p.steps, seconds: p.seconds, mean: p.return_mean });
             !stop.load(Ordering::Relaxed)
         };
         let saved = match &self.resume {
@@ -196,40 +187,12 @@ impl Train {
             eprintln!("nearl: {}", unstable(faults));
         }
         let stopped = stop.load(Ordering::Relaxed);
-        let Some((steps, seconds, mean)) = last else {
-            let done = run.done;
-            if self.json {
-                say(
-                    serde_json::json!({ "run": out, "snapshot": null, "steps": done, "seconds": 0.0, "return": null, "stopped": stopped }),
-                );
-            } else if stopped {
-                say(format!("stopped by a signal before the first batch; run folder {}", out.display()));
-            } else {
-                let (out, steps) = (out.display(), run.steps);
-                say(format!("{out} has {done} of {steps} steps already; give more with --steps"));
-            }
+        let Some(end) = last else {
+            self.tell_nothing(&run, &out, stopped);
             return Ok(());
         };
-        let stopped = stopped && steps < run.steps;
-        if self.json {
-            say(
-                serde_json::json!({ "run": out, "snapshot": saved, "steps": steps, "seconds": seconds, "return": mean,
-                "stopped": stopped }),
-            );
-        } else {
-            say(format!(
-                "{} {}: {} after {steps} steps in {seconds:.0} s, {:.0} steps/s",
-                run.name,
-                run.algo,
-                returned(mean, " (mean of the last 100 episodes)"),
-                steps as f64 / seconds
-            ));
-            say(format!(
-                "run folder {}, snapshot {}",
-                out.display(),
-                run_folder::snapshot_of(&out)?.display()
-            ));
-        }
+        let stopped = stopped && end.steps < run.steps;
+        self.tell(&run, &out, &saved, &end, stopped)?;
         if let Some(python) = python {
             let video = out.join("video.mp4");
             python.module(
@@ -241,15 +204,71 @@ impl Train {
             }
         }
         if stopped && !self.json {
+            let (steps, all, task, out) = (end.steps, run.steps, &self.task, out.display());
             say(format!(
-                "stopped by a signal after {steps} of {} steps; go on with 'nearl train {} --resume {}'",
-                run.steps,
-                self.task,
-                out.display()
+                "stopped by a signal after {steps} of {all} steps; go on with 'nearl train {task} --resume {out}'"
             ));
         }
         Ok(())
     }
+
+    fn experience(&self, stop: &Arc<AtomicBool>) -> Result<Experience, Failure> {
+        Ok(match (&self.from, &self.collect) {
+            (Some(name), _) => Experience::Loop(RobotName::new(name)?, Arc::clone(stop)),
+            (None, Some(name)) => Experience::Served(RobotName::new(name)?, Arc::clone(stop)),
+            (None, None) => Experience::Here,
+        })
+    }
+
+    /// Says how a training ended that learned something.
+    fn tell(&self, run: &Run, out: &Path, saved: &Path, end: &End, stopped: bool) -> Result<(), Failure> {
+        let End { steps, seconds, mean } = *end;
+        if self.json {
+            say(
+                serde_json::json!({ "run": out, "snapshot": saved, "steps": steps, "seconds": seconds, "return": mean,
+                "stopped": stopped }),
+            );
+            return Ok(());
+        }
+        let (name, algo, speed) = (&run.name, run.algo, steps as f64 / seconds);
+        let returned = returned(mean, " (mean of the last 100 episodes)");
+        say(format!("{name} {algo}: {returned} after {steps} steps in {seconds:.0} s, {speed:.0} steps/s"));
+        say(format!("run folder {}, snapshot {}", out.display(), run_folder::snapshot_of(out)?.display()));
+        Ok(())
+    }
+
+    /// Says why nothing was learned: a signal came first, or the run had all its steps.
+    fn tell_nothing(&self, run: &Run, out: &Path, stopped: bool) {
+        let Run { steps, done, .. } = run;
+        if self.json {
+            say(
+                serde_json::json!({ "run": out, "snapshot": null, "steps": done, "seconds": 0.0, "return": null,
+                "stopped": stopped }),
+            );
+        } else if stopped {
+            say(format!("stopped by a signal before the first batch; run folder {}", out.display()));
+        } else {
+            say(format!("{} has {done} of {steps} steps already; give more with --steps", out.display()));
+        }
+    }
+}
+
+/// Becomes true with the first signal to end; the second one ends the program at once.
+fn on_signals() -> Result<Arc<AtomicBool>, Failure> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register_conditional_shutdown(signal, 1, Arc::clone(&stop))?;
+        signal_hook::flag::register(signal, Arc::clone(&stop))?;
+    }
+    Ok(stop)
+}
+
+/// How far a training came.
+struct End {
+    steps: u64,
+    seconds: f64,
+    /// Mean return of the last episodes.
+    mean: f64,
 }
 
 /// Time between two lines of a training that no bar shows.
