@@ -21,6 +21,22 @@ pub enum Drive {
     },
 }
 
+impl std::fmt::Display for Drive {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Drive::Effort => write!(f, "effort [N m or N]"),
+            Drive::Position => write!(f, "position [rad or m]"),
+            Drive::Velocity => write!(f, "velocity [rad/s or m/s]"),
+            Drive::Pd { stiffness, damping } => {
+                write!(
+                    f,
+                    "pd target [rad or m], stiffness {stiffness} N m/rad or N/m, damping {damping} N m s/rad or N s/m"
+                )
+            }
+        }
+    }
+}
+
 /// What a command means for the equations of motion of a period.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Held {

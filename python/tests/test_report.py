@@ -95,6 +95,13 @@ def test_settings_of_a_loop_are_a_table_and_no_raw_json(tmp_path) -> None:
     assert "<details>" in page and "Metadata:" not in page and "x" * 301 not in page
 
 
+def test_a_flight_says_what_the_joints_are_commanded(tmp_path) -> None:
+    commands = {"shoulder": "effort [N m or N]", "elbow": "effort [N m or N]", "wrist": "pd target [rad or m], stiffness 50 N m/rad or N/m"}
+    log = synthetic.flight_log(tmp_path / "commands.mcap", 300, {"dt": "0.001", "commands": json.dumps(commands)})
+    words = text_of(report.build(tmp_path / "r.html", logs=[log]))
+    assert "Commanded: shoulder, elbow: effort [N m or N]. wrist: pd target [rad or m], stiffness 50 N m/rad or N/m." in words
+
+
 def test_the_command(inputs, tmp_path) -> None:
     out = tmp_path / "report.html"
     command = [sys.executable, "-m", "nearl.report", "--out", str(out)]

@@ -1,6 +1,7 @@
 """The page: the promise in three numbers and a picture, then tables and figures of what was measured."""
 
 import html
+import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -246,9 +247,18 @@ def _flights(logs: list[Log]) -> list[tuple[str, str]]:
         parts = [picture or f'<p class="lead">{html.escape(sentence)}</p>', flight.states(log) or "", flight.ledger(log), flight.latency(log)]
         modes = {mode: log.mode.count(mode) for mode in sorted(set(log.mode))}
         words = ", ".join(f"{n:,} {mode}" for mode, n in modes.items())
-        lead = f'<p class="lead">Ticks by mode: {html.escape(words)}.</p>'
+        lead = f'<p class="lead">Ticks by mode: {html.escape(words)}.</p>{_commands(log)}'
         sections.append((f"Flight {log.path.name}", lead + "".join(parts) + _settings(log)))
     return sections
+
+
+def _commands(log: Log) -> str:
+    """What the joints are sent: those that are sent the same in one sentence."""
+    joints: dict[str, list[str]] = {}
+    for joint, command in json.loads(log.metadata.get("commands", "{}")).items():
+        joints.setdefault(command, []).append(joint)
+    said = "".join(f" {html.escape(', '.join(names))}: {html.escape(command)}." for command, names in joints.items())
+    return f'<p class="lead">Commanded:{said}</p>' if said else ""
 
 
 def _settings(log: Log) -> str:

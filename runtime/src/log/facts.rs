@@ -32,7 +32,7 @@ const UNITS: [(&str, &str); 10] = [
     ("v", "rad/s"),
     ("proposal_q, target_q", "rad"),
     ("proposal_v, target_v", "rad/s"),
-    ("action, applied", "N m, or as the task commands the joints"),
+    ("action, applied", "what `commands` says of each joint"),
     ("brake", "rad/s^2"),
     ("multiplier of a joint's row", "rad/s"),
     ("multiplier of another row", "(rad/s)^2 per unit of the row"),

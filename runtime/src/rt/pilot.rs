@@ -1,6 +1,7 @@
 //! The controller of a snapshot in the loop: states in, [`Controller::update`], numbers out.
 
 use std::cell::Cell;
+use std::collections::BTreeMap;
 
 use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, Moved, RefuseReason, Side, Status};
 
@@ -84,6 +85,14 @@ impl Pilot {
             task: snapshot.manifest.task.name.clone(),
             controller,
         })
+    }
+
+    /// What each controllable joint is commanded, in words with units, by its name.
+    pub(crate) fn commands(&self, manifest: &Manifest) -> BTreeMap<String, String> {
+        let (model, controllable) = (self.controller.model(), self.controller.layout().controllable());
+        // Refused before, where they cannot be had.
+        let drives = manifest.task.command.drives(model, controllable).unwrap_or_default();
+        controllable.iter().filter_map(|&i| Some((model.dof_name(i), drives.get(i)?.to_string()))).collect()
     }
 
     /// Controller and brake have projectors of their own; what one verified, the other may count on.

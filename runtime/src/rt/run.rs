@@ -226,6 +226,7 @@ pub fn run(
         ("task", snapshot.manifest.task.name.clone()),
         ("snapshot", file.display().to_string()),
         ("version", snapshot.manifest.version.to_string()),
+        ("commands", serde_json::json!(first.commands(&snapshot.manifest)).to_string()),
     ];
     settings.first = snapshot.to_bytes();
     settings.metadata.extend(facts.map(|(key, value)| (key.to_owned(), value)));

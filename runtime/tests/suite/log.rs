@@ -87,6 +87,8 @@ with open(sys.argv[1], "rb") as f:
     reader = make_reader(f)
     facts = {k: v for m in reader.iter_metadata() for k, v in m.metadata.items()}
     joints, rows, units = facts["joints"].split(","), json.loads(facts["rows"]), json.loads(facts["units"])
+    commands = json.loads(facts["commands"])
+    assert sorted(commands) == joints and set(commands.values()) == {"effort [N m or N]"}, commands
     statuses, kinds = json.loads(facts["statuses"]), json.loads(facts["kinds"])
     assert joints[6] == "panda_joint7" and rows[:7] == joints, (joints, rows)
     assert units["v"] == "rad/s" and statuses["13"] == "braked-no-verified-brake" and "torque" in kinds
