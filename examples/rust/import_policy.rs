@@ -11,7 +11,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let recipe = folder.join("reacher.toml"); // what it sees, what its outputs mean, and the limits
     let made = snapshot(
         &network,
-        &Setting { name: "reacher", robot: &folder.join("reacher.xml"), recipe: Some(&recipe) },
+        &Setting { name: "reacher", robot: &folder.join("reacher.xml"), recipes: &[recipe] },
     )?;
     println!("{} inputs, layers {:?}", network.n_in(), &network.dense.widths()[1..]);
 

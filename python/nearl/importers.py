@@ -11,7 +11,7 @@ Live objects are read, never files of theirs: the library that wrote a file load
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from nearl._core import Controller, Policy
 
 _Path = str | os.PathLike[str]
+_Recipe = _Path | Sequence[_Path] | None
 _Layer = tuple[np.ndarray, np.ndarray, str]
 
 # What follows a layer, by the name of the module's class.
@@ -27,26 +28,27 @@ _FUNCTIONS = {"Identity": "identity", "Tanh": "tanh", "ReLU": "relu", "SiLU": "s
 _NOTHING = ("Identity", "Flatten", "Dropout", "FlattenExtractor")
 
 
-def import_onnx(path: _Path, robot: _Path, recipe: _Path | None = None, output: str | None = None, name: str = "policy") -> Controller:
+def import_onnx(path: _Path, robot: _Path, recipe: _Recipe = None, output: str | None = None, name: str = "policy") -> Controller:
     """The controller of the policy in an ONNX file.
 
     Args:
         path: The file; external data lies beside it.
         robot: URDF or MJCF file.
-        recipe: TOML file that says what the policy sees and what its outputs mean, where the file's metadata does not.
+        recipe: What the policy sees and what its outputs mean, where the file's metadata does not say it: a TOML file, unitree's ``deploy.yaml``,
+            or several of them, of which a later one comes before those before it.
         output: Which of several outputs is the action.
         name: Of the task.
 
     Raises:
         ValueError: the file is no policy, names a node that is not read, or something does not fit robot or recipe.
     """
-    return Policy.from_onnx(path, output).controller(robot, recipe, name)
+    return Policy.from_onnx(path, output).controller(robot, _files(recipe), name)
 
 
 def import_torch(
     module: Any,
     robot: _Path | None = None,
-    recipe: _Path | None = None,
+    recipe: _Recipe = None,
     *,
     task: str | None = None,
     mean: Any = None,
@@ -81,7 +83,7 @@ def import_sb3(
     *,
     task: str | None = None,
     robot: _Path | None = None,
-    recipe: _Path | None = None,
+    recipe: _Recipe = None,
     name: str = "policy",
 ) -> Controller:
     """The controller of a Stable-Baselines3 model (PPO, A2C, SAC, TD3, DDPG): its mean action.
@@ -121,12 +123,18 @@ def import_sb3(
     return _place(made, robot, recipe, task, name)
 
 
-def _place(policy: Policy, robot: _Path | None, recipe: _Path | None, task: str | None, name: str) -> Controller:
+def _files(recipe: _Recipe) -> Sequence[_Path]:
+    if recipe is None:
+        return []
+    return [recipe] if isinstance(recipe, str | os.PathLike) else recipe
+
+
+def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: str | None, name: str) -> Controller:
     if task is not None and robot is None:
         return policy.in_task(task)
     if robot is None or task is not None:
         raise ValueError("give either task=, or robot= and recipe=")
-    return policy.controller(robot, recipe, name)
+    return policy.controller(robot, _files(recipe), name)
 
 
 def _policy(layers: list[_Layer], mean: Any, std: Any, clip: float, output_clip: tuple[float, float]) -> Policy:

@@ -91,16 +91,17 @@ impl Policy {
         Ok(array(py, &y))
     }
 
-    /// The controller of the policy on a robot; `recipe` is a TOML file that says what it sees and what its outputs mean.
-    #[pyo3(signature = (robot, recipe=None, name="policy"))]
+    /// The controller of the policy on a robot; `recipes` are files, TOML or unitree's
+    /// `deploy.yaml`, that say what it sees and what its outputs mean; a later one comes before those before it.
+    #[pyo3(signature = (robot, recipes=Vec::new(), name="policy"))]
     fn controller(
         &self,
         py: Python<'_>,
         robot: PathBuf,
-        recipe: Option<PathBuf>,
+        recipes: Vec<PathBuf>,
         name: &str,
     ) -> PyResult<Controller> {
-        let setting = Setting { name, robot: &robot, recipe: recipe.as_deref() };
+        let setting = Setting { name, robot: &robot, recipes: &recipes };
         let made = py.detach(|| snapshot(&self.network, &setting)).map_err(errors::value)?;
         Controller::new(&made)
     }

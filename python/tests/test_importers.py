@@ -232,6 +232,65 @@ def test_a_recipe_that_does_not_fit_is_refused_by_name(tmp_path) -> None:
         nearl.import_onnx(path, **files)
 
 
+DEPLOY = """
+joint_ids_map: [2, 0, 1]
+step_dt: 0.02
+stiffness: [20, 30.0, 40.0]
+damping: [1, 2, 3]
+default_joint_pos: [0.3, 0.1, 0.2]
+commands: {base_velocity: {ranges: {lin_vel_x: [-0.5, 1.0], heading: null}}}
+actions:
+  JointPositionAction: {clip: null, joint_names: [.*], scale: [0.5, 0.6,
+    0.7], offset: [0.3, 0.1, 0.2], joint_ids: null}
+observations:
+  projected_gravity: {params: {}, clip: null, scale: [1.0, 1.0, 1.0], history_length: 1}
+  joint_vel_rel: {params: {}, clip: [-0.2, 0.2], scale: [0.05, 0.05, 0.05], history_length: 2}
+  velocity_commands: {params: {command_name: base_velocity}, clip: null, scale: null, history_length: 1}
+  joint_pos_rel: {params: {}, clip: null, scale: 2.0, history_length: 1}
+"""
+
+
+def test_a_deployment_of_unitree_is_a_recipe(tmp_path) -> None:
+    """From state to targets against NumPy and onnxruntime; a second recipe comes before it."""
+    path, files = Net(15).gemm(15, 3).save(tmp_path / "policy.onnx", 3), planar(tmp_path)
+    (tmp_path / "deploy.yaml").write_text(DEPLOY)
+    (tmp_path / "over.toml").write_text("[time]\ndt = 0.01\n[constraints]\nguard = false\n")
+    guarded = nearl.import_onnx(path, files["robot"], tmp_path / "deploy.yaml")
+    files["recipe"] = [tmp_path / "deploy.yaml", tmp_path / "over.toml"]
+    controller = nearl.import_onnx(path, **files)
+    assert (guarded.dt, controller.dt) == (0.02, 0.01)
+    session, order, pose = onnxruntime.InferenceSession(path), [2, 0, 1], np.array([0.3, 0.1, 0.2])
+    before = None
+    for _ in range(3):
+        q, v, command = np.array([0, 0, 0, 0, 0, 0, 1, *RNG.normal(size=3)]), 0.1 * RNG.normal(size=9), RNG.normal(size=3)
+        now = 0.05 * np.clip(v[6:][order], -0.2, 0.2)
+        obs = np.concatenate([[0, 0, -1], now if before is None else before, now, command, 2 * (q[7:][order] - pose)])
+        before = now
+        (out,) = session.run(None, {"obs": f32(obs)[None]})
+        want = np.zeros(3)
+        want[order] = pose + out[0] * [0.5, 0.6, 0.7]
+        action, _ = controller.update(q, v, np.concatenate([q[7:], v[6:], command]))
+        np.testing.assert_allclose(action, want, atol=1e-5)
+        # By itself the file has its drives bounded, with the gains of its motors.
+        action, _ = guarded.update(q, v, np.concatenate([q[7:], v[6:], command]))
+        force = np.array([20, 30, 40]) * (action - q[7:]) - np.array([1, 2, 3]) * v[6:]
+        assert np.all(np.abs(force) <= np.array([35, 13, 2.6]) * (1 + 1e-9)) and np.any(action != want)
+
+    def refused(change: tuple[str, str], said: str) -> None:
+        (tmp_path / "deploy.yaml").write_text(DEPLOY.replace(*change))
+        with pytest.raises(ValueError, match=said):
+            nearl.import_onnx(path, planar(tmp_path)["robot"], tmp_path / "deploy.yaml")
+
+    refused(("joint_ids_map: [2, 0, 1]", "joint_ids_map: [2, 0, 3]"), "there is no motor 3 in a robot of 3 joints")
+    refused(("joint_ids_map: [2, 0, 1]", "joint_ids_map: [2, 0, 0]"), "no motor 0 .*twice")
+    refused(("projected_gravity", "gait_phase"), "'gait_phase' depends on the command")
+    refused(("projected_gravity", "height_scan"), "unknown variant `height_scan`")
+    refused(("damping: [1, 2, 3]", "damping: [1, 2]"), "damping: 2 numbers for a robot of 3 joints")
+    refused(("JointPositionAction", "JointVelocityAction"), "none but JointPositionAction")
+    refused(("step_dt: 0.02", "step_dt: fast"), "it is no deploy.yaml")
+    refused(("step_dt: 0.02", "*alias"), "it is no deploy.yaml")
+
+
 def test_the_metadata_of_mjlab_is_a_recipe(tmp_path) -> None:
     path = Net(12).gemm(12, 3).save(tmp_path / "policy.onnx", 3)
     model = onnx.load(path)

@@ -9,6 +9,7 @@
 
 mod assemble;
 mod chain;
+mod deploy;
 mod elementwise;
 mod file;
 mod graph;

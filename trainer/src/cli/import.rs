@@ -12,9 +12,10 @@ pub(super) struct Import {
     /// Robot file, URDF or MJCF.
     #[arg(long)]
     robot: PathBuf,
-    /// What the policy sees and what its outputs mean (TOML), where the file's metadata does not say it.
+    /// What the policy sees and what its outputs mean (TOML, or unitree's deploy.yaml), where the file's metadata does not say it. Given
+    /// twice, the second comes before the first.
     #[arg(long)]
-    recipe: Option<PathBuf>,
+    recipe: Vec<PathBuf>,
     /// Which of several outputs is the action.
     #[arg(long)]
     output: Option<String>,
@@ -29,7 +30,7 @@ impl Import {
         let stem = self.policy.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
         let name: String = stem.chars().map(|c| if c.is_alphanumeric() { c } else { '-' }).collect();
         let name = if name.is_empty() { "policy".to_string() } else { name };
-        let setting = Setting { name: &name, robot: &self.robot, recipe: self.recipe.as_deref() };
+        let setting = Setting { name: &name, robot: &self.robot, recipes: &self.recipe };
         let made = snapshot(&network, &setting)?;
         made.save(&self.out)?;
         say(format!(

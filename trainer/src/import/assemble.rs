@@ -1,15 +1,15 @@
 //! From an imported network, a robot and a recipe to a snapshot.
 
-use super::metadata;
 use super::{ImportError, ImportedNetwork};
+use super::{deploy, metadata};
 use crate::robot::{describe, folder_of};
-use nearl_runtime::constraints::{Drive, Model, StateLayout};
+use nearl_runtime::constraints::{Drive, JointKind, Model, RobotDescription, StateLayout};
 use nearl_runtime::net::Activation;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::recipe::{Numbers, Observer, PolicySection};
 use nearl_runtime::snapshot::{FORMAT, ModelFormat, Simulation};
 use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, Task};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Outputs of a network without a clip are taken up to this size; those of a trained policy are a few.
@@ -24,8 +24,9 @@ pub struct Setting<'a> {
     pub name: &'a str,
     /// Robot file, URDF or MJCF.
     pub robot: &'a Path,
-    /// Recipe file: a task file of which only `[time] dt` and `[policy]` are needed.
-    pub recipe: Option<&'a Path>,
+    /// Recipe files: task files of which only `[time] dt` and `[policy]` are needed, or unitree's `deploy.yaml`. What a later one says
+    /// comes before what those before it say.
+    pub recipes: &'a [PathBuf],
 }
 
 /// The snapshot of a policy of actions. Whatever the recipe does not say is taken from the file's metadata.
@@ -35,29 +36,18 @@ pub struct Setting<'a> {
 pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snapshot, ImportError> {
     let mut table = metadata::recipe(network)?;
     let mut said_by = "the policy's metadata".to_string();
-    if let Some(path) = setting.recipe {
+    for path in setting.recipes {
         said_by = path.display().to_string();
-        let text = read(path)?;
-        let over = toml::from_str(&text)
-            .map_err(|e| recipe(&said_by, e.message().lines().next().unwrap_or_default()))?;
-        merge(&mut table, over);
+        merge(&mut table, said(path, setting.robot)?);
     }
     if !table.contains_key("policy") {
         return Err(ImportError::NoRecipe { input: network.input_name.clone(), n_in: network.n_in() });
     }
-    let model_text = read(setting.robot)?;
-    let model_format = if model_text.contains("<mujoco") { ModelFormat::Mjcf } else { ModelFormat::Urdf };
-    complete(&mut table, setting, model_format);
+    let simulation = simulation(setting.robot)?;
+    complete(&mut table, setting, simulation.format);
     let free = table.get("model").and_then(|m| m.get("free_flyer")).and_then(Value::as_bool).unwrap_or(false);
-    let names_files = model_text.contains("file=") || model_text.contains("filename=");
-    let simulation = Simulation {
-        format: model_format,
-        text: model_text,
-        folder: names_files.then(|| folder_of(setting.robot)),
-    };
-    let unusable =
-        |e: &dyn std::fmt::Display| ImportError::Robot(format!("{}: {e}", setting.robot.display()));
-    let robot = describe(&simulation, free).map_err(|e| unusable(&e))?;
+    let robot = described(&simulation, free, setting.robot)?;
+    let unusable = |e: &dyn std::fmt::Display| unusable(setting.robot, e);
     let model = Model::from_description(robot.clone()).map_err(|e| unusable(&e))?;
     state(&mut table, &model, &said_by)?;
     let mut task =
@@ -114,6 +104,42 @@ pub fn for_task(network: &ImportedNetwork, mut manifest: Manifest) -> Result<Sna
     let snapshot = Snapshot { networks: networks(network, n_state), manifest };
     Controller::new(&snapshot).map_err(|e| recipe(&task, &e.to_string()))?;
     Ok(snapshot)
+}
+
+/// What a recipe file says, as sections of a task file.
+fn said(path: &Path, robot: &Path) -> Result<Table, ImportError> {
+    let (said_by, text) = (path.display().to_string(), read(path)?);
+    if !path.extension().is_some_and(|e| e == "yaml" || e == "yml") {
+        return toml::from_str(&text)
+            .map_err(|e| recipe(&said_by, e.message().lines().next().unwrap_or_default()));
+    }
+    let simulation = simulation(robot)?;
+    let described = described(&simulation, false, robot)?;
+    let joints: Vec<String> =
+        described.joints().filter(|j| j.kind != JointKind::Free).map(|j| j.name.clone()).collect();
+    let mut table = deploy::recipe(&text, &joints).map_err(|e| recipe(&said_by, &e))?;
+    if simulation.format == ModelFormat::Urdf {
+        // Robots of these files walk.
+        let floats = Table::from_iter([("free_flyer".to_string(), Value::from(true))]);
+        table.insert("model".into(), floats.into());
+    }
+    Ok(table)
+}
+
+/// The robot file as it is simulated.
+fn simulation(path: &Path) -> Result<Simulation, ImportError> {
+    let text = read(path)?;
+    let format = if text.contains("<mujoco") { ModelFormat::Mjcf } else { ModelFormat::Urdf };
+    let names_files = text.contains("file=") || text.contains("filename=");
+    Ok(Simulation { format, text, folder: names_files.then(|| folder_of(path)) })
+}
+
+fn described(simulation: &Simulation, free: bool, robot: &Path) -> Result<RobotDescription, ImportError> {
+    describe(simulation, free).map_err(|e| unusable(robot, &e))
+}
+
+fn unusable(robot: &Path, e: &dyn std::fmt::Display) -> ImportError {
+    ImportError::Robot(format!("{}: {e}", robot.display()))
 }
 
 fn recipe(said_by: &str, reason: &str) -> ImportError {
