@@ -5,8 +5,11 @@ use std::io::{Error, Read, Result};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-/// Largest robot, task, fault or limits file that is read \[bytes\].
+/// Largest robot or fault file that is read \[bytes\].
 pub const MAX_TEXT_BYTES: u64 = 16 << 20;
+
+/// Largest task, recipe or limits file that is read, before it is parsed \[bytes\].
+pub const MAX_TASK_BYTES: u64 = 1 << 20;
 
 /// Opens a regular file for reading, without ever waiting: a pipe, a device or a folder is refused, whatever it would do when read.
 /// With `links`, the last part of the path may be a symbolic link.
@@ -50,6 +53,18 @@ pub fn read_bounded(path: &Path, limit: u64, links: bool) -> Result<Vec<u8>> {
 /// # Errors
 /// As [`read_bounded`]; a file that is not UTF-8.
 pub fn read_text(path: &Path) -> Result<String> {
-    let bytes = read_bounded(path, MAX_TEXT_BYTES, true)?;
+    text(path, MAX_TEXT_BYTES)
+}
+
+/// The text of a regular file of at most [`MAX_TASK_BYTES`].
+///
+/// # Errors
+/// As [`read_text`].
+pub fn read_task_text(path: &Path) -> Result<String> {
+    text(path, MAX_TASK_BYTES)
+}
+
+fn text(path: &Path, limit: u64) -> Result<String> {
+    let bytes = read_bounded(path, limit, true)?;
     String::from_utf8(bytes).map_err(|e| Error::other(format!("it is not UTF-8 text: {}", e.utf8_error())))
 }

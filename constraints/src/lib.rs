@@ -75,7 +75,7 @@ pub use description::RobotDescription;
 pub use drive::Drive;
 pub use dynamics::Dynamics;
 pub use error::{LimitError, ModelError};
-pub use file::{MAX_TEXT_BYTES, open_regular, read_bounded, read_text};
+pub use file::{MAX_TASK_BYTES, MAX_TEXT_BYTES, open_regular, read_bounded, read_task_text, read_text};
 pub use kinematics::{FrameMotion, Kinematics, PointMotion};
 pub use layout::{Entry, LayoutError, StateLayout};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};

@@ -251,7 +251,7 @@ impl Task {
     /// As [`Task::read`].
     pub fn read_with(path: &Path, overrides: &[String], own: OwnTime<'_>) -> Result<Self, TaskError> {
         let file = path.display().to_string();
-        let text = nearl_constraints::read_text(path)
+        let text = nearl_constraints::read_task_text(path)
             .map_err(|e| TaskError::Unreadable { file: file.clone(), reason: e.to_string() })?;
         Self::parse_with(&file, &text, overrides, own)
     }
@@ -325,7 +325,7 @@ impl Task {
     /// As [`Task::read`].
     pub fn read_constraints(path: &Path) -> Result<ConstraintSettings, TaskError> {
         let file = path.display().to_string();
-        let text = nearl_constraints::read_text(path)
+        let text = nearl_constraints::read_task_text(path)
             .map_err(|e| TaskError::Unreadable { file: file.clone(), reason: e.to_string() })?;
         let at = |place, reason| TaskError::Invalid { file: file.clone(), place, reason };
         let mut table: toml::Table =

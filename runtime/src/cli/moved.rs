@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use nearl_constraints::{Moved, read_text};
+use nearl_constraints::{Moved, read_task_text};
 
 use super::{Failure, say, seconds};
 use crate::link::{OperatorLink, RobotName, Verdict};
@@ -62,7 +62,7 @@ impl LimitsCommand {
     fn moved(&self) -> Result<Moved, Failure> {
         let mut text = self.set.join("\n");
         if let Some(file) = &self.file {
-            let more = read_text(file).map_err(|e| format!("{}: {e}", file.display()))?;
+            let more = read_task_text(file).map_err(|e| format!("{}: {e}", file.display()))?;
             text = format!("{more}\n{text}");
         }
         let mut moved: Moved = toml::from_str(&text).map_err(|e| {

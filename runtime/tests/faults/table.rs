@@ -314,6 +314,7 @@ pub const ROWS: &[Row] = &[
             (FILES, "fault_39_a_manifest_nested_beyond_measure_is_refused_and_overflows_no_stack"),
             (BOMBS, "robots_that_ask_for_too_much_are_refused_by_element_and_number"),
             (BOMBS, "tasks_that_take_too_much_to_read_are_refused_by_key_and_number"),
+            (BOMBS, "task_files_beyond_their_size_are_refused_by_name_before_they_are_parsed"),
             (BOMBS, "lines_and_lists_without_an_end_are_refused_by_their_number"),
         ],
     ),

@@ -158,13 +158,13 @@ fn tasks_that_take_too_much_to_read_are_refused_by_key_and_number() {
     let rows: Vec<String> = (0..5_000).map(row).collect();
     let many: Vec<String> = (0..20_000).map(|i| format!("t{i} = \"v.elbow\"")).collect();
     for (text, words) in [
-        (rewarded(&format!("still = \"{}\"", vec!["v.elbow"; 1_000_000].join(" + "))), "reward.still"),
+        (rewarded(&format!("still = \"{}\"", vec!["v.elbow"; 90_000].join(" + "))), "reward.still"),
         (
             rewarded(&format!("still = \"{}v.elbow{}\"", "(".repeat(200_000), ")".repeat(200_000))),
             "reward.still",
         ),
         (rewarded(&format!("still = \"{}v.elbow\"", "-".repeat(200_000))), "reward.still"),
-        (rewarded(&format!("still = \"{}\"", "v".repeat(5_000_000))), "reward.still"),
+        (rewarded(&format!("still = \"{}\"", "v".repeat(1_000_000))), "reward.still"),
         (rewarded(&many.join("\n")), "20000 terms, more than the 1000"),
         (
             task.replace("torque = {}", &format!("torque = {{}}\nrows = [{}]", rows.join(","))),
@@ -172,10 +172,46 @@ fn tasks_that_take_too_much_to_read_are_refused_by_key_and_number() {
         ),
         (format!("{task}\n[metrics]\na = {}{}", "[".repeat(200_000), "]".repeat(200_000)), "recurs"),
         (format!("{task}\n{} = 1", vec!["a"; 200_000].join(".")), "recursion limit"),
-        (format!("{task}\n# {}", "x".repeat(17 << 20)), "more than the limit of 16777216"),
     ] {
+        assert!(text.len() <= MOST_OF_A_TASK, "'{words}' is not what would refuse it");
         std::fs::write(folder.path().join("bomb.toml"), text).expect("task file");
         refused(folder.path(), &["train", "bomb.toml", "--out", "run"], None, words);
+    }
+}
+
+/// Largest task file [bytes].
+const MOST_OF_A_TASK: usize = 1 << 20;
+
+/// By every command that reads one; a comment of its own length is as long as a file may be.
+#[test]
+fn task_files_beyond_their_size_are_refused_by_name_before_they_are_parsed() {
+    let folder = folder();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::copy(repository().join("examples/robots/panda/panda.urdf"), at("panda.urdf")).expect("copy");
+    let task = fixture("two_link.toml") + "\n#";
+    let longest = format!("{task}{}", "x".repeat(MOST_OF_A_TASK - task.len()));
+    std::fs::write(at("longest.toml"), &longest).expect("task file");
+    let arguments = ["train", "longest.toml", "--steps", "64", "--out", "longest"];
+    let (code, out, error) = limited(folder.path(), &arguments, None);
+    assert_eq!(code, Some(0), "{out}{error}");
+    // Not a task at all: what is too long is not looked at.
+    std::fs::write(at("beyond.toml"), "=".repeat(MOST_OF_A_TASK + 1)).expect("task file");
+    let panda = panda();
+    let panda = panda.to_str().expect("UTF-8");
+    let onnx = at("policy.onnx");
+    let onnx = onnx.to_str().expect("UTF-8");
+    let (code, out, error) = limited(folder.path(), &["export", panda, "--out", onnx], None);
+    assert_eq!(code, Some(0), "{out}{error}");
+    let commands: &[&[&str]] = &[
+        &["train", "beyond.toml", "--out", "run"],
+        &["project", "beyond.toml"],
+        &["run", panda, "--plant", "nobody", "--limits", "beyond.toml"],
+        &["limits", "nobody", "--file", "beyond.toml"],
+        &["import", onnx, "--robot", "panda.urdf", "--recipe", "beyond.toml", "--out", "x"],
+    ];
+    for arguments in commands {
+        refused(folder.path(), arguments, None, "beyond.toml");
+        refused(folder.path(), arguments, None, "it has 1048577 bytes, more than the limit of 1048576");
     }
 }
 

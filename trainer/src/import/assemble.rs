@@ -3,7 +3,9 @@
 use super::{ImportError, ImportedNetwork};
 use super::{deploy, metadata};
 use crate::robot::{describe, folder_of};
-use nearl_runtime::constraints::{Drive, JointKind, Model, RobotDescription, StateLayout};
+use nearl_runtime::constraints::{
+    Drive, JointKind, Model, RobotDescription, StateLayout, read_task_text, read_text,
+};
 use nearl_runtime::net::Activation;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::recipe::{Numbers, Observer, PolicySection};
@@ -108,7 +110,7 @@ pub fn for_task(network: &ImportedNetwork, mut manifest: Manifest) -> Result<Sna
 
 /// What a recipe file says, as sections of a task file.
 fn said(path: &Path, robot: &Path) -> Result<Table, ImportError> {
-    let (said_by, text) = (path.display().to_string(), read(path)?);
+    let (said_by, text) = (path.display().to_string(), read(path, read_task_text)?);
     if !path.extension().is_some_and(|e| e == "yaml" || e == "yml") {
         return toml::from_str(&text)
             .map_err(|e| recipe(&said_by, e.message().lines().next().unwrap_or_default()));
@@ -128,7 +130,7 @@ fn said(path: &Path, robot: &Path) -> Result<Table, ImportError> {
 
 /// The robot file as it is simulated.
 fn simulation(path: &Path) -> Result<Simulation, ImportError> {
-    let text = read(path)?;
+    let text = read(path, read_text)?;
     let format = if text.contains("<mujoco") { ModelFormat::Mjcf } else { ModelFormat::Urdf };
     let names_files = text.contains("file=") || text.contains("filename=");
     Ok(Simulation { format, text, folder: names_files.then(|| folder_of(path)) })
@@ -146,8 +148,8 @@ fn recipe(said_by: &str, reason: &str) -> ImportError {
     ImportError::Recipe(format!("{said_by}: {reason}"))
 }
 
-fn read(path: &Path) -> Result<String, ImportError> {
-    nearl_runtime::constraints::read_text(path)
+fn read(path: &Path, text: fn(&Path) -> std::io::Result<String>) -> Result<String, ImportError> {
+    text(path)
         .map_err(|e| ImportError::Unreadable { file: path.display().to_string(), reason: e.to_string() })
 }
 

@@ -1,6 +1,7 @@
 //! The metadata of an ONNX file as a recipe: our own, or mjlab's.
 
 use super::{ImportError, ImportedNetwork};
+use nearl_runtime::constraints::MAX_TASK_BYTES;
 use nearl_runtime::recipe::{Term, TermKind};
 use serde::Deserialize;
 use toml::{Table, Value};
@@ -13,6 +14,10 @@ pub(super) fn recipe(network: &ImportedNetwork) -> Result<Table, ImportError> {
     if let Some(text) = network.metadata.get(RECIPE) {
         let refuse =
             |e: toml::de::Error| ImportError::Metadata { key: RECIPE.into(), reason: e.message().into() };
+        if text.len() as u64 > MAX_TASK_BYTES {
+            let reason = format!("it has {} bytes, more than the limit of {MAX_TASK_BYTES}", text.len());
+            return Err(ImportError::Metadata { key: RECIPE.into(), reason });
+        }
         return toml::from_str(text).map_err(refuse);
     }
     if network.metadata.contains_key("observation_names") && network.metadata.contains_key("joint_names") {
