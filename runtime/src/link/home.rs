@@ -13,7 +13,7 @@
 //! A process that comes while nobody holds `alive` begins anew: it removes what killed processes left before it opens anything, so that no start can
 //! hang on a file that is half made. The process that leaves last removes everything.
 
-use std::fs::{DirBuilder, File, Metadata, OpenOptions, read_dir, symlink_metadata};
+use std::fs::{DirBuilder, DirEntry, File, Metadata, OpenOptions, read_dir, symlink_metadata};
 use std::hash::{BuildHasher, Hasher};
 use std::io::{Error, ErrorKind, Read, Result, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
@@ -92,9 +92,21 @@ pub(super) fn is_held(name: &RobotName) -> bool {
     flock(&alive, FlockOperation::NonBlockingLockExclusive) == Err(Errno::WOULDBLOCK)
 }
 
-/// True if the robot's folder holds more than its lock.
+/// True if the robot's folder holds more of this user's than its lock.
 pub(super) fn has_files(name: &RobotName) -> bool {
-    read_dir(name.folder()).into_iter().flatten().flatten().any(|entry| entry.file_name() != ALIVE)
+    own_entries(&name.folder()).any(|(entry, _)| entry.file_name() != ALIVE)
+}
+
+/// What lies in a folder of this user and is this user's; nothing where the folder is not, or a link.
+pub(super) fn own_entries(folder: &Path) -> impl Iterator<Item = (DirEntry, Metadata)> + use<> {
+    let is_own = symlink_metadata(folder).is_ok_and(|meta| meta.is_dir() && is_ours(&meta));
+    let entries = is_own.then(|| read_dir(folder).ok()).flatten().into_iter().flatten().flatten();
+    entries.filter_map(|entry| entry.metadata().ok().filter(is_ours).map(|meta| (entry, meta)))
+}
+
+/// True if it belongs to the calling user.
+pub(super) fn is_ours(meta: &Metadata) -> bool {
+    meta.uid() == rustix::process::geteuid().as_raw()
 }
 
 /// Everything of the robot but the lock itself.

@@ -38,17 +38,18 @@ pub(super) fn too_small(name: &RobotName, available: u64, bytes: u64) -> LinkErr
     LinkError::Memory { name: name.clone(), path: FOLDER, available, needed }
 }
 
-/// Every file in shared memory whose name begins with `prefix`.
+/// Every file of this user in shared memory whose name begins with `prefix`. What others call so is left alone, by root too.
 pub(super) fn files(prefix: &str) -> impl Iterator<Item = DirEntry> {
     let entries = read_dir(FOLDER).into_iter().flatten().flatten();
-    entries.filter(move |entry| entry.file_name().to_string_lossy().starts_with(prefix))
+    let named = entries.filter(move |entry| entry.file_name().to_string_lossy().starts_with(prefix));
+    named.filter(|entry| entry.metadata().is_ok_and(|meta| home::is_ours(&meta)))
 }
 
 /// Closes the segments of this robot to other users: iceoryx2 opens one of them, a counter, to all.
 pub(super) fn close_to_others(name: &RobotName) {
-    let user = rustix::process::geteuid().as_raw();
     for entry in files(&name.segments()) {
-        let is_open = |meta: &Metadata| meta.is_file() && meta.uid() == user && meta.mode() & 0o077 != 0;
+        // Looked at again once it is open: its name may be another file's by now.
+        let is_open = |meta: &Metadata| meta.is_file() && home::is_ours(meta) && meta.mode() & 0o077 != 0;
         if let Ok(file) = home::private().read(true).open(entry.path())
             && file.metadata().is_ok_and(|meta| is_open(&meta))
         {
@@ -63,7 +64,7 @@ pub(crate) fn reserve(name: &RobotName) -> Result<(), LinkError> {
         // A segment may vanish or belong to a peer that is starting: only a full tmpfs matters here.
         let Ok(file) = home::private().write(true).open(entry.path()) else { continue };
         let Ok(meta) = file.metadata() else { continue };
-        let length = if meta.is_file() { meta.len() } else { 0 };
+        let length = if meta.is_file() && home::is_ours(&meta) { meta.len() } else { 0 };
         if length > 0 && fallocate(&file, FallocateFlags::KEEP_SIZE, 0, length) == Err(Errno::NOSPC) {
             return Err(too_small(name, 0, length));
         }
@@ -74,7 +75,11 @@ pub(crate) fn reserve(name: &RobotName) -> Result<(), LinkError> {
 /// Removes what a robot name left behind. Only for names no process uses any more (tests, demonstrations, benchmarks).
 pub fn remove_files(name: &RobotName) {
     remove_segments(name);
-    let _ = std::fs::remove_dir_all(name.folder());
+    if let Some((folder, _)) =
+        home::own_entries(&home::of_user()).find(|(entry, _)| entry.file_name() == name.as_str())
+    {
+        let _ = std::fs::remove_dir_all(folder.path());
+    }
 }
 
 /// Removes iceoryx2's segments of a robot name; those of other users stay.

@@ -1,21 +1,19 @@
 //! What robots have in shared memory now, and whether a living process still holds it.
 
 use std::collections::BTreeMap;
-use std::fs::read_dir;
 use std::os::unix::fs::MetadataExt;
 
 use iceoryx2::prelude::{CallbackProgression, Node, NodeState};
 
-use super::memory::FOLDER;
 use super::service::Ipc;
-use super::{RobotName, home};
+use super::{RobotName, home, memory};
 
 /// Shared memory of one robot name.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct Remains {
     /// Robot.
     pub name: String,
-    /// Processes that hold it; those of other users count as living.
+    /// Processes that hold it.
     pub alive: usize,
     /// Processes that died without leaving.
     pub dead: usize,
@@ -32,25 +30,22 @@ impl Remains {
     }
 }
 
-/// Every robot name of this user with shared memory or files on this machine, sorted by name.
+/// Every robot name of this user with shared memory or files on this machine, sorted by name. What another user called so is none of them.
 pub fn remains() -> Vec<Remains> {
     let mut sizes: BTreeMap<String, u64> = BTreeMap::new();
-    for entry in read_dir(FOLDER).into_iter().flatten().flatten() {
+    for entry in memory::files("nearl.") {
         let file = entry.file_name().to_string_lossy().into_owned();
         let name = file.strip_prefix("nearl.").and_then(|rest| rest.split_once('.')).map(|(name, _)| name);
-        if let (Some(name), Ok(meta)) = (name, entry.metadata())
-            && meta.uid() == rustix::process::geteuid().as_raw()
-        {
+        if let (Some(name), Ok(meta)) = (name, entry.metadata()) {
             *sizes.entry(name.to_owned()).or_default() += 512 * meta.blocks();
         }
     }
-    for entry in read_dir(home::of_user()).into_iter().flatten().flatten() {
+    for (entry, _) in home::own_entries(&home::of_user()) {
         let name = entry.file_name().to_string_lossy().into_owned();
         let Ok(robot) = RobotName::new(&name) else { continue };
         if home::has_files(&robot) || home::is_held(&robot) {
-            let files = read_dir(entry.path()).into_iter().flatten().flatten();
-            let bytes =
-                files.filter_map(|f| f.metadata().ok()).filter(|m| m.is_file()).map(|m| 512 * m.blocks());
+            let files = home::own_entries(&entry.path());
+            let bytes = files.filter(|(_, m)| m.is_file()).map(|(_, m)| 512 * m.blocks());
             *sizes.entry(name).or_default() += bytes.sum::<u64>();
         }
     }

@@ -103,6 +103,8 @@ fn fault_41_another_user_can_open_nothing_and_what_another_user_made_is_refused_
     let theirs = Path::new("/dev/shm/nearl-60123");
     std::fs::create_dir_all(theirs).unwrap();
     std::fs::set_permissions(theirs, PermissionsExt::from_mode(0o777)).unwrap();
+    std::fs::create_dir_all(theirs.join("listed")).unwrap();
+    std::fs::write(theirs.join("listed/newest-state"), "listed").unwrap();
     let output =
         command_of("stranger", &name).stdout(Stdio::piped()).stderr(Stdio::piped()).output().unwrap();
     std::fs::remove_dir_all(theirs).unwrap();
@@ -112,6 +114,44 @@ fn fault_41_another_user_can_open_nothing_and_what_another_user_made_is_refused_
     for word in ["link-foreign", "/dev/shm/nearl-60123", "belongs to user 0"] {
         assert!(said.contains(word), "'{word}' is not in: {said}");
     }
+}
+
+/// Names that another user gave are in no list, whatever lies under them, and nothing of that user's is touched, not even by root.
+#[test]
+fn fault_41_what_another_user_made_is_in_no_list_and_stays() {
+    // SAFETY: plain call.
+    if unsafe { libc::geteuid() } != 0 {
+        return skip("only root can give files to another user");
+    }
+    let (mine, theirs) = (Name::new("mine"), Name::new("theirs"));
+    let given = |path: &Path| std::os::unix::fs::chown(path, Some(60_123), Some(60_123)).unwrap();
+    let segments = [&mine, &theirs].map(|name| {
+        let path = PathBuf::from(format!("/dev/shm/nearl.{}.0123456789abcdef.decoy", name.0));
+        std::fs::write(&path, "theirs").unwrap();
+        given(&path);
+        path
+    });
+    let folder = home(&theirs);
+    drop(TrainerLink::open(&theirs.0).unwrap()); // makes it
+    std::fs::write(folder.join("newest-state"), "theirs").unwrap();
+    given(&folder.join("newest-state"));
+    let listed = |name: &Name| remains().into_iter().find(|r| r.name == name.0.as_str());
+    assert!(listed(&theirs).is_none(), "a file of theirs in a folder of ours");
+    given(&folder);
+    assert!(listed(&theirs).is_none(), "a folder of theirs");
+    assert!(listed(&mine).is_none(), "a segment of theirs that is called as ours");
+    let plant = PlantLink::open(&mine.0, &toy::robot(true)).unwrap();
+    let found = listed(&mine).expect("ours is listed");
+    assert!((found.alive, found.dead, found.held) == (1, 0, true), "{found:?}");
+    let checks = nearl_runtime::doctor::examine(Path::new("no-such-snapshot"), None);
+    assert!(checks.iter().all(|c| !c.text.contains(theirs.0.as_str())), "{checks:?}");
+    drop(plant);
+    remove_files(&theirs.0);
+    for path in segments.iter().chain([&folder.join("newest-state")]) {
+        assert_eq!(std::fs::read_to_string(path).unwrap(), "theirs", "{}", path.display());
+    }
+    segments.iter().for_each(|path| std::fs::remove_file(path).unwrap());
+    std::fs::remove_dir_all(folder).unwrap();
 }
 
 /// Made shorter while both ends read and write it: a named end and a robot at rest, not a SIGBUS.

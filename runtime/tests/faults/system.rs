@@ -144,7 +144,9 @@ fn stranger(name: &RobotName) {
             assert_eq!(opened.unwrap_err().kind(), std::io::ErrorKind::PermissionDenied, "{segment:?}");
         }
     }
-    // The folder of this user was made by root before.
+    // The folder of this user was made by root before, with what looks like a robot in it.
+    let listed = remains();
+    assert!(listed.is_empty(), "{listed:?}");
     let error = PlantLink::open(name, &toy::robot(true)).map(|_| ()).unwrap_err();
     println!("said {} {error}", error.code());
 }

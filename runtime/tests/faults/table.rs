@@ -333,7 +333,13 @@ pub const ROWS: &[Row] = &[
         "another user made the files first, or opens ours",
         "refused by name, owner and mode; nothing of ours can be opened",
         &["link-foreign"],
-        &[(SECURITY, "fault_41_another_user_can_open_nothing_and_what_another_user_made_is_refused_by_name")],
+        &[
+            (
+                SECURITY,
+                "fault_41_another_user_can_open_nothing_and_what_another_user_made_is_refused_by_name",
+            ),
+            (SECURITY, "fault_41_what_another_user_made_is_in_no_list_and_stays"),
+        ],
     ),
     (
         42,
