@@ -390,13 +390,15 @@ fn clock() -> Check {
     warn(CheckCode::Clock, text)
 }
 
-/// Shortest control period that is tried [s].
+/// Shortest control period that is tried, and the shortest that is told by its number [s].
 const SHORTEST: f64 = 2e-5;
+const NANOSECOND: f64 = 1e-9;
 
 /// One second of an empty loop beside the control period `dt` [s].
 fn wake(dt: f64) -> Check {
     if dt < SHORTEST {
-        let text = format!("the period is {dt:e} s, which no loop here keeps: give at least {SHORTEST:e} s");
+        let period = if dt < NANOSECOND { format!("less than {NANOSECOND} s") } else { format!("{dt} s") };
+        let text = format!("the period is {period}, which no loop here keeps: give at least {SHORTEST} s");
         return fail(CheckCode::WakeUp, text);
     }
     let period = dt.min(1e-3);

@@ -252,9 +252,15 @@ fn fault_46_motors_too_weak_to_hold_the_arm_are_refused_by_joint_and_number() {
 
 #[test]
 fn doctor_ends_at_any_period_and_never_calls_a_lack_ok() {
-    let short = File::new("short", &snapshot(1, |m| (m.task.time.dt, m.task.time.sim_dt) = (1e-7, 1e-7)));
-    let checks = nearl_runtime::doctor::examine(&short.0, None);
-    assert!(checks.iter().any(|c| c.check == "wake-up" && c.text.contains("1e-7 s")), "{checks:?}");
+    for (dt, words) in [(1e-7, "is 0.0000001 s"), (1e-300, "is less than 0.000000001 s")] {
+        let short = File::new("short", &snapshot(1, |m| (m.task.time.dt, m.task.time.sim_dt) = (dt, dt)));
+        let checks = nearl_runtime::doctor::examine(&short.0, None);
+        let words = format!("the period {words}, which no loop here keeps: give at least 0.00002 s");
+        assert!(checks.iter().any(|c| c.check == "wake-up" && c.text == words), "{checks:?}");
+        let is_power =
+            |text: &str| text.as_bytes().windows(3).any(|w| w[0].is_ascii_digit() && &w[1..] == b"e-");
+        assert!(!checks.iter().any(|c| is_power(&c.text)), "numbers are plain: {checks:?}");
+    }
     for braking in [Braking::Certified, Braking::Stored] {
         let file = File::new("lack", &snapshot(1, |m| m.task.constraints.braking = braking));
         let checks = nearl_runtime::doctor::examine(&file.0, None);
