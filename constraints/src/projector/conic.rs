@@ -9,9 +9,10 @@
 //!            z - s <= z_max,   -z - s <= -z_min,   -s <= 0,   |G_c u + c| <= radius + s
 //! ```
 //!
-//! P is constant, so no NaN can enter it (a NaN in P stays in Clarabel's buffers for good). Clarabel's own equilibration is
-//! frozen at set-up; the scaling by `sigma` and by the limits keeps all numbers near 1 instead. There is no
-//! `time_limit`: it counts all earlier solves too; a call-back with a clock of its own takes its place.
+//! P is constant. A NaN that gets into it all the same would stay in Clarabel's buffers for good: the solver is thrown away after that
+//! solve and built again in the next tick. Clarabel's own equilibration is frozen at set-up; the scaling by `sigma` and by the limits keeps
+//! all numbers near 1 instead. There is no `time_limit`: it counts all earlier solves too; a call-back with a clock of its own takes its
+//! place.
 
 use super::coupled::Coupled;
 use crate::LimitError;
@@ -240,7 +241,7 @@ impl Conic {
     }
 
     /// True when Clarabel returned something worth checking in `y`; its word on optimality is not taken. A solver that
-    /// was lost to a panic is built again in the next tick.
+    /// was lost to a panic, or to a NaN in its P, is built again in the next tick.
     pub(crate) fn solve(&mut self, p: &Coupled) -> bool {
         if self.solver.is_none() && self.build().is_err() {
             return false;
@@ -290,10 +291,16 @@ impl Conic {
                 | SolverStatus::InsufficientProgress
                 | SolverStatus::CallbackTerminated
         );
-        if !(usable && solution.x.iter().all(|x| x.is_finite())) {
-            // A spare in place of a buffer that may hold NaN; only a failed solve pays for the allocation.
-            let healed = clarabel::solver::DefaultResiduals::new(self.shape.columns, self.shape.rows);
-            solver.residuals = healed;
+        let is_sound = solver.data.P.nzval.iter().all(|p| p.is_finite());
+        if !(is_sound && usable && solution.x.iter().all(|x| x.is_finite())) {
+            // A spare in place of what may hold NaN; only a failed solve pays for the allocation.
+            match is_sound {
+                true => {
+                    solver.residuals =
+                        clarabel::solver::DefaultResiduals::new(self.shape.columns, self.shape.rows);
+                }
+                false => self.solver = None,
+            }
             return false;
         }
         let (n, x) = (self.shape.n, &self.shape);
@@ -312,6 +319,18 @@ impl Conic {
             *nu = solution.z[*first] * self.scale;
         }
         true
+    }
+
+    /// The Hessian that the solver was built with (n).
+    pub(crate) fn hessian(&self) -> &[f64] {
+        &self.typical.hessian
+    }
+
+    /// Puts NaN in P.
+    #[cfg(test)]
+    pub(crate) fn spoil(&mut self) {
+        let nan = vec![f64::NAN; self.p.nzval.len()];
+        self.solver.as_mut().expect("a solver").update_P(&nan).expect("as many numbers as P has");
     }
 }
 
@@ -404,12 +423,9 @@ mod tests {
     fn a_solver_with_a_nan_in_its_hessian_answers_in_the_tick_after() {
         let mut conic = Conic::new(&problem(), vec![1.0; 2], 50, None).unwrap();
         assert!(answers(&mut conic));
-        let sound = conic.p.nzval.clone();
-        let spoil = |conic: &mut Conic, p: &Vec<f64>| conic.solver.as_mut().unwrap().update_P(p).unwrap();
-        spoil(&mut conic, &vec![f64::NAN; sound.len()]);
+        conic.spoil();
         assert!(!answers(&mut conic), "a NaN in P gives no answer");
-        spoil(&mut conic, &sound);
-        assert!(answers(&mut conic), "the buffers that held it are new");
+        assert!(answers(&mut conic), "a new solver answers, and nobody had to put P right");
     }
 
     #[test]

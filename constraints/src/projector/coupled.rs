@@ -192,7 +192,8 @@ impl Coupled {
         let finite = |x: &[f64]| x.iter().all(|x| x.is_finite());
         let number = |x: &[f64]| x.iter().all(|x| !x.is_nan());
         let cones = self.cones.iter().all(|cone| finite(&cone.g) && finite(&cone.c) && !cone.radius.is_nan());
-        finite(&self.rows)
+        finite(&self.hessian)
+            && finite(&self.rows)
             && number(&self.row_lower)
             && number(&self.row_upper)
             && finite(&self.goal)

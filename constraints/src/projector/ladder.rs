@@ -34,6 +34,8 @@ impl Projector {
         let measured = Measured { q, v, external: &self.external, previous: self.previous.get() };
         stages.sources.fill(p, &mut self.dynamics, &measured, &self.dofs, &self.tangent, &self.period);
         if !p.is_finite() {
+            // Nothing of a tick changes the Hessian: whatever did does not reach the next one.
+            p.hessian.copy_from_slice(stages.conic.hessian());
             return Err(BrakeReason::NonFiniteDynamics);
         }
         let named = &mut target.ledger.outside; // a brake asks a second time

@@ -17,6 +17,8 @@ mod moved;
 mod nearer;
 mod polish;
 mod sources;
+#[cfg(test)]
+mod spoilt;
 mod stages;
 mod switch;
 

@@ -15,6 +15,7 @@ const SECURITY: &str = "runtime/tests/faults/security.rs";
 const KILLS: &str = "runtime/tests/faults/kills.rs";
 const PEERS: &str = "runtime/tests/faults/peers.rs";
 const SOLVER: &str = "runtime/tests/faults/solver.rs";
+const SPOILT: &str = "constraints/src/projector/spoilt.rs";
 const PROCESSES: &str = "tests/tests/programs/processes.rs";
 const PROPOSERS: &str = "runtime/tests/faults/proposers.rs";
 const CLOCK: &str = "runtime/tests/clock.rs";
@@ -76,7 +77,10 @@ pub const ROWS: &[Row] = &[
         "solver fails numerically",
         "brakes in that tick, the next is as if new",
         &["braked-non-finite-dynamics"],
-        &[(SOLVER, "fault_07_a_failed_solve_leaves_the_next_one_healthy")],
+        &[
+            (SOLVER, "fault_07_a_failed_solve_leaves_the_next_one_healthy"),
+            (SPOILT, "fault_07_a_nan_in_p_brakes_in_its_tick_and_the_next_is_as_if_new"),
+        ],
     ),
     (
         8,
