@@ -387,6 +387,7 @@ pub const ROWS: &[Row] = &[
         &["doctor-model"],
         &[
             (FRICTION, "a_joint_that_rubs_keeps_its_limits_under_attack"),
+            (FRICTION, "a_task_whose_robot_rubs_keeps_its_limits_in_the_simulator"),
             (FRICTION, "what_friction_may_do_is_said_by_joint_and_number"),
             (SIMULATOR, "a_robot_with_dampers_and_springs_keeps_its_limits"),
         ],

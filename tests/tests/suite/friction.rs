@@ -3,7 +3,11 @@
 use nearl_constraints::{
     AccelerationLimit, Dynamics, Limit, Model, Period, Projector, Settings, TorqueLimit, VelocityLimit,
 };
+use nearl_runtime::Controller;
+use nearl_tests::random_policy;
 use nearl_trainer::mj;
+use nearl_trainer::rollout::{make_env, stream};
+use std::path::Path;
 
 #[path = "../../../constraints/examples/coulomb/attack.rs"]
 #[allow(dead_code, unreachable_pub)]
@@ -163,6 +167,64 @@ fn a_joint_that_rubs_keeps_its_limits_under_attack() {
     );
     let [a, ..] = attack(&smooth(&text)).worst;
     assert!(a > 1.0, "the attack would see nothing: {a}");
+}
+
+/// How far the two-link arm of the fixtures, whose joints rub by MuJoCo's `frictionloss`, came beyond the limits of its task file under a
+/// random policy (acceleration [rad/s²], speed [rad/s], position [rad], torque [N m]), and how near to its limits of speed.
+fn task_that_rubs(known: bool) -> ([f64; 4], f64) {
+    let folder = tempfile::tempdir().expect("folder");
+    let fixture = |name: &str| {
+        std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures").join(name))
+            .expect(name)
+    };
+    let rubs = fixture("two_link.xml")
+        .replace("range=\"-2 2\"", "range=\"-2 2\" frictionloss=\"6\"")
+        .replace("range=\"-2.2 2.2\"", "range=\"-2.2 2.2\" frictionloss=\"2\"");
+    let task = folder.path().join("two_link.toml");
+    std::fs::write(folder.path().join("two_link.xml"), rubs).expect("robot");
+    std::fs::write(&task, fixture("two_link.toml")).expect("task");
+    let mut snapshot = random_policy(task.to_str().expect("UTF-8"), 5, 3.0);
+    let friction: Vec<f64> = snapshot.manifest.robot.joints.iter().map(|j| j.friction).collect();
+    assert_eq!(friction, [6.0, 2.0], "the robot of the task has the friction of its file");
+    if !known {
+        for joint in &mut snapshot.manifest.robot.joints {
+            (joint.friction, joint.friction_onset) = (0.0, None);
+        }
+    }
+    let dt = snapshot.manifest.task.time.dt;
+    let mut env = make_env(&snapshot).expect("environment");
+    let mut controller = Controller::new(&snapshot).expect("controller");
+    let (mut state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
+    env.reset(&mut stream(5, 0)).expect("reset");
+    let (mut worst, mut fastest) = ([f64::NEG_INFINITY; 4], 0.0_f64);
+    for _ in 0..20_000 {
+        env.observe(&mut state.obs);
+        env.state(&mut state.q, &mut state.v);
+        controller.update(&state, &noise, &mut out);
+        env.step(&out.action);
+        for (i, (limit, effort)) in [(1.98, 80.0), (2.18, 30.0)].into_iter().enumerate() {
+            let (q, v) = (env.qpos()[i], env.qvel()[i]);
+            let beyond = [
+                (v - state.v[i]).abs() / dt - 30.0,
+                v.abs() - 4.0,
+                q.abs() - limit,
+                out.action[i].abs() - effort,
+            ];
+            (0..4).for_each(|k| worst[k] = worst[k].max(beyond[k]));
+            fastest = fastest.max(v.abs() / 4.0);
+        }
+    }
+    (worst, fastest)
+}
+
+#[test]
+fn a_task_whose_robot_rubs_keeps_its_limits_in_the_simulator() {
+    let ([a, v, q, tau], fastest) = task_that_rubs(true);
+    let beyond = format!("{a} rad/s², {v} rad/s, {q} rad, {tau} N m beyond");
+    assert!(a < 1e-6 && v < 1e-9 && q < 1e-9 && tau <= 0.0, "{beyond}");
+    assert!(fastest > 0.98, "the limits were not reached: {fastest}");
+    let ([a, ..], _) = task_that_rubs(false);
+    assert!(a > 1.0, "the test would see nothing: {a}");
 }
 
 /// The table of `results/friction`, of the URDF file that `NEARL_ROBOT` names.
