@@ -11,7 +11,7 @@ use std::ffi::OsString;
 use std::fs::{Metadata, read_dir, remove_dir_all, remove_file};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::{RobotName, memory};
 
@@ -62,8 +62,14 @@ fn begun(name: &RobotName) -> BTreeSet<(PathBuf, u64)> {
         .collect()
 }
 
+/// Finishing the description of a service takes milliseconds: one that is unfinished for so long was left.
+const LEFT: Duration = Duration::from_secs(1);
+
 /// Descriptions of services that are not finished: they become readable only, to the owner, when they are.
-pub(super) struct Unfinished(BTreeSet<(PathBuf, u64)>);
+pub(super) struct Unfinished {
+    files: BTreeSet<(PathBuf, u64)>,
+    since: Instant,
+}
 
 impl Unfinished {
     pub(super) fn of(name: &RobotName) -> Unfinished {
@@ -72,12 +78,15 @@ impl Unfinished {
             let meta = f.metadata().ok()?;
             (meta.is_file() && meta.mode() & 0o777 == 0o600).then(|| (f.path(), meta.ino()))
         });
-        Unfinished(half.collect())
+        Unfinished { files: half.collect(), since: Instant::now() }
     }
 
-    /// Removes those that still are: finishing takes milliseconds, so this is to be called seconds later.
-    pub(super) fn remove(&self, name: &RobotName) {
-        for (file, _) in self.0.intersection(&Unfinished::of(name).0) {
+    /// Removes those that still are, once they had the time to be finished.
+    pub(super) fn remove_left(&self, name: &RobotName) {
+        if self.files.is_empty() || self.since.elapsed() < LEFT {
+            return;
+        }
+        for (file, _) in self.files.intersection(&Unfinished::of(name).files) {
             // Another process may be faster.
             let _ = remove_file(file);
         }

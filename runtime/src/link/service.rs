@@ -38,6 +38,8 @@ pub struct Bus {
     node: Node<Ipc>,
     name: RobotName,
     epoch: u64,
+    /// What was unfinished when this process came.
+    unfinished: debris::Unfinished,
     /// Last: what the others remove when they go lies in it.
     _home: Home,
 }
@@ -51,6 +53,7 @@ impl Bus {
         set_log_level_from_env_or(LogLevel::Fatal);
         memory::check(name, SHARED_MEMORY)?;
         let home = Home::enter(name)?;
+        let unfinished = debris::Unfinished::of(name);
         debris::sweep_segments(name);
         let config = name.config()?;
         let node = retry(
@@ -65,7 +68,7 @@ impl Bus {
         .map_err(|e| name.transport("start", format!("{e:?}")))?;
         let epoch = clock::now() ^ (u64::from(std::process::id()) << 40);
         memory::close_to_others(name);
-        let bus = Bus { node, name: name.clone(), epoch, _home: home };
+        let bus = Bus { node, name: name.clone(), epoch, unfinished, _home: home };
         bus.clean();
         Ok(bus)
     }
@@ -177,7 +180,8 @@ impl Bus {
         Ok(SnapshotReader::new(port))
     }
 
-    /// Opens a service, or creates it. What hangs in its creation until the last attempt was left by a killed process.
+    /// Opens a service, or creates it. What hangs in its creation for a second, or did so before this process joined, was left by a killed
+    /// one and is removed between two attempts.
     ///
     /// # Errors
     /// What the last attempt said.
@@ -187,12 +191,13 @@ impl Bus {
         is_passing: impl Fn(&E) -> bool,
     ) -> Result<T, E> {
         let unfinished = debris::Unfinished::of(&self.name);
-        retry(&mut attempt, &is_passing).or_else(|error| {
-            if !is_passing(&error) {
-                return Err(error);
+        retry(&mut attempt, |error| {
+            let passes = is_passing(error);
+            if passes {
+                self.unfinished.remove_left(&self.name);
+                unfinished.remove_left(&self.name);
             }
-            unfinished.remove(&self.name);
-            attempt()
+            passes
         })
     }
 
@@ -255,12 +260,48 @@ fn is_passing(error: &Failure) -> bool {
     )
 }
 
-fn retry<T, E>(mut attempt: impl FnMut() -> Result<T, E>, is_passing: impl Fn(&E) -> bool) -> Result<T, E> {
+/// Tries again while what is said may pass.
+fn retry<T, E>(mut attempt: impl FnMut() -> Result<T, E>, may_pass: impl Fn(&E) -> bool) -> Result<T, E> {
     for wait in BACK_OFF {
         match attempt() {
-            Err(error) if is_passing(&error) => std::thread::sleep(Duration::from_millis(wait)),
+            Err(error) if may_pass(&error) => std::thread::sleep(Duration::from_millis(wait)),
             other => return other,
         }
     }
     attempt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Whoever was killed while it created services stands in the way for a second, however many of them were left.
+    #[test]
+    fn unfinished_services_are_removed_after_a_second_all_of_them() {
+        let name = RobotName::new(&format!("t{}-unfinished", std::process::id())).unwrap();
+        let first = Bus::join(&name).unwrap();
+        let folder = name.folder().join("services");
+        std::fs::create_dir_all(&folder).unwrap();
+        let files = ["first.service", "second.service"].map(|file| folder.join(file));
+        files.iter().for_each(|file| std::fs::write(file, "").unwrap());
+        let mode = |mode| std::os::unix::fs::PermissionsExt::from_mode(mode);
+        files.iter().for_each(|file| std::fs::set_permissions(file, mode(0o600)).unwrap());
+        let second = Bus::join(&name).unwrap();
+        for (file, most) in files.iter().zip([3, 2]) {
+            let mut attempts = 0;
+            let attempt = || {
+                attempts += 1;
+                if file.exists() {
+                    // As iceoryx2 waits for another process to finish.
+                    std::thread::sleep(Duration::from_millis(500));
+                    return Err(());
+                }
+                Ok(())
+            };
+            second.open(attempt, |_| true).unwrap();
+            assert!(attempts <= most, "{attempts} attempts at {}", file.display());
+        }
+        drop((first, second));
+        super::super::remove_files(&name);
+    }
 }
