@@ -42,7 +42,7 @@ fn corpus_is_there() {
     if std::env::var_os("NEARL_WRITE").is_some() {
         write_all();
     }
-    for target in ["snapshot", "task", "plan", "message", "state", "robot", "rollout", "log"] {
+    for target in ["snapshot", "task", "plan", "message", "state", "robot", "rollout", "log", "verified"] {
         assert!(!files(target).is_empty());
     }
 }
@@ -56,6 +56,9 @@ fn corpus_is_of_the_present_format() {
         assert!(snapshot.to_bytes() == bytes, "write the corpus anew: see fuzz/README.md");
     }
     nearl_runtime::log::replay(&folder().join("log/flight.mcap")).expect("a log of the present schema");
+    let report =
+        nearl_verify::verify(&folder().join("verified/flight.mcap")).expect("a log of the present schema");
+    assert!(report.is_whole() && report.verified > 30, "a log that is verified\n{report}");
 }
 
 /// Where the limits of a task file begin.
@@ -129,6 +132,10 @@ fn write_all() {
     (reply.n_obs, reply.n_state, reply.n_act, reply.rows) = (14, 14, 7, 30);
     write("rollout", "reply", bytes_of(&reply));
     write("log", "flight.mcap", &flight());
+    let folder = Scratch::new("fuzz-attack");
+    let (log, summary) = crate::verified::flight().fly(&folder.0);
+    assert_eq!((summary.dropped, summary.brief, summary.error), (0, 0, None));
+    write("verified", "flight.mcap", &std::fs::read(log).expect("log"));
 }
 
 /// Eight ticks and more of the arm, with a swap.

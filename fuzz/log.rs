@@ -20,24 +20,45 @@ pub fn damage(rng: &mut Rng, base: &[u8], other: &[u8]) -> Vec<u8> {
 }
 
 /// Writes the log again with one of its parts damaged.
-fn within(rng: &mut Rng, base: &[u8]) -> Option<Vec<u8>> {
+pub fn within(rng: &mut Rng, base: &[u8]) -> Option<Vec<u8>> {
     let victim = rng.below(24);
+    again(base, &mut |n, part, data| {
+        let other: &[u8] = match part {
+            Part::Fact => b"{}",
+            Part::Snapshot => base,
+            Part::Message => b"[1e308, null]",
+        };
+        let is_hit = n == victim || (n > 6 && rng.below(12) == 0);
+        if is_hit { mutate(rng, data, other) } else { data.to_vec() }
+    })
+}
+
+/// What bytes of a log are.
+pub enum Part {
+    /// A value of the metadata.
+    Fact,
+    Snapshot,
+    Message,
+}
+
+/// What becomes of the bytes of a part, by the part's place.
+pub type Change<'a> = &'a mut dyn FnMut(usize, Part, &[u8]) -> Vec<u8>;
+
+/// Writes the log again with its parts changed, as a file that is sound.
+pub fn again(base: &[u8], change: Change<'_>) -> Option<Vec<u8>> {
     let mut writer = mcap::WriteOptions::new().compression(None).create(Cursor::new(Vec::new())).ok()?;
     let mut channels: BTreeMap<u16, u16> = BTreeMap::new();
     for (n, part) in ChunkFlattener::new(base).ok()?.enumerate() {
-        let hit = n == victim || (n > 6 && rng.below(12) == 0);
         match part.ok()? {
             Record::DataEnd(_) => break,
             Record::Metadata(mut m) => {
-                if hit {
-                    for value in m.metadata.values_mut() {
-                        *value = String::from_utf8_lossy(&mutate(rng, value.as_bytes(), b"{}")).into_owned();
-                    }
+                for value in m.metadata.values_mut() {
+                    *value = String::from_utf8_lossy(&change(n, Part::Fact, value.as_bytes())).into_owned();
                 }
                 writer.write_metadata(&m).ok()?;
             }
             Record::Attachment { header, data, .. } => {
-                let data = if hit { mutate(rng, &data, base) } else { data.into_owned() };
+                let data = change(n, Part::Snapshot, &data);
                 let (name, media_type) = (header.name, header.media_type);
                 let attachment = mcap::Attachment {
                     log_time: 0,
@@ -53,7 +74,7 @@ fn within(rng: &mut Rng, base: &[u8]) -> Option<Vec<u8>> {
                 channels.insert(c.id, writer.add_channel(schema, &c.topic, "json", &BTreeMap::new()).ok()?);
             }
             Record::Message { header, data } => {
-                let data = if hit { mutate(rng, &data, b"[1e308, null]") } else { data.into_owned() };
+                let data = change(n, Part::Message, &data);
                 let header = MessageHeader { channel_id: *channels.get(&header.channel_id)?, ..header };
                 writer.write_to_known_channel(&header, &data).ok()?;
             }

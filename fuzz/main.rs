@@ -1,4 +1,4 @@
-//! Everything that comes from outside, damaged: snapshots, task files, fault plans, messages, flight logs.
+//! Everything that comes from outside, damaged: snapshots, task files, fault plans, messages, flight logs, to replay and to verify.
 //!
 //! A program of its own: a case that hangs ends the process, and the allocator counts the bytes that each thread holds.
 //!
@@ -16,6 +16,8 @@
 
 #[path = "../runtime/tests/arm/mod.rs"]
 mod arm;
+#[path = "../runtime/tests/attack/mod.rs"]
+mod attack;
 mod budget;
 mod corpus;
 mod log;
@@ -24,6 +26,7 @@ mod mutate;
 mod snapshot;
 #[path = "../runtime/tests/toy/mod.rs"]
 mod toy;
+mod verified;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -75,7 +78,7 @@ pub fn fuzz(
 fn run(target: &str, seed: u64, input: &[u8], read: &impl Fn(&[u8])) {
     let mut panicked = false;
     let peak = peak_of(|| panicked = catch_unwind(AssertUnwindSafe(|| read(input))).is_err());
-    let room = if target == "log" { ROOM_OF_LOGS } else { ROOM };
+    let room = if matches!(target, "log" | "verified") { ROOM_OF_LOGS } else { ROOM };
     let most = room + 100 * input.len() as u64;
     if panicked || peak > most {
         let file = std::env::temp_dir().join(format!("nearl-fuzz-{target}-{seed}"));
@@ -156,4 +159,16 @@ fn flight_logs() {
     let folder = arm::Scratch::new("fuzz-log");
     let file = folder.0.join("flight.mcap");
     fuzz("log", 120, log::damage, |bytes| log::read(&file, bytes));
+}
+
+#[test]
+fn verified_logs() {
+    let folder = arm::Scratch::new("fuzz-verified");
+    let file = folder.0.join("flight.mcap");
+    let (limits, broken) = (verified::Limits::new(), std::sync::atomic::AtomicU64::new(0));
+    let damage = |rng: &mut Rng, base: &[u8], other: &[u8]| limits.damage(rng, base, other);
+    fuzz("verified", 300, damage, |bytes| {
+        broken.fetch_add(verified::read(&file, bytes, &limits), std::sync::atomic::Ordering::Relaxed);
+    });
+    println!("{} ticks were beyond a limit, and none of them was called verified", broken.into_inner());
 }

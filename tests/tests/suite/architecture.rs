@@ -15,7 +15,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("nearl-rollout-protocol", &["nearl-runtime"]),
     ("nearl-trainer", &["nearl-runtime", "nearl-rollout-protocol"]),
     ("nearl-python", &["nearl-constraints", "nearl-runtime", "nearl-trainer"]),
-    ("nearl-tests", &["nearl-constraints", "nearl-runtime", "nearl-trainer"]),
+    ("nearl-tests", &["nearl-constraints", "nearl-runtime", "nearl-trainer", "nearl-verify"]),
 ];
 
 /// What a program that embeds the controller must not have to build: links, command lines, logs, physics, Python.
