@@ -364,6 +364,48 @@ fn hostile_snapshots_are_refused_by_name_and_the_last_good_one_stays_in_use() {
     assert_eq!((&report["failed"], &report["malformed"]), (&0.into(), &1.into()), "{report}");
 }
 
+/// A snapshot whose policy has a layer of `width` x `width`, which takes a while to look at.
+fn wide(good: &Snapshot, width: usize) -> Snapshot {
+    let mut wide = good.clone();
+    let layers = &mut wide.networks.policy.layers;
+    let (n_in, n_out) = (layers[0].n_in, layers.last().expect("layers").n_out);
+    let layer = |n_in: usize, n_out: usize| DenseLayer {
+        n_in,
+        n_out,
+        weight: vec![1e-4; n_in * n_out],
+        bias: vec![0.0; n_out],
+    };
+    *layers = vec![layer(n_in, width), layer(width, width), layer(width, n_out)];
+    wide
+}
+
+#[test]
+fn while_a_large_snapshot_is_validated_everybody_is_served_but_those_who_wait_for_it() {
+    let server = Server::start_with("large", &[]);
+    let right = expected(&snapshot(), 5);
+    let large = wide(&snapshot(), 3000).to_bytes();
+    let mut link = TrainerLink::open(&server.0).expect("link");
+    let (mut client, mut learner) = (server.client(), server.client());
+    link.push(1, &large).expect("push");
+    // Nobody answered the push yet: this waits for it, and is not told that nothing was pushed.
+    let asked = Request { training: Some(GOOD), version: Some(1), ..Request::new(3, 2) };
+    let mut parts = learner.request(&asked).expect("request");
+    let mut served = 0;
+    let receipt = until("the receipt", || {
+        assert!(bits(&numbers(&mut client, 5).expect("a rollout")) == right);
+        served += 1;
+        link.receipt()
+    });
+    println!("{served} rollouts while {} bytes were validated", large.len());
+    assert_eq!(receipt.verdict(), Verdict::Accepted, "{}", receipt.text());
+    while parts.next_part(PATIENCE).expect("a part of a training by what was pushed").is_some() {}
+    assert!(parts.steps() > 0);
+    // One is what waiting for the validation would leave, another may be over before it begins.
+    assert!(served > 4, "{served} rollouts");
+    drop((client, learner, link));
+    assert_eq!(server.end()["failed"], 0);
+}
+
 #[test]
 fn trainings_keep_no_more_than_the_server_allows_all_of_them() {
     let server = Server::start_with("room", &["--max-envs", "8", "--max-steps", "4000"]);

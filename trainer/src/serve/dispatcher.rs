@@ -1,7 +1,7 @@
 //! Takes requests in, decides whose chunk is simulated next, and sends what is ready.
 
 use super::job::{Job, Rollout, Stage, Subject};
-use super::policy::{Policies, has_shape};
+use super::policy::{Policies, Validated, Validation, has_shape};
 use super::pool::{Outcome, Pool};
 use super::refusal::Refusal;
 use super::training::{Load, Session};
@@ -12,7 +12,7 @@ use nearl_rollout_protocol::{
     Answer, Caller, Constraints, Layout, MAX_CHUNK, ReplyMessage, Request, constraint_set, decode,
 };
 use nearl_runtime::Snapshot;
-use nearl_runtime::link::{SnapshotBytes, Verdict};
+use nearl_runtime::link::Verdict;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
 
@@ -186,10 +186,18 @@ impl Dispatcher {
         self.jobs.insert(self.slots, Job::new(caller, request, subject, reply));
     }
 
+    /// What a policy that is pushed to the server is held to.
+    pub(super) fn validation(&self) -> Validation {
+        self.policies.validation()
+    }
+
     /// Takes a policy that was pushed to the server, for those who learn.
-    pub(super) fn take_policy(&mut self, bytes: &SnapshotBytes) -> (Verdict, String) {
-        match self.policies.push(bytes) {
-            Ok(()) => (Verdict::Accepted, "in use by those who learn".into()),
+    pub(super) fn take_policy(&mut self, version: u64, found: Validated) -> (Verdict, String) {
+        match found {
+            Ok(snapshot) => {
+                self.policies.take(snapshot, version);
+                (Verdict::Accepted, "in use by those who learn".into())
+            }
             Err(refusal) => refusal,
         }
     }

@@ -9,6 +9,7 @@ mod dispatcher;
 mod job;
 mod policy;
 mod pool;
+mod pushed;
 mod refusal;
 mod training;
 mod turns;
@@ -114,16 +115,12 @@ pub fn serve(
         let mut pool = pool::Pool::start(scope, snapshot, settings.threads)?;
         let mut dispatcher = dispatcher::Dispatcher::new(snapshot, settings, pool.layout())?;
         let mut server = RolloutServer::open(name)?;
+        let mut pushed = pushed::Pushed::default();
         begin();
         let mut searched = Instant::now();
         while !stop.is_requested() {
             let callers = server.receive();
-            // What was pushed before a request is in use with it.
-            for bytes in server.snapshots() {
-                let (verdict, text) = dispatcher.take_policy(&bytes);
-                server.receipt(&bytes.header, verdict, &text);
-            }
-            callers.into_iter().for_each(|caller| dispatcher.admit(caller));
+            pushed.attend(scope, &mut server, &mut dispatcher, callers);
             if searched.elapsed() > SEARCH {
                 dispatcher.keep_only(&server.survivors());
                 searched = Instant::now();
@@ -134,6 +131,7 @@ pub fn serve(
                 dispatcher.take_back(outcome);
             }
         }
+        pushed.end(&mut dispatcher);
         Ok(dispatcher.close())
     })
 }

@@ -1,11 +1,12 @@
 //! The policies a server acts by: its own, and for those who learn the one that was pushed last.
 
 use nearl_rollout_protocol::Request;
-use nearl_runtime::link::{SnapshotBytes, Verdict};
+use nearl_runtime::link::{SnapshotBytes, SnapshotHeader, Verdict};
 use nearl_runtime::net::Dense;
 use nearl_runtime::{Controller, Manifest, Networks, Snapshot, SnapshotError};
 use serde_json::Value;
 use std::sync::Arc;
+use std::thread::{Builder, Scope, ScopedJoinHandle};
 
 /// Room of the thread that validates a pushed snapshot: parsers recurse as deep as its robot is nested [bytes].
 const STACK: usize = 16 << 20;
@@ -14,12 +15,15 @@ pub(super) struct Policies {
     own: Arc<Snapshot>,
     pushed: Option<(u64, Arc<Snapshot>)>,
     /// What a pushed snapshot must share with the server's own.
-    task: Value,
+    task: Arc<Value>,
 }
+
+/// What becomes of a pushed snapshot; a refusal is a verdict with a sentence.
+pub(super) type Validated = Result<Snapshot, (Verdict, String)>;
 
 impl Policies {
     pub(super) fn new(own: &Snapshot) -> Policies {
-        Policies { task: shared(&own.manifest), own: Arc::new(own.clone()), pushed: None }
+        Policies { task: Arc::new(shared(&own.manifest)), own: Arc::new(own.clone()), pushed: None }
     }
 
     /// The policy of a request; one sentence if the server does not have it.
@@ -48,12 +52,34 @@ impl Policies {
         request.version.unwrap_or(self.own.manifest.version)
     }
 
-    /// Takes a snapshot of the server's own task.
-    pub(super) fn push(&mut self, bytes: &SnapshotBytes) -> Result<(), (Verdict, String)> {
-        let version = bytes.header.version;
-        let snapshot = guarded(version, || Snapshot::from_bytes(&bytes.bytes).map_err(refused))?;
+    /// Takes over what was validated.
+    pub(super) fn take(&mut self, snapshot: Snapshot, version: u64) {
+        self.pushed = Some((version, Arc::new(snapshot)));
+    }
+
+    /// What the next pushed snapshot is held to, for whatever thread validates it.
+    pub(super) fn validation(&self) -> Validation {
+        Validation {
+            task: Arc::clone(&self.task),
+            name: self.own.manifest.task.name.clone(),
+            known: self.pushed.as_ref().map(|(_, snapshot)| Arc::clone(snapshot)),
+        }
+    }
+}
+
+/// Whether a pushed snapshot is whole and of the server's own task.
+pub(super) struct Validation {
+    task: Arc<Value>,
+    name: String,
+    /// The last good one: of the same shape no controller has to be made to see that one can be.
+    known: Option<Arc<Snapshot>>,
+}
+
+impl Validation {
+    fn run(&self, bytes: &[u8]) -> Validated {
+        let snapshot = Snapshot::from_bytes(bytes).map_err(refused)?;
         if let Some(section) = difference(&self.task, &shared(&snapshot.manifest)) {
-            let task = &self.own.manifest.task.name;
+            let task = &self.name;
             return Err((
                 Verdict::ForeignRobot,
                 format!(
@@ -61,28 +87,45 @@ impl Policies {
                 ),
             ));
         }
-        let has_shape = |known: &(u64, Arc<Snapshot>)| has_shape(&known.1, &snapshot);
-        if !self.pushed.as_ref().is_some_and(has_shape) {
-            guarded(version, || Controller::new(&snapshot).map(|_| ()).map_err(refused))?;
+        if !self.known.as_ref().is_some_and(|known| has_shape(known, &snapshot)) {
+            Controller::new(&snapshot).map_err(refused)?;
         }
-        self.pushed = Some((version, Arc::new(snapshot)));
-        Ok(())
+        Ok(snapshot)
+    }
+
+    /// Validates on a thread with room for what a hostile snapshot might break; a panic there is a refusal, not the end of the server.
+    pub(super) fn start<'scope>(
+        self,
+        scope: &'scope Scope<'scope, '_>,
+        pushed: SnapshotBytes,
+    ) -> Validating<'scope> {
+        let header = pushed.header;
+        let thread = Builder::new().stack_size(STACK).spawn_scoped(scope, move || self.run(&pushed.bytes));
+        Validating { header, thread: thread.ok() }
     }
 }
 
-/// Does what a hostile snapshot might break on a thread with room; a panic there is a refusal, not the end of the server.
-fn guarded<T: Send>(
-    version: u64,
-    validation: impl FnOnce() -> Result<T, (Verdict, String)> + Send,
-) -> Result<T, (Verdict, String)> {
-    let broke = || {
-        let text = format!("snapshot version {version} broke its validation: export it again");
-        Err((Verdict::Other, text))
-    };
-    std::thread::scope(|scope| {
-        let thread = std::thread::Builder::new().stack_size(STACK).spawn_scoped(scope, validation);
-        thread.map_or_else(|_| broke(), |thread| thread.join().unwrap_or_else(|_| broke()))
-    })
+/// A pushed snapshot that a thread validates.
+pub(super) struct Validating<'scope> {
+    pub(super) header: SnapshotHeader,
+    /// None where no thread was to be had.
+    thread: Option<ScopedJoinHandle<'scope, Validated>>,
+}
+
+impl Validating<'_> {
+    pub(super) fn is_finished(&self) -> bool {
+        self.thread.as_ref().is_none_or(ScopedJoinHandle::is_finished)
+    }
+
+    /// What was found; waits for it.
+    pub(super) fn end(self) -> Validated {
+        let found = self.thread.and_then(|thread| thread.join().ok());
+        found.unwrap_or_else(|| {
+            let text =
+                format!("snapshot version {} broke its validation: export it again", self.header.version);
+            Err((Verdict::Other, text))
+        })
+    }
 }
 
 fn refused(e: SnapshotError) -> (Verdict, String) {
