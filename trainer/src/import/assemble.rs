@@ -3,9 +3,8 @@
 use super::{ImportError, ImportedNetwork};
 use super::{deploy, metadata};
 use crate::robot::{describe, folder_of};
-use nearl_runtime::constraints::{
-    Drive, JointKind, Model, RobotDescription, StateLayout, read_task_text, read_text,
-};
+use nearl_runtime::constraints::description::JointKind;
+use nearl_runtime::constraints::{Drive, Model, RobotDescription, StateLayout, read_task_text, read_text};
 use nearl_runtime::net::Activation;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::recipe::{Numbers, Observer, PolicySection};
