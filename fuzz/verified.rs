@@ -112,7 +112,7 @@ impl Limits {
         again(base, &mut |n, part, data| {
             let is_hit = matches!(part, Part::Message) && (n == victim || rng.below(20) == 0);
             match serde_json::from_slice::<Value>(data) {
-                Ok(mut tick) if is_hit && tick.get("target_v").is_some() => {
+                Ok(mut tick) if is_hit && self.has_all(&tick) => {
                     self.push(rng, &mut tick);
                     (0..rng.below(4)).for_each(|_| cover(rng, &mut tick));
                     tick.to_string().into_bytes()
@@ -120,6 +120,12 @@ impl Limits {
                 _ => data.to_vec(),
             }
         })
+    }
+
+    /// It is a tick with a target and an action for each joint.
+    fn has_all(&self, tick: &Value) -> bool {
+        let is_whole = |key: &str| tick[key].as_array().is_some_and(|x| x.len() == self.speed.len());
+        ["target_q", "target_v", "action"].into_iter().all(is_whole)
     }
 
     /// One number beyond its limit by anything from a hair to its size.

@@ -124,7 +124,7 @@ fn fault_41_what_another_user_made_is_in_no_list_and_stays() {
         return skip("only root can give files to another user");
     }
     let (mine, theirs) = (Name::new("mine"), Name::new("theirs"));
-    let given = |path: &Path| std::os::unix::fs::chown(path, Some(60_123), Some(60_123)).unwrap();
+    let given = |path: &Path| std::os::unix::fs::chown(path, Some(60_124), Some(60_124)).unwrap();
     let segments = [&mine, &theirs].map(|name| {
         let path = PathBuf::from(format!("/dev/shm/nearl.{}.0123456789abcdef.decoy", name.0));
         std::fs::write(&path, "theirs").unwrap();

@@ -187,7 +187,6 @@ const MOST_OF_A_TASK: usize = 1 << 20;
 fn task_files_beyond_their_size_are_refused_by_name_before_they_are_parsed() {
     let folder = folder();
     let at = |name: &str| folder.path().join(name);
-    std::fs::copy(repository().join("examples/robots/panda/panda.urdf"), at("panda.urdf")).expect("copy");
     let task = fixture("two_link.toml") + "\n#";
     let longest = format!("{task}{}", "x".repeat(MOST_OF_A_TASK - task.len()));
     std::fs::write(at("longest.toml"), &longest).expect("task file");
@@ -198,16 +197,11 @@ fn task_files_beyond_their_size_are_refused_by_name_before_they_are_parsed() {
     std::fs::write(at("beyond.toml"), "=".repeat(MOST_OF_A_TASK + 1)).expect("task file");
     let panda = panda();
     let panda = panda.to_str().expect("UTF-8");
-    let onnx = at("policy.onnx");
-    let onnx = onnx.to_str().expect("UTF-8");
-    let (code, out, error) = limited(folder.path(), &["export", panda, "--out", onnx], None);
-    assert_eq!(code, Some(0), "{out}{error}");
     let commands: &[&[&str]] = &[
         &["train", "beyond.toml", "--out", "run"],
         &["project", "beyond.toml"],
         &["run", panda, "--plant", "nobody", "--limits", "beyond.toml"],
         &["limits", "nobody", "--file", "beyond.toml"],
-        &["import", onnx, "--robot", "panda.urdf", "--recipe", "beyond.toml", "--out", "x"],
     ];
     for arguments in commands {
         refused(folder.path(), arguments, None, "beyond.toml");

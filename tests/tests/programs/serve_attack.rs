@@ -392,16 +392,18 @@ fn while_a_large_snapshot_is_validated_everybody_is_served_but_those_who_wait_fo
     let mut parts = learner.request(&asked).expect("request");
     let mut served = 0;
     let receipt = until("the receipt", || {
-        assert!(bits(&numbers(&mut client, 5).expect("a rollout")) == right);
+        let mut rollouts = client.request(&Request::new(5, 1)).expect("request");
+        let step = bits(&rollouts.next(PATIENCE).expect("a chunk").expect("a step").numbers);
+        assert!(step == right[..step.len()], "other bits beside a validation");
         served += 1;
         link.receipt()
     });
-    println!("{served} rollouts while {} bytes were validated", large.len());
+    println!("{served} steps served while {} bytes were validated", large.len());
     assert_eq!(receipt.verdict(), Verdict::Accepted, "{}", receipt.text());
     while parts.next_part(PATIENCE).expect("a part of a training by what was pushed").is_some() {}
     assert!(parts.steps() > 0);
-    // One is what waiting for the validation would leave, another may be over before it begins.
-    assert!(served > 4, "{served} rollouts");
+    // One waits for the end of the validation if all do, and a few may be over before it begins.
+    assert!(served > 10, "{served} steps served");
     drop((client, learner, link));
     assert_eq!(server.end()["failed"], 0);
 }

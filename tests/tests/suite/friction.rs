@@ -184,10 +184,10 @@ fn task_that_rubs(known: bool) -> ([f64; 4], f64) {
     std::fs::write(folder.path().join("two_link.xml"), rubs).expect("robot");
     std::fs::write(&task, fixture("two_link.toml")).expect("task");
     let mut snapshot = random_policy(task.to_str().expect("UTF-8"), 5, 3.0);
-    let friction: Vec<f64> = snapshot.manifest.robot.joints.iter().map(|j| j.friction).collect();
+    let friction: Vec<f64> = snapshot.manifest.robot.joints().map(|j| j.friction).collect();
     assert_eq!(friction, [6.0, 2.0], "the robot of the task has the friction of its file");
     if !known {
-        for joint in &mut snapshot.manifest.robot.joints {
+        for joint in snapshot.manifest.robot.bodies.iter_mut().flat_map(|body| &mut body.joints) {
             (joint.friction, joint.friction_onset) = (0.0, None);
         }
     }

@@ -3,7 +3,7 @@
 use nearl_runtime::Controller;
 use nearl_tests::training;
 use nearl_trainer::export;
-use nearl_trainer::import::{for_task, onnx};
+use nearl_trainer::import::{Setting, for_task, onnx};
 use rand::RngExt;
 
 const SHORT: [&str; 3] = ["train.n_envs=4", "train.n_steps=32", "train.ppo.batch_size=64"];
@@ -57,4 +57,22 @@ fn damaged_files_are_refused_in_a_sentence() {
         }
     }
     assert!(refused > 200 && read > 200, "{refused} refused, {read} read");
+}
+
+#[test]
+fn a_recipe_has_the_limit_of_a_task_file() {
+    let snapshot = training("HalfCheetah-v5", "ppo", 0, 1, &SHORT).snapshot().clone();
+    let bytes = export::onnx(&snapshot).expect("exports");
+    let mut network = onnx("policy.onnx", &bytes, None, None).expect("imports");
+    network.metadata.insert("nearl_recipe".into(), "=".repeat((1 << 20) + 1));
+    let setting = Setting { name: "x", robot: std::path::Path::new("no.urdf"), recipe: None };
+    let error = nearl_trainer::import::snapshot(&network, &setting).unwrap_err().to_string();
+    assert_eq!(error, "metadata 'nearl_recipe': it has 1048577 bytes, more than the limit of 1048576");
+    network.metadata.clear();
+    let folder = tempfile::tempdir().expect("folder");
+    let recipe = folder.path().join("beyond.toml");
+    std::fs::write(&recipe, "=".repeat((1 << 20) + 1)).expect("recipe");
+    let error = nearl_trainer::import::snapshot(&network, &Setting { recipe: Some(&recipe), ..setting });
+    let error = error.unwrap_err().to_string();
+    assert!(error.contains("beyond.toml") && error.contains("more than the limit of 1048576"), "{error}");
 }
