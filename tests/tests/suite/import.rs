@@ -65,14 +65,17 @@ fn a_recipe_has_the_limit_of_a_task_file() {
     let bytes = export::onnx(&snapshot).expect("exports");
     let mut network = onnx("policy.onnx", &bytes, None, None).expect("imports");
     network.metadata.insert("nearl_recipe".into(), "=".repeat((1 << 20) + 1));
-    let setting = Setting { name: "x", robot: std::path::Path::new("no.urdf"), recipe: None };
+    let setting = Setting { name: "x", robot: std::path::Path::new("no.urdf"), recipes: &[] };
     let error = nearl_trainer::import::snapshot(&network, &setting).unwrap_err().to_string();
     assert_eq!(error, "metadata 'nearl_recipe': it has 1048577 bytes, more than the limit of 1048576");
     network.metadata.clear();
     let folder = tempfile::tempdir().expect("folder");
     let recipe = folder.path().join("beyond.toml");
     std::fs::write(&recipe, "=".repeat((1 << 20) + 1)).expect("recipe");
-    let error = nearl_trainer::import::snapshot(&network, &Setting { recipe: Some(&recipe), ..setting });
+    let error = nearl_trainer::import::snapshot(
+        &network,
+        &Setting { recipes: std::slice::from_ref(&recipe), ..setting },
+    );
     let error = error.unwrap_err().to_string();
     assert!(error.contains("beyond.toml") && error.contains("more than the limit of 1048576"), "{error}");
 }
