@@ -111,6 +111,12 @@ def test_the_command(inputs, tmp_path) -> None:
     assert failed.stderr.count("\n") == 1
 
 
+def test_without_matplotlib_it_says_what_to_install(tmp_path) -> None:
+    program = "import sys; sys.modules['matplotlib'] = None; from nearl.report.__main__ import main; sys.exit(main(['--run', 'none']))"
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr == "nearl.report: the report needs matplotlib: pip install 'nearl[viz]'\n", done.stderr
+
+
 @pytest.mark.parametrize("content", [b"", b"not mcap", b"\x89MCAP0\r\n"])
 def test_a_broken_log_is_refused_in_a_sentence(tmp_path, content) -> None:
     path = tmp_path / "broken.mcap"

@@ -6,6 +6,17 @@
 or ``nearl.report.build(...)``. Figures are inside the file; nothing is fetched from anywhere.
 """
 
-from nearl.report.build import build
+from typing import Any
+
+try:
+    from nearl.report.build import build
+except ModuleNotFoundError as error:
+    if (error.name or "").split(".")[0] != "matplotlib":
+        raise
+
+    def build(*_: Any, **__: Any) -> None:  # type: ignore[misc]
+        """Says what is missing."""
+        raise ImportError("the report needs matplotlib: pip install 'nearl[viz]'")
+
 
 __all__ = ["build"]

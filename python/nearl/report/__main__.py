@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from nearl.report.build import build
+from nearl.report import build
 from nearl.report.read import ReadError
 
 
@@ -26,7 +26,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         build(given.out, runs=given.run, logs=given.log, evals=given.eval, summaries=given.summary, sweeps=given.sweeps, demos=given.demos, task=given.task,
               title=given.title)  # fmt: skip
-    except (ReadError, OSError) as error:
+    except (ReadError, OSError, ImportError) as error:
         print(f"nearl.report: {error}", file=sys.stderr)
         return 1
     print(given.out)
