@@ -92,45 +92,46 @@ def stage(folder: Path) -> None:
             place.write_text(text)
 
 
-def stubs() -> dict[str, str]:
-    """Types of the extension, by a name with a dot, as the package's stub says them."""
+def types(module: str) -> dict[str, str]:
+    """What public functions, classes and values of a module take and give, as its source or its stub writes it, by a name with a dot."""
+    source = ROOT / "python" / Path(*module.split("."))
+    file = next(f for f in (source.with_suffix(".pyi"), source.with_suffix(".py"), source / "__init__.py") if f.exists())
     found = {}
-    for node in ast.parse((ROOT / "python" / "nearl" / "_core.pyi").read_text()).body:
-        inside = node.body if isinstance(node, ast.ClassDef) else [node]
+    tree = ast.parse(file.read_text()).body
+    classes = {node.name: node for node in tree if isinstance(node, ast.ClassDef)}
+    for node in tree:
+        inside = [node]
+        if isinstance(node, ast.ClassDef):
+            above = [classes[base.id].body for base in node.bases if isinstance(base, ast.Name) and base.id in classes]
+            inside = [*sum(above, []), *node.body]
         for function in (f for f in inside if isinstance(f, ast.FunctionDef)):
-            takes, gives = ast.unparse(function.args), f" -> {ast.unparse(function.returns)}" if function.returns else ""
-            name = f"{node.name}.{function.name}" if isinstance(node, ast.ClassDef) else function.name
-            is_value = any(isinstance(d, ast.Name) and d.id == "property" for d in function.decorator_list)
-            if function.name == "__new__":
-                name, gives = node.name, ""
-            found[name] = gives.replace(" -> ", ": ") if is_value else f"({re.sub(r'^(self|cls)(, )?', '', takes)}){gives}"
+            takes = re.sub(r"^(self|cls)(, )?", "", ast.unparse(function.args))
+            gives = ast.unparse(function.returns) if function.returns else ""
+            if not isinstance(node, ast.ClassDef):
+                found[function.name] = f"({takes}) -> {gives}"
+            elif function.name in ("__new__", "__init__"):
+                found[node.name] = f"({takes})"
+            elif any(isinstance(d, ast.Name) and d.id == "property" for d in function.decorator_list):
+                found[f"{node.name}.{function.name}"] = f": {gives}"
+            else:
+                found[f"{node.name}.{function.name}"] = f"({takes}) -> {gives}"
     return found
 
 
-def described(name: str, thing: object, types: dict[str, str]) -> str:
-    """Its types and its docstring."""
-    typed = types.get(name)
-    if typed is None and callable(thing):
-        try:
-            typed = re.sub(r"\(self(, )?", "(", str(inspect.signature(thing)))
-        except ValueError:  # it cannot be made by a call
-            typed = ""
-    return f"```text\nnearl.{name}{typed or ''}\n\n{inspect.getdoc(thing) or ''}\n```"
-
-
 def reference(file: Path) -> None:
-    """The Python package, from its docstrings and its stub."""
+    """The Python package, from its docstrings and its types."""
     import nearl
 
-    types = stubs()
     parts = ["# Python", inspect.getdoc(nearl) or ""]
     for name in sorted(n for n in nearl.__all__ if not n.startswith("_")):
         thing = getattr(nearl, name)
-        parts.append(f"## nearl.{name}\n\n{described(name, thing, types)}")
+        known = types(getattr(thing, "__module__", None) or "nearl._core")
+        parts.append(f"## nearl.{name}\n\n```text\nnearl.{name}{known.get(name, '')}\n\n{inspect.getdoc(thing) or ''}\n```")
         members = vars(thing).items() if inspect.isclass(thing) else ()
         for member, value in members:
             if not member.startswith("_") and inspect.getdoc(value):
-                parts.append(f"### {name}.{member}\n\n{described(f'{name}.{member}', value, types)}")
+                typed = known.get(f"{name}.{member}", "")
+                parts.append(f"### {name}.{member}\n\n```text\n{name}.{member}{typed}\n\n{inspect.getdoc(value)}\n```")
     file.write_text("\n\n".join(parts) + "\n")
 
 
