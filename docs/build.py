@@ -102,8 +102,8 @@ def types(module: str) -> dict[str, str]:
     for node in tree:
         inside = [node]
         if isinstance(node, ast.ClassDef):
-            above = [classes[base.id].body for base in node.bases if isinstance(base, ast.Name) and base.id in classes]
-            inside = [*sum(above, []), *node.body]
+            above = [classes[base.id] for base in node.bases if isinstance(base, ast.Name) and base.id in classes]
+            inside = [item for of in (*above, node) for item in of.body]
         for function in (f for f in inside if isinstance(f, ast.FunctionDef)):
             takes = re.sub(r"^(self|cls)(, )?", "", ast.unparse(function.args))
             gives = ast.unparse(function.returns) if function.returns else ""
