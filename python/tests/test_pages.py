@@ -151,3 +151,10 @@ def test_c(compiler: str, block: str, tmp_path: Path) -> None:
 
 def test_there_is_c_to_compile() -> None:
     assert "CONNECT" in blocks("c")
+
+
+def test_pictures_of_the_pages_are_small_and_the_first_one_moves() -> None:
+    pictures = {page.parent / name for page in PAGES for name in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page.read_text())}
+    assert len(pictures) > 3 and all(picture.stat().st_size < 2_000_000 for picture in pictures), pictures
+    first = re.search(r"!\[[^]]*\]\(([^)]+)\)", (ROOT / "README.md").read_text())
+    assert first and (ROOT / first[1]).read_bytes().count(b"ANMF") > 20, "frames of a WebP"
