@@ -210,7 +210,7 @@ fn targets_within_the_intervals_are_not_touched() {
 /// the projection did, and more was moved where drives were bounded.
 #[test]
 fn the_report_of_the_drives_does_not_hide_that_of_the_projection() {
-    let set = ["idm.kind=\"learned\"", "constraints.braking=\"certified\""];
+    let set = ["idm.kind=\"learned\"", "time.policy_every=1", "constraints.braking=\"certified\""];
     let mut snapshot = training("Panda-reach", "pid2-ib", 1, 1, &set).snapshot().clone();
     for layer in &mut snapshot.networks.policy.layers {
         layer.weight.iter_mut().for_each(|w| *w *= 20.0);
