@@ -106,9 +106,9 @@ impl Manifest {
         }
     }
 
-    /// Whether the task limits the action itself: `[constraints.action]`.
+    /// Whether actions are kept within limits of their own: `[constraints.action]`, or the forces of drives.
     pub fn limits_actions(&self) -> bool {
-        self.task.constraints.action.is_some()
+        self.task.constraints.action.is_some() || self.bounds_drives()
     }
 
     /// Whether the controller of this snapshot guards its actions: those of a network, where the task asks for it. Analytic inverse dynamics

@@ -38,6 +38,18 @@ fn the_ledger_is_in_the_metrics() {
     }
 }
 
+/// Under `guard = "drive"` the metrics say how often a policy asked a drive for too much.
+#[test]
+fn what_drives_are_asked_for_is_in_the_metrics() {
+    let leg = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/leg.toml");
+    let mut t = training(leg, "ppo", 0, 1, &["constraints.torque_rate.limit=20.0"]);
+    let p = t.iterate();
+    let of = |column| cell(&t, &p, column);
+    assert!(of("constraints/raw_violations") > 0.1, "{}", of("constraints/raw_violations"));
+    assert_eq!((of("constraints/target_violations"), of("constraints/avoided")), (0.0, 1.0));
+    assert!(of("idm/residual").is_nan(), "no state is proposed");
+}
+
 #[test]
 fn without_projection_in_training_nothing_is_moved_nor_avoided() {
     let (t, p) = first("pid2-ib", &[TIGHT, "train.project_in_training=false"]);
