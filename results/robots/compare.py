@@ -26,6 +26,11 @@ def compare(path: pathlib.Path, theirs: dict) -> dict:
         return row
     if model.joint_names != theirs["joints"] or (model.nq, model.nv) != (theirs["nq"], theirs["nv"]):
         return {**row, "different": "joints"}
+    def limits(q: int, v: int) -> list[float]:
+        return [model.lower_position_limit[q], model.upper_position_limit[q], model.velocity_limit[v], model.effort_limit[v]]
+
+    unlike = [name for name, (q, v, *limit) in theirs["limits"].items() if limits(q, v) != limit]
+    row |= {"limits": len(theirs["limits"]), "unlike": unlike}
     worst = {"mass": 0.0, "nle": 0.0}
     for state in theirs["states"]:
         mass = np.array(state["mass"]).reshape(model.nv, model.nv)
@@ -41,13 +46,14 @@ def table(rows: list[dict]) -> str:
     lines = [
         f"{len(rows)} URDFs of example-robot-data 6.0.0: {len(loads)} load, {len(compared)} of them are compared with Pinocchio 4.1.0's own",
         f"parser (mass matrix, non-linear effects at three random states): the largest difference is {worst:.1e} of the largest entry.",
+        f"Limits of position, speed and effort are compared for {sum(r['limits'] for r in compared)} joints; {sum(len(r['unlike']) for r in compared)} differ.",
         "", "Refused:", "", "| file | why |", "|---|---|",
     ]
     lines += [f"| {r['file']} | {r['ours']} |" for r in rows if r["ours"] != "loads"]
-    lines += ["", "Loaded:", "", "| file | dofs | mass matrix | nle | notes |", "|---|---|---|---|---|"]
+    lines += ["", "Loaded:", "", "| file | dofs | mass matrix | nle | limits that differ | notes |", "|---|---|---|---|---|---|"]
     for r in loads:
         numbers = [f"{r[k]:.0e}" if k in r else (r.get("different") or "refused by Pinocchio") for k in ("mass", "nle")]
-        lines.append(f"| {r['file']} | {r['nv']}{' (floating base)' if r['floating'] else ''} | {numbers[0]} | {numbers[1]} | {len(r['notes']) or ''} |")
+        lines.append(f"| {r['file']} | {r['nv']}{' (floating base)' if r['floating'] else ''} | {numbers[0]} | {numbers[1]} | {len(r.get('unlike', [])) or ''} | {len(r['notes']) or ''} |")
     return "\n".join(lines) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""Prints what Pinocchio's own parser makes of every URDF below a folder: joints, and dynamics at three random states, one JSON line each."""
+"""Prints what Pinocchio's own parser makes of every URDF below a folder: joints, limits, and dynamics at three random states, one JSON line each."""
 
 import json
 import pathlib
@@ -26,7 +26,13 @@ def robot(path: pathlib.Path) -> dict:
         mass = np.triu(mass) + np.triu(mass, 1).T
         states.append({"q": q.tolist(), "v": v.tolist(), "mass": mass.ravel().tolist(),
                        "nle": pin.nonLinearEffects(model, data, q, v).tolist()})
-    return {"floating": floating, "joints": list(model.names)[1:], "nq": model.nq, "nv": model.nv, "states": states}
+    limits = {}
+    for name, joint in zip(list(model.names)[1:], list(model.joints)[1:]):
+        if joint.nq == joint.nv == 1:
+            q, v = joint.idx_q, joint.idx_v
+            of = (model.lowerPositionLimit[q], model.upperPositionLimit[q], model.upperVelocityLimit[v], model.upperEffortLimit[v])
+            limits[name] = [q, v, *map(float, of)]
+    return {"floating": floating, "limits": limits, "joints": list(model.names)[1:], "nq": model.nq, "nv": model.nv, "states": states}
 
 
 root = pathlib.Path(sys.argv[1])
