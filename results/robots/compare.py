@@ -53,7 +53,9 @@ def table(rows: list[dict]) -> str:
     lines += ["", "Loaded:", "", "| file | dofs | mass matrix | nle | limits that differ | notes |", "|---|---|---|---|---|---|"]
     for r in loads:
         numbers = [f"{r[k]:.0e}" if k in r else (r.get("different") or "refused by Pinocchio") for k in ("mass", "nle")]
-        lines.append(f"| {r['file']} | {r['nv']}{' (floating base)' if r['floating'] else ''} | {numbers[0]} | {numbers[1]} | {len(r.get('unlike', [])) or ''} | {len(r['notes']) or ''} |")
+        dofs = f"{r['nv']}{' (floating base)' if r['floating'] else ''}"
+        counts = [len(r.get(k, [])) or "" for k in ("unlike", "notes")]
+        lines.append(f"| {r['file']} | {dofs} | {numbers[0]} | {numbers[1]} | {counts[0]} | {counts[1]} |")
     return "\n".join(lines) + "\n"
 
 
