@@ -42,7 +42,7 @@ def import_onnx(path: _Path, robot: _Path, recipe: _Recipe = None, output: str |
     Raises:
         ValueError: the file is no policy, names a node that is not read, or something does not fit robot or recipe.
     """
-    return Policy.from_onnx(path, output).controller(robot, _files(recipe), name)
+    return Policy.from_onnx(path, output).controller(robot, recipe, name)
 
 
 def import_torch(
@@ -123,18 +123,12 @@ def import_sb3(
     return _place(made, robot, recipe, task, name)
 
 
-def _files(recipe: _Recipe) -> Sequence[_Path]:
-    if recipe is None:
-        return []
-    return [recipe] if isinstance(recipe, str | os.PathLike) else recipe
-
-
 def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: str | None, name: str) -> Controller:
     if task is not None and robot is None:
         return policy.in_task(task)
     if robot is None or task is not None:
         raise ValueError("give either task=, or robot= and recipe=")
-    return policy.controller(robot, _files(recipe), name)
+    return policy.controller(robot, recipe, name)
 
 
 def _policy(layers: list[_Layer], mean: Any, std: Any, clip: float, output_clip: tuple[float, float]) -> Policy:

@@ -14,6 +14,13 @@ use crate::arrays::{array, matrix, vector};
 use crate::controller::Controller;
 use crate::errors;
 
+/// One recipe file or several.
+#[derive(FromPyObject)]
+enum Recipes {
+    One(PathBuf),
+    Several(Vec<PathBuf>),
+}
+
 /// The networks of a policy made elsewhere: `clip(net(clip((obs - mean) / std)))`.
 #[pyclass(module = "nearl._core", frozen)]
 pub(crate) struct Policy {
@@ -91,16 +98,21 @@ impl Policy {
         Ok(array(py, &y))
     }
 
-    /// The controller of the policy on a robot; `recipes` are files, TOML or unitree's
-    /// `deploy.yaml`, that say what it sees and what its outputs mean; a later one comes before those before it.
-    #[pyo3(signature = (robot, recipes=Vec::new(), name="policy"))]
+    /// The controller of the policy on a robot; `recipe` is a file, TOML or unitree's `deploy.yaml`, that says what it sees and what its
+    /// outputs mean, or several, of which a later one comes before those before it.
+    #[pyo3(signature = (robot, recipe=None, name="policy"))]
     fn controller(
         &self,
         py: Python<'_>,
         robot: PathBuf,
-        recipes: Vec<PathBuf>,
+        recipe: Option<Recipes>,
         name: &str,
     ) -> PyResult<Controller> {
+        let recipes = match recipe {
+            None => Vec::new(),
+            Some(Recipes::One(file)) => vec![file],
+            Some(Recipes::Several(files)) => files,
+        };
         let setting = Setting { name, robot: &robot, recipes: &recipes };
         let made = py.detach(|| snapshot(&self.network, &setting)).map_err(errors::value)?;
         Controller::new(&made)
