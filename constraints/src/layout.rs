@@ -193,7 +193,8 @@ fn one_dof<'m>(
     let found = model.joint(joint).map_err(|e| refuse(e.to_string()))?;
     if found.nq != 1 || found.nv != 1 {
         return Err(refuse(format!(
-            "joint '{joint}' has {} position and {} velocity entries; only joints with one of each can be projected",
+            "joint '{joint}' has {} position and {} velocity entries; only joints with one of each can be projected: make a continuous joint of a \
+             URDF a revolute one with lower and upper, and do not name joints of more freedom",
             found.nq, found.nv
         )));
     }

@@ -1,5 +1,8 @@
 """Policies made elsewhere give what onnxruntime gives, and what is no policy is refused by name."""
 
+import json
+import os
+import signal
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -212,6 +215,91 @@ def test_the_recipe_is_computed_from_the_state(tmp_path) -> None:
         np.testing.assert_allclose(action, np.clip(want, [-35, -13, -2.6], [35, 13, 2.6]), atol=1e-5)
 
 
+MOTORS = """<mujoco><option timestep="0.002"/><worldbody>
+  <body><joint name="rail" type="slide" axis="1 0 0" range="-1 1" limited="true"/><geom size=".1" mass="3"/>
+  <body><joint name="shoulder" axis="0 1 0" range="-1.5 1.5" limited="true"/><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03" mass="1.5"/>
+  <body pos="0 0 -.4"><joint name="elbow" axis="0 1 0" range="-2 2" limited="true"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".03" mass="1"/>
+  </body></body></body></worldbody><actuator>
+  <motor joint="elbow" gear="-20" ctrlrange="-1 1"/><motor joint="rail" gear="150" ctrlrange="-1 1"/><motor joint="shoulder" ctrlrange="-50 50"/>
+</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("guard", ["false", "true"])
+def test_commands_in_newtons_go_through_gear_and_order_of_the_motors(tmp_path, guard) -> None:
+    """Motors in another order than the joints, which is another than the policy's: MuJoCo's joint forces are the commands asked for."""
+    import mujoco
+
+    (tmp_path / "robot.xml").write_text(MOTORS)
+    (tmp_path / "recipe.toml").write_text(
+        "[time]\ndt = 0.002\n[policy]\njoints = ['shoulder', 'elbow', 'rail']\naction = { scale = [40.0, 15.0, 100.0] }\n"
+        "observation = [{ term = 'joint_pos' }]\n"
+        f"[constraints]\nguard = {guard}\nvelocity = {{ limit = 5.0 }}\nacceleration = {{ limit = 1000.0 }}\ntorque = {{ scale = 1.0 }}\n"
+    )
+    asked = np.array([0.5, -0.4, 0.3])
+    policy = nearl.Policy.from_layers([(np.zeros((3, 3)), asked, "identity")], np.zeros(3), np.ones(3), (-np.inf, np.inf), (-1.0, 1.0))
+    controller = policy.controller(tmp_path / "robot.xml", tmp_path / "recipe.toml", "robot")
+    q, v = np.array([0.1, 0.2, -0.3]), np.array([0.05, -0.1, 0.2])
+    action, _ = controller.update(q, v, np.concatenate([q, v]))
+    np.testing.assert_allclose(action, [15.0 * -0.4 / -20.0, 100.0 * 0.3 / 150.0, 40.0 * 0.5], rtol=1e-6)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, action
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.qfrc_actuator, [100.0 * 0.3, 40.0 * 0.5, 15.0 * -0.4], rtol=1e-6)
+    # What the motors cannot give is cut to what they can.
+    policy = nearl.Policy.from_layers([(np.zeros((3, 3)), 1e3 * asked, "identity")], np.zeros(3), np.ones(3), (-np.inf, np.inf), (-9.0, 9.0))
+    controller = policy.controller(tmp_path / "robot.xml", tmp_path / "recipe.toml", "robot")
+    data.ctrl[:], _ = controller.update(q, v, np.concatenate([q, v]))
+    assert np.all(np.abs(data.ctrl) <= [1.0, 1.0, 50.0])
+
+
+def arm_of_drives(tmp_path, command: str, robot: str = "planar.urdf", dt: float = 0.002) -> nearl.Controller:
+    """A policy that swings its targets from end to end, guarded."""
+    (tmp_path / "recipe.toml").write_text(
+        f"[time]\ndt = {dt}\nsim_dt = 0.002\npolicy_every = 20\n[command]\n{command}\n[policy]\njoints = ['joint2', 'joint0', 'joint1']\n"
+        "pose = [0.3, 0.1, 0.2]\nobservation = [{ term = 'joint_pos' }, { term = 'joint_vel' }, { term = 'phase', period = 0.7 }]\n[constraints]\n"
+        "guard = true\nposition = { margin = 0.02 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 15.0 }\ntorque = { scale = 1.0 }\n"
+    )
+    layers = [(3.0 * RNG.normal(size=(3, 8)), RNG.normal(size=3), "tanh"), (3.0 * np.eye(3), np.zeros(3), "identity")]
+    policy = nearl.Policy.from_layers(layers, np.zeros(8), np.ones(8), (-np.inf, np.inf), (-3.0, 3.0))
+    return policy.controller(tmp_path / robot, tmp_path / "recipe.toml", "arm")
+
+
+PD = "interface = 'pd'\nstiffness = { joint0 = 80.0, joint1 = 40.0, joint2 = 10.0 }\ndamping = { joint0 = 4.0, joint1 = 2.0, joint2 = 0.3 }"
+
+
+def test_joint_targets_of_a_urdf_move_its_drives_in_a_plant(tmp_path) -> None:
+    """Without a reward or a scene a plant has the drives of [command] all the same, and the limits hold in MuJoCo."""
+    planar(tmp_path)
+    arm_of_drives(tmp_path, PD).save(tmp_path / "arm.safetensors")
+    name = f"drives{os.getpid()}"
+    plant = [NEARL, "plant", tmp_path / "arm.safetensors", "--name", name, "--lockstep", "--seconds", "60", "--endless", "--json"]
+    with subprocess.Popen(plant, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as robot:
+        run = [NEARL, "run", tmp_path / "arm.safetensors", "--plant", name, "--seconds", "4", "--json"]
+        loop = subprocess.run(run, capture_output=True, text=True, check=False)
+        robot.send_signal(signal.SIGINT)
+        said, _ = robot.communicate()
+    assert loop.returncode == 0, loop.stderr
+    found = json.loads(said.splitlines()[-1])
+    assert found["report"]["ticks"] >= 2000 and not any(found["violations"].values()), found
+    assert json.loads(loop.stdout)["counters"]["raw_violations"] > 500
+
+
+def test_a_simulation_without_the_drives_that_are_commanded_is_refused(tmp_path) -> None:
+    def refused(controller: nearl.Controller, said: str) -> None:
+        controller.save(tmp_path / "arm.safetensors")
+        done = subprocess.run([NEARL, "plant", tmp_path / "arm.safetensors", "--name", "nobody"], capture_output=True, text=True, check=False)
+        assert done.returncode != 0 and said in done.stderr, done.stderr
+
+    planar(tmp_path)
+    refused(arm_of_drives(tmp_path, "interface = 'position'"), "joint 'joint0' is sent 'position' commands, and the simulated robot has no such drive")
+    joints = "".join(f"<body><joint name='joint{i}' axis='0 1 0' range='-2 2' limited='true'/><geom size='.1' mass='1'/>" for i in range(3))
+    drives = "".join(f"<position joint='joint{i}' kp='40' kv='2' forcerange='-20 20'/>" for i in range(3))
+    (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{joints}</body></body></body></worldbody><actuator>{drives}</actuator></mujoco>")
+    gains = "interface = 'pd'\nstiffness = 40.0\ndamping = 3.0"
+    refused(arm_of_drives(tmp_path, gains, "arm.xml"), "has stiffness 40 and damping 3 here, and the simulated robot's has 40 and 2")
+
+
 def test_a_recipe_that_does_not_fit_is_refused_by_name(tmp_path) -> None:
     files = planar(tmp_path)
     path = Net(14).gemm(14, 3).save(tmp_path / "policy.onnx", 3)
@@ -227,6 +315,8 @@ def test_a_recipe_that_does_not_fit_is_refused_by_name(tmp_path) -> None:
     refused((", history = 2", ""), r"has 11 entries \(joint_pos 3, joint_vel 3, last_action 3, command 2\), but the policy's input 'obs' has 14")
     refused(("dt = 0.01", ""), "the control period is not known")
     refused(("scale = 0.1", "scale = [1, 2]"), r"term 2 \('joint_vel'\): its scale has 2 numbers for 3 entries")
+    files["robot"].write_text(planar_urdf().replace('name="joint0" type="revolute"', 'name="joint0" type="continuous"'))
+    refused(("", ""), "joint 'joint0' has 2 position and 1 velocity entries.*make a continuous joint of a URDF a revolute one with lower and upper")
     files["recipe"] = None
     with pytest.raises(ValueError, match="does not say what the 14 entries of its input 'obs' are; give them with --recipe"):
         nearl.import_onnx(path, **files)

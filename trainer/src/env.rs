@@ -10,6 +10,7 @@
 pub mod bench;
 
 mod ant;
+mod commands;
 mod half_cheetah;
 mod hopper;
 mod meter;
@@ -343,7 +344,7 @@ fn entry(name: &str) -> Result<&'static Registered, EnvError> {
 pub fn of_task(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvError> {
     let task = &manifest.task;
     if user::is_own(task) {
-        return user::build(manifest, origin);
+        return of_user(manifest, origin);
     }
     let own = [
         ("termination", !task.termination.is_empty()),
@@ -361,6 +362,7 @@ pub fn of_task(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvErr
     };
     check_time(task, env.spec(), origin)?;
     check_robot(manifest, env.as_ref(), origin)?;
+    commands::check(manifest, env.as_ref(), origin)?;
     user::with_cost(env, task, origin)
 }
 
@@ -369,7 +371,13 @@ pub fn of_task(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvErr
 /// # Errors
 /// As [`of_task`].
 pub fn of_plant(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvError> {
-    if is_known(&manifest.task) { of_task(manifest, origin) } else { user::build(manifest, origin) }
+    if is_known(&manifest.task) { of_task(manifest, origin) } else { of_user(manifest, origin) }
+}
+
+fn of_user(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvError> {
+    let env = user::build(manifest, origin)?;
+    commands::check(manifest, env.as_ref(), origin)?;
+    Ok(env)
 }
 
 /// Whether a task file describes or names an environment: by `[reward]`, by `env`, or by the name of a native one.

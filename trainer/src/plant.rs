@@ -129,6 +129,12 @@ impl MujocoPlant {
         self.env.spec().dt
     }
 
+    /// Physics step \[s\] that a task has to state for its limits to be exact here; none where the integrator is no Euler.
+    pub fn sim_dt(&self) -> Option<f64> {
+        let spec = self.env.spec();
+        spec.semi_implicit_euler.then_some(spec.sim_dt)
+    }
+
     /// The meter of the simulator's own state.
     pub fn meter(&self) -> &Meter {
         &self.meter

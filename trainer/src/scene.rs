@@ -14,6 +14,7 @@ use nearl_runtime::snapshot::{ModelFormat, Simulation};
 use nearl_runtime::task::{Task, suggest};
 use serde::Deserialize;
 
+use crate::env;
 use crate::mj::{Foot, PdDrive, Scene};
 use crate::robot::SceneOptions;
 
@@ -62,17 +63,18 @@ struct Feet {
     position: [f64; 3],
 }
 
-/// What the task adds to the robot file `file`; nothing where it describes no environment of its own.
+/// What the task adds to the robot file `file`; nothing where a native environment simulates it.
 ///
 /// # Errors
 /// [`Mistake`] with the key that is wrong.
 pub fn of(task: &Task, file: &Simulation) -> Result<SceneOptions, Mistake> {
-    if task.reward.is_empty() {
+    if task.reward.is_empty() && env::is_known(task) {
         return match task.scene.is_empty() {
             true => Ok(SceneOptions::default()),
-            false => {
-                Err(mistake("scene", "only a task with its own [reward] has it; add [reward] or take it out"))
-            }
+            false => Err(mistake(
+                "scene",
+                "the native environments bring theirs; add a [reward] of your own or take it out",
+            )),
         };
     }
     let section: Section = serde_path_to_error::deserialize(task.scene.clone())

@@ -112,7 +112,7 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
     };
     let (simulation, is_bundled) = robot_file(&parsed, path, bundled.is_some())?;
     let floats = parsed.model.free_flyer;
-    let described = match parsed.reward.is_empty() {
+    let described = match parsed.reward.is_empty() && parsed.scene.is_empty() {
         true => robot::describe(&simulation, floats),
         false => {
             let add = scene::of(&parsed, &simulation).map_err(|m| EnvError::Task {

@@ -209,7 +209,7 @@ impl std::fmt::Display for PolicySection {
         write!(f, "sees {seen}; commands {} = ", self.joints.join(", "))?;
         match &self.action.offset {
             None if self.pose.is_empty() => {}
-            None => write!(f, "pose + ")?,
+            None => write!(f, "pose {:?} + ", self.pose)?,
             Some(offset) => write!(f, "{offset} + ")?,
         }
         write!(f, "{} x output", self.action.scale)?;
@@ -225,6 +225,18 @@ impl std::fmt::Display for Term {
         write!(f, "{}", self.term.name())?;
         if !self.term.unit().is_empty() {
             write!(f, " [{}]", self.term.unit())?;
+        }
+        if let Some(joints) = &self.joints {
+            write!(f, " of {}", joints.join(", "))?;
+        }
+        if let Some(period) = self.period {
+            write!(f, " of {period} s")?;
+        }
+        if !self.shifts.is_empty() {
+            write!(f, ", shifts {:?} cycles", self.shifts)?;
+        }
+        if let Some(point) = self.point {
+            write!(f, " of point {point:?} m")?;
         }
         if !self.entries.is_empty() && self.value.is_empty() {
             write!(f, " from {}", self.entries.join(", "))?;

@@ -9,7 +9,8 @@ use nearl_runtime::cli::{Ended, LOOP_GONE, MEMORY_TORN};
 use nearl_runtime::link::{METERS, PlantLink, PlantReport, PlantRunner, PlantSettings, RobotName};
 use nearl_runtime::rt::{FaultPlan, FaultyPlant, Reason, Stop};
 use nearl_runtime::snapshot::in_run;
-use nearl_runtime::{Manifest, Snapshot};
+use nearl_runtime::task::IdmKind;
+use nearl_runtime::{Manifest, PolicyKind, Snapshot};
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
@@ -56,6 +57,15 @@ impl PlantCommand {
         let plan = self.faults.as_deref().map(FaultPlan::load).transpose()?.unwrap_or_default();
         let plant = MujocoPlant::new(&manifest, self.seed, !self.endless)?;
         let dt = plant.dt();
+        let time = &manifest.task.time;
+        let analytic = manifest.policy != PolicyKind::Direct && manifest.task.idm.kind == IdmKind::Pinocchio;
+        let counts = time.sim_dt == 0.0 && (manifest.guards() || analytic);
+        if let Some(step) = plant.sim_dt().filter(|_| counts) {
+            eprintln!(
+                "nearl: the task counts on forces without steps (time.sim_dt is 0), and this simulation has steps of {step} s: limits hold but for the \
+                 difference; with time.sim_dt = {step} they are exact here"
+            );
+        }
         let name = RobotName::new(&self.name)?;
         let link = PlantLink::open(&name, &plant.robot(self.lockstep))?;
         let mut settings =

@@ -2,9 +2,11 @@
 
 use super::{ImportError, ImportedNetwork};
 use super::{deploy, metadata};
-use crate::robot::{describe, folder_of};
+use crate::robot::{describe, describe_simulated, folder_of};
+use crate::scene;
 use nearl_runtime::constraints::description::JointKind;
 use nearl_runtime::constraints::{Drive, Model, RobotDescription, StateLayout, read_task_text, read_text};
+use nearl_runtime::motors::Motors;
 use nearl_runtime::net::Activation;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::recipe::{Numbers, Observer, PolicySection};
@@ -47,7 +49,15 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
     let simulation = simulation(setting.robot)?;
     complete(&mut table, setting, simulation.format);
     let free = table.get("model").and_then(|m| m.get("free_flyer")).and_then(Value::as_bool).unwrap_or(false);
-    let robot = described(&simulation, free, setting.robot)?;
+    let robot = if table.contains_key("scene") {
+        let task =
+            Task::parse(&said_by, &table.to_string(), &[]).map_err(|e| ImportError::Recipe(e.to_string()))?;
+        let add = scene::of(&task, &simulation)
+            .map_err(|m| recipe(&said_by, &format!("[{}] {}", m.key, m.reason)))?;
+        describe_simulated(&simulation, free, &add).map_err(|e| unusable(setting.robot, &e))?
+    } else {
+        described(&simulation, free, setting.robot)?
+    };
     let unusable = |e: &dyn std::fmt::Display| unusable(setting.robot, e);
     let model = Model::from_description(robot.clone()).map_err(|e| unusable(&e))?;
     state(&mut table, &model, &said_by)?;
@@ -279,7 +289,7 @@ fn check_widths(
     ))
 }
 
-/// Lowest and highest command of each controllable joint: the motor's for a force, what the policy can ask for otherwise.
+/// The range of what each motor is sent, in the motors' order: the motor's own for a force, what the policy can ask for otherwise.
 fn ranges(
     section: &PolicySection,
     task: &Task,
@@ -299,15 +309,16 @@ fn ranges(
         }
     };
     let drives = task.command.drives(model, layout.controllable())?;
-    let (mut lower, mut upper) = (Vec::new(), Vec::new());
-    for &dof in layout.controllable() {
+    let motors = Motors::new(model, layout.controllable(), &drives)?;
+    let mut sent = vec![(0.0, 0.0); layout.controllable().len()];
+    for (k, &dof) in layout.controllable().iter().enumerate() {
         let joint = model.dof_name(dof);
         let at = section.joints.iter().position(|j| *j == joint);
         let i =
             at.ok_or_else(|| format!("the policy gives no command for the controllable joint '{joint}'"))?;
         let effort = model.effort_limit()[dof];
         let ends = match drives[dof] {
-            Drive::Effort if effort.is_finite() => [-effort, effort],
+            Drive::Effort if effort.is_finite() => [-effort, effort].map(|torque| motors.action(k, torque)),
             Drive::Effort => {
                 return Err(format!(
                     "the robot file does not say how strong the motor of joint '{joint}' is; give its effort limit"
@@ -315,10 +326,9 @@ fn ranges(
             }
             _ => clip[i].map(|x| offset[i] + scale[i] * x),
         };
-        lower.push(ends[0].min(ends[1]));
-        upper.push(ends[0].max(ends[1]));
+        sent[motors.place(k)] = (ends[0].min(ends[1]), ends[0].max(ends[1]));
     }
-    Ok((lower, upper))
+    Ok(sent.into_iter().unzip())
 }
 
 fn networks(network: &ImportedNetwork, n_state: usize) -> Networks {

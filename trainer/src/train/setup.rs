@@ -9,7 +9,7 @@ use crate::learn::{
 };
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
-use nearl_runtime::constraints::{Consistency, Drive, Guard};
+use nearl_runtime::constraints::{Consistency, Guard};
 use nearl_runtime::controller::{Parts, seen_entries};
 use nearl_runtime::motors::Motors;
 use nearl_runtime::recipe::Observer;
@@ -149,30 +149,8 @@ fn check_motors(manifest: &Manifest, env: &dyn Env) -> Result<(), TrainError> {
             driven.join(", ")
         )));
     }
-    let motors = Motors::new(&model, controllable, &drives)
+    Motors::new(&model, controllable, &drives)
         .map_err(|reason| TrainError::Settings(format!("[idm] of '{task}': {reason}")))?;
-    let commanded = controllable.iter().enumerate().filter(|(_, dof)| drives[**dof] != Drive::Effort);
-    for (k, &dof) in commanded {
-        let a = &spec.actuators[motors.place(k)];
-        let gains = env.sim().model().gains(motors.place(k)).filter(|_| a.gear == 1.0);
-        let fits = match (drives[dof], gains) {
-            (Drive::Pd { stiffness, damping }, Some([gain, by_q, by_v])) => {
-                (gain, by_q, by_v) == (stiffness, -stiffness, -damping)
-            }
-            (Drive::Position, Some([gain, by_q, _])) => gain > 0.0 && gain == -by_q,
-            (Drive::Velocity, Some([gain, by_q, by_v])) => gain > 0.0 && by_q == 0.0 && gain == -by_v,
-            _ => false,
-        };
-        if !fits {
-            return Err(TrainError::Settings(format!(
-                "[command] of '{task}' sends '{}' commands to joint '{}', but actuator '{}' is none for them; write <position kp=\"K\" kv=\"D\"> \
-                 with the stiffness and damping of the task file (<velocity kv=\"D\"> for 'velocity'), or another interface",
-                drives[dof].name(),
-                a.joint,
-                a.name
-            )));
-        }
-    }
     Ok(())
 }
 

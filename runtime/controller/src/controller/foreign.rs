@@ -1,7 +1,7 @@
-//! Around a policy made elsewhere: computes its observation from the state, and turns its outputs into commands.
+//! Around a policy made elsewhere: computes its observation from the state, and turns its outputs into what the motors are sent.
 
-use super::State;
 use super::parts::unusable;
+use super::{Parts, State};
 use crate::normaliser::Normaliser;
 use crate::recipe::{ActionMap, Observer};
 use crate::snapshot::{Manifest, PolicyKind, SnapshotError};
@@ -25,7 +25,9 @@ impl Foreign {
             ));
         }
         let observer = Observer::new(policy, model, layout).map_err(|e| unusable(&e))?;
-        let map = ActionMap::new(policy, model, layout).map_err(|e| unusable(&e))?;
+        let drives = Parts::drives(m, model, layout.controllable())?;
+        let motors = Parts::motors(model, layout.controllable(), &drives)?;
+        let map = ActionMap::new(policy, model, layout, motors).map_err(|e| unusable(&e))?;
         Ok(Self { observer, map: Some(map) })
     }
 
@@ -55,7 +57,7 @@ impl Foreign {
         self.map.is_some()
     }
 
-    /// Turns the outputs of a policy of actions (n_act) into commands.
+    /// Turns the outputs of a policy of actions (n_act) into what the motors are sent.
     pub(super) fn command(&mut self, outputs: &mut [f32]) {
         let Some(map) = &mut self.map else { return };
         map.clip(outputs);

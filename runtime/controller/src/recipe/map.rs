@@ -1,23 +1,32 @@
-//! From a policy's outputs to the commands of the joints.
+//! From a policy's outputs to what the motors are sent.
 
 use super::PolicySection;
 use super::source::one_dof;
+use crate::motors::Motors;
 use nearl_constraints::{Model, StateLayout};
 
-/// `command_j = offset_i + scale_i clip(output_i)`, where joint `j` of the controller is joint `i` of the policy.
+/// `command_j = offset_i + scale_i clip(output_i)`, where joint `j` of the controller is joint `i` of the policy, and what its motor is sent for that
+/// command, in the order of the motors.
 #[derive(Clone, Debug)]
 pub struct ActionMap {
+    /// By joint of the policy: which controllable joint it is.
     to: Vec<usize>,
+    motors: Motors,
     scale: Vec<f32>,
     offset: Vec<f32>,
     clip: Vec<[f32; 2]>,
-    commands: Vec<f32>,
+    sent: Vec<f32>,
 }
 
 impl ActionMap {
     /// # Errors
     /// One sentence naming the joint or the key.
-    pub fn new(policy: &PolicySection, model: &Model, layout: &StateLayout) -> Result<Self, String> {
+    pub fn new(
+        policy: &PolicySection,
+        model: &Model,
+        layout: &StateLayout,
+        motors: Motors,
+    ) -> Result<Self, String> {
         let n = policy.joints.len();
         if !policy.pose.is_empty() && policy.pose.len() != n {
             return Err(format!(
@@ -60,9 +69,10 @@ impl ActionMap {
         Ok(Self {
             scale: f32s(a.scale.spread("policy.action.scale", n)?),
             offset: f32s(offset),
-            commands: vec![0.0; n],
+            sent: vec![0.0; n],
             clip,
             to,
+            motors,
         })
     }
 
@@ -83,11 +93,12 @@ impl ActionMap {
         }
     }
 
-    /// Replaces clipped outputs (n_act) by commands in the controller's order.
+    /// Replaces clipped outputs (n_act) by what the motors are sent, in their order.
     pub fn command(&mut self, outputs: &mut [f32]) {
         for (i, &k) in self.to.iter().enumerate() {
-            self.commands[k] = self.scale[i].mul_add(outputs[i], self.offset[i]);
+            let command = self.scale[i].mul_add(outputs[i], self.offset[i]);
+            self.sent[self.motors.place(k)] = self.motors.action(k, f64::from(command)) as f32;
         }
-        outputs.copy_from_slice(&self.commands);
+        outputs.copy_from_slice(&self.sent);
     }
 }
