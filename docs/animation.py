@@ -27,7 +27,7 @@ def fly(projected: bool, projector: nearl.Projector, rest: np.ndarray) -> tuple[
         v_hat = 12.0 * (goal - q)
         q_hat = q + DT * v_hat
         target = projector.project(q, v, q_proposal=q_hat, v_proposal=v_hat)
-        broken += sum((target.violations if projected else target.raw_violations).values())
+        broken += sum((target.target_violations if projected else target.raw_violations).values())
         q, v = (target.q, target.v) if projected else (q_hat, v_hat)
         if tick % EVERY == 0:
             poses.append(q.copy())

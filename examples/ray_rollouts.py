@@ -32,7 +32,7 @@ class Worker:
         rows: dict[str, list] = {"observations": [], "actions": [], "rewards": []}
         while not over and len(rows["rewards"]) < self.env.max_episode_steps:
             action, ledger = self.controller.update(*self.env.state(), obs)
-            broken += sum(ledger.violations.values())
+            broken += sum(ledger.target_violations.values())
             rows["observations"].append(obs)
             rows["actions"].append(action)
             obs, reward, _, over, _ = self.env.step(action)

@@ -186,13 +186,13 @@ fn run(scene: &Scene, what: What, (dt, sub_steps): (f64, u32), ticks: usize, see
         let beyond = (0..n).any(|i| target.q[i] > high[i] + 1e-9 || target.q[i] < low[i] - 1e-9);
         let harder = (0..n).any(|i| (target.v[i] - v[i]).abs() > A * dt + 1e-9);
         let wrong =
-            target.ledger.violations.total() > 0 || (named && !expected) || faster || beyond || harder;
+            target.ledger.target_violations.total() > 0 || (named && !expected) || faster || beyond || harder;
         if wrong {
             let l = &target.ledger;
             let why = [faster, beyond, harder, named && !expected];
             eprintln!(
                 "tick {tick}: {status:?}, faster, beyond, harder, otherwise named {why:?}, {:?} {:?}",
-                l.violations, l.outside
+                l.target_violations, l.outside
             );
         }
         seen.outside += usize::from(wrong);

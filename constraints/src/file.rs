@@ -1,4 +1,4 @@
-//! Reading files that somebody else may have prepared.
+//! Reads files whose size and kind are not to be trusted.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Error, Read, Result};

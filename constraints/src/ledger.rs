@@ -212,12 +212,17 @@ pub struct Ledger {
     /// What the raw proposal would have violated.
     pub raw_violations: Counts,
     /// What the target violates, by the independent checker; zero unless braking or recovering.
-    pub violations: Counts,
+    pub target_violations: Counts,
     /// What the measured state, or the brake in force where limits were moved, is beyond already, as in [`ActiveRow::row`]: dofs, then hard coupled rows.
     pub outside: Vec<usize>,
 }
 
 impl Ledger {
+    /// Whether the tick began within the limits and its target breaks one: what `target_violations` of many ticks counts.
+    pub fn target_breaks(&self) -> bool {
+        self.target_violations.total() > 0 && self.outside.is_empty()
+    }
+
     /// Memory for `rows` active rows.
     pub(crate) fn new(rows: usize) -> Ledger {
         Ledger {
@@ -230,7 +235,7 @@ impl Ledger {
             residual: 0.0,
             duration_ns: 0,
             raw_violations: Counts::default(),
-            violations: Counts::default(),
+            target_violations: Counts::default(),
             outside: Vec::with_capacity(rows),
         }
     }

@@ -36,7 +36,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     complete(&mut manifest)?;
     let mut training =
         Training::new(&Request { manifest, algo: "pid2-il".parse()?, steps: 40_000, seed: 0, threads: 2 })?;
-    while !training.is_done() && training.step()?.is_some() {}
+    while !training.is_done() && training.try_iterate()?.is_some() {}
 
     let mut controller = Controller::new(training.snapshot())?;
     let (mut state, noise, mut out) = (controller.state(), controller.noise(), controller.output());

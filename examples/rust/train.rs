@@ -9,7 +9,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     complete(&mut manifest)?;
     let mut training =
         Training::new(&Request { manifest, algo: "pid2-ib".parse()?, steps: 16_384, seed: 0, threads: 2 })?;
-    while let Some(progress) = training.step()? {
+    while let Some(progress) = training.try_iterate()? {
         println!("{:6} steps, return {:.1}", progress.steps, progress.return_mean);
         if training.is_done() {
             break;

@@ -12,12 +12,6 @@ from nearl import _core
 Floats = NDArray[np.float64]
 PerJoint = float | Mapping[str, float]
 
-ROUNDS = 4  # actions tried by linearised dynamics
-DRAWS = 64  # actions drawn where these do not do
-STEP = 0.01  # of the differences, as a share of an action's range
-INSIDE = 1e-3  # how far inside the limits linearised dynamics aim, as a share of a limit's size
-ROUNDING = 1e-9
-
 
 class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Keeps the joints of a ``MujocoEnv`` within position and velocity limits, as far as any single action can.
@@ -65,15 +59,13 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._mujoco, self._model, self._frame_skip = mujoco, inner.model, inner.frame_skip
         self._ahead = mujoco.MjData(self._model)
         self._ctrl = ctrl or (lambda action: action)
-        self._seed = seed
         low, high = env.action_space.low.astype(float), env.action_space.high.astype(float)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise ValueError("the action space is unbounded; give the environment actuators with a ctrlrange")
-        self._middle, self._half = (low + high) / 2, np.maximum((high - low) / 2, 1e-9)
-        self._q, self._v, self._lower, self._upper = self._limits(constraints)
-        size = self._upper - self._lower
-        self._size = np.where(np.isfinite(size), np.maximum(size, 1e-6), 1.0)
-        self._size[len(self._q) :] /= 2  # of a velocity, the limit
+        positions, velocities = self._limits(constraints)
+        self._q, self._v = list(positions), list(velocities)
+        actions = list(zip(low.tolist(), high.tolist()))
+        self._search = _core.ActionSearch(list(positions.values()), list(velocities.values()), actions, seed)
 
     def step(self, action: ArrayLike) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """A step under ``action``, or under the nearest one found that ends within the limits."""
@@ -84,19 +76,12 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
     def safe(self, action: ArrayLike) -> tuple[NDArray[Any], str]:
         """The action that a step would use and what was found, ``"kept"``, ``"replaced"`` or ``"outside"``; nothing is stepped."""
         given = np.asarray(action)
-        asked = np.clip((given.astype(float) - self._middle) / self._half, -1.0, 1.0)
-        at = self._foresee(given.astype(float))
-        first = self._excess(at)
-        if first <= 0.0:
-            return given, "kept"
-        best, least = self._by_slopes(asked, at, first)
-        if least > 0.0:
-            best, least = self._by_draws(asked, best, least)
-        if least >= first or (self._keeps and least > 0.0):
-            return given, "outside"
+        verdict, found = self._search.find(given.astype(float).tolist(), self._foresee)
+        if verdict == "kept" or (verdict == "outside" and (self._keeps or np.array_equal(found, given))):
+            return given, verdict
         # What the space's own type makes of it is what the environment gets.
-        safe = (self._middle + self._half * best).astype(self.env.action_space.dtype)
-        inside = self._excess(self._foresee(safe.astype(float))) <= 0.0
+        safe = found.astype(self.env.action_space.dtype)
+        inside = self._search.excess(self._foresee(safe.astype(float)).tolist()) <= 0.0
         if self._keeps and not inside:
             return given, "outside"
         return safe, "replaced" if inside else "outside"
@@ -105,39 +90,7 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
     def outside(self) -> bool:
         """Whether the state is outside the limits now."""
         data = self.env.unwrapped.data  # type: ignore[attr-defined]
-        return self._excess(np.concatenate([data.qpos[self._q], data.qvel[self._v]])) > 0.0
-
-    def _by_slopes(self, asked: Floats, at: Floats, least: float) -> tuple[Floats, float]:
-        best = trial = asked
-        for _ in range(ROUNDS):
-            slope = np.empty((len(at), len(asked)))
-            for k in range(len(asked)):
-                step = -STEP if trial[k] > 0 else STEP
-                beside = trial.copy()
-                beside[k] += step
-                slope[:, k] = (self._foresee(self._middle + self._half * beside) - at) / step
-            inside = INSIDE * self._size
-            trial = _core.nearest_action(asked, trial, slope, self._lower + inside - at, self._upper - inside - at)
-            at = self._foresee(self._middle + self._half * trial)
-            excess = self._excess(at)
-            if excess < least:
-                best, least = trial, excess
-            if excess <= 0.0:
-                break
-        return best, least
-
-    def _by_draws(self, asked: Floats, around: Floats, least: float) -> tuple[Floats, float]:
-        rng, best, way = np.random.default_rng(self._seed), around, np.inf
-        for draw in range(DRAWS):
-            r = rng.uniform(-1.0, 1.0, len(asked))
-            u = (np.clip(around + 0.5 * r**3, -1.0, 1.0), r, np.clip(around + 0.5 * r**3, -1.0, 1.0), np.sign(r))[draw % 4]
-            excess = self._excess(self._foresee(self._middle + self._half * u))
-            distance = float(((u - asked) ** 2).sum())
-            if (excess <= 0.0 and distance < way) or (np.isinf(way) and excess < least):
-                best, least, way = u, min(excess, least), distance if excess <= 0.0 else way
-            if np.isfinite(way) and draw >= DRAWS // 4:
-                break
-        return best, least
+        return self._search.excess([*data.qpos[self._q], *data.qvel[self._v]]) > 0.0
 
     def _foresee(self, action: Floats) -> Floats:
         """Positions and velocities that have limits, after a step under ``action``."""
@@ -147,11 +100,7 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
         mujoco.mj_step(self._model, ahead, nstep=self._frame_skip)
         return np.concatenate([ahead.qpos[self._q], ahead.qvel[self._v]])
 
-    def _excess(self, at: Floats) -> float:
-        beyond = np.maximum(self._lower - at, at - self._upper)
-        return float(np.where(beyond > ROUNDING, beyond / self._size, 0.0).sum())
-
-    def _limits(self, constraints: Mapping[str, Mapping[str, PerJoint]]) -> tuple[list[int], list[int], Floats, Floats]:
+    def _limits(self, constraints: Mapping[str, Mapping[str, PerJoint]]) -> tuple[dict[int, tuple[float, float]], dict[int, float]]:
         keys = {"position": "margin", "velocity": "limit"}
         for name, settings in constraints.items():
             if name not in keys:
@@ -173,11 +122,9 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
             limit = constraints["velocity"]["limit"]
             named = single if isinstance(limit, Mapping) else ranged
             v = {int(m.jnt_dofadr[named[n]]): x for n, x in _per_joint(limit, named, "velocity limit").items()}
-        lower = np.array([low for low, _ in q.values()] + [-x for x in v.values()])
-        upper = np.array([high for _, high in q.values()] + list(v.values()))
-        if (lower > upper).any():
+        if any(low > high for low, high in q.values()):
             raise ValueError("a joint has no position or velocity left within its limits; give a smaller margin")
-        return list(q), list(v), lower, upper
+        return q, v
 
 
 def _per_joint(value: PerJoint, joints: Mapping[str, int], what: str) -> dict[str, float]:

@@ -3,8 +3,6 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
-use nearl_constraints::Entry;
-use nearl_runtime::task::IdmKind;
 use nearl_runtime::{self as runtime, Noise, Output, PolicyKind, Snapshot, State};
 use nearl_trainer::run_folder;
 use numpy::PyArray1;
@@ -24,16 +22,9 @@ struct Inner {
 }
 
 impl Inner {
-    /// Fills in the joints' state from the observation; what it does not hold stays at rest.
+    /// A tick for an observation; joints that it does not hold stay at rest.
     fn act(&mut self, obs: &[f64], noise: Option<&[f64]>) -> Vec<f64> {
-        self.state.obs.copy_from_slice(obs);
-        for (entry, value) in self.controller.layout().entries().iter().zip(obs) {
-            match *entry {
-                Entry::Position { idx_q, .. } => self.state.q[idx_q] = *value,
-                Entry::Velocity { dof } => self.state.v[dof] = *value,
-                Entry::Other => {}
-            }
-        }
+        self.controller.observed(obs, &mut self.state);
         let wanted = if self.stochastic { &mut self.noise.proposal } else { &mut self.noise.action };
         wanted.fill(0.0);
         for (n, x) in wanted.iter_mut().zip(noise.into_iter().flatten()) {
@@ -49,16 +40,6 @@ impl Inner {
 fn silence(noise: &mut Noise) {
     noise.proposal.fill(0.0);
     noise.action.fill(0.0);
-}
-
-/// The first joint whose position or velocity is not observed.
-fn first_unseen(controller: &runtime::Controller) -> Option<String> {
-    let (model, entries) = (controller.model(), controller.layout().entries());
-    let seen = |dof: usize| {
-        let position = entries.iter().any(|e| matches!(e, Entry::Position { dof: d, .. } if *d == dof));
-        position && entries.contains(&Entry::Velocity { dof })
-    };
-    (0..model.nv()).find(|dof| !seen(*dof)).map(|dof| model.dof_name(dof))
 }
 
 /// State to action: propose, project, invert, as on the robot.
@@ -284,9 +265,7 @@ impl Controller {
         let manifest = &snapshot.manifest;
         let stochastic = manifest.policy == PolicyKind::Stochastic;
         let n_noise = if stochastic { noise.proposal.len() } else { noise.action.len() };
-        let analytic = manifest.task.idm.kind == IdmKind::Pinocchio && manifest.policy != PolicyKind::Direct;
-        let computes = manifest.task.policy.as_ref().is_some_and(|p| !p.observation.is_empty());
-        let unseen = if analytic || computes { first_unseen(&controller) } else { None };
+        let unseen = controller.first_unseen();
         let (task, algo, digest) = (manifest.task.name.clone(), manifest.algo.clone(), snapshot.digest());
         let inner = Mutex::new(Inner { controller, state, noise, out, stochastic });
         let snapshot = snapshot.clone();

@@ -37,7 +37,7 @@ mod _core {
     #[pymodule_export]
     use super::model::Model;
     #[pymodule_export]
-    use super::nearest::nearest_action;
+    use super::nearest::{ActionSearch, nearest_action};
     #[pymodule_export]
     use super::plant::{LoopThread, Plant};
     #[pymodule_export]

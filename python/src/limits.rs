@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nearl_constraints::limit::{Argument, LimitEntry, REGISTRY, Takes};
+use nearl_constraints::limit::{Argument, REGISTRY, RegisteredLimit, Takes};
 use nearl_constraints::{
     self as constraints, Cone, ConstraintSettings, LimitError, LimitSet, PerJoint, Rows, Soft,
 };
@@ -70,7 +70,7 @@ fn made(kind: &str, settings: &Bound<'_, PyDict>) -> PyResult<Box<dyn constraint
 }
 
 /// The section of a task file that says the same as the arguments.
-fn section(entry: &LimitEntry, settings: &Bound<'_, PyDict>) -> PyResult<Value> {
+fn section(entry: &RegisteredLimit, settings: &Bound<'_, PyDict>) -> PyResult<Value> {
     let arguments = entry.about.arguments;
     for name in settings.keys() {
         let name: String = name.extract()?;

@@ -1,11 +1,12 @@
 //! The projector: the nearest next state that every limit allows.
 
 use std::collections::BTreeMap;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use nearl_constraints::row::Previous;
 use nearl_constraints::{self as constraints, Braking, Consistency, Proposal, Settings, Solver};
+use nearl_trainer::many::{Projectors, Rows};
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -41,10 +42,8 @@ pub(crate) struct Projector {
     names: Vec<String>,
     sizes: (usize, usize),
     controllable: Vec<usize>,
-    settings: Settings,
-    limits: Vec<Box<dyn constraints::Limit>>,
-    /// One for single projections and one more for each further thread of a batch.
-    projectors: Mutex<Vec<constraints::Projector>>,
+    dt: f64,
+    projectors: Mutex<Projectors>,
 }
 
 type Problem<'py> = (
@@ -107,21 +106,14 @@ impl Projector {
         };
         let controllable = dofs(robot, controllable)?;
         let limits = limits::boxed(&limits, robot)?;
-        let first = py
-            .detach(|| constraints::Projector::new(robot, &limits, &controllable, settings.clone()))
-            .map_err(errors::value)?;
-        let (names, settings) = (first.row_names(), first.settings().clone());
+        let dofs = controllable.clone();
+        let mut projectors =
+            py.detach(|| Projectors::new(robot, limits, dofs, settings)).map_err(errors::value)?;
+        let first = projectors.first();
+        let (names, dt) = (first.row_names(), first.settings().dt);
         robot.notes().iter().chain(first.notes()).try_for_each(|note| errors::warn(py, note))?;
         let sizes = (robot.nq(), robot.nv());
-        Ok(Projector {
-            names,
-            sizes,
-            controllable,
-            settings,
-            limits,
-            projectors: Mutex::new(vec![first]),
-            model,
-        })
+        Ok(Projector { names, sizes, controllable, dt, projectors: Mutex::new(projectors), model })
     }
 
     /// The nearest next state to `(q_proposal, v_proposal)` from the state `(q, v)`.
@@ -179,9 +171,8 @@ impl Projector {
             "a batch",
             "call project(..., previous=(acceleration, torque)) row by row, or build a projector without it",
         )?;
-        let (batch, n) = self.batch_of(q, v, q_proposal, v_proposal)?;
-        let threads = threads_for(threads, n);
-        let targets = q.py().detach(|| self.batch(&batch, n, threads)).map_err(errors::value)?;
+        let (rows, _) = self.rows(q, v, q_proposal, v_proposal)?;
+        let targets = q.py().detach(|| self.lock().project(&rows, threads)).map_err(errors::value)?;
         Ok(Targets { targets, names: self.names.clone(), sizes: self.sizes })
     }
 
@@ -235,20 +226,18 @@ impl Projector {
         threads: Option<usize>,
     ) -> PyResult<Pair<'py>> {
         self.refuse_previous(q.py(), "a batch", "build a projector without it")?;
-        let (batch, n) = self.batch_of(q, v, q_proposal, v_proposal)?;
+        let (rows, n) = self.rows(q, v, q_proposal, v_proposal)?;
         let nv = self.sizes.1;
-        let cotangents = (matrix("dq", dq, n, nv)?, matrix("dv", dv, n, nv)?);
-        let threads = threads_for(threads, n);
+        let (dq, dv) = (matrix("dq", dq, n, nv)?, matrix("dv", dv, n, nv)?);
         let py = q.py();
-        let run = || self.vjp(&batch, &cotangents, n, threads);
+        let run = || self.lock().vjp(&rows, (&dq, &dv), threads);
         let (dq_proposal, dv_proposal) = py.detach(run).map_err(errors::value)?;
         Ok((array2(py, dq_proposal, nv)?, array2(py, dv_proposal, nv)?))
     }
 
     /// Switches every limit of that name on or off.
     fn set_enabled(&self, name: &str, on: bool) -> PyResult<()> {
-        let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
-        projectors.iter_mut().try_for_each(|p| p.set_enabled(name, on)).map_err(errors::value)
+        self.lock().all().iter_mut().try_for_each(|p| p.set_enabled(name, on)).map_err(errors::value)
     }
 
     /// Moves limits inside those of the build, or back towards them, for all projections to come; what is not named is as it was built. A
@@ -280,24 +269,21 @@ impl Projector {
         energy: Option<f64>,
     ) -> PyResult<()> {
         let moved = limits::moved(speed, [velocity, acceleration, lower, upper], frame, frame_speed, energy);
-        let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
-        projectors.iter_mut().try_for_each(|p| p.move_limits(&moved)).map_err(errors::value)
+        self.lock().all().iter_mut().try_for_each(|p| p.move_limits(&moved)).map_err(errors::value)
     }
 
     /// Names of the limits and whether they hold.
     #[getter]
     fn enabled<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let out = PyDict::new(py);
-        let projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
-        projectors[0].enabled().try_for_each(|(name, on)| out.set_item(name, on))?;
+        self.lock().first().enabled().try_for_each(|(name, on)| out.set_item(name, on))?;
         Ok(out)
     }
 
     /// Forces on the robot beside its motors, as generalised forces `J'f` (nv), for all projections to come: contact forces.
     fn set_external_forces(&self, forces: &Bound<'_, PyAny>) -> PyResult<()> {
         let forces = self.model.get().v("forces", forces)?;
-        let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
-        projectors.iter_mut().for_each(|p| p.set_external_forces(&forces));
+        self.lock().all().iter_mut().for_each(|p| p.set_external_forces(&forces));
         Ok(())
     }
 
@@ -316,7 +302,7 @@ impl Projector {
     /// Control period [s].
     #[getter]
     fn dt(&self) -> f64 {
-        self.settings.dt
+        self.dt
     }
 
     /// The robot.
@@ -328,9 +314,9 @@ impl Projector {
     fn __repr__(&self) -> String {
         format!(
             "Projector(dt={}, controllable={:?}, limits={:?})",
-            self.settings.dt,
+            self.dt,
             self.controllable(),
-            self.limits
+            self.lock().limits()
         )
     }
 }
@@ -371,140 +357,40 @@ impl Projector {
         f: impl FnOnce(&mut constraints::Projector, &constraints::Model) -> R + Send,
     ) -> R {
         let model = &self.model.get().model;
-        py.detach(|| f(&mut self.projectors.lock().unwrap_or_else(PoisonError::into_inner)[0], model))
+        py.detach(|| f(self.lock().first(), model))
     }
 
-    fn batch(
-        &self,
-        batch: &Batch,
-        n: usize,
-        threads: usize,
-    ) -> Result<Vec<constraints::Target>, constraints::LimitError> {
-        let model = &self.model.get().model;
-        let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
-        self.more(&mut projectors, threads)?;
-        let mut targets = vec![constraints::Target::new(model); n];
-        let size = n.div_ceil(threads).max(1);
-        std::thread::scope(|scope| {
-            for ((i, chunk), projector) in targets.chunks_mut(size).enumerate().zip(projectors.iter_mut()) {
-                scope.spawn(move || batch.project(i * size, projector, chunk));
-            }
-        });
-        Ok(targets)
+    fn lock(&self) -> MutexGuard<'_, Projectors> {
+        self.projectors.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// As many projectors as threads, alike in what is switched on and in the forces.
-    fn more(
-        &self,
-        projectors: &mut Vec<constraints::Projector>,
-        threads: usize,
-    ) -> Result<(), constraints::LimitError> {
-        let model = &self.model.get().model;
-        while projectors.len() < threads {
-            let settings = self.settings.clone();
-            let mut new = constraints::Projector::new(model, &self.limits, &self.controllable, settings)?;
-            let off: Vec<String> =
-                projectors[0].enabled().filter(|(_, on)| !on).map(|(name, _)| name.to_string()).collect();
-            off.iter().try_for_each(|name| new.set_enabled(name, false))?;
-            new.set_external_forces(projectors[0].external_forces());
-            new.set_moved(projectors[0].moved());
-            projectors.push(new);
-        }
-        Ok(())
-    }
-
-    fn batch_of(
+    fn rows(
         &self,
         q: &Bound<'_, PyAny>,
         v: &Bound<'_, PyAny>,
         q_proposal: &Bound<'_, PyAny>,
         v_proposal: &Bound<'_, PyAny>,
-    ) -> PyResult<(Batch, usize)> {
+    ) -> PyResult<(Rows, usize)> {
         let (nq, nv) = self.sizes;
         let (q, n) = rows("q", q, nq)?;
-        let batch = Batch {
-            sizes: self.sizes,
+        let rows = Rows {
             q,
             v: matrix("v", v, n, nv)?,
             q_proposal: matrix("q_proposal", q_proposal, n, nq)?,
             v_proposal: matrix("v_proposal", v_proposal, n, nv)?,
         };
-        for (name, of) in [("q", &batch.q), ("q_proposal", &batch.q_proposal)] {
+        for (name, of) in [("q", &rows.q), ("q_proposal", &rows.q_proposal)] {
             for (row, of) in of.chunks_exact(nq.max(1)).enumerate() {
                 let checked = self.model.get().model.check_configuration(of);
                 checked.map_err(|e| errors::value(format!("{name}[{row}]: {e}")))?;
             }
         }
-        Ok((batch, n))
-    }
-
-    fn vjp(
-        &self,
-        batch: &Batch,
-        (dq, dv): &(Vec<f64>, Vec<f64>),
-        n: usize,
-        threads: usize,
-    ) -> Result<(Vec<f64>, Vec<f64>), constraints::LimitError> {
-        let (nv, model) = (self.sizes.1, &self.model.get().model);
-        let mut projectors = self.projectors.lock().unwrap_or_else(PoisonError::into_inner);
-        self.more(&mut projectors, threads)?;
-        let (mut dq_out, mut dv_out) = (vec![0.0; n * nv], vec![0.0; n * nv]);
-        let size = n.div_ceil(threads).max(1);
-        std::thread::scope(|scope| {
-            let chunks = dq_out.chunks_mut(size * nv).zip(dv_out.chunks_mut(size * nv));
-            for ((k, (dq_out, dv_out)), projector) in chunks.enumerate().zip(projectors.iter_mut()) {
-                scope.spawn(move || {
-                    let mut target = [constraints::Target::new(model)];
-                    for (j, (dq_out, dv_out)) in dq_out.chunks_mut(nv).zip(dv_out.chunks_mut(nv)).enumerate()
-                    {
-                        let i = k * size + j;
-                        batch.project(i, projector, &mut target);
-                        projector.vjp(&dq[i * nv..][..nv], &dv[i * nv..][..nv], dq_out, dv_out);
-                    }
-                });
-            }
-        });
-        Ok((dq_out, dv_out))
+        Ok((rows, n))
     }
 }
 
 /// Two matrices.
 type Pair<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>);
-
-fn threads_for(wanted: Option<usize>, n: usize) -> usize {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    wanted.unwrap_or(cores).clamp(1, n.max(1))
-}
-
-/// States and proposals, row by row.
-struct Batch {
-    sizes: (usize, usize),
-    q: Vec<f64>,
-    v: Vec<f64>,
-    q_proposal: Vec<f64>,
-    v_proposal: Vec<f64>,
-}
-
-impl Batch {
-    /// Projects rows from `first` on, each as if it were the only one. What the projector remembers stays.
-    fn project(
-        &self,
-        first: usize,
-        projector: &mut constraints::Projector,
-        targets: &mut [constraints::Target],
-    ) {
-        let (nq, nv) = self.sizes;
-        let mut proposal = Proposal { q: vec![0.0; nq], v: vec![0.0; nv] };
-        let memory = projector.memory();
-        for (i, target) in (first..).zip(targets) {
-            proposal.q.copy_from_slice(&self.q_proposal[i * nq..][..nq]);
-            proposal.v.copy_from_slice(&self.v_proposal[i * nv..][..nv]);
-            projector.forget();
-            projector.project(&self.q[i * nq..][..nq], &self.v[i * nv..][..nv], &proposal, target);
-        }
-        projector.set_memory(&memory);
-    }
-}
 
 /// Degrees of freedom of the joints named; all joints with one position and one velocity entry when none are named.
 fn dofs(model: &constraints::Model, names: Option<Vec<String>>) -> PyResult<Vec<usize>> {

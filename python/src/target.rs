@@ -116,8 +116,8 @@ impl Ledger {
 
     /// Limits the target breaks, by kind and by an independent checker.
     #[getter]
-    fn violations<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        counts(py, &self.ledger.violations)
+    fn target_violations<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        counts(py, &self.ledger.target_violations)
     }
 
     fn __repr__(&self) -> String {
@@ -268,8 +268,8 @@ impl Targets {
 
     /// Number of limits each target breaks (n).
     #[getter]
-    fn violations<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
-        PyArray1::from_vec(py, self.targets.iter().map(|t| t.ledger.violations.total()).collect())
+    fn target_violations<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
+        PyArray1::from_vec(py, self.targets.iter().map(|t| t.ledger.target_violations.total()).collect())
     }
 
     fn __len__(&self) -> usize {

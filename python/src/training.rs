@@ -195,8 +195,8 @@ impl Training {
             let mut inner = self.lock();
             let Inner { training, folder, .. } = &mut *inner;
             let progress = match folder {
-                Some(folder) => training.step_in(folder),
-                None => training.step(),
+                Some(folder) => training.iterate_in(folder),
+                None => training.try_iterate(),
             };
             // What a function of the caller raised says more than what came of it.
             if let Some(raised) = self.raised.lock().unwrap_or_else(PoisonError::into_inner).take() {

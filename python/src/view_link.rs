@@ -1,12 +1,11 @@
 //! The viewer of a running loop (see `nearl.view`).
 
-use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use nearl_constraints::{Kind, Rung};
 use nearl_runtime::codes::LedgerStatus;
-use nearl_runtime::link::{LinkError, RobotName, RowsMessage, TickMessage, ViewLink};
+use nearl_runtime::link::{LeanedOn, LinkError, RobotName, RowsMessage, TickMessage, ViewLink, Watched};
 use nearl_runtime::rt::{Mode, Reason};
 use numpy::PyArray1;
 use pyo3::exceptions::PyConnectionError;
@@ -16,9 +15,6 @@ use pyo3::types::PyDict;
 use crate::arrays::array;
 use crate::errors;
 use crate::link::{SIGNALS, seconds};
-
-/// Pause when the stream is empty: the topic keeps 32 ticks, which is so much at 10 kHz.
-const NAP: Duration = Duration::from_millis(2);
 
 /// Reads the ticks of a loop and the names and limits of its rows; the loop does not wait for it.
 #[pyclass(module = "nearl._core", frozen)]
@@ -32,51 +28,6 @@ struct Inner {
     rows: RowsMessage,
     /// The plant waits for every action, so no tick has a deadline.
     is_lockstep: bool,
-}
-
-/// The hardest that a row was leaned on.
-#[derive(Clone, Copy, Default)]
-struct Held {
-    ticks: u64,
-    multiplier: f64,
-    slack: f64,
-}
-
-/// What the ticks of one picture did.
-#[derive(Default)]
-struct Seen {
-    newest: Option<TickMessage>,
-    ticks: u64,
-    raw: u64,
-    target: u64,
-    latency: Vec<u64>,
-    /// By number, kind and side of the row.
-    held: BTreeMap<(u32, u32, u32), Held>,
-}
-
-impl Seen {
-    fn take(&mut self, tick: &TickMessage) {
-        self.ticks += 1;
-        if self.newest.as_ref().is_some_and(|newest| newest.snapshot != tick.snapshot) {
-            // Numbers of rows are those of their snapshot.
-            self.held.clear();
-        }
-        self.newest = Some(*tick);
-        self.latency.push(tick.end.saturating_sub(tick.due));
-        if tick.nu == 0 {
-            return;
-        }
-        self.raw += u64::from(tick.ledger.raw_violations);
-        self.target += u64::from(tick.ledger.target_violations);
-        let numbers = tick.rows.iter().zip(&tick.kinds).zip(&tick.sides);
-        let pulls = tick.multipliers().iter().zip(tick.slacks());
-        for (((row, kind), side), (multiplier, slack)) in numbers.zip(pulls) {
-            let held = self.held.entry((*row, *kind, *side)).or_default();
-            held.ticks += 1;
-            held.multiplier = held.multiplier.max(*multiplier);
-            held.slack = held.slack.max(*slack);
-        }
-    }
 }
 
 #[pymethods]
@@ -128,18 +79,24 @@ impl ViewClient {
     /// What the ticks of the next `span` [s] did, as a dict; none where no tick came.
     fn look<'py>(&self, py: Python<'py>, span: f64) -> PyResult<Option<Bound<'py, PyDict>>> {
         let (start, span) = (Instant::now(), seconds(span)?);
-        let mut seen = Seen::default();
+        let mut watched = Watched::default();
         loop {
             let wait = SIGNALS.min(span.saturating_sub(start.elapsed()));
-            py.detach(|| self.with(|inner| watch(inner, &mut seen, wait)))?;
+            py.detach(|| {
+                self.with(|inner| {
+                    if let Some(rows) = inner.link.watch(wait, &mut watched) {
+                        inner.rows = rows;
+                    }
+                })
+            })?;
             if start.elapsed() >= span {
                 break;
             }
             py.check_signals()?;
         }
-        let Some(tick) = &seen.newest else { return Ok(None) };
+        let Some(tick) = &watched.newest else { return Ok(None) };
         let lost = self.with(|inner| inner.link.lost())?;
-        picture(py, tick, &seen, lost).map(Some)
+        picture(py, tick, &watched, lost).map(Some)
     }
 
     /// Leaves.
@@ -156,23 +113,12 @@ impl ViewClient {
     }
 }
 
-fn watch(inner: &mut Inner, seen: &mut Seen, span: Duration) {
-    let end = Instant::now() + span;
-    loop {
-        if let Some(rows) = inner.link.rows() {
-            inner.rows = rows;
-        }
-        while let Some(tick) = inner.link.tick() {
-            seen.take(&tick);
-        }
-        if Instant::now() >= end {
-            return;
-        }
-        std::thread::sleep(NAP);
-    }
-}
-
-fn picture<'py>(py: Python<'py>, tick: &TickMessage, seen: &Seen, lost: u64) -> PyResult<Bound<'py, PyDict>> {
+fn picture<'py>(
+    py: Python<'py>,
+    tick: &TickMessage,
+    watched: &Watched,
+    lost: u64,
+) -> PyResult<Bound<'py, PyDict>> {
     let out = PyDict::new(py);
     let acts = tick.nu > 0;
     out.set_item("acts", acts)?;
@@ -187,15 +133,15 @@ fn picture<'py>(py: Python<'py>, tick: &TickMessage, seen: &Seen, lost: u64) -> 
         ("overruns", tick.overruns),
         ("raw_total", tick.raw_violations),
         ("target_total", tick.target_violations),
-        ("raw", seen.raw),
-        ("target", seen.target),
-        ("ticks", seen.ticks),
+        ("raw", watched.raw_violations),
+        ("target", watched.target_violations),
+        ("ticks", watched.ticks),
         ("lost", lost),
     ];
     for (name, value) in numbers {
         out.set_item(name, value)?;
     }
-    out.set_item("latency_ns", PyArray1::from_slice(py, &seen.latency))?;
+    out.set_item("latency_ns", PyArray1::from_slice(py, &watched.latency))?;
     out.set_item("q", array(py, tick.q()))?;
     out.set_item("v", array(py, tick.v()))?;
     for (name, values) in [
@@ -208,7 +154,7 @@ fn picture<'py>(py: Python<'py>, tick: &TickMessage, seen: &Seen, lost: u64) -> 
         out.set_item(name, acts.then(|| array(py, values)))?;
     }
     out.set_item("ledger", if acts { Some(ledger(py, tick)?) } else { None })?;
-    out.set_item("active", active(py, seen)?)?;
+    out.set_item("active", active(py, watched)?)?;
     Ok(out)
 }
 
@@ -226,16 +172,16 @@ fn ledger<'py>(py: Python<'py>, tick: &TickMessage) -> PyResult<Bound<'py, PyDic
     Ok(out)
 }
 
-fn active<'py>(py: Python<'py>, seen: &Seen) -> PyResult<Vec<Bound<'py, PyDict>>> {
-    let row = |(&(row, kind, side), held): (&(u32, u32, u32), &Held)| {
+fn active<'py>(py: Python<'py>, watched: &Watched) -> PyResult<Vec<Bound<'py, PyDict>>> {
+    let row = |(&(row, kind, side), leaned): (&(u32, u32, u32), &LeanedOn)| {
         let out = PyDict::new(py);
         out.set_item("row", row)?;
         out.set_item("kind", Kind::ALL.get(kind as usize).map_or("unknown", |kind| kind.name()))?;
         out.set_item("side", if side == 0 { "lower" } else { "upper" })?;
-        out.set_item("multiplier", held.multiplier)?;
-        out.set_item("slack", held.slack)?;
-        out.set_item("ticks", held.ticks)?;
+        out.set_item("multiplier", leaned.multiplier)?;
+        out.set_item("slack", leaned.slack)?;
+        out.set_item("ticks", leaned.ticks)?;
         Ok(out)
     };
-    seen.held.iter().map(row).collect()
+    watched.active.iter().map(row).collect()
 }

@@ -71,7 +71,7 @@ def flight_log(path: Path, ticks: int = 3000, metadata: dict[str, str] | None = 
                 "proposal_q": q_hat.tolist(), "proposal_v": v_hat.tolist(), "target_q": target.q.tolist(), "target_v": target.v.tolist(),
                 "action": [0.0] * 7,
                 "ledger": {"status": 1, "rung": RUNGS.index(target.rung), "active": len(target.active), "iterations": target.iterations,
-                           "raw_violations": sum(target.raw_violations.values()), "target_violations": sum(target.violations.values()),
+                           "raw_violations": sum(target.raw_violations.values()), "target_violations": sum(target.target_violations.values()),
                            "moved": target.moved, "slack": target.slack, "residual": target.residual, "duration_ns": target.duration_ns},
                 "overruns": 0, "stale": 0, "lost_states": 0,
             }  # fmt: skip

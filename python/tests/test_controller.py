@@ -56,7 +56,7 @@ def test_the_action_is_inverse_dynamics_of_the_target(controller, env) -> None:
     for _ in range(200):
         q, v = env.state
         action, ledger = controller.update(q, v, env.native.observe())
-        assert ledger.is_ok and sum(ledger.violations.values()) == 0
+        assert ledger.is_ok and sum(ledger.target_violations.values()) == 0
         target = dict(zip(controller.state_names, controller.target, strict=True))
         v_next = np.array([target[f"v.{name}"] for name in model.joint_names])
         tau = model.rnea(q, v, (v_next - v) / controller.dt) - model.passive(q, v)

@@ -113,7 +113,7 @@ def test_targets_are_the_optimum(model, rng, dt, n, solver, tolerance) -> None:
         distance = np.linalg.norm(y - optimum) / max(np.linalg.norm(optimum), A_MAX * dt)
         assert distance <= tolerance, f"{target.status} {target.rung}: {distance}"
         assert problem.violation(y) <= 1e-9
-        assert target.violations["torque"] == 0 and target.slack <= 1e-9
+        assert target.target_violations["torque"] == 0 and target.slack <= 1e-9
         np.testing.assert_allclose(target.q, problem.q + dt * problem.v + problem.kappa * dt * y, atol=1e-12)
     assert solved > 250 and torque_active > 20, f"{solved} solved, {torque_active} with torque rows active"
 
@@ -292,7 +292,7 @@ def test_hard_jerk_holds_with_position_velocity_and_acceleration():
         side = np.where(random.random(7) < 0.004, -side, side)
         wish = 3 * side * panda.velocity_limit
         target = projector.project(q, v, q + dt * wish, wish, previous=(a, np.zeros(7)))
-        assert sum(target.ledger.violations.values()) == 0, tick
+        assert sum(target.ledger.target_violations.values()) == 0, tick
         beyond = np.maximum(target.q - panda.upper_position_limit, panda.lower_position_limit - target.q)
         jerk = np.abs(target.acceleration - a) / dt / 300 - 1
         seen = [beyond, np.abs(target.v) / panda.velocity_limit - 1, np.abs(target.acceleration) / 10 - 1, jerk]

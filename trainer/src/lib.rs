@@ -13,6 +13,7 @@ pub mod export;
 pub mod foresight;
 pub mod import;
 pub mod learn;
+pub mod many;
 pub mod mj;
 pub mod online;
 pub mod plant;

@@ -1,4 +1,4 @@
-//! From a robot file to its description, and where the simulator's robot file comes from.
+//! Reads the description of a robot from its file, and finds the robot file that the simulator compiles.
 
 use std::path::{Path, PathBuf};
 

@@ -224,12 +224,12 @@ impl Training {
         })
     }
 
-    /// [`Training::step`] on environments of this process, which neither fail nor stop.
+    /// [`Training::try_iterate`] on environments of this process, which neither fail nor stop.
     ///
     /// # Panics
     /// When the experience comes from elsewhere and ends.
     pub fn iterate(&mut self) -> Progress {
-        match self.step() {
+        match self.try_iterate() {
             Ok(Some(progress)) => progress,
             Ok(None) => panic!("the source of experience was stopped"),
             Err(e) => panic!("{e}"),
@@ -241,7 +241,7 @@ impl Training {
     ///
     /// # Errors
     /// [`TrainError::Source`].
-    pub fn step(&mut self) -> Result<Option<Progress>, TrainError> {
+    pub fn try_iterate(&mut self) -> Result<Option<Progress>, TrainError> {
         self.is_best = false;
         self.source.project(self.limits());
         if !self.source.collect(&self.snapshot)? {

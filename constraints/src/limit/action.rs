@@ -62,7 +62,7 @@ pub struct ActionReport {
     /// Limits that the action broke before; for [`ActionLimit`] each sum is one, and all rates are one.
     pub raw_violations: u32,
     /// Limits that the given one breaks by more than 1e-9, counted from the formulas and not from how it was found.
-    pub violations: u32,
+    pub target_violations: u32,
 }
 
 /// Keeps an action within [`ActionSettings`]. Nothing is allocated after [`ActionLimit::new`].
@@ -164,18 +164,18 @@ impl ActionLimit {
                 }
             };
         }
-        let raw_violations = self.violations(action);
+        let raw_violations = self.broken(action);
         if hold {
             self.fit(self.sums.len());
             action.copy_from_slice(&self.answer);
         }
-        let violations = self.violations(action);
+        let target_violations = self.broken(action);
         let square = |(a, u): (&f64, &f64)| (a - u) * (a - u);
         let moved = action.iter().zip(&self.asked).map(square).sum::<f64>().sqrt();
         if self.remembers() {
             self.before.get_or_insert_with(|| vec![0.0; action.len()]).copy_from_slice(action);
         }
-        ActionReport { moved, raw_violations, violations }
+        ActionReport { moved, raw_violations, target_violations }
     }
 
     /// Finds the multipliers of the first `k` sums with those of the others given, and the action.
@@ -239,7 +239,7 @@ impl ActionLimit {
         self.value(sum, &self.answer) <= limit
     }
 
-    fn violations(&self, action: &[f64]) -> u32 {
+    fn broken(&self, action: &[f64]) -> u32 {
         let sums = self.sums.iter().filter(|(sum, limit)| self.value(*sum, action) > limit + TOLERANCE);
         let changes = self.before.as_ref().is_some_and(|before| {
             let change = action.iter().zip(before).map(|(a, b)| (a - b).abs());

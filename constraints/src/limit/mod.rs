@@ -40,7 +40,7 @@ pub use locked::{LockedJoints, LockedSettings};
 pub use margin::AlwaysHard;
 pub use moved::Moved;
 pub use position::{PositionLimit, PositionSettings};
-pub use registry::LimitEntry;
+pub use registry::RegisteredLimit;
 pub use set::LimitSet;
 pub use settings::PerJoint;
 pub use torque::{TorqueLimit, TorqueSettings};

@@ -4,7 +4,7 @@
 use super::{About, ConstraintSettings, Kind, Limit};
 
 /// One kind of limit.
-pub struct LimitEntry {
+pub struct RegisteredLimit {
     /// Name in the task file.
     pub name: &'static str,
     /// What its rows, cones and bounds are called in reports.
@@ -74,8 +74,8 @@ macro_rules! limits {
         }
 
         /// All kinds of limits by their name in the task file.
-        pub const REGISTRY: &[registry::LimitEntry] = &[$(
-            registry::LimitEntry {
+        pub const REGISTRY: &[registry::RegisteredLimit] = &[$(
+            registry::RegisteredLimit {
                 name: stringify!($key),
                 kind: Kind::$kind,
                 many: <$settings as settings::Section>::MANY,

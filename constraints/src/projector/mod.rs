@@ -319,7 +319,7 @@ impl Projector {
         status: Status,
     ) -> Status {
         let verdict = self.checker.check(q, v, &target.q, &target.v, &self.external, self.previous.get());
-        target.ledger.violations = verdict.counts;
+        target.ledger.target_violations = verdict.counts;
         let soft = target.ledger.active.iter().fold(0.0, |most: f64, row| most.max(row.slack));
         target.ledger.slack = verdict.worst.max(soft);
         let outside = &target.ledger.outside;
@@ -347,7 +347,7 @@ impl Projector {
             Rung::StoredBrake => checker.check_brake(q, v, to.0, to.1, &self.external, self.previous.get()),
             _ => checker.check(q, v, to.0, to.1, &self.external, self.previous.get()),
         };
-        target.ledger.violations = verdict.counts;
+        target.ledger.target_violations = verdict.counts;
         target.ledger.slack = if verdict.worst.is_finite() { verdict.worst } else { f64::MAX };
     }
 

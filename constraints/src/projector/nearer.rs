@@ -1,4 +1,4 @@
-//! A second projection, for ticks in which no brake leads from the nearest allowed state. Each limit that the step or its brake breaks
+//! A second projection, for ticks in which no brake leads from the nearest allowed state. Each limit that the target or its brake breaks
 //! becomes one more row: linear in the velocity change `y`, with a slope found by differences. Cones become their tangents:
 //!
 //! ```text

@@ -56,7 +56,7 @@ fn fault_07_a_nan_in_p_brakes_in_its_tick_and_the_next_is_as_if_new() {
                     finite(&target.q) && finite(&target.v) && finite(&target.acceleration),
                     "tick {tick}"
                 );
-                assert_eq!(target.ledger.violations.total(), 0, "tick {tick}");
+                assert_eq!(target.ledger.target_violations.total(), 0, "tick {tick}");
                 (met, brakes) = (false, brakes + 1);
             } else {
                 assert!(is_as_new, "tick {tick}: {status:?} and {healthy:?}");

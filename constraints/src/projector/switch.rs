@@ -169,7 +169,7 @@ impl Projector {
         self.previous.known = known(&self.previous.acceleration) && known(&self.previous.torque);
     }
 
-    /// Takes `proposal` as the target of the tick just projected, whatever it breaks: `violations` and what is remembered are the
+    /// Takes `proposal` as the target of the tick just projected, whatever it breaks: `target_violations` and what is remembered are the
     /// proposal's; status and rung stay the projection's. For comparisons with what [`Projector::project`] does; `q`, `v` as there.
     pub fn pass(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) {
         target.q.copy_from_slice(&proposal.q);

@@ -46,11 +46,11 @@ fn run(
         attack.propose(model, dt, &q, &mut raw);
         let status = projector.project(&q, &v, &raw, &mut target);
         seen.ticks += 1;
-        if target.ledger.violations.total() > 0 && seen.broken == 0 {
+        if target.ledger.target_violations.total() > 0 && seen.broken == 0 {
             let at = format!("{:?}", projector.settings());
-            println!("tick {tick}: {:?} {status:?} {:?} of {at}", target.ledger.violations, target.ledger);
+            println!("tick {tick}: {:?} {status:?} {:?} of {at}", target.ledger.target_violations, target.ledger);
         }
-        seen.broken += usize::from(target.ledger.violations.total() > 0);
+        seen.broken += usize::from(target.ledger.target_violations.total() > 0);
         seen.slowed += usize::from(status == Status::Slowed);
         seen.braked += usize::from(status == Status::Braked(BrakeReason::NoVerifiedBrake));
         seen.unanswered += usize::from(status == Status::Braked(BrakeReason::NoCertifiedAnswer));

@@ -1,7 +1,7 @@
 //! What must hold for every kind of limit in the registry.
 
 use crate::common::*;
-use nearl_constraints::limit::{Form, LimitEntry, REGISTRY};
+use nearl_constraints::limit::{Form, REGISTRY, RegisteredLimit};
 use nearl_constraints::*;
 
 /// The example of one kind, on top of the limits of single joints.
@@ -23,7 +23,7 @@ fn projector(constraints: &ConstraintSettings, solver: Solver) -> Projector {
 }
 
 /// The example of a kind with one more setting, such as `("margin", 0.1)` or `("soft", table)`, in its first limit.
-fn with_setting(entry: &LimitEntry, key: &str, value: impl Into<toml::Value>) -> String {
+fn with_setting(entry: &RegisteredLimit, key: &str, value: impl Into<toml::Value>) -> String {
     let mut section: toml::Table = toml::from_str(entry.about.example).unwrap();
     let limit = match section.iter_mut().next().unwrap().1 {
         toml::Value::Array(limits) => &mut limits[0],
@@ -37,7 +37,7 @@ fn with_setting(entry: &LimitEntry, key: &str, value: impl Into<toml::Value>) ->
     format!("{key} = {value}")
 }
 
-fn softened(entry: &LimitEntry) -> String {
+fn softened(entry: &RegisteredLimit) -> String {
     let soft = toml::Table::from_iter([("linear".into(), 0.1.into()), ("quadratic".into(), 5.0.into())]);
     with_setting(entry, "soft", soft)
 }
@@ -76,7 +76,7 @@ fn every_kind_reads_its_example_and_stays_finite_and_inside() {
         let (mut solved, mut braked) = (0, 0);
         walk(&mut projector, 4000, 3, |_, _, _, target| {
             assert!(target.q.iter().chain(&target.v).chain(&target.acceleration).all(|x| x.is_finite()));
-            assert_eq!(target.ledger.violations.total(), 0, "{}: {:?}", entry.name, target.ledger);
+            assert_eq!(target.ledger.target_violations.total(), 0, "{}: {:?}", entry.name, target.ledger);
             solved += usize::from(target.ledger.status == Status::Solved);
             braked += usize::from(!target.ledger.status.is_ok());
         });
@@ -154,7 +154,7 @@ fn soft_kinds_give_way_and_say_so() {
         let mut other = Target::new(ladder.model());
         let (mut gave, mut furthest) = (0, 0.0f64);
         walk(&mut ladder, 3000, 3, |q, v, raw, target| {
-            assert_eq!(target.ledger.violations.total(), 0, "{}: {:?}", entry.name, target.ledger);
+            assert_eq!(target.ledger.target_violations.total(), 0, "{}: {:?}", entry.name, target.ledger);
             assert!(target.ledger.status.is_ok(), "{}: {:?}", entry.name, target.ledger);
             gave += usize::from(target.ledger.active.iter().any(|row| row.slack > 0.0));
             clarabel.project(q, v, raw, &mut other);

@@ -29,7 +29,7 @@ fn torque_holds_by_default_where_braking_is_not_certified() {
         }
         let raw = Proposal { q: (0..7).map(|i| q[i] + 0.01 * side[i]).collect(), v: side.to_vec() };
         projector.project(&q, &v, &raw, &mut target);
-        assert_eq!(target.ledger.violations.total(), 0, "tick {tick}: {:?}", target.ledger);
+        assert_eq!(target.ledger.target_violations.total(), 0, "tick {tick}: {:?}", target.ledger);
         (q, v) = (target.q.clone(), target.v.clone());
     }
 }

@@ -202,7 +202,7 @@ fn a_stored_brake_keeps_a_way_to_stop_where_braking_is_not_certified() {
             let mut projector =
                 Projector::new(&panda(), &limits(0.62), &[0, 1, 2, 3, 4, 5, 6], settings).unwrap();
             storm(&mut projector, 20_000, 10 + seed, |_, _, target| {
-                lost[k] += usize::from(target.ledger.violations.total() > 0);
+                lost[k] += usize::from(target.ledger.target_violations.total() > 0);
             });
         }
     }
@@ -221,7 +221,7 @@ fn one_iteration_and_no_time_are_not_enough_and_it_says_so() {
             let braked = target.ledger.status == Status::Braked(BrakeReason::NoCertifiedAnswer);
             short += usize::from(braked || target.ledger.residual > 1e-6);
             solved += usize::from(target.ledger.rung == Rung::Clarabel);
-            assert!(braked || target.ledger.violations.total() == 0, "{:?}", target.ledger);
+            assert!(braked || target.ledger.target_violations.total() == 0, "{:?}", target.ledger);
         });
         (short, solved)
     };

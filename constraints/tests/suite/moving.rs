@@ -150,8 +150,8 @@ fn attack_joints(
         if away && !named {
             wrong.push("outside, and not named".into());
         }
-        if target.ledger.violations.total() > 0 {
-            wrong.push(format!("the checker finds {:?}", target.ledger.violations));
+        if target.ledger.target_violations.total() > 0 {
+            wrong.push(format!("the checker finds {:?}", target.ledger.target_violations));
         }
         if named && !matches!(status, Status::Tightening | Status::Braked(BrakeReason::NoVerifiedBrake)) {
             wrong.push("another status".into());
@@ -263,8 +263,8 @@ fn frames_speeds_and_energy_keep_what_is_declared_on_the_way_to_moved_limits() {
                     check("speed", fast, speed);
                     check("energy", joule, energy);
                 }
-                if target.ledger.violations.total() > 0 {
-                    wrong.push(format!("the checker finds {:?}", target.ledger.violations));
+                if target.ledger.target_violations.total() > 0 {
+                    wrong.push(format!("the checker finds {:?}", target.ledger.target_violations));
                 }
                 braked += usize::from(named && !status.is_ok());
                 if !wrong.is_empty() && outside < 3 {
@@ -302,7 +302,7 @@ fn a_slower_speed_is_reached_in_the_time_it_takes() {
                 raw.v.fill(0.0);
                 (raw.q[0], raw.v[0]) = (q[0] + 5.0 * dt, 5.0);
                 let status = projector.project(&q, &v, &raw, &mut target);
-                assert_eq!(target.ledger.violations.total(), 0);
+                assert_eq!(target.ledger.target_violations.total(), 0);
                 (q, v) = (target.q.clone(), target.v.clone());
                 ticks += usize::from(status == Status::Tightening);
             }

@@ -286,7 +286,7 @@ fn the_panda_stays_inside_everything() {
                 matches!(status, Status::Unchanged | Status::Clamped | Status::Solved),
                 "step {step}: {l:?} {q:?} {v:?}"
             );
-            assert_eq!((l.violations.total(), l.outside.len()), (0, 0), "step {step}: {l:?}");
+            assert_eq!((l.target_violations.total(), l.outside.len()), (0, 0), "step {step}: {l:?}");
             (raw_violations.torque, raw_violations.position) = (
                 raw_violations.torque + l.raw_violations.torque,
                 raw_violations.position + l.raw_violations.position,
@@ -322,7 +322,7 @@ fn braking_from_any_admissible_state_stops_inside() {
         for _ in 0..1500 {
             let status = projector.project(&qb, &vb, &nothing, &mut target);
             assert_eq!(status, Status::Braked(BrakeReason::NonFiniteProposal));
-            assert_eq!(target.ledger.violations.total(), 0, "{:?}", target.ledger);
+            assert_eq!(target.ledger.target_violations.total(), 0, "{:?}", target.ledger);
             (qb, vb) = (target.q.clone(), target.v.clone());
         }
         assert!(vb.iter().all(|v| v.abs() < 1e-9), "{vb:?}");
@@ -409,7 +409,7 @@ fn a_floating_base_passes_through() {
         let status = projector.project(&q, &v, &raw, &mut target);
         assert!(status.is_ok(), "{:?}", target.ledger);
         assert_eq!((bits(&target.q[..7]), bits(&target.v[..6])), (bits(&raw.q[..7]), bits(&raw.v[..6])));
-        assert_eq!(target.ledger.violations.total(), 0);
+        assert_eq!(target.ledger.target_violations.total(), 0);
         solved += usize::from(status == Status::Solved);
     }
     println!("{solved} solved");

@@ -2,7 +2,7 @@
 //! `NEARL_WRITE=1 cargo test --release --locked -p nearl-constraints --test suite written` writes them anew.
 
 use nearl_constraints::Kind;
-use nearl_constraints::limit::{Argument, LimitEntry, REGISTRY};
+use nearl_constraints::limit::{Argument, REGISTRY, RegisteredLimit};
 use std::fmt::Write;
 use std::path::Path;
 
@@ -33,7 +33,7 @@ fn parameter(argument: &Argument) -> String {
     }
 }
 
-fn class(entry: &LimitEntry) -> String {
+fn class(entry: &RegisteredLimit) -> String {
     let (about, name) = (entry.about, entry.name);
     let mut parameters = vec!["cls".to_string(), "model: Model".to_string()];
     let mut star = false;
@@ -57,7 +57,7 @@ fn class(entry: &LimitEntry) -> String {
 }
 
 fn python() -> String {
-    let mut classes: Vec<&LimitEntry> = REGISTRY.iter().collect();
+    let mut classes: Vec<&RegisteredLimit> = REGISTRY.iter().collect();
     classes.sort_by_key(|entry| entry.about.class);
     let names: String = classes.iter().map(|entry| format!("    \"{}\",\n", entry.about.class)).collect();
     let kinds: String = Kind::ALL.iter().map(|kind| format!("    \"{}\",\n", kind.name())).collect();
@@ -76,7 +76,7 @@ const END: &str = "<!-- kinds of limits: end -->\n";
 
 fn kinds() -> String {
     let mut text = "| kind | Python | form | margin |\n|---|---|---|---|\n".to_string();
-    for LimitEntry { name, about, .. } in REGISTRY {
+    for RegisteredLimit { name, about, .. } in REGISTRY {
         writeln!(text, "| `{name}` | `{}` | {} | {} |", about.class, about.form.name(), about.margin)
             .unwrap();
     }

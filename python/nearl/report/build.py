@@ -157,7 +157,7 @@ def _results(runs: list[Run], programs: list[Summary], logs: list[Log]) -> str:
         parts.append(_table("Latency [µs]", head, loops))
     if broken := [_broken_row(*loop) for p in programs for loop in p.loops]:
         head = ["loop", "by raw proposals", "by projected targets", "by the robot", "robot's largest excess"]
-        parts.append(_table("Limits broken in the loop [count over joints and ticks]", head, broken))
+        parts.append(_table("Limits broken in the loop [ticks; by the robot summed over kinds of limits]", head, broken))
     if receipts := [_receipt_row(*r) for p in programs for r in p.receipts]:
         parts.append(_table("Snapshots pushed while it ran", ["loop", "version", "verdict", "words"], receipts, words=3))
     return "".join(parts)

@@ -60,7 +60,7 @@ class Panel:
         why = "" if p.reason in (None, "none") else f" ({escape(str(p.reason))})"
         mode = f'<b style="color:{MODES.get(p.mode, "#667085")}">{escape(p.mode.upper())}</b>{why}'
         lost = f"; {p.lost:,} ticks were not read by this view" if p.lost else ""
-        outside = f"limits broken so far: {p.raw_total:,} by proposals, {p.broken_total:,} by targets{lost}"
+        outside = f"ticks so far that broke a limit: {p.raw_total:,} by proposals, {p.broken_total:,} by targets{lost}"
         return f"{mode} tick {p.tick:,}, policy {p.version}, episode {p.episode}<br>{outside}"
 
     def _latency(self, p: Picture) -> str:

@@ -51,7 +51,7 @@ class Picture:
         period: Control period [s].
         held: Rows that held a target back.
         ledger: What the projector said of the tick by name; None where it projected nothing.
-        raw, broken: Limits broken by proposals and by targets since the last picture.
+        raw, broken: Ticks since the last picture whose proposal broke a limit, and that began within the limits and whose target broke one.
         raw_total, broken_total: The same since the start.
         latency: Time from when each tick was due until its action was handed over [s]; None where nothing keeps real time.
         overruns: Ticks that ended after the next was due; None as ``latency``.

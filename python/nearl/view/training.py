@@ -113,7 +113,8 @@ class Training:
             self._totals.episode += 1
 
     def _count(self, window: _Window, ledger: _core.Ledger) -> None:
-        raw, broken = sum(ledger.raw_violations.values()), sum(ledger.violations.values())
+        raw = any(ledger.raw_violations.values())
+        broken = any(ledger.target_violations.values()) and not ledger.outside
         window.raw, window.broken = window.raw + raw, window.broken + broken
         self._totals.raw, self._totals.broken, self._totals.tick = self._totals.raw + raw, self._totals.broken + broken, self._totals.tick + 1
         for row in ledger.active:

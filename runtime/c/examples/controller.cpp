@@ -19,7 +19,7 @@ int main(int argc, char **argv) {
     for (int tick = 0; tick < 2000; tick++) {
         obs = {q[0], v[0]};
         const int status = nearl_controller_update(controller.get(), q.data(), v.data(), obs.data(), action.data(), &ledger);
-        if (status < 0 || ledger.violations > 0) return std::fprintf(stderr, "tick %d: %s\n", tick, nearl_status_name(status)), 1;
+        if (status < 0 || ledger.target_violations > 0) return std::fprintf(stderr, "tick %d: %s\n", tick, nearl_status_name(status)), 1;
         v[0] += sizes.dt * action[0] / 2.0;
         q[0] += sizes.dt * v[0];
         farthest = std::fmax(farthest, std::fabs(q[0]));

@@ -97,7 +97,7 @@ typedef struct nearl_ledger {
     uint32_t active;              /* rows that hold the target back */
     uint32_t iterations;          /* of the solver */
     uint32_t raw_violations;      /* limits that the raw proposal broke */
-    uint32_t violations;          /* limits that the target breaks, by the independent check */
+    uint32_t target_violations;   /* limits that the target breaks, by the independent check */
     uint32_t reserved;
     double moved;                 /* weighted distance between proposal and target */
     double slack;                 /* largest slack of a soft row */

@@ -477,11 +477,11 @@ impl Controller {
     /// Adds to the ledger what was done to the action. Of a direct policy, whose state nothing projects, the ledger says nothing else.
     fn count(&self, report: ActionReport, ledger: &mut Ledger) {
         if self.kind == PolicyKind::Direct {
-            (ledger.raw_violations.other, ledger.violations.other, ledger.moved) = (0, 0, 0.0);
+            (ledger.raw_violations.other, ledger.target_violations.other, ledger.moved) = (0, 0, 0.0);
             ledger.status = if report.moved > 0.0 { Status::Clamped } else { Status::Unchanged };
         }
         ledger.raw_violations.other += report.raw_violations;
-        ledger.violations.other += report.violations;
+        ledger.target_violations.other += report.target_violations;
         ledger.moved += report.moved;
     }
 

@@ -209,6 +209,8 @@ pub struct LedgerNumbers {
     pub raw_violations: u32,
     /// Limits the projected target breaks, by the independent check.
     pub target_violations: u32,
+    /// Limits that the tick began outside.
+    pub outside: u64,
     /// Weighted distance between proposal and target.
     pub moved: f64,
     /// Largest slack of a soft row.
@@ -217,6 +219,13 @@ pub struct LedgerNumbers {
     pub residual: f64,
     /// Time of the projection \[ns\].
     pub duration: u64,
+}
+
+impl LedgerNumbers {
+    /// Whether the tick began within the limits and its target broke one: what `target_violations` of many ticks counts.
+    pub fn target_breaks(&self) -> bool {
+        self.target_violations > 0 && self.outside == 0
+    }
 }
 
 message! {
@@ -414,9 +423,9 @@ message! {
         aged: u32,
         /// Flight log records dropped.
         log_drops: u64,
-        /// Limits the raw proposals broke.
+        /// Ticks whose raw proposal broke a limit.
         raw_violations: u64,
-        /// Limits the projected targets broke.
+        /// Ticks that began within the limits and whose target broke one.
         target_violations: u64,
         /// Wake-up latency p50, p99, p99.9, max \[ns\].
         wake: [u64; 4],
@@ -446,9 +455,9 @@ message! {
         episode: u64,
         /// Ticks so far that ended after the next slot was due.
         overruns: u64,
-        /// Limits so far that raw proposals broke.
+        /// Ticks so far whose raw proposal broke a limit.
         raw_violations: u64,
-        /// Limits so far that projected targets broke.
+        /// Ticks so far that began within the limits and whose target broke one.
         target_violations: u64,
         /// [`crate::rt::Mode`] as a number.
         mode: u32,

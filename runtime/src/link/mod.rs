@@ -59,4 +59,4 @@ pub use schema::{Header, Message, Queued, hash_names};
 #[cfg(feature = "cli")]
 pub(crate) use service::SHARED_MEMORY;
 pub use trainer::TrainerLink;
-pub use view::ViewLink;
+pub use view::{LeanedOn, ViewLink, Watched};

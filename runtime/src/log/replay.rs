@@ -18,7 +18,9 @@ use serde_json::Value;
 use super::brief::{BriefJson, MemoryJson, digest};
 use super::facts::{self, Session};
 use super::tick::{TickJson, encode};
-use super::writer::{BRIEF_TOPIC, MEMORY_TOPIC, SNAPSHOT_TOPIC, SnapshotEntry, TICK_TOPIC, attachment_name};
+use super::writer::{
+    BRIEF_TOPIC, MEMORY_TOPIC, SNAPSHOT_TOPIC, SnapshotNumbered, TICK_TOPIC, attachment_name,
+};
 use crate::link::{Message, ProposalMessage, SnapshotBytes, SnapshotHeader, StateMessage};
 use crate::rt::{Build, Core, Inputs, Loaded, PilotBuilder, Record};
 use crate::snapshot::one_line;
@@ -118,7 +120,7 @@ struct Replayer<B: Build> {
     topics: HashMap<u16, String>,
     facts: BTreeMap<String, String>,
     attachments: HashMap<String, Vec<u8>>,
-    snapshots: HashMap<u64, SnapshotEntry>,
+    snapshots: HashMap<u64, SnapshotNumbered>,
     running: Option<(Session, Core<B::Controller>)>,
     line: Vec<u8>,
     /// The tick read last.
@@ -235,8 +237,9 @@ impl<B: Build> Replayer<B> {
                 Some(BRIEF_TOPIC) => self.brief(&data)?,
                 Some(MEMORY_TOPIC) => self.memory(&data)?,
                 Some(SNAPSHOT_TOPIC) => {
-                    let entry: SnapshotEntry = serde_json::from_slice(&data).map_err(|e| one_line(&e))?;
-                    self.snapshots.insert(entry.id, entry);
+                    let numbered: SnapshotNumbered =
+                        serde_json::from_slice(&data).map_err(|e| one_line(&e))?;
+                    self.snapshots.insert(numbered.id, numbered);
                 }
                 _ => {}
             },
@@ -363,13 +366,13 @@ impl<B: Build> Replayer<B> {
 
     fn load(&mut self, id: u64, session: &Session) -> Result<Box<Loaded<B::Controller>>, String> {
         let missing = || format!("snapshot number {id} is not in it");
-        let entry = self.snapshots.get(&id).ok_or_else(missing)?;
-        let bytes = self.attachments.get(&attachment_name(&entry.digest)).ok_or_else(missing)?;
-        if blake3::hash(bytes).to_hex().as_str() != entry.digest {
+        let numbered = self.snapshots.get(&id).ok_or_else(missing)?;
+        let bytes = self.attachments.get(&attachment_name(&numbered.digest)).ok_or_else(missing)?;
+        if blake3::hash(bytes).to_hex().as_str() != numbered.digest {
             return Err(format!("snapshot number {id} is damaged"));
         }
         let mut header = SnapshotHeader::zeroed();
-        (header.version, header.length) = (entry.version, bytes.len() as u64);
+        (header.version, header.length) = (numbered.version, bytes.len() as u64);
         let snapshot = SnapshotBytes { header, bytes: bytes.clone() };
         let controller = self.build.build(&snapshot, &session.robot).map_err(|refusal| refusal.text)?;
         Ok(Box::new(Loaded { id, controller }))

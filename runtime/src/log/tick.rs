@@ -11,7 +11,7 @@ use crate::link::{Message, ProposalMessage, StateMessage};
 use crate::rt::{Counters, Mode, Reason, Record, Row, Sensed};
 
 /// Version of the tick messages; replay reads this one only.
-pub const SCHEMA_VERSION: u32 = 5;
+pub const SCHEMA_VERSION: u32 = 6;
 
 /// JSON schema of the `tick` topic.
 pub(crate) const SCHEMA: &str = r#"{
@@ -35,8 +35,8 @@ pub(crate) const SCHEMA: &str = r#"{
     "brake": {"type": "array", "items": {"type": "number"}},
     "ledger": {"type": "object", "properties": {
       "status": {"type": "integer"}, "rung": {"type": "integer"}, "active": {"type": "integer"}, "iterations": {"type": "integer"},
-      "raw_violations": {"type": "integer"}, "target_violations": {"type": "integer"}, "moved": {"type": "number"},
-      "slack": {"type": "number"}, "residual": {"type": "number"}, "duration_ns": {"type": "integer"},
+      "raw_violations": {"type": "integer"}, "target_violations": {"type": "integer"}, "outside": {"type": "integer"},
+      "moved": {"type": "number"}, "slack": {"type": "number"}, "residual": {"type": "number"}, "duration_ns": {"type": "integer"},
       "active_rows": {"type": "array", "items": {"type": "object", "properties": {
         "kind": {"type": "string"}, "row": {"type": "integer"}, "side": {"type": "string"}, "multiplier": {"type": "number"},
         "slack": {"type": "number"}}}}}},
@@ -161,6 +161,7 @@ struct LedgerJson {
     iterations: u32,
     raw_violations: u32,
     target_violations: u32,
+    outside: u64,
     #[serde(deserialize_with = "number")]
     moved: f64,
     #[serde(deserialize_with = "number")]
@@ -279,6 +280,7 @@ fn ledger_json(record: &Record) -> LedgerJson {
         iterations: ledger.iterations,
         raw_violations: ledger.raw_violations,
         target_violations: ledger.target_violations,
+        outside: ledger.outside,
         moved: ledger.moved,
         slack: ledger.slack,
         residual: ledger.residual,

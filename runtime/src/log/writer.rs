@@ -37,7 +37,7 @@ const MEMORY_EVERY: u64 = 1000;
 
 /// A snapshot that may come into use: one message of topic `snapshot`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub(super) struct SnapshotEntry {
+pub(super) struct SnapshotNumbered {
     /// In the order they were received; 0 for the first.
     pub(super) id: u64,
     pub(super) version: u64,
@@ -190,27 +190,27 @@ impl Log {
         self.writer.write_to_known_channel(&header, line).map_err(said)
     }
 
-    /// Writes a snapshot's bytes, unless they are there, and its entry.
+    /// Writes a snapshot's bytes, unless they are there, and its number.
     pub(super) fn attach(&mut self, snapshot: &Waiting) -> Result<(), String> {
         let now = crate::clock::now().saturating_add(self.wall);
-        let entry = SnapshotEntry {
+        let numbered = SnapshotNumbered {
             id: snapshot.id,
             version: snapshot.version,
             digest: blake3::hash(&snapshot.bytes).to_hex().to_string(),
             bytes: snapshot.bytes.len() as u64,
             rows: snapshot.rows.clone(),
         };
-        if self.attached.insert(entry.digest.clone()) {
+        if self.attached.insert(numbered.digest.clone()) {
             let attachment = mcap::Attachment {
                 log_time: now,
                 create_time: now,
-                name: attachment_name(&entry.digest),
+                name: attachment_name(&numbered.digest),
                 media_type: "application/octet-stream".into(),
                 data: Cow::Borrowed(&snapshot.bytes),
             };
             self.writer.attach(&attachment).map_err(said)?;
         }
-        let line = serde_json::to_vec(&entry).map_err(|e| e.to_string())?;
+        let line = serde_json::to_vec(&numbered).map_err(|e| e.to_string())?;
         let sequence = snapshot.id as u32;
         let header = MessageHeader { channel_id: self.snapshots, sequence, log_time: now, publish_time: now };
         self.writer.write_to_known_channel(&header, &line).map_err(said)

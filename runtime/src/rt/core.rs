@@ -211,9 +211,11 @@ impl<T: LoopController> Core<T> {
             }
         }
         if record.mode.acts() {
-            record.counters.raw_violations += u64::from(record.output.ledger.raw_violations);
-            record.counters.target_violations += u64::from(record.output.ledger.target_violations);
-            let is = |status: LedgerStatus| u64::from(record.output.ledger.status == status.number());
+            let ledger = record.output.ledger;
+            let is = |status: LedgerStatus| u64::from(ledger.status == status.number());
+            record.counters.raw_violations += u64::from(ledger.raw_violations > 0);
+            record.counters.target_violations += u64::from(ledger.target_breaks());
+            record.counters.recovering += u64::from(ledger.outside > 0);
             let bounded = is(LedgerStatus::ActionsBounded);
             record.counters.unprojected += is(LedgerStatus::NotProjected) + bounded;
             record.counters.bounded_actions += bounded;

@@ -148,7 +148,7 @@ impl Pilot {
         LedgerNumbers {
             status: LedgerStatus::ActionsBounded.number(),
             raw_violations: ledger.raw_violations.other,
-            target_violations: ledger.violations.other,
+            target_violations: ledger.target_violations.other,
             moved: ledger.moved,
             duration,
             ..LedgerNumbers::default()
@@ -376,7 +376,8 @@ pub fn numbers(ledger: &Ledger) -> LedgerNumbers {
         active: ledger.active.len() as u32,
         iterations: ledger.iterations,
         raw_violations: ledger.raw_violations.total(),
-        target_violations: ledger.violations.total(),
+        target_violations: ledger.target_violations.total(),
+        outside: ledger.outside.len() as u64,
         moved: ledger.moved,
         slack: ledger.slack,
         residual: ledger.residual,

@@ -63,7 +63,7 @@ pub struct RunReport {
     pub reason: Reason,
     /// Ticks in each mode.
     pub modes: BTreeMap<&'static str, u64>,
-    /// Counts of the loop: overruns, skipped slots, swaps, violations raw and projected, and so on.
+    /// Counts of the loop: overruns, skipped slots, swaps, ticks whose proposal or target broke a limit, and so on.
     pub counters: Counters,
     /// States refused for their sizes, their sender or their schema.
     pub refused_states: u64,
@@ -103,13 +103,16 @@ impl RunReport {
     /// What proposals and targets broke; a policy that proposes nothing breaks nothing either, which says nothing.
     fn projected(&self) -> String {
         let c = &self.counters;
-        let counts = format!("raw proposal {}, projected {}", c.raw_violations, c.target_violations);
+        let counts = format!(
+            "by raw proposals in {} ticks, by their targets in {}",
+            c.raw_violations, c.target_violations
+        );
         let acted = c.mode_ticks[Mode::Active.code() as usize] + c.mode_ticks[Mode::Degraded.code() as usize];
         match c.unprojected {
             0 => counts,
             all if all == acted && all == c.bounded_actions => format!(
-                "nothing was projected: the policy gives actions, and only their own limits or the forces of their drives were kept; limits on \
-                 actions broken: asked for {}, given {}",
+                "nothing was projected: the policy gives actions, and only their own limits or the forces of their drives were kept; ticks \
+                 with limits on actions broken: asked for {}, given {}",
                 c.raw_violations, c.target_violations
             ),
             all if all == acted && c.bounded_actions == 0 => {

@@ -245,10 +245,12 @@ pub struct Counters {
     pub dropped_actions: u64,
     /// Records that found the ring full.
     pub dropped_records: u64,
-    /// Limits the raw proposals broke, summed over ticks.
+    /// Ticks whose raw proposal broke a limit.
     pub raw_violations: u64,
-    /// Limits the projected targets broke, summed over ticks.
+    /// Ticks that began within the limits and whose target broke one.
     pub target_violations: u64,
+    /// Ticks that began outside a limit, or on the way to limits that were moved: their targets can only come nearer.
+    pub recovering: u64,
     /// Ticks that acted on what no projection has seen: their policy gives actions and proposes no state.
     pub unprojected: u64,
     /// Those of them whose action was kept within limits of its own, or within the forces that the drives' motors have.

@@ -104,7 +104,7 @@ fn fault_06_an_answer_cut_by_cap_or_deadline_is_used_only_if_the_checker_accepts
             let wish: Vec<f64> = weights(k / 50, N).iter().map(|w| 2.0 * f64::from(*w)).collect();
             let status = capped.project(&q, &v, &Proposal { q: q.clone(), v: wish }, &mut target);
             let ledger = &target.ledger;
-            assert_eq!(ledger.violations.total(), 0, "tick {k}: {status:?}");
+            assert_eq!(ledger.target_violations.total(), 0, "tick {k}: {status:?}");
             used += u32::from(ledger.rung == Rung::Clarabel && ledger.iterations == cap);
             if status == brake {
                 brakes += 1;

@@ -179,7 +179,7 @@ fn the_unchanged_task_file_projects() {
     let (code, out, error) = nearl(folder.path(), &["project", "t.toml"], line);
     assert_eq!(code, Some(0), "{error}");
     let target: serde_json::Value = serde_json::from_str(&out).expect("JSON");
-    assert_eq!(target["violations"], 0, "{target}");
+    assert_eq!(target["target_violations"], 0, "{target}");
     assert_eq!((&target["status"], &target["rung"]), (&"clamped".into(), &"closed form".into()), "{target}");
     assert!(target["raw_violations"].as_u64() > Some(0), "{target}");
 }

@@ -61,7 +61,7 @@ impl Serving {
 fn trace(run: &mut Run, iterations: usize) -> Vec<(Vec<u8>, String)> {
     (0..iterations)
         .map(|_| {
-            let p = run.step().expect("experience").expect("no stop");
+            let p = run.try_iterate().expect("experience").expect("no stop");
             (
                 run.snapshot().to_bytes(),
                 format!("{:?} {:?} {:?}", p.tally, p.return_mean.to_bits(), p.cost_mean.to_bits()),
@@ -120,7 +120,7 @@ fn what_cannot_be_collected_is_refused_by_name() {
     let error = |task: &str, set: &[&str]| {
         let asked = request(task, "ppo", 0, 1, &[&SMALL[..], set].concat());
         let mut run = Run::on(&asked, &server.experience()).expect("a server");
-        run.step().expect_err("a refusal").to_string()
+        run.try_iterate().expect_err("a refusal").to_string()
     };
     let text = error("Hopper-v5", &["constraints.velocity.limit=3.0"]);
     assert!(text.contains("task 'Hopper-v5' in [constraints]") && text.contains("foreign-robot"), "{text}");
@@ -188,7 +188,7 @@ fn a_server_that_ends_keeps_what_was_learned() {
     trace(&mut run, 2);
     let before = run.snapshot().to_bytes();
     server.end();
-    let error = run.step().expect_err("no server").to_string();
+    let error = run.try_iterate().expect_err("no server").to_string();
     assert!(
         error.contains("no rollout server") || error.contains("ended") || error.contains("server"),
         "{error}"
@@ -205,7 +205,7 @@ fn a_training_is_stopped_in_the_middle_and_begins_anew() {
     let mut run = Run::on(&asked, &experience).expect("a server");
     let first = trace(&mut run, 1);
     stop.store(true, Ordering::Relaxed);
-    assert!(run.step().expect("no error").is_none(), "a stop ends the collection");
+    assert!(run.try_iterate().expect("no error").is_none(), "a stop ends the collection");
     drop(run);
     stop.store(false, Ordering::Relaxed);
     let mut again = Run::on(&asked, &experience).expect("a server");

@@ -200,7 +200,7 @@ fn targets_within_the_intervals_are_not_touched() {
             same += usize::from(allowed);
         }
         let ledger = &out.next.ledger;
-        assert_eq!((ledger.raw_violations.total(), ledger.violations.total()), (broken, 0));
+        assert_eq!((ledger.raw_violations.total(), ledger.target_violations.total()), (broken, 0));
         assert_eq!(ledger.status == Status::Clamped, broken > 0);
     }
     assert!(same > 1000, "{same}");

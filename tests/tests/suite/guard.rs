@@ -92,7 +92,7 @@ fn run(snapshot: &Snapshot, seed: u64, ticks: usize, restart_every: usize) -> Ou
             let ledger = &out.next.ledger;
             assert!(ledger.moved > 0.0 || same, "tick {tick}: an allowed action was changed");
             moved += u64::from(!same);
-            refused += u64::from(ledger.violations.total() > 0);
+            refused += u64::from(ledger.target_violations.total() > 0);
             braked += u64::from(!status.is_ok() && ledger.rung == Rung::Brake);
         }
         env.step(&out.action);

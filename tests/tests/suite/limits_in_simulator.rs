@@ -50,7 +50,7 @@ fn run_at(seed: u64, projection: bool, ticks: usize, dt: f64) -> Outcome {
         let status = controller.update(&state, &noise, &mut out);
         // The stored brake is a checked way to stop; only the joints' own brakes are not.
         braked += u64::from(!status.is_ok() && out.next.ledger.rung == Rung::Brake);
-        refused += u64::from(out.next.ledger.violations.total() > 0);
+        refused += u64::from(out.next.ledger.target_violations.total() > 0);
         env.step(&out.action);
         inverse.force(env.sim(), &mut force).expect("an inverse");
         meter.observe(env.qpos(), env.qvel(), Some(&force));

@@ -130,7 +130,7 @@ fn ranks_that_do_not_do_the_same_are_refused() {
         let mut asked = asked("ppo", 1);
         asked.seed = rank as u64;
         let mut training = Training::on(&asked, experience).expect("a training");
-        training.step().expect_err("they differ").to_string()
+        training.try_iterate().expect_err("they differ").to_string()
     });
     for words in said {
         assert!(words.contains("do not train the same") && words.contains("seed"), "{words}");

@@ -93,7 +93,7 @@ fn run(job: &Job) -> Result<Counts, Box<dyn Error>> {
         }
         attack.propose(tick, &q, &v, &mut proposal);
         counts.status(projector.project(&q, &v, &proposal, &mut target));
-        counts.refused += u64::from(target.ledger.violations.total() > 0);
+        counts.refused += u64::from(target.ledger.target_violations.total() > 0);
         dynamics.rnea(&q, &v, &target.acceleration, &mut tau);
         before.copy_from_slice(&v);
         plant.step(&tau)?;
@@ -124,7 +124,7 @@ fn tell(tick: usize, counts: &Counts, worst: [f64; 4], proposal: &Proposal, targ
             "tick {tick}: {:?} by {:?}, excess {worst:?} (position, velocity, acceleration, torque), {:?}, {} outside; proposed {:?} {:?}",
             l.status,
             l.rung,
-            l.violations,
+            l.target_violations,
             l.outside.len(),
             proposal.q,
             proposal.v

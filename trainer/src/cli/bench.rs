@@ -105,10 +105,10 @@ impl TrainBench {
         let (mut rates, mut ceilings, mut shares) = (Vec::new(), Vec::new(), Vec::new());
         for _ in 0..self.repeat.max(1) {
             let mut training = Training::new(&request)?;
-            training.step()?;
+            training.try_iterate()?;
             let (start, from) = (Instant::now(), training.snapshot().manifest.steps);
             while start.elapsed().as_secs_f64() < self.seconds {
-                training.step()?;
+                training.try_iterate()?;
             }
             let seconds = start.elapsed().as_secs_f64();
             rates.push((training.snapshot().manifest.steps - from) as f64 / seconds);

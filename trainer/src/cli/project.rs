@@ -1,7 +1,7 @@
 //! `nearl project`: states and proposals in, targets out, one JSON object a line.
 //!
 //! Input `{"q": [..], "v": [..], "q_proposal": [..], "v_proposal": [..]}`; output
-//! `{"q": [..], "v": [..], "status": "..", "active": [..], "outside": [..], "moved": .., "violations": .., ..}`.
+//! `{"q": [..], "v": [..], "status": "..", "active": [..], "outside": [..], "moved": .., "target_violations": .., ..}`.
 
 use super::{Failure, say};
 use crate::{env, tasks};
@@ -73,7 +73,7 @@ impl Project {
             say(serde_json::json!({
                 "q": target.q, "v": target.v, "status": l.status.name(), "reason": l.status.reason(), "rung": l.rung.name(),
                 "active": active, "outside": outside, "moved": l.moved, "slack": l.slack, "iterations": l.iterations, "residual": l.residual,
-                "raw_violations": l.raw_violations.total(), "violations": l.violations.total(), "duration_ns": l.duration_ns,
+                "raw_violations": l.raw_violations.total(), "target_violations": l.target_violations.total(), "duration_ns": l.duration_ns,
             }));
         }
         Ok(())

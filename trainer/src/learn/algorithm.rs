@@ -32,71 +32,140 @@ pub enum Algorithm {
 
 /// One line of the table.
 #[derive(Clone, Copy, Debug)]
-pub struct AlgorithmEntry {
+pub struct RegisteredAlgorithm {
     /// Which.
     pub algorithm: Algorithm,
     /// As it is written.
     pub name: &'static str,
     /// What it is, in one line.
     pub about: &'static str,
+    /// The policy is one on actions: it proposes nothing.
+    pub is_direct: bool,
+    /// What it has demonstrations for; `None` takes none.
+    pub demos: Option<Demonstrated>,
+}
+
+/// What an algorithm has demonstrations for.
+#[derive(Clone, Copy, Debug)]
+pub struct Demonstrated {
+    /// They have to hold actions.
+    pub needs_actions: bool,
+    /// The inverse model learns alone, from noise, before anything else.
+    pub warms_up: bool,
+    /// Episodes begin in demonstrated states now and then; those that it is compared with were published without.
+    pub begins_there: bool,
+    /// How much a transition looks demonstrated may be the reward.
+    pub likeness: bool,
 }
 
 /// Every algorithm, in the order of the paper; behind them what it is compared with.
-pub const ALGORITHMS: &[AlgorithmEntry] = &[
-    AlgorithmEntry {
+pub const ALGORITHMS: &[RegisteredAlgorithm] = &[
+    RegisteredAlgorithm {
         algorithm: Algorithm::Ppo,
         name: "ppo",
         about: "a Gaussian policy on actions, nothing proposed or projected; an inverse model learns on the side",
+        is_direct: true,
+        demos: None,
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::PpoCombined,
         name: "ppo-combined",
         about: "PPO on the paper's two networks, policy and inverse model, without any other loss (its RL-Pure)",
+        is_direct: false,
+        demos: None,
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::Nearl,
         name: "nearl",
         about: "supervised meta policy and inverse model, policy gradient on the pair (the paper's Algorithm 1)",
+        is_direct: false,
+        demos: None,
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::Pid2Gan,
         name: "pid2-gan",
         about: "policy, inverse dynamics and a discriminator without a bottleneck",
+        is_direct: false,
+        demos: None,
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::Pid2Ib,
         name: "pid2-ib",
         about: "policy, inverse dynamics and a discriminator with the information bottleneck (the paper's Algorithm 2)",
+        is_direct: false,
+        demos: None,
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::Bc,
         name: "bc",
         about: "the meta policy clones demonstrated states, the inverse model learns from own experience; no reward is read",
+        is_direct: false,
+        demos: Some(Demonstrated {
+            needs_actions: false,
+            warms_up: true,
+            begins_there: true,
+            likeness: false,
+        }),
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::Soil,
         name: "soil",
         about: "PPO on actions with demonstrations whose actions an inverse model infers",
+        is_direct: true,
+        demos: Some(Demonstrated {
+            needs_actions: false,
+            warms_up: true,
+            begins_there: true,
+            likeness: false,
+        }),
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::Dapg,
         name: "dapg",
         about: "PPO on actions, cloned first, with demonstrated actions in its gradient",
+        is_direct: true,
+        demos: Some(Demonstrated {
+            needs_actions: true,
+            warms_up: false,
+            begins_there: false,
+            likeness: false,
+        }),
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::Pid2Il,
         name: "pid2-il",
         about: "`pid2-ib`, cloned first, whose discriminator takes demonstrated states for real too (Algorithm 2 whole)",
+        is_direct: false,
+        demos: Some(Demonstrated {
+            needs_actions: false,
+            warms_up: true,
+            begins_there: true,
+            likeness: true,
+        }),
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::Bco,
         name: "bco",
         about: "a policy on actions clones demonstrated states, whose actions an inverse model infers; no reward is read",
+        is_direct: true,
+        demos: Some(Demonstrated {
+            needs_actions: false,
+            warms_up: true,
+            begins_there: false,
+            likeness: false,
+        }),
     },
-    AlgorithmEntry {
+    RegisteredAlgorithm {
         algorithm: Algorithm::Gaifo,
         name: "gaifo",
         about: "PPO on actions whose reward is how much a transition looks demonstrated; the task's reward is not read",
+        is_direct: true,
+        demos: Some(Demonstrated {
+            needs_actions: false,
+            warms_up: false,
+            begins_there: false,
+            likeness: true,
+        }),
     },
 ];
 
@@ -115,15 +184,15 @@ pub struct UnknownAlgorithm {
 impl Algorithm {
     /// As it is written.
     pub fn name(self) -> &'static str {
-        self.entry().name
+        self.registered().name
     }
 
     /// What it is, in one line.
     pub fn about(self) -> &'static str {
-        self.entry().about
+        self.registered().about
     }
 
-    fn entry(self) -> &'static AlgorithmEntry {
+    fn registered(self) -> &'static RegisteredAlgorithm {
         let found = ALGORITHMS.iter().find(|e| e.algorithm == self);
         found.unwrap_or_else(|| unreachable!("{self:?} has no line in the table"))
     }
@@ -135,27 +204,23 @@ impl Algorithm {
 
     /// Whether the policy is one on actions: it proposes nothing.
     pub fn is_direct(self) -> bool {
-        matches!(self, Self::Ppo | Self::Soil | Self::Dapg | Self::Bco | Self::Gaifo)
+        self.registered().is_direct
     }
 
-    /// Whether it learns from demonstrations; the others take none.
-    pub fn imitates(self) -> bool {
-        matches!(self, Self::Bc | Self::Soil | Self::Dapg | Self::Pid2Il | Self::Bco | Self::Gaifo)
+    /// What it has demonstrations for; `None` takes none.
+    pub fn demos(self) -> Option<Demonstrated> {
+        self.registered().demos
     }
 
-    /// Whether its inverse model learns alone, from noise, before anything else.
-    pub fn warms_up(self) -> bool {
-        self.imitates() && !matches!(self, Self::Dapg | Self::Gaifo)
-    }
-
-    /// Whether its episodes begin in demonstrated states now and then; those that it is compared with were published without.
-    pub fn begins_in_demonstrations(self) -> bool {
-        matches!(self, Self::Bc | Self::Soil | Self::Pid2Il)
+    /// Names of those whose reward may be how much a transition looks demonstrated.
+    pub fn by_likeness() -> String {
+        let those = ALGORITHMS.iter().filter(|e| e.demos.is_some_and(|demos| demos.likeness));
+        those.map(|e| e.name).collect::<Vec<_>>().join(" and ")
     }
 
     /// Names of those that learn from demonstrations.
     pub fn imitating() -> String {
-        let names = ALGORITHMS.iter().filter(|e| e.algorithm.imitates()).map(|e| e.name);
+        let names = ALGORITHMS.iter().filter(|e| e.demos.is_some()).map(|e| e.name);
         names.collect::<Vec<_>>().join(", ")
     }
 }
@@ -173,7 +238,7 @@ impl FromStr for Algorithm {
         if let Some(e) = ALGORITHMS.iter().find(|e| e.name == name) {
             return Ok(e.algorithm);
         }
-        let alike = |e: &AlgorithmEntry| (strsim::jaro(e.name, &name.to_lowercase()), e.name);
+        let alike = |e: &RegisteredAlgorithm| (strsim::jaro(e.name, &name.to_lowercase()), e.name);
         let near =
             ALGORITHMS.iter().map(alike).max_by(|a, b| a.0.total_cmp(&b.0)).filter(|(score, _)| *score > 0.7);
         Err(UnknownAlgorithm {

@@ -2,7 +2,7 @@
 //!
 //! The stream carries states, versions and the seed of the noise; everything else is computed again by the same
 //! [`Controller`] the loop has, with the networks of the version that acted. A tick whose target and action do not come out
-//! bit for bit (the first motion is let in softly; what the projector remembers was lost in a gap) is counted and left out.
+//! bit for bit (the ramp of the first motion; what the projector remembers was lost in a gap) is counted and left out.
 
 use crate::env::{Env, EnvError, Moment};
 use crate::rollout::{Period, Rows};

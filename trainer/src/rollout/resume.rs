@@ -1,4 +1,4 @@
-//! An environment in the middle of an episode, to disk and back.
+//! Saves an environment in the middle of an episode, and goes on from there.
 //!
 //! What follows a start depends on it, the goal and the actions alone ([`Env::set_state`](crate::env::Env::set_state)), so the
 //! episode is kept as these and played again: no part of a simulator's memory has to be known.

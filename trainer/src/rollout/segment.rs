@@ -92,17 +92,17 @@ pub struct Tally {
     pub notes: Vec<f64>,
     /// Control ticks.
     pub ticks: u64,
-    /// Ticks whose raw proposal broke a constraint.
+    /// Ticks whose raw proposal broke a limit.
     pub raw_violations: u64,
-    /// Ticks that began with a controllable joint already outside its limits: the projection can only lead it back.
+    /// Ticks that began outside a limit: their targets can only come nearer.
     pub recovering: u64,
-    /// Ticks that began inside and whose target broke a constraint, by the independent checker.
+    /// Ticks that began within the limits and whose target broke one, by the independent checker.
     pub target_violations: u64,
     /// Ticks in which the projection moved the proposal.
     pub moved: u64,
     /// Sum of the weighted distances moved [weight rad/s].
     pub distance: f64,
-    /// Ticks whose raw proposal broke a constraint and whose target breaks none.
+    /// Ticks whose raw proposal broke a limit and whose target breaks none.
     pub avoided: u64,
     /// Sum over ticks of the rows that held the target back.
     pub active_rows: u64,
@@ -117,11 +117,11 @@ pub struct Tally {
 impl Tally {
     /// Counts a control tick by what the projection says of it; what only a simulator knows is the caller's.
     pub(crate) fn count(&mut self, ledger: &Ledger) {
-        let (raw, left) = (ledger.raw_violations.total() > 0, ledger.violations.total() > 0);
+        let (raw, left) = (ledger.raw_violations.total() > 0, ledger.target_violations.total() > 0);
         self.ticks += 1;
         self.raw_violations += u64::from(raw);
         self.recovering += u64::from(!ledger.outside.is_empty());
-        self.target_violations += u64::from(left && ledger.outside.is_empty());
+        self.target_violations += u64::from(ledger.target_breaks());
         self.moved += u64::from(ledger.moved > 0.0);
         self.distance += ledger.moved;
         self.avoided += u64::from(raw && !left);

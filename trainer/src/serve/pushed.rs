@@ -1,5 +1,5 @@
-//! Snapshots that were pushed to the server: each is validated on a thread of its own. Of a small one the server waits for it; while a large one
-//! is validated everybody is served but who goes by what was pushed.
+//! Snapshots that were pushed to the server. Each is validated on a thread of its own. The server waits until a small one is validated. While a
+//! large one is validated, it serves all clients but those whose next request needs that snapshot.
 
 use super::dispatcher::Dispatcher;
 use super::policy::Validating;

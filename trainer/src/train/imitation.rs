@@ -42,24 +42,25 @@ impl Imitation {
         steps: u64,
     ) -> Result<Option<Self>, TrainError> {
         let own = settings.demos.clone();
-        match (algo.imitates(), own.file.is_empty()) {
-            (false, true) => return Ok(None),
-            (false, false) => {
+        let uses = match (algo.demos(), own.file.is_empty()) {
+            (None, true) => return Ok(None),
+            (None, false) => {
                 return Err(TrainError::Settings(format!(
                     "[train.demos.file]: '{algo}' takes no demonstrations; give one of {} with --algo, or leave --demos out",
                     Algorithm::imitating()
                 )));
             }
-            (true, true) => {
+            (Some(_), true) => {
                 return Err(TrainError::Settings(format!(
                     "'{algo}' learns from demonstrations and was given none; give a file with --demos ('nearl demos record RUN' writes one)"
                 )));
             }
-            (true, false) => {}
-        }
-        if own.reward == DemoReward::Likeness && !matches!(algo, Algorithm::Pid2Il | Algorithm::Gaifo) {
+            (Some(uses), false) => uses,
+        };
+        if own.reward == DemoReward::Likeness && !uses.likeness {
             return Err(TrainError::Settings(format!(
-                "[train.demos.reward]: \"likeness\" is for pid2-il and gaifo, and '{algo}' has no use for it; leave it out, or take one of these"
+                "[train.demos.reward]: \"likeness\" is for {}, and '{algo}' has no use for it; leave it out, or take one of these",
+                Algorithm::by_likeness()
             )));
         }
         let wrong = |reason| TrainError::Demos(DemoError { file: own.file.clone(), reason });
@@ -68,11 +69,11 @@ impl Imitation {
         let mut env = crate::env::of_task(manifest, &task.name).map_err(RolloutError::from)?;
         demos.check(&mut *env, task.time.dt * task.time.policy_every as f64).map_err(wrong)?;
         let demos = demos.columns(&task.state.observation).map_err(wrong)?;
-        if algo == Algorithm::Dapg {
+        if uses.needs_actions {
             check_actions(&demos, manifest.action_lower.len()).map_err(wrong)?;
         }
         let batch = (settings.n_envs * settings.n_steps) as u64;
-        let warm_ups = if algo.warms_up() { own.warmup.div_ceil(batch) } else { 0 };
+        let warm_ups = if uses.warms_up { own.warmup.div_ceil(batch) } else { 0 };
         Ok(Some(Self {
             demos,
             settings: own,
@@ -80,7 +81,7 @@ impl Imitation {
             warm_ups,
             updates: updates(steps, batch, warm_ups),
             batch,
-            begins_in_frames: algo.begins_in_demonstrations(),
+            begins_in_frames: uses.begins_there,
         }))
     }
 

@@ -1,4 +1,4 @@
-//! A training to disk and back.
+//! Writes a training to a checkpoint, and goes on from one.
 
 use super::{Experience, Request, TrainError, Training};
 use crate::checkpoint::{self, Checkpoint, CheckpointError, FORMAT, Header, Values};

@@ -83,7 +83,7 @@ fn run(
     mut report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
     while !training.is_done() {
-        let Some(progress) = training.step_in(&mut folder)? else { break };
+        let Some(progress) = training.iterate_in(&mut folder)? else { break };
         if !report(&progress, training.fraction()) {
             break;
         }
@@ -92,13 +92,13 @@ fn run(
 }
 
 impl Training {
-    /// [`Training::step`], its row in the run folder, and a checkpoint where one is due on the way; at the end it is the
-    /// caller's to [`save`](Training::save). What was learned is kept when the step fails.
+    /// [`Training::try_iterate`], its row in the run folder, and a checkpoint where one is due on the way; at the end it is the
+    /// caller's to [`save`](Training::save). What was learned is kept when it fails.
     ///
     /// # Errors
     /// [`TrainError`].
-    pub fn step_in(&mut self, folder: &mut RunFolder) -> Result<Option<Progress>, TrainError> {
-        let progress = match self.step() {
+    pub fn iterate_in(&mut self, folder: &mut RunFolder) -> Result<Option<Progress>, TrainError> {
+        let progress = match self.try_iterate() {
             Ok(Some(progress)) => progress,
             Ok(None) => return Ok(None),
             Err(e) => {

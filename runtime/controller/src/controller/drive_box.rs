@@ -94,7 +94,7 @@ impl DriveBox {
             let asked = joint.stiffness * (*action - at) - joint.damping * v;
             let broken = u32::from(asked < low - TOLERANCE || asked > high + TOLERANCE);
             report.raw_violations += broken;
-            report.violations += if hold { 0 } else { broken };
+            report.target_violations += if hold { 0 } else { broken };
             let force = if hold { asked.clamp(low, high) } else { asked };
             if force != asked {
                 let target = at + (force + joint.damping * v) / joint.stiffness;

@@ -1,9 +1,9 @@
 //! What a controller tells of itself: sizes, names, limits, and how far a state is from them.
 
-use super::{Controller, Excess, Noise, Output, State};
+use super::{Controller, Excess, Inverse, Noise, Output, State};
 use crate::PolicyKind;
 use crate::normaliser::Normaliser;
-use nearl_constraints::{LimitSet, Model, StateLayout, Target};
+use nearl_constraints::{Entry, LimitSet, Model, StateLayout, Target};
 
 impl Controller {
     /// How far `state` is outside the limits of the controllable joints: the largest excess of a position and of a velocity; less than
@@ -45,6 +45,32 @@ impl Controller {
     /// Number of entries that the policy sees.
     pub fn n_seen(&self) -> usize {
         self.policy.n_in()
+    }
+
+    /// The first joint whose position or velocity the observation lacks although the tick needs it: for analytic inverse dynamics, or for an
+    /// observation that is computed from the state.
+    pub fn first_unseen(&self) -> Option<String> {
+        if !(matches!(self.inverse, Inverse::Analytic(_)) || self.foreign.remembers()) {
+            return None;
+        }
+        let entries = self.layout.entries();
+        let is_seen = |dof: usize| {
+            let position = entries.iter().any(|e| matches!(e, Entry::Position { dof: d, .. } if *d == dof));
+            position && entries.contains(&Entry::Velocity { dof })
+        };
+        (0..self.model.nv()).find(|dof| !is_seen(*dof)).map(|dof| self.model.dof_name(dof))
+    }
+
+    /// Writes an observation (n_obs) into `state`, and with it the joints' positions and velocities that it holds; the others stay.
+    pub fn observed(&self, obs: &[f64], state: &mut State) {
+        state.obs.copy_from_slice(obs);
+        for (entry, value) in self.layout.entries().iter().zip(obs) {
+            match *entry {
+                Entry::Position { idx_q, .. } => state.q[idx_q] = *value,
+                Entry::Velocity { dof } => state.v[dof] = *value,
+                Entry::Other => {}
+            }
+        }
     }
 
     /// Writes what the policy would see in `state` if it ran in the next tick, before the normaliser (n_seen).
