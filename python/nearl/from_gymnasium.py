@@ -45,9 +45,9 @@ def from_gymnasium(env_id: str, folder: str | os.PathLike[str], **kwargs: Any) -
     """Writes ``<name>.toml`` and its robot file into ``folder`` for a Gymnasium environment that is built on ``MujocoEnv``.
 
     The task steps the same physics as Gymnasium, bit for bit for the same state and action, and observes all joint positions and
-    velocities. Reward, start and end of an episode come along for InvertedPendulum, InvertedDoublePendulum, Swimmer, Reacher and Pusher (v5);
-    HalfCheetah, Hopper, Walker2d and Ant are bundled tasks. For others they are code in Gymnasium: write them as expressions, which trains
-    everywhere, or pass functions to ``nearl.make_vec(file, n, reward=..., termination=...)``.
+    velocities. Reward, start and end of an episode come along for all eleven MuJoCo tasks of Gymnasium (v5), with the arguments given. For
+    other environments they are code: write them as expressions, which trains everywhere, or pass functions to
+    ``nearl.make_vec(file, n, reward=..., termination=...)``.
 
     Not supported: robots with meshes, actuators that do not drive a single joint within a range, wrappers, environments that move
     their goal or model while they run. Training with constraints also needs the robot to be one tree of bodies.

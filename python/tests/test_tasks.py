@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import ROOT
+from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
@@ -158,38 +159,86 @@ def test_gymnasiums_mujoco_environments_become_task_files(env_id: str, tmp_path:
         nearl.from_gymnasium(env_id, tmp_path)
 
 
-def judged_afresh(env: gymnasium.Env, action: np.ndarray) -> float:
-    """Gymnasium's own reward function; after a step MuJoCo's places of bodies are those before its last physics step, here they are new."""
+OWN_TASKS = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Swimmer-v5", "Reacher-v5", "Pusher-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5"]
+OWN_TASKS += ["Ant-v5", "Humanoid-v5", "HumanoidStandup-v5"]
+# Of Gymnasium's reward functions these read places of bodies, which after a step are those before its last physics step.
+LAGGING = ("InvertedDoublePendulum-v5", "Reacher-v5", "Pusher-v5", "Ant-v5", "Humanoid-v5")
+
+
+def place(env: gymnasium.Env) -> np.ndarray:
+    """Where Gymnasium's Ant and Humanoid measure their speed, at the present state."""
+    mujoco.mj_kinematics(env.model, env.data)
+    if type(env).__name__ == "AntEnv":
+        return env.data.body(env._main_body).xpos.copy()
+    return np.average(env.data.xipos, axis=0, weights=env.model.body_mass)
+
+
+def judged_afresh(env: gymnasium.Env, action: np.ndarray, before: np.ndarray) -> float:
+    """Gymnasium's own reward function, with places of bodies that are those of the new state."""
+    name = type(env).__name__
+    if name in ("AntEnv", "HumanoidEnv"):
+        return env._get_rew((place(env) - before)[0] / env.dt, action)[0]
     mujoco.mj_forward(env.model, env.data)
-    if type(env).__name__ != "InvertedDoublePendulumEnv":
+    if name != "InvertedDoublePendulumEnv":
         return env._get_rew(action)[0]
     x, _, y = env.data.site_xpos[0]
     return env._get_rew(x, y, bool(y <= 1))[0]
 
 
-@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Swimmer-v5", "Reacher-v5", "Pusher-v5"])
+def again(theirs: gymnasium.Env, ours: nearl.Env) -> None:
+    """Both go on from Gymnasium's state, with nothing else of what was before: contact forces begin where the solver last was."""
+    q, v = theirs.data.qpos.copy(), theirs.data.qvel.copy()
+    mujoco.mj_resetData(theirs.model, theirs.data)
+    theirs.set_state(q, v)
+    ours.set_state(q, v)
+
+
+@pytest.mark.parametrize("env_id", OWN_TASKS)
 def test_gymnasiums_own_tasks_bring_their_rewards_and_ends(env_id: str, tmp_path: Path) -> None:
     theirs, ours = gymnasium.make(env_id).unwrapped, nearl.Env(str(nearl.from_gymnasium(env_id, tmp_path)))
     theirs.action_space.seed(1)
     theirs.reset(seed=1)
-    ours.set_state(theirs.data.qpos, theirs.data.qvel)
-    ends = 0
+    again(theirs, ours)
+    ends = contacts = 0
     for _ in range(300):
         action = theirs.action_space.sample().astype(np.float64)
+        before = place(theirs)
         _, reward, terminated, _, _ = theirs.step(action)
         _, our_reward, our_terminated, _, _ = ours.step(action)
-        if env_id in ("InvertedDoublePendulum-v5", "Reacher-v5", "Pusher-v5"):
-            reward = judged_afresh(theirs, action)
-        assert our_reward == pytest.approx(reward, abs=1e-12)
-        if terminated or our_terminated:  # a tip that crosses the line within a physics step may be seen one period apart
+        contacts += bool(np.any(theirs.data.cfrc_ext))
+        if env_id in LAGGING:
+            reward = judged_afresh(theirs, action, before)
+        assert our_reward == pytest.approx(reward, abs=1e-12, rel=1e-12)
+        if "Inverted" not in env_id:
+            assert our_terminated == terminated
+        elif terminated or our_terminated:  # a tip that crosses the line within a physics step may be seen one period apart
             assert our_terminated == (reward <= 1)
+        if terminated or our_terminated:
             ends += 1
             theirs.reset()
-        theirs.set_state(theirs.data.qpos.copy(), theirs.data.qvel.copy())
-        ours.set_state(theirs.data.qpos, theirs.data.qvel)
-    assert ends > 0 or "Inverted" not in env_id
+        again(theirs, ours)
+    assert ends > 0 or env_id in ("Swimmer-v5", "Reacher-v5", "Pusher-v5", "HalfCheetah-v5", "Ant-v5", "HumanoidStandup-v5")
+    assert contacts > 20 or env_id not in ("Ant-v5", "Humanoid-v5", "HumanoidStandup-v5")
     drawn = np.array([np.r_[ours.reset(seed=seed)[0], 0] for seed in range(20)])
     assert drawn.std(axis=0).max() > 0, "episodes begin at random places"
+
+
+def test_arguments_of_a_task_of_gymnasium_are_in_its_reward(tmp_path: Path) -> None:
+    """Weights and ranges of one's own, an episode that does not end, and a force that is not cut."""
+    given = {"forward_reward_weight": 2.0, "healthy_z_range": (0.4, float("inf")), "contact_force_range": (-float("inf"), 5.0)}
+    given |= {"contact_cost_weight": 0.01, "terminate_when_unhealthy": False}
+    theirs, ours = gymnasium.make("Ant-v5", **given).unwrapped, nearl.Env(str(nearl.from_gymnasium("Ant-v5", tmp_path, **given)))
+    theirs.action_space.seed(2)
+    theirs.reset(seed=2)
+    unhealthy = 0
+    for _ in range(200):
+        again(theirs, ours)
+        action, before = theirs.action_space.sample().astype(np.float64), place(theirs)
+        _, _, terminated, _, _ = theirs.step(action)
+        _, our_reward, our_terminated, _, _ = ours.step(action)
+        assert our_reward == pytest.approx(judged_afresh(theirs, action, before), rel=1e-12) and not terminated and not our_terminated
+        unhealthy += not theirs.is_healthy
+    assert 0 < unhealthy < 200
 
 
 def test_an_environment_without_mujoco_has_no_robot(tmp_path: Path) -> None:
@@ -197,7 +246,7 @@ def test_an_environment_without_mujoco_has_no_robot(tmp_path: Path) -> None:
         nearl.from_gymnasium("CartPole-v1", tmp_path)
 
 
-@pytest.mark.parametrize("env_id", ["InvertedDoublePendulum-v5", "Swimmer-v5", "Reacher-v5", "Pusher-v5"])
+@pytest.mark.parametrize("env_id", OWN_TASKS)
 def test_every_task_of_gymnasium_trains(env_id: str, tmp_path: Path) -> None:
     """A few iterations through the environment, the constraints and the learner: weights move and stay numbers."""
     agent = nearl.PID2(nearl.from_gymnasium(env_id, tmp_path), settings={"train.n_envs": 4, "train.n_steps": 64})
@@ -223,9 +272,14 @@ def test_tasks_whose_reward_is_code_train_with_functions(env_id: str, tmp_path: 
     assert len(rows) == 3 and all(np.isfinite(value) for row in rows for value in row.values())
 
 
+class OfSomebody(HopperEnv):
+    """A class whose reward nobody knows here."""
+
+
 def test_a_task_from_gymnasium_learns(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"\[reward\] of 'Humanoid' is 0 whatever happens"):
-        nearl.PID2(nearl.from_gymnasium("Humanoid-v5", tmp_path))
+    gymnasium.register("OfSomebody-v0", OfSomebody)
+    with pytest.raises(ValueError, match=r"\[reward\] of 'OfSomebody' is 0 whatever happens"):
+        nearl.PID2(nearl.from_gymnasium("OfSomebody-v0", tmp_path))
     file = nearl.from_gymnasium("InvertedPendulum-v5", tmp_path)
     seen: list[float] = []
     nearl.PID2(file, settings={"train.n_envs": 8}).learn(40_000, callback=lambda _, m: seen.append(m.get("rollout/ep_rew_mean", 0.0)))

@@ -54,6 +54,8 @@ struct User {
     start: Vec<Start>,
     before: Before,
     course: Course,
+    /// Some expression reads the external forces on bodies.
+    reads_external: bool,
     /// Where the commands are in the observation, if they stand there together.
     seen_commands: std::ops::Range<usize>,
     /// What is told of the episode.
@@ -149,7 +151,10 @@ fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spe
     let climbs = course.curriculum.is_some();
     let notes = Notes::read(&task.metrics, &reward, &names, drawn, measured.is_some(), climbs)?;
     let told = reward.iter().chain(&termination).map(|term| &term.of).chain(notes.expressions());
-    course.contacts = Contacts::of(model, told.chain(&observation).chain(&privileged));
+    let told: Vec<_> = told.chain(&observation).chain(&privileged).collect();
+    let is_external = |quantity| matches!(quantity, Quantity::External(..));
+    let reads_external = told.iter().flat_map(|e| e.quantities()).any(is_external);
+    course.contacts = Contacts::of(model, told.into_iter());
     let max_episode_steps = task.time.max_episode_steps.unwrap_or(EPISODE);
     let constants = Constants { name: task.name.clone(), sub_steps, max_episode_steps };
     let seen_commands = place_of(&commands, &listed);
@@ -168,6 +173,7 @@ fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spe
         start: starts(task, &spec.joints, &start)?,
         before: Before::new(model),
         course,
+        reads_external,
         seen_commands,
         dt: spec.dt,
         drives,
@@ -341,8 +347,11 @@ impl Rules for User {
         0.0
     }
 
-    /// Kinematics at the new state: MuJoCo's step leaves them at the old one.
+    /// Kinematics at the new state: MuJoCo's step leaves them at the old one, to which the contact forces belong.
     fn finish(&self, sim: &mut Sim) -> Result<(), MjError> {
+        if self.reads_external {
+            sim.compute_contact_forces()?;
+        }
         sim.update_kinematics()
     }
 

@@ -258,6 +258,13 @@ impl Sim {
         self.state.xpos()
     }
 
+    /// Centre of mass of all bodies \[m\], as of the last evaluation.
+    pub fn centre(&self) -> [f64; 3] {
+        let (mass, at) = (self.model.0.body_mass(), self.state.xipos());
+        let total: f64 = mass.iter().sum();
+        [0, 1, 2].map(|axis| mass.iter().zip(at).map(|(m, x)| m * x[axis]).sum::<f64>() / total)
+    }
+
     /// External force on each body `[torque, force]`, the world included, after [`Sim::compute_contact_forces`].
     pub fn contact_forces(&self) -> &[[f64; 6]] {
         self.state.cfrc_ext()

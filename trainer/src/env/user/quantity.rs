@@ -19,6 +19,12 @@ pub(super) enum Quantity {
     Place(usize, usize),
     /// `vx.<body>`, `vy.`, `vz.`: change of it over the control period, per second \[m/s\].
     Speed(usize, usize),
+    /// `com.x`, `com.y`, `com.z`: centre of mass of all bodies \[m\].
+    Centre(usize),
+    /// `com.vx`, `com.vy`, `com.vz`: change of it over the control period, per second \[m/s\].
+    CentreSpeed(usize),
+    /// `cfrc.<body>.tx`, `.ty`, `.tz`, `.fx`, `.fy`, `.fz`: MuJoCo's external torque \[N·m\] and force \[N\] on a body in the last physics step.
+    External(usize, usize),
     /// `ground.<body>`: height of the ground where the body is \[m\].
     Ground(usize),
     /// `base.vx`, `base.vy`, `base.vz`: velocity of the free base in its own axes \[m/s\].
@@ -99,6 +105,8 @@ pub(super) struct Own<'a> {
 pub(super) struct Names(Vec<(String, Quantity)>);
 
 const AXES: [&str; 3] = ["x", "y", "z"];
+/// Entries of an external force, in MuJoCo's order.
+const WRENCH: [&str; 6] = ["tx", "ty", "tz", "fx", "fy", "fz"];
 
 impl Names {
     pub(super) fn new(model: &Model, own: Own<'_>, place: Place) -> Names {
@@ -156,12 +164,23 @@ impl Names {
     }
 
     fn put_bodies(&mut self, model: &Model, follows: bool, outcome: bool) {
+        for (axis, letter) in AXES.iter().enumerate() {
+            self.put(format!("com.{letter}"), Quantity::Centre(axis));
+            if outcome {
+                self.put(format!("com.v{letter}"), Quantity::CentreSpeed(axis));
+            }
+        }
         for body in 1..model.n_bodies() {
             let name = model.body_name(body);
             for (axis, letter) in AXES.iter().enumerate() {
                 self.put(format!("{letter}.{name}"), Quantity::Place(body, axis));
                 if outcome {
                     self.put(format!("v{letter}.{name}"), Quantity::Speed(body, axis));
+                }
+            }
+            if follows && outcome {
+                for (k, entry) in WRENCH.iter().enumerate() {
+                    self.put(format!("cfrc.{name}.{entry}"), Quantity::External(body, k));
                 }
             }
             if follows {
@@ -249,18 +268,20 @@ pub(super) struct Before {
     q: Vec<f64>,
     v: Vec<f64>,
     x: Vec<[f64; 3]>,
+    centre: [f64; 3],
 }
 
 impl Before {
     pub(super) fn new(model: &Model) -> Before {
         let (q, v) = (vec![0.0; model.nq()], vec![0.0; model.nv()]);
-        Before { q, v, x: vec![[0.0; 3]; model.n_bodies()] }
+        Before { q, v, x: vec![[0.0; 3]; model.n_bodies()], centre: [0.0; 3] }
     }
 
     pub(super) fn remember(&mut self, sim: &Sim) {
         self.q.copy_from_slice(sim.qpos());
         self.v.copy_from_slice(sim.qvel());
         self.x.copy_from_slice(sim.positions());
+        self.centre = sim.centre();
     }
 }
 
@@ -280,6 +301,8 @@ impl Outcome<'_> {
         match quantity {
             Quantity::Change(i) => sim.qpos()[i] - before.q[i],
             Quantity::Speed(body, axis) => (sim.positions()[body][axis] - before.x[body][axis]) / self.dt,
+            Quantity::CentreSpeed(axis) => (sim.centre()[axis] - before.centre[axis]) / self.dt,
+            Quantity::External(body, k) => sim.contact_forces()[body][k],
             Quantity::Action(i) => self.action[i],
             Quantity::Effort => super::super::rules::squared(self.action),
             Quantity::ActionChange => self.course.map_or(0.0, |course| course.action_change),
@@ -343,6 +366,7 @@ impl Seen<'_> {
             Quantity::Position(i) => self.q[i],
             Quantity::Velocity(i) => self.v[i],
             Quantity::Place(body, axis) => self.sim.positions()[body][axis],
+            Quantity::Centre(axis) => self.sim.centre()[axis],
             Quantity::Ground(body) => {
                 let [x, y, _] = self.sim.positions()[body];
                 self.sim.ground(x, y)
