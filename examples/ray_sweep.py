@@ -2,7 +2,7 @@
 
     pip install ray        # not a dependency of nearl
     python examples/ray_sweep.py --tasks HalfCheetah-v5,Hopper-v5 --algos ppo,pid2-ib --seeds 0,1,2 --steps 1000000 --out runs/ray
-    python -m nearl.report runs/ray
+    nearl report runs/ray
 
 Every machine of the cluster needs the package and sees the folder. Finished runs are skipped, broken ones done again.
 """

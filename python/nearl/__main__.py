@@ -8,14 +8,7 @@ PROGRAM = Path(__file__).parent / "bin" / "nearl"
 
 
 def main() -> None:
-    """Becomes the program, with the arguments of this command line; ``nearl demo`` draws its report with this very Python.
-
-    ``nearl view`` is Python: it shows a running loop or a training in a browser.
-    """
-    if sys.argv[1:2] == ["view"]:
-        from nearl.view.__main__ import main as view
-
-        sys.exit(view(sys.argv[2:]))
+    """Becomes the program, with the arguments of this command line; what of it is Python, such as ``nearl view``, is this very Python's."""
     if not PROGRAM.is_file():
         sys.exit(f"nearl: '{PROGRAM}' is missing; install a wheel ('make wheel' builds one), not the source folder")
     os.environ.setdefault("NEARL_PYTHON", sys.executable)

@@ -1,7 +1,7 @@
 """Metrics for TensorBoard, under SB3's tags.
 
-    python -m nearl.tensorboard runs/HalfCheetah-v5/pid2-ib_0      # event files beside metrics.csv; then: tensorboard --logdir runs
-    python -m nearl.tensorboard --follow runs/HalfCheetah-v5/pid2-ib_0   # while it is trained
+    nearl tensorboard runs/HalfCheetah-v5/pid2-ib_0      # event files beside metrics.csv; then: tensorboard --logdir runs
+    nearl tensorboard --follow runs/HalfCheetah-v5/pid2-ib_0   # while it is trained
 
     agent.learn(1_000_000, callback=nearl.tensorboard.Writer("runs/mine"))
 """
@@ -117,7 +117,7 @@ def _emptied(run: str | os.PathLike[str], folder: str | os.PathLike[str] | None)
 
 def main(arguments: list[str] | None = None) -> int:
     """0 on success, 1 with one sentence on standard error otherwise."""
-    parser = argparse.ArgumentParser(prog="python -m nearl.tensorboard", description="Event files from run folders of 'nearl train'.")
+    parser = argparse.ArgumentParser(prog="nearl tensorboard", description="Event files from run folders of 'nearl train'.")
     parser.add_argument("runs", metavar="RUN_FOLDER", nargs="+", type=Path)
     parser.add_argument("--follow", action="store_true", help="go on with each new row of one training until it is done")
     given = parser.parse_args(arguments)
@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 0
     except (ReadError, ImportError, OSError) as error:
-        print(f"nearl.tensorboard: {error}", file=sys.stderr)
+        print(f"nearl tensorboard: {error}", file=sys.stderr)
         return 1
     return 0
 

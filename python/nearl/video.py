@@ -1,7 +1,7 @@
 """A video of a trained policy or of demonstrations, through MuJoCo's own renderer, on a machine without a screen.
 
-    python -m nearl.video runs/HalfCheetah-v5/pid2-ib_0 cheetah.mp4
-    python -m nearl.video demos.npz demos.mp4 --task HalfCheetah-v5
+    nearl video runs/HalfCheetah-v5/pid2-ib_0 cheetah.mp4
+    nearl video demos.npz demos.mp4 --task HalfCheetah-v5
 """
 
 import argparse
@@ -143,7 +143,7 @@ def check() -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """0 on success, 1 with one sentence on standard error otherwise."""
-    parser = argparse.ArgumentParser(prog="python -m nearl.video", description="A video of a trained policy, or of demonstrations.")
+    parser = argparse.ArgumentParser(prog="nearl video", description="A video of a trained policy, or of demonstrations.")
     parser.add_argument("run", metavar="RUN", nargs="?", help="run folder, snapshot file, or demonstrations (.npz)")
     parser.add_argument("out", metavar="FILE", nargs="?", help=".mp4 or .gif")
     parser.add_argument("--check", action="store_true", help="write none, and say what is missing for one")
@@ -165,7 +165,7 @@ def main(arguments: list[str] | None = None) -> int:
             return 0
         n = record(given["run"], given["out"], **{k: v for k, v in given.items() if k not in ("run", "out")})
     except (VideoError, OSError, ValueError) as error:
-        print(f"nearl.video: {error}", file=sys.stderr)
+        print(f"nearl video: {error}", file=sys.stderr)
         return 1
     print(f"{given['out']}: {n} frames")
     return 0

@@ -241,3 +241,17 @@ def test_the_ray_example_says_what_it_needs() -> None:
     command = [sys.executable, str(ROOT / "examples" / "ray_sweep.py"), "--tasks", "Hopper-v5", "--out", "x"]
     failed = subprocess.run(command, capture_output=True, text=True)
     assert failed.returncode == 1 and failed.stderr.strip() == "ray_sweep.py needs Ray: pip install ray"
+
+
+@pytest.mark.parametrize("command", ["view", "report", "video", "tensorboard"])
+def test_what_is_python_is_a_command_of_the_program(command: str, tmp_path: Path) -> None:
+    """The program hands everything on, `--help` too; where a Python lacks the package it says what to do."""
+    program = ROOT / "target" / "release" / "nearl"
+    asked = [program, command, "--help"]
+    told = subprocess.run(asked, env={**os.environ, "NEARL_PYTHON": sys.executable}, capture_output=True, text=True, timeout=120)
+    assert told.returncode == 0 and told.stdout.startswith(f"usage: nearl {command}"), told.stdout + told.stderr
+    bare = tmp_path / "python"
+    bare.write_text(f'#!/bin/sh\nexec "{sys.executable}" -I -S "$@"\n')
+    bare.chmod(0o755)
+    refused = subprocess.run(asked, env={**os.environ, "NEARL_PYTHON": str(bare)}, capture_output=True, text=True, timeout=120)
+    assert refused.returncode == 1 and "the Python package 'nearl' is not in it" in refused.stderr and "make package" in refused.stderr, refused.stderr

@@ -107,14 +107,14 @@ def test_the_command(inputs, tmp_path) -> None:
     command = [sys.executable, "-m", "nearl.report", "--out", str(out)]
     assert subprocess.run([*command, "--run", *map(str, inputs["runs"][:2])], check=True, capture_output=True, text=True).stdout.strip() == str(out)
     failed = subprocess.run([*command, "--run", str(tmp_path)], capture_output=True, text=True)
-    assert failed.returncode == 1 and failed.stderr.startswith("nearl.report: ") and "no metrics.csv" in failed.stderr
+    assert failed.returncode == 1 and failed.stderr.startswith("nearl report: ") and "no metrics.csv" in failed.stderr
     assert failed.stderr.count("\n") == 1
 
 
 def test_without_matplotlib_it_says_what_to_install(tmp_path) -> None:
     program = "import sys; sys.modules['matplotlib'] = None; from nearl.report.__main__ import main; sys.exit(main(['--run', 'none']))"
     done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 1 and done.stderr == "nearl.report: the report needs matplotlib: pip install 'nearl[viz]'\n", done.stderr
+    assert done.returncode == 1 and done.stderr == "nearl report: the report needs matplotlib: pip install 'nearl[viz]'\n", done.stderr
 
 
 @pytest.mark.parametrize("content", [b"", b"not mcap", b"\x89MCAP0\r\n"])

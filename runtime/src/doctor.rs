@@ -133,7 +133,10 @@ fn name(code: CheckCode) -> &'static str {
 fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
     let snapshot = match Snapshot::load(file) {
         Ok(snapshot) => snapshot,
-        Err(e) => return (None, vec![fail(CheckCode::Snapshot, e.to_string())]),
+        Err(e @ SnapshotError::Unreadable { .. }) => {
+            return (None, vec![fail(CheckCode::Snapshot, e.to_string())]);
+        }
+        Err(e) => return (None, vec![fail(CheckCode::Snapshot, format!("{}: {e}", file.display()))]),
     };
     let m = &snapshot.manifest;
     let (task, algo) = (&m.task.name, &m.algo);

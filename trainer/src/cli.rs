@@ -19,7 +19,7 @@ mod sweep;
 mod tasks;
 mod train;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use nearl_runtime::cli::Failure;
 pub(crate) use nearl_runtime::cli::say;
@@ -85,9 +85,27 @@ enum Command {
     Robot(robot::RobotCommand),
     /// List the bundled tasks.
     Tasks(tasks::Tasks),
+    /// A running loop, or a training, in a browser.
+    #[command(disable_help_flag = true)]
+    View(python::InPython),
+    /// One HTML page about runs and flights.
+    #[command(disable_help_flag = true)]
+    Report(python::InPython),
+    /// A video of a trained policy, or of demonstrations.
+    #[command(disable_help_flag = true)]
+    Video(python::InPython),
+    /// TensorBoard's files from run folders.
+    #[command(disable_help_flag = true)]
+    Tensorboard(python::InPython),
 }
 
 impl Cli {
+    /// Reads the command line; ends the program where it is refused.
+    pub fn read() -> Cli {
+        let given = minus_is_a_sign(Cli::command()).get_matches();
+        Cli::from_arg_matches(&given).unwrap_or_else(|e| e.exit())
+    }
+
     /// Runs the subcommand.
     ///
     /// # Errors
@@ -115,8 +133,19 @@ impl Cli {
             Command::Tunnel(c) => c.run(),
             Command::Robot(c) => c.run(),
             Command::Tasks(c) => c.run(),
+            Command::View(c) => c.run("nearl.view"),
+            Command::Report(c) => c.run("nearl.report"),
+            Command::Video(c) => c.run("nearl.video"),
+            Command::Tensorboard(c) => c.run("nearl.tensorboard"),
         }
     }
+}
+
+/// `--steps -5` is refused for its number, not as an option `-5` that there is not.
+fn minus_is_a_sign(command: clap::Command) -> clap::Command {
+    let is_value = |arg: &clap::Arg| arg.get_action().takes_values() && !arg.is_allow_hyphen_values_set();
+    let command = command.mut_args(|arg| if is_value(&arg) { arg.allow_negative_numbers(true) } else { arg });
+    command.mut_subcommands(minus_is_a_sign)
 }
 
 /// A number of threads or jobs.

@@ -1,4 +1,4 @@
-"""``python -m nearl.report``."""
+"""``nearl report``."""
 
 import argparse
 import sys
@@ -11,7 +11,7 @@ from nearl.report.read import ReadError
 
 def main(arguments: list[str] | None = None) -> int:
     """Writes the report; 0 on success, 1 with one sentence on standard error otherwise."""
-    parser = argparse.ArgumentParser(prog="python -m nearl.report", description="One HTML page about runs and flights.")
+    parser = argparse.ArgumentParser(prog="nearl report", description="One HTML page about runs and flights.")
     several: dict[str, Any] = {"action": "extend", "nargs": "+", "type": Path, "default": []}
     parser.add_argument("sweeps", metavar="DIR", nargs="*", type=Path, help="folders of many runs, as 'nearl sweep' makes them: one figure, also as a PNG")
     parser.add_argument("--run", metavar="RUN_FOLDER", help="run folders of 'nearl train'; seeds of one task and algorithm share a curve", **several)
@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
         build(given.out, runs=given.run, logs=given.log, evals=given.eval, summaries=given.summary, sweeps=given.sweeps, demos=given.demos, task=given.task,
               title=given.title)  # fmt: skip
     except (ReadError, OSError, ImportError) as error:
-        print(f"nearl.report: {error}", file=sys.stderr)
+        print(f"nearl report: {error}", file=sys.stderr)
         return 1
     print(given.out)
     return 0

@@ -1,6 +1,5 @@
 //! The `nearl` command.
 
-use clap::Parser;
 use nearl_trainer::cli::Cli;
 use std::process::ExitCode;
 
@@ -8,7 +7,7 @@ use std::process::ExitCode;
 static ALLOCATOR: nearl_trainer::allocations::Counting = nearl_trainer::allocations::Counting;
 
 fn main() -> ExitCode {
-    match Cli::parse().run() {
+    match Cli::read().run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             eprintln!("nearl: {e}");

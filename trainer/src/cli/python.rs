@@ -1,9 +1,43 @@
-//! The Python that draws reports and videos.
+//! The Python that draws reports and videos, and the commands that are Python.
 
 use super::Failure;
-use std::ffi::OsStr;
+use clap::Args;
+use std::ffi::{OsStr, OsString};
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
+
+/// What is handed on to a module of the Python package, `--help` too.
+#[derive(Args)]
+pub(super) struct InPython {
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENTS")]
+    arguments: Vec<OsString>,
+}
+
+impl InPython {
+    /// Becomes `-m MODULE`.
+    ///
+    /// # Errors
+    /// No Python has the package.
+    pub(super) fn run(self, module: &str) -> Result<(), Failure> {
+        let python = Python::of(None).0;
+        let is_there = "import importlib.util, sys; sys.exit(importlib.util.find_spec('nearl') is None)";
+        let found = Command::new(&python).args(["-c", is_there]).stderr(Stdio::null()).status();
+        let why = match found {
+            Ok(status) if status.success() => {
+                Command::new(&python).args(["-m", module]).args(self.arguments).exec().to_string()
+            }
+            Ok(_) => "the Python package 'nearl' is not in it".into(),
+            Err(e) => e.to_string(),
+        };
+        Err(format!(
+            "'{}' cannot run {module}: {why}; 'make package' installs the package into .venv of a checkout, or say with NEARL_PYTHON which \
+             Python has it",
+            python.display()
+        )
+        .into())
+    }
+}
 
 /// A Python in which the package `nearl` is installed.
 pub(super) struct Python(PathBuf);
