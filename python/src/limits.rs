@@ -5,9 +5,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nearl_constraints::limit::{Argument, REGISTRY, RegisteredLimit, Takes};
-use nearl_constraints::{
-    self as constraints, Cone, ConstraintSettings, LimitError, LimitSet, PerJoint, Rows, Soft,
-};
+use nearl_constraints::{self as constraints, Cone, LimitError, LimitSet, PerJoint, Rows, Soft};
+use nearl_runtime::task::Task;
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyString};
@@ -61,9 +60,8 @@ fn made(kind: &str, settings: &Bound<'_, PyDict>) -> PyResult<Box<dyn constraint
     let section = section(entry, settings)?;
     let section = if entry.many { Value::Array(vec![section]) } else { section };
     let table = Table::from_iter([(kind.to_string(), section)]);
-    let read: ConstraintSettings = table.try_into().map_err(|e: toml::de::Error| {
-        errors::value(format!("limit '{kind}': {}; see docs/LIMITS.md", e.message()))
-    })?;
+    let read = Task::constraints_of(Value::Table(table))
+        .map_err(|(_, reason)| errors::value(format!("limit '{kind}': {reason}; see docs/LIMITS.md")))?;
     (entry.build)(&read)
         .pop()
         .ok_or_else(|| errors::value(format!("limit '{kind}' is empty; give it a setting")))
@@ -315,15 +313,37 @@ impl Values {
     }
 }
 
-/// Where limits are moved: velocity, acceleration, lowest and highest position by joint, and those that have names.
+/// By name, numbers; and by name, a place in the world.
+pub(crate) type Named = Option<BTreeMap<String, f64>>;
+pub(crate) type Places = Option<BTreeMap<String, ([f64; 3], [f64; 3])>>;
+
+/// Where limits are moved: velocity, acceleration, lowest and highest position by joint, planes inside and speeds of frames, then where planes lie
+/// (normal, a point of theirs) and obstacles stand (position, roll, pitch and yaw).
 pub(crate) fn moved(
     speed: f64,
     joints: [Option<Values>; 4],
-    frame: Option<BTreeMap<String, f64>>,
-    frame_speed: Option<BTreeMap<String, f64>>,
+    [frame, frame_speed]: [Named; 2],
     energy: Option<f64>,
+    [plane, body]: [Places; 2],
 ) -> constraints::Moved {
     let [velocity, acceleration, lower, upper] = joints.map(|values| values.map(Values::per_joint));
     let (frame, frame_speed) = (frame.unwrap_or_default(), frame_speed.unwrap_or_default());
-    constraints::Moved { speed, velocity, acceleration, lower, upper, frame, frame_speed, energy }
+    let plane = plane.unwrap_or_default().into_iter();
+    let plane =
+        plane.map(|(name, (normal, through))| (name, constraints::limit::HalfSpace { normal, through }));
+    let body = body.unwrap_or_default().into_iter();
+    let body = body.map(|(name, (position, rpy))| (name, constraints::limit::Pose { position, rpy }));
+    constraints::Moved {
+        speed,
+        velocity,
+        acceleration,
+        lower,
+        upper,
+        frame,
+        frame_speed,
+        energy,
+        plane: plane.collect(),
+        body: body.collect(),
+        payload: None,
+    }
 }

@@ -8,7 +8,9 @@ use crate::snapshot::ModelFormat;
 use nearl_constraints::description::FrictionLaw;
 use nearl_constraints::{ConstraintSettings, Period};
 use serde::{Deserialize, Serialize};
+use serde_path_to_error::Segment;
 use std::path::Path;
+use toml::de::{DeArray, DeTable};
 
 /// The whole task file.
 #[derive(Clone, Debug, Deserialize, Serialize)]
@@ -277,18 +279,6 @@ impl Task {
         let at = |place, reason| TaskError::Invalid { file: file.into(), place, reason };
         let mut table: toml::Table =
             toml::from_str(text).map_err(|e| at(line_of(text, e.span()), first_line(e.message())))?;
-        if overrides.is_empty() {
-            // read from the text, not from the table, so that the message can name the line
-            let de = toml::Deserializer::parse(text)
-                .map_err(|e| at(line_of(text, e.span()), first_line(e.message())))?;
-            let mut task: Task = serde_path_to_error::deserialize(de).map_err(|e| {
-                let (key, inner) = (e.path().to_string(), e.into_inner());
-                at(format!("{}{}", line_of(text, inner.span()), bracket(&key)), suggest(inner.message()))
-            })?;
-            task.state_time(own);
-            task.check(file)?;
-            return Ok(task);
-        }
         for set in overrides {
             apply(&mut table, set)?;
         }
@@ -301,7 +291,8 @@ impl Task {
                 let reason = format!("'{last}' is a value, not a section");
                 return TaskError::Override { set: set.clone(), reason };
             }
-            at(bracket(&key), suggest(e.into_inner().message()))
+            let line = if overrides.is_empty() { line_of_key(text, e.path()) } else { String::new() };
+            at(format!("{line}{}", bracket(&key)), suggest(e.into_inner().message()))
         })?;
         task.state_time(own);
         task.check(file)?;
@@ -333,10 +324,17 @@ impl Task {
         let Some(section) = table.remove("constraints") else {
             return Err(at(String::new(), "it has no section [constraints]; write one".into()));
         };
-        serde_path_to_error::deserialize(section).map_err(|e| {
-            let key = e.path().to_string();
-            at(bracket(&format!("constraints.{key}")), suggest(e.into_inner().message()))
-        })
+        Self::constraints_of(section)
+            .map_err(|(key, reason)| at(bracket(&format!("constraints.{key}")), reason))
+    }
+
+    /// What a section `[constraints]` says.
+    ///
+    /// # Errors
+    /// The key, and a sentence.
+    pub fn constraints_of(section: toml::Value) -> Result<ConstraintSettings, (String, String)> {
+        serde_path_to_error::deserialize(section)
+            .map_err(|e| (e.path().to_string(), suggest(e.into_inner().message())))
     }
 
     /// Physics sub-steps in one control period; 0 for a zero-order-hold plant.
@@ -437,6 +435,28 @@ fn first_line(s: &str) -> String {
 
 fn line_of(text: &str, span: Option<std::ops::Range<usize>>) -> String {
     span.map_or(String::new(), |s| format!(":{}", 1 + text[..s.start.min(text.len())].matches('\n').count()))
+}
+
+/// `:12`, where `path` stands in the text, or what of it stands there; nothing for the file as a whole.
+fn line_of_key(text: &str, path: &serde_path_to_error::Path) -> String {
+    let Ok(document) = DeTable::parse(text) else { return String::new() };
+    let (mut table, mut list, mut span) = (Some(document.get_ref()), None, None);
+    for segment in path.iter() {
+        let found = match segment {
+            Segment::Map { key } | Segment::Enum { variant: key } => table
+                .and_then(|t| t.get_key_value(key.as_str()))
+                .map(|(key, value)| (key.span(), value.get_ref())),
+            Segment::Seq { index } => {
+                list.and_then(|l: &DeArray<'_>| l.get(*index)).map(|value| (value.span(), value.get_ref()))
+            }
+            Segment::Unknown => None,
+        };
+        let Some((place, value)) = found else { break };
+        span = Some(place);
+        table = value.as_table();
+        list = value.as_array();
+    }
+    line_of(text, span)
 }
 
 /// ` [key]`; nothing for the file as a whole.

@@ -54,6 +54,12 @@ const FILES: &[(&str, &str, &str, &[&str])] = &[
         &["t.toml:", "constrants", "did you mean 'constraints'"],
     ),
     ("Panda-reach", "dt = 0.001\npolicy", "dt = \"fast\"\npolicy", &["t.toml:9", "time.dt", "expected f64"]),
+    (
+        "Panda-reach",
+        "[state]",
+        "[state]\ncontrollable = [\n \"panda_joint1\",\n 2]",
+        &["t.toml:16 [state.controllable[1]]", "expected a string"],
+    ),
     ("Panda-reach", "name = \"Panda-reach\"", "", &["t.toml", "missing field `name`"]),
     ("Panda-reach", "name = \"Panda-reach\"", "name = ", &["t.toml:3"]),
     ("Panda-reach", "[time]", "[model]", &["t.toml:8", "duplicate key"]),
@@ -253,6 +259,7 @@ fn a_value_that_is_no_number_is_refused_before_anything_starts() {
     let folder = folder();
     for (arguments, says) in [
         (vec!["train", "Hopper-v5", "--steps", "many"], "'many' is not a number of steps"),
+        (vec!["train", "Hopper-v5", "--steps", "-5"], "'-5' is not a number of steps"),
         (vec!["run", "x", "--plant", "a", "--seconds", "nan"], "'nan' is not a duration"),
         (vec!["run", "x", "--plant", "a", "--rate", "0"], "'0' is not a rate"),
         (vec!["plant", "Panda-reach", "--name", "a", "--seconds", "1e99"], "'1e99' is not a duration"),
@@ -424,7 +431,8 @@ fn the_doctor_fails_on_a_damaged_snapshot_and_finds_what_a_killed_plant_left() {
         found.unwrap_or_else(|| panic!("no {check}: {report}")).clone()
     };
     assert_eq!((&report["ok"], &text("snapshot")["finding"]), (&false.into(), &"fail".into()), "{report}");
-    assert!(text("snapshot")["text"].to_string().contains("digest mismatch"), "{report}");
+    let said = text("snapshot")["text"].to_string();
+    assert!(said.contains("digest mismatch") && said.contains(damaged.to_str().expect("UTF-8")), "{report}");
     assert_eq!(text("links")["finding"], "warn", "{report}");
     assert!(text("links")["text"].to_string().contains(&format!("/dev/shm/nearl.{name}.*")), "{report}");
     remove_files(&RobotName::new(&name).expect("name"));

@@ -16,17 +16,17 @@ pub(super) fn read(text: &str) -> Result<Manifest, String> {
         format: u32,
     }
     let version: Version = serde_json::from_str(text).map_err(words)?;
-    match version.format {
-        FORMAT => serde_json::from_str(text).map_err(words),
-        FORMAT_WITH_SKIP => {
-            serde_json::from_str(text).map(|m| Manifest { format: FORMAT, ..m }).map_err(words)
-        }
-        1 => translate(serde_json::from_str(text).map_err(words)?),
-        other => Err(format!("format {other} where this program reads 1 to {FORMAT_WITH_SKIP}")),
-    }
+    let of_today = match version.format {
+        FORMAT | FORMAT_WITH_SKIP => None,
+        1 => Some(translate(serde_json::from_str(text).map_err(words)?)?),
+        other => return Err(format!("format {other} where this program reads 1 to {FORMAT_WITH_SKIP}")),
+    };
+    let read: Manifest = serde_json::from_str(of_today.as_deref().unwrap_or(text)).map_err(words)?;
+    Ok(Manifest { format: FORMAT, ..read })
 }
 
-fn translate(mut old: Map<String, Value>) -> Result<Manifest, String> {
+/// The text of today's manifest for one of format 1.
+fn translate(mut old: Map<String, Value>) -> Result<String, String> {
     let mut take = |key: &str| old.remove(key).ok_or_else(|| format!("format 1 without '{key}'"));
     let (format, text) = (take("model_format")?, take("model")?);
     let format: ModelFormat = serde_json::from_value(format).map_err(|e| e.to_string())?;
@@ -42,5 +42,5 @@ fn translate(mut old: Map<String, Value>) -> Result<Manifest, String> {
     let model = model.map_err(|e| e.to_string())?;
     old.insert("format".into(), FORMAT.into());
     old.insert("robot".into(), serde_json::to_value(model.description()).map_err(|e| e.to_string())?);
-    serde_json::from_value(Value::Object(old)).map_err(|e| e.to_string())
+    Ok(Value::Object(old).to_string())
 }
