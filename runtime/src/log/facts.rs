@@ -86,15 +86,21 @@ pub fn facts(robot: &RobotMessage, core: &CoreSettings, faults: &FaultPlan) -> B
     .into()
 }
 
+/// Refuses a log of another schema, whose ticks may have other fields; the error is one clause.
+pub(crate) fn check_schema(facts: &BTreeMap<String, String>) -> Result<(), String> {
+    let version = facts.get("schema").ok_or("its metadata has no `schema`")?;
+    match *version == SCHEMA_VERSION.to_string() {
+        true => Ok(()),
+        false => Err(format!(
+            "its schema is {version}, this build replays {SCHEMA_VERSION}; replay it with the build that wrote it"
+        )),
+    }
+}
+
 /// Reads the facts back; the error is one clause.
 pub(crate) fn read(facts: &BTreeMap<String, String>) -> Result<Session, String> {
     let get = |key: &str| facts.get(key).ok_or_else(|| format!("its metadata has no `{key}`"));
-    let version = get("schema")?;
-    if *version != SCHEMA_VERSION.to_string() {
-        return Err(format!(
-            "its schema is {version}, this build replays {SCHEMA_VERSION}; replay it with the build that wrote it"
-        ));
-    }
+    check_schema(facts)?;
     fn parse<T: for<'de> Deserialize<'de>>(key: &str, text: &str) -> Result<T, String> {
         serde_json::from_str(text).map_err(|e| format!("its metadata `{key}` is damaged: {e}"))
     }

@@ -250,6 +250,9 @@ impl<B: Build> Replayer<B> {
 
     /// A whole tick: everything in it is compared.
     fn tick(&mut self, logged: &[u8]) -> Result<(), String> {
+        if self.running.is_none() {
+            facts::check_schema(&self.facts)?;
+        }
         let at = self.at + 1;
         let damaged = |e| format!("the message of tick {at} is damaged: {}", one_line(&e));
         let json = serde_json::from_slice::<TickJson<'_>>(logged).map_err(damaged)?;

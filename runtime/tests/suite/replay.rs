@@ -78,6 +78,17 @@ type Change<'a> = &'a dyn Fn(&mut Value) -> bool;
 
 /// Copies the log with the message of `tick` changed, or left out if `change` says so.
 fn edit(from: &Path, to: &Path, tick: u64, change: Change<'_>) {
+    edit_with(from, to, tick, change, &|_| {});
+}
+
+/// The same with the metadata changed too.
+fn edit_with(
+    from: &Path,
+    to: &Path,
+    tick: u64,
+    change: Change<'_>,
+    facts: &dyn Fn(&mut BTreeMap<String, String>),
+) {
     use mcap::read::ChunkFlattener;
     use mcap::records::{MessageHeader, Record as Part};
     let bytes = std::fs::read(from).unwrap();
@@ -89,7 +100,10 @@ fn edit(from: &Path, to: &Path, tick: u64, change: Change<'_>) {
         match part.unwrap() {
             Part::DataEnd(_) => is_over = true,
             _ if is_over => {}
-            Part::Metadata(m) => writer.write_metadata(&m).unwrap(),
+            Part::Metadata(mut m) => {
+                facts(&mut m.metadata);
+                writer.write_metadata(&m).unwrap();
+            }
             Part::Attachment { header, data, .. } => writer
                 .attach(&mcap::Attachment {
                     log_time: 0,
@@ -116,6 +130,21 @@ fn edit(from: &Path, to: &Path, tick: u64, change: Change<'_>) {
         }
     }
     writer.finish().unwrap();
+}
+
+/// Its ticks may have other fields: what is told is the schema, and not a field that is missing.
+#[test]
+fn a_log_of_another_schema_is_refused_by_its_schema() {
+    let folder = Scratch::new("other-schema");
+    let (log, _) = record("other-schema", &folder.0);
+    let copy = folder.0.join("copy.mcap");
+    let older = |m: &mut Value| {
+        m["ledger"].as_object_mut().unwrap().remove("outside");
+        true
+    };
+    edit_with(&log, &copy, 1, &older, &|facts| _ = facts.insert("schema".into(), "5".into()));
+    let error = replay(&copy).unwrap_err().to_string();
+    assert!(error.contains("its schema is 5") && !error.contains("damaged"), "{error}");
 }
 
 #[test]
