@@ -242,7 +242,7 @@ def test_rows_of_a_flight_have_the_names_of_its_snapshot(tmp_path) -> None:
     assert found.names == ["joint 1 velocity ↑", "motor 2 torque ↑"] and np.isfinite(found.multiplier).sum(axis=1).tolist() == [1, 1]
 
 
-def test_nothing_runs_over_the_edge_at_1200_pixels(inputs, tmp_path) -> None:
+def test_nothing_runs_over_the_edge_at_1200_pixels_and_no_page_on_a_phone(inputs, tmp_path) -> None:
     """In Chromium, light and dark: no element is wider than the page, and the figures turn dark with it."""
     sync_api = pytest.importorskip("playwright.sync_api")
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
@@ -261,6 +261,11 @@ def test_nothing_runs_over_the_edge_at_1200_pixels(inputs, tmp_path) -> None:
                 for place in ("h1", "figure.drawn"):
                     shot = tab.locator(place).first.screenshot()
                     assert (np.median(plt_gray(shot)) < 0.4) == is_dark, (page.name, scheme, place)
+        phone = browser.new_page(viewport={"width": 390, "height": 844})
+        for page in pages:
+            phone.goto(page.as_uri())
+            assert phone.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0, page.name
+            assert phone.locator(".wide").first.evaluate("e => e.scrollWidth > e.clientWidth"), "a wide table is moved sideways in its own frame"
         browser.close()
 
 

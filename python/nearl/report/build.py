@@ -36,7 +36,8 @@ figure img { max-width: 100%; height: auto; display: block; margin: 0 auto; } fi
 table { width: 100%; border-collapse: collapse; background: var(--card); font-variant-numeric: tabular-nums; font-size: .87rem; }
 th, td { padding: .35rem .5rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: bottom; overflow-wrap: break-word; }
 th:first-child, td:first-child { text-align: left; min-width: 9em; } th { color: var(--soft); font-weight: 600; border-bottom-width: 2px; }
-td.words { text-align: left; }
+th.words, td.words { text-align: left; }
+.wide { overflow-x: auto; }
 """
 
 
@@ -216,8 +217,7 @@ def _broken_row(name: str, s: dict[str, Any]) -> list[str]:
 
 def _receipt_row(name: str, receipt: dict[str, Any]) -> list[str]:
     words = str(receipt["text"])
-    short = words if len(words) <= 90 else words[:90].rsplit(" ", 1)[0] + " …"
-    return [name, str(receipt["version"]), "swapped in" if receipt["accepted"] else "refused", short]
+    return [name, str(receipt["version"]), "swapped in" if receipt["accepted"] else "refused", words]
 
 
 def _share(part: float | None, whole: float | None) -> str:
@@ -230,14 +230,14 @@ def _count(n: float | None) -> str:
 
 def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], words: int | None = None) -> str:
     """A table; the column ``words`` holds sentences."""
-    cells = "".join(f"<th>{html.escape(h)}</th>" for h in head)
 
-    def line(row: Sequence[str]) -> str:
-        return "".join(f'<td class="words">{html.escape(c)}</td>' if i == words else f"<td>{html.escape(c)}</td>" for i, c in enumerate(row))
+    def line(row: Sequence[str], tag: str) -> str:
+        cells = "".join(f'<{tag} class="words">{html.escape(c)}</{tag}>' if i == words else f"<{tag}>{html.escape(c)}</{tag}>" for i, c in enumerate(row))
+        return f"<tr>{cells}</tr>"
 
-    lines = "".join(f"<tr>{line(row)}</tr>" for row in rows)
+    lines = "".join(line(row, "td") for row in rows)
     heading = f"<h3>{html.escape(caption)}</h3>" if caption else ""
-    return f"{heading}<table><thead><tr>{cells}</tr></thead><tbody>{lines}</tbody></table>"
+    return f'{heading}<div class="wide"><table><thead>{line(head, "th")}</thead><tbody>{lines}</tbody></table></div>'
 
 
 def _flights(logs: list[Log]) -> list[tuple[str, str]]:
