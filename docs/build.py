@@ -52,9 +52,13 @@ nav:
     - Changes: CHANGELOG.md
 """
 # Colours of code would come from another host and a search needs a server, but the theme's scripts ask for their elements all the same.
+# Long lines of code go on below: the reference everywhere, drawings made of letters where there is room for them.
 MAIN = """\
 {% extends "base.html" %}
-{% block extrahead %}<link id="hljs-light"><link id="hljs-dark">{% endblock %}
+{% block extrahead %}<link id="hljs-light"><link id="hljs-dark"><style>
+pre code.language-text { white-space: pre-wrap; overflow-wrap: anywhere; }
+@media (min-width: 992px) { pre code { white-space: pre-wrap; } }
+</style>{% endblock %}
 {% block content %}{{ super() }}<div class="modal" id="mkdocs_search_modal"><div id="mkdocs-search-results"></div></div>{% endblock %}
 """
 THEME = "theme:\n  name: mkdocs\n  color_mode: auto\n  highlightjs: false\n  shortcuts:\n    search: 0\n  custom_dir: "
@@ -127,11 +131,11 @@ def reference(file: Path) -> None:
         thing = getattr(nearl, name)
         known = types(getattr(thing, "__module__", None) or "nearl._core")
         parts.append(f"## nearl.{name}\n\n```text\nnearl.{name}{known.get(name, '')}\n\n{inspect.getdoc(thing) or ''}\n```")
-        members = vars(thing).items() if inspect.isclass(thing) else ()
-        for member, value in members:
-            if not member.startswith("_") and inspect.getdoc(value):
+        for member in vars(thing) if inspect.isclass(thing) else ():
+            said = inspect.getdoc(getattr(thing, member))  # not of the `staticmethod` around it
+            if not member.startswith("_") and said:
                 typed = known.get(f"{name}.{member}", "")
-                parts.append(f"### {name}.{member}\n\n```text\n{name}.{member}{typed}\n\n{inspect.getdoc(value)}\n```")
+                parts.append(f"### {name}.{member}\n\n```text\n{name}.{member}{typed}\n\n{said}\n```")
     file.write_text("\n\n".join(parts) + "\n")
 
 

@@ -2,10 +2,12 @@
 
 import ast
 import importlib.resources
+import importlib.util
 import inspect
 import re
 import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from conftest import ROOT
@@ -104,3 +106,16 @@ def test_every_task_says_what_it_needs() -> None:
         for fact in (f"{len(env.obs_names)} observations", f"{len(env.actuator_names)} actions", f"{env.max_episode_steps} control periods", "inverse model: "):
             assert fact in lines[1], (name, lines[1])
         assert lines[1].endswith(", a cost") == env.has_cost, (name, lines[1])
+
+
+def test_the_reference_says_of_a_member_what_its_own_docstring_says(tmp_path: Path) -> None:
+    """Not what Python says of what it is wrapped in."""
+    found = importlib.util.spec_from_file_location("build", ROOT / "docs" / "build.py")
+    build = importlib.util.module_from_spec(found)
+    found.loader.exec_module(build)
+    build.reference(tmp_path / "PYTHON.md")
+    text = (tmp_path / "PYTHON.md").read_text()
+    for wrapper in (staticmethod, classmethod, property):
+        assert inspect.getdoc(wrapper).splitlines()[0] not in text
+    for load in (nearl.Controller.load, nearl.PID2.load, nearl.Model.from_urdf):
+        assert inspect.getdoc(load) in text
