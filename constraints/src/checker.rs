@@ -88,6 +88,8 @@ struct RowsOf {
     enabled: bool,
     first: usize,
     count: usize,
+    /// How much of it may be put elsewhere.
+    places: usize,
 }
 
 struct ConeOf {
@@ -129,8 +131,8 @@ impl Checker {
         let (mut rows, mut cones, mut first) = (Vec::new(), Vec::new(), model.nv());
         for (limit, l) in limits.iter().enumerate() {
             if let Some(r) = l.rows(model, controllable)? {
-                let (hard, count) = (l.soft().is_none(), r.sizes().len());
-                rows.push(RowsOf { rows: r, limit, hard, enabled: true, first, count });
+                let (hard, count, places) = (l.soft().is_none(), r.sizes().len(), r.places().len());
+                rows.push(RowsOf { rows: r, limit, hard, enabled: true, first, count, places });
                 first += count;
             }
         }
@@ -285,6 +287,15 @@ impl Checker {
         });
     }
 
+    /// Puts what may be elsewhere where the numbers say, in the order of the limits.
+    pub(crate) fn put(&mut self, numbers: &[[f64; 6]]) {
+        let mut first = 0;
+        for block in &mut self.rows {
+            block.rows.put(&numbers[first..first + block.places]);
+            first += block.places;
+        }
+    }
+
     /// What is in force on the way to moved limits: positions, speeds and how fast a dof may speed up (nv).
     pub(crate) fn hold(&mut self, limits: &LimitSet, speed: &[f64], faster: &[f64]) {
         self.limits.q_lower.copy_from_slice(&limits.q_lower);
@@ -424,7 +435,9 @@ impl Checker {
         verdict.see(Kind::Position, i, -lowest, -low);
         if kinematic && a_max.is_finite() {
             let half = 0.5 * a_max * tau;
-            let stop = |speed: f64| (speed - half).max(0.0).powi(2) / (2.0 * a_max); // braking distance
+            // A brake in whole steps needs up to this much less than the smooth one, and what hard jerk promises is reckoned in steps.
+            let less = if self.limits.jerk[i].is_finite() { 0.125 * a_max * tau * tau } else { 0.0 };
+            let stop = |speed: f64| ((speed - half).max(0.0).powi(2) / (2.0 * a_max) - less).max(0.0); // braking distance
             verdict.see(Kind::Viability, i, next.0 + stop(next.1), high.max(next.0));
             verdict.see(Kind::Viability, i, stop(-next.1) - next.0, (-low).max(-next.0));
         }

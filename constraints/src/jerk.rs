@@ -104,7 +104,7 @@ impl Brake {
     }
 
     /// The highest position of a period at acceleration `a` and of braking after it, less the position at its start.
-    fn reach(&self, v: f64, a: f64) -> f64 {
+    pub(crate) fn reach(&self, v: f64, a: f64) -> f64 {
         let p = &self.period;
         let (end, v_next) = (p.dt * v + p.kappa * p.dt * p.dt * a, v + p.dt * a);
         peak(v, a, p).max(end + self.stop(v_next, a).highest())
@@ -145,6 +145,11 @@ impl Brake {
             bound = (end, Kind::Viability);
         }
         (bound.0, bound.1, outside)
+    }
+
+    /// The highest velocity of braking whose first period has acceleration `a`, and the lowest, with its sign turned.
+    pub(crate) fn fastest(&self, v: f64, a: f64) -> [f64; 2] {
+        [(v, a), (-v, -a)].map(|(v, a)| if a > 0.0 { self.rest(v, a) } else { v + self.period.dt * a })
     }
 
     /// Velocity after a period at acceleration `a > 0` and the way back to none: `v + G(a)`.

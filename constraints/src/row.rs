@@ -85,6 +85,16 @@ pub struct Needs {
     pub previous: bool,
 }
 
+/// A plane or an obstacle that an operator may put elsewhere.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Place {
+    /// Name of an obstacle; `None` is the plane of the limit itself.
+    pub name: Option<String>,
+    /// Of an obstacle position \[m\], roll, pitch and yaw \[rad\]; of a plane the unit normal, its distance from the origin along that, without
+    /// the margin \[m\], and two zeros.
+    pub numbers: [f64; 6],
+}
+
 /// Memory of the rows of one limit; `lower <= G y <= upper`.
 pub struct RowsMut<'a> {
     /// `G` (rows x nv, row-major), zero at the start of each tick.
@@ -141,6 +151,16 @@ pub trait Rows: Send {
     /// The largest [`Rows::inset`] that leaves anything \[m\]; 0 where that means nothing.
     fn most_inset(&self) -> f64 {
         0.0
+    }
+
+    /// What of it may be put elsewhere while the robot runs, and where it is.
+    fn places(&self) -> Vec<Place> {
+        Vec::new()
+    }
+
+    /// Puts each of [`Rows::places`], in their order, where these numbers say. Must not allocate.
+    fn put(&mut self, numbers: &[[f64; 6]]) {
+        let _ = numbers;
     }
 
     /// Writes the rows of the tick. Must not allocate.

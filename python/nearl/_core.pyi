@@ -218,6 +218,8 @@ class Projector:
         frame: dict[str, float] | None = None,
         frame_speed: dict[str, float] | None = None,
         energy: float | None = None,
+        plane: dict[str, tuple[Sequence[float], Sequence[float]]] | None = None,
+        body: dict[str, tuple[Sequence[float], Sequence[float]]] | None = None,
     ) -> None: ...
     def set_external_forces(self, forces: ArrayLike) -> None: ...
     @property
@@ -499,6 +501,9 @@ class LoopClient:
         frame: dict[str, float] | None = None,
         frame_speed: dict[str, float] | None = None,
         energy: float | None = None,
+        plane: dict[str, tuple[Sequence[float], Sequence[float]]] | None = None,
+        body: dict[str, tuple[Sequence[float], Sequence[float]]] | None = None,
+        payload: tuple[str, float, Sequence[float], Sequence[float]] | None = None,
     ) -> tuple[bool, str, str, int]: ...
     def close(self) -> None: ...
 

@@ -1,9 +1,9 @@
 //! The client of a running loop (see `nearl.Link`).
 
-use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use nearl_constraints::description::Payload;
 use nearl_runtime::link::{
     LinkError, OperatorLink, ReceiptMessage, RobotName, TrainerLink, TransitionMessage, Verdict,
 };
@@ -92,7 +92,10 @@ impl LoopClient {
     }
 
     /// Moves the loop's limits: whether it took them, the code of its answer, its sentence, and the first tick.
-    #[pyo3(signature = (patience, *, speed=1.0, velocity=None, acceleration=None, lower=None, upper=None, frame=None, frame_speed=None, energy=None))]
+    #[pyo3(signature = (
+        patience, *, speed=1.0, velocity=None, acceleration=None, lower=None, upper=None, frame=None, frame_speed=None, energy=None,
+        plane=None, body=None, payload=None
+    ))]
     fn move_limits(
         &self,
         py: Python<'_>,
@@ -102,12 +105,17 @@ impl LoopClient {
         acceleration: Option<limits::Values>,
         lower: Option<limits::Values>,
         upper: Option<limits::Values>,
-        frame: Option<BTreeMap<String, f64>>,
-        frame_speed: Option<BTreeMap<String, f64>>,
+        frame: limits::Named,
+        frame_speed: limits::Named,
         energy: Option<f64>,
+        plane: limits::Places,
+        body: limits::Places,
+        payload: Option<(String, f64, [f64; 3], [f64; 6])>,
     ) -> PyResult<(bool, &'static str, String, u64)> {
         let patience = seconds(patience)?;
-        let moved = limits::moved(speed, [velocity, acceleration, lower, upper], frame, frame_speed, energy);
+        let joints = [velocity, acceleration, lower, upper];
+        let mut moved = limits::moved(speed, joints, [frame, frame_speed], energy, [plane, body]);
+        moved.payload = payload.map(|(frame, mass, com, inertia)| Payload { frame, mass, com, inertia });
         let receipt = py.detach(|| {
             self.with(|Inner { operator, .. }| {
                 if operator.is_none() {

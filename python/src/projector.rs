@@ -1,6 +1,5 @@
 //! The projector: the nearest next state that every limit allows.
 
-use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -252,11 +251,16 @@ impl Projector {
     ///     frame (dict): by the name of a FrameLimit, how far inside all its planes lie [m].
     ///     frame_speed (dict): by the name of a FrameSpeedLimit, largest speed [m/s].
     ///     energy (float): largest kinetic energy [J].
+    ///     plane (dict): by the name of a FrameLimit with a half-space, where its plane lies: its normal (3) and a point of it (3) [m].
+    ///     body (dict): by the name of an obstacle of a CollisionLimit, where it stands: position (3) [m], roll, pitch and yaw (3) [rad].
     ///
     /// Raises:
-    ///     ValueError: a limit would be wider than it was built or leaves no room to stop; a name is unknown; a hard limit on frames or energy
-    ///         without a stored brake; nothing is changed then.
-    #[pyo3(signature = (*, speed=1.0, velocity=None, acceleration=None, lower=None, upper=None, frame=None, frame_speed=None, energy=None))]
+    ///     ValueError: a limit would be wider than it was built or leaves no room to stop; a name is unknown; a hard limit on frames, bodies or
+    ///         energy without a stored brake; nothing is changed then.
+    #[pyo3(signature = (
+        *, speed=1.0, velocity=None, acceleration=None, lower=None, upper=None, frame=None, frame_speed=None, energy=None, plane=None,
+        body=None
+    ))]
     fn move_limits(
         &self,
         speed: f64,
@@ -264,11 +268,14 @@ impl Projector {
         acceleration: Option<limits::Values>,
         lower: Option<limits::Values>,
         upper: Option<limits::Values>,
-        frame: Option<BTreeMap<String, f64>>,
-        frame_speed: Option<BTreeMap<String, f64>>,
+        frame: limits::Named,
+        frame_speed: limits::Named,
         energy: Option<f64>,
+        plane: limits::Places,
+        body: limits::Places,
     ) -> PyResult<()> {
-        let moved = limits::moved(speed, [velocity, acceleration, lower, upper], frame, frame_speed, energy);
+        let joints = [velocity, acceleration, lower, upper];
+        let moved = limits::moved(speed, joints, [frame, frame_speed], energy, [plane, body]);
         self.lock().all().iter_mut().try_for_each(|p| p.move_limits(&moved)).map_err(errors::value)
     }
 

@@ -3,7 +3,7 @@
 use super::clearance::{Ahead, Clearance};
 use super::{About, Argument, Form, Limit, Takes};
 use crate::kinematics::{dot, norm};
-use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
+use crate::row::{Motion, Needs, Place, Rows, RowsMut, TickStart};
 use crate::{FrameId, Kind, LimitError, Model, Period, PointMotion, Soft};
 use serde::{Deserialize, Serialize};
 
@@ -133,7 +133,7 @@ impl FrameLimit {
         }
     }
 
-    /// Names, unit normals and offsets `n . p0 - margin`.
+    /// Names, unit normals and offsets `n . p0`.
     fn planes(&self) -> Result<Vec<Plane>, LimitError> {
         let s = &self.settings;
         let (frame, mut planes) = (&s.frame, Vec::new());
@@ -143,7 +143,7 @@ impl FrameLimit {
             let n = normal.map(|x| x / length);
             let offset = dot(n, through);
             check(&format!("a point of the plane of frame '{frame}'"), offset, true, "finite, in m")?;
-            planes.push(Plane { name: frame.clone(), n, offset: offset - s.margin });
+            planes.push(Plane { name: frame.clone(), n, offset });
         }
         if let Some(FrameBox { lower, upper }) = s.inside {
             for (k, axis) in ["x", "y", "z"].iter().enumerate() {
@@ -159,7 +159,7 @@ impl FrameLimit {
                     n[k] = sign;
                     if end.is_finite() {
                         let name = format!("{frame} {side} {axis} = {}", sign * end);
-                        planes.push(Plane { name, n, offset: end - s.margin });
+                        planes.push(Plane { name, n, offset: end });
                     }
                 }
             }
@@ -212,12 +212,14 @@ impl Limit for FrameLimit {
         check(&of("braking"), s.braking, s.braking > 0.0, "above 0 m/s²")?;
         check(&of("margin"), s.margin, s.margin >= 0.0, "at least 0 m")?;
         check(&of("point"), s.point.iter().sum(), true, "finite, in m")?;
-        let planes = self.planes()?;
+        let (planes, margin) = (self.planes()?, s.margin);
         let (jacobian, ahead) = (vec![0.0; 3 * model.nv()], Ahead::new(model));
         let sides = s.inside.map_or([f64::INFINITY; 3], |b| std::array::from_fn(|k| b.upper[k] - b.lower[k]));
         let room = 0.5 * sides.into_iter().fold(f64::INFINITY, f64::min) - s.margin;
-        let (point, braking, inset) = (s.point, s.braking, 0.0);
-        Ok(Some(Box::new(FrameRows { frame, point, planes, braking, jacobian, ahead, inset, room })))
+        let (point, braking, inset, is_plane) = (s.point, s.braking, 0.0, s.half_space.is_some());
+        let rows =
+            FrameRows { frame, point, planes, margin, is_plane, braking, jacobian, ahead, inset, room };
+        Ok(Some(Box::new(rows)))
     }
 
     fn soft(&self) -> Option<Soft> {
@@ -228,6 +230,7 @@ impl Limit for FrameLimit {
 struct Plane {
     name: String,
     n: [f64; 3],
+    /// Distance from the origin along `n`, without the margin.
     offset: f64,
 }
 
@@ -235,6 +238,10 @@ struct FrameRows {
     frame: FrameId,
     point: [f64; 3],
     planes: Vec<Plane>,
+    /// Distance kept from every plane [m].
+    margin: f64,
+    /// The first plane is that of a half-space.
+    is_plane: bool,
     braking: f64,
     /// Of the point (3 x nv).
     jacobian: Vec<f64>,
@@ -246,9 +253,9 @@ struct FrameRows {
 }
 
 impl Plane {
-    /// Of a point looked at ahead, to the plane `inset` further inside.
-    fn clearance(&self, inset: f64, p: &PointMotion, period: &Period) -> Clearance {
-        let (d, c) = (self.offset - inset - dot(self.n, p.position), dot(self.n, p.acceleration));
+    /// Of a point looked at ahead, to the plane less the margin and `inset` further inside.
+    fn clearance(&self, (margin, inset): (f64, f64), p: &PointMotion, period: &Period) -> Clearance {
+        let (d, c) = (self.offset - margin - inset - dot(self.n, p.position), dot(self.n, p.acceleration));
         Clearance::ahead(d, dot(self.n, p.velocity), c, period)
     }
 }
@@ -283,6 +290,17 @@ impl Rows for FrameRows {
         self.room
     }
 
+    fn places(&self) -> Vec<Place> {
+        let planes = self.planes.iter().take(usize::from(self.is_plane));
+        planes.map(|p| Place { name: None, numbers: [p.n[0], p.n[1], p.n[2], p.offset, 0.0, 0.0] }).collect()
+    }
+
+    fn put(&mut self, numbers: &[[f64; 6]]) {
+        for (plane, [x, y, z, offset, ..]) in self.planes.iter_mut().zip(numbers) {
+            (plane.n, plane.offset) = ([*x, *y, *z], *offset);
+        }
+    }
+
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (nv, j, period) = (rows.nv, &mut self.jacobian, tick.period);
         let kinematics = self.ahead.look(tick.q, tick.v, period.dt);
@@ -292,7 +310,7 @@ impl Rows for FrameRows {
             for (i, g) in rows.row(r).iter_mut().enumerate() {
                 *g = dot(plane.n, [j[i], j[nv + i], j[2 * nv + i]]) / period.dt;
             }
-            let clearance = plane.clearance(self.inset, &at, period);
+            let clearance = plane.clearance((self.margin, self.inset), &at, period);
             rows.upper[r] = clearance.bound(self.braking, period);
             rows.outside[r] = clearance.is_outside();
         }
@@ -303,7 +321,7 @@ impl Rows for FrameRows {
             self.ahead.look_at_frames(motion.q, motion.v, motion.period.dt).point(self.frame, self.point);
         let then = self.ahead.turn(motion.v_next).point(self.frame, self.point);
         for (x, plane) in out.iter_mut().zip(&self.planes) {
-            let clearance = plane.clearance(self.inset, &at, motion.period);
+            let clearance = plane.clearance((self.margin, self.inset), &at, motion.period);
             *x = clearance.excess(dot(plane.n, then.velocity), self.braking, motion.period);
         }
     }
@@ -313,7 +331,7 @@ impl Rows for FrameRows {
         let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
         let at = then.point(self.frame, self.point);
         for (x, plane) in out.iter_mut().zip(&self.planes) {
-            *x = dot(plane.n, at.position) - plane.offset + self.inset;
+            *x = dot(plane.n, at.position) - (plane.offset - self.margin) + self.inset;
         }
     }
 }

@@ -38,7 +38,7 @@ pub use frame_speed::{FrameSpeedLimit, FrameSpeedSettings};
 pub use jerk::{JerkLimit, JerkSettings};
 pub use locked::{LockedJoints, LockedSettings};
 pub use margin::AlwaysHard;
-pub use moved::Moved;
+pub use moved::{Moved, Pose};
 pub use position::{PositionLimit, PositionSettings};
 pub use registry::RegisteredLimit;
 pub use set::LimitSet;

@@ -1,11 +1,13 @@
 //! Limits that are tighter for a while than a projector was built with.
 
-use super::PerJoint;
+use super::{HalfSpace, PerJoint};
+use crate::description::Payload;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// `{ speed = 0.3, upper = { elbow = 1.0 }, frame = { hand = 0.2 } }`: where limits are moved to while the robot runs. What is not named is as it was
-/// built; nothing can be looser than that. See [`Projector::move_limits`](crate::Projector::move_limits).
+/// built. Joints, insets, speeds and energy can be no looser than that; where a plane lies, an obstacle stands and what is carried is the operator's word.
+/// See [`Projector::move_limits`](crate::Projector::move_limits).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Moved {
@@ -32,6 +34,26 @@ pub struct Moved {
     /// Largest kinetic energy \[J\].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub energy: Option<f64>,
+    /// By the name of a `frame` limit with a half-space: where its plane lies; the margin of the build is kept.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub plane: BTreeMap<String, HalfSpace>,
+    /// By the name of an obstacle of `collision`: where it stands.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub body: BTreeMap<String, Pose>,
+    /// What the robot carries, beside what its description has: for a controller that is built anew, and refused by a projector that runs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub payload: Option<Payload>,
+}
+
+/// `{ position = [0.5, 0, 0.3], rpy = [0, 0, 1.57] }`: a place in the world.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pose {
+    /// Origin \[m\].
+    pub position: [f64; 3],
+    /// Roll, pitch and yaw \[rad\].
+    #[serde(default)]
+    pub rpy: [f64; 3],
 }
 
 impl Default for Moved {
@@ -45,6 +67,9 @@ impl Default for Moved {
             frame: BTreeMap::new(),
             frame_speed: BTreeMap::new(),
             energy: None,
+            plane: BTreeMap::new(),
+            body: BTreeMap::new(),
+            payload: None,
         }
     }
 }

@@ -186,15 +186,30 @@ impl Backup {
         self.on_the_way.fill(0.0);
     }
 
+    /// Puts planes and obstacles elsewhere, in the order of the limits.
+    pub(crate) fn put(&mut self, numbers: &[[f64; 6]]) {
+        self.checker.put(numbers);
+    }
+
     /// Finds by how much the stored brake, verified for limits that were moved since, breaks each hard row at most, which is what the way to
     /// the new ones may break from here on ([`Backup::on_the_way`]); true when that is anything.
-    pub(crate) fn measure_the_way(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
+    pub(crate) fn measure_the_way(
+        &mut self,
+        with: &With<'_>,
+        (q, v): (&[f64], &[f64]),
+        before: &[f64],
+    ) -> bool {
         self.on_the_way.fill(0.0);
         if self.within || !self.stored {
             return false;
         }
         let rows = self.allowed.len();
         self.trial.copy_from_slice(&self.deceleration);
+        for &i in &with.dofs.controllable {
+            let dof = Dof::of(with.limits, i);
+            let brake = Brake::new(&dof, self.trial[i], with.period);
+            self.stops[i] = dof.jerk.is_finite().then(|| brake.stop(v[i], before[i]));
+        }
         self.find_cuts(with, v);
         let mut first = 0;
         for k in 0..=self.cuts.len() {

@@ -60,11 +60,13 @@ impl Projector {
         let zero = || vec![0.0; nv];
         let coupled = stages(model, each, &limits, &dofs, &weight, &settings)?;
         let cones = coupled.as_ref().map_or(0, |stages| stages.sources.cone_limits().count());
+        let places = coupled.iter().flat_map(|stages| stages.sources.places());
+        let places = places.map(|(.., place)| place.numbers).collect();
         Ok(Projector {
             dynamics: Dynamics::new(model),
             checker,
             notes,
-            moving: Moving::new(&limits, switches.len(), cones),
+            moving: Moving::new(&limits, switches.len(), cones, places),
             in_force: limits.clone(),
             coupled,
             switches,

@@ -11,13 +11,18 @@
 //!
 //! The brake obeys all of it, so there is always an answer. The next brake is verified for the limit in force, so this limit never moves back.
 //! The goal is put where the fastest way leads: a joint that is too fast, or could not stop in front of its new position limit, slows down by
-//! `A_b`. Where the speed of a frame, a plane or the energy is what is late, all joints slow down in proportion, as fast as one of them can.
+//! `A_b`. Where the speed of a frame, a plane, a body or the energy is what is late, all joints slow down in proportion, as fast as one of them can.
+//!
+//! A joint of hard jerk goes on speeding up for a while as it begins to brake: `s` is the fastest that its brake becomes, and `r` as far as that goes
+//! ([`smooth`]). Of bodies the least distance of all pairs is what is in force.
 
 mod numbers;
+mod smooth;
 mod way;
 
 use super::Projector;
 use super::backup::With;
+use crate::jerk::Brake;
 use crate::ledger::Status;
 use crate::limit::Moved;
 use crate::target::Braking;
@@ -34,6 +39,9 @@ pub(super) struct Moving {
     pub(super) on: bool,
     /// As [`Projector::moved`].
     numbers: Vec<f64>,
+    /// Where planes and obstacles are, and where they were built.
+    places: Vec<[f64; 6]>,
+    built: Vec<[f64; 6]>,
     /// Some hard row or cone is moved.
     pub(super) coupled: bool,
     /// Positions and speeds asked for, of the build where those are tighter.
@@ -56,12 +64,14 @@ pub(super) struct Moving {
 }
 
 impl Moving {
-    pub(super) fn new(limits: &LimitSet, switches: usize, cones: usize) -> Moving {
+    pub(super) fn new(limits: &LimitSet, switches: usize, cones: usize, built: Vec<[f64; 6]>) -> Moving {
         let nv = limits.velocity.len();
         let infinite = || vec![f64::INFINITY; nv];
         let mut moving = Moving {
             on: false,
-            numbers: vec![0.0; 4 * nv + 2 * switches],
+            numbers: vec![0.0; 4 * nv + 2 * switches + 6 * built.len()],
+            places: built.clone(),
+            built,
             coupled: false,
             wanted: limits.clone(),
             faster: infinite(),
@@ -83,9 +93,11 @@ impl Moving {
         let nv = self.faster.len();
         self.numbers.fill(f64::INFINITY);
         self.numbers[2 * nv..3 * nv].fill(f64::NEG_INFINITY);
-        let switches = (self.numbers.len() - 4 * nv) / 2;
+        let places = self.numbers.len() - 6 * self.built.len();
+        let switches = (places - 4 * nv) / 2;
         self.numbers[4 * nv..4 * nv + switches].fill(0.0);
-        self.numbers[4 * nv + switches..].fill(1.0);
+        self.numbers[4 * nv + switches..places].fill(1.0);
+        self.numbers[places..].copy_from_slice(self.built.as_flattened());
     }
 }
 
@@ -95,8 +107,8 @@ impl Projector {
     /// [`Status::Tightening`](crate::Status::Tightening). Allocates.
     ///
     /// # Errors
-    /// Limits wider than those of the build or without room to stop, unknown names, hard rows and cones without a stored brake, hard
-    /// jerk, the free consistency; nothing is changed then.
+    /// Limits wider than those of the build or without room to stop, unknown names, hard rows and cones without a stored brake, the free
+    /// consistency, a payload, which changes the robot; nothing is changed then.
     pub fn move_limits(&mut self, moved: &Moved) -> Result<(), LimitError> {
         let numbers = self.moved_numbers(moved)?;
         self.set_moved(&numbers);
@@ -104,7 +116,8 @@ impl Projector {
     }
 
     /// Where limits are moved to, as plain numbers: largest speed, largest gain of speed, lowest and highest position of each dof (4 nv), then
-    /// how far inside the rows of each limit lie \[m\] and the share that its cone has (2 for each limit).
+    /// how far inside the rows of each limit lie \[m\] and the share that its cone has (2 for each limit), then six numbers for each plane and obstacle
+    /// that may be put elsewhere ([`Place`](crate::row::Place)).
     pub fn moved(&self) -> &[f64] {
         &self.moving.numbers
     }
@@ -131,9 +144,12 @@ impl Projector {
             m.wanted.q_upper[i] = m.wanted.q_upper[i].min(m.numbers[3 * nv + i]);
         }
         let (insets, shares) = m.numbers[4 * nv..].split_at(switches);
+        let (shares, places) = shares.split_at(switches);
+        m.places.as_flattened_mut().copy_from_slice(places);
+        let elsewhere = m.places != m.built;
         let joints = m.numbers[..2 * nv].iter().chain(&m.numbers[3 * nv..4 * nv]).any(|x| x.is_finite())
             || m.numbers[2 * nv..3 * nv].iter().any(|x| x.is_finite());
-        m.coupled = insets.iter().any(|by| *by > 0.0) || shares.iter().any(|share| *share < 1.0);
+        m.coupled = insets.iter().any(|by| *by > 0.0) || shares.iter().any(|share| *share < 1.0) || elsewhere;
         m.on = joints || m.coupled;
         m.slow = None;
         for limit in 0..switches {
@@ -143,7 +159,10 @@ impl Projector {
                 stages.sources.inset(limit, insets[limit]);
             }
         }
+        self.checker.put(&m.places);
+        self.backup.put(&m.places);
         if let Some(stages) = &mut self.coupled {
+            stages.sources.put(&m.places, &m.built);
             for c in 0..m.shares.len() {
                 let limit = stages.sources.cone_limits().nth(c).map_or(0, |(limit, ..)| limit);
                 m.shares[c] = shares[limit];
@@ -166,6 +185,9 @@ impl Projector {
         let dof =
             |limits: &LimitSet| Dof { whole: self.settings.braking == Braking::Stored, ..Dof::of(limits, i) };
         let (dof, wanted) = (dof(limits), dof(&self.moving.wanted));
+        if dof.jerk.is_finite() {
+            return self.move_smooth((q, v), i, (&dof, &wanted), built);
+        }
         let stored = (self.settings.braking == Braking::Stored && self.backup.stored)
             .then(|| self.backup.next_velocity(i, v, &self.period));
         let way = way((&dof, &wanted), (q, v), built, stored, self.moving.faster[i], &self.period);
@@ -198,7 +220,7 @@ impl Projector {
             With { limits: &self.in_force, dofs: &self.dofs, period: &self.period, external: &self.external };
         let mut further = false;
         if self.settings.braking == Braking::Stored {
-            self.backup.measure_the_way(&with, q, v);
+            self.backup.measure_the_way(&with, (q, v), &self.before);
             for (k, (most, on)) in self.backup.on_the_way().enumerate() {
                 if most > 0.0 {
                     name(rows, self.checker.hard_row(k));
@@ -222,7 +244,13 @@ impl Projector {
         }
         self.v_stop.copy_from_slice(v);
         for &i in &self.dofs.controllable {
-            self.v_stop[i] = match self.settings.braking == Braking::Stored && self.backup.stored {
+            let stored = self.settings.braking == Braking::Stored && self.backup.stored;
+            self.v_stop[i] = match stored {
+                _ if self.limits.jerk[i].is_finite() => {
+                    let dof = Dof::of(&self.limits, i);
+                    let most = if stored { self.backup.deceleration(i) } else { Brake::most(&dof) };
+                    v[i] + self.period.dt * Brake::new(&dof, most, &self.period).next(v[i], self.before[i])
+                }
                 true => self.backup.next_velocity(i, v[i], &self.period),
                 false => v[i] - v[i].signum() * (self.braking[i] * self.period.dt).min(v[i].abs()),
             };
@@ -254,7 +282,13 @@ impl Projector {
         }
         for &i in &self.dofs.controllable {
             let m = &self.moving;
-            let mut goal = m.slow.map_or(self.goal[i], |share| share * v[i]);
+            let mut goal = match m.slow {
+                Some(_) if self.limits.jerk[i].is_finite() => {
+                    let brake = Brake::of(&Dof::of(&self.limits, i), &self.period);
+                    v[i] + self.period.dt * brake.next(v[i], self.before[i])
+                }
+                slow => slow.map_or(self.goal[i], |share| share * v[i]),
+            };
             // What the box bounds, it clamps and reports by itself.
             if m.lower[i] > self.bounds.v_lower[i] {
                 goal = goal.max(m.lower[i]);

@@ -2,7 +2,7 @@
 
 use super::Dofs;
 use super::coupled::Coupled;
-use crate::row::{Cone, Needs, Previous, Rows, RowsMut, TickStart};
+use crate::row::{Cone, Needs, Place, Previous, Rows, RowsMut, TickStart};
 use crate::{Dynamics, Kind, Kinematics, Limit, LimitError, Model, Period, Soft};
 
 /// Where rows come from, and the memory they are written to.
@@ -33,8 +33,10 @@ struct Block {
     sizes: Vec<f64>,
     soft: Option<Soft>,
     enabled: bool,
-    /// It was moved inside.
+    /// It was moved.
     moved: bool,
+    /// How much of it may be put elsewhere.
+    places: usize,
 }
 
 struct ConeBlock {
@@ -74,7 +76,8 @@ impl Sources {
             if let Some(rows) = l.rows(model, controllable)? {
                 let (sizes, soft) = (rows.sizes(), l.soft());
                 check_sizes(&sizes, rows.names().len(), soft, l.label())?;
-                let block = Block { first, limit, soft, enabled: true, moved: false, rows, sizes };
+                let places = rows.places().len();
+                let block = Block { first, limit, soft, enabled: true, moved: false, places, rows, sizes };
                 first += block.sizes.len();
                 blocks.push(block);
             }
@@ -145,6 +148,26 @@ impl Sources {
     pub(crate) fn inset(&mut self, limit: usize, inset: f64) {
         for block in self.blocks.iter_mut().filter(|b| b.limit == limit) {
             block.moved = block.rows.inset(inset) && inset > 0.0;
+        }
+    }
+
+    /// What may be put elsewhere: of which limit, whether that is hard, and where it is.
+    pub(crate) fn places(&self) -> impl Iterator<Item = (usize, bool, Place)> {
+        let of = |b: &Block| {
+            let (limit, hard) = (b.limit, b.soft.is_none());
+            b.rows.places().into_iter().map(move |place| (limit, hard, place))
+        };
+        self.blocks.iter().flat_map(of)
+    }
+
+    /// Puts [`Sources::places`] where the numbers say; `built` are those of the build.
+    pub(crate) fn put(&mut self, numbers: &[[f64; 6]], built: &[[f64; 6]]) {
+        let mut first = 0;
+        for block in &mut self.blocks {
+            let own = first..first + block.places;
+            block.rows.put(&numbers[own.clone()]);
+            block.moved |= numbers[own.clone()] != built[own.clone()];
+            first = own.end;
         }
     }
 

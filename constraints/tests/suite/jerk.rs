@@ -333,8 +333,9 @@ fn what_hard_jerk_is_not_kept_with_is_refused_by_name() {
     let text = said(Projector::new(&panda(), &alone, &[0, 3], Settings::new(0.001, 1)));
     assert!(text.contains("hard jerk of 'panda_joint1', 'panda_joint4' has no acceleration limit"), "{text}");
     let mut moves = panda_with_jerk(300.0, Vec::new(), Settings::new(0.001, 1)).unwrap();
-    let text = moves.move_limits(&Moved::speed(0.5)).unwrap_err().to_string();
-    assert!(text.contains("limits are moved while jerk is hard"), "{text}");
+    let slower = Moved { acceleration: Some(PerJoint::All(2.0)), ..Moved::default() };
+    let text = moves.move_limits(&slower).unwrap_err().to_string();
+    assert!(text.contains("acceleration of joint 'panda_joint1' is moved while its jerk is hard"), "{text}");
     let both = "{ \"limit\": 1.0, \"hard\": true, \"soft\": { \"linear\": 1.0 } }";
     let text = serde_json::from_str::<limit::JerkSettings>(both).unwrap_err().to_string();
     assert!(text.contains("drop hard or soft"), "{text}");

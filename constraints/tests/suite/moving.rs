@@ -201,6 +201,200 @@ fn joints_with_torque_keep_what_is_declared_on_the_way_to_moved_limits() {
     }
 }
 
+/// The fastest that a joint becomes whose acceleration falls from `a` as its jerk lets it.
+fn crest(v: f64, a: f64, step: f64, dt: f64) -> f64 {
+    let (mut v, mut a) = (v, a - step);
+    while a > 0.0 {
+        (v, a) = (v + dt * a, a - step);
+    }
+    v
+}
+
+/// How far a joint goes at most that brakes from `v` after acceleration `a`: with what it speeds up by, for as long as its acceleration takes to
+/// turn round, and then by the deceleration `b`, which falls to none once more.
+fn farthest(v: f64, a: f64, b: f64, step: f64, dt: f64) -> f64 {
+    let top = crest(v, a, step, dt).max(v).max(0.0) + dt * step;
+    let turns = ((a.max(0.0) + b) / step + 2.0) * dt;
+    top * top / (2.0 * b) + top * (2.0 * turns + 3.0 * dt)
+}
+
+/// Hard jerk: what speeds up when limits become tighter goes on doing so for as long as its acceleration takes to fall, and no longer.
+#[test]
+fn joints_of_hard_jerk_keep_what_is_declared_on_the_way_to_moved_limits() {
+    const A: f64 = 10.0;
+    let robots =
+        [("small", small_arm(), None), ("rail", rail_arm(), Some(0.9)), ("random", random_arm(4, 5), None)];
+    for (name, model, torque) in &robots {
+        for (sub_steps, dt, jerk) in
+            [(0, 0.001, 300.0), (1, 0.001, 100.0), (1, 0.002, 300.0), (5, 0.01, 200.0), (0, 0.02, 300.0)]
+        {
+            let mut limits = joints(A, *torque);
+            limits.push(Box::new(JerkLimit::hard(jerk)));
+            let braking = if torque.is_some() { Braking::Stored } else { Braking::Certified };
+            let settings = Settings { braking, ..Settings::new(dt, sub_steps) };
+            let n = model.nv();
+            let all: Vec<usize> = (0..n).collect();
+            let mut projector = Projector::new(model, &limits, &all, settings).unwrap();
+            let (mut raw, mut target) = (Proposal::new(model), Target::new(model));
+            let (mut q, mut v, mut a) = (middle(model), vec![0.0; n], vec![0.0; n]);
+            let (mut attack, mut random) = (Attack::new(7, n), Random(19));
+            let mut asked: Option<Asked> = None;
+            let (mut ends, mut on_the_way, mut arrived, mut outside) = (vec![[f64::INFINITY; 2]; n], 0, 0, 0);
+            let step = jerk * dt;
+            for tick in 0..(if dt < 0.005 { 5000 } else { 2000 }) {
+                if random.next() < dt / 0.2 {
+                    let (mut moved, new) = draw(model, A, &mut random);
+                    moved.acceleration = None; // refused by name
+                    if projector.move_limits(&moved).is_ok() {
+                        // Certified brakes are the quickest, so that this is how far a joint may go beyond.
+                        let reach = |i: usize, d: f64| d * q[i] + farthest(d * v[i], d * a[i], A, step, dt);
+                        ends = (0..n)
+                            .map(|i| [new.upper[i].max(reach(i, 1.0)), (-new.lower[i]).max(reach(i, -1.0))])
+                            .collect();
+                        asked = Some(new);
+                    }
+                }
+                attack.propose(model, dt, &q, &mut raw);
+                let status = projector.project(&q, &v, &raw, &mut target);
+                let named = !target.ledger.outside.is_empty();
+                let mut wrong = Vec::new();
+                let mut check = |what: &str, i: usize, value: f64, limit: f64| {
+                    if value > limit + 1e-9 * limit.abs().max(1.0) {
+                        wrong.push(format!("{what} {i}: {value} of {limit}"));
+                    }
+                };
+                for i in 0..n {
+                    check("built speed", i, target.v[i].abs(), model.velocity_limit()[i]);
+                    check("built position", i, target.q[i], model.upper_position_limit()[i]);
+                    check("built position", i, -target.q[i], -model.lower_position_limit()[i]);
+                    check("acceleration", i, target.acceleration[i].abs(), A);
+                    check("jerk", i, (target.acceleration[i] - a[i]).abs(), step);
+                    let Some(asked) = &asked else { continue };
+                    for (d, speed) in [(1.0, asked.speed[i]), (-1.0, asked.speed[i])] {
+                        check("speed", i, d * target.v[i], speed.max(crest(d * v[i], d * a[i], step, dt)));
+                    }
+                    if braking == Braking::Certified {
+                        check("way", i, target.q[i], ends[i][0]);
+                        check("way", i, -target.q[i], ends[i][1]);
+                    }
+                    if !named {
+                        check("speed asked for", i, target.v[i].abs(), asked.speed[i]);
+                        check("position asked for", i, target.q[i], asked.upper[i]);
+                        check("position asked for", i, -target.q[i], -asked.lower[i]);
+                    }
+                }
+                if target.ledger.target_violations.total() > 0 {
+                    wrong.push(format!("the checker finds {:?}", target.ledger.target_violations));
+                }
+                if named
+                    && !matches!(status, Status::Tightening | Status::Braked(BrakeReason::NoVerifiedBrake))
+                {
+                    wrong.push("another status".into());
+                }
+                if !wrong.is_empty() && outside < 3 {
+                    println!("tick {tick} {status:?}: {wrong:?} {:?}", target.ledger);
+                }
+                outside += usize::from(!wrong.is_empty());
+                arrived += usize::from(on_the_way > 0 && !named);
+                on_the_way += usize::from(named);
+                projector.remember(&target);
+                (q, v, a) = (target.q.clone(), target.v.clone(), target.acceleration.clone());
+            }
+            println!(
+                "{name} {sub_steps} {dt} {jerk}: {outside} outside, {on_the_way} on the way, {arrived} after"
+            );
+            assert_eq!(outside, 0, "{name}, {sub_steps} steps of {dt} s, {jerk} rad/s³");
+            assert!(on_the_way > 20 && arrived > 20, "{name}, {dt} shows nothing");
+        }
+    }
+}
+
+/// A plane that turns and shifts, and a post that somebody carries about.
+#[test]
+fn planes_and_bodies_that_are_put_elsewhere_keep_what_is_declared() {
+    for (name, model, torque) in [("small", small_arm(), Some(0.6)), ("rail", rail_arm(), None)] {
+        let frame = model.frame("tool").unwrap();
+        let (mut kinematics, zero) = (Kinematics::new(&model), vec![0.0; model.nv()]);
+        let q0 = middle(&model);
+        kinematics.update(&q0, &zero, &zero);
+        let at0 = kinematics.point(frame, [0.0; 3]).position;
+        for (sub_steps, dt) in [(0, 0.001), (1, 0.002), (5, 0.01), (1, 0.02)] {
+            let ball =
+                |name: &str, frame: Option<&str>, position: [f64; 3], radius: f64| limit::SolidSettings {
+                    name: Some(name.into()),
+                    frame: frame.map(str::to_string),
+                    shape: geometry::Shape::Sphere { radius },
+                    position,
+                    rpy: [0.0; 3],
+                };
+            let mut limits = joints(10.0, torque);
+            let through = [at0[0] + 0.3, at0[1], at0[2]];
+            limits.push(Box::new(FrameLimit::half_space("tool", [1.0, 0.0, 0.0], through, 3.0)));
+            let shapes = vec![ball("hand", Some("tool"), [0.0; 3], 0.05), ball("post", None, [9.0; 3], 0.08)];
+            limits.push(Box::new(CollisionLimit::of(shapes, 3.0)));
+            let all: Vec<usize> = (0..model.nv()).collect();
+            let mut projector = Projector::new(&model, &limits, &all, Settings::new(dt, sub_steps)).unwrap();
+            assert!(projector.stores_a_brake());
+            let (mut raw, mut target) = (Proposal::new(&model), Target::new(&model));
+            let (mut q, mut v) = (q0.clone(), zero.clone());
+            let (mut attack, mut random) = (Attack::new(11, model.nv()), Random(23));
+            let (mut plane, mut post) = (([1.0, 0.0, 0.0], through), [9.0; 3]);
+            let (mut on_the_way, mut outside, mut arrived) = (0, 0, 0);
+            for tick in 0..(if dt < 0.005 { 3000 } else { 1000 }) {
+                if random.next() < dt / 0.3 {
+                    let mut moved = moved();
+                    kinematics.update(&q, &v, &zero);
+                    let at = kinematics.point(frame, [0.0; 3]).position;
+                    (plane, post) = (([1.0, 0.0, 0.0], through), [9.0; 3]);
+                    if random.next() < 0.6 {
+                        let normal =
+                            [random.between(0.5, 2.0), random.between(-1.0, 1.0), random.between(-1.0, 1.0)];
+                        plane = (
+                            normal,
+                            std::array::from_fn(|k| at[k] + random.between(-0.03, 0.15) * normal[k]),
+                        );
+                        moved.plane.insert("tool".into(), limit::HalfSpace { normal, through: plane.1 });
+                    }
+                    if random.next() < 0.6 {
+                        // Sometimes so near that they touch.
+                        let way: [f64; 3] = std::array::from_fn(|_| random.between(-1.0, 1.0));
+                        let size = way.iter().map(|x| x * x).sum::<f64>().sqrt().max(0.1);
+                        let far = random.between(0.12, 0.4);
+                        post = std::array::from_fn(|k| at[k] + far * way[k] / size);
+                        moved.body.insert("post".into(), limit::Pose { position: post, rpy: [0.0; 3] });
+                    }
+                    projector.move_limits(&moved).unwrap();
+                }
+                attack.propose(&model, dt, &q, &mut raw);
+                let status = projector.project(&q, &v, &raw, &mut target);
+                kinematics.update(&target.q, &target.v, &zero);
+                let at = kinematics.point(frame, [0.0; 3]).position;
+                let size = plane.0.iter().map(|x| x * x).sum::<f64>().sqrt();
+                let beyond = (0..3).map(|k| plane.0[k] * (at[k] - plane.1[k]) / size).sum::<f64>();
+                let gap = (0..3).map(|k| (at[k] - post[k]).powi(2)).sum::<f64>().sqrt() - 0.13;
+                let named = !target.ledger.outside.is_empty();
+                let mut wrong = vec![];
+                if !named && (beyond > 1e-9 || gap < -1e-9) {
+                    wrong.push(format!("{beyond} m beyond the plane, {gap} m from the post"));
+                }
+                if target.ledger.target_violations.total() > 0 {
+                    wrong.push(format!("the checker finds {:?}", target.ledger.target_violations));
+                }
+                if !wrong.is_empty() && outside < 3 {
+                    println!("tick {tick} {status:?}: {wrong:?} {:?}", target.ledger);
+                }
+                outside += usize::from(!wrong.is_empty());
+                arrived += usize::from(on_the_way > 0 && !named);
+                on_the_way += usize::from(named);
+                (q, v) = (target.q.clone(), target.v.clone());
+            }
+            println!("{name} {sub_steps} {dt}: {outside} outside, {on_the_way} on the way, {arrived} after");
+            assert_eq!(outside, 0, "{name}, {sub_steps} steps of {dt} s");
+            assert!(on_the_way > 20 && arrived > 20, "{name}, {dt} shows nothing");
+        }
+    }
+}
+
 /// A point below a plane, its speed and the energy, all of which move.
 #[test]
 fn frames_speeds_and_energy_keep_what_is_declared_on_the_way_to_moved_limits() {
@@ -333,6 +527,10 @@ fn what_was_built_is_not_loosened_and_what_is_unknown_is_named() {
     let one = |name: &str, value: f64| Some(PerJoint::Joints([(name.to_string(), value)].into()));
     let named = |name: &str, value: f64| [(name.to_string(), value)].into();
     let before = projector.moved().to_vec();
+    let plane =
+        |name: &str, normal| [(name.to_string(), limit::HalfSpace { normal, through: [0.0; 3] })].into();
+    let nowhere = limit::Pose { position: [0.0; 3], rpy: [0.0; 3] };
+    let load = description::Payload { frame: "tool".into(), mass: 1.5, com: [0.0; 3], inertia: [0.0; 6] };
     let cases = [
         (Moved::speed(1.5), vec!["speed", "1.5", "at most 1"]),
         (Moved::speed(f64::NAN), vec!["speed"]),
@@ -349,6 +547,9 @@ fn what_was_built_is_not_loosened_and_what_is_unknown_is_named() {
         (Moved { frame: named("tol", 0.1), ..moved() }, vec!["'tol'", "tool"]),
         (Moved { frame_speed: named("tool", 0.9), ..moved() }, vec!["frame_speed 0.9 m/s", "'tool'", "0.8"]),
         (Moved { energy: Some(1.0), ..moved() }, vec!["energy"]),
+        (Moved { plane: plane("tool", [0.0; 3]), ..moved() }, vec!["'tool'"]),
+        (Moved { body: [("post".to_string(), nowhere)].into(), ..moved() }, vec!["'post'"]),
+        (Moved { payload: Some(load), ..moved() }, vec!["payload of 1.5 kg", "nearl limits"]),
     ];
     for (moved, words) in cases {
         let error = projector.move_limits(&moved).unwrap_err().to_string();

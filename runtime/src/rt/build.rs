@@ -54,6 +54,8 @@ pub(crate) struct Source {
     pub(crate) moved: Moved,
     /// Only the limits are new.
     pub(crate) is_order: bool,
+    /// It was in use before, with other limits, and is to be so again.
+    pub(crate) goes_back: bool,
 }
 
 struct Job {

@@ -2,7 +2,8 @@
 //! controller before is kept, and is swapped back in when the robot no longer reaches its targets.
 //!
 //! Limits that an operator moves take the same way: the snapshot in use is built again with them, and a snapshot that comes later is built
-//! with them too. No snapshot overtakes such an order, and no controller with other limits is kept to go back to.
+//! with them too. No snapshot overtakes such an order, and no controller with other limits is kept to go back to: what was in use before is built again
+//! with the limits in force, where it has to be.
 
 use std::sync::Arc;
 
@@ -17,7 +18,7 @@ use crate::log::LogQueue;
 use crate::rt::build::{Builder, Built, Source};
 use crate::rt::core::Loaded;
 use crate::rt::receive::SnapshotReceiver;
-use crate::rt::residual::{Residual, RollbackSettings};
+use crate::rt::residual::{Residual, RollbackSettings, Weights};
 use crate::rt::swap::Sender;
 use crate::rt::tick::{Build, LoopController, Record};
 
@@ -41,6 +42,10 @@ pub(crate) struct SnapshotInbox<B: Build> {
     next_order: Option<(SnapshotHeader, Moved)>,
     /// In use before the current one.
     previous: Option<Made<B::Controller>>,
+    /// What weights were in use before the current ones, with whatever limits.
+    former: Option<Source>,
+    /// Number of the newest that came by an order.
+    by_order: u64,
     /// Header of the one in use; none for the first.
     current: Option<SnapshotHeader>,
     residual: Residual,
@@ -99,10 +104,17 @@ impl<B: Build> SnapshotInbox<B> {
             swap,
             ready: None,
             offered: None,
-            in_use: Source { bytes: Arc::new(first), moved: Moved::default(), is_order: false },
+            in_use: Source {
+                bytes: Arc::new(first),
+                moved: Moved::default(),
+                is_order: false,
+                goes_back: false,
+            },
             order: None,
             next_order: None,
             previous: None,
+            former: None,
+            by_order: 0,
             current: None,
             residual: Residual::new(rollback),
             condemned: None,
@@ -130,7 +142,8 @@ impl<B: Build> SnapshotInbox<B> {
 
     /// Takes in a tick and the one before it.
     pub(crate) fn observe(&mut self, previous: &Record, record: &Record) {
-        if let Some((before, after)) = self.residual.observe(previous, record) {
+        let weights = if record.snapshot == self.by_order { Weights::Same } else { Weights::New };
+        if let Some((before, after)) = self.residual.observe(previous, record, weights) {
             self.condemned = Some(format!(
                 "taken back: the velocity reached is {after:.3} rad/s or m/s off the target, {before:.3} before the swap"
             ));
@@ -151,6 +164,7 @@ impl<B: Build> SnapshotInbox<B> {
         if let Some(built) = self.builder.collect() {
             self.take(around, built);
         }
+        self.build_former(around);
         self.offer();
     }
 
@@ -166,7 +180,8 @@ impl<B: Build> SnapshotInbox<B> {
         (self.newest, self.came) = ((sender, version), clock::now());
         self.received += 1;
         let SnapshotBytes { header, bytes } = snapshot;
-        let source = Source { bytes: Arc::new(bytes), moved: self.in_use.moved.clone(), is_order: false };
+        let moved = self.in_use.moved.clone();
+        let source = Source { bytes: Arc::new(bytes), moved, is_order: false, goes_back: false };
         if let Some(replaced) = self.builder.take(self.received, header, source, *around.robot) {
             supersede(around.link, &replaced);
         }
@@ -202,13 +217,31 @@ impl<B: Build> SnapshotInbox<B> {
         let Some((header, moved)) = self.next_order.take() else { return };
         self.received += 1;
         self.order = Some(header);
-        let source = Source { bytes: Arc::clone(&self.in_use.bytes), moved, is_order: true };
+        self.by_order = self.received;
+        let source =
+            Source { bytes: Arc::clone(&self.in_use.bytes), moved, is_order: true, goes_back: false };
         self.builder.take(self.received, header, source, *around.robot); // it was idle: nothing is replaced
+    }
+
+    /// What is condemned gives way to the weights before it. Those that have other limits than are in force now are built again.
+    fn build_former(&mut self, around: &mut Surroundings<'_>) {
+        let is_free =
+            self.builder.is_idle() && self.order.is_none() && self.ready.is_none() && self.offered.is_none();
+        if self.condemned.is_none() || self.previous.is_some() || !is_free {
+            return;
+        }
+        let Some(former) = self.former.take() else { return };
+        self.received += 1;
+        let source = Source { moved: self.in_use.moved.clone(), is_order: false, goes_back: true, ..former };
+        self.builder.take(self.received, SnapshotHeader::default(), source, *around.robot); // it was idle
     }
 
     fn take(&mut self, around: &mut Surroundings<'_>, built: Built<B::Controller>) {
         let controller = match built.result {
             Ok(controller) => *controller,
+            Err(refusal) if built.source.goes_back => {
+                return self.note(&format!("nothing could be taken back to: {}", refusal.text));
+            }
             Err(refusal) => {
                 if built.source.is_order {
                     self.order = None;
@@ -223,7 +256,12 @@ impl<B: Build> SnapshotInbox<B> {
             None => self.builder.discard(Box::new(built.bytes)),
         }
         let loaded = Box::new(Loaded { id: built.id, controller });
+        let goes_back = built.source.goes_back;
         let made = (built.source, loaded);
+        if goes_back {
+            self.previous = Some(made);
+            return;
+        }
         if let Some((header, replaced)) = self.ready.replace((built.header, made)) {
             supersede(around.link, &header);
             self.builder.discard(Box::new(replaced));
@@ -263,9 +301,11 @@ impl<B: Build> SnapshotInbox<B> {
         if !is_order {
             self.accepted.push((around.tick, version));
         }
-        let before = std::mem::replace(&mut self.in_use, Source { is_order: false, ..source });
+        let before =
+            std::mem::replace(&mut self.in_use, Source { is_order: false, goes_back: false, ..source });
         let Some(header) = header else {
             self.builder.discard(Box::new((before, old)));
+            self.former = None;
             if let (Some(bad), Some(text)) = (self.current.take(), condemned) {
                 self.rolled_back += 1;
                 self.note(&text);
@@ -274,14 +314,17 @@ impl<B: Build> SnapshotInbox<B> {
             return;
         };
         if is_order {
-            // Nothing with other limits is kept; what is run has the weights that it had.
-            self.order = None;
+            // Nothing with other limits is kept; what is run has the weights that it had, and may still have to go.
+            (self.order, self.condemned) = (None, condemned);
             let previous = self.previous.take();
             previous.into_iter().for_each(|scrap| self.builder.discard(Box::new(scrap)));
             self.builder.discard(old);
             return reply(around.link, &header, around.tick, Verdict::Accepted, "in force");
         }
         // What was condemned is nothing to go back to.
+        if condemned.is_none() {
+            self.former = Some(before.clone());
+        }
         let kept = (before, old);
         let scrap = if condemned.is_none() { self.previous.replace(kept) } else { Some(kept) };
         if let Some(scrap) = scrap {

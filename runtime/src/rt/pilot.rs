@@ -13,6 +13,7 @@ use crate::link::{
 };
 use crate::rt::brake::Brake;
 use crate::rt::pinned::{Pinned, UNITS, above};
+use crate::rt::run::check_holding;
 use crate::rt::tick::{Build, LoopController, MAX_ROWS, Outcome, Question, Refusal, Row, TickOutput};
 use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError};
 
@@ -413,6 +414,11 @@ impl Build for PilotBuilder {
             return refuse(Verdict::Other, text.into());
         }
         snapshot.manifest.moved = Some(moved.clone());
+        if moved.payload.is_some()
+            && let Err(text) = check_holding(&snapshot)
+        {
+            return refuse(Verdict::Other, format!("with the payload {text}"));
+        }
         Ok(snapshot.to_bytes())
     }
 }

@@ -28,6 +28,14 @@ impl Default for RollbackSettings {
     }
 }
 
+/// What a swap brought.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Weights {
+    New,
+    /// Only the limits are others.
+    Same,
+}
+
 /// Sliding mean of the residual `sqrt(mean_i (v_i - v'_i)^2)`: velocity reached against velocity of the target.
 pub(crate) struct Residual {
     settings: RollbackSettings,
@@ -45,8 +53,14 @@ impl Residual {
         self.window.iter().sum::<f64>() / self.window.len().max(1) as f64
     }
 
-    /// Takes in a tick and the one before it; true when the snapshot in use should be taken back.
-    pub(crate) fn observe(&mut self, previous: &Record, record: &Record) -> Option<(f64, f64)> {
+    /// Takes in a tick and the one before it; the means before and after when the snapshot in use should be taken back. With the same `weights`
+    /// as the tick before, what was begun is watched on, whatever the limits.
+    pub(crate) fn observe(
+        &mut self,
+        previous: &Record,
+        record: &Record,
+        weights: Weights,
+    ) -> Option<(f64, f64)> {
         if self.settings.window == 0 {
             return None;
         }
@@ -57,7 +71,7 @@ impl Residual {
             }
         }
         // By the number, because the tick of the swap itself may have come without a state or been dropped.
-        if record.snapshot != previous.snapshot {
+        if record.snapshot != previous.snapshot && weights == Weights::New {
             let is_known = 4 * self.window.len() >= self.settings.window;
             self.before = is_known.then(|| self.mean());
             self.window.clear();
@@ -109,7 +123,7 @@ mod tests {
         };
         let records: Vec<Record> = errors.enumerate().map(&mut next).collect();
         let pairs = records.windows(2);
-        pairs.filter_map(|p| residual.observe(&p[0], &p[1]).map(|_| p[1].state.tick)).collect()
+        pairs.filter_map(|p| residual.observe(&p[0], &p[1], Weights::New).map(|_| p[1].state.tick)).collect()
     }
 
     #[test]
@@ -117,6 +131,24 @@ mod tests {
         let before = std::iter::repeat_n((0.02, false), 20);
         let after = std::iter::once((0.02, true)).chain(std::iter::repeat_n((0.1, false), 50));
         assert_eq!(run(before.chain(after)), [30]);
+    }
+
+    #[test]
+    fn an_order_in_between_changes_nothing() {
+        let settings = RollbackSettings { window: 10, factor: 3.0, floor: 0.05 };
+        let found = |by_order: Weights| {
+            let mut residual = Residual::new(settings);
+            let snapshot = |n: u64| u64::from(n >= 20) + u64::from(n >= 25);
+            let records: Vec<Record> =
+                (0..60).map(|n| tick(n, if n > 20 { 0.1 } else { 0.02 }, snapshot(n))).collect();
+            let weights = |record: &Record| if record.snapshot == 2 { by_order } else { Weights::New };
+            let pairs = records.windows(2);
+            pairs
+                .filter_map(|p| residual.observe(&p[0], &p[1], weights(&p[1])).map(|_| p[1].state.tick))
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(found(Weights::Same), [30]);
+        assert!(found(Weights::New).is_empty());
     }
 
     #[test]

@@ -240,7 +240,7 @@ pub fn run(
 
 /// Refuses a robot whose motors cannot hold it within its limits: it would brake until it fell. Where the forces of drives are bounded and nothing is
 /// promised of the motion (`guard = "drive"`), a robot on legs need not hold every pose.
-fn check_holding(snapshot: &Snapshot) -> Result<(), String> {
+pub(crate) fn check_holding(snapshot: &Snapshot) -> Result<(), String> {
     if snapshot.manifest.bounds_drives() {
         return Ok(());
     }

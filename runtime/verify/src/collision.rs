@@ -1,8 +1,11 @@
 //! Distances between bodies: from below by a plane between them, from above by two points of theirs. The points come from projections onto one
 //! body and the other in turn, which are closed forms.
 
+use std::collections::BTreeMap;
+
 use crate::limits::{CollisionSection, Of};
 use crate::motion::{Machine, Spot};
+use crate::moved::Pose;
 use crate::period::Period;
 use crate::robot::Shape;
 use crate::rows::{Passage, plane};
@@ -18,7 +21,7 @@ const TOUCHING: f64 = 1e-9;
 const SAME: f64 = 1e-7;
 
 /// A solid on the robot or in the world.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Body {
     name: String,
     /// The frame that carries it; none for an obstacle.
@@ -28,6 +31,7 @@ struct Body {
 }
 
 /// All solids, the pairs that must not meet, and what they keep.
+#[derive(Clone)]
 pub(crate) struct Collision {
     bodies: Vec<Body>,
     pairs: Vec<[usize; 2]>,
@@ -79,9 +83,7 @@ impl Collision {
                 })?,
                 None => Spot { link: None, place: Place::HERE },
             };
-            let [roll, pitch, yaw] = s.rpy;
-            let axes = product(&product(&turn(ONE[2], yaw), &turn(ONE[1], pitch)), &turn(ONE[0], roll));
-            let place = spot.place.then(&Place { at: s.position, axes });
+            let place = spot.place.then(&placed(s.position, s.rpy));
             let name = s.name.clone().or(s.frame.clone()).ok_or("a shape of collision has no name")?;
             bodies.push(Body { name, frame: s.frame.clone(), spot: Spot { place, ..spot }, shape: s.shape });
         }
@@ -120,6 +122,28 @@ impl Collision {
         let (margin, is_hard) = (section.margin, section.soft.is_none());
         let (influence, braking) = (section.influence, section.braking);
         Ok(Collision { bodies, pairs, margin, slots, is_hard, influence, braking })
+    }
+
+    /// The same with obstacles elsewhere.
+    pub(crate) fn with(&self, places: &BTreeMap<String, Pose>) -> Collision {
+        let mut moved = self.clone();
+        for body in moved.bodies.iter_mut().filter(|body| body.frame.is_none()) {
+            if let Some(to) = places.get(&body.name) {
+                body.spot.place = placed(to.position, to.rpy);
+            }
+        }
+        moved
+    }
+
+    /// The least distance of all pairs at the last [`Machine::go`], at most the influence [m]; none where that of some pair is not known.
+    pub(crate) fn least(&self, machine: &Machine) -> Option<f64> {
+        let mut least = self.influence;
+        for pair in &self.pairs {
+            machine.spend(10);
+            let [a, b] = pair.map(|k| self.solid(machine, k));
+            least = least.min(nearest(&a, &b)?.distance);
+        }
+        Some(least)
     }
 
     /// Names of its rows in the log.
@@ -230,6 +254,12 @@ impl Collision {
         let c = ((speed - before) / p.dt).clamp(-most, most);
         Told::Row(plane(p, at.distance - self.margin, speed, c, then, self.braking), slope)
     }
+}
+
+/// A place by its position and roll, pitch and yaw.
+fn placed(at: Vec3, [roll, pitch, yaw]: Vec3) -> Place {
+    let axes = product(&product(&turn(ONE[2], yaw), &turn(ONE[1], pitch)), &turn(ONE[0], roll));
+    Place { at, axes }
 }
 
 /// Where two solids are nearest; none where the points may be several, or are in each other.

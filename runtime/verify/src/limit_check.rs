@@ -326,9 +326,14 @@ pub(crate) fn rows(
     }
     let Some(collision) = l.collision.as_ref().filter(|c| c.is_hard) else { return Ok(()) };
     machine.go(passage.q, passage.v);
+    if l.nearer.is_nan() {
+        return Err(Fault::Unknown(
+            "how near bodies come on the way to obstacles that were put elsewhere is not known".into(),
+        ));
+    }
     let is_near = excused && !matches!(collision.gap(machine, collision.margin), Gap::Kept);
     machine.go(passage.q1, passage.v1);
-    match collision.gap(machine, collision.margin - TOLERANCE) {
+    match collision.gap(machine, collision.margin - l.nearer - TOLERANCE) {
         Gap::Near(pair, gap) if !is_near => broken(format!("distance of {pair}"), gap, collision.margin, "m"),
         Gap::Open(pair) => Err(Fault::Unknown(format!("the distance of {pair} could not be bounded"))),
         _ => Ok(()),

@@ -201,11 +201,12 @@ struct FrameSection {
     soft: Option<Soft>,
 }
 
+/// A plane, by its normal and a point of it.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct HalfSpace {
-    normal: Vec3,
-    through: Vec3,
+pub(crate) struct HalfSpace {
+    pub(crate) normal: Vec3,
+    pub(crate) through: Vec3,
 }
 
 #[derive(Debug, Deserialize)]
@@ -335,6 +336,8 @@ pub(crate) struct Limits {
     /// Rows, then cones, in the order of their numbers in the log, which begin at nv.
     pub(crate) rows: Vec<Row>,
     pub(crate) collision: Option<Rc<Collision>>,
+    /// By how much bodies may be nearer than their margin, on the way to where obstacles were put [m]; not a number where that is not known.
+    pub(crate) nearer: f64,
 }
 
 /// What limits are read for.
@@ -431,7 +434,7 @@ impl Section {
             let most = energy.limit - energy.margin;
             rows.push(Row::new("energy", "robot", (2.0 * most).sqrt(), energy.soft, Rule::Energy { most }));
         }
-        Ok(Limits { joints, rows, collision })
+        Ok(Limits { joints, rows, collision, nearer: 0.0 })
     }
 
     fn joint(&self, of: &Of<'_>, dof: usize, joint: &crate::robot::Joint) -> Bounds {
@@ -565,20 +568,21 @@ impl Profiles {
 impl FrameSection {
     fn rows(&self, of: &Of<'_>, rows: &mut Vec<Row>) -> Result<(), String> {
         let spot = of.spot(&self.frame)?;
-        let mut plane = |name: &str, n: Vec3, offset: f64| {
+        let mut plane = |name: &str, n: Vec3, offset: f64, is_half_space: bool| {
             let rule = Rule::Plane {
                 spot,
                 point: self.point,
                 n,
                 offset: offset - self.margin,
                 braking: self.braking,
+                half_space: is_half_space.then_some(self.margin),
             };
             let row = Row::new("frame", name, self.braking, self.soft, rule);
             rows.push(Row { label: self.name.clone().unwrap_or_else(|| self.frame.clone()), ..row });
         };
         if let Some(half) = &self.half_space {
             let n = times(1.0 / norm(half.normal), half.normal);
-            plane(&self.frame, n, dot(n, half.through));
+            plane(&self.frame, n, dot(n, half.through), true);
         }
         if let Some(inside) = &self.inside {
             for (k, axis) in ["x", "y", "z"].iter().enumerate() {
@@ -586,7 +590,7 @@ impl FrameSection {
                     let mut n = [0.0; 3];
                     n[k] = sign;
                     if let Some(end) = end {
-                        plane(&format!("{} {side} {axis} = {end}", self.frame), n, sign * end);
+                        plane(&format!("{} {side} {axis} = {end}", self.frame), n, sign * end, false);
                     }
                 }
             }

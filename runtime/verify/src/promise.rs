@@ -7,7 +7,7 @@ use crate::limits::{Consistency, Limits, Of, PerJoint, Section, Way};
 use crate::motion::Machine;
 use crate::moved::{Moved, Moving};
 use crate::period::Period;
-use crate::robot::Robot;
+use crate::robot::{Payload, Robot};
 
 /// The parts of a snapshot's manifest that are read.
 #[derive(Deserialize)]
@@ -130,6 +130,8 @@ pub(crate) struct Promise {
     pub(crate) limits_actions: bool,
     /// Where an operator has moved its limits; `limits` are then those in force for a tick.
     pub(crate) moving: Option<Moving>,
+    /// What the robot carries beside what its description has.
+    pub(crate) payload: Option<Payload>,
     /// A unit of softness: the weighted squared distance of the largest velocity change of one period.
     pub(crate) worth: f64,
 }
@@ -156,8 +158,11 @@ impl Promise {
     /// # Errors
     /// A clause that says what of it is not known here.
     pub(crate) fn read(bytes: &[u8], pinned: Option<&Value>) -> Result<Promise, String> {
-        let manifest: Manifest =
+        let mut manifest: Manifest =
             serde_json::from_str(&manifest(bytes)?).map_err(|e| format!("its manifest is damaged: {e}"))?;
+        if let Some(payload) = manifest.moved.as_ref().and_then(|moved| moved.payload.as_ref()) {
+            manifest.robot.carry(payload)?;
+        }
         Promise::of(&manifest, pinned)
     }
 
@@ -249,6 +254,7 @@ impl Promise {
             actions,
             limits_actions: section.action.is_some() || section.guard == "drive",
             moving,
+            payload: m.moved.as_ref().and_then(|moved| moved.payload.clone()),
             worth,
         })
     }

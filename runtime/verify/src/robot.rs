@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use crate::space::{Place, Vec3};
+use crate::space::{Mat3, Place, Vec3, dot, minus, plus, product, times};
 
 /// A robot as a snapshot describes it.
 #[derive(Debug, Deserialize)]
@@ -13,6 +13,56 @@ pub(crate) struct Robot {
     pub(crate) frames: Vec<Frame>,
     pub(crate) solids: Vec<Solid>,
     pub(crate) motors: Vec<Motor>,
+}
+
+/// A body held fast in a frame.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Payload {
+    frame: String,
+    mass: f64,
+    #[serde(default)]
+    com: Vec3,
+    /// About its centre of mass, in the frame's axes: `xx, xy, xz, yy, yz, zz` [kg·m²].
+    #[serde(default)]
+    inertia: [f64; 6],
+}
+
+impl Robot {
+    /// Adds a payload to the body that holds it: the second moments of both about their common centre of mass.
+    ///
+    /// # Errors
+    /// A clause.
+    pub(crate) fn carry(&mut self, load: &Payload) -> Result<(), String> {
+        let frame = self.frames.iter().find(|f| f.name == load.frame).map(|f| (f.body, f.placement));
+        let body = self.bodies.iter().position(|b| b.name == load.frame).map(|k| (Some(k), Place::HERE));
+        let fixed = || format!("its payload is held by '{}', which does not move", load.frame);
+        let (body, place) = body.or(frame).ok_or_else(fixed)?;
+        let body = body.and_then(|body| self.bodies.get_mut(body)).ok_or_else(fixed)?;
+        if !(load.mass > 0.0 && load.mass.is_finite()) {
+            return Err(format!("its payload has a mass of {} kg", load.mass));
+        }
+        let at = place.point(load.com);
+        let mass = body.mass + load.mass;
+        let com = times(1.0 / mass, plus(times(body.mass, body.com), times(load.mass, at)));
+        let full = |[xx, xy, xz, yy, yz, zz]: [f64; 6]| [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+        // R I R'
+        let back = |m: &Mat3| [0, 1, 2].map(|i| [0, 1, 2].map(|j| m[j][i]));
+        let turned = product(&product(&place.axes, &full(load.inertia)), &back(&place.axes));
+        let mut sum = full(body.inertia);
+        for (m, c) in [(body.mass, body.com), (load.mass, at)] {
+            let d = minus(c, com);
+            for i in 0..3 {
+                for j in 0..3 {
+                    sum[i][j] += m * (if i == j { dot(d, d) } else { 0.0 } - d[i] * d[j]);
+                }
+            }
+        }
+        let all: Mat3 = [0, 1, 2].map(|i| [0, 1, 2].map(|j| sum[i][j] + turned[i][j]));
+        (body.mass, body.com) = (mass, com);
+        body.inertia = [all[0][0], all[0][1], all[0][2], all[1][1], all[1][2], all[2][2]];
+        Ok(())
+    }
 }
 
 /// A rigid body and the joints that let it move against its parent.

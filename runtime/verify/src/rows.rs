@@ -62,8 +62,8 @@ pub(crate) enum Rule {
     TorqueRate { dof: usize, most: f64 },
     /// The force of a drive at one end of the period.
     Drive { dof: usize, most: f64, stiffness: f64, damping: f64, at_end: bool },
-    /// `n . p <= offset`, and `braking` stops the point in front of it.
-    Plane { spot: Spot, point: Vec3, n: Vec3, offset: f64, braking: f64 },
+    /// `n . p <= offset`, and `braking` stops the point in front of it; the margin of a half-space, which may be put elsewhere.
+    Plane { spot: Spot, point: Vec3, n: Vec3, offset: f64, braking: f64, half_space: Option<f64> },
     /// A sum of positions, velocities and accelerations.
     User { terms: Vec<Term>, lower: f64, upper: f64, braking: Option<f64>, is_equality: bool },
     /// A pair of bodies, see [`Collision`](crate::collision::Collision).
@@ -193,7 +193,7 @@ impl Row {
                 let [still, by] = drive(p, *stiffness, *damping, *at_end, passage.v[*dof]);
                 both(passage.tau[*dof] + still + by * passage.a[*dof], *most)
             }
-            Rule::Plane { spot, point, n, offset, braking } => {
+            Rule::Plane { spot, point, n, offset, braking, .. } => {
                 let mut ahead = Vec::new();
                 m.moved(passage.q, passage.v, p.dt, &mut ahead);
                 m.go(&ahead, passage.v);

@@ -10,6 +10,7 @@ use crate::moved::Moving;
 use crate::optimum;
 use crate::promise::{Entry, Projects, Promise, Sent};
 use crate::report::{Report, Violation};
+use crate::robot::Payload;
 use crate::rows::{Passage, Row};
 use crate::stop;
 use crate::tick::{Numbered, Status, Tick};
@@ -56,6 +57,8 @@ pub(crate) struct Session {
     promises: HashMap<u64, (Promise, Option<Promise>)>,
     past: Option<Past>,
     begun: Option<Begun>,
+    /// What the robot carries as far as the brake in force was verified with it.
+    carried: Option<Payload>,
     at: u64,
     pub(crate) report: Report,
 }
@@ -150,8 +153,21 @@ impl Session {
         }
         promises.0.machine.grant();
         promises.1.iter().for_each(|pinned| pinned.machine.grant());
+        if self.past.is_none() || promises.0.payload == self.carried {
+            self.carried.clone_from(&promises.0.payload);
+        }
+        // Another payload than the brake in force was verified with: it is executed until one with this payload is found.
+        let carries = promises.0.payload == self.carried;
+        let brakes = tick.ledger.status() == Some(Status::Braked);
+        if !brakes {
+            self.carried.clone_from(&promises.0.payload);
+        }
         let told = match self.examine(&mut promises, tick) {
             Ok(told) => told,
+            Err(Fault::Broken(_)) if brakes && !carries => {
+                self.skip("the robot braked as was verified before it carried what it carries now", 1);
+                None
+            }
             Err(Fault::Broken(Breach { what, value, limit, unit })) => {
                 self.report.add(Violation { tick: tick.tick, what, value, limit, unit });
                 None
@@ -424,7 +440,14 @@ impl Session {
             past => past.as_ref().map(|past| &past.brake[..]).filter(|brake| brake.len() == case.v.len()),
         };
         let Promise { machine, period, controllable, .. } = promise;
-        Ok(moving.in_force(machine, (period, controllable), (case.q, case.v), brake))
+        let last = case.last.clone();
+        let jerk = controllable.iter().any(|i| moving.built.joints[*i].jerk.is_finite());
+        if jerk && last.is_none() && case.v.iter().any(|v| *v != 0.0) {
+            let why = "their limits were moved, and the tick before, of which jerk speaks, is not known";
+            return Err(Fault::Unknown(why.into()));
+        }
+        let last = last.unwrap_or_else(|| vec![0.0; case.v.len()]);
+        Ok(moving.in_force(machine, (period, controllable), (case.q, case.v), (brake, &last)))
     }
 
     fn optimum(

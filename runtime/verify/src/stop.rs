@@ -250,7 +250,7 @@ fn rows(promise: &mut Promise, passage: &Passage<'_>, period: u32) -> Result<(),
     }
     let Some(collision) = limits.collision.as_ref().filter(|c| c.is_hard) else { return Ok(()) };
     machine.go(passage.q1, passage.v1);
-    match collision.gap(machine, collision.margin - TOLERANCE) {
+    match collision.gap(machine, collision.margin - limits.nearer - TOLERANCE) {
         Gap::Near(pair, gap) => broken(
             format!("distance of {pair} in period {} of the way to stop", period + 1),
             gap,

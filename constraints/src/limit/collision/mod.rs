@@ -5,8 +5,8 @@ mod pairs;
 use super::clearance::Ahead;
 use super::frame::check;
 use super::{About, Argument, Form, Limit, Takes, quoted_names};
-use crate::geometry::{Placement, Shape};
-use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
+use crate::geometry::Shape;
+use crate::row::{Motion, Needs, Place, Rows, RowsMut, TickStart};
 use crate::{FrameId, Kind, LimitError, Model, Soft};
 use pairs::{Body, Pairs, Reach};
 use serde::{Deserialize, Serialize};
@@ -169,8 +169,7 @@ impl CollisionLimit {
             s.shape.check(&format!("shape '{name}'"))?;
             let sum = s.position.iter().chain(&s.rpy).sum();
             check(&format!("position or rpy of shape '{name}'"), sum, true, "finite, in m and rad")?;
-            let local = Placement::new(s.position, s.rpy);
-            bodies.push(Body::new(name.clone(), link, frame, s.shape, local));
+            bodies.push(Body::stated(name.clone(), link, frame, s));
         }
         if self.settings.urdf {
             self.add_links(model, &mut bodies)?;
@@ -305,6 +304,14 @@ impl Rows for CollisionRows {
 
     fn asks_more(&self) -> bool {
         true
+    }
+
+    fn places(&self) -> Vec<Place> {
+        self.pairs.places()
+    }
+
+    fn put(&mut self, numbers: &[[f64; 6]]) {
+        self.pairs.put(numbers);
     }
 
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {

@@ -1,8 +1,10 @@
 //! Which solids are near each other now, and how fast they close.
 
 use super::super::clearance::Clearance;
+use super::SolidSettings;
 use crate::geometry::{Placement, Separation, Shape, separation};
 use crate::kinematics::{dot, minus, norm};
+use crate::row::Place;
 use crate::{FrameId, FrameMotion, Kinematics, Period};
 
 /// A solid on a frame.
@@ -14,11 +16,20 @@ pub(super) struct Body {
     shape: Shape,
     local: Placement,
     radius: f64,
+    /// Position and roll, pitch, yaw of an obstacle, which may be put elsewhere.
+    stands: Option<[f64; 6]>,
 }
 
 impl Body {
     pub(super) fn new(name: String, link: String, frame: FrameId, shape: Shape, local: Placement) -> Body {
-        Body { name, link, frame, shape, local, radius: shape.bounding_radius() }
+        Body { name, link, frame, shape, local, radius: shape.bounding_radius(), stands: None }
+    }
+
+    /// As the settings have it.
+    pub(super) fn stated(name: String, link: String, frame: FrameId, s: &SolidSettings) -> Body {
+        let ([x, y, z], [roll, pitch, yaw]) = (s.position, s.rpy);
+        let stands = link.is_empty().then_some([x, y, z, roll, pitch, yaw]);
+        Body { stands, ..Body::new(name, link, frame, s.shape, Placement::new(s.position, s.rpy)) }
     }
 
     pub(super) fn called(&self, name: &str) -> bool {
@@ -89,6 +100,21 @@ impl Pairs {
         let (before, at, slots) = (room(), room(), reach.rows.min(pairs.len()));
         let (nearest, found) = (Vec::with_capacity(slots + 1), Vec::with_capacity(slots));
         Pairs { bodies, pairs, reach, before, at, nearest, found }
+    }
+
+    /// The obstacles, and where they stand.
+    pub(super) fn places(&self) -> Vec<Place> {
+        let stands = |body: &Body| Some(Place { name: Some(body.name.clone()), numbers: body.stands? });
+        self.bodies.iter().filter_map(stands).collect()
+    }
+
+    /// Puts the obstacles elsewhere.
+    pub(super) fn put(&mut self, numbers: &[[f64; 6]]) {
+        let obstacles = self.bodies.iter_mut().filter(|body| body.stands.is_some());
+        for (body, numbers) in obstacles.zip(numbers) {
+            let [x, y, z, roll, pitch, yaw] = *numbers;
+            (body.local, body.stands) = (Placement::new([x, y, z], [roll, pitch, yaw]), Some(*numbers));
+        }
     }
 
     /// Number of rows.

@@ -1,6 +1,7 @@
 //! Turns limits that are asked for by name into plain numbers, and refuses those that cannot be, with the reason.
 
 use super::Moving;
+use crate::kinematics::{dot, norm};
 use crate::limit::Moved;
 use crate::projector::Projector;
 use crate::target::{Braking, Consistency};
@@ -14,7 +15,7 @@ impl Projector {
     /// As there.
     pub fn moved_numbers(&self, moved: &Moved) -> Result<Vec<f64>, LimitError> {
         let (nv, switches) = (self.model.nv(), self.switches.len());
-        let mut still = Moving::new(&self.limits, switches, 0);
+        let mut still = Moving::new(&self.limits, switches, 0, self.moving.built.clone());
         if *moved == Moved::default() {
             return Ok(still.numbers);
         }
@@ -24,11 +25,13 @@ impl Projector {
                 next: "set consistency = \"kinematic\", or build another projector with tighter limits",
             });
         }
-        if self.limits.has_jerk() {
+        if let Some(payload) = &moved.payload {
             return Err(LimitError::Unusable {
-                what: "limits are moved while jerk is hard, for which no way to other limits is declared"
-                    .into(),
-                next: "drop hard from jerk, or build another projector with tighter limits",
+                what: format!(
+                    "a payload of {} kg changes the robot that the projector was built for",
+                    payload.mass
+                ),
+                next: "build another with Model::with_payload, or give it to a running loop with 'nearl limits'",
             });
         }
         let share = moved.speed;
@@ -39,8 +42,10 @@ impl Projector {
         let numbers = &mut still.numbers;
         self.move_joints(moved, numbers)?;
         let (insets, shares) = numbers[4 * nv..].split_at_mut(switches);
+        let (shares, places) = shares.split_at_mut(switches);
         self.move_frames(moved, insets)?;
         self.move_cones(moved, shares)?;
+        self.move_places(moved, places)?;
         if share < 1.0 && shares.iter().all(|s| *s == 1.0) && numbers[..nv].iter().all(|v| v.is_infinite()) {
             let what = format!(
                 "speed is {share} of no limit: the projector has none on velocity, frame speed or energy"
@@ -81,6 +86,13 @@ impl Projector {
             let speed = inside("velocity", velocity[i], v, wider(velocity[i], v), "rad/s or m/s")?;
             let gain =
                 inside("acceleration", acceleration[i], a, wider(acceleration[i], a), "rad/s² or m/s²")?;
+            if gain.is_some() && built.jerk[i].is_finite() {
+                // Turned round at standstill, it speeds up by what it slowed down by, until that has fallen.
+                return Err(LimitError::Unusable {
+                    what: format!("acceleration of joint '{name}' is moved while its jerk is hard"),
+                    next: "drop hard from jerk, or move speeds and positions alone",
+                });
+            }
             let up = inside("upper", upper[i], high, wider(upper[i], high), "rad or m")?;
             let down = inside("lower", lower[i], low, lower[i].is_some_and(|x| x < low), "rad or m")?;
             numbers[i] = (moved.speed * v).min(speed.unwrap_or(f64::INFINITY));
@@ -137,6 +149,61 @@ impl Projector {
             }
             if !any {
                 return Err(self.unknown("frame", name));
+            }
+        }
+        Ok(())
+    }
+
+    /// Planes and obstacles, wherever they are put.
+    fn move_places(&self, moved: &Moved, numbers: &mut [f64]) -> Result<(), LimitError> {
+        let places: Vec<_> = self.coupled.iter().flat_map(|stages| stages.sources.places()).collect();
+        let finite = |what: String, values: &[f64]| match values.iter().find(|x| !x.is_finite()) {
+            Some(x) => Err(LimitError::BadValue { what, value: *x, domain: "finite, in m or rad" }),
+            None => Ok(()),
+        };
+        for (name, plane) in &moved.plane {
+            let mut any = false;
+            for ((limit, hard, place), to) in places.iter().zip(numbers.chunks_mut(6)) {
+                if place.name.is_some() || self.switches[*limit].label != *name {
+                    continue;
+                }
+                finite(format!("plane of '{name}'"), &[plane.normal, plane.through].concat())?;
+                let length = norm(plane.normal);
+                if length < 1e-9 {
+                    let (what, domain) = (format!("length of the normal of '{name}'"), "above 0");
+                    return Err(LimitError::BadValue { what, value: length, domain });
+                }
+                self.can_stop("frame", name, *hard)?;
+                let n = plane.normal.map(|x| x / length);
+                to[..3].copy_from_slice(&n);
+                (to[3], any) = (dot(n, plane.through), true);
+            }
+            if !any {
+                return Err(self.unknown("frame", name));
+            }
+        }
+        for (name, pose) in &moved.body {
+            let mut any = false;
+            for ((_, hard, place), to) in places.iter().zip(numbers.chunks_mut(6)) {
+                if place.name.as_ref() == Some(name) {
+                    finite(format!("place of obstacle '{name}'"), &[pose.position, pose.rpy].concat())?;
+                    self.can_stop("collision", name, *hard)?;
+                    to[..3].copy_from_slice(&pose.position);
+                    to[3..].copy_from_slice(&pose.rpy);
+                    any = true;
+                }
+            }
+            if !any {
+                let known: Vec<&str> = places.iter().filter_map(|(.., p)| p.name.as_deref()).collect();
+                let near = match known.is_empty() {
+                    true => "; collision has none".to_string(),
+                    false => crate::error::near_names(name, known.into_iter()),
+                };
+                let what = format!("no obstacle is called '{name}'{near}");
+                return Err(LimitError::Unusable {
+                    what,
+                    next: "name one of collision.shapes without a frame",
+                });
             }
         }
         Ok(())

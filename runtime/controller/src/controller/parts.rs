@@ -6,8 +6,8 @@ use crate::snapshot::{Manifest, Networks, PolicyKind, SnapshotError};
 use crate::task::{IdmInput, IdmKind};
 use nearl_constraints::description::FrictionLaw;
 use nearl_constraints::{
-    ActionLimit, Consistency, ConstraintSettings, Drive, DriveTorqueLimit, Entry, Model, Projector, Settings,
-    StateLayout, TorqueLimit, build_limits,
+    ActionLimit, Consistency, ConstraintSettings, Drive, DriveTorqueLimit, Entry, Model, Moved, Projector,
+    Settings, StateLayout, TorqueLimit, build_limits,
 };
 
 /// Robot, layout and projector of a task: what a controller needs beside its networks.
@@ -40,7 +40,11 @@ impl Parts {
     /// # Errors
     /// As [`Parts::new`].
     pub fn robot(m: &Manifest) -> Result<Model, SnapshotError> {
-        let model = Model::from_description(m.robot.clone());
+        let mut robot = m.robot.clone();
+        if let Some(payload) = m.moved.as_ref().and_then(|moved| moved.payload.as_ref()) {
+            robot.carry(payload).map_err(|e| unusable(&e))?;
+        }
+        let model = Model::from_description(robot);
         match m.task.model.friction {
             FrictionLaw::Mujoco => model,
             law => model.and_then(|model| model.with_friction_law(law)),
@@ -133,7 +137,9 @@ impl Parts {
         let mut projector =
             Projector::new(model, &limits, controllable, settings).map_err(|e| unusable(&e))?;
         if let Some(moved) = &m.moved {
-            projector.move_limits(moved).map_err(|e| unusable(&e))?;
+            // The model has the payload.
+            let moved = Moved { payload: None, ..moved.clone() };
+            projector.move_limits(&moved).map_err(|e| unusable(&e))?;
         }
         Ok(projector)
     }
