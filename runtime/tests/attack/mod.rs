@@ -161,6 +161,7 @@ impl Attack {
                 let id = core.controller.id + 1;
                 log.push_snapshot(id, 1, next.to_bytes(), controller.row_names());
                 *core.controller = Loaded { id, controller };
+                twin.carry(self, moved);
             }
             core.swap(moved.is_some());
             let (begin, fresh) = (tick * period, Some(&state));
@@ -205,6 +206,15 @@ impl Twin {
 }
 
 impl Twin {
+    /// The plant has in its hand what the operator says.
+    fn carry(&mut self, attack: &Attack, moved: &Moved) {
+        let bare = attack.model();
+        let model =
+            moved.payload.as_ref().map_or(Ok(bare.clone()), |payload| bare.with_payload(payload)).unwrap();
+        let all: Vec<usize> = (0..model.nv()).collect();
+        self.dynamics = PeriodDynamics::new(&model, &all, *self.dynamics.period());
+    }
+
     fn measure(&self, state: &mut StateMessage) {
         let n = self.v.len() as u32;
         (state.nq, state.nv, state.nu, state.n_obs) = (n, n, n, 2 * n);

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use crate::arm::*;
 use crate::toy::Name;
+use nearl_constraints::Moved;
 use nearl_runtime::link::*;
 use nearl_runtime::log::{Gap, replay};
 use nearl_runtime::rt::*;
@@ -278,6 +279,44 @@ fn a_snapshot_that_misses_its_targets_is_taken_back_and_the_log_replays() {
     assert_eq!(report.versions.iter().map(|v| v.1).collect::<Vec<_>>(), [1, 2, toy::MISSES, 2]);
     assert_eq!((report.rolled_back, report.counters.swaps), (1, 3));
     assert!(report.refusals[0].contains("off the target"), "{:?}", report.refusals);
+    let (drops, _dropped) = std::sync::mpsc::channel();
+    let found = nearl_runtime::log::replay_with(&log, toy::SpringBuilder(drops)).unwrap();
+    assert_eq!((found.difference, found.ticks, found.swaps), (None, report.ticks, 3));
+}
+
+/// Limits that an operator moves while a new snapshot is still being watched: it is taken back as it would be without, and what comes back has the limits.
+#[test]
+fn a_snapshot_that_misses_its_targets_is_taken_back_after_an_order_too() {
+    let folder = Scratch::new("rollback-order");
+    let log = folder.0.join("rollback.mcap");
+    let name = Name::new("rollback-order");
+    let body = toy::PointMass { q: 1.0, pause: Duration::from_millis(3), ..toy::PointMass::default() };
+    let plant = toy::PlantThread::start(&name, body, PlantSettings::lockstep(toy::DT));
+    let settings = RunSettings { log: Some(log.clone()), first: b"spring".to_vec(), ..toy::settings() };
+    let running = toy::LoopThread::start(&name, settings, |_| {});
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    trainer.wait_for_runtime(PATIENCE).unwrap();
+    let mut operator = OperatorLink::open(&name.0, PATIENCE).unwrap();
+    while trainer.state().is_none_or(|s| s.tick < 300) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    trainer.push(toy::MISSES, b"missing").unwrap();
+    assert_eq!(trainer.wait_for_receipt(toy::MISSES, PATIENCE).unwrap().verdict(), Verdict::Accepted);
+    let ordered = operator.move_limits(&Moved::speed(0.5), PATIENCE).unwrap();
+    assert_eq!(ordered.verdict(), Verdict::Accepted, "{}", ordered.text());
+    let receipt = trainer.wait_for_receipt(toy::MISSES, PATIENCE).unwrap();
+    assert_eq!(receipt.verdict(), Verdict::RolledBack, "{}", receipt.text());
+    assert!(
+        receipt.tick > ordered.tick,
+        "it was taken back before the order: {} {}",
+        receipt.tick,
+        ordered.tick
+    );
+    let report = running.end();
+    plant.end();
+    // The toy's version is that of the message, and what is built again came with none.
+    assert_eq!(report.versions.iter().map(|v| v.1).collect::<Vec<_>>(), [1, toy::MISSES, 0]);
+    assert_eq!((report.rolled_back, report.counters.swaps), (1, 3), "{report}");
     let (drops, _dropped) = std::sync::mpsc::channel();
     let found = nearl_runtime::log::replay_with(&log, toy::SpringBuilder(drops)).unwrap();
     assert_eq!((found.difference, found.ticks, found.swaps), (None, report.ticks, 3));

@@ -7,6 +7,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::{JoinHandle, ThreadId};
 use std::time::Duration;
 
+use nearl_constraints::Moved;
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 
@@ -118,7 +119,7 @@ impl Drop for Spring {
     }
 }
 
-/// Accepts the bytes `spring` and nothing else.
+/// Accepts the bytes `spring`, and `missing` for one that misses its targets whatever its version; with limits moved, which it has none of, as well.
 pub struct SpringBuilder(pub Sender<(u64, ThreadId)>);
 
 impl Build for SpringBuilder {
@@ -131,10 +132,17 @@ impl Build for SpringBuilder {
         if snapshot.bytes == b"panic" {
             panic!("scripted panic of the test builder");
         }
+        if snapshot.bytes == b"missing" {
+            return Ok(spring(MISSES, &self.0));
+        }
         if snapshot.bytes != b"spring" {
             return Err(Refusal { verdict: Verdict::Corrupt, text: "the digest does not match".into() });
         }
         Ok(spring(snapshot.header.version, &self.0))
+    }
+
+    fn with_limits(&mut self, bytes: &[u8], _: &Moved) -> Result<Vec<u8>, Refusal> {
+        Ok(bytes.to_vec())
     }
 }
 
