@@ -7,6 +7,7 @@ The first worker writes the run folder, which every machine of the cluster sees.
 """
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ def main() -> None:
     parser.add_argument("--batch-size", type=int, default=2048, help="of a minibatch; the workers share those of 512 and more")
     parser.add_argument("--out", required=True, type=lambda text: str(Path(text).resolve()))
     given = parser.parse_args()
+    os.environ.setdefault("RAY_TRAIN_WORKER_GROUP_START_TIMEOUT_S", "600")  # [s]; on a busy machine a minute, Ray's own, is short for importing torch
     try:
         import torch  # noqa: F401
         from ray.train import ScalingConfig
