@@ -24,8 +24,8 @@ fn error(error: LinkError) -> PyErr {
 #[pyclass(module = "nearl._core", frozen)]
 pub(crate) struct Plant {
     exchange: Mutex<Option<Exchange>>,
-    /// nq, nv, n_obs, nu.
-    sizes: [usize; 4],
+    /// nq, nv, n_obs.
+    sizes: [usize; 3],
 }
 
 type Told<'py> = (&'static str, Option<Bound<'py, PyArray1<f64>>>);
@@ -54,10 +54,8 @@ impl Plant {
         let (nq, nv, n_obs) = (nq.unwrap_or(joints.len()), nv.unwrap_or(joints.len()), observation.len());
         let robot = Robot { joints, observation, limits: 0, stated: None, nq, nv, nu, dt, lockstep };
         let name = RobotName::new(name).map_err(errors::value)?;
-        let mut exchange = Exchange::open(&name, &robot, watchdog).map_err(error)?;
-        let state = exchange.state();
-        (state.nq, state.nv, state.n_obs, state.nu) = (nq as u32, nv as u32, n_obs as u32, nu as u32);
-        Ok(Plant { exchange: Mutex::new(Some(exchange)), sizes: [nq, nv, n_obs, nu] })
+        let exchange = Exchange::open(&name, &robot, watchdog).map_err(error)?;
+        Ok(Plant { exchange: Mutex::new(Some(exchange)), sizes: [nq, nv, n_obs] })
     }
 
     /// Gives the state q (nq) [rad or m], v (nv) [rad/s or m/s], obs (n_obs) to the loop and waits at most `patience` [s] for an action
@@ -74,7 +72,7 @@ impl Plant {
         begins: bool,
     ) -> PyResult<Told<'py>> {
         let py = q.py();
-        let [nq, nv, n_obs, nu] = self.sizes;
+        let [nq, nv, n_obs] = self.sizes;
         let (q, v, obs) = (vector("q", q, nq)?, vector("v", v, nv)?, vector("obs", obs, n_obs)?);
         if !(0.0..=1e6).contains(&patience) {
             return Err(errors::value(format!("patience is {patience} s; give 0 to 1e6 seconds")));
@@ -83,19 +81,12 @@ impl Plant {
             let mut open = self.open();
             let exchange = open.as_mut()?;
             let state = exchange.state();
-            state.q[..nq].copy_from_slice(&q);
-            state.v[..nv].copy_from_slice(&v);
-            state.obs[..n_obs].copy_from_slice(&obs);
             (state.time, state.episode, state.bits) = (time, episode, if begins { STATE_RESET } else { 0 });
-            let told = match exchange.tick(patience) {
-                Turn::Act(action) if action.len() == nu => ("act", Some(action.to_vec())),
-                Turn::Hold(action) if action.len() == nu => ("hold", Some(action.to_vec())),
-                _ => ("brake", None),
-            };
-            if let Some(action) = &told.1 {
-                exchange.state().applied[..nu].copy_from_slice(action);
-            }
-            Some(told)
+            Some(match exchange.exchange(&q, &v, &obs, patience) {
+                Turn::Act(action) => ("act", Some(action.to_vec())),
+                Turn::Hold(action) => ("hold", Some(action.to_vec())),
+                Turn::Brake => ("brake", None),
+            })
         });
         let (turn, action) =
             told.ok_or_else(|| PyRuntimeError::new_err("the plant is closed; open another one"))?;

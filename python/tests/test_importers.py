@@ -258,7 +258,7 @@ def arm_of_drives(tmp_path, command: str, robot: str = "planar.urdf", dt: float 
     (tmp_path / "recipe.toml").write_text(
         f"[time]\ndt = {dt}\nsim_dt = 0.002\npolicy_every = 20\n[command]\n{command}\n[policy]\njoints = ['joint2', 'joint0', 'joint1']\n"
         "pose = [0.3, 0.1, 0.2]\nobservation = [{ term = 'joint_pos' }, { term = 'joint_vel' }, { term = 'phase', period = 0.7 }]\n[constraints]\n"
-        "guard = true\nposition = { margin = 0.02 }\nvelocity = { scale = 0.5 }\nacceleration = { limit = 15.0 }\ntorque = { scale = 1.0 }\n"
+        "guard = true\nposition = { margin = 0.02 }\nvelocity = { limit = 2.0 }\nacceleration = { limit = 15.0 }\ntorque = { scale = 1.0 }\n"
     )
     layers = [(3.0 * RNG.normal(size=(3, 8)), RNG.normal(size=3), "tanh"), (3.0 * np.eye(3), np.zeros(3), "identity")]
     policy = nearl.Policy.from_layers(layers, np.zeros(8), np.ones(8), (-np.inf, np.inf), (-3.0, 3.0))
@@ -294,7 +294,7 @@ def test_a_simulation_without_the_drives_that_are_commanded_is_refused(tmp_path)
     planar(tmp_path)
     refused(arm_of_drives(tmp_path, "interface = 'position'"), "joint 'joint0' is sent 'position' commands, and the simulated robot has no such drive")
     joints = "".join(f"<body><joint name='joint{i}' axis='0 1 0' range='-2 2' limited='true'/><geom size='.1' mass='1'/>" for i in range(3))
-    drives = "".join(f"<position joint='joint{i}' kp='40' kv='2' forcerange='-20 20'/>" for i in range(3))
+    drives = "".join(f"<position joint='joint{i}' kp='40' kv='2' ctrlrange='-3 3' forcerange='-20 20'/>" for i in range(3))
     (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{joints}</body></body></body></worldbody><actuator>{drives}</actuator></mujoco>")
     gains = "interface = 'pd'\nstiffness = 40.0\ndamping = 3.0"
     refused(arm_of_drives(tmp_path, gains, "arm.xml"), "has stiffness 40 and damping 3 here, and the simulated robot's has 40 and 2")

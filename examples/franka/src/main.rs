@@ -143,18 +143,15 @@ fn drive(robot: &franka::Robot, name: &str, settings: &Settings) -> Result<Repor
         let (measured, _) = control.read_once()?; // 1. measure; this keeps the time
         let leaving = leave.load(Ordering::Relaxed) || time >= settings.seconds;
         let state = plant.state();
-        (state.nq, state.nv, state.nu, state.n_obs) = (N as u32, N as u32, N as u32, 2 * N as u32);
-        state.q[..N].copy_from_slice(&measured.q);
-        state.v[..N].copy_from_slice(&measured.dq);
-        state.obs[..N].copy_from_slice(&measured.q);
-        state.obs[N..2 * N].copy_from_slice(&measured.dq);
         (state.time, state.bits) = (time, if time == 0.0 { STATE_RESET } else { 0 });
         let patience = match (settings.simulated, plant.is_attached()) {
             (false, _) => 0.6 * DT,
             (true, true) => 0.3,
             (true, false) => 0.002,
         };
-        let turn = if leaving { Turn::Brake } else { plant.tick(patience) }; // 2. ask
+        let (q, v) = (&measured.q, &measured.dq);
+        let seen: [f64; 2 * N] = std::array::from_fn(|i| if i < N { q[i] } else { v[i - N] });
+        let turn = if leaving { Turn::Brake } else { plant.exchange(q, v, &seen, patience) }; // 2. ask
         let leads = turn != Turn::Brake;
         let asked = match turn {
             Turn::Act(action) | Turn::Hold(action) => {

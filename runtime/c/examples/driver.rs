@@ -16,28 +16,16 @@ fn main() -> Result<(), Failure> {
 /// Ticks acted and braked, and how far and how fast the carriage went [m, m/s].
 pub(crate) fn drive(name: &str, ticks: u64) -> Result<[f64; 4], Failure> {
     let dt = 0.001;
-    let robot = Robot {
-        joints: vec!["slide".into()],
-        observation: vec!["q.slide".into(), "v.slide".into()],
-        limits: 0,
-        stated: None,
-        nq: 1,
-        nv: 1,
-        nu: 1,
-        dt,
-        lockstep: true,
-    };
+    let robot = Robot { lockstep: true, ..Robot::new(&["slide"], &["q.slide", "v.slide"], 1, dt) };
     let mut plant = Exchange::open(&RobotName::new(name)?, &robot, 0.02)?;
-
     let (mut q, mut v, mut farthest, mut fastest) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64); // the robot
     let (mut acted, mut braked, mut tick) = (0, 0, 0);
     while acted < ticks && braked < 100 {
-        let state = plant.state(); // 1. measure
-        (state.nq, state.nv, state.nu, state.n_obs) = (1, 1, 1, 2);
-        (state.q[0], state.v[0], state.obs[0], state.obs[1]) = (q, v, q, v);
+        let state = plant.state();
         (state.time, state.bits) = (tick as f64 * dt, if tick == 0 { STATE_RESET } else { 0 });
-        let force = match plant.tick(0.3) {
-            Turn::Act(action) => (action[0], acted += 1).0, // 2. ask
+        // 1. measure, 2. ask
+        let force = match plant.exchange(&[q], &[v], &[q, v], 0.3) {
+            Turn::Act(action) => (action[0], acted += 1).0,
             Turn::Hold(action) => action[0],
             Turn::Brake => (-2.0 * v / dt, braked += 1).0, // 3. brake by itself
         };
@@ -46,9 +34,6 @@ pub(crate) fn drive(name: &str, ticks: u64) -> Result<[f64; 4], Failure> {
         (farthest, fastest) = (farthest.max(q.abs()), fastest.max(v.abs()));
         tick += 1;
     }
-    if acted < ticks {
-        Err("no loop came, or it left".into())
-    } else {
-        Ok([acted as f64, braked as f64, farthest, fastest])
-    }
+    let found = [acted as f64, braked as f64, farthest, fastest];
+    (acted == ticks).then_some(found).ok_or_else(|| "no loop came, or it left".into())
 }

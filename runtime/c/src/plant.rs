@@ -69,10 +69,7 @@ unsafe fn open(name: *const c_char, robot: *const RobotIn) -> Result<Plant, Stri
         lockstep: robot.lockstep != 0,
     };
     let name = RobotName::new(&name).map_err(|e| e.to_string())?;
-    let mut exchange = Exchange::open(&name, &described, robot.watchdog).map_err(|e| e.to_string())?;
-    let state = exchange.state();
-    (state.nq, state.nv) = (robot.nq as u32, robot.nv as u32);
-    (state.nu, state.n_obs) = (robot.nu as u32, robot.n_obs as u32);
+    let exchange = Exchange::open(&name, &described, robot.watchdog).map_err(|e| e.to_string())?;
     Ok(Plant { exchange, nq: robot.nq, nv: robot.nv, nu: robot.nu, n_obs: robot.n_obs })
 }
 
@@ -101,26 +98,15 @@ impl Plant {
         let (q, v, obs) =
             unsafe { (slice(state.q, self.nq)?, slice(state.v, self.nv)?, slice(state.obs, self.n_obs)?) };
         let message = self.exchange.state();
-        message.q[..self.nq].copy_from_slice(q);
-        message.v[..self.nv].copy_from_slice(v);
-        message.obs[..self.n_obs].copy_from_slice(obs);
         (message.time, message.episode) = (state.time, state.episode);
         message.bits = if state.begins != 0 { STATE_RESET } else { 0 };
         let patience = if patience.is_finite() { patience.max(0.0) } else { 1e6 };
-        let (turn, given) = match self.exchange.tick(patience) {
+        let (turn, given) = match self.exchange.exchange(q, v, obs, patience) {
             Turn::Act(given) => (0, given),
             Turn::Hold(given) => (1, given),
-            Turn::Brake => (2, &[][..]),
+            Turn::Brake => return Some(2), // also where the loop is of another robot; it will say so
         };
-        if turn != 2 && given.len() != self.nu {
-            return Some(2); // the loop is of another robot; it will say so
-        }
-        action[..given.len()].copy_from_slice(given);
-        if turn != 2 {
-            let applied: [f64; nearl_runtime::link::MAX_JOINTS] =
-                std::array::from_fn(|i| action.get(i).copied().unwrap_or(0.0));
-            self.exchange.state().applied = applied;
-        }
+        action.copy_from_slice(given);
         Some(turn)
     }
 }

@@ -159,25 +159,13 @@ fn a_driver_in_rust_obeys_the_limits() {
 
 /// The carriage of the examples, which waits at rest until somebody proposes: ticks acted, how far and how fast it went [m, m/s].
 fn patient_carriage(name: &str, ticks: u64) -> Vec<f64> {
-    let robot = Robot {
-        joints: vec!["slide".into()],
-        observation: vec!["q.slide".into(), "v.slide".into()],
-        limits: 0,
-        stated: None,
-        nq: 1,
-        nv: 1,
-        nu: 1,
-        dt: 0.001,
-        lockstep: true,
-    };
+    let robot = Robot { lockstep: true, ..Robot::new(&["slide"], &["q.slide", "v.slide"], 1, 0.001) };
     let mut plant = Exchange::open(&RobotName::new(name).expect("a name"), &robot, 0.02).expect("a plant");
     let (mut q, mut v, mut acted, mut farthest, mut fastest) = (0.0_f64, 0.0_f64, 0, 0.0_f64, 0.0_f64);
     let end = Instant::now() + Duration::from_secs(60);
     while acted < ticks && Instant::now() < end {
-        let state = plant.state();
-        (state.nq, state.nv, state.nu, state.n_obs) = (1, 1, 1, 2);
-        (state.q[0], state.v[0], state.obs[0], state.obs[1], state.time) = (q, v, q, v, acted as f64 * 0.001);
-        let force = match plant.tick(0.3) {
+        plant.state().time = acted as f64 * 0.001;
+        let force = match plant.exchange(&[q], &[v], &[q, v], 0.3) {
             Turn::Act(action) => (action[0], acted += 1).0,
             Turn::Hold(action) => action[0],
             Turn::Brake => {

@@ -1,4 +1,4 @@
-//! One tick of a plant that keeps its own time: a robot's driver calls [`Exchange::tick`] once in each control period.
+//! One tick of a plant that keeps its own time: a robot's driver calls [`Exchange::exchange`] once in each control period.
 //!
 //! [`PlantRunner`](super::PlantRunner) drives a simulator on a time grid. A real robot often keeps the time, and its driver has a loop of its own.
 
@@ -40,9 +40,13 @@ impl Exchange {
     /// # Errors
     /// [`LinkError`]; a second plant of the name is refused.
     pub fn open(name: &RobotName, robot: &Robot, watchdog: f64) -> Result<Exchange, LinkError> {
+        let link = PlantLink::open(name, robot)?;
+        let mut state = StateMessage::zeroed();
+        (state.nq, state.nv) = (robot.nq as u32, robot.nv as u32);
+        (state.nu, state.n_obs) = (robot.nu as u32, robot.observation.len() as u32);
         Ok(Exchange {
-            link: PlantLink::open(name, robot)?,
-            state: StateMessage::zeroed(),
+            link,
+            state,
             last: ActionMessage::zeroed(),
             watchdog: clock::nanoseconds(watchdog),
             last_fresh: 0,
@@ -52,9 +56,35 @@ impl Exchange {
         })
     }
 
-    /// The state to be sent next. The link's own numbers (header, tick, due, late, watchdog) are filled in by [`Exchange::tick`].
+    /// The state to be sent next: time, episode and `bits` are the driver's. The link's own numbers (header, tick, due, late, watchdog) are
+    /// filled in by [`Exchange::tick`].
     pub fn state(&mut self) -> &mut StateMessage {
         &mut self.state
+    }
+
+    /// Sends what was measured (q, v, observation) and waits at most `patience` \[s\] for its action, which is taken as applied. An action of
+    /// another size than the robot's is none.
+    ///
+    /// # Panics
+    /// Where one of the three is not as long as the robot says.
+    pub fn exchange(&mut self, q: &[f64], v: &[f64], obs: &[f64], patience: f64) -> Turn<'_> {
+        let nu = self.state.nu as usize;
+        let state = &mut self.state;
+        let sizes = [("q", q.len(), state.nq), ("v", v.len(), state.nv), ("obs", obs.len(), state.n_obs)];
+        for (what, have, need) in sizes {
+            assert!(have == need as usize, "{what} has {have} entries, and the robot has {need}");
+        }
+        state.q[..q.len()].copy_from_slice(q);
+        state.v[..v.len()].copy_from_slice(v);
+        state.obs[..obs.len()].copy_from_slice(obs);
+        let acts = match self.tick(patience) {
+            Turn::Act(action) if action.len() == nu => true,
+            Turn::Hold(action) if action.len() == nu => false,
+            _ => return Turn::Brake,
+        };
+        let action = self.last.action();
+        self.state.applied[..nu].copy_from_slice(action);
+        if acts { Turn::Act(action) } else { Turn::Hold(action) }
     }
 
     /// Sends the state and waits at most `patience` \[s\] for its action. Without a loop it does not wait at all, unless time stands still

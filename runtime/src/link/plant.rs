@@ -32,6 +32,22 @@ pub struct Robot {
 }
 
 impl Robot {
+    /// A robot of joints with one position and one velocity each, on its own time, that states no limits.
+    pub fn new(joints: &[&str], observation: &[&str], nu: usize, dt: f64) -> Robot {
+        let names = |list: &[&str]| list.iter().map(ToString::to_string).collect();
+        Robot {
+            joints: names(joints),
+            observation: names(observation),
+            limits: 0,
+            stated: None,
+            nq: joints.len(),
+            nv: joints.len(),
+            nu,
+            dt,
+            lockstep: false,
+        }
+    }
+
     /// The message, or the number that does not fit.
     pub fn message(&self, name: &RobotName) -> Result<RobotMessage, LinkError> {
         let sizes = [
