@@ -317,10 +317,6 @@ impl Values {
 pub(crate) type Named = Option<BTreeMap<String, f64>>;
 pub(crate) type Places = Option<BTreeMap<String, ([f64; 3], [f64; 3])>>;
 
-/// By name, numbers; and by name, a place in the world.
-pub(crate) type Named = Option<BTreeMap<String, f64>>;
-pub(crate) type Places = Option<BTreeMap<String, ([f64; 3], [f64; 3])>>;
-
 /// Where limits are moved: velocity, acceleration, lowest and highest position by joint, planes inside and speeds of frames, then where planes lie
 /// (normal, a point of theirs) and obstacles stand (position, roll, pitch and yaw).
 pub(crate) fn moved(

@@ -25,6 +25,7 @@ pub fn snapshot(task: &str, actions: bool) -> Result<Snapshot, VectorError> {
         manifest.task.constraints.guard = Guard::Model;
     }
     complete(&mut manifest)?;
+    manifest.algo = "blank".into();
     Ok(if actions { space::idle(manifest) } else { space::still(manifest) })
 }
 

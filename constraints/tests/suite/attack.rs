@@ -48,7 +48,10 @@ fn run(
         seen.ticks += 1;
         if target.ledger.target_violations.total() > 0 && seen.broken == 0 {
             let at = format!("{:?}", projector.settings());
-            println!("tick {tick}: {:?} {status:?} {:?} of {at}", target.ledger.target_violations, target.ledger);
+            println!(
+                "tick {tick}: {:?} {status:?} {:?} of {at}",
+                target.ledger.target_violations, target.ledger
+            );
         }
         seen.broken += usize::from(target.ledger.target_violations.total() > 0);
         seen.slowed += usize::from(status == Status::Slowed);

@@ -40,7 +40,12 @@ fn no_brake_asks_more_of_a_motor_than_it_has() {
             let status = projector.project(&q, &v, &raw, &mut target);
             braked += u32::from(status == Status::Braked(BrakeReason::NoVerifiedBrake));
             nonfinite += u32::from(status == Status::Braked(BrakeReason::NonFiniteProposal));
-            assert_eq!(target.ledger.target_violations.total(), 0, "seed {seed}, tick {tick}: {:?}", target.ledger);
+            assert_eq!(
+                target.ledger.target_violations.total(),
+                0,
+                "seed {seed}, tick {tick}: {:?}",
+                target.ledger
+            );
             (q, v) = (target.q.clone(), target.v.clone());
         }
     }

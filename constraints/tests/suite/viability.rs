@@ -153,7 +153,9 @@ fn attack_robot(model: &Model, projector: &mut Projector, p: &Period, steps: usi
         }
         let status = projector.project(&q, &v, &proposal, &mut target);
         outside += usize::from(
-            !status.is_ok() || !target.ledger.outside.is_empty() || target.ledger.target_violations.total() > 0,
+            !status.is_ok()
+                || !target.ledger.outside.is_empty()
+                || target.ledger.target_violations.total() > 0,
         );
         for i in 0..7 {
             let (low, high);
