@@ -61,7 +61,7 @@ impl Bound {
 }
 
 /// Writes the bounded values (bounds) that a step under an action (n_act) leads to; false where the physics cannot be believed.
-pub type Foresee<'a> = dyn FnMut(&[f64], &mut [f64]) -> bool + 'a;
+pub(super) type Foresee<'a> = dyn FnMut(&[f64], &mut [f64]) -> bool + 'a;
 
 /// Finds actions whose step ends within bounds.
 pub struct Search {
