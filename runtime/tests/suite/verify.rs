@@ -184,7 +184,8 @@ fn every_kind_of_limit_is_verified_alone_and_together() {
 /// What is done to something of a log.
 type Alter<'a, T> = &'a dyn Fn(&mut T);
 
-/// Orders of an operator every 0.2 s, and back: speeds, positions, how fast a joint may speed up, and what ties joints together.
+/// Orders of an operator every 0.2 s, and back: speeds, positions, how fast a joint may speed up where jerk is soft, and what ties joints
+/// together.
 fn orders(dt: f64, kinds: &str) -> Vec<(u64, Moved)> {
     let named = |joint: &str, x: f64| Some(PerJoint::Joints([(joint.to_owned(), x)].into()));
     let mut all = vec![
@@ -193,7 +194,7 @@ fn orders(dt: f64, kinds: &str) -> Vec<(u64, Moved)> {
         Moved {
             upper: named("panda_joint4", -2.0),
             lower: named("panda_joint1", -0.1),
-            acceleration: named("panda_joint2", 2.0),
+            acceleration: if kinds.contains("hard = true") { None } else { named("panda_joint2", 2.0) },
             ..Moved::default()
         },
         Moved { velocity: named("panda_joint6", 0.1), ..Moved::speed(0.6) },
@@ -286,7 +287,10 @@ fn what_is_put_elsewhere_and_what_is_taken_up_is_verified() {
         let (_folder, log) = record("verify-carried", &flight);
         let report = verify(&log).unwrap();
         println!("{limits}, {sub_steps} steps of {dt} s\n{report}");
-        assert_eq!((report.found, report.is_whole()), (0, true), "{limits} {dt}\n{report}");
+        assert_eq!((report.found, report.complete), (0, true), "{limits} {dt}\n{report}");
+        // A brake that was stored for another load is nothing that the log can confirm.
+        let another_load = |why: &String| why == "the robot braked as was verified before it carried what it carries now";
+        assert!(report.not_verified.keys().all(another_load), "{limits} {dt}\n{report}");
         assert!(report.verified + report.idle > 1400 && report.optimal > 100, "{limits} {dt}\n{report}");
         assert_eq!(replay(&log).unwrap().difference, None, "{limits} {dt}");
         // As if the plane, or the ball, had been put where the hand was, and as if the load had been another.
@@ -749,7 +753,7 @@ fn what_a_log_does_not_have_is_not_verified_and_a_damaged_one_is_refused_by_name
         assert!(text.contains(what) && text.contains("copy.mcap"), "{what}: {text}");
     };
     copy(&log, &other, &|_, _| true, &|bytes| bytes, &|facts| _ = facts.insert("schema".into(), "4".into()));
-    refused("its schema is 4, this build reads 5");
+    refused(&format!("its schema is 4, this build reads {}", nearl_runtime::log::SCHEMA_VERSION));
     copy(&log, &other, &|topic, _| topic != "snapshot", &|bytes| bytes, &|_| {});
     refused("snapshot number 0 is not in it");
     copy(

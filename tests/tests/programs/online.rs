@@ -201,7 +201,7 @@ fn exploration_is_in_the_log() {
         assert_eq!(plant.end()["violations"]["velocity"], 0);
         let replay = Process::nearl(&["replay", log, "--json"]).json();
         assert!(replay["difference"].is_null() && number(&replay["ticks"]) >= 400.0, "{replay}");
-        number(&run["counters"]["raw_violations"])
+        number(&run["plant"]["episode_return"])
     };
     let numbers = [&["--explore", "7"][..], &["--explore", "8"], &[]].map(explore);
     assert!(numbers[0] != numbers[1] && numbers[0] != numbers[2], "the noise does nothing: {numbers:?}");
