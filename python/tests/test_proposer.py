@@ -132,9 +132,9 @@ def test_actions_are_guarded(tmp_path: Path) -> None:
     with Carriage("acts") as plant, nearl.Loop(blank(tmp_path, actions=True), name("acts"), ramp=0.0, proposal_age=5.0) as loop:
         with nearl.Proposer(name("acts")) as proposer:
             assert (proposer.kind, proposer.entries) == ("actions", ["slide"])
-            # On a busy machine the plant brakes now and then, and comes less far in as many states.
+            # 400 periods take it from one end to the other, also where the first of them pass before the loop hears the proposer.
             for k, _ in zip(range(20_000), proposer.states(), strict=False):
-                proposer.propose([1e9 if k // 200 % 2 == 0 else -1e9])
+                proposer.propose([1e9 if k // 400 % 2 == 0 else -1e9])
                 if k >= 600 and plant.farthest > 0.2 and plant.fastest > 0.4:
                     break
         plant.obeys()
