@@ -289,7 +289,8 @@ fn what_is_put_elsewhere_and_what_is_taken_up_is_verified() {
         println!("{limits}, {sub_steps} steps of {dt} s\n{report}");
         assert_eq!((report.found, report.complete), (0, true), "{limits} {dt}\n{report}");
         // A brake that was stored for another load is nothing that the log can confirm.
-        let another_load = |why: &String| why == "the robot braked as was verified before it carried what it carries now";
+        let another_load =
+            |why: &String| why == "the robot braked as was verified before it carried what it carries now";
         assert!(report.not_verified.keys().all(another_load), "{limits} {dt}\n{report}");
         assert!(report.verified + report.idle > 1400 && report.optimal > 100, "{limits} {dt}\n{report}");
         assert_eq!(replay(&log).unwrap().difference, None, "{limits} {dt}");
