@@ -65,6 +65,8 @@ pub const PRESETS: &[PresetEntry] = &[
                 "train.ppo.log_std=-1.0",
                 "train.ppo.lr=1e-3",
                 "train.ppo.target_kl=0.0",
+                "train.nets.idm_residual=true",
+                "train.pid2.idm_threshold=0.03",
             ],
         )],
     },
