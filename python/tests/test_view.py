@@ -119,8 +119,9 @@ def test_rows_over_several_joints_have_a_line_each_and_the_active_ones_come_firs
 def test_latency_stands_against_the_deadline() -> None:
     panel = view.Panel(arm())
     quiet, late = panel.html(picture(), {}), panel.html(picture(latency=np.array([2e-4, 1.5e-3]), overruns=1), {})
-    assert "largest 400 µs, deadline 1,000 µs, late so far 0" in quiet and quiet.count("<rect") == 1
+    assert "largest 400 µs, deadline 1,000 µs" in quiet and "the loop itself took longer: 0" in quiet and quiet.count("<rect") == 1
     assert late.count("<rect") == 2 and late.count('fill="#b91c1c"') == 1, "the late one alone is red"
+    assert "the loop itself took longer: 1" in late
     assert "deadline" not in view.Panel(arm()).html(picture(latency=None, overruns=None), {}), "a training keeps no real time"
 
 

@@ -28,6 +28,8 @@ STYLE = """<style>
 .nearl .bar i{position:absolute;top:0;bottom:0;background:#667085}
 .nearl .lit{background:#ffb000;border-color:#b45309}
 .nearl .told td:first-child{width:34%}
+.nearl .joints{font-size:11px}
+.nearl .joints th:first-child{width:22%}
 .nearl .rows td:nth-child(2){width:34%}
 .nearl .rows td:nth-child(3){width:20%}
 .nearl .lit i{background:#7c2d12}
@@ -68,7 +70,8 @@ class Panel:
             return ""
         self._latencies.append(float(p.latency.max()))
         median, most, deadline = (1e6 * x for x in (np.median(p.latency), p.latency.max(), p.period))
-        words = f"median {median:,.0f} µs, largest {most:,.0f} µs, deadline {deadline:,.0f} µs, late so far {p.overruns:,}"
+        words = f"median {median:,.0f} µs, largest {most:,.0f} µs, deadline {deadline:,.0f} µs; red is above it<br>"
+        words += f"ticks so far for which the loop itself took longer: {p.overruns:,}"
         return f"<h4>From a tick's due time to its action</h4>{words}{columns(self._latencies, p.period, self._pictures)}"
 
     def _joints(self, p: Picture) -> str:
@@ -92,7 +95,7 @@ class Panel:
             lines.append(f'<tr><td title="{escape(name)}">{escape(name)}</td>{"".join(cells)}</tr>')
         head = "".join(f"<th>{HEADS[k]}</th>" for k in shown)
         words = "Joints within their limits; a lit bar holds the target back, by its multiplier"
-        return f"<h4>{words}</h4><table><tr><th></th>{head}</tr>{''.join(lines)}</table>"
+        return f"<h4>{words}</h4><table class=joints><tr><th></th>{head}</tr>{''.join(lines)}</table>"
 
     def _bar(self, held: Held) -> tuple[int, int | None]:
         """Joint and bar that a row lights."""

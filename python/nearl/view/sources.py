@@ -54,7 +54,8 @@ class Picture:
         raw, broken: Ticks since the last picture whose proposal broke a limit, and that began within the limits and whose target broke one.
         raw_total, broken_total: The same since the start.
         latency: Time from when each tick was due until its action was handed over [s]; None where nothing keeps real time.
-        overruns: Ticks that ended after the next was due; None as ``latency``.
+        overruns: Ticks for which the loop itself took longer than a period, from the state to the action; a plant that is late counts in
+            ``latency`` alone. None as ``latency``.
         lost: Ticks that this view did not read in time.
         force: What the action makes the motors do on each degree of freedom (nv) [N m or N]; None in a tick without an action.
     """
