@@ -1,7 +1,7 @@
 //! `[train]` of the task file: how experience is collected, and the learner's own sections.
 
 use crate::demos::DemoSettings;
-use crate::learn::{NearlSettings, NetSettings, Pid2Settings, PpoSettings};
+use crate::learn::{CostSettings, NearlSettings, NetSettings, Pid2Settings, PpoSettings};
 use nearl_runtime::task::suggest;
 use serde::{Deserialize, Serialize};
 
@@ -78,6 +78,8 @@ pub struct TrainSettings {
     pub nearl: NearlSettings,
     /// Settings of `pid2-ib`, `pid2-gan` and `pid2-il`.
     pub pid2: Pid2Settings,
+    /// A limit on the cost of an episode.
+    pub cost: CostSettings,
     /// Demonstrations, and what is learned from them.
     pub demos: DemoSettings,
 }
@@ -105,6 +107,7 @@ impl Default for TrainSettings {
             ppo: PpoSettings::default(),
             nearl: NearlSettings::default(),
             pid2: Pid2Settings::default(),
+            cost: CostSettings::default(),
             demos: DemoSettings::default(),
         }
     }
@@ -149,13 +152,14 @@ impl TrainSettings {
 
     /// Numbers with which no learner learns.
     fn check_learners(&self) -> Result<(), String> {
-        let (ppo, pid2, nearl) = (&self.ppo, &self.pid2, &self.nearl);
+        let (ppo, pid2, nearl, cost) = (&self.ppo, &self.pid2, &self.nearl, &self.cost);
         if ppo.n_epochs == 0 {
             return Err("[train.ppo.n_epochs]: 0 learns nothing; give at least 1".into());
         }
         let above = |x: f64| x > 0.0 && x.is_finite();
         let at_least = |x: f64| x >= 0.0 && x.is_finite();
         let norm = |x: f64| x > 0.0;
+        let limit = |x: f64| x >= 0.0;
         type Domain = (fn(f64) -> bool, &'static str);
         let (positive, not_negative): (Domain, Domain) = ((above, "above 0"), (at_least, "at least 0"));
         let single = f64::from;
@@ -183,6 +187,10 @@ impl TrainSettings {
             ("nearl.policy_lr", single(nearl.policy_lr), not_negative),
             ("nearl.idm_threshold", nearl.idm_threshold, not_negative),
             ("nearl.idm_lr", single(nearl.idm_lr), positive),
+            ("cost.limit", cost.limit, (limit, "at least 0, or inf for none")),
+            ("cost.lr", single(cost.lr), not_negative),
+            ("cost.gain", single(cost.gain), not_negative),
+            ("cost.multiplier", single(cost.multiplier), not_negative),
         ] {
             if !allowed(value) {
                 let value = value as f32; // as it was written
@@ -214,7 +222,7 @@ mod tests {
         let mut compare = |table: &str, key: &str, value: &toml::Value| {
             let told = on_page(page, table, key);
             let same = match (number(&told), number(value)) {
-                (Some(a), Some(b)) => (a - b).abs() <= 1e-6 * b.abs(),
+                (Some(a), Some(b)) => a == b || (a - b).abs() <= 1e-6 * b.abs(),
                 _ => told == *value,
             };
             assert!(same, "{table} {key}: {told} on the page, {value} in the program");
@@ -229,7 +237,7 @@ mod tests {
                 value => compare("## `[train]`", key, value),
             }
         }
-        assert_eq!(keys, 67);
+        assert_eq!(keys, 71);
         for column in crate::train::COLUMNS {
             assert!(page.contains(&format!("`{column}`")), "{column}");
         }
@@ -247,6 +255,8 @@ mod tests {
             ("pid2.generator_weight = -5.0", "[train.pid2.generator_weight]: -5 is not at least 0"),
             ("pid2.beta = nan", "[train.pid2.beta]"),
             ("nearl.idm_lr = -1.0", "[train.nearl.idm_lr]"),
+            ("cost.limit = -1.0", "[train.cost.limit]: -1 is not at least 0, or inf for none"),
+            ("cost.lr = nan", "[train.cost.lr]"),
         ] {
             let refused = read(text).unwrap_err();
             assert!(refused.contains(words), "{refused}");

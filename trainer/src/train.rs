@@ -32,7 +32,9 @@ use nearl_runtime::controller::Parts;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
-use setup::{check_experience, check_minibatch, check_outputs, check_reward, dims, learner, policy_kind};
+use setup::{
+    check_cost, check_experience, check_minibatch, check_outputs, check_reward, dims, learner, policy_kind,
+};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -119,6 +121,7 @@ pub struct Training {
     privileged_stats: RunningStats,
     change_stats: RunningStats,
     return_stats: RunningStats,
+    cost_stats: RunningStats,
     rng: ChaCha8Rng,
     total: u64,
     seed: u64,
@@ -163,6 +166,7 @@ impl Training {
         let parts = Parts::new(&manifest)?;
         let dims = dims(&manifest, &parts, spec.privileged.len())?;
         check_outputs(&manifest.task.name, &dims)?;
+        check_cost(request.algo, &settings, &spec)?;
         check_experience(&settings, &manifest.task, experience)?;
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
@@ -198,6 +202,7 @@ impl Training {
             privileged_stats: RunningStats::new(dims.n_privileged),
             change_stats,
             return_stats: RunningStats::new(1),
+            cost_stats: RunningStats::new(1),
             algo: request.algo,
             settings,
             snapshot,
@@ -413,6 +418,7 @@ impl Training {
             self.obs_stats.merge(&g.obs_stats);
             self.change_stats.merge(&g.change_stats);
             self.return_stats.merge(&g.return_stats);
+            self.cost_stats.merge(&g.cost_stats);
             let rows = g.segment.privileged.chunks_exact(self.dims.n_privileged.max(1));
             rows.for_each(|row| self.privileged_stats.push(row));
         }
@@ -448,6 +454,8 @@ impl Training {
     fn fill_batch(&mut self) {
         let n_steps = self.settings.n_steps;
         let proposes = self.snapshot.manifest.policy != PolicyKind::Direct;
+        let length = self.recent.iter().map(|e| e.1 as f64).sum::<f64>() / self.recent.len() as f64;
+        let cost: f64 = self.source.gathered().iter().flat_map(|g| &g.segment.cost).sum();
         let b = &mut self.batch;
         b.clear();
         b.n = self.settings.n_envs * n_steps;
@@ -461,6 +469,8 @@ impl Training {
             );
         };
         let scale = if self.settings.scale_reward { 1.0 / self.return_stats.std(1e-8)[0] } else { 1.0 };
+        let cost_scale = self.settings.cost.is_limited().then(|| 1.0 / self.cost_stats.std(1e-8)[0]);
+        b.episode_cost = cost / b.n as f64 * length;
         for g in self.source.gathered() {
             let s = &g.segment;
             b.obs.extend_from_slice(&s.x);
@@ -478,13 +488,17 @@ impl Training {
             b.sampled.extend_from_slice(&s.sampled);
             b.action.extend_from_slice(&s.action);
             b.log_prob.extend_from_slice(&s.log_prob);
-            let reward: Vec<f32> = s.reward.iter().map(|r| (r * scale).clamp(-10.0, 10.0) as f32).collect();
+            let scaled = |of: &[f64], scale: f64| -> Vec<f32> {
+                of.iter().map(|x| (x * scale).clamp(-10.0, 10.0) as f32).collect()
+            };
+            let reward = scaled(&s.reward, scale);
+            let cost = cost_scale.map_or_else(Vec::new, |scale| scaled(&s.cost, scale));
             let mut final_obs = Vec::with_capacity(s.final_x.len() * (n_obs + n_privileged));
             for (i, (_, x)) in s.final_x.iter().enumerate() {
                 for_value(x, &s.final_privileged[i * n_privileged..][..n_privileged], &mut final_obs);
             }
             let (terminated, truncated) = (s.terminated.clone(), s.truncated.clone());
-            b.stretches.push(Stretch { reward, terminated, truncated, final_obs });
+            b.stretches.push(Stretch { reward, cost, terminated, truncated, final_obs });
         }
         b.discount = (self.settings.gamma as f32, self.settings.gae_lambda as f32);
         b.estimate(|x| self.learner.values(x));

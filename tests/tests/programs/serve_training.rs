@@ -74,7 +74,11 @@ fn trace(run: &mut Run, iterations: usize) -> Vec<(Vec<u8>, String)> {
 fn a_served_training_has_the_bits_of_one_in_this_process_whoever_else_is_served() {
     // A learned model and a cost; a direct policy; analytic dynamics and a stochastic proposal, in episodes that are cut.
     let tasks = [
-        ("HalfCheetah-velocity", "pid2-ib", vec!["train.moved_penalty=0.01"]),
+        (
+            "HalfCheetah-velocity",
+            "pid2-ib",
+            vec!["train.moved_penalty=0.01", "train.cost.limit=5.0", "train.cost.multiplier=0.5"],
+        ),
         ("Hopper-v5", "ppo", vec!["train.project_in_training=false"]),
         ("Panda-reach", "nearl", vec![]),
     ];

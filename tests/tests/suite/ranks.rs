@@ -58,9 +58,11 @@ fn on_each<T: Send>(ranks: &[Experience], work: impl Fn(usize, &Experience) -> T
 }
 
 fn asked(algo: &str, threads: usize) -> Request {
-    let mut asked = request("HalfCheetah-v5", algo, 3, threads, &SET);
-    asked.steps = STEPS;
-    asked
+    asked_of("HalfCheetah-v5", algo, threads, &[])
+}
+
+fn asked_of(task: &str, algo: &str, threads: usize, more: &[&str]) -> Request {
+    Request { steps: STEPS, ..request(task, algo, 3, threads, &[&SET, more].concat()) }
 }
 
 fn last(run: &Path) -> Vec<u8> {
@@ -80,13 +82,19 @@ fn metrics(run: &Path) -> Vec<Vec<String>> {
 #[test]
 fn any_number_of_ranks_gives_the_same_bits() {
     let folder = tempfile::tempdir().expect("folder");
-    for algo in ["pid2-ib", "ppo"] {
-        let one = folder.path().join(format!("{algo}_1"));
-        train(&asked(algo, 1), &one, |_, _| true).expect("one rank");
+    let costed = ["train.cost.limit=5.0", "train.cost.multiplier=0.5"];
+    for (task, algo, more) in [
+        ("HalfCheetah-v5", "pid2-ib", [].as_slice()),
+        ("HalfCheetah-v5", "ppo", &[]),
+        ("Hopper-velocity", "ppo", &costed),
+    ] {
+        let asked = |threads| asked_of(task, algo, threads, more);
+        let one = folder.path().join(format!("{task}_{algo}_1"));
+        train(&asked(1), &one, |_, _| true).expect("one rank");
         for (size, threads) in [(2, 1), (2, 2), (3, 1), (4, 1)] {
-            let run = |rank| folder.path().join(format!("{algo}_{size}_{threads}_{rank}"));
+            let run = |rank| folder.path().join(format!("{task}_{algo}_{size}_{threads}_{rank}"));
             on_each(&ranks(size, usize::MAX), |rank, experience| {
-                train_on(&asked(algo, threads), experience, &run(rank), |_, _| true).expect("a rank");
+                train_on(&asked(threads), experience, &run(rank), |_, _| true).expect("a rank");
             });
             for rank in 0..size {
                 assert!(last(&run(rank)) == last(&one), "{algo}: rank {rank} of {size} has other weights");

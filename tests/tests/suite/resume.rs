@@ -3,7 +3,7 @@
 use nearl_tests::request;
 use nearl_trainer::checkpoint::path_in;
 use nearl_trainer::run_folder::RunFolder;
-use nearl_trainer::train::{Request, resume, train};
+use nearl_trainer::train::{Request, Training, resume, train};
 use std::path::Path;
 use std::sync::Barrier;
 
@@ -69,6 +69,28 @@ fn ppo() {
 #[test]
 fn pid2_ib() {
     check("HalfCheetah-v5", "pid2-ib", &["train.pid2.idm_threshold=0.01", "train.moved_penalty=0.1"]);
+}
+
+/// The multiplier, the network that values the cost, its optimiser and the statistics of the cost go on too.
+#[test]
+fn a_limit_on_the_cost() {
+    let more = ["train.cost.limit=5.0", "train.cost.multiplier=0.5"];
+    check("HalfCheetah-velocity", "pid2-ib", &more);
+    check("Hopper-velocity", "ppo", &[more.as_slice(), &["train.ppo.target_kl=0.01"]].concat());
+}
+
+#[test]
+fn a_limit_on_a_cost_is_refused_where_it_means_nothing() {
+    let refused = |task: &str, algo: &str| {
+        let error = Training::new(&asked(task, algo, 1, &["train.cost.limit=25.0"])).err().expect("refused");
+        error.to_string()
+    };
+    assert!(
+        refused("Hopper-v5", "ppo")
+            .contains("[train.cost.limit]: 25 an episode, but 'Hopper-v5' has no cost")
+    );
+    let imitating = refused("Hopper-velocity", "dapg");
+    assert!(imitating.starts_with("[train.cost.limit]: 'dapg' learns from demonstrations"), "{imitating}");
 }
 
 /// A stochastic meta policy, a free joint, ReLU.

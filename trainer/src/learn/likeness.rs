@@ -232,6 +232,7 @@ mod tests {
             terminated: vec![true; b.n],
             truncated: vec![false; b.n],
             final_obs: Vec::new(),
+            cost: Vec::new(),
         }];
         b.advantage.fill(f32::NAN);
         let mut rng = crate::rollout::stream(1, 2);

@@ -333,6 +333,7 @@ fn gaifo_comes_close_without_the_reward() {
                 terminated: vec![true],
                 truncated: vec![false],
                 final_obs: Vec::new(),
+                cost: Vec::new(),
             })
             .collect();
         let pace = Pace { rate: 1.0 - round as f32 / rounds as f32, clip: 1.0 };

@@ -124,14 +124,14 @@ fn body(v: &Value, group: &Group, t: &Tile<'_>, w: &mut ValueScratch, grad: &mut
     add_sums(grad, &[squares.sum()]);
 }
 /// `max((V - R)^2, (clip(V, V_old +- range) - R)^2)`, as PPO's own code has it: no slope where the clipped error is larger.
-/// What the value was is the return less the advantage.
+/// What the value was is that under which advantages were estimated.
 #[inline(always)]
 fn hold(range: f32, value: &[V], target: &[V], old: &mut [V], t: &Tile<'_>, slope: &mut [V]) {
-    gather_one(old, &t.batch.advantage, t.idx);
+    gather_one(old, &t.batch.value, t.idx);
     for i in 0..value.len() {
         for l in 0..LANES {
             let (v, r) = (value[i].0[l], target[i].0[l]);
-            let before = r - old[i].0[l];
+            let before = old[i].0[l];
             let held = v.clamp(before - range, before + range);
             if (held - r).abs() > (v - r).abs() {
                 slope[i].0[l] = 0.0;

@@ -36,6 +36,7 @@ pub struct LeftOut {
 struct Sums {
     before: Vec<f64>,
     reward: f64,
+    cost: f64,
     moved: f64,
     /// A tick of it is not usable.
     spoiled: bool,
@@ -167,6 +168,7 @@ impl Stream {
         }
         let step = self.env.score(&moment(last), &moment(next), last.action())?;
         self.sums.reward += step.reward;
+        self.sums.cost += step.cost;
         self.episode.total += step.reward;
         self.episode.cost += step.cost;
         let terminated = step.terminated || last.next_bits & STATE_TERMINATED != 0;
@@ -176,8 +178,8 @@ impl Stream {
             self.episode.steps += 1;
             let whole = last.period_tick as usize + 1 == self.controller.policy_every() || ended;
             if last.policy_version == self.wanted && whole && !self.sums.spoiled {
-                let Sums { before, reward, moved, .. } = &self.sums;
-                let (reward, moved) = (*reward, *moved);
+                let Sums { before, reward, cost, moved, .. } = &self.sums;
+                let (reward, cost, moved) = (*reward, *cost, *moved);
                 self.controller.peek(&self.state, &mut self.seen);
                 let period = Period {
                     out: &self.out,
@@ -186,6 +188,7 @@ impl Stream {
                     seen: &self.seen,
                     privileged: [&[], &[]],
                     reward,
+                    cost,
                     moved,
                     terminated,
                     truncated,

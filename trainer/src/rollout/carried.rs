@@ -12,6 +12,7 @@ impl Collected {
             push(numbers, pairs(list));
         }
         push(numbers, s.reward.iter().copied());
+        push(numbers, s.cost.iter().copied());
         for list in [&s.terminated, &s.truncated] {
             push(numbers, list.iter().map(|&bit| f64::from(u8::from(bit))));
         }
@@ -23,7 +24,7 @@ impl Collected {
         push(numbers, t.costs.iter().copied());
         push(numbers, t.notes.iter().copied());
         push(numbers, t.ledger().into_iter());
-        for stats in [&self.obs_stats, &self.change_stats, &self.return_stats] {
+        for stats in [&self.obs_stats, &self.change_stats, &self.return_stats, &self.cost_stats] {
             push(numbers, stats.to_vec().into_iter());
         }
     }
@@ -39,6 +40,7 @@ impl Collected {
             list.extend(exactly(from, length.div_ceil(2))?.iter().flat_map(|&pair| split(pair)).take(length));
         }
         s.reward.extend_from_slice(exactly(from, n_steps)?);
+        s.cost.extend_from_slice(exactly(from, n_steps)?);
         for list in [&mut s.terminated, &mut s.truncated] {
             list.extend(exactly(from, n_steps)?.iter().map(|&bit| bit != 0.0));
         }
@@ -61,7 +63,8 @@ impl Collected {
             stats.set(exactly(from, 2 * n + 1)?);
             Some(stats)
         };
-        let (obs_stats, change_stats, return_stats) = (stats(n_obs)?, stats(n_state)?, stats(1)?);
+        let (obs_stats, change_stats) = (stats(n_obs)?, stats(n_state)?);
+        let (return_stats, cost_stats) = (stats(1)?, stats(1)?);
         let (n, cuts) = (s.privileged.len(), s.final_x.len());
         let privileged_fit = n % n_steps.max(1) == 0 && s.final_privileged.len() * n_steps == n * cuts;
         let cuts_fit = s.final_x.iter().all(|(t, _)| *t < n_steps);
@@ -71,6 +74,7 @@ impl Collected {
             obs_stats,
             change_stats,
             return_stats,
+            cost_stats,
         })
     }
 }

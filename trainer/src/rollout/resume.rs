@@ -53,6 +53,9 @@ impl Worker {
         put("circumstances", e.circumstances.clone());
         put("actions", e.actions.clone());
         put("sums", vec![self.episode.0, self.rows.discounted, self.cost]);
+        if self.env.spec().has_cost {
+            put("discounted_cost", vec![self.rows.discounted_cost]);
+        }
         put("obs", self.state.obs.clone());
         put("projector", self.controller.memory());
         if self.frames.is_some() {
@@ -78,6 +81,7 @@ impl Worker {
             actions: take("actions", ticks.checked_mul(n_act))?,
         };
         let (sums, obs) = (take("sums", Some(3))?, take("obs", Some(self.state.obs.len()))?);
+        let discounted_cost = if spec.has_cost { take("discounted_cost", Some(1))?[0] } else { 0.0 };
         let memory = take("projector", Some(self.controller.memory().len()))?;
         if self.frames.is_some() {
             self.from_frame = take("from_frame", Some(1))? == [1.0];
@@ -103,6 +107,7 @@ impl Worker {
         }
         (self.episode, self.ticks) = ((sums[0], length), ticks);
         (self.rows.discounted, self.cost) = (sums[1], sums[2]);
+        self.rows.discounted_cost = discounted_cost;
         self.rng.set_word_pos(rng.into());
         Ok(())
     }

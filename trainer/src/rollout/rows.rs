@@ -15,6 +15,8 @@ pub struct Rows {
     pub(super) moved_penalty: f64,
     /// Discounted return of the episode so far.
     pub(super) discounted: f64,
+    /// The same of its cost.
+    pub(super) discounted_cost: f64,
     change: Vec<f64>,
     /// Network input of the state after the last row, and what the value alone sees of it.
     after: Vec<f32>,
@@ -35,6 +37,8 @@ pub struct Period<'a> {
     pub privileged: [&'a [f64]; 2],
     /// The task's reward.
     pub reward: f64,
+    /// The task's cost.
+    pub cost: f64,
     /// Distance the projection moved the targets.
     pub moved: f64,
     /// The episode ended in a terminal state.
@@ -53,6 +57,7 @@ impl Rows {
             gamma,
             moved_penalty,
             discounted: 0.0,
+            discounted_cost: 0.0,
             change: vec![0.0; layout.n_state()],
             after: vec![0.0; controller.n_seen()],
             after_privileged: Vec::new(),
@@ -78,11 +83,13 @@ impl Rows {
     pub fn push(&mut self, p: &Period<'_>, normaliser: &Normaliser) {
         let reward = p.reward - self.moved_penalty * p.moved;
         self.discounted = self.discounted * self.gamma + reward;
+        self.discounted_cost = self.discounted_cost * self.gamma + p.cost;
         for (change, &i) in self.change.iter_mut().zip(&self.state) {
             *change = p.after[i] - p.before[i];
         }
         let change = (&self.change[..], &normaliser.scale[..]);
-        self.collected.push(p.out, change, p.seen, (reward, self.discounted), (p.terminated, false));
+        let sums = [(reward, self.discounted), (p.cost, self.discounted_cost)];
+        self.collected.push(p.out, change, p.seen, sums, (p.terminated, false));
         normaliser.observation(p.seen, &mut self.after);
         let [before, after] = p.privileged;
         self.collected.segment.privileged.extend_from_slice(before);
@@ -92,7 +99,7 @@ impl Rows {
             self.cut();
         }
         if p.truncated || p.terminated {
-            self.discounted = 0.0;
+            (self.discounted, self.discounted_cost) = (0.0, 0.0);
         }
     }
 
@@ -109,6 +116,6 @@ impl Rows {
     /// What comes next follows from nothing seen here.
     pub fn interrupt(&mut self) {
         self.cut();
-        self.discounted = 0.0;
+        (self.discounted, self.discounted_cost) = (0.0, 0.0);
     }
 }

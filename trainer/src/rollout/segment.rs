@@ -29,6 +29,8 @@ pub struct Segment {
     pub log_prob: Vec<f32>,
     /// Reward less the penalty for distance moved (n_steps).
     pub reward: Vec<f64>,
+    /// Cost (n_steps).
+    pub cost: Vec<f64>,
     /// The episode ended in a terminal state (n_steps).
     pub terminated: Vec<bool>,
     /// The episode was cut, by time or by the end of the segment (n_steps).
@@ -66,6 +68,7 @@ impl Segment {
             .into_iter()
             .for_each(Vec::clear);
         self.reward.clear();
+        self.cost.clear();
         self.terminated.clear();
         self.truncated.clear();
         self.final_x.clear();
@@ -202,6 +205,8 @@ pub struct Collected {
     pub change_stats: RunningStats,
     /// Discounted returns, for scaling the reward.
     pub return_stats: RunningStats,
+    /// Discounted costs, for scaling the cost.
+    pub cost_stats: RunningStats,
 }
 
 impl Collected {
@@ -213,33 +218,38 @@ impl Collected {
             obs_stats: RunningStats::new(n_obs),
             change_stats: RunningStats::new(n_state),
             return_stats: RunningStats::new(1),
+            cost_stats: RunningStats::new(1),
         }
     }
 
-    /// Adds a policy step that led to what the policy sees as `after` by the change of state `change`; `discounted` is the return so far,
-    /// `truncated` that nothing follows in this stretch.
+    /// Adds a policy step that led to what the policy sees as `after` by the change of state `change`. Reward and cost come each with
+    /// their discounted sums so far; `truncated` says that nothing follows in this stretch.
     pub(super) fn push(
         &mut self,
         out: &Output,
         (change, scale): (&[f64], &[f64]),
         after: &[f64],
-        (reward, discounted): (f64, f64),
+        [(reward, discounted), (cost, discounted_cost)]: [(f64, f64); 2],
         (terminated, truncated): (bool, bool),
     ) {
         self.segment.push(out, change, scale);
         self.segment.reward.push(reward);
+        self.segment.cost.push(cost);
         self.segment.terminated.push(terminated);
         self.segment.truncated.push(truncated);
         self.change_stats.push(change);
         self.obs_stats.push(after);
         self.return_stats.push(&[discounted]);
+        self.cost_stats.push(&[discounted_cost]);
     }
 
     /// Forgets everything; keeps the rows' memory.
     pub(super) fn clear(&mut self) {
         self.segment.clear();
         self.tally = Tally::default();
-        for stats in [&mut self.obs_stats, &mut self.change_stats, &mut self.return_stats] {
+        for stats in
+            [&mut self.obs_stats, &mut self.change_stats, &mut self.return_stats, &mut self.cost_stats]
+        {
             stats.clear();
         }
     }

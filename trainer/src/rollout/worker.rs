@@ -191,7 +191,9 @@ impl Worker {
             }
             self.draw(true);
             self.env.privileged(&mut self.privileged[0]);
+            let costed = self.cost;
             let (reward, terminated) = self.policy_step();
+            let cost = self.cost - costed;
             let truncated = self.ticks >= self.env.spec().max_episode_steps;
             self.controller.peek(&self.state, &mut self.seen);
             let (before, after, seen, moved) =
@@ -205,6 +207,7 @@ impl Worker {
                 seen,
                 privileged,
                 reward,
+                cost,
                 moved,
                 terminated,
                 truncated,

@@ -51,6 +51,8 @@ pub const COLUMNS: &[&str] = &[
     "likeness/loss",
     "likeness/accuracy",
     "likeness/reward",
+    "cost/multiplier",
+    "cost/value_loss",
 ];
 
 impl Training {

@@ -43,6 +43,9 @@ impl Training {
         }
         put("stats.change".into(), Values::F64(self.change_stats.to_vec()));
         put("stats.return".into(), Values::F64(self.return_stats.to_vec()));
+        if self.settings.cost.is_limited() {
+            put("stats.cost".into(), Values::F64(self.cost_stats.to_vec()));
+        }
         let recent = self.recent.iter().flat_map(|&(r, n)| [r, n as f64]).collect();
         put("recent".into(), Values::F64(recent));
         put("recent_costs".into(), Values::F64(self.recent_costs.clone()));
@@ -113,6 +116,10 @@ impl Training {
         if self.dims.n_privileged > 0 {
             let n = self.privileged_stats.to_vec().len();
             self.privileged_stats.set(&from.take_f64("stats.privileged", Some(n))?);
+        }
+        if self.settings.cost.is_limited() {
+            let n = self.cost_stats.to_vec().len();
+            self.cost_stats.set(&from.take_f64("stats.cost", Some(n))?);
         }
         self.best = from.take_f64("best", None)?.first().copied();
         self.recent_costs = from.take_f64("recent_costs", None)?;

@@ -4,8 +4,8 @@ use super::{Experience, TrainError};
 use crate::demos::DemoReward;
 use crate::env::{Env, Spec};
 use crate::learn::{
-    Algorithm, Bc, Bco, Dapg, Dims, Gaifo, Gradient, Imitating, Kind, Learner, MOST_OUTPUTS, Nearl, Pid2,
-    Pid2Il, Ppo, Soil,
+    Algorithm, Bc, Bco, CostLimited, Dapg, Dims, Gaifo, Gradient, Imitating, Kind, Learner, MOST_OUTPUTS,
+    Nearl, Pid2, Pid2Il, Ppo, Soil,
 };
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
@@ -40,7 +40,7 @@ pub(super) fn learner(
     let direct = |rng: &mut ChaCha8Rng| Ppo::new(dims.clone(), nets, ppo.clone(), threads, rng);
     let demos = settings.demos.clone();
     let (rows, likeness_lr) = (ppo.batch_size, settings.pid2.discriminator_lr);
-    match algo {
+    let learner: Box<dyn Learner> = match algo {
         Algorithm::Ppo => Box::new(direct(rng)),
         Algorithm::PpoCombined => nearl(settings.nearl.without_supervision(), rng),
         Algorithm::Nearl => nearl(settings.nearl.clone(), rng),
@@ -62,7 +62,32 @@ pub(super) fn learner(
             let imitating = Imitating::<Gaifo>::new(direct(rng), demos);
             Box::new(imitating.by_likeness(&dims, nets, likeness_lr, rows, threads, rng))
         }
+    };
+    if !settings.cost.is_limited() {
+        return learner;
     }
+    Box::new(CostLimited::new(learner, settings.cost.clone(), &dims, nets, ppo, threads, rng))
+}
+
+/// A limit on a cost needs one, and a learner that has it all from rewards.
+pub(super) fn check_cost(algo: Algorithm, settings: &TrainSettings, spec: &Spec) -> Result<(), TrainError> {
+    let limit = settings.cost.limit;
+    if !settings.cost.is_limited() {
+        return Ok(());
+    }
+    if !spec.has_cost {
+        return Err(TrainError::Settings(format!(
+            "[train.cost.limit]: {limit} an episode, but '{}' has no cost; write a [cost] into its task file, or leave the limit out",
+            spec.name
+        )));
+    }
+    if algo.demos().is_some() {
+        return Err(TrainError::Settings(format!(
+            "[train.cost.limit]: '{algo}' learns from demonstrations and keeps to no limit of {limit} on the cost; leave it out, or take ppo, \
+             ppo-combined, nearl, pid2-gan or pid2-ib"
+        )));
+    }
+    Ok(())
 }
 
 /// Sizes of the networks. A policy with a recipe sees what that computes, in which an inverse model would not find the state.

@@ -141,7 +141,7 @@ fn the_value_has_a_rate_of_its_own() {
     assert!(same != value(PpoSettings { value_lr: 1e-3, ..settings }));
 }
 
-/// `max((V - R)^2, (clip(V, V_old +- range) - R)^2)` by central differences; the value was the return less the advantage.
+/// `max((V - R)^2, (clip(V, V_old +- range) - R)^2)` by central differences; the value was that of the estimate.
 #[test]
 fn the_clipped_value_loss_equals_central_differences() {
     let range = 0.4;
@@ -150,14 +150,15 @@ fn the_clipped_value_loss_equals_central_differences() {
     let mut l = Ppo::new(dims(), &nets, settings, 1, &mut crate::rollout::stream(1, 1));
     spread(&mut l.params.groups[VALUE].p, &[&l.nets.value.net]);
     l.nets.refresh(VALUE, &mut l.params);
-    let (b, d) = (batch(&dims(), TILE, 3), dims());
+    let (mut b, d) = (batch(&dims(), TILE, 3), dims());
+    b.value = b.returns.iter().zip(&b.advantage).map(|(r, a)| r - a).collect();
     let idx: Vec<u32> = (0..b.n as u32).collect();
     let mut grad = vec![ZERO; l.params.groups[VALUE].p.len() + 1];
     l.nets.tile(VALUE, &l.params, tile(&b, &idx), &mut l.nets.scratch(), &mut grad);
     let value = Net64::of(&l.nets.value.net.mlp.to_dense(&l.params.groups[VALUE].p), Activation::Tanh);
     let error = |net: &Net64, i: usize| {
         let (v, r) = (net.forward(&row(&b.obs, i, d.n_obs))[0], f64::from(b.returns[i]));
-        let before = r - f64::from(b.advantage[i]);
+        let before = f64::from(b.value[i]);
         let held = v.clamp(before - f64::from(range), before + f64::from(range));
         ((v - r).powi(2), (held - r).powi(2))
     };
@@ -181,7 +182,7 @@ fn advantages_are_estimated_anew_before_each_pass() {
         b.discount = (1.0, 1.0);
         for _ in 0..TILE / 2 {
             let (reward, terminated, truncated) = (vec![1.0, 2.0], vec![false, true], vec![false; 2]);
-            b.stretches.push(super::super::Stretch { reward, terminated, truncated, final_obs: Vec::new() });
+            b.stretches.push(super::super::Stretch { reward, terminated, truncated, ..Default::default() });
         }
         b.estimate(|x| vec![0.0; x.len() / dims().n_obs]);
         assert_eq!(b.returns[..4], [3.0, 2.0, 3.0, 2.0]);
