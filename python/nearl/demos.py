@@ -122,8 +122,10 @@ def from_minari(task: FilePath, dataset: Any, out: FilePath, *, dt: float | None
 
 def from_robomimic(task: FilePath, file: FilePath, out: FilePath, *, dt: float, columns: Mapping[str, tuple[str, int]], **options: Any) -> Path:
     """Reads robomimic's HDF5; ``columns`` says which entry of which observation each name is: ``{"q.panda_joint1": ("robot0_joint_pos", 0)}``."""
-    import h5py
-
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError("reading robomimic's HDF5 needs h5py: pip install 'nearl[demos]'") from error
     episodes = []
     with h5py.File(file) as data:
         demos = sorted(data["data"], key=lambda name: int(name.rpartition("_")[2]))
@@ -143,8 +145,10 @@ def from_lerobot(
 
     ``names`` are the entries of ``key``; by default the dataset's own, of which ``shoulder.pos`` and ``shoulder`` are the joint ``shoulder``.
     """
-    from pyarrow import parquet
-
+    try:
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ImportError("reading a LeRobot dataset needs pyarrow: pip install 'nearl[demos]'") from error
     info = json.loads((Path(folder) / "meta" / "info.json").read_text())
     if key not in info["features"]:
         raise BadDemonstrations(f"'{folder}': no feature '{key}'; it has {', '.join(info['features'])}")

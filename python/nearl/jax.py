@@ -10,11 +10,15 @@ the active rows otherwise. The measured state is a constant. For robots whose jo
 from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 import nearl
+
+try:
+    import jax
+    import jax.numpy as jnp
+except ImportError as error:
+    raise ImportError("nearl.jax needs JAX: pip install 'nearl[jax]'") from error
 
 
 def project(projector: nearl.Projector) -> Callable[[Any, Any, Any, Any], tuple[jax.Array, jax.Array]]:

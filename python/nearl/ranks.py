@@ -62,7 +62,7 @@ class Ranks:
             import torch
             import torch.distributed as distributed
         except ImportError as error:
-            raise ImportError(f"training on several hosts hands bytes round by torch.distributed, but {error}; 'pip install torch'") from error
+            raise ImportError(f"training on several hosts hands bytes round by torch.distributed, but {error}; pip install 'nearl[torch]'") from error
         if not distributed.is_initialized():
             take_slurm(os.environ)
             missing = [name for name in ("WORLD_SIZE", "RANK", "MASTER_ADDR", "MASTER_PORT") if name not in os.environ]

@@ -10,9 +10,13 @@ the active rows otherwise. The measured state is a constant. For robots whose jo
 from typing import Any
 
 import numpy as np
-import torch
 
 import nearl
+
+try:
+    import torch
+except ImportError as error:
+    raise ImportError("nearl.torch needs PyTorch: pip install 'nearl[torch]'") from error
 
 
 class _Project(torch.autograd.Function):
