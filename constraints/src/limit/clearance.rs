@@ -11,8 +11,8 @@
 //! which is the motion of a joint with closing acceleration `a = c + r y / T`, speed `w = w^ - (T + tau / 2) c` and distance
 //! `d = d^ + T w + kappa T² c` (the half sub-step is there because a semi-implicit plant applies `r y` to a position as `kappa T`,
 //! but the curvature of its path as `T / 2`). So the row is `r y / T <= approach(d, w) - c`. The speed `v` enters exactly,
-//! however long the period. Every tick measures anew, so the errors in `y` do not add up but where something slides along the boundary;
-//! what it has then crept beyond it is taken back slowly.
+//! however long the period. Every tick measures anew, so the errors in `y` add up in one case alone: where something slides along the
+//! boundary. It then creeps beyond the boundary, and is brought back slowly.
 
 use crate::viability::approach;
 use crate::{Dynamics, Kinematics, Model, Period};

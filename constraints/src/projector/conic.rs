@@ -11,8 +11,8 @@
 //!
 //! P is constant. A NaN that gets into it all the same would stay in Clarabel's buffers for good: the solver is thrown away after that
 //! solve and built again in the next tick. Clarabel's own equilibration is frozen at set-up; the scaling by `sigma` and by the limits keeps
-//! all numbers near 1 instead. There is no `time_limit`: it counts all earlier solves too; a call-back with a clock of its own takes its
-//! place.
+//! all numbers near 1 instead. Clarabel's `time_limit` counts all earlier solves too, so a call-back with a clock of its
+//! own ends a solve that takes too long.
 
 use super::coupled::Coupled;
 use crate::LimitError;

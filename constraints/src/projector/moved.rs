@@ -11,10 +11,11 @@
 //!
 //! The brake obeys all of it, so there is always an answer. The next brake is verified for the limit in force, so this limit never moves back.
 //! The goal is put where the fastest way leads: a joint that is too fast, or could not stop in front of its new position limit, slows down by
-//! `A_b`. Where the speed of a frame, a plane, a body or the energy is what is late, all joints slow down in proportion, as fast as one of them can.
+//! `A_b`. Where the new limit on a frame, its speed, a body or the energy is not kept yet, all joints slow down in proportion, as fast as one of
+//! them can.
 //!
 //! A joint of hard jerk goes on speeding up for a while as it begins to brake: `s` is the fastest that its brake becomes, and `r` as far as that goes
-//! ([`smooth`]). Of bodies the least distance of all pairs is what is in force.
+//! ([`smooth`]). For bodies one number is in force on the way: the least distance of all pairs.
 
 mod numbers;
 mod smooth;

@@ -1,6 +1,6 @@
 //! The C interface: `include/nearl.h`, which a test compares with what is defined here.
 //!
-//! No panic leaves this library: a call that would is answered as its failure is.
+//! No panic leaves this library: a call in which something panics returns what it returns when it fails.
 
 mod controller;
 mod plant;

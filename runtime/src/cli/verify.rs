@@ -1,4 +1,4 @@
-//! `nearl verify`.
+//! `nearl verify`: confirms from a flight log alone what the loop promised.
 
 use std::path::PathBuf;
 use std::time::Instant;

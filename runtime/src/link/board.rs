@@ -4,7 +4,8 @@
 //! show, then counts on; a reader copies the place that is shown and keeps the copy if the count is still the same. Nobody waits for
 //! anybody, there is no system call, and a process killed at any moment leaves the last whole message. Only the entries in use are copied.
 //!
-//! Beside each place stands a sum of its words and its number. A message that something else has written into does not have it, and is refused.
+//! Beside each place stands a checksum of its words and its number. Where something else has written into a message, the checksum does not fit,
+//! and the message is refused.
 //!
 //! The file gets its name when it is complete. A sender's successor puts its own in its place, which readers find when they
 //! [`attend`](BoardReader::attend); who may send is decided by [`Owner`](super::owner::Owner).

@@ -1,9 +1,9 @@
 //! Snapshots on their way into the loop: from bytes to a built controller to the swap, with one receipt for each. The
 //! controller before is kept, and is swapped back in when the robot no longer reaches its targets.
 //!
-//! Limits that an operator moves take the same way: the snapshot in use is built again with them, and a snapshot that comes later is built
-//! with them too. No snapshot overtakes such an order, and no controller with other limits is kept to go back to: what was in use before is built again
-//! with the limits in force, where it has to be.
+//! Limits that an operator moves take the same way: the snapshot in use is built again with them, and so is every snapshot that comes later.
+//! No snapshot overtakes an operator's order. The controller that is kept for going back never has other limits than those in force: after
+//! an order, the snapshot before is built again too.
 
 use std::sync::Arc;
 

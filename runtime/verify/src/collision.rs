@@ -1,5 +1,5 @@
-//! Distances between bodies: from below by a plane between them, from above by two points of theirs. The points come from projections onto one
-//! body and the other in turn, which are closed forms.
+//! Distances between bodies, enclosed from both sides: a plane between two bodies bounds their distance from below, a point of each from above.
+//! The points come from projections onto one body and the other in turn, which are closed forms.
 
 use std::collections::BTreeMap;
 

@@ -4,8 +4,8 @@
 //!     min sum_i (v'_i - goal_i)²    within the joints' limits and the rows,
 //! ```
 //!
-//! with the multipliers of the log. What pulls the target to the proposal must be what the active rows push back, each row must push the way
-//! it can, and only where it is at its bound: where a little more would break it. The problem is convex, so this is all there is to show.
+//! with the multipliers of the log. The pull of the proposal on the target must equal the push of the active rows. Each of them must push
+//! away from its bound, and be at it: a little more would break the limit. The problem is convex, so nothing else has to be shown.
 
 use crate::collision::Told;
 use crate::limit_check::{Fault, TOLERANCE, are_near, broken, worst};

@@ -1,4 +1,4 @@
-//! What is read of a flight log's messages. JSON has no NaN: `null` is one.
+//! What is read of a flight log's messages. JSON has no NaN: `null` stands for it.
 
 use serde::{Deserialize, Deserializer};
 

@@ -1,5 +1,5 @@
-//! Set-ups that are allowed and hardly meant, or not allowed, through the three doors: the Rust builder, a task file, and the doctor. Each says
-//! so by name, number and unit. What the doctor says of them is the table of `docs/DOCTOR.md`:
+//! Set-ups that are refused, or allowed although hardly anybody means them. The Rust builder, the reader of task files and the doctor each say
+//! what is wrong by name, number and unit. What the doctor says of them is the table of `docs/DOCTOR.md`:
 //! `NEARL_WRITE=1 cargo test --release -p nearl-tests --test programs doubts`.
 
 use std::fmt::Write;

@@ -1,4 +1,4 @@
-//! `nearl demos`.
+//! `nearl demos`: records demonstrations, and checks files of them.
 
 use super::{Failure, at_least_one, say};
 use crate::demos::{Demonstrations, record};

@@ -1,4 +1,4 @@
-//! `nearl eval`.
+//! `nearl eval`: episodes without exploration, and the limits they broke.
 
 use super::{Failure, say, unstable};
 use crate::evaluate::evaluate;

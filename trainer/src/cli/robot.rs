@@ -1,4 +1,4 @@
-//! `nearl robot`.
+//! `nearl robot`: joints, limits and motors of a robot file.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! `nearl sweep`.
+//! `nearl sweep`: tasks times algorithms times seeds.
 
 use std::path::PathBuf;
 use std::sync::Arc;

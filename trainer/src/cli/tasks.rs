@@ -1,4 +1,4 @@
-//! `nearl tasks`.
+//! `nearl tasks`: the bundled tasks, and what each of them needs.
 
 use super::{Failure, say};
 use crate::tasks;

@@ -1,4 +1,4 @@
-//! `nearl train`.
+//! `nearl train`: begins a training, or goes on with one.
 
 use super::python::Python;
 use super::{Failure, at_least_one, cores, say, unstable};

@@ -1,4 +1,4 @@
-//! The file of a policy.
+//! Reads the ONNX file of a policy, and the external data beside it.
 
 use super::ImportError;
 use super::graph::Graph;

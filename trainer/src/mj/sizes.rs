@@ -1,7 +1,7 @@
-//! What a robot file asks MuJoCo to make room for, looked at before it is compiled: a few letters may ask for more memory than there is, and
-//! MuJoCo takes them at their word.
+//! Looks at what a robot file asks MuJoCo to make room for, before MuJoCo compiles it: a few letters may ask for more memory than there is,
+//! and MuJoCo reserves what they ask for.
 //!
-//! Tags are read as they stand, without what MuJoCo's own parser knows: numbers that only weigh or place something do not matter here.
+//! Tags are read as they stand, not as MuJoCo's parser would: only numbers that ask for room matter here.
 
 use std::path::Path;
 

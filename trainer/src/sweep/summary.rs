@@ -1,4 +1,5 @@
-//! What a sweep came to: the mean of the last ten rows of each run's metrics (as in `nearl.report`), and the interquartile mean over seeds.
+//! What a sweep came to: the mean of the last ten rows of each run's metrics, and the interquartile mean of these over seeds. The report's table
+//! has the last point of its curves instead.
 
 use std::collections::BTreeMap;
 use std::path::Path;

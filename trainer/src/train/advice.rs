@@ -1,4 +1,4 @@
-//! What is said before a training begins.
+//! Warnings that are printed before a training begins.
 
 use super::TrainError;
 use crate::env::{ChaCha8Rng, SeedableRng};
