@@ -1,4 +1,4 @@
-"""What a joint may accelerate so that it still stops in front of a limit; from the formulas, for the judges of our answers."""
+"""What a joint may accelerate so that it still stops in front of a limit; from the formulas, for programs that check our answers."""
 
 import numpy as np
 

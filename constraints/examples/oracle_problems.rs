@@ -1,4 +1,4 @@
-//! Writes problems and our answers, for comparison with independent solvers: `results/oracles/judge.py`.
+//! Writes problems and our answers, for comparison with independent solvers: `results/oracles/compare.py`.
 //!
 //! `cargo run --release -p nearl-constraints --example oracle_problems -- COUNT FILE`
 //!

@@ -1,4 +1,4 @@
-"""`margin` and `soft` of every limit, judged by quantities computed here: what was exceeded, and by how much."""
+"""`margin` and `soft` of every limit: what was exceeded, and by how much, from quantities that are computed here."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

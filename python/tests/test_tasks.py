@@ -173,7 +173,7 @@ def place(env: gymnasium.Env) -> np.ndarray:
     return np.average(env.data.xipos, axis=0, weights=env.model.body_mass)
 
 
-def judged_afresh(env: gymnasium.Env, action: np.ndarray, before: np.ndarray) -> float:
+def reward_again(env: gymnasium.Env, action: np.ndarray, before: np.ndarray) -> float:
     """Gymnasium's own reward function, with places of bodies that are those of the new state."""
     name = type(env).__name__
     if name in ("AntEnv", "HumanoidEnv"):
@@ -207,7 +207,7 @@ def test_gymnasiums_own_tasks_bring_their_rewards_and_ends(env_id: str, tmp_path
         _, our_reward, our_terminated, _, _ = ours.step(action)
         contacts += bool(np.any(theirs.data.cfrc_ext))
         if env_id in LAGGING:
-            reward = judged_afresh(theirs, action, before)
+            reward = reward_again(theirs, action, before)
         assert our_reward == pytest.approx(reward, abs=1e-12, rel=1e-12)
         if "Inverted" not in env_id:
             assert our_terminated == terminated
@@ -236,7 +236,7 @@ def test_arguments_of_a_task_of_gymnasium_are_in_its_reward(tmp_path: Path) -> N
         action, before = theirs.action_space.sample().astype(np.float64), place(theirs)
         _, _, terminated, _, _ = theirs.step(action)
         _, our_reward, our_terminated, _, _ = ours.step(action)
-        assert our_reward == pytest.approx(judged_afresh(theirs, action, before), rel=1e-12) and not terminated and not our_terminated
+        assert our_reward == pytest.approx(reward_again(theirs, action, before), rel=1e-12) and not terminated and not our_terminated
         unhealthy += not theirs.is_healthy
     assert 0 < unhealthy < 200
 

@@ -58,7 +58,7 @@ pub(super) trait Rules: Clone + Send + 'static {
     /// Follows a period that was simulated and ended in `sim`'s state.
     fn follow(&mut self, _sim: &Sim, _action: &[f64]) {}
 
-    /// What happens between this period and the next, after it was judged.
+    /// What happens between this period and the next, once reward and end of this one are known.
     fn advance(&mut self, _sim: &mut Sim) {}
 
     /// Reward of the period that ends in `sim`'s state, and whether the episode ends there. `before` is what

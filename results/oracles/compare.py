@@ -166,7 +166,7 @@ def polished(robot, q, v, goal, y):
     return y
 
 
-def judge(path):
+def compare(path):
     results, robot, here = [], None, None
     for text in Path(path).open():
         line = json.loads(text)
@@ -196,7 +196,7 @@ def judge(path):
 def main() -> None:
     print("| robot | problems | solved by | solver | problems | furthest [rad/s] | median [rad/s] | limits active in |")
     print("|---|---|---|---|---|---|---|---|")
-    for robot, kind, here in judge(sys.argv[1]):
+    for robot, kind, here in compare(sys.argv[1]):
         kinds = ", ".join(f"{k} {n}" for k, n in sorted(here["kinds"].items()))
         rungs = ", ".join(f"{k} {n}" for k, n in sorted(here["rungs"].items()))
         for solver in ("quadprog", "proxsuite", "ECOS", "ECOS, polished"):
