@@ -11,6 +11,7 @@ import ctypes
 import gc
 import json
 import os
+import re
 import time
 from pathlib import Path
 
@@ -18,7 +19,10 @@ import numpy as np
 import pinocchio as pin
 import qpsolvers
 
-URDF = Path(__file__).resolve().parents[2] / "examples" / "robots" / "panda" / "panda.urdf"
+ROOT = Path(__file__).resolve().parents[2]
+URDF = ROOT / "examples" / "robots" / "panda" / "panda.urdf"
+# The Rust loop's own priority, where it is stated.
+PRIORITY = int(re.search(r"const PRIORITY: i32 = (\d+);", (ROOT / "runtime" / "src" / "thread.rs").read_text())[1])
 ACCELERATION, MARGIN, SPEED, TORQUE = 10.0, 0.01, 0.9, 0.95  # as in examples/tasks/Panda-reach.toml
 POLICY_HZ = 50
 
@@ -94,7 +98,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=1000.0)
-    parser.add_argument("--priority", type=int, default=40)
+    parser.add_argument("--priority", type=int, default=PRIORITY)
     parser.add_argument("--collect", action="store_true", help="leave the garbage collector on")
     arguments = parser.parse_args()
     loop, period = Loop(arguments.rate), round(1e9 / arguments.rate)
