@@ -401,7 +401,7 @@ message! {
         pid: u32,
         /// Version of the snapshot in use.
         policy_version: u64,
-        /// Ticks that ended after the next slot was due.
+        /// Ticks for which the loop took longer than a period, from the state (on its own grid: from the slot) to the action.
         overruns: u64,
         /// Slots left out because of overruns.
         skipped: u64,
@@ -453,7 +453,7 @@ message! {
         snapshot: u64,
         /// Number of the episode.
         episode: u64,
-        /// Ticks so far that ended after the next slot was due.
+        /// Ticks so far for which the loop took longer than a period, from the state (on its own grid: from the slot) to the action.
         overruns: u64,
         /// Ticks so far whose raw proposal broke a limit.
         raw_violations: u64,
