@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
 # What prior knowledge is worth (the paper's figure 5) and what each part of PID2-IL is worth.
 #     results/ablation/run.sh [SEEDS [STEPS [TASKS]]]
-# The demonstrations are those of results/imitation. Finished runs are skipped, broken ones go on.
+# The demonstrations are those of results/imitation. Finished runs are skipped, broken ones go on. RUNS is the folder of all runs, NEARL the program.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 seeds=${1:-0-4} steps=${2:-1M} tasks=${3:-Hopper-v5 HalfCheetah-v5 Walker2d-v5 Ant-v5}
-demos=runs/imitation
+nearl=${NEARL:-target/release/nearl} runs=${RUNS:-runs}
+demos=$runs/imitation
 
 # half of the controllable joints of each task, the ones that matter left out
 declare -A half=(
@@ -17,10 +18,10 @@ declare -A half=(
 go() { # name of the variant, then what it sets
     local name=$1 task=$2
     shift 2
-    target/release/nearl sweep --tasks $task --algos pid2-il --demos $demos/$task.npz --seeds "$seeds" --steps "$steps" --set train.n_envs=64 \
+    "$nearl" sweep --tasks $task --algos pid2-il --demos $demos/$task.npz --seeds "$seeds" --steps "$steps" --set train.n_envs=64 \
         --set train.n_steps=64 --set train.ppo.batch_size=128 --set train.ppo.log_std=-1.0 --set train.nets.policy=[64,64] \
         --set train.nets.value=[64,64] --set train.nets.discriminator=[64,64] --set train.eval_every=20000 --set train.eval_episodes=3 \
-        --jobs "${JOBS:-2}" --out runs/ablation/$name "$@"
+        --jobs "${JOBS:-2}" --out $runs/ablation/$name "$@"
 }
 
 for task in $tasks; do
@@ -35,4 +36,4 @@ for task in $tasks; do
     go one_demo $task --set train.demos.episodes=1
     go four_demos $task --set train.demos.episodes=4
 done
-.venv/bin/python results/imitation/figure.py runs/ablation results/ablation --experts results/imitation/experts --variants
+.venv/bin/python results/imitation/figure.py $runs/ablation results/ablation --experts results/imitation/experts --variants

@@ -71,14 +71,25 @@ def together(new: list[float], n_kept: int, cells: list[str], place: int) -> flo
     return (sum(new) + n_kept * before) / (len(new) + n_kept)
 
 
-def draw(rows: list[dict], expert: dict[str, float], file: Path) -> None:
-    """A panel for each task: interquartile means over the seeds and their bands."""
+def panels(rows: list[dict], variants: bool) -> dict[str, dict]:
+    """Curves of each panel, by its title, then by name and seed: a panel for each task, of variants one for the inverse models and one for the parts."""
     found: dict = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for row in rows:
-        found[row["task"]][row["name"]][row["seed"]].append((int(row["steps"]), float(row["return"])))
+        prior = row["name"].startswith(("right", "full", "missing"))
+        titles = {row["task"]}
+        if variants:
+            titles = {f"{row['task']}: {what}" for what, is_there in (("inverse model", prior), ("parts", not prior or row["name"] == "right_0.5")) if is_there}
+        for title in titles:
+            found[title][row["name"]][row["seed"]].append((int(row["steps"]), float(row["return"])))
+    return found
+
+
+def draw(rows: list[dict], expert: dict[str, float], file: Path, variants: bool) -> None:
+    """Interquartile means over the seeds and their bands."""
+    found = panels(rows, variants)
     across = min(len(found), 2)
     figure, axes = plt.subplots(-(-len(found) // across), across, figsize=(5.2 * across, 3.8 * -(-len(found) // across)), squeeze=False)
-    for axis, (task, names) in zip(axes.flat, sorted(found.items())):
+    for axis, (title, names) in zip(axes.flat, sorted(found.items())):
         for name, seeds in sorted(names.items()):
             n = min(len(points) for points in seeds.values())
             steps = [x for x, _ in next(iter(seeds.values()))[:n]]
@@ -86,8 +97,8 @@ def draw(rows: list[dict], expert: dict[str, float], file: Path) -> None:
             (line,) = axis.plot(steps, interquartile_mean(values), label=f"{name} ({len(values)})")
             if len(values) > 1:
                 axis.fill_between(steps, *bootstrap_band(values), color=line.get_color(), alpha=0.15, lw=0)
-        axis.axhline(expert[task], color="black", lw=0.8, ls="--", label="expert")
-        axis.set(title=task, xlabel="steps", ylabel="return without noise")
+        axis.axhline(expert[title.split(":")[0]], color="black", lw=0.8, ls="--", label="expert")
+        axis.set(title=title, xlabel="steps", ylabel="return without noise")
         axis.legend(fontsize=7)
     for axis in axes.flat[len(found) :]:
         axis.set_visible(False)
@@ -123,7 +134,7 @@ def main() -> None:
         speed, half, end = interquartile_mean(values.mean(axis=1)), centre[(n - 1) // 2], centre[-1]
         share = end / expert[task]
         lines.append(f"| {task} | {name} | {len(values)} | {speed:.0f} | {half:.0f} | {end:.0f} | {share:.2f} | {r2:.2f} | {updated:.2f} |")
-    draw(rows, expert, args.folder / "figure.png")
+    draw(rows, expert, args.folder / "figure.png", args.variants)
     with open(args.folder / "curves.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
