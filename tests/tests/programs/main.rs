@@ -10,6 +10,7 @@ mod examples;
 mod online;
 mod printed;
 mod processes;
+mod recording;
 mod serve;
 mod serve_attack;
 mod serve_clients;

@@ -37,6 +37,25 @@ fn rates_fall_to_what_is_asked_for() {
     near(rates(&["train.anneal=false"]), [1.0; 4]);
 }
 
+/// From 0.25 to half of it in four iterations, of which the first only collects: the first update clips at 7/8 of it, the second at 6/8.
+#[test]
+fn the_clip_range_falls_to_what_is_asked_for() {
+    let weights = |set: &[&str], iterations: usize| {
+        let asked =
+            Request { steps: 4 * 256, ..request("HalfCheetah-v5", "ppo", 0, 1, &[&SHORT, set].concat()) };
+        let mut t = Training::new(&asked).expect("training");
+        (0..iterations).for_each(|_| drop(t.iterate()));
+        let p = t.snapshot().networks.policy.clone();
+        p.layers.iter().flat_map(|l| l.weight.iter().map(|w| w.to_bits())).collect::<Vec<_>>()
+    };
+    let large = "train.ppo.lr=0.01"; // so that ratios leave the range
+    let falling = [large, "train.ppo.clip_range=0.25", "train.ppo.clip_to=0.5"];
+    let held = |range| [large, range, "train.ppo.clip_to=1.0"];
+    assert!(weights(&falling, 2) == weights(&held("train.ppo.clip_range=0.21875"), 2), "7/8 of 0.25");
+    assert!(weights(&falling, 2) != weights(&held("train.ppo.clip_range=0.25"), 2), "the range matters");
+    assert!(weights(&falling, 3) != weights(&held("train.ppo.clip_range=0.21875"), 3), "it falls further");
+}
+
 /// Ticks are moved by the projection in as many environments as project.
 #[test]
 fn limits_come_in_environment_by_environment() {

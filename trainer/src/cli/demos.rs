@@ -1,5 +1,6 @@
 //! `nearl demos`: records demonstrations, and checks files of them.
 
+use super::eval::{SIMULATED, changed};
 use super::{Failure, at_least_one, say};
 use crate::demos::{Demonstrations, record};
 use crate::{env, run_folder, tasks};
@@ -28,6 +29,12 @@ pub(super) struct Record {
     /// Seed of the resets.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Other limits than those of the run, or another robot: `constraints.guard="simulator"`, `random.mass=1.2`.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Keep only episodes of at least this return.
+    #[arg(long, value_name = "RETURN", allow_negative_numbers = true)]
+    at_least: Option<f64>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -57,8 +64,20 @@ impl Demos {
 impl Record {
     fn run(self) -> Result<(), Failure> {
         let file = run_folder::snapshot_of(&self.run)?;
-        let snapshot = Snapshot::load(&file).map_err(|e| format!("{}: {e}", file.display()))?;
-        let (demos, returns) = record(&snapshot, self.episodes, self.seed)?;
+        let mut snapshot = Snapshot::load(&file).map_err(|e| format!("{}: {e}", file.display()))?;
+        let sections = [&SIMULATED[..], &["constraints"]].concat();
+        changed(&mut snapshot, &self.set, &sections, "recording changes limits and what is simulated")?;
+        let (mut demos, mut returns) = record(&snapshot, self.episodes, self.seed)?;
+        if let Some(least) = self.at_least {
+            let best = returns.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            let mut kept = returns.iter().map(|total| *total >= least);
+            demos.episodes.retain(|_| kept.next().unwrap_or_default());
+            returns.retain(|total| *total >= least);
+            if returns.is_empty() {
+                let (out, n) = (self.out.display(), self.episodes);
+                return Err(format!("--at-least {least}: the best of {n} episodes has {best:.1}, and '{out}' was not written; ask for less").into());
+            }
+        }
         demos.save(&self.out)?;
         let mean = returns.iter().sum::<f64>() / returns.len() as f64;
         let (out, lengths) =

@@ -36,7 +36,12 @@ impl Eval {
         }
         let file = run_folder::snapshot_of(&self.run)?;
         let mut snapshot = Snapshot::load(&file).map_err(|e| format!("{}: {e}", file.display()))?;
-        elsewhere(&mut snapshot, &self.set)?;
+        changed(
+            &mut snapshot,
+            &self.set,
+            &SIMULATED,
+            "an evaluation changes what is simulated and no controller",
+        )?;
         let results = self
             .compare
             .iter()
@@ -107,24 +112,25 @@ impl Eval {
 }
 
 /// Sections that say what is simulated, and nothing of the controller.
-const SIMULATED: [&str; 10] =
+pub(super) const SIMULATED: [&str; 10] =
     ["reset", "termination", "metrics", "scene", "commands", "pushes", "random", "noise", "delay", "reward"];
 
-/// Changes what is simulated; networks, limits and the controller's own robot stay.
-fn elsewhere(snapshot: &mut Snapshot, set: &[String]) -> Result<(), Failure> {
+/// Changes those `sections` of the task; networks and the controller's own robot stay. Others are refused, for the reason `why`.
+pub(super) fn changed(
+    snapshot: &mut Snapshot,
+    set: &[String],
+    sections: &[&str],
+    why: &str,
+) -> Result<(), Failure> {
     if set.is_empty() {
         return Ok(());
     }
     let section = |set: &String| set.split(['.', '=']).next().unwrap_or_default().trim().to_string();
-    if let Some(other) = set.iter().find(|set| !SIMULATED.contains(&section(set).as_str())) {
-        return Err(format!(
-            "--set {other}: an evaluation changes what is simulated and no controller; there are {}",
-            SIMULATED.join(", ")
-        )
-        .into());
+    if let Some(other) = set.iter().find(|set| !sections.contains(&section(set).as_str())) {
+        return Err(format!("--set {other}: {why}; there are {}", sections.join(", ")).into());
     }
     let task = &snapshot.manifest.task;
     snapshot.manifest.task = Task::parse(&task.name, &run_folder::to_toml(task), set)?;
-    snapshot.manifest.task.state.privileged.clear(); // of the value, which an evaluation does not have
+    snapshot.manifest.task.state.privileged.clear(); // of the value, which has no part here
     Ok(())
 }
