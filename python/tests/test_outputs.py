@@ -1,6 +1,7 @@
 """What is made of finished runs: the figure of a sweep, TensorBoard's files, videos; and the same sweep with Ray."""
 
 import importlib.util
+import json
 import os
 import re
 import struct
@@ -79,6 +80,15 @@ def test_the_command_writes_a_page_and_a_picture(swept: Path, tmp_path: Path) ->
     assert row[7] == "0.00 %", "no target of the synthetic runs is outside"
     with pytest.raises(ReadError, match="holds no run with metrics"):
         report.build(out, sweeps=[tmp_path])
+
+
+def test_the_mean_over_seeds_is_one_number_for_the_command_and_the_figures(tmp_path: Path) -> None:
+    """It is written twice: in Rust for the table of `nearl sweep`, in Python for curves. Five seeds, so that values count in part."""
+    command = [ROOT / "target" / "release" / "nearl", "sweep", "--tasks", CART_POLE, "--algos", "ppo", "--seeds", "0-4", "--steps", "2048", "--json"]
+    told = json.loads(subprocess.run([*command, "--out", tmp_path], check=True, capture_output=True, text=True).stdout)
+    (line,), runs = told["summary"], told["runs"]
+    for key in ("return", "idm_loss", "steps_per_s"):
+        assert line[key] == pytest.approx(curves.interquartile_mean([run[key] for run in runs]), rel=1e-12), key
 
 
 def test_costs_have_their_own_row(tmp_path: Path) -> None:
