@@ -83,7 +83,8 @@ class AccelerationLimit(Limit):
 @final
 class CollisionLimit(Limit):
     """Bodies keep `margin` apart, as far as `braking` [m/s²] can be delivered; `influence` [m] must exceed `margin + w² / (2 braking)` at
-    closing speed w. `urdf` adds the robot file's own spheres, boxes, cylinders and capsules.
+    closing speed w. A `half_space` is what lies at `z <= 0` of its own axes. `urdf` adds the robot file's own spheres, boxes, cylinders and
+    capsules.
 
     In a task file:
 

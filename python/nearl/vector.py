@@ -23,7 +23,10 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
     with the mask ``_<key>``: ``final_obs`` (same-step mode), ``fault``; ``cost`` where the task has one; and with ``constraints`` always:
     ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit) and ``moved``.
 
-    Args: see :func:`make_vec`.
+    Args:
+        max_episode_steps: Control periods after which an episode is cut; the task's own by default.
+
+    The other arguments are those of :func:`make_vec`.
     """
 
     metadata: dict[str, Any]

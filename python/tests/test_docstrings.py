@@ -85,6 +85,7 @@ def test_states_have_units(thing: object) -> None:
 def test_nearest_says_its_metric_and_planes_say_their_side() -> None:
     assert "((q' - q_proposal) / (kappa dt))²" in (nearl.Projector.__doc__ or ""), nearl.Projector.__doc__
     assert "normal . (p - through) <= 0" in (nearl.FrameLimit.__doc__ or ""), nearl.FrameLimit.__doc__
+    assert "`half_space` is what lies at `z <= 0`" in (nearl.CollisionLimit.__doc__ or ""), nearl.CollisionLimit.__doc__
 
 
 def test_counts_say_what_they_count() -> None:
@@ -92,6 +93,7 @@ def test_counts_say_what_they_count() -> None:
         text = inspect.getdoc(thing) or ""
         assert "max_episode_steps" not in text or "period" in text.split("max_episode_steps", 1)[1][:120], text
     assert "environment steps" in (nearl.PID2.learn.__doc__ or "")
+    assert "max_episode_steps: Control periods" in (inspect.getdoc(nearl.VecEnv) or "")
 
 
 def test_every_task_says_what_it_needs() -> None:

@@ -15,8 +15,8 @@ use serde::{Deserialize, Serialize};
 pub(super) const ABOUT: About = About {
     class: "CollisionLimit",
     promise: "Bodies keep `margin` apart, as far as `braking` [m/s²] can be delivered; `influence` [m] must exceed `margin \
-        + w² / (2 braking)` at closing speed w. `urdf` adds the robot file's own spheres, boxes, cylinders and \
-        capsules.",
+        + w² / (2 braking)` at closing speed w. A `half_space` is what lies at `z <= 0` of its own axes. `urdf` adds the \
+        robot file's own spheres, boxes, cylinders and capsules.",
     example: "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \
         \"floor\", shape = \"half_space\" }], braking = 2.0 }",
     form: Form::Either,
