@@ -521,3 +521,30 @@ fn plant_summary(state: &StateMessage, tally: Option<&TallyMessage>) -> PlantSum
         episode_return: tally.episode_return,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::link::METERS;
+
+    /// Without a tally nothing was measured: that is not the same as 0.
+    #[test]
+    fn what_a_plant_did_not_measure_is_named_and_has_no_number() {
+        let mut state = StateMessage::zeroed();
+        (state.late, state.watchdog) = (3, 1);
+        let silent = plant_summary(&state, None);
+        assert_eq!((silent.late, silent.watchdog), (3, 1));
+        assert_eq!(silent.not_measured, METERS);
+        assert!(silent.violations.is_empty() && silent.worst.is_empty());
+        assert_eq!((silent.episodes, silent.last_return, silent.episode_return), (0, 0.0, 0.0));
+
+        let mut tally = TallyMessage::zeroed();
+        tally.measure(1, 7, 0.25);
+        (tally.episodes, tally.last_return, tally.episode_return) = (2, -3.5, 1.0);
+        let partly = plant_summary(&state, Some(&tally));
+        assert_eq!(partly.not_measured, ["position", "acceleration", "torque"]);
+        assert_eq!(partly.violations.into_iter().collect::<Vec<_>>(), [("velocity", 7)]);
+        assert_eq!(partly.worst.into_iter().collect::<Vec<_>>(), [("velocity", 0.25)]);
+        assert_eq!((partly.episodes, partly.last_return, partly.episode_return), (2, -3.5, 1.0));
+    }
+}
