@@ -120,6 +120,12 @@ impl Ledger {
         counts(py, &self.ledger.target_violations)
     }
 
+    /// Whether the tick began within the limits and its target breaks one: what `target_violations` counts over many ticks.
+    #[getter]
+    fn target_breaks(&self) -> bool {
+        self.ledger.target_breaks()
+    }
+
     fn __repr__(&self) -> String {
         let l = &self.ledger;
         format!("Ledger('{}', {} active, moved {:.3e})", l.status.name(), l.active.len(), l.moved)

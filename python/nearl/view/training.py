@@ -113,8 +113,7 @@ class Training:
             self._totals.episode += 1
 
     def _count(self, window: _Window, ledger: _core.Ledger) -> None:
-        raw = any(ledger.raw_violations.values())
-        broken = any(ledger.target_violations.values()) and not ledger.outside
+        raw, broken = any(ledger.raw_violations.values()), ledger.target_breaks
         window.raw, window.broken = window.raw + raw, window.broken + broken
         self._totals.raw, self._totals.broken, self._totals.tick = self._totals.raw + raw, self._totals.broken + broken, self._totals.tick + 1
         for row in ledger.active:
