@@ -127,6 +127,12 @@ pub fn build_limits(settings: &ConstraintSettings, model: &Model) -> Result<Vec<
             next: "leave [constraints.action] to a controller with a policy on actions or a learned inverse model",
         });
     }
+    if settings.reached.is_some() {
+        return Err(LimitError::Unusable {
+            what: "reached bounds what a network gives the motors, and no action is given here".into(),
+            next: "leave constraints.reached to a controller with a policy on actions or a learned inverse model",
+        });
+    }
     check_counts(settings)?;
     let mut limits = Vec::new();
     for entry in REGISTRY {

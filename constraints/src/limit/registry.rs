@@ -34,6 +34,9 @@ macro_rules! limits {
             /// `true`: actions of a policy and of a learned inverse model lead to a projected state too.
             #[serde(skip_serializing_if = "crate::Guard::is_off")]
             pub guard: crate::Guard,
+            /// The share of control ticks whose reached state may be outside a position limit: of policies whose actions come out of a network.
+            #[serde(skip_serializing_if = "Option::is_none")]
+            pub reached: Option<f64>,
             $(
                 #[doc = concat!("Settings of [`", stringify!($limit), "`].")]
                 #[serde(skip_serializing_if = "settings::Section::is_absent")]

@@ -65,7 +65,10 @@ fn snapshot() -> Snapshot {
         ],
     };
     let normaliser = Normaliser::new(vec![0.0; 2], vec![1.0; 2], vec![0.5; 2]);
-    Snapshot { manifest, networks: Networks { normaliser, policy, policy_log_std: vec![], idm: None } }
+    Snapshot {
+        manifest,
+        networks: Networks { normaliser, policy, policy_log_std: vec![], idm: None, margins: Vec::new() },
+    }
 }
 
 /// Where cargo put the library: beside this test.

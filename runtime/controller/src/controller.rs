@@ -7,11 +7,15 @@
 //! An action that comes out of a network takes the same way once more where the task asks for it (`[constraints] guard = true`): it proposes the
 //! state that it leads to.
 //!
+//! Where the task asks for a share of ticks that may end outside (`[constraints] reached`), the state of each tick says what the tick before led
+//! to, and the action is bounded as limits come near (`controller/dial.rs`).
+//!
 //! What it remembers from tick to tick is in `controller/memory.rs`, what it tells of itself in `controller/facts.rs`.
 //!
 //! Training, evaluation, the real-time loop and replay all call [`Controller::update`]. Noise is an
 //! input: zero on the robot. Nothing is allocated after [`Controller::new`] but Clarabel's one block.
 
+mod dial;
 mod drive_box;
 mod facts;
 mod foreign;
@@ -22,6 +26,7 @@ mod memory;
 mod noise;
 mod parts;
 
+pub use dial::{Margin, merge_margins};
 pub use parts::{Parts, seen_entries};
 
 use crate::idm::{AnalyticIdm, LearnedIdm};
@@ -29,6 +34,7 @@ use crate::net::{Activation, Forward, Function};
 use crate::normaliser::Normaliser;
 use crate::snapshot::{Networks, PolicyKind, Snapshot, SnapshotError};
 use crate::task::IdmKind;
+use dial::Dial;
 use drive_box::DriveBox;
 use foreign::Foreign;
 use given::Given;
@@ -142,6 +148,7 @@ pub struct Controller {
     projector: Projector,
     inverse: Inverse,
     guard: Option<Guard>,
+    dial: Option<Dial>,
     drive_box: Option<DriveBox>,
     action_limit: Option<ActionLimit>,
     action_range: Vec<(f64, f64)>,
@@ -199,6 +206,8 @@ impl Controller {
         let drive_box = bounds.then(|| DriveBox::new(m, &model, layout.controllable(), &projector));
         let drive_box = drive_box.transpose()?;
         let action_limit = Parts::action_limit(m, &model)?;
+        let idx_q = idx_q(&model);
+        let dial = Dial::new(m, &model, layout.controllable(), &idx_q, projector.limits())?;
         let zero = |n| vec![0.0; n];
         let rest = State { q: model.neutral(), v: zero(model.nv()), obs: zero(layout.n_obs()) };
         let proposal = Proposal { q: model.neutral(), v: zero(model.nv()) };
@@ -214,13 +223,14 @@ impl Controller {
             projector,
             inverse,
             guard,
+            dial,
             drive_box,
             action_limit,
             action_range: m.action_lower.iter().copied().zip(m.action_upper.iter().copied()).collect(),
             dt: m.task.time.dt,
             policy_every: m.task.time.policy_every,
             projection: true,
-            idx_q: idx_q(&model),
+            idx_q,
             halves: halves(&layout),
             tick: 0,
             begun: 0,
@@ -236,10 +246,12 @@ impl Controller {
             model,
         };
         controller.canary()?;
+        controller.bring_margins(&n.margins)?;
         Ok(controller)
     }
 
-    /// One control tick. The same state, noise and history of ticks since [`Controller::reset`] give the same bits.
+    /// One control tick. The same state, noise and history of ticks since [`Controller::reset`] give the same bits; with
+    /// `[constraints] reached` the history since [`Controller::new`] does, as no episode ends what was learned.
     ///
     /// A state that is not finite is replaced by the last finite one and reported as such: the action is then what that one asked for,
     /// and no longer right once the robot has moved on. The real-time loop of `nearl-runtime` bridges a few such ticks and then brakes; so should a loop
@@ -252,9 +264,11 @@ impl Controller {
             return out.next.ledger.status;
         }
         let held = self.hold_last_finite(state);
+        self.learn(held);
         self.propose(noise, out);
         self.project(out);
         self.invert(noise, out);
+        self.bound(out);
         self.guard(out);
         self.limit_action(out);
         self.tick += 1;
@@ -440,6 +454,22 @@ impl Controller {
         }
     }
 
+    /// What the last tick led to, for the share of ticks that may end outside.
+    fn learn(&mut self, held: bool) {
+        let Some(dial) = self.dial.as_mut().filter(|_| self.projection) else { return };
+        if held {
+            dial.interrupt();
+        }
+        dial.learn(&self.held.q);
+    }
+
+    /// Bounds what motors do where a position limit comes near, by the margins learned so far.
+    fn bound(&mut self, out: &mut Output) {
+        let Some(dial) = self.dial.as_mut().filter(|_| self.projection) else { return };
+        let proposed = (self.kind != PolicyKind::Direct).then_some(&self.proposal.q[..]);
+        dial.bound(&self.held.q, &self.held.v, proposed, &mut out.action);
+    }
+
     /// The action of the nearest allowed state in place of one that leads elsewhere. Of a direct policy, where its action leads is what it
     /// proposes.
     fn guard(&mut self, out: &mut Output) {
@@ -499,7 +529,7 @@ impl Controller {
         }
     }
 
-    /// Takes new networks of the same shapes, as the learner makes them. Allocates; not for the loop.
+    /// Takes new networks of the same shapes, as the learner makes them, and the margins that come with them, if any do. Allocates; not for the loop.
     pub fn set_networks(&mut self, networks: &Networks) {
         self.normaliser = networks.normaliser.clone();
         self.policy = Forward::layered(&networks.policy, self.functions.clone());
@@ -511,6 +541,11 @@ impl Controller {
             }
             (Inverse::Direct, _) => self.action_log_std.clone_from(&networks.policy_log_std),
             _ => {}
+        }
+        if let Some(dial) = &mut self.dial
+            && networks.margins.len() == dial.learned_len()
+        {
+            dial.bring(&networks.margins);
         }
     }
 

@@ -23,6 +23,7 @@ const FORMAT_WITH_SKIP: u32 = 3;
 /// Larger files are refused before they are read, in \[byte\].
 pub const MAX_BYTES: u64 = 256 << 20;
 const KEY: &str = "nearl";
+const MARGINS: &str = "reached.margins";
 
 /// How the networks are read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -150,6 +151,8 @@ pub struct Networks {
     pub policy_log_std: Vec<f32>,
     /// Learned inverse dynamics (n_input -> n_act) and its log standard deviation.
     pub idm: Option<(Dense, Vec<f32>)>,
+    /// The margins of `[constraints] reached` as the controllers of the training learned them; empty without it, and before they did.
+    pub margins: Vec<f64>,
 }
 
 /// What a controller is built from.
@@ -435,6 +438,7 @@ impl Networks {
     fn knows(name: &str) -> bool {
         let (net, rest) = name.split_once('.').unwrap_or((name, ""));
         match net {
+            "reached" => rest == "margins",
             "normaliser" => ["mean", "std", "scale", "lower", "upper"].contains(&rest),
             "policy" | "idm" => {
                 let layer = rest.strip_suffix(".weight").or_else(|| rest.strip_suffix(".bias"));
@@ -454,6 +458,9 @@ impl Networks {
             let side = |i: usize| self.normaliser.clip.iter().map(|c| c[i]).collect::<Vec<f64>>();
             out.push(f64s("normaliser.lower", &side(0)));
             out.push(f64s("normaliser.upper", &side(1)));
+        }
+        if !self.margins.is_empty() {
+            out.push(f64s(MARGINS, &self.margins));
         }
         let mut net = |prefix: &str, dense: &Dense, log_std: &[f32]| {
             for (i, l) in dense.layers.iter().enumerate() {
@@ -487,7 +494,9 @@ impl Networks {
         let (policy_net, policy_log_std) = read_net(views, "policy")?;
         let has_idm = views.iter().any(|(n, _)| n.starts_with("idm."));
         let idm = if has_idm && policy != PolicyKind::Direct { Some(read_net(views, "idm")?) } else { None };
-        Ok(Self { normaliser, policy: policy_net, policy_log_std, idm })
+        let has_margins = views.iter().any(|(n, _)| n == MARGINS);
+        let margins = if has_margins { read_f64(views, MARGINS)? } else { Vec::new() };
+        Ok(Self { normaliser, policy: policy_net, policy_log_std, idm, margins })
     }
 }
 

@@ -65,7 +65,10 @@ pub fn snapshot(version: u64, change: impl FnOnce(&mut Manifest)) -> Snapshot {
     };
     let policy = Dense { layers: vec![layer(version, n, 16), layer(version + 7, 16, n)], skip: None };
     let normaliser = Normaliser::new(vec![0.0; n], vec![1.0; n], vec![0.5; n]);
-    Snapshot { manifest, networks: Networks { normaliser, policy, policy_log_std: vec![], idm: None } }
+    Snapshot {
+        manifest,
+        networks: Networks { normaliser, policy, policy_log_std: vec![], idm: None, margins: Vec::new() },
+    }
 }
 
 /// Forward dynamics and one semi-implicit Euler step: `v' = v + T a`, `q' = q + T v'`.

@@ -91,7 +91,13 @@ impl Attack {
         let normaliser = Normaliser::new(vec![0.0; n], vec![1.0; n], vec![0.5; n]);
         Snapshot {
             manifest,
-            networks: Networks { normaliser, policy, policy_log_std: vec![0.0; n], idm: None },
+            networks: Networks {
+                normaliser,
+                policy,
+                policy_log_std: vec![0.0; n],
+                idm: None,
+                margins: Vec::new(),
+            },
         }
     }
 

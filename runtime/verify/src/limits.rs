@@ -24,6 +24,10 @@ pub(crate) struct Section {
     pub(crate) braking: Way,
     #[serde(default)]
     pub(crate) guard: serde_json::Value,
+    /// Bounds actions by what was reached; no limit of a state.
+    #[serde(default)]
+    #[allow(dead_code)] // actions of a network are not verified
+    reached: serde::de::IgnoredAny,
     position: Option<Position>,
     velocity: Option<Velocity>,
     acceleration: Option<Acceleration>,

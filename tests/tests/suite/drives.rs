@@ -69,7 +69,8 @@ fn policy(seed: u64, guard: &str) -> Snapshot {
         *bias += POSE[i % 3] as f32;
     }
     let normaliser = Normaliser::identity(24, 24);
-    snapshot.networks = Networks { normaliser, policy: net, policy_log_std: vec![0.0; 12], idm: None };
+    snapshot.networks =
+        Networks { normaliser, policy: net, policy_log_std: vec![0.0; 12], idm: None, margins: Vec::new() };
     snapshot
 }
 

@@ -343,5 +343,6 @@ fn networks(network: &ImportedNetwork, n_state: usize) -> Networks {
         policy: network.dense.clone(),
         policy_log_std: vec![NO_NOISE; network.n_out()],
         idm: None,
+        margins: Vec::new(),
     }
 }

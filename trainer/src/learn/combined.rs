@@ -192,6 +192,7 @@ impl Combined {
             policy: self.policy.mlp.to_dense(p),
             policy_log_std: self.policy_log_std.as_ref().map_or(Vec::new(), |r| lanes(r, self.dims.n_state)),
             idm: self.inverse.as_ref().map(|(m, r)| (m.net.mlp.to_dense(p), lanes(r, self.dims.n_act))),
+            margins: Vec::new(),
         }
     }
 

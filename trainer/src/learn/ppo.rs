@@ -166,6 +166,7 @@ impl Learner for Ppo {
             policy: self.nets.policy.mlp.to_dense(p),
             policy_log_std: scalars(&p[self.nets.log_std.clone()])[..self.nets.dims.n_act].to_vec(),
             idm: None,
+            margins: Vec::new(),
         }
     }
 

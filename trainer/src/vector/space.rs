@@ -67,7 +67,10 @@ pub(crate) fn still(manifest: Manifest) -> Snapshot {
     let (n_obs, n_state) = sizes(&manifest);
     let policy = Dense { layers: vec![zeros(n_obs, n_state)], skip: None };
     let normaliser = Normaliser::identity(n_obs, n_state);
-    Snapshot { networks: Networks { normaliser, policy, policy_log_std: Vec::new(), idm: None }, manifest }
+    Snapshot {
+        networks: Networks { normaliser, policy, policy_log_std: Vec::new(), idm: None, margins: Vec::new() },
+        manifest,
+    }
 }
 
 /// A policy whose actions are zero; `manifest` is complete.
@@ -77,7 +80,13 @@ pub(crate) fn idle(mut manifest: Manifest) -> Snapshot {
     let policy = Dense { layers: vec![zeros(n_obs, n_act)], skip: None };
     let normaliser = Normaliser::identity(n_obs, n_state);
     Snapshot {
-        networks: Networks { normaliser, policy, policy_log_std: vec![0.0; n_act], idm: None },
+        networks: Networks {
+            normaliser,
+            policy,
+            policy_log_std: vec![0.0; n_act],
+            idm: None,
+            margins: Vec::new(),
+        },
         manifest,
     }
 }

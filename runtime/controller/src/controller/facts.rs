@@ -1,5 +1,6 @@
 //! What a controller tells of itself: sizes, names, limits, and how far a state is from them.
 
+use super::dial::Dial;
 use super::{Controller, Excess, Inverse, Noise, Output, State};
 use crate::PolicyKind;
 use crate::normaliser::Normaliser;
@@ -35,6 +36,16 @@ impl Controller {
         let miss =
             |&k: &usize| (obs[self.layout.state()[k]] - out.target[k]).abs() / self.normaliser.scale[k];
         seen.iter().map(miss).sum::<f64>() / seen.len().max(1) as f64
+    }
+
+    /// The share of ticks that may end outside a position limit (`[constraints] reached`), where the task says one.
+    pub fn asked(&self) -> Option<f64> {
+        self.dial.as_ref().map(Dial::asked)
+    }
+
+    /// Which rows of [`Controller::margins`] configuration `q` is outside of.
+    pub fn outside<'a>(&'a self, q: &'a [f64]) -> impl Iterator<Item = bool> + 'a {
+        self.dial.iter().flat_map(|dial| dial.outside(q))
     }
 
     /// Whether actions are kept within limits of their own: forces of drives, or `[constraints] action`.

@@ -1,11 +1,12 @@
 //! What a controller remembers from tick to tick, and how another controller takes it over.
 
-use super::Controller;
+use super::dial::{Dial, Margin};
 use super::drive_box::DriveBox;
+use super::{Controller, SnapshotError};
 use nearl_constraints::{ActionLimit, Projector};
 
 impl Controller {
-    /// Starts a new episode: the next tick is a policy tick.
+    /// Starts a new episode: the next tick is a policy tick. The margins of `[constraints] reached` stay.
     pub fn reset(&mut self) {
         (self.tick, self.begun, self.earlier) = (0, 0, 0);
         self.given.forget();
@@ -16,6 +17,9 @@ impl Controller {
         }
         if let Some(limit) = &mut self.action_limit {
             limit.forget();
+        }
+        if let Some(dial) = &mut self.dial {
+            dial.interrupt();
         }
     }
 
@@ -39,6 +43,9 @@ impl Controller {
         }
         if let Some(limit) = &self.action_limit {
             limit.write_memory(memory);
+        }
+        if let Some(dial) = &self.dial {
+            dial.write_memory(memory);
         }
         self.foreign.write_memory(self.earlier + self.tick, memory);
     }
@@ -80,6 +87,11 @@ impl Controller {
     pub fn take_memory(&mut self, memory: &[f64]) {
         let (memory, seen) = memory.split_at(memory.len() - self.foreign.memory_len());
         self.earlier = self.foreign.set_memory(seen).saturating_sub(self.tick);
+        let of_dial = self.dial.as_ref().map_or(0, Dial::memory_len);
+        let (memory, learned) = memory.split_at(memory.len() - of_dial);
+        if let Some(own) = &mut self.dial {
+            own.set_memory(learned);
+        }
         let of_limit = self.action_limit.as_ref().map_or(0, ActionLimit::memory_len);
         let (memory, limit) = memory.split_at(memory.len() - of_limit);
         if let Some(own) = &mut self.action_limit {
@@ -98,10 +110,45 @@ impl Controller {
     pub fn remembers(&self) -> bool {
         let last = self.last_word();
         self.drive_box.is_some()
+            || self.dial.is_some()
             || self.action_limit.as_ref().is_some_and(ActionLimit::remembers)
             || self.policy_every > 1
             || self.foreign.remembers()
             || last.needs_previous()
             || last.stores_a_brake()
+    }
+
+    /// The margins of `[constraints] reached`, two rows a controllable joint, lower before upper; none without it.
+    pub fn margins(&self) -> Vec<Margin> {
+        self.dial.as_ref().map_or(Vec::new(), Dial::margins)
+    }
+
+    /// What these margins and their steps are, as plain numbers: what [`Networks::margins`](crate::Networks::margins) holds.
+    pub fn learned_margins(&self) -> Vec<f64> {
+        self.dial.as_ref().map_or(Vec::new(), Dial::learned)
+    }
+
+    /// Forgets what was learned since the snapshot: its margins again.
+    pub fn forget_margins(&mut self) {
+        if let Some(dial) = &mut self.dial {
+            dial.begin_anew();
+        }
+    }
+
+    /// Begins with the margins of a snapshot.
+    pub(super) fn bring_margins(&mut self, learned: &[f64]) -> Result<(), SnapshotError> {
+        let need = self.dial.as_ref().map_or(0, Dial::learned_len);
+        match &mut self.dial {
+            _ if learned.is_empty() => {}
+            Some(dial) if learned.len() == need => dial.bring(learned),
+            _ => {
+                return Err(SnapshotError::Shape {
+                    name: "reached.margins".into(),
+                    expected: format!("{need} wide"),
+                    actual: format!("{} wide", learned.len()),
+                });
+            }
+        }
+        Ok(())
     }
 }

@@ -121,7 +121,7 @@ impl Parts {
         controllable: &[usize],
         consistency: Consistency,
     ) -> Result<Projector, SnapshotError> {
-        let of_states = ConstraintSettings { action: None, ..m.task.constraints.clone() };
+        let of_states = ConstraintSettings { action: None, reached: None, ..m.task.constraints.clone() };
         let mut limits = build_limits(&of_states, model).map_err(|e| unusable(&e))?;
         let drives = Self::drives(m, model, controllable)?;
         let is_pd = |drive: &Drive| matches!(drive, Drive::Pd { .. });
