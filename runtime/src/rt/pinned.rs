@@ -125,6 +125,17 @@ impl Pinned {
         let loses_guard = old.guards() && !keeps(new);
         say(loses_guard, "its actions are not guarded where those of the loop are".into());
         let (kept, brought) = (&self.constraints, &new.task.constraints);
+        if let Some(was) = kept.reached
+            && brought.reached.is_none_or(|is| above(is, was))
+        {
+            say(
+                true,
+                match brought.reached {
+                    Some(is) => format!("constraints.reached = {is} where the loop has {was}"),
+                    None => format!("no constraints.reached where the loop has {was}"),
+                },
+            );
+        }
         // Of a braking that is chosen nobody knows here whether it is the stored one.
         let worth =
             |braking| [Braking::Certified, Braking::Auto, Braking::Stored].iter().position(|b| *b == braking);

@@ -9,6 +9,7 @@ use std::time::Duration;
 use crate::arm::*;
 use crate::toy::Name;
 use nearl_constraints::Moved;
+use nearl_runtime::PolicyKind;
 use nearl_runtime::link::*;
 use nearl_runtime::log::{Gap, replay};
 use nearl_runtime::rt::*;
@@ -72,6 +73,53 @@ fn a_run_with_swaps_and_faults_replays_bit_for_bit() {
     let found = replay(&log).unwrap();
     assert_eq!(found.difference, None);
     assert_eq!((found.ticks, found.swaps, found.complete), (report.ticks, 3, true));
+}
+
+/// Margins that are learned on the way (`constraints.reached`) are the loop's own: a hot swap keeps them, and the log replays with them.
+#[test]
+fn a_run_that_learns_margins_replays_bit_for_bit() {
+    let (name, folder) = (Name::new("replay-dial"), Scratch::new("replay-dial"));
+    let pushing = |version| {
+        let mut snapshot = snapshot(version, |m| {
+            m.policy = PolicyKind::Direct;
+            let limits =
+                "{\"position\": {\"margin\": 1.0}, \"velocity\": {\"scale\": 1.0}, \"reached\": 0.05}";
+            m.task.constraints = serde_json::from_str(limits).unwrap();
+        });
+        let policy = &mut snapshot.networks.policy;
+        let last = policy.layers.last_mut().unwrap();
+        (last.n_out, last.weight) = (N, weights(version + 3, 16 * N).iter().map(|w| 20.0 * w).collect());
+        last.bias = weights(version + 4, N);
+        snapshot.networks.policy_log_std = vec![0.0; N];
+        snapshot
+    };
+    let file = folder.0.join("first.safetensors");
+    pushing(1).save(&file).unwrap();
+    let log = folder.0.join("run.mcap");
+    let plant = start_with(&name, &pushing(1), FaultPlan::default(), Duration::from_micros(500));
+    let settings = RunSettings { log: Some(log.clone()), ticks: Some(1600), ..toy::settings() };
+    let running = execute_with(&name, &file, &Stop::new(), settings);
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    trainer.wait_for_runtime(PATIENCE).unwrap();
+    for version in 2..=3 {
+        trainer.push(version, &pushing(version).to_bytes()).unwrap();
+        let receipt = trainer.wait_for_receipt(version, PATIENCE).unwrap();
+        assert_eq!(receipt.verdict(), Verdict::Accepted, "{}", receipt.text());
+    }
+    let mut looser = pushing(9);
+    looser.manifest.task.constraints.reached = Some(0.06);
+    trainer.push(9, &looser.to_bytes()).unwrap();
+    let receipt = trainer.wait_for_receipt(9, PATIENCE).unwrap();
+    assert_eq!(receipt.verdict(), Verdict::Looser, "{}", receipt.text());
+    assert!(receipt.text().contains("constraints.reached"), "{}", receipt.text());
+    let report = running.join().unwrap().unwrap();
+    let (panda, _) = plant.end();
+    assert_eq!((report.log_drops, report.counters.swaps), (0, 2), "{report}");
+    let edge = panda.worst[0] + 1.0;
+    assert!(edge > 1e-3, "no joint was outside by more than {edge} rad, so no margin was learned");
+    let found = replay(&log).unwrap();
+    assert_eq!(found.difference, None);
+    assert_eq!((found.ticks, found.swaps, found.complete), (report.ticks, 2, true));
 }
 
 /// Edits a message; false leaves it out.
