@@ -2,6 +2,7 @@
 
 use crate::rollout::{RolloutError, Scorer, Worker, make_env, stream};
 use nearl_runtime::constraints::{ConstraintSettings, LimitSet, Model, PerJoint, build_limits};
+use nearl_runtime::controller::Margin;
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
 use serde::Serialize;
 
@@ -29,6 +30,34 @@ pub struct Told {
     pub largest: f64,
 }
 
+/// A row of `[constraints] reached`: one side of the range of a joint.
+#[derive(Clone, Debug, Serialize)]
+pub struct ReachedRow {
+    /// The joint.
+    pub joint: String,
+    /// `below` or `above` its range.
+    pub side: &'static str,
+    /// Ticks that ended there.
+    pub outside: u64,
+    /// Its margin at the end, 0 to 1 ([`Margin`](nearl_runtime::controller::Margin)).
+    pub margin: f64,
+    /// Its margin is at its end, and more ticks ended outside than were asked for.
+    pub unattainable: bool,
+}
+
+/// What became of `[constraints] reached`.
+#[derive(Clone, Debug, Serialize)]
+pub struct Reached {
+    /// The share of ticks outside a position limit that was asked for.
+    pub asked: f64,
+    /// The share that ended there.
+    pub share: f64,
+    /// The same of each episode: margins that begin at 0 need some thousand ticks.
+    pub by_episode: Vec<f64>,
+    /// Every row that has a limit.
+    pub rows: Vec<ReachedRow>,
+}
+
 /// Mean results of some episodes.
 #[derive(Clone, Debug, Serialize)]
 pub struct Evaluation {
@@ -50,6 +79,8 @@ pub struct Evaluation {
     pub target_violations: u64,
     /// Ticks whose state, as the simulator has it afterwards, broke a position or velocity limit.
     pub reached_violations: u64,
+    /// What became of the share that the task asks for, if it does.
+    pub reached: Option<Reached>,
     /// Ticks whose action the simulator's guard replaced by one that stays inside.
     pub replaced: u64,
     /// Ticks for which it found none.
@@ -123,6 +154,7 @@ pub(crate) fn evaluate_by(
         recovering: 0,
         target_violations: 0,
         reached_violations: 0,
+        reached: None,
         replaced: 0,
         unavoided: 0,
         worst: Vec::new(),
@@ -131,11 +163,13 @@ pub(crate) fn evaluate_by(
         residual: 0.0,
     };
     let names = worker.notes().to_vec();
-    let mut told = Vec::new();
+    let (mut told, mut by_episode) = (Vec::new(), Vec::new());
     for _ in 0..episodes {
+        let before = worker.outside.0;
         let (ret, length) = worker.evaluate().map_err(RolloutError::from)?;
         let t = &worker.rows.collected.tally;
         told.push(t.notes.clone());
+        by_episode.push((worker.outside.0 - before) as f64 / t.ticks.max(1) as f64);
         e.returns.push(ret);
         e.costs.extend_from_slice(&t.costs);
         e.lengths.push(length);
@@ -148,6 +182,7 @@ pub(crate) fn evaluate_by(
         e.residual += t.residual;
     }
     [e.replaced, e.unavoided] = worker.foreseen;
+    e.reached = reached(&worker, e.ticks, by_episode);
     e.told = names
         .into_iter()
         .enumerate()
@@ -161,6 +196,24 @@ pub(crate) fn evaluate_by(
         e.worst.extend(excess.map(|x| Worst { limit, joint: joint(x.dof), by: x.by, beyond_margin }));
     }
     Ok(e)
+}
+
+fn reached(worker: &Worker, ticks: u64, by_episode: Vec<f64>) -> Option<Reached> {
+    let (controller, (any, by_row)) = (&worker.controller, &worker.outside);
+    let (asked, share) = (controller.asked()?, *any as f64 / ticks.max(1) as f64);
+    let limits = controller.limits();
+    let of_row = |(margin, &outside): (Margin, &u64)| {
+        let limit = if margin.is_upper { &limits.q_upper } else { &limits.q_lower }[margin.dof];
+        limit.is_finite().then(|| ReachedRow {
+            joint: controller.model().dof_name(margin.dof),
+            side: if margin.is_upper { "above" } else { "below" },
+            outside,
+            margin: margin.share,
+            unattainable: margin.at_end && outside > 0 && share > asked,
+        })
+    };
+    let rows = controller.margins().into_iter().zip(by_row).filter_map(of_row).collect();
+    Some(Reached { asked, share, by_episode, rows })
 }
 
 fn tell(name: String, values: impl ExactSizeIterator<Item = f64>) -> Told {

@@ -28,9 +28,9 @@ use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
 use imitation::Imitation;
 use nearl_rollout_protocol::Layout;
-use nearl_runtime::controller::Parts;
+use nearl_runtime::controller::{Parts, merge_margins};
 use nearl_runtime::normaliser::Normaliser;
-use nearl_runtime::{Manifest, PolicyKind, Snapshot, SnapshotError};
+use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 use setup::{
     check_cost, check_experience, check_minibatch, check_outputs, check_reward, dims, learner, policy_kind,
@@ -188,7 +188,10 @@ impl Training {
             normaliser.scale = limit_scale(&parts, &manifest)?;
         }
         let networks = learner.networks(&normaliser);
-        let snapshot = Snapshot { manifest, networks };
+        let mut snapshot = Snapshot { manifest, networks };
+        if snapshot.manifest.task.constraints.reached.is_some() {
+            snapshot.networks.margins = Controller::new(&snapshot)?.learned_margins();
+        }
         let sizes = Layout { n_obs: dims.n_obs, n_state: dims.n_state, n_act: dims.n_act };
         let mut source = experience.open(&snapshot, sizes, &settings, request.threads, request.seed)?;
         let (mut obs_stats, mut change_stats) =
@@ -333,8 +336,8 @@ impl Training {
         };
         let normaliser = &self.snapshot.networks.normaliser;
         imitator.see(imitation.batch(normaliser), 0.0);
-        let metrics = imitator.pretrain(&mut self.rng);
-        self.snapshot.networks = self.learner.networks(normaliser);
+        let (metrics, normaliser) = (imitator.pretrain(&mut self.rng), normaliser.clone());
+        self.renew(&normaliser);
         metrics
     }
 
@@ -422,6 +425,13 @@ impl Training {
             let rows = g.segment.privileged.chunks_exact(self.dims.n_privileged.max(1));
             rows.for_each(|row| self.privileged_stats.push(row));
         }
+        let gathered = self.source.gathered();
+        let own = &mut self.snapshot.networks.margins;
+        if let Some(margins) = merge_margins(gathered.iter().map(|g| &g.margins[..]))
+            && margins.len() == own.len()
+        {
+            *own = margins;
+        }
     }
 
     /// New networks and statistics for the next collection. What was learned from demonstrations stays what it was.
@@ -434,7 +444,13 @@ impl Training {
         {
             imitator.rescale(&self.snapshot.networks.normaliser, &normaliser);
         }
-        self.snapshot.networks = self.learner.networks(&normaliser);
+        self.renew(&normaliser);
+    }
+
+    /// The learner's networks in the snapshot; its margins stay.
+    fn renew(&mut self, normaliser: &Normaliser) {
+        let margins = std::mem::take(&mut self.snapshot.networks.margins);
+        self.snapshot.networks = Networks { margins, ..self.learner.networks(normaliser) };
     }
 
     /// The statistics as they are.

@@ -5,6 +5,7 @@ mod allocation;
 mod architecture;
 mod demos;
 mod determinism;
+mod dial;
 mod drives;
 mod env_mujoco;
 mod env_parity;

@@ -1,7 +1,7 @@
 //! `nearl eval`: episodes without exploration, and the limits they broke.
 
 use super::{Failure, say, unstable};
-use crate::evaluate::evaluate;
+use crate::evaluate::{Reached, ReachedRow, evaluate};
 use crate::run_folder;
 use clap::Args;
 use nearl_runtime::Snapshot;
@@ -24,6 +24,9 @@ pub(super) struct Eval {
     /// Another robot than the one of the training: `random.mass=1.2`, `delay.action=2`, of the sections that a task of one's own simulates by.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Ask for this share of ticks outside a position limit (`constraints.reached`), of a policy that was trained without or for another.
+    #[arg(long, value_name = "SHARE")]
+    reached: Option<f64>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -42,6 +45,9 @@ impl Eval {
             &SIMULATED,
             "an evaluation changes what is simulated and no controller",
         )?;
+        if self.reached.is_some() {
+            snapshot.manifest.task.constraints.reached = self.reached;
+        }
         let results = self
             .compare
             .iter()
@@ -87,6 +93,11 @@ impl Eval {
                 e.mode, e.replaced, e.unavoided
             ));
         }
+        for (e, reached) in results.iter().filter_map(|e| Some((e, e.reached.as_ref()?))) {
+            for line in reached_lines(reached, e.ticks) {
+                say(format!("{}: {line}", e.mode));
+            }
+        }
         for (e, w) in results.iter().flat_map(|e| e.worst.iter().map(move |w| (e, w))) {
             let unit = if w.limit == "position" { "rad or m" } else { "rad/s or m/s" };
             let without = match w.beyond_margin {
@@ -111,6 +122,32 @@ impl Eval {
     }
 }
 
+/// Asked and reached share, and row by row what cannot be had.
+fn reached_lines(reached: &Reached, ticks: u64) -> Vec<String> {
+    let percent = |share: f64| format!("{:.2} %", 100.0 * share);
+    let of = |row: &ReachedRow| percent(row.outside as f64 / ticks.max(1) as f64);
+    let mut rows: Vec<&ReachedRow> = reached.rows.iter().filter(|row| row.outside > 0).collect();
+    rows.sort_by_key(|row| std::cmp::Reverse(row.outside));
+    let most: Vec<String> = (rows.iter().take(3))
+        .map(|row| format!("'{}' {} its range {}, margin {:.2}", row.joint, row.side, of(row), row.margin))
+        .collect();
+    let most = if most.is_empty() { String::new() } else { format!("; most {}", most.join(", ")) };
+    let mut lines = vec![format!(
+        "constraints.reached asks for {} of the ticks outside a position limit, and {} were{most}",
+        percent(reached.asked),
+        percent(reached.share)
+    )];
+    lines.extend(rows.iter().filter(|row| row.unattainable).map(|row| {
+        format!(
+            "unattainable: joint '{}' is {} its range in {} of the ticks although its motor pushes away from it as hard as it can",
+            row.joint,
+            row.side,
+            of(row)
+        )
+    }));
+    lines
+}
+
 /// Sections that say what is simulated, and nothing of the controller.
 pub(super) const SIMULATED: [&str; 10] =
     ["reset", "termination", "metrics", "scene", "commands", "pushes", "random", "noise", "delay", "reward"];
@@ -133,4 +170,38 @@ pub(super) fn changed(
     snapshot.manifest.task = Task::parse(&task.name, &run_folder::to_toml(task), set)?;
     snapshot.manifest.task.state.privileged.clear(); // of the value, which has no part here
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Reached, ReachedRow, reached_lines};
+
+    #[test]
+    fn shares_are_said_and_what_cannot_be_had_by_row() {
+        let row = |joint: &str, side, outside, margin, unattainable| ReachedRow {
+            joint: joint.into(),
+            side,
+            outside,
+            margin,
+            unattainable,
+        };
+        let rows = vec![
+            row("hip", "below", 1, 0.25, false),
+            row("foot", "above", 30, 1.0, true),
+            row("foot", "below", 0, 0.0, false),
+        ];
+        let reached = Reached { asked: 0.01, share: 0.031, by_episode: vec![0.031], rows };
+        assert_eq!(
+            reached_lines(&reached, 1000),
+            [
+                "constraints.reached asks for 1.00 % of the ticks outside a position limit, and 3.10 % were; most 'foot' above its range 3.00 %, \
+                 margin 1.00, 'hip' below its range 0.10 %, margin 0.25",
+                "unattainable: joint 'foot' is above its range in 3.00 % of the ticks although its motor pushes away from it as hard as it can",
+            ]
+        );
+        let none = Reached { asked: 0.5, share: 0.0, by_episode: Vec::new(), rows: Vec::new() };
+        let text =
+            "constraints.reached asks for 50.00 % of the ticks outside a position limit, and 0.00 % were";
+        assert_eq!(reached_lines(&none, 0), [text]);
+    }
 }

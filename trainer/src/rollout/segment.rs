@@ -207,6 +207,8 @@ pub struct Collected {
     pub return_stats: RunningStats,
     /// Discounted costs, for scaling the cost.
     pub cost_stats: RunningStats,
+    /// The margins of `[constraints] reached` at its end ([`Controller::learned_margins`](nearl_runtime::Controller::learned_margins)).
+    pub margins: Vec<f64>,
 }
 
 impl Collected {
@@ -219,6 +221,7 @@ impl Collected {
             change_stats: RunningStats::new(n_state),
             return_stats: RunningStats::new(1),
             cost_stats: RunningStats::new(1),
+            margins: Vec::new(),
         }
     }
 
@@ -247,6 +250,7 @@ impl Collected {
     pub(super) fn clear(&mut self) {
         self.segment.clear();
         self.tally = Tally::default();
+        self.margins.clear();
         for stats in
             [&mut self.obs_stats, &mut self.change_stats, &mut self.return_stats, &mut self.cost_stats]
         {

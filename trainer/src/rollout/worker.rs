@@ -46,6 +46,8 @@ pub struct Worker {
     pub(super) episode: (f64, usize),
     pub(super) cost: f64,
     pub(super) ticks: usize,
+    /// Ticks that ended outside a position limit, and row by row those of [`Controller::margins`].
+    pub(crate) outside: (u64, Vec<u64>),
     /// Furthest that a position and a velocity came beyond its limit.
     pub(crate) excess: [Option<Excess>; 2],
     /// Limits that an evaluation measures too, and how far these were left.
@@ -89,6 +91,7 @@ impl Worker {
             privileged: [(); 2].map(|()| vec![0.0; env.spec().privileged.len()]),
             noise: controller.noise(),
             out: controller.output(),
+            outside: (0, vec![0; controller.margins().len()]),
             rows: Rows::new(&controller, gamma, 0.0),
             env,
             controller,
@@ -224,6 +227,9 @@ impl Worker {
                 self.rows.cut();
             }
         }
+        if self.left == 0 {
+            self.rows.collected.margins = self.controller.learned_margins();
+        }
         Ok(())
     }
 
@@ -330,6 +336,10 @@ impl Worker {
         self.env.actual_state(&mut self.actual.q, &mut self.actual.v);
         let excess = self.controller.excess(&self.actual);
         tally.reached_violations += u64::from(excess != [None; 2]);
+        for (count, is) in self.outside.1.iter_mut().zip(self.controller.outside(&self.actual.q)) {
+            *count += u64::from(is);
+        }
+        self.outside.0 += u64::from(excess[0].is_some());
         tally.residual += self.controller.residual(&self.state.obs, &self.out);
         let larger = |most: &[_; 2], new: [_; 2]| [0, 1].map(|k| Excess::larger(most[k], new[k]));
         self.excess = larger(&self.excess, excess);

@@ -8,6 +8,9 @@ use nearl_runtime::net::kernel::{LANES, V, scalars, scalars_mut};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+/// Margins of `[constraints] reached`.
+const MARGINS: &str = "margins";
+
 impl Training {
     /// Everything the next iteration depends on.
     ///
@@ -50,6 +53,9 @@ impl Training {
         put("recent".into(), Values::F64(recent));
         put("recent_costs".into(), Values::F64(self.recent_costs.clone()));
         put("best".into(), Values::F64(self.best.into_iter().collect()));
+        if !self.snapshot.networks.margins.is_empty() {
+            put(MARGINS.into(), Values::F64(self.snapshot.networks.margins.clone()));
+        }
         put("seconds".into(), Values::F64(vec![self.seconds()]));
         if let Some(imitation) = &self.imitation {
             put("demos".into(), Values::F64(vec![imitation.fingerprint()]));
@@ -133,12 +139,17 @@ impl Training {
             return Err(format!("it learned from other demonstrations than '{file}' holds now"));
         }
         self.rng.set_word_pos(from.header.rng.into());
+        let n = self.snapshot.networks.margins.len();
+        if n > 0 {
+            self.snapshot.networks.margins = from.take_f64(MARGINS, Some(n))?;
+        }
         self.source.restore(from)?;
         if let Some(name) = from.tensors.keys().next() {
             return Err(format!("tensor '{name}' belongs to nothing"));
         }
         if self.snapshot.manifest.steps > 0 {
-            self.snapshot.networks = self.learner.networks(&self.normaliser());
+            let normaliser = self.normaliser();
+            self.renew(&normaliser);
         }
         Ok(())
     }

@@ -226,6 +226,12 @@ pub(super) fn check_experience(
             "[state.privileged]: {source} knows no more of a robot than its policy sees; take it out, or train without {next}"
         )));
     }
+    if task.constraints.reached.is_some() && matches!(experience, Experience::Loop(..)) {
+        return Err(TrainError::Settings(format!(
+            "[constraints.reached]: {source} learns margins of its own, without which its ticks cannot be computed again; take it out, or train \
+             without {next}"
+        )));
+    }
     if !settings.project_in_training && matches!(experience, Experience::Loop(..)) {
         return Err(TrainError::Settings(format!(
             "[train.project_in_training]: {source} projects every target of a robot; set it to true, or train without {next}"

@@ -14,6 +14,7 @@ impl Worker {
     pub fn reseed(&mut self, rng: ChaCha8Rng) -> Result<(), EnvError> {
         self.rng = rng;
         self.rows.clear();
+        self.controller.forget_margins();
         self.restart()
     }
 
