@@ -61,8 +61,8 @@ class Snapshot:
         for k in range(count):
             out = self.tensors[f"{name}.{k}.weight"] @ out + self.tensors[f"{name}.{k}.bias"]
             out = np.tanh(out) if k < count - 1 else out
-        skip = self.tensors.get(f"{name}.skip.weight")
-        return out if skip is None else out + skip @ x + self.tensors.get(f"{name}.skip.bias", 0.0)
+        skip = self.tensors.get(f"{name}.skip")
+        return out if skip is None else out + skip @ x
 
     def see(self, obs: np.ndarray) -> np.ndarray:
         """The networks' input."""

@@ -1,0 +1,50 @@
+"""The share asked for by `constraints.reached` and the one that came, in training and after it.
+
+    python results/reached/dialled.py NEARL RUNS SEED... > results/reached/dialled.csv
+
+RUNS has the run folders of `dialled.sh`. Each policy is evaluated for 40 episodes of 1000 ticks, of which the second half counts, as margins that
+begin at 0 need some thousand ticks: with what it was trained for, and the one that was trained without under each share. The floor is what
+the best of 400 sampled actions leaves outside, in every fortieth tick of 10,000 of the policy without margins (`dial.py`).
+"""
+
+import json
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+from dial import Snapshot, fly
+
+EPISODES = 40
+SHARES = ("0.1", "0.05", "0.01")
+
+
+def evaluate(nearl: str, run: pathlib.Path, asked: str) -> dict:
+    """Shares and returns of the second half of the episodes; all of them where there are no margins, velocities counted too."""
+    command = [nearl, "eval", str(run), "--episodes", str(EPISODES), "--json", *(() if asked == "none" else ("--reached", asked))]
+    (found,) = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    half, reached = EPISODES // 2, found["reached"]
+    if reached is None:
+        share = f"{found['reached_violations'] / found['ticks']:.4f}"
+        return {"outside": share, "outside of all": share, "return": f"{np.mean(found['returns']):.1f}", "worst rows": "", "unattainable": ""}
+    rows = sorted(reached["rows"], key=lambda row: -row["outside"])
+    return {
+        "outside": f"{np.mean(reached['by_episode'][half:]):.4f}",
+        "outside of all": f"{reached['share']:.4f}",
+        "return": f"{np.mean(found['returns'][half:]):.1f}",
+        "worst rows": "; ".join(f"{r['joint']} {r['side']} {r['outside'] / found['ticks']:.4f} margin {r['margin']:.2f}" for r in rows[:3]),
+        "unattainable": "; ".join(f"{r['joint']} {r['side']}" for r in rows if r["unattainable"]),
+    }
+
+
+if __name__ == "__main__":
+    nearl, runs, seeds = sys.argv[1], pathlib.Path(sys.argv[2]), sys.argv[3:]
+    columns = ["seed", "trained for", "asked", "outside", "outside of all", "return", "floor", "worst rows", "unattainable"]
+    print(",".join(columns))
+    for seed in seeds:
+        for trained in ("none", *SHARES):
+            run = runs / f"{trained}_{seed}"
+            floor = fly(Snapshot(str(run / "checkpoints/final.safetensors")), None, 10000, "motor")["floor"]
+            for asked in ("none", *SHARES) if trained == "none" else (trained,):
+                row = {"seed": seed, "trained for": trained, "asked": asked, **evaluate(nearl, run, asked), "floor": floor}
+                print(",".join(str(row[column]) for column in columns), flush=True)
