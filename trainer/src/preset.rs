@@ -13,7 +13,7 @@ pub enum Preset {
 
 /// What one of them sets.
 #[derive(Clone, Copy, Debug)]
-pub struct PresetEntry {
+pub struct RegisteredPreset {
     /// Which.
     pub preset: Preset,
     /// As it is written.
@@ -27,8 +27,8 @@ pub struct PresetEntry {
 }
 
 /// Every preset.
-pub const PRESETS: &[PresetEntry] = &[
-    PresetEntry {
+pub const PRESETS: &[RegisteredPreset] = &[
+    RegisteredPreset {
         preset: Preset::Paper,
         name: "paper",
         about: "32 x 32 for all networks, the inverse model affine plus a residual; batch 2048, minibatch 64",
@@ -41,7 +41,7 @@ pub const PRESETS: &[PresetEntry] = &[
         ],
         tasks: &[],
     },
-    PresetEntry {
+    RegisteredPreset {
         preset: Preset::Strong,
         name: "strong",
         about: "64 x 64, and a search with seeds at a million steps: batch 2048, minibatch 64, a first spread of e^-0.5, passes end at a divergence of 0.0225",
@@ -83,7 +83,7 @@ impl Preset {
         self.entry().name
     }
 
-    fn entry(self) -> &'static PresetEntry {
+    fn entry(self) -> &'static RegisteredPreset {
         let found = PRESETS.iter().find(|e| e.preset == self);
         found.unwrap_or_else(|| unreachable!("{self:?} has no line in the table"))
     }
