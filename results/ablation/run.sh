@@ -37,3 +37,4 @@ for task in $tasks; do
     go four_demos $task --set train.demos.episodes=4
 done
 .venv/bin/python results/imitation/figure.py $runs/ablation results/ablation --experts results/imitation/experts --variants
+.venv/bin/python results/ablation/ranks.py
