@@ -1,18 +1,20 @@
-"""reached.csv as a table: shares of ticks that end outside, and of those that no sampled action avoids."""
+"""reached.csv and trained.csv as tables: shares of ticks that end outside, and of those that no sampled action avoids."""
 
 import csv
 import pathlib
 
 HERE = pathlib.Path(__file__).parent
-rows = list(csv.DictReader((HERE / "reached.csv").open()))
-lines = [
-    "| task | guard | outside | unavoidable by 400 samples | from inside: outside | unavoidable | return | steps/s |",
-    "|---|---|---|---|---|---|---|---|",
-]
-for row in rows:
-    share = lambda n, of: f"{100 * int(row[n]) / max(int(row[of]), 1):.2f} %"
-    shares = [share("outside", "ticks"), share("unavoidable", "ticks")]
-    shares += [share("outside_from_inside", "began_inside"), share("unavoidable_from_inside", "began_inside")]
-    lines.append(f"| {row['task']} | {row['guard']} | {' | '.join(shares)} | {row['mean_return']} | {row['steps_per_second']} |")
-(HERE / "table.md").write_text("\n".join(lines) + "\n")
-print("\n".join(lines))
+
+
+def share(row: dict, n: str, of: str) -> str:
+    return f"{100 * int(row[n]) / max(int(row[of]), 1):.2f} %"
+
+
+for name, first in (("reached", "policy"), ("trained", "trained")):
+    titles = [first, "task", "guard", "outside", "unavoidable by 400 samples", "from inside: outside", "unavoidable", "return", "steps/s"]
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
+    for row in csv.DictReader((HERE / f"{name}.csv").open()):
+        cells = [row[first], row["task"], row["guard"].replace(";", ","), share(row, "outside", "ticks"), share(row, "unavoidable", "ticks")]
+        cells += [share(row, f"{what}_from_inside", "began_inside") for what in ("outside", "unavoidable")]
+        lines.append(f"| {' | '.join(cells)} | {row['mean_return']} | {row['steps_per_second']} |")
+    (HERE / ("table.md" if name == "reached" else "trained.md")).write_text("\n".join(lines) + "\n")

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Hopper without the simulator's guard and trained behind it, 0.05 rad before the joints' soft stops: results/reached/trained.sh [STEPS] [TICKS] writes
-# trained.csv. RUNS may hold the trainings.
+# Hopper without the simulator's guard and trained behind it, 0.05 rad before the joints' soft stops: results/reached/trained.sh [STEPS] [TICKS] adds
+# what is missing to trained.csv. RUNS may hold the trainings.
 set -eu
 cd "$(dirname "$0")/../.."
 steps=${1:-200000}
@@ -9,7 +9,7 @@ runs=${RUNS:-$(mktemp -d)}
 nearl=${NEARL:-target/release/nearl}
 python=${PYTHON:-.venv/bin/python}
 out=results/reached/trained.csv
-echo "trained,task,guard,ticks,outside,unavoidable,began_inside,outside_from_inside,unavoidable_from_inside,mean_return,episodes,steps_per_second" > "$out"
+[ -e "$out" ] || echo "trained,task,guard,ticks,outside,unavoidable,began_inside,outside_from_inside,unavoidable_from_inside,mean_return,episodes,steps_per_second" > "$out"
 train() {
     name=$1
     shift
@@ -18,5 +18,5 @@ train() {
 train without
 train behind --set 'constraints.guard="simulator"' --set constraints.position.margin=0.05
 for name in without behind; do
-    "$python" results/reached/measure.py Hopper-v5 "$runs/$name/checkpoints/final.safetensors" "$ticks" 0.05 | sed "s/^/$name,/" >> "$out"
+    grep -q "^$name," "$out" || "$python" results/reached/measure.py Hopper-v5 "$runs/$name/checkpoints/final.safetensors" "$ticks" 0.05 | sed "s/^/$name,/" >> "$out"
 done
