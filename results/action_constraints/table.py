@@ -2,12 +2,14 @@
 
     .venv/bin/python results/action_constraints/table.py RUNS FOLDER
 
-RUNS has `<set>/<task>/<algo>_<seed>` and `<set>/update.json`. Ten episodes of each run are recorded (`nearl demos record`), and what was done in them is
-held against the formula here, from the joint velocities of the simulator: nothing that projects has a say in it.
+RUNS has `<set>/<task>/<algo>_<seed>` and, where times were taken, `<set>/update.json`. Runs without a set are those of results/strong. Ten episodes of each
+run are recorded (`nearl demos record`), and what was done in them is held against the formula here, from the joint velocities of the simulator: nothing that
+projects has a say in it.
 """
 
 import csv
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -18,7 +20,11 @@ import numpy as np
 
 from nearl.curves import bootstrap_band, interquartile_mean
 
-NEARL = Path(__file__).parents[2] / "target" / "release" / "nearl"
+ROOT = Path(__file__).parents[2]
+NEARL = os.environ.get("NEARL", ROOT / "target/release/nearl")
+sys.path.insert(0, str(ROOT / "results/strong"))
+from table import rank_test  # noqa: E402
+
 RATES = {"HC+rate": [0.2, 0.2, 0.2, 0.5, 0.5, 0.5], "H+rate": [0.2, 0.5, 0.5]}
 BOUNDS = {"HC+O": 20.0, "H+M": 10.0, "W+M": 10.0, "Ant+S": 2.0}
 
@@ -46,38 +52,52 @@ def episodes(run: Path) -> list[tuple[np.ndarray, np.ndarray, float]]:
     return result
 
 
+def free() -> dict[tuple[str, str], list[float]]:
+    """Returns without noise of the runs without a set, by task and algorithm."""
+    found = defaultdict(list)
+    with open(ROOT / "results/strong/runs.csv") as f:
+        for row in csv.DictReader(f):
+            found[row["task"], row["algo"]].append(float(row["without_noise"]))
+    return found
+
+
+def measure(run: Path) -> dict:
+    """A row of the data: ten episodes of this run."""
+    name, task, (algo, seed) = run.parents[1].name, run.parent.name, run.name.rsplit("_", 1)
+    recorded = episodes(run)
+    over = np.concatenate([excess(name, a, w) for a, w, _ in recorded])
+    row = {"set": name, "task": task, "algo": algo, "seed": seed, "without_noise": f"{np.mean([r for *_, r in recorded]):.5g}"}
+    row |= {"steps": len(over), "largest_excess": f"{over.max():.3g}", "steps_beyond_1e-9": int((over > 1e-9).sum())}
+    return row | {"steps_on_the_limit": int((over > -1e-6).sum())}
+
+
+def centre(values: list[float]) -> str:
+    """Interquartile mean with its band."""
+    low, high = bootstrap_band(values)
+    return f"{interquartile_mean(values):.0f}" + (f" ({low:.0f} to {high:.0f})" if len(values) > 1 else "")
+
+
 def main(runs: Path, folder: Path) -> None:
-    rows, returns = [], defaultdict(dict)
-    for run in sorted(p.parent for p in runs.glob("*/*/*_*/checkpoints")):
-        name, task, (algo, seed) = run.parents[1].name, run.parent.name, run.name.rsplit("_", 1)
-        recorded = episodes(run)
-        over = None if name.startswith("free") else np.concatenate([excess(name, a, w) for a, w, _ in recorded])
-        value = float(np.mean([r for *_, r in recorded]))
-        returns[name, task, algo][int(seed)] = value
-        rows.append(
-            {"set": name, "task": task, "algo": algo, "seed": seed, "without_noise": f"{value:.5g}", "steps": sum(len(a) for a, *_ in recorded)}
-            | {"largest_excess": "" if over is None else f"{over.max():.3g}", "steps_beyond_1e-9": 0 if over is None else int((over > 1e-9).sum())}
-            | {"steps_on_the_limit": 0 if over is None else int((over > -1e-6).sum())}
-        )
+    finished = sorted(file.parents[1] for file in runs.glob("*/*/*_*/checkpoints/final.safetensors"))
+    rows, beside = [measure(run) for run in finished], free()
     with open(folder / "runs.csv", "w", newline="") as f:
         writer = csv.DictWriter(f, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    titles = ["set", "algorithm", "seeds", "return without noise", "without the set", "steps beyond by more than 1e-9", "steps on it"]
-    titles += ["update p50, p99 [us]", "without the set"]
-    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     timed = {f.parent.name: json.loads(f.read_text()) for f in runs.glob("*/update.json")}
+    titles = ["set", "algorithm", "seeds", "return", "without the set", "share", "p", "steps beyond", "largest excess", "steps on it"]
+    titles += ["update p50, p99 [us]", "without the set"] if timed else []
     us = lambda name: f"{timed[name]['p50']:.1f}, {timed[name]['p99']:.1f}" if name in timed else ""  # noqa: E731
-    for (name, task, algo), found in sorted(returns.items()):
-        if name.startswith("free"):
-            continue
-        values, free = np.array(list(found.values())), list(returns.get((f"free-{task}", task, algo), {}).values())
-        low, high = bootstrap_band(values)
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
+    for name, task, algo in sorted({(r["set"], r["task"], r["algo"]) for r in rows}):
         mine = [r for r in rows if (r["set"], r["task"], r["algo"]) == (name, task, algo)]
+        values, without = [float(r["without_noise"]) for r in mine], beside[task, algo]
         broken, held, steps = (sum(int(r[k]) for r in mine) for k in ("steps_beyond_1e-9", "steps_on_the_limit", "steps"))
-        beside = f"{interquartile_mean(free):.0f}" if free else ""
-        centre = f"{interquartile_mean(values):.0f}" + (f" ({low:.0f} to {high:.0f})" if len(values) > 1 else "")
-        lines.append(f"| {name} | {algo} | {len(values)} | {centre} | {beside} | {broken} of {steps} | {held} | {us(name)} | {us(f'free-{task}')} |")
+        cells = [name, algo, str(len(values)), centre(values), centre(without), f"{interquartile_mean(values) / interquartile_mean(without):.2f}"]
+        cells += [f"{rank_test(values, without):.2f}" if len(values) > 2 else ""]
+        cells += [f"{broken} of {steps}", f"{max(float(r['largest_excess']) for r in mine):.1g}", f"{100 * held / steps:.0f} %"]
+        cells += [us(name), us(f"free-{task}")] if timed else []
+        lines.append(f"| {' | '.join(cells)} |")
     (folder / "table.md").write_text("\n".join(lines) + "\n")
 
 
