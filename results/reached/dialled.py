@@ -7,6 +7,7 @@ begin at 0 need some thousand ticks: with what it was trained for, and the one t
 the best of 400 sampled actions leaves outside, in every fortieth tick of 10,000 of the policy without margins (`dial.py`).
 """
 
+import csv
 import json
 import pathlib
 import subprocess
@@ -37,14 +38,21 @@ def evaluate(nearl: str, run: pathlib.Path, asked: str) -> dict:
     }
 
 
+def in_training(run: pathlib.Path) -> str:
+    """Share of the ticks outside a position or a velocity limit in the second half of the training, exploration included."""
+    with (run / "metrics.csv").open() as file:
+        shares = [float(row["constraints/reached_violations"]) for row in csv.DictReader(file)]
+    return f"{np.mean(shares[len(shares) // 2 :]):.4f}"
+
+
 if __name__ == "__main__":
     nearl, runs, seeds = sys.argv[1], pathlib.Path(sys.argv[2]), sys.argv[3:]
-    columns = ["seed", "trained for", "asked", "outside", "outside of all", "return", "floor", "worst rows", "unattainable"]
+    columns = ["seed", "trained for", "in training", "asked", "outside", "outside of all", "return", "floor", "worst rows", "unattainable"]
     print(",".join(columns))
     for seed in seeds:
         for trained in ("none", *SHARES):
             run = runs / f"{trained}_{seed}"
             floor = fly(Snapshot(str(run / "checkpoints/final.safetensors")), None, 10000, "motor")["floor"]
             for asked in ("none", *SHARES) if trained == "none" else (trained,):
-                row = {"seed": seed, "trained for": trained, "asked": asked, **evaluate(nearl, run, asked), "floor": floor}
+                row = {"seed": seed, "trained for": trained, "in training": in_training(run), "asked": asked, **evaluate(nearl, run, asked), "floor": floor}
                 print(",".join(str(row[column]) for column in columns), flush=True)
