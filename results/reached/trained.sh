@@ -9,7 +9,8 @@ runs=${RUNS:-$(mktemp -d)}
 nearl=${NEARL:-target/release/nearl}
 python=${PYTHON:-.venv/bin/python}
 out=results/reached/trained.csv
-[ -e "$out" ] || echo "trained,task,guard,ticks,outside,unavoidable,began_inside,outside_from_inside,unavoidable_from_inside,mean_return,episodes,steps_per_second" > "$out"
+counts=ticks,outside,unavoidable,began_inside,outside_from_inside,unavoidable_from_inside
+[ -e "$out" ] || echo "trained,task,guard,$counts,mean_return,episodes,steps_per_second" > "$out"
 train() {
     name=$1
     shift
@@ -18,5 +19,6 @@ train() {
 train without
 train behind --set 'constraints.guard="simulator"' --set constraints.position.margin=0.05
 for name in without behind; do
-    grep -q "^$name," "$out" || "$python" results/reached/measure.py Hopper-v5 "$runs/$name/checkpoints/final.safetensors" "$ticks" 0.05 | sed "s/^/$name,/" >> "$out"
+    grep -q "^$name," "$out" && continue
+    "$python" results/reached/measure.py Hopper-v5 "$runs/$name/checkpoints/final.safetensors" "$ticks" 0.05 | sed "s/^/$name,/" >> "$out"
 done
