@@ -89,7 +89,7 @@ def recipe(folder: Path, block: str) -> None:
 # What the blocks of a page are a part of, in the page's order. Those of OWN_ROBOT are one file, which test_readme.py trains.
 PARTS: dict[str, list[Build]] = {
     "GUARD": [guarded_file],
-    "LIMITS": [limits, trains("HalfCheetah-v5.toml"), trains("HalfCheetah-v5.toml")],
+    "LIMITS": [limits, *[trains("HalfCheetah-v5.toml")] * 3],
     "OWN_LIMIT": [limits],
     "POLICIES": [recipe],
     "TASKS": [trains("anymal-walk.toml")] * 2,
