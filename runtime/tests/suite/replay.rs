@@ -82,8 +82,7 @@ fn a_run_that_learns_margins_replays_bit_for_bit() {
     let pushing = |version| {
         let mut snapshot = snapshot(version, |m| {
             m.policy = PolicyKind::Direct;
-            let limits =
-                "{\"position\": {\"margin\": 1.0}, \"velocity\": {\"scale\": 1.0}, \"reached\": 0.05}";
+            let limits = "{\"position\": {\"margin\": 1.0}, \"velocity\": {\"scale\": 1.0}, \"acceleration\": {\"limit\": 10.0}, \"reached\": 0.05}";
             m.task.constraints = serde_json::from_str(limits).unwrap();
         });
         let policy = &mut snapshot.networks.policy;
