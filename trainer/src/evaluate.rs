@@ -39,7 +39,7 @@ pub struct ReachedRow {
     pub side: &'static str,
     /// Ticks that ended there.
     pub outside: u64,
-    /// Its margin at the end, 0 to 1 ([`Margin`](nearl_runtime::controller::Margin)).
+    /// Its margin at the end, 0 to 1 ([`Margin`]).
     pub margin: f64,
     /// Its margin is at its end, and more ticks ended outside than were asked for.
     pub unattainable: bool,
