@@ -255,12 +255,18 @@ impl Training {
         if !self.source.collect(&self.snapshot)? {
             return Ok(None);
         }
-        let bad = |g: &&Collected| g.segment.reward.iter().find(|r| !r.is_finite()).copied();
-        if let Some(reward) = self.source.gathered().iter().find_map(bad) {
+        // a cost that is only counted spoils nothing that is learned
+        let reads_cost = self.settings.cost.is_limited();
+        let bad = |g: &&Collected| {
+            let costs = g.segment.cost.iter().map(|x| ("cost", x)).filter(|_| reads_cost);
+            let mut read = g.segment.reward.iter().map(|x| ("reward", x)).chain(costs);
+            read.find(|(_, x)| !x.is_finite()).map(|(what, x)| (what, *x))
+        };
+        if let Some((what, value)) = self.source.gathered().iter().find_map(bad) {
             let (task, steps) = (&self.snapshot.manifest.task.name, self.snapshot.manifest.steps);
             return Err(TrainError::Settings(format!(
-                "a reward of '{task}' came out as {reward} after {steps} steps, and nothing can be learned from it; look for a logarithm, root or \
-                 quotient in [reward] that leaves its domain"
+                "a {what} of '{task}' came out as {value} after {steps} steps, and nothing can be learned from it; look for a logarithm, root or \
+                 quotient in [{what}] that leaves its domain"
             )));
         }
         let mut tally = Tally::default();

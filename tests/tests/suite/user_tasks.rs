@@ -145,6 +145,27 @@ fn mistakes_are_named_with_file_and_key() {
     assert!(message.is_err_and(|m| m.contains("[termination]: only a task with its own [reward]")));
 }
 
+/// So does a cost, where the learner keeps to a limit on it; where it is only counted the training goes on.
+#[test]
+fn a_cost_that_is_no_number_ends_the_training_that_reads_it() {
+    let folder = tempfile::tempdir().expect("folder");
+    let odd = "[cost]\nodd = \"0.0 * log(q.slider + 0.5)\"\n\n[reward]";
+    let file = edited(folder.path(), "[reward]", odd);
+    let trained = |set: &[&str], run: &str| {
+        let set: Vec<String> = set.iter().map(|s| (*s).to_string()).collect();
+        let mut manifest = tasks::load(&file, &set).expect("task");
+        complete(&mut manifest).expect("environment");
+        let request = Request { manifest, algo: Algorithm::Ppo, steps: 100_000, seed: 0, threads: 1 };
+        train(&request, &folder.path().join(run), |_, _| true).map_err(|e| e.to_string())
+    };
+    let error = trained(&["train.cost.limit=5.0"], "limited").expect_err("a cost of NaN");
+    assert!(
+        error.contains("a cost of 'cart-pole' came out as NaN after") && error.contains("in [cost]"),
+        "{error}"
+    );
+    trained(&[], "counted").expect("only counted");
+}
+
 /// A reward that leaves its domain ends the training instead of spoiling it, and what was learned stays.
 #[test]
 fn a_reward_that_is_no_number_ends_the_training() {

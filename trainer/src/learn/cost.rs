@@ -100,12 +100,10 @@ impl CostLimited {
         let adam = Adam::new(value.len, ppo.rate_of_value());
         let multiplier = Group { p: vec![V::splat(settings.multiplier)], transposed: Vec::new() };
         let (mut groups, mut adam) = (vec![group, multiplier], vec![adam]);
-        let append = |params: &mut Params| {
+        change(&mut *learner, |params| {
             params.groups.append(&mut groups);
             params.adam.append(&mut adam);
-            Ok(())
-        };
-        learner.restore(&mut { append }).unwrap_or_else(|e| unreachable!("nothing was read: {e}"));
+        });
         let critic = Critic { value, group: at, phase, max_norm: ppo.max_grad_norm };
         Self { learner, settings, ppo, critic, threads }
     }
@@ -113,22 +111,22 @@ impl CostLimited {
     fn integral(&self) -> f32 {
         self.learner.params().groups[self.critic.group + 1].p[0].0[0]
     }
+}
 
-    /// Takes `f` to the parameters, which stay consistent with what follows from them.
-    fn change(&mut self, mut f: impl FnMut(&mut Params)) {
-        let done = self.learner.restore(&mut |params| {
-            f(params);
-            Ok(())
-        });
-        done.unwrap_or_else(|e| unreachable!("nothing was read: {e}"));
-    }
+/// Takes `f` to the learner's parameters, and refreshes what follows from them.
+fn change(learner: &mut dyn Learner, mut f: impl FnMut(&mut Params)) {
+    let done = learner.restore(&mut |params| {
+        f(params);
+        Ok(())
+    });
+    done.unwrap_or_else(|e| unreachable!("nothing was read: {e}"));
 }
 
 impl Learner for CostLimited {
     fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics {
         let [integral, multiplier] = self.settings.stepped(self.integral(), batch.episode_cost);
         let (group, threads) = (self.critic.group, self.threads);
-        self.change(|params| params.groups[group + 1].p[0] = V::splat(integral));
+        change(&mut *self.learner, |params| params.groups[group + 1].p[0] = V::splat(integral));
         let params = self.learner.params();
         batch.estimate_cost(multiplier, |x| self.critic.value.of(&params.groups[group], x, threads));
         let mut metrics = self.learner.update(batch, pace, rng);
@@ -140,11 +138,9 @@ impl Learner for CostLimited {
         let schedule = Schedule { epochs, minibatch, threads, rate: pace.rate, clip: pace.clip };
         let mut loss = f64::NAN;
         let Self { learner, critic, .. } = self;
-        let learned = learner.restore(&mut |params| {
+        change(&mut **learner, |params| {
             loss = optimise(critic, params, batch, &[critic.phase], schedule, rng)[0].mean[0];
-            Ok(())
         });
-        learned.unwrap_or_else(|e| unreachable!("nothing was read: {e}"));
         std::mem::swap(&mut batch.returns, &mut batch.cost.returns);
         std::mem::swap(&mut batch.value, &mut batch.cost.value);
         metrics.extend([("cost/multiplier", f64::from(multiplier)), ("cost/value_loss", loss)]);

@@ -27,9 +27,7 @@ impl Collected {
         for stats in [&self.obs_stats, &self.change_stats, &self.return_stats, &self.cost_stats] {
             push(numbers, stats.to_vec().into_iter());
         }
-        if !self.margins.is_empty() {
-            push(numbers, self.margins.iter().copied());
-        }
+        push(numbers, self.margins.iter().copied());
     }
 
     /// The inverse of [`Collected::carry`] for `n_steps` steps of these sizes; `None` for numbers of any other shape.
@@ -68,7 +66,7 @@ impl Collected {
         };
         let (obs_stats, change_stats) = (stats(n_obs)?, stats(n_state)?);
         let (return_stats, cost_stats) = (stats(1)?, stats(1)?);
-        let margins = if from.is_empty() { Vec::new() } else { pull(from)?.to_vec() };
+        let margins = pull(from)?.to_vec();
         let (n, cuts) = (s.privileged.len(), s.final_x.len());
         let privileged_fit = n % n_steps.max(1) == 0 && s.final_privileged.len() * n_steps == n * cuts;
         let cuts_fit = s.final_x.iter().all(|(t, _)| *t < n_steps);
