@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::cli::{Failure, say};
 use crate::codes::CheckCode;
-use crate::controller::{Controller, Parts};
+use crate::controller::{Controller, Margin, Parts};
 use crate::gains;
 use crate::holding;
 use crate::link::{
@@ -144,7 +144,10 @@ fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
         format!("{task} by {algo}, version {}, {} steps, digest {}", m.version, m.steps, snapshot.digest());
     let mut checks = vec![ok(CheckCode::Snapshot, text)];
     match Controller::new(&snapshot) {
-        Ok(_) => checks.push(ok(CheckCode::Canary, "trial states gave finite actions".into())),
+        Ok(controller) => {
+            checks.push(ok(CheckCode::Canary, "trial states gave finite actions".into()));
+            checks.extend(reached(m, &controller));
+        }
         Err(e) => {
             checks.push(fail(CheckCode::Canary, e.to_string()));
             return (None, checks);
@@ -166,6 +169,34 @@ fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
         Err(e) => checks.push(fail(CheckCode::Braking, e.to_string())),
     }
     (Some(snapshot), checks)
+}
+
+/// Is the share of ticks that may end outside to be had?
+fn reached(m: &Manifest, controller: &Controller) -> Option<Check> {
+    let asked = 100.0 * m.task.constraints.reached?;
+    let margins = controller.margins();
+    let name = |row: &Margin| {
+        format!(
+            "the {} limit of joint '{}'",
+            if row.is_upper { "upper" } else { "lower" },
+            controller.model().dof_name(row.dof)
+        )
+    };
+    let ends: Vec<String> = margins.iter().filter(|row| row.at_end).map(name).collect();
+    if !ends.is_empty() {
+        let text = format!(
+            "{asked:.3} % of ticks may end outside a position limit, but at {} the motor pushes away with all it has and it is not enough; the share \
+             there may be higher",
+            ends.join(", ")
+        );
+        return Some(warn(CheckCode::Reached, text));
+    }
+    let widest = margins.iter().max_by(|a, b| a.share.total_cmp(&b.share)).filter(|row| row.share > 0.0);
+    let learned = match widest {
+        Some(row) => format!("the largest margin that was learned is {:.2}, at {}", row.share, name(row)),
+        None => "no margin was learned yet".into(),
+    };
+    Some(ok(CheckCode::Reached, format!("{asked:.3} % of ticks may end outside a position limit; {learned}")))
 }
 
 /// What the robot file has that projection and inverse dynamics do not reckon with, and limits that are hardly meant.

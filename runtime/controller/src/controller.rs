@@ -165,6 +165,8 @@ pub struct Controller {
     /// Ticks of the episode before `tick` counted from 0: those of the controller that this one took over from.
     earlier: usize,
     version: u64,
+    /// How long each part of its memory is.
+    remembered: memory::Lengths,
     mean: Vec<f32>,
     held: State,
     goal: Proposal,
@@ -237,6 +239,7 @@ impl Controller {
             given: Given::new(if kind == PolicyKind::Direct { n_act } else { layout.n_state() }),
             earlier: 0,
             version: m.version,
+            remembered: memory::Lengths::default(),
             mean: vec![0.0; layout.n_state().max(n_act)],
             held: rest.clone(),
             goal: proposal.clone(),
@@ -245,6 +248,7 @@ impl Controller {
             layout,
             model,
         };
+        controller.remembered = controller.lengths();
         controller.canary()?;
         controller.bring_margins(&n.margins)?;
         Ok(controller)

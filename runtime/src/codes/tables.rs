@@ -48,6 +48,8 @@ codes! {
             "Set constraints.braking = \"stored\", or multiply constraints.acceleration.limit by the number in the sentence.";
         Gains = "doctor-gains", "How well must the gains of the joints' drives be known?",
             "Measure the gains, or lower the drives' damping or the speed limits, or raise constraints.acceleration.limit.";
+        Reached = "doctor-reached", "Which share of ticks may end outside a position limit, and can the motors keep to it?",
+            "Ask for a larger constraints.reached, or leave the limits named room for what the motors cannot hold.";
         Memory = "doctor-memory", "Is there room for the links in /dev/shm?", "Free space there or remount it larger.";
         Links = "doctor-links", "Are there links that only dead processes hold?",
             "Start the robot again, which cleans up, or delete the files the sentence names.";

@@ -11,7 +11,7 @@ use crate::link::{Message, ProposalMessage, StateMessage};
 use crate::rt::{Counters, Mode, Reason, Record, Row, Sensed};
 
 /// Version of the tick messages; replay reads this one only.
-pub const SCHEMA_VERSION: u32 = 6;
+pub const SCHEMA_VERSION: u32 = 7;
 
 /// JSON schema of the `tick` topic.
 pub(crate) const SCHEMA: &str = r#"{

@@ -36,7 +36,6 @@ pub struct Pilot {
     limits: f64,
     /// Scratch, with room for what is shared.
     memory: Vec<f64>,
-    memory_len: usize,
     /// A tick was begun whose answer is not taken yet: the brake has the memory from before it.
     tried: Cell<bool>,
     /// Ticks since the policy ran.
@@ -79,7 +78,6 @@ impl Pilot {
             checked: checked(&controller),
             proposes: snapshot.manifest.proposes(),
             limits: number_of(controller.limits()),
-            memory_len: 1 + controller.memory().len(),
             memory: controller.memory(),
             tried: Cell::new(false),
             period_tick: 0,
@@ -266,8 +264,10 @@ impl LoopController for Pilot {
 
     fn load_memory(&mut self, memory: &[f64]) {
         // A way to stop within other limits is none within these.
-        if memory.first() == Some(&self.limits) && memory.len() == self.memory_len {
-            self.controller.take_memory(&memory[1..]);
+        if let Some((limits, memory)) = memory.split_first()
+            && *limits == self.limits
+        {
+            self.controller.take_memory(memory);
             self.share(false);
         }
     }

@@ -1,5 +1,6 @@
 //! `[constraints] reached`: the share of ticks that end outside, in training, in files and where it can mean nothing.
 
+use nearl_runtime::doctor::Finding;
 use nearl_runtime::{Controller, Snapshot};
 use nearl_tests::training;
 use nearl_trainer::rollout::{make_env, stream};
@@ -42,6 +43,47 @@ fn a_snapshot_has_its_margins() {
     );
 }
 
+/// A loop swaps between a snapshot that asks for a share and one that does not: what both know is handed on.
+#[test]
+fn a_swap_to_margins_or_from_them_keeps_the_way_to_stop() {
+    let with = trained(1, &[ASKED, "constraints.acceleration.limit=200.0", "constraints.braking=stored"]);
+    let mut without = with.clone();
+    without.manifest.task.constraints.reached = None;
+    without.networks.margins.clear();
+    let controller = |snapshot: &Snapshot| Controller::new(snapshot).expect("controller");
+    for (from, to) in [(&with, &without), (&without, &with)] {
+        let (mut from, mut to) = (controller(from), controller(to));
+        let (mut state, noise, mut out) = (from.state(), from.noise(), from.output());
+        state.v[3] = 0.5;
+        from.update(&state, &noise, &mut out);
+        let brake = from.stored_brake().map(<[f64]>::to_vec);
+        assert!(brake.is_some(), "a way to stop was stored");
+        assert!(!to.take_memory(&from.memory()), "the margins are not of both");
+        assert_eq!(to.stored_brake().map(<[f64]>::to_vec), brake);
+        assert!(!to.take_memory(&from.memory()[1..]), "no memory");
+    }
+}
+
+/// Doctor says what is asked and what was learned, and names the limit at which a motor has no more to give.
+#[test]
+fn doctor_says_what_is_asked_and_where_it_cannot_be_had() {
+    let mut snapshot = trained(1, &[ASKED]);
+    let folder = tempfile::tempdir().expect("a folder");
+    let said = |snapshot: &Snapshot| {
+        let file = folder.path().join("policy.safetensors");
+        snapshot.save(&file).expect("saved");
+        let checks = nearl_runtime::doctor::examine(&file, None);
+        let check = checks.into_iter().find(|check| check.check == "reached").expect("a check of the share");
+        (check.finding, check.text)
+    };
+    let (finding, text) = said(&snapshot);
+    assert!(finding == Finding::Ok && text.starts_with("5.000 % of ticks"), "{text}");
+    let last = snapshot.networks.margins.len() - 1;
+    snapshot.networks.margins[last] = 1.0;
+    let (finding, text) = said(&snapshot);
+    assert!(finding == Finding::Warn && text.contains("the upper limit of joint 'ffoot'"), "{text}");
+}
+
 /// Whoever takes over in the middle of an episode goes on with the margins, bit for bit; an episode's end leaves them.
 #[test]
 fn margins_are_handed_on_and_outlast_episodes() {
@@ -55,7 +97,7 @@ fn margins_are_handed_on_and_outlast_episodes() {
         env.observe(&mut state.obs);
         env.state(&mut state.q, &mut state.v);
         if tick == 300 {
-            b.take_memory(&a.memory());
+            assert!(b.take_memory(&a.memory()));
         }
         a.update(&state, &noise, &mut out_a);
         if tick >= 300 {

@@ -99,7 +99,9 @@ impl Worker {
                 return Err(changed());
             }
         }
-        self.controller.set_memory(&memory);
+        if !self.controller.set_memory(&memory) {
+            return Err(changed());
+        }
         self.observe();
         let bits = |x: &[f64]| x.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
         if bits(&self.state.obs) != bits(&obs) {

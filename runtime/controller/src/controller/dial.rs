@@ -268,11 +268,6 @@ impl Dial {
         self.first = self.learned();
     }
 
-    /// Number of entries of what [`Dial::write_memory`] writes.
-    pub(super) fn memory_len(&self) -> usize {
-        1 + self.learned_len()
-    }
-
     /// Appends what the next tick depends on.
     pub(super) fn write_memory(&self, memory: &mut Vec<f64>) {
         memory.push(f64::from(u8::from(self.acted)));

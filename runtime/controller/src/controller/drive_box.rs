@@ -122,11 +122,6 @@ impl DriveBox {
         self.known = memory[0] != 0.0;
         self.before.copy_from_slice(&memory[1..]);
     }
-
-    /// Entries of its memory.
-    pub(super) fn memory_len(&self) -> usize {
-        1 + self.before.len()
-    }
 }
 
 impl Joint {

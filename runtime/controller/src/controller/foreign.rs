@@ -95,9 +95,4 @@ impl Foreign {
         observer.set_memory(rest);
         *ticks as usize
     }
-
-    /// Entries of its memory.
-    pub(super) fn memory_len(&self) -> usize {
-        self.observer.as_ref().map_or(0, |observer| 1 + observer.memory_len())
-    }
 }

@@ -1,9 +1,24 @@
 //! What a controller remembers from tick to tick, and how another controller takes it over.
 
 use super::dial::{Dial, Margin};
-use super::drive_box::DriveBox;
 use super::{Controller, SnapshotError};
 use nearl_constraints::{ActionLimit, Projector};
+
+/// Parts of a memory: the projector's, the drives', the limit's on actions, the margins, and what the policy saw. Their lengths come first.
+const PARTS: usize = 5;
+
+/// The lengths of these parts.
+pub(super) type Lengths = [usize; PARTS];
+
+/// The parts of what [`Controller::memory`] gave; `None` where it is no such thing.
+fn parts(memory: &[f64]) -> Option<[&[f64]; PARTS]> {
+    let (lengths, mut rest) = memory.split_at_checked(PARTS)?;
+    let mut parts = [rest; PARTS];
+    for (part, &length) in parts.iter_mut().zip(lengths) {
+        (*part, rest) = rest.split_at_checked(length as usize)?;
+    }
+    rest.is_empty().then_some(parts)
+}
 
 impl Controller {
     /// Starts a new episode: the next tick is a policy tick. The margins of `[constraints] reached` stay.
@@ -37,17 +52,20 @@ impl Controller {
 
     /// Appends [`Controller::memory`] to `memory`; allocates only where that has no room.
     pub fn write_memory(&self, memory: &mut Vec<f64>) {
-        self.last_word().write_memory(memory);
-        if let Some(drives) = &self.drive_box {
-            drives.write_memory(memory);
+        let begin = memory.len();
+        memory.extend([0.0; PARTS]);
+        let mut from = memory.len();
+        for part in 0..PARTS {
+            match part {
+                0 => self.last_word().write_memory(memory),
+                1 => self.drive_box.iter().for_each(|drives| drives.write_memory(memory)),
+                2 => self.action_limit.iter().for_each(|limit| limit.write_memory(memory)),
+                3 => self.dial.iter().for_each(|dial| dial.write_memory(memory)),
+                _ => self.foreign.write_memory(self.earlier + self.tick, memory),
+            }
+            memory[begin + part] = (memory.len() - from) as f64;
+            from = memory.len();
         }
-        if let Some(limit) = &self.action_limit {
-            limit.write_memory(memory);
-        }
-        if let Some(dial) = &self.dial {
-            dial.write_memory(memory);
-        }
-        self.foreign.write_memory(self.earlier + self.tick, memory);
     }
 
     /// The way to stop that was verified last (nv), see [`Projector::stored_brake`].
@@ -71,38 +89,38 @@ impl Controller {
         self.guard.as_mut().map_or(&mut self.projector, |guard| &mut guard.projector)
     }
 
-    /// Begins in the middle of an episode, at a policy tick, with what [`Controller::memory`] gave.
-    ///
-    /// # Panics
-    /// When it has another length.
-    pub fn set_memory(&mut self, memory: &[f64]) {
+    /// Begins in the middle of an episode, at a policy tick, with what [`Controller::memory`] gave. False as for [`Controller::take_memory`].
+    pub fn set_memory(&mut self, memory: &[f64]) -> bool {
         self.reset();
-        self.take_memory(memory);
+        self.take_memory(memory)
     }
 
-    /// Takes what [`Controller::memory`] gave, in the middle of a policy period too: a controller that takes over from another.
-    ///
-    /// # Panics
-    /// When it has another length.
-    pub fn take_memory(&mut self, memory: &[f64]) {
-        let (memory, seen) = memory.split_at(memory.len() - self.foreign.memory_len());
-        self.earlier = self.foreign.set_memory(seen).saturating_sub(self.tick);
-        let of_dial = self.dial.as_ref().map_or(0, Dial::memory_len);
-        let (memory, learned) = memory.split_at(memory.len() - of_dial);
-        if let Some(own) = &mut self.dial {
-            own.set_memory(learned);
+    /// How long each part of [`Controller::memory`] is.
+    pub(super) fn lengths(&self) -> Lengths {
+        let memory = self.memory();
+        std::array::from_fn(|part| memory[part] as usize)
+    }
+
+    /// Takes what [`Controller::memory`] gave, in the middle of a policy period too: a controller that takes over from another. Of one with
+    /// other parts, such as margins where this one learns none, what both know; what the other did not know begins anew.
+    /// False where something was left.
+    pub fn take_memory(&mut self, memory: &[f64]) -> bool {
+        let Some(parts) = parts(memory) else { return false };
+        let mut whole = true;
+        for (k, (part, need)) in parts.into_iter().zip(self.remembered).enumerate() {
+            if part.len() != need {
+                whole = false;
+                continue;
+            }
+            match k {
+                0 => self.projector().set_memory(part),
+                1 => self.drive_box.iter_mut().for_each(|drives| drives.set_memory(part)),
+                2 => self.action_limit.iter_mut().for_each(|limit| limit.set_memory(part)),
+                3 => self.dial.iter_mut().for_each(|dial| dial.set_memory(part)),
+                _ => self.earlier = self.foreign.set_memory(part).saturating_sub(self.tick),
+            }
         }
-        let of_limit = self.action_limit.as_ref().map_or(0, ActionLimit::memory_len);
-        let (memory, limit) = memory.split_at(memory.len() - of_limit);
-        if let Some(own) = &mut self.action_limit {
-            own.set_memory(limit);
-        }
-        let own = self.drive_box.as_ref().map_or(0, DriveBox::memory_len);
-        let (projector, drives) = memory.split_at(memory.len() - own);
-        self.projector().set_memory(projector);
-        if let Some(own) = &mut self.drive_box {
-            own.set_memory(drives);
-        }
+        whole
     }
 
     /// Whether what comes out of a tick depends on the ticks before: the policy proposes every few ticks, a limit speaks of the tick before, or

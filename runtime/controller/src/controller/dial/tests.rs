@@ -137,7 +137,7 @@ fn what_was_learned_is_handed_on() {
     (0..500).for_each(|_| tick(&mut a, &state()));
     let mut memory = Vec::new();
     a.write_memory(&mut memory);
-    assert_eq!(memory.len(), a.memory_len());
+    assert_eq!(memory.len(), 1 + a.learned_len());
     b.set_memory(&memory);
     for _ in 0..500 {
         let q = state();
