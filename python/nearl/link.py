@@ -205,8 +205,8 @@ class Link:
         """Moves the limits of the running loop inside those it was started with, or back to them; without arguments, back.
 
         The arguments are those of ``Projector.move_limits``: ``speed``, ``velocity``, ``acceleration``, ``lower``, ``upper``, ``frame``,
-        ``frame_speed``, ``energy``, ``plane``, ``body``; and ``payload``, what the robot carries from then on: frame, mass [kg], centre of mass
-        in the frame's axes (3) [m] and inertia about it (``xx, xy, xz, yy, yz, zz``) [kg·m²]. They hold until others are asked for, whoever leaves.
+        ``frame_speed``, ``energy``, ``plane``, ``body``; and ``payload``, what the robot carries from then on, a tuple: frame, mass [kg], centre of
+        mass in the frame's axes (3) [m] and inertia about it (``xx, xy, xz, yy, yz, zz``) [kg·m²]. They hold until others are asked for, whoever leaves.
 
         Raises:
             ConnectionError: there is no loop, no answer came, or another operator moves its limits.
