@@ -75,6 +75,19 @@ fn columns_are_found_by_name() {
     assert!(error.starts_with("it has no column 'q.wing'; it has "), "{error}");
 }
 
+/// A file that was cut at any place is refused by its name, and nothing of it is read.
+#[test]
+fn a_file_cut_short_is_refused_by_name() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, _) = recorded(folder.path(), "Hopper-v5");
+    let whole = std::fs::read(&file).expect("file");
+    for length in (0..200).chain((1..40).map(|k| k * whole.len() / 40)).chain([whole.len() - 1]) {
+        std::fs::write(&file, &whole[..length]).expect("file");
+        let error = Demonstrations::load(&file).expect_err("refused").to_string();
+        assert!(error.contains("demos.npz") && error.contains("cut short"), "{length} bytes: {error}");
+    }
+}
+
 type Arrays = std::collections::BTreeMap<String, Array>;
 
 /// What somebody did to a file.

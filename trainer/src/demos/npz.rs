@@ -36,7 +36,7 @@ fn number(bytes: &[u8], at: usize, width: usize) -> Result<u64, String> {
 /// # Errors
 /// One sentence; nothing of a damaged file is returned.
 pub fn read(bytes: &[u8]) -> Result<BTreeMap<String, Array>, String> {
-    let last = bytes.len().checked_sub(22).ok_or("it is no zip archive")?;
+    let last = bytes.len().checked_sub(22).ok_or("it is no zip archive, or cut short")?;
     let found =
         (last.saturating_sub(65_535)..=last).rev().find(|&at| number(bytes, at, 4) == Ok(u64::from(END)));
     let end = found.ok_or("it is no zip archive, or cut short")?;
