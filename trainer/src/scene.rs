@@ -93,7 +93,8 @@ pub fn of(task: &Task, file: &Simulation) -> Result<SceneOptions, Mistake> {
         without_solids: !section.solids,
     };
     if scene.armature.is_some() && scene.drives.is_empty() {
-        let reason = "it is that of drives, and [command] interface = \"pd\" of a URDF gives none here; write it into the robot file";
+        let reason =
+            "it is that of drives, and [command] of a URDF gives none here; write it into the robot file";
         return Err(mistake("scene.armature", reason));
     }
     Ok(SceneOptions { scene, sim_dt: section.timestep })
@@ -124,7 +125,7 @@ fn check(section: &Section) -> Result<(), Mistake> {
     Ok(())
 }
 
-/// The drives of a URDF whose joints are commanded `pd`; an MJCF brings its own actuators.
+/// The drives of a URDF whose joints are commanded `pd`, or `position` with gains of a servo; an MJCF brings its own actuators.
 fn drives(task: &Task, file: &Simulation) -> Result<Vec<PdDrive>, Mistake> {
     if file.format != ModelFormat::Urdf || task.command.is_effort() {
         return Ok(Vec::new());
@@ -136,23 +137,29 @@ fn drives(task: &Task, file: &Simulation) -> Result<Vec<PdDrive>, Mistake> {
     let dof = |joint: &str| model.joint(joint).map(|joint| joint.idx_v);
     let driven: Vec<usize> = motors.iter().filter_map(|motor| dof(&motor.joint).ok()).collect();
     let commanded = task.command.drives(&model, &driven).map_err(|e| mistake("command", e))?;
-    let is_pd = |i: &usize| matches!(commanded[*i], Drive::Pd { .. });
-    if !driven.iter().any(is_pd) {
+    let mut gains = Vec::new();
+    for &i in &driven {
+        gains.push(match commanded[i] {
+            Drive::Pd { stiffness, damping } => Some((stiffness, damping)),
+            Drive::Position => task.command.gains(&model.dof_name(i)).map_err(|e| mistake("command", e))?,
+            _ => None,
+        });
+    }
+    if gains.iter().all(Option::is_none) {
         return Ok(Vec::new());
     }
-    if let Some(&other) = driven.iter().find(|i| !is_pd(i)) {
+    if let Some((&other, _)) = driven.iter().zip(&gains).find(|(_, gains)| gains.is_none()) {
         return Err(mistake(
             "command.interface",
             format!(
-                "joint '{}' is commanded {} where others have pd drives; a URDF has one interface for all its motors",
+                "joint '{}' is commanded {} without stiffness, where others have drives; a URDF has one interface for all its motors",
                 model.dof_name(other),
                 commanded[other].name()
             ),
         ));
     }
-    let drive = |(motor, &i): (&nearl_runtime::constraints::description::Motor, &usize)| {
-        let (Drive::Pd { stiffness, damping }, Some([_, effort])) = (commanded[i], motor.control_range)
-        else {
+    let drive = |(motor, gains): (&nearl_runtime::constraints::description::Motor, &Option<(f64, f64)>)| {
+        let (Some((stiffness, damping)), Some([_, effort])) = (*gains, motor.control_range) else {
             let reason = format!(
                 "joint '{}' states no effort, which bounds its drive; write it into <limit>",
                 motor.joint
@@ -162,5 +169,5 @@ fn drives(task: &Task, file: &Simulation) -> Result<Vec<PdDrive>, Mistake> {
         let (name, joint) = (motor.name.clone(), motor.joint.clone());
         Ok(PdDrive { name, joint, stiffness, damping, effort })
     };
-    motors.iter().zip(&driven).map(drive).collect()
+    motors.iter().zip(&gains).map(drive).collect()
 }

@@ -10,10 +10,10 @@ use std::collections::BTreeMap;
 pub struct CommandSection {
     /// What the joints are commanded; a joint that is not named has `effort`.
     pub interface: Interfaces,
-    /// K of `pd` joints [N·m/rad or N/m].
+    /// K of `pd` joints, and of the simulated servos of a URDF's `position` joints [N·m/rad or N/m].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stiffness: Option<PerJoint>,
-    /// D of `pd` joints [N·m s/rad or N s/m]; 0 when absent.
+    /// D of the same [N·m s/rad or N s/m]; 0 when absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub damping: Option<PerJoint>,
 }
@@ -82,9 +82,18 @@ impl CommandSection {
     }
 
     fn pd(&self, joint: &str) -> Result<Drive, String> {
-        let stiffness = number(self.stiffness.as_ref(), joint).ok_or_else(|| {
+        let (stiffness, damping) = self.gains(joint)?.ok_or_else(|| {
             format!("[command.stiffness]: joint '{joint}' has a pd drive and no stiffness; give it in N m/rad or N/m")
         })?;
+        Ok(Drive::Pd { stiffness, damping })
+    }
+
+    /// Stiffness [N·m/rad or N/m] and damping [N·m s/rad or N s/m] of a joint, where it has a stiffness.
+    ///
+    /// # Errors
+    /// One sentence: a value out of its domain.
+    pub fn gains(&self, joint: &str) -> Result<Option<(f64, f64)>, String> {
+        let Some(stiffness) = number(self.stiffness.as_ref(), joint) else { return Ok(None) };
         let damping = number(self.damping.as_ref(), joint).unwrap_or(0.0);
         if !(stiffness.is_finite() && stiffness > 0.0) {
             return Err(format!(
@@ -96,7 +105,7 @@ impl CommandSection {
                 "[command.damping]: {damping} of joint '{joint}' is no damping; give a number of at least 0"
             ));
         }
-        Ok(Drive::Pd { stiffness, damping })
+        Ok(Some((stiffness, damping)))
     }
 
     fn check_names(&self, model: &Model, controllable: &[usize]) -> Result<(), String> {

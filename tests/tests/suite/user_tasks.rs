@@ -421,10 +421,8 @@ fn a_velocity_prior_holds_in_every_target() {
     assert_eq!(e.costs.len(), 2);
 }
 
-/// A URDF robot with a task of its own: MuJoCo compiles it, motors and limits are the file's.
-#[test]
-fn a_urdf_robot_has_a_task_of_its_own() {
-    let folder = tempfile::tempdir().expect("folder");
+/// The task file of an arm whose robot is a URDF, with another section.
+fn urdf_arm(folder: &Path, section: &str) -> String {
     let link = |name: &str, z: f64| {
         format!(
             r#"<link name="{name}"><inertial><origin xyz="0 0 {z}"/><mass value="1"/><inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/>
@@ -446,16 +444,23 @@ fn a_urdf_robot_has_a_task_of_its_own() {
         joint("z_shoulder", "revolute", ["base", "upper"], r#"lower="-2" upper="2""#),
         joint("a_elbow", "continuous", ["upper", "lower"], ""),
     );
-    std::fs::write(folder.path().join("arm.urdf"), &text).expect("robot");
+    std::fs::write(folder.join("arm.urdf"), &text).expect("robot");
     let task = std::fs::read_to_string(fixture("two_link.toml")).expect("task");
     let task = task
         .replace("mjcf = \"two_link.xml\"", "urdf = \"arm.urdf\"")
         .replace("-v.elbow^2", "-v.a_elbow^2")
         .replace("dt = 0.01\nsim_dt = 0.01", "dt = 0.002\nsim_dt = 0.002")
         .replace("[state]\n", "[state]\ncontrollable = [\"z_shoulder\", \"a_elbow\"]\n");
-    let file = folder.path().join("arm.toml");
-    std::fs::write(&file, &task).expect("task");
-    let snapshot = random_policy(&file.display().to_string(), 3, 3.0);
+    let file = folder.join("arm.toml");
+    std::fs::write(&file, task + section).expect("task");
+    file.display().to_string()
+}
+
+/// A URDF robot with a task of its own: MuJoCo compiles it, motors and limits are the file's.
+#[test]
+fn a_urdf_robot_has_a_task_of_its_own() {
+    let folder = tempfile::tempdir().expect("folder");
+    let snapshot = random_policy(&urdf_arm(folder.path(), ""), 3, 3.0);
     let robot = &snapshot.manifest.robot;
     assert_eq!(robot.motors.iter().map(|m| m.joint.as_str()).collect::<Vec<_>>(), ["z_shoulder", "a_elbow"]);
     let (mut env, mut controller) =
@@ -476,6 +481,40 @@ fn a_urdf_robot_has_a_task_of_its_own() {
     assert!(
         (3.9..4.0 + 1e-9).contains(&fastest),
         "{fastest} rad/s of 4: the limit was not reached, or broken"
+    );
+}
+
+/// A URDF's joints that are sent positions are servos with the gains of the section, which follow what is projected; without gains nothing could
+/// be simulated.
+#[test]
+fn servos_of_a_urdf_follow_positions() {
+    let folder = tempfile::tempdir().expect("folder");
+    let servo = "\n[command]\ninterface = \"position\"\nstiffness = { z_shoulder = 4e4, a_elbow = 4e3 }\n\
+                 damping = { z_shoulder = 80.0, a_elbow = 8.0 }\n";
+    let snapshot = random_policy(&urdf_arm(folder.path(), servo), 3, 3.0);
+    let (mut env, mut controller) =
+        (make_env(&snapshot).expect("environment"), Controller::new(&snapshot).expect("controller"));
+    let (mut state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
+    env.reset(&mut stream(5, 0)).expect("reset");
+    let (mut missed, mut least, mut most) = (0.0f64, 0.0f64, 0.0f64);
+    for _ in 0..5000 {
+        env.observe(&mut state.obs);
+        env.state(&mut state.q, &mut state.v);
+        assert!(controller.update(&state, &noise, &mut out).is_ok());
+        assert_eq!(out.action, out.next.q, "what is sent is the projected position");
+        env.step(&out.action);
+        missed = env.qpos().iter().zip(&out.next.q).map(|(q, t)| (q - t).abs()).fold(missed, f64::max);
+        (least, most) = (least.min(env.qpos()[0]), most.max(env.qpos()[0]));
+    }
+    println!("missed {missed} rad, from {least} to {most} rad");
+    assert!(missed < 0.1 && most - least > 0.3, "missed {missed} rad, from {least} to {most} rad");
+    let bare = urdf_arm(folder.path(), "\n[command]\ninterface = \"position\"\n");
+    let mut manifest = tasks::load(&bare, &[]).expect("task");
+    complete(&mut manifest).expect("environment");
+    let refused = env::of_task(&manifest, &bare).err().expect("no servo").to_string();
+    assert!(
+        refused.contains("'z_shoulder' is sent 'position' commands") && refused.contains("stiffness"),
+        "{refused}"
     );
 }
 

@@ -59,7 +59,8 @@ pub(super) fn check(manifest: &Manifest, env: &dyn Env, origin: &str) -> Result<
                 match drive {
                     Drive::Velocity => "an MJCF with <velocity kv=\"D\"> actuators",
                     Drive::Pd { .. } => "an MJCF with <position kp=\"K\" kv=\"D\"> actuators",
-                    _ => "an MJCF with <position kp=\"K\"> actuators, or interface = \"pd\"",
+                    _ =>
+                        "an MJCF with <position kp=\"K\"> actuators, or a URDF and the servos' stiffness and damping in [command]",
                 }
             ),
         };
