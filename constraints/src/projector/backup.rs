@@ -91,6 +91,10 @@ pub(crate) struct Backup {
     trial: Vec<f64>,
     /// The planned motion of each dof of hard jerk (nv).
     stops: Vec<Option<Stop>>,
+    /// Full ticks of the planned brake of each other dof, and the speed left after them (nv).
+    full: Vec<(f64, f64)>,
+    /// The largest deceleration of each dof (nv).
+    most: Vec<f64>,
     now: State,
     next: State,
     way: Vec<f64>,
@@ -139,6 +143,8 @@ impl Backup {
             of_state: checker.hard_kinds().iter().map(of_state).collect(),
             trial: zero(),
             stops: vec![None; model.nv()],
+            full: vec![(0.0, 0.0); model.nv()],
+            most: zero(),
             now: state(),
             next: state(),
             way: zero(),
@@ -210,7 +216,8 @@ impl Backup {
             let brake = Brake::new(&dof, self.trial[i], with.period);
             self.stops[i] = dof.jerk.is_finite().then(|| brake.stop(v[i], before[i]));
         }
-        self.find_cuts(with, v);
+        self.count(with, v);
+        self.find_cuts(with);
         let mut first = 0;
         for k in 0..=self.cuts.len() {
             let last = match self.cuts.get(k) {
@@ -296,15 +303,15 @@ impl Backup {
     /// Decelerations of a brake from the state after a tick at acceleration `a`; false when some joint cannot stand before its limit.
     fn plan(&mut self, with: &With<'_>, (q, v): (&[f64], &[f64]), a: &[f64], plan: Plan) -> bool {
         let dt = with.period.dt;
-        let most = |i: usize| {
-            let dof = Dof::of(with.limits, i);
-            if dof.jerk.is_finite() { Brake::most(&dof) } else { dof.braking(with.period) }
-        };
-        let quickest = with.dofs.controllable.iter().map(|&i| v[i].abs() / (most(i) * dt));
-        let quickest = quickest.fold(0.0, f64::max);
+        let mut quickest: f64 = 0.0;
         for &i in &with.dofs.controllable {
             let dof = Dof::of(with.limits, i);
-            let (most, speed) = (most(i), v[i].abs());
+            self.most[i] = if dof.jerk.is_finite() { Brake::most(&dof) } else { dof.braking(with.period) };
+            quickest = quickest.max(v[i].abs() / (self.most[i] * dt));
+        }
+        for &i in &with.dofs.controllable {
+            let dof = Dof::of(with.limits, i);
+            let (most, speed) = (self.most[i], v[i].abs());
             self.stops[i] = None;
             if dof.jerk.is_finite() {
                 let wanted = match plan {
@@ -342,20 +349,23 @@ impl Backup {
                 }
             };
         }
+        self.count(with, v);
         true
     }
 
-    /// Full ticks of the planned brake of dof `i`, and the speed left after them.
-    fn full(&self, i: usize, v: f64, dt: f64) -> (f64, f64) {
-        let step = self.trial[i] * dt;
-        let ticks = (v.abs() / step + 1e-9).floor();
-        let left = v.abs() - ticks * step;
-        (ticks, if left > 1e-9 * step { left } else { 0.0 })
+    /// Counts the full ticks of the planned brake of each dof, once for all that is looked at of it.
+    fn count(&mut self, with: &With<'_>, v: &[f64]) {
+        for &i in &with.dofs.controllable {
+            let step = self.trial[i] * with.period.dt;
+            let ticks = (v[i].abs() / step + 1e-9).floor();
+            let left = v[i].abs() - ticks * step;
+            self.full[i] = (ticks, if left > 1e-9 * step { left } else { 0.0 });
+        }
     }
 
     /// Every hard row and cone holds in every tick of the planned brake.
     fn within_reach(&mut self, with: &With<'_>, q: &[f64], v: &[f64]) -> bool {
-        self.find_cuts(with, v);
+        self.find_cuts(with);
         let mut first = 0;
         for k in 0..self.cuts.len() {
             let end = self.cuts[k];
@@ -368,14 +378,14 @@ impl Backup {
     }
 
     /// Finds the ticks at which some acceleration of the planned brake changes.
-    fn find_cuts(&mut self, with: &With<'_>, v: &[f64]) {
+    fn find_cuts(&mut self, with: &With<'_>) {
         self.cuts.clear();
         for &i in &with.dofs.controllable {
             if let Some(stop) = &self.stops[i] {
                 self.cuts.extend(stop.cuts().map(|tick| tick.min(1e6) as u32));
                 continue;
             }
-            let (full, left) = self.full(i, v[i], with.period.dt);
+            let (full, left) = self.full[i];
             let full = full.min(1e6) as u32;
             self.cuts.push(full);
             if left > 0.0 {
@@ -490,7 +500,7 @@ impl Backup {
                 continue;
             }
             let (b, speed) = (self.trial[i], v[i].abs());
-            let (full, rest) = self.full(i, v[i], dt);
+            let (full, rest) = self.full[i];
             let ticks = f64::from(k).min(full);
             let mut left = if ticks == full { rest } else { speed - ticks * b * dt };
             let mut way = ticks * dt * speed - b * dt * dt * (0.5 * ticks * (ticks - 1.0) + kappa * ticks);
