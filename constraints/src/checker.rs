@@ -244,7 +244,19 @@ impl Checker {
         external: &[f64],
         out: &mut [f64],
     ) {
-        let mut motion = self.reckoned.motion(now, next, external, None);
+        self.breaches_with(now, next, external, None, out);
+    }
+
+    /// The same with the motor forces of the motion (nv), where another checker of the same limits has found them already.
+    pub(crate) fn breaches_with(
+        &mut self,
+        now: (&[f64], &[f64]),
+        next: (&[f64], &[f64]),
+        external: &[f64],
+        torque: Option<&[f64]>,
+        out: &mut [f64],
+    ) {
+        let mut motion = self.reckoned.motion(now, next, external, (None, torque));
         out.fill(f64::NEG_INFINITY);
         let mut first = 0;
         for block in self.rows.iter_mut().filter(|r| r.hard) {
@@ -335,7 +347,7 @@ impl Checker {
         external: &[f64],
         out: &mut [f64],
     ) {
-        let mut motion = self.reckoned.motion(now, next, external, None);
+        let mut motion = self.reckoned.motion(now, next, external, (None, None));
         for (out, block) in out.iter_mut().zip(&mut self.cones) {
             *out = match block.hard && block.enabled {
                 true => 1.0 + block.cone.excess(&mut motion).max(block.cone.breach(&mut motion)),
@@ -369,7 +381,7 @@ impl Checker {
         let mut verdict = Verdict::default();
         self.boxes(&mut verdict, now, next, previous);
         let kept = meant == Meant::Kept;
-        let mut motion = self.reckoned.motion(now, next, external, previous.filter(|_| !kept));
+        let mut motion = self.reckoned.motion(now, next, external, (previous.filter(|_| !kept), None));
         let mut allowed = self.allowed.iter();
         for block in self.rows.iter_mut().filter(|r| r.hard) {
             let (excess, allowed) = (&mut self.excess[..block.count], allowed.by_ref().take(block.count));
@@ -446,19 +458,21 @@ impl Checker {
 
 impl Reckoned {
     /// The motion from `now` to `next`, configurations (nq) and velocities (nv), with its acceleration, motor forces and frames, as far as a row or a cone
-    /// needs them.
+    /// needs them; `torque` where its motor forces are known.
     fn motion<'m>(
         &'m mut self,
         now: (&'m [f64], &'m [f64]),
         next: (&'m [f64], &'m [f64]),
         external: &[f64],
-        previous: Option<Previous<'m>>,
+        (previous, torque): (Option<Previous<'m>>, Option<&[f64]>),
     ) -> Motion<'m> {
         let ((q, v), (q_next, v_next)) = (now, next);
         for i in 0..v.len() {
             self.a[i] = (v_next[i] - v[i]) / self.period.dt;
         }
-        if self.needs.motors {
+        if let Some(torque) = torque {
+            self.tau.copy_from_slice(torque);
+        } else if self.needs.motors {
             self.dynamics.motors_without_friction(&self.period, q, v, &self.a, &mut self.tau);
             self.tau.iter_mut().zip(external).for_each(|(tau, external)| *tau -= external);
         }

@@ -263,11 +263,17 @@ impl Backup {
         more
     }
 
-    /// The motion breaks no hard row or cone.
-    pub(crate) fn allows(&mut self, with: &With<'_>, from: (&[f64], &[f64]), to: (&[f64], &[f64])) -> bool {
+    /// The motion breaks no hard row or cone. `torque`: what a checker of the same limits has found its motor forces to be, if one has.
+    pub(crate) fn allows(
+        &mut self,
+        with: &With<'_>,
+        from: (&[f64], &[f64]),
+        to: (&[f64], &[f64]),
+        torque: Option<&[f64]>,
+    ) -> bool {
         let rows = self.allowed.len();
         let breach = &mut self.breach[..rows];
-        self.checker.breaches(from, to, with.external, breach);
+        self.checker.breaches_with(from, to, with.external, torque, breach);
         breach.iter().zip(&self.allowed).all(holds)
     }
 

@@ -28,7 +28,8 @@ macro_rules! with {
 
 impl Projector {
     /// Takes the target if it breaks nothing and a brake from it is verified; else the nearest for which that is so as far as its rows
-    /// are linear; else the furthest such state on the way from one tick of the stored brake to the target; else that tick.
+    /// are linear; else the furthest such state on the way from one tick of the stored brake to the target; else that tick. `checked`: the
+    /// checker looked at the passage to the target last.
     pub(super) fn keep_a_brake(
         &mut self,
         q: &[f64],
@@ -36,15 +37,16 @@ impl Projector {
         proposal: &Proposal,
         target: &mut Target,
         status: Status,
+        checked: bool,
     ) -> Status {
         self.backup.begin();
-        if self.leads_to_a_brake(q, v, target) {
+        if self.leads_to_a_brake(q, v, target, checked) {
             return self.taken(q, v, target, status);
         }
         // On the way to moved limits, what the brake in force breaks is all that may be broken.
         let on_the_way = self.moving.coupled && self.backup.stored;
         let outside = !on_the_way && self.backup.excuse(&with!(self), q, v);
-        if outside && self.leads_to_a_brake(q, v, target) {
+        if outside && self.leads_to_a_brake(q, v, target, checked) {
             return self.taken(q, v, target, status);
         }
         if !self.backup.stored && !self.backup.verify(&with!(self), (q, v), &self.before) {
@@ -77,7 +79,7 @@ impl Projector {
         }
         self.write(q, v, Some(proposal), target);
         target.ledger.rung = Rung::StoredBrake;
-        self.keep_a_brake(q, v, proposal, target, Status::Slowed)
+        self.keep_a_brake(q, v, proposal, target, Status::Slowed, false)
     }
 
     /// A target that is not the nearest allowed state is checked for what its limits keep.
@@ -91,10 +93,12 @@ impl Projector {
         status
     }
 
-    /// The passage to the target breaks no hard row or cone, and a brake from it is verified, which is then stored.
-    fn leads_to_a_brake(&mut self, q: &[f64], v: &[f64], target: &Target) -> bool {
+    /// The passage to the target breaks no hard row or cone, and a brake from it is verified, which is then stored. `checked`: the checker
+    /// looked at this passage last, so that its motor forces are known.
+    fn leads_to_a_brake(&mut self, q: &[f64], v: &[f64], target: &Target, checked: bool) -> bool {
         let with = with!(self);
-        self.backup.allows(&with, (q, v), (&target.q, &target.v))
+        let torque = checked.then(|| self.checker.torque());
+        self.backup.allows(&with, (q, v), (&target.q, &target.v), torque)
             && self.backup.verify(&with, (&target.q, &target.v), &target.acceleration)
     }
 
@@ -114,7 +118,7 @@ impl Projector {
             }
             self.write(q, v, Some(proposal), target);
             self.v_wanted.copy_from_slice(&target.v);
-            if self.leads_to_a_brake(q, v, target) {
+            if self.leads_to_a_brake(q, v, target, false) {
                 return true;
             }
         }
@@ -182,7 +186,7 @@ impl Projector {
             let share = if k == 0 { NEARLY } else { 0.5 * (good + bad) };
             self.blend(share);
             self.write(q, v, Some(proposal), target);
-            let leads = self.leads_to_a_brake(q, v, target);
+            let leads = self.leads_to_a_brake(q, v, target, false);
             *(if leads { &mut good } else { &mut bad }) = share;
             if leads && k == 0 {
                 break;

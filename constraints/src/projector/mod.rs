@@ -328,7 +328,7 @@ impl Projector {
         let status = if outside.is_empty() { status } else { self.named(v, outside) };
         match self.settings.braking {
             _ if !accepted => self.brake(q, v, Some(proposal), target, BrakeReason::NoCertifiedAnswer),
-            Braking::Stored => self.keep_a_brake(q, v, proposal, target, status),
+            Braking::Stored => self.keep_a_brake(q, v, proposal, target, status, true),
             _ => status,
         }
     }

@@ -30,7 +30,7 @@ impl Backup {
     /// Why the target of `passage` is refused: the passage itself or a tick of the brake that is tried first; `None` where that shows nothing
     /// wrong. The breaches of the rows there are [`Backup::found`].
     pub(crate) fn refusal(&mut self, with: &With<'_>, passage: Passage<'_>) -> Option<Refusal> {
-        if !self.allows(with, passage.from, passage.to) {
+        if !self.allows(with, passage.from, passage.to, None) {
             self.keep_found();
             return Some(Refusal::Passage);
         }
@@ -84,7 +84,7 @@ impl Backup {
         near.a[i] += probe / dt;
         let known = match refusal {
             Refusal::Passage => {
-                self.allows(with, passage.from, (&near.q, &near.v));
+                self.allows(with, passage.from, (&near.q, &near.v), None);
                 true
             }
             Refusal::Brake(tick) => {
