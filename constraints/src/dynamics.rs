@@ -14,6 +14,8 @@ pub struct Dynamics {
     model: Model,
     scratch: RawData,
     lengths: (usize, usize),
+    /// Some joint has a spring.
+    sprung: bool,
     middle: Middle,
 }
 
@@ -42,7 +44,8 @@ impl Dynamics {
             behind: zero(),
             by_velocity: vec![0.0; lengths.1 * lengths.1],
         };
-        Dynamics { scratch: RawData::new(model.raw()), model: model.clone(), lengths, middle }
+        let sprung = model.stiffness().iter().any(|k| *k != 0.0);
+        Dynamics { scratch: RawData::new(model.raw()), model: model.clone(), lengths, sprung, middle }
     }
 
     /// Inverse dynamics `tau = M a + nle`, without the passive forces: a motor supplies `tau - passive`.
@@ -108,6 +111,12 @@ impl Dynamics {
     fn passive_after(&self, time: f64, q: &[f64], v: &[f64], passive: &mut [f64]) {
         self.check(q, &[v, passive]);
         let m = &self.model;
+        if !self.sprung {
+            // As below with `spring = 0`, without a walk over the joints.
+            let of = |(damping, v): (&f64, &f64)| -0.0 - damping * v;
+            passive.iter_mut().zip(m.damping().iter().zip(v).map(of)).for_each(|(p, x)| *p = x);
+            return;
+        }
         for joint in m.joints() {
             for i in joint.idx_v..joint.idx_v + joint.nv {
                 let k = m.stiffness()[i];
