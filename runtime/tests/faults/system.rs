@@ -36,6 +36,7 @@ fn child() {
             run_loop(link, robot, spring(1, &drops), build, &toy::settings(), &stop).unwrap();
         }
         Ok("memory") => memory(&name),
+        Ok("filled") => filled(&name),
         Ok("full-disk") => full_disk(&name),
         Ok("start") => {
             let _plant = PlantLink::open(&name, &toy::robot(true)).unwrap();
@@ -69,6 +70,25 @@ fn memory(name: &RobotName) {
         Ok(mut trainer) => say("push", trainer.push(2, &vec![7; 64 << 20])),
         Err(error) => say("trainer", Err(error)),
     }
+}
+
+/// Both ends are open when the memory fills up: what they write from then on was reserved, or the first new page would end the process.
+fn filled(name: &RobotName) {
+    let plant = PlantLink::open(name, &toy::robot(true)).unwrap();
+    let stop = Stop::new();
+    let running = std::thread::spawn({
+        let stop = stop.clone();
+        move || PlantRunner::new(plant, PlantSettings::lockstep(DT)).unwrap().run(&mut body(), &stop)
+    });
+    let (link, robot) = connect(name, 20.0).unwrap();
+    let mut rest = std::fs::File::create("/dev/shm/rest").unwrap();
+    while rest.write_all(&[7; 4096]).is_ok() {}
+    let (drops, _dropped) = std::sync::mpsc::channel();
+    let settings = RunSettings { ticks: Some(3000), ..toy::settings() };
+    let report = run_loop(link, robot, spring(1, &drops), SpringBuilder(drops), &settings, &Stop::new());
+    stop.request();
+    running.join().unwrap();
+    println!("said filled {}", report.unwrap().modes["active"]);
 }
 
 /// The disk has room for 60 kB of log: the limit on the size of files stands in for it.
@@ -292,12 +312,16 @@ fn fault_18_what_a_consumer_never_reads_takes_no_more_memory() {
 
 /// What the ends of the links say in a private `/dev/shm`, which needs user namespaces.
 fn with_memory(options: &str, name: &Name) -> Option<Vec<String>> {
+    in_memory("memory", options, name)
+}
+
+fn in_memory(role: &str, options: &str, name: &Name) -> Option<Vec<String>> {
     let script = format!("mount -t tmpfs -o {options} tmpfs /dev/shm || exit 77; exec \"$0\" \"$@\"");
-    let inner = command("memory", name);
+    let inner = command(role, name);
     let run = |namespace: &str| {
         let mut outer = Command::new("unshare");
         outer.args([namespace, "sh", "-c", &script]).arg(inner.get_program()).args(inner.get_args());
-        outer.env(ROLE, "memory").env(NAME, name.0.as_str()).output().ok()
+        outer.env(ROLE, role).env(NAME, name.0.as_str()).output().ok()
     };
     let is_made = |output: &std::process::Output| output.status.code() != Some(1);
     let output = run("-rm").filter(is_made).or_else(|| run("-m"))?;
@@ -324,6 +348,8 @@ fn fault_20_shared_memory_that_is_tiny_or_read_only_is_refused_before_any_motion
     let all = |code: &str| ["plant", "runtime", "trainer"].map(|role| format!("{role} {code}"));
     assert_eq!(with_memory("size=1M", &name).unwrap(), all("link-memory"));
     assert_eq!(with_memory("size=64M,ro", &name).unwrap(), all("link-memory-missing"));
+    let filled = in_memory("filled", "size=64M", &name).expect("memory that fills up later ends nobody");
+    assert_eq!(filled, ["filled 3000"]);
 }
 
 #[test]
