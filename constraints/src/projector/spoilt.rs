@@ -66,3 +66,42 @@ fn fault_07_a_nan_in_p_brakes_in_its_tick_and_the_next_is_as_if_new() {
         assert!(brakes > 20, "{solver:?}: {brakes} ticks met the NaN");
     }
 }
+
+/// The rows are reckoned with a robot whose links weigh nearly nothing: what they let through is beyond the motors of the true one, which the
+/// checker knows.
+#[test]
+fn fault_36_what_rows_of_a_wrong_robot_let_through_the_checker_rejects() {
+    let model = Model::from_urdf_text(PANDA).unwrap();
+    let mut light = model.description().clone();
+    for body in &mut light.bodies {
+        (body.mass, body.inertia) = (1e-2 * body.mass, body.inertia.map(|x| 1e-2 * x));
+    }
+    let light = Model::from_description(light).unwrap();
+    let limits: Vec<Box<dyn Limit>> = vec![
+        Box::new(PositionLimit::default()),
+        Box::new(VelocityLimit::default()),
+        Box::new(AccelerationLimit::uniform(10.0)),
+        Box::new(TorqueLimit::scaled(0.5)),
+    ];
+    let dofs: Vec<usize> = (0..7).collect();
+    let settings = Settings { braking: Braking::Certified, ..Settings::new(0.001, 1) };
+    let projector = || Projector::new(&model, &limits, &dofs, settings.clone()).unwrap();
+    let (mut sound, mut wrong) = (projector(), projector());
+    wrong.dynamics = Dynamics::new(&light);
+    let q = vec![0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8];
+    let (v, mut random) = (vec![0.0; 7], Random(11));
+    let mut target = Target::new(&model);
+    let mut rejected = 0;
+    for tick in 0..TICKS {
+        let wish = (0..7).map(|_| 5.0 * random.between(-1.0, 1.0)).collect();
+        let proposal = Proposal { q: q.clone(), v: wish };
+        let status = sound.project(&q, &v, &proposal, &mut target);
+        assert!(status.is_ok() && target.ledger.target_violations.total() == 0, "tick {tick}: {status:?}");
+        let status = wrong.project(&q, &v, &proposal, &mut target);
+        rejected += u32::from(status == Status::Braked(BrakeReason::NoCertifiedAnswer));
+        assert!(!status.is_ok() || target.ledger.target_violations.total() == 0, "tick {tick}: {status:?}");
+        // From rest the brake stays at rest, which the motors can hold.
+        assert_eq!(target.ledger.target_violations.total(), 0, "tick {tick}: {status:?}");
+    }
+    assert!(rejected > 20, "{rejected} targets of the wrong rows were rejected");
+}

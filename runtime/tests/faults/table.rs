@@ -293,7 +293,10 @@ pub const ROWS: &[Row] = &[
         "torque beyond the motors: speed, payload, singular inertia",
         "brakes; what is sent is within the motors' range",
         &["braked-no-certified-answer"],
-        &[(SOLVER, "fault_36_a_wrong_payload_and_a_singular_inertia_brake")],
+        &[
+            (SOLVER, "fault_36_a_wrong_payload_and_a_singular_inertia_brake"),
+            (SPOILT, "fault_36_what_rows_of_a_wrong_robot_let_through_the_checker_rejects"),
+        ],
     ),
     (
         37,
