@@ -173,6 +173,22 @@ fn lie<M: Queued>(node: &Node<Ipc>, name: &RobotName) {
     }
 }
 
+/// Whether the trainer's end reads any of a few transitions with this schema that are right otherwise.
+fn hears(node: &Node<Ipc>, name: &RobotName, viewer: &mut TrainerLink, schema: u64) -> bool {
+    let topic = ServiceName::new(&format!("nearl/{name}/{}", TransitionMessage::TOPIC)).unwrap();
+    let service = node.service_builder(&topic).publish_subscribe::<TransitionMessage>().open().unwrap();
+    let port = service.publisher_builder().create().unwrap();
+    let epoch = schema | 1 << 63;
+    let mut heard = false;
+    for seq in 1..=20 {
+        let mut message = TransitionMessage::zeroed();
+        *message.header_mut() = Header { schema, epoch, seq, stamp: 0 };
+        port.loan_uninit().unwrap().write_payload(message).send().unwrap();
+        heard |= std::iter::from_fn(|| viewer.transition()).any(|t| t.header.epoch == epoch);
+    }
+    heard
+}
+
 /// A peer on every topic at once, beside those who belong there.
 #[test]
 fn fault_33_lies_on_every_topic_end_nothing_and_move_nothing() {
@@ -201,6 +217,14 @@ fn fault_33_lies_on_every_topic_end_nothing_and_move_nothing() {
         }
         let _ = ticks.rows().map(|rows| (rows.row_kinds(), rows.row_names(), rows.task_name()));
     }
+    assert!(
+        !hears(&node, &name.0, &mut viewer, TransitionMessage::SCHEMA ^ 1),
+        "another build's message was read"
+    );
+    assert!(
+        hears(&node, &name.0, &mut viewer, TransitionMessage::SCHEMA),
+        "the same with the right schema is"
+    );
     // The true words are heard after all that.
     let version = 1 << 40;
     viewer.push(version, &snapshot(version, |_| {}).to_bytes()).unwrap();
