@@ -365,6 +365,9 @@ fn kill_starts(killer: &Killer, test: &str, stride: usize, survivors: &[bool]) -
         }
     }
     println!("{points} points, the slowest start after one took {slowest:?}, one after none {usual:?}");
+    // What is half made is left alone for a second and looked at in pauses of a tenth: two seconds, and more on a machine with other work.
+    let most = Duration::from_secs(2) + 10 * usual;
+    assert!(slowest < most, "a start after a kill took {slowest:?}, {most:?} is the most");
     points
 }
 
