@@ -4,8 +4,8 @@
     python results/doors/sb3.py learner ppo|sac PLACE STEPS SEED     # a line of sb3_learners.csv
     python results/doors/sb3.py table > results/doors/sb3_learners.md
 
-A PLACE is `pendulum`, `cheetah`, either with `-guard` behind it, or `arm`. `sb3.sh` runs learners and table. Needs
-`pip install stable-baselines3==2.9.2 "gymnasium[mujoco]==1.4.0"` beside nearl.
+A PLACE is `pendulum`, `cheetah` or `torque` (of the Panda), each also with `-guard`; `arm` (proposed states, projected) or `arm-raw` (accelerations through
+inverse dynamics, without limits). `sb3.sh` runs learners and table. Needs `pip install stable-baselines3==2.9.2 "gymnasium[mujoco]==1.4.0"` beside nearl.
 """
 
 import csv
@@ -86,8 +86,8 @@ def policies(steps: int) -> None:
 
 # Of the places below: the environment and its limits. Random actions leave the pendulum's in a quarter of the ticks.
 LIMITED = {
-    "cheetah": (TASK, guarded.LIMITS),
     "pendulum": ("InvertedPendulum-v5", {"position": {}, "velocity": {"limit": {"slider": 1.0, "hinge": 2.0}}}),
+    "cheetah": (TASK, guarded.LIMITS),
 }
 
 
@@ -113,31 +113,70 @@ class Count(gymnasium.Wrapper):
         return result
 
 
-class CountArm(gymnasium.Wrapper):
-    """Control ticks of the projected arm whose raw proposal and whose target broke a limit, and states outside, by the URDF's numbers and the task's shares."""
+PANDA = nearl.Model.from_urdf(EXAMPLES.parent / "robots/panda/panda.urdf")
+TICKS, FASTEST = 20, 10.0  # of a policy period; the task's limit on accelerations [rad/s²]
 
-    def __init__(self, env: gymnasium.Env):
+
+class Held(gymnasium.Wrapper):
+    """The arm without limits: an action in [-1, 1] holds for a policy period, as torques or as accelerations of up to the task's limit."""
+
+    def __init__(self, accelerations: bool):
+        super().__init__(gymnasium.make("nearl/Panda-reach"))
+        self.accelerations, self.most = accelerations, self.env.action_space.high
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, self.most.shape, np.float64)
+
+    def reset(self, **arguments):
+        self.obs, info = self.env.reset(**arguments)
+        return self.obs, info
+
+    def step(self, action):
+        total, action = 0.0, np.asarray(action, float)
+        for _ in range(TICKS):
+            torque = PANDA.rnea(self.obs[:7], self.obs[7:14], FASTEST * action) if self.accelerations else self.most * action
+            self.obs, reward, *over, info = self.env.step(np.clip(torque, -self.most, self.most).astype(np.float32))
+            total += float(reward)
+            if any(over):
+                break
+        return self.obs, total, *over, info
+
+
+class CountArm(gymnasium.Wrapper):
+    """Policy periods of the arm that end outside the task's positions or speeds; of its control ticks, those whose proposal and whose target broke a limit."""
+
+    def __init__(self, env: gymnasium.Env, projects: bool):
         super().__init__(env)
-        self.steps = self.raw = self.outside = 0
-        model = nearl.Model.from_urdf(EXAMPLES.parent / "robots/panda/panda.urdf")
-        self.low, self.high = np.array(model.lower_position_limit) + 0.01, np.array(model.upper_position_limit) - 0.01
-        self.speed = 0.9 * np.array(model.velocity_limit)
+        self.steps = self.outside = 0
+        self.raw = self.targets = 0 if projects else ""
+        self.low, self.high = np.array(PANDA.lower_position_limit) + 0.01, np.array(PANDA.upper_position_limit) - 0.01
+        self.speed = 0.9 * np.array(PANDA.velocity_limit)
 
     def step(self, action):
         obs, *rest, info = self.env.step(action)
         q, v = obs[:7], obs[7:14]
         beyond = (q < self.low - 1e-6) | (q > self.high + 1e-6) | (np.abs(v) > self.speed + 1e-6)
-        self.steps, self.raw = self.steps + 1, self.raw + int(info["raw_violations"])
-        self.outside += int(info["target_violations"]) + bool(beyond.any())
+        self.steps, self.outside = self.steps + 1, self.outside + bool(beyond.any())
+        if self.raw != "":
+            self.raw, self.targets = self.raw + int(info["raw_violations"]), self.targets + int(info["target_violations"])
         return obs, *rest, info
+
+
+ARMS = {
+    "arm": ("states, projected", lambda: guarded.make("arm")),
+    "arm-raw": ("accelerations", lambda: Held(accelerations=True)),
+    "torque": ("torques", lambda: Held(accelerations=False)),
+    "torque-guard": (
+        "torques, guarded",
+        lambda: gymnasium.wrappers.RescaleAction(gymnasium.make("nearl/Panda-reach", constraints="task", actions="guarded"), -1.0, 1.0),
+    ),
+}
 
 
 def learner(name: str, place: str, steps: int, seed: int) -> None:
     """A line of sb3_learners.csv: one learner, one place, one seed."""
 
     def make() -> gymnasium.Env:
-        if place == "arm":
-            return CountArm(guarded.make("arm"))
+        if place in ARMS:
+            return CountArm(ARMS[place][1](), projects=place in ("arm", "torque-guard"))
         task, limits = LIMITED[place.removesuffix("-guard")]
         env = gymnasium.make(task)
         return Count(nearl.Guard(env, limits) if place.endswith("-guard") else env, limits)
@@ -153,22 +192,29 @@ def learner(name: str, place: str, steps: int, seed: int) -> None:
     seconds = time.perf_counter() - start
     probe = make()
     after = np.mean(returns(probe, act, EPISODES))
-    asked = getattr(env, "raw", "")
-    print(f"{name},{place},{steps},{seed},{env.outside},{env.steps},{asked},{probe.outside},{probe.steps},{before:.1f},{after:.1f},{seconds:.0f}", flush=True)
+    asked, targets = getattr(env, "raw", ""), getattr(env, "targets", "")
+    seen = [env.outside, env.steps, asked, probe.outside, probe.steps, f"{before:.1f}", f"{after:.1f}", f"{seconds:.0f}", targets]
+    print(name, place, steps, seed, *seen, sep=",", flush=True)
 
 
 def table() -> None:
-    """sb3_learners.csv as a table: each figure of every seed."""
+    """sb3_learners.csv as a table: shares of all seeds together, returns of their mean, of the worst and of the best."""
     rows = list(csv.DictReader((Path(__file__).parent / "sb3_learners.csv").open()))
-    print("| learner | environment | steps | ticks outside while learning [%] | outside without noise [%] | return before | return after |")
-    print("|---|---|---|---|---|---|---|")
-    for key in dict.fromkeys((row["learner"], row["place"], row["steps"]) for row in rows):
-        of = sorted((row for row in rows if (row["learner"], row["place"], row["steps"]) == key), key=lambda row: int(row["seed"]))
-        bare = key[1].removesuffix("-guard")
-        where = 'Panda-reach, `constraints="task"`' if bare == "arm" else LIMITED[bare][0] + (", `nearl.Guard`" if bare != key[1] else "")
-        shares = [", ".join(f"{100 * int(row[n]) / int(row[k]):.1f}" for row in of) for n, k in (("outside", "ticks"), ("probe_outside", "probe_ticks"))]
-        means = [", ".join(row[name] for row in of) for name in ("before", "after")]
-        print(f"| {' | '.join([key[0].upper(), where, key[2], *shares, *means])} |")
+    shares = "ticks outside while learning [%] | without noise [%]"
+    print(f"| environment | learner | steps | seeds | {shares} | targets outside | return before | after | worst seed | best seed | steps/s |")
+    print("|---" * 12 + "|")
+    places = [*(name + behind for name in LIMITED for behind in ("", "-guard")), *ARMS]
+    keys = {(row["learner"], row["place"], row["steps"]) for row in rows}
+    for name, place, steps in sorted(keys, key=lambda key: (places.index(key[1]), key[0], int(key[2]))):
+        of = [row for row in rows if (row["learner"], row["place"], row["steps"]) == (name, place, steps)]
+        bare = place.removesuffix("-guard")
+        where = f"Panda-reach, {ARMS[place][0]}" if place in ARMS else LIMITED[bare][0] + (", `nearl.Guard`" if bare != place else "")
+        total = {key: sum(float(row[key] or 0) for row in of) for key in of[0] if key not in ("learner", "place")}
+        outside = [f"{100 * total[n] / total[k]:.2f}" for n, k in (("outside", "ticks"), ("probe_outside", "probe_ticks"))]
+        targets = f"{total['targets']:.0f}" if of[0]["targets"] else "-"
+        after = [float(row["after"]) for row in of]
+        means = [f"{x:.1f}" for x in (total["before"] / len(of), np.mean(after), min(after), max(after))]
+        print(f"| {' | '.join([where, name.upper(), steps, str(len(of)), *outside, targets, *means])} | {total['steps'] / total['seconds']:.0f} |")
 
 
 if __name__ == "__main__":
