@@ -200,8 +200,8 @@ def learner(name: str, place: str, steps: int, seed: int) -> None:
 def table() -> None:
     """sb3_learners.csv as a table: shares of all seeds together, returns of their mean, of the worst and of the best."""
     rows = list(csv.DictReader((Path(__file__).parent / "sb3_learners.csv").open()))
-    shares = "ticks outside while learning [%] | without noise [%]"
-    print(f"| environment | learner | steps | seeds | {shares} | targets outside | return before | after | worst seed | best seed | steps/s |")
+    shares = "outside while learning [%] | without noise [%]"
+    print(f"| environment | learner | steps | seeds | {shares} | targets outside | return before | after | worst | best | steps/s |")
     print("|---" * 12 + "|")
     places = [*(name + behind for name in LIMITED for behind in ("", "-guard")), *ARMS]
     keys = {(row["learner"], row["place"], row["steps"]) for row in rows}

@@ -16,7 +16,7 @@ use crate::stop;
 use crate::tick::{Numbered, Status, Tick};
 
 /// Version of the tick messages that are read.
-const SCHEMA: &str = "6";
+const SCHEMA: &str = "7";
 /// A target's position is where its velocity leads, up to this share [rad or m].
 const CONSISTENT: f64 = 1e-9;
 /// A proposal's position and velocity belong together up to this [rad or m].

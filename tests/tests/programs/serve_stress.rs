@@ -256,6 +256,7 @@ fn sixteen_clients_hammer_a_server_which_neither_crashes_nor_leaks_nor_errs() {
         assert_eq!(said(end), count(what) + more, "{end}: {report}, {counts:?}");
     }
     assert_eq!((said("failed"), said("closed")), (0, 0), "{report}");
-    // A simulator of the Panda takes 0.7 MB; the server has all of them from the start.
-    assert!(late < early + 8_000, "the server grew from {early} kB to {late} kB");
+    // A simulator of the Panda takes 0.7 MB; the server has all of them from the start. Hundreds of requests that each kept a tenth of one would be
+    // more than this; what the allocator keeps beside them was 4 to 8 MB, by how many ran at once.
+    assert!(late < early + 16_000, "the server grew from {early} kB to {late} kB");
 }
