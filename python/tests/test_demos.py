@@ -191,6 +191,7 @@ def test_an_agent_learns_from_them(tmp_path: Path) -> None:
 
 def test_demonstrations_can_be_looked_at(tmp_path: Path) -> None:
     imageio = pytest.importorskip("imageio.v3")
+    pytest.importorskip("imageio_ffmpeg")
     file = demos.from_columns("Hopper-v5", [episode(), episode(20, 1)], tmp_path / "a.npz", dt=0.008)
     film = lambda *more: subprocess.run(  # noqa: E731
         [sys.executable, "-m", "nearl.video", file, tmp_path / "a.mp4", *more], capture_output=True, text=True, env={**os.environ, "MUJOCO_GL": "egl"}
