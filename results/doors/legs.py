@@ -228,13 +228,14 @@ def main(playground: Path) -> None:
             nearl.import_onnx(policy, robot=file, recipe=folder / f"{what}.toml", name="go1").save(folder / f"{what}.safetensors")
             return folder / f"{what}.safetensors"
 
-        print("| command (forward, sideways [m/s], yaw [rad/s]) | its own simulation | nearl | lowest base height [m]: own, nearl |")
-        print("|---|---|---|---|")
+        print("| command | what | asked | in its own simulation | in nearl |")
+        print("|---|---|---|---|---|")
         for k, command in enumerate(COMMANDS):
             own, low = walk_theirs(theirs, command)
             ours, ours_low, _ = walk_ours(snapshot(f"walk{k}", command, RAW), f"go1-{k}")
-            say = [", ".join(f"{x:+.3f}" for x in speeds) for speeds in (own, ours)]
-            print(f"| {command} | {say[0]} | {say[1]} | {low:.3f}, {ours_low:.3f} |", flush=True)
+            for what, *three in zip(("forward [m/s]", "sideways [m/s]", "yaw [rad/s]"), command, own, ours, strict=True):
+                print(f"| {k + 1} | {what} | {' | '.join(f'{x:+.3f}' for x in three)} |")
+            print(f"| {k + 1} | lowest height of the base [m] | | {low:.3f} | {ours_low:.3f} |", flush=True)
         low, high = theirs.model.jnt_range[1:].T
         clip = f", clip = [{((low - POSE) / SCALE).tolist()}, {((high - POSE) / SCALE).tolist()}]"
         print("\n| targets | peak torque (motors' = 1) | peak torque rate [N m/s] | mean forward speed [m/s] | falls | swaps |")

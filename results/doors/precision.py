@@ -74,13 +74,13 @@ def row(path: Path, folder: Path) -> str:
             errors.append([np.abs(ours - exact).max(), np.abs(theirs - exact).max(), np.abs(ours - theirs).max()])
     worst, median = np.max(errors, axis=0) / size, np.median(errors, axis=0) / size
     name = path.relative_to(folder).as_posix()
-    cells = " | ".join(f"{w:.1e} ({m:.1e})" for w, m in zip(worst, median, strict=True))
+    cells = " | ".join(f"{w:.1e} | {m:.1e}" for w, m in zip(worst, median, strict=True))
     return f"| {name} | {size:.3g} | {cells} |"
 
 
 def main(folder: Path) -> None:
-    print("| policy | largest output | nearl: worst (median) error | onnxruntime: worst (median) error | between the two |")
-    print("|---|---|---|---|---|")
+    print("| policy | largest output | worst error of nearl | median | worst of onnxruntime | median | worst between the two | median |")
+    print("|---|---|---|---|---|---|---|---|")
     for path in sorted(folder.rglob("*.onnx")):
         print(row(path, folder), flush=True)
 
