@@ -329,6 +329,7 @@ class LoopThread:
         priority: int | None = None,
         proposal_age: float | None = None,
         proposal_hold: float | None = None,
+        rollback_window: int | None = None,
     ) -> LoopThread: ...
     @property
     def running(self) -> bool: ...

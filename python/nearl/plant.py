@@ -113,6 +113,8 @@ class Loop:
         priority: SCHED_FIFO priority, with memory locked.
         proposal_age: Another process proposes (:class:`nearl.Proposer`) in place of the policy; age at which a proposal is only held [s].
         proposal_hold: So long is it held before the loop brakes [s].
+        rollback_window: Ticks after which a snapshot that was pushed is taken back if the robot stays three times further from its targets than
+            before; 0 keeps it, for policies that are meant to do something else.
     """
 
     def __init__(
@@ -127,6 +129,7 @@ class Loop:
         priority: int | None = None,
         proposal_age: float | None = None,
         proposal_hold: float | None = None,
+        rollback_window: int | None = None,
     ) -> None:
         self.report: dict[str, Any] | None = None
         self._thread = _core.LoopThread(
@@ -139,6 +142,7 @@ class Loop:
             priority=priority,
             proposal_age=proposal_age,
             proposal_hold=proposal_hold,
+            rollback_window=rollback_window,
         )
 
     @property

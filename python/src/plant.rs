@@ -5,7 +5,9 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use nearl_runtime::link::{Exchange, LinkError, Robot, RobotName, STATE_RESET, Turn};
-use nearl_runtime::rt::{ProposerSettings, RunError, RunReport, RunSettings, Stop, ThreadSettings, run};
+use nearl_runtime::rt::{
+    ProposerSettings, RollbackSettings, RunError, RunReport, RunSettings, Stop, ThreadSettings, run,
+};
 use numpy::PyArray1;
 use pyo3::exceptions::{PyConnectionError, PyRuntimeError};
 use pyo3::prelude::*;
@@ -125,7 +127,7 @@ impl LoopThread {
     /// Starts the loop of a snapshot on the plant `name`.
     #[new]
     #[pyo3(signature = (snapshot, name, *, seconds=None, log=None, patience=None, ramp=None, priority=None, proposal_age=None,
-                        proposal_hold=None))]
+                        proposal_hold=None, rollback_window=None))]
     fn new(
         snapshot: PathBuf,
         name: &str,
@@ -136,6 +138,7 @@ impl LoopThread {
         priority: Option<i32>,
         proposal_age: Option<f64>,
         proposal_hold: Option<f64>,
+        rollback_window: Option<usize>,
     ) -> PyResult<LoopThread> {
         for (what, value) in [("proposal_age", proposal_age), ("proposal_hold", proposal_hold)] {
             if let Some(value) = value.filter(|value| !(0.0..=1e6).contains(value)) {
@@ -151,7 +154,13 @@ impl LoopThread {
         let thread = ThreadSettings { priority, cpu: None, lock_memory: priority.is_some() };
         let unsaid = RunSettings::default();
         let (patience, ramp) = (patience.unwrap_or(unsaid.patience), ramp.unwrap_or(unsaid.ramp));
-        let settings = RunSettings { seconds, log, patience, ramp, thread, proposer, ..unsaid };
+        let window = rollback_window.unwrap_or(unsaid.rollback.window);
+        if window > RollbackSettings::MOST_WINDOW {
+            let most = RollbackSettings::MOST_WINDOW;
+            return Err(errors::value(format!("rollback_window is {window} ticks; give at most {most}")));
+        }
+        let rollback = RollbackSettings { window, ..unsaid.rollback };
+        let settings = RunSettings { seconds, log, patience, ramp, thread, proposer, rollback, ..unsaid };
         let stop = Stop::new();
         let running = std::thread::Builder::new().name("nearl-loop".into()).spawn({
             let stop = stop.clone();

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -131,3 +132,25 @@ def test_the_driver_of_the_page(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     acted, _, farthest, fastest = map(float, done.stdout.split())
     assert acted == 500 and farthest <= 0.4 and fastest <= 0.8
+
+
+@pytest.mark.parametrize(("window", "rolled_back"), [(None, 1), (0, 0)])
+def test_a_policy_that_the_robot_does_not_follow_is_taken_back_unless_it_is_meant_to_stay(tmp_path, window, rolled_back) -> None:
+    """The carriage trembles by 0.2 m/s as soon as the second policy, a push of 1 N, is in use: its states are far from any target."""
+    first = spring(tmp_path)
+    push = nearl.Policy.from_layers([([[0.0, 0.0]], [0.05], "identity")], [0, 0], [1, 1], (-np.inf, np.inf), (-np.inf, np.inf))
+    second = tmp_path / "push.safetensors"
+    push.controller(tmp_path / "carriage.urdf", tmp_path / "recipe.toml", "push").save(second)
+    what = f"keep{window}"
+    with open_plant(what, lockstep=True) as plant, nearl.Loop(first, name(what), ramp=0.0, rollback_window=window) as loop:
+        sent, tremble = False, 0.0
+        for tick in range(2500):
+            _, action = plant.exchange([0.0], [tremble], [0.0, tremble], patience=5.0, time=tick * 0.001)
+            is_pushed = action is not None and abs(action[0] - 1.0) < 1e-6
+            tremble = 0.2 * (-1) ** tick if is_pushed else 0.0
+            if tick >= 500 and not sent:
+                sent = True
+                threading.Thread(target=lambda: nearl.Link(name(what)).push(second)).start()
+    assert loop.report["rolled_back"] == rolled_back, loop.report
+    with pytest.raises(ValueError, match="rollback_window is 2000000 ticks; give at most 1000000"):
+        nearl.Loop(first, name(what), rollback_window=2_000_000)

@@ -1,11 +1,12 @@
-"""Seconds until a return: NEARL, Stable-Baselines3's PPO with the same settings, and its SAC with its own.
+"""Seconds until a return: NEARL, JAX on EnvPool and Stable-Baselines3's PPO with the same settings, and its SAC with its own.
 
     cargo build --release --locked -p nearl-trainer --bin nearl
     .peers/bin/python results/time_to_return/run.py > results/time_to_return/table.md      # peers of results/throughput/peers/requirements.txt
 
 Returns are those of training, exploration on: the mean of the last hundred episodes, which every system reports at each of its batches. Runs are processes
-of their own, one after another, systems by turns; a run ends when it has the highest return of its task, or at `--limit` seconds. What `other` cores of the
-machine did meanwhile stands in each line: above 0.3 a run does not count. `--systems ppo,pid2-ib` needs no peers.
+of their own, systems by turns: one after another on the whole machine, or with `--one-core` each on a core of its own. A run ends when it has the highest
+return of its task, or at `--limit` seconds. What `other` programs did meanwhile (cores, those of the run) stands in each line: above 0.3 a run does not count.
+The table is of all lines of `runs.jsonl`; remove the file to start again. `--systems ppo,pid2-ib` needs no peers.
 """
 
 import argparse
@@ -13,12 +14,14 @@ import csv
 import json
 import math
 import os
+import queue
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import tomllib
@@ -26,12 +29,13 @@ import tomllib
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 GOALS = {"HalfCheetah-v5": [5000, 8000], "Ant-v5": [3000, 5000], "Walker2d-v5": [3500], "Hopper-v5": [2500]}
-SYSTEMS = ["ppo", "pid2-ib", "sb3-ppo", "sb3-sac"]
+SYSTEMS = ["ppo", "pid2-ib", "jax", "sb3-ppo", "sb3-sac"]
 
 
-def busy() -> float:
-    """Processor seconds of the whole machine that were not idle."""
-    user, nice, system, _, _, irq, soft, steal = map(int, Path("/proc/stat").read_text().split("\n")[0].split()[1:9])
+def busy(core: int | None) -> float:
+    """Processor seconds of a core, or of the whole machine, that were not idle."""
+    line = Path("/proc/stat").read_text().split("\n")[0 if core is None else core + 1]
+    user, nice, system, _, _, irq, soft, steal = map(int, line.split()[1:9])
     return (user + nice + system + irq + soft + steal) / os.sysconf("SC_CLK_TCK")
 
 
@@ -54,15 +58,21 @@ def command(system: str, task: str, seed: int, steps: int, s: dict, a: argparse.
     """The words of a run that prints `{steps, return}` a line."""
     if system in ("ppo", "pid2-ib"):
         return [a.nearl, "train", task, "--algo", system, "--preset", "strong", "--steps", str(steps), "--seed", str(seed), "--out", out, "--json"]
+    if system == "jax":
+        script = ROOT / "results" / "throughput" / "peers" / "jax_envpool_ppo.py"
+        words = ["--env", task, "--seed", seed, "--n-envs", 64, "--batch", s["batch"], "--minibatch", s["minibatch"], "--nets", json.dumps(s["nets"])]
+        words += ["--lr", s["lr"], "--log-std", s["log_std"], "--gae-lambda", s["gae_lambda"], "--target-kl", s["target_kl"], "--tell", steps]
+        return [a.python, script, *words]
     return [a.python, HERE / "peer.py", system, task, "--seed", str(seed), "--steps", str(steps), "--settings", json.dumps(s)]
 
 
-def run(system: str, task: str, seed: int, s: dict, a: argparse.Namespace) -> dict:
-    """Seconds and steps to each return of the task, none where it was not reached."""
+def run(system: str, task: str, seed: int, s: dict, a: argparse.Namespace, core: int | None) -> dict:
+    """Seconds and steps to each return of the task, none where it was not reached; on one core, or on the whole machine."""
     goals, reached = GOALS[task], {}
     with tempfile.TemporaryDirectory() as folder:
         words = [str(w) for w in command(system, task, seed, a.steps, s, a, Path(folder) / "run")]
-        start, before = time.monotonic(), busy()
+        words = words if core is None else ["taskset", "-c", str(core), *words]
+        start, before = time.monotonic(), busy(core)
         child = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
         ended = False
         for line in child.stdout:
@@ -79,7 +89,8 @@ def run(system: str, task: str, seed: int, s: dict, a: argparse.Namespace) -> di
             sys.exit(f"'{' '.join(words)}' failed with status {status}; its message is above")
         wall, own = time.monotonic() - start, used.ru_utime + used.ru_stime
     found = {f"to_{goal}": reached.get(goal) for goal in goals}
-    return {"task": task, "system": system, "seed": seed, "other": round((busy() - before - own) / wall, 2)} | found
+    cores = os.cpu_count() if core is None else 1
+    return {"task": task, "system": system, "seed": seed, "cores": cores, "other": round((busy(core) - before - own) / wall, 2)} | found
 
 
 def main() -> None:
@@ -91,31 +102,49 @@ def main() -> None:
     p.add_argument("--seeds", type=int, default=5)
     p.add_argument("--steps", type=int, default=10_000_000, help="steps over which rates fall to zero")
     p.add_argument("--limit", type=float, default=1800.0, help="seconds after which a run is given up")
+    p.add_argument("--first-seed", type=int, default=0)
+    p.add_argument("--one-core", action="store_true", help="each run on a core of its own, as many side by side as there are cores")
     a = p.parse_args()
-    lines = []
-    with open(HERE / "runs.jsonl", "a") as log:
-        for task in a.tasks.split(","):
-            s = settings(a.nearl, task)
-            for seed in range(a.seeds):
-                for system in a.systems.split(","):
-                    lines.append(run(system, task, seed, s, a))
-                    log.write(json.dumps(lines[-1]) + "\n")
-                    log.flush()
-    table(lines)
+    said = {task: settings(a.nearl, task) for task in a.tasks.split(",")}
+    seeds = range(a.first_seed, a.first_seed + a.seeds)
+    todo = [(system, task, seed) for task in said for seed in seeds for system in a.systems.split(",")]
+    cores: queue.Queue = queue.Queue()
+    for core in range(os.cpu_count()) if a.one_core else [None]:
+        cores.put(core)
+
+    def one(system: str, task: str, seed: int) -> None:
+        core = cores.get()
+        try:
+            line = run(system, task, seed, said[task], a, core)
+        finally:
+            cores.put(core)
+        with open(HERE / "runs.jsonl", "a") as log:
+            log.write(json.dumps(line) + "\n")
+
+    with ThreadPoolExecutor(cores.qsize()) as pool:
+        for done in [pool.submit(one, *what) for what in todo]:
+            done.result()
+    table([json.loads(line) for line in (HERE / "runs.jsonl").read_text().splitlines()])
 
 
 def table(lines: list[dict]) -> None:
-    """Median over the seeds; a seed that never came there counts as infinitely late."""
+    """Median over the seeds that nobody disturbed; a seed that never came there counts as infinitely late."""
+    if len({line["cores"] for line in lines}) > 1:
+        sys.exit(f"{HERE / 'runs.jsonl'} has runs on one core and on several, which do not compare; remove the file and start again")
     writer = csv.writer(sys.stdout, delimiter="|", lineterminator="|\n")
-    writer.writerows([["", " task ", " return ", " system ", " seconds ", " million steps ", " seeds there ", " disturbed "], ["", *["---"] * 7]])
-    found = defaultdict(list)
+    writer.writerows([["", " task ", " return ", " system ", " seconds ", " million steps ", " seeds there ", " left out as disturbed "], ["", *["---"] * 7]])
+    found, disturbed = defaultdict(list), defaultdict(int)
     for line in lines:
         for goal in GOALS[line["task"]]:
-            found[line["task"], goal, line["system"]].append((line[f"to_{goal}"], line["other"] > 0.3))
-    for (task, goal, system), runs in found.items():
-        there = [r for r, _ in runs if r]
-        seconds, steps = (statistics.median([r[k] if r else math.inf for r, _ in runs]) for k in (0, 1))
-        words = [task, goal, system, f"{seconds:.0f}", f"{steps / 1e6:.2f}", f"{len(there)} of {len(runs)}", sum(d for _, d in runs)]
+            key = line["task"], goal, line["system"]
+            if line["other"] > 0.3:
+                disturbed[key] += 1
+            else:
+                found[key].append(line[f"to_{goal}"])
+    for key, runs in sorted(found.items(), key=lambda kv: (list(GOALS).index(kv[0][0]), kv[0][1])):
+        there = [r for r in runs if r]
+        seconds, steps = (statistics.median([r[k] if r else math.inf for r in runs]) for k in (0, 1))
+        words = [*key, f"{seconds:.0f}", f"{steps / 1e6:.2f}", f"{len(there)} of {len(runs)}", disturbed[key]]
         writer.writerow(["", *(f" {w} " for w in words)])
 
 

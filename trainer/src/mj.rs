@@ -8,6 +8,7 @@ mod describe;
 mod guard;
 mod inverse;
 mod motors;
+mod pairs;
 mod perturb;
 mod scene;
 mod sim;
@@ -177,9 +178,12 @@ impl Model {
             ModelFormat::Urdf => keep_fixed_links(text),
         };
         sizes::check(&text, folder).map_err(MjError::Load)?;
-        let loaded = guard::counting_warnings(|| match scene.is_empty() {
-            true => compile(&text, folder).map_err(|e| MjError::Load(guard::one_line(&e.to_string()))),
-            false => scene::compile(&text, folder, scene),
+        let loaded = guard::counting_warnings(|| {
+            let model = match scene.is_empty() {
+                true => compile(&text, folder).map_err(|e| MjError::Load(guard::one_line(&e.to_string()))),
+                false => scene::compile(&text, folder, scene),
+            };
+            model.and_then(|model| pairs::list(&text, folder, scene, model))
         });
         let mut model = loaded?;
         let opt = model.opt_mut();

@@ -4,7 +4,7 @@ import json
 import time
 
 
-def arguments():
+def parser():
     p = argparse.ArgumentParser()
     p.add_argument("--env", default="HalfCheetah-v5")
     p.add_argument("--seconds", type=float, default=6.0, help="stop at the first iteration after this time")
@@ -13,7 +13,11 @@ def arguments():
     p.add_argument("--batch", type=int, default=2048, help="environment steps per iteration, over all environments")
     p.add_argument("--minibatch", type=int, default=64)
     p.add_argument("--epochs", type=int, default=10)
-    return p.parse_args()
+    return p
+
+
+def arguments():
+    return parser().parse_args()
 
 
 class Meter:

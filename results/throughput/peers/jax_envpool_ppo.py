@@ -1,13 +1,29 @@
-"""CleanRL-style PPO in JAX on EnvPool: jitted policy step, whole update (GAE, epochs, minibatches) in one jitted scan."""
+"""CleanRL-style PPO in JAX on EnvPool: jitted policy step, whole update (GAE, epochs, minibatches) in one jitted scan.
+
+`--tell STEPS` prints `{"steps": ..., "return": ...}` after each batch instead of a rate, while the learning rate falls to zero over so many steps.
+"""
+import json
+
 import envpool
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 
-from common import Meter, arguments
+from common import Meter, parser
 
-GAMMA, LAM, CLIP = 0.99, 0.95, 0.2
+GAMMA, CLIP = 0.99, 0.2
+
+
+def arguments():
+    p = parser()
+    p.add_argument("--nets", type=json.loads, default=[32, 32])
+    p.add_argument("--lr", type=float, default=3e-4)
+    p.add_argument("--log-std", type=float, default=0.0)
+    p.add_argument("--gae-lambda", type=float, default=0.95)
+    p.add_argument("--target-kl", type=float, default=0.0, help="no further pass over a batch once its divergence is 1.5 times this; 0: all of them")
+    p.add_argument("--tell", type=int, default=0, metavar="STEPS")
+    return p.parse_args()
 
 
 def mlp_init(key, sizes, last):
@@ -54,9 +70,9 @@ def main():
     n_obs, n_act = e.observation_space.shape[0], e.action_space.shape[0]
     key = jax.random.PRNGKey(args.seed)
     key, k1, k2 = jax.random.split(key, 3)
-    params = {"pi": mlp_init(k1, [n_obs, 32, 32, n_act], 0.01), "v": mlp_init(k2, [n_obs, 32, 32, 1], 1.0),
-              "logstd": jnp.zeros(n_act)}
-    opt = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(3e-4, eps=1e-5))
+    params = {"pi": mlp_init(k1, [n_obs, *args.nets, n_act], 0.01), "v": mlp_init(k2, [n_obs, *args.nets, 1], 1.0),
+              "logstd": jnp.full(n_act, args.log_std)}
+    opt = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(1.0, eps=1e-5))
     opt_state = opt.init(params)
 
     def loss_fn(p, mb):
@@ -68,30 +84,53 @@ def main():
         vc = val + jnp.clip(v - val, -CLIP, CLIP)
         return pg + 0.25 * jnp.maximum((v - ret) ** 2, (vc - ret) ** 2).mean()
 
-    @jax.jit
-    def update(params, opt_state, key, obs, act, logp, val, rew, done, last_obs):
+    def rows(params, obs, act, logp, val, rew, done, last_obs):
         def gae(c, x):
             nv, last = c
             r, v, d = x
-            last = r + GAMMA * nv * (1 - d) - v + GAMMA * LAM * (1 - d) * last
+            last = r + GAMMA * nv * (1 - d) - v + GAMMA * args.gae_lambda * (1 - d) * last
             return (v, last), last
         last_v = mlp(params["v"], last_obs)[..., 0]
         _, adv = jax.lax.scan(gae, (last_v, jnp.zeros(n)), (rew, val, done), reverse=True)
-        flat = [x.reshape((-1,) + x.shape[2:]) for x in (obs, act, logp, adv, adv + val, val)]
+        return [x.reshape((-1,) + x.shape[2:]) for x in (obs, act, logp, adv, adv + val, val)]
 
+    def epoch(c, lr, flat, k):
         def step(c, mb):
             p, s = c
             g = jax.grad(loss_fn)(p, mb)
             u, s = opt.update(g, s, p)
-            return (optax.apply_updates(p, u), s), None
+            return (optax.apply_updates(p, jax.tree.map(lambda x: lr * x, u)), s), None
+        i = jax.random.permutation(k, args.batch)
+        mbs = [x[i].reshape((-1, args.minibatch) + x.shape[1:]) for x in flat]
+        return jax.lax.scan(step, c, mbs)[0]
 
-        def epoch(c, k):
-            i = jax.random.permutation(k, args.batch)
-            mbs = [x[i].reshape((-1, args.minibatch) + x.shape[1:]) for x in flat]
-            return jax.lax.scan(step, c, mbs)[0], None
+    @jax.jit
+    def update(params, opt_state, key, lr, *batch):
+        flat = rows(params, *batch)
         key, k = jax.random.split(key)
-        (params, opt_state), _ = jax.lax.scan(epoch, (params, opt_state), jax.random.split(k, args.epochs))
+        scan = lambda c, k: (epoch(c, lr, flat, k), None)
+        (params, opt_state), _ = jax.lax.scan(scan, (params, opt_state), jax.random.split(k, args.epochs))
         return params, opt_state, key
+
+    rows_of = jax.jit(rows)
+
+    @jax.jit
+    def one(params, opt_state, key, lr, flat):
+        """A pass over the batch, and how far the policy is from the one that collected it."""
+        key, k = jax.random.split(key)
+        params, opt_state = epoch((params, opt_state), lr, flat, k)
+        d = log_prob(params, flat[0], flat[1]) - flat[2]
+        return params, opt_state, key, (jnp.exp(d) - 1 - d).mean()
+
+    def until(params, opt_state, key, lr, *batch):
+        flat = rows_of(params, *batch)
+        for _ in range(args.epochs):
+            params, opt_state, key, kl = one(params, opt_state, key, lr, flat)
+            if kl > 1.5 * args.target_kl:
+                break
+        return params, opt_state, key
+
+    learn = until if args.target_kl else update
 
     f = np.float32
     O, A = np.zeros((T, n, n_obs), f), np.zeros((T, n, n_act), f)
@@ -105,7 +144,7 @@ def main():
     meter, steps, obs = Meter(args.seconds), 0, norm(e.reset()[0])
     while True:
         meter.tick(steps)
-        if meter.is_done():
+        if steps >= args.tell if args.tell else meter.is_done():
             break
         for t in range(T):
             key, a, lp, v = act_fn(params, key, obs)
@@ -121,10 +160,15 @@ def main():
             ret[done] = 0
             R[t], D[t] = np.clip(r / np.sqrt(rn.var + 1e-8), -10, 10), done
             obs = norm(o)
-        params, opt_state, key = update(params, opt_state, key, O, A, L, V, R, D, obs)
+        lr = args.lr * (1 - steps / args.tell) if args.tell else args.lr
+        params, opt_state, key = learn(params, opt_state, key, lr, O, A, L, V, R, D, obs)
         jax.block_until_ready(params)
         steps += args.batch
-    meter.report(finished)
+        if args.tell:
+            last = finished[-100:]
+            print(json.dumps({"steps": steps, "return": sum(last) / len(last) if last else None}), flush=True)
+    if not args.tell:
+        meter.report(finished)
 
 
 if __name__ == "__main__":

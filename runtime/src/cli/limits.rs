@@ -5,9 +5,6 @@ use clap::Args;
 use super::Failure;
 use crate::rt::{ModeLimits, RollbackSettings};
 
-/// Longest window of the residual [ticks]; its memory is taken at once.
-const MOST_WINDOW: usize = 1_000_000;
-
 /// When the loop degrades, brakes, latches, recovers and rolls back.
 #[derive(Args, Clone, Copy, Debug)]
 #[command(next_help_heading = "Mode limits and rollback")]
@@ -41,12 +38,9 @@ impl LimitOptions {
                 format!("{name} {ticks} ticks is below {least}, by {than}: give at least {least}").into()
             );
         }
-        if r.window > MOST_WINDOW {
-            let window = r.window;
-            return Err(format!(
-                "--rollback-window {window} ticks is not usable: give at most {MOST_WINDOW}"
-            )
-            .into());
+        let (window, most) = (r.window, RollbackSettings::MOST_WINDOW);
+        if window > most {
+            return Err(format!("--rollback-window {window} ticks is not usable: give at most {most}").into());
         }
         let least = [("--rollback-factor", r.factor, 1.0), ("--rollback-floor", r.floor, 0.0)];
         if let Some((name, value, least)) =

@@ -28,6 +28,11 @@ impl Default for RollbackSettings {
     }
 }
 
+impl RollbackSettings {
+    /// Longest window of the residual \[ticks\]; its memory is taken at once.
+    pub const MOST_WINDOW: usize = 1_000_000;
+}
+
 /// What a swap brought.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Weights {

@@ -3,7 +3,7 @@
 use mujoco_rs::mujoco_c::{mjModel, mjtByte, mjtSameFrame};
 use mujoco_rs::wrappers::mj_model::MjModel;
 
-use super::{MjError, Model, Sim, guard};
+use super::{MjError, Model, Sim, guard, pairs};
 
 /// What a frame coincides with.
 const NONE: mjtByte = mjtSameFrame::mjSAMEFRAME_NONE as mjtByte;
@@ -104,10 +104,14 @@ impl Sim {
         let lengths =
             |p: &Physique| [p.mass.len(), p.friction.len(), p.armature.len(), p.gain.len(), p.bumps.len()];
         assert!(lengths(&now) == lengths(to), "the numbers of another robot");
+        let of_pairs = pairs::frictions(&self.model().0, &to.friction);
         self.call_with_model(|m, d| {
             // SAFETY: the arrays have the lengths compared above, and nothing else reads this robot meanwhile.
             unsafe {
                 write(m, to);
+                for (i, friction) in of_pairs.iter().enumerate() {
+                    (0..5).for_each(|k| *(*m).pair_friction.add(5 * i + k) = friction[k]);
+                }
                 guard::mj_setConst(m, d);
             }
         })

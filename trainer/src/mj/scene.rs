@@ -61,7 +61,16 @@ impl Scene {
 
 /// Compiles a text as if it stood in a file of `folder`, with the things of `scene`.
 pub(super) fn compile(text: &str, folder: Option<&Path>, scene: &Scene) -> Result<MjModel, MjError> {
-    let words = |e: MjEditError| MjError::Load(guard::one_line(&e.to_string()));
+    let (mut spec, files) = specify(text, folder, scene)?;
+    spec.compile_with_vfs(&files).map_err(words)
+}
+
+pub(super) fn words(e: MjEditError) -> MjError {
+    MjError::Load(guard::one_line(&e.to_string()))
+}
+
+/// What [`compile`] compiles, and the files that it names.
+pub(super) fn specify(text: &str, folder: Option<&Path>, scene: &Scene) -> Result<(MjSpec, MjVfs), MjError> {
     let mut files = MjVfs::new();
     let mut spec = match folder {
         None => MjSpec::from_xml_string(text).map_err(words)?,
@@ -73,7 +82,7 @@ pub(super) fn compile(text: &str, folder: Option<&Path>, scene: &Scene) -> Resul
         }
     };
     scene.add_to(&mut spec)?;
-    spec.compile_with_vfs(&files).map_err(words)
+    Ok((spec, files))
 }
 
 impl Scene {
