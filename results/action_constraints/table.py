@@ -2,9 +2,9 @@
 
     .venv/bin/python results/action_constraints/table.py RUNS FOLDER
 
-RUNS has `<set>/<task>/<algo>_<seed>` and, where times were taken, `<set>/update.json`. Runs without a set are those of results/strong. Ten episodes of each
-run are recorded (`nearl demos record`), and what was done in them is held against the formula here, from the joint velocities of the simulator: nothing that
-projects has a say in it.
+RUNS has `<set>/<task>/<algo>_<seed>` and, where times were taken, `<set>/update.json`. Runs that it does not have stay what they are in FOLDER. Runs without a
+set are those of results/strong. Ten episodes of each run are recorded (`nearl demos record`), and what was done in them is held against the formula here, from
+the joint velocities of the simulator: nothing that projects has a say in it.
 """
 
 import csv
@@ -80,14 +80,18 @@ def centre(values: list[float]) -> str:
 def main(runs: Path, folder: Path) -> None:
     finished = sorted(file.parents[1] for file in runs.glob("*/*/*_*/checkpoints/final.safetensors"))
     rows, beside = [measure(run) for run in finished], free()
+    name = lambda row: tuple(row[k] for k in ("set", "task", "algo", "seed"))  # noqa: E731
+    measured = {name(row) for row in rows}
+    with open(folder / "runs.csv", newline="") as f:
+        rows = sorted([row for row in csv.DictReader(f) if name(row) not in measured] + rows, key=name)
     with open(folder / "runs.csv", "w", newline="") as f:
         writer = csv.DictWriter(f, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     timed = {f.parent.name: json.loads(f.read_text()) for f in runs.glob("*/update.json")}
     titles = ["set", "algorithm", "seeds", "return", "without the set", "share", "p", "steps beyond", "largest excess", "steps on it"]
-    titles += ["update p50, p99 [us]", "without the set"] if timed else []
-    us = lambda name: f"{timed[name]['p50']:.1f}, {timed[name]['p99']:.1f}" if name in timed else ""  # noqa: E731
+    titles += [f"update {p} {how} [us]" for how in ("with the set", "without") for p in ("p50", "p99")] if timed else []
+    us = lambda name: [f"{timed[name][p]:.1f}" if name in timed else "" for p in ("p50", "p99")]  # noqa: E731
     lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for name, task, algo in sorted({(r["set"], r["task"], r["algo"]) for r in rows}):
         mine = [r for r in rows if (r["set"], r["task"], r["algo"]) == (name, task, algo)]
@@ -96,7 +100,7 @@ def main(runs: Path, folder: Path) -> None:
         cells = [name, algo, str(len(values)), centre(values), centre(without), f"{interquartile_mean(values) / interquartile_mean(without):.2f}"]
         cells += [f"{rank_test(values, without):.2f}" if len(values) > 2 else ""]
         cells += [f"{broken} of {steps}", f"{max(float(r['largest_excess']) for r in mine):.1g}", f"{100 * held / steps:.0f} %"]
-        cells += [us(name), us(f"free-{task}")] if timed else []
+        cells += us(name) + us(f"free-{task}") if timed else []
         lines.append(f"| {' | '.join(cells)} |")
     (folder / "table.md").write_text("\n".join(lines) + "\n")
 
