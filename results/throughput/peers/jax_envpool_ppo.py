@@ -71,7 +71,7 @@ def main():
     key = jax.random.PRNGKey(args.seed)
     key, k1, k2 = jax.random.split(key, 3)
     params = {"pi": mlp_init(k1, [n_obs, *args.nets, n_act], 0.01), "v": mlp_init(k2, [n_obs, *args.nets, 1], 1.0),
-              "logstd": jnp.full(n_act, args.log_std)}
+              "logstd": jnp.full(n_act, args.log_std, jnp.float32)}
     opt = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(1.0, eps=1e-5))
     opt_state = opt.init(params)
 
@@ -160,7 +160,7 @@ def main():
             ret[done] = 0
             R[t], D[t] = np.clip(r / np.sqrt(rn.var + 1e-8), -10, 10), done
             obs = norm(o)
-        lr = args.lr * (1 - steps / args.tell) if args.tell else args.lr
+        lr = f(args.lr * (1 - steps / args.tell) if args.tell else args.lr)
         params, opt_state, key = learn(params, opt_state, key, lr, O, A, L, V, R, D, obs)
         jax.block_until_ready(params)
         steps += args.batch
