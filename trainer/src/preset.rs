@@ -56,19 +56,22 @@ pub const PRESETS: &[RegisteredPreset] = &[
             "train.nets.value=[64,64]",
             "train.nets.discriminator=[64,64]",
         ],
-        tasks: &[(
-            "HalfCheetah-v5",
-            &[
-                "train.n_envs=32",
-                "train.n_steps=128",
-                "train.ppo.batch_size=128",
-                "train.ppo.log_std=-1.0",
-                "train.ppo.lr=1e-3",
-                "train.ppo.target_kl=0.0",
-                "train.nets.idm_residual=true",
-                "train.pid2.idm_threshold=0.03",
-            ],
-        )],
+        tasks: &[
+            (
+                "HalfCheetah-v5",
+                &[
+                    "train.n_envs=32",
+                    "train.n_steps=128",
+                    "train.ppo.batch_size=128",
+                    "train.ppo.log_std=-1.0",
+                    "train.ppo.lr=1e-3",
+                    "train.ppo.target_kl=0.0",
+                    "train.nets.idm_residual=true",
+                    "train.pid2.idm_threshold=0.03",
+                ],
+            ),
+            ("Ant-v5", &["train.pid2.null_space=true", "train.pid2.alpha=1e-3"]),
+        ],
     },
 ];
 
