@@ -144,7 +144,8 @@ def table(lines: list[dict]) -> None:
     for key, runs in sorted(found.items(), key=lambda kv: (list(GOALS).index(kv[0][0]), kv[0][1])):
         there = [r for r in runs if r]
         seconds, steps = (statistics.median([r[k] if r else math.inf for r in runs]) for k in (0, 1))
-        words = [*key, f"{seconds:.0f}", f"{steps / 1e6:.2f}", f"{len(there)} of {len(runs)}", disturbed[key]]
+        found_it = [f"{seconds:.0f}", f"{steps / 1e6:.2f}"] if math.isfinite(seconds) else ["not reached", ""]
+        words = [*key, *found_it, f"{len(there)} of {len(runs)}", disturbed[key]]
         writer.writerow(["", *(f" {w} " for w in words)])
 
 
