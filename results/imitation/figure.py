@@ -65,7 +65,7 @@ def kept(folder: Path, found: set[tuple[str, str, str]]) -> tuple[list[dict], di
 
 def together(new: list[float], n_kept: int, cells: list[str], place: int) -> float:
     """Mean of a column over the seeds that were measured now and those that were before, of which the table has the mean; all have equally many rows."""
-    before = float(cells[place]) if n_kept else 0.0
+    before = float(cells[place] or "nan") if n_kept else 0.0
     if n_kept and int(cells[0]) != n_kept:
         raise SystemExit(f"{n_kept} of the {cells[0]} seeds in the table would stay, and it has their mean alone: measure all of them again, or none")
     return (sum(new) + n_kept * before) / (len(new) + n_kept)
@@ -133,7 +133,8 @@ def main() -> None:
         centre = interquartile_mean(values)
         speed, half, end = interquartile_mean(values.mean(axis=1)), centre[(n - 1) // 2], centre[-1]
         share = end / expert[task]
-        lines.append(f"| {task} | {name} | {len(values)} | {speed:.0f} | {half:.0f} | {end:.0f} | {share:.2f} | {r2:.2f} | {updated:.2f} |")
+        model = " | ".join("" if np.isnan(value) else f"{value:.2f}" for value in (r2, updated))
+        lines.append(f"| {task} | {name} | {len(values)} | {speed:.0f} | {half:.0f} | {end:.0f} | {share:.2f} | {model} |")
     draw(rows, expert, args.folder / "figure.png", args.variants)
     with open(args.folder / "curves.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")

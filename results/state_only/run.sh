@@ -17,6 +17,7 @@ for task in $tasks; do
     demos=runs/imitation/$task.npz
     [ -f $demos ] || target/release/nearl demos record results/imitation/experts/$task.safetensors --out $demos
     target/release/nearl sweep --tasks $task --algos gaifo,bco --demos $demos "${common[@]}"
-    target/release/nearl sweep --tasks $task --algos pid2-il --demos $demos --set 'train.demos.reward="likeness"' "${common[@]}"
+    target/release/nearl sweep --tasks $task --algos pid2-il --demos $demos --set 'train.demos.reward="likeness"' --set train.nets.idm=[32,32] \
+        --set train.nets.idm_residual=true --set train.pid2.idm_threshold=0.1 "${common[@]}"
 done
 .venv/bin/python results/imitation/figure.py $runs results/state_only --experts results/imitation/experts
