@@ -18,7 +18,7 @@ import numpy as np
 from nearl.curves import interquartile_mean
 
 NEARL = os.environ.get("NEARL", "target/release/nearl")
-WAYS = {"free": "PPO", "limited": "PPO, cost limited", "prior": "PID²-IB, prior", "both": "PID²-IB, prior and cost limited"}
+WAYS = {"free": "PPO", "limited": "PPO, limit", "prior": "PID²-IB, prior", "both": "PID²-IB, prior and limit"}
 # Safety-Gymnasium's tasks in OmniSafe's benchmark, 1e7 steps: return and cost of PPO-Lagrangian
 PUBLISHED = {"HalfCheetah": ("2946", "3.4"), "Hopper": ("962", "14.0"), "Walker2d": ("2982", "13.5"), "Ant": ("3262", "–")}
 NUMBERS = ["training_return", "training_cost", "return", "cost", "multiplier"]
