@@ -20,12 +20,12 @@ import numpy as np
 import yaml
 
 import nearl
+from switching import in_nearls_words, push
 
 DT, EVERY = 0.002, 10  # s, ticks of a policy
 RATE = 10_000.0  # N m/s
 SWITCH = 1000  # ticks
-TORQUE_RATE = f"torque_rate = {{ limit = {RATE} }}"
-GUARD = f'guard = "drive"\ntorque = {{ scale = 1.0 }}\n{TORQUE_RATE}'
+GUARD = f'guard = "drive"\ntorque = {{ scale = 1.0 }}\ntorque_rate = {{ limit = {RATE} }}'
 # N m and kg m² of each kind of motor, by joint, as its g1_constants.py has them.
 MOTORS = {
     "hip_pitch|hip_yaw|waist_yaw": (88.0, 0.010178),
@@ -160,16 +160,6 @@ class Motion:
         return [*self.q[k], *self.v[k], *between[:, :2].ravel()]
 
 
-def in_nearls_words(d: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """Configuration and velocity as a plant gives them: quaternion x y z w, the base's velocity in its own axes."""
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, d.qpos[3:7])
-    q, v = d.qpos.copy(), d.qvel.copy()
-    q[3:7] = np.roll(q[3:7], -1)
-    v[:3] = turn.reshape(3, 3).T @ v[:3]
-    return q, v
-
-
 def fly(robot: G1, motion: Motion, snapshots: list[Path], name: str, seconds: float) -> list[str]:
     """Peak torque as a share of the motors', peak change of it [N m/s], both whenever and in 0.1 s behind a switch, falls, switches."""
     model = mujoco.MjModel.from_xml_path(str(robot.file))
@@ -189,7 +179,7 @@ def fly(robot: G1, motion: Motion, snapshots: list[Path], name: str, seconds: fl
         nearl.Loop(snapshots[0], name, patience=30.0, ramp=0.0, rollback_window=0) as loop,
     ):
         motion.begin(d.qpos[3:7], d.qpos[7:])
-        acted, pushes = 0, 0
+        acted, pushes, pushed = 0, 0, 0
         while acted < seconds / DT:
             q, v = in_nearls_words(d)
             observation = [*d.qpos[7:], *d.qvel[6:], 0.4, 0.0, 0.0, *motion.tell(since, d.qpos[3:7], d.qpos[7:])]
@@ -202,7 +192,7 @@ def fly(robot: G1, motion: Motion, snapshots: list[Path], name: str, seconds: fl
             torque = robot.kp * (target - d.qpos[7:]) - robot.kd * d.qvel[6:]
             share = np.abs(torque / robot.effort).max()
             change = 0.0 if before is None else np.abs(torque - before).max() / DT
-            at = [0, 1] if pushes and since < 0.1 / DT else [0]
+            at = [0, 1] if pushes and acted - pushed < 0.1 / DT else [0]
             peak[at], rate[at], before = np.maximum(peak[at], share), np.maximum(rate[at], change), torque
             d.ctrl[:] = target
             mujoco.mj_step(model, d)
@@ -212,22 +202,13 @@ def fly(robot: G1, motion: Motion, snapshots: list[Path], name: str, seconds: fl
                 motion.begin(d.qpos[3:7], d.qpos[7:])
             if len(snapshots) > 1 and acted % SWITCH == 0:
                 # From another thread: the loop answers behind a tick, and the ticks are this one's.
-                pushes, since = pushes + 1, 0
+                pushes, pushed, since = pushes + 1, acted, 0
                 motion.begin(d.qpos[3:7], d.qpos[7:])
                 pushing.submit(push, name, snapshots[pushes % 2])
         pushing.shutdown(wait=False, cancel_futures=True)
         swaps = loop.stop()["counters"]["swaps"]
     behind = [f"{peak[1]:.3f}", f"{rate[1]:.0f}"] if swaps else ["", ""]
     return [f"{peak[0]:.3f}", f"{rate[0]:.0f}", *behind, str(falls), str(swaps)]
-
-
-LINKS: dict[str, nearl.Link] = {}
-
-
-def push(name: str, snapshot: Path) -> None:
-    receipt = LINKS.setdefault(name, nearl.Link(name)).push(snapshot)
-    if not receipt.accepted:
-        print(f"{name}: {receipt.text}", file=sys.stderr)
 
 
 def main(checkout: Path) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 import onnxruntime
 
 import nearl
+from switching import in_nearls_words, push
 
 GO1 = "mujoco_playground/_src/locomotion/go1/xmls"
 JOINTS = [f"{leg}_{part}_joint" for leg in ("FR", "FL", "RR", "RL") for part in ("hip", "thigh", "calf")]
@@ -154,16 +155,6 @@ def walk_ours(snapshot: Path, name: str) -> tuple[np.ndarray, float, int]:
         plant.wait()
 
 
-def in_nearls_words(d: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """Configuration and velocity as a plant gives them: quaternion x y z w, the base's velocity in its own axes."""
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, d.qpos[3:7])
-    q, v = d.qpos.copy(), d.qvel.copy()
-    q[3:7] = np.roll(q[3:7], -1)
-    v[:3] = turn.reshape(3, 3).T @ v[:3]
-    return q, v
-
-
 def switched(theirs: Theirs, snapshots: list[Path], name: str, seconds: float) -> tuple[float, float, float, int, int]:
     """Peak torque as a share of the motors', peak change of it [N m/s], mean forward speed, falls and hot swaps, while two policies are pushed in turn."""
     m, d = theirs.model, theirs.data
@@ -204,15 +195,6 @@ def switched(theirs: Theirs, snapshots: list[Path], name: str, seconds: float) -
             pushing.shutdown(wait=False, cancel_futures=True)
             swaps = loop.stop()["counters"]["swaps"]
     return peak, rate, float(np.mean(speeds)), falls, swaps
-
-
-LINKS: dict[str, nearl.Link] = {}
-
-
-def push(name: str, snapshot: Path) -> None:
-    receipt = LINKS.setdefault(name, nearl.Link(name)).push(snapshot)
-    if not receipt.accepted:
-        print(f"{name}: {receipt.text}", file=sys.stderr)
 
 
 def main(playground: Path) -> None:

@@ -19,7 +19,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use mujoco_rs::error::MjModelError;
-use mujoco_rs::mujoco_c::{mjtDisableBit, mjtEnableBit};
+use mujoco_rs::mujoco_c::mjtDisableBit;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::mj_model::{MjModel, MjtBias, MjtDyn, MjtGain, MjtJoint, MjtObjBase, MjtTrn};
 
@@ -194,8 +194,7 @@ impl Model {
             opt.disableflags |= mjtDisableBit::mjDSBL_CONTACT as i32;
         }
         // The constraints of one tree are one island, at most: to look for it takes 4 to 9 % of the time and changes no bit.
-        let sleeps = opt.enableflags & mjtEnableBit::mjENBL_SLEEP as i32 != 0;
-        if model.ntree() == 1 && !sleeps {
+        if model.ntree() == 1 && !pairs::sleeps(&model) {
             model.opt_mut().disableflags |= mjtDisableBit::mjDSBL_ISLAND as i32;
         }
         Ok(Model(Arc::new(model)))

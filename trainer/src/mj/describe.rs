@@ -9,7 +9,7 @@ use nearl_runtime::constraints::geometry::{Placement, Shape};
 use mujoco_rs::mujoco_c::mjtDisableBit;
 use mujoco_rs::wrappers::mj_model::{MjtGeomBase, MjtObjBase};
 
-use super::{JointKind, MjError, Model, motors};
+use super::{JointKind, MjError, Model, motors, pairs};
 
 impl Model {
     /// The robot as plain numbers, from which the dynamics of the controller are built. Its joints stand in MuJoCo's order.
@@ -126,7 +126,7 @@ impl Model {
     /// Geoms that can touch something.
     fn solids(&self) -> Vec<Solid> {
         let m = &self.0;
-        let touches = |id: &usize| m.geom_contype()[*id] != 0 || m.geom_conaffinity()[*id] != 0;
+        let touches = |id: &usize| pairs::is_solid(m, *id);
         let solid = |id: usize| {
             let [x, y, z] = m.geom_size()[id];
             let shape = match m.geom_type()[id] {

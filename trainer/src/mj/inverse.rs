@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
+use mujoco_rs::mujoco_c::mjtEnableBit;
 use mujoco_rs::wrappers::mj_data::MjData;
 use mujoco_rs::wrappers::mj_model::MjModel;
 
-use super::{MjError, Sim, guard, mjtEnableBit};
+use super::{MjError, Sim, guard};
 
 /// MuJoCo's inverse dynamics of a robot. It looks at the motion alone and never at what the actuators were told.
 pub struct Inverse {

@@ -34,10 +34,14 @@ pub(super) fn list(
     scene: &Scene,
     model: MjModel,
 ) -> Result<MjModel, MjError> {
-    let sleeps = model.opt().enableflags & mjtEnableBit::mjENBL_SLEEP as i32 != 0;
     let pairs = can_touch(&model);
     let n_solids = (0..model.geom_contype().len()).filter(|&id| is_solid(&model, id)).count();
-    if model.npair() > 0 || model.nflex() > 0 || sleeps || pairs.is_empty() || pairs.len() > MOST * n_solids {
+    if model.npair() > 0
+        || model.nflex() > 0
+        || sleeps(&model)
+        || pairs.is_empty()
+        || pairs.len() > MOST * n_solids
+    {
         return Ok(model);
     }
     // Names are given by place in the specification, which the first compilation says the numbers of.
@@ -83,7 +87,13 @@ fn name_all(spec: &mut MjSpec) -> Result<(), MjEditError> {
     Ok(())
 }
 
-fn is_solid(m: &MjModel, id: usize) -> bool {
+/// Whether MuJoCo lets robots at rest sleep.
+pub(super) fn sleeps(m: &MjModel) -> bool {
+    m.opt().enableflags & mjtEnableBit::mjENBL_SLEEP as i32 != 0
+}
+
+/// Whether a geom can touch anything.
+pub(super) fn is_solid(m: &MjModel, id: usize) -> bool {
     m.geom_contype()[id] != 0 || m.geom_conaffinity()[id] != 0
 }
 

@@ -65,6 +65,7 @@ pub(super) fn compile(text: &str, folder: Option<&Path>, scene: &Scene) -> Resul
     spec.compile_with_vfs(&files).map_err(words)
 }
 
+/// MuJoCo's own explanation.
 pub(super) fn words(e: MjEditError) -> MjError {
     MjError::Load(guard::one_line(&e.to_string()))
 }

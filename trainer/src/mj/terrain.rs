@@ -7,7 +7,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
-use super::Sim;
+use super::{Sim, pairs};
 
 /// Distance of two nodes \[m\].
 const CELL: f64 = 0.2;
@@ -52,7 +52,7 @@ impl Sim {
     /// Height of the highest solid of the world at a place \[m\], as MuJoCo's own ray from above meets it; 0 where nothing is.
     pub fn ground(&self, x: f64, y: f64) -> f64 {
         let m = &self.model().0;
-        let touches = |id: &usize| m.geom_contype()[*id] != 0 || m.geom_conaffinity()[*id] != 0;
+        let touches = |id: &usize| pairs::is_solid(m, *id);
         let of_world = |id: &usize| m.geom_bodyid()[*id] == 0 && touches(id);
         let solids = (0..m.geom_bodyid().len()).filter(of_world);
         let highest = solids.map(|id| self.top(id, x, y)).fold(f64::NEG_INFINITY, f64::max);
