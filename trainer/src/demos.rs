@@ -13,7 +13,7 @@ pub mod npz;
 mod rows;
 mod settings;
 
-pub use rows::Frame;
+pub use rows::{Frame, Frames, MIN_UNIT};
 pub use settings::{DemoReward, DemoSettings};
 
 use crate::env::Env;

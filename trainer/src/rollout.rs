@@ -4,6 +4,7 @@
 //! same bits whatever the number of threads.
 
 mod carried;
+mod demonstrated;
 mod resume;
 mod rows;
 mod scorer;

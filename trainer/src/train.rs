@@ -297,6 +297,12 @@ impl Training {
             Metrics::new()
         };
         metrics.extend(self.source.notes());
+        if self.imitation.as_ref().is_some_and(Imitation::is_tracked) {
+            let rewards =
+                self.source.gathered().into_iter().flat_map(|g| g.segment.reward.iter()).sum::<f64>();
+            metrics
+                .push(("tracking/reward", rewards / (self.settings.n_envs * self.settings.n_steps) as f64));
+        }
         self.snapshot.manifest.steps += (self.settings.n_envs * self.settings.n_steps) as u64;
         self.snapshot.manifest.version += 1;
         self.refresh();

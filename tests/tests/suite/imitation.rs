@@ -78,7 +78,7 @@ fn resuming_gives_the_same_bits() {
     let folder = tempfile::tempdir().expect("folder");
     let (file, _) = demos(folder.path());
     let task = ["bc", "soil", "dapg", "pid2-il", "bco", "gaifo"].map(|algo| (algo, "task"));
-    for (algo, reward) in task.into_iter().chain([("pid2-il", "likeness")]) {
+    for (algo, reward) in task.into_iter().chain([("pid2-il", "likeness"), ("pid2-il", "tracking")]) {
         let request = asked(algo, &file, &[&format!("train.demos.reward='{reward}'")]);
         let mut whole = Training::new(&request).expect("training");
         (0..5).for_each(|_| drop(whole.iterate()));
@@ -113,6 +113,7 @@ fn without_the_reward_of_the_task_another_one_changes_nothing() {
     };
     assert!(differs("pid2-il", "task"), "with the reward of the task another one matters");
     assert!(!differs("pid2-il", "likeness"), "it read the reward of the task");
+    assert!(!differs("pid2-il", "tracking"), "it read the reward of the task");
     assert!(!differs("gaifo", "task"), "it has no reward but likeness");
     let likeness = "train.demos.reward='likeness'";
     let mut training = Training::new(&asked("pid2-il", &file, &[likeness])).expect("training");
@@ -165,6 +166,10 @@ fn what_does_not_fit_is_refused_by_name() {
     refused(
         &asked("soil", &file, &["train.demos.reward='likeness'"]),
         &["[train.demos.reward]: \"likeness\" is for pid2-il and gaifo, and 'soil'"],
+    );
+    refused(
+        &asked("bc", &file, &["train.demos.reward='tracking'"]),
+        &["[train.demos.reward]: \"tracking\" is for soil, dapg and pid2-il, and 'bc'"],
     );
     let mut bare = demos;
     bare.episodes.iter_mut().for_each(|e| e.actions.clear());

@@ -2,16 +2,35 @@
 
 use super::Demonstrations;
 use crate::learn::Batch;
+use crate::stats::RunningStats;
 use nearl_runtime::normaliser::{CLIP, Normaliser};
 
-/// A state of the simulator.
+/// A demonstrated state from which the expert went on.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
     /// Configuration (nq), MuJoCo's convention.
     pub qpos: Vec<f64>,
     /// Velocity (nv), MuJoCo's convention.
     pub qvel: Vec<f64>,
+    /// Proposed entries of the observation one step later (n_state).
+    pub next: Vec<f64>,
+    /// Steps that the demonstration goes on for, at least 1.
+    pub left: usize,
 }
+
+/// Every state from which an expert went on, episode by episode.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frames {
+    /// All but the last state of each episode.
+    pub frames: Vec<Frame>,
+    /// Observation index of each proposed entry (n_state).
+    pub state: Vec<usize>,
+    /// Standard deviation of each proposed entry over the demonstrations, at least [`MIN_UNIT`] (n_state) \[rad, m, or as much a second\].
+    pub units: Vec<f64>,
+}
+
+/// Least unit of an entry that the demonstrations hardly move \[rad, m, or as much a second\].
+pub const MIN_UNIT: f64 = 0.05;
 
 impl Demonstrations {
     /// Transitions.
@@ -27,14 +46,23 @@ impl Demonstrations {
         self
     }
 
-    /// Every state from which an expert went on: all but the last of each episode.
-    pub fn frames(&self) -> Vec<Frame> {
-        let of = |e: &super::Episode| {
+    /// Every state from which an expert went on, with the proposed entries `state` (indices into the observation) of the one after it.
+    pub fn frames(&self, state: &[usize]) -> Frames {
+        let width = self.names.len();
+        let mut frames = Vec::with_capacity(self.n_steps());
+        let mut stats = RunningStats::new(state.len());
+        for e in &self.episodes {
             let (nq, nv) = (e.qpos.len() / (e.length + 1), e.qvel.len() / (e.length + 1));
-            let states = e.qpos.chunks_exact(nq).zip(e.qvel.chunks_exact(nv)).take(e.length);
-            states.map(|(q, v)| Frame { qpos: q.to_vec(), qvel: v.to_vec() }).collect::<Vec<_>>()
-        };
-        self.episodes.iter().flat_map(of).collect()
+            let entries =
+                e.observations.chunks_exact(width).map(|row| state.iter().map(|&k| row[k]).collect());
+            let entries: Vec<Vec<f64>> = entries.collect();
+            entries.iter().for_each(|row| stats.push(row));
+            let states = e.qpos.chunks_exact(nq).zip(e.qvel.chunks_exact(nv));
+            for (t, ((q, v), next)) in states.zip(entries.into_iter().skip(1)).enumerate() {
+                frames.push(Frame { qpos: q.to_vec(), qvel: v.to_vec(), next, left: e.length - t });
+            }
+        }
+        Frames { frames, state: state.to_vec(), units: stats.std(MIN_UNIT) }
     }
 
     /// Each transition as observation, change of the proposed entries `state` (indices into the observation) and action, in the units of

@@ -11,6 +11,8 @@ pub enum DemoReward {
     Task,
     /// How much a transition of states looks demonstrated, as `gaifo`; the reward of the task is not read.
     Likeness,
+    /// How near the state is to the demonstrated one of the same moment; the reward of the task is not read.
+    Tracking,
 }
 
 /// `[train.demos]`, read by the algorithms that learn from demonstrations.

@@ -56,6 +56,8 @@ pub struct Demonstrated {
     pub begins_there: bool,
     /// How much a transition looks demonstrated may be the reward.
     pub likeness: bool,
+    /// How near the demonstration is followed may be the reward.
+    pub tracking: bool,
 }
 
 /// Every algorithm, in the order of the paper; behind them what it is compared with.
@@ -105,6 +107,7 @@ pub const ALGORITHMS: &[RegisteredAlgorithm] = &[
             warms_up: true,
             begins_there: true,
             likeness: false,
+            tracking: false,
         }),
     },
     RegisteredAlgorithm {
@@ -117,6 +120,7 @@ pub const ALGORITHMS: &[RegisteredAlgorithm] = &[
             warms_up: true,
             begins_there: true,
             likeness: false,
+            tracking: true,
         }),
     },
     RegisteredAlgorithm {
@@ -129,6 +133,7 @@ pub const ALGORITHMS: &[RegisteredAlgorithm] = &[
             warms_up: false,
             begins_there: false,
             likeness: false,
+            tracking: true,
         }),
     },
     RegisteredAlgorithm {
@@ -141,6 +146,7 @@ pub const ALGORITHMS: &[RegisteredAlgorithm] = &[
             warms_up: true,
             begins_there: true,
             likeness: true,
+            tracking: true,
         }),
     },
     RegisteredAlgorithm {
@@ -153,6 +159,7 @@ pub const ALGORITHMS: &[RegisteredAlgorithm] = &[
             warms_up: true,
             begins_there: false,
             likeness: false,
+            tracking: false,
         }),
     },
     RegisteredAlgorithm {
@@ -165,6 +172,7 @@ pub const ALGORITHMS: &[RegisteredAlgorithm] = &[
             warms_up: false,
             begins_there: false,
             likeness: true,
+            tracking: false,
         }),
     },
 ];
@@ -212,10 +220,9 @@ impl Algorithm {
         self.registered().demos
     }
 
-    /// Names of those whose reward may be how much a transition looks demonstrated.
-    pub fn by_likeness() -> String {
-        let those = ALGORITHMS.iter().filter(|e| e.demos.is_some_and(|demos| demos.likeness));
-        those.map(|e| e.name).collect::<Vec<_>>().join(" and ")
+    /// Names of those that have such a use for demonstrations.
+    pub fn taking(use_of_it: impl Fn(&Demonstrated) -> bool) -> Vec<&'static str> {
+        ALGORITHMS.iter().filter(|e| e.demos.as_ref().is_some_and(&use_of_it)).map(|e| e.name).collect()
     }
 
     /// Names of those that learn from demonstrations.

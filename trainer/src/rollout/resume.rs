@@ -58,8 +58,9 @@ impl Worker {
         }
         put("obs", self.state.obs.clone());
         put("projector", self.controller.memory());
-        if self.frames.is_some() {
-            put("from_frame", vec![f64::from(u8::from(self.from_frame))]);
+        if let Some(d) = &self.demonstrated {
+            put("from_frame", vec![f64::from(u8::from(d.from_frame))]);
+            d.frame().into_iter().for_each(|at| put("frame", vec![at as f64]));
         }
         Ok(())
     }
@@ -83,8 +84,11 @@ impl Worker {
         let (sums, obs) = (take("sums", Some(3))?, take("obs", Some(self.state.obs.len()))?);
         let discounted_cost = if spec.has_cost { take("discounted_cost", Some(1))?[0] } else { 0.0 };
         let memory = take("projector", Some(self.controller.memory().len()))?;
-        if self.frames.is_some() {
-            self.from_frame = take("from_frame", Some(1))? == [1.0];
+        if let Some(d) = &mut self.demonstrated {
+            d.from_frame = take("from_frame", Some(1))? == [1.0];
+            if d.frame().is_some() {
+                d.stand_at(take("frame", Some(1))?[0] as usize);
+            }
         }
         let changed =
             || format!("environment {i} does not repeat its episode: task, robot or MuJoCo changed");

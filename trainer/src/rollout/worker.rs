@@ -2,16 +2,16 @@
 
 mod stream;
 
+use super::demonstrated::Demonstrated;
 use super::resume::Episode;
 use super::{Period, RolloutError, Rows, Scorer};
-use crate::demos::{self, Frame};
+use crate::demos::{self, Frame, Frames};
 use crate::env::{Env, EnvError, Fault};
 use crate::foresight::{Foresight, Verdict};
 use crate::plant::watched_limits;
 use nearl_runtime::constraints::{Guard, LimitSet};
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Excess, Networks, Noise, Output, PolicyKind, Snapshot, State};
-use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use std::sync::Arc;
@@ -55,10 +55,8 @@ pub struct Worker {
     /// Policy steps left in the segment.
     left: usize,
     pub(super) history: Episode,
-    /// Demonstrated states, and the share of the episodes that begin in one.
-    pub(super) frames: Option<(Arc<[Frame]>, f64)>,
-    /// The present episode began in one: its return counts nowhere.
-    pub(super) from_frame: bool,
+    /// Demonstrations in whose states episodes begin.
+    pub(super) demonstrated: Option<Demonstrated>,
     /// What was collected in the segment.
     pub rows: Rows,
 }
@@ -104,8 +102,7 @@ impl Worker {
             beyond: None,
             left: 0,
             history: Episode::default(),
-            frames: None,
-            from_frame: false,
+            demonstrated: None,
         };
         worker.restart()?;
         Ok(worker)
@@ -138,20 +135,18 @@ impl Worker {
         self.scorer = Some((scorer, vec![0.0; self.state.obs.len()]));
     }
 
-    /// Lets that share of the episodes to come begin in one of the frames.
-    pub(crate) fn begin_in(&mut self, frames: Arc<[Frame]>, share: f64) {
-        self.frames = (!frames.is_empty()).then_some((frames, share));
+    /// Lets that share of the episodes to come begin in one of the frames; the reward of the learner is how near they are followed if
+    /// `tracked`.
+    pub(crate) fn begin_in(&mut self, frames: Arc<Frames>, share: f64, tracked: bool) {
+        self.demonstrated = Demonstrated::new(frames, share, tracked);
     }
 
     fn restart(&mut self) -> Result<(), EnvError> {
         self.env.reset(&mut self.rng)?;
-        self.from_frame = false;
-        if let Some((frames, share)) = &self.frames
-            && self.rng.random::<f64>() < *share
+        if let Some(demonstrated) = &mut self.demonstrated
+            && let Some(Frame { qpos, qvel, .. }) = demonstrated.begin(self.env.qpos(), &mut self.rng)
         {
-            let Frame { qpos, qvel } = &frames[self.rng.random_range(0..frames.len())];
             self.env.set_state(qpos, qvel)?;
-            self.from_frame = true;
         }
         self.history.begin(&*self.env);
         self.controller.reset();
@@ -195,9 +190,12 @@ impl Worker {
             self.draw(true);
             self.env.privileged(&mut self.privileged[0]);
             let costed = self.cost;
-            let (reward, terminated) = self.policy_step();
+            let (mut reward, terminated) = self.policy_step();
             let cost = self.cost - costed;
-            let truncated = self.ticks >= self.env.spec().max_episode_steps;
+            let mut truncated = self.ticks >= self.env.spec().max_episode_steps;
+            if let Some((near, ended)) = self.demonstrated.as_mut().and_then(|d| d.step(&self.state.obs)) {
+                (reward, truncated) = (near, truncated || ended);
+            }
             self.controller.peek(&self.state, &mut self.seen);
             let (before, after, seen, moved) =
                 (&self.before[..], &self.state.obs[..], &self.seen[..], self.moved);
@@ -217,7 +215,7 @@ impl Worker {
             };
             self.rows.push(&period, self.controller.normaliser());
             if terminated || truncated {
-                if !self.from_frame {
+                if !self.demonstrated.as_ref().is_some_and(|d| d.from_frame) {
                     self.rows.collected.tally.episodes.push(self.episode);
                     self.rows.collected.tally.costs.push(self.cost);
                     self.rows.collected.tally.note(self.env.notes());

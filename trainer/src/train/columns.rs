@@ -51,6 +51,7 @@ pub const COLUMNS: &[&str] = &[
     "likeness/loss",
     "likeness/accuracy",
     "likeness/reward",
+    "tracking/reward",
     "cost/multiplier",
     "cost/value_loss",
 ];

@@ -57,10 +57,15 @@ impl Imitation {
             }
             (Some(uses), false) => uses,
         };
-        if own.reward == DemoReward::Likeness && !uses.likeness {
+        let (word, those) = match own.reward {
+            DemoReward::Task => ("task", None),
+            DemoReward::Likeness => ("likeness", Some(Algorithm::taking(|uses| uses.likeness))),
+            DemoReward::Tracking => ("tracking", Some(Algorithm::taking(|uses| uses.tracking))),
+        };
+        if let Some(those) = those.filter(|those| !those.contains(&algo.name())) {
             return Err(TrainError::Settings(format!(
-                "[train.demos.reward]: \"likeness\" is for {}, and '{algo}' has no use for it; leave it out, or take one of these",
-                Algorithm::by_likeness()
+                "[train.demos.reward]: \"{word}\" is for {}, and '{algo}' has no use for it; leave it out, or take one of these",
+                listed(&those)
             )));
         }
         let wrong = |reason| TrainError::Demos(DemoError { file: own.file.clone(), reason });
@@ -90,22 +95,31 @@ impl Imitation {
         self.updates = updates(steps, self.batch, self.warm_ups);
     }
 
-    /// Lets episodes begin in the demonstrations' states.
+    /// Whether how near the demonstrations are followed is the reward.
+    pub(super) fn is_tracked(&self) -> bool {
+        self.settings.reward == DemoReward::Tracking
+    }
+
+    /// Lets episodes begin in the demonstrations' states, and be rewarded by how near they follow them if that is the reward.
     ///
     /// # Errors
     /// [`TrainError::Settings`] where the experience comes from elsewhere.
     pub(super) fn place(&self, source: &mut dyn Source) -> Result<(), TrainError> {
-        if !self.begins_in_frames || self.settings.resets == 0.0 {
+        let tracked = self.is_tracked();
+        let resets = if self.begins_in_frames { self.settings.resets } else { 0.0 };
+        if resets == 0.0 && !tracked {
             return Ok(());
         }
-        if source.begin_in(&self.demos.frames().into(), self.settings.resets) {
+        if source.begin_in(&self.demos.frames(&self.state).into(), resets, tracked) {
             return Ok(());
         }
-        Err(TrainError::Settings(
-            "[train.demos.resets]: episodes can begin in demonstrated states in environments of this process alone; leave --from and --collect \
-             out, or set it to 0"
-                .into(),
-        ))
+        let (key, what, next) = match tracked {
+            true => ("reward", "demonstrations can be tracked", "take another reward"),
+            false => ("resets", "episodes can begin in demonstrated states", "set it to 0"),
+        };
+        Err(TrainError::Settings(format!(
+            "[train.demos.{key}]: {what} in environments of this process alone; leave --from and --collect out, or {next}"
+        )))
     }
 
     /// Adds what was demonstrated to the statistics of observations and of changes.
@@ -161,6 +175,15 @@ impl Imitation {
     /// The file, for messages.
     pub(super) fn file(&self) -> &str {
         &self.settings.file
+    }
+}
+
+/// `a`, `a and b`, `a, b and c`.
+fn listed(names: &[&str]) -> String {
+    match names.split_last() {
+        Some((last, [])) => (*last).into(),
+        Some((last, others)) => format!("{} and {last}", others.join(", ")),
+        None => String::new(),
     }
 }
 

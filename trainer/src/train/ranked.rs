@@ -5,7 +5,7 @@
 
 use super::source::{Source, SourceError};
 use crate::checkpoint::{Checkpoint, FORMAT, Header, Values, WorkerHeader};
-use crate::demos::Frame;
+use crate::demos::Frames;
 use crate::ranks::{RankError, Ranks};
 use crate::rollout::{Collected, Collector};
 use crate::settings::TrainSettings;
@@ -153,8 +153,8 @@ impl Source for RankedSource {
         workers.for_each(|(i, worker)| worker.set_projection(first + i < projecting));
     }
 
-    fn begin_in(&mut self, frames: &Arc<[Frame]>, share: f64) -> bool {
-        self.collector.begin_in(frames, share)
+    fn begin_in(&mut self, frames: &Arc<Frames>, share: f64, tracked: bool) -> bool {
+        self.collector.begin_in(frames, share, tracked)
     }
 
     fn gathered(&mut self) -> Vec<&Collected> {

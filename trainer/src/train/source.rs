@@ -3,7 +3,7 @@
 use super::ranked::RankedSource;
 use super::served::{ServedError, ServedSource};
 use crate::checkpoint::Checkpoint;
-use crate::demos::Frame;
+use crate::demos::Frames;
 use crate::online::{LoopSource, OnlineError};
 use crate::ranks::{RankError, Ranks};
 use crate::rollout::{Collected, Collector, RolloutError, Scorer};
@@ -59,8 +59,9 @@ pub trait Source: Send {
     fn collect(&mut self, snapshot: &Snapshot) -> Result<bool, SourceError>;
     /// Lets that share of the environments project while they collect, where they are of this process.
     fn project(&mut self, _share: f64) {}
-    /// Lets that share of the episodes begin in one of the frames; false where they begin elsewhere.
-    fn begin_in(&mut self, _frames: &Arc<[Frame]>, _share: f64) -> bool {
+    /// Lets that share of the episodes begin in one of the frames, and the reward be how near they are followed if `tracked`; false where
+    /// episodes begin elsewhere.
+    fn begin_in(&mut self, _frames: &Arc<Frames>, _share: f64, _tracked: bool) -> bool {
         false
     }
     /// What was collected last.
@@ -98,8 +99,8 @@ impl Source for Collector {
         self.workers().enumerate().for_each(|(i, worker)| worker.set_projection(i < projecting));
     }
 
-    fn begin_in(&mut self, frames: &Arc<[Frame]>, share: f64) -> bool {
-        self.workers().for_each(|worker| worker.begin_in(Arc::clone(frames), share));
+    fn begin_in(&mut self, frames: &Arc<Frames>, share: f64, tracked: bool) -> bool {
+        self.workers().for_each(|worker| worker.begin_in(Arc::clone(frames), share, tracked));
         true
     }
 
