@@ -12,7 +12,7 @@ pub struct Frame {
     pub qpos: Vec<f64>,
     /// Velocity (nv), MuJoCo's convention.
     pub qvel: Vec<f64>,
-    /// Proposed entries of the observation one step later (n_state).
+    /// What is followed of the observation one step later.
     pub next: Vec<f64>,
     /// Steps that the demonstration goes on for, at least 1.
     pub left: usize,
@@ -23,14 +23,17 @@ pub struct Frame {
 pub struct Frames {
     /// All but the last state of each episode.
     pub frames: Vec<Frame>,
-    /// Observation index of each proposed entry (n_state).
-    pub state: Vec<usize>,
-    /// Standard deviation of each proposed entry over the demonstrations, at least [`MIN_UNIT`] (n_state) \[rad, m, or as much a second\].
+    /// Observation index of each entry that is followed.
+    pub followed: Vec<usize>,
+    /// Standard deviation of each of these over the demonstrations, at least [`MIN_UNIT`] \[rad, m\].
     pub units: Vec<f64>,
 }
 
-/// Least unit of an entry that the demonstrations hardly move \[rad, m, or as much a second\].
+/// Least unit of an entry that the demonstrations hardly move \[rad, m\].
 pub const MIN_UNIT: f64 = 0.05;
+
+/// How names of speeds begin. They jitter with every action, and follow where positions do.
+const SPEED: &str = "v.";
 
 impl Demonstrations {
     /// Transitions.
@@ -46,15 +49,19 @@ impl Demonstrations {
         self
     }
 
-    /// Every state from which an expert went on, with the proposed entries `state` (indices into the observation) of the one after it.
+    /// Every state from which an expert went on, with what is to be followed of the one after it: of the proposed entries `state` (indices
+    /// into the observation) all that are no speeds, or all where there is nothing else.
     pub fn frames(&self, state: &[usize]) -> Frames {
         let width = self.names.len();
+        let (speeds, places): (Vec<_>, Vec<_>) =
+            state.iter().partition(|&&k| self.names[k].starts_with(SPEED));
+        let followed: Vec<usize> = if places.is_empty() { speeds } else { places };
         let mut frames = Vec::with_capacity(self.n_steps());
-        let mut stats = RunningStats::new(state.len());
+        let mut stats = RunningStats::new(followed.len());
         for e in &self.episodes {
             let (nq, nv) = (e.qpos.len() / (e.length + 1), e.qvel.len() / (e.length + 1));
             let entries =
-                e.observations.chunks_exact(width).map(|row| state.iter().map(|&k| row[k]).collect());
+                e.observations.chunks_exact(width).map(|row| followed.iter().map(|&k| row[k]).collect());
             let entries: Vec<Vec<f64>> = entries.collect();
             entries.iter().for_each(|row| stats.push(row));
             let states = e.qpos.chunks_exact(nq).zip(e.qvel.chunks_exact(nv));
@@ -62,7 +69,7 @@ impl Demonstrations {
                 frames.push(Frame { qpos: q.to_vec(), qvel: v.to_vec(), next, left: e.length - t });
             }
         }
-        Frames { frames, state: state.to_vec(), units: stats.std(MIN_UNIT) }
+        Frames { frames, followed, units: stats.std(MIN_UNIT) }
     }
 
     /// Each transition as observation, change of the proposed entries `state` (indices into the observation) and action, in the units of

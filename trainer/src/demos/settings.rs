@@ -11,7 +11,7 @@ pub enum DemoReward {
     Task,
     /// How much a transition of states looks demonstrated, as `gaifo`; the reward of the task is not read.
     Likeness,
-    /// How near the state is to the demonstrated one of the same moment; the reward of the task is not read.
+    /// How near the proposed positions are to the demonstrated ones of the same moment; the reward of the task is not read.
     Tracking,
 }
 
@@ -25,6 +25,8 @@ pub struct DemoSettings {
     pub episodes: usize,
     /// What `pid2-il` is rewarded by.
     pub reward: DemoReward,
+    /// With [`DemoReward::Tracking`], an episode ends once a step is worth less than this; 0: never.
+    pub stray: f64,
     /// Share of the episodes that begin in a random frame of the demonstrations, for `bc`, `soil` and `pid2-il`.
     pub resets: f64,
     /// Steps of the fresh networks' own noise from which the inverse model learns before anything else; no effect for `dapg` and `gaifo`.
@@ -51,6 +53,7 @@ impl Default for DemoSettings {
             file: String::new(),
             episodes: 0,
             reward: DemoReward::default(),
+            stray: 0.0,
             resets: 0.5,
             warmup: 16_384,
             epochs: 20,
@@ -80,6 +83,7 @@ impl DemoSettings {
         let (share, at_least, above): (Domain, Domain, Domain) =
             ((share, "within [0, 1]"), (at_least, "at least 0"), (above, "above 0"));
         for (key, value, (allowed, domain)) in [
+            ("stray", self.stray, share),
             ("resets", self.resets, share),
             ("lr", f64::from(self.lr), above),
             ("weight", self.weight, at_least),

@@ -135,9 +135,9 @@ impl Worker {
         self.scorer = Some((scorer, vec![0.0; self.state.obs.len()]));
     }
 
-    /// Lets that share of the episodes to come begin in one of the frames; the reward of the learner is how near they are followed if
-    /// `tracked`.
-    pub(crate) fn begin_in(&mut self, frames: Arc<Frames>, share: f64, tracked: bool) {
+    /// Lets that share of the episodes to come begin in one of the frames. Where something is `tracked` the reward of the learner is how near
+    /// they are followed, and an episode ends below that.
+    pub(crate) fn begin_in(&mut self, frames: Arc<Frames>, share: f64, tracked: Option<f64>) {
         self.demonstrated = Demonstrated::new(frames, share, tracked);
     }
 
@@ -190,11 +190,11 @@ impl Worker {
             self.draw(true);
             self.env.privileged(&mut self.privileged[0]);
             let costed = self.cost;
-            let (mut reward, terminated) = self.policy_step();
+            let (mut reward, mut terminated) = self.policy_step();
             let cost = self.cost - costed;
             let mut truncated = self.ticks >= self.env.spec().max_episode_steps;
-            if let Some((near, ended)) = self.demonstrated.as_mut().and_then(|d| d.step(&self.state.obs)) {
-                (reward, truncated) = (near, truncated || ended);
+            if let Some(f) = self.demonstrated.as_mut().and_then(|d| d.step(&self.state.obs)) {
+                (reward, terminated, truncated) = (f.worth, terminated || f.strayed, truncated || f.ended);
             }
             self.controller.peek(&self.state, &mut self.seen);
             let (before, after, seen, moved) =

@@ -105,15 +105,15 @@ impl Imitation {
     /// # Errors
     /// [`TrainError::Settings`] where the experience comes from elsewhere.
     pub(super) fn place(&self, source: &mut dyn Source) -> Result<(), TrainError> {
-        let tracked = self.is_tracked();
+        let tracked = self.is_tracked().then_some(self.settings.stray);
         let resets = if self.begins_in_frames { self.settings.resets } else { 0.0 };
-        if resets == 0.0 && !tracked {
+        if resets == 0.0 && tracked.is_none() {
             return Ok(());
         }
         if source.begin_in(&self.demos.frames(&self.state).into(), resets, tracked) {
             return Ok(());
         }
-        let (key, what, next) = match tracked {
+        let (key, what, next) = match tracked.is_some() {
             true => ("reward", "demonstrations can be tracked", "take another reward"),
             false => ("resets", "episodes can begin in demonstrated states", "set it to 0"),
         };

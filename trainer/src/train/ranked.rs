@@ -153,7 +153,7 @@ impl Source for RankedSource {
         workers.for_each(|(i, worker)| worker.set_projection(first + i < projecting));
     }
 
-    fn begin_in(&mut self, frames: &Arc<Frames>, share: f64, tracked: bool) -> bool {
+    fn begin_in(&mut self, frames: &Arc<Frames>, share: f64, tracked: Option<f64>) -> bool {
         self.collector.begin_in(frames, share, tracked)
     }
 

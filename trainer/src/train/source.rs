@@ -59,9 +59,9 @@ pub trait Source: Send {
     fn collect(&mut self, snapshot: &Snapshot) -> Result<bool, SourceError>;
     /// Lets that share of the environments project while they collect, where they are of this process.
     fn project(&mut self, _share: f64) {}
-    /// Lets that share of the episodes begin in one of the frames, and the reward be how near they are followed if `tracked`; false where
-    /// episodes begin elsewhere.
-    fn begin_in(&mut self, _frames: &Arc<Frames>, _share: f64, _tracked: bool) -> bool {
+    /// Lets that share of the episodes begin in one of the frames; where something is `tracked` the reward is how near they are followed,
+    /// and an episode ends below that. False where episodes begin elsewhere.
+    fn begin_in(&mut self, _frames: &Arc<Frames>, _share: f64, _tracked: Option<f64>) -> bool {
         false
     }
     /// What was collected last.
@@ -99,7 +99,7 @@ impl Source for Collector {
         self.workers().enumerate().for_each(|(i, worker)| worker.set_projection(i < projecting));
     }
 
-    fn begin_in(&mut self, frames: &Arc<Frames>, share: f64, tracked: bool) -> bool {
+    fn begin_in(&mut self, frames: &Arc<Frames>, share: f64, tracked: Option<f64>) -> bool {
         self.workers().for_each(|worker| worker.begin_in(Arc::clone(frames), share, tracked));
         true
     }
