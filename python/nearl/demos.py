@@ -74,7 +74,7 @@ def from_columns(
             _unit(env, qpos)
         if len(qpos) < 2:
             raise BadDemonstrations(f"{source}, episode {i}: {len(qpos)} rows make no transition; give at least 2")
-        parts["observations"].append(np.stack([env.set_state(q, v) for q, v in zip(qpos, qvel)]))
+        parts["observations"].append(np.stack([env.set_state(q, v, k * period) for k, (q, v) in enumerate(zip(qpos, qvel))]))
         parts["qpos"].append(qpos)
         parts["qvel"].append(qvel)
         if actions:

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 
 use nearl_runtime::Snapshot;
-use nearl_trainer::env::{self, ChaCha8Rng, Fault, SeedableRng};
+use nearl_trainer::env::{self, ChaCha8Rng, EnvError, Fault, SeedableRng};
 use nearl_trainer::run_folder;
 use nearl_trainer::tasks as task_files;
 use numpy::PyArray1;
@@ -89,15 +89,24 @@ impl Env {
         Ok(array(py, &obs.map_err(errors::value)?))
     }
 
-    /// Starts an episode from `qpos` (nq) and `qvel` (nv), MuJoCo's convention. Returns the observation (n_obs).
+    /// Starts an episode from `qpos` (nq) and `qvel` (nv), MuJoCo's convention, `time` seconds after its beginning. Returns the observation (n_obs).
+    #[pyo3(signature = (qpos, qvel, time=0.0))]
     fn set_state<'py>(
         &self,
         py: Python<'py>,
         qpos: &Bound<'py, PyAny>,
         qvel: &Bound<'py, PyAny>,
+        time: f64,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let (qpos, qvel) = (vector("qpos", qpos, self.spec.nq)?, vector("qvel", qvel, self.spec.nv)?);
-        let obs = self.with(py, |inner| inner.env.set_state(&qpos, &qvel).map(|()| inner.observation()));
+        if !time.is_finite() {
+            return Err(errors::value(format!("time is {time}; give the seconds since the episode began")));
+        }
+        let obs = self.with(py, |inner| {
+            inner.env.set_state(&qpos, &qvel)?;
+            inner.env.set_time(time);
+            Ok::<_, EnvError>(inner.observation())
+        });
         Ok(array(py, &obs.map_err(errors::value)?))
     }
 

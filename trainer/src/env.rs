@@ -121,6 +121,9 @@ pub trait Env: Send {
     /// [`EnvError::Physics`] for a wrong length or an entry that is not finite (the state is then unchanged).
     fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), EnvError>;
 
+    /// Sets the time in the episode \[s\], which [`Env::set_state`] begins at 0.
+    fn set_time(&mut self, time: f64);
+
     /// Simulates one control period ([`Spec::dt`]) under `action` (n_act), held constant and clamped to its range by the
     /// plant.
     ///

@@ -21,6 +21,11 @@ fn demos(folder: &Path) -> (PathBuf, Demonstrations) {
 
 /// A small training with these demonstrations.
 fn asked(algo: &str, file: &Path, more: &[&str]) -> Request {
+    asked_of(TASK, algo, file, more)
+}
+
+/// The same of another task.
+fn asked_of(task: &str, algo: &str, file: &Path, more: &[&str]) -> Request {
     let file = format!("train.demos.file='{}'", file.display());
     let set = [
         "train.n_envs=4",
@@ -31,7 +36,7 @@ fn asked(algo: &str, file: &Path, more: &[&str]) -> Request {
         "train.demos.warmup=640",
         &file,
     ];
-    Request { steps: 8 * 640, ..request(TASK, algo, 5, 1, &[set.as_slice(), more].concat()) }
+    Request { steps: 8 * 640, ..request(task, algo, 5, 1, &[set.as_slice(), more].concat()) }
 }
 
 #[test]
@@ -48,7 +53,7 @@ fn episodes_begin_in_states_of_the_file_bit_for_bit() {
     };
     let e = &demos.episodes;
     let (nq, nv) = (e[0].qpos.len() / (e[0].length + 1), e[0].qvel.len() / (e[0].length + 1));
-    let begun: Vec<usize> = (0..4).filter(|i| of(&format!("env.{i}.from_frame")) == [1.0]).collect();
+    let begun: Vec<usize> = (0..4).filter(|i| of(&format!("env.{i}.from_frame"))[0] == 1.0).collect();
     assert!(begun.len() >= 2, "a fresh policy falls within 320 steps: {begun:?}");
     for i in begun {
         let (qpos, qvel) = (of(&format!("env.{i}.qpos")), of(&format!("env.{i}.qvel")));
@@ -58,6 +63,50 @@ fn episodes_begin_in_states_of_the_file_bit_for_bit() {
         });
         assert!(is_there, "environment {i} began in no state of the file");
     }
+}
+
+/// A policy that sees the time sees that of the demonstration, also after a stop.
+#[test]
+fn an_episode_that_begins_in_a_state_goes_on_at_its_time() {
+    let folder = tempfile::tempdir().expect("folder");
+    let example = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/tasks");
+    let text = std::fs::read_to_string(example.join("cart-pole.toml")).expect("example");
+    let task = folder.path().join("timed.toml");
+    std::fs::copy(example.join("cart-pole.xml"), folder.path().join("cart-pole.xml")).expect("robot");
+    std::fs::write(&task, text.replacen("\"v.hinge\"]", "\"v.hinge\", \"time\"]", 1)).expect("task");
+    let task = task.display().to_string();
+    let snapshot = training(&task, "pid2-ib", 3, 1, &[]).snapshot().clone();
+    let (demos, _) = record(&snapshot, 4, 1).expect("episodes");
+    let file = folder.path().join("demos.npz");
+    demos.save(&file).expect("saved");
+    let request =
+        asked_of(&task, "pid2-il", &file, &["train.demos.resets=1.0", "train.demos.reward='tracking'"]);
+    let run = |training: &mut Training, n: usize| (0..n).for_each(|_| drop(training.iterate()));
+    let mut whole = Training::new(&request).expect("training");
+    run(&mut whole, 3);
+    let checkpoint = whole.checkpoint().expect("checkpoint");
+    let of = |name: String| match &checkpoint.tensors[&name] {
+        Values::F64(v) => v.clone(),
+        Values::F32(_) => panic!("{name} is narrow"),
+    };
+    let mut late = 0;
+    for i in 0..4 {
+        let (began, obs) = (of(format!("env.{i}.from_frame"))[1], of(format!("env.{i}.obs")));
+        let since = of(format!("env.{i}.actions")).len() as f64 * 0.02;
+        assert!((obs[5] - began - since).abs() < 1e-9, "{obs:?}: began at {began} s, {since} s ago");
+        let qpos = of(format!("env.{i}.qpos"));
+        let frame = (began / 0.02).round() as usize;
+        assert!(
+            demos.episodes.iter().any(|e| e.qpos.chunks_exact(2).nth(frame) == Some(&qpos[..])),
+            "frame {frame}"
+        );
+        late += usize::from(frame > 0);
+    }
+    assert!(late > 0, "some episode begins in the middle of a demonstration");
+    let mut second = Training::resume(checkpoint, Path::new("run"), None, 2).expect("resumed");
+    run(&mut whole, 2);
+    run(&mut second, 2);
+    assert!(bits(&mut whole) == bits(&mut second), "other bits after a stop");
 }
 
 /// Weights, statistics and what was reported, without the clock.

@@ -12,6 +12,8 @@ pub struct Frame {
     pub qpos: Vec<f64>,
     /// Velocity (nv), MuJoCo's convention.
     pub qvel: Vec<f64>,
+    /// Time since the episode began \[s\].
+    pub time: f64,
     /// What is followed of the observation one step later.
     pub next: Vec<f64>,
     /// Steps that the demonstration goes on for, at least 1.
@@ -66,7 +68,8 @@ impl Demonstrations {
             entries.iter().for_each(|row| stats.push(row));
             let states = e.qpos.chunks_exact(nq).zip(e.qvel.chunks_exact(nv));
             for (t, ((q, v), next)) in states.zip(entries.into_iter().skip(1)).enumerate() {
-                frames.push(Frame { qpos: q.to_vec(), qvel: v.to_vec(), next, left: e.length - t });
+                let time = t as f64 * self.dt;
+                frames.push(Frame { qpos: q.to_vec(), qvel: v.to_vec(), time, next, left: e.length - t });
             }
         }
         Frames { frames, followed, units: stats.std(MIN_UNIT) }

@@ -135,6 +135,11 @@ impl<R: Rules> Env for Simulated<R> {
         set.map_err(self.physics())
     }
 
+    fn set_time(&mut self, time: f64) {
+        self.foreseen.clear();
+        self.sim.set_time(time);
+    }
+
     fn step(&mut self, action: &[f64]) -> Step {
         assert_eq!(action.len(), self.spec.n_act(), "the action of '{}' has another length", self.spec.name);
         if action.iter().any(|a| !a.is_finite()) {

@@ -16,6 +16,8 @@ pub(super) struct Demonstrated {
     at: usize,
     /// The present episode began in a frame: its return counts nowhere.
     pub(super) from_frame: bool,
+    /// Time in the demonstration at which it did, otherwise 0 \[s\].
+    pub(super) began: f64,
 }
 
 /// A policy step beside a demonstration.
@@ -32,7 +34,14 @@ pub(super) struct Followed {
 impl Demonstrated {
     /// `None` without frames.
     pub(super) fn new(demos: Arc<Frames>, share: f64, tracked: Option<f64>) -> Option<Self> {
-        (!demos.frames.is_empty()).then_some(Self { demos, share, tracked, at: 0, from_frame: false })
+        (!demos.frames.is_empty()).then_some(Self {
+            demos,
+            share,
+            tracked,
+            at: 0,
+            from_frame: false,
+            began: 0.0,
+        })
     }
 
     /// The frame of the present moment, where that matters.
@@ -50,8 +59,10 @@ impl Demonstrated {
     pub(super) fn begin(&mut self, qpos: &[f64], rng: &mut ChaCha8Rng) -> Option<&Frame> {
         let frames = &self.demos.frames;
         self.from_frame = rng.random::<f64>() < self.share;
+        self.began = 0.0;
         if self.from_frame {
             self.at = rng.random_range(0..frames.len());
+            self.began = frames[self.at].time;
             return Some(&frames[self.at]);
         }
         if self.tracked.is_some() {

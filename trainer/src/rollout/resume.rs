@@ -59,7 +59,7 @@ impl Worker {
         put("obs", self.state.obs.clone());
         put("projector", self.controller.memory());
         if let Some(d) = &self.demonstrated {
-            put("from_frame", vec![f64::from(u8::from(d.from_frame))]);
+            put("from_frame", vec![f64::from(u8::from(d.from_frame)), d.began]);
             d.frame().into_iter().for_each(|at| put("frame", vec![at as f64]));
         }
         Ok(())
@@ -85,7 +85,8 @@ impl Worker {
         let discounted_cost = if spec.has_cost { take("discounted_cost", Some(1))?[0] } else { 0.0 };
         let memory = take("projector", Some(self.controller.memory().len()))?;
         if let Some(d) = &mut self.demonstrated {
-            d.from_frame = take("from_frame", Some(1))? == [1.0];
+            let from_frame = take("from_frame", Some(2))?;
+            (d.from_frame, d.began) = (from_frame[0] == 1.0, from_frame[1]);
             if d.frame().is_some() {
                 d.stand_at(take("frame", Some(1))?[0] as usize);
             }
@@ -98,6 +99,9 @@ impl Worker {
             self.env.set_goal(&e.goal).map_err(|e| e.to_string())?;
         }
         self.env.set_state(&e.qpos, &e.qvel).map_err(|e| e.to_string())?;
+        if let Some(d) = &self.demonstrated {
+            self.env.set_time(d.began);
+        }
         for action in e.actions.chunks_exact(n_act.max(1)) {
             if self.env.step(action).terminated {
                 return Err(changed());

@@ -144,9 +144,10 @@ impl Worker {
     fn restart(&mut self) -> Result<(), EnvError> {
         self.env.reset(&mut self.rng)?;
         if let Some(demonstrated) = &mut self.demonstrated
-            && let Some(Frame { qpos, qvel, .. }) = demonstrated.begin(self.env.qpos(), &mut self.rng)
+            && let Some(Frame { qpos, qvel, time, .. }) = demonstrated.begin(self.env.qpos(), &mut self.rng)
         {
             self.env.set_state(qpos, qvel)?;
+            self.env.set_time(*time);
         }
         self.history.begin(&*self.env);
         self.controller.reset();

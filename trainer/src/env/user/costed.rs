@@ -44,6 +44,10 @@ impl Env for Costed {
         self.inner.set_state(qpos, qvel)
     }
 
+    fn set_time(&mut self, time: f64) {
+        self.inner.set_time(time);
+    }
+
     fn step(&mut self, action: &[f64]) -> Step {
         self.before.remember(self.inner.sim());
         let step = self.inner.step(action);
