@@ -68,6 +68,8 @@ pub(super) struct Combined {
     pub(super) ppo: PpoSettings,
     /// How the gradient passes the projection.
     pub(super) gradient: Gradient,
+    /// Weight of the squared distance between a proposal and its projection in the policy's loss.
+    pub(super) bound_weight: f32,
     /// Meta policy.
     pub(super) policy: Net,
     /// Spread of a stochastic meta policy.
@@ -131,8 +133,18 @@ impl Combined {
             model.init(&mut group.p, rng);
             set_lanes(&mut group.p[range.clone()], dims.n_act, ppo.log_std);
         }
-        let combined =
-            Self { dims, ppo, gradient, policy, policy_log_std, inverse, value, policy_range, len: at };
+        let combined = Self {
+            dims,
+            ppo,
+            gradient,
+            bound_weight: 0.0,
+            policy,
+            policy_log_std,
+            inverse,
+            value,
+            policy_range,
+            len: at,
+        };
         combined.refresh(&mut group);
         (combined, [group, value_group])
     }

@@ -72,6 +72,9 @@ pub struct Pid2Settings {
     pub alpha: f32,
     /// How the policy gradient passes the projection.
     pub gradient: Gradient,
+    /// Weight of the squared distance between a proposal and its projection in the policy's loss (of the proposed change in its
+    /// standard deviations): what was clamped has no other way back. No effect with `exploration = "proposal"`.
+    pub bound_weight: f32,
 }
 
 impl Default for Pid2Settings {
@@ -91,6 +94,7 @@ impl Default for Pid2Settings {
             beta: 0.1,
             alpha: 1e-5,
             gradient: Gradient::default(),
+            bound_weight: 0.0,
         }
     }
 }
@@ -178,7 +182,8 @@ impl Pid2 {
     ) -> Self {
         let (lr, value_lr) = (ppo.lr, ppo.rate_of_value());
         let discriminator = Discriminator::new(dims.n_state, dims.n_obs, nets, bottleneck);
-        let (combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
+        let (mut combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
+        combined.bound_weight = settings.bound_weight;
         let d = &discriminator;
         let mut adversary = Group { p: vec![ZERO; d.len], transposed: vec![ZERO; d.transposed] };
         d.init(&mut adversary.p, rng);

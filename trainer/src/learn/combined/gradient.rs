@@ -82,7 +82,27 @@ impl Combined {
                 du[k] = if self.gradient.passes(u[k], x, dx) { dx } else { 0.0 };
             }
         }
+        self.pull_inside(t, w);
         (sums, clamped as f32)
+    }
+
+    /// Adds the gradient of `bound_weight |u - C(u)|² / 2` to `dL / du`: what was clamped has no other way back.
+    #[inline(always)]
+    fn pull_inside(&self, t: &Tile<'_>, w: &mut CombinedScratch) {
+        if self.bound_weight == 0.0 {
+            return;
+        }
+        let s = self.dims.n_state;
+        let sv = s.div_ceil(LANES);
+        let u = scalars(w.policy.output()).chunks_exact(sv * LANES);
+        let rows = scalars_mut(&mut w.d_change).chunks_exact_mut(sv * LANES).zip(u);
+        for ((du, u), &i) in rows.zip(t.idx) {
+            let of = i as usize * s..(i as usize + 1) * s;
+            let (lower, upper) = (&t.batch.lower[of.clone()], &t.batch.upper[of]);
+            for (((du, &u), &l), &h) in du.iter_mut().zip(u).zip(lower).zip(upper) {
+                *du += self.bound_weight * t.scale * (u - u.max(l).min(h));
+            }
+        }
     }
 
     /// Input rows of the inverse model from the policy's current output, projected as when it was collected; returns how many

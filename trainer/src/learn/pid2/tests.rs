@@ -10,6 +10,7 @@ use nearl_runtime::net::kernel::{LANES, scalars};
 use nearl_runtime::net::{Activation, Dense};
 
 const LIMIT: f64 = 2e-4;
+const BOUND: f32 = 0.4;
 const TANH: Activation = Activation::Tanh;
 const RELU: Activation = Activation::Relu;
 
@@ -37,7 +38,13 @@ fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2,
     let ppo = PpoSettings { log_std: -0.3, ..PpoSettings::default() };
     // Of the three, only this is the derivative of a loss.
     let gradient = Gradient::Projection;
-    let settings = Pid2Settings { generator_weight: 0.7, beta: 0.2, gradient, ..Pid2Settings::default() };
+    let settings = Pid2Settings {
+        generator_weight: 0.7,
+        beta: 0.2,
+        gradient,
+        bound_weight: BOUND,
+        ..Pid2Settings::default()
+    };
     let mut rng = crate::rollout::stream(1, 1);
     let kind = Kind { stochastic, learned: !stochastic };
     let mut l = Pid2::new(dims(), &nets, ppo, settings, kind, bottleneck, 1, &mut rng);
@@ -115,10 +122,12 @@ fn actor_loss(l: &Pid2, b: &Batch, n: &Nets64) -> f64 {
     let one = |i: usize| {
         let obs = row(&b.obs, i, d.n_obs);
         let u = n.policy.forward(&obs);
+        let mut outside = 0.0;
         let log_prob = match &n.inverse {
             Some(inverse) => {
                 let (lo, hi) = (row(&b.lower, i, d.n_state), row(&b.upper, i, d.n_state));
                 let w: Vec<f64> = (0..d.n_state).map(|k| u[k].max(lo[k]).min(hi[k])).collect();
+                outside = u.iter().zip(&w).map(|(u, w)| (u - w).powi(2)).sum();
                 let mean = inverse.forward(&inverse_input(b, i, &d, &w));
                 log_normal(&row(&b.sampled, i, d.n_act), &mean, &n.log_std)
             }
@@ -133,7 +142,8 @@ fn actor_loss(l: &Pid2, b: &Batch, n: &Nets64) -> f64 {
         let x = [u.iter().enumerate().map(shown).collect(), obs].concat();
         let noise = noise(l, Pass::Generator, i);
         let (logit, _) = discriminate(&n.enc, &n.dec, &x, &noise, true);
-        reference::surrogate(b, i, log_prob, 0.2) + 0.5 * e * e + 0.7 * softplus(-logit)
+        let pulled = 0.5 * f64::from(BOUND) * outside;
+        reference::surrogate(b, i, log_prob, 0.2) + pulled + 0.5 * e * e + 0.7 * softplus(-logit)
     };
     (0..b.n).map(one).sum::<f64>() / b.n as f64
 }
