@@ -57,9 +57,12 @@ def measured(run: Path, wanted: np.ndarray, place: Path) -> tuple[dict[str, str]
     with np.load(file) as data:
         reached, speed, n = data["qpos"], data["qvel"], int(data["lengths"][0])
     task = run / "task.toml"
-    lower, upper, fastest = limits(task.parent / "g1.urdf", list(_core.Env(str(task)).joint_names[1:]))
+    names = list(_core.Env(str(task)).joint_names[1:])
+    lower, upper, fastest = limits(task.parent / "g1.urdf", names)
     joints, speeds = reached[1 : n + 1, BASE:], np.abs(speed[1 : n + 1, BASE - 1 :])
     error = np.abs(joints - wanted[1 : n + 1, BASE:])
+    beyond = np.maximum(np.maximum(lower - joints, joints - upper), 0.0)
+    furthest = f"{beyond.max():.3f} ({names[int(beyond.max(0).argmax())]})"
     still = np.abs(wanted[:1, BASE:] - wanted[1 : n + 1, BASE:])
     base = np.linalg.norm(reached[1 : n + 1, :3] - wanted[1 : n + 1, :3], axis=1)
     evaluated = told("eval", run, "--episodes", 1)[0]
@@ -75,7 +78,8 @@ def measured(run: Path, wanted: np.ndarray, place: Path) -> tuple[dict[str, str]
         "largest error of a joint [rad]": f"{error.max():.3f}",
         "mean distance of the base [m]": f"{base.mean():.3f}",
         "largest force of a motor, share of its effort": f"{effort:.3f}",
-        "periods with a joint beyond its range": f"{int(((joints < lower) | (joints > upper)).any(1).sum())} of {n}",
+        "periods with a joint beyond its range": f"{int((beyond > 0).any(1).sum())} of {n}",
+        "furthest beyond its range [rad]": furthest,
         "periods with a joint beyond its speed": f"{int((speeds > fastest).any(1).sum())} of {n}",
     }, file
 
