@@ -237,7 +237,7 @@ mod tests {
                 value => compare("## `[train]`", key, value),
             }
         }
-        assert_eq!(keys, 71);
+        assert_eq!(keys, 73);
         for column in crate::train::COLUMNS {
             assert!(page.contains(&format!("`{column}`")), "{column}");
         }
