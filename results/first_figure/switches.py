@@ -7,38 +7,25 @@ runs of FOLDER's `runs.csv` stand beside them as what the task files set.
 """
 
 import csv
-import json
-import os
-import subprocess
 import sys
 from collections import defaultdict
 from pathlib import Path
 
-import numpy as np
+from nearl.report.sweep import read_sweep
 
-NEARL = os.environ.get("NEARL", Path(__file__).parents[2] / "target" / "release" / "nearl")
+sys.path.append(str(Path(__file__).parents[1]))
+from curves import LOSS, end, without_noise, write
+
 TASKS = ["HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5"]
-
-
-def measured(run: Path) -> tuple[float, float]:
-    """Mean return without noise, and the error of the inverse model at the end."""
-    told = subprocess.run([NEARL, "eval", run, "--json"], check=True, capture_output=True, text=True)
-    with open(run / "metrics.csv") as file:
-        errors = [float(row["idm/mse_after"]) for row in list(csv.DictReader(file))[-10:]]
-    return float(np.mean(json.loads(told.stdout)[0]["returns"])), float(np.mean(errors))
 
 
 def main(runs: Path, folder: Path) -> None:
     rows = []
-    for path in sorted(runs.glob("*/*/*_*")):
-        algo, seed = path.name.rsplit("_", 1)
-        value, error = measured(path)
-        rows.append({"switch": path.parents[1].name, "task": path.parent.name, "algo": algo, "seed": int(seed)})
-        rows[-1] |= {"without_noise": f"{value:.1f}", "idm_mse": f"{error:.4g}"}
-    with open(folder / "switches.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    for switch in sorted(path for path in runs.iterdir() if path.is_dir()):
+        for run in read_sweep(switch):
+            rows.append({"switch": switch.name, "task": run.task, "algo": run.algo, "seed": run.seed})
+            rows[-1] |= {"without_noise": f"{without_noise(run):.1f}", "idm_mse": f"{end(run, LOSS):.4g}"}
+    write(folder / "switches.csv", rows)
     with open(folder / "runs.csv") as file:
         rows += [row | {"switch": "as the task files set"} for row in csv.DictReader(file) if row["algo"] == "pid2-ib"]
     cells: dict = defaultdict(dict)

@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
 # Each repair of PID2-IB that is a setting, by itself, beside what the task files set: a million steps each, some 25 minutes on two idle cores.
-# Finished runs are skipped. RUNS is the folder of runs, NEARL the program.
+# Finished runs are skipped. RUNS is the folder of runs.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
-runs=${RUNS:-runs/first_figure_switches} nearl=${NEARL:-target/release/nearl}
+runs=${RUNS:-runs/first_figure_switches}
 
 go() { # name, task, algorithm, seeds, then what is set
     local name=$1 task=$2 algo=$3 seeds=$4
     shift 4
-    "$nearl" sweep --tasks "$task" --algos "$algo" --seeds "$seeds" --steps 1e6 --out "$runs/$name" "$@"
+    target/release/nearl sweep --tasks "$task" --algos "$algo" --seeds "$seeds" --steps 1e6 --out "$runs/$name" "$@"
 }
 
 for task in HalfCheetah-v5 Hopper-v5; do
@@ -23,4 +23,4 @@ go slow_discriminator Walker2d-v5 pid2-ib 0-2 --set train.pid2.discriminator_lr=
 for task in HalfCheetah-v5 Hopper-v5 Walker2d-v5 Ant-v5; do
     go both_networks $task ppo-combined 0-2
 done
-NEARL="$nearl" .venv/bin/python results/first_figure/switches.py "$runs" results/first_figure
+.venv/bin/python results/first_figure/switches.py "$runs" results/first_figure

@@ -10,7 +10,7 @@ pub(super) struct Demonstrated {
     demos: Arc<Frames>,
     /// Share of the episodes that begin in a demonstrated state.
     share: f64,
-    /// How near the demonstration is followed is the reward, and what it has to be at least.
+    /// The least that a step has to be worth, where how near the demonstration is followed is the reward.
     tracked: Option<f64>,
     /// The frame of the present moment.
     at: usize,
@@ -134,8 +134,13 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         for _ in 0..20 {
             let Frame { qpos, left, .. } = d.begin(&[0.0], &mut rng).expect("a frame").clone();
-            let mut steps = (1..=left).map(|t| d.step(&[0.0, qpos[0] + t as f64]).expect("tracked"));
-            let ends: Vec<bool> = steps.by_ref().map(|step| step.ended && step.worth == 1.0).collect();
+            let ends: Vec<bool> = (1..=left)
+                .map(|t| d.step(&[0.0, qpos[0] + t as f64]).expect("tracked"))
+                .map(|step| {
+                    assert!(step.worth == 1.0 && !step.strayed, "{step:?}");
+                    step.ended
+                })
+                .collect();
             assert!(d.from_frame && ends.iter().position(|end| *end) == Some(left - 1), "{qpos:?}: {ends:?}");
         }
         let mut untracked = Demonstrated::new(demos, 1.0, None).expect("frames");

@@ -135,8 +135,8 @@ impl Worker {
         self.scorer = Some((scorer, vec![0.0; self.state.obs.len()]));
     }
 
-    /// Lets that share of the episodes to come begin in one of the frames. Where something is `tracked` the reward of the learner is how near
-    /// they are followed, and an episode ends below that.
+    /// Lets that share of the episodes to come begin in one of the frames. With `tracked` the reward of the learner is how near they are
+    /// followed, and an episode ends once a step is worth less than it.
     pub(crate) fn begin_in(&mut self, frames: Arc<Frames>, share: f64, tracked: Option<f64>) {
         self.demonstrated = Demonstrated::new(frames, share, tracked);
     }

@@ -59,8 +59,8 @@ pub trait Source: Send {
     fn collect(&mut self, snapshot: &Snapshot) -> Result<bool, SourceError>;
     /// Lets that share of the environments project while they collect, where they are of this process.
     fn project(&mut self, _share: f64) {}
-    /// Lets that share of the episodes begin in one of the frames; where something is `tracked` the reward is how near they are followed,
-    /// and an episode ends below that. False where episodes begin elsewhere.
+    /// Lets that share of the episodes begin in one of the frames. With `tracked` the reward is how near they are followed, and an episode
+    /// ends once a step is worth less than it. False where episodes begin elsewhere.
     fn begin_in(&mut self, _frames: &Arc<Frames>, _share: f64, _tracked: Option<f64>) -> bool {
         false
     }
