@@ -96,6 +96,10 @@ pub trait Learner: Send {
     /// Learns from a batch at the pace of the run's schedule; `rng` orders the minibatches and draws noise. Log probabilities, advantages
     /// and returns of the batch may be estimated again on the way.
     fn update(&mut self, batch: &mut Batch, pace: Pace, rng: &mut ChaCha8Rng) -> Metrics;
+    /// Learns from the fresh networks' own noise what needs no reward: how the robot answers to actions. Nothing, unless said otherwise.
+    fn warm_up(&mut self, _batch: &Batch, _rng: &mut ChaCha8Rng) -> Metrics {
+        Metrics::new()
+    }
     /// Itself, if it learns from demonstrations.
     fn imitator(&mut self) -> Option<&mut dyn Imitator> {
         None

@@ -67,6 +67,7 @@ pub const PRESETS: &[RegisteredPreset] = &[
                     "train.ppo.lr=1e-3",
                     "train.ppo.target_kl=0.0",
                     "train.nets.idm_residual=true",
+                    "train.pid2.warmup=16384",
                     "train.pid2.idm_threshold=0.03",
                 ],
             ),

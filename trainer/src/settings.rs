@@ -237,7 +237,7 @@ mod tests {
                 value => compare("## `[train]`", key, value),
             }
         }
-        assert_eq!(keys, 73);
+        assert_eq!(keys, 74);
         for column in crate::train::COLUMNS {
             assert!(page.contains(&format!("`{column}`")), "{column}");
         }

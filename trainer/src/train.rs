@@ -34,6 +34,7 @@ use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, Snapsh
 use rand_chacha::ChaCha8Rng;
 use setup::{
     check_cost, check_experience, check_minibatch, check_outputs, check_reward, dims, learner, policy_kind,
+    warm_ups,
 };
 use std::sync::Arc;
 use std::time::Instant;
@@ -109,6 +110,8 @@ pub struct Training {
     learner: Box<dyn Learner>,
     source: Box<dyn Source>,
     imitation: Option<Imitation>,
+    /// Batches of the warm-up, after the first.
+    warm_ups: u64,
     /// What gives rewards in the task's place.
     scorer: Option<Scorer>,
     /// The last batch: its memory is used again.
@@ -170,8 +173,9 @@ impl Training {
         check_experience(&settings, &manifest.task, experience)?;
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
-        let imitation =
-            Imitation::read(request.algo, &settings, &manifest, parts.layout.state(), request.steps)?;
+        let warm_ups = warm_ups(request.algo, &settings).div_ceil(batch as u64);
+        let state = parts.layout.state();
+        let imitation = Imitation::read(request.algo, &settings, &manifest, state, request.steps, warm_ups)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);
         manifest.activation = settings.nets.activation;
         let mut learner =
@@ -212,6 +216,7 @@ impl Training {
             learner,
             source,
             imitation,
+            warm_ups,
             scorer: match experience {
                 Experience::Scored(scorer) => Some(scorer.clone()),
                 _ => None,
@@ -323,15 +328,16 @@ impl Training {
         }))
     }
 
-    /// An update from the batch, or in the warm-up of the inverse model alone.
+    /// An update from the batch, or a part of the warm-up.
     fn learn(&mut self, pace: Pace) -> Metrics {
-        let (Some(imitation), iterations) = (&self.imitation, self.snapshot.manifest.version) else {
+        let iterations = self.snapshot.manifest.version;
+        if iterations <= self.warm_ups {
+            return self.learner.warm_up(&self.batch, &mut self.rng);
+        }
+        let Some(imitation) = &self.imitation else {
             return self.learner.update(&mut self.batch, pace, &mut self.rng);
         };
         if let Some(imitator) = self.learner.imitator() {
-            if imitation.warms_up(iterations) {
-                return imitator.warm_up(&self.batch, &mut self.rng);
-            }
             let rows = imitation.batch(&self.snapshot.networks.normaliser);
             imitator.see(rows, imitation.weight(iterations));
         }

@@ -71,11 +71,17 @@ fn pid2_ib() {
     check("HalfCheetah-v5", "pid2-ib", &["train.pid2.idm_threshold=0.01", "train.moved_penalty=0.1"]);
 }
 
+/// Stopped in the warm-up and after it.
+#[test]
+fn pid2_that_warms_up() {
+    check("Hopper-v5", "pid2-ib", &["train.pid2.warmup=1900"]);
+}
+
 /// The multiplier, the network that values the cost, its optimiser and the statistics of the cost go on too.
 #[test]
 fn a_limit_on_the_cost() {
     let more = ["train.cost.limit=5.0", "train.cost.multiplier=0.5"];
-    check("HalfCheetah-velocity", "pid2-ib", &more);
+    check("HalfCheetah-velocity", "pid2-ib", &[more.as_slice(), &["train.pid2.warmup=640"]].concat());
     check("Hopper-velocity", "ppo", &[more.as_slice(), &["train.ppo.target_kl=0.01"]].concat());
 }
 

@@ -147,6 +147,10 @@ impl Learner for CostLimited {
         metrics
     }
 
+    fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
+        self.learner.warm_up(batch, rng)
+    }
+
     fn networks(&self, normaliser: &Normaliser) -> Networks {
         self.learner.networks(normaliser)
     }

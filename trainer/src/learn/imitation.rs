@@ -26,8 +26,6 @@ use std::ops::Range;
 pub trait Imitator {
     /// Demonstrations in the units of the next batch, and what a row of them weighs in the policy gradient beside one of the batch.
     fn see(&mut self, demos: Batch, weight: f64);
-    /// Learns the inverse model alone from a batch.
-    fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics;
     /// Learns from the demonstrations alone, once.
     fn pretrain(&mut self, rng: &mut ChaCha8Rng) -> Metrics;
     /// Changes the first and last layers so that what goes out stays the same in the robot's units.
@@ -118,6 +116,10 @@ impl<M: Method> Learner for Imitating<M> {
         metrics.extend(told);
         metrics
     }
+    /// The inverse model alone: the policy clones demonstrations.
+    fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
+        self.base.learn_inverse(batch, rng)
+    }
     fn networks(&self, normaliser: &Normaliser) -> Networks {
         self.base.networks(normaliser)
     }
@@ -142,9 +144,6 @@ impl<M: Method> Learner for Imitating<M> {
 impl<M: Method> Imitator for Imitating<M> {
     fn see(&mut self, demos: Batch, weight: f64) {
         self.seen = Seen { demos, weight };
-    }
-    fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
-        self.base.learn_inverse(batch, rng)
     }
     fn pretrain(&mut self, rng: &mut ChaCha8Rng) -> Metrics {
         M::pretrain(self, rng)

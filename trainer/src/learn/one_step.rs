@@ -38,6 +38,7 @@ struct Actor {
     nets: Networks,
 }
 
+#[derive(Debug)]
 struct Sample {
     proposal: [f32; 2],
     action: [f32; 2],
@@ -227,8 +228,8 @@ fn bc_recovers_the_known_shift() {
         nets: l.networks(&normaliser),
     };
     let (batch, first) = collect(&actor(&bc), 1024, &mut rng);
+    bc.warm_up(&batch, &mut rng);
     let imitator = bc.imitator().expect("it imitates");
-    imitator.warm_up(&batch, &mut rng);
     imitator.see(demonstrated(1024, &mut rng), 0.0);
     imitator.pretrain(&mut rng);
     let cloned = actor(&bc);
@@ -237,6 +238,40 @@ fn bc_recovers_the_known_shift() {
         assert!((0..2).all(|k| (proposed[k] - shift[k]).abs() < 1e-3), "{x:?}: {proposed:?} {shift:?}");
     }
     solves("bc", (first, collect(&cloned, 1024, &mut rng).1));
+}
+
+/// A plant that moves by itself: after the warm-up the policy proposes that movement, and the action that does it is the fresh networks'
+/// own mean, near none.
+#[test]
+fn after_the_warm_up_what_the_robot_does_by_itself_is_proposed() {
+    let (dims, ppo, _) = plain();
+    let (n, mut rng) = (affine(), crate::rollout::stream(4, 0));
+    let settings = Pid2Settings { idm_lr: 1e-2, ..Pid2Settings::default() };
+    let mut pid2 = Pid2::new(dims, &n, ppo, settings, DETERMINISTIC, true, 1, &mut rng);
+    let normaliser = Normaliser::identity(2, 2);
+    let actor = |l: &dyn Learner| Actor {
+        kind: Some(DETERMINISTIC),
+        activation: n.activation,
+        nets: l.networks(&normaliser),
+    };
+    let fresh = actor(&pid2);
+    let drift = |x: [f32; 2]| [0.8 * x[0] - 0.3 * x[1], 0.5 * x[1] - 0.4];
+    let (mut batch, _) = collect(&fresh, 4096, &mut rng);
+    for (reached, x) in batch.reached.chunks_exact_mut(2).zip(batch.obs.chunks_exact(2)) {
+        reached.iter_mut().zip(drift([x[0], x[1]])).for_each(|(to, d)| *to += d);
+    }
+    pid2.warm_up(&batch, &mut rng);
+    let warm = actor(&pid2);
+    for x in [[0.0, 0.0], [1.0, -0.5], [-2.0, 1.0]] {
+        let (of_fresh, own) = (fresh.act(x, || 0.0), warm.act(x, || 0.0));
+        let (moves, answer) = (drift(x), reached(of_fresh.action));
+        let want: [f32; 2] = std::array::from_fn(|k| moves[k] + answer[k]);
+        let furthest =
+            |a: [f32; 2], b: [f32; 2]| a.iter().zip(b).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
+        assert!(furthest(of_fresh.proposal, want) > 0.3, "{x:?}: nothing had to be learned");
+        assert!(furthest(own.proposal, want) < 0.1, "{x:?}: {own:?} instead of {want:?}");
+        assert!(furthest(own.action, of_fresh.action) < 0.1, "{x:?}: {own:?}");
+    }
 }
 
 /// Under linear dynamics an affine inverse model fills in the expert's own actions.
@@ -301,8 +336,8 @@ fn bco_acts_like_the_expert() {
         |l: &dyn Learner| Actor { kind: None, activation: n.activation, nets: l.networks(&normaliser) };
     let (mut batch, first) = collect(&actor(&bco), 1024, &mut rng);
     batch.advantage.fill(f32::NAN);
+    bco.warm_up(&batch, &mut rng);
     let imitator = bco.imitator().expect("it imitates");
-    imitator.warm_up(&batch, &mut rng);
     imitator.see(demonstrated(1024, &mut rng), 0.0);
     imitator.pretrain(&mut rng);
     bco.update(&mut batch, Pace::default(), &mut rng);

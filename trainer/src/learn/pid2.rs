@@ -1,6 +1,7 @@
 //! PID^2: policy, inverse dynamics, discriminator (Algorithm 2 of the paper, lines 8 to 13).
 //!
 //! ```text
+//! warm up, if asked to: the inverse model and the policy on what was reached by the fresh networks' own noise
 //! collect with constraints                                        (line 8; `rollout`)
 //! inverse model on reached transitions, Eq. 4, above a threshold  (lines 10 to 12)
 //! discriminator, bottleneck, and policy against them, Eq. 2       (line 9)
@@ -21,12 +22,14 @@ mod null_space;
 use super::combined::{Combined, CombinedScratch, Gradient, Kind};
 use super::discriminator::{Discriminator, DiscriminatorScratch, LATENT};
 use super::epochs::{Pace, Update};
+use super::imitation::Base;
 use super::inverse::ThresholdPer;
 use super::nets::NetSettings;
 use super::optimise::{Group, Params, Phases, Rows, SUMS, Tile, add_sums, optimise};
 use super::ppo::PpoSettings;
 use super::value::ValueScratch;
 use super::{Adam, Batch, Dims, Learner, Metrics};
+use crate::demos::DemoSettings;
 use adversary::{discriminate, fool_discriminator};
 use fakes::Fakes;
 use nearl_runtime::net::kernel::{V, ZERO};
@@ -42,6 +45,10 @@ use std::ops::Range;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pid2Settings {
+    /// Steps of the fresh networks' own noise from which inverse model and meta policy learn what was reached, before anything else: the
+    /// policy then begins by proposing what the robot does by itself, and the action that does it is near none. With demonstrations:
+    /// [`DemoSettings::warmup`](crate::demos::DemoSettings::warmup).
+    pub warmup: u64,
     /// The inverse model learns from reached transitions while its mean squared error is at least this (\[sigma_I\]).
     pub idm_threshold: f64,
     /// What of a row of actions is compared with the threshold.
@@ -80,6 +87,7 @@ pub struct Pid2Settings {
 impl Default for Pid2Settings {
     fn default() -> Self {
         Self {
+            warmup: 0,
             idm_threshold: 0.5,
             idm_threshold_per: ThresholdPer::default(),
             idm_lr: 3e-4,
@@ -280,6 +288,14 @@ impl Learner for Pid2 {
         let after = self.nets.combined.idm_error(self.actor(), batch, self.threads);
         let actions = super::variance(&batch.action, n_act);
         metrics.extend(super::idm_metrics(before, after, inverse_learns, actions));
+        metrics
+    }
+
+    /// The policy clones what was reached as it would clone demonstrations.
+    fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
+        let cloned = self.clone_demos(batch, &DemoSettings::default(), rng);
+        let mut metrics = self.learn_inverse(batch, rng);
+        metrics.extend(cloned.into_iter().map(|(_, error)| ("train/policy_mse", error)));
         metrics
     }
 

@@ -16,7 +16,7 @@ pub(super) struct Imitation {
     settings: DemoSettings,
     /// Observation index of each proposed entry.
     state: Vec<usize>,
-    /// Batches from which the inverse model alone learns, after the first.
+    /// Batches of the warm-up, after the first.
     warm_ups: u64,
     /// Updates of the run, and steps of each.
     updates: u64,
@@ -40,6 +40,7 @@ impl Imitation {
         manifest: &Manifest,
         state: &[usize],
         steps: u64,
+        warm_ups: u64,
     ) -> Result<Option<Self>, TrainError> {
         let own = settings.demos.clone();
         let uses = match (algo.demos(), own.file.is_empty()) {
@@ -78,7 +79,6 @@ impl Imitation {
             check_actions(&demos, manifest.action_lower.len()).map_err(wrong)?;
         }
         let batch = (settings.n_envs * settings.n_steps) as u64;
-        let warm_ups = if uses.warms_up { own.warmup.div_ceil(batch) } else { 0 };
         Ok(Some(Self {
             demos,
             settings: own,
@@ -144,11 +144,6 @@ impl Imitation {
     /// What a row of them weighs in the policy gradient after `iterations` of the training.
     pub(super) fn weight(&self, iterations: u64) -> f64 {
         self.settings.weight(iterations.saturating_sub(self.warm_ups + 1), self.updates)
-    }
-
-    /// Whether the batch after `iterations` is one for the inverse model alone.
-    pub(super) fn warms_up(&self, iterations: u64) -> bool {
-        iterations <= self.warm_ups
     }
 
     /// Whether the demonstrations alone are learned from once `iterations` are done.

@@ -69,6 +69,15 @@ pub(super) fn learner(
     Box::new(CostLimited::new(learner, settings.cost.clone(), &dims, nets, ppo, threads, rng))
 }
 
+/// Steps from which the algorithm learns before its first update.
+pub(super) fn warm_ups(algo: Algorithm, settings: &TrainSettings) -> u64 {
+    match (algo, algo.demos()) {
+        (_, Some(uses)) if uses.warms_up => settings.demos.warmup,
+        (Algorithm::Pid2Ib | Algorithm::Pid2Gan, _) => settings.pid2.warmup,
+        _ => 0,
+    }
+}
+
 /// A limit on a cost needs one, and a learner that has it all from rewards.
 pub(super) fn check_cost(algo: Algorithm, settings: &TrainSettings, spec: &Spec) -> Result<(), TrainError> {
     let limit = settings.cost.limit;
