@@ -76,7 +76,8 @@ def main(folder: Path, runs: Path | None) -> None:
         words = []
         for k, (algo, values) in enumerate(found.items()):
             centre, (low, high) = float(interquartile_mean(values)), bootstrap_band(values)
-            words.append(f"**{centre:.0f}** ({low:.0f} to {high:.0f}): {', '.join(f'{v:.0f}' for v in values)}")
+            runs = ", ".join(f"{v:.0f}" for v in values) if len(values) <= 5 else f"{len(values)} runs"
+            words.append(f"**{centre:.0f}** ({low:.0f} to {high:.0f}): {runs}")
             x = at + 0.24 * (k - 0.5)
             axis.plot([x] * len(values), values, "o", color=f"C{k}", alpha=0.5, ms=5)
             axis.errorbar(x + 0.07, centre, [[centre - low], [high - centre]], fmt="s", color=f"C{k}", capsize=3, label=algo if at == 0 else None)
