@@ -34,7 +34,7 @@ use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, Snapsh
 use rand_chacha::ChaCha8Rng;
 use setup::{
     check_cost, check_experience, check_minibatch, check_outputs, check_reward, dims, learner, policy_kind,
-    warm_ups,
+    warm_up_steps,
 };
 use std::sync::Arc;
 use std::time::Instant;
@@ -173,7 +173,7 @@ impl Training {
         check_experience(&settings, &manifest.task, experience)?;
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
-        let warm_ups = warm_ups(request.algo, &settings).div_ceil(batch as u64);
+        let warm_ups = warm_up_steps(request.algo, &settings).div_ceil(batch as u64);
         let state = parts.layout.state();
         let imitation = Imitation::read(request.algo, &settings, &manifest, state, request.steps, warm_ups)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);

@@ -69,8 +69,8 @@ pub(super) fn learner(
     Box::new(CostLimited::new(learner, settings.cost.clone(), &dims, nets, ppo, threads, rng))
 }
 
-/// Steps from which the algorithm learns before its first update.
-pub(super) fn warm_ups(algo: Algorithm, settings: &TrainSettings) -> u64 {
+/// Steps of the warm-up, which comes before the algorithm's first update.
+pub(super) fn warm_up_steps(algo: Algorithm, settings: &TrainSettings) -> u64 {
     match (algo, algo.demos()) {
         (_, Some(uses)) if uses.warms_up => settings.demos.warmup,
         (Algorithm::Pid2Ib | Algorithm::Pid2Gan, _) => settings.pid2.warmup,
