@@ -345,10 +345,11 @@ pub(crate) struct Health {
 }
 
 impl Health {
-    pub(crate) fn new() -> Result<Health, hdrhistogram::CreationError> {
+    /// Of a loop that begins with this `version`: who asks before the first tick counts on from it.
+    pub(crate) fn new(version: u64) -> Result<Health, hdrhistogram::CreationError> {
         let histogram = || Histogram::new_with_bounds(1, 100_000_000_000, 2);
         let mut last = HealthMessage::zeroed();
-        last.pid = std::process::id();
+        (last.pid, last.policy_version) = (std::process::id(), version);
         Ok(Health { next: 0, last, proposals: [0; 5], wake: histogram()?, compute: histogram()? })
     }
 

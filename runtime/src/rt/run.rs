@@ -319,6 +319,7 @@ fn assemble<B: Build>(
     let (bell, gone) = (Arc::new(Bell::default()), Arc::new(AtomicBool::new(false)));
     let ends =
         Ends { states, proposals, actions, records, slot, bell: Arc::clone(&bell), gone: Arc::clone(&gone) };
+    let health = Health::new(first.version()).map_err(|e| RunError::Snapshot(e.to_string()))?;
     let first = Box::new(Loaded { id: 0, controller: first });
     let cycle = Cycle::new(cycle_settings, first, settings.faults.clone(), ends, stop.clone());
     let mut snapshots =
@@ -326,7 +327,6 @@ fn assemble<B: Build>(
     snapshots.set_rows(0, told);
     let mut tick = Box::new(TickMessage::zeroed());
     tick.period = clock::nanoseconds(robot.dt);
-    let health = Health::new().map_err(|e| RunError::Snapshot(e.to_string()))?;
     let io = Io {
         link,
         period: clock::nanoseconds(robot.dt),

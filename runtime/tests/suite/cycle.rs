@@ -160,6 +160,29 @@ fn hot_swap_changes_the_version_between_two_ticks() {
     }
 }
 
+/// A trainer that comes before the first tick counts on from the version in use.
+#[test]
+fn the_version_is_told_before_the_first_tick() {
+    let name = Name::new("early");
+    let mut plant = PlantLink::open(&name.0, &robot(true)).unwrap();
+    let over = Stop::new();
+    let waits = std::thread::spawn({
+        let over = over.clone();
+        move || {
+            while !over.is_requested() {
+                plant.announce();
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }
+    });
+    let running = LoopThread::start(&name, settings(), |spring| spring.version = 7);
+    let health = TrainerLink::open(&name.0).unwrap().wait_for_runtime(PATIENCE).unwrap();
+    assert_eq!((health.tick, health.policy_version), (0, 7));
+    running.end();
+    over.request();
+    waits.join().unwrap();
+}
+
 #[test]
 fn bad_snapshots_get_a_reason_and_the_loop_keeps_running() {
     let name = Name::new("refuse");
