@@ -33,8 +33,8 @@ use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 use setup::{
-    check_cost, check_experience, check_minibatch, check_outputs, check_reward, dims, learner, policy_kind,
-    warm_up_steps,
+    check_cost, check_experience, check_minibatch, check_outputs, check_reward, check_warm_up, dims, learner,
+    policy_kind, warm_up_steps,
 };
 use std::sync::Arc;
 use std::time::Instant;
@@ -165,6 +165,7 @@ impl Training {
         let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
         manifest.algo = request.algo.to_string();
         manifest.policy = policy_kind(request.algo, &settings, &manifest.task)?;
+        check_warm_up(request.algo, &settings, manifest.policy)?;
         let spec = complete(&mut manifest)?;
         let parts = Parts::new(&manifest)?;
         let dims = dims(&manifest, &parts, spec.privileged.len())?;

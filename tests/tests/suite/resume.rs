@@ -77,6 +77,19 @@ fn pid2_that_warms_up() {
     check("Hopper-v5", "pid2-ib", &["train.pid2.warmup=1900"]);
 }
 
+#[test]
+fn a_warm_up_is_refused_where_the_policy_does_not_learn_through_the_inverse_model() {
+    for (task, more) in [("Hopper-v5", &["train.exploration=proposal"][..]), ("Panda-reach", &[])] {
+        let overrides = [&["train.pid2.warmup=4096"], more].concat();
+        let error = Training::new(&asked(task, "pid2-ib", 1, &overrides)).err().expect("refused").to_string();
+        assert!(
+            error.starts_with("[train.pid2.warmup]: 4096 steps, but here the policy explores"),
+            "{error}"
+        );
+    }
+    assert!(Training::new(&asked("Panda-reach", "nearl", 1, &["train.pid2.warmup=4096"])).is_ok());
+}
+
 /// The multiplier, the network that values the cost, its optimiser and the statistics of the cost go on too.
 #[test]
 fn a_limit_on_the_cost() {

@@ -6,19 +6,21 @@
 //! | stochastic | learned | `log pi(u, s) + log I(a, s_c, w)` | its own likelihood; the target `w` is stored |
 //! | stochastic | analytic | `log pi(u, s)` | its own likelihood |
 
+mod coordinates;
 mod gradient;
 
 use super::Dims;
 use super::batch::Batch;
 use super::inverse::{InverseModel, InverseScratch};
 use super::losses::{in_parts, mean_std, set_lanes, widths};
-use super::net::{Net, Tape};
+use super::net::Net;
 use super::nets::NetSettings;
 use super::optimise::{Group, PhaseReport, Rows, TILE, Tile};
 use super::ppo::PpoSettings;
 use super::rescale::{Inputs, carry, outputs};
 use super::value::Value;
 use super::{Metrics, init};
+use coordinates::Proposing;
 use nearl_runtime::Networks;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars};
 use nearl_runtime::normaliser::Normaliser;
@@ -72,6 +74,8 @@ pub(super) struct Combined {
     pub(super) bound_weight: f32,
     /// Meta policy.
     pub(super) policy: Net,
+    /// The layer that makes a proposal of what the policy puts out, where they differ. No phase changes it.
+    pub(super) coordinates: Option<Net>,
     /// Spread of a stochastic meta policy.
     pub(super) policy_log_std: Option<Range<usize>>,
     /// The learned inverse model and its spread.
@@ -86,7 +90,7 @@ pub(super) struct Combined {
 
 /// Buffers of one thread.
 pub(super) struct CombinedScratch {
-    pub(super) policy: Tape,
+    pub(super) policy: Proposing,
     pub(super) inverse: Option<InverseScratch>,
     /// Observation rows.
     pub(super) obs: Vec<V>,
@@ -98,13 +102,15 @@ pub(super) struct CombinedScratch {
 }
 
 impl Combined {
-    /// Fresh networks, the parameter group of policy and inverse model, and that of the value.
+    /// Fresh networks, the parameter group of policy and inverse model, and that of the value. With `identified` the policy has
+    /// [coordinates] for a proposal, and a linear map beside its layers.
     pub(super) fn new(
         dims: Dims,
         nets: &NetSettings,
         ppo: PpoSettings,
         gradient: Gradient,
         kind: Kind,
+        identified: bool,
         rng: &mut ChaCha8Rng,
     ) -> (Self, [Group; 2]) {
         assert!(kind.stochastic || kind.learned, "a policy explores in its proposal or in its action");
@@ -115,7 +121,8 @@ impl Combined {
             *at = range.end;
             range
         };
-        let policy = Net::new(&widths(o, &nets.policy, s), f, 0, &mut at, &mut transposed);
+        let make = if identified { Net::with_skip } else { Net::new };
+        let policy = make(&widths(o, &nets.policy, s), f, 0, &mut at, &mut transposed);
         let policy_range = 0..at;
         let policy_log_std = kind.stochastic.then(|| vectors(&mut at, s));
         let inverse = kind.learned.then(|| {
@@ -123,8 +130,11 @@ impl Combined {
             let log_std = vectors(&mut at, dims.n_act);
             (model, log_std)
         });
+        let coordinates = identified.then(|| Net::new(&[s, s], f, s, &mut at, &mut transposed));
         let mut group = Group { p: vec![ZERO; at], transposed: vec![ZERO; transposed] };
-        policy.mlp.write_dense(&init::orthogonal(&policy.mlp.widths(), 0.01, rng), &mut group.p);
+        let mut first = init::orthogonal(&policy.mlp.widths(), 0.01, rng);
+        first.skip = identified.then(|| vec![0.0; o * s]);
+        policy.mlp.write_dense(&first, &mut group.p);
         let (value, value_group) = Value::new(&dims, nets, &ppo, rng);
         if let Some(range) = &policy_log_std {
             set_lanes(&mut group.p[range.clone()], s, ppo.log_std);
@@ -139,12 +149,14 @@ impl Combined {
             gradient,
             bound_weight: 0.0,
             policy,
+            coordinates,
             policy_log_std,
             inverse,
             value,
             policy_range,
             len: at,
         };
+        combined.begin_coordinates(&mut group);
         combined.refresh(&mut group);
         (combined, [group, value_group])
     }
@@ -153,6 +165,9 @@ impl Combined {
     pub(super) fn refresh(&self, group: &mut Group) {
         let Group { p, transposed } = group;
         self.policy.transpose(p, transposed);
+        if let Some(net) = &self.coordinates {
+            net.transpose(p, transposed);
+        }
         self.refresh_inverse(group);
     }
 
@@ -187,7 +202,10 @@ impl Combined {
     pub(super) fn scratch(&self) -> CombinedScratch {
         let (ov, sv) = (self.dims.n_obs.div_ceil(LANES), self.dims.n_state.div_ceil(LANES));
         CombinedScratch {
-            policy: self.policy.tape(TILE),
+            policy: Proposing {
+                policy: self.policy.tape(TILE),
+                coordinates: self.coordinates.as_ref().map(|net| net.tape(TILE)),
+            },
             inverse: self.inverse.as_ref().map(|(m, _)| m.scratch()),
             obs: vec![ZERO; TILE * ov],
             change: vec![ZERO; TILE * sv],
@@ -201,7 +219,7 @@ impl Combined {
         let lanes = |r: &Range<usize>, n: usize| scalars(&p[r.clone()])[..n].to_vec();
         Networks {
             normaliser: normaliser.clone(),
-            policy: self.policy.mlp.to_dense(p),
+            policy: self.in_changes(p),
             policy_log_std: self.policy_log_std.as_ref().map_or(Vec::new(), |r| lanes(r, self.dims.n_state)),
             idm: self.inverse.as_ref().map(|(m, r)| (m.net.mlp.to_dense(p), lanes(r, self.dims.n_act))),
             margins: Vec::new(),

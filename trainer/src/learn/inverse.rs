@@ -82,6 +82,23 @@ impl InverseModel {
         self.net.mlp.write_dense(&dense, p);
     }
 
+    /// Begins anew as a linear map of its input, where it has one: alone, or beside layers, whose output then begins at zero.
+    pub(super) fn begin_affine(&self, p: &mut [V], weight: Vec<f32>, bias: Vec<f32>) {
+        let mut dense = self.net.mlp.to_dense(p);
+        let is_affine = dense.layers.len() == 1;
+        let Some(last) = dense.layers.last_mut().filter(|_| is_affine || dense.skip.is_some()) else {
+            return;
+        };
+        last.bias = bias;
+        if is_affine {
+            last.weight = weight;
+        } else {
+            last.weight.fill(0.0);
+            dense.skip = Some(weight);
+        }
+        self.net.mlp.write_dense(&dense, p);
+    }
+
     /// Where its parameters lie.
     pub(super) fn range(&self) -> Range<usize> {
         self.start..self.end

@@ -96,7 +96,7 @@ impl Nearl {
         rng: &mut ChaCha8Rng,
     ) -> Self {
         let (lr, value_lr) = (ppo.lr, ppo.rate_of_value());
-        let (combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
+        let (combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, false, rng);
         let adam = vec![
             Adam::new(combined.policy_range.len(), settings.policy_lr),
             Adam::new(combined.inverse_range().len(), settings.idm_lr),

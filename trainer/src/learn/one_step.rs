@@ -246,7 +246,7 @@ fn bc_recovers_the_known_shift() {
 fn after_the_warm_up_what_the_robot_does_by_itself_is_proposed() {
     let (dims, ppo, _) = plain();
     let (n, mut rng) = (affine(), crate::rollout::stream(4, 0));
-    let settings = Pid2Settings { idm_lr: 1e-2, ..Pid2Settings::default() };
+    let settings = Pid2Settings { warmup: 4096, ..Pid2Settings::default() };
     let mut pid2 = Pid2::new(dims, &n, ppo, settings, DETERMINISTIC, true, 1, &mut rng);
     let normaliser = Normaliser::identity(2, 2);
     let actor = |l: &dyn Learner| Actor {

@@ -29,7 +29,6 @@ use super::optimise::{Group, Params, Phases, Rows, SUMS, Tile, add_sums, optimis
 use super::ppo::PpoSettings;
 use super::value::ValueScratch;
 use super::{Adam, Batch, Dims, Learner, Metrics};
-use crate::demos::DemoSettings;
 use adversary::{discriminate, fool_discriminator};
 use fakes::Fakes;
 use nearl_runtime::net::kernel::{V, ZERO};
@@ -190,7 +189,8 @@ impl Pid2 {
     ) -> Self {
         let (lr, value_lr) = (ppo.lr, ppo.rate_of_value());
         let discriminator = Discriminator::new(dims.n_state, dims.n_obs, nets, bottleneck);
-        let (mut combined, [actor, critic]) = Combined::new(dims, nets, ppo, settings.gradient, kind, rng);
+        let (mut combined, [actor, critic]) =
+            Combined::new(dims, nets, ppo, settings.gradient, kind, settings.warmup > 0, rng);
         combined.bound_weight = settings.bound_weight;
         let d = &discriminator;
         let mut adversary = Group { p: vec![ZERO; d.len], transposed: vec![ZERO; d.transposed] };
@@ -291,12 +291,10 @@ impl Learner for Pid2 {
         metrics
     }
 
-    /// The policy clones what was reached as it would clone demonstrations.
+    /// What the robot does by itself and what actions change, by least squares; then the inverse model as ever.
     fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
-        let cloned = self.clone_demos(batch, &DemoSettings::default(), rng);
-        let mut metrics = self.learn_inverse(batch, rng);
-        metrics.extend(cloned.into_iter().map(|(_, error)| ("train/policy_mse", error)));
-        metrics
+        self.nets.combined.identify(&mut self.params.groups[COMBINED], batch);
+        self.learn_inverse(batch, rng)
     }
 
     fn networks(&self, normaliser: &Normaliser) -> Networks {

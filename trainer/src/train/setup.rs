@@ -5,7 +5,7 @@ use crate::demos::DemoReward;
 use crate::env::{Env, Spec};
 use crate::learn::{
     Algorithm, Bc, Bco, CostLimited, Dapg, Dims, Gaifo, Gradient, Imitating, Kind, Learner, MOST_OUTPUTS,
-    Nearl, Pid2, Pid2Il, Ppo, Soil,
+    Nearl, Pid2, Pid2Il, Pid2Settings, Ppo, Soil,
 };
 use crate::rollout::RolloutError;
 use crate::settings::{Exploration, TrainSettings};
@@ -35,7 +35,9 @@ pub(super) fn learner(
         Box::new(Nearl::new(dims.clone(), nets, ppo.clone(), settings, kind, threads, rng))
     };
     let pid2 = |bottleneck, rng: &mut ChaCha8Rng| {
-        Pid2::new(dims.clone(), nets, ppo.clone(), settings.pid2.clone(), kind, bottleneck, threads, rng)
+        let warmup = warm_up_of_pid2(algo, settings);
+        let own = Pid2Settings { warmup, ..settings.pid2.clone() };
+        Pid2::new(dims.clone(), nets, ppo.clone(), own, kind, bottleneck, threads, rng)
     };
     let direct = |rng: &mut ChaCha8Rng| Ppo::new(dims.clone(), nets, ppo.clone(), threads, rng);
     let demos = settings.demos.clone();
@@ -71,11 +73,34 @@ pub(super) fn learner(
 
 /// Steps of the warm-up, which comes before the algorithm's first update.
 pub(super) fn warm_up_steps(algo: Algorithm, settings: &TrainSettings) -> u64 {
-    match (algo, algo.demos()) {
-        (_, Some(uses)) if uses.warms_up => settings.demos.warmup,
-        (Algorithm::Pid2Ib | Algorithm::Pid2Gan, _) => settings.pid2.warmup,
+    match algo.demos() {
+        Some(uses) if uses.warms_up => settings.demos.warmup,
+        _ => warm_up_of_pid2(algo, settings),
+    }
+}
+
+/// Demonstrations have a warm-up of their own.
+fn warm_up_of_pid2(algo: Algorithm, settings: &TrainSettings) -> u64 {
+    match algo {
+        Algorithm::Pid2Ib | Algorithm::Pid2Gan => settings.pid2.warmup,
         _ => 0,
     }
+}
+
+/// The warm-up of PID² finds what an action changes, for a policy that learns through the inverse model.
+pub(super) fn check_warm_up(
+    algo: Algorithm,
+    settings: &TrainSettings,
+    policy: PolicyKind,
+) -> Result<(), TrainError> {
+    let steps = warm_up_of_pid2(algo, settings);
+    if steps == 0 || policy == PolicyKind::Deterministic {
+        return Ok(());
+    }
+    Err(TrainError::Settings(format!(
+        "[train.pid2.warmup]: {steps} steps, but here the policy explores in its proposals and does not learn through a learned inverse model; set it \
+         to 0, or explore in the actions (idm.kind = \"learned\", exploration = \"action\")"
+    )))
 }
 
 /// A limit on a cost needs one, and a learner that has it all from rewards.

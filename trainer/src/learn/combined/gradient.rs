@@ -4,7 +4,7 @@
 use super::super::gaussian::{Gaussian, MOST_VECTORS, gather, inverse_sigma, likelihood_ratio, residuals};
 use super::super::inverse::{CLIP, InverseModel, gather_input};
 use super::super::optimise::{Group, Tile};
-use super::{Combined, CombinedScratch};
+use super::{Combined, CombinedScratch, Proposing};
 use nearl_runtime::multiversion;
 use nearl_runtime::net::kernel::{LANES, V, ZERO, scalars, scalars_mut};
 use std::ops::Range;
@@ -18,7 +18,11 @@ impl Combined {
     pub(in super::super) fn propose(&self, group: &Group, t: &Tile<'_>, w: &mut CombinedScratch) {
         let n = self.dims.n_obs;
         gather(&mut w.obs, n.div_ceil(LANES), 0, &t.batch.obs, n, t.idx);
-        self.policy.forward(&group.p, &w.obs, &mut w.policy);
+        let Proposing { policy, coordinates } = &mut w.policy;
+        self.policy.forward(&group.p, &w.obs, policy);
+        if let (Some(net), Some(tape)) = (&self.coordinates, coordinates) {
+            net.forward(&group.p, policy.output(), tape);
+        }
     }
 
     /// Policy gradient on the combined policy (Eq. 1). Leaves `dL / du` in `w.d_change`, where other
@@ -46,7 +50,14 @@ impl Combined {
     /// From `dL / du` in `w.d_change` to the policy's parameters.
     #[inline(always)]
     pub(in super::super) fn learn(&self, group: &Group, w: &mut CombinedScratch, grad: &mut [V]) {
-        self.policy.backward(&group.transposed, &w.obs, &w.d_change, &mut w.policy, Some(grad), false);
+        let Proposing { policy, coordinates } = &mut w.policy;
+        let slope = match (&self.coordinates, coordinates) {
+            (Some(net), Some(tape)) => {
+                net.backward(&group.transposed, policy.output(), &w.d_change, tape, None, true)
+            }
+            _ => &w.d_change,
+        };
+        self.policy.backward(&group.transposed, &w.obs, slope, policy, Some(grad), false);
     }
 
     /// Ratio on `log I(a | s_c, w_c)` with `w = clamp(pi(s), lower, upper)`.

@@ -27,6 +27,16 @@ fn dims() -> Dims {
 
 /// A learner with weights far from zero, and a minibatch.
 fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2, Batch) {
+    learner_that_warms_up(stochastic, bottleneck, activation, 0)
+}
+
+/// The same, with coordinates for a proposal where `warmup` is not 0.
+fn learner_that_warms_up(
+    stochastic: bool,
+    bottleneck: bool,
+    activation: Activation,
+    warmup: u64,
+) -> (Pid2, Batch) {
     let nets = NetSettings {
         policy: vec![6, 5],
         idm: vec![6, 5],
@@ -39,6 +49,7 @@ fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2,
     // Of the three, only this is the derivative of a loss.
     let gradient = Gradient::Projection;
     let settings = Pid2Settings {
+        warmup,
         generator_weight: 0.7,
         beta: 0.2,
         gradient,
@@ -50,7 +61,7 @@ fn learner(stochastic: bool, bottleneck: bool, activation: Activation) -> (Pid2,
     let mut l = Pid2::new(dims(), &nets, ppo, settings, kind, bottleneck, 1, &mut rng);
     let c = &l.nets.combined;
     let inverse = c.inverse.as_ref().map(|(m, _)| &m.net);
-    let actor: Vec<_> = [&c.policy].into_iter().chain(inverse).collect();
+    let actor: Vec<_> = [&c.policy].into_iter().chain(inverse).chain(&c.coordinates).collect();
     spread(&mut l.params.groups[COMBINED].p, &actor);
     spread(&mut l.params.groups[CRITIC].p, &[&c.value.net]);
     let (encoder, decoder) = l.nets.discriminator.nets();
@@ -96,6 +107,7 @@ fn noise(l: &Pid2, pass: Pass, i: usize) -> Vec<f64> {
 
 struct Nets64 {
     policy: Net64,
+    coordinates: Option<Net64>,
     value: Net64,
     inverse: Option<Net64>,
     log_std: Vec<f64>,
@@ -109,6 +121,7 @@ fn nets64(l: &Pid2) -> Nets64 {
     let of = |dense: &Dense| Net64::of(dense, enc.mlp.activation);
     Nets64 {
         policy: of(&l.nets.combined.policy.mlp.to_dense(a)),
+        coordinates: l.nets.combined.coordinates.as_ref().map(|c| of(&c.mlp.to_dense(a))),
         value: of(&l.nets.combined.value.net.mlp.to_dense(v)),
         inverse: l.nets.combined.inverse.as_ref().map(|(m, _)| of(&m.net.mlp.to_dense(a))),
         log_std: l.nets.combined.log_std(l.actor()).iter().map(|&v| f64::from(v)).collect(),
@@ -121,7 +134,8 @@ fn actor_loss(l: &Pid2, b: &Batch, n: &Nets64) -> f64 {
     let d = dims();
     let one = |i: usize| {
         let obs = row(&b.obs, i, d.n_obs);
-        let u = n.policy.forward(&obs);
+        let z = n.policy.forward(&obs);
+        let u = n.coordinates.as_ref().map_or(z.clone(), |c| c.forward(&z));
         let mut outside = 0.0;
         let log_prob = match &n.inverse {
             Some(inverse) => {
@@ -155,15 +169,16 @@ fn check(name: &str, net: &Net64, dense: &Dense, loss: impl Fn(&Net64) -> f64) {
 
 #[test]
 fn actor_gradients_equal_central_differences() {
-    for (stochastic, activation) in [
-        (false, TANH),
-        (true, TANH),
-        (false, RELU),
-        (true, RELU),
-        (false, Activation::Elu),
-        (false, Activation::Silu),
+    for (stochastic, activation, warmup) in [
+        (false, TANH, 0),
+        (false, TANH, 1),
+        (true, TANH, 0),
+        (false, RELU, 0),
+        (true, RELU, 0),
+        (false, Activation::Elu, 0),
+        (false, Activation::Silu, 0),
     ] {
-        let (l, b) = learner(stochastic, true, activation);
+        let (l, b) = learner_that_warms_up(stochastic, true, activation, warmup);
         let (grad, sums) = gradient(&l, &b, ACTOR);
         let (value_grad, _) = gradient(&l, &b, VALUE);
         let n = nets64(&l);
@@ -545,5 +560,98 @@ fn policy_and_inverse_model_stay_what_they_were_when_statistics_move() {
         let (is, now) = act(&l, &to, o);
         assert!(was.iter().zip(&is).all(|(a, b)| (a - b).abs() < 1e-4 * (1.0 + a.abs())), "{was:?} {is:?}");
         assert!((value - now).abs() < 1e-4 * (1.0 + value.abs()), "{value} {now}");
+    }
+}
+
+/// Of a plant that is linear: what it does by itself is proposed, and the policy's first entries are the actions, of which the inverse
+/// model makes themselves. The others are at right angles to what actions change.
+#[test]
+fn the_policys_first_entries_are_actions_after_the_warm_up() {
+    let (mut l, _) = learner_that_warms_up(false, true, TANH, 1);
+    let (d, mut rng) = (dims(), crate::rollout::stream(11, 0));
+    // only what the inverse model sees makes what the seen entries do
+    let of_obs = |k: usize, o: usize| match d.seen_obs.contains(&o) {
+        true => 0.4 * ((3 * k + 2 * o) as f64).sin(),
+        false => 0.0,
+    };
+    let of_action = |k: usize, j: usize| 0.8 * ((5 * k + 3 * j + 1) as f64).cos();
+    let moves = |x: &[f64], a: &[f64], k: usize| {
+        let own: f64 = x.iter().enumerate().map(|(o, x)| of_obs(k, o) * x).sum();
+        own + 0.1 * k as f64 + a.iter().enumerate().map(|(j, a)| of_action(k, j) * a).sum::<f64>()
+    };
+    let mut normal = |n: usize| -> Vec<f64> { (0..n).map(|_| StandardNormal.sample(&mut rng)).collect() };
+    let mut b = Batch { n: 4096, ..Batch::default() };
+    for _ in 0..b.n {
+        let (x, a) = (normal(d.n_obs), normal(d.n_act));
+        b.reached.extend((0..d.n_state).map(|k| moves(&x, &a, k) as f32));
+        b.obs.extend(x.iter().map(|&x| x as f32));
+        b.action.extend(a.iter().map(|&a| a as f32));
+    }
+    l.nets.combined.identify(&mut l.params.groups[COMBINED], &b);
+    let n = nets64(&l);
+    let coordinates = n.coordinates.as_ref().expect("coordinates");
+    let column = |j: usize| -> Vec<f64> {
+        let unit: Vec<f64> = (0..d.n_state).map(|k| f64::from(u8::from(k == j))).collect();
+        let zero = coordinates.forward(&vec![0.0; d.n_state]);
+        coordinates.forward(&unit).iter().zip(zero).map(|(a, b)| a - b).collect()
+    };
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    for j in 0..d.n_act {
+        let of = column(j);
+        assert!((0..d.n_state).all(|k| (of[k] - of_action(k, j)).abs() < 2e-3), "column {j}: {of:?}");
+        for rest in d.n_act..d.n_state {
+            let (unit, product) = (column(rest), dot(&of, &column(rest)));
+            assert!(product.abs() < 1e-5 && (dot(&unit, &unit) - 1.0).abs() < 1e-5, "columns {j}, {rest}");
+        }
+    }
+    // with the layers' own output at nothing
+    let c = &l.nets.combined;
+    let mut dense = c.policy.mlp.to_dense(l.actor());
+    dense.layers.last_mut().expect("a layer").weight.fill(0.0);
+    c.policy.mlp.write_dense(&dense, &mut l.params.groups[COMBINED].p);
+    let policy = Net64::of(&l.nets.combined.networks(l.actor(), &Normaliser::identity(7, 5)).policy, TANH);
+    let inverse = n.inverse.as_ref().expect("learned");
+    for _ in 0..20 {
+        let (x, a) = (normal(d.n_obs), normal(d.n_act));
+        let u = policy.forward(&x);
+        for (k, u) in u.iter().enumerate() {
+            let own = moves(&x, &[0.0; 2], k);
+            assert!((u - own).abs() < 5e-3, "entry {k}: {u} instead of {own}");
+        }
+        let mut change = u;
+        for (j, a) in a.iter().enumerate() {
+            change.iter_mut().zip(column(j)).for_each(|(u, of)| *u += a * of);
+        }
+        let seen = d.seen_obs.iter().map(|&o| x[o]).chain(d.seen_state.iter().map(|&k| change[k]));
+        let back = inverse.forward(&seen.collect::<Vec<_>>());
+        assert!(back.iter().zip(&a).all(|(b, a)| (b - a).abs() < 2e-2), "{back:?} instead of {a:?}");
+    }
+}
+
+/// An action that changes nothing, or more actions than proposed entries, leave a proposal its coordinates.
+#[test]
+fn coordinates_span_the_space_whatever_actions_change() {
+    for (n_state, n_act) in [(5, 2), (2, 3), (1, 1)] {
+        let dims = Dims { n_state, n_act, seen_state: vec![0], seen_obs: vec![1], ..dims() };
+        let settings = Pid2Settings { warmup: 1, ..Pid2Settings::default() };
+        let (kind, mut rng) = (Kind { stochastic: false, learned: true }, crate::rollout::stream(12, 0));
+        let (nets, ppo) = (NetSettings::default(), PpoSettings::default());
+        let mut l = Pid2::new(dims.clone(), &nets, ppo, settings, kind, true, 1, &mut rng);
+        let mut normal = |n: usize| -> Vec<f32> { (0..n).map(|_| StandardNormal.sample(&mut rng)).collect() };
+        let n = 256;
+        let b = Batch {
+            n,
+            obs: normal(n * dims.n_obs),
+            action: normal(n * n_act),
+            reached: vec![0.0; n * n_state],
+            ..Batch::default()
+        };
+        l.nets.combined.identify(&mut l.params.groups[COMBINED], &b);
+        let net = l.nets.combined.coordinates.as_ref().expect("coordinates");
+        let weight = net.mlp.to_dense(l.actor()).layers.remove(0).weight;
+        let m = DMatrix::from_fn(n_state, n_state, |i, j| f64::from(weight[i * n_state + j]));
+        let smallest = m.singular_values().min();
+        assert!(smallest > 1e-4, "{n_state} entries, {n_act} actions: {smallest:e}");
+        assert!(l.nets.combined.in_changes(l.actor()).skip.expect("a map").iter().all(|w| w.is_finite()));
     }
 }
