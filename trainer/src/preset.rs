@@ -67,11 +67,31 @@ pub const PRESETS: &[RegisteredPreset] = &[
                     "train.ppo.lr=1e-3",
                     "train.ppo.target_kl=0.0",
                     "train.nets.idm_residual=true",
+                    "train.pid2.lr=5e-4",
                     "train.pid2.warmup=16384",
+                    "train.pid2.bound_weight=0.1",
                     "train.pid2.idm_threshold=0.03",
                 ],
             ),
-            ("Ant-v5", &["train.pid2.null_space=true", "train.pid2.alpha=1e-3"]),
+            (
+                "Hopper-v5",
+                &[
+                    "train.nets.idm_residual=true",
+                    "train.pid2.warmup=16384",
+                    "train.pid2.bound_weight=0.1",
+                    "train.pid2.idm_threshold=0.05",
+                ],
+            ),
+            ("Walker2d-v5", &["train.pid2.warmup=16384", "train.pid2.bound_weight=0.1"]),
+            (
+                "Ant-v5",
+                &[
+                    "train.pid2.null_space=true",
+                    "train.pid2.alpha=1e-3",
+                    "train.pid2.warmup=16384",
+                    "train.pid2.bound_weight=0.1",
+                ],
+            ),
         ],
     },
 ];

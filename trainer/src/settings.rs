@@ -179,6 +179,7 @@ impl TrainSettings {
             ("pid2.idm_lr", single(pid2.idm_lr), positive),
             ("pid2.discriminator_lr", single(pid2.discriminator_lr), positive),
             ("pid2.generator_weight", single(pid2.generator_weight), not_negative),
+            ("pid2.lr", single(pid2.lr), not_negative),
             ("pid2.generator_lr", single(pid2.generator_lr), not_negative),
             ("pid2.gradient_penalty", single(pid2.gradient_penalty), not_negative),
             ("pid2.i_c", single(pid2.i_c), not_negative),
@@ -237,7 +238,7 @@ mod tests {
                 value => compare("## `[train]`", key, value),
             }
         }
-        assert_eq!(keys, 74);
+        assert_eq!(keys, 75);
         for column in crate::train::COLUMNS {
             assert!(page.contains(&format!("`{column}`")), "{column}");
         }

@@ -1,7 +1,7 @@
 //! PID^2: policy, inverse dynamics, discriminator (Algorithm 2 of the paper, lines 8 to 13).
 //!
 //! ```text
-//! warm up, if asked to: the inverse model and the policy on what was reached by the fresh networks' own noise
+//! warm up, if asked to: coordinates of a proposal, from what was reached by the fresh networks' own noise
 //! collect with constraints                                        (line 8; `rollout`)
 //! inverse model on reached transitions, Eq. 4, above a threshold  (lines 10 to 12)
 //! discriminator, bottleneck, and policy against them, Eq. 2       (line 9)
@@ -44,10 +44,12 @@ use std::ops::Range;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pid2Settings {
-    /// Steps of the fresh networks' own noise from which inverse model and meta policy learn what was reached, before anything else: the
-    /// policy then begins by proposing what the robot does by itself, and the action that does it is near none. With demonstrations:
-    /// [`DemoSettings::warmup`](crate::demos::DemoSettings::warmup).
+    /// Steps of the fresh networks' own noise in which a regression finds what actions change and what the robot does by itself, before
+    /// anything else. The policy then proposes in coordinates whose first entries are actions. Refused where it does not learn through a
+    /// learned inverse model. With demonstrations: [`DemoSettings::warmup`](crate::demos::DemoSettings::warmup).
     pub warmup: u64,
+    /// Learning rate of policy and inverse model in the policy gradient; 0: `ppo.lr`. Two networks in a row move further at the same rate.
+    pub lr: f32,
     /// The inverse model learns from reached transitions while its mean squared error is at least this (\[sigma_I\]).
     pub idm_threshold: f64,
     /// What of a row of actions is compared with the threshold.
@@ -87,6 +89,7 @@ impl Default for Pid2Settings {
     fn default() -> Self {
         Self {
             warmup: 0,
+            lr: 0.0,
             idm_threshold: 0.5,
             idm_threshold_per: ThresholdPer::default(),
             idm_lr: 3e-4,
@@ -187,7 +190,9 @@ impl Pid2 {
         threads: usize,
         rng: &mut ChaCha8Rng,
     ) -> Self {
-        let (lr, value_lr) = (ppo.lr, ppo.rate_of_value());
+        let value_lr = ppo.rate_of_value();
+        let lr = if settings.lr > 0.0 { settings.lr } else { ppo.lr };
+        let ppo = PpoSettings { lr, value_lr, ..ppo };
         let discriminator = Discriminator::new(dims.n_state, dims.n_obs, nets, bottleneck);
         let (mut combined, [actor, critic]) =
             Combined::new(dims, nets, ppo, settings.gradient, kind, settings.warmup > 0, rng);

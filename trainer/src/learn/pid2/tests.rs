@@ -655,3 +655,22 @@ fn coordinates_span_the_space_whatever_actions_change() {
         assert!(l.nets.combined.in_changes(l.actor()).skip.expect("a map").iter().all(|w| w.is_finite()));
     }
 }
+
+/// The rate is that of policy and inverse model: the value keeps PPO's.
+#[test]
+fn a_rate_of_its_own_is_that_of_policy_and_inverse_model() {
+    let learned = |ppo: PpoSettings, lr: f32| {
+        let settings = Pid2Settings { lr, ..Pid2Settings::default() };
+        let (kind, mut rng) = (Kind { stochastic: false, learned: true }, crate::rollout::stream(13, 0));
+        let mut l = Pid2::new(dims(), &NetSettings::default(), ppo, settings, kind, true, 1, &mut rng);
+        let mut b = batch(&dims(), 256, 3);
+        let metrics = l.update(&mut b, Pace::default(), &mut rng);
+        let told = metrics.iter().find(|(n, _)| *n == "train/learning_rate").expect("a rate").1;
+        (l.params.groups.into_iter().map(|g| g.p).collect::<Vec<_>>(), told)
+    };
+    let ppo = PpoSettings { lr: 3e-4, ..PpoSettings::default() };
+    let (own, told) = learned(ppo.clone(), 1e-3);
+    assert!((told - 1e-3).abs() < 1e-9, "{told}");
+    assert!(own == learned(PpoSettings { lr: 1e-3, value_lr: 3e-4, ..ppo.clone() }, 0.0).0);
+    assert!(own != learned(ppo, 0.0).0);
+}
