@@ -1,8 +1,11 @@
 //! Warnings that are printed before a training begins.
 
 use super::TrainError;
+use super::setup::warm_up_of_pid2;
 use crate::env::{ChaCha8Rng, SeedableRng};
+use crate::learn::Algorithm;
 use crate::rollout::RolloutError;
+use crate::settings::TrainSettings;
 use nearl_runtime::Manifest;
 use nearl_runtime::controller::Parts;
 
@@ -20,6 +23,23 @@ pub fn advice(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
     let mut lines = nearl_runtime::doctor::advice(manifest)?;
     lines.extend(beginnings(manifest)?);
     Ok(lines)
+}
+
+/// Says so where a run of `steps` ends before a reward is read: the first batch fills the statistics, and the warm-up of PID² reads none.
+///
+/// # Errors
+/// [`TrainError`] of settings that cannot be read.
+pub fn of_length(algo: Algorithm, steps: u64, manifest: &Manifest) -> Result<Option<String>, TrainError> {
+    let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
+    let batch = (settings.n_envs * settings.n_steps) as u64;
+    let warmup = warm_up_of_pid2(algo, &settings);
+    let end = batch * (1 + warmup.div_ceil(batch));
+    Ok((warmup > 0 && steps <= end).then(|| {
+        format!(
+            "the run ends after {steps} steps, and first batch and warm-up take {end}: nothing is learned from a reward; give more with --steps, or \
+             leave the warm-up out with --set train.pid2.warmup=0"
+        )
+    }))
 }
 
 /// Where a joint began furthest outside, and in how many resets.
@@ -79,4 +99,29 @@ fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
         say(velocity, "rad/s or m/s", range, "velocity");
     }
     Ok(lines)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::preset::Preset;
+    use crate::tasks;
+
+    /// 2048 steps a batch: one for the statistics and eight of the warm-up.
+    #[test]
+    fn a_run_that_ends_in_its_warm_up_is_told_so() {
+        let said = |algo, steps, set: &[&str]| {
+            let set: Vec<String> = set.iter().map(|s| (*s).into()).collect();
+            let manifest = tasks::load_with("Hopper-v5", Some(Preset::Strong), &set).expect("task");
+            of_length(algo, steps, &manifest).expect("settings")
+        };
+        let short = said(Algorithm::Pid2Ib, 18_432, &[]).expect("too short");
+        assert!(
+            short.starts_with("the run ends after 18432 steps, and first batch and warm-up take 18432"),
+            "{short}"
+        );
+        assert_eq!(said(Algorithm::Pid2Ib, 18_433, &[]), None);
+        assert_eq!(said(Algorithm::Ppo, 10_000, &[]), None);
+        assert_eq!(said(Algorithm::Pid2Ib, 10_000, &["train.pid2.warmup=0"]), None);
+    }
 }

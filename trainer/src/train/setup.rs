@@ -80,7 +80,7 @@ pub(super) fn warm_up_steps(algo: Algorithm, settings: &TrainSettings) -> u64 {
 }
 
 /// Demonstrations have a warm-up of their own.
-fn warm_up_of_pid2(algo: Algorithm, settings: &TrainSettings) -> u64 {
+pub(super) fn warm_up_of_pid2(algo: Algorithm, settings: &TrainSettings) -> u64 {
     match algo {
         Algorithm::Pid2Ib | Algorithm::Pid2Gan => settings.pid2.warmup,
         _ => 0,
