@@ -11,7 +11,7 @@ go() { # task, its seeds
     target/release/nearl sweep --tasks "$1" --algos ppo,pid2-ib --seeds "${seeds:-$2}" --steps "$steps" --preset strong --out "$runs"
 }
 
-go HalfCheetah-v5 10-19
+go HalfCheetah-v5 10-19,30-34
 go Hopper-v5 5-9,30-34
 go Walker2d-v5 5-9
 go Ant-v5 5-9

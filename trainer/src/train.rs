@@ -10,7 +10,7 @@ mod served;
 mod setup;
 mod source;
 
-pub use advice::{advice, of_length};
+pub use advice::{advice, ends_in_warm_up};
 pub use columns::COLUMNS;
 pub use ranked::RankedSource;
 pub use run::{resume, resume_on, train, train_on};

@@ -162,7 +162,7 @@ impl Train {
         let experience = self.experience(&stop)?;
         // Said with the first batch: a training that is refused says why, and nothing else.
         let mut advice = crate::train::advice(&manifest)?;
-        advice.extend(crate::train::of_length(run.algo, run.steps, &manifest)?);
+        advice.extend(crate::train::ends_in_warm_up(run.algo, run.steps, &manifest)?);
         let bar = bar(self.json, run.steps);
         let (mut last, mut faults, mut lines) = (None, 0, Lines::new(self.json));
         let report = |p: &Progress, _| {

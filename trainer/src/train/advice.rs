@@ -29,7 +29,11 @@ pub fn advice(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
 ///
 /// # Errors
 /// [`TrainError`] of settings that cannot be read.
-pub fn of_length(algo: Algorithm, steps: u64, manifest: &Manifest) -> Result<Option<String>, TrainError> {
+pub fn ends_in_warm_up(
+    algo: Algorithm,
+    steps: u64,
+    manifest: &Manifest,
+) -> Result<Option<String>, TrainError> {
     let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
     let batch = (settings.n_envs * settings.n_steps) as u64;
     let warmup = warm_up_of_pid2(algo, &settings);
@@ -113,7 +117,7 @@ mod tests {
         let said = |algo, steps, set: &[&str]| {
             let set: Vec<String> = set.iter().map(|s| (*s).into()).collect();
             let manifest = tasks::load_with("Hopper-v5", Some(Preset::Strong), &set).expect("task");
-            of_length(algo, steps, &manifest).expect("settings")
+            ends_in_warm_up(algo, steps, &manifest).expect("settings")
         };
         let short = said(Algorithm::Pid2Ib, 18_432, &[]).expect("too short");
         assert!(

@@ -77,7 +77,8 @@ impl Regression {
         for i in 1..k {
             xx[(i, i)] += RIDGE;
         }
-        let found = xx.cholesky().map_or_else(|| DMatrix::zeros(k, outputs), |c| c.solve(&xy));
+        let Some(factor) = xx.cholesky() else { unreachable!("finite sums with a ridge are positive") };
+        let found = factor.solve(&xy);
         Self { weight: found.rows(1, inputs).transpose(), bias: found.row(0).transpose() }
     }
 }
@@ -103,7 +104,9 @@ impl Combined {
         });
         let l = columns(&moves.weight.columns(o, a).into_owned());
         let back = l.clone().lu();
-        let solve = |m: DMatrix<f64>| back.solve(&m).unwrap_or(m);
+        let solve = |m: DMatrix<f64>| {
+            back.solve(&m).unwrap_or_else(|| unreachable!("no column of L lies in those before it"))
+        };
         let bias = solve(DMatrix::from_columns(&[moves.bias])).column(0).into_owned();
         let by_itself = Affine::new(&solve(moves.weight.columns(0, o).into_owned()), &bias);
         write(net, &l, group);
