@@ -157,8 +157,17 @@ impl Training {
         })
     }
 
-    /// Asks for `steps` more, at whose end the learning rate falls to zero, and holds the run folder until `end`.
+    /// Asks for `steps` more, at whose end the learning rate falls to zero, and holds the run folder until `end`. Warns first where they
+    /// end before a reward is read.
     fn begin(&self, py: Python<'_>, steps: u64) -> PyResult<()> {
+        let warning = py.detach(|| {
+            let inner = self.lock();
+            let manifest = &inner.training.snapshot().manifest;
+            let algo = manifest.algo.parse().map_err(|e| errors::train(TrainError::Algorithm(e)))?;
+            train::ends_in_warm_up(algo, manifest.steps.saturating_add(steps), manifest)
+                .map_err(errors::train)
+        })?;
+        warning.map_or(Ok(()), |line| errors::warn(py, &line))?;
         py.detach(|| {
             let mut inner = self.lock();
             if inner.learns {

@@ -4,6 +4,7 @@ import _thread
 import itertools
 import signal
 import threading
+import warnings
 from pathlib import Path
 
 import gymnasium
@@ -36,6 +37,17 @@ def test_five_lines(tmp_path: Path) -> None:
     assert not np.array_equal(before, agent.predict(np.zeros(5))[0])
     with pytest.raises(ValueError, match="no optimiser state"):
         loaded.learn(1000)
+
+
+def test_a_run_that_ends_in_its_warm_up_is_told_so() -> None:
+    """2048 steps a batch: one for the statistics and eight of the warm-up."""
+    agent = nearl.PID2("Hopper-v5", algo="pid2-ib", preset="strong")
+    with pytest.warns(UserWarning, match="ends after 4096 steps, and first batch and warm-up take 18432"):
+        agent.learn(4096)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        agent.learn(16_384)
+    assert not [w for w in said if "warm-up" in str(w.message)]
 
 
 def test_predictions_are_the_controllers_and_come_in_rows(tmp_path: Path) -> None:

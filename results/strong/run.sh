@@ -7,11 +7,16 @@ steps=${1:-1M} seeds=${2:-}
 runs=runs/strong/$steps folder=results/strong
 [ "$steps" = 1M ] || folder=$runs
 
-go() { # task, its seeds
-    target/release/nearl sweep --tasks "$1" --algos ppo,pid2-ib --seeds "${seeds:-$2}" --steps "$steps" --preset strong --out "$runs"
+go() { # task, its seeds, then what it sets
+    local task=$1 own=$2
+    shift 2
+    target/release/nearl sweep --tasks "$task" --algos ppo,pid2-ib --seeds "${seeds:-$own}" --steps "$steps" --preset strong --out "$runs" "$@"
 }
 
-go HalfCheetah-v5 10-19,30-34
+# the rate of PID2 that the preset has is for a million steps
+rate=()
+[ "$steps" = 1M ] || rate=(--set train.pid2.lr=3e-4)
+go HalfCheetah-v5 10-19,30-34 "${rate[@]}"
 go Hopper-v5 5-9,30-34
 go Walker2d-v5 5-9
 go Ant-v5 5-9

@@ -40,8 +40,8 @@ pub fn ends_in_warm_up(
     let end = batch * (1 + warmup.div_ceil(batch));
     Ok((warmup > 0 && steps <= end).then(|| {
         format!(
-            "the run ends after {steps} steps, and first batch and warm-up take {end}: nothing is learned from a reward; give more with --steps, or \
-             leave the warm-up out with --set train.pid2.warmup=0"
+            "the run ends after {steps} steps, and first batch and warm-up take {end}: nothing is learned from a reward; give it more, or leave the \
+             warm-up out with train.pid2.warmup=0"
         )
     }))
 }
