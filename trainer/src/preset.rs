@@ -70,22 +70,26 @@ pub const PRESETS: &[RegisteredPreset] = &[
                     "train.pid2.lr=5e-4",
                     "train.pid2.warmup=16384",
                     "train.pid2.bound_weight=0.1",
-                    "train.pid2.idm_threshold=0.03",
                 ],
             ),
             (
                 "Hopper-v5",
+                &["train.nets.idm_residual=true", "train.pid2.warmup=16384", "train.pid2.bound_weight=0.1"],
+            ),
+            (
+                "Walker2d-v5",
                 &[
+                    "train.nets.idm=[32,32]",
                     "train.nets.idm_residual=true",
                     "train.pid2.warmup=16384",
                     "train.pid2.bound_weight=0.1",
-                    "train.pid2.idm_threshold=0.05",
                 ],
             ),
-            ("Walker2d-v5", &["train.pid2.warmup=16384", "train.pid2.bound_weight=0.1"]),
             (
                 "Ant-v5",
                 &[
+                    "train.nets.idm=[32,32]",
+                    "train.nets.idm_residual=true",
                     "train.pid2.null_space=true",
                     "train.pid2.alpha=1e-3",
                     "train.pid2.warmup=16384",
@@ -161,10 +165,10 @@ mod tests {
     #[test]
     fn what_is_set_beside_a_preset_wins() {
         let set = ["train.ppo.log_std=-0.7".to_string()];
-        let manifest = tasks::load_with("Ant-v5", Some(Preset::Strong), &set).expect("task");
+        let manifest = tasks::load_with("Walker2d-v5", Some(Preset::Strong), &set).expect("task");
         let settings = TrainSettings::read(&manifest.task.train).expect("settings");
         assert_eq!((settings.ppo.log_std, settings.ppo.batch_size), (-0.7, 64));
-        assert_eq!(settings.nets.idm, Vec::<usize>::new(), "what neither says stays the task file's");
+        assert!(settings.pid2.null_space, "what neither says stays the task file's");
         assert_eq!(
             "weak".parse::<Preset>().unwrap_err().to_string(),
             "no preset 'weak'; give one of paper, strong"

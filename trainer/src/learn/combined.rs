@@ -180,8 +180,14 @@ impl Combined {
 
     /// Carries the networks over to other statistics; transposed weights are the caller's to refresh.
     pub(super) fn rescale(&self, actor: &mut Group, value: &mut Group, from: &Normaliser, to: &Normaliser) {
-        let (d, obs) = (&self.dims, Inputs::observation(from, to));
-        carry(&self.policy, &mut actor.p, &obs, &outputs(from, to));
+        let (d, obs, gain) = (&self.dims, Inputs::observation(from, to), outputs(from, to));
+        match &self.coordinates {
+            Some(net) => {
+                carry(&self.policy, &mut actor.p, &obs, &[]);
+                carry(net, &mut actor.p, &Inputs::same(d.n_state), &gain);
+            }
+            None => carry(&self.policy, &mut actor.p, &obs, &gain),
+        }
         carry(&self.value.net, &mut value.p, &obs, &[]);
         if let Some((model, _)) = &self.inverse {
             carry(&model.net, &mut actor.p, &Inputs::seen(from, to, &d.seen_obs, &d.seen_state), &[]);

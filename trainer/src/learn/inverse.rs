@@ -82,12 +82,13 @@ impl InverseModel {
         self.net.mlp.write_dense(&dense, p);
     }
 
-    /// Begins anew as a linear map of its input, where it has one: alone, or beside layers, whose output then begins at zero.
-    pub(super) fn begin_affine(&self, p: &mut [V], weight: Vec<f32>, bias: Vec<f32>) {
+    /// Begins anew as a linear map of its input, where it has one: alone, or beside layers, whose output then begins at zero. False where it
+    /// has none.
+    pub(super) fn begin_affine(&self, p: &mut [V], weight: Vec<f32>, bias: Vec<f32>) -> bool {
         let mut dense = self.net.mlp.to_dense(p);
         let is_affine = dense.layers.len() == 1;
         let Some(last) = dense.layers.last_mut().filter(|_| is_affine || dense.skip.is_some()) else {
-            return;
+            return false;
         };
         last.bias = bias;
         if is_affine {
@@ -97,6 +98,7 @@ impl InverseModel {
             dense.skip = Some(weight);
         }
         self.net.mlp.write_dense(&dense, p);
+        true
     }
 
     /// Where its parameters lie.

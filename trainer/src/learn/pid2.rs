@@ -296,10 +296,14 @@ impl Learner for Pid2 {
         metrics
     }
 
-    /// What the robot does by itself and what actions change, by least squares; then the inverse model as ever.
+    /// What the robot does by itself and what actions change, by least squares. An inverse model that cannot begin so learns from the batch.
     fn warm_up(&mut self, batch: &Batch, rng: &mut ChaCha8Rng) -> Metrics {
-        self.nets.combined.identify(&mut self.params.groups[COMBINED], batch);
-        self.learn_inverse(batch, rng)
+        if !self.nets.combined.identify(&mut self.params.groups[COMBINED], batch) {
+            return self.learn_inverse(batch, rng);
+        }
+        let error = self.nets.combined.idm_error(self.actor(), batch, self.threads);
+        let actions = super::variance(&batch.action, self.nets.combined.dims.n_act);
+        super::idm_metrics(error, error, false, actions)
     }
 
     fn networks(&self, normaliser: &Normaliser) -> Networks {

@@ -15,6 +15,11 @@ pub(super) struct Inputs {
 }
 
 impl Inputs {
+    /// Inputs that stay what they are.
+    pub(super) fn same(n: usize) -> Self {
+        Self { a: vec![1.0; n], c: vec![0.0; n] }
+    }
+
     /// Normalised observations.
     pub(super) fn observation(from: &Normaliser, to: &Normaliser) -> Self {
         let a = to.std.iter().zip(&from.std).map(|(to, from)| to / from).collect();

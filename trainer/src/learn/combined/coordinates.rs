@@ -4,13 +4,17 @@
 //! output along one of them moves the action far, along another hardly. So the policy puts out `z` and proposes `u = L z`. Of a batch
 //!
 //! ```text
-//! reached change = F x + c + G a             (x observation, a action, all normalised)
-//! action         = A [x_c, change_c] + b
+//! reached change = F x + c + G a             (x what the inverse model sees of the observation, a action, all normalised)
+//! G = U S V'                                 (the entries of the change that the inverse model sees)
+//! A = V S^-1 U'
 //! ```
 //!
-//! the first columns of `L` are those of `G`, and the others are unit vectors at right angles to them, for what no action changes. A linear
-//! map beside the policy's layers adds `F x + c` to the proposal: where the layers put out zero, what the robot does by itself is
-//! proposed, and their first entries are actions. The inverse model begins as `A` and `b`. `L` stays as it is from then on.
+//! with the singular values in `S` raised to a part of the largest: two legs on the ground hold their hips, and what moves one against
+//! the other changes nothing until one of them is lifted. The first columns of `L` are `U S V'`, the others unit vectors at right angles
+//! to them, for what no action changes. A linear map beside the policy's layers adds `F x + c` to the proposal, and the inverse model begins
+//! as `A (change - F x - c)`. So the first entries of what the layers put out are the action, and the others leave it as it is: the combined
+//! policy begins as one that puts out actions. A regression of the actions on what was reached would not do: noise in what is reached draws its slopes
+//! towards zero, furthest where an action changes least. `L` stays as it is from then on.
 
 use super::super::batch::Batch;
 use super::super::inverse::CLIP;
@@ -23,7 +27,9 @@ use nearl_runtime::net::{Dense, DenseLayer};
 
 /// Added to the mean square of each input, whose own is near 1.
 const RIDGE: f64 = 1e-4;
-/// No column of `L` is shorter than this in its own direction.
+/// No singular value of `G` is taken for less than this part of the largest.
+const LEAST: f64 = 0.3;
+/// Nor for less than this, where no action changes anything.
 const SHORTEST: f64 = 1e-3;
 
 /// Buffers of what the policy puts out and of what it proposes by it.
@@ -36,18 +42,6 @@ impl Proposing {
     /// The proposals, row by row.
     pub(in super::super) fn output(&self) -> &[V] {
         self.coordinates.as_ref().unwrap_or(&self.policy).output()
-    }
-}
-
-/// Row-major weights of a linear map, and its bias.
-struct Affine {
-    weight: Vec<f32>,
-    bias: Vec<f32>,
-}
-
-impl Affine {
-    fn new(weight: &DMatrix<f64>, bias: &DVector<f64>) -> Self {
-        Self { weight: row_major(weight), bias: bias.iter().map(|&b| b as f32).collect() }
     }
 }
 
@@ -91,44 +85,45 @@ impl Combined {
         }
     }
 
-    /// Finds coordinates, policy and inverse model anew in a batch of what noise reached; nothing where the policy has no coordinates.
-    pub(in super::super) fn identify(&self, group: &mut Group, batch: &Batch) {
-        let Some(net) = &self.coordinates else { return };
+    /// Finds coordinates, policy and inverse model anew in a batch of what noise reached; nothing where the policy has no coordinates. False
+    /// where the inverse model cannot begin so: it has hidden layers and no linear map beside them.
+    pub(in super::super) fn identify(&self, group: &mut Group, batch: &Batch) -> bool {
+        let Some(net) = &self.coordinates else { return false };
         let d = &self.dims;
         let (o, s, a, seen) = (d.n_obs, d.n_state, d.n_act, d.seen_obs.len());
-        let change = |i: usize, k: usize| f64::from(batch.reached[i * s + k].clamp(-CLIP, CLIP));
-        let moves = Regression::of(batch.n, o + a, s, |i, to| {
-            let inputs = batch.obs[i * o..][..o].iter().chain(&batch.action[i * a..][..a]);
-            to.iter_mut().zip(inputs).for_each(|(to, &x)| *to = f64::from(x));
-            to[o + a..].iter_mut().enumerate().for_each(|(k, to)| *to = change(i, k));
+        let moves = Regression::of(batch.n, seen + a, s, |i, to| {
+            let obs = d.seen_obs.iter().map(|&k| batch.obs[i * o + k]);
+            let inputs = obs.chain(batch.action[i * a..][..a].iter().copied());
+            to.iter_mut().zip(inputs).for_each(|(to, x)| *to = f64::from(x));
+            let reached = batch.reached[i * s..][..s].iter();
+            to[seen + a..].iter_mut().zip(reached).for_each(|(to, &x)| *to = f64::from(x.clamp(-CLIP, CLIP)));
         });
-        let l = columns(&moves.weight.columns(o, a).into_owned());
-        let back = l.clone().lu();
-        let solve = |m: DMatrix<f64>| {
-            back.solve(&m).unwrap_or_else(|| unreachable!("no column of L lies in those before it"))
+        let by_itself = moves.weight.columns(0, seen).into_owned();
+        let Coordinates { l, back } =
+            Coordinates::of(&moves.weight.columns(seen, a).into_owned(), &d.seen_state);
+        let Some(inverse) = l.clone().try_inverse() else {
+            unreachable!("no column of L lies in those before it")
         };
-        let bias = solve(DMatrix::from_columns(&[moves.bias])).column(0).into_owned();
-        let by_itself = Affine::new(&solve(moves.weight.columns(0, o).into_owned()), &bias);
         write(net, &l, group);
+        let mut beside = DMatrix::zeros(s, o);
+        for (&k, column) in d.seen_obs.iter().zip((&inverse * &by_itself).column_iter()) {
+            beside.column_mut(k).copy_from(&column);
+        }
         let mut dense = self.policy.mlp.to_dense(&group.p);
-        dense.skip = Some(by_itself.weight);
+        dense.skip = Some(row_major(&beside));
         if let Some(last) = dense.layers.last_mut() {
-            last.bias = by_itself.bias;
+            last.bias = (inverse * &moves.bias).iter().map(|&b| b as f32).collect();
         }
         self.policy.mlp.write_dense(&dense, &mut group.p);
-        if let Some((model, _)) = &self.inverse {
-            let inverse = Regression::of(batch.n, 2 * seen, a, |i, to| {
-                for j in 0..seen {
-                    to[j] = f64::from(batch.obs[i * o + d.seen_obs[j]]);
-                    to[seen + j] = change(i, d.seen_state[j]);
-                }
-                let action = &batch.action[i * a..][..a];
-                to[2 * seen..].iter_mut().zip(action).for_each(|(to, &x)| *to = f64::from(x));
-            });
-            let inverse = Affine::new(&inverse.weight, &inverse.bias);
-            model.begin_affine(&mut group.p, inverse.weight, inverse.bias);
-        }
+        let begun = self.inverse.as_ref().is_some_and(|(model, _)| {
+            let mut weight = DMatrix::zeros(a, 2 * seen);
+            weight.columns_mut(0, seen).copy_from(&-(&back * by_itself.select_rows(&d.seen_state)));
+            weight.columns_mut(seen, seen).copy_from(&back);
+            let bias = back * moves.bias.select_rows(&d.seen_state);
+            model.begin_affine(&mut group.p, row_major(&weight), bias.iter().map(|&b| -b as f32).collect())
+        });
         self.refresh(group);
+        begun
     }
 
     /// The policy with `L` in its last layer.
@@ -150,20 +145,51 @@ impl Combined {
     }
 }
 
-/// `L`: the columns of `g`, then unit vectors at right angles to them.
-fn columns(g: &DMatrix<f64>) -> DMatrix<f64> {
-    let (s, n) = (g.nrows(), g.ncols().min(g.nrows()));
-    let mut wide = DMatrix::zeros(s, n + s);
-    wide.columns_mut(0, n).copy_from(&g.columns(0, n));
-    wide.columns_mut(n, s).fill_with_identity();
-    let (mut l, mut r) = wide.qr().unpack();
-    for k in 0..n {
-        let own = r[(k, k)];
-        r[(k, k)] = own.abs().max(SHORTEST).copysign(own);
+/// `L`, and the inverse of what actions change.
+struct Coordinates {
+    l: DMatrix<f64>,
+    /// `A` (n_act x seen).
+    back: DMatrix<f64>,
+}
+
+impl Coordinates {
+    /// Of what each action changes in each entry, of which the inverse model sees `seen`. More actions than entries have as many coordinates
+    /// as there are entries, along `V`.
+    fn of(g: &DMatrix<f64>, seen: &[usize]) -> Self {
+        let (s, a, m) = (g.nrows(), g.ncols(), seen.len());
+        let n = m.min(a);
+        let (u, mut values, v) = of_svd(&g.select_rows(seen));
+        let least = (LEAST * values.max()).max(SHORTEST);
+        values.apply(|value| *value = value.max(least));
+        let stretched = &u * DMatrix::from_diagonal(&values);
+        let back = v.transpose() * DMatrix::from_diagonal(&values.map(f64::recip)) * u.transpose();
+        let fits = a <= m;
+        let first = if fits { stretched * &v } else { stretched };
+        let mut wide = DMatrix::zeros(m, n + m);
+        wide.columns_mut(0, n).copy_from(&u);
+        wide.columns_mut(n, m).fill_with_identity();
+        let others = wide.qr().q();
+        let mut l = DMatrix::zeros(s, s);
+        for (i, &k) in seen.iter().enumerate() {
+            l.view_mut((k, 0), (1, n)).copy_from(&first.row(i));
+            l.view_mut((k, n), (1, m - n)).copy_from(&others.view((i, n), (1, m - n)));
+        }
+        // what the inverse model does not see leaves its action as it is
+        for (j, k) in (0..s).filter(|k| !seen.contains(k)).enumerate() {
+            if fits {
+                l.view_mut((k, 0), (1, n)).copy_from(&g.row(k));
+            }
+            l[(k, m + j)] = 1.0;
+        }
+        Self { l, back }
     }
-    let moved = l.columns(0, n) * r.view((0, 0), (n, n));
-    l.columns_mut(0, n).copy_from(&moved);
-    l
+}
+
+/// `U`, the singular values and `V'`.
+fn of_svd(m: &DMatrix<f64>) -> (DMatrix<f64>, DVector<f64>, DMatrix<f64>) {
+    let svd = m.clone().svd(true, true);
+    let (Some(u), Some(v)) = (svd.u, svd.v_t) else { unreachable!("asked for both") };
+    (u, svd.singular_values, v)
 }
 
 fn write(net: &Net, l: &DMatrix<f64>, group: &mut Group) {

@@ -57,6 +57,7 @@ impl Base for Pid2 {
     /// The meta policy takes on the demonstrated changes.
     fn clone_demos(&mut self, demos: &Batch, s: &DemoSettings, rng: &mut ChaCha8Rng) -> Metrics {
         let (c, group) = (&self.nets.combined, &mut self.params.groups[COMBINED]);
+        assert!(c.coordinates.is_none(), "a policy that clones puts out a proposal");
         let cloning = Cloning { net: &c.policy, range: c.policy_range.clone(), wanted: Wanted::Change };
         vec![(CLONED, cloning.run(group, demos, s, self.threads, rng))]
     }
