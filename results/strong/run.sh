@@ -18,6 +18,6 @@ rate=()
 [ "$steps" = 1M ] || rate=(--set train.pid2.lr=3e-4)
 go HalfCheetah-v5 10-19,30-34 "${rate[@]}"
 go Hopper-v5 5-9,30-34
-go Walker2d-v5 5-9
+go Walker2d-v5 5-9,30-34
 go Ant-v5 5-9
 .venv/bin/python results/strong/table.py "$folder" "$runs"

@@ -1,4 +1,4 @@
-"""What an action becomes on its way through two inverses of the same noise: a regression of actions on what was reached, and the inverse of what actions change.
+"""What becomes of an action through two inverse models of the same noise: a regression of actions on what was reached, and the inverse of what actions change.
 
     .venv/bin/python results/strong/slopes.py
 

@@ -88,8 +88,6 @@ pub const PRESETS: &[RegisteredPreset] = &[
             (
                 "Ant-v5",
                 &[
-                    "train.nets.idm=[32,32]",
-                    "train.nets.idm_residual=true",
                     "train.pid2.null_space=true",
                     "train.pid2.alpha=1e-3",
                     "train.pid2.warmup=16384",
