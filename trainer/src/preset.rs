@@ -163,10 +163,10 @@ mod tests {
     #[test]
     fn what_is_set_beside_a_preset_wins() {
         let set = ["train.ppo.log_std=-0.7".to_string()];
-        let manifest = tasks::load_with("Walker2d-v5", Some(Preset::Strong), &set).expect("task");
+        let manifest = tasks::load_with("Ant-v5", Some(Preset::Strong), &set).expect("task");
         let settings = TrainSettings::read(&manifest.task.train).expect("settings");
         assert_eq!((settings.ppo.log_std, settings.ppo.batch_size), (-0.7, 64));
-        assert!(settings.pid2.null_space, "what neither says stays the task file's");
+        assert_eq!(settings.nets.idm, Vec::<usize>::new(), "what neither says stays the task file's");
         assert_eq!(
             "weak".parse::<Preset>().unwrap_err().to_string(),
             "no preset 'weak'; give one of paper, strong"

@@ -11,10 +11,10 @@
 //!
 //! with the singular values in `S` raised to a part of the largest: two legs on the ground hold their hips, and what moves one against
 //! the other changes nothing until one of them is lifted. The first columns of `L` are `U S V'`, the others unit vectors at right angles
-//! to them, for what no action changes. A linear map beside the policy's layers adds `F x + c` to the proposal, and the inverse model begins
-//! as `A (change - F x - c)`. So the first entries of what the layers put out are the action, and the others leave it as it is: the combined
-//! policy begins as one that puts out actions. A regression of the actions on what was reached would not do: noise in what is reached draws its slopes
-//! towards zero, furthest where an action changes least. `L` stays as it is from then on.
+//! to them in the entries that the inverse model sees, for what no action changes. A linear map beside the policy's layers adds `F x + c` to
+//! the proposal, and the inverse model begins as `A (change - F x - c)`. So the first entries of what the layers put out are the action, and
+//! the others leave it as it is: the combined policy begins as one that puts out actions. A regression of the actions on what was reached would
+//! not do: noise in what is reached draws its slopes towards zero, furthest where an action changes least. `L` stays as it is from then on.
 
 use super::super::batch::Batch;
 use super::super::inverse::CLIP;
