@@ -21,7 +21,8 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
 
     Environment ``i`` behaves as a single one that was seeded with ``seed + i``. ``info`` holds, where there is something to say and
     with the mask ``_<key>``: ``final_obs`` (same-step mode), ``fault``; ``cost`` where the task has one; and with ``constraints`` always:
-    ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit) and ``moved``.
+    ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit), ``executed``
+    (what the actuators got in the last of them, num_envs x n_act) and ``moved``.
 
     Args:
         max_episode_steps: Control periods after which an episode is cut; the task's own by default.
@@ -151,7 +152,8 @@ def make_vec(
         actions: What an action is with ``constraints``. ``"state"``: the proposed next state. ``"change"``: its change in [-1, 1], in units of what
             the limits allow in a policy period (of a trained agent, of three standard deviations of its changes). ``"guarded"`` (with
             ``constraints="task"``): what the actuators get, which gives way where the state it leads to would break a limit; the robot model tells
-            where the task has analytic inverse dynamics, else the simulator, for positions and velocities.
+            where the task has analytic inverse dynamics, else the simulator, for positions and velocities. ``"limited"`` (likewise): what the
+            actuators get, replaced by the nearest action within the task's ``[constraints.action]``; limits on states are not kept then.
         seed: Environment ``i`` draws from the stream of ``seed + i`` until ``reset(seed=...)`` says otherwise.
         threads: Threads to step on; all cores by default. Results do not depend on it.
         reward: ``reward(obs, actions, next_obs)`` for all environments at once, arrays of num_envs rows in, (num_envs,) out: replaces

@@ -43,9 +43,10 @@ impl VecEnv {
             "state" => Meaning::State,
             "change" => Meaning::Change,
             "guarded" => Meaning::Action,
+            "limited" => Meaning::Limited,
             other => {
                 return Err(errors::value(format!(
-                    "actions is '{other}'; give \"state\", \"change\" or \"guarded\""
+                    "actions is '{other}'; give \"state\", \"change\", \"guarded\" or \"limited\""
                 )));
             }
         };
@@ -208,6 +209,9 @@ fn info<'py>(py: Python<'py>, vector: &Vector) -> PyResult<Bound<'py, PyDict>> {
         };
         info.set_item("raw_violations", counts(|l| l.tally.raw_violations))?;
         info.set_item("target_violations", counts(|l| l.tally.target_violations))?;
+        let executed: Vec<f64> = vector.lanes().flat_map(|lane| lane.executed().to_vec()).collect();
+        let width = executed.len() / vector.n();
+        info.set_item("executed", array2(py, executed, width)?)?;
         info.set_item("moved", array(py, &vector.lanes().map(|l| l.moved).collect::<Vec<_>>()))?;
     }
     Ok(info)

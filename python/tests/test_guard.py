@@ -131,6 +131,58 @@ def test_a_vector_of_guarded_cheetahs_stays_inside():
     assert count[None] > 50 and count["guarded"] <= 8, count
 
 
+def with_limits(folder: pathlib.Path, limits: str) -> str:
+    """HalfCheetah's own task file, with limits on actions."""
+    task = pathlib.Path(__file__).parents[2] / "examples/tasks/HalfCheetah-v5.toml"
+    (folder / "limited.toml").write_text(task.read_text() + f"\n[constraints.action]\n{limits}\n")
+    return str(folder / "limited.toml")
+
+
+def test_limited_actions_are_the_nearest_ones_of_the_set(tmp_path):
+    """Of a ball the nearest point is known by hand: an environment without limits goes the same way under it."""
+    limited = nearl.make_vec(with_limits(tmp_path, "square = 0.5"), 1, constraints="task", actions="limited")
+    plain = nearl.make_vec("HalfCheetah-v5", 1)
+    rng = np.random.default_rng(3)
+    for envs in (limited, plain):
+        envs.reset(seed=4)
+    moved = 0
+    for _ in range(100):
+        action = rng.uniform(-1, 1, (1, 6)).astype(np.float32).astype(float)
+        *_, info = limited.step(action)
+        nearest = action * min(1.0, np.sqrt(0.5) / np.linalg.norm(action))
+        np.testing.assert_allclose(info["executed"], nearest, rtol=1e-9)
+        plain.step(nearest)
+        for name in ("qpos", "qvel"):
+            np.testing.assert_allclose(getattr(limited.native, name), getattr(plain.native, name), rtol=1e-9, atol=1e-9)
+        limited.native.set_state(0, plain.native.qpos[0], plain.native.qvel[0])
+        plain.native.set_state(0, plain.native.qpos[0], plain.native.qvel[0])
+        assert info["raw_violations"][0] == (np.linalg.norm(action) ** 2 > 0.5)
+        assert info["target_violations"][0] == 0
+        moved += info["raw_violations"][0]
+    assert moved > 80
+
+
+def test_a_limited_environment_passes_no_more_than_its_power(tmp_path):
+    env = nearl.ProjectedEnv(with_limits(tmp_path, "power = 5.0"), "task", "limited")
+    env.action_space.seed(5)
+    env.reset(seed=6)
+    raw = 0
+    for _ in range(300):
+        velocity = env.native.qvel[0, 3:]
+        *_, terminated, truncated, info = env.step(env.action_space.sample())
+        assert np.abs(velocity * info["executed"]).sum() <= 5.0 + 1e-9
+        assert info["target_violations"] == 0 and not terminated and not truncated
+        raw += info["raw_violations"]
+    assert raw > 200
+
+
+def test_limited_actions_want_a_limit(tmp_path):
+    with pytest.raises(ValueError, match=r"limits no actions; write power, delivered, square or rate"):
+        nearl.make_vec("HalfCheetah-v5", 1, constraints="task", actions="limited")
+    with pytest.raises(ValueError, match='give constraints="task"'):
+        nearl.make_vec("HalfCheetah-v5", 1, constraints="some.safetensors", actions="limited")
+
+
 def test_actions_of_an_unknown_meaning_are_refused():
     with pytest.raises(ValueError, match="'torque'"):
         nearl.make_vec("Panda-reach", 1, constraints="task", actions="torque")

@@ -38,6 +38,15 @@ pub enum Meaning {
     Change,
     /// What the actuators get, where the guard allows it.
     Action,
+    /// What the actuators get, where the task's limits on actions allow it.
+    Limited,
+}
+
+impl Meaning {
+    /// The action is the actuators' own, not a state.
+    pub(super) fn is_actuators(self) -> bool {
+        matches!(self, Meaning::Action | Meaning::Limited)
+    }
 }
 
 /// A controller between action and actuators.
@@ -135,6 +144,11 @@ impl Lane {
     /// Whether actions are proposals.
     pub fn is_projected(&self) -> bool {
         self.proposing.is_some()
+    }
+
+    /// What the actuators got in the last control period (n_act); nothing where they get the caller's own actions.
+    pub fn executed(&self) -> &[f64] {
+        self.proposing.as_ref().map_or(&[], |p| &p.out.action)
     }
 
     /// Does what the round says.
@@ -241,7 +255,7 @@ impl Proposing {
                 }
             }
             Meaning::Action if self.foresight.is_some() => self.out.action.copy_from_slice(action),
-            Meaning::Action => {
+            Meaning::Action | Meaning::Limited => {
                 self.noise.action.iter_mut().zip(action).for_each(|(noise, a)| *noise = *a as f32);
             }
         }

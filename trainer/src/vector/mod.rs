@@ -97,19 +97,23 @@ impl Vector {
         }
         let first = tasks::env(task)?;
         let spec = first.spec().clone();
-        let guarded = settings.actions == Meaning::Action;
+        let of_actuators = settings.actions.is_actuators();
         let open = match &settings.constraints {
             None => None,
-            Some(Constraints::Task) if guarded => Some(space::guarded_snapshot(task)?),
+            Some(Constraints::Task) if settings.actions == Meaning::Action => {
+                Some(space::guarded_snapshot(task)?)
+            }
+            Some(Constraints::Task) if of_actuators => Some(space::limited_snapshot(task)?),
             Some(Constraints::Task) => Some(space::task_snapshot(task)?),
-            Some(Constraints::Agent(_)) if guarded => {
-                let reason = "actions is 'guarded', which needs no trained agent; give constraints=\"task\"";
+            Some(Constraints::Agent(_)) if of_actuators => {
+                let reason =
+                    "'guarded' and 'limited' actions need no trained agent; give constraints=\"task\"";
                 return Err(VectorError::Unusable(reason.into()));
             }
             Some(Constraints::Agent(file)) => Some(space::agent_snapshot(&spec.name, file)?),
         };
         let space = match &open {
-            Some(snapshot) if !guarded => Space::proposals(snapshot, settings.actions)?,
+            Some(snapshot) if !of_actuators => Space::proposals(snapshot, settings.actions)?,
             _ => Space::actions(&spec),
         };
         let ticks = open.as_ref().map_or(1, |snapshot| snapshot.manifest.task.time.policy_every);

@@ -135,6 +135,19 @@ pub(super) fn guarded_snapshot(task: &str) -> Result<Snapshot, VectorError> {
     Ok(idle(manifest))
 }
 
+/// The task's limits on actions around actions as the actuators take them, and nothing else.
+pub(super) fn limited_snapshot(task: &str) -> Result<Snapshot, VectorError> {
+    let mut manifest = tasks::load(task, &[])?;
+    if manifest.task.constraints.action.is_none() {
+        return Err(VectorError::Unusable(format!(
+            "actions is 'limited', but task '{task}' limits no actions; write power, delivered, square or rate under [constraints.action] of a task \
+             file, or ask for 'guarded' actions, which keep the limits on states"
+        )));
+    }
+    train::complete(&mut manifest)?;
+    Ok(idle(manifest))
+}
+
 fn zeros(n_in: usize, n_out: usize) -> DenseLayer {
     DenseLayer { n_in, n_out, weight: vec![0.0; n_in * n_out], bias: vec![0.0; n_out] }
 }
