@@ -10,6 +10,7 @@
 import json
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TextIO
@@ -111,8 +112,10 @@ class PID2:
             raise ValueError(f"total_timesteps is {total_timesteps}; ask for at least one step")
         callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]
         bar = _Bar(sys.stderr, self.num_timesteps, total_timesteps) if progress_bar else None
-        self._training.begin(int(total_timesteps))
+        warning = self._training.begin(int(total_timesteps))
         try:
+            if warning is not None:
+                warnings.warn(warning, stacklevel=2)
             while not self._training.done:
                 metrics = self._training.iterate()
                 if bar is not None:

@@ -157,23 +157,18 @@ impl Training {
         })
     }
 
-    /// Asks for `steps` more, at whose end the learning rate falls to zero, and holds the run folder until `end`. Warns first where they
-    /// end before a reward is read.
-    fn begin(&self, py: Python<'_>, steps: u64) -> PyResult<()> {
-        let warning = py.detach(|| {
-            let inner = self.lock();
-            let manifest = &inner.training.snapshot().manifest;
-            let algo = manifest.algo.parse().map_err(|e| errors::train(TrainError::Algorithm(e)))?;
-            train::ends_in_warm_up(algo, manifest.steps.saturating_add(steps), manifest)
-                .map_err(errors::train)
-        })?;
-        warning.map_or(Ok(()), |line| errors::warn(py, &line))?;
+    /// Asks for `steps` more, at whose end the learning rate falls to zero, and holds the run folder until `end`. What there is to warn of:
+    /// that they end before a reward is read.
+    fn begin(&self, py: Python<'_>, steps: u64) -> PyResult<Option<String>> {
         py.detach(|| {
             let mut inner = self.lock();
             if inner.learns {
                 return Err(errors::value("this agent is learning already, in another thread; wait for its end"));
             }
             let manifest = &inner.training.snapshot().manifest;
+            let algo = manifest.algo.parse().map_err(|e| errors::train(TrainError::Algorithm(e)))?;
+            let warning = train::ends_in_warm_up(algo, manifest.steps.saturating_add(steps), manifest)
+                .map_err(errors::train)?;
             if let Some(out) = &self.out {
                 let held = run_folder::lock(out).map_err(run)?;
                 let file = checkpoint::path_in(out);
@@ -194,7 +189,7 @@ impl Training {
             }
             inner.training.extend(steps);
             inner.learns = true;
-            Ok(())
+            Ok(warning)
         })
     }
 

@@ -42,8 +42,12 @@ def test_five_lines(tmp_path: Path) -> None:
 def test_a_run_that_ends_in_its_warm_up_is_told_so() -> None:
     """2048 steps a batch: one for the statistics and eight of the warm-up."""
     agent = nearl.PID2("Hopper-v5", algo="pid2-ib", preset="strong")
-    with pytest.warns(UserWarning, match="ends after 4096 steps, and first batch and warm-up take 18432"):
+    with warnings.catch_warnings(), pytest.raises(UserWarning, match="ends after 4096 steps"):
+        warnings.simplefilter("error")
         agent.learn(4096)
+    with pytest.warns(UserWarning, match="ends after 4096 steps, and first batch and warm-up take 18432") as warned:
+        agent.learn(4096)
+    assert [w.filename for w in warned if "warm-up" in str(w.message)] == [__file__]
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         agent.learn(16_384)
