@@ -106,11 +106,18 @@ pub trait Learner: Send {
     }
 }
 
-/// The inverse model's mean squared error before and after an update, the part of the actions' variance that it explains, and
-/// whether it learned.
-fn idm_metrics(before: Option<f64>, after: Option<f64>, learned: bool, actions: f64) -> Metrics {
+/// The inverse model's mean squared error before and after an update, the part of the actions' variance that it explains, and whether
+/// it learned; `actions` are its rows of `n_act`.
+fn idm_metrics(
+    before: Option<f64>,
+    after: Option<f64>,
+    learned: bool,
+    actions: &[f32],
+    n_act: usize,
+) -> Metrics {
     let (Some(before), Some(after)) = (before, after) else { return Metrics::new() };
-    let explained = |error: f64| if actions > 0.0 { 1.0 - error / actions } else { f64::NAN };
+    let variance = variance(actions, n_act);
+    let explained = |error: f64| if variance > 0.0 { 1.0 - error / variance } else { f64::NAN };
     vec![
         ("idm/mse_before", before),
         ("idm/mse_after", after),
@@ -149,9 +156,10 @@ mod tests {
     /// Columns 1 3 (variance 1) and 10 30 (variance 100); a model with the error 10.1 explains four fifths.
     #[test]
     fn what_the_inverse_model_explains_is_by_hand() {
-        let actions = variance(&[1.0, 10.0, 3.0, 30.0], 2);
-        assert!((actions - 50.5).abs() < 1e-12, "{actions}");
-        let metrics = idm_metrics(Some(50.5), Some(10.1), true, actions);
+        let actions = [1.0, 10.0, 3.0, 30.0];
+        let variance = variance(&actions, 2);
+        assert!((variance - 50.5).abs() < 1e-12, "{variance}");
+        let metrics = idm_metrics(Some(50.5), Some(10.1), true, &actions, 2);
         let of = |name: &str| metrics.iter().find(|(n, _)| *n == name).map_or(f64::NAN, |m| m.1);
         assert!(of("idm/r2_before").abs() < 1e-12 && (of("idm/r2_after") - 0.8).abs() < 1e-12);
     }

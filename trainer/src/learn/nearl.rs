@@ -149,8 +149,7 @@ impl Learner for Nearl {
             metrics.push(("train/policy_mse", imitate.mean[0] / self.nets.combined.dims.n_state as f64));
         }
         let after = self.nets.combined.idm_error(self.actor(), batch, self.threads);
-        let actions = super::variance(&batch.action, n_act);
-        metrics.extend(super::idm_metrics(before, after, inverse_learns, actions));
+        metrics.extend(super::idm_metrics(before, after, inverse_learns, &batch.action, n_act));
         metrics
     }
 

@@ -291,8 +291,7 @@ impl Learner for Pid2 {
             ]);
         }
         let after = self.nets.combined.idm_error(self.actor(), batch, self.threads);
-        let actions = super::variance(&batch.action, n_act);
-        metrics.extend(super::idm_metrics(before, after, inverse_learns, actions));
+        metrics.extend(super::idm_metrics(before, after, inverse_learns, &batch.action, n_act));
         metrics
     }
 
@@ -302,8 +301,7 @@ impl Learner for Pid2 {
             return self.learn_inverse(batch, rng);
         }
         let error = self.nets.combined.idm_error(self.actor(), batch, self.threads);
-        let actions = super::variance(&batch.action, self.nets.combined.dims.n_act);
-        super::idm_metrics(error, error, false, actions)
+        super::idm_metrics(error, error, false, &batch.action, self.nets.combined.dims.n_act)
     }
 
     fn networks(&self, normaliser: &Normaliser) -> Networks {

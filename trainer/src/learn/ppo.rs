@@ -189,8 +189,7 @@ impl Learner for Ppo {
         let phases: &[usize] = if before.is_some() { &[ACTOR, VALUE, INVERSE] } else { &[ACTOR, VALUE] };
         let mut metrics = self.passes(batch, pace, rng, phases);
         let after = self.nets.idm_error(&self.params, batch, self.threads);
-        let actions = super::variance(&batch.action, self.nets.dims.n_act);
-        metrics.extend(super::idm_metrics(before, after, true, actions));
+        metrics.extend(super::idm_metrics(before, after, true, &batch.action, self.nets.dims.n_act));
         metrics
     }
 }

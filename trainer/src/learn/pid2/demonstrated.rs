@@ -72,8 +72,7 @@ impl Base for Pid2 {
             optimise(&self.nets, &mut self.params, batch, &[INVERSE], schedule, rng);
         }
         let after = self.nets.combined.idm_error(self.actor(), batch, threads);
-        let actions = super::super::variance(&batch.action, self.nets.combined.dims.n_act);
-        super::super::idm_metrics(before, after, true, actions)
+        super::super::idm_metrics(before, after, true, &batch.action, self.nets.combined.dims.n_act)
     }
 
     fn params_mut(&mut self) -> &mut Params {

@@ -63,8 +63,7 @@ impl Base for Ppo {
         let schedule = Schedule { epochs, minibatch, threads, rate: 1.0, clip: 1.0 };
         optimise(&self.nets, &mut self.params, batch, &[INVERSE], schedule, rng);
         let after = self.nets.idm_error(&self.params, batch, threads);
-        let actions = super::super::variance(&batch.action, self.nets.dims.n_act);
-        super::super::idm_metrics(before, after, true, actions)
+        super::super::idm_metrics(before, after, true, &batch.action, self.nets.dims.n_act)
     }
 
     /// The mean of the policy takes on the demonstrations' actions.
