@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# PPO and PID2-IB with the preset `strong`: four tasks, a million steps, seeds by which nothing was chosen; on two idle cores an hour and a half. Finished runs
+# PPO and PID2-IB with the preset `strong`: four tasks, a million steps, seeds by which nothing was chosen; on two idle cores two hours. Finished runs
 # are skipped, broken ones go on. Other steps or seeds: results/strong/run.sh 10M 0-4, which goes to runs/strong/10M and writes its data there.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -16,7 +16,7 @@ go() { # task, its seeds, then what it sets
 # the rate of PID2 that the preset has is for a million steps
 rate=()
 [ "$steps" = 1M ] || rate=(--set train.pid2.lr=3e-4)
-go HalfCheetah-v5 10-19,30-34 "${rate[@]}"
+go HalfCheetah-v5 10-19,30-34,40-64 "${rate[@]}"
 go Hopper-v5 5-9,30-34
 go Walker2d-v5 5-9,30-34
 go Ant-v5 5-9
