@@ -198,3 +198,25 @@ fn write(net: &Net, l: &DMatrix<f64>, group: &mut Group) {
     net.mlp.write_dense(&Dense { layers: vec![layer], skip: None }, &mut group.p);
     net.transpose(&group.p, &mut group.transposed);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::Coordinates;
+    use nalgebra::{DMatrix, DVector};
+
+    /// Of three actions two change something: what they change leads back to them, and the third, which nothing shows, is given as none.
+    #[test]
+    fn more_actions_than_entries_come_back_as_far_as_they_change_anything() {
+        let g = DMatrix::from_row_slice(3, 3, &[2.0, 0.0, 0.0, 9.0, 9.0, 9.0, 0.0, 1.0, 0.0]);
+        let seen = [0, 2];
+        let Coordinates { l, back } = Coordinates::of(&g, &seen);
+        let action = DVector::from_column_slice(&[0.7, -0.4, 0.9]);
+        let given = &back * (&g * &action).select_rows(&seen);
+        assert!((given - DVector::from_column_slice(&[0.7, -0.4, 0.0])).amax() < 1e-12);
+        // two coordinates move the action, each by its own length, and what the inverse model does not see moves none
+        let slopes = &back * l.select_rows(&seen);
+        let square = slopes.columns(0, 2).transpose() * slopes.columns(0, 2);
+        assert!((square - DMatrix::identity(2, 2)).amax() < 1e-12);
+        assert!(slopes.column(2).amax() < 1e-12 && (l[(1, 2)] - 1.0).abs() < 1e-12);
+    }
+}
