@@ -74,7 +74,9 @@ pub struct ActionLimit {
     range: Vec<(f64, f64)>,
     /// Dof that an entry drives.
     dofs: Vec<usize>,
-    before: Option<Vec<f64>>,
+    /// The action before, once there was one: kept apart, so that an episode that begins allocates nothing.
+    before: Vec<f64>,
+    has_before: bool,
     /// Of the call under way: what is asked for, velocities, bounds, and the answer.
     asked: Vec<f64>,
     v: Vec<f64>,
@@ -139,7 +141,8 @@ impl ActionLimit {
             bounds: vec![(0.0, 0.0); n],
             range,
             dofs,
-            before: None,
+            before: vec![0.0; n],
+            has_before: false,
             asked,
             v,
             answer,
@@ -156,12 +159,11 @@ impl ActionLimit {
         }
         for i in 0..action.len() {
             let (lower, upper) = self.range[i];
-            self.bounds[i] = match &self.before {
-                None => (lower, upper),
-                Some(before) => {
-                    let at = before[i].clamp(lower, upper);
-                    ((at - self.rate[i]).max(lower), (at + self.rate[i]).min(upper))
-                }
+            self.bounds[i] = if self.has_before {
+                let at = self.before[i].clamp(lower, upper);
+                ((at - self.rate[i]).max(lower), (at + self.rate[i]).min(upper))
+            } else {
+                (lower, upper)
             };
         }
         let raw_violations = self.broken(action);
@@ -173,7 +175,8 @@ impl ActionLimit {
         let square = |(a, u): (&f64, &f64)| (a - u) * (a - u);
         let moved = action.iter().zip(&self.asked).map(square).sum::<f64>().sqrt();
         if self.remembers() {
-            self.before.get_or_insert_with(|| vec![0.0; action.len()]).copy_from_slice(action);
+            self.before.copy_from_slice(action);
+            self.has_before = true;
         }
         ActionReport { moved, raw_violations, target_violations }
     }
@@ -241,10 +244,9 @@ impl ActionLimit {
 
     fn broken(&self, action: &[f64]) -> u32 {
         let sums = self.sums.iter().filter(|(sum, limit)| self.value(*sum, action) > limit + TOLERANCE);
-        let changes = self.before.as_ref().is_some_and(|before| {
-            let change = action.iter().zip(before).map(|(a, b)| (a - b).abs());
-            change.zip(&self.rate).any(|(change, rate)| change > rate + TOLERANCE)
-        });
+        let change = action.iter().zip(&self.before).map(|(a, b)| (a - b).abs());
+        let changes =
+            self.has_before && change.zip(&self.rate).any(|(change, rate)| change > rate + TOLERANCE);
         sums.count() as u32 + u32::from(changes)
     }
 
@@ -255,7 +257,7 @@ impl ActionLimit {
 
     /// Begins anew: no rate holds for the next action.
     pub fn forget(&mut self) {
-        self.before = None;
+        self.has_before = false;
     }
 
     /// Entries of its memory.
@@ -266,11 +268,8 @@ impl ActionLimit {
     /// Appends what the next action depends on beside its arguments.
     pub fn write_memory(&self, memory: &mut Vec<f64>) {
         if self.remembers() {
-            memory.push(f64::from(u8::from(self.before.is_some())));
-            match &self.before {
-                Some(before) => memory.extend_from_slice(before),
-                None => memory.resize(memory.len() + self.range.len(), 0.0),
-            }
+            memory.push(f64::from(u8::from(self.has_before)));
+            memory.extend(self.before.iter().map(|&a| if self.has_before { a } else { 0.0 }));
         }
     }
 
@@ -280,7 +279,10 @@ impl ActionLimit {
     /// When it has another length.
     pub fn set_memory(&mut self, memory: &[f64]) {
         assert_eq!(memory.len(), self.memory_len(), "memory of another limit");
-        self.before = memory.split_first().filter(|(known, _)| **known != 0.0).map(|(_, b)| b.to_vec());
+        self.has_before = memory.first().is_some_and(|&known| known != 0.0);
+        if let Some((_, before)) = memory.split_first() {
+            self.before.copy_from_slice(before);
+        }
     }
 }
 

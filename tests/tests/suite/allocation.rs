@@ -43,6 +43,27 @@ fn a_step_of_a_user_task_allocates_nothing() {
     assert_eq!(allocations() - before, 0);
 }
 
+/// What an action must stay near to is forgotten where an episode begins, and known again after its first tick.
+#[test]
+fn an_episode_that_begins_allocates_nothing_with_limits_on_actions() {
+    drop(std::hint::black_box(Box::new(1)));
+    assert!(allocations() > 0, "the counter counts");
+    for limit in ["rate={thigh_joint=0.2}", "square=0.1", "power=1.0"] {
+        let set = format!("constraints.action.{limit}");
+        let mut controller =
+            Controller::new(training("Hopper-v5", "ppo", 0, 1, &[&set]).snapshot()).expect("controller");
+        let (state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
+        let before = allocations();
+        for tick in 0..100 {
+            if tick % 10 == 0 {
+                controller.reset();
+            }
+            controller.update(&state, &noise, &mut out);
+        }
+        assert_eq!(allocations() - before, 0, "{limit}");
+    }
+}
+
 #[test]
 fn an_update_allocates_nothing_beyond_clarabel() {
     drop(std::hint::black_box(Box::new(1)));
