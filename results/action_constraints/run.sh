@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Limits on actions of the literature, kept exactly while training and after it: return, excess and, with TIMES=yes, microseconds.
 #     results/action_constraints/run.sh [SEEDS [STEPS [ALGOS]]]      e.g. 0-4 1M ppo,pid2-ib
-# Finished runs are skipped, broken ones go on. RUNS is the folder of all runs, NEARL the program. What they stand beside, the same runs without a set, is
-# results/strong/before_coordinates.csv (PID2-IB of the preset of then). Times are worth something on a quiet machine only.
+# Finished runs are skipped, broken ones go on. RUNS is the folder of all runs, NEARL the program. What they stand beside, the same settings without a set, is
+# results/strong/runs.csv. Times are worth something on a quiet machine only.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 seeds=${1:-0-4} steps=${2:-1M} algos=${3:-ppo,pid2-ib}

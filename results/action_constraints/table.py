@@ -55,7 +55,7 @@ def episodes(run: Path) -> list[tuple[np.ndarray, np.ndarray, float]]:
 def free() -> dict[tuple[str, str], list[float]]:
     """Returns without noise of the runs without a set, by task and algorithm."""
     found = defaultdict(list)
-    with open(ROOT / "results/strong/before_coordinates.csv") as f:
+    with open(ROOT / "results/strong/runs.csv") as f:
         for row in csv.DictReader(f):
             found[row["task"], row["algo"]].append(float(row["without_noise"]))
     return found
