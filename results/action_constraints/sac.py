@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import SAC
 
 import nearl
@@ -56,7 +55,7 @@ def episode(model: SAC, env: nearl.ProjectedEnv, name: str, seed: int) -> tuple[
 def run(name: str, seed: int, steps: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         env = environment(name, Path(folder))
-        model = SAC("MlpPolicy", TimeLimit(env, 1000), seed=seed, device="cpu")
+        model = SAC("MlpPolicy", env, seed=seed, device="cpu")
         began = time.perf_counter()
         model.learn(steps)
         seconds = time.perf_counter() - began
