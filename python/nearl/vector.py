@@ -22,7 +22,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
     Environment ``i`` behaves as a single one that was seeded with ``seed + i``. ``info`` holds, where there is something to say and
     with the mask ``_<key>``: ``final_obs`` (same-step mode), ``fault``; ``cost`` where the task has one; and with ``constraints`` always:
     ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit), ``executed``
-    (what the actuators got in the last of them, num_envs x n_act) and ``moved``.
+    (what the actuators got in the last of them, num_envs x n_act; not a number where the step only began an episode) and ``moved``.
 
     Args:
         max_episode_steps: Control periods after which an episode is cut; the task's own by default.

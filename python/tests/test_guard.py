@@ -176,6 +176,18 @@ def test_a_limited_environment_passes_no_more_than_its_power(tmp_path):
     assert raw > 200
 
 
+def test_a_step_that_only_begins_an_episode_executes_nothing(tmp_path):
+    file = with_limits(tmp_path, "square = 0.5")
+    action = np.full((1, 6), 0.1)
+    for mode, executed in (("NextStep", [True, True, False, True]), ("SameStep", [True] * 4)):
+        env = nearl.VecEnv(file, 1, "task", autoreset_mode=mode, actions="limited", max_episode_steps=2)
+        _, info = env.reset(seed=1)
+        assert np.isnan(info["executed"]).all()
+        for wanted in executed:
+            *_, info = env.step(action)
+            np.testing.assert_allclose(info["executed"], action if wanted else np.full((1, 6), np.nan), rtol=1e-6)
+
+
 def test_limited_actions_want_a_limit(tmp_path):
     with pytest.raises(ValueError, match=r"limits no actions; write power, delivered, square or rate"):
         nearl.make_vec("HalfCheetah-v5", 1, constraints="task", actions="limited")

@@ -52,6 +52,9 @@ pub struct Pid2Settings {
     pub lr: f32,
     /// The inverse model learns from reached transitions while its mean squared error is at least this (\[sigma_I\]).
     pub idm_threshold: f64,
+    /// The policy gradient moves the inverse model too. Without it the inverse model learns from reached transitions alone, so that proposals
+    /// stay what the robot reaches; the policy still learns through it.
+    pub idm_policy_gradient: bool,
     /// What of a row of actions is compared with the threshold.
     pub idm_threshold_per: ThresholdPer,
     /// Learning rate of the inverse model's supervised loss.
@@ -91,6 +94,7 @@ impl Default for Pid2Settings {
             warmup: 0,
             lr: 0.0,
             idm_threshold: 0.5,
+            idm_policy_gradient: true,
             idm_threshold_per: ThresholdPer::default(),
             idm_lr: 3e-4,
             discriminator_lr: 3e-4,
@@ -197,6 +201,7 @@ impl Pid2 {
         let (mut combined, [actor, critic]) =
             Combined::new(dims, nets, ppo, settings.gradient, kind, settings.warmup > 0, rng);
         combined.bound_weight = settings.bound_weight;
+        combined.inverse_learns = settings.idm_policy_gradient;
         let d = &discriminator;
         let mut adversary = Group { p: vec![ZERO; d.len], transposed: vec![ZERO; d.transposed] };
         d.init(&mut adversary.p, rng);

@@ -146,7 +146,8 @@ impl Lane {
         self.proposing.is_some()
     }
 
-    /// What the actuators got in the last control period (n_act); nothing where they get the caller's own actions.
+    /// What the actuators got in the last control period (n_act), not a number where the round only began an episode; nothing where they get the
+    /// caller's own actions.
     pub fn executed(&self) -> &[f64] {
         self.proposing.as_ref().map_or(&[], |p| &p.out.action)
     }
@@ -158,7 +159,10 @@ impl Lane {
         (self.fault, self.tally, self.moved) = (Fault::None, Tally::default(), 0.0);
         match round {
             Round::Step(_) if !self.ended => self.step(),
-            _ => self.reset(),
+            _ => {
+                self.reset();
+                self.forget();
+            }
         }
         self.ended = self.terminated || self.truncated;
         if let (Round::Step(Autoreset::SameStep), true) = (round, self.ended) {
@@ -181,6 +185,13 @@ impl Lane {
         self.env.set_state(qpos, qvel)?;
         self.begin();
         Ok(())
+    }
+
+    /// Nothing was executed: the round only began an episode.
+    fn forget(&mut self) {
+        if let Some(p) = &mut self.proposing {
+            p.out.action.fill(f64::NAN);
+        }
     }
 
     fn reset(&mut self) {

@@ -82,8 +82,8 @@ impl Combined {
         let action =
             Gaussian { log_std: log_std.clone(), n: a, sampled: &inv.action, mean, d: &mut inv.slope };
         let sums = likelihood_ratio([action], &self.ppo, t, &mut w.rows, &group.p, grad);
-        let dx =
-            model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, Some(grad), true);
+        let own = self.inverse_learns.then_some(grad);
+        let dx = model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, own, true);
         // through the projection into the proposal
         w.d_change.fill(ZERO);
         let rows = scalars_mut(&mut w.d_change).chunks_exact_mut(sv * LANES).zip(u.chunks_exact(sv * LANES));
@@ -214,7 +214,9 @@ impl Combined {
         let action =
             Gaussian { log_std: log_std.clone(), n: a, sampled: &inv.action, mean, d: &mut inv.slope };
         let sums = likelihood_ratio([proposal, action], &self.ppo, t, &mut w.rows, &group.p, grad);
-        model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, Some(grad), false);
+        if self.inverse_learns {
+            model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, Some(grad), false);
+        }
         sums
     }
 

@@ -687,3 +687,31 @@ fn a_rate_of_its_own_is_that_of_policy_and_inverse_model() {
     assert!(own == learned(PpoSettings { lr: 1e-3, value_lr: 3e-4, ..ppo.clone() }, 0.0).0);
     assert!(own != learned(ppo, 0.0).0);
 }
+
+/// Policy and spread learn the same through an inverse model that the reward does not move.
+#[test]
+fn without_its_policy_gradient_the_inverse_model_stays() {
+    let (mut l, b) = learner(false, true, TANH);
+    let (with, sums) = gradient(&l, &b, ACTOR);
+    l.nets.combined.inverse_learns = false;
+    let (without, same) = gradient(&l, &b, ACTOR);
+    let inverse = l.nets.combined.inverse_range();
+    assert!(with[inverse.clone()].iter().any(|g| g.0 != ZERO.0));
+    assert!(without[inverse.clone()].iter().all(|g| g.0 == ZERO.0));
+    assert!(
+        with[..inverse.start] == without[..inverse.start] && with[inverse.end..] == without[inverse.end..]
+    );
+    assert_eq!(sums, same);
+
+    for stochastic in [false, true] {
+        let settings =
+            Pid2Settings { idm_policy_gradient: false, idm_threshold: 1e9, ..Pid2Settings::default() };
+        let (kind, mut rng) = (Kind { stochastic, learned: true }, crate::rollout::stream(13, 0));
+        let nets = NetSettings::default();
+        let mut l = Pid2::new(dims(), &nets, PpoSettings::default(), settings, kind, false, 1, &mut rng);
+        let (before, inverse) = (l.actor().to_vec(), l.nets.combined.inverse_range());
+        l.update(&mut batch(&dims(), 256, 3), Pace::default(), &mut rng);
+        assert!(before[inverse.clone()] == l.actor()[inverse.clone()], "stochastic {stochastic}");
+        assert!(before[..inverse.start] != l.actor()[..inverse.start], "stochastic {stochastic}");
+    }
+}
