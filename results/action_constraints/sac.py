@@ -22,15 +22,8 @@ import nearl
 ROOT = Path(__file__).parents[2]
 CSV = Path(__file__).with_name("sac.csv")
 excess = runpy.run_path(str(Path(__file__).with_name("table.py")))["excess"]
-# what run.sh says
-SETS = {
-    "HC+O": ("HalfCheetah-v5", "power = 20.0"),
-    "HC+rate": ("HalfCheetah-v5", "rate = { bthigh = 0.2, bshin = 0.2, bfoot = 0.2, fthigh = 0.5, fshin = 0.5, ffoot = 0.5 }"),
-    "H+M": ("Hopper-v5", "delivered = 10.0"),
-    "H+rate": ("Hopper-v5", "rate = { thigh_joint = 0.2, leg_joint = 0.5, foot_joint = 0.5 }"),
-    "W+M": ("Walker2d-v5", "delivered = 10.0"),
-    "Ant+S": ("Ant-v5", "square = 2.0"),
-}
+# task and limit of each
+SETS = {name: (task, limit) for name, task, limit in map(str.split, Path(__file__).with_name("sets.txt").read_text().splitlines())}
 
 
 def environment(name: str, folder: Path) -> nearl.ProjectedEnv:
