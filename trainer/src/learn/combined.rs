@@ -73,7 +73,7 @@ pub(super) struct Combined {
     /// Weight of the squared distance between a proposal and its projection in the policy's loss.
     pub(super) bound_weight: f32,
     /// The policy gradient moves the inverse model too.
-    pub(super) inverse_learns: bool,
+    pub(super) idm_policy_gradient: bool,
     /// Meta policy.
     pub(super) policy: Net,
     /// The layer that makes a proposal of what the policy puts out, where they differ. No phase changes it.
@@ -150,7 +150,7 @@ impl Combined {
             ppo,
             gradient,
             bound_weight: 0.0,
-            inverse_learns: true,
+            idm_policy_gradient: true,
             policy,
             coordinates,
             policy_log_std,

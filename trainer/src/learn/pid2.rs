@@ -52,8 +52,8 @@ pub struct Pid2Settings {
     pub lr: f32,
     /// The inverse model learns from reached transitions while its mean squared error is at least this (\[sigma_I\]).
     pub idm_threshold: f64,
-    /// The policy gradient moves the inverse model too. Without it the inverse model learns from reached transitions alone, so that proposals
-    /// stay what the robot reaches; the policy still learns through it.
+    /// The policy gradient moves the inverse model too. Otherwise only what was reached does, so that proposals stay nearer to it; the policy
+    /// learns through the inverse model either way. No effect with analytic inverse dynamics.
     pub idm_policy_gradient: bool,
     /// What of a row of actions is compared with the threshold.
     pub idm_threshold_per: ThresholdPer,
@@ -201,7 +201,7 @@ impl Pid2 {
         let (mut combined, [actor, critic]) =
             Combined::new(dims, nets, ppo, settings.gradient, kind, settings.warmup > 0, rng);
         combined.bound_weight = settings.bound_weight;
-        combined.inverse_learns = settings.idm_policy_gradient;
+        combined.idm_policy_gradient = settings.idm_policy_gradient;
         let d = &discriminator;
         let mut adversary = Group { p: vec![ZERO; d.len], transposed: vec![ZERO; d.transposed] };
         d.init(&mut adversary.p, rng);

@@ -157,12 +157,12 @@ impl Lane {
         (self.reward, self.cost, self.final_obs) = (0.0, 0.0, None);
         (self.terminated, self.truncated) = (false, false);
         (self.fault, self.tally, self.moved) = (Fault::None, Tally::default(), 0.0);
+        if let Some(p) = &mut self.proposing {
+            p.out.action.fill(f64::NAN);
+        }
         match round {
             Round::Step(_) if !self.ended => self.step(),
-            _ => {
-                self.reset();
-                self.forget();
-            }
+            _ => self.reset(),
         }
         self.ended = self.terminated || self.truncated;
         if let (Round::Step(Autoreset::SameStep), true) = (round, self.ended) {
@@ -185,13 +185,6 @@ impl Lane {
         self.env.set_state(qpos, qvel)?;
         self.begin();
         Ok(())
-    }
-
-    /// Nothing was executed: the round only began an episode.
-    fn forget(&mut self) {
-        if let Some(p) = &mut self.proposing {
-            p.out.action.fill(f64::NAN);
-        }
     }
 
     fn reset(&mut self) {

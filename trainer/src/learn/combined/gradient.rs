@@ -82,7 +82,7 @@ impl Combined {
         let action =
             Gaussian { log_std: log_std.clone(), n: a, sampled: &inv.action, mean, d: &mut inv.slope };
         let sums = likelihood_ratio([action], &self.ppo, t, &mut w.rows, &group.p, grad);
-        let own = self.inverse_learns.then_some(grad);
+        let own = self.idm_policy_gradient.then_some(grad);
         let dx = model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, own, true);
         // through the projection into the proposal
         w.d_change.fill(ZERO);
@@ -214,7 +214,7 @@ impl Combined {
         let action =
             Gaussian { log_std: log_std.clone(), n: a, sampled: &inv.action, mean, d: &mut inv.slope };
         let sums = likelihood_ratio([proposal, action], &self.ppo, t, &mut w.rows, &group.p, grad);
-        if self.inverse_learns {
+        if self.idm_policy_gradient {
             model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, Some(grad), false);
         }
         sums

@@ -693,7 +693,7 @@ fn a_rate_of_its_own_is_that_of_policy_and_inverse_model() {
 fn without_its_policy_gradient_the_inverse_model_stays() {
     let (mut l, b) = learner(false, true, TANH);
     let (with, sums) = gradient(&l, &b, ACTOR);
-    l.nets.combined.inverse_learns = false;
+    l.nets.combined.idm_policy_gradient = false;
     let (without, same) = gradient(&l, &b, ACTOR);
     let inverse = l.nets.combined.inverse_range();
     assert!(with[inverse.clone()].iter().any(|g| g.0 != ZERO.0));
