@@ -120,7 +120,7 @@ impl TrainSettings {
     /// One sentence naming the key.
     pub fn read(table: &toml::Table) -> Result<Self, String> {
         let settings: Self = serde_path_to_error::deserialize(table.clone())
-            .map_err(|e| format!("[train.{}]: {}", e.path(), suggest(e.inner().message())))?;
+            .map_err(|e| refusal(&e.path().to_string(), e.inner().message()))?;
         if settings.eval_episodes == 0 {
             return Err("[train.eval_episodes]: 0 measures nothing; give at least 1".into());
         }
@@ -202,6 +202,21 @@ impl TrainSettings {
     }
 }
 
+/// What is wrong at `key`. A key of another section is told with that section, any other with the one it resembles.
+fn refusal(key: &str, message: &str) -> String {
+    let name = key.rsplit('.').next().unwrap_or(key);
+    let sections = toml::Table::try_from(TrainSettings::default()).unwrap_or_else(|e| unreachable!("{e}"));
+    let own = sections.contains_key(name).then(|| format!("train.{name}"));
+    let of = |(section, keys): (&String, &toml::Value)| {
+        keys.as_table().is_some_and(|keys| keys.contains_key(name)).then(|| format!("train.{section}.{name}"))
+    };
+    let there: Vec<String> = own.into_iter().chain(sections.iter().filter_map(of)).collect();
+    if there.is_empty() || !message.starts_with("unknown field") {
+        return format!("[train.{key}]: {}", suggest(message));
+    }
+    format!("[train.{key}]: no such key here; give {}", there.join(" or "))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -258,6 +273,11 @@ mod tests {
             ("nearl.idm_lr = -1.0", "[train.nearl.idm_lr]"),
             ("cost.limit = -1.0", "[train.cost.limit]: -1 is not at least 0, or inf for none"),
             ("cost.lr = nan", "[train.cost.lr]"),
+            ("ppo.gae_lambda = 0.9", "[train.ppo.gae_lambda]: no such key here; give train.gae_lambda"),
+            ("beta = 0.1", "[train.beta]: no such key here; give train.pid2.beta"),
+            ("idm_lr = 0.1", "give train.nearl.idm_lr or train.pid2.idm_lr"),
+            ("ppo.batch_siz = 64", "did you mean 'batch_size'?"),
+            ("ppo.lr = \"fast\"", "[train.ppo.lr]: invalid type: string \"fast\", expected f32"),
         ] {
             let refused = read(text).unwrap_err();
             assert!(refused.contains(words), "{refused}");
