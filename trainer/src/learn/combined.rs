@@ -86,6 +86,9 @@ pub(super) struct Combined {
     pub(super) value: Value,
     /// Where the policy's network lies in the group.
     pub(super) policy_range: Range<usize>,
+    /// Weights of the linear map beside its layers, one range for each observation that the inverse model does not see. They stay zero: the map
+    /// is for what the robot does by itself.
+    pub(super) unread: Vec<Range<usize>>,
     /// Vectors of the group.
     pub(super) len: usize,
 }
@@ -126,6 +129,12 @@ impl Combined {
         let make = if identified { Net::with_skip } else { Net::new };
         let policy = make(&widths(o, &nets.policy, s), f, 0, &mut at, &mut transposed);
         let policy_range = 0..at;
+        let unseen = (0..o).filter(|k| !dims.seen_obs.contains(k));
+        let unread = policy.mlp.skip.iter().flat_map(|map| {
+            let n = map.n_vectors();
+            unseen.clone().map(move |k| map.w + k * n..map.w + (k + 1) * n)
+        });
+        let unread = unread.collect();
         let policy_log_std = kind.stochastic.then(|| vectors(&mut at, s));
         let inverse = kind.learned.then(|| {
             let model = InverseModel::new(&dims, nets, &mut at, &mut transposed);
@@ -157,6 +166,7 @@ impl Combined {
             inverse,
             value,
             policy_range,
+            unread,
             len: at,
         };
         combined.begin_coordinates(&mut group);

@@ -60,6 +60,14 @@ impl Net64 {
         h
     }
 
+    /// Without what the linear map reads of these of its `n_in` inputs.
+    pub(super) fn unread(mut self, n_in: usize, inputs: impl Fn(usize) -> bool) -> Self {
+        for row in self.skip.chunks_exact_mut(n_in) {
+            row.iter_mut().enumerate().filter(|(k, _)| inputs(*k)).for_each(|(_, w)| *w = 0.0);
+        }
+        self
+    }
+
     /// Parameters one after another: weight, bias of each layer.
     pub(super) fn flat(&mut self) -> Vec<&mut f64> {
         self.layers

@@ -14,7 +14,8 @@
 //! to them in the entries that the inverse model sees, for what no action changes. A linear map beside the policy's layers adds `F x + c` to
 //! the proposal, and the inverse model begins as `A (change - F x - c)`. So the first entries of what the layers put out are the action, and
 //! the others leave it as it is: the combined policy begins as one that puts out actions. A regression of the actions on what was reached would
-//! not do: noise in what is reached draws its slopes towards zero, furthest where an action changes least. `L` stays as it is from then on.
+//! not do: noise in what is reached draws its slopes towards zero, furthest where an action changes least. `L` stays as it is from then on, and
+//! the linear map reads nothing but `x`: Adam moves each of its weights by the whole rate, so that a map of all observations is mostly noise.
 
 use super::super::batch::Batch;
 use super::super::inverse::CLIP;

@@ -58,6 +58,7 @@ impl Combined {
             _ => &w.d_change,
         };
         self.policy.backward(&group.transposed, &w.obs, slope, policy, Some(grad), false);
+        self.unread.iter().for_each(|range| grad[range.clone()].fill(ZERO));
     }
 
     /// Ratio on `log I(a | s_c, w_c)` with `w = clamp(pi(s), lower, upper)`.

@@ -188,7 +188,10 @@ fn actor_gradients_equal_central_differences() {
             actor_loss(&l, &b, &m)
         };
         let mlp = |net: &Net| net.mlp.to_dense(&grad);
-        check("policy", &n.policy, &mlp(&l.nets.combined.policy), |p| with(&|m| m.policy = p.clone()));
+        // the linear map reads what the inverse model sees
+        let d = dims();
+        let read = |p: &Net64| p.clone().unread(d.n_obs, |k| !d.seen_obs.contains(&k));
+        check("policy", &n.policy, &mlp(&l.nets.combined.policy), |p| with(&|m| m.policy = read(p)));
         let value = l.nets.combined.value.net.mlp.to_dense(&value_grad);
         check("value", &n.value, &value, |p| with(&|m| m.value = p.clone()));
         let range = match (&l.nets.combined.inverse, &l.nets.combined.policy_log_std) {
@@ -666,6 +669,23 @@ fn coordinates_span_the_space_whatever_actions_change() {
         let smallest = m.singular_values().min();
         assert!(smallest > 1e-4, "{n_state} entries, {n_act} actions: {smallest:e}");
         assert!(l.nets.combined.in_changes(l.actor()).skip.expect("a map").iter().all(|w| w.is_finite()));
+    }
+}
+
+/// What the inverse model does not see reaches a proposal through the layers alone.
+#[test]
+fn the_linear_map_reads_what_the_inverse_model_sees() {
+    let d = dims();
+    let settings = Pid2Settings { warmup: 1, ..Pid2Settings::default() };
+    let (kind, mut rng) = (Kind { stochastic: false, learned: true }, crate::rollout::stream(14, 0));
+    let nets = NetSettings { idm: Vec::new(), ..NetSettings::default() };
+    let mut l = Pid2::new(d.clone(), &nets, PpoSettings::default(), settings, kind, true, 1, &mut rng);
+    let mut b = batch(&d, 256, 3);
+    l.warm_up(&b, &mut rng);
+    l.update(&mut b, Pace::default(), &mut rng);
+    let map = l.nets.combined.policy.mlp.to_dense(l.actor()).skip.expect("a map");
+    for (i, weight) in map.iter().enumerate() {
+        assert_eq!(*weight != 0.0, d.seen_obs.contains(&(i % d.n_obs)), "observation {}", i % d.n_obs);
     }
 }
 
