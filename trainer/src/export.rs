@@ -7,10 +7,11 @@
 
 use crate::import::metadata::RECIPE;
 use nearl_runtime::constraints::Drive;
+use nearl_runtime::motors::Motors;
 use nearl_runtime::net::Function;
 use nearl_runtime::normaliser::CLIP;
 use nearl_runtime::recipe::{ActionSection, Numbers, PolicySection};
-use nearl_runtime::{Controller, PolicyKind, Snapshot, SnapshotError};
+use nearl_runtime::{Controller, PolicyKind, Snapshot, SnapshotError, Task};
 use rten_onnx::onnx::{
     AttributeProto, AttributeType, DataType, Dimension, GraphProto, ModelProto, NodeProto,
     OperatorSetIdProto, StringStringEntryProto, TensorProto, TensorShapeProto, TypeProto, TypeProtoTensor,
@@ -191,39 +192,66 @@ impl Graph {
     }
 }
 
-/// mjlab's keys where the policy has a recipe, and the recipe itself for `nearl import`.
+/// mjlab's keys where the policy has a recipe, and the recipe itself for `nearl import`; none of a policy of actions whose motors no recipe can
+/// describe, because several drive a joint or their torque is not linear in what they are sent.
 fn metadata(snapshot: &Snapshot, controller: &Controller) -> Vec<StringStringEntryProto> {
     let task = &snapshot.manifest.task;
-    let joints: Vec<String> =
-        controller.layout().controllable().iter().map(|&dof| controller.model().dof_name(dof)).collect();
+    let acts = snapshot.manifest.policy == PolicyKind::Direct;
     let mut pairs = vec![("task", task.name.clone())];
-    let section = task.policy.clone().unwrap_or_else(|| PolicySection {
-        joints,
-        action: ActionSection { offset: Some(Numbers::All(0.0)), ..ActionSection::default() },
-        ..PolicySection::default()
-    });
-    pairs.push(("joint_names", section.joints.join(",")));
-    let numbers = |values: &[f64]| values.iter().map(f64::to_string).collect::<Vec<_>>().join(",");
-    if !section.pose.is_empty() {
-        pairs.push(("default_joint_pos", numbers(&section.pose)));
-    }
-    let terms: Vec<String> = match section.observation.is_empty() {
-        true => task.state.observation.clone(),
-        false => section.observation.iter().map(|t| t.term.name().to_string()).collect(),
+    let section = task
+        .policy
+        .clone()
+        .or_else(|| if acts { of_motors(task, controller) } else { of_joints(controller) });
+    let terms: Vec<String> = match section.as_ref().map_or(&[][..], |s| &s.observation) {
+        [] => task.state.observation.clone(),
+        terms => terms.iter().map(|t| t.term.name().to_string()).collect(),
     };
     pairs.push(("observation_names", terms.join(",")));
-    if snapshot.manifest.policy == PolicyKind::Direct {
-        let scale = section.action.scale.spread("scale", section.joints.len()).unwrap_or_default();
-        pairs.push(("action_scale", numbers(&scale)));
-        if let Some([stiffness, damping]) = gains(snapshot, &section.joints, controller) {
-            pairs.push(("joint_stiffness", numbers(&stiffness)));
-            pairs.push(("joint_damping", numbers(&damping)));
+    let numbers = |values: &[f64]| values.iter().map(f64::to_string).collect::<Vec<_>>().join(",");
+    if let Some(section) = section {
+        pairs.push(("joint_names", section.joints.join(",")));
+        if !section.pose.is_empty() {
+            pairs.push(("default_joint_pos", numbers(&section.pose)));
         }
-        pairs.push((RECIPE, recipe(snapshot, section)));
+        if acts {
+            let scale = section.action.scale.spread("scale", section.joints.len()).unwrap_or_default();
+            pairs.push(("action_scale", numbers(&scale)));
+            if let Some([stiffness, damping]) = gains(snapshot, &section.joints, controller) {
+                pairs.push(("joint_stiffness", numbers(&stiffness)));
+                pairs.push(("joint_damping", numbers(&damping)));
+            }
+            pairs.push((RECIPE, recipe(snapshot, section)));
+        }
     }
     let entry =
         |(key, value): (&str, String)| StringStringEntryProto { key: Some(key.into()), value: Some(value) };
     pairs.into_iter().map(entry).collect()
+}
+
+/// The joints that are proposed.
+fn of_joints(controller: &Controller) -> Option<PolicySection> {
+    let joints =
+        controller.layout().controllable().iter().map(|&dof| controller.model().dof_name(dof)).collect();
+    Some(PolicySection { joints, ..PolicySection::default() })
+}
+
+/// The recipe of a policy whose outputs are what the motors are sent: joints in the order of their motors, and the command that an output is.
+fn of_motors(task: &Task, controller: &Controller) -> Option<PolicySection> {
+    let (model, layout) = (controller.model(), controller.layout());
+    let dofs = layout.controllable();
+    let drives = task.command.drives(model, dofs).ok()?;
+    let motors = Motors::new(model, dofs, &drives).ok()?;
+    let mut order: Vec<usize> = (0..dofs.len()).collect();
+    order.sort_by_key(|&k| motors.place(k));
+    let offset = |&k: &usize| motors.command(k, 0.0);
+    let scale = |k: &usize| motors.command(*k, 1.0) - offset(k);
+    let action = ActionSection {
+        scale: Numbers::Each(order.iter().map(scale).collect()),
+        offset: Some(Numbers::Each(order.iter().map(offset).collect())),
+        clip: None,
+    };
+    let joints = order.iter().map(|&k| model.dof_name(dofs[k])).collect();
+    Some(PolicySection { joints, action, ..PolicySection::default() })
 }
 
 /// Stiffness and damping of the joints' drives, where all have one.
@@ -245,6 +273,9 @@ fn recipe(snapshot: &Snapshot, section: PolicySection) -> String {
     let mut table: toml::Table = toml::from_str(&crate::run_folder::to_toml(&task)).unwrap_or_default();
     for key in ["env", "reward", "cost", "termination", "reset", "train"] {
         table.remove(key);
+    }
+    if let Some(time) = table.get_mut("time").and_then(toml::Value::as_table_mut) {
+        time.remove("max_episode_steps"); // of the environment
     }
     if let Some(model) = table.get_mut("model").and_then(toml::Value::as_table_mut) {
         model.remove("urdf");

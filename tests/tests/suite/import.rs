@@ -33,6 +33,44 @@ fn what_was_exported_comes_back() {
     }
 }
 
+/// The robot file is all it takes: gears, and on Ant another order of the motors than of the joints, are in the file.
+#[test]
+fn a_policy_of_motors_comes_back_with_the_robot_file_alone() {
+    for (task, file) in [
+        ("HalfCheetah-v5", "half_cheetah"),
+        ("Hopper-v5", "hopper"),
+        ("Walker2d-v5", "walker2d_v5"),
+        ("Ant-v5", "ant"),
+    ] {
+        let robot = format!("{}/../examples/robots/gymnasium/{file}.xml", env!("CARGO_MANIFEST_DIR"));
+        let mut t = training(task, "ppo", 0, 1, &SHORT);
+        (0..3).for_each(|_| drop(t.iterate()));
+        let snapshot = t.snapshot().clone();
+        let network =
+            onnx("policy.onnx", &export::onnx(&snapshot).expect("exports"), None, None).expect("imports");
+        let setting = Setting { name: "back", robot: std::path::Path::new(&robot), recipes: &[] };
+        let back =
+            nearl_trainer::import::snapshot(&network, &setting).unwrap_or_else(|e| panic!("{task}: {e}"));
+        let mut both = [&snapshot, &back].map(|s| Controller::new(s).expect("controller"));
+        let mut rng = nearl_trainer::rollout::stream(3, 0);
+        let mut largest = 0.0f64;
+        for _ in 0..100 {
+            let obs: Vec<f64> = both[0].state().obs.iter().map(|_| rng.random::<f64>() - 0.5).collect();
+            let actions = both.each_mut().map(|controller| {
+                let (mut state, mut out) = (controller.state(), controller.output());
+                state.obs.copy_from_slice(&obs);
+                controller.update(&state, &controller.noise(), &mut out);
+                out.action
+            });
+            let [before, after] = &actions;
+            assert_eq!(before.len(), after.len(), "{task}");
+            assert!(before.iter().zip(after).all(|(a, b)| (a - b).abs() < 1e-6), "{task}: {actions:?}");
+            largest = before.iter().fold(largest, |most, a| most.max(a.abs()));
+        }
+        assert!(largest > 1e-3, "{task}: {largest}");
+    }
+}
+
 #[test]
 fn damaged_files_are_refused_in_a_sentence() {
     let snapshot = training("HalfCheetah-v5", "ppo", 0, 1, &SHORT).snapshot().clone();
