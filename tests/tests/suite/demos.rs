@@ -42,6 +42,34 @@ fn what_is_recorded_comes_back_and_is_of_its_task() {
     }
 }
 
+/// A goal, a command and noise are of the reset and not of the state: they are taken as they were recorded. The state is still compared.
+#[test]
+fn what_a_reset_draws_is_taken_as_it_was_recorded() {
+    let two_link = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/two_link.toml");
+    let command = [
+        "commands={ x = \"uniform\" }",
+        "state.observation=[\"q.shoulder\", \"q.elbow\", \"v.shoulder\", \"v.elbow\", \"command.x - q.elbow\"]",
+        "state.propose=[\"q.shoulder\", \"q.elbow\", \"v.shoulder\", \"v.elbow\"]",
+        "time.max_episode_steps=100",
+    ];
+    let noise = ["noise={ v = \"0.01 * normal\" }", "time.max_episode_steps=100"];
+    for (task, set) in [("Panda-reach", &[][..]), (two_link, &command[..]), (two_link, &noise[..])] {
+        let set: Vec<String> = set.iter().map(|s: &&str| (*s).to_string()).collect();
+        let snapshot = training(task, "pid2-ib", 3, 1, &set.iter().map(String::as_str).collect::<Vec<_>>())
+            .snapshot()
+            .clone();
+        let (mut demos, _) = record(&snapshot, 3, 1).expect("episodes");
+        let manifest = tasks::load(task, &set).expect("task");
+        let mut env = env::of_task(&manifest, task).expect("environment");
+        let period = manifest.task.time.dt * manifest.task.time.policy_every as f64;
+        demos.check(&mut *env, period).unwrap_or_else(|e| panic!("{task} {set:?}: {e}"));
+        let q = demos.names.iter().position(|n| n.starts_with("q.")).expect("a position");
+        demos.episodes[1].observations[q] += 0.1;
+        let error = demos.check(&mut *env, period).expect_err("another state");
+        assert!(error.starts_with("episode 1 begins with q."), "{error}");
+    }
+}
+
 /// NumPy reads what is written here, and what NumPy writes is read here.
 #[test]
 fn numpy_reads_and_writes_the_same_file() {
