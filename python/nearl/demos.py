@@ -5,8 +5,8 @@ of the file are those of the task's own environment in these states, so that the
 
     nearl.demos.from_csv("task.toml", "walk.csv", "walk.npz", dt=0.02)
 
-A position that the task does not observe (where a planar runner is) may be missing and is 0; a velocity that is missing is the
-difference of positions.
+What the robot was asked to do is a column too, ``command.<name>`` (of Panda-reach ``goal.x``), which a task that observes it does not go without. A
+position that the task does not observe (where a planar runner is) may be missing and is 0; a velocity that is missing is the difference of positions.
 """
 
 import json
@@ -19,16 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.recorded import SAME, BadDemonstrations, Rows, check_period, check_units, column, controller, goal_names, observations
 
 Floats = NDArray[np.float64]
 FilePath = str | os.PathLike[str]
 _BASE_Q = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _BASE_V = ("x", "y", "z", "wx", "wy", "wz")
-_SAME = 1e-6  # part of a period by which two may differ
-
-
-class BadDemonstrations(ValueError):
-    """A source that does not fit the task: the message names file, column and episode."""
 
 
 def from_columns(
@@ -46,43 +42,59 @@ def from_columns(
     Args:
         task: Name of a bundled task, or a task file.
         episodes: For each episode a column (n) by name: ``q.<joint>``, and ``v.<joint>`` where it is known [rad or m, per s]. The base of a robot that floats
-            is ``q.<joint>.x y z qw qx qy qz`` and ``v.<joint>.x y z wx wy wz`` (rotation in the body's frame). Columns of other names are left out.
+            is ``q.<joint>.x y z qw qx qy qz`` and ``v.<joint>.x y z wx wy wz`` (rotation in the body's frame). What was asked for is ``command.<name>``,
+            or as the task's observation calls it (``goal.x``); what it observes and no state gives is a column of the entry's name. Columns of other
+            names are left out.
         out: File to write (``.npz``).
-        dt: Time between two rows [s]. States are interpolated where it is not the task's period.
+        dt: Time between two rows [s]. Of a period of several rows the first is taken; otherwise states are interpolated, and what was asked for holds until
+            the next row.
         actions: Columns of actions, in the order of the task's actuators; none by default. Their last row is left out.
-        period: Policy period of the task [s]; its control period by default.
+        period: Policy period [s], where it will not be the task file's (``dt`` times ``policy_every``).
         source: What messages call the source.
 
     Returns:
         ``out``.
 
     Raises:
-        BadDemonstrations: a column is missing, not finite or of another length, or an episode has less than two rows.
+        BadDemonstrations: a column is missing, not finite or of another length, an episode has less than two rows, or numbers that are in other units.
     """
+    if isinstance(episodes, Mapping):
+        raise BadDemonstrations(f"{source}: episodes is one table of columns; give a list of them, [table], one for each episode")
     env = _core.Env(os.fspath(task))
-    period = env.dt if period is None else period
-    if not (dt > 0 and np.isfinite(dt)):
-        raise BadDemonstrations(f"{source}: dt is {dt}; give the time between two rows in seconds")
-    if actions and abs(dt - period) > _SAME * period:
-        raise BadDemonstrations(f"{source}: its rows are {dt} s apart and the task's period is {period} s; actions cannot be interpolated, leave them out")
+    of_task = controller(env, task)
+    period = of_task.dt * of_task.policy_every if period is None else period
+    check_period(dt, period, source)
+    if actions and abs(dt - period) > SAME * period:
+        raise BadDemonstrations(
+            f"{source}: its rows are {dt} s apart and the policy period of the task is {period:g} s; actions cannot be interpolated: leave them out, or "
+            f"give one row for each policy period"
+        )
     parts: dict[str, list[Floats]] = {name: [] for name in ("observations", "qpos", "qvel", "actions")}
     lengths = []
     for i, columns in enumerate(episodes):
-        qpos, qvel = _states(env, columns, dt, f"{source}, episode {i}")
-        if abs(dt - period) > _SAME * period:
-            qpos, qvel = _resampled(qpos, dt, period), _resampled(qvel, dt, period)
+        where = f"{source}, episode {i}"
+        qpos, qvel = _states(env, columns, dt, where)
+        if (n := len(qpos)) < 2:
+            raise BadDemonstrations(f"{where}: {n} rows make no transition; give at least 2")
+        check_units(of_task, _entries(env), qpos, qvel, where)
+        rows = Rows(n, dt, period)
+        known = [name for name in (*env.obs_names, *goal_names(env)) if name in columns]
+        recorded = {name: rows.newest(column(columns, name, n, where)) for name in known}
+        qpos, qvel = rows.states(qpos), rows.states(qvel)
+        if not rows.whole:
             _unit(env, qpos)
         if len(qpos) < 2:
-            raise BadDemonstrations(f"{source}, episode {i}: {len(qpos)} rows make no transition; give at least 2")
-        parts["observations"].append(np.stack([env.set_state(q, v, k * period) for k, (q, v) in enumerate(zip(qpos, qvel))]))
+            raise BadDemonstrations(f"{where}: {n} rows {dt:g} s apart make no transition of the policy's {period:g} s; give more rows, and dt in seconds")
+        state = dict(zip([*_entries(env)[0], *_entries(env)[1]], [*qpos.T, *qvel.T]))
+        parts["observations"].append(observations(env, recorded, state, qpos, qvel, period, where))
         parts["qpos"].append(qpos)
         parts["qvel"].append(qvel)
         if actions:
-            parts["actions"].append(np.stack([_column(columns, name, len(qpos), f"{source}, episode {i}") for name in actions], 1)[:-1])
+            parts["actions"].append(np.stack([column(columns, name, n, where) for name in actions], 1)[:-1])
         lengths.append(len(qpos) - 1)
     if not lengths:
         raise BadDemonstrations(f"{source}: it has no episode")
-    arrays = {name: np.concatenate(rows) for name, rows in parts.items() if rows}
+    arrays = {name: np.ascontiguousarray(np.concatenate(rows)) for name, rows in parts.items() if rows}
     Path(out).parent.mkdir(parents=True, exist_ok=True)
     with open(out, "wb") as file:
         np.savez(file, lengths=np.array(lengths), dt=np.array(period), names=np.array(env.obs_names), **arrays)  # type: ignore[arg-type]
@@ -203,18 +215,6 @@ def _split(table: Mapping[str, Floats], of: ArrayLike | None) -> list[dict[str, 
     return [{name: column[of == of[first]] for name, column in table.items()} for first in firsts]
 
 
-def _column(columns: Mapping[str, ArrayLike], name: str, n: int, where: str) -> Floats:
-    if name not in columns:
-        raise BadDemonstrations(f"{where}: no column '{name}'; it has {', '.join(columns)}")
-    column = np.asarray(columns[name], float)
-    if column.shape != (n,):
-        raise BadDemonstrations(f"{where}: column '{name}' has shape {column.shape} where the others have {n} rows")
-    bad = np.flatnonzero(~np.isfinite(column))
-    if len(bad):
-        raise BadDemonstrations(f"{where}: column '{name}' is {column[bad[0]]} in row {bad[0]}")
-    return column
-
-
 def _entries(env: _core.Env) -> tuple[list[str], list[str]]:
     """Names of the entries of qpos and qvel."""
     floats = [joint for joint in env.joint_names if any(name.startswith(f"q.{joint}.") for name in env.obs_names)]
@@ -236,12 +236,12 @@ def _states(env: _core.Env, columns: Mapping[str, ArrayLike], dt: float, where: 
     n = len(np.asarray(columns[given[0]]))
     # a place that the task does not observe is of no matter; a joint's angle is
     of_no_matter = lambda name: not any(name in observed for observed in env.obs_names)  # noqa: E731
-    qpos = np.stack([np.zeros(n) if name not in columns and of_no_matter(name) else _column(columns, name, n, where) for name in q_names], 1)
+    qpos = np.stack([np.zeros(n) if name not in columns and of_no_matter(name) else column(columns, name, n, where) for name in q_names], 1)
     _unit(env, qpos)
     qvel = _differences(q_names, v_names, qpos, dt)
     for k, name in enumerate(v_names):
         if name in columns:
-            qvel[:, k] = _column(columns, name, n, where)
+            qvel[:, k] = column(columns, name, n, where)
     return qpos, qvel
 
 
@@ -277,10 +277,3 @@ def _turned(a: Floats, b: Floats) -> Floats:
     xyz, w = np.where(w[:, None] < 0, -xyz, xyz), np.abs(w)
     sine = np.linalg.norm(xyz, axis=1)
     return xyz * (2 * np.arctan2(sine, w) / np.maximum(sine, 1e-12))[:, None]
-
-
-def _resampled(rows: Floats, dt: float, period: float) -> Floats:
-    """Rows at multiples of ``period``, interpolated."""
-    times = np.arange(len(rows)) * dt
-    at = np.arange(int(times[-1] / period + _SAME) + 1) * period
-    return np.stack([np.interp(at, times, column) for column in rows.T], 1)

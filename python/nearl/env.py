@@ -14,7 +14,7 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     """A task on one simulated robot.
 
     Same spaces, observations, rewards and terminations as Gymnasium's environment of the same name (``Panda-reach`` is our own).
-    The time limit is Gymnasium's wrapper, which ``gymnasium.make("nearl/...")`` adds.
+    The time limit is Gymnasium's wrapper, which ``gymnasium.make("nearl/...")`` adds. It cannot be pickled or copied: make it in the process that uses it.
 
     Args:
         task: Name of the task, one of ``nearl.tasks()``, or a task file (TOML).

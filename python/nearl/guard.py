@@ -34,7 +34,8 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
         seed: Of the drawn actions: the same state and action give the same result.
 
     Raises:
-        ValueError: a key that is not known, a joint that the robot does not have, a limit that is no number, or an environment of another kind.
+        ValueError: a key that is not known, a joint that the robot does not have, a limit that is no number, no limit at all, or an environment of
+            another kind; in a step an action (n_act) of another shape, or with an entry that is not finite.
     """
 
     def __init__(
@@ -64,6 +65,11 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise ValueError("the action space is unbounded; give the environment actuators with a ctrlrange")
         positions, velocities = self._limits(constraints)
         self._q, self._v = list(positions), list(velocities)
+        if not (positions or velocities):
+            raise ValueError(
+                "no joint has a limit to be kept; give constraints that say which, e.g. {'position': {}, 'velocity': {'limit': 25.0}} for every joint with a "
+                "range in the robot file, or {'velocity': {'limit': {'JOINT': 25.0}}}"
+            )
         actions = list(zip(low.tolist(), high.tolist()))
         self._search = _core.ActionSearch(list(positions.values()), list(velocities.values()), actions, seed)
 
@@ -75,7 +81,7 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def safe(self, action: ArrayLike) -> tuple[NDArray[Any], str]:
         """The action that a step would use and what was found, ``"kept"``, ``"replaced"`` or ``"outside"``; nothing is stepped."""
-        given = np.asarray(action)
+        given = self._checked(action)
         verdict, found = self._search.find(given.astype(float).tolist(), self._foresee)
         if verdict == "kept" or (verdict == "outside" and (self._keeps or np.array_equal(found, given))):
             return given, verdict
@@ -85,6 +91,19 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._keeps and not inside:
             return given, "outside"
         return safe, "replaced" if inside else "outside"
+
+    def _checked(self, action: ArrayLike) -> NDArray[Any]:
+        """The action as it came, of the space's shape and finite."""
+        given, shape = np.asarray(action), self.env.action_space.shape
+        if given.shape != shape:
+            raise ValueError(f"action has shape {given.shape}, expected {shape}")
+        if not np.issubdtype(given.dtype, np.number) or np.iscomplexobj(given):
+            raise ValueError(f"action is not an array of numbers but of {given.dtype}; pass a NumPy array")
+        bad = np.flatnonzero(~np.isfinite(given))
+        if len(bad):
+            i = int(bad[0])
+            raise ValueError(f"action[{i}] is {given.flat[i]}: every entry must be finite; check the policy's output")
+        return given
 
     @property
     def outside(self) -> bool:

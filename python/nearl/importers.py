@@ -71,8 +71,9 @@ def import_torch(
         name: Of the task made of robot and recipe.
 
     Raises:
-        ValueError: a module that is no layer of a policy, by name.
+        ValueError: a module that is no layer of a policy, by name; or a file.
     """
+    _live(module, "import_torch", "torch.load")
     policy = _policy(_layers(getattr(module, "actor", module)), *_normaliser(module, mean, std), clip, output_clip)
     return _place(policy, robot, recipe, task, name)
 
@@ -90,29 +91,41 @@ def import_sb3(
 
     Args:
         model: The live object.
-        vec_normalize: The ``VecNormalize`` it was trained with.
+        vec_normalize: The ``VecNormalize`` it was trained with; the model's own where it has one. A model that was loaded without its environment
+            does not know of any: load it with ``env=``, or give it here.
         task: Task of this package whose environment gives the observation; or ``robot`` and ``recipe``.
         robot: URDF or MJCF file.
         recipe: As for :func:`import_onnx`.
         name: Of the task made of robot and recipe.
 
     Raises:
-        ValueError: a part of the policy that is no layer, by name.
+        ValueError: a part of the policy that is no layer, by name; or a file.
     """
+    _live(model, "import_sb3", "stable_baselines3.PPO.load")
     space, policy = model.action_space, model.policy
+    if not hasattr(space, "low"):
+        raise ValueError(f"the model chooses from {space}, and an imported policy gives numbers within a range; train it on a Box of actions")
+    if hasattr(policy, "lstm_actor"):
+        raise ValueError("the model's policy is recurrent (lstm_actor), which is none that layers consist of; train one without memory, or give it history")
     low, high = np.asarray(space.low, float).ravel(), np.asarray(space.high, float).ravel()
     actor = getattr(policy, "actor", None)
-    if actor is None:  # PPO, A2C: the action is cut to its range
-        layers = [*_layers(policy.mlp_extractor.policy_net), *_layers(policy.action_net)]
+    if actor is None:  # PPO, A2C: the action is cut to its range, or with use_sde=True and squash_output=True squashed
+        parts = [policy.mlp_extractor.policy_net, policy.action_net]
         squashed = bool(getattr(policy, "squash_output", False))
+        layers = _layers([*_seen_by(policy), *parts])
+        layers = _followed(layers, "tanh") if squashed else layers
     elif hasattr(actor, "latent_pi"):  # SAC: the mean is squashed
-        layers, squashed = [*_layers(actor.latent_pi), *_layers(actor.mu), _squash(len(low))], True
+        layers, squashed = _followed(_layers([*_seen_by(actor), actor.latent_pi, actor.mu]), "tanh"), True
     else:  # TD3, DDPG: the network ends with a tanh
-        layers, squashed = _layers(actor.mu), True
+        layers, squashed = _layers([*_seen_by(actor), actor.mu]), True
     if squashed:
         layers = [*layers, (np.diag((high - low) / 2), (high + low) / 2, "identity")]
     mean = std = None
     clip = math.inf
+    if vec_normalize is None:
+        vec_normalize = getattr(model, "get_vec_normalize_env", lambda: None)()
+    if vec_normalize is not None and not hasattr(vec_normalize, "norm_obs"):
+        raise ValueError(f"vec_normalize is {vec_normalize!r} and no VecNormalize; give the live object, e.g. VecNormalize.load(file, env)")
     if vec_normalize is not None and vec_normalize.norm_obs:
         rms = vec_normalize.obs_rms
         mean, std = rms.mean, np.sqrt(np.asarray(rms.var) + vec_normalize.epsilon)
@@ -152,8 +165,19 @@ def _normaliser(module: Any, mean: Any, std: Any) -> tuple[Any, Any]:
     return normaliser._mean, _numbers(normaliser._std) + float(normaliser.eps)
 
 
-def _squash(n: int) -> _Layer:
-    return np.eye(n), np.zeros(n), "tanh"
+def _live(model: Any, name: str, loader: str) -> None:
+    """Refuses a file in the place of what a library makes of it."""
+    if isinstance(model, str | os.PathLike):
+        file = os.fspath(model)
+        raise ValueError(
+            f"'{file}' is a file, and files of PyTorch and Stable-Baselines3 are pickles, which are never opened here; load it with the library that wrote it, "
+            f"e.g. {loader}({file!r}), and give nearl.{name} what it returns"
+        )
+
+
+def _seen_by(policy: Any) -> list[Any]:
+    """What SB3 makes of the observation before the first layer: nothing but flattening, or it is named."""
+    return [part for part in [getattr(policy, "pi_features_extractor", None) or getattr(policy, "features_extractor", None)] if part is not None]
 
 
 def _layers(module: Any) -> list[_Layer]:
@@ -172,13 +196,27 @@ def _layers(module: Any) -> list[_Layer]:
                 raise ValueError(f"module {part} has another alpha or beta than 1, which is not known")
             if not layers:
                 raise ValueError(f"module {part} stands before the first linear layer; give the policy's network alone")
-            if layers[-1][2] != "identity":
-                n = len(layers[-1][1])
-                layers.append((np.eye(n), np.zeros(n), "identity"))
-            layers[-1] = (*layers[-1][:2], _FUNCTIONS[kind])
+            layers = _followed(layers, _FUNCTIONS[kind])
+        elif kind == "Hardtanh" and layers:
+            layers = _clipped(layers, float(part.min_val), float(part.max_val))
         else:
             raise ValueError(f"module {kind} is none that a policy's layers consist of; export the policy as ONNX if it is made of them")
     return layers
+
+
+def _followed(layers: list[_Layer], function: str) -> list[_Layer]:
+    """The same with a function after the last of them."""
+    *before, (weight, bias, last) = layers
+    if last == "identity":
+        return [*before, (weight, bias, function)]
+    return [*layers, (np.eye(len(bias)), np.zeros(len(bias)), function)]
+
+
+def _clipped(layers: list[_Layer], low: float, high: float) -> list[_Layer]:
+    """The same with each output cut to a range: ``clip(x) = low + relu(x - low) - relu(x - high)``."""
+    n = len(layers[-1][1])
+    both = np.vstack([np.eye(n), np.eye(n)]), np.repeat([-low, -high], n), "relu"
+    return [*layers, both, (np.hstack([np.eye(n), -np.eye(n)]), np.full(n, low), "identity")]
 
 
 def _flat(module: Any) -> Iterable[Any]:

@@ -19,15 +19,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.arguments import seed_of, threads_of, whole
 from nearl.outcome import Outcome, ask
 from nearl.ranks import Gather
 
 Floats = NDArray[np.float64]
 Callback = Callable[["PID2", dict[str, float]], bool | None]
+# Of a run folder: which of reward and termination came from Python, which the checkpoint does not tell apart.
+FUNCTIONS = "functions.json"
 
 
 class PID2:
     """A policy that proposes states, its inverse dynamics and the constraints between them, trained in this process.
+
+    It cannot be pickled or copied: another process gets what was learned by :meth:`save` and :meth:`load`.
 
     Args:
         task: Name of the task, one of ``nearl.tasks()``, or a task file (TOML).
@@ -37,7 +42,7 @@ class PID2:
         settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.scale": 0.8}``.
         preset: Settings by name, ``"paper"`` or ``"strong"``; ``settings`` come after them.
         demos: Demonstrations (``.npz``) for ``bc``, ``soil``, ``dapg``, ``pid2-il``, ``bco`` and ``gaifo``; ``nearl demos record RUN`` writes some.
-        run: Run folder to write as ``nearl train`` does; none by default. Of several ranks the first writes it.
+        run: Run folder to write as ``nearl train`` does, from where the process is now; none by default. Of several ranks the first writes it.
         reward: ``reward(obs, actions, next_obs)``, arrays of n rows in, (n,) out, replaces the task's, as in :func:`nearl.make_vec`; here it is
             asked once a control period of each environment, with one row, from several threads in any order: the same arguments must give
             the same answer.
@@ -68,14 +73,20 @@ class PID2:
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
         if demos is not None:
             overrides.append(f"train.demos.file={_toml(os.path.abspath(demos))}")
-        if not 0 <= seed < 2**64:
-            raise ValueError(f"seed is {seed}; give a whole number from 0 to 2**64 - 1")
-        run = run if ranks is None or ranks.rank == 0 else None
+        seed, threads = seed_of(seed), threads_of(threads)
+        # What is written later goes there, wherever the process has gone meanwhile.
+        run = None if run is None or (ranks is not None and ranks.rank != 0) else os.path.abspath(run)
         self._training: _core.Training | None = _core.Training(
-            os.fspath(task), algo, seed, _threads(threads), overrides, run, preset, _scorer(reward, termination), reward is not None, ranks
+            os.fspath(task), algo, seed, threads, overrides, run, preset, _scorer(reward, termination), reward is not None, ranks
         )
         self.task, self.algo, self.seed = self._training.task, algo, seed
+        self._keep_functions(run, reward, termination)
         self._begin(self._training.controller())
+
+    def _keep_functions(self, run: str | None, reward: Outcome | None, termination: Outcome | None) -> None:
+        """What is told of the functions in the run folder once something is learned from them."""
+        self._functions = None if run is None else Path(run) / FUNCTIONS
+        self._given = {"reward": reward is not None, "termination": termination is not None}
 
     def _begin(self, controller: _core.Controller) -> None:
         self._controller = controller
@@ -108,12 +119,13 @@ class PID2:
             raise ValueError(
                 "a policy loaded from a snapshot file predicts and does not learn: the file has no optimiser state; load a run folder, or make a new PID2"
             )
-        if total_timesteps < 1:
-            raise ValueError(f"total_timesteps is {total_timesteps}; ask for at least one step")
+        total_timesteps = whole("total_timesteps", total_timesteps, 1, "ask for at least one step")
         callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]
         bar = _Bar(sys.stderr, self.num_timesteps, total_timesteps) if progress_bar else None
-        warning = self._training.begin(int(total_timesteps))
+        warning = self._training.begin(total_timesteps)
         try:
+            if self._functions is not None and any(self._given.values()):
+                self._functions.write_text(json.dumps(self._given))
             if warning is not None:
                 warnings.warn(warning, stacklevel=2)
             while not self._training.done:
@@ -149,7 +161,9 @@ class PID2:
         Returns:
             Action (n_act) or (n x n_act), within the actuators' range, and the state for the next call.
         """
-        obs = np.asarray(observation, float)
+        obs, n_obs = _numbers("observation", observation), len(self._controller.obs_names)
+        if obs.ndim not in (1, 2) or obs.shape[-1] != n_obs or obs.size == 0:
+            raise ValueError(f"observation has shape {obs.shape}; give one observation, ({n_obs},), or at least one row of several, (n, {n_obs})")
         rows = np.atleast_2d(obs)
         if not self._controller.remembers:
             memory: tuple[_core.Controller, ...] = (self._controller,) * len(rows)
@@ -187,12 +201,15 @@ class PID2:
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: it is not a snapshot, was damaged, or learned from functions that are not given again.
+            ValueError: it is not a snapshot, was damaged, or learned from a function that is not given again, by its name.
         """
         agent = cls.__new__(cls)
         agent._training, agent.seed = None, 0
+        path, threads = os.path.abspath(path), threads_of(threads)
         if ranks is not None or (Path(path) / "checkpoints" / "resume.safetensors").is_file():
-            agent._training = _core.Training.resume(path, _threads(threads), _scorer(reward, termination), reward is not None, ranks)
+            _ask_again(Path(path), reward, termination)
+            agent._training = _core.Training.resume(path, threads, _scorer(reward, termination), reward is not None, ranks)
+            agent._keep_functions(path, reward, termination)
         controller = _core.Controller.load(path) if agent._training is None else agent._training.controller()
         agent.task, agent.algo = controller.task, controller.algo
         agent._begin(controller)
@@ -211,10 +228,25 @@ def _scorer(reward: Outcome | None, termination: Outcome | None) -> Callable[[Fl
     return scorer
 
 
-def _threads(threads: int | None) -> int:
-    if threads is not None and threads < 1:
-        raise ValueError(f"threads is {threads}; give at least 1, or leave it out for all cores")
-    return threads or os.cpu_count() or 1
+def _ask_again(run: Path, reward: Outcome | None, termination: Outcome | None) -> None:
+    """Refuses to go on without a function that the run has learned from; the others may take the task's place from here on."""
+    if not (run / FUNCTIONS).is_file():
+        return
+    learned = json.loads((run / FUNCTIONS).read_text())
+    missing = [name for name, given in (("reward", reward), ("termination", termination)) if learned[name] and given is None]
+    if missing:
+        give = ", ".join(f"{name}=..." for name, was in learned.items() if was)
+        raise ValueError(
+            f"the training in '{run}' has its {' and its '.join(missing)} from Python functions, which no file holds; go on in Python with "
+            f"nearl.PID2.load(run, {give})"
+        )
+
+
+def _numbers(name: str, value: Any) -> Floats:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is not an array of numbers but {type(value)}; pass a NumPy array") from None
 
 
 def _toml(value: Any) -> str:

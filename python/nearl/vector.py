@@ -11,6 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.arguments import seed_of, threads_of, whole
 from nearl.outcome import Floats, Outcome, ask
 
 Step = tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
@@ -23,6 +24,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
     with the mask ``_<key>``: ``final_obs`` (same-step mode), ``fault``; ``cost`` where the task has one; and with ``constraints`` always:
     ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit), ``executed``
     (what the actuators got in the last of them, num_envs x n_act; not a number where the step only began an episode) and ``moved``.
+    A vector cannot be pickled or copied: make it in the process that uses it.
 
     Args:
         max_episode_steps: Control periods after which an episode is cut; the task's own by default.
@@ -48,9 +50,10 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         mode = AutoresetMode(autoreset_mode)
         if mode is AutoresetMode.DISABLED:
             raise ValueError("autoreset_mode is Disabled, which is not offered; use NextStep or SameStep")
-        if num_envs < 1:
-            raise ValueError(f"num_envs is {num_envs}; ask for at least one environment")
-        threads = threads or os.cpu_count() or 1
+        num_envs = whole("num_envs", num_envs, 1, "ask for at least one environment")
+        seed, threads = seed_of(seed, num_envs), threads_of(threads)
+        if max_episode_steps is not None:
+            max_episode_steps = whole("max_episode_steps", max_episode_steps, 1, "give at least one control period")
         task = os.fspath(task)
         constraints = None if constraints is None else os.fspath(constraints)
         same_step = mode is AutoresetMode.SAME_STEP
@@ -74,9 +77,14 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         """Begins an episode everywhere. ``seed``: one for all (environment ``i`` gets ``seed + i``) or one each."""
         if options:
             raise ValueError(f"reset options {sorted(options)} are not known; this vector takes none")
-        if isinstance(seed, int | np.integer):
-            seed = [int(seed) + i for i in range(self.num_envs)]
-        obs = self._native.reset(None if seed is None else list(seed))
+        if seed is None:
+            seeds = None
+        elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+            seeds = [None if one is None else seed_of(one, name=f"seed[{i}]") for i, one in enumerate(seed)]
+        else:
+            first = seed_of(seed, self.num_envs)
+            seeds = [first + i for i in range(self.num_envs)]
+        obs = self._native.reset(seeds)
         self._obs, self._over = obs.copy(), np.zeros(self.num_envs, bool)
         return obs, {}
 

@@ -81,11 +81,34 @@ def test_the_nearest_action_is_the_solution_of_a_general_solver():
         ({"velocity": {"limit": -1.0}}, "-1.0"),
         ({"position": {"margin": 9.0}}, "margin"),
         ({"velocity": {}}, "limit"),
+        ({}, "no joint has a limit to be kept; give constraints"),
     ],
 )
 def test_what_is_no_limit_is_refused_by_name(constraints, words):
     with pytest.raises(ValueError, match=words):
         nearl.Guard(gymnasium.make("HalfCheetah-v5"), constraints)
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        (np.full(6, np.nan), r"action\[0\] is nan: every entry must be finite"),
+        (np.array([0, 0, 0, 0, -np.inf, 0]), r"action\[4\] is -inf: every entry must be finite"),
+        (np.zeros(5), r"action has shape \(5,\), expected \(6,\)"),
+        (np.zeros((1, 6)), r"action has shape \(1, 6\), expected \(6,\)"),
+        (["a"] * 6, "action is not an array of numbers"),
+    ],
+)
+def test_what_is_no_action_reaches_no_simulator(action, words):
+    """As at every other door; the state is the one of before, bit for bit."""
+    env = nearl.Guard(gymnasium.make("HalfCheetah-v5"), LIMITS)
+    env.reset(seed=1)
+    before = env.unwrapped.data.qpos.copy(), env.unwrapped.data.qvel.copy(), env.unwrapped.data.time
+    for act in (env.step, env.safe):
+        with pytest.raises(ValueError, match=words):
+            act(action)
+    after = env.unwrapped.data.qpos, env.unwrapped.data.qvel, env.unwrapped.data.time
+    assert all(np.array_equal(a, b) for a, b in zip(before, after))
 
 
 def test_an_environment_without_mujoco_is_refused():

@@ -477,6 +477,13 @@ class ReLU:
         return np.maximum(x, 0)
 
 
+class Hardtanh:
+    min_val, max_val = -0.5, 2.0
+
+    def __call__(self, x):
+        return np.clip(x, self.min_val, self.max_val)
+
+
 class LayerNorm:
     pass
 
@@ -520,6 +527,46 @@ def test_the_actors_of_stable_baselines_are_read() -> None:
             x = np.clip((obs - norm.obs_rms.mean) / np.sqrt(norm.obs_rms.var + 1e-8), -10, 10)
             np.testing.assert_allclose(controller.act(obs), end(head(latent(x))), atol=2e-5, err_msg=name)
     assert sys.modules.get("torch") is None
+
+
+def test_squashed_means_and_clips_of_stable_baselines_are_kept() -> None:
+    """`use_sde=True`: PPO and A2C squash with `squash_output`, SAC clips its mean before it does. The normaliser is the model's own unless one is given."""
+    box = SimpleNamespace(low=np.array([-1.0, -1.0, -0.5, -1.0, -1.0, -1.0]), high=np.array([1.0, 0.5, 1.0, 1.0, 1.0, 1.0]))
+    latent, head = Sequential([Linear(17, 8), Tanh()]), Linear(8, 6)
+    rms = SimpleNamespace(mean=RNG.normal(size=17), var=0.5 + RNG.random(17))
+    norm = SimpleNamespace(norm_obs=True, clip_obs=3.0, epsilon=1e-8, obs_rms=rms)
+    policies = {
+        "ppo": (SimpleNamespace(mlp_extractor=SimpleNamespace(policy_net=latent), action_net=head, squash_output=True), lambda x: x),
+        "sac": (SimpleNamespace(actor=SimpleNamespace(latent_pi=latent, mu=Sequential([head, Hardtanh()]))), Hardtanh()),
+    }
+    for name, (policy, clip) in policies.items():
+        model = SimpleNamespace(policy=policy, action_space=box, get_vec_normalize_env=lambda: norm)
+        own = nearl.import_sb3(model, task="HalfCheetah-v5")
+        without = nearl.import_sb3(model, SimpleNamespace(norm_obs=False), task="HalfCheetah-v5")
+        for _ in range(20):
+            obs = 3 * RNG.normal(size=17)
+            x = np.clip((obs - rms.mean) / np.sqrt(rms.var + 1e-8), -3, 3)
+            for controller, seen in ((own, x), (without, obs)):
+                want = box.low + 0.5 * (np.tanh(clip(head(latent(seen)))) + 1) * (box.high - box.low)
+                np.testing.assert_allclose(controller.act(obs), want, atol=2e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("read", [nearl.import_sb3, nearl.import_torch])
+def test_a_file_in_the_place_of_a_live_object_is_named_and_not_opened(read) -> None:
+    with pytest.raises(ValueError, match=r"'nowhere.zip' is a file, .* never opened here; load it .*\.load\('nowhere.zip'\)"):
+        read("nowhere.zip", task="HalfCheetah-v5")
+
+
+def test_what_else_a_model_of_stable_baselines_does_is_refused_by_name() -> None:
+    box, latent, head = SimpleNamespace(low=-np.ones(6), high=np.ones(6)), Sequential([Linear(17, 8), Tanh()]), Linear(8, 6)
+    policy = SimpleNamespace(mlp_extractor=SimpleNamespace(policy_net=latent), action_net=head, features_extractor=LayerNorm())
+    with pytest.raises(ValueError, match="module LayerNorm"):
+        nearl.import_sb3(SimpleNamespace(policy=policy, action_space=box), task="HalfCheetah-v5")
+    with pytest.raises(ValueError, match="recurrent"):
+        nearl.import_sb3(SimpleNamespace(policy=SimpleNamespace(lstm_actor=None), action_space=box), task="HalfCheetah-v5")
+    with pytest.raises(ValueError, match="'vec.pkl' and no VecNormalize"):
+        del policy.features_extractor
+        nearl.import_sb3(SimpleNamespace(policy=policy, action_space=box), "vec.pkl", task="HalfCheetah-v5")
 
 
 def test_where_drives_alone_are_bounded_a_robot_need_not_hold_every_pose(tmp_path) -> None:

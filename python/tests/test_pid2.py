@@ -209,6 +209,37 @@ def test_numbers_that_no_training_has_are_refused() -> None:
         nearl.PID2(CART_POLE, settings={"train.n_envs": 16, "train.n_steps": 1_000_000_000})
 
 
+def test_what_is_no_number_is_refused_in_a_sentence() -> None:
+    for wrong in ({"seed": None}, {"seed": "0"}, {"threads": "2"}):
+        name, value = next(iter(wrong.items()))
+        with pytest.raises(ValueError, match=f"{name} is {value!r}; give"):
+            nearl.PID2(CART_POLE, **wrong)  # type: ignore[arg-type]
+    agent = nearl.PID2(CART_POLE, algo="ppo", threads=1, settings={"train.n_envs": 2, "train.n_steps": 64})
+    for steps in ("200k", None, 0.5):
+        with pytest.raises(ValueError, match=f"total_timesteps is {steps!r}; ask for at least one step"):
+            agent.learn(steps)  # type: ignore[arg-type]
+    assert agent.learn(1e2).num_timesteps == 128  # type: ignore[arg-type]
+    for obs, shape in ((np.zeros((0, 5)), r"\(0, 5\)"), (np.zeros((2, 2, 5)), r"\(2, 2, 5\)"), (np.zeros(4), r"\(4,\)"), (None, r"\(\)")):
+        with pytest.raises(ValueError, match=f"observation has shape {shape}; give one observation, .5,., or at least one row"):
+            agent.predict(obs)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="observation is not an array of numbers but <class 'str'>"):
+        agent.predict("abc")  # type: ignore[arg-type]
+
+
+def test_a_run_is_written_where_it_began(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = {"train.n_envs": 2, "train.n_steps": 64}
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    agent = nearl.PID2(CART_POLE, algo="ppo", run="run", settings=small)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    agent.learn(256)
+    monkeypatch.chdir(tmp_path)
+    again = nearl.PID2.load("run")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    again.learn(256)
+    assert nearl.PID2.load(tmp_path / "run").num_timesteps == 512 and not list((tmp_path / "elsewhere").iterdir())
+
+
 def test_a_second_learn_at_the_same_time_is_refused() -> None:
     agent = nearl.PID2(CART_POLE, algo="ppo", threads=1)
     refused: list[str] = []
@@ -321,3 +352,17 @@ def test_a_training_from_functions_goes_on_with_them_alone(tmp_path) -> None:
     again = nearl.PID2.load(tmp_path / "half", reward=reward).learn(512)
     obs = np.random.default_rng(0).normal(size=(20, len(agent.controller.obs_names)))
     np.testing.assert_array_equal(agent.predict(obs)[0], again.predict(obs)[0])
+
+
+@pytest.mark.parametrize("learned", [("reward",), ("termination",), ("reward", "termination")])
+def test_a_function_that_a_run_learned_from_is_asked_for_by_its_name(tmp_path: Path, learned: tuple[str, ...]) -> None:
+    """The other one alone is not taken for it, also after the run has gone on."""
+    functions = {"reward": lambda obs, actions, next_obs: 0.0 * next_obs[:, 0] - 7.0, "termination": lambda obs, actions, next_obs: next_obs[:, 0] > 1e9}
+    given = {name: functions[name] for name in learned}
+    nearl.PID2(CART_POLE, "ppo", settings=SMALL, run=tmp_path / "run", **given).learn(512)
+    for _ in range(2):
+        for missing in learned:
+            others = {name: function for name, function in functions.items() if name != missing}
+            with pytest.raises(ValueError, match=rf"has its {missing} from Python functions, .* nearl.PID2.load\(run, {'=..., '.join(learned)}=...\)"):
+                nearl.PID2.load(tmp_path / "run", **others)
+        nearl.PID2.load(tmp_path / "run", **given).learn(256)

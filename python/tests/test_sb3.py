@@ -58,6 +58,26 @@ def test_every_kind_of_policy_comes_over_whole(kind, arguments):
             np.testing.assert_allclose(controller.act(obs), model.predict(obs, deterministic=True)[0], atol=1e-5)
 
 
+@pytest.mark.parametrize(("kind", "arguments"), [("PPO", {"n_steps": 64, "policy_kwargs": {"squash_output": True}}), ("A2C", {}), ("SAC", EARLY)])
+def test_policies_that_explore_by_their_state_come_over_whole(kind, arguments):
+    model = getattr(sb3, kind)("MlpPolicy", gymnasium.make(f"nearl/{TASK}"), use_sde=True, seed=0, device="cpu", **arguments).learn(70)
+    head = model.policy.actor.mu[0] if kind == "SAC" else model.policy.action_net
+    with torch.no_grad():
+        head.weight.mul_(30.0)  # far into what is clipped and squashed
+    controller, rng = nearl.import_sb3(model, task=TASK), np.random.default_rng(0)
+    for obs in rng.normal(size=(60, 17)):
+        np.testing.assert_allclose(controller.act(obs), model.predict(obs, deterministic=True)[0], atol=2e-5)
+
+
+def test_the_normaliser_that_a_model_learned_behind_is_its_own():
+    env = VecNormalize(make_vec_env(f"nearl:nearl/{TASK}", n_envs=2, seed=0))
+    model = sb3.PPO("MlpPolicy", env, n_steps=64, seed=0, device="cpu").learn(256)
+    env.training = False
+    controller, rng = nearl.import_sb3(model, task=TASK), np.random.default_rng(0)
+    for obs in 5 * rng.normal(size=(30, 17)):
+        np.testing.assert_allclose(controller.act(obs), model.predict(env.normalize_obs(obs), deterministic=True)[0], atol=1e-5)
+
+
 @pytest.mark.parametrize("algorithm", ["sac", "ppo"])
 def test_its_learners_break_no_limit_of_the_arm(algorithm, capsys):
     example("sb3_guarded").main(algorithm, "arm", "300")

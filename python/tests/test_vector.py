@@ -135,3 +135,29 @@ def test_a_constrained_step_is_cubic_projection_and_inverse_dynamics() -> None:
             tau = model.rnea(q, v, target.acceleration) - model.passive(q, v)
             env.step(tau)
         np.testing.assert_allclose(obs[:14], np.concatenate(env.state), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"num_envs": 0}, "num_envs is 0; ask for at least one environment"),
+        ({"num_envs": "4"}, "num_envs is '4'; ask for at least one environment"),
+        ({"threads": 0}, "threads is 0; give at least 1"),
+        ({"threads": "2"}, "threads is '2'; give at least 1"),
+        ({"seed": -1}, r"seed is -1; give a whole number from 0 to 2\*\*64 - 2"),
+        ({"seed": 2**64 - 1}, r"seed is 18446744073709551615; give a whole number from 0 to 2\*\*64 - 2"),
+        ({"seed": None}, "seed is None; give a whole number"),
+        ({"max_episode_steps": 0}, "max_episode_steps is 0; give at least one control period"),
+    ],
+)
+def test_numbers_that_no_vector_has_are_refused(arguments, words) -> None:
+    with pytest.raises(ValueError, match=words):
+        nearl.VecEnv("Hopper-v5", **{"num_envs": 2} | arguments)
+
+
+def test_seeds_of_a_reset_are_whole_numbers() -> None:
+    vec = nearl.make_vec("Hopper-v5", 2, seed=np.int64(3))
+    assert np.array_equal(vec.reset(seed=np.array([3, 4]))[0], vec.reset(seed=3)[0])
+    for seed, words in ((-1, "seed is -1;"), ([0, -1], r"seed\[1\] is -1;"), ("ab", "seed is 'ab';"), (2**64 - 1, "seed is 18446744073709551615;")):
+        with pytest.raises(ValueError, match=words):
+            vec.reset(seed=seed)

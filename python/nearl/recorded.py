@@ -1,0 +1,175 @@
+"""What a recording says of a task beside the joints' states: what the robot was asked to do, in which period, and whether its units can be true."""
+
+import os
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nearl import _core
+
+Floats = NDArray[np.float64]
+Columns = Mapping[str, ArrayLike]
+SAME = 1e-6  # part of a period by which two may differ
+_FAST = 10.0  # times its limit at which a joint's speed is one of other units
+_SLOW = 1.0  # s between two rows, which only a policy as slow records
+_DRAWS = 3  # episodes in which a state is looked at, to see what is drawn in each
+_LOOKS = 256  # states of an episode that are looked at for it
+# Names of commands in an expression: `command.x`, or `{command.left-x}` in braces.
+_COMMAND = re.compile(r"\{(command\.[^}]*)\}|(?<![\w.])(command\.[\w.]+)")
+
+
+class BadDemonstrations(ValueError):
+    """A source that does not fit the task: the message names file, column and episode."""
+
+
+def column(columns: Columns, name: str, n: int, where: str) -> Floats:
+    """A column (n) by its name, all of it finite."""
+    if name not in columns:
+        raise BadDemonstrations(f"{where}: no column '{name}'; it has {', '.join(columns)}")
+    values = np.asarray(columns[name], float)
+    if values.shape != (n,):
+        raise BadDemonstrations(f"{where}: column '{name}' has shape {values.shape} where the others have {n} rows")
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        raise BadDemonstrations(f"{where}: column '{name}' is {values[bad[0]]} in row {bad[0]}")
+    return values
+
+
+def controller(env: _core.Env, task: str | os.PathLike[str]) -> _core.Controller:
+    """The task's controller around a policy that asks for nothing: it knows the policy period and the limits."""
+    n_obs, n_act = len(env.obs_names), len(env.actuator_names)
+    idle = [(np.zeros((n_act, n_obs)), np.zeros(n_act), "identity")]
+    policy = _core.Policy.from_layers(idle, np.zeros(n_obs), np.ones(n_obs), (-np.inf, np.inf), (-np.inf, np.inf))
+    try:
+        return policy.in_task(os.fspath(task))
+    except ValueError as error:
+        try:  # a [policy] of its own sees something else, which is left out here
+            return policy.in_task(os.fspath(task), ["policy.observation=[]"])
+        except ValueError:
+            raise error from None
+
+
+def check_period(dt: float, period: float, source: str) -> None:
+    """Refuses a time between two rows that no recording of the task has."""
+    if not (dt > 0 and np.isfinite(dt)):
+        raise BadDemonstrations(f"{source}: dt is {dt}; give the time between two rows in seconds")
+    if dt >= _SLOW and dt > 10 * period:
+        raise BadDemonstrations(
+            f"{source}: dt is {dt} s between two rows, and the policy of the task acts every {period} s; dt is in seconds, so for {dt:g} ms give {dt / 1e3:g}"
+        )
+
+
+def check_units(of_task: _core.Controller, names: tuple[Sequence[str], Sequence[str]], qpos: Floats, qvel: Floats, where: str) -> None:
+    """Refuses positions (n x nq) further outside the task's limits than these are apart and than half a turn, and warns of speeds (n x nv) that are far
+    above theirs."""
+    limits, dofs = of_task.limits, of_task.row_names
+    for k, name in enumerate(names[1]):
+        joint = name[2:]
+        if joint not in dofs:
+            continue
+        dof = dofs.index(joint)
+        if "q." + joint in names[0]:
+            lower, upper = limits["lower_position"][dof], limits["upper_position"][dof]
+            positions = qpos[:, names[0].index("q." + joint)]
+            outside = np.maximum(lower - positions, positions - upper)
+            row = int(np.argmax(outside))
+            if outside[row] > max(upper - lower, np.pi):
+                raise BadDemonstrations(
+                    f"{where}: column 'q.{joint}' is {positions[row]:g} in row {row}, and joint '{joint}' goes from {lower:.3g} to {upper:.3g} rad or m; "
+                    f"if these are degrees or millimetres, give numpy.radians of them, or metres"
+                )
+        limit = limits["velocity"][dof]
+        row = int(np.argmax(np.abs(qvel[:, k])))
+        if (speed := abs(qvel[row, k])) > _FAST * limit > 0:
+            warnings.warn(
+                f"{where}: joint '{joint}' moves at {speed:.3g} rad/s or m/s in row {row}, {speed / limit:.0f} times the task's limit of {limit:.3g}; "
+                f"look whether its columns are in rad or m, and dt in seconds",
+                stacklevel=3,
+            )
+
+
+class Rows:
+    """Which rows of an episode are those of the policy: every so many, or between two of them."""
+
+    def __init__(self, n: int, dt: float, period: float):
+        every = round(period / dt)
+        self.whole = every >= 1 and abs(period / dt - every) <= SAME * every
+        at = np.arange(int((n - 1) * dt / period + SAME) + 1)
+        self._times, self._at = np.arange(n) * dt, at * period
+        self._newest = at * every if self.whole else np.minimum((self._at / dt + SAME).astype(int), n - 1)
+
+    def states(self, rows: Floats) -> Floats:
+        """Of rows (n x any) that change steadily."""
+        if self.whole:
+            return rows[self._newest]
+        return np.stack([np.interp(self._at, self._times, of) for of in rows.T], 1)
+
+    def newest(self, values: Floats) -> Floats:
+        """Of a column (n) that holds until the next row."""
+        return values[self._newest]
+
+
+def goal_names(env: _core.Env) -> list[str]:
+    """Columns of the entries of the environment's goal, in its order; none where the observation does not tell of all of them."""
+    own = [name for name in env.obs_names if name.startswith("goal.")]
+    asked = {braced or plain for entry in env.obs_names for braced, plain in _COMMAND.findall(entry)}
+    names = own or sorted(asked)  # as the task file's table of commands is kept
+    return names if len(names) == len(env.goal) else []
+
+
+def observations(env: _core.Env, recorded: Mapping[str, Floats], state: Mapping[str, Floats], qpos: Floats, qvel: Floats, period: float, where: str) -> Floats:
+    """Observations (n x n_obs) of an episode.
+
+    What follows from the state and from what was asked for is the task's own. What does not, as noise, is what was recorded.
+
+    Args:
+        env: Of the task.
+        recorded: Columns (n) of the recording by name.
+        state: Columns (n) of ``qpos`` and ``qvel`` by name.
+        qpos: Configurations (n x nq).
+        qvel: Velocities (n x nv).
+        period: Between two of them [s].
+        where: Source and episode, for messages.
+    """
+    goals = goal_names(env)
+    given = [(k, recorded[name]) for k, name in enumerate(goals) if name in recorded]
+
+    def look(seed: int, rows: range) -> Floats:
+        env.reset(seed)
+        return np.stack([_seen(env, qpos[i], qvel[i], i * period, [(k, of[i]) for k, of in given]) for i in rows])
+
+    n = len(qpos)
+    seen, some = look(0, range(n)), range(0, n, max(1, n // _LOOKS))
+    others = [look(seed, some) for seed in range(1, _DRAWS)]
+    lacking = []
+    for k, name in enumerate(env.obs_names):
+        drawn = any(not np.array_equal(other[:, k], seen[some, k]) for other in others)
+        if not drawn and not name.startswith("cfrc."):
+            continue
+        if (own := state.get(name, recorded.get(name))) is not None:
+            seen[:, k] = own
+        elif drawn:
+            lacking.append(name)
+    if lacking:
+        missing = [name for name in goals if name not in recorded]
+        raise BadDemonstrations(
+            f"{where}: the task also observes {', '.join(lacking)}, which positions and velocities do not say; give the columns "
+            f"{', '.join(missing or lacking)} as they were when it was recorded"
+            + ("" if missing else ", or convert with a task file without [noise] and [random]")
+        )
+    return seen
+
+
+def _seen(env: _core.Env, qpos: Floats, qvel: Floats, time: float, goal: list[tuple[int, float]]) -> Floats:
+    """The observation (n_obs) in a state, asked for what was asked for."""
+    seen = env.set_state(qpos, qvel, time)
+    if not goal:
+        return seen
+    asked = env.goal
+    for k, value in goal:
+        asked[k] = value
+    env.goal = asked
+    return env.observe()
