@@ -81,7 +81,7 @@ pub struct Checkpoint {
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// The file system.
-    #[error("cannot write checkpoint '{file}': {reason}; what was written there last still holds")]
+    #[error("cannot write checkpoint '{file}': {reason}; one that was there before still holds")]
     Unwritable {
         /// Path.
         file: String,
@@ -153,7 +153,12 @@ impl Checkpoint {
         let file = path.display().to_string();
         let unusable = |reason: String| CheckpointError::Unusable { file: file.clone(), reason };
         let bytes = nearl_runtime::constraints::read_bounded(path, MAX_BYTES, false);
-        let bytes = bytes.map_err(|e| unusable(e.to_string()))?;
+        let bytes = bytes.map_err(|e| match e.kind() {
+            std::io::ErrorKind::NotFound => {
+                unusable("there is none, which a run has after its first batch".into())
+            }
+            _ => unusable(e.to_string()),
+        })?;
         Self::from_bytes(&file, &bytes)
     }
 

@@ -151,7 +151,7 @@ fn minus_is_a_sign(command: clap::Command) -> clap::Command {
 /// A number of threads or jobs.
 pub(crate) fn at_least_one(text: &str) -> Result<usize, String> {
     match text.parse() {
-        Ok(0) | Err(_) => Err(format!("'{text}' is not a whole number above 0; leave it out for all cores")),
+        Ok(0) | Err(_) => Err(format!("'{text}' is not a whole number above 0")),
         Ok(n) => Ok(n),
     }
 }

@@ -98,6 +98,12 @@ fn memory() -> Option<[u64; 2]> {
     Some([of("MemAvailable:")?, of("MemTotal:")?])
 }
 
+/// The free memory \[MB\] where `needed` MB more would leave less than a sixteenth of all there is.
+pub(crate) fn lacks_memory(needed: u64) -> Option<u64> {
+    let [free, total] = memory()?;
+    (free < needed.saturating_add(total / 16)).then_some(free)
+}
+
 impl Collector {
     /// The environments `envs` of a training, which collect `n_steps` policy steps each, on `threads` threads.
     ///
@@ -119,8 +125,8 @@ impl Collector {
         let (mut workers, full) =
             (Vec::new(), |what: String, free| RolloutError::Memory { n_envs, n_steps, what, free });
         for i in envs {
-            if let Some([free, total]) = (workers.len() % 64 == 0).then(memory).flatten()
-                && free < batch + total / 16
+            if workers.len() % 64 == 0
+                && let Some(free) = lacks_memory(batch)
             {
                 let what = if workers.is_empty() {
                     format!("a batch of {batch} MB")

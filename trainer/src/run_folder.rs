@@ -103,9 +103,9 @@ fn unwritten(file: &Path) -> impl Fn(std::io::Error) -> RunError {
     move |e| RunError::Write { path: file.display().to_string(), reason: e.to_string() }
 }
 
-/// Whether something was learned there: a row of metrics, or a checkpoint.
+/// Whether something was learned there: a checkpoint, or a second row of metrics. In the first batch nothing is learned.
 fn holds_a_run(path: &Path) -> bool {
-    let rows = |text: String| text.lines().count() > 1;
+    let rows = |text: String| text.lines().count() > 2;
     std::fs::read_to_string(path.join("metrics.csv"))
         .map_or_else(|e| e.kind() != std::io::ErrorKind::NotFound, rows)
         || has_checkpoint(path)

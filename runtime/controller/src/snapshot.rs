@@ -296,10 +296,14 @@ pub fn one_line(text: &dyn std::fmt::Display) -> String {
 /// What the system said.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let beside = path.with_extension(format!("part{}", std::process::id()));
-    let mut file = std::fs::File::create(&beside)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    std::fs::rename(&beside, path)
+    let write = || {
+        let mut file = std::fs::File::create(&beside)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        std::fs::rename(&beside, path)
+    };
+    // what failed half-way takes room that is missing already
+    write().inspect_err(|_| drop(std::fs::remove_file(&beside)))
 }
 
 /// The snapshot file in a run folder of `nearl train`, its final one, else its latest; any other path as it is.

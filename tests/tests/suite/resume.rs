@@ -61,6 +61,27 @@ fn check(task: &str, algo: &str, more: &[&str]) {
     assert!(rows(&whole).len() as u64 > ITERATIONS);
 }
 
+/// Killed before its first batch a run leaves its folder free, and after it there is something to go on from.
+#[test]
+fn a_run_that_is_killed_early_has_a_way_on() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (whole, killed) = (folder.path().join("whole"), folder.path().join("killed"));
+    let request = asked("Hopper-v5", "ppo", 1, &[]);
+    train(&request, &whole, |_, _| true).expect("uninterrupted");
+    for batches in [0, 1] {
+        let mut training = Training::new(&request).expect("training");
+        let manifest = training.snapshot().manifest.clone();
+        let mut run = RunFolder::create(&killed, &manifest, request.seed, &training.columns()).expect("free");
+        (0..batches).for_each(|_| drop(training.iterate_in(&mut run).expect("a batch")));
+    }
+    let again = Training::new(&request).expect("training");
+    let taken = RunFolder::create(&killed, &again.snapshot().manifest, request.seed, &again.columns());
+    assert!(taken.is_err(), "it holds a run");
+    resume(&killed, None, 1, |_, _| true).expect("resume");
+    assert!(final_of(&whole) == final_of(&killed));
+    assert_eq!(rows(&whole), rows(&killed));
+}
+
 #[test]
 fn ppo() {
     check("Hopper-v5", "ppo", &[]);

@@ -9,7 +9,9 @@ use crate::train::{Experience, Progress, Request, resume_on, train_on};
 use crate::{run_folder, tasks};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
+use nearl_runtime::Task;
 use nearl_runtime::link::RobotName;
+use std::collections::BTreeSet;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -117,20 +119,56 @@ struct Run {
 }
 
 impl Run {
-    /// What the checkpoint in `folder` says; it must be of `task`.
-    fn resumed(folder: &Path, task: &str, steps: Option<u64>) -> Result<Self, Failure> {
+    /// What the checkpoint in `folder` says; it must be of `task`, which was read of `file`.
+    fn resumed(folder: &Path, task: &Task, file: &str, steps: Option<u64>) -> Result<Self, Failure> {
         let header = Checkpoint::load(&checkpoint::path_in(folder))?.header;
-        let name = header.manifest.task.name;
-        if name != task {
+        let name = header.manifest.task.name.clone();
+        if name != task.name {
             let folder = folder.display();
             return Err(format!(
-                "run '{folder}' trains '{name}', not '{task}'; write 'nearl train {folder}/task.toml --resume {folder}'"
+                "run '{folder}' trains '{name}', not '{}'; write 'nearl train {folder}/task.toml --resume {folder}'",
+                task.name
             )
             .into());
+        }
+        // a bundled name says nothing of what --preset and --set were
+        let others = others(&header.manifest.task, task);
+        if !others.is_empty() && Path::new(file).is_file() {
+            let keys = others.join(", ");
+            eprintln!(
+                "nearl: warning: the run goes on with the settings it was started with; '{file}' has others under {keys}: start a new run with \
+                 --out for these"
+            );
         }
         let (algo, done) = (header.manifest.algo.parse()?, header.manifest.steps);
         Ok(Self { name, algo, steps: steps.unwrap_or(header.total), done })
     }
+}
+
+/// The keys under which two tasks differ; not the robot file, which a run folder has under its own name.
+fn others(a: &Task, b: &Task) -> Vec<String> {
+    fn walk(a: &toml::Table, b: &toml::Table, at: &str, found: &mut Vec<String>) {
+        let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
+        for key in keys {
+            let path = format!("{at}{key}");
+            match (a.get(key), b.get(key)) {
+                (Some(toml::Value::Table(a)), Some(toml::Value::Table(b))) => {
+                    walk(a, b, &format!("{path}."), found)
+                }
+                (a, b) if a != b => found.push(path),
+                _ => {}
+            }
+        }
+    }
+    let [a, b] = [a, b].map(|task| {
+        let mut table =
+            toml::Table::try_from(task).unwrap_or_else(|e| unreachable!("it was read from TOML: {e}"));
+        table.remove("model");
+        table
+    });
+    let mut found = Vec::new();
+    walk(&a, &b, "", &mut found);
+    found
 }
 
 impl Train {
@@ -139,7 +177,7 @@ impl Train {
         let mut manifest = tasks::load_with(&self.task, self.preset, &set)?;
         crate::train::complete(&mut manifest)?;
         let run = match &self.resume {
-            Some(folder) => Run::resumed(folder, &manifest.task.name, self.steps)?,
+            Some(folder) => Run::resumed(folder, &manifest.task, &self.task, self.steps)?,
             None => Run {
                 name: manifest.task.name.clone(),
                 algo: self.algo.parse()?,
@@ -327,7 +365,19 @@ fn returned(mean: f64, of: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::steps;
+    use super::{others, steps};
+    use crate::tasks;
+
+    #[test]
+    fn what_another_task_file_says_is_found_by_its_keys() {
+        let of = |set: &[&str]| {
+            let set: Vec<String> = set.iter().map(|s| (*s).to_string()).collect();
+            tasks::load("Hopper-v5", &set).expect("task").task
+        };
+        assert!(others(&of(&[]), &of(&[])).is_empty());
+        let changed = of(&["train.n_envs=3", "constraints.velocity.scale=0.5"]);
+        assert_eq!(others(&of(&[]), &changed), ["constraints.velocity.scale", "train.n_envs"]);
+    }
 
     #[test]
     fn steps_are_read_as_people_write_them() {

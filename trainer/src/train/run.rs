@@ -92,7 +92,7 @@ fn run(
 }
 
 impl Training {
-    /// [`Training::try_iterate`], its row in the run folder, and a checkpoint where one is due on the way; at the end it is the
+    /// [`Training::try_iterate`], its row in the run folder, and a checkpoint after the first batch and where one is due on the way; at the end it is the
     /// caller's to [`save`](Training::save). What was learned is kept when it fails.
     ///
     /// # Errors
@@ -118,7 +118,8 @@ impl Training {
         for (_, name) in kept.into_iter().filter(|(due, _)| *due) {
             folder.keep(&name, self.snapshot())?;
         }
-        if !self.is_done() && folder.is_due(progress.steps, self.total) {
+        let is_first = self.snapshot().manifest.version == 1;
+        if !self.is_done() && (is_first || folder.is_due(progress.steps, self.total)) {
             self.save(folder)?;
         }
         Ok(Some(progress))

@@ -9,7 +9,7 @@ pub(crate) mod space;
 use std::sync::MutexGuard;
 
 use crate::env::{ChaCha8Rng, EnvError, SeedableRng};
-use crate::rollout::RolloutError;
+use crate::rollout::{RolloutError, lacks_memory};
 use crate::tasks::{self, TaskLoadError};
 use crate::train::TrainError;
 use lane::{Proposing, Round};
@@ -120,6 +120,14 @@ impl Vector {
         let max_steps = settings.max_episode_steps.unwrap_or(spec.max_episode_steps);
         let lanes = (0..settings.num_envs as u64)
             .map(|i| {
+                if i % 64 == 0
+                    && let Some(free) = lacks_memory(0)
+                {
+                    return Err(VectorError::Unusable(format!(
+                        "num_envs is {}, and environments after the first {i} would take more memory than the {free} MB that are free; ask for fewer",
+                        settings.num_envs
+                    )));
+                }
                 let (env, seed) = (first.another()?, settings.seed.wrapping_add(i));
                 let proposing =
                     open.as_ref().map(|s| Proposing::new(s, &*env, settings.actions)).transpose()?;
