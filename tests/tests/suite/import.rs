@@ -71,6 +71,20 @@ fn a_policy_of_motors_comes_back_with_the_robot_file_alone() {
     }
 }
 
+/// What a policy proposes is no action, and the file is refused for that.
+#[test]
+fn a_proposal_is_not_imported_as_an_action() {
+    let snapshot = training("HalfCheetah-v5", "pid2-ib", 0, 1, &SHORT).snapshot().clone();
+    let network = onnx("policy.onnx", &export::onnx(&snapshot).expect("exports"), None, None).expect("reads");
+    let robot = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/robots/gymnasium/half_cheetah.xml");
+    let setting = Setting { name: "back", robot: std::path::Path::new(robot), recipes: &[] };
+    let refused = nearl_trainer::import::snapshot(&network, &setting).unwrap_err().to_string();
+    assert!(
+        refused.contains("'change' is a change of state") && refused.contains("keep the snapshot"),
+        "{refused}"
+    );
+}
+
 #[test]
 fn damaged_files_are_refused_in_a_sentence() {
     let snapshot = training("HalfCheetah-v5", "ppo", 0, 1, &SHORT).snapshot().clone();

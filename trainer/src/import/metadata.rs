@@ -20,6 +20,11 @@ pub(super) fn recipe(network: &ImportedNetwork) -> Result<Table, ImportError> {
         }
         return toml::from_str(text).map_err(refuse);
     }
+    if network.output_name == "change" && network.metadata.contains_key("task") {
+        let reason = "the file's output 'change' is a change of state that 'nearl export' wrote of a policy that proposes, and what is imported gives \
+                      actions; keep the snapshot it was exported from, which every command takes";
+        return Err(ImportError::Recipe(reason.into()));
+    }
     if network.metadata.contains_key("observation_names") && network.metadata.contains_key("joint_names") {
         return mjlab(network);
     }
