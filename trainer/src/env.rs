@@ -349,6 +349,11 @@ pub fn of_task(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvErr
     if user::is_own(task) {
         return of_user(manifest, origin);
     }
+    if manifest.algo == "import" && !is_known(task) {
+        let reason = "an imported policy has no task of its own to be simulated in; import it with --recipe FILE.toml that has [reward], or run it with \
+                      'nearl run'";
+        return Err(EnvError::Task { origin: origin.into(), key: "reward".into(), reason: reason.into() });
+    }
     let own = [
         ("termination", !task.termination.is_empty()),
         ("reset", !task.reset.is_empty()),
