@@ -292,3 +292,50 @@ fn task_files() {
         build_limits(&read("velocity = { limit = -2 }").unwrap(), &panda()).unwrap_err().to_string();
     assert!(negative.contains("-2") && negative.contains("rad/s"), "{negative}");
 }
+
+/// What a file states and nobody would miss until the robot moves is said or refused, each by its joint.
+#[test]
+fn urdf_limits_are_never_dropped_without_a_word() {
+    let model = |joint: &str| Model::from_urdf_text(&urdf(joint, "1"));
+    let note = |joint: &str, words: &[&str]| {
+        let notes = model(joint).expect("a robot").notes().join("; ");
+        words.iter().for_each(|w| assert!(notes.contains(w), "'{w}' is not in: {notes}"));
+    };
+    assert!(model(GOOD).expect("a robot").notes().is_empty());
+    let soft = format!(
+        r#"{GOOD}<safety_controller soft_lower_limit="-0.5" soft_upper_limit="0.5" k_velocity="1"/>"#
+    );
+    note(
+        &soft,
+        &["joint 'elbow' has soft_lower_limit -0.5 and soft_upper_limit 0.5", "is not used", "margin"],
+    );
+    let zero = r#"<limit lower="-1" upper="1" effort="0" velocity="0"/>"#;
+    note(zero, &["joint 'elbow' states velocity 0 in <limit>", "joint 'elbow' states effort 0 in <limit>"]);
+    let upper = r#"<limit upper="1" effort="5" velocity="2"/>"#;
+    note(upper, &["joint 'elbow' states upper and no lower in <limit>, which URDF takes for 0"]);
+    let bounded = model(upper).expect("a robot");
+    assert_eq!((bounded.lower_position_limit(), bounded.upper_position_limit()), (&[0.0][..], &[1.0][..]));
+    refuse_model(
+        model(r#"<limit lower="1" effort="5" velocity="2"/>"#),
+        &["joint 'elbow' has lower 1 above upper 0"],
+    );
+    refuse_model(
+        model(&format!(r#"{GOOD}<mimic joint="zz"/>"#)),
+        &["joint 'elbow' mimics 'zz', which is not there"],
+    );
+    refuse_model(model(&format!(r#"{GOOD}<mimic joint="elbow"/>"#)), &["joint 'elbow' mimics itself"]);
+    let text = urdf(GOOD, "1");
+    for nameless in [text.replace(r#" name="elbow""#, ""), text.replace(r#""elbow""#, r#""""#)] {
+        let words = ["the <joint> between the links 'a' and 'b' has no name"];
+        refuse_model(Model::from_urdf_text(&nameless), &words);
+    }
+    for (moments, is_body) in [([1.0, 1.0, 2.0], true), ([0.1, 0.1, 10.0], false), ([1.0, 0.5, 1.49], true)] {
+        let [xx, yy, zz] = moments;
+        let text = text.replace(
+            r#"ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1""#,
+            &format!(r#"ixx="{xx}" ixy="0" ixz="0" iyy="{yy}" iyz="0" izz="{zz}""#),
+        );
+        let notes = Model::from_urdf_text(&text).expect("a robot").notes().join("; ");
+        assert_eq!(notes.contains("the inertia of 'b' is that of no body"), !is_body, "{moments:?}: {notes}");
+    }
+}
