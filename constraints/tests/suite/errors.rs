@@ -339,3 +339,63 @@ fn urdf_limits_are_never_dropped_without_a_word() {
         assert_eq!(notes.contains("the inertia of 'b' is that of no body"), !is_body, "{moments:?}: {notes}");
     }
 }
+
+/// Limits that hold for fewer joints than are controllable name the others; those that hold for none are refused.
+#[test]
+fn limits_for_some_joints_name_the_others() {
+    use nearl_constraints::description::Range;
+    let robot = |unlimited: &[usize]| {
+        let mut robot = panda().description().clone();
+        let mut joints: Vec<_> = robot.bodies.iter_mut().flat_map(|b| &mut b.joints).collect();
+        unlimited.iter().for_each(|i| joints[*i].range = Range::Unlimited);
+        Model::from_description(robot).expect("a robot")
+    };
+    let position: [Box<dyn Limit>; 2] =
+        [Box::new(PositionLimit::with_margin(0.0)), Box::new(AccelerationLimit::uniform(5.0))];
+    let settings = Settings::new(0.01, 0);
+    let notes = |model: &Model, limits: &[Box<dyn Limit>]| {
+        Projector::new(model, limits, &[0, 1, 2], settings.clone()).expect("a projector").notes().join("; ")
+    };
+    assert!(!notes(&robot(&[]), &position).contains("position limit"));
+    let some = notes(&robot(&[1]), &position);
+    assert!(some.contains("the position limit does not hold for 'panda_joint2'"), "{some}");
+    let words = ["position", "'panda_joint1', 'panda_joint2', 'panda_joint3'", "write a range into it"];
+    refuse_for(&robot(&[0, 1, 2]), &position, &[0, 1, 2], settings.clone(), &words);
+    let by_joint = |joints: &[&str]| -> [Box<dyn Limit>; 1] {
+        let map = joints.iter().map(|name| (name.to_string(), 3.0)).collect();
+        [Box::new(AccelerationLimit::new(AccelerationSettings::of(PerJoint::Joints(map), None)))]
+    };
+    let some = notes(&robot(&[]), &by_joint(&["panda_joint1", "panda_joint3"]));
+    assert!(some.contains("the acceleration limit does not name 'panda_joint2'"), "{some}");
+    let all = notes(&robot(&[]), &by_joint(&["panda_joint1", "panda_joint2", "panda_joint3"]));
+    assert!(!all.contains("does not name"), "{all}");
+    refuse(
+        &by_joint(&[]),
+        &[0, 1, 2],
+        settings.clone(),
+        &["acceleration limit is an empty table, which holds for no joint"],
+    );
+    let row = |coefficient: f64| -> [Box<dyn Limit>; 1] {
+        let terms = [("v.panda_joint1".to_string(), coefficient)].into();
+        let bounds = (Some(-1.0), Some(1.0));
+        [Box::new(UserRow::new(UserRowSettings {
+            name: "r".into(),
+            terms,
+            lower: bounds.0,
+            upper: bounds.1,
+            equals: None,
+            braking: None,
+            margin: 0.0,
+            soft: None,
+        }))]
+    };
+    assert!(Projector::new(&panda(), &row(1e12), &[0], settings.clone()).is_ok());
+    for huge in [1e308, -2e12, f64::NAN] {
+        refuse(
+            &row(huge),
+            &[0],
+            settings.clone(),
+            &["coefficient of 'v.panda_joint1' in row 'r'", "at most 1e12"],
+        );
+    }
+}
