@@ -2,6 +2,8 @@
 //!
 //! An unknown key, a wrong type or a value out of range is one sentence with file, line and key.
 
+pub mod names;
+
 use crate::command::CommandSection;
 use crate::recipe::PolicySection;
 use crate::snapshot::ModelFormat;
@@ -159,16 +161,16 @@ pub type OwnTime<'a> = &'a dyn Fn(&Task) -> Option<(f64, f64)>;
 #[serde(deny_unknown_fields)]
 pub struct StateSection {
     /// Every observation entry, in the environment's order; the environment's own names when absent.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "names::list")]
     pub observation: Vec<String>,
     /// Expressions that the value sees beside what the policy sees, in training alone.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub privileged: Vec<String>,
     /// Entries the policy proposes; all when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default, deserialize_with = "names::optional", skip_serializing_if = "Option::is_none")]
     pub propose: Option<Vec<String>>,
     /// Joints the projector may move; all proposed joints when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default, deserialize_with = "names::optional", skip_serializing_if = "Option::is_none")]
     pub controllable: Option<Vec<String>>,
 }
 
@@ -203,7 +205,7 @@ pub enum IdmInput {
     /// Every proposed entry.
     Full,
     /// Entries by name.
-    #[serde(untagged)]
+    #[serde(untagged, deserialize_with = "names::list")]
     Names(Vec<String>),
 }
 
