@@ -240,6 +240,9 @@ pub enum TaskError {
     },
 }
 
+/// Longest period of a policy in control ticks.
+const MOST_TICKS: usize = 100_000;
+
 impl Task {
     /// Reads `path` and applies `overrides` (`constraints.velocity.scale=0.8`).
     ///
@@ -402,6 +405,17 @@ impl Task {
         }
         if t.policy_every == 0 {
             return refuse("time.policy_every", "0 ticks; the policy needs at least every tick = 1".into());
+        }
+        if t.policy_every > MOST_TICKS {
+            return refuse(
+                "time.policy_every",
+                format!(
+                    "{} ticks of {} s are {:.0} s in which the policy sees nothing; give at most {MOST_TICKS} ticks",
+                    t.policy_every,
+                    t.dt,
+                    t.policy_every as f64 * t.dt
+                ),
+            );
         }
         if self.idm.kind == IdmKind::Learned && t.policy_every != 1 {
             return refuse(
