@@ -4,6 +4,7 @@
 
 mod check;
 mod collision;
+mod notes;
 
 use crate::ModelError;
 use crate::description::{Body, Frame, JointDescription, JointKind, Motor, Range, RobotDescription};
@@ -172,8 +173,8 @@ impl Reader {
         let limit = |key| number(children(node, "limit").next()?, key);
         joint.range = match (limit("lower"), limit("upper")) {
             _ if kind == JointKind::Continuous => Range::Unlimited,
-            (Some(lower), Some(upper)) => Range::Limited(lower, upper),
-            _ => Range::NotStated,
+            (None, None) => Range::NotStated,
+            (lower, upper) => Range::Limited(lower.unwrap_or(0.0), upper.unwrap_or(0.0)),
         };
         // A zero means that nobody filled it in.
         (joint.velocity, joint.effort) =
@@ -230,6 +231,8 @@ impl Reader {
     fn notes(&mut self, root: Node) {
         let robot = &mut self.robot;
         robot.notes.extend(children(root, "joint").filter_map(mimic));
+        robot.notes.extend(children(root, "joint").flat_map(notes::of_joint));
+        robot.notes.extend(notes::inertias(&robot.bodies));
         let mut weighs: Vec<bool> = robot.bodies.iter().map(|body| body.mass > 0.0).collect();
         for k in (0..robot.bodies.len()).rev().filter(|k| robot.bodies[*k].joints.is_empty()) {
             if let Some(parent) = robot.bodies[k].parent {

@@ -289,17 +289,33 @@ impl ReplayCommand {
             return Err(format!("{file}: {difference}; the {} ticks before are the same", found.ticks).into());
         }
         if !self.json {
-            let end = if found.complete { "" } else { "; the log was cut short by the end of its runtime" };
+            let end = match found.complete {
+                true => "",
+                false => {
+                    "; the log was cut short, by the end of its runtime or later: what came after is not in it"
+                }
+            };
+            let others = if found.gaps.is_empty() { "" } else { "; others could not be computed" };
             say(format!(
-                "{file}: {} ticks and {} swaps, bit for bit the same{end}",
+                "{file}: {} ticks and {} swaps, bit for bit the same{others}{end}",
                 found.ticks, found.swaps
             ));
             if found.brief > 0 {
                 say(format!("  {} of them by their digest: the disk was too slow for more", found.brief));
             }
             for Gap { from, to, lost } in &found.gaps {
-                say(format!("  ticks {from} to {to} could not be computed: {lost} of them were dropped"));
+                say(format!(
+                    "  ticks {from} to {to} could not be computed: {lost} of them are not in the log"
+                ));
             }
+        }
+        let missing: u64 = found.gaps.iter().map(|gap| gap.to - gap.from + 1).sum();
+        if missing > 0 {
+            return Err(Box::new(Unverified(format!(
+                "{file}: what was computed is the same, but {missing} ticks could not be: {} of them are not in the log, which a slow disk explains \
+                 (see dropped records in the report of the run) or somebody who took them out",
+                found.gaps.iter().map(|gap| gap.lost).sum::<u64>()
+            ))));
         }
         Ok(())
     }

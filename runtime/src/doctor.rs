@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use nearl_constraints::{Model, Projector, certify_braking};
+use nearl_constraints::{Drive, certify_braking};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
@@ -110,7 +110,7 @@ pub fn examine(file: &Path, plant: Option<&str>) -> Vec<Check> {
 /// As [`Parts::new`].
 pub fn advice(manifest: &Manifest) -> Result<Vec<String>, SnapshotError> {
     let parts = Parts::new(manifest)?;
-    let notes = notes(&parts.model, &parts.projector);
+    let notes = notes(manifest, &parts);
     let checks = [notes, holding(manifest, &parts), gains(manifest, &parts), braking(manifest, parts)];
     let odd = checks.into_iter().filter(|check| check.finding != Finding::Ok);
     Ok(odd.map(|check| format!("{} [{}]", check.text, check.code)).collect())
@@ -159,7 +159,7 @@ fn examine_snapshot(file: &Path) -> (Option<Snapshot>, Vec<Check>) {
     match Parts::new(&snapshot.manifest) {
         Ok(parts) => {
             checks.extend([
-                notes(&parts.model, &parts.projector),
+                notes(m, &parts),
                 projection(m),
                 holding(m, &parts),
                 gains(m, &parts),
@@ -200,12 +200,50 @@ fn reached(m: &Manifest, controller: &Controller) -> Option<Check> {
 }
 
 /// What the robot file has that projection and inverse dynamics do not reckon with, and limits that are hardly meant.
-fn notes(model: &Model, projector: &Projector) -> Check {
-    let notes = [model.notes(), projector.notes()].concat();
-    match &notes[..] {
+fn notes(m: &Manifest, parts: &Parts) -> Check {
+    match &doubts(m, parts)[..] {
         [] => ok(CheckCode::Model, "the model holds what the robot file describes".into()),
         notes => warn(CheckCode::Model, notes.join("; ")),
     }
+}
+
+/// What whoever writes a snapshot is told of its robot and limits, one sentence each.
+///
+/// # Errors
+/// As [`Parts::new`].
+pub fn told(m: &Manifest) -> Result<Vec<String>, SnapshotError> {
+    Ok(doubts(m, &Parts::new(m)?))
+}
+
+fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
+    let Parts { model, projector, .. } = parts;
+    let mut notes = [model.notes(), projector.notes()].concat();
+    if m.guards() {
+        // Nothing is made up for where actions are guarded.
+        notes.retain(|note| !note.starts_with("dry friction is made up for"));
+        notes.extend(guard_friction(m, parts));
+    }
+    notes
+}
+
+/// What dry friction takes from the promise of `guard = true`, whose dynamics know none; joints that follow positions or velocities by themselves
+/// make up for their own.
+fn guard_friction(m: &Manifest, parts: &Parts) -> Option<String> {
+    let Parts { model, layout, .. } = parts;
+    let drives = Parts::drives(m, model, layout.controllable()).ok()?;
+    let rubs = |&&i: &&usize| {
+        let by_force = matches!(drives[i], Drive::Effort | Drive::Pd { .. });
+        by_force && model.friction()[i] > 0.0
+    };
+    let joint = |&i: &usize| format!("'{}' ({} N m or N)", model.dof_name(i), model.friction()[i]);
+    let joints: Vec<String> = layout.controllable().iter().filter(rubs).map(joint).collect();
+    (!joints.is_empty()).then(|| {
+        format!(
+            "guard = true reckons without the dry friction of {}: limits on acceleration and position are not promised there; let the policy propose \
+             states, which is reckoned with it, or set the friction of the file to 0 where the drives make up for it",
+            joints.join(", ")
+        )
+    })
 }
 
 /// Does anything keep the limits at all?

@@ -26,7 +26,9 @@ pub fn snapshot(task: &str, actions: bool) -> Result<Snapshot, VectorError> {
     }
     complete(&mut manifest)?;
     manifest.algo = "blank".into();
-    Ok(if actions { space::idle(manifest) } else { space::still(manifest) })
+    let snapshot = if actions { space::idle(manifest) } else { space::still(manifest) };
+    snapshot.check()?;
+    Ok(snapshot)
 }
 
 /// Fills in what the environment of the task knows, or what follows from the robot where it is none.

@@ -20,6 +20,7 @@ use crate::env::{Env, EnvError};
 use crate::rollout::{RolloutError, Worker, make_env, stream};
 use nearl_runtime::Snapshot;
 use nearl_runtime::snapshot::write_whole;
+use nearl_runtime::task::names::bare;
 use npz::{Array, Values};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -185,7 +186,7 @@ impl Demonstrations {
     /// One sentence naming a column that is missing.
     pub fn columns(&self, names: &[String]) -> Result<Self, String> {
         let place = |name: &String| {
-            let found = self.names.iter().position(|n| n == name);
+            let found = self.names.iter().position(|n| bare(n) == bare(name));
             found.ok_or_else(|| format!("it has no column '{name}'; it has {}", self.names.join(" ")))
         };
         let places = names.iter().map(place).collect::<Result<Vec<_>, _>>()?;

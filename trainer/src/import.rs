@@ -55,6 +55,20 @@ pub enum ImportError {
         /// What is wrong with it.
         reason: String,
     },
+    /// A number that is none, or that no trained policy has.
+    #[error(
+        "{file}: tensor '{tensor}' has {value} at index {index}, where a trained policy has numbers up to 1e6; export an earlier checkpoint of the policy"
+    )]
+    Value {
+        /// Path as given.
+        file: String,
+        /// Its name in the file, or the layer.
+        tensor: String,
+        /// Where.
+        index: usize,
+        /// The value.
+        value: String,
+    },
     /// Nothing says what the inputs are.
     #[error(
         "the file does not say what the {n_in} entries of its input '{input}' are; give them with --recipe FILE, see docs/POLICIES.md"
@@ -91,6 +105,9 @@ impl ImportError {
         match self {
             Self::Node { name, op, reason } => {
                 Self::Node { name: plain(name), op: plain(op), reason: plain(reason) }
+            }
+            Self::Value { file, tensor, index, value } => {
+                Self::Value { file, tensor: plain(tensor), index, value }
             }
             Self::Graph(reason) => Self::Graph(plain(reason)),
             other => other,

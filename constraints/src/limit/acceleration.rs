@@ -1,7 +1,7 @@
 //! Acceleration limits, which are also what braking counts on.
 
 use super::margin::less_each;
-use super::{About, AlwaysHard, Argument, Form, Limit, LimitSet, PerJoint, Takes};
+use super::{About, AlwaysHard, Argument, Form, Limit, LimitSet, PerJoint, Takes, quoted};
 use crate::{LimitError, Model};
 use serde::{Deserialize, Serialize};
 
@@ -76,8 +76,21 @@ impl Limit for AccelerationLimit {
         "acceleration"
     }
 
+    fn notes(&self, model: &Model, controllable: &[usize]) -> Vec<String> {
+        let without = self.settings.limit.left_out(model, controllable);
+        if without.is_empty() {
+            return Vec::new();
+        }
+        vec![format!(
+            "the acceleration limit does not name {}, which may speed up and brake without limit; name every controllable joint, or give one number for \
+             all",
+            quoted(model, &without)
+        )]
+    }
+
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         let domain = "above 0 rad/s² or m/s²";
+        self.settings.limit.names_some("acceleration limit")?;
         let mut values = self.settings.limit.values(model, "acceleration limit", |x| x > 0.0, domain)?;
         less_each(model, "acceleration margin", &mut values, self.settings.margin.as_ref(), controllable)?;
         for &i in controllable {

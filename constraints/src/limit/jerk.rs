@@ -91,6 +91,7 @@ impl JerkLimit {
 
     /// Limits less margins of the dofs that have one.
     fn values(&self, model: &Model, controllable: &[usize]) -> Result<Vec<Option<f64>>, LimitError> {
+        self.settings.limit.names_some("jerk limit")?;
         let mut values =
             self.settings.limit.values(model, "jerk limit", |x| x > 0.0, "above 0 rad/s³ or m/s³")?;
         less_each(model, "jerk margin", &mut values, self.settings.margin.as_ref(), controllable)?;

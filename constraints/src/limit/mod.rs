@@ -91,6 +91,12 @@ pub trait Limit: Send + Sync + std::fmt::Debug {
         Ok(None)
     }
 
+    /// Where it holds for less than its name says, one sentence each: what a projector's notes tell.
+    fn notes(&self, model: &Model, controllable: &[usize]) -> Vec<String> {
+        let _ = (model, controllable);
+        Vec::new()
+    }
+
     /// How much its rows or its cone resist; `None` for hard ones. The part in the box is always hard.
     fn soft(&self) -> Option<Soft> {
         None

@@ -35,7 +35,8 @@ impl Default for PositionSettings {
 
 /// `lower + margin <= q <= upper - margin`.
 ///
-/// Continuous joints, joints the file declares unlimited, and joints with several dofs have no position limit.
+/// Continuous joints, joints the file declares unlimited, and joints with several dofs have no position limit; a note names those of an MJCF,
+/// where a forgotten range looks like an intended one.
 #[derive(Debug, Clone, Default)]
 pub struct PositionLimit {
     settings: PositionSettings,
@@ -58,6 +59,17 @@ impl Limit for PositionLimit {
         "position"
     }
 
+    fn notes(&self, model: &Model, controllable: &[usize]) -> Vec<String> {
+        let free: Vec<usize> = controllable.iter().copied().filter(|i| is_free(model, *i)).collect();
+        if free.is_empty() {
+            return Vec::new();
+        }
+        vec![format!(
+            "the position limit does not hold for {}, for which the robot file gives no range; write one into it, or bound q. of the joint with rows",
+            quoted(model, &free)
+        )]
+    }
+
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         let margin =
             self.settings.margin.values(model, "position margin", |x| x >= 0.0, "at least 0 rad or m")?;
@@ -66,6 +78,10 @@ impl Limit for PositionLimit {
         if !missing.is_empty() {
             let next = "write lower and upper into it, or declare the joint continuous";
             return Err(LimitError::Missing { limit: "position", joints: quoted(model, &missing), next });
+        }
+        if !controllable.is_empty() && controllable.iter().all(|i| is_free(model, *i)) {
+            let next = "write a range into it, or leave the position limit out";
+            return Err(LimitError::Missing { limit: "position", joints: quoted(model, controllable), next });
         }
         for &i in controllable {
             let joint = model.joint_of_dof(i);
@@ -77,4 +93,11 @@ impl Limit for PositionLimit {
         }
         Ok(())
     }
+}
+
+/// True for a hinge or slide without a range.
+fn is_free(model: &Model, dof: usize) -> bool {
+    let joint = model.joint_of_dof(dof);
+    let (lower, upper) = (model.lower_position_limit(), model.upper_position_limit());
+    joint.nq == 1 && joint.nv == 1 && lower[joint.idx_q].is_infinite() && upper[joint.idx_q].is_infinite()
 }

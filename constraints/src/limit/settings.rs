@@ -54,6 +54,26 @@ impl PerJoint {
         }
     }
 
+    /// Refuses a table without a joint, of a limit that holds for the joints it names alone.
+    ///
+    /// # Errors
+    /// [`LimitError::Unusable`] with the name of the limit.
+    pub(crate) fn names_some(&self, limit: &str) -> Result<(), LimitError> {
+        match self {
+            PerJoint::Joints(map) if map.is_empty() => Err(LimitError::Unusable {
+                what: format!("{limit} is an empty table, which holds for no joint"),
+                next: "give one number for all, name joints, or leave the limit out",
+            }),
+            _ => Ok(()),
+        }
+    }
+
+    /// The dofs among `controllable` of which a table by joint says nothing.
+    pub(crate) fn left_out(&self, model: &Model, controllable: &[usize]) -> Vec<usize> {
+        let PerJoint::Joints(map) = self else { return Vec::new() };
+        controllable.iter().copied().filter(|i| !map.contains_key(&model.joint_of_dof(*i).name)).collect()
+    }
+
     /// One value per dof (nv), `None` where nothing is said.
     ///
     /// # Errors

@@ -57,6 +57,7 @@ impl Limit for TorqueRateLimit {
     }
 
     fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
+        self.settings.limit.names_some("torque_rate limit")?;
         let domain = "above 0 N·m/s or N/s";
         let mut values = self.settings.limit.values(model, "torque_rate limit", |x| x > 0.0, domain)?;
         less_each(model, "torque_rate margin", &mut values, self.settings.margin.as_ref(), controllable)?;

@@ -71,6 +71,9 @@ pub struct UserRow {
     settings: UserRowSettings,
 }
 
+/// Coefficients beyond this are no unit's; their squares leave the range of the solver.
+const LARGEST: f64 = 1e12;
+
 impl UserRow {
     /// From the task file's settings.
     pub fn new(settings: UserRowSettings) -> UserRow {
@@ -97,9 +100,10 @@ impl UserRow {
         if joint.nq != 1 && quantity == Quantity::Position {
             return Err(unusable("a continuous joint, whose position is (cos, sin) and no angle"));
         }
-        if !coefficient.is_finite() || coefficient == 0.0 {
+        if !(coefficient.abs() <= LARGEST) || coefficient == 0.0 {
             let what = format!("coefficient of '{name}' in row '{}'", self.settings.name);
-            return Err(LimitError::BadValue { what, value: coefficient, domain: "a finite number but 0" });
+            let domain = "a number but 0, and at most 1e12 in size";
+            return Err(LimitError::BadValue { what, value: coefficient, domain });
         }
         Ok(Term { quantity, dof: joint.idx_v, idx_q: joint.idx_q, coefficient })
     }

@@ -43,6 +43,7 @@ impl Projector {
         let period = Period::new(settings.dt, settings.sub_steps);
         let checker = Checker::new(model, each, &dofs.controllable, period, settings.consistency)?;
         let mut notes = choice::doubts(model, &limits, &dofs, &settings);
+        notes.extend(each.iter().flat_map(|limit| limit.notes(model, &dofs.controllable)));
         let braking = choice::braking(model, &limits, &dofs, &settings, &checker, &mut notes);
         let settings = Settings { braking, ..settings };
         check_combination(model, &limits, &dofs, (settings.consistency, settings.braking))?;

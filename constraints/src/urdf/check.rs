@@ -11,9 +11,29 @@ const KINDS: [&str; 6] = ["revolute", "continuous", "prismatic", "fixed", "float
 
 /// Names once each, links that are there, one root, and no circles.
 pub(super) fn check_tree(robot: Node, wrong: &mut Vec<String>) {
-    let named = |tag| {
-        robot.children().filter(move |n| n.has_tag_name(tag)).map(|n| n.attribute("name").unwrap_or("?"))
-    };
+    let all = |tag| robot.children().filter(move |n: &Node| n.has_tag_name(tag));
+    let named = |tag| all(tag).map(|n| n.attribute("name").unwrap_or("?"));
+    let nameless = |node: &Node| node.attribute("name").is_none_or(|name| name.trim().is_empty());
+    wrong.extend(all("link").filter(nameless).map(|_| "a <link> has no name".to_string()));
+    wrong.extend(all("joint").filter(nameless).map(|joint| {
+        let end =
+            |tag: &str| joint.children().find(|n| n.has_tag_name(tag)).and_then(|n| n.attribute("link"));
+        let (parent, child) = (end("parent").unwrap_or("?"), end("child").unwrap_or("?"));
+        format!("the <joint> between the links '{parent}' and '{child}' has no name")
+    }));
+    let joints: BTreeSet<_> = named("joint").collect();
+    for joint in all("joint") {
+        let Some(mimic) = joint.children().find(|n| n.has_tag_name("mimic")) else { continue };
+        let name = joint.attribute("name").unwrap_or("?");
+        match mimic.attribute("joint") {
+            None => wrong.push(format!("joint '{name}' has a <mimic> without joint")),
+            Some(of) if !joints.contains(of) => {
+                wrong.push(format!("joint '{name}' mimics '{of}', which is not there"));
+            }
+            Some(of) if of == name => wrong.push(format!("joint '{name}' mimics itself")),
+            Some(_) => {}
+        }
+    }
     for tag in ["link", "joint"] {
         let mut seen = BTreeSet::new();
         let again: BTreeSet<_> = named(tag).filter(|name| !seen.insert(*name)).collect();
@@ -108,7 +128,11 @@ pub(super) fn check_joint(joint: Node, wrong: &mut Vec<String>) {
     };
     let (lower, upper) = (number("lower"), number("upper"));
     let _ = (number("effort"), number("velocity"));
-    if let (Some(lower), Some(upper)) = (lower, upper)
+    if kind == "continuous" {
+        return;
+    }
+    // One end alone: URDF takes the other for 0.
+    if let (Some(lower), Some(upper)) = (lower.or(upper.map(|_| 0.0)), upper.or(lower.map(|_| 0.0)))
         && lower > upper
     {
         wrong.push(format!("joint '{name}' has lower {lower} above upper {upper}"));

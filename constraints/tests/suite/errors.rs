@@ -292,3 +292,110 @@ fn task_files() {
         build_limits(&read("velocity = { limit = -2 }").unwrap(), &panda()).unwrap_err().to_string();
     assert!(negative.contains("-2") && negative.contains("rad/s"), "{negative}");
 }
+
+/// What a file states and nobody would miss until the robot moves is said or refused, each by its joint.
+#[test]
+fn urdf_limits_are_never_dropped_without_a_word() {
+    let model = |joint: &str| Model::from_urdf_text(&urdf(joint, "1"));
+    let note = |joint: &str, words: &[&str]| {
+        let notes = model(joint).expect("a robot").notes().join("; ");
+        words.iter().for_each(|w| assert!(notes.contains(w), "'{w}' is not in: {notes}"));
+    };
+    assert!(model(GOOD).expect("a robot").notes().is_empty());
+    let soft = format!(
+        r#"{GOOD}<safety_controller soft_lower_limit="-0.5" soft_upper_limit="0.5" k_velocity="1"/>"#
+    );
+    note(
+        &soft,
+        &["joint 'elbow' has soft_lower_limit -0.5 and soft_upper_limit 0.5", "is not used", "margin"],
+    );
+    let zero = r#"<limit lower="-1" upper="1" effort="0" velocity="0"/>"#;
+    note(zero, &["joint 'elbow' states velocity 0 in <limit>", "joint 'elbow' states effort 0 in <limit>"]);
+    let upper = r#"<limit upper="1" effort="5" velocity="2"/>"#;
+    note(upper, &["joint 'elbow' states upper and no lower in <limit>, which URDF takes for 0"]);
+    let bounded = model(upper).expect("a robot");
+    assert_eq!((bounded.lower_position_limit(), bounded.upper_position_limit()), (&[0.0][..], &[1.0][..]));
+    refuse_model(
+        model(r#"<limit lower="1" effort="5" velocity="2"/>"#),
+        &["joint 'elbow' has lower 1 above upper 0"],
+    );
+    refuse_model(
+        model(&format!(r#"{GOOD}<mimic joint="zz"/>"#)),
+        &["joint 'elbow' mimics 'zz', which is not there"],
+    );
+    refuse_model(model(&format!(r#"{GOOD}<mimic joint="elbow"/>"#)), &["joint 'elbow' mimics itself"]);
+    let text = urdf(GOOD, "1");
+    for nameless in [text.replace(r#" name="elbow""#, ""), text.replace(r#""elbow""#, r#""""#)] {
+        let words = ["the <joint> between the links 'a' and 'b' has no name"];
+        refuse_model(Model::from_urdf_text(&nameless), &words);
+    }
+    for (moments, is_body) in [([1.0, 1.0, 2.0], true), ([0.1, 0.1, 10.0], false), ([1.0, 0.5, 1.49], true)] {
+        let [xx, yy, zz] = moments;
+        let text = text.replace(
+            r#"ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1""#,
+            &format!(r#"ixx="{xx}" ixy="0" ixz="0" iyy="{yy}" iyz="0" izz="{zz}""#),
+        );
+        let notes = Model::from_urdf_text(&text).expect("a robot").notes().join("; ");
+        assert_eq!(notes.contains("the inertia of 'b' is that of no body"), !is_body, "{moments:?}: {notes}");
+    }
+}
+
+/// Limits that hold for fewer joints than are controllable name the others; those that hold for none are refused.
+#[test]
+fn limits_for_some_joints_name_the_others() {
+    use nearl_constraints::description::Range;
+    let robot = |unlimited: &[usize]| {
+        let mut robot = panda().description().clone();
+        let mut joints: Vec<_> = robot.bodies.iter_mut().flat_map(|b| &mut b.joints).collect();
+        unlimited.iter().for_each(|i| joints[*i].range = Range::Unlimited);
+        Model::from_description(robot).expect("a robot")
+    };
+    let position: [Box<dyn Limit>; 2] =
+        [Box::new(PositionLimit::with_margin(0.0)), Box::new(AccelerationLimit::uniform(5.0))];
+    let settings = Settings::new(0.01, 0);
+    let notes = |model: &Model, limits: &[Box<dyn Limit>]| {
+        Projector::new(model, limits, &[0, 1, 2], settings.clone()).expect("a projector").notes().join("; ")
+    };
+    assert!(!notes(&robot(&[]), &position).contains("position limit"));
+    let some = notes(&robot(&[1]), &position);
+    assert!(some.contains("the position limit does not hold for 'panda_joint2'"), "{some}");
+    let words = ["position", "'panda_joint1', 'panda_joint2', 'panda_joint3'", "write a range into it"];
+    refuse_for(&robot(&[0, 1, 2]), &position, &[0, 1, 2], settings.clone(), &words);
+    let by_joint = |joints: &[&str]| -> [Box<dyn Limit>; 1] {
+        let map = joints.iter().map(|name| (name.to_string(), 3.0)).collect();
+        [Box::new(AccelerationLimit::new(AccelerationSettings::of(PerJoint::Joints(map), None)))]
+    };
+    let some = notes(&robot(&[]), &by_joint(&["panda_joint1", "panda_joint3"]));
+    assert!(some.contains("the acceleration limit does not name 'panda_joint2'"), "{some}");
+    let all = notes(&robot(&[]), &by_joint(&["panda_joint1", "panda_joint2", "panda_joint3"]));
+    assert!(!all.contains("does not name"), "{all}");
+    refuse(
+        &by_joint(&[]),
+        &[0, 1, 2],
+        settings.clone(),
+        &["acceleration limit is an empty table, which holds for no joint"],
+    );
+    let row = |coefficient: f64| -> [Box<dyn Limit>; 1] {
+        let terms = [("v.panda_joint1".to_string(), coefficient)].into();
+        let bounds = (Some(-1.0), Some(1.0));
+        [Box::new(UserRow::new(UserRowSettings {
+            name: "r".into(),
+            terms,
+            lower: bounds.0,
+            upper: bounds.1,
+            equals: None,
+            braking: None,
+            margin: 0.0,
+            soft: None,
+        }))]
+    };
+    assert!(Projector::new(&panda(), &row(1e12), &[0], settings.clone()).is_ok());
+    for huge in [1e308, -2e12, f64::NAN] {
+        refuse(
+            &row(huge),
+            &[0],
+            settings.clone(),
+            &["coefficient of 'v.panda_joint1' in row 'r'", "at most 1e12"],
+        );
+    }
+}

@@ -64,6 +64,14 @@ impl CommandSection {
     /// One sentence: a joint that the model does not have or that is not controllable, a drive without stiffness, a value out of its domain.
     pub fn drives(&self, model: &Model, controllable: &[usize]) -> Result<Vec<Drive>, String> {
         self.check_names(model, controllable)?;
+        if self.interface == Interfaces::All(Interface::Effort)
+            && let Some(key) = self.first_gain()
+        {
+            return Err(format!(
+                "[command.{key}] is given, but every joint is sent a force (interface = \"effort\"), which has no gains; write interface = \"pd\", or \
+                 take {key} out"
+            ));
+        }
         let mut drives = vec![Drive::Effort; model.nv()];
         for &i in controllable {
             let joint = model.dof_name(i);
@@ -79,6 +87,12 @@ impl CommandSection {
             };
         }
         Ok(drives)
+    }
+
+    /// The key of a gain that is given.
+    fn first_gain(&self) -> Option<&'static str> {
+        let gains = [("stiffness", &self.stiffness), ("damping", &self.damping)];
+        gains.into_iter().find_map(|(key, value)| value.is_some().then_some(key))
     }
 
     fn pd(&self, joint: &str) -> Result<Drive, String> {

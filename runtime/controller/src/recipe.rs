@@ -20,6 +20,7 @@ mod map;
 mod observer;
 mod source;
 
+use crate::task::names;
 use serde::{Deserialize, Serialize};
 
 pub use map::ActionMap;
@@ -30,6 +31,7 @@ pub use observer::Observer;
 #[serde(deny_unknown_fields)]
 pub struct PolicySection {
     /// Joints of one degree of freedom in the policy's order: of its joint terms and of its outputs.
+    #[serde(deserialize_with = "names::list")]
     pub joints: Vec<String>,
     /// Their positions that `joint_pos` and the outputs are relative to [rad or m]; 0 when absent.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -102,10 +104,10 @@ pub struct Term {
     /// What it is.
     pub term: TermKind,
     /// Joints of `joint_pos` and `joint_vel`; those of the policy when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default, deserialize_with = "names::optional", skip_serializing_if = "Option::is_none")]
     pub joints: Option<Vec<String>>,
     /// Entries of the plant's observation that a `command` or `observed` term reads.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, deserialize_with = "names::list", skip_serializing_if = "Vec::is_empty")]
     pub entries: Vec<String>,
     /// What a `constant` is, or a `command` that no plant gives.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]

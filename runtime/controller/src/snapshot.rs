@@ -399,6 +399,14 @@ impl Snapshot {
         Ok(Self { manifest, networks })
     }
 
+    /// Refuses, before a file is written, what [`Snapshot::load`] and [`Controller::new`](crate::Controller::new) would refuse of it.
+    ///
+    /// # Errors
+    /// [`SnapshotError`] as a reader of the file would say it.
+    pub fn check(&self) -> Result<(), SnapshotError> {
+        crate::Controller::new(&Self::from_bytes(&self.to_bytes())?).map(drop)
+    }
+
     /// Digest of the content in hex; two snapshots with the same digest behave the same.
     pub fn digest(&self) -> String {
         let bytes = self.to_bytes();
@@ -505,7 +513,7 @@ impl Networks {
 }
 
 /// Weights beyond this are refused: no trained network of this kind has them.
-const HUGE: f64 = 1e6;
+pub const HUGE: f64 = 1e6;
 
 fn find<'a, 'b>(
     views: &'a [(String, TensorView<'b>)],

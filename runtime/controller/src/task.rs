@@ -2,6 +2,8 @@
 //!
 //! An unknown key, a wrong type or a value out of range is one sentence with file, line and key.
 
+pub mod names;
+
 use crate::command::CommandSection;
 use crate::recipe::PolicySection;
 use crate::snapshot::ModelFormat;
@@ -159,16 +161,16 @@ pub type OwnTime<'a> = &'a dyn Fn(&Task) -> Option<(f64, f64)>;
 #[serde(deny_unknown_fields)]
 pub struct StateSection {
     /// Every observation entry, in the environment's order; the environment's own names when absent.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "names::list")]
     pub observation: Vec<String>,
     /// Expressions that the value sees beside what the policy sees, in training alone.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub privileged: Vec<String>,
     /// Entries the policy proposes; all when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default, deserialize_with = "names::optional", skip_serializing_if = "Option::is_none")]
     pub propose: Option<Vec<String>>,
     /// Joints the projector may move; all proposed joints when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default, deserialize_with = "names::optional", skip_serializing_if = "Option::is_none")]
     pub controllable: Option<Vec<String>>,
 }
 
@@ -203,7 +205,7 @@ pub enum IdmInput {
     /// Every proposed entry.
     Full,
     /// Entries by name.
-    #[serde(untagged)]
+    #[serde(untagged, deserialize_with = "names::list")]
     Names(Vec<String>),
 }
 
@@ -237,6 +239,9 @@ pub enum TaskError {
         reason: String,
     },
 }
+
+/// Longest period of a policy in control ticks.
+const MOST_TICKS: usize = 100_000;
 
 impl Task {
     /// Reads `path` and applies `overrides` (`constraints.velocity.scale=0.8`).
@@ -400,6 +405,17 @@ impl Task {
         }
         if t.policy_every == 0 {
             return refuse("time.policy_every", "0 ticks; the policy needs at least every tick = 1".into());
+        }
+        if t.policy_every > MOST_TICKS {
+            return refuse(
+                "time.policy_every",
+                format!(
+                    "{} ticks of {} s are {:.0} s in which the policy sees nothing; give at most {MOST_TICKS} ticks",
+                    t.policy_every,
+                    t.dt,
+                    t.policy_every as f64 * t.dt
+                ),
+            );
         }
         if self.idm.kind == IdmKind::Learned && t.policy_every != 1 {
             return refuse(

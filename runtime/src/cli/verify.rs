@@ -26,7 +26,7 @@ pub struct VerifyCommand {
 /// A log that could not be verified, or not whole.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub struct Unverified(String);
+pub struct Unverified(pub(crate) String);
 
 impl VerifyCommand {
     /// Verifies and prints what was found.
@@ -60,8 +60,16 @@ fn conclude(file: &str, report: &Report) -> Result<(), Failure> {
             Err(Box::new(Unverified(format!("{file}: no tick of it has an action, so that there is nothing to verify"))))
         }
         _ => Err(Box::new(Unverified(format!(
-            "{file}: what was verified holds, but not all of it could be: {} ticks and what came after its end; the reasons are above",
-            report.unverified()
+            "{file}: what was verified holds, but not all of it could be: {}; the reasons are above",
+            missing(report)
         )))),
     }
+}
+
+/// What could not be verified.
+fn missing(report: &Report) -> String {
+    let ticks = (report.unverified() > 0).then(|| format!("{} ticks", report.unverified()));
+    let end = (!report.complete).then(|| "what came after the end of the log".to_string());
+    let file = (report.complete && !report.intact).then(|| "the end of the file".to_string());
+    [ticks, end, file].into_iter().flatten().collect::<Vec<_>>().join(" and ")
 }

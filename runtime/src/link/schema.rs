@@ -4,6 +4,7 @@
 //! connect and misread each other. So the hash of field names, types and offsets is part of the type name (the
 //! service then refuses to open) and is repeated in every header (a sample with another hash is refused and counted).
 
+use nearl_controller::task::names::bare;
 use std::fmt::Debug;
 
 const FNV_OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
@@ -34,11 +35,11 @@ pub const fn hash_field(hash: u64, name: &str, type_name: &str, offset: usize) -
     hash_number(hash_bytes(hash_bytes(hash, name.as_bytes()), type_name.as_bytes()), offset as u64)
 }
 
-/// The 64-bit hash that identifies a list of names (joints, observation entries), order included.
+/// The 64-bit hash that identifies a list of names (joints, observation entries), order included; with braces around a name it is the same name.
 pub fn hash_names<S: AsRef<str>>(names: impl IntoIterator<Item = S>) -> u64 {
     names
         .into_iter()
-        .fold(hash_start(), |hash, name| hash_bytes(hash_bytes(hash, name.as_ref().as_bytes()), b"\n"))
+        .fold(hash_start(), |hash, name| hash_bytes(hash_bytes(hash, bare(name.as_ref()).as_bytes()), b"\n"))
 }
 
 /// First field of every message.

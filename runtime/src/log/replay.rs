@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 use std::fs::File;
-use std::io::{self, BufReader, Read};
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use mcap::read::parse_record;
@@ -39,7 +39,7 @@ pub struct Replay {
     pub brief: u64,
     /// Ticks that the log lost, and those after them up to the next memory.
     pub gaps: Vec<Gap>,
-    /// The log was closed by the runtime, not cut by its death.
+    /// The log was closed by the runtime, not cut by its death or later.
     pub complete: bool,
     /// Where log and replay first differ.
     pub difference: Option<Difference>,
@@ -103,7 +103,26 @@ pub fn replay_with<B: Build>(file: &Path, build: B) -> Result<Replay, ReplayErro
     let fail =
         |reason: String| ReplayError { file: file.to_owned(), reason: reason.replace(['\n', '\r'], " ") };
     let (log, length) = open(file).map_err(|e| fail(e.to_string()))?;
-    Replayer::new(build).run(log, length).map_err(fail)
+    let mut found = Replayer::new(build).run(log, length).map_err(fail)?;
+    found.complete &= ends_whole(file).map_err(|e| fail(e.to_string()))?;
+    Ok(found)
+}
+
+/// Whether the file ends as MCAP ends: a part of its end may be missing that no tick is in.
+fn ends_whole(file: &Path) -> io::Result<bool> {
+    let mut log = nearl_constraints::open_regular(file, true)?;
+    let mut end = [0; mcap::MAGIC.len()];
+    let length = log.metadata()?.len();
+    log.seek(SeekFrom::Start(length.saturating_sub(end.len() as u64)))?;
+    Ok(log.read_exact(&mut end).is_ok() && end == *mcap::MAGIC)
+}
+
+/// What is said of a log that another program wrote anew.
+fn compressed(format: &str) -> String {
+    format!(
+        "its chunks are compressed with {}, which this program does not read: write it without compression, or with lz4",
+        one_line(&format)
+    )
 }
 
 /// The log to be read from its start, and its length.
@@ -210,6 +229,7 @@ impl<B: Build> Replayer<B> {
                 Ok(part) => self.take(part)?,
                 // A runtime that was killed leaves its last chunk unfinished.
                 Err(mcap::McapError::UnexpectedEof | mcap::McapError::UnexpectedEoc) => break,
+                Err(mcap::McapError::UnsupportedCompression(format)) => return Err(compressed(&format)),
                 Err(e) => return Err(one_line(&e)),
             }
             if self.found.difference.is_some() {

@@ -448,14 +448,17 @@ impl<T: LoopController> Core<T> {
         }
     }
 
-    /// The plant's clock stands still, or no joint has moved although the state says that one moves.
+    /// The plant's clock stands still or runs backwards within an episode, or no joint has moved although the state says that one moves.
     fn is_frozen(&self, new: &StateMessage) -> bool {
         let old = &self.record.state;
         if new.tick == old.tick {
             return false; // sent again because no answer came
         }
         let moves = new.v().iter().any(|v| v.abs() > self.settings.stop_speed);
-        (new.time > 0.0 && new.time == old.time) || (moves && new.q() == old.q() && new.v() == old.v())
+        let goes_back = new.time < old.time && new.episode == old.episode;
+        goes_back
+            || (new.time > 0.0 && new.time == old.time)
+            || (moves && new.q() == old.q() && new.v() == old.v())
     }
 }
 

@@ -90,6 +90,11 @@ pub enum FaultKind {
     },
     /// The plant measures its old state again.
     Freeze,
+    /// The plant's clock goes back.
+    Back {
+        /// By so much in every tick \[s\].
+        by: f64,
+    },
     /// A state is lost on the way.
     Drop,
     /// A state comes twice.
@@ -188,6 +193,7 @@ impl FaultPlan {
             match kind {
                 FaultKind::State { number } => state.v[joint] = number.value(),
                 FaultKind::Jump { by } => state.q[joint] += by,
+                FaultKind::Back { by } => state.time = last.time - by,
                 FaultKind::Freeze => {
                     (state.q, state.v, state.obs, state.time) = (last.q, last.v, last.obs, last.time);
                 }

@@ -37,7 +37,7 @@ codes! {
         None = "none", "Nothing is wrong.", "Nothing to do.";
         StaleState = "stale-state", "No state came within the age limit, or its time stamp is older than that.",
             "Check that the plant runs and is not starved of processor time; raise --age-limit if it pauses on purpose.";
-        FrozenState = "frozen-state", "The plant goes on sending, but its clock or its moving joints stand still.",
+        FrozenState = "frozen-state", "The plant goes on sending, but its clock stands still or runs backwards, or its moving joints stand still.",
             "Check the sensor or driver behind the plant: it repeats an old sample.";
         LostStates = "lost-states", "More states in a row were lost between plant and loop than may be bridged.",
             "Free processor time for plant and runtime, or lower the rate; `hold_states` is the number that is bridged.";

@@ -132,6 +132,12 @@ fn fault_24_stale_and_frozen_samples_brake() {
     assert_eq!(frozen.at(403), (Mode::Braking, Reason::FrozenState));
     assert_eq!((frozen.counters().frozen_states, frozen.at(600).0), (8, Mode::Active));
     frozen.assert_within_limits(ROUNDING);
+    // A clock that runs backwards is none either, however fresh the message is.
+    let back = Flight::of(&[(400, 8, FaultKind::Back { by: 1e-3 })], 600);
+    assert_eq!(back.at(400), (Mode::Degraded, Reason::FrozenState));
+    assert_eq!(back.at(403), (Mode::Braking, Reason::FrozenState));
+    assert_eq!((back.counters().frozen_states, back.at(600).0), (8, Mode::Active));
+    back.assert_within_limits(ROUNDING);
 }
 
 #[test]

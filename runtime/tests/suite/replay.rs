@@ -10,6 +10,7 @@ use crate::arm::*;
 use crate::toy::Name;
 use nearl_constraints::Moved;
 use nearl_runtime::PolicyKind;
+use nearl_runtime::cli::{ReplayCommand, UNVERIFIED, exit_code};
 use nearl_runtime::link::*;
 use nearl_runtime::log::{Gap, replay};
 use nearl_runtime::rt::*;
@@ -252,6 +253,11 @@ fn after_a_lost_tick_replay_goes_on_from_the_next_memory() {
         "a memory is written every 1000 ticks, at the end of a policy period: {to}"
     );
     assert_eq!(found.ticks, report.ticks - (to - from + 1));
+    let failure = ReplayCommand { file: copy.clone(), json: false }.run().expect_err("ticks are missing");
+    assert_eq!(exit_code(&failure), UNVERIFIED);
+    let text = failure.to_string();
+    assert!(text.contains("ticks could not be: 1 of them are not in the log"), "{text}");
+    ReplayCommand { file: log.clone(), json: true }.run().expect("a whole log");
     // What comes after is compared as what was before.
     let late = to + 30;
     edit(&copy, &log, late, &|m| {
@@ -272,6 +278,28 @@ fn a_log_cut_by_the_death_of_its_runtime_replays_as_far_as_it_goes() {
     let found = replay(&cut).unwrap();
     assert_eq!((found.difference, found.complete), (None, false));
     assert!(found.ticks > 100 && found.ticks < report.ticks, "{} of {}", found.ticks, report.ticks);
+    // Behind the last tick stands an index; a file that lost a part of it has every tick and is not whole.
+    for lost in [1, 50] {
+        std::fs::write(&cut, &bytes[..bytes.len() - lost]).unwrap();
+        let found = replay(&cut).unwrap();
+        assert_eq!(
+            (found.difference, found.complete, found.ticks),
+            (None, false, report.ticks),
+            "{lost} bytes"
+        );
+    }
+    std::fs::write(&cut, otherwise_compressed(bytes)).unwrap();
+    let text = replay(&cut).unwrap_err().to_string();
+    assert!(text.contains("compressed with zst,") && text.contains("write it without compression"), "{text}");
+}
+
+/// The log with its chunks said to be of another compression.
+fn otherwise_compressed(mut log: Vec<u8>) -> Vec<u8> {
+    let said = b"\x03\0\0\0lz4";
+    let places: Vec<usize> = (0..log.len() - said.len()).filter(|at| log[*at..].starts_with(said)).collect();
+    assert!(!places.is_empty(), "its chunks are compressed");
+    places.iter().for_each(|at| log[at + 4..at + 7].copy_from_slice(b"zst"));
+    log
 }
 
 #[test]

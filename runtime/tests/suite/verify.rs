@@ -9,8 +9,9 @@ use nearl_constraints::description::{JointDescription, JointKind, Payload};
 use nearl_constraints::limit::{HalfSpace, Pose};
 use nearl_constraints::{Kinematics, Moved, PerJoint};
 use nearl_runtime::Snapshot;
+use nearl_runtime::cli::{UNVERIFIED, VerifyCommand, exit_code};
 use nearl_runtime::log::replay;
-use nearl_verify::{Report, verify};
+use nearl_verify::{Report, Violation, verify};
 use serde_json::{Value, json};
 
 use crate::arm::Scratch;
@@ -796,4 +797,21 @@ fn what_a_log_does_not_have_is_not_verified_and_a_damaged_one_is_refused_by_name
     std::fs::write(&cut, &whole[..whole.len() / 2]).unwrap();
     let report = verify(&cut).unwrap();
     assert!(report.found == 0 && !report.complete && !report.is_whole() && report.verified > 100, "{report}");
+    for lost in [1, 50] {
+        std::fs::write(&cut, &whole[..whole.len() - lost]).unwrap();
+        let report = verify(&cut).unwrap();
+        assert!(report.found == 0 && report.complete && !report.intact && !report.is_whole(), "{report}");
+        assert!(
+            report.to_string().contains("the end of the file behind the last tick, which was cut off"),
+            "{report}"
+        );
+        let failure = VerifyCommand { file: cut.clone(), json: true }.run().expect_err("not whole");
+        assert_eq!(exit_code(&failure), UNVERIFIED);
+        assert!(failure.to_string().contains("not all of it could be: the end of the file;"), "{failure}");
+    }
+    let violation = |what: &str, value: f64, unit: &str| {
+        Violation { tick: 5, what: what.into(), value, limit: 2.0, unit: unit.into() }.to_string()
+    };
+    assert_eq!(violation("action[1]", f64::NAN, "a number"), "tick 5: action[1] is NaN, which is no number");
+    assert_eq!(violation("row 're'", 2.5, ""), "tick 5: row 're' is 2.5, and 2 is what holds there");
 }

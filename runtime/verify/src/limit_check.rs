@@ -321,7 +321,7 @@ pub(crate) fn rows(
             && !(excused && row.is_of_state() && is_beyond(row, machine, passage.q, passage.v))
         {
             let (value, limit, unit) = row.value(machine, p, passage);
-            return broken(format!("{} of '{}'", row.kind, row.name), value, limit, unit);
+            return broken(row.subject(), value, limit, unit);
         }
     }
     let Some(collision) = l.collision.as_ref().filter(|c| c.is_hard) else { return Ok(()) };

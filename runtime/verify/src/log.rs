@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use mcap::read::parse_record;
@@ -38,7 +38,18 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
         VerifyError { file: file.to_owned(), reason: plain }
     };
     let (log, length) = open(file).map_err(fail)?;
-    read(log, length).map_err(fail)
+    let mut report = read(log, length).map_err(fail)?;
+    report.intact = report.complete && ends_whole(file).map_err(|e| fail(e.to_string()))?;
+    Ok(report)
+}
+
+/// Whether the file ends as MCAP ends.
+fn ends_whole(file: &Path) -> std::io::Result<bool> {
+    let mut log = File::open(file)?;
+    let mut end = [0; mcap::MAGIC.len()];
+    let length = log.metadata()?.len();
+    log.seek(SeekFrom::Start(length.saturating_sub(end.len() as u64)))?;
+    Ok(log.read_exact(&mut end).is_ok() && end == *mcap::MAGIC)
 }
 
 /// The log to be read from its start, and its length. A pipe, a device or a folder is refused without being opened.
@@ -77,6 +88,11 @@ fn read(mut log: impl Read, length: usize) -> Result<Report, String> {
             Ok(part) => take(&mut session, &mut topics, part)?,
             // A runtime that was killed leaves its last chunk unfinished.
             Err(mcap::McapError::UnexpectedEof | mcap::McapError::UnexpectedEoc) => break,
+            Err(mcap::McapError::UnsupportedCompression(format)) => {
+                return Err(format!(
+                    "its chunks are compressed with {format}, which this program does not read: write it without compression, or with lz4"
+                ));
+            }
             Err(e) => return Err(e.to_string()),
         }
     }

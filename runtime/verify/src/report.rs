@@ -8,6 +8,9 @@ use serde::Serialize;
 /// Violations that are told one by one; all are counted.
 const TOLD: usize = 10;
 
+/// Unit of what has to be a number and is none.
+pub(crate) const A_NUMBER: &str = "a number";
+
 /// What does not hold.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Violation {
@@ -26,7 +29,13 @@ pub struct Violation {
 impl fmt::Display for Violation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Violation { tick, what, value, limit, unit } = self;
-        write!(f, "tick {tick}: {what} is {value} {unit}, and {limit} {unit} is what holds there")
+        match unit.as_str() {
+            A_NUMBER => write!(f, "tick {tick}: {what} is {value}, which is no number"),
+            "" => write!(f, "tick {tick}: {what} is {value}, and {limit} is what holds there"),
+            unit => {
+                write!(f, "tick {tick}: {what} is {value} {unit}, and {limit} {unit} is what holds there")
+            }
+        }
     }
 }
 
@@ -59,6 +68,8 @@ pub struct Report {
     pub unbalanced: f64,
     /// The log was closed by the runtime, not cut by its death.
     pub complete: bool,
+    /// The file ends as it was written: nothing of what stands behind the last tick is missing.
+    pub intact: bool,
 }
 
 impl Report {
@@ -76,7 +87,7 @@ impl Report {
 
     /// Everything that was claimed was verified, and something was.
     pub fn is_whole(&self) -> bool {
-        self.found == 0 && self.unverified() == 0 && self.complete && self.verified > 0
+        self.found == 0 && self.unverified() == 0 && self.complete && self.intact && self.verified > 0
     }
 }
 
@@ -100,7 +111,15 @@ impl fmt::Display for Report {
             writeln!(f, "  not verified: {count} ticks, {reason}")?;
         }
         if !self.complete {
-            writeln!(f, "  not verified: what came after the end of this log, which was cut short")?;
+            writeln!(
+                f,
+                "  not verified: what came after the end of this log, which was cut short by the end of its runtime or later"
+            )?;
+        } else if !self.intact {
+            writeln!(
+                f,
+                "  not verified: the end of the file behind the last tick, which was cut off or damaged after the runtime closed it"
+            )?;
         }
         for violation in &self.violations {
             writeln!(f, "  {violation}")?;

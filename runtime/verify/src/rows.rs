@@ -103,6 +103,14 @@ const RECOVERY: f64 = 2.0;
 const ROUNDING: f64 = 1e-10;
 
 impl Row {
+    /// Its name as the subject of a sentence.
+    pub(crate) fn subject(&self) -> String {
+        match self.kind {
+            "user" => format!("row '{}'", self.name),
+            kind => format!("{kind} of '{}'", self.name),
+        }
+    }
+
     pub(crate) fn new(kind: &'static str, name: &str, size: f64, soft: Option<Soft>, rule: Rule) -> Row {
         Row { kind, name: name.to_owned(), size, soft, rule, label: String::new(), allowed: 0.0 }
     }
@@ -150,7 +158,7 @@ impl Row {
             }
             Rule::User { lower, upper, .. } => {
                 let value = self.sum(passage);
-                (value, if value > *upper { *upper } else { *lower }, "in the unit of the row")
+                (value, if value > *upper { *upper } else { *lower }, "")
             }
             Rule::Speed { spot, point, most } => {
                 m.go(passage.q1, passage.v1);

@@ -266,7 +266,7 @@ impl Session {
             return broken("limits moved by an operator, of a tick on the way to such,", 0.0, 1.0, "or more");
         }
         let finite = |what: &str, x: &[f64]| match x.iter().position(|x| !x.is_finite()) {
-            Some(k) => broken(format!("{what}[{k}]"), x[k], 0.0, "a number"),
+            Some(k) => broken(format!("{what}[{k}]"), x[k], 0.0, crate::report::A_NUMBER),
             None => Ok(()),
         };
         finite("target_q", &tick.target_q)?;

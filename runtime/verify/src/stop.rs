@@ -241,7 +241,7 @@ fn rows(promise: &mut Promise, passage: &Passage<'_>, period: u32) -> Result<(),
         if row.breach(machine, p, passage).is_some_and(|by| is_above(by, row.allowed)) {
             let (value, limit, unit) = row.value(machine, p, passage);
             return broken(
-                format!("{} of '{}' in period {} of the way to stop", row.kind, row.name, period + 1),
+                format!("{} in period {} of the way to stop", row.subject(), period + 1),
                 value,
                 limit,
                 unit,

@@ -312,3 +312,41 @@ fn what_friction_may_do_is_said_by_joint_and_number() {
         "{refusal}"
     );
 }
+
+/// Doctor, import and blank say of a guarded policy what dry friction takes from its limits, and of one that proposes states that it is made up for.
+#[test]
+fn a_guard_says_which_joints_rub() {
+    let folder = tempfile::tempdir().expect("folder");
+    let urdf = r#"<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0.1"/><mass value="1"/>
+        <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/></inertial></link><joint name="elbow" type="revolute"><parent link="base"/>
+        <child link="arm"/><axis xyz="0 1 0"/><dynamics friction="0.4"/><limit lower="-1" upper="1" effort="20" velocity="3"/></joint></robot>"#;
+    let told = |interface: &str, friction: &str, actions: bool| {
+        std::fs::write(folder.path().join("arm.urdf"), urdf.replace("0.4", friction)).expect("robot");
+        let text = format!(
+            "name = \"arm\"\n[model]\nurdf = \"arm.urdf\"\n[time]\ndt = 0.002\nsim_dt = 0.0\n[state]\nobservation = [\"q.elbow\", \"v.elbow\"]\n\
+             [command]\n{interface}\n[constraints]\nposition = {{}}\nvelocity = {{}}\nacceleration = {{ limit = 8.0 }}\ntorque = {{}}\n[idm]\n\
+             kind = \"pinocchio\"\n"
+        );
+        let file = folder.path().join("arm.toml");
+        std::fs::write(&file, text).expect("task");
+        let snapshot =
+            nearl_trainer::blank::snapshot(&file.display().to_string(), actions).expect("a snapshot");
+        nearl_runtime::doctor::told(&snapshot.manifest).expect("a task").join("; ")
+    };
+    let (guard, made_up) =
+        ("guard = true reckons without the dry friction of 'elbow' (0.4 N m or N)", "made up for as MuJoCo");
+    for interface in ["interface = \"effort\"", "interface = \"pd\"\nstiffness = 100.0\ndamping = 10.0"] {
+        let guarded = told(interface, "0.4", true);
+        assert!(guarded.contains(guard) && !guarded.contains(made_up), "{interface}: {guarded}");
+        let proposing = told(interface, "0.4", false);
+        assert!(
+            !proposing.contains("reckons without") && proposing.contains(made_up),
+            "{interface}: {proposing}"
+        );
+        assert!(!told(interface, "0", true).contains("friction"), "{interface}");
+    }
+    assert!(
+        !told("interface = \"position\"", "0.4", true).contains("friction"),
+        "the drive makes up for its own"
+    );
+}

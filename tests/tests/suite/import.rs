@@ -3,7 +3,7 @@
 use nearl_runtime::Controller;
 use nearl_tests::training;
 use nearl_trainer::export;
-use nearl_trainer::import::{Setting, for_task, onnx};
+use nearl_trainer::import::{ImportError, Setting, for_task, onnx};
 use rand::RngExt;
 
 const SHORT: [&str; 3] = ["train.n_envs=4", "train.n_steps=32", "train.ppo.batch_size=64"];
@@ -130,4 +130,31 @@ fn a_recipe_has_the_limit_of_a_task_file() {
     );
     let error = error.unwrap_err().to_string();
     assert!(error.contains("beyond.toml") && error.contains("more than the limit of 1048576"), "{error}");
+}
+
+/// Weights that the reader of a snapshot refuses are refused where they come from, by tensor, index and value.
+#[test]
+fn weights_that_are_none_are_named_in_the_file_they_come_from() {
+    let good = training("HalfCheetah-v5", "ppo", 0, 1, &SHORT).snapshot().clone();
+    for (value, said) in
+        [(3e38_f32, "3e38"), (f32::NAN, "NaN"), (f32::NEG_INFINITY, "-inf"), (2e6, "2000000")]
+    {
+        let mut snapshot = good.clone();
+        snapshot.networks.policy.layers[0].bias[3] = value;
+        let bytes = export::onnx(&snapshot).expect("exports");
+        let error = onnx("policy.onnx", &bytes, None, None).expect_err("no weights");
+        assert!(matches!(&error, ImportError::Value { index: 3, .. }), "{error}");
+        let error = error.to_string();
+        for words in
+            ["policy.onnx: tensor '", &format!("has {said}"), "at index 3", "export an earlier checkpoint"]
+        {
+            assert!(error.contains(words), "{error}");
+        }
+    }
+    // A mistake beside the weights: what no reader takes, no writer writes.
+    let mut network =
+        onnx("policy.onnx", &export::onnx(&good).expect("exports"), None, None).expect("imports");
+    network.std[2] = 1e7;
+    let error = for_task(&network, good.manifest.clone()).expect_err("no deviation").to_string();
+    assert!(error.contains("'normaliser.std' has 10000000 at index 2"), "{error}");
 }

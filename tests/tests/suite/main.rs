@@ -18,6 +18,7 @@ mod import;
 mod leg;
 mod limits_in_simulator;
 mod meters;
+mod names;
 mod networks;
 mod own_draws;
 mod own_robots;

@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 use nearl_runtime::Snapshot;
 use nearl_runtime::constraints::convention as c;
 use nearl_runtime::constraints::description::{Command, RobotDescription};
-use nearl_runtime::constraints::{Dynamics, Model};
+use nearl_runtime::constraints::{
+    AccelerationLimit, Dynamics, Limit, Model, PositionLimit, Projector, Settings,
+};
 use nearl_runtime::snapshot::{ModelFormat, Simulation};
 use nearl_trainer::mj::{JointKind, Sim};
 use nearl_trainer::robot;
@@ -393,4 +395,38 @@ fn resigned(file: &[u8], from: &str, to: &str) -> Vec<u8> {
     header["__metadata__"]["nearl"] = format!("{sum}\n{manifest}").into();
     let header = serde_json::to_vec(&header).expect("a header");
     [&(header.len() as u64).to_le_bytes()[..], &header, &file[8 + length..]].concat()
+}
+
+/// MuJoCo takes a joint whose ends are swapped for one without limits; nobody who wrote them means that.
+#[test]
+fn a_range_with_swapped_ends_is_refused_and_a_joint_without_one_is_named() {
+    let arm = |range: [&str; 2]| {
+        let joint = |name: &str, range: &str| {
+            format!(
+                r#"<joint name="{name}" type="hinge" axis="0 1 0" {range}/><geom size="0.1" mass="1" pos=".2 0 0"/>"#
+            )
+        };
+        let [first, second] = [joint("a", range[0]), joint("elbow", range[1])];
+        robot::read_mjcf_text(&format!(
+            r#"<mujoco><worldbody><body>{first}<body pos=".4 0 0">{second}</body></body></worldbody></mujoco>"#
+        ))
+        .expect("described")
+    };
+    let good = r#"range="-90 90""#;
+    let swapped =
+        Model::from_description(arm([good, r#"range="120 -20""#])).err().expect("refused").to_string();
+    assert!(swapped.contains("joint 'elbow' has lower ") && swapped.contains(" above upper "), "{swapped}");
+    for without in ["", r#"limited="false" range="-90 90""#] {
+        let limits = |robot: RobotDescription| {
+            let model = Model::from_description(robot).expect("a robot");
+            let position: [Box<dyn Limit>; 2] =
+                [Box::new(PositionLimit::with_margin(0.0)), Box::new(AccelerationLimit::uniform(5.0))];
+            let settings = Settings::new(0.01, 0);
+            Projector::new(&model, &position, &[0, 1], settings).map(|p| p.notes().join("; "))
+        };
+        let notes = limits(arm([good, without])).expect("a projector");
+        assert!(notes.contains("the position limit does not hold for 'elbow'"), "{without}: {notes}");
+        let refused = limits(arm([without, without])).expect_err("nothing to hold").to_string();
+        assert!(refused.contains("the robot file gives none for 'a', 'elbow'"), "{without}: {refused}");
+    }
 }

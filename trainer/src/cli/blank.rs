@@ -20,11 +20,13 @@ impl Blank {
     pub(super) fn run(self) -> Result<(), Failure> {
         let snapshot = crate::blank::snapshot(&self.task, self.actions)?;
         snapshot.save(&self.out)?;
+        let notes = nearl_runtime::doctor::told(&snapshot.manifest)?;
         let what = if self.actions { "actions" } else { "states" };
         say(format!(
             "{}: no policy; start the loop with `nearl run {0} --plant NAME --proposer`, and propose {what}",
             self.out.display()
         ));
+        notes.iter().for_each(|note| say(format!("  note: {note}")));
         Ok(())
     }
 }

@@ -33,6 +33,7 @@ impl Import {
         let setting = Setting { name: &name, robot: &self.robot, recipes: &self.recipe };
         let made = snapshot(&network, &setting)?;
         made.save(&self.out)?;
+        let notes = nearl_runtime::doctor::told(&made.manifest)?;
         say(format!(
             "{}: {} inputs, layers {:?}, {} joints; look at it with 'nearl doctor {}', run it with 'nearl run {} --plant NAME'",
             self.out.display(),
@@ -42,6 +43,7 @@ impl Import {
             self.out.display(),
             self.out.display()
         ));
+        notes.iter().for_each(|note| say(format!("  note: {note}")));
         Ok(())
     }
 }

@@ -139,8 +139,8 @@ fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spe
     let names = Names::new(model, own, Place::Outcome);
     let seen = Names::new(model, own, Place::Observation);
     let listed = observed(task, model, &commands);
-    let observe =
-        |name: &String| seen.compile(name).or_else(|e| seen.compile(&format!("{{{name}}}")).map_err(|_| e));
+    // As a name first: a joint may be called `left-hip`, which is no difference.
+    let observe = |text: &String| seen.compile(&format!("{{{text}}}")).or_else(|_| seen.compile(text));
     let observation: Result<Vec<_>, _> = listed.iter().map(observe).collect();
     let observation = observation.map_err(|e| mistake("state.observation", e))?;
     let (reward, termination) =

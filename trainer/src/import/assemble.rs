@@ -11,7 +11,7 @@ use nearl_runtime::net::Activation;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::recipe::{Numbers, Observer, PolicySection};
 use nearl_runtime::snapshot::{FORMAT, ModelFormat, Simulation};
-use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, Task};
+use nearl_runtime::{Manifest, Networks, PolicyKind, Snapshot, Task};
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
@@ -86,7 +86,7 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
         moved: None,
     };
     let snapshot = Snapshot { networks: networks(network, layout.n_state()), manifest };
-    Controller::new(&snapshot).map_err(|e| ImportError::Recipe(format!("{said_by}: {e}")))?;
+    snapshot.check().map_err(|e| recipe(&said_by, &e.to_string()))?;
     Ok(snapshot)
 }
 
@@ -113,7 +113,7 @@ pub fn for_task(network: &ImportedNetwork, mut manifest: Manifest) -> Result<Sna
     manifest.algo = "import".into();
     let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
     let snapshot = Snapshot { networks: networks(network, n_state), manifest };
-    Controller::new(&snapshot).map_err(|e| recipe(&task, &e.to_string()))?;
+    snapshot.check().map_err(|e| recipe(&task, &e.to_string()))?;
     Ok(snapshot)
 }
 

@@ -4,9 +4,10 @@ use super::ImportError;
 use super::graph::Graph;
 use super::network::ImportedNetwork;
 use super::sound::is_sound;
+use super::tensor::Tensor;
 use nearl_runtime::file_kind::FileKind;
-use nearl_runtime::snapshot::MAX_BYTES;
-use rten_onnx::onnx::ModelProto;
+use nearl_runtime::snapshot::{HUGE, MAX_BYTES};
+use rten_onnx::onnx::{GraphProto, ModelProto};
 use std::path::Path;
 
 /// Reads the policy in an ONNX file; `output` names the output that is the action where there are several.
@@ -47,10 +48,47 @@ pub fn onnx(
     let model = ModelProto::parse_buf(bytes).map_err(|_| other(file, None))?;
     let graph = model.graph.as_ref().filter(|g| !g.node.is_empty()).ok_or_else(|| other(file, None))?;
     let mut network = Graph::new(graph, beside).policy(output).map_err(ImportError::in_one_line)?;
+    check_values(file, graph, beside, &network)?;
     let pairs = model.metadata_props.iter();
     network.metadata =
         pairs.filter_map(|p| Some((p.key.clone()?, p.value.clone().unwrap_or_default()))).collect();
     Ok(network)
+}
+
+/// Refuses numbers that no reader of the snapshot would take, by the tensor of the file that holds the first, else by the layer they end up in.
+fn check_values(
+    file: &str,
+    graph: &GraphProto,
+    beside: Option<&Path>,
+    network: &ImportedNetwork,
+) -> Result<(), ImportError> {
+    let is_wrong = |x: f64| !x.is_finite() || x.abs() > HUGE;
+    let first = |values: &mut dyn Iterator<Item = f64>| values.enumerate().find(|(_, x)| is_wrong(*x));
+    let mut parts: Vec<(String, (usize, f64))> = Vec::new();
+    for (i, layer) in network.dense.layers.iter().enumerate() {
+        for (what, values) in [("weight", &layer.weight), ("bias", &layer.bias)] {
+            let found = first(&mut values.iter().map(|x| f64::from(*x)));
+            parts.extend(found.map(|found| (format!("{what} of layer {i}"), found)));
+        }
+    }
+    for (what, values) in [("mean of the inputs", &network.mean), ("scale of the inputs", &network.std)] {
+        parts.extend(first(&mut values.iter().copied()).map(|found| (what.to_string(), found)));
+    }
+    let Some(part) = parts.into_iter().next() else { return Ok(()) };
+    let of_file = graph.initializer.iter().find_map(|proto| {
+        let tensor = Tensor::read(proto, beside).ok()?;
+        let found = first(&mut tensor.values.iter().copied())?;
+        Some((proto.name.clone().unwrap_or_default(), found))
+    });
+    let (tensor, (index, value)) = of_file.unwrap_or(part);
+    let single = value as f32;
+    let value = match f64::from(single) == value {
+        true if single.abs() > 1e9 && single.is_finite() => format!("{single:e}"),
+        true => single.to_string(),
+        false => format!("{value:e}"),
+    };
+    let error = ImportError::Value { file: file.into(), tensor, index, value };
+    Err(error.in_one_line())
 }
 
 fn other(file: &str, kind: Option<FileKind>) -> ImportError {

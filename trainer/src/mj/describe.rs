@@ -74,6 +74,9 @@ impl Model {
         let friction =
             if self.disables(mjtDisableBit::mjDSBL_FRICTIONLOSS) { 0.0 } else { m.dof_frictionloss()[v] };
         let stops = m.jnt_limited()[id] && one && !self.disables(mjtDisableBit::mjDSBL_LIMIT);
+        // MuJoCo takes a joint whose ends are swapped for one without limits.
+        let [lower, upper] = m.jnt_range()[id];
+        let swapped = one && lower > upper;
         let [low, high] = m.jnt_actfrcrange()[id];
         JointDescription {
             kind: match joint.kind {
@@ -85,7 +88,11 @@ impl Model {
             axis: if one { m.jnt_axis()[id] } else { [0.0, 0.0, 1.0] },
             anchor: if joint.kind == JointKind::Free { [0.0; 3] } else { m.jnt_pos()[id] },
             reference: if one { m.qpos0()[q] } else { 0.0 },
-            range: if stops { Range::Limited(joint.range[0], joint.range[1]) } else { Range::Unlimited },
+            range: match (swapped, stops) {
+                (true, _) => Range::Limited(lower, upper),
+                (false, true) => Range::Limited(joint.range[0], joint.range[1]),
+                (false, false) => Range::Unlimited,
+            },
             velocity: None,
             effort: m.jnt_actfrclimited()[id].then(|| (-low).min(high).max(0.0)),
             damping: damper,
