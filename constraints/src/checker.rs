@@ -279,6 +279,12 @@ impl Checker {
         rows.chain(self.cones.iter().filter(|c| c.hard).map(|c| c.cone.kind())).collect()
     }
 
+    /// Of which of the hard rows, then of the hard cones, a state may be beyond what they keep.
+    pub(crate) fn hard_of_state(&self) -> Vec<bool> {
+        let rows = self.rows.iter().filter(|r| r.hard).flat_map(|r| vec![r.rows.of_state(); r.count]);
+        rows.chain(self.cones.iter().filter(|c| c.hard).map(|_| true)).collect()
+    }
+
     /// Motor forces of the last motion checked, by inverse dynamics (nv); zero when no limit needs them.
     pub fn torque(&self) -> &[f64] {
         &self.reckoned.tau

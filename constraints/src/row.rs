@@ -141,6 +141,12 @@ pub trait Rows: Send {
         false
     }
 
+    /// True when what the rows keep is of the state that a motion ends in, so that a measured state may be beyond it already and come back.
+    /// False when it is of the motion: no state is beyond it then.
+    fn of_state(&self) -> bool {
+        matches!(self.kind(), Kind::Frame | Kind::Collision | Kind::User)
+    }
+
     /// Moves what the rows keep this far \[m\] further inside than it was built, for the ticks to come; false, and nothing is done, where that
     /// means nothing. Must not allocate.
     fn inset(&mut self, by: f64) -> bool {

@@ -248,6 +248,11 @@ impl Rows for Row {
         self.braking.is_some()
     }
 
+    /// With an acceleration in it the sum is of a motion: at rest or in flight, another acceleration gives the same state another sum.
+    fn of_state(&self) -> bool {
+        self.terms.iter().all(|t| t.quantity != Quantity::Acceleration)
+    }
+
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (t, kappa) = (tick.period.dt, tick.period.kappa);
         if let Some(braking) = self.braking {

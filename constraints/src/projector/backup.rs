@@ -19,7 +19,7 @@ mod stopping;
 use super::Dofs;
 use crate::checker::Checker;
 use crate::jerk::{Brake, Stop};
-use crate::viability::{Dof, Kind, Period};
+use crate::viability::{Dof, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model};
 pub(crate) use refusal::{Passage, Refusal};
 use stopping::{least_deceleration, soonest};
@@ -128,9 +128,6 @@ impl Backup {
         let state = || State { q: model.neutral(), v: zero(), a: zero() };
         let period = Period::new(settings.dt, settings.sub_steps);
         let checker = Checker::new(model, limits, controllable, period, settings.consistency)?;
-        let of_state = |kind: &Kind| {
-            matches!(kind, Kind::Frame | Kind::FrameSpeed | Kind::Energy | Kind::Collision | Kind::User)
-        };
         Ok(Backup {
             stored: false,
             within: false,
@@ -140,7 +137,7 @@ impl Backup {
             allowed: vec![0.0; checker.hard()],
             on_the_way: vec![0.0; checker.hard()],
             here: vec![0.0; checker.hard()],
-            of_state: checker.hard_kinds().iter().map(of_state).collect(),
+            of_state: checker.hard_of_state(),
             trial: zero(),
             stops: vec![None; model.nv()],
             full: vec![(0.0, 0.0); model.nv()],

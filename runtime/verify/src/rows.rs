@@ -122,7 +122,11 @@ impl Row {
 
     /// Whether a state, not a motion, is beyond it: a measured state may be so already.
     pub(crate) fn is_of_state(&self) -> bool {
-        matches!(self.rule, Rule::Plane { .. } | Rule::User { .. } | Rule::Speed { .. } | Rule::Energy { .. })
+        match &self.rule {
+            Rule::Plane { .. } | Rule::Speed { .. } | Rule::Energy { .. } => true,
+            Rule::User { terms, .. } => terms.iter().all(|t| t.acceleration == 0.0),
+            _ => false,
+        }
     }
 
     /// Value, limit and unit of what the state after a passage keeps, for messages.
