@@ -203,7 +203,8 @@ impl Checker {
             verdict.see(Kind::Acceleration, i, a.abs(), self.limits.acceleration[i]);
             if self.limits.jerk[i].is_finite() {
                 let unknown = if v[i] == 0.0 { 0.0 } else { a };
-                let before = previous.map_or(unknown, |previous| previous.acceleration[i]);
+                let most = self.limits.acceleration[i]; // what is beyond it counts as it
+                let before = previous.map_or(unknown, |previous| previous.acceleration[i].clamp(-most, most));
                 verdict.see(Kind::Jerk, i, (a - before).abs() / self.period.dt, self.limits.jerk[i]);
             }
             if self.limits.has_position(i) {
