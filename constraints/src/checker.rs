@@ -72,6 +72,8 @@ pub struct Checker {
     rows: Vec<RowsOf>,
     cones: Vec<ConeOf>,
     excess: Vec<f64>,
+    /// The same of what rows ask for, where no brake keeps them.
+    asked: Vec<f64>,
     /// Largest speed [rad/s or m/s] and how fast a dof may speed up [rad/s² or m/s²] (nv), where limits were moved.
     speed: Vec<f64>,
     faster: Vec<f64>,
@@ -152,6 +154,8 @@ impl Checker {
             a: zero(),
             tau: zero(),
         };
+        let limits = LimitSet::collect(model, limits, controllable)?;
+        rows.iter_mut().try_for_each(|r| r.rows.fit(&limits))?;
         let hard_rows = rows.iter().filter(|r| r.hard).map(|r| r.count).sum::<usize>();
         Ok(Checker {
             speed: vec![f64::INFINITY; model.nv()],
@@ -159,10 +163,11 @@ impl Checker {
             moved: false,
             allowed: vec![0.0; hard_rows + cones.iter().filter(|c| c.hard).count()],
             excess: vec![0.0; rows.iter().map(|r| r.count).max().unwrap_or(0)],
+            asked: vec![0.0; rows.iter().map(|r| r.count).max().unwrap_or(0)],
             rows,
             cones,
             reckoned,
-            limits: LimitSet::collect(model, limits, controllable)?,
+            limits,
             dofs: controllable.iter().map(|i| (*i, model.joint_of_dof(*i).idx_q)).collect(),
             period,
             consistency,
@@ -203,7 +208,8 @@ impl Checker {
             verdict.see(Kind::Acceleration, i, a.abs(), self.limits.acceleration[i]);
             if self.limits.jerk[i].is_finite() {
                 let unknown = if v[i] == 0.0 { 0.0 } else { a };
-                let before = previous.map_or(unknown, |previous| previous.acceleration[i]);
+                let most = self.limits.acceleration[i]; // what is beyond it counts as it
+                let before = previous.map_or(unknown, |previous| previous.acceleration[i].clamp(-most, most));
                 verdict.see(Kind::Jerk, i, (a - before).abs() / self.period.dt, self.limits.jerk[i]);
             }
             if self.limits.has_position(i) {
@@ -277,6 +283,18 @@ impl Checker {
     pub(crate) fn hard_kinds(&self) -> Vec<Kind> {
         let rows = self.rows.iter().filter(|r| r.hard).flat_map(|r| vec![r.rows.kind(); r.count]);
         rows.chain(self.cones.iter().filter(|c| c.hard).map(|c| c.cone.kind())).collect()
+    }
+
+    /// Names and dofs of the hard limits whose joints a brake slows down in proportion.
+    pub(crate) fn in_proportion(&self) -> impl Iterator<Item = (Vec<String>, Vec<usize>)> {
+        let hard = self.rows.iter().filter(|r| r.hard);
+        hard.map(|r| (r.rows.names(), r.rows.in_proportion())).filter(|(_, dofs)| !dofs.is_empty())
+    }
+
+    /// Of which of the hard rows, then of the hard cones, a state may be beyond what they keep.
+    pub(crate) fn hard_of_state(&self) -> Vec<bool> {
+        let rows = self.rows.iter().filter(|r| r.hard).flat_map(|r| vec![r.rows.of_state(); r.count]);
+        rows.chain(self.cones.iter().filter(|c| c.hard).map(|_| true)).collect()
     }
 
     /// Motor forces of the last motion checked, by inverse dynamics (nv); zero when no limit needs them.
@@ -389,6 +407,13 @@ impl Checker {
                 _ if !block.enabled => excess.fill(f64::NEG_INFINITY),
                 true => block.rows.breach(&mut motion, excess),
                 false => block.rows.excess(&mut motion, excess),
+            }
+            if kept && block.enabled && excess.contains(&f64::NEG_INFINITY) {
+                // No brake keeps them, and they are broken all the same.
+                let asked = &mut self.asked[..block.count];
+                block.rows.excess(&mut motion, asked);
+                let unkept = excess.iter_mut().zip(asked).filter(|(x, _)| **x == f64::NEG_INFINITY);
+                unkept.for_each(|(x, asked)| *x = *asked);
             }
             for (r, (excess, allowed)) in excess.iter().zip(allowed).enumerate() {
                 let excess = if kept { excess - allowed } else { *excess };

@@ -167,8 +167,8 @@ pub fn interval(dof: &Dof, q: f64, v: f64, before: Option<f64>, period: &Period)
     let within =
         |most: f64, from: f64| if most < from { (most, Kind::Acceleration) } else { (from, Kind::Jerk) };
     let (a, step) = (dof.acceleration, brake.step);
-    // From an acceleration beyond the limit, which comes first, the way back.
-    let known = before.map(|before| before.clamp(-a - step, a + step));
+    // An acceleration beyond the limit counts as the limit: what it really was could leave nothing but to speed up.
+    let known = before.map(|before| before.clamp(-a, a));
     let reached = |side: f64| known.map_or(f64::INFINITY, |known| side * known + step);
     let (up, down) = (within(a, reached(1.0)), within(a, reached(-1.0)));
     let next = brake.next(v, known.unwrap_or(brake.curve(v))).clamp(-down.0, up.0);
@@ -180,7 +180,7 @@ pub fn interval(dof: &Dof, q: f64, v: f64, before: Option<f64>, period: &Period)
     let (lower, lower_kind, below) = brake.upper_bound((dof.velocity, q - dof.lower), -v, down, -next);
     let beyond = q > dof.upper + ROUNDING || q < dof.lower - ROUNDING;
     let position = beyond.then_some(Kind::Position);
-    let acceleration = (known != before).then_some(Kind::Acceleration);
+    let acceleration = before.filter(|before| before.abs() > a + step).map(|_| Kind::Acceleration);
     let outside = position.or(above).or(below).or(acceleration);
     Interval { lower: -lower, upper, lower_kind, upper_kind, outside }
 }

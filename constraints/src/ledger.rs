@@ -62,7 +62,9 @@ impl Status {
                 "no way to stop could be verified; the stored brake is executed"
             }
             Status::Braked(BrakeReason::NonFiniteDynamics) => "the dynamics came out as NaN or infinity",
-            Status::Refused(RefuseReason::NonFiniteState) => "the measured state holds NaN or infinity",
+            Status::Refused(RefuseReason::NonFiniteState) => {
+                "the measured state, or the tick before it, holds NaN or infinity"
+            }
             Status::Refused(RefuseReason::WrongLength) => "a vector has the wrong length",
         })
     }

@@ -5,7 +5,7 @@
 //! [`checker`](crate::checker). The two must not share their formula: rows come from Jacobians and mass matrices, the checker from
 //! forward kinematics and inverse dynamics.
 
-use crate::{Kind, Kinematics, Period};
+use crate::{Kind, Kinematics, LimitError, LimitSet, Period};
 use serde::{Deserialize, Serialize};
 
 /// What is known at the start of a tick. Lengths nq and nv; units rad or m, s, N·m or N.
@@ -130,15 +130,35 @@ pub trait Rows: Send {
     /// What `fill` and `excess` read.
     fn needs(&self) -> Needs;
 
-    /// True when `lower` and `upper` are always equal.
+    /// True when `lower` and `upper` are equal wherever the state is not [`outside`](RowsMut::outside).
     fn equality(&self) -> bool {
         false
+    }
+
+    /// Takes what single joints may do, before the rows are asked anything.
+    ///
+    /// # Errors
+    /// The joints cannot do what the rows ask for.
+    fn fit(&mut self, limits: &LimitSet) -> Result<(), LimitError> {
+        let _ = limits;
+        Ok(())
+    }
+
+    /// Dofs that a brake slows down in proportion, so that sums of them that the rows hold at a value stay there.
+    fn in_proportion(&self) -> Vec<usize> {
+        Vec::new()
     }
 
     /// True when the rows ask for more than [`breach`](Rows::breach) keeps, so that a way to stop is left: where a stored brake is
     /// verified for that, a tick may do without them.
     fn asks_more(&self) -> bool {
         false
+    }
+
+    /// True when what the rows keep is of the state that a motion ends in, so that a measured state may be beyond it already and come back.
+    /// False when it is of the motion: no state is beyond it then.
+    fn of_state(&self) -> bool {
+        matches!(self.kind(), Kind::Frame | Kind::Collision | Kind::User)
     }
 
     /// Moves what the rows keep this far \[m\] further inside than it was built, for the ticks to come; false, and nothing is done, where that

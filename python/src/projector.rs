@@ -290,8 +290,7 @@ impl Projector {
     /// Forces on the robot beside its motors, as generalised forces `J'f` (nv), for all projections to come: contact forces.
     fn set_external_forces(&self, forces: &Bound<'_, PyAny>) -> PyResult<()> {
         let forces = self.model.get().v("forces", forces)?;
-        self.lock().all().iter_mut().for_each(|p| p.set_external_forces(&forces));
-        Ok(())
+        self.lock().all().iter_mut().try_for_each(|p| p.set_external_forces(&forces)).map_err(errors::value)
     }
 
     /// What the rows of a ledger's `active` are of: dofs, then coupled rows.

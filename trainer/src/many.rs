@@ -121,7 +121,7 @@ impl Projectors {
             let off: Vec<String> =
                 first.enabled().filter(|(_, on)| !on).map(|(name, _)| name.to_string()).collect();
             off.iter().try_for_each(|name| new.set_enabled(name, false))?;
-            new.set_external_forces(first.external_forces());
+            new.set_external_forces(first.external_forces())?;
             new.set_moved(first.moved());
             self.all.push(new);
         }

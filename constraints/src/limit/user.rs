@@ -3,8 +3,8 @@
 use super::margin::is_zero;
 use super::{About, Argument, Form, Limit, Takes};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
-use crate::viability::{POSITION_TOLERANCE, approach};
-use crate::{Kind, LimitError, Model, Soft};
+use crate::viability::{POSITION_TOLERANCE, Period, approach};
+use crate::{Kind, LimitError, LimitSet, Model, Soft};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -66,6 +66,17 @@ pub struct UserRowSettings {
 /// With `braking` B the sum `s` of positions is held like a joint: its acceleration toward a bound is at most what
 /// [`approach`] gives for its distance and speed. Without it the row speaks of the next state alone, and nothing looks
 /// ahead.
+///
+/// A hard row with `equals` stays at that value. A sum of positions at it, `s = e`, is held by its acceleration alone,
+///
+/// ```text
+///     s'' = -(w + r (s - e)) / T,   r = min(1 / (2 T), RETURN)
+/// ```
+///
+/// which takes off what rounding leaves. Beside it, `e` is a lower and an upper bound with a `braking` of what each of its joints alone can
+/// give: the sum stops there if the proposal leads it there. A sum without accelerations that is beside its value goes no further from it. Brakes slow
+/// the joints of such a row down in proportion, which leaves the sum of positions, and sums of speeds or accelerations that are 0, where
+/// they are.
 #[derive(Debug, Clone)]
 pub struct UserRow {
     settings: UserRowSettings,
@@ -183,12 +194,26 @@ impl Limit for UserRow {
         }
         let largest =
             [bounds.0, bounds.1].into_iter().filter(|x| x.is_finite()).fold(0.0, |m: f64, x| m.max(x.abs()));
+        let steepest = terms.iter().fold(0.0, |m: f64, t| m.max(t.coefficient.abs()));
         let size = match s.braking {
             Some(braking) => braking,
             None if largest > 0.0 => largest,
-            None => terms.iter().fold(0.0, |m: f64, t| m.max(t.coefficient.abs())),
+            None => steepest,
         };
-        Ok(Some(Box::new(Row { name: s.name.clone(), terms, bounds, braking: s.braking, size, equality })))
+        let hard = s.soft.is_none();
+        let has = |quantity| terms.iter().any(|t| t.quantity == quantity);
+        let equal = match (has(Quantity::Position), has(Quantity::Velocity), has(Quantity::Acceleration)) {
+            _ if !(equality && hard) => None,
+            (true, false, false) => Some(Equal::Positions),
+            (_, _, false) => Some(Equal::Speeds),
+            _ => Some(Equal::Accelerations),
+        };
+        // A brake in proportion keeps any sum of positions, and a sum of speeds or of accelerations at 0.
+        let one = terms.iter().all(|t| t.quantity == terms[0].quantity);
+        let moved = terms.iter().all(|t| controllable.is_empty() || controllable.contains(&t.dof));
+        let kept = equal.is_some() && moved && one && (of_positions || bounds.0 == 0.0);
+        let (name, braking) = (s.name.clone(), s.braking);
+        Ok(Some(Box::new(Row { name, terms, bounds, braking, size, equality, hard, equal, kept, steepest })))
     }
 
     fn soft(&self) -> Option<Soft> {
@@ -210,6 +235,17 @@ struct Term {
     coefficient: f64,
 }
 
+/// What a hard row with `equals` is a sum of.
+#[derive(Clone, Copy, PartialEq)]
+enum Equal {
+    /// Positions alone.
+    Positions,
+    /// Speeds, perhaps with positions.
+    Speeds,
+    /// Accelerations, perhaps with others.
+    Accelerations,
+}
+
 struct Row {
     name: String,
     terms: Vec<Term>,
@@ -217,13 +253,77 @@ struct Row {
     braking: Option<f64>,
     size: f64,
     equality: bool,
+    hard: bool,
+    equal: Option<Equal>,
+    /// A brake in proportion keeps its value.
+    kept: bool,
+    /// The largest coefficient.
+    steepest: f64,
 }
+
+/// A sum of positions that is this far from its value, or would be after a period, is at it [unit of the sum].
+const AT: f64 = 1e-9;
+
+/// The same for a sum of speeds, as a share of its size.
+const AT_SPEED: f64 = 2e-9;
+
+/// Rate at which what rounding leaves of a distance is taken off [1/s].
+const RETURN: f64 = 2.0;
 
 impl Row {
     /// The sum of positions and its speed.
     fn sum(&self, q: &[f64], v: &[f64]) -> (f64, f64) {
         let each = |x: &dyn Fn(&Term) -> f64| self.terms.iter().map(|t| t.coefficient * x(t)).sum();
         (each(&|t| q[t.idx_q]), each(&|t| v[t.dof]))
+    }
+
+    /// The sum of a state, or of a motion where `a` is given.
+    fn value(&self, q: &[f64], v: &[f64], a: Option<&[f64]>) -> f64 {
+        let each = |t: &Term| match t.quantity {
+            Quantity::Position => q[t.idx_q],
+            Quantity::Velocity => v[t.dof],
+            Quantity::Acceleration => a.map_or(0.0, |a| a[t.dof]),
+        };
+        self.terms.iter().map(|t| t.coefficient * each(t)).sum()
+    }
+
+    /// Whether a sum of positions with that speed is at the value it is kept at.
+    fn is_at(&self, (s, w): (f64, f64), period: &Period) -> bool {
+        (s - self.bounds.0).abs() <= AT && (w * period.dt).abs() <= AT
+    }
+
+    /// The lowest and highest sum that the limits of single joints leave.
+    fn reach(&self, limits: &LimitSet) -> (f64, f64) {
+        self.terms.iter().fold((0.0, 0.0), |(low, high), t| {
+            let (from, to) = match t.quantity {
+                Quantity::Position => (limits.q_lower[t.dof], limits.q_upper[t.dof]),
+                Quantity::Velocity => (-limits.velocity[t.dof], limits.velocity[t.dof]),
+                Quantity::Acceleration => (-limits.acceleration[t.dof], limits.acceleration[t.dof]),
+            };
+            let ends = [t.coefficient * from, t.coefficient * to];
+            (low + ends[0].min(ends[1]), high + ends[0].max(ends[1]))
+        })
+    }
+
+    /// Rows of a sum of positions in the unit of its acceleration.
+    fn fill_braking(&self, braking: f64, tick: &TickStart<'_>, rows: &mut RowsMut<'_>) {
+        let t = tick.period.dt;
+        let (s, w) = self.sum(tick.q, tick.v);
+        for term in &self.terms {
+            rows.row(0)[term.dof] += term.coefficient / t;
+        }
+        if self.equal.is_some() && self.is_at((s, w), tick.period) {
+            let held = -(w + (0.5 / t).min(RETURN) * (s - self.bounds.0)) / t;
+            (rows.lower[0], rows.upper[0]) = (held, held);
+            return;
+        }
+        let beyond = (self.bounds.0 - s).max(s - self.bounds.1) > POSITION_TOLERANCE;
+        rows.outside[0] = beyond || self.equal.is_some();
+        rows.upper[0] = bound(self.bounds.1 - s, w, braking, tick);
+        rows.lower[0] = -bound(s - self.bounds.0, -w, braking, tick);
+        if rows.lower[0] > rows.upper[0] {
+            rows.lower[0] = rows.upper[0];
+        }
     }
 }
 
@@ -245,27 +345,48 @@ impl Rows for Row {
     }
 
     fn equality(&self) -> bool {
-        self.equality && self.braking.is_none()
+        self.equal.is_some() || (self.equality && self.braking.is_none())
     }
 
     fn asks_more(&self) -> bool {
-        self.braking.is_some()
+        self.braking.is_some() || self.equal == Some(Equal::Positions)
+    }
+
+    fn fit(&mut self, limits: &LimitSet) -> Result<(), LimitError> {
+        let ((low, high), (least, most)) = (self.reach(limits), self.bounds);
+        if self.hard && (most < low - AT || least > high + AT) {
+            let value = if most < low { most } else { least };
+            let asked = if self.equality { "to be" } else { "to reach" };
+            return Err(LimitError::Unusable {
+                what: format!(
+                    "row '{}' asks its sum {asked} {value}, and the limits of its joints leave it {low} to {high}, all in the unit of the sum",
+                    self.name
+                ),
+                next: "ask for a value in that range",
+            });
+        }
+        if self.equal == Some(Equal::Positions) && self.braking.is_none() {
+            let own = |t: &Term| t.coefficient.abs() * limits.braking[t.dof].min(limits.acceleration[t.dof]);
+            let least = self.terms.iter().map(own).fold(f64::INFINITY, f64::min);
+            let braking = if least.is_finite() { least } else { self.steepest };
+            (self.braking, self.size) = (Some(braking), braking);
+        }
+        Ok(())
+    }
+
+    fn in_proportion(&self) -> Vec<usize> {
+        if self.kept { self.terms.iter().map(|t| t.dof).collect() } else { Vec::new() }
+    }
+
+    /// With an acceleration in it the sum is of a motion: at rest or in flight, another acceleration gives the same state another sum.
+    fn of_state(&self) -> bool {
+        self.terms.iter().all(|t| t.quantity != Quantity::Acceleration)
     }
 
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let (t, kappa) = (tick.period.dt, tick.period.kappa);
         if let Some(braking) = self.braking {
-            let (s, w) = self.sum(tick.q, tick.v);
-            rows.outside[0] = (self.bounds.0 - s).max(s - self.bounds.1) > POSITION_TOLERANCE;
-            for term in &self.terms {
-                rows.row(0)[term.dof] += term.coefficient / t;
-            }
-            rows.upper[0] = bound(self.bounds.1 - s, w, braking, tick);
-            rows.lower[0] = -bound(s - self.bounds.0, -w, braking, tick);
-            if rows.lower[0] > rows.upper[0] {
-                rows.lower[0] = rows.upper[0];
-            }
-            return;
+            return self.fill_braking(braking, tick, rows);
         }
         let mut still = 0.0;
         for term in &self.terms {
@@ -278,12 +399,29 @@ impl Rows for Row {
             rows.row(0)[i] += c * g;
             still += c * constant;
         }
-        (rows.lower[0], rows.upper[0]) = (self.bounds.0 - still, self.bounds.1 - still);
+        let (mut lower, mut upper) = self.bounds;
+        if self.equal == Some(Equal::Speeds) {
+            // Beside its value, no further from it.
+            let now = self.value(tick.q, tick.v, None);
+            rows.outside[0] = (now - lower).abs() > AT_SPEED * self.size;
+            if rows.outside[0] {
+                (lower, upper) = (lower.min(now), upper.max(now));
+            }
+        }
+        (rows.lower[0], rows.upper[0]) = (lower - still, upper - still);
     }
 
     fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]) {
         if let Some(braking) = self.braking {
             let (s, w) = self.sum(motion.q, motion.v);
+            if self.equal.is_some() {
+                // No further from its value than the state is and leads; at it, as slow too.
+                let (to, then) = self.sum(motion.q_next, motion.v_next);
+                let (t, e) = (motion.period.dt, self.bounds.0);
+                let slow = if self.is_at((s, w), motion.period) { t * then.abs() } else { 0.0 };
+                excess[0] = ((to - e).abs().max(slow) - (s - e).abs() - t * w.abs()) / self.steepest;
+                return;
+            }
             let a: f64 = self.terms.iter().map(|t| t.coefficient * motion.acceleration[t.dof]).sum();
             let limit = |d: f64, w: f64| {
                 if d.is_finite() { approach(d, w, braking, motion.period) } else { f64::INFINITY }
@@ -292,25 +430,31 @@ impl Rows for Row {
             excess[0] = (a - upper).max(lower.min(upper) - a) / self.size;
             return;
         }
-        let value: f64 = self
-            .terms
-            .iter()
-            .map(|t| {
-                t.coefficient
-                    * match t.quantity {
-                        Quantity::Position => motion.q_next[t.idx_q],
-                        Quantity::Velocity => motion.v_next[t.dof],
-                        Quantity::Acceleration => motion.acceleration[t.dof],
-                    }
-            })
-            .sum();
-        excess[0] = (value - self.bounds.1).max(self.bounds.0 - value) / self.size;
+        let value = self.value(motion.q_next, motion.v_next, Some(motion.acceleration));
+        let (mut lower, mut upper) = self.bounds;
+        if self.equal == Some(Equal::Speeds) {
+            let now = self.value(motion.q, motion.v, None);
+            if (now - lower).abs() > AT_SPEED * self.size {
+                (lower, upper) = (lower.min(now), upper.max(now));
+            }
+        }
+        excess[0] = (value - upper).max(lower - value) / self.size;
     }
 
     /// Beyond the bounds where the motion ends. A row that standing still breaks is none that a brake can keep.
     fn breach(&mut self, motion: &mut Motion<'_>, breach: &mut [f64]) {
+        let value = |row: &Row| row.value(motion.q_next, motion.v_next, Some(motion.acceleration));
+        if let Some(equal) = self.equal {
+            let (off, positions) = ((value(self) - self.bounds.0).abs(), equal == Equal::Positions);
+            breach[0] = match self.kept {
+                true if positions => (off - 2.0 * AT) / self.steepest,
+                true => off / self.size - AT_SPEED,
+                false => f64::NEG_INFINITY,
+            };
+            return;
+        }
         if self.braking.is_some() {
-            let (s, _) = self.sum(motion.q_next, motion.v_next);
+            let s = value(self);
             breach[0] = (s - self.bounds.1).max(self.bounds.0 - s) / self.size;
             return;
         }

@@ -7,7 +7,8 @@
 //!     v_k = v - k b T,   q_k = q + k T v - b T^2 (k (k - 1) / 2 + kappa k)     (k <= N_i, sign of v)
 //! ```
 //!
-//! and in the last one the rest of the speed is taken off, so that no joint turns round. A joint of hard jerk has `b_i` as its largest deceleration
+//! and in the last one the rest of the speed is taken off, so that no joint turns round. Joints of which a row holds a sum at a value slow down
+//! in proportion, `b_i / |v_i|` the same for all of them, so that the sum stays. A joint of hard jerk has `b_i` as its largest deceleration
 //! and brakes as in [`jerk`](crate::jerk). A brake is verified when each joint stands before its position limit in these very ticks, stays below its
 //! speed profile, and every hard row and cone holds ([`Rows::breach`](crate::Rows::breach)) at the ticks looked at and, by the bound of
 //! [`Backup::between`], at those between them. By induction there is always a way to stop: either the new state has a verified brake, or the old one
@@ -19,7 +20,7 @@ mod stopping;
 use super::Dofs;
 use crate::checker::Checker;
 use crate::jerk::{Brake, Stop};
-use crate::viability::{Dof, Kind, Period};
+use crate::viability::{Dof, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model};
 pub(crate) use refusal::{Passage, Refusal};
 use stopping::{least_deceleration, soonest};
@@ -55,6 +56,9 @@ const MOST: u32 = 65;
 
 /// A brake that goes further than this beyond a moved limit is not over with it [m, or share of a size].
 const FURTHER: f64 = 1e-6;
+
+/// A joint of several that brake in proportion stands at this speed, which none of the others waits for [rad/s or m/s].
+const STANDS: f64 = 1e-10;
 
 /// A brake of more ticks than this is as good as one without ticks.
 const MANY: f64 = 1e5;
@@ -95,6 +99,10 @@ pub(crate) struct Backup {
     full: Vec<(f64, f64)>,
     /// The largest deceleration of each dof (nv).
     most: Vec<f64>,
+    /// The least deceleration of each dof that stops in time (nv).
+    least: Vec<f64>,
+    /// Dofs that slow down in proportion, because a sum of them is held at a value.
+    groups: Vec<Vec<usize>>,
     now: State,
     next: State,
     way: Vec<f64>,
@@ -128,9 +136,6 @@ impl Backup {
         let state = || State { q: model.neutral(), v: zero(), a: zero() };
         let period = Period::new(settings.dt, settings.sub_steps);
         let checker = Checker::new(model, limits, controllable, period, settings.consistency)?;
-        let of_state = |kind: &Kind| {
-            matches!(kind, Kind::Frame | Kind::FrameSpeed | Kind::Energy | Kind::Collision | Kind::User)
-        };
         Ok(Backup {
             stored: false,
             within: false,
@@ -140,11 +145,13 @@ impl Backup {
             allowed: vec![0.0; checker.hard()],
             on_the_way: vec![0.0; checker.hard()],
             here: vec![0.0; checker.hard()],
-            of_state: checker.hard_kinds().iter().map(of_state).collect(),
+            of_state: checker.hard_of_state(),
             trial: zero(),
             stops: vec![None; model.nv()],
             full: vec![(0.0, 0.0); model.nv()],
             most: zero(),
+            least: zero(),
+            groups: groups(checker.in_proportion().map(|(_, dofs)| dofs)),
             now: state(),
             next: state(),
             way: zero(),
@@ -343,6 +350,7 @@ impl Backup {
                 return false;
             }
             let least = least.min(most);
+            self.least[i] = least;
             self.trial[i] = match plan {
                 _ if speed == 0.0 => most,
                 Plan::Together(late) => {
@@ -355,7 +363,35 @@ impl Backup {
                 }
             };
         }
+        if !self.slow_in_proportion(v, plan) {
+            return false;
+        }
         self.count(with, v);
+        true
+    }
+
+    /// Gives the dofs of each group decelerations in proportion to their velocities; false where one of them would have to stop sooner than
+    /// another can.
+    fn slow_in_proportion(&mut self, v: &[f64], plan: Plan) -> bool {
+        for group in &self.groups {
+            let (mut low, mut high, mut wanted) = (0.0f64, f64::INFINITY, 0.0f64);
+            for &i in group.iter().filter(|i| v[**i].abs() > STANDS) {
+                let speed = v[i].abs();
+                (low, high) = (low.max(self.least[i] / speed), high.min(self.most[i] / speed));
+                wanted = wanted.max(self.trial[i] / speed);
+            }
+            if low > high * (1.0 + 1e-9) {
+                return false;
+            }
+            if let Plan::Apart(share) = plan {
+                let low = low.max(LEAST * high);
+                wanted = low + share * (high - low);
+            }
+            for &i in group {
+                let stands = v[i].abs() <= STANDS;
+                self.trial[i] = if stands { self.most[i] } else { wanted.min(high) * v[i].abs() };
+            }
+        }
         true
     }
 
@@ -526,6 +562,21 @@ impl Backup {
             }
         }
     }
+}
+
+/// Sets of dofs, joined where they share one.
+fn groups(sets: impl Iterator<Item = Vec<usize>>) -> Vec<Vec<usize>> {
+    let mut groups: Vec<Vec<usize>> = Vec::new();
+    for mut set in sets {
+        let (joined, apart): (Vec<_>, Vec<_>) =
+            groups.into_iter().partition(|group: &Vec<usize>| group.iter().any(|i| set.contains(i)));
+        set.extend(joined.into_iter().flatten());
+        set.sort_unstable();
+        set.dedup();
+        groups = apart;
+        groups.push(set);
+    }
+    groups
 }
 
 /// A row is broken by no more than is allowed, or by rounding: not by both, or what rests at its limit would creep beyond it tick by tick.

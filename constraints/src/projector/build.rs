@@ -47,6 +47,7 @@ impl Projector {
         let braking = choice::braking(model, &limits, &dofs, &settings, &checker, &mut notes);
         let settings = Settings { braking, ..settings };
         check_combination(model, &limits, &dofs, (settings.consistency, settings.braking))?;
+        check_proportion(model, &limits, &checker)?;
         let weight: Vec<f64> = match &settings.velocity_weight {
             Some(w) => w.iter().map(|w| w * w).collect(),
             None => vec![1.0; nv],
@@ -163,6 +164,23 @@ fn check_jerk(
     refused(&|i| limits.profile[i] != [None, None], "is not kept together with a velocity profile", next)
 }
 
+/// A brake of bounded jerk slows each joint down in its own time, and not in proportion.
+fn check_proportion(model: &Model, limits: &LimitSet, checker: &Checker) -> Result<(), LimitError> {
+    for (names, dofs) in checker.in_proportion() {
+        let joints = dofs.iter().filter(|i| limits.jerk[**i].is_finite());
+        let joints = joints.map(|i| format!("'{}'", model.dof_name(*i))).collect::<Vec<_>>().join(", ");
+        if !joints.is_empty() {
+            let row = names.join("', '");
+            let what = format!("row '{row}' holds {joints} at a value, which no brake of hard jerk keeps");
+            return Err(LimitError::Unusable {
+                what,
+                next: "drop hard of the jerk, or give lower and upper",
+            });
+        }
+    }
+    Ok(())
+}
+
 /// The limits one by one.
 fn switches(
     model: &Model,
@@ -217,7 +235,7 @@ fn stages(
     settings: &Settings,
 ) -> Result<Option<Stages>, LimitError> {
     let period = Period::new(settings.dt, settings.sub_steps);
-    let mut sources = Sources::new(model, each, &dofs.controllable)?;
+    let mut sources = Sources::new(model, (each, limits), &dofs.controllable)?;
     let free = settings.consistency == Consistency::Free;
     let labels = sources.labels();
     if let Some(label) = labels.first().filter(|_| free) {
@@ -251,6 +269,7 @@ fn stages(
     let mut dynamics = Dynamics::new(model);
     let rest = Measured { q: &neutral, v: &zero, external: &zero, previous: None };
     sources.fill(&mut problem, &mut dynamics, &rest, dofs, &zero, &period);
+    problem.equality = sources.equalities(); // whether or not that state is outside of them
     let conic = Conic::new(&problem, sigma, settings.max_iter, settings.deadline)?;
     let (n, m) = (problem.n, problem.m);
     let polish = Polish::new(&problem);

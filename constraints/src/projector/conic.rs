@@ -204,7 +204,13 @@ impl Conic {
         }
         for r in 0..x.m {
             let Some(at) = x.lifted(r) else {
-                self.b[r] = if p.row_upper[r].is_finite() { p.row_upper[r] } else { 0.0 };
+                // Of a row that the state is outside of, the value next to where the proposal leads.
+                let wanted = || p.row(r, &p.goal).clamp(p.row_lower[r], p.row_upper[r]);
+                self.b[r] = match p.row_upper[r].is_finite() {
+                    true if p.row_lower[r] < p.row_upper[r] => wanted(),
+                    true => p.row_upper[r],
+                    false => 0.0,
+                };
                 continue;
             };
             let tighten = if p.soft[r].is_some() { 0.0 } else { TIGHTEN };
@@ -227,7 +233,7 @@ impl Conic {
         let mut next = 0;
         for k in 0..n {
             for r in 0..x.m {
-                let off = p.equality[r] && !p.row_upper[r].is_finite();
+                let off = x.lifted(r).is_none() && !p.row_upper[r].is_finite();
                 self.a[next + r] = if off { 0.0 } else { p.rows[r * n + k] * self.sigma[k] };
             }
             next += x.m + 2;

@@ -58,6 +58,9 @@ pub(crate) struct ConeRows {
     pub(crate) size: f64,
 }
 
+/// What a row asks for at most is this share of its range in the box away from the ends of that.
+const INSIDE: f64 = 1e-9;
+
 /// The least size numbers of a limit are multiplied by, so that disabled limits stay finite.
 const ROOM: f64 = 1e6;
 
@@ -109,6 +112,19 @@ impl Coupled {
             *to = g[*j] / size;
         }
         self.row_size[r] = size;
+    }
+
+    /// Lets hard row `r` ask for no more than the box can give.
+    pub(super) fn bring_nearer(&mut self, r: usize) {
+        let ends = self.gradient(r).iter().zip(&self.lower).zip(&self.upper);
+        let (low, high) = ends.fold((0.0, 0.0), |(low, high), ((g, lower), upper)| {
+            (low + (g * lower).min(g * upper), high + (g * lower).max(g * upper))
+        });
+        let inside = INSIDE * (high - low);
+        if inside.is_finite() {
+            self.row_upper[r] = self.row_upper[r].max(low + inside);
+            self.row_lower[r] = self.row_lower[r].min(high - inside);
+        }
     }
 
     /// Row `r` of `G` (n).

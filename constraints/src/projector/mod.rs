@@ -188,7 +188,9 @@ impl Projector {
         if !self.lengths_fit(q, v, proposal, target) {
             return Status::Refused(RefuseReason::WrongLength);
         }
-        if !(finite(q) && finite(v)) {
+        let before = self.previous.get().filter(|_| self.needs_previous());
+        let known = before.is_none_or(|before| finite(before.acceleration) && finite(before.torque));
+        if !(finite(q) && finite(v) && known) {
             return self.refuse(q, target);
         }
         self.update_bounds(q, v, target);
@@ -270,7 +272,9 @@ impl Projector {
                 true => {
                     let known = self.previous.get().map(|previous| previous.acceleration[i]);
                     let known = known.or((v[i] == 0.0).then_some(0.0));
-                    self.before[i] = known.unwrap_or_else(|| jerk::Brake::of(&dof, &self.period).curve(v[i]));
+                    let within = known.map(|a| a.clamp(-dof.acceleration, dof.acceleration));
+                    self.before[i] =
+                        within.unwrap_or_else(|| jerk::Brake::of(&dof, &self.period).curve(v[i]));
                     jerk::interval(&dof, at, v[i], known, &self.period)
                 }
                 false => interval(&dof, at, v[i], &self.period),

@@ -51,6 +51,7 @@ impl Nearer {
         to.rows[m * n..].fill(0.0);
         to.row_lower.fill(f64::NEG_INFINITY);
         to.row_upper.fill(f64::INFINITY);
+        to.equality[..m].copy_from_slice(&p.equality);
         to.row_lower[..m].copy_from_slice(&p.row_lower);
         to.row_upper[..m].copy_from_slice(&p.row_upper);
         for (c, cone) in p.cones.iter().enumerate().filter(|(_, cone)| cone.radius.is_finite()) {

@@ -3,7 +3,7 @@
 use super::Dofs;
 use super::coupled::Coupled;
 use crate::row::{Cone, Needs, Place, Previous, Rows, RowsMut, TickStart};
-use crate::{Dynamics, Kind, Kinematics, Limit, LimitError, Model, Period, Soft};
+use crate::{Dynamics, Kind, Kinematics, Limit, LimitError, LimitSet, Model, Period, Soft};
 
 /// Where rows come from, and the memory they are written to.
 pub(crate) struct Sources {
@@ -68,12 +68,13 @@ pub(crate) struct Label {
 impl Sources {
     pub(crate) fn new(
         model: &Model,
-        limits: &[Box<dyn Limit>],
+        (limits, set): (&[Box<dyn Limit>], &LimitSet),
         controllable: &[usize],
     ) -> Result<Sources, LimitError> {
         let (mut blocks, mut cones, mut first) = (Vec::new(), Vec::new(), 0);
         for (limit, l) in limits.iter().enumerate() {
-            if let Some(rows) = l.rows(model, controllable)? {
+            if let Some(mut rows) = l.rows(model, controllable)? {
+                rows.fit(set)?;
                 let (sizes, soft) = (rows.sizes(), l.soft());
                 check_sizes(&sizes, rows.names().len(), soft, l.label())?;
                 let places = rows.places().len();
@@ -233,8 +234,14 @@ impl Sources {
                 let outside = &mut self.outside[rows];
                 block.rows.fill(&mut tick, &mut RowsMut { g, lower, upper, outside, nv });
             }
+            let equal = block.soft.is_none() && block.rows.equality();
             for (r, size) in block.sizes.iter().enumerate() {
-                problem.take_row(block.first + r, &self.g[r * nv..(r + 1) * nv], *size, dofs, y);
+                let row = block.first + r;
+                problem.take_row(row, &self.g[r * nv..(r + 1) * nv], *size, dofs, y);
+                if equal && self.outside[row] {
+                    problem.bring_nearer(row);
+                }
+                problem.equality[row] = equal && !self.outside[row];
             }
         }
         for (c, block) in self.cones.iter_mut().enumerate() {

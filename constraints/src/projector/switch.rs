@@ -75,10 +75,18 @@ impl Projector {
     /// Forces on the robot beside its motors, as generalised forces `J'f` (nv) [N·m or N], for the ticks to come: contact
     /// forces of a walking robot, measured or estimated, are held constant over a period.
     ///
+    /// # Errors
+    /// A force that is NaN or infinite, by the joint it acts on; those before stay.
+    ///
     /// # Panics
     /// When there are not nv of them.
-    pub fn set_external_forces(&mut self, forces: &[f64]) {
+    pub fn set_external_forces(&mut self, forces: &[f64]) -> Result<(), LimitError> {
+        if let Some(i) = forces.iter().position(|force| !force.is_finite()) {
+            let what = format!("external force on '{}'", self.model.dof_name(i.min(self.model.nv() - 1)));
+            return Err(LimitError::BadValue { what, value: forces[i], domain: "finite, in N·m or N" });
+        }
         self.external.copy_from_slice(forces);
+        Ok(())
     }
 
     /// The forces last set (nv).

@@ -346,3 +346,55 @@ fn what_hard_jerk_is_not_kept_with_is_refused_by_name() {
         assert_eq!(serde_json::to_string(&read).unwrap(), settings);
     }
 }
+
+/// What is told of the tick before is no number, or more than the joint can do.
+#[test]
+fn a_tick_before_that_cannot_have_been_is_refused_or_counts_as_the_limit() {
+    let (model, dt, most, jerk) = (panda(), 0.004, 8.0, 300.0);
+    let limits: Vec<Box<dyn Limit>> = vec![
+        Box::new(PositionLimit::default()),
+        Box::new(VelocityLimit::scaled(1.0)),
+        Box::new(AccelerationLimit::new(limit::AccelerationSettings::of(PerJoint::All(most), None))),
+        Box::new(JerkLimit::hard(jerk)),
+    ];
+    let q = [0.1, -0.4, 0.2, -1.8, 0.1, 1.9, 0.3];
+    let v = [0.5; 7];
+    let still = Proposal { q: q.to_vec(), v: vec![0.0; 7] };
+    let mut target = Target::new(&model);
+    for (before, torque) in [(f64::NAN, 0.0), (f64::INFINITY, 0.0), (0.0, f64::NAN), (f64::NEG_INFINITY, 0.0)]
+    {
+        let mut projector =
+            Projector::new(&model, &limits, &[0, 1, 2, 3, 4, 5, 6], Settings::new(dt, 1)).unwrap();
+        projector.set_previous(Some(row::Previous { acceleration: &[before; 7], torque: &[torque; 7] }));
+        let status = projector.project(&q, &v, &still, &mut target);
+        assert_eq!(status, Status::Refused(RefuseReason::NonFiniteState), "{before} {torque}");
+        assert!(target.v.iter().all(|v| *v == 0.0) && status.reason().unwrap().contains("the tick before"));
+        projector.set_previous(None);
+        assert!(projector.project(&q, &v, &still, &mut target).is_ok());
+    }
+    for before in [1e300, 100.0, 9.0, 8.0] {
+        let mut projector =
+            Projector::new(&model, &limits, &[0, 1, 2, 3, 4, 5, 6], Settings::new(dt, 1)).unwrap();
+        projector.set_previous(Some(row::Previous { acceleration: &[before; 7], torque: &[0.0; 7] }));
+        let status = projector.project(&q, &v, &still, &mut target);
+        for (i, v1) in target.v.iter().enumerate() {
+            let a = (v1 - v[i]) / dt;
+            // The least that a joint at its limit may go on with.
+            assert!((a - (most - jerk * dt)).abs() < 1e-9, "{before}: joint {i} at {a} rad/s², {status:?}");
+        }
+        assert!(status.is_ok(), "{before}: {status:?}");
+    }
+}
+
+#[test]
+fn forces_from_outside_that_are_no_numbers_are_refused_by_joint() {
+    let mut projector = panda_projector(Some(1.0), Settings::new(0.004, 1));
+    projector.set_external_forces(&[1.0; 7]).unwrap();
+    for wrong in [f64::NAN, f64::INFINITY] {
+        let mut forces = [0.0; 7];
+        forces[2] = wrong;
+        let said = projector.set_external_forces(&forces).unwrap_err().to_string();
+        assert!(said.contains("external force on 'panda_joint3'") && said.contains("finite"), "{said}");
+        assert_eq!(projector.external_forces(), [1.0; 7]);
+    }
+}

@@ -30,6 +30,7 @@ mod kinematics;
 mod motors;
 mod moving;
 mod mujoco;
+mod own_rows;
 mod projector;
 mod stages;
 mod stored_brake;

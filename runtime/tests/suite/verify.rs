@@ -187,6 +187,25 @@ type Alter<'a, T> = &'a dyn Fn(&mut T);
 
 /// Orders of an operator every 0.2 s, and back: speeds, positions, how fast a joint may speed up where jerk is soft, and what ties joints
 /// together.
+/// Speeds with accelerations of another joint, and sums of positions and of speeds that stay where they are.
+#[test]
+fn rows_of_several_joints_are_verified_with_what_a_brake_keeps_of_them() {
+    let rows = [
+        "{ name = \"mix\", terms = { \"v.panda_joint4\" = 1.0, \"a.panda_joint2\" = 0.05 }, lower = -0.8, upper = 0.8 }",
+        "{ name = \"mimic\", terms = { \"q.panda_joint6\" = 1.0, \"q.panda_joint4\" = 0.8 }, equals = 0.0 }",
+        "{ name = \"geared\", terms = { \"v.panda_joint1\" = 1.0, \"v.panda_joint3\" = -0.5 }, equals = 0.0 }",
+    ];
+    for (test, dt, sub_steps, rows) in [
+        ("verify-rows-a", 0.001, 1, rows.join(", ")),
+        ("verify-rows-b", 0.004, 1, rows[..1].join(", ")),
+        ("verify-rows-c", 0.004, 1, rows[1..].join(", ")),
+    ] {
+        let limits = format!("{LIMITS}\nrows = [{rows}]");
+        let (_folder, log) = record(test, &attack(&limits, dt, sub_steps, 20));
+        holds(&verify(&log).unwrap(), 1500);
+    }
+}
+
 fn orders(dt: f64, kinds: &str) -> Vec<(u64, Moved)> {
     let named = |joint: &str, x: f64| Some(PerJoint::Joints([(joint.to_owned(), x)].into()));
     let mut all = vec![

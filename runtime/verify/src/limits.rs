@@ -8,7 +8,7 @@ use serde::Deserialize;
 use crate::collision::Collision;
 use crate::motion::Machine;
 use crate::robot::{Range, Robot, Shape};
-use crate::rows::{Row, Rule, Soft, Term};
+use crate::rows::{Equal, Row, Rule, Soft, Term};
 use crate::space::{Vec3, dot, norm, times};
 
 /// `[constraints]`. A key that is not known here is not verified, and refused by name.
@@ -418,7 +418,7 @@ impl Section {
             }
         }
         for row in &self.rows {
-            rows.push(row.row(of)?);
+            rows.push(row.row(of, &joints)?);
         }
         let soft = self.torque.as_ref().and_then(|torque| torque.soft);
         for &(dof, effort) in &efforts {
@@ -604,7 +604,7 @@ impl FrameSection {
 }
 
 impl UserRow {
-    fn row(&self, of: &Of<'_>) -> Result<Row, String> {
+    fn row(&self, of: &Of<'_>, joints: &[Bounds]) -> Result<Row, String> {
         let term = |(name, c): (&String, &f64)| -> Result<Term, String> {
             let unknown =
                 || format!("its row '{}' names '{name}', which is no state of the robot", self.name);
@@ -628,13 +628,32 @@ impl UserRow {
         let upper = self.equals.or(self.upper.map(|x| x - self.margin)).unwrap_or(none);
         let largest =
             [lower, upper].into_iter().filter(|x| x.is_finite()).fold(0.0, |most: f64, x| most.max(x.abs()));
-        let size = match self.braking {
+        let steepest = self.terms.values().fold(0.0, |most: f64, c| most.max(c.abs()));
+        let is_of = |letter: &str| self.terms.keys().all(|name| name.starts_with(letter));
+        let is_equal = self.equals.is_some() && self.soft.is_none();
+        let is_value = is_equal && is_of("q.");
+        // What each of the joints alone can give.
+        let each = self.terms.values().zip(&terms).map(|(c, t)| {
+            let joint = &joints[t.dof];
+            c.abs() * joint.braking.min(joint.acceleration)
+        });
+        let least = each.fold(none, f64::min);
+        let own = is_value.then_some(if least.is_finite() { least } else { steepest });
+        let braking = self.braking.or(own);
+        let size = match braking {
             Some(braking) => braking,
             None if largest > 0.0 => largest,
-            None => self.terms.values().fold(0.0, |most: f64, c| most.max(c.abs())),
+            None => steepest,
         };
+        let is_moved = terms.iter().all(|t| of.controllable.contains(&t.dof));
+        let rests = is_value || (lower == 0.0 && (is_of("v.") || is_of("a.")));
+        let equal = is_equal.then_some(Equal {
+            is_of_state: terms.iter().all(|t| t.acceleration == 0.0),
+            is_kept: is_moved && rests,
+            steepest,
+        });
         let is_equality = self.equals.is_some();
-        let rule = Rule::User { terms, lower, upper, braking: self.braking, is_equality };
+        let rule = Rule::User { terms, lower, upper, braking, is_equality, equal };
         Ok(Row::new("user", &self.name, size, self.soft, rule))
     }
 }

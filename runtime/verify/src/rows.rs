@@ -49,6 +49,17 @@ pub(crate) struct Term {
     pub(crate) acceleration: f64,
 }
 
+/// A sum that is held at one value.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Equal {
+    /// It has no accelerations.
+    pub(crate) is_of_state: bool,
+    /// A brake that slows its joints down in proportion leaves it there.
+    pub(crate) is_kept: bool,
+    /// The largest coefficient.
+    pub(crate) steepest: f64,
+}
+
 /// What a row says.
 #[derive(Clone, Debug)]
 pub(crate) enum Rule {
@@ -65,7 +76,15 @@ pub(crate) enum Rule {
     /// `n . p <= offset`, and `braking` stops the point in front of it; the margin of a half-space, which may be put elsewhere.
     Plane { spot: Spot, point: Vec3, n: Vec3, offset: f64, braking: f64, half_space: Option<f64> },
     /// A sum of positions, velocities and accelerations.
-    User { terms: Vec<Term>, lower: f64, upper: f64, braking: Option<f64>, is_equality: bool },
+    User {
+        terms: Vec<Term>,
+        lower: f64,
+        upper: f64,
+        braking: Option<f64>,
+        is_equality: bool,
+        /// Hard, with one value.
+        equal: Option<Equal>,
+    },
     /// A pair of bodies, see [`Collision`](crate::collision::Collision).
     Pair,
     /// Speed of a point.
@@ -99,6 +118,11 @@ const CREEP: f64 = 1e-4;
 const RETURN: f64 = 20.0;
 /// In front of a plane a row asks for at most so many times its braking.
 const RECOVERY: f64 = 2.0;
+/// A sum of positions so near its value is at it, in its own unit; one of speeds to a share of its size.
+const AT: f64 = 1e-9;
+const AT_SPEED: f64 = 2e-9;
+/// Rate at which such a distance is taken off [1/s].
+const TAKEN_OFF: f64 = 2.0;
 /// A state so far outside what can stop is inside [rad or m].
 const ROUNDING: f64 = 1e-10;
 
@@ -130,7 +154,11 @@ impl Row {
 
     /// Whether a state, not a motion, is beyond it: a measured state may be so already.
     pub(crate) fn is_of_state(&self) -> bool {
-        matches!(self.rule, Rule::Plane { .. } | Rule::User { .. } | Rule::Speed { .. } | Rule::Energy { .. })
+        match &self.rule {
+            Rule::Plane { .. } | Rule::Speed { .. } | Rule::Energy { .. } => true,
+            Rule::User { terms, .. } => terms.iter().all(|t| t.acceleration == 0.0),
+            _ => false,
+        }
     }
 
     /// Value, limit and unit of what the state after a passage keeps, for messages.
@@ -211,9 +239,15 @@ impl Row {
                 let (speed, c) = (dot(*n, at.velocity), dot(*n, at.acceleration));
                 [none, plane(p, offset - dot(*n, at.at), speed, c, then, *braking)]
             }
-            Rule::User { terms, lower, upper, braking, .. } => match braking {
+            Rule::User { terms, lower, upper, braking, equal, .. } => match braking {
                 None => {
-                    let value = self.sum(passage);
+                    let (value, [mut lower, mut upper]) = (self.sum(passage), [*lower, *upper]);
+                    let still = Passage { q1: passage.q, v1: passage.v, ..*passage };
+                    let now = self.sum(&still);
+                    let is_beside = (now - lower).abs() > AT_SPEED * self.size;
+                    if equal.is_some_and(|equal| equal.is_of_state) && is_beside {
+                        (lower, upper) = (lower.min(now), upper.max(now)); // no further from it
+                    }
                     [(lower - value) / self.size, (value - upper) / self.size]
                 }
                 Some(b) => {
@@ -222,6 +256,15 @@ impl Row {
                     let s = sum(&|t| t.position.map_or(0.0, |(iq, c)| c * passage.q[iq]));
                     let (w, a) =
                         (sum(&|t| weight(t) * passage.v[t.dof]), sum(&|t| weight(t) * passage.a[t.dof]));
+                    if let Some(equal) = equal {
+                        let (off, left) = (s - lower, p.dt * w);
+                        if off.abs() <= AT && left.abs() <= AT {
+                            let held = -(w + (0.5 / p.dt).min(TAKEN_OFF) * off) / p.dt;
+                            return [(held - a) / b, (a - held) / b];
+                        }
+                        let further = (self.sum(passage) - lower).abs() - off.abs() - left.abs();
+                        return [none, further / equal.steepest];
+                    }
                     let beyond = |d: f64, w: f64, a: f64| {
                         if d.is_finite() { (a - in_front(p, d, w, *b)) / b } else { none }
                     };
@@ -256,7 +299,15 @@ impl Row {
                 m.speed(spot, *point) / most - 1.0
             }
             Rule::Energy { most } => (m.energy(passage.q1, passage.v1) / most).sqrt() - 1.0,
-            Rule::User { terms, lower, upper, braking, is_equality } => {
+            Rule::User { lower, braking, equal: Some(equal), .. } => {
+                let off = (self.sum(passage) - lower).abs();
+                match (equal.is_kept, braking) {
+                    (true, Some(_)) => (off - 2.0 * AT) / equal.steepest,
+                    (true, None) => off / self.size - AT_SPEED,
+                    (false, _) => return None,
+                }
+            }
+            Rule::User { terms, lower, upper, braking, is_equality, .. } => {
                 let stands = *lower <= 0.0 && *upper >= 0.0;
                 let of_positions = terms.iter().any(|t| t.position.is_some());
                 if braking.is_none() && (*is_equality || !(of_positions || stands)) {
@@ -391,9 +442,10 @@ pub(crate) fn is_beyond(row: &Row, m: &mut Machine, q: &[f64], v: &[f64]) -> boo
             m.go(q, v);
             dot(*n, minus(m.place(spot).point(*point), times(*offset, *n))) > 0.0
         }
-        Rule::User { lower, upper, .. } => {
+        Rule::User { terms, lower, upper, braking, equal, .. } => {
             let value = row.sum(&passage);
-            value > *upper || value < *lower
+            let leaves = || terms.iter().any(|t| t.position.is_some_and(|(_, c)| c * v[t.dof] != 0.0));
+            value > *upper || value < *lower || (equal.is_some() && braking.is_some() && leaves())
         }
         Rule::Speed { spot, point, most } => {
             m.go(q, v);
