@@ -161,3 +161,9 @@ def test_seeds_of_a_reset_are_whole_numbers() -> None:
     for seed, words in ((-1, "seed is -1;"), ([0, -1], r"seed\[1\] is -1;"), ("ab", "seed is 'ab';"), (2**64 - 1, "seed is 18446744073709551615;")):
         with pytest.raises(ValueError, match=words):
             vec.reset(seed=seed)
+
+
+def test_a_proposed_velocity_ranges_over_the_tasks_limit_where_the_robot_file_has_none() -> None:
+    vec = nearl.make_vec("tests/fixtures/two_link.toml", 1, constraints="task")  # an MJCF, which states no speed; the task says 4 rad/s
+    assert np.isfinite(vec.single_action_space.low).all()
+    assert vec.single_action_space.high[2:] == pytest.approx([4.0, 4.0]) and vec.single_action_space.low[2:] == pytest.approx([-4.0, -4.0])

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::{Meaning, VectorError};
 use crate::env::Spec;
 use crate::{tasks, train};
-use nearl_runtime::constraints::{Entry, Guard, Model, StateLayout};
+use nearl_runtime::constraints::{Entry, Guard, LimitSet, Model, StateLayout};
 use nearl_runtime::net::{Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::task::IdmKind;
@@ -24,13 +24,17 @@ impl Space {
         Space { names, low: spec.action_low().collect(), high: spec.action_high().collect() }
     }
 
-    /// A proposed position ranges over the joint's limits, a velocity over its own; anything else is unbounded. A change ranges over [-1, 1].
+    /// A proposed position ranges over the joint's limits, a velocity over its own, or over the task's where the robot file has none; anything else is
+    /// unbounded. A change ranges over [-1, 1].
     pub(super) fn proposals(snapshot: &Snapshot, meaning: Meaning) -> Result<Space, SnapshotError> {
         let controller = Controller::new(snapshot)?;
         let (model, layout) = (controller.model(), controller.layout());
         let (mut names, mut low, mut high) = (Vec::new(), Vec::new(), Vec::new());
         for k in 0..layout.n_state() {
-            let (l, h) = if meaning == Meaning::Change { (-1.0, 1.0) } else { range(model, layout, k) };
+            let (l, h) = match meaning {
+                Meaning::Change => (-1.0, 1.0),
+                _ => range(model, controller.limits(), layout, k),
+            };
             names.push(layout.state_name(k).to_owned());
             low.push(l);
             high.push(h);
@@ -39,12 +43,16 @@ impl Space {
     }
 }
 
-fn range(model: &Model, layout: &StateLayout, k: usize) -> (f64, f64) {
+fn range(model: &Model, limits: &LimitSet, layout: &StateLayout, k: usize) -> (f64, f64) {
     match layout.state_entry(k) {
         Entry::Position { idx_q, .. } => {
             (model.lower_position_limit()[idx_q], model.upper_position_limit()[idx_q])
         }
-        Entry::Velocity { dof } => (-model.velocity_limit()[dof], model.velocity_limit()[dof]),
+        Entry::Velocity { dof } => {
+            let of_file = model.velocity_limit()[dof];
+            let most = if of_file.is_finite() { of_file } else { limits.velocity[dof] };
+            (-most, most)
+        }
         Entry::Other => (f64::NEG_INFINITY, f64::INFINITY),
     }
 }
