@@ -394,7 +394,8 @@ class TorqueRateLimit(Limit):
 
 @final
 class TorqueSpeedLimit(Limit):
-    """The line of a direct-current motor: `|tau + stall / no_load v| <= stall - margin` in [N·m, N] and [rad/s, m/s].
+    """The line of a direct-current motor: `|tau + stall / no_load v| <= stall - margin` in [N·m, N] and [rad/s, m/s], at the speeds with
+    which a period begins and ends.
 
     In a task file:
 

@@ -126,7 +126,8 @@ impl Gauge {
                 self.motors(passage);
                 each(&|i| {
                     let (stall, no_load) = line[i];
-                    (self.tau[i] / stall + passage.v_next[i] / no_load).abs() - 1.0
+                    let at = |v: f64| (self.tau[i] / stall + v / no_load).abs() - 1.0;
+                    at(passage.v[i]).max(at(passage.v_next[i]))
                 })
             }
             Meter::Profile { curves } => each(&|i| {

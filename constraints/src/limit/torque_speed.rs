@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 pub(super) const ABOUT: About = About {
     class: "TorqueSpeedLimit",
     promise: "The line of a direct-current motor: `|tau + stall / no_load v| <= stall - margin` in [N·m, N] and [rad/s, \
-        m/s].",
+        m/s], at the speeds with which a period begins and ends.",
     example: "torque_speed = { stall = 80.0, no_load = 3.0 }",
     form: Form::Either,
     margin: "of force, at every speed [N·m, N]",
@@ -45,10 +45,11 @@ pub struct TorqueSpeedSettings {
 /// The line of a direct-current motor, in both directions:
 ///
 /// ```text
-///     |tau + (stall / no_load) v'| <= stall - margin
+///     |tau + (stall / no_load) v'| <= stall - margin,   |tau + (stall / no_load) v| <= stall - margin
 /// ```
 ///
-/// at the speed `v'` the tick ends with. The gearbox's own limit, flat in speed, is [`TorqueLimit`](super::TorqueLimit).
+/// at the speed `v'` that the tick ends with and the speed `v` that it begins with: the force acts all the while, and the speed is between the
+/// two. The gearbox's own limit, flat in speed, is [`TorqueLimit`](super::TorqueLimit).
 #[derive(Debug, Clone)]
 pub struct TorqueSpeedLimit {
     settings: TorqueSpeedSettings,
@@ -106,11 +107,12 @@ impl Rows for TorqueSpeedRows {
     }
 
     fn names(&self) -> Vec<String> {
-        self.motors.iter().map(|m| m.joint.clone()).collect()
+        let ends = self.motors.iter().map(|m| m.joint.clone());
+        ends.chain(self.motors.iter().map(|m| format!("{} at the start", m.joint))).collect()
     }
 
     fn sizes(&self) -> Vec<f64> {
-        self.motors.iter().map(|m| m.most).collect()
+        self.motors.iter().chain(&self.motors).map(|m| m.most).collect()
     }
 
     fn needs(&self) -> Needs {
@@ -118,19 +120,25 @@ impl Rows for TorqueSpeedRows {
     }
 
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
+        let starts = self.motors.len();
         for (r, m) in self.motors.iter().enumerate() {
             let i = m.dof;
             tick.motor(i, rows.row(r));
             rows.row(r)[i] += m.slope;
+            tick.motor(i, rows.row(starts + r));
             let still = tick.bias[i] + m.slope * tick.v[i];
-            (rows.lower[r], rows.upper[r]) = (-m.most - still, m.most - still);
+            for r in [r, starts + r] {
+                (rows.lower[r], rows.upper[r]) = (-m.most - still, m.most - still);
+            }
         }
     }
 
     fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]) {
-        for (x, m) in excess.iter_mut().zip(&self.motors) {
-            let share = (motion.torque[m.dof] + m.slope * motion.v_next[m.dof]) / m.most;
-            *x = share.abs() - 1.0;
+        let (ends, starts) = excess.split_at_mut(self.motors.len());
+        for (x, v) in [(ends, motion.v_next), (starts, motion.v)] {
+            for (x, m) in x.iter_mut().zip(&self.motors) {
+                *x = ((motion.torque[m.dof] + m.slope * v[m.dof]) / m.most).abs() - 1.0;
+            }
         }
     }
 }

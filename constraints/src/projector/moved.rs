@@ -198,14 +198,22 @@ impl Projector {
         let m = &mut self.moving;
         let aim = [v + t * way.aim.lower, v + t * way.aim.upper];
         (m.lower[i], m.upper[i]) = (aim[0], aim[1]);
-        let hard = [aim[0].min(way.stop), aim[1].max(way.stop)];
+        // A brake that is the bound itself differs from it by rounding, and does not move it.
+        let rounding = ROUNDING * dof.braking(&self.period).min(1e6) * t;
+        let stop = match way.stop {
+            s if s > aim[1] && s - aim[1] <= rounding => aim[1],
+            s if s < aim[0] && aim[0] - s <= rounding => aim[0],
+            s => s,
+        };
+        let hard = [aim[0].min(stop), aim[1].max(stop)];
         m.speed[i] = wanted.velocity.max(way.stop.abs());
         m.speeding[i] = m.faster[i].max(gain(v, way.stop) / t);
         let f = &mut self.in_force;
         f.q_upper[i] = wanted.upper.max((q + rest.max(0.0)).min(dof.upper));
         f.q_lower[i] = wanted.lower.min((q + rest.min(0.0)).max(dof.lower));
         let beyond = |x: f64, limit: f64| x > limit + POSITION_TOLERANCE;
-        let behind = beyond(f.q_upper[i], wanted.upper) || beyond(-f.q_lower[i], -wanted.lower);
+        let slower = hard[0] < aim[0] || aim[1] < hard[1];
+        let behind = slower || beyond(f.q_upper[i], wanted.upper) || beyond(-f.q_lower[i], -wanted.lower);
         (way.aim, hard, !way.arrived || behind)
     }
 

@@ -232,3 +232,69 @@ fn one_iteration_and_no_time_are_not_enough_and_it_says_so() {
     let deadline = Some(std::time::Duration::from_nanos(1));
     assert!(hard(Settings { deadline, ..settings }).0 > 100);
 }
+
+/// The force that is sent acts from the start of a period to its end: it stays below the motor's line at both speeds.
+#[test]
+fn the_line_of_a_motor_holds_at_the_start_and_at_the_end_of_a_period() {
+    let model = two_joint_arm();
+    let (stall, no_load) = ([40.0, 12.0], 4.0);
+    let by_joint = |values: [f64; 2]| PerJoint::Each(values.to_vec());
+    for (dt, sub_steps) in [(0.005, 0), (0.02, 0), (0.005, 1), (0.02, 1), (0.02, 5)] {
+        let limits: Vec<Box<dyn Limit>> = vec![
+            Box::new(PositionLimit::default()),
+            Box::new(VelocityLimit::scaled(1.0)),
+            Box::new(AccelerationLimit::new(AccelerationSettings::of(PerJoint::All(20.0), None))),
+            Box::new(TorqueSpeedLimit::new(limit::TorqueSpeedSettings {
+                stall: by_joint(stall),
+                no_load: PerJoint::All(no_load),
+                margin: None,
+                soft: None,
+            })),
+        ];
+        let mut projector = Projector::new(&model, &limits, &[0, 1], Settings::new(dt, sub_steps)).unwrap();
+        let mut dynamics = Dynamics::new(&model);
+        let period = Period::new(dt, sub_steps);
+        let (mut q, mut v, mut random) = (vec![1.57, 0.0], vec![0.0; 2], Random(1));
+        let (mut side, mut target, mut tau) = ([1.0; 2], Target::new(&model), [0.0; 2]);
+        let (mut worst, mut moved) = ([f64::MIN; 2], 0.0f64);
+        for tick in 0..4000 {
+            if tick % 20 == 0 {
+                side = std::array::from_fn(|_| if random.next() < 0.5 { -1.0 } else { 1.0 });
+            }
+            let raw = Proposal { q: q.clone(), v: side.iter().map(|s| 100.0 * s).collect() };
+            projector.project(&q, &v, &raw, &mut target);
+            let a: Vec<f64> = (0..2).map(|i| (target.v[i] - v[i]) / dt).collect();
+            dynamics.motors_without_friction(&period, &q, &v, &a, &mut tau);
+            for i in 0..2 {
+                for (worst, v) in worst.iter_mut().zip([v[i], target.v[i]]) {
+                    *worst = worst.max((tau[i] + stall[i] / no_load * v).abs() / stall[i] - 1.0);
+                }
+                moved = moved.max(target.v[i].abs());
+            }
+            (q, v) = (target.q.clone(), target.v.clone());
+        }
+        println!(
+            "{dt} s, {sub_steps} steps: beyond the line by {worst:.1?} at start and end, up to {moved:.2} rad/s"
+        );
+        assert!(worst.iter().all(|x| *x < 1e-9) && moved > 0.5, "{worst:?} {moved}");
+    }
+}
+
+/// Two joints in one plane, the first against gravity.
+fn two_joint_arm() -> Model {
+    let body = |mass: f64| {
+        format!(
+            "<inertial><mass value=\"{mass}\"/><origin xyz=\"0.2 0 0\"/>\
+             <inertia ixx=\"0.02\" iyy=\"0.02\" izz=\"0.02\" ixy=\"0\" ixz=\"0\" iyz=\"0\"/></inertial>"
+        )
+    };
+    let limit = "<limit lower=\"-3\" upper=\"3\" velocity=\"4\" effort=\"100\"/>";
+    Model::from_urdf_text(&format!(
+        "<robot name=\"r\"><link name=\"a\"/><link name=\"b\">{}</link><link name=\"c\">{}</link>\
+         <joint name=\"j\" type=\"revolute\"><parent link=\"a\"/><child link=\"b\"/><axis xyz=\"0 1 0\"/>{limit}</joint>\
+         <joint name=\"k\" type=\"revolute\"><parent link=\"b\"/><child link=\"c\"/><origin xyz=\"0.4 0 0\"/><axis xyz=\"0 1 0\"/>{limit}</joint></robot>",
+        body(2.0),
+        body(1.0),
+    ))
+    .unwrap()
+}

@@ -603,3 +603,62 @@ fn a_payload_weighs_what_a_fixed_link_does() {
     assert!(wrong("tool", -1.0).contains("mass -1 kg") && wrong("tool", f64::NAN).contains("NaN"));
     assert!(wrong("base", 1.0).contains("'base' is fixed to the world"), "{}", wrong("base", 1.0));
 }
+
+/// After limits have moved, a tick that claims the nearest allowed state names what holds every joint back that does not do as proposed.
+#[test]
+fn a_joint_that_moved_limits_hold_back_is_named_in_every_tick_that_claims_the_nearest() {
+    let joints = [0, 1, 2, 3, 4, 5, 6];
+    for (braking, sub_steps) in
+        [(Braking::Auto, 1), (Braking::Stored, 0), (Braking::Stored, 5), (Braking::Certified, 1)]
+    {
+        let (mut claims, mut ways) = (0, 0);
+        for seed in 0..4 {
+            let mut limits = panda_limits(Some(1.0));
+            limits[2] =
+                Box::new(AccelerationLimit::new(limit::AccelerationSettings::of(PerJoint::All(8.0), None)));
+            let settings = Settings { braking, ..Settings::new(0.004, sub_steps) };
+            let mut projector = Projector::new(&panda(), &limits, &joints, settings).unwrap();
+            let mut random = Random(seed);
+            let (mut q, mut v) = (vec![0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0], vec![0.0; 7]);
+            let (mut side, mut target) = ([1.0; 7], Target::new(&panda()));
+            for tick in 0..6000 {
+                if tick % 60 == 0 {
+                    let elbow = random.between(-2.5, -0.2);
+                    let wrist = random.between(1.0, 3.0);
+                    let upper = [("panda_joint4".to_string(), elbow), ("panda_joint6".to_string(), wrist)];
+                    let moved = Moved {
+                        upper: Some(PerJoint::Joints(upper.into_iter().collect())),
+                        ..Moved::speed(random.between(0.2, 1.0))
+                    };
+                    let moved = if random.next() < 0.7 { moved } else { Moved::default() };
+                    let _ = projector.move_limits(&moved);
+                }
+                if random.next() < 0.03 {
+                    side = std::array::from_fn(|_| if random.next() < 0.5 { -1.0 } else { 1.0 });
+                }
+                let raw = Proposal {
+                    q: (0..7).map(|i| q[i] + 10.0 * side[i]).collect(),
+                    v: side.iter().map(|s| 100.0 * s).collect(),
+                };
+                let status = projector.project(&q, &v, &raw, &mut target);
+                let ledger = &target.ledger;
+                ways += usize::from(status == Status::Tightening);
+                let coupled = ledger.active.iter().any(|row| row.row >= 7);
+                if matches!(status, Status::Clamped | Status::Solved) && !coupled {
+                    claims += 1;
+                    for i in 0..7 {
+                        let named = ledger.active.iter().any(|row| row.row == i && row.multiplier > 0.0);
+                        assert!(
+                            named,
+                            "{braking:?} {seed} {tick}: joint {i} {} -> {}: {ledger:?}",
+                            v[i], target.v[i]
+                        );
+                    }
+                }
+                (q, v) = (target.q.clone(), target.v.clone());
+            }
+        }
+        println!("{braking:?}, {sub_steps} steps: {claims} claims, {ways} ticks on the way");
+        assert!(claims > 3000 && ways > 100, "{claims} {ways}");
+    }
+}

@@ -510,7 +510,8 @@ impl Section {
             let row = |(dof, most)| Row::new("jerk", of.name(dof), most, soft, Rule::Jerk { dof, most });
             rows.extend(each(&jerk.limit, &jerk.margin).into_iter().map(row));
         }
-        if let Some(motor) = &self.torque_speed {
+        for at_start in [false, true] {
+            let Some(motor) = &self.torque_speed else { break };
             for &dof in of.controllable {
                 let joint = of.name(dof);
                 if let (Some(stall), Some(no_load)) =
@@ -518,13 +519,9 @@ impl Section {
                 {
                     let friction = of.robot.joints().nth(dof).map_or(0.0, |joint| joint.friction);
                     let most = less(stall, &motor.margin, dof, joint) - friction;
-                    rows.push(Row::new(
-                        "torque_speed",
-                        joint,
-                        most,
-                        motor.soft,
-                        Rule::TorqueSpeed { dof, most, slope: stall / no_load },
-                    ));
+                    let named = if at_start { format!("{joint} at the start") } else { joint.to_owned() };
+                    let rule = Rule::TorqueSpeed { dof, most, slope: stall / no_load, at_start };
+                    rows.push(Row::new("torque_speed", &named, most, motor.soft, rule));
                 }
             }
         }

@@ -65,8 +65,8 @@ pub(crate) struct Equal {
 pub(crate) enum Rule {
     /// `|tau| <= most`.
     Torque { dof: usize, most: f64 },
-    /// `|tau + slope v'| <= most`.
-    TorqueSpeed { dof: usize, most: f64, slope: f64 },
+    /// `|tau + slope v'| <= most`, or with the speed at the start of the period.
+    TorqueSpeed { dof: usize, most: f64, slope: f64, at_start: bool },
     /// `|a - a_before| / T <= most`.
     Jerk { dof: usize, most: f64 },
     /// `|tau - tau_before| / T <= most`.
@@ -170,8 +170,9 @@ impl Row {
     ) -> (f64, f64, &'static str) {
         match &self.rule {
             Rule::Torque { dof, most } => (passage.tau[*dof], *most, "N m or N"),
-            Rule::TorqueSpeed { dof, most, slope } => {
-                (passage.tau[*dof] + slope * passage.v1[*dof], *most, "N m or N")
+            Rule::TorqueSpeed { dof, most, slope, at_start } => {
+                let v = if *at_start { passage.v } else { passage.v1 };
+                (passage.tau[*dof] + slope * v[*dof], *most, "N m or N")
             }
             Rule::Drive { most, .. } => (self.excess(m, p, passage)[1] * most + most, *most, "N m or N"),
             Rule::Jerk { most, .. } => {
@@ -216,8 +217,9 @@ impl Row {
         let none = f64::NEG_INFINITY;
         match &self.rule {
             Rule::Torque { dof, most } => both(passage.tau[*dof], *most),
-            Rule::TorqueSpeed { dof, most, slope } => {
-                both(passage.tau[*dof] + slope * passage.v1[*dof], *most)
+            Rule::TorqueSpeed { dof, most, slope, at_start } => {
+                let v = if *at_start { passage.v } else { passage.v1 };
+                both(passage.tau[*dof] + slope * v[*dof], *most)
             }
             Rule::Jerk { dof, most } => {
                 passage.before.map_or([none; 2], |(a, _)| both((passage.a[*dof] - a[*dof]) / p.dt, *most))
@@ -347,9 +349,9 @@ impl Row {
         match &self.rule {
             Rule::Torque { dof, .. } => force(*dof, 1.0),
             Rule::TorqueRate { dof, .. } => force(*dof, 1.0 / p.dt),
-            Rule::TorqueSpeed { dof, slope, .. } => {
+            Rule::TorqueSpeed { dof, slope, at_start, .. } => {
                 force(*dof, 1.0);
-                out[*dof] += slope;
+                out[*dof] += if *at_start { 0.0 } else { *slope };
             }
             Rule::Drive { dof, stiffness, damping, at_end, .. } => {
                 force(*dof, 1.0);
