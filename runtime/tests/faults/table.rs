@@ -199,8 +199,8 @@ pub const ROWS: &[Row] = &[
     ),
     (
         24,
-        "stale sample: old time stamp, frozen values",
-        "old: brakes; frozen: 3 bridged, then brakes",
+        "stale sample: old time stamp, frozen values, a clock of the plant that stands or runs backwards",
+        "old: brakes; the others: 3 bridged, then brakes",
         &["stale-state", "frozen-state"],
         &[(HERE, "fault_24_stale_and_frozen_samples_brake")],
     ),
