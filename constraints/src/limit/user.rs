@@ -111,7 +111,8 @@ impl UserRow {
         if joint.nq != 1 && quantity == Quantity::Position {
             return Err(unusable("a continuous joint, whose position is (cos, sin) and no angle"));
         }
-        if !(coefficient.abs() <= LARGEST) || coefficient == 0.0 {
+        let sane = coefficient.abs() <= LARGEST; // NaN is not
+        if !sane || coefficient == 0.0 {
             let what = format!("coefficient of '{name}' in row '{}'", self.settings.name);
             let domain = "a number but 0, and at most 1e12 in size";
             return Err(LimitError::BadValue { what, value: coefficient, domain });
