@@ -38,6 +38,7 @@ pub fn flight() -> Attack {
         ),
         dt: DT,
         sub_steps: 1,
+        plant_steps: 0,
         policy_every: 10,
         seed: 5,
         ticks: 40,

@@ -49,6 +49,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         constraints: format!("{LIMITS}{own}"),
         dt,
         sub_steps,
+        plant_steps: 0,
         policy_every: 20,
         seed,
         ticks,

@@ -60,6 +60,10 @@ const FURTHER: f64 = 1e-6;
 /// A joint of several that brake in proportion stands at this speed, which none of the others waits for [rad/s or m/s].
 const STANDS: f64 = 1e-10;
 
+/// A joint that is slower than this share of what a period of its braking takes off stands after one: its share of a longer brake would be next to
+/// no deceleration, with which a plant that is off by a little would not stop it.
+const AT_ONCE: f64 = 1e-4;
+
 /// A brake of more ticks than this is as good as one without ticks.
 const MANY: f64 = 1e5;
 
@@ -352,7 +356,7 @@ impl Backup {
             let least = least.min(most);
             self.least[i] = least;
             self.trial[i] = match plan {
-                _ if speed == 0.0 => most,
+                _ if speed <= AT_ONCE * most * dt => most,
                 Plan::Together(late) => {
                     let ticks = (late * quickest - 1e-9).ceil().max(1.0);
                     (speed / (ticks * dt)).max(least).min(most)

@@ -27,6 +27,8 @@ pub struct Attack {
     pub dt: f64,
     /// Physics steps in it; 0 for constant acceleration.
     pub sub_steps: u32,
+    /// Euler steps in which the plant really moves; 0 is as the period says, which is one or constant acceleration.
+    pub plant_steps: u32,
     pub policy_every: usize,
     pub seed: u64,
     pub ticks: u64,
@@ -187,6 +189,8 @@ impl Attack {
 /// The plant that the model says it is: forces are held for a period.
 struct Twin {
     dynamics: PeriodDynamics,
+    /// Of its period in a control period.
+    steps: u32,
     q: Vec<f64>,
     v: Vec<f64>,
     a: Vec<f64>,
@@ -198,9 +202,13 @@ impl Twin {
     fn new(attack: &Attack) -> Twin {
         let model = attack.model();
         let all: Vec<usize> = (0..model.nv()).collect();
-        let period = nearl_constraints::Period::new(attack.dt, attack.sub_steps);
+        let period = match attack.plant_steps {
+            0 => nearl_constraints::Period::new(attack.dt, attack.sub_steps),
+            steps => nearl_constraints::Period::new(attack.dt / f64::from(steps), 1),
+        };
         let zero = vec![0.0; model.nv()];
         Twin {
+            steps: attack.plant_steps.max(1),
             dynamics: PeriodDynamics::new(&model, &all, period),
             q: attack.start.clone(),
             v: zero.clone(),
@@ -238,12 +246,14 @@ impl Twin {
         }
         self.held.iter_mut().zip(forces).for_each(|(held, tau)| *held = Held::Force(*tau));
         let zero = vec![0.0; self.v.len()];
-        self.dynamics.update(&self.q, &self.v, &zero);
-        self.dynamics.accelerate(&self.held, &mut self.a);
         let (dt, kappa) = (self.dynamics.period().dt, self.dynamics.period().kappa);
-        for i in 0..self.v.len() {
-            self.q[i] += dt * self.v[i] + kappa * dt * dt * self.a[i];
-            self.v[i] += dt * self.a[i];
+        for _ in 0..self.steps {
+            self.dynamics.update(&self.q, &self.v, &zero);
+            self.dynamics.accelerate(&self.held, &mut self.a);
+            for i in 0..self.v.len() {
+                self.q[i] += dt * self.v[i] + kappa * dt * dt * self.a[i];
+                self.v[i] += dt * self.a[i];
+            }
         }
     }
 }

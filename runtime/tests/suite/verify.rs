@@ -31,6 +31,7 @@ fn attack(constraints: &str, dt: f64, sub_steps: u32, policy_every: usize) -> At
         constraints: constraints.into(),
         dt,
         sub_steps,
+        plant_steps: 0,
         policy_every,
         seed: 5,
         ticks: 1500,
@@ -187,6 +188,28 @@ type Alter<'a, T> = &'a dyn Fn(&mut T);
 
 /// Orders of an operator every 0.2 s, and back: speeds, positions, how fast a joint may speed up where jerk is soft, and what ties joints
 /// together.
+/// A plant that moves in several steps, or in next to none, is what the period makes of it to second order. A brake that was verified a tick before
+/// may then end up within the margin, and no further; with no margin to take it up, it ends beyond the limit, and is found.
+#[test]
+fn a_flight_on_a_plant_that_differs_to_second_order_is_verified_within_its_margins() {
+    let limits = LIMITS.replace("25.0", "8.0");
+    for (sub_steps, plant_steps, dt) in [(4, 4, 0.004), (0, 40, 0.004), (5, 5, 0.01)] {
+        let mut braked = 0;
+        for (margin, is_kept) in [("0.01", true), ("0.0", false)] {
+            let limits = limits.replace("margin = 0.01", &format!("margin = {margin}"));
+            let flight = Attack { plant_steps, ticks: 3000, ..attack(&limits, dt, sub_steps, 20) };
+            let (_folder, log) = record("verify-second-order", &flight);
+            let report = verify(&log).unwrap();
+            println!("{sub_steps} {plant_steps} {margin}: {report}");
+            assert_eq!(report.found == 0, is_kept, "{report}");
+            assert!(report.verified + report.found + report.idle == 3000, "{report}");
+            let is_braked = |tick: &Value| (10..=13).contains(&tick["ledger"]["status"].as_u64().unwrap());
+            braked += ticks(&log).iter().filter(|tick| is_braked(tick)).count();
+        }
+        assert!(braked > 20, "{braked}");
+    }
+}
+
 /// Speeds with accelerations of another joint, and sums of positions and of speeds that stay where they are.
 #[test]
 fn rows_of_several_joints_are_verified_with_what_a_brake_keeps_of_them() {

@@ -280,7 +280,10 @@ fn returns(
     }
     let slower = (v.abs() - j.brake(p) * p.dt).max(0.0);
     for s in q.map(|q| sides(j, q, v, v1)).into_iter().flatten() {
-        if s.room < 0.0 && is_above(s.v1, (s.v - j.brake(p) * p.dt).max(0.0)) {
+        // Beyond by rounding it may go on by as little.
+        let is_beyond =
+            s.room < 0.0 && is_above(p.way(s.v, s.v1) - s.room + s.sign * s.limit, s.sign * s.limit);
+        if is_beyond && is_above(s.v1, (s.v - j.brake(p) * p.dt).max(0.0)) {
             return broken(
                 of("speed", &j.name) + ", which is outside,",
                 v1,

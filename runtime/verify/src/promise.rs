@@ -117,6 +117,8 @@ pub(crate) enum Projects {
 pub(crate) struct Promise {
     pub(crate) machine: Machine,
     pub(crate) limits: Limits,
+    /// The same without margins, where the plant is the model to second order only.
+    pub(crate) without_margins: Option<Limits>,
     pub(crate) controllable: Vec<usize>,
     pub(crate) period: Period,
     pub(crate) policy_every: u32,
@@ -152,6 +154,26 @@ fn manifest(bytes: &[u8]) -> Result<String, String> {
         .ok_or_else(|| "its manifest is cut".to_owned())
 }
 
+/// The limits with every margin at 0, but for that of bodies, which is their limit.
+fn without_margins(limits: &Value) -> Value {
+    let mut limits = limits.clone();
+    let kinds = limits.as_object_mut().into_iter().flatten().filter(|(kind, _)| *kind != "collision");
+    for (_, kind) in kinds {
+        let each = match kind {
+            Value::Array(all) => all.iter_mut().collect(),
+            one => vec![one],
+        };
+        for margin in each.into_iter().filter_map(|one| one.get_mut("margin")) {
+            match margin {
+                Value::Object(joints) => joints.values_mut().for_each(|x| *x = 0.0.into()),
+                Value::Array(joints) => joints.iter_mut().for_each(|x| *x = 0.0.into()),
+                all => *all = 0.0.into(),
+            }
+        }
+    }
+    limits
+}
+
 impl Promise {
     /// The promise of a snapshot, given as the bytes of its file; `pinned` takes the place of its limits.
     ///
@@ -168,9 +190,11 @@ impl Promise {
 
     fn of(m: &Manifest, pinned: Option<&Value>) -> Result<Promise, String> {
         let machine = Machine::new(&m.robot)?;
-        let section = pinned.unwrap_or(&m.task.constraints);
-        let section = Section::deserialize(section)
-            .map_err(|e| format!("its limits hold what is not known here: {e}"))?;
+        let written = pinned.unwrap_or(&m.task.constraints);
+        let section = |written: &Value| {
+            Section::deserialize(written).map_err(|e| format!("its limits hold what is not known here: {e}"))
+        };
+        let (bare, section) = (section(&without_margins(written))?, section(written)?);
         let joint = |name: &str| m.robot.joints().position(|j| j.name == name);
         let entry = |name: &String| {
             let (letter, rest) = name.split_once('.')?;
@@ -212,12 +236,9 @@ impl Promise {
                 _ => None,
             })
             .collect();
-        let limits = section.limits(&Of {
-            robot: &m.robot,
-            machine: &machine,
-            controllable: &controllable,
-            drives: &drives,
-        })?;
+        let of = Of { robot: &m.robot, machine: &machine, controllable: &controllable, drives: &drives };
+        let limits = section.limits(&of)?;
+        let without_margins = (sub_steps != 1).then(|| bare.limits(&of)).transpose()?;
         let (is_direct, is_analytic) = (m.policy == "direct", m.task.idm.kind == "pinocchio");
         let guards = section.guard.as_bool() == Some(true);
         let projects = match (is_direct, is_analytic) {
@@ -244,6 +265,7 @@ impl Promise {
         Ok(Promise {
             machine,
             limits,
+            without_margins,
             controllable,
             period,
             policy_every: m.task.time.policy_every.max(1),

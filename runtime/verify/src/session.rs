@@ -364,8 +364,21 @@ impl Session {
         Ok((pq, pv))
     }
 
-    /// Limits, action, optimum and way to stop of one promise.
+    /// Limits, action, optimum and way to stop of one promise. A plant that moves in several steps is off by the second order of its period,
+    /// which margins are for: the brake that was verified a tick before is executed from where it ended, and keeps the limits without them.
     fn confirm(&mut self, promise: &mut Promise, case: &Case<'_>) -> Result<Option<Told>, Fault> {
+        if case.status != Status::Braked || promise.moving.is_some() {
+            return self.confirm_within(promise, case);
+        }
+        let Some(limits) = promise.without_margins.take() else { return self.confirm_within(promise, case) };
+        let with = std::mem::replace(&mut promise.limits, limits);
+        let found = self.confirm_within(promise, case);
+        promise.without_margins = Some(std::mem::replace(&mut promise.limits, with));
+        found
+    }
+
+    /// The same with the promise's limits as they are.
+    fn confirm_within(&mut self, promise: &mut Promise, case: &Case<'_>) -> Result<Option<Told>, Fault> {
         let (tick, p, nv) = (case.tick, promise.period, case.v.len());
         let a: Vec<f64> = (0..nv).map(|i| (tick.target_v[i] - case.v[i]) / p.dt).collect();
         let mut tau = vec![0.0; nv];
