@@ -103,9 +103,10 @@ fn unwritten(file: &Path) -> impl Fn(std::io::Error) -> RunError {
     move |e| RunError::Write { path: file.display().to_string(), reason: e.to_string() }
 }
 
-/// Whether something was learned there: a checkpoint, or a second row of metrics. In the first batch nothing is learned.
+/// Whether something was learned there: a checkpoint, or a row of metrics, of which a run of this program has one before anything is learned.
 fn holds_a_run(path: &Path) -> bool {
-    let rows = |text: String| text.lines().count() > 2;
+    let unlearned = usize::from(path.join("env.json").is_file());
+    let rows = |text: String| text.lines().count() > 1 + unlearned;
     std::fs::read_to_string(path.join("metrics.csv"))
         .map_or_else(|e| e.kind() != std::io::ErrorKind::NotFound, rows)
         || has_checkpoint(path)
