@@ -52,9 +52,12 @@ class Oracle:
             [1 - self.soft @ v / 0.1, 1 + self.soft @ v / 0.1, 0.0]])  # fmt: skip
         hessian = np.diag(np.append(np.full(n, 2 * unit**2), worth * SOFT[1])) / worth
         pull = np.append(2 * unit * goal, -worth * SOFT[0]) / worth
-        A, b = pad(self.equal), [-(self.equal @ v)]
+        A, b, off = pad(self.equal), [-(self.equal @ v)], self.equal @ v
+        if abs(off) > 1e-8:  # a brake left the row: it comes back where the proposal leads it, and goes no further
+            side = pad(np.sign(off) * self.equal)
+            G, h, A, b = np.vstack([G, side, -side]), np.append(h, [0.0, abs(off)]), np.zeros((0, n + 1)), []
         try:
-            x = quadprog.solve_qp(hessian, pull, np.vstack([A, -G]).T, np.concatenate([b, -h]), 1)[0]
+            x = quadprog.solve_qp(hessian, pull, np.vstack([A, -G]).T, np.concatenate([b, -h]), len(b))[0]
         except ValueError:
             return None  # nothing satisfies all rows
         return unit * x[:n]

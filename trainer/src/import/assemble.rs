@@ -41,7 +41,12 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
     let mut said_by = "the policy's metadata".to_string();
     for path in setting.recipes {
         said_by = path.display().to_string();
-        merge(&mut table, said(path, setting.robot)?);
+        let over = said(path, setting.robot)?;
+        // joints that are sent forces have no use for the gains that another file says
+        if over.get("command").and_then(|c| c.get("interface")).and_then(Value::as_str) == Some("effort") {
+            table.remove("command");
+        }
+        merge(&mut table, over);
     }
     if !table.contains_key("policy") {
         return Err(ImportError::NoRecipe { input: network.input_name.clone(), n_in: network.n_in() });
