@@ -12,7 +12,7 @@ unzip -q -j -d "$folder" "$folder"/example_robot_data-*.whl "$robots/z1_descript
     "$robots/ur_description/urdf/ur10_joint_limited_robot.urdf"
 cargo build --release --locked -p nearl-constraints --example attack
 # Ticks of each of the twelve lines of a kind: what is quick has more.
-kinds="joints=1500000 locked=1100000 velocity_profile=1100000 jerk=400000 torque=50000 torque_speed=50000 rows=50000 frame=20000
+kinds="joints=1500000 locked=1100000 velocity_profile=1100000 jerk=400000 torque=50000 torque_speed=50000 rows=50000 mixed_rows=50000 frame=20000
     frame_speed=20000 energy=20000 collision=10000 all=3000 jerk+all=3000 torque+frame_speed=10000 torque+energy=10000 torque+frame=10000
     torque+collision=5000 torque+rows=20000"
 attack() {

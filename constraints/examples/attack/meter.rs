@@ -48,6 +48,8 @@ pub enum Meter {
     TorqueRate { limits: Vec<f64> },
     /// `q_a + 0.7 q_b` between two bounds, `|v_a + v_b|` below one.
     Rows { joints: [usize; 2], lower: f64, upper: f64, most: f64 },
+    /// The speed of one joint and `share` of the acceleration of another.
+    MixedRow { joints: [usize; 2], share: f64, most: f64 },
 }
 
 /// What the measures need.
@@ -163,6 +165,9 @@ impl Gauge {
                 let sum = passage.q_next[*a] + 0.7 * passage.q_next[*b];
                 let speed = (passage.v_next[*a] + passage.v_next[*b]).abs();
                 (sum - upper).max(lower - sum).max(speed / most - 1.0)
+            }
+            Meter::MixedRow { joints: [a, b], share, most } => {
+                (passage.v_next[*a] + share * self.a[*b]).abs() / most - 1.0
             }
         }
     }

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 /// Kinds of limits, each attacked alone and together; the joints' own limits hold in every scene. Hard jerk is not kept together with speed
 /// profiles, so `all` is without it and `jerk+all` without those.
-pub const KINDS: [&str; 13] = [
+pub const KINDS: [&str; 14] = [
     "joints",
     "torque",
     "torque_speed",
@@ -19,6 +19,7 @@ pub const KINDS: [&str; 13] = [
     "energy",
     "collision",
     "rows",
+    "mixed_rows",
     "all",
     "jerk",
     "jerk+all",
@@ -126,6 +127,7 @@ impl<'a> Robot<'a> {
             }
             "collision" => self.bodies(scene),
             "rows" => self.rows(scene),
+            "mixed_rows" => self.mixed_rows(scene),
             "jerk" => {
                 limits.push(Box::new(JerkLimit::hard(JERK)));
                 meters.push(Meter::Jerk { limit: JERK, soft: false });
@@ -232,6 +234,25 @@ impl<'a> Robot<'a> {
         let of = |frame: &str| Ball { frame: self.model.frame(frame).unwrap(), radius: 0.05 };
         let (tool, elbow) = (of(self.frame), of(elbow));
         scene.meters.push(Meter::Collision { tool, elbow, post, radius: 0.08, floor });
+    }
+
+    /// The speed of one joint and the acceleration of another.
+    fn mixed_rows(&self, scene: &mut Scene) {
+        let (a, b) = (self.middle() - 1, self.middle());
+        let (name_a, name_b) = (self.model.dof_name(a), self.model.dof_name(b));
+        let most = 0.4 * self.model.velocity_limit()[a];
+        let share = most / ACCELERATION;
+        scene.limits.push(Box::new(limit::UserRow::new(limit::UserRowSettings {
+            name: "mixed".to_string(),
+            terms: [(format!("v.{name_a}"), 1.0), (format!("a.{name_b}"), share)].into_iter().collect(),
+            lower: Some(-most),
+            upper: Some(most),
+            equals: None,
+            braking: None,
+            margin: 0.0,
+            soft: None,
+        })));
+        scene.meters.push(Meter::MixedRow { joints: [a, b], share, most });
     }
 
     /// A sum of positions that stops in front of its bounds, and a sum of velocities.
