@@ -3,6 +3,9 @@
 use crate::{Dynamics, LimitSet, Model, Period};
 use serde::{Deserialize, Serialize};
 
+/// How the note of a projector begins that says what is made up for, so that what makes up for nothing can leave it out.
+pub const MADE_UP_FOR: &str = "dry friction is made up for";
+
 /// What dry friction is taken to be.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

@@ -76,6 +76,7 @@ pub use drive::Drive;
 pub use dynamics::Dynamics;
 pub use error::{LimitError, ModelError};
 pub use file::{MAX_TASK_BYTES, MAX_TEXT_BYTES, open_regular, read_bounded, read_task_text, read_text};
+pub use friction::MADE_UP_FOR;
 pub use kinematics::{FrameMotion, Kinematics, PointMotion};
 pub use layout::{Entry, LayoutError, StateLayout};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};

@@ -292,7 +292,7 @@ impl ReplayCommand {
             let end = match found.complete {
                 true => "",
                 false => {
-                    "; the log was cut short, by the end of its runtime or later: what came after is not in it"
+                    "; the log was cut short: its runtime did not close it, or a part was lost since, and what came after is not in it"
                 }
             };
             let others = if found.gaps.is_empty() { "" } else { "; others could not be computed" };

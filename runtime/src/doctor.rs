@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use nearl_constraints::{Drive, certify_braking};
+use nearl_constraints::{Drive, MADE_UP_FOR, certify_braking};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
@@ -220,7 +220,7 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     let mut notes = [model.notes(), projector.notes()].concat();
     if m.guards() {
         // Nothing is made up for where actions are guarded.
-        notes.retain(|note| !note.starts_with("dry friction is made up for"));
+        notes.retain(|note| !note.starts_with(MADE_UP_FOR));
         notes.extend(guard_friction(m, parts));
     }
     notes

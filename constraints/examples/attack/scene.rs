@@ -238,45 +238,44 @@ impl<'a> Robot<'a> {
 
     /// The speed of one joint and the acceleration of another.
     fn mixed_rows(&self, scene: &mut Scene) {
-        let (a, b) = (self.middle() - 1, self.middle());
-        let (name_a, name_b) = (self.model.dof_name(a), self.model.dof_name(b));
+        let joints @ [a, _] = [self.middle() - 1, self.middle()];
         let most = 0.4 * self.model.velocity_limit()[a];
         let share = most / ACCELERATION;
-        scene.limits.push(Box::new(limit::UserRow::new(limit::UserRowSettings {
-            name: "mixed".to_string(),
-            terms: [(format!("v.{name_a}"), 1.0), (format!("a.{name_b}"), share)].into_iter().collect(),
-            lower: Some(-most),
-            upper: Some(most),
-            equals: None,
-            braking: None,
-            margin: 0.0,
-            soft: None,
-        })));
-        scene.meters.push(Meter::MixedRow { joints: [a, b], share, most });
+        scene.limits.push(self.row("mixed", joints, [("v", 1.0), ("a", share)], (-most, most), None));
+        scene.meters.push(Meter::MixedRow { joints, share, most });
     }
 
     /// A sum of positions that stops in front of its bounds, and a sum of velocities.
     fn rows(&self, scene: &mut Scene) {
-        let (a, b) = (self.middle() - 1, self.middle());
-        let (name_a, name_b) = (self.model.dof_name(a), self.model.dof_name(b));
+        let joints @ [a, b] = [self.middle() - 1, self.middle()];
         let at = self.start[a] + 0.7 * self.start[b];
         let (lower, upper) = (at - 0.4, at + 0.4);
         let most = 0.6 * self.model.velocity_limit()[a];
-        let row = |name: &str, letter: &str, second: f64, (lower, upper): (f64, f64), braking| {
-            let terms = [(format!("{letter}.{name_a}"), 1.0), (format!("{letter}.{name_b}"), second)];
-            limit::UserRow::new(limit::UserRowSettings {
-                name: name.to_string(),
-                terms: terms.into_iter().collect(),
-                lower: Some(lower),
-                upper: Some(upper),
-                equals: None,
-                braking,
-                margin: 0.0,
-                soft: None,
-            })
-        };
-        scene.limits.push(Box::new(row("positions", "q", 0.7, (lower, upper), Some(2.0))));
-        scene.limits.push(Box::new(row("speeds", "v", 1.0, (-most, most), None)));
-        scene.meters.push(Meter::Rows { joints: [a, b], lower, upper, most });
+        scene.limits.push(self.row("positions", joints, [("q", 1.0), ("q", 0.7)], (lower, upper), Some(2.0)));
+        scene.limits.push(self.row("speeds", joints, [("v", 1.0), ("v", 1.0)], (-most, most), None));
+        scene.meters.push(Meter::Rows { joints, lower, upper, most });
+    }
+
+    /// A sum over two joints: of each what it is a term of, and its coefficient.
+    fn row(
+        &self,
+        name: &str,
+        joints: [usize; 2],
+        terms: [(&str, f64); 2],
+        (lower, upper): (f64, f64),
+        braking: Option<f64>,
+    ) -> Box<dyn Limit> {
+        let of = joints.iter().zip(terms);
+        let terms = of.map(|(i, (letter, c))| (format!("{letter}.{}", self.model.dof_name(*i)), c)).collect();
+        Box::new(limit::UserRow::new(limit::UserRowSettings {
+            name: name.to_string(),
+            terms,
+            lower: Some(lower),
+            upper: Some(upper),
+            equals: None,
+            braking,
+            margin: 0.0,
+            soft: None,
+        }))
     }
 }

@@ -132,8 +132,9 @@ fn rubbing(model: &Model, limits: &LimitSet, dofs: &Dofs, period: &Period) -> Op
     let joints: Vec<String> = dofs.controllable.iter().filter(|i| off[**i] > 0.0).map(joint).collect();
     (!joints.is_empty()).then(|| {
         format!(
-            "dry friction is made up for as MuJoCo has it; where joints rub otherwise, accelerations leave what is asked for, and their limits, by at \
+            "{} as MuJoCo has it; where joints rub otherwise, accelerations leave what is asked for, and their limits, by at \
              most so many rad/s² or m/s²: {}; measure the friction and write it into the robot file",
+            friction::MADE_UP_FOR,
             joints.join(", ")
         )
     })

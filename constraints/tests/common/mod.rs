@@ -26,6 +26,20 @@ pub fn described(name: &str) -> Model {
     Model::from_description(description).unwrap()
 }
 
+/// A row of one's own without bounds: hard, without margin.
+pub fn row(name: &str, terms: &[(&str, f64)]) -> limit::UserRowSettings {
+    limit::UserRowSettings {
+        name: name.into(),
+        terms: terms.iter().map(|(n, c)| (n.to_string(), *c)).collect(),
+        lower: None,
+        upper: None,
+        equals: None,
+        braking: None,
+        margin: 0.0,
+        soft: None,
+    }
+}
+
 /// The robot with a floating base.
 pub fn free(file: &str) -> Model {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/robots").join(file);

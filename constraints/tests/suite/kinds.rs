@@ -5,26 +5,11 @@ use crate::common::*;
 use nearl_constraints::geometry::Shape;
 use nearl_constraints::limit::{AccelerationSettings, UserRowSettings, VelocityProfileSettings};
 use nearl_constraints::*;
-use std::collections::BTreeMap;
 
 fn with(extra: Vec<Box<dyn Limit>>, settings: Settings) -> Projector {
     let mut limits = panda_limits(Some(1.0));
     limits.extend(extra);
     Projector::new(&panda(), &limits, &[0, 1, 2, 3, 4, 5, 6], settings).unwrap()
-}
-
-fn row(name: &str, terms: &[(&str, f64)]) -> UserRowSettings {
-    let terms = terms.iter().map(|(n, c)| (n.to_string(), *c)).collect::<BTreeMap<_, _>>();
-    UserRowSettings {
-        name: name.into(),
-        terms,
-        lower: None,
-        upper: None,
-        equals: None,
-        braking: None,
-        margin: 0.0,
-        soft: None,
-    }
 }
 
 /// Bang-bang proposals at the limits, in closed loop.

@@ -4,19 +4,6 @@ use crate::common::*;
 use nearl_constraints::limit::{AccelerationSettings, UserRowSettings};
 use nearl_constraints::*;
 
-fn row(name: &str, terms: &[(&str, f64)]) -> UserRowSettings {
-    UserRowSettings {
-        name: name.into(),
-        terms: terms.iter().map(|(n, c)| (n.to_string(), *c)).collect(),
-        lower: None,
-        upper: None,
-        equals: None,
-        braking: None,
-        margin: 0.0,
-        soft: None,
-    }
-}
-
 fn between(name: &str, terms: &[(&str, f64)], lower: f64, upper: f64) -> UserRowSettings {
     UserRowSettings { lower: Some(lower), upper: Some(upper), ..row(name, terms) }
 }

@@ -113,7 +113,7 @@ impl fmt::Display for Report {
         if !self.complete {
             writeln!(
                 f,
-                "  not verified: what came after the end of this log, which was cut short by the end of its runtime or later"
+                "  not verified: what came after the end of this log, which was cut short: its runtime did not close it, or a part was lost since"
             )?;
         } else if !self.intact {
             writeln!(
