@@ -1,7 +1,7 @@
 //! Equations of motion of a [`Model`]: `M(q) a + nle(q, v) = tau + passive(q, v)`.
 
 use crate::Model;
-use crate::description::FrictionLaw;
+use crate::friction::MadeUpFor;
 use crate::pinocchio::{self, RawData};
 use crate::viability::Period;
 use std::ffi::c_int;
@@ -129,7 +129,7 @@ impl Dynamics {
 
     /// What the motors supply (nv) to keep acceleration `a` over a period that begins at `q`, `v`, without external forces:
     /// [`Dynamics::motors_without_friction`], and what makes up for the dry friction of the joints, at most [`Model::friction`], as
-    /// [`FrictionLaw`] says.
+    /// [`FrictionLaw`](crate::description::FrictionLaw) says.
     pub fn motors(&mut self, period: &Period, q: &[f64], v: &[f64], a: &[f64], tau: &mut [f64]) {
         self.motors_without_friction(period, q, v, a, tau);
         if self.model.friction().iter().all(|f| *f == 0.0) {
@@ -138,12 +138,7 @@ impl Dynamics {
         let mut m = std::mem::take(&mut self.middle);
         self.before_dampers(period, q, v, a, &mut m);
         for (i, tau) in tau.iter_mut().enumerate() {
-            let f = self.model.friction()[i];
-            if self.model.friction_law()[i] == FrictionLaw::Coulomb {
-                *tau += FrictionLaw::coulomb(f, period, v[i], a[i]);
-            } else if let Some(onset) = self.model.friction_onset()[i].filter(|_| f > 0.0) {
-                *tau += onset.mean(f, period, v[i], a[i], m.step[i]);
-            }
+            *tau += MadeUpFor::of(&self.model, i, period, v[i], a[i], m.step[i]).force;
         }
         self.middle = m;
     }

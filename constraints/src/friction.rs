@@ -25,14 +25,63 @@ pub enum FrictionLaw {
 }
 
 impl FrictionLaw {
-    /// What a motor adds (N·m or N) on average over a period by Coulomb's law. The joint begins at velocity `v` and accelerates with `a`.
-    pub(crate) fn coulomb(f: f64, period: &Period, v: f64, a: f64) -> f64 {
-        let force = |v: f64| f * (v / STANDS);
+    /// What a motor adds on average over a period by Coulomb's law. The joint begins at velocity `v` and accelerates with `a`.
+    pub(crate) fn coulomb(f: f64, period: &Period, v: f64, a: f64) -> MadeUpFor {
+        let (force, slope) = (|v: f64| f * (v / STANDS), f / STANDS);
         if period.sub_steps == 0 {
-            return mean_of_clamp(force(v), force(v + period.dt * a), f);
+            let (force, [_, by_end]) = mean_of_clamp(force(v), force(v + period.dt * a), f);
+            return MadeUpFor { force, by_acceleration: by_end * slope * period.dt, by_solved: 0.0 };
         }
-        let steps = (1..=period.sub_steps).map(|k| force(v + f64::from(k) * period.tau * a).clamp(-f, f));
-        steps.sum::<f64>() / f64::from(period.sub_steps)
+        let steps = (1..=period.sub_steps).map(|k| {
+            let time = f64::from(k) * period.tau;
+            let wanted = force(v + time * a);
+            MadeUpFor::step(wanted, f, [slope * time, 0.0])
+        });
+        MadeUpFor::mean(steps, period.sub_steps)
+    }
+}
+
+/// What motors add on average over a period to make up for the dry friction of a joint.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct MadeUpFor {
+    /// N·m or N.
+    pub(crate) force: f64,
+    /// Its slope by the acceleration, at least 0 [kg·m² or kg].
+    pub(crate) by_acceleration: f64,
+    /// Its slope by the acceleration before an implicit damper takes its share, at least 0 [kg·m² or kg].
+    pub(crate) by_solved: f64,
+}
+
+impl MadeUpFor {
+    /// Of the `i`-th dof of `model`, which begins at velocity `v` and accelerates with `a`; `solved` is the acceleration before an implicit
+    /// damper takes its share.
+    pub(crate) fn of(model: &Model, i: usize, period: &Period, v: f64, a: f64, solved: f64) -> MadeUpFor {
+        let f = model.friction()[i];
+        match (model.friction_law()[i], model.friction_onset()[i]) {
+            (FrictionLaw::Coulomb, _) if f > 0.0 => FrictionLaw::coulomb(f, period, v, a),
+            (FrictionLaw::Mujoco, Some(onset)) if f > 0.0 => onset.mean(f, period, v, a, solved),
+            _ => MadeUpFor::default(),
+        }
+    }
+
+    /// Of one physics step that would take `wanted`, with its slopes where it is less than `f`.
+    fn step(wanted: f64, f: f64, slopes: [f64; 2]) -> MadeUpFor {
+        let [by_acceleration, by_solved] = if wanted.abs() < f { slopes } else { [0.0; 2] };
+        MadeUpFor { force: wanted.clamp(-f, f), by_acceleration, by_solved }
+    }
+
+    fn mean(steps: impl Iterator<Item = MadeUpFor>, n: u32) -> MadeUpFor {
+        let n = f64::from(n);
+        let sum = steps.fold(MadeUpFor::default(), |sum, step| MadeUpFor {
+            force: sum.force + step.force,
+            by_acceleration: sum.by_acceleration + step.by_acceleration,
+            by_solved: sum.by_solved + step.by_solved,
+        });
+        MadeUpFor {
+            force: sum.force / n,
+            by_acceleration: sum.by_acceleration / n,
+            by_solved: sum.by_solved / n,
+        }
     }
 }
 
@@ -63,28 +112,39 @@ impl Onset {
         Onset { inertia: 0.9 / (1.0 - 0.9) / mobility, time: 0.5 * 0.95 * 0.02 }
     }
 
-    /// What a motor adds (N·m or N) on average over a period against friction `f`. The joint begins at velocity `v` and accelerates with `a`;
+    /// What a motor adds on average over a period against friction `f`. The joint begins at velocity `v` and accelerates with `a`;
     /// `solved` is the acceleration before an implicit damper takes its share.
-    pub(crate) fn mean(&self, f: f64, period: &Period, v: f64, a: f64, solved: f64) -> f64 {
+    pub(crate) fn mean(&self, f: f64, period: &Period, v: f64, a: f64, solved: f64) -> MadeUpFor {
         // No time constant of MuJoCo's is below two physics steps.
         let time = self.time.max(0.95 * period.tau);
         let force = |v: f64| self.inertia * (solved + v / time);
         if period.sub_steps == 0 {
-            return mean_of_clamp(force(v), force(v + period.dt * a), f);
+            let (force, [by_start, by_end]) = mean_of_clamp(force(v), force(v + period.dt * a), f);
+            return MadeUpFor {
+                force,
+                by_acceleration: by_end * self.inertia * period.dt / time,
+                by_solved: (by_start + by_end) * self.inertia,
+            };
         }
-        let steps = (0..period.sub_steps).map(|k| force(v + f64::from(k) * period.tau * a).clamp(-f, f));
-        steps.sum::<f64>() / f64::from(period.sub_steps)
+        let steps = (0..period.sub_steps).map(|k| {
+            let gone = f64::from(k) * period.tau;
+            MadeUpFor::step(force(v + gone * a), f, [self.inertia * gone / time, self.inertia])
+        });
+        MadeUpFor::mean(steps, period.sub_steps)
     }
 }
 
-/// Mean of `clamp(x, -f, f)` for `x` that goes evenly from `x0` to `x1`.
-fn mean_of_clamp(x0: f64, x1: f64, f: f64) -> f64 {
+/// Mean of `clamp(x, -f, f)` for `x` that goes evenly from `x0` to `x1`, and its slopes by either.
+fn mean_of_clamp(x0: f64, x1: f64, f: f64) -> (f64, [f64; 2]) {
     // The integral of the clamp: a parabola that goes on as a line.
     let integral = |x: f64| if x.abs() <= f { 0.5 * x * x } else { f * (x.abs() - 0.5 * f) };
-    match (x1 - x0).abs() > 1e-9 * f {
-        true => (integral(x1) - integral(x0)) / (x1 - x0),
-        false => (0.5 * (x0 + x1)).clamp(-f, f),
+    if (x1 - x0).abs() > 1e-9 * f {
+        let mean = (integral(x1) - integral(x0)) / (x1 - x0);
+        let slope = |end: f64, other: f64| ((end.clamp(-f, f) - mean) / (end - other)).max(0.0);
+        return (mean, [slope(x0, x1), slope(x1, x0)]);
     }
+    let middle = 0.5 * (x0 + x1);
+    (middle.clamp(-f, f), if middle.abs() < f { [0.5; 2] } else { [0.0; 2] })
 }
 
 /// Configurations looked at.
@@ -117,7 +177,7 @@ pub(crate) fn doubt(model: &Model, limits: &LimitSet, period: &Period) -> Vec<f6
         for j in (0..nv).filter(|j| model.friction()[*j] > 0.0) {
             let (mut matrix, mut column) = (rows.clone(), vec![0.0; nv]);
             column[j] = 2.0 * model.friction()[j];
-            crate::period_dynamics::solve(nv, &mut matrix, &mut column);
+            crate::period_dynamics::solve(nv, 1, &mut matrix, &mut column);
             off.iter_mut().zip(&column).for_each(|(off, x)| *off += x.abs());
         }
         most.iter_mut().zip(&off).for_each(|(most, off)| *most = most.max(*off));
@@ -134,14 +194,39 @@ mod tests {
     fn coulomb_s_friction_is_against_motion_and_knows_no_sign_at_rest() {
         for sub_steps in [0, 1, 5] {
             let p = Period::new(0.01, sub_steps);
-            assert_eq!(FrictionLaw::coulomb(2.0, &p, 1.0, 3.0), 2.0);
-            assert_eq!(FrictionLaw::coulomb(2.0, &p, -1.0, 3.0), -2.0);
-            assert_eq!(FrictionLaw::coulomb(2.0, &p, 0.0, 0.0), 0.0);
-            assert!(FrictionLaw::coulomb(2.0, &p, 1e-15, -1e-15).abs() < 1e-8);
+            let of = |v, a| FrictionLaw::coulomb(2.0, &p, v, a).force;
+            assert_eq!(of(1.0, 3.0), 2.0);
+            assert_eq!(of(-1.0, 3.0), -2.0);
+            assert_eq!(of(0.0, 0.0), 0.0);
+            assert!(of(1e-15, -1e-15).abs() < 1e-8);
         }
         // From 0.04 to -0.06: two of five periods forward; of five steps the first, the second stands, three are backward.
-        assert!((FrictionLaw::coulomb(2.0, &Period::new(0.01, 0), 0.04, -10.0) + 0.4).abs() < 1e-4);
-        assert!((FrictionLaw::coulomb(2.0, &Period::new(0.01, 5), 0.04, -10.0) + 0.8).abs() < 1e-9);
-        assert_eq!(FrictionLaw::coulomb(2.0, &Period::new(0.01, 1), 0.04, -10.0), -2.0);
+        let of = |sub_steps| FrictionLaw::coulomb(2.0, &Period::new(0.01, sub_steps), 0.04, -10.0).force;
+        assert!((of(0) + 0.4).abs() < 1e-4);
+        assert!((of(5) + 0.8).abs() < 1e-9);
+        assert_eq!(of(1), -2.0);
+    }
+
+    /// Against central differences, where the law has no corner.
+    #[test]
+    fn slopes_are_those_of_the_force() {
+        let onset = Onset { inertia: 0.3, time: 0.0095 };
+        for sub_steps in [0, 1, 5] {
+            let p = Period::new(0.01, sub_steps);
+            for (v, a, solved) in [(0.01, -0.7, -0.9), (0.05, -8.0, -8.5), (-0.02, 3.0, 3.1), (1.0, 3.0, 3.0)]
+            {
+                let at = |a: f64, solved: f64| onset.mean(2.0, &p, v, a, solved);
+                let h = 1e-6;
+                let by_a = (at(a + h, solved).force - at(a - h, solved).force) / (2.0 * h);
+                let by_solved = (at(a, solved + h).force - at(a, solved - h).force) / (2.0 * h);
+                let found = at(a, solved);
+                assert!((found.by_acceleration - by_a).abs() < 1e-7, "{sub_steps} {v}: {found:?} {by_a}");
+                assert!((found.by_solved - by_solved).abs() < 1e-7, "{sub_steps} {v}: {found:?} {by_solved}");
+            }
+            let (v, a, h) = (2e-7, -3e-5, 1e-9);
+            let at = |a: f64| FrictionLaw::coulomb(2.0, &p, v, a);
+            let by_a = (at(a + h).force - at(a - h).force) / (2.0 * h);
+            assert!((at(a).by_acceleration / by_a - 1.0).abs() < 1e-5, "{sub_steps}: {by_a} {:?}", at(a));
+        }
     }
 }

@@ -216,34 +216,15 @@ pub fn told(m: &Manifest) -> Result<Vec<String>, SnapshotError> {
 }
 
 fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
-    let Parts { model, projector, .. } = parts;
+    let Parts { model, projector, layout, .. } = parts;
     let mut notes = [model.notes(), projector.notes()].concat();
-    if m.guards() {
-        // Nothing is made up for where actions are guarded.
+    // Joints that follow positions or velocities by themselves make up for their own friction.
+    let by_force = |drive: &Drive| matches!(drive, Drive::Effort | Drive::Pd { .. });
+    let drives = Parts::drives(m, model, layout.controllable());
+    if drives.is_ok_and(|drives| !layout.controllable().iter().any(|&i| by_force(&drives[i]))) {
         notes.retain(|note| !note.starts_with(MADE_UP_FOR));
-        notes.extend(guard_friction(m, parts));
     }
     notes
-}
-
-/// What dry friction takes from the promise of `guard = true`, whose dynamics know none; joints that follow positions or velocities by themselves
-/// make up for their own.
-fn guard_friction(m: &Manifest, parts: &Parts) -> Option<String> {
-    let Parts { model, layout, .. } = parts;
-    let drives = Parts::drives(m, model, layout.controllable()).ok()?;
-    let rubs = |&&i: &&usize| {
-        let by_force = matches!(drives[i], Drive::Effort | Drive::Pd { .. });
-        by_force && model.friction()[i] > 0.0
-    };
-    let joint = |&i: &usize| format!("'{}' ({} N m or N)", model.dof_name(i), model.friction()[i]);
-    let joints: Vec<String> = layout.controllable().iter().filter(rubs).map(joint).collect();
-    (!joints.is_empty()).then(|| {
-        format!(
-            "guard = true reckons without the dry friction of {}: limits on acceleration and position are not promised there; let the policy propose \
-             states, which is reckoned with it, or set the friction of the file to 0 where the drives make up for it",
-            joints.join(", ")
-        )
-    })
 }
 
 /// Does anything keep the limits at all?
