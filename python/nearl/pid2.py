@@ -49,9 +49,11 @@ class PID2:
         termination: Likewise, true where an episode ends: beside the task's own.
         ranks: The other processes of a training on several hosts, ``nearl.Ranks()``. Every one makes the same agent and learns the same steps;
             without ``reward`` and ``termination``.
+        start_from: Run folder whose networks it starts from in place of fresh ones, of the same or another algorithm, task or limits, as
+            ``nearl train --start-from`` does.
 
     Raises:
-        ValueError: unknown task, algorithm or setting; the message names it.
+        ValueError: unknown task, algorithm or setting, or networks that do not fit; the message names it.
         OSError: a file cannot be read, or ``run`` not written.
     """
 
@@ -69,6 +71,7 @@ class PID2:
         reward: Outcome | None = None,
         termination: Outcome | None = None,
         ranks: Gather | None = None,
+        start_from: str | os.PathLike[str] | None = None,
     ):
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
         if demos is not None:
@@ -77,7 +80,8 @@ class PID2:
         # What is written later goes there, wherever the process has gone meanwhile.
         run = None if run is None or (ranks is not None and ranks.rank != 0) else os.path.abspath(run)
         self._training: _core.Training | None = _core.Training(
-            os.fspath(task), algo, seed, threads, overrides, run, preset, _scorer(reward, termination), reward is not None, ranks
+            os.fspath(task), algo, seed, threads, overrides, run, preset, _scorer(reward, termination), reward is not None, ranks,
+            None if start_from is None else os.path.abspath(start_from),
         )
         self.task, self.algo, self.seed = self._training.task, algo, seed
         self._keep_functions(run, reward, termination)

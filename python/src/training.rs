@@ -85,9 +85,9 @@ fn experience(
 #[pymethods]
 impl Training {
     /// `settings`: overrides of the task file, `key=value`, after those of `preset`. `out`: run folder to write, as `nearl train` does.
-    /// `ranks`: those of a training on several hosts.
+    /// `ranks`: those of a training on several hosts. `start_from`: run folder whose networks it starts from.
     #[new]
-    #[pyo3(signature = (task, algo, seed, threads, settings, out, preset=None, scorer=None, rewards=false, ranks=None))]
+    #[pyo3(signature = (task, algo, seed, threads, settings, out, preset=None, scorer=None, rewards=false, ranks=None, start_from=None))]
     fn new(
         py: Python<'_>,
         task: &str,
@@ -100,6 +100,7 @@ impl Training {
         scorer: Option<Py<PyAny>>,
         rewards: bool,
         ranks: Option<Py<PyAny>>,
+        start_from: Option<PathBuf>,
     ) -> PyResult<Training> {
         let ranks = ranks::read(py, ranks)?;
         py.detach(|| {
@@ -112,7 +113,11 @@ impl Training {
             complete(&mut manifest).map_err(errors::train)?;
             let algo = algo.parse().map_err(|e| errors::train(TrainError::Algorithm(e)))?;
             let request = Request { manifest, algo, steps: 0, seed, threads: threads.max(1) };
-            let training = train::Training::on(&request, &experience).map_err(errors::train)?;
+            let training = match &start_from {
+                Some(run) => train::Training::start_from(&request, &experience, run),
+                None => train::Training::on(&request, &experience),
+            };
+            let training = training.map_err(errors::train)?;
             let advice = train::advice(&request.manifest).map_err(errors::train)?;
             if let Some(out) = &out {
                 RunFolder::create(out, &training.snapshot().manifest, seed, &training.columns())
@@ -167,8 +172,11 @@ impl Training {
             }
             let manifest = &inner.training.snapshot().manifest;
             let algo = manifest.algo.parse().map_err(|e| errors::train(TrainError::Algorithm(e)))?;
-            let warning = train::ends_in_warm_up(algo, manifest.steps.saturating_add(steps), manifest)
-                .map_err(errors::train)?;
+            let warning = match inner.training.starts_warm() {
+                true => None,
+                false => train::ends_in_warm_up(algo, manifest.steps.saturating_add(steps), manifest)
+                    .map_err(errors::train)?,
+            };
             if let Some(out) = &self.out {
                 let held = run_folder::lock(out).map_err(run)?;
                 let file = checkpoint::path_in(out);

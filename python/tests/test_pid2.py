@@ -146,6 +146,21 @@ def test_a_stopped_run_goes_on_exactly(tmp_path: Path) -> None:
     assert part.controller.digest == whole.controller.digest
 
 
+def test_a_training_starts_from_the_networks_of_another(tmp_path: Path) -> None:
+    settings = {"train.n_envs": 4, "train.n_steps": 256, "train.pid2.warmup": 1024}
+    one = nearl.PID2("Hopper-v5", seed=1, settings=settings, run=tmp_path / "one").learn(4096)
+    obs = np.linspace(-1.0, 1.0, 11)
+    two = nearl.PID2("Hopper-v5", seed=2, settings=settings, start_from=tmp_path / "one")
+    np.testing.assert_array_equal(two.predict(obs)[0], one.predict(obs)[0])
+    assert two.num_timesteps == 0
+    slower = nearl.PID2("Hopper-v5", settings={**settings, "constraints.velocity.limit": 6.0}, start_from=tmp_path / "one")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # it has no warm-up to end in
+        slower.learn(2048)
+    with pytest.raises(ValueError, match="--start-from: the networks of '.*one' do not fit 'Walker2d-v5': entry"):
+        nearl.PID2("Walker2d-v5", settings=settings, start_from=tmp_path / "one")
+
+
 def test_a_run_folder_has_checkpoints_on_the_way(tmp_path) -> None:
     seen = []
     agent = nearl.PID2("examples/tasks/cart-pole.toml", algo="ppo", run=tmp_path / "run", threads=1)

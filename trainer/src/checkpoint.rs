@@ -36,6 +36,9 @@ pub struct Header {
     /// Reward or end of a control period were somebody else's code: without it the training cannot go on.
     #[serde(default, alias = "judged", skip_serializing_if = "std::ops::Not::not")]
     pub is_scored_elsewhere: bool,
+    /// It started from the networks of another training, without a warm-up.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub starts_warm: bool,
 }
 
 /// Whole numbers of one environment.
@@ -89,7 +92,9 @@ pub enum CheckpointError {
         reason: String,
     },
     /// Missing, not a regular file, or too large.
-    #[error("cannot use checkpoint '{file}': {reason}; give the run folder of 'nearl train' with --resume")]
+    #[error(
+        "cannot use checkpoint '{file}': {reason}; give the run folder of 'nearl train' with --resume or --start-from"
+    )]
     Unusable {
         /// Path.
         file: String,

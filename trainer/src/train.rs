@@ -9,11 +9,12 @@ mod run;
 mod served;
 mod setup;
 mod source;
+mod start_from;
 
 pub use advice::{advice, ends_in_warm_up};
 pub use columns::COLUMNS;
 pub use ranked::RankedSource;
-pub use run::{resume, resume_on, train, train_on};
+pub use run::{resume, resume_on, train, train_in, train_on};
 pub use served::{ServedError, ServedSource};
 pub use setup::{complete, limit_scale};
 pub use source::{Experience, Source, SourceError};
@@ -112,6 +113,8 @@ pub struct Training {
     imitation: Option<Imitation>,
     /// Batches of the warm-up, after the first.
     warm_ups: u64,
+    /// It started from the networks of another training.
+    starts_warm: bool,
     /// What gives rewards in the task's place.
     scorer: Option<Scorer>,
     /// The last batch: its memory is used again.
@@ -218,6 +221,7 @@ impl Training {
             source,
             imitation,
             warm_ups,
+            starts_warm: false,
             scorer: match experience {
                 Experience::Scored(scorer) => Some(scorer.clone()),
                 _ => None,

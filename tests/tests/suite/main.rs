@@ -28,5 +28,6 @@ mod recipe;
 mod resume;
 mod robots;
 mod schedules;
+mod start_from;
 mod terrain;
 mod user_tasks;

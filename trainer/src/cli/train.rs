@@ -5,7 +5,7 @@ use super::{Failure, at_least_one, cores, say, unstable};
 use crate::checkpoint::{self, Checkpoint};
 use crate::learn::Algorithm;
 use crate::preset::Preset;
-use crate::train::{Experience, Progress, Request, resume_on, train_on};
+use crate::train::{Experience, Progress, Request, Training, resume_on, train_in, train_on};
 use crate::{run_folder, tasks};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -37,6 +37,10 @@ pub(super) struct Train {
     /// if it had never stopped.
     #[arg(long, value_name = "DIR")]
     resume: Option<PathBuf>,
+    /// Start from the networks of the run in this folder, of the same or another algorithm, task or limits: what they read and put out, and
+    /// their sizes, must be the same. Optimisers and schedules begin anew.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["resume", "demos"])]
+    start_from: Option<PathBuf>,
     /// Learn from the running loop of this robot instead of environments of one's own, and push snapshots back while it runs:
     /// `nearl plant TASK --name NAME`, then `nearl run SNAPSHOT --plant NAME --explore SEED`.
     #[arg(long, value_name = "NAME")]
@@ -116,6 +120,8 @@ struct Run {
     algo: Algorithm,
     steps: u64,
     done: u64,
+    /// It has no warm-up.
+    starts_warm: bool,
 }
 
 impl Run {
@@ -141,7 +147,8 @@ impl Run {
             );
         }
         let (algo, done) = (header.manifest.algo.parse()?, header.manifest.steps);
-        Ok(Self { name, algo, steps: steps.unwrap_or(header.total), done })
+        let (steps, starts_warm) = (steps.unwrap_or(header.total), header.starts_warm);
+        Ok(Self { name, algo, steps, done, starts_warm })
     }
 }
 
@@ -183,6 +190,7 @@ impl Train {
                 algo: self.algo.parse()?,
                 steps: self.steps.unwrap_or(STEPS),
                 done: 0,
+                starts_warm: self.start_from.is_some(),
             },
         };
         let out = self
@@ -200,7 +208,9 @@ impl Train {
         let experience = self.experience(&stop)?;
         // Said with the first batch: a training that is refused says why, and nothing else.
         let mut advice = crate::train::advice(&manifest)?;
-        advice.extend(crate::train::ends_in_warm_up(run.algo, run.steps, &manifest)?);
+        if !run.starts_warm {
+            advice.extend(crate::train::ends_in_warm_up(run.algo, run.steps, &manifest)?);
+        }
         let bar = bar(self.json, run.steps);
         let (mut last, mut faults, mut lines) = (None, 0, Lines::new(self.json));
         let report = |p: &Progress, _| {
@@ -218,7 +228,10 @@ impl Train {
             None => {
                 let (algo, steps) = (run.algo, run.steps);
                 let request = Request { manifest, algo, steps, seed: self.seed, threads };
-                train_on(&request, &experience, &out, report)?
+                match &self.start_from {
+                    Some(run) => train_in(&out, Training::start_from(&request, &experience, run)?, report)?,
+                    None => train_on(&request, &experience, &out, report)?,
+                }
             }
         };
         bar.finish_and_clear();

@@ -103,7 +103,17 @@ impl RankedSource {
     fn header(&self, snapshot: &Snapshot) -> Header {
         let (manifest, seed) = (snapshot.manifest.clone(), self.seed);
         let (adam, workers) = (Vec::new(), Vec::new());
-        Header { format: FORMAT, manifest, total: 0, seed, rng: 0, adam, workers, is_scored_elsewhere: false }
+        Header {
+            format: FORMAT,
+            manifest,
+            total: 0,
+            seed,
+            rng: 0,
+            adam,
+            workers,
+            is_scored_elsewhere: false,
+            starts_warm: false,
+        }
     }
 
     fn different(&self, other: usize, what: String) -> String {

@@ -4,12 +4,13 @@ use super::{Experience, Request, TrainError, Training};
 use crate::checkpoint::{self, Checkpoint, CheckpointError, FORMAT, Header, Values};
 use crate::learn::Params;
 use crate::run_folder::RunFolder;
+use crate::stats::RunningStats;
 use nearl_runtime::net::kernel::{LANES, V, scalars, scalars_mut};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Margins of `[constraints] reached`.
-const MARGINS: &str = "margins";
+pub(super) const MARGINS: &str = "margins";
 
 impl Training {
     /// Everything the next iteration depends on.
@@ -28,6 +29,7 @@ impl Training {
             adam: params.adam.iter().map(|a| a.t).collect(),
             workers: Vec::new(),
             is_scored_elsewhere: self.scorer.is_some(),
+            starts_warm: self.starts_warm,
         };
         let mut to = Checkpoint { header, tensors: BTreeMap::new() };
         let mut put = |name: String, values: Values| to.tensors.insert(name, values);
@@ -111,18 +113,7 @@ impl Training {
 
     fn restore(&mut self, from: &mut Checkpoint) -> Result<(), String> {
         self.learner.restore(&mut |params| restore_params(params, from))?;
-        for (name, stats) in [
-            ("stats.obs", &mut self.obs_stats),
-            ("stats.change", &mut self.change_stats),
-            ("stats.return", &mut self.return_stats),
-        ] {
-            let n = stats.to_vec().len();
-            stats.set(&from.take_f64(name, Some(n))?);
-        }
-        if self.dims.n_privileged > 0 {
-            let n = self.privileged_stats.to_vec().len();
-            self.privileged_stats.set(&from.take_f64("stats.privileged", Some(n))?);
-        }
+        take_statistics(self, from)?;
         if self.settings.cost.is_limited() {
             let n = self.cost_stats.to_vec().len();
             self.cost_stats.set(&from.take_f64("stats.cost", Some(n))?);
@@ -139,6 +130,9 @@ impl Training {
             return Err(format!("it learned from other demonstrations than '{file}' holds now"));
         }
         self.rng.set_word_pos(from.header.rng.into());
+        if from.header.starts_warm {
+            (self.warm_ups, self.starts_warm) = (0, true);
+        }
         let n = self.snapshot.networks.margins.len();
         if n > 0 {
             self.snapshot.networks.margins = from.take_f64(MARGINS, Some(n))?;
@@ -170,15 +164,37 @@ fn f32s(p: &[V]) -> Values {
     Values::F32(scalars(p).to_vec())
 }
 
+/// Takes the statistics of what was seen.
+pub(super) fn take_statistics(to: &mut Training, from: &mut Checkpoint) -> Result<(), String> {
+    let mut take = |name: &str, stats: &mut RunningStats| -> Result<(), String> {
+        let n = stats.to_vec().len();
+        stats.set(&from.take_f64(name, Some(n))?);
+        Ok(())
+    };
+    take("stats.obs", &mut to.obs_stats)?;
+    take("stats.change", &mut to.change_stats)?;
+    take("stats.return", &mut to.return_stats)?;
+    if to.dims.n_privileged > 0 {
+        take("stats.privileged", &mut to.privileged_stats)?;
+    }
+    Ok(())
+}
+
+/// Takes the weights of the `n`-th group.
+pub(super) fn take_group(params: &mut Params, n: usize, from: &mut Checkpoint) -> Result<(), String> {
+    let to = &mut params.groups[n].p;
+    let values = from.take_f32(&format!("group.{n}"), to.len() * LANES)?;
+    scalars_mut(to).copy_from_slice(&values);
+    Ok(())
+}
+
 fn restore_params(params: &mut Params, from: &mut Checkpoint) -> Result<(), String> {
+    (0..params.groups.len()).try_for_each(|n| take_group(params, n, from))?;
     let mut fill = |name: String, to: &mut [V]| -> Result<(), String> {
         let values = from.take_f32(&name, to.len() * LANES)?;
         scalars_mut(to).copy_from_slice(&values);
         Ok(())
     };
-    for (i, group) in params.groups.iter_mut().enumerate() {
-        fill(format!("group.{i}"), &mut group.p)?;
-    }
     for (i, adam) in params.adam.iter_mut().enumerate() {
         fill(format!("adam.{i}.m"), &mut adam.m)?;
         fill(format!("adam.{i}.v"), &mut adam.v)?;

@@ -27,8 +27,19 @@ pub fn train_on(
     out: &Path,
     report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
-    let training = Training::on(request, experience)?;
-    let folder = RunFolder::create(out, &training.snapshot().manifest, request.seed, &training.columns())?;
+    train_in(out, Training::on(request, experience)?, report)
+}
+
+/// [`train`] with a training that has been made already.
+///
+/// # Errors
+/// [`TrainError`].
+pub fn train_in(
+    out: &Path,
+    training: Training,
+    report: impl FnMut(&Progress, f64) -> bool,
+) -> Result<PathBuf, TrainError> {
+    let folder = RunFolder::create(out, &training.snapshot().manifest, training.seed, &training.columns())?;
     run(training, folder, report)
 }
 

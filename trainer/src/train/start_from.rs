@@ -1,0 +1,167 @@
+//! A training that starts from the networks of another one.
+
+use super::resume::{MARGINS, take_group, take_statistics};
+use super::setup::{dims, limit_scale, warm_up_of_pid2};
+use super::{Experience, Request, TrainError, Training};
+use crate::checkpoint::{self, Checkpoint};
+use crate::learn::Algorithm;
+use crate::settings::{ChangeScale, TrainSettings};
+use nearl_runtime::controller::Parts;
+use nearl_runtime::{Manifest, PolicyKind};
+use std::path::Path;
+
+impl Training {
+    /// [`Training::on`] with the networks and statistics of the run in folder `run` in place of fresh ones. Limits, reward, reset, seed and algorithm
+    /// may be others; what the networks read and put out may not, nor their sizes. Optimisers, episodes and schedules begin anew, and there is no
+    /// warm-up. Networks that the run had none of are fresh.
+    ///
+    /// # Errors
+    /// [`TrainError`]: what [`Training::on`] refuses, a run without a checkpoint, or networks that do not fit.
+    pub fn start_from(request: &Request, experience: &Experience, run: &Path) -> Result<Self, TrainError> {
+        let mut from = Checkpoint::load(&checkpoint::path_in(run))?;
+        let mut training = Self::on(request, experience)?;
+        if training.imitation.is_some() {
+            return Err(TrainError::Settings(format!(
+                "--start-from: '{}' begins with its demonstrations; leave one of both out",
+                request.algo
+            )));
+        }
+        let refuse = |reason| {
+            TrainError::Settings(format!(
+                "--start-from: the networks of '{}' do not fit '{}': {reason}",
+                run.display(),
+                request.manifest.task.name
+            ))
+        };
+        let ours = &training.snapshot.manifest;
+        if let Some(reason) = misfit(&from.header.manifest, training.algo, ours, &training.settings)? {
+            return Err(refuse(reason));
+        }
+        training.take(&mut from).map_err(refuse)?;
+        Ok(training)
+    }
+
+    /// Whether it started from the networks of another training, and has no warm-up.
+    pub fn starts_warm(&self) -> bool {
+        self.starts_warm
+    }
+
+    fn take(&mut self, from: &mut Checkpoint) -> Result<(), String> {
+        let same = from.header.manifest.algo == self.snapshot.manifest.algo;
+        self.learner.restore(&mut |params| {
+            params.beta = from.take_f32("beta", 1)?[0];
+            // policy, with its inverse model, and value
+            (0..2).try_for_each(|n| take_group(params, n, from))?;
+            let has = |n: usize| from.tensors.contains_key(&format!("group.{n}"));
+            let others: Vec<usize> = (2..params.groups.len()).filter(|n| same && has(*n)).collect();
+            others.into_iter().try_for_each(|n| take_group(params, n, from))
+        })?;
+        take_statistics(self, from)?;
+        let n = self.snapshot.networks.margins.len();
+        if n > 0
+            && let Ok(margins) = from.take_f64(MARGINS, Some(n))
+        {
+            self.snapshot.networks.margins = margins;
+        }
+        (self.warm_ups, self.starts_warm) = (0, true);
+        let normaliser = self.normaliser();
+        self.renew(&normaliser);
+        Ok(())
+    }
+}
+
+/// What networks of `theirs` read or put out that is not that of `ours`, or another size.
+fn misfit(
+    theirs: &Manifest,
+    algo: Algorithm,
+    ours: &Manifest,
+    settings: &TrainSettings,
+) -> Result<Option<String>, TrainError> {
+    let their_algo: Algorithm = theirs.algo.parse().map_err(TrainError::Algorithm)?;
+    let their_settings = TrainSettings::read(&theirs.task.train).map_err(TrainError::Settings)?;
+    let (their_parts, parts) = (Parts::new(theirs)?, Parts::new(ours)?);
+    let proposed = |parts: &Parts| -> Vec<String> {
+        (0..parts.layout.n_state()).map(|k| parts.layout.state_name(k).to_string()).collect()
+    };
+    let read = |m: &Manifest| m.task.state.observation.clone();
+    let private = |m: &Manifest| m.task.state.privileged.clone();
+    let differ = [
+        ("the observation", "state.observation", read(theirs), read(ours)),
+        ("what the value sees besides", "state.privileged", private(theirs), private(ours)),
+        ("the proposed state", "state.propose", proposed(&their_parts), proposed(&parts)),
+    ];
+    for (what, key, theirs, ours) in differ {
+        if let Some(reason) = other_entry(what, key, &theirs, &ours) {
+            return Ok(Some(reason));
+        }
+    }
+    let (have, need) = (theirs.action_lower.len(), ours.action_lower.len());
+    if have != need {
+        return Ok(Some(format!("its actions have {have} entries, and {need} are needed")));
+    }
+    if theirs.policy != ours.policy {
+        return Ok(Some(format!(
+            "a policy of '{their_algo}' is {} there and one of '{algo}' is {} here; give the same algorithm, inverse model ([idm]) and train.exploration",
+            kind(theirs.policy),
+            kind(ours.policy)
+        )));
+    }
+    if theirs.task.policy != ours.task.policy {
+        return Ok(Some("[policy] is another there, and the networks see something else".into()));
+    }
+    let n = ours.task.state.privileged.len();
+    if dims(theirs, &their_parts, n)? != dims(ours, &parts, n)? {
+        return Ok(Some("the inverse model sees other entries of the state there; give the same [idm] and state.controllable".into()));
+    }
+    if let Some(key) = other_sizes(&their_settings, settings) {
+        return Ok(Some(format!(
+            "[train.nets] has another {key} there; give the same sizes, or the same --preset"
+        )));
+    }
+    let warm = |algo, settings| warm_up_of_pid2(algo, settings) > 0;
+    if warm(their_algo, &their_settings) != warm(algo, settings) {
+        return Ok(Some(format!(
+            "train.pid2.warmup is {} there and {} here, and makes other networks; make both 0 or both more",
+            warm_up_of_pid2(their_algo, &their_settings),
+            warm_up_of_pid2(algo, settings)
+        )));
+    }
+    let (a, b) = (&their_settings, settings);
+    if (a.normalise_obs, a.change_scale) != (b.normalise_obs, b.change_scale) {
+        return Ok(Some("train.normalise_obs or train.change_scale is another there; give the same".into()));
+    }
+    if b.change_scale == ChangeScale::Limits
+        && limit_scale(&their_parts, theirs)? != limit_scale(&parts, ours)?
+    {
+        return Ok(Some(
+            "train.change_scale = \"limits\" makes a proposal mean something else under other limits; train both with \"running\"".into(),
+        ));
+    }
+    Ok(None)
+}
+
+fn kind(policy: PolicyKind) -> &'static str {
+    match policy {
+        PolicyKind::Direct => "one of actions",
+        PolicyKind::Deterministic => "one of states that explores in its actions",
+        PolicyKind::Stochastic => "one of states that explores in its proposals",
+    }
+}
+
+/// The first entry in which two lists differ.
+fn other_entry(what: &str, key: &str, theirs: &[String], ours: &[String]) -> Option<String> {
+    let n = theirs.len().max(ours.len());
+    let at = (0..n).find(|&k| theirs.get(k) != ours.get(k))?;
+    let name = |list: &[String]| list.get(at).map_or("nothing".to_string(), |name| format!("'{name}'"));
+    Some(format!("entry {at} of {what} is {} there and {} here ({key})", name(theirs), name(ours)))
+}
+
+/// The first size in which the networks differ.
+fn other_sizes(theirs: &TrainSettings, ours: &TrainSettings) -> Option<String> {
+    let table = |s: &TrainSettings| {
+        toml::Table::try_from(&s.nets).unwrap_or_else(|e| unreachable!("it was read from TOML: {e}"))
+    };
+    let (a, b) = (table(theirs), table(ours));
+    let differs = |key: &&String| a.get(*key) != b.get(*key);
+    b.keys().find(differs).map(|key| format!("{key} ({} there, {} here)", a[key], b[key]))
+}
