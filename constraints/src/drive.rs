@@ -102,6 +102,19 @@ impl Drive {
         }
     }
 
+    /// How far from where its joint is a command may have to be \[rad or m\] for all of `effort` at any speed up to `speed`; 0 for what is no
+    /// target. A brake that is gentler than the drive's own damping asks for the most:
+    ///
+    /// ```text
+    ///     (effort + D speed) / K + T speed
+    /// ```
+    pub fn reach(&self, period: &Period, effort: f64, speed: f64) -> f64 {
+        match *self {
+            Drive::Pd { stiffness, damping } => (effort + damping * speed) / stiffness + period.dt * speed,
+            _ => 0.0,
+        }
+    }
+
     /// Its name in the task file.
     pub fn name(&self) -> &'static str {
         match self {

@@ -179,9 +179,14 @@ impl Reader {
         // A zero means that nobody filled it in.
         (joint.velocity, joint.effort) =
             (limit("velocity").filter(|x| *x > 0.0), limit("effort").filter(|x| *x > 0.0));
-        let dynamics = |key| number(children(node, "dynamics").next()?, key);
-        (joint.damping, joint.friction) =
-            (dynamics("damping").unwrap_or(0.0), dynamics("friction").unwrap_or(0.0));
+        let dynamics = children(node, "dynamics").next();
+        [joint.damping, joint.friction] = ["damping", "friction"].map(|key| {
+            let Some(text) = dynamics.and_then(|dynamics| dynamics.attribute(key)) else { return 0.0 };
+            finite(text).unwrap_or_else(|| {
+                self.wrong.push(format!("joint '{name}' has <dynamics> {key} '{text}', not a number"));
+                0.0
+            })
+        });
         let order = self.robot.motors.len();
         self.robot.motors.push(Motor::direct(name, order, joint.effort));
         Some(joint)

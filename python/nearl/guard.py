@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 PerJoint = float | Mapping[str, float]
 
 
-class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
+class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """Keeps the joints of a ``MujocoEnv`` within position and velocity limits, as far as any single action can.
 
         env = nearl.Guard(gymnasium.make("HalfCheetah-v5"), {"position": {}, "velocity": {"limit": 25.0}})
@@ -48,7 +48,8 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
     ):
         import mujoco
 
-        super().__init__(env)
+        gymnasium.utils.RecordConstructorArgs.__init__(self, constraints=constraints, ctrl=ctrl, seed=seed, unavoidable=unavoidable)
+        gymnasium.Wrapper.__init__(self, env)
         if unavoidable not in ("least", "kept"):
             raise ValueError(f"unavoidable is '{unavoidable}'; give 'least' or 'kept'")
         self._keeps = unavoidable == "kept"
@@ -121,9 +122,13 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _limits(self, constraints: Mapping[str, Mapping[str, PerJoint]]) -> tuple[dict[int, tuple[float, float]], dict[int, float]]:
         keys = {"position": "margin", "velocity": "limit"}
+        if not isinstance(constraints, Mapping):
+            raise ValueError(f"constraints is {constraints!r}; give a table, e.g. {{'position': {{}}, 'velocity': {{'limit': 25.0}}}}")
         for name, settings in constraints.items():
             if name not in keys:
                 raise ValueError(f"the guard of a simulator knows 'position' and 'velocity', not '{name}'; a task file has the others")
+            if not isinstance(settings, Mapping):
+                raise ValueError(f"{name} is {settings!r}; give a table, {{'{keys[name]}': {settings!r}}}")
             if unknown := settings.keys() - {keys[name]}:
                 raise ValueError(f"{name} has no '{min(unknown)}'; it has '{keys[name]}'")
         m, joint = self._model, self._mujoco.mjtJoint

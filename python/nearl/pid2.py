@@ -39,7 +39,7 @@ class PID2:
         algo: Name of the algorithm, one of ``nearl.algorithms()``.
         seed: Of everything random; the same seed gives the same weights whatever the number of threads.
         threads: At least 1; all cores by default.
-        settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.scale": 0.8}``.
+        settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.limit": 12.0}``.
         preset: Settings by name, ``"paper"`` or ``"strong"``; ``settings`` come after them.
         demos: Demonstrations (``.npz``) for ``bc``, ``soil``, ``dapg``, ``pid2-il``, ``bco`` and ``gaifo``; ``nearl demos record RUN`` writes some.
         run: Run folder to write as ``nearl train`` does, from where the process is now; none by default. Of several ranks the first writes it.

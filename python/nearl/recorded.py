@@ -29,7 +29,10 @@ def column(columns: Columns, name: str, n: int, where: str) -> Floats:
     """A column (n) by its name, all of it finite."""
     if name not in columns:
         raise BadDemonstrations(f"{where}: no column '{name}'; it has {', '.join(columns)}")
-    values = np.asarray(columns[name], float)
+    try:
+        values = np.asarray(columns[name], float)
+    except (TypeError, ValueError):
+        raise BadDemonstrations(f"{where}: column '{name}' holds what is no number") from None
     if values.shape != (n,):
         raise BadDemonstrations(f"{where}: column '{name}' has shape {values.shape} where the others have {n} rows")
     bad = np.flatnonzero(~np.isfinite(values))

@@ -120,8 +120,11 @@ impl Training {
             let training = training.map_err(errors::train)?;
             let advice = train::advice(&request.manifest).map_err(errors::train)?;
             if let Some(out) = &out {
-                RunFolder::create(out, &training.snapshot().manifest, seed, &training.columns())
-                    .map_err(run)?;
+                let folder = RunFolder::create(out, &training.snapshot().manifest, seed, &training.columns());
+                let folder = folder.map_err(run)?;
+                if let Some(origin) = training.origin() {
+                    folder.tell("start_from", origin).map_err(run)?;
+                }
             }
             Ok((Training::of(training, out, raised), advice))
         })

@@ -157,7 +157,7 @@ def test_a_training_starts_from_the_networks_of_another(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # it has no warm-up to end in
         slower.learn(2048)
-    with pytest.raises(ValueError, match="--start-from: the networks of '.*one' do not fit 'Walker2d-v5': entry"):
+    with pytest.raises(ValueError, match="start_from: the networks of '.*one' do not fit 'Walker2d-v5': entry"):
         nearl.PID2("Walker2d-v5", settings=settings, start_from=tmp_path / "one")
 
 

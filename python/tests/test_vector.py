@@ -1,6 +1,7 @@
 """A vector is its single environments, on any number of threads; and its constrained form is the controller's path."""
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -167,3 +168,82 @@ def test_a_proposed_velocity_ranges_over_the_tasks_limit_where_the_robot_file_ha
     vec = nearl.make_vec("tests/fixtures/two_link.toml", 1, constraints="task")  # an MJCF, which states no speed; the task says 4 rad/s
     assert np.isfinite(vec.single_action_space.low).all()
     assert vec.single_action_space.high[2:] == pytest.approx([4.0, 4.0]) and vec.single_action_space.low[2:] == pytest.approx([-4.0, -4.0])
+
+
+DAMPED = """name = "r"
+[model]
+urdf = "r.urdf"
+[scene]
+timestep = 0.001
+solids = false
+[time]
+dt = 0.001
+sim_dt = 0.001
+max_episode_steps = 10000
+[state]
+controllable = ["j"]
+[command]
+interface = "pd"
+stiffness = 100
+damping = 20
+[reward]
+still = "1"
+[policy]
+joints = ["j"]
+observation = [{ term = "joint_pos" }, { term = "joint_vel" }, { term = "last_action" }]
+[constraints]
+guard = true
+position = { margin = 0.02 }
+velocity = { limit = 3.0 }
+acceleration = { limit = 10.0 }
+torque = {}
+[idm]
+kind = "pinocchio"
+"""
+LINK = """<robot name="r"><link name="base"/><link name="arm">
+<inertial><mass value="1"/><inertia ixx=".2" iyy=".2" izz=".2" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" effort="6" velocity="3"/></joint></robot>"""
+
+
+def test_a_drive_whose_damping_is_the_stronger_brake_is_sent_far_enough(tmp_path: Path) -> None:
+    """Its own damping brakes at 300 rad/s² of 10 from full speed: a gentle brake needs a target far beyond the joint's range. The task's recipe is for
+    its policy, and whoever gives the actions has another."""
+    (tmp_path / "r.urdf").write_text(LINK)
+    (tmp_path / "r.toml").write_text(DAMPED)
+    env = nearl.make_vec(str(tmp_path / "r.toml"), 1, constraints="task", actions="guarded")
+    env.reset(seed=0)
+    worst = fastest = 0.0
+    for tick in range(2800):
+        before = env.native.qvel[0, 0]
+        env.step([env.native.action_high if tick // 700 % 2 == 0 else env.native.action_low])
+        worst, fastest = max(worst, abs(env.native.qvel[0, 0] - before) / 1e-3), max(fastest, abs(before))
+    assert worst < 10.0 + 1e-6
+    assert fastest > 2.8
+
+
+def test_what_changes_stops_and_friction_is_told() -> None:
+    def notes(option: str, joint: str) -> str:
+        text = f"""<mujoco><compiler angle="radian"/>{option}<worldbody><body><joint name="j" axis="0 1 0" range="-1 1" {joint}/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03"/></body></worldbody><actuator><motor joint="j" ctrlrange="-40 40"/></actuator></mujoco>"""
+        return "; ".join(nearl.Model.from_mjcf_text(text).notes)
+
+    assert notes("", 'frictionloss="2"') == ""
+    assert "stops that act before the range ends (margin of a joint) are not modelled: 'j' by 0.05" in notes("", 'margin="0.05"')
+    assert "noslip_iterations change dry friction" in notes('<option noslip_iterations="5"/>', 'frictionloss="2"')
+    assert notes('<option noslip_iterations="5"/>', "") == ""
+    for hurried in ('iterations="1"', 'ls_iterations="1"', 'tolerance="1e-2"'):
+        assert "its dry friction is then not what is modelled" in notes(f"<option {hurried}/>", 'frictionloss="2"')
+    unconstrained = '<option><flag constraint="disable"/></option>'
+    model = nearl.Model.from_mjcf_text(
+        f"""<mujoco>{unconstrained}<worldbody><body><joint name="j" frictionloss="2"/><geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    assert model.friction[0] == 0.0
+
+
+@pytest.mark.parametrize("text", ["2.5N", "1,5", "nan", "inf", "0x10", ""])
+def test_friction_and_damping_that_are_no_numbers_are_refused(text: str) -> None:
+    for key in ("friction", "damping"):
+        urdf = LINK.replace("</joint>", f'<dynamics {key}="{text}"/></joint>')
+        with pytest.raises(ValueError, match=f"joint 'j' has <dynamics> {key} '{text}', not a number"):
+            nearl.Model.from_urdf_text(urdf)

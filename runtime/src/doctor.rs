@@ -221,10 +221,39 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     // Joints that follow positions or velocities by themselves make up for their own friction.
     let by_force = |drive: &Drive| matches!(drive, Drive::Effort | Drive::Pd { .. });
     let drives = Parts::drives(m, model, layout.controllable());
-    if drives.is_ok_and(|drives| !layout.controllable().iter().any(|&i| by_force(&drives[i]))) {
+    let Ok(drives) = drives else { return notes };
+    if !layout.controllable().iter().any(|&i| by_force(&drives[i])) {
         notes.retain(|note| !note.starts_with(MADE_UP_FOR));
     }
+    notes.extend(cut_targets(m, parts, &drives));
     notes
+}
+
+/// Targets that a drive is not sent because its range ends before.
+fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> {
+    let Parts { model, layout, projector } = parts;
+    let (dofs, limits) = (layout.controllable(), projector.limits());
+    let motors = Parts::motors(model, dofs, drives).ok()?;
+    let cut = |(k, &i): (usize, &usize)| {
+        let reach = drives[i].reach(&m.task.period(), limits.effort[i], limits.velocity[i]);
+        let ends = [*m.action_lower.get(motors.place(k))?, *m.action_upper.get(motors.place(k))?];
+        let [low, high] = ends.map(|end| motors.command(k, end));
+        let [needed_low, needed_high] = [limits.q_lower[i] - reach, limits.q_upper[i] + reach];
+        let short =
+            reach.is_finite() && reach > 0.0 && (low > needed_low + 1e-9 || high < needed_high - 1e-9);
+        let short = short && needed_low.is_finite() && needed_high.is_finite();
+        short.then(|| {
+            format!("'{}' from {low:.3} to {high:.3} where braking may ask for {needed_low:.3} to {needed_high:.3}", model.dof_name(i))
+        })
+    };
+    let joints: Vec<String> = dofs.iter().enumerate().filter_map(cut).collect();
+    (!joints.is_empty()).then(|| {
+        format!(
+            "a drive's targets are cut at its range, and limits on acceleration and position are not promised where they are: {} [rad or m]; \
+             give the actuators that ctrlrange, less speed or less damping",
+            joints.join(", ")
+        )
+    })
 }
 
 /// Does anything keep the limits at all?

@@ -60,7 +60,10 @@ fn range(manifest: &mut Manifest) -> Result<(), VectorError> {
         let (lower, upper) = (model.lower_position_limit()[iq], model.upper_position_limit()[iq]);
         let (low, high) = match drives[dof] {
             Drive::Effort => (motors.action(k, -effort), motors.action(k, effort)),
-            Drive::Pd { stiffness, .. } => (lower - effort / stiffness, upper + effort / stiffness),
+            Drive::Pd { .. } => {
+                let reach = drives[dof].reach(&manifest.task.period(), effort, model.velocity_limit()[dof]);
+                (lower - reach, upper + reach)
+            }
             Drive::Position => (lower, upper),
             Drive::Velocity => (-model.velocity_limit()[dof], model.velocity_limit()[dof]),
         };

@@ -62,6 +62,7 @@ pub use soil::Soil;
 use nearl_runtime::Networks;
 use nearl_runtime::normaliser::Normaliser;
 use rand_chacha::ChaCha8Rng;
+use std::ops::Range;
 
 /// Sizes of a task in network space.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -91,6 +92,8 @@ pub trait Learner: Send {
     fn params(&self) -> &Params;
     /// Takes `f` to everything an update changes, then refreshes what follows from it.
     fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String>;
+    /// Where the log standard deviations of what explores lie in the first group [vectors].
+    fn spreads(&self) -> Vec<Range<usize>>;
     /// Value of each row of `x` (n x n_obs).
     fn values(&mut self, x: &[f32]) -> Vec<f32>;
     /// Learns from a batch at the pace of the run's schedule; `rng` orders the minibatches and draws noise. Log probabilities, advantages

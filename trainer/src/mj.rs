@@ -300,9 +300,9 @@ impl Model {
         }
     }
 
-    /// How far from where its joint is a position drive has to be sent for its largest force \[rad or m\].
-    pub fn reach(&self, id: usize) -> f64 {
-        self.0.actuator_forcerange()[id][1] / self.0.actuator_gainprm()[id][0]
+    /// The largest force of actuator `id` [N·m or N], of one that has a range of it.
+    pub fn strength(&self, id: usize) -> f64 {
+        self.0.actuator_forcerange()[id][1]
     }
 
     fn is_plain(&self, id: usize) -> bool {

@@ -103,6 +103,13 @@ fn unwritten(file: &Path) -> impl Fn(std::io::Error) -> RunError {
     move |e| RunError::Write { path: file.display().to_string(), reason: e.to_string() }
 }
 
+/// Writes what is known of a run into the file that holds it.
+fn about_run(held: Option<&File>, about: &serde_json::Value) -> std::io::Result<()> {
+    let Some(mut file) = held else { return Ok(()) };
+    file.set_len(0)?;
+    file.write_all(format!("{about:#}\n").as_bytes())
+}
+
 /// Whether something was learned there: a checkpoint, or a row of metrics, of which a run of this program has one before anything is learned.
 fn holds_a_run(path: &Path) -> bool {
     let unlearned = usize::from(path.join("env.json").is_file());
@@ -157,7 +164,7 @@ pub struct RunFolder {
     metrics: BufWriter<File>,
     columns: usize,
     saved: (u64, Instant),
-    _held: Option<File>,
+    held: Option<File>,
 }
 
 impl RunFolder {
@@ -185,16 +192,23 @@ impl RunFolder {
             "mujoco": "3.17.0", "pinocchio": "4.1.0", "isa": nearl_runtime::net::kernel::isa(),
             "cores": std::thread::available_parallelism().map_or(1, usize::from), "os": std::env::consts::OS, "arch": std::env::consts::ARCH,
         });
-        let about = || -> std::io::Result<()> {
-            let Some(mut file) = held.as_ref() else { return Ok(()) };
-            file.set_len(0)?;
-            file.write_all(format!("{host:#}\n").as_bytes())
-        };
-        about().map_err(unwritten(&env))?;
+        about_run(held.as_ref(), &host).map_err(unwritten(&env))?;
         let file = path.join("metrics.csv");
         let mut metrics = BufWriter::new(File::create(&file).map_err(unwritten(&file))?);
         writeln!(metrics, "{}", columns.join(",")).map_err(unwritten(&file))?;
         Ok(Self::open(path, metrics, columns, 0, held))
+    }
+
+    /// Adds what else is known of the run to `env.json`.
+    ///
+    /// # Errors
+    /// [`RunError::Write`].
+    pub fn tell(&self, key: &str, value: &serde_json::Value) -> Result<(), RunError> {
+        let file = self.path.join("env.json");
+        let text = std::fs::read_to_string(&file).map_err(unwritten(&file))?;
+        let mut about: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
+        about[key] = value.clone();
+        about_run(self.held.as_ref(), &about).map_err(unwritten(&file))
     }
 
     /// Opens the folder of a run to go on: keeps the rows of `metrics.csv` up to `steps`, of which there must be `rows`.
@@ -241,7 +255,7 @@ impl RunFolder {
 
     fn open(path: &Path, metrics: BufWriter<File>, columns: &[&str], steps: u64, held: Option<File>) -> Self {
         let saved = (steps, Instant::now());
-        Self { path: path.into(), metrics, columns: columns.len(), saved, _held: held }
+        Self { path: path.into(), metrics, columns: columns.len(), saved, held }
     }
 
     /// Whether a checkpoint is due after `steps` of `total`: at every tenth, and after two minutes.

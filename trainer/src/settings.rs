@@ -160,6 +160,7 @@ impl TrainSettings {
         let at_least = |x: f64| x >= 0.0 && x.is_finite();
         let norm = |x: f64| x > 0.0;
         let limit = |x: f64| x >= 0.0;
+        let spread = |x: f64| (-20.0..=10.0).contains(&x);
         type Domain = (fn(f64) -> bool, &'static str);
         let (positive, not_negative): (Domain, Domain) = ((above, "above 0"), (at_least, "at least 0"));
         let single = f64::from;
@@ -174,7 +175,7 @@ impl TrainSettings {
             ("ppo.vf_coef", single(ppo.vf_coef), not_negative),
             ("ppo.ent_coef", single(ppo.ent_coef), not_negative),
             ("ppo.max_grad_norm", single(ppo.max_grad_norm), (norm, "above 0, or inf for none")),
-            ("ppo.log_std", single(ppo.log_std), (f64::is_finite as fn(f64) -> bool, "finite")),
+            ("ppo.log_std", single(ppo.log_std), (spread, "between -20 and 10")),
             ("pid2.idm_threshold", pid2.idm_threshold, not_negative),
             ("pid2.idm_lr", single(pid2.idm_lr), positive),
             ("pid2.discriminator_lr", single(pid2.discriminator_lr), positive),
@@ -182,6 +183,7 @@ impl TrainSettings {
             ("pid2.lr", single(pid2.lr), not_negative),
             ("pid2.generator_lr", single(pid2.generator_lr), not_negative),
             ("pid2.gradient_penalty", single(pid2.gradient_penalty), not_negative),
+            ("pid2.bound_weight", single(pid2.bound_weight), not_negative),
             ("pid2.i_c", single(pid2.i_c), not_negative),
             ("pid2.beta", single(pid2.beta), not_negative),
             ("pid2.alpha", single(pid2.alpha), not_negative),

@@ -115,6 +115,7 @@ pub struct Training {
     warm_ups: u64,
     /// It started from the networks of another training.
     starts_warm: bool,
+    origin: Option<serde_json::Value>,
     /// What gives rewards in the task's place.
     scorer: Option<Scorer>,
     /// The last batch: its memory is used again.
@@ -222,6 +223,7 @@ impl Training {
             imitation,
             warm_ups,
             starts_warm: false,
+            origin: None,
             scorer: match experience {
                 Experience::Scored(scorer) => Some(scorer.clone()),
                 _ => None,

@@ -76,8 +76,12 @@ impl VelocityLimit {
         let stated = model.velocity_limit();
         let missing: Vec<usize> = controllable.iter().copied().filter(|i| stated[*i].is_infinite()).collect();
         if !missing.is_empty() {
-            let next =
-                "give them in the task file: velocity = { limit = 3.0 } or { limit = { joint = 3.0 } }";
+            let next = match missing.iter().all(|&i| own[i].is_some()) {
+                true => "scale is a share of the robot file's: leave it out and write a smaller limit",
+                false => {
+                    "give them in the task file: velocity = { limit = 3.0 } or { limit = { joint = 3.0 } }"
+                }
+            };
             return Err(LimitError::Missing { limit: "velocity", joints: quoted(model, &missing), next });
         }
         for &i in controllable {

@@ -12,7 +12,7 @@ use super::sources::{Measured, Sources};
 use super::{Dofs, History, Projector, Stages, Switch};
 use crate::checker::Checker;
 use crate::ledger::{Rung, Status};
-use crate::target::{Bounds, Braking, Consistency, Settings, Solver};
+use crate::target::{Bounds, Braking, Consistency, Proposal, Settings, Solver};
 use crate::viability::{Dof, Interval, Kind, Period};
 use crate::{Dynamics, Limit, LimitError, LimitSet, Model, Soft};
 
@@ -84,6 +84,8 @@ impl Projector {
             consistent: vec![false; nv],
             clamped: vec![[false; 2]; nv],
             last: (Status::Unchanged, Rung::ClosedForm),
+            normal: vec![0.0; model.nv()],
+            asked: Proposal::new(model),
             v_wanted: zero(),
             v_stop: zero(),
             tangent: zero(),

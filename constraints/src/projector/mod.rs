@@ -102,6 +102,10 @@ pub struct Projector {
     clamped: Vec<[bool; 2]>,
     /// How the last tick ended.
     last: (Status, Rung),
+    /// Scratch: velocities without denormal numbers (nv).
+    normal: Vec<f64>,
+    /// Scratch: a proposal without them.
+    asked: Proposal,
     /// Velocities of the target that no brake was verified for (nv).
     v_wanted: Vec<f64>,
     /// Velocities after a tick of the stored brake (nv).
@@ -171,7 +175,19 @@ impl Projector {
     pub fn project(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) -> Status {
         let start = Instant::now();
         target.ledger.reset();
-        let status = self.ladder(start, (q, v), proposal, target);
+        let mut normal = std::mem::take(&mut self.normal);
+        let mut asked = std::mem::replace(&mut self.asked, Proposal { q: Vec::new(), v: Vec::new() });
+        let v = without_denormals(v, &mut normal);
+        let status = match proposal.v.iter().any(|x| x.is_subnormal()) && proposal.q.len() == q.len() {
+            true => {
+                asked.q.clone_from(&proposal.q);
+                asked.v.clone_from(&proposal.v);
+                asked.v.iter_mut().filter(|x| x.is_subnormal()).for_each(|x| *x = 0.0);
+                self.ladder(start, (q, v), &asked, target)
+            }
+            false => self.ladder(start, (q, v), proposal, target),
+        };
+        (self.normal, self.asked) = (normal, asked);
         target.ledger.status = status;
         self.last = (status, target.ledger.rung);
         target.ledger.duration_ns = start.elapsed().as_nanos() as u64;
@@ -414,6 +430,16 @@ impl Projector {
         [q.len(), proposal.q.len(), target.q.len()].iter().all(|n| *n == nq)
             && [v.len(), proposal.v.len(), target.v.len(), target.acceleration.len()].iter().all(|n| *n == nv)
     }
+}
+
+/// Velocities with 0 for what is no motion at all: a filter that fades leaves numbers below 1e-308, for which some processors need a hundred
+/// times as long.
+fn without_denormals<'a>(v: &'a [f64], scratch: &'a mut [f64]) -> &'a [f64] {
+    if scratch.len() != v.len() || !v.iter().any(|x| x.is_subnormal()) {
+        return v;
+    }
+    scratch.iter_mut().zip(v).for_each(|(to, &x)| *to = if x.is_subnormal() { 0.0 } else { x });
+    scratch
 }
 
 fn finite(x: &[f64]) -> bool {

@@ -98,17 +98,57 @@ fn what_does_not_fit_is_refused_by_name() {
         ),
         (
             asked("Hopper-v5", "pid2-ib", 6, 2, &["train.pid2.warmup=640"]),
-            "train.pid2.warmup is 0 there and 640 here",
+            "that of 'pid2-ib' was 0 steps where 'pid2-ib' has 640; set train.pid2.warmup=0",
         ),
         (asked("Hopper-v5", "pid2-ib", 6, 2, &["train.normalise_obs=false"]), "train.normalise_obs"),
         (asked("Hopper-v5", "pid2-ib", 6, 2, &["idm.input=full"]), "the inverse model sees other entries"),
     ] {
         let refusal = start(&request, &source).err().expect("refused");
         assert!(
-            refusal.starts_with("--start-from: the networks of '") && refusal.contains(sentence),
+            refusal.starts_with("start_from: the networks of '") && refusal.contains(sentence),
             "{refusal}"
         );
     }
+    let arm = run(folder.path(), "arm", &asked("Panda-reach", "pid2-ib", 5, 1, &[]));
+    let refusal = start(&asked("Panda-reach", "pid2-ib", 6, 1, &["time.policy_every=10"]), &arm)
+        .err()
+        .expect("refused");
+    assert!(refusal.contains("its policy runs every 0.02 s, and every 0.01 s here"), "{refusal}");
     let nowhere = start(&asked("Hopper-v5", "pid2-ib", 6, 2, &[]), folder.path()).err().expect("refused");
-    assert!(nowhere.contains("a run has after its first batch"), "{nowhere}");
+    assert!(nowhere.contains("is no run folder with something learned"), "{nowhere}");
+}
+
+/// A spread other than the run's is meant; the same one goes on as it was learned.
+#[test]
+fn a_spread_that_is_asked_for_is_taken() {
+    let folder = tempfile::tempdir().expect("folder");
+    for algo in ["pid2-ib", "ppo"] {
+        let source = run(folder.path(), algo, &asked("Hopper-v5", algo, 5, 6, &[]));
+        let spread = |more: &[&str]| {
+            let training = start(&asked("Hopper-v5", algo, 6, 4, more), &source).expect("it fits");
+            let networks = &training.snapshot().networks;
+            networks.idm.as_ref().map_or(networks.policy_log_std.clone(), |(_, spread)| spread.clone())
+        };
+        assert!(spread(&[]).iter().all(|x| *x != 0.0 && x.abs() < 0.5), "{algo}: {:?}", spread(&[]));
+        assert_eq!(spread(&["train.ppo.log_std=-1.5"]), [-1.5; 3], "{algo}");
+    }
+}
+
+/// Where it came from stands in the run folder.
+#[test]
+fn a_run_names_what_it_started_from() {
+    let folder = tempfile::tempdir().expect("folder");
+    let source = run(folder.path(), "source", &asked("Hopper-v5", "ppo", 5, 2, &[]));
+    let out = folder.path().join("out");
+    let training = start(&asked("Hopper-v5", "ppo", 6, 2, &[]), &source).expect("it fits");
+    train_in(&out, training, |_, _| true).expect("a run");
+    let about: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(out.join("env.json")).expect("env.json"))
+            .expect("JSON");
+    assert_eq!(about["start_from"]["run"], source.display().to_string());
+    assert_eq!(
+        (&about["start_from"]["steps"], &about["start_from"]["algo"]),
+        (&(2 * BATCH).into(), &"ppo".into())
+    );
+    assert_eq!((&about["algo"], &about["seed"]), (&"ppo".into(), &6.into()));
 }

@@ -56,7 +56,7 @@ pub(super) struct Train {
     demos: Option<PathBuf>,
     #[arg(long, conflicts_with = "resume", help = one_preset())]
     preset: Option<Preset>,
-    /// Overrides of the task file, e.g. `constraints.velocity.scale=0.8`.
+    /// Overrides of the task file, e.g. `constraints.velocity.limit=12`.
     #[arg(long = "set", value_name = "KEY=VALUE", conflicts_with = "resume")]
     set: Vec<String>,
     /// Print one JSON object an iteration instead of a progress bar.

@@ -21,8 +21,8 @@ mod random;
 mod settings;
 
 use nearl_runtime::Manifest;
-use nearl_runtime::constraints::RobotDescription;
 use nearl_runtime::constraints::description::Motor;
+use nearl_runtime::constraints::{self, RobotDescription};
 use nearl_runtime::task::Task;
 use rand_chacha::ChaCha8Rng;
 
@@ -121,7 +121,7 @@ fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spe
     let sub_steps = sub_steps(task, model)?;
     let (actuators, drives) = match format {
         ModelFormat::Mjcf => (model.joint_actuators().map_err(|e| mistake("model.mjcf", e))?, Vec::new()),
-        ModelFormat::Urdf if model.nu() > 0 => (pd_actuators(model), Vec::new()),
+        ModelFormat::Urdf if model.nu() > 0 => (pd_actuators(manifest, model), Vec::new()),
         ModelFormat::Urdf => drives(&manifest.robot, model).map_err(|e| mistake("model.urdf", e))?,
     };
     let joints = model.joints();
@@ -229,13 +229,25 @@ fn drives(robot: &RobotDescription, model: &Model) -> Result<(Vec<Actuator>, Vec
     }
 }
 
-/// The drives that the scene gave the joints of a URDF. Their targets range over all that may ask for the whole effort somewhere.
-fn pd_actuators(model: &Model) -> Vec<Actuator> {
+/// The drives that the scene gave the joints of a URDF. Their targets range over all that may ask for the whole effort somewhere, at any
+/// speed that is allowed.
+fn pd_actuators(manifest: &Manifest, model: &Model) -> Vec<Actuator> {
     let joints = model.joints();
+    let period = manifest.task.period();
+    let speed = |name: &str| {
+        let stated =
+            manifest.robot.joints().find(|joint| joint.name == name).and_then(|joint| joint.velocity);
+        let asked = manifest.task.constraints.velocity.as_ref().and_then(|v| v.limit.as_ref()?.of(name));
+        stated.into_iter().chain(asked).fold(0.0, f64::max)
+    };
     let mut actuators = model.actuators();
     for (id, actuator) in actuators.iter_mut().enumerate() {
         let ([low, high], reach) = match joints.iter().find(|joint| joint.idx_v == actuator.dof) {
-            Some(joint) => (joint.range, model.reach(id)),
+            Some(joint) => {
+                let [stiffness, _, by_v] = model.gains(id).unwrap_or([1.0, -1.0, 0.0]);
+                let drive = constraints::Drive::Pd { stiffness, damping: -by_v };
+                (joint.range, drive.reach(&period, model.strength(id), speed(&actuator.joint)))
+            }
             None => ([f64::NEG_INFINITY, f64::INFINITY], 0.0),
         };
         let turns = 2.0 * std::f64::consts::PI;

@@ -212,6 +212,12 @@ impl Combined {
         self.inverse.as_ref().map_or(0..0, |(model, _)| model.range())
     }
 
+    /// Where log standard deviations of actions and proposals lie.
+    pub(super) fn spreads(&self) -> Vec<Range<usize>> {
+        let action = self.inverse.as_ref().map(|(_, spread)| spread.clone());
+        action.into_iter().chain(self.policy_log_std.clone()).collect()
+    }
+
     /// Where the policy's network and its spread lie.
     pub(super) fn proposal_range(&self) -> Range<usize> {
         0..self.policy_log_std.as_ref().map_or(self.policy_range.end, |spread| spread.end)

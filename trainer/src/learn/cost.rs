@@ -168,6 +168,10 @@ impl Learner for CostLimited {
         })
     }
 
+    fn spreads(&self) -> Vec<Range<usize>> {
+        self.learner.spreads()
+    }
+
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
         self.learner.values(x)
     }

@@ -133,6 +133,9 @@ impl<M: Method> Learner for Imitating<M> {
         }
         Ok(())
     }
+    fn spreads(&self) -> Vec<Range<usize>> {
+        self.base.spreads()
+    }
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
         self.base.values(x)
     }

@@ -167,6 +167,10 @@ impl Learner for Nearl {
         Ok(())
     }
 
+    fn spreads(&self) -> Vec<Range<usize>> {
+        self.nets.combined.spreads()
+    }
+
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
         self.nets.combined.value.of(&self.params.groups[CRITIC], x, self.threads)
     }

@@ -180,6 +180,10 @@ impl Learner for Ppo {
         Ok(())
     }
 
+    fn spreads(&self) -> Vec<Range<usize>> {
+        vec![self.nets.log_std.clone()]
+    }
+
     fn values(&mut self, x: &[f32]) -> Vec<f32> {
         self.nets.value.of(&self.params.groups[VALUE], x, self.threads)
     }

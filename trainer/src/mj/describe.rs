@@ -71,9 +71,15 @@ impl Model {
         let one = joint.nv == 1;
         let spring = if self.disables(mjtDisableBit::mjDSBL_SPRING) { 0.0 } else { m.jnt_stiffness()[id] };
         let damper = if self.disables(mjtDisableBit::mjDSBL_DAMPER) { 0.0 } else { m.dof_damping()[v] };
-        let friction =
-            if self.disables(mjtDisableBit::mjDSBL_FRICTIONLOSS) { 0.0 } else { m.dof_frictionloss()[v] };
-        let stops = m.jnt_limited()[id] && one && !self.disables(mjtDisableBit::mjDSBL_LIMIT);
+        // constraints of the solver are what friction and stops are made of
+        let unconstrained = self.disables(mjtDisableBit::mjDSBL_CONSTRAINT);
+        let friction = if self.disables(mjtDisableBit::mjDSBL_FRICTIONLOSS) || unconstrained {
+            0.0
+        } else {
+            m.dof_frictionloss()[v]
+        };
+        let stops =
+            m.jnt_limited()[id] && one && !self.disables(mjtDisableBit::mjDSBL_LIMIT) && !unconstrained;
         // MuJoCo takes a joint whose ends are swapped for one without limits.
         let [lower, upper] = m.jnt_range()[id];
         let swapped = one && lower > upper;
@@ -203,6 +209,26 @@ impl Model {
         note((0..m.jnt_type().len()).any(balls), "limits of ball joints are not modelled");
         note(m.body_mocapid().iter().any(|id| *id >= 0), "mocap bodies are taken to stand still");
         note(self.disables(mjtDisableBit::mjDSBL_ACTUATION), "the file switches its actuators off");
+        let early = |id: usize| {
+            let stops = m.jnt_limited()[id] && self.joint(id).nv == 1 && m.jnt_margin()[id] > 0.0;
+            stops.then(|| format!("'{}' by {}", self.joint_name(id), m.jnt_margin()[id]))
+        };
+        let early: Vec<String> = (0..m.jnt_type().len()).filter_map(early).collect();
+        note(
+            !early.is_empty() && !self.disables(mjtDisableBit::mjDSBL_LIMIT),
+            &format!(
+                "stops that act before the range ends (margin of a joint) are not modelled: {} [rad or m]; keep constraints.position that far inside",
+                early.join(", ")
+            ),
+        );
+        let rubs = m.dof_frictionloss().iter().any(|f| *f > 0.0);
+        let slips = option.noslip_iterations > 0;
+        note(rubs && slips, "noslip_iterations change dry friction, and that is not modelled; take them out");
+        let hurried = option.iterations < 20 || option.ls_iterations < 10 || option.tolerance > 1e-6;
+        note(
+            rubs && hurried,
+            "the simulator's solver ends early (iterations, ls_iterations or tolerance), and its dry friction is then not what is modelled",
+        );
         notes
     }
 

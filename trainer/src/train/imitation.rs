@@ -58,6 +58,13 @@ impl Imitation {
             }
             (Some(uses), false) => uses,
         };
+        if manifest.task.policy.as_ref().is_some_and(|policy| !policy.observation.is_empty()) {
+            return Err(TrainError::Settings(format!(
+                "'{algo}' learns from demonstrated observations, and [policy] of '{}' has its networks see something else, which no demonstrations hold; \
+                 leave [policy] out, or train without demonstrations",
+                manifest.task.name
+            )));
+        }
         let (word, those) = match own.reward {
             DemoReward::Task => ("task", None),
             DemoReward::Likeness => ("likeness", Some(Algorithm::taking(|uses| uses.likeness))),

@@ -40,6 +40,9 @@ pub fn train_in(
     report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
     let folder = RunFolder::create(out, &training.snapshot().manifest, training.seed, &training.columns())?;
+    if let Some(origin) = training.origin() {
+        folder.tell("start_from", origin)?;
+    }
     run(training, folder, report)
 }
 

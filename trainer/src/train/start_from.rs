@@ -7,6 +7,7 @@ use crate::checkpoint::{self, Checkpoint};
 use crate::learn::Algorithm;
 use crate::settings::{ChangeScale, TrainSettings};
 use nearl_runtime::controller::Parts;
+use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Manifest, PolicyKind};
 use std::path::Path;
 
@@ -18,17 +19,25 @@ impl Training {
     /// # Errors
     /// [`TrainError`]: what [`Training::on`] refuses, a run without a checkpoint, or networks that do not fit.
     pub fn start_from(request: &Request, experience: &Experience, run: &Path) -> Result<Self, TrainError> {
-        let mut from = Checkpoint::load(&checkpoint::path_in(run))?;
+        let file = checkpoint::path_in(run);
+        if !file.is_file() {
+            return Err(TrainError::Settings(format!(
+                "start_from: '{}' is no run folder with something learned: there is no '{}'; give the folder that 'nearl train' wrote",
+                run.display(),
+                file.display()
+            )));
+        }
+        let mut from = Checkpoint::load(&file)?;
         let mut training = Self::on(request, experience)?;
         if training.imitation.is_some() {
             return Err(TrainError::Settings(format!(
-                "--start-from: '{}' begins with its demonstrations; leave one of both out",
+                "start_from: '{}' begins with its demonstrations; leave one of both out",
                 request.algo
             )));
         }
         let refuse = |reason| {
             TrainError::Settings(format!(
-                "--start-from: the networks of '{}' do not fit '{}': {reason}",
+                "start_from: the networks of '{}' do not fit '{}': {reason}",
                 run.display(),
                 request.manifest.task.name
             ))
@@ -37,7 +46,13 @@ impl Training {
         if let Some(reason) = misfit(&from.header.manifest, training.algo, ours, &training.settings)? {
             return Err(refuse(reason));
         }
-        training.take(&mut from).map_err(refuse)?;
+        let theirs = &from.header.manifest;
+        training.origin = Some(serde_json::json!({
+            "run": run, "task": theirs.task.name, "algo": theirs.algo, "seed": from.header.seed, "steps": theirs.steps
+        }));
+        let their_settings = TrainSettings::read(&theirs.task.train).map_err(TrainError::Settings)?;
+        let fresh_spread = their_settings.ppo.log_std != training.settings.ppo.log_std;
+        training.take(&mut from, fresh_spread).map_err(refuse)?;
         Ok(training)
     }
 
@@ -46,15 +61,29 @@ impl Training {
         self.starts_warm
     }
 
-    fn take(&mut self, from: &mut Checkpoint) -> Result<(), String> {
+    /// What it started from, as `env.json` has it.
+    pub fn origin(&self) -> Option<&serde_json::Value> {
+        self.origin.as_ref()
+    }
+
+    /// Takes what fits. A `log_std` that is not that of the run is meant, and stays.
+    fn take(&mut self, from: &mut Checkpoint, fresh_spread: bool) -> Result<(), String> {
         let same = from.header.manifest.algo == self.snapshot.manifest.algo;
+        let spreads = if fresh_spread { self.learner.spreads() } else { Vec::new() };
         self.learner.restore(&mut |params| {
             params.beta = from.take_f32("beta", 1)?[0];
+            let own: Vec<_> =
+                spreads.iter().map(|range| params.groups[0].p[range.clone()].to_vec()).collect();
             // policy, with its inverse model, and value
             (0..2).try_for_each(|n| take_group(params, n, from))?;
-            let has = |n: usize| from.tensors.contains_key(&format!("group.{n}"));
-            let others: Vec<usize> = (2..params.groups.len()).filter(|n| same && has(*n)).collect();
-            others.into_iter().try_for_each(|n| take_group(params, n, from))
+            for (range, own) in spreads.iter().zip(&own) {
+                params.groups[0].p[range.clone()].copy_from_slice(own);
+            }
+            // the others are fresh where the run had none of their size
+            for n in (2..params.groups.len()).filter(|_| same) {
+                let _ = take_group(params, n, from);
+            }
+            Ok(())
         })?;
         take_statistics(self, from)?;
         let n = self.snapshot.networks.margins.len();
@@ -113,15 +142,21 @@ fn misfit(
     if dims(theirs, &their_parts, n)? != dims(ours, &parts, n)? {
         return Ok(Some("the inverse model sees other entries of the state there; give the same [idm] and state.controllable".into()));
     }
-    if let Some(key) = other_sizes(&their_settings, settings) {
+    let period = |m: &Manifest| m.task.time.dt * m.task.time.policy_every as f64;
+    let (a, b) = (period(theirs), period(ours));
+    if (a - b).abs() > 1e-9 * b {
         return Ok(Some(format!(
-            "[train.nets] has another {key} there; give the same sizes, or the same --preset"
+            "its policy runs every {a} s, and every {b} s here (time.dt, time.policy_every): a proposal and what is learned of its values are for that long"
         )));
+    }
+    let learned = ours.policy != PolicyKind::Direct && ours.task.idm.kind == IdmKind::Learned;
+    if let Some(key) = other_sizes(&their_settings, settings, learned) {
+        return Ok(Some(format!("[train.nets] has another {key}; give the same sizes, or the same preset")));
     }
     let warm = |algo, settings| warm_up_of_pid2(algo, settings) > 0;
     if warm(their_algo, &their_settings) != warm(algo, settings) {
         return Ok(Some(format!(
-            "train.pid2.warmup is {} there and {} here, and makes other networks; make both 0 or both more",
+            "a warm-up of PID² makes other networks, and that of '{their_algo}' was {0} steps where '{algo}' has {1}; set train.pid2.warmup={0}",
             warm_up_of_pid2(their_algo, &their_settings),
             warm_up_of_pid2(algo, settings)
         )));
@@ -156,12 +191,14 @@ fn other_entry(what: &str, key: &str, theirs: &[String], ours: &[String]) -> Opt
     Some(format!("entry {at} of {what} is {} there and {} here ({key})", name(theirs), name(ours)))
 }
 
-/// The first size in which the networks differ.
-fn other_sizes(theirs: &TrainSettings, ours: &TrainSettings) -> Option<String> {
+/// The first size in which the networks differ; the inverse model's matters where the policy `learned` one.
+fn other_sizes(theirs: &TrainSettings, ours: &TrainSettings, learned: bool) -> Option<String> {
     let table = |s: &TrainSettings| {
         toml::Table::try_from(&s.nets).unwrap_or_else(|e| unreachable!("it was read from TOML: {e}"))
     };
     let (a, b) = (table(theirs), table(ours));
-    let differs = |key: &&String| a.get(*key) != b.get(*key);
-    b.keys().find(differs).map(|key| format!("{key} ({} there, {} here)", a[key], b[key]))
+    let keys = ["policy", "value", "activation", "idm", "idm_residual"];
+    let counts = if learned { 5 } else { 3 };
+    let key = keys.into_iter().take(counts).find(|key| a.get(*key) != b.get(*key))?;
+    Some(format!("{key} ({} there, {} here)", a[key], b[key]))
 }

@@ -81,9 +81,10 @@ pub(crate) fn still(manifest: Manifest) -> Snapshot {
     }
 }
 
-/// A policy whose actions are zero; `manifest` is complete.
+/// A policy whose actions are zero, of the task without its `[policy]`: who gives actions has a recipe of their own. `manifest` is complete.
 pub(crate) fn idle(mut manifest: Manifest) -> Snapshot {
     manifest.policy = PolicyKind::Direct;
+    manifest.task.policy = None;
     let ((n_obs, n_state), n_act) = (sizes(&manifest), manifest.action_lower.len());
     let policy = Dense { layers: vec![zeros(n_obs, n_act)], skip: None };
     let normaliser = Normaliser::identity(n_obs, n_state);

@@ -10,10 +10,10 @@ use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposa
 /// Forward, project, back. With `S_c` the controllable dofs, whose motors the action (n_act) drives:
 ///
 /// ```text
-///     tau -> a = R^-1 (tau - b)                     forward dynamics over the period
+///     tau -> a with tau = R a + b + F(a)            forward dynamics over the period, with dry friction F
 ///         -> v + T a, q (+) (T v + kappa T^2 a)     the proposal
 ///         -> project -> a'                          as the proposal of any policy
-///         -> tau' = R a' + b                        on S_c, while the other dofs follow
+///         -> tau' = R a' + b + F(a')                on S_c, while the other dofs follow
 /// ```
 ///
 /// Joints with a drive take their command for the force (see [`Drive`]). Where the projection moves nothing the action stays bit for bit.
@@ -148,6 +148,13 @@ fn check_actions(
     if m.task.constraints.torque.is_none() && dofs.iter().any(of_force) {
         return refuse(
             "[constraints] guard = true without a torque limit would ask for more than the motors give; add torque = { scale = 1.0 }".into(),
+        );
+    }
+    if m.task.constraints.torque.as_ref().is_some_and(|torque| torque.soft.is_some())
+        && dofs.iter().any(of_force)
+    {
+        return refuse(
+            "[constraints] guard = true with a soft torque limit would ask for more than the motors give; take its soft out".into(),
         );
     }
     if m.action_lower.len() != dofs.len() {
