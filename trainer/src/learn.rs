@@ -92,7 +92,7 @@ pub trait Learner: Send {
     fn params(&self) -> &Params;
     /// Takes `f` to everything an update changes, then refreshes what follows from it.
     fn restore(&mut self, f: &mut dyn FnMut(&mut Params) -> Result<(), String>) -> Result<(), String>;
-    /// Where the log standard deviations of what explores lie in the first group [vectors].
+    /// Where the log standard deviations of what explores lie in the first group, in vectors.
     fn spreads(&self) -> Vec<Range<usize>>;
     /// Value of each row of `x` (n x n_obs).
     fn values(&mut self, x: &[f32]) -> Vec<f32>;
