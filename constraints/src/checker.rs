@@ -92,6 +92,11 @@ struct RowsOf {
     count: usize,
     /// How much of it may be put elsewhere.
     places: usize,
+    /// Where that was built, and whether it is elsewhere.
+    built: Vec<[f64; 6]>,
+    elsewhere: bool,
+    /// How much further inside than it was built it lies.
+    inset: f64,
 }
 
 struct ConeOf {
@@ -133,8 +138,22 @@ impl Checker {
         let (mut rows, mut cones, mut first) = (Vec::new(), Vec::new(), model.nv());
         for (limit, l) in limits.iter().enumerate() {
             if let Some(r) = l.rows(model, controllable)? {
-                let (hard, count, places) = (l.soft().is_none(), r.sizes().len(), r.places().len());
-                rows.push(RowsOf { rows: r, limit, hard, enabled: true, first, count, places });
+                let (hard, count) = (l.soft().is_none(), r.sizes().len());
+                let built: Vec<_> = r.places().iter().map(|place| place.numbers).collect();
+                let (places, elsewhere, inset) = (built.len(), false, 0.0);
+                let block = RowsOf {
+                    rows: r,
+                    limit,
+                    hard,
+                    enabled: true,
+                    first,
+                    count,
+                    places,
+                    built,
+                    elsewhere,
+                    inset,
+                };
+                rows.push(block);
                 first += count;
             }
         }
@@ -313,15 +332,28 @@ impl Checker {
             (block.share, block.in_force) = (share, share);
         }
         self.rows.iter_mut().filter(|r| r.limit == limit).for_each(|r| {
-            r.rows.inset(inset);
+            if r.rows.inset(inset) {
+                r.inset = inset;
+            }
         });
+    }
+
+    /// By how much each hard row and cone may be broken as it is asked for and still be kept as it was built; infinite for what was put elsewhere.
+    pub(crate) fn slack_to_the_build(&self) -> impl Iterator<Item = f64> {
+        let rows =
+            self.rows.iter().filter(|r| r.hard).flat_map(|r| {
+                std::iter::repeat_n(if r.elsewhere { f64::INFINITY } else { r.inset }, r.count)
+            });
+        rows.chain(self.cones.iter().filter(|c| c.hard).map(|c| 1.0 - c.share))
     }
 
     /// Puts what may be elsewhere where the numbers say, in the order of the limits.
     pub(crate) fn put(&mut self, numbers: &[[f64; 6]]) {
         let mut first = 0;
         for block in &mut self.rows {
-            block.rows.put(&numbers[first..first + block.places]);
+            let numbers = &numbers[first..first + block.places];
+            block.elsewhere = numbers != block.built;
+            block.rows.put(numbers);
             first += block.places;
         }
     }

@@ -245,6 +245,11 @@ impl Backup {
             }
             first = last + 1;
         }
+        // What lies between the ticks looked at is a bound, and would add up from tick to tick: what was built holds all the same.
+        self.on_the_way
+            .iter_mut()
+            .zip(self.checker.slack_to_the_build())
+            .for_each(|(most, slack)| *most = most.min(slack));
         self.checker.breaches((q, v), (q, v), with.external, &mut self.here);
         self.on_the_way.iter().any(|most| *most > 0.0)
     }
