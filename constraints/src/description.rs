@@ -10,7 +10,7 @@
 //! Axes and anchors `p` of a body's joints are in the body's axes, as they are where every joint is at its `reference`. Units: m, kg, rad,
 //! s, N. Numbers that are not there are `None` and never infinite, so that the description can be written as JSON.
 
-mod check;
+pub(crate) mod check;
 mod motor;
 mod payload;
 

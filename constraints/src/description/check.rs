@@ -143,6 +143,10 @@ fn check_body(body: &Body, wrong: &mut Vec<String>) {
     }
     if [0, 3, 5].iter().any(|k| body.inertia[*k] < -ROUNDING) {
         wrong.push(format!("body '{name}' has a negative moment of inertia"));
+    } else if is_indefinite(body.inertia) {
+        wrong.push(format!(
+            "the inertia of body '{name}' is negative about some axis: correct its products of inertia"
+        ));
     }
     for joint in &body.joints {
         check_joint(joint, wrong);
@@ -211,6 +215,19 @@ fn check_motor(motor: &Motor, wrong: &mut Vec<String>) {
             wrong.push(format!("motor '{name}' has a {what} range from {low} to {high}"));
         }
     }
+}
+
+/// Whether a moment of inertia about some axis is negative by more than a file's rounding.
+fn is_indefinite([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> bool {
+    let more = ROUNDING + 1e-4 * (xx + yy + zz).abs();
+    !has_no_negative_eigenvalue([xx + more, xy, xz, yy + more, yz, zz + more])
+}
+
+/// Whether a symmetric matrix (`xx xy xz yy yz zz`) has no negative eigenvalue, by its principal minors.
+pub(crate) fn has_no_negative_eigenvalue([a, d, e, b, f, c]: [f64; 6]) -> bool {
+    let pairs = [a * b - d * d, a * c - e * e, b * c - f * f];
+    let all = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e);
+    [a, b, c, all].iter().chain(&pairs).all(|minor| *minor >= 0.0)
 }
 
 fn check_placement(what: &str, placement: &Placement, wrong: &mut Vec<String>) {

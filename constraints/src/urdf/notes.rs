@@ -2,6 +2,7 @@
 
 use super::{called, children, number};
 use crate::description::Body;
+use crate::description::check::has_no_negative_eigenvalue;
 use roxmltree::Node;
 
 /// Limits of a joint that are not used, or that stand for nothing.
@@ -56,15 +57,10 @@ pub(super) fn inertias(bodies: &[Body]) -> Option<String> {
     })
 }
 
-/// Whether `tr(I) / 2 - I` has no negative eigenvalue, by its principal minors.
+/// Whether `tr(I) / 2 - I` has no negative eigenvalue.
 fn is_of_mass([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> bool {
     let trace = xx + yy + zz;
-    if trace <= 0.0 {
-        return true;
-    }
     let half = (0.5 + ROUNDED) * trace;
-    let [a, b, c, d, e, f] = [half - xx, half - yy, half - zz, -xy, -xz, -yz].map(|x| x / trace);
-    let pairs = [a * b - d * d, a * c - e * e, b * c - f * f];
-    let all = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e);
-    [a, b, c, all].iter().chain(&pairs).all(|minor| *minor >= 0.0)
+    trace <= 0.0
+        || has_no_negative_eigenvalue([half - xx, -xy, -xz, half - yy, -yz, half - zz].map(|x| x / trace))
 }
