@@ -62,6 +62,7 @@ pub mod ledger;
 pub mod limit;
 mod model;
 mod period_dynamics;
+mod physics_steps;
 mod pinocchio;
 mod projector;
 mod random;
@@ -83,6 +84,7 @@ pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Sid
 pub use limit::*;
 pub use model::{FrameId, Joint, Model};
 pub use period_dynamics::PeriodDynamics;
+pub use physics_steps::PhysicsSteps;
 #[doc(hidden)]
 pub use projector::{CoupledStages, Numbers};
 pub use projector::{Problem, ProblemCone, Projector};

@@ -136,6 +136,21 @@ impl PeriodDynamics {
         &self.period
     }
 
+    /// The model these equations belong to.
+    pub(crate) fn model(&self) -> &Model {
+        self.dynamics.model()
+    }
+
+    /// `R` of the state of [`PeriodDynamics::update`] (nv x nv, row-major).
+    pub(crate) fn rows(&self) -> &[f64] {
+        &self.rows
+    }
+
+    /// [`Dynamics::integrate`].
+    pub(crate) fn integrate(&mut self, q: &[f64], dq: &[f64], out: &mut [f64]) {
+        self.dynamics.integrate(q, dq, out);
+    }
+
     /// Finds the accelerations of the free dofs; those of the others are in `a`.
     fn settle(&mut self, a: &mut [f64]) {
         // as if no joint rubbed

@@ -4,7 +4,7 @@ use crate::env::{Env, EnvError, Limits, Meter};
 use crate::foresight::Foresight;
 use crate::mj::{Inverse, MjError};
 use crate::rollout::stream;
-use nearl_runtime::constraints::{Guard, LimitSet, Model};
+use nearl_runtime::constraints::{Guard, LimitSet, Model, end_of_range};
 use nearl_runtime::controller::Parts;
 use nearl_runtime::link::{
     ActionMessage, Plant, Robot, STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, StateMessage, TallyMessage,
@@ -48,7 +48,8 @@ struct Episode {
     saturated: u32,
 }
 
-/// What the meter watches, in MuJoCo's order: the task's limits, and the robot file's effort where the task limits no torque.
+/// What the meter watches, in MuJoCo's order: the task's limits ([`end_of_range`]), and the robot file's effort where the task limits no
+/// torque.
 pub fn watched_limits(env: &dyn Env, model: &Model, set: &LimitSet) -> Limits {
     let spec = env.spec();
     let none = vec![f64::INFINITY; spec.nv];
@@ -61,8 +62,9 @@ pub fn watched_limits(env: &dyn Env, model: &Model, set: &LimitSet) -> Limits {
     };
     for j in &spec.joints {
         let Some(m) = model.joints().iter().find(|m| m.name == j.name && m.nv == 1) else { continue };
-        watched.lower_position[j.idx_q] = set.q_lower[m.idx_v];
-        watched.upper_position[j.idx_q] = set.q_upper[m.idx_v];
+        let [low, high] = [model.lower_position_limit()[m.idx_q], model.upper_position_limit()[m.idx_q]];
+        watched.lower_position[j.idx_q] = end_of_range(set.q_lower[m.idx_v], low);
+        watched.upper_position[j.idx_q] = end_of_range(set.q_upper[m.idx_v], high);
         watched.velocity[j.idx_v] = set.velocity[m.idx_v];
         watched.acceleration[j.idx_v] = set.acceleration[m.idx_v];
         watched.effort[j.idx_v] = model.effort_limit()[m.idx_v].min(set.effort[m.idx_v]);

@@ -57,17 +57,29 @@ impl AccelerationSettings {
 #[derive(Debug, Clone)]
 pub struct AccelerationLimit {
     settings: AccelerationSettings,
+    /// Share of A that braking counts on at most.
+    share: f64,
 }
+
+/// Share of the acceleration limit that braking counts on at most where a period is not one physics step ([`AccelerationLimit::over_steps`]).
+pub const BRAKING_SHARE: f64 = 0.98;
 
 impl AccelerationLimit {
     /// From the task file's settings.
     pub fn new(settings: AccelerationSettings) -> AccelerationLimit {
-        AccelerationLimit { settings }
+        AccelerationLimit { settings, share: 1.0 }
+    }
+
+    /// The same for `sub_steps` physics steps in a period. With several or none the motion within a period is not that of a constant acceleration:
+    /// a joint comes a little further than foreseen, and brakes harder than it counted on until that is made up for. It counts on [`BRAKING_SHARE`]
+    /// of the limit then.
+    pub fn over_steps(settings: AccelerationSettings, sub_steps: usize) -> AccelerationLimit {
+        AccelerationLimit { settings, share: if sub_steps == 1 { 1.0 } else { BRAKING_SHARE } }
     }
 
     /// The same limit [rad/s² or m/s²] for every joint.
     pub fn uniform(a_max: f64) -> AccelerationLimit {
-        AccelerationLimit { settings: AccelerationSettings::of(PerJoint::All(a_max), None) }
+        AccelerationLimit::new(AccelerationSettings::of(PerJoint::All(a_max), None))
     }
 }
 
@@ -95,7 +107,7 @@ impl Limit for AccelerationLimit {
         less_each(model, "acceleration margin", &mut values, self.settings.margin.as_ref(), controllable)?;
         for &i in controllable {
             set.acceleration[i] = set.acceleration[i].min(values[i].unwrap_or(f64::INFINITY));
-            set.braking[i] = set.braking[i].min(set.acceleration[i]);
+            set.braking[i] = set.braking[i].min(self.share * set.acceleration[i]);
         }
         let Some(braking) = &self.settings.braking else { return Ok(()) };
         let values = braking.values(model, "acceleration braking", |x| x > 0.0, domain)?;

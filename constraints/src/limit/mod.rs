@@ -28,7 +28,7 @@ mod velocity;
 mod velocity_profile;
 
 pub use about::{About, Argument, Form, Takes};
-pub use acceleration::{AccelerationLimit, AccelerationSettings};
+pub use acceleration::{AccelerationLimit, AccelerationSettings, BRAKING_SHARE};
 pub use action::{ActionLimit, ActionReport, ActionSettings};
 pub use collision::{CollisionLimit, CollisionSettings, SolidSettings};
 pub use drive::DriveTorqueLimit;
@@ -39,7 +39,7 @@ pub use jerk::{JerkLimit, JerkSettings};
 pub use locked::{LockedJoints, LockedSettings};
 pub use margin::AlwaysHard;
 pub use moved::{Moved, Pose};
-pub use position::{PositionLimit, PositionSettings};
+pub use position::{PositionLimit, PositionSettings, STOP_GAPS, end_of_range};
 pub use registry::RegisteredLimit;
 pub use set::LimitSet;
 pub use settings::PerJoint;

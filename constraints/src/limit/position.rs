@@ -40,17 +40,34 @@ impl Default for PositionSettings {
 #[derive(Debug, Clone, Default)]
 pub struct PositionLimit {
     settings: PositionSettings,
+    /// Least margin [rad or m].
+    gap: f64,
+}
+
+/// How far from the end of its range a joint stops at least \[rad or m\] that stops before it ([`PositionLimit::before_stops`]): where a period is
+/// one physics step, whose end is foreseen to rounding, and where it is several or none.
+pub const STOP_GAPS: [f64; 2] = [1e-6, 1e-4];
+
+/// What counts as outside of a position limit: the end of the range of a limit that lies one of [`STOP_GAPS`] before it, else the limit.
+pub fn end_of_range(limit: f64, end: f64) -> f64 {
+    if STOP_GAPS.iter().any(|gap| ((limit - end).abs() - gap).abs() < 1e-9) { end } else { limit }
 }
 
 impl PositionLimit {
     /// From the task file's settings.
     pub fn new(settings: PositionSettings) -> PositionLimit {
-        PositionLimit { settings }
+        PositionLimit { settings, gap: 0.0 }
+    }
+
+    /// The same, at least one of [`STOP_GAPS`] away from the ends, with `sub_steps` physics steps in a period: the stop of a simulated joint acts
+    /// on a joint that is beyond it by a rounding error, and throws a robot about that would otherwise move as it is asked to.
+    pub fn before_stops(settings: PositionSettings, sub_steps: usize) -> PositionLimit {
+        PositionLimit { settings, gap: STOP_GAPS[usize::from(sub_steps != 1)] }
     }
 
     /// The same margin [rad or m] for every joint.
     pub fn with_margin(margin: f64) -> PositionLimit {
-        PositionLimit { settings: PositionSettings { margin: PerJoint::All(margin), soft: AlwaysHard } }
+        PositionLimit::new(PositionSettings { margin: PerJoint::All(margin), soft: AlwaysHard })
     }
 }
 
@@ -86,7 +103,7 @@ impl Limit for PositionLimit {
         for &i in controllable {
             let joint = model.joint_of_dof(i);
             if joint.nq == 1 && joint.nv == 1 {
-                let m = margin[i].unwrap_or(0.0);
+                let m = margin[i].unwrap_or(0.0).max(self.gap);
                 set.q_lower[i] = set.q_lower[i].max(model.lower_position_limit()[joint.idx_q] + m);
                 set.q_upper[i] = set.q_upper[i].min(model.upper_position_limit()[joint.idx_q] - m);
             }

@@ -44,7 +44,8 @@ use nearl_constraints::{
     ActionLimit, ActionReport, Bounds, Entry, Ledger, Model, Projector, Proposal, RefuseReason, StateLayout,
     Status, Target,
 };
-use parts::{check_sizes, halves, idx_q};
+pub(crate) use parts::idx_q;
+use parts::{check_sizes, halves};
 use std::time::Instant;
 
 /// What is measured at the start of a tick.
@@ -189,9 +190,7 @@ impl Controller {
         let (inverse, action_log_std) = match (kind, m.task.idm.kind, &n.idm) {
             (PolicyKind::Direct, ..) => (Inverse::Direct, n.policy_log_std.clone()),
             (_, IdmKind::Pinocchio, _) => {
-                let drives = Parts::drives(m, &model, layout.controllable())?;
-                let motors = Parts::motors(&model, layout.controllable(), &drives)?;
-                let idm = AnalyticIdm::new(&model, layout.controllable(), &drives, motors, m.task.period());
+                let idm = AnalyticIdm::new(m, &model, layout.controllable())?;
                 (Inverse::Analytic(idm), vec![0.0; n_act])
             }
             (_, IdmKind::Learned, Some((net, log_std))) => {
@@ -446,7 +445,7 @@ impl Controller {
             }
             Inverse::Analytic(idm) => {
                 out.log_prob_action = 0.0;
-                idm.action(&self.held.q, &self.held.v, &out.next, &mut out.action);
+                idm.action(&self.held.q, &self.held.v, &out.next, self.projector.limits(), &mut out.action);
             }
         }
         let given = if self.foreign.has_map() { &self.mean[..n] } else { &out.sampled[..] };

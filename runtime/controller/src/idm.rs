@@ -1,10 +1,12 @@
 //! Inverse dynamics: from the state and the projected state to the action.
 
+use crate::arrival::Arrivals;
+use crate::controller::Parts;
 use crate::motors::Motors;
 use crate::net::Forward;
 use crate::normaliser::CLIP;
-use nearl_constraints::drive::Arrival;
-use nearl_constraints::{Drive, Dynamics, Model, Period, StateLayout, Target};
+use crate::snapshot::{Manifest, SnapshotError};
+use nearl_constraints::{Dynamics, LimitSet, Model, Period, StateLayout, Target};
 
 /// A Gaussian network I(a | s_c, s'_c): the mean action from the observation entries of S_c and their
 /// projected change, both in network space.
@@ -41,42 +43,44 @@ impl LearnedIdm {
 }
 
 /// Recursive Newton-Euler on the robot model: `tau = M(q) a + nle(q, v) - tau_passive` with `a = (v' - v) / dt` (Featherstone 2008; through
-/// Pinocchio), on average over the period ([`Dynamics::motors`]); then what the [`Drive`] of each joint is to be sent for it.
+/// Pinocchio), on average over the period ([`Dynamics::motors`]); then what the [`Drive`](nearl_constraints::Drive) of each joint is to be sent
+/// for it, and with several physics steps in a period what these take ([`PhysicsSteps`](nearl_constraints::PhysicsSteps)).
 pub struct AnalyticIdm {
     dynamics: Dynamics,
-    joints: Vec<Joint>,
+    dofs: Vec<usize>,
     motors: Motors,
     period: Period,
+    arrivals: Arrivals,
     tau: Vec<f64>,
-}
-
-struct Joint {
-    dof: usize,
-    idx_q: usize,
-    drive: Drive,
+    external: Vec<f64>,
 }
 
 impl AnalyticIdm {
-    /// Actions are what the `motors` of the joints of `dofs` are sent, held over `period`; `drives` (nv) says what the joints are commanded.
-    pub fn new(model: &Model, dofs: &[usize], drives: &[Drive], motors: Motors, period: Period) -> Self {
-        let joint = |&dof: &usize| Joint { dof, idx_q: model.joint_of_dof(dof).idx_q, drive: drives[dof] };
-        let joints = dofs.iter().map(joint).collect();
-        Self { dynamics: Dynamics::new(model), joints, motors, period, tau: vec![0.0; model.nv()] }
+    /// Actions are what the task's motors of the joints of `dofs` are sent, held over its period.
+    ///
+    /// # Errors
+    /// [`SnapshotError::Unusable`] for joints whose motors are not known.
+    pub fn new(m: &Manifest, model: &Model, dofs: &[usize]) -> Result<Self, SnapshotError> {
+        let drives = Parts::drives(m, model, dofs)?;
+        Ok(Self {
+            dynamics: Dynamics::new(model),
+            motors: Parts::motors(model, dofs, &drives)?,
+            arrivals: Arrivals::new(m, model, dofs, &drives, false),
+            dofs: dofs.to_vec(),
+            period: m.task.period(),
+            tau: vec![0.0; model.nv()],
+            external: vec![0.0; model.nv()],
+        })
     }
 
-    /// What each motor is sent (n_act) to take (q, v) to `target`; of a plain motor it is the force [N m or N].
-    pub fn action(&mut self, q: &[f64], v: &[f64], target: &Target, action: &mut [f64]) {
-        self.dynamics.motors(&self.period, q, v, &target.acceleration, &mut self.tau);
-        for (k, joint) in self.joints.iter().enumerate() {
-            let &Joint { dof, idx_q, drive } = joint;
-            let to = Arrival {
-                q: target.q[idx_q],
-                v: target.v[dof],
-                a: target.acceleration[dof],
-                tau: self.tau[dof],
-            };
-            let command = drive.command(&self.period, q[idx_q], v[dof], &to);
-            action[self.motors.place(k)] = self.motors.action(k, command);
+    /// What each motor is sent (n_act) to take (q, v) to `target`; of a plain motor it is the force [N m or N], within `limits` with several
+    /// physics steps.
+    pub fn action(&mut self, q: &[f64], v: &[f64], target: &Target, limits: &LimitSet, action: &mut [f64]) {
+        let a = &target.acceleration;
+        self.dynamics.motors(&self.period, q, v, a, &mut self.tau);
+        let commands = self.arrivals.commands((q, v), target, (a, &self.tau), &self.external, limits);
+        for (k, &i) in self.dofs.iter().enumerate() {
+            action[self.motors.place(k)] = self.motors.action(k, commands[i]);
         }
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! Read [`controller`] first: the one data path is on that page. Nothing here opens a link, starts a thread or reads a command line.
 
+mod arrival;
 pub mod codes;
 pub mod command;
 pub mod controller;

@@ -37,11 +37,9 @@ impl Brake {
         let controllable = layout.controllable();
         let projector =
             if guards { Parts::guard_projector(manifest, &model, controllable)? } else { projector };
-        let drives = Parts::drives(manifest, &model, controllable)?;
-        let motors = Parts::motors(&model, controllable, &drives)?;
         let joints = model.joints().iter().filter(|j| j.nv == 1 && controllable.contains(&j.idx_v));
         Ok(Some(Brake {
-            idm: AnalyticIdm::new(&model, controllable, &drives, motors, manifest.task.period()),
+            idm: AnalyticIdm::new(manifest, &model, controllable)?,
             proposal: Proposal::new(&model),
             target: Target::new(&model),
             joints: joints.map(|j| (j.idx_v, j.idx_q)).collect(),
@@ -98,7 +96,7 @@ impl Brake {
         if self.projector.needs_previous() {
             self.projector.remember(&self.target);
         }
-        self.idm.action(q, v, &self.target, &mut self.action);
+        self.idm.action(q, v, &self.target, self.projector.limits(), &mut self.action);
         for (action, &(lower, upper)) in self.action.iter_mut().zip(&self.range) {
             *action = if action.is_finite() { action.clamp(lower, upper) } else { 0.0 };
         }

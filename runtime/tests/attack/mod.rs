@@ -202,13 +202,15 @@ impl Twin {
     fn new(attack: &Attack) -> Twin {
         let model = attack.model();
         let all: Vec<usize> = (0..model.nv()).collect();
-        let period = match attack.plant_steps {
-            0 => nearl_constraints::Period::new(attack.dt, attack.sub_steps),
+        // as many steps as the model says, unless it is told otherwise
+        let steps = if attack.plant_steps == 0 { attack.sub_steps } else { attack.plant_steps };
+        let period = match steps {
+            0 => nearl_constraints::Period::new(attack.dt, 0),
             steps => nearl_constraints::Period::new(attack.dt / f64::from(steps), 1),
         };
         let zero = vec![0.0; model.nv()];
         Twin {
-            steps: attack.plant_steps.max(1),
+            steps: steps.max(1),
             dynamics: PeriodDynamics::new(&model, &all, period),
             q: attack.start.clone(),
             v: zero.clone(),

@@ -20,6 +20,7 @@ mod robot;
 mod rows;
 mod session;
 mod space;
+mod steps;
 mod stop;
 mod tick;
 

@@ -24,6 +24,12 @@ pub(crate) struct Section {
     pub(crate) braking: Way,
     #[serde(default)]
     pub(crate) guard: serde_json::Value,
+    /// Joints stop so far before the ends of their ranges at least [rad or m].
+    #[serde(skip)]
+    pub(crate) gap: f64,
+    /// Share of the acceleration limit that braking leaves.
+    #[serde(skip)]
+    pub(crate) reserve: f64,
     /// Bounds actions by what was reached; no limit of a state.
     #[serde(default)]
     #[allow(dead_code)] // actions of a network are not verified
@@ -465,7 +471,7 @@ impl Section {
         if let (Some(position), Range::Limited(lower, upper), Some(_)) =
             (&self.position, joint.range, of.machine.single(dof))
         {
-            let margin = -less(0.0, &position.margin, dof, name);
+            let margin = (-less(0.0, &position.margin, dof, name)).max(self.gap);
             (bounds.lower, bounds.upper) = (lower + margin, upper - margin);
         }
         if let Some(velocity) = &self.velocity {
@@ -489,7 +495,7 @@ impl Section {
                 bounds.acceleration = less(limit, &acceleration.margin, dof, name);
             }
             let stated = acceleration.braking.as_ref().and_then(|braking| braking.of(dof, name));
-            bounds.braking = stated.unwrap_or(none).min(bounds.acceleration);
+            bounds.braking = stated.unwrap_or(none).min((1.0 - self.reserve) * bounds.acceleration);
         }
         let jerk = self.jerk.as_ref().filter(|jerk| jerk.hard);
         if let Some((jerk, limit)) = jerk.and_then(|jerk| Some((jerk, jerk.limit.of(dof, name)?))) {

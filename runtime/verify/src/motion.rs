@@ -371,6 +371,11 @@ impl Machine {
         }
     }
 
+    /// Of dof `i` [N m s/rad or N s/m].
+    pub(crate) fn damping(&self, i: usize) -> f64 {
+        self.links[i].damping
+    }
+
     /// `M(q) x` (nv).
     pub(crate) fn mass_times(&mut self, q: &[f64], x: &[f64], out: &mut [f64]) {
         let still = vec![0.0; x.len()];

@@ -8,6 +8,7 @@ use crate::motion::Machine;
 use crate::moved::{Moved, Moving};
 use crate::period::Period;
 use crate::robot::{Payload, Robot};
+use crate::rows::Rule;
 
 /// The parts of a snapshot's manifest that are read.
 #[derive(Deserialize)]
@@ -113,12 +114,15 @@ pub(crate) enum Projects {
     Nothing,
 }
 
+/// Share by which the torque of a brake may be more than was verified where the plant has come a little elsewhere.
+const DRIFT: f64 = 0.01;
+
 /// A snapshot's promise.
 pub(crate) struct Promise {
     pub(crate) machine: Machine,
     pub(crate) limits: Limits,
-    /// The same without margins, where the plant is the model to second order only.
-    pub(crate) without_margins: Option<Limits>,
+    /// The same without margins, where the plant is the model to second order only: of the brake in force, whose torque may be more by [`DRIFT`].
+    pub(crate) without_margins: Option<(Limits, Option<Moving>)>,
     pub(crate) controllable: Vec<usize>,
     pub(crate) period: Period,
     pub(crate) policy_every: u32,
@@ -194,7 +198,7 @@ impl Promise {
         let section = |written: &Value| {
             Section::deserialize(written).map_err(|e| format!("its limits hold what is not known here: {e}"))
         };
-        let (bare, section) = (section(&without_margins(written))?, section(written)?);
+        let (bare, mut section) = (section(&without_margins(written))?, section(written)?);
         let joint = |name: &str| m.robot.joints().position(|j| j.name == name);
         let entry = |name: &String| {
             let (letter, rest) = name.split_once('.')?;
@@ -222,6 +226,10 @@ impl Promise {
         if sub_steps > 1000 || m.task.time.dt.is_nan() || m.task.time.dt <= 0.0 {
             return Err(format!("its control period of {} s has {sub_steps} physics steps", m.task.time.dt));
         }
+        // Joints whose forces are reckoned with end so far before their stops [rad or m], and their braking leaves a share of the limit.
+        if m.task.idm.kind == "pinocchio" || section.guard.as_bool() == Some(true) {
+            (section.gap, section.reserve) = if sub_steps == 1 { (1e-6, 0.0) } else { (1e-4, 0.02) };
+        }
         let period = Period::new(m.task.time.dt, sub_steps);
         let sent: Vec<Sent> = m
             .robot
@@ -238,7 +246,13 @@ impl Promise {
             .collect();
         let of = Of { robot: &m.robot, machine: &machine, controllable: &controllable, drives: &drives };
         let limits = section.limits(&of)?;
-        let without_margins = (sub_steps != 1).then(|| bare.limits(&of)).transpose()?;
+        let mut bare = (sub_steps != 1).then(|| bare.limits(&of)).transpose()?;
+        for row in bare.iter_mut().flat_map(|limits| &mut limits.rows) {
+            // Of the motion that a brake was to make; what its action asks of a motor is looked at by itself.
+            if let Rule::Torque { most, .. } = &mut row.rule {
+                *most *= 1.0 + DRIFT;
+            }
+        }
         let (is_direct, is_analytic) = (m.policy == "direct", m.task.idm.kind == "pinocchio");
         let guards = section.guard.as_bool() == Some(true);
         let projects = match (is_direct, is_analytic) {
@@ -258,7 +272,11 @@ impl Promise {
                 (false, false) => 1.0,
             }
         };
-        let moving = m.moved.as_ref().map(|moved| Moving::new(limits.clone(), moved, &period, &controllable));
+        let moving = |limits: &Limits| {
+            m.moved.as_ref().map(|moved| Moving::new(limits.clone(), moved, &period, &controllable))
+        };
+        let without_margins = bare.map(|limits| (limits.clone(), moving(&limits)));
+        let moving = moving(&limits);
         let worth = controllable.iter().map(change).fold(0.0, |most: f64, x| most.max(2.0 * x * x));
         let consistency =
             if projects == Projects::Proposals { section.consistency } else { Consistency::Kinematic };
@@ -285,6 +303,14 @@ impl Promise {
     pub(crate) fn stated(bytes: &[u8]) -> Result<Value, String> {
         let manifest: Value = serde_json::from_str(&manifest(bytes)?).map_err(|e| e.to_string())?;
         Ok(manifest["task"]["constraints"].clone())
+    }
+
+    /// Takes the limits without margins for those with them, and the other way round.
+    pub(crate) fn leave_out_margins(&mut self) {
+        if let Some((limits, moving)) = &mut self.without_margins {
+            std::mem::swap(limits, &mut self.limits);
+            std::mem::swap(moving, &mut self.moving);
+        }
     }
 
     /// The limits as they were built.

@@ -367,13 +367,14 @@ impl Session {
     /// Limits, action, optimum and way to stop of one promise. A plant that moves in several steps is off by the second order of its period,
     /// which margins are for: the brake that was verified a tick before is executed from where it ended, and keeps the limits without them.
     fn confirm(&mut self, promise: &mut Promise, case: &Case<'_>) -> Result<Option<Told>, Fault> {
-        if case.status != Status::Braked || promise.moving.is_some() {
-            return self.confirm_within(promise, case);
+        let of_brake = case.status == Status::Braked;
+        if of_brake {
+            promise.leave_out_margins();
         }
-        let Some(limits) = promise.without_margins.take() else { return self.confirm_within(promise, case) };
-        let with = std::mem::replace(&mut promise.limits, limits);
         let found = self.confirm_within(promise, case);
-        promise.without_margins = Some(std::mem::replace(&mut promise.limits, with));
+        if of_brake {
+            promise.leave_out_margins();
+        }
         found
     }
 
@@ -661,9 +662,11 @@ fn is_outside(promise: &mut Promise, case: &Case<'_>, whole: bool) -> bool {
 }
 
 /// The action is the one that leads to the target; where a joint rubs, to within its dry friction.
-fn actions(promise: &Promise, passage: &Passage<'_>, found: &[f64]) -> Result<(), Fault> {
-    let p = &promise.period;
+fn actions(promise: &mut Promise, passage: &Passage<'_>, found: &[f64]) -> Result<(), Fault> {
+    let p = promise.period;
     let (lag, sag) = (0.5 * (p.dt - p.tau), (p.dt * p.dt - p.tau * p.tau) / 6.0);
+    let by_steps = p.sub_steps > 1 && !promise.actions.iter().any(|x| matches!(x.sent, Sent::Target { .. }));
+    let mut means = Vec::new();
     for action in &promise.actions {
         let (i, joint) = (action.dof, &promise.limits.joints[action.dof].name);
         let Some(at) = promise.machine.single(i) else { continue };
@@ -683,9 +686,17 @@ fn actions(promise: &Promise, passage: &Passage<'_>, found: &[f64]) -> Result<()
         let leads = sent.max(action.range[0]).min(action.range[1]);
         let is = found.get(action.place).copied().unwrap_or(f64::NAN);
         let size = 1.0 + leads.abs().max(action.range[1].abs().min(1e3));
+        means.push(leads);
+        if by_steps && matches!(action.sent, Sent::Force) {
+            continue;
+        }
         if !are_near(is, leads, by_friction + ACTION * size) {
             return broken(format!("action for joint '{joint}'"), is, leads, unit);
         }
     }
-    Ok(())
+    if p.sub_steps > 1 && !means.is_empty() {
+        crate::steps::lead(promise, passage, found, &means)
+    } else {
+        Ok(())
+    }
 }

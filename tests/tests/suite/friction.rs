@@ -16,7 +16,7 @@ mod attack;
 use attack::{FINE, Rubs, Seen, rub, uniform};
 
 /// A URDF of three joints whose last one is light and rubs as much as the others.
-fn arm(friction: [f64; 3], damping: f64) -> String {
+pub(super) fn arm(friction: [f64; 3], damping: f64) -> String {
     let links = [("a", "0 1 0", 1.5, 0.012), ("b", "0 1 0", 0.8, 0.006), ("c", "1 0 0", 0.2, 0.0002)];
     let mut text = r#"<robot name="rubbing"><link name="base"/>"#.to_string();
     let mut parent = "base".to_string();
@@ -35,7 +35,7 @@ fn arm(friction: [f64; 3], damping: f64) -> String {
 
 const FRICTION: [f64; 3] = [1.0, 2.0, 1.0];
 
-fn plant(text: &str, sim_dt: f64) -> mj::Sim {
+pub(super) fn plant(text: &str, sim_dt: f64) -> mj::Sim {
     let options = mj::Options { sim_dt: Some(sim_dt), without_contacts: true, ..mj::Options::default() };
     mj::Sim::new(&mj::Model::from_text(text, mj::ModelFormat::Urdf, options).expect("plant"))
         .expect("simulation")

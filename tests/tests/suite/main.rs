@@ -29,5 +29,6 @@ mod resume;
 mod robots;
 mod schedules;
 mod start_from;
+mod steps;
 mod terrain;
 mod user_tasks;

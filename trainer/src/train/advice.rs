@@ -7,6 +7,7 @@ use crate::learn::Algorithm;
 use crate::rollout::RolloutError;
 use crate::settings::TrainSettings;
 use nearl_runtime::Manifest;
+use nearl_runtime::constraints::STOP_GAPS;
 use nearl_runtime::controller::Parts;
 
 /// Resets looked at, and their seed.
@@ -68,7 +69,7 @@ fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
             let at = q[model.joint_of_dof(i).idx_q];
             let by = [(limits.q_lower[i] - at).max(at - limits.q_upper[i]), v[i].abs() - limits.velocity[i]];
             for (outside, (by, value)) in found[i].iter_mut().zip(by.into_iter().zip([at, v[i]])) {
-                if by > 1e-9 {
+                if by > 1.5 * STOP_GAPS[1] {
                     outside.resets += 1;
                     if by > outside.by {
                         (outside.by, outside.value) = (by, value);

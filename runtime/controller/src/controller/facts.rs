@@ -4,7 +4,7 @@ use super::dial::Dial;
 use super::{Controller, Excess, Inverse, Noise, Output, State};
 use crate::PolicyKind;
 use crate::normaliser::Normaliser;
-use nearl_constraints::{Entry, LimitSet, Model, StateLayout, Target};
+use nearl_constraints::{Entry, LimitSet, Model, StateLayout, Target, end_of_range};
 
 impl Controller {
     /// How far `state` is outside the limits of the controllable joints: the largest excess of a position and of a velocity; less than
@@ -17,8 +17,11 @@ impl Controller {
     pub fn excess_over(&self, l: &LimitSet, state: &State) -> [Option<Excess>; 2] {
         let mut worst = [None::<Excess>; 2];
         for &dof in self.layout.controllable() {
-            let (q, v) = (state.q[self.idx_q[dof]], state.v[dof]);
-            let by = [(l.q_lower[dof] - q).max(q - l.q_upper[dof]), v.abs() - l.velocity[dof]];
+            let (iq, model) = (self.idx_q[dof], self.model());
+            let (q, v) = (state.q[iq], state.v[dof]);
+            let low = end_of_range(l.q_lower[dof], model.lower_position_limit()[iq]);
+            let high = end_of_range(l.q_upper[dof], model.upper_position_limit()[iq]);
+            let by = [(low - q).max(q - high), v.abs() - l.velocity[dof]];
             for (worst, by) in worst.iter_mut().zip(by) {
                 *worst = Excess::larger(*worst, (by > 1e-9).then_some(Excess { dof, by }));
             }

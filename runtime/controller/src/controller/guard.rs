@@ -2,9 +2,10 @@
 //! that leads to what the projection made of it.
 
 use super::parts::unusable;
+use crate::arrival::Arrivals;
 use crate::motors::Motors;
 use crate::snapshot::{Manifest, SnapshotError};
-use nearl_constraints::drive::{Arrival, Held};
+use nearl_constraints::drive::Held;
 use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposal, StateLayout, Target};
 
 /// Forward, project, back. With `S_c` the controllable dofs, whose motors the action (n_act) drives:
@@ -16,7 +17,8 @@ use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposa
 ///         -> tau' = R a' + b + F(a')                on S_c, while the other dofs follow
 /// ```
 ///
-/// Joints with a drive take their command for the force (see [`Drive`]). Where the projection moves nothing the action stays bit for bit.
+/// Joints with a drive take their command for the force (see [`Drive`]). Where the plant makes several physics steps of a period they are made
+/// one by one, forward and back. Where the projection moves nothing the action stays bit for bit.
 pub(super) struct Guard {
     pub(super) projector: Projector,
     dynamics: PeriodDynamics,
@@ -24,6 +26,7 @@ pub(super) struct Guard {
     /// By dof (nv).
     drives: Vec<Drive>,
     motors: Motors,
+    arrivals: Arrivals,
     pub(super) proposal: Proposal,
     /// Configuration index of each dof that is a joint of its own.
     single: Vec<Option<usize>>,
@@ -57,6 +60,7 @@ impl Guard {
             single: single.collect(),
             held: vec![Held::Force(0.0); nv],
             tau: vec![0.0; nv],
+            arrivals: Arrivals::new(m, model, &dofs, &drives, true),
             drives,
             motors,
             a: vec![0.0; nv],
@@ -72,6 +76,7 @@ impl Guard {
     pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], next: &mut Target, hold: bool) {
         self.dynamics.update(q, v, self.projector.external_forces());
         self.foresee(q, v, action);
+        let beyond = self.arrivals.end_beyond(q, self.projector.limits());
         self.projector.project(q, v, &self.proposal, next);
         if !hold {
             self.projector.pass(q, v, &self.proposal, next);
@@ -79,14 +84,14 @@ impl Guard {
         if self.projector.needs_previous() {
             self.projector.remember(next);
         }
-        if hold && self.is_moved(next) {
+        if hold && (beyond || self.is_moved(next)) {
             self.a.copy_from_slice(&next.acceleration);
             self.dynamics.drive(&mut self.a, &mut self.tau);
+            let (external, limits) = (self.projector.external_forces(), self.projector.limits());
+            let by = (&self.a[..], &self.tau[..]);
+            let commands = self.arrivals.commands((q, v), next, by, external, limits);
             for (k, &i) in self.dofs.iter().enumerate() {
-                let iq = self.single[i].unwrap_or(0);
-                let to = Arrival { q: next.q[iq], v: next.v[i], a: self.a[i], tau: self.tau[i] };
-                let command = self.drives[i].command(self.dynamics.period(), q[iq], v[i], &to);
-                action[self.motors.place(k)] = self.motors.action(k, command);
+                action[self.motors.place(k)] = self.motors.action(k, commands[i]);
             }
         }
     }
@@ -100,7 +105,9 @@ impl Guard {
             let command = self.motors.command(k, action[self.motors.place(k)]);
             self.held[i] = self.drives[i].held(&period, at, v[i], command);
         }
-        self.dynamics.accelerate(&self.held, &mut self.a);
+        if !self.arrivals.foresee((q, v), self.projector.external_forces(), &self.held, &mut self.a) {
+            self.dynamics.accelerate(&self.held, &mut self.a);
+        }
         for i in 0..v.len() {
             let y = t * self.a[i];
             self.proposal.v[i] = v[i] + y;
@@ -167,11 +174,11 @@ fn check_actions(
     }
     for (k, &i) in dofs.iter().enumerate().filter(|(_, i)| drives[**i] == Drive::Effort) {
         let ends = [&m.action_lower, &m.action_upper].map(|range| motors.command(k, range[motors.place(k)]));
-        let (effort, most) = (model.effort_limit()[i], ends[0].abs().max(ends[1].abs()));
-        if (most - effort).abs() > 1e-9 * effort.max(1.0) {
+        let (low, high, effort) = (ends[0].min(ends[1]), ends[0].max(ends[1]), model.effort_limit()[i]);
+        if high.min(-low) < effort * (1.0 - 1e-9) {
             return refuse(format!(
-                "[constraints] guard = true needs actions in N m or N, but that of joint '{}' goes to {most} and its motor to {effort}; write \
-                 <motor gear=\"1\"> with the joint's torque as its ctrlrange",
+                "[constraints] guard = true needs actions that reach the torque limit, but that of joint '{}' goes from {low} to {high} N m or N and the \
+                 joint's effort is {effort}; widen the motor's ctrlrange, or state the effort that it has",
                 model.dof_name(i)
             ));
         }

@@ -6,8 +6,8 @@ use crate::snapshot::{Manifest, Networks, PolicyKind, SnapshotError};
 use crate::task::{IdmInput, IdmKind};
 use nearl_constraints::description::FrictionLaw;
 use nearl_constraints::{
-    ActionLimit, Consistency, ConstraintSettings, Drive, DriveTorqueLimit, Entry, Model, Moved, Projector,
-    Settings, StateLayout, TorqueLimit, build_limits,
+    AccelerationLimit, ActionLimit, Consistency, ConstraintSettings, Drive, DriveTorqueLimit, Entry, Limit,
+    Model, Moved, PositionLimit, Projector, Settings, StateLayout, TorqueLimit, build_limits,
 };
 
 /// Robot, layout and projector of a task: what a controller needs beside its networks.
@@ -123,6 +123,9 @@ impl Parts {
     ) -> Result<Projector, SnapshotError> {
         let of_states = ConstraintSettings { action: None, reached: None, ..m.task.constraints.clone() };
         let mut limits = build_limits(&of_states, model).map_err(|e| unusable(&e))?;
+        if m.task.idm.kind == IdmKind::Pinocchio || m.guards() {
+            keep_clear(&mut limits, m);
+        }
         let drives = Self::drives(m, model, controllable)?;
         let is_pd = |drive: &Drive| matches!(drive, Drive::Pd { .. });
         if let Some(torque) = m.task.constraints.torque.clone().filter(|_| drives.iter().any(is_pd)) {
@@ -142,6 +145,26 @@ impl Parts {
             projector.move_limits(&moved).map_err(|e| unusable(&e))?;
         }
         Ok(projector)
+    }
+}
+
+/// Where motor forces are reckoned with, joints end before their stops, and braking leaves a reserve for what happens within a period.
+fn keep_clear(limits: &mut [Box<dyn Limit>], m: &Manifest) {
+    let (of, sub_steps) = (&m.task.constraints, m.task.sub_steps());
+    for limit in limits {
+        match limit.name() {
+            "position" => {
+                if let Some(position) = of.position.clone() {
+                    *limit = Box::new(PositionLimit::before_stops(position, sub_steps));
+                }
+            }
+            "acceleration" => {
+                if let Some(acceleration) = of.acceleration.clone() {
+                    *limit = Box::new(AccelerationLimit::over_steps(acceleration, sub_steps));
+                }
+            }
+            _ => {}
+        }
     }
 }
 
@@ -169,7 +192,7 @@ pub(super) fn halves(layout: &StateLayout) -> Vec<(usize, Half)> {
 }
 
 /// Configuration index of each degree of freedom that belongs to a one-dof joint; 0 elsewhere (never read).
-pub(super) fn idx_q(model: &Model) -> Vec<usize> {
+pub(crate) fn idx_q(model: &Model) -> Vec<usize> {
     let mut idx = vec![0; model.nv()];
     for j in model.joints().iter().filter(|j| j.nv == 1) {
         idx[j.idx_v] = j.idx_q;

@@ -1,0 +1,352 @@
+//! The physics steps of a period, one after the other.
+
+use crate::drive::Held;
+use crate::period_dynamics::solve;
+use crate::{LimitSet, Model, Period, PeriodDynamics};
+
+/// What forces that are held for a period lead to where the plant makes several Euler steps of it, and which forces lead where.
+///
+/// [`PeriodDynamics`] reckons with the forces of a constant acceleration, on average over the period. A held motor force makes none:
+/// weight, Coriolis forces and dampers change as the robot moves, and a strong damper passes that on to the velocity within a physics step.
+/// Here the steps are made as the plant makes them (`tau_s` is the length of one):
+///
+/// ```text
+///     v <- v + tau_s a(q, v, tau),   q <- q (+) tau_s v
+/// ```
+///
+/// [`PhysicsSteps::drive`] looks for the forces by Newton's method over the whole period (single shooting; Stoer and Bulirsch,
+/// *Numerical Analysis*, 7.3), whose slopes Broyden's rule keeps. One force decides velocity and position alike: the velocity is what is asked
+/// for, unless the position would end beyond its limit. Nothing allocates after [`PhysicsSteps::new`]. Units: rad or m, s, N·m or N.
+pub struct PhysicsSteps {
+    /// Of one physics step.
+    step: PeriodDynamics,
+    period: Period,
+    /// Configuration index of each dof that is a joint of its own.
+    single: Vec<Option<usize>>,
+    /// Dofs whose motion follows from forces, and where among them those are whose force is looked for.
+    free: Vec<usize>,
+    pushed: Vec<usize>,
+    held: Vec<Held>,
+    /// Where the steps have led, and where the last one began.
+    q: Vec<f64>,
+    from: Vec<f64>,
+    v: Vec<f64>,
+    a: Vec<f64>,
+    moved: Vec<f64>,
+    slopes: Slopes,
+    /// Accelerations that are asked for (nv).
+    wanted: Vec<f64>,
+    /// Pushed dofs whose force has no more room.
+    full: Vec<bool>,
+    /// What is missing of the velocity of each pushed dof, and by how much its force changes.
+    missing: Vec<f64>,
+    before: Vec<f64>,
+    change: Vec<f64>,
+    /// The force of each pushed dof, and the largest it may have.
+    force: Vec<f64>,
+    most: Vec<f64>,
+}
+
+/// How the velocities at the end of a period grow with the forces that are held, and scratch for it.
+#[derive(Default)]
+struct Slopes {
+    /// Pushed x pushed, row-major: velocity for a change of force, and the inverse.
+    velocity: Vec<f64>,
+    force: Vec<f64>,
+    mass: Vec<f64>,
+    inverse: Vec<f64>,
+    /// Free x pushed.
+    q: Vec<f64>,
+    v: Vec<f64>,
+    push: Vec<f64>,
+    row: Vec<f64>,
+}
+
+/// What may be missing of an acceleration [rad/s² or m/s²].
+const MISSING: f64 = 1e-9;
+/// How far beyond its limit a position may end without more being asked for [rad or m], and how often more is asked for in a period.
+const BEYOND: f64 = 1e-12;
+const RETREATS: usize = 3;
+/// Rounds before the best forces found are taken; three are the rule, and some ten where joints rub.
+const ROUNDS: usize = 30;
+
+impl PhysicsSteps {
+    /// For motors on the dofs `driven` of `model`. The dofs `follow` have the accelerations that they are given, whatever it takes; all others
+    /// follow from the forces. `None` where a period has a single physics step or none: [`PeriodDynamics`] is exact for the former.
+    pub fn new(model: &Model, driven: &[usize], follow: &[usize], period: Period) -> Option<PhysicsSteps> {
+        if period.sub_steps < 2 {
+            return None;
+        }
+        let nv = model.nv();
+        let free: Vec<usize> = (0..nv).filter(|i| !follow.contains(i)).collect();
+        let pushed: Vec<usize> = (0..free.len()).filter(|r| driven.contains(&free[*r])).collect();
+        let (n, m) = (free.len(), pushed.len());
+        let single = (0..nv).map(|i| {
+            let joint = model.joint_of_dof(i);
+            (joint.nq == 1 && joint.nv == 1).then_some(joint.idx_q)
+        });
+        let zero = |len: usize| vec![0.0; len];
+        let slopes = Slopes {
+            velocity: zero(m * m),
+            force: zero(m * m),
+            mass: zero(n * n),
+            inverse: zero(n * n),
+            q: zero(n * m),
+            v: zero(n * m),
+            push: zero(n * m),
+            row: zero(m),
+        };
+        Some(PhysicsSteps {
+            step: PeriodDynamics::new(model, driven, Period::new(period.tau, 1)),
+            period,
+            single: single.collect(),
+            free,
+            pushed,
+            held: vec![Held::Force(0.0); nv],
+            q: model.neutral(),
+            from: model.neutral(),
+            v: zero(nv),
+            a: zero(nv),
+            moved: zero(nv),
+            wanted: zero(nv),
+            full: vec![false; m],
+            slopes,
+            missing: zero(m),
+            before: zero(m),
+            change: zero(m),
+            force: zero(m),
+            most: zero(m),
+        })
+    }
+
+    /// The mean acceleration (nv) over a period that begins at `q` (nq), `v` (nv) with these motors `held` (nv) under the generalised forces
+    /// `external` (nv). NaN where the equations have no solution.
+    pub fn accelerate(&mut self, (q, v): (&[f64], &[f64]), external: &[f64], held: &[Held], a: &mut [f64]) {
+        self.held.copy_from_slice(held);
+        self.walk(q, v, external);
+        a.iter_mut().zip(self.v.iter().zip(v)).for_each(|(a, (end, v))| *a = (end - v) / self.period.dt);
+    }
+
+    /// Whether a joint was beyond its position limit at the end of the steps that were made last, and further than at their start, `q` (nq).
+    pub fn end_beyond(&self, q: &[f64], limits: &LimitSet) -> bool {
+        self.pushed.iter().any(|&r| self.beyond(self.free[r], q, limits).is_some_and(|[by, _]| by > BEYOND))
+    }
+
+    /// How far dof `i` has ended beyond its limit, or further beyond it than at `q`, and the sign of the way back.
+    fn beyond(&self, i: usize, q: &[f64], limits: &LimitSet) -> Option<[f64; 2]> {
+        let iq = self.single[i]?;
+        let above = self.q[iq] - limits.q_upper[i].max(q[iq]);
+        let below = limits.q_lower[i].min(q[iq]) - self.q[iq];
+        Some(if above > below { [above, -1.0] } else { [below, 1.0] })
+    }
+
+    /// Changes the motor forces `tau` (nv), which lead to the accelerations `a` (nv) about, into those that lead to them, within `limits`. `most` (nv)
+    /// are the largest forces.
+    pub fn drive(
+        &mut self,
+        (q, v): (&[f64], &[f64]),
+        external: &[f64],
+        a: &[f64],
+        (tau, most): (&mut [f64], &[f64]),
+        limits: &LimitSet,
+    ) {
+        self.full.fill(false);
+        self.wanted.copy_from_slice(a);
+        self.held.iter_mut().zip(a).for_each(|(held, a)| *held = Held::Acceleration(*a));
+        self.free.iter().for_each(|&i| self.held[i] = Held::Force(0.0));
+        for (k, &r) in self.pushed.iter().enumerate() {
+            let i = self.free[r];
+            (self.force[k], self.most[k]) = (tau[i].clamp(-most[i], most[i]), most[i]);
+        }
+        let (mut least, mut retreats) = (f64::INFINITY, 0);
+        for round in 0..ROUNDS {
+            for (k, &r) in self.pushed.iter().enumerate() {
+                self.held[self.free[r]] = Held::Force(self.force[k]);
+            }
+            self.walk(q, v, external);
+            let left = self.miss(v);
+            if left < least || left <= MISSING || self.full.contains(&true) {
+                least = left;
+                for (k, &r) in self.pushed.iter().enumerate() {
+                    tau[self.free[r]] = self.force[k];
+                }
+            }
+            if !left.is_finite() {
+                return;
+            }
+            if left <= MISSING {
+                if retreats == RETREATS || !self.retreat(q, limits) {
+                    return;
+                }
+                retreats += 1;
+                self.miss(v);
+            }
+            if round == 0 {
+                self.find_slopes(q, v, external);
+            } else if left > MISSING && !self.full.contains(&true) {
+                self.turn_slopes();
+            }
+            self.before.copy_from_slice(&self.missing);
+            self.push();
+        }
+    }
+
+    /// Asks for less acceleration where a position would end beyond its limit, or further beyond it than it is; whether it asks anywhere.
+    fn retreat(&mut self, q: &[f64], limits: &LimitSet) -> bool {
+        let by_acceleration = self.period.kappa * self.period.dt * self.period.dt;
+        let mut asks = false;
+        for r in 0..self.pushed.len() {
+            let i = self.free[self.pushed[r]];
+            let Some([by, sign]) = self.beyond(i, q, limits) else { continue };
+            if by > BEYOND && limits.jerk[i].is_infinite() {
+                let most = limits.acceleration[i];
+                let to = (self.wanted[i] + sign * by / by_acceleration).clamp(-most, most);
+                asks |= (to - self.wanted[i]) * sign > 0.0;
+                self.wanted[i] = to;
+            }
+        }
+        asks
+    }
+
+    /// Makes the steps with what is held.
+    fn walk(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
+        let tau = self.period.tau;
+        self.q.copy_from_slice(q);
+        self.v.copy_from_slice(v);
+        for _ in 0..self.period.sub_steps {
+            self.step.update(&self.q, &self.v, external);
+            self.step.accelerate(&self.held, &mut self.a);
+            for (i, a) in self.a.iter().enumerate() {
+                self.v[i] += tau * a;
+                self.moved[i] = tau * self.v[i];
+            }
+            self.go();
+        }
+    }
+
+    /// Moves the configuration by what the velocity makes of a step.
+    fn go(&mut self) {
+        self.from.copy_from_slice(&self.q);
+        if self.single.iter().any(Option::is_none) {
+            self.step.integrate(&self.from, &self.moved, &mut self.q);
+        }
+        for (iq, moved) in self.single.iter().zip(&self.moved) {
+            if let Some(iq) = *iq {
+                self.q[iq] = self.from[iq] + moved;
+            }
+        }
+    }
+
+    /// Writes what is missing of the velocities; the largest, as an acceleration.
+    fn miss(&mut self, v: &[f64]) -> f64 {
+        let mut most = 0.0;
+        for (k, &r) in self.pushed.iter().enumerate() {
+            let i = self.free[r];
+            let missing = v[i] + self.period.dt * self.wanted[i] - self.v[i];
+            self.missing[k] = if self.full[k] { 0.0 } else { missing };
+            let size = (self.missing[k] / self.period.dt).abs();
+            // a NaN stays
+            most = if size > most || size.is_nan() { size } else { most };
+        }
+        most
+    }
+
+    /// The slopes for a robot whose mass and dampers stay what they are at `q`, `v`, and whose joints do not rub.
+    fn find_slopes(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
+        let (n, m, nv, tau) = (self.free.len(), self.pushed.len(), v.len(), self.period.tau);
+        self.step.update(q, v, external);
+        let (s, model) = (&mut self.slopes, self.step.model());
+        s.inverse.fill(0.0);
+        for r in 0..n {
+            s.inverse[r * n + r] = 1.0;
+            for c in 0..n {
+                s.mass[r * n + c] = self.step.rows()[self.free[r] * nv + self.free[c]];
+            }
+        }
+        solve(n, n, &mut s.mass, &mut s.inverse);
+        s.q.fill(0.0);
+        s.v.fill(0.0);
+        for _ in 0..self.period.sub_steps {
+            for (r, &i) in self.free.iter().enumerate() {
+                let (k, d) = (model.stiffness()[i], model.damping()[i]);
+                for c in 0..m {
+                    let of_force = if self.pushed[c] == r { 1.0 } else { 0.0 };
+                    s.push[r * m + c] = of_force - k * s.q[r * m + c] - d * s.v[r * m + c];
+                }
+            }
+            for r in 0..n {
+                for c in 0..m {
+                    let a: f64 = (0..n).map(|j| s.inverse[r * n + j] * s.push[j * m + c]).sum();
+                    s.v[r * m + c] += tau * a;
+                    s.q[r * m + c] += tau * s.v[r * m + c];
+                }
+            }
+        }
+        for (k, &r) in self.pushed.iter().enumerate() {
+            s.velocity[k * m..(k + 1) * m].copy_from_slice(&s.v[r * m..(r + 1) * m]);
+        }
+        self.invert_slopes();
+    }
+
+    /// The force for a change of velocity, of the dofs whose force has room.
+    fn invert_slopes(&mut self) {
+        let (m, s) = (self.pushed.len(), &mut self.slopes);
+        for r in 0..m {
+            for c in 0..m {
+                let of_one = f64::from(u8::from(r == c));
+                let stays = self.full[r] || self.full[c];
+                s.push[r * m + c] = if stays { of_one } else { s.velocity[r * m + c] };
+                s.force[r * m + c] = of_one;
+            }
+        }
+        solve(m, m, &mut s.push[..m * m], &mut s.force);
+    }
+
+    /// Broyden's rule, of the inverse: afterwards what the last change of force did would have been foreseen.
+    fn turn_slopes(&mut self) {
+        let (m, s) = (self.pushed.len(), &mut self.slopes);
+        // the velocities grew by what is missing no more
+        let did = |k: usize| self.before[k] - self.missing[k];
+        let mut along = 0.0;
+        for k in 0..m {
+            let foreseen: f64 = (0..m).map(|c| s.force[k * m + c] * did(c)).sum();
+            along += self.change[k] * foreseen;
+            s.push[k] = self.change[k] - foreseen;
+            s.row[k] = (0..m).map(|r| self.change[r] * s.force[r * m + k]).sum();
+        }
+        let size: f64 = self.change.iter().map(|x| x * x).sum();
+        if along.abs() <= 1e-6 * size {
+            return;
+        }
+        for k in 0..m {
+            for c in 0..m {
+                s.force[k * m + c] += s.push[k] * s.row[c] / along;
+            }
+        }
+    }
+
+    /// Makes the next change of force. Where one has no room for it all, it goes as far as there is room, and the others stay for this round.
+    fn push(&mut self) {
+        let m = self.pushed.len();
+        let mut ends = false;
+        for k in 0..m {
+            let row = &self.slopes.force[k * m..(k + 1) * m];
+            let wanted: f64 = row.iter().zip(&self.missing).map(|(s, x)| s * x).sum();
+            self.change[k] = if self.full[k] { 0.0 } else { wanted };
+            ends |= (self.force[k] + self.change[k]).abs() > self.most[k];
+        }
+        for k in 0..m {
+            let to = (self.force[k] + self.change[k]).clamp(-self.most[k], self.most[k]);
+            let is_short = to != self.force[k] + self.change[k];
+            if ends && !is_short {
+                self.change[k] = 0.0;
+                continue;
+            }
+            (self.full[k], self.change[k]) = (self.full[k] || is_short, to - self.force[k]);
+            self.force[k] = to;
+        }
+        if ends {
+            self.invert_slopes();
+        }
+    }
+}

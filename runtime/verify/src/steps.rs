@@ -1,0 +1,148 @@
+//! The physics steps of a period under the actions that a log has, made one after the other.
+
+use crate::limit_check::{Fault, are_near, broken};
+use crate::motion::Machine;
+use crate::promise::{Action, Promise, Sent};
+use crate::rows::{Passage, Rule};
+
+/// Share by which the acceleration over a period may differ from the target's.
+const LED: f64 = 1e-6;
+/// A force or a position is at its limit up to this share.
+const AT_LIMIT: f64 = 1e-6;
+
+/// Where the steps have led.
+struct Walk {
+    q: Vec<f64>,
+    v: Vec<f64>,
+}
+
+/// The actions, held, lead through the steps to the target's velocities. A joint may fall short of its own whose force is at its limit, or no
+/// farther from zero than the mean one where its limit depends on the speed, or which slows down as it would end beyond its position limit
+/// otherwise. Where joints rub, by no more than their dry friction does. `means` has the action of each joint for its mean force.
+pub(crate) fn lead(
+    promise: &mut Promise,
+    passage: &Passage<'_>,
+    found: &[f64],
+    means: &[f64],
+) -> Result<(), Fault> {
+    let (nv, p) = (passage.v.len(), promise.period);
+    let walk = walk(promise, passage, found, None);
+    let mut by_friction = vec![0.0; nv];
+    for k in 0..promise.actions.len() {
+        let action = &promise.actions[k];
+        let (friction, dof) = (action.friction, action.dof);
+        if friction > 0.0 {
+            let pushed = self::walk(promise, passage, found, Some((dof, friction)));
+            (0..nv).for_each(|i| by_friction[i] += 1.5 * (pushed.v[i] - walk.v[i]).abs());
+        }
+    }
+    for (action, mean) in promise.actions.iter().zip(means) {
+        let (i, is) = (action.dof, found.get(action.place).copied().unwrap_or(f64::NAN));
+        if matches!(action.sent, Sent::Position | Sent::Velocity) {
+            continue;
+        }
+        let a = (walk.v[i] - passage.v[i]) / p.dt;
+        let off = walk.v[i] - passage.v1[i];
+        let near = |x: f64, y: f64| are_near(x, y, AT_LIMIT * (1.0 + y.abs()));
+        let leads = off.abs() <= LED * p.dt * (1.0 + passage.a[i].abs()) + by_friction[i];
+        let at_end = near(is, *mean) || action.range.iter().any(|end| near(is, *end));
+        // With margins and without: it is not known here which were kept to.
+        let each = || {
+            std::iter::once(&promise.limits).chain(promise.without_margins.iter().map(|(limits, _)| limits))
+        };
+        let has_no_room = each().flat_map(|limits| &limits.rows).any(|row| match row.rule {
+            Rule::Torque { dof, most } => dof == i && near(force(action, is).abs(), most),
+            Rule::TorqueSpeed { dof, .. } => dof == i && near(is, 0.0),
+            _ => false,
+        });
+        // What is given up of the velocity leads it no farther inside than it is for.
+        let retreats = promise.machine.single(i).is_some_and(|iq| {
+            each().any(|limits| {
+                let joint = &limits.joints[i];
+                let (low, high) = (joint.lower.min(passage.q[iq]), joint.upper.max(passage.q[iq]));
+                let inside = if off < 0.0 { high - walk.q[iq] } else { walk.q[iq] - low };
+                inside <= off.abs() * p.dt + AT_LIMIT && a.abs() <= joint.acceleration * (1.0 + LED)
+            })
+        });
+        if !(leads || at_end || has_no_room || retreats) {
+            return broken(
+                format!("velocity that the action leads joint '{}' to", promise.limits.joints[i].name),
+                walk.v[i],
+                passage.v1[i],
+                "rad/s or m/s",
+            );
+        }
+    }
+    Ok(())
+}
+
+/// Force of an action [N m or N].
+fn force(action: &Action, is: f64) -> f64 {
+    action.gear * (action.gain * is + action.bias)
+}
+
+/// Makes the steps; `more` is a force on one dof besides.
+fn walk(promise: &mut Promise, passage: &Passage<'_>, found: &[f64], more: Option<(usize, f64)>) -> Walk {
+    let (nv, p) = (passage.v.len(), promise.period);
+    let mut at = Walk { q: passage.q.to_vec(), v: passage.v.to_vec() };
+    let mut next = Vec::new();
+    let (mut force_of, mut a) = (vec![0.0; nv], passage.a.to_vec());
+    let is_free: Vec<bool> = (0..nv)
+        .map(|i| promise.actions.iter().any(|x| x.dof == i && matches!(x.sent, Sent::Force)))
+        .collect();
+    for action in promise.actions.iter().filter(|action| is_free[action.dof]) {
+        force_of[action.dof] = force(action, found.get(action.place).copied().unwrap_or(f64::NAN));
+    }
+    if let Some((i, by)) = more {
+        force_of[i] += by;
+    }
+    for _ in 0..p.sub_steps {
+        (0..nv).filter(|i| !is_free[*i]).for_each(|i| a[i] = passage.a[i]);
+        accelerations(&mut promise.machine, p.tau, (&at.q, &at.v), &force_of, &is_free, &mut a);
+        at.v.iter_mut().zip(&a).for_each(|(v, a)| *v += p.tau * a);
+        promise.machine.moved(&at.q, &at.v, p.tau, &mut next);
+        std::mem::swap(&mut at.q, &mut next);
+    }
+    at
+}
+
+/// The accelerations of the free dofs in a step that is implicit in the dampers: `(M + tau D) a = force - c - K (q - rest) - D v`; those of the
+/// others are in `a`.
+fn accelerations(
+    machine: &mut Machine,
+    tau: f64,
+    (q, v): (&[f64], &[f64]),
+    force: &[f64],
+    is_free: &[bool],
+    a: &mut [f64],
+) {
+    let nv = v.len();
+    let free: Vec<usize> = (0..nv).filter(|i| is_free[*i]).collect();
+    free.iter().for_each(|&i| a[i] = 0.0);
+    let (mut need, mut unit, mut column) = (vec![0.0; nv], vec![0.0; nv], vec![0.0; nv]);
+    // one step is explicit but for its dampers
+    machine.motors(&crate::Period::new(tau, 1), q, v, a, &mut need);
+    let n = free.len();
+    let mut rows = vec![vec![0.0; n + 1]; n];
+    for (c, &j) in free.iter().enumerate() {
+        unit.fill(0.0);
+        unit[j] = 1.0;
+        machine.mass_times(q, &unit, &mut column);
+        (0..n).for_each(|r| rows[r][c] = column[free[r]]);
+        rows[c][c] += tau * machine.damping(j);
+    }
+    (0..n).for_each(|r| rows[r][n] = force[free[r]] - need[free[r]]);
+    // the matrix is positive definite: no pivoting
+    for k in 0..n {
+        for r in k + 1..n {
+            let share = rows[r][k] / rows[k][k];
+            for c in k..=n {
+                rows[r][c] -= share * rows[k][c];
+            }
+        }
+    }
+    for k in (0..n).rev() {
+        let known: f64 = (k + 1..n).map(|j| rows[k][j] * a[free[j]]).sum();
+        a[free[k]] = (rows[k][n] - known) / rows[k][k];
+    }
+}
