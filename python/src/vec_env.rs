@@ -65,6 +65,7 @@ impl VecEnv {
         let settings =
             Settings { num_envs, constraints, actions, seed, threads, max_episode_steps, autoreset };
         let vector = py.detach(|| Vector::new(task, &settings)).map_err(errors::vector)?;
+        vector.notes().iter().try_for_each(|note| errors::warn(py, note))?;
         Ok(VecEnv(Mutex::new(vector)))
     }
 

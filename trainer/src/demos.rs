@@ -218,6 +218,12 @@ impl Demonstrations {
                     "'qpos' and 'qvel' have {q} and {v} columns where the robot has {nq} and {nv}"
                 ));
             }
+            let (width, n_act) = (e.actions.len() / e.length.max(1), env.spec().n_act());
+            if width != 0 && width != n_act {
+                return Err(format!(
+                    "'actions' of episode {i} have {width} columns where the robot has {n_act} actuators; record them with the task, or leave them out"
+                ));
+            }
             let begin = (&e.qpos[..nq], &e.qvel[..nv]);
             let is_drawn = drawn(env, begin).map_err(|error| format!("episode {i}: {error}"))?;
             env.observe(&mut obs);

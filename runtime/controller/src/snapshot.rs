@@ -184,9 +184,11 @@ pub enum SnapshotError {
         reason: String,
     },
     /// Not a safetensors file, or cut short.
-    #[error("snapshot is not a safetensors file: {reason}; it may be cut short: copy it again")]
+    #[error("{what} is not a safetensors file: {reason}")]
     Malformed {
-        /// What the reader said.
+        /// The file, if it is known.
+        what: String,
+        /// What the reader said, and what to do.
         reason: String,
     },
     /// Another kind of file.
@@ -321,7 +323,19 @@ impl Snapshot {
         let unreadable =
             |reason: String| SnapshotError::Unreadable { file: path.display().to_string(), reason };
         let bytes = nearl_constraints::read_bounded(path, MAX_BYTES, false);
-        Self::from_bytes(&bytes.map_err(|e| unreadable(e.to_string()))?)
+        let bytes = bytes.map_err(|e| unreadable(e.to_string()))?;
+        Self::from_bytes(&bytes).map_err(|e| match e {
+            SnapshotError::Malformed { reason, .. } => {
+                let is_text = bytes.len() > 8
+                    && std::str::from_utf8(&bytes).is_ok()
+                    && bytes.iter().all(|b| *b >= b'\t');
+                let text =
+                    "it is text, as task files are; give a snapshot (.safetensors) or the folder of a run";
+                let reason = if is_text { text.to_string() } else { reason };
+                SnapshotError::Malformed { what: format!("'{}'", path.display()), reason }
+            }
+            e => e,
+        })
     }
 
     /// Writes the file whole: to a name beside it, then renamed.
@@ -359,7 +373,10 @@ impl Snapshot {
     /// # Errors
     /// [`SnapshotError`].
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
-        let malformed = |e: safetensors::SafeTensorError| SnapshotError::Malformed { reason: one_line(&e) };
+        let malformed = |e: safetensors::SafeTensorError| SnapshotError::Malformed {
+            what: "snapshot".into(),
+            reason: format!("{}; it may be cut short: copy it again", one_line(&e)),
+        };
         let foreign = |reason: String| SnapshotError::Foreign { reason: one_line(&reason) };
         if let Some(kind) = FileKind::of(bytes).filter(|kind| *kind != FileKind::Safetensors) {
             return Err(SnapshotError::Kind { kind: kind.name(), next: kind.next() });

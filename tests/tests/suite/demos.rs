@@ -39,6 +39,14 @@ fn what_is_recorded_comes_back_and_is_of_its_task() {
         odd.episodes[1].qpos[2] += 0.1;
         let error = odd.check(&mut *env, manifest.task.time.dt).expect_err("another state");
         assert!(error.starts_with("episode 1 begins with "), "{error}");
+        let mut narrow = demos.clone();
+        let e = &mut narrow.episodes[1];
+        e.actions.truncate((n_act - 1) * e.length);
+        let error = narrow.check(&mut *env, manifest.task.time.dt).expect_err("fewer actuators");
+        assert!(
+            error.contains("of episode 1 have") && error.contains(&format!("{n_act} actuators")),
+            "{error}"
+        );
     }
 }
 

@@ -142,8 +142,8 @@ impl Run {
         if !others.is_empty() && Path::new(file).is_file() {
             let keys = others.join(", ");
             eprintln!(
-                "nearl: warning: the run goes on with the settings it was started with; '{file}' has others under {keys}: start a new run with \
-                 --out for these"
+                "nearl: warning: the run goes on with the settings it was started with; '{file}' by itself has others under {keys}: if the \
+                 file was changed since, and none of --set, --preset and --demos set these, start a new run with --out"
             );
         }
         let (algo, done) = (header.manifest.algo.parse()?, header.manifest.steps);

@@ -160,6 +160,18 @@ impl Model {
     fn beyond(&self) -> Vec<String> {
         let m = &self.0;
         let mut beyond = Vec::new();
+        let off = |id: &usize| {
+            let group = m.actuator_group()[*id];
+            (0..31).contains(&group) && (m.opt().disableactuator >> group) & 1 != 0
+        };
+        for id in (0..self.nu()).filter(off) {
+            beyond.push(format!(
+                "actuator '{}' is switched off with its group {} (actuatorgroupdisable): take that out of the file's option, or the actuator out of the \
+                 file",
+                self.actuator_name(id),
+                m.actuator_group()[id]
+            ));
+        }
         for id in (1..self.n_bodies()).filter(|id| m.body_gravcomp()[*id] != 0.0) {
             beyond.push(format!(
                 "body '{}' has gravcomp {}: take it out",
@@ -183,7 +195,8 @@ impl Model {
             }
         }
         let damped = m.dof_damping().iter().any(|d| *d != 0.0);
-        if self.is_euler() && damped && self.disables(mjtDisableBit::mjDSBL_EULERDAMP) {
+        let euler = m.opt().integrator == mujoco_rs::mujoco_c::mjtIntegrator::mjINT_EULER as i32;
+        if euler && damped && self.disables(mjtDisableBit::mjDSBL_EULERDAMP) {
             beyond.push("the option flag eulerdamp is off: take it out".to_string());
         }
         beyond

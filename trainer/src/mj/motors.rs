@@ -39,7 +39,7 @@ impl Model {
         self.0.actuator_trntype().len()
     }
 
-    fn actuator_name(&self, id: usize) -> String {
+    pub(super) fn actuator_name(&self, id: usize) -> String {
         self.name(MjtObjBase::mjOBJ_ACTUATOR, id).unwrap_or_else(|| match self.driven_joint(id) {
             Some(joint) => joint,
             None => format!("number {id}"),

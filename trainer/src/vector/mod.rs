@@ -84,6 +84,7 @@ pub struct Vector {
     n_obs: usize,
     space: Space,
     dt: f64,
+    notes: Vec<String>,
 }
 
 impl Vector {
@@ -117,6 +118,7 @@ impl Vector {
             _ => Space::actions(&spec),
         };
         let ticks = open.as_ref().map_or(1, |snapshot| snapshot.manifest.task.time.policy_every);
+        let notes = open.as_ref().map_or(Ok(Vec::new()), space::notes)?;
         let max_steps = settings.max_episode_steps.unwrap_or(spec.max_episode_steps);
         let lanes = (0..settings.num_envs as u64)
             .map(|i| {
@@ -136,7 +138,7 @@ impl Vector {
             .collect::<Result<Vec<_>, VectorError>>()?;
         let pool = Pool::new(lanes, settings.threads).map_err(|e| VectorError::Threads(e.to_string()))?;
         let (n_obs, dt) = (spec.n_obs(), spec.dt * ticks as f64);
-        Ok(Vector { pool, autoreset: settings.autoreset, n: settings.num_envs, n_obs, space, dt })
+        Ok(Vector { pool, autoreset: settings.autoreset, n: settings.num_envs, n_obs, space, dt, notes })
     }
 
     /// Begins an episode everywhere; `seeds` (n), if given, restart the random streams.
@@ -246,6 +248,12 @@ impl Vector {
     /// Smallest and largest action.
     pub fn action_range(&self) -> (&[f64], &[f64]) {
         (&self.space.low, &self.space.high)
+    }
+
+    /// What of the robot file the limits do not reckon with, and limits that are hardly meant, one sentence each; where the robot model tells what
+    /// actions lead to.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Time of one step \[s\].

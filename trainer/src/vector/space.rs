@@ -6,6 +6,7 @@ use super::{Meaning, VectorError};
 use crate::env::Spec;
 use crate::{tasks, train};
 use nearl_runtime::constraints::{Entry, Guard, LimitSet, Model, StateLayout};
+use nearl_runtime::controller::Parts;
 use nearl_runtime::net::{Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::task::IdmKind;
@@ -135,13 +136,29 @@ fn open(mut snapshot: Snapshot) -> Snapshot {
     snapshot
 }
 
-/// The task's limits around actions as the actuators take them: by the robot model where it knows what they lead to, else by the simulator.
+/// The task's limits around actions as the actuators take them: by the drives where the task guards these, by the robot model where it knows what
+/// actions lead to, else by the simulator.
 pub(super) fn guarded_snapshot(task: &str) -> Result<Snapshot, VectorError> {
     let mut manifest = tasks::load(task, &[])?;
-    let by_model = manifest.task.idm.kind == IdmKind::Pinocchio;
-    manifest.task.constraints.guard = if by_model { Guard::Model } else { Guard::Simulator };
+    let guard = &mut manifest.task.constraints.guard;
+    *guard = match (*guard, manifest.task.idm.kind) {
+        // of the drives alone, as on the robot
+        (Guard::Drive, _) => Guard::Drive,
+        (_, IdmKind::Pinocchio) => Guard::Model,
+        _ => Guard::Simulator,
+    };
     train::complete(&mut manifest)?;
     Ok(idle(manifest))
+}
+
+/// The notes of the robot and of the limits, where they are kept by the robot's dynamics.
+pub(super) fn notes(snapshot: &Snapshot) -> Result<Vec<String>, VectorError> {
+    let m = &snapshot.manifest;
+    if m.task.idm.kind != IdmKind::Pinocchio || m.bounds_drives() {
+        return Ok(Vec::new());
+    }
+    let Parts { model, projector, .. } = Parts::new(m)?;
+    Ok([model.notes(), projector.notes()].concat())
 }
 
 /// The task's limits on actions around actions as the actuators take them, and nothing else.
