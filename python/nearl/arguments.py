@@ -13,7 +13,9 @@ def whole(name: str, value: Any, least: int, give: str, most: int | None = None)
     Raises:
         ValueError: it is no whole number, below ``least`` or above ``most``; ``give`` says what to do.
     """
-    if isinstance(value, float) and value.is_integer():
+    if isinstance(value, float):
+        if not value.is_integer():
+            raise ValueError(f"{name} is {value!r}, no whole number; {give}")
         value = int(value)
     try:
         number = operator.index(value)

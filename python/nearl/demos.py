@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.recorded import SAME, BadDemonstrations, Rows, check_period, check_units, column, controller, goal_names, observations
+from nearl.recorded import SAME, BadDemonstrations, Rows, check_period, check_units, column, controller, goal_names, numbers, observations
+from nearl.sources import FilePath, check_entries, csv_table, minari_dataset, npz_arrays, once, seconds_between, split
 
 Floats = NDArray[np.float64]
-FilePath = str | os.PathLike[str]
 _BASE_Q = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _BASE_V = ("x", "y", "z", "wx", "wy", "wz")
 
@@ -58,8 +58,10 @@ def from_columns(
     Raises:
         BadDemonstrations: a column is missing, not finite or of another length, an episode has less than two rows, or numbers that are in other units.
     """
-    if isinstance(episodes, Mapping):
+    if hasattr(episodes, "keys"):
         raise BadDemonstrations(f"{source}: episodes is one table of columns; give a list of them, [table], one for each episode")
+    if not isinstance(episodes, Iterable):
+        raise BadDemonstrations(f"{source}: episodes is {episodes!r}; give a list of tables of columns by name, one for each episode")
     env = _core.Env(os.fspath(task))
     of_task = controller(env, task)
     period = of_task.dt * of_task.policy_every if period is None else period
@@ -69,10 +71,14 @@ def from_columns(
             f"{source}: its rows are {dt} s apart and the policy period of the task is {period:g} s; actions cannot be interpolated: leave them out, or "
             f"give one row for each policy period"
         )
+    if actions and (isinstance(actions, str) or len(actions) != len(env.actuator_names)):
+        raise BadDemonstrations(f"{source}: actions is {actions!r}; give one column for each actuator, {', '.join(env.actuator_names)}")
     parts: dict[str, list[Floats]] = {name: [] for name in ("observations", "qpos", "qvel", "actions")}
     lengths = []
     for i, columns in enumerate(episodes):
         where = f"{source}, episode {i}"
+        if not hasattr(columns, "keys"):
+            raise BadDemonstrations(f"{where}: it is of {type(columns).__name__}; give a table of columns by name, as {{'q.<joint>': values}}")
         qpos, qvel = _states(env, columns, dt, where)
         if (n := len(qpos)) < 2:
             raise BadDemonstrations(f"{where}: {n} rows make no transition; give at least 2")
@@ -103,33 +109,39 @@ def from_columns(
 
 def from_csv(task: FilePath, file: FilePath, out: FilePath, *, dt: float, episode: str = "episode", **options: Any) -> Path:
     """Reads a CSV file with a heading; rows of one episode have the same value in the column ``episode`` (all rows are one where there is none)."""
-    with open(file, newline="") as lines:
-        heading = [name.strip() for name in lines.readline().strip().lstrip("\ufeff").split(",")]
-        try:
-            rows = np.loadtxt(lines, delimiter=",", ndmin=2)
-        except ValueError as error:
-            raise BadDemonstrations(f"'{file}': {error}") from None
-    if rows.shape[1] != len(heading):
-        raise BadDemonstrations(f"'{file}': {rows.shape[1]} columns below a heading of {len(heading)}")
-    table = dict(zip(heading, rows.T))
-    return from_columns(task, _split(table, table.get(episode)), out, dt=dt, source=f"'{file}'", **options)
+    source = f"'{os.fspath(file)}'"
+    table = csv_table(file)
+    of = column(table, episode, len(table[episode]), source) if episode in table else None
+    return from_columns(task, split(table, of, source), out, dt=dt, source=source, **options)
 
 
 def from_minari(task: FilePath, dataset: Any, out: FilePath, *, dt: float | None = None, names: Sequence[str] | None = None, **options: Any) -> Path:
-    """Reads a Minari dataset (``minari.load_dataset``) whose observations are those of the task, or have the columns ``names``."""
+    """Reads a Minari dataset, or the one of that name on this machine, whose observations are those of the task, or have the columns ``names``."""
     env = _core.Env(os.fspath(task))
+    source = f"Minari dataset '{dataset}'" if isinstance(dataset, str) else "Minari dataset"
+    if isinstance(dataset, str):
+        dataset = minari_dataset(dataset)
+    if not hasattr(dataset, "iterate_episodes"):
+        raise BadDemonstrations(f"{source}: {dataset!r} is none; give its name, or what minari.load_dataset returns")
     names = env.obs_names if names is None else names
+    once(names, source)
+    options.setdefault("actions", env.actuator_names)
     episodes = []
     for i, e in enumerate(dataset.iterate_episodes()):
-        observations = np.asarray(e.observations, float)
+        where = f"{source}, episode {i}"
+        if isinstance(e.observations, Mapping):
+            raise BadDemonstrations(f"{where}: its observations are tables of {', '.join(e.observations)}; give their columns to nearl.demos.from_columns")
+        observations = numbers(e.observations, "array 'observations'", where)
         if observations.ndim != 2 or observations.shape[1] != len(names):
-            raise BadDemonstrations(f"Minari dataset, episode {i}: observations of shape {observations.shape} where {len(names)} columns have names")
+            raise BadDemonstrations(f"{where}: observations of shape {observations.shape} where {len(names)} columns have names")
         columns = dict(zip(names, observations.T))
-        given = np.asarray(e.actions, float).reshape(len(observations) - 1, -1)
-        columns |= dict(zip(env.actuator_names, np.vstack([given, given[-1:]]).T))
+        if options["actions"]:
+            given, want = numbers(e.actions, "array 'actions'", where), (len(observations) - 1, len(env.actuator_names))
+            if given.shape != want:
+                raise BadDemonstrations(f"{where}: actions of shape {given.shape} where the task's are {want}; give actions=() to leave them out")
+            columns |= dict(zip(env.actuator_names, np.vstack([given, given[-1:]]).T))
         episodes.append(columns)
-    options.setdefault("actions", env.actuator_names)
-    return from_columns(task, episodes, out, dt=env.dt if dt is None else dt, source="Minari dataset", **options)
+    return from_columns(task, episodes, out, dt=env.dt if dt is None else dt, source=source, **options)
 
 
 def from_robomimic(task: FilePath, file: FilePath, out: FilePath, *, dt: float, columns: Mapping[str, tuple[str, int]], **options: Any) -> Path:
@@ -138,16 +150,28 @@ def from_robomimic(task: FilePath, file: FilePath, out: FilePath, *, dt: float, 
         import h5py
     except ImportError as error:
         raise ImportError("reading robomimic's HDF5 needs h5py: pip install 'nearl[demos]'") from error
+    source = f"'{os.fspath(file)}'"
+    check_entries(columns, source)
+    os.stat(file)  # a file that is not there is said by the system
     episodes = []
-    with h5py.File(file) as data:
-        demos = sorted(data["data"], key=lambda name: int(name.rpartition("_")[2]))
-        for i, demo in enumerate(demos):
-            obs = data["data"][demo]["obs"]
+    try:
+        data = h5py.File(file)
+    except OSError as error:
+        raise BadDemonstrations(f"{source} cannot be read as HDF5 ({error}); give the file that robomimic wrote") from None
+    with data:
+        if not isinstance(data.get("data"), h5py.Group):
+            raise BadDemonstrations(f"{source}: no group 'data', in which robomimic has its demonstrations; it has {', '.join(data) or 'nothing'}")
+        if odd := [name for name in data["data"] if not name.rpartition("_")[2].isdecimal()]:
+            raise BadDemonstrations(f"{source}: 'data/{odd[0]}' has not the name of a demonstration, demo_0 and on; give the file that robomimic wrote")
+        for i, demo in enumerate(sorted(data["data"], key=lambda name: int(name.rpartition("_")[2]))):
+            where, obs = f"{source}, episode {i} ({demo})", data["data"][demo].get("obs", {})
             for name, (key, k) in columns.items():
-                if key not in obs or k >= obs[key].shape[1]:
-                    raise BadDemonstrations(f"'{file}', episode {i} ({demo}): no observation '{key}' with entry {k} for '{name}'; it has {', '.join(obs)}")
-            episodes.append({name: np.asarray(obs[key][:, k], float) for name, (key, k) in columns.items()})
-    return from_columns(task, episodes, out, dt=dt, source=f"'{file}'", **options)
+                shape: tuple[int, ...] = getattr(obs.get(key), "shape", ())
+                if len(shape) != 2 or k >= shape[1]:
+                    has = ", ".join(f"{name} {getattr(of, 'shape', '')}" for name, of in obs.items()) or "nothing"
+                    raise BadDemonstrations(f"{where}: no observation '{key}' with entry {k} for '{name}'; it has {has}")
+            episodes.append({name: numbers(obs[key][:, k], f"observation '{key}'", where) for name, (key, k) in columns.items()})
+    return from_columns(task, episodes, out, dt=dt, source=source, **options)
 
 
 def from_lerobot(
@@ -161,11 +185,16 @@ def from_lerobot(
         from pyarrow import parquet
     except ImportError as error:
         raise ImportError("reading a LeRobot dataset needs pyarrow: pip install 'nearl[demos]'") from error
-    info = json.loads((Path(folder) / "meta" / "info.json").read_text())
-    if key not in info["features"]:
-        raise BadDemonstrations(f"'{folder}': no feature '{key}'; it has {', '.join(info['features'])}")
+    source, meta = f"'{os.fspath(folder)}'", Path(folder) / "meta" / "info.json"
+    try:
+        info = json.loads(meta.read_text())
+        features, dt = info["features"], seconds_between(info["fps"], f"'{meta}'")
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise BadDemonstrations(f"'{meta}' describes no LeRobot dataset of version 3 ({error!r}); give the dataset's folder") from None
+    if key not in features:
+        raise BadDemonstrations(f"{source}: no feature '{key}'; it has {', '.join(features)}")
     if names is None:
-        given = info["features"][key].get("names") or []
+        given = features[key].get("names") or []
         given = given.get("motors", []) if isinstance(given, dict) else given
         names = [name if name.startswith(("q.", "v.")) else "q." + name.removesuffix(".pos") for name in given]
     rows, of = [], []
@@ -175,8 +204,9 @@ def from_lerobot(
         of += table["episode_index"].to_pylist()
     values = np.array(rows, float)
     if values.ndim != 2 or values.shape[1] != len(names):
-        raise BadDemonstrations(f"'{folder}': '{key}' has shape {values.shape} and {len(names)} names; give names=")
-    return from_columns(task, _split(dict(zip(names, values.T)), np.array(of)), out, dt=1 / info["fps"], source=f"'{folder}'", **options)
+        raise BadDemonstrations(f"{source}: '{key}' has shape {values.shape} and {len(names)} names; give names=")
+    once(names, source)
+    return from_columns(task, split(dict(zip(names, values.T)), np.array(of), source), out, dt=dt, source=source, **options)
 
 
 def from_motion(task: FilePath, file: FilePath, out: FilePath, *, joints: Sequence[str] | None = None, base: str = "root", **options: Any) -> Path:
@@ -184,35 +214,31 @@ def from_motion(task: FilePath, file: FilePath, out: FilePath, *, joints: Sequen
 
     A base that floats is seven entries before the joints in ``joint_pos``, or the first body of ``body_pos_w`` and ``body_quat_w``.
     """
-    with np.load(file, allow_pickle=False) as data:
-        clip = {name: data[name] for name in data.files}
-    missing = [name for name in ("fps", "joint_pos") if name not in clip]
-    if missing:
-        raise BadDemonstrations(f"'{file}': no array '{missing[0]}'; it has {', '.join(clip)}")
+    source = f"'{os.fspath(file)}'"
+    clip = npz_arrays(file, ["fps", "joint_pos"], ["joint_names", "body_pos_w", "body_quat_w"])
     if joints is None:
         if "joint_names" not in clip:
-            raise BadDemonstrations(f"'{file}': no array 'joint_names'; give joints=, the joints in the order of 'joint_pos'")
-        joints = [str(name) for name in clip["joint_names"]]
-    q = np.asarray(clip["joint_pos"], float)
+            raise BadDemonstrations(f"{source}: no array 'joint_names'; give joints=, the joints in the order of 'joint_pos'")
+        joints = [str(name) for name in np.ravel(clip["joint_names"])]
+    once([f"q.{name}" for name in joints], source)
+    q = numbers(clip["joint_pos"], "array 'joint_pos'", source)
+    if q.ndim != 2:
+        raise BadDemonstrations(f"{source}: 'joint_pos' has shape {q.shape}; give one row a frame, (n, {len(joints)})")
     extra = q.shape[1] - len(joints)
     if extra not in (0, 7):
-        raise BadDemonstrations(f"'{file}': 'joint_pos' has {q.shape[1]} columns for {len(joints)} joints; 7 more would be the base")
+        raise BadDemonstrations(f"{source}: 'joint_pos' has {q.shape[1]} columns for {len(joints)} joints; 7 more would be the base")
     columns = {f"q.{name}": q[:, extra + k] for k, name in enumerate(joints)}
     if extra == 7:
         columns |= {f"q.{base}.{entry}": q[:, k] for k, entry in enumerate(_BASE_Q)}
     elif "body_pos_w" in clip and "body_quat_w" in clip:
-        pose = np.hstack([np.asarray(clip[name], float)[:, 0] for name in ("body_pos_w", "body_quat_w")])
-        columns |= {f"q.{base}.{entry}": pose[:, k] for k, entry in enumerate(_BASE_Q)}
-    return from_columns(task, [columns], out, dt=1 / float(np.ravel(clip["fps"])[0]), source=f"'{file}'", **options)
-
-
-def _split(table: Mapping[str, Floats], of: ArrayLike | None) -> list[dict[str, Floats]]:
-    """The rows of each episode, in the order in which they begin."""
-    if of is None:
-        return [dict(table)]
-    of = np.asarray(of)
-    firsts = sorted(np.unique(of, return_index=True)[1])
-    return [{name: column[of == of[first]] for name, column in table.items()} for first in firsts]
+        pose = []
+        for name, width in (("body_pos_w", 3), ("body_quat_w", 4)):
+            of = numbers(clip[name], f"array '{name}'", source)
+            if of.ndim != 3 or of.shape[0] != len(q) or of.shape[1] == 0 or of.shape[2] != width:
+                raise BadDemonstrations(f"{source}: '{name}' has shape {of.shape} where 'joint_pos' has {len(q)} rows; give ({len(q)}, bodies, {width})")
+            pose += list(of[:, 0].T)
+        columns |= {f"q.{base}.{entry}": of for entry, of in zip(_BASE_Q, pose)}
+    return from_columns(task, [columns], out, dt=seconds_between(clip["fps"], source), source=source, **options)
 
 
 def _entries(env: _core.Env) -> tuple[list[str], list[str]]:
@@ -233,7 +259,7 @@ def _states(env: _core.Env, columns: Mapping[str, ArrayLike], dt: float, where: 
     given = [name for name in (*q_names, *v_names) if name in columns]
     if not given:
         raise BadDemonstrations(f"{where}: none of the task's columns ({', '.join(q_names)}); it has {', '.join(columns)}")
-    n = len(np.asarray(columns[given[0]]))
+    n = len(np.atleast_1d(numbers(columns[given[0]], f"column '{given[0]}'", where)))
     # a place that the task does not observe is of no matter; a joint's angle is
     of_no_matter = lambda name: not any(name in observed for observed in env.obs_names)  # noqa: E731
     qpos = np.stack([np.zeros(n) if name not in columns and of_no_matter(name) else column(columns, name, n, where) for name in q_names], 1)

@@ -1,6 +1,7 @@
 """A guard around any MuJoCo environment of Gymnasium: actions that would end outside the limits give way to near ones that do not."""
 
 from collections.abc import Callable, Mapping
+from numbers import Real
 from typing import Any
 
 import gymnasium
@@ -138,7 +139,12 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
         q: dict[int, tuple[float, float]] = {}
         if "position" in constraints:
             margins = _per_joint(constraints["position"].get("margin", 0.0), ranged, "position margin")
-            q = {int(m.jnt_qposadr[ranged[n]]): (m.jnt_range[ranged[n]][0] + x, m.jnt_range[ranged[n]][1] - x) for n, x in margins.items()}
+            for name, x in margins.items():
+                low, high = m.jnt_range[ranged[name]]
+                if 2 * x > high - low:
+                    most = (high - low) / 2
+                    raise ValueError(f"position margin of joint '{name}' is {x:g}, which leaves nothing from {low:.3g} to {high:.3g}; give at most {most:.3g}")
+                q[int(m.jnt_qposadr[ranged[name]])] = low + x, high - x
         v: dict[int, float] = {}
         if "velocity" in constraints:
             if "limit" not in constraints["velocity"]:
@@ -146,8 +152,6 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
             limit = constraints["velocity"]["limit"]
             named = single if isinstance(limit, Mapping) else ranged
             v = {int(m.jnt_dofadr[named[n]]): x for n, x in _per_joint(limit, named, "velocity limit").items()}
-        if any(low > high for low, high in q.values()):
-            raise ValueError("a joint has no position or velocity left within its limits; give a smaller margin")
         return q, v
 
 
@@ -156,6 +160,6 @@ def _per_joint(value: PerJoint, joints: Mapping[str, int], what: str) -> dict[st
     for name, number in values.items():
         if name not in joints:
             raise ValueError(f"{what}: the robot has no such joint '{name}'; it has {', '.join(joints)}")
-        if not (np.isfinite(number) and number >= 0.0):
-            raise ValueError(f"{what} of joint '{name}' is {number}; give a number of at least 0")
+        if not isinstance(number, Real) or not (np.isfinite(float(number)) and float(number) >= 0.0):
+            raise ValueError(f"{what} of joint '{name}' is {number!r}; give a number of at least 0")
     return {name: float(number) for name, number in values.items()}

@@ -11,12 +11,12 @@ Live objects are read, never files of theirs: the library that wrote a file load
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from nearl._core import Controller, Policy
+from nearl._core import Controller, Env, Policy
 
 _Path = str | os.PathLike[str]
 _Recipe = _Path | Sequence[_Path] | None
@@ -42,7 +42,13 @@ def import_onnx(path: _Path, robot: _Path, recipe: _Recipe = None, output: str |
     Raises:
         ValueError: the file is no policy, names a node that is not read, or something does not fit robot or recipe.
     """
-    return Policy.from_onnx(path, output).controller(robot, recipe, name)
+    try:
+        policy = Policy.from_onnx(path, output)
+    except ValueError as error:
+        if os.fspath(path) in str(error):
+            raise
+        raise ValueError(f"'{os.fspath(path)}': {error}") from None
+    return _place(policy, robot, recipe, None, name)
 
 
 def import_torch(
@@ -74,7 +80,8 @@ def import_torch(
         ValueError: a module that is no layer of a policy, by name; or a file.
     """
     _live(module, "import_torch", "torch.load")
-    policy = _policy(_layers(getattr(module, "actor", module)), *_normaliser(module, mean, std), clip, output_clip)
+    network = [("actor", module.actor)] if hasattr(module, "actor") else [("", module)]
+    policy = _policy(_layers(network), *_normaliser(module, mean, std), clip, output_clip)
     return _place(policy, robot, recipe, task, name)
 
 
@@ -99,10 +106,11 @@ def import_sb3(
         name: Of the task made of robot and recipe.
 
     Raises:
-        ValueError: a part of the policy that is no layer, by name; or a file.
+        ValueError: a part of the policy that is no layer, by name; actions that are none of the task's actuators; or a file.
     """
     _live(model, "import_sb3", "stable_baselines3.PPO.load")
     space, policy = model.action_space, model.policy
+    _check_meaning(model)
     if not hasattr(space, "low"):
         raise ValueError(f"the model chooses from {space}, and an imported policy gives numbers within a range; train it on a Box of actions")
     if hasattr(policy, "lstm_actor"):
@@ -110,14 +118,14 @@ def import_sb3(
     low, high = np.asarray(space.low, float).ravel(), np.asarray(space.high, float).ravel()
     actor = getattr(policy, "actor", None)
     if actor is None:  # PPO, A2C: the action is cut to its range, or with use_sde=True and squash_output=True squashed
-        parts = [policy.mlp_extractor.policy_net, policy.action_net]
+        parts = [("mlp_extractor.policy_net", policy.mlp_extractor.policy_net), ("action_net", policy.action_net)]
         squashed = bool(getattr(policy, "squash_output", False))
         layers = _layers([*_seen_by(policy), *parts])
         layers = _followed(layers, "tanh") if squashed else layers
     elif hasattr(actor, "latent_pi"):  # SAC: the mean is squashed
-        layers, squashed = _followed(_layers([*_seen_by(actor), actor.latent_pi, actor.mu]), "tanh"), True
+        layers, squashed = _followed(_layers([*_seen_by(actor), ("actor.latent_pi", actor.latent_pi), ("actor.mu", actor.mu)]), "tanh"), True
     else:  # TD3, DDPG: the network ends with a tanh
-        layers, squashed = _layers([*_seen_by(actor), actor.mu]), True
+        layers, squashed = _layers([*_seen_by(actor), ("actor.mu", actor.mu)]), True
     if squashed:
         layers = [*layers, (np.diag((high - low) / 2), (high + low) / 2, "identity")]
     mean = std = None
@@ -130,10 +138,37 @@ def import_sb3(
         rms = vec_normalize.obs_rms
         mean, std = rms.mean, np.sqrt(np.asarray(rms.var) + vec_normalize.epsilon)
         clip = float(vec_normalize.clip_obs)
-    size = np.shape(layers[0][0])[1]
-    mean, std = _moments(mean, std, size)
     made = _policy(layers, mean, std, clip, (-math.inf, math.inf))
+    if task is not None and robot is None:
+        _check_range(low, high, os.fspath(task))
     return _place(made, robot, recipe, task, name)
+
+
+def _check_meaning(model: Any) -> None:
+    """Refuses a policy that learned in an environment of ours to give something else than what the actuators get."""
+    env = getattr(model, "get_env", lambda: None)()
+    if env is None or not hasattr(env, "has_attr") or not env.has_attr("action_meaning"):
+        return
+    for meaning in env.get_attr("action_meaning"):
+        if meaning in ("state", "change"):
+            raise ValueError(
+                f"the model learned with actions='{meaning}', so that it gives {'proposed states' if meaning == 'state' else 'changes of the state'} and no "
+                f"actions of the actuators; learn with actions='guarded' to import it, or let a policy of actions='state' propose beside the loop "
+                f"(nearl.Proposer)"
+            )
+
+
+def _check_range(low: np.ndarray, high: np.ndarray, task: str) -> None:
+    """Refuses actions in another range than the motors have, which would be taken for theirs."""
+    env = Env(task)
+    for which, given, want in (("smallest", low, env.action_low), ("largest", high, env.action_high)):
+        if given.shape != want.shape:
+            return  # the task says how many there are
+        for i in np.flatnonzero(~np.isclose(given, want, rtol=1e-5, atol=1e-9)):
+            raise ValueError(
+                f"the {which} action[{i}] of the model is {given[i]:g}, and that of actuator '{env.actuator_names[i]}' of '{task}' is {want[i]:g}; "
+                f"train the model on actions of the actuators' range, or give robot= and a recipe= that says what its outputs mean"
+            )
 
 
 def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: str | None, name: str) -> Controller:
@@ -141,6 +176,11 @@ def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: str | Non
         return policy.in_task(task)
     if robot is None or task is not None:
         raise ValueError("give either task=, or robot= and recipe=")
+    recipes = [] if recipe is None else [recipe] if isinstance(recipe, str | os.PathLike) else recipe
+    for what, kind, file in (("robot", "a URDF or MJCF file", robot), *(("recipe", "a TOML file or unitree's deploy.yaml", one) for one in recipes)):
+        if not os.path.isfile(file):
+            reason = "it is no file" if os.path.exists(file) else "it does not exist"
+            raise ValueError(f"cannot read {what} '{os.fspath(file)}': {reason}; give {kind}")
     return policy.controller(robot, recipe, name)
 
 
@@ -152,8 +192,11 @@ def _policy(layers: list[_Layer], mean: Any, std: Any, clip: float, output_clip:
 
 
 def _moments(mean: Any, std: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
-    mean = np.zeros(size) if mean is None else _numbers(mean).ravel()
-    std = np.ones(size) if std is None else _numbers(std).ravel()
+    mean = np.zeros(size) if mean is None else _numbers(mean, "mean").ravel()
+    std = np.ones(size) if std is None else _numbers(std, "std").ravel()
+    for name, values, is_good, give in (("mean", mean, np.isfinite(mean), "finite numbers"), ("std", std, np.isfinite(std) & (std > 0), "numbers above 0")):
+        if len(bad := np.flatnonzero(~is_good)):
+            raise ValueError(f"{name}[{bad[0]}] of the observation is {values[bad[0]]:g}; give {give}, one for each entry")
     return mean, std
 
 
@@ -162,7 +205,7 @@ def _normaliser(module: Any, mean: Any, std: Any) -> tuple[Any, Any]:
     normaliser = getattr(module, "actor_obs_normalizer", None)
     if mean is not None or std is not None or normaliser is None or not hasattr(normaliser, "_mean"):
         return mean, std
-    return normaliser._mean, _numbers(normaliser._std) + float(normaliser.eps)
+    return normaliser._mean, _numbers(normaliser._std, "actor_obs_normalizer._std") + float(normaliser.eps)
 
 
 def _live(model: Any, name: str, loader: str) -> None:
@@ -173,21 +216,27 @@ def _live(model: Any, name: str, loader: str) -> None:
             f"'{file}' is a file, and files of PyTorch and Stable-Baselines3 are pickles, which are never opened here; load it with the library that wrote it, "
             f"e.g. {loader}({file!r}), and give nearl.{name} what it returns"
         )
+    if isinstance(model, Mapping):
+        raise ValueError(
+            f"a table of weights (state_dict) does not say in which order layers run and what follows them; load it into the network it is of, "
+            f"network.load_state_dict(...), and give nearl.{name} that"
+        )
 
 
-def _seen_by(policy: Any) -> list[Any]:
+def _seen_by(policy: Any) -> list[tuple[str, Any]]:
     """What SB3 makes of the observation before the first layer: nothing but flattening, or it is named."""
-    return [part for part in [getattr(policy, "pi_features_extractor", None) or getattr(policy, "features_extractor", None)] if part is not None]
+    parts = [(name, getattr(policy, name, None)) for name in ("pi_features_extractor", "features_extractor")]
+    return [(name, part) for name, part in parts if part is not None][:1]
 
 
-def _layers(module: Any) -> list[_Layer]:
-    """The linear layers of a module with what follows each, in the order in which a Sequential runs them."""
+def _layers(modules: Iterable[tuple[str, Any]]) -> list[_Layer]:
+    """The linear layers of named modules with what follows each, in the order in which a Sequential runs them."""
     layers: list[_Layer] = []
-    for part in _flat(module):
+    for name, part in (flat for named in modules for flat in _flat(*named)):
         kind = type(part).__name__
         if kind == "Linear":
-            weight = _numbers(part.weight)
-            bias = np.zeros(len(weight)) if part.bias is None else _numbers(part.bias)
+            weight = _finite(part.weight, f"{name}.weight".lstrip("."))
+            bias = np.zeros(len(weight)) if part.bias is None else _finite(part.bias, f"{name}.bias".lstrip("."))
             layers.append((weight, bias, "identity"))
         elif kind in _NOTHING:
             continue
@@ -219,19 +268,31 @@ def _clipped(layers: list[_Layer], low: float, high: float) -> list[_Layer]:
     return [*layers, both, (np.hstack([np.eye(n), -np.eye(n)]), np.full(n, low), "identity")]
 
 
-def _flat(module: Any) -> Iterable[Any]:
-    """Parts in order. Only a Sequential says in which order its parts run."""
+def _flat(name: str, module: Any) -> Iterable[tuple[str, Any]]:
+    """Parts in order, by the names that torch has for them. Only a Sequential says in which order its parts run."""
     kind = type(module).__name__
     if kind == "Sequential" or isinstance(module, list | tuple) or (kind == "MLP" and hasattr(module, "__iter__")):
-        for part in module:
-            yield from _flat(part)
+        for i, part in enumerate(module):
+            yield from _flat(f"{name}.{i}".lstrip("."), part)
     else:
-        yield module
+        yield name, module
 
 
-def _numbers(value: Any) -> np.ndarray:
+def _finite(value: Any, name: str) -> np.ndarray:
+    """A tensor of the module by its name, all of it finite."""
+    numbers = _numbers(value, name)
+    if not np.isfinite(numbers).all():
+        at = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
+        raise ValueError(f"the module's tensor '{name}' is {numbers[at]} at {list(at)}; the training diverged: give the network of an earlier checkpoint")
+    return numbers
+
+
+def _numbers(value: Any, name: str) -> np.ndarray:
     """A tensor of torch, or anything NumPy accepts, as an array."""
     for step in ("detach", "cpu", "numpy"):
         if hasattr(value, step):
             value = getattr(value, step)()
-    return np.asarray(value, float)
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is of {type(value).__name__} and holds what is no number; give an array of numbers") from None

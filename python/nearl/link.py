@@ -15,8 +15,8 @@
 """
 
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -81,6 +81,30 @@ class Chunk:
 
     def __len__(self) -> int:
         return len(self.reward)
+
+
+def _snapshot_of(path: Path) -> Path:
+    """The snapshot file of a path: itself, or a run folder's final one, else its latest."""
+    if not path.exists():
+        raise FileNotFoundError(f"cannot read snapshot '{path}': it does not exist; give a snapshot file or a run folder")
+    if not path.is_dir():
+        return path
+    for name in ("final", "latest"):
+        if (file := path / "checkpoints" / f"{name}.safetensors").is_file():
+            return file
+    raise FileNotFoundError(f"cannot read snapshot '{path}': the folder has no checkpoints/final.safetensors or latest.safetensors; give a run folder with one")
+
+
+def _check_finite(name: str, value: Any) -> None:
+    """Refuses numbers that are none, which no message to a loop can carry."""
+    if isinstance(value, Mapping):
+        for key, of in value.items():
+            _check_finite(f"{name} of '{key}'", of)
+    elif isinstance(value, list | tuple | np.ndarray):
+        for i, of in enumerate(value):
+            _check_finite(f"{name}[{i}]", of)
+    elif isinstance(value, float | np.floating) and not np.isfinite(value):
+        raise ValueError(f"{name} is {value}; give a finite number, or leave it out for the limit of the build")
 
 
 def _chunk(sequence: int, first_step: int, version: int, constraints: int, rows: Floats, columns: list[tuple[str, int]]) -> Chunk:
@@ -192,14 +216,17 @@ class Link:
         return from_arrays(arrays, lost)
 
     def push(self, snapshot: str | os.PathLike[str] | bytes) -> Receipt:
-        """Puts a snapshot (a file or its bytes) into the running loop; what does not fit the robot is refused.
+        """Puts a snapshot (a file, a run folder or bytes) into the running loop; what does not fit the robot is refused.
 
         Raises:
             OSError: the file cannot be read.
             ConnectionError: there is no loop, no answer came, or another trainer pushes to it.
         """
-        data = snapshot if isinstance(snapshot, bytes) else Path(snapshot).read_bytes()
-        return Receipt(*self._running().push(data, self._patience))
+        if isinstance(snapshot, bytes):
+            return Receipt(*self._running().push(snapshot, self._patience))
+        file = _snapshot_of(Path(snapshot))
+        receipt = Receipt(*self._running().push(file.read_bytes(), self._patience))
+        return receipt if receipt.accepted else replace(receipt, text=f"'{file}': {receipt.text}")
 
     def move_limits(self, **moved: Any) -> Receipt:
         """Moves the limits of the running loop inside those it was started with, or back to them; without arguments, back.
@@ -209,8 +236,11 @@ class Link:
         mass in the frame's axes (3) [m] and inertia about it (``xx, xy, xz, yy, yz, zz``) [kg·m²]. They hold until others are asked for, whoever leaves.
 
         Raises:
+            ValueError: a number is not finite.
             ConnectionError: there is no loop, no answer came, or another operator moves its limits.
         """
+        for name, value in moved.items():
+            _check_finite(name, value)
         return Receipt(*self._running().move_limits(self._patience, **moved))
 
     def _running(self) -> _core.LoopClient:

@@ -11,7 +11,8 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -27,6 +28,8 @@ Floats = NDArray[np.float64]
 Callback = Callable[["PID2", dict[str, float]], bool | None]
 # Of a run folder: which of reward and termination came from Python, which the checkpoint does not tell apart.
 FUNCTIONS = "functions.json"
+# What the `nearl` command advises, and what does the same here.
+_ARGUMENTS = {"go on with --resume": "go on with nearl.PID2.load(run)", "another folder with --out": "another folder as run=", "with --out": "with run="}
 
 
 class PID2:
@@ -79,10 +82,11 @@ class PID2:
         seed, threads = seed_of(seed), threads_of(threads)
         # What is written later goes there, wherever the process has gone meanwhile.
         run = None if run is None or (ranks is not None and ranks.rank != 0) else os.path.abspath(run)
-        self._training: _core.Training | None = _core.Training(
-            os.fspath(task), algo, seed, threads, overrides, run, preset, _scorer(reward, termination), reward is not None, ranks,
-            None if start_from is None else os.path.abspath(start_from),
-        )
+        with _said_in_python():
+            self._training: _core.Training | None = _core.Training(
+                os.fspath(task), algo, seed, threads, overrides, run, preset, _scorer(reward, termination), reward is not None, ranks,
+                None if start_from is None else os.path.abspath(start_from),
+            )
         self.task, self.algo, self.seed = self._training.task, algo, seed
         self._keep_functions(run, reward, termination)
         self._begin(self._training.controller())
@@ -126,7 +130,8 @@ class PID2:
         total_timesteps = whole("total_timesteps", total_timesteps, 1, "ask for at least one step")
         callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]
         bar = _Bar(sys.stderr, self.num_timesteps, total_timesteps) if progress_bar else None
-        warning = self._training.begin(total_timesteps)
+        with _said_in_python():
+            warning = self._training.begin(total_timesteps)
         try:
             if self._functions is not None and any(self._given.values()):
                 self._functions.write_text(json.dumps(self._given))
@@ -212,12 +217,29 @@ class PID2:
         path, threads = os.path.abspath(path), threads_of(threads)
         if ranks is not None or (Path(path) / "checkpoints" / "resume.safetensors").is_file():
             _ask_again(Path(path), reward, termination)
-            agent._training = _core.Training.resume(path, threads, _scorer(reward, termination), reward is not None, ranks)
+            with _said_in_python(path):
+                agent._training = _core.Training.resume(path, threads, _scorer(reward, termination), reward is not None, ranks)
             agent._keep_functions(path, reward, termination)
-        controller = _core.Controller.load(path) if agent._training is None else agent._training.controller()
+        with _said_in_python(path):
+            controller = _core.Controller.load(path) if agent._training is None else agent._training.controller()
         agent.task, agent.algo = controller.task, controller.algo
         agent._begin(controller)
         return agent
+
+
+@contextmanager
+def _said_in_python(path: str = "") -> Iterator[None]:
+    """A refusal of a folder or file, with ``path`` in it, and arguments of this class in place of the command's."""
+    try:
+        yield
+    except ValueError as error:
+        said = str(error)
+        for option, argument in _ARGUMENTS.items():
+            said = said.replace(option, argument)
+        said = said if path in said else f"'{path}': {said}"
+        if said == str(error):
+            raise
+        raise ValueError(said) from None
 
 
 def _scorer(reward: Outcome | None, termination: Outcome | None) -> Callable[[Floats, Floats, Floats], tuple[float | None, bool]] | None:

@@ -132,6 +132,7 @@ class Loop:
         rollback_window: int | None = None,
     ) -> None:
         self.report: dict[str, Any] | None = None
+        self._refused: Exception | None = None
         self._thread = _core.LoopThread(
             snapshot,
             name,
@@ -163,12 +164,27 @@ class Loop:
         return self._end(wait=True)
 
     def _end(self, wait: bool) -> dict[str, Any]:
+        if self._refused is not None:
+            raise self._refused
         if self.report is None:
-            self.report = json.loads(self._thread.end(wait))
+            try:
+                self.report = json.loads(self._thread.end(wait))
+            except Exception as refused:
+                self._refused = refused
+                raise
         return self.report
 
     def __enter__(self) -> "Loop":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.stop()
+        if self.report is not None or self._refused is not None:
+            return
+        try:
+            self.stop()
+        except Exception as refused:
+            if error is None:
+                raise
+            # The body's own exception is the one to see; what became of the loop is told beneath it.
+            if hasattr(error, "add_note"):
+                error.add_note(f"The loop beside it: {refused}")

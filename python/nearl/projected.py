@@ -53,6 +53,7 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._renderer: Renderer | None = None
         self._task = os.fspath(task)
         self._native = _core.VecEnv(self._task, 1, os.fspath(constraints), 0, 1, max_episode_steps, False, actions)
+        self.action_meaning = actions
         low, high = self._native.action_low, self._native.action_high
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self._native.n_obs,), np.float64)

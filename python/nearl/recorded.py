@@ -4,6 +4,7 @@ import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,14 +26,22 @@ class BadDemonstrations(ValueError):
     """A source that does not fit the task: the message names file, column and episode."""
 
 
+def numbers(values: ArrayLike, what: str, where: str) -> Floats:
+    """An array of real numbers."""
+    try:
+        given = np.asarray(values)
+        if not np.iscomplexobj(given):
+            return given.astype(float)
+    except (TypeError, ValueError):
+        raise BadDemonstrations(f"{where}: {what} holds what is no number; give numbers") from None
+    raise BadDemonstrations(f"{where}: {what} holds complex numbers; give real ones, as numpy.real of them")
+
+
 def column(columns: Columns, name: str, n: int, where: str) -> Floats:
     """A column (n) by its name, all of it finite."""
     if name not in columns:
         raise BadDemonstrations(f"{where}: no column '{name}'; it has {', '.join(columns)}")
-    try:
-        values = np.asarray(columns[name], float)
-    except (TypeError, ValueError):
-        raise BadDemonstrations(f"{where}: column '{name}' holds what is no number") from None
+    values = numbers(columns[name], f"column '{name}'", where)
     if values.shape != (n,):
         raise BadDemonstrations(f"{where}: column '{name}' has shape {values.shape} where the others have {n} rows")
     bad = np.flatnonzero(~np.isfinite(values))
@@ -57,6 +66,11 @@ def controller(env: _core.Env, task: str | os.PathLike[str]) -> _core.Controller
 
 def check_period(dt: float, period: float, source: str) -> None:
     """Refuses a time between two rows that no recording of the task has."""
+    for name, value, is_of in (("dt", dt, "the time between two rows"), ("period", period, "the policy period")):
+        if not isinstance(value, Real):
+            raise BadDemonstrations(f"{source}: {name} is {value!r}; give {is_of} in seconds, a number")
+    if not (period > 0 and np.isfinite(period)):
+        raise BadDemonstrations(f"{source}: period is {period}; give the policy period in seconds")
     if not (dt > 0 and np.isfinite(dt)):
         raise BadDemonstrations(f"{source}: dt is {dt}; give the time between two rows in seconds")
     if dt >= _SLOW and dt > 10 * period:

@@ -59,6 +59,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         same_step = mode is AutoresetMode.SAME_STEP
         self._native = _core.VecEnv(task, num_envs, constraints, seed, threads, max_episode_steps, same_step, actions)
         self.num_envs = num_envs
+        self.action_meaning = "actuators" if constraints is None else actions
         self._reward, self._termination = reward, termination
         self._obs = np.zeros((num_envs, self._native.n_obs))
         self._over = np.zeros(num_envs, bool)  # whose next step only begins an episode

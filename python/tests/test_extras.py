@@ -16,7 +16,7 @@ EXTRAS = PROJECT["optional-dependencies"]
 # Modules of a distribution, where they are called otherwise.
 MODULES = {"imageio-ffmpeg": "imageio_ffmpeg", "stable-baselines3": "stable_baselines3", "tensorboardX": "tensorboardX"}
 # Brought for the sake of the user's own program, whose objects are handed over.
-HANDED_OVER = {"stable_baselines3", "minari"}
+HANDED_OVER = {"stable_baselines3"}
 # What an extra is for, tried without its libraries.
 TRIED = {
     "train": "import nearl; nearl.make_vec",
@@ -27,6 +27,7 @@ TRIED = {
     "torch": "import nearl.torch",
     "jax": "import nearl.jax",
     "demos": "import nearl.demos; nearl.demos.from_robomimic('Hopper-v5', 'a.hdf5', 'a.npz', dt=0.1, columns={})",
+    "minari": "import nearl.demos; nearl.demos.from_minari('Hopper-v5', 'mujoco/hopper/expert-v0', 'a.npz')",
 }
 
 

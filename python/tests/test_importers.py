@@ -529,9 +529,23 @@ def test_the_actors_of_stable_baselines_are_read() -> None:
     assert sys.modules.get("torch") is None
 
 
-def test_squashed_means_and_clips_of_stable_baselines_are_kept() -> None:
+def with_motors(tmp_path, box) -> str:
+    """A task of a chain of six joints and 17 entries of observation, its motors with the range of ``box``."""
+    joints, robot = [f"j{k}" for k in range(6)], ""
+    for joint in reversed(joints):
+        robot = f'<body pos="0 0 -.3"><joint name="{joint}" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".03" mass="1"/>{robot}</body>'
+    motors = "".join(f'<motor joint="{j}" ctrllimited="true" ctrlrange="{a:g} {b:g}"/>' for j, a, b in zip(joints, box.low, box.high))
+    (tmp_path / "chain.xml").write_text(f"<mujoco><worldbody>{robot}</worldbody><actuator>{motors}</actuator></mujoco>")
+    entries = [*(f"q.{j}" for j in joints), *(f"v.{j}" for j in joints), *(f"sin(q.{j})" for j in joints[:5])]
+    task = f'name = "chain"\n[model]\nmjcf = "chain.xml"\n[time]\ndt = 0.01\nsim_dt = 0.002\n[state]\nobservation = {json.dumps(entries)}\n'
+    (tmp_path / "chain.toml").write_text(task + '[reward]\nstill = "-q.j0^2"\n[constraints]\nvelocity = { limit = 3.0 }\n[idm]\nkind = "pinocchio"\n')
+    return str(tmp_path / "chain.toml")
+
+
+def test_squashed_means_and_clips_of_stable_baselines_are_kept(tmp_path) -> None:
     """`use_sde=True`: PPO and A2C squash with `squash_output`, SAC clips its mean before it does. The normaliser is the model's own unless one is given."""
     box = SimpleNamespace(low=np.array([-1.0, -1.0, -0.5, -1.0, -1.0, -1.0]), high=np.array([1.0, 0.5, 1.0, 1.0, 1.0, 1.0]))
+    task = with_motors(tmp_path, box)
     latent, head = Sequential([Linear(17, 8), Tanh()]), Linear(8, 6)
     rms = SimpleNamespace(mean=RNG.normal(size=17), var=0.5 + RNG.random(17))
     norm = SimpleNamespace(norm_obs=True, clip_obs=3.0, epsilon=1e-8, obs_rms=rms)
@@ -541,14 +555,73 @@ def test_squashed_means_and_clips_of_stable_baselines_are_kept() -> None:
     }
     for name, (policy, clip) in policies.items():
         model = SimpleNamespace(policy=policy, action_space=box, get_vec_normalize_env=lambda: norm)
-        own = nearl.import_sb3(model, task="HalfCheetah-v5")
-        without = nearl.import_sb3(model, SimpleNamespace(norm_obs=False), task="HalfCheetah-v5")
+        own = nearl.import_sb3(model, task=task)
+        without = nearl.import_sb3(model, SimpleNamespace(norm_obs=False), task=task)
         for _ in range(20):
             obs = 3 * RNG.normal(size=17)
             x = np.clip((obs - rms.mean) / np.sqrt(rms.var + 1e-8), -3, 3)
             for controller, seen in ((own, x), (without, obs)):
                 want = box.low + 0.5 * (np.tanh(clip(head(latent(seen)))) + 1) * (box.high - box.low)
                 np.testing.assert_allclose(controller.act(obs), want, atol=2e-5, err_msg=name)
+
+
+def ppo(n_in: int, n_out: int, **more) -> SimpleNamespace:
+    """A model with SB3's attributes."""
+    latent, head = Sequential([Linear(n_in, 8), Tanh()]), Linear(8, n_out)
+    policy = SimpleNamespace(mlp_extractor=SimpleNamespace(policy_net=latent), action_net=head)
+    return SimpleNamespace(policy=policy, action_space=SimpleNamespace(low=np.full(n_out, -1.0), high=np.full(n_out, 1.0)), **more)
+
+
+def test_a_model_that_learned_to_propose_is_not_taken_for_one_of_actions() -> None:
+    """What the environment says, as SB3's vectors hand it on; a vector that says nothing is one of actions."""
+    for meaning, refused in (("state", True), ("change", True), ("guarded", False), ("actuators", False), (None, False)):
+        env = SimpleNamespace(has_attr=lambda name, m=meaning: m is not None and name == "action_meaning", get_attr=lambda _, m=meaning: [m, m])
+        model = ppo(17, 6, get_env=lambda env=env: env)
+        if refused:
+            with pytest.raises(ValueError, match=f"learned with actions='{meaning}', .*learn with actions='guarded' to import it"):
+                nearl.import_sb3(model, task="HalfCheetah-v5")
+        else:
+            nearl.import_sb3(model, task="HalfCheetah-v5")
+    gymnasium = pytest.importorskip("gymnasium")
+    for meaning in ("state", "change", "guarded"):
+        env = gymnasium.make("nearl/Panda-reach", constraints="task", actions=meaning)
+        vector = nearl.make_vec("Panda-reach", 2, constraints="task", actions=meaning)
+        assert env.get_wrapper_attr("action_meaning") == vector.action_meaning == meaning
+    assert nearl.make_vec("HalfCheetah-v5", 2).action_meaning == "actuators"
+
+
+def test_actions_of_another_range_than_the_motors_are_refused() -> None:
+    model = ppo(17, 6)
+    model.action_space.high[2] = 2.0
+    with pytest.raises(ValueError, match=r"largest action\[2\] of the model is 2, and that of actuator 'bfoot' of 'HalfCheetah-v5' is 1; train the model"):
+        nearl.import_sb3(model, task="HalfCheetah-v5")
+
+
+def test_numbers_that_no_policy_has_are_named_as_they_were_given(tmp_path) -> None:
+    files, net = planar(tmp_path), Sequential([Linear(14, 9), Tanh(), Sequential([Linear(9, 3)])])
+    for given, said in (({"std": np.zeros(14)}, r"std\[0\] of the observation is 0"), ({"std": -np.ones(14)}, r"std\[0\] .* is -1"),
+                        ({"mean": np.full(14, np.nan)}, r"mean\[0\] .* is nan"), ({"std": "x"}, "std is of str and holds what is no number")):  # fmt: skip
+        with pytest.raises(ValueError, match=f"{said}.*; give"):
+            nearl.import_torch(net, **files, **given)
+    with pytest.raises(ValueError, match=r"table of weights .* network.load_state_dict\(...\), and give nearl.import_torch that"):
+        nearl.import_torch({"0.weight": np.zeros((9, 14))}, **files)
+    last = next(iter(list(net)[2]))
+    last.weight[1, 3] = np.nan
+    with pytest.raises(ValueError, match=r"the module's tensor '2.0.weight' is nan at \[1, 3\]; the training diverged"):
+        nearl.import_torch(net, **files)
+    model = ppo(17, 6)
+    model.policy.action_net.bias[4] = np.inf
+    with pytest.raises(ValueError, match=r"tensor 'action_net.bias' is inf at \[4\]"):
+        nearl.import_sb3(model, task="HalfCheetah-v5")
+
+
+def test_robot_recipe_and_output_are_named_as_what_they_are(tmp_path) -> None:
+    files, path = planar(tmp_path), Net(14).gemm(14, 3).save(tmp_path / "policy.onnx", 3)
+    for name, said in (("robot", "cannot read robot 'no.xml': it does not exist; give a URDF"), ("recipe", "cannot read recipe 'no.xml': it does not exist")):
+        with pytest.raises(ValueError, match=said):
+            nearl.import_onnx(path, **files | {name: "no.xml"})
+    with pytest.raises(ValueError, match=r"policy.onnx': .*no output 'foo'"):
+        nearl.import_onnx(path, **files, output="foo")
 
 
 @pytest.mark.parametrize("read", [nearl.import_sb3, nearl.import_torch])

@@ -176,6 +176,16 @@ def test_an_observation_that_is_not_finite_is_refused_by_name() -> None:
     assert (agent.predict(np.full(5, 0.1))[0] == before).all()
 
 
+def test_refusals_of_files_and_folders_name_them_and_what_python_does_next(tmp_path: Path) -> None:
+    run, junk = tmp_path / "run", tmp_path / "junk.safetensors"
+    nearl.PID2(CART_POLE, algo="ppo", run=run, threads=1, settings={"train.n_envs": 2, "train.n_steps": 64}).learn(128)
+    with pytest.raises(ValueError, match=r"run' already holds a run; go on with nearl.PID2.load\(run\), give another folder as run="):
+        nearl.PID2(CART_POLE, algo="ppo", run=run)
+    junk.write_bytes(b"not a snapshot at all")
+    with pytest.raises(ValueError, match=r"junk.safetensors' is not a safetensors file"):
+        nearl.PID2.load(junk)
+
+
 def test_two_agents_do_not_mix_their_rows_in_one_run_folder(tmp_path: Path) -> None:
     run = tmp_path / "run"
     first = nearl.PID2(CART_POLE, algo="ppo", run=run, threads=1).learn(4096)
@@ -230,8 +240,8 @@ def test_what_is_no_number_is_refused_in_a_sentence() -> None:
         with pytest.raises(ValueError, match=f"{name} is {value!r}; give"):
             nearl.PID2(CART_POLE, **wrong)  # type: ignore[arg-type]
     agent = nearl.PID2(CART_POLE, algo="ppo", threads=1, settings={"train.n_envs": 2, "train.n_steps": 64})
-    for steps in ("200k", None, 0.5):
-        with pytest.raises(ValueError, match=f"total_timesteps is {steps!r}; ask for at least one step"):
+    for steps, said in (("200k", "'200k'"), (None, "None"), (1.5, "1.5, no whole number")):
+        with pytest.raises(ValueError, match=f"total_timesteps is {said}; ask for at least one step"):
             agent.learn(steps)  # type: ignore[arg-type]
     assert agent.learn(1e2).num_timesteps == 128  # type: ignore[arg-type]
     for obs, shape in ((np.zeros((0, 5)), r"\(0, 5\)"), (np.zeros((2, 2, 5)), r"\(2, 2, 5\)"), (np.zeros(4), r"\(4,\)"), (None, r"\(\)")):

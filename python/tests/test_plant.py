@@ -84,6 +84,62 @@ def test_mistakes_are_named(tmp_path) -> None:
         loop.stop()
 
 
+def test_an_exception_of_the_body_is_what_comes_out(tmp_path) -> None:
+    with pytest.raises(ZeroDivisionError, match="mine") as own, nearl.Loop(spring(tmp_path), name("mine"), patience=0.2):
+        raise ZeroDivisionError("mine")
+    if sys.version_info >= (3, 11):
+        assert "no plant named" in own.value.__notes__[0]
+    with pytest.raises(RuntimeError, match="no plant named"), nearl.Loop(spring(tmp_path), name("mine"), patience=0.2):
+        pass
+
+
+def test_a_refusal_that_the_body_hears_is_not_lost(tmp_path) -> None:
+    """Said again whenever the report is asked for, and not a second time at the end of a body that has dealt with it."""
+    what = name("refused")
+    plant, refused = nearl.Plant(what, ["other"], ["q.slide", "v.slide"], 0.001, 1), pytest.raises(RuntimeError, match="joint 0 is `slide`")
+    with plant, refused, nearl.Loop(spring(tmp_path), what) as loop:
+        while loop.running:
+            plant.exchange([0.0], [0.0], [0.0, 0.0], patience=0.001)
+        loop.stop()
+    with pytest.raises(RuntimeError, match="joint 0 is `slide`"):
+        loop.stop()
+    with nearl.Loop(spring(tmp_path), name("nobody"), patience=0.2) as loop, pytest.raises(RuntimeError, match="nobody"):
+        loop.stop()
+
+
+def test_snapshots_and_limits_of_a_loop_are_looked_at_before_it_is_asked(tmp_path) -> None:
+    spring(tmp_path)
+    link = nearl.Link(name("nobody"), patience=0.05)
+    with pytest.raises(FileNotFoundError, match="cannot read snapshot 'nope': it does not exist; give a snapshot file or a run folder"):
+        link.push("nope")
+    with pytest.raises(FileNotFoundError, match="the folder has no checkpoints/final.safetensors"):
+        link.push(tmp_path)
+    for moved, said in (({"speed": np.nan}, "speed is nan"), ({"velocity": {"slide": np.float32(np.inf)}}, "velocity of 'slide' is inf")):
+        with pytest.raises(ValueError, match=f"{said}; give a finite number"):
+            link.move_limits(**moved)
+
+
+def test_a_run_folder_is_pushed_and_a_refused_file_is_named(tmp_path) -> None:
+    snapshot, what = spring(tmp_path), name("push")
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "run" / "checkpoints" / "latest.safetensors").write_bytes(snapshot.read_bytes())
+    (tmp_path / "junk.safetensors").write_bytes(b"not a snapshot at all")
+    receipts: list = []
+
+    def push() -> None:
+        with nearl.Link(what) as link:
+            receipts.extend(link.push(path) for path in (tmp_path / "junk.safetensors", tmp_path / "run"))
+
+    with open_plant("push", lockstep=True) as plant, nearl.Loop(snapshot, what, ramp=0.0):
+        plant.exchange([0.0], [0.0], [0.0, 0.0], patience=5.0)
+        thread = threading.Thread(target=push)
+        thread.start()
+        while thread.is_alive():
+            plant.exchange([0.0], [0.0], [0.0, 0.0], patience=5.0)
+    assert not receipts[0].accepted and "junk.safetensors'" in receipts[0].text, receipts
+    assert receipts[1].accepted, receipts
+
+
 def nearl_command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "nearl", *map(str, arguments)]
 
