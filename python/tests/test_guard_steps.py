@@ -93,3 +93,82 @@ def test_unknown_arms_stay_within_their_limits(tmp_path: Path, seed: int, integr
         assert accelerations.max() <= ACCELERATION + 1e-7, f"tick {tick}: {accelerations}"
         touched += int((np.minimum(data.qpos - ranges[:, 0], ranges[:, 1] - data.qpos) < 1e-3).any())
     assert touched > 10, "no joint came to the end of its range"
+
+
+DRIVEN = """<mujoco><compiler angle="radian"/><option timestep="0.002" {option}/><worldbody>
+<body><joint name="a" axis="0 1 0" range="-6 6" damping="0.2"/><geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 0" mass="1"/>
+<body pos="0.3 0 0"><joint name="b" axis="0 1 0" range="-6 6" damping="0.2"/><geom type="capsule" size="0.03" fromto="0 0 0 0.2 0 0" mass="0.5"/>
+</body></body></worldbody><actuator>{actuators}</actuator>{more}</mujoco>"""
+SERVOS = "".join(f'<position name="{j}" joint="{j}" kp="40" kv="2" forcerange="-8 8" ctrlrange="-20 20" group="1"/>' for j in "ab")
+
+
+def drives(folder: Path, constraints: str, idm: str, option: str = "", more: str = "") -> Path:
+    (folder / "arm.xml").write_text(DRIVEN.format(option=option, actuators=SERVOS, more=more))
+    file = folder / "arm.toml"
+    file.write_text(f"""name = "arm"
+[model]
+mjcf = "arm.xml"
+[time]
+dt = 0.002
+sim_dt = 0.002
+[command]
+interface = "pd"
+stiffness = 40.0
+damping = 2.0
+[state]
+controllable = ["a", "b"]
+[reward]
+still = "1.0"
+[idm]
+kind = "{idm}"
+[constraints]
+{constraints}
+""")
+    return file
+
+
+@pytest.mark.parametrize("idm", ["learned", "pinocchio"])
+def test_the_guard_of_drives_holds_their_forces_and_rates(tmp_path: Path, idm: str) -> None:
+    """By MuJoCo's own actuator forces, of targets that jump from end to end."""
+    text = 'guard = "drive"\ntorque = { scale = 0.5 }\ntorque_rate = { limit = 100.0 }\nacceleration = { limit = 20.0 }'
+    file = drives(tmp_path, text, idm)
+    envs = nearl.make_vec(file, 1, constraints="task", actions="guarded")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
+    data = mujoco.MjData(model)
+    envs.reset(seed=0)
+    before = None
+    for tick in range(300):
+        data.qpos[:], data.qvel[:] = envs.native.qpos[0], envs.native.qvel[0]
+        *_, info = envs.step(np.array([[2.0, -2.0]]) * (1 if tick // 7 % 2 else -1))
+        data.ctrl[:] = info["executed"][0]
+        mujoco.mj_forward(model, data)
+        force = data.actuator_force.copy()
+        assert np.abs(force).max() <= 0.5 * 8.0 + 1e-9, force
+        if before is not None:
+            assert np.abs(force - before).max() <= 100.0 * 0.002 + 1e-9, (tick, force, before)
+        before = force
+
+
+def test_what_the_limits_do_not_reckon_with_is_told_where_an_environment_is_made(tmp_path: Path) -> None:
+    text = "velocity = { limit = 100.0 }\nacceleration = { limit = 20.0 }\ntorque = { scale = 1.0 }"
+    tendon = '<tendon><fixed name="t" stiffness="5"><joint joint="a" coef="1"/></fixed></tendon>'
+    with pytest.warns(UserWarning) as told:
+        nearl.make_vec(drives(tmp_path, text, "pinocchio", more=tendon), 1, constraints="task", actions="guarded")
+    said = " ".join(str(warning.message) for warning in told)
+    assert "tendons are not modelled" in said and "'a' is 100 rad/s" in said
+
+
+def test_actuators_that_are_switched_off_are_refused_by_name(tmp_path: Path) -> None:
+    text = "velocity = { limit = 2.0 }\nacceleration = { limit = 20.0 }\ntorque = { scale = 1.0 }"
+    file = drives(tmp_path, text, "pinocchio", option='actuatorgroupdisable="1"')
+    with pytest.raises(ValueError, match="'a' is switched off with its group 1"):
+        nearl.make_vec(file, 1, constraints="task", actions="guarded")
+
+
+def test_an_inertia_that_is_negative_about_some_axis_is_refused() -> None:
+    text = """<robot name="r"><link name="base"/><link name="arm"><inertial><mass value="1"/>
+        <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="1" ixz="0" iyz="0"/></inertial></link>
+        <joint name="j" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="1 -1 0"/>
+        <limit lower="-1" upper="1" effort="5" velocity="2"/></joint></robot>"""
+    with pytest.raises(ValueError, match="inertia of body 'arm' is negative about some axis"):
+        nearl.Model.from_urdf_text(text)
