@@ -30,10 +30,11 @@ pub fn all() -> Vec<Explanation> {
 
 /// A code that does not exist.
 #[derive(Debug, thiserror::Error)]
-#[error("there is no code '{asked}'; did you mean '{nearest}'? `nearl explain` without a code lists all")]
+#[error("there is no code '{asked}'; did you mean {nearest}? `nearl explain` without a code lists all")]
 pub struct UnknownCode {
     asked: String,
-    nearest: &'static str,
+    /// The nearest one, or all that begin with what was asked for.
+    nearest: String,
 }
 
 /// The explanation of `code` among `all`.
@@ -44,8 +45,11 @@ pub fn find(all: &[Explanation], code: &str) -> Result<Explanation, UnknownCode>
     if let Some(found) = all.iter().find(|e| e.code == code) {
         return Ok(*found);
     }
+    let of_it = all.iter().filter(|e| e.code.strip_prefix(code).is_some_and(|rest| rest.starts_with('-')));
+    let of_it: Vec<String> = of_it.map(|e| format!("'{}'", e.code)).collect();
     let like = |e: &&Explanation| (strsim::jaro(e.code, code) * 1e6) as u64;
-    let nearest = all.iter().max_by_key(like).map_or("none", |e| e.code);
+    let nearest = || all.iter().max_by_key(like).map_or("none".into(), |e| format!("'{}'", e.code));
+    let nearest = if of_it.is_empty() { nearest() } else { of_it.join(", ") };
     Err(UnknownCode { asked: code.to_owned(), nearest })
 }
 
@@ -81,5 +85,10 @@ mod tests {
     fn an_unknown_code_names_the_nearest() {
         let text = find(&all(), "stale-sate").unwrap_err().to_string();
         assert!(text.contains("'stale-state'"), "{text}");
+        let text = find(&all(), "braked").unwrap_err().to_string();
+        assert!(
+            text.contains("'braked-no-verified-brake'") && text.contains("'braked-non-finite-proposal'"),
+            "{text}"
+        );
     }
 }

@@ -226,7 +226,22 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
         notes.retain(|note| !note.starts_with(MADE_UP_FOR));
     }
     notes.extend(cut_targets(m, parts, &drives));
+    notes.extend(undriven(m, parts));
     notes
+}
+
+/// What a guard by the robot's model does not promise of joints that nothing drives.
+fn undriven(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Option<String> {
+    let driven = layout.controllable();
+    let loose = model.joints().iter().filter(|j| (j.idx_v..j.idx_v + j.nv).any(|i| !driven.contains(&i)));
+    let loose: Vec<String> = loose.map(|j| format!("'{}'", j.name)).collect();
+    (m.guards() && !loose.is_empty()).then(|| {
+        format!(
+            "guard = true reckons with {} as with joints that nothing drives and nothing touches: on the ground or in contact the limits of the others hold as \
+             far as that is so; take guard = \"drive\" for a robot on legs, or \"simulator\" in training",
+            loose.join(", ")
+        )
+    })
 }
 
 /// Targets that a drive is not sent because its range ends before.

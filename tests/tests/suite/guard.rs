@@ -3,7 +3,7 @@
 use nearl_runtime::constraints::drive::{Arrival, Held};
 use nearl_runtime::constraints::{Drive, Dynamics, Model, Period, PeriodDynamics, Rung};
 use nearl_runtime::net::{Dense, Forward};
-use nearl_runtime::{Controller, Snapshot};
+use nearl_runtime::{Controller, PolicyKind, Snapshot, doctor};
 use nearl_tests::training;
 use nearl_trainer::env::{Env, Meter};
 use nearl_trainer::foresight::{Foresight, Verdict};
@@ -12,6 +12,7 @@ use nearl_trainer::plant::{TOLERANCE, watched_limits};
 use nearl_trainer::rollout::{make_env, stream};
 use nearl_trainer::tasks;
 use rand::RngExt;
+use std::path::Path;
 
 /// Ticks of an attack: 50,000, or as many as `NEARL_TICKS` says (`results/doors/guard.md` has a million).
 fn ticks() -> usize {
@@ -220,6 +221,20 @@ fn forward_dynamics_of_a_period_are_the_inverse_of_its_inverse_dynamics() {
             let off = tau.iter().zip(&torque).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
             assert!(off < 1e-9, "{sub_steps} sub-steps: {off:e} N m");
         }
+    }
+}
+
+/// A trunk that stands on its feet is none of the joints that a guard by the model makes promises for.
+#[test]
+fn joints_that_nothing_drives_are_told_of_a_guard_by_the_model() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/tasks/anymal-walk.toml");
+    for (guard, is_told) in [("true", true), ("drive", false)] {
+        let set = [format!("constraints.guard={guard}"), "constraints.torque={ scale = 1.0 }".into()];
+        let mut manifest = tasks::load(&file.display().to_string(), &set).expect("task");
+        manifest.policy = PolicyKind::Direct;
+        let told = doctor::told(&manifest).expect("notes");
+        let found = told.iter().any(|note| note.contains("joints that nothing drives"));
+        assert_eq!(found, is_told, "{guard}: {told:?}");
     }
 }
 
