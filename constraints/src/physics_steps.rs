@@ -2,7 +2,7 @@
 
 use crate::drive::Held;
 use crate::period_dynamics::solve;
-use crate::{LimitSet, Model, Period, PeriodDynamics};
+use crate::{Dynamics, LimitSet, Model, Period, PeriodDynamics};
 
 /// What forces that are held for a period lead to where the plant makes several Euler steps of it, and which forces lead where.
 ///
@@ -20,6 +20,8 @@ use crate::{LimitSet, Model, Period, PeriodDynamics};
 pub struct PhysicsSteps {
     /// Of one physics step.
     step: PeriodDynamics,
+    /// The same by the articulated-body algorithm alone, where no joint rubs: of the robot whose joints have `tau_s D` more inertia.
+    quick: Option<Dynamics>,
     period: Period,
     /// Configuration index of each dof that is a joint of its own.
     single: Vec<Option<usize>>,
@@ -98,6 +100,7 @@ impl PhysicsSteps {
         };
         Some(PhysicsSteps {
             step: PeriodDynamics::new(model, driven, Period::new(period.tau, 1)),
+            quick: quick(model, period.tau),
             period,
             single: single.collect(),
             free,
@@ -213,9 +216,18 @@ impl PhysicsSteps {
         let tau = self.period.tau;
         self.q.copy_from_slice(q);
         self.v.copy_from_slice(v);
+        let are_forces = self.held.iter().all(|held| matches!(held, Held::Force(_)));
         for _ in 0..self.period.sub_steps {
-            self.step.update(&self.q, &self.v, external);
-            self.step.accelerate(&self.held, &mut self.a);
+            if let (Some(quick), true) = (&mut self.quick, are_forces) {
+                quick.passive(&self.q, &self.v, &mut self.moved);
+                for (i, force) in self.moved.iter_mut().enumerate() {
+                    *force += external[i] + if let Held::Force(tau) = self.held[i] { tau } else { 0.0 };
+                }
+                quick.aba(&self.q, &self.v, &self.moved, &mut self.a);
+            } else {
+                self.step.update(&self.q, &self.v, external);
+                self.step.accelerate(&self.held, &mut self.a);
+            }
             for (i, a) in self.a.iter().enumerate() {
                 self.v[i] += tau * a;
                 self.moved[i] = tau * self.v[i];
@@ -349,4 +361,15 @@ impl PhysicsSteps {
             self.invert_slopes();
         }
     }
+}
+
+fn quick(model: &Model, tau: f64) -> Option<Dynamics> {
+    if model.friction().iter().any(|f| *f > 0.0) {
+        return None;
+    }
+    let mut description = model.description().clone();
+    for joint in description.bodies.iter_mut().flat_map(|body| &mut body.joints) {
+        joint.armature += tau * joint.damping;
+    }
+    Model::from_description(description).ok().map(|model| Dynamics::new(&model))
 }

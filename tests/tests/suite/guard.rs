@@ -10,7 +10,7 @@ use nearl_trainer::foresight::{Foresight, Verdict};
 use nearl_trainer::mj;
 use nearl_trainer::plant::{TOLERANCE, watched_limits};
 use nearl_trainer::rollout::{make_env, stream};
-use nearl_trainer::tasks;
+use nearl_trainer::{tasks, train};
 use rand::RngExt;
 use std::path::Path;
 
@@ -232,6 +232,7 @@ fn joints_that_nothing_drives_are_told_of_a_guard_by_the_model() {
         let set = [format!("constraints.guard={guard}"), "constraints.torque={ scale = 1.0 }".into()];
         let mut manifest = tasks::load(&file.display().to_string(), &set).expect("task");
         manifest.policy = PolicyKind::Direct;
+        train::complete(&mut manifest).expect("a whole task");
         let told = doctor::told(&manifest).expect("notes");
         let found = told.iter().any(|note| note.contains("joints that nothing drives"));
         assert_eq!(found, is_told, "{guard}: {told:?}");
