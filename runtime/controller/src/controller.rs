@@ -104,8 +104,8 @@ pub struct Output {
 enum Inverse {
     /// A direct policy has no inverse model: its output is the mean action.
     Direct,
-    Learned(LearnedIdm),
-    Analytic(AnalyticIdm),
+    Learned(Box<LearnedIdm>),
+    Analytic(Box<AnalyticIdm>),
 }
 
 /// How far a joint is outside a limit.
@@ -191,12 +191,12 @@ impl Controller {
             (PolicyKind::Direct, ..) => (Inverse::Direct, n.policy_log_std.clone()),
             (_, IdmKind::Pinocchio, _) => {
                 let idm = AnalyticIdm::new(m, &model, layout.controllable())?;
-                (Inverse::Analytic(idm), vec![0.0; n_act])
+                (Inverse::Analytic(Box::new(idm)), vec![0.0; n_act])
             }
             (_, IdmKind::Learned, Some((net, log_std))) => {
                 let seen = seen_entries(m, &layout)?;
                 let net = Forward::new(net, m.activation);
-                (Inverse::Learned(LearnedIdm::new(net, &layout, &seen)), log_std.clone())
+                (Inverse::Learned(Box::new(LearnedIdm::new(net, &layout, &seen))), log_std.clone())
             }
             (_, IdmKind::Learned, None) => {
                 return Err(SnapshotError::MissingTensor { name: "idm.0.weight".into() });
