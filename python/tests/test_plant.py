@@ -140,6 +140,18 @@ def test_a_run_folder_is_pushed_and_a_refused_file_is_named(tmp_path) -> None:
     assert receipts[1].accepted, receipts
 
 
+def test_a_loop_that_comes_while_time_stands_still_is_told_of_the_plant(tmp_path) -> None:
+    """The driver waits for an action in lockstep before there is a loop, and says meanwhile what it is and where it is."""
+    snapshot, turns = spring(tmp_path), []
+    with open_plant("late", lockstep=True) as plant:
+        thread = threading.Thread(target=lambda: turns.append(plant.exchange([0.0], [0.0], [0.0, 0.0], patience=10.0)))
+        thread.start()
+        time.sleep(0.5)
+        with nearl.Loop(snapshot, name("late"), ramp=0.0, patience=3.0):
+            thread.join()
+    assert turns[0][1] is not None, turns
+
+
 def nearl_command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "nearl", *map(str, arguments)]
 

@@ -91,10 +91,7 @@ impl Exchange {
     /// meanwhile (lockstep).
     pub fn tick(&mut self, patience: f64) -> Turn<'_> {
         let now = clock::now();
-        if now >= self.next_announce {
-            self.link.announce();
-            self.next_announce = now + ANNOUNCE;
-        }
+        self.announce(now);
         self.state.due = now;
         self.link.send_state(&mut self.state);
         self.state.tick += 1;
@@ -110,6 +107,16 @@ impl Exchange {
             self.state.watchdog += 1;
         }
         Turn::Brake
+    }
+
+    /// Says what the plant is, when that is due; whether it was.
+    fn announce(&mut self, now: u64) -> bool {
+        let is_due = now >= self.next_announce;
+        if is_due {
+            self.link.announce();
+            self.next_announce = now + ANNOUNCE;
+        }
+        is_due
     }
 
     /// Whether the action of the state just sent came before `until`.
@@ -138,6 +145,10 @@ impl Exchange {
                 self.link.attend();
                 if !self.lockstep {
                     return false;
+                }
+                // a loop that comes while time stands still waits to be told of the plant and of where it is
+                if self.announce(now) {
+                    self.link.send_state(&mut self.state);
                 }
             }
             if now >= until {
