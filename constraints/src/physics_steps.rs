@@ -144,7 +144,7 @@ impl PhysicsSteps {
     }
 
     /// Changes the motor forces `tau` (nv), which lead to the accelerations `a` (nv) about, into those that lead to them, within `limits`. `most` (nv)
-    /// are the largest forces.
+    /// are the largest forces. Forces that are no numbers stay.
     pub fn drive(
         &mut self,
         (q, v): (&[f64], &[f64]),
@@ -153,6 +153,9 @@ impl PhysicsSteps {
         (tau, most): (&mut [f64], &[f64]),
         limits: &LimitSet,
     ) {
+        if tau.iter().any(|tau| !tau.is_finite()) {
+            return;
+        }
         self.full.fill(false);
         self.wanted.copy_from_slice(a);
         self.held.iter_mut().zip(a).for_each(|(held, a)| *held = Held::Acceleration(*a));

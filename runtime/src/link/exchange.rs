@@ -94,8 +94,10 @@ impl Exchange {
         self.announce(now);
         self.state.due = now;
         self.link.send_state(&mut self.state);
+        let is_answered = self.wait(now + clock::nanoseconds(patience));
+        // what is sent again while it waits is of the same tick
         self.state.tick += 1;
-        if self.wait(now + clock::nanoseconds(patience)) {
+        if is_answered {
             self.last_fresh = clock::now();
             return if self.last.nu > 0 { Turn::Act(self.last.action()) } else { Turn::Brake };
         }

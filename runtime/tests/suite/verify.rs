@@ -185,6 +185,16 @@ fn every_kind_of_limit_is_verified_alone_and_together() {
     }
 }
 
+/// A motor's line bounds the force at the speed of a period's start and end, where the steps of the period are reckoned with one by one.
+#[test]
+fn a_motor_s_line_is_verified_over_several_steps() {
+    let line = COUPLED.iter().find(|kind| kind.starts_with("torque_speed")).expect("a motor's line");
+    let (_folder, log) = record("verify-line-steps", &attack(&format!("{LIMITS}\n{line}"), 0.004, 4, 5));
+    let report = verify(&log).unwrap();
+    assert_eq!((report.found, report.is_whole()), (0, true), "{report}");
+    assert!(report.verified + report.idle == 1500 && report.optimal > 200, "{report}");
+}
+
 /// What is done to something of a log.
 type Alter<'a, T> = &'a dyn Fn(&mut T);
 

@@ -45,14 +45,16 @@ pub(crate) fn lead(
         let off = walk.v[i] - passage.v1[i];
         let near = |x: f64, y: f64| are_near(x, y, AT_LIMIT * (1.0 + y.abs()));
         let leads = off.abs() <= LED * p.dt * (1.0 + passage.a[i].abs()) + by_friction[i];
-        let at_end = near(is, *mean) || action.range.iter().any(|end| near(is, *end));
+        let at_end = action.range.iter().any(|end| near(is, *end));
         // With margins and without: it is not known here which were kept to.
         let each = || {
             std::iter::once(&promise.limits).chain(promise.without_margins.iter().map(|(limits, _)| limits))
         };
         let has_no_room = each().flat_map(|limits| &limits.rows).any(|row| match row.rule {
             Rule::Torque { dof, most } => dof == i && near(force(action, is).abs(), most),
-            Rule::TorqueSpeed { dof, .. } => dof == i && near(is, 0.0),
+            Rule::TorqueSpeed { dof, .. } => {
+                dof == i && near(force(action, is).abs(), force(action, *mean).abs())
+            }
             _ => false,
         });
         // What is given up of the velocity leads it no farther inside than it is for.

@@ -85,3 +85,21 @@ fn forces_keep_to_their_largest() {
         }
     }
 }
+
+/// A robot whose equations have no solution has no forces to begin with; none are made up, and nothing panics.
+#[test]
+fn forces_that_are_no_numbers_stay() {
+    let model = Model::from_urdf_text(&arm([0.0; 3], 0.5)).expect("model");
+    let mut steps = PhysicsSteps::new(&model, &[0, 1, 2], &[], Period::new(0.01, 5)).expect("several steps");
+    for most in [f64::INFINITY, 1.0, f64::NAN] {
+        let mut tau = [1.0, f64::NAN, 2.0];
+        steps.drive(
+            (&[0.1; 3], &[0.2; 3]),
+            &[0.0; 3],
+            &[1.0; 3],
+            (&mut tau, &[1.0, most, 1.0]),
+            &LimitSet::unlimited(3),
+        );
+        assert!(tau[0] == 1.0 && tau[1].is_nan() && tau[2] == 2.0, "{tau:?}");
+    }
+}
