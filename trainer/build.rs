@@ -14,6 +14,7 @@ fn main() {
     // A link argument reaches this package alone: crates that link it repeat these two lines in their build.rs.
     println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
     println!("cargo::rustc-link-arg=-Wl,-rpath,$ORIGIN/../lib");
+    println!("cargo::rustc-link-arg=-Wl,--wrap=hypot"); // see src/hypot.rs
     println!("cargo::rerun-if-env-changed=NEARL_SITE_PACKAGES");
     if let Ok(site) = std::env::var("NEARL_SITE_PACKAGES") {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{site}/cmeel.prefix/lib");

@@ -90,9 +90,7 @@ struct RowsOf {
     enabled: bool,
     first: usize,
     count: usize,
-    /// How much of it may be put elsewhere.
-    places: usize,
-    /// Where that was built, and whether it is elsewhere.
+    /// Where what may be put elsewhere was built, and whether it is elsewhere.
     built: Vec<[f64; 6]>,
     elsewhere: bool,
     /// How much further inside than it was built it lies.
@@ -140,19 +138,9 @@ impl Checker {
             if let Some(r) = l.rows(model, controllable)? {
                 let (hard, count) = (l.soft().is_none(), r.sizes().len());
                 let built: Vec<_> = r.places().iter().map(|place| place.numbers).collect();
-                let (places, elsewhere, inset) = (built.len(), false, 0.0);
-                let block = RowsOf {
-                    rows: r,
-                    limit,
-                    hard,
-                    enabled: true,
-                    first,
-                    count,
-                    places,
-                    built,
-                    elsewhere,
-                    inset,
-                };
+                let (elsewhere, inset) = (false, 0.0);
+                let block =
+                    RowsOf { rows: r, limit, hard, enabled: true, first, count, built, elsewhere, inset };
                 rows.push(block);
                 first += count;
             }
@@ -351,10 +339,10 @@ impl Checker {
     pub(crate) fn put(&mut self, numbers: &[[f64; 6]]) {
         let mut first = 0;
         for block in &mut self.rows {
-            let numbers = &numbers[first..first + block.places];
+            let numbers = &numbers[first..first + block.built.len()];
             block.elsewhere = numbers != block.built;
             block.rows.put(numbers);
-            first += block.places;
+            first += block.built.len();
         }
     }
 

@@ -120,11 +120,8 @@ impl Training {
             let training = training.map_err(errors::train)?;
             let advice = train::advice(&request.manifest).map_err(errors::train)?;
             if let Some(out) = &out {
-                let folder = RunFolder::create(out, &training.snapshot().manifest, seed, &training.columns());
-                let folder = folder.map_err(run)?;
-                if let Some(origin) = training.origin() {
-                    folder.tell("start_from", origin).map_err(run)?;
-                }
+                let (manifest, columns) = (&training.snapshot().manifest, training.columns());
+                RunFolder::create(out, manifest, seed, &columns, training.origin()).map_err(run)?;
             }
             Ok((Training::of(training, out, raised), advice))
         })

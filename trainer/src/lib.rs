@@ -11,6 +11,7 @@ pub mod env;
 pub mod evaluate;
 pub mod export;
 pub mod foresight;
+mod hypot;
 pub mod import;
 pub mod learn;
 pub mod many;

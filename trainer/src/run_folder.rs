@@ -168,11 +168,18 @@ pub struct RunFolder {
 }
 
 impl RunFolder {
-    /// Creates the folder with `task.toml` and its robot file, `env.json` and an empty `metrics.csv` with `columns`.
+    /// Creates the folder with `task.toml` and its robot file, `env.json` and an empty `metrics.csv` with `columns`. `origin` is what the run
+    /// starts from, where that is another run.
     ///
     /// # Errors
     /// [`RunError`]; a folder that already holds a run is never overwritten.
-    pub fn create(path: &Path, manifest: &Manifest, seed: u64, columns: &[&str]) -> Result<Self, RunError> {
+    pub fn create(
+        path: &Path,
+        manifest: &Manifest,
+        seed: u64,
+        columns: &[&str],
+        origin: Option<&serde_json::Value>,
+    ) -> Result<Self, RunError> {
         let is_free = || match holds_a_run(path) {
             true => Err(RunError::Exists { path: path.display().to_string() }),
             false => Ok(()),
@@ -187,28 +194,19 @@ impl RunFolder {
         let held = lock(path)?;
         is_free()?;
         write_task(path, "task", manifest)?;
-        let host = serde_json::json!({
+        let mut about = serde_json::json!({
             "algo": manifest.algo, "seed": seed, "version": env!("CARGO_PKG_VERSION"),
             "mujoco": "3.17.0", "pinocchio": "4.1.0", "isa": nearl_runtime::net::kernel::isa(),
             "cores": std::thread::available_parallelism().map_or(1, usize::from), "os": std::env::consts::OS, "arch": std::env::consts::ARCH,
         });
-        about_run(held.as_ref(), &host).map_err(unwritten(&env))?;
+        if let Some(origin) = origin {
+            about["start_from"] = origin.clone();
+        }
+        about_run(held.as_ref(), &about).map_err(unwritten(&env))?;
         let file = path.join("metrics.csv");
         let mut metrics = BufWriter::new(File::create(&file).map_err(unwritten(&file))?);
         writeln!(metrics, "{}", columns.join(",")).map_err(unwritten(&file))?;
         Ok(Self::open(path, metrics, columns, 0, held))
-    }
-
-    /// Adds what else is known of the run to `env.json`.
-    ///
-    /// # Errors
-    /// [`RunError::Write`].
-    pub fn tell(&self, key: &str, value: &serde_json::Value) -> Result<(), RunError> {
-        let file = self.path.join("env.json");
-        let text = std::fs::read_to_string(&file).map_err(unwritten(&file))?;
-        let mut about: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
-        about[key] = value.clone();
-        about_run(self.held.as_ref(), &about).map_err(unwritten(&file))
     }
 
     /// Opens the folder of a run to go on: keeps the rows of `metrics.csv` up to `steps`, of which there must be `rows`.

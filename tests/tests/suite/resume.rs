@@ -71,11 +71,12 @@ fn a_run_that_is_killed_early_has_a_way_on() {
     for batches in [0, 1] {
         let mut training = Training::new(&request).expect("training");
         let manifest = training.snapshot().manifest.clone();
-        let mut run = RunFolder::create(&killed, &manifest, request.seed, &training.columns()).expect("free");
+        let mut run =
+            RunFolder::create(&killed, &manifest, request.seed, &training.columns(), None).expect("free");
         (0..batches).for_each(|_| drop(training.iterate_in(&mut run).expect("a batch")));
     }
     let again = Training::new(&request).expect("training");
-    let taken = RunFolder::create(&killed, &again.snapshot().manifest, request.seed, &again.columns());
+    let taken = RunFolder::create(&killed, &again.snapshot().manifest, request.seed, &again.columns(), None);
     assert!(taken.is_err(), "it holds a run");
     resume(&killed, None, 1, |_, _| true).expect("resume");
     assert!(final_of(&whole) == final_of(&killed));
@@ -160,7 +161,7 @@ fn of_trainings_that_begin_in_one_folder_at_once_one_has_it() {
         let begin = Barrier::new(4);
         let create = || {
             begin.wait();
-            let folder = RunFolder::create(&out.path().join("run"), manifest, 0, &["steps"]);
+            let folder = RunFolder::create(&out.path().join("run"), manifest, 0, &["steps"], None);
             begin.wait();
             folder.map(drop).map_err(|e| e.to_string())
         };

@@ -39,10 +39,8 @@ pub fn train_in(
     training: Training,
     report: impl FnMut(&Progress, f64) -> bool,
 ) -> Result<PathBuf, TrainError> {
-    let folder = RunFolder::create(out, &training.snapshot().manifest, training.seed, &training.columns())?;
-    if let Some(origin) = training.origin() {
-        folder.tell("start_from", origin)?;
-    }
+    let (manifest, columns) = (&training.snapshot().manifest, training.columns());
+    let folder = RunFolder::create(out, manifest, training.seed, &columns, training.origin())?;
     run(training, folder, report)
 }
 
