@@ -67,6 +67,11 @@ pub struct Arrival {
 }
 
 impl Drive {
+    /// Whether commands are positions [rad or m].
+    pub fn takes_position(&self) -> bool {
+        matches!(self, Drive::Position | Drive::Pd { .. })
+    }
+
     /// What `command` does to a joint at `q`, `v`. With `h` and `c` of [`Period::lag`] and [`Period::sag`], a drive gives on average
     ///
     /// ```text

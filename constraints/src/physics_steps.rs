@@ -52,9 +52,8 @@ pub struct PhysicsSteps {
 /// How the velocities at the end of a period grow with the forces that are held, and scratch for it.
 #[derive(Default)]
 struct Slopes {
-    /// Pushed x pushed, row-major: velocity for a change of force, and the inverse.
+    /// Pushed x pushed, row-major: velocity for a change of force.
     velocity: Vec<f64>,
-    force: Vec<f64>,
     mass: Vec<f64>,
     inverse: Vec<f64>,
     /// Free x pushed.
@@ -70,7 +69,14 @@ const MISSING: f64 = 1e-9;
 const BEYOND: f64 = 1e-12;
 const RETREATS: usize = 3;
 /// Rounds before the best forces found are taken; three are the rule, and some ten where joints rub.
-const ROUNDS: usize = 30;
+const ROUNDS: usize = 80;
+/// Choices of the forces that go to their ends, for each force.
+const CHOICES: usize = 4;
+/// How often slopes are measured, and how often a change by them is halved.
+const MEASURED: usize = 6;
+const HALVINGS: usize = 10;
+/// By which share of a force slopes are measured.
+const NEAR: f64 = 1e-5;
 
 impl PhysicsSteps {
     /// For motors on the dofs `driven` of `model`. The dofs `follow` have the accelerations that they are given, whatever it takes; all others
@@ -90,7 +96,6 @@ impl PhysicsSteps {
         let zero = |len: usize| vec![0.0; len];
         let slopes = Slopes {
             velocity: zero(m * m),
-            force: zero(m * m),
             mass: zero(n * n),
             inverse: zero(n * n),
             q: zero(n * m),
@@ -144,7 +149,7 @@ impl PhysicsSteps {
     }
 
     /// Changes the motor forces `tau` (nv), which lead to the accelerations `a` (nv) about, into those that lead to them, within `limits`. `most` (nv)
-    /// are the largest forces. Forces that are no numbers stay.
+    /// are the largest forces. Forces that are no numbers stay, and so do those that nothing nearer was found for.
     pub fn drive(
         &mut self,
         (q, v): (&[f64], &[f64]),
@@ -164,37 +169,70 @@ impl PhysicsSteps {
             let i = self.free[r];
             (self.force[k], self.most[k]) = (tau[i].clamp(-most[i], most[i]), most[i]);
         }
-        let (mut least, mut retreats) = (f64::INFINITY, 0);
-        for round in 0..ROUNDS {
-            for (k, &r) in self.pushed.iter().enumerate() {
-                self.held[self.free[r]] = Held::Force(self.force[k]);
-            }
-            self.walk(q, v, external);
-            let left = self.miss(v);
-            if left < least || left <= MISSING || self.full.contains(&true) {
-                least = left;
-                for (k, &r) in self.pushed.iter().enumerate() {
-                    tau[self.free[r]] = self.force[k];
-                }
-            }
-            if !left.is_finite() {
-                return;
-            }
-            if left <= MISSING {
+        self.try_forces(q, v, external);
+        let begun = self.missing.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
+        if !amiss(&self.missing, &self.full).is_finite() {
+            return;
+        }
+        let (mut has_slopes, mut retreats, mut failed, mut measured, mut halves) = (false, 0, 0, 0, false);
+        for _ in 0..ROUNDS {
+            if self.left() <= MISSING {
                 if retreats == RETREATS || !self.retreat(q, limits) {
-                    return;
+                    break;
                 }
                 retreats += 1;
                 self.miss(v);
             }
-            if round == 0 {
+            if !has_slopes {
                 self.find_slopes(q, v, external);
-            } else if left > MISSING && !self.full.contains(&true) {
-                self.turn_slopes();
+                has_slopes = true;
+            }
+            if halves && failed > 0 {
+                self.change.iter_mut().for_each(|change| *change *= 0.5);
+            } else {
+                self.choose_change();
             }
             self.before.copy_from_slice(&self.missing);
-            self.push();
+            self.force.iter_mut().zip(&self.change).for_each(|(force, change)| *force += change);
+            self.try_forces(q, v, external);
+            // At its end, but not because more was needed.
+            for (full, (force, missing)) in self.full.iter_mut().zip(self.force.iter().zip(&self.missing)) {
+                *full &= force * missing >= 0.0;
+            }
+            let (was, is) = (amiss(&self.before, &self.full), amiss(&self.missing, &self.full));
+            if is < was || !halves {
+                self.turn_slopes();
+            }
+            if is < was {
+                (failed, halves) = (0, false);
+                continue;
+            }
+            // No nearer: from where it was, once by what this has shown of the slopes, then a part of the way that measured ones show.
+            self.force.iter_mut().zip(&self.change).for_each(|(force, change)| *force -= change);
+            self.missing.copy_from_slice(&self.before);
+            failed += 1;
+            if failed > if halves { HALVINGS } else { 1 } {
+                if measured == MEASURED {
+                    break;
+                }
+                self.measure_slopes(q, v, external, measured % 2 == 1);
+                (measured, failed, halves) = (measured + 1, 0, true);
+            }
         }
+        if self.missing.iter().all(|x| x.abs() <= begun.max(MISSING * self.period.dt)) || retreats > 0 {
+            for (k, &r) in self.pushed.iter().enumerate() {
+                tau[self.free[r]] = self.force[k];
+            }
+        }
+    }
+
+    /// Makes the steps with the forces, and writes what is missing.
+    fn try_forces(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
+        for (k, &r) in self.pushed.iter().enumerate() {
+            self.held[self.free[r]] = Held::Force(self.force[k]);
+        }
+        self.walk(q, v, external);
+        self.miss(v);
     }
 
     /// Asks for less acceleration where a position would end beyond its limit, or further beyond it than it is; whether it asks anywhere.
@@ -252,18 +290,17 @@ impl PhysicsSteps {
         }
     }
 
-    /// Writes what is missing of the velocities; the largest, as an acceleration.
-    fn miss(&mut self, v: &[f64]) -> f64 {
-        let mut most = 0.0;
+    /// Writes what is missing of the velocities.
+    fn miss(&mut self, v: &[f64]) {
         for (k, &r) in self.pushed.iter().enumerate() {
             let i = self.free[r];
-            let missing = v[i] + self.period.dt * self.wanted[i] - self.v[i];
-            self.missing[k] = if self.full[k] { 0.0 } else { missing };
-            let size = (self.missing[k] / self.period.dt).abs();
-            // a NaN stays
-            most = if size > most || size.is_nan() { size } else { most };
+            self.missing[k] = v[i] + self.period.dt * self.wanted[i] - self.v[i];
         }
-        most
+    }
+
+    /// The largest of it where a force has room, as an acceleration.
+    fn left(&self) -> f64 {
+        with_room(&self.missing, &self.full).fold(0.0, |most: f64, x| most.max(x.abs())) / self.period.dt
     }
 
     /// The slopes for a robot whose mass and dampers stay what they are at `q`, `v`, and whose joints do not rub.
@@ -300,70 +337,93 @@ impl PhysicsSteps {
         for (k, &r) in self.pushed.iter().enumerate() {
             s.velocity[k * m..(k + 1) * m].copy_from_slice(&s.v[r * m..(r + 1) * m]);
         }
-        self.invert_slopes();
     }
 
-    /// The force for a change of velocity, of the dofs whose force has room.
-    fn invert_slopes(&mut self) {
-        let (m, s) = (self.pushed.len(), &mut self.slopes);
-        for r in 0..m {
-            for c in 0..m {
-                let of_one = f64::from(u8::from(r == c));
-                let stays = self.full[r] || self.full[c];
-                s.push[r * m + c] = if stays { of_one } else { s.velocity[r * m + c] };
-                s.force[r * m + c] = of_one;
+    /// The slopes where the forces are, by differences to smaller or to `larger` forces: joints that rub have others while they stick.
+    fn measure_slopes(&mut self, q: &[f64], v: &[f64], external: &[f64], larger: bool) {
+        let m = self.pushed.len();
+        for c in 0..m {
+            let at = self.force[c];
+            let by = (1.0 + at.abs()) * if (at > 0.0) == larger { NEAR } else { -NEAR };
+            self.force[c] = at + by;
+            self.try_forces(q, v, external);
+            for r in 0..m {
+                let slope = (self.before[r] - self.missing[r]) / by;
+                if slope.is_finite() {
+                    self.slopes.velocity[r * m + c] = slope;
+                }
             }
+            self.force[c] = at;
         }
-        solve(m, m, &mut s.push[..m * m], &mut s.force);
+        self.missing.copy_from_slice(&self.before);
     }
 
-    /// Broyden's rule, of the inverse: afterwards what the last change of force did would have been foreseen.
+    /// Broyden's rule: afterwards what the last change of force did would have been foreseen.
     fn turn_slopes(&mut self) {
         let (m, s) = (self.pushed.len(), &mut self.slopes);
-        // the velocities grew by what is missing no more
-        let did = |k: usize| self.before[k] - self.missing[k];
-        let mut along = 0.0;
-        for k in 0..m {
-            let foreseen: f64 = (0..m).map(|c| s.force[k * m + c] * did(c)).sum();
-            along += self.change[k] * foreseen;
-            s.push[k] = self.change[k] - foreseen;
-            s.row[k] = (0..m).map(|r| self.change[r] * s.force[r * m + k]).sum();
-        }
         let size: f64 = self.change.iter().map(|x| x * x).sum();
-        if along.abs() <= 1e-6 * size {
-            return;
-        }
-        for k in 0..m {
-            for c in 0..m {
-                s.force[k * m + c] += s.push[k] * s.row[c] / along;
+        let is_known = size > 0.0 && self.missing.iter().all(|x| x.is_finite());
+        for r in 0..m {
+            let row = &mut s.velocity[r * m..(r + 1) * m];
+            let foreseen: f64 = row.iter().zip(&self.change).map(|(s, x)| s * x).sum();
+            // the velocities grew by what is missing no more
+            let by = (self.before[r] - self.missing[r] - foreseen) / size;
+            for (slope, change) in row.iter_mut().zip(&self.change) {
+                // where it led nowhere the next change is to be smaller
+                *slope = if is_known { *slope + by * change } else { 4.0 * *slope };
             }
         }
     }
 
-    /// Makes the next change of force. Where one has no room for it all, it goes as far as there is room, and the others stay for this round.
-    fn push(&mut self) {
-        let m = self.pushed.len();
-        let mut ends = false;
-        for k in 0..m {
-            let row = &self.slopes.force[k * m..(k + 1) * m];
-            let wanted: f64 = row.iter().zip(&self.missing).map(|(s, x)| s * x).sum();
-            self.change[k] = if self.full[k] { 0.0 } else { wanted };
-            ends |= (self.force[k] + self.change[k]).abs() > self.most[k];
-        }
-        for k in 0..m {
-            let to = (self.force[k] + self.change[k]).clamp(-self.most[k], self.most[k]);
-            let is_short = to != self.force[k] + self.change[k];
-            if ends && !is_short {
-                self.change[k] = 0.0;
+    /// The change of force that makes up for what is missing. A force that would go beyond its end goes there, as long as more is missing of its
+    /// velocity in that direction, and the others make up for what that does to them.
+    fn choose_change(&mut self) {
+        let (m, s) = (self.pushed.len(), &mut self.slopes);
+        self.full.fill(false);
+        self.change.fill(0.0);
+        for _ in 0..CHOICES * m {
+            for r in 0..m {
+                let by_full =
+                    (0..m).filter(|c| self.full[*c]).map(|c| s.velocity[r * m + c] * self.change[c]);
+                s.row[r] = if self.full[r] { self.change[r] } else { self.missing[r] - by_full.sum::<f64>() };
+                for c in 0..m {
+                    let of_one = f64::from(u8::from(r == c));
+                    let stays = self.full[r] || self.full[c];
+                    s.push[r * m + c] = if stays { of_one } else { s.velocity[r * m + c] };
+                }
+            }
+            solve(m, 1, &mut s.push[..m * m], &mut s.row);
+            let mut is_other = false;
+            for k in 0..m {
+                let (to, most) = (self.force[k] + s.row[k], self.most[k]);
+                if !self.full[k] && to.abs() > most {
+                    (self.full[k], is_other) = (true, true);
+                    s.row[k] = to.clamp(-most, most) - self.force[k];
+                }
+                self.change[k] = if s.row[k].is_finite() { s.row[k] } else { 0.0 };
+            }
+            if is_other {
                 continue;
             }
-            (self.full[k], self.change[k]) = (self.full[k] || is_short, to - self.force[k]);
-            self.force[k] = to;
-        }
-        if ends {
-            self.invert_slopes();
+            let too_far = |k: &usize| {
+                let slopes = &s.velocity[k * m..(k + 1) * m];
+                let grows: f64 = slopes.iter().zip(&self.change).map(|(slope, change)| slope * change).sum();
+                (self.missing[*k] - grows) * (self.force[*k] + self.change[*k]) < 0.0
+            };
+            let Some(k) = (0..m).find(|k| self.full[*k] && too_far(k)) else { return };
+            self.full[k] = false;
         }
     }
+}
+
+/// What is missing of the dofs whose force has room.
+fn with_room<'a>(missing: &'a [f64], full: &'a [bool]) -> impl Iterator<Item = f64> + 'a {
+    missing.iter().zip(full).map(|(missing, full)| if *full { 0.0 } else { *missing })
+}
+
+/// The sum of its squares; NaN where a velocity is.
+fn amiss(missing: &[f64], full: &[bool]) -> f64 {
+    with_room(missing, full).map(|x| x * x).sum()
 }
 
 fn quick(model: &Model, tau: f64) -> Option<Dynamics> {

@@ -246,6 +246,10 @@ impl constraints::Limit for Shared {
         self.0.cone(model, controllable)
     }
 
+    fn notes(&self, model: &constraints::Model, controllable: &[usize]) -> Vec<String> {
+        self.0.notes(model, controllable)
+    }
+
     fn soft(&self) -> Option<Soft> {
         self.0.soft()
     }

@@ -33,7 +33,7 @@ def arm(rng: np.random.Generator, timestep: float, integrator: str) -> tuple[str
     return text, ranges
 
 
-def task(folder: Path, n: int, dt: float, sim_dt: float) -> Path:
+def task(folder: Path, n: int, dt: float, sim_dt: float, margin: float = 0.0) -> Path:
     """A task whose guard knows the arm."""
     joints = [f"j{i}" for i in range(n)]
     seen = [f"{letter}.{joint}" for letter in "qv" for joint in joints]
@@ -55,7 +55,7 @@ still = "1.0"
 [idm]
 kind = "pinocchio"
 [constraints]
-position = {{}}
+position = {{ margin = {margin} }}
 velocity = {{ limit = {SPEED} }}
 acceleration = {{ limit = {ACCELERATION} }}
 torque = {{ scale = 1.0 }}
@@ -93,6 +93,55 @@ def test_unknown_arms_stay_within_their_limits(tmp_path: Path, seed: int, integr
         assert accelerations.max() <= ACCELERATION + 1e-7, f"tick {tick}: {accelerations}"
         touched += int((np.minimum(data.qpos - ranges[:, 0], ranges[:, 1] - data.qpos) < 1e-3).any())
     assert touched > 10, "no joint came to the end of its range"
+
+
+def rubbing_arm(rng: np.random.Generator, timestep: float) -> tuple[str, int]:
+    """A chain of 2 to 4 light hinges about any axes, of which half rub and half have dampers."""
+    n = int(rng.integers(2, 5))
+    bodies, motors, strong = "", "", rng.uniform(40, 150, n)
+    for i in range(n):
+        x, y, z = rng.normal(size=3)
+        inertia = " ".join(map(str, rng.uniform(0.01, 0.012, 3)))
+        friction, damping = rng.uniform(0.1, 2) * (rng.random() < 0.5), rng.uniform(0, 5) * (rng.random() < 0.5)
+        bodies += (
+            f'<body pos="{rng.uniform(-0.1, 0.1)} 0 {rng.uniform(0.1, 0.3)}"><joint name="j{i}" axis="{x} {y} {z}" range="-1 1" damping="{damping}" '
+            f'frictionloss="{friction}"/><inertial pos="0 0.05 0.1" mass="{rng.uniform(0.3, 3)}" diaginertia="{inertia}"/>'
+        )
+        motors += f'<motor name="m{i}" joint="j{i}" ctrlrange="-{strong[i]} {strong[i]}"/>'
+    text = (
+        f'<mujoco><compiler angle="radian"/><option timestep="{timestep}" gravity="0 0 {-9.81 * (rng.random() < 0.5)}"/>'
+        f"<worldbody>{bodies}{'</body>' * n}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+    return text, n
+
+
+@pytest.mark.parametrize("seed", [5, 7, 21, 41, 45, 55])
+def test_joints_that_stick_and_slip_within_a_period_are_led_through_its_steps(tmp_path: Path, seed: int) -> None:
+    """Dry friction bends how a velocity grows with the force: a search by slopes of a robot without it had ended at the motors' limits, 3900 rad/s² off."""
+    rng = np.random.default_rng(seed)
+    steps, timestep = int(rng.choice([2, 5])), float(rng.choice([0.001, 0.002, 0.004]))
+    text, n = rubbing_arm(rng, timestep)
+    (tmp_path / "arm.xml").write_text(text)
+    dt = timestep * steps
+    envs = nearl.make_vec(task(tmp_path, n, dt, timestep, margin=0.01), 1, constraints="task", actions="guarded")
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    obs, _ = envs.reset(seed=0)
+    data.qpos[:], data.qvel[:] = obs[0, :n], obs[0, n:]
+    push, pushed = np.zeros(n), 0
+    for tick in range(700):
+        if rng.random() < 0.05:
+            push = rng.choice([-1, 1], n) * 10.0 ** rng.uniform(0, 4)
+        *_, info = envs.step(push[None])
+        before = data.qvel.copy()
+        data.ctrl[:] = info["executed"][0]
+        mujoco.mj_step(model, data, steps)
+        accelerations = np.abs(data.qvel - before) / dt
+        assert np.abs(data.qpos).max() <= 1.0, f"tick {tick}: {data.qpos}"
+        assert np.abs(data.qvel).max() <= SPEED + 1e-6, f"tick {tick}: {data.qvel}"
+        assert accelerations.max() <= ACCELERATION + 1e-3, f"tick {tick}: {accelerations}"
+        pushed += int(accelerations.max() > 0.9 * ACCELERATION)
+    assert pushed > 50, "nothing was held back"
 
 
 DRIVEN = """<mujoco><compiler angle="radian"/><option timestep="0.002" {option}/><worldbody>
@@ -172,3 +221,15 @@ def test_an_inertia_that_is_negative_about_some_axis_is_refused() -> None:
         <limit lower="-1" upper="1" effort="5" velocity="2"/></joint></robot>"""
     with pytest.raises(ValueError, match="inertia of body 'arm' is negative about some axis"):
         nearl.Model.from_urdf_text(text)
+
+
+def test_targets_that_no_torque_limit_holds_to_the_motors_are_told(tmp_path: Path) -> None:
+    """Of two weak motors: the target keeps 50 rad/s², and the arm does not."""
+    text = "velocity = { limit = 2.0 }\nacceleration = { limit = 50.0 }"
+    file = drives(tmp_path, text, "pinocchio")
+    arm = (tmp_path / "arm.xml").read_text()
+    motors = "".join(f'<motor name="{j}" joint="{j}" ctrlrange="-1 1"/>' for j in "ab")
+    (tmp_path / "arm.xml").write_text(arm.replace(SERVOS, motors))
+    file.write_text(file.read_text().replace('interface = "pd"\nstiffness = 40.0\ndamping = 2.0', 'interface = "effort"'))
+    with pytest.warns(UserWarning, match="without a torque limit a target may ask for more than the motors of 'a', 'b' give"):
+        nearl.make_vec(file, 1, constraints="task")

@@ -57,7 +57,22 @@ def test_what_is_wrong_is_refused_by_name(panda) -> None:
         (lambda: nearl.FrameLimit(panda, 3, 2.0, normal=[0, 0, 1]), TypeError, "expected a text; got int, as 'frame'"),
         (lambda: nearl.EnergyLimit(panda, float("nan")), ValueError, "energy limit is NaN"),
         (lambda: nearl.CollisionLimit(panda, [{"shape": "cone"}], 2.0), ValueError, "limit 'collision': .*cone"),
-        (lambda: nearl.VelocityProfileLimit(panda, "fr4"), ValueError, 'limit \'velocity_profile\': .*"fr3"'),
+        (lambda: nearl.VelocityProfileLimit(panda, "fr4"), ValueError, "limit 'velocity_profile': .*\"fr3\""),
     ]:
         with pytest.raises(error, match=f"(?s){words}"):
             build()
+
+
+def test_joints_that_a_limit_leaves_out_are_told(panda) -> None:
+    with pytest.warns(UserWarning, match="acceleration limit does not name 'panda_joint2'.*'panda_joint7'"):
+        nearl.Projector(panda, [nearl.VelocityLimit(panda), nearl.AccelerationLimit(panda, {"panda_joint1": 10.0})], dt=0.01)
+    inertial = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>'
+    two = nearl.Model.from_mjcf_text(
+        f'<mujoco><worldbody><body><joint name="a" range="-1 1" limited="true"/>{inertial}<body><joint name="b" axis="0 1 0"/>{inertial}</body>'
+        "</body></worldbody></mujoco>"
+    )
+    acceleration = nearl.AccelerationLimit(two, 10.0)
+    with pytest.warns(UserWarning, match="position limit does not hold for 'b'"):
+        nearl.Projector(two, [nearl.PositionLimit(two), acceleration], dt=0.01)
+    with pytest.warns(UserWarning, match="velocity limit does not name 'b', for which the robot file gives none either"):
+        nearl.Projector(two, [nearl.VelocityLimit(two, {"a": 1.0}), acceleration], dt=0.01)

@@ -149,3 +149,31 @@ def test_a_frame_keeps_the_box_of_the_build_while_its_limit_is_moved_inside(tmp_
         at = data.body("b3").xpos
         nearest = max(nearest, (low - at).max(), (at - high).max())
     assert -0.01 < nearest <= 1e-9, nearest
+
+
+def test_one_of_two_planes_of_a_name_cannot_be_meant(panda: nearl.Model) -> None:
+    """Both were put where one was meant to be, and the other was gone."""
+    limits = [nearl.PositionLimit(panda), nearl.VelocityLimit(panda), nearl.AccelerationLimit(panda, A)]
+    wall, floor = ([1, 0, 0], [0.8, 0, 0]), ([0, 0, -1], [0, 0, 0.2])
+    elsewhere = ([1, 0, 0], [0.7, 0, 0])
+
+    def planes(*names: str | None) -> nearl.Projector:
+        both = [
+            nearl.FrameLimit(panda, "panda_hand", 5.0, normal=normal, through=through, **({} if name is None else {"name": name}))
+            for name, (normal, through) in zip(names, [wall, floor], strict=True)
+        ]
+        return nearl.Projector(panda, limits + both, DT)
+
+    with pytest.raises(ValueError, match="several planes are called 'panda_hand' and lie apart.*a name of its own"):
+        planes(None, None).move_limits(plane={"panda_hand": elsewhere})
+    planes("wall", "floor").move_limits(plane={"wall": elsewhere})
+
+    def bodies(*names: str) -> nearl.Projector:
+        ball = {"sphere": {"radius": 0.1}}
+        shapes = [{"frame": "panda_hand", "shape": ball}]
+        shapes += [{"name": name, "shape": ball, "position": [3.0, float(k), 0.0]} for k, name in enumerate(names)]
+        return nearl.Projector(panda, [*limits, nearl.CollisionLimit(panda, shapes, 2.0, influence=2.0)], DT)
+
+    with pytest.raises(ValueError, match="several obstacles are called 'person'"):
+        bodies("person", "person").move_limits(body={"person": ([2, 2, 2], [0, 0, 0])})
+    bodies("a", "b").move_limits(body={"b": ([2, 2, 2], [0, 0, 0])})

@@ -96,6 +96,21 @@ impl Limit for VelocityLimit {
         "velocity"
     }
 
+    fn notes(&self, model: &Model, controllable: &[usize]) -> Vec<String> {
+        let Some(limit) = self.settings.limit.as_ref().filter(|_| self.settings.scale.is_none()) else {
+            return Vec::new();
+        };
+        let mut without = limit.left_out(model, controllable);
+        without.retain(|i| model.velocity_limit()[*i].is_infinite());
+        if without.is_empty() {
+            return Vec::new();
+        }
+        vec![format!(
+            "the velocity limit does not name {}, for which the robot file gives none either; name every controllable joint, or give one number for all",
+            quoted(model, &without)
+        )]
+    }
+
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         let mut own = match &self.settings.limit {
             Some(limit) => limit.values(model, "velocity limit", |x| x > 0.0, "above 0 rad/s or m/s")?,

@@ -17,6 +17,8 @@ pub(crate) struct Arrivals {
     drives: Vec<Drive>,
     /// Configuration index of each dof; 0 where it has none of its own.
     idx_q: Vec<usize>,
+    /// Dry friction by dof (nv), which torque limits leave to the motors beside what they allow.
+    friction: Vec<f64>,
     steps: Option<PhysicsSteps>,
     commands: Vec<f64>,
     force: Vec<f64>,
@@ -41,6 +43,7 @@ impl Arrivals {
         Arrivals {
             steps: PhysicsSteps::new(model, dofs, &follow, period).filter(|_| !has_targets),
             idx_q: idx_q(model),
+            friction: model.friction().to_vec(),
             period,
             by_speed: m.task.constraints.torque_speed.is_some(),
             dofs: dofs.to_vec(),
@@ -63,8 +66,8 @@ impl Arrivals {
     ) -> &[f64] {
         self.force.copy_from_slice(tau);
         if let Some(steps) = &mut self.steps {
-            for (most, (effort, tau)) in self.most.iter_mut().zip(limits.effort.iter().zip(tau)) {
-                *most = if self.by_speed { tau.abs() } else { *effort };
+            for (i, most) in self.most.iter_mut().enumerate() {
+                *most = if self.by_speed { tau[i].abs() } else { limits.effort[i] + self.friction[i] };
             }
             steps.drive((q, v), external, a, (&mut self.force, &self.most), limits);
         }

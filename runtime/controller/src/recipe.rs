@@ -50,12 +50,35 @@ pub struct PolicySection {
 pub struct ActionSection {
     /// One number for all joints or one for each.
     pub scale: Numbers,
-    /// The same; the pose when absent.
+    /// The same; when absent the pose for joints that are commanded positions, and 0 for those that are commanded velocities or forces.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub offset: Option<Numbers>,
     /// Lowest and highest output, before the scale. What `last_action` sees is clipped too.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clip: Option<[Numbers; 2]>,
+}
+
+impl PolicySection {
+    /// What is added to the scaled output of each joint, which is commanded a position or not.
+    ///
+    /// # Errors
+    /// One sentence, for a pose or an offset of another length.
+    pub fn offset(&self, takes_position: &[bool]) -> Result<Vec<f64>, String> {
+        let n = self.joints.len();
+        if !self.pose.is_empty() && self.pose.len() != n {
+            return Err(format!(
+                "policy.pose has {} positions for {n} joints; give one for each",
+                self.pose.len()
+            ));
+        }
+        match &self.action.offset {
+            Some(offset) => offset.spread("policy.action.offset", n),
+            None if self.pose.is_empty() => Ok(vec![0.0; n]),
+            None => {
+                Ok(self.pose.iter().zip(takes_position).map(|(at, is)| if *is { *at } else { 0.0 }).collect())
+            }
+        }
+    }
 }
 
 /// One number for all entries, or one for each.
@@ -211,7 +234,7 @@ impl std::fmt::Display for PolicySection {
         write!(f, "sees {seen}; commands {} = ", self.joints.join(", "))?;
         match &self.action.offset {
             None if self.pose.is_empty() => {}
-            None => write!(f, "pose {:?} + ", self.pose)?,
+            None => write!(f, "pose {:?} (of joints that are commanded positions) + ", self.pose)?,
             Some(offset) => write!(f, "{offset} + ")?,
         }
         write!(f, "{} x output", self.action.scale)?;

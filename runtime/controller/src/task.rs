@@ -281,9 +281,7 @@ impl Task {
         overrides: &[String],
         own: OwnTime<'_>,
     ) -> Result<Self, TaskError> {
-        let at = |place, reason| TaskError::Invalid { file: file.into(), place, reason };
-        let mut table: toml::Table =
-            toml::from_str(text).map_err(|e| at(line_of(text, e.span()), first_line(e.message())))?;
+        let mut table = Self::table(file, text)?;
         for set in overrides {
             apply(&mut table, set)?;
         }
@@ -296,12 +294,44 @@ impl Task {
                 let reason = format!("'{last}' is a value, not a section");
                 return TaskError::Override { set: set.clone(), reason };
             }
-            let line = if overrides.is_empty() { line_of_key(text, e.path()) } else { String::new() };
-            at(format!("{line}{}", bracket(&key)), suggest(e.into_inner().message()))
+            let line = if overrides.is_empty() { line_of_key(text, e.path()).0 } else { String::new() };
+            let place = format!("{line}{}", bracket(&key));
+            TaskError::Invalid { file: file.into(), place, reason: suggest(e.into_inner().message()) }
         })?;
         task.state_time(own);
         task.check(file)?;
         Ok(task)
+    }
+
+    /// A task whose sections several files said, each `(name, text)`, later ones over earlier ones. What is wrong is told with the line of the last
+    /// file that says it.
+    ///
+    /// # Errors
+    /// As [`Task::read`].
+    pub fn merged(table: toml::Table, files: &[(String, String)]) -> Result<Self, TaskError> {
+        let last = files.last().map_or("", |(file, _)| file.as_str());
+        let task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
+            let found = files.iter().map(|(file, text)| (file.as_str(), line_of_key(text, e.path())));
+            let (file, (line, depth)) =
+                found.max_by_key(|(_, (_, depth))| *depth).unwrap_or((last, (String::new(), 0)));
+            let (file, line) = if depth == 0 { (last, String::new()) } else { (file, line) };
+            let place = format!("{line}{}", bracket(&e.path().to_string()));
+            TaskError::Invalid { file: file.into(), place, reason: suggest(e.into_inner().message()) }
+        })?;
+        task.check(last)?;
+        Ok(task)
+    }
+
+    /// The sections of a text; `file` is the name used in messages.
+    ///
+    /// # Errors
+    /// [`TaskError::Invalid`] for what is no TOML, with its line.
+    pub fn table(file: &str, text: &str) -> Result<toml::Table, TaskError> {
+        toml::from_str(text).map_err(|e| TaskError::Invalid {
+            file: file.into(),
+            place: line_of(text, e.span()),
+            reason: first_line(e.message()),
+        })
     }
 
     /// Takes what the file leaves out from the environment.
@@ -324,8 +354,7 @@ impl Task {
         let text = nearl_constraints::read_task_text(path)
             .map_err(|e| TaskError::Unreadable { file: file.clone(), reason: e.to_string() })?;
         let at = |place, reason| TaskError::Invalid { file: file.clone(), place, reason };
-        let mut table: toml::Table =
-            toml::from_str(&text).map_err(|e| at(line_of(&text, e.span()), first_line(e.message())))?;
+        let mut table = Self::table(&file, &text)?;
         let Some(section) = table.remove("constraints") else {
             return Err(at(String::new(), "it has no section [constraints]; write one".into()));
         };
@@ -453,10 +482,10 @@ fn line_of(text: &str, span: Option<std::ops::Range<usize>>) -> String {
     span.map_or(String::new(), |s| format!(":{}", 1 + text[..s.start.min(text.len())].matches('\n').count()))
 }
 
-/// `:12`, where `path` stands in the text, or what of it stands there; nothing for the file as a whole.
-fn line_of_key(text: &str, path: &serde_path_to_error::Path) -> String {
-    let Ok(document) = DeTable::parse(text) else { return String::new() };
-    let (mut table, mut list, mut span) = (Some(document.get_ref()), None, None);
+/// `:12`, where `path` stands in the text, or what of it stands there, and how many of its segments do; nothing for the file as a whole.
+fn line_of_key(text: &str, path: &serde_path_to_error::Path) -> (String, usize) {
+    let Ok(document) = DeTable::parse(text) else { return (String::new(), 0) };
+    let (mut table, mut list, mut span, mut depth) = (Some(document.get_ref()), None, None, 0);
     for segment in path.iter() {
         let found = match segment {
             Segment::Map { key } | Segment::Enum { variant: key } => table
@@ -468,11 +497,11 @@ fn line_of_key(text: &str, path: &serde_path_to_error::Path) -> String {
             Segment::Unknown => None,
         };
         let Some((place, value)) = found else { break };
-        span = Some(place);
+        (span, depth) = (Some(place), depth + 1);
         table = value.as_table();
         list = value.as_array();
     }
-    line_of(text, span)
+    (line_of(text, span), depth)
 }
 
 /// ` [key]`; nothing for the file as a whole.

@@ -4,6 +4,7 @@ use super::Moving;
 use crate::kinematics::{dot, norm};
 use crate::limit::Moved;
 use crate::projector::Projector;
+use crate::row::Place;
 use crate::target::{Braking, Consistency};
 use crate::viability::Dof;
 use crate::{LimitError, PerJoint};
@@ -162,9 +163,12 @@ impl Projector {
             None => Ok(()),
         };
         for (name, plane) in &moved.plane {
+            let is_meant =
+                |limit: usize, place: &Place| place.name.is_none() && self.switches[limit].label == *name;
+            is_one("planes", name, places.iter().filter(|(limit, _, place)| is_meant(*limit, place)))?;
             let mut any = false;
             for ((limit, hard, place), to) in places.iter().zip(numbers.chunks_mut(6)) {
-                if place.name.is_some() || self.switches[*limit].label != *name {
+                if !is_meant(*limit, place) {
                     continue;
                 }
                 finite(format!("plane of '{name}'"), &[plane.normal, plane.through].concat())?;
@@ -183,6 +187,7 @@ impl Projector {
             }
         }
         for (name, pose) in &moved.body {
+            is_one("obstacles", name, places.iter().filter(|(.., place)| place.name.as_ref() == Some(name)))?;
             let mut any = false;
             for ((_, hard, place), to) in places.iter().zip(numbers.chunks_mut(6)) {
                 if place.name.as_ref() == Some(name) {
@@ -267,4 +272,22 @@ impl Projector {
             next: "name one that the projector was built with",
         }
     }
+}
+
+/// Of several that have a name all would be put where one is meant to be; those that lie in the same place are one.
+fn is_one<'a>(
+    what: &str,
+    name: &str,
+    mut found: impl Iterator<Item = &'a (usize, bool, Place)>,
+) -> Result<(), LimitError> {
+    let Some((.., first)) = found.next() else { return Ok(()) };
+    if found.all(|(.., other)| other.numbers == first.numbers) {
+        return Ok(());
+    }
+    Err(LimitError::Unusable {
+        what: format!(
+            "several {what} are called '{name}' and lie apart, so that one of them cannot be meant"
+        ),
+        next: "give each limit or shape a name of its own",
+    })
 }

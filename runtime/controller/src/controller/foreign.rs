@@ -27,7 +27,7 @@ impl Foreign {
         let observer = Observer::new(policy, model, layout).map_err(|e| unusable(&e))?;
         let drives = Parts::drives(m, model, layout.controllable())?;
         let motors = Parts::motors(model, layout.controllable(), &drives)?;
-        let map = ActionMap::new(policy, model, layout, motors).map_err(|e| unusable(&e))?;
+        let map = ActionMap::new(policy, model, layout, &drives, motors).map_err(|e| unusable(&e))?;
         Ok(Self { observer, map: Some(map) })
     }
 

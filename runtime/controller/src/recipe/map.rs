@@ -3,7 +3,7 @@
 use super::PolicySection;
 use super::source::one_dof;
 use crate::motors::Motors;
-use nearl_constraints::{Model, StateLayout};
+use nearl_constraints::{Drive, Model, StateLayout};
 
 /// `command_j = offset_i + scale_i clip(output_i)`, where joint `j` of the controller is joint `i` of the policy, and what its motor is sent for that
 /// command, in the order of the motors.
@@ -19,21 +19,18 @@ pub struct ActionMap {
 }
 
 impl ActionMap {
+    /// `drives` (nv) says what the joints are commanded.
+    ///
     /// # Errors
     /// One sentence naming the joint or the key.
     pub fn new(
         policy: &PolicySection,
         model: &Model,
         layout: &StateLayout,
+        drives: &[Drive],
         motors: Motors,
     ) -> Result<Self, String> {
         let n = policy.joints.len();
-        if !policy.pose.is_empty() && policy.pose.len() != n {
-            return Err(format!(
-                "policy.pose has {} positions for {n} joints; give one for each",
-                policy.pose.len()
-            ));
-        }
         let driven = layout.controllable();
         let place = |name: &String| -> Result<usize, String> {
             let joint = one_dof(model, name).map_err(|e| format!("policy.joints: {e}"))?;
@@ -61,11 +58,8 @@ impl ActionMap {
                 lower.into_iter().zip(upper).map(|(l, u)| [l, u]).collect()
             }
         };
-        let offset = match &a.offset {
-            Some(offset) => offset.spread("policy.action.offset", n)?,
-            None if policy.pose.is_empty() => vec![0.0; n],
-            None => policy.pose.clone(),
-        };
+        let positions: Vec<bool> = to.iter().map(|&k| drives[driven[k]].takes_position()).collect();
+        let offset = policy.offset(&positions)?;
         Ok(Self {
             scale: f32s(a.scale.spread("policy.action.scale", n)?),
             offset: f32s(offset),
