@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import synthetic
 from conftest import ROOT
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 import nearl
 from nearl import curves, report
@@ -79,6 +81,27 @@ def test_the_first_screen_is_the_promise_in_three_numbers(inputs, tmp_path) -> N
     share = {kind: f"{100 * e[f'{kind}_violations'] / e['ticks']:.2f} %" for kind in ("raw", "target", "reached")}
     assert shown == [share["raw"], share["target"], share["reached"]] and first.count("data:image/png") == 1
     assert "of raw proposals broke a limit in eval" in first, "named by its file"
+
+
+def test_a_flight_counts_broken_targets_as_the_run_does(tmp_path) -> None:
+    """The policy's ticks that began within the limits; one that began outside can only come nearer, and a brake of the loop's own is no proposal."""
+    whole = synthetic.flight_log(tmp_path / "whole.mcap", 200, {"dt": "0.001"})
+    changed = tmp_path / "changed.mcap"
+    with open(whole, "rb") as source, open(changed, "wb") as file:
+        reader, writer = make_reader(source), Writer(file)
+        writer.start()
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        channel = writer.register_channel("tick", "json", writer.register_schema("nearl.Tick", "jsonschema", b"{}"))
+        for _, _, message in reader.iter_messages(topics=["tick"]):
+            tick = json.loads(message.data)
+            n = tick["tick"]
+            tick["ledger"] |= {"outside": int(n <= 105), "target_violations": int(n > 5 and n <= 115), "raw_violations": int(n > 100)}
+            tick["mode"] = "hold" if n <= 5 else "braking" if n > 155 else "active"
+            writer.add_message(channel, message.log_time, json.dumps(tick).encode(), message.publish_time, n)
+        writer.finish()
+    page = report.build(tmp_path / "r.html", logs=[changed]).read_text()
+    assert re.findall(r"<strong[^>]*>(.*?)</strong>", page)[:2] == [f"{100 * 55 / 150:.2f} %", f"{100 * 10 / 150:.2f} %"]
 
 
 @pytest.mark.parametrize("dt, ticks", [(1e-3, 600), (8e-3, 250), (0.05, 60)])

@@ -13,7 +13,7 @@ use crate::codes::{self, Explanation};
 use crate::link::{RobotName, bench_round_trip};
 use crate::log::{Gap, replay};
 use crate::rt::{
-    FaultPlan, PRIORITY, Percentiles, ProposerSettings, Reason, RunSettings, Stop, ThreadSettings,
+    FaultPlan, Mode, PRIORITY, Percentiles, ProposerSettings, Reason, RunSettings, Stop, ThreadSettings,
     bench_wake, run,
 };
 pub use limits::LimitOptions;
@@ -157,6 +157,16 @@ pub fn say(line: impl std::fmt::Display) {
     }
 }
 
+/// A path as a shell takes it: in quotes where it holds more than letters, digits and what stands in plain names.
+pub fn quoted(path: &std::path::Path) -> String {
+    let text = path.display().to_string();
+    let is_plain = |c: char| c.is_alphanumeric() || "/._-+:,=@%".contains(c);
+    match !text.is_empty() && text.chars().all(is_plain) {
+        true => text,
+        false => format!("'{}'", text.replace('\'', r"'\''")),
+    }
+}
+
 /// A duration in seconds on the command line: positive and finite.
 ///
 /// # Errors
@@ -181,6 +191,17 @@ fn ahead() -> u64 {
     u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX).saturating_sub(crate::clock::now())
 }
 
+/// Says on standard error that the loop does not act any more, and why.
+fn tell_mode(tick: u64, mode: Mode, reason: Reason) {
+    use std::io::Write;
+    let why = match reason {
+        Reason::None => String::new(),
+        reason => format!(" ({reason}): {} {}", reason.explanation().meaning, reason.explanation().remedy),
+    };
+    // Who closed standard error does not want to know.
+    let _ = writeln!(std::io::stderr(), "tick {tick}: {mode}{why}");
+}
+
 /// Any failure, as one sentence.
 pub type Failure = Box<dyn std::error::Error + Send + Sync>;
 
@@ -191,6 +212,8 @@ pub const LOOP_GONE: u8 = 4;
 
 /// Exit code of a run or a plant whose shared memory was taken away.
 pub const MEMORY_TORN: u8 = 5;
+/// Exit code of a run that ended in Fault.
+pub const FAULT: u8 = 6;
 
 /// A run or a plant that ended by itself for a reason with an exit code of its own.
 #[derive(Debug, thiserror::Error)]
@@ -257,6 +280,7 @@ impl RunCommand {
             wall: ahead(),
             thread,
             strict: self.strict,
+            on_mode: Some(tell_mode),
             ..RunSettings::default()
         };
         let stop = Stop::on_signals()?;
@@ -269,6 +293,7 @@ impl RunCommand {
         match report.reason {
             Reason::PlantGone => Err(Ended::failure(PLANT_GONE, report.reason, &self.plant)),
             Reason::MemoryTorn => Err(Ended::failure(MEMORY_TORN, report.reason, &self.plant)),
+            reason if report.last_mode == Mode::Fault => Err(Ended::failure(FAULT, reason, &self.plant)),
             _ => Ok(()),
         }
     }
@@ -392,4 +417,18 @@ fn wake(rate: f64, seconds: f64, priority: i32, cpu: Option<usize>, json: bool) 
 
 fn line(name: &str, percentiles: &Percentiles) {
     say(format!("  {name:<16} {percentiles}"));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_path_in_a_hint_can_be_pasted() {
+        let quote = |text: &str| quoted(std::path::Path::new(text));
+        assert_eq!(quote("runs/panda_0/policy-2.safetensors"), "runs/panda_0/policy-2.safetensors");
+        assert_eq!(quote("mein Arm ü/p.safetensors"), "'mein Arm ü/p.safetensors'");
+        assert_eq!(quote("it's"), r"'it'\''s'");
+        assert_eq!(quote(""), "''");
+    }
 }

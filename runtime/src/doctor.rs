@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use nearl_constraints::{Drive, MADE_UP_FOR, certify_braking};
+use nearl_constraints::{Drive, MADE_UP_FOR, REGISTRY, certify_braking};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
@@ -14,11 +14,11 @@ use crate::controller::{Controller, Margin, Parts};
 use crate::gains;
 use crate::holding;
 use crate::link::{
-    Remains, RobotMessage, RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, home_of_user,
-    remains,
+    RobotMessage, RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, home_of_user, remains,
 };
 use crate::rt::{PRIORITY, Pilot, Stop, ThreadSettings, bench_wake, prepare};
-use crate::snapshot::{Manifest, Snapshot, SnapshotError, in_run};
+use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError, in_run};
+use crate::task::IdmKind;
 
 /// Check that a snapshot, this machine and a plant are ready.
 #[derive(Args, Debug)]
@@ -227,7 +227,39 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     }
     notes.extend(cut_targets(m, parts, &drives));
     notes.extend(undriven(m, parts));
+    notes.extend(beyond_motors(m, parts, &drives));
+    notes.extend(unguarded(m));
     notes
+}
+
+/// Limits that nothing is held to: those of states, of a policy that gives actions.
+fn unguarded(m: &Manifest) -> Option<String> {
+    let of = &m.task.constraints;
+    let is_off = m.policy == PolicyKind::Direct && of.guard.is_off();
+    (is_off && REGISTRY.iter().any(|kind| !(kind.build)(of).is_empty())).then(|| {
+        "the limits on states under [constraints] hold for nothing: this policy gives actions, and guard is off; add guard = true to [constraints] to hold \
+         them"
+            .into()
+    })
+}
+
+/// Motors whose strength no limit knows, and that targets are given to.
+fn beyond_motors(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
+    let of = &m.task.constraints;
+    let is_kept = of.position.is_some() || of.velocity.is_some() || of.acceleration.is_some();
+    let by_model = m.policy != PolicyKind::Direct && m.task.idm.kind == IdmKind::Pinocchio;
+    let weak = layout
+        .controllable()
+        .iter()
+        .filter(|&&i| drives[i] == Drive::Effort && model.effort_limit()[i].is_finite());
+    let weak: Vec<String> = weak.map(|&i| format!("'{}'", model.dof_name(i))).collect();
+    (is_kept && by_model && of.torque.is_none() && !weak.is_empty()).then(|| {
+        format!(
+            "without a torque limit a target may ask for more than the motors of {} give, and the joint then leaves its limits though the target keeps \
+             them; add torque = {{ scale = 1.0 }} to [constraints]",
+            weak.join(", ")
+        )
+    })
 }
 
 /// What a guard by the robot's model does not promise of joints that nothing drives.
@@ -433,7 +465,8 @@ fn memory() -> Check {
 /// Links that only dead processes hold.
 fn stale_links() -> Check {
     let all = remains();
-    let stale: Vec<_> = all.iter().filter(|r| r.is_stale()).collect();
+    let mut stale: Vec<_> = all.iter().filter(|r| r.is_stale()).collect();
+    stale.sort_by_key(|r| -r.changed);
     if stale.is_empty() {
         let alive = all.iter().filter(|r| r.alive > 0).count();
         return ok(
@@ -442,15 +475,25 @@ fn stale_links() -> Check {
         );
     }
     let kilobytes = stale.iter().map(|r| r.bytes).sum::<u64>() >> 10;
-    let folder = home_of_user();
-    let name = |r: &&Remains| format!("/dev/shm/nearl.{0}.* and {1}/{0}", r.name, folder.display());
-    let names: Vec<String> = stale.iter().map(name).collect();
-    warn(
-        CheckCode::Links,
-        format!(
-            "{kilobytes} kB are held by dead processes: start the robot again, which cleans up, or delete {}",
-            names.join(" ")
-        ),
+    let names: Vec<&str> = stale.iter().map(|r| r.name.as_str()).collect();
+    warn(CheckCode::Links, left(&names, kilobytes, &home_of_user()))
+}
+
+/// Names of robots that are told one by one.
+const NAMED: usize = 3;
+
+/// What dead processes left of the links of this user's robots `names`, newest first.
+fn left(names: &[&str], kilobytes: u64, folder: &Path) -> String {
+    let files = |name: &&str| format!("/dev/shm/nearl.{name}.* and {}/{name}", folder.display());
+    let shown: Vec<String> = names.iter().take(NAMED).map(files).collect();
+    let more = match names.len().saturating_sub(NAMED) {
+        0 => String::new(),
+        more => format!(" and those of {more} more (names in {})", folder.display()),
+    };
+    format!(
+        "{kilobytes} kB of {} robots are held by dead processes: start a robot again, which cleans up, or delete {}{more}",
+        names.len(),
+        shown.join(", ")
     )
 }
 
@@ -526,7 +569,7 @@ fn wake(dt: f64) -> Check {
 /// What was compared with the plant, and what it did not say.
 fn plant_found(name: &str, robot: &RobotMessage) -> Check {
     let (mut same, mut unsaid) = (vec!["joints", "observation"], Vec::new());
-    let file = "the robot file's limits and the actuators' range";
+    let file = "the robot file's limits, the actuators' range and what the joints are commanded";
     if robot.limits != 0 {
         same.push(file)
     } else {
@@ -570,5 +613,29 @@ fn examine_plant(name: &str, snapshot: &Snapshot) -> Check {
             Err(refusal) => fail(CheckCode::Plant, refusal.text),
             Ok(_) => plant_found(name, &robot),
         },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_left_of_many_robots_is_a_count_and_the_first_few() {
+        let names: Vec<String> = (0..400).map(|k| format!("arm{k}")).collect();
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let text = left(&names, 1200, Path::new("/run/x"));
+        assert!(
+            text.contains("1200 kB of 400 robots") && text.contains("/run/x/arm2 and those of 397 more"),
+            "{text}"
+        );
+        assert!(text.len() < 400 && !text.contains("arm3"), "{text}");
+        let text = left(&names[..2], 8, Path::new("/run/x"));
+        assert!(
+            text.ends_with(
+                "delete /dev/shm/nearl.arm0.* and /run/x/arm0, /dev/shm/nearl.arm1.* and /run/x/arm1"
+            ),
+            "{text}"
+        );
     }
 }

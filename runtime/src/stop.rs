@@ -1,9 +1,17 @@
 //! Asking the loop to stop: SIGINT, SIGTERM, or a call.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::low_level::{exit, register};
+
+use crate::clock;
+
+/// Signals so close to the first are the same wish [ns]: a shell sends one to a whole group, and a program in it passes it on.
+const ONE_WISH: u64 = 200_000_000;
+/// Exit code of a program that a second signal ended.
+const ENDED: i32 = 130;
 
 /// Set once; the loop then brakes to zero velocity and returns.
 #[derive(Clone, Debug, Default)]
@@ -15,13 +23,14 @@ impl Stop {
         Stop::default()
     }
 
-    /// Also set by the first SIGINT or SIGTERM; a second one ends the process at once with code 130.
+    /// Also set by the first SIGINT or SIGTERM; a second one, 0.2 s after it or later, ends the process at once with code 130.
     pub fn on_signals() -> std::io::Result<Stop> {
         let stop = Stop::default();
+        let first = Arc::new(AtomicU64::new(0));
         for signal in [SIGINT, SIGTERM] {
-            // In this order: the first signal finds the switch off, and turns it on for the second.
-            signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&stop.0))?;
-            signal_hook::flag::register(signal, Arc::clone(&stop.0))?;
+            let (is_asked, first) = (Arc::clone(&stop.0), Arc::clone(&first));
+            // SAFETY: the handler reads the clock, reads and writes atomic numbers, and ends the process, which a handler may do.
+            unsafe { register(signal, move || heed(&is_asked, &first)) }?;
         }
         Ok(stop)
     }
@@ -34,5 +43,15 @@ impl Stop {
     /// True once it was asked for.
     pub fn is_requested(&self) -> bool {
         self.0.load(Ordering::Acquire)
+    }
+}
+
+/// What a signal does; `first` is when the first one came, 0 before \[ns\].
+fn heed(is_asked: &AtomicBool, first: &AtomicU64) {
+    let now = clock::now().max(1);
+    match first.compare_exchange(0, now, Ordering::AcqRel, Ordering::Acquire) {
+        Ok(_) if !is_asked.swap(true, Ordering::AcqRel) => {}
+        Err(at) if now < at.saturating_add(ONE_WISH) => {}
+        _ => exit(ENDED),
     }
 }

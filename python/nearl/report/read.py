@@ -83,6 +83,7 @@ _NUMBERS = {
     "episode": ("state", "episode"),
     "raw_violations": ("ledger", "raw_violations"),
     "target_violations": ("ledger", "target_violations"),
+    "outside": ("ledger", "outside"),
     "moved": ("ledger", "moved"),
     "active": ("ledger", "active"),
     "iterations": ("ledger", "iterations"),
@@ -114,6 +115,7 @@ def read_log(path: Path) -> Log:
     if any("rows" in entry and json.dumps(entry["rows"]) != json.dumps(json.loads(metadata.get("rows", "[]"))) for entry in swapped):
         metadata.pop("rows", None)  # a later snapshot numbers its rows otherwise
     columns = {name: np.array([_at(tick, keys) for tick in ticks]) for name, keys in _NUMBERS.items()}
+    columns["target_violations"][columns["outside"] > 0] = 0.0  # from outside a target can only come nearer: `nearl run` counts these as recovering
     table = {key: _table([tick.get(key) for tick in ticks]) for key in ("proposal_q", "proposal_v", "target_q", "target_v")}
     state = {key: _table([tick.get("state", {}).get(key) for tick in ticks]) for key in ("q", "v")}
     active = [tick.get("ledger", {}).get("active_rows") or [] for tick in ticks]

@@ -18,7 +18,7 @@ int main(int argc, char **argv) {
         nearl_state state = {.time = tick * robot.dt, .q = &q, .v = &v, .obs = obs, .begins = tick == 0};
         switch (nearl_plant_exchange(plant, &state, 0.3, &force)) { /* 2. ask */
         case NEARL_ACT: acted++; break;
-        case NEARL_HOLD: break;                             /* `force` is that of before */
+        case NEARL_HOLD: break;                             /* `force` is that of before; a position would stop the robot at once */
         default: force = -2.0 * v / robot.dt, braked++;     /* 3. brake by itself */
         }
         if (force > 40.0) force = 40.0; /* the motor's own limit */

@@ -17,7 +17,7 @@ extern "C" {
 
 /* What the driver is to do in a period. */
 #define NEARL_ACT 0   /* apply `action`, computed from the state just given */
-#define NEARL_HOLD 1  /* apply `action`, that of before: none came in time */
+#define NEARL_HOLD 1  /* none came in time: apply `action`, that of before; where it is a position, slow down instead (docs/CONNECT.md) */
 #define NEARL_BRAKE 2 /* bring the robot to rest: no loop, a silent one, or it leaves braking to the plant */
 
 typedef struct nearl_plant nearl_plant;

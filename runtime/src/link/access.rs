@@ -307,6 +307,9 @@ impl Verdict {
     }
 }
 
+/// What stands at the end of a sentence that was cut.
+const CUT: &str = "… (the whole sentence is a note in the report of the loop)";
+
 impl ReceiptMessage {
     /// The answer to the snapshot with `header`.
     pub fn answer(header: &SnapshotHeader, verdict: Verdict, text: &str) -> ReceiptMessage {
@@ -327,16 +330,18 @@ impl ReceiptMessage {
         String::from_utf8_lossy(&self.text[..length]).into_owned()
     }
 
-    /// Writes verdict and sentence; a sentence beyond the capacity is cut at a character.
+    /// Writes verdict and sentence; a sentence beyond the capacity is cut at a character, and says where it stands whole.
     pub fn set(&mut self, verdict: Verdict, text: &str) {
-        let mut length = text.len().min(MAX_TEXT);
+        let end = if text.len() > MAX_TEXT { CUT } else { "" };
+        let mut length = text.len().min(MAX_TEXT - end.len());
         while !text.is_char_boundary(length) {
             length -= 1;
         }
+        let text = format!("{}{end}", &text[..length]);
         self.verdict = verdict.code();
-        self.length = length as u32;
+        self.length = text.len() as u32;
         self.text = [0; MAX_TEXT];
-        self.text[..length].copy_from_slice(&text.as_bytes()[..length]);
+        self.text[..text.len()].copy_from_slice(text.as_bytes());
     }
 }
 
@@ -365,7 +370,10 @@ mod tests {
         assert_eq!(robot.joint_names(), ["hip", "knee"]);
         let mut receipt = ReceiptMessage::zeroed();
         receipt.set(Verdict::Corrupt, &"\u{e9}".repeat(200));
-        assert_eq!(receipt.text(), "\u{e9}".repeat(128));
+        assert_eq!(receipt.text(), "\u{e9}".repeat(200));
+        receipt.set(Verdict::Corrupt, &"\u{e9}".repeat(600));
+        let room = (MAX_TEXT - CUT.len()) / 2;
+        assert_eq!(receipt.text(), format!("{}{CUT}", "\u{e9}".repeat(room)));
         assert_eq!(receipt.verdict(), Verdict::Corrupt);
     }
 

@@ -8,9 +8,9 @@ use crate::clock;
 /// What the driver is to do in this period.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Turn<'a> {
-    /// Apply this action, computed from the state just sent.
+    /// Apply this action, computed from the state just sent: by the policy, or to brake with (Braking, Fault).
     Act(&'a [f64]),
-    /// Apply the action before once more: none came in time.
+    /// Apply the action before once more: none came in time. Where it is a position, that would stop the robot within a period: slow down instead.
     Hold(&'a [f64]),
     /// Bring the robot to rest: there is no loop, none answered for the watchdog's time, or it leaves braking to the plant.
     Brake,

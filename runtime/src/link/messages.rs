@@ -37,7 +37,7 @@ pub const MAX_TASK: usize = 128;
 /// Capacity of the text in a [`LimitsMessage`] \[bytes\].
 pub const MAX_MOVED: usize = 8192;
 /// Capacity of the text in a [`ReceiptMessage`] \[bytes\].
-pub const MAX_TEXT: usize = 256;
+pub const MAX_TEXT: usize = 1024;
 
 /// This state begins an episode. For learning; the loop goes by the episode's number.
 pub const STATE_RESET: u32 = 1;
@@ -109,7 +109,7 @@ message! {
         state_epoch: u64,
         /// [`crate::rt::Mode`] as a number.
         mode: u32,
-        /// Entries used in `action`; 0 in Hold, Braking and Fault: the plant brakes by itself.
+        /// Entries used in `action`; 0 where the loop has none to give, in Hold or without a state or a model to brake by: the plant brakes by itself.
         nu: u32,
         /// Version of the snapshot that computed it.
         policy_version: u64,
@@ -318,7 +318,7 @@ message! {
 
 message! {
     /// The runtime's reply to one snapshot, or to limits that were moved.
-    ReceiptMessage, "receipt", version 1, buffer 8, history 1, subscribers 8 {
+    ReceiptMessage, "receipt", version 2, buffer 8, history 1, subscribers 8 {
         /// `header.epoch` of the trainer that sent the snapshot, or of the operator.
         trainer_epoch: u64,
         /// Version of the snapshot replied to.

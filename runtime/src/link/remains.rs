@@ -21,6 +21,8 @@ pub struct Remains {
     pub bytes: u64,
     /// A process has links of the robot now.
     pub held: bool,
+    /// When something of it changed last [s since 1970].
+    pub changed: i64,
 }
 
 impl Remains {
@@ -32,30 +34,34 @@ impl Remains {
 
 /// Every robot name of this user with shared memory or files on this machine, sorted by name. What another user called so is none of them.
 pub fn remains() -> Vec<Remains> {
-    let mut sizes: BTreeMap<String, u64> = BTreeMap::new();
+    let mut found: BTreeMap<String, (u64, i64)> = BTreeMap::new();
+    let mut add = |name: &str, bytes: u64, changed: i64| {
+        let (all, last) = found.entry(name.to_owned()).or_default();
+        (*all, *last) = (*all + bytes, changed.max(*last));
+    };
     for entry in memory::files("nearl.") {
         let file = entry.file_name().to_string_lossy().into_owned();
         let name = file.strip_prefix("nearl.").and_then(|rest| rest.split_once('.')).map(|(name, _)| name);
         if let (Some(name), Ok(meta)) = (name, entry.metadata()) {
-            *sizes.entry(name.to_owned()).or_default() += 512 * meta.blocks();
+            add(name, 512 * meta.blocks(), meta.mtime());
         }
     }
     for (entry, _) in home::own_entries(&home::of_user()) {
         let name = entry.file_name().to_string_lossy().into_owned();
         let Ok(robot) = RobotName::new(&name) else { continue };
         if home::has_files(&robot) || home::is_held(&robot) {
+            add(&name, 0, 0);
             let files = home::own_entries(&entry.path());
-            let bytes = files.filter(|(_, m)| m.is_file()).map(|(_, m)| 512 * m.blocks());
-            *sizes.entry(name).or_default() += bytes.sum::<u64>();
+            files.filter(|(_, m)| m.is_file()).for_each(|(_, m)| add(&name, 512 * m.blocks(), m.mtime()));
         }
     }
-    sizes.into_iter().filter_map(|(name, bytes)| of(&name, bytes)).collect()
+    found.into_iter().filter_map(|(name, (bytes, changed))| of(&name, bytes, changed)).collect()
 }
 
-fn of(name: &str, bytes: u64) -> Option<Remains> {
+fn of(name: &str, bytes: u64, changed: i64) -> Option<Remains> {
     let robot = RobotName::new(name).ok()?;
     let mut remains =
-        Remains { name: name.to_owned(), alive: 0, dead: 0, bytes, held: home::is_held(&robot) };
+        Remains { name: name.to_owned(), alive: 0, dead: 0, bytes, held: home::is_held(&robot), changed };
     if robot.token().is_none() {
         return Some(remains);
     }

@@ -21,6 +21,7 @@ use crate::rt::receive::SnapshotReceiver;
 use crate::rt::residual::{Residual, RollbackSettings, Weights};
 use crate::rt::swap::Sender;
 use crate::rt::tick::{Build, LoopController, Record};
+use crate::rt::watch::Watched;
 
 /// How many refusals are kept as text for the report.
 const KEPT: usize = 32;
@@ -59,6 +60,8 @@ pub(crate) struct SnapshotInbox<B: Build> {
     pub(crate) came: u64,
     /// What viewers are told of the one in use.
     pub(crate) rows: Box<RowsMessage>,
+    /// Joints of one that was taken into use, for the report.
+    pub(crate) watched: Option<Vec<Watched>>,
     /// Versions taken into use: (first tick at the latest, version of the controller).
     pub(crate) accepted: Vec<(u64, u64)>,
     /// Sentences of refusals, the first ones.
@@ -79,6 +82,7 @@ struct Offer {
     version: u64,
     /// Its number, and what viewers are told of it.
     rows: (u64, Box<RowsMessage>),
+    watched: Vec<Watched>,
 }
 
 /// What a look at the snapshots needs of the I/O thread.
@@ -122,6 +126,7 @@ impl<B: Build> SnapshotInbox<B> {
             newest: (0, 0),
             came: clock::now(),
             rows: Box::new(RowsMessage::zeroed()),
+            watched: None,
             accepted: Vec::new(),
             refusals: Vec::new(),
             refused: 0,
@@ -282,8 +287,9 @@ impl<B: Build> SnapshotInbox<B> {
             (None, None) => return,
         };
         let (version, rows) = (loaded.controller.version(), (loaded.id, loaded.controller.told()));
+        let watched = loaded.controller.watched();
         match (self.swap.offer(loaded), header) {
-            (Ok(()), header) => self.offered = Some(Offer { header, source, version, rows }),
+            (Ok(()), header) => self.offered = Some(Offer { header, source, version, rows, watched }),
             (Err(loaded), Some(header)) => self.ready = Some((header, (source, loaded))),
             (Err(loaded), None) => self.previous = Some((source, loaded)),
         }
@@ -292,10 +298,11 @@ impl<B: Build> SnapshotInbox<B> {
     /// The old controller came back: the new one is in use. The one before the old is no longer needed.
     fn settle(&mut self, around: &mut Surroundings<'_>) {
         let Some(old) = self.swap.collect() else { return };
-        let Some(Offer { header, source, version, rows }) = self.offered.take() else {
+        let Some(Offer { header, source, version, rows, watched }) = self.offered.take() else {
             return self.builder.discard(old);
         };
         self.set_rows(rows.0, rows.1);
+        self.watched = Some(watched);
         let condemned = self.condemned.take();
         let is_order = source.is_order;
         if !is_order {

@@ -19,6 +19,7 @@ use crate::log::LogQueue;
 use crate::percentiles::percentiles;
 use crate::rt::inbox::{SnapshotInbox, Surroundings};
 use crate::rt::tick::{Build, Record, Sensed};
+use crate::rt::watch::Watch;
 
 /// Before a state is due, this thread is awake so much earlier [ns].
 const LEAD: u64 = 120_000;
@@ -62,6 +63,7 @@ pub(crate) struct Io<B: Build> {
     pub(crate) traffic: Traffic,
     /// What the plant counted, as far as it said.
     pub(crate) tally: Option<TallyMessage>,
+    pub(crate) watch: Watch,
 }
 
 /// What this thread counts and remembers.
@@ -145,6 +147,7 @@ impl<B: Build> Io<B> {
         let Ok(record) = self.records.peek() else { return false };
         self.traffic.tick = record.tick;
         self.health.take(record);
+        self.watch.take(record);
         if self.link.is_watched() {
             fill_tick(&mut self.tick, record);
             self.link.send_tick(&mut self.tick);
@@ -210,8 +213,11 @@ impl<B: Build> Io<B> {
         }
         self.hear_tally();
         self.look_for_the_plant();
-        let Io { link, log, robot, snapshots, traffic, .. } = self;
+        let Io { link, log, robot, snapshots, traffic, watch, .. } = self;
         snapshots.pump(&mut Surroundings { link, log, robot, tick: traffic.tick });
+        if let Some(joints) = snapshots.watched.take() {
+            watch.set(joints);
+        }
         let now = clock::now();
         self.look_for_the_trainer(now);
         if now >= self.health.next {

@@ -18,6 +18,7 @@ pub mod faults;
 mod heard;
 mod inbox;
 mod io;
+mod meaning;
 mod mode;
 mod pilot;
 mod pinned;
@@ -28,6 +29,7 @@ mod resume;
 mod run;
 pub mod swap;
 mod tick;
+mod watch;
 
 pub use crate::clock;
 pub use crate::grid::Grid;
@@ -39,13 +41,15 @@ pub use brake::Brake;
 pub use core::{Core, CoreSettings, Inputs, Loaded, ProposerSettings};
 pub use cycle::Sync;
 pub use faults::{Fault, FaultKind, FaultPlan, FaultyPlant, Odd};
+pub use meaning::Meaning;
 pub use mode::{Event, Mode, ModeLimits, Modes, Reason};
 pub use pilot::{Pilot, PilotBuilder, describe, numbers};
 pub use pinned::Pinned;
 pub use report::{PlantSummary, ProposerSummary, RunReport};
 pub use residual::RollbackSettings;
 pub use resume::{MAX_MEMORY, Resume};
-pub use run::{RunError, RunSettings, connect, run, run_loop};
+pub use run::{OnMode, RunError, RunSettings, connect, run, run_loop};
 pub use tick::{
     Build, Counters, LoopController, MAX_ROWS, Outcome, Question, Record, Refusal, Row, Sensed, TickOutput,
 };
+pub use watch::{Found, Watched};

@@ -3,6 +3,7 @@
 use std::cell::Cell;
 use std::collections::BTreeMap;
 
+use nearl_constraints::description::JointKind;
 use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, Moved, RefuseReason, Side, Status};
 
 use crate::codes::LedgerStatus;
@@ -12,9 +13,11 @@ use crate::link::{
     RowsMessage, SnapshotBytes, StateMessage, Verdict, hash_names,
 };
 use crate::rt::brake::Brake;
+use crate::rt::meaning::Meaning;
 use crate::rt::pinned::{Pinned, UNITS, above};
 use crate::rt::run::check_holding;
 use crate::rt::tick::{Build, LoopController, MAX_ROWS, Outcome, Question, Refusal, Row, TickOutput};
+use crate::rt::watch::Watched;
 use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError};
 
 /// A controller with its inputs and outputs, checked against the plant it drives.
@@ -49,15 +52,18 @@ pub struct Pilot {
 impl Pilot {
     /// Builds and validates the controller of `snapshot` for `robot`. Allocates and parses the robot file.
     pub fn new(snapshot: &Snapshot, robot: &RobotMessage) -> Result<Pilot, Refusal> {
-        Pilot::within(snapshot, robot, None)
+        Pilot::within(snapshot, robot, &PilotBuilder::default())
     }
 
-    /// [`Pilot::new`] of a snapshot that may not loosen what is `pinned`. Another robot's snapshot is refused as such first.
-    fn within(snapshot: &Snapshot, robot: &RobotMessage, pinned: Option<&Pinned>) -> Result<Pilot, Refusal> {
+    /// [`Pilot::new`] of a snapshot that has to fit what is fixed at the start of a loop. Another robot's snapshot is refused as such first.
+    fn within(snapshot: &Snapshot, robot: &RobotMessage, fixed: &PilotBuilder) -> Result<Pilot, Refusal> {
         let refuse = |error: SnapshotError| Refusal { verdict: Verdict::of(&error), text: error.to_string() };
         let controller = Controller::new(snapshot).map_err(refuse)?;
         compare(&describe_controller(&controller, &snapshot.manifest), robot)?;
-        if let Some(pinned) = pinned {
+        if let Some(meaning) = &fixed.meaning {
+            meaning.admit(&snapshot.manifest)?;
+        }
+        if let Some(pinned) = &fixed.pinned {
             pinned.admit(&snapshot.manifest)?;
         }
         compare_limits(&controller, robot)?;
@@ -262,6 +268,26 @@ impl LoopController for Pilot {
         told
     }
 
+    fn watched(&self) -> Vec<Watched> {
+        let (model, limits) = (self.controller.model(), self.controller.limits());
+        let controllable = self.controller.layout().controllable();
+        let all = model.description().bodies.iter().flat_map(|body| &body.joints);
+        let slides: Vec<&str> = all.filter(|j| j.kind == JointKind::Slide).map(|j| j.name.as_str()).collect();
+        let joints = model.joints().iter().filter(|j| j.nq == 1 && j.nv == 1);
+        joints
+            .filter(|j| self.proposes && controllable.contains(&j.idx_v))
+            .map(|j| Watched {
+                joint: j.name.clone(),
+                dof: j.idx_v,
+                idx_q: j.idx_q,
+                length: if slides.contains(&j.name.as_str()) { "m" } else { "rad" },
+                lower: limits.q_lower[j.idx_v],
+                upper: limits.q_upper[j.idx_v],
+                velocity: limits.velocity[j.idx_v],
+            })
+            .collect()
+    }
+
     fn load_memory(&mut self, memory: &[f64]) {
         // A way to stop within other limits is none within these.
         if let Some((limits, memory)) = memory.split_first()
@@ -386,9 +412,11 @@ pub fn numbers(ledger: &Ledger) -> LedgerNumbers {
     }
 }
 
-/// Builds [`Pilot`]s from snapshot bytes, within the limits that are fixed, if any are.
+/// Builds [`Pilot`]s from snapshot bytes, within what is fixed, if anything is.
 #[derive(Debug, Default)]
 pub struct PilotBuilder {
+    /// What the robot takes the numbers of an action for.
+    pub meaning: Option<Meaning>,
     /// What no snapshot may loosen.
     pub pinned: Option<Pinned>,
 }
@@ -399,7 +427,7 @@ impl Build for PilotBuilder {
     fn build(&mut self, snapshot: &SnapshotBytes, robot: &RobotMessage) -> Result<Pilot, Refusal> {
         let parsed = Snapshot::from_bytes(&snapshot.bytes);
         let snapshot = parsed.map_err(|e| Refusal { verdict: Verdict::of(&e), text: e.to_string() })?;
-        Pilot::within(&snapshot, robot, self.pinned.as_ref())
+        Pilot::within(&snapshot, robot, self)
     }
 
     fn with_limits(&mut self, bytes: &[u8], moved: &Moved) -> Result<Vec<u8>, Refusal> {

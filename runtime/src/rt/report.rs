@@ -8,6 +8,7 @@ use serde::Serialize;
 
 use crate::percentiles::Percentiles;
 use crate::rt::tick::Counters;
+use crate::rt::watch::Found;
 use crate::rt::{Mode, Reason, Sync};
 use crate::thread::Usage;
 
@@ -65,6 +66,10 @@ pub struct RunReport {
     pub modes: BTreeMap<&'static str, u64>,
     /// Counts of the loop: overruns, skipped slots, swaps, ticks whose proposal or target broke a limit, and so on.
     pub counters: Counters,
+    /// Ticks whose target is not the nearest allowed state to what was proposed, by their status.
+    pub statuses: BTreeMap<&'static str, u64>,
+    /// What of single joints was found outside its limits where a tick began: the first time each.
+    pub outside: Vec<Found>,
     /// States refused for their sizes, their sender or their schema.
     pub refused_states: u64,
     /// From due to begin of the tick.
@@ -138,6 +143,14 @@ impl fmt::Display for RunReport {
             c.overruns, c.skipped, self.plant.late, c.stale, c.lost_states
         )?;
         writeln!(f, "  limits broken    {}", self.projected())?;
+        if !self.statuses.is_empty() || c.refused > 0 {
+            let refused = (c.refused > 0).then(|| format!("refused {}", c.refused));
+            let each = self.statuses.iter().map(|(status, n)| format!("{status} {n}")).chain(refused);
+            writeln!(f, "  out of the way   {}", each.collect::<Vec<_>>().join(", "))?;
+        }
+        for found in &self.outside {
+            writeln!(f, "  found outside    {found}")?;
+        }
         let measured = self.plant.violations.iter().map(|(kind, n)| format!("{kind} {n}"));
         let others = self.plant.not_measured.iter().map(|kind| format!("{kind} not measured"));
         let plant: Vec<String> = measured.chain(others).collect();

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::sync_channel;
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rtrb::RingBuffer;
@@ -25,6 +26,7 @@ use crate::rt::cycle::{Cycle, CycleEnd, CycleSettings, Ends, Sync};
 use crate::rt::faults::FaultPlan;
 use crate::rt::inbox::SnapshotInbox;
 use crate::rt::io::{Health, Io, Traffic};
+use crate::rt::meaning::Meaning;
 use crate::rt::mode::ModeLimits;
 use crate::rt::pilot::{Pilot, PilotBuilder};
 use crate::rt::pinned::Pinned;
@@ -32,6 +34,7 @@ use crate::rt::receive::SnapshotReceiver;
 use crate::rt::report::{PlantSummary, ProposerSummary, RunReport};
 use crate::rt::residual::RollbackSettings;
 use crate::rt::tick::{Build, LoopController, Refusal};
+use crate::rt::watch::Watch;
 use crate::rt::{Mode, Reason, swap};
 use crate::snapshot::{Snapshot, SnapshotError, in_run};
 use crate::stop::Stop;
@@ -101,6 +104,32 @@ pub struct RunSettings {
     pub metadata: BTreeMap<String, String>,
     /// Bytes of the first snapshot, kept in the flight log for replay.
     pub first: Vec<u8>,
+    /// Told of each tick in which the mode becomes Fault, or Hold again, on a thread of its own, which may wait.
+    pub on_mode: Option<OnMode>,
+}
+
+/// Tick, mode, and why.
+pub type OnMode = fn(u64, Mode, Reason);
+
+/// Modes that wait to be told.
+const TOLD: usize = 16;
+
+/// Tells the modes that are sent to it until nobody sends any more.
+struct Teller {
+    tell: SyncSender<(u64, Mode, Reason)>,
+    thread: JoinHandle<()>,
+}
+
+impl Teller {
+    fn start(on_mode: OnMode) -> Result<Teller, RunError> {
+        let (tell, told) = sync_channel(TOLD);
+        let thread = spawn("nearl-tell", move || {
+            for (tick, mode, reason) in told {
+                on_mode(tick, mode, reason);
+            }
+        })?;
+        Ok(Teller { tell, thread })
+    }
 }
 
 impl Default for RunSettings {
@@ -133,6 +162,7 @@ impl Default for RunSettings {
             log: None,
             metadata: BTreeMap::new(),
             first: Vec::new(),
+            on_mode: None,
         }
     }
 }
@@ -233,7 +263,9 @@ pub fn run(
     if let Some(pinned) = &pinned {
         settings.metadata.insert("limits".into(), pinned.to_json());
     }
-    let mut report = run_loop(link, robot, first, PilotBuilder { pinned }, &settings, stop)?;
+    let meaning = Meaning::of(&snapshot.manifest).map_err(|e| refused(e.to_string()))?;
+    let build = PilotBuilder { meaning: Some(meaning), pinned };
+    let mut report = run_loop(link, robot, first, build, &settings, stop)?;
     report.warnings.extend(snapshot.manifest.without_simulator().map(str::to_owned));
     Ok(report)
 }
@@ -281,7 +313,12 @@ pub fn run_loop<B: Build>(
     let begin = clock::now();
     let version = first.version();
     let name = link.name().to_string();
-    let (cycle, io) = assemble(link, robot, first, build, settings, stop)?;
+    let (cycle, mut io) = assemble(link, robot, first, build, settings, stop)?;
+    let (tell, teller) = match settings.on_mode.map(Teller::start).transpose()? {
+        Some(Teller { tell, thread }) => (Some(tell), Some(thread)),
+        None => (None, None),
+    };
+    io.watch.tell = tell;
     let over = Arc::new(AtomicBool::new(false));
     let io_thread = spawn("nearl-io", {
         let over = Arc::clone(&over);
@@ -289,7 +326,11 @@ pub fn run_loop<B: Build>(
     })?;
     let end = start_cycle(cycle, settings);
     over.store(true, Ordering::Release);
-    let io = io_thread.join().map_err(|_| RunError::Panicked("nearl-io"))?;
+    let mut io = io_thread.join().map_err(|_| RunError::Panicked("nearl-io"))?;
+    io.watch.tell = None;
+    if let Some(teller) = teller {
+        let _ = teller.join();
+    }
     let (end, warnings) = end?;
     Ok(report(name, &robot, settings.sync, begin, version, end, io, warnings))
 }
@@ -307,6 +348,7 @@ fn assemble<B: Build>(
     let asked = asked(&mut link, &robot, &first, settings)?;
     let cycle_settings = cycle_settings(&robot, settings);
     let told = first.told();
+    let watch = Watch::of(first.watched());
     let log = open_log(&robot, (first.version(), &first.row_names()), &cycle_settings.core, settings)?;
     let thread_error = |name| move |e: std::io::Error| RunError::Thread { name, reason: e.to_string() };
     let builder = Builder::start(build).map_err(thread_error("nearl-build"))?;
@@ -349,6 +391,7 @@ fn assemble<B: Build>(
         tick,
         traffic: Traffic::default(),
         tally: None,
+        watch,
     };
     Ok((cycle, io))
 }
@@ -484,6 +527,8 @@ fn report<B: Build>(
         },
         modes: Mode::ALL.iter().copied().map(mode_count).collect(),
         counters,
+        statuses: io.watch.statuses(),
+        outside: io.watch.outside,
         refused_states: io.traffic.refused_states + io.link.refused_states(),
         wake: percentiles(&end.wake),
         compute: percentiles(&end.compute),

@@ -4,6 +4,7 @@ use crate::link::{
     LedgerNumbers, MAX_JOINTS, Message, ProposalMessage, RobotMessage, RowsMessage, SnapshotBytes,
     StateMessage, Verdict,
 };
+use crate::rt::watch::Watched;
 use crate::rt::{Mode, Reason, Resume};
 use nearl_constraints::Moved;
 
@@ -49,6 +50,10 @@ pub trait LoopController: Send + 'static {
         let mut told = Box::new(RowsMessage::zeroed());
         told.set_row_names(&self.row_names());
         told
+    }
+    /// Its joints with limits, by which the report of a run names what was found outside. Not for the real-time thread: it allocates.
+    fn watched(&self) -> Vec<Watched> {
+        Vec::new()
     }
     /// Takes what another controller of the same robot saved in the tick before, if it fits.
     fn load_memory(&mut self, _memory: &[f64]) {}

@@ -151,6 +151,7 @@ impl Attack {
         };
         let mut facts = facts(&robot, &settings, &FaultPlan::default());
         facts.insert("limits".into(), Pinned::of(&first.manifest, "the snapshot").unwrap().to_json());
+        facts.insert("rows".into(), serde_json::json!(controller.row_names()).to_string());
         let path = folder.join("attack.mcap");
         let mut log = LogQueue::create(&path, &facts, 0).unwrap();
         log.push_snapshot(0, 1, first.to_bytes(), controller.row_names());

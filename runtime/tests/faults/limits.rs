@@ -130,6 +130,97 @@ fn fault_38_a_pushed_snapshot_may_tighten_the_limits_but_never_loosen_them() {
     assert!(arm.worst.iter().all(|e| *e <= ROUNDING), "position, velocity, torque: {:?}", arm.worst);
 }
 
+/// A robot takes the numbers of an action for what its driver was written for; a policy may be right in every limit and wrong in that.
+#[test]
+fn a_pushed_snapshot_whose_actions_mean_something_else_is_refused_by_both_names() {
+    let (name, wide) = (Name::new("meaning"), [(-20.0, 20.0); N]);
+    let of = |version: u64, command: &str, change: fn(&mut Manifest)| {
+        snapshot(version, |m| {
+            m.task.command = toml::from_str(command).unwrap();
+            (m.action_lower, m.action_upper) = wide.into_iter().unzip();
+            change(m);
+        })
+    };
+    let (positions, velocities) = ("interface = \"position\"", "interface = \"velocity\"");
+    let first = of(1, positions, |_| {});
+    let file = File::new("meaning", &first);
+    // A driver of one's own: it announces no digest of limits and commands, and takes whatever comes for positions.
+    let robot = Robot { limits: 0, stated: None, ..describe(&first.manifest, true).unwrap() };
+    let (link, over) = (PlantLink::open(&name.0, &robot).unwrap(), Stop::new());
+    let plant = std::thread::spawn({
+        let over = over.clone();
+        move || {
+            let mut arm =
+                Panda { follows_positions: true, pause: Duration::from_micros(300), ..Panda::new() };
+            PlantRunner::new(link, PlantSettings::lockstep(toy::DT)).unwrap().run(&mut arm, &over);
+            arm
+        }
+    });
+    // Not even where looser limits are let in: this is no limit.
+    let stop = Stop::new();
+    let running = execute_with(&name, &file.0, &stop, RunSettings { allow_looser: true, ..toy::settings() });
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    trainer.wait_for_runtime(PATIENCE).unwrap();
+    let mut push = |snapshot: Snapshot| {
+        let version = snapshot.manifest.version;
+        trainer.push(version, &snapshot.to_bytes()).unwrap();
+        let receipt = trainer.wait_for_receipt(version, Duration::from_secs(60)).unwrap();
+        (receipt.verdict(), receipt.text())
+    };
+    let one = "[interface]\npanda_joint1 = \"position\"\npanda_joint2 = \"velocity\"\npanda_joint3 = \"position\"\n\
+               panda_joint4 = \"position\"\npanda_joint5 = \"position\"\npanda_joint6 = \"position\"\npanda_joint7 = \"position\"";
+    let gains = "interface = \"pd\"\nstiffness = 800.0\ndamping = 40.0";
+    let swapped: fn(&mut Manifest) = |m| {
+        let (a, b) = (m.robot.motors[0].order, m.robot.motors[1].order);
+        (m.robot.motors[0].order, m.robot.motors[1].order) = (b, a);
+    };
+    let other = [
+        (
+            of(2, velocities, |_| {}),
+            "joint 'panda_joint1' is sent velocity [rad/s or m/s] where the loop sends position [rad or m], and 6 more",
+        ),
+        (
+            of(3, one, |_| {}),
+            "joint 'panda_joint2' is sent velocity [rad/s or m/s] where the loop sends position [rad or m]:",
+        ),
+        (
+            of(4, "", |_| {}),
+            "joint 'panda_joint1' is sent effort [N m or N] where the loop sends position [rad or m]",
+        ),
+        (of(5, gains, |_| {}), "pd target [rad or m], stiffness 800 N m/rad or N/m"),
+        (
+            of(6, positions, swapped),
+            "action 0 is for joint 'panda_joint2' where the loop's is for 'panda_joint1'",
+        ),
+    ];
+    let count = other.len() as u64;
+    for (snapshot, words) in other {
+        let (verdict, text) = push(snapshot);
+        assert_eq!(verdict, Verdict::ForeignRobot, "{text}");
+        assert!(text.contains(words), "'{words}' is not in: {text}");
+    }
+    let (verdict, text) = push(of(7, positions, |_| {}));
+    assert_eq!(verdict, Verdict::Accepted, "{text}");
+    stop.request();
+    let report = running.join().unwrap().unwrap();
+    over.request();
+    let arm = plant.join().unwrap();
+    assert_eq!((report.counters.swaps, report.refused_snapshots), (1, count), "{report}");
+    assert!(arm.worst[1] <= ROUNDING, "{} rad/s beyond the speed limits", arm.worst[1]);
+    // Gains of the robot's own drives, and the law of a motor, mean something else as well.
+    let pd =
+        |damping: f64| of(1, &format!("interface = \"pd\"\nstiffness = 800.0\ndamping = {damping}"), |_| {});
+    let refused = |old: &Snapshot, new: &Snapshot| {
+        Meaning::of(&old.manifest).unwrap().admit(&new.manifest).map_err(|refusal| refusal.text)
+    };
+    assert_eq!(refused(&pd(40.0), &pd(40.0)), Ok(()));
+    let text = refused(&pd(40.0), &pd(41.0)).unwrap_err();
+    assert!(text.contains("damping 41 N m s/rad") && text.contains("damping 40 N m s/rad"), "{text}");
+    let geared = of(1, "", |m| m.robot.motors[3].gear = 2.0);
+    let text = refused(&of(1, "", |_| {}), &geared).unwrap_err();
+    assert!(text.contains("motor of joint 'panda_joint4' has gear 2 where the loop's has 1"), "{text}");
+}
+
 #[test]
 fn the_operator_fixes_the_limits_by_a_file_or_lets_them_go() {
     let name = Name::new("limits-file");

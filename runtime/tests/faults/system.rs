@@ -7,6 +7,8 @@ use std::time::{Duration, Instant};
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 
+use super::flight::plan;
+use crate::arm::{File, snapshot, start_with};
 use crate::toy::{self, DT, LoopThread, Name, PlantThread, PointMass, SpringBuilder, spring};
 
 const ROLE: &str = "NEARL_FAULT_ROLE";
@@ -427,5 +429,38 @@ fn fault_32_without_rights_strict_refuses_and_best_effort_warns() {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         assert_eq!(body.applied.is_empty(), strict, "a strict refusal comes before any motion");
         assert_eq!(counted.watchdog, 0);
+    }
+}
+
+/// The program itself: what it says, and the code it ends with.
+#[test]
+fn a_run_that_ends_in_fault_says_when_and_why_and_ends_with_its_own_code() {
+    let first = snapshot(1, |_| {});
+    for (test, faults, code, says) in [
+        ("ends-in-fault", plan(&[(100, 20, FaultKind::State { number: Odd::Nan })]), Some(6), true),
+        ("ends-well", plan(&[]), Some(0), false),
+    ] {
+        let (name, file) = (Name::new(test), File::new(test, &first));
+        let plant = start_with(&name, &first, faults, Duration::from_micros(300));
+        let mut command = Command::new(env!("CARGO_BIN_EXE_nearl-runtime"));
+        command.arg("run").arg(&file.0).args([
+            "--plant",
+            name.0.as_str(),
+            "--priority",
+            "0",
+            "--seconds",
+            "0.4",
+        ]);
+        let out = command.output().unwrap();
+        let (stdout, stderr) = (String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
+        plant.end();
+        assert_eq!(out.status.code(), code, "{stdout}{stderr}");
+        assert_eq!(stderr.contains(": fault (bad-states): More states in a row"), says, "{stderr}");
+        assert_eq!(
+            stderr.lines().filter(|line| line.starts_with("tick ")).count(),
+            usize::from(says),
+            "{stderr}"
+        );
+        assert_eq!(stdout.contains("ended in fault (bad-states)"), says, "{stdout}");
     }
 }

@@ -40,7 +40,7 @@ pub const ROWS: &[Row] = &[
     (
         2,
         "measured state is NaN or infinite",
-        "3 are bridged by prediction, then the plant brakes, after 8 latched",
+        "3 are bridged by prediction, then the plant brakes, after 8 latched: the run ends with exit code 6",
         &["bad-state", "bad-states"],
         &[(HERE, "fault_02_a_state_that_is_not_finite_is_bridged_then_braked_then_latched")],
     ),
@@ -249,7 +249,7 @@ pub const ROWS: &[Row] = &[
     (
         31,
         "SIGINT, SIGTERM",
-        "brakes to zero velocity, exit code 0; a second one ends at once with 130",
+        "brakes to zero velocity, exit code 0; a second one, after 0.2 s or later, ends at once with 130",
         &["stop"],
         &[(KILLS, "fault_31_a_signal_at_any_moment_brakes_to_rest_and_a_second_one_ends_at_once")],
     ),

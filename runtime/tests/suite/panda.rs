@@ -129,6 +129,33 @@ fn position_commands_lead_within_the_limits_and_are_refused_by_a_robot_that_take
     assert!(*plant.speeds.last().unwrap() < 1e-2, "it stops by the positions it is sent");
 }
 
+/// A robot that is switched on outside its limits: which joint, by how much, and what became of the ticks.
+#[test]
+fn a_joint_found_outside_its_limits_is_named_in_the_report() {
+    let name = Name::new("panda-outside");
+    let first = snapshot(1, |_| {});
+    let file = File::new("panda-outside", &first);
+    let mut panda = Panda { pause: Duration::from_micros(300), ..Panda::new() };
+    panda.q[0] = panda.upper[0] + 0.05;
+    let at = panda.q[0];
+    // The margin of the task is part of the limit that is kept.
+    let limit = panda.upper[0] - 0.01;
+    let plant = start_panda(&name, &first, panda);
+    let settings = RunSettings { ticks: Some(600), ..toy::settings() };
+    let report = execute_with(&name, &file.0, &Stop::new(), settings).join().unwrap().unwrap();
+    plant.end();
+    let [found] = &report.outside[..] else { panic!("{:?}", report.outside) };
+    let near = |a: f64, b: f64| (a - b).abs() < 1e-12;
+    assert!(found.joint == "panda_joint1" && found.what == "highest position", "{found}");
+    assert!(near(found.value, at) && near(found.limit, limit) && found.unit == "rad", "{found} {at} {limit}");
+    assert!(found.tick < 20, "{found}");
+    let recovering = report.statuses["recovering"];
+    assert!(recovering > 100 && recovering >= report.counters.recovering, "{report}");
+    let text = report.to_string();
+    assert!(text.contains(&format!("found outside    joint 'panda_joint1' at {at} rad")), "{text}");
+    assert!(text.contains(&format!("recovering {recovering}")), "{text}");
+}
+
 #[test]
 fn foreign_and_damaged_snapshots_are_refused_by_reason_while_the_loop_runs() {
     let name = Name::new("panda-foreign");

@@ -624,6 +624,33 @@ fn every_seeded_corruption_is_named_at_its_tick() {
             "slack",
             Box::new(move |m: &mut Value| m["ledger"]["active_rows"][0]["slack"] = 0.1.into()),
         ),
+        (
+            "rows gone",
+            "ledger.active is",
+            Box::new(move |m: &mut Value| m["ledger"]["active_rows"] = json!([])),
+        ),
+        (
+            "said to be unchanged",
+            "said to be unchanged",
+            Box::new(move |m: &mut Value| m["ledger"]["status"] = 0.into()),
+        ),
+        (
+            "said to be clamped",
+            "said to be clamped joint by joint",
+            Box::new(move |m: &mut Value| m["ledger"]["status"] = 1.into()),
+        ),
+        (
+            "said to be unchanged, and no row",
+            "no active row balances",
+            Box::new(move |m: &mut Value| {
+                m["ledger"]["status"] = 0.into();
+                m["ledger"]["active"] = 0.into();
+                m["ledger"]["active_rows"] = json!([]);
+            }),
+        ),
+        ("slack", "ledger.slack", Box::new(move |m: &mut Value| m["ledger"]["slack"] = 0.9.into())),
+        ("slack below", "ledger.slack", Box::new(move |m: &mut Value| m["ledger"]["slack"] = (-0.9).into())),
+        ("outside", "ledger.outside", Box::new(move |m: &mut Value| m["ledger"]["outside"] = 1.into())),
         ("moved", "moved", Box::new(move |m: &mut Value| add(&mut m["ledger"]["moved"], 0.1))),
         ("status", "status", Box::new(move |m: &mut Value| m["ledger"]["status"] = 77.into())),
         ("recovering", "recovering", Box::new(move |m: &mut Value| m["ledger"]["status"] = 3.into())),
@@ -665,6 +692,56 @@ fn every_seeded_corruption_is_named_at_its_tick() {
     };
     copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
     assert!(verify(&other).unwrap().found > 0, "a proposal was changed");
+}
+
+/// A record that is full may have fewer rows than were active; any other has them all.
+#[test]
+fn a_record_has_room_for_as_many_rows_as_the_loop_writes() {
+    assert_eq!(nearl_verify::ROOM, nearl_runtime::rt::MAX_ROWS);
+}
+
+/// What the metadata says of robot, period, rows and snapshot is what the snapshot in the log says.
+#[test]
+fn metadata_that_was_edited_or_emptied_is_named() {
+    let folder = Scratch::new("verify-facts");
+    let slow = Attack { pause: Duration::from_micros(300), ticks: 200, ..attack(LIMITS, 0.001, 1, 20) };
+    let (log, _) = slow.record(&Name::new("verify-facts").0, &folder.0);
+    let other = folder.0.join("copy.mcap");
+    let with = |change: Alter<BTreeMap<String, String>>| {
+        copy(&log, &other, &|_, _| true, &|bytes| bytes, &|facts| change(facts));
+        verify(&other).unwrap()
+    };
+    assert_eq!(with(&|_| {}).found, 0);
+    for (key, edited) in [
+        ("dt", "0.002"),
+        ("joints", "panda_joint2,panda_joint1"),
+        ("rows", "[\"panda_joint1\"]"),
+        ("statuses", "{\"0\":\"solved\"}"),
+        ("modes", "[\"active\"]"),
+        ("rungs", "brake"),
+        ("digest", "0123456789abcdef"),
+        ("version", "77"),
+        ("task", "another"),
+    ] {
+        for value in [edited, ""] {
+            let report = with(&|facts| {
+                assert!(facts.insert(key.into(), value.into()).is_some(), "{key} is in every log");
+            });
+            let told = &report.violations[0];
+            assert!(report.found == 1 && told.to_string().starts_with("metadata"), "{key}\n{report}");
+            assert!(told.what.contains(&format!("`{key}`")) && !report.is_whole(), "{key}\n{report}");
+        }
+    }
+    for key in ["dt", "joints", "rows", "statuses", "modes", "rungs"] {
+        let report = with(&|facts| _ = facts.remove(key));
+        assert!(report.found == 1 && report.to_string().contains(&format!("`{key}`")), "{key}\n{report}");
+    }
+    let refused = |change: Alter<BTreeMap<String, String>>| {
+        copy(&log, &other, &|_, _| true, &|bytes| bytes, &|facts| change(facts));
+        verify(&other).unwrap_err().to_string()
+    };
+    let text = refused(&|facts| _ = facts.insert("limits".into(), String::new()));
+    assert!(text.contains("`limits` is damaged"), "{text}");
 }
 
 /// What a change cannot be seen in: nothing of it is claimed by the projection, or it says less than before.

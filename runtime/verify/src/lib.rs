@@ -6,6 +6,7 @@
 //! multipliers that the log carries. What is not known here is refused by name, and a tick that cannot be confirmed is counted so.
 
 mod collision;
+mod facts;
 mod jerk;
 mod limit_check;
 mod limits;
@@ -28,3 +29,4 @@ pub(crate) use period::Period;
 
 pub use log::{VerifyError, verify};
 pub use report::{Report, Violation};
+pub use tick::ROOM;

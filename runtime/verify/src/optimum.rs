@@ -24,6 +24,8 @@ const ROUNDING: f64 = 1e-9;
 const CONIC: f64 = 2e-5;
 /// A goal so many times its box away was brought nearer before it was solved for.
 const FAR: f64 = 1e5;
+/// What a ledger's slack may be off by, as a share.
+const SLACK: f64 = 1e-5;
 /// A proposal is the same as another up to this share: it is computed anew.
 const SAME: f64 = 1e-12;
 /// Why such a tick is not compared.
@@ -56,7 +58,7 @@ pub(crate) fn confirm(
     ledger: &Ledger,
     whole: bool,
 ) -> Result<f64, Fault> {
-    if ledger.active != ledger.active_rows.len() {
+    if !ledger.is_whole() {
         return unknown("more rows were active than a record has room for");
     }
     let Promise { machine, limits, controllable, period, .. } = promise;
@@ -82,7 +84,8 @@ pub(crate) fn confirm(
             false => push_of_row(promise, passage, (n, active, side), ledger.rung, &forces, &mut push)?,
         }
     }
-    all_hold(promise, passage, ledger)?;
+    let most = all_hold(promise, passage, ledger)?;
+    slack(ledger, most)?;
     balance(promise, passage, goals, ledger.rung, &push)
 }
 
@@ -221,7 +224,7 @@ pub(crate) fn apart(
     ledger: &Ledger,
     whole: bool,
 ) -> Result<(), Fault> {
-    if ledger.active != ledger.active_rows.len() {
+    if !ledger.is_whole() {
         return Err(Fault::Unknown("more rows were active than a record has room for".into()));
     }
     let (p, mut named) = (&promise.period, 0);
@@ -274,6 +277,7 @@ pub(crate) fn apart(
             }
         }
     }
+    slack(ledger, Some(0.0))?;
     match named == ledger.active_rows.len() {
         true => Ok(()),
         false => broken(
@@ -341,17 +345,32 @@ fn belongs(
     }
 }
 
-/// Every hard row is kept as the projection has to keep it, and a soft one that gives way is named.
-fn all_hold(promise: &mut Promise, passage: &Passage<'_>, ledger: &Ledger) -> Result<(), Fault> {
+/// The slack of a nearest state is no more than the worst of its rows gives way, where that is known.
+fn slack(ledger: &Ledger, most: Option<f64>) -> Result<(), Fault> {
+    let (said, Some(most)) = (ledger.slack, most) else { return Ok(()) };
+    if said.is_nan() || said > most + SLACK * (1.0 + most) {
+        return broken("ledger.slack", said, most, "of a limit's size at most");
+    }
+    Ok(())
+}
+
+/// Every hard row is kept as the projection has to keep it, and a soft one that gives way is named. By how much the worst of them is exceeded, as
+/// a share of its size; none where that of some row is not known.
+fn all_hold(promise: &mut Promise, passage: &Passage<'_>, ledger: &Ledger) -> Result<Option<f64>, Fault> {
     let nv = passage.v.len();
     let Promise { machine, limits, period, .. } = promise;
+    let mut highest = Some(0.0f64);
     for (r, row) in limits.rows.iter().enumerate() {
         let excess = match (&limits.collision, &row.rule) {
             (Some(bodies), Rule::Pair) => {
                 match bodies.row(machine, period, passage, r - first_pair(&limits.rows)) {
                     Told::Row(excess, _) => excess,
+                    Told::None => f64::NEG_INFINITY,
                     // That bodies keep apart is looked at by itself. A row that is not known and holds nothing back is no matter here.
-                    Told::None | Told::Unknown(_) => f64::NEG_INFINITY,
+                    Told::Unknown(_) => {
+                        highest = None;
+                        f64::NEG_INFINITY
+                    }
                 }
             }
             _ => worst(row.excess(machine, period, passage)),
@@ -360,6 +379,7 @@ fn all_hold(promise: &mut Promise, passage: &Passage<'_>, ledger: &Ledger) -> Re
             return Err(Fault::Unknown(SPENT.into()));
         }
         let is_named = || ledger.active_rows.iter().any(|active| active.row == nv + r);
+        highest = highest.map(|most| most.max(excess));
         let most = if row.soft.is_some() { 10.0 * TOLERANCE } else { AT.max(TOLERANCE) };
         if excess > most && (row.soft.is_none() || !is_named()) {
             return broken(
@@ -370,5 +390,5 @@ fn all_hold(promise: &mut Promise, passage: &Passage<'_>, ledger: &Ledger) -> Re
             );
         }
     }
-    Ok(())
+    Ok(highest)
 }

@@ -299,10 +299,17 @@ impl Promise {
         })
     }
 
+    /// The manifest of a snapshot, given as the bytes of its file.
+    ///
+    /// # Errors
+    /// A clause.
+    pub(crate) fn manifest(bytes: &[u8]) -> Result<Value, String> {
+        serde_json::from_str(&manifest(bytes)?).map_err(|e| format!("its manifest is damaged: {e}"))
+    }
+
     /// The limits that the snapshot itself states, to compare with those of a loop.
     pub(crate) fn stated(bytes: &[u8]) -> Result<Value, String> {
-        let manifest: Value = serde_json::from_str(&manifest(bytes)?).map_err(|e| e.to_string())?;
-        Ok(manifest["task"]["constraints"].clone())
+        Ok(Promise::manifest(bytes)?["task"]["constraints"].clone())
     }
 
     /// Takes the limits without margins for those with them, and the other way round.

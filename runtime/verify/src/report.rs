@@ -11,6 +11,9 @@ const TOLD: usize = 10;
 /// Unit of what has to be a number and is none.
 pub(crate) const A_NUMBER: &str = "a number";
 
+/// Unit of what is said in words, with no number.
+pub(crate) const IN_WORDS: &str = "in words";
+
 /// What does not hold.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Violation {
@@ -30,6 +33,7 @@ impl fmt::Display for Violation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Violation { tick, what, value, limit, unit } = self;
         match unit.as_str() {
+            IN_WORDS => write!(f, "{what}"),
             A_NUMBER => write!(f, "tick {tick}: {what} is {value}, which is no number"),
             "" => write!(f, "tick {tick}: {what} is {value}, and {limit} is what holds there"),
             unit => {

@@ -4,16 +4,17 @@ use std::collections::{BTreeMap, HashMap};
 
 use serde_json::Value;
 
+use crate::facts;
 use crate::limit_check::{self, Breach, Fault, are_near, broken};
 use crate::limits::{Consistency, Limits, Way};
 use crate::moved::Moving;
 use crate::optimum;
 use crate::promise::{Entry, Projects, Promise, Sent};
-use crate::report::{Report, Violation};
+use crate::report::{IN_WORDS, Report, Violation};
 use crate::robot::Payload;
 use crate::rows::{Passage, Row};
 use crate::stop;
-use crate::tick::{Numbered, Status, Tick};
+use crate::tick::{CLAMPED, Ledger, Numbered, ROOM, Status, Tick, UNCHANGED};
 
 /// Version of the tick messages that are read.
 const SCHEMA: &str = "7";
@@ -23,6 +24,8 @@ const CONSISTENT: f64 = 1e-9;
 const BELONGS: f64 = 1e-11;
 /// Velocities of proposals count up to this [rad/s or m/s].
 const HUGE: f64 = 1e12;
+/// A proposal that is passed on is moved by no more than this [rad/s or m/s]: it is computed anew from the one of its period.
+const CHANGED: f64 = 1e-6;
 /// Share of its size by which an action may differ from the one that leads to the target.
 const ACTION: f64 = 1e-7;
 
@@ -106,6 +109,7 @@ impl Session {
                     "its schema is {schema}, this build reads {SCHEMA}; use the build that wrote it"
                 ));
             }
+            self.compare_facts()?;
         }
         if tick <= self.at {
             return Err(format!("tick {tick} comes after tick {}: ticks only rise", self.at));
@@ -117,6 +121,19 @@ impl Session {
         }
         self.at = tick;
         self.report.ticks += 1;
+        Ok(())
+    }
+
+    /// Names what the metadata says otherwise than the first snapshot.
+    fn compare_facts(&mut self) -> Result<(), String> {
+        let Some(first) = self.snapshots.get(&0) else { return Ok(()) }; // named where a tick needs it
+        let Some(bytes) = self.attachments.get(&first.digest) else { return Ok(()) };
+        let differ =
+            facts::differ(&self.facts, first, bytes).map_err(|e| format!("snapshot number 0: {e}"))?;
+        for what in differ {
+            let unit = IN_WORDS.to_owned();
+            self.report.add(Violation { tick: 0, what, value: f64::NAN, limit: f64::NAN, unit });
+        }
         Ok(())
     }
 
@@ -262,6 +279,7 @@ impl Session {
         if own.projects == Projects::Nothing || status == Status::NotProjected {
             return unknown("their policy gives actions that nothing was projected for");
         }
+        agrees(&tick.ledger, status, nv)?;
         if own.moving.is_none() && status == Status::Tightening {
             return broken("limits moved by an operator, of a tick on the way to such,", 0.0, 1.0, "or more");
         }
@@ -514,6 +532,14 @@ impl Session {
         }
         let said = case.tick.ledger.moved;
         let found = distance(promise, passage, proposal, &other);
+        if case.tick.ledger.status == UNCHANGED && found > CHANGED && !promise.limits_actions {
+            return broken(
+                "distance to the target of a proposal that is said to be unchanged",
+                found,
+                0.0,
+                "rad/s or m/s",
+            );
+        }
         if !promise.limits_actions && !are_near(said, found, 1e-6 * (1e-3 + found)) {
             return broken("ledger.moved", said, found, "rad/s or m/s");
         }
@@ -552,6 +578,56 @@ impl Session {
         }
         Ok(())
     }
+}
+
+/// What a ledger says of one thing in several of its numbers.
+fn agrees(ledger: &Ledger, status: Status, nv: usize) -> Result<(), Fault> {
+    let rows = ledger.active_rows.len();
+    let is_full = rows == ROOM && ledger.active > ROOM;
+    if !(ledger.is_whole() || is_full) {
+        return broken("ledger.active", ledger.active as f64, rows as f64, "active rows in its list");
+    }
+    if ledger.status == UNCHANGED && ledger.active > 0 {
+        return broken(
+            "number of active rows of a proposal that is said to be unchanged",
+            ledger.active as f64,
+            0.0,
+            "",
+        );
+    }
+    if ledger.status == CLAMPED
+        && let Some(row) = ledger.active_rows.iter().map(|active| active.row).find(|row| *row >= nv)
+    {
+        return broken(
+            "number of an active row of a proposal that is said to be clamped joint by joint",
+            row as f64,
+            nv as f64,
+            "at most, less one",
+        );
+    }
+    let must_be = match status {
+        Status::Recovering | Status::Tightening => Some(true),
+        Status::Nearest | Status::Slowed => Some(false),
+        _ => None,
+    };
+    if must_be.is_some_and(|must_be| must_be != (ledger.outside > 0)) {
+        let limit = f64::from(u8::from(ledger.outside == 0));
+        let unit = if ledger.outside == 0 { "or more" } else { "" };
+        let says = match status {
+            Status::Recovering => "recovering",
+            Status::Tightening => "tightening",
+            Status::Slowed => "slowed",
+            _ => "the nearest allowed state",
+        };
+        let what = format!("ledger.outside of a tick that says it is {says}");
+        return broken(what, ledger.outside as f64, limit, unit);
+    }
+    // Of a target that was looked for otherwise, it is what that exceeds, and no row holds it.
+    let slack = ledger.active_rows.iter().fold(0.0, |most: f64, row| most.max(row.slack));
+    if ledger.slack < slack {
+        return broken("ledger.slack", ledger.slack, slack, "of a limit's size, at least");
+    }
+    Ok(())
 }
 
 /// The proposed state at a policy tick; of a joint with one half proposed the other follows at constant acceleration.

@@ -60,8 +60,13 @@ pub(crate) struct Ledger {
     /// Active rows, of which the log may have fewer.
     pub(crate) active: usize,
     pub(crate) target_violations: u32,
+    /// Limits that the tick began outside.
+    pub(crate) outside: u64,
     #[serde(deserialize_with = "number")]
     pub(crate) moved: f64,
+    /// The largest share of a limit by which the target exceeds it.
+    #[serde(deserialize_with = "number")]
+    pub(crate) slack: f64,
     pub(crate) active_rows: Vec<Active>,
 }
 
@@ -92,6 +97,29 @@ pub(crate) struct Numbered {
     pub(crate) rows: Vec<String>,
 }
 
+/// Active rows a tick has room for: with more of them, the log has fewer than were active.
+pub const ROOM: usize = 96;
+/// Numbers of the statuses `unchanged` and `clamped`.
+pub(crate) const UNCHANGED: u32 = 0;
+pub(crate) const CLAMPED: u32 = 1;
+/// Statuses as the metadata has them.
+pub(crate) const STATUSES: [(u32, &str); 14] = [
+    (UNCHANGED, "unchanged"),
+    (CLAMPED, "clamped"),
+    (2, "solved"),
+    (3, "recovering"),
+    (4, "slowed"),
+    (5, "not-projected"),
+    (6, "tightening"),
+    (7, "actions-bounded"),
+    (10, "braked-non-finite-proposal"),
+    (11, "braked-no-certified-answer"),
+    (12, "braked-non-finite-dynamics"),
+    (13, "braked-no-verified-brake"),
+    (20, "refused-non-finite-state"),
+    (21, "refused-wrong-length"),
+];
+
 /// How a projection ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Status {
@@ -112,6 +140,11 @@ pub(crate) enum Status {
 }
 
 impl Ledger {
+    /// The rows of the log are all that were active.
+    pub(crate) fn is_whole(&self) -> bool {
+        self.active == self.active_rows.len()
+    }
+
     /// The status, if its number is one.
     pub(crate) fn status(&self) -> Option<Status> {
         Some(match self.status {

@@ -1,0 +1,154 @@
+//! What the report of a run says of its ticks beside counts: how those ended that are out of the way, and which joints were found outside their
+//! limits. On the I/O thread: the real-time thread only counts.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::mpsc::SyncSender;
+
+use serde::Serialize;
+
+use crate::codes::LedgerStatus;
+use crate::rt::tick::{Record, Sensed};
+use crate::rt::{Mode, Reason};
+
+/// Findings that are told one by one.
+const TOLD: usize = 32;
+/// Beyond a limit by more than rounding, as a share of it (of 1 where it is smaller).
+const ROUNDING: f64 = 1e-9;
+
+/// A joint with its limits as the projection keeps them.
+#[derive(Clone, Debug)]
+pub struct Watched {
+    /// Name.
+    pub joint: String,
+    /// Degree of freedom.
+    pub dof: usize,
+    /// Place in the configuration.
+    pub idx_q: usize,
+    /// Unit of its position.
+    pub length: &'static str,
+    /// Lowest position [rad or m].
+    pub lower: f64,
+    /// Highest position [rad or m].
+    pub upper: f64,
+    /// Largest speed [rad/s or m/s].
+    pub velocity: f64,
+}
+
+/// A joint that was outside a limit where a tick began.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Found {
+    /// The first tick.
+    pub tick: u64,
+    /// Joint; empty where no single joint is beyond its position or speed.
+    pub joint: String,
+    /// Limit.
+    pub what: &'static str,
+    /// What was measured.
+    pub value: f64,
+    /// What is allowed.
+    pub limit: f64,
+    /// Unit of both.
+    pub unit: String,
+}
+
+impl fmt::Display for Found {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Found { tick, joint, what, value, limit, unit } = self;
+        if joint.is_empty() {
+            return write!(f, "{what}, first at tick {tick}");
+        }
+        write!(f, "joint '{joint}' at {value} {unit}, and its {what} is {limit} {unit}, first at tick {tick}")
+    }
+}
+
+/// No single joint is where it may not be, and the projection could only return all the same.
+const ELSEWHERE: &str =
+    "no single joint, but one that cannot stop in front of its limit, or a limit of several joints";
+
+/// What is gathered from the records.
+pub(crate) struct Watch {
+    joints: Vec<Watched>,
+    counts: BTreeMap<u32, u64>,
+    pub(crate) outside: Vec<Found>,
+    mode: Mode,
+    /// Where a mode that does not act is told.
+    pub(crate) tell: Option<SyncSender<(u64, Mode, Reason)>>,
+}
+
+impl Watch {
+    pub(crate) fn of(joints: Vec<Watched>) -> Watch {
+        Watch { joints, counts: BTreeMap::new(), outside: Vec::new(), mode: Mode::Hold, tell: None }
+    }
+
+    /// The limits are these from now on.
+    pub(crate) fn set(&mut self, joints: Vec<Watched>) {
+        self.joints = joints;
+    }
+
+    pub(crate) fn take(&mut self, record: &Record) {
+        if std::mem::replace(&mut self.mode, record.mode) != record.mode
+            && matches!(record.mode, Mode::Fault | Mode::Hold)
+            && let Some(tell) = &self.tell
+        {
+            // Where nobody reads, the mode still stands in the report.
+            let _ = tell.try_send((record.tick, record.mode, record.reason));
+        }
+        if record.output.nu == 0 {
+            return;
+        }
+        *self.counts.entry(record.output.ledger.status).or_default() += 1;
+        if record.output.ledger.outside > 0 && record.sensed == Sensed::Measured {
+            self.name(record);
+        }
+    }
+
+    fn name(&mut self, record: &Record) {
+        let (mut is_one, state) = (false, &record.state);
+        for joint in &self.joints {
+            let (q, v) = (state.q[joint.idx_q], state.v[joint.dof]);
+            let speed = format!("{}/s", joint.length);
+            let kinds = [
+                ("lowest position", -q, -joint.lower, q, joint.lower, joint.length),
+                ("highest position", q, joint.upper, q, joint.upper, joint.length),
+                ("largest speed", v.abs(), joint.velocity, v, joint.velocity.copysign(v), speed.as_str()),
+            ];
+            for (what, is, most, value, limit, unit) in kinds {
+                if is <= most + ROUNDING * most.abs().max(1.0) || most.is_nan() {
+                    continue;
+                }
+                is_one = true;
+                let is_known = self.outside.iter().any(|f| f.joint == joint.joint && f.what == what);
+                if !is_known && self.outside.len() < TOLD {
+                    let (tick, joint, unit) = (record.tick, joint.joint.clone(), unit.to_owned());
+                    self.outside.push(Found { tick, joint, what, value, limit, unit });
+                }
+            }
+        }
+        let is_told = self.outside.iter().any(|found| found.joint.is_empty());
+        if !is_one && !is_told && self.outside.len() < TOLD {
+            let none = || String::new();
+            self.outside.push(Found {
+                tick: record.tick,
+                joint: none(),
+                what: ELSEWHERE,
+                value: 0.0,
+                limit: 0.0,
+                unit: none(),
+            });
+        }
+    }
+
+    /// Ticks by a status that is out of the way.
+    pub(crate) fn statuses(&self) -> BTreeMap<&'static str, u64> {
+        let of = |status: &LedgerStatus| Some((status.name(), *self.counts.get(&status.number())?));
+        let usual = [
+            LedgerStatus::Unchanged,
+            LedgerStatus::Clamped,
+            LedgerStatus::Solved,
+            LedgerStatus::NotProjected,
+            LedgerStatus::ActionsBounded,
+        ];
+        LedgerStatus::ALL.iter().filter(|status| !usual.contains(status)).filter_map(of).collect()
+    }
+}
