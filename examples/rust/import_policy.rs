@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
         let how = if guarded { "behind its limits" } else { "as it is" };
         println!(
-            "{how}: fastest joint {fastest:.2} rad/s of 4 allowed, tip as near as {:.0} mm",
+            "{how}: fastest joint {fastest:.2} rad/s of 2 allowed, tip as near as {:.0} mm",
             1e3 * closest
         );
         assert!(!guarded || fastest <= 2.001);

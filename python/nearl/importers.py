@@ -249,7 +249,11 @@ def _layers(modules: Iterable[tuple[str, Any]]) -> list[_Layer]:
         elif kind == "Hardtanh" and layers:
             layers = _clipped(layers, float(part.min_val), float(part.max_val))
         else:
-            raise ValueError(f"module {kind} is none that a policy's layers consist of; export the policy as ONNX if it is made of them")
+            known = ", ".join(["Linear", "Hardtanh", *(name for name in _FUNCTIONS if name != "Identity"), *_NOTHING])
+            raise ValueError(
+                f"module {kind} is none that a policy's layers consist of ({known}); let your own program compute the policy and propose beside the "
+                "loop (docs/POLICIES.md, nearl.Proposer), or put nearl.Guard around the environment"
+            )
     return layers
 
 

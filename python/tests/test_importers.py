@@ -309,7 +309,7 @@ def test_a_recipe_that_does_not_fit_is_refused_by_name(tmp_path) -> None:
         with pytest.raises(ValueError, match=said):
             nearl.import_onnx(path, **files)
 
-    refused(("joint_pos_rel", "height_scan"), r"recipe.toml: \[policy.observation\[0\].term\] unknown variant `height_scan`")
+    refused(("joint_pos_rel", "height_scan"), r"recipe.toml:8 \[policy.observation\[0\].term\]: unknown variant `height_scan`")
     refused(("joint_pos_rel", "projected_gravity"), r"term 1 \('projected_gravity'\): the robot's base is fixed")
     refused(('"joint2"', '"elbow"'), "elbow")
     refused((", history = 2", ""), r"has 11 entries \(joint_pos 3, joint_vel 3, last_action 3, command 2\), but the policy's input 'obs' has 14")
@@ -671,3 +671,42 @@ observation = [{{ term = "joint_pos" }}, {{ term = "joint_vel" }}]
         found[guard] = {line.split()[1]: line.split()[0] for line in report.stdout.splitlines() if line[:4].strip() in ("ok", "warn", "fail")}
     assert found["true"]["holding"] == "fail"
     assert [found['"drive"'][check] for check in ("projection", "holding", "braking")] == ["ok", "warn", "ok"]
+
+
+def test_what_is_wrong_in_a_recipe_is_told_with_its_line(tmp_path) -> None:
+    policies = ROOT / "examples" / "policies"
+    right = (policies / "reacher.toml").read_text()
+    recipe = tmp_path / "recipe.toml"
+    for old, new, said in [
+        ("velocity = { limit = 2.0 }", "velocity = { limt = 2.0 }", "unknown field `limt`"),
+        ("guard = true", 'guard = "yes"', "expected true, false"),
+        ("dt = 0.02 ", "dt = .02 ", "invalid mantissa"),
+        ('joints = ["joint0", "joint1"]', "joints = [1, 2]", "invalid type: integer"),
+    ]:
+        assert right.count(old) == 1
+        recipe.write_text(right.replace(old, new))
+        line = 1 + recipe.read_text().split("\n").index(next(at for at in recipe.read_text().split("\n") if new.strip() in at))
+        with pytest.raises(ValueError) as told:
+            nearl.import_onnx(policies / "reacher.onnx", robot=policies / "reacher.xml", recipe=recipe)
+        assert f"{recipe}:{line}" in str(told.value) and said in str(told.value), (line, told.value)
+
+
+@pytest.mark.parametrize(("interface", "added"), [("effort", False), ("velocity", False), ("position", True), ("pd", True)])
+def test_the_pose_is_added_to_positions_alone(tmp_path, interface: str, added: bool) -> None:
+    """It is in rad, and a policy of velocities or forces that puts out zeros asks for nothing."""
+    robot = tmp_path / "arm.urdf"
+    robot.write_text(planar_urdf())
+    gains = "stiffness = 40.0\ndamping = 2.0\n" if interface == "pd" else ""
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(
+        f'[time]\ndt = 0.01\n[command]\ninterface = "{interface}"\n{gains}[policy]\njoints = ["joint1", "joint0", "joint2"]\npose = [0.3, -0.2, 0.1]\n'
+        "observation = [{ term = 'joint_pos' }]\n[constraints]\n"
+    )
+    policy = tmp_path / "zero.onnx"
+    Net(3).add("Gemm", f32(np.zeros((3, 3))), f32(np.zeros(3))).save(policy, 3)
+    controller = nearl.import_onnx(policy, robot=robot, recipe=recipe)
+    action, _ = controller.update(np.zeros(3), np.zeros(3), np.zeros(6))
+    assert action == pytest.approx([-0.2, 0.3, 0.1] if added else [0.0, 0.0, 0.0], abs=1e-7)
+    recipe.write_text(recipe.read_text().replace("[0.3, -0.2, 0.1]", "[0.3]"))
+    with pytest.raises(ValueError, match="policy.pose has 1 positions for 3 joints"):
+        nearl.import_onnx(policy, robot=robot, recipe=recipe)

@@ -17,6 +17,7 @@ pub use rows::{Frame, Frames, MIN_UNIT};
 pub use settings::{DemoReward, DemoSettings};
 
 use crate::env::{Env, EnvError};
+use crate::mj::Actuator;
 use crate::rollout::{RolloutError, Worker, make_env, stream};
 use nearl_runtime::Snapshot;
 use nearl_runtime::snapshot::write_whole;
@@ -224,6 +225,9 @@ impl Demonstrations {
                     "'actions' of episode {i} have {width} columns where the robot has {n_act} actuators; record them with the task, or leave them out"
                 ));
             }
+            if let Some(wrong) = beyond(&e.actions, &env.spec().actuators) {
+                return Err(format!("'actions' of episode {i}: {wrong}"));
+            }
             let begin = (&e.qpos[..nq], &e.qvel[..nv]);
             let is_drawn = drawn(env, begin).map_err(|error| format!("episode {i}: {error}"))?;
             env.observe(&mut obs);
@@ -242,6 +246,29 @@ impl Demonstrations {
         }
         Ok(())
     }
+}
+
+/// How far beyond its actuator's range an action is that nobody meant, as a multiple of the range: what a policy puts out before a clip is less far.
+const FAR_BEYOND: f64 = 5.0;
+
+/// Actions (row-major) that are no controls of these actuators: half of a column is outside the range, and its largest far outside.
+fn beyond(actions: &[f64], actuators: &[Actuator]) -> Option<String> {
+    let n = actuators.len();
+    let rows = actions.len() / n.max(1);
+    actuators.iter().enumerate().find_map(|(k, actuator)| {
+        let (low, high) = (actuator.low, actuator.high);
+        let column = || (0..rows).map(move |row| actions[row * n + k]);
+        let outside = column().filter(|x| *x < low - 1e-9 || *x > high + 1e-9).count();
+        let most = column().fold(0.0, |most: f64, x| if x.abs() > most.abs() { x } else { most });
+        let is_far = most.abs() > FAR_BEYOND * low.abs().max(high.abs());
+        (rows > 0 && 2 * outside > rows && is_far).then(|| {
+            format!(
+                "{outside} of {rows} of '{}' are outside its range, {low} to {high}, the furthest {most}; give the actuators' controls in the order of \
+                 the robot file, not forces",
+                actuator.name
+            )
+        })
+    })
 }
 
 /// Episodes of a policy without noise, from ordinary resets, under its limits.

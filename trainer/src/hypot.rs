@@ -6,6 +6,6 @@
 
 /// `sqrt(x² + y²)`, which neither overflows nor underflows on the way.
 #[unsafe(no_mangle)]
-pub extern "C" fn __wrap_hypot(x: f64, y: f64) -> f64 {
+extern "C" fn __wrap_hypot(x: f64, y: f64) -> f64 {
     libm::hypot(x, y)
 }

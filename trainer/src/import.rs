@@ -26,7 +26,7 @@ pub use network::ImportedNetwork;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ImportError {
     /// The file cannot be read.
-    #[error("cannot read policy '{file}': {reason}")]
+    #[error("cannot read '{file}': {reason}")]
     Unreadable {
         /// Path as given.
         file: String,

@@ -164,7 +164,8 @@ pub struct RunFolder {
     metrics: BufWriter<File>,
     columns: usize,
     saved: (u64, Instant),
-    held: Option<File>,
+    /// Dropped with the run.
+    _held: Option<File>,
 }
 
 impl RunFolder {
@@ -253,7 +254,7 @@ impl RunFolder {
 
     fn open(path: &Path, metrics: BufWriter<File>, columns: &[&str], steps: u64, held: Option<File>) -> Self {
         let saved = (steps, Instant::now());
-        Self { path: path.into(), metrics, columns: columns.len(), saved, held }
+        Self { path: path.into(), metrics, columns: columns.len(), saved, _held: held }
     }
 
     /// Whether a checkpoint is due after `steps` of `total`: at every tenth, and after two minutes.

@@ -47,6 +47,10 @@ fn what_is_recorded_comes_back_and_is_of_its_task() {
             error.contains("of episode 1 have") && error.contains(&format!("{n_act} actuators")),
             "{error}"
         );
+        let mut forces = demos.clone();
+        forces.episodes[1].actions.iter_mut().for_each(|x| *x *= 1e6);
+        let error = forces.check(&mut *env, manifest.task.time.dt).expect_err("forces");
+        assert!(error.starts_with("'actions' of episode 1: ") && error.contains("not forces"), "{error}");
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::{Failure, say};
 use clap::Args;
+use nearl_runtime::cli::quoted;
 use std::path::PathBuf;
 
 #[derive(Args)]
@@ -23,8 +24,9 @@ impl Blank {
         let notes = nearl_runtime::doctor::told(&snapshot.manifest)?;
         let what = if self.actions { "actions" } else { "states" };
         say(format!(
-            "{}: no policy; start the loop with `nearl run {0} --plant NAME --proposer`, and propose {what}",
-            self.out.display()
+            "{}: no policy; start the loop with `nearl run {} --plant NAME --proposer`, and propose {what}",
+            self.out.display(),
+            quoted(&self.out)
         ));
         notes.iter().for_each(|note| say(format!("  note: {note}")));
         Ok(())

@@ -3,6 +3,7 @@
 use super::{Failure, say};
 use crate::import::{Setting, read, snapshot};
 use clap::Args;
+use nearl_runtime::cli::quoted;
 use std::path::PathBuf;
 
 #[derive(Args)]
@@ -35,13 +36,13 @@ impl Import {
         made.save(&self.out)?;
         let notes = nearl_runtime::doctor::told(&made.manifest)?;
         say(format!(
-            "{}: {} inputs, layers {:?}, {} joints; look at it with 'nearl doctor {}', run it with 'nearl run {} --plant NAME'",
+            "{}: {} inputs, layers {:?}, {} joints; look at it with `nearl doctor {}`, run it with `nearl run {} --plant NAME`",
             self.out.display(),
             network.n_in(),
             &network.dense.widths()[1..],
             network.n_out(),
-            self.out.display(),
-            self.out.display()
+            quoted(&self.out),
+            quoted(&self.out)
         ));
         notes.iter().for_each(|note| say(format!("  note: {note}")));
         Ok(())

@@ -157,4 +157,9 @@ fn table(summary: &[Summary]) {
             number(s.steps_per_s, 0)
         ));
     }
+    say(
+        "return, cost and idm loss: interquartile mean over the runs of each run's last ten batches, exploration on; steps/s: of one core, over the \
+         whole run"
+            .to_string(),
+    );
 }

@@ -11,6 +11,7 @@ use nearl_runtime::net::Activation;
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::recipe::{Numbers, Observer, PolicySection};
 use nearl_runtime::snapshot::{FORMAT, ModelFormat, Simulation};
+use nearl_runtime::task::TaskError;
 use nearl_runtime::{Manifest, Networks, PolicyKind, Snapshot, Task};
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
@@ -38,16 +39,17 @@ pub struct Setting<'a> {
 /// [`ImportError`]: what is missing, or what does not fit.
 pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snapshot, ImportError> {
     let mut table = metadata::recipe(network)?;
-    let mut said_by = "the policy's metadata".to_string();
+    let mut files = vec![("the policy's metadata".to_string(), String::new())];
     for path in setting.recipes {
-        said_by = path.display().to_string();
-        let over = said(path, setting.robot)?;
+        let (over, text) = said(path, setting.robot)?;
+        files.push((path.display().to_string(), text));
         // joints that are sent forces have no use for the gains that another file says
         if over.get("command").and_then(|c| c.get("interface")).and_then(Value::as_str) == Some("effort") {
             table.remove("command");
         }
         merge(&mut table, over);
     }
+    let said_by = files[files.len() - 1].0.clone();
     if !table.contains_key("policy") {
         return Err(ImportError::NoRecipe { input: network.input_name.clone(), n_in: network.n_in() });
     }
@@ -55,8 +57,7 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
     complete(&mut table, setting, simulation.format);
     let free = table.get("model").and_then(|m| m.get("free_flyer")).and_then(Value::as_bool).unwrap_or(false);
     let robot = if table.contains_key("scene") {
-        let task =
-            Task::parse(&said_by, &table.to_string(), &[]).map_err(|e| ImportError::Recipe(e.to_string()))?;
+        let task = Task::merged(table.clone(), &files).map_err(|e| ImportError::Recipe(e.to_string()))?;
         let add = scene::of(&task, &simulation)
             .map_err(|m| recipe(&said_by, &format!("[{}] {}", m.key, m.reason)))?;
         describe_simulated(&simulation, free, &add).map_err(|e| unusable(setting.robot, &e))?
@@ -65,9 +66,8 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
     };
     let unusable = |e: &dyn std::fmt::Display| unusable(setting.robot, e);
     let model = Model::from_description(robot.clone()).map_err(|e| unusable(&e))?;
-    state(&mut table, &model, &said_by)?;
-    let mut task =
-        Task::parse(&said_by, &table.to_string(), &[]).map_err(|e| ImportError::Recipe(e.to_string()))?;
+    state(&mut table, &model, &files)?;
+    let mut task = Task::merged(table, &files).map_err(|e| ImportError::Recipe(e.to_string()))?;
     let mut section = task.policy.take().unwrap_or_default();
     take_clip(&mut section, network).map_err(|e| recipe(&said_by, &e))?;
     let layout = layout(&model, &task).map_err(|e| recipe(&said_by, &e))?;
@@ -122,12 +122,12 @@ pub fn for_task(network: &ImportedNetwork, mut manifest: Manifest) -> Result<Sna
     Ok(snapshot)
 }
 
-/// What a recipe file says, as sections of a task file.
-fn said(path: &Path, robot: &Path) -> Result<Table, ImportError> {
+/// What a recipe file says, as sections of a task file, and its text where it is one.
+fn said(path: &Path, robot: &Path) -> Result<(Table, String), ImportError> {
     let (said_by, text) = (path.display().to_string(), read(path, read_task_text)?);
     if !path.extension().is_some_and(|e| e == "yaml" || e == "yml") {
-        return toml::from_str(&text)
-            .map_err(|e| recipe(&said_by, e.message().lines().next().unwrap_or_default()));
+        let table = Task::table(&said_by, &text).map_err(|e| ImportError::Recipe(e.to_string()))?;
+        return Ok((table, text));
     }
     let simulation = simulation(robot)?;
     let described = described(&simulation, false, robot)?;
@@ -139,7 +139,7 @@ fn said(path: &Path, robot: &Path) -> Result<Table, ImportError> {
         let floats = Table::from_iter([("free_flyer".to_string(), Value::from(true))]);
         table.insert("model".into(), floats.into());
     }
-    Ok(table)
+    Ok((table, String::new()))
 }
 
 /// The robot file as it is simulated.
@@ -199,7 +199,8 @@ fn complete(table: &mut Table, setting: &Setting<'_>, format: ModelFormat) {
 }
 
 /// `[state]`: positions and velocities of the policy's joints in the robot's order, and what the terms read of the plant.
-fn state(table: &mut Table, model: &Model, said_by: &str) -> Result<(), ImportError> {
+fn state(table: &mut Table, model: &Model, files: &[(String, String)]) -> Result<(), ImportError> {
+    let said_by = files.last().map_or("", |(file, _)| file.as_str());
     let missing = |what: &str| recipe(said_by, what);
     if table.get("time").and_then(|t| t.get("dt")).is_none() {
         return Err(missing(
@@ -207,8 +208,15 @@ fn state(table: &mut Table, model: &Model, said_by: &str) -> Result<(), ImportEr
         ));
     }
     let policy = table.get("policy").cloned().unwrap_or(Table::new().into());
-    let policy: PolicySection = serde_path_to_error::deserialize(policy)
-        .map_err(|e| missing(&format!("[policy.{}] {}", e.path(), e.inner().to_string().trim_end())))?;
+    let policy: PolicySection = serde_path_to_error::deserialize(policy).map_err(|e| {
+        // with its line, where the task as a whole is read
+        let whole = Task::merged(table.clone(), files).err();
+        let told = |e: TaskError| ImportError::Recipe(e.to_string());
+        whole.map_or_else(
+            || missing(&format!("[policy.{}] {}", e.path(), e.inner().to_string().trim_end())),
+            told,
+        )
+    })?;
     let state = table.entry("state").or_insert(Table::new().into());
     let Some(state) = state.as_table_mut() else { return Err(missing("[state] is no section")) };
     let mut joints = Vec::new();
@@ -303,9 +311,6 @@ fn ranges(
 ) -> Result<(Vec<f64>, Vec<f64>), String> {
     let n = section.joints.len();
     let scale = section.action.scale.spread("policy.action.scale", n)?;
-    let pose = if section.pose.is_empty() { vec![0.0; n] } else { section.pose.clone() };
-    let offset =
-        section.action.offset.clone().unwrap_or(Numbers::Each(pose)).spread("policy.action.offset", n)?;
     let clip = match &section.action.clip {
         None => vec![[-MOST, MOST]; n],
         Some([l, u]) => {
@@ -314,6 +319,9 @@ fn ranges(
         }
     };
     let drives = task.command.drives(model, layout.controllable())?;
+    let takes_position =
+        |name: &String| model.joint(name).is_ok_and(|joint| drives[joint.idx_v].takes_position());
+    let offset = section.offset(&section.joints.iter().map(takes_position).collect::<Vec<_>>())?;
     let motors = Motors::new(model, layout.controllable(), &drives)?;
     let mut sent = vec![(0.0, 0.0); layout.controllable().len()];
     for (k, &dof) in layout.controllable().iter().enumerate() {

@@ -284,7 +284,7 @@ fn operations(n: &Node<'_>) -> Result<Vec<Operation>, String> {
         "Min" => one(Operation::Clip(vec![f64::NEG_INFINITY], n.row(1 - n.at.min(1))?)),
         "Split" => split(n),
         "Slice" => slice(n),
-        _ => Err("is none that a policy's layers consist of".into()),
+        _ => Err("is none that a policy's layers consist of (docs/POLICIES.md lists them; a policy of others proposes beside the loop)".into()),
     }
 }
 

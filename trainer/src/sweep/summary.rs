@@ -21,14 +21,14 @@ pub struct Row {
     pub run: String,
     /// Environment steps.
     pub steps: Option<f64>,
-    /// Mean return of the last 100 episodes.
+    /// Mean over the last ten batches of the return in training, exploration on.
     #[serde(rename = "return")]
     pub return_mean: Option<f64>,
-    /// Mean cost of the last 100 episodes.
+    /// The same of the cost.
     pub cost: Option<f64>,
-    /// Loss of the inverse model after its last update.
+    /// The same of the loss of the inverse model after an update.
     pub idm_loss: Option<f64>,
-    /// Steps per second of one core.
+    /// Steps per second of one core, over the whole run.
     pub steps_per_s: Option<f64>,
 }
 
@@ -66,16 +66,17 @@ impl Row {
             let values = end.get(key)?;
             (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
         };
+        let last = |key: &str| end.get(key).and_then(|v| v.last().copied());
         Row {
             task: run.name.clone(),
             algo: run.algo.to_string(),
             seed: run.seed,
             run: run.folder.display().to_string(),
-            steps: end.get("time/total_timesteps").and_then(|v| v.last().copied()),
+            steps: last("time/total_timesteps"),
             return_mean: mean("rollout/ep_rew_mean"),
             cost: mean("rollout/ep_cost_mean"),
             idm_loss: mean("idm/mse_after"),
-            steps_per_s: mean("time/fps"),
+            steps_per_s: last("time/fps"),
         }
     }
 }

@@ -6,7 +6,6 @@ use super::{Meaning, VectorError};
 use crate::env::Spec;
 use crate::{tasks, train};
 use nearl_runtime::constraints::{Entry, Guard, LimitSet, Model, StateLayout};
-use nearl_runtime::controller::Parts;
 use nearl_runtime::net::{Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::task::IdmKind;
@@ -157,8 +156,7 @@ pub(super) fn notes(snapshot: &Snapshot) -> Result<Vec<String>, VectorError> {
     if m.task.idm.kind != IdmKind::Pinocchio || m.bounds_drives() {
         return Ok(Vec::new());
     }
-    let Parts { model, projector, .. } = Parts::new(m)?;
-    Ok([model.notes(), projector.notes()].concat())
+    Ok(nearl_runtime::doctor::told(m)?)
 }
 
 /// The task's limits on actions around actions as the actuators take them, and nothing else.
