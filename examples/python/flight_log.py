@@ -1,4 +1,4 @@
-"""A plant and a loop for half a second, with a flight log, and what the log says: Foxglove opens the same file."""
+"""A plant and a loop for half a second, with a flight log, and what the log says: Foxglove opens the same file. Needs `pip install mcap`."""
 
 import json
 import os

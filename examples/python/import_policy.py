@@ -21,10 +21,10 @@ for seed in range(10):
     while not over:
         q, v = env.unwrapped.data.qpos, env.unwrapped.data.qvel  # [rad], [rad/s]; of the target [m], [m/s]
         cos_sin, target, away = obs[:4], obs[4:6], obs[8:10]
-        torque, ledger = controller.update(q, v, np.concatenate([q[:2], v[:2], cos_sin, target, away]))  # [N m]
+        control, ledger = controller.update(q, v, np.concatenate([q[:2], v[:2], cos_sin, target, away]))  # of the motors, -1 to 1
         replaced += ledger.moved > 0.0
-        obs, reward, terminated, truncated, _ = env.step((torque / 200).astype(np.float32))  # Gymnasium's gear
+        obs, reward, terminated, truncated, _ = env.step(control.astype(np.float32))
         over, total = terminated or truncated, total + float(reward)
         fastest = max(fastest, float(np.abs(env.unwrapped.data.qvel[:2]).max()))
 print(f"return {total / 10:.2f}, {replaced} actions replaced, fastest joint {fastest:.4f} rad/s, allowed 2")
-assert fastest <= 2.0 + 1e-3  # its integrator and ours differ in the second order
+assert 1.5 < fastest <= 2.0 + 1e-3  # it moves, and its integrator and ours differ in the second order

@@ -6,11 +6,15 @@ of the file are those of the task's own environment in these states, so that the
     nearl.demos.from_csv("task.toml", "walk.csv", "walk.npz", dt=0.02)
 
 What the robot was asked to do is a column too, ``command.<name>`` (of Panda-reach ``goal.x``), which a task that observes it does not go without. A
-position that the task does not observe (where a planar runner is) may be missing and is 0; a velocity that is missing is the difference of positions.
+position that the task does not observe (where a planar runner is) may be missing and is 0; a velocity that is missing is the difference of positions,
+central within an episode and one-sided at its ends.
 """
+
+from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,8 +23,31 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.recorded import SAME, BadDemonstrations, Rows, check_period, check_units, column, controller, goal_names, numbers, observations
-from nearl.sources import FilePath, check_entries, csv_table, minari_dataset, npz_arrays, once, seconds_between, split
+from nearl.recorded import (
+    SAME,
+    BadDemonstrations,
+    Rows,
+    check_period,
+    check_units,
+    check_velocities,
+    column,
+    controller,
+    goal_names,
+    numbers,
+    observations,
+)
+from nearl.sources import (
+    FilePath,
+    check_entries,
+    csv_table,
+    feature_names,
+    lerobot_column,
+    minari_dataset,
+    npz_arrays,
+    once,
+    seconds_between,
+    split,
+)
 
 Floats = NDArray[np.float64]
 _BASE_Q = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -74,15 +101,17 @@ def from_columns(
     if actions and (isinstance(actions, str) or len(actions) != len(env.actuator_names)):
         raise BadDemonstrations(f"{source}: actions is {actions!r}; give one column for each actuator, {', '.join(env.actuator_names)}")
     parts: dict[str, list[Floats]] = {name: [] for name in ("observations", "qpos", "qvel", "actions")}
-    lengths = []
+    lengths: list[int] = []
+    told: set[str] = set()
     for i, columns in enumerate(episodes):
         where = f"{source}, episode {i}"
         if not hasattr(columns, "keys"):
             raise BadDemonstrations(f"{where}: it is of {type(columns).__name__}; give a table of columns by name, as {{'q.<joint>': values}}")
-        qpos, qvel = _states(env, columns, dt, where)
+        qpos, qvel, rates = _states(env, columns, dt, where)
         if (n := len(qpos)) < 2:
             raise BadDemonstrations(f"{where}: {n} rows make no transition; give at least 2")
         check_units(of_task, _entries(env), qpos, qvel, where)
+        check_velocities(columns, _entries(env)[1], qvel, rates, where, told)
         rows = Rows(n, dt, period)
         known = [name for name in (*env.obs_names, *goal_names(env)) if name in columns]
         recorded = {name: rows.newest(column(columns, name, n, where)) for name in known}
@@ -144,14 +173,31 @@ def from_minari(task: FilePath, dataset: Any, out: FilePath, *, dt: float | None
     return from_columns(task, episodes, out, dt=env.dt if dt is None else dt, source=source, **options)
 
 
-def from_robomimic(task: FilePath, file: FilePath, out: FilePath, *, dt: float, columns: Mapping[str, tuple[str, int]], **options: Any) -> Path:
-    """Reads robomimic's HDF5; ``columns`` says which entry of which observation each name is: ``{"q.panda_joint1": ("robot0_joint_pos", 0)}``."""
+def from_robomimic(
+    task: FilePath,
+    file: FilePath,
+    out: FilePath,
+    *,
+    dt: float,
+    columns: Mapping[str, tuple[str, int]],
+    actions: Sequence[str | tuple[str, int]] = (),
+    **options: Any,
+) -> Path:
+    """Reads robomimic's HDF5; ``columns`` says which entry of which observation each name is: ``{"q.panda_joint1": ("robot0_joint_pos", 0)}``.
+
+    A key that is no observation is a dataset of the demonstration itself, as ``actions`` is. ``actions`` are such entries in the order of the task's
+    actuators, ``[("actions", 0), ("actions", 1)]``, or names in ``columns``.
+    """
     try:
         import h5py
     except ImportError as error:
         raise ImportError("reading robomimic's HDF5 needs h5py: pip install 'nearl[demos]'") from error
     source = f"'{os.fspath(file)}'"
     check_entries(columns, source)
+    pairs = {f"actions[{i}]": of for i, of in enumerate(actions) if not isinstance(of, str)}
+    check_entries(pairs, source)
+    columns = {**columns, **pairs}
+    acted = actions if isinstance(actions, str) else [of if isinstance(of, str) else f"actions[{i}]" for i, of in enumerate(actions)]
     os.stat(file)  # a file that is not there is said by the system
     episodes = []
     try:
@@ -164,22 +210,32 @@ def from_robomimic(task: FilePath, file: FilePath, out: FilePath, *, dt: float, 
         if odd := [name for name in data["data"] if not name.rpartition("_")[2].isdecimal()]:
             raise BadDemonstrations(f"{source}: 'data/{odd[0]}' has not the name of a demonstration, demo_0 and on; give the file that robomimic wrote")
         for i, demo in enumerate(sorted(data["data"], key=lambda name: int(name.rpartition("_")[2]))):
-            where, obs = f"{source}, episode {i} ({demo})", data["data"][demo].get("obs", {})
+            where, group = f"{source}, episode {i} ({demo})", data["data"][demo]
+            arrays = {**group, **group.get("obs", {})}
             for name, (key, k) in columns.items():
-                shape: tuple[int, ...] = getattr(obs.get(key), "shape", ())
+                shape: tuple[int, ...] = getattr(arrays.get(key), "shape", ())
                 if len(shape) != 2 or k >= shape[1]:
-                    has = ", ".join(f"{name} {getattr(of, 'shape', '')}" for name, of in obs.items()) or "nothing"
+                    has = ", ".join(f"{name} {of.shape}" for name, of in arrays.items() if hasattr(of, "shape")) or "nothing"
                     raise BadDemonstrations(f"{where}: no observation '{key}' with entry {k} for '{name}'; it has {has}")
-            episodes.append({name: numbers(obs[key][:, k], f"observation '{key}'", where) for name, (key, k) in columns.items()})
-    return from_columns(task, episodes, out, dt=dt, source=source, **options)
+            episodes.append({name: numbers(arrays[key][:, k], f"'{key}'", where) for name, (key, k) in columns.items()})
+    return from_columns(task, episodes, out, dt=dt, actions=acted, source=source, **options)
 
 
 def from_lerobot(
-    task: FilePath, folder: FilePath, out: FilePath, *, names: Sequence[str] | None = None, key: str = "observation.state", **options: Any
+    task: FilePath,
+    folder: FilePath,
+    out: FilePath,
+    *,
+    names: Sequence[str] | None = None,
+    key: str = "observation.state",
+    actions: Sequence[str] = (),
+    **options: Any,
 ) -> Path:
     """Reads a LeRobot dataset (v3) from its folder: ``key`` frame by frame, at the rate of ``meta/info.json``.
 
-    ``names`` are the entries of ``key``; by default the dataset's own, of which ``shoulder.pos`` and ``shoulder`` are the joint ``shoulder``.
+    ``names`` are the entries of ``key``; by default the dataset's own, of which ``shoulder.pos`` and ``shoulder`` are the joint ``shoulder`` and
+    ``shoulder.vel`` is its velocity. Entries that the task has no place for are left out with a warning. ``actions`` are entries of the feature ``action``
+    by the dataset's names, in the order of the task's actuators; where it has no names they are ``action.0``, ``action.1`` and on.
     """
     try:
         from pyarrow import parquet
@@ -193,20 +249,46 @@ def from_lerobot(
         raise BadDemonstrations(f"'{meta}' describes no LeRobot dataset of version 3 ({error!r}); give the dataset's folder") from None
     if key not in features:
         raise BadDemonstrations(f"{source}: no feature '{key}'; it has {', '.join(features)}")
+    given = feature_names(features[key])
     if names is None:
-        given = features[key].get("names") or []
-        given = given.get("motors", []) if isinstance(given, dict) else given
-        names = [name if name.startswith(("q.", "v.")) else "q." + name.removesuffix(".pos") for name in given]
-    rows, of = [], []
+        names = [lerobot_column(name) for name in given]
+    wanted = [key]
+    if actions:
+        if "action" not in features:
+            raise BadDemonstrations(f"{source}: no feature 'action' for actions={actions!r}; it has {', '.join(features)}")
+        wanted.append("action")
+    parts: dict[str, list[Any]] = {name: [] for name in (*wanted, "episode_index")}
     for file in sorted((Path(folder) / "data").rglob("*.parquet")):
-        table = parquet.read_table(file, columns=[key, "episode_index"])
-        rows += table[key].to_pylist()
-        of += table["episode_index"].to_pylist()
-    values = np.array(rows, float)
+        table = parquet.read_table(file, columns=list(parts))
+        for name, rows in parts.items():
+            rows += table[name].to_pylist()
+    values = np.array(parts[key], float)
     if values.ndim != 2 or values.shape[1] != len(names):
         raise BadDemonstrations(f"{source}: '{key}' has shape {values.shape} and {len(names)} names; give names=")
     once(names, source)
-    return from_columns(task, split(dict(zip(names, values.T)), np.array(of), source), out, dt=dt, source=source, **options)
+    columns = dict(zip(names, values.T))
+    if actions:
+        acted = np.array(parts["action"], float)
+        acted = acted[:, None] if acted.ndim == 1 else acted  # a single number is no list
+        of_action = feature_names(features["action"]) or [f"action.{k}" for k in range(acted.shape[1])]
+        if acted.ndim != 2 or acted.shape[1] != len(of_action):
+            raise BadDemonstrations(f"{source}: 'action' has shape {acted.shape} and {len(of_action)} names; correct names in '{meta}'")
+        once(of_action, source)
+        if isinstance(actions, str) or (unknown := [name for name in actions if name not in of_action]):
+            said = actions if isinstance(actions, str) else unknown[0]
+            raise BadDemonstrations(f"{source}: actions has '{said}', which is no entry of 'action'; give a list of {', '.join(of_action)}")
+        # of its own, because a target is often called as the position is
+        columns |= {f"action of {name}": acted[:, of_action.index(name)] for name in actions}
+        actions = [f"action of {name}" for name in actions]
+    env = _core.Env(os.fspath(task))
+    used = {*_entries(env)[0], *_entries(env)[1], *env.obs_names, *goal_names(env)}
+    if left := [said for said, name in zip(given if len(given) == len(names) else names, names) if name not in used]:
+        warnings.warn(
+            f"{source}: of '{key}' {', '.join(left)} {'is' if len(left) == 1 else 'are'} left out, because the task has no such column; give names= if they "
+            f"are joints of other names ({', '.join(_entries(env)[0])})",
+            stacklevel=2,
+        )
+    return from_columns(task, split(columns, np.array(parts["episode_index"]), source), out, dt=dt, actions=actions, source=source, **options)
 
 
 def from_motion(task: FilePath, file: FilePath, out: FilePath, *, joints: Sequence[str] | None = None, base: str = "root", **options: Any) -> Path:
@@ -253,8 +335,8 @@ def _entries(env: _core.Env) -> tuple[list[str], list[str]]:
     return q, v
 
 
-def _states(env: _core.Env, columns: Mapping[str, ArrayLike], dt: float, where: str) -> tuple[Floats, Floats]:
-    """qpos (n x nq) and qvel (n x nv) of an episode."""
+def _states(env: _core.Env, columns: Mapping[str, ArrayLike], dt: float, where: str) -> tuple[Floats, Floats, Floats]:
+    """qpos (n x nq) and qvel (n x nv) of an episode, and what positions change by from row to row (n - 1 x nv) [rad or m, per s]."""
     q_names, v_names = _entries(env)
     given = [name for name in (*q_names, *v_names) if name in columns]
     if not given:
@@ -264,11 +346,12 @@ def _states(env: _core.Env, columns: Mapping[str, ArrayLike], dt: float, where: 
     of_no_matter = lambda name: not any(name in observed for observed in env.obs_names)  # noqa: E731
     qpos = np.stack([np.zeros(n) if name not in columns and of_no_matter(name) else column(columns, name, n, where) for name in q_names], 1)
     _unit(env, qpos)
-    qvel = _differences(q_names, v_names, qpos, dt)
+    rates = _rates(q_names, v_names, qpos, dt)
+    qvel = _central(rates) if n > 1 else np.zeros((n, len(v_names)))
     for k, name in enumerate(v_names):
         if name in columns:
             qvel[:, k] = column(columns, name, n, where)
-    return qpos, qvel
+    return qpos, qvel, rates
 
 
 def _unit(env: _core.Env, qpos: Floats) -> None:
@@ -281,19 +364,21 @@ def _unit(env: _core.Env, qpos: Floats) -> None:
             turn[1:][np.cumsum(flips) % 2 == 1] *= -1
 
 
-def _differences(q_names: Sequence[str], v_names: Sequence[str], qpos: Floats, dt: float) -> Floats:
-    """Velocities from one row to the next; the last row has that of the row before."""
-    qvel = np.zeros((len(qpos), len(v_names)))
-    if len(qpos) < 2:
-        return qvel
+def _rates(q_names: Sequence[str], v_names: Sequence[str], qpos: Floats, dt: float) -> Floats:
+    """Mean velocities (n - 1 x nv) from each row to the next."""
+    rates = np.zeros((max(len(qpos) - 1, 0), len(v_names)))
     for k, name in enumerate(v_names):
         if (place := "q" + name[1:]) in q_names:
-            qvel[:-1, k] = np.diff(qpos[:, q_names.index(place)]) / dt
+            rates[:, k] = np.diff(qpos[:, q_names.index(place)]) / dt
         elif name.endswith(".wx"):
             at = q_names.index("q" + name[1:].removesuffix("wx") + "qw")
-            qvel[:-1, k : k + 3] = _turned(qpos[:-1, at : at + 4], qpos[1:, at : at + 4]) / dt
-    qvel[-1] = qvel[-2]
-    return qvel
+            rates[:, k : k + 3] = _turned(qpos[:-1, at : at + 4], qpos[1:, at : at + 4]) / dt
+    return rates
+
+
+def _central(rates: Floats) -> Floats:
+    """Velocities (n x nv) in the rows: central differences, one-sided at both ends."""
+    return np.concatenate([rates[:1], (rates[1:] + rates[:-1]) / 2, rates[-1:]])
 
 
 def _turned(a: Floats, b: Floats) -> Floats:

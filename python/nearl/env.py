@@ -1,5 +1,7 @@
 """One environment, as Gymnasium wants it."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import gymnasium
@@ -41,9 +43,7 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (n_obs,), np.float64)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self._native.dt)}
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray[np.float64], dict[str, Any]]:
         """Begins an episode.
 
         Args:

@@ -41,7 +41,7 @@ input = "full"
 """
 
 
-def from_gymnasium(env_id: str, folder: str | os.PathLike[str], **kwargs: Any) -> Path:
+def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathLike[str], **kwargs: Any) -> Path:
     """Writes ``<name>.toml`` and its robot file into ``folder`` for a Gymnasium environment that is built on ``MujocoEnv``.
 
     The task steps the same physics as Gymnasium, bit for bit for the same state and action, and observes all joint positions and
@@ -53,7 +53,7 @@ def from_gymnasium(env_id: str, folder: str | os.PathLike[str], **kwargs: Any) -
     their goal or model while they run. Training with constraints also needs the robot to be one tree of bodies.
 
     Args:
-        env_id: Name known to ``gymnasium.make``.
+        env_id: Name known to ``gymnasium.make``, or an environment that it made, of which wrappers are left out.
         folder: Where to write; created if it does not exist.
         **kwargs: For ``gymnasium.make``.
 
@@ -61,11 +61,17 @@ def from_gymnasium(env_id: str, folder: str | os.PathLike[str], **kwargs: Any) -
         The task file.
 
     Raises:
-        ValueError: not a MuJoCo environment.
+        ValueError: not a MuJoCo environment, or one that no name was registered for.
         FileExistsError: the task file is there already.
     """
     import mujoco
 
+    if not isinstance(env_id, str):
+        spec = env_id.spec if isinstance(env_id, gymnasium.Env) else None
+        if spec is None:
+            raise ValueError(f"{env_id!r} was not made by a name; register it with gymnasium.register and give that name, as 'Hopper-v5'")
+        length = {} if spec.max_episode_steps is None else {"max_episode_steps": spec.max_episode_steps}
+        env_id, kwargs = spec.id, {**spec.kwargs, **length, "render_mode": None, **kwargs}
     env = gymnasium.make(env_id, **kwargs)
     steps = env.spec.max_episode_steps if env.spec is not None else None
     inner: Any = env.unwrapped
@@ -93,8 +99,8 @@ def from_gymnasium(env_id: str, folder: str | os.PathLike[str], **kwargs: Any) -
         if own
         else "the reward, the start and the end of an\n# episode are Python there and must be written here, or given to nearl.make_vec as functions."
     )
-    length = f"max_episode_steps = {steps}\n" if steps else ""  # without a time limit there: the usual length here
-    times = {"dt": dt, "sim_dt": timestep if euler else 0.0, "steps": length}
+    limit = f"max_episode_steps = {steps}\n" if steps else ""  # without a time limit there: the usual length here
+    times = {"dt": dt, "sim_dt": timestep if euler else 0.0, "steps": limit}
     sections = as_toml(own) if own else EMPTY
     file.write_text(TEMPLATE.format(env_id=env_id, name=name, robot=robot.name, joints=joints, about=about, sections=sections, **times))
     env.close()

@@ -1,11 +1,13 @@
 """SB3's five lines on the Rust trainer.
 
-    agent = nearl.PID2("HalfCheetah-v5", algo="pid2-ib", seed=0)
-    agent.learn(1_000_000, progress_bar=True)
-    action, state = agent.predict(obs)
-    agent.save("cheetah.safetensors")
-    agent = nearl.PID2.load("cheetah.safetensors")
+agent = nearl.PID2("HalfCheetah-v5", algo="pid2-ib", seed=0)
+agent.learn(1_000_000, progress_bar=True)
+action, state = agent.predict(obs)
+agent.save("cheetah.safetensors")
+agent = nearl.PID2.load("cheetah.safetensors")
 """
+
+from __future__ import annotations
 
 import json
 import os
@@ -84,7 +86,16 @@ class PID2:
         run = None if run is None or (ranks is not None and ranks.rank != 0) else os.path.abspath(run)
         with _said_in_python():
             self._training: _core.Training | None = _core.Training(
-                os.fspath(task), algo, seed, threads, overrides, run, preset, _scorer(reward, termination), reward is not None, ranks,
+                os.fspath(task),
+                algo,
+                seed,
+                threads,
+                overrides,
+                run,
+                preset,
+                _scorer(reward, termination),
+                reward is not None,
+                ranks,
                 None if start_from is None else os.path.abspath(start_from),
             )
         self.task, self.algo, self.seed = self._training.task, algo, seed
@@ -110,7 +121,7 @@ class PID2:
         """The controller with what was learned so far."""
         return self._controller
 
-    def learn(self, total_timesteps: int, callback: Callback | list[Callback] | None = None, progress_bar: bool = False) -> "PID2":
+    def learn(self, total_timesteps: int, callback: Callback | list[Callback] | None = None, progress_bar: bool = False) -> PID2:
         """Learns from at least ``total_timesteps`` more environment steps.
 
         Args:
@@ -200,7 +211,7 @@ class PID2:
         reward: Outcome | None = None,
         termination: Outcome | None = None,
         ranks: Gather | None = None,
-    ) -> "PID2":
+    ) -> PID2:
         """A policy to predict with, from a snapshot file; from a run folder, one that can also learn on, exactly where it stopped.
 
         With ``ranks`` it is a run folder, which rank 0 reads for all; the number of ranks may be another than before.

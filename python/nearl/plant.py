@@ -10,6 +10,8 @@ with nearl.Loop("policy.safetensors", "arm") as loop:     # in place of `nearl r
 print(loop.report["counters"])
 """
 
+from __future__ import annotations
+
 import json
 import os
 from collections.abc import Sequence
@@ -91,7 +93,7 @@ class Plant:
         """Leaves; the loop sees that the plant is gone."""
         self._plant.close()
 
-    def __enter__(self) -> "Plant":
+    def __enter__(self) -> Plant:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -174,7 +176,7 @@ class Loop:
                 raise
         return self.report
 
-    def __enter__(self) -> "Loop":
+    def __enter__(self) -> Loop:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

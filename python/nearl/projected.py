@@ -1,5 +1,7 @@
 """One environment whose actions pass the constraints, as Gymnasium wants it: what ``gymnasium.make("nearl/...", constraints=...)`` gives."""
 
+from __future__ import annotations
+
 import os
 from typing import Any
 
@@ -60,9 +62,7 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self._native.dt)}
         self._seeded = False
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray[np.float64], dict[str, Any]]:
         """Begins an episode; ``seed`` restarts the random stream. Returns the observation (n_obs) and info."""
         if options:
             raise ValueError(f"reset options {sorted(options)} are not known; this environment takes none")

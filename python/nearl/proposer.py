@@ -7,6 +7,8 @@
             proposer.propose(model(state.obs))         # in the order of proposer.entries
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -116,7 +118,7 @@ class Proposer:
         """Leaves: the loop holds the last proposal for a while, then brakes."""
         self._client.close()
 
-    def __enter__(self) -> "Proposer":
+    def __enter__(self) -> Proposer:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

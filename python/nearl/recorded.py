@@ -16,6 +16,9 @@ Columns = Mapping[str, ArrayLike]
 SAME = 1e-6  # part of a period by which two may differ
 _FAST = 10.0  # times its limit at which a joint's speed is one of other units
 _SLOW = 1.0  # s between two rows, which only a policy as slow records
+_STILL = 0.02  # rad/s or m/s below which a joint stands, for all that a recording tells
+_FEW = 5  # rows of motion that say something of a velocity
+_OFF = 0.65  # part of the larger by which velocity and difference must differ: a factor of three, or the sign
 _DRAWS = 3  # episodes in which a state is looked at, to see what is drawn in each
 _LOOKS = 256  # states of an episode that are looked at for it
 # Names of commands in an expression: `command.x`, or `{command.left-x}` in braces.
@@ -106,6 +109,47 @@ def check_units(of_task: _core.Controller, names: tuple[Sequence[str], Sequence[
                 f"look whether its columns are in rad or m, and dt in seconds",
                 stacklevel=3,
             )
+
+
+def check_velocities(columns: Columns, names: Sequence[str], qvel: Floats, rates: Floats, where: str, told: set[str]) -> None:
+    """Warns of recorded velocities (n x nv) that positions do not follow: another sign, unit or gear.
+
+    Between two rows the mean of both velocities stands against ``rates`` (n - 1 x nv), what the positions change by. Only rows in which something moves
+    steadily count, and half of these must be off, so that an angle that jumps by a turn, an impact or rows that are far apart are no reason. ``told`` are
+    the columns that were warned of.
+    """
+    wrong = []
+    for k, name in enumerate(names):
+        base, _, entry = name.rpartition(".")
+        place = f"q{base[1:]}.qw" if entry in ("wx", "wy", "wz") else "q" + name[1:]
+        if name in told or name not in columns or place not in columns:
+            continue
+        if (row := _disagrees(qvel[:, k], rates[:, k])) is not None:
+            told.add(name)
+            given = (qvel[row, k] + qvel[row + 1, k]) / 2
+            wrong.append((f"column '{name}' is {given:.3g} around row {row}, where '{place}' changes by {rates[row, k]:.3g} a second", name))
+    if wrong:
+        also = f" (likewise {', '.join(name for _, name in wrong[1:])})" if wrong[1:] else ""
+        warnings.warn(
+            f"{where}: {wrong[0][0]}, and is as far off in half of the rows{also}; look at sign, unit and dt, or leave velocities out: then they are the "
+            "differences of the positions",
+            stacklevel=3,
+        )
+
+
+def _disagrees(velocity: Floats, rate: Floats) -> int | None:
+    """A row in which a velocity (n) is as far from the change of the position (n - 1) as in half of the rows, where that is far."""
+    mean = (velocity[1:] + velocity[:-1]) / 2
+    size = np.maximum(np.abs(mean), np.abs(rate))
+    step = np.abs(np.diff(rate))
+    jumps = np.maximum(np.append(step, 0.0), np.insert(step, 0, 0.0))
+    # Where a velocity is another one in the next row, rows are too far apart to tell.
+    steady = (np.abs(np.diff(velocity)) <= 0.5 * np.abs(mean)) & (jumps <= 0.5 * np.abs(rate))
+    moves = np.flatnonzero(steady & (size >= max(_STILL, 0.2 * np.percentile(size, 90))))
+    if len(moves) < max(_FEW, 0.2 * len(rate)):
+        return None
+    off = (np.abs(mean - rate) / size)[moves]
+    return int(moves[np.argsort(off)[len(off) // 2]]) if np.median(off) > _OFF else None
 
 
 class Rows:

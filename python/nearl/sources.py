@@ -132,6 +132,19 @@ def seconds_between(fps: Any, source: str) -> float:
     return 1 / float(rate[0])
 
 
+def feature_names(feature: Mapping[str, Any]) -> list[str]:
+    """Names of the entries of a feature of a LeRobot dataset; none where it has none."""
+    names = feature.get("names") or []
+    return list(names.get("motors", []) if isinstance(names, Mapping) else names)
+
+
+def lerobot_column(name: str) -> str:
+    """The column of an entry of a robot's state as LeRobot names it: ``shoulder.pos``, ``shoulder.vel``, ``shoulder``."""
+    if name.startswith(("q.", "v.")):
+        return name
+    return "v." + name.removesuffix(".vel") if name.endswith(".vel") else "q." + name.removesuffix(".pos")
+
+
 def minari_dataset(name: str) -> Any:
     """What Minari has under a name on this machine."""
     try:

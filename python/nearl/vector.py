@@ -1,5 +1,7 @@
 """Many environments in one call."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +23,8 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
     """``num_envs`` environments of one task, stepped natively on all cores with the interpreter released.
 
     Environment ``i`` behaves as a single one that was seeded with ``seed + i``. ``info`` holds, where there is something to say and
-    with the mask ``_<key>``: ``final_obs`` (same-step mode), ``fault``; ``cost`` where the task has one; and with ``constraints`` always:
+    with the mask ``_<key>``: ``final_obs`` and ``final_info`` (same-step mode: what the last step of an episode gave), ``fault``; ``cost`` where the task
+    has one, 0 and masked out where the row is the begin of an episode, as in Gymnasium's ``SyncVectorEnv``; and with ``constraints`` always:
     ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit), ``executed``
     (what the actuators got in the last of them, num_envs x n_act; not a number where the step only began an episode) and ``moved``.
     A vector cannot be pickled or copied: make it in the process that uses it.
@@ -72,9 +75,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
-    def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Begins an episode everywhere. ``seed``: one for all (environment ``i`` gets ``seed + i``) or one each."""
         if options:
             raise ValueError(f"reset options {sorted(options)} are not known; this vector takes none")
@@ -91,9 +92,19 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
 
     def step(self, actions: ArrayLike) -> Step:  # type: ignore[override]  # flags are booleans
         """One action (num_envs x n_act) each; an environment whose episode ended begins a new one, see the autoreset mode."""
-        if self._reward is None and self._termination is None:
-            return self._native.step(actions)
-        return self._scored(np.asarray(actions, float))
+        began = self._over
+        own = self._reward is None and self._termination is None
+        stepped = self._native.step(actions) if own else self._scored(np.asarray(actions, float))
+        *_, terminated, truncated, info = stepped
+        ended, same_step = terminated | truncated, self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+        self._over = ended & (not same_step)
+        if same_step and ended.any():
+            info["final_info"] = {name: of for key in list(info) if key[0] != "_" and key != "final_obs" for name, of in _final(info, key, ended)}
+            info["_final_info"] = ended
+        if "cost" in info:
+            info["_cost"] = ~(ended if same_step else began)
+            info["cost"] = np.where(info["_cost"], info["cost"], 0.0)
+        return stepped
 
     def _scored(self, actions: Floats) -> Step:
         """A step whose reward or termination the caller's functions give."""
@@ -112,8 +123,6 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
                 obs = self._native.end(fresh.tolist())
                 if self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP:
                     _add_final(info, fresh, reached)
-        over = terminated | truncated
-        self._over = over & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         self._obs = obs.copy()
         return obs, rewards, terminated, truncated, info
 
@@ -127,6 +136,14 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
     def native(self) -> _core.VecEnv:
         """The Rust environments: names, ranges, states."""
         return self._native
+
+
+def _final(info: dict[str, Any], key: str, ended: NDArray[np.bool_]) -> list[tuple[str, NDArray[Any]]]:
+    """An entry of the information and its mask, of the episodes that ended alone."""
+    mask: NDArray[np.bool_] = info.get(f"_{key}", True) & ended
+    values = info[key].copy()
+    values[~mask] = None if values.dtype == object else 0
+    return [(key, values), (f"_{key}", mask)] if mask.any() else []
 
 
 def _add_final(info: dict[str, Any], ended: NDArray[np.bool_], reached: Floats) -> None:

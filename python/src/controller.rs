@@ -72,10 +72,10 @@ impl Controller {
         })
     }
 
-    /// One control tick without noise: the action (n_act) [N m or N, or what `[command]` says] and the ledger. `q` (nq) [rad or m] and `v` (nv)
-    /// [rad/s or m/s] in Pinocchio's convention, `obs` (n_obs). With NaN or infinity in
-    /// them the ledger says "refused", and the action is the one that the last finite state asked for: right for a tick or two, so
-    /// brake if it lasts.
+    /// One control tick without noise: the action (n_act) and the ledger. The action is what the actuators get, in their order: of a robot file's
+    /// motors their controls, which are forces [N m or N] where a motor has no gear, else force by gear; of drives what `[command]` says. `q` (nq)
+    /// [rad or m] and `v` (nv) [rad/s or m/s] in Pinocchio's convention, `obs` (n_obs). With NaN or infinity in them the ledger says "refused", and the
+    /// action is the one that the last finite state asked for: right for a tick or two, so brake if it lasts.
     fn update<'py>(
         &self,
         q: &Bound<'py, PyAny>,

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from conftest import ROOT
 import nearl
 from nearl import _core, demos
 
+UNNAMED = ["action.1", "action.2", "action.0"]
 NEARL = ROOT / "target" / "release" / "nearl"
 
 
@@ -51,7 +53,7 @@ def test_what_is_not_observed_may_be_missing_and_velocities_are_differences(tmp_
     columns = {name: column for name, column in episode().items() if name.startswith("q.") and name != "q.rootx"}
     data = checked(demos.from_columns("Hopper-v5", [columns], tmp_path / "a.npz", dt=0.008))
     assert not data["qpos"][:, 0].any()
-    assert np.allclose(data["qvel"][:-1, 4], np.diff(columns["q.leg_joint"]) / 0.008)
+    np.testing.assert_allclose(data["qvel"][:, 4], np.gradient(columns["q.leg_joint"], 0.008), rtol=0, atol=1e-12)
     with pytest.raises(demos.BadDemonstrations, match="episode 0: no column 'q.leg_joint'"):
         demos.from_columns("Hopper-v5", [{k: v for k, v in columns.items() if k != "q.leg_joint"}], tmp_path / "b.npz", dt=0.008)
 
@@ -68,6 +70,57 @@ def test_another_period_is_interpolated_and_a_turning_base_has_the_right_velocit
     assert float(data["dt"]) == 0.05 and data["lengths"].tolist() == [15]
     assert np.allclose(data["qvel"][:, :6], [0.3, 0, 0, 0, 0, rate], atol=1e-9)
     assert np.allclose(np.linalg.norm(data["qpos"][:, 3:7], axis=1), 1) and np.allclose(data["qvel"][:, 6:], 0.1)
+
+
+def test_differences_are_numpys_and_know_the_ends_of_episodes(tmp_path: Path) -> None:
+    parts = [{name: column for name, column in episode(n, seed).items() if name.startswith("q.")} for n, seed in ((30, 0), (3, 1), (2, 2))]
+    data = checked(demos.from_columns("Hopper-v5", parts, tmp_path / "a.npz", dt=0.008))
+    expected = [np.gradient(np.stack(list(part.values()), 1), 0.008, axis=0) for part in parts]
+    np.testing.assert_allclose(data["qvel"], np.concatenate(expected), rtol=0, atol=1e-11)
+
+
+def test_a_base_that_turns_ever_faster_has_the_velocity_of_each_row(tmp_path: Path) -> None:
+    """Of an angle of the second order central differences are exact, about an axis that is none of the frame's."""
+    t, axis = np.arange(40) * 0.05, np.array([2.0, -1.0, 2.0]) / 3
+    angle = 0.8 * t**2
+    columns = {f"q.{joint}": (0.0 if joint.startswith("hip") else 0.9) + 0 * t for joint in _core.Env("Ant-v5").joint_names[1:]}
+    columns |= {f"q.root.{e}": x for e, x in zip(("x", "y", "z"), (0.3 * t**2, 0 * t, 0.75 + 0 * t))} | {"q.root.qw": np.cos(angle / 2)}
+    columns |= {f"q.root.{e}": a * np.sin(angle / 2) for e, a in zip(("qx", "qy", "qz"), axis)}
+    data = checked(demos.from_columns("Ant-v5", [columns], tmp_path / "a.npz", dt=0.05), "Ant-v5")
+    inner = slice(1, -1)
+    np.testing.assert_allclose(data["qvel"][inner, 3:6], 1.6 * t[inner, None] * axis, atol=1e-9)
+    np.testing.assert_allclose(data["qvel"][inner, 0], 0.6 * t[inner], atol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0, 180 / np.pi, 1e-3])
+def test_velocities_that_positions_do_not_follow_are_warned_of(tmp_path: Path, factor: float) -> None:
+    right = [episode(60), episode(60, 1)]
+    wrong = [columns | {"v.leg_joint": factor * columns["v.leg_joint"]} for columns in right]
+    with pytest.warns(UserWarning, match=r"episode .: column 'v.leg_joint' is .* where 'q.leg_joint' changes by .* look at sign, unit and dt") as told:
+        demos.from_columns("Hopper-v5", wrong, tmp_path / "a.npz", dt=0.008)
+    assert sum("changes by" in str(warning.message) for warning in told) == 1
+    every = {name: factor * of if name.startswith("v.") else of for name, of in right[1].items()}
+    with pytest.warns(UserWarning, match=r"likewise .*v.foot_joint"):
+        demos.from_columns("Hopper-v5", [every], tmp_path / "a.npz", dt=0.008)
+
+
+@pytest.mark.parametrize("task", ["HalfCheetah-v5", "Hopper-v5", "Ant-v5", "Panda-reach", "Walker2d-v5"])
+@pytest.mark.parametrize("every", [1, 3])
+def test_velocities_of_a_simulation_are_not(tmp_path: Path, task: str, every: int) -> None:
+    """Of wild motions too, with impacts, and of rows that are too far apart for them."""
+    env, rng = _core.Env(task), np.random.default_rng(3)
+    q_names, v_names = demos._entries(env)
+    env.reset(3)
+    rows = []
+    for _ in range(200):
+        rows.append([*env.qpos, *env.qvel])
+        env.step(rng.uniform(env.action_low, env.action_high))
+    columns = dict(zip([*q_names, *v_names], np.array(rows)[::every].T))
+    if task == "Panda-reach":
+        columns |= {f"goal.{axis}": np.full(len(columns[q_names[0]]), 0.4) for axis in "xyz"}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*changes by")
+        demos.from_columns(task, [columns], tmp_path / "a.npz", dt=env.dt * every)
 
 
 def test_csv(tmp_path: Path) -> None:
@@ -135,11 +188,24 @@ def test_robomimic(tmp_path: Path) -> None:
             group = file.create_group(f"data/{name}")
             group.attrs["num_samples"] = 12
             group["obs/joint_pos"] = np.stack([columns[joint] for joint in joints], 1)
+            group["actions"] = np.stack([columns[name] for name in "cab"], 1)
     which = {name: ("joint_pos", k) for k, name in enumerate(joints)}
     data = checked(demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "a.npz", dt=0.008, columns=which))
     assert data["lengths"].tolist() == [11] * 3 and np.array_equal(data["qpos"][24:, 4], parts["demo_10"]["q.leg_joint"])
     with pytest.raises(demos.BadDemonstrations, match=r"episode 0 \(demo_0\): no observation 'arm'"):
         demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "b.npz", dt=0.008, columns={"q.rooty": ("arm", 0)})
+    # actions of the demonstration, in the order of the task's actuators: by entries, or by names of columns
+    expected = np.concatenate([np.stack([part[name] for name in "abc"], 1)[:-1] for part in parts.values()])
+    named = which | {"first": ("actions", 1), "second": ("actions", 2), "third": ("actions", 0)}
+    for columns, actions in ((which, [("actions", 1), ("actions", 2), ("actions", 0)]), (named, ["first", "second", "third"])):
+        out = demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "c.npz", dt=0.008, columns=columns, actions=actions)
+        assert np.array_equal(checked(out)["actions"], expected)
+    with pytest.raises(demos.BadDemonstrations, match=r"no observation 'actions' with entry 3 for 'actions\[2\]'; it has .*actions \(12, 3\)"):
+        actions = [("actions", k) for k in (1, 2, 3)]
+        demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "c.npz", dt=0.008, columns=which, actions=actions)
+    for actions, words in ([["a", 1.5]], r"columns\['actions\[0\]'\] is \['a', 1.5\]; give the"), ("actions", "actions is 'actions'; give one column for each"):
+        with pytest.raises(demos.BadDemonstrations, match=words):
+            demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "c.npz", dt=0.008, columns=which, actions=actions)
 
 
 def test_lerobot(tmp_path: Path) -> None:
@@ -159,6 +225,44 @@ def test_lerobot(tmp_path: Path) -> None:
     assert data["lengths"].tolist() == [11, 11] and np.allclose(data["qpos"][12:, 5], parts[1]["q.foot_joint"], atol=1e-6)
     with pytest.raises(demos.BadDemonstrations, match=r"no feature 'state'; it has observation.state"):
         demos.from_lerobot("Hopper-v5", tmp_path, tmp_path / "b.npz", key="state")
+
+
+def lerobot(folder: Path, features: dict[str, tuple[object, np.ndarray]], episodes: np.ndarray) -> Path:
+    """A dataset of version 3 of names and rows by feature."""
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    of = {key: {"dtype": "float32", "shape": [rows.shape[1]], "names": names} for key, (names, rows) in features.items()}
+    (folder / "meta" / "info.json").write_text(json.dumps({"codebase_version": "v3.0", "fps": 125, "features": of}))
+    table = {key: pa.array(rows.astype(np.float32).tolist(), pa.list_(pa.float32())) for key, (_, rows) in features.items()}
+    parquet.write_table(pa.table(table | {"episode_index": episodes}), folder / "data" / "chunk-000" / "file-000.parquet")
+    return folder
+
+
+def test_lerobot_has_velocities_and_actions(tmp_path: Path) -> None:
+    """Positions, velocities and a gripper in one feature; targets that are called as the positions are in another."""
+    parts = [episode(12, k) for k in (0, 1)]
+    rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    q, v = ([name for name in rows if name.startswith(letter)] for letter in ("q.", "v."))
+    names = [f"{name[2:]}.vel" for name in v] + ["gripper.pos"] + [f"{name[2:]}.pos" for name in q]
+    states = np.stack([*(rows[name] for name in v), np.zeros(24), *(rows[name] for name in q)], 1)
+    acted = np.stack([rows[name] for name in "cab"], 1)
+    joints = ["foot_joint.pos", "thigh_joint.pos", "leg_joint.pos"]
+    features = {"observation.state": (names, states), "action": ({"motors": joints}, acted)}
+    folder = lerobot(tmp_path / "set", features, np.repeat([0, 1], 12))
+    with pytest.warns(UserWarning, match="of 'observation.state' gripper.pos is left out"):
+        data = checked(demos.from_lerobot("Hopper-v5", folder, tmp_path / "a.npz", actions=[joints[1], joints[2], joints[0]]))
+    assert np.array_equal(data["qvel"], np.stack([rows[name] for name in v], 1).astype(np.float32))
+    expected = np.concatenate([np.stack([part[name] for name in "abc"], 1)[:-1] for part in parts])
+    assert np.array_equal(data["actions"], expected.astype(np.float32))
+    with pytest.raises(demos.BadDemonstrations, match="actions has 'knee', which is no entry of 'action'; give a list of foot_joint.pos, thigh_joint.pos"):
+        demos.from_lerobot("Hopper-v5", folder, tmp_path / "b.npz", actions=["knee", *joints[:2]])
+    features["action"] = (None, acted)
+    data = checked(demos.from_lerobot("Hopper-v5", lerobot(tmp_path / "b", features, np.repeat([0, 1], 12)), tmp_path / "c.npz", actions=UNNAMED))
+    assert np.array_equal(data["actions"], expected.astype(np.float32))
+    del features["action"]
+    with pytest.raises(demos.BadDemonstrations, match="no feature 'action' for actions="):
+        demos.from_lerobot("Hopper-v5", lerobot(tmp_path / "c", features, np.repeat([0, 1], 12)), tmp_path / "d.npz", actions=UNNAMED)
 
 
 def test_lerobot_as_lerobot_writes_it(tmp_path: Path) -> None:

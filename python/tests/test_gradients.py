@@ -100,3 +100,33 @@ def test_jax() -> None:
     expected = p.vjp_batch(q, v, q_hat, v_hat, np.full((20, 7), 3.0), 2 * targets.v)
     np.testing.assert_allclose(dq, expected[0], rtol=1e-12)
     np.testing.assert_allclose(dv, expected[1], rtol=1e-12)
+
+
+def test_jax_maps_over_samples_as_a_loop_does() -> None:
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_enable_x64", True)
+    import nearl.jax
+
+    p, (q, v, q_hat, v_hat) = projector(), cases(20, 6)
+    project = nearl.jax.project(p)
+
+    def scalar(q: object, v: object, q_hat: object, v_hat: object) -> object:
+        target_q, target_v = project(q, v, q_hat, v_hat)
+        return 3.0 * target_q.sum() + (target_v**2).sum()
+
+    gradient = jax.grad(scalar, argnums=(2, 3))
+    loop = [gradient(*of) for of in zip(q, v, q_hat, v_hat)]
+    expected = p.vjp_batch(q, v, q_hat, v_hat, np.full((20, 7), 3.0), 2 * p.project_batch(q, v, q_hat, v_hat).v)
+    for mapped in (jax.vmap(gradient), jax.jit(jax.vmap(gradient))):
+        for k, product in enumerate(mapped(q, v, q_hat, v_hat)):
+            np.testing.assert_array_equal(product, np.stack([np.asarray(of[k]) for of in loop]))
+            np.testing.assert_allclose(product, expected[k], rtol=1e-12)
+    # one state and many proposals; and two axes
+    mapped = jax.vmap(gradient, in_axes=(None, None, 0, 0))(q[0], v[0], q_hat[:5], v_hat[:5])
+    for k in range(2):
+        np.testing.assert_array_equal(mapped[k], np.stack([np.asarray(gradient(q[0], v[0], a, b)[k]) for a, b in zip(q_hat[:5], v_hat[:5])]))
+    blocks = [x.reshape(4, 5, 7) for x in (q, v, q_hat, v_hat)]
+    np.testing.assert_array_equal(jax.vmap(jax.vmap(project))(*blocks)[0].reshape(20, 7), p.project_batch(q, v, q_hat, v_hat).q)
+    np.testing.assert_array_equal(jax.vmap(project)(*blocks)[1].reshape(20, 7), p.project_batch(q, v, q_hat, v_hat).v)
+    with pytest.raises(ValueError, match=r"q_proposal has shape \(6,\); give all four arrays the same one, \(7,\) or \(n, 7\)"):
+        project(q[0], v[0], q_hat[0, :6], v_hat[0])

@@ -159,6 +159,20 @@ def test_gymnasiums_mujoco_environments_become_task_files(env_id: str, tmp_path:
         nearl.from_gymnasium(env_id, tmp_path)
 
 
+def test_an_environment_of_gymnasium_becomes_the_task_file_of_its_name(tmp_path: Path) -> None:
+    by_name = nearl.from_gymnasium("Hopper-v5", tmp_path / "a", ctrl_cost_weight=0.5, max_episode_steps=70)
+    env = gymnasium.make("Hopper-v5", ctrl_cost_weight=0.5, max_episode_steps=70)
+    for k, instance in enumerate((env, gymnasium.wrappers.FlattenObservation(env))):
+        assert nearl.from_gymnasium(instance, tmp_path / f"b{k}").read_text() == by_name.read_text()
+    bare = nearl.from_gymnasium(env.unwrapped, tmp_path / "c").read_text()  # of which Gymnasium knows no length but that of the name
+    assert bare == by_name.read_text().replace("max_episode_steps = 70", "max_episode_steps = 1000")
+    assert "max_episode_steps = 70" in by_name.read_text() and "0.5" in by_name.read_text()
+    unnamed = type(env.unwrapped)()
+    for what in (unnamed, 5):
+        with pytest.raises(ValueError, match="was not made by a name; register it with gymnasium.register and give that name"):
+            nearl.from_gymnasium(what, tmp_path)
+
+
 OWN_TASKS = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Swimmer-v5", "Reacher-v5", "Pusher-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5"]
 OWN_TASKS += ["Ant-v5", "Humanoid-v5", "HumanoidStandup-v5"]
 # Of Gymnasium's reward functions these read places of bodies, which after a step are those before its last physics step.

@@ -1,5 +1,7 @@
 """A vector is its single environments, on any number of threads; and its constrained form is the controller's path."""
 
+import inspect
+import pydoc
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -37,6 +39,69 @@ def test_a_vector_equals_single_environments(task: str, mode: AutoresetMode) -> 
                 assert (a is None and b is None) or np.array_equal(a, b)
     assert ended[1] > 0, "the comparison covers truncations"
     assert ended[0] > 0 or task != "Hopper-v5", "the comparison covers terminations"
+
+
+def same_information(ours: dict, theirs: dict) -> None:
+    """Everything that Gymnasium's vector says, and beyond it nothing that is not masked out."""
+    assert ours.keys() >= theirs.keys()
+    for key in ours.keys() - theirs.keys():
+        assert not np.any(ours[key]), (key, ours, theirs)
+    for key, values in theirs.items():
+        if isinstance(values, dict):
+            same_information(ours[key], values)
+        elif key == "final_obs":
+            assert all((a is None and b is None) or np.array_equal(a, b) for a, b in zip(ours[key], values, strict=True))
+        else:
+            assert np.array_equal(ours[key], values) and ours[key].dtype == values.dtype, (key, ours[key], values)
+
+
+@pytest.mark.parametrize("ended_by", ["the task", "a function"])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("task", ["Hopper-velocity", "Hopper-v5", "Panda-reach"])
+def test_the_information_is_that_of_gymnasiums_vector(task: str, mode: AutoresetMode, ended_by: str) -> None:
+    n, far = 4, lambda obs: np.abs(obs[..., 6]) > 0.5
+
+    class Far(gymnasium.Wrapper):
+        def step(self, action):
+            obs, reward, terminated, truncated, info = self.env.step(action)
+            return obs, reward, bool(terminated or far(obs)), truncated, info
+
+    make = lambda: gymnasium.make(f"nearl/{task}", max_episode_steps=25)  # noqa: E731
+    kwargs = {} if ended_by == "the task" else {"termination": lambda obs, actions, reached: far(reached)}
+    singles = SyncVectorEnv([(lambda: Far(make())) if kwargs else make] * n, autoreset_mode=mode)
+    vec = nearl.VecEnv(task, n, max_episode_steps=25, autoreset_mode=mode, **kwargs)
+    vec.reset(seed=1), singles.reset(seed=1)
+    vec.action_space.seed(2)
+    ended, masked = 0, 0
+    for _ in range(80):
+        actions = vec.action_space.sample()
+        ours, theirs = vec.step(actions), singles.step(actions)
+        assert all(np.array_equal(a, b) for a, b in zip(ours[:2], theirs[:2], strict=True))
+        same_information(ours[4], theirs[4])
+        ended += len(theirs[4].get("_final_info", ()))
+        masked += "_cost" in theirs[4] and not theirs[4]["_cost"].all()
+    assert (ended > 0) == (mode is AutoresetMode.SAME_STEP)
+    assert masked > 0 or task != "Hopper-velocity"
+
+
+def test_what_the_last_step_did_under_constraints_is_final_information_too() -> None:
+    vec = nearl.VecEnv("Panda-reach", 2, "task", max_episode_steps=40, autoreset_mode="SameStep", actions="guarded")
+    vec.reset(seed=1)
+    vec.action_space.seed(2)
+    infos = [vec.step(vec.action_space.sample())[4] for _ in range(4)]
+    last = [info for info in infos if "final_info" in info]
+    assert 0 < len(last) < 4
+    for info in last:
+        assert info["_final_info"].all()
+        for key in ("raw_violations", "target_violations", "executed", "moved"):
+            assert np.array_equal(info["final_info"][key], info[key]) and info["final_info"][f"_{key}"].all()
+
+
+def test_signatures_are_those_of_the_source() -> None:
+    """NumPy's own types are unions over many lines, which nobody reads in `help`."""
+    for function in (nearl.make_vec, nearl.VecEnv, nearl.VecEnv.step, nearl.Env.step, nearl.ProjectedEnv.step, nearl.Guard, nearl.Guard.step, nearl.PID2):
+        said = pydoc.plain(pydoc.render_doc(function))
+        assert "NestedSequence" not in said and len(str(inspect.signature(function))) < 600, function
 
 
 def test_actions_may_be_in_any_memory_order() -> None:
