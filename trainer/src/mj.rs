@@ -8,6 +8,7 @@ mod describe;
 mod guard;
 mod inverse;
 mod motors;
+mod packages;
 mod pairs;
 mod perturb;
 mod scene;
@@ -177,6 +178,7 @@ impl Model {
             ModelFormat::Urdf if options.floats => keep_fixed_links(&set_afloat(text)?),
             ModelFormat::Urdf => keep_fixed_links(text),
         };
+        let text = packages::resolve(&text, folder);
         sizes::check(&text, folder).map_err(MjError::Load)?;
         let loaded = guard::counting_warnings(|| {
             let model = match scene.is_empty() {
@@ -185,7 +187,10 @@ impl Model {
             };
             model.and_then(|model| pairs::list(&text, folder, scene, model))
         });
-        let mut model = loaded?;
+        let mut model = loaded.map_err(|e| match (e, packages::advice(&text)) {
+            (MjError::Load(reason), Some(advice)) => MjError::Load(reason + &advice),
+            (e, _) => e,
+        })?;
         let opt = model.opt_mut();
         if let Some(sim_dt) = options.sim_dt {
             opt.timestep = sim_dt;

@@ -518,6 +518,16 @@ fn servos_of_a_urdf_follow_positions() {
     );
 }
 
+/// A URDF states no timestep: what is said names the key that does.
+#[test]
+fn a_period_that_is_no_whole_number_of_a_urdf_s_steps_names_the_key_of_the_step() {
+    let folder = tempfile::tempdir().expect("folder");
+    let arm = urdf_arm(folder.path(), "");
+    let loaded = tasks::load(&arm, &["time.dt=0.005".into(), "time.sim_dt=0.0".into()]);
+    let refused = loaded.map(|_| ()).expect_err("2.5 steps").to_string();
+    assert!(refused.contains("[time.dt]: 0.005 s") && refused.contains("[scene] timestep"), "{refused}");
+}
+
 /// A range of 1.4 m less the margin of the task, and a start drawn from 1.5 times it: the joint, the number and what is allowed are said, and
 /// nothing where episodes begin inside.
 #[test]

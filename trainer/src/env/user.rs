@@ -275,10 +275,16 @@ fn sub_steps(task: &Task, model: &Model) -> Result<usize, Mistake> {
     }
     let steps = (t.dt / sim_dt).round();
     if steps < 1.0 || (t.dt / sim_dt - steps).abs() > 1e-9 {
-        let reason = format!(
-            "{} s is not a whole number of the robot file's timestep of {sim_dt} s; change one of them",
-            t.dt
-        );
+        let reason = match task.model.urdf {
+            Some(_) => format!(
+                "{} s is not a whole number of physics steps, which take {sim_dt} s for a URDF; write them as [scene] timestep, or another dt",
+                t.dt
+            ),
+            None => format!(
+                "{} s is not a whole number of the robot file's timestep of {sim_dt} s; change one of them",
+                t.dt
+            ),
+        };
         return Err(mistake("time.dt", reason));
     }
     Ok(steps as usize)
