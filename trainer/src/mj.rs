@@ -178,7 +178,7 @@ impl Model {
             ModelFormat::Urdf if options.floats => keep_fixed_links(&set_afloat(text)?),
             ModelFormat::Urdf => keep_fixed_links(text),
         };
-        let text = packages::resolve(&text, folder);
+        let text = packages::resolve(text, folder);
         sizes::check(&text, folder).map_err(MjError::Load)?;
         let loaded = guard::counting_warnings(|| {
             let model = match scene.is_empty() {

@@ -68,7 +68,6 @@ impl Meaning {
             0 => String::new(),
             more => format!(", and {more} more"),
         };
-        // The text of a receipt is short: what differs comes first.
         let text = format!(
             "{first}{more}: the robot would take its numbers for something else; import or train it with the loop's [command] and motors, or start a \
              loop of its own"

@@ -6,9 +6,9 @@ const SCHEME: &str = "package://";
 
 /// The text with the places of files that are found. They are looked for in the folders of `ROS_PACKAGE_PATH`, in `share` of those of
 /// `AMENT_PREFIX_PATH`, and in and beside the folders that `folder` lies in.
-pub(super) fn resolve(text: &str, folder: Option<&Path>) -> String {
+pub(super) fn resolve(text: String, folder: Option<&Path>) -> String {
     if !text.contains(SCHEME) {
-        return text.to_owned();
+        return text;
     }
     let listed = |name: &str| -> Vec<PathBuf> {
         std::env::var_os(name).map_or_else(Vec::new, |list| std::env::split_paths(&list).collect())
@@ -17,7 +17,7 @@ pub(super) fn resolve(text: &str, folder: Option<&Path>) -> String {
     search.extend(listed("AMENT_PREFIX_PATH").into_iter().map(|prefix| prefix.join("share")));
     let folder = folder.and_then(|folder| folder.canonicalize().ok());
     search.extend(folder.iter().flat_map(|folder| folder.ancestors()).map(Path::to_path_buf));
-    resolve_in(text, &search)
+    resolve_in(&text, &search)
 }
 
 fn resolve_in(text: &str, search: &[PathBuf]) -> String {
@@ -27,12 +27,19 @@ fn resolve_in(text: &str, search: &[PathBuf]) -> String {
         let end = part.find(['"', '\'']).unwrap_or(part.len());
         let (name, rest) = part.split_at(end);
         match place(name, search).and_then(|file| file.to_str().map(str::to_owned)) {
-            Some(file) => resolved.push_str(&file),
+            Some(file) => resolved.push_str(&escaped(&file)),
             None => resolved.extend([SCHEME, name]),
         }
         resolved.push_str(rest);
     }
     resolved
+}
+
+/// As it stands in an attribute: a folder may be called as no XML may.
+fn escaped(file: &str) -> String {
+    [('&', "&amp;"), ('<', "&lt;"), ('"', "&quot;"), ('\'', "&apos;")]
+        .iter()
+        .fold(file.to_owned(), |file, (letter, entity)| file.replace(*letter, entity))
 }
 
 /// Where `arm_description/meshes/link.stl` is.
@@ -88,7 +95,7 @@ mod tests {
 
     #[test]
     fn a_mesh_of_a_package_is_found_beside_the_robot_file_or_its_package_is_named() {
-        let folder = std::env::temp_dir().join(format!("nearl-packages-{}", std::process::id()));
+        let folder = std::env::temp_dir().join(format!("nearl 'packages' & <{}>", std::process::id()));
         let (package, elsewhere) = (folder.join("arm_description"), folder.join("elsewhere"));
         let urdf = package.join("urdf");
         for folder in [&urdf, &package.join("meshes"), &elsewhere] {
