@@ -21,7 +21,7 @@ for seed in range(5):
     positions = np.array(rows)  # (250, 2)
     episodes.append({"q.slider": positions[:, 0], "q.hinge": positions[:, 1]})
 file = f"{folder}/pole.npz"
-demos.from_columns(TASK, episodes, file, dt=0.02)
+demos.from_columns(TASK, episodes, file, dt=0.02, overwrite=True)
 
 agent = nearl.PID2(TASK, "pid2-il", seed=0, demos=file).learn(40_000)
 (obs, _), over, periods = env.reset(seed=100), False, 0

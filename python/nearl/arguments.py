@@ -37,3 +37,16 @@ def threads_of(value: Any) -> int:
     if value is None:
         return os.cpu_count() or 1
     return whole("threads", value, 1, "give at least 1, or leave it out for all cores")
+
+
+def constraints_of(value: Any) -> str:
+    """``"task"``, or a snapshot file; of a run folder the newest one, as ``nearl eval`` and ``nearl run`` take it."""
+    path = os.fspath(value)
+    if path == "task" or not os.path.isdir(path):
+        return path
+    for name in ("final", "latest"):
+        if os.path.isfile(file := os.path.join(path, "checkpoints", f"{name}.safetensors")):
+            return file
+    raise ValueError(
+        f"constraints is '{path}', a folder without checkpoints/final.safetensors or latest.safetensors; give a run folder of a training, or a snapshot file"
+    )

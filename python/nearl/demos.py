@@ -27,12 +27,14 @@ from nearl.recorded import (
     SAME,
     BadDemonstrations,
     Rows,
+    check_others,
     check_period,
     check_units,
     check_velocities,
     column,
     controller,
     goal_names,
+    is_episode,
     numbers,
     observations,
 )
@@ -45,6 +47,7 @@ from nearl.sources import (
     minari_dataset,
     npz_arrays,
     once,
+    renamed,
     seconds_between,
     split,
 )
@@ -62,6 +65,7 @@ def from_columns(
     dt: float,
     actions: Sequence[str] = (),
     period: float | None = None,
+    overwrite: bool = False,
     source: str = "the columns",
 ) -> Path:
     """Writes one file of demonstrations from columns by name.
@@ -70,13 +74,14 @@ def from_columns(
         task: Name of a bundled task, or a task file.
         episodes: For each episode a column (n) by name: ``q.<joint>``, and ``v.<joint>`` where it is known [rad or m, per s]. The base of a robot that floats
             is ``q.<joint>.x y z qw qx qy qz`` and ``v.<joint>.x y z wx wy wz`` (rotation in the body's frame). What was asked for is ``command.<name>``,
-            or as the task's observation calls it (``goal.x``); what it observes and no state gives is a column of the entry's name. Columns of other
-            names are left out.
+            or as the task's observation calls it (``goal.x``); what it observes and no state gives is a column of the entry's name. A column of times is
+            held against ``dt``, one of episode numbers must say the same in every row, and columns of other names are left out with a warning.
         out: File to write (``.npz``).
         dt: Time between two rows [s]. Of a period of several rows the first is taken; otherwise states are interpolated, and what was asked for holds until
             the next row.
         actions: Columns of actions, in the order of the task's actuators; none by default. Their last row is left out.
         period: Policy period [s], where it will not be the task file's (``dt`` times ``policy_every``).
+        overwrite: Writes over a file that is there already, which is refused otherwise.
         source: What messages call the source.
 
     Returns:
@@ -84,7 +89,10 @@ def from_columns(
 
     Raises:
         BadDemonstrations: a column is missing, not finite or of another length, an episode has less than two rows, or numbers that are in other units.
+        FileExistsError: ``out`` is there already.
     """
+    if not overwrite and os.path.exists(out):
+        raise FileExistsError(f"'{os.fspath(out)}' is there already; give another file, remove it, or give overwrite=True")
     if hasattr(episodes, "keys"):
         raise BadDemonstrations(f"{source}: episodes is one table of columns; give a list of them, [table], one for each episode")
     if not isinstance(episodes, Iterable):
@@ -103,6 +111,7 @@ def from_columns(
     parts: dict[str, list[Floats]] = {name: [] for name in ("observations", "qpos", "qvel", "actions")}
     lengths: list[int] = []
     told: set[str] = set()
+    used = {*_known(env), *(actions or ())}
     for i, columns in enumerate(episodes):
         where = f"{source}, episode {i}"
         if not hasattr(columns, "keys"):
@@ -110,7 +119,8 @@ def from_columns(
         qpos, qvel, rates = _states(env, columns, dt, where)
         if (n := len(qpos)) < 2:
             raise BadDemonstrations(f"{where}: {n} rows make no transition; give at least 2")
-        check_units(of_task, _entries(env), qpos, qvel, where)
+        check_others(columns, used, n, dt, where, told)
+        check_units(of_task, _entries(env), qpos, qvel, rates, dt, where, told)
         check_velocities(columns, _entries(env)[1], qvel, rates, where, told)
         rows = Rows(n, dt, period)
         known = [name for name in (*env.obs_names, *goal_names(env)) if name in columns]
@@ -136,16 +146,52 @@ def from_columns(
     return Path(out)
 
 
-def from_csv(task: FilePath, file: FilePath, out: FilePath, *, dt: float, episode: str = "episode", **options: Any) -> Path:
-    """Reads a CSV file with a heading; rows of one episode have the same value in the column ``episode`` (all rows are one where there is none)."""
+def from_csv(
+    task: FilePath,
+    file: FilePath,
+    out: FilePath,
+    *,
+    dt: float,
+    episode: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    actions: Sequence[str] = (),
+    period: float | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Reads a CSV file with a heading.
+
+    Rows of one episode have the same value in the column ``episode``: by default the one that is called so in any spelling (``Episode``,
+    ``episode_index``, ``demo``); where there is none all rows are one. ``columns`` says how the heading calls what the task calls otherwise:
+    ``{"q.shoulder": "Shoulder angle"}``. A column of times (``time``, ``timestamp``) is held against ``dt``. The rest is as in :func:`from_columns`.
+    """
     source = f"'{os.fspath(file)}'"
-    table = csv_table(file)
-    of = column(table, episode, len(table[episode]), source) if episode in table else None
-    return from_columns(task, split(table, of, source), out, dt=dt, source=source, **options)
+    table = renamed(csv_table(file), columns, source)
+    if episode is None:
+        known = {*_known(_core.Env(os.fspath(task))), *(actions or ())}
+        named = [name for name in table if name not in known and is_episode(name)]
+        if len(named) > 1:
+            raise BadDemonstrations(f"{source}: columns {', '.join(named)} may all say of which episode a row is; give episode=, the one that does")
+        episode = named[0] if named else None
+    of = None if episode is None else column(table, episode, len(next(iter(table.values()))), source)
+    kept = {name: values for name, values in table.items() if name != episode}
+    return from_columns(task, split(kept, of, source), out, dt=dt, actions=actions, period=period, overwrite=overwrite, source=source)
 
 
-def from_minari(task: FilePath, dataset: Any, out: FilePath, *, dt: float | None = None, names: Sequence[str] | None = None, **options: Any) -> Path:
-    """Reads a Minari dataset, or the one of that name on this machine, whose observations are those of the task, or have the columns ``names``."""
+def from_minari(
+    task: FilePath,
+    dataset: Any,
+    out: FilePath,
+    *,
+    dt: float | None = None,
+    names: Sequence[str] | None = None,
+    actions: Sequence[str] | None = None,
+    period: float | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Reads a Minari dataset, or the one of that name on this machine, whose observations are those of the task, or have the columns ``names``.
+
+    Its actions come along; ``actions=()`` leaves them out.
+    """
     env = _core.Env(os.fspath(task))
     source = f"Minari dataset '{dataset}'" if isinstance(dataset, str) else "Minari dataset"
     if isinstance(dataset, str):
@@ -154,7 +200,7 @@ def from_minari(task: FilePath, dataset: Any, out: FilePath, *, dt: float | None
         raise BadDemonstrations(f"{source}: {dataset!r} is none; give its name, or what minari.load_dataset returns")
     names = env.obs_names if names is None else names
     once(names, source)
-    options.setdefault("actions", env.actuator_names)
+    actions = env.actuator_names if actions is None else actions
     episodes = []
     for i, e in enumerate(dataset.iterate_episodes()):
         where = f"{source}, episode {i}"
@@ -164,13 +210,14 @@ def from_minari(task: FilePath, dataset: Any, out: FilePath, *, dt: float | None
         if observations.ndim != 2 or observations.shape[1] != len(names):
             raise BadDemonstrations(f"{where}: observations of shape {observations.shape} where {len(names)} columns have names")
         columns = dict(zip(names, observations.T))
-        if options["actions"]:
+        if actions:
             given, want = numbers(e.actions, "array 'actions'", where), (len(observations) - 1, len(env.actuator_names))
             if given.shape != want:
                 raise BadDemonstrations(f"{where}: actions of shape {given.shape} where the task's are {want}; give actions=() to leave them out")
             columns |= dict(zip(env.actuator_names, np.vstack([given, given[-1:]]).T))
         episodes.append(columns)
-    return from_columns(task, episodes, out, dt=env.dt if dt is None else dt, source=source, **options)
+    dt = env.dt if dt is None else dt
+    return from_columns(task, episodes, out, dt=dt, actions=actions, period=period, overwrite=overwrite, source=source)
 
 
 def from_robomimic(
@@ -181,7 +228,8 @@ def from_robomimic(
     dt: float,
     columns: Mapping[str, tuple[str, int]],
     actions: Sequence[str | tuple[str, int]] = (),
-    **options: Any,
+    period: float | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Reads robomimic's HDF5; ``columns`` says which entry of which observation each name is: ``{"q.panda_joint1": ("robot0_joint_pos", 0)}``.
 
@@ -218,7 +266,7 @@ def from_robomimic(
                     has = ", ".join(f"{name} {of.shape}" for name, of in arrays.items() if hasattr(of, "shape")) or "nothing"
                     raise BadDemonstrations(f"{where}: no observation '{key}' with entry {k} for '{name}'; it has {has}")
             episodes.append({name: numbers(arrays[key][:, k], f"'{key}'", where) for name, (key, k) in columns.items()})
-    return from_columns(task, episodes, out, dt=dt, actions=acted, source=source, **options)
+    return from_columns(task, episodes, out, dt=dt, actions=acted, period=period, overwrite=overwrite, source=source)
 
 
 def from_lerobot(
@@ -229,7 +277,8 @@ def from_lerobot(
     names: Sequence[str] | None = None,
     key: str = "observation.state",
     actions: Sequence[str] = (),
-    **options: Any,
+    period: float | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Reads a LeRobot dataset (v3) from its folder: ``key`` frame by frame, at the rate of ``meta/info.json``.
 
@@ -242,6 +291,12 @@ def from_lerobot(
     except ImportError as error:
         raise ImportError("reading a LeRobot dataset needs pyarrow: pip install 'nearl[demos]'") from error
     source, meta = f"'{os.fspath(folder)}'", Path(folder) / "meta" / "info.json"
+    os.stat(folder)  # a folder that is not there is said by the system
+    if not meta.is_file():
+        raise BadDemonstrations(
+            f"{source} is no LeRobot dataset, which is a folder with meta/info.json and data/*/*.parquet; give that folder, and a single parquet file by "
+            f"nearl.demos.from_columns: [table for _, table in pandas.read_parquet(file).groupby('episode_index')], with columns called as the task's"
+        )
     try:
         info = json.loads(meta.read_text())
         features, dt = info["features"], seconds_between(info["fps"], f"'{meta}'")
@@ -281,17 +336,28 @@ def from_lerobot(
         columns |= {f"action of {name}": acted[:, of_action.index(name)] for name in actions}
         actions = [f"action of {name}" for name in actions]
     env = _core.Env(os.fspath(task))
-    used = {*_entries(env)[0], *_entries(env)[1], *env.obs_names, *goal_names(env)}
+    used = _known(env)
     if left := [said for said, name in zip(given if len(given) == len(names) else names, names) if name not in used]:
         warnings.warn(
             f"{source}: of '{key}' {', '.join(left)} {'is' if len(left) == 1 else 'are'} left out, because the task has no such column; give names= if they "
             f"are joints of other names ({', '.join(_entries(env)[0])})",
             stacklevel=2,
         )
-    return from_columns(task, split(columns, np.array(parts["episode_index"]), source), out, dt=dt, actions=actions, source=source, **options)
+        columns = {name: of for name, of in columns.items() if name in used or name in actions} if len(left) < len(names) else columns
+    episodes = split(columns, np.array(parts["episode_index"]), source)
+    return from_columns(task, episodes, out, dt=dt, actions=actions, period=period, overwrite=overwrite, source=source)
 
 
-def from_motion(task: FilePath, file: FilePath, out: FilePath, *, joints: Sequence[str] | None = None, base: str = "root", **options: Any) -> Path:
+def from_motion(
+    task: FilePath,
+    file: FilePath,
+    out: FilePath,
+    *,
+    joints: Sequence[str] | None = None,
+    base: str = "root",
+    period: float | None = None,
+    overwrite: bool = False,
+) -> Path:
     """Reads a motion clip (``.npz``) as retargeting tools write it: ``fps``, ``joint_pos`` (n x joints) and ``joint_names``.
 
     A base that floats is seven entries before the joints in ``joint_pos``, or the first body of ``body_pos_w`` and ``body_quat_w``.
@@ -320,7 +386,12 @@ def from_motion(task: FilePath, file: FilePath, out: FilePath, *, joints: Sequen
                 raise BadDemonstrations(f"{source}: '{name}' has shape {of.shape} where 'joint_pos' has {len(q)} rows; give ({len(q)}, bodies, {width})")
             pose += list(of[:, 0].T)
         columns |= {f"q.{base}.{entry}": of for entry, of in zip(_BASE_Q, pose)}
-    return from_columns(task, [columns], out, dt=seconds_between(clip["fps"], source), source=source, **options)
+    return from_columns(task, [columns], out, dt=seconds_between(clip["fps"], source), period=period, overwrite=overwrite, source=source)
+
+
+def _known(env: _core.Env) -> set[str]:
+    """Names of all columns that the task has a place for."""
+    return {*_entries(env)[0], *_entries(env)[1], *env.obs_names, *goal_names(env)}
 
 
 def _entries(env: _core.Env) -> tuple[list[str], list[str]]:

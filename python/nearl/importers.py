@@ -11,6 +11,8 @@ Live objects are read, never files of theirs: the library that wrote a file load
 
 import math
 import os
+import warnings
+import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -24,6 +26,11 @@ _Layer = tuple[np.ndarray, np.ndarray, str]
 
 # What follows a layer, by the name of the module's class.
 _FUNCTIONS = {"Identity": "identity", "Tanh": "tanh", "ReLU": "relu", "SiLU": "silu", "Sigmoid": "sigmoid", "ELU": "elu", "Softplus": "softplus"}
+# What works in the place of TorchScript.
+_SCRIPT = (
+    "of which nobody reads the layers; give nearl.import_torch the torch.nn.Sequential that it was made from, or export it, "
+    "torch.onnx.export({}, (torch.zeros(1, n),), 'policy.onnx', dynamo=False) with n inputs, and import that file (nearl.import_onnx, `nearl import`)"
+)
 # Modules that do nothing when a policy acts.
 _NOTHING = ("Identity", "Flatten", "Dropout", "FlattenExtractor")
 
@@ -65,6 +72,9 @@ def import_torch(
 ) -> Controller:
     """The controller of a policy that is a ``torch.nn.Sequential`` of linear layers, or that has one as its ``actor``.
 
+    Of a module with a ``forward`` of its own, give the Sequential inside (``module.net``) where that is all it runs; else export it with
+    ``torch.onnx.export`` and read the file with :func:`import_onnx`.
+
     Args:
         module: The live object. An ``actor_obs_normalizer`` of rsl_rl is read with it.
         robot: URDF or MJCF file; or ``task``.
@@ -79,8 +89,11 @@ def import_torch(
     Raises:
         ValueError: a module that is no layer of a policy, by name; or a file.
     """
+    if isinstance(module, str | os.PathLike) and _is_torchscript(module):
+        raise ValueError(f"'{os.fspath(module)}' is a file of TorchScript, {_SCRIPT.format(f'torch.jit.load({os.fspath(module)!r})')}")
     _live(module, "import_torch", "torch.load")
     network = [("actor", module.actor)] if hasattr(module, "actor") else [("", module)]
+    _check_order(*network[0])
     policy = _policy(_layers(network), *_normaliser(module, mean, std), clip, output_clip)
     return _place(policy, robot, recipe, task, name)
 
@@ -99,7 +112,7 @@ def import_sb3(
     Args:
         model: The live object.
         vec_normalize: The ``VecNormalize`` it was trained with; the model's own where it has one. A model that was loaded without its environment
-            does not know of any: load it with ``env=``, or give it here.
+            does not know of any, and a warning says so: load it with ``env=``, or give it here; ``False`` says that there was none.
         task: Task of this package whose environment gives the observation; or ``robot`` and ``recipe``.
         robot: URDF or MJCF file.
         recipe: As for :func:`import_onnx`.
@@ -132,6 +145,14 @@ def import_sb3(
     clip = math.inf
     if vec_normalize is None:
         vec_normalize = getattr(model, "get_vec_normalize_env", lambda: None)()
+        if vec_normalize is None and getattr(model, "get_env", lambda: None)() is None:
+            warnings.warn(
+                "the model has no environment with it (PPO.load without env=), so nobody tells whether it learned behind a VecNormalize: observations are "
+                "taken as they are; if there was one, give it as vec_normalize=VecNormalize.load(file, venv), and vec_normalize=False if there was none",
+                stacklevel=2,
+            )
+    if vec_normalize is False:
+        vec_normalize = None
     if vec_normalize is not None and not hasattr(vec_normalize, "norm_obs"):
         raise ValueError(f"vec_normalize is {vec_normalize!r} and no VecNormalize; give the live object, e.g. VecNormalize.load(file, env)")
     if vec_normalize is not None and vec_normalize.norm_obs:
@@ -220,6 +241,31 @@ def _live(model: Any, name: str, loader: str) -> None:
         raise ValueError(
             f"a table of weights (state_dict) does not say in which order layers run and what follows them; load it into the network it is of, "
             f"network.load_state_dict(...), and give nearl.{name} that"
+        )
+
+
+def _is_torchscript(file: _Path) -> bool:
+    """By the names in the archive; nothing of it is unpickled."""
+    if not zipfile.is_zipfile(file):
+        return False
+    with zipfile.ZipFile(file) as archive:
+        return any("/code/" in name for name in archive.namelist())
+
+
+def _check_order(name: str, module: Any) -> None:
+    """Refuses modules that run their parts in an order of their own, with what can be given in their place."""
+    for at, part in _flat(name, module):
+        kind = type(part).__name__
+        if kind.endswith("ScriptModule") or kind == "TopLevelTracedModule":
+            raise ValueError(f"module {getattr(part, 'original_name', kind)} is TorchScript ({kind}), {_SCRIPT.format('module')}")
+        parts = list(getattr(part, "named_children", lambda: ())())
+        if not parts:
+            continue
+        inner = [f"module.{at}.{of}".replace("..", ".") for of, child in parts if type(child).__name__ == "Sequential"]
+        give = f"where that runs nothing but {' or '.join(inner)}, give nearl.import_torch this; else " if inner else ""
+        raise ValueError(
+            f"module {kind} runs its parts ({', '.join(of for of, _ in parts)}) in its own forward, which is code and not read; {give}export it, "
+            f"torch.onnx.export(module, (torch.zeros(1, n),), 'policy.onnx') with n inputs, and import that file (nearl.import_onnx, `nearl import`)"
         )
 
 

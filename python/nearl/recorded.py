@@ -3,7 +3,8 @@
 import os
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from difflib import get_close_matches
 from numbers import Real
 
 import numpy as np
@@ -21,6 +22,13 @@ _FEW = 5  # rows of motion that say something of a velocity
 _OFF = 0.65  # part of the larger by which velocity and difference must differ: a factor of three, or the sign
 _DRAWS = 3  # episodes in which a state is looked at, to see what is drawn in each
 _LOOKS = 256  # states of an episode that are looked at for it
+_JITTER = 0.05  # part of dt by which recorded times may differ from it
+_GAP = 0.5  # part of dt by which one step of time may
+_UNITS = (1.0, 1e3, 1e6, 1e9)  # of recorded times in a second
+_OUT = 3.0  # times the speed of the rows around at which a step is a jump
+# Columns that say of which episode a row is, and at which time it was, by their names without case and signs.
+_EPISODE = re.compile(r"(episodes?|ep|demo|demonstration|traj|trajectory|rollout|trial)(index|idx|id|number|num|no|nr)?")
+_TIME = re.compile(r"(time|timestamps?|stamp|t|elapsed|seconds|secs?)(s|secs?|seconds|ms|us|ns|milliseconds|microseconds|nanoseconds)?")
 # Names of commands in an expression: `command.x`, or `{command.left-x}` in braces.
 _COMMAND = re.compile(r"\{(command\.[^}]*)\}|(?<![\w.])(command\.[\w.]+)")
 
@@ -82,9 +90,77 @@ def check_period(dt: float, period: float, source: str) -> None:
         )
 
 
-def check_units(of_task: _core.Controller, names: tuple[Sequence[str], Sequence[str]], qpos: Floats, qvel: Floats, where: str) -> None:
+def is_episode(name: object) -> bool:
+    """Whether a column of this name says of which episode a row is, however it is spelt."""
+    return _EPISODE.fullmatch(_letters(name)) is not None
+
+
+def _letters(name: object) -> str:
+    return re.sub(r"[^a-z0-9]", "", str(name).lower())
+
+
+def check_others(columns: Columns, used: Collection[str], n: int, dt: float, where: str, told: set[str]) -> None:
+    """Holds the columns (n) that are not ``used`` against what else is known: one episode, whose rows are ``dt`` apart. Of the rest it warns, once each."""
+    left = []
+    for name in columns:
+        if name in used:
+            continue
+        if is_episode(name):
+            of = np.asarray(columns[name]).ravel()
+            if len(others := np.flatnonzero(of != of[:1])):
+                raise BadDemonstrations(
+                    f"{where}: its column '{name}' is {of[0]} up to row {others[0] - 1} and {of[others[0]]} after it, so this is more than one episode; give a "
+                    f"table for each, in pandas [table for _, table in frame.groupby('{name}')]"
+                )
+        elif _TIME.fullmatch(_letters(name)):
+            _check_times(columns, name, n, dt, where)
+        elif str(name) not in told:
+            left.append(name)
+    if not left:
+        return
+    told.update(map(str, left))
+    free = {name.lower(): name for name in used if name not in columns}
+    said = []
+    for name in left:
+        near = get_close_matches(str(name).lower(), free, 1, 0.8)
+        said.append(f"'{name}'" + (f" (is '{free[near[0]]}' meant?)" if near else ""))
+    are = ("column", "is") if len(said) == 1 else ("columns", "are")
+    none = "it is no position, velocity or observation of the task" if len(said) == 1 else "they are no positions, velocities or observations of the task"
+    warnings.warn(f"{where}: {are[0]} {', '.join(said)} {are[1]} not used: {none}, and not in actions=", stacklevel=3)
+
+
+def _check_times(columns: Columns, name: str, n: int, dt: float, where: str) -> None:
+    """Refuses recorded times (n), in s, ms, µs or ns, between which is no ``dt``."""
+    times = column(columns, name, n, where)
+    steps = np.diff(times)
+    usual = float(np.median(steps))
+    unit = next((unit for unit in _UNITS if abs(usual - dt * unit) <= _JITTER * dt * unit), None)
+    if unit is None:
+        raise BadDemonstrations(
+            f"{where}: column '{name}' goes on by {usual:g} from row to row, and dt is {dt:g} s; correct dt, or leave the column out if it is no "
+            f"time in s, ms, µs or ns"
+        )
+    if len(off := np.flatnonzero(np.abs(steps - dt * unit) > _GAP * dt * unit)):
+        row = int(off[0])
+        raise BadDemonstrations(
+            f"{where}: column '{name}' goes from {times[row]:.10g} in row {row} to {times[row + 1]:.10g} in the next, and dt is {dt:g} s; if rows are missing "
+            f"there or another episode begins, give the rows from there on as an episode of their own (in CSV by a column 'episode'), and leave the column "
+            f"out if its times are not to be believed"
+        )
+
+
+def check_units(
+    of_task: _core.Controller,
+    names: tuple[Sequence[str], Sequence[str]],
+    qpos: Floats,
+    qvel: Floats,
+    rates: Floats,
+    dt: float,
+    where: str,
+    told: set[str],
+) -> None:
     """Refuses positions (n x nq) further outside the task's limits than these are apart and than half a turn, and warns of speeds (n x nv) that are far
-    above theirs."""
+    above theirs, and of single rows between which a joint jumps (``rates``, n - 1 x nv)."""
     limits, dofs = of_task.limits, of_task.row_names
     for k, name in enumerate(names[1]):
         joint = name[2:]
@@ -102,6 +178,11 @@ def check_units(of_task: _core.Controller, names: tuple[Sequence[str], Sequence[
                     f"if these are degrees or millimetres, give numpy.radians of them, or metres"
                 )
         limit = limits["velocity"][dof]
+        if (at := _jump(rates[:, k], limit)) is not None and "q." + joint in names[0]:
+            if (key := f"jump of {joint}") not in told:
+                told.add(key)
+                _warn_of_jump(joint, qpos[:, names[0].index("q." + joint)], at, dt, limit, where)
+            continue
         row = int(np.argmax(np.abs(qvel[:, k])))
         if (speed := abs(qvel[row, k])) > _FAST * limit > 0:
             warnings.warn(
@@ -109,6 +190,25 @@ def check_units(of_task: _core.Controller, names: tuple[Sequence[str], Sequence[
                 f"look whether its columns are in rad or m, and dt in seconds",
                 stacklevel=3,
             )
+
+
+def _jump(rate: Floats, limit: float) -> int | None:
+    """The row after which a joint is faster (n - 1) than its limit, and far faster than before and after."""
+    speed = np.abs(rate)
+    beside = np.pad(speed, 1)
+    out = (speed > limit) & (speed > _OUT * np.maximum(beside[:-2], beside[2:]))
+    return int(np.argmax(np.where(out, speed, 0.0))) if limit > 0 and out.any() else None
+
+
+def _warn_of_jump(joint: str, positions: Floats, row: int, dt: float, limit: float, where: str) -> None:
+    a, b = positions[row : row + 2]
+    turned = abs(abs(b - a) / (2 * np.pi) - 1) < 0.1
+    reason = "take the turn out with numpy.unwrap" if turned else "look whether rows are missing there, or another episode begins (in CSV a column 'episode')"
+    warnings.warn(
+        f"{where}: joint '{joint}' jumps from {a:.3g} in row {row} to {b:.3g} in the next, {abs(b - a) / dt:.3g} rad/s or m/s with dt = {dt:g} s, where the "
+        f"task's limit is {limit:.3g}; {reason}",
+        stacklevel=4,
+    )
 
 
 def check_velocities(columns: Columns, names: Sequence[str], qvel: Floats, rates: Floats, where: str, told: set[str]) -> None:

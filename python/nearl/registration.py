@@ -5,6 +5,7 @@ plug-ins by itself: the ``gymnasium.envs`` entry point of earlier versions is no
 """
 
 import os
+import warnings
 
 import gymnasium
 
@@ -15,6 +16,8 @@ def register(*task_files: str | os.PathLike[str]) -> list[str]:
     """Registers the bundled tasks, or the task files given; returns the ids, ``nearl/<name in the file>``.
 
         env = gymnasium.make(nearl.register("my_task.toml")[0])
+
+    A file of a name that another file was registered under takes its id, with a warning; the same file is read anew.
 
     Raises:
         OSError: a task file or its robot cannot be read.
@@ -27,7 +30,13 @@ def register(*task_files: str | os.PathLike[str]) -> list[str]:
         env = _core.Env(os.fspath(file))
         if env.task in bundled:
             raise ValueError(f"{os.fspath(file)} [name]: '{env.task}' is a bundled task, whose id it would take; give the file another name")
-        gymnasium.registry.pop(f"nearl/{env.task}", None)
+        before = gymnasium.registry.pop(f"nearl/{env.task}", None)
+        if before is not None and (other := before.kwargs["task"]) != os.path.abspath(file) and os.path.realpath(other) != os.path.realpath(file):
+            warnings.warn(
+                f"'{os.fspath(file)}' takes the id nearl/{env.task} of '{other}', whose [name] is the same: the id makes environments of the new file from now "
+                f"on; give one of the two another name",
+                stacklevel=2,
+            )
         ids.append(_register(env.task, os.path.abspath(file), env.max_episode_steps))
     return ids
 

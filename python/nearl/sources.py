@@ -18,6 +18,7 @@ FilePath = str | os.PathLike[str]
 # How files begin that are often taken for CSV.
 _NO_TEXT = {
     b"PK": "a zip or .npz file, no CSV; give the text file",
+    b"PAR1": "a parquet file, no CSV; give nearl.demos.from_columns what pandas.read_parquet makes of it, a table for each episode",
     b"\x1f\x8b": "compressed with gzip; unpack it first",
     b"\xff\xfe": "text in UTF-16; save it as UTF-8",
     b"\xfe\xff": "text in UTF-16; save it as UTF-8",
@@ -49,13 +50,28 @@ def split(table: Mapping[str, Floats], of: NDArray[Any] | None, source: str) -> 
     return [{name: values[a:b] for name, values in table.items()} for a, b in pairwise(begins)]
 
 
+def renamed(table: Mapping[str, Floats], columns: Any, source: str) -> dict[str, Floats]:
+    """A table by the task's names, which ``columns`` maps to those of its heading; columns that are not in it keep theirs."""
+    if columns is None:
+        return dict(table)
+    if not isinstance(columns, Mapping):
+        raise BadDemonstrations(f"{source}: columns is {columns!r}; give the heading's name of each column, as {{'q.shoulder': 'Shoulder angle'}}")
+    for name, given in columns.items():
+        if not isinstance(given, str) or given not in table:
+            raise BadDemonstrations(f"{source}: columns['{name}'] is {given!r}, and its heading has no such column; it has {', '.join(table)}")
+    taken = set(columns.values())
+    once([*columns, *(name for name in table if name not in taken)], source)
+    return {name: table[given] for name, given in columns.items()} | {name: of for name, of in table.items() if name not in taken}
+
+
 def csv_table(file: FilePath) -> dict[str, Floats]:
     """Columns (n) of a CSV file by the names of its heading."""
     source = f"'{os.fspath(file)}'"
     with open(file, "rb") as data:
-        begin = data.read(2)
-    if begin in _NO_TEXT:
-        raise BadDemonstrations(f"{source} is {_NO_TEXT[begin]}")
+        begin = data.read(4)
+    for sign, what in _NO_TEXT.items():
+        if begin.startswith(sign):
+            raise BadDemonstrations(f"{source} is {what}")
     values = array("d")
     with open(file, newline="", encoding="utf-8-sig") as text:
         lines = csv.reader(text, skipinitialspace=True)

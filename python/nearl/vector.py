@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import seed_of, threads_of, whole
+from nearl.arguments import constraints_of, seed_of, threads_of, whole
 from nearl.outcome import Floats, Outcome, ask
 
 Step = tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
@@ -53,12 +54,14 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         mode = AutoresetMode(autoreset_mode)
         if mode is AutoresetMode.DISABLED:
             raise ValueError("autoreset_mode is Disabled, which is not offered; use NextStep or SameStep")
+        if isinstance(num_envs, float):
+            raise ValueError(f"num_envs is {num_envs!r}, no int; ask for at least one environment, as num_envs=4")
         num_envs = whole("num_envs", num_envs, 1, "ask for at least one environment")
         seed, threads = seed_of(seed, num_envs), threads_of(threads)
         if max_episode_steps is not None:
             max_episode_steps = whole("max_episode_steps", max_episode_steps, 1, "give at least one control period")
         task = os.fspath(task)
-        constraints = None if constraints is None else os.fspath(constraints)
+        constraints = None if constraints is None else constraints_of(constraints)
         same_step = mode is AutoresetMode.SAME_STEP
         self._native = _core.VecEnv(task, num_envs, constraints, seed, threads, max_episode_steps, same_step, actions)
         self.num_envs = num_envs
@@ -77,6 +80,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Begins an episode everywhere. ``seed``: one for all (environment ``i`` gets ``seed + i``) or one each."""
+        self._check_open()
         if options:
             raise ValueError(f"reset options {sorted(options)} are not known; this vector takes none")
         if seed is None:
@@ -92,6 +96,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
 
     def step(self, actions: ArrayLike) -> Step:  # type: ignore[override]  # flags are booleans
         """One action (num_envs x n_act) each; an environment whose episode ended begins a new one, see the autoreset mode."""
+        self._check_open()
         began = self._over
         own = self._reward is None and self._termination is None
         stepped = self._native.step(actions) if own else self._scored(np.asarray(actions, float))
@@ -126,8 +131,13 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         self._obs = obs.copy()
         return obs, rewards, terminated, truncated, info
 
+    def _check_open(self) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError("the vector was closed, and neither steps nor begins an episode any more; make another one with nearl.make_vec")
+
     def set_state(self, index: int, qpos: ArrayLike, qvel: ArrayLike) -> None:
         """Begins an episode of environment ``index`` at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention."""
+        self._check_open()
         self._native.set_state(index, np.asarray(qpos, float).tolist(), np.asarray(qvel, float).tolist())
         self._obs[index] = self._native.end([False] * self.num_envs)[index]
         self._over[index] = False
@@ -171,10 +181,10 @@ def make_vec(
     Args:
         task: Name of the task, one of ``nearl.tasks()``, or a task file (TOML) with a robot of your own.
         num_envs: Number of environments.
-        constraints: None: an action is what the actuators get. ``"task"`` (tasks with analytic inverse dynamics) or the snapshot
-            file of a trained agent: an action is the proposed next state, one entry per ``native.action_names``; it is projected
-            onto the constraints and inverted to an action by the controller that also runs on the robot. A step then spans one
-            policy period.
+        constraints: None: an action is what the actuators get. ``"task"`` (tasks with analytic inverse dynamics), or the snapshot
+            file of a trained agent, or its run folder, of which the newest is taken: an action is the proposed next state, one entry
+            per ``native.action_names``; it is projected onto the constraints and inverted to an action by the controller that also
+            runs on the robot. A step then spans one policy period.
         actions: What an action is with ``constraints``. ``"state"``: the proposed next state. ``"change"``: its change in [-1, 1], in units of what
             the limits allow in a policy period (of a trained agent, of three standard deviations of its changes). ``"guarded"`` (with
             ``constraints="task"``): what the actuators get, which gives way where the state it leads to would break a limit; the robot model tells

@@ -101,7 +101,7 @@ def test_velocities_that_positions_do_not_follow_are_warned_of(tmp_path: Path, f
     assert sum("changes by" in str(warning.message) for warning in told) == 1
     every = {name: factor * of if name.startswith("v.") else of for name, of in right[1].items()}
     with pytest.warns(UserWarning, match=r"likewise .*v.foot_joint"):
-        demos.from_columns("Hopper-v5", [every], tmp_path / "a.npz", dt=0.008)
+        demos.from_columns("Hopper-v5", [every], tmp_path / "b.npz", dt=0.008)
 
 
 @pytest.mark.parametrize("task", ["HalfCheetah-v5", "Hopper-v5", "Ant-v5", "Panda-reach", "Walker2d-v5"])
@@ -198,14 +198,14 @@ def test_robomimic(tmp_path: Path) -> None:
     expected = np.concatenate([np.stack([part[name] for name in "abc"], 1)[:-1] for part in parts.values()])
     named = which | {"first": ("actions", 1), "second": ("actions", 2), "third": ("actions", 0)}
     for columns, actions in ((which, [("actions", 1), ("actions", 2), ("actions", 0)]), (named, ["first", "second", "third"])):
-        out = demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "c.npz", dt=0.008, columns=columns, actions=actions)
+        out = demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "c.npz", dt=0.008, columns=columns, actions=actions, overwrite=True)
         assert np.array_equal(checked(out)["actions"], expected)
     with pytest.raises(demos.BadDemonstrations, match=r"no observation 'actions' with entry 3 for 'actions\[2\]'; it has .*actions \(12, 3\)"):
         actions = [("actions", k) for k in (1, 2, 3)]
-        demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "c.npz", dt=0.008, columns=which, actions=actions)
+        demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "d.npz", dt=0.008, columns=which, actions=actions)
     for actions, words in ([["a", 1.5]], r"columns\['actions\[0\]'\] is \['a', 1.5\]; give the"), ("actions", "actions is 'actions'; give one column for each"):
         with pytest.raises(demos.BadDemonstrations, match=words):
-            demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "c.npz", dt=0.008, columns=which, actions=actions)
+            demos.from_robomimic("Hopper-v5", tmp_path / "low_dim.hdf5", tmp_path / "d.npz", dt=0.008, columns=which, actions=actions)
 
 
 def test_lerobot(tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
+import zipfile
 from types import SimpleNamespace
 
 import numpy as np
@@ -509,6 +511,52 @@ def test_live_modules_are_read(tmp_path) -> None:
         nearl.import_torch(Sequential([Linear(14, 3), LayerNorm()]), **files)
 
 
+def test_what_works_in_the_place_of_a_module_of_ones_own_is_said(tmp_path) -> None:
+    """Modules by what torch calls them and their parts; `test_torch_modules_are_read` has torch itself where it is installed."""
+    files = planar(tmp_path)
+    net = Sequential([Linear(14, 9), Tanh(), Linear(9, 3)])
+
+    class Own:
+        def __init__(self, **parts):
+            self.parts = parts
+
+        def named_children(self):
+            return self.parts.items()
+
+    for module, said in (
+        (Own(net=net), r"module Own runs its parts \(net\) .* nothing but module.net, give nearl.import_torch this; else export it, torch.onnx.export\(module"),
+        (SimpleNamespace(actor=Own(net=net)), "nothing but module.actor.net, give"),
+        (Own(first=Linear(14, 9), last=Linear(9, 3)), r"module Own runs its parts \(first, last\) in its own forward, which is code and not read; export it"),
+        (type("RecursiveScriptModule", (), {"original_name": "Policy"})(), "module Policy is TorchScript .* made from, or export it, .*dynamo=False"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            nearl.import_torch(module, **files)
+    with zipfile.ZipFile(tmp_path / "script.pt", "w") as archive:
+        archive.writestr("script/data.pkl", b"never read")
+        archive.writestr("script/code/__torch__/policy.py", "")
+    with pytest.raises(ValueError, match=r"script.pt' is a file of TorchScript, .*torch.onnx.export\(torch.jit.load\('.*script.pt'\), .*nearl.import_onnx"):
+        nearl.import_torch(tmp_path / "script.pt", **files)
+
+
+def test_a_model_without_its_environment_is_said_to_be_taken_as_it_is() -> None:
+    """Only there does nobody know whether a VecNormalize is missing."""
+    lost = ppo(17, 6, get_env=lambda: None, get_vec_normalize_env=lambda: None)
+    with pytest.warns(UserWarning, match=r"no environment with it .* taken as they are; .* vec_normalize=VecNormalize.load.* vec_normalize=False"):
+        taken = nearl.import_sb3(lost, task="HalfCheetah-v5")
+    rms = SimpleNamespace(mean=np.ones(17), var=np.ones(17))
+    norm = SimpleNamespace(norm_obs=True, clip_obs=10.0, epsilon=1e-8, obs_rms=rms)
+    obs = RNG.normal(size=17)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        plain, normalised = (nearl.import_sb3(lost, given, task="HalfCheetah-v5") for given in (False, norm))
+        with_env = ppo(17, 6, get_env=lambda: SimpleNamespace(has_attr=lambda _: False), get_vec_normalize_env=lambda: None)
+        nearl.import_sb3(with_env, task="HalfCheetah-v5")
+        with_env.get_vec_normalize_env = lambda: norm
+        nearl.import_sb3(with_env, task="HalfCheetah-v5")
+    np.testing.assert_allclose(plain.act(obs), normalised.act(obs + 1.0), atol=1e-5)
+    assert np.array_equal(taken.act(obs), plain.act(obs)) and not np.allclose(taken.act(obs), normalised.act(obs), atol=1e-2)
+
+
 def test_the_actors_of_stable_baselines_are_read() -> None:
     """Objects with SB3's attributes; its own are too large a requirement for every test run."""
     box = SimpleNamespace(low=np.full(6, -1.0), high=np.full(6, 1.0))
@@ -710,3 +758,29 @@ def test_the_pose_is_added_to_positions_alone(tmp_path, interface: str, added: b
     recipe.write_text(recipe.read_text().replace("[0.3, -0.2, 0.1]", "[0.3]"))
     with pytest.raises(ValueError, match="policy.pose has 1 positions for 3 joints"):
         nearl.import_onnx(policy, robot=robot, recipe=recipe)
+
+
+def test_torch_modules_are_read(tmp_path) -> None:
+    torch = pytest.importorskip("torch")
+    files = planar(tmp_path)
+
+    class Own(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = torch.nn.Sequential(torch.nn.Linear(14, 9), torch.nn.Tanh(), torch.nn.Linear(9, 3))
+
+        def forward(self, x):
+            return self.net(x)
+
+    own = Own()
+    nearl.import_torch(own.net, **files)
+    with pytest.raises(ValueError, match="nothing but module.net, give nearl.import_torch this"):
+        nearl.import_torch(own, **files)
+    script = torch.jit.trace(own, torch.zeros(1, 14))
+    with pytest.raises(ValueError, match="module Own is TorchScript"):
+        nearl.import_torch(script, **files)
+    script.save(tmp_path / "own.pt")
+    with pytest.raises(ValueError, match="is a file of TorchScript"):
+        nearl.import_torch(tmp_path / "own.pt", **files)
+    torch.onnx.export(script, (torch.zeros(1, 14),), tmp_path / "own.onnx", dynamo=False)
+    nearl.import_onnx(tmp_path / "own.onnx", **files)

@@ -101,6 +101,15 @@ def test_callbacks_see_metrics_and_stop_the_learning() -> None:
     assert {"rollout/ep_rew_mean", "time/fps", "train/approx_kl"} <= seen[-1].keys()
 
 
+@pytest.mark.parametrize(("answer", "stops"), [(False, True), (np.False_, True), (np.bool_(True), False), (None, False), (0, False), (0.0, False), ("", False)])
+def test_a_callback_stops_by_false_of_python_or_numpy_alone(answer: object, stops: bool) -> None:
+    calls: list[int] = []
+    agent = nearl.PID2(CART_POLE, algo="ppo", settings=SMALL)
+    agent.learn(3 * 256, callback=lambda _, metrics: (calls.append(1), answer)[1])
+    assert len(calls) == (1 if stops else 3)
+    assert "of Python or NumPy" in (nearl.PID2.learn.__doc__ or "")
+
+
 def test_the_same_seed_gives_the_same_policy_on_any_number_of_threads() -> None:
     digest = lambda seed, threads: nearl.PID2(CART_POLE, seed=seed, threads=threads).learn(5000).controller.digest  # noqa: E731
     assert digest(0, 1) == digest(0, 3) != digest(1, 1)

@@ -141,7 +141,7 @@ def test_the_period_is_the_policys(tmp_path: Path) -> None:
     columns = recording(90, 0.005)
     columns["v.shoulder"] = np.arange(90) / 90
     for dt, rows in ((0.02, slice(None)), (0.005, slice(None, None, 4))):
-        file = demos.from_columns(task, [columns], tmp_path / "a.npz", dt=dt)
+        file = demos.from_columns(task, [columns], tmp_path / "a.npz", dt=dt, overwrite=True)
         with np.load(file) as data:
             assert float(data["dt"]) == 0.02
             assert np.array_equal(data["qpos"][:, 1], columns["q.elbow"][rows]) and np.array_equal(data["qvel"][:, 0], columns["v.shoulder"][rows])

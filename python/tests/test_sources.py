@@ -137,7 +137,7 @@ def test_minari_datasets_are_found_by_name_or_refused(tmp_path: Path, monkeypatc
         return data(observed, np.zeros((8, 3)))
 
     monkeypatch.setitem(__import__("sys").modules, "minari", SimpleNamespace(load_dataset=load))
-    read = lambda dataset, **more: demos.from_minari(TASK, dataset, tmp_path / "out.npz", **more)  # noqa: E731
+    read = lambda dataset, **more: demos.from_minari(TASK, dataset, tmp_path / "out.npz", overwrite=True, **more)  # noqa: E731
     with np.load(read("mujoco/hopper-v0")) as made:
         assert made["lengths"].tolist() == [8] and loaded == ["mujoco/hopper-v0"]
     for dataset, said in (

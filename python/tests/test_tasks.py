@@ -1,6 +1,7 @@
 """Tasks of the user's own and costs, through Gymnasium and through a vector; rewards and terminations by functions."""
 
 import shutil
+import warnings
 from pathlib import Path
 
 import gymnasium
@@ -29,6 +30,22 @@ def test_a_task_file_is_a_gymnasium_environment() -> None:
     assert reward == pytest.approx(obs[2] - 0.1 * obs[0] ** 2 - 0.01 * 0.25, abs=1e-12) and not terminated and info == {}
     env.reset(options={"qpos": [0, 0.39], "qvel": [0, 3.0]})
     assert env.step(np.zeros(1))[2], "it fell"
+
+
+def test_another_file_under_the_same_name_takes_its_id_with_a_warning(tmp_path: Path) -> None:
+    shutil.copy(CART_POLE.with_suffix(".xml"), tmp_path)
+    other, link = tmp_path / "other.toml", tmp_path / "link.toml"
+    other.write_text(CART_POLE.read_text().replace("max_episode_steps = 500", "max_episode_steps = 7"))
+    link.symlink_to(other)
+    nearl.register(CART_POLE)
+    with pytest.warns(UserWarning, match=r"other.toml' takes the id nearl/cart-pole of '.*cart-pole.toml', whose \[name\] is the same"):
+        (env_id,) = nearl.register(other)
+    assert gymnasium.spec(env_id).max_episode_steps == 7
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        nearl.register(other, str(other), link)
+    with pytest.warns(UserWarning, match="takes the id"):
+        nearl.register(CART_POLE)
 
 
 def test_a_task_file_is_a_vector() -> None:

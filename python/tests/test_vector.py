@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from conftest import ROBOTS
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import nearl
@@ -208,6 +209,8 @@ def test_a_constrained_step_is_cubic_projection_and_inverse_dynamics() -> None:
     [
         ({"num_envs": 0}, "num_envs is 0; ask for at least one environment"),
         ({"num_envs": "4"}, "num_envs is '4'; ask for at least one environment"),
+        ({"num_envs": 2.0}, "num_envs is 2.0, no int; ask for at least one environment"),
+        ({"num_envs": np.float64(2)}, r"num_envs is .*2.0.*, no int"),
         ({"threads": 0}, "threads is 0; give at least 1"),
         ({"threads": "2"}, "threads is '2'; give at least 1"),
         ({"seed": -1}, r"seed is -1; give a whole number from 0 to 2\*\*64 - 2"),
@@ -219,6 +222,43 @@ def test_a_constrained_step_is_cubic_projection_and_inverse_dynamics() -> None:
 def test_numbers_that_no_vector_has_are_refused(arguments, words) -> None:
     with pytest.raises(ValueError, match=words):
         nearl.VecEnv("Hopper-v5", **{"num_envs": 2} | arguments)
+
+
+def test_a_closed_vector_neither_steps_nor_resets() -> None:
+    """As an `AsyncVectorEnv` of Gymnasium: the error is Gymnasium's own."""
+    vec = nearl.make_vec("Hopper-v5", 2)
+    vec.reset(seed=0)
+    qpos, qvel = vec.native.qpos[0], vec.native.qvel[0]
+    vec.close()
+    vec.close()
+    for use in (vec.reset, lambda: vec.step(np.zeros((2, 3))), lambda: vec.set_state(0, qpos, qvel)):
+        with pytest.raises(ClosedEnvironmentError, match="the vector was closed, .*; make another one with nearl.make_vec"):
+            use()
+
+
+def test_a_run_folder_is_its_newest_policy(tmp_path: Path) -> None:
+    """Of vectors and of single environments; actions are projected as by the file itself."""
+    run = tmp_path / "run"
+    small = {"train.n_envs": 2, "train.n_steps": 64, "train.ppo.batch_size": 32, "train.ppo.n_epochs": 1}
+    nearl.PID2("HalfCheetah-v5", "pid2-ib", run=run, settings=small).learn(256)
+    (snapshot,) = (file for file in (run / "checkpoints").glob("*.safetensors") if file.stem in ("final", "latest"))
+    results = []
+    for constraints in (run, snapshot):
+        vec = nearl.make_vec("HalfCheetah-v5", 2, constraints)
+        vec.reset(seed=3)
+        vec.action_space.seed(3)
+        results.append([vec.step(vec.action_space.sample())[0] for _ in range(5)])
+    assert np.array_equal(*results)
+    assert nearl.ProjectedEnv("HalfCheetah-v5", str(run)).action_space.shape == vec.single_action_space.shape
+    for make in (lambda: nearl.make_vec("HalfCheetah-v5", 2, tmp_path), lambda: nearl.ProjectedEnv("HalfCheetah-v5", tmp_path)):
+        with pytest.raises(ValueError, match="a folder without checkpoints/final.safetensors or latest.safetensors; give a run folder"):
+            make()
+
+
+def test_a_folder_called_task_is_not_the_tasks_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "task").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert nearl.make_vec("Panda-reach", 1, "task").num_envs == 1
 
 
 def test_seeds_of_a_reset_are_whole_numbers() -> None:

@@ -54,7 +54,7 @@ def main(clip: Path, folder: Path, first: int = 0, last: int | None = None) -> N
     text = (HERE / "g1.toml").read_text().replace("max_episode_steps = 1", f"max_episode_steps = {len(q) - 1}")
     text += f'\n[metrics]\neffort = {{ max = "{share_of_effort(ROBOT)}" }}\n'
     task.write_text(text)
-    demos.from_motion(task, cut, out, base=BASE)
+    demos.from_motion(task, cut, out, base=BASE, overwrite=True)
     with np.load(out) as data:
         q, v = data["qpos"][0], data["qvel"][0]
     table = lambda names, values: ", ".join(f'"{name}" = {x:.6f}' for name, x in zip(names, values, strict=True))  # noqa: E731
