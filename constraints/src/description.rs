@@ -199,6 +199,11 @@ impl JointDescription {
     }
 }
 
+/// How the note of a joint begins that mimics another, `q = multiplier q_other + offset`: a task whose limits hold the two together needs it no more.
+pub fn mimics(joint: &str, other: &str, multiplier: f64, offset: f64) -> String {
+    format!("joint '{joint}' mimics '{other}' in the file (multiplier {multiplier}, offset {offset})")
+}
+
 impl RobotDescription {
     /// All joints in the order of the velocities.
     pub fn joints(&self) -> impl Iterator<Item = &JointDescription> {

@@ -7,7 +7,7 @@ mod collision;
 mod notes;
 
 use crate::ModelError;
-use crate::description::{Body, Frame, JointDescription, JointKind, Motor, Range, RobotDescription};
+use crate::description::{Body, Frame, JointDescription, JointKind, Motor, Range, RobotDescription, mimics};
 use crate::geometry::Placement;
 pub(crate) use check::ROUNDING;
 use check::{check_joint, check_link, check_tree};
@@ -268,15 +268,18 @@ fn empty(root: Node) -> RobotDescription {
     }
 }
 
-/// A mimic joint is one of its own here.
+/// A mimic joint is one of its own to the limits.
 fn mimic(joint: Node) -> Option<String> {
     let mimic = joint.children().find(|n| n.has_tag_name("mimic"))?;
     let (name, of) = (joint.attribute("name").unwrap_or("?"), mimic.attribute("joint").unwrap_or("?"));
-    let number = |key, default| mimic.attribute(key).unwrap_or(default).to_string();
-    let (multiplier, offset) = (number("multiplier", "1"), number("offset", "0"));
+    let (multiplier, offset) =
+        (number(mimic, "multiplier").unwrap_or(1.0), number(mimic, "offset").unwrap_or(0.0));
+    let begins = mimics(name, of, multiplier, offset);
+    let by = -multiplier;
     Some(format!(
-        "joint '{name}' mimics '{of}' in the file (multiplier {multiplier}, offset {offset}), but moves on its own in this model: leave it out of \
-         the controllable joints, or hold both together with a row"
+        "{begins}: a simulation holds the two together, and the limits do not know of it; command both and hold them together with \
+         rows = [{{ name = \"mimic\", terms = {{ \"q.{name}\" = 1.0, \"q.{of}\" = {by:?} }}, equals = {offset:?} }}] in [constraints], or leave both \
+         out of the controllable joints"
     ))
 }
 

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
+use nearl_constraints::description::{Command, Motor, mimics};
 use nearl_constraints::{Drive, MADE_UP_FOR, REGISTRY, certify_braking};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
@@ -218,6 +219,8 @@ pub fn told(m: &Manifest) -> Result<Vec<String>, SnapshotError> {
 fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     let Parts { model, projector, layout, .. } = parts;
     let mut notes = [model.notes(), projector.notes()].concat();
+    let settled = settled_mimics(m, parts);
+    notes.retain(|note| !settled.iter().any(|begins| note.starts_with(begins)));
     // Joints that follow positions or velocities by themselves make up for their own friction.
     let by_force = |drive: &Drive| matches!(drive, Drive::Effort | Drive::Pd { .. });
     let drives = Parts::drives(m, model, layout.controllable());
@@ -230,6 +233,29 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     notes.extend(beyond_motors(m, parts, &drives));
     notes.extend(unguarded(m));
     notes
+}
+
+/// How notes begin of joints that mimic others and that a row holds together, or that nothing commands.
+fn settled_mimics(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Vec<String> {
+    let loose =
+        |name: &str| model.joint(name).is_ok_and(|joint| !layout.controllable().contains(&joint.idx_v));
+    let mut begins = Vec::new();
+    for row in &m.task.constraints.rows {
+        let terms: Vec<_> =
+            row.terms.iter().filter_map(|(name, c)| Some((name.strip_prefix("q.")?, *c))).collect();
+        let ([(a, of_a), (b, of_b)], Some(equals), None) = (&terms[..], row.equals, row.soft) else {
+            continue;
+        };
+        // q_a + (of_b / of_a) q_b = equals / of_a, whichever of the two follows; without the sign of a zero.
+        begins.push(mimics(a, b, 0.0 - of_b / of_a, equals / of_a + 0.0));
+        begins.push(mimics(b, a, 0.0 - of_a / of_b, equals / of_b + 0.0));
+    }
+    let notes = model.notes().iter().filter(|note| {
+        let mut names = note.split('\'').skip(1).step_by(2);
+        note.starts_with("joint '") && note.contains("' mimics '") && names.by_ref().take(2).all(loose)
+    });
+    begins.extend(notes.cloned());
+    begins
 }
 
 /// Limits that nothing is held to: those of states, of a policy that gives actions.
@@ -294,10 +320,17 @@ fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> 
         })
     };
     let joints: Vec<String> = dofs.iter().enumerate().filter_map(cut).collect();
+    let states_range = |motor: &Motor| {
+        matches!(motor.command, Command::Position | Command::Pd) && motor.control_range.is_some()
+    };
+    let next = match model.motors().iter().any(states_range) {
+        true => "give the actuators that ctrlrange, less speed or less damping",
+        false => "make the snapshot anew with this robot file and these limits",
+    };
     (!joints.is_empty()).then(|| {
         format!(
             "a drive's targets are cut at its range, and limits on acceleration and position are not promised where they are: {} [rad or m]; \
-             give the actuators that ctrlrange, less speed or less damping",
+             {next}",
             joints.join(", ")
         )
     })

@@ -2,9 +2,10 @@
 
 use crate::vector::{VectorError, space};
 use crate::{env, tasks, train};
-use nearl_runtime::constraints::{Drive, Guard};
+use nearl_runtime::constraints::description::Command;
+use nearl_runtime::constraints::{Drive, Guard, Model};
 use nearl_runtime::controller::Parts;
-use nearl_runtime::task::IdmKind;
+use nearl_runtime::task::{IdmKind, Task};
 use nearl_runtime::{Manifest, Snapshot};
 
 /// A snapshot whose own policy keeps the robot where it is (states), or asks for nothing (`actions`, behind the guard).
@@ -56,25 +57,66 @@ fn range(manifest: &mut Manifest) -> Result<(), VectorError> {
     let motors = Parts::motors(&model, layout.controllable(), &drives)?;
     let mut places = vec![(0.0, 0.0); layout.controllable().len()];
     for (k, &dof) in layout.controllable().iter().enumerate() {
-        let (iq, effort) = (model.joint_of_dof(dof).idx_q, model.effort_limit()[dof]);
-        let (lower, upper) = (model.lower_position_limit()[iq], model.upper_position_limit()[iq]);
-        let (low, high) = match drives[dof] {
-            Drive::Effort => (motors.action(k, -effort), motors.action(k, effort)),
-            Drive::Pd { .. } => {
-                let reach = drives[dof].reach(&manifest.task.period(), effort, model.velocity_limit()[dof]);
-                (lower - reach, upper + reach)
-            }
-            Drive::Position => (lower, upper),
-            Drive::Velocity => (-model.velocity_limit()[dof], model.velocity_limit()[dof]),
-        };
+        let [low, high] = commands(&manifest.task, &model, drives[dof], dof);
         if !(low.is_finite() && high.is_finite()) {
             return Err(VectorError::Unusable(format!(
-                "task '{name}': the robot file does not bound what joint '{}' can be sent; give it position, velocity and effort limits",
-                model.dof_name(dof)
+                "task '{name}': nothing bounds what joint '{}' can be sent; {}",
+                model.dof_name(dof),
+                bound_by(drives[dof], &model, dof)
             )));
         }
-        places[motors.place(k)] = (low.min(high), low.max(high));
+        let ends = [motors.action(k, low), motors.action(k, high)];
+        places[motors.place(k)] = (ends[0].min(ends[1]), ends[0].max(ends[1]));
     }
     (manifest.action_lower, manifest.action_upper) = places.into_iter().unzip();
     Ok(())
+}
+
+/// What would bound the commands of a joint.
+fn bound_by(drive: Drive, model: &Model, dof: usize) -> &'static str {
+    match drive {
+        Drive::Effort => {
+            "write its effort into the robot file: effort in <limit> of a URDF, ctrlrange of an MJCF's motor"
+        }
+        Drive::Pd { .. } if model.effort_limit()[dof].is_infinite() => {
+            "write its effort into the robot file: effort in <limit> of a URDF, forcerange of an MJCF's actuator"
+        }
+        Drive::Velocity => {
+            "write velocity into its <limit> in a URDF, or limit under constraints.velocity of the task: an MJCF has no place for it"
+        }
+        _ => {
+            "write its range into the robot file: lower and upper in <limit> of a URDF, range of an MJCF's joint"
+        }
+    }
+}
+
+/// Lowest and highest command of a joint, infinite where nothing bounds it: all that its motor gives; of a drive the control range that the robot
+/// file states for it, else the targets that may ask for the whole effort somewhere, at any speed that file and task know.
+pub(crate) fn commands(task: &Task, model: &Model, drive: Drive, dof: usize) -> [f64; 2] {
+    let (joint, effort) = (model.dof_name(dof), model.effort_limit()[dof]);
+    let iq = model.joint_of_dof(dof).idx_q;
+    let range = [model.lower_position_limit()[iq], model.upper_position_limit()[iq]];
+    let asked = task.constraints.velocity.as_ref().and_then(|v| v.limit.as_ref()?.of(&joint));
+    let speeds = [Some(model.velocity_limit()[dof]).filter(|x| x.is_finite()), asked];
+    let speed = speeds.into_iter().flatten().reduce(f64::max);
+    let motor = model.motors().iter().find(|motor| motor.joint == joint);
+    let own = motor.filter(|motor| matches!(motor.command, Command::Position | Command::Pd));
+    let own = own.and_then(|motor| motor.control_range);
+    let servo = |(stiffness, damping)| Drive::Pd { stiffness, damping };
+    let pulls = match drive {
+        Drive::Position => task.command.gains(&joint).ok().flatten().map(servo),
+        Drive::Pd { .. } => Some(drive),
+        _ => None,
+    };
+    match (drive, own, pulls) {
+        (Drive::Effort, ..) => [-effort, effort],
+        (Drive::Velocity, ..) => speed.map_or([f64::NEG_INFINITY, f64::INFINITY], |speed| [-speed, speed]),
+        (_, Some(own), _) => own,
+        (_, None, Some(pulls)) => {
+            let reach = pulls.reach(&task.period(), effort, speed.unwrap_or(0.0));
+            let turns = 2.0 * std::f64::consts::PI;
+            [range[0].max(-turns) - reach, range[1].min(turns) + reach]
+        }
+        (_, None, None) => range,
+    }
 }

@@ -22,8 +22,9 @@ use std::sync::Arc;
 use mujoco_rs::error::MjModelError;
 use mujoco_rs::mujoco_c::mjtDisableBit;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
-use mujoco_rs::wrappers::mj_model::{MjModel, MjtBias, MjtDyn, MjtGain, MjtJoint, MjtObjBase, MjtTrn};
+use mujoco_rs::wrappers::mj_model::{MjModel, MjtBias, MjtDyn, MjtGain, MjtJoint, MjtObjBase};
 
+pub(crate) use describe::EQUATIONS;
 pub use guard::{last_warning, warnings};
 pub use inverse::Inverse;
 pub use perturb::Physique;
@@ -127,10 +128,23 @@ pub struct Actuator {
     pub gear: f64,
     /// The action is the actuator's force: no gain, bias, delay or dynamics of its own.
     pub is_plain: bool,
+    /// Its number among all motors of the robot: of MuJoCo's controls, or of the motors of a URDF.
+    pub control: usize,
     /// Smallest action that has an effect of its own.
     pub low: f64,
     /// Largest action that has an effect of its own.
     pub high: f64,
+}
+
+/// An actuator that nothing commands.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Hold {
+    /// Its number among MuJoCo's controls.
+    pub control: usize,
+    /// The entry of `qpos` that it keeps; none where its control is no position.
+    pub idx_q: Option<usize>,
+    /// Position of the actuator for a unit of the joint's.
+    pub gear: f64,
 }
 
 /// A compiled robot. Cloning shares it.
@@ -287,21 +301,22 @@ impl Model {
 
     /// Actuators that drive a joint, in the order of the action.
     pub fn actuators(&self) -> Vec<Actuator> {
-        (0..self.nu())
-            .map(|id| {
-                let joint = self.0.actuator_trnid()[id][0] as usize;
-                let [low, high] = self.0.actuator_ctrlrange()[id];
-                Actuator {
-                    name: self.name(MjtObjBase::mjOBJ_ACTUATOR, id).unwrap_or_else(|| self.joint_name(joint)),
-                    joint: self.joint_name(joint),
-                    dof: self.0.jnt_dofadr()[joint] as usize,
-                    gear: self.0.actuator_gear()[id][0],
-                    is_plain: self.is_plain(id),
-                    low,
-                    high,
-                }
-            })
-            .collect()
+        (0..self.nu()).map(|id| self.actuator(id)).collect()
+    }
+
+    fn actuator(&self, id: usize) -> Actuator {
+        let joint = self.0.actuator_trnid()[id][0] as usize;
+        let [low, high] = self.0.actuator_ctrlrange()[id];
+        Actuator {
+            name: self.name(MjtObjBase::mjOBJ_ACTUATOR, id).unwrap_or_else(|| self.joint_name(joint)),
+            joint: self.joint_name(joint),
+            dof: self.0.jnt_dofadr()[joint] as usize,
+            gear: self.0.actuator_gear()[id][0],
+            is_plain: self.is_plain(id),
+            control: id,
+            low,
+            high,
+        }
     }
 
     /// What actuator `id` gives for its control, the position and the velocity of its joint: `gain u + by_q q + by_v v`; none where it is
@@ -331,20 +346,25 @@ impl Model {
             && self.0.actuator_delay()[id] == 0.0
     }
 
-    /// [`Model::actuators`] of a robot all of whose actuators drive a joint with one degree of freedom within a range.
+    /// The actuators of the joints that `wanted` names, or all, each of which drives a joint with one degree of freedom within a range.
     ///
     /// # Errors
     /// A sentence naming the actuator that does not.
-    pub fn joint_actuators(&self) -> Result<Vec<Actuator>, String> {
-        let list = (0..self.nu())
-            .map(|id| self.name(MjtObjBase::mjOBJ_ACTUATOR, id).unwrap_or_else(|| format!("number {id}")));
-        for (id, name) in list.enumerate() {
-            let on_joint =
-                matches!(self.0.actuator_trntype()[id], MjtTrn::mjTRN_JOINT | MjtTrn::mjTRN_JOINTINPARENT);
-            let joint = self.0.actuator_trnid()[id][0].max(0) as usize;
-            if !on_joint || self.joint(joint).nv != 1 {
+    pub fn joint_actuators(&self, wanted: Option<&[String]>) -> Result<Vec<Actuator>, String> {
+        if self.nu() == 0 {
+            return Err("the robot has no actuator; add an <actuator> section".into());
+        }
+        let mut found = Vec::new();
+        for id in 0..self.nu() {
+            let driven = self.driven_joint(id);
+            if wanted.is_some_and(|names| !driven.as_ref().is_some_and(|joint| names.contains(joint))) {
+                continue;
+            }
+            let name = self.actuator_name(id);
+            if driven.is_none() {
                 return Err(format!(
-                    "actuator '{name}' does not drive a joint with one degree of freedom; use joint transmissions"
+                    "actuator '{name}' does not drive a joint with one degree of freedom; use joint transmissions, or name the joints that are to be \
+                     commanded in state.controllable, with idm.kind = \"pinocchio\" or guard = true: the actuator is then held at control 0"
                 ));
             }
             let [low, high] = self.0.actuator_ctrlrange()[id];
@@ -353,11 +373,22 @@ impl Model {
                     "actuator '{name}' has no ctrlrange; give it one, the action is chosen within it"
                 ));
             }
+            found.push(self.actuator(id));
         }
-        match self.nu() {
-            0 => Err("the robot has no actuator; add an <actuator> section".into()),
-            _ => Ok(self.actuators()),
-        }
+        Ok(found)
+    }
+
+    /// What holds the actuators that are not in `commanded` where their joints are in `qpos`: control, entry of `qpos` that it is, and its value
+    /// elsewhere. An actuator whose control is a position holds its joint; any other does nothing.
+    pub fn held(&self, commanded: &[Actuator]) -> Vec<Hold> {
+        let rest = (0..self.nu()).filter(|id| !commanded.iter().any(|actuator| actuator.control == *id));
+        let hold = |control: usize| {
+            let by_position = self.gains(control).filter(|[gain, by_q, _]| *gain > 0.0 && *gain == -by_q);
+            let joint = by_position.and_then(|_| self.driven_joint(control));
+            let joint = joint.and_then(|name| self.joints().into_iter().find(|joint| joint.name == name));
+            Hold { control, idx_q: joint.map(|joint| joint.idx_q), gear: self.0.actuator_gear()[control][0] }
+        };
+        rest.map(hold).collect()
     }
 
     fn joint(&self, id: usize) -> Joint {

@@ -1,6 +1,6 @@
 //! MuJoCo as the robot behind a link: `nearl plant`.
 
-use crate::env::{Env, EnvError, Limits, Meter};
+use crate::env::{Env, EnvError, Limits, Meter, Spec};
 use crate::foresight::Foresight;
 use crate::mj::{Inverse, MjError};
 use crate::rollout::stream;
@@ -32,8 +32,10 @@ pub struct MujocoPlant {
     robot: Robot,
     action: Vec<f64>,
     force: Vec<f64>,
-    /// Configuration and velocity in Pinocchio's convention.
+    /// Configuration and velocity as the environment gives them, and as the robot's model has them.
     state: (Vec<f64>, Vec<f64>),
+    seen: (Vec<f64>, Vec<f64>),
+    places: Vec<Place>,
     episode: Episode,
     resets: bool,
 }
@@ -72,6 +74,47 @@ pub fn watched_limits(env: &dyn Env, model: &Model, set: &LimitSet) -> Limits {
     watched
 }
 
+/// Where the entries of a joint are in the environment's state, and in that of the robot's model.
+struct Place {
+    from: (usize, usize),
+    to: (usize, usize),
+    /// Configuration entries and velocities.
+    size: (usize, usize),
+    /// The model has cosine and sine of the simulated angle.
+    turns: bool,
+}
+
+/// The joints of the robot's model in the environment: their order may be another, and a joint that turns without end is one angle there.
+///
+/// # Errors
+/// [`PlantError::Robot`] with the joint that is not simulated as the model has it.
+fn places(spec: &Spec, model: &Model) -> Result<Vec<Place>, PlantError> {
+    let refused = |name: &str, reason: String| {
+        PlantError::Robot(format!(
+            "joint '{name}' {reason}; import the policy, or make the snapshot, with this robot file anew"
+        ))
+    };
+    let place = |joint: &nearl_runtime::constraints::Joint| {
+        let found = spec.joints.iter().find(|own| own.name == joint.name);
+        let own = found.ok_or_else(|| refused(&joint.name, "is not in the simulated robot".into()))?;
+        let turns = (joint.nq, joint.nv) == (2, 1) && (own.nq, own.nv) == (1, 1);
+        if !turns && (joint.nq, joint.nv) != (own.nq, own.nv) {
+            let (nq, nv) = (joint.nq, joint.nv);
+            let reason = format!(
+                "has {nq} configuration entries and {nv} velocities in the snapshot, and {} and {} in the simulation",
+                own.nq, own.nv
+            );
+            return Err(refused(&joint.name, reason));
+        }
+        let (from, to) = ((own.idx_q, own.idx_v), (joint.idx_q, joint.idx_v));
+        Ok(Place { from, to, size: (own.nq, own.nv), turns })
+    };
+    match spec.joints.iter().find(|own| !model.joints().iter().any(|joint| joint.name == own.name)) {
+        Some(own) => Err(refused(&own.name, "is simulated and not in the snapshot".into())),
+        None => model.joints().iter().map(place).collect(),
+    }
+}
+
 /// Why a plant could not start.
 #[derive(Debug, thiserror::Error)]
 pub enum PlantError {
@@ -84,6 +127,9 @@ pub enum PlantError {
     /// MuJoCo.
     #[error(transparent)]
     Physics(#[from] MjError),
+    /// The robot that is simulated is not the one that is controlled.
+    #[error("the simulation is not of the robot that is controlled: {0}")]
+    Robot(String),
     /// The limits to watch.
     #[error(transparent)]
     Limits(#[from] crate::env::LimitError),
@@ -104,6 +150,13 @@ impl MujocoPlant {
         let mut meter = Meter::new(limits.clone(), TOLERANCE, env.spec().dt)?;
         meter.begin(env.qvel());
         let (n_act, nq, nv) = (env.spec().n_act(), env.spec().nq, env.spec().nv);
+        let commanded = manifest.action_lower.len();
+        if n_act != commanded {
+            return Err(PlantError::Robot(format!(
+                "the snapshot commands {commanded} motors, and the simulation takes {n_act}; name the joints that are commanded in state.controllable, with \
+                 idm.kind = \"pinocchio\" or guard = true"
+            )));
+        }
         let asks = manifest.task.constraints.guard == Guard::Simulator;
         Ok(Self {
             foresight: asks.then(|| Foresight::new(env.as_ref(), &limits)),
@@ -111,6 +164,8 @@ impl MujocoPlant {
             inverse: Inverse::new(env.sim())?,
             drive: Brake::new(manifest)?,
             robot: describe(manifest, false)?,
+            places: places(env.spec(), &model)?,
+            seen: (vec![0.0; model.nq()], vec![0.0; model.nv()]),
             env,
             rng,
             action: vec![0.0; n_act],
@@ -140,6 +195,19 @@ impl MujocoPlant {
     /// The meter of the simulator's own state.
     pub fn meter(&self) -> &Meter {
         &self.meter
+    }
+
+    /// Brings the state of the robot's model up to date.
+    fn see(&mut self) {
+        let ((q, v), (to_q, to_v)) = (&mut self.state, &mut self.seen);
+        self.env.state(q, v);
+        for Place { from, to, size, turns } in &self.places {
+            match turns {
+                true => (to_q[to.0 + 1], to_q[to.0]) = q[from.0].sin_cos(),
+                false => to_q[to.0..to.0 + size.0].copy_from_slice(&q[from.0..from.0 + size.0]),
+            }
+            to_v[to.1..to.1 + size.1].copy_from_slice(&v[from.1..from.1 + size.1]);
+        }
     }
 
     fn advance(&mut self) {
@@ -190,10 +258,12 @@ impl MujocoPlant {
 
 impl Plant for MujocoPlant {
     fn observe(&mut self, s: &mut StateMessage) {
-        let spec = self.env.spec();
-        (s.nq, s.nv) = (spec.nq as u32, spec.nv as u32);
+        self.see();
+        let ((q, v), spec) = (&self.seen, self.env.spec());
+        (s.nq, s.nv) = (q.len() as u32, v.len() as u32);
         (s.nu, s.n_obs) = (spec.n_act() as u32, spec.n_obs() as u32);
-        self.env.state(&mut s.q[..spec.nq], &mut s.v[..spec.nv]);
+        s.q[..q.len()].copy_from_slice(q);
+        s.v[..v.len()].copy_from_slice(v);
         self.env.observe(&mut s.obs[..spec.n_obs()]);
         s.applied[..self.action.len()].copy_from_slice(&self.action);
         s.time = self.env.sim().time();
@@ -218,9 +288,11 @@ impl Plant for MujocoPlant {
     /// The drive's own brake, where analytic inverse dynamics knows the torque that stops the robot; no action elsewhere.
     fn brake(&mut self) {
         self.action.fill(0.0);
+        if self.drive.is_some() {
+            self.see();
+        }
         if let Some(brake) = &mut self.drive {
-            self.env.state(&mut self.state.0, &mut self.state.1);
-            let (_, torque) = brake.update(&self.state.0, &self.state.1);
+            let (_, torque) = brake.update(&self.seen.0, &self.seen.1);
             self.action.copy_from_slice(torque);
         }
         self.advance();

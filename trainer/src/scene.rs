@@ -135,11 +135,22 @@ fn drives(task: &Task, file: &Simulation) -> Result<Vec<PdDrive>, Mistake> {
     let mut motors = model.motors().to_vec();
     motors.sort_by_key(|motor| motor.order);
     let dof = |joint: &str| model.joint(joint).map(|joint| joint.idx_v);
+    // Joints that nothing commands are held by drives of the same kind, where these have gains and the file says how strong they are.
+    let is_commanded =
+        |joint: &String| task.state.controllable.as_ref().is_none_or(|names| names.contains(joint));
+    let has_gains = |joint: &str| matches!(task.command.gains(joint), Ok(Some(_)));
+    motors.retain(|motor| {
+        is_commanded(&motor.joint) || (has_gains(&motor.joint) && motor.control_range.is_some())
+    });
     let driven: Vec<usize> = motors.iter().filter_map(|motor| dof(&motor.joint).ok()).collect();
-    let commanded = task.command.drives(&model, &driven).map_err(|e| mistake("command", e))?;
+    let wanted: Vec<usize> = driven.iter().copied().filter(|&i| is_commanded(&model.dof_name(i))).collect();
+    let commanded = task.command.drives(&model, &wanted).map_err(|e| mistake("command", e))?;
     let mut gains = Vec::new();
     for &i in &driven {
         gains.push(match commanded[i] {
+            _ if !wanted.contains(&i) => {
+                task.command.gains(&model.dof_name(i)).map_err(|e| mistake("command", e))?
+            }
             Drive::Pd { stiffness, damping } => Some((stiffness, damping)),
             Drive::Position => task.command.gains(&model.dof_name(i)).map_err(|e| mistake("command", e))?,
             _ => None,

@@ -100,13 +100,24 @@ impl Limit for PositionLimit {
             let next = "write a range into it, or leave the position limit out";
             return Err(LimitError::Missing { limit: "position", joints: quoted(model, controllable), next });
         }
+        let mut narrow = Vec::new();
         for &i in controllable {
             let joint = model.joint_of_dof(i);
             if joint.nq == 1 && joint.nv == 1 {
                 let m = margin[i].unwrap_or(0.0).max(self.gap);
-                set.q_lower[i] = set.q_lower[i].max(model.lower_position_limit()[joint.idx_q] + m);
-                set.q_upper[i] = set.q_upper[i].min(model.upper_position_limit()[joint.idx_q] - m);
+                let (lower, upper) =
+                    (model.lower_position_limit()[joint.idx_q], model.upper_position_limit()[joint.idx_q]);
+                if m > 0.0 && lower + m >= upper - m {
+                    let name = &joint.name;
+                    narrow.push(format!("constraints.position.margin {m} of joint '{name}' leaves nothing of its range from {lower} to {upper} rad or m"));
+                }
+                set.q_lower[i] = set.q_lower[i].max(lower + m);
+                set.q_upper[i] = set.q_upper[i].min(upper - m);
             }
+        }
+        if !narrow.is_empty() {
+            let next = "write a smaller one, or a table of margins by joint: position = { margin = { JOINT = 0.001 } }";
+            return Err(LimitError::Unusable { what: narrow.join(", "), next });
         }
         Ok(())
     }

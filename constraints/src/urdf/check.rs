@@ -108,7 +108,13 @@ pub(super) fn check_joint(joint: Node, wrong: &mut Vec<String>) {
     if axis.is_some_and(|xyz| xyz.split_whitespace().all(|x| x.parse() == Ok(0.0))) {
         wrong.push(format!("joint '{name}' has the axis 0 0 0"));
     }
-    let limit = joint.children().find(|n| n.has_tag_name("limit"));
+    let mut limits = joint.children().filter(|n| n.has_tag_name("limit"));
+    let limit = limits.next();
+    if limits.next().is_some() {
+        wrong.push(format!(
+            "joint '{name}' has more than one <limit>, and nothing says which holds: keep one"
+        ));
+    }
     if kind != "continuous" {
         let missing =
             ["effort", "velocity"].into_iter().filter(|key| limit.is_none_or(|l| !l.has_attribute(*key)));

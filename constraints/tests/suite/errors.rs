@@ -179,7 +179,7 @@ fn limits_that_make_no_sense() {
         &[wide(), Box::new(AccelerationLimit::uniform(1.0))],
         &[3, 0, 1],
         s(),
-        &["contradict", "panda_joint4"],
+        &["leaves nothing of its range", "panda_joint4"],
     );
     refuse(&[Box::new(PositionLimit::with_margin(-0.1))], &[0], s(), &["margin", "-0.1", "at least 0"]);
     refuse(&[Box::new(VelocityLimit::scaled(1.5))], &[0], s(), &["velocity scale", "1.5"]);

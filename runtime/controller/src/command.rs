@@ -124,6 +124,8 @@ impl CommandSection {
 
     fn check_names(&self, model: &Model, controllable: &[usize]) -> Result<(), String> {
         let known: Vec<String> = controllable.iter().map(|i| model.dof_name(*i)).collect();
+        // A simulation holds the other joints by drives, which have gains too.
+        let has_motor = |name: &String| model.motors().iter().any(|motor| motor.joint == *name);
         let interface = match &self.interface {
             Interfaces::All(_) => Vec::new(),
             Interfaces::Joints(map) => map.keys().collect(),
@@ -145,7 +147,8 @@ impl CommandSection {
             ("damping", of(&self.damping)),
         ];
         for (key, names) in named {
-            if let Some(name) = names.iter().find(|name| !known.contains(name)) {
+            let is_known = |name: &String| known.contains(name) || (key != "interface" && has_motor(name));
+            if let Some(name) = names.iter().find(|name| !is_known(name)) {
                 return Err(format!(
                     "[command.{key}]: '{name}' is no controllable joint; they are {}",
                     known.join(", ")

@@ -512,6 +512,10 @@ fn bracket(key: &str) -> String {
 /// `unknown field 'velocty', expected ...` gains the nearest key.
 pub fn suggest(message: &str) -> String {
     let message = first_line(message);
+    if message == "missing field `idm`" {
+        return "missing section [idm]; write it with kind = \"pinocchio\" (the model's own, where each controllable joint has a motor) or kind = \"learned\""
+            .into();
+    }
     let mut quoted = message.split('`').skip(1).step_by(2);
     let Some(unknown) = quoted.next().filter(|_| message.starts_with("unknown ")) else { return message };
     let near = quoted.map(|k| (strsim::jaro(unknown, k), k)).max_by(|a, b| a.0.total_cmp(&b.0));

@@ -38,7 +38,7 @@ pub enum LinkError {
     #[error("no loop of `{0}` asks for proposals: start `nearl run SNAPSHOT --plant {0} --proposer` first")]
     NoQuestion(RobotName),
     /// The single owner of a topic exists already.
-    #[error("robot `{name}` already has a {role}: stop that process first, or use another --name")]
+    #[error("robot `{name}` already has a {role}: stop that process first, or take another name")]
     Taken {
         /// Robot.
         name: RobotName,

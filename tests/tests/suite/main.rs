@@ -15,6 +15,7 @@ mod gains;
 mod guard;
 mod imitation;
 mod import;
+mod left_alone;
 mod leg;
 mod limits_in_simulator;
 mod meters;

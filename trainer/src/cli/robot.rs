@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use nearl_runtime::constraints::Model;
-use nearl_runtime::constraints::description::{Range, RobotDescription};
+use nearl_runtime::constraints::description::{JointKind, Range, RobotDescription};
 
 use super::{Failure, say};
 use crate::robot;
@@ -30,8 +30,16 @@ impl RobotCommand {
             return Ok(());
         }
         let (bodies, nq, nv) = (description.bodies.len(), model.nq(), model.nv());
+        let endless = description.joints().filter(|joint| joint.kind == JointKind::Continuous).count();
+        let simulated = match endless {
+            0 => String::new(),
+            n => format!(
+                " ({} in a task with [reward] or [scene], where a continuous joint is one angle)",
+                nq - n
+            ),
+        };
         say(format!(
-            "{}: {bodies} bodies, nq {nq}, nv {nv}, {:.4} kg move",
+            "{}: {bodies} bodies, nq {nq}{simulated}, nv {nv}, {:.4} kg move",
             description.name,
             model.total_mass()
         ));

@@ -38,9 +38,8 @@ pub(super) fn check(manifest: &Manifest, env: &dyn Env, origin: &str) -> Result<
     let Ok(drives) = task.command.drives(&model, layout.controllable()) else { return Ok(()) };
     for &dof in layout.controllable() {
         let (drive, joint) = (drives[dof], model.dof_name(dof));
-        let at = env.spec().actuators.iter().position(|a| a.joint == joint);
-        let gains =
-            at.filter(|&k| env.spec().actuators[k].gear == 1.0).and_then(|k| env.sim().model().gains(k));
+        let actuator = env.spec().actuators.iter().find(|a| a.joint == joint);
+        let gains = actuator.filter(|a| a.gear == 1.0).and_then(|a| env.sim().model().gains(a.control));
         let reason = match (drive, gains) {
             (Drive::Pd { stiffness, damping }, Some([gain, _, by_v]))
                 if takes(drive, gains) && !(same(stiffness, gain) && same(damping, -by_v)) =>

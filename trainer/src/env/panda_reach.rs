@@ -89,7 +89,12 @@ pub(super) fn build_at(dt: f64) -> Result<Box<dyn Env>, EnvError> {
     let mut names = joint_names(&model, 0);
     names.extend(["goal.x", "goal.y", "goal.z", "error.x", "error.y", "error.z"].map(String::from));
     let task = Constants { name: NAME.into(), sub_steps: 1, max_episode_steps: periods(dt) };
-    let spec = Spec::new(&model, task, names, joints.iter().map(torque).collect());
+    let spec = Spec::new(
+        &model,
+        task,
+        names,
+        joints.iter().enumerate().map(|(k, joint)| torque(k, joint)).collect(),
+    );
     let ranges =
         std::array::from_fn(|j| [joints[j].range[0] + LIMIT_MARGIN, joints[j].range[1] - LIMIT_MARGIN]);
 
@@ -101,7 +106,7 @@ pub(super) fn build_at(dt: f64) -> Result<Box<dyn Env>, EnvError> {
 }
 
 /// A joint driven by its own torque, up to its effort limit.
-fn torque(joint: &Joint) -> Actuator {
+fn torque(control: usize, joint: &Joint) -> Actuator {
     let name = joint.name.clone();
     Actuator {
         joint: name.clone(),
@@ -109,6 +114,7 @@ fn torque(joint: &Joint) -> Actuator {
         dof: joint.idx_v,
         gear: 1.0,
         is_plain: true,
+        control,
         low: -joint.effort,
         high: joint.effort,
     }

@@ -22,15 +22,16 @@ mod settings;
 
 use nearl_runtime::Manifest;
 use nearl_runtime::constraints::description::Motor;
-use nearl_runtime::constraints::{self, RobotDescription};
-use nearl_runtime::task::Task;
+use nearl_runtime::constraints::{self, Guard, RobotDescription};
+use nearl_runtime::snapshot::PolicyKind;
+use nearl_runtime::task::{IdmKind, Task};
 use rand_chacha::ChaCha8Rng;
 
 use super::rules::{Robot, Rules, joint_names};
 use super::simulated::Simulated;
 use super::spec::{Constants, EPISODE, Spec};
 use super::{Env, EnvError};
-use crate::mj::{Actuator, JointKind, MjError, Model, ModelFormat, Sim};
+use crate::mj::{Actuator, Hold, JointKind, MjError, Model, ModelFormat, Sim};
 use crate::{robot, scene};
 use commands::Commands;
 use contacts::Contacts;
@@ -68,6 +69,35 @@ struct User {
     dt: f64,
     /// Motors that MuJoCo's model does not have; without any, the action is its control.
     drives: Vec<Drive>,
+    held: Held,
+}
+
+/// MuJoCo's actuators that nobody commands, and the controls that keep their joints where the episode begins.
+#[derive(Clone, Default)]
+struct Held {
+    holds: Vec<Hold>,
+    controls: Vec<f64>,
+    /// Controls of an episode that goes on from its middle.
+    given: Option<Vec<f64>>,
+}
+
+impl Held {
+    /// What a model holds that is commanded by `actuators`, at its initial configuration.
+    fn new(model: &Model, actuators: &[Actuator]) -> Held {
+        let holds = model.held(actuators);
+        let mut held = Held { controls: vec![0.0; holds.len()], holds, given: None };
+        held.begin(model.qpos0());
+        held
+    }
+
+    fn begin(&mut self, qpos: &[f64]) {
+        if let Some(given) = self.given.take() {
+            return self.controls = given;
+        }
+        for (control, hold) in self.controls.iter_mut().zip(&self.holds) {
+            *control = hold.idx_q.map_or(0.0, |idx_q| hold.gear * qpos[idx_q]);
+        }
+    }
 }
 
 /// A motor and where its joint's entries are.
@@ -119,11 +149,15 @@ fn refused(origin: &str, mistake: Mistake) -> EnvError {
 fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spec, User), Mistake> {
     let task = &manifest.task;
     let sub_steps = sub_steps(task, model)?;
+    let wanted = commanded(manifest);
     let (actuators, drives) = match format {
-        ModelFormat::Mjcf => (model.joint_actuators().map_err(|e| mistake("model.mjcf", e))?, Vec::new()),
-        ModelFormat::Urdf if model.nu() > 0 => (pd_actuators(manifest, model), Vec::new()),
-        ModelFormat::Urdf => drives(&manifest.robot, model).map_err(|e| mistake("model.urdf", e))?,
+        ModelFormat::Mjcf => {
+            (model.joint_actuators(wanted).map_err(|e| mistake("model.mjcf", e))?, Vec::new())
+        }
+        ModelFormat::Urdf if model.nu() > 0 => (pd_actuators(manifest, model, wanted), Vec::new()),
+        ModelFormat::Urdf => drives(&manifest.robot, model, wanted).map_err(|e| mistake("model.urdf", e))?,
     };
+    let held = Held::new(model, &actuators);
     let joints = model.joints();
     let (start, dt) = (Names::new(model, Own::default(), Place::Start), model.sim_dt() * sub_steps as f64);
     let driven = actuators.iter().map(|actuator| actuator.dof).collect();
@@ -177,8 +211,19 @@ fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spe
         seen_commands,
         dt: spec.dt,
         drives,
+        held,
     };
     Ok((spec, rules))
+}
+
+/// The joints whose motors alone the action is for; every motor's where it names none. A network's action without a guard, and without a recipe,
+/// is one of all motors.
+fn commanded(manifest: &Manifest) -> Option<&[String]> {
+    let task = &manifest.task;
+    let by_joint = task.idm.kind == IdmKind::Pinocchio
+        || task.constraints.guard == Guard::Model
+        || task.policy.is_some();
+    task.state.controllable.as_deref().filter(|_| by_joint)
 }
 
 /// What the task observes: what it lists, else all positions, then all velocities, then the commands.
@@ -198,11 +243,18 @@ fn place_of(commands: &[String], listed: &[String]) -> std::ops::Range<usize> {
 }
 
 /// The motors of a URDF, which MuJoCo does not know: actions within their ranges, and the joints they drive.
-fn drives(robot: &RobotDescription, model: &Model) -> Result<(Vec<Actuator>, Vec<Drive>), String> {
+fn drives(
+    robot: &RobotDescription,
+    model: &Model,
+    wanted: Option<&[String]>,
+) -> Result<(Vec<Actuator>, Vec<Drive>), String> {
     let (joints, mut motors) = (model.joints(), robot.motors.clone());
     motors.sort_by_key(|motor| motor.order);
     let mut found = (Vec::new(), Vec::new());
-    for motor in motors {
+    for (control, motor) in motors.into_iter().enumerate() {
+        if wanted.is_some_and(|names| !names.contains(&motor.joint)) {
+            continue;
+        }
         let Some([low, high]) = motor.control_range else {
             return Err(format!(
                 "joint '{}' states no effort, and the action is chosen within it; write it into <limit>",
@@ -218,6 +270,7 @@ fn drives(robot: &RobotDescription, model: &Model) -> Result<(Vec<Actuator>, Vec
             dof: joint.idx_v,
             gear: motor.gear,
             is_plain: true,
+            control,
             low,
             high,
         });
@@ -231,7 +284,7 @@ fn drives(robot: &RobotDescription, model: &Model) -> Result<(Vec<Actuator>, Vec
 
 /// The drives that the scene gave the joints of a URDF. Their targets range over all that may ask for the whole effort somewhere, at any
 /// speed that is allowed.
-fn pd_actuators(manifest: &Manifest, model: &Model) -> Vec<Actuator> {
+fn pd_actuators(manifest: &Manifest, model: &Model, wanted: Option<&[String]>) -> Vec<Actuator> {
     let joints = model.joints();
     let period = manifest.task.period();
     let speed = |name: &str| {
@@ -240,8 +293,12 @@ fn pd_actuators(manifest: &Manifest, model: &Model) -> Vec<Actuator> {
         let asked = manifest.task.constraints.velocity.as_ref().and_then(|v| v.limit.as_ref()?.of(name));
         stated.into_iter().chain(asked).fold(0.0, f64::max)
     };
+    // What a policy of actions may send is what it explores; where the model finds the target, a joint may turn on and on.
+    let turns = if manifest.policy == PolicyKind::Direct { 1.0 } else { 1e3 };
     let mut actuators = model.actuators();
-    for (id, actuator) in actuators.iter_mut().enumerate() {
+    actuators.retain(|actuator| wanted.is_none_or(|names| names.contains(&actuator.joint)));
+    for actuator in &mut actuators {
+        let id = actuator.control;
         let ([low, high], reach) = match joints.iter().find(|joint| joint.idx_v == actuator.dof) {
             Some(joint) => {
                 let [stiffness, _, by_v] = model.gains(id).unwrap_or([1.0, -1.0, 0.0]);
@@ -250,7 +307,7 @@ fn pd_actuators(manifest: &Manifest, model: &Model) -> Vec<Actuator> {
             }
             None => ([f64::NEG_INFINITY, f64::INFINITY], 0.0),
         };
-        let turns = 2.0 * std::f64::consts::PI;
+        let turns = turns * 2.0 * std::f64::consts::PI;
         (actuator.low, actuator.high) = (low.max(-turns) - reach, high.min(turns) + reach);
     }
     actuators
@@ -342,6 +399,7 @@ impl Rules for User {
         }
         let delay = self.measured.as_ref().map(Measured::delay);
         self.notes.begin(self.course.random.as_ref().map_or(&[], Random::notes), delay, level);
+        self.held.begin(sim.qpos());
         self.measure(sim);
     }
 
@@ -349,10 +407,13 @@ impl Rules for User {
         self.before.remember(sim);
     }
 
-    fn actuate(&self, _: &Spec, sim: &mut Sim, action: &[f64]) {
+    fn actuate(&self, spec: &Spec, sim: &mut Sim, action: &[f64]) {
         let action = self.measured.as_ref().map_or(action, |measured| measured.arriving(action));
         if self.drives.is_empty() {
-            return sim.ctrl_mut().copy_from_slice(action);
+            let controls = sim.ctrl_mut();
+            spec.actuators.iter().zip(action).for_each(|(of, action)| controls[of.control] = *action);
+            let held = self.held.holds.iter().zip(&self.held.controls);
+            return held.for_each(|(hold, control)| controls[hold.control] = *control);
         }
         let strength = self.course.random.as_ref().map(|random| &random.strength);
         for (i, (drive, action)) in self.drives.iter().zip(action).enumerate() {
@@ -422,11 +483,14 @@ impl Rules for User {
     }
 
     fn circumstances(&self) -> Vec<f64> {
-        self.course.circumstances()
+        [self.course.circumstances(), self.held.controls.clone()].concat()
     }
 
     fn set_circumstances(&mut self, circumstances: &[f64]) {
-        self.course.set_circumstances(circumstances);
+        let own = circumstances.len().saturating_sub(self.held.controls.len());
+        let (course, held) = circumstances.split_at(own);
+        self.course.set_circumstances(course);
+        self.held.given = (held.len() == self.held.controls.len()).then(|| held.to_vec());
     }
 
     fn start_curriculum(&mut self) {

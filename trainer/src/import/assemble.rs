@@ -2,6 +2,7 @@
 
 use super::{ImportError, ImportedNetwork};
 use super::{deploy, metadata};
+use crate::blank::commands;
 use crate::robot::{describe, describe_simulated, folder_of};
 use crate::scene;
 use nearl_runtime::constraints::description::JointKind;
@@ -56,7 +57,8 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
     let simulation = simulation(setting.robot)?;
     complete(&mut table, setting, simulation.format);
     let free = table.get("model").and_then(|m| m.get("free_flyer")).and_then(Value::as_bool).unwrap_or(false);
-    let robot = if table.contains_key("scene") {
+    // As the task is simulated.
+    let robot = if table.contains_key("scene") || table.contains_key("reward") {
         let task = Task::merged(table.clone(), &files).map_err(|e| ImportError::Recipe(e.to_string()))?;
         let add = scene::of(&task, &simulation)
             .map_err(|m| recipe(&said_by, &format!("[{}] {}", m.key, m.reason)))?;
@@ -302,7 +304,9 @@ fn check_widths(
     ))
 }
 
-/// The range of what each motor is sent, in the motors' order: the motor's own for a force, what the policy can ask for otherwise.
+/// The range of what each motor is sent, in the motors' order: that of motors and drives, as a task has it that was trained here. The clip of the
+/// recipe is of outputs, and a guard may have to send more than the policy can ask for. Where the robot file does not bound the commands of a joint
+/// it is what the policy can ask for.
 fn ranges(
     section: &PolicySection,
     task: &Task,
@@ -329,16 +333,25 @@ fn ranges(
         let at = section.joints.iter().position(|j| *j == joint);
         let i =
             at.ok_or_else(|| format!("the policy gives no command for the controllable joint '{joint}'"))?;
-        let effort = model.effort_limit()[dof];
-        let ends = match drives[dof] {
-            Drive::Effort if effort.is_finite() => [-effort, effort].map(|torque| motors.action(k, torque)),
-            Drive::Effort => {
+        let range = commands(task, model, drives[dof], dof);
+        let asked = clip[i].map(|x| offset[i] + scale[i] * x);
+        let asked = [asked[0].min(asked[1]), asked[0].max(asked[1])];
+        let [low, high] = match drives[dof] {
+            Drive::Effort if range[1].is_infinite() => {
                 return Err(format!(
                     "the robot file does not say how strong the motor of joint '{joint}' is; give its effort limit"
                 ));
             }
-            _ => clip[i].map(|x| offset[i] + scale[i] * x),
+            // Without gains nobody knows how far ahead of a joint its servo may be sent.
+            Drive::Position
+                if task.command.gains(&joint)?.is_none() && range.iter().all(|x| x.is_finite()) =>
+            {
+                [range[0].min(asked[0]), range[1].max(asked[1])]
+            }
+            _ if range.iter().all(|x| x.is_finite()) => range,
+            _ => asked,
         };
+        let ends = [low, high].map(|command| motors.action(k, command));
         sent[motors.place(k)] = (ends[0].min(ends[1]), ends[0].max(ends[1]));
     }
     Ok(sent.into_iter().unzip())

@@ -11,6 +11,9 @@ use mujoco_rs::wrappers::mj_model::{MjtGeomBase, MjtObjBase};
 
 use super::{JointKind, MjError, Model, motors, pairs};
 
+/// The note of a file with equality constraints.
+pub(crate) const EQUATIONS: &str = "equality constraints are not modelled";
+
 impl Model {
     /// The robot as plain numbers, from which the dynamics of the controller are built. Its joints stand in MuJoCo's order.
     ///
@@ -210,7 +213,7 @@ impl Model {
                 notes.push(text.to_string());
             }
         };
-        note(m.neq() > 0, "equality constraints are not modelled");
+        note(m.neq() > 0, EQUATIONS);
         note(m.ntendon() > 0, "tendons are not modelled");
         note(m.nflex() > 0, "flexible bodies are not modelled");
         let several = |id: usize| self.joint(id).nv > 1 && m.dof_frictionloss()[self.joint(id).idx_v] != 0.0;

@@ -17,9 +17,9 @@ pub(super) fn add(model: &Model, robot: &mut RobotDescription) {
                 load(model, id, motor.gear, robot, &joint);
                 robot.motors.push(motor);
             }
-            _ => robot
-                .notes
-                .push(format!("actuator '{name}' does not drive a joint with one dof and is not modelled")),
+            _ => robot.notes.push(format!(
+                "actuator '{name}' does not drive a joint with one dof and is not modelled: nothing commands it, and a simulation holds it at control 0"
+            )),
         }
     }
 }
@@ -47,7 +47,7 @@ impl Model {
     }
 
     /// Name of the joint with one dof that an actuator drives.
-    fn driven_joint(&self, id: usize) -> Option<String> {
+    pub(super) fn driven_joint(&self, id: usize) -> Option<String> {
         let kind = self.0.actuator_trntype()[id];
         let on_joint = matches!(kind, MjtTrn::mjTRN_JOINT | MjtTrn::mjTRN_JOINTINPARENT);
         let joint = usize::try_from(self.0.actuator_trnid()[id][0]).ok().filter(|_| on_joint)?;

@@ -21,7 +21,8 @@ impl Foreign {
         let Some(policy) = &m.task.policy else { return Ok(Self::default()) };
         if m.policy != PolicyKind::Direct {
             return Err(unusable(
-                &"[policy] is for policies of actions, and this one proposes states; take the section out",
+                &"[policy] is for policies of actions, and this one proposes states; give actions=\"guarded\" (make_vec, ProjectedEnv), train with --algo \
+                  ppo, or take the section out",
             ));
         }
         let observer = Observer::new(policy, model, layout).map_err(|e| unusable(&e))?;

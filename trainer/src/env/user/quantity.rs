@@ -235,6 +235,12 @@ impl Names {
 
     fn near(&self, name: &str) -> String {
         let scored = self.0.iter().map(|(n, _)| (strsim::jaro(n, name), n));
+        let is_given = self.0.iter().any(|(n, _)| n.starts_with("command."));
+        if let Some(command) = name.strip_prefix("command.").filter(|_| !is_given) {
+            return format!(
+                ", as the task has no section [commands]; write one with a value or a draw for each: {command} = 0.0"
+            );
+        }
         match scored.max_by(|a, b| a.0.total_cmp(&b.0)) {
             Some((score, near)) if score > 0.75 => format!("; did you mean '{near}'?"),
             _ => {

@@ -59,8 +59,8 @@ struct Draw {
 pub(super) struct Random {
     nominal: Physique,
     pub(super) physique: Physique,
-    /// Degree of freedom of each actuator.
-    dofs: Vec<usize>,
+    /// Number among MuJoCo's controls, and degree of freedom, of each actuator.
+    places: Vec<(usize, usize)>,
     /// Factor on the force of each entry of the action, for motors that MuJoCo does not know.
     pub(super) strength: Vec<f64>,
     draws: Vec<Draw>,
@@ -117,7 +117,7 @@ impl Random {
         Ok(Some(Random {
             physique: nominal.clone(),
             nominal,
-            dofs: actuators.iter().map(|actuator| actuator.dof).collect(),
+            places: actuators.iter().map(|actuator| (actuator.control, actuator.dof)).collect(),
             strength: vec![1.0; actuators.len()],
             means: vec![f64::NAN; draws.len()],
             draws,
@@ -159,7 +159,7 @@ impl Random {
                     }
                     (sum, count) = (sum + value, count + 1.0);
                     let (physique, strength) = (&mut self.physique, &mut self.strength);
-                    draw.kind.apply(physique, strength, &self.dofs, entry, axis, value);
+                    draw.kind.apply(physique, strength, &self.places, entry, axis, value);
                 }
             }
             *mean = sum / count;
@@ -232,12 +232,13 @@ impl Kind {
         self,
         p: &mut Physique,
         strength: &mut [f64],
-        dofs: &[usize],
+        places: &[(usize, usize)],
         entry: usize,
         axis: usize,
         value: f64,
     ) {
         let by = |x: &mut f64| *x *= value;
+        let (control, dof) = places.get(entry).copied().unwrap_or_default();
         match self {
             Kind::Mass => {
                 by(&mut p.mass[entry]);
@@ -246,19 +247,19 @@ impl Kind {
             Kind::Inertia => p.inertia[entry].iter_mut().for_each(by),
             Kind::Centre => p.centre[entry][axis] += value,
             Kind::Friction => by(&mut p.friction[entry][0]),
-            Kind::Armature => by(&mut p.armature[dofs[entry]]),
+            Kind::Armature => by(&mut p.armature[dof]),
             Kind::Bumps => by(&mut p.bumps[entry]),
             Kind::Strength if p.gain.is_empty() => by(&mut strength[entry]),
             Kind::Strength => {
-                by(&mut p.gain[entry]);
-                p.bias[entry].iter_mut().for_each(by);
-                p.force_range[entry].iter_mut().for_each(by);
+                by(&mut p.gain[control]);
+                p.bias[control].iter_mut().for_each(by);
+                p.force_range[control].iter_mut().for_each(by);
             }
             Kind::Stiffness => {
-                by(&mut p.gain[entry]);
-                by(&mut p.bias[entry][1]);
+                by(&mut p.gain[control]);
+                by(&mut p.bias[control][1]);
             }
-            Kind::Damping => by(&mut p.bias[entry][2]),
+            Kind::Damping => by(&mut p.bias[control][2]),
         }
     }
 }
