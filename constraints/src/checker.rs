@@ -4,7 +4,7 @@
 
 use crate::ledger::Counts;
 use crate::row::{Cone, Motion, Needs, Previous, Rows};
-use crate::viability::{Kind, Period};
+use crate::viability::{Kind, Period, whole_way};
 use crate::{Consistency, Dynamics, Kinematics, Limit, LimitError, LimitSet, Model};
 
 /// A violation counts above this share of its limit (of 1 where the limit is smaller).
@@ -69,6 +69,8 @@ pub struct Checker {
     dofs: Vec<(usize, usize)>,
     period: Period,
     consistency: Consistency,
+    /// Joints stop in whole periods ([`Checker::stop_in_whole_periods`]).
+    whole: bool,
     rows: Vec<RowsOf>,
     cones: Vec<ConeOf>,
     excess: Vec<f64>,
@@ -178,7 +180,13 @@ impl Checker {
             dofs: controllable.iter().map(|i| (*i, model.joint_of_dof(*i).idx_q)).collect(),
             period,
             consistency,
+            whole: false,
         })
+    }
+
+    /// Joints stop as a stored brake has them stop: by whole periods of one deceleration and a shorter last one.
+    pub(crate) fn stop_in_whole_periods(&mut self) {
+        self.whole = true;
     }
 
     /// Checks going from (`q`, `v`) to (`q_next`, `v_next`) in one period; configurations nq, velocities nv. `external`:
@@ -245,8 +253,12 @@ impl Checker {
 
     /// Number of hard rows and cones.
     pub(crate) fn hard(&self) -> usize {
-        let rows = self.rows.iter().filter(|r| r.hard).map(|r| r.count).sum::<usize>();
-        rows + self.cones.iter().filter(|c| c.hard).count()
+        self.hard_rows() + self.cones.iter().filter(|c| c.hard).count()
+    }
+
+    /// Number of hard rows, which come first.
+    pub(crate) fn hard_rows(&self) -> usize {
+        self.rows.iter().filter(|r| r.hard).map(|r| r.count).sum()
     }
 
     /// Writes the breach of each hard row, then of each hard cone ([`Checker::hard`]); minus infinity where it is switched off.
@@ -494,7 +506,12 @@ impl Checker {
             let half = 0.5 * a_max * tau;
             // A brake in whole steps needs up to this much less than the smooth one, and what hard jerk promises is reckoned in steps.
             let less = if self.limits.jerk[i].is_finite() { 0.125 * a_max * tau * tau } else { 0.0 };
-            let stop = |speed: f64| ((speed - half).max(0.0).powi(2) / (2.0 * a_max) - less).max(0.0); // braking distance
+            // A brake that is stored is of whole periods, and may stop where the smooth one does not.
+            let whole = self.whole && self.limits.jerk[i].is_infinite();
+            let stop = |speed: f64| {
+                let smooth = ((speed - half).max(0.0).powi(2) / (2.0 * a_max) - less).max(0.0); // braking distance
+                if whole { smooth.min(whole_way(speed, a_max, &self.period)) } else { smooth }
+            };
             verdict.see(Kind::Viability, i, next.0 + stop(next.1), high.max(next.0));
             verdict.see(Kind::Viability, i, stop(-next.1) - next.0, (-low).max(-next.0));
         }

@@ -219,7 +219,9 @@ impl PhysicsSteps {
                 (measured, failed, halves) = (measured + 1, 0, true);
             }
         }
-        if self.missing.iter().all(|x| x.abs() <= begun.max(MISSING * self.period.dt)) || retreats > 0 {
+        // A force that has come to its end is missed by as much, whatever the others do.
+        let is_near = |x: f64| x.abs() <= begun.max(MISSING * self.period.dt);
+        if with_room(&self.missing, &self.full).all(is_near) || retreats > 0 {
             for (k, &r) in self.pushed.iter().enumerate() {
                 tau[self.free[r]] = self.force[k];
             }

@@ -165,8 +165,8 @@ pub const POSITION_TOLERANCE: f64 = 1e-9;
 /// A state this far outside the set is inside [rad or m].
 const ROUNDING: f64 = 1e-10;
 
-/// Bounds that cross by less than this share of A are rounding.
-const CROSSING: f64 = 1e-6;
+/// Bounds that cross by less than this share of A are rounding: a target beyond A by more would not pass the checker.
+const CROSSING: f64 = 5e-10;
 
 /// The box of one dof at position `q` [rad or m] and velocity `v` [rad/s or m/s].
 pub fn interval(dof: &Dof, q: f64, v: f64, period: &Period) -> Interval {
@@ -221,6 +221,30 @@ fn returning(dof: &Dof, v: f64, period: &Period) -> (f64, Kind) {
     smaller((dof.acceleration, Kind::Acceleration), (-v / period.dt, Kind::Position))
 }
 
+/// A joint beyond a position limit is to come back in so many periods, as points and bodies do, or sooner where periods are long [s].
+const RETURN_PERIODS: f64 = 20.0;
+const RETURN_TIME: f64 = 0.5;
+
+/// Share of the speed limit with which it is to come back.
+const RETURN_SPEED: f64 = 0.1;
+
+/// The highest and the lowest velocity that is aimed at: of a dof the distance `d` beyond its upper limit
+///
+/// ```text
+///     -min(d / max(min(20 T, 0.5 s), 2 T), V / 10)
+/// ```
+///
+/// Not to go further is what the box asks for. To stand still would not do: where a plant moves otherwise than foreseen by a little in each period,
+/// that adds up.
+pub fn coming_back(dof: &Dof, q: f64, period: &Period) -> (f64, f64) {
+    let time = (RETURN_PERIODS * period.dt).min(RETURN_TIME).max(2.0 * period.dt);
+    let back = |d: f64| match d > POSITION_TOLERANCE {
+        true => -(d / time).min(RETURN_SPEED * dof.velocity),
+        false => f64::INFINITY,
+    };
+    (back(q - dof.upper), -back(dof.lower - q))
+}
+
 /// Upper bound of the acceleration at distance `d` below the upper limit, with braking deceleration `a`: the smallest of
 ///
 /// 1. `A`
@@ -270,17 +294,29 @@ fn whole_bound(d: f64, v: f64, a: f64, p: &Period) -> f64 {
 /// From inside the set, braking with `A` is always allowed. Close to the limit the formulas lose that to rounding: with
 /// `d = 1e-11` the last bits of `q` are 1e-5 of `-v^2 / 2 d`.
 fn floor(bound: f64, d: f64, v: f64, a: f64, p: &Period) -> f64 {
+    if is_inside(d, v, a, p) { bound.max(-a) } else { bound }
+}
+
+/// The state is in the set.
+fn is_inside(d: f64, v: f64, a: f64, p: &Period) -> bool {
     let w = (v - 0.5 * a * p.tau).max(0.0);
-    let inside = w * w <= 2.0 * a * (d + ROUNDING);
-    if inside { bound.max(-a) } else { bound }
+    w * w <= 2.0 * a * (d + ROUNDING)
 }
 
 /// The same for whole periods: where those of `a` and a shorter one stop in time, the next of them is always allowed, and turns nothing
 /// round.
 fn whole_floor(bound: f64, d: f64, v: f64, a: f64, p: &Period) -> f64 {
+    if whole_way(v, a, p) <= d + ROUNDING {
+        bound.max(-a.min(v.max(0.0) / p.dt))
+    } else {
+        floor(bound, d, v, a, p)
+    }
+}
+
+/// The way to standstill from speed `v` in whole periods of deceleration `a` and a shorter last one [rad or m].
+pub(crate) fn whole_way(v: f64, a: f64, p: &Period) -> f64 {
     let (t, k) = (p.dt, (v / (a * p.dt)).floor().max(0.0));
-    let way = v * t * (k + 1.0 - p.kappa) - 0.5 * a * t * t * k * (k + 1.0);
-    if way.max(0.0) <= d + ROUNDING { bound.max(-a.min(v.max(0.0) / t)) } else { floor(bound, d, v, a, p) }
+    (v * t * (k + 1.0 - p.kappa) - 0.5 * a * t * t * k * (k + 1.0)).max(0.0)
 }
 
 /// Positions at the end of each sub-step, `d - j tau v - tau^2 j (j + 1) / 2 a >= 0`:
@@ -413,5 +449,17 @@ mod tests {
         assert_eq!((leaving.lower, leaving.upper), (-20.0, -20.0));
         let fast = interval(&dof, 0.0, 9.0, &p);
         assert_eq!((fast.lower, fast.upper, fast.outside), (-20.0, -20.0, Some(Kind::Velocity)));
+    }
+
+    #[test]
+    fn what_is_beyond_a_limit_is_to_come_back() {
+        let dof = Dof { lower: -1.0, upper: 1.0, velocity: 5.0, ..Dof::FREE };
+        let (none, p) = (f64::INFINITY, Period::new(0.01, 1));
+        assert_eq!(coming_back(&dof, 0.5, &p), (none, -none));
+        // 0.002 rad in 20 periods of 0.01 s, and never faster than 0.1 * 5 rad/s
+        assert!((coming_back(&dof, 1.002, &p).0 + 0.01).abs() < 1e-9);
+        assert!((coming_back(&dof, -3.0, &p).1 - 0.5).abs() < 1e-9);
+        // 20 periods of 0.2 s are too long: 0.01 rad in half a second
+        assert!((coming_back(&dof, 1.01, &Period::new(0.2, 1)).0 + 0.02).abs() < 1e-9);
     }
 }

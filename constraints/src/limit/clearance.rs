@@ -28,7 +28,7 @@ const ROUNDING: f64 = 1e-10;
 const CREEP: f64 = 1e-4;
 
 /// A state this far beyond the boundary rests at it [m].
-const AT: f64 = 1e-9;
+pub(super) const AT: f64 = 1e-9;
 
 /// See [`CREEP`].
 const RETURN: f64 = 20.0;

@@ -1,6 +1,6 @@
 //! Where a point of a frame may be: below a plane, inside a box.
 
-use super::clearance::{Ahead, Clearance};
+use super::clearance::{AT, Ahead, Clearance};
 use super::{About, Argument, Form, Limit, Takes};
 use crate::kinematics::{dot, norm};
 use crate::row::{Motion, Needs, Place, Rows, RowsMut, TickStart};
@@ -258,6 +258,11 @@ impl Plane {
         let (d, c) = (self.offset - margin - inset - dot(self.n, p.position), dot(self.n, p.acceleration));
         Clearance::ahead(d, dot(self.n, p.velocity), c, period)
     }
+
+    /// How far a point is beyond the plane less the margin and `inset` further inside [m].
+    fn beyond(&self, (margin, inset): (f64, f64), p: &PointMotion) -> f64 {
+        dot(self.n, p.position) - (self.offset - margin) + inset
+    }
 }
 
 impl Rows for FrameRows {
@@ -314,6 +319,13 @@ impl Rows for FrameRows {
             rows.upper[r] = clearance.bound(self.braking, period);
             rows.outside[r] = clearance.is_outside();
         }
+        // Seen from where the point will be, that is off by the second order of the period.
+        if rows.outside.contains(&true) {
+            let now = self.ahead.look_at_frames(tick.q, tick.v, 0.0).point(self.frame, self.point);
+            for (outside, plane) in rows.outside.iter_mut().zip(&self.planes) {
+                *outside &= plane.beyond((self.margin, self.inset), &now) > AT;
+            }
+        }
     }
 
     fn excess(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
@@ -331,7 +343,7 @@ impl Rows for FrameRows {
         let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
         let at = then.point(self.frame, self.point);
         for (x, plane) in out.iter_mut().zip(&self.planes) {
-            *x = dot(plane.n, at.position) - (plane.offset - self.margin) + self.inset;
+            *x = plane.beyond((self.margin, self.inset), &at);
         }
     }
 }

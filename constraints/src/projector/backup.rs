@@ -64,6 +64,10 @@ const STANDS: f64 = 1e-10;
 /// no deceleration, with which a plant that is off by a little would not stop it.
 const AT_ONCE: f64 = 1e-4;
 
+/// A joint that is outside, and needs up to this share more than it brakes by at most, is off by noise: it brakes by itself, and the others go
+/// on. Where it needs more, all brake.
+const LATE: f64 = 1e-2;
+
 /// A brake of more ticks than this is as good as one without ticks.
 const MANY: f64 = 1e5;
 
@@ -115,8 +119,13 @@ pub(crate) struct Backup {
     /// Ticks looked at in a stretch, and the breach of each row there.
     ticks: Vec<u32>,
     breach: Vec<f64>,
-    /// Breach of each row where a target was refused.
+    /// Breach of each row where a target was refused, and by how much it might be broken there.
     found: Vec<f64>,
+    spared: Vec<f64>,
+    /// What the state breaks of a cone is excused in a brake, and not in the passage to it.
+    strict: bool,
+    /// Hard rows before the hard cones.
+    cones_from: usize,
     /// A state next to it.
     near: State,
 }
@@ -163,6 +172,9 @@ impl Backup {
             ticks: Vec::with_capacity(MOST as usize),
             breach: vec![0.0; checker.hard() * MOST as usize],
             found: vec![0.0; checker.hard()],
+            spared: vec![0.0; checker.hard()],
+            strict: false,
+            cones_from: checker.hard_rows(),
             near: state(),
             checker,
         })
@@ -194,6 +206,23 @@ impl Backup {
     /// A tick begins: nothing is beyond its limit but what the brake in force is, where limits were moved.
     pub(crate) fn begin(&mut self) {
         self.allowed.copy_from_slice(&self.on_the_way);
+        self.strict = false;
+    }
+
+    /// Whether the passage to a target may break nothing of cones that the state breaks already: they are of speeds, which are less within a period.
+    pub(crate) fn be_strict(&mut self, strict: bool) {
+        self.strict = strict;
+    }
+
+    /// Whether something of a cone is excused.
+    pub(crate) fn excuses_a_cone(&self) -> bool {
+        let from = self.cones_from;
+        self.allowed[from..].iter().zip(&self.on_the_way[from..]).any(|(allowed, most)| allowed > most)
+    }
+
+    /// By how much hard row `r` may be broken in a passage.
+    fn allowed_in_a_passage(&self, r: usize) -> f64 {
+        if self.strict && r >= self.cones_from { self.on_the_way[r] } else { self.allowed[r] }
     }
 
     /// Asks for `share` of the size of a limit's cones, and for its rows to lie `inset` [m] further inside.
@@ -288,9 +317,8 @@ impl Backup {
         torque: Option<&[f64]>,
     ) -> bool {
         let rows = self.allowed.len();
-        let breach = &mut self.breach[..rows];
-        self.checker.breaches_with(from, to, with.external, torque, breach);
-        breach.iter().zip(&self.allowed).all(holds)
+        self.checker.breaches_with(from, to, with.external, torque, &mut self.breach[..rows]);
+        (0..rows).all(|r| holds((&self.breach[r], &self.allowed_in_a_passage(r))))
     }
 
     /// Looks for a brake from the state after a tick at acceleration `a` and stores it; the old one stays when there is none.
@@ -342,7 +370,9 @@ impl Backup {
                     Plan::Apart(share) => (LEAST + share * (1.0 - LEAST)) * most,
                 };
                 let at = with.dofs.single[i].map(|iq| q[iq]);
-                let Some(b) = soonest(&dof, at, (v[i], a[i]), wanted.clamp(LEAST * most, most), with.period)
+                let wanted = wanted.clamp(LEAST * most, most);
+                let Some(b) =
+                    soonest(&dof, at, (v[i], a[i]), wanted, with.period).or(with.outside[i].then_some(most))
                 else {
                     return false;
                 };
@@ -355,7 +385,7 @@ impl Backup {
                 Some(iq) if speed > 0.0 => least_deceleration(&dof, q[iq], v[i], with.period),
                 _ => 0.0,
             };
-            if least > most * (1.0 + 1e-9) {
+            if least > most * (1.0 + if with.outside[i] { LATE } else { 1e-9 }) {
                 return false;
             }
             let least = least.min(most);
@@ -599,4 +629,6 @@ pub(crate) struct With<'a> {
     pub(crate) dofs: &'a Dofs,
     pub(crate) period: &'a Period,
     pub(crate) external: &'a [f64],
+    /// Dofs that may not be able to stop before their limit: then they brake as hard as they may (nv).
+    pub(crate) outside: &'a [bool],
 }

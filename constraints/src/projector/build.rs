@@ -8,6 +8,7 @@ use super::coupled::Coupled;
 use super::moved::Moving;
 use super::nearer::Nearer;
 use super::polish::Polish;
+use super::sent::Sent;
 use super::sources::{Measured, Sources};
 use super::{Dofs, History, Projector, Stages, Switch};
 use crate::checker::Checker;
@@ -41,11 +42,14 @@ impl Projector {
         let switches = switches(model, limits, &dofs.controllable)?;
         let (each, limits) = (limits, LimitSet::collect(model, limits, &dofs.controllable)?);
         let period = Period::new(settings.dt, settings.sub_steps);
-        let checker = Checker::new(model, each, &dofs.controllable, period, settings.consistency)?;
+        let mut checker = Checker::new(model, each, &dofs.controllable, period, settings.consistency)?;
         let mut notes = choice::doubts(model, &limits, &dofs, &settings);
         notes.extend(each.iter().flat_map(|limit| limit.notes(model, &dofs.controllable)));
         let braking = choice::braking(model, &limits, &dofs, &settings, &checker, &mut notes);
         let settings = Settings { braking, ..settings };
+        if braking == Braking::Stored {
+            checker.stop_in_whole_periods();
+        }
         check_combination(model, &limits, &dofs, (settings.consistency, settings.braking))?;
         check_proportion(model, &limits, &checker)?;
         let weight: Vec<f64> = match &settings.velocity_weight {
@@ -73,7 +77,7 @@ impl Projector {
             coupled,
             switches,
             external: zero(),
-            previous: History { known: false, acceleration: zero(), torque: zero() },
+            previous: History { known: false, acceleration: zero(), torque: zero(), sent: Sent::default() },
             before: zero(),
             braking: (0..nv).map(|i| Dof::of(&limits, i).braking(&period)).collect(),
             bounds: Bounds::new(nv),
@@ -87,6 +91,8 @@ impl Projector {
             normal: vec![0.0; model.nv()],
             asked: Proposal::new(model),
             v_wanted: zero(),
+            outside: vec![false; model.nv()],
+            first: [model.neutral(), zero(), zero()],
             v_stop: zero(),
             tangent: zero(),
             backup: Backup::new(model, each, &dofs.controllable, &settings)?,

@@ -59,7 +59,7 @@ impl Projector {
                 dgoal
             }
         };
-        for (&i, d) in controllable.iter().zip(dgoal) {
+        for (&i, d) in controllable.iter().zip(dgoal).filter(|(i, _)| !self.clamped[**i][0]) {
             dv_proposal[i] = 0.5 * d;
             dq_proposal[i] = 0.5 * d / way;
         }

@@ -22,6 +22,7 @@ macro_rules! with {
             dofs: &$projector.dofs,
             period: &$projector.period,
             external: &$projector.external,
+            outside: &$projector.outside,
         }
     };
 }
@@ -45,15 +46,24 @@ impl Projector {
         }
         // On the way to moved limits, what the brake in force breaks is all that may be broken.
         let on_the_way = self.moving.coupled && self.backup.stored;
-        let outside = !on_the_way && self.backup.excuse(&with!(self), q, v);
-        if outside && self.leads_to_a_brake(q, v, target, checked) {
-            return self.taken(q, v, target, status);
+        if !on_the_way && self.backup.excuse(&with!(self), q, v) {
+            let inside = match self.backup.excuses_a_cone() {
+                true => self.come_inside(q, v, proposal, target, (status, checked)),
+                false => None,
+            };
+            if let Some(status) = inside {
+                return self.taken(q, v, target, status);
+            }
+            if self.leads_to_a_brake(q, v, target, false) {
+                return self.taken(q, v, target, status);
+            }
         }
         if !self.backup.stored && !self.backup.verify(&with!(self), (q, v), &self.before) {
             return self.brake(q, v, Some(proposal), target, BrakeReason::NoVerifiedBrake);
         }
         self.v_wanted.copy_from_slice(&target.v);
         if !self.project_again(q, v, proposal, target) && !self.go_part_of_the_way(q, v, proposal, target) {
+            self.keep_the_passage(q, v, proposal, target);
             self.report_rung(q, v, target, Rung::StoredBrake);
             return Status::Braked(BrakeReason::NoVerifiedBrake);
         }
@@ -93,6 +103,41 @@ impl Projector {
         status
     }
 
+    /// From outside of a hard cone, a target that keeps it: the noise of a measured speed is gone in a period. Its brake may break by as
+    /// much what the state breaks. `None` where no such target is found, and the one there was stays.
+    fn come_inside(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        proposal: &Proposal,
+        target: &mut Target,
+        (status, checked): (Status, bool),
+    ) -> Option<Status> {
+        self.backup.be_strict(true);
+        if self.leads_to_a_brake(q, v, target, checked) {
+            return Some(status);
+        }
+        let [first_q, first_v, first_a] = &mut self.first;
+        first_q.copy_from_slice(&target.q);
+        first_v.copy_from_slice(&target.v);
+        first_a.copy_from_slice(&target.acceleration);
+        let moved = target.ledger.moved;
+        self.v_wanted.copy_from_slice(&target.v);
+        let stored = self.backup.stored;
+        if self.project_again(q, v, proposal, target)
+            || (stored && self.go_part_of_the_way(q, v, proposal, target))
+        {
+            return Some(Status::Slowed);
+        }
+        self.backup.be_strict(false);
+        let [first_q, first_v, first_a] = &self.first;
+        target.q.copy_from_slice(first_q);
+        target.v.copy_from_slice(first_v);
+        target.acceleration.copy_from_slice(first_a);
+        target.ledger.moved = moved;
+        None
+    }
+
     /// The passage to the target breaks no hard row or cone, and a brake from it is verified, which is then stored. `checked`: the checker
     /// looked at this passage last, so that its motor forces are known.
     fn leads_to_a_brake(&mut self, q: &[f64], v: &[f64], target: &Target, checked: bool) -> bool {
@@ -123,6 +168,39 @@ impl Projector {
             }
         }
         false
+    }
+
+    /// Where the measured state is not the one that the stored brake was verified from, a tick of it may break by as much what it kept: the
+    /// nearest state to it that breaks nothing takes its place, should one be found.
+    fn keep_the_passage(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) {
+        if self.dofs.curved || self.coupled.is_none() || self.keeps(q, v, target) {
+            return;
+        }
+        self.v_wanted.copy_from_slice(&self.v_stop);
+        self.begin_again(v);
+        if let Some(stages) = &mut self.coupled {
+            stages.nearer.aim(&stages.y);
+        }
+        for _ in 0..ROUNDS {
+            let passage =
+                Passage { from: (q, v), to: (&target.q, &target.v), acceleration: &target.acceleration };
+            self.backup.refuse_passage();
+            self.change(v, &target.v);
+            if !self.cut(Refusal::Passage, passage) || !self.take_nearer(v) {
+                break;
+            }
+            self.write(q, v, Some(proposal), target);
+            if self.keeps(q, v, target) {
+                return;
+            }
+        }
+        self.blend(0.0);
+        self.write(q, v, Some(proposal), target);
+    }
+
+    /// The passage to the target breaks no hard row or cone.
+    fn keeps(&mut self, q: &[f64], v: &[f64], target: &Target) -> bool {
+        self.backup.allows(&with!(self), (q, v), (&target.q, &target.v), None)
     }
 
     /// The second projection begins at `v_wanted`.

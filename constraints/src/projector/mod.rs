@@ -16,6 +16,7 @@ mod modes;
 mod moved;
 mod nearer;
 mod polish;
+mod sent;
 mod sources;
 #[cfg(test)]
 mod spoilt;
@@ -92,13 +93,15 @@ pub struct Projector {
     notes: Vec<String>,
     /// `q_hat (-) q` (nv).
     displacement: Vec<f64>,
+    /// The measured state is outside what the dof's own limits allow (nv).
+    outside: Vec<bool>,
     /// Unconstrained optimum of v' (nv).
     goal: Vec<f64>,
     /// Next velocity under construction (nv).
     v_next: Vec<f64>,
     /// The proposal's position and velocity belong together (nv).
     consistent: Vec<bool>,
-    /// Free mode: position and velocity of the dof were clamped (nv).
+    /// Free mode: position and velocity of the dof were clamped. Kinematic: it aims elsewhere than the proposal does (nv).
     clamped: Vec<[bool; 2]>,
     /// How the last tick ended.
     last: (Status, Rung),
@@ -108,6 +111,8 @@ pub struct Projector {
     asked: Proposal,
     /// Velocities of the target that no brake was verified for (nv).
     v_wanted: Vec<f64>,
+    /// Position, velocity and acceleration of the target that was found first.
+    first: [Vec<f64>; 3],
     /// Velocities after a tick of the stored brake (nv).
     v_stop: Vec<f64>,
     tangent: Vec<f64>,
@@ -159,6 +164,7 @@ struct History {
     known: bool,
     acceleration: Vec<f64>,
     torque: Vec<f64>,
+    sent: sent::Sent,
 }
 
 impl History {
@@ -322,6 +328,7 @@ impl Projector {
                 }
                 (self.bounds.q_lower[i], self.bounds.q_upper[i]) = (lower, upper);
             }
+            self.outside[i] = outside;
             if outside {
                 target.ledger.outside.push(i);
             }

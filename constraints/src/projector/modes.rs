@@ -5,7 +5,7 @@
 use super::Projector;
 use crate::ledger::{ActiveRow, BrakeReason, Side, Status};
 use crate::target::{Proposal, Target};
-use crate::viability::Kind;
+use crate::viability::{Dof, Kind, coming_back};
 
 /// Position and velocity of a proposal belong together up to this [rad or m, relative above 1].
 const CONSISTENT: f64 = 1e-11;
@@ -74,6 +74,7 @@ impl Projector {
     ) -> Result<Status, BrakeReason> {
         self.find_goal(q, v, proposal);
         self.aim(v);
+        self.come_back(q);
         self.v_next.copy_from_slice(&proposal.v);
         for &i in &self.dofs.controllable {
             self.v_next[i] = self.goal[i].clamp(self.bounds.v_lower[i], self.bounds.v_upper[i]);
@@ -99,6 +100,7 @@ impl Projector {
         }
         for &i in &self.dofs.controllable {
             let mut size = 1.0;
+            self.clamped[i] = [false; 2];
             if let Some(iq) = self.dofs.single[i] {
                 self.displacement[i] = proposal.q[iq] - q[iq];
                 size = q[iq].abs().max(1.0); // not the proposal's: next to 1e300 every speed would belong
@@ -107,6 +109,19 @@ impl Projector {
             let y_q = ((e - t * v[i]) / (kappa * t)).clamp(-HUGE, HUGE);
             self.consistent[i] = (kappa * t * (y_q - y_v)).abs() <= CONSISTENT * size;
             self.goal[i] = if self.consistent[i] { proposal.v[i] } else { v[i] + 0.5 * (y_q + y_v) };
+        }
+    }
+
+    /// Joints that are beyond a position limit aim at coming back, whatever is proposed.
+    fn come_back(&mut self, q: &[f64]) {
+        for &i in self.dofs.controllable.iter().filter(|i| self.outside[**i]) {
+            let Some(iq) = self.dofs.single[i] else { continue };
+            let (most, least) = coming_back(&Dof::of(&self.limits, i), q[iq], &self.period);
+            let goal = self.goal[i].min(most).max(least);
+            let elsewhere = goal != self.goal[i];
+            self.consistent[i] &= !elsewhere;
+            self.clamped[i] = [elsewhere; 2];
+            self.goal[i] = goal;
         }
     }
 

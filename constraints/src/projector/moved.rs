@@ -225,8 +225,13 @@ impl Projector {
         if !m.coupled {
             return;
         }
-        let with =
-            With { limits: &self.in_force, dofs: &self.dofs, period: &self.period, external: &self.external };
+        let with = With {
+            limits: &self.in_force,
+            dofs: &self.dofs,
+            period: &self.period,
+            external: &self.external,
+            outside: &self.outside,
+        };
         let mut further = false;
         if self.settings.braking == Braking::Stored {
             self.backup.measure_the_way(&with, (q, v), &self.before);

@@ -66,6 +66,11 @@ impl Nearer {
         self.cuts = 0;
     }
 
+    /// Looks for the answer next to `y` (n) in place of the tick's goal.
+    pub(super) fn aim(&mut self, y: &[f64]) {
+        self.problem.goal.copy_from_slice(y);
+    }
+
     /// `breach + slope (y - at) <= 0`, a little further inside; true when there was room for it and it says anything.
     pub(super) fn cut(&mut self, breach: f64, slope: &[f64], at: &[f64]) -> bool {
         let size = slope.iter().fold(0.0, |most: f64, s| most.max(s.abs()));

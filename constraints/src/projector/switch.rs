@@ -94,9 +94,9 @@ impl Projector {
         &self.external
     }
 
-    /// True when some limit speaks of the tick before.
+    /// True when some limit speaks of the tick before, or some joint goes on from it.
     pub fn needs_previous(&self) -> bool {
-        self.checker.needs().previous
+        self.checker.needs().previous || self.previous.sent.is_any()
     }
 
     /// True when a brake is stored from tick to tick ([`Braking::Stored`](crate::Braking)).
@@ -138,6 +138,7 @@ impl Projector {
     /// Forgets the tick before and the stored brake: a new episode begins.
     pub fn forget(&mut self) {
         self.previous.known = false;
+        self.lose();
         self.backup.forget();
     }
 
@@ -154,6 +155,7 @@ impl Projector {
         memory.push(f64::from(u8::from(self.previous.known)));
         memory.extend_from_slice(&self.previous.acceleration);
         memory.extend_from_slice(&self.previous.torque);
+        self.previous.sent.write(memory);
         self.backup.write_memory(memory);
     }
 
@@ -166,7 +168,8 @@ impl Projector {
         self.previous.known = memory[0] != 0.0;
         self.previous.acceleration.copy_from_slice(&memory[1..=nv]);
         self.previous.torque.copy_from_slice(&memory[1 + nv..=2 * nv]);
-        self.backup.set_memory(&memory[1 + 2 * nv..]);
+        let rest = self.previous.sent.set(&memory[1 + 2 * nv..]);
+        self.backup.set_memory(rest);
     }
 
     /// Makes the last tick, which ended with `target`, the tick before.
@@ -175,6 +178,7 @@ impl Projector {
         self.previous.torque.copy_from_slice(self.checker.torque());
         let known = |x: &[f64]| x.iter().all(|x| x.is_finite());
         self.previous.known = known(&self.previous.acceleration) && known(&self.previous.torque);
+        self.previous.sent.remember(target);
     }
 
     /// Takes `proposal` as the target of the tick just projected, whatever it breaks: `target_violations` and what is remembered are the

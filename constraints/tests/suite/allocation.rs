@@ -53,7 +53,9 @@ fn frames(settings: Settings) {
     let mut limits = panda_limits(None);
     limits.push(Box::new(FrameSpeedLimit::of("panda_hand", 1.0)));
     limits.push(Box::new(EnergyLimit::of(2.5)));
-    let mut projector = Projector::new(&panda(), &limits, &[0, 1, 2, 3, 4, 5, 6], settings).unwrap();
+    let mut projector =
+        Projector::new(&panda(), &limits, &[0, 1, 2, 3, 4, 5, 6], Settings { dt: 0.005, ..settings })
+            .unwrap();
     let (ticks, allocations) = count(&mut projector, 3.0);
     println!("speed and energy: ticks {ticks:?}, allocations {allocations:?}");
     assert!(ticks[Rung::Clarabel as usize] > 20 && allocations[..2] == [0, 0]);

@@ -27,6 +27,7 @@ mod jerk;
 mod kept;
 mod kinds;
 mod kinematics;
+mod measured;
 mod motors;
 mod moving;
 mod mujoco;

@@ -268,6 +268,7 @@ impl Controller {
         }
         let held = self.hold_last_finite(state);
         self.learn(held);
+        self.depart();
         self.propose(noise, out);
         self.project(out);
         self.invert(noise, out);
@@ -292,6 +293,12 @@ impl Controller {
         self.held.v.copy_from_slice(&state.v);
         self.held.obs.copy_from_slice(&state.obs);
         false
+    }
+
+    /// Joints that follow by themselves what they are sent go on from there: see [`Projector::depart`]. The observation stays what is measured.
+    fn depart(&mut self) {
+        let last = self.guard.as_ref().map_or(&self.projector, |guard| &guard.projector);
+        last.depart(&mut self.held.q, &mut self.held.v);
     }
 
     /// The policy's next state: `proposal_k = s_k + scale_k u_k`, with `u = pi(x) (+ sigma noise)`.

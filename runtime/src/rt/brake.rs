@@ -20,6 +20,8 @@ pub struct Brake {
     range: Vec<(f64, f64)>,
     period: Period,
     action: Vec<f64>,
+    /// Where the tick begins (nq, nv).
+    from: (Vec<f64>, Vec<f64>),
 }
 
 impl Brake {
@@ -45,6 +47,7 @@ impl Brake {
             joints: joints.map(|j| (j.idx_v, j.idx_q)).collect(),
             range: manifest.action_lower.iter().copied().zip(manifest.action_upper.iter().copied()).collect(),
             period: manifest.task.period(),
+            from: (model.neutral(), vec![0.0; model.nv()]),
             action: vec![0.0; manifest.action_lower.len()],
             projector,
         }))
@@ -58,8 +61,8 @@ impl Brake {
     /// Proposes rest, `v' = 0` and `q' = q + T v - kappa T v`, or with hard jerk what leads there, and returns the command (of motors the torque
     /// [N m]) for the nearest allowed state. Joints that are not controllable keep their velocity.
     pub fn update(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
-        self.propose_rest(q, v);
-        self.act(q, v)
+        self.begin(q, v);
+        self.act()
     }
 
     /// The same for a proposal between rest and a target (nq, nv): `share` of the way from the one to the other.
@@ -71,17 +74,23 @@ impl Brake {
         target_v: &[f64],
         share: f64,
     ) -> (Status, &[f64]) {
-        self.propose_rest(q, v);
+        self.begin(q, v);
         for &(dof, idx_q) in &self.joints {
             let (rest_q, rest_v) = (self.proposal.q[idx_q], self.proposal.v[dof]);
             self.proposal.q[idx_q] = rest_q + share * (target_q[idx_q] - rest_q);
             self.proposal.v[dof] = rest_v + share * (target_v[dof] - rest_v);
         }
-        self.act(q, v)
+        self.act()
     }
 
-    fn propose_rest(&mut self, q: &[f64], v: &[f64]) {
+    /// Proposes rest for where the tick begins: as measured, or of joints that follow by themselves what they were sent.
+    fn begin(&mut self, q: &[f64], v: &[f64]) {
         let Period { dt, kappa, .. } = self.period;
+        let (from_q, from_v) = &mut self.from;
+        from_q.copy_from_slice(q);
+        from_v.copy_from_slice(v);
+        self.projector.depart(from_q, from_v);
+        let (q, v) = (&self.from.0, &self.from.1);
         self.proposal.q.copy_from_slice(q);
         self.proposal.v.copy_from_slice(v);
         for &(dof, idx_q) in &self.joints {
@@ -91,7 +100,8 @@ impl Brake {
         }
     }
 
-    fn act(&mut self, q: &[f64], v: &[f64]) -> (Status, &[f64]) {
+    fn act(&mut self) -> (Status, &[f64]) {
+        let (q, v) = (&self.from.0, &self.from.1);
         let status = self.projector.project(q, v, &self.proposal, &mut self.target);
         if self.projector.needs_previous() {
             self.projector.remember(&self.target);

@@ -165,6 +165,9 @@ impl<T: LoopController> Core<T> {
         if swapped {
             self.controller.controller.reset();
             self.controller.controller.load_memory(&self.memory);
+            if self.record.output.nu == 0 {
+                self.controller.controller.lose();
+            }
             self.heard.repeat(&mut self.controller.controller);
             self.brake_broken = false;
             self.record.counters.swaps += 1;
@@ -308,6 +311,8 @@ impl<T: LoopController> Core<T> {
         self.record.reason = self.modes.reason();
         if self.record.output.nu > 0 {
             self.controller.controller.save_memory(&mut self.memory);
+        } else {
+            self.controller.controller.lose();
         }
     }
 
@@ -383,6 +388,8 @@ impl<T: LoopController> Core<T> {
             self.memory.clear();
             self.heard.begin(state.header.seq);
             self.held = None;
+        } else if lost > 0 {
+            self.controller.controller.lose();
         }
         let is_frozen = is_next && self.is_frozen(state);
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);

@@ -244,6 +244,11 @@ impl LoopController for Pilot {
         self.share(false);
     }
 
+    fn lose(&mut self) {
+        self.controller.projector().lose();
+        self.share(false);
+    }
+
     fn save_memory(&self, memory: &mut Vec<f64>) {
         self.tried.set(false);
         memory.clear();

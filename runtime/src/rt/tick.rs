@@ -20,6 +20,8 @@ pub trait LoopController: Send + 'static {
     fn brake(&mut self, state: &StateMessage, output: &mut TickOutput) -> Outcome;
     /// The next state begins a new episode, or follows a swap.
     fn reset(&mut self);
+    /// What was answered in the tick before is not what the robot does.
+    fn lose(&mut self) {}
     /// What it takes from another process in place of its policy; none where it takes nothing. Allocates; not for the real-time thread.
     fn question(&self) -> Option<Question> {
         None

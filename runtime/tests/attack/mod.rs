@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nearl_constraints::drive::Held;
-use nearl_constraints::{Model, Moved, PeriodDynamics};
+use nearl_constraints::{Drive, Model, Moved, PeriodDynamics};
 use nearl_runtime::link::*;
 use nearl_runtime::log::{LogQueue, LogSummary, facts};
 use nearl_runtime::net::{Activation, Dense, DenseLayer};
@@ -132,10 +132,14 @@ impl Attack {
 impl Attack {
     /// Records a flight into `folder` without threads and links, as fast as its log is written.
     pub fn fly(&self, folder: &Path) -> (PathBuf, LogSummary) {
-        let first = self.snapshot(1);
+        self.fly_with(&self.snapshot(1), folder)
+    }
+
+    /// The same with a snapshot of this robot.
+    pub fn fly_with(&self, first: &Snapshot, folder: &Path) -> (PathBuf, LogSummary) {
         let robot = describe(&first.manifest, true).unwrap();
         let robot = robot.message(&RobotName::new("flight").unwrap()).unwrap();
-        let controller = Pilot::new(&first, &robot).unwrap();
+        let controller = Pilot::new(first, &robot).unwrap();
         let period = (self.dt * 1e9).round() as u64;
         let settings = CoreSettings {
             period,
@@ -187,9 +191,10 @@ impl Attack {
     }
 }
 
-/// The plant that the model says it is: forces are held for a period.
+/// The plant that the model says it is: forces, or the targets of drives, are held for a period.
 struct Twin {
     dynamics: PeriodDynamics,
+    drives: Vec<Drive>,
     /// Of its period in a control period.
     steps: u32,
     q: Vec<f64>,
@@ -212,6 +217,7 @@ impl Twin {
         let zero = vec![0.0; model.nv()];
         Twin {
             steps: steps.max(1),
+            drives: attack.snapshot(1).manifest.task.command.drives(&model, &all).unwrap(),
             dynamics: PeriodDynamics::new(&model, &all, period),
             q: attack.start.clone(),
             v: zero.clone(),
@@ -247,10 +253,12 @@ impl Twin {
         if forces.is_empty() {
             return;
         }
-        self.held.iter_mut().zip(forces).for_each(|(held, tau)| *held = Held::Force(*tau));
-        let zero = vec![0.0; self.v.len()];
-        let (dt, kappa) = (self.dynamics.period().dt, self.dynamics.period().kappa);
+        let (zero, period) = (vec![0.0; self.v.len()], *self.dynamics.period());
+        let (dt, kappa) = (period.dt, period.kappa);
         for _ in 0..self.steps {
+            for (i, (held, command)) in self.held.iter_mut().zip(forces).enumerate() {
+                *held = self.drives[i].held(&period, self.q[i], self.v[i], *command);
+            }
             self.dynamics.update(&self.q, &self.v, &zero);
             self.dynamics.accelerate(&self.held, &mut self.a);
             for i in 0..self.v.len() {

@@ -225,6 +225,38 @@ fn a_flight_on_a_plant_that_differs_to_second_order_is_verified_within_its_margi
     }
 }
 
+/// A drive that is sent less far than its target asks for leads elsewhere: the log claims a target that nothing leads to.
+#[test]
+fn targets_of_drives_that_are_cut_at_their_range_are_found() {
+    let drives = format!("{LIMITS}\n[command]\ninterface = \"pd\"\nstiffness = 100.0\ndamping = 5.0");
+    for sub_steps in [1, 0] {
+        let attack = attack(&drives, 0.001, sub_steps, 20);
+        let mut snapshot = attack.snapshot(1);
+        let model = attack.model();
+        let reach = |i: usize| (model.effort_limit()[i] + 5.0 * model.velocity_limit()[i]) / 100.0 + 0.01;
+        let ends = |far: f64| {
+            let low = (0..7).map(|i| model.lower_position_limit()[i] - far * reach(i)).collect::<Vec<_>>();
+            let high = (0..7).map(|i| model.upper_position_limit()[i] + far * reach(i)).collect::<Vec<_>>();
+            (low, high)
+        };
+        let mut fly = |far: f64| {
+            (snapshot.manifest.action_lower, snapshot.manifest.action_upper) = ends(far);
+            let folder = Scratch::new(&format!("verify-cut-{sub_steps}-{far}"));
+            let (log, summary) = attack.fly_with(&snapshot, &folder.0);
+            assert_eq!((summary.dropped, summary.brief, summary.error), (0, 0, None));
+            verify(&log).unwrap()
+        };
+        holds(&fly(1.0), 1500);
+        let report = fly(0.0);
+        println!("{sub_steps}: {report}");
+        let is_cut = |violation: &Violation| violation.what.contains("is cut at its range");
+        assert!(report.found > 0 && report.violations.iter().any(is_cut), "{report}");
+        let told = report.not_verified.keys().any(|why| why.contains("is cut at its range"));
+        assert!(told && !report.is_whole(), "{report}");
+        assert_eq!(report.verified + report.found + report.unverified() + report.idle, 1500, "{report}");
+    }
+}
+
 /// Speeds with accelerations of another joint, and sums of positions and of speeds that stay where they are.
 #[test]
 fn rows_of_several_joints_are_verified_with_what_a_brake_keeps_of_them() {
@@ -870,6 +902,8 @@ fn a_log_that_is_made_to_cost_much_ends_with_a_reason() {
         joint.unwrap().kind = JointKind::Ball;
     };
     refused(&ball, "joint 'panda_joint1' has several degrees of freedom");
+    let text = verify(&other).unwrap_err().to_string();
+    assert!(text.contains("nearl replay") && !text.contains("of this build"), "{text}");
 }
 
 #[test]

@@ -6,6 +6,7 @@
 //! multipliers that the log carries. What is not known here is refused by name, and a tick that cannot be confirmed is counted so.
 
 mod collision;
+mod cut;
 mod facts;
 mod jerk;
 mod limit_check;

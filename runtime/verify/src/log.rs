@@ -9,6 +9,7 @@ use mcap::read::parse_record;
 use mcap::records::Record as Part;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
+use crate::motion::UNKNOWN_ROBOT;
 use crate::report::Report;
 use crate::session::Session;
 use crate::tick::{Brief, Numbered, Tick};
@@ -20,12 +21,16 @@ const WORDS: usize = 300;
 
 /// Why a log cannot be verified.
 #[derive(Debug, thiserror::Error)]
-#[error(
-    "flight log '{file}' cannot be verified: {reason}; give a file written by `nearl run --log` of this build"
-)]
+#[error("flight log '{file}' cannot be verified: {reason}{}", next(*is_log))]
 pub struct VerifyError {
     file: PathBuf,
     reason: String,
+    /// It is a log, of a robot that is not known here.
+    is_log: bool,
+}
+
+fn next(is_log: bool) -> &'static str {
+    if is_log { "" } else { "; give a file written by `nearl run --log` of this build" }
 }
 
 /// Verifies the log in `file`.
@@ -35,7 +40,8 @@ pub struct VerifyError {
 pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     let fail = |reason: String| {
         let plain: String = reason.replace(['\n', '\r'], " ").chars().take(WORDS).collect();
-        VerifyError { file: file.to_owned(), reason: plain }
+        let is_log = reason.contains(UNKNOWN_ROBOT);
+        VerifyError { file: file.to_owned(), reason: plain, is_log }
     };
     let (log, length) = open(file).map_err(fail)?;
     let mut report = read(log, length).map_err(fail)?;

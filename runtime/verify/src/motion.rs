@@ -73,6 +73,8 @@ const JOINTS: usize = 256;
 /// Steps of work (a link moved, a distance looked at) that a tick may take on average, and more of them at first.
 const EACH: i64 = 500_000;
 const FIRST: i64 = 20_000_000;
+/// What is said of a robot whose motion is not known here.
+pub(crate) const UNKNOWN_ROBOT: &str = "robots of hinges, slides and continuous joints alone are verified";
 /// Why a tick is not verified for which no steps are left.
 pub(crate) const SPENT: &str = "verifying them takes longer than a log of this length is given";
 
@@ -176,7 +178,8 @@ impl Machine {
                     JointKind::Continuous => 2,
                     _ => {
                         return Err(format!(
-                            "joint '{}' has several degrees of freedom, and the recursion here is of joints with one",
+                            "joint '{}' has several degrees of freedom, and {UNKNOWN_ROBOT}; `nearl replay` computes its ticks again, and `nearl report` \
+                             shows what was measured",
                             joint.name
                         ));
                     }

@@ -130,6 +130,9 @@ pub(crate) struct Promise {
     pub(crate) projects: Projects,
     pub(crate) consistency: Consistency,
     pub(crate) way: Way,
+    /// Controllable joints that follow by themselves what they are sent: dof, entry of a configuration and how far they may be from it
+    /// where they are sent a position, else none.
+    follows: Vec<(usize, Option<(usize, f64)>)>,
     /// Of analytic inverse dynamics; empty where a network gives the action.
     pub(crate) actions: Vec<Action>,
     /// Limits on actions, and those of drives, change `moved`.
@@ -157,6 +160,10 @@ fn manifest(bytes: &[u8]) -> Result<String, String> {
         .map(|(_, manifest)| manifest.to_owned())
         .ok_or_else(|| "its manifest is cut".to_owned())
 }
+
+/// A joint that is sent positions does not follow where it is further from the last one than its way at the speed limit in this time [s]; without
+/// one, than this [rad or m].
+const FOLLOWING: f64 = 0.1;
 
 /// The limits with every margin at 0, but for that of bodies, which is their limit.
 fn without_margins(limits: &Value) -> Value {
@@ -262,6 +269,16 @@ impl Promise {
             (false, false) if guards => Projects::Unlogged,
             (false, false) => Projects::Proposals,
         };
+        let follows = |&dof: &usize| match sent[dof] {
+            Sent::Position => {
+                let most = FOLLOWING * limits.joints[dof].velocity;
+                let most = if most.is_finite() { most } else { FOLLOWING };
+                machine.single(dof).map(|at| (dof, Some((at, most))))
+            }
+            Sent::Velocity => Some((dof, None)),
+            _ => None,
+        };
+        let follows = controllable.iter().filter_map(follows).collect();
         let is_known = (is_analytic && !is_direct) || (guards && controllable.len() == machine.nv());
         let actions = if is_known { m.actions(&controllable, &sent)? } else { Vec::new() };
         let change = |dof: &usize| {
@@ -291,6 +308,7 @@ impl Promise {
             projects,
             consistency,
             way: section.braking,
+            follows,
             actions,
             limits_actions: section.action.is_some() || section.guard == "drive",
             moving,
@@ -317,6 +335,24 @@ impl Promise {
         if let Some((limits, moving)) = &mut self.without_margins {
             std::mem::swap(limits, &mut self.limits);
             std::mem::swap(moving, &mut self.moving);
+        }
+    }
+
+    /// Whether some joint goes on from what it was sent in the tick before.
+    pub(crate) fn follows(&self) -> bool {
+        !self.follows.is_empty()
+    }
+
+    /// Puts what was `sent` (nq, nv) in the tick before in the place of what is measured, of joints that follow by themselves.
+    pub(crate) fn depart(&self, sent: &(Vec<f64>, Vec<f64>), q: &mut [f64], v: &mut [f64]) {
+        for &(dof, position) in &self.follows {
+            match position {
+                Some((at, most)) if (q[at] - sent.0[at]).abs() <= most => {
+                    (q[at], v[dof]) = (sent.0[at], sent.1[dof]);
+                }
+                Some(_) => {}
+                None => v[dof] = sent.1[dof],
+            }
         }
     }
 

@@ -34,6 +34,9 @@ type Told = (Vec<f64>, Vec<f64>);
 
 /// What the tick before left.
 struct Past {
+    /// Number of its state: the plant's start and the count since.
+    epoch: u64,
+    seq: u64,
     episode: u64,
     target: (Vec<f64>, Vec<f64>),
     /// Its acceleration, and the brake that it stored; empty where it stored none.
@@ -59,6 +62,8 @@ pub(crate) struct Session {
     /// Promises by snapshot: its own, then what the loop pinned beside it.
     promises: HashMap<u64, (Promise, Option<Promise>)>,
     past: Option<Past>,
+    /// The log does not have the tick before.
+    is_cut: bool,
     begun: Option<Begun>,
     /// What the robot carries as far as the brake in force was verified with it.
     carried: Option<Payload>,
@@ -117,7 +122,7 @@ impl Session {
         let lost = tick - self.at - 1;
         if lost > 0 {
             self.skip("the log does not have them", lost);
-            (self.past, self.begun) = (None, None);
+            (self.past, self.begun, self.is_cut) = (None, None, true);
         }
         self.at = tick;
         self.report.ticks += 1;
@@ -145,7 +150,7 @@ impl Session {
     pub(crate) fn brief(&mut self, tick: u64) -> Result<(), String> {
         self.arrive(tick)?;
         self.skip("the disk was too slow for more than their inputs", 1);
-        (self.past, self.begun) = (None, None);
+        (self.past, self.begun, self.is_cut) = (None, None, true);
         Ok(())
     }
 
@@ -158,7 +163,7 @@ impl Session {
         }
         if tick.action.is_empty() {
             self.report.idle += 1;
-            self.past = None;
+            (self.past, self.is_cut) = (None, false);
             return Ok(());
         }
         let mut promises = match self.promises.remove(&tick.snapshot) {
@@ -195,18 +200,38 @@ impl Session {
             }
         };
         let (dt, nq, nv) = (promises.0.period.dt, promises.0.machine.nq(), promises.0.machine.nv());
+        let v = self.begins(&promises.0, tick).map_or_else(|| tick.state.v.clone(), |(_, v)| v);
         self.promises.insert(tick.snapshot, promises);
-        let v = match (&tick.sensed[..], self.past.take()) {
-            ("predicted", Some(past)) => past.target.1,
-            _ => tick.state.v.clone(),
-        };
+        (self.past, self.is_cut) = (None, false);
         if [tick.target_q.len(), tick.target_v.len(), v.len()] != [nq, nv, nv] {
             return Ok(()); // it was named, and leaves nothing that the next tick could be confirmed by
         }
         let a = tick.target_v.iter().zip(&v).map(|(to, from)| (to - from) / dt).collect();
         let target = (tick.target_q.clone(), tick.target_v.clone());
-        self.past = Some(Past { episode: tick.state.episode, target, a, brake: tick.brake.clone(), told });
+        let state = &tick.state;
+        let (epoch, seq, episode, brake) = (state.epoch, state.seq, state.episode, tick.brake.clone());
+        self.past = Some(Past { epoch, seq, episode, target, a, brake, told });
         Ok(())
+    }
+
+    /// The state that a tick goes on from (nq, nv): as measured or predicted, and of joints that follow by themselves what they were sent
+    /// unless states were lost since. None where the log does not have what it was predicted from, or has a state of another robot.
+    fn begins(&self, own: &Promise, tick: &Tick) -> Option<(Vec<f64>, Vec<f64>)> {
+        let (mut q, mut v) = match (&tick.sensed[..], &self.past) {
+            ("predicted", past) => past.as_ref()?.target.clone(),
+            _ => (tick.state.q.clone(), tick.state.v.clone()),
+        };
+        if [q.len(), v.len()] != [own.machine.nq(), own.machine.nv()] {
+            return None;
+        }
+        if let Some(past) = &self.past {
+            let state = &tick.state;
+            let is_next = state.epoch == past.epoch && state.seq <= past.seq + 1;
+            if is_next && [past.target.0.len(), past.target.1.len()] == [q.len(), v.len()] {
+                own.depart(&past.target, &mut q, &mut v);
+            }
+        }
+        Some((q, v))
     }
 
     /// What snapshot `id` promises, and what the loop pinned.
@@ -291,15 +316,17 @@ impl Session {
         finite("target_v", &tick.target_v)?;
         finite("action", &tick.action)?;
         let by_policy = matches!(tick.mode.as_str(), "active" | "degraded");
-        let (q, v) = match (tick.sensed.as_str(), &self.past) {
-            ("measured", _) => (tick.state.q.clone(), tick.state.v.clone()),
-            ("predicted", Some(past)) => past.target.clone(),
-            ("predicted", None) => {
-                return unknown("they acted on a state predicted from a tick that the log does not have");
-            }
-            (other, _) => {
-                return broken(format!("action, while the state is '{other}',"), tick.action[0], 0.0, "");
-            }
+        if !matches!(tick.sensed.as_str(), "measured" | "predicted") {
+            let what = format!("action, while the state is '{}',", tick.sensed);
+            return broken(what, tick.action[0], 0.0, "");
+        }
+        if own.follows() && self.is_cut {
+            return unknown(
+                "their joints go on from what they were sent in a tick that the log does not have",
+            );
+        }
+        let Some((q, v)) = self.begins(own, tick) else {
+            return unknown("they acted on a state predicted from a tick that the log does not have");
         };
         finite("state.q", &q)?;
         finite("state.v", &v)?;
@@ -742,7 +769,7 @@ fn actions(promise: &mut Promise, passage: &Passage<'_>, found: &[f64]) -> Resul
     let p = promise.period;
     let (lag, sag) = (0.5 * (p.dt - p.tau), (p.dt * p.dt - p.tau * p.tau) / 6.0);
     let by_steps = p.sub_steps > 1 && !promise.actions.iter().any(|x| matches!(x.sent, Sent::Target { .. }));
-    let mut means = Vec::new();
+    let (mut means, mut cut) = (Vec::new(), None);
     for action in &promise.actions {
         let (i, joint) = (action.dof, &promise.limits.joints[action.dof].name);
         let Some(at) = promise.machine.single(i) else { continue };
@@ -763,12 +790,19 @@ fn actions(promise: &mut Promise, passage: &Passage<'_>, found: &[f64]) -> Resul
         let is = found.get(action.place).copied().unwrap_or(f64::NAN);
         let size = 1.0 + leads.abs().max(action.range[1].abs().min(1e3));
         means.push(leads);
+        // What a motor lacks of a force is its limit's matter; a position, a speed or a target that ends before leads elsewhere.
+        if !matches!(action.sent, Sent::Force) && !are_near(sent, leads, by_friction + ACTION * size) {
+            cut = cut.or(Some(i));
+        }
         if by_steps && matches!(action.sent, Sent::Force) {
             continue;
         }
         if !are_near(is, leads, by_friction + ACTION * size) {
             return broken(format!("action for joint '{joint}'"), is, leads, unit);
         }
+    }
+    if let Some(cut) = cut {
+        return crate::cut::lead(promise, passage, found, cut);
     }
     if p.sub_steps > 1 && !means.is_empty() {
         crate::steps::lead(promise, passage, found, &means)

@@ -79,7 +79,7 @@ pub(crate) fn lead(
 }
 
 /// Force of an action [N m or N].
-fn force(action: &Action, is: f64) -> f64 {
+pub(crate) fn force(action: &Action, is: f64) -> f64 {
     action.gear * (action.gain * is + action.bias)
 }
 
@@ -134,7 +134,12 @@ fn accelerations(
         rows[c][c] += tau * machine.damping(j);
     }
     (0..n).for_each(|r| rows[r][n] = force[free[r]] - need[free[r]]);
-    // the matrix is positive definite: no pivoting
+    solve(rows).into_iter().zip(&free).for_each(|(x, &i)| a[i] = x);
+}
+
+/// Solves equations whose rows end with their right side. The matrix is nearly symmetric and positive definite: no pivoting.
+pub(crate) fn solve(mut rows: Vec<Vec<f64>>) -> Vec<f64> {
+    let n = rows.len();
     for k in 0..n {
         for r in k + 1..n {
             let share = rows[r][k] / rows[k][k];
@@ -143,8 +148,10 @@ fn accelerations(
             }
         }
     }
+    let mut x = vec![0.0; n];
     for k in (0..n).rev() {
-        let known: f64 = (k + 1..n).map(|j| rows[k][j] * a[free[j]]).sum();
-        a[free[k]] = (rows[k][n] - known) / rows[k][k];
+        let known: f64 = (k + 1..n).map(|j| rows[k][j] * x[j]).sum();
+        x[k] = (rows[k][n] - known) / rows[k][k];
     }
+    x
 }

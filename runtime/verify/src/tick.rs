@@ -45,6 +45,10 @@ pub(crate) struct Tick {
 #[derive(Debug, Deserialize)]
 pub(crate) struct State {
     #[serde(default)]
+    pub(crate) epoch: u64,
+    #[serde(default)]
+    pub(crate) seq: u64,
+    #[serde(default)]
     pub(crate) episode: u64,
     #[serde(deserialize_with = "numbers")]
     pub(crate) q: Vec<f64>,

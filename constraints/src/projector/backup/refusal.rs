@@ -31,7 +31,7 @@ impl Backup {
     /// wrong. The breaches of the rows there are [`Backup::found`].
     pub(crate) fn refusal(&mut self, with: &With<'_>, passage: Passage<'_>) -> Option<Refusal> {
         if !self.allows(with, passage.from, passage.to, None) {
-            self.keep_found();
+            self.refuse_passage();
             return Some(Refusal::Passage);
         }
         let (q, v) = passage.to;
@@ -51,6 +51,7 @@ impl Backup {
             if most > worst {
                 (worst, at) = (most, Some(tick));
                 self.keep_found();
+                self.spared.copy_from_slice(&self.allowed);
             }
         }
         at.map(Refusal::Brake)
@@ -58,7 +59,7 @@ impl Backup {
 
     /// By how much each hard row is broken where the last target was refused, less what is allowed.
     pub(crate) fn found(&self) -> impl Iterator<Item = f64> {
-        self.found.iter().zip(&self.allowed).map(|(found, allowed)| found - allowed)
+        self.found.iter().zip(&self.spared).map(|(found, spared)| found - spared)
     }
 
     /// Writes to `slopes` (hard rows) how the breaches of a refusal change with the velocity change of dof `i`, by a difference; false where
@@ -104,6 +105,14 @@ impl Backup {
 
     fn tried_first(&self) -> Plan {
         TRIED[self.favourite]
+    }
+
+    /// The passage that was looked at last is refused.
+    pub(crate) fn refuse_passage(&mut self) {
+        self.keep_found();
+        for r in 0..self.spared.len() {
+            self.spared[r] = self.allowed_in_a_passage(r);
+        }
     }
 
     fn keep_found(&mut self) {

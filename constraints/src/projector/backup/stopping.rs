@@ -10,7 +10,9 @@ pub(super) fn least_deceleration(dof: &Dof, q: f64, v: f64, period: &Period) -> 
         true => (dof.upper - q, dof.profile[1], 1.0),
         false => (q - dof.lower, dof.profile[0], -1.0),
     };
-    let mut least = stopping(room, v.abs(), period).max(smooth(room, v.abs(), period));
+    let (ticks, smooth) = (stopping(room, v.abs(), period), smooth(room, v.abs(), period));
+    // Where the smooth brake asks for more than there is, the ticks may still do.
+    let mut least = if smooth > dof.braking(period) * (1.0 + 1e-9) { ticks } else { ticks.max(smooth) };
     if let Some(p) = profile {
         // Braking with the deceleration of the parabola that leads from here to the end of the profile stays below the profile.
         let needed = (v.abs() + p.offset).powi(2) / (2.0 * (at * (p.at - q)).max(f64::MIN_POSITIVE));

@@ -139,6 +139,7 @@ impl Parts {
         };
         let mut projector =
             Projector::new(model, &limits, controllable, settings).map_err(|e| unusable(&e))?;
+        projector.follow(&drives);
         if let Some(moved) = &m.moved {
             // The model has the payload.
             let moved = Moved { payload: None, ..moved.clone() };

@@ -1,0 +1,100 @@
+//! Set points of joints that follow by themselves what they are sent: each begins where the one before ended, not where the joint is measured.
+//! From there the drive's lag, its droop under a load and the noise of its encoder would go into the next set point, and add up.
+
+use super::Projector;
+use crate::{Drive, Target};
+
+/// How far a joint may lag behind the position it was sent: its way at the speed limit in this time [s], without one this itself [rad or m].
+const FOLLOWING: f64 = 0.1;
+
+/// What joints were sent that follow by themselves.
+#[derive(Default)]
+pub(super) struct Sent {
+    known: bool,
+    /// Dofs that are sent positions, with their entry of a configuration and how far they may be from it [rad or m].
+    positions: Vec<(usize, usize, f64)>,
+    /// Dofs that are sent velocities.
+    velocities: Vec<usize>,
+    /// The target of the tick before (nq, nv).
+    q: Vec<f64>,
+    v: Vec<f64>,
+}
+
+impl Projector {
+    /// The `drives` (nv) say which controllable joints follow by themselves what they are sent: [`Projector::depart`] has those go on from there.
+    pub fn follow(&mut self, drives: &[Drive]) {
+        let sent = &mut self.previous.sent;
+        (sent.positions, sent.velocities) = (Vec::new(), Vec::new());
+        for &i in &self.dofs.controllable {
+            match (drives[i], self.dofs.single[i]) {
+                (Drive::Position, Some(iq)) => {
+                    let window = FOLLOWING * self.limits.velocity[i];
+                    sent.positions.push((i, iq, if window.is_finite() { window } else { FOLLOWING }));
+                }
+                (Drive::Velocity, _) => sent.velocities.push(i),
+                _ => {}
+            }
+        }
+        (sent.q, sent.v, sent.known) = (self.model.neutral(), vec![0.0; self.model.nv()], false);
+    }
+
+    /// Puts what was sent in the tick before in the place of what is measured, `q` (nq) and `v` (nv), of joints that follow by themselves: a set
+    /// point that began at the measured position would carry each error of the drive into the next. Joints that are sent positions and are further
+    /// from the last one than they move at their speed limit within 0.1 s (0.1 rad or m without one) do not follow, and begin where they are.
+    pub fn depart(&self, q: &mut [f64], v: &mut [f64]) {
+        let sent = &self.previous.sent;
+        if !sent.known {
+            return;
+        }
+        for &(i, iq, window) in &sent.positions {
+            if (q[iq] - sent.q[iq]).abs() <= window {
+                (q[iq], v[i]) = (sent.q[iq], sent.v[i]);
+            }
+        }
+        for &i in &sent.velocities {
+            v[i] = sent.v[i];
+        }
+    }
+
+    /// What was sent in the tick before is not what the robot does: the next tick begins where it is measured.
+    pub fn lose(&mut self) {
+        self.previous.sent.known = false;
+    }
+}
+
+impl Sent {
+    /// Some joint follows by itself.
+    pub(super) fn is_any(&self) -> bool {
+        !(self.positions.is_empty() && self.velocities.is_empty())
+    }
+
+    pub(super) fn write(&self, memory: &mut Vec<f64>) {
+        if self.is_any() {
+            memory.push(f64::from(u8::from(self.known)));
+            memory.extend_from_slice(&self.q);
+            memory.extend_from_slice(&self.v);
+        }
+    }
+
+    /// Takes what [`Sent::write`] wrote; what is left of `memory`.
+    pub(super) fn set<'m>(&mut self, memory: &'m [f64]) -> &'m [f64] {
+        if !self.is_any() {
+            return memory;
+        }
+        let (q, rest) = memory[1..].split_at(self.q.len());
+        let (v, rest) = rest.split_at(self.v.len());
+        self.known = memory[0] != 0.0;
+        self.q.copy_from_slice(q);
+        self.v.copy_from_slice(v);
+        rest
+    }
+
+    /// Makes `target` what was sent in the tick before.
+    pub(super) fn remember(&mut self, target: &Target) {
+        if self.is_any() {
+            self.q.copy_from_slice(&target.q);
+            self.v.copy_from_slice(&target.v);
+            self.known = true;
+        }
+    }
+}
