@@ -115,7 +115,8 @@ nearl_sizes nearl_controller_sizes(const nearl_controller *controller);
 int nearl_controller_update(nearl_controller *controller, const double *q, const double *v, const double *obs, double *action,
                             nearl_ledger *ledger);
 
-/* A new episode: the next tick is one of the policy's. */
+/* A new episode, or a pause in which the robot did something else than it was sent: the next tick is one of the policy's, and begins where the
+ * robot is. */
 void nearl_controller_reset(nearl_controller *controller);
 
 /* NULL is allowed. */

@@ -107,7 +107,7 @@ const FILES: &[(&str, &str, &str, &[&str])] = &[
         "Panda-reach",
         "margin = 0.01",
         "margin = 5.0",
-        &["contradict", "'panda_joint1'", "'panda_joint7'", "rad"],
+        &["leaves nothing of its range", "'panda_joint1'", "'panda_joint7'", "rad"],
     ),
     (
         "Panda-reach",
