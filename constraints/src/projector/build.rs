@@ -92,6 +92,7 @@ impl Projector {
             asked: Proposal::new(model),
             v_wanted: zero(),
             outside: vec![false; model.nv()],
+            pull: zero(),
             first: [model.neutral(), zero(), zero()],
             v_stop: zero(),
             tangent: zero(),

@@ -59,7 +59,7 @@ impl Projector {
                 dgoal
             }
         };
-        for (&i, d) in controllable.iter().zip(dgoal).filter(|(i, _)| !self.clamped[**i][0]) {
+        for (&i, d) in controllable.iter().zip(dgoal).filter(|(i, _)| self.pull[**i] == 0.0) {
             dv_proposal[i] = 0.5 * d;
             dq_proposal[i] = 0.5 * d / way;
         }

@@ -101,7 +101,9 @@ pub struct Projector {
     v_next: Vec<f64>,
     /// The proposal's position and velocity belong together (nv).
     consistent: Vec<bool>,
-    /// Free mode: position and velocity of the dof were clamped. Kinematic: it aims elsewhere than the proposal does (nv).
+    /// By how much more the proposal asks for than a dof that is to come back aims at [rad/s or m/s] (nv).
+    pull: Vec<f64>,
+    /// Free mode: position and velocity of the dof were clamped (nv).
     clamped: Vec<[bool; 2]>,
     /// How the last tick ended.
     last: (Status, Rung),

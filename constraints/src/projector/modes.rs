@@ -83,6 +83,7 @@ impl Projector {
         if !solved {
             self.report_box(target);
         }
+        self.report_pulls(target);
         let unchanged = self.write(q, v, Some(proposal), target);
         Ok(match (solved, unchanged) {
             (true, _) => Status::Solved,
@@ -100,7 +101,7 @@ impl Projector {
         }
         for &i in &self.dofs.controllable {
             let mut size = 1.0;
-            self.clamped[i] = [false; 2];
+            self.pull[i] = 0.0;
             if let Some(iq) = self.dofs.single[i] {
                 self.displacement[i] = proposal.q[iq] - q[iq];
                 size = q[iq].abs().max(1.0); // not the proposal's: next to 1e300 every speed would belong
@@ -118,10 +119,21 @@ impl Projector {
             let Some(iq) = self.dofs.single[i] else { continue };
             let (most, least) = coming_back(&Dof::of(&self.limits, i), q[iq], &self.period);
             let goal = self.goal[i].min(most).max(least);
-            let elsewhere = goal != self.goal[i];
-            self.consistent[i] &= !elsewhere;
-            self.clamped[i] = [elsewhere; 2];
+            self.pull[i] = self.goal[i] - goal;
+            self.consistent[i] &= goal == self.goal[i];
             self.goal[i] = goal;
+        }
+    }
+
+    /// What is coming back is held by its position limit.
+    fn report_pulls(&self, target: &mut Target) {
+        let active = &mut target.ledger.active;
+        for &i in self.dofs.controllable.iter().filter(|i| self.pull[**i] != 0.0) {
+            if active.iter().all(|row| row.row != i) {
+                let side = if self.pull[i] > 0.0 { Side::Upper } else { Side::Lower };
+                let multiplier = 2.0 * self.weight[i] * self.pull[i].abs();
+                active.push(ActiveRow { kind: Kind::Position, row: i, side, multiplier, slack: 0.0 });
+            }
         }
     }
 
