@@ -127,13 +127,16 @@ impl Projector {
 
     /// What is coming back is held by its position limit.
     fn report_pulls(&self, target: &mut Target) {
-        let active = &mut target.ledger.active;
         for &i in self.dofs.controllable.iter().filter(|i| self.pull[**i] != 0.0) {
-            if active.iter().all(|row| row.row != i) {
-                let side = if self.pull[i] > 0.0 { Side::Upper } else { Side::Lower };
-                let multiplier = 2.0 * self.weight[i] * self.pull[i].abs();
-                active.push(ActiveRow { kind: Kind::Position, row: i, side, multiplier, slack: 0.0 });
-            }
+            let side = if self.pull[i] > 0.0 { Side::Upper } else { Side::Lower };
+            let multiplier = 2.0 * self.weight[i] * self.pull[i].abs();
+            target.ledger.active.push(ActiveRow {
+                kind: Kind::Position,
+                row: i,
+                side,
+                multiplier,
+                slack: 0.0,
+            });
         }
     }
 

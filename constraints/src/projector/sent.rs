@@ -7,6 +7,9 @@ use crate::{Drive, Target};
 /// How far a joint may lag behind the position it was sent: its way at the speed limit in this time [s], without one this itself [rad or m].
 const FOLLOWING: f64 = 0.1;
 
+/// After more periods than this the driver has long come to rest.
+const MISSED: u64 = 1000;
+
 /// What joints were sent that follow by themselves.
 #[derive(Default)]
 pub(super) struct Sent {
@@ -53,6 +56,19 @@ impl Projector {
         }
         for &i in &sent.velocities {
             v[i] = sent.v[i];
+        }
+    }
+
+    /// Periods passed in which nothing was sent, and the driver went on by itself as docs/CONNECT.md has it: positions from the last one on, slower
+    /// in each period by what the joint may decelerate, velocities as they were.
+    pub fn miss(&mut self, periods: u64) {
+        let (dt, sent) = (self.period.dt, &mut self.previous.sent);
+        for &(i, iq, _) in &sent.positions {
+            for _ in 0..periods.min(MISSED) {
+                let slower = (self.limits.acceleration[i] * dt).min(sent.v[i].abs());
+                sent.v[i] -= slower.copysign(sent.v[i]);
+                sent.q[iq] += dt * sent.v[i];
+            }
         }
     }
 

@@ -145,6 +145,18 @@ fn joints_that_follow_go_on_from_what_they_were_sent() {
     projector.lose();
     assert_eq!(goes_on(&projector), (0.2, 0.01, 0.3, 0.01, 0.01));
 
+    // two periods without an answer: 15 rad/s^2 take 0.15 rad/s off in each
+    projector.remember(&target);
+    projector.miss(2);
+    let held = goes_on(&projector);
+    assert!(
+        (held.1 - 0.1).abs() < 1e-12 && (held.0 - target.q[0] - 0.01 * (0.25 + 0.1)).abs() < 1e-12,
+        "{held:?}"
+    );
+    assert_eq!(held.3, 0.5);
+    projector.miss(100);
+    assert_eq!(goes_on(&projector).1, 0.0);
+
     target.q[0] = 0.2 + 1.5 * window; // it does not follow
     projector.remember(&target);
     assert_eq!(goes_on(&projector), (0.2, 0.01, 0.3, 0.5, 0.01));

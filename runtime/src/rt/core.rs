@@ -388,8 +388,9 @@ impl<T: LoopController> Core<T> {
             self.memory.clear();
             self.heard.begin(state.header.seq);
             self.held = None;
-        } else if lost > 0 {
-            self.controller.controller.lose();
+        } else if lost > 0 && self.settings.sync == Sync::Plant {
+            // Each of them was answered by nothing; a loop with a clock of its own has answered in every slot.
+            self.controller.controller.miss(lost);
         }
         let is_frozen = is_next && self.is_frozen(state);
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);

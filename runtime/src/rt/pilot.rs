@@ -249,6 +249,11 @@ impl LoopController for Pilot {
         self.share(false);
     }
 
+    fn miss(&mut self, periods: u64) {
+        self.controller.projector().miss(periods);
+        self.share(false);
+    }
+
     fn save_memory(&self, memory: &mut Vec<f64>) {
         self.tried.set(false);
         memory.clear();

@@ -22,6 +22,8 @@ pub trait LoopController: Send + 'static {
     fn reset(&mut self);
     /// What was answered in the tick before is not what the robot does.
     fn lose(&mut self) {}
+    /// The plant has held for so many periods what was answered last.
+    fn miss(&mut self, _periods: u64) {}
     /// What it takes from another process in place of its policy; none where it takes nothing. Allocates; not for the real-time thread.
     fn question(&self) -> Option<Question> {
         None

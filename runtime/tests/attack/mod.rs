@@ -36,6 +36,10 @@ pub struct Attack {
     pub moves: Vec<(u64, Moved)>,
     /// Time that the plant takes to measure: a lockstep loop is faster than its log.
     pub pause: Duration,
+    /// One of so many states is lost, and the driver holds; 0 is none. Of [`Attack::fly`], with joints that are sent positions.
+    pub lost: u64,
+    /// How far behind itself the robot is measured \[s\].
+    pub lag: f64,
 }
 
 fn weights(seed: u64, n: usize) -> Vec<f32> {
@@ -162,8 +166,17 @@ impl Attack {
         let mut core = Core::new(settings, Box::new(Loaded { id: 0, controller }), 0, FaultPlan::default());
         let mut twin = Twin::new(self);
         for tick in 1..=self.ticks {
+            if self.lost > 0 && tick % self.lost == 0 {
+                twin.hold(first);
+                continue;
+            }
             let mut state = StateMessage::zeroed();
             twin.measure(&mut state);
+            for i in 0..twin.v.len() {
+                let behind = twin.q[i] - self.lag * twin.v[i];
+                state.q_mut()[i] = behind;
+                state.obs_mut()[i] = behind;
+            }
             (state.header.epoch, state.header.seq, state.header.stamp) = (1, tick, tick * period);
             state.tick = tick;
             let moved = self.moves.iter().find(|(at, _)| *at == tick);
@@ -236,6 +249,17 @@ impl Twin {
             moved.payload.as_ref().map_or(Ok(bare.clone()), |payload| bare.with_payload(payload)).unwrap();
         let all: Vec<usize> = (0..model.nv()).collect();
         self.dynamics = PeriodDynamics::new(&model, &all, *self.dynamics.period());
+    }
+
+    /// What a driver of positions does without an answer: it goes on, slower by what the joints may decelerate.
+    fn hold(&mut self, snapshot: &Snapshot) {
+        let period = self.dynamics.period().dt * f64::from(self.steps);
+        let most =
+            snapshot.manifest.task.constraints.acceleration.as_ref().and_then(|a| a.limit.of("")).unwrap();
+        for (q, v) in self.q.iter_mut().zip(&mut self.v) {
+            *v -= v.signum() * (most * period).min(v.abs());
+            *q += period * *v;
+        }
     }
 
     fn measure(&self, state: &mut StateMessage) {

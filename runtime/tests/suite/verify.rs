@@ -37,6 +37,8 @@ fn attack(constraints: &str, dt: f64, sub_steps: u32, policy_every: usize) -> At
         ticks: 1500,
         moves: Vec::new(),
         pause: Duration::ZERO,
+        lost: 0,
+        lag: 0.0,
     }
 }
 
@@ -222,6 +224,41 @@ fn a_flight_on_a_plant_that_differs_to_second_order_is_verified_within_its_margi
             braked += ticks(&log).iter().filter(|tick| is_braked(tick)).count();
         }
         assert!(braked > 20, "{braked}");
+    }
+}
+
+/// Positions go on from what was sent, though the robot is measured 20 ms behind and every seventh state is lost, in whose period the driver
+/// holds: by differences of what the robot is sent, no acceleration is above its limit but by what a period without an answer makes of it.
+#[test]
+fn set_points_of_a_robot_that_lags_keep_their_limits_over_states_that_are_lost() {
+    let positions = format!("{LIMITS}\n[command]\ninterface = \"position\"");
+    for lost in [0, 7] {
+        let flight = Attack { lost, lag: 0.02, ..attack(&positions, 0.004, 1, 20) };
+        let (_folder, log) = record("verify-sent", &flight);
+        let report = verify(&log).unwrap();
+        println!("{lost}: {report}");
+        assert_eq!((report.found, report.is_whole()), (0, true), "{report}");
+        let (mut q, mut v, mut seq, mut most, mut fastest) =
+            (flight.start.clone(), vec![0.0; 7], 0, 0.0f64, 0.0f64);
+        for tick in ticks(&log) {
+            let now = tick["state"]["seq"].as_u64().unwrap();
+            for _ in seq + 1..now {
+                for i in 0..7 {
+                    v[i] -= f64::signum(v[i]) * (25.0 * 0.004_f64).min(v[i].abs());
+                    q[i] += 0.004 * v[i];
+                }
+            }
+            for i in 0..7 {
+                let to = tick["action"][i].as_f64().unwrap();
+                let speed = (to - q[i]) / 0.004;
+                most = most.max((speed - v[i]).abs() / 0.004);
+                fastest = fastest.max(speed.abs());
+                (q[i], v[i]) = (to, speed);
+            }
+            seq = now;
+        }
+        assert!(most < 25.0 + 1e-6, "{lost}: {most} rad/s^2");
+        assert!(fastest > 0.3, "{lost}: {fastest} rad/s prove nothing");
     }
 }
 

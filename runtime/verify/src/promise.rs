@@ -356,6 +356,19 @@ impl Promise {
         }
     }
 
+    /// What drivers make of what was `sent` (nq, nv) in `periods` in which they hear nothing more: positions go on, slower in each.
+    pub(crate) fn hold(&self, sent: &mut (Vec<f64>, Vec<f64>), periods: u64) {
+        let dt = self.period.dt;
+        for &(dof, position) in &self.follows {
+            let Some((at, _)) = position else { continue };
+            for _ in 0..periods.min(1000) {
+                let v = sent.1[dof];
+                sent.1[dof] = v.signum() * (v.abs() - self.built().joints[dof].acceleration * dt).max(0.0);
+                sent.0[at] += dt * sent.1[dof];
+            }
+        }
+    }
+
     /// The limits as they were built.
     pub(crate) fn built(&self) -> &Limits {
         self.moving.as_ref().map_or(&self.limits, |moving| &moving.built)

@@ -214,8 +214,13 @@ impl Session {
         Ok(())
     }
 
-    /// The state that a tick goes on from (nq, nv): as measured or predicted, and of joints that follow by themselves what they were sent
-    /// unless states were lost since. None where the log does not have what it was predicted from, or has a state of another robot.
+    /// The loop answers a state when it comes, and has no clock of its own.
+    fn waits_for_the_plant(&self) -> bool {
+        let settings = self.facts.get("settings").and_then(|text| serde_json::from_str::<Value>(text).ok());
+        settings.is_none_or(|settings| settings["sync"] != "clock")
+    }
+
+    /// The state that a tick goes on from (nq, nv): as measured or predicted, and of joints that follow by themselves what they were sent. None where the log does not have what it was predicted from, or has a state of another robot.
     fn begins(&self, own: &Promise, tick: &Tick) -> Option<(Vec<f64>, Vec<f64>)> {
         let (mut q, mut v) = match (&tick.sensed[..], &self.past) {
             ("predicted", past) => past.as_ref()?.target.clone(),
@@ -224,12 +229,16 @@ impl Session {
         if [q.len(), v.len()] != [own.machine.nq(), own.machine.nv()] {
             return None;
         }
-        if let Some(past) = &self.past {
-            let state = &tick.state;
-            let is_next = state.epoch == past.epoch && state.seq <= past.seq + 1;
-            if is_next && [past.target.0.len(), past.target.1.len()] == [q.len(), v.len()] {
-                own.depart(&past.target, &mut q, &mut v);
+        let state = &tick.state;
+        if let Some(past) = self.past.as_ref().filter(|past| past.epoch == state.epoch)
+            && [past.target.0.len(), past.target.1.len()] == [q.len(), v.len()]
+        {
+            let mut sent = past.target.clone();
+            let lost = state.seq.saturating_sub(past.seq + 1);
+            if lost > 0 && own.follows() && self.waits_for_the_plant() {
+                own.hold(&mut sent, lost);
             }
+            own.depart(&sent, &mut q, &mut v);
         }
         Some((q, v))
     }
