@@ -44,6 +44,8 @@ pub fn flight() -> Attack {
         ticks: 40,
         moves: Vec::new(),
         pause: Duration::ZERO,
+        lost: 0,
+        lag: 0.0,
     }
 }
 

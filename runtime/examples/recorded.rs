@@ -55,6 +55,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         ticks,
         moves: (1..if kind == "moved" { ticks / every } else { 0 }).map(order).collect(),
         pause: Duration::ZERO,
+        lost: 0,
+        lag: 0.0,
     };
     let begin = Instant::now();
     let (log, summary) = attack.fly(Path::new(folder));

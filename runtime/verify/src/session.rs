@@ -220,7 +220,8 @@ impl Session {
         settings.is_none_or(|settings| settings["sync"] != "clock")
     }
 
-    /// The state that a tick goes on from (nq, nv): as measured or predicted, and of joints that follow by themselves what they were sent. None where the log does not have what it was predicted from, or has a state of another robot.
+    /// The state that a tick goes on from (nq, nv): as measured or predicted, and of joints that follow by themselves what they were sent. None
+    /// where the log does not have what it was predicted from, or has a state of another robot.
     fn begins(&self, own: &Promise, tick: &Tick) -> Option<(Vec<f64>, Vec<f64>)> {
         let (mut q, mut v) = match (&tick.sensed[..], &self.past) {
             ("predicted", past) => past.as_ref()?.target.clone(),
