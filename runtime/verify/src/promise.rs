@@ -164,6 +164,8 @@ fn manifest(bytes: &[u8]) -> Result<String, String> {
 /// A joint that is sent positions does not follow where it is further from the last one than its way at the speed limit in this time [s]; without
 /// one, than this [rad or m].
 const FOLLOWING: f64 = 0.1;
+/// After more periods than this a driver that holds has long come to rest.
+const MISSED: u64 = 1000;
 
 /// The limits with every margin at 0, but for that of bodies, which is their limit.
 fn without_margins(limits: &Value) -> Value {
@@ -361,7 +363,7 @@ impl Promise {
         let dt = self.period.dt;
         for &(dof, position) in &self.follows {
             let Some((at, _)) = position else { continue };
-            for _ in 0..periods.min(1000) {
+            for _ in 0..periods.min(MISSED) {
                 let v = sent.1[dof];
                 sent.1[dof] = v.signum() * (v.abs() - self.built().joints[dof].acceleration * dt).max(0.0);
                 sent.0[at] += dt * sent.1[dof];

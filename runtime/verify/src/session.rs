@@ -63,7 +63,9 @@ pub(crate) struct Session {
     promises: HashMap<u64, (Promise, Option<Promise>)>,
     past: Option<Past>,
     /// The log does not have the tick before.
-    is_cut: bool,
+    has_gap: bool,
+    /// The loop had a clock of its own, and answered in every slot; else it answered a state when one came.
+    keeps_time: bool,
     begun: Option<Begun>,
     /// What the robot carries as far as the brake in force was verified with it.
     carried: Option<Payload>,
@@ -114,6 +116,9 @@ impl Session {
                     "its schema is {schema}, this build reads {SCHEMA}; use the build that wrote it"
                 ));
             }
+            let settings =
+                self.facts.get("settings").and_then(|text| serde_json::from_str::<Value>(text).ok());
+            self.keeps_time = settings.is_some_and(|settings| settings["sync"] == "clock");
             self.compare_facts()?;
         }
         if tick <= self.at {
@@ -122,7 +127,7 @@ impl Session {
         let lost = tick - self.at - 1;
         if lost > 0 {
             self.skip("the log does not have them", lost);
-            (self.past, self.begun, self.is_cut) = (None, None, true);
+            (self.past, self.begun, self.has_gap) = (None, None, true);
         }
         self.at = tick;
         self.report.ticks += 1;
@@ -150,7 +155,7 @@ impl Session {
     pub(crate) fn brief(&mut self, tick: u64) -> Result<(), String> {
         self.arrive(tick)?;
         self.skip("the disk was too slow for more than their inputs", 1);
-        (self.past, self.begun, self.is_cut) = (None, None, true);
+        (self.past, self.begun, self.has_gap) = (None, None, true);
         Ok(())
     }
 
@@ -163,7 +168,7 @@ impl Session {
         }
         if tick.action.is_empty() {
             self.report.idle += 1;
-            (self.past, self.is_cut) = (None, false);
+            (self.past, self.has_gap) = (None, false);
             return Ok(());
         }
         let mut promises = match self.promises.remove(&tick.snapshot) {
@@ -202,7 +207,7 @@ impl Session {
         let (dt, nq, nv) = (promises.0.period.dt, promises.0.machine.nq(), promises.0.machine.nv());
         let v = self.begins(&promises.0, tick).map_or_else(|| tick.state.v.clone(), |(_, v)| v);
         self.promises.insert(tick.snapshot, promises);
-        (self.past, self.is_cut) = (None, false);
+        (self.past, self.has_gap) = (None, false);
         if [tick.target_q.len(), tick.target_v.len(), v.len()] != [nq, nv, nv] {
             return Ok(()); // it was named, and leaves nothing that the next tick could be confirmed by
         }
@@ -212,12 +217,6 @@ impl Session {
         let (epoch, seq, episode, brake) = (state.epoch, state.seq, state.episode, tick.brake.clone());
         self.past = Some(Past { epoch, seq, episode, target, a, brake, told });
         Ok(())
-    }
-
-    /// The loop answers a state when it comes, and has no clock of its own.
-    fn waits_for_the_plant(&self) -> bool {
-        let settings = self.facts.get("settings").and_then(|text| serde_json::from_str::<Value>(text).ok());
-        settings.is_none_or(|settings| settings["sync"] != "clock")
     }
 
     /// The state that a tick goes on from (nq, nv): as measured or predicted, and of joints that follow by themselves what they were sent. None
@@ -231,12 +230,12 @@ impl Session {
             return None;
         }
         let state = &tick.state;
-        if let Some(past) = self.past.as_ref().filter(|past| past.epoch == state.epoch)
+        if let Some(past) = self.past.as_ref().filter(|past| own.follows() && past.epoch == state.epoch)
             && [past.target.0.len(), past.target.1.len()] == [q.len(), v.len()]
         {
             let mut sent = past.target.clone();
             let lost = state.seq.saturating_sub(past.seq + 1);
-            if lost > 0 && own.follows() && self.waits_for_the_plant() {
+            if !self.keeps_time {
                 own.hold(&mut sent, lost);
             }
             own.depart(&sent, &mut q, &mut v);
@@ -330,7 +329,7 @@ impl Session {
             let what = format!("action, while the state is '{}',", tick.sensed);
             return broken(what, tick.action[0], 0.0, "");
         }
-        if own.follows() && self.is_cut {
+        if own.follows() && self.has_gap {
             return unknown(
                 "their joints go on from what they were sent in a tick that the log does not have",
             );
