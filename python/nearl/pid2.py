@@ -127,8 +127,8 @@ class PID2:
         Args:
             total_timesteps: Rounded up to whole batches of ``n_envs * n_steps``. The learning rate falls to zero at their end, so one
                 long call is not two short ones.
-            callback: ``callback(agent, metrics)`` after each iteration, or several; metrics by SB3's tags. ``False``, of Python or NumPy, ends the
-                learning; whatever else comes back, ``None`` and 0 too, does not.
+            callback: ``callback(agent, metrics)`` after each iteration, or several; the agent has what was learned so far, metrics are by SB3's tags.
+                ``False``, of Python or NumPy, ends the learning; whatever else comes back, ``None`` and 0 too, does not.
             progress_bar: Draws a bar on standard error, if that is a terminal.
 
         A run folder is held against other trainings meanwhile, and has a checkpoint after every tenth of the steps and every two
@@ -153,6 +153,8 @@ class PID2:
                 metrics = self._training.iterate()
                 if bar is not None:
                     bar.show(metrics)
+                if callbacks:
+                    self._controller = self._training.controller()
                 if [answer for c in callbacks if isinstance(answer := c(self, metrics), bool | np.bool_) and not answer]:
                     break
         finally:

@@ -101,6 +101,23 @@ def test_callbacks_see_metrics_and_stop_the_learning() -> None:
     assert {"rollout/ep_rew_mean", "time/fps", "train/approx_kl"} <= seen[-1].keys()
 
 
+def test_a_callback_sees_what_was_learned_so_far(tmp_path: Path) -> None:
+    agent = nearl.PID2(CART_POLE, algo="ppo", seed=3)
+    observation, kept = np.full(len(agent.controller.obs_names), 0.1), tmp_path / "kept.safetensors"
+    actions, kept_actions = [agent.predict(observation)[0]], []
+
+    def keep(agent: nearl.PID2, _: object) -> None:
+        actions.append(agent.predict(observation)[0])
+        agent.save(kept)
+        kept_actions.append(nearl.PID2.load(kept).predict(observation)[0])
+
+    agent.learn(4096, callback=keep)
+    assert len(actions) > 2
+    assert all((a != b).any() for a, b in itertools.pairwise(actions))
+    np.testing.assert_array_equal(kept_actions, actions[1:])
+    np.testing.assert_array_equal(agent.predict(observation)[0], actions[-1])
+
+
 @pytest.mark.parametrize(("answer", "stops"), [(False, True), (np.False_, True), (np.bool_(True), False), (None, False), (0, False), (0.0, False), ("", False)])
 def test_a_callback_stops_by_false_of_python_or_numpy_alone(answer: object, stops: bool) -> None:
     calls: list[int] = []
