@@ -2,6 +2,7 @@
 
 use crate::drive::Held;
 use crate::period_dynamics::solve;
+use crate::viability::{Dof, too_fast};
 use crate::{Dynamics, LimitSet, Model, Period, PeriodDynamics};
 
 /// What forces that are held for a period lead to where the plant makes several Euler steps of it, and which forces lead where.
@@ -16,7 +17,7 @@ use crate::{Dynamics, LimitSet, Model, Period, PeriodDynamics};
 ///
 /// [`PhysicsSteps::drive`] looks for the forces by Newton's method over the whole period (single shooting; Stoer and Bulirsch,
 /// *Numerical Analysis*, 7.3), whose slopes Broyden's rule keeps. One force decides velocity and position alike: the velocity is what is asked
-/// for, unless the position would end beyond its limit. Nothing allocates after [`PhysicsSteps::new`]. Units: rad or m, s, N·m or N.
+/// for, unless a step would end beyond a position limit or the last one too fast to stop. Nothing allocates after [`PhysicsSteps::new`]. Units: rad or m, s, N·m or N.
 pub struct PhysicsSteps {
     /// Of one physics step.
     step: PeriodDynamics,
@@ -29,9 +30,9 @@ pub struct PhysicsSteps {
     free: Vec<usize>,
     pushed: Vec<usize>,
     held: Vec<Held>,
-    /// Where the steps have led, and where the last one began.
-    q: Vec<f64>,
-    from: Vec<f64>,
+    /// Where the steps have led, one after the other, from where they began ((sub_steps + 1) x nq, row-major), with the first and the last velocity (nv).
+    path: Vec<f64>,
+    begun: Vec<f64>,
     v: Vec<f64>,
     a: Vec<f64>,
     moved: Vec<f64>,
@@ -65,7 +66,7 @@ struct Slopes {
 
 /// What may be missing of an acceleration [rad/s² or m/s²].
 const MISSING: f64 = 1e-9;
-/// How far beyond its limit a position may end without more being asked for [rad or m], and how often more is asked for in a period.
+/// How far beyond its limit a step may end without more being asked for [rad or m], and how often more is asked for in a period.
 const BEYOND: f64 = 1e-12;
 const RETREATS: usize = 3;
 /// Rounds before the best forces found are taken; three are the rule, and some ten where joints rub.
@@ -111,8 +112,8 @@ impl PhysicsSteps {
             free,
             pushed,
             held: vec![Held::Force(0.0); nv],
-            q: model.neutral(),
-            from: model.neutral(),
+            path: model.neutral().repeat(period.sub_steps as usize + 1),
+            begun: zero(nv),
             v: zero(nv),
             a: zero(nv),
             moved: zero(nv),
@@ -135,17 +136,51 @@ impl PhysicsSteps {
         a.iter_mut().zip(self.v.iter().zip(v)).for_each(|(a, (end, v))| *a = (end - v) / self.period.dt);
     }
 
-    /// Whether a joint was beyond its position limit at the end of the steps that were made last, and further than at their start, `q` (nq).
-    pub fn end_beyond(&self, q: &[f64], limits: &LimitSet) -> bool {
-        self.pushed.iter().any(|&r| self.beyond(self.free[r], q, limits).is_some_and(|[by, _]| by > BEYOND))
+    /// Whether the steps that were made last took a joint beyond its position limit, further beyond it than it was, or to where it may not be able
+    /// to stop in front of it.
+    pub fn went_beyond(&self, limits: &LimitSet) -> bool {
+        self.pushed.iter().any(|&r| self.beyond(self.free[r], limits).is_some())
     }
 
-    /// How far dof `i` has ended beyond its limit, or further beyond it than at `q`, and the sign of the way back.
-    fn beyond(&self, i: usize, q: &[f64], limits: &LimitSet) -> Option<[f64; 2]> {
-        let iq = self.single[i]?;
-        let above = self.q[iq] - limits.q_upper[i].max(q[iq]);
-        let below = limits.q_lower[i].min(q[iq]) - self.q[iq];
-        Some(if above > below { [above, -1.0] } else { [below, 1.0] })
+    /// By how much less the joint of dof `i` would have had to accelerate [rad/s² or m/s²] where a step ended beyond its limit or further beyond it
+    /// than it began, or the last one too fast to stop, and the sign of the way back.
+    ///
+    /// A constant acceleration moves the joint by `tau_s^2 j (j + 1) / 2` of itself in `j` steps. Where the steps led further than a constant acceleration
+    /// to the same velocity leads, by `T e`, each period of a brake may too. That takes `e v / A_b` more way, so that the set is
+    ///
+    /// ```text
+    ///     (v + e)^2 <= 2 A_b d + e^2
+    /// ```
+    fn beyond(&self, i: usize, limits: &LimitSet) -> Option<[f64; 2]> {
+        let (iq, nq, p) = (self.single[i]?, self.nq(), &self.period);
+        let (begun, v) = (self.path[iq], self.v[i]);
+        let (high, low) = (limits.q_upper[i].max(begun), limits.q_lower[i].min(begun));
+        if high.is_infinite() && low.is_infinite() || limits.acceleration[i].is_infinite() {
+            return None;
+        }
+        let mut most = [0.0, 0.0];
+        for (j, q) in self.path.iter().skip(iq).step_by(nq).enumerate().skip(1) {
+            let (by, sign) = if q - high > low - q { (q - high, -1.0) } else { (low - q, 1.0) };
+            let less = by / (0.5 * p.tau * p.tau * (j * (j + 1)) as f64);
+            if by > BEYOND && less > most[0] {
+                most = [less, sign];
+            }
+        }
+        let braking = Dof::of(limits, i).braking(p);
+        let q = self.path[self.path.len() - nq + iq];
+        let further = (q - begun) / p.dt - self.begun[i] - p.kappa * (v - self.begun[i]);
+        for (d, v, further, sign) in [(high - q, v, further, -1.0), (q - low, -v, -further, 1.0)] {
+            let e = further.max(0.0);
+            let less = too_fast(d + 0.5 * e * e / braking, v + e, braking, p);
+            if less > most[0] {
+                most = [less, sign];
+            }
+        }
+        (most[0] > 0.0).then_some(most)
+    }
+
+    fn nq(&self) -> usize {
+        self.path.len() / (self.period.sub_steps as usize + 1)
     }
 
     /// Changes the motor forces `tau` (nv), which lead to the accelerations `a` (nv) about, into those that lead to them, within `limits`. `most` (nv)
@@ -177,7 +212,7 @@ impl PhysicsSteps {
         let (mut has_slopes, mut retreats, mut failed, mut measured, mut halves) = (false, 0, 0, 0, false);
         for _ in 0..ROUNDS {
             if self.left() <= MISSING {
-                if retreats == RETREATS || !self.retreat(q, limits) {
+                if retreats == RETREATS || !self.retreat(limits) {
                     break;
                 }
                 retreats += 1;
@@ -237,16 +272,14 @@ impl PhysicsSteps {
         self.miss(v);
     }
 
-    /// Asks for less acceleration where a position would end beyond its limit, or further beyond it than it is; whether it asks anywhere.
-    fn retreat(&mut self, q: &[f64], limits: &LimitSet) -> bool {
-        let by_acceleration = self.period.kappa * self.period.dt * self.period.dt;
+    /// Asks for less acceleration where a joint went too far or ended too fast; whether it asks anywhere.
+    fn retreat(&mut self, limits: &LimitSet) -> bool {
         let mut asks = false;
         for r in 0..self.pushed.len() {
             let i = self.free[self.pushed[r]];
-            let Some([by, sign]) = self.beyond(i, q, limits) else { continue };
-            if by > BEYOND && limits.jerk[i].is_infinite() {
+            if let (Some([less, sign]), true) = (self.beyond(i, limits), limits.jerk[i].is_infinite()) {
                 let most = limits.acceleration[i];
-                let to = (self.wanted[i] + sign * by / by_acceleration).clamp(-most, most);
+                let to = (self.wanted[i] + sign * less).clamp(-most, most);
                 asks |= (to - self.wanted[i]) * sign > 0.0;
                 self.wanted[i] = to;
             }
@@ -256,38 +289,34 @@ impl PhysicsSteps {
 
     /// Makes the steps with what is held.
     fn walk(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
-        let tau = self.period.tau;
-        self.q.copy_from_slice(q);
+        let (tau, nq) = (self.period.tau, self.nq());
+        self.path[..nq].copy_from_slice(q);
         self.v.copy_from_slice(v);
+        self.begun.copy_from_slice(v);
         let are_forces = self.held.iter().all(|held| matches!(held, Held::Force(_)));
-        for _ in 0..self.period.sub_steps {
+        for k in 0..self.period.sub_steps as usize {
+            let (from, to) = self.path[k * nq..(k + 2) * nq].split_at_mut(nq);
             if let (Some(quick), true) = (&mut self.quick, are_forces) {
-                quick.passive(&self.q, &self.v, &mut self.moved);
+                quick.passive(from, &self.v, &mut self.moved);
                 for (i, force) in self.moved.iter_mut().enumerate() {
                     *force += external[i] + if let Held::Force(tau) = self.held[i] { tau } else { 0.0 };
                 }
-                quick.aba(&self.q, &self.v, &self.moved, &mut self.a);
+                quick.aba(from, &self.v, &self.moved, &mut self.a);
             } else {
-                self.step.update(&self.q, &self.v, external);
+                self.step.update(from, &self.v, external);
                 self.step.accelerate(&self.held, &mut self.a);
             }
             for (i, a) in self.a.iter().enumerate() {
                 self.v[i] += tau * a;
                 self.moved[i] = tau * self.v[i];
             }
-            self.go();
-        }
-    }
-
-    /// Moves the configuration by what the velocity makes of a step.
-    fn go(&mut self) {
-        self.from.copy_from_slice(&self.q);
-        if self.single.iter().any(Option::is_none) {
-            self.step.integrate(&self.from, &self.moved, &mut self.q);
-        }
-        for (iq, moved) in self.single.iter().zip(&self.moved) {
-            if let Some(iq) = *iq {
-                self.q[iq] = self.from[iq] + moved;
+            if self.single.iter().any(Option::is_none) {
+                self.step.integrate(from, &self.moved, to);
+            }
+            for (iq, moved) in self.single.iter().zip(&self.moved) {
+                if let Some(iq) = *iq {
+                    to[iq] = from[iq] + moved;
+                }
             }
         }
     }

@@ -366,6 +366,12 @@ fn braking_bound(d: f64, v: f64, a: f64, p: &Period) -> f64 {
     ((-b + discriminant.sqrt()) / (2.0 * t * t)).max(-w / t)
 }
 
+/// By how much less a dof would have had to accelerate in a period [rad/s² or m/s²] for the state at its end, at distance `d` below the upper limit and
+/// with velocity `v`, to be in the set of braking deceleration `a`; 0 inside.
+pub(crate) fn too_fast(d: f64, v: f64, a: f64, p: &Period) -> f64 {
+    if is_inside(d, v, a, p) { 0.0 } else { -braking_bound(d + p.dt * v, v, a, p) }
+}
+
 /// The largest acceleration towards a boundary at distance `d`, approached with speed `w`, from which a deceleration of
 /// `braking` still stops in front of it: the position and viability bounds of a joint, for any other distance.
 ///

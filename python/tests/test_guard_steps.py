@@ -95,6 +95,59 @@ def test_unknown_arms_stay_within_their_limits(tmp_path: Path, seed: int, integr
     assert touched > 10, "no joint came to the end of its range"
 
 
+def attack(folder: Path, text: str, steps: int, rng: np.random.Generator, accelerations: float | np.ndarray = ACCELERATION) -> None:
+    """Pushes onto the limits of the task in `folder`, and steps the simulator beside it, whose joints keep to their ranges, speeds and accelerations."""
+    envs = nearl.make_vec(folder / "arm.toml", 1, constraints="task", actions="guarded")
+    model = mujoco.MjModel.from_xml_string(text)
+    data, dt, n = mujoco.MjData(model), model.opt.timestep * steps, model.nv
+    obs, _ = envs.reset(seed=0)
+    data.qpos[:], data.qvel[:] = obs[0, :n], obs[0, n:]
+    low, high = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.inf, np.inf]).T
+    push, touched = np.zeros(n), 0
+    for tick in range(800):
+        if tick % 25 == 0:
+            push = rng.uniform(-300, 300, n)
+        _, _, _, _, info = envs.step(push[None])
+        before = data.qvel.copy()
+        data.ctrl[:] = info["executed"][0]
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+            assert (data.qpos >= low).all() and (data.qpos <= high).all(), f"tick {tick}, within it: {data.qpos}"
+        assert np.abs(data.qvel).max() <= SPEED * (1 + 1e-9), f"tick {tick}: {data.qvel}"
+        assert (np.abs(data.qvel - before) / dt <= accelerations + 1e-7).all(), f"tick {tick}: {data.qvel - before}"
+        touched += int((np.minimum(data.qpos - low, high - data.qpos) < 1e-3).any())
+    assert touched > 10, "no joint came to the end of its range"
+
+
+@pytest.mark.parametrize("seed", [2, 6, 7, 8, 12, 17])
+def test_arms_stay_within_their_limits_over_long_periods(tmp_path: Path, seed: int) -> None:
+    """A held force does not brake evenly over 20 ms: joints had come up to 1.1 mrad too far, touched their stops and left 10 rad/s² by 17."""
+    rng = np.random.default_rng(seed)
+    steps = int(rng.choice([2, 5, 10]))
+    text, ranges = arm(rng, 0.02 / steps, "Euler")
+    (tmp_path / "arm.xml").write_text(text)
+    task(tmp_path, len(ranges), 0.02, 0.02 / steps)
+    attack(tmp_path, text, steps, rng)
+
+
+@pytest.mark.parametrize("steps", [12, 20, 40])
+def test_a_gantry_touches_no_stop_in_the_middle_of_a_period(tmp_path: Path, steps: int) -> None:
+    """A joint that turns round within a period ends it before its stop, but had been beyond it in between, and was thrown back."""
+    text = """<mujoco><option timestep="0.002"/><worldbody>
+    <body pos="0 0 1"><joint name="j0" type="slide" axis="1 0 0" range="-0.5 0.5"/><inertial pos="0 0 0" mass="5" diaginertia=".1 .1 .1"/>
+     <body><joint name="j1" type="slide" axis="0 0 1" range="-0.3 0.3"/><inertial pos="0 0 0" mass="2" diaginertia=".01 .01 .01"/>
+      <body><joint name="j2" type="hinge" axis="0 1 0" range="-115 115" armature="0.01"/><inertial pos="0 0 -.2" mass="1" diaginertia=".01 .01 .01"/>
+       <body pos="0 0 -.4"><joint name="j3" type="hinge" axis="0 1 0" armature="0.005"/><inertial pos="0 0 -.1" mass=".5" diaginertia=".004 .004 .004"/>
+       </body></body></body></body></worldbody>
+    <actuator><motor joint="j0" ctrlrange="-300 300"/><motor joint="j1" ctrlrange="-300 300"/><motor joint="j2" ctrlrange="-300 300"/>
+     <motor joint="j3" ctrlrange="-300 300"/></actuator></mujoco>"""
+    (tmp_path / "arm.xml").write_text(text)
+    file, most = task(tmp_path, 4, 0.002 * steps, 0.002), np.array([6.0, 6.0, 15.0, 20.0])
+    by_joint = ", ".join(f"j{i} = {a}" for i, a in enumerate(most))
+    file.write_text(file.read_text().replace(f"acceleration = {{ limit = {ACCELERATION}", f"acceleration = {{ limit = {{ {by_joint} }}"))
+    attack(tmp_path, text, steps, np.random.default_rng(0), most)
+
+
 def rubbing_arm(rng: np.random.Generator, timestep: float) -> tuple[str, int]:
     """A chain of 2 to 4 light hinges about any axes, of which half rub and half have dampers."""
     n = int(rng.integers(2, 5))

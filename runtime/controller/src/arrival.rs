@@ -94,8 +94,8 @@ impl Arrivals {
         true
     }
 
-    /// Whether what was foreseen last ends beyond a position limit that `q` is not so far beyond.
-    pub(crate) fn end_beyond(&self, q: &[f64], limits: &LimitSet) -> bool {
-        self.steps.as_ref().is_some_and(|steps| steps.end_beyond(q, limits))
+    /// Whether what was foreseen last takes a joint beyond a position limit, or further beyond it than it is.
+    pub(crate) fn go_beyond(&self, limits: &LimitSet) -> bool {
+        self.steps.as_ref().is_some_and(|steps| steps.went_beyond(limits))
     }
 }

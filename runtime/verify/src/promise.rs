@@ -237,7 +237,8 @@ impl Promise {
         }
         // Joints whose forces are reckoned with end so far before their stops [rad or m], and their braking leaves a share of the limit.
         if m.task.idm.kind == "pinocchio" || section.guard.as_bool() == Some(true) {
-            (section.gap, section.reserve) = if sub_steps == 1 { (1e-6, 0.0) } else { (1e-4, 0.02) };
+            (section.gap, section.reserve) =
+                if sub_steps == 1 { (1e-6, 0.0) } else { (1e-4, (4.0 * m.task.time.dt).clamp(0.02, 0.2)) };
         }
         let period = Period::new(m.task.time.dt, sub_steps);
         let sent: Vec<Sent> = m

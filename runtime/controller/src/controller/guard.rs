@@ -76,7 +76,7 @@ impl Guard {
     pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], next: &mut Target, hold: bool) {
         self.dynamics.update(q, v, self.projector.external_forces());
         self.foresee(q, v, action);
-        let beyond = self.arrivals.end_beyond(q, self.projector.limits());
+        let beyond = self.arrivals.go_beyond(self.projector.limits());
         self.projector.project(q, v, &self.proposal, next);
         if !hold {
             self.projector.pass(q, v, &self.proposal, next);

@@ -161,7 +161,7 @@ fn keep_clear(limits: &mut [Box<dyn Limit>], m: &Manifest) {
             }
             "acceleration" => {
                 if let Some(acceleration) = of.acceleration.clone() {
-                    *limit = Box::new(AccelerationLimit::over_steps(acceleration, sub_steps));
+                    *limit = Box::new(AccelerationLimit::over_steps(acceleration, m.task.time.dt, sub_steps));
                 }
             }
             _ => {}
