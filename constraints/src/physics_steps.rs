@@ -17,7 +17,8 @@ use crate::{Dynamics, LimitSet, Model, Period, PeriodDynamics};
 ///
 /// [`PhysicsSteps::drive`] looks for the forces by Newton's method over the whole period (single shooting; Stoer and Bulirsch,
 /// *Numerical Analysis*, 7.3), whose slopes Broyden's rule keeps. One force decides velocity and position alike: the velocity is what is asked
-/// for, unless a step would end beyond a position limit or the last one too fast to stop. Nothing allocates after [`PhysicsSteps::new`]. Units: rad or m, s, N·m or N.
+/// for, unless a step would end beyond a position limit or the last one too fast to stop. Nothing allocates after [`PhysicsSteps::new`]. Units: rad
+/// or m, s, N·m or N.
 pub struct PhysicsSteps {
     /// Of one physics step.
     step: PeriodDynamics,

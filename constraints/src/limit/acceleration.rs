@@ -107,6 +107,10 @@ impl Limit for AccelerationLimit {
         )]
     }
 
+    fn named_joints(&self) -> Vec<&str> {
+        self.settings.limit.names()
+    }
+
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         let domain = "above 0 rad/s² or m/s²";
         self.settings.limit.names_some("acceleration limit")?;

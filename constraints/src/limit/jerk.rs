@@ -104,6 +104,10 @@ impl Limit for JerkLimit {
         "jerk"
     }
 
+    fn named_joints(&self) -> Vec<&str> {
+        self.settings.limit.names()
+    }
+
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         if self.settings.soft.is_some() {
             return Ok(());

@@ -46,6 +46,10 @@ impl Limit for LockedJoints {
         "locked"
     }
 
+    fn named_joints(&self) -> Vec<&str> {
+        self.settings.joints.iter().map(String::as_str).collect()
+    }
+
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         for name in &self.settings.joints {
             let unknown = |near| LimitError::UnknownJoint { limit: "locked", name: name.clone(), near };

@@ -97,6 +97,11 @@ pub trait Limit: Send + Sync + std::fmt::Debug {
         Vec::new()
     }
 
+    /// Joints that its settings name one by one: a projector notes those that are not controllable, for which nothing holds.
+    fn named_joints(&self) -> Vec<&str> {
+        Vec::new()
+    }
+
     /// How much its rows or its cone resist; `None` for hard ones. The part in the box is always hard.
     fn soft(&self) -> Option<Soft> {
         None

@@ -87,6 +87,10 @@ impl Limit for PositionLimit {
         )]
     }
 
+    fn named_joints(&self) -> Vec<&str> {
+        self.settings.margin.names()
+    }
+
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         let margin =
             self.settings.margin.values(model, "position margin", |x| x >= 0.0, "at least 0 rad or m")?;

@@ -68,6 +68,12 @@ impl PerJoint {
         }
     }
 
+    /// The joints of a table by joint.
+    pub(crate) fn names(&self) -> Vec<&str> {
+        let PerJoint::Joints(map) = self else { return Vec::new() };
+        map.keys().map(String::as_str).collect()
+    }
+
     /// The dofs among `controllable` of which a table by joint says nothing.
     pub(crate) fn left_out(&self, model: &Model, controllable: &[usize]) -> Vec<usize> {
         let PerJoint::Joints(map) = self else { return Vec::new() };

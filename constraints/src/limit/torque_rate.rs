@@ -56,6 +56,10 @@ impl Limit for TorqueRateLimit {
         "torque_rate"
     }
 
+    fn named_joints(&self) -> Vec<&str> {
+        self.settings.limit.names()
+    }
+
     fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
         self.settings.limit.names_some("torque_rate limit")?;
         let domain = "above 0 N·m/s or N/s";

@@ -67,6 +67,10 @@ impl Limit for TorqueSpeedLimit {
         "torque_speed"
     }
 
+    fn named_joints(&self) -> Vec<&str> {
+        self.settings.stall.names()
+    }
+
     fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
         let positive = |x: f64| x > 0.0;
         let stall = self.settings.stall.values(model, "torque_speed stall", positive, "above 0 N·m or N")?;

@@ -111,6 +111,10 @@ impl Limit for VelocityLimit {
         )]
     }
 
+    fn named_joints(&self) -> Vec<&str> {
+        self.settings.limit.as_ref().map_or(Vec::new(), |limit| limit.names())
+    }
+
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         let mut own = match &self.settings.limit {
             Some(limit) => limit.values(model, "velocity limit", |x| x > 0.0, "above 0 rad/s or m/s")?,

@@ -199,6 +199,13 @@ impl Limit for VelocityProfileLimit {
         "velocity_profile"
     }
 
+    fn named_joints(&self) -> Vec<&str> {
+        match &self.settings {
+            VelocityProfileSettings::Joints(map) => map.keys().map(String::as_str).collect(),
+            _ => Vec::new(),
+        }
+    }
+
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
         for (i, c) in self.curves(model)? {
             if controllable.contains(&i) {

@@ -45,6 +45,9 @@ impl Projector {
         let mut checker = Checker::new(model, each, &dofs.controllable, period, settings.consistency)?;
         let mut notes = choice::doubts(model, &limits, &dofs, &settings);
         notes.extend(each.iter().flat_map(|limit| limit.notes(model, &dofs.controllable)));
+        notes.extend(
+            each.iter().filter_map(|limit| choice::unheld(model, limit.as_ref(), &dofs.controllable)),
+        );
         let braking = choice::braking(model, &limits, &dofs, &settings, &checker, &mut notes);
         let settings = Settings { braking, ..settings };
         if braking == Braking::Stored {

@@ -3,7 +3,7 @@
 use super::Dofs;
 use crate::checker::Checker;
 use crate::viability::{Kind, Period};
-use crate::{Braking, Consistency, LimitSet, Model, Settings, certify_braking, friction};
+use crate::{Braking, Consistency, Limit, LimitSet, Model, Settings, certify_braking, friction};
 
 /// States looked at, and their seed.
 const SAMPLES: (usize, u64) = (2000, 7);
@@ -32,10 +32,17 @@ pub(super) fn braking(
     checker: &Checker,
     notes: &mut Vec<String>,
 ) -> Braking {
+    let kinds = checker.hard_kinds();
+    if settings.braking == Braking::Certified && kinds.contains(&Kind::Collision) {
+        notes.push(
+            "braking = \"certified\" stores no brake: bodies may come into each other where joints cannot stop as their rows ask; leave braking out, and one \
+             is stored"
+                .into(),
+        );
+    }
     if settings.braking != Braking::Auto {
         return settings.braking;
     }
-    let kinds = checker.hard_kinds();
     if settings.consistency == Consistency::Free || kinds.is_empty() {
         return Braking::Certified; // the boxes of single joints keep themselves
     }
@@ -84,6 +91,25 @@ fn listed(kinds: &[Kind]) -> String {
     let mut names: Vec<_> = kinds.iter().map(|kind| kind.name()).collect();
     names.dedup();
     names.join(", ")
+}
+
+/// The joints that a limit names and does not hold for.
+pub(super) fn unheld(model: &Model, limit: &dyn Limit, controllable: &[usize]) -> Option<String> {
+    let is_held = |name: &&str| {
+        let of_joint =
+            |joint: &crate::Joint| (joint.idx_v..joint.idx_v + joint.nv).any(|i| controllable.contains(&i));
+        model.find(name).is_ok_and(of_joint)
+    };
+    let names: Vec<String> = limit
+        .named_joints()
+        .into_iter()
+        .filter(|name| !is_held(name))
+        .map(|name| format!("'{name}'"))
+        .collect();
+    let subject = format!("'{}' names {}", limit.label(), names.join(", "));
+    (!names.is_empty()).then(|| {
+        format!("{subject} and does not hold there, for they are not controllable; make them so (state.controllable of a task), or take them out")
+    })
 }
 
 /// One sentence for each number that is allowed and hardly meant.

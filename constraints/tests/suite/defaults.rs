@@ -1,7 +1,8 @@
 //! Limits hold where the settings say nothing of braking, and numbers that are probably mistakes are named in a warning.
 
+use crate::common::solids::*;
 use crate::common::*;
-use nearl_constraints::limit::AccelerationSettings;
+use nearl_constraints::limit::{AccelerationSettings, JerkSettings, PositionSettings};
 use nearl_constraints::*;
 
 fn panda_with(acceleration: PerJoint, extra: Vec<Box<dyn Limit>>, settings: Settings) -> Projector {
@@ -52,6 +53,49 @@ fn what_is_chosen_depends_on_what_could_break() {
         vec![Box::new(FrameLimit::half_space("panda_hand", [0.0, 0.0, 1.0], [0.0, 0.0, 0.8], 2.0))];
     let plane = panda_with(PerJoint::All(10.0), below, Settings::new(0.001, 1));
     assert_eq!(plane.settings().braking, Braking::Stored);
+}
+
+/// Without a brake bodies went up to 77 mm into each other.
+#[test]
+fn bodies_without_a_brake_are_noted() {
+    let notes = |braking: Braking| {
+        let settings = Settings { braking, ..Settings::new(0.001, 1) };
+        panda_with(PerJoint::All(10.0), vec![Box::new(panda_collision(2, 0.3))], settings).notes().join("; ")
+    };
+    assert!(
+        notes(Braking::Certified).contains("bodies may come into each other"),
+        "{}",
+        notes(Braking::Certified)
+    );
+    assert!(!notes(Braking::Auto).contains("bodies"), "{}", notes(Braking::Auto));
+}
+
+/// Six kinds of limits were taken for joints that are not controllable, and held nothing there.
+#[test]
+fn a_limit_names_the_joints_that_it_cannot_hold() {
+    let (model, seventh) = (panda(), "panda_joint7".to_string());
+    let of = |value: f64| PerJoint::Joints([(seventh.clone(), value)].into());
+    let named: Vec<(&str, Box<dyn Limit>)> = vec![
+        ("locked", Box::new(LockedJoints::of(vec![seventh.clone()]))),
+        ("velocity", Box::new(VelocityLimit::values(of(0.2)))),
+        ("acceleration", Box::new(AccelerationLimit::new(AccelerationSettings::of(of(5.0), None)))),
+        ("jerk", Box::new(JerkLimit::new(JerkSettings { limit: of(50.0), margin: None, soft: None }))),
+        (
+            "position",
+            Box::new(PositionLimit::new(PositionSettings { margin: of(0.1), ..Default::default() })),
+        ),
+    ];
+    for (name, limit) in named {
+        let limits: Vec<Box<dyn Limit>> = vec![Box::new(AccelerationLimit::uniform(10.0)), limit];
+        let notes = |controllable: &[usize]| {
+            let projector =
+                Projector::new(&model, &limits, controllable, Settings::new(0.001, 1)).expect(name);
+            projector.notes().join("; ")
+        };
+        let said = format!("'{name}' names 'panda_joint7' and does not hold there");
+        assert!(notes(&[0, 1]).contains(&said), "{name}: {}", notes(&[0, 1]));
+        assert!(!notes(&[5, 6]).contains("does not hold there"), "{name}: {}", notes(&[5, 6]));
+    }
 }
 
 /// A base that nobody drives left the choice at `certified` without a word.

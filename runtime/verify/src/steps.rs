@@ -10,15 +10,18 @@ const LED: f64 = 1e-6;
 /// A force or a position is at its limit up to this share.
 const AT_LIMIT: f64 = 1e-6;
 
-/// Where the steps have led.
+/// Where the steps have led, and the lowest and highest positions after one of them.
 struct Walk {
     q: Vec<f64>,
     v: Vec<f64>,
+    lowest: Vec<f64>,
+    highest: Vec<f64>,
 }
 
 /// The actions, held, lead through the steps to the target's velocities. A joint may fall short of its own whose force is at its limit, or no
-/// farther from zero than the mean one where its limit depends on the speed, or which slows down as it would end beyond its position limit
-/// otherwise. Where joints rub, by no more than their dry friction does. `means` has the action of each joint for its mean force.
+/// farther from zero than the mean one where its limit depends on the speed, or which slows down as it would come beyond its position limit or
+/// end too fast to stop in front of it otherwise. Where joints rub, by no more than their dry friction does. `means` has the action of each
+/// joint for its mean force.
 pub(crate) fn lead(
     promise: &mut Promise,
     passage: &Passage<'_>,
@@ -60,10 +63,20 @@ pub(crate) fn lead(
         // What is given up of the velocity leads it no farther inside than it is for.
         let retreats = promise.machine.single(i).is_some_and(|iq| {
             each().any(|limits| {
-                let joint = &limits.joints[i];
-                let (low, high) = (joint.lower.min(passage.q[iq]), joint.upper.max(passage.q[iq]));
-                let inside = if off < 0.0 { high - walk.q[iq] } else { walk.q[iq] - low };
-                inside <= off.abs() * p.dt + AT_LIMIT && a.abs() <= joint.acceleration * (1.0 + LED)
+                let (joint, q, given_up) = (&limits.joints[i], passage.q[iq], off.abs());
+                let (side, room) = match off < 0.0 {
+                    true => (1.0, joint.upper.max(q) - walk.q[iq]),
+                    false => (-1.0, walk.q[iq] - joint.lower.min(q)),
+                };
+                let farthest =
+                    if off < 0.0 { walk.highest[iq] - walk.q[iq] } else { walk.q[iq] - walk.lowest[iq] };
+                // Each period of a brake may lead as much further as this one did; with what is given up the joint could not stop.
+                let further = (side * (walk.q[iq] - q - p.way(passage.v[i], walk.v[i])) / p.dt).max(0.0);
+                let (speed, brake) = (side * walk.v[i] + given_up + further, joint.brake(&p));
+                let left = room - p.kappa * p.dt * given_up + 0.5 * further * further / brake;
+                let is_near = room - farthest <= given_up * p.dt + AT_LIMIT;
+                let is_fast = p.stopping(speed, brake) >= left - given_up * p.dt - AT_LIMIT;
+                (is_near || is_fast) && a.abs() <= joint.acceleration * (1.0 + LED)
             })
         });
         if !(leads || at_end || has_no_room || retreats) {
@@ -86,7 +99,8 @@ pub(crate) fn force(action: &Action, is: f64) -> f64 {
 /// Makes the steps; `more` is a force on one dof besides.
 fn walk(promise: &mut Promise, passage: &Passage<'_>, found: &[f64], more: Option<(usize, f64)>) -> Walk {
     let (nv, p) = (passage.v.len(), promise.period);
-    let mut at = Walk { q: passage.q.to_vec(), v: passage.v.to_vec() };
+    let mut at =
+        Walk { q: passage.q.to_vec(), v: passage.v.to_vec(), lowest: Vec::new(), highest: Vec::new() };
     let mut next = Vec::new();
     let (mut force_of, mut a) = (vec![0.0; nv], passage.a.to_vec());
     let is_free: Vec<bool> = (0..nv)
@@ -104,6 +118,11 @@ fn walk(promise: &mut Promise, passage: &Passage<'_>, found: &[f64], more: Optio
         at.v.iter_mut().zip(&a).for_each(|(v, a)| *v += p.tau * a);
         promise.machine.moved(&at.q, &at.v, p.tau, &mut next);
         std::mem::swap(&mut at.q, &mut next);
+        if at.lowest.is_empty() {
+            (at.lowest, at.highest) = (at.q.clone(), at.q.clone());
+        }
+        at.lowest.iter_mut().zip(&at.q).for_each(|(low, q)| *low = low.min(*q));
+        at.highest.iter_mut().zip(&at.q).for_each(|(high, q)| *high = high.max(*q));
     }
     at
 }
