@@ -1,7 +1,9 @@
 """`nearl.Guard`, and environments whose actions pass the constraints: what is promised is measured on the environment's own state."""
 
+import copy
 import importlib.util
 import pathlib
+import pickle
 import warnings
 from typing import ClassVar
 
@@ -46,6 +48,33 @@ def test_bang_bang_actions_end_within_the_limits():
                 assert (info["guard"] == "outside") == outside(env) == env.outside
                 assert info["guard"] != "kept" or (info["action"] == action).all()
     assert count[False] > 40 and count[True] <= 4, count
+
+
+def test_hardly_an_action_that_ends_inside_is_missed():
+    """Of 150 wild steps of an ant 59 ended outside, and 400 actions at random had shown a way for 19 of them."""
+    env = nearl.Guard(gymnasium.make("Ant-v5"), {"position": {}, "velocity": {"limit": 6.0}})
+    env.reset(seed=1)
+    rng, model, data = np.random.default_rng(1), env.unwrapped.model, env.unwrapped.data
+    low, high = model.jnt_range[1:].T
+
+    def ends_inside(start, ctrl):
+        trial = copy.copy(start)
+        trial.ctrl[:] = ctrl
+        mujoco.mj_step(model, trial, nstep=env.unwrapped.frame_skip)
+        return (np.abs(trial.qvel[6:]) <= 6.0).all() and (low <= trial.qpos[7:]).all() and (trial.qpos[7:] <= high).all()
+
+    ended = missed = 0
+    for k in range(150):
+        if k % 10 == 0:
+            action = rng.choice([-1.0, 1.0], 8).astype(np.float32) * (rng.random() < 0.7)
+        start = copy.copy(data)
+        *_, terminated, truncated, info = env.step(action)
+        if info["guard"] == "outside":
+            ended += 1
+            missed += any(ends_inside(start, rng.uniform(-1, 1, 8) if k % 2 else rng.choice([-1.0, 1.0], 8)) for k in range(400))
+        if terminated or truncated:
+            env.reset()
+    assert missed <= 3 and ended <= 25, (missed, ended)
 
 
 def test_what_is_allowed_changes_nothing():
@@ -498,3 +527,296 @@ def test_a_ctrl_that_fits_no_actuators_is_refused(tmp_path):
         nearl.Guard(wrappers.ClipAction(Chain(tmp_path / "free.xml")), FAST)
     with pytest.raises(ValueError, match="unbounded in entry 0 and ctrl= makes others of them"):
         nearl.Guard(wrappers.ClipAction(gymnasium.make("HalfCheetah-v5")), FAST, ctrl=lambda a: a)
+
+
+class Cart(gymnasium.Env):
+    """A slide with a range and a hinge without one, each with a motor; `after` may do to it what it likes once a step is done."""
+
+    metadata: ClassVar = {}
+    XML = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body><joint name="s" type="slide" axis="1 0 0" range="-1 1"/>
+    <inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/><body><joint name="c" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/>
+    </body></body></worldbody><actuator><motor joint="s" ctrlrange="-10 10"/><motor joint="c" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+    def __init__(self, gain=1.0, after=lambda env: None, xml=XML):
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self.data, self.frame_skip, self.gain, self.after, self.steps = mujoco.MjData(self.model), 1, gain, after, 0
+        self.action_space = gymnasium.spaces.Box(*self.model.actuator_ctrlrange.T.astype(np.float32))
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2 * self.model.nq,), float)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.steps = 0
+        return np.concatenate([self.data.qpos, self.data.qvel]), {}
+
+    def step(self, action):
+        self.steps += 1
+        self.data.ctrl[:] = self.gain * np.asarray(action)
+        mujoco.mj_step(self.model, self.data, self.frame_skip)
+        self.after(self)
+        return np.concatenate([self.data.qpos, self.data.qvel]), 0.0, False, False, {}
+
+
+SLOW = {"velocity": {"limit": 1.0}}
+
+
+def bang(env, steps=200):
+    """Steps under forces to and fro: the fastest of each joint, and the words of those that did not end within 1 m/s and 1 rad/s."""
+    env.reset(seed=0)
+    most, words = np.zeros(env.unwrapped.model.nv), []
+    for k in range(steps):
+        *_, info = env.step(env.action_space.high if k // 60 % 2 == 0 else env.action_space.low)
+        speeds = np.abs(env.unwrapped.data.qvel)
+        if not (speeds <= 1.0 + 1e-9).all():
+            words.append(info["guard"])
+        most = np.fmax(most, speeds)
+    return most, words
+
+
+def stopped(env):
+    env.data.time = 0.0
+
+
+def sawtooth(env):
+    env.data.time = 0.01 * (env.steps % 3)
+
+
+@pytest.mark.parametrize("clock", [stopped, sawtooth])
+def test_no_clock_silences_the_comparison(clock):
+    """A phase in place of the time: nothing was compared, and 41 of 200 steps beyond the limit were called 'kept' and 'replaced'."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        most, words = bang(nearl.Guard(Cart(after=clock), SLOW))
+    assert (most <= 1.0 + 1e-9).all() and not words
+    with pytest.warns(UserWarning, match="actuator '1' got .* where the guard had foreseen"):
+        most, words = bang(nearl.Guard(Cart(3.0, clock), SLOW))
+    assert most[0] > 1.02 and len(words) > 20 and set(words) == {"outside"}
+    env = nearl.Guard(Cart(3.0, clock), SLOW)
+    env.reset()
+    with pytest.raises(ValueError, match="actuator '0' got 6 where the guard had foreseen 2"):
+        for _ in range(2):
+            env.step(np.array([2.0, 0.2]))
+
+
+def begun(env):
+    """Begins anew every 10 steps, with a clock that shows the time of 20 steps, during which the robot came to rest."""
+    if env.steps % 10 == 0:
+        mujoco.mj_resetData(env.model, env.data)
+        env.data.time = 0.2 * (env.steps // 10 % 2)
+
+
+class Ending(gymnasium.Wrapper):
+    def step(self, action):
+        obs, reward, _, truncated, info = self.env.step(action)
+        return obs, reward, self.unwrapped.steps % 10 == 0, truncated, info
+
+
+def test_a_beginning_within_a_step_is_no_other_step():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        most, words = bang(nearl.Guard(Ending(Cart(after=begun)), SLOW))
+    assert (most <= 1.0 + 1e-9).all() and not words
+
+
+def lost(env):
+    if env.steps == 50:
+        env.data.qvel[1] = np.nan
+
+
+def test_a_state_that_is_no_number_is_outside():
+    env = nearl.Guard(Cart(after=lost), SLOW)
+    env.unwrapped.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    with pytest.warns(UserWarning, match="the velocity of joint 'c' is nan, from which no action leads back: reset the environment"):
+        _, words = bang(env)
+    assert len(words) == 151 and set(words) == {"outside"} and env.outside
+    env.reset()
+    assert not env.outside and env.step(np.zeros(2))[4]["guard"] == "kept"
+
+
+def test_an_action_at_which_mujoco_gives_up_does_not_lead_inside():
+    """MuJoCo begins anew by itself above 1e10 m/s², at rest: that looked like the best of all ends, and was called "kept"."""
+    xml = Cart.XML.replace('"0.01"', '"1e-6"').replace('"-10 10"', '"-4e9 4e9"').replace('mass="1"', 'mass="0.1"')
+    free, asked = Cart(xml=xml), np.array([4e9, 0.0])
+    free.step(asked)
+    assert not free.data.qvel.any(), "it did not give up"
+    env = nearl.Guard(Cart(xml=xml), {"velocity": {"limit": 8e3}})
+    env.reset()
+    *_, info = env.step(asked)
+    speed = np.abs(env.unwrapped.data.qvel).max()
+    assert info["guard"] == "replaced" and 0.0 < speed <= 8e3
+    env = nearl.Guard(Cart(xml=xml), {"velocity": {"limit": 8e3}}, unavoidable="kept")
+    env.reset()
+    with pytest.warns(UserWarning, match="MuJoCo gave up in the middle of a step") as told:
+        for _ in range(3):
+            env.unwrapped.data.qvel[1] = 1e6  # from which nothing leads back
+            *_, info = env.step(asked)
+            assert info["guard"] == "outside" and not env.unwrapped.data.qvel.any()
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("name", ["Reacher-v5", "Pusher-v5", "Swimmer-v5"])
+def test_one_number_is_for_every_joint_that_an_actuator_moves(name):
+    """Reacher's shoulder turns without end: it reached 126 rad/s of 2."""
+    env = nearl.Guard(gymnasium.make(name), {"velocity": {"limit": 2.0}})
+    env.reset(seed=0)
+    driven = env.unwrapped.model.jnt_dofadr[env.unwrapped.model.actuator_trnid[:, 0]]
+    rng, most = np.random.default_rng(0), np.zeros(len(driven))
+    for _ in range(100):
+        *_, info = env.step(rng.choice([-1.0, 1.0]) * env.action_space.high)
+        most = np.maximum(most, np.abs(env.unwrapped.data.qvel[driven]))
+        assert info["guard"] != "outside"
+    assert (most <= 2.0 + 1e-9).all() and most.max() > 1.9
+
+
+MOVED = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body name="base"><freejoint name="root"/><geom size=".1"/><site name="jet"/>
+<body><joint name="a" axis="0 1 0"/><geom type="capsule" size=".03" fromto="0 0 0 .3 0 0"/>
+<body pos=".3 0 0"><joint name="b" axis="0 1 0"/><geom type="capsule" size=".03" fromto="0 0 0 .3 0 0"/>
+<body pos=".3 0 0"><joint name="ball" type="ball" range="0 30" limited="true"/><geom size=".05"/>
+<body pos=".3 0 0"><joint name="loose" axis="0 1 0"/><geom size=".05"/></body></body></body></body></body></worldbody>
+<tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="-1"/></fixed></tendon>
+<actuator><motor tendon="t" ctrlrange="-1 1"/>{jet}</actuator></mujoco>"""
+
+
+def test_joints_that_one_number_cannot_hold_are_named():
+    """A tendon's joints are among those that are driven; a ball and a free joint cannot be held, and a loose one was never asked for."""
+    jet = '<motor site="jet" gear="0 0 1 0 0 0" ctrlrange="-1 1"/>'
+    with pytest.warns(UserWarning, match="keeps the velocity of hinges and slides alone; of 'root', 'ball', a ball or free joint each, nothing is kept"):
+        env = nearl.Guard(Cart(xml=MOVED.format(jet=jet)), SLOW)
+    env.reset()
+    data = env.unwrapped.data
+    for joint, outside in (("a", True), ("b", True), ("loose", False), ("root", False), ("ball", False)):
+        data.joint(joint).qvel[0] = 1.5
+        assert env.outside == outside, joint
+        data.joint(joint).qvel[0] = 0.0
+    with pytest.warns(UserWarning, match="keeps the position of hinges and slides alone; of 'ball'"):
+        nearl.Guard(Cart(xml=MOVED.format(jet="").replace('name="loose"', 'name="loose" range="-9 9" limited="true"')), {"position": {}})
+    with pytest.raises(
+        ValueError, match="velocity limit: joint 'ball' has more than one degree of freedom; take it out of the table, which may have a, b, loose"
+    ):
+        nearl.Guard(Cart(xml=MOVED.format(jet="")), {"velocity": {"limit": {"ball": 1.0}}})
+    with pytest.raises(ValueError, match="position margin: joint 'c' has no range in the robot file; take it out of the table, which may have s"):
+        nearl.Guard(Cart(), {"position": {"margin": {"c": 0.1}}})
+
+
+class Drawn(Cart):
+    """Every episode has a robot of its own: another model, other masses in it, or another range."""
+
+    def reset(self, *, seed=None, options=None):
+        how, mass = options or ("same", 1.0)
+        if how == "model":
+            self.model = mujoco.MjModel.from_xml_string(Cart.XML.replace('mass="1"', f'mass="{mass}"'))
+            self.data = mujoco.MjData(self.model)
+        if how == "mass":
+            self.model.body_mass[1:], self.model.actuator_gear[:, 0] = mass, 1.5
+            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+        if how == "range":
+            self.model.jnt_range[0] = -0.3, 0.3
+        return super().reset(seed=seed)
+
+
+def test_another_robot_in_every_episode_is_guarded_as_it_is():
+    env = nearl.Guard(Drawn(), {"position": {}, **SLOW})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        for how, mass, end in (("same", 1.0, 1.0), ("model", 0.1, 1.0), ("mass", 0.3, 1.0), ("range", 1.0, 0.3), ("model", 2.0, 1.0)):
+            env.reset(options=(how, mass))
+            data, most, farthest = env.unwrapped.data, 0.0, 0.0
+            for k in range(150):
+                *_, info = env.step(np.array([3.0 if k < 20 else 0.02 if k < 100 else -0.02, 0.02]))
+                most, farthest = max(most, np.abs(data.qvel).max()), max(farthest, abs(data.qpos[0]))
+                assert info["guard"] == "outside" or (np.abs(data.qvel).max() <= 1.0 + 1e-9 and abs(data.qpos[0]) <= end + 1e-9), how
+            assert most <= 1.0 + 1e-9, how
+
+
+class Nothing(gymnasium.Env):
+    model, data, frame_skip, action_space = None, None, 1, gymnasium.spaces.Box(-1, 1, (2,))
+
+
+class Skips(Cart):
+    def step(self, action):
+        self.frame_skip = 3
+        return super().step(action)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: nearl.Guard(Nothing(), SLOW), r"is no MuJoCo environment with continuous actions \(no model, data\)"),
+        (lambda: nearl.Guard(Cart(), SLOW, ctrl=3), "ctrl is 3; give the function"),
+        (lambda: nearl.Guard(Cart(), SLOW, ctrl=lambda a: a * [1, np.nan]), "ctrl gives nan for actuator '1': every entry must be finite"),
+        (lambda: nearl.Guard(Cart(), SLOW, seed=-1), "seed is -1; give a whole number"),
+        (lambda: nearl.Guard(Skips(), SLOW), "took 0.03 s and its frame_skip says 0.01 s"),
+    ],
+)
+def test_what_no_guard_can_be_made_of_is_refused_in_a_sentence(make, words):
+    with pytest.raises(ValueError, match=words):
+        make().step(np.ones(2))
+
+
+def test_an_actuator_that_comes_back_has_its_joint_limited_again():
+    env = Cart()
+    env.model.actuator_gear[1, 0] = 0.0
+    guard = nearl.Guard(env, SLOW)
+    bang(guard)
+    env.model.actuator_gear[1, 0] = 1.0
+    most, words = bang(guard)
+    assert (most <= 1.0 + 1e-9).all() and most[1] > 0.9 and not words
+
+
+def test_limits_that_do_not_fit_another_range_are_refused_in_every_step():
+    env = nearl.Guard(Drawn(), {"position": {"margin": 0.5}})
+    env.reset()
+    words = "position margin of joint 's' is 0.5, which leaves nothing from -0.3 to 0.3; give at most 0.3"
+    with pytest.raises(ValueError, match=words):
+        env.reset(options=("range", 1.0))
+    with pytest.raises(ValueError, match=words):
+        env.step(np.zeros(2))
+
+
+class Writes(Cart):
+    """Works in the array that it is given."""
+
+    def step(self, action):
+        result = super().step(action)
+        action[:] = 7.0
+        return result
+
+
+def test_what_is_said_of_an_action_stays_true():
+    """An environment that writes into its action, and a policy that uses one array over again."""
+    env = nearl.Guard(Writes(), SLOW)
+    env.reset()
+    action = np.array([0.5, 0.05])
+    *_, first = env.step(action)
+    action[:] = -1.0, -0.01
+    *_, second = env.step(action)
+    assert first["guard"] == second["guard"] == "kept"
+    assert first["action"].tolist() == [0.5, 0.05] and second["action"].tolist() == [-1.0, -0.01]
+
+
+def test_actions_of_any_shape_are_taken_where_ctrl_says_what_they_are():
+    env = Cart()
+    env.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2, 1), np.float32)
+    env.step = lambda action: Cart.step(env, np.array([10.0, 1.0]) * np.asarray(action).ravel())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        most, words = bang(nearl.Guard(env, SLOW, ctrl=lambda action: np.array([10.0, 1.0]) * action[:, 0]))
+    assert (most <= 1.0 + 1e-9).all() and most.min() > 0.9 and not words
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_of_a_guard_guards(again):
+    env = nearl.Guard(gymnasium.make("HalfCheetah-v5"), FAST)
+    first = fastest(env)
+    twin = again(env)
+    assert fastest(twin) == first == fastest(env) and first[0] <= 20.0 + 1e-9
+    assert twin.unwrapped.data is not env.unwrapped.data
+
+
+def test_a_vector_is_not_guarded_as_a_whole():
+    envs = gymnasium.make_vec("HalfCheetah-v5", 2, vectorization_mode="sync", wrappers=[lambda env: nearl.Guard(env, FAST)])
+    envs.reset(seed=0)
+    *_, info = envs.step(envs.action_space.sample())
+    assert set(info["guard"]) <= {"kept", "replaced"}
+    with pytest.raises(ValueError, match="SyncVectorEnv is no gymnasium.Env; in a vector put a guard around each environment"):
+        nearl.Guard(envs, FAST)
