@@ -259,6 +259,8 @@ class Controller:
     @property
     def limits(self) -> dict[str, _Floats]: ...
     @property
+    def notes(self) -> list[str]: ...
+    @property
     def dt(self) -> float: ...
     @property
     def policy_every(self) -> int: ...
@@ -287,7 +289,7 @@ class Plant:
         *,
         nq: int | None = None,
         nv: int | None = None,
-        watchdog: float = 0.02,
+        watchdog: float,
         lockstep: bool = False,
     ) -> Plant: ...
     def exchange(

@@ -1,8 +1,11 @@
-"""What a caller hands over, before Rust sees it: whole numbers, each refused in one sentence."""
+"""What a caller hands over, before Rust sees it: whole numbers, arrays and lists of names, each refused in one sentence."""
 
 import operator
 import os
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 MOST_SEED = 2**64 - 1
 
@@ -24,6 +27,35 @@ def whole(name: str, value: Any, least: int, give: str, most: int | None = None)
     if number < least or (most is not None and number > most):
         raise ValueError(f"{name} is {number}; {give}")
     return number
+
+
+def numbers(name: str, value: Any) -> NDArray[np.float64]:
+    """``value`` as an array of real numbers.
+
+    Raises:
+        ValueError: it holds anything else, complex numbers among it, whose imaginary part NumPy would drop.
+    """
+    try:
+        if not np.iscomplexobj(value):
+            return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is not an array of numbers but {type(value)}; pass a NumPy array") from None
+    raise ValueError(f"{name} holds complex numbers, and a robot has none; give real ones, e.g. {name}.real")
+
+
+def names_of(what: str, value: Any) -> list[str]:
+    """A list of names; a single one is refused, whose letters would be taken for names.
+
+    Raises:
+        ValueError: it is one, or holds what is none.
+    """
+    if isinstance(value, str):
+        raise ValueError(f"{what} is {value!r}, a single name; give a list of names, e.g. [{value!r}]")
+    names = list(value)
+    for i, name in enumerate(names):
+        if not isinstance(name, str):
+            raise ValueError(f"{what}[{i}] is {name!r}; give names")
+    return names
 
 
 def seed_of(value: Any, n: int = 1, name: str = "seed") -> int:

@@ -35,7 +35,7 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self._picture = (width, height), camera
         self._renderer: Renderer | None = None
         self._native = _core.Env(task)
-        self._seeded = False
+        self._seeded = self._begun = False
         low = self._native.action_low.astype(np.float32)
         high = self._native.action_high.astype(np.float32)
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
@@ -56,7 +56,7 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         super().reset(seed=seed)
         if seed is None and not self._seeded:
             seed = int(self.np_random.integers(2**63))
-        self._seeded = True
+        self._seeded = self._begun = True
         obs = self._native.reset(seed)
         return (self._start(dict(options), obs) if options else obs), {}
 
@@ -77,6 +77,8 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
         ``info["cost"]`` is there where the task has a ``[cost]``, ``info["fault"]`` only if the physics could not be believed.
         """
+        if not self._begun:
+            raise gymnasium.error.ResetNeeded("no episode has begun; call reset() before step()")
         obs, reward, cost, terminated, fault = self._native.step(action)
         info: dict[str, Any] = {"cost": cost} if self._native.has_cost else {}
         if fault is not None:
@@ -103,7 +105,9 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
     def set_state(self, qpos: ArrayLike, qvel: ArrayLike) -> NDArray[np.float64]:
         """Begins an episode at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention; returns the observation."""
-        return self._native.set_state(qpos, qvel)
+        obs = self._native.set_state(qpos, qvel)
+        self._begun = True
+        return obs
 
     @property
     def state(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -128,7 +128,7 @@ def import_sb3(
         raise ValueError(f"the model chooses from {space}, and an imported policy gives numbers within a range; train it on a Box of actions")
     if hasattr(policy, "lstm_actor"):
         raise ValueError("the model's policy is recurrent (lstm_actor), which is none that layers consist of; train one without memory, or give it history")
-    low, high = np.asarray(space.low, float).ravel(), np.asarray(space.high, float).ravel()
+    low, high = _numbers(space.low, "action_space.low").ravel(), _numbers(space.high, "action_space.high").ravel()
     actor = getattr(policy, "actor", None)
     if actor is None:  # PPO, A2C: the action is cut to its range, or with use_sde=True and squash_output=True squashed
         parts = [("mlp_extractor.policy_net", policy.mlp_extractor.policy_net), ("action_net", policy.action_net)]
@@ -157,7 +157,7 @@ def import_sb3(
         raise ValueError(f"vec_normalize is {vec_normalize!r} and no VecNormalize; give the live object, e.g. VecNormalize.load(file, env)")
     if vec_normalize is not None and vec_normalize.norm_obs:
         rms = vec_normalize.obs_rms
-        mean, std = rms.mean, np.sqrt(np.asarray(rms.var) + vec_normalize.epsilon)
+        mean, std = rms.mean, np.sqrt(_numbers(rms.var, "obs_rms.var") + vec_normalize.epsilon)
         clip = float(vec_normalize.clip_obs)
     made = _policy(layers, mean, std, clip, (-math.inf, math.inf))
     if task is not None and robot is None:
@@ -194,7 +194,7 @@ def _check_range(low: np.ndarray, high: np.ndarray, task: str) -> None:
 
 def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: str | None, name: str) -> Controller:
     if task is not None and robot is None:
-        return policy.in_task(task)
+        return _told(policy.in_task(task))
     if robot is None or task is not None:
         raise ValueError("give either task=, or robot= and recipe=")
     recipes = [] if recipe is None else [recipe] if isinstance(recipe, str | os.PathLike) else recipe
@@ -202,7 +202,14 @@ def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: str | Non
         if not os.path.isfile(file):
             reason = "it is no file" if os.path.exists(file) else "it does not exist"
             raise ValueError(f"cannot read {what} '{os.fspath(file)}': {reason}; give {kind}")
-    return policy.controller(robot, recipe, name)
+    return _told(policy.controller(robot, recipe, name))
+
+
+def _told(controller: Controller) -> Controller:
+    """Says what `nearl import` says of robot and limits, at the line of whoever imports."""
+    for note in controller.notes:
+        warnings.warn(note, stacklevel=4)
+    return controller
 
 
 def _policy(layers: list[_Layer], mean: Any, std: Any, clip: float, output_clip: tuple[float, float]) -> Policy:
@@ -342,6 +349,8 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     for step in ("detach", "cpu", "numpy"):
         if hasattr(value, step):
             value = getattr(value, step)()
+    if np.iscomplexobj(value):
+        raise ValueError(f"{name} holds complex numbers, and the layers of a policy are real; give a network of real numbers")
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError):

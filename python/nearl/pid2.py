@@ -13,7 +13,7 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import seed_of, threads_of, whole
+from nearl.arguments import numbers, seed_of, threads_of, whole
 from nearl.outcome import Outcome, ask
 from nearl.ranks import Gather
 
@@ -32,6 +32,29 @@ Callback = Callable[["PID2", dict[str, float]], bool | None]
 FUNCTIONS = "functions.json"
 # What the `nearl` command advises, and what does the same here.
 _ARGUMENTS = {"go on with --resume": "go on with nearl.PID2.load(run)", "another folder with --out": "another folder as run=", "with --out": "with run="}
+
+
+class Memory(Sequence[_core.Controller]):
+    """What each environment of a prediction remembers: its controller. They are made when the next prediction asks for them, from what the first one saw."""
+
+    def __init__(self, of: _core.Controller, rows: Floats, noise: Floats | None):
+        self._of, self._rows, self._noise = of, rows.copy(), noise
+        self._made: list[_core.Controller] | None = None
+
+    @property
+    def _controllers(self) -> list[_core.Controller]:
+        if self._made is None:
+            made = [self._of.another() for _ in self._rows]
+            for i, (controller, row) in enumerate(zip(made, self._rows)):
+                controller.act(row, None if self._noise is None else self._noise[i])
+            self._made = made
+        return self._made
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._controllers[index]
 
 
 class PID2:
@@ -167,39 +190,47 @@ class PID2:
     def predict(
         self,
         observation: ArrayLike,
-        state: tuple[_core.Controller, ...] | None = None,
+        state: Sequence[_core.Controller] | None = None,
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
-    ) -> tuple[Floats, tuple[_core.Controller, ...] | None]:
+    ) -> tuple[Floats, Sequence[_core.Controller] | None]:
         """The action for one observation (n_obs) or several (n x n_obs), as the controller on the robot would give it.
 
         Args:
             observation: In the order of ``controller.obs_names``.
             state: What the last call returned. It matters where ``controller.remembers``: the policy runs every few ticks only
                 (Panda-reach), a limit speaks of the tick before (jerk, torque rate), or a brake is stored. Each call is then one control
-                tick, and without ``state`` the first of an episode. None elsewhere.
-            episode_start: (n) true where an episode begins.
+                tick, and without ``state`` the first of an episode. None elsewhere. It has a controller for each environment, made when it is given
+                back: rows without ``state`` take no memory, however many they are.
+            episode_start: (n) true where an episode begins, or one for all.
             deterministic: Without the noise of exploration.
 
         Returns:
             Action (n_act) or (n x n_act), within the actuators' range, and the state for the next call.
         """
-        obs, n_obs = _numbers("observation", observation), len(self._controller.obs_names)
+        obs, n_obs = numbers("observation", observation), len(self._controller.obs_names)
         if obs.ndim not in (1, 2) or obs.shape[-1] != n_obs or obs.size == 0:
             raise ValueError(f"observation has shape {obs.shape}; give one observation, ({n_obs},), or at least one row of several, (n, {n_obs})")
         rows = np.atleast_2d(obs)
-        if not self._controller.remembers:
-            memory: tuple[_core.Controller, ...] = (self._controller,) * len(rows)
-        else:
-            memory = state if state is not None else tuple(self._controller.another() for _ in rows)
-            if len(memory) != len(rows):
-                raise ValueError(f"state is of {len(memory)} environments, observation of {len(rows)}; give the state of the same environments")
-            for controller, begins in zip(memory, np.broadcast_to(np.asarray(episode_start if episode_start is not None else False), len(rows))):
-                if begins:
-                    controller.reset()
+        begins = _begins(episode_start, len(rows))
+        if state is not None and self._controller.remembers and len(state) != len(rows):
+            raise ValueError(f"state is of {len(state)} environments, observation of {len(rows)}; give the state of the same environments")
         noise = None if deterministic else self._rng.standard_normal((len(rows), self._controller.n_noise))
-        actions = np.stack([c.act(row, None if noise is None else noise[i]) for i, (c, row) in enumerate(zip(memory, rows))])
-        return (actions if obs.ndim > 1 else actions[0]), (memory if self._controller.remembers else None)
+        memory: Sequence[_core.Controller] | None = None
+        if not self._controller.remembers:
+            controllers: Sequence[_core.Controller] = (self._controller,) * len(rows)
+            begins = np.zeros(len(rows), bool)
+        elif state is None:
+            # One is enough: it forgets from row to row.
+            memory, controllers, begins = Memory(self._controller, rows, noise), (self._controller.another(),) * len(rows), np.ones(len(rows), bool)
+        else:
+            controllers = memory = state
+        actions = []
+        for i, (controller, row) in enumerate(zip(controllers, rows)):
+            if begins[i]:
+                controller.reset()
+            actions.append(controller.act(row, None if noise is None else noise[i]))
+        return (np.stack(actions) if obs.ndim > 1 else actions[0]), memory
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the snapshot: networks, normaliser, constraints, robot; ``nearl eval``, ``nearl run`` and :meth:`load` read it."""
@@ -282,11 +313,12 @@ def _ask_again(run: Path, reward: Outcome | None, termination: Outcome | None) -
         )
 
 
-def _numbers(name: str, value: Any) -> Floats:
-    try:
-        return np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} is not an array of numbers but {type(value)}; pass a NumPy array") from None
+def _begins(episode_start: Any, n: int) -> NDArray[np.bool_]:
+    """Where of ``n`` rows an episode begins; nowhere for None."""
+    begins = np.asarray(False if episode_start is None else episode_start, bool)
+    if begins.ndim > 1 or begins.size not in (1, n):
+        raise ValueError(f"episode_start has shape {begins.shape}, and observation is of {n} environments; give one true or false for each, ({n},)")
+    return np.broadcast_to(begins, n)
 
 
 def _toml(value: Any) -> str:

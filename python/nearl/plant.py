@@ -21,6 +21,7 @@ from typing import Any
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.arguments import names_of
 
 
 class Plant:
@@ -54,7 +55,9 @@ class Plant:
         watchdog: float = 0.02,
         lockstep: bool = False,
     ) -> None:
-        self._plant = _core.Plant(name, list(joints), list(observation), dt, nu, nq=nq, nv=nv, watchdog=watchdog, lockstep=lockstep)
+        self._plant = _core.Plant(
+            name, names_of("joints", joints), names_of("observation", observation), dt, nu, nq=nq, nv=nv, watchdog=watchdog, lockstep=lockstep
+        )
 
     def exchange(
         self,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import constraints_of
+from nearl.arguments import constraints_of, numbers
 from nearl.env import Env
 from nearl.render import Frame, Renderer
 
@@ -75,7 +75,9 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
         """One policy period under ``action`` (n_act): observation (n_obs), reward, terminated, truncated, info."""
-        obs, rewards, terminated, truncated, infos = self._native.step(np.asarray(action, float)[None])
+        if not self._seeded:
+            raise gymnasium.error.ResetNeeded("no episode has begun; call reset() before step()")
+        obs, rewards, terminated, truncated, infos = self._native.step(numbers("action", action)[None])
         info = {key: values[0] for key, values in infos.items() if not key.startswith("_")}
         return obs[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
 

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import constraints_of, seed_of, threads_of, whole
+from nearl.arguments import constraints_of, numbers, seed_of, threads_of, whole
 from nearl.outcome import Floats, Outcome, ask
 
 Step = tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
@@ -99,7 +99,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         self._check_open()
         began = self._over
         own = self._reward is None and self._termination is None
-        stepped = self._native.step(actions) if own else self._scored(np.asarray(actions, float))
+        stepped = self._native.step(actions) if own else self._scored(numbers("actions", actions))
         *_, terminated, truncated, info = stepped
         ended, same_step = terminated | truncated, self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         self._over = ended & (not same_step)
@@ -138,7 +138,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
     def set_state(self, index: int, qpos: ArrayLike, qvel: ArrayLike) -> None:
         """Begins an episode of environment ``index`` at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention."""
         self._check_open()
-        self._native.set_state(index, np.asarray(qpos, float).tolist(), np.asarray(qvel, float).tolist())
+        self._native.set_state(index, numbers("qpos", qpos).tolist(), numbers("qvel", qvel).tolist())
         self._obs[index] = self._native.end([False] * self.num_envs)[index]
         self._over[index] = False
 

@@ -1,8 +1,11 @@
 //! Turns what NumPy accepts into vectors, and vectors into arrays.
 
-use numpy::{AllowTypeChange, PyArray1, PyArray2, PyArrayLikeDyn, PyArrayMethods, PyUntypedArrayMethods};
-use pyo3::exceptions::PyValueError;
+use numpy::{
+    AllowTypeChange, PyArray1, PyArray2, PyArrayDyn, PyArrayLikeDyn, PyArrayMethods, PyUntypedArrayMethods,
+};
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyFloat};
 
 /// A vector of `expected` numbers; `name` is what the message calls it.
 pub(crate) fn vector(name: &str, value: &Bound<'_, PyAny>, expected: usize) -> PyResult<Vec<f64>> {
@@ -32,9 +35,37 @@ fn numbers<'py>(
     name: &str,
     value: &Bound<'py, PyAny>,
 ) -> PyResult<PyArrayLikeDyn<'py, f64, AllowTypeChange>> {
+    refuse_complex(name, value)?;
     value.extract().map_err(|_| {
         let kind = value.get_type().to_string();
         PyValueError::new_err(format!("{name} is not an array of numbers but {kind}; pass a NumPy array"))
+    })
+}
+
+/// NumPy drops the imaginary part of what is made real, with no more than a warning.
+pub(crate) fn refuse_complex(name: &str, value: &Bound<'_, PyAny>) -> PyResult<()> {
+    if value.cast::<PyArrayDyn<f64>>().is_ok() || value.is_exact_instance_of::<PyFloat>() {
+        return Ok(());
+    }
+    if let Ok(map) = value.cast::<PyDict>() {
+        return map.values().iter().try_for_each(|value| refuse_complex(name, &value));
+    }
+    // What NumPy cannot look at is refused by whoever reads it.
+    let answer = value.py().import("numpy")?.call_method1("iscomplexobj", (value,));
+    if answer.and_then(|is| is.is_truthy()).unwrap_or(false) {
+        return Err(PyValueError::new_err(format!(
+            "{name} holds complex numbers, and a robot has none; give real ones, e.g. {name}.real"
+        )));
+    }
+    Ok(())
+}
+
+/// A single number.
+pub(crate) fn number(name: &str, value: &Bound<'_, PyAny>) -> PyResult<f64> {
+    refuse_complex(name, value)?;
+    value.extract().map_err(|_| {
+        let kind = value.get_type().name().map_or("another type".into(), |kind| kind.to_string());
+        PyTypeError::new_err(format!("{name} is of {kind}; give a number"))
     })
 }
 

@@ -1,9 +1,9 @@
 //! The controller of a snapshot.
 
 use std::path::PathBuf;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use nearl_runtime::{self as runtime, Noise, Output, PolicyKind, Snapshot, State};
+use nearl_runtime::{self as runtime, Noise, Output, PolicyKind, Snapshot, State, doctor};
 use nearl_trainer::run_folder;
 use numpy::PyArray1;
 use pyo3::prelude::*;
@@ -50,7 +50,7 @@ pub(crate) struct Controller {
     n_noise: usize,
     /// A joint whose state the observation lacks though the inverse dynamics needs it.
     unseen: Option<String>,
-    snapshot: Snapshot,
+    snapshot: Arc<Snapshot>,
     names: Vec<String>,
     task: String,
     algo: String,
@@ -128,7 +128,7 @@ impl Controller {
 
     /// The same controller once more, at the start of an episode.
     fn another(&self, py: Python<'_>) -> PyResult<Controller> {
-        py.detach(|| Controller::new(&self.snapshot))
+        py.detach(|| Controller::of(self.snapshot.clone()))
     }
 
     /// Writes the snapshot that it runs on.
@@ -201,6 +201,12 @@ impl Controller {
         Ok(out)
     }
 
+    /// What `nearl import` and `nearl doctor` say of its robot and limits, a sentence each: limits that nothing holds, friction, targets that are cut.
+    #[getter]
+    fn notes(&self, py: Python<'_>) -> PyResult<Vec<String>> {
+        py.detach(|| doctor::told(&self.snapshot.manifest)).map_err(errors::snapshot)
+    }
+
     /// Control period [s].
     #[getter]
     fn dt(&self, py: Python<'_>) -> f64 {
@@ -257,7 +263,12 @@ impl Controller {
 impl Controller {
     /// The controller of a snapshot.
     pub(crate) fn new(snapshot: &Snapshot) -> PyResult<Controller> {
-        let controller = runtime::Controller::new(snapshot).map_err(errors::snapshot)?;
+        Controller::of(Arc::new(snapshot.clone()))
+    }
+
+    /// The same of one that several controllers share.
+    fn of(snapshot: Arc<Snapshot>) -> PyResult<Controller> {
+        let controller = runtime::Controller::new(&snapshot).map_err(errors::snapshot)?;
         let (model, layout) = (controller.model(), controller.layout());
         let sizes = (model.nq(), model.nv(), layout.n_obs());
         let names = controller.row_names();
@@ -268,7 +279,6 @@ impl Controller {
         let unseen = controller.first_unseen();
         let (task, algo, digest) = (manifest.task.name.clone(), manifest.algo.clone(), snapshot.digest());
         let inner = Mutex::new(Inner { controller, state, noise, out, stochastic });
-        let snapshot = snapshot.clone();
         Ok(Controller { inner, sizes, n_noise, unseen, names, task, algo, digest, snapshot })
     }
 

@@ -77,5 +77,21 @@ pub(crate) fn snapshot(error: SnapshotError) -> PyErr {
 /// Says as a `UserWarning` what is allowed and hardly meant.
 pub(crate) fn warn(py: Python<'_>, text: &str) -> PyResult<()> {
     let text = std::ffi::CString::new(text).unwrap_or_default();
-    PyErr::warn(py, &py.get_type::<PyUserWarning>(), &text, 1)
+    PyErr::warn(py, &py.get_type::<PyUserWarning>(), &text, level(py).unwrap_or(1))
+}
+
+/// Where a warning points: past the frames of this package, and of Gymnasium which makes environments of it, to whoever called.
+fn level(py: Python<'_>) -> PyResult<i32> {
+    let mut frame = py.import("sys")?.getattr("_getframe")?.call0()?;
+    for level in 1.. {
+        let name = frame.getattr("f_globals")?.get_item("__name__")?.extract::<String>()?;
+        if !["nearl", "gymnasium"].contains(&name.split('.').next().unwrap_or_default()) {
+            return Ok(level);
+        }
+        frame = frame.getattr("f_back")?;
+        if frame.is_none() {
+            break;
+        }
+    }
+    Ok(1)
 }

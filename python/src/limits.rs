@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nearl_constraints::limit::{Argument, REGISTRY, RegisteredLimit, Takes};
+use nearl_constraints::limit::{Argument, ConstraintSettings, REGISTRY, RegisteredLimit, Takes};
 use nearl_constraints::{self as constraints, Cone, LimitError, LimitSet, PerJoint, Rows, Soft};
 use nearl_runtime::task::Task;
 use pyo3::exceptions::PyTypeError;
@@ -12,6 +12,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyString};
 use toml::{Table, Value};
 
+use crate::arrays::refuse_complex;
 use crate::errors;
 use crate::model::Model;
 
@@ -23,21 +24,21 @@ pub(crate) fn add_to(module: &Bound<'_, PyModule>) -> PyResult<()> {
 /// What every limit is: pass a list of them to `Projector`. `name` is what `Projector.set_enabled` takes. Each kind has a class of its own
 /// (`nearl.VelocityLimit` and its like); `Limit(model, "velocity", {"scale": 0.8})` is the same by the name that the kind has in a task file.
 #[pyclass(module = "nearl._core", frozen, subclass)]
-pub(crate) struct Limit(Arc<dyn constraints::Limit>, Vec<String>);
+pub(crate) struct Limit(Arc<dyn constraints::Limit>, Vec<String>, String);
 
 #[pymethods]
 impl Limit {
     #[new]
     fn new(model: &Model, kind: &str, settings: &Bound<'_, PyDict>) -> PyResult<Limit> {
         let robot = &model.model;
-        let limit = made(kind, settings)?;
+        let (limit, written) = made(kind, settings)?;
         // Unknown joints and impossible numbers are refused where they are written, before any projector is built.
         let tried = limit
             .restrict(robot, &[], &mut LimitSet::unlimited(robot.nv()))
             .and_then(|()| limit.rows(robot, &[]).map(|_| ()))
             .and_then(|()| limit.cone(robot, &[]).map(|_| ()));
         tried.map_err(errors::value)?;
-        Ok(Limit(Arc::from(limit), joints(robot)))
+        Ok(Limit(Arc::from(limit), joints(robot), written))
     }
 
     /// Name to switch the limit on and off by.
@@ -46,13 +47,48 @@ impl Limit {
         self.0.label()
     }
 
-    fn __repr__(&self) -> String {
-        format!("{:?}", self.0)
+    fn __repr__(&self) -> &str {
+        &self.2
     }
 }
 
-/// The limit of `kind`, one of the registry, from the arguments of its class.
-fn made(kind: &str, settings: &Bound<'_, PyDict>) -> PyResult<Box<dyn constraints::Limit>> {
+/// As Python writes it: the class, and what a task file would say with all that was left out.
+fn in_python(entry: &RegisteredLimit, settings: &ConstraintSettings) -> String {
+    let class = entry.about.class;
+    let written = Table::try_from(settings).unwrap_or_default().remove(entry.name);
+    let section = match written {
+        Some(Value::Array(mut several)) if entry.many && several.len() == 1 => several.pop(),
+        other => other,
+    };
+    match section {
+        Some(Value::Table(table)) => {
+            let given: Vec<String> = table.iter().map(|(key, x)| format!("{key}={}", literal(x))).collect();
+            format!("{class}({})", given.join(", "))
+        }
+        Some(value) => format!("{class}({})", literal(&value)),
+        None => format!("{class}()"),
+    }
+}
+
+/// A value as Python writes it.
+fn literal(value: &Value) -> String {
+    match value {
+        Value::Boolean(true) => "True".into(),
+        Value::Boolean(false) => "False".into(),
+        Value::Float(x) => format!("{x:?}"),
+        Value::Array(list) => format!("[{}]", list.iter().map(literal).collect::<Vec<_>>().join(", ")),
+        Value::Table(table) => {
+            let entries: Vec<String> =
+                table.iter().map(|(key, x)| format!("{key:?}: {}", literal(x))).collect();
+            format!("{{{}}}", entries.join(", "))
+        }
+        Value::String(text) => format!("{text:?}"),
+        other => other.to_string(),
+    }
+}
+
+/// The limit of `kind`, one of the registry, from the arguments of its class, and how Python writes it.
+fn made(kind: &str, settings: &Bound<'_, PyDict>) -> PyResult<(Box<dyn constraints::Limit>, String)> {
     let entry = REGISTRY.iter().find(|entry| entry.name == kind).ok_or_else(|| {
         let known: Vec<&str> = REGISTRY.iter().map(|entry| entry.name).collect();
         errors::value(format!("there is no limit of kind '{kind}'; choose one of {}", known.join(", ")))
@@ -62,9 +98,10 @@ fn made(kind: &str, settings: &Bound<'_, PyDict>) -> PyResult<Box<dyn constraint
     let table = Table::from_iter([(kind.to_string(), section)]);
     let read = Task::constraints_of(Value::Table(table))
         .map_err(|(_, reason)| errors::value(format!("limit '{kind}': {reason}; see docs/LIMITS.md")))?;
-    (entry.build)(&read)
+    let limit = (entry.build)(&read)
         .pop()
-        .ok_or_else(|| errors::value(format!("limit '{kind}' is empty; give it a setting")))
+        .ok_or_else(|| errors::value(format!("limit '{kind}' is empty; give it a setting")))?;
+    Ok((limit, in_python(entry, &read)))
 }
 
 /// The section of a task file that says the same as the arguments.
@@ -154,10 +191,13 @@ fn complete(section: &mut Value) -> PyResult<()> {
 
 /// An argument as a task file has it.
 fn value(argument: &Argument, given: &Bound<'_, PyAny>) -> PyResult<Value> {
-    read(argument.takes, given).map_err(|_: PyErr| {
+    let refused = |got: &str| {
         let (expected, name) = (argument.takes.expected(), argument.name);
-        let got = given.get_type().name().map_or("another type".into(), |n| n.to_string());
         PyTypeError::new_err(format!("expected {expected}; got {got}, as '{name}'"))
+    };
+    refuse_complex(argument.name, given).map_err(|_| refused("complex numbers"))?;
+    read(argument.takes, given).map_err(|_: PyErr| {
+        refused(&given.get_type().name().map_or("another type".into(), |n| n.to_string()))
     })
 }
 
@@ -208,9 +248,15 @@ fn written(given: &Bound<'_, PyAny>) -> PyResult<Value> {
     Ok(Value::Array(list.iter().map(written).collect::<PyResult<_>>()?))
 }
 
-/// One limit shared by many projectors.
-#[derive(Debug, Clone)]
-pub(crate) struct Shared(Arc<dyn constraints::Limit>);
+/// One limit shared by many projectors, and how it was written.
+#[derive(Clone)]
+pub(crate) struct Shared(Arc<dyn constraints::Limit>, String);
+
+impl std::fmt::Debug for Shared {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.1)
+    }
+}
 
 impl constraints::Limit for Shared {
     fn name(&self) -> &'static str {
@@ -219,6 +265,10 @@ impl constraints::Limit for Shared {
 
     fn label(&self) -> &str {
         self.0.label()
+    }
+
+    fn named_joints(&self) -> Vec<&str> {
+        self.0.named_joints()
     }
 
     fn restrict(
@@ -257,9 +307,15 @@ impl constraints::Limit for Shared {
 
 /// The Rust limits behind a list of Python ones.
 pub(crate) fn boxed(
-    limits: &[Bound<'_, PyAny>],
+    limits: &Bound<'_, PyAny>,
     robot: &constraints::Model,
 ) -> PyResult<Vec<Box<dyn constraints::Limit>>> {
+    let limits: Vec<Bound<'_, PyAny>> = limits.extract().map_err(|_| {
+        let kind = limits.get_type().name().map_or("another type".into(), |kind| kind.to_string());
+        PyTypeError::new_err(format!(
+            "limits is of {kind}; give a list of limits, e.g. [nearl.VelocityLimit(model)]"
+        ))
+    })?;
     limits.iter().enumerate().map(|(i, limit)| one(i, limit, robot)).collect()
 }
 
@@ -279,7 +335,7 @@ fn one(
             limit.get().0.label(),
             limit.get().1.join(", ")
         ))),
-        Ok(limit) => Ok(Box::new(Shared(limit.get().0.clone()))),
+        Ok(limit) => Ok(Box::new(Shared(limit.get().0.clone(), limit.get().2.clone()))),
         Err(_) => Err(PyTypeError::new_err(format!(
             "limits[{i}] is {}, not a limit; pass objects such as nearl.PositionLimit(model)",
             limit.get_type()
@@ -298,6 +354,7 @@ impl<'a, 'py> FromPyObject<'a, 'py> for Values {
     type Error = PyErr;
 
     fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        refuse_complex("the value", &given.to_owned())?;
         let all = given.extract().map(Values::All);
         let named = all.or_else(|_: PyErr| given.extract().map(Values::Joints));
         named.or_else(|_: PyErr| given.extract().map(Values::Each)).map_err(|_: PyErr| {

@@ -12,7 +12,7 @@ use numpy::PyArray1;
 use pyo3::exceptions::{PyConnectionError, PyRuntimeError};
 use pyo3::prelude::*;
 
-use crate::arrays::{array, vector};
+use crate::arrays::{array, number, vector};
 use crate::errors;
 
 fn error(error: LinkError) -> PyErr {
@@ -36,18 +36,19 @@ type Told<'py> = (&'static str, Option<Bound<'py, PyArray1<f64>>>);
 impl Plant {
     /// Announces the robot; joints in the order of v. After `watchdog` [s] without a fresh action the plant is told to brake.
     #[new]
-    #[pyo3(signature = (name, joints, observation, dt, nu, *, nq=None, nv=None, watchdog=0.02, lockstep=false))]
+    #[pyo3(signature = (name, joints, observation, dt, nu, *, nq=None, nv=None, watchdog, lockstep=false))]
     fn new(
         name: &str,
         joints: Vec<String>,
         observation: Vec<String>,
-        dt: f64,
+        dt: &Bound<'_, PyAny>,
         nu: usize,
         nq: Option<usize>,
         nv: Option<usize>,
-        watchdog: f64,
+        watchdog: &Bound<'_, PyAny>,
         lockstep: bool,
     ) -> PyResult<Plant> {
+        let (dt, watchdog) = (number("dt", dt)?, number("watchdog", watchdog)?);
         for (what, value) in [("dt", dt), ("watchdog", watchdog)] {
             if !(value.is_finite() && value > 0.0) {
                 return Err(errors::value(format!("{what} is {value} s; give a positive number of seconds")));

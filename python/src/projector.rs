@@ -10,7 +10,7 @@ use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arrays::{array, array2, matrix, rows};
+use crate::arrays::{array, array2, matrix, number, rows};
 use crate::errors;
 use crate::limits;
 use crate::model::Model;
@@ -64,8 +64,8 @@ impl Projector {
     fn new(
         py: Python<'_>,
         model: Py<Model>,
-        limits: Vec<Bound<'_, PyAny>>,
-        dt: f64,
+        limits: &Bound<'_, PyAny>,
+        dt: &Bound<'_, PyAny>,
         controllable: Option<Vec<String>>,
         consistency: &str,
         solver: &str,
@@ -101,10 +101,10 @@ impl Projector {
             velocity_weight,
             braking,
             deadline,
-            ..Settings::new(dt, sub_steps)
+            ..Settings::new(number("dt", dt)?, sub_steps)
         };
         let controllable = dofs(robot, controllable)?;
-        let limits = limits::boxed(&limits, robot)?;
+        let limits = limits::boxed(limits, robot)?;
         let dofs = controllable.clone();
         let mut projectors =
             py.detach(|| Projectors::new(robot, limits, dofs, settings)).map_err(errors::value)?;

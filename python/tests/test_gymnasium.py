@@ -1,5 +1,7 @@
 """Our environments against Gymnasium 1.4.0's v5 on MuJoCo 3.17.0."""
 
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -97,6 +99,34 @@ def drawn(env: gymnasium.Env) -> np.ndarray:
         return env.render()
     except nearl.render.VideoError as error:
         pytest.skip(str(error))
+
+
+def test_a_step_before_an_episode_is_refused_without_wrappers_too() -> None:
+    for env in (nearl.Env("HalfCheetah-v5"), nearl.ProjectedEnv("Panda-reach")):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="no episode has begun; call reset"):
+            env.step(env.action_space.sample())
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+    env = nearl.Env("HalfCheetah-v5")
+    env.set_state(env.qpos, env.qvel)
+    env.step(np.zeros(6))
+
+
+def test_warnings_of_a_task_point_at_the_line_that_made_it(tmp_path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><compiler angle="radian"/><worldbody><body><joint name="hinge" axis="0 1 0" range="-1 1"/><geom size=".1" mass="1"/></body></worldbody>'
+        '<actuator><motor joint="hinge" ctrlrange="-9 9"/></actuator></mujoco>'
+    )
+    task = tmp_path / "arm.toml"
+    task.write_text(
+        'name = "arm"\n[model]\nmjcf = "arm.xml"\n[time]\ndt = 0.01\nsim_dt = 0.002\n[state]\nobservation = ["q.hinge", "v.hinge"]\n'
+        '[reward]\nstill = "-q.hinge^2"\n[constraints]\nvelocity = { limit = 900.0 }\n[idm]\nkind = "pinocchio"\n'
+    )
+    env_id = nearl.register(str(task))[0]
+    with pytest.warns(UserWarning, match="is it degrees") as said:
+        gymnasium.make(env_id, constraints="task")
+        nearl.make_vec(str(task), 2, constraints="task")
+    assert {Path(w.filename) for w in said if "degrees" in str(w.message)} == {Path(__file__)}
 
 
 def test_an_environment_draws_its_state() -> None:

@@ -322,6 +322,10 @@ def test_a_recipe_that_does_not_fit_is_refused_by_name(tmp_path) -> None:
     files["recipe"] = None
     with pytest.raises(ValueError, match="does not say what the 14 entries of its input 'obs' are; give them with --recipe"):
         nearl.import_onnx(path, **files)
+    files["recipe"] = tmp_path / "task.toml"
+    files["recipe"].write_text('name = "r"\n[constraints]\nvelocity = { limit = 1.0 }\n')
+    with pytest.raises(ValueError, match=r"'.*task.toml' has no \[policy\], which says what the 14 entries .* give the file as task= to nearl.import_torch"):
+        nearl.import_onnx(path, **files)
 
 
 DEPLOY = """
@@ -548,6 +552,7 @@ def test_a_model_without_its_environment_is_said_to_be_taken_as_it_is() -> None:
     obs = RNG.normal(size=17)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message="the limits on states under .constraints. hold for nothing")  # true of this task
         plain, normalised = (nearl.import_sb3(lost, given, task="HalfCheetah-v5") for given in (False, norm))
         with_env = ppo(17, 6, get_env=lambda: SimpleNamespace(has_attr=lambda _: False), get_vec_normalize_env=lambda: None)
         nearl.import_sb3(with_env, task="HalfCheetah-v5")
@@ -555,6 +560,38 @@ def test_a_model_without_its_environment_is_said_to_be_taken_as_it_is() -> None:
         nearl.import_sb3(with_env, task="HalfCheetah-v5")
     np.testing.assert_allclose(plain.act(obs), normalised.act(obs + 1.0), atol=1e-5)
     assert np.array_equal(taken.act(obs), plain.act(obs)) and not np.allclose(taken.act(obs), normalised.act(obs), atol=1e-2)
+
+
+def test_limits_that_nothing_holds_are_said_by_every_import(tmp_path) -> None:
+    """In the words of `nearl import`, once, at the line that imports; a guard that holds them has nothing to say."""
+    onnx_file, files = Net(14).gemm(14, 3).save(tmp_path / "policy.onnx", 3), planar(tmp_path)
+    loose = RECIPE + "[constraints]\nvelocity = { limit = 3.0 }\nacceleration = { limit = 50.0 }\ntorque = {}\n"
+    guarded = loose.replace("velocity", "guard = true\nvelocity")
+    torch_net, box = Sequential([Linear(14, 9), Tanh(), Linear(9, 3)]), SimpleNamespace(low=np.full(6, -1.0), high=np.full(6, 1.0))
+    actor = SimpleNamespace(mlp_extractor=SimpleNamespace(policy_net=Sequential([Linear(17, 8)])), action_net=Linear(8, 6))
+    sb3 = SimpleNamespace(policy=actor, action_space=box)
+
+    def hold_for_nothing(make) -> list[str]:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            make()
+        return [w.filename for w in said if "hold for nothing: this policy gives actions, and guard is off; add guard = true" in str(w.message)]
+
+    for text, expected in ((loose, [__file__]), (guarded, [])):
+        files["recipe"].write_text(text)
+        assert hold_for_nothing(lambda: nearl.import_onnx(onnx_file, **files)) == expected
+        assert hold_for_nothing(lambda: nearl.import_torch(torch_net, **files)) == expected
+    assert hold_for_nothing(lambda: nearl.import_sb3(sb3, False, task="HalfCheetah-v5")) == [__file__]
+
+
+def test_layers_of_complex_numbers_are_refused(tmp_path) -> None:
+    files, layer = planar(tmp_path), Linear(14, 3)
+    layer.weight = SimpleNamespace(detach=lambda: np.ones((3, 14), complex))
+    with pytest.raises(ValueError, match="0.weight holds complex numbers, and the layers of a policy are real"):
+        nearl.import_torch(Sequential([layer]), **files)
+    for name in ("mean", "std"):
+        with pytest.raises(ValueError, match=f"{name} holds complex numbers"):
+            nearl.import_torch(Sequential([Linear(14, 3)]), **files, **{name: np.ones(14, complex)})
 
 
 def test_the_actors_of_stable_baselines_are_read() -> None:

@@ -34,18 +34,59 @@ def test_a_kind_by_its_name_is_its_class(panda) -> None:
 
 def test_what_an_argument_leaves_out_is_filled_in(panda) -> None:
     box = repr(nearl.FrameLimit(panda, "panda_hand", 2.0, lower=np.array([0.0, -1.0, 0.1])))
-    assert "lower: [0.0, -1.0, 0.1], upper: [inf, inf, inf]" in box and "half_space: None" in box
+    assert "\"lower\": [0.0, -1.0, 0.1], \"upper\": [inf, inf, inf]" in box and "half_space" not in box
     plane = repr(nearl.FrameLimit(panda, "panda_hand", 2.0, normal=(0, 0, -1)))
-    assert "normal: [0.0, 0.0, -1.0], through: [0.0, 0.0, 0.0]" in plane and "inside: None" in plane
+    assert "\"normal\": [0.0, 0.0, -1.0], \"through\": [0.0, 0.0, 0.0]" in plane and "box" not in plane and "inside" not in plane
     curve = {"limit": 1.0, "offset": 0.1, "squared": 2.0, "lower": -1.0, "upper": 1.0}
     profile = repr(nearl.VelocityProfileLimit(panda, {"panda_joint1": curve, "panda_joint2": curve}, margin=0.25))
-    assert profile.count("margin: 0.25") == 2 and profile.count("squared: 2.0") == 2
+    assert profile.count('"margin": 0.25') == 2 and profile.count('"squared": 2.0') == 2
     soft = repr(nearl.TorqueLimit(panda, soft=(2.0, 3.0)))
-    assert "linear: 2.0, quadratic: 3.0" in soft and "scale: 1.0" in soft
+    assert '"linear": 2.0, "quadratic": 3.0' in soft and "scale=1.0" in soft
     shapes = [{"frame": "panda_hand", "shape": {"sphere": {"radius": 0.1}}}, {"name": "floor", "shape": "half_space"}]
     shapes.append({"name": "post", "shape": {"sphere": {"radius": 0.2}}, "position": [1, 0, 0]})
     bodies = repr(nearl.CollisionLimit(panda, shapes, 2.0, ignore=[("panda_hand", "floor")], rows=3))
-    assert "radius: 0.1" in bodies and "HalfSpace" in bodies and '["panda_hand", "floor"]' in bodies and "rows: 3" in bodies
+    assert '"radius": 0.1' in bodies and '"half_space"' in bodies and '["panda_hand", "floor"]' in bodies and "rows=3" in bodies
+
+
+def test_limits_are_written_as_python_has_them(panda) -> None:
+    """What is written is read back: names, numbers, lists and tables of Python, with what was left out."""
+    fields = lambda **given: given  # noqa: E731
+    for limit, kind, given in (
+        (nearl.AccelerationLimit(panda, 10.0), "AccelerationLimit", {"limit": 10.0}),
+        (nearl.AccelerationLimit(panda, {"panda_joint1": 3.0}, braking=2), "AccelerationLimit", {"limit": {"panda_joint1": 3.0}, "braking": 2.0}),
+        (nearl.VelocityLimit(panda, limit=np.full(7, 0.5)), "VelocityLimit", {"limit": [0.5] * 7}),
+        (nearl.JerkLimit(panda, 9.0, hard=True), "JerkLimit", {"limit": 9.0, "hard": True}),
+        (nearl.RowLimit(panda, "r", {"q.panda_joint1": 2.0}, equals=0.5), "RowLimit", {"name": "r", "terms": {"q.panda_joint1": 2.0}, "equals": 0.5}),
+    ):
+        written = eval(repr(limit), {kind: fields, "inf": np.inf})
+        assert written | given == written, repr(limit)
+    assert repr(nearl.VelocityLimit(panda)) in repr(nearl.Projector(panda, [nearl.VelocityLimit(panda)], dt=0.01))
+
+
+def test_complex_numbers_are_refused_everywhere(panda) -> None:
+    """NumPy would drop the imaginary part, with a warning that names nothing."""
+    for wrong in (np.complex128(1 + 1j), np.full(7, 1 + 1j), [np.complex64(1j)] * 7, {"panda_joint1": np.complex128(1j)}):
+        with pytest.raises(TypeError, match="expected a number for all joints.*; got complex numbers, as 'limit'"):
+            nearl.VelocityLimit(panda, limit=wrong)
+    projector, q = nearl.Projector(panda, [nearl.VelocityLimit(panda)], dt=0.01), np.array([0.0, 0, 0, -1.5, 0, 1.5, 0])
+    for k, name in enumerate(("q", "v", "q_proposal", "v_proposal")):
+        state = [q, 0 * q, q, 0 * q]
+        state[k] = state[k] + 0j
+        with pytest.raises(ValueError, match=f"{name} holds complex numbers, and a robot has none; give real ones, e.g. {name}.real"):
+            projector.project(*state)
+    with pytest.raises(ValueError, match="actions holds complex numbers"):
+        nearl.make_vec("HalfCheetah-v5", 2).step(np.zeros((2, 6), complex))
+    with pytest.raises(ValueError, match="observation holds complex numbers"):
+        nearl.PID2("HalfCheetah-v5").predict(np.zeros(17, complex))
+
+
+def test_arguments_of_a_projector_are_named(panda) -> None:
+    limit = nearl.VelocityLimit(panda)
+    for limits in (limit, "velocity", None):
+        with pytest.raises(TypeError, match=f"limits is of {type(limits).__name__}; give a list of limits"):
+            nearl.Projector(panda, limits, dt=0.01)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="dt is of str; give a number"):
+        nearl.Projector(panda, [limit], dt="1")  # type: ignore[arg-type]
 
 
 def test_what_is_wrong_is_refused_by_name(panda) -> None:

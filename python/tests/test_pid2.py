@@ -2,6 +2,7 @@
 
 import _thread
 import itertools
+import resource
 import signal
 import threading
 import warnings
@@ -317,6 +318,40 @@ def test_rows_of_a_prediction_do_not_hear_of_each_other(tmp_path: Path) -> None:
     begun, state = agent.predict(obs, state, np.ones(8, bool))
     assert np.array_equal(begun, actions)
     assert not np.array_equal(agent.predict(-obs, state)[0], agent.predict(-obs)[0])
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_rows_of_a_controller_that_remembers_take_no_memory(tmp_path: Path, deterministic: bool) -> None:
+    """As many rows as are wanted are the first ticks of one controller; what each remembers is made where it is asked for."""
+    task = edited(tmp_path, 'consistency = "free"', 'consistency = "kinematic"\njerk = { limit = { slider = 50.0 } }')
+    agent = nearl.PID2(task, algo="pid2-ib", threads=1, settings={"train.pid2.gradient": "straight-through"})
+    obs = np.random.default_rng(1).uniform(-0.5, 0.5, (20_000, 5))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    many, state = agent.predict(obs, deterministic=deterministic)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000, "kB; a controller a row took 15 GB"
+    assert state is not None and len(state) == 20_000
+
+    few = 30
+    agent._rng = np.random.default_rng(agent.seed)
+    noise = None if deterministic else agent._rng.standard_normal((few, agent.controller.n_noise))
+    alone = [agent.controller.another() for _ in range(few)]
+    first = np.stack([c.act(row, None if noise is None else noise[i]) for i, (c, row) in enumerate(zip(alone, obs))])
+    agent._rng = np.random.default_rng(agent.seed)
+    rows = obs[:few].copy()
+    actions, state = agent.predict(rows, deterministic=deterministic)
+    rows[:] = 0.0  # the caller may fill the same array with what comes next
+    assert np.array_equal(actions, first) and np.array_equal(actions, many[:few])
+    for _ in range(3):
+        actions, again = agent.predict(-obs[:few], state)
+        assert np.array_equal(actions, np.stack([c.act(row) for c, row in zip(alone, -obs[:few])])) and again is state
+
+
+def test_where_episodes_begin_is_said_for_each_environment() -> None:
+    agent = nearl.PID2(CART_POLE)
+    assert np.array_equal(agent.predict(np.zeros((2, 5)), None, [True, False])[0], agent.predict(np.zeros((2, 5)), None, True)[0])
+    for wrong, shape in (([True, False], "2,"), (np.ones((3, 1), bool), "3, 1"), ([], "0,")):
+        with pytest.raises(ValueError, match=rf"episode_start has shape \({shape}\), and observation is of 3 environments; give one true or false for each"):
+            agent.predict(np.zeros((3, 5)), None, wrong)
 
 
 def test_presets_and_algorithms_are_those_of_the_trainer() -> None:

@@ -84,6 +84,26 @@ def test_mistakes_are_named(tmp_path) -> None:
         loop.stop()
 
 
+def test_names_and_numbers_of_a_plant_are_named() -> None:
+    right = {"joints": ["slide"], "observation": ["q.slide", "v.slide"], "dt": 0.01, "nu": 1}
+    for wrong, error, said in (
+        ({"joints": "slide"}, ValueError, r"joints is 'slide', a single name; give a list of names, e.g. \['slide'\]"),
+        ({"observation": "q.slide"}, ValueError, "observation is 'q.slide', a single name"),
+        ({"joints": [1]}, ValueError, r"joints\[0\] is 1; give names"),
+        ({"dt": "0.01"}, TypeError, "dt is of str; give a number"),
+        ({"watchdog": None}, TypeError, "watchdog is of NoneType; give a number"),
+    ):
+        with pytest.raises(error, match=said):
+            nearl.Plant(name("named"), **{**right, **wrong})
+
+
+def test_a_plant_whose_time_stands_still_does_not_spin() -> None:
+    with open_plant("idle", lockstep=True) as plant:
+        begun, busy = time.monotonic(), time.thread_time()
+        assert plant.exchange([0.1], [0.0], [0.1, 0.0], patience=1.0)[0] == "brake"
+        assert time.monotonic() - begun >= 1.0 and time.thread_time() - busy < 0.1, "a look every 30 us took more"
+
+
 def test_an_exception_of_the_body_is_what_comes_out(tmp_path) -> None:
     with pytest.raises(ZeroDivisionError, match="mine") as own, nearl.Loop(spring(tmp_path), name("mine"), patience=0.2):
         raise ZeroDivisionError("mine")

@@ -73,12 +73,26 @@ pub fn describe_simulated(
 /// # Errors
 /// [`RobotError`].
 pub fn read(path: &Path, floats: bool) -> Result<RobotDescription, RobotError> {
-    let is_mjcf = path.extension().is_some_and(|ending| ending == "xml" || ending == "mjcf");
-    match (is_mjcf, floats) {
+    match (is_mjcf(path), floats) {
         (true, _) => read_mjcf(path),
         (false, true) => Ok(Model::from_urdf_free_flyer(path)?.description().clone()),
         (false, false) => Ok(Model::from_urdf(path)?.description().clone()),
     }
+}
+
+/// Contacts and sensors of an MJCF file, a sentence each: they are the simulator's, and no controller knows them. None of a URDF.
+///
+/// # Errors
+/// As [`read`].
+pub fn simulated_alone(path: &Path) -> Result<Vec<String>, RobotError> {
+    if !is_mjcf(path) {
+        return Ok(Vec::new());
+    }
+    Ok(compile(&mjcf(path)?, false)?.simulated_alone())
+}
+
+fn is_mjcf(path: &Path) -> bool {
+    path.extension().is_some_and(|ending| ending == "xml" || ending == "mjcf")
 }
 
 /// Describes an MJCF file, with what it includes and its meshes.
@@ -86,12 +100,16 @@ pub fn read(path: &Path, floats: bool) -> Result<RobotDescription, RobotError> {
 /// # Errors
 /// [`RobotError`].
 pub fn read_mjcf(path: &Path) -> Result<RobotDescription, RobotError> {
+    describe(&mjcf(path)?, false)
+}
+
+fn mjcf(path: &Path) -> Result<Simulation, RobotError> {
     let unreadable = |reason: String| ModelError::Unreadable { path: path.to_path_buf(), reason };
     let text = nearl_runtime::constraints::read_text(path).map_err(|e| unreadable(e.to_string()))?;
     if text.trim().is_empty() {
         return Err(unreadable("the file is empty".to_string()).into());
     }
-    describe(&Simulation { format: ModelFormat::Mjcf, text, folder: Some(folder_of(path)) }, false)
+    Ok(Simulation { format: ModelFormat::Mjcf, text, folder: Some(folder_of(path)) })
 }
 
 /// Describes an MJCF text; files that it names are looked for in the current folder.

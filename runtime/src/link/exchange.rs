@@ -19,7 +19,7 @@ pub enum Turn<'a> {
 /// The plant announces itself this often [ns].
 const ANNOUNCE: u64 = 100_000_000;
 /// Polls between looks at the clock before a loop was ever seen [ns].
-const SLOW_POLL: u64 = 30_000;
+const STANDSTILL_POLL: u64 = 1_000_000;
 
 /// A plant's link with its watchdog.
 pub struct Exchange {
@@ -156,7 +156,12 @@ impl Exchange {
             if now >= until {
                 return false;
             }
-            if self.is_attached { std::thread::yield_now() } else { clock::sleep_until(now + SLOW_POLL) }
+            // While nobody has answered yet time stands still, and nothing comes too late.
+            if self.is_attached {
+                std::thread::yield_now()
+            } else {
+                clock::sleep_until(until.min(now + STANDSTILL_POLL))
+            }
         }
     }
 

@@ -108,6 +108,8 @@ pub struct PlantReport {
 
 /// Polls between looks at the clock while a runtime that is not attached yet is being waited for [ns].
 const SLOW_POLL: u64 = 30_000;
+/// The same in lockstep while nobody answers: time stands still, and nothing comes too late [ns].
+const STANDSTILL_POLL: u64 = 1_000_000;
 /// Longest braking of a plant that ends by itself [s], and the speed that counts as rest [rad/s or m/s].
 const LAST_BRAKE: f64 = 2.0;
 const STILL: f64 = 1e-2;
@@ -285,6 +287,8 @@ impl PlantRunner {
         let period = clock::nanoseconds(self.settings.dt);
         let watchdog = clock::nanoseconds(self.settings.watchdog);
         let mut resend = clock::now() + RESEND;
+        // In lockstep a runtime that was killed takes no leave.
+        let mut is_silent = false;
         loop {
             let header = self.state.header;
             match self.link.newest_action() {
@@ -312,18 +316,24 @@ impl PlantRunner {
                     self.link.announce();
                     self.link.send_state(&mut self.state);
                     resend = now + RESEND;
+                    is_silent = true;
                 }
                 _ => {}
             }
-            if self.is_attached {
+            if self.is_attached && !is_silent {
                 std::thread::yield_now();
                 continue;
             }
             self.link.attend();
-            let is_alone = !is_waiting && self.settings.pace == Pace::RealTime;
             self.report.looks += u64::from(!is_waiting);
-            let pause = if is_alone { (until.saturating_sub(due) / LOOKS).max(SLOW_POLL) } else { SLOW_POLL };
-            clock::sleep_until((now + pause).min(until.max(now + SLOW_POLL)));
+            let pause = match (is_waiting && !is_silent, self.settings.pace) {
+                (true, _) => SLOW_POLL,
+                (false, Pace::Lockstep) => STANDSTILL_POLL,
+                (false, Pace::RealTime) => (until.saturating_sub(due) / LOOKS).max(SLOW_POLL),
+            };
+            let latest =
+                if self.settings.pace == Pace::RealTime { until.max(now + SLOW_POLL) } else { u64::MAX };
+            clock::sleep_until((now + pause).min(latest));
         }
     }
 }

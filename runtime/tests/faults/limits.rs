@@ -421,6 +421,17 @@ fn a_plant_alone_looks_for_a_runtime_a_few_times_a_tick() {
     assert!(report.looks <= 4 * report.ticks, "{report:?}");
 }
 
+/// In lockstep time stands still without a runtime: a look every millisecond is enough, and the first runtime is served all the same.
+#[test]
+fn a_plant_whose_time_stands_still_looks_for_a_runtime_now_and_then() {
+    let name = Name::new("standstill");
+    let link = PlantLink::open(&name.0, &toy::robot(true)).unwrap();
+    let settings = PlantSettings { loop_patience: Some(0.5), ..PlantSettings::lockstep(toy::DT) };
+    let report = PlantRunner::new(link, settings).unwrap().run(&mut toy::PointMass::default(), &Stop::new());
+    assert!(report.loop_gone && report.ticks == 0, "{report:?}");
+    assert!((50..=510).contains(&report.looks), "{report:?}");
+}
+
 /// A log is a record: what is there stays, whatever is started again with the same name.
 #[test]
 fn fault_44_a_log_that_is_there_is_never_written_over() {

@@ -158,6 +158,28 @@ impl Pair {
     }
 }
 
+/// What a controller never hears of is named: contacts and sensors of an MJCF file, where there are any.
+#[test]
+fn what_is_the_simulator_s_alone_is_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    let told = |touch: &str, sensors: &str| {
+        let text = format!(
+            "<mujoco><worldbody><body><joint name=\"j\"/><geom size=\".1\" mass=\"1\" {touch}/><site name=\"s\"/></body></worldbody>\
+             <sensor>{sensors}</sensor></mujoco>"
+        );
+        let file = folder.path().join("r.xml");
+        std::fs::write(&file, text).expect("robot");
+        robot::simulated_alone(&file).expect("a robot").join("; ")
+    };
+    let off = "contype=\"0\" conaffinity=\"0\"";
+    assert_eq!(told(off, ""), "");
+    assert!(told("", "").contains("contacts are the simulator's alone: 1 geoms"), "{}", told("", ""));
+    let sensors = "<gyro name=\"imu\" site=\"s\"/><touch site=\"s\"/>";
+    assert!(told(off, sensors).ends_with("from the state: 'imu', number 1"), "{}", told(off, sensors));
+    let urdf = root().join("examples/robots/panda/panda.urdf");
+    assert_eq!(robot::simulated_alone(&urdf), Ok(Vec::new()));
+}
+
 #[test]
 fn gymnasium_s_robots_are_mujoco_s() {
     let packages = PathBuf::from(std::env::var("NEARL_SITE_PACKAGES").expect("set in .cargo/config.toml"));

@@ -22,10 +22,11 @@ pub(super) struct PlantCommand {
     /// Name of the robot; the runtime says the same with `--plant`.
     #[arg(long)]
     name: String,
-    /// Stop by itself after this time in [s].
+    /// Stop by itself after this time of the robot's own clock in [s], counted in control periods. With --lockstep that clock stands still while no
+    /// runtime answers: without one the plant waits for ever, unless --loop-patience says how long.
     #[arg(long, value_parser = nearl_runtime::cli::seconds)]
     seconds: Option<f64>,
-    /// Wait for the action of every state instead of keeping real time.
+    /// Wait for the action of every state instead of keeping real time; --loop-patience ends a wait that is too long.
     #[arg(long)]
     lockstep: bool,
     /// SCHED_FIFO priority, 1 to 99, if the system allows it; best that of the runtime.

@@ -45,7 +45,8 @@ impl RobotCommand {
         ));
         joints(&description, &model);
         motors(&description);
-        description.notes.iter().for_each(|note| say(format!("note: {note}")));
+        let left = robot::simulated_alone(&self.file)?;
+        description.notes.iter().chain(&left).for_each(|note| say(format!("note: {note}")));
         Ok(())
     }
 }

@@ -52,6 +52,17 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
     }
     let said_by = files[files.len() - 1].0.clone();
     if !table.contains_key("policy") {
+        if !setting.recipes.is_empty() {
+            let given: Vec<String> =
+                setting.recipes.iter().map(|file| format!("'{}'", file.display())).collect();
+            return Err(ImportError::Recipe(format!(
+                "{} has no [policy], which says what the {} entries of the policy's input '{}' are and what its outputs mean; write one \
+                 (docs/POLICIES.md), or give the file as task= to nearl.import_torch or nearl.import_sb3 if it is the task that the policy learned",
+                given.join(" with "),
+                network.n_in(),
+                network.input_name
+            )));
+        }
         return Err(ImportError::NoRecipe { input: network.input_name.clone(), n_in: network.n_in() });
     }
     let simulation = simulation(setting.robot)?;

@@ -205,6 +205,30 @@ impl Model {
         beyond
     }
 
+    /// What is the simulator's alone in every robot that has it, so that no note of the description speaks of it: contacts and sensors.
+    pub(crate) fn simulated_alone(&self) -> Vec<String> {
+        let m = &self.0;
+        let touches = |id: usize| m.geom_contype()[id] != 0 || m.geom_conaffinity()[id] != 0;
+        let touching = (0..m.geom_contype().len()).filter(|id| touches(*id)).count();
+        let name = |id: usize| {
+            self.name(MjtObjBase::mjOBJ_SENSOR, id).map_or(format!("number {id}"), |name| format!("'{name}'"))
+        };
+        let sensors: Vec<String> = (0..m.nsensor() as usize).map(name).collect();
+        let mut left = Vec::new();
+        if touching > 0 && !self.disables(mjtDisableBit::mjDSBL_CONTACT) {
+            left.push(format!(
+                "contacts are the simulator's alone: {touching} geoms may touch something, and the model that limits are kept by knows no contact force"
+            ));
+        }
+        if !sensors.is_empty() {
+            left.push(format!(
+                "sensors are not read, observations are computed from the state: {}",
+                sensors.join(", ")
+            ));
+        }
+        left
+    }
+
     /// What the file says and the description does not.
     fn notes(&self) -> Vec<String> {
         let (m, mut notes) = (&self.0, Vec::new());
