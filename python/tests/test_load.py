@@ -78,13 +78,15 @@ def flight(tmp_path, name: str, ordered: bool) -> tuple[np.ndarray, np.ndarray]:
         while len(carried) < 600:
             assert tick < 10_000, "the order was not answered"
             q, v = arm.data.qpos.copy(), arm.data.qvel.copy()
+            # An answer that comes while the action is under way is of the next one.
+            carries = tick >= 200 and (bool(answer) or not ordered)
             turn, action = plant.exchange(q, v, [*q, *v], patience=5.0, time=tick * DT)
             if turn != "act" or action is None:
                 assert tick == 0, turn
                 continue
             if tick == 200 and ordered:
                 operator.start()
-            if tick >= 200 and (answer or not ordered):
+            if carries:
                 arm.model = arm.with_load
             arm.step(action)
             tick += 1
