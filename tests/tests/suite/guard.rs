@@ -6,7 +6,7 @@ use nearl_runtime::net::{Dense, Forward};
 use nearl_runtime::{Controller, PolicyKind, Snapshot, doctor};
 use nearl_tests::training;
 use nearl_trainer::env::{Env, Meter};
-use nearl_trainer::foresight::{Foresight, Verdict};
+use nearl_trainer::foresight::{Bound, Foresight, Search, Verdict};
 use nearl_trainer::mj;
 use nearl_trainer::plant::{TOLERANCE, watched_limits};
 use nearl_trainer::rollout::{make_env, stream};
@@ -487,6 +487,28 @@ fn outside(task: &str, ticks: u64) -> [u64; 3] {
     };
     let ([without, _], [with, said]) = (count(false), count(true));
     [without, with, said]
+}
+
+/// A state that is no number was inside, and an action that the physics gives up at was left as it is.
+#[test]
+fn what_the_physics_cannot_say_is_not_inside() {
+    let new = || Search::new(vec![Bound::velocity(0.3)], &[(-1.0, 1.0)], 0);
+    let spoilt = |action: &[f64], values: &mut [f64]| {
+        values[0] = if action[0] > 0.5 { f64::NAN } else { action[0] };
+        true
+    };
+    let given_up = |action: &[f64], values: &mut [f64]| {
+        values[0] = if action[0] > 0.5 { 0.0 } else { action[0] };
+        action[0] <= 0.5
+    };
+    for (k, foresee) in [&spoilt as &dyn Fn(&[f64], &mut [f64]) -> bool, &given_up].into_iter().enumerate() {
+        let mut action = [0.9];
+        assert_eq!(new().update(&mut |a, x| foresee(a, x), &mut action), Verdict::Replaced, "{k}");
+        assert!(action[0].abs() <= 0.3, "{k}: {action:?}");
+    }
+    let mut action = [0.9];
+    assert_eq!(new().update(&mut |_, _| false, &mut action), Verdict::Outside);
+    assert_eq!(action, [0.9], "nothing better was found");
 }
 
 #[test]

@@ -112,12 +112,10 @@ impl Search {
         self.bounds.len()
     }
 
-    /// Replaces `action` (n_act) where its step would end outside. The last step foreseen is that of the result.
+    /// Replaces `action` (n_act) where its step would end outside, or where the physics cannot be believed. The last step foreseen is that of the result.
     pub fn update(&mut self, foresee: &mut Foresee, action: &mut [f64]) -> Verdict {
-        if !foresee(action, &mut self.at) {
-            return Verdict::Kept; // what the physics cannot do is the simulator's to report
-        }
-        let first = self.excess(&self.at);
+        // Where the physics cannot be believed nothing says that it ends inside.
+        let first = if foresee(action, &mut self.at) { self.excess(&self.at) } else { f64::INFINITY };
         if first <= 0.0 {
             return Verdict::Kept;
         }
@@ -125,7 +123,7 @@ impl Search {
             *asked = ((a - middle) / half).clamp(-1.0, 1.0);
         }
         self.best.copy_from_slice(&self.asked);
-        let mut least = self.by_slopes(foresee, first);
+        let mut least = if first.is_finite() { self.by_slopes(foresee, first) } else { first };
         if least > 0.0 {
             least = self.by_draws(foresee, least);
         }
@@ -217,11 +215,15 @@ impl Search {
         }
     }
 
-    /// How far `values` (bounds) are outside, in shares of the bounds' sizes; 0 inside.
+    /// How far `values` (bounds) are outside, in shares of the bounds' sizes; 0 inside, infinite where one is no number.
     pub fn excess(&self, values: &[f64]) -> f64 {
         let beyond = |(x, bound): (&f64, &Bound)| {
             let by = (bound.lower - x).max(x - bound.upper);
-            if by > ROUNDING { by / bound.size } else { 0.0 }
+            match x.is_nan() {
+                true => f64::INFINITY,
+                false if by > ROUNDING => by / bound.size,
+                false => 0.0,
+            }
         };
         values.iter().zip(&self.bounds).map(beyond).sum()
     }
