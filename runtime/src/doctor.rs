@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use clap::Args;
 use nearl_constraints::description::{Command, Motor, mimics};
-use nearl_constraints::{Drive, Guard, MADE_UP_FOR, REGISTRY, certify_braking};
+use nearl_constraints::{Drive, Guard, MADE_UP_FOR, REGISTRY, certify_braking, end_of_range};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
@@ -239,6 +239,7 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     }
     if moves_by_model(m) {
         notes.extend(cut_targets(m, parts, &drives));
+        notes.extend(held_targets(m, parts, &drives));
     }
     notes.extend(undriven(m, parts));
     notes.extend(beyond_motors(m, parts, &drives));
@@ -282,6 +283,33 @@ fn unguarded(m: &Manifest) -> Option<String> {
         "the limits on states under [constraints] hold for nothing: this policy gives actions, and guard is off; add guard = true to [constraints] to hold \
          them"
             .into()
+    })
+}
+
+/// Drives whose targets are held over several physics steps, of joints with a position limit and no margin.
+fn held_targets(
+    m: &Manifest,
+    Parts { model, layout, projector }: &Parts,
+    drives: &[Drive],
+) -> Option<String> {
+    let steps = m.task.sub_steps();
+    let has_no_margin = |i: usize| {
+        let limits = projector.limits();
+        let joint = model.joint_of_dof(i);
+        let beside = |limit: f64, end: f64| limit.is_finite() && end_of_range(limit, end) == end;
+        (joint.nq, joint.nv) == (1, 1)
+            && (beside(limits.q_upper[i], model.upper_position_limit()[joint.idx_q])
+                || beside(limits.q_lower[i], model.lower_position_limit()[joint.idx_q]))
+    };
+    let is_held = |i: &&usize| matches!(drives[**i], Drive::Pd { .. }) && has_no_margin(**i);
+    let held: Vec<String> =
+        layout.controllable().iter().filter(is_held).map(|&i| format!("'{}'", model.dof_name(i))).collect();
+    (steps > 1 && !held.is_empty()).then(|| {
+        format!(
+            "the drives of {} hold their targets over {steps} physics steps, where the motion is foreseen to second order in the period alone: joints may come \
+             beyond their ranges, be thrown by their stops and leave their limits; give position a margin, or set time.dt to time.sim_dt",
+            held.join(", ")
+        )
     })
 }
 

@@ -103,3 +103,32 @@ fn forces_that_are_no_numbers_stay() {
         assert!(tau[0] == 1.0 && tau[1].is_nan() && tau[2] == 2.0, "{tau:?}");
     }
 }
+
+/// A PD drive whose target is held for five steps left 10 rad/s² by 23 at its stop, and nobody was told.
+#[test]
+fn targets_held_over_several_steps_are_told() {
+    let folder = tempfile::tempdir().expect("folder");
+    std::fs::write(folder.path().join("arm.urdf"), arm([0.0; 3], 0.5)).expect("robot");
+    let text = |dt: f64, margin: f64, interface: &str| {
+        format!(
+            "name = \"arm\"\n[model]\nurdf = \"arm.urdf\"\n[time]\ndt = {dt}\nsim_dt = 0.002\n[state]\nobservation = [\"q.a\", \"v.a\"]\n\
+             [command]\n{interface}\n[constraints]\nposition = {{ margin = {margin} }}\nvelocity = {{ limit = 2.0 }}\n\
+             acceleration = {{ limit = 10.0 }}\ntorque = {{}}\nguard = true\n[idm]\nkind = \"pinocchio\"\n"
+        )
+    };
+    let (pd, force) = ("interface = \"pd\"\nstiffness = 200.0\ndamping = 10.0", "interface = \"effort\"");
+    let file = folder.path().join("arm.toml");
+    for (dt, margin, interface, is_told) in
+        [(0.01, 0.0, pd, true), (0.01, 0.002, pd, false), (0.002, 0.0, pd, false), (0.01, 0.0, force, false)]
+    {
+        std::fs::write(&file, text(dt, margin, interface)).expect("task");
+        let mut manifest = nearl_trainer::tasks::load(&file.display().to_string(), &[]).expect("a task");
+        nearl_trainer::blank::complete(&mut manifest).expect("complete");
+        let told = nearl_runtime::doctor::told(&manifest).expect("a task").join("; ");
+        assert_eq!(
+            told.contains("hold their targets over 5 physics steps"),
+            is_told,
+            "{dt} {margin}: {told}"
+        );
+    }
+}
