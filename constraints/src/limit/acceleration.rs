@@ -61,16 +61,6 @@ pub struct AccelerationLimit {
     share: f64,
 }
 
-/// Share of the acceleration limit that braking counts on at most where a period of `dt` \[s\] is `sub_steps` physics steps: all of it with one, else
-/// `1 - clamp(4 dt, 0.02, 0.2)`. The longer a period, the further from that of a constant acceleration is the motion within it.
-pub fn braking_share(dt: f64, sub_steps: usize) -> f64 {
-    let [least, per_second, most] = BRAKING_RESERVE;
-    if sub_steps == 1 { 1.0 } else { 1.0 - (per_second * dt).clamp(least, most) }
-}
-
-/// The share that is kept back: least, per second of the period, most.
-const BRAKING_RESERVE: [f64; 3] = [0.02, 4.0, 0.2];
-
 impl AccelerationLimit {
     /// From the task file's settings.
     pub fn new(settings: AccelerationSettings) -> AccelerationLimit {
@@ -78,10 +68,11 @@ impl AccelerationLimit {
     }
 
     /// The same for periods of `dt` \[s\] of `sub_steps` physics steps. With several or none the motion within a period is not that of a constant
-    /// acceleration: a joint comes a little further than foreseen, and brakes harder than it counted on until that is made up for. It counts on a
-    /// share of the limit then ([`braking_share`]).
+    /// acceleration, the less so the longer it is: a joint comes a little further than foreseen, and brakes harder than it counted on until that
+    /// is made up for. It counts on `1 - clamp(4 dt, 0.02, 0.2)` of the limit then.
     pub fn over_steps(settings: AccelerationSettings, dt: f64, sub_steps: usize) -> AccelerationLimit {
-        AccelerationLimit { settings, share: braking_share(dt, sub_steps) }
+        let share = if sub_steps == 1 { 1.0 } else { 1.0 - (4.0 * dt).clamp(0.02, 0.2) };
+        AccelerationLimit { settings, share }
     }
 
     /// The same limit [rad/s² or m/s²] for every joint.

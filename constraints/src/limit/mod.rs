@@ -28,7 +28,7 @@ mod velocity;
 mod velocity_profile;
 
 pub use about::{About, Argument, Form, Takes};
-pub use acceleration::{AccelerationLimit, AccelerationSettings, braking_share};
+pub use acceleration::{AccelerationLimit, AccelerationSettings};
 pub use action::{ActionLimit, ActionReport, ActionSettings};
 pub use collision::{CollisionLimit, CollisionSettings, SolidSettings};
 pub use drive::DriveTorqueLimit;

@@ -70,7 +70,7 @@ fn bodies_without_a_brake_are_noted() {
     assert!(!notes(Braking::Auto).contains("bodies"), "{}", notes(Braking::Auto));
 }
 
-/// Six kinds of limits were taken for joints that are not controllable, and held nothing there.
+/// Limits were taken for joints that are not controllable, and held nothing there.
 #[test]
 fn a_limit_names_the_joints_that_it_cannot_hold() {
     let (model, seventh) = (panda(), "panda_joint7".to_string());

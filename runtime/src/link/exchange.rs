@@ -2,6 +2,7 @@
 //!
 //! [`PlantRunner`](super::PlantRunner) drives a simulator on a time grid. A real robot often keeps the time, and its driver has a loop of its own.
 
+use super::runner::STANDSTILL_POLL;
 use super::{ActionMessage, LinkError, Message, PlantLink, Robot, RobotName, StateMessage};
 use crate::clock;
 
@@ -18,8 +19,6 @@ pub enum Turn<'a> {
 
 /// The plant announces itself this often [ns].
 const ANNOUNCE: u64 = 100_000_000;
-/// Polls between looks at the clock before a loop was ever seen [ns].
-const STANDSTILL_POLL: u64 = 1_000_000;
 
 /// A plant's link with its watchdog.
 pub struct Exchange {

@@ -109,7 +109,7 @@ pub struct PlantReport {
 /// Polls between looks at the clock while a runtime that is not attached yet is being waited for [ns].
 const SLOW_POLL: u64 = 30_000;
 /// The same in lockstep while nobody answers: time stands still, and nothing comes too late [ns].
-const STANDSTILL_POLL: u64 = 1_000_000;
+pub(super) const STANDSTILL_POLL: u64 = 1_000_000;
 /// Longest braking of a plant that ends by itself [s], and the speed that counts as rest [rad/s or m/s].
 const LAST_BRAKE: f64 = 2.0;
 const STILL: f64 = 1e-2;

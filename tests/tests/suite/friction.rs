@@ -336,23 +336,35 @@ fn what_friction_may_do_is_said_by_joint_and_number() {
     );
 }
 
+/// An arm of one joint that rubs [N·m], with a motor of so much effort [N·m].
+fn elbow(friction: &str, effort: u32) -> String {
+    format!(
+        r#"<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0.1"/><mass value="1"/>
+        <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/></inertial></link><joint name="elbow" type="revolute"><parent link="base"/>
+        <child link="arm"/><axis xyz="0 1 0"/><dynamics friction="{friction}"/><limit lower="-1" upper="1" effort="{effort}" velocity="3"/></joint></robot>"#
+    )
+}
+
+/// The manifest of a task, before any training; `text` is written into `file`.
+pub(super) fn manifest(file: &std::path::Path, text: &str) -> nearl_runtime::Manifest {
+    std::fs::write(file, text).expect("task");
+    let mut manifest = nearl_trainer::tasks::load(&file.display().to_string(), &[]).expect("a task");
+    nearl_trainer::blank::complete(&mut manifest).expect("complete");
+    manifest
+}
+
 /// Of a policy of actions, limits of the motion count on friction and brakes where the robot's model guards them. A guard of drives promises none, and the
 /// simulator's asks neither.
 #[test]
 fn friction_and_brakes_are_told_where_a_limit_counts_on_them() {
     let folder = tempfile::tempdir().expect("folder");
-    let urdf = r#"<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0.1"/><mass value="1"/>
-        <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/></inertial></link><joint name="elbow" type="revolute"><parent link="base"/>
-        <child link="arm"/><axis xyz="0 1 0"/><dynamics friction="0.4"/><limit lower="-1" upper="1" effort="2" velocity="3"/></joint></robot>"#;
-    std::fs::write(folder.path().join("arm.urdf"), urdf).expect("robot");
+    std::fs::write(folder.path().join("arm.urdf"), elbow("0.4", 2)).expect("robot");
     let text = "name = \"arm\"\n[model]\nurdf = \"arm.urdf\"\n[time]\ndt = 0.002\nsim_dt = 0.0\n[state]\nobservation = [\"q.elbow\", \"v.elbow\"]\n\
         [command]\ninterface = \"pd\"\nstiffness = 100.0\ndamping = 10.0\n[constraints]\nposition = {}\nvelocity = {}\nacceleration = { limit = 80.0 }\n\
         torque = {}\nbraking = \"certified\"\nguard = GUARD\n[idm]\nkind = \"pinocchio\"\n";
     let file = folder.path().join("arm.toml");
     for (guard, tells) in [("true", true), ("\"drive\"", false), ("\"simulator\"", false)] {
-        std::fs::write(&file, text.replace("GUARD", guard)).expect("task");
-        let mut manifest = nearl_trainer::tasks::load(&file.display().to_string(), &[]).expect("a task");
-        nearl_trainer::blank::complete(&mut manifest).expect("complete");
+        let mut manifest = manifest(&file, &text.replace("GUARD", guard));
         // Before a training nobody knows the policy; a snapshot of one of actions says it.
         let advice = nearl_runtime::doctor::advice(&manifest).expect("advice").join("; ");
         manifest.policy = nearl_runtime::PolicyKind::Direct;
@@ -368,11 +380,8 @@ fn friction_and_brakes_are_told_where_a_limit_counts_on_them() {
 #[test]
 fn a_task_says_which_of_its_joints_rub() {
     let folder = tempfile::tempdir().expect("folder");
-    let urdf = r#"<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0.1"/><mass value="1"/>
-        <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/></inertial></link><joint name="elbow" type="revolute"><parent link="base"/>
-        <child link="arm"/><axis xyz="0 1 0"/><dynamics friction="0.4"/><limit lower="-1" upper="1" effort="20" velocity="3"/></joint></robot>"#;
     let told = |interface: &str, friction: &str, actions: bool| {
-        std::fs::write(folder.path().join("arm.urdf"), urdf.replace("0.4", friction)).expect("robot");
+        std::fs::write(folder.path().join("arm.urdf"), elbow(friction, 20)).expect("robot");
         let text = format!(
             "name = \"arm\"\n[model]\nurdf = \"arm.urdf\"\n[time]\ndt = 0.002\nsim_dt = 0.0\n[state]\nobservation = [\"q.elbow\", \"v.elbow\"]\n\
              [command]\n{interface}\n[constraints]\nposition = {{}}\nvelocity = {{}}\nacceleration = {{ limit = 8.0 }}\ntorque = {{}}\n[idm]\n\

@@ -1,6 +1,6 @@
 //! Several physics steps in a period: commands lead through the simulator's steps to what is asked for.
 
-use super::friction::{arm, plant};
+use super::friction::{arm, manifest, plant};
 use nearl_constraints::drive::Held;
 use nearl_constraints::{LimitSet, Model, Period, PeriodDynamics, PhysicsSteps};
 use nearl_trainer::rollout::stream;
@@ -121,9 +121,7 @@ fn targets_held_over_several_steps_are_told() {
     for (dt, margin, interface, is_told) in
         [(0.01, 0.0, pd, true), (0.01, 0.002, pd, false), (0.002, 0.0, pd, false), (0.01, 0.0, force, false)]
     {
-        std::fs::write(&file, text(dt, margin, interface)).expect("task");
-        let mut manifest = nearl_trainer::tasks::load(&file.display().to_string(), &[]).expect("a task");
-        nearl_trainer::blank::complete(&mut manifest).expect("complete");
+        let manifest = manifest(&file, &text(dt, margin, interface));
         let told = nearl_runtime::doctor::told(&manifest).expect("a task").join("; ");
         assert_eq!(
             told.contains("hold their targets over 5 physics steps"),
