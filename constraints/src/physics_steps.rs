@@ -1,22 +1,22 @@
 //! The physics steps of a period, one after the other.
 
-use crate::drive::Held;
+use crate::drive::{Drive, Held};
 use crate::period_dynamics::solve;
 use crate::viability::{Dof, too_fast};
 use crate::{Dynamics, LimitSet, Model, Period, PeriodDynamics};
 
-/// What forces that are held for a period lead to where the plant makes several Euler steps of it, and which forces lead where.
+/// What commands that are held for a period lead to where the plant makes several Euler steps of it, and which commands lead where.
 ///
 /// [`PeriodDynamics`] reckons with the forces of a constant acceleration, on average over the period. A held motor force makes none:
 /// weight, Coriolis forces and dampers change as the robot moves, and a strong damper passes that on to the velocity within a physics step.
-/// Here the steps are made as the plant makes them (`tau_s` is the length of one):
+/// The drive of a target pushes less the nearer it comes. Here the steps are made as the plant makes them (`tau_s` is the length of one):
 ///
 /// ```text
 ///     v <- v + tau_s a(q, v, tau),   q <- q (+) tau_s v
 /// ```
 ///
-/// [`PhysicsSteps::drive`] looks for the forces by Newton's method over the whole period (single shooting; Stoer and Bulirsch,
-/// *Numerical Analysis*, 7.3), whose slopes Broyden's rule keeps. One force decides velocity and position alike: the velocity is what is asked
+/// [`PhysicsSteps::drive`] looks for the commands by Newton's method over the whole period (single shooting; Stoer and Bulirsch,
+/// *Numerical Analysis*, 7.3), whose slopes Broyden's rule keeps. One command decides velocity and position alike: the velocity is what is asked
 /// for, unless a step would end beyond a position limit or the last one too fast to stop. Nothing allocates after [`PhysicsSteps::new`]. Units: rad
 /// or m, s, N·m or N.
 pub struct PhysicsSteps {
@@ -27,9 +27,14 @@ pub struct PhysicsSteps {
     period: Period,
     /// Configuration index of each dof that is a joint of its own.
     single: Vec<Option<usize>>,
-    /// Dofs whose motion follows from forces, and where among them those are whose force is looked for.
+    /// Dofs whose motion follows from forces, and where among them those are whose command is looked for: a force or the target of a drive.
     free: Vec<usize>,
     pushed: Vec<usize>,
+    /// By dof (nv).
+    drives: Vec<Drive>,
+    ranges: Vec<[f64; 2]>,
+    /// See [`reserve`].
+    reserve: f64,
     held: Vec<Held>,
     /// Where the steps have led, one after the other, from where they began ((sub_steps + 1) x nq, row-major), with the first and the last velocity (nv).
     path: Vec<f64>,
@@ -40,21 +45,22 @@ pub struct PhysicsSteps {
     slopes: Slopes,
     /// Accelerations that are asked for (nv).
     wanted: Vec<f64>,
-    /// Pushed dofs whose force has no more room.
+    /// Pushed dofs whose command has no more room.
     full: Vec<bool>,
-    /// What is missing of the velocity of each pushed dof, and by how much its force changes.
+    /// What is missing of the velocity of each pushed dof, and by how much its command changes.
     missing: Vec<f64>,
     before: Vec<f64>,
     change: Vec<f64>,
-    /// The force of each pushed dof, and the largest it may have.
-    force: Vec<f64>,
+    /// The command of each pushed dof, the largest force it may ask for, and the ends that this gives the command.
+    command: Vec<f64>,
     most: Vec<f64>,
+    ends: Vec<[f64; 2]>,
 }
 
-/// How the velocities at the end of a period grow with the forces that are held, and scratch for it.
+/// How the velocities at the end of a period grow with the commands that are held, and scratch for it.
 #[derive(Default)]
 struct Slopes {
-    /// Pushed x pushed, row-major: velocity for a change of force.
+    /// Pushed x pushed, row-major: velocity for a change of command.
     velocity: Vec<f64>,
     mass: Vec<f64>,
     inverse: Vec<f64>,
@@ -70,20 +76,31 @@ const MISSING: f64 = 1e-9;
 /// How far beyond its limit a step may end without more being asked for [rad or m], and how often more is asked for in a period.
 const BEYOND: f64 = 1e-12;
 const RETREATS: usize = 3;
-/// Rounds before the best forces found are taken; three are the rule, and some ten where joints rub.
+/// How much further than in this period the steps of the next ones may lead.
+const FURTHER: f64 = 1.5;
+/// By which share of it a drive may push beyond its largest force.
+const TOO_HARD: f64 = 1e-9;
+/// Rounds before the best commands found are taken; three are the rule, and some ten where joints rub.
 const ROUNDS: usize = 80;
-/// Choices of the forces that go to their ends, for each force.
+/// Choices of the commands that go to their ends, for each command.
 const CHOICES: usize = 4;
 /// How often slopes are measured, and how often a change by them is halved.
 const MEASURED: usize = 6;
 const HALVINGS: usize = 10;
-/// By which share of a force slopes are measured.
+/// By which share of a command slopes are measured.
 const NEAR: f64 = 1e-5;
 
 impl PhysicsSteps {
-    /// For motors on the dofs `driven` of `model`. The dofs `follow` have the accelerations that they are given, whatever it takes; all others
-    /// follow from the forces. `None` where a period has a single physics step or none: [`PeriodDynamics`] is exact for the former.
-    pub fn new(model: &Model, driven: &[usize], follow: &[usize], period: Period) -> Option<PhysicsSteps> {
+    /// For motors on the dofs `driven` of `model`, whose commands `drives` (nv) names; targets stay within `ranges` (nv). The dofs `follow` have
+    /// the accelerations that they are given, whatever it takes; all others follow from the forces. `None` where a period has a single physics step
+    /// or none: [`PeriodDynamics`] is exact for the former.
+    pub fn new(
+        model: &Model,
+        (drives, ranges): (&[Drive], &[[f64; 2]]),
+        driven: &[usize],
+        follow: &[usize],
+        period: Period,
+    ) -> Option<PhysicsSteps> {
         if period.sub_steps < 2 {
             return None;
         }
@@ -112,6 +129,9 @@ impl PhysicsSteps {
             single: single.collect(),
             free,
             pushed,
+            drives: drives.to_vec(),
+            ranges: ranges.to_vec(),
+            reserve: reserve(drives, &period),
             held: vec![Held::Force(0.0); nv],
             path: model.neutral().repeat(period.sub_steps as usize + 1),
             begun: zero(nv),
@@ -124,33 +144,58 @@ impl PhysicsSteps {
             missing: zero(m),
             before: zero(m),
             change: zero(m),
-            force: zero(m),
+            command: zero(m),
             most: zero(m),
+            ends: vec![[0.0; 2]; m],
         })
     }
 
-    /// The mean acceleration (nv) over a period that begins at `q` (nq), `v` (nv) with these motors `held` (nv) under the generalised forces
-    /// `external` (nv). NaN where the equations have no solution.
-    pub fn accelerate(&mut self, (q, v): (&[f64], &[f64]), external: &[f64], held: &[Held], a: &mut [f64]) {
-        self.held.copy_from_slice(held);
+    /// The mean acceleration (nv) over a period that begins at `q` (nq), `v` (nv) with these `commands` (nv; nothing is read where no motor is) under
+    /// the generalised forces `external` (nv). `most` (nv) are the largest forces. NaN where the equations have no solution.
+    pub fn accelerate(
+        &mut self,
+        (q, v): (&[f64], &[f64]),
+        external: &[f64],
+        (commands, most): (&[f64], &[f64]),
+        a: &mut [f64],
+    ) {
+        for (i, held) in self.held.iter_mut().enumerate() {
+            let at = self.single[i].map_or(0.0, |iq| q[iq]);
+            *held = self.drives[i].held(&self.period, at, v[i], commands[i]);
+        }
+        self.free.iter().for_each(|&i| self.held[i] = Held::Force(0.0));
+        for (k, &r) in self.pushed.iter().enumerate() {
+            let i = self.free[r];
+            (self.command[k], self.most[k]) = (commands[i], most[i]);
+        }
         self.walk(q, v, external);
         a.iter_mut().zip(self.v.iter().zip(v)).for_each(|(a, (end, v))| *a = (end - v) / self.period.dt);
     }
 
     /// Whether the steps that were made last took a joint beyond its position limit, further beyond it than it was, or to where it may not be able
-    /// to stop in front of it.
+    /// to stop in front of it, or asked a drive for more than its largest force on the way.
     pub fn went_beyond(&self, limits: &LimitSet) -> bool {
-        self.pushed.iter().any(|&r| self.beyond(self.free[r], limits).is_some())
+        self.pushed.iter().any(|&r| self.beyond(self.free[r], limits).is_some()) || self.asks_too_much()
+    }
+
+    /// Whether a drive was asked for more than its largest force in one of the steps.
+    fn asks_too_much(&self) -> bool {
+        (0..self.pushed.len()).any(|k| {
+            let Drive::Pd { stiffness, .. } = self.drives[self.free[self.pushed[k]]] else { return false };
+            let (at, [low, high]) = (self.command[k], self.ends[k]);
+            stiffness * (low - at).max(at - high) > TOO_HARD * self.most[k]
+        })
     }
 
     /// By how much less the joint of dof `i` would have had to accelerate [rad/s² or m/s²] where a step ended beyond its limit or further beyond it
     /// than it began, or the last one too fast to stop, and the sign of the way back.
     ///
     /// A constant acceleration moves the joint by `tau_s^2 j (j + 1) / 2` of itself in `j` steps. Where the steps led further than a constant acceleration
-    /// to the same velocity leads, by `T e`, each period of a brake may too. That takes `e v / A_b` more way, so that the set is
+    /// to the same velocity leads, by `T f`, each period of a brake may too, and by more as the robot moves. A joint that turns round within a period
+    /// is led further than where it ends. So the joint ends in the set
     ///
     /// ```text
-    ///     (v + e)^2 <= 2 A_b d + e^2
+    ///     (v + e)^2 <= 2 A_b d,    e = 1.5 f + r A_b T
     /// ```
     fn beyond(&self, i: usize, limits: &LimitSet) -> Option<[f64; 2]> {
         let (iq, nq, p) = (self.single[i]?, self.nq(), &self.period);
@@ -171,8 +216,8 @@ impl PhysicsSteps {
         let q = self.path[self.path.len() - nq + iq];
         let further = (q - begun) / p.dt - self.begun[i] - p.kappa * (v - self.begun[i]);
         for (d, v, further, sign) in [(high - q, v, further, -1.0), (q - low, -v, -further, 1.0)] {
-            let e = further.max(0.0);
-            let less = too_fast(d + 0.5 * e * e / braking, v + e, braking, p);
+            let e = FURTHER * further.max(0.0) + self.reserve * braking * p.dt;
+            let less = too_fast(d, v + e, braking, p);
             if less > most[0] {
                 most = [less, sign];
             }
@@ -184,17 +229,17 @@ impl PhysicsSteps {
         self.path.len() / (self.period.sub_steps as usize + 1)
     }
 
-    /// Changes the motor forces `tau` (nv), which lead to the accelerations `a` (nv) about, into those that lead to them, within `limits`. `most` (nv)
-    /// are the largest forces. Forces that are no numbers stay, and so do those that nothing nearer was found for.
+    /// Changes the `commands` (nv), which lead to the accelerations `a` (nv) about, into those that lead to them, within `limits`. `most` (nv)
+    /// are the largest forces. Commands that are no numbers stay, and so do those that nothing nearer was found for.
     pub fn drive(
         &mut self,
         (q, v): (&[f64], &[f64]),
         external: &[f64],
         a: &[f64],
-        (tau, most): (&mut [f64], &[f64]),
+        (commands, most): (&mut [f64], &[f64]),
         limits: &LimitSet,
     ) {
-        if tau.iter().any(|tau| !tau.is_finite()) {
+        if commands.iter().any(|command| !command.is_finite()) {
             return;
         }
         self.full.fill(false);
@@ -203,16 +248,24 @@ impl PhysicsSteps {
         self.free.iter().for_each(|&i| self.held[i] = Held::Force(0.0));
         for (k, &r) in self.pushed.iter().enumerate() {
             let i = self.free[r];
-            (self.force[k], self.most[k]) = (tau[i].clamp(-most[i], most[i]), most[i]);
+            (self.command[k], self.most[k]) = (commands[i], most[i]);
+            self.ends[k] = [-most[i], most[i]];
         }
-        self.try_forces(q, v, external);
+        if self.pushed.iter().any(|&r| matches!(self.drives[self.free[r]], Drive::Pd { .. })) {
+            self.walk(q, v, external);
+        }
+        self.command
+            .iter_mut()
+            .zip(&self.ends)
+            .for_each(|(command, [low, high])| *command = command.clamp(*low, *high));
+        self.try_commands(q, v, external);
         let begun = self.missing.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
         if !amiss(&self.missing, &self.full).is_finite() {
             return;
         }
         let (mut has_slopes, mut retreats, mut failed, mut measured, mut halves) = (false, 0, 0, 0, false);
         for _ in 0..ROUNDS {
-            if self.left() <= MISSING {
+            if self.left() <= MISSING && !self.asks_too_much() {
                 if retreats == RETREATS || !self.retreat(limits) {
                     break;
                 }
@@ -229,22 +282,22 @@ impl PhysicsSteps {
                 self.choose_change();
             }
             self.before.copy_from_slice(&self.missing);
-            self.force.iter_mut().zip(&self.change).for_each(|(force, change)| *force += change);
-            self.try_forces(q, v, external);
+            self.command.iter_mut().zip(&self.change).for_each(|(command, change)| *command += change);
+            self.try_commands(q, v, external);
             // At its end, but not because more was needed.
-            for (full, (force, missing)) in self.full.iter_mut().zip(self.force.iter().zip(&self.missing)) {
-                *full &= force * missing >= 0.0;
+            for (k, full) in self.full.iter_mut().enumerate() {
+                *full &= side(self.command[k], self.ends[k]) * self.missing[k] >= 0.0;
             }
             let (was, is) = (amiss(&self.before, &self.full), amiss(&self.missing, &self.full));
             if is < was || !halves {
                 self.turn_slopes();
             }
-            if is < was {
+            if is < was || is.sqrt() <= MISSING * self.period.dt {
                 (failed, halves) = (0, false);
                 continue;
             }
             // No nearer: from where it was, once by what this has shown of the slopes, then a part of the way that measured ones show.
-            self.force.iter_mut().zip(&self.change).for_each(|(force, change)| *force -= change);
+            self.command.iter_mut().zip(&self.change).for_each(|(command, change)| *command -= change);
             self.missing.copy_from_slice(&self.before);
             failed += 1;
             if failed > if halves { HALVINGS } else { 1 } {
@@ -255,20 +308,17 @@ impl PhysicsSteps {
                 (measured, failed, halves) = (measured + 1, 0, true);
             }
         }
-        // A force that has come to its end is missed by as much, whatever the others do.
+        // A command that has come to its end is missed by as much, whatever the others do.
         let is_near = |x: f64| x.abs() <= begun.max(MISSING * self.period.dt);
         if with_room(&self.missing, &self.full).all(is_near) || retreats > 0 {
             for (k, &r) in self.pushed.iter().enumerate() {
-                tau[self.free[r]] = self.force[k];
+                commands[self.free[r]] = self.command[k];
             }
         }
     }
 
-    /// Makes the steps with the forces, and writes what is missing.
-    fn try_forces(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
-        for (k, &r) in self.pushed.iter().enumerate() {
-            self.held[self.free[r]] = Held::Force(self.force[k]);
-        }
+    /// Makes the steps with the commands, and writes what is missing.
+    fn try_commands(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
         self.walk(q, v, external);
         self.miss(v);
     }
@@ -288,15 +338,16 @@ impl PhysicsSteps {
         asks
     }
 
-    /// Makes the steps with what is held.
+    /// Makes the steps with the commands and what is held beside them.
     fn walk(&mut self, q: &[f64], v: &[f64], external: &[f64]) {
         let (tau, nq) = (self.period.tau, self.nq());
         self.path[..nq].copy_from_slice(q);
         self.v.copy_from_slice(v);
         self.begun.copy_from_slice(v);
-        let are_forces = self.held.iter().all(|held| matches!(held, Held::Force(_)));
-        for k in 0..self.period.sub_steps as usize {
-            let (from, to) = self.path[k * nq..(k + 2) * nq].split_at_mut(nq);
+        let are_forces = self.free.len() == v.len();
+        for j in 0..self.period.sub_steps as usize {
+            self.push(j);
+            let (from, to) = self.path[j * nq..(j + 2) * nq].split_at_mut(nq);
             if let (Some(quick), true) = (&mut self.quick, are_forces) {
                 quick.passive(from, &self.v, &mut self.moved);
                 for (i, force) in self.moved.iter_mut().enumerate() {
@@ -322,6 +373,33 @@ impl PhysicsSteps {
         }
     }
 
+    /// The forces of the commands in physics step `j`. The ends of a target are such that its drive can push as hard in all steps so far, where
+    /// there are such targets.
+    fn push(&mut self, j: usize) {
+        let nq = self.nq();
+        for (k, &r) in self.pushed.iter().enumerate() {
+            let i = self.free[r];
+            let (command, most) = (self.command[k], self.most[k]);
+            let force = match (self.drives[i], self.single[i]) {
+                (Drive::Pd { stiffness, damping }, Some(iq)) => {
+                    let (q, damper) = (self.path[j * nq + iq], damping * self.v[i]);
+                    let [low, high] = [-most, most].map(|most| q + (most + damper) / stiffness);
+                    let [least, largest] = if j == 0 { self.ranges[i] } else { self.ends[k] };
+                    let both = [low.clamp(least, largest), high.clamp(least, largest)];
+                    if j == 0 || both[0] < both[1] {
+                        self.ends[k] = both;
+                    }
+                    stiffness * (command - q) - damper
+                }
+                _ => {
+                    self.ends[k] = [-most, most];
+                    command
+                }
+            };
+            self.held[i] = Held::Force(force);
+        }
+    }
+
     /// Writes what is missing of the velocities.
     fn miss(&mut self, v: &[f64]) {
         for (k, &r) in self.pushed.iter().enumerate() {
@@ -330,7 +408,7 @@ impl PhysicsSteps {
         }
     }
 
-    /// The largest of it where a force has room, as an acceleration.
+    /// The largest of it where a command has room, as an acceleration.
     fn left(&self) -> f64 {
         with_room(&self.missing, &self.full).fold(0.0, |most: f64, x| most.max(x.abs())) / self.period.dt
     }
@@ -352,10 +430,13 @@ impl PhysicsSteps {
         s.v.fill(0.0);
         for _ in 0..self.period.sub_steps {
             for (r, &i) in self.free.iter().enumerate() {
-                let (k, d) = (model.stiffness()[i], model.damping()[i]);
+                let (mut k, mut d, mut of_command) = (model.stiffness()[i], model.damping()[i], 1.0);
+                if let (Drive::Pd { stiffness, damping }, true) = (self.drives[i], self.pushed.contains(&r)) {
+                    (k, d, of_command) = (k + stiffness, d + damping, stiffness);
+                }
                 for c in 0..m {
-                    let of_force = if self.pushed[c] == r { 1.0 } else { 0.0 };
-                    s.push[r * m + c] = of_force - k * s.q[r * m + c] - d * s.v[r * m + c];
+                    let of_command = if self.pushed[c] == r { of_command } else { 0.0 };
+                    s.push[r * m + c] = of_command - k * s.q[r * m + c] - d * s.v[r * m + c];
                 }
             }
             for r in 0..n {
@@ -371,26 +452,26 @@ impl PhysicsSteps {
         }
     }
 
-    /// The slopes where the forces are, by differences to smaller or to `larger` forces: joints that rub have others while they stick.
+    /// The slopes where the commands are, by differences to smaller or to `larger` ones: joints that rub have others while they stick.
     fn measure_slopes(&mut self, q: &[f64], v: &[f64], external: &[f64], larger: bool) {
         let m = self.pushed.len();
         for c in 0..m {
-            let at = self.force[c];
+            let at = self.command[c];
             let by = (1.0 + at.abs()) * if (at > 0.0) == larger { NEAR } else { -NEAR };
-            self.force[c] = at + by;
-            self.try_forces(q, v, external);
+            self.command[c] = at + by;
+            self.try_commands(q, v, external);
             for r in 0..m {
                 let slope = (self.before[r] - self.missing[r]) / by;
                 if slope.is_finite() {
                     self.slopes.velocity[r * m + c] = slope;
                 }
             }
-            self.force[c] = at;
+            self.command[c] = at;
         }
         self.missing.copy_from_slice(&self.before);
     }
 
-    /// Broyden's rule: afterwards what the last change of force did would have been foreseen.
+    /// Broyden's rule: afterwards what the last change of command did would have been foreseen.
     fn turn_slopes(&mut self) {
         let (m, s) = (self.pushed.len(), &mut self.slopes);
         let size: f64 = self.change.iter().map(|x| x * x).sum();
@@ -407,7 +488,7 @@ impl PhysicsSteps {
         }
     }
 
-    /// The change of force that makes up for what is missing. A force that would go beyond its end goes there, as long as more is missing of its
+    /// The change of command that makes up for what is missing. A command that would go beyond its end goes there, as long as more is missing of its
     /// velocity in that direction, and the others make up for what that does to them.
     fn choose_change(&mut self) {
         let (m, s) = (self.pushed.len(), &mut self.slopes);
@@ -427,10 +508,10 @@ impl PhysicsSteps {
             solve(m, 1, &mut s.push[..m * m], &mut s.row);
             let mut is_other = false;
             for k in 0..m {
-                let (to, most) = (self.force[k] + s.row[k], self.most[k]);
-                if !self.full[k] && to.abs() > most {
+                let (to, [low, high]) = (self.command[k] + s.row[k], self.ends[k]);
+                if !self.full[k] && (to > high || to < low) {
                     (self.full[k], is_other) = (true, true);
-                    s.row[k] = to.clamp(-most, most) - self.force[k];
+                    s.row[k] = to.clamp(low, high) - self.command[k];
                 }
                 self.change[k] = if s.row[k].is_finite() { s.row[k] } else { 0.0 };
             }
@@ -440,7 +521,7 @@ impl PhysicsSteps {
             let too_far = |k: &usize| {
                 let slopes = &s.velocity[k * m..(k + 1) * m];
                 let grows: f64 = slopes.iter().zip(&self.change).map(|(slope, change)| slope * change).sum();
-                (self.missing[*k] - grows) * (self.force[*k] + self.change[*k]) < 0.0
+                (self.missing[*k] - grows) * side(self.command[*k] + self.change[*k], self.ends[*k]) < 0.0
             };
             let Some(k) = (0..m).find(|k| self.full[*k] && too_far(k)) else { return };
             self.full[k] = false;
@@ -448,7 +529,19 @@ impl PhysicsSteps {
     }
 }
 
-/// What is missing of the dofs whose force has room.
+/// By how much further than in a period a brake may lead in the next ones, as a share of the velocity that a period of braking takes away. Forces
+/// change with the motion over a long period, and those of a drive that is held on its target over any.
+fn reserve(drives: &[Drive], period: &Period) -> f64 {
+    let has_targets = drives.iter().any(|drive| matches!(drive, Drive::Pd { .. }));
+    if has_targets { 0.5 } else { ((period.dt - 0.005) / 0.03).clamp(0.0, 0.5) }
+}
+
+/// Above 0 in the upper half between two ends, below in the lower one.
+fn side(command: f64, [low, high]: [f64; 2]) -> f64 {
+    command - 0.5 * (low + high)
+}
+
+/// What is missing of the dofs whose command has room.
 fn with_room<'a>(missing: &'a [f64], full: &'a [bool]) -> impl Iterator<Item = f64> + 'a {
     missing.iter().zip(full).map(|(missing, full)| if *full { 0.0 } else { *missing })
 }

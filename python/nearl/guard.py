@@ -126,7 +126,6 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
         sizes = [(upper, upper - lower) for lower, upper in positions.values()] + [(most, most) for most in velocities.values()]
         self._nowhere = np.array([upper + _NOWHERE * max(size, _NEAR) for upper, size in sizes])
         self._sizes = np.minimum([size for _, size in sizes], 1.0)
-        self._middle = 0.5 * (low + high).ravel()
         actions = list(zip(low.ravel().tolist(), high.ravel().tolist()))
         self._search = _core.ActionSearch(list(positions.values()), list(velocities.values()), actions, self._seed)
         self._ranges = ranges
@@ -171,8 +170,6 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
             self._last = None
             return given, "outside"  # no action leads back from there
         verdict, found = self._search.find(given.astype(float).ravel().tolist(), self._foresee)
-        if verdict == "outside":
-            verdict, found = self._again(found)
         found = found.reshape(given.shape)
         if verdict == "kept" or (verdict == "outside" and (self._keeps or np.array_equal(found, given))):
             return given, verdict
@@ -182,18 +179,6 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
         if self._keeps and not inside:
             return given, "outside"
         return safe, "replaced" if inside else "outside"
-
-    def _again(self, found: Floats) -> tuple[str, Floats]:
-        """Searches on from where a search has ended, twice, then from the middle of the range: from elsewhere the slopes are other ones."""
-        best, least = found, self._search.excess(self._foresee(found).tolist())
-        for start in (None, None, self._middle):
-            verdict, found = self._search.find((best if start is None else start).tolist(), self._foresee)
-            if verdict != "outside":
-                return "replaced", found
-            excess = self._search.excess(self._foresee(found).tolist())
-            if excess < least:
-                best, least = found, excess
-        return "outside", best
 
     def _checked(self, action: ArrayLike) -> NDArray[Any]:
         """The action as it came, of the space's shape and finite."""

@@ -131,6 +131,12 @@ fn section(entry: &RegisteredLimit, settings: &Bound<'_, PyDict>) -> PyResult<Va
         }
     }
     complete(&mut section)?;
+    if entry.name == "frame" && section.get("half_space").is_none() && section.get("box").is_none() {
+        let class = entry.about.class;
+        return Err(errors::value(format!(
+            "{class} states no place for the frame to be in; give normal and through for a plane, or lower and upper for a box, in m"
+        )));
+    }
     Ok(section)
 }
 

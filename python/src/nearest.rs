@@ -43,10 +43,13 @@ impl ActionSearch {
         let mut search = self.0.lock_py_attached(py).unwrap_or_else(PoisonError::into_inner);
         let (n, mut failed) = (search.n_bounds(), None);
         let mut step = |action: &[f64], values: &mut [f64]| {
+            if failed.is_some() {
+                return false; // the search goes on to its end, and the caller is not asked again
+            }
             let found = foresee.call1((array(py, action),)).and_then(|found| vector("foresee", &found, n));
             match found {
                 Ok(found) => values.copy_from_slice(&found),
-                Err(error) => failed = failed.take().or(Some(error)),
+                Err(error) => failed = Some(error),
             }
             failed.is_none()
         };

@@ -77,6 +77,46 @@ def test_hardly_an_action_that_ends_inside_is_missed():
     assert missed <= 3 and ended <= 25, (missed, ended)
 
 
+def test_the_guard_of_a_task_is_that_around_an_environment(tmp_path):
+    """From the same states, of the same actions, with no limit on accelerations; one start of the search found nothing in 42 of the ticks."""
+    robot = pathlib.Path(__file__).resolve().parents[2] / "examples" / "robots" / "gymnasium" / "ant.xml"
+    joints = [f"{name}_{leg}" for leg in (1, 2, 3, 4) for name in ("hip", "ankle")]
+    (tmp_path / "ant.toml").write_text(
+        f'name = "guarded-ant"\n[model]\nmjcf = "{robot}"\n[state]\ncontrollable = {joints}\n[idm]\nkind = "learned"\n[time]\ndt = 0.05\nsim_dt = 0\n'
+        '[constraints]\nguard = "simulator"\nconsistency = "free"\nposition = {}\nvelocity = { limit = 6.0 }\n[reward]\nalive = "1"\n'
+    )
+    env = gymnasium.make(nearl.register(tmp_path / "ant.toml")[0], constraints="task", actions="guarded")
+    around = nearl.Guard(gymnasium.make("Ant-v5", xml_file=str(robot)), {"position": {}, "velocity": {"limit": 6.0}})
+    around.reset(seed=1)
+    obs, _ = env.reset(seed=1)
+    rng, ended, other = np.random.default_rng(1), np.zeros(2, int), 0
+    for k in range(150):
+        if k % 10 == 0:
+            action = rng.choice([-1.0, 1.0], 8).astype(np.float32) * (rng.random() < 0.7)
+        around.unwrapped.set_state(obs[:15], obs[15:29])
+        *_, found = around.step(action)
+        obs, _, terminated, truncated, info = env.step(action)
+        ended += info["target_violations"], found["guard"] == "outside"
+        other += not np.allclose(found["action"], info["executed"], atol=1e-6)
+        if terminated or truncated:
+            obs, _ = env.reset()
+    assert other <= 3 and (ended <= 15).all(), (other, ended)
+
+
+def test_a_ctrl_that_fails_is_called_once():
+    calls = []
+
+    def fails(action):
+        calls.append(action)
+        raise RuntimeError("no controls today")
+
+    env = nearl.Guard(gymnasium.make("HalfCheetah-v5"), LIMITS, ctrl=fails)
+    env.reset(seed=0)
+    with pytest.raises(RuntimeError, match="no controls today"):
+        env.step(np.zeros(6, np.float32))
+    assert len(calls) == 1
+
+
 def test_what_is_allowed_changes_nothing():
     plain, guarded = gymnasium.make("HalfCheetah-v5"), nearl.Guard(gymnasium.make("HalfCheetah-v5"), LIMITS)
     plain.reset(seed=3)

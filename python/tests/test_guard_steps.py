@@ -1,5 +1,6 @@
 """Guarded actions on arms that nobody has seen, pushed onto their limits: every limit holds in the simulator at any number of physics steps."""
 
+import re
 from pathlib import Path
 
 import mujoco
@@ -33,7 +34,27 @@ def arm(rng: np.random.Generator, timestep: float, integrator: str) -> tuple[str
     return text, ranges
 
 
-def task(folder: Path, n: int, dt: float, sim_dt: float, margin: float = 0.0) -> Path:
+def with_drives(text: str, ranges: np.ndarray, rng: np.random.Generator, speeds: list[float]) -> tuple[str, str]:
+    """The arm with drives of targets in place of its motors, whose joints would swing at one of these `speeds` [rad/s] alone, and `[command]`."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data, n = mujoco.MjData(model), len(ranges)
+    w, share = rng.choice(speeds, n), rng.choice([0.1, 0.5, 1.0], n)
+    inertia = np.full(n, np.inf)
+    for _ in range(20):
+        data.qpos[:] = rng.uniform(ranges[:, 0], ranges[:, 1])
+        mujoco.mj_forward(model, data)
+        mass = np.zeros((n, n))
+        mujoco.mj_fullM(model, data, mass)
+        inertia = np.minimum(inertia, 1.0 / np.diag(np.linalg.inv(mass)))
+    stiffness, damping = (w * w * inertia).round(4), (2.0 * share * w * inertia).round(5)
+    for i in range(n):
+        drive = f'<position name="m{i}" joint="j{i}" kp="{stiffness[i]}" kv="{damping[i]}" ctrlrange="-30 30" forcerange="-300 300"/>'
+        text = re.sub(rf'<motor name="m{i}"[^>]*/>', drive, text)
+    gains = [", ".join(f"j{i} = {gain}" for i, gain in enumerate(gains)) for gains in (stiffness, damping)]
+    return text, f'interface = "pd"\nstiffness = {{ {gains[0]} }}\ndamping = {{ {gains[1]} }}'
+
+
+def task(folder: Path, n: int, dt: float, sim_dt: float, margin: float = 0.0, command: str = 'interface = "effort"') -> Path:
     """A task whose guard knows the arm."""
     joints = [f"j{i}" for i in range(n)]
     seen = [f"{letter}.{joint}" for letter in "qv" for joint in joints]
@@ -46,7 +67,7 @@ dt = {dt}
 sim_dt = {sim_dt}
 max_episode_steps = 100000
 [command]
-interface = "effort"
+{command}
 [state]
 controllable = {joints}
 observation = {seen}
@@ -95,7 +116,7 @@ def test_unknown_arms_stay_within_their_limits(tmp_path: Path, seed: int, integr
     assert touched > 10, "no joint came to the end of its range"
 
 
-def attack(folder: Path, text: str, steps: int, rng: np.random.Generator, accelerations: float | np.ndarray = ACCELERATION) -> None:
+def attack(folder: Path, text: str, steps: int, rng: np.random.Generator, accelerations: float | np.ndarray = ACCELERATION, far: float = 300.0) -> None:
     """Pushes onto the limits of the task in `folder`, and steps the simulator beside it, whose joints keep to their ranges, speeds and accelerations."""
     envs = nearl.make_vec(folder / "arm.toml", 1, constraints="task", actions="guarded")
     model = mujoco.MjModel.from_xml_string(text)
@@ -103,10 +124,11 @@ def attack(folder: Path, text: str, steps: int, rng: np.random.Generator, accele
     obs, _ = envs.reset(seed=0)
     data.qpos[:], data.qvel[:] = obs[0, :n], obs[0, n:]
     low, high = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.inf, np.inf]).T
-    push, touched = np.zeros(n), 0
+    # what a joint keeps of its range for a brake that leads further
+    push, touched, near = np.zeros(n), 0, 1e-3 + accelerations * dt * dt / 4
     for tick in range(800):
         if tick % 25 == 0:
-            push = rng.uniform(-300, 300, n)
+            push = rng.uniform(-far, far, n)
         _, _, _, _, info = envs.step(push[None])
         before = data.qvel.copy()
         data.ctrl[:] = info["executed"][0]
@@ -115,8 +137,20 @@ def attack(folder: Path, text: str, steps: int, rng: np.random.Generator, accele
             assert (data.qpos >= low).all() and (data.qpos <= high).all(), f"tick {tick}, within it: {data.qpos}"
         assert np.abs(data.qvel).max() <= SPEED * (1 + 1e-9), f"tick {tick}: {data.qvel}"
         assert (np.abs(data.qvel - before) / dt <= accelerations + 1e-7).all(), f"tick {tick}: {data.qvel - before}"
-        touched += int((np.minimum(data.qpos - low, high - data.qpos) < 1e-3).any())
+        touched += int((np.minimum(data.qpos - low, high - data.qpos) < near).any())
     assert touched > 10, "no joint came to the end of its range"
+
+
+@pytest.mark.parametrize("dt", [0.005, 0.01])
+@pytest.mark.parametrize("seed", [1, 3, 4, 6, 8])
+def test_drives_held_on_their_targets_stay_within_their_limits(tmp_path: Path, seed: int, dt: float) -> None:
+    rng = np.random.default_rng(seed)
+    steps = int(rng.choice([2, 5, 10]))
+    text, ranges = arm(rng, dt / steps, "Euler")
+    text, command = with_drives(text, ranges, rng, [10.0, 30.0, 80.0])
+    (tmp_path / "arm.xml").write_text(text)
+    task(tmp_path, len(ranges), dt, dt / steps, command=command)
+    attack(tmp_path, text, steps, rng, far=3.0)
 
 
 @pytest.mark.parametrize("seed", [2, 6, 7, 8, 12, 17])

@@ -821,3 +821,67 @@ def test_torch_modules_are_read(tmp_path) -> None:
         nearl.import_torch(tmp_path / "own.pt", **files)
     torch.onnx.export(script, (torch.zeros(1, 14),), tmp_path / "own.onnx", dynamo=False)
     nearl.import_onnx(tmp_path / "own.onnx", **files)
+
+
+def one_joint(tmp_path, actuator: str, recipe: str, hanging: str = "") -> nearl.Controller:
+    """A slide with what hangs on it, whose policy asks for nothing."""
+    (tmp_path / "slide.xml").write_text(
+        "<mujoco><compiler angle='radian'/><worldbody><body><joint name='slide' type='slide' axis='1 0 0' range='-1 1'/><geom size='.1' mass='1'/>"
+        f"{hanging}</body></worldbody><actuator>{actuator}</actuator></mujoco>"
+    )
+    (tmp_path / "slide.toml").write_text(
+        f"[time]\ndt = 0.002\nsim_dt = 0.002\n[policy]\njoints = ['slide']\nobservation = [{{ term = 'joint_pos' }}]\n{recipe}"
+    )
+    Net(1).add("Gemm", f32(np.zeros((1, 1))), f32(np.zeros(1))).save(tmp_path / "zero.onnx", 1)
+    return nearl.import_onnx(tmp_path / "zero.onnx", robot=tmp_path / "slide.xml", recipe=tmp_path / "slide.toml")
+
+
+GUARDED = "[constraints]\nguard = true\nposition = { margin = 0.02 }\nvelocity = { limit = 3.0 }\nacceleration = { limit = 5.0 }\ntorque = { scale = 1.0 }\n"
+
+
+@pytest.mark.parametrize(("kp", "kv", "told"), [(80.0, 4.0, False), (40.0, 4.0, True), (80.0, 2.0, True)])
+def test_gains_other_than_the_robot_files_are_told(tmp_path, kp, kv, told) -> None:
+    actuator = "<position joint='slide' kp='80' kv='4' ctrlrange='-9 9' forcerange='-30 30'/>"
+    drive = f"[command]\ninterface = 'pd'\nstiffness = {kp}\ndamping = {kv}\n"
+    text = f"'slide' has stiffness {kp:.0f} and damping {kv:.0f} by [command], 80 and 4 by the robot file"
+    for limits in ("[constraints]\n", GUARDED):
+        assert any(text in note for note in one_joint(tmp_path, actuator, drive + limits).notes) == told
+
+
+def test_a_range_that_cuts_targets_promises_no_velocity(tmp_path) -> None:
+    drive = "[command]\ninterface = 'pd'\nstiffness = 80.0\ndamping = 4.0\n"
+    actuator = "<position joint='slide' kp='80' kv='4' ctrlrange='-1 1' forcerange='-30 30'/>"
+    told = one_joint(tmp_path, actuator, drive + GUARDED).notes
+    assert any("limits on acceleration, velocity and position are not promised" in note for note in told), told
+
+
+def test_a_joint_that_swings_is_told_of(tmp_path) -> None:
+    pole = "<body><joint name='hinge' axis='0 1 0'/><geom size='.1' pos='0 0 -.5' mass='1'/></body>"
+    motor = "<motor joint='slide' ctrlrange='-30 30'/>"
+    swinging, alone = (one_joint(tmp_path, motor, GUARDED, hanging) for hanging in (pole, ""))
+    text = "they may push the others harder than their motors can hold, which then leave their limits on position, velocity and acceleration"
+    assert [any(text in note for note in c.notes) for c in (swinging, alone)] == [True, False]
+    for controller, rests in ((swinging, True), (alone, False)):
+        controller.save(tmp_path / "slide.safetensors")
+        said = subprocess.run([NEARL, "doctor", tmp_path / "slide.safetensors"], capture_output=True, text=True).stdout
+        assert "'slide' might need" in said
+        assert ("to brake while 'hinge', which nothing drives, stand still" in said) == rests, said
+
+
+@pytest.mark.parametrize("interface", ["effort", "position"])
+def test_a_recipe_without_limits_has_none(tmp_path, interface) -> None:
+    """It is the recipe with an empty [constraints], and import says that nothing holds."""
+    actuator = "<motor joint='slide' ctrlrange='-30 30'/>" if interface == "effort" else "<position joint='slide' kp='80' kv='4'/>"
+    command = f"[command]\ninterface = '{interface}'\n"
+    without, empty = (one_joint(tmp_path, actuator, command + limits) for limits in ("", "[constraints]\n"))
+    assert without.notes == empty.notes
+    assert any("no limit holds" in note for note in without.notes)
+
+
+@pytest.mark.parametrize(("guard", "times"), [("false", 1), ("true", 0)])
+def test_a_training_of_actions_says_once_that_limits_hold_for_nothing(tmp_path, guard, times) -> None:
+    command = [NEARL, "train", "Hopper-v5", "--algo", "ppo", "--steps", "2048", "--out", tmp_path / "run", "--set", f"constraints.guard={guard}"]
+    command += ["--set", "constraints.torque={ scale = 1.0 }", "--set", "constraints.consistency=kinematic"]
+    said = subprocess.run(command, capture_output=True, text=True)
+    assert said.returncode == 0, said.stderr
+    assert said.stderr.count("hold for nothing") == times, said.stderr

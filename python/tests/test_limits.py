@@ -95,6 +95,7 @@ def test_what_is_wrong_is_refused_by_name(panda) -> None:
         (lambda: nearl.Limit(panda, "energy", {"limt": 2.0}), TypeError, "EnergyLimit takes no 'limt'; it takes limit, margin, soft"),
         (lambda: nearl.Limit(panda, "energy", {}), TypeError, "EnergyLimit needs 'limit'"),
         (lambda: nearl.FrameLimit(panda, "panda_hand", 2.0, through=[0, 0, 1]), ValueError, "through needs normal"),
+        (lambda: nearl.FrameLimit(panda, "panda_hand", 2.0), ValueError, "FrameLimit states no place .* give normal and through .* or lower and upper"),
         (lambda: nearl.FrameLimit(panda, 3, 2.0, normal=[0, 0, 1]), TypeError, "expected a text; got int, as 'frame'"),
         (lambda: nearl.EnergyLimit(panda, float("nan")), ValueError, "energy limit is NaN"),
         (lambda: nearl.CollisionLimit(panda, [{"shape": "cone"}], 2.0), ValueError, "limit 'collision': .*cone"),

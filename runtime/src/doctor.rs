@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use clap::Args;
 use nearl_constraints::description::{Command, Motor, mimics};
-use nearl_constraints::{Drive, Guard, MADE_UP_FOR, REGISTRY, certify_braking, end_of_range};
+use nearl_constraints::{Drive, Dynamics, Guard, MADE_UP_FOR, REGISTRY, certify_braking};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
@@ -241,6 +241,7 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
         notes.extend(cut_targets(m, parts, &drives));
         notes.extend(held_targets(m, parts, &drives));
     }
+    notes.extend(other_gains(parts, &drives));
     notes.extend(undriven(m, parts));
     notes.extend(beyond_motors(m, parts, &drives));
     notes.extend(unguarded(m));
@@ -275,40 +276,54 @@ fn settled_mimics(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Vec<Stri
     begins
 }
 
-/// Limits that nothing is held to: those of states, of a policy that gives actions.
+/// Limits that nothing is held to: those of states, of a policy that gives actions; and a policy made elsewhere that has none.
 fn unguarded(m: &Manifest) -> Option<String> {
     let of = &m.task.constraints;
     let is_off = m.policy == PolicyKind::Direct && of.guard.is_off();
-    (is_off && REGISTRY.iter().any(|kind| !(kind.build)(of).is_empty())).then(|| {
+    let has_limits = REGISTRY.iter().any(|kind| !(kind.build)(of).is_empty());
+    if is_off && !has_limits && m.task.policy.is_some() && !m.limits_actions() {
+        return Some(
+            "no limit holds: [constraints] names none, and guard is off, so this policy's actions are sent as they are; add guard = true and the limits, \
+             torque = { scale = 1.0 } among them, to [constraints] of the recipe"
+                .into(),
+        );
+    }
+    (is_off && has_limits).then(|| {
         "the limits on states under [constraints] hold for nothing: this policy gives actions, and guard is off; add guard = true to [constraints] to hold \
          them"
             .into()
     })
 }
 
-/// Drives whose targets are held over several physics steps, of joints with a position limit and no margin.
-fn held_targets(
-    m: &Manifest,
-    Parts { model, layout, projector }: &Parts,
-    drives: &[Drive],
-) -> Option<String> {
-    let steps = m.task.sub_steps();
-    let has_no_margin = |i: usize| {
-        let limits = projector.limits();
-        let joint = model.joint_of_dof(i);
-        let beside = |limit: f64, end: f64| limit.is_finite() && end_of_range(limit, end) == end;
-        (joint.nq, joint.nv) == (1, 1)
-            && (beside(limits.q_upper[i], model.upper_position_limit()[joint.idx_q])
-                || beside(limits.q_lower[i], model.lower_position_limit()[joint.idx_q]))
+/// `T sqrt(K / I)` of a drive that is held on its target for `T` above which it has moved its joint a good part of the way there: where the physics steps
+/// are foreseen one by one, and where they are not known.
+const FAR: [f64; 2] = [1.0, 0.2];
+
+/// Drives that are held on a target for so long that they push otherwise at the end of a period than at its start.
+fn held_targets(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
+    let (steps, dt, nv) = (m.task.sub_steps(), m.task.time.dt, model.nv());
+    let mut mass = vec![0.0; nv * nv];
+    Dynamics::new(model).mass(&model.neutral(), &mut mass);
+    let is_long = |&i: &usize| match drives[i] {
+        Drive::Pd { stiffness, .. } => {
+            let inertia = mass[i * nv + i];
+            let far = dt * (stiffness / inertia).sqrt();
+            (steps != 1 && far > FAR[usize::from(steps == 0)]).then(|| {
+                format!("'{}' (stiffness {stiffness} on {inertia:.3} kg m² or kg)", model.dof_name(i))
+            })
+        }
+        _ => None,
     };
-    let is_held = |i: &&usize| matches!(drives[**i], Drive::Pd { .. }) && has_no_margin(**i);
-    let held: Vec<String> =
-        layout.controllable().iter().filter(is_held).map(|&i| format!("'{}'", model.dof_name(i))).collect();
-    (steps > 1 && !held.is_empty()).then(|| {
+    let long: Vec<String> = layout.controllable().iter().filter_map(is_long).collect();
+    (!long.is_empty()).then(|| {
+        let why = match steps {
+            0 => "the motion on the way is foreseen to second order alone without time.sim_dt",
+            _ => "the robot is led far on the way",
+        };
         format!(
-            "the drives of {} hold their targets over {steps} physics steps, where the motion is foreseen to second order in the period alone: joints may come \
-             beyond their ranges, be thrown by their stops and leave their limits; give position a margin, or set time.dt to time.sim_dt",
-            held.join(", ")
+            "a period of {dt} s takes the drives of {} a good part of the way to a target, and {why}: limits on position, velocity and acceleration may \
+             be left; set time.dt to the length of a physics step and time.policy_every to as many as there were, or give position a margin",
+            long.join(", ")
         )
     })
 }
@@ -332,15 +347,52 @@ fn beyond_motors(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Dr
     })
 }
 
-/// What a guard by the robot's model does not promise of joints that nothing drives.
-fn undriven(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Option<String> {
+/// Gains that `[command]` states other than the robot file's own drive has them; a policy's metadata has three decimals.
+fn other_gains(Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
+    let same = |a: f64, b: f64| (a - b).abs() <= 1e-3 * a.abs().max(1.0);
+    let other = |&i: &usize| {
+        let (Drive::Pd { stiffness, damping }, joint) = (drives[i], model.dof_name(i)) else { return None };
+        let is_drive = |motor: &&Motor| {
+            motor.joint == joint
+                && motor.not_modelled.is_none()
+                && motor.gear == 1.0
+                && motor.gain > 0.0
+                && motor.gain == -motor.bias[1]
+        };
+        let motor = model.motors().iter().find(is_drive)?;
+        let (of_file, damped) = (motor.gain, 0.0 - motor.bias[2]);
+        let differs = !(same(stiffness, of_file) && same(damping, damped));
+        differs.then(|| {
+            format!(
+                "'{joint}' has stiffness {stiffness} and damping {damping} by [command], {of_file} and {damped} by the robot file"
+            )
+        })
+    };
+    let joints: Vec<String> = layout.controllable().iter().filter_map(other).collect();
+    (!joints.is_empty()).then(|| {
+        format!(
+            "[command] contradicts the drives of the robot file, and targets and limits count on [command]: {} [N m/rad or N/m, N m s/rad or N s/m]; write the \
+             gains that the robot has into both",
+            joints.join("; ")
+        )
+    })
+}
+
+/// Joints that nothing drives, quoted.
+fn loose_joints(Parts { model, layout, .. }: &Parts) -> Vec<String> {
     let driven = layout.controllable();
     let loose = model.joints().iter().filter(|j| (j.idx_v..j.idx_v + j.nv).any(|i| !driven.contains(&i)));
-    let loose: Vec<String> = loose.map(|j| format!("'{}'", j.name)).collect();
+    loose.map(|j| format!("'{}'", j.name)).collect()
+}
+
+/// What a guard by the robot's model does not promise of joints that nothing drives.
+fn undriven(m: &Manifest, parts: &Parts) -> Option<String> {
+    let loose = loose_joints(parts);
     (m.guards() && !loose.is_empty()).then(|| {
         format!(
             "guard = true reckons with {} as with joints that nothing drives and nothing touches: on the ground or in contact the limits of the others hold as \
-             far as that is so; take guard = \"drive\" for a robot on legs, or \"simulator\" in training",
+             far as that is so; where they swing they may push the others harder than their motors can hold, which then leave their limits on position, \
+             velocity and acceleration; take guard = \"drive\" for a robot on legs, or \"simulator\" in training",
             loose.join(", ")
         )
     })
@@ -373,7 +425,7 @@ fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> 
     };
     (!joints.is_empty()).then(|| {
         format!(
-            "a drive's targets are cut at its range, and limits on acceleration and position are not promised where they are: {} [rad or m]; \
+            "a drive's targets are cut at its range, and limits on acceleration, velocity and position are not promised where they are: {} [rad or m]; \
              {next}",
             joints.join(", ")
         )
@@ -482,6 +534,7 @@ fn gains(m: &Manifest, parts: &Parts) -> Check {
 
 /// Can the motors give the decelerations that the position limits count on?
 fn braking(m: &Manifest, parts: Parts) -> Check {
+    let loose = loose_joints(&parts);
     let Parts { model, layout, projector } = parts;
     let (limits, controllable) = (projector.limits(), layout.controllable());
     if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {
@@ -502,8 +555,13 @@ fn braking(m: &Manifest, parts: Parts) -> Check {
         Err(e) => fail(CheckCode::Braking, e.to_string()),
         Ok(c) => {
             let joint = model.dof_name(c.dof);
+            // The search leaves what nothing drives at rest.
+            let at_rest = match &loose[..] {
+                [] => String::new(),
+                loose => format!(" while {}, which nothing drives, stand still", loose.join(", ")),
+            };
             let found = format!(
-                "in the hardest of {} states '{joint}' might need {:.1} of its {:.1} N m or N to brake",
+                "in the hardest of {} states '{joint}' might need {:.1} of its {:.1} N m or N to brake{at_rest}",
                 c.samples, c.needed, c.effort
             );
             if c.holds() {

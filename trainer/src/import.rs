@@ -69,6 +69,19 @@ pub enum ImportError {
         /// The value.
         value: String,
     },
+    /// A normaliser that divides by 0.
+    #[error(
+        "{file}: the standard deviation of entry {index} of the input '{input}' is 0, and the normaliser divides by it; write a positive one, 1 where \
+         the entry never varied, and export again"
+    )]
+    Deviation {
+        /// Path as given.
+        file: String,
+        /// Name of the input.
+        input: String,
+        /// Which entry.
+        index: usize,
+    },
     /// Nothing says what the inputs are.
     #[error(
         "the file does not say what the {n_in} entries of its input '{input}' are; give them with --recipe FILE, see docs/POLICIES.md"
@@ -109,6 +122,7 @@ impl ImportError {
             Self::Value { file, tensor, index, value } => {
                 Self::Value { file, tensor: plain(tensor), index, value }
             }
+            Self::Deviation { file, input, index } => Self::Deviation { file, input: plain(input), index },
             Self::Graph(reason) => Self::Graph(plain(reason)),
             other => other,
         }

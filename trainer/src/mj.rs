@@ -14,9 +14,10 @@ mod perturb;
 mod scene;
 mod sim;
 mod sizes;
+mod start;
 mod terrain;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use mujoco_rs::error::MjModelError;
@@ -63,6 +64,9 @@ pub enum MjError {
     /// A robot whose equations of motion plain numbers cannot say.
     #[error("MuJoCo reads the robot file, but a controller cannot reckon with it: {0}")]
     NoDescription(String),
+    /// A physics step that is none \[s\].
+    #[error("<option timestep> of the robot file is {0} s, which is no physics step; give seconds above 0")]
+    Timestep(f64),
     /// The robot file has no such body.
     #[error("the robot has no body '{0}'")]
     NoBody(String),
@@ -158,7 +162,7 @@ impl Model {
     /// brings its own `<mujoco>` settings.
     ///
     /// # Errors
-    /// [`MjError::Load`] with MuJoCo's own explanation.
+    /// [`MjError::Load`] with MuJoCo's own explanation; [`MjError::Timestep`].
     pub fn from_text(text: &str, format: ModelFormat, options: Options) -> Result<Model, MjError> {
         Model::from_text_in(text, format, None, options)
     }
@@ -179,7 +183,7 @@ impl Model {
     /// The same with what a task puts beside the robot.
     ///
     /// # Errors
-    /// As [`Model::from_text`]; [`MjError::NoBody`] for a foot on no body.
+    /// As [`Model::from_text`]; [`MjError::NoBody`] for a foot on no body; [`MjError::Timestep`].
     pub fn with_scene(
         text: &str,
         format: ModelFormat,
@@ -196,7 +200,7 @@ impl Model {
         sizes::check(&text, folder).map_err(MjError::Load)?;
         let loaded = guard::counting_warnings(|| {
             let model = match scene.is_empty() {
-                true => compile(&text, folder).map_err(|e| MjError::Load(guard::one_line(&e.to_string()))),
+                true => compile(&text, folder),
                 false => scene::compile(&text, folder, scene),
             };
             model.and_then(|model| pairs::list(&text, folder, scene, model))
@@ -208,6 +212,9 @@ impl Model {
         let opt = model.opt_mut();
         if let Some(sim_dt) = options.sim_dt {
             opt.timestep = sim_dt;
+        }
+        if !(opt.timestep.is_finite() && opt.timestep > 0.0) {
+            return Err(MjError::Timestep(opt.timestep));
         }
         if options.without_contacts {
             opt.disableflags |= mjtDisableBit::mjDSBL_CONTACT as i32;
@@ -425,11 +432,21 @@ impl Model {
 }
 
 /// Compiles a text as if it stood in a file of `folder`.
-fn compile(text: &str, folder: Option<&Path>) -> Result<MjModel, MjModelError> {
-    let Some(folder) = folder else { return MjModel::from_xml_string(text) };
-    let (path, mut files) = (folder.join("nearl-robot.xml"), MjVfs::new());
-    files.add_from_buffer(&path, text.as_bytes())?;
-    MjModel::from_xml_vfs(&path, &files)
+fn compile(text: &str, folder: Option<&Path>) -> Result<MjModel, MjError> {
+    let (path, files) = as_file(text, folder)?;
+    MjModel::from_xml_vfs(&path, &files).map_err(|e| match e {
+        MjModelError::LoadFailed(said) => guard::refused(&path, &files, &said),
+        other => MjError::Load(guard::one_line(&other.to_string())),
+    })
+}
+
+/// A text as a file of `folder`, or of no folder.
+fn as_file(text: &str, folder: Option<&Path>) -> Result<(PathBuf, MjVfs), MjError> {
+    let path = folder.map_or(PathBuf::from("model.xml"), |folder| folder.join("nearl-robot.xml"));
+    let mut files = MjVfs::new();
+    let added = files.add_from_buffer(&path, text.as_bytes());
+    added.map_err(|e| MjError::Load(guard::one_line(&e.to_string())))?;
+    Ok((path, files))
 }
 
 /// Hangs a URDF's root link on the world by a free joint.

@@ -6,6 +6,7 @@ use nearl_runtime::Manifest;
 use nearl_runtime::constraints::description::{JointKind, Range, RobotDescription};
 use nearl_runtime::constraints::{Model, ModelError};
 use nearl_runtime::snapshot::{ModelFormat, Simulation};
+use toml::Table;
 
 use crate::mj::{self, MjError, Options, Scene};
 
@@ -15,6 +16,14 @@ pub enum RobotError {
     /// MuJoCo's side of it.
     #[error(transparent)]
     Physics(#[from] MjError),
+    /// The same of a file that has a name.
+    #[error("{file}: {error}")]
+    File {
+        /// Path as given.
+        file: String,
+        /// Why.
+        error: MjError,
+    },
     /// The URDF's side of it.
     #[error(transparent)]
     Model(#[from] ModelError),
@@ -31,17 +40,39 @@ pub fn describe(file: &Simulation, floats: bool) -> Result<RobotDescription, Rob
     }
 }
 
-/// Describes a robot file as MuJoCo simulates it: of a URDF, joints and masses are MuJoCo's (a continuous joint is a hinge without
-/// limits, a link without `<inertial>` weighs what its geometry does), limits and motors the file's.
+/// Describes the robot file of a task, with what is to be known of where its episodes begin: as MuJoCo simulates it with what the task adds, else as
+/// [`describe`] does. `reset` is the task's section.
 ///
 /// # Errors
 /// [`RobotError`].
-pub fn describe_simulated(
+pub fn describe_in_task(
+    file: &Simulation,
+    floats: bool,
+    add: Option<&SceneOptions>,
+    reset: &Table,
+) -> Result<RobotDescription, RobotError> {
+    let model = match (add, file.format) {
+        (None, ModelFormat::Urdf) => return describe(file, floats),
+        (None, ModelFormat::Mjcf) => compile(file, floats)?,
+        (Some(add), _) => compile_in(file, floats, add)?,
+    };
+    let mut robot = match add {
+        None => model.describe()?,
+        Some(add) => describe_simulated(&model, file, floats, add)?,
+    };
+    robot.notes.extend(model.starts(reset));
+    Ok(robot)
+}
+
+/// Describes a robot file as MuJoCo simulates it: of a URDF, joints and masses are MuJoCo's (a continuous joint is a hinge without
+/// limits, a link without `<inertial>` weighs what its geometry does), limits and motors the file's.
+fn describe_simulated(
+    model: &mj::Model,
     file: &Simulation,
     floats: bool,
     options: &SceneOptions,
 ) -> Result<RobotDescription, RobotError> {
-    let mut robot = compile_in(file, floats, options)?.describe()?;
+    let mut robot = model.describe()?;
     if file.format == ModelFormat::Mjcf {
         return Ok(robot);
     }
@@ -80,7 +111,8 @@ pub fn read(path: &Path, floats: bool) -> Result<RobotDescription, RobotError> {
     }
 }
 
-/// Contacts and sensors of an MJCF file, a sentence each: they are the simulator's, and no controller knows them. None of a URDF.
+/// Contacts and sensors of an MJCF file, and where its episodes begin, a sentence each: they are the simulator's, and no controller knows them. None of
+/// a URDF.
 ///
 /// # Errors
 /// As [`read`].
@@ -88,7 +120,8 @@ pub fn simulated_alone(path: &Path) -> Result<Vec<String>, RobotError> {
     if !is_mjcf(path) {
         return Ok(Vec::new());
     }
-    Ok(compile(&mjcf(path)?, false)?.simulated_alone())
+    let model = compile(&mjcf(path)?, false)?;
+    Ok([model.simulated_alone(), model.starts(&Table::new())].concat())
 }
 
 fn is_mjcf(path: &Path) -> bool {
@@ -100,7 +133,13 @@ fn is_mjcf(path: &Path) -> bool {
 /// # Errors
 /// [`RobotError`].
 pub fn read_mjcf(path: &Path) -> Result<RobotDescription, RobotError> {
-    describe(&mjcf(path)?, false)
+    let file = path.display().to_string();
+    let robot = describe(&mjcf(path)?, false).map_err(|e| match e {
+        RobotError::Physics(error) => RobotError::File { file: file.clone(), error },
+        other => other,
+    })?;
+    robot.check(&file)?;
+    Ok(robot)
 }
 
 fn mjcf(path: &Path) -> Result<Simulation, RobotError> {

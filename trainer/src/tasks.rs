@@ -112,17 +112,15 @@ pub fn load(task: &str, overrides: &[String]) -> Result<Manifest, TaskLoadError>
     };
     let (simulation, is_bundled) = robot_file(&parsed, path, bundled.is_some())?;
     let floats = parsed.model.free_flyer;
-    let described = match parsed.reward.is_empty() && parsed.scene.is_empty() {
-        true => robot::describe(&simulation, floats),
-        false => {
-            let add = scene::of(&parsed, &simulation).map_err(|m| EnvError::Task {
-                origin: task.into(),
-                key: m.key,
-                reason: m.reason,
-            })?;
-            robot::describe_simulated(&simulation, floats, &add)
-        }
+    let add = match parsed.reward.is_empty() && parsed.scene.is_empty() {
+        true => None,
+        false => Some(scene::of(&parsed, &simulation).map_err(|m| EnvError::Task {
+            origin: task.into(),
+            key: m.key,
+            reason: m.reason,
+        })?),
     };
+    let described = robot::describe_in_task(&simulation, floats, add.as_ref(), &parsed.reset);
     let description = described.map_err(|source| TaskLoadError::Description {
         task: parsed.name.clone(),
         robot: parsed.model.file().map_or(String::new(), |(file, _)| file.to_string()),

@@ -100,6 +100,9 @@ impl TorqueLimit {
         let stated = model.effort_limit();
         let without = |i: &usize| stated[*i].is_infinite() || stated[*i] <= 0.0;
         let missing: Vec<usize> = controllable.iter().copied().filter(without).collect();
+        if let Some(error) = missing.iter().find_map(|i| powerless(model, *i)) {
+            return Err(error);
+        }
         if !missing.is_empty() {
             let next =
                 "write effort (URDF) or a motor with ctrlrange (MJCF) into it, or do not control the joint";
@@ -113,6 +116,28 @@ impl TorqueLimit {
             .map(|(i, effort)| Ok((i, less_friction(model, i, effort)?)))
             .collect()
     }
+}
+
+/// The refusal of a joint whose motor turns no control into torque, or none one way.
+fn powerless(model: &Model, dof: usize) -> Option<LimitError> {
+    let joint = model.dof_name(dof);
+    model.motors().iter().filter(|motor| motor.joint == joint).find_map(|motor| {
+        let name = &motor.name;
+        let factors = [("gear", motor.gear), ("gain", motor.gain)];
+        if let Some((key, _)) = factors.into_iter().find(|(_, factor)| *factor == 0.0) {
+            let what = format!("torque is asked for, but motor '{name}' on joint '{joint}' has {key} 0 and gives none");
+            let next = "write another number into the robot file, or do not control the joint";
+            return Some(LimitError::Unusable { what, next });
+        }
+        let ranges = [("ctrlrange", motor.control_range), ("forcerange", motor.force_range)];
+        let one_way = |range: Option<[f64; 2]>| range.filter(|[low, high]| *low >= 0.0 || *high <= 0.0);
+        let (key, [low, high]) = ranges.into_iter().find_map(|(key, range)| Some((key, one_way(range)?)))?;
+        let what = format!(
+            "torque is asked for, but the {key} of motor '{name}' on joint '{joint}' is {low} to {high}, which gives no torque one way"
+        );
+        let next = "write a range that begins below 0 and ends above 0, or do not control the joint";
+        Some(LimitError::Unusable { what, next })
+    })
 }
 
 struct TorqueRows {

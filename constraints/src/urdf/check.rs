@@ -33,6 +33,12 @@ pub(super) fn check_tree(robot: Node, wrong: &mut Vec<String>) {
             Some(of) if of == name => wrong.push(format!("joint '{name}' mimics itself")),
             Some(_) => {}
         }
+        for key in ["multiplier", "offset"] {
+            let Some(text) = mimic.attribute(key) else { continue };
+            if !text.trim().parse::<f64>().is_ok_and(f64::is_finite) {
+                wrong.push(format!("joint '{name}' has <mimic> {key} '{text}', not a number"));
+            }
+        }
     }
     for tag in ["link", "joint"] {
         let mut seen = BTreeSet::new();

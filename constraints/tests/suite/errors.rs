@@ -324,6 +324,13 @@ fn urdf_limits_are_never_dropped_without_a_word() {
         &["joint 'elbow' mimics 'zz', which is not there"],
     );
     refuse_model(model(&format!(r#"{GOOD}<mimic joint="elbow"/>"#)), &["joint 'elbow' mimics itself"]);
+    for (key, value) in [("multiplier", "nan"), ("multiplier", "inf"), ("offset", "-inf"), ("offset", "half")]
+    {
+        refuse_model(
+            model(&format!(r#"{GOOD}<mimic joint="elbow" {key}="{value}"/>"#)),
+            &[&format!("joint 'elbow' has <mimic> {key} '{value}', not a number")],
+        );
+    }
     let text = urdf(GOOD, "1");
     for nameless in [text.replace(r#" name="elbow""#, ""), text.replace(r#""elbow""#, r#""""#)] {
         let words = ["the <joint> between the links 'a' and 'b' has no name"];

@@ -1,13 +1,14 @@
 //! Which commands take the joints where they are to arrive.
 
 use crate::controller::idx_q;
+use crate::motors::Motors;
 use crate::snapshot::Manifest;
 use nearl_constraints::drive::{Arrival, Held};
-use nearl_constraints::{Drive, LimitSet, Model, Period, PhysicsSteps, Target};
+use nearl_constraints::{Drive, LimitSet, Model, Period, PeriodDynamics, PhysicsSteps, Target};
 
 /// The commands of the controllable joints for the motion and the mean forces of a period ([`Drive::command`]). Where the plant makes several
-/// physics steps of it and no joint has the target of a drive, the forces are those whose steps lead there ([`PhysicsSteps`]); no force and no
-/// position leaves its limit for that.
+/// physics steps of it, forces and the targets of drives are those whose steps lead there ([`PhysicsSteps`]); no force and no position leaves its
+/// limit for that.
 pub(crate) struct Arrivals {
     period: Period,
     /// What a force may be depends on the speed: it is corrected towards zero only.
@@ -21,27 +22,33 @@ pub(crate) struct Arrivals {
     friction: Vec<f64>,
     steps: Option<PhysicsSteps>,
     commands: Vec<f64>,
-    force: Vec<f64>,
+    held: Vec<Held>,
     most: Vec<f64>,
 }
 
 impl Arrivals {
-    /// For commands to `dofs`; `drives` (nv) says what they are. A dof that is not among them is `loose`, or keeps the acceleration it is given.
+    /// For commands to `dofs`; `drives` (nv) says what they are, and the motors take them as far as their range goes. A dof that
+    /// is not among them is `loose`, or keeps the acceleration it is given.
     pub(crate) fn new(
         m: &Manifest,
         model: &Model,
         dofs: &[usize],
-        drives: &[Drive],
+        (drives, motors): (&[Drive], &Motors),
         loose: bool,
     ) -> Arrivals {
         let (nv, period) = (model.nv(), m.task.period());
         let is_led = |i: &usize| matches!(drives[*i], Drive::Position | Drive::Velocity);
         let follow: Vec<usize> =
             (0..nv).filter(|i| if dofs.contains(i) { is_led(i) } else { !loose }).collect();
-        // A drive that is held on its target runs ahead of it: where it ends fast enough it has come too far.
-        let has_targets = dofs.iter().any(|i| matches!(drives[*i], Drive::Pd { .. }));
+        let mut ranges = vec![[f64::NEG_INFINITY, f64::INFINITY]; nv];
+        for (k, &i) in dofs.iter().enumerate() {
+            let end = |of: &[f64]| of.get(motors.place(k)).map(|end| motors.command(k, *end));
+            if let (Some(low), Some(high)) = (end(&m.action_lower), end(&m.action_upper)) {
+                ranges[i] = [low.min(high), low.max(high)];
+            }
+        }
         Arrivals {
-            steps: PhysicsSteps::new(model, dofs, &follow, period).filter(|_| !has_targets),
+            steps: PhysicsSteps::new(model, (drives, &ranges), dofs, &follow, period),
             idx_q: idx_q(model),
             friction: model.friction().to_vec(),
             period,
@@ -49,7 +56,7 @@ impl Arrivals {
             dofs: dofs.to_vec(),
             drives: drives.to_vec(),
             commands: vec![0.0; nv],
-            force: vec![0.0; nv],
+            held: vec![Held::Force(0.0); nv],
             most: vec![0.0; nv],
         }
     }
@@ -64,38 +71,41 @@ impl Arrivals {
         external: &[f64],
         limits: &LimitSet,
     ) -> &[f64] {
-        self.force.copy_from_slice(tau);
-        if let Some(steps) = &mut self.steps {
-            for (i, most) in self.most.iter_mut().enumerate() {
-                *most = if self.by_speed { tau[i].abs() } else { limits.effort[i] + self.friction[i] };
-            }
-            steps.drive((q, v), external, a, (&mut self.force, &self.most), limits);
-        }
         for &i in &self.dofs {
             let iq = self.idx_q[i];
-            let to = Arrival { q: to.q[iq], v: to.v[i], a: a[i], tau: self.force[i] };
+            let to = Arrival { q: to.q[iq], v: to.v[i], a: a[i], tau: tau[i] };
             self.commands[i] = self.drives[i].command(&self.period, q[iq], v[i], &to);
+        }
+        if let Some(steps) = &mut self.steps {
+            for (i, most) in self.most.iter_mut().enumerate() {
+                let is_lower = self.by_speed && self.drives[i] == Drive::Effort;
+                *most = if is_lower { tau[i].abs() } else { limits.effort[i] + self.friction[i] };
+            }
+            steps.drive((q, v), external, a, (&mut self.commands, &self.most), limits);
         }
         &self.commands
     }
 
-    /// The accelerations (nv) that what is `held` (nv) leads to by the physics steps; false where they are not made.
+    /// Writes the accelerations (nv) that `commands` (nv) lead to. Returns whether the physics steps on the way there take a joint beyond a position
+    /// limit, or further beyond it than it is, or ask a drive for more than it may give.
     pub(crate) fn foresee(
         &mut self,
-        state: (&[f64], &[f64]),
-        external: &[f64],
-        held: &[Held],
+        (q, v): (&[f64], &[f64]),
+        (dynamics, external): (&mut PeriodDynamics, &[f64]),
+        commands: &[f64],
+        limits: &LimitSet,
         a: &mut [f64],
     ) -> bool {
-        match &mut self.steps {
-            Some(steps) => steps.accelerate(state, external, held, a),
-            None => return false,
+        if let Some(steps) = &mut self.steps {
+            let all = limits.effort.iter().zip(&self.friction);
+            self.most.iter_mut().zip(all).for_each(|(most, (effort, friction))| *most = effort + friction);
+            steps.accelerate((q, v), external, (commands, &self.most), a);
+            return steps.went_beyond(limits);
         }
-        true
-    }
-
-    /// Whether what was foreseen last takes a joint beyond a position limit, or further beyond it than it is.
-    pub(crate) fn go_beyond(&self, limits: &LimitSet) -> bool {
-        self.steps.as_ref().is_some_and(|steps| steps.went_beyond(limits))
+        for &i in &self.dofs {
+            self.held[i] = self.drives[i].held(&self.period, q[self.idx_q[i]], v[i], commands[i]);
+        }
+        dynamics.accelerate(&self.held, a);
+        false
     }
 }

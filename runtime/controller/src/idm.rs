@@ -62,10 +62,11 @@ impl AnalyticIdm {
     /// [`SnapshotError::Unusable`] for joints whose motors are not known.
     pub fn new(m: &Manifest, model: &Model, dofs: &[usize]) -> Result<Self, SnapshotError> {
         let drives = Parts::drives(m, model, dofs)?;
+        let motors = Parts::motors(model, dofs, &drives)?;
         Ok(Self {
             dynamics: Dynamics::new(model),
-            motors: Parts::motors(model, dofs, &drives)?,
-            arrivals: Arrivals::new(m, model, dofs, &drives, false),
+            arrivals: Arrivals::new(m, model, dofs, (&drives, &motors), false),
+            motors,
             dofs: dofs.to_vec(),
             period: m.task.period(),
             tau: vec![0.0; model.nv()],

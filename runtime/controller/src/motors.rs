@@ -88,16 +88,20 @@ fn one(model: &Model, dof: usize) -> Result<&Motor, String> {
 /// `None` where the control is the torque.
 fn law(motor: &Motor) -> Result<Option<Law>, String> {
     let Motor { name, joint, gear, gain, bias: [bias, by_q, by_v], .. } = motor;
-    let reason = match &motor.not_modelled {
-        Some(reason) => Some(format!("has {reason}")),
-        None if (*by_q, *by_v) != (0.0, 0.0) => {
-            Some("depends on position or velocity: say what it is sent under [command]".to_string())
+    let beyond = match &motor.not_modelled {
+        Some(reason) if *gear == 0.0 || *gain == 0.0 => {
+            Some((format!("has {reason}"), "write another number into the robot file"))
         }
+        Some(reason) => Some((format!("has {reason}"), "take a <motor> in its place")),
+        None if (*by_q, *by_v) != (0.0, 0.0) => Some((
+            "depends on position or velocity".to_string(),
+            "say what it is sent under [command], take a <motor> in its place",
+        )),
         None => None,
     };
-    match reason {
-        Some(reason) => Err(format!(
-            "the torque of actuator '{name}' on joint '{joint}' is asked for, but it {reason}, or take a <motor> or idm.kind = \"learned\""
+    match beyond {
+        Some((reason, next)) => Err(format!(
+            "the torque of actuator '{name}' on joint '{joint}' is asked for, but it {reason}; {next}, or use idm.kind = \"learned\""
         )),
         None if (*gear, *gain, *bias) == (1.0, 1.0, 0.0) => Ok(None),
         None => Ok(Some(Law { gear: *gear, gain: *gain, bias: *bias })),

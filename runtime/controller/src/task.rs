@@ -285,6 +285,10 @@ impl Task {
         for set in overrides {
             apply(&mut table, set)?;
         }
+        if let Some((path, value)) = first_odd(&table) {
+            let line = if overrides.is_empty() { line_of_key(text, &path).0 } else { String::new() };
+            return Err(odd(file, &line, &path, value));
+        }
         let mut task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
             let key = e.path().to_string();
             let below = overrides.iter().find(|set| set.trim_start().starts_with(&format!("{key}.")));
@@ -294,7 +298,8 @@ impl Task {
                 let reason = format!("'{last}' is a value, not a section");
                 return TaskError::Override { set: set.clone(), reason };
             }
-            let line = if overrides.is_empty() { line_of_key(text, e.path()).0 } else { String::new() };
+            let line =
+                if overrides.is_empty() { line_of_key(text, &steps(e.path())).0 } else { String::new() };
             let place = format!("{line}{}", bracket(&key));
             TaskError::Invalid { file: file.into(), place, reason: suggest(e.into_inner().message()) }
         })?;
@@ -310,11 +315,18 @@ impl Task {
     /// As [`Task::read`].
     pub fn merged(table: toml::Table, files: &[(String, String)]) -> Result<Self, TaskError> {
         let last = files.last().map_or("", |(file, _)| file.as_str());
-        let task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
-            let found = files.iter().map(|(file, text)| (file.as_str(), line_of_key(text, e.path())));
+        let said_at = |path: &[Step]| {
+            let found = files.iter().map(|(file, text)| (file.as_str(), line_of_key(text, path)));
             let (file, (line, depth)) =
                 found.max_by_key(|(_, (_, depth))| *depth).unwrap_or((last, (String::new(), 0)));
-            let (file, line) = if depth == 0 { (last, String::new()) } else { (file, line) };
+            if depth == 0 { (last, String::new()) } else { (file, line) }
+        };
+        if let Some((path, value)) = first_odd(&table) {
+            let (file, line) = said_at(&path);
+            return Err(odd(file, &line, &path, value));
+        }
+        let task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
+            let (file, line) = said_at(&steps(e.path()));
             let place = format!("{line}{}", bracket(&e.path().to_string()));
             TaskError::Invalid { file: file.into(), place, reason: suggest(e.into_inner().message()) }
         })?;
@@ -355,6 +367,9 @@ impl Task {
             .map_err(|e| TaskError::Unreadable { file: file.clone(), reason: e.to_string() })?;
         let at = |place, reason| TaskError::Invalid { file: file.clone(), place, reason };
         let mut table = Self::table(&file, &text)?;
+        if let Some((path, value)) = first_odd(&table) {
+            return Err(odd(&file, &line_of_key(&text, &path).0, &path, value));
+        }
         let Some(section) = table.remove("constraints") else {
             return Err(at(String::new(), "it has no section [constraints]; write one".into()));
         };
@@ -482,19 +497,35 @@ fn line_of(text: &str, span: Option<std::ops::Range<usize>>) -> String {
     span.map_or(String::new(), |s| format!(":{}", 1 + text[..s.start.min(text.len())].matches('\n').count()))
 }
 
-/// `:12`, where `path` stands in the text, or what of it stands there, and how many of its segments do; nothing for the file as a whole.
-fn line_of_key(text: &str, path: &serde_path_to_error::Path) -> (String, usize) {
+/// A key of a section, or a place in a list.
+#[derive(Clone, Debug)]
+enum Step {
+    Key(String),
+    At(usize),
+}
+
+/// The way to a value, up to where it is known.
+fn steps(path: &serde_path_to_error::Path) -> Vec<Step> {
+    let step = |segment: &Segment| match segment {
+        Segment::Map { key } | Segment::Enum { variant: key } => Some(Step::Key(key.clone())),
+        Segment::Seq { index } => Some(Step::At(*index)),
+        Segment::Unknown => None,
+    };
+    path.iter().map_while(step).collect()
+}
+
+/// `:12`, where `path` stands in the text, or what of it stands there, and how many of its steps do; nothing for the file as a whole.
+fn line_of_key(text: &str, path: &[Step]) -> (String, usize) {
     let Ok(document) = DeTable::parse(text) else { return (String::new(), 0) };
     let (mut table, mut list, mut span, mut depth) = (Some(document.get_ref()), None, None, 0);
-    for segment in path.iter() {
-        let found = match segment {
-            Segment::Map { key } | Segment::Enum { variant: key } => table
+    for step in path {
+        let found = match step {
+            Step::Key(key) => table
                 .and_then(|t| t.get_key_value(key.as_str()))
                 .map(|(key, value)| (key.span(), value.get_ref())),
-            Segment::Seq { index } => {
+            Step::At(index) => {
                 list.and_then(|l: &DeArray<'_>| l.get(*index)).map(|value| (value.span(), value.get_ref()))
             }
-            Segment::Unknown => None,
         };
         let Some((place, value)) = found else { break };
         (span, depth) = (Some(place), depth + 1);
@@ -502,6 +533,39 @@ fn line_of_key(text: &str, path: &serde_path_to_error::Path) -> (String, usize) 
         list = value.as_array();
     }
     (line_of(text, span), depth)
+}
+
+/// Sections whose own checks speak of a number that is not finite; the learner's may have some.
+const CHECKED_ELSEWHERE: [&str; 3] = ["time", "scene", "train"];
+
+/// The first number that is NaN or infinite: as JSON it would be no number, and a snapshot with it could not be read.
+fn first_odd(table: &toml::Table) -> Option<(Vec<Step>, f64)> {
+    let mut sections = table.iter().filter(|(key, _)| !CHECKED_ELSEWHERE.contains(&key.as_str()));
+    sections.find_map(|(key, value)| odd_within(value, &[Step::Key(key.clone())]))
+}
+
+fn odd_within(value: &toml::Value, path: &[Step]) -> Option<(Vec<Step>, f64)> {
+    let below = |step: Step, value: &toml::Value| odd_within(value, &[path, &[step]].concat());
+    match value {
+        toml::Value::Float(x) if !x.is_finite() => Some((path.to_vec(), *x)),
+        toml::Value::Table(table) => table.iter().find_map(|(key, x)| below(Step::Key(key.clone()), x)),
+        toml::Value::Array(list) => list.iter().enumerate().find_map(|(i, x)| below(Step::At(i), x)),
+        _ => None,
+    }
+}
+
+/// The refusal of it.
+fn odd(file: &str, line: &str, path: &[Step], value: f64) -> TaskError {
+    let mut key = String::new();
+    for step in path {
+        match step {
+            Step::Key(name) if key.is_empty() => key.push_str(name),
+            Step::Key(name) => key = format!("{key}.{name}"),
+            Step::At(index) => key = format!("{key}[{index}]"),
+        }
+    }
+    let reason = format!("{value} is not finite, and a snapshot cannot hold it; give a finite number");
+    TaskError::Invalid { file: file.into(), place: format!("{line}{}", bracket(&key)), reason }
 }
 
 /// ` [key]`; nothing for the file as a whole.

@@ -294,6 +294,32 @@ fn targets_of_drives_that_are_cut_at_their_range_are_found() {
     }
 }
 
+/// Targets that are held over several steps lead through them to what the log claims, and those that are another's do not.
+#[test]
+fn targets_of_drives_are_verified_over_several_steps() {
+    let drives = format!("{LIMITS}\n[command]\ninterface = \"pd\"\nstiffness = 100.0\ndamping = 5.0")
+        .replace("25.0", "8.0");
+    for (sub_steps, dt) in [(2, 0.002), (5, 0.005)] {
+        let flight = attack(&drives, dt, sub_steps, 20);
+        let mut snapshot = flight.snapshot(1);
+        (snapshot.manifest.action_lower, snapshot.manifest.action_upper) = (vec![-9.0; 7], vec![9.0; 7]);
+        let folder = Scratch::new(&format!("verify-targets-{sub_steps}"));
+        let (log, summary) = flight.fly_with(&snapshot, &folder.0);
+        assert_eq!((summary.dropped, summary.brief, summary.error), (0, 0, None));
+        holds(&verify(&log).unwrap(), 1500);
+        let other = folder.0.join("copy.mcap");
+        let edit = |topic: &str, m: &mut Value| {
+            if topic == "tick" && m["tick"] == 700 {
+                m["action"][3] = (m["action"][3].as_f64().unwrap() + 1e-4).into();
+            }
+            true
+        };
+        copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+        let report = verify(&other).unwrap();
+        assert!(report.found == 1 && report.violations[0].tick == 700, "{report}");
+    }
+}
+
 /// Speeds with accelerations of another joint, and sums of positions and of speeds that stay where they are.
 #[test]
 fn rows_of_several_joints_are_verified_with_what_a_brake_keeps_of_them() {

@@ -777,7 +777,6 @@ fn is_outside(promise: &mut Promise, case: &Case<'_>, whole: bool) -> bool {
 fn actions(promise: &mut Promise, passage: &Passage<'_>, found: &[f64]) -> Result<(), Fault> {
     let p = promise.period;
     let (lag, sag) = (0.5 * (p.dt - p.tau), (p.dt * p.dt - p.tau * p.tau) / 6.0);
-    let by_steps = p.sub_steps > 1 && !promise.actions.iter().any(|x| matches!(x.sent, Sent::Target { .. }));
     let (mut means, mut cut) = (Vec::new(), None);
     for action in &promise.actions {
         let (i, joint) = (action.dof, &promise.limits.joints[action.dof].name);
@@ -799,12 +798,13 @@ fn actions(promise: &mut Promise, passage: &Passage<'_>, found: &[f64]) -> Resul
         let is = found.get(action.place).copied().unwrap_or(f64::NAN);
         let size = 1.0 + leads.abs().max(action.range[1].abs().min(1e3));
         means.push(leads);
+        let moves = matches!(action.sent, Sent::Force | Sent::Target { .. });
+        if p.sub_steps > 1 && moves {
+            continue;
+        }
         // What a motor lacks of a force is its limit's matter; a position, a speed or a target that ends before leads elsewhere.
         if !matches!(action.sent, Sent::Force) && !are_near(sent, leads, by_friction + ACTION * size) {
             cut = cut.or(Some(i));
-        }
-        if by_steps && matches!(action.sent, Sent::Force) {
-            continue;
         }
         if !are_near(is, leads, by_friction + ACTION * size) {
             return broken(format!("action for joint '{joint}'"), is, leads, unit);

@@ -9,13 +9,16 @@ use crate::rows::{Passage, Rule};
 const LED: f64 = 1e-6;
 /// A force or a position is at its limit up to this share.
 const AT_LIMIT: f64 = 1e-6;
+/// How much further than in this period the steps of the next ones may lead.
+const FURTHER: f64 = 1.5;
 
-/// Where the steps have led, and the lowest and highest positions after one of them.
+/// Where the steps have led, the lowest and highest positions after one of them, and the largest force of each motor in one of them.
 struct Walk {
     q: Vec<f64>,
     v: Vec<f64>,
     lowest: Vec<f64>,
     highest: Vec<f64>,
+    hardest: Vec<f64>,
 }
 
 /// The actions, held, lead through the steps to the target's velocities. A joint may fall short of its own whose force is at its limit, or no
@@ -30,6 +33,8 @@ pub(crate) fn lead(
 ) -> Result<(), Fault> {
     let (nv, p) = (passage.v.len(), promise.period);
     let walk = walk(promise, passage, found, None);
+    let has_targets = promise.actions.iter().any(|action| matches!(action.sent, Sent::Target { .. }));
+    let reserve = if has_targets { 0.5 } else { ((p.dt - 0.005) / 0.03).clamp(0.0, 0.5) };
     let mut by_friction = vec![0.0; nv];
     for k in 0..promise.actions.len() {
         let action = &promise.actions[k];
@@ -54,9 +59,11 @@ pub(crate) fn lead(
             std::iter::once(&promise.limits).chain(promise.without_margins.iter().map(|(limits, _)| limits))
         };
         let has_no_room = each().flat_map(|limits| &limits.rows).any(|row| match row.rule {
-            Rule::Torque { dof, most } => dof == i && near(force(action, is).abs(), most),
+            Rule::Torque { dof, most } => dof == i && near(walk.hardest[i], most),
             Rule::TorqueSpeed { dof, .. } => {
-                dof == i && near(force(action, is).abs(), force(action, *mean).abs())
+                dof == i
+                    && matches!(action.sent, Sent::Force)
+                    && near(walk.hardest[i], force(action, *mean).abs())
             }
             _ => false,
         });
@@ -70,10 +77,11 @@ pub(crate) fn lead(
                 };
                 let farthest =
                     if off < 0.0 { walk.highest[iq] - walk.q[iq] } else { walk.q[iq] - walk.lowest[iq] };
-                // Each period of a brake may lead as much further as this one did; with what is given up the joint could not stop.
+                // Each period of a brake may lead further than constant accelerations do; with what is given up the joint could not stop.
                 let further = (side * (walk.q[iq] - q - p.way(passage.v[i], walk.v[i])) / p.dt).max(0.0);
-                let (speed, brake) = (side * walk.v[i] + given_up + further, joint.brake(&p));
-                let left = room - p.kappa * p.dt * given_up + 0.5 * further * further / brake;
+                let brake = joint.brake(&p);
+                let speed = side * walk.v[i] + given_up + FURTHER * further + reserve * brake * p.dt;
+                let left = room - p.kappa * p.dt * given_up;
                 let is_near = room - farthest <= given_up * p.dt + AT_LIMIT;
                 let is_fast = p.stopping(speed, brake) >= left - given_up * p.dt - AT_LIMIT;
                 (is_near || is_fast) && a.abs() <= joint.acceleration * (1.0 + LED)
@@ -99,20 +107,30 @@ pub(crate) fn force(action: &Action, is: f64) -> f64 {
 /// Makes the steps; `more` is a force on one dof besides.
 fn walk(promise: &mut Promise, passage: &Passage<'_>, found: &[f64], more: Option<(usize, f64)>) -> Walk {
     let (nv, p) = (passage.v.len(), promise.period);
-    let mut at =
-        Walk { q: passage.q.to_vec(), v: passage.v.to_vec(), lowest: Vec::new(), highest: Vec::new() };
+    let mut at = Walk {
+        q: passage.q.to_vec(),
+        v: passage.v.to_vec(),
+        lowest: Vec::new(),
+        highest: Vec::new(),
+        hardest: vec![0.0; nv],
+    };
     let mut next = Vec::new();
     let (mut force_of, mut a) = (vec![0.0; nv], passage.a.to_vec());
-    let is_free: Vec<bool> = (0..nv)
-        .map(|i| promise.actions.iter().any(|x| x.dof == i && matches!(x.sent, Sent::Force)))
-        .collect();
-    for action in promise.actions.iter().filter(|action| is_free[action.dof]) {
-        force_of[action.dof] = force(action, found.get(action.place).copied().unwrap_or(f64::NAN));
-    }
-    if let Some((i, by)) = more {
-        force_of[i] += by;
-    }
+    let is_led = |action: &&Action| matches!(action.sent, Sent::Position | Sent::Velocity);
+    let moves: Vec<&Action> = promise.actions.iter().filter(|action| !is_led(action)).collect();
+    let is_free: Vec<bool> = (0..nv).map(|i| moves.iter().any(|action| action.dof == i)).collect();
     for _ in 0..p.sub_steps {
+        for action in &moves {
+            let (i, is) = (action.dof, found.get(action.place).copied().unwrap_or(f64::NAN));
+            let push = match (action.sent, promise.machine.single(i)) {
+                (Sent::Target { stiffness, damping }, Some(iq)) => {
+                    stiffness * (is - at.q[iq]) - damping * at.v[i]
+                }
+                _ => force(action, is),
+            };
+            at.hardest[i] = at.hardest[i].max(push.abs());
+            force_of[i] = push + more.filter(|(of, _)| *of == i).map_or(0.0, |(_, by)| by);
+        }
         (0..nv).filter(|i| !is_free[*i]).for_each(|i| a[i] = passage.a[i]);
         accelerations(&mut promise.machine, p.tau, (&at.q, &at.v), &force_of, &is_free, &mut a);
         at.v.iter_mut().zip(&a).for_each(|(v, a)| *v += p.tau * a);

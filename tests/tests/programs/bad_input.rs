@@ -74,6 +74,21 @@ const FILES: &[(&str, &str, &str, &[&str])] = &[
     ("Panda-reach", "dt = 0.001\npolicy", "dt = 0\npolicy", &["t.toml", "time.dt", "0 s"]),
     ("Panda-reach", "dt = 0.001\npolicy", "dt = -0.001\npolicy", &["t.toml", "time.dt", "-0.001 s"]),
     ("Panda-reach", "dt = 0.001\npolicy", "dt = nan\npolicy", &["t.toml", "time.dt", "NaN s"]),
+    (
+        "Panda-reach",
+        "limit = 10.0",
+        "limit = { panda_joint2 = inf }",
+        &[
+            "t.toml:24 [constraints.acceleration.limit.panda_joint2]: inf is not finite",
+            "give a finite number",
+        ],
+    ),
+    (
+        "Panda-reach",
+        "[state]",
+        "[policy]\njoints = [\"panda_joint1\"]\npose = [\n    nan]\n[state]",
+        &["t.toml:16 [policy.pose[0]]: NaN is not finite"],
+    ),
     ("Panda-reach", "sim_dt = 0.001", "sim_dt = 0.0007", &["time.sim_dt", "whole number", "0.0007 s"]),
     (
         "Panda-reach",
@@ -135,6 +150,23 @@ fn a_bad_task_file_is_refused_with_file_line_and_key() {
     assert_refused(folder.path(), &["project", "missing.toml"], b"", &["missing.toml", "No such file"]);
     std::fs::create_dir(folder.path().join("folder.toml")).expect("folder");
     assert_refused(folder.path(), &["project", "folder.toml"], b"", &["folder.toml", "directory"]);
+}
+
+#[test]
+fn a_robot_file_that_is_refused_is_named() {
+    let folder = folder();
+    let joint = "<joint name=\"hip\" range=\"-1 1\" limited=\"true\"/>";
+    let robot = format!("<mujoco><worldbody><body>{joint}<geom size=\".1\"/></body></worldbody></mujoco>");
+    let step = "<mujoco><option timestep=\"nan\"/>";
+    for (from, to, says) in [
+        ("</body>", "", &["robot.xml: MuJoCo cannot load the robot file: "][..]),
+        ("-1 1", "-inf inf", &["robot.xml holds impossible numbers: joint 'hip' has a range from -inf"]),
+        ("<mujoco>", step, &["robot.xml: <option timestep> of the robot file is NaN s", "above 0"]),
+    ] {
+        assert!(robot.contains(from));
+        std::fs::write(folder.path().join("robot.xml"), robot.replace(from, to)).expect("robot");
+        assert_refused(folder.path(), &["robot", "robot.xml"], b"", says);
+    }
 }
 
 /// Without an environment there is nothing to train on, but a robot and limits are enough to project.

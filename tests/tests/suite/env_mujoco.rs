@@ -1,6 +1,6 @@
 //! The MuJoCo module: errors come back, warnings stay out of files, URDF frames survive.
 
-use nearl_trainer::mj::{MjError, Model, ModelFormat, Options, Sim, last_warning, warnings};
+use nearl_trainer::mj::{MjError, Model, ModelFormat, Options, Scene, Sim, last_warning, warnings};
 
 /// Balls that start apart, in a simulation with `size` of working memory.
 fn balls(size: usize) -> String {
@@ -62,6 +62,38 @@ fn a_robot_that_does_not_compile_is_refused_with_the_reason() {
     assert!(matches!(refused, Err(MjError::Load(_))), "{refused:?}");
     let refused = Model::from_text("not a robot", ModelFormat::Urdf, Options::default());
     assert!(refused.unwrap_err().to_string().starts_with("MuJoCo cannot load the robot file: "));
+}
+
+/// MuJoCo's own sentence names the element and its line at the end, beyond what `mujoco-rs` has room for.
+#[test]
+fn the_reason_is_told_to_its_end() {
+    let folder = tempfile::tempdir().expect("folder");
+    std::fs::write(folder.path().join("words.xml"), "words, and no element").expect("file");
+    let text = "<mujoco>\n  <include file=\"words.xml\"/>\n</mujoco>";
+    let load = |scene: &Scene| {
+        let options = Options::default();
+        Model::with_scene(text, ModelFormat::Mjcf, Some(folder.path()), options, scene)
+            .unwrap_err()
+            .to_string()
+    };
+    for scene in [Scene::default(), Scene { floor: Some(1.0), ..Scene::default() }] {
+        let words = load(&scene);
+        assert!(words.contains("Include error") && words.ends_with("Element 'include', line 2"), "{words}");
+    }
+}
+
+/// A physics step that is none, unless the task says another.
+#[test]
+fn a_timestep_that_is_none_is_refused() {
+    for step in ["nan", "inf", "0", "-0.002"] {
+        let text = PENDULUM.replacen("<mujoco>", &format!("<mujoco><option timestep=\"{step}\"/>"), 1);
+        let load =
+            |sim_dt| Model::from_text(&text, ModelFormat::Mjcf, Options { sim_dt, ..Options::default() });
+        let refused = load(None).unwrap_err();
+        assert!(matches!(refused, MjError::Timestep(_)), "{step}: {refused}");
+        assert!(refused.to_string().contains("<option timestep>"), "{refused}");
+        assert_eq!(load(Some(0.001)).expect("the task's own").sim_dt(), 0.001);
+    }
 }
 
 #[test]

@@ -511,6 +511,41 @@ fn what_the_physics_cannot_say_is_not_inside() {
     assert_eq!(action, [0.9], "nothing better was found");
 }
 
+/// A speed that falls on the way to the corners, and is within its limit about the middle of the range alone: from a corner slopes lead away, and a draw
+/// of 12 numbers does not come there. What is inside costs one step, and a search has an end.
+#[test]
+fn a_search_begins_anew_where_slopes_lead_away() {
+    let steps = std::cell::Cell::new(0);
+    let mut foresee = |action: &[f64], values: &mut [f64]| {
+        steps.set(steps.get() + 1);
+        let away = (action.iter().map(|a| (a - 1.0) * (a - 1.0)).sum::<f64>() / 12.0).sqrt();
+        values[0] = if away < 0.5 { 5.0 * away } else { 3.0 - away };
+        true
+    };
+    let new = || Search::new(vec![Bound::velocity(1.0)], &[(0.0, 2.0); 12], 0);
+    let corner: [f64; 12] = std::array::from_fn(|k| if k % 3 == 0 { 0.0 } else { 2.0 });
+    let (mut found, mut again) = (corner, corner);
+    assert_eq!(new().update(&mut foresee, &mut found), Verdict::Replaced);
+    assert!(found.iter().all(|a| (a - 1.0).abs() < 0.7), "{found:?}");
+    let (mut search, mut inside) = (new(), [1.1; 12]);
+    steps.set(0);
+    assert_eq!(search.update(&mut foresee, &mut inside), Verdict::Kept);
+    assert_eq!((inside, steps.get()), ([1.1; 12], 1));
+    search.update(&mut foresee, &mut again);
+    assert_eq!(found, again, "the same state and action give another result");
+
+    let mut hopeless = |_: &[f64], values: &mut [f64]| {
+        steps.set(steps.get() + 1);
+        values[0] = 2.0;
+        true
+    };
+    let mut left = corner;
+    steps.set(0);
+    assert_eq!(search.update(&mut hopeless, &mut left), Verdict::Outside);
+    assert_eq!(left, corner, "nothing better was found");
+    assert!(steps.get() <= 470, "{} steps", steps.get());
+}
+
 #[test]
 fn actions_that_the_simulator_refuses_are_replaced_by_ones_it_allows() {
     let [without, with, said] = outside("HalfCheetah-v5", 3000);

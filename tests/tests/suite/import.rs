@@ -155,6 +155,21 @@ fn weights_that_are_none_are_named_in_the_file_they_come_from() {
             assert!(error.contains(words), "{error}");
         }
     }
+    // An entry that never varied: the deviation, not what comes of it, and no other checkpoint.
+    const DEVIATION: f64 = 1234.5;
+    let mut snapshot = good.clone();
+    snapshot.networks.normaliser.std[2] = DEVIATION;
+    let mut bytes = export::onnx(&snapshot).expect("exports");
+    let at = bytes.windows(4).position(|w| w == (DEVIATION as f32).to_le_bytes()).expect("the deviation");
+    bytes[at..at + 4].copy_from_slice(&0.0_f32.to_le_bytes());
+    let error = onnx("policy.onnx", &bytes, None, None).expect_err("no deviation");
+    assert!(matches!(&error, ImportError::Deviation { index: 2, .. }), "{error}");
+    let error = error.to_string();
+    assert!(
+        error.contains("policy.onnx: the standard deviation of entry 2 of the input 'obs' is 0")
+            && !error.contains("checkpoint"),
+        "{error}"
+    );
     // A mistake beside the weights: what no reader takes, no writer writes.
     let mut network =
         onnx("policy.onnx", &export::onnx(&good).expect("exports"), None, None).expect("imports");

@@ -3,13 +3,15 @@
 
 use std::path::{Path, PathBuf};
 
+use nearl_runtime::constraints::{Drive, Model};
+use nearl_runtime::motors::Motors;
 use nearl_runtime::{Controller, PolicyKind};
 use nearl_tests::random_policy;
 use nearl_trainer::env::{self, Env};
 use nearl_trainer::learn::Algorithm;
 use nearl_trainer::rollout::{make_env, stream};
 use nearl_trainer::train::{Request, Training, advice, complete, train};
-use nearl_trainer::{evaluate, tasks};
+use nearl_trainer::{evaluate, robot, tasks};
 use rand::RngExt;
 
 fn fixture(name: &str) -> String {
@@ -218,13 +220,70 @@ fn analytic_inverse_dynamics_wants_motors_of_the_controllable_joints() {
         (
             ELBOW,
             "<general joint=\"elbow\" dyntype=\"filter\" dynprm=\"0.1\" ctrlrange=\"-30 30\"/>",
-            "it has dynamics of its own",
+            "it has dynamics of its own; take a <motor> in its place, or use idm.kind = \"learned\"",
+        ),
+        (
+            ELBOW,
+            "<motor joint=\"elbow\" gear=\"0\" ctrlrange=\"-30 30\"/>",
+            "motor 'elbow' on joint 'elbow' has gear 0 and gives none; write another number into the robot file",
+        ),
+        (
+            ELBOW,
+            "<motor name=\"e\" joint=\"elbow\" ctrlrange=\"1 5\"/>",
+            "the ctrlrange of motor 'e' on joint 'elbow' is 1 to 5, which gives no torque one way; write a range that begins below 0",
         ),
         ("<actuator>", &format!("<actuator>{ELBOW}"), "but the actuators drive elbow, shoulder, elbow;"),
     ] {
         let message = refusal(from, to);
         assert!(if says.is_empty() { message.is_empty() } else { message.contains(says) }, "{to}: {message}");
     }
+    // Without a torque limit, where the torque is turned into a control.
+    with_motors(folder.path(), ELBOW, "<motor name=\"e\" joint=\"elbow\" gear=\"0\" ctrlrange=\"-30 30\"/>");
+    let described = robot::read_mjcf(&folder.path().join("two_link.xml")).expect("described");
+    let model = Model::from_description(described).expect("a robot");
+    let message = Motors::new(&model, &[0, 1], &[Drive::Effort; 2]).expect_err("no torque");
+    assert!(
+        message.ends_with(
+            "it has gear 0; write another number into the robot file, or use idm.kind = \"learned\""
+        ),
+        "{message}"
+    );
+}
+
+/// Keyframes and ranges do not say where an episode begins: the file's initial positions do, or `[reset]`.
+#[test]
+fn where_episodes_begin_is_told_until_the_task_says_it() {
+    let folder = tempfile::tempdir().expect("folder");
+    let range = "range=\"-2.2 2.2\"";
+    let task = with_motors(folder.path(), range, "range=\"0.25 2.2\"");
+    let file = folder.path().join("two_link.xml");
+    let robot = std::fs::read_to_string(&file).expect("robot");
+    let keys = "<keyframe><key qpos=\"0 0\"/><key name=\"home\" qpos=\"0 1.25\"/></keyframe></mujoco>";
+    let robot = robot.replace("</mujoco>", keys);
+    std::fs::write(&file, &robot).expect("robot");
+    let notes = |set: &[&str]| {
+        let set: Vec<String> = set.iter().map(|s| (*s).to_string()).collect();
+        tasks::load(&task, &set).expect("task").robot.notes.join("; ")
+    };
+    let keyframe = "keyframes are not read ('number 0', 'home'): episodes begin at the robot file's initial positions; to begin at 'home', write \
+                    q = { elbow = 1.25 } in [reset]";
+    let outside = "episodes begin outside of the range of 'elbow' (0 rad, 0.25 to 2.2); write positions inside in [reset], such as q = { elbow = 0.25 }";
+    assert_eq!(notes(&[]), format!("{keyframe}; {outside}"));
+    assert_eq!(notes(&["reset.q={ shoulder = 0.1 }"]), outside);
+    assert_eq!(notes(&["reset.q={ elbow = 1.25 }"]), "");
+    // As they say, so it is.
+    let begins = |set: &[String]| {
+        let manifest = tasks::load(&task, set).expect("task");
+        let mut env = env::of_task(&manifest, "mine").expect("environment");
+        env.reset(&mut stream(1, 0)).expect("reset");
+        env.qpos()[1]
+    };
+    assert_eq!(begins(&[]), 0.0);
+    assert_eq!(begins(&["reset.q={ elbow = 1.25 }".to_string()]), 1.25);
+    // A model without a task begins nowhere.
+    assert!(robot::read_mjcf_text(&robot).expect("described").notes.is_empty());
+    let told = robot::simulated_alone(&file).expect("told").join("; ");
+    assert!(told.contains(keyframe) && told.contains(outside), "{told}");
 }
 
 const ELBOW: &str = "<motor joint=\"elbow\" ctrlrange=\"-30 30\"/>";

@@ -1,10 +1,14 @@
-//! The search for an action whose step ends within bounds: by slopes, then among drawn ones. What a step leads to, the caller says.
+//! The search for an action whose step ends within bounds: by slopes, then among drawn ones, from several starts. What a step leads to, the caller says.
 
 use super::Nearest;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
+/// Searches, each from the best action so far, which is the one asked for at first.
+const STARTS: usize = 4;
+/// The one that begins in the middle of the range instead: a search goes on near its start, and there slopes are other ones.
+const FROM_MIDDLE: usize = 2;
 /// Actions tried by linearised dynamics, one after the other.
 const ROUNDS: usize = 4;
 /// Actions drawn where these do not do.
@@ -71,8 +75,9 @@ pub struct Search {
     /// Of the drawn actions.
     seed: u64,
     nearest: Nearest,
-    /// Actions in units of their half ranges: as asked for, under trial, best so far, and moved in one entry.
+    /// Actions in units of their half ranges: as asked for, at a start, under trial, best so far, and beside one of these.
     asked: Vec<f64>,
+    start: Vec<f64>,
     trial: Vec<f64>,
     best: Vec<f64>,
     beside: Vec<f64>,
@@ -94,6 +99,7 @@ impl Search {
         Search {
             nearest: Nearest::new(n, m),
             asked: zero(),
+            start: zero(),
             trial: zero(),
             best: zero(),
             beside: zero(),
@@ -123,9 +129,20 @@ impl Search {
             *asked = ((a - middle) / half).clamp(-1.0, 1.0);
         }
         self.best.copy_from_slice(&self.asked);
-        let mut least = if first.is_finite() { self.by_slopes(foresee, first) } else { first };
-        if least > 0.0 {
-            least = self.by_draws(foresee, least);
+        // The same draws in every tick: what is sent depends on state and action alone.
+        let (mut least, mut rng) = (first, ChaCha8Rng::seed_from_u64(self.seed));
+        for start in 0..STARTS {
+            match start {
+                FROM_MIDDLE => self.start.fill(0.0),
+                _ => self.start.copy_from_slice(&self.best),
+            }
+            least = self.by_slopes(foresee, least);
+            if least > 0.0 {
+                least = self.by_draws(foresee, &mut rng, least);
+            }
+            if least <= 0.0 {
+                break;
+            }
         }
         if least < first {
             for (a, (best, (middle, half))) in action.iter_mut().zip(self.best.iter().zip(&self.range)) {
@@ -136,11 +153,19 @@ impl Search {
         if least <= 0.0 { Verdict::Replaced } else { Verdict::Outside }
     }
 
-    /// Newton's way: the nearest action by dynamics linearised at the last one, confirmed by a step. Least excess of those tried.
+    /// Newton's way: the action nearest to the start by dynamics linearised at the last one, confirmed by a step. Least excess of those tried.
     fn by_slopes(&mut self, foresee: &mut Foresee, first: f64) -> f64 {
         let (n, mut least) = (self.range.len(), first);
-        self.trial.copy_from_slice(&self.asked);
-        for _ in 0..ROUNDS {
+        self.trial.copy_from_slice(&self.start);
+        for round in 0..=ROUNDS {
+            self.beside.copy_from_slice(&self.trial);
+            let excess = self.ahead(foresee);
+            if excess < least {
+                (least, _) = (excess, self.best.copy_from_slice(&self.trial));
+            }
+            if excess <= 0.0 || excess.is_infinite() || round == ROUNDS {
+                break;
+            }
             for k in 0..n {
                 self.beside.copy_from_slice(&self.trial);
                 let step = if self.trial[k] > 0.0 { -STEP } else { STEP };
@@ -153,34 +178,20 @@ impl Search {
                     self.slope[r * n + k] = (aside - at) / step;
                 }
             }
-            let Search { nearest, slope, bounds, at, trial, asked, .. } = self;
-            nearest.solve(asked, trial, slope, |r| {
+            let Search { nearest, slope, bounds, at, trial, start, .. } = self;
+            nearest.solve(start, trial, slope, |r| {
                 let (bound, inside) = (&bounds[r], INSIDE * bounds[r].size);
                 [bound.lower + inside - at[r], bound.upper - inside - at[r]]
             });
             self.trial.copy_from_slice(self.nearest.solution());
-            self.beside.copy_from_slice(&self.trial);
-            self.scale();
-            if !foresee(&self.action, &mut self.at) {
-                return least;
-            }
-            let excess = self.excess(&self.at);
-            if excess < least {
-                (least, _) = (excess, self.best.copy_from_slice(&self.trial));
-            }
-            if excess <= 0.0 {
-                break;
-            }
         }
         least
     }
 
     /// Draws around the best, over the whole range and from its corners, in turn; the nearest that is inside, else the least far outside.
-    fn by_draws(&mut self, foresee: &mut Foresee, first: f64) -> f64 {
+    fn by_draws(&mut self, foresee: &mut Foresee, rng: &mut ChaCha8Rng, first: f64) -> f64 {
         let (mut least, mut nearest) = (first, f64::INFINITY);
         let around = self.best.clone();
-        // The same draws in every tick: what is sent depends on state and action alone.
-        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         for draw in 0..DRAWS {
             for (k, u) in self.beside.iter_mut().enumerate() {
                 let r: f64 = rng.random_range(-1.0..1.0);
@@ -190,11 +201,7 @@ impl Search {
                     _ => r.signum(),
                 };
             }
-            self.scale();
-            if !foresee(&self.action, &mut self.at) {
-                continue;
-            }
-            let excess = self.excess(&self.at);
+            let excess = self.ahead(foresee);
             let way: f64 = self.beside.iter().zip(&self.asked).map(|(a, b)| (a - b) * (a - b)).sum();
             if (excess <= 0.0 && way < nearest) || (nearest.is_infinite() && excess < least) {
                 least = excess.min(least);
@@ -206,6 +213,12 @@ impl Search {
             }
         }
         least
+    }
+
+    /// Excess after a step under `beside`, whose values are then in `at`; infinite where the physics cannot be believed.
+    fn ahead(&mut self, foresee: &mut Foresee) -> f64 {
+        self.scale();
+        if foresee(&self.action, &mut self.at) { self.excess(&self.at) } else { f64::INFINITY }
     }
 
     /// Writes `beside` in units of the action.

@@ -3,7 +3,7 @@
 use super::{ImportError, ImportedNetwork};
 use super::{deploy, metadata};
 use crate::blank::commands;
-use crate::robot::{describe, describe_simulated, folder_of};
+use crate::robot::{describe, describe_in_task, folder_of};
 use crate::scene;
 use nearl_runtime::constraints::description::JointKind;
 use nearl_runtime::constraints::{Drive, Model, RobotDescription, StateLayout, read_task_text, read_text};
@@ -69,14 +69,17 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
     complete(&mut table, setting, simulation.format);
     let free = table.get("model").and_then(|m| m.get("free_flyer")).and_then(Value::as_bool).unwrap_or(false);
     // As the task is simulated.
-    let robot = if table.contains_key("scene") || table.contains_key("reward") {
-        let task = Task::merged(table.clone(), &files).map_err(|e| ImportError::Recipe(e.to_string()))?;
-        let add = scene::of(&task, &simulation)
-            .map_err(|m| recipe(&said_by, &format!("[{}] {}", m.key, m.reason)))?;
-        describe_simulated(&simulation, free, &add).map_err(|e| unusable(setting.robot, &e))?
-    } else {
-        described(&simulation, free, setting.robot)?
+    let add = match table.contains_key("scene") || table.contains_key("reward") {
+        false => None,
+        true => {
+            let task = Task::merged(table.clone(), &files).map_err(|e| ImportError::Recipe(e.to_string()))?;
+            let add = scene::of(&task, &simulation);
+            Some(add.map_err(|m| recipe(&said_by, &format!("[{}] {}", m.key, m.reason)))?)
+        }
     };
+    let reset = table.get("reset").and_then(Value::as_table).cloned().unwrap_or_default();
+    let robot =
+        describe_in_task(&simulation, free, add.as_ref(), &reset).map_err(|e| unusable(setting.robot, &e))?;
     let unusable = |e: &dyn std::fmt::Display| unusable(setting.robot, e);
     let model = Model::from_description(robot.clone()).map_err(|e| unusable(&e))?;
     state(&mut table, &model, &files)?;
@@ -199,9 +202,8 @@ fn complete(table: &mut Table, setting: &Setting<'_>, format: ModelFormat) {
     default("model", Table::new().into());
     default("time", Table::new().into());
     default("idm", Table::from_iter([("kind".to_string(), Value::from("pinocchio"))]).into());
-    let torque = Table::from_iter([("scale".to_string(), Value::from(1.0))]);
-    let constraints = [("guard".to_string(), Value::from(true)), ("torque".to_string(), Value::from(torque))];
-    default("constraints", Table::from_iter(constraints).into());
+    // A limit that is not named does not hold.
+    default("constraints", Table::new().into());
     let key = if format == ModelFormat::Mjcf { "mjcf" } else { "urdf" };
     if let Some(model) = table.get_mut("model").and_then(Value::as_table_mut) {
         model.insert(key.into(), setting.robot.display().to_string().into());

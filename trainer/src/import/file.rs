@@ -80,6 +80,10 @@ fn check_values(
         let found = first(&mut tensor.values.iter().copied())?;
         Some((proto.name.clone().unwrap_or_default(), found))
     });
+    if let (None, Some(index)) = (&of_file, network.std.iter().position(|std| *std == 0.0)) {
+        let (file, input) = (file.into(), network.input_name.clone());
+        return Err(ImportError::Deviation { file, input, index }.in_one_line());
+    }
     let (tensor, (index, value)) = of_file.unwrap_or(part);
     let single = value as f32;
     let value = match f64::from(single) == value {

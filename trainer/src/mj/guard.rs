@@ -5,11 +5,14 @@
 //! MuJoCo's C frames back to [`catching`]; the functions called there are declared `C-unwind` for that reason, and the
 //! simulation must be reset afterwards, because MuJoCo was left in the middle of a computation.
 
+use std::ffi::{CStr, CString, c_char, c_int};
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::path::Path;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use mujoco_rs::mujoco_c::{mjData, mjModel};
+use mujoco_rs::mujoco_c::{mj_deleteModel, mj_loadXML, mjData, mjModel};
+use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::mj_logging::{MjLogMessage, MjtLogLevel};
 
 use super::MjError;
@@ -111,6 +114,30 @@ fn text(message: &MjLogMessage) -> String {
         Some(function) if !function.is_empty() => format!("{function}: {subject}"),
         _ => subject,
     }
+}
+
+/// Bytes of an explanation that `mujoco-rs` hands on.
+const HANDED_ON: usize = 99;
+/// Bytes of the longest explanation that MuJoCo writes.
+const MOST: usize = 1024;
+
+/// Why MuJoCo does not load the file `path` of `files`; `said` is as much as `mujoco-rs` hands on. Where that may be less than all, MuJoCo is asked
+/// again.
+pub(super) fn refused(path: &Path, files: &MjVfs, said: &str) -> MjError {
+    let whole = if said.len() < HANDED_ON { None } else { explanation(path, files) };
+    MjError::Load(one_line(whole.as_deref().unwrap_or(said)))
+}
+
+fn explanation(path: &Path, files: &MjVfs) -> Option<String> {
+    let path = CString::new(path.to_str()?).ok()?;
+    let mut room: [c_char; MOST] = [0; MOST];
+    // SAFETY: the path ends with a zero, `room` is as long as is said and ends with one, and a model that is loaded all the same is given back.
+    let words = unsafe {
+        let model = mj_loadXML(path.as_ptr(), files.ffi(), room.as_mut_ptr(), MOST as c_int);
+        mj_deleteModel(model);
+        CStr::from_ptr(room.as_ptr())
+    };
+    Some(words.to_string_lossy().into_owned()).filter(|words| !words.is_empty())
 }
 
 /// MuJoCo's words without its line breaks.

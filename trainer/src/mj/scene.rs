@@ -7,7 +7,7 @@ use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::mj_editing::{MjSpec, MjtLimited, PositionConfig, SpecItem};
 use mujoco_rs::wrappers::mj_model::{MjModel, MjtGeomBase, MjtJoint, MjtTrn};
 
-use super::{MjError, guard, terrain};
+use super::{MjError, as_file, guard, terrain};
 
 /// Things of a task that are not in its robot file. The default adds nothing.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -72,16 +72,15 @@ pub(super) fn words(e: MjEditError) -> MjError {
 
 /// What [`compile`] compiles, and the files that it names.
 pub(super) fn specify(text: &str, folder: Option<&Path>, scene: &Scene) -> Result<(MjSpec, MjVfs), MjError> {
-    let mut files = MjVfs::new();
-    let mut spec = match folder {
-        None => MjSpec::from_xml_string(text).map_err(words)?,
-        Some(folder) => {
-            let path = folder.join("nearl-robot.xml");
-            let added = files.add_from_buffer(&path, text.as_bytes());
-            added.map_err(|e| MjError::Load(guard::one_line(&e.to_string())))?;
-            MjSpec::from_xml_vfs(&path, &files).map_err(words)?
-        }
+    let (path, files) = as_file(text, folder)?;
+    let parsed = match folder {
+        None => MjSpec::from_xml_string(text),
+        Some(_) => MjSpec::from_xml_vfs(&path, &files),
     };
+    let mut spec = parsed.map_err(|e| match e {
+        MjEditError::ParseFailed(said) => guard::refused(&path, &files, &said),
+        other => words(other),
+    })?;
     scene.add_to(&mut spec)?;
     Ok((spec, files))
 }

@@ -5,7 +5,6 @@ use super::parts::unusable;
 use crate::arrival::Arrivals;
 use crate::motors::Motors;
 use crate::snapshot::{Manifest, SnapshotError};
-use nearl_constraints::drive::Held;
 use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposal, StateLayout, Target};
 
 /// Forward, project, back. With `S_c` the controllable dofs, whose motors the action (n_act) drives:
@@ -23,14 +22,12 @@ pub(super) struct Guard {
     pub(super) projector: Projector,
     dynamics: PeriodDynamics,
     dofs: Vec<usize>,
-    /// By dof (nv).
-    drives: Vec<Drive>,
     motors: Motors,
     arrivals: Arrivals,
     pub(super) proposal: Proposal,
     /// Configuration index of each dof that is a joint of its own.
     single: Vec<Option<usize>>,
-    held: Vec<Held>,
+    commands: Vec<f64>,
     tau: Vec<f64>,
     a: Vec<f64>,
     /// Tangent displacement of the period, and where it leads.
@@ -58,10 +55,9 @@ impl Guard {
             dynamics: PeriodDynamics::new(model, &dofs, m.task.period()),
             proposal: Proposal::new(model),
             single: single.collect(),
-            held: vec![Held::Force(0.0); nv],
+            commands: vec![0.0; nv],
             tau: vec![0.0; nv],
-            arrivals: Arrivals::new(m, model, &dofs, &drives, true),
-            drives,
+            arrivals: Arrivals::new(m, model, &dofs, (&drives, &motors), true),
             motors,
             a: vec![0.0; nv],
             step: vec![0.0; nv],
@@ -75,8 +71,7 @@ impl Guard {
     /// is that state with its ledger. With `hold` off the action stays and `next` is where it leads.
     pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], next: &mut Target, hold: bool) {
         self.dynamics.update(q, v, self.projector.external_forces());
-        self.foresee(q, v, action);
-        let beyond = self.arrivals.go_beyond(self.projector.limits());
+        let beyond = self.foresee(q, v, action);
         self.projector.project(q, v, &self.proposal, next);
         if !hold {
             self.projector.pass(q, v, &self.proposal, next);
@@ -96,18 +91,15 @@ impl Guard {
         }
     }
 
-    /// Writes the proposal: the state at the end of the period under `action`.
-    fn foresee(&mut self, q: &[f64], v: &[f64], action: &[f64]) {
+    /// Writes the proposal: the state at the end of the period under `action`. Returns what [`Arrivals::foresee`] does.
+    fn foresee(&mut self, q: &[f64], v: &[f64], action: &[f64]) -> bool {
         let period = *self.dynamics.period();
         let (t, kappa) = (period.dt, period.kappa);
         for (k, &i) in self.dofs.iter().enumerate() {
-            let at = q[self.single[i].unwrap_or(0)];
-            let command = self.motors.command(k, action[self.motors.place(k)]);
-            self.held[i] = self.drives[i].held(&period, at, v[i], command);
+            self.commands[i] = self.motors.command(k, action[self.motors.place(k)]);
         }
-        if !self.arrivals.foresee((q, v), self.projector.external_forces(), &self.held, &mut self.a) {
-            self.dynamics.accelerate(&self.held, &mut self.a);
-        }
+        let by = (&mut self.dynamics, self.projector.external_forces());
+        let beyond = self.arrivals.foresee((q, v), by, &self.commands, self.projector.limits(), &mut self.a);
         for i in 0..v.len() {
             let y = t * self.a[i];
             self.proposal.v[i] = v[i] + y;
@@ -121,6 +113,7 @@ impl Guard {
                 self.proposal.q[iq] = q[iq] + self.step[i];
             }
         }
+        beyond
     }
 
     /// Whether the target differs from the proposal in a controllable joint.
