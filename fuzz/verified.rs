@@ -46,6 +46,7 @@ pub fn flight() -> Attack {
         pause: Duration::ZERO,
         lost: 0,
         lag: 0.0,
+        drive_damping: 0.0,
     }
 }
 

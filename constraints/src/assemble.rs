@@ -90,6 +90,7 @@ impl Tree {
             effort: none,
             armature: zero.clone(),
             damping: zero.clone(),
+            drive_damping: zero.clone(),
             stiffness: zero.clone(),
             spring_reference: zero.clone(),
             friction: zero,
@@ -124,6 +125,7 @@ impl Inner {
             self.effort[i] = joint.effort.unwrap_or(f64::INFINITY).min(strength);
             self.armature[i] = joint.armature;
             self.damping[i] = joint.damping;
+            self.drive_damping[i] = joint.drive_damping;
             self.stiffness[i] = joint.stiffness;
             self.spring_reference[i] = joint.spring_reference;
             self.friction[i] = if nv == 1 { joint.friction } else { 0.0 };

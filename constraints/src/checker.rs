@@ -304,6 +304,11 @@ impl Checker {
         rows.chain(self.cones.iter().filter(|c| c.hard).map(|c| c.cone.kind())).collect()
     }
 
+    /// Whether hard rows can be broken by joints that brake as they may ([`Rows::needs_a_brake`]).
+    pub(crate) fn needs_a_brake(&self) -> bool {
+        self.rows.iter().any(|r| r.hard && r.rows.needs_a_brake())
+    }
+
     /// Names and dofs of the hard limits whose joints a brake slows down in proportion.
     pub(crate) fn in_proportion(&self) -> impl Iterator<Item = (Vec<String>, Vec<usize>)> {
         let hard = self.rows.iter().filter(|r| r.hard);

@@ -84,6 +84,10 @@ pub struct JointDescription {
     pub effort: Option<f64>,
     /// Viscous damping [N·m·s/rad or N·s/m].
     pub damping: f64,
+    /// What the drives of its motors damp, where a physics step of the plant takes that implicitly beside `damping`, as MuJoCo's `implicitfast`
+    /// does [N·m·s/rad or N·s/m]. It is part of the motors' forces.
+    #[serde(default, skip_serializing_if = "is_none")]
+    pub drive_damping: f64,
     /// Spring [N·m/rad or N/m].
     pub stiffness: f64,
     /// Position at which the spring is at rest [rad or m].
@@ -98,6 +102,10 @@ pub struct JointDescription {
     /// What dry friction is taken to be.
     #[serde(default, skip_serializing_if = "is_mujoco")]
     pub friction_law: FrictionLaw,
+}
+
+fn is_none(damping: &f64) -> bool {
+    *damping == 0.0
 }
 
 fn is_mujoco(law: &FrictionLaw) -> bool {
@@ -189,6 +197,7 @@ impl JointDescription {
             velocity: None,
             effort: None,
             damping: 0.0,
+            drive_damping: 0.0,
             stiffness: 0.0,
             spring_reference: 0.0,
             armature: 0.0,

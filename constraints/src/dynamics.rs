@@ -143,13 +143,14 @@ impl Dynamics {
         self.middle = m;
     }
 
-    /// `step = M^-1 (M + tau_s D) a`: the acceleration that an Euler step implicit in the damping begins with to end with `a`.
+    /// `step = M^-1 (M + tau_s D) a`: the acceleration that an Euler step implicit in the damping `D` of joints and drives begins with to end
+    /// with `a`.
     fn before_dampers(&mut self, period: &Period, q: &[f64], v: &[f64], a: &[f64], m: &mut Middle) {
         m.step.copy_from_slice(a);
-        if period.tau > 0.0 && self.model.damping().iter().any(|d| *d > 0.0) {
+        if (0..a.len()).any(|i| period.implicit(&self.model, i) > 0.0) {
             self.rnea(q, v, a, &mut m.force);
             for (i, force) in m.force.iter_mut().enumerate() {
-                *force += period.tau * self.model.damping()[i] * a[i];
+                *force += period.implicit(&self.model, i) * a[i];
             }
             self.aba(q, v, &m.force, &mut m.step);
         }

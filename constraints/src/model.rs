@@ -54,6 +54,7 @@ pub(crate) struct Inner {
     pub(crate) effort: Vec<f64>,
     pub(crate) armature: Vec<f64>,
     pub(crate) damping: Vec<f64>,
+    pub(crate) drive_damping: Vec<f64>,
     pub(crate) stiffness: Vec<f64>,
     pub(crate) spring_reference: Vec<f64>,
     pub(crate) friction: Vec<f64>,
@@ -228,6 +229,12 @@ impl Model {
     /// [`crate::Period::resistance`].
     pub fn damping(&self) -> &[f64] {
         &self.0.damping
+    }
+
+    /// What drives damp (nv) [N·m·s/rad or N·s/m], where a physics step takes that implicitly: it acts on the change of the velocity within the step
+    /// ([`crate::Period::resistance`]), and its motor's force has the rest.
+    pub fn drive_damping(&self) -> &[f64] {
+        &self.0.drive_damping
     }
 
     /// Joint springs (nv) [N·m/rad or N/m].

@@ -65,7 +65,7 @@ impl PeriodDynamics {
             dynamics: Dynamics::new(model),
             period,
             rubs,
-            dampers: period.tau > 0.0 && model.damping().iter().any(|d| *d > 0.0),
+            dampers: (0..nv).any(|i| period.implicit(model, i) > 0.0),
             driven: driven.to_vec(),
             loose,
             v: vec![0.0; nv],
@@ -89,9 +89,9 @@ impl PeriodDynamics {
         if self.rubs && self.dampers {
             let nv = v.len();
             self.dynamics.mass(q, &mut self.matrix);
-            let damping = self.dynamics.model().damping();
+            let model = self.dynamics.model();
             self.before.fill(0.0);
-            (0..nv).for_each(|i| self.before[i * nv + i] = self.period.tau * damping[i]);
+            (0..nv).for_each(|i| self.before[i * nv + i] = self.period.implicit(model, i));
             solve(nv, nv, &mut self.matrix, &mut self.before);
             (0..nv).for_each(|i| self.before[i * nv + i] += 1.0);
         }

@@ -22,7 +22,8 @@ use crate::{Dynamics, LimitSet, Model, Period, PeriodDynamics};
 pub struct PhysicsSteps {
     /// Of one physics step.
     step: PeriodDynamics,
-    /// The same by the articulated-body algorithm alone, where no joint rubs: of the robot whose joints have `tau_s D` more inertia.
+    /// The same by the articulated-body algorithm alone, where no joint rubs: of the robot whose joints have `tau_s D` more inertia, `D` that of
+    /// joints and drives together.
     quick: Option<Dynamics>,
     period: Period,
     /// Configuration index of each dof that is a joint of its own.
@@ -557,7 +558,7 @@ fn quick(model: &Model, tau: f64) -> Option<Dynamics> {
     }
     let mut description = model.description().clone();
     for joint in description.bodies.iter_mut().flat_map(|body| &mut body.joints) {
-        joint.armature += tau * joint.damping;
+        joint.armature += tau * (joint.damping + joint.drive_damping);
     }
     Model::from_description(description).ok().map(|model| Dynamics::new(&model))
 }

@@ -155,6 +155,11 @@ pub trait Rows: Send {
         false
     }
 
+    /// True when joints that brake as they may can break the rows, whatever their motors give: a brake has to be stored for them.
+    fn needs_a_brake(&self) -> bool {
+        false
+    }
+
     /// True when what the rows keep is of the state that a motion ends in, so that a measured state may be beyond it already and come back.
     /// False when it is of the motion: no state is beyond it then.
     fn of_state(&self) -> bool {

@@ -68,9 +68,16 @@ impl Period {
     /// What the damper and the spring of dof `i` add to the mass matrix's diagonal when the acceleration is constant over the period:
     /// `kappa T D + (T^2 - tau^2) / 6 K`, for they meet the velocity `v + kappa T a` and the configuration
     /// `q + (T - tau) / 2 v + (T^2 - tau^2) / 6 a` on average. With one sub-step it is `T D`: MuJoCo's Euler step, which is implicit in the
-    /// damping.
+    /// damping. Drives whose damping a step takes implicitly add `tau` times that.
     pub fn resistance(&self, model: &Model, i: usize) -> f64 {
-        self.kappa * self.dt * model.damping()[i] + self.sag() * model.stiffness()[i]
+        self.kappa * self.dt * model.damping()[i]
+            + self.sag() * model.stiffness()[i]
+            + self.tau * model.drive_damping()[i]
+    }
+
+    /// What is implicit of the dampers of dof `i` in a physics step, as an inertia: `tau (D + D_drive)` [kg·m² or kg].
+    pub(crate) fn implicit(&self, model: &Model, i: usize) -> f64 {
+        self.tau * (model.damping()[i] + model.drive_damping()[i])
     }
 }
 

@@ -112,6 +112,30 @@ def test_motors_reckon_with_euler_s_implicit_damping(pair, rng) -> None:
     theirs.opt.enableflags = flags
 
 
+SERVOS = """<mujoco><option timestep="0.004" integrator="implicitfast"/><worldbody>
+<body><joint name="a" axis="0 1 0" damping="0.4" armature="0.01"/><geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 0" mass="1"/>
+<body pos="0.3 0 0"><joint name="b" axis="1 1 0" damping="0.1"/><geom type="capsule" size="0.03" fromto="0 0 0 0.2 0 0" mass="0.5"/></body></body></worldbody>
+<actuator><position joint="a" kp="90" kv="30" forcerange="-40 40"/><position joint="b" kp="20" kv="2" forcerange="-8 8"/></actuator></mujoco>"""
+
+
+def test_motors_reckon_with_drives_whose_damping_a_step_takes_implicitly(tmp_path: Path, rng) -> None:
+    """What MuJoCo's drives give at the start of a step of `implicitfast` is what its change of velocity asks for."""
+    (tmp_path / "servos.xml").write_text(SERVOS)
+    ours, theirs = nearl.Model.from_mjcf(tmp_path / "servos.xml"), mujoco.MjModel.from_xml_string(SERVOS)
+    dt, tried = theirs.opt.timestep, 0
+    for data in states(theirs, rng):
+        data.ctrl[:] = data.qpos + rng.uniform(-0.3, 0.3, 2)
+        q, v = data.qpos.copy(), data.qvel.copy()
+        mujoco.mj_step(theirs, data)
+        force, a = data.actuator_force, (data.qvel - v) / dt
+        if (np.abs(force) < [40, 8]).all():
+            close(ours.motors(q, v, a, dt), force, 1e-10)
+            tried += 1
+        explicit = ours.rnea(q, v, a) - ours.passive(q, v)
+        assert np.abs(explicit - force).max() > 0.01, "what is implicit does not show"
+    assert tried > 20
+
+
 def test_integrate_and_difference_invert_each_other(pair, rng) -> None:
     ours, theirs = pair
     for data in states(theirs, rng, 10):

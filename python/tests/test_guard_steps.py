@@ -34,11 +34,12 @@ def arm(rng: np.random.Generator, timestep: float, integrator: str) -> tuple[str
     return text, ranges
 
 
-def with_drives(text: str, ranges: np.ndarray, rng: np.random.Generator, speeds: list[float]) -> tuple[str, str]:
-    """The arm with drives of targets in place of its motors, whose joints would swing at one of these `speeds` [rad/s] alone, and `[command]`."""
+def with_drives(text: str, ranges: np.ndarray, rng: np.random.Generator, speeds: list[float], more: float = 1.0) -> tuple[str, str]:
+    """The arm with drives of targets in place of its motors, whose joints would swing at one of these `speeds` [rad/s] alone, and `[command]`. They damp
+    `more` than a tenth to all of what it takes to creep."""
     model = mujoco.MjModel.from_xml_string(text)
     data, n = mujoco.MjData(model), len(ranges)
-    w, share = rng.choice(speeds, n), rng.choice([0.1, 0.5, 1.0], n)
+    w, share = rng.choice(speeds, n), more * rng.choice([0.1, 0.5, 1.0], n)
     inertia = np.full(n, np.inf)
     for _ in range(20):
         data.qpos[:] = rng.uniform(ranges[:, 0], ranges[:, 1])
@@ -48,10 +49,17 @@ def with_drives(text: str, ranges: np.ndarray, rng: np.random.Generator, speeds:
         inertia = np.minimum(inertia, 1.0 / np.diag(np.linalg.inv(mass)))
     stiffness, damping = (w * w * inertia).round(4), (2.0 * share * w * inertia).round(5)
     for i in range(n):
-        drive = f'<position name="m{i}" joint="j{i}" kp="{stiffness[i]}" kv="{damping[i]}" ctrlrange="-30 30" forcerange="-300 300"/>'
+        drive = f'<position name="m{i}" joint="j{i}" kp="{stiffness[i]}" kv="{damping[i]}" ctrlrange="-1e5 1e5" forcerange="-300 300"/>'
         text = re.sub(rf'<motor name="m{i}"[^>]*/>', drive, text)
     gains = [", ".join(f"j{i} = {gain}" for i, gain in enumerate(gains)) for gains in (stiffness, damping)]
     return text, f'interface = "pd"\nstiffness = {{ {gains[0]} }}\ndamping = {{ {gains[1]} }}'
+
+
+def within_ranges(text: str, ranges: np.ndarray) -> str:
+    """The arm whose targets end where its joints do."""
+    for i, (low, high) in enumerate(ranges):
+        text = re.sub(rf'(<position name="m{i}"[^>]*)ctrlrange="[^"]*"', rf'\1ctrlrange="{low} {high}"', text)
+    return text
 
 
 def task(folder: Path, n: int, dt: float, sim_dt: float, margin: float = 0.0, command: str = 'interface = "effort"') -> Path:
@@ -116,8 +124,17 @@ def test_unknown_arms_stay_within_their_limits(tmp_path: Path, seed: int, integr
     assert touched > 10, "no joint came to the end of its range"
 
 
-def attack(folder: Path, text: str, steps: int, rng: np.random.Generator, accelerations: float | np.ndarray = ACCELERATION, far: float = 300.0) -> None:
-    """Pushes onto the limits of the task in `folder`, and steps the simulator beside it, whose joints keep to their ranges, speeds and accelerations."""
+def attack(
+    folder: Path,
+    text: str,
+    steps: int,
+    rng: np.random.Generator,
+    accelerations: float | np.ndarray = ACCELERATION,
+    far: float = 300.0,
+    ends: str = "position",
+) -> None:
+    """Pushes onto the limits of the task in `folder`, and steps the simulator beside it, whose joints keep to their ranges, speeds and accelerations.
+    Some joint must come to the end of its range of positions, or some drive to that of its targets where `ends` says so."""
     envs = nearl.make_vec(folder / "arm.toml", 1, constraints="task", actions="guarded")
     model = mujoco.MjModel.from_xml_string(text)
     data, dt, n = mujoco.MjData(model), model.opt.timestep * steps, model.nv
@@ -137,20 +154,52 @@ def attack(folder: Path, text: str, steps: int, rng: np.random.Generator, accele
             assert (data.qpos >= low).all() and (data.qpos <= high).all(), f"tick {tick}, within it: {data.qpos}"
         assert np.abs(data.qvel).max() <= SPEED * (1 + 1e-9), f"tick {tick}: {data.qvel}"
         assert (np.abs(data.qvel - before) / dt <= accelerations + 1e-7).all(), f"tick {tick}: {data.qvel - before}"
-        touched += int((np.minimum(data.qpos - low, high - data.qpos) < near).any())
-    assert touched > 10, "no joint came to the end of its range"
+        room = np.minimum(data.qpos - low, high - data.qpos) - near
+        if ends == "target":
+            room = np.minimum(data.ctrl - model.actuator_ctrlrange[:, 0], model.actuator_ctrlrange[:, 1] - data.ctrl) - 1e-6
+        touched += int((room < 0).any())
+    assert touched > 10, f"nothing came to the end of its range of {ends}s"
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5])
+def test_targets_are_kept_within_the_range_of_their_drives(tmp_path: Path, seed: int, integrator: str, recwarn: pytest.WarningsRecorder) -> None:
+    """A target that is cut at the `ctrlrange` of its drive brakes the joint harder than its limit: most robot files end it where the joint ends."""
+    rng = np.random.default_rng(seed)
+    text, ranges = arm(rng, 0.005, integrator)
+    text, command = with_drives(text, ranges, rng, [30.0, 80.0], 3.0)
+    text = within_ranges(text, ranges)
+    (tmp_path / "arm.xml").write_text(text)
+    task(tmp_path, len(ranges), 0.005, 0.005, command=command)
+    attack(tmp_path, text, 1, rng, far=3.0, ends="target")
+    assert not any("cut at its range" in str(warning.message) for warning in recwarn)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
 @pytest.mark.parametrize("dt", [0.005, 0.01])
 @pytest.mark.parametrize("seed", [1, 3, 4, 6, 8])
-def test_drives_held_on_their_targets_stay_within_their_limits(tmp_path: Path, seed: int, dt: float) -> None:
+def test_drives_held_on_their_targets_stay_within_their_limits(tmp_path: Path, seed: int, dt: float, integrator: str) -> None:
+    """`implicitfast` takes the damping of the drives implicitly."""
     rng = np.random.default_rng(seed)
     steps = int(rng.choice([2, 5, 10]))
-    text, ranges = arm(rng, dt / steps, "Euler")
+    text, ranges = arm(rng, dt / steps, integrator)
     text, command = with_drives(text, ranges, rng, [10.0, 30.0, 80.0])
     (tmp_path / "arm.xml").write_text(text)
     task(tmp_path, len(ranges), dt, dt / steps, command=command)
     attack(tmp_path, text, steps, rng, far=3.0)
+
+
+@pytest.mark.parametrize("friction", [0.0, 1.0])
+@pytest.mark.parametrize("seed", [1, 3, 6])
+def test_strong_dampers_of_drives_are_taken_implicitly(tmp_path: Path, seed: int, friction: float) -> None:
+    """Drives that damp ten times as much as it takes to creep, one step a period, with forces that come to their ends: there MuJoCo's step is another."""
+    rng = np.random.default_rng(seed)
+    text, ranges = arm(rng, 0.005, "implicitfast")
+    text, command = with_drives(text, ranges, rng, [30.0, 80.0], 10.0)
+    text = text.replace('forcerange="-300 300"', 'forcerange="-60 60"').replace("<joint ", f'<joint frictionloss="{friction}" ')
+    (tmp_path / "arm.xml").write_text(text)
+    task(tmp_path, len(ranges), 0.005, 0.005, command=command)
+    attack(tmp_path, text, 1, rng, far=3.0)
 
 
 @pytest.mark.parametrize("seed", [2, 6, 7, 8, 12, 17])

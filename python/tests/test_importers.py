@@ -848,11 +848,12 @@ def test_gains_other_than_the_robot_files_are_told(tmp_path, kp, kv, told) -> No
         assert any(text in note for note in one_joint(tmp_path, actuator, drive + limits).notes) == told
 
 
-def test_a_range_that_cuts_targets_promises_no_velocity(tmp_path) -> None:
+@pytest.mark.parametrize(("limits", "told"), [(GUARDED, False), (GUARDED + "braking = 'certified'\n", True)])
+def test_a_range_that_cuts_targets_promises_no_velocity_without_a_stored_brake(tmp_path, limits, told) -> None:
     drive = "[command]\ninterface = 'pd'\nstiffness = 80.0\ndamping = 4.0\n"
     actuator = "<position joint='slide' kp='80' kv='4' ctrlrange='-1 1' forcerange='-30 30'/>"
-    told = one_joint(tmp_path, actuator, drive + GUARDED).notes
-    assert any("limits on acceleration, velocity and position are not promised" in note for note in told), told
+    notes = one_joint(tmp_path, actuator, drive + limits).notes
+    assert any("limits on acceleration, velocity and position are not promised" in note for note in notes) == told, notes
 
 
 def test_a_joint_that_swings_is_told_of(tmp_path) -> None:

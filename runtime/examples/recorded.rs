@@ -57,6 +57,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         pause: Duration::ZERO,
         lost: 0,
         lag: 0.0,
+        drive_damping: 0.0,
     };
     let begin = Instant::now();
     let (log, summary) = attack.fly(Path::new(folder));

@@ -401,6 +401,13 @@ fn undriven(m: &Manifest, parts: &Parts) -> Option<String> {
 /// Targets that a drive is not sent because its range ends before.
 fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> {
     let Parts { model, layout, projector } = parts;
+    let torque = m.task.constraints.torque.as_ref();
+    if m.task.sub_steps() == 1
+        && projector.stores_a_brake()
+        && torque.is_some_and(|torque| torque.soft.is_none())
+    {
+        return None; // kept inside, and a brake that stays inside is there
+    }
     let (dofs, limits) = (layout.controllable(), projector.limits());
     let motors = Parts::motors(model, dofs, drives).ok()?;
     let cut = |(k, &i): (usize, &usize)| {

@@ -26,7 +26,7 @@ mod walker2d;
 use nearl_runtime::Manifest;
 use nearl_runtime::constraints::Model;
 use nearl_runtime::snapshot::Simulation;
-use nearl_runtime::task::Task;
+use nearl_runtime::task::{IdmKind, Task};
 
 use crate::mj::{MjError, ModelFormat, Sim};
 use crate::robot;
@@ -402,6 +402,19 @@ pub fn own_time(task: &Task) -> Option<(f64, f64)> {
     let env = (entry(task.env.as_deref().unwrap_or(&task.name)).ok()?.build)().ok()?;
     let spec = env.spec();
     Some((spec.dt, if spec.semi_implicit_euler { spec.sim_dt } else { 0.0 }))
+}
+
+/// Says so where limits reckon with constant acceleration over a period and the simulation makes physics steps of it that they could count on.
+pub fn unstated_steps(manifest: &Manifest, spec: &Spec) -> Option<String> {
+    let task = &manifest.task;
+    let by_forces = manifest.guards() || (manifest.proposes() && task.idm.kind == IdmKind::Pinocchio);
+    (by_forces && user::is_own(task) && spec.semi_implicit_euler && task.time.sim_dt == 0.0).then(|| {
+        format!(
+            "time.sim_dt is not stated: limits reckon with constant acceleration, as of a robot, and the simulated robot, which makes Euler steps of {} s, \
+             leaves them by the difference; write sim_dt = {} under [time] for this simulation",
+            spec.sim_dt, spec.sim_dt
+        )
+    })
 }
 
 /// The constraints reckon with the task's periods: what is simulated must have them.

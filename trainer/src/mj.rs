@@ -251,22 +251,17 @@ impl Model {
         self.0.opt().timestep
     }
 
-    /// Whether a physics step is an Euler step (velocity first, then position with the new velocity) that is implicit in the dampers of the
-    /// joints alone: MuJoCo's `Euler`, and its `implicitfast` where neither actuators nor tendons nor a fluid damp.
+    /// Whether a physics step is an Euler step (velocity first, then position with the new velocity) that is implicit in dampers of joints and of
+    /// their drives alone: MuJoCo's `Euler`, and its `implicitfast` where no actuator damps otherwise, and neither tendons nor a fluid do.
     pub fn is_euler(&self) -> bool {
         use mujoco_rs::mujoco_c::mjtIntegrator::{mjINT_EULER, mjINT_IMPLICITFAST};
         let (m, option) = (&self.0, self.0.opt());
         if option.integrator != mjINT_IMPLICITFAST as i32 {
             return option.integrator == mjINT_EULER as i32;
         }
-        let damps = |id: usize| {
-            let affine = m.actuator_biastype()[id] == MjtBias::mjBIAS_AFFINE;
-            m.actuator_gaintype()[id] != MjtGain::mjGAIN_FIXED
-                || !(affine || m.actuator_biastype()[id] == MjtBias::mjBIAS_NONE)
-                || (affine && m.actuator_biasprm()[id][2] != 0.0)
-        };
         let tendons = m.tendon_damping().iter().any(|d| *d != 0.0);
-        !((0..self.nu()).any(damps) || tendons || option.density != 0.0 || option.viscosity != 0.0)
+        let is_known = (0..m.actuator_trntype().len()).all(|id| self.implicit_damping(id).is_some());
+        is_known && !(tendons || option.density != 0.0 || option.viscosity != 0.0)
     }
 
     /// Whether a physics step is MuJoCo's Runge-Kutta of fourth order.

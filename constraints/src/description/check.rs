@@ -176,6 +176,7 @@ fn check_joint(joint: &JointDescription, wrong: &mut Vec<String>) {
         ("velocity", joint.velocity.unwrap_or(0.0)),
         ("effort", joint.effort.unwrap_or(0.0)),
         ("damping", joint.damping),
+        ("drive damping", joint.drive_damping),
         ("armature", joint.armature),
         ("friction", joint.friction),
     ];

@@ -1,23 +1,30 @@
-//! Motor force limits of joints with drives, at both ends of a period.
+//! What joints with drives may be sent: force limits at both ends of a period, and the range of the target.
 
 use super::{Limit, TorqueLimit};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
-use crate::{Drive, Kind, LimitError, Model, Soft};
+use crate::{Drive, Kind, LimitError, LimitSet, Model, Period, Soft};
 
-/// `|K (q* - q) - D v| <= effort` at the start and at the end of a period. The force of a drive changes while its target is held:
-/// the mean that [`TorqueLimit`] speaks of is not all. With constant acceleration it is a parabola whose ends are its largest values but for a
-/// share of the order of `K T^2 a`.
+/// `|K (q* - q) - D v| <= effort` at the start and at the end of a period, and `q*` within its range. The force of a drive changes while its target
+/// is held: the mean that [`TorqueLimit`] speaks of is not all. With constant acceleration it is a parabola whose ends are its largest values but for
+/// a share of the order of `K T^2 a`. A target that is cut at its range brakes the joint harder than its acceleration limit allows.
 #[derive(Debug, Clone)]
 pub struct DriveTorqueLimit {
     torque: TorqueLimit,
     /// By dof (nv).
     drives: Vec<Drive>,
+    ranges: Vec<[f64; 2]>,
+    period: Period,
 }
 
 impl DriveTorqueLimit {
-    /// The forces of `torque` for the joints that have a drive; `drives` by dof (nv).
-    pub fn new(torque: TorqueLimit, drives: &[Drive]) -> DriveTorqueLimit {
-        DriveTorqueLimit { torque, drives: drives.to_vec() }
+    /// The forces of `torque` for the joints that have a drive, and the `ranges` of their targets [rad or m]; both by dof (nv).
+    pub fn new(
+        torque: TorqueLimit,
+        drives: &[Drive],
+        ranges: &[[f64; 2]],
+        period: Period,
+    ) -> DriveTorqueLimit {
+        DriveTorqueLimit { torque, drives: drives.to_vec(), ranges: ranges.to_vec(), period }
     }
 }
 
@@ -28,13 +35,22 @@ impl Limit for DriveTorqueLimit {
 
     fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
         let efforts = self.torque.efforts(model, controllable)?;
+        let share = if self.period.sub_steps == 1 { 1.0 } else { 1.0 - AWAY };
         let drives = efforts.into_iter().filter_map(|(dof, effort)| match self.drives[dof] {
             Drive::Pd { stiffness, damping } => {
-                Some(Joint { dof, effort, stiffness, damping, name: model.dof_name(dof) })
+                let joint = model.joint_of_dof(dof);
+                // Where a joint is no number, its target is none either.
+                let [low, high] =
+                    if joint.nq == 1 { self.ranges[dof] } else { [f64::NEG_INFINITY, f64::INFINITY] };
+                // A target makes up for any friction as well.
+                let rubs = model.friction()[dof] / stiffness;
+                let range = [low + rubs, high - rubs];
+                let (name, idx_q) = (model.dof_name(dof), joint.idx_q);
+                Some(Joint { dof, idx_q, effort, stiffness, damping, range, share, is_cut: false, name })
             }
             _ => None,
         });
-        Ok(Some(Box::new(DriveTorqueRows { joints: drives.collect() })))
+        Ok(Some(Box::new(DriveTorqueRows { joints: drives.collect(), period: self.period })))
     }
 
     fn soft(&self) -> Option<Soft> {
@@ -44,15 +60,47 @@ impl Limit for DriveTorqueLimit {
 
 struct Joint {
     dof: usize,
+    idx_q: usize,
     effort: f64,
     stiffness: f64,
     damping: f64,
+    /// Of its target [rad or m].
+    range: [f64; 2],
+    /// Share of the way to the ends of the range that a target may go.
+    share: f64,
+    /// The range ends before what a brake may ask for.
+    is_cut: bool,
     name: String,
 }
+
+impl Joint {
+    fn drive(&self) -> Drive {
+        Drive::Pd { stiffness: self.stiffness, damping: self.damping }
+    }
+
+    /// Least and largest target of a joint at `q`.
+    fn targets(&self, q: f64) -> [f64; 2] {
+        self.range.map(|end| q + self.share * (end - q))
+    }
+
+    /// Least and largest force at the start of a period that begins at `q`, `v`, by effort and range.
+    fn forces(&self, q: f64, v: f64) -> [f64; 2] {
+        let [low, high] = self.targets(q).map(|end| self.stiffness * (end - q) - self.damping * v);
+        [low.clamp(-self.effort, self.effort), high.clamp(-self.effort, self.effort)]
+    }
+}
+
+/// By which share of the way a target stays away from the end of its range where the rows know it on average alone: what leads through several
+/// physics steps differs by that, or without steps what a drive makes of a period.
+const AWAY: f64 = 0.2;
+
+/// Ranges this close are the same [rad or m].
+const NEAR: f64 = 1e-9;
 
 /// Of each joint the start of the period, then its end.
 struct DriveTorqueRows {
     joints: Vec<Joint>,
+    period: Period,
 }
 
 impl Rows for DriveTorqueRows {
@@ -75,6 +123,20 @@ impl Rows for DriveTorqueRows {
         Needs { motors: true, ..Needs::default() }
     }
 
+    fn fit(&mut self, limits: &LimitSet) -> Result<(), LimitError> {
+        for j in &mut self.joints {
+            let reach = j.drive().reach(&self.period, j.effort, limits.velocity[j.dof]);
+            let [low, high] = [limits.q_lower[j.dof] - reach, limits.q_upper[j.dof] + reach];
+            j.is_cut =
+                low.is_finite() && high.is_finite() && (low < j.range[0] - NEAR || high > j.range[1] + NEAR);
+        }
+        Ok(())
+    }
+
+    fn needs_a_brake(&self) -> bool {
+        self.joints.iter().any(|j| j.is_cut)
+    }
+
     /// With `tau` on average, `h` and `c` of the period, and the last evaluation of the drive at `e = T - tau_s`, where the joint has come
     /// to `q + e v + e T a / 2`:
     ///
@@ -95,7 +157,8 @@ impl Rows for DriveTorqueRows {
                 tick.motor(j.dof, row);
                 row[j.dof] += by_acceleration / t;
                 let still = still + tick.bias[j.dof];
-                (rows.lower[2 * r + k], rows.upper[2 * r + k]) = (-j.effort - still, j.effort - still);
+                let [low, high] = if k == 0 { j.forces(tick.q[j.idx_q], v) } else { [-j.effort, j.effort] };
+                (rows.lower[2 * r + k], rows.upper[2 * r + k]) = (low - still, high - still);
             }
         }
     }
@@ -106,12 +169,14 @@ impl Rows for DriveTorqueRows {
         let (t, end) = (period.dt, period.dt - period.tau);
         for (x, j) in excess.chunks_exact_mut(2).zip(&self.joints) {
             let (v, a) = (motion.v[j.dof], motion.acceleration[j.dof]);
-            let drive = Drive::Pd { stiffness: j.stiffness, damping: j.damping };
-            // Where the joint is does not matter, only how far the target is from there.
+            // How far the target is from where the joint is.
             let to = crate::drive::Arrival { q: 0.0, v: 0.0, a, tau: motion.torque[j.dof] };
-            let target = drive.command(period, 0.0, v, &to);
+            let target = j.drive().command(period, 0.0, v, &to);
             let force = |q: f64, v: f64| j.stiffness * (target - q) - j.damping * v;
-            x[0] = force(0.0, v).abs() / j.effort - 1.0;
+            let at = motion.q[j.idx_q] + target;
+            let [low, high] = j.targets(motion.q[j.idx_q]);
+            let beyond = j.stiffness * (at - high).max(low - at);
+            x[0] = (force(0.0, v).abs() - j.effort).max(beyond) / j.effort;
             x[1] = force(end * (v + 0.5 * t * a), v + end * a).abs() / j.effort - 1.0;
         }
     }

@@ -44,10 +44,15 @@ impl Default for TorqueSettings {
 
 /// `|tau| <= scale * effort - margin - friction`, with the motor forces of a whole period,
 /// [`Dynamics::motors_without_friction`](crate::Dynamics::motors_without_friction): whichever way a joint rubs, its motor can make up for it.
+/// Where physics steps take the damping of a drive implicitly, its force stays below the end by a share of 1e-7: at the end MuJoCo's steps do
+/// not.
 #[derive(Debug, Clone, Default)]
 pub struct TorqueLimit {
     settings: TorqueSettings,
 }
+
+/// By which share of it a force stays below its end where the end changes how a physics step is made.
+const SHORT: f64 = 1e-7;
 
 impl TorqueLimit {
     /// From the task file's settings.
@@ -108,7 +113,10 @@ impl TorqueLimit {
                 "write effort (URDF) or a motor with ctrlrange (MJCF) into it, or do not control the joint";
             return Err(LimitError::Missing { limit: "torque", joints: quoted(model, &missing), next });
         }
-        let mut efforts: Vec<_> = stated.iter().map(|effort| Some(scale * effort)).collect();
+        let share = |damping: &f64| if *damping > 0.0 { scale * (1.0 - SHORT) } else { scale };
+        let shares = model.drive_damping().iter().map(share);
+        let mut efforts: Vec<_> =
+            stated.iter().zip(shares).map(|(effort, share)| Some(share * effort)).collect();
         less_each(model, "torque margin", &mut efforts, self.settings.margin.as_ref(), controllable)?;
         controllable
             .iter()

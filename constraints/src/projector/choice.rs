@@ -71,7 +71,7 @@ pub(super) fn braking(
         ));
         return Braking::Certified;
     }
-    if kinds.iter().all(|kind| *kind == Kind::Torque) {
+    if kinds.iter().all(|kind| *kind == Kind::Torque) && !checker.needs_a_brake() {
         let period = Period::new(settings.dt, settings.sub_steps);
         let (samples, seed) = SAMPLES;
         // A brake of bounded jerk has every acceleration between the limits on its way.

@@ -1,6 +1,6 @@
 //! Which commands take the joints where they are to arrive.
 
-use crate::controller::idx_q;
+use crate::controller::{idx_q, target_ranges};
 use crate::motors::Motors;
 use crate::snapshot::Manifest;
 use nearl_constraints::drive::{Arrival, Held};
@@ -40,13 +40,7 @@ impl Arrivals {
         let is_led = |i: &usize| matches!(drives[*i], Drive::Position | Drive::Velocity);
         let follow: Vec<usize> =
             (0..nv).filter(|i| if dofs.contains(i) { is_led(i) } else { !loose }).collect();
-        let mut ranges = vec![[f64::NEG_INFINITY, f64::INFINITY]; nv];
-        for (k, &i) in dofs.iter().enumerate() {
-            let end = |of: &[f64]| of.get(motors.place(k)).map(|end| motors.command(k, *end));
-            if let (Some(low), Some(high)) = (end(&m.action_lower), end(&m.action_upper)) {
-                ranges[i] = [low.min(high), low.max(high)];
-            }
-        }
+        let ranges = target_ranges(m, nv, dofs, motors);
         Arrivals {
             steps: PhysicsSteps::new(model, (drives, &ranges), dofs, &follow, period),
             idx_q: idx_q(model),

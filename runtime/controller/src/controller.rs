@@ -44,8 +44,8 @@ use nearl_constraints::{
     ActionLimit, ActionReport, Bounds, Entry, Ledger, Model, Projector, Proposal, RefuseReason, StateLayout,
     Status, Target,
 };
-pub(crate) use parts::idx_q;
 use parts::{check_sizes, halves};
+pub(crate) use parts::{idx_q, target_ranges};
 use std::time::Instant;
 
 /// What is measured at the start of a tick.

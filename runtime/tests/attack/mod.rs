@@ -40,6 +40,8 @@ pub struct Attack {
     pub lost: u64,
     /// How far behind itself the robot is measured \[s\].
     pub lag: f64,
+    /// What physics steps take implicitly of the damping of every drive [N·m·s/rad].
+    pub drive_damping: f64,
 }
 
 fn weights(seed: u64, n: usize) -> Vec<f32> {
@@ -53,7 +55,10 @@ fn weights(seed: u64, n: usize) -> Vec<f32> {
 
 impl Attack {
     pub fn model(&self) -> Model {
-        Model::from_urdf_text(&self.urdf).unwrap()
+        let mut robot = Model::from_urdf_text(&self.urdf).unwrap().description().clone();
+        let joints = robot.bodies.iter_mut().flat_map(|body| &mut body.joints);
+        joints.for_each(|joint| joint.drive_damping = self.drive_damping);
+        Model::from_description(robot).unwrap()
     }
 
     /// A snapshot of random weights and a wide spread, `version` of them.

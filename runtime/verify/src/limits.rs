@@ -358,6 +358,8 @@ pub(crate) struct Of<'a> {
     pub(crate) controllable: &'a [usize],
     /// Stiffness and damping of the joints that are sent the target of their drive, by dof.
     pub(crate) drives: &'a [Option<[f64; 2]>],
+    /// How far commands to the joints may go, by dof.
+    pub(crate) ranges: &'a [[f64; 2]],
 }
 
 impl Of<'_> {
@@ -399,8 +401,9 @@ impl Section {
         if let Some(torque) = &self.torque {
             for &dof in of.controllable {
                 let joint = of.robot.joints().nth(dof).ok_or("a joint is missing")?;
-                // Whichever way a joint rubs, its motor can make up for it.
-                let most = torque.scale * of.robot.effort(joint) - joint.friction;
+                // Whichever way a joint rubs, its motor can make up for it. At the very end a step is no longer implicit in the drive's damping.
+                let short = if joint.drive_damping > 0.0 { 1e-7 } else { 0.0 };
+                let most = torque.scale * (1.0 - short) * of.robot.effort(joint) - joint.friction;
                 let effort = less(most, &torque.margin, dof, &joint.name);
                 efforts.push((dof, effort));
                 rows.push(Row::new(
@@ -429,8 +432,13 @@ impl Section {
         let soft = self.torque.as_ref().and_then(|torque| torque.soft);
         for &(dof, effort) in &efforts {
             let Some([stiffness, damping]) = of.drives[dof] else { continue };
+            // A target makes up for any friction as well.
+            let rubs = of.robot.joints().nth(dof).map_or(0.0, |joint| joint.friction / stiffness);
+            let [low, high] = of.ranges[dof];
+            let range = of.machine.single(dof).map(|iq| (iq, [low + rubs, high - rubs]));
             for (at_end, at) in [(false, "start"), (true, "end")] {
-                let rule = Rule::Drive { dof, most: effort, stiffness, damping, at_end };
+                let range = range.filter(|_| !at_end);
+                let rule = Rule::Drive { dof, most: effort, stiffness, damping, at_end, range };
                 rows.push(Row::new("torque", &format!("{} at the {at}", of.name(dof)), effort, soft, rule));
             }
         }

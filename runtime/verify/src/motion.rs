@@ -20,6 +20,7 @@ struct Link {
     reference: f64,
     armature: f64,
     damping: f64,
+    drive_damping: f64,
     stiffness: f64,
     spring_reference: f64,
     /// First entry in a configuration.
@@ -89,6 +90,7 @@ impl Link {
             reference: joint.reference,
             armature: joint.armature,
             damping: joint.damping,
+            drive_damping: joint.drive_damping,
             stiffness: joint.stiffness,
             spring_reference: joint.spring_reference,
             idx_q,
@@ -337,7 +339,7 @@ impl Machine {
     /// forces `h = (T - tau) / 2` after the start on average, where the robot has come to `q + h v` and is faster by `h a`:
     ///
     /// ```text
-    ///     M(q + h v) a + c(q + h v, v) + h (dc / dv) a + D (v + kappa T a) + K (q + h v + (T² - tau²) / 6 a - rest)
+    ///     M(q + h v) a + c(q + h v, v) + h (dc / dv) a + D (v + kappa T a) + K (q + h v + (T² - tau²) / 6 a - rest) + tau D_drive a
     /// ```
     pub(crate) fn motors(
         &mut self,
@@ -368,15 +370,16 @@ impl Machine {
         self.ahead = ahead;
         for (k, link) in self.links.iter().enumerate() {
             tau[k] += link.damping * (v[k] + period.kappa * period.dt * a[k]);
+            tau[k] += period.tau * link.drive_damping * a[k];
             if link.stiffness != 0.0 {
                 tau[k] += link.stiffness * (q[link.idx_q] + lag * v[k] + sag * a[k] - link.spring_reference);
             }
         }
     }
 
-    /// Of dof `i` [N m s/rad or N s/m].
+    /// What a physics step takes implicitly of dof `i`, its drive's included [N m s/rad or N s/m].
     pub(crate) fn damping(&self, i: usize) -> f64 {
-        self.links[i].damping
+        self.links[i].damping + self.links[i].drive_damping
     }
 
     /// `M(q) x` (nv).

@@ -254,7 +254,15 @@ impl Promise {
                 _ => None,
             })
             .collect();
-        let of = Of { robot: &m.robot, machine: &machine, controllable: &controllable, drives: &drives };
+        let mut ranges = vec![[f64::NEG_INFINITY, f64::INFINITY]; machine.nv()];
+        for action in m.actions(&controllable, &sent).unwrap_or_default() {
+            let [low, high] = action.range;
+            if !(low.is_nan() || high.is_nan()) {
+                ranges[action.dof] = [low, high];
+            }
+        }
+        let (controls, drives, ranges) = (&controllable[..], &drives[..], &ranges[..]);
+        let of = Of { robot: &m.robot, machine: &machine, controllable: controls, drives, ranges };
         let limits = section.limits(&of)?;
         let mut bare = (sub_steps != 1).then(|| bare.limits(&of)).transpose()?;
         for row in bare.iter_mut().flat_map(|limits| &mut limits.rows) {

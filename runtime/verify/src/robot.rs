@@ -90,6 +90,9 @@ pub(crate) struct Joint {
     pub(crate) velocity: Option<f64>,
     pub(crate) effort: Option<f64>,
     pub(crate) damping: f64,
+    /// What drives damp, where physics steps take it implicitly [N·m·s/rad or N·s/m].
+    #[serde(default)]
+    pub(crate) drive_damping: f64,
     pub(crate) stiffness: f64,
     pub(crate) spring_reference: f64,
     pub(crate) armature: f64,

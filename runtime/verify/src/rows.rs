@@ -71,8 +71,15 @@ pub(crate) enum Rule {
     Jerk { dof: usize, most: f64 },
     /// `|tau - tau_before| / T <= most`.
     TorqueRate { dof: usize, most: f64 },
-    /// The force of a drive at one end of the period.
-    Drive { dof: usize, most: f64, stiffness: f64, damping: f64, at_end: bool },
+    /// The force of a drive at one end of the period, and at its start the range of the target.
+    Drive {
+        dof: usize,
+        most: f64,
+        stiffness: f64,
+        damping: f64,
+        at_end: bool,
+        range: Option<(usize, [f64; 2])>,
+    },
     /// `n . p <= offset`, and `braking` stops the point in front of it; the margin of a half-space, which may be put elsewhere.
     Plane { spot: Spot, point: Vec3, n: Vec3, offset: f64, braking: f64, half_space: Option<f64> },
     /// A sum of positions, velocities and accelerations.
@@ -114,6 +121,8 @@ pub(crate) struct Passage<'a> {
 
 /// Frames and bodies keep this far inside their boundary, for what a straight row misses of a curved way [m]; a projection's own choice.
 const CREEP: f64 = 1e-4;
+/// By which share of the way targets stay away from the ends of their range, but over a single physics step; a projection's own choice.
+const AWAY: f64 = 0.2;
 /// What is beyond it comes back in so many periods.
 const RETURN: f64 = 20.0;
 /// In front of a plane a row asks for at most so many times its braking.
@@ -227,9 +236,17 @@ impl Row {
             Rule::TorqueRate { dof, most } => passage
                 .before
                 .map_or([none; 2], |(_, tau)| both((passage.tau[*dof] - tau[*dof]) / p.dt, *most)),
-            Rule::Drive { dof, most, stiffness, damping, at_end } => {
-                let [still, by] = drive(p, *stiffness, *damping, *at_end, passage.v[*dof]);
-                both(passage.tau[*dof] + still + by * passage.a[*dof], *most)
+            Rule::Drive { dof, most, stiffness, damping, at_end, range } => {
+                let v = passage.v[*dof];
+                let [still, by] = drive(p, *stiffness, *damping, *at_end, v);
+                let force = passage.tau[*dof] + still + by * passage.a[*dof];
+                let [low, high] = range.map_or([-most, *most], |(iq, range)| {
+                    let share = if p.sub_steps == 1 { 1.0 } else { 1.0 - AWAY };
+                    range.map(|end| {
+                        (stiffness * share * (end - passage.q[iq]) - damping * v).clamp(-most, *most)
+                    })
+                });
+                [(low - force) / most, (force - high) / most]
             }
             Rule::Plane { spot, point, n, offset, braking, .. } => {
                 let mut ahead = Vec::new();

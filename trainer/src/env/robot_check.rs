@@ -22,6 +22,7 @@ pub(super) fn difference(a: &Model, b: &Model) -> Option<String> {
         ("velocity limits", a.velocity_limit().to_vec(), b.velocity_limit().to_vec()),
         ("effort limits", a.effort_limit().to_vec(), b.effort_limit().to_vec()),
         ("damping", a.damping().to_vec(), b.damping().to_vec()),
+        ("damping of drives", a.drive_damping().to_vec(), b.drive_damping().to_vec()),
         ("masses or where they lie", mass(a), mass(b)),
         ("masses", vec![a.total_mass()], vec![b.total_mass()]),
     ];

@@ -24,7 +24,7 @@ pub(super) fn add(model: &Model, robot: &mut RobotDescription) {
     }
 }
 
-/// A motor's rotor and damper act on the joint by the square of the gear.
+/// A motor's rotor and dampers act on the joint by the square of the gear.
 fn load(model: &Model, id: usize, gear: f64, robot: &mut RobotDescription, joint: &str) {
     let joints = robot.bodies.iter_mut().flat_map(|body| &mut body.joints);
     let Some(joint): Option<&mut JointDescription> = joints.into_iter().find(|j| j.name == joint) else {
@@ -32,6 +32,7 @@ fn load(model: &Model, id: usize, gear: f64, robot: &mut RobotDescription, joint
     };
     joint.armature += gear * gear * model.0.actuator_armature()[id];
     joint.damping += gear * gear * model.0.actuator_damping()[id];
+    joint.drive_damping += gear * gear * model.implicit_damping(id).unwrap_or(0.0);
 }
 
 impl Model {
@@ -52,6 +53,23 @@ impl Model {
         let on_joint = matches!(kind, MjtTrn::mjTRN_JOINT | MjtTrn::mjTRN_JOINTINPARENT);
         let joint = usize::try_from(self.0.actuator_trnid()[id][0]).ok().filter(|_| on_joint)?;
         Some(self.joint(joint)).filter(|j| j.nv == 1).map(|j| j.name)
+    }
+
+    /// What the law of an actuator damps and `implicitfast` takes implicitly [N·m·s/rad or N·s/m], before its gear; `None` where that changes with
+    /// the state, is below 0 or acts on more than one dof.
+    pub(super) fn implicit_damping(&self, id: usize) -> Option<f64> {
+        let m = &self.0;
+        if m.opt().integrator != mujoco_rs::mujoco_c::mjtIntegrator::mjINT_IMPLICITFAST as i32 {
+            return Some(0.0);
+        }
+        let damping = match m.actuator_biastype()[id] {
+            MjtBias::mjBIAS_NONE => 0.0,
+            MjtBias::mjBIAS_AFFINE => 0.0 - m.actuator_biasprm()[id][2],
+            _ => return None,
+        };
+        let on_one = || self.driven_joint(id).is_some() && m.actuator_ctrlnum()[id] == 1;
+        let is_one = damping == 0.0 || (damping > 0.0 && on_one());
+        (is_one && m.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED).then_some(damping)
     }
 
     fn motor(&self, id: usize, name: String, joint: &str) -> Motor {

@@ -2,7 +2,7 @@
 
 use super::TrainError;
 use super::setup::warm_up_of_pid2;
-use crate::env::{ChaCha8Rng, SeedableRng};
+use crate::env::{ChaCha8Rng, SeedableRng, unstated_steps};
 use crate::learn::Algorithm;
 use crate::rollout::RolloutError;
 use crate::settings::TrainSettings;
@@ -59,6 +59,7 @@ fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
     let Parts { model, layout, projector } = Parts::new(manifest)?;
     let limits = projector.limits();
     let mut env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
+    let unstated = unstated_steps(manifest, env.spec());
     let mut rng = ChaCha8Rng::seed_from_u64(RESETS.1);
     let (mut q, mut v) = (vec![0.0; model.nq()], vec![0.0; model.nv()]);
     let mut found = vec![[Outside::default(); 2]; model.nv()];
@@ -78,7 +79,7 @@ fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
             }
         }
     }
-    let mut lines = Vec::new();
+    let mut lines = Vec::from_iter(unstated);
     let is_own = !manifest.task.reward.is_empty();
     let next = |key: &str| match is_own {
         true => format!("draw it inside in [reset], or give constraints.{key} more room"),

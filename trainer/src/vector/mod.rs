@@ -118,7 +118,7 @@ impl Vector {
             _ => Space::actions(&spec),
         };
         let ticks = open.as_ref().map_or(1, |snapshot| snapshot.manifest.task.time.policy_every);
-        let notes = open.as_ref().map_or(Ok(Vec::new()), space::notes)?;
+        let notes = open.as_ref().map_or(Ok(Vec::new()), |open| space::notes(open, &spec))?;
         let max_steps = settings.max_episode_steps.unwrap_or(spec.max_episode_steps);
         let lanes = (0..settings.num_envs as u64)
             .map(|i| {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::{Meaning, VectorError};
-use crate::env::Spec;
+use crate::env::{Spec, unstated_steps};
 use crate::{tasks, train};
 use nearl_runtime::constraints::{Entry, Guard, LimitSet, Model, StateLayout};
 use nearl_runtime::net::{Dense, DenseLayer};
@@ -151,12 +151,14 @@ pub(super) fn guarded_snapshot(task: &str) -> Result<Snapshot, VectorError> {
 }
 
 /// The notes of the robot and of the limits, where they are kept by the robot's dynamics.
-pub(super) fn notes(snapshot: &Snapshot) -> Result<Vec<String>, VectorError> {
+pub(super) fn notes(snapshot: &Snapshot, spec: &Spec) -> Result<Vec<String>, VectorError> {
     let m = &snapshot.manifest;
     if m.task.idm.kind != IdmKind::Pinocchio || m.bounds_drives() {
         return Ok(Vec::new());
     }
-    Ok(nearl_runtime::doctor::told(m)?)
+    let mut notes = nearl_runtime::doctor::told(m)?;
+    notes.extend(unstated_steps(m, spec));
+    Ok(notes)
 }
 
 /// The task's limits on actions around actions as the actuators take them, and nothing else.

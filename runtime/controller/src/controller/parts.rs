@@ -129,7 +129,13 @@ impl Parts {
         let drives = Self::drives(m, model, controllable)?;
         let is_pd = |drive: &Drive| matches!(drive, Drive::Pd { .. });
         if let Some(torque) = m.task.constraints.torque.clone().filter(|_| drives.iter().any(is_pd)) {
-            limits.push(Box::new(DriveTorqueLimit::new(TorqueLimit::new(torque), &drives)));
+            // Of joints without motors the one who takes their commands speaks.
+            let ranges = match Self::motors(model, controllable, &drives) {
+                Ok(motors) => target_ranges(m, model.nv(), controllable, &motors),
+                Err(_) => vec![[f64::NEG_INFINITY, f64::INFINITY]; model.nv()],
+            };
+            let torque = TorqueLimit::new(torque);
+            limits.push(Box::new(DriveTorqueLimit::new(torque, &drives, &ranges, m.task.period())));
         }
         let settings = Settings {
             consistency,
@@ -147,6 +153,18 @@ impl Parts {
         }
         Ok(projector)
     }
+}
+
+/// How far commands to the joints of `dofs` may go, by dof (nv): as far as the plant takes the actions.
+pub(crate) fn target_ranges(m: &Manifest, nv: usize, dofs: &[usize], motors: &Motors) -> Vec<[f64; 2]> {
+    let mut ranges = vec![[f64::NEG_INFINITY, f64::INFINITY]; nv];
+    for (k, &i) in dofs.iter().enumerate() {
+        let end = |of: &[f64]| of.get(motors.place(k)).map(|end| motors.command(k, *end));
+        if let (Some(low), Some(high)) = (end(&m.action_lower), end(&m.action_upper)) {
+            ranges[i] = [low.min(high), low.max(high)];
+        }
+    }
+    ranges
 }
 
 /// Where motor forces are reckoned with, joints end before their stops, and braking leaves a reserve for what happens within a period.
