@@ -112,6 +112,22 @@ def test_motors_reckon_with_euler_s_implicit_damping(pair, rng) -> None:
     theirs.opt.enableflags = flags
 
 
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_a_weight_that_is_held_is_no_weight(tmp_path: Path, rng, share: float) -> None:
+    """`gravcomp` of all that moves; a pedestal that does not move has none."""
+    bodies = "".join(
+        f'<body pos="0.1 0 {k}" gravcomp="{share}"><joint name="j{k}" axis="{axis}" damping="0.3"/><geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 0.1"/>'
+        for k, axis in enumerate(["0 1 0", "1 0 0", "0 1 1"])
+    )
+    text = f'<mujoco><worldbody><body name="pedestal"><geom size="0.1"/>{bodies}{"</body>" * 4}</worldbody></mujoco>'
+    (tmp_path / "held.xml").write_text(text)
+    ours, theirs = nearl.Model.from_mjcf(tmp_path / "held.xml"), mujoco.MjModel.from_xml_string(text)
+    for data in states(theirs, rng, 20):
+        q, v = data.qpos.copy(), data.qvel.copy()
+        close(ours.nle(q, v) - ours.passive(q, v), data.qfrc_bias - data.qfrc_passive, 1e-11)
+        assert np.abs(data.qfrc_gravcomp).max() > 0.1
+
+
 SERVOS = """<mujoco><option timestep="0.004" integrator="implicitfast"/><worldbody>
 <body><joint name="a" axis="0 1 0" damping="0.4" armature="0.01"/><geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 0" mass="1"/>
 <body pos="0.3 0 0"><joint name="b" axis="1 1 0" damping="0.1"/><geom type="capsule" size="0.03" fromto="0 0 0 0.2 0 0" mass="0.5"/></body></body></worldbody>

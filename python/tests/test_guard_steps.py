@@ -202,6 +202,40 @@ def test_strong_dampers_of_drives_are_taken_implicitly(tmp_path: Path, seed: int
     attack(tmp_path, text, 1, rng, far=3.0)
 
 
+HAND = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body><joint name="j0" axis="0 1 0" range="-1 1"/><geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 0" mass="2" contype="0" conaffinity="0"/>
+<body pos="0.3 0 0"><joint name="j1" axis="1 1 0" range="-1 1" armature="0.05"/><inertial pos="0.1 0 0" mass="1" diaginertia=".01 .01 .01"/>
+<body pos="0.2 0 0"><joint name="f0" type="slide" axis="0 1 0" range="-0.1 0.1"/><inertial pos="0 0 0" mass="0.02" diaginertia="1e-5 1e-5 1e-5"/></body>
+<body pos="0.2 0 0"><joint name="f1" type="slide" axis="0 -1 0" range="-0.1 0.1"/><inertial pos="0 0 0" mass="0.02" diaginertia="1e-5 1e-5 1e-5"/></body>
+</body></body></worldbody><tendon><fixed name="split"><joint joint="{across}" coef="0.5"/><joint joint="f1" coef="0.5"/></fixed></tendon>
+<equality><joint joint1="f0" joint2="f1"/></equality><actuator>
+<position name="j0" joint="j0" kp="4500" kv="450" ctrlrange="-1 1" forcerange="-87 87"/>
+<position name="j1" joint="j1" kp="2000" kv="200" ctrlrange="-1 1" forcerange="-30 30"/>
+<general tendon="split" gainprm="1" biastype="affine" biasprm="0 -100 -10" ctrlrange="-1 1" forcerange="-100 100"/></actuator></mujoco>"""
+
+
+def test_a_hand_that_a_tendon_closes_is_no_matter_of_the_arm_s_drives(tmp_path: Path) -> None:
+    """The gains are those of a Panda and its hand. What the tendon damps is implicit too, and moves the fingers alone."""
+    text, rng = HAND.format(across="f0"), np.random.default_rng(0)
+    (tmp_path / "arm.xml").write_text(text)
+    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
+    envs = nearl.make_vec(task(tmp_path, 2, 0.002, 0.002, command=command), 1, constraints="task", actions="guarded")
+    obs, _ = envs.reset(seed=0)
+    before, fastest = obs[0, 2:].copy(), 0.0
+    for tick in range(2000):
+        if tick % 100 == 0:
+            push = rng.uniform(-2, 2, 2)
+        obs, *_ = envs.step(push[None])
+        accelerations = np.abs(obs[0, 2:] - before) / 0.002
+        assert accelerations.max() <= ACCELERATION * 1.01, f"tick {tick}: {accelerations}"
+        assert np.abs(obs[0, :2]).max() <= 1.0
+        before, fastest = obs[0, 2:].copy(), max(fastest, np.abs(obs[0, 2:]).max())
+    assert 1.0 < fastest <= SPEED + 1e-3
+    (tmp_path / "arm.xml").write_text(HAND.format(across="j1"))
+    with pytest.raises(ValueError, match="so the projector cannot count on its steps; write sim_dt = 0"):
+        nearl.make_vec(tmp_path / "arm.toml", 1, constraints="task", actions="guarded")
+
+
 @pytest.mark.parametrize("seed", [2, 6, 7, 8, 12, 17])
 def test_arms_stay_within_their_limits_over_long_periods(tmp_path: Path, seed: int) -> None:
     """A held force does not brake evenly over 20 ms: joints had come up to 1.1 mrad too far, touched their stops and left 10 rad/s² by 17."""

@@ -252,16 +252,22 @@ impl Model {
     }
 
     /// Whether a physics step is an Euler step (velocity first, then position with the new velocity) that is implicit in dampers of joints and of
-    /// their drives alone: MuJoCo's `Euler`, and its `implicitfast` where no actuator damps otherwise, and neither tendons nor a fluid do.
+    /// their drives alone: MuJoCo's `Euler`, and its `implicitfast` where nothing else damps: no actuator otherwise, no fluid, and no tendon but one
+    /// of joints that no motor drives, as the fingers of a hand.
     pub fn is_euler(&self) -> bool {
         use mujoco_rs::mujoco_c::mjtIntegrator::{mjINT_EULER, mjINT_IMPLICITFAST};
         let (m, option) = (&self.0, self.0.opt());
         if option.integrator != mjINT_IMPLICITFAST as i32 {
             return option.integrator == mjINT_EULER as i32;
         }
-        let tendons = m.tendon_damping().iter().any(|d| *d != 0.0);
-        let is_known = (0..m.actuator_trntype().len()).all(|id| self.implicit_damping(id).is_some());
-        is_known && !(tendons || option.density != 0.0 || option.viscosity != 0.0)
+        let is_known = |id: usize| {
+            self.implicit_damping(id).is_some() || self.tendon_of(id).is_some_and(|t| self.is_apart(t))
+        };
+        let tendons = m.tendon_damping().iter().enumerate();
+        (0..m.actuator_trntype().len()).all(is_known)
+            && tendons.filter(|(_, damping)| **damping != 0.0).all(|(tendon, _)| self.is_apart(tendon))
+            && option.density == 0.0
+            && option.viscosity == 0.0
     }
 
     /// Whether a physics step is MuJoCo's Runge-Kutta of fourth order.

@@ -299,9 +299,14 @@ fn what_cannot_be_described_is_refused_by_name() {
     };
     let geom = r#"<geom size="0.1" mass="1"/>"#;
     refused(
-        &format!(r#"gravcomp="1"><joint name="a" damping="1"/>{geom}"#),
+        &format!(r#"gravcomp="1"><joint name="a" damping="1"/>{geom}<body><joint/>{geom}</body>"#),
         r#"<option><flag eulerdamp="disable"/></option>"#,
-        &["body 'arm' has gravcomp 1", "eulerdamp"],
+        &["body 'arm' has gravcomp 1, and others that move have another", "eulerdamp"],
+    );
+    refused(
+        &format!(r#"gravcomp="1"><joint name="a" actuatorgravcomp="true"/>{geom}"#),
+        "",
+        &["joint 'a' has its weight held by its actuator"],
     );
     refused(
         &format!(r#"><joint name="a" type="ball" stiffness="2"/>{geom}"#),

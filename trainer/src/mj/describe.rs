@@ -30,7 +30,8 @@ impl Model {
             gravity: if self.disables(mjtDisableBit::mjDSBL_GRAVITY) {
                 [0.0; 3]
             } else {
-                self.0.opt().gravity
+                let weight = 1.0 - self.held_weight().unwrap_or(0.0);
+                self.0.opt().gravity.map(|g| weight * g)
             },
             bodies: (1..self.n_bodies()).map(|id| self.describe_body(id)).collect(),
             frames: self.sites(),
@@ -45,6 +46,15 @@ impl Model {
 
     pub(super) fn disables(&self, bit: mjtDisableBit) -> bool {
         self.0.opt().disableflags & bit as i32 != 0
+    }
+
+    /// The share of their weight that is held of all bodies that move (`gravcomp`): as if gravity were weaker. `None` where it is not the same.
+    fn held_weight(&self) -> Option<f64> {
+        let m = &self.0;
+        let moves = |id: &usize| m.body_weldid()[*id] != 0 && m.body_mass()[*id] > 0.0;
+        let mut shares = (1..self.n_bodies()).filter(moves).map(|id| m.body_gravcomp()[id]);
+        let first = shares.next().unwrap_or(0.0);
+        shares.all(|share| share == first).then_some(first)
     }
 
     fn describe_body(&self, id: usize) -> Body {
@@ -175,12 +185,21 @@ impl Model {
                 m.actuator_group()[id]
             ));
         }
-        for id in (1..self.n_bodies()).filter(|id| m.body_gravcomp()[*id] != 0.0) {
+        let held = |id: &usize| m.body_gravcomp()[*id] != 0.0;
+        for id in (1..self.n_bodies()).filter(|id| held(id) && self.held_weight().is_none()) {
             beyond.push(format!(
-                "body '{}' has gravcomp {}: take it out",
+                "body '{}' has gravcomp {}, and others that move have another: give all of them the same, or take it out",
                 self.body_name(id),
                 m.body_gravcomp()[id]
             ));
+        }
+        for (id, joint) in self.joints().iter().enumerate() {
+            if m.jnt_actgravcomp()[id] && (1..self.n_bodies()).any(|id| held(&id)) {
+                beyond.push(format!(
+                    "joint '{}' has its weight held by its actuator (actuatorgravcomp): take that out",
+                    joint.name
+                ));
+            }
         }
         for (id, joint) in self.joints().into_iter().enumerate() {
             let name = &joint.name;

@@ -3,7 +3,7 @@
 use nearl_runtime::constraints::description::{Command, JointDescription, Motor, RobotDescription};
 
 use mujoco_rs::mujoco_c::mjtDisableBit;
-use mujoco_rs::wrappers::mj_model::{MjtBias, MjtDyn, MjtGain, MjtObjBase, MjtTrn};
+use mujoco_rs::wrappers::mj_model::{MjtBias, MjtDyn, MjtGain, MjtObjBase, MjtTrn, MjtWrap};
 
 use super::Model;
 
@@ -70,6 +70,23 @@ impl Model {
         let on_one = || self.driven_joint(id).is_some() && m.actuator_ctrlnum()[id] == 1;
         let is_one = damping == 0.0 || (damping > 0.0 && on_one());
         (is_one && m.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED).then_some(damping)
+    }
+
+    /// The tendon that an actuator pulls.
+    pub(super) fn tendon_of(&self, id: usize) -> Option<usize> {
+        let is_tendon = self.0.actuator_trntype()[id] == MjtTrn::mjTRN_TENDON;
+        usize::try_from(self.0.actuator_trnid()[id][0]).ok().filter(|_| is_tendon)
+    }
+
+    /// Whether a tendon is a sum of joints that no motor drives: the equations of those that motors drive do not have what it damps.
+    pub(super) fn is_apart(&self, tendon: usize) -> bool {
+        let m = &self.0;
+        let [first, count] = [m.tendon_adr()[tendon], m.tendon_num()[tendon]].map(|x| x.max(0) as usize);
+        (first..first + count).all(|k| {
+            let joint = m.wrap_objid()[k];
+            let drives = |id: usize| self.driven_joint(id).is_some() && m.actuator_trnid()[id][0] == joint;
+            m.wrap_type()[k] == MjtWrap::mjWRAP_JOINT && !(0..self.n_actuators()).any(drives)
+        })
     }
 
     fn motor(&self, id: usize, name: String, joint: &str) -> Motor {
