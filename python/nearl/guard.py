@@ -323,7 +323,9 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
             if name not in keys:
                 raise ValueError(f"the guard of a simulator knows 'position' and 'velocity', not '{name}'; a task file has the others")
             if not isinstance(settings, Mapping):
-                raise ValueError(f"{name} is {settings!r}; give a table, {{'{keys[name]}': {settings!r}}}")
+                is_number = isinstance(settings, int | float) and not isinstance(settings, bool)
+                example = {keys[name]: settings} if is_number else {"position": {}, "velocity": {"limit": 25.0}}[name]
+                raise ValueError(f"{name} is {settings!r}; give a table, e.g. {example}")
             if unknown := settings.keys() - {keys[name]}:
                 raise ValueError(f"{name} has no '{min(unknown)}'; it has '{keys[name]}'")
         m, joint = self._model, self._mujoco.mjtJoint

@@ -158,6 +158,8 @@ def test_the_nearest_action_is_the_solution_of_a_general_solver():
         ({"velocity": {"limit": "x"}}, "velocity limit of joint 'bthigh' is 'x'; give a number"),
         ({"velocity": {"limit": [1.0, 2.0]}}, "velocity limit of joint 'bthigh' is"),
         ({"velocity": {}}, "limit"),
+        ({"velocity": 3.0}, r"velocity is 3.0; give a table, e.g. {'limit': 3.0}"),
+        ({"position": True}, r"position is True; give a table, e.g. {}"),
         ({}, "no joint has a limit to be kept; give constraints"),
     ],
 )
