@@ -886,3 +886,12 @@ def test_a_training_of_actions_says_once_that_limits_hold_for_nothing(tmp_path, 
     said = subprocess.run(command, capture_output=True, text=True)
     assert said.returncode == 0, said.stderr
     assert said.stderr.count("hold for nothing") == times, said.stderr
+
+
+def test_a_sweep_says_for_each_task_what_its_trainings_would_say(tmp_path) -> None:
+    command = [NEARL, "sweep", "--tasks", "Hopper-v5", "--algos", "ppo,nearl", "--seeds", "0,1", "--steps", "2048", "--out", tmp_path / "runs", "--json"]
+    said = subprocess.run(command, capture_output=True, text=True)
+    assert said.returncode == 0, said.stderr
+    assert said.stderr.count("nearl: warning: Hopper-v5: the limits on states under [constraints] hold for nothing") == 1, said.stderr
+    again = subprocess.run(command, capture_output=True, text=True)
+    assert (again.returncode, again.stderr) == (0, ""), again.stderr

@@ -11,6 +11,8 @@ use super::{Failure, at_least_one, cores, say};
 use crate::learn::Algorithm;
 use crate::preset::Preset;
 use crate::sweep::{Event, Found, Row, Run, Summary, Sweep, run};
+use crate::{tasks, train};
+use nearl_runtime::PolicyKind;
 
 #[derive(Args)]
 pub(super) struct SweepCommand {
@@ -65,6 +67,33 @@ fn seeds(text: &str) -> Result<Seeds, String> {
     Ok(Seeds(all))
 }
 
+/// What the trainings that are still to be made say before they begin, once for each task. One that cannot be made says why by itself.
+fn advice(sweep: &Sweep, runs: &[Run]) -> Vec<String> {
+    let mut lines = Vec::new();
+    let mut seen = Vec::new();
+    for r in runs.iter().filter(|r| r.found != Found::Finished) {
+        let kind = (&r.task, r.algo.is_direct());
+        if seen.contains(&kind) {
+            continue;
+        }
+        seen.push(kind);
+        let Ok(mut manifest) = tasks::load_with(&r.task, sweep.preset, &sweep.set) else { continue };
+        if train::complete(&mut manifest).is_err() {
+            continue;
+        }
+        if r.algo.is_direct() {
+            manifest.policy = PolicyKind::Direct;
+        }
+        for line in train::advice(&manifest).unwrap_or_default() {
+            let line = format!("{}: {line}", r.name);
+            if !lines.contains(&line) {
+                lines.push(line);
+            }
+        }
+    }
+    lines
+}
+
 impl SweepCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
         let Seeds(seeds) = self.seeds;
@@ -82,6 +111,9 @@ impl SweepCommand {
         let stop = Arc::new(AtomicBool::new(false));
         for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
             signal_hook::flag::register(signal, Arc::clone(&stop))?;
+        }
+        for line in advice(&sweep, &runs) {
+            eprintln!("nearl: warning: {line}");
         }
         let todo = runs.iter().filter(|r| r.found != Found::Finished).count() as u64;
         let bar = if self.json { ProgressBar::hidden() } else { ProgressBar::new(todo * sweep.steps) };
