@@ -42,9 +42,9 @@ impl Limit for DriveTorqueLimit {
                 // Where a joint is no number, its target is none either.
                 let [low, high] =
                     if joint.nq == 1 { self.ranges[dof] } else { [f64::NEG_INFINITY, f64::INFINITY] };
-                // A target makes up for any friction as well.
+                // A target makes up for any friction as well, where its range is wide enough.
                 let rubs = model.friction()[dof] / stiffness;
-                let range = [low + rubs, high - rubs];
+                let range = if high - low > 2.0 * rubs { [low + rubs, high - rubs] } else { [low, high] };
                 let (name, idx_q) = (model.dof_name(dof), joint.idx_q);
                 Some(Joint { dof, idx_q, effort, stiffness, damping, range, share, is_cut: false, name })
             }

@@ -432,10 +432,11 @@ impl Section {
         let soft = self.torque.as_ref().and_then(|torque| torque.soft);
         for &(dof, effort) in &efforts {
             let Some([stiffness, damping]) = of.drives[dof] else { continue };
-            // A target makes up for any friction as well.
+            // A target makes up for any friction as well, where its range is wide enough.
             let rubs = of.robot.joints().nth(dof).map_or(0.0, |joint| joint.friction / stiffness);
             let [low, high] = of.ranges[dof];
-            let range = of.machine.single(dof).map(|iq| (iq, [low + rubs, high - rubs]));
+            let range = if high - low > 2.0 * rubs { [low + rubs, high - rubs] } else { [low, high] };
+            let range = of.machine.single(dof).map(|iq| (iq, range));
             for (at_end, at) in [(false, "start"), (true, "end")] {
                 let range = range.filter(|_| !at_end);
                 let rule = Rule::Drive { dof, most: effort, stiffness, damping, at_end, range };
