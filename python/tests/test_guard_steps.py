@@ -232,7 +232,7 @@ def test_a_hand_that_a_tendon_closes_is_no_matter_of_the_arm_s_drives(tmp_path: 
         before, fastest = obs[0, 2:].copy(), max(fastest, np.abs(obs[0, 2:]).max())
     assert 1.0 < fastest <= SPEED + 1e-3
     (tmp_path / "arm.xml").write_text(HAND.format(across="j1"))
-    with pytest.raises(ValueError, match="so the projector cannot count on its steps; write sim_dt = 0"):
+    with pytest.raises(ValueError, match="dampers of tendons or actuators that act on more than a joint; take these out"):
         nearl.make_vec(tmp_path / "arm.toml", 1, constraints="task", actions="guarded")
 
 
@@ -366,6 +366,45 @@ def test_the_guard_of_drives_holds_their_forces_and_rates(tmp_path: Path, idm: s
         if before is not None:
             assert np.abs(force - before).max() <= 100.0 * 0.002 + 1e-9, (tick, force, before)
         before = force
+
+
+@pytest.mark.parametrize(("guard", "keeps"), [("true", True), ('"simulator"', False)])
+def test_guarded_actions_are_guarded_as_the_task_says(tmp_path: Path, guard: str, keeps: bool) -> None:
+    """The simulator's guard keeps positions and velocities alone."""
+    text = f"guard = {guard}\nposition = {{}}\nvelocity = {{ limit = 2.0 }}\nacceleration = {{ limit = 5.0 }}\ntorque = {{ scale = 1.0 }}"
+    envs = nearl.make_vec(drives(tmp_path, text, "pinocchio"), 1, constraints="task", actions="guarded")
+    obs, _ = envs.reset(seed=0)
+    rng, most = np.random.default_rng(0), 0.0
+    for tick in range(300):
+        before = envs.native.qvel[0].copy()
+        if tick % 20 == 0:
+            push = rng.uniform(-3, 3, 2)
+        envs.step(push[None])
+        most = max(most, np.abs(envs.native.qvel[0] - before).max() / 0.002)
+    assert (most <= 5.0 + 1e-6) == keeps, most
+
+
+@pytest.mark.parametrize(("ends", "told"), [("-1 1", True), ("-20 20", False)])
+def test_targets_that_end_before_the_guard_of_drives_can_hold_a_force_are_told(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder, ends: str, told: bool
+) -> None:
+    file = drives(tmp_path, 'guard = "drive"\ntorque = { scale = 0.5 }', "learned")
+    arm = tmp_path / "arm.xml"
+    arm.write_text(arm.read_text().replace('ctrlrange="-20 20"', f'ctrlrange="{ends}"'))
+    nearl.make_vec(file, 1, constraints="task", actions="guarded")
+    assert any("limits on torque are not promised where they are: 'a'" in str(warning.message) for warning in recwarn) == told
+
+
+def test_drives_whose_damping_shakes_a_joint_apart_within_a_period_are_told(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    """25 N·m·s/rad on some 0.03 kg m², in steps of 5 ms."""
+    for integrator, told in (("Euler", True), ("implicitfast", False)):
+        text = DRIVEN.format(option=f'integrator="{integrator}"', actuators=SERVOS.replace('kv="2"', 'kv="25"'), more="")
+        (tmp_path / "arm.xml").write_text(text.replace('timestep="0.002"', 'timestep="0.005"'))
+        file = task(tmp_path, 2, 0.01, 0.005, command='interface = "pd"\nstiffness = 40.0\ndamping = 25.0')
+        file.write_text(file.read_text().replace("j0", "a").replace("j1", "b"))
+        recwarn.clear()
+        nearl.make_vec(file, 1, constraints="task", actions="guarded")
+        assert any("which shakes them apart" in str(warning.message) for warning in recwarn) == told, integrator
 
 
 def test_what_the_limits_do_not_reckon_with_is_told_where_an_environment_is_made(tmp_path: Path) -> None:

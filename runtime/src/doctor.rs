@@ -105,6 +105,25 @@ pub fn examine(file: &Path, plant: Option<&str>) -> Vec<Check> {
     checks
 }
 
+/// Drives whose targets end before what keeps their limits.
+///
+/// # Errors
+/// As [`Parts::new`].
+pub fn cut(m: &Manifest) -> Result<Option<String>, SnapshotError> {
+    let parts = Parts::new(m)?;
+    let drives = Parts::drives(m, &parts.model, parts.layout.controllable())?;
+    Ok(cut_targets(m, &parts, &drives))
+}
+
+/// Joints that the motors cannot hold still everywhere within the position limits.
+///
+/// # Errors
+/// As [`Parts::new`].
+pub fn weak(m: &Manifest) -> Result<Option<String>, SnapshotError> {
+    let check = holding(m, &Parts::new(m)?);
+    Ok((check.finding != Finding::Ok).then_some(check.text))
+}
+
 /// What the checks of a task say before it is trained: one line for each that is not as it should be, with what to change.
 ///
 /// # Errors
@@ -237,9 +256,12 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     if !layout.controllable().iter().any(|&i| by_force(&drives[i])) {
         notes.retain(|note| !note.starts_with(MADE_UP_FOR));
     }
-    if moves_by_model(m) {
+    if moves_by_model(m) || m.bounds_drives() {
         notes.extend(cut_targets(m, parts, &drives));
+    }
+    if moves_by_model(m) {
         notes.extend(held_targets(m, parts, &drives));
+        notes.extend(shaken_joints(m, parts, &drives));
     }
     notes.extend(other_gains(parts, &drives));
     notes.extend(undriven(m, parts));
@@ -309,7 +331,7 @@ fn held_targets(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Dri
             let inertia = mass[i * nv + i];
             let far = dt * (stiffness / inertia).sqrt();
             (steps != 1 && far > FAR[usize::from(steps == 0)]).then(|| {
-                format!("'{}' (stiffness {stiffness} on {inertia:.3} kg m² or kg)", model.dof_name(i))
+                format!("'{}' (stiffness {stiffness} on {} kg m² or kg)", model.dof_name(i), short(inertia))
             })
         }
         _ => None,
@@ -326,6 +348,42 @@ fn held_targets(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Dri
             long.join(", ")
         )
     })
+}
+
+/// An explicit damper of a drive grows without bound where it takes away twice a velocity in a physics step.
+const SHAKES: f64 = 2.0;
+
+/// Drives whose damping the physics steps of the simulation cannot make.
+fn shaken_joints(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
+    let (period, nv) = (m.task.period(), model.nv());
+    if period.sub_steps < 2 {
+        return None; // exact, or without steps
+    }
+    let mut mass = vec![0.0; nv * nv];
+    Dynamics::new(model).mass(&model.neutral(), &mut mass);
+    let shakes = |&i: &usize| match drives[i] {
+        Drive::Pd { damping, .. } => {
+            let inertia = mass[i * nv + i] + period.tau * (model.damping()[i] + model.drive_damping()[i]);
+            (damping * period.tau > SHAKES * inertia).then(|| {
+                format!("'{}' (damping {damping} on {} kg m² or kg)", model.dof_name(i), short(inertia))
+            })
+        }
+        _ => None,
+    };
+    let joints: Vec<String> = layout.controllable().iter().filter_map(shakes).collect();
+    (!joints.is_empty()).then(|| {
+        format!(
+            "a physics step of {} s takes away more than twice the velocity by the damping of the drives of {}, which shakes them apart: take \
+             integrator=\"implicitfast\" in the robot file, shorter steps or less damping",
+            period.tau,
+            joints.join(", ")
+        )
+    })
+}
+
+/// Three digits.
+fn short(x: f64) -> String {
+    if x.abs() < 1e-3 { format!("{x:.2e}") } else { format!("{x:.3}") }
 }
 
 /// Motors whose strength no limit knows, and that targets are given to.
@@ -411,10 +469,16 @@ fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> 
     let (dofs, limits) = (layout.controllable(), projector.limits());
     let motors = Parts::motors(model, dofs, drives).ok()?;
     let cut = |(k, &i): (usize, &usize)| {
-        let reach = drives[i].reach(&m.task.period(), limits.effort[i], limits.velocity[i]);
+        // At rest at least, where no speed is known.
+        let speed = Some(limits.velocity[i]).filter(|v| v.is_finite() || !m.bounds_drives()).unwrap_or(0.0);
+        let reach = drives[i].reach(&m.task.period(), limits.effort[i], speed);
         let ends = [*m.action_lower.get(motors.place(k))?, *m.action_upper.get(motors.place(k))?];
         let [low, high] = ends.map(|end| motors.command(k, end));
-        let [needed_low, needed_high] = [limits.q_lower[i] - reach, limits.q_upper[i] + reach];
+        // Without a position limit the robot file's own ends.
+        let iq = model.joint_of_dof(i).idx_q;
+        let file = [model.lower_position_limit()[iq], model.upper_position_limit()[iq]];
+        let [lower, upper] = if m.bounds_drives() { file } else { [limits.q_lower[i], limits.q_upper[i]] };
+        let [needed_low, needed_high] = [lower - reach, upper + reach];
         let short =
             reach.is_finite() && reach > 0.0 && (low > needed_low + 1e-9 || high < needed_high - 1e-9);
         let short = short && needed_low.is_finite() && needed_high.is_finite();
@@ -430,11 +494,14 @@ fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> 
         true => "give the actuators that ctrlrange, less speed or less damping",
         false => "make the snapshot anew with this robot file and these limits",
     };
+    let (promised, needs) = match m.bounds_drives() {
+        true => ("limits on torque are", "a torque limit"),
+        false => ("limits on acceleration, velocity and position are", "braking"),
+    };
     (!joints.is_empty()).then(|| {
         format!(
-            "a drive's targets are cut at its range, and limits on acceleration, velocity and position are not promised where they are: {} [rad or m]; \
-             {next}",
-            joints.join(", ")
+            "a drive's targets are cut at its range, and {promised} not promised where they are: {} [rad or m]; {next}",
+            joints.join(", ").replace("braking may", &format!("{needs} may"))
         )
     })
 }

@@ -270,6 +270,23 @@ impl Model {
             && option.viscosity == 0.0
     }
 
+    /// What keeps a physics step from being one ([`Model::is_euler`]), and what to change.
+    pub fn not_euler(&self) -> &'static str {
+        use mujoco_rs::mujoco_c::mjtIntegrator::{mjINT_IMPLICITFAST, mjINT_RK4};
+        let option = self.0.opt();
+        let is = |integrator| option.integrator == integrator as i32;
+        if is(mjINT_RK4) {
+            "the robot file's integrator is Runge-Kutta; take integrator=\"implicitfast\" there"
+        } else if !is(mjINT_IMPLICITFAST) {
+            "the robot file's integrator is implicit in Coriolis forces; take integrator=\"implicitfast\" there"
+        } else if option.density != 0.0 || option.viscosity != 0.0 {
+            "the robot file's implicitfast is implicit in what air or water do (density, viscosity); take these out, or integrator=\"Euler\""
+        } else {
+            "the robot file's implicitfast is implicit in dampers of tendons or actuators that act on more than a joint; take these out, or \
+             integrator=\"Euler\""
+        }
+    }
+
     /// Whether a physics step is MuJoCo's Runge-Kutta of fourth order.
     pub fn is_runge_kutta(&self) -> bool {
         self.0.opt().integrator == mujoco_rs::mujoco_c::mjtIntegrator::mjINT_RK4 as i32

@@ -90,6 +90,7 @@ pub const PRESETS: &[RegisteredPreset] = &[
                 &[
                     "train.gae_lambda=0.8",
                     "train.pid2.idm_policy_gradient=false",
+                    "train.pid2.idm_threshold=0.05",
                     "train.pid2.null_space=true",
                     "train.pid2.alpha=1e-3",
                     "train.pid2.warmup=16384",

@@ -301,7 +301,7 @@ fn what_cannot_be_described_is_refused_by_name() {
     refused(
         &format!(r#"gravcomp="1"><joint name="a" damping="1"/>{geom}<body><joint/>{geom}</body>"#),
         r#"<option><flag eulerdamp="disable"/></option>"#,
-        &["body 'arm' has gravcomp 1, and others that move have another", "eulerdamp"],
+        &["gravcomp is not the same for all bodies that move ('arm' 1, ", "eulerdamp"],
     );
     refused(
         &format!(r#"gravcomp="1"><joint name="a" actuatorgravcomp="true"/>{geom}"#),

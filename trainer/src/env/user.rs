@@ -317,8 +317,10 @@ fn pd_actuators(manifest: &Manifest, model: &Model, wanted: Option<&[String]>) -
 fn sub_steps(task: &Task, model: &Model) -> Result<usize, Mistake> {
     let (t, sim_dt) = (&task.time, model.sim_dt());
     if t.sim_dt != 0.0 && !model.is_euler() {
-        let reason = "the robot file's integrator is neither Euler nor an implicitfast that is implicit in the dampers of joints and their drives alone, so \
-                      the projector cannot count on its steps; write sim_dt = 0";
+        let reason = format!(
+            "{}, or write sim_dt = 0: the projector cannot count on the file's steps then, and limits are exact no more",
+            model.not_euler()
+        );
         return Err(mistake("time.sim_dt", reason));
     }
     if t.sim_dt != 0.0 && (t.sim_dt - sim_dt).abs() > 1e-12 {

@@ -186,11 +186,13 @@ impl Model {
             ));
         }
         let held = |id: &usize| m.body_gravcomp()[*id] != 0.0;
-        for id in (1..self.n_bodies()).filter(|id| held(id) && self.held_weight().is_none()) {
+        if self.held_weight().is_none() {
+            let all = (1..self.n_bodies()).filter(|id| m.body_weldid()[*id] != 0 && m.body_mass()[*id] > 0.0);
+            let each: Vec<String> =
+                all.map(|id| format!("'{}' {}", self.body_name(id), m.body_gravcomp()[id])).collect();
             beyond.push(format!(
-                "body '{}' has gravcomp {}, and others that move have another: give all of them the same, or take it out",
-                self.body_name(id),
-                m.body_gravcomp()[id]
+                "gravcomp is not the same for all bodies that move ({}): give all of them the same, or none any",
+                each.join(", ")
             ));
         }
         for (id, joint) in self.joints().iter().enumerate() {

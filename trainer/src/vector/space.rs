@@ -141,8 +141,9 @@ pub(super) fn guarded_snapshot(task: &str) -> Result<Snapshot, VectorError> {
     let mut manifest = tasks::load(task, &[])?;
     let guard = &mut manifest.task.constraints.guard;
     *guard = match (*guard, manifest.task.idm.kind) {
-        // of the drives alone, as on the robot
+        // of the drives alone, as on the robot, or by the simulator, where the task says so
         (Guard::Drive, _) => Guard::Drive,
+        (Guard::Simulator, _) => Guard::Simulator,
         (_, IdmKind::Pinocchio) => Guard::Model,
         _ => Guard::Simulator,
     };
@@ -153,10 +154,14 @@ pub(super) fn guarded_snapshot(task: &str) -> Result<Snapshot, VectorError> {
 /// The notes of the robot and of the limits, where they are kept by the robot's dynamics.
 pub(super) fn notes(snapshot: &Snapshot, spec: &Spec) -> Result<Vec<String>, VectorError> {
     let m = &snapshot.manifest;
-    if m.task.idm.kind != IdmKind::Pinocchio || m.bounds_drives() {
+    if m.bounds_drives() {
+        return Ok(nearl_runtime::doctor::cut(m)?.into_iter().collect());
+    }
+    if m.task.idm.kind != IdmKind::Pinocchio || m.task.constraints.guard == Guard::Simulator {
         return Ok(Vec::new());
     }
     let mut notes = nearl_runtime::doctor::told(m)?;
+    notes.extend(nearl_runtime::doctor::weak(m)?);
     notes.extend(unstated_steps(m, spec));
     Ok(notes)
 }
