@@ -373,7 +373,7 @@ def test_guarded_actions_are_guarded_as_the_task_says(tmp_path: Path, guard: str
     """The simulator's guard keeps positions and velocities alone."""
     text = f"guard = {guard}\nposition = {{}}\nvelocity = {{ limit = 2.0 }}\nacceleration = {{ limit = 5.0 }}\ntorque = {{ scale = 1.0 }}"
     envs = nearl.make_vec(drives(tmp_path, text, "pinocchio"), 1, constraints="task", actions="guarded")
-    obs, _ = envs.reset(seed=0)
+    envs.reset(seed=0)
     rng, most = np.random.default_rng(0), 0.0
     for tick in range(300):
         before = envs.native.qvel[0].copy()
