@@ -2,6 +2,10 @@
 
 use crate::Period;
 
+/// By which share of it a drive's force stays below its end where physics steps take its damping implicitly: at the end MuJoCo's do not, and the
+/// joint is thrown.
+pub const SHORT: f64 = 1e-7;
+
 /// The command interface of one joint.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub enum Drive {

@@ -236,6 +236,28 @@ def test_a_hand_that_a_tendon_closes_is_no_matter_of_the_arm_s_drives(tmp_path: 
         nearl.make_vec(tmp_path / "arm.toml", 1, constraints="task", actions="guarded")
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_force_at_its_end_throws_no_joint(tmp_path: Path, seed: int) -> None:
+    """At the end of a forcerange MuJoCo's step is no longer implicit in the drive's damping: with fingers that the guard does not know, whose weight brings
+    forces there, the arm had left 10 rad/s² by 31 and 36."""
+    (tmp_path / "arm.xml").write_text(HAND.format(across="f0").replace('forcerange="-87 87"', 'forcerange="-15 15"'))
+    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
+    file = task(tmp_path, 2, 0.002, 0.002, margin=0.003, command=command)
+    file.write_text(file.read_text() + 'braking = "stored"\n')
+    envs = nearl.make_vec(file, 1, constraints="task", actions="guarded")
+    obs, _ = envs.reset(seed=0)
+    rng, before, most = np.random.default_rng(seed), obs[0, 2:].copy(), 0.0
+    for tick in range(3000):
+        if tick % 100 == 0:
+            push = rng.uniform(-2, 2, 2)
+        obs, *_, info = envs.step(push[None])
+        accelerations = np.abs(obs[0, 2:] - before) / 0.002
+        assert accelerations.max() <= ACCELERATION + 1.0, f"tick {tick}: {accelerations}"
+        assert np.abs(obs[0, 2:]).max() <= SPEED + 0.005, f"tick {tick}: {obs}"
+        before, most = obs[0, 2:].copy(), max(most, abs(4500 * (info["executed"][0][0] - obs[0, 0])))
+    assert most > 15.0, "no force came to its end"
+
+
 @pytest.mark.parametrize("seed", [2, 6, 7, 8, 12, 17])
 def test_arms_stay_within_their_limits_over_long_periods(tmp_path: Path, seed: int) -> None:
     """A held force does not brake evenly over 20 ms: joints had come up to 1.1 mrad too far, touched their stops and left 10 rad/s² by 17."""

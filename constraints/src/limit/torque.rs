@@ -2,6 +2,7 @@
 
 use super::margin::{less_each, less_friction};
 use super::{About, Argument, Form, Limit, LimitSet, PerJoint, Takes, quoted};
+use crate::drive::SHORT;
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
 use crate::{Kind, LimitError, Model, Soft};
 use serde::{Deserialize, Serialize};
@@ -50,9 +51,6 @@ impl Default for TorqueSettings {
 pub struct TorqueLimit {
     settings: TorqueSettings,
 }
-
-/// By which share of it a force stays below its end where the end changes how a physics step is made.
-const SHORT: f64 = 1e-7;
 
 impl TorqueLimit {
     /// From the task file's settings.

@@ -3,7 +3,7 @@
 use crate::controller::{idx_q, target_ranges};
 use crate::motors::Motors;
 use crate::snapshot::Manifest;
-use nearl_constraints::drive::{Arrival, Held};
+use nearl_constraints::drive::{Arrival, Held, SHORT};
 use nearl_constraints::{Drive, LimitSet, Model, Period, PeriodDynamics, PhysicsSteps, Target};
 
 /// The commands of the controllable joints for the motion and the mean forces of a period ([`Drive::command`]). Where the plant makes several
@@ -20,6 +20,8 @@ pub(crate) struct Arrivals {
     idx_q: Vec<usize>,
     /// Dry friction by dof (nv), which torque limits leave to the motors beside what they allow.
     friction: Vec<f64>,
+    /// Forces of drives (nv) short of where MuJoCo's step is no longer implicit in their damping; infinite for the others.
+    ends: Vec<f64>,
     steps: Option<PhysicsSteps>,
     commands: Vec<f64>,
     held: Vec<Held>,
@@ -41,7 +43,12 @@ impl Arrivals {
         let follow: Vec<usize> =
             (0..nv).filter(|i| if dofs.contains(i) { is_led(i) } else { !loose }).collect();
         let ranges = target_ranges(m, nv, dofs, motors);
+        let end = |i: usize| match model.drive_damping()[i] > 0.0 {
+            true => (1.0 - SHORT) * model.effort_limit()[i],
+            false => f64::INFINITY,
+        };
         Arrivals {
+            ends: (0..nv).map(end).collect(),
             steps: PhysicsSteps::new(model, (drives, &ranges), dofs, &follow, period),
             idx_q: idx_q(model),
             friction: model.friction().to_vec(),
@@ -69,6 +76,10 @@ impl Arrivals {
             let iq = self.idx_q[i];
             let to = Arrival { q: to.q[iq], v: to.v[i], a: a[i], tau: tau[i] };
             self.commands[i] = self.drives[i].command(&self.period, q[iq], v[i], &to);
+            if let (Drive::Pd { stiffness, damping }, true) = (self.drives[i], self.ends[i].is_finite()) {
+                let target = |force: f64| q[iq] + (force + damping * v[i]) / stiffness;
+                self.commands[i] = self.commands[i].max(target(-self.ends[i])).min(target(self.ends[i]));
+            }
         }
         if let Some(steps) = &mut self.steps {
             for (i, most) in self.most.iter_mut().enumerate() {

@@ -98,6 +98,8 @@ pub(crate) struct Action {
     pub(crate) bias: f64,
     /// Of the joint: the motor makes up for some of it [N·m or N].
     pub(crate) friction: f64,
+    /// The largest force that a drive is sent for, where steps take its damping implicitly [N m or N]; infinite elsewhere.
+    pub(crate) strength: f64,
     pub(crate) range: [f64; 2],
 }
 
@@ -439,6 +441,13 @@ impl Manifest {
                 gain: motor.gain,
                 bias: motor.bias[0],
                 friction: self.robot.joints().nth(*dof).map_or(0.0, |joint| joint.friction),
+                strength: self.robot.joints().nth(*dof).map_or(f64::INFINITY, |joint| {
+                    if joint.drive_damping > 0.0 {
+                        (1.0 - 1e-7) * self.robot.effort(joint)
+                    } else {
+                        f64::INFINITY
+                    }
+                }),
                 range,
             }
         };

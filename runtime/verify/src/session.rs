@@ -791,7 +791,10 @@ fn actions(promise: &mut Promise, passage: &Passage<'_>, found: &[f64]) -> Resul
             Sent::Velocity => (passage.v1[i], 0.0, "rad/s or m/s"),
             Sent::Target { stiffness, damping } => {
                 let target = passage.q[at] + lag * v + sag * a + (tau + damping * (v + lag * a)) / stiffness;
-                (target, action.friction / stiffness, "rad or m")
+                // No force goes to where a step is no longer implicit in the drive's damping.
+                let [low, high] = [-action.strength, action.strength]
+                    .map(|force| passage.q[at] + (force + damping * v) / stiffness);
+                (target.max(low).min(high), action.friction / stiffness, "rad or m")
             }
         };
         let leads = sent.max(action.range[0]).min(action.range[1]);
