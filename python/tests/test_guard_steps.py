@@ -438,6 +438,23 @@ def test_what_the_limits_do_not_reckon_with_is_told_where_an_environment_is_made
     assert "tendons are not modelled" in said and "'a' is 100 rad/s" in said
 
 
+@pytest.mark.parametrize(
+    ("drive", "words"),
+    [
+        ('position kp="40" kv="2" gear="2"', r"\(actuator 'a' has gear 2; with gear 1 its gains are 2² times as much"),
+        ('position kp="40" kv="2" timeconst="0.1"', r"\(actuator 'a' has dynamics of its own\)"),
+        ('general biastype="affine" gainprm="40" biasprm="0 -30 -2"', r"\(actuator 'a' pushes with 40 times what it is sent and -30 times the position"),
+    ],
+)
+def test_drives_that_are_no_plain_ones_are_refused_by_what_they_are(tmp_path: Path, drive: str, words: str) -> None:
+    text = "velocity = { limit = 2.0 }\nacceleration = { limit = 20.0 }\ntorque = { scale = 1.0 }"
+    file = drives(tmp_path, text, "pinocchio")
+    arm = tmp_path / "arm.xml"
+    arm.write_text(re.sub(r'<position name="a"[^>]*/>', f'<{drive} name="a" joint="a" ctrlrange="-9 9" forcerange="-8 8"/>', arm.read_text()))
+    with pytest.raises(ValueError, match=words):
+        nearl.make_vec(file, 1, constraints="task", actions="guarded")
+
+
 def test_actuators_that_are_switched_off_are_refused_by_name(tmp_path: Path) -> None:
     text = "velocity = { limit = 2.0 }\nacceleration = { limit = 20.0 }\ntorque = { scale = 1.0 }"
     file = drives(tmp_path, text, "pinocchio", option='actuatorgroupdisable="1"')

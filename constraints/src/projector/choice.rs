@@ -65,8 +65,8 @@ pub(super) fn braking(
         joints.dedup();
         let (joints, verb) = (joints.join(", "), if joints.len() == 1 { "is" } else { "are" });
         notes.push(format!(
-            "no brake is stored because {joints} {verb} not controllable: {} may be broken when something forces a stop; braking = \"stored\" \
-             verifies one as if nothing else moved",
+            "no brake is stored because {joints} {verb} not controllable: {} may be broken when something forces a stop, and with it limits on position, \
+             velocity and acceleration; braking = \"stored\" verifies one as if nothing else moved",
             listed(&kinds)
         ));
         return Braking::Certified;

@@ -1,6 +1,7 @@
 //! Whether the simulator's actuators take what `[command]` of a task sends them.
 
 use nearl_runtime::Manifest;
+use nearl_runtime::constraints::description::Motor;
 use nearl_runtime::constraints::{Drive, Model, StateLayout};
 
 use super::{Env, EnvError};
@@ -20,6 +21,28 @@ fn takes(drive: Drive, gains: Option<[f64; 3]>) -> bool {
     }
 }
 
+/// What the actuator of a joint is in place of a drive.
+fn other(manifest: &Manifest, joint: &str) -> Option<String> {
+    let motor = manifest.robot.motors.iter().find(|motor| motor.joint == joint)?;
+    let Motor { name, gear, gain, bias: [constant, by_q, _], not_modelled, .. } = motor;
+    let what = if let Some(reason) = not_modelled {
+        format!("has {reason}")
+    } else if *gear != 1.0 {
+        format!(
+            "has gear {gear}; with gear 1 its gains are {gear}² times as much, and what it is sent a {gear}th"
+        )
+    } else if *by_q != 0.0 && *by_q != -gain {
+        format!(
+            "pushes with {gain} times what it is sent and {by_q} times the position, which have to be opposite"
+        )
+    } else if *constant != 0.0 {
+        format!("pushes with {constant} besides")
+    } else {
+        return None;
+    };
+    Some(format!("actuator '{name}' {what}"))
+}
+
 /// Refuses a simulation in which positions, velocities or targets would act as something else.
 ///
 /// # Errors
@@ -32,7 +55,10 @@ pub(super) fn check(manifest: &Manifest, env: &dyn Env, origin: &str) -> Result<
     // What is wrong with robot, state or section is said where the controller is made.
     let Ok(model) = Model::from_description(manifest.robot.clone()) else { return Ok(()) };
     let (propose, controllable) = (task.state.propose.as_deref(), task.state.controllable.as_deref());
-    let Ok(layout) = StateLayout::new(&model, &task.state.observation, propose, controllable) else {
+    // What the policy sees where the task does not say.
+    let of_task = &task.state.observation;
+    let observation = if of_task.is_empty() { &env.spec().obs } else { of_task };
+    let Ok(layout) = StateLayout::new(&model, observation, propose, controllable) else {
         return Ok(());
     };
     let Ok(drives) = task.command.drives(&model, layout.controllable()) else { return Ok(()) };
@@ -52,9 +78,10 @@ pub(super) fn check(manifest: &Manifest, env: &dyn Env, origin: &str) -> Result<
             }
             _ if takes(drive, gains) => continue,
             _ => format!(
-                "joint '{joint}' is sent '{}' commands, and the simulated robot has no such drive; give {}, or drive the robot by a plant of your \
+                "joint '{joint}' is sent '{}' commands, and the simulated robot has no such drive{}; give {}, or drive the robot by a plant of your \
                  own (docs/CONNECT.md)",
                 drive.name(),
+                other(manifest, &joint).map(|what| format!(" ({what})")).unwrap_or_default(),
                 match drive {
                     Drive::Velocity => "an MJCF with <velocity kv=\"D\"> actuators",
                     Drive::Pd { .. } => "an MJCF with <position kp=\"K\" kv=\"D\"> actuators",
