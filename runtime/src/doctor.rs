@@ -468,6 +468,10 @@ fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> 
     }
     let (dofs, limits) = (layout.controllable(), projector.limits());
     let motors = Parts::motors(model, dofs, drives).ok()?;
+    let (promised, asks) = match m.bounds_drives() {
+        true => ("limits on torque are", "a torque limit"),
+        false => ("limits on acceleration, velocity and position are", "braking"),
+    };
     let cut = |(k, &i): (usize, &usize)| {
         // At rest at least, where no speed is known.
         let speed = Some(limits.velocity[i]).filter(|v| v.is_finite() || !m.bounds_drives()).unwrap_or(0.0);
@@ -483,7 +487,10 @@ fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> 
             reach.is_finite() && reach > 0.0 && (low > needed_low + 1e-9 || high < needed_high - 1e-9);
         let short = short && needed_low.is_finite() && needed_high.is_finite();
         short.then(|| {
-            format!("'{}' from {low:.3} to {high:.3} where braking may ask for {needed_low:.3} to {needed_high:.3}", model.dof_name(i))
+            format!(
+                "'{}' from {low:.3} to {high:.3} where {asks} may ask for {needed_low:.3} to {needed_high:.3}",
+                model.dof_name(i)
+            )
         })
     };
     let joints: Vec<String> = dofs.iter().enumerate().filter_map(cut).collect();
@@ -494,14 +501,10 @@ fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> 
         true => "give the actuators that ctrlrange, less speed or less damping",
         false => "make the snapshot anew with this robot file and these limits",
     };
-    let (promised, needs) = match m.bounds_drives() {
-        true => ("limits on torque are", "a torque limit"),
-        false => ("limits on acceleration, velocity and position are", "braking"),
-    };
     (!joints.is_empty()).then(|| {
         format!(
             "a drive's targets are cut at its range, and {promised} not promised where they are: {} [rad or m]; {next}",
-            joints.join(", ").replace("braking may", &format!("{needs} may"))
+            joints.join(", ")
         )
     })
 }
