@@ -105,23 +105,23 @@ pub fn examine(file: &Path, plant: Option<&str>) -> Vec<Check> {
     checks
 }
 
-/// Drives whose targets end before what keeps their limits.
+/// What whoever steps a simulated robot behind its limits is told, one sentence each: what [`told`] says, and joints that the motors cannot hold still
+/// everywhere; where the forces of drives alone are bounded, those whose targets end too early for that.
 ///
 /// # Errors
 /// As [`Parts::new`].
-pub fn cut(m: &Manifest) -> Result<Option<String>, SnapshotError> {
+pub fn told_of_simulated(m: &Manifest) -> Result<Vec<String>, SnapshotError> {
     let parts = Parts::new(m)?;
-    let drives = Parts::drives(m, &parts.model, parts.layout.controllable())?;
-    Ok(cut_targets(m, &parts, &drives))
-}
-
-/// Joints that the motors cannot hold still everywhere within the position limits.
-///
-/// # Errors
-/// As [`Parts::new`].
-pub fn weak(m: &Manifest) -> Result<Option<String>, SnapshotError> {
-    let check = holding(m, &Parts::new(m)?);
-    Ok((check.finding != Finding::Ok).then_some(check.text))
+    if m.bounds_drives() {
+        let drives = Parts::drives(m, &parts.model, parts.layout.controllable())?;
+        return Ok(cut_targets(m, &parts, &drives).into_iter().collect());
+    }
+    let mut notes = doubts(m, &parts);
+    let holds = holding(m, &parts);
+    if holds.finding != Finding::Ok {
+        notes.push(holds.text);
+    }
+    Ok(notes)
 }
 
 /// What the checks of a task say before it is trained: one line for each that is not as it should be, with what to change.

@@ -401,9 +401,8 @@ impl Section {
         if let Some(torque) = &self.torque {
             for &dof in of.controllable {
                 let joint = of.robot.joints().nth(dof).ok_or("a joint is missing")?;
-                // Whichever way a joint rubs, its motor can make up for it. At the very end a step is no longer implicit in the drive's damping.
-                let short = if joint.drive_damping > 0.0 { 1e-7 } else { 0.0 };
-                let most = torque.scale * (1.0 - short) * of.robot.effort(joint) - joint.friction;
+                // Whichever way a joint rubs, its motor can make up for it.
+                let most = torque.scale * of.robot.usable(joint) - joint.friction;
                 let effort = less(most, &torque.margin, dof, &joint.name);
                 efforts.push((dof, effort));
                 rows.push(Row::new(

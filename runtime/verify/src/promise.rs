@@ -441,13 +441,12 @@ impl Manifest {
                 gain: motor.gain,
                 bias: motor.bias[0],
                 friction: self.robot.joints().nth(*dof).map_or(0.0, |joint| joint.friction),
-                strength: self.robot.joints().nth(*dof).map_or(f64::INFINITY, |joint| {
-                    if joint.drive_damping > 0.0 {
-                        (1.0 - 1e-7) * self.robot.effort(joint)
-                    } else {
-                        f64::INFINITY
-                    }
-                }),
+                strength: self
+                    .robot
+                    .joints()
+                    .nth(*dof)
+                    .filter(|joint| joint.drive_damping > 0.0)
+                    .map_or(f64::INFINITY, |joint| self.robot.usable(joint)),
                 range,
             }
         };

@@ -182,6 +182,12 @@ impl Robot {
         self.bodies.iter().flat_map(|body| &body.joints)
     }
 
+    /// [`Robot::effort`], short of the end where a physics step is no longer implicit in a drive's damping [N·m or N].
+    pub(crate) fn usable(&self, joint: &Joint) -> f64 {
+        let effort = self.effort(joint);
+        if joint.drive_damping > 0.0 { (1.0 - 1e-7) * effort } else { effort }
+    }
+
     /// The largest force of a joint, by its own limit and its motors' [N·m or N].
     pub(crate) fn effort(&self, joint: &Joint) -> f64 {
         let motors = self.motors.iter().filter(|motor| motor.joint == joint.name).map(Motor::strength);

@@ -243,7 +243,7 @@ impl Row {
                 let [low, high] = range.map_or([-most, *most], |(iq, range)| {
                     let share = if p.sub_steps == 1 { 1.0 } else { 1.0 - AWAY };
                     range.map(|end| {
-                        (stiffness * share * (end - passage.q[iq]) - damping * v).clamp(-most, *most)
+                        (stiffness * share * (end - passage.q[iq]) - damping * v).max(-most).min(*most)
                     })
                 });
                 [(low - force) / most, (force - high) / most]

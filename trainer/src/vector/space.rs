@@ -154,14 +154,11 @@ pub(super) fn guarded_snapshot(task: &str) -> Result<Snapshot, VectorError> {
 /// The notes of the robot and of the limits, where they are kept by the robot's dynamics.
 pub(super) fn notes(snapshot: &Snapshot, spec: &Spec) -> Result<Vec<String>, VectorError> {
     let m = &snapshot.manifest;
-    if m.bounds_drives() {
-        return Ok(nearl_runtime::doctor::cut(m)?.into_iter().collect());
-    }
-    if m.task.idm.kind != IdmKind::Pinocchio || m.task.constraints.guard == Guard::Simulator {
+    let by_model = m.task.idm.kind == IdmKind::Pinocchio && m.task.constraints.guard != Guard::Simulator;
+    if !(by_model || m.bounds_drives()) {
         return Ok(Vec::new());
     }
-    let mut notes = nearl_runtime::doctor::told(m)?;
-    notes.extend(nearl_runtime::doctor::weak(m)?);
+    let mut notes = nearl_runtime::doctor::told_of_simulated(m)?;
     notes.extend(unstated_steps(m, spec));
     Ok(notes)
 }
