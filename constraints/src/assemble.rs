@@ -4,7 +4,7 @@
 //! axis stands still in its joint's frame, which Pinocchio's derivatives take for granted.
 
 use crate::ModelError;
-use crate::description::{Body, FrictionLaw, JointDescription, JointKind, Onset, Range, RobotDescription};
+use crate::description::{Body, Command, FrictionLaw, JointDescription, JointKind, Motor, Onset, Range, RobotDescription};
 use crate::geometry::Placement;
 use crate::model::{Inner, Joint, ModelFrame};
 use crate::pinocchio::{self, RawData, RawModel};
@@ -91,6 +91,7 @@ impl Tree {
             armature: zero.clone(),
             damping: zero.clone(),
             drive_damping: zero.clone(),
+            held: vec![false; nv],
             stiffness: zero.clone(),
             spring_reference: zero.clone(),
             friction: zero,
@@ -119,6 +120,8 @@ impl Inner {
             (self.lower[idx_q], self.upper[idx_q]) = (lower, upper);
         }
         let motors = self.description.motors.iter().filter(|m| m.joint == joint.name);
+        let servo = |m: &Motor| matches!(m.command, Command::Position | Command::Pd | Command::Velocity);
+        let held = joint.held || motors.clone().any(servo);
         let strength = motors.map(|m| m.strength()).reduce(|sum, x| sum + x).unwrap_or(f64::INFINITY);
         for i in idx_v..idx_v + nv {
             self.velocity[i] = joint.velocity.unwrap_or(f64::INFINITY);
@@ -126,6 +129,7 @@ impl Inner {
             self.armature[i] = joint.armature;
             self.damping[i] = joint.damping;
             self.drive_damping[i] = joint.drive_damping;
+            self.held[i] = held && nv == 1;
             self.stiffness[i] = joint.stiffness;
             self.spring_reference[i] = joint.spring_reference;
             self.friction[i] = if nv == 1 { joint.friction } else { 0.0 };

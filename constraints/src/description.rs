@@ -102,6 +102,13 @@ pub struct JointDescription {
     /// What dry friction is taken to be.
     #[serde(default, skip_serializing_if = "is_mujoco")]
     pub friction_law: FrictionLaw,
+    /// Something beside the motors named here holds it where it is, as a tendon or an equation does the fingers of a hand. Of one-dof joints only.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub held: bool,
+}
+
+fn is_false(held: &bool) -> bool {
+    !held
 }
 
 fn is_none(damping: &f64) -> bool {
@@ -204,6 +211,7 @@ impl JointDescription {
             friction: 0.0,
             friction_onset: None,
             friction_law: FrictionLaw::default(),
+            held: false,
         }
     }
 }

@@ -55,6 +55,7 @@ pub(crate) struct Inner {
     pub(crate) armature: Vec<f64>,
     pub(crate) damping: Vec<f64>,
     pub(crate) drive_damping: Vec<f64>,
+    pub(crate) held: Vec<bool>,
     pub(crate) stiffness: Vec<f64>,
     pub(crate) spring_reference: Vec<f64>,
     pub(crate) friction: Vec<f64>,
@@ -235,6 +236,11 @@ impl Model {
     /// ([`crate::Period::resistance`]), and its motor's force has the rest.
     pub fn drive_damping(&self) -> &[f64] {
         &self.0.drive_damping
+    }
+
+    /// Dofs (nv) that something holds where they are while nobody commands them: a drive of positions or velocities, or what the robot file holds them by.
+    pub fn held(&self) -> &[bool] {
+        &self.0.held
     }
 
     /// Joint springs (nv) [N·m/rad or N/m].

@@ -93,7 +93,7 @@ const NEAR: f64 = 1e-5;
 
 impl PhysicsSteps {
     /// For motors on the dofs `driven` of `model`, whose commands `drives` (nv) names; targets stay within `ranges` (nv). The dofs `follow` have
-    /// the accelerations that they are given, whatever it takes; all others follow from the forces. `None` where a period has a single physics step
+    /// the accelerations that they are given, whatever it takes, and none where no command gives one; all others follow from the forces. `None` where a period has a single physics step
     /// or none: [`PeriodDynamics`] is exact for the former.
     pub fn new(
         model: &Model,
@@ -162,7 +162,10 @@ impl PhysicsSteps {
     ) {
         for (i, held) in self.held.iter_mut().enumerate() {
             let at = self.single[i].map_or(0.0, |iq| q[iq]);
-            *held = self.drives[i].held(&self.period, at, v[i], commands[i]);
+            *held = match self.drives[i] {
+                Drive::Effort => Held::Acceleration(0.0), // followed: of those that are free the force is set below
+                drive => drive.held(&self.period, at, v[i], commands[i]),
+            };
         }
         self.free.iter().for_each(|&i| self.held[i] = Held::Force(0.0));
         for (k, &r) in self.pushed.iter().enumerate() {

@@ -258,6 +258,36 @@ def test_a_force_at_its_end_throws_no_joint(tmp_path: Path, seed: int) -> None:
     assert most > 15.0, "no force came to its end"
 
 
+@pytest.mark.parametrize(("dt", "timestep", "seed"), [(0.002, 0.002, 0), (0.002, 0.002, 1), (0.005, 0.005, 0), (0.006, 0.002, 0)])
+def test_fingers_that_are_left_alone_take_no_arm_off_its_limits(tmp_path: Path, recwarn: pytest.WarningsRecorder, dt: float, timestep: float, seed: int) -> None:
+    """An equation and a tendon hold them. Without a stored brake, and reckoned with as loose, the arm had left 10 rad/s² by XX."""
+    (tmp_path / "arm.xml").write_text(HAND.format(across="f0").replace('forcerange="-87 87"', 'forcerange="-15 15"').replace('"0.002"', f'"{timestep}"'))
+    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
+    envs = nearl.make_vec(task(tmp_path, 2, dt, timestep, margin=0.003, command=command), 1, constraints="task", actions="guarded")
+    told = "\n".join(str(warning.message) for warning in recwarn)
+    assert "a brake is stored as if 'f0', 'f1', which are not controllable, did not move" in told, told
+    assert "with joints that nothing drives" not in told, told
+    obs, _ = envs.reset(seed=0)
+    rng, before, held_back = np.random.default_rng(seed), obs[0, 2:].copy(), 0
+    for tick in range(2000):
+        if tick % 100 == 0:
+            push = rng.uniform(-2, 2, 2)
+        obs, *_ = envs.step(push[None])
+        accelerations = np.abs(obs[0, 2:] - before) / dt
+        assert accelerations.max() <= ACCELERATION + 0.02, f"tick {tick}: {accelerations}"
+        assert np.abs(obs[0, 2:]).max() <= SPEED + 1e-3 and np.abs(obs[0, :2]).max() <= 1.0, f"tick {tick}: {obs}"
+        before, held_back = obs[0, 2:].copy(), held_back + int(accelerations.max() > 0.9 * ACCELERATION)
+    assert held_back > 50
+
+
+@pytest.mark.parametrize(("mass", "says"), [(0.02, "a brake is stored as if 'f0', 'f1'"), (2.0, "no brake is stored because 'f0', 'f1' are not controllable")])
+def test_a_brake_is_stored_where_what_is_left_alone_is_light(tmp_path: Path, recwarn: pytest.WarningsRecorder, mass: float, says: str) -> None:
+    (tmp_path / "arm.xml").write_text(HAND.format(across="f0").replace('mass="0.02"', f'mass="{mass}"'))
+    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
+    nearl.make_vec(task(tmp_path, 2, 0.002, 0.002, command=command), 1, constraints="task", actions="guarded")
+    assert any(says in str(warning.message) for warning in recwarn), [str(warning.message) for warning in recwarn]
+
+
 @pytest.mark.parametrize("seed", [2, 6, 7, 8, 12, 17])
 def test_arms_stay_within_their_limits_over_long_periods(tmp_path: Path, seed: int) -> None:
     """A held force does not brake evenly over 20 ms: joints had come up to 1.1 mrad too far, touched their stops and left 10 rad/s² by 17."""

@@ -866,7 +866,7 @@ def test_a_joint_that_swings_is_told_of(tmp_path) -> None:
         controller.save(tmp_path / "slide.safetensors")
         said = subprocess.run([NEARL, "doctor", tmp_path / "slide.safetensors"], capture_output=True, text=True).stdout
         assert "'slide' might need" in said
-        assert ("to brake while 'hinge', which nothing drives, stand still" in said) == rests, said
+        assert ("to brake while 'hinge', which nothing commands, stand still" in said) == rests, said
 
 
 @pytest.mark.parametrize("interface", ["effort", "position"])

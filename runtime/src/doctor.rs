@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use crate::cli::{Failure, say};
 use crate::codes::CheckCode;
-use crate::controller::{Controller, Margin, Parts};
+use crate::controller::{Controller, Margin, Parts, held_dofs};
 use crate::gains;
 use crate::holding;
 use crate::link::{
@@ -436,16 +436,17 @@ fn other_gains(Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<
     })
 }
 
-/// Joints that nothing drives, quoted.
-fn loose_joints(Parts { model, layout, .. }: &Parts) -> Vec<String> {
-    let driven = layout.controllable();
-    let loose = model.joints().iter().filter(|j| (j.idx_v..j.idx_v + j.nv).any(|i| !driven.contains(&i)));
-    loose.map(|j| format!("'{}'", j.name)).collect()
+/// Joints that nothing commands, quoted, but for those with a dof in `held`.
+fn left_alone(Parts { model, layout, .. }: &Parts, held: &[usize]) -> Vec<String> {
+    let commanded = layout.controllable();
+    let is_left = |i: usize| !commanded.contains(&i) && !held.contains(&i);
+    let left = model.joints().iter().filter(|j| (j.idx_v..j.idx_v + j.nv).any(is_left));
+    left.map(|j| format!("'{}'", j.name)).collect()
 }
 
 /// What a guard by the robot's model does not promise of joints that nothing drives.
 fn undriven(m: &Manifest, parts: &Parts) -> Option<String> {
-    let loose = loose_joints(parts);
+    let loose = left_alone(parts, &held_dofs(m, &parts.model, parts.layout.controllable()));
     (m.guards() && !loose.is_empty()).then(|| {
         format!(
             "guard = true reckons with {} as with joints that nothing drives and nothing touches: on the ground or in contact the limits of the others hold as \
@@ -611,7 +612,7 @@ fn gains(m: &Manifest, parts: &Parts) -> Check {
 
 /// Can the motors give the decelerations that the position limits count on?
 fn braking(m: &Manifest, parts: Parts) -> Check {
-    let loose = loose_joints(&parts);
+    let left_alone = left_alone(&parts, &[]);
     let Parts { model, layout, projector } = parts;
     let (limits, controllable) = (projector.limits(), layout.controllable());
     if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {
@@ -632,10 +633,10 @@ fn braking(m: &Manifest, parts: Parts) -> Check {
         Err(e) => fail(CheckCode::Braking, e.to_string()),
         Ok(c) => {
             let joint = model.dof_name(c.dof);
-            // The search leaves what nothing drives at rest.
-            let at_rest = match &loose[..] {
+            // The search leaves what nothing commands at rest.
+            let at_rest = match &left_alone[..] {
                 [] => String::new(),
-                loose => format!(" while {}, which nothing drives, stand still", loose.join(", ")),
+                joints => format!(" while {}, which nothing commands, stand still", joints.join(", ")),
             };
             let found = format!(
                 "in the hardest of {} states '{joint}' might need {:.1} of its {:.1} N m or N to brake{at_rest}",

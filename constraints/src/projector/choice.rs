@@ -2,14 +2,22 @@
 
 use super::Dofs;
 use crate::checker::Checker;
+use crate::period_dynamics::solve;
+use crate::random::Random;
 use crate::viability::{Kind, Period};
-use crate::{Braking, Consistency, Limit, LimitSet, Model, Settings, certify_braking, friction};
+use crate::{Braking, Consistency, Dynamics, Limit, LimitSet, Model, Settings, certify_braking, friction};
 
 /// States looked at, and their seed.
 const SAMPLES: (usize, u64) = (2000, 7);
 
+/// Configurations at which inertias are looked at.
+const CONFIGURATIONS: usize = 200;
+
 /// Share of a motor's force that certified braking must leave: the search is no proof.
 const MARGIN: f64 = 0.03;
+
+/// Share of an inertia that joints which nobody commands may take off before a brake that reckons with them as standing still is worth nothing.
+const LIGHT: f64 = 0.05;
 
 /// A joint that needs longer than this to stop has an acceleration limit nobody meant [s].
 const LONGEST_STOP: f64 = 30.0;
@@ -64,12 +72,22 @@ pub(super) fn braking(
             dofs.fixed.iter().map(|i| format!("'{}'", model.joint_of_dof(*i).name)).collect();
         joints.dedup();
         let (joints, verb) = (joints.join(", "), if joints.len() == 1 { "is" } else { "are" });
+        let share = carried_off(model, limits, dofs);
+        if share > LIGHT {
+            notes.push(format!(
+                "no brake is stored because {joints} {verb} not controllable: {} may be broken when something forces a stop, and with it limits on position, \
+                 velocity and acceleration; braking = \"stored\" verifies one as if nothing else moved",
+                listed(&kinds)
+            ));
+            return Braking::Certified;
+        }
         notes.push(format!(
-            "no brake is stored because {joints} {verb} not controllable: {} may be broken when something forces a stop, and with it limits on position, \
-             velocity and acceleration; braking = \"stored\" verifies one as if nothing else moved",
+            "a brake is stored as if {joints}, which {verb} not controllable, did not move: at most {:.1} % of what the motors accelerate gives way to \
+             that, and {} may be broken by as much",
+            100.0 * share,
             listed(&kinds)
         ));
-        return Braking::Certified;
+        return Braking::Stored;
     }
     if kinds.iter().all(|kind| *kind == Kind::Torque) && !checker.needs_a_brake() {
         let period = Period::new(settings.dt, settings.sub_steps);
@@ -85,6 +103,45 @@ pub(super) fn braking(
         }
     }
     Braking::Stored
+}
+
+/// The largest share of the inertia of the controllable dofs that the others take off by giving way: the sum of the eigenvalues of
+/// `M_cc^-1 M_cf M_ff^-1 M_fc`, at configurations within the limits. Not finite, or above 1, where a mass matrix is none.
+fn carried_off(model: &Model, limits: &LimitSet, dofs: &Dofs) -> f64 {
+    let (nv, controllable, fixed) = (model.nv(), &dofs.controllable, &dofs.fixed);
+    let (n, m) = (controllable.len(), fixed.len());
+    let mut dynamics = Dynamics::new(model);
+    let mut random = Random(SAMPLES.1);
+    let (mut q, mut mass) = (model.neutral(), vec![0.0; nv * nv]);
+    let block = |mass: &[f64], rows: &[usize], columns: &[usize]| -> Vec<f64> {
+        rows.iter().flat_map(|i| columns.iter().map(move |j| mass[j * nv + i])).collect()
+    };
+    let mut most: f64 = 0.0;
+    for _ in 0..CONFIGURATIONS {
+        for &i in controllable {
+            let joint = model.joint_of_dof(i);
+            if joint.nq == 1 && joint.nv == 1 {
+                let or = |x: f64, otherwise: f64| if x.is_finite() { x } else { otherwise };
+                let (low, high) =
+                    (or(limits.q_lower[i], -std::f64::consts::PI), or(limits.q_upper[i], std::f64::consts::PI));
+                q[joint.idx_q] = random.between(low, high);
+            }
+        }
+        dynamics.mass(&q, &mut mass);
+        let mut follows = block(&mass, fixed, controllable);
+        solve(m, n, &mut block(&mass, fixed, fixed), &mut follows);
+        let couples = block(&mass, controllable, fixed);
+        let mut lost: Vec<f64> = (0..n * n)
+            .map(|k| (0..m).map(|f| couples[k / n * m + f] * follows[f * n + k % n]).sum())
+            .collect();
+        solve(n, n, &mut block(&mass, controllable, controllable), &mut lost);
+        let share: f64 = (0..n).map(|i| lost[i * n + i]).sum();
+        if !share.is_finite() {
+            return f64::INFINITY;
+        }
+        most = most.max(share);
+    }
+    most
 }
 
 fn listed(kinds: &[Kind]) -> String {

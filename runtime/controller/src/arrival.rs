@@ -29,19 +29,19 @@ pub(crate) struct Arrivals {
 }
 
 impl Arrivals {
-    /// For commands to `dofs`; `drives` (nv) says what they are, and the motors take them as far as their range goes. A dof that
-    /// is not among them is `loose`, or keeps the acceleration it is given.
+    /// For commands to `dofs`; `drives` (nv) says what they are, and the motors take them as far as their range goes. Of the others those that
+    /// are `led` have the acceleration that they are given, none where nothing gives one.
     pub(crate) fn new(
         m: &Manifest,
         model: &Model,
         dofs: &[usize],
         (drives, motors): (&[Drive], &Motors),
-        loose: bool,
+        led: &[usize],
     ) -> Arrivals {
         let (nv, period) = (model.nv(), m.task.period());
-        let is_led = |i: &usize| matches!(drives[*i], Drive::Position | Drive::Velocity);
+        let by_position = |i: &usize| matches!(drives[*i], Drive::Position | Drive::Velocity);
         let follow: Vec<usize> =
-            (0..nv).filter(|i| if dofs.contains(i) { is_led(i) } else { !loose }).collect();
+            (0..nv).filter(|i| if dofs.contains(i) { by_position(i) } else { led.contains(i) }).collect();
         let ranges = target_ranges(m, nv, dofs, motors);
         let end = |i: usize| match model.drive_damping()[i] > 0.0 {
             true => (1.0 - SHORT) * model.effort_limit()[i],
@@ -57,7 +57,7 @@ impl Arrivals {
             dofs: dofs.to_vec(),
             drives: drives.to_vec(),
             commands: vec![0.0; nv],
-            held: vec![Held::Force(0.0); nv],
+            held: (0..nv).map(|i| if led.contains(&i) { Held::Acceleration(0.0) } else { Held::Force(0.0) }).collect(),
             most: vec![0.0; nv],
         }
     }

@@ -27,7 +27,7 @@ mod noise;
 mod parts;
 
 pub use dial::{Margin, merge_margins};
-pub use parts::{Parts, seen_entries};
+pub use parts::{Parts, held_dofs, seen_entries};
 
 use crate::idm::{AnalyticIdm, LearnedIdm};
 use crate::net::{Activation, Forward, Function};

@@ -63,9 +63,10 @@ impl AnalyticIdm {
     pub fn new(m: &Manifest, model: &Model, dofs: &[usize]) -> Result<Self, SnapshotError> {
         let drives = Parts::drives(m, model, dofs)?;
         let motors = Parts::motors(model, dofs, &drives)?;
+        let others: Vec<usize> = (0..model.nv()).filter(|i| !dofs.contains(i)).collect();
         Ok(Self {
             dynamics: Dynamics::new(model),
-            arrivals: Arrivals::new(m, model, dofs, (&drives, &motors), false),
+            arrivals: Arrivals::new(m, model, dofs, (&drives, &motors), &others),
             motors,
             dofs: dofs.to_vec(),
             period: m.task.period(),

@@ -3,7 +3,7 @@
 use nearl_runtime::constraints::description::{Command, JointDescription, Motor, RobotDescription};
 
 use mujoco_rs::mujoco_c::mjtDisableBit;
-use mujoco_rs::wrappers::mj_model::{MjtBias, MjtDyn, MjtGain, MjtObjBase, MjtTrn, MjtWrap};
+use mujoco_rs::wrappers::mj_model::{MjtBias, MjtDyn, MjtEq, MjtGain, MjtObjBase, MjtTrn, MjtWrap};
 
 use super::Model;
 
@@ -21,6 +21,9 @@ pub(super) fn add(model: &Model, robot: &mut RobotDescription) {
                 "actuator '{name}' does not drive a joint with one dof and is not modelled: nothing commands it, and a simulation holds it at control 0"
             )),
         }
+    }
+    for joint in (0..model.0.jnt_type().len()).filter(|id| model.is_tied(*id)).map(|id| model.joint_name(id)) {
+        robot.bodies.iter_mut().flat_map(|body| &mut body.joints).filter(|j| j.name == joint).for_each(|j| j.held = true);
     }
 }
 
@@ -76,6 +79,23 @@ impl Model {
     pub(super) fn tendon_of(&self, id: usize) -> Option<usize> {
         let is_tendon = self.0.actuator_trntype()[id] == MjtTrn::mjTRN_TENDON;
         usize::try_from(self.0.actuator_trnid()[id][0]).ok().filter(|_| is_tendon)
+    }
+
+    /// Whether a joint with one dof is tied to others, by an equation or a sum of joints that an actuator pulls: so the fingers of a hand hold each other.
+    fn is_tied(&self, joint: usize) -> bool {
+        let m = &self.0;
+        let id = i32::try_from(joint).unwrap_or(-1);
+        let is_off = self.disables(mjtDisableBit::mjDSBL_EQUALITY) || self.disables(mjtDisableBit::mjDSBL_CONSTRAINT);
+        let equates = |k: usize| {
+            m.eq_type()[k] == MjtEq::mjEQ_JOINT && m.eq_active0()[k] && [m.eq_obj1id()[k], m.eq_obj2id()[k]].contains(&id)
+        };
+        let pulls = |tendon: usize| {
+            let [first, count] = [m.tendon_adr()[tendon], m.tendon_num()[tendon]].map(|x| x.max(0) as usize);
+            (first..first + count).any(|k| m.wrap_type()[k] == MjtWrap::mjWRAP_JOINT && m.wrap_objid()[k] == id)
+        };
+        let by_equation = !is_off && (0..m.eq_type().len()).any(equates);
+        let by_tendon = || (0..self.n_actuators()).filter_map(|id| self.tendon_of(id)).any(pulls);
+        self.joint(joint).nv == 1 && (by_equation || by_tendon())
     }
 
     /// Whether a tendon is a sum of joints that no motor drives: the equations of those that motors drive do not have what it damps.

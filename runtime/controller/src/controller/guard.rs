@@ -1,7 +1,7 @@
 //! The guard of `guard = true`: forward dynamics say which state an action leads to, that state is projected, and inverse dynamics give the action
 //! that leads to what the projection made of it.
 
-use super::parts::unusable;
+use super::parts::{held_dofs, unusable};
 use crate::arrival::Arrivals;
 use crate::motors::Motors;
 use crate::snapshot::{Manifest, SnapshotError};
@@ -16,6 +16,7 @@ use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposa
 ///         -> tau' = R a' + b + F(a')                on S_c, while the other dofs follow
 /// ```
 ///
+/// Dofs that something holds where they are ([`held_dofs`]) have no acceleration, whatever that takes; the others follow from the forces.
 /// Joints with a drive take their command for the force (see [`Drive`]). Where the plant makes several physics steps of a period they are made
 /// one by one, forward and back. Where the projection moves nothing the action stays bit for bit.
 pub(super) struct Guard {
@@ -51,13 +52,15 @@ impl Guard {
             let joint = model.joint_of_dof(i);
             (joint.nq == 1 && joint.nv == 1).then_some(joint.idx_q)
         });
+        let held = held_dofs(m, model, &dofs);
+        let driven: Vec<usize> = (0..nv).filter(|i| dofs.contains(i) || held.contains(i)).collect();
         Ok(Guard {
-            dynamics: PeriodDynamics::new(model, &dofs, m.task.period()),
+            dynamics: PeriodDynamics::new(model, &driven, m.task.period()),
             proposal: Proposal::new(model),
             single: single.collect(),
             commands: vec![0.0; nv],
             tau: vec![0.0; nv],
-            arrivals: Arrivals::new(m, model, &dofs, (&drives, &motors), true),
+            arrivals: Arrivals::new(m, model, &dofs, (&drives, &motors), &held),
             motors,
             a: vec![0.0; nv],
             step: vec![0.0; nv],
