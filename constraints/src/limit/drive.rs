@@ -50,7 +50,7 @@ impl Limit for DriveTorqueLimit {
             }
             _ => None,
         });
-        Ok(Some(Box::new(DriveTorqueRows { joints: drives.collect(), period: self.period })))
+        Ok(Some(Box::new(DriveTorqueRows::new(drives.collect(), self.period))))
     }
 
     fn soft(&self) -> Option<Soft> {
@@ -97,10 +97,50 @@ const AWAY: f64 = 0.2;
 /// Ranges this close are the same [rad or m].
 const NEAR: f64 = 1e-9;
 
-/// Of each joint the start of the period, then its end.
+/// What a row is of. A drive that is evaluated once has the same force at both ends.
+#[derive(Clone, Copy, PartialEq)]
+enum At {
+    Start,
+    End,
+    Target,
+}
+
+impl At {
+    fn name(self) -> &'static str {
+        match self {
+            At::Start => "at the start",
+            At::End => "at the end",
+            At::Target => "by its target",
+        }
+    }
+}
+
+/// Row by row the joint and what of it; one curve each, or what rises and falls between two ticks of a brake would be hidden below another.
 struct DriveTorqueRows {
     joints: Vec<Joint>,
+    rows: Vec<(usize, At)>,
     period: Period,
+}
+
+impl DriveTorqueRows {
+    fn new(joints: Vec<Joint>, period: Period) -> DriveTorqueRows {
+        let has = |j: &Joint, at: At| match at {
+            At::Start => true,
+            At::End => period.sub_steps != 1,
+            At::Target => j.range.iter().any(|end| end.is_finite()),
+        };
+        let of = |(k, j): (usize, &Joint)| {
+            let parts: Vec<_> =
+                [At::Start, At::End, At::Target].into_iter().filter(|at| has(j, *at)).collect();
+            parts.into_iter().map(move |at| (k, at))
+        };
+        let rows = joints.iter().enumerate().flat_map(of).collect();
+        DriveTorqueRows { joints, rows, period }
+    }
+
+    fn of_rows(&self) -> impl Iterator<Item = (&Joint, At)> {
+        self.rows.iter().map(|(k, at)| (&self.joints[*k], *at))
+    }
 }
 
 impl Rows for DriveTorqueRows {
@@ -109,14 +149,11 @@ impl Rows for DriveTorqueRows {
     }
 
     fn names(&self) -> Vec<String> {
-        self.joints
-            .iter()
-            .flat_map(|j| ["start", "end"].map(|at| format!("{} at the {at}", j.name)))
-            .collect()
+        self.of_rows().map(|(j, at)| format!("{} {}", j.name, at.name())).collect()
     }
 
     fn sizes(&self) -> Vec<f64> {
-        self.joints.iter().flat_map(|j| [j.effort, j.effort]).collect()
+        self.of_rows().map(|(j, _)| j.effort).collect()
     }
 
     fn needs(&self) -> Needs {
@@ -143,23 +180,30 @@ impl Rows for DriveTorqueRows {
     /// ```text
     ///     start = tau + K (h v + c a) + D h a          end = start - K (e v + e T a / 2) - D e a
     /// ```
+    ///
+    /// A target is within its range where the force at the start is within what the ends of the range make.
     fn fill(&mut self, tick: &mut TickStart<'_>, rows: &mut RowsMut<'_>) {
         let period = *tick.period;
         let (t, lag, sag) = (period.dt, period.lag(), period.sag());
         let end = t - period.tau;
-        for (r, j) in self.joints.iter().enumerate() {
+        for (r, (k, at)) in self.rows.iter().enumerate() {
+            let j = &self.joints[*k];
             let v = tick.v[j.dof];
-            let start = [j.stiffness * lag * v, j.stiffness * sag + j.damping * lag];
-            let change = [j.stiffness * end * v, (0.5 * j.stiffness * t + j.damping) * end];
-            let ends = [start, [start[0] - change[0], start[1] - change[1]]];
-            for (k, [still, by_acceleration]) in ends.into_iter().enumerate() {
-                let row = rows.row(2 * r + k);
-                tick.motor(j.dof, row);
-                row[j.dof] += by_acceleration / t;
-                let still = still + tick.bias[j.dof];
-                let [low, high] = if k == 0 { j.forces(tick.q[j.idx_q], v) } else { [-j.effort, j.effort] };
-                (rows.lower[2 * r + k], rows.upper[2 * r + k]) = (low - still, high - still);
+            let mut force = [j.stiffness * lag * v, j.stiffness * sag + j.damping * lag];
+            if *at == At::End {
+                force[0] -= j.stiffness * end * v;
+                force[1] -= (0.5 * j.stiffness * t + j.damping) * end;
             }
+            let [still, by_acceleration] = force;
+            let row = rows.row(r);
+            tick.motor(j.dof, row);
+            row[j.dof] += by_acceleration / t;
+            let still = still + tick.bias[j.dof];
+            let [low, high] = match at {
+                At::Target => j.forces(tick.q[j.idx_q], v),
+                _ => [-j.effort, j.effort],
+            };
+            (rows.lower[r], rows.upper[r]) = (low - still, high - still);
         }
     }
 
@@ -167,17 +211,22 @@ impl Rows for DriveTorqueRows {
     fn excess(&mut self, motion: &mut Motion<'_>, excess: &mut [f64]) {
         let period = motion.period;
         let (t, end) = (period.dt, period.dt - period.tau);
-        for (x, j) in excess.chunks_exact_mut(2).zip(&self.joints) {
+        for (x, (k, at)) in excess.iter_mut().zip(&self.rows) {
+            let j = &self.joints[*k];
             let (v, a) = (motion.v[j.dof], motion.acceleration[j.dof]);
             // How far the target is from where the joint is.
             let to = crate::drive::Arrival { q: 0.0, v: 0.0, a, tau: motion.torque[j.dof] };
             let target = j.drive().command(period, 0.0, v, &to);
             let force = |q: f64, v: f64| j.stiffness * (target - q) - j.damping * v;
-            let at = motion.q[j.idx_q] + target;
-            let [low, high] = j.targets(motion.q[j.idx_q]);
-            let beyond = j.stiffness * (at - high).max(low - at);
-            x[0] = (force(0.0, v).abs() - j.effort).max(beyond) / j.effort;
-            x[1] = force(end * (v + 0.5 * t * a), v + end * a).abs() / j.effort - 1.0;
+            *x = match at {
+                At::Start => force(0.0, v).abs() / j.effort - 1.0,
+                At::End => force(end * (v + 0.5 * t * a), v + end * a).abs() / j.effort - 1.0,
+                At::Target => {
+                    let q = motion.q[j.idx_q];
+                    let [low, high] = j.targets(q);
+                    j.stiffness * (q + target - high).max(low - q - target) / j.effort
+                }
+            };
         }
     }
 }
