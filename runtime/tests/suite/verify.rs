@@ -263,6 +263,25 @@ fn set_points_of_a_robot_that_lags_keep_their_limits_over_states_that_are_lost()
     }
 }
 
+/// What a joint went on from in the first tick after a gap is not in the log, so that its acceleration there, of which the jerk of the next tick speaks,
+/// is not known either: it was taken from the measured state, and honest logs were accused.
+#[test]
+fn a_jerk_after_a_gap_is_not_told_from_a_measured_state() {
+    let limits =
+        format!("{LIMITS}\njerk = {{ limit = 600.0, hard = true }}\n[command]\ninterface = \"position\"");
+    let (folder, log) = record("verify-gap-jerk", &Attack { lag: 0.02, ..attack(&limits, 0.004, 1, 20) });
+    let whole = verify(&log).unwrap();
+    assert_eq!((whole.found, whole.is_whole()), (0, true), "{whole}");
+    let other = folder.0.join("copy.mcap");
+    for left_out in [300, 517, 733, 901, 1204] {
+        let edit = |topic: &str, m: &mut Value| topic != "tick" || m["tick"] != left_out;
+        copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+        let report = verify(&other).unwrap();
+        assert_eq!(report.found, 0, "{left_out}: {report}");
+        assert!((1..8).contains(&report.unverified()), "{left_out}: {report}");
+    }
+}
+
 /// Targets are kept within the range of their drives. Where nothing keeps them, as under a soft torque limit, a drive that is sent less far than its
 /// target asks for leads elsewhere: the log claims a target that nothing leads to.
 #[test]
@@ -775,6 +794,7 @@ fn every_seeded_corruption_is_named_at_its_tick() {
         ),
         ("brake too weak", "way to stop", Box::new(move |m: &mut Value| m["brake"] = json!(vec![2e-2; 7]))),
         ("not a number", "target_v[2]", Box::new(move |m: &mut Value| m["target_v"][2] = Value::Null)),
+        ("left out", "action", Box::new(move |m: &mut Value| m["action"] = json!([]))),
         ("cut", "length of target_q", Box::new(move |m: &mut Value| m["target_q"] = json!([0.0]))),
         ("speeds cut", "length of target_v", Box::new(move |m: &mut Value| m["target_v"] = json!([0.0]))),
         ("state cut", "length of state.v", Box::new(move |m: &mut Value| m["state"]["v"] = json!([0.0]))),

@@ -39,8 +39,9 @@ struct Past {
     seq: u64,
     episode: u64,
     target: (Vec<f64>, Vec<f64>),
-    /// Its acceleration, and the brake that it stored; empty where it stored none.
-    a: Vec<f64>,
+    /// Its acceleration, where it is known what it began from.
+    a: Option<Vec<f64>>,
+    /// The brake that it stored; empty where it stored none.
     brake: Vec<f64>,
     /// Acceleration and motor forces, where they are what the next tick was told.
     told: Option<Told>,
@@ -167,7 +168,13 @@ impl Session {
             self.past.iter_mut().for_each(|past| past.told = None);
         }
         if tick.action.is_empty() {
-            self.report.idle += 1;
+            let asks = [&tick.target_q, &tick.target_v, &tick.brake].into_iter().any(|x| !x.is_empty());
+            if asks {
+                let what = format!("tick {}: its action is missing, and its target is not", tick.tick);
+                let (value, limit, unit) = (f64::NAN, f64::NAN, IN_WORDS.to_owned());
+                self.report.add(Violation { tick: tick.tick, what, value, limit, unit });
+            }
+            self.report.idle += u64::from(!asks);
             (self.past, self.has_gap) = (None, false);
             return Ok(());
         }
@@ -205,13 +212,15 @@ impl Session {
             }
         };
         let (dt, nq, nv) = (promises.0.period.dt, promises.0.machine.nq(), promises.0.machine.nv());
-        let v = self.begins(&promises.0, tick).map_or_else(|| tick.state.v.clone(), |(_, v)| v);
+        // Of joints that go on from what they were sent, or of a predicted state, not known after a gap.
+        let begun = self.begins(&promises.0, tick).filter(|_| !(promises.0.follows() && self.has_gap));
+        let v = begun.as_ref().map_or(&tick.state.v, |(_, v)| v).clone();
         self.promises.insert(tick.snapshot, promises);
         (self.past, self.has_gap) = (None, false);
         if [tick.target_q.len(), tick.target_v.len(), v.len()] != [nq, nv, nv] {
             return Ok(()); // it was named, and leaves nothing that the next tick could be confirmed by
         }
-        let a = tick.target_v.iter().zip(&v).map(|(to, from)| (to - from) / dt).collect();
+        let a = begun.map(|(_, v)| tick.target_v.iter().zip(&v).map(|(to, from)| (to - from) / dt).collect());
         let target = (tick.target_q.clone(), tick.target_v.clone());
         let state = &tick.state;
         let (epoch, seq, episode, brake) = (state.epoch, state.seq, state.episode, tick.brake.clone());
@@ -344,7 +353,7 @@ impl Session {
             self.begun = Some(Begun { goal: goal(own, tick, &q, &v), start: (q.clone(), v.clone()) });
         }
         let proposal = self.proposal(own, tick, by_policy, (&q, &v));
-        let last = self.past.as_ref().map(|past| past.a.clone());
+        let last = self.past.as_ref().and_then(|past| past.a.clone());
         let mut case = Case { tick, is_own: true, q: &q, v: &v, status, by_policy, last, proposal };
         let told = self.confirm(own, &case)?;
         if let Some(pinned) = pinned {
@@ -372,9 +381,9 @@ impl Session {
             // The loop's own brake proposes rest, of hard jerk what leads there.
             for &i in &own.controllable {
                 let joint = &own.built().joints[i];
-                pv[i] = match (joint.smooth(p), &self.past) {
+                pv[i] = match (joint.smooth(p), self.past.as_ref().and_then(|past| past.a.as_ref())) {
                     (None, _) => 0.0,
-                    (Some(smooth), Some(past)) => v[i] + p.dt * smooth.next(v[i], past.a[i]),
+                    (Some(smooth), Some(a)) => v[i] + p.dt * smooth.next(v[i], a[i]),
                     (Some(_), None) => {
                         return no("the tick before their brake is not known, of which jerk speaks");
                     }
