@@ -11,6 +11,7 @@ mod setup;
 mod source;
 mod start_from;
 
+pub(crate) use advice::beginnings;
 pub use advice::{advice, ends_in_warm_up};
 pub use columns::COLUMNS;
 pub use ranked::RankedSource;

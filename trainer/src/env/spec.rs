@@ -27,6 +27,8 @@ pub struct Spec {
     pub semi_implicit_euler: bool,
     /// Control periods after which the caller truncates an episode.
     pub max_episode_steps: usize,
+    /// Geoms that may touch something.
+    pub touching: usize,
     /// Whether [`Step::cost`](super::Step::cost) means anything.
     pub has_cost: bool,
     /// What the value alone may see ([`Env::privileged`](super::Env::privileged)).
@@ -68,6 +70,7 @@ impl Spec {
             sim_dt: model.sim_dt(),
             sub_steps: task.sub_steps,
             semi_implicit_euler: model.is_euler(),
+            touching: model.touching(),
             max_episode_steps: task.max_episode_steps,
             has_cost: false,
             privileged: Vec::new(),

@@ -226,17 +226,28 @@ impl Model {
         beyond
     }
 
+    /// Geoms that may touch something.
+    pub(crate) fn touching(&self) -> usize {
+        if self.disables(mjtDisableBit::mjDSBL_CONTACT) || self.disables(mjtDisableBit::mjDSBL_CONSTRAINT) {
+            return 0;
+        }
+        let m = &self.0;
+        let touches = |id: usize| m.geom_contype()[id] != 0 || m.geom_conaffinity()[id] != 0;
+        let in_pair =
+            |id: usize| [m.pair_geom1(), m.pair_geom2()].into_iter().flatten().any(|geom| *geom == id as i32);
+        (0..m.geom_contype().len()).filter(|id| touches(*id) || in_pair(*id)).count()
+    }
+
     /// What is the simulator's alone in every robot that has it, so that no note of the description speaks of it: contacts and sensors.
     pub(crate) fn simulated_alone(&self) -> Vec<String> {
         let m = &self.0;
-        let touches = |id: usize| m.geom_contype()[id] != 0 || m.geom_conaffinity()[id] != 0;
-        let touching = (0..m.geom_contype().len()).filter(|id| touches(*id)).count();
+        let touching = self.touching();
         let name = |id: usize| {
             self.name(MjtObjBase::mjOBJ_SENSOR, id).map_or(format!("number {id}"), |name| format!("'{name}'"))
         };
         let sensors: Vec<String> = (0..m.nsensor() as usize).map(name).collect();
         let mut left = Vec::new();
-        if touching > 0 && !self.disables(mjtDisableBit::mjDSBL_CONTACT) {
+        if touching > 0 {
             left.push(format!(
                 "contacts are the simulator's alone: {touching} geoms may touch something, and the model that limits are kept by knows no contact force"
             ));

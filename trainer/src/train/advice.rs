@@ -55,7 +55,11 @@ struct Outside {
     resets: usize,
 }
 
-fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
+/// Whether its simulation states its physics step, and joints that an episode may begin with outside their limits, a sentence each.
+///
+/// # Errors
+/// [`TrainError`] of a task that cannot be simulated.
+pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
     let Parts { model, layout, projector } = Parts::new(manifest)?;
     let limits = projector.limits();
     let mut env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::{Meaning, VectorError};
-use crate::env::{Spec, unstated_steps};
+use crate::env::Spec;
 use crate::{tasks, train};
 use nearl_runtime::constraints::{Entry, Guard, LimitSet, Model, StateLayout};
 use nearl_runtime::net::{Dense, DenseLayer};
@@ -159,7 +159,15 @@ pub(super) fn notes(snapshot: &Snapshot, spec: &Spec) -> Result<Vec<String>, Vec
         return Ok(Vec::new());
     }
     let mut notes = nearl_runtime::doctor::told_of_simulated(m)?;
-    notes.extend(unstated_steps(m, spec));
+    notes.extend(train::beginnings(m)?);
+    // Of joints that nothing drives it is told with them.
+    if by_model && spec.touching > 0 && !notes.iter().any(|note| note.contains("nothing touches")) {
+        notes.push(format!(
+            "{} geoms may touch something, and limits on the motion know of no contact: a joint that is hit leaves them; keep away by constraints.collision \
+             or position, or take the contacts out (contype and conaffinity 0)",
+            spec.touching
+        ));
+    }
     Ok(notes)
 }
 
