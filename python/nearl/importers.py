@@ -162,6 +162,7 @@ def import_sb3(
     made = _policy(layers, mean, std, clip, (-math.inf, math.inf))
     if task is not None and robot is None:
         _check_range(low, high, os.fspath(task))
+        _check_wrappers(model)
     return _place(made, robot, recipe, task, name)
 
 
@@ -177,6 +178,29 @@ def _check_meaning(model: Any) -> None:
                 f"actions of the actuators; learn with actions='guarded' to import it, or let a policy of actions='state' propose beside the loop "
                 f"(nearl.Proposer)"
             )
+
+
+# Wrappers of Gymnasium that leave every number of an observation where it is.
+_SAME = frozenset({"DtypeObservation", "FlattenObservation"})
+
+
+def _check_wrappers(model: Any) -> None:
+    """Refuses a policy that learned from observations that a wrapper had changed: the controller gives it those of the task."""
+    env = getattr(model, "get_env", lambda: None)()
+    while env is not None and not hasattr(env, "envs") and hasattr(env, "venv"):
+        env = env.venv
+    if not (envs := getattr(env, "envs", None)):
+        return
+    import gymnasium
+
+    for one in envs:
+        while isinstance(one, gymnasium.Wrapper):
+            if isinstance(one, gymnasium.ObservationWrapper) and type(one).__name__ not in _SAME:
+                raise ValueError(
+                    f"the model learned behind the wrapper {type(one).__name__}, which changes observations, and the controller gives it those of the task; "
+                    f"learn with VecNormalize, which is taken along, or give robot= and a recipe= that says how the policy sees each entry"
+                )
+            one = one.env
 
 
 def _check_range(low: np.ndarray, high: np.ndarray, task: str) -> None:

@@ -675,6 +675,26 @@ def test_a_model_that_learned_to_propose_is_not_taken_for_one_of_actions() -> No
     assert nearl.make_vec("HalfCheetah-v5", 2).action_meaning == "actuators"
 
 
+def test_a_model_that_learned_behind_a_wrapper_of_observations_is_not_taken_for_one_without() -> None:
+    """Its actions were off by a tenth of the motors' range, and nothing was said."""
+    gymnasium = pytest.importorskip("gymnasium")
+    wrappers = gymnasium.wrappers
+
+    def learned(wrap):
+        envs = SimpleNamespace(envs=[wrap(gymnasium.make("HalfCheetah-v5"))], has_attr=lambda _: False)
+        return ppo(17, 6, get_env=lambda: SimpleNamespace(venv=envs, has_attr=lambda _: False), get_vec_normalize_env=lambda: None)
+
+    for wrap in (
+        wrappers.NormalizeObservation,
+        lambda env: wrappers.TransformObservation(env, lambda o: 10 * o, None),
+        lambda env: wrappers.RecordEpisodeStatistics(wrappers.NormalizeObservation(env)),
+    ):
+        with pytest.raises(ValueError, match="learned behind the wrapper (Normalize|Transform)Observation, .*learn with VecNormalize"):
+            nearl.import_sb3(learned(wrap), task="HalfCheetah-v5")
+    for wrap in (wrappers.RecordEpisodeStatistics, wrappers.FlattenObservation, lambda env: wrappers.DtypeObservation(env, np.float32)):
+        nearl.import_sb3(learned(wrap), task="HalfCheetah-v5")
+
+
 def test_actions_of_another_range_than_the_motors_are_refused() -> None:
     model = ppo(17, 6)
     model.action_space.high[2] = 2.0
