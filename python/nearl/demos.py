@@ -50,6 +50,7 @@ from nearl.sources import (
     renamed,
     seconds_between,
     split,
+    unbraced,
 )
 
 Floats = NDArray[np.float64]
@@ -116,6 +117,8 @@ def from_columns(
         where = f"{source}, episode {i}"
         if not hasattr(columns, "keys"):
             raise BadDemonstrations(f"{where}: it is of {type(columns).__name__}; give a table of columns by name, as {{'q.<joint>': values}}")
+        once([unbraced(name) for name in columns.keys()], where)  # noqa: SIM118 (a table of another library)
+        columns = {unbraced(name): columns[name] for name in columns.keys()}  # noqa: SIM118
         qpos, qvel, rates = _states(env, columns, dt, where)
         if (n := len(qpos)) < 2:
             raise BadDemonstrations(f"{where}: {n} rows make no transition; give at least 2")
@@ -244,7 +247,7 @@ def from_robomimic(
     check_entries(columns, source)
     pairs = {f"actions[{i}]": of for i, of in enumerate(actions) if not isinstance(of, str)}
     check_entries(pairs, source)
-    columns = {**columns, **pairs}
+    columns = {**{unbraced(name): of for name, of in columns.items()}, **pairs}
     acted = actions if isinstance(actions, str) else [of if isinstance(of, str) else f"actions[{i}]" for i, of in enumerate(actions)]
     os.stat(file)  # a file that is not there is said by the system
     episodes = []
@@ -280,7 +283,7 @@ def from_lerobot(
     period: float | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Reads a LeRobot dataset (v3) from its folder: ``key`` frame by frame, at the rate of ``meta/info.json``.
+    """Reads a LeRobot dataset (v3) from its folder: ``key`` frame by frame, at the rate of ``meta/info.json``, against which its timestamps are held.
 
     ``names`` are the entries of ``key``; by default the dataset's own, of which ``shoulder.pos`` and ``shoulder`` are the joint ``shoulder`` and
     ``shoulder.vel`` is its velocity. Entries that the task has no place for are left out with a warning. ``actions`` are entries of the feature ``action``
@@ -312,6 +315,8 @@ def from_lerobot(
         if "action" not in features:
             raise BadDemonstrations(f"{source}: no feature 'action' for actions={actions!r}; it has {', '.join(features)}")
         wanted.append("action")
+    if "timestamp" in features:
+        wanted.append("timestamp")  # held against the rate
     parts: dict[str, list[Any]] = {name: [] for name in (*wanted, "episode_index")}
     for file in sorted((Path(folder) / "data").rglob("*.parquet")):
         table = parquet.read_table(file, columns=list(parts))
@@ -344,6 +349,8 @@ def from_lerobot(
             stacklevel=2,
         )
         columns = {name: of for name, of in columns.items() if name in used or name in actions} if len(left) < len(names) else columns
+    if "timestamp" in parts:
+        columns |= {"timestamp": np.array(parts["timestamp"], float).ravel()}
     episodes = split(columns, np.array(parts["episode_index"]), source)
     return from_columns(task, episodes, out, dt=dt, actions=actions, period=period, overwrite=overwrite, source=source)
 

@@ -50,6 +50,11 @@ def split(table: Mapping[str, Floats], of: NDArray[Any] | None, source: str) -> 
     return [{name: values[a:b] for name, values in table.items()} for a, b in pairwise(begins)]
 
 
+def unbraced(name: str) -> str:
+    """A name without the braces around it that expressions ask for: ``{q.left-hip}`` is ``q.left-hip``."""
+    return name[1:-1] if name.startswith("{") and name.endswith("}") and not {"{", "}"} & set(name[1:-1]) else name
+
+
 def renamed(table: Mapping[str, Floats], columns: Any, source: str) -> dict[str, Floats]:
     """A table by the task's names, which ``columns`` maps to those of its heading; columns that are not in it keep theirs."""
     if columns is None:
@@ -60,8 +65,8 @@ def renamed(table: Mapping[str, Floats], columns: Any, source: str) -> dict[str,
         if not isinstance(given, str) or given not in table:
             raise BadDemonstrations(f"{source}: columns['{name}'] is {given!r}, and its heading has no such column; it has {', '.join(table)}")
     taken = set(columns.values())
-    once([*columns, *(name for name in table if name not in taken)], source)
-    return {name: table[given] for name, given in columns.items()} | {name: of for name, of in table.items() if name not in taken}
+    once([*map(unbraced, columns), *(name for name in table if name not in taken)], source)
+    return {unbraced(name): table[given] for name, given in columns.items()} | {name: of for name, of in table.items() if name not in taken}
 
 
 def csv_table(file: FilePath) -> dict[str, Floats]:

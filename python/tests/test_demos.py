@@ -39,6 +39,15 @@ def checked(file: Path, task: str = "Hopper-v5") -> dict[str, np.ndarray]:
         return dict(data)
 
 
+def test_braces_around_the_name_of_a_column_are_no_part_of_it(tmp_path: Path) -> None:
+    columns = episode()
+    plain = checked(demos.from_columns("Hopper-v5", [columns], tmp_path / "plain.npz", dt=0.008))
+    braced = checked(demos.from_columns("Hopper-v5", [{f"{{{name}}}": of for name, of in columns.items()}], tmp_path / "braced.npz", dt=0.008))
+    assert all(np.array_equal(plain[name], braced[name]) for name in plain)
+    with pytest.raises(demos.BadDemonstrations, match="column 'q.leg_joint' is there twice"):
+        demos.from_columns("Hopper-v5", [columns | {"{q.leg_joint}": columns["q.leg_joint"]}], tmp_path / "twice.npz", dt=0.008)
+
+
 def test_columns_become_states_bit_for_bit(tmp_path: Path) -> None:
     first, second = episode(), episode(20, 1)
     out = demos.from_columns("Hopper-v5", [first, second], tmp_path / "a.npz", dt=0.008, actions=("a", "b", "c"))
@@ -237,6 +246,26 @@ def lerobot(folder: Path, features: dict[str, tuple[object, np.ndarray]], episod
     table = {key: pa.array(rows.astype(np.float32).tolist(), pa.list_(pa.float32())) for key, (_, rows) in features.items()}
     parquet.write_table(pa.table(table | {"episode_index": episodes}), folder / "data" / "chunk-000" / "file-000.parquet")
     return folder
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        (0.016 * np.arange(12), "'timestamp' goes on by 0.016 from row to row, and dt is 0.008 s"),
+        (0.008 * np.arange(12) + np.where(np.arange(12) > 6, 0.5, 0.0), "'timestamp' goes from 0.04.* in row 6 to 0.55.* in the next, and dt is 0.008 s"),
+        (0.008 * np.arange(12), None),
+    ],
+)
+def test_the_timestamps_of_lerobot_are_held_against_its_rate(tmp_path: Path, times: np.ndarray, words: str | None) -> None:
+    part = episode(12, 0)
+    joints = [name for name in part if name.startswith("q.")]
+    rows = np.stack([part[name] for name in joints], 1)
+    folder = lerobot(tmp_path / "set", {"observation.state": ([name[2:] for name in joints], rows), "timestamp": (None, times[:, None])}, np.zeros(12, int))
+    if words is None:
+        assert checked(demos.from_lerobot("Hopper-v5", folder, tmp_path / "a.npz"))["lengths"].tolist() == [11]
+        return
+    with pytest.raises(demos.BadDemonstrations, match=words):
+        demos.from_lerobot("Hopper-v5", folder, tmp_path / "a.npz")
 
 
 def test_lerobot_has_velocities_and_actions(tmp_path: Path) -> None:
