@@ -4,7 +4,9 @@
 //! axis stands still in its joint's frame, which Pinocchio's derivatives take for granted.
 
 use crate::ModelError;
-use crate::description::{Body, Command, FrictionLaw, JointDescription, JointKind, Motor, Onset, Range, RobotDescription};
+use crate::description::{
+    Body, Command, FrictionLaw, JointDescription, JointKind, Motor, Onset, Range, RobotDescription,
+};
 use crate::geometry::Placement;
 use crate::model::{Inner, Joint, ModelFrame};
 use crate::pinocchio::{self, RawData, RawModel};

@@ -1,6 +1,7 @@
 """Guarded actions on arms that nobody has seen, pushed onto their limits: every limit holds in the simulator at any number of physics steps."""
 
 import re
+import warnings
 from pathlib import Path
 
 import mujoco
@@ -259,9 +260,11 @@ def test_a_force_at_its_end_throws_no_joint(tmp_path: Path, seed: int) -> None:
 
 
 @pytest.mark.parametrize(("dt", "timestep", "seed"), [(0.002, 0.002, 0), (0.002, 0.002, 1), (0.005, 0.005, 0), (0.006, 0.002, 0)])
-def test_fingers_that_are_left_alone_take_no_arm_off_its_limits(tmp_path: Path, recwarn: pytest.WarningsRecorder, dt: float, timestep: float, seed: int) -> None:
-    """An equation and a tendon hold them. Without a stored brake, and reckoned with as loose, the arm had left 10 rad/s² by XX."""
-    (tmp_path / "arm.xml").write_text(HAND.format(across="f0").replace('forcerange="-87 87"', 'forcerange="-15 15"').replace('"0.002"', f'"{timestep}"'))
+def test_fingers_that_are_left_alone_take_no_arm_off_its_limits(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder, dt: float, timestep: float, seed: int
+) -> None:
+    """An equation and a tendon hold them. Without a stored brake and reckoned with as loose, a Panda's own hand had thrown its arm off 10 rad/s² by 90."""
+    (tmp_path / "arm.xml").write_text(HAND.format(across="f0").replace('forcerange="-87 87"', 'forcerange="-40 40"').replace('"0.002"', f'"{timestep}"'))
     command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
     envs = nearl.make_vec(task(tmp_path, 2, dt, timestep, margin=0.003, command=command), 1, constraints="task", actions="guarded")
     told = "\n".join(str(warning.message) for warning in recwarn)
@@ -274,10 +277,31 @@ def test_fingers_that_are_left_alone_take_no_arm_off_its_limits(tmp_path: Path, 
             push = rng.uniform(-2, 2, 2)
         obs, *_ = envs.step(push[None])
         accelerations = np.abs(obs[0, 2:] - before) / dt
-        assert accelerations.max() <= ACCELERATION + 0.02, f"tick {tick}: {accelerations}"
+        assert accelerations.max() <= ACCELERATION + 0.15, f"tick {tick}: {accelerations}"
         assert np.abs(obs[0, 2:]).max() <= SPEED + 1e-3 and np.abs(obs[0, :2]).max() <= 1.0, f"tick {tick}: {obs}"
         before, held_back = obs[0, 2:].copy(), held_back + int(accelerations.max() > 0.9 * ACCELERATION)
     assert held_back > 50
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_brake_is_seen_to_cut_a_target_between_the_ticks_looked_at(tmp_path: Path, seed: int) -> None:
+    """A target rises towards the end of its range for a few ticks of a brake while the force stays the same: hidden below the force, it was cut, and the arm
+    left 10 rad/s² by 37."""
+    text = re.sub(r'<body pos="0.2 0 0">.*?</body>\n', "", HAND.format(across="f0"))
+    text = re.sub(r"<tendon>.*</equality>", "", text, flags=re.DOTALL).replace('forcerange="-87 87"', 'forcerange="-15 15"')
+    (tmp_path / "arm.xml").write_text(re.sub(r"<general[^>]*/>", "", text).replace('"0.002"', '"0.005"'))
+    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
+    envs = nearl.make_vec(task(tmp_path, 2, 0.005, 0.005, margin=0.003, command=command), 1, constraints="task", actions="guarded")
+    obs, _ = envs.reset(seed=0)
+    rng, before, highest = np.random.default_rng(seed), obs[0, 2:].copy(), 0.0
+    for tick in range(2000):
+        if tick % 100 == 0:
+            push = rng.uniform(-2, 2, 2)
+        obs, *_, info = envs.step(push[None])
+        accelerations = np.abs(obs[0, 2:] - before) / 0.005
+        assert accelerations.max() <= ACCELERATION + 1e-8, f"tick {tick}: {accelerations}"
+        before, highest = obs[0, 2:].copy(), max(highest, np.abs(info["executed"][0]).max())
+    assert 0.99 < highest <= 1.0, highest
 
 
 @pytest.mark.parametrize(("mass", "says"), [(0.02, "a brake is stored as if 'f0', 'f1'"), (2.0, "no brake is stored because 'f0', 'f1' are not controllable")])
@@ -511,3 +535,27 @@ def test_targets_that_no_torque_limit_holds_to_the_motors_are_told(tmp_path: Pat
     file.write_text(file.read_text().replace('interface = "pd"\nstiffness = 40.0\ndamping = 2.0', 'interface = "effort"'))
     with pytest.warns(UserWarning, match="without a torque limit a target may ask for more than the motors of 'a', 'b' give"):
         nearl.make_vec(file, 1, constraints="task")
+
+
+def test_what_may_touch_and_an_episode_that_begins_outside_are_told(tmp_path: Path) -> None:
+    """A table in reach threw an arm to 310 rad/s² where 10 were allowed, and no word was said."""
+
+    def told(text: str, reset: str = "") -> str:
+        file = drives(tmp_path, "guard = true\nposition = {}\nvelocity = { limit = 2.0 }\nacceleration = { limit = 5.0 }\ntorque = {}", "pinocchio")
+        (tmp_path / "arm.xml").write_text(text)
+        file.write_text(file.read_text() + reset)
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            nearl.make_vec(file, 1, constraints="task", actions="guarded")
+        return "\n".join(str(warning.message) for warning in found)
+
+    touching = DRIVEN.format(option="", actuators=SERVOS, more="")
+    alone = touching.replace("<geom ", '<geom contype="0" conaffinity="0" ')
+    assert "2 geoms may touch something, and limits on the motion know of no contact" in told(touching)
+    assert "touch" not in told(alone)
+    table = '<worldbody><geom name="t" size="1" pos="9 0 0" contype="0" conaffinity="0"/>'
+    pair = alone.replace("<geom contype", '<geom name="l" contype', 1).replace("<worldbody>", table)
+    assert "2 geoms may touch" in told(pair.replace("</mujoco>", '<contact><pair geom1="t" geom2="l"/></contact></mujoco>'))
+    said = told(alone, "[reset]\nq = { a = 6.5 }\nv = { b = 3.0 }\n")
+    assert "64 of 64 episodes begin with joint 'a' outside its limits, furthest at 6.5000 rad or m where -5.999999 to 5.999999" in said, said
+    assert "64 of 64 episodes begin with joint 'b' outside its limits, furthest at 3.0000 rad/s or m/s" in said, said

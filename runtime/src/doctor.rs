@@ -446,7 +446,7 @@ fn left_alone(Parts { model, layout, .. }: &Parts, held: &[usize]) -> Vec<String
 
 /// What a guard by the robot's model does not promise of joints that nothing drives.
 fn undriven(m: &Manifest, parts: &Parts) -> Option<String> {
-    let loose = left_alone(parts, &held_dofs(m, &parts.model, parts.layout.controllable()));
+    let loose = left_alone(parts, &held_dofs(&parts.model, parts.layout.controllable()));
     (m.guards() && !loose.is_empty()).then(|| {
         format!(
             "guard = true reckons with {} as with joints that nothing drives and nothing touches: on the ground or in contact the limits of the others hold as \

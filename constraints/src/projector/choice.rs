@@ -122,8 +122,10 @@ fn carried_off(model: &Model, limits: &LimitSet, dofs: &Dofs) -> f64 {
             let joint = model.joint_of_dof(i);
             if joint.nq == 1 && joint.nv == 1 {
                 let or = |x: f64, otherwise: f64| if x.is_finite() { x } else { otherwise };
-                let (low, high) =
-                    (or(limits.q_lower[i], -std::f64::consts::PI), or(limits.q_upper[i], std::f64::consts::PI));
+                let (low, high) = (
+                    or(limits.q_lower[i], -std::f64::consts::PI),
+                    or(limits.q_upper[i], std::f64::consts::PI),
+                );
                 q[joint.idx_q] = random.between(low, high);
             }
         }

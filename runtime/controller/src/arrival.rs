@@ -57,7 +57,9 @@ impl Arrivals {
             dofs: dofs.to_vec(),
             drives: drives.to_vec(),
             commands: vec![0.0; nv],
-            held: (0..nv).map(|i| if led.contains(&i) { Held::Acceleration(0.0) } else { Held::Force(0.0) }).collect(),
+            held: (0..nv)
+                .map(|i| if led.contains(&i) { Held::Acceleration(0.0) } else { Held::Force(0.0) })
+                .collect(),
             most: vec![0.0; nv],
         }
     }

@@ -22,8 +22,14 @@ pub(super) fn add(model: &Model, robot: &mut RobotDescription) {
             )),
         }
     }
-    for joint in (0..model.0.jnt_type().len()).filter(|id| model.is_tied(*id)).map(|id| model.joint_name(id)) {
-        robot.bodies.iter_mut().flat_map(|body| &mut body.joints).filter(|j| j.name == joint).for_each(|j| j.held = true);
+    for joint in (0..model.0.jnt_type().len()).filter(|id| model.is_tied(*id)).map(|id| model.joint_name(id))
+    {
+        robot
+            .bodies
+            .iter_mut()
+            .flat_map(|body| &mut body.joints)
+            .filter(|j| j.name == joint)
+            .for_each(|j| j.held = true);
     }
 }
 
@@ -85,13 +91,17 @@ impl Model {
     fn is_tied(&self, joint: usize) -> bool {
         let m = &self.0;
         let id = i32::try_from(joint).unwrap_or(-1);
-        let is_off = self.disables(mjtDisableBit::mjDSBL_EQUALITY) || self.disables(mjtDisableBit::mjDSBL_CONSTRAINT);
+        let is_off =
+            self.disables(mjtDisableBit::mjDSBL_EQUALITY) || self.disables(mjtDisableBit::mjDSBL_CONSTRAINT);
         let equates = |k: usize| {
-            m.eq_type()[k] == MjtEq::mjEQ_JOINT && m.eq_active0()[k] && [m.eq_obj1id()[k], m.eq_obj2id()[k]].contains(&id)
+            m.eq_type()[k] == MjtEq::mjEQ_JOINT
+                && m.eq_active0()[k]
+                && [m.eq_obj1id()[k], m.eq_obj2id()[k]].contains(&id)
         };
         let pulls = |tendon: usize| {
             let [first, count] = [m.tendon_adr()[tendon], m.tendon_num()[tendon]].map(|x| x.max(0) as usize);
-            (first..first + count).any(|k| m.wrap_type()[k] == MjtWrap::mjWRAP_JOINT && m.wrap_objid()[k] == id)
+            (first..first + count)
+                .any(|k| m.wrap_type()[k] == MjtWrap::mjWRAP_JOINT && m.wrap_objid()[k] == id)
         };
         let by_equation = !is_off && (0..m.eq_type().len()).any(equates);
         let by_tendon = || (0..self.n_actuators()).filter_map(|id| self.tendon_of(id)).any(pulls);

@@ -52,7 +52,7 @@ impl Guard {
             let joint = model.joint_of_dof(i);
             (joint.nq == 1 && joint.nv == 1).then_some(joint.idx_q)
         });
-        let held = held_dofs(m, model, &dofs);
+        let held = held_dofs(model, &dofs);
         let driven: Vec<usize> = (0..nv).filter(|i| dofs.contains(i) || held.contains(i)).collect();
         Ok(Guard {
             dynamics: PeriodDynamics::new(model, &driven, m.task.period()),

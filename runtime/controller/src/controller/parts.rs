@@ -210,15 +210,9 @@ pub(super) fn halves(layout: &StateLayout) -> Vec<(usize, Half)> {
     found
 }
 
-/// Dofs of `model` that no command reaches, none of `controllable`, and that something holds where they are all the same: as the robot file says, or a
-/// drive that `[command]` has gains for, where the file knows no motors.
-pub fn held_dofs(m: &Manifest, model: &Model, controllable: &[usize]) -> Vec<usize> {
-    let has_motors = !model.motors().is_empty();
-    let by_drive = |i: usize| {
-        let single = model.joint_of_dof(i).nq == 1 && model.joint_of_dof(i).nv == 1;
-        single && !has_motors && matches!(m.task.command.gains(&model.dof_name(i)), Ok(Some(_)))
-    };
-    (0..model.nv()).filter(|&i| !controllable.contains(&i) && (model.held()[i] || by_drive(i))).collect()
+/// Dofs of `model` that no command reaches, none of `controllable`, and that something holds where they are all the same ([`Model::held`]).
+pub fn held_dofs(model: &Model, controllable: &[usize]) -> Vec<usize> {
+    (0..model.nv()).filter(|&i| !controllable.contains(&i) && model.held()[i]).collect()
 }
 
 /// Configuration index of each degree of freedom that belongs to a one-dof joint; 0 elsewhere (never read).
