@@ -360,6 +360,8 @@ pub(crate) struct Of<'a> {
     pub(crate) drives: &'a [Option<[f64; 2]>],
     /// How far commands to the joints may go, by dof.
     pub(crate) ranges: &'a [[f64; 2]],
+    /// Physics steps in a period.
+    pub(crate) sub_steps: u32,
 }
 
 impl Of<'_> {
@@ -436,10 +438,15 @@ impl Section {
             let [low, high] = of.ranges[dof];
             let range = if high - low > 2.0 * rubs { [low + rubs, high - rubs] } else { [low, high] };
             let range = of.machine.single(dof).map(|iq| (iq, range));
-            for (at_end, at) in [(false, "start"), (true, "end")] {
-                let range = range.filter(|_| !at_end);
+            let range = range.filter(|(_, ends)| ends.iter().any(|end| end.is_finite()));
+            let parts = [
+                Some((false, None, "at the start")),
+                (of.sub_steps != 1).then_some((true, None, "at the end")), // with one step the force is the same
+                range.is_some().then_some((false, range, "by its target")),
+            ];
+            for (at_end, range, at) in parts.into_iter().flatten() {
                 let rule = Rule::Drive { dof, most: effort, stiffness, damping, at_end, range };
-                rows.push(Row::new("torque", &format!("{} at the {at}", of.name(dof)), effort, soft, rule));
+                rows.push(Row::new("torque", &format!("{} {at}", of.name(dof)), effort, soft, rule));
             }
         }
         for speed in &self.frame_speed {

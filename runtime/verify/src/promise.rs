@@ -264,7 +264,7 @@ impl Promise {
             }
         }
         let (controls, drives, ranges) = (&controllable[..], &drives[..], &ranges[..]);
-        let of = Of { robot: &m.robot, machine: &machine, controllable: controls, drives, ranges };
+        let of = Of { robot: &m.robot, machine: &machine, controllable: controls, drives, ranges, sub_steps };
         let limits = section.limits(&of)?;
         let mut bare = (sub_steps != 1).then(|| bare.limits(&of)).transpose()?;
         for row in bare.iter_mut().flat_map(|limits| &mut limits.rows) {

@@ -71,7 +71,7 @@ pub(crate) enum Rule {
     Jerk { dof: usize, most: f64 },
     /// `|tau - tau_before| / T <= most`.
     TorqueRate { dof: usize, most: f64 },
-    /// The force of a drive at one end of the period, and at its start the range of the target.
+    /// The force of a drive at one end of the period, or at its start what the range of the target makes of it.
     Drive {
         dof: usize,
         most: f64,
