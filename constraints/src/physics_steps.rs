@@ -93,8 +93,8 @@ const NEAR: f64 = 1e-5;
 
 impl PhysicsSteps {
     /// For motors on the dofs `driven` of `model`, whose commands `drives` (nv) names; targets stay within `ranges` (nv). The dofs `follow` have
-    /// the accelerations that they are given, whatever it takes, and none where no command gives one; all others follow from the forces. `None` where a period has a single physics step
-    /// or none: [`PeriodDynamics`] is exact for the former.
+    /// the accelerations that they are given, whatever it takes, and none where no command gives one; all others follow from the forces. `None` where a
+    /// period has a single physics step or none: [`PeriodDynamics`] is exact for the former.
     pub fn new(
         model: &Model,
         (drives, ranges): (&[Drive], &[[f64; 2]]),

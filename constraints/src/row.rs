@@ -196,7 +196,8 @@ pub trait Rows: Send {
 
     /// Writes by how much the motion or the state it ends in breaks what each row is there to keep, above 0 where it does, in any unit
     /// that is continuous along a motion, and no larger one of two curves: each is a row of its own. A brake is verified for this, by its bends between
-    /// the ticks looked at: [`excess`](Rows::excess) may ask for more, so that a way to stop is left. Minus infinity is a row that no brake can keep. Must not allocate.
+    /// the ticks looked at: [`excess`](Rows::excess) may ask for more, so that a way to stop is left. Minus infinity is a row that no brake can keep. Must
+    /// not allocate.
     fn breach(&mut self, motion: &mut Motion<'_>, breach: &mut [f64]) {
         self.excess(motion, breach);
     }

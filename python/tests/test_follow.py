@@ -83,6 +83,24 @@ def droop(q: float, _v: float, command: float, dt: float) -> tuple[float, float]
     return command - 0.001, (command - 0.001 - q) / dt
 
 
+def slow(q: float, _v: float, command: float, dt: float) -> tuple[float, float]:
+    """It takes 0.15 s to two thirds of the way, in which set points at their speed limit are further ahead than they may be."""
+    to = q + dt / 0.15 * (command - q)
+    return to, (to - q) / dt
+
+
+class Stopped:
+    """Something holds it for a second."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def __call__(self, q: float, _v: float, command: float, dt: float) -> tuple[float, float]:
+        self.time += dt
+        to = q if 0.3 < self.time < 1.3 else command
+        return to, (to - q) / dt
+
+
 class Coarse:
     """A 12-bit encoder, with velocities by differences."""
 
@@ -116,11 +134,12 @@ def keeps(commands: np.ndarray, dt: float) -> None:
     assert abs(np.diff(speed)).max() / dt < 10.0 + 1e-6
 
 
-@pytest.mark.parametrize("case", ["straight", "lag", "droop", "encoder", "late"])
+@pytest.mark.parametrize("case", ["straight", "lag", "droop", "encoder", "late", "slow", "stopped"])
 @pytest.mark.parametrize("dt", [0.02, 0.004])
 def test_set_points_go_on_from_set_points(tmp_path: Path, case: str, dt: float) -> None:
-    """Restarted at what is measured the same joints ended 0.17 to 0.29 rad beyond the limit, or ran away."""
-    servo = {"lag": lag, "droop": droop}.get(case, straight)
+    """Restarted at what is measured the same joints ended 0.17 to 0.29 rad beyond the limit, or ran away; and where a robot was too far behind, set points
+    jumped back to it, at ten times the speed limit and three hundred times the acceleration limit."""
+    servo = {"lag": lag, "droop": droop, "slow": slow, "stopped": Stopped()}.get(case, straight)
     measure = {"encoder": Coarse(dt), "late": Late()}.get(case, lambda q, v: (q, v))
     ask = -3.0 if case == "droop" else 3.0
     sign = np.sign(ask)

@@ -537,6 +537,19 @@ def test_targets_that_no_torque_limit_holds_to_the_motors_are_told(tmp_path: Pat
         nearl.make_vec(file, 1, constraints="task")
 
 
+@pytest.mark.parametrize(("force", "told"), [(8.0, False), (0.2, True)])
+def test_drives_whose_force_swings_within_a_period_are_told(tmp_path: Path, force: float, told: bool) -> None:
+    """40 N m/rad at 2 rad/s make 0.16 N m less at the end of two steps of 2 ms than at their start."""
+    file = drives(tmp_path, "guard = true\nposition = {}\nvelocity = { limit = 2.0 }\nacceleration = { limit = 5.0 }\ntorque = {}", "pinocchio")
+    file.write_text(file.read_text().replace("dt = 0.002\nsim_dt", "dt = 0.004\nsim_dt"))
+    (tmp_path / "arm.xml").write_text((tmp_path / "arm.xml").read_text().replace("-8 8", f"-{force} {force}"))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        nearl.make_vec(file, 1, constraints="task", actions="guarded")
+    said = "\n".join(str(warning.message) for warning in found)
+    assert ("at their speed limits the drives of 'a' (0.160 of its 0.200 N m or N), 'b'" in said) == told, said
+
+
 def test_what_may_touch_and_an_episode_that_begins_outside_are_told(tmp_path: Path) -> None:
     """A table in reach threw an arm to 310 rad/s² where 10 were allowed, and no word was said."""
 

@@ -261,6 +261,7 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     }
     if moves_by_model(m) {
         notes.extend(held_targets(m, parts, &drives));
+        notes.extend(swung_targets(m, parts, &drives));
         notes.extend(shaken_joints(m, parts, &drives));
     }
     notes.extend(other_gains(parts, &drives));
@@ -346,6 +347,42 @@ fn held_targets(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Dri
             "a period of {dt} s takes the drives of {} a good part of the way to a target, and {why}: limits on position, velocity and acceleration may \
              be left; set time.dt to the length of a physics step and time.policy_every to as many as there were, or give position a margin",
             long.join(", ")
+        )
+    })
+}
+
+/// Share of a drive's force by which it may change within a period at the speed limit of its joint, before what is reckoned of it is off by too much.
+const SWINGS: f64 = 0.5;
+
+/// Drives that push so much less at the end of a period than at its start, where their joints pass the targets that are held, that little is left to brake.
+fn swung_targets(
+    m: &Manifest,
+    Parts { model, layout, projector }: &Parts,
+    drives: &[Drive],
+) -> Option<String> {
+    let (period, limits) = (m.task.period(), projector.limits());
+    let swings = |&i: &usize| match drives[i] {
+        Drive::Pd { stiffness, .. } => {
+            let change = stiffness * limits.velocity[i] * (period.dt - period.tau);
+            (change.is_finite() && change > SWINGS * limits.effort[i]).then(|| {
+                format!(
+                    "'{}' ({} of its {} N m or N)",
+                    model.dof_name(i),
+                    short(change),
+                    short(limits.effort[i])
+                )
+            })
+        }
+        _ => None,
+    };
+    let joints: Vec<String> = layout.controllable().iter().filter_map(swings).collect();
+    (period.sub_steps > 1 && !joints.is_empty()).then(|| {
+        format!(
+            "at their speed limits the drives of {} change their force by so much within a period of {} s while their target is held, and may not be able to \
+             brake then: limits on position, velocity and acceleration may be left; set time.dt to the length of a physics step and time.policy_every to as \
+             many as there were, or lower the speed limits",
+            joints.join(", "),
+            period.dt
         )
     })
 }

@@ -186,11 +186,13 @@ impl Projector {
         let mut normal = std::mem::take(&mut self.normal);
         let mut asked = std::mem::replace(&mut self.asked, Proposal { q: Vec::new(), v: Vec::new() });
         let v = without_denormals(v, &mut normal);
-        let status = match proposal.v.iter().any(|x| x.is_subnormal()) && proposal.q.len() == q.len() {
+        let is_changed = self.previous.sent.waits() || proposal.v.iter().any(|x| x.is_subnormal());
+        let status = match is_changed && self.lengths_fit(q, v, proposal, target) {
             true => {
                 asked.q.clone_from(&proposal.q);
                 asked.v.clone_from(&proposal.v);
                 asked.v.iter_mut().filter(|x| x.is_subnormal()).for_each(|x| *x = 0.0);
+                self.wait(q, v, &mut asked);
                 self.ladder(start, (q, v), &asked, target)
             }
             false => self.ladder(start, (q, v), proposal, target),

@@ -2,7 +2,8 @@
 //! From there the drive's lag, its droop under a load and the noise of its encoder would go into the next set point, and add up.
 
 use super::Projector;
-use crate::{Drive, Target};
+use crate::viability::Period;
+use crate::{Drive, Proposal, Target};
 
 /// How far a joint may lag behind the position it was sent: its way at the speed limit in this time [s], without one this itself [rad or m].
 const FOLLOWING: f64 = 0.1;
@@ -16,6 +17,8 @@ pub(super) struct Sent {
     known: bool,
     /// Dofs that are sent positions, with their entry of a configuration and how far they may be from it [rad or m].
     positions: Vec<(usize, usize, f64)>,
+    /// Those of them that are further away, with their entry: their set points wait at rest.
+    waiting: Vec<(usize, usize)>,
     /// Dofs that are sent velocities.
     velocities: Vec<usize>,
     /// The target of the tick before (nq, nv).
@@ -27,7 +30,7 @@ impl Projector {
     /// The `drives` (nv) say which controllable joints follow by themselves what they are sent: [`Projector::depart`] has those go on from there.
     pub fn follow(&mut self, drives: &[Drive]) {
         let sent = &mut self.previous.sent;
-        (sent.positions, sent.velocities) = (Vec::new(), Vec::new());
+        (sent.positions, sent.velocities, sent.waiting) = (Vec::new(), Vec::new(), Vec::new());
         for &i in &self.dofs.controllable {
             match (drives[i], self.dofs.single[i]) {
                 (Drive::Position, Some(iq)) => {
@@ -38,24 +41,39 @@ impl Projector {
                 _ => {}
             }
         }
+        sent.waiting.reserve(sent.positions.len());
         (sent.q, sent.v, sent.known) = (self.model.neutral(), vec![0.0; self.model.nv()], false);
     }
 
     /// Puts what was sent in the tick before in the place of what is measured, `q` (nq) and `v` (nv), of joints that follow by themselves: a set
-    /// point that began at the measured position would carry each error of the drive into the next. Joints that are sent positions and are further
-    /// from the last one than they move at their speed limit within 0.1 s (0.1 rad or m without one) do not follow, and begin where they are.
-    pub fn depart(&self, q: &mut [f64], v: &mut [f64]) {
-        let sent = &self.previous.sent;
+    /// point that began at the measured position would carry each error of the drive into the next. Of joints that are sent positions and are further
+    /// from the last one than they move at their speed limit within 0.1 s (0.1 rad or m without one), what is projected next proposes rest: their set
+    /// points wait for them.
+    pub fn depart(&mut self, q: &mut [f64], v: &mut [f64]) {
+        let sent = &mut self.previous.sent;
+        sent.waiting.clear();
         if !sent.known {
             return;
         }
         for &(i, iq, window) in &sent.positions {
-            if (q[iq] - sent.q[iq]).abs() <= window {
-                (q[iq], v[i]) = (sent.q[iq], sent.v[i]);
+            // where nothing is measured there is nothing to wait for
+            if (q[iq] - sent.q[iq]).abs() > window {
+                sent.waiting.push((i, iq));
             }
+            (q[iq], v[i]) = (sent.q[iq], sent.v[i]);
         }
         for &i in &sent.velocities {
             v[i] = sent.v[i];
+        }
+    }
+
+    /// Puts rest in the place of what is `asked` of joints whose set points wait, at `q`, `v`.
+    pub(super) fn wait(&self, q: &[f64], v: &[f64], asked: &mut Proposal) {
+        let Period { dt, kappa, .. } = self.period;
+        for &(i, iq) in &self.previous.sent.waiting {
+            let rest = self.rest(i, v[i]);
+            asked.v[i] = rest;
+            asked.q[iq] = q[iq] + dt * v[i] + kappa * dt * (rest - v[i]);
         }
     }
 
@@ -74,11 +92,22 @@ impl Projector {
 
     /// What was sent in the tick before is not what the robot does: the next tick begins where it is measured.
     pub fn lose(&mut self) {
-        self.previous.sent.known = false;
+        self.previous.sent.forget();
     }
 }
 
 impl Sent {
+    /// As if nothing had been sent.
+    pub(super) fn forget(&mut self) {
+        self.known = false;
+        self.waiting.clear();
+    }
+
+    /// Some set point waits for its joint.
+    pub(super) fn waits(&self) -> bool {
+        !self.waiting.is_empty()
+    }
+
     /// Some joint follows by itself.
     pub(super) fn is_any(&self) -> bool {
         !(self.positions.is_empty() && self.velocities.is_empty())
@@ -100,6 +129,7 @@ impl Sent {
         let (q, rest) = memory[1..].split_at(self.q.len());
         let (v, rest) = rest.split_at(self.v.len());
         self.known = memory[0] != 0.0;
+        self.waiting.clear();
         self.q.copy_from_slice(q);
         self.v.copy_from_slice(v);
         rest

@@ -297,7 +297,7 @@ impl Controller {
 
     /// Joints that follow by themselves what they are sent go on from there: see [`Projector::depart`]. The observation stays what is measured.
     fn depart(&mut self) {
-        let last = self.guard.as_ref().map_or(&self.projector, |guard| &guard.projector);
+        let last = self.guard.as_mut().map_or(&mut self.projector, |guard| &mut guard.projector);
         last.depart(&mut self.held.q, &mut self.held.v);
     }
 

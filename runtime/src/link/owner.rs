@@ -18,6 +18,11 @@ pub struct Owner {
 }
 
 impl Owner {
+    /// Whether somebody has the `role`, or had it and was killed.
+    pub(crate) fn is_taken(name: &RobotName, role: &str) -> bool {
+        name.folder().join(format!("owner-{role}")).exists()
+    }
+
     /// Takes the `role` (`plant`, `runtime`, `trainer`).
     ///
     /// # Errors

@@ -29,6 +29,11 @@ pub struct RuntimeLink {
 }
 
 impl RuntimeLink {
+    /// False once the plant has left: it closed its link, and no other one has come.
+    pub(crate) fn has_plant(&self) -> bool {
+        self.bus.has("plant")
+    }
+
     /// Opens all topics; a second runtime of the same robot is refused.
     pub fn open(name: &RobotName) -> Result<RuntimeLink, LinkError> {
         let bus = Bus::join(name)?;

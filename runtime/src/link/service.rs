@@ -112,6 +112,11 @@ impl Bus {
         self.open(build, is_passing).map_err(|e| self.open_error(M::TOPIC, &e))
     }
 
+    /// Whether somebody has a role of the robot, or had it and was killed.
+    pub(super) fn has(&self, role: &str) -> bool {
+        Owner::is_taken(&self.name, role)
+    }
+
     /// Takes a role of the robot; its owner publishes the role's topics.
     ///
     /// # Errors

@@ -237,10 +237,10 @@ impl<B: Build> Io<B> {
         }
     }
 
-    /// A plant that keeps real time and is silent is gone. One in lockstep may take its time, as long as its process lives.
+    /// A plant that keeps real time and is silent is gone. One in lockstep may take its time, as long as its process lives and has not left.
     fn look_for_the_plant(&self) {
         let is_silent = clock::now() > self.traffic.last_state + self.gone_after;
-        if is_silent && !(self.robot.is_lockstep() && is_alive(self.robot.pid)) {
+        if is_silent && !(self.robot.is_lockstep() && is_alive(self.robot.pid) && self.link.has_plant()) {
             self.end();
         }
     }

@@ -375,6 +375,17 @@ fn fault_45_a_plant_or_a_loop_that_is_gone_ends_the_other_with_its_own_code() {
     let report = running.join().unwrap().unwrap();
     assert_eq!(report.reason, Reason::PlantGone, "{report}");
 
+    // One in lockstep may take its time, and is gone as soon as it has left, though its process lives.
+    let left = Name::new("left");
+    let plant = PlantLink::open(&left.0, &toy::robot(true)).unwrap();
+    let plant = std::thread::spawn(move || {
+        let settings = PlantSettings { ticks: Some(50), ..PlantSettings::lockstep(toy::DT) };
+        PlantRunner::new(plant, settings).unwrap().run(&mut toy::PointMass::default(), &Stop::new())
+    });
+    let settings = RunSettings { plant_patience: 0.5, ..toy::settings() };
+    let report = toy::LoopThread::start(&left, settings, |_| {}).join();
+    assert_eq!((report.reason, plant.join().unwrap().ticks), (Reason::PlantGone, 50), "{report}");
+
     // The wall's time counts: a plant that makes a tenth of its ticks does not make the run ten times as long.
     let slow = Name::new("slow-wall");
     let first = snapshot(1, |_| {});

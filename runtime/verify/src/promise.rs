@@ -163,8 +163,8 @@ fn manifest(bytes: &[u8]) -> Result<String, String> {
         .ok_or_else(|| "its manifest is cut".to_owned())
 }
 
-/// A joint that is sent positions does not follow where it is further from the last one than its way at the speed limit in this time [s]; without
-/// one, than this [rad or m].
+/// The set points of a joint that is sent positions wait where it is further from the last one than its way at the speed limit in this time [s];
+/// without one, than this [rad or m].
 const FOLLOWING: f64 = 0.1;
 /// After more periods than this a driver that holds has long come to rest.
 const MISSED: u64 = 1000;
@@ -356,17 +356,20 @@ impl Promise {
         !self.follows.is_empty()
     }
 
-    /// Puts what was `sent` (nq, nv) in the tick before in the place of what is measured, of joints that follow by themselves.
-    pub(crate) fn depart(&self, sent: &(Vec<f64>, Vec<f64>), q: &mut [f64], v: &mut [f64]) {
+    /// Puts what was `sent` (nq, nv) in the tick before in the place of what is measured, of joints that follow by themselves. Returns the dofs that are too
+    /// far from it: their set points wait at rest.
+    pub(crate) fn depart(&self, sent: &(Vec<f64>, Vec<f64>), q: &mut [f64], v: &mut [f64]) -> Vec<usize> {
+        let mut waiting = Vec::new();
         for &(dof, position) in &self.follows {
-            match position {
-                Some((at, most)) if (q[at] - sent.0[at]).abs() <= most => {
-                    (q[at], v[dof]) = (sent.0[at], sent.1[dof]);
+            if let Some((at, most)) = position {
+                if (q[at] - sent.0[at]).abs() > most {
+                    waiting.push(dof);
                 }
-                Some(_) => {}
-                None => v[dof] = sent.1[dof],
+                q[at] = sent.0[at];
             }
+            v[dof] = sent.1[dof];
         }
+        waiting
     }
 
     /// What drivers make of what was `sent` (nq, nv) in `periods` in which they hear nothing more: positions go on, slower in each.

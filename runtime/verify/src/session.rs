@@ -231,6 +231,11 @@ impl Session {
     /// The state that a tick goes on from (nq, nv): as measured or predicted, and of joints that follow by themselves what they were sent. None
     /// where the log does not have what it was predicted from, or has a state of another robot.
     fn begins(&self, own: &Promise, tick: &Tick) -> Option<(Vec<f64>, Vec<f64>)> {
+        self.departs(own, tick).map(|(from, _)| from)
+    }
+
+    /// The same, with the dofs whose set points wait for their joints.
+    fn departs(&self, own: &Promise, tick: &Tick) -> Option<((Vec<f64>, Vec<f64>), Vec<usize>)> {
         let (mut q, mut v) = match (&tick.sensed[..], &self.past) {
             ("predicted", past) => past.as_ref()?.target.clone(),
             _ => (tick.state.q.clone(), tick.state.v.clone()),
@@ -238,7 +243,7 @@ impl Session {
         if [q.len(), v.len()] != [own.machine.nq(), own.machine.nv()] {
             return None;
         }
-        let state = &tick.state;
+        let (state, mut waiting) = (&tick.state, Vec::new());
         if let Some(past) = self.past.as_ref().filter(|past| own.follows() && past.epoch == state.epoch)
             && [past.target.0.len(), past.target.1.len()] == [q.len(), v.len()]
         {
@@ -247,9 +252,9 @@ impl Session {
             if !self.keeps_time {
                 own.hold(&mut sent, lost);
             }
-            own.depart(&sent, &mut q, &mut v);
+            waiting = own.depart(&sent, &mut q, &mut v);
         }
-        Some((q, v))
+        Some(((q, v), waiting))
     }
 
     /// What snapshot `id` promises, and what the loop pinned.
@@ -366,8 +371,45 @@ impl Session {
         Ok(told.filter(|_| by_policy && tick.ramp >= 1.0))
     }
 
-    /// What was projected in this tick, where it is known.
+    /// What was projected in this tick, where it is known: what was proposed, or rest for joints whose set points wait.
     fn proposal(
+        &self,
+        own: &Promise,
+        tick: &Tick,
+        by_policy: bool,
+        (q, v): (&[f64], &[f64]),
+    ) -> Result<(Vec<f64>, Vec<f64>), String> {
+        let (mut pq, mut pv) = self.proposed(own, tick, by_policy, (q, v))?;
+        for i in self.departs(own, tick).map_or(Vec::new(), |(_, waiting)| waiting) {
+            self.rest(own, i, (q, v), (&mut pq, &mut pv))?;
+        }
+        Ok((pq, pv))
+    }
+
+    /// Proposes rest for dof `i` at `q`, `v`, of hard jerk what leads there.
+    fn rest(
+        &self,
+        own: &Promise,
+        i: usize,
+        (q, v): (&[f64], &[f64]),
+        (pq, pv): (&mut [f64], &mut [f64]),
+    ) -> Result<(), String> {
+        let p = &own.period;
+        pv[i] = match (own.built().joints[i].smooth(p), self.past.as_ref().and_then(|past| past.a.as_ref())) {
+            (None, _) => 0.0,
+            (Some(smooth), Some(a)) => v[i] + p.dt * smooth.next(v[i], a[i]),
+            (Some(_), None) => {
+                return Err("the tick before their brake is not known, of which jerk speaks".to_owned());
+            }
+        };
+        if let Some(at) = own.machine.single(i) {
+            pq[at] = q[at] + p.way(v[i], pv[i]);
+        }
+        Ok(())
+    }
+
+    /// What was proposed in this tick, where it is known.
+    fn proposed(
         &self,
         own: &Promise,
         tick: &Tick,
@@ -378,19 +420,8 @@ impl Session {
         let p = &own.period;
         let (mut pq, mut pv) = (q.to_vec(), v.to_vec());
         if !by_policy {
-            // The loop's own brake proposes rest, of hard jerk what leads there.
             for &i in &own.controllable {
-                let joint = &own.built().joints[i];
-                pv[i] = match (joint.smooth(p), self.past.as_ref().and_then(|past| past.a.as_ref())) {
-                    (None, _) => 0.0,
-                    (Some(smooth), Some(a)) => v[i] + p.dt * smooth.next(v[i], a[i]),
-                    (Some(_), None) => {
-                        return no("the tick before their brake is not known, of which jerk speaks");
-                    }
-                };
-                if let Some(at) = own.machine.single(i) {
-                    pq[at] = q[at] + p.way(v[i], pv[i]);
-                }
+                self.rest(own, i, (q, v), (&mut pq, &mut pv))?; // the loop's own brake
             }
             return Ok((pq, pv));
         }
