@@ -47,6 +47,12 @@ struct Past {
     told: Option<Told>,
 }
 
+/// What a tick goes on from (nq, nv), and the dofs whose set points wait for their joints.
+struct Start {
+    from: (Vec<f64>, Vec<f64>),
+    waiting: Vec<usize>,
+}
+
 /// The state in which a policy period began, and what was proposed then.
 struct Begun {
     start: (Vec<f64>, Vec<f64>),
@@ -231,11 +237,11 @@ impl Session {
     /// The state that a tick goes on from (nq, nv): as measured or predicted, and of joints that follow by themselves what they were sent. None
     /// where the log does not have what it was predicted from, or has a state of another robot.
     fn begins(&self, own: &Promise, tick: &Tick) -> Option<(Vec<f64>, Vec<f64>)> {
-        self.departs(own, tick).map(|(from, _)| from)
+        self.start(own, tick).map(|start| start.from)
     }
 
     /// The same, with the dofs whose set points wait for their joints.
-    fn departs(&self, own: &Promise, tick: &Tick) -> Option<((Vec<f64>, Vec<f64>), Vec<usize>)> {
+    fn start(&self, own: &Promise, tick: &Tick) -> Option<Start> {
         let (mut q, mut v) = match (&tick.sensed[..], &self.past) {
             ("predicted", past) => past.as_ref()?.target.clone(),
             _ => (tick.state.q.clone(), tick.state.v.clone()),
@@ -254,7 +260,7 @@ impl Session {
             }
             waiting = own.depart(&sent, &mut q, &mut v);
         }
-        Some(((q, v), waiting))
+        Some(Start { from: (q, v), waiting })
     }
 
     /// What snapshot `id` promises, and what the loop pinned.
@@ -380,7 +386,7 @@ impl Session {
         (q, v): (&[f64], &[f64]),
     ) -> Result<(Vec<f64>, Vec<f64>), String> {
         let (mut pq, mut pv) = self.proposed(own, tick, by_policy, (q, v))?;
-        for i in self.departs(own, tick).map_or(Vec::new(), |(_, waiting)| waiting) {
+        for i in self.start(own, tick).map_or(Vec::new(), |start| start.waiting) {
             self.rest(own, i, (q, v), (&mut pq, &mut pv))?;
         }
         Ok((pq, pv))
