@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
@@ -213,24 +214,30 @@ HAND = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator=
 <position name="j0" joint="j0" kp="4500" kv="450" ctrlrange="-1 1" forcerange="-87 87"/>
 <position name="j1" joint="j1" kp="2000" kv="200" ctrlrange="-1 1" forcerange="-30 30"/>
 <general tendon="split" gainprm="1" biastype="affine" biasprm="0 -100 -10" ctrlrange="-1 1" forcerange="-100 100"/></actuator></mujoco>"""
+OF_HAND = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
+
+
+def pushed(envs: nearl.VecEnv, dt: float, seed: int, ticks: int) -> Iterator[tuple[int, np.ndarray, np.ndarray, dict]]:
+    """Pushes two joints onto their limits, another way every hundred ticks: tick, observation, mean accelerations and info of each."""
+    obs, _ = envs.reset(seed=0)
+    rng, before = np.random.default_rng(seed), obs[0, 2:].copy()
+    for tick in range(ticks):
+        if tick % 100 == 0:
+            push = rng.uniform(-2, 2, 2)
+        obs, *_, info = envs.step(push[None])
+        yield tick, obs, np.abs(obs[0, 2:] - before) / dt, info
+        before = obs[0, 2:].copy()
 
 
 def test_a_hand_that_a_tendon_closes_is_no_matter_of_the_arm_s_drives(tmp_path: Path) -> None:
     """The gains are those of a Panda and its hand. What the tendon damps is implicit too, and moves the fingers alone."""
-    text, rng = HAND.format(across="f0"), np.random.default_rng(0)
-    (tmp_path / "arm.xml").write_text(text)
-    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
-    envs = nearl.make_vec(task(tmp_path, 2, 0.002, 0.002, command=command), 1, constraints="task", actions="guarded")
-    obs, _ = envs.reset(seed=0)
-    before, fastest = obs[0, 2:].copy(), 0.0
-    for tick in range(2000):
-        if tick % 100 == 0:
-            push = rng.uniform(-2, 2, 2)
-        obs, *_ = envs.step(push[None])
-        accelerations = np.abs(obs[0, 2:] - before) / 0.002
+    (tmp_path / "arm.xml").write_text(HAND.format(across="f0"))
+    envs = nearl.make_vec(task(tmp_path, 2, 0.002, 0.002, command=OF_HAND), 1, constraints="task", actions="guarded")
+    fastest = 0.0
+    for tick, obs, accelerations, _ in pushed(envs, 0.002, 0, 2000):
         assert accelerations.max() <= ACCELERATION * 1.01, f"tick {tick}: {accelerations}"
         assert np.abs(obs[0, :2]).max() <= 1.0
-        before, fastest = obs[0, 2:].copy(), max(fastest, np.abs(obs[0, 2:]).max())
+        fastest = max(fastest, np.abs(obs[0, 2:]).max())
     assert 1.0 < fastest <= SPEED + 1e-3
     (tmp_path / "arm.xml").write_text(HAND.format(across="j1"))
     with pytest.raises(ValueError, match="dampers of tendons or actuators that act on more than a joint; take these out"):
@@ -242,20 +249,14 @@ def test_a_force_at_its_end_throws_no_joint(tmp_path: Path, seed: int) -> None:
     """At the end of a forcerange MuJoCo's step is no longer implicit in the drive's damping: with fingers that the guard does not know, whose weight brings
     forces there, the arm had left 10 rad/s² by 31 and 36."""
     (tmp_path / "arm.xml").write_text(HAND.format(across="f0").replace('forcerange="-87 87"', 'forcerange="-15 15"'))
-    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
-    file = task(tmp_path, 2, 0.002, 0.002, margin=0.003, command=command)
+    file = task(tmp_path, 2, 0.002, 0.002, margin=0.003, command=OF_HAND)
     file.write_text(file.read_text() + 'braking = "stored"\n')
     envs = nearl.make_vec(file, 1, constraints="task", actions="guarded")
-    obs, _ = envs.reset(seed=0)
-    rng, before, most = np.random.default_rng(seed), obs[0, 2:].copy(), 0.0
-    for tick in range(3000):
-        if tick % 100 == 0:
-            push = rng.uniform(-2, 2, 2)
-        obs, *_, info = envs.step(push[None])
-        accelerations = np.abs(obs[0, 2:] - before) / 0.002
+    most = 0.0
+    for tick, obs, accelerations, info in pushed(envs, 0.002, seed, 3000):
         assert accelerations.max() <= ACCELERATION + 1.0, f"tick {tick}: {accelerations}"
         assert np.abs(obs[0, 2:]).max() <= SPEED + 0.005, f"tick {tick}: {obs}"
-        before, most = obs[0, 2:].copy(), max(most, abs(4500 * (info["executed"][0][0] - obs[0, 0])))
+        most = max(most, abs(4500 * (info["executed"][0][0] - obs[0, 0])))
     assert most > 15.0, "no force came to its end"
 
 
@@ -265,21 +266,15 @@ def test_fingers_that_are_left_alone_take_no_arm_off_its_limits(
 ) -> None:
     """An equation and a tendon hold them. Without a stored brake and reckoned with as loose, a Panda's own hand had thrown its arm off 10 rad/s² by 90."""
     (tmp_path / "arm.xml").write_text(HAND.format(across="f0").replace('forcerange="-87 87"', 'forcerange="-40 40"').replace('"0.002"', f'"{timestep}"'))
-    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
-    envs = nearl.make_vec(task(tmp_path, 2, dt, timestep, margin=0.003, command=command), 1, constraints="task", actions="guarded")
+    envs = nearl.make_vec(task(tmp_path, 2, dt, timestep, margin=0.003, command=OF_HAND), 1, constraints="task", actions="guarded")
     told = "\n".join(str(warning.message) for warning in recwarn)
     assert "a brake is stored as if 'f0', 'f1', which are not controllable, did not move" in told, told
     assert "with joints that nothing drives" not in told, told
-    obs, _ = envs.reset(seed=0)
-    rng, before, held_back = np.random.default_rng(seed), obs[0, 2:].copy(), 0
-    for tick in range(2000):
-        if tick % 100 == 0:
-            push = rng.uniform(-2, 2, 2)
-        obs, *_ = envs.step(push[None])
-        accelerations = np.abs(obs[0, 2:] - before) / dt
+    held_back = 0
+    for tick, obs, accelerations, _ in pushed(envs, dt, seed, 2000):
         assert accelerations.max() <= ACCELERATION + 0.15, f"tick {tick}: {accelerations}"
         assert np.abs(obs[0, 2:]).max() <= SPEED + 1e-3 and np.abs(obs[0, :2]).max() <= 1.0, f"tick {tick}: {obs}"
-        before, held_back = obs[0, 2:].copy(), held_back + int(accelerations.max() > 0.9 * ACCELERATION)
+        held_back += int(accelerations.max() > 0.9 * ACCELERATION)
     assert held_back > 50
 
 
@@ -290,25 +285,18 @@ def test_a_brake_is_seen_to_cut_a_target_between_the_ticks_looked_at(tmp_path: P
     text = re.sub(r'<body pos="0.2 0 0">.*?</body>\n', "", HAND.format(across="f0"))
     text = re.sub(r"<tendon>.*</equality>", "", text, flags=re.DOTALL).replace('forcerange="-87 87"', 'forcerange="-15 15"')
     (tmp_path / "arm.xml").write_text(re.sub(r"<general[^>]*/>", "", text).replace('"0.002"', '"0.005"'))
-    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
-    envs = nearl.make_vec(task(tmp_path, 2, 0.005, 0.005, margin=0.003, command=command), 1, constraints="task", actions="guarded")
-    obs, _ = envs.reset(seed=0)
-    rng, before, highest = np.random.default_rng(seed), obs[0, 2:].copy(), 0.0
-    for tick in range(2000):
-        if tick % 100 == 0:
-            push = rng.uniform(-2, 2, 2)
-        obs, *_, info = envs.step(push[None])
-        accelerations = np.abs(obs[0, 2:] - before) / 0.005
+    envs = nearl.make_vec(task(tmp_path, 2, 0.005, 0.005, margin=0.003, command=OF_HAND), 1, constraints="task", actions="guarded")
+    highest = 0.0
+    for tick, _, accelerations, info in pushed(envs, 0.005, seed, 2000):
         assert accelerations.max() <= ACCELERATION + 1e-8, f"tick {tick}: {accelerations}"
-        before, highest = obs[0, 2:].copy(), max(highest, np.abs(info["executed"][0]).max())
+        highest = max(highest, np.abs(info["executed"][0]).max())
     assert 0.99 < highest <= 1.0, highest
 
 
 @pytest.mark.parametrize(("mass", "says"), [(0.02, "a brake is stored as if 'f0', 'f1'"), (2.0, "no brake is stored because 'f0', 'f1' are not controllable")])
 def test_a_brake_is_stored_where_what_is_left_alone_is_light(tmp_path: Path, recwarn: pytest.WarningsRecorder, mass: float, says: str) -> None:
     (tmp_path / "arm.xml").write_text(HAND.format(across="f0").replace('mass="0.02"', f'mass="{mass}"'))
-    command = 'interface = "pd"\nstiffness = { j0 = 4500, j1 = 2000 }\ndamping = { j0 = 450, j1 = 200 }'
-    nearl.make_vec(task(tmp_path, 2, 0.002, 0.002, command=command), 1, constraints="task", actions="guarded")
+    nearl.make_vec(task(tmp_path, 2, 0.002, 0.002, command=OF_HAND), 1, constraints="task", actions="guarded")
     assert any(says in str(warning.message) for warning in recwarn), [str(warning.message) for warning in recwarn]
 
 
