@@ -56,8 +56,11 @@ impl Projector {
             return;
         }
         for &(i, iq, window) in &sent.positions {
-            // where nothing is measured there is nothing to wait for
-            if (q[iq] - sent.q[iq]).abs() > window {
+            let away = (q[iq] - sent.q[iq]).abs();
+            if away.is_nan() {
+                continue; // a position that is no number stays, and is refused
+            }
+            if away > window {
                 sent.waiting.push((i, iq));
             }
             (q[iq], v[i]) = (sent.q[iq], sent.v[i]);

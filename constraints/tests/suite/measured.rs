@@ -152,6 +152,9 @@ fn joints_that_follow_go_on_from_what_they_were_sent() {
     projector.depart(&mut near_q, &mut near_v);
     projector.project(&near_q, &near_v, &raw, &mut next);
     assert!(next.v[0] > 0.4, "{}", next.v[0]); // and goes on when it is there
+    near_q[0] = f64::NAN;
+    projector.depart(&mut near_q, &mut near_v);
+    assert!(near_q[0].is_nan(), "{}", near_q[0]); // what is no number is not hidden
 
     let memory = projector.memory();
     projector.forget();

@@ -280,6 +280,16 @@ fn a_jerk_after_a_gap_is_not_told_from_a_measured_state() {
         assert_eq!(report.found, 0, "{left_out}: {report}");
         assert!((1..8).contains(&report.unverified()), "{left_out}: {report}");
     }
+    // The set point that takes the place of a measured position does not hide one that is no number.
+    let edit = |topic: &str, m: &mut Value| {
+        if topic == "tick" && m["tick"] == 700 {
+            m["state"]["q"][2] = Value::Null;
+        }
+        true
+    };
+    copy(&log, &other, &edit, &|bytes| bytes, &|_| {});
+    let report = verify(&other).unwrap();
+    assert!(report.found > 0 && report.violations[0].what.contains("state.q[2]"), "{report}");
 }
 
 /// Targets are kept within the range of their drives. Where nothing keeps them, as under a soft torque limit, a drive that is sent less far than its

@@ -362,7 +362,11 @@ impl Promise {
         let mut waiting = Vec::new();
         for &(dof, position) in &self.follows {
             if let Some((at, most)) = position {
-                if (q[at] - sent.0[at]).abs() > most {
+                let away = (q[at] - sent.0[at]).abs();
+                if away.is_nan() {
+                    continue; // a position that is no number stays, and is named
+                }
+                if away > most {
                     waiting.push(dof);
                 }
                 q[at] = sent.0[at];
