@@ -52,8 +52,18 @@ fn rows(name: &str, limit: &dyn Limit) {
         let q = &configuration(k);
         let (q_next, v_next, acceleration, torque) = (q, &v, &[0.0; 7], &[]);
         let (period, kinematics, previous) = (&period, &mut kinematics, None);
-        let mut motion =
-            Motion { q, v: &v, q_next, v_next, acceleration, torque, period, kinematics, previous };
+        let mut motion = Motion {
+            q,
+            v: &v,
+            q_next,
+            v_next,
+            acceleration,
+            torque,
+            mass: &[],
+            period,
+            kinematics,
+            previous,
+        };
         rows.excess(&mut motion, &mut upper);
     });
 }

@@ -1,6 +1,7 @@
 //! The independent checker evaluates the limits themselves at a next state. It shares no code with the projector's
-//! assembly: no boxes, no rows, no mass matrix; the motor force comes from inverse dynamics. At which moment of the period that
-//! force is taken is one definition for both ([`Period::lag`], [`Period::resistance`]), which tests compare with MuJoCo.
+//! assembly: no boxes, no rows; the motor force comes from inverse dynamics. At which moment of the period that
+//! force is taken ([`Period::lag`], [`Period::resistance`]), and by how much a drive's changes within it, is one definition for both, which tests compare
+//! with MuJoCo.
 
 use crate::ledger::Counts;
 use crate::row::{Cone, Motion, Needs, Previous, Rows};
@@ -60,6 +61,8 @@ struct Reckoned {
     /// Acceleration and motor forces (nv).
     a: Vec<f64>,
     tau: Vec<f64>,
+    /// Mass matrix (nv x nv).
+    mass: Vec<f64>,
 }
 
 /// Scratch and constants of the checker.
@@ -162,6 +165,7 @@ impl Checker {
             needs: needs.fold(Needs::default(), Needs::and),
             a: zero(),
             tau: zero(),
+            mass: vec![0.0; model.nv() * model.nv()],
         };
         let limits = LimitSet::collect(model, limits, controllable)?;
         rows.iter_mut().try_for_each(|r| r.rows.fit(&limits))?;
@@ -302,6 +306,12 @@ impl Checker {
     pub(crate) fn hard_kinds(&self) -> Vec<Kind> {
         let rows = self.rows.iter().filter(|r| r.hard).flat_map(|r| vec![r.rows.kind(); r.count]);
         rows.chain(self.cones.iter().filter(|c| c.hard).map(|c| c.cone.kind())).collect()
+    }
+
+    /// By how much less than they keep the hard rows, then the hard cones, are verified for in a brake ([`Rows::reserves`]).
+    pub(crate) fn hard_reserves(&self) -> Vec<f64> {
+        let rows = self.rows.iter().filter(|r| r.hard).flat_map(|r| r.rows.reserves());
+        rows.chain(self.cones.iter().filter(|c| c.hard).map(|_| 0.0)).collect()
     }
 
     /// Whether hard rows can be broken by joints that brake as they may ([`Rows::needs_a_brake`]).
@@ -543,12 +553,15 @@ impl Reckoned {
             self.dynamics.motors_without_friction(&self.period, q, v, &self.a, &mut self.tau);
             self.tau.iter_mut().zip(external).for_each(|(tau, external)| *tau -= external);
         }
+        if self.needs.mass {
+            self.dynamics.mass(q, &mut self.mass);
+        }
         if self.needs.kinematics {
             self.kinematics.update(q, v, &self.a);
         }
-        let (acceleration, torque, period, kinematics) =
-            (&self.a[..], &self.tau[..], &self.period, &mut self.kinematics);
-        Motion { q, v, q_next, v_next, acceleration, torque, period, kinematics, previous }
+        let (acceleration, torque, mass) = (&self.a[..], &self.tau[..], &self.mass[..]);
+        let (period, kinematics) = (&self.period, &mut self.kinematics);
+        Motion { q, v, q_next, v_next, acceleration, torque, mass, period, kinematics, previous }
     }
 }
 

@@ -70,6 +70,7 @@ pub mod row;
 mod target;
 mod urdf;
 pub mod viability;
+mod within_period;
 
 pub use certify::{Certificate, certify_braking};
 pub use description::RobotDescription;

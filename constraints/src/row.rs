@@ -64,6 +64,8 @@ pub struct Motion<'a> {
     /// [`Dynamics::motors_without_friction`](crate::Dynamics::motors_without_friction) less the external forces;
     /// zero unless some row has [`Needs::motors`].
     pub torque: &'a [f64],
+    /// Mass matrix (nv x nv, symmetric) at `q`; zero unless some row has [`Needs::mass`].
+    pub mass: &'a [f64],
     /// The control period.
     pub period: &'a Period,
     /// Frames at `q`, `v` and that acceleration; stale unless some row has [`Needs::kinematics`].
@@ -158,6 +160,12 @@ pub trait Rows: Send {
     /// True when joints that brake as they may can break the rows, whatever their motors give: a brake has to be stored for them.
     fn needs_a_brake(&self) -> bool {
         false
+    }
+
+    /// By how much less than it keeps each row is verified for in a brake, as a share of its size: what a plant makes of the periods of a brake may differ
+    /// from what it was verified as.
+    fn reserves(&self) -> Vec<f64> {
+        vec![0.0; self.sizes().len()]
     }
 
     /// True when what the rows keep is of the state that a motion ends in, so that a measured state may be beyond it already and come back.

@@ -57,6 +57,21 @@ def with_drives(text: str, ranges: np.ndarray, rng: np.random.Generator, speeds:
     return text, f'interface = "pd"\nstiffness = {{ {gains[0]} }}\ndamping = {{ {gains[1]} }}'
 
 
+def with_weak_motors(text: str, ranges: np.ndarray, share: float) -> str:
+    """The arm with drives whose largest force is this share of what it takes to accelerate all joints at their limits in the worst of some hundred places."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data, n, rng = mujoco.MjData(model), len(ranges), np.random.default_rng(1)
+    most, mass = np.zeros(n), np.zeros((n, n))
+    for _ in range(300):
+        data.qpos[:], data.qvel[:] = rng.uniform(ranges[:, 0], ranges[:, 1]), rng.uniform(-SPEED, SPEED, n)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, mass)
+        most = np.maximum(most, np.abs(data.qfrc_bias - data.qfrc_passive) + ACCELERATION * np.abs(mass).sum(axis=1))
+    for i, force in enumerate(share * most):
+        text = re.sub(rf'(name="m{i}"[^>]*forcerange=)"[^"]*"', rf'\1"{-force:.4f} {force:.4f}"', text)
+    return text
+
+
 def within_ranges(text: str, ranges: np.ndarray) -> str:
     """The arm whose targets end where its joints do."""
     for i, (low, high) in enumerate(ranges):
@@ -134,9 +149,10 @@ def attack(
     accelerations: float | np.ndarray = ACCELERATION,
     far: float = 300.0,
     ends: str = "position",
+    near: float = 1e-3,
 ) -> None:
     """Pushes onto the limits of the task in `folder`, and steps the simulator beside it, whose joints keep to their ranges, speeds and accelerations.
-    Some joint must come to the end of its range of positions, or some drive to that of its targets where `ends` says so."""
+    Some joint must come `near` the end of its range of positions [rad], or some drive to that of its targets where `ends` says so."""
     envs = nearl.make_vec(folder / "arm.toml", 1, constraints="task", actions="guarded")
     model = mujoco.MjModel.from_xml_string(text)
     data, dt, n = mujoco.MjData(model), model.opt.timestep * steps, model.nv
@@ -144,7 +160,7 @@ def attack(
     data.qpos[:], data.qvel[:] = obs[0, :n], obs[0, n:]
     low, high = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.inf, np.inf]).T
     # what a joint keeps of its range for a brake that leads further
-    push, touched, near = np.zeros(n), 0, 1e-3 + accelerations * dt * dt / 4
+    push, touched, near = np.zeros(n), 0, near + accelerations * dt * dt / 4
     for tick in range(800):
         if tick % 25 == 0:
             push = rng.uniform(-far, far, n)
@@ -189,6 +205,35 @@ def test_drives_held_on_their_targets_stay_within_their_limits(tmp_path: Path, s
     (tmp_path / "arm.xml").write_text(text)
     task(tmp_path, len(ranges), dt, dt / steps, command=command)
     attack(tmp_path, text, steps, rng, far=3.0)
+
+
+@pytest.mark.parametrize(
+    ("dt", "integrator", "seed"), [(0.005, "Euler", 57), (0.005, "Euler", 59), (0.005, "implicitfast", 15), (0.01, "Euler", 57), (0.01, "implicitfast", 15)]
+)
+def test_targets_over_several_steps_are_kept_within_the_range_of_their_drives(tmp_path: Path, dt: float, integrator: str, seed: int) -> None:
+    """The force at the start of a period was reckoned with for a constant acceleration: targets were cut, and 10 rad/s² left."""
+    rng = np.random.default_rng(seed)
+    steps = int(rng.choice([2, 5, 10]))
+    text, ranges = arm(rng, dt / steps, integrator)
+    text, command = with_drives(text, ranges, rng, [30.0, 80.0])
+    text = within_ranges(text, ranges)
+    (tmp_path / "arm.xml").write_text(text)
+    task(tmp_path, len(ranges), dt, dt / steps, command=command)
+    attack(tmp_path, text, steps, rng, far=3.0, near=0.05)
+
+
+@pytest.mark.parametrize(("dt", "share", "seed"), [(0.005, 1.05, 20), (0.005, 2.0, 22), (0.01, 1.05, 12), (0.01, 1.05, 20)])
+def test_drives_whose_force_swings_within_a_period_can_brake(tmp_path: Path, dt: float, share: float, seed: int) -> None:
+    """A drive whose joint comes near its target within a period gives more of its force at the start and at the end than on average: nothing was left to
+    brake with, and 10 rad/s² were left by up to 100."""
+    rng = np.random.default_rng(seed)
+    steps = int(rng.choice([2, 5, 10]))
+    text, ranges = arm(rng, dt / steps, "Euler")
+    text, command = with_drives(text, ranges, rng, [30.0, 80.0])
+    text = with_weak_motors(text, ranges, share)
+    (tmp_path / "arm.xml").write_text(text)
+    task(tmp_path, len(ranges), dt, dt / steps, command=command)
+    attack(tmp_path, text, steps, rng, far=3.0, near=0.05)
 
 
 @pytest.mark.parametrize("friction", [0.0, 1.0])

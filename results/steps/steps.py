@@ -16,7 +16,7 @@ import nearl
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parents[1] / "python/tests"))
-from test_guard_steps import ACCELERATION, SPEED, arm, task, with_drives, within_ranges  # noqa: E402
+from test_guard_steps import ACCELERATION, SPEED, arm, task, with_drives, with_weak_motors, within_ranges  # noqa: E402
 
 TICKS, PUSHED = 600, 25
 
@@ -31,6 +31,7 @@ class Setting(NamedTuple):
     speeds: tuple[float, ...] = ()
     integrator: str = "Euler"
     ends: bool = False
+    share: float = 0.0
 
 
 SETTINGS = [
@@ -55,6 +56,7 @@ SETTINGS = [
             Setting(0.01, speeds=(30.0, 80.0), integrator=integrator, ends=True),
         )
     ),
+    *(Setting(dt, speeds=(30.0, 80.0), share=share) for dt in (0.005, 0.01) for share in (1.05, 2.0)),
 ]
 
 
@@ -69,6 +71,8 @@ def excess(seed: int, of: Setting) -> tuple[int, np.ndarray]:
         far = 3.0
     if of.ends:
         text = within_ranges(text, ranges)
+    if of.share:
+        text = with_weak_motors(text, ranges, of.share)
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "arm.xml").write_text(text)
         envs = nearl.make_vec(task(Path(folder), n, of.dt, of.dt / steps, of.margin, command), 1, constraints="task", actions="guarded")
@@ -89,17 +93,17 @@ def main() -> None:
     """Attacks the arms of every setting, and says how many kept everything."""
     warnings.simplefilter("ignore")
     arms = int(sys.argv[1]) if len(sys.argv) > 1 else 60
-    lines = ["dt,steps,margin,drives,integrator,targets_end,seed,position,speed,acceleration"]
+    lines = ["dt,steps,margin,drives,integrator,targets_end,share,seed,position,speed,acceleration"]
     for of in SETTINGS:
         runs = [(seed, *excess(seed, of)) for seed in range(arms)]
         fastest = max(of.speeds, default=0)
-        lines += [
-            f"{of.dt},{steps},{of.margin},{fastest:g},{of.integrator},{int(of.ends)},{seed},{w[0]:.3g},{w[1]:.3g},{w[2]:.3g}" for seed, steps, w in runs
-        ]
+        setting = f"{of.margin},{fastest:g},{of.integrator},{int(of.ends)},{of.share:g}"
+        lines += [f"{of.dt},{steps},{setting},{seed},{w[0]:.3g},{w[1]:.3g},{w[2]:.3g}" for seed, steps, w in runs]
         kept = sum(w.max() < 1e-8 for _, _, w in runs)
         most = np.max([w for _, _, w in runs], axis=0)
         worst = f"{most[0]:.2g} rad, {most[1]:.2g} rad/s, {most[2]:.2g} rad/s²"
         drives = f"drives up to {fastest:g} rad/s{', targets end with the joints' if of.ends else ''}"
+        drives += f", {of.share} of the force they need" if of.share else ""
         counts = ", ".join(map(str, of.counts))
         print(f"{of.dt * 1e3:g} ms, {counts} steps, {of.integrator}, margin {of.margin}, {drives}: {kept} of {arms} kept everything; worst {worst}", flush=True)
     (HERE / "steps.csv").write_text("\n".join(lines) + "\n")

@@ -100,6 +100,8 @@ pub(crate) struct Backup {
     here: Vec<f64>,
     /// Rows of which a state, not a motion, is beyond the limit.
     of_state: Vec<bool>,
+    /// By how much less than it keeps each row is verified for in a brake (hard rows).
+    less: Vec<f64>,
     trial: Vec<f64>,
     /// The planned motion of each dof of hard jerk (nv).
     stops: Vec<Option<Stop>>,
@@ -159,6 +161,7 @@ impl Backup {
             on_the_way: vec![0.0; checker.hard()],
             here: vec![0.0; checker.hard()],
             of_state: checker.hard_of_state(),
+            less: checker.hard_reserves(),
             trial: zero(),
             stops: vec![None; model.nv()],
             full: vec![(0.0, 0.0); model.nv()],
@@ -522,7 +525,12 @@ impl Backup {
                 self.ticks.push(first + at);
                 self.look(with, q, v, first + at, n as usize);
                 let seen = &self.breach[n as usize * rows..(n as usize + 1) * rows];
-                if !seen.iter().zip(&self.allowed).all(holds) {
+                if !seen
+                    .iter()
+                    .zip(&self.less)
+                    .zip(&self.allowed)
+                    .all(|((seen, less), allowed)| holds((&(seen + less), allowed)))
+                {
                     return false;
                 }
             }
@@ -553,7 +561,7 @@ impl Backup {
                 let after = if n + 2 < count { bend(n + 1, r) } else { before };
                 let most = at(n, r).max(at(n + 1, r)) + 0.5 * before.max(after);
                 before = after;
-                most <= self.allowed[r] || self.ticks[n + 1] - self.ticks[n] == 1
+                most + self.less[r] <= self.allowed[r] || self.ticks[n + 1] - self.ticks[n] == 1
             })
         })
     }

@@ -74,6 +74,7 @@ fn excess_of(
         v_next: &v_next,
         acceleration: &a,
         torque: &[],
+        mass: &[],
         period,
         kinematics: &mut kinematics,
         previous: None,

@@ -17,6 +17,7 @@ mod attack;
 mod certify;
 mod conformance;
 mod defaults;
+mod drives;
 mod errors;
 mod frame_limits;
 mod friction;

@@ -7,6 +7,7 @@
 
 mod collision;
 mod cut;
+mod drives;
 mod facts;
 mod jerk;
 mod limit_check;

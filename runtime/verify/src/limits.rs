@@ -6,9 +6,10 @@ use std::rc::Rc;
 use serde::Deserialize;
 
 use crate::collision::Collision;
+use crate::drives::Drives;
 use crate::motion::Machine;
 use crate::robot::{Range, Robot, Shape};
-use crate::rows::{Equal, Row, Rule, Soft, Term};
+use crate::rows::{Equal, Row, Rule, SHORT, Soft, Term};
 use crate::space::{Vec3, dot, norm, times};
 
 /// `[constraints]`. A key that is not known here is not verified, and refused by name.
@@ -358,6 +359,8 @@ pub(crate) struct Of<'a> {
     pub(crate) controllable: &'a [usize],
     /// Stiffness and damping of the joints that are sent the target of their drive, by dof.
     pub(crate) drives: &'a [Option<[f64; 2]>],
+    /// Dofs that forces move, ascending.
+    pub(crate) free: &'a [usize],
     /// How far commands to the joints may go, by dof.
     pub(crate) ranges: &'a [[f64; 2]],
     /// Physics steps in a period.
@@ -431,8 +434,10 @@ impl Section {
             rows.push(row.row(of, &joints)?);
         }
         let soft = self.torque.as_ref().and_then(|torque| torque.soft);
+        let all = Rc::new(Drives::new(of.drives, of.free.to_vec()));
         for &(dof, effort) in &efforts {
             let Some([stiffness, damping]) = of.drives[dof] else { continue };
+            let effort = if of.sub_steps > 1 { (1.0 - SHORT) * effort } else { effort };
             // A target makes up for any friction as well, where its range is wide enough.
             let rubs = of.robot.joints().nth(dof).map_or(0.0, |joint| joint.friction / stiffness);
             let [low, high] = of.ranges[dof];
@@ -445,7 +450,8 @@ impl Section {
                 range.is_some().then_some((false, range, "by its target")),
             ];
             for (at_end, range, at) in parts.into_iter().flatten() {
-                let rule = Rule::Drive { dof, most: effort, stiffness, damping, at_end, range };
+                let all = all.clone();
+                let rule = Rule::Drive { dof, most: effort, stiffness, damping, at_end, range, all };
                 rows.push(Row::new("torque", &format!("{} {at}", of.name(dof)), effort, soft, rule));
             }
         }

@@ -377,6 +377,11 @@ impl Machine {
         }
     }
 
+    /// Stiffness and damping of dof `i` itself [N m/rad or N/m, N m s/rad or N s/m].
+    pub(crate) fn spring(&self, i: usize) -> [f64; 2] {
+        [self.links[i].stiffness, self.links[i].damping]
+    }
+
     /// What a physics step takes implicitly of dof `i`, its drive's included [N m s/rad or N s/m].
     pub(crate) fn damping(&self, i: usize) -> f64 {
         self.links[i].damping + self.links[i].drive_damping

@@ -263,8 +263,14 @@ impl Promise {
                 ranges[action.dof] = [low, high];
             }
         }
+        let is_free = |(dof, joint): (usize, &crate::robot::Joint)| {
+            let is_led = matches!(sent[dof], Sent::Position | Sent::Velocity);
+            (!is_led && (controllable.contains(&dof) || !joint.held)).then_some(dof)
+        };
+        let free: Vec<usize> = m.robot.joints().enumerate().filter_map(is_free).collect();
         let (controls, drives, ranges) = (&controllable[..], &drives[..], &ranges[..]);
-        let of = Of { robot: &m.robot, machine: &machine, controllable: controls, drives, ranges, sub_steps };
+        let (robot, machine_of, free) = (&m.robot, &machine, &free[..]);
+        let of = Of { robot, machine: machine_of, controllable: controls, drives, free, ranges, sub_steps };
         let limits = section.limits(&of)?;
         let mut bare = (sub_steps != 1).then(|| bare.limits(&of)).transpose()?;
         for row in bare.iter_mut().flat_map(|limits| &mut limits.rows) {

@@ -93,6 +93,9 @@ pub(crate) struct Joint {
     /// What drives damp, where physics steps take it implicitly [N·m·s/rad or N·s/m].
     #[serde(default)]
     pub(crate) drive_damping: f64,
+    /// Something that nobody commands holds it.
+    #[serde(default)]
+    pub(crate) held: bool,
     pub(crate) stiffness: f64,
     pub(crate) spring_reference: f64,
     pub(crate) armature: f64,

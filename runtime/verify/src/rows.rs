@@ -1,7 +1,10 @@
 //! Limits that tie joints together: what they ask of a passage, what they keep, and how they change with it.
 
+use std::rc::Rc;
+
 use serde::Deserialize;
 
+use crate::drives::Drives;
 use crate::limit_check::worst;
 use crate::motion::{Machine, Spot};
 use crate::period::Period;
@@ -79,6 +82,7 @@ pub(crate) enum Rule {
         damping: f64,
         at_end: bool,
         range: Option<(usize, [f64; 2])>,
+        all: Rc<Drives>,
     },
     /// `n . p <= offset`, and `braking` stops the point in front of it; the margin of a half-space, which may be put elsewhere.
     Plane { spot: Spot, point: Vec3, n: Vec3, offset: f64, braking: f64, half_space: Option<f64> },
@@ -121,8 +125,11 @@ pub(crate) struct Passage<'a> {
 
 /// Frames and bodies keep this far inside their boundary, for what a straight row misses of a curved way [m]; a projection's own choice.
 const CREEP: f64 = 1e-4;
-/// By which share of the way targets stay away from the ends of their range, but over a single physics step; a projection's own choice.
+/// By which share of it the force of a drive stays below its end over several physics steps; a projection's own choice.
+pub(crate) const SHORT: f64 = 0.01;
+/// By which share of the way targets stay away from the ends of their range without physics steps, and over several; a projection's own choice.
 const AWAY: f64 = 0.2;
+const AWAY_OVER_STEPS: f64 = 0.1;
 /// What is beyond it comes back in so many periods.
 const RETURN: f64 = 20.0;
 /// In front of a plane a row asks for at most so many times its braking.
@@ -236,12 +243,15 @@ impl Row {
             Rule::TorqueRate { dof, most } => passage
                 .before
                 .map_or([none; 2], |(_, tau)| both((passage.tau[*dof] - tau[*dof]) / p.dt, *most)),
-            Rule::Drive { dof, most, stiffness, damping, at_end, range } => {
+            Rule::Drive { dof, most, stiffness, damping, at_end, range, all } => {
                 let v = passage.v[*dof];
-                let [still, by] = drive(p, *stiffness, *damping, *at_end, v);
-                let force = passage.tau[*dof] + still + by * passage.a[*dof];
+                let force = passage.tau[*dof] + all.ends(m, p, passage)[*dof][usize::from(*at_end)];
                 let [low, high] = range.map_or([-most, *most], |(iq, range)| {
-                    let share = if p.sub_steps == 1 { 1.0 } else { 1.0 - AWAY };
+                    let share = match p.sub_steps {
+                        0 => 1.0 - AWAY,
+                        1 => 1.0,
+                        _ => 1.0 - AWAY_OVER_STEPS,
+                    };
                     range.map(|end| {
                         (stiffness * share * (end - passage.q[iq]) - damping * v).max(-most).min(*most)
                     })
@@ -370,9 +380,10 @@ impl Row {
                 force(*dof, 1.0);
                 out[*dof] += if *at_start { 0.0 } else { *slope };
             }
-            Rule::Drive { dof, stiffness, damping, at_end, .. } => {
+            Rule::Drive { dof, at_end, all, .. } => {
                 force(*dof, 1.0);
-                out[*dof] += drive(p, *stiffness, *damping, *at_end, 0.0)[1] / p.dt;
+                let slopes = all.slopes(m, p, passage.q);
+                (0..nv).for_each(|j| out[j] += slopes[j][*dof][usize::from(*at_end)] / p.dt);
             }
             Rule::Jerk { dof, .. } => out[*dof] = 1.0 / (p.dt * p.dt),
             Rule::Plane { spot, point, n, .. } => {
@@ -413,18 +424,6 @@ impl Row {
         }
         out
     }
-}
-
-/// A drive's force at the start or the last evaluation of a period, less the mean: its part without acceleration, and per acceleration.
-/// The mean is that of `K (q* - q) - D v` over the evaluations.
-fn drive(p: &Period, stiffness: f64, damping: f64, at_end: bool, v: f64) -> [f64; 2] {
-    let (lag, sag) = (0.5 * (p.dt - p.tau), (p.dt * p.dt - p.tau * p.tau) / 6.0);
-    let start = [stiffness * lag * v, stiffness * sag + damping * lag];
-    if !at_end {
-        return start;
-    }
-    let end = p.dt - p.tau;
-    [start[0] - stiffness * end * v, start[1] - (0.5 * stiffness * p.dt + damping) * end]
 }
 
 /// The largest acceleration of a sum towards a bound at distance `d`, at speed `w`: it stops in front of it with `b`, or brakes with `b` if it still can.
