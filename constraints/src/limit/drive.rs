@@ -6,7 +6,7 @@ use crate::within_period::WithinPeriod;
 use crate::{Drive, Kind, LimitError, LimitSet, Model, Period, Soft};
 
 /// `|K (q* - q) - D v| <= effort` at the start and at the end of a period, and `q*` within its range. The force of a drive changes while its target
-/// is held, and the joint's acceleration with it ([`WithinPeriod`]): the mean that [`TorqueLimit`] speaks of is not all. A target that is cut at its
+/// is held, and the acceleration of its joint with it: the mean that [`TorqueLimit`] speaks of is not all. A target that is cut at its
 /// range brakes the joint harder than its acceleration limit allows.
 #[derive(Debug, Clone)]
 pub struct DriveTorqueLimit {

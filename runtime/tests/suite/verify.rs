@@ -335,20 +335,34 @@ fn targets_of_drives_that_are_cut_at_their_range_are_found() {
 }
 
 /// Targets that are held over the steps of a period lead through them to what the log claims, and those that are another's do not; whether the steps
-/// take the damping of the drives implicitly or not.
+/// take the damping of the drives implicitly or not. Stiff drives come to their largest force at the ends of periods.
 #[test]
 fn targets_of_drives_are_verified_over_several_steps() {
-    let drives = format!("{LIMITS}\n[command]\ninterface = \"pd\"\nstiffness = 100.0\ndamping = 5.0")
-        .replace("25.0", "8.0");
-    for (sub_steps, dt, drive_damping) in [(2, 0.002, 0.0), (5, 0.005, 0.0), (1, 0.002, 5.0), (5, 0.005, 5.0)]
-    {
+    let cases = [
+        (2, 0.002, 0.0, 100.0),
+        (5, 0.005, 0.0, 100.0),
+        (1, 0.002, 5.0, 100.0),
+        (5, 0.005, 5.0, 100.0),
+        (2, 0.002, 0.0, 2000.0),
+        (5, 0.005, 5.0, 1000.0),
+    ];
+    for (sub_steps, dt, drive_damping, stiffness) in cases {
+        let drives =
+            format!("{LIMITS}\n[command]\ninterface = \"pd\"\nstiffness = {stiffness:?}\ndamping = 5.0")
+                .replace("25.0", "8.0");
         let flight = Attack { drive_damping, ..attack(&drives, dt, sub_steps, 20) };
         let mut snapshot = flight.snapshot(1);
         (snapshot.manifest.action_lower, snapshot.manifest.action_upper) = (vec![-9.0; 7], vec![9.0; 7]);
-        let folder = Scratch::new(&format!("verify-targets-{sub_steps}-{drive_damping}"));
+        let folder = Scratch::new(&format!("verify-targets-{sub_steps}-{drive_damping}-{stiffness}"));
         let (log, summary) = flight.fly_with(&snapshot, &folder.0);
         assert_eq!((summary.dropped, summary.brief, summary.error), (0, 0, None));
         holds(&verify(&log).unwrap(), 1500);
+        // of seven joints, then their mean forces, then the forces at the ends
+        let is_of_an_end = |row: &Value| row["row"].as_u64().unwrap() >= 14;
+        let is_bound =
+            |tick: &Value| tick["ledger"]["active_rows"].as_array().unwrap().iter().any(is_of_an_end);
+        let bound = ticks(&log).iter().filter(|tick| is_bound(tick)).count();
+        assert!(stiffness < 1000.0 || bound > 10, "{bound} ticks at the end of a force");
         let other = folder.0.join("copy.mcap");
         let edit = |topic: &str, m: &mut Value| {
             if topic == "tick" && m["tick"] == 700 {

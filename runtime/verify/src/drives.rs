@@ -7,6 +7,9 @@ use crate::period::Period;
 use crate::rows::Passage;
 use crate::steps::solve;
 
+/// Products of numbers that take as long as moving a link.
+const OF_A_LINK: usize = 50;
+
 /// The joints that forces move, and the drives among what makes them.
 #[derive(Debug)]
 pub(crate) struct Drives {
@@ -40,8 +43,10 @@ impl Drives {
             self.found.borrow().as_ref().filter(|x| x.q == q && x.v == v && x.a == a).map(|x| x.ends.clone());
         known.unwrap_or_else(|| {
             let ends = self.reckon(m, p, (q, v, a));
-            let (q, v, a) = (q.to_vec(), v.to_vec(), a.to_vec());
-            self.found.replace(Some(Found { q, v, a, ends: ends.clone() }));
+            if !m.is_spent() {
+                let (q, v, a) = (q.to_vec(), v.to_vec(), a.to_vec());
+                self.found.replace(Some(Found { q, v, a, ends: ends.clone() }));
+            }
             ends
         })
     }
@@ -60,7 +65,10 @@ impl Drives {
             return (0..v.len()).map(even).collect();
         }
         let (n, steps) = (self.free.len(), p.sub_steps as usize);
-        m.spend(steps * n * n);
+        m.spend(n * n * (n + steps * (n + 2)) / OF_A_LINK);
+        if m.is_spent() {
+            return (0..v.len()).map(even).collect(); // the tick is not verified
+        }
         let inverse = self.inverse(m, p, q);
         // What is held moves each free joint from its velocity to the one that is asked for.
         let of = |i: usize| -> [f64; 4] {
