@@ -343,13 +343,14 @@ fn targets_of_drives_are_verified_over_several_steps() {
         (5, 0.005, 0.0, 100.0),
         (1, 0.002, 5.0, 100.0),
         (5, 0.005, 5.0, 100.0),
-        (2, 0.002, 0.0, 2000.0),
-        (5, 0.005, 5.0, 1000.0),
+        (2, 0.002, 0.0, 4000.0),
+        (5, 0.005, 5.0, 2000.0),
     ];
     for (sub_steps, dt, drive_damping, stiffness) in cases {
         let drives =
             format!("{LIMITS}\n[command]\ninterface = \"pd\"\nstiffness = {stiffness:?}\ndamping = 5.0")
-                .replace("25.0", "8.0");
+                .replace("25.0", "8.0")
+                .replace("scale = 0.8", if stiffness > 1000.0 { "scale = 0.5" } else { "scale = 0.8" });
         let flight = Attack { drive_damping, ..attack(&drives, dt, sub_steps, 20) };
         let mut snapshot = flight.snapshot(1);
         (snapshot.manifest.action_lower, snapshot.manifest.action_upper) = (vec![-9.0; 7], vec![9.0; 7]);
