@@ -120,8 +120,8 @@ const AWAY_OVER_STEPS: f64 = 0.1;
 /// By which share of it a force stays below its end over several physics steps, in which the robot's mass and weight change.
 const SHORT: f64 = 0.01;
 
-/// What a brake leaves of a drive's force over several physics steps, as a share of it: they lead to the velocities of constant accelerations on another
-/// way, and to other positions from period to period.
+/// What a brake leaves of a drive's force over several physics steps, as a share of it, and of the way to the end of a range: the steps lead to the
+/// velocities of constant accelerations on another way, and to other positions from period to period.
 const RESERVE: f64 = 0.02;
 const RESERVE_OF_TARGETS: f64 = 0.1;
 
