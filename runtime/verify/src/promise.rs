@@ -269,8 +269,9 @@ impl Promise {
         };
         let free: Vec<usize> = m.robot.joints().enumerate().filter_map(is_free).collect();
         let (controls, drives, ranges) = (&controllable[..], &drives[..], &ranges[..]);
-        let (robot, machine_of, free) = (&m.robot, &machine, &free[..]);
-        let of = Of { robot, machine: machine_of, controllable: controls, drives, free, ranges, sub_steps };
+        let robot = &m.robot;
+        let of =
+            Of { robot, machine: &machine, controllable: controls, drives, free: &free, ranges, sub_steps };
         let limits = section.limits(&of)?;
         let mut bare = (sub_steps != 1).then(|| bare.limits(&of)).transpose()?;
         for row in bare.iter_mut().flat_map(|limits| &mut limits.rows) {
