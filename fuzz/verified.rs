@@ -45,6 +45,7 @@ pub fn flight() -> Attack {
         moves: Vec::new(),
         pause: Duration::ZERO,
         lost: 0,
+        late: 0,
         lag: 0.0,
         drive_damping: 0.0,
     }

@@ -77,7 +77,7 @@ class Plant:
             v: Velocity (nv).
             obs: Observation (n_obs).
             patience: Longest wait [s]; without a loop there is none, except in lockstep.
-            time: The plant's own clock [s].
+            time: The plant's own clock [s]; 0 where it has none.
             episode: Number of the episode.
             begins: This state begins an episode.
 

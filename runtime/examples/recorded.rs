@@ -56,6 +56,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         moves: (1..if kind == "moved" { ticks / every } else { 0 }).map(order).collect(),
         pause: Duration::ZERO,
         lost: 0,
+        late: 0,
         lag: 0.0,
         drive_damping: 0.0,
     };

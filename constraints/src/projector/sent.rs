@@ -11,38 +11,53 @@ const FOLLOWING: f64 = 0.1;
 /// After more periods than this the driver has long come to rest.
 const MISSED: u64 = 1000;
 
+/// What a joint was sent that follows by itself.
+#[derive(Clone, Copy, Default)]
+struct SetPoint {
+    /// Position; 0 where it is sent velocities \[rad or m\].
+    q: f64,
+    /// Velocity at the end of its period.
+    v: f64,
+    /// Mean velocity of its period, by which a driver of positions goes on that hears nothing more.
+    mean: f64,
+}
+
+/// A joint that follows by itself what it is sent.
+struct Follower {
+    dof: usize,
+    /// Where it is sent positions: its entry of a configuration and how far it may be from the last one [rad or m].
+    position: Option<(usize, f64)>,
+    last: SetPoint,
+    before: SetPoint,
+}
+
 /// What joints were sent that follow by themselves.
 #[derive(Default)]
 pub(super) struct Sent {
-    known: bool,
-    /// Dofs that are sent positions, with their entry of a configuration and how far they may be from it [rad or m].
-    positions: Vec<(usize, usize, f64)>,
-    /// Those of them that are further away, with their entry: their set points wait at rest.
+    joints: Vec<Follower>,
+    /// How many of the last two set points are known.
+    known: usize,
+    /// Dofs that are further away, with their entry of a configuration: their set points wait at rest.
     waiting: Vec<(usize, usize)>,
-    /// Dofs that are sent velocities.
-    velocities: Vec<usize>,
-    /// The target of the tick before (nq, nv).
-    q: Vec<f64>,
-    v: Vec<f64>,
 }
 
 impl Projector {
     /// The `drives` (nv) say which controllable joints follow by themselves what they are sent: [`Projector::depart`] has those go on from there.
     pub fn follow(&mut self, drives: &[Drive]) {
-        let sent = &mut self.previous.sent;
-        (sent.positions, sent.velocities, sent.waiting) = (Vec::new(), Vec::new(), Vec::new());
-        for &i in &self.dofs.controllable {
-            match (drives[i], self.dofs.single[i]) {
+        let mut joints = Vec::new();
+        let zero = SetPoint::default();
+        for &dof in &self.dofs.controllable {
+            let position = match (drives[dof], self.dofs.single[dof]) {
                 (Drive::Position, Some(iq)) => {
-                    let window = FOLLOWING * self.limits.velocity[i];
-                    sent.positions.push((i, iq, if window.is_finite() { window } else { FOLLOWING }));
+                    let window = FOLLOWING * self.limits.velocity[dof];
+                    Some((iq, if window.is_finite() { window } else { FOLLOWING }))
                 }
-                (Drive::Velocity, _) => sent.velocities.push(i),
-                _ => {}
-            }
+                (Drive::Velocity, _) => None,
+                _ => continue,
+            };
+            joints.push(Follower { dof, position, last: zero, before: zero });
         }
-        sent.waiting.reserve(sent.positions.len());
-        (sent.q, sent.v, sent.known) = (self.model.neutral(), vec![0.0; self.model.nv()], false);
+        self.previous.sent = Sent { waiting: Vec::with_capacity(joints.len()), known: 0, joints };
     }
 
     /// Puts what was sent in the tick before in the place of what is measured, `q` (nq) and `v` (nv), of joints that follow by themselves: a set
@@ -52,21 +67,21 @@ impl Projector {
     pub fn depart(&mut self, q: &mut [f64], v: &mut [f64]) {
         let sent = &mut self.previous.sent;
         sent.waiting.clear();
-        if !sent.known {
+        if sent.known == 0 {
             return;
         }
-        for &(i, iq, window) in &sent.positions {
-            let away = (q[iq] - sent.q[iq]).abs();
-            if away.is_nan() {
-                continue; // a position that is no number stays, and is refused
+        for &Follower { dof, position, last, .. } in &sent.joints {
+            if let Some((iq, window)) = position {
+                let away = (q[iq] - last.q).abs();
+                if away.is_nan() {
+                    continue; // a position that is no number stays, and is refused
+                }
+                if away > window {
+                    sent.waiting.push((dof, iq));
+                }
+                q[iq] = last.q;
             }
-            if away > window {
-                sent.waiting.push((i, iq));
-            }
-            (q[iq], v[i]) = (sent.q[iq], sent.v[i]);
-        }
-        for &i in &sent.velocities {
-            v[i] = sent.v[i];
+            v[dof] = last.v;
         }
     }
 
@@ -80,17 +95,28 @@ impl Projector {
         }
     }
 
-    /// Periods passed in which nothing was sent, and the driver went on by itself as docs/CONNECT.md has it: positions from the last one on, slower
+    /// Periods passed in which nothing was sent, and the driver went on by itself as docs/CONNECT.md has it: positions from the last two on, slower
     /// in each period by what the joint may decelerate, velocities as they were.
     pub fn miss(&mut self, periods: u64) {
-        let (dt, sent) = (self.period.dt, &mut self.previous.sent);
-        for &(i, iq, _) in &sent.positions {
+        let dt = self.period.dt;
+        for Follower { dof, position, last, .. } in &mut self.previous.sent.joints {
+            if position.is_none() {
+                continue;
+            }
             for _ in 0..periods.min(MISSED) {
-                let slower = (self.limits.acceleration[i] * dt).min(sent.v[i].abs());
-                sent.v[i] -= slower.copysign(sent.v[i]);
-                sent.q[iq] += dt * sent.v[i];
+                let slower = (self.limits.acceleration[*dof] * dt).min(last.mean.abs());
+                last.mean -= slower.copysign(last.mean);
+                last.v = last.mean;
+                last.q += dt * last.mean;
             }
         }
+    }
+
+    /// The target of the tick before came too late and was never sent: what was sent last is that of the tick before it.
+    pub fn recall(&mut self) {
+        let sent = &mut self.previous.sent;
+        sent.known = sent.known.saturating_sub(1);
+        sent.joints.iter_mut().for_each(|joint| joint.last = joint.before);
     }
 
     /// What was sent in the tick before is not what the robot does: the next tick begins where it is measured.
@@ -102,7 +128,7 @@ impl Projector {
 impl Sent {
     /// As if nothing had been sent.
     pub(super) fn forget(&mut self) {
-        self.known = false;
+        self.known = 0;
         self.waiting.clear();
     }
 
@@ -113,14 +139,15 @@ impl Sent {
 
     /// Some joint follows by itself.
     pub(super) fn is_any(&self) -> bool {
-        !(self.positions.is_empty() && self.velocities.is_empty())
+        !self.joints.is_empty()
     }
 
     pub(super) fn write(&self, memory: &mut Vec<f64>) {
         if self.is_any() {
-            memory.push(f64::from(u8::from(self.known)));
-            memory.extend_from_slice(&self.q);
-            memory.extend_from_slice(&self.v);
+            memory.push(self.known as f64);
+            for SetPoint { q, v, mean } in self.joints.iter().flat_map(|joint| [joint.last, joint.before]) {
+                memory.extend([q, v, mean]);
+            }
         }
     }
 
@@ -129,21 +156,28 @@ impl Sent {
         if !self.is_any() {
             return memory;
         }
-        let (q, rest) = memory[1..].split_at(self.q.len());
-        let (v, rest) = rest.split_at(self.v.len());
-        self.known = memory[0] != 0.0;
+        let (points, rest) = memory[1..].split_at(6 * self.joints.len());
+        let of = |p: &[f64]| SetPoint { q: p[0], v: p[1], mean: p[2] };
+        for (joint, points) in self.joints.iter_mut().zip(points.chunks_exact(6)) {
+            (joint.last, joint.before) = (of(&points[..3]), of(&points[3..]));
+        }
+        self.known = memory[0] as usize;
         self.waiting.clear();
-        self.q.copy_from_slice(q);
-        self.v.copy_from_slice(v);
         rest
     }
 
-    /// Makes `target` what was sent in the tick before.
-    pub(super) fn remember(&mut self, target: &Target) {
-        if self.is_any() {
-            self.q.copy_from_slice(&target.q);
-            self.v.copy_from_slice(&target.v);
-            self.known = true;
+    /// Makes `target`, of a period of `dt` \[s\], what was sent in the tick before.
+    pub(super) fn remember(&mut self, target: &Target, dt: f64) {
+        for joint in &mut self.joints {
+            joint.before = joint.last;
+            let v = target.v[joint.dof];
+            let (q, mean) = match joint.position {
+                Some((iq, _)) if self.known > 0 => (target.q[iq], (target.q[iq] - joint.before.q) / dt),
+                Some((iq, _)) => (target.q[iq], v),
+                None => (0.0, v),
+            };
+            joint.last = SetPoint { q, v, mean };
         }
+        self.known = (self.known + 1).min(2);
     }
 }

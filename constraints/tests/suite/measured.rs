@@ -175,4 +175,23 @@ fn joints_that_follow_go_on_from_what_they_were_sent() {
     assert_eq!(held.3, 0.5);
     projector.miss(100);
     assert_eq!(goes_on(&mut projector).1, 0.0);
+
+    // an answer that came too late was never sent: the driver went on from the two before it, by their mean speed of 0.3 rad/s, less 0.15
+    let lasts = [0.2, 0.203, 0.209].map(|q| {
+        target.q[0] = q;
+        (target.v[0], target.v[1]) = (200.0 * (q - 0.2), q);
+        target.clone()
+    });
+    projector.lose();
+    lasts.iter().for_each(|last| projector.remember(last));
+    projector.recall();
+    let memory = projector.memory();
+    projector.forget();
+    projector.set_memory(&memory);
+    projector.miss(1);
+    let held = goes_on(&mut projector);
+    assert!((held.0 - (0.203 + 0.01 * 0.15)).abs() < 1e-12 && (held.1 - 0.15).abs() < 1e-12, "{held:?}");
+    assert_eq!(held.3, 0.203);
+    projector.recall();
+    assert_eq!(goes_on(&mut projector), (0.2, 0.01, 0.3, 0.01, 0.01)); // no more is known
 }

@@ -36,7 +36,7 @@ typedef struct nearl_robot {
 
 /* One sample; lengths are those of the robot. */
 typedef struct nearl_state {
-    double time;         /* the plant's own clock [s] */
+    double time;         /* the plant's own clock [s]; 0 where it has none */
     const double *q;     /* configuration (nq) */
     const double *v;     /* velocity (nv) */
     const double *obs;   /* observation (n_obs) */

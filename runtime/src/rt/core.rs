@@ -17,6 +17,7 @@ use crate::rt::Sync;
 use crate::rt::faults::FaultPlan;
 use crate::rt::heard::Heard;
 use crate::rt::mode::{Event, Mode, ModeLimits, Modes, Reason};
+use crate::rt::pace::Pace;
 use crate::rt::tick::{LoopController, Outcome, Record, Sensed, TickOutput};
 
 /// Settings of a tick; times in \[ns\].
@@ -107,6 +108,7 @@ pub struct Core<T: LoopController> {
     braked: u32,
     ramped: u32,
     overran: bool,
+    pace: Pace,
     /// `brake` panicked: it is not called again on this controller. A panic of `tick` latches Fault.
     brake_broken: bool,
 }
@@ -127,6 +129,7 @@ impl<T: LoopController> Core<T> {
             braked: 0,
             ramped: 0,
             overran: false,
+            pace: Pace::default(),
             brake_broken: false,
             settings,
             controller,
@@ -191,7 +194,7 @@ impl<T: LoopController> Core<T> {
             Event::Good if self.held == Some(0) => Sensed::Measured,
             Event::Good => Sensed::Predicted,
             Event::Held(_) if self.record.mode != Mode::Hold => Sensed::Predicted,
-            Event::Lost(Reason::LostStates) if self.record.fresh => Sensed::Measured,
+            Event::Lost(Reason::LostStates | Reason::WrongPeriod) if self.record.fresh => Sensed::Measured,
             _ => Sensed::Missing,
         };
         self.count(event);
@@ -237,6 +240,7 @@ impl<T: LoopController> Core<T> {
         self.held = Some(0);
         (self.braked, self.ramped) = (resume.braked, resume.ramped);
         (self.overran, self.brake_broken) = (resume.overran, resume.brake_broken);
+        self.pace = Pace::default();
         self.memory.clear();
         self.memory.extend_from_slice(resume.memory());
         self.controller.controller.reset();
@@ -249,6 +253,7 @@ impl<T: LoopController> Core<T> {
         let is_plain =
             self.record.sensed == Sensed::Measured && self.held == Some(0) && !self.memory.is_empty();
         resume.is_set = is_plain
+            && self.pace == Pace::default()
             && self.settings.proposer.is_none()
             && self.record.output.nu > 0
             && self.controller.controller.is_memory_whole()
@@ -388,15 +393,30 @@ impl<T: LoopController> Core<T> {
             self.memory.clear();
             self.heard.begin(state.header.seq);
             self.held = None;
-        } else if lost > 0 && self.settings.sync == Sync::Plant {
-            // Each of them was answered by nothing; a loop with a clock of its own has answered in every slot.
-            self.controller.controller.miss(lost);
+            self.pace = Pace::default();
+        } else if self.settings.sync == Sync::Plant {
+            // A loop with a clock of its own has answered in every slot.
+            self.go_on(state, lost);
+            self.pace.take(state.time - self.record.state.time, lost + 1, self.settings.period);
         }
         let is_frozen = is_next && self.is_frozen(state);
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);
         let gap = if is_next && self.settings.real_time { missed.min(lost) } else { 0 };
         self.record.state = *state;
         self.event_of_state(is_frozen, gap)
+    }
+
+    /// Tells the controller what the plant has done by itself up to `state`, before which `lost` states were: it says how often it had no answer in
+    /// time, that to the last state it was given included.
+    fn go_on(&mut self, state: &StateMessage, lost: u64) {
+        let known = &self.record.state;
+        let alone = state.late.saturating_sub(known.late);
+        let controller = &mut self.controller.controller;
+        if state.watchdog > known.watchdog {
+            controller.lose();
+        } else if alone.max(lost) > 0 {
+            controller.miss(alone.max(lost), alone > lost);
+        }
     }
 
     /// What the state just taken is worth.
@@ -424,8 +444,11 @@ impl<T: LoopController> Core<T> {
         }
         self.estimate = *state;
         self.held = Some(0);
-        let is_bridged = gap <= u64::from(self.settings.modes.hold_states);
-        if is_bridged { Event::Good } else { Event::Lost(Reason::LostStates) }
+        match gap <= u64::from(self.settings.modes.hold_states) {
+            false => Event::Lost(Reason::LostStates),
+            true if self.pace.is_wrong() => Event::Lost(Reason::WrongPeriod),
+            true => Event::Good,
+        }
     }
 
     /// No state came: with the loop's own clock a few are bridged, with the plant's the wait was over the age limit.

@@ -20,6 +20,7 @@ mod inbox;
 mod io;
 mod meaning;
 mod mode;
+mod pace;
 mod pilot;
 mod pinned;
 mod receive;

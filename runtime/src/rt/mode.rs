@@ -74,6 +74,8 @@ codes! {
             "Find the program that truncates files under /dev/shm, then start plant and runtime again.";
         LoopGone = "loop-gone", "No action came for so long that the runtime counts as gone; the plant braked and ended by itself.",
             "Start the plant again, then the runtime; without --loop-patience a plant brakes and waits for the next runtime.";
+        WrongPeriod = "wrong-period", "Sixteen times in a row the plant's own clock showed a period that is a fifth or more off the one it announced.",
+            "Let the driver's loop run once in each period of `dt`, or announce, and train with, the period that it has; its `time` is in seconds.";
     }
 }
 

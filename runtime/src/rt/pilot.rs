@@ -249,7 +249,10 @@ impl LoopController for Pilot {
         self.share(false);
     }
 
-    fn miss(&mut self, periods: u64) {
+    fn miss(&mut self, periods: u64, came_late: bool) {
+        if came_late {
+            self.controller.projector().recall();
+        }
         self.controller.projector().miss(periods);
         self.share(false);
     }

@@ -72,7 +72,7 @@ pub(crate) struct Watch {
     counts: BTreeMap<u32, u64>,
     pub(crate) outside: Vec<Found>,
     mode: Mode,
-    /// Where a mode that does not act is told.
+    /// Where a mode is told that does not act, and that a driver keeps another period.
     pub(crate) tell: Option<SyncSender<(u64, Mode, Reason)>>,
 }
 
@@ -87,8 +87,9 @@ impl Watch {
     }
 
     pub(crate) fn take(&mut self, record: &Record) {
+        let is_told = matches!(record.mode, Mode::Fault | Mode::Hold) || record.reason == Reason::WrongPeriod;
         if std::mem::replace(&mut self.mode, record.mode) != record.mode
-            && matches!(record.mode, Mode::Fault | Mode::Hold)
+            && is_told
             && let Some(tell) = &self.tell
         {
             // Where nobody reads, the mode still stands in the report.

@@ -38,6 +38,8 @@ pub struct Attack {
     pub pause: Duration,
     /// One of so many states is lost, and the driver holds; 0 is none. Of [`Attack::fly`], with joints that are sent positions.
     pub lost: u64,
+    /// One of so many answers comes too late: the driver holds, and says so in its next state; 0 is none. As for `lost`.
+    pub late: u64,
     /// How far behind itself the robot is measured \[s\].
     pub lag: f64,
     /// What physics steps take implicitly of the damping of every drive [N·m·s/rad].
@@ -170,8 +172,10 @@ impl Attack {
         log.push_snapshot(0, 1, first.to_bytes(), controller.row_names());
         let mut core = Core::new(settings, Box::new(Loaded { id: 0, controller }), 0, FaultPlan::default());
         let mut twin = Twin::new(self);
+        let mut late = 0;
         for tick in 1..=self.ticks {
             if self.lost > 0 && tick % self.lost == 0 {
+                late += 1;
                 twin.hold(first);
                 continue;
             }
@@ -183,7 +187,7 @@ impl Attack {
                 state.obs_mut()[i] = behind;
             }
             (state.header.epoch, state.header.seq, state.header.stamp) = (1, tick, tick * period);
-            state.tick = tick;
+            (state.tick, state.late) = (tick, late);
             let moved = self.moves.iter().find(|(at, _)| *at == tick);
             if let Some((_, moved)) = moved {
                 let mut next = self.snapshot(1);
@@ -201,6 +205,11 @@ impl Attack {
             log.push(&core.record);
             while log.waiting() > 100 {
                 std::thread::sleep(Duration::from_micros(100));
+            }
+            if self.late > 0 && tick % self.late < self.late.min(2) {
+                late += 1;
+                twin.hold(first);
+                continue;
             }
             let output = &core.record.output;
             twin.act(&output.action[..output.nu as usize]);

@@ -16,6 +16,9 @@ pub struct Flight {
     pub sequence: Sequence,
     /// What another process proposes in the next period.
     pub proposal: Option<ProposalMessage>,
+    /// Control periods that pass in the plant's own loop for each that it announced.
+    pub stretch: u32,
+    clock: f64,
     plan: FaultPlan,
     brake: Brake,
     robot: RobotMessage,
@@ -59,6 +62,8 @@ impl Flight {
             panda: Panda::new(),
             sequence: Sequence::default(),
             proposal: None,
+            stretch: 1,
+            clock: DT,
             brake: Brake::new(&snapshot.manifest).unwrap().unwrap(),
             plan,
             robot,
@@ -98,7 +103,7 @@ impl Flight {
         self.tick += 1;
         let mut state = StateMessage::zeroed();
         self.panda.observe(&mut state);
-        (state.tick, state.time) = (self.tick, self.tick as f64 * DT);
+        (state.tick, state.time) = (self.tick, self.clock);
         self.plan.spoil(self.tick, &mut state, &self.last);
         self.last = state;
         state.header = Header { schema: 0, epoch: 1, seq: self.tick, stamp: self.now };
@@ -129,6 +134,7 @@ impl Flight {
         }
         self.apply();
         self.now += PERIOD;
+        self.clock += f64::from(self.stretch) * DT;
     }
 
     fn compute(&mut self, state: &StateMessage, swapped: bool) {
@@ -153,7 +159,7 @@ impl Flight {
             action.action[..torque.len()].copy_from_slice(torque);
         }
         assert!(action.action().iter().all(|a| a.is_finite()), "an action that is not finite");
-        self.panda.apply(&action);
+        (0..self.stretch).for_each(|_| self.panda.apply(&action));
     }
 
     /// Mode and reason of a tick of the loop, from 1.

@@ -237,3 +237,19 @@ fn fault_48_a_plant_that_moves_otherwise_than_told_keeps_torque_and_nearly_the_r
         }
     }
 }
+
+#[test]
+fn fault_48_a_plant_with_another_period_than_told_brakes_until_it_keeps_it() {
+    let mut flight = Flight::new(&stochastic(1), settings(), FaultPlan::default());
+    flight.fly(200);
+    flight.stretch = 2;
+    flight.fly(100);
+    flight.stretch = 1;
+    flight.fly(100);
+    // state 201 was measured one period after the one before, and the sixteenth that is late is state 217
+    assert_eq!(flight.at(216), (Mode::Active, Reason::None));
+    assert!((217..=301).all(|tick| flight.at(tick) == (Mode::Braking, Reason::WrongPeriod)));
+    assert!(flight.records[216..].iter().all(|r| r.sensed == Sensed::Measured && r.output.nu > 0));
+    assert_eq!(flight.at(400), (Mode::Active, Reason::None));
+    flight.assert_within_limits(0.5 * toy::DT);
+}

@@ -397,10 +397,13 @@ pub const ROWS: &[Row] = &[
     ),
     (
         48,
-        "a plant that moves otherwise than told: other sub-steps, periods that jitter by half",
-        "torque holds exactly; speed and position to half a period",
-        &["none"],
-        &[(HERE, "fault_48_a_plant_that_moves_otherwise_than_told_keeps_torque_and_nearly_the_rest")],
+        "a plant that moves otherwise than told: other sub-steps, periods that jitter by half, that are others all the time",
+        "torque holds exactly; speed and position to half a period; brakes while it exchanges in another period than it said",
+        &["wrong-period"],
+        &[
+            (HERE, "fault_48_a_plant_that_moves_otherwise_than_told_keeps_torque_and_nearly_the_rest"),
+            (HERE, "fault_48_a_plant_with_another_period_than_told_brakes_until_it_keeps_it"),
+        ],
     ),
     (
         49,

@@ -9,6 +9,7 @@ use crate::moved::{Moved, Moving};
 use crate::period::Period;
 use crate::robot::{Payload, Robot};
 use crate::rows::Rule;
+use crate::tick::Tick;
 
 /// The parts of a snapshot's manifest that are read.
 #[derive(Deserialize)]
@@ -76,6 +77,17 @@ enum Interfaces {
 pub(crate) enum Entry {
     Position { dof: usize, at: usize },
     Velocity { dof: usize },
+}
+
+/// What joints that follow by themselves were sent in a period.
+#[derive(Clone)]
+pub(crate) struct SetPoints {
+    /// Configuration (nq).
+    pub(crate) q: Vec<f64>,
+    /// Velocity at the end of the period (nv).
+    pub(crate) v: Vec<f64>,
+    /// Mean velocity on the way, by which a driver of positions goes on (nv).
+    pub(crate) mean: Vec<f64>,
 }
 
 /// What a joint is sent.
@@ -363,37 +375,51 @@ impl Promise {
         !self.follows.is_empty()
     }
 
-    /// Puts what was `sent` (nq, nv) in the tick before in the place of what is measured, of joints that follow by themselves. Returns the dofs that are too
-    /// far from it: their set points wait at rest.
-    pub(crate) fn depart(&self, sent: &(Vec<f64>, Vec<f64>), q: &mut [f64], v: &mut [f64]) -> Vec<usize> {
+    /// Puts what was `sent` in the tick before in the place of what is measured. Returns the dofs that are too far from it: their set points wait at rest.
+    pub(crate) fn depart(&self, sent: &SetPoints, q: &mut [f64], v: &mut [f64]) -> Vec<usize> {
         let mut waiting = Vec::new();
         for &(dof, position) in &self.follows {
             if let Some((at, most)) = position {
-                let away = (q[at] - sent.0[at]).abs();
+                let away = (q[at] - sent.q[at]).abs();
                 if away.is_nan() {
                     continue; // a position that is no number stays, and is named
                 }
                 if away > most {
                     waiting.push(dof);
                 }
-                q[at] = sent.0[at];
+                q[at] = sent.q[at];
             }
-            v[dof] = sent.1[dof];
+            v[dof] = sent.v[dof];
         }
         waiting
     }
 
-    /// What drivers make of what was `sent` (nq, nv) in `periods` in which they hear nothing more: positions go on, slower in each.
-    pub(crate) fn hold(&self, sent: &mut (Vec<f64>, Vec<f64>), periods: u64) {
+    /// What drivers make of what was `sent` in `periods` in which they hear nothing more: positions go on by their mean speed, slower in each.
+    pub(crate) fn hold(&self, sent: &mut SetPoints, periods: u64) {
         let dt = self.period.dt;
         for &(dof, position) in &self.follows {
             let Some((at, _)) = position else { continue };
             for _ in 0..periods.min(MISSED) {
-                let v = sent.1[dof];
-                sent.1[dof] = v.signum() * (v.abs() - self.built().joints[dof].acceleration * dt).max(0.0);
-                sent.0[at] += dt * sent.1[dof];
+                let v = sent.mean[dof];
+                let slower = v.signum() * (v.abs() - self.built().joints[dof].acceleration * dt).max(0.0);
+                (sent.v[dof], sent.mean[dof]) = (slower, slower);
+                sent.q[at] += dt * slower;
             }
         }
+    }
+
+    /// What is sent with the target of `tick`, after what was sent `before` it. Targets of a wrong length send nothing.
+    pub(crate) fn sends(&self, tick: &Tick, before: Option<&SetPoints>) -> SetPoints {
+        let (q, v) = (tick.target_q.clone(), tick.target_v.clone());
+        let mut mean = v.clone();
+        for &(dof, position) in &self.follows {
+            if let (Some((at, _)), Some(before)) = (position, before)
+                && let (Some(mean), Some(to)) = (mean.get_mut(dof), q.get(at))
+            {
+                *mean = (to - before.q[at]) / self.period.dt;
+            }
+        }
+        SetPoints { q, v, mean }
     }
 
     /// The limits as they were built.

@@ -9,12 +9,12 @@ use crate::limit_check::{self, Breach, Fault, are_near, broken};
 use crate::limits::{Consistency, Limits, Way};
 use crate::moved::Moving;
 use crate::optimum;
-use crate::promise::{Entry, Projects, Promise, Sent};
+use crate::promise::{Entry, Projects, Promise, Sent, SetPoints};
 use crate::report::{IN_WORDS, Report, Violation};
 use crate::robot::Payload;
 use crate::rows::{Passage, Row};
 use crate::stop;
-use crate::tick::{CLAMPED, Ledger, Numbered, ROOM, Status, Tick, UNCHANGED};
+use crate::tick::{CLAMPED, Ledger, Numbered, ROOM, State, Status, Tick, UNCHANGED};
 
 /// Version of the tick messages that are read.
 const SCHEMA: &str = "7";
@@ -39,6 +39,14 @@ struct Past {
     seq: u64,
     episode: u64,
     target: (Vec<f64>, Vec<f64>),
+    /// How often the plant had had no answer in time by then, and its watchdog had braked.
+    late: u64,
+    watchdog: u64,
+    /// What was sent in its period, and in the one before it, of joints that follow by themselves what they are sent.
+    sent: SetPoints,
+    before: Option<SetPoints>,
+    /// So many ticks of those two came after a gap of the log, from what was sent in ticks that it does not have.
+    cut_off: u8,
     /// Its acceleration, where it is known what it began from.
     a: Option<Vec<f64>>,
     /// The brake that it stored; empty where it stored none.
@@ -47,9 +55,23 @@ struct Past {
     told: Option<Told>,
 }
 
+impl Past {
+    /// States between it and `next` that did not come.
+    fn lost(&self, next: &State) -> u64 {
+        next.seq.saturating_sub(self.seq.saturating_add(1))
+    }
+
+    /// Periods up to `next` in which the plant had no answer in time.
+    fn alone(&self, next: &State) -> u64 {
+        next.late.saturating_sub(self.late)
+    }
+}
+
 /// What a tick goes on from (nq, nv), and the dofs whose set points wait for their joints.
 struct Start {
     from: (Vec<f64>, Vec<f64>),
+    /// What stood as sent, of joints that follow by themselves.
+    sent: Option<SetPoints>,
     waiting: Vec<usize>,
 }
 
@@ -219,9 +241,15 @@ impl Session {
         };
         let (dt, nq, nv) = (promises.0.period.dt, promises.0.machine.nq(), promises.0.machine.nv());
         // Of joints that go on from what they were sent, or of a predicted state, not known after a gap.
-        let begun = self.begins(&promises.0, tick).filter(|_| !(promises.0.follows() && self.has_gap));
+        let is_cut_off = self.is_cut_off(&promises.0, tick);
+        let (begun, before) = match self.start(&promises.0, tick).filter(|_| !is_cut_off) {
+            Some(Start { from, sent, .. }) => (Some(from), sent),
+            None => (None, None),
+        };
+        let sent = promises.0.sends(tick, before.as_ref());
         let v = begun.as_ref().map_or(&tick.state.v, |(_, v)| v).clone();
         self.promises.insert(tick.snapshot, promises);
+        let cut_off = self.past.as_ref().map_or(0, |past| past.cut_off);
         (self.past, self.has_gap) = (None, false);
         if [tick.target_q.len(), tick.target_v.len(), v.len()] != [nq, nv, nv] {
             return Ok(()); // it was named, and leaves nothing that the next tick could be confirmed by
@@ -230,7 +258,10 @@ impl Session {
         let target = (tick.target_q.clone(), tick.target_v.clone());
         let state = &tick.state;
         let (epoch, seq, episode, brake) = (state.epoch, state.seq, state.episode, tick.brake.clone());
-        self.past = Some(Past { epoch, seq, episode, target, a, brake, told });
+        let cut_off = if is_cut_off { 2 } else { cut_off.saturating_sub(1) };
+        let (late, watchdog) = (state.late, state.watchdog);
+        self.past =
+            Some(Past { epoch, seq, episode, target, late, watchdog, sent, before, cut_off, a, brake, told });
         Ok(())
     }
 
@@ -249,18 +280,35 @@ impl Session {
         if [q.len(), v.len()] != [own.machine.nq(), own.machine.nv()] {
             return None;
         }
-        let (state, mut waiting) = (&tick.state, Vec::new());
+        let (state, mut waiting, mut sent) = (&tick.state, Vec::new(), None);
         if let Some(past) = self.past.as_ref().filter(|past| own.follows() && past.epoch == state.epoch)
             && [past.target.0.len(), past.target.1.len()] == [q.len(), v.len()]
         {
-            let mut sent = past.target.clone();
-            let lost = state.seq.saturating_sub(past.seq + 1);
-            if !self.keeps_time {
-                own.hold(&mut sent, lost);
-            }
-            waiting = own.depart(&sent, &mut q, &mut v);
+            sent = self.standing(own, past, state);
+            waiting = sent.as_ref().map_or(Vec::new(), |sent| own.depart(sent, &mut q, &mut v));
         }
-        Some(Start { from: (q, v), waiting })
+        Some(Start { from: (q, v), sent, waiting })
+    }
+
+    /// Joints go on from what they were sent in a tick that the log does not have.
+    fn is_cut_off(&self, own: &Promise, tick: &Tick) -> bool {
+        let goes_back = |past: &Past| {
+            past.cut_off > 0 && !self.keeps_time && past.alone(&tick.state).max(past.lost(&tick.state)) > 0
+        };
+        own.follows() && (self.has_gap || self.past.as_ref().is_some_and(goes_back))
+    }
+
+    /// What stands as sent where `state` was measured: the last answer, or the one before it where that came too late, and from there on what the
+    /// driver made of it without an answer. None where it is not known, as its watchdog braked.
+    fn standing(&self, own: &Promise, past: &Past, state: &State) -> Option<SetPoints> {
+        if self.keeps_time {
+            return Some(past.sent.clone()); // it answered in every slot
+        }
+        let (lost, alone) = (past.lost(state), past.alone(state));
+        let applied = if alone > lost { past.before.as_ref() } else { Some(&past.sent) };
+        let mut sent = applied.filter(|_| state.watchdog <= past.watchdog)?.clone();
+        own.hold(&mut sent, lost.max(alone));
+        Some(sent)
     }
 
     /// What snapshot `id` promises, and what the loop pinned.
@@ -349,7 +397,7 @@ impl Session {
             let what = format!("action, while the state is '{}',", tick.sensed);
             return broken(what, tick.action[0], 0.0, "");
         }
-        if own.follows() && self.has_gap {
+        if self.is_cut_off(own, tick) {
             return unknown(
                 "their joints go on from what they were sent in a tick that the log does not have",
             );
