@@ -4,7 +4,7 @@ use crate::env::{Env, EnvError, Limits, Meter, Spec};
 use crate::foresight::Foresight;
 use crate::mj::{Inverse, MjError};
 use crate::rollout::stream;
-use nearl_runtime::constraints::{Guard, LimitSet, Model, end_of_range};
+use nearl_runtime::constraints::{Drive, Guard, LimitSet, Model, end_of_range};
 use nearl_runtime::controller::Parts;
 use nearl_runtime::link::{
     ActionMessage, Plant, Robot, STATE_RESET, STATE_TERMINATED, STATE_TRUNCATED, StateMessage, TallyMessage,
@@ -31,6 +31,9 @@ pub struct MujocoPlant {
     drive: Option<Brake>,
     robot: Robot,
     action: Vec<f64>,
+    followers: Vec<Follower>,
+    /// `action` was applied last, and the robot did not brake by itself.
+    is_sent: bool,
     force: Vec<f64>,
     /// Configuration and velocity as the environment gives them, and as the robot's model has them.
     state: (Vec<f64>, Vec<f64>),
@@ -72,6 +75,30 @@ pub fn watched_limits(env: &dyn Env, model: &Model, set: &LimitSet) -> Limits {
         watched.effort[j.idx_v] = model.effort_limit()[m.idx_v].min(set.effort[m.idx_v]);
     }
     watched
+}
+
+/// A joint that is sent positions.
+struct Follower {
+    /// Its entry of an action.
+    entry: usize,
+    /// What it may decelerate by in a period [rad/s or m/s].
+    slower: f64,
+    /// Mean speed on the way to what it was sent last [rad/s or m/s].
+    mean: f64,
+}
+
+/// Those of the joints that `drives` (nv) says are sent positions; `set` limits their acceleration.
+fn followers(spec: &Spec, model: &Model, drives: &[Drive], set: &LimitSet) -> Vec<Follower> {
+    let dof_of = |own: usize| {
+        let name = &spec.joints.iter().find(|joint| joint.idx_v == own)?.name;
+        model.joints().iter().find(|joint| joint.name == *name && joint.nv == 1).map(|joint| joint.idx_v)
+    };
+    let commanded = spec.actuators.iter().enumerate();
+    commanded
+        .filter_map(|(entry, actuator)| Some((entry, dof_of(actuator.dof)?)))
+        .filter(|&(_, dof)| drives[dof] == Drive::Position)
+        .map(|(entry, dof)| Follower { entry, slower: spec.dt * set.acceleration[dof], mean: 0.0 })
+        .collect()
 }
 
 /// Where the entries of a joint are in the environment's state, and in that of the robot's model.
@@ -143,7 +170,7 @@ impl MujocoPlant {
     /// [`PlantError`].
     pub fn new(manifest: &Manifest, seed: u64, resets: bool) -> Result<Self, PlantError> {
         let mut env = crate::env::of_plant(manifest, &manifest.task.name)?;
-        let Parts { model, projector, .. } = Parts::new(manifest)?;
+        let Parts { model, layout, projector, .. } = Parts::new(manifest)?;
         let mut rng = stream(seed, 0);
         env.reset(&mut rng)?;
         let limits = watched_limits(env.as_ref(), &model, projector.limits());
@@ -158,7 +185,9 @@ impl MujocoPlant {
             )));
         }
         let asks = manifest.task.constraints.guard == Guard::Simulator;
+        let drives = Parts::drives(manifest, &model, layout.controllable())?;
         Ok(Self {
+            followers: followers(env.spec(), &model, &drives, projector.limits()),
             foresight: asks.then(|| Foresight::new(env.as_ref(), &limits)),
             meter,
             inverse: Inverse::new(env.sim())?,
@@ -169,6 +198,7 @@ impl MujocoPlant {
             env,
             rng,
             action: vec![0.0; n_act],
+            is_sent: false,
             force: vec![0.0; nv],
             state: (vec![0.0; nq], vec![0.0; nv]),
             episode: Episode { bits: STATE_RESET, ..Episode::default() },
@@ -251,6 +281,7 @@ impl MujocoPlant {
             eprintln!("nearl: the start of an episode is drawn again: {e}");
         }
         self.meter.begin(self.env.qvel());
+        self.is_sent = false;
         let e = &mut self.episode;
         *e = Episode { number: e.number + 1, last: e.total, bits: STATE_RESET, ..Episode::default() };
     }
@@ -280,13 +311,28 @@ impl Plant for MujocoPlant {
     }
 
     fn apply(&mut self, action: &ActionMessage) {
+        let dt = self.dt();
+        for Follower { entry, mean, .. } in &mut self.followers {
+            *mean = if self.is_sent { (action.action[*entry] - self.action[*entry]) / dt } else { 0.0 };
+        }
         let n = self.action.len();
         self.action.copy_from_slice(&action.action[..n]);
+        self.is_sent = true;
+        self.advance();
+    }
+
+    fn hold(&mut self, _action: &ActionMessage) {
+        let dt = self.dt();
+        for Follower { entry, slower, mean } in &mut self.followers {
+            *mean -= slower.min(mean.abs()).copysign(*mean);
+            self.action[*entry] += dt * *mean;
+        }
         self.advance();
     }
 
     /// The drive's own brake, where analytic inverse dynamics knows the torque that stops the robot; no action elsewhere.
     fn brake(&mut self) {
+        self.is_sent = false;
         self.action.fill(0.0);
         if self.drive.is_some() {
             self.see();

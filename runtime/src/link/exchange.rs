@@ -29,6 +29,8 @@ pub struct Exchange {
     watchdog: u64,
     last_fresh: u64,
     is_attached: bool,
+    /// It was told to brake last: there is no action that could be held.
+    brakes: bool,
     lockstep: bool,
     next_announce: u64,
 }
@@ -50,13 +52,14 @@ impl Exchange {
             watchdog: clock::nanoseconds(watchdog),
             last_fresh: 0,
             is_attached: false,
+            brakes: true,
             lockstep: robot.lockstep,
             next_announce: 0,
         })
     }
 
-    /// The state to be sent next: time, episode and `bits` are the driver's. The link's own numbers (header, tick, due, late, watchdog) are
-    /// filled in by [`Exchange::tick`].
+    /// The state to be sent next: time, episode and `bits` are the driver's. The link's own numbers (header, tick, due, late, watchdog, and
+    /// `STATE_BRAKED`) are filled in by [`Exchange::tick`].
     pub fn state(&mut self) -> &mut StateMessage {
         &mut self.state
     }
@@ -77,9 +80,13 @@ impl Exchange {
         state.v[..v.len()].copy_from_slice(v);
         state.obs[..obs.len()].copy_from_slice(obs);
         let acts = match self.tick(patience) {
-            Turn::Act(action) if action.len() == nu => true,
-            Turn::Hold(action) if action.len() == nu => false,
-            _ => return Turn::Brake,
+            Turn::Act(action) if action.len() == nu => Some(true),
+            Turn::Hold(action) if action.len() == nu => Some(false),
+            _ => None,
+        };
+        let Some(acts) = acts else {
+            self.brakes = true;
+            return Turn::Brake;
         };
         let action = self.last.action();
         self.state.applied[..nu].copy_from_slice(action);
@@ -92,21 +99,25 @@ impl Exchange {
         let now = clock::now();
         self.announce(now);
         self.state.due = now;
+        self.state.set_braked(self.brakes);
         self.link.send_state(&mut self.state);
         let is_answered = self.wait(now + clock::nanoseconds(patience));
         // what is sent again while it waits is of the same tick
         self.state.tick += 1;
         if is_answered {
             self.last_fresh = clock::now();
-            return if self.last.nu > 0 { Turn::Act(self.last.action()) } else { Turn::Brake };
+            self.brakes = self.last.nu == 0;
+            return if self.brakes { Turn::Brake } else { Turn::Act(self.last.action()) };
         }
-        if self.is_attached && clock::now() < self.last_fresh + self.watchdog && self.last.nu > 0 {
+        let is_alive = self.is_attached && clock::now() < self.last_fresh + self.watchdog;
+        if is_alive && !self.brakes {
             self.state.late += 1;
             return Turn::Hold(self.last.action());
         }
-        if std::mem::take(&mut self.is_attached) {
+        if !is_alive && std::mem::take(&mut self.is_attached) {
             self.state.watchdog += 1;
         }
+        self.brakes = true;
         Turn::Brake
     }
 
@@ -138,7 +149,6 @@ impl Exchange {
                 if ours && !self.is_attached {
                     // an answer to a state of before: there is a loop, which the next states are waited for
                     (self.is_attached, self.last_fresh) = (true, clock::now());
-                    self.last = *action;
                 }
             }
             let now = clock::now();

@@ -45,6 +45,8 @@ pub const STATE_RESET: u32 = 1;
 pub const STATE_TERMINATED: u32 = 2;
 /// The episode was cut by a time limit.
 pub const STATE_TRUNCATED: u32 = 4;
+/// The plant braked by itself last, and applied no action; [`Exchange`](crate::link::Exchange) and [`PlantRunner`](crate::link::PlantRunner) set it.
+pub const STATE_BRAKED: u32 = 8;
 /// The plant waits for the action of every state (no real-time grid).
 pub const ROBOT_LOCKSTEP: u32 = 1;
 /// The plant states its limits by number; infinite is none.
@@ -95,6 +97,13 @@ message! {
         applied: [f64; MAX_JOINTS],
         /// Observation of the policy.
         obs: [f64; MAX_OBS],
+    }
+}
+
+impl StateMessage {
+    /// Sets or clears [`STATE_BRAKED`].
+    pub(crate) fn set_braked(&mut self, braked: bool) {
+        self.bits = self.bits & !STATE_BRAKED | if braked { STATE_BRAKED } else { 0 };
     }
 }
 

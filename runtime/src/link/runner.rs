@@ -22,6 +22,11 @@ pub trait Plant {
     fn observe(&mut self, state: &mut StateMessage);
     /// Applies `action` for one control period.
     fn apply(&mut self, action: &ActionMessage);
+    /// No action came in time for this control period, and `action` is the one applied last. Where joints are sent positions it would stop them within
+    /// a period: a plant of those goes on from its last two, slower (`docs/CONNECT.md`).
+    fn hold(&mut self, action: &ActionMessage) {
+        self.apply(action);
+    }
     /// Advances one control period while bringing the velocity to zero, or keeping it there.
     fn brake(&mut self);
     /// Writes what was counted since the start; a plant that measures no limit and has no episodes leaves it as it is.
@@ -130,6 +135,8 @@ pub struct PlantRunner {
     last: ActionMessage,
     last_fresh: u64,
     is_attached: bool,
+    /// The plant braked by itself last.
+    brakes: bool,
     /// A runtime sends actions, though not yet in time for the state they are for.
     is_near: bool,
     /// When an action came last, whatever state it was for, and when the first could have.
@@ -151,6 +158,7 @@ impl PlantRunner {
             last: ActionMessage::zeroed(),
             last_fresh: 0,
             is_attached: false,
+            brakes: true,
             is_near: false,
             last_heard: clock::now(),
             next_announce: 0,
@@ -200,6 +208,7 @@ impl PlantRunner {
         plant.observe(&mut self.state);
         self.state.tick = self.report.ticks;
         self.state.due = due;
+        self.state.set_braked(self.brakes);
         (self.state.late, self.state.watchdog) = (self.report.late, self.report.watchdog);
         self.link.send_state(&mut self.state);
         let sent = self.state.header.stamp;
@@ -213,7 +222,13 @@ impl PlantRunner {
                 self.is_attached = true;
                 self.last = action;
                 self.report.fresh += 1;
-                self.advance(plant);
+                match self.last.nu {
+                    0 => self.brake(plant),
+                    _ => {
+                        self.brakes = false;
+                        plant.apply(&self.last);
+                    }
+                }
             }
             // Stopped while time stood still: the state stays as it is.
             None if self.settings.pace == Pace::Lockstep => return,
@@ -257,14 +272,10 @@ impl PlantRunner {
         patience.is_some_and(|patience| clock::now() > self.last_heard + patience)
     }
 
-    /// Applies the last action, or brakes if the runtime left that to the plant.
-    fn advance(&mut self, plant: &mut impl Plant) {
-        if self.last.nu > 0 {
-            plant.apply(&self.last);
-        } else {
-            self.report.braked += 1;
-            plant.brake();
-        }
+    fn brake(&mut self, plant: &mut impl Plant) {
+        self.brakes = true;
+        self.report.braked += 1;
+        plant.brake();
     }
 
     /// No action came in time: hold the last one, or brake once the watchdog's time is over.
@@ -272,14 +283,16 @@ impl PlantRunner {
         let is_alive = clock::now() < self.last_fresh + clock::nanoseconds(self.settings.watchdog);
         if self.is_attached && is_alive {
             self.report.late += 1;
-            return self.advance(plant);
+            return match self.brakes {
+                true => self.brake(plant),
+                false => plant.hold(&self.last),
+            };
         }
         if self.is_attached {
             self.is_attached = false;
             self.report.watchdog += 1;
         }
-        self.report.braked += 1;
-        plant.brake();
+        self.brake(plant);
     }
 
     /// The action for the state just sent, if it comes in time.

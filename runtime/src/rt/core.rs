@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::codes::LedgerStatus;
 use crate::grid::Grid;
-use crate::link::{Message, ProposalMessage, StateMessage};
+use crate::link::{Message, ProposalMessage, STATE_BRAKED, StateMessage};
 use crate::rt::Sync;
 use crate::rt::faults::FaultPlan;
 use crate::rt::heard::Heard;
@@ -412,7 +412,7 @@ impl<T: LoopController> Core<T> {
         let known = &self.record.state;
         let alone = state.late.saturating_sub(known.late);
         let controller = &mut self.controller.controller;
-        if state.watchdog > known.watchdog {
+        if state.bits & STATE_BRAKED != 0 {
             controller.lose();
         } else if alone.max(lost) > 0 {
             controller.miss(alone.max(lost), alone > lost);

@@ -229,6 +229,9 @@ impl<P: Plant> Plant for FaultyPlant<P> {
     fn apply(&mut self, action: &ActionMessage) {
         self.plant.apply(action);
     }
+    fn hold(&mut self, action: &ActionMessage) {
+        self.plant.hold(action);
+    }
     fn brake(&mut self) {
         self.plant.brake();
     }

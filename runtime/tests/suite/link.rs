@@ -151,3 +151,45 @@ fn body_is_still(link: &mut RuntimeLink) -> bool {
     std::thread::sleep(Duration::from_millis(5));
     link.newest_state().is_some_and(|state| state.watchdog > 0 && state.v()[0] == 0.0)
 }
+
+/// A driver holds what it has applied, and nothing else; its states say what it did.
+#[test]
+fn a_driver_holds_no_answer_that_it_has_not_applied() {
+    let name = Name::new("held");
+    let mut plant = Exchange::open(&name.0, &robot(false), 5.0).unwrap();
+    let mut link = RuntimeLink::open(&name.0).unwrap();
+    let newest = |link: &mut RuntimeLink| *link.newest_state().expect("a state");
+    let answer = |link: &mut RuntimeLink, state: &StateMessage| {
+        let mut action = ActionMessage::zeroed();
+        (action.state_epoch, action.state_seq) = (state.header.epoch, state.header.seq);
+        (action.nu, action.action[0]) = (1, 0.5);
+        link.send_action(&mut action);
+    };
+    assert_eq!(plant.tick(0.0), Turn::Brake);
+    let state = newest(&mut link);
+    answer(&mut link, &state);
+    assert_eq!(plant.tick(0.0), Turn::Brake, "there is a loop, but its answer came too late");
+    assert!(plant.is_attached());
+    let state = newest(&mut link);
+    assert_eq!((state.bits & STATE_BRAKED, state.late), (STATE_BRAKED, 0));
+
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            let next = loop {
+                match link.newest_state() {
+                    Some(next) => break *next,
+                    None => std::thread::yield_now(),
+                }
+            };
+            answer(&mut link, &next);
+        });
+        assert_eq!(plant.tick(5.0), Turn::Act(&[0.5]));
+    });
+    assert_eq!(plant.tick(0.0), Turn::Hold(&[0.5]));
+    let state = newest(&mut link);
+    assert_eq!((state.bits & STATE_BRAKED, state.late), (0, 0));
+    plant.state().bits = STATE_RESET | STATE_BRAKED;
+    assert_eq!(plant.tick(0.0), Turn::Hold(&[0.5]));
+    let state = newest(&mut link);
+    assert_eq!((state.bits, state.late), (STATE_RESET, 1));
+}

@@ -39,9 +39,8 @@ struct Past {
     seq: u64,
     episode: u64,
     target: (Vec<f64>, Vec<f64>),
-    /// How often the plant had had no answer in time by then, and its watchdog had braked.
+    /// How often the plant had had no answer in time by then.
     late: u64,
-    watchdog: u64,
     /// What was sent in its period, and in the one before it, of joints that follow by themselves what they are sent.
     sent: SetPoints,
     before: Option<SetPoints>,
@@ -80,6 +79,9 @@ struct Begun {
     start: (Vec<f64>, Vec<f64>),
     goal: (Vec<f64>, Vec<f64>),
 }
+
+/// Of the bits of a state: the plant braked by itself last.
+const BRAKED: u32 = 8;
 
 /// What has been read of a log.
 #[derive(Default)]
@@ -259,9 +261,8 @@ impl Session {
         let state = &tick.state;
         let (epoch, seq, episode, brake) = (state.epoch, state.seq, state.episode, tick.brake.clone());
         let cut_off = if is_cut_off { 2 } else { cut_off.saturating_sub(1) };
-        let (late, watchdog) = (state.late, state.watchdog);
-        self.past =
-            Some(Past { epoch, seq, episode, target, late, watchdog, sent, before, cut_off, a, brake, told });
+        let late = state.late;
+        self.past = Some(Past { epoch, seq, episode, target, late, sent, before, cut_off, a, brake, told });
         Ok(())
     }
 
@@ -299,14 +300,14 @@ impl Session {
     }
 
     /// What stands as sent where `state` was measured: the last answer, or the one before it where that came too late, and from there on what the
-    /// driver made of it without an answer. None where it is not known, as its watchdog braked.
+    /// driver made of it without an answer. None where the plant braked by itself.
     fn standing(&self, own: &Promise, past: &Past, state: &State) -> Option<SetPoints> {
         if self.keeps_time {
             return Some(past.sent.clone()); // it answered in every slot
         }
         let (lost, alone) = (past.lost(state), past.alone(state));
         let applied = if alone > lost { past.before.as_ref() } else { Some(&past.sent) };
-        let mut sent = applied.filter(|_| state.watchdog <= past.watchdog)?.clone();
+        let mut sent = applied.filter(|_| state.bits & BRAKED == 0)?.clone();
         own.hold(&mut sent, lost.max(alone));
         Some(sent)
     }

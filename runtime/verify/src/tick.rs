@@ -50,11 +50,11 @@ pub(crate) struct State {
     pub(crate) seq: u64,
     #[serde(default)]
     pub(crate) episode: u64,
-    /// How often the plant had no answer in time, and how often its watchdog braked.
+    /// How often the plant had no answer in time.
     #[serde(default)]
     pub(crate) late: u64,
     #[serde(default)]
-    pub(crate) watchdog: u64,
+    pub(crate) bits: u32,
     #[serde(deserialize_with = "numbers")]
     pub(crate) q: Vec<f64>,
     #[serde(deserialize_with = "numbers")]
