@@ -394,10 +394,8 @@ impl<T: LoopController> Core<T> {
             self.heard.begin(state.header.seq);
             self.held = None;
             self.pace = Pace::default();
-        } else if self.settings.sync == Sync::Plant {
-            // A loop with a clock of its own has answered in every slot.
+        } else {
             self.go_on(state, lost);
-            self.pace.take(state.time - self.record.state.time, lost + 1, self.settings.period);
         }
         let is_frozen = is_next && self.is_frozen(state);
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);
@@ -409,14 +407,18 @@ impl<T: LoopController> Core<T> {
     /// Tells the controller what the plant has done by itself up to `state`, before which `lost` states were: it says how often it had no answer in
     /// time, that to the last state it was given included.
     fn go_on(&mut self, state: &StateMessage, lost: u64) {
-        let known = &self.record.state;
-        let alone = state.late.saturating_sub(known.late);
-        let controller = &mut self.controller.controller;
+        let (known, controller) = (&self.record.state, &mut self.controller.controller);
         if state.bits & STATE_BRAKED != 0 {
             controller.lose();
-        } else if alone.max(lost) > 0 {
+        }
+        if self.settings.sync == Sync::Clock {
+            return; // it has answered in every slot, at its own pace
+        }
+        let alone = state.late.saturating_sub(known.late);
+        if alone.max(lost) > 0 {
             controller.miss(alone.max(lost), alone > lost);
         }
+        self.pace.take(state.time - known.time, lost + 1, self.settings.period);
     }
 
     /// What the state just taken is worth.

@@ -1,6 +1,7 @@
 //! What the forces of drives do within a period.
 
 use std::cell::RefCell;
+use std::rc::Rc;
 
 use crate::motion::Machine;
 use crate::period::Period;
@@ -18,7 +19,12 @@ pub(crate) struct Drives {
     /// Ascending; the others accelerate evenly, whatever it takes.
     free: Vec<usize>,
     found: RefCell<Option<Found>>,
+    /// What was found last of a configuration.
+    slopes: RefCell<Option<(Vec<f64>, Slopes)>>,
 }
+
+/// By dof of an acceleration, then by dof of a force at the start and at the end.
+type Slopes = Rc<Vec<Vec<[f64; 2]>>>;
 
 /// The last passage that was asked for.
 #[derive(Debug)]
@@ -32,7 +38,12 @@ struct Found {
 impl Drives {
     pub(crate) fn new(gains: &[Option<[f64; 2]>], free: Vec<usize>) -> Drives {
         let gains = gains.iter().map(|gains| gains.unwrap_or_default()).collect();
-        Drives { gains, free, found: RefCell::default() }
+        Drives { gains, free, found: RefCell::default(), slopes: RefCell::default() }
+    }
+
+    /// Stiffness and damping of the drive of `dof`.
+    pub(crate) fn gains(&self, dof: usize) -> [f64; 2] {
+        self.gains[dof]
     }
 
     /// The force of each drive at the start and at the last evaluation of a period, less the mean force that the same acceleration takes if it is constant,
@@ -51,11 +62,19 @@ impl Drives {
         })
     }
 
-    /// By the velocities' change with each acceleration (nv x nv of start and end, a row for each acceleration).
-    pub(crate) fn slopes(&self, m: &mut Machine, p: &Period, q: &[f64]) -> Vec<Vec<[f64; 2]>> {
-        let still = vec![0.0; self.gains.len()];
-        let unit = |i: usize| (0..still.len()).map(|j| f64::from(u8::from(i == j))).collect::<Vec<_>>();
-        (0..still.len()).map(|i| self.reckon(m, p, (q, &still, &unit(i)))).collect()
+    /// How [`Drives::ends`] change with each acceleration (nv x nv, a row for each acceleration).
+    pub(crate) fn slopes(&self, m: &mut Machine, p: &Period, q: &[f64]) -> Slopes {
+        let known = self.slopes.borrow().as_ref().filter(|(at, _)| at == q).map(|(_, slopes)| slopes.clone());
+        known.unwrap_or_else(|| {
+            let still = vec![0.0; self.gains.len()];
+            let unit = |i: usize| (0..still.len()).map(|j| f64::from(u8::from(i == j))).collect::<Vec<_>>();
+            let slopes: Slopes =
+                Rc::new((0..still.len()).map(|i| self.reckon(m, p, (q, &still, &unit(i)))).collect());
+            if !m.is_spent() {
+                self.slopes.replace(Some((q.to_vec(), slopes.clone())));
+            }
+            slopes
+        })
     }
 
     /// Linear in the velocities and accelerations.

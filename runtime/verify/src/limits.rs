@@ -436,7 +436,7 @@ impl Section {
         let soft = self.torque.as_ref().and_then(|torque| torque.soft);
         let all = Rc::new(Drives::new(of.drives, of.free.to_vec()));
         for &(dof, effort) in &efforts {
-            let Some([stiffness, damping]) = of.drives[dof] else { continue };
+            let Some([stiffness, _]) = of.drives[dof] else { continue };
             let effort = if of.sub_steps > 1 { (1.0 - SHORT) * effort } else { effort };
             // A target makes up for any friction as well, where its range is wide enough.
             let rubs = of.robot.joints().nth(dof).map_or(0.0, |joint| joint.friction / stiffness);
@@ -451,7 +451,7 @@ impl Section {
             ];
             for (at_end, range, at) in parts.into_iter().flatten() {
                 let all = all.clone();
-                let rule = Rule::Drive { dof, most: effort, stiffness, damping, at_end, range, all };
+                let rule = Rule::Drive { dof, most: effort, at_end, range, all };
                 rows.push(Row::new("torque", &format!("{} {at}", of.name(dof)), effort, soft, rule));
             }
         }

@@ -75,15 +75,7 @@ pub(crate) enum Rule {
     /// `|tau - tau_before| / T <= most`.
     TorqueRate { dof: usize, most: f64 },
     /// The force of a drive at one end of the period, or at its start what the range of the target makes of it.
-    Drive {
-        dof: usize,
-        most: f64,
-        stiffness: f64,
-        damping: f64,
-        at_end: bool,
-        range: Option<(usize, [f64; 2])>,
-        all: Rc<Drives>,
-    },
+    Drive { dof: usize, most: f64, at_end: bool, range: Option<(usize, [f64; 2])>, all: Rc<Drives> },
     /// `n . p <= offset`, and `braking` stops the point in front of it; the margin of a half-space, which may be put elsewhere.
     Plane { spot: Spot, point: Vec3, n: Vec3, offset: f64, braking: f64, half_space: Option<f64> },
     /// A sum of positions, velocities and accelerations.
@@ -243,8 +235,8 @@ impl Row {
             Rule::TorqueRate { dof, most } => passage
                 .before
                 .map_or([none; 2], |(_, tau)| both((passage.tau[*dof] - tau[*dof]) / p.dt, *most)),
-            Rule::Drive { dof, most, stiffness, damping, at_end, range, all } => {
-                let v = passage.v[*dof];
+            Rule::Drive { dof, most, at_end, range, all } => {
+                let (v, [stiffness, damping]) = (passage.v[*dof], all.gains(*dof));
                 let force = passage.tau[*dof] + all.ends(m, p, passage)[*dof][usize::from(*at_end)];
                 let [low, high] = range.map_or([-most, *most], |(iq, range)| {
                     let share = match p.sub_steps {

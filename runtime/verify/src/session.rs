@@ -302,12 +302,15 @@ impl Session {
     /// What stands as sent where `state` was measured: the last answer, or the one before it where that came too late, and from there on what the
     /// driver made of it without an answer. None where the plant braked by itself.
     fn standing(&self, own: &Promise, past: &Past, state: &State) -> Option<SetPoints> {
+        if state.bits & BRAKED != 0 {
+            return None;
+        }
         if self.keeps_time {
             return Some(past.sent.clone()); // it answered in every slot
         }
         let (lost, alone) = (past.lost(state), past.alone(state));
         let applied = if alone > lost { past.before.as_ref() } else { Some(&past.sent) };
-        let mut sent = applied.filter(|_| state.bits & BRAKED == 0)?.clone();
+        let mut sent = applied?.clone();
         own.hold(&mut sent, lost.max(alone));
         Some(sent)
     }
