@@ -268,6 +268,7 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     notes.extend(undriven(m, parts));
     notes.extend(beyond_motors(m, parts, &drives));
     notes.extend(unguarded(m));
+    notes.extend(far_poses(m, model));
     notes
 }
 
@@ -316,6 +317,22 @@ fn unguarded(m: &Manifest) -> Option<String> {
          them"
             .into()
     })
+}
+
+/// Joints whose pose, which positions and outputs of a policy are relative to, is outside of their range.
+fn far_poses(m: &Manifest, model: &nearl_constraints::Model) -> Vec<String> {
+    let Some(policy) = &m.task.policy else { return Vec::new() };
+    let note = |(name, &pose): (&String, &f64)| {
+        let at = model.joint(name).ok().filter(|joint| joint.nq == 1)?.idx_q;
+        let (low, high) = (model.lower_position_limit()[at], model.upper_position_limit()[at]);
+        (pose < low || pose > high).then(|| {
+            format!(
+                "[policy] pose of '{name}' is {pose} rad or m, outside of its range of {low} to {high}; is it in degrees, or of another joint? What the policy \
+                 sees and asks for is relative to it"
+            )
+        })
+    };
+    policy.joints.iter().zip(&policy.pose).filter_map(note).collect()
 }
 
 /// `T sqrt(K / I)` of a drive that is held on its target for `T` above which it has moved its joint a good part of the way there: where the physics steps

@@ -11,7 +11,8 @@ use nearl_runtime::constraints::{
     AccelerationLimit, Limit, Model, PerJoint, PositionLimit, Projector, Settings, TorqueLimit, VelocityLimit,
 };
 use nearl_runtime::controller::Parts;
-use nearl_runtime::doctor::{Check, Finding, examine};
+use nearl_runtime::doctor::{Check, Finding, examine, told};
+use nearl_runtime::recipe::PolicySection;
 use nearl_trainer::tasks;
 use nearl_trainer::train::{Request, Training, advice, complete};
 
@@ -316,5 +317,28 @@ fn a_moving_link_without_an_inertia_is_named() {
     assert!(
         notes.contains("'shank'") && notes.contains("no mass") && notes.contains("<inertial>"),
         "{notes}"
+    );
+}
+
+/// What a policy sees and asks for is relative to its pose: one in degrees had the joint go to the end of its range, and nothing said so.
+#[test]
+fn a_pose_outside_of_a_range_is_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    let file = write(folder.path(), SAME, SAME);
+    let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).expect("task");
+    complete(&mut manifest).expect("manifest");
+    let joints = ["elbow", "shoulder"].map(String::from).to_vec();
+    let notes = |pose: [f64; 2]| {
+        let mut manifest = manifest.clone();
+        let section =
+            PolicySection { joints: joints.clone(), pose: pose.to_vec(), ..PolicySection::default() };
+        manifest.task.policy = Some(section);
+        told(&manifest).expect("notes").into_iter().filter(|note| note.contains("pose")).collect::<Vec<_>>()
+    };
+    assert!(notes([-2.2, 2.0]).is_empty());
+    let found = notes([-90.0, 1.5]);
+    assert!(
+        found.len() == 1 && found[0].contains("'elbow' is -90 rad or m, outside of its range of -2.2 to 2.2"),
+        "{found:?}"
     );
 }
