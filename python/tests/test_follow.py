@@ -209,10 +209,10 @@ def test_a_driver_that_goes_on_while_answers_are_late_keeps_every_limit(tmp_path
             patience = 0.0 if tick > 0 and random.random() < 0.2 else 5.0
             turn, action = plant.exchange([q], [speed], observation, patience=patience, time=(tick + 1) * dt, begins=tick == 0)
             slower = np.sign(speed) * max(abs(speed) - most * dt, 0.0)  # as docs/CONNECT.md has it
-            if interface == "velocity":
-                to = float(action[0]) if turn != "brake" else slower
+            if turn == "act":
+                to = float(action[0]) if interface == "velocity" else (float(action[0]) - q) / dt
             else:
-                to = (float(action[0]) - q) / dt if turn == "act" else slower
+                to = float(action[0]) if interface == "velocity" and turn == "hold" else slower
             q, speed = q + dt * to, to
             turns.append(turn)
             speeds.append(speed)
