@@ -166,14 +166,15 @@ impl Sent {
         rest
     }
 
-    /// Makes `target`, of a period of `dt` \[s\], what was sent in the tick before.
-    pub(super) fn remember(&mut self, target: &Target, dt: f64) {
+    /// Makes `target` what was sent in the tick before.
+    pub(super) fn remember(&mut self, target: &Target, period: &Period) {
+        let Period { dt, kappa, .. } = *period;
         for joint in &mut self.joints {
             joint.before = joint.last;
-            let v = target.v[joint.dof];
+            let (v, a) = (target.v[joint.dof], target.acceleration[joint.dof]);
             let (q, mean) = match joint.position {
                 Some((iq, _)) if self.known > 0 => (target.q[iq], (target.q[iq] - joint.before.q) / dt),
-                Some((iq, _)) => (target.q[iq], v),
+                Some((iq, _)) => (target.q[iq], v - (1.0 - kappa) * dt * a), // from where it was measured
                 None => (0.0, v),
             };
             joint.last = SetPoint { q, v, mean };

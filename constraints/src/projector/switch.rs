@@ -178,7 +178,7 @@ impl Projector {
         self.previous.torque.copy_from_slice(self.checker.torque());
         let known = |x: &[f64]| x.iter().all(|x| x.is_finite());
         self.previous.known = known(&self.previous.acceleration) && known(&self.previous.torque);
-        self.previous.sent.remember(target, self.period.dt);
+        self.previous.sent.remember(target, &self.period);
     }
 
     /// Takes `proposal` as the target of the tick just projected, whatever it breaks: `target_violations` and what is remembered are the

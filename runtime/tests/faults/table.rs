@@ -397,8 +397,8 @@ pub const ROWS: &[Row] = &[
     ),
     (
         48,
-        "a plant that moves otherwise than told: other sub-steps, periods that jitter by half, that are others all the time",
-        "torque holds exactly; speed and position to half a period; brakes while it exchanges in another period than it said",
+        "a plant that moves otherwise than told: other sub-steps, jitter of half a period, another period",
+        "torque exact, speed and position to half a period; another period: brakes",
         &["wrong-period"],
         &[
             (HERE, "fault_48_a_plant_that_moves_otherwise_than_told_keeps_torque_and_nearly_the_rest"),

@@ -408,15 +408,15 @@ impl Promise {
         }
     }
 
-    /// What is sent with the target of `tick`, after what was sent `before` it. Targets of a wrong length send nothing.
-    pub(crate) fn sends(&self, tick: &Tick, before: Option<&SetPoints>) -> SetPoints {
+    /// What is sent with the target of `tick` that began at `from` (nq, nv). Targets of a wrong length send nothing.
+    pub(crate) fn sends(&self, tick: &Tick, from: Option<&(Vec<f64>, Vec<f64>)>) -> SetPoints {
         let (q, v) = (tick.target_q.clone(), tick.target_v.clone());
         let mut mean = v.clone();
         for &(dof, position) in &self.follows {
-            if let (Some((at, _)), Some(before)) = (position, before)
+            if let (Some((at, _)), Some((from, _))) = (position, from)
                 && let (Some(mean), Some(to)) = (mean.get_mut(dof), q.get(at))
             {
-                *mean = (to - before.q[at]) / self.period.dt;
+                *mean = (to - from[at]) / self.period.dt;
             }
         }
         SetPoints { q, v, mean }

@@ -248,7 +248,7 @@ impl Session {
             Some(Start { from, sent, .. }) => (Some(from), sent),
             None => (None, None),
         };
-        let sent = promises.0.sends(tick, before.as_ref());
+        let sent = promises.0.sends(tick, begun.as_ref());
         let v = begun.as_ref().map_or(&tick.state.v, |(_, v)| v).clone();
         self.promises.insert(tick.snapshot, promises);
         let cut_off = self.past.as_ref().map_or(0, |past| past.cut_off);

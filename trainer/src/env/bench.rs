@@ -54,7 +54,7 @@ pub fn physics(first: &dyn Env, threads: usize, duration: Duration) -> Result<Ph
     Ok(Physics { steps, seconds: started.elapsed().as_secs_f64() })
 }
 
-/// Steps every environment of a thread in turn until `end`.
+/// Steps every environment of a thread in turn until `end`, once at least: a thread that had no core till then has been measured too.
 fn drive(mut envs: Vec<Box<dyn Env>>, seed: u64, end: Instant) -> Result<u64, EnvError> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let spec = envs[0].spec().clone();
@@ -65,7 +65,7 @@ fn drive(mut envs: Vec<Box<dyn Env>>, seed: u64, end: Instant) -> Result<u64, En
     }
     let mut ages = vec![0; envs.len()];
     let mut steps = 0;
-    while Instant::now() < end {
+    while steps == 0 || Instant::now() < end {
         for (env, age) in envs.iter_mut().zip(&mut ages) {
             for (a, (low, high)) in action.iter_mut().zip(&ranges) {
                 *a = rng.random_range(*low..*high);
