@@ -397,7 +397,7 @@ pub const ROWS: &[Row] = &[
     ),
     (
         48,
-        "a plant that moves otherwise than told: other sub-steps, jitter of half a period, another period",
+        "a plant that moves otherwise than told: sub-steps, jitter, another period",
         "torque exact, speed and position to half a period; another period: brakes",
         &["wrong-period"],
         &[
