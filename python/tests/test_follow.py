@@ -206,7 +206,7 @@ def test_a_driver_that_goes_on_while_answers_are_late_keeps_every_limit(tmp_path
         loop = nearl.Loop(tmp_path / "one.safetensors", name, log=log, ramp=0.0)
         for tick in range(1500):
             observation = [{"q.j1": q, "v.j1": speed}[entry] for entry in entries]
-            patience = 0.0 if tick == 1 or tick > 1 and random.random() < 0.2 else 5.0
+            patience = 0.0 if tick == 1 or (tick > 1 and random.random() < 0.2) else 5.0
             turn, action = plant.exchange([q], [speed], observation, patience=patience, time=(tick + 1) * dt, begins=tick == 0)
             slower = np.sign(speed) * max(abs(speed) - most * dt, 0.0)  # as docs/CONNECT.md has it
             if turn == "act":
