@@ -2,7 +2,8 @@
 
 /// A period may be so much shorter or longer in the long run, as a share of it.
 const OFF: f64 = 0.2;
-/// So many in a row say that it is no jitter: one of half a period either way is that often on one side once in years.
+/// So many in a row say that it is no jitter: of one that is even over half a period either way, 0.3 of the periods are that long, and 0.3^16 = 4e-9 of
+/// them end a row of these.
 const IN_A_ROW: i32 = 16;
 
 /// Periods in a row that were too long, or negative, too short.
