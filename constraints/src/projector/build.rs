@@ -8,7 +8,6 @@ use super::coupled::Coupled;
 use super::moved::Moving;
 use super::nearer::Nearer;
 use super::polish::Polish;
-use super::sent::Sent;
 use super::sources::{Measured, Sources};
 use super::{Dofs, History, Projector, Stages, Switch};
 use crate::checker::Checker;
@@ -80,7 +79,7 @@ impl Projector {
             coupled,
             switches,
             external: zero(),
-            previous: History { known: false, acceleration: zero(), torque: zero(), sent: Sent::default() },
+            previous: History::none(nv),
             before: zero(),
             braking: (0..nv).map(|i| Dof::of(&limits, i).braking(&period)).collect(),
             bounds: Bounds::new(nv),

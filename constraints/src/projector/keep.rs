@@ -1,7 +1,9 @@
 //! A target is taken only when its passage and a whole verified brake from it keep every hard limit.
 
-use super::Projector;
 use super::backup::{Passage, Refusal, With};
+use super::ladder::ROW_TOLERANCE;
+use super::{Projector, Stages};
+use crate::Kind;
 use crate::ledger::{BrakeReason, Rung, Status};
 use crate::target::{Proposal, Target};
 
@@ -64,6 +66,7 @@ impl Projector {
         self.v_wanted.copy_from_slice(&target.v);
         if !self.project_again(q, v, proposal, target) && !self.go_part_of_the_way(q, v, proposal, target) {
             self.keep_the_passage(q, v, proposal, target);
+            self.keep_the_motors(q, v, Some(proposal), target);
             self.report_rung(q, v, target, Rung::StoredBrake);
             return Status::Braked(BrakeReason::NoVerifiedBrake);
         }
@@ -196,6 +199,50 @@ impl Projector {
         }
         self.blend(0.0);
         self.write(q, v, Some(proposal), target);
+    }
+
+    /// A tick of a brake asks motors for no more than they may give: beyond that they would be cut one by one, and what the others give would throw the
+    /// joints. Where it does, as after a push, the nearest velocities for which it does not: within the box, or else within the acceleration limits,
+    /// or else whatever they are.
+    pub(super) fn keep_the_motors(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        proposal: Option<&Proposal>,
+        target: &mut Target,
+    ) {
+        if !self.fill_rows(q, v) {
+            return;
+        }
+        self.change(v, &target.v);
+        let Some(stages) = &mut self.coupled else { return };
+        let Stages { problem: p, nearer, labels, y, .. } = stages;
+        let is_motor =
+            |r: usize| p.soft[r].is_none() && matches!(labels[r].kind, Kind::Torque | Kind::TorqueSpeed);
+        if (0..p.m).all(|r| !is_motor(r) || p.excess(r, y) <= ROW_TOLERANCE) {
+            return;
+        }
+        for attempt in 0..3 {
+            nearer.begin(p, y);
+            nearer.keep_only(is_motor);
+            nearer.aim(y);
+            for (k, &i) in self.dofs.controllable.iter().enumerate() {
+                let most = self.in_force.acceleration[i] * self.period.dt;
+                match attempt {
+                    0 => nearer.bound(k, self.bounds.v_lower[i] - v[i], self.bounds.v_upper[i] - v[i]),
+                    1 => nearer.bound(k, -most, most),
+                    _ => nearer.bound(k, f64::NEG_INFINITY, f64::INFINITY),
+                }
+            }
+            if let Some(y) = nearer.solve() {
+                for (y, &i) in y.iter().zip(&self.dofs.controllable) {
+                    self.v_next[i] = v[i] + y;
+                }
+                self.consistent.fill(false);
+                self.write(q, v, proposal, target);
+                return;
+            }
+        }
     }
 
     /// The passage to the target breaks no hard row or cone.

@@ -7,7 +7,7 @@ use crate::ledger::{ActiveRow, BrakeReason, Rung, Side};
 use crate::target::{Solver, Target};
 
 /// Share of its limit by which the closed form and Clarabel's answer may exceed a row or a cone; the checker allows ten times this.
-const ROW_TOLERANCE: f64 = 1e-10;
+pub(super) const ROW_TOLERANCE: f64 = 1e-10;
 
 /// The same for equal rows, which Clarabel cannot be kept a little inside of.
 const EQUALITY_TOLERANCE: f64 = 5e-10;
@@ -28,16 +28,11 @@ impl Projector {
             p.upper[k] = self.bounds.v_upper[i] - v[i];
             stages.y[k] = self.v_next[i] - v[i];
         }
-        for &j in &self.dofs.fixed {
-            self.tangent[j] = self.v_next[j] - v[j];
-        }
-        let measured = Measured { q, v, external: &self.external, previous: self.previous.get() };
-        stages.sources.fill(p, &mut self.dynamics, &measured, &self.dofs, &self.tangent, &self.period);
-        if !p.is_finite() {
-            // Nothing of a tick changes the Hessian: whatever did does not reach the next one.
-            p.hessian.copy_from_slice(stages.conic.hessian());
+        if !self.fill_rows(q, v) {
             return Err(BrakeReason::NonFiniteDynamics);
         }
+        let Some(stages) = &mut self.coupled else { return Ok(false) };
+        let p = &mut stages.problem;
         let named = &mut target.ledger.outside; // a brake asks a second time
         for row in stages.sources.outside().map(|r| v.len() + r) {
             if !named.contains(&row) {
@@ -56,6 +51,24 @@ impl Projector {
         target.ledger.rung = rung;
         self.take(v, target);
         Ok(true)
+    }
+
+    /// Writes the rows and cones at `q`, `v`, with what `v_next` asks of dofs that are not controllable; false where there are none, or where they are
+    /// no numbers.
+    pub(super) fn fill_rows(&mut self, q: &[f64], v: &[f64]) -> bool {
+        let Some(stages) = &mut self.coupled else { return false };
+        let p = &mut stages.problem;
+        for &j in &self.dofs.fixed {
+            self.tangent[j] = self.v_next[j] - v[j];
+        }
+        let measured = Measured { q, v, external: &self.external, previous: self.previous.get() };
+        stages.sources.fill(p, &mut self.dynamics, &measured, &self.dofs, &self.tangent, &self.period);
+        if !p.is_finite() {
+            // Nothing of a tick changes the Hessian: whatever did does not reach the next one.
+            p.hessian.copy_from_slice(stages.conic.hessian());
+            return false;
+        }
+        true
     }
 
     /// Takes over the answer of a stage with its multipliers.

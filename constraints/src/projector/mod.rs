@@ -161,17 +161,59 @@ struct Switch {
     enabled: bool,
 }
 
-/// The tick before, where it is known.
-struct History {
+/// What a tick asked of the robot, where it is known.
+#[derive(Clone)]
+struct Asked {
     known: bool,
     acceleration: Vec<f64>,
     torque: Vec<f64>,
+}
+
+impl Asked {
+    fn none(nv: usize) -> Asked {
+        Asked { known: false, acceleration: vec![0.0; nv], torque: vec![0.0; nv] }
+    }
+
+    fn get(&self) -> Option<Previous<'_>> {
+        self.known.then_some(Previous { acceleration: &self.acceleration, torque: &self.torque })
+    }
+
+    fn set(&mut self, acceleration: &[f64], torque: &[f64]) {
+        self.acceleration.copy_from_slice(acceleration);
+        self.torque.copy_from_slice(torque);
+        self.known = true;
+    }
+
+    fn write(&self, memory: &mut Vec<f64>) {
+        memory.push(f64::from(u8::from(self.known)));
+        memory.extend_from_slice(&self.acceleration);
+        memory.extend_from_slice(&self.torque);
+    }
+
+    /// Takes what [`Asked::write`] wrote; what is left of `memory`.
+    fn read<'m>(&mut self, memory: &'m [f64]) -> &'m [f64] {
+        let (asked, rest) = memory.split_at(1 + 2 * self.acceleration.len());
+        let (acceleration, torque) = asked[1..].split_at(self.acceleration.len());
+        self.set(acceleration, torque);
+        self.known = asked[0] != 0.0;
+        rest
+    }
+}
+
+/// The tick before, and the one before that: what was sent last, where the answer of the tick before came too late.
+struct History {
+    last: Asked,
+    before: Asked,
     sent: sent::Sent,
 }
 
 impl History {
+    fn none(nv: usize) -> History {
+        History { last: Asked::none(nv), before: Asked::none(nv), sent: sent::Sent::default() }
+    }
+
     fn get(&self) -> Option<Previous<'_>> {
-        self.known.then_some(Previous { acceleration: &self.acceleration, torque: &self.torque })
+        self.last.get()
     }
 }
 
@@ -396,6 +438,7 @@ impl Projector {
         let unsolved = matches!(reason, BrakeReason::NoCertifiedAnswer | BrakeReason::NonFiniteDynamics);
         self.stop(q, v, target, !unsolved);
         self.write(q, v, proposal, target);
+        self.keep_the_motors(q, v, proposal, target);
         let stored = self.settings.braking == Braking::Stored && self.backup.stored;
         self.report_rung(q, v, target, if stored { Rung::StoredBrake } else { Rung::Brake });
         Status::Braked(reason)

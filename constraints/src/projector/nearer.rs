@@ -66,6 +66,18 @@ impl Nearer {
         self.cuts = 0;
     }
 
+    /// Leaves out every row and cone of the tick but those with `kept` (m).
+    pub(super) fn keep_only(&mut self, kept: impl Fn(usize) -> bool) {
+        for r in (0..self.rows + self.cones).filter(|r| *r >= self.rows || !kept(*r)) {
+            (self.problem.row_lower[r], self.problem.row_upper[r]) = (f64::NEG_INFINITY, f64::INFINITY);
+        }
+    }
+
+    /// Box of the velocity change of controllable dof `k`.
+    pub(super) fn bound(&mut self, k: usize, lower: f64, upper: f64) {
+        (self.problem.lower[k], self.problem.upper[k]) = (lower, upper);
+    }
+
     /// Looks for the answer next to `y` (n) in place of the tick's goal.
     pub(super) fn aim(&mut self, y: &[f64]) {
         self.problem.goal.copy_from_slice(y);

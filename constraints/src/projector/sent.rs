@@ -1,7 +1,7 @@
 //! Set points of joints that follow by themselves what they are sent: each begins where the one before ended, not where the joint is measured.
 //! From there the drive's lag, its droop under a load and the noise of its encoder would go into the next set point, and add up.
 
-use super::Projector;
+use super::{History, Projector};
 use crate::viability::Period;
 use crate::{Drive, Proposal, Target};
 
@@ -96,32 +96,40 @@ impl Projector {
     }
 
     /// Periods passed in which nothing was sent, and the driver went on by itself as docs/CONNECT.md has it: positions from the last two on, slower
-    /// in each period by what the joint may decelerate, velocities as they were.
+    /// in each period by what the joint may decelerate, velocities and forces as they were.
     pub fn miss(&mut self, periods: u64) {
         let dt = self.period.dt;
-        for Follower { dof, position, last, .. } in &mut self.previous.sent.joints {
-            if position.is_none() {
-                continue;
-            }
+        let History { last: asked, sent, .. } = &mut self.previous;
+        for Follower { dof, position, last, .. } in &mut sent.joints {
             for _ in 0..periods.min(MISSED) {
-                let slower = (self.limits.acceleration[*dof] * dt).min(last.mean.abs());
-                last.mean -= slower.copysign(last.mean);
-                last.v = last.mean;
-                last.q += dt * last.mean;
+                asked.acceleration[*dof] = 0.0;
+                if position.is_some() {
+                    let slower =
+                        (self.limits.acceleration[*dof] * dt).min(last.mean.abs()).copysign(last.mean);
+                    last.mean -= slower;
+                    last.v = last.mean;
+                    last.q += dt * last.mean;
+                    asked.acceleration[*dof] = -slower / dt;
+                }
             }
         }
     }
 
     /// The target of the tick before came too late and was never sent: what was sent last is that of the tick before it.
     pub fn recall(&mut self) {
-        let sent = &mut self.previous.sent;
+        let History { last, before, sent } = &mut self.previous;
+        std::mem::swap(last, before);
+        before.known = false;
         sent.known = sent.known.saturating_sub(1);
         sent.joints.iter_mut().for_each(|joint| joint.last = joint.before);
     }
 
-    /// What was sent in the tick before is not what the robot does: the next tick begins where it is measured.
+    /// What was sent in the tick before is not what the robot does: the next tick begins where it is measured, and limits on a change from the tick
+    /// before do not hold in it.
     pub fn lose(&mut self) {
-        self.previous.sent.forget();
+        let History { last, before, sent } = &mut self.previous;
+        (last.known, before.known) = (false, false);
+        sent.forget();
     }
 }
 

@@ -1,7 +1,7 @@
 //! What may be changed between ticks: limits on and off, forces from outside, the tick before.
 
-use super::Projector;
 use super::build::check_combination;
+use super::{History, Projector};
 use crate::jerk::Brake;
 use crate::row::Previous;
 use crate::viability::Dof;
@@ -128,16 +128,14 @@ impl Projector {
     /// # Panics
     /// When there are not nv of them.
     pub fn set_previous(&mut self, previous: Option<Previous<'_>>) {
-        self.previous.known = previous.is_some();
-        if let Some(previous) = previous {
-            self.previous.acceleration.copy_from_slice(previous.acceleration);
-            self.previous.torque.copy_from_slice(previous.torque);
+        self.previous.last.known = false;
+        if let Some(Previous { acceleration, torque }) = previous {
+            self.previous.last.set(acceleration, torque);
         }
     }
 
     /// Forgets the tick before and the stored brake: a new episode begins.
     pub fn forget(&mut self) {
-        self.previous.known = false;
         self.lose();
         self.backup.forget();
     }
@@ -152,9 +150,8 @@ impl Projector {
 
     /// Appends [`Projector::memory`] to `memory`; allocates only where that has no room.
     pub fn write_memory(&self, memory: &mut Vec<f64>) {
-        memory.push(f64::from(u8::from(self.previous.known)));
-        memory.extend_from_slice(&self.previous.acceleration);
-        memory.extend_from_slice(&self.previous.torque);
+        self.previous.last.write(memory);
+        self.previous.before.write(memory);
         self.previous.sent.write(memory);
         self.backup.write_memory(memory);
     }
@@ -164,20 +161,18 @@ impl Projector {
     /// # Panics
     /// When it has another length.
     pub fn set_memory(&mut self, memory: &[f64]) {
-        let nv = self.previous.acceleration.len();
-        self.previous.known = memory[0] != 0.0;
-        self.previous.acceleration.copy_from_slice(&memory[1..=nv]);
-        self.previous.torque.copy_from_slice(&memory[1 + nv..=2 * nv]);
-        let rest = self.previous.sent.set(&memory[1 + 2 * nv..]);
+        let rest = self.previous.last.read(memory);
+        let rest = self.previous.before.read(rest);
+        let rest = self.previous.sent.set(rest);
         self.backup.set_memory(rest);
     }
 
     /// Makes the last tick, which ended with `target`, the tick before.
     pub fn remember(&mut self, target: &Target) {
-        self.previous.acceleration.copy_from_slice(&target.acceleration);
-        self.previous.torque.copy_from_slice(self.checker.torque());
-        let known = |x: &[f64]| x.iter().all(|x| x.is_finite());
-        self.previous.known = known(&self.previous.acceleration) && known(&self.previous.torque);
+        let History { last, before, .. } = &mut self.previous;
+        std::mem::swap(last, before);
+        last.set(&target.acceleration, self.checker.torque());
+        last.known = [&last.acceleration, &last.torque].into_iter().flatten().all(|x| x.is_finite());
         self.previous.sent.remember(target, &self.period);
     }
 

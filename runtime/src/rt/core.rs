@@ -415,8 +415,11 @@ impl<T: LoopController> Core<T> {
             return; // it has answered in every slot, at its own pace
         }
         let alone = state.late.saturating_sub(known.late);
+        if alone > lost {
+            controller.recall();
+        }
         if alone.max(lost) > 0 {
-            controller.miss(alone.max(lost), alone > lost);
+            controller.miss(alone.max(lost));
         }
         self.pace.take(state.time - known.time, lost + 1, self.settings.period);
     }

@@ -245,14 +245,16 @@ impl LoopController for Pilot {
     }
 
     fn lose(&mut self) {
-        self.controller.projector().lose();
+        self.controller.lose();
         self.share(false);
     }
 
-    fn miss(&mut self, periods: u64, came_late: bool) {
-        if came_late {
-            self.controller.projector().recall();
-        }
+    fn recall(&mut self) {
+        self.controller.recall();
+        self.share(false);
+    }
+
+    fn miss(&mut self, periods: u64) {
         self.controller.projector().miss(periods);
         self.share(false);
     }

@@ -1,7 +1,7 @@
 //! What the loop remembers from tick to tick, as plain numbers: after a gap in a flight log, replay goes on from there.
 
-/// Numbers that a controller may remember: for 64 joints the limits, the lengths of its parts, the tick before, two set points and a stored brake.
-pub const MAX_MEMORY: usize = 586;
+/// Numbers that a controller may remember: for 64 joints the limits, the lengths of its parts, the two ticks before with their set points and a stored brake.
+pub const MAX_MEMORY: usize = 715;
 
 /// The memory of a [`Core`](super::Core) after a tick, beside the tick's record. Only where the state was measured and the controller begins
 /// a policy period; elsewhere `is_set` is false and the rest says nothing.

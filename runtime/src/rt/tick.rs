@@ -22,9 +22,10 @@ pub trait LoopController: Send + 'static {
     fn reset(&mut self);
     /// What was answered in the tick before is not what the robot does.
     fn lose(&mut self) {}
-    /// The plant has gone on by itself for so many periods: from what was answered last, or, if that came too late to be applied, from the answer
-    /// before it.
-    fn miss(&mut self, _periods: u64, _came_late: bool) {}
+    /// What was answered in the tick before came too late and was never applied.
+    fn recall(&mut self) {}
+    /// The plant has gone on by itself for so many periods, from what was answered last.
+    fn miss(&mut self, _periods: u64) {}
     /// What it takes from another process in place of its policy; none where it takes nothing. Allocates; not for the real-time thread.
     fn question(&self) -> Option<Question> {
         None

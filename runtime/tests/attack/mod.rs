@@ -36,7 +36,7 @@ pub struct Attack {
     pub moves: Vec<(u64, Moved)>,
     /// Time that the plant takes to measure: a lockstep loop is faster than its log.
     pub pause: Duration,
-    /// One of so many states is lost, and the driver holds; 0 is none. Of [`Attack::fly`], with joints that are sent positions.
+    /// One of so many states is lost, and the driver holds; 0 is none. Of [`Attack::fly`], with joints that are sent positions or forces.
     pub lost: u64,
     /// One of so many answers comes too late: the driver holds, and says so in its next state; 0 is none. As for `lost`.
     pub late: u64,
@@ -228,6 +228,8 @@ struct Twin {
     v: Vec<f64>,
     a: Vec<f64>,
     held: Vec<Held>,
+    /// What it was sent last.
+    last: Vec<f64>,
     pause: Duration,
 }
 
@@ -250,6 +252,7 @@ impl Twin {
             v: zero.clone(),
             a: zero,
             held: vec![Held::Force(0.0); model.nv()],
+            last: Vec::new(),
             pause: attack.pause,
         }
     }
@@ -265,8 +268,11 @@ impl Twin {
         self.dynamics = PeriodDynamics::new(&model, &all, *self.dynamics.period());
     }
 
-    /// What a driver of positions does without an answer: it goes on, slower by what the joints may decelerate.
+    /// What a driver does without an answer: of positions it goes on, slower by what the joints may decelerate, of forces it holds them.
     fn hold(&mut self, snapshot: &Snapshot) {
+        if self.drives.iter().all(|drive| matches!(drive, Drive::Effort)) {
+            return self.step();
+        }
         let period = self.dynamics.period().dt * f64::from(self.steps);
         let most =
             snapshot.manifest.task.constraints.acceleration.as_ref().and_then(|a| a.limit.of("")).unwrap();
@@ -288,13 +294,18 @@ impl Twin {
 
     /// A period under these motor forces; none, and the motors hold it where it stands.
     fn act(&mut self, forces: &[f64]) {
-        if forces.is_empty() {
+        forces.clone_into(&mut self.last);
+        self.step();
+    }
+
+    fn step(&mut self) {
+        if self.last.is_empty() {
             return;
         }
         let (zero, period) = (vec![0.0; self.v.len()], *self.dynamics.period());
         let (dt, kappa) = (period.dt, period.kappa);
         for _ in 0..self.steps {
-            for (i, (held, command)) in self.held.iter_mut().zip(forces).enumerate() {
+            for (i, (held, command)) in self.held.iter_mut().zip(&self.last).enumerate() {
                 *held = self.drives[i].held(&period, self.q[i], self.v[i], *command);
             }
             self.dynamics.update(&self.q, &self.v, &zero);

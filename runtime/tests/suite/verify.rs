@@ -265,6 +265,66 @@ fn set_points_of_a_robot_that_lags_keep_their_limits_over_states_and_answers_tha
     }
 }
 
+/// Every seventh state is lost, every fifth answer and the next come too late, and the driver holds the forces of before. They then lead where nobody
+/// foresaw: by as much faster as a period's acceleration makes, for each period. No force is above its limit all the same, on the way back neither, and
+/// the change of a force, or of an acceleration, is that from what was sent before: it was reckoned from answers that nobody had applied.
+#[test]
+fn forces_keep_their_limits_and_rates_over_states_and_answers_that_are_lost() {
+    let numbers = |value: &Value| -> Vec<f64> {
+        value.as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect()
+    };
+    let largest =
+        |a: &[f64], b: &[f64]| a.iter().zip(b).fold(0.0, |most: f64, (a, b)| most.max((a - b).abs()));
+    for rates in ["", "torque_rate = { limit = 2000.0 }", "jerk = { limit = 600.0, hard = true }"] {
+        for (lost, late, periods) in [(0, 0, 0.0), (7, 0, 1.0), (0, 5, 2.0), (7, 5, 3.0)] {
+            let flight = Attack { lost, late, ..attack(&format!("{LIMITS}\n{rates}"), 0.004, 1, 20) };
+            let (_folder, log) = record("verify-rate", &flight);
+            let (mut before, mut compared) = (None::<[Vec<f64>; 2]>, 0);
+            let [mut force_change, mut change, mut force, mut fastest] = [0.0f64; 4];
+            for pair in ticks(&log).windows(2) {
+                let tick = &pair[0];
+                let between = |what: &str| {
+                    pair[1]["state"][what].as_u64().unwrap() - tick["state"][what].as_u64().unwrap()
+                };
+                let (v, target, action) =
+                    (numbers(&tick["state"]["v"]), numbers(&tick["target_v"]), numbers(&tick["action"]));
+                fastest = fastest.max(largest(&v, &[0.0; 7]));
+                let strength = |i: usize| if i < 4 { 0.8 * 87.0 } else { 0.8 * 12.0 };
+                force = action.iter().enumerate().fold(force, |most, (i, f)| most.max(f.abs() / strength(i)));
+                if between("late") >= between("seq") {
+                    continue; // it came too late
+                }
+                let acceleration: Vec<f64> =
+                    target.iter().zip(&v).map(|(to, from)| (to - from) / 0.004).collect();
+                if let Some([before_force, before]) = &before {
+                    let (status, slack) = (&tick["ledger"]["status"], &tick["ledger"]["slack"]);
+                    let status = status.as_u64().unwrap();
+                    // a brake that asks for more than the motors have gives way to them
+                    if status < 10 {
+                        change = change.max(largest(&acceleration, before));
+                    }
+                    // a soft rate gives way where something hard asks for it, and says so
+                    if status <= 1 && slack.as_f64().unwrap() < 1e-9 {
+                        force_change = force_change.max(largest(&action, before_force));
+                        compared += 1;
+                    }
+                }
+                before = Some([action, acceleration]);
+            }
+            let told = format!(
+                "{rates} {lost}, {late}: {fastest} rad/s, {force} of the force, changes {force_change}, {change}"
+            );
+            println!("{told} of {compared}");
+            assert!(force < 1.0 + 1e-6 && fastest > 1.0, "{told}");
+            match rates.split(' ').next() {
+                Some("torque_rate") => assert!(force_change < 8.0 + 1e-6 && compared > 100, "{told}"),
+                Some("jerk") => assert!(change < 2.4 + 1e-6, "{told}"),
+                _ => assert!(fastest < 1.305 + 0.1 * periods + 0.01, "{told}"),
+            }
+        }
+    }
+}
+
 /// What a joint went on from in the first tick after a gap is not in the log, so that its acceleration there, of which the jerk of the next tick speaks,
 /// is not known either: it was taken from the measured state, and honest logs were accused.
 #[test]

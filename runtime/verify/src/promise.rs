@@ -8,7 +8,7 @@ use crate::motion::Machine;
 use crate::moved::{Moved, Moving};
 use crate::period::Period;
 use crate::robot::{Payload, Robot};
-use crate::rows::Rule;
+use crate::rows::{Row, Rule};
 use crate::tick::Tick;
 
 /// The parts of a snapshot's manifest that are read.
@@ -406,6 +406,23 @@ impl Promise {
                 sent.q[at] += dt * slower;
             }
         }
+    }
+
+    /// The same of what they are asked for then (nv): what the last of the `periods` does to their mean speed.
+    pub(crate) fn hold_asked(&self, sent: &SetPoints, periods: u64, a: &mut [f64]) {
+        let mut by_then = sent.clone();
+        self.hold(&mut by_then, periods.min(MISSED) - 1);
+        let before = by_then.mean.clone();
+        self.hold(&mut by_then, 1);
+        for &(dof, position) in &self.follows {
+            a[dof] = position.map_or(0.0, |_| (by_then.mean[dof] - before[dof]) / self.period.dt);
+        }
+    }
+
+    /// Whether a tick depends on what was sent before it.
+    pub(crate) fn goes_on(&self) -> bool {
+        let Limits { rows, joints, .. } = self.built();
+        self.follows() || rows.iter().any(Row::needs_before) || joints.iter().any(|j| j.jerk.is_finite())
     }
 
     /// What is sent with the target of `tick` that began at `from` (nq, nv). Targets of a wrong length send nothing.

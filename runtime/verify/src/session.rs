@@ -46,10 +46,18 @@ struct Past {
     before: Option<SetPoints>,
     /// So many ticks of those two came after a gap of the log, from what was sent in ticks that it does not have.
     cut_off: u8,
-    /// Its acceleration, where it is known what it began from.
-    a: Option<Vec<f64>>,
     /// The brake that it stored; empty where it stored none.
     brake: Vec<f64>,
+    /// What it asked of the robot, and what the tick before it did.
+    asked: Asked,
+    asked_before: Asked,
+}
+
+/// What a tick asked of the robot.
+#[derive(Clone, Default)]
+struct Asked {
+    /// Acceleration, where it is known what it began from.
+    a: Option<Vec<f64>>,
     /// Acceleration and motor forces, where they are what the next tick was told.
     told: Option<Told>,
 }
@@ -58,6 +66,11 @@ impl Past {
     /// States between it and `next` that did not come.
     fn lost(&self, next: &State) -> u64 {
         next.seq.saturating_sub(self.seq.saturating_add(1))
+    }
+
+    /// The plant braked by itself up to `next`, a state that came after it.
+    fn is_braked_since(&self, next: &State) -> bool {
+        next.bits & BRAKED != 0 && (next.epoch, next.seq) != (self.epoch, self.seq)
     }
 
     /// Periods up to `next` in which the plant had no answer in time.
@@ -195,7 +208,7 @@ impl Session {
         self.arrive(tick.tick)?;
         if tick.swapped {
             self.begun = None;
-            self.past.iter_mut().for_each(|past| past.told = None);
+            self.past.iter_mut().for_each(|past| (past.asked.told, past.asked_before.told) = (None, None));
         }
         if tick.action.is_empty() {
             let asks = [&tick.target_q, &tick.target_v, &tick.brake].into_iter().any(|x| !x.is_empty());
@@ -242,6 +255,7 @@ impl Session {
             }
         };
         let (dt, nq, nv) = (promises.0.period.dt, promises.0.machine.nq(), promises.0.machine.nv());
+        let asked_before = self.asked(&promises.0, tick);
         // Of joints that go on from what they were sent, or of a predicted state, not known after a gap.
         let is_cut_off = self.is_cut_off(&promises.0, tick);
         let (begun, before) = match self.start(&promises.0, tick).filter(|_| !is_cut_off) {
@@ -261,8 +275,20 @@ impl Session {
         let state = &tick.state;
         let (epoch, seq, episode, brake) = (state.epoch, state.seq, state.episode, tick.brake.clone());
         let cut_off = if is_cut_off { 2 } else { cut_off.saturating_sub(1) };
-        let late = state.late;
-        self.past = Some(Past { epoch, seq, episode, target, late, sent, before, cut_off, a, brake, told });
+        let (late, asked) = (state.late, Asked { a, told });
+        self.past = Some(Past {
+            epoch,
+            seq,
+            episode,
+            target,
+            late,
+            sent,
+            before,
+            cut_off,
+            brake,
+            asked,
+            asked_before,
+        });
         Ok(())
     }
 
@@ -291,18 +317,45 @@ impl Session {
         Some(Start { from: (q, v), sent, waiting })
     }
 
-    /// Joints go on from what they were sent in a tick that the log does not have.
+    /// The tick goes on from what was sent in one that the log does not have.
     fn is_cut_off(&self, own: &Promise, tick: &Tick) -> bool {
         let goes_back = |past: &Past| {
             past.cut_off > 0 && !self.keeps_time && past.alone(&tick.state).max(past.lost(&tick.state)) > 0
         };
-        own.follows() && (self.has_gap || self.past.as_ref().is_some_and(goes_back))
+        let is_back = self.past.as_ref().is_some_and(goes_back);
+        is_back && own.goes_on() || self.has_gap && own.follows()
+    }
+
+    /// What was asked of the robot for what it does up to `tick`: by the tick before, or by the one before that where its answer came too late, and
+    /// from there on what the driver made of it without an answer. Nothing is known where the plant braked by itself.
+    fn asked(&self, own: &Promise, tick: &Tick) -> Asked {
+        let state = &tick.state;
+        let is_known = |past: &&Past| {
+            let fits = [past.target.0.len(), past.target.1.len()] == [own.machine.nq(), own.machine.nv()];
+            past.epoch == state.epoch && fits && !past.is_braked_since(state)
+        };
+        let Some(past) = self.past.as_ref().filter(is_known) else { return Asked::default() };
+        let (lost, alone) = (past.lost(state), past.alone(state));
+        let periods = lost.max(alone);
+        if self.keeps_time || periods == 0 {
+            return past.asked.clone();
+        }
+        let (sent, mut asked) = match alone > lost {
+            true => (past.before.as_ref(), past.asked_before.clone()),
+            false => (Some(&past.sent), past.asked.clone()),
+        };
+        if own.follows() {
+            let Some(sent) = sent else { return Asked::default() };
+            let told = asked.told.as_mut().map(|(a, _)| a);
+            asked.a.iter_mut().chain(told).for_each(|a| own.hold_asked(sent, periods, a));
+        }
+        asked
     }
 
     /// What stands as sent where `state` was measured: the last answer, or the one before it where that came too late, and from there on what the
     /// driver made of it without an answer. None where the plant braked by itself.
     fn standing(&self, own: &Promise, past: &Past, state: &State) -> Option<SetPoints> {
-        if state.bits & BRAKED != 0 {
+        if past.is_braked_since(state) {
             return None;
         }
         if self.keeps_time {
@@ -402,9 +455,7 @@ impl Session {
             return broken(what, tick.action[0], 0.0, "");
         }
         if self.is_cut_off(own, tick) {
-            return unknown(
-                "their joints go on from what they were sent in a tick that the log does not have",
-            );
+            return unknown("they go on from what was sent in a tick that the log does not have");
         }
         let Some((q, v)) = self.begins(own, tick) else {
             return unknown("they acted on a state predicted from a tick that the log does not have");
@@ -416,7 +467,7 @@ impl Session {
             self.begun = Some(Begun { goal: goal(own, tick, &q, &v), start: (q.clone(), v.clone()) });
         }
         let proposal = self.proposal(own, tick, by_policy, (&q, &v));
-        let last = self.past.as_ref().and_then(|past| past.a.clone());
+        let last = self.asked(own, tick).a;
         let mut case = Case { tick, is_own: true, q: &q, v: &v, status, by_policy, last, proposal };
         let told = self.confirm(own, &case)?;
         if let Some(pinned) = pinned {
@@ -439,7 +490,7 @@ impl Session {
     ) -> Result<(Vec<f64>, Vec<f64>), String> {
         let (mut pq, mut pv) = self.proposed(own, tick, by_policy, (q, v))?;
         for i in self.start(own, tick).map_or(Vec::new(), |start| start.waiting) {
-            self.rest(own, i, (q, v), (&mut pq, &mut pv))?;
+            self.rest((own, tick), i, (q, v), (&mut pq, &mut pv))?;
         }
         Ok((pq, pv))
     }
@@ -447,13 +498,13 @@ impl Session {
     /// Proposes rest for dof `i` at `q`, `v`, of hard jerk what leads there.
     fn rest(
         &self,
-        own: &Promise,
+        (own, tick): (&Promise, &Tick),
         i: usize,
         (q, v): (&[f64], &[f64]),
         (pq, pv): (&mut [f64], &mut [f64]),
     ) -> Result<(), String> {
         let p = &own.period;
-        pv[i] = match (own.built().joints[i].smooth(p), self.past.as_ref().and_then(|past| past.a.as_ref())) {
+        pv[i] = match (own.built().joints[i].smooth(p), self.asked(own, tick).a) {
             (None, _) => 0.0,
             (Some(smooth), Some(a)) => v[i] + p.dt * smooth.next(v[i], a[i]),
             (Some(_), None) => {
@@ -479,7 +530,7 @@ impl Session {
         let (mut pq, mut pv) = (q.to_vec(), v.to_vec());
         if !by_policy {
             for &i in &own.controllable {
-                self.rest(own, i, (q, v), (&mut pq, &mut pv))?; // the loop's own brake
+                self.rest((own, tick), i, (q, v), (&mut pq, &mut pv))?; // the loop's own brake
             }
             return Ok((pq, pv));
         }
@@ -536,7 +587,7 @@ impl Session {
         let a: Vec<f64> = (0..nv).map(|i| (tick.target_v[i] - case.v[i]) / p.dt).collect();
         let mut tau = vec![0.0; nv];
         promise.machine.motors(&p, case.q, case.v, &a, &mut tau);
-        let told = self.past.as_ref().and_then(|past| past.told.clone());
+        let told = self.asked(promise, tick).told;
         let before = told.as_ref().map(|(a, tau)| (&a[..], &tau[..]));
         let passage = Passage {
             q: case.q,

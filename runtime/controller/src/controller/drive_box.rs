@@ -22,9 +22,9 @@ const TOLERANCE: f64 = 1e-9;
 pub(super) struct DriveBox {
     joints: Vec<Joint>,
     dt: f64,
-    /// Force at the start of the tick before (n_act); not known at the start of an episode, when no rate holds.
-    before: Vec<f64>,
-    known: bool,
+    /// Force at the start of the tick before (n_act), then of the one before that; not known at the start of an episode, when no rate holds.
+    before: [Vec<f64>; 2],
+    known: [bool; 2],
 }
 
 struct Joint {
@@ -75,7 +75,8 @@ impl DriveBox {
             Ok(Joint { at, dof, idx_q, stiffness, damping, effort, rate, acceleration })
         };
         let joints = dofs.iter().enumerate().map(joint).collect::<Result<Vec<_>, _>>()?;
-        Ok(DriveBox { dt: m.task.time.dt, before: vec![0.0; joints.len()], known: false, joints })
+        let zero = vec![0.0; joints.len()];
+        Ok(DriveBox { dt: m.task.time.dt, before: [zero.clone(), zero], known: [false; 2], joints })
     }
 
     /// Where in the action the `k`-th controllable joint's command is.
@@ -87,10 +88,11 @@ impl DriveBox {
     /// [rad or m], and counts every drive that was asked for a force outside its interval. With `hold` off nothing is moved.
     pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], hold: bool) -> ActionReport {
         let mut report = ActionReport::default();
-        for (joint, before) in self.joints.iter().zip(&mut self.before) {
+        let [before, earlier] = &mut self.before;
+        for (joint, (before, earlier)) in self.joints.iter().zip(before.iter_mut().zip(earlier)) {
             let action = &mut action[joint.at];
             let (at, v) = (q[joint.idx_q], v[joint.dof]);
-            let (low, high) = joint.forces(v, self.dt, self.known.then_some(*before));
+            let (low, high) = joint.forces(v, self.dt, self.known[0].then_some(*before));
             let asked = joint.stiffness * (*action - at) - joint.damping * v;
             let broken = u32::from(asked < low - TOLERANCE || asked > high + TOLERANCE);
             report.raw_violations += broken;
@@ -101,26 +103,37 @@ impl DriveBox {
                 report.moved = report.moved.max((target - *action).abs());
                 *action = target;
             }
-            *before = force;
+            (*earlier, *before) = (*before, force);
         }
-        self.known = true;
+        self.known = [true, self.known[0]];
         report
     }
 
     pub(super) fn forget(&mut self) {
-        self.known = false;
+        self.known = [false; 2];
+    }
+
+    /// The target of the tick before came too late and was never sent.
+    pub(super) fn recall(&mut self) {
+        self.before.swap(0, 1);
+        self.known = [self.known[1], false];
     }
 
     /// Appends what the next tick depends on beside its arguments.
     pub(super) fn write_memory(&self, memory: &mut Vec<f64>) {
-        memory.push(f64::from(u8::from(self.known)));
-        memory.extend_from_slice(&self.before);
+        for (before, &known) in self.before.iter().zip(&self.known) {
+            memory.push(f64::from(u8::from(known)));
+            memory.extend_from_slice(before);
+        }
     }
 
     /// Takes what [`DriveBox::write_memory`] gave.
     pub(super) fn set_memory(&mut self, memory: &[f64]) {
-        self.known = memory[0] != 0.0;
-        self.before.copy_from_slice(&memory[1..]);
+        let parts = memory.chunks_exact(1 + self.joints.len());
+        for ((before, known), part) in self.before.iter_mut().zip(&mut self.known).zip(parts) {
+            *known = part[0] != 0.0;
+            before.copy_from_slice(&part[1..]);
+        }
     }
 }
 

@@ -1,6 +1,7 @@
 //! What a controller remembers from tick to tick, and how another controller takes it over.
 
 use super::dial::{Dial, Margin};
+use super::drive_box::DriveBox;
 use super::{Controller, SnapshotError};
 use nearl_constraints::{ActionLimit, Projector};
 
@@ -36,6 +37,21 @@ impl Controller {
         if let Some(dial) = &mut self.dial {
             dial.interrupt();
         }
+    }
+
+    /// What was given in the tick before came too late and was never sent: limits on a change, and joints that go on from what they were sent, go on
+    /// from the tick before it.
+    pub fn recall(&mut self) {
+        self.projector().recall();
+        self.drive_box.iter_mut().for_each(DriveBox::recall);
+        self.action_limit.iter_mut().for_each(ActionLimit::recall);
+    }
+
+    /// What was given in the tick before is not what the robot does: the next tick begins where it is measured, and limits on a change do not hold in it.
+    pub fn lose(&mut self) {
+        self.projector().lose();
+        self.drive_box.iter_mut().for_each(DriveBox::forget);
+        self.action_limit.iter_mut().for_each(ActionLimit::forget);
     }
 
     /// Whether the policy runs in the next tick.
