@@ -31,8 +31,9 @@ const ROUNDING: f64 = 1e-10;
 /// What is broken already may be broken by so much more: in 10,000 ticks it adds up to [`ROUNDING`].
 const NOISE: f64 = 1e-14;
 
-/// Ways of braking, tried from the one that passed last on.
-const TRIED: [Plan; 7] = [
+/// Ways of braking, tried from the one that passed last on. The latest are for drives whose target is at its end where they hold a joint against its
+/// weight: away from there they have hardly more force than that, `K T v` after a tick at `v`, and stop it within `m / (K T^2)` ticks at best.
+const TRIED: [Plan; 10] = [
     Plan::Together(1.0),
     Plan::Together(2.0),
     Plan::Apart(1.0),
@@ -40,6 +41,9 @@ const TRIED: [Plan; 7] = [
     Plan::Apart(0.5),
     Plan::Apart(0.2),
     Plan::Apart(0.0),
+    Plan::Together(25.0),
+    Plan::Together(250.0),
+    Plan::Together(10000.0),
 ];
 
 /// Without a position limit near, a joint that brakes by itself takes at least this share of the largest deceleration.

@@ -119,3 +119,38 @@ fn over_several_steps_the_largest_force_is_the_limit() {
         assert!((largest - 0.99 * 50.0).abs() < 1e-6, "{steps} steps: {ends:?}");
     }
 }
+
+/// A drive whose target is at its end where it holds a joint against its weight can hardly brake it on the way back inside: `K T v` more than the weight,
+/// after a tick at `v`. Such joints stood still for ever, whatever was proposed.
+#[test]
+fn a_joint_that_hangs_at_the_end_of_its_target_comes_back() {
+    for (stiffness, dt, ticks) in [(4000.0, 0.002, 2000), (400.0, 0.002, 4000), (1600.0, 0.001, 4000)] {
+        let mut description = slides(&[[0.0, 0.0]]).description().clone();
+        description.gravity = [9.81, 0.0, 0.0];
+        let model = Model::from_description(description).unwrap();
+        let (period, drives) = (Period::new(dt, 1), [Drive::Pd { stiffness, damping: 0.0 }]);
+        let of_drives = DriveTorqueLimit::new(TorqueLimit::default(), &drives, &[[-1.0, 1.0]], period);
+        let limits: [Box<dyn Limit>; 4] = [
+            Box::new(VelocityLimit::scaled(1.0)),
+            Box::new(AccelerationLimit::new(limit::AccelerationSettings::of(PerJoint::All(5.0), None))),
+            Box::new(TorqueLimit::default()),
+            Box::new(of_drives),
+        ];
+        let settings = Settings { braking: Braking::Stored, ..Settings::new(dt, 1) };
+        let mut projector = Projector::new(&model, &limits, &[0], settings).unwrap();
+        // 2 kg hang at the lower end of the target: `K (q* - q) = -2 g` with `q* = -1`
+        let begin = -1.0 + 2.0 * 9.81 / stiffness;
+        let (mut q, mut v, mut target) = (vec![begin], vec![0.0], Target::new(&model));
+        let mut proposal = Proposal::new(&model);
+        for _ in 0..ticks {
+            // a speed at which it stops within what is left to there
+            let speed: f64 = (0.5 - q[0]).clamp(0.0, 1.0);
+            (proposal.q[0], proposal.v[0]) = (q[0] + dt * speed, speed);
+            projector.project(&q, &v, &proposal, &mut target);
+            assert_eq!(target.ledger.target_violations.total(), 0, "{:?}", target.ledger);
+            (q, v) = (target.q.clone(), target.v.clone());
+        }
+        println!("{stiffness} N/m: from {begin} to {} m, at {} m/s", q[0], v[0]);
+        assert!(q[0] > begin + 0.5, "{stiffness} N/m: from {begin} to {} m", q[0]);
+    }
+}
