@@ -439,6 +439,10 @@ impl<T: LoopController> Core<T> {
             return self.hold(Reason::FrozenState);
         }
         let jump = self.settings.jump;
+        if jump > 0.0 && self.held.is_none() && self.controller.controller.elsewhere(state).is_some() {
+            counters.implausible_states += 1;
+            return Event::Lost(Reason::ImplausibleState);
+        }
         if jump > 0.0 && self.held.is_some() {
             let ticks = state.tick.saturating_sub(self.estimate.tick).max(1);
             let age = ticks as f64 * self.settings.period as f64 * 1e-9;

@@ -45,10 +45,10 @@ codes! {
             "Check the plant's sensors; the first few are bridged by prediction, then the plant brakes.";
         BadStates = "bad-states", "More states in a row held NaN or infinity than allowed; latched.",
             "Repair the plant's sensors, then start the runtime again.";
-        ImplausibleState = "implausible-state", "A joint jumped further than its speed allows in the time that passed.",
-            "Check encoder and wiring of the plant; the sample was not used.";
+        ImplausibleState = "implausible-state", "A joint jumped further than its speed allows in the time that passed, or an episode begins further outside of its range than that is wide.",
+            "Check encoder, wiring, unit (degrees for radians?) and joint order of the plant; the sample was not used.";
         ImplausibleStates = "implausible-states", "More implausible states in a row than allowed; latched.",
-            "Check encoders and joint order of the plant, then start the runtime again.";
+            "Check encoders, units and joint order of the plant, then start the runtime again.";
         SilentProposer = "silent-proposer", "The process that proposes has said nothing usable for longer than the age limit.",
             "Look at that process; --proposal-age and --proposal-hold are how long its last proposal counts.";
         Controller = "controller", "The controller refused the state: it gave no checked target.",

@@ -4,7 +4,7 @@ use std::cell::Cell;
 use std::collections::BTreeMap;
 
 use nearl_constraints::description::JointKind;
-use nearl_constraints::{BrakeReason, Entry, Ledger, LimitSet, Moved, RefuseReason, Side, Status};
+use nearl_constraints::{BrakeReason, Entry, Joint, Ledger, LimitSet, Moved, RefuseReason, Side, Status};
 
 use crate::codes::LedgerStatus;
 use crate::controller::{Controller, Noise, Output, State};
@@ -33,6 +33,8 @@ pub struct Pilot {
     observed: Vec<Entry>,
     /// Joints whose samples are checked: degree of freedom, configuration index, largest speed V [rad/s or m/s].
     checked: Vec<(usize, usize, f64)>,
+    /// Joints with a range: degree of freedom, configuration index, and the positions of which none is outside [rad or m].
+    places: Vec<(usize, usize, [f64; 2])>,
     /// The policy proposes states; a direct one without a guard gives actions only.
     proposes: bool,
     /// A number for the limits of the joints: equal limits, equal numbers.
@@ -82,6 +84,7 @@ impl Pilot {
             entries: (0..layout.n_state()).map(|k| layout.state_entry(k)).collect(),
             observed: layout.entries().to_vec(),
             checked: checked(&controller),
+            places: places(&controller),
             proposes: snapshot.manifest.proposes(),
             limits: number_of(controller.limits()),
             memory: controller.memory(),
@@ -169,6 +172,19 @@ fn checked(controller: &Controller) -> Vec<(usize, usize, f64)> {
         .filter(|j| layout.controllable().contains(&j.idx_v) && limits.velocity[j.idx_v].is_finite())
         .map(|j| (j.idx_v, j.idx_q, limits.velocity[j.idx_v]))
         .collect()
+}
+
+/// Where joints may stand where an episode begins: outside of their range by as much as it is wide, and by half a radian or metre.
+fn places(controller: &Controller) -> Vec<(usize, usize, [f64; 2])> {
+    let (model, layout) = (controller.model(), controller.layout());
+    let place = |joint: &Joint| {
+        let (lower, upper) =
+            (model.lower_position_limit()[joint.idx_q], model.upper_position_limit()[joint.idx_q]);
+        let away = (upper - lower).max(0.5);
+        away.is_finite().then_some((joint.idx_v, joint.idx_q, [lower - away, upper + away]))
+    };
+    let joints = model.joints().iter().filter(|j| j.nv == 1 && j.nq == 1);
+    joints.filter(|j| layout.controllable().contains(&j.idx_v)).filter_map(place).collect()
 }
 
 /// The low half of a hash of the limits.
@@ -357,6 +373,13 @@ impl LoopController for Pilot {
             new.v[dof].abs() > jump * speed || way > jump * age * speed.max(new.v[dof].abs())
         };
         self.checked.iter().find(jumped).map(|joint| joint.0)
+    }
+
+    fn elsewhere(&self, state: &StateMessage) -> Option<usize> {
+        let is_outside = |(_, idx_q, [lower, upper]): &&(usize, usize, [f64; 2])| {
+            !(*lower..=*upper).contains(&state.q[*idx_q])
+        };
+        self.places.iter().find(is_outside).map(|place| place.0)
     }
 
     fn soften(&mut self, state: &StateMessage, share: f64, output: &mut TickOutput) {

@@ -69,6 +69,10 @@ pub trait LoopController: Send + 'static {
     fn implausible(&self, _old: &StateMessage, _new: &StateMessage, _age: f64, _jump: f64) -> Option<usize> {
         None
     }
+    /// A degree of freedom of `state` that is further outside of its joint's range than any robot stands, in degrees for radians for one.
+    fn elsewhere(&self, _state: &StateMessage) -> Option<usize> {
+        None
+    }
     /// Takes `output` back towards standing still: `share` in (0, 1) of the way to its target is left. Only where a model
     /// of the robot knows the action for that; the others stay as they are.
     fn soften(&mut self, _state: &StateMessage, _share: f64, _output: &mut TickOutput) {}

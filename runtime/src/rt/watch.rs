@@ -95,6 +95,10 @@ impl Watch {
             // Where nobody reads, the mode still stands in the report.
             let _ = tell.try_send((record.tick, record.mode, record.reason));
         }
+        let is_elsewhere = matches!(record.reason, Reason::ImplausibleState | Reason::ImplausibleStates);
+        if is_elsewhere && record.fresh {
+            self.name(record);
+        }
         if record.output.nu == 0 {
             return;
         }

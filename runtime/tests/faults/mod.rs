@@ -168,6 +168,10 @@ fn fault_26_a_jump_is_rejected_and_counted() {
     let stays = Flight::of(&[(400, 20, FaultKind::Jump { by: 1.0 })], 600);
     assert_eq!(stays.first(Mode::Fault), Some((407, Reason::ImplausibleStates)));
     stays.assert_within_limits(ROUNDING);
+    // Before the first motion a position that no robot has, as one in degrees: nothing is sent.
+    let degrees = Flight::of(&[(1, 30, FaultKind::Jump { by: 30.0 })], 60);
+    assert_eq!(degrees.first(Mode::Fault), Some((8, Reason::ImplausibleStates)));
+    assert!(degrees.records.iter().take(30).all(|record| record.output.nu == 0));
 }
 
 #[test]

@@ -214,7 +214,7 @@ pub const ROWS: &[Row] = &[
     (
         26,
         "sensor jump",
-        "rejected and counted, bridged 3 times, after 8 latched",
+        "rejected and counted, bridged 3 times, after 8 latched; nothing is sent where an episode begins with one in degrees",
         &["implausible-state", "implausible-states"],
         &[(HERE, "fault_26_a_jump_is_rejected_and_counted")],
     ),
