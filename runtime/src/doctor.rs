@@ -18,7 +18,7 @@ use crate::link::{
     RobotMessage, RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, home_of_user, remains,
 };
 use crate::rt::{PRIORITY, Pilot, Stop, ThreadSettings, bench_wake, prepare};
-use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError, in_run};
+use crate::snapshot::{Manifest, ModelFormat, PolicyKind, Snapshot, SnapshotError, in_run};
 use crate::task::IdmKind;
 
 /// Check that a snapshot, this machine and a plant are ready.
@@ -269,6 +269,7 @@ fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
     notes.extend(beyond_motors(m, parts, &drives));
     notes.extend(unguarded(m));
     notes.extend(far_poses(m, model));
+    notes.extend(other_steps(m));
     notes
 }
 
@@ -333,6 +334,29 @@ fn far_poses(m: &Manifest, model: &nearl_constraints::Model) -> Vec<String> {
         })
     };
     policy.joints.iter().zip(&policy.pose).filter_map(note).collect()
+}
+
+/// MuJoCo's timestep where a file states none [s].
+const TIMESTEP: f64 = 0.002;
+
+/// Physics steps that limits are reckoned for, where the robot file's are others. What a file includes is not looked at.
+fn other_steps(m: &Manifest) -> Option<String> {
+    let file = m.simulation.as_ref().filter(|simulation| simulation.format == ModelFormat::Mjcf)?;
+    let document = roxmltree::Document::parse(&file.text).ok()?;
+    let root = document.root_element();
+    if root.descendants().any(|element| element.has_tag_name("include")) {
+        return None;
+    }
+    let options = root.children().filter(|element| element.has_tag_name("option"));
+    let stated = options.filter_map(|option| option.attribute("timestep")).next_back();
+    let timestep: f64 = stated.map_or(Some(TIMESTEP), |text| text.trim().parse().ok())?;
+    let sim_dt = m.task.time.sim_dt;
+    (sim_dt > 0.0 && (sim_dt - timestep).abs() > 1e-12).then(|| {
+        format!(
+            "[time] sim_dt is {sim_dt} s, and the robot file's timestep is {timestep} s: limits are reckoned for steps of {sim_dt} s, and a simulation that \
+             makes others leaves them; write sim_dt = {timestep}, or 0 for a robot that makes no steps"
+        )
+    })
 }
 
 /// `T sqrt(K / I)` of a drive that is held on its target for `T` above which it has moved its joint a good part of the way there: where the physics steps

@@ -321,6 +321,26 @@ fn a_moving_link_without_an_inertia_is_named() {
 }
 
 /// What a policy sees and asks for is relative to its pose: one in degrees had the joint go to the end of its range, and nothing said so.
+/// A recipe whose steps are not those of the robot file: accelerations came out at twice their limit, and nothing but the plant said so.
+#[test]
+fn physics_steps_that_are_not_the_file_s_are_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    let file = write(folder.path(), SAME, SAME);
+    let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).expect("task");
+    complete(&mut manifest).expect("manifest");
+    let stated = manifest.task.time.sim_dt;
+    let notes = |sim_dt: f64| {
+        let mut manifest = manifest.clone();
+        manifest.task.time.sim_dt = sim_dt;
+        let about = |note: &String| note.contains("timestep");
+        told(&manifest).expect("notes").into_iter().filter(about).collect::<Vec<_>>()
+    };
+    assert!(stated > 0.0 && notes(stated).is_empty() && notes(0.0).is_empty());
+    let found = notes(0.005);
+    let says = format!("sim_dt is 0.005 s, and the robot file's timestep is {stated} s");
+    assert!(found.len() == 1 && found[0].contains(&says), "{found:?}");
+}
+
 #[test]
 fn a_pose_outside_of_a_range_is_named() {
     let folder = tempfile::tempdir().expect("folder");
