@@ -44,6 +44,7 @@ from nearl.sources import (
     csv_table,
     feature_names,
     lerobot_column,
+    lerobot_rows,
     minari_dataset,
     npz_arrays,
     once,
@@ -124,7 +125,7 @@ def from_columns(
             raise BadDemonstrations(f"{where}: {n} rows make no transition; give at least 2")
         check_others(columns, used, n, dt, where, told)
         check_units(of_task, _entries(env), qpos, qvel, rates, dt, where, told)
-        check_velocities(columns, _entries(env)[1], qvel, rates, where, told)
+        check_velocities(columns, _entries(env)[1], qvel, rates, dt, where, told)
         rows = Rows(n, dt, period)
         known = [name for name in (*env.obs_names, *goal_names(env)) if name in columns]
         recorded = {name: rows.newest(column(columns, name, n, where)) for name in known}
@@ -285,12 +286,16 @@ def from_lerobot(
 ) -> Path:
     """Reads a LeRobot dataset (v3) from its folder: ``key`` frame by frame, at the rate of ``meta/info.json``, against which its timestamps are held.
 
-    ``names`` are the entries of ``key``; by default the dataset's own, of which ``shoulder.pos`` and ``shoulder`` are the joint ``shoulder`` and
-    ``shoulder.vel`` is its velocity. Entries that the task has no place for are left out with a warning. ``actions`` are entries of the feature ``action``
-    by the dataset's names, in the order of the task's actuators; where it has no names they are ``action.0``, ``action.1`` and on.
+    A dataset in which frames or files are missing is refused: its data is held against the numbers of episodes and frames in ``meta/info.json``, the lengths
+    in ``meta/episodes`` and the column ``frame_index``.
+
+    ``names`` are the entries of ``key``, by default the dataset's own. Of either ``shoulder.pos`` and ``shoulder`` are the joint ``shoulder`` and
+    ``shoulder.vel`` is its velocity; columns of the task are meant by their own names, as ``q.shoulder``. Entries that the task has no place for are left
+    out with a warning. ``actions`` are entries of the feature ``action`` by the dataset's names, in the order of the task's actuators; where it has no names
+    they are ``action.0``, ``action.1`` and on.
     """
     try:
-        from pyarrow import parquet
+        import pyarrow  # noqa: F401 (is asked for here, so that its absence is said first)
     except ImportError as error:
         raise ImportError("reading a LeRobot dataset needs pyarrow: pip install 'nearl[demos]'") from error
     source, meta = f"'{os.fspath(folder)}'", Path(folder) / "meta" / "info.json"
@@ -307,9 +312,12 @@ def from_lerobot(
         raise BadDemonstrations(f"'{meta}' describes no LeRobot dataset of version 3 ({error!r}); give the dataset's folder") from None
     if key not in features:
         raise BadDemonstrations(f"{source}: no feature '{key}'; it has {', '.join(features)}")
-    given = feature_names(features[key])
-    if names is None:
-        names = [lerobot_column(name) for name in given]
+    env = _core.Env(os.fspath(task))
+    used = _known(env)
+    if isinstance(names, str):
+        raise BadDemonstrations(f"{source}: names is {names!r}; give a list, one name for each entry of '{key}'")
+    given = [unbraced(name) for name in (feature_names(features[key]) if names is None else names)]
+    names = [name if name in used else lerobot_column(name) for name in given]
     wanted = [key]
     if actions:
         if "action" not in features:
@@ -317,14 +325,13 @@ def from_lerobot(
         wanted.append("action")
     if "timestamp" in features:
         wanted.append("timestamp")  # held against the rate
-    parts: dict[str, list[Any]] = {name: [] for name in (*wanted, "episode_index")}
-    for file in sorted((Path(folder) / "data").rglob("*.parquet")):
-        table = parquet.read_table(file, columns=list(parts))
-        for name, rows in parts.items():
-            rows += table[name].to_pylist()
+    parts = lerobot_rows(folder, info, wanted)
     values = np.array(parts[key], float)
     if values.ndim != 2 or values.shape[1] != len(names):
-        raise BadDemonstrations(f"{source}: '{key}' has shape {values.shape} and {len(names)} names; give names=")
+        raise BadDemonstrations(
+            f"{source}: '{key}' has shape {values.shape} and {len(names)} names; give names=, one for each entry: <joint>, "
+            f"<joint>.pos, <joint>.vel, or a column of the task ({', '.join(_entries(env)[0])})"
+        )
     once(names, source)
     columns = dict(zip(names, values.T))
     if actions:
@@ -340,9 +347,7 @@ def from_lerobot(
         # of its own, because a target is often called as the position is
         columns |= {f"action of {name}": acted[:, of_action.index(name)] for name in actions}
         actions = [f"action of {name}" for name in actions]
-    env = _core.Env(os.fspath(task))
-    used = _known(env)
-    if left := [said for said, name in zip(given if len(given) == len(names) else names, names) if name not in used]:
+    if left := [said for said, name in zip(given, names) if name not in used]:
         warnings.warn(
             f"{source}: of '{key}' {', '.join(left)} {'is' if len(left) == 1 else 'are'} left out, because the task has no such column; give names= if they "
             f"are joints of other names ({', '.join(_entries(env)[0])})",

@@ -20,6 +20,9 @@ _SLOW = 1.0  # s between two rows, which only a policy as slow records
 _STILL = 0.02  # rad/s or m/s below which a joint stands, for all that a recording tells
 _FEW = 5  # rows of motion that say something of a velocity
 _OFF = 0.65  # part of the larger by which velocity and difference must differ: a factor of three, or the sign
+_FACTOR, _MOST = 1.45, 1.3  # how many times as fast as the other one is in half of the rows, and in three quarters: a factor of 1.5 with room for rounding
+_SPAN = 8  # rows over which noise of positions matters less
+_BEYOND = 0.1  # part of its range by which a joint is outside of it, where that is told
 _DRAWS = 3  # episodes in which a state is looked at, to see what is drawn in each
 _LOOKS = 256  # states of an episode that are looked at for it
 _JITTER = 0.05  # part of dt by which recorded times may differ from it
@@ -159,8 +162,8 @@ def check_units(
     where: str,
     told: set[str],
 ) -> None:
-    """Refuses positions (n x nq) further outside the task's limits than these are apart and than half a turn, and warns of speeds (n x nv) that are far
-    above theirs, and of single rows between which a joint jumps (``rates``, n - 1 x nv)."""
+    """Refuses positions (n x nq) further outside the task's limits than these are apart and than half a turn. Warns of positions outside by a tenth of the
+    range, of speeds (n x nv) that are far above theirs, and of single rows between which a joint jumps (``rates``, n - 1 x nv)."""
     limits, dofs = of_task.limits, of_task.row_names
     for k, name in enumerate(names[1]):
         joint = name[2:]
@@ -177,6 +180,9 @@ def check_units(
                     f"{where}: column 'q.{joint}' is {positions[row]:g} in row {row}, and joint '{joint}' goes from {lower:.3g} to {upper:.3g} rad or m; "
                     f"if these are degrees or millimetres, give numpy.radians of them, or metres"
                 )
+            if outside[row] > _BEYOND * (upper - lower) and (key := f"range of {joint}") not in told:
+                told.add(key)
+                _warn_of_range(joint, float(positions[row]), row, (lower, upper), positions, where)
         limit = limits["velocity"][dof]
         if (at := _jump(rates[:, k], limit)) is not None and "q." + joint in names[0]:
             if (key := f"jump of {joint}") not in told:
@@ -190,6 +196,17 @@ def check_units(
                 f"look whether its columns are in rad or m, and dt in seconds",
                 stacklevel=3,
             )
+
+
+def _warn_of_range(joint: str, value: float, row: int, limits: tuple[float, float], positions: Floats, where: str) -> None:
+    lower, upper = limits
+    share = np.mean((positions < lower) | (positions > upper))
+    warnings.warn(
+        f"{where}: column 'q.{joint}' is {value:.4g} in row {row}, and the task lets joint '{joint}' be at {lower:.3g} to {upper:.3g} rad or m (its range less "
+        f"constraints.position.margin); {100 * share:.3g} % of the rows are outside. Look whether these are degrees, millimetres or shares of an opening (0 to "
+        f"1), and whether the column is of another joint or counts from another zero; if it is right, give the joint that room in the robot file or the task",
+        stacklevel=4,
+    )
 
 
 def _jump(rate: Floats, limit: float) -> int | None:
@@ -211,34 +228,41 @@ def _warn_of_jump(joint: str, positions: Floats, row: int, dt: float, limit: flo
     )
 
 
-def check_velocities(columns: Columns, names: Sequence[str], qvel: Floats, rates: Floats, where: str, told: set[str]) -> None:
-    """Warns of recorded velocities (n x nv) that positions do not follow: another sign, unit or gear.
+def check_velocities(columns: Columns, names: Sequence[str], qvel: Floats, rates: Floats, dt: float, where: str, told: set[str]) -> None:
+    """Warns of recorded velocities (n x nv) that positions do not follow: another sign, unit, gear or ``dt``.
 
     Between two rows the mean of both velocities stands against ``rates`` (n - 1 x nv), what the positions change by. Only rows in which something moves
-    steadily count, and half of these must be off, so that an angle that jumps by a turn, an impact or rows that are far apart are no reason. ``told`` are
-    the columns that were warned of.
+    steadily count, and half of these must be off, so that an angle that jumps by a turn, an impact or rows that are far apart are no reason. Off is a factor
+    of three or the other sign, or a factor of one and a half that is in most of the rows and over longer spans too, as noise makes none. ``told`` are the
+    columns that were warned of.
     """
-    wrong = []
+    wrong, factors = [], []
     for k, name in enumerate(names):
         base, _, entry = name.rpartition(".")
         place = f"q{base[1:]}.qw" if entry in ("wx", "wy", "wz") else "q" + name[1:]
         if name in told or name not in columns or place not in columns:
             continue
-        if (row := _disagrees(qvel[:, k], rates[:, k])) is not None:
+        if (found := _disagrees(qvel[:, k], rates[:, k])) is not None:
             told.add(name)
+            row, factor = found
             given = (qvel[row, k] + qvel[row + 1, k]) / 2
             wrong.append((f"column '{name}' is {given:.3g} around row {row}, where '{place}' changes by {rates[row, k]:.3g} a second", name))
-    if wrong:
-        also = f" (likewise {', '.join(name for _, name in wrong[1:])})" if wrong[1:] else ""
-        warnings.warn(
-            f"{where}: {wrong[0][0]}, and is as far off in half of the rows{also}; look at sign, unit and dt, or leave velocities out: then they are the "
-            "differences of the positions",
-            stacklevel=3,
-        )
+            factors.append(factor)
+    if not wrong:
+        return
+    also = f" (likewise {', '.join(name for _, name in wrong[1:])})" if wrong[1:] else ""
+    of_time = None not in factors and len(factors) > 1 and max(factors) < 1.1 * min(factors)  # type: ignore[type-var, operator]
+    fits = f" (rows about {dt / float(np.median(factors)):.2g} s apart would fit, and dt is {dt:g} s)" if of_time else ""  # type: ignore[arg-type]
+    warnings.warn(
+        f"{where}: {wrong[0][0]}, and is as far off in half of the rows{also}; look at sign, unit and dt{fits}, or leave velocities out: then they are the "
+        "differences of the positions",
+        stacklevel=3,
+    )
 
 
-def _disagrees(velocity: Floats, rate: Floats) -> int | None:
-    """A row in which a velocity (n) is as far from the change of the position (n - 1) as in half of the rows, where that is far."""
+def _disagrees(velocity: Floats, rate: Floats) -> tuple[int, float | None] | None:
+    """A row in which a velocity (n) is as far from the change of the position (n - 1) as in half of the rows, where that is far, and how many times as fast
+    it is, where it is as many times in most of them."""
     mean = (velocity[1:] + velocity[:-1]) / 2
     size = np.maximum(np.abs(mean), np.abs(rate))
     step = np.abs(np.diff(rate))
@@ -248,8 +272,32 @@ def _disagrees(velocity: Floats, rate: Floats) -> int | None:
     moves = np.flatnonzero(steady & (size >= max(_STILL, 0.2 * np.percentile(size, 90))))
     if len(moves) < max(_FEW, 0.2 * len(rate)):
         return None
-    off = (np.abs(mean - rate) / size)[moves]
-    return int(moves[np.argsort(off)[len(off) // 2]]) if np.median(off) > _OFF else None
+    off = np.abs(mean - rate)[moves] / size[moves]
+    row = int(moves[np.argsort(off)[len(off) // 2]])
+    factor = _factor(mean[moves], rate[moves])
+    span = min(_SPAN, len(rate) // _FEW)
+    sums = [np.convolve(of, np.ones(span), "valid") for of in (mean, rate)]
+    if np.median(off) > _OFF:
+        # A velocity that is another one in each row and comes to nothing is noise around a joint that stands.
+        noise = np.median(np.abs(rate[moves])) < _STILL and np.median(np.abs(sums[0])) < 0.65 * span * np.median(np.abs(mean))
+        return None if noise else (row, factor)
+    if factor is None:
+        return None
+    far = np.maximum(*np.abs(sums))
+    over = _factor(*(of[far >= max(_STILL * span, 0.2 * np.percentile(far, 90))] for of in sums))
+    return (row, factor) if over is not None and (over > 1) == (factor > 1) else None
+
+
+def _factor(given: Floats, found: Floats) -> float | None:
+    """How many times as fast ``given`` is as ``found``, neither of them small, where that is far from one in most entries."""
+    size = np.maximum(np.abs(given), np.abs(found))
+    # in parts of the larger one, so that neither is divided by what may be 0
+    lead = np.where(given * found > 0, (np.abs(given) - np.abs(found)) / np.maximum(size, 1e-300), 0.0)
+    for sign in (1, -1):
+        quarter, half = np.percentile(sign * lead, [25, 50]) if len(lead) else (0.0, 0.0)
+        if half > 1 - 1 / _FACTOR and quarter > 1 - 1 / _MOST:
+            return float((1 / (1 - half)) ** sign) if half < 1 else None
+    return None
 
 
 class Rows:

@@ -2,10 +2,12 @@
 
 import csv
 import os
+import re
 import zipfile
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -157,6 +159,89 @@ def feature_names(feature: Mapping[str, Any]) -> list[str]:
     """Names of the entries of a feature of a LeRobot dataset; none where it has none."""
     names = feature.get("names") or []
     return list(names.get("motors", []) if isinstance(names, Mapping) else names)
+
+
+def lerobot_rows(folder: FilePath, info: Mapping[str, Any], wanted: Sequence[str]) -> dict[str, list[Any]]:
+    """The features ``wanted`` of a LeRobot dataset frame by frame, and its ``episode_index``; refuses one in which frames are missing.
+
+    What there has to be say ``info``, which is meta/info.json, the lengths in meta/episodes, and the column ``frame_index``: each where it is there.
+    """
+    root, source = Path(folder), f"'{os.fspath(folder)}'"
+    files = sorted((root / "data").rglob("*.parquet"))
+    if not files:
+        raise BadDemonstrations(f"{source}: its folder 'data' has no parquet file, in which the frames are; get the dataset again, the whole of it")
+    parts: dict[str, list[Any]] = {name: [] for name in dict.fromkeys((*wanted, "episode_index"))}
+    frames: list[int] = []
+    begins = []
+    for file in files:
+        begins.append(len(parts["episode_index"]))
+        table = _parquet(file, [*parts, "frame_index"])
+        if missing := [name for name in parts if name not in table]:
+            raise BadDemonstrations(f"'{file}': no column '{missing[0]}'; it has {', '.join(table) or 'none that is asked for'}: get the file again")
+        for name, rows in parts.items():
+            rows += table[name]
+        frames += table.get("frame_index", [])
+    of = np.array(parts["episode_index"])
+    split({}, of, source)  # refuses episodes whose rows are not together
+    if (lack := _lack(root, info, of, frames, files, begins)) is not None:
+        hint = f" ({', '.join(gone)} {'is' if len(gone) == 1 else 'are'} not there)" if (gone := _gone(root, info, files)) else ""
+        raise BadDemonstrations(
+            f"{source}: {lack}{hint}; get the dataset again, the whole of it, or give the episodes that are whole to nearl.demos.from_columns"
+        )
+    return parts
+
+
+def _parquet(file: Path, names: Sequence[str]) -> dict[str, list[Any]]:
+    """Those of the columns ``names`` that a parquet file has."""
+    import pyarrow
+    from pyarrow import parquet
+
+    try:
+        with parquet.ParquetFile(file) as data:
+            table = data.read([name for name in names if name in data.schema_arrow.names])
+            return {name: table[name].to_pylist() for name in table.column_names}
+    except (pyarrow.ArrowException, OSError) as error:
+        said = " ".join(str(error).split()).rstrip(".")
+        raise BadDemonstrations(f"'{file}' cannot be read as parquet ({said}); it was cut short or damaged: get the file again") from None
+
+
+def _lack(root: Path, info: Mapping[str, Any], of: NDArray[Any], frames: list[int], files: list[Path], begins: list[int]) -> str | None:
+    """What is missing in a LeRobot dataset whose rows are of the episodes ``of``; ``begins`` are the first rows of its ``files``."""
+    where = lambda row: f"'{files[int(np.searchsorted(begins, row, 'right')) - 1].relative_to(root).as_posix()}'"  # noqa: E731
+    episodes, first, lengths = np.unique(of, return_index=True, return_counts=True)
+    there = f"the data has {len(episodes)} episodes with {len(of)} frames"
+    total = [info.get(name) for name in ("total_episodes", "total_frames")]
+    said = [f"{n} {what}" for n, what in zip(total, ("episodes", "frames")) if isinstance(n, int)]
+    if said:
+        there += f", and meta/info.json says {' with '.join(said)}"
+    for episode, row, n in zip(episodes, first, lengths):
+        own = np.array(frames[row : row + n]) if len(frames) == len(of) else np.arange(n)
+        if len(off := np.flatnonzero(own != np.arange(n))):
+            k = int(off[0])
+            begins_at = f"begins with frame {own[0]}" if k == 0 else f"goes from frame {own[k - 1]} to frame {own[k]}"
+            return f"episode {episode} {begins_at} in {where(row + k)}, so frames of it are missing; {there}"
+    tables = [_parquet(file, ["episode_index", "length"]) for file in sorted((root / "meta" / "episodes").rglob("*.parquet"))]
+    stated = {e: n for table in tables if len(table) == 2 for e, n in zip(table["episode_index"], table["length"])}
+    for episode, row, n in zip(episodes, first, lengths):
+        if (length := stated.get(int(episode), n)) != n:
+            return f"episode {episode} has {n} frames up to {where(row + n - 1)}, and meta/episodes says {length}; {there}"
+    if any(isinstance(n, int) and n != has for n, has in zip(total, (len(episodes), len(of)))):
+        absent = sorted({*stated, *range(total[0] if isinstance(total[0], int) else 0)} - {int(e) for e in episodes})
+        return there + (f"; the first that is missing is episode {absent[0]}" if absent else "")
+    return None
+
+
+def _gone(root: Path, info: Mapping[str, Any], files: list[Path]) -> list[str]:
+    """Data files of a LeRobot dataset that its meta/episodes names, or that are left out in their numbers, and that are not there."""
+    named: set[str] = set()
+    for file in sorted((root / "meta" / "episodes").rglob("*.parquet")):
+        table = _parquet(file, ["data/chunk_index", "data/file_index"])
+        if len(table) == 2 and isinstance(info.get("data_path"), str):
+            named |= {info["data_path"].format(chunk_index=c, file_index=f) for c, f in zip(table["data/chunk_index"], table["data/file_index"])}
+    for folder in {file.parent for file in files}:
+        numbers_of = [int(found[1]) for file in files if file.parent == folder and (found := re.fullmatch(r"file-(\d+)", file.stem))]
+        named |= {(folder / f"file-{k:03d}.parquet").relative_to(root).as_posix() for k in range(max(numbers_of, default=0))}
+    return [f"'{name}'" for name in sorted(named) if not (root / name).is_file()]
 
 
 def lerobot_column(name: str) -> str:

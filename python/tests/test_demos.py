@@ -294,6 +294,84 @@ def test_lerobot_has_velocities_and_actions(tmp_path: Path) -> None:
         demos.from_lerobot("Hopper-v5", lerobot(tmp_path / "c", features, np.repeat([0, 1], 12)), tmp_path / "d.npz", actions=UNNAMED)
 
 
+def lerobot_in_files(folder: Path, lengths: list[int], per_file: int, lists: bool) -> Path:
+    """A dataset as LeRobot lays it out, its frames dealt to files of ``per_file`` each; with ``lists`` in meta/episodes where each episode is."""
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    parts = [episode(n, k) for k, n in enumerate(lengths)]
+    joints = [name for name in parts[0] if name.startswith("q.")]
+    feature = {"dtype": "float32", "shape": [len(joints)], "names": [f"{name[2:]}.pos" for name in joints]}
+    info = {"codebase_version": "v3.0", "fps": 125, "features": {"observation.state": feature}, "total_episodes": len(lengths), "total_frames": sum(lengths),
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"}  # fmt: skip
+    (folder / "meta" / "episodes").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    rows = np.concatenate([np.stack([part[name] for name in joints], 1) for part in parts]).astype(np.float32)
+    of, frame = np.repeat(np.arange(len(lengths)), lengths), np.concatenate([np.arange(n) for n in lengths])
+    table = pa.table({"observation.state": pa.array(rows.tolist(), pa.list_(pa.float32())), "episode_index": of, "frame_index": frame})
+    for k in range(-(-len(of) // per_file)):
+        parquet.write_table(table.slice(k * per_file, per_file), folder / "data" / "chunk-000" / f"file-{k:03d}.parquet")
+    if lists:
+        ends = (np.cumsum(lengths) - 1) // per_file
+        of_each = {"episode_index": range(len(lengths)), "length": lengths, "data/chunk_index": [0] * len(lengths), "data/file_index": ends.tolist()}
+        parquet.write_table(pa.table({name: list(of) for name, of in of_each.items()}), folder / "meta" / "episodes" / "file-000.parquet")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("per_file", "gone", "lists", "words"),
+    [
+        (20, 0, False, r"the data has 2 episodes with 24 frames, and meta/info.json says 4 episodes with 44 frames; the first that is missing is episode 0 "
+                       r"\('data/chunk-000/file-000.parquet' is not there\)"),
+        (20, 1, False, r"episode 3 begins with frame 8 in 'data/chunk-000/file-002.parquet', so .* the data has 3 episodes with 24 frames, .* says 4 e"),
+        (20, 2, False, r"the data has 4 episodes with 40 frames, and meta/info.json says 4 episodes with 44 frames; get the dataset again"),
+        (20, 2, True, r"episode 3 has 8 frames up to 'data/chunk-000/file-001.parquet', and meta/episodes says 12; .* \('data/chunk-000/file-002.parquet' is"),
+        (18, 0, False, r"episode 1 begins with frame 10 in 'data/chunk-000/file-001.parquet', so frames of it are missing; .* 44 frames \(.*file-000.parquet'"),
+        (9, 1, True, r"episode 1 goes from frame 0 to frame 10 in 'data/chunk-000/file-002.parquet'.* \('data/chunk-000/file-001.parquet' is not there\); "),
+        (4, 3, False, r"episode 1 goes from frame 3 to frame 8 in 'data/chunk-000/file-004.parquet', so .* \('data/chunk-000/file-003.parquet' is not there\)"),
+    ],
+)  # fmt: skip
+def test_lerobot_without_a_file_is_refused(tmp_path: Path, per_file: int, gone: int, lists: bool, words: str) -> None:
+    """What its own numbers say must be there: between two episodes, at their end and inside of one."""
+    folder = lerobot_in_files(tmp_path / "set", [8, 12, 12, 12], per_file, lists)
+    assert checked(demos.from_lerobot("Hopper-v5", folder, tmp_path / "whole.npz"))["lengths"].tolist() == [7, 11, 11, 11]
+    (folder / "data" / "chunk-000" / f"file-{gone:03d}.parquet").unlink()
+    with pytest.raises(demos.BadDemonstrations, match=f"set': {words}"):
+        demos.from_lerobot("Hopper-v5", folder, tmp_path / "a.npz")
+    assert not (tmp_path / "a.npz").exists()
+
+
+def test_lerobot_with_a_file_cut_short_is_refused(tmp_path: Path) -> None:
+    folder = lerobot_in_files(tmp_path / "set", [8, 12], 9, True)
+    file = folder / "data" / "chunk-000" / "file-001.parquet"
+    content = file.read_bytes()
+    for bad in (content[:-200], content[:3], b"", content[:4] + bytes(60) + content[64:]):
+        file.write_bytes(bad)
+        with pytest.raises(demos.BadDemonstrations, match=r"file-001.parquet' cannot be read as parquet \(.+\); it was cut short or damaged: get"):
+            demos.from_lerobot("Hopper-v5", folder, tmp_path / "a.npz")
+    for rest in (folder / "data").rglob("*.parquet"):
+        rest.unlink()
+    with pytest.raises(demos.BadDemonstrations, match=r"set': its folder 'data' has no parquet file"):
+        demos.from_lerobot("Hopper-v5", folder, tmp_path / "a.npz")
+
+
+def test_names_for_lerobot_are_spelt_as_its_own(tmp_path: Path) -> None:
+    """With names=, bare, with .pos or as columns of the task; what the dataset calls them is of no matter then."""
+    part = episode(12, 0)
+    q = [name for name in part if name.startswith("q.")]
+    rows = np.stack([part[name] for name in q], 1)
+    folder = lerobot(tmp_path / "set", {"observation.state": (None, rows)}, np.zeros(12, int))
+    for spelt in ("{}", "{}.pos", "q.{}", "{{q.{}}}"):
+        names = [spelt.format(name[2:]) for name in q]
+        data = checked(demos.from_lerobot("Hopper-v5", folder, tmp_path / "a.npz", names=names, overwrite=True))
+        assert np.array_equal(data["qpos"], rows.astype(np.float32)), spelt
+    refused = pytest.raises(demos.BadDemonstrations, match="no column 'q.foot_joint'")
+    with pytest.warns(UserWarning, match="of 'observation.state' gripper is left out"), refused:
+        demos.from_lerobot("Hopper-v5", folder, tmp_path / "b.npz", names=[*(name[2:] for name in q[:-1]), "gripper"])
+    for names, words in ((None, r"shape \(12, 6\) and 0 names; give names=, one for each entry: <joint>, <joint>.pos"), ("rootx", "names is 'rootx'; give")):
+        with pytest.raises(demos.BadDemonstrations, match=words):
+            demos.from_lerobot("Hopper-v5", folder, tmp_path / "b.npz", names=names)
+
+
 def test_lerobot_as_lerobot_writes_it(tmp_path: Path) -> None:
     """Two episodes that LeRobot itself recorded and closed."""
     datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot is not installed (it brings torch)")

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -168,6 +169,61 @@ def test_other_units_are_named(tmp_path: Path) -> None:
     fast = columns | {"q.elbow": columns["q.elbow"] + 0.4 * (np.arange(60) % 2)}
     with pytest.warns(UserWarning, match=r"joint 'elbow' moves at .* 3; look whether its columns are in rad"):
         demos.from_columns(task, [fast], tmp_path / "a.npz", dt=0.01)
+
+
+@pytest.mark.parametrize("factor", [0.4, 1 / 1.5, 1.5, 2.5])
+def test_another_rate_is_told_by_the_velocities(tmp_path: Path, factor: float) -> None:
+    """Rows of another distance than dt make all recorded velocities as many times as fast as the differences are."""
+    rng, t = np.random.default_rng(4), np.arange(80) * 0.02
+    columns = recording(80) | {"v.shoulder": 0.5 * np.cos(t), "v.elbow": -0.6 * np.sin(2 * t)}  # derivatives by hand
+    noisy = {name: of + 1e-4 * rng.normal(size=80) if name.startswith("q.") else of for name, of in columns.items()}
+    for part in (columns, noisy):
+        words = rf"'v.shoulder' is .* 'q.shoulder' changes by .*\(likewise v.elbow\); .*rows about 0.02 s apart would fit, and dt is {0.02 * factor:g} s"
+        with pytest.warns(UserWarning, match=words):
+            demos.from_columns(arm(tmp_path, ["command.x"]), [part], tmp_path / "a.npz", dt=0.02 * factor, overwrite=True)
+    gear = columns | {"v.elbow": factor * columns["v.elbow"]}
+    with pytest.warns(UserWarning, match=r"'v.elbow' is .*, and is as far off in half of the rows; look at sign, unit and dt, or leave"):
+        demos.from_columns(arm(tmp_path, ["command.x"]), [gear], tmp_path / "a.npz", dt=0.02, overwrite=True)
+
+
+def test_right_velocities_with_noise_and_joints_that_stand_are_not_accused(tmp_path: Path) -> None:
+    """Nor does numpy complain of a division, where a joint stands to the last bit."""
+    rng, task = np.random.default_rng(5), arm(tmp_path, ["command.x"])
+    for k in range(60):
+        n, dt = int(rng.choice([6, 20, 60, 200])), float(rng.choice([0.005, 0.02, 0.05]))
+        t, a, f = np.arange(n) * dt, rng.uniform(0.1, 0.6), rng.uniform(0.5, 6.0)
+        q, v = rng.choice([0.0, 1e-4, 2e-3]), rng.choice([0.0, 0.01, 0.1])
+        columns = recording(n, dt) | {"q.shoulder": a * np.sin(f * t) + q * rng.normal(size=n), "v.shoulder": a * f * np.cos(f * t) + v * rng.normal(size=n)}
+        columns |= {"q.elbow": np.full(n, 0.3), "v.elbow": (k % 3) * 0.1 * rng.normal(size=n)}
+        del columns["command.y"]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            warnings.filterwarnings("error", message=".*changes by")
+            demos.from_columns(task, [columns], tmp_path / "a.npz", dt=dt, overwrite=True, period=dt)
+
+
+def test_positions_outside_of_the_range_are_told_by_joint(tmp_path: Path) -> None:
+    """From a tenth of the range on, once for each joint, with the value that is furthest out; MuJoCo says what the range is."""
+    task = arm(tmp_path, ["command.x"])
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
+    lower, upper = model.joint("elbow").range
+    columns = {name: of for name, of in recording().items() if name != "command.y"}
+    for share in (0.09, 0.11):
+        q = np.linspace(0.0, upper + share * (upper - lower), 60)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            demos.from_columns(task, [columns | {"q.elbow": q}] * 2, tmp_path / "a.npz", dt=0.02, overwrite=True)
+        words = [str(warning.message) for warning in told]
+        if share < 0.1:
+            assert words == []
+            continue
+        assert len(words) == 1, words
+        outside = 100 * np.mean(q > upper)
+        assert f"episode 0: column 'q.elbow' is {q[-1]:.4g} in row 59, and the task lets joint 'elbow' be at {lower:.3g} to {upper:.3g} rad or m" in words[0]
+        assert f"{outside:.3g} % of the rows are outside. Look whether these are degrees" in words[0]
+    far = columns | {"q.elbow": np.linspace(0.0, upper + 1.01 * (upper - lower), 60)}
+    with pytest.raises(demos.BadDemonstrations, match="numpy.radians"):
+        demos.from_columns(task, [far], tmp_path / "a.npz", dt=0.02, overwrite=True)
 
 
 def test_arrays_are_written_row_by_row(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 import synthetic
 from conftest import ROOT
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 import nearl
 from nearl import curves, report
@@ -146,6 +146,63 @@ def test_a_broken_log_is_refused_in_a_sentence(tmp_path, content) -> None:
     path.write_bytes(content)
     with pytest.raises(ReadError, match=r"broken\.mcap.*(cannot|can) be read|holds no ticks"):
         read_log(path)
+
+
+@pytest.fixture(scope="module", params=["lz4", "zstd"])
+def chunks(request, tmp_path_factory) -> tuple[Path, list[dict], list[int]]:
+    """A log of many small chunks as a loop writes it, its ticks, and at which byte the data of each chunk ends."""
+    folder = tmp_path_factory.mktemp("chunks")
+    whole = synthetic.flight_log(folder / "long.mcap", 200, {"dt": "0.001"})
+    path, ticks = folder / "small.mcap", []
+    with open(whole, "rb") as source, open(path, "wb") as file:
+        reader, writer = make_reader(source), Writer(file, chunk_size=20_000, compression=CompressionType[request.param.upper()])
+        writer.start()
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        channel = writer.register_channel("tick", "json", writer.register_schema("nearl.Tick", "jsonschema", b"{}"))
+        for _, _, message in reader.iter_messages(topics=["tick"]):
+            ticks.append(json.loads(message.data))
+            writer.add_message(channel, message.log_time, message.data, message.publish_time, ticks[-1]["tick"])
+        writer.finish()
+    with open(path, "rb") as file:
+        ends = [c.chunk_start_offset + c.chunk_length for c in make_reader(file).get_summary().chunk_indexes]
+    assert len(ends) > 4
+    return path, ticks, ends
+
+
+def test_a_log_of_a_loop_that_was_killed_is_read_to_its_end(chunks, tmp_path) -> None:
+    """In the middle of a chunk, and with a last chunk whose length was not written yet, as our runtime leaves it."""
+    path, ticks, ends = chunks
+    content = path.read_bytes()
+    seen = []
+    for k, rest in ((2, content[ends[2] : ends[2] + 90]), (3, b"\x06" + b"\xff" * 8 + content[ends[3] : ends[3] + 500])):
+        file = tmp_path / "killed.mcap"
+        file.write_bytes(content[: ends[k]] + rest)
+        with pytest.warns(UserWarning, match=r"killed.mcap' is without its end, and \d+ ticks of it are reported: the loop was killed"):
+            log = read_log(file)
+        n = len(log)
+        seen.append(n)
+        assert log.without_end and log.metadata["dt"] == "0.001"
+        assert np.array_equal(log.q, [tick["state"]["q"] for tick in ticks[:n]]) and log.columns["tick"].tolist() == [tick["tick"] for tick in ticks[:n]]
+    assert 0 < seen[0] < seen[1] < len(ticks)
+    done = subprocess.run([sys.executable, "-m", "nearl.report", "--log", str(file), "--out", str(tmp_path / "r.html")], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stderr.count("\n") == 1 and done.stderr.startswith(f"nearl report: '{file}' is without its end"), done.stderr
+    page = text_of(tmp_path / "r.html")
+    assert f"killed.mcap: {n} ticks of 1 ms, without its end." in page and "The end of this log is missing: the loop was killed" in page
+    assert not read_log(path).without_end and "without its end" not in text_of(report.build(tmp_path / "r.html", logs=[path]))
+
+
+def test_a_log_with_a_flipped_bit_is_refused_in_a_sentence(chunks, tmp_path) -> None:
+    path, _, ends = chunks
+    for place in (ends[0] - 40, ends[1] - 200, ends[2] - 1000):
+        content = bytearray(path.read_bytes())
+        content[place] ^= 0x40
+        file = tmp_path / "flipped.mcap"
+        file.write_bytes(content)
+        done = subprocess.run([sys.executable, "-m", "nearl.report", "--log", str(file), "--out", str(tmp_path / "r.html")], capture_output=True, text=True)
+        assert done.returncode == 1 and not (tmp_path / "r.html").exists()
+        begin, end = f"nearl report: '{file}' is a flight log that is damaged (", f"; `nearl verify {file}` tells how far this one is sound\n"
+        assert done.stderr.startswith(begin) and done.stderr.endswith(end) and done.stderr.count("\n") == 1, done.stderr
 
 
 def test_the_pull_from_states_is_the_sum_of_the_multipliers(tmp_path) -> None:

@@ -595,6 +595,13 @@ fn projection(m: &Manifest) -> Check {
     }
     if m.bounds_drives() {
         let text = "the forces of its drives and their change are kept within the motors'; nothing is promised of the motion (guard = \"drive\")";
+        let steps = m.task.sub_steps();
+        if steps > 1 {
+            let when = format!(
+                "at the first of the {steps} physics steps of a period alone; a period of one step keeps them in all"
+            );
+            return warn(CheckCode::Projection, format!("{text}, {when}"));
+        }
         return ok(CheckCode::Projection, text.into());
     }
     if m.proposes() {
@@ -627,12 +634,14 @@ fn holding(m: &Manifest, parts: &Parts) -> Check {
     }
     let loads = holding::heaviest(model, limits, controllable, &period);
     let share = |l: &holding::Load| l.needed / l.effort;
+    let floats = model.joints().iter().any(|j| j.nv > 1 && !controllable.contains(&j.idx_v));
+    let held = if floats { ", with its base held: what legs carry comes on top" } else { "" };
     match loads.iter().max_by(|a, b| share(a).total_cmp(&share(b))) {
         None => ok(CheckCode::Holding, "no joint has a torque limit".into()),
         Some(l) => ok(
             CheckCode::Holding,
             format!(
-                "standing still takes at most {:.1} of {:.1} N m or N, at joint '{}'",
+                "standing still takes at most {:.1} of {:.1} N m or N, at joint '{}'{held}",
                 l.needed, l.effort, l.joint
             ),
         ),

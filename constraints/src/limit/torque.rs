@@ -134,7 +134,9 @@ fn powerless(model: &Model, dof: usize) -> Option<LimitError> {
             let next = "write another number into the robot file, or do not control the joint";
             return Some(LimitError::Unusable { what, next });
         }
-        let ranges = [("ctrlrange", motor.control_range), ("forcerange", motor.force_range)];
+        // of a drive they are targets
+        let controls = motor.control_range.filter(|_| motor.bias[1] == 0.0 && motor.bias[2] == 0.0);
+        let ranges = [("ctrlrange", controls), ("forcerange", motor.force_range)];
         let one_way = |range: Option<[f64; 2]>| range.filter(|[low, high]| *low >= 0.0 || *high <= 0.0);
         let (key, [low, high]) = ranges.into_iter().find_map(|(key, range)| Some((key, one_way(range)?)))?;
         let what = format!(

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE.html")
     given = parser.parse_args(arguments)
     try:
-        build(given.out, runs=given.run, logs=given.log, evals=given.eval, summaries=given.summary, sweeps=given.sweeps, demos=given.demos, task=given.task,
-              title=given.title)  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: print(f"nearl report: {message}", file=sys.stderr)
+            build(given.out, runs=given.run, logs=given.log, evals=given.eval, summaries=given.summary, sweeps=given.sweeps, demos=given.demos,
+                  task=given.task, title=given.title)  # fmt: skip
     except (ReadError, OSError, ImportError) as error:
         print(f"nearl report: {error}", file=sys.stderr)
         return 1

@@ -11,7 +11,7 @@ import numpy as np
 from nearl._core import __version__
 from nearl.report import demonstrations, flight, sweep, training
 from nearl.report.promise import promise
-from nearl.report.read import Log, ReadError, Run, Summary, read_json, read_log, read_run
+from nearl.report.read import WITHOUT_END, Log, ReadError, Run, Summary, read_json, read_log, read_run
 from nearl.report.style import image
 
 Paths = Iterable[str | Path]
@@ -140,7 +140,7 @@ def _about(runs: list[Run], logs: list[Log]) -> str:
         names = sorted({f"{r.task} with {r.algo}" for r in runs})
         parts.append(f"{len(runs)} training{'s' if len(runs) > 1 else ''}: {', '.join(names)}.")
     for log in logs:
-        parts.append(f"{log.path.name}: {len(log)} ticks of {1e3 * log.dt:g} ms.")
+        parts.append(f"{log.path.name}: {len(log)} ticks of {1e3 * log.dt:g} ms{', without its end' * log.without_end}.")
     return " ".join(parts) + f" nearl {__version__}."
 
 
@@ -247,7 +247,8 @@ def _flights(logs: list[Log]) -> list[tuple[str, str]]:
         parts = [picture or f'<p class="lead">{html.escape(sentence)}</p>', flight.states(log) or "", flight.ledger(log), flight.latency(log)]
         modes = {mode: log.mode.count(mode) for mode in sorted(set(log.mode))}
         words = ", ".join(f"{n:,} {mode}" for mode, n in modes.items())
-        lead = f'<p class="lead">Ticks by mode: {html.escape(words)}.</p>{_commands(log)}'
+        lead = f'<p class="lead">The end of this log is missing: {html.escape(WITHOUT_END)}.</p>' if log.without_end else ""
+        lead += f'<p class="lead">Ticks by mode: {html.escape(words)}.</p>{_commands(log)}'
         sections.append((f"Flight {log.path.name}", lead + "".join(parts) + _settings(log)))
     return sections
 

@@ -4,6 +4,7 @@ import io
 import json
 import re
 import struct
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,6 +18,7 @@ from nearl import _core
 from nearl.runs import ReadError, Run, json_of, read_run
 
 Floats = NDArray[np.float64]
+WITHOUT_END = "the loop was killed, or the copy was cut short, and what came after is not in the file; `nearl verify` tells what of it holds"
 __all__ = ["Log", "ReadError", "Run", "Summary", "read_json", "read_log", "read_run"]
 
 
@@ -35,6 +37,7 @@ class Log:
     target_v: Floats
     mode: list[str]
     active: list[list[dict[str, Any]]] = field(default_factory=list)
+    without_end: bool = False  # the loop was killed, or a copy was cut short
 
     def __len__(self) -> int:
         return len(self.mode)
@@ -94,24 +97,17 @@ _NUMBERS = {
 
 
 def read_log(path: Path) -> Log:
-    """A flight log (MCAP, topic ``tick``, JSON messages)."""
+    """A flight log (MCAP, topic ``tick``, JSON messages); of one without its end the ticks that are there, with a warning."""
+    metadata, messages, without_end = _content(path)
     try:
-        from mcap.exceptions import McapError
-        from mcap.reader import make_reader
-    except ImportError as error:
-        raise ReadError("reading a flight log needs the mcap package: pip install 'nearl[viz]'") from error
-    stream = io.BytesIO(path.read_bytes())  # so that what fails below is the content
-    metadata: dict[str, str] = {}
-    try:
-        reader = make_reader(stream)
-        ticks = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=["tick"])]
-        for record in reader.iter_metadata():
-            metadata.update(record.metadata)
-        swapped = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=["snapshot"])]
-    except (McapError, ValueError, OSError, EOFError, struct.error) as error:
-        raise ReadError(f"'{path}' is not a flight log that can be read ({error}); give a file written by 'nearl run --log'") from error
+        ticks, swapped = ([json.loads(data) for data in messages.get(topic, [])] for topic in ("tick", "snapshot"))
+    except ValueError as error:
+        raise ReadError(_damaged(path, error)) from error
     if not ticks:
-        raise ReadError(f"'{path}' holds no ticks; the loop never ran")
+        why = "the loop ended, or the copy was cut, before the first; give another log" if without_end else "the loop never ran"
+        raise ReadError(f"'{path}' holds no ticks; {why}")
+    if without_end:
+        warnings.warn(f"'{path}' is without its end, and {len(ticks):,} ticks of it are reported: {WITHOUT_END}", stacklevel=2)
     if any("rows" in entry and json.dumps(entry["rows"]) != json.dumps(json.loads(metadata.get("rows", "[]"))) for entry in swapped):
         metadata.pop("rows", None)  # a later snapshot numbers its rows otherwise
     columns = {name: np.array([_at(tick, keys) for tick in ticks]) for name, keys in _NUMBERS.items()}
@@ -119,7 +115,47 @@ def read_log(path: Path) -> Log:
     table = {key: _table([tick.get(key) for tick in ticks]) for key in ("proposal_q", "proposal_v", "target_q", "target_v")}
     state = {key: _table([tick.get("state", {}).get(key) for tick in ticks]) for key in ("q", "v")}
     active = [tick.get("ledger", {}).get("active_rows") or [] for tick in ticks]
-    return Log(path, metadata, columns, **state, **table, mode=[str(tick.get("mode")) for tick in ticks], active=active)
+    return Log(path, metadata, columns, **state, **table, mode=[str(tick.get("mode")) for tick in ticks], active=active, without_end=without_end)
+
+
+def _content(path: Path) -> tuple[dict[str, str], dict[str, list[bytes]], bool]:
+    """Metadata of an MCAP file, its messages by topic in their order, and whether its end is missing. What is damaged inside is refused."""
+    try:
+        from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
+        from mcap.records import Channel, DataEnd, Message, Metadata
+        from mcap.stream_reader import StreamReader
+        from zstandard import ZstdError
+    except ImportError as error:
+        raise ReadError("reading a flight log needs the mcap package: pip install 'nearl[viz]'") from error
+    content = path.read_bytes()
+    metadata: dict[str, str] = {}
+    topics: dict[int, str] = {}
+    messages: dict[str, list[tuple[int, bytes]]] = {}
+    complete = False
+    try:
+        for record in StreamReader(io.BytesIO(content), validate_crcs=True).records:
+            if isinstance(record, Message):
+                messages.setdefault(topics[record.channel_id], []).append((record.log_time, record.data))
+            elif isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Metadata):
+                metadata.update(record.metadata)
+            complete |= isinstance(record, DataEnd)  # what follows are summaries
+    except InvalidMagic as error:
+        if not complete:
+            raise ReadError(f"'{path}' is not a flight log that can be read ({error}); give a file written by 'nearl run --log'") from error
+    except (McapError, ValueError, OSError, EOFError, struct.error, RuntimeError, KeyError, MemoryError, ZstdError) as error:
+        closed = len(content) > 8 and content[8:].endswith(content[:8])  # as MCAP begins and ends
+        if not complete and (closed or not isinstance(error, EndOfFile | RecordLengthLimitExceeded | struct.error)):
+            raise ReadError(_damaged(path, error)) from error
+    return metadata, {topic: [data for _, data in sorted(found, key=lambda m: m[0])] for topic, found in messages.items()}, not complete
+
+
+def _damaged(path: Path, error: Exception) -> str:
+    return (
+        f"'{path}' is a flight log that is damaged ({str(error) or type(error).__name__}); take another copy of it; `nearl verify {path}` tells how far this "
+        "one is sound"
+    )
 
 
 def _at(tick: dict[str, Any], keys: tuple[str, ...]) -> float:

@@ -45,7 +45,7 @@ codes! {
             "Check the plant's sensors; the first few are bridged by prediction, then the plant brakes.";
         BadStates = "bad-states", "More states in a row held NaN or infinity than allowed; latched.",
             "Repair the plant's sensors, then start the runtime again.";
-        ImplausibleState = "implausible-state", "A joint jumped further than its speed allows in the time that passed, or an episode begins further outside of its range than that is wide.",
+        ImplausibleState = "implausible-state", "A joint jumped further than its speed allows, or begins outside of its range by more than its width.",
             "Check encoder, wiring, unit (degrees for radians?) and joint order of the plant; the sample was not used.";
         ImplausibleStates = "implausible-states", "More implausible states in a row than allowed; latched.",
             "Check encoders, units and joint order of the plant, then start the runtime again.";
