@@ -31,8 +31,7 @@ const ROUNDING: f64 = 1e-10;
 /// What is broken already may be broken by so much more: in 10,000 ticks it adds up to [`ROUNDING`].
 const NOISE: f64 = 1e-14;
 
-/// Ways of braking, tried from the one that passed last on. The latest are for drives whose target is at its end where they hold a joint against its
-/// weight: away from there they have hardly more force than that, `K T v` after a tick at `v`, and stop it within `m / (K T^2)` ticks at best.
+/// Ways of braking, tried from the one that passed last on.
 const TRIED: [Plan; 10] = [
     Plan::Together(1.0),
     Plan::Together(2.0),
@@ -43,8 +42,15 @@ const TRIED: [Plan; 10] = [
     Plan::Apart(0.0),
     Plan::Together(25.0),
     Plan::Together(250.0),
-    Plan::Together(10000.0),
+    Plan::Together(10_000.0),
 ];
+
+/// The last of them are for drives whose targets end. One with its target at that end that holds a joint against its weight has hardly more force than that
+/// away from there, `K T v` after a tick at `v`, and stops it within `m / (K T^2)` ticks at best.
+const USUAL: usize = 7;
+
+/// Ticks in which the slowest of them stop, or five times as many as the quickest stop takes.
+const SLOWEST: f64 = 10_000.0;
 
 /// Without a position limit near, a joint that brakes by itself takes at least this share of the largest deceleration.
 const LEAST: f64 = 0.05;
@@ -93,8 +99,9 @@ pub(crate) struct Backup {
     within: bool,
     /// Its decelerations (nv).
     deceleration: Vec<f64>,
-    /// The index into [`TRIED`] that passed last.
+    /// The index into [`TRIED`] that passed last, and how many are tried.
     favourite: usize,
+    tried: usize,
     checker: Checker,
     dynamics: Dynamics,
     /// By how much each row may be broken (hard rows): what the measured state breaks already.
@@ -160,6 +167,7 @@ impl Backup {
             within: false,
             deceleration: zero(),
             favourite: 0,
+            tried: if checker.needs_a_brake() { TRIED.len() } else { USUAL },
             dynamics: Dynamics::new(model),
             allowed: vec![0.0; checker.hard()],
             on_the_way: vec![0.0; checker.hard()],
@@ -201,7 +209,7 @@ impl Backup {
 
     pub(crate) fn set_memory(&mut self, memory: &[f64]) {
         (self.stored, self.within) = (memory[0] != 0.0, memory[0] == 1.0);
-        self.favourite = memory[1] as usize % TRIED.len();
+        self.favourite = memory[1] as usize % self.tried;
         self.deceleration.copy_from_slice(&memory[2..]);
     }
 
@@ -330,8 +338,8 @@ impl Backup {
 
     /// Looks for a brake from the state after a tick at acceleration `a` and stores it; the old one stays when there is none.
     pub(crate) fn verify(&mut self, with: &With<'_>, (q, v): (&[f64], &[f64]), a: &[f64]) -> bool {
-        for k in 0..TRIED.len() {
-            let index = (self.favourite + k) % TRIED.len();
+        for k in 0..self.tried {
+            let index = (self.favourite + k) % self.tried;
             if self.plan(with, (q, v), a, TRIED[index]) && self.within_reach(with, q, v) {
                 (self.favourite, self.stored) = (index, true);
                 self.within = self.allowed.iter().all(|allowed| *allowed <= 0.0);
@@ -373,7 +381,7 @@ impl Backup {
             if dof.jerk.is_finite() {
                 let wanted = match plan {
                     _ if dof.locked => most,
-                    Plan::Together(late) => speed / ((late * quickest - 1e-9).ceil().max(1.0) * dt),
+                    Plan::Together(late) => speed / (late_by(late, quickest) * dt),
                     Plan::Apart(share) => (LEAST + share * (1.0 - LEAST)) * most,
                 };
                 let at = with.dofs.single[i].map(|iq| q[iq]);
@@ -399,10 +407,7 @@ impl Backup {
             self.least[i] = least;
             self.trial[i] = match plan {
                 _ if speed <= AT_ONCE * most * dt => most,
-                Plan::Together(late) => {
-                    let ticks = (late * quickest - 1e-9).ceil().max(1.0);
-                    (speed / (ticks * dt)).max(least).min(most)
-                }
+                Plan::Together(late) => (speed / (late_by(late, quickest) * dt)).max(least).min(most),
                 Plan::Apart(share) => {
                     let least = least.max(LEAST * most);
                     least + share * (most - least)
@@ -613,6 +618,11 @@ impl Backup {
             }
         }
     }
+}
+
+/// Ticks of a brake that is so many times as late as the quickest.
+fn late_by(late: f64, quickest: f64) -> f64 {
+    ((late * quickest).min(SLOWEST.max(5.0 * quickest)) - 1e-9).ceil().max(1.0)
 }
 
 /// Sets of dofs, joined where they share one.

@@ -1,6 +1,6 @@
 //! Forces of drives whose targets are held over several physics steps, on robots whose mass never changes: hand arithmetic, and the steps by hand.
 
-use nearl_constraints::description::{Body, JointDescription, JointKind};
+use nearl_constraints::description::{Body, JointDescription, JointKind, Range};
 use nearl_constraints::geometry::Placement;
 use nearl_constraints::*;
 
@@ -127,10 +127,13 @@ fn a_joint_that_hangs_at_the_end_of_its_target_comes_back() {
     for (stiffness, dt, ticks) in [(4000.0, 0.002, 2000), (400.0, 0.002, 4000), (1600.0, 0.001, 4000)] {
         let mut description = slides(&[[0.0, 0.0]]).description().clone();
         description.gravity = [9.81, 0.0, 0.0];
+        let joint = &mut description.bodies[0].joints[0];
+        joint.range = Range::Limited(-1.0, 1.0);
         let model = Model::from_description(description).unwrap();
         let (period, drives) = (Period::new(dt, 1), [Drive::Pd { stiffness, damping: 0.0 }]);
         let of_drives = DriveTorqueLimit::new(TorqueLimit::default(), &drives, &[[-1.0, 1.0]], period);
-        let limits: [Box<dyn Limit>; 4] = [
+        let limits: [Box<dyn Limit>; 5] = [
+            Box::new(PositionLimit::default()),
             Box::new(VelocityLimit::scaled(1.0)),
             Box::new(AccelerationLimit::new(limit::AccelerationSettings::of(PerJoint::All(5.0), None))),
             Box::new(TorqueLimit::default()),
