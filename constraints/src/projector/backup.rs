@@ -45,7 +45,7 @@ const TRIED: [Plan; 10] = [
     Plan::Together(10_000.0),
 ];
 
-/// The last of them are for drives whose targets end. One with its target at that end that holds a joint against its weight has hardly more force than that
+/// The last of them are for drives whose targets end, over one physics step, where nothing is off. One with its target at that end that holds a joint against its weight has hardly more force than that
 /// away from there, `K T v` after a tick at `v`, and stops it within `m / (K T^2)` ticks at best.
 const USUAL: usize = 7;
 
@@ -167,7 +167,7 @@ impl Backup {
             within: false,
             deceleration: zero(),
             favourite: 0,
-            tried: if checker.needs_a_brake() { TRIED.len() } else { USUAL },
+            tried: if checker.needs_a_brake() && settings.sub_steps == 1 { TRIED.len() } else { USUAL },
             dynamics: Dynamics::new(model),
             allowed: vec![0.0; checker.hard()],
             on_the_way: vec![0.0; checker.hard()],

@@ -3,9 +3,9 @@
 use super::backup::{Passage, Refusal, With};
 use super::ladder::ROW_TOLERANCE;
 use super::{Projector, Stages};
-use crate::Kind;
 use crate::ledger::{BrakeReason, Rung, Status};
 use crate::target::{Proposal, Target};
+use crate::{Braking, Kind};
 
 /// Projections with rows of what was refused, in a tick.
 const ROUNDS: usize = 3;
@@ -201,9 +201,9 @@ impl Projector {
         self.write(q, v, Some(proposal), target);
     }
 
-    /// A tick of a brake asks motors for no more than they may give: beyond that they would be cut one by one, and what the others give would throw the
-    /// joints. Where it does, as after a push, the nearest velocities for which it does not: within the box, or else within the acceleration limits,
-    /// or else whatever they are.
+    /// A tick of a stored brake asks motors for no more than they may give: beyond that they would be cut one by one, and what the others give would throw the
+    /// joints. Where it does, as after a push, the nearest velocities for which it does not: with every row that it keeps, or else within the box, or else
+    /// within the acceleration limits, or else whatever they are.
     pub(super) fn keep_the_motors(
         &mut self,
         q: &[f64],
@@ -211,7 +211,7 @@ impl Projector {
         proposal: Option<&Proposal>,
         target: &mut Target,
     ) {
-        if !self.fill_rows(q, v) {
+        if self.settings.braking != Braking::Stored || !self.fill_rows(q, v) {
             return;
         }
         self.change(v, &target.v);
@@ -222,15 +222,15 @@ impl Projector {
         if (0..p.m).all(|r| !is_motor(r) || p.excess(r, y) <= ROW_TOLERANCE) {
             return;
         }
-        for attempt in 0..3 {
+        for attempt in 0..4 {
             nearer.begin(p, y);
-            nearer.keep_only(is_motor);
+            nearer.keep_only(|r| is_motor(r) || attempt == 0 && p.excess(r, y) <= ROW_TOLERANCE);
             nearer.aim(y);
             for (k, &i) in self.dofs.controllable.iter().enumerate() {
                 let most = self.in_force.acceleration[i] * self.period.dt;
                 match attempt {
-                    0 => nearer.bound(k, self.bounds.v_lower[i] - v[i], self.bounds.v_upper[i] - v[i]),
-                    1 => nearer.bound(k, -most, most),
+                    0 | 1 => nearer.bound(k, self.bounds.v_lower[i] - v[i], self.bounds.v_upper[i] - v[i]),
+                    2 => nearer.bound(k, -most, most),
                     _ => nearer.bound(k, f64::NEG_INFINITY, f64::INFINITY),
                 }
             }
