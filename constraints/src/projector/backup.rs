@@ -45,8 +45,8 @@ const TRIED: [Plan; 10] = [
     Plan::Together(10_000.0),
 ];
 
-/// The last of them are for drives whose targets end, over one physics step, where nothing is off. One with its target at that end that holds a joint against its weight has hardly more force than that
-/// away from there, `K T v` after a tick at `v`, and stops it within `m / (K T^2)` ticks at best.
+/// The last of them are for drives whose targets end, over one physics step, where nothing is off. One that holds a joint against its weight with its target
+/// at that end has hardly more force than that away from there, `K T v` after a tick at `v`, and stops it within `m / (K T^2)` ticks at best.
 const USUAL: usize = 7;
 
 /// Ticks in which the slowest of them stop, or five times as many as the quickest stop takes.
