@@ -162,7 +162,6 @@ struct Switch {
 }
 
 /// What a tick asked of the robot, where it is known.
-#[derive(Clone)]
 struct Asked {
     known: bool,
     acceleration: Vec<f64>,

@@ -163,6 +163,15 @@ fn write(folder: &Path, robot: Edit, task: Edit) -> PathBuf {
     file
 }
 
+/// The usual task, complete, and the folder that it is in.
+fn completed() -> (tempfile::TempDir, nearl_runtime::Manifest) {
+    let folder = tempfile::tempdir().expect("folder");
+    let file = write(folder.path(), SAME, SAME);
+    let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).expect("task");
+    complete(&mut manifest).expect("manifest");
+    (folder, manifest)
+}
+
 /// A door's answer: what it warns of, or why it refuses.
 type Answer = Result<Vec<String>, String>;
 
@@ -324,10 +333,7 @@ fn a_moving_link_without_an_inertia_is_named() {
 /// A recipe whose steps are not those of the robot file: accelerations came out at twice their limit, and nothing but the plant said so.
 #[test]
 fn physics_steps_that_are_not_the_file_s_are_named() {
-    let folder = tempfile::tempdir().expect("folder");
-    let file = write(folder.path(), SAME, SAME);
-    let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).expect("task");
-    complete(&mut manifest).expect("manifest");
+    let (_folder, manifest) = completed();
     let stated = manifest.task.time.sim_dt;
     let notes = |sim_dt: f64| {
         let mut manifest = manifest.clone();
@@ -343,10 +349,7 @@ fn physics_steps_that_are_not_the_file_s_are_named() {
 
 #[test]
 fn a_pose_outside_of_a_range_is_named() {
-    let folder = tempfile::tempdir().expect("folder");
-    let file = write(folder.path(), SAME, SAME);
-    let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).expect("task");
-    complete(&mut manifest).expect("manifest");
+    let (_folder, manifest) = completed();
     let joints = ["elbow", "shoulder"].map(String::from).to_vec();
     let notes = |pose: [f64; 2]| {
         let mut manifest = manifest.clone();
