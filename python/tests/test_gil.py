@@ -55,31 +55,19 @@ def hold_the_lock(seconds: float) -> tuple[int, int]:
 HELD, TURNS = 0.25, 8
 
 
-def share_of_ticks(starts: np.ndarray, held: list[tuple[int, int]]) -> float:
-    """Ticks a second while the lock was held, as a share of those in the pause after it: the median over the turns."""
-    shares = []
-    for (begin, finish), (following, _) in zip(held, [*held[1:], (starts[-1], 0)], strict=True):
-        inside = ((starts >= begin) & (starts < finish)).sum() / (finish - begin)
-        outside = ((starts >= finish) & (starts < following)).sum() / (following - finish)
-        shares.append(inside / outside)
-    return float(np.median(shares))
+def goes_on(starts: np.ndarray, held: list[tuple[int, int]]) -> bool:
+    """Whether ticks begin late in the holds, by the median: a loop that a tick made wait for the lock has none there."""
+    return bool(np.median([((starts > (begin + finish) // 2) & (starts < finish)).sum() for begin, finish in held]) > 0)
 
 
-def keeps_pace(starts: np.ndarray, held: list[tuple[int, int]]) -> bool:
-    """A loop that loses one tick in twenty only while the lock is held does not."""
-    return share_of_ticks(starts, held) > 0.95
-
-
-def test_a_loop_that_loses_a_tenth_of_its_ticks_under_the_lock_is_found() -> None:
+def test_a_loop_that_waits_for_the_lock_in_one_tick_of_many_is_found() -> None:
     millisecond = 1_000_000
-    grid = np.arange(2000) * millisecond
-    held = [(k * 500 * millisecond, (k * 500 + 250) * millisecond) for k in range(4)]
-    under = np.any([(grid >= begin) & (grid < finish) for begin, finish in held], axis=0)
-    lost = under & (np.cumsum(under) % 10 == 0)
-    assert under.sum() == 1000
-    assert lost.sum() == 100
-    assert keeps_pace(grid, held)
-    assert not keeps_pace(grid[~lost], held)
+    grid = np.arange(4000) * millisecond
+    held = [(k * 500 * millisecond, (k * 500 + 250) * millisecond) for k in range(8)]
+    assert goes_on(grid, held)
+    # A tick that needs the lock ends with the hold, and those after it wait with it.
+    waits = np.any([(grid >= begin + 7 * millisecond) & (grid < finish) for begin, finish in held], axis=0)
+    assert not goes_on(grid[~waits], held)
 
 
 def test_the_loop_runs_on_while_python_holds_its_lock(tmp_path: Path) -> None:
@@ -123,7 +111,7 @@ def test_the_loop_runs_on_while_python_holds_its_lock(tmp_path: Path) -> None:
         messages = make_reader(file).iter_messages(topics=["tick"])
         ticks = [json.loads(message.data) for _, _, message in messages]
     starts = np.array([tick["begin_ns"] for tick in ticks])
-    # How many ticks a second the machine makes is its own affair; that they are as many with the lock as without, not.
-    assert keeps_pace(starts, held), f"{share_of_ticks(starts, held):.3f} of the ticks a second without the lock"
+    # How many ticks a second the machine makes is its own affair; that none waits for the lock, not.
+    assert goes_on(starts, held), "no tick began late in the holds"
     assert report["modes"]["fault"] == 0 and report["counters"]["target_violations"] == 0, report
     assert moved["violations"]["torque"] == 0, moved
