@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use serde::{Deserialize, Serialize};
 
 use super::tick::{Numbers, StateJson, state_json};
-use crate::rt::{Record, Resume};
+use crate::rt::{Record, Resume, Way};
 
 /// JSON schema of the `brief` topic.
 pub(super) const BRIEF_SCHEMA: &str = r#"{
@@ -89,6 +89,9 @@ pub(super) struct MemoryJson<'a> {
     ramped: u32,
     overran: bool,
     brake_broken: bool,
+    /// None in logs of builds that did not compare ways with velocities.
+    #[serde(default)]
+    way: Numbers<'a>,
     memory: Numbers<'a>,
 }
 
@@ -96,11 +99,11 @@ pub(super) struct MemoryJson<'a> {
 pub(super) fn encode_memory(record: &Record, out: &mut Vec<u8>) -> serde_json::Result<()> {
     let Resume { modes, grid, braked, ramped, overran, brake_broken, .. } = record.resume;
     out.clear();
-    let memory = record.resume.memory().into();
+    let (way, memory) = (record.resume.way.numbers().into(), record.resume.memory().into());
     let tick = record.tick;
     serde_json::to_writer(
         out,
-        &MemoryJson { tick, modes, grid, braked, ramped, overran, brake_broken, memory },
+        &MemoryJson { tick, modes, grid, braked, ramped, overran, brake_broken, way, memory },
     )
 }
 
@@ -115,6 +118,7 @@ impl MemoryJson<'_> {
             ramped: self.ramped,
             overran: self.overran,
             brake_broken: self.brake_broken,
+            way: Way::of(&self.way.0)?,
             ..Resume::none()
         };
         resume.set_memory(&self.memory.0).then_some(resume)

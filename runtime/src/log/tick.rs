@@ -46,7 +46,7 @@ pub(crate) const SCHEMA: &str = r#"{
 }"#;
 
 /// A list of numbers, `null` for those JSON does not have.
-#[derive(Serialize)]
+#[derive(Default, Serialize)]
 #[serde(transparent)]
 pub(super) struct Numbers<'a>(pub(super) Cow<'a, [f64]>);
 

@@ -19,6 +19,7 @@ use crate::rt::heard::Heard;
 use crate::rt::mode::{Event, Mode, ModeLimits, Modes, Reason};
 use crate::rt::pace::Pace;
 use crate::rt::tick::{LoopController, Outcome, Record, Sensed, TickOutput};
+use crate::rt::way::Way;
 
 /// Settings of a tick; times in \[ns\].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -109,6 +110,7 @@ pub struct Core<T: LoopController> {
     ramped: u32,
     overran: bool,
     pace: Pace,
+    way: Way,
     /// `brake` panicked: it is not called again on this controller. A panic of `tick` latches Fault.
     brake_broken: bool,
 }
@@ -130,6 +132,7 @@ impl<T: LoopController> Core<T> {
             ramped: 0,
             overran: false,
             pace: Pace::default(),
+            way: Way::new(),
             brake_broken: false,
             settings,
             controller,
@@ -241,6 +244,7 @@ impl<T: LoopController> Core<T> {
         (self.braked, self.ramped) = (resume.braked, resume.ramped);
         (self.overran, self.brake_broken) = (resume.overran, resume.brake_broken);
         self.pace = Pace::default();
+        self.way = resume.way;
         self.memory.clear();
         self.memory.extend_from_slice(resume.memory());
         self.controller.controller.reset();
@@ -262,6 +266,7 @@ impl<T: LoopController> Core<T> {
             (resume.modes, resume.grid) = (self.modes.counts(), self.grid.place());
             (resume.braked, resume.ramped) = (self.braked, self.ramped);
             (resume.overran, resume.brake_broken) = (self.overran, self.brake_broken);
+            resume.way = self.way;
         }
     }
 
@@ -394,8 +399,11 @@ impl<T: LoopController> Core<T> {
             self.heard.begin(state.header.seq);
             self.held = None;
             self.pace = Pace::default();
+            self.way.clear();
+            self.record.apart = None;
         } else {
             self.go_on(state, lost);
+            self.follow(state, lost);
         }
         let is_frozen = is_next && self.is_frozen(state);
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);
@@ -424,6 +432,22 @@ impl<T: LoopController> Core<T> {
         self.pace.take(state.time - known.time, lost + 1, self.settings.period);
     }
 
+    /// Compares where the joints went with their velocities. Once a driver is found to tell others, nothing can be reckoned with them any more.
+    fn follow(&mut self, state: &StateMessage, lost: u64) {
+        let (known, settings) = (&self.record.state, &self.settings);
+        if settings.jump <= 0.0 || self.record.apart.is_some() {
+            return;
+        }
+        let is_usable =
+            known.is_finite() && state.is_finite() && lost <= u64::from(settings.modes.hold_states);
+        if !is_usable || self.pace.is_wrong() {
+            self.way.clear();
+            return;
+        }
+        let nominal = (lost + 1) as f64 * settings.period as f64 * 1e-9;
+        self.record.apart = self.way.take(known, state, nominal, self.controller.controller.speeds());
+    }
+
     /// What the state just taken is worth.
     fn event_of_state(&mut self, is_frozen: bool, gap: u64) -> Event {
         let (state, counters) = (&self.record.state, &mut self.record.counters);
@@ -450,6 +474,9 @@ impl<T: LoopController> Core<T> {
                 counters.implausible_states += 1;
                 return self.hold(Reason::ImplausibleState);
             }
+        }
+        if self.record.apart.is_some() {
+            return Event::Lost(Reason::WrongVelocity);
         }
         self.estimate = *state;
         self.held = Some(0);

@@ -31,6 +31,7 @@ mod run;
 pub mod swap;
 mod tick;
 mod watch;
+mod way;
 
 pub use crate::clock;
 pub use crate::grid::Grid;
@@ -54,3 +55,4 @@ pub use tick::{
     Build, Counters, LoopController, MAX_ROWS, Outcome, Question, Record, Refusal, Row, Sensed, TickOutput,
 };
 pub use watch::{Found, Watched};
+pub use way::{Apart, Way};

@@ -76,6 +76,8 @@ codes! {
             "Start the plant again, then the runtime; without --loop-patience a plant brakes and waits for the next runtime.";
         WrongPeriod = "wrong-period", "Sixteen times in a row the plant's own clock showed a period that is a fifth or more off the one it announced.",
             "Let the driver's loop run once in each period of `dt`, or announce, and train with, the period that it has; its `time` is in seconds.";
+        WrongVelocity = "wrong-velocity", "A joint moved another way than its velocities say, by a quarter of its fastest speed over a quarter of a second; latched.",
+            "Check unit, sign, filter and joint order of the plant's velocities, that they are measured, and that `dt` is the period it has; then start the runtime again.";
     }
 }
 
@@ -224,7 +226,8 @@ impl Modes {
     }
 
     fn count(&mut self, event: Event, overran: bool) {
-        let unusable = |reason| matches!(reason, Reason::BadState | Reason::ImplausibleState);
+        let unusable =
+            |reason| matches!(reason, Reason::BadState | Reason::ImplausibleState | Reason::WrongVelocity);
         let is_bad = matches!(event, Event::Held(r) | Event::Lost(r) if unusable(r));
         self.good = if event == Event::Good && !overran { self.good.saturating_add(1) } else { 0 };
         self.bad = if is_bad { self.bad.saturating_add(1) } else { 0 };
@@ -237,6 +240,7 @@ impl Modes {
             Event::Panicked => Reason::Panic,
             Event::Lost(Reason::BadState) if is_over => Reason::BadStates,
             Event::Lost(Reason::ImplausibleState) if is_over => Reason::ImplausibleStates,
+            Event::Lost(Reason::WrongVelocity) if is_over => Reason::WrongVelocity,
             _ if self.late >= self.starved => Reason::Starved,
             _ => Reason::None,
         }

@@ -365,6 +365,10 @@ impl LoopController for Pilot {
         }
     }
 
+    fn speeds(&self) -> &[(usize, usize, f64)] {
+        &self.checked
+    }
+
     /// With `S = max(V, |v|)` of the old state: `|v'| > jump S`, or `|q' - q| > jump age max(S, |v'|)`.
     fn implausible(&self, old: &StateMessage, new: &StateMessage, age: f64, jump: f64) -> Option<usize> {
         let jumped = |&&(dof, idx_q, limit): &&(usize, usize, f64)| {

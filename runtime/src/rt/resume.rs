@@ -1,5 +1,7 @@
 //! What the loop remembers from tick to tick, as plain numbers: after a gap in a flight log, replay goes on from there.
 
+use crate::rt::way::Way;
+
 /// Numbers that a controller may remember: for 64 joints the limits, the lengths of its parts, the two ticks before with their set points and a stored brake.
 pub const MAX_MEMORY: usize = 715;
 
@@ -21,6 +23,8 @@ pub struct Resume {
     pub overran: bool,
     /// The brake has panicked.
     pub brake_broken: bool,
+    /// Where the joints went since the sums began.
+    pub way: Way,
     /// Entries used in `memory`.
     pub length: u32,
     /// What the controller saved.
@@ -38,6 +42,7 @@ impl Resume {
             ramped: 0,
             overran: false,
             brake_broken: false,
+            way: Way::new(),
             length: 0,
             memory: [0.0; MAX_MEMORY],
         }

@@ -5,6 +5,7 @@ use crate::link::{
     StateMessage, Verdict,
 };
 use crate::rt::watch::Watched;
+use crate::rt::way::Apart;
 use crate::rt::{Mode, Reason, Resume};
 use nearl_constraints::Moved;
 
@@ -68,6 +69,10 @@ pub trait LoopController: Send + 'static {
     /// The first degree of freedom of `new` that cannot have come from `old` in `age` \[s\], allowing `jump` times its speed.
     fn implausible(&self, _old: &StateMessage, _new: &StateMessage, _age: f64, _jump: f64) -> Option<usize> {
         None
+    }
+    /// Joints whose samples can be checked: degree of freedom, configuration index, largest speed [rad/s or m/s].
+    fn speeds(&self) -> &[(usize, usize, f64)] {
+        &[]
     }
     /// A degree of freedom of `state` that is further outside of its joint's range than any robot stands, in degrees for radians for one.
     fn elsewhere(&self, _state: &StateMessage) -> Option<usize> {
@@ -326,6 +331,8 @@ pub struct Record {
     pub stop: bool,
     /// What the state was worth.
     pub sensed: Sensed,
+    /// A joint that goes elsewhere than its velocity says, once it is found in an episode.
+    pub apart: Option<Apart>,
     /// Share of the way to the target that the first motion was given; 1 once it is over.
     pub ramp: f64,
     /// Noise of the proposal, in every entry.
@@ -362,6 +369,7 @@ impl Record {
             snapshot: 0,
             stop: false,
             sensed: Sensed::Missing,
+            apart: None,
             ramp: 1.0,
             noise: 0.0,
             heard: false,

@@ -9,6 +9,7 @@ use serde::Serialize;
 
 use crate::codes::LedgerStatus;
 use crate::rt::tick::{Record, Sensed};
+use crate::rt::way::Apart;
 use crate::rt::{Mode, Reason};
 
 /// Findings that are told one by one.
@@ -35,7 +36,7 @@ pub struct Watched {
     pub velocity: f64,
 }
 
-/// A joint that was outside a limit where a tick began.
+/// A joint that was outside a limit where a tick began, or whose velocity was not that of its motion.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Found {
     /// The first tick.
@@ -46,7 +47,7 @@ pub struct Found {
     pub what: &'static str,
     /// What was measured.
     pub value: f64,
-    /// What is allowed.
+    /// What is allowed, or its own motion has.
     pub limit: f64,
     /// Unit of both.
     pub unit: String,
@@ -99,12 +100,34 @@ impl Watch {
         if is_elsewhere && record.fresh {
             self.name(record);
         }
+        if let Some(apart) = record.apart {
+            self.name_apart(record.tick, apart);
+        }
         if record.output.nu == 0 {
             return;
         }
         *self.counts.entry(record.output.ledger.status).or_default() += 1;
         if record.output.ledger.outside > 0 && record.sensed == Sensed::Measured {
             self.name(record);
+        }
+    }
+
+    /// A joint that goes elsewhere than its velocity says.
+    fn name_apart(&mut self, tick: u64, apart: Apart) {
+        const WHAT: &str = "mean speed by its positions";
+        let Some(joint) = self.joints.iter().find(|joint| joint.dof == apart.dof) else { return };
+        let is_known = self.outside.iter().any(|f| f.joint == joint.joint && f.what == WHAT);
+        if !is_known && self.outside.len() < TOLD {
+            let unit = format!("{}/s", joint.length);
+            let found = Found {
+                tick,
+                joint: joint.joint.clone(),
+                what: WHAT,
+                value: apart.told,
+                limit: apart.moved,
+                unit,
+            };
+            self.outside.push(found);
         }
     }
 

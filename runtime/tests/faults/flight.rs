@@ -18,6 +18,8 @@ pub struct Flight {
     pub proposal: Option<ProposalMessage>,
     /// Control periods that pass in the plant's own loop for each that it announced.
     pub stretch: u32,
+    /// What the driver makes of the velocities that it tells, as a share of them.
+    pub told: f64,
     clock: f64,
     plan: FaultPlan,
     brake: Brake,
@@ -63,6 +65,7 @@ impl Flight {
             sequence: Sequence::default(),
             proposal: None,
             stretch: 1,
+            told: 1.0,
             clock: DT,
             brake: Brake::new(&snapshot.manifest).unwrap().unwrap(),
             plan,
@@ -103,6 +106,7 @@ impl Flight {
         self.tick += 1;
         let mut state = StateMessage::zeroed();
         self.panda.observe(&mut state);
+        state.v.iter_mut().for_each(|v| *v *= self.told);
         (state.tick, state.time) = (self.tick, self.clock);
         self.plan.spoil(self.tick, &mut state, &self.last);
         self.last = state;

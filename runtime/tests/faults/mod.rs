@@ -174,6 +174,29 @@ fn fault_26_a_jump_is_rejected_and_counted() {
     assert!(degrees.records.iter().take(30).all(|record| record.output.nu == 0));
 }
 
+/// Nothing can be reckoned with such velocities, and so nothing is sent any more once they are found.
+#[test]
+fn fault_26_velocities_of_another_motion_end_the_loop() {
+    for told in [0.0, -1.0, 0.4] {
+        let mut flight = Flight::new(&stochastic(1), settings(), FaultPlan::default());
+        flight.fly(300);
+        assert_eq!(flight.at(300), (Mode::Active, Reason::None));
+        flight.told = told;
+        flight.fly(1500);
+        let (tick, reason) =
+            flight.first(Mode::Fault).unwrap_or_else(|| panic!("{told} of the velocities: not found"));
+        assert_eq!(reason, Reason::WrongVelocity);
+        println!("{told} of the velocities: found {} ms after they were told first", tick - 308);
+        assert!(
+            flight.records[tick as usize - 8..]
+                .iter()
+                .all(|r| r.output.nu == 0 && r.sensed == Sensed::Missing)
+        );
+        let apart = flight.core.record.apart.expect("the joint is named");
+        assert!((apart.moved - apart.told).abs() > 0.02, "{apart:?}");
+    }
+}
+
 #[test]
 fn fault_35_opposite_policies_every_ten_ticks_obey_every_limit() {
     let mut opposite = stochastic(1);

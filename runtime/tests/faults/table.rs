@@ -214,9 +214,13 @@ pub const ROWS: &[Row] = &[
     (
         26,
         "sensor jump",
-        "rejected and counted, bridged 3 times, after 8 latched; nothing is sent where an episode begins with one in degrees",
-        &["implausible-state", "implausible-states"],
-        &[(HERE, "fault_26_a_jump_is_rejected_and_counted")],
+        "rejected and counted, bridged 3 times, after 8 latched; nothing is sent where an episode begins with one in degrees, or once \
+         velocities are found to be those of another motion",
+        &["implausible-state", "implausible-states", "wrong-velocity"],
+        &[
+            (HERE, "fault_26_a_jump_is_rejected_and_counted"),
+            (HERE, "fault_26_velocities_of_another_motion_end_the_loop"),
+        ],
     ),
     (
         27,
@@ -278,7 +282,7 @@ pub const ROWS: &[Row] = &[
         &["none"],
         &[
             (GIL, "test_the_loop_runs_on_while_python_holds_its_lock"),
-            (GIL, "test_a_loop_that_loses_a_tenth_of_its_ticks_under_the_lock_is_found"),
+            (GIL, "test_a_loop_that_waits_for_the_lock_in_one_tick_of_many_is_found"),
         ],
     ),
     (
