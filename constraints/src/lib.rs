@@ -66,6 +66,7 @@ mod physics_steps;
 mod pinocchio;
 mod projector;
 mod random;
+mod recent;
 pub mod row;
 mod target;
 mod urdf;
@@ -89,6 +90,7 @@ pub use physics_steps::PhysicsSteps;
 #[doc(hidden)]
 pub use projector::{CoupledStages, Numbers};
 pub use projector::{Problem, ProblemCone, Projector};
+pub use recent::Recent;
 pub use row::{Cone, Rows, Soft};
 pub use target::{Bounds, Braking, Consistency, Guard, Proposal, Settings, Solver, Target};
 pub use viability::Period;

@@ -15,7 +15,7 @@
 //! and a sum falls where its multiplier grows: bisection ends between two neighbouring floating-point numbers, on the side that obeys.
 
 use super::PerJoint;
-use crate::{LimitError, Model};
+use crate::{LimitError, Model, Recent};
 use serde::{Deserialize, Serialize};
 
 /// `action = { power, delivered, square, rate }`; at least one of them.
@@ -74,9 +74,7 @@ pub struct ActionLimit {
     range: Vec<(f64, f64)>,
     /// Dof that an entry drives.
     dofs: Vec<usize>,
-    /// The action before, then the one before that, once there were such: kept apart, so that an episode that begins allocates nothing.
-    before: [Vec<f64>; 2],
-    has_before: [bool; 2],
+    given: Recent,
     /// Of the call under way: what is asked for, velocities, bounds, and the answer.
     asked: Vec<f64>,
     v: Vec<f64>,
@@ -141,8 +139,7 @@ impl ActionLimit {
             bounds: vec![(0.0, 0.0); n],
             range,
             dofs,
-            before: [vec![0.0; n], vec![0.0; n]],
-            has_before: [false; 2],
+            given: Recent::new(n),
             asked,
             v,
             answer,
@@ -159,8 +156,8 @@ impl ActionLimit {
         }
         for i in 0..action.len() {
             let (lower, upper) = self.range[i];
-            self.bounds[i] = if self.has_before[0] {
-                let at = self.before[0][i].clamp(lower, upper);
+            self.bounds[i] = if let Some(given) = self.given.get() {
+                let at = given[i].clamp(lower, upper);
                 ((at - self.rate[i]).max(lower), (at + self.rate[i]).min(upper))
             } else {
                 (lower, upper)
@@ -175,9 +172,7 @@ impl ActionLimit {
         let square = |(a, u): (&f64, &f64)| (a - u) * (a - u);
         let moved = action.iter().zip(&self.asked).map(square).sum::<f64>().sqrt();
         if self.remembers() {
-            self.before.swap(0, 1);
-            self.before[0].copy_from_slice(action);
-            self.has_before = [true, self.has_before[0]];
+            self.given.push(&*action);
         }
         ActionReport { moved, raw_violations, target_violations }
     }
@@ -245,9 +240,10 @@ impl ActionLimit {
 
     fn broken(&self, action: &[f64]) -> u32 {
         let sums = self.sums.iter().filter(|(sum, limit)| self.value(*sum, action) > limit + TOLERANCE);
-        let change = action.iter().zip(&self.before[0]).map(|(a, b)| (a - b).abs());
-        let changes =
-            self.has_before[0] && change.zip(&self.rate).any(|(change, rate)| change > rate + TOLERANCE);
+        let changes = self.given.get().is_some_and(|given| {
+            let change = action.iter().zip(given).map(|(a, b)| (a - b).abs());
+            change.zip(&self.rate).any(|(change, rate)| change > rate + TOLERANCE)
+        });
         sums.count() as u32 + u32::from(changes)
     }
 
@@ -258,27 +254,23 @@ impl ActionLimit {
 
     /// Begins anew: no rate holds for the next action.
     pub fn forget(&mut self) {
-        self.has_before = [false; 2];
+        self.given.forget();
     }
 
     /// The action before came too late and was never sent: the next one follows on the one before that.
     pub fn recall(&mut self) {
-        self.before.swap(0, 1);
-        self.has_before = [self.has_before[1], false];
+        self.given.recall();
     }
 
     /// Entries of its memory.
     pub fn memory_len(&self) -> usize {
-        if self.remembers() { 2 * (1 + self.range.len()) } else { 0 }
+        if self.remembers() { self.given.memory_len() } else { 0 }
     }
 
     /// Appends what the next action depends on beside its arguments.
     pub fn write_memory(&self, memory: &mut Vec<f64>) {
         if self.remembers() {
-            for (before, &has) in self.before.iter().zip(&self.has_before) {
-                memory.push(f64::from(u8::from(has)));
-                memory.extend(before.iter().map(|&a| if has { a } else { 0.0 }));
-            }
+            self.given.write(memory);
         }
     }
 
@@ -288,10 +280,8 @@ impl ActionLimit {
     /// When it has another length.
     pub fn set_memory(&mut self, memory: &[f64]) {
         assert_eq!(memory.len(), self.memory_len(), "memory of another limit");
-        let parts = memory.chunks_exact(1 + self.range.len());
-        for ((before, has), part) in self.before.iter_mut().zip(&mut self.has_before).zip(parts) {
-            *has = part[0] != 0.0;
-            before.copy_from_slice(&part[1..]);
+        if self.remembers() {
+            self.given.read(memory);
         }
     }
 }

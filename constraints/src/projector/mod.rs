@@ -33,7 +33,7 @@ use crate::ledger::{BrakeReason, RefuseReason, Rung, Status};
 use crate::row::Previous;
 use crate::target::{Bounds, Braking, Consistency, Proposal, Settings, Target};
 use crate::viability::{Dof, Interval, Kind, Period, interval};
-use crate::{Dynamics, LimitSet, Model};
+use crate::{Dynamics, LimitSet, Model, Recent};
 use active_set::ActiveSet;
 use backup::Backup;
 use conic::Conic;
@@ -161,58 +161,30 @@ struct Switch {
     enabled: bool,
 }
 
-/// What a tick asked of the robot, where it is known.
-struct Asked {
-    known: bool,
-    acceleration: Vec<f64>,
-    torque: Vec<f64>,
-}
-
-impl Asked {
-    fn none(nv: usize) -> Asked {
-        Asked { known: false, acceleration: vec![0.0; nv], torque: vec![0.0; nv] }
-    }
-
-    fn get(&self) -> Option<Previous<'_>> {
-        self.known.then_some(Previous { acceleration: &self.acceleration, torque: &self.torque })
-    }
-
-    fn set(&mut self, acceleration: &[f64], torque: &[f64]) {
-        self.acceleration.copy_from_slice(acceleration);
-        self.torque.copy_from_slice(torque);
-        self.known = true;
-    }
-
-    fn write(&self, memory: &mut Vec<f64>) {
-        memory.push(f64::from(u8::from(self.known)));
-        memory.extend_from_slice(&self.acceleration);
-        memory.extend_from_slice(&self.torque);
-    }
-
-    /// Takes what [`Asked::write`] wrote; what is left of `memory`.
-    fn read<'m>(&mut self, memory: &'m [f64]) -> &'m [f64] {
-        let (asked, rest) = memory.split_at(1 + 2 * self.acceleration.len());
-        let (acceleration, torque) = asked[1..].split_at(self.acceleration.len());
-        self.set(acceleration, torque);
-        self.known = asked[0] != 0.0;
-        rest
-    }
-}
-
-/// The tick before, and the one before that: what was sent last, where the answer of the tick before came too late.
+/// The last two ticks.
 struct History {
-    last: Asked,
-    before: Asked,
+    nv: usize,
+    /// Accelerations (nv), then motor forces (nv), that they asked of the robot.
+    asked: Recent,
     sent: sent::Sent,
 }
 
 impl History {
     fn none(nv: usize) -> History {
-        History { last: Asked::none(nv), before: Asked::none(nv), sent: sent::Sent::default() }
+        History { nv, asked: Recent::new(2 * nv), sent: sent::Sent::default() }
     }
 
     fn get(&self) -> Option<Previous<'_>> {
-        self.last.get()
+        let (acceleration, torque) = self.asked.get()?.split_at(self.nv);
+        Some(Previous { acceleration, torque })
+    }
+
+    /// Forgets both where the numbers are none: what limits on a change look back to is not known.
+    fn push(&mut self, Previous { acceleration, torque }: Previous<'_>) {
+        self.asked.push(acceleration.iter().chain(torque));
+        if !(finite(acceleration) && finite(torque)) {
+            self.asked.forget();
+        }
     }
 }
 

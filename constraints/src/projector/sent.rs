@@ -99,17 +99,21 @@ impl Projector {
     /// in each period by what the joint may decelerate, velocities and forces as they were.
     pub fn miss(&mut self, periods: u64) {
         let dt = self.period.dt;
-        let History { last: asked, sent, .. } = &mut self.previous;
+        let History { asked, sent, .. } = &mut self.previous;
+        let mut asked = asked.get_mut();
         for Follower { dof, position, last, .. } in &mut sent.joints {
             for _ in 0..periods.min(MISSED) {
-                asked.acceleration[*dof] = 0.0;
+                let mut acceleration = 0.0;
                 if position.is_some() {
                     let slower =
                         (self.limits.acceleration[*dof] * dt).min(last.mean.abs()).copysign(last.mean);
                     last.mean -= slower;
                     last.v = last.mean;
                     last.q += dt * last.mean;
-                    asked.acceleration[*dof] = -slower / dt;
+                    acceleration = -slower / dt;
+                }
+                if let Some(asked) = &mut asked {
+                    asked[*dof] = acceleration;
                 }
             }
         }
@@ -117,9 +121,8 @@ impl Projector {
 
     /// The target of the tick before came too late and was never sent: what was sent last is that of the tick before it.
     pub fn recall(&mut self) {
-        let History { last, before, sent } = &mut self.previous;
-        std::mem::swap(last, before);
-        before.known = false;
+        let History { asked, sent, .. } = &mut self.previous;
+        asked.recall();
         sent.known = sent.known.saturating_sub(1);
         sent.joints.iter_mut().for_each(|joint| joint.last = joint.before);
     }
@@ -127,9 +130,8 @@ impl Projector {
     /// What was sent in the tick before is not what the robot does: the next tick begins where it is measured, and limits on a change from the tick
     /// before do not hold in it.
     pub fn lose(&mut self) {
-        let History { last, before, sent } = &mut self.previous;
-        (last.known, before.known) = (false, false);
-        sent.forget();
+        self.previous.asked.forget();
+        self.previous.sent.forget();
     }
 }
 

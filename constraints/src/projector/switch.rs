@@ -1,7 +1,7 @@
 //! What may be changed between ticks: limits on and off, forces from outside, the tick before.
 
+use super::Projector;
 use super::build::check_combination;
-use super::{History, Projector};
 use crate::jerk::Brake;
 use crate::row::Previous;
 use crate::viability::Dof;
@@ -128,9 +128,13 @@ impl Projector {
     /// # Panics
     /// When there are not nv of them.
     pub fn set_previous(&mut self, previous: Option<Previous<'_>>) {
-        self.previous.last.known = false;
-        if let Some(Previous { acceleration, torque }) = previous {
-            self.previous.last.set(acceleration, torque);
+        self.previous.asked.forget();
+        if let Some(previous) = previous {
+            assert_eq!(
+                (previous.acceleration.len(), previous.torque.len()),
+                (self.previous.nv, self.previous.nv)
+            );
+            self.previous.asked.push(previous.acceleration.iter().chain(previous.torque));
         }
     }
 
@@ -150,8 +154,7 @@ impl Projector {
 
     /// Appends [`Projector::memory`] to `memory`; allocates only where that has no room.
     pub fn write_memory(&self, memory: &mut Vec<f64>) {
-        self.previous.last.write(memory);
-        self.previous.before.write(memory);
+        self.previous.asked.write(memory);
         self.previous.sent.write(memory);
         self.backup.write_memory(memory);
     }
@@ -161,18 +164,14 @@ impl Projector {
     /// # Panics
     /// When it has another length.
     pub fn set_memory(&mut self, memory: &[f64]) {
-        let rest = self.previous.last.read(memory);
-        let rest = self.previous.before.read(rest);
+        let rest = self.previous.asked.read(memory);
         let rest = self.previous.sent.set(rest);
         self.backup.set_memory(rest);
     }
 
     /// Makes the last tick, which ended with `target`, the tick before.
     pub fn remember(&mut self, target: &Target) {
-        let History { last, before, .. } = &mut self.previous;
-        std::mem::swap(last, before);
-        last.set(&target.acceleration, self.checker.torque());
-        last.known = [&last.acceleration, &last.torque].into_iter().flatten().all(|x| x.is_finite());
+        self.previous.push(Previous { acceleration: &target.acceleration, torque: self.checker.torque() });
         self.previous.sent.remember(target, &self.period);
     }
 

@@ -3,7 +3,7 @@
 use crate::rt::way::Way;
 
 /// Numbers that a controller may remember: for 64 joints the limits, the lengths of its parts, the two ticks before with their set points and a stored brake.
-pub const MAX_MEMORY: usize = 715;
+pub const MAX_MEMORY: usize = 714;
 
 /// The memory of a [`Core`](super::Core) after a tick, beside the tick's record. Only where the state was measured and the controller begins
 /// a policy period; elsewhere `is_set` is false and the rest says nothing.

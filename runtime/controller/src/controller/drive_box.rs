@@ -4,7 +4,7 @@
 use super::Parts;
 use super::parts::unusable;
 use crate::snapshot::{Manifest, SnapshotError};
-use nearl_constraints::{ActionReport, Drive, Model, Projector};
+use nearl_constraints::{ActionReport, Drive, Model, Projector, Recent};
 
 /// A force further than this beyond its interval [N·m or N] counts as a limit that was broken.
 const TOLERANCE: f64 = 1e-9;
@@ -22,9 +22,10 @@ const TOLERANCE: f64 = 1e-9;
 pub(super) struct DriveBox {
     joints: Vec<Joint>,
     dt: f64,
-    /// Force at the start of the tick before (n_act), then of the one before that; not known at the start of an episode, when no rate holds.
-    before: [Vec<f64>; 2],
-    known: [bool; 2],
+    /// Forces at the start of the last ticks (n_act); not known at the start of an episode, when no rate holds.
+    forces: Recent,
+    /// Those of the tick under way (n_act).
+    force: Vec<f64>,
 }
 
 struct Joint {
@@ -75,8 +76,8 @@ impl DriveBox {
             Ok(Joint { at, dof, idx_q, stiffness, damping, effort, rate, acceleration })
         };
         let joints = dofs.iter().enumerate().map(joint).collect::<Result<Vec<_>, _>>()?;
-        let zero = vec![0.0; joints.len()];
-        Ok(DriveBox { dt: m.task.time.dt, before: [zero.clone(), zero], known: [false; 2], joints })
+        let n = joints.len();
+        Ok(DriveBox { dt: m.task.time.dt, forces: Recent::new(n), force: vec![0.0; n], joints })
     }
 
     /// Where in the action the `k`-th controllable joint's command is.
@@ -88,11 +89,11 @@ impl DriveBox {
     /// [rad or m], and counts every drive that was asked for a force outside its interval. With `hold` off nothing is moved.
     pub(super) fn update(&mut self, q: &[f64], v: &[f64], action: &mut [f64], hold: bool) -> ActionReport {
         let mut report = ActionReport::default();
-        let [before, earlier] = &mut self.before;
-        for (joint, (before, earlier)) in self.joints.iter().zip(before.iter_mut().zip(earlier)) {
+        let before = self.forces.get();
+        for (k, (joint, given)) in self.joints.iter().zip(&mut self.force).enumerate() {
             let action = &mut action[joint.at];
             let (at, v) = (q[joint.idx_q], v[joint.dof]);
-            let (low, high) = joint.forces(v, self.dt, self.known[0].then_some(*before));
+            let (low, high) = joint.forces(v, self.dt, before.map(|before| before[k]));
             let asked = joint.stiffness * (*action - at) - joint.damping * v;
             let broken = u32::from(asked < low - TOLERANCE || asked > high + TOLERANCE);
             report.raw_violations += broken;
@@ -103,37 +104,29 @@ impl DriveBox {
                 report.moved = report.moved.max((target - *action).abs());
                 *action = target;
             }
-            (*earlier, *before) = (*before, force);
+            *given = force;
         }
-        self.known = [true, self.known[0]];
+        self.forces.push(&self.force);
         report
     }
 
     pub(super) fn forget(&mut self) {
-        self.known = [false; 2];
+        self.forces.forget();
     }
 
     /// The target of the tick before came too late and was never sent.
     pub(super) fn recall(&mut self) {
-        self.before.swap(0, 1);
-        self.known = [self.known[1], false];
+        self.forces.recall();
     }
 
     /// Appends what the next tick depends on beside its arguments.
     pub(super) fn write_memory(&self, memory: &mut Vec<f64>) {
-        for (before, &known) in self.before.iter().zip(&self.known) {
-            memory.push(f64::from(u8::from(known)));
-            memory.extend_from_slice(before);
-        }
+        self.forces.write(memory);
     }
 
     /// Takes what [`DriveBox::write_memory`] gave.
     pub(super) fn set_memory(&mut self, memory: &[f64]) {
-        let parts = memory.chunks_exact(1 + self.joints.len());
-        for ((before, known), part) in self.before.iter_mut().zip(&mut self.known).zip(parts) {
-            *known = part[0] != 0.0;
-            before.copy_from_slice(&part[1..]);
-        }
+        self.forces.read(memory);
     }
 }
 
