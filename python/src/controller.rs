@@ -141,7 +141,7 @@ impl Controller {
         self.with(py, |inner| inner.controller.reset());
     }
 
-    /// Raw and projected entries of the proposed state in the last tick, each (n_state).
+    /// Raw entries of the state proposed in the last tick (n_state).
     #[getter]
     fn proposal<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         array(py, &self.with(py, |inner| inner.out.proposal.clone()))

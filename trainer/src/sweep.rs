@@ -152,7 +152,9 @@ impl Sweep {
         drop(run_folder::lock(folder)?);
         let other = |what: String| Err(SweepError::Other { path: folder.display().to_string(), what });
         match std::fs::read_to_string(folder.join("task.toml")) {
-            Ok(text) if text != task => return other("a run of another task file".into()),
+            Ok(text) if text != task => {
+                return other("a run of another task file or of other settings (--set)".into());
+            }
             Ok(_) => {}
             Err(_) if is_empty(folder) => return Ok(Found::Nothing),
             Err(_) => return other("no run: it has no task.toml".into()),

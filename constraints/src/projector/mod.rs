@@ -32,7 +32,7 @@ use crate::jerk;
 use crate::ledger::{BrakeReason, RefuseReason, Rung, Status};
 use crate::row::Previous;
 use crate::target::{Bounds, Braking, Consistency, Proposal, Settings, Target};
-use crate::viability::{Dof, Interval, Kind, Period, interval};
+use crate::viability::{Dof, Interval, Kind, POSITION_TOLERANCE, Period, interval};
 use crate::{Dynamics, LimitSet, Model, Recent};
 use active_set::ActiveSet;
 use backup::Backup;
@@ -327,7 +327,7 @@ impl Projector {
             };
             let mut v_lower = exact(x.lower_kind, x.lower, -dof.velocity);
             let mut v_upper = exact(x.upper_kind, x.upper, dof.velocity).max(v_lower);
-            let mut outside = x.outside.is_some();
+            let mut outside = x.outside.is_some() || self.is_beyond(i, at);
             self.moving.beyond |= outside;
             if self.moving.on {
                 let (aim, hard, behind) = self.move_dof((at, v[i]), i, x);
@@ -351,6 +351,13 @@ impl Projector {
             }
             self.intervals[i] = x;
         }
+    }
+
+    /// The joint of dof `i`, at `at`, is beyond its range. Without an acceleration limit its interval does not know.
+    fn is_beyond(&self, i: usize, at: f64) -> bool {
+        self.dofs.single[i].is_some()
+            && (at > self.limits.q_upper[i] + POSITION_TOLERANCE
+                || at < self.limits.q_lower[i] - POSITION_TOLERANCE)
     }
 
     /// The independent checker has the last word.

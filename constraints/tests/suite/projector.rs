@@ -381,6 +381,31 @@ fn free_mode_clamps_position_and_velocity_apart() {
     assert_eq!((bits(&target.q), bits(&target.v)), (bits(&raw.q), bits(&raw.v)));
 }
 
+/// Without an acceleration limit too: what begins outside is named, and its target is the nearest position to the limit that its speed reaches.
+#[test]
+fn free_mode_names_what_begins_outside_and_brings_it_back() {
+    let model = robot("gymnasium/half_cheetah.xml");
+    let limits: Vec<Box<dyn Limit>> =
+        vec![Box::new(PositionLimit::default()), Box::new(VelocityLimit::values(PerJoint::All(2.0)))];
+    let settings = Settings { consistency: Consistency::Free, ..Settings::new(0.01, 1) };
+    let mut projector = Projector::new(&model, &limits, &[3, 4, 5, 6, 7, 8], settings).unwrap();
+    let (mut target, raw, v) = (Target::new(&model), Proposal::new(&model), vec![0.0; 9]);
+    let (low, high) = (model.lower_position_limit()[5], model.upper_position_limit()[5]);
+    // A period reaches 0.02 rad, and the proposal is 0, inside of the range.
+    for (at, to) in [
+        (high + 0.005, high - 0.015),
+        (high + 0.03, high + 0.01),
+        (low - 0.005, low + 0.015),
+        (low - 0.5, low - 0.48),
+    ] {
+        let mut q = vec![0.0; 9];
+        q[5] = at;
+        let status = projector.project(&q, &v, &raw, &mut target);
+        assert_eq!((status, &target.ledger.outside[..]), (Status::Recovering, &[5][..]), "at {at}");
+        assert!((target.q[5] - to).abs() < 1e-12, "at {at}: {target:?}");
+    }
+}
+
 /// A floating base passes through, its legs are projected; the base enters the torque rows as it was proposed.
 #[test]
 fn a_floating_base_passes_through() {

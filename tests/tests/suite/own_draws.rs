@@ -6,6 +6,7 @@ use nearl_tests::training;
 use nearl_trainer::env::Env;
 use nearl_trainer::evaluate::evaluate;
 use nearl_trainer::rollout::{Worker, make_env, stream};
+use nearl_trainer::tasks;
 
 const CALM: [&str; 4] = ["commands={}", "pushes={}", "termination={}", "reward={ alive = 1.0 }"];
 const SEEN: &str =
@@ -294,6 +295,17 @@ fn the_value_alone_sees_what_is_privileged() {
 const MISTAKES: &[(&str, &[&str])] = &[
     ("random.masses=1", &["[random.masses]", "there are mass, inertia, com, friction"]),
     ("random.mass={ trunkk = 1.0 }", &["[random.mass.trunkk]", "did you mean 'trunk'?"]),
+    ("random.mass=-1", &["[random.mass]", "no factor that is drawn is 0.01 or more"]),
+    (
+        "random.mass={ trunk = \"-2 + uniform\" }",
+        &["[random.mass.trunk]", "no factor that is drawn is 0.01 or more"],
+    ),
+    ("random.strength={ all = -1 }", &["[random.strength.all]", "no factor that is drawn is 0 or more"]),
+    ("delay.action=-1", &["[delay.action]", "no delay that is drawn has 0 to 100 control periods"]),
+    (
+        "delay.observation=500",
+        &["[delay.observation]", "no delay that is drawn has 0 to 100 control periods"],
+    ),
     ("noise.qq=1", &["[noise.qq]", "there are q, v, base_v, base_w, tilt"]),
     ("noise.bias=1", &["[noise.bias]", "it is a table"]),
     ("delay.actions=1", &["[delay.actions]", "there are 'action' and 'observation'"]),
@@ -309,4 +321,18 @@ const MISTAKES: &[(&str, &[&str])] = &[
 #[test]
 fn mistakes_are_named_with_their_key() {
     refuses_each(MISTAKES);
+}
+
+/// A factor on a gain that a motor of torques does not have would do nothing, and one on what MuJoCo keeps in its place would change the torque.
+#[test]
+fn gains_of_motors_that_are_no_drives_cannot_be_drawn() {
+    for key in ["stiffness", "damping"] {
+        let set = format!("random.{key}=1.1");
+        let message = tasks::load(&fixture("two_link.toml").display().to_string(), &[set])
+            .err()
+            .expect("refused")
+            .to_string();
+        let says = [&format!("[random.{key}]")[..], "no motor of the robot is a drive with such a gain"];
+        assert!(says.iter().all(|part| message.contains(part)), "{message}");
+    }
 }

@@ -226,16 +226,26 @@ impl Model {
         beyond
     }
 
-    /// Geoms that may touch something.
+    /// Geoms that another may touch: by their masks or a pair, of bodies that move against each other and are not joined.
     pub(crate) fn touching(&self) -> usize {
         if self.disables(mjtDisableBit::mjDSBL_CONTACT) || self.disables(mjtDisableBit::mjDSBL_CONSTRAINT) {
             return 0;
         }
         let m = &self.0;
-        let touches = |id: usize| m.geom_contype()[id] != 0 || m.geom_conaffinity()[id] != 0;
+        let parents_touch = self.disables(mjtDisableBit::mjDSBL_FILTERPARENT);
+        let welded = |geom: usize| m.body_weldid()[m.geom_bodyid()[geom] as usize];
+        let above = |body: i32| m.body_weldid()[m.body_parentid()[body as usize] as usize];
+        let is_parent = |a: i32, b: i32| a != 0 && b != 0 && (a == above(b) || b == above(a));
+        let may = |a: usize, b: usize| {
+            let masks =
+                m.geom_contype()[a] & m.geom_conaffinity()[b] | m.geom_contype()[b] & m.geom_conaffinity()[a];
+            let (one, other) = (welded(a), welded(b));
+            masks != 0 && one != other && (parents_touch || !is_parent(one, other))
+        };
         let in_pair =
             |id: usize| [m.pair_geom1(), m.pair_geom2()].into_iter().flatten().any(|geom| *geom == id as i32);
-        (0..m.geom_contype().len()).filter(|id| touches(*id) || in_pair(*id)).count()
+        let n = m.geom_contype().len();
+        (0..n).filter(|&a| in_pair(a) || (0..n).any(|b| may(a, b))).count()
     }
 
     /// What is the simulator's alone in every robot that has it, so that no note of the description speaks of it: contacts and sensors.

@@ -6,7 +6,9 @@
 //! vx = "if(abs(uniform) < 0.1, 0, uniform)"
 //! ```
 
-use rand::RngExt;
+use std::ops::RangeInclusive;
+
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
@@ -80,6 +82,12 @@ pub(super) fn drawn(of: &Expression<Quantity>, rng: &mut ChaCha8Rng, level: f64)
         Quantity::Normal => normal,
         _ => level,
     })
+}
+
+/// Whether `of` is drawn within `domain` at all, at the lowest or the highest level.
+pub(super) fn is_ever(of: &Expression<Quantity>, domain: &RangeInclusive<f64>) -> bool {
+    let mut rng = ChaCha8Rng::seed_from_u64(0);
+    (0..128).any(|k| domain.contains(&drawn(of, &mut rng, f64::from(k % 2))))
 }
 
 /// Whole control periods of `dt` \[s\] in a time.

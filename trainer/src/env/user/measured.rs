@@ -18,7 +18,7 @@ use std::collections::VecDeque;
 
 use rand_chacha::ChaCha8Rng;
 
-use super::commands::drawn;
+use super::commands::{drawn, is_ever};
 use super::expression::Expression;
 use super::quantity::{Names, Quantity, base};
 use super::settings::{Mistake, Text, mistake};
@@ -92,7 +92,14 @@ impl Measured {
                 "observation" => 1,
                 _ => return Err(mistake(key, "there are 'action' and 'observation'")),
             };
-            delays[place] = Some(Text::read(&key, value, start)?);
+            let of = Text::read(&key, value, start)?;
+            if !is_ever(&of, &(-0.5..=LONGEST + 0.5)) {
+                return Err(mistake(
+                    key,
+                    format!("no delay that is drawn has 0 to {LONGEST} control periods"),
+                ));
+            }
+            delays[place] = Some(of);
         }
         let single = joints.iter().filter(|joint| joint.nv == 1);
         let joints: Vec<_> = single.map(|joint| (joint.idx_q, joint.idx_v)).collect();

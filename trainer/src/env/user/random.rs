@@ -10,8 +10,9 @@
 //! ```
 
 use rand_chacha::ChaCha8Rng;
+use std::ops::RangeInclusive;
 
-use super::commands::drawn;
+use super::commands::{drawn, is_ever};
 use super::expression::Expression;
 use super::quantity::{Names, Quantity};
 use super::settings::{Mistake, Text, mistake};
@@ -89,9 +90,10 @@ impl Random {
                     format!("nothing of that name can differ; there are {}", known.join(", ")),
                 ));
             };
-            if matches!(kind, Kind::Stiffness | Kind::Damping) && model.nu() == 0 {
-                let reason =
-                    "the robot has motors of torques and no drives; take it out, or command the joints 'pd'";
+            let able = kind.able(model, actuators);
+            if matches!(kind, Kind::Stiffness | Kind::Damping) && able.is_empty() {
+                let reason = "no motor of the robot is a drive with such a gain; take it out, or command the joints 'pd' (factors on the forces of motors are \
+                              'strength')";
                 return Err(mistake(key, reason));
             }
             if *kind == Kind::Bumps && model.physique().bumps.is_empty() {
@@ -103,13 +105,13 @@ impl Random {
                 toml::Value::Table(by_name) => {
                     for (entry, value) in by_name {
                         let key = format!("{key}.{entry}");
-                        draws.push(Draw::read(&key, *kind, entry, value, (model, &names), start)?);
+                        draws.push(Draw::read(&key, *kind, entry, value, (&able, &names), start)?);
                     }
                 }
                 value => {
-                    let of = Text::read(&key, value, start)?;
+                    let of = kind.factor(&key, value, start)?;
                     let together = matches!(kind, Kind::Friction | Kind::Bumps);
-                    draws.push(Draw { kind: *kind, entries: kind.all(model, names.len()), together, of });
+                    draws.push(Draw { kind: *kind, entries: able, together, of });
                 }
             }
         }
@@ -173,12 +175,12 @@ impl Draw {
         kind: Kind,
         entry: &str,
         value: &toml::Value,
-        (model, names): (&Model, &[String]),
+        (able, names): (&[usize], &[String]),
         start: &Names,
     ) -> Result<Draw, Mistake> {
-        let of = Text::read(key, value, start)?;
+        let of = kind.factor(key, value, start)?;
         if entry == "all" {
-            return Ok(Draw { kind, entries: kind.all(model, names.len()), together: true, of });
+            return Ok(Draw { kind, entries: able.to_vec(), together: true, of });
         }
         let at = names.iter().position(|name| name == entry).ok_or_else(|| {
             let near = names.iter().map(|name| (strsim::jaro(name, entry), name));
@@ -187,9 +189,9 @@ impl Draw {
                 .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));
             mistake(key, format!("there is no '{entry}' of which it could be{near}"))
         })?;
-        if !kind.all(model, names.len()).contains(&at) {
+        if !able.contains(&at) {
             let reason = format!(
-                "'{entry}' cannot differ in it: it is the world, or a body alone whose inertia MuJoCo simplifies"
+                "'{entry}' cannot differ in it: it is the world, a body alone whose inertia MuJoCo simplifies, or a motor that is no drive"
             );
             return Err(mistake(key, reason));
         }
@@ -208,24 +210,48 @@ impl Kind {
         }
     }
 
-    /// Which of the `n` entries may differ: every body but the world, and centres of mass where MuJoCo counts on none at the joint.
-    fn all(self, model: &Model, n: usize) -> Vec<usize> {
+    /// Which entries may differ: every body but the world, centres of mass where MuJoCo counts on none at the joint, and gains of drives.
+    fn able(self, model: &Model, actuators: &[Actuator]) -> Vec<usize> {
+        let (n, bias) = (self.names(model, actuators).len(), model.physique().bias);
+        let has_gain =
+            |i: &usize, k: usize| bias.get(actuators[*i].control).is_some_and(|bias| bias[k] != 0.0);
         match self {
             Kind::Mass | Kind::Inertia => (1..n).collect(),
             Kind::Centre => (1..n).filter(|body| !model.is_simple(*body)).collect(),
+            Kind::Stiffness => (0..n).filter(|i| has_gain(i, 1)).collect(),
+            Kind::Damping => (0..n).filter(|i| has_gain(i, 2)).collect(),
             _ => (0..n).collect(),
         }
     }
 
-    /// A factor that physics can have.
-    fn within(self, value: f64) -> f64 {
+    /// The factors that physics can have.
+    fn domain(self) -> RangeInclusive<f64> {
         match self {
-            Kind::Centre => value,
-            Kind::Mass | Kind::Inertia => value.max(0.01),
+            Kind::Centre => f64::MIN..=f64::MAX,
+            Kind::Mass | Kind::Inertia => 0.01..=f64::MAX,
             // MuJoCo looks for contacts within the height that was compiled.
-            Kind::Bumps => value.clamp(0.0, 1.0),
-            _ => value.max(0.0),
+            Kind::Bumps => 0.0..=1.0,
+            _ => 0.0..=f64::MAX,
         }
+    }
+
+    /// The nearest factor that physics can have.
+    fn within(self, value: f64) -> f64 {
+        let domain = self.domain();
+        value.max(*domain.start()).min(*domain.end())
+    }
+
+    /// Reads what is drawn, and refuses what is never a factor that physics can have.
+    fn factor(self, key: &str, value: &toml::Value, start: &Names) -> Result<Expression<Quantity>, Mistake> {
+        let (of, domain) = (Text::read(key, value, start)?, self.domain());
+        if is_ever(&of, &domain) {
+            return Ok(of);
+        }
+        let reason = match *domain.end() == f64::MAX {
+            true => format!("no factor that is drawn is {} or more", domain.start()),
+            false => format!("no factor that is drawn is from {} to {}", domain.start(), domain.end()),
+        };
+        Err(mistake(key, reason))
     }
 
     fn apply(
