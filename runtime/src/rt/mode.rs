@@ -76,8 +76,8 @@ codes! {
             "Start the plant again, then the runtime; without --loop-patience a plant brakes and waits for the next runtime.";
         WrongPeriod = "wrong-period", "Sixteen times in a row the plant's own clock showed a period that is a fifth or more off the one it announced.",
             "Let the driver's loop run once in each period of `dt`, or announce, and train with, the period that it has; its `time` is in seconds.";
-        WrongVelocity = "wrong-velocity", "A joint moved another way than its velocities say, by a quarter of its fastest speed over a quarter of a second; latched.",
-            "Check unit, sign, filter and joint order of the plant's velocities, that they are measured, and that `dt` is the period it has; then start the runtime again.";
+        WrongVelocity = "wrong-velocity", "A joint moved another way than its velocities say, by a quarter of what its fastest speed leads it; latched.",
+            "Check unit, sign, filter and order of the plant's velocities, and that `dt` is the period it has; then start the runtime again.";
     }
 }
 

@@ -214,8 +214,7 @@ pub const ROWS: &[Row] = &[
     (
         26,
         "sensor jump",
-        "rejected and counted, bridged 3 times, after 8 latched; nothing is sent where an episode begins with one in degrees, or once \
-         velocities are found to be those of another motion",
+        "rejected, bridged 3 times, after 8 latched; nothing sent where an episode begins with one, or with velocities of another motion",
         &["implausible-state", "implausible-states", "wrong-velocity"],
         &[
             (HERE, "fault_26_a_jump_is_rejected_and_counted"),

@@ -328,10 +328,10 @@ fn mistakes_are_named_with_their_key() {
 fn gains_of_motors_that_are_no_drives_cannot_be_drawn() {
     for key in ["stiffness", "damping"] {
         let set = format!("random.{key}=1.1");
-        let message = tasks::load(&fixture("two_link.toml").display().to_string(), &[set])
-            .err()
-            .expect("refused")
-            .to_string();
+        let Err(error) = tasks::load(&fixture("two_link.toml").display().to_string(), &[set]) else {
+            panic!("{key} is taken")
+        };
+        let message = error.to_string();
         let says = [&format!("[random.{key}]")[..], "no motor of the robot is a drive with such a gain"];
         assert!(says.iter().all(|part| message.contains(part)), "{message}");
     }
