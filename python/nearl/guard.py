@@ -130,6 +130,23 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
         self._search = _core.ActionSearch(list(positions.values()), list(velocities.values()), actions, self._seed)
         self._ranges = ranges
 
+    def set_constraints(self, constraints: Mapping[str, Mapping[str, PerJoint]]) -> None:
+        """Keeps other limits from the next step on, as a curriculum has them; in a vector ``envs.call("set_constraints", {...})``.
+
+        Args:
+            constraints: As of the constructor.
+
+        Raises:
+            ValueError: as of the constructor; the limits of before stay then.
+        """
+        before = self._constraints
+        self._constraints, self._ranges = copy.deepcopy(constraints), b""
+        try:
+            self._read()
+        except ValueError:
+            self._constraints, self._ranges = before, b""
+            raise
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode; the environment may have changed its model for it."""
         result = self.env.reset(seed=seed, options=options)

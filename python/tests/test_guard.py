@@ -134,6 +134,33 @@ def test_what_is_allowed_changes_nothing():
     assert kept > 5
 
 
+def test_other_limits_hold_from_the_next_step_on_and_wrong_ones_change_nothing():
+    env = nearl.Guard(gymnasium.make("HalfCheetah-v5"), {"velocity": {"limit": 1000.0}})
+    env.reset(seed=1)
+    rng, most = np.random.default_rng(2), {1000.0: 0.0, 15.0: 0.0}
+    for limit in (1000.0, 15.0):
+        env.set_constraints({"velocity": {"limit": limit}})
+        # What is faster than the new limit may need steps to come below it.
+        for step in range(300):
+            _, _, _, _, info = env.step(np.sign(rng.uniform(-1, 1, 6)).astype(np.float32))
+            fastest = np.abs(env.unwrapped.data.qvel[3:]).max()
+            assert (info["guard"] == "outside") == bool(fastest > limit + 1e-9)
+            if step >= 20:
+                most[limit] = max(most[limit], fastest)
+    assert most[15.0] <= 15.0 + 1e-9 < 20.0 < most[1000.0], most
+    with pytest.raises(ValueError, match="velocity has no 'limits'"):
+        env.set_constraints({"velocity": {"limits": 1000.0}})
+    for _ in range(50):
+        env.step(np.sign(rng.uniform(-1, 1, 6)).astype(np.float32))
+        assert np.abs(env.unwrapped.data.qvel[3:]).max() <= 15.0 + 1e-9
+    envs = gymnasium.vector.SyncVectorEnv([lambda: nearl.Guard(gymnasium.make("HalfCheetah-v5"), LIMITS)] * 2)
+    envs.reset(seed=3)
+    envs.call("set_constraints", {"velocity": {"limit": 5.0}})
+    for _ in range(60):
+        envs.step(np.sign(rng.uniform(-1, 1, (2, 6))).astype(np.float32))
+        assert all(np.abs(env.unwrapped.data.qvel[3:]).max() <= 5.0 + 1e-9 for env in envs.envs)
+
+
 def test_the_nearest_action_is_the_solution_of_a_general_solver():
     quadprog = pytest.importorskip("quadprog")
     rng = np.random.default_rng(5)
