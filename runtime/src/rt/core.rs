@@ -403,9 +403,11 @@ impl<T: LoopController> Core<T> {
             self.record.apart = None;
         } else {
             self.go_on(state, lost);
-            self.follow(state, lost);
         }
         let is_frozen = is_next && self.is_frozen(state);
+        if self.held.is_some() {
+            self.follow(state, lost, is_frozen);
+        }
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);
         let gap = if is_next && self.settings.real_time { missed.min(lost) } else { 0 };
         self.record.state = *state;
@@ -433,14 +435,15 @@ impl<T: LoopController> Core<T> {
     }
 
     /// Compares where the joints went with their velocities. Once a driver is found to tell others, nothing can be reckoned with them any more.
-    fn follow(&mut self, state: &StateMessage, lost: u64) {
+    fn follow(&mut self, state: &StateMessage, lost: u64, is_frozen: bool) {
         let (known, settings) = (&self.record.state, &self.settings);
-        if settings.jump <= 0.0 || self.record.apart.is_some() {
+        let is_again = state.tick == known.tick; // because no answer came
+        if settings.jump <= 0.0 || self.record.apart.is_some() || is_again {
             return;
         }
         let is_usable =
             known.is_finite() && state.is_finite() && lost <= u64::from(settings.modes.hold_states);
-        if !is_usable || self.pace.is_wrong() {
+        if !is_usable || is_frozen || self.pace.is_wrong() {
             self.way.clear();
             return;
         }

@@ -132,6 +132,13 @@ fn fault_24_stale_and_frozen_samples_brake() {
     assert_eq!(frozen.at(403), (Mode::Braking, Reason::FrozenState));
     assert_eq!((frozen.counters().frozen_states, frozen.at(600).0), (8, Mode::Active));
     frozen.assert_within_limits(ROUNDING);
+    // However long it was, a driver that measures again is followed again: a sample that stands is no velocity of another motion.
+    let long = Flight::of(&[(400, 600, FaultKind::Freeze)], 1400);
+    assert_eq!(
+        (long.counters().frozen_states, long.first(Mode::Fault), long.at(1400).0),
+        (600, None, Mode::Active)
+    );
+    long.assert_within_limits(ROUNDING);
     // A clock that runs backwards is none either, however fresh the message is.
     let back = Flight::of(&[(400, 8, FaultKind::Back { by: 1e-3 })], 600);
     assert_eq!(back.at(400), (Mode::Degraded, Reason::FrozenState));
