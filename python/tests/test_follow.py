@@ -52,8 +52,9 @@ def fly(
     dt: float = 0.008,
     ask: float = 3.0,
     measure: Callable[[float, float], tuple[float, float]] = lambda q, v: (q, v),
+    is_ended: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and commands of the flight, whose log is verified."""
+    """Positions and commands of the flight, whose log is verified; ``is_ended``: until nothing is sent any more."""
     entries = save(tmp, interface, dt, np.zeros((1, 2)), ask)
     name, log = f"py{os.getpid()}-follow", tmp / "one.mcap"
     q, v, positions, commands = 0.0, 0.0, [], []
@@ -64,7 +65,9 @@ def fly(
             seen = {"q.j1": seen_q, "v.j1": seen_v}
             observation = [seen[entry] for entry in entries]
             turn, action = plant.exchange([seen_q], [seen_v], observation, patience=5.0, time=tick * dt, begins=tick == 0)
-            assert turn != "brake", tick
+            assert is_ended or turn != "brake", tick
+            if turn == "brake":
+                break
             q, v = servo(q, v, float(action[0]), dt)
             positions.append(q)
             commands.append(float(action[0]))
@@ -192,6 +195,25 @@ def test_a_wrong_mass_costs_no_more_than_a_margin(tmp_path: Path, heavier: float
     assert positions.max() < LIMIT + 0.08
     assert LIMIT - 0.01 < positions[-1] < LIMIT + 5e-4
     assert abs(positions[-1] - positions[len(positions) // 2]) < 1e-4  # it rests
+
+
+@pytest.mark.parametrize("told", [0.0, -1.0])
+def test_velocities_of_another_motion_end_loops_that_reckon_with_them(tmp_path: Path, told: float) -> None:
+    """Forces are found for the velocity that is told; set points go on from set points, and a drive without a sensor of velocities says 0."""
+    inertia = 2.0 * (0.6**2 / 12 + 0.3**2)
+
+    def servo(q: float, v: float, command: float, dt: float) -> tuple[float, float]:
+        to = v + dt * (command + 2.0 * 9.81 * 0.3 * np.cos(q)) / inertia
+        return q + dt * (v + to) / 2, to
+
+    def measure(q: float, v: float) -> tuple[float, float]:
+        return q, told * v
+
+    positions, _ = fly(tmp_path, "effort", servo, 4.0, dt=0.002, ask=60.0, measure=measure, is_ended=True)
+    assert 0.25 / 0.002 <= len(positions) <= 0.5 / 0.002
+    positions, commands = fly(tmp_path, "position", straight, 4.0, dt=0.002, measure=measure)
+    keeps(commands, 0.002)
+    assert positions[-1] > LIMIT - 0.01
 
 
 @pytest.mark.parametrize("interface", ["position", "velocity"])

@@ -60,6 +60,11 @@ impl Projector {
         self.previous.sent = Sent { waiting: Vec::with_capacity(joints.len()), known: 0, joints };
     }
 
+    /// Whether dof `i` goes on from what it was sent, whatever is measured.
+    pub fn follows(&self, i: usize) -> bool {
+        self.previous.sent.joints.iter().any(|joint| joint.dof == i)
+    }
+
     /// Puts what was sent in the tick before in the place of what is measured, `q` (nq) and `v` (nv), of joints that follow by themselves: a set
     /// point that began at the measured position would carry each error of the drive into the next. Of joints that are sent positions and are further
     /// from the last one than they move at their speed limit within 0.1 s (0.1 rad or m without one), what is projected next proposes rest: their set

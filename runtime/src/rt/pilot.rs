@@ -33,6 +33,8 @@ pub struct Pilot {
     observed: Vec<Entry>,
     /// Joints whose samples are checked: degree of freedom, configuration index, largest speed V [rad/s or m/s].
     checked: Vec<(usize, usize, f64)>,
+    /// Those of them whose measured velocity is reckoned with: the others go on from what they were sent.
+    reckoned: Vec<(usize, usize, f64)>,
     /// Joints with a range: degree of freedom, configuration index, and the positions of which none is outside [rad or m].
     places: Vec<(usize, usize, [f64; 2])>,
     /// The policy proposes states; a direct one without a guard gives actions only.
@@ -60,7 +62,7 @@ impl Pilot {
     /// [`Pilot::new`] of a snapshot that has to fit what is fixed at the start of a loop. Another robot's snapshot is refused as such first.
     fn within(snapshot: &Snapshot, robot: &RobotMessage, fixed: &PilotBuilder) -> Result<Pilot, Refusal> {
         let refuse = |error: SnapshotError| Refusal { verdict: Verdict::of(&error), text: error.to_string() };
-        let controller = Controller::new(snapshot).map_err(refuse)?;
+        let mut controller = Controller::new(snapshot).map_err(refuse)?;
         compare(&describe_controller(&controller, &snapshot.manifest), robot)?;
         if let Some(meaning) = &fixed.meaning {
             meaning.admit(&snapshot.manifest)?;
@@ -73,6 +75,9 @@ impl Pilot {
             PolicyKind::Direct => PROPOSES_ACTIONS,
             _ => PROPOSES_STATES,
         };
+        let checked = checked(&controller);
+        let (mut reckoned, projector) = (checked.clone(), controller.projector());
+        reckoned.retain(|joint| !projector.follows(joint.0));
         let names = controller.given_names().filter(|names| names.len() <= MAX_OBS);
         let layout = controller.layout();
         Ok(Pilot {
@@ -83,7 +88,8 @@ impl Pilot {
             out: controller.output(),
             entries: (0..layout.n_state()).map(|k| layout.state_entry(k)).collect(),
             observed: layout.entries().to_vec(),
-            checked: checked(&controller),
+            checked,
+            reckoned,
             places: places(&controller),
             proposes: snapshot.manifest.proposes(),
             limits: number_of(controller.limits()),
@@ -366,7 +372,7 @@ impl LoopController for Pilot {
     }
 
     fn speeds(&self) -> &[(usize, usize, f64)] {
-        &self.checked
+        &self.reckoned
     }
 
     /// With `S = max(V, |v|)` of the old state: `|v'| > jump S`, or `|q' - q| > jump age max(S, |v'|)`.

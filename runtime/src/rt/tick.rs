@@ -70,7 +70,7 @@ pub trait LoopController: Send + 'static {
     fn implausible(&self, _old: &StateMessage, _new: &StateMessage, _age: f64, _jump: f64) -> Option<usize> {
         None
     }
-    /// Joints whose samples can be checked: degree of freedom, configuration index, largest speed [rad/s or m/s].
+    /// Joints whose measured velocity is reckoned with: degree of freedom, configuration index, largest speed [rad/s or m/s].
     fn speeds(&self) -> &[(usize, usize, f64)] {
         &[]
     }
