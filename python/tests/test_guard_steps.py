@@ -595,10 +595,12 @@ def test_what_may_touch_and_an_episode_that_begins_outside_are_told(tmp_path: Pa
             nearl.make_vec(file, 1, constraints="task", actions="guarded")
         return "\n".join(str(warning.message) for warning in found)
 
-    touching = DRIVEN.format(option="", actuators=SERVOS, more="")
-    alone = touching.replace("<geom ", '<geom contype="0" conaffinity="0" ')
-    assert "2 geoms may touch something, and limits on the motion know of no contact" in told(touching)
-    assert "touch" not in told(alone)
+    joined = DRIVEN.format(option="", actuators=SERVOS, more="")
+    alone = joined.replace("<geom ", '<geom contype="0" conaffinity="0" ')
+    floor = '<worldbody><geom name="floor" type="plane" size="9 9 1" pos="0 0 -9"/>'
+    assert "3 geoms may touch something, and limits on the motion know of no contact" in told(joined.replace("<worldbody>", floor))
+    # Bodies that a joint connects, and a floor beside geoms that touch nothing.
+    assert "touch" not in told(joined) + told(alone) + told(alone.replace("<worldbody>", floor))
     table = '<worldbody><geom name="t" size="1" pos="9 0 0" contype="0" conaffinity="0"/>'
     pair = alone.replace("<geom contype", '<geom name="l" contype', 1).replace("<worldbody>", table)
     assert "2 geoms may touch" in told(pair.replace("</mujoco>", '<contact><pair geom1="t" geom2="l"/></contact></mujoco>'))
