@@ -164,7 +164,7 @@ fn what_is_the_simulator_s_alone_is_named() {
     let folder = tempfile::tempdir().expect("folder");
     let told = |touch: &str, sensors: &str| {
         let text = format!(
-            "<mujoco><worldbody><body><joint name=\"j\"/><geom size=\".1\" mass=\"1\" {touch}/><site name=\"s\"/></body></worldbody>\
+            "<mujoco><worldbody><geom type=\"plane\" size=\"1 1 1\"/><body><joint name=\"j\"/><geom size=\".1\" mass=\"1\" {touch}/><site name=\"s\"/></body></worldbody>\
              <sensor>{sensors}</sensor></mujoco>"
         );
         let file = folder.path().join("r.xml");
@@ -173,7 +173,7 @@ fn what_is_the_simulator_s_alone_is_named() {
     };
     let off = "contype=\"0\" conaffinity=\"0\"";
     assert_eq!(told(off, ""), "");
-    assert!(told("", "").contains("contacts are the simulator's alone: 1 geoms"), "{}", told("", ""));
+    assert!(told("", "").contains("contacts are the simulator's alone: 2 geoms"), "{}", told("", ""));
     let sensors = "<gyro name=\"imu\" site=\"s\"/><touch site=\"s\"/>";
     assert!(told(off, sensors).ends_with("from the state: 'imu', number 1"), "{}", told(off, sensors));
     let urdf = root().join("examples/robots/panda/panda.urdf");
