@@ -302,6 +302,7 @@ class Plant:
         time: float = 0.0,
         episode: int = 0,
         begins: bool = False,
+        braked: bool = False,
     ) -> tuple[str, _Floats | None]: ...
     @property
     def attached(self) -> bool: ...

@@ -69,6 +69,7 @@ class Plant:
         time: float = 0.0,
         episode: int = 0,
         begins: bool = False,
+        braked: bool = False,
     ) -> tuple[str, NDArray[Any] | None]:
         """Gives a state to the loop and waits for its action.
 
@@ -80,16 +81,18 @@ class Plant:
             time: The plant's own clock [s]; 0 where it has none.
             episode: Number of the episode.
             begins: This state begins an episode.
+            braked: Since the last exchange the driver braked by itself, or something else held the robot, as an emergency stop does: set points begin
+                where the robot is.
 
         Returns:
             ``("act", action)``, ``("hold", action)`` with the action of before as none came in time, or ``("brake", None)``: there is no loop, it
             is silent, or it leaves braking to the plant. Bring the robot to rest then.
         """
-        return self._plant.exchange(q, v, obs, patience, time=time, episode=episode, begins=begins)
+        return self._plant.exchange(q, v, obs, patience, time=time, episode=episode, begins=begins, braked=braked)
 
     @property
     def attached(self) -> bool:
-        """Whether a loop answers."""
+        """Whether a loop answered the last exchange: it is told of the plant in an exchange alone, so that there is nothing to wait for before one."""
         return self._plant.attached
 
     def close(self) -> None:

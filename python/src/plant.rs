@@ -63,7 +63,8 @@ impl Plant {
 
     /// Gives the state q (nq) [rad or m], v (nv) [rad/s or m/s], obs (n_obs) to the loop and waits at most `patience` [s] for an action
     /// (nu): ("act", action), ("hold", the action before) or ("brake", None).
-    #[pyo3(signature = (q, v, obs, patience, *, time=0.0, episode=0, begins=false))]
+    #[pyo3(signature = (q, v, obs, patience, *, time=0.0, episode=0, begins=false, braked=false))]
+    #[expect(clippy::too_many_arguments)]
     fn exchange<'py>(
         &self,
         q: &Bound<'py, PyAny>,
@@ -73,6 +74,7 @@ impl Plant {
         time: f64,
         episode: u64,
         begins: bool,
+        braked: bool,
     ) -> PyResult<Told<'py>> {
         let py = q.py();
         let [nq, nv, n_obs] = self.sizes;
@@ -83,6 +85,9 @@ impl Plant {
         let told = py.detach(|| {
             let mut open = self.open();
             let exchange = open.as_mut()?;
+            if braked {
+                exchange.braked();
+            }
             let state = exchange.state();
             (state.time, state.episode, state.bits) = (time, episode, if begins { STATE_RESET } else { 0 });
             Some(match exchange.exchange(&q, &v, &obs, patience) {
@@ -96,7 +101,7 @@ impl Plant {
         Ok((turn, action.map(|a| array(py, &a))))
     }
 
-    /// Whether a loop answers.
+    /// Whether a loop answered the last exchange.
     #[getter]
     fn attached(&self) -> bool {
         self.open().as_ref().is_some_and(Exchange::is_attached)

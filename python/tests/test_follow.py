@@ -216,6 +216,55 @@ def test_velocities_of_another_motion_end_loops_that_reckon_with_them(tmp_path: 
     assert positions[-1] > LIMIT - 0.01
 
 
+@pytest.mark.parametrize("late", [0, 1, 2, 4])
+@pytest.mark.parametrize("dt", [0.004, 0.01, 0.02])
+def test_a_late_answer_in_front_of_a_limit_leads_no_further(tmp_path: Path, dt: float, late: int) -> None:
+    """What the driver's hold slowed down ended a period slower than it was on average, and was taken for that: 6 mrad beyond the limit by one answer."""
+    entries, name = save(tmp_path, "position", dt, np.zeros((1, 2)), 3.0), f"py{os.getpid()}-front"
+    q, speed, positions, fast, held = 0.0, 0.0, [], False, 0
+    with nearl.Plant(name, joints=["j1"], observation=entries, dt=dt, nu=1, lockstep=True, watchdog=5.0) as plant:
+        loop = nearl.Loop(tmp_path / "one.safetensors", name, ramp=0.0)
+        for tick in range(int(2.0 / dt)):
+            fast = fast or speed > 1.6
+            is_late = fast and speed < 1.5 and held < late and tick % 2 == 0
+            observation = [{"q.j1": q, "v.j1": speed}[entry] for entry in entries]
+            turn, action = plant.exchange([q], [speed], observation, patience=0.0 if is_late else 5.0, time=(tick + 1) * dt, begins=tick == 0)
+            held += turn == "hold"
+            speed = (float(action[0]) - q) / dt if turn == "act" else np.sign(speed) * max(abs(speed) - 10.0 * dt, 0.0)
+            q += dt * speed
+            positions.append(q)
+        loop.stop()
+    assert held == late
+    assert LIMIT - 1e-3 < max(positions) < LIMIT + 1e-9
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_an_emergency_stop_that_is_told_ends_where_the_robot_is(tmp_path: Path, is_told: bool) -> None:
+    """Set points came to rest 0.4 rad ahead of a robot that was held, and were sent at once when it was let go: 40 rad/s of 2."""
+    dt, entries, name = 0.01, save(tmp_path, "position", 0.01, np.zeros((1, 2)), 3.0), f"py{os.getpid()}-stop"
+    q, speed, commands = 0.0, 0.0, [0.0]
+    with nearl.Plant(name, joints=["j1"], observation=entries, dt=dt, nu=1, lockstep=True, watchdog=5.0) as plant:
+        loop = nearl.Loop(tmp_path / "one.safetensors", name, ramp=0.0)
+        for tick in range(250):
+            is_held = 30 <= tick < 130
+            was_held = is_told and 30 < tick <= 130
+            observation = [{"q.j1": q, "v.j1": speed}[entry] for entry in entries]
+            turn, action = plant.exchange([q], [speed], observation, patience=5.0, time=(tick + 1) * dt, begins=tick == 0, braked=was_held)
+            assert turn == "act", tick
+            speed = 0.0 if is_held else (float(action[0]) - q) / dt
+            q += dt * speed
+            if not is_held:
+                commands.append(q)
+        loop.stop()
+    speeds = np.diff(commands) / dt
+    if not is_told:
+        assert abs(speeds).max() > 10.0  # what it is told for
+        return
+    assert abs(speeds).max() < 2.0 + 1e-9
+    assert abs(np.diff(np.append(0.0, speeds[30:]))).max() / dt < 10.0 + 1e-6
+    assert LIMIT - 1e-3 < q < LIMIT + 1e-9
+
+
 @pytest.mark.parametrize("interface", ["position", "velocity"])
 def test_a_driver_that_goes_on_while_answers_are_late_keeps_every_limit(tmp_path: Path, interface: str) -> None:
     """One of five answers, and now and then two in a row, come too late, and are never applied. Taken for applied, they had the next set point jump from

@@ -347,10 +347,20 @@ fn other_steps(m: &Manifest) -> Option<String> {
     if root.descendants().any(|element| element.has_tag_name("include")) {
         return None;
     }
-    let options = root.children().filter(|element| element.has_tag_name("option"));
-    let stated = options.filter_map(|option| option.attribute("timestep")).next_back();
-    let timestep: f64 = stated.map_or(Some(TIMESTEP), |text| text.trim().parse().ok())?;
+    let stated = |name| {
+        let options = root.children().filter(|element| element.has_tag_name("option"));
+        options.filter_map(|option| option.attribute(name)).next_back()
+    };
     let sim_dt = m.task.time.sim_dt;
+    if let Some(integrator @ ("RK4" | "implicit")) = stated("integrator")
+        && sim_dt > 0.0
+    {
+        return Some(format!(
+            "[time] sim_dt is {sim_dt} s, and the robot file's integrator is {integrator}: limits are reckoned for steps of Euler's, and a simulation that \
+             makes others leaves them; write integrator=\"implicitfast\" or \"Euler\" there, or sim_dt = 0 for a robot that makes no steps"
+        ));
+    }
+    let timestep: f64 = stated("timestep").map_or(Some(TIMESTEP), |text| text.trim().parse().ok())?;
     (sim_dt > 0.0 && (sim_dt - timestep).abs() > 1e-12).then(|| {
         format!(
             "[time] sim_dt is {sim_dt} s, and the robot file's timestep is {timestep} s: limits are reckoned for steps of {sim_dt} s, and a simulation that \
@@ -620,7 +630,8 @@ fn projection(m: &Manifest) -> Check {
 /// Can the motors hold the robot everywhere within its position limits?
 fn holding(m: &Manifest, parts: &Parts) -> Check {
     let Parts { model, layout, projector } = parts;
-    let (limits, controllable) = (projector.limits(), layout.controllable());
+    let controllable = layout.controllable();
+    let limits = &holding::standing(projector.limits(), &m.task.constraints, model);
     if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {
         return ok(CheckCode::Holding, "the task has no torque limit to compare gravity with".into());
     }

@@ -1,6 +1,6 @@
 //! Checks whether the motors can hold the robot still against gravity, over configurations within the position limits.
 
-use nearl_constraints::{Dynamics, LimitSet, Model, Period};
+use nearl_constraints::{ConstraintSettings, Dynamics, LimitSet, Model, Period};
 
 /// Seeded configurations the search starts from, and steps of its grid over a joint's range.
 const STARTS: usize = 2000;
@@ -26,6 +26,19 @@ impl Load {
     pub fn holds(&self) -> bool {
         self.needed <= self.effort
     }
+}
+
+/// `limits` with the forces that the motors have at standstill: those of a hard `torque_speed` where they are less.
+pub fn standing(limits: &LimitSet, of: &ConstraintSettings, model: &Model) -> LimitSet {
+    let mut standing = limits.clone();
+    if let Some(line) = of.torque_speed.as_ref().filter(|line| line.soft.is_none()) {
+        for (i, effort) in standing.effort.iter_mut().enumerate() {
+            let name = model.dof_name(i);
+            let margin = line.margin.as_ref().and_then(|margin| margin.of(&name)).unwrap_or(0.0);
+            *effort = line.stall.of(&name).map_or(*effort, |stall| effort.min(stall - margin));
+        }
+    }
+    standing
 }
 
 /// For each controllable joint with a torque limit, the configuration within the position limits in which standing still asks most of its
@@ -133,7 +146,7 @@ pub fn refusal(model: &Model, limits: &LimitSet, controllable: &[usize], period:
     (!weak.is_empty()).then(|| {
         format!(
             "the motors cannot hold the robot still everywhere within its position limits: {}; \
-             raise constraints.torque.scale, or narrow the position limits to where they can",
+             raise constraints.torque.scale (or the stall of torque_speed), or narrow the position limits to where they can",
             weak.join("; ")
         )
     })

@@ -74,6 +74,7 @@ pub struct ActionLimit {
     range: Vec<(f64, f64)>,
     /// Dof that an entry drives.
     dofs: Vec<usize>,
+    /// The last actions that were given.
     given: Recent,
     /// Of the call under way: what is asked for, velocities, bounds, and the answer.
     asked: Vec<f64>,

@@ -103,7 +103,7 @@ impl Projector {
     /// Periods passed in which nothing was sent, and the driver went on by itself as docs/CONNECT.md has it: positions from the last two on, slower
     /// in each period by what the joint may decelerate, velocities and forces as they were.
     pub fn miss(&mut self, periods: u64) {
-        let dt = self.period.dt;
+        let Period { dt, kappa, .. } = self.period;
         let History { asked, sent, .. } = &mut self.previous;
         let mut asked = asked.get_mut();
         for Follower { dof, position, last, .. } in &mut sent.joints {
@@ -113,7 +113,8 @@ impl Projector {
                     let slower =
                         (self.limits.acceleration[*dof] * dt).min(last.mean.abs()).copysign(last.mean);
                     last.mean -= slower;
-                    last.v = last.mean;
+                    // A period that is slowed ends slower than it was on average.
+                    last.v = (last.mean.abs() - (1.0 - kappa) * slower.abs()).max(0.0).copysign(last.mean);
                     last.q += dt * last.mean;
                     acceleration = -slower / dt;
                 }

@@ -42,6 +42,7 @@ typedef struct nearl_state {
     const double *obs;   /* observation (n_obs) */
     uint64_t episode;    /* number of the episode; 0 for a robot that is never reset */
     int begins;          /* not 0: this state begins an episode */
+    int braked;          /* not 0: since the state before the driver braked by itself, or something held the robot (emergency stop) */
 } nearl_state;
 
 /* Opens the plant `name`; NULL and a sentence where it cannot. */

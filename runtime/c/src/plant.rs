@@ -30,6 +30,7 @@ pub struct StateIn {
     obs: *const f64,
     episode: u64,
     begins: c_int,
+    braked: c_int,
 }
 
 /// `nearl_plant`.
@@ -100,6 +101,9 @@ impl Plant {
         let message = self.exchange.state();
         (message.time, message.episode) = (state.time, state.episode);
         message.bits = if state.begins != 0 { STATE_RESET } else { 0 };
+        if state.braked != 0 {
+            self.exchange.braked();
+        }
         let patience = if patience.is_finite() { patience.max(0.0) } else { 1e6 };
         let (turn, given) = match self.exchange.exchange(q, v, obs, patience) {
             Turn::Act(given) => (0, given),

@@ -64,6 +64,12 @@ impl Exchange {
         &mut self.state
     }
 
+    /// The driver has braked by itself since the last exchange, or something else has held the robot, as an emergency stop does: the next state says so,
+    /// and set points begin where the robot is.
+    pub fn braked(&mut self) {
+        self.brakes = true;
+    }
+
     /// Sends what was measured (q, v, observation) and waits at most `patience` \[s\] for its action, which is taken as applied. An action of
     /// another size than the robot's is none.
     ///

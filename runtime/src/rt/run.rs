@@ -278,8 +278,9 @@ pub(crate) fn check_holding(snapshot: &Snapshot) -> Result<(), String> {
     }
     let parts = Parts::new(&snapshot.manifest).map_err(|e| e.to_string())?;
     let period = snapshot.manifest.task.period();
-    let limits = parts.projector.limits();
-    holding::refusal(&parts.model, limits, parts.layout.controllable(), &period).map_or(Ok(()), Err)
+    let limits =
+        holding::standing(parts.projector.limits(), &snapshot.manifest.task.constraints, &parts.model);
+    holding::refusal(&parts.model, &limits, parts.layout.controllable(), &period).map_or(Ok(()), Err)
 }
 
 /// The limits of the loop: those of `--limits`, which the first snapshot must keep too, else those of the first snapshot.

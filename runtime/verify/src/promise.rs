@@ -402,7 +402,8 @@ impl Promise {
             for _ in 0..periods.min(MISSED) {
                 let v = sent.mean[dof];
                 let slower = v.signum() * (v.abs() - self.built().joints[dof].acceleration * dt).max(0.0);
-                (sent.v[dof], sent.mean[dof]) = (slower, slower);
+                let by = (1.0 - self.period.kappa) * (v.abs() - slower.abs());
+                (sent.v[dof], sent.mean[dof]) = (v.signum() * (slower.abs() - by).max(0.0), slower);
                 sent.q[at] += dt * slower;
             }
         }

@@ -345,6 +345,17 @@ fn physics_steps_that_are_not_the_file_s_are_named() {
     let found = notes(0.005);
     let says = format!("sim_dt is 0.005 s, and the robot file's timestep is {stated} s");
     assert!(found.len() == 1 && found[0].contains(&says), "{found:?}");
+    let by = |integrator: &str, sim_dt: f64| {
+        let mut manifest = manifest.clone();
+        manifest.task.time.sim_dt = sim_dt;
+        let file = manifest.simulation.as_mut().expect("a robot file");
+        file.text =
+            file.text.replacen("<mujoco>", &format!("<mujoco><option integrator=\"{integrator}\"/>"), 1);
+        let notes = told(&manifest).expect("notes");
+        notes.into_iter().filter(|note| note.contains(&format!("integrator is {integrator}"))).count()
+    };
+    assert_eq!(["RK4", "implicit", "implicitfast", "Euler"].map(|name| by(name, stated)), [1, 1, 0, 0]);
+    assert_eq!(by("RK4", 0.0), 0);
 }
 
 #[test]
