@@ -164,7 +164,8 @@ fn what_is_the_simulator_s_alone_is_named() {
     let folder = tempfile::tempdir().expect("folder");
     let told = |touch: &str, sensors: &str| {
         let text = format!(
-            "<mujoco><worldbody><geom type=\"plane\" size=\"1 1 1\"/><body><joint name=\"j\"/><geom size=\".1\" mass=\"1\" {touch}/><site name=\"s\"/></body></worldbody>\
+            "<mujoco><worldbody><geom type=\"plane\" size=\"1 1 1\"/>\
+             <body><joint name=\"j\"/><geom size=\".1\" mass=\"1\" {touch}/><site name=\"s\"/></body></worldbody>\
              <sensor>{sensors}</sensor></mujoco>"
         );
         let file = folder.path().join("r.xml");
