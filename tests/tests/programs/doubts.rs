@@ -350,7 +350,7 @@ fn physics_steps_that_are_not_the_file_s_are_named() {
         manifest.task.time.sim_dt = sim_dt;
         let file = manifest.simulation.as_mut().expect("a robot file");
         file.text =
-            file.text.replacen("<mujoco>", &format!("<mujoco><option integrator=\"{integrator}\"/>"), 1);
+            file.text.replacen("</mujoco>", &format!("<option integrator=\"{integrator}\"/></mujoco>"), 1);
         let notes = told(&manifest).expect("notes");
         notes.into_iter().filter(|note| note.contains(&format!("integrator is {integrator}"))).count()
     };
