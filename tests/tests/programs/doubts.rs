@@ -146,6 +146,15 @@ const SET_UPS: &[SetUp] = &[
         is_refused: false,
         check: Some("holding"),
     },
+    SetUp {
+        what: "motors that have too little force at standstill to hold the arm",
+        robot: SAME,
+        task: ("torque = {}", "torque = {}\ntorque_speed = { stall = 1.6, no_load = 3.0 }"),
+        limits: None,
+        says: &["'shoulder' needs 38.5 N m or N of its 1.6", "stall of torque_speed"],
+        is_refused: false,
+        check: Some("holding"),
+    },
 ];
 
 fn edited(text: String, (from, to): Edit) -> String {
