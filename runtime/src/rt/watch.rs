@@ -77,6 +77,14 @@ pub(crate) struct Watch {
     pub(crate) tell: Option<SyncSender<(u64, Mode, Reason)>>,
 }
 
+/// Adds what is found for the first time of its joint and limit.
+fn add(outside: &mut Vec<Found>, found: Found) {
+    let is_known = outside.iter().any(|f| f.joint == found.joint && f.what == found.what);
+    if !is_known && outside.len() < TOLD {
+        outside.push(found);
+    }
+}
+
 impl Watch {
     pub(crate) fn of(joints: Vec<Watched>) -> Watch {
         Watch { joints, counts: BTreeMap::new(), outside: Vec::new(), mode: Mode::Hold, tell: None }
@@ -116,19 +124,9 @@ impl Watch {
     fn name_apart(&mut self, tick: u64, apart: Apart) {
         const WHAT: &str = "mean speed by its positions";
         let Some(joint) = self.joints.iter().find(|joint| joint.dof == apart.dof) else { return };
-        let is_known = self.outside.iter().any(|f| f.joint == joint.joint && f.what == WHAT);
-        if !is_known && self.outside.len() < TOLD {
-            let unit = format!("{}/s", joint.length);
-            let found = Found {
-                tick,
-                joint: joint.joint.clone(),
-                what: WHAT,
-                value: apart.told,
-                limit: apart.moved,
-                unit,
-            };
-            self.outside.push(found);
-        }
+        let (joint, unit) = (joint.joint.clone(), format!("{}/s", joint.length));
+        let (value, limit) = (apart.told, apart.moved);
+        add(&mut self.outside, Found { tick, joint, what: WHAT, value, limit, unit });
     }
 
     fn name(&mut self, record: &Record) {
@@ -146,24 +144,13 @@ impl Watch {
                     continue;
                 }
                 is_one = true;
-                let is_known = self.outside.iter().any(|f| f.joint == joint.joint && f.what == what);
-                if !is_known && self.outside.len() < TOLD {
-                    let (tick, joint, unit) = (record.tick, joint.joint.clone(), unit.to_owned());
-                    self.outside.push(Found { tick, joint, what, value, limit, unit });
-                }
+                let (tick, joint, unit) = (record.tick, joint.joint.clone(), unit.to_owned());
+                add(&mut self.outside, Found { tick, joint, what, value, limit, unit });
             }
         }
-        let is_told = self.outside.iter().any(|found| found.joint.is_empty());
-        if !is_one && !is_told && self.outside.len() < TOLD {
-            let none = || String::new();
-            self.outside.push(Found {
-                tick: record.tick,
-                joint: none(),
-                what: ELSEWHERE,
-                value: 0.0,
-                limit: 0.0,
-                unit: none(),
-            });
+        if !is_one {
+            let (tick, joint, unit) = (record.tick, String::new(), String::new());
+            add(&mut self.outside, Found { tick, joint, what: ELSEWHERE, value: 0.0, limit: 0.0, unit });
         }
     }
 
