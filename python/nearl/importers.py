@@ -35,16 +35,28 @@ _SCRIPT = (
 _NOTHING = ("Identity", "Flatten", "Dropout", "FlattenExtractor")
 
 
-def import_onnx(path: _Path, robot: _Path, recipe: _Recipe = None, output: str | None = None, name: str = "policy") -> Controller:
+def import_onnx(
+    path: _Path,
+    robot: _Path | None = None,
+    recipe: _Recipe = None,
+    output: str | None = None,
+    name: str = "policy",
+    *,
+    task: _Path | None = None,
+    actions: str = "actuators",
+) -> Controller:
     """The controller of the policy in an ONNX file.
 
     Args:
         path: The file; external data lies beside it.
-        robot: URDF or MJCF file.
+        robot: URDF or MJCF file; or ``task``.
         recipe: What the policy sees and what its outputs mean, where the file's metadata does not say it: a TOML file, unitree's ``deploy.yaml``,
             or several of them, of which a later one comes before those before it.
         output: Which of several outputs is the action.
-        name: Of the task.
+        name: Of the task made of robot and recipe.
+        task: In place of robot and recipe, the task whose observation the policy sees: a bundled one or a TOML file.
+        actions: What the policy gives in its task: ``"actuators"``, what the motors get; ``"state"``, the next state, entry by entry; ``"change"``, its
+            change in units of what the limits allow in a policy period, as environments have them (:func:`nearl.make_vec`).
 
     Raises:
         ValueError: the file is no policy, names a node that is not read, or something does not fit robot or recipe.
@@ -55,7 +67,7 @@ def import_onnx(path: _Path, robot: _Path, recipe: _Recipe = None, output: str |
         if os.fspath(path) in str(error):
             raise
         raise ValueError(f"'{os.fspath(path)}': {error}") from None
-    return _place(policy, robot, recipe, None, name)
+    return _place(policy, robot, recipe, task, name, actions)
 
 
 def import_torch(
@@ -63,7 +75,8 @@ def import_torch(
     robot: _Path | None = None,
     recipe: _Recipe = None,
     *,
-    task: str | None = None,
+    task: _Path | None = None,
+    actions: str = "actuators",
     mean: Any = None,
     std: Any = None,
     clip: float = math.inf,
@@ -79,7 +92,8 @@ def import_torch(
         module: The live object. An ``actor_obs_normalizer`` of rsl_rl is read with it.
         robot: URDF or MJCF file; or ``task``.
         recipe: As for :func:`import_onnx`.
-        task: Task of this package whose environment gives the observation, in place of robot and recipe.
+        task: In place of robot and recipe, the task whose observation the policy sees: a bundled one or a TOML file.
+        actions: What the policy gives in its task, as for :func:`import_onnx`.
         mean: Of each observation entry; 0 if not given.
         std: Of each observation entry, with the normaliser's epsilon; 1 if not given.
         clip: Network inputs are cut to this many standard deviations.
@@ -95,14 +109,15 @@ def import_torch(
     network = [("actor", module.actor)] if hasattr(module, "actor") else [("", module)]
     _check_order(*network[0])
     policy = _policy(_layers(network), *_normaliser(module, mean, std), clip, output_clip)
-    return _place(policy, robot, recipe, task, name)
+    return _place(policy, robot, recipe, task, name, actions)
 
 
 def import_sb3(
     model: Any,
     vec_normalize: Any = None,
     *,
-    task: str | None = None,
+    task: _Path | None = None,
+    actions: str | None = None,
     robot: _Path | None = None,
     recipe: _Recipe = None,
     name: str = "policy",
@@ -113,7 +128,8 @@ def import_sb3(
         model: The live object.
         vec_normalize: The ``VecNormalize`` it was trained with; the model's own where it has one. A model that was loaded without its environment
             does not know of any, and a warning says so: load it with ``env=``, or give it here; ``False`` says that there was none.
-        task: Task of this package whose environment gives the observation; or ``robot`` and ``recipe``.
+        task: The task whose observation the model sees, a bundled one or a TOML file; or ``robot`` and ``recipe``.
+        actions: What the model gives in its task, as for :func:`import_onnx`; by default what its environment says, ``"actuators"`` where it says nothing.
         robot: URDF or MJCF file.
         recipe: As for :func:`import_onnx`.
         name: Of the task made of robot and recipe.
@@ -123,7 +139,7 @@ def import_sb3(
     """
     _live(model, "import_sb3", "stable_baselines3.PPO.load")
     space, policy = model.action_space, model.policy
-    _check_meaning(model)
+    actions = _meaning(model, actions, task)
     if not hasattr(space, "low"):
         raise ValueError(f"the model chooses from {space}, and an imported policy gives numbers within a range; train it on a Box of actions")
     if hasattr(policy, "lstm_actor"):
@@ -159,52 +175,110 @@ def import_sb3(
         rms = vec_normalize.obs_rms
         mean, std = rms.mean, np.sqrt(_numbers(rms.var, "obs_rms.var") + vec_normalize.epsilon)
         clip = float(vec_normalize.clip_obs)
-    made = _policy(layers, mean, std, clip, (-math.inf, math.inf))
+    wrappers = _wrappers(model) if task is not None and robot is None else []
+    for wrapper in wrappers:
+        layers, low, high = _rescaled(wrapper, layers, low, high)
+    # What leaves the range of the space is cut there by the model, and by the motors; a proposed state has no motor.
+    made = _policy(layers, mean, std, clip, (low, high) if actions != "actuators" or wrappers else (-math.inf, math.inf))
     if task is not None and robot is None:
-        _check_range(low, high, os.fspath(task))
-        _check_wrappers(model)
-    return _place(made, robot, recipe, task, name)
+        _check_range(low, high, os.fspath(task), actions)
+    controller = _place(made, robot, recipe, task, name, actions)
+    if actions != "actuators":
+        _check_task(model, controller)
+    return controller
 
 
-def _check_meaning(model: Any) -> None:
-    """Refuses a policy that learned in an environment of ours to give something else than what the actuators get."""
+def _meaning(model: Any, actions: str | None, task: _Path | None) -> str:
+    """What the model gives: as its environment says where it is one of ours, which has to be what the caller says."""
     env = getattr(model, "get_env", lambda: None)()
-    if env is None or not hasattr(env, "has_attr") or not env.has_attr("action_meaning"):
-        return
-    for meaning in env.get_attr("action_meaning"):
-        if meaning in ("state", "change"):
-            raise ValueError(
-                f"the model learned with actions='{meaning}', so that it gives {'proposed states' if meaning == 'state' else 'changes of the state'} and no "
-                f"actions of the actuators; learn with actions='guarded' to import it, or let a policy of actions='state' propose beside the loop "
-                f"(nearl.Proposer)"
-            )
+    told = None
+    if env is not None and hasattr(env, "has_attr") and env.has_attr("action_meaning"):
+        meanings = sorted({meaning if meaning in ("state", "change") else "actuators" for meaning in env.get_attr("action_meaning")})
+        told = meanings[0]
+        if meanings != [told] or actions not in (None, told):
+            raise ValueError(f"the model learned with actions {' and '.join(map(repr, meanings))}, and it is imported with actions={actions!r}; leave it out")
+    actions = actions or told or "actuators"
+    if actions != "actuators" and task is None:
+        raise ValueError(
+            f"the model gives {'proposed states' if actions == 'state' else 'changes of the state'} (actions='{actions}'), and a recipe is of a policy that "
+            f"gives actions of the actuators; give the task that it learned, task=FILE"
+        )
+    return actions
 
 
 # Wrappers of Gymnasium that leave every number of an observation where it is.
 _SAME = frozenset({"DtypeObservation", "FlattenObservation"})
 
 
-def _check_wrappers(model: Any) -> None:
-    """Refuses a policy that learned from observations that a wrapper had changed: the controller gives it those of the task."""
+def _env(model: Any) -> Any:
+    """The first single environment that the model learned in, with its wrappers; None where it brings none."""
     env = getattr(model, "get_env", lambda: None)()
     while env is not None and not hasattr(env, "envs") and hasattr(env, "venv"):
         env = env.venv
-    if not (envs := getattr(env, "envs", None)):
-        return
+    return (getattr(env, "envs", None) or [None])[0]
+
+
+def _wrappers(model: Any) -> list[Any]:
+    """The wrappers that rescale actions, outermost first. Those that change observations otherwise than VecNormalize, or actions otherwise, are refused: the
+    controller gives the observation of the task, and takes what the network puts out."""
+    if (one := _env(model)) is None:
+        return []
     import gymnasium
 
-    for one in envs:
-        while isinstance(one, gymnasium.Wrapper):
-            if isinstance(one, gymnasium.ObservationWrapper) and type(one).__name__ not in _SAME:
-                raise ValueError(
-                    f"the model learned behind the wrapper {type(one).__name__}, which changes observations, and the controller gives it those of the task; "
-                    f"learn with VecNormalize, which is taken along, or give robot= and a recipe= that says how the policy sees each entry"
-                )
-            one = one.env
+    rescaling = []
+    while isinstance(one, gymnasium.Wrapper):
+        kind = type(one).__name__
+        if isinstance(one, gymnasium.ObservationWrapper) and kind not in _SAME:
+            raise ValueError(
+                f"the model learned behind the wrapper {kind}, which changes observations, and the controller gives it those of the task; "
+                f"learn with VecNormalize, which is taken along, or give robot= and a recipe= that says how the policy sees each entry"
+            )
+        if kind == "RescaleAction":
+            rescaling.append(one)
+        elif isinstance(one, gymnasium.ActionWrapper) and kind != "ClipAction":
+            raise ValueError(
+                f"the model learned behind the wrapper {kind}, which changes actions, and the controller takes what the network puts out; learn without it, "
+                f"or with RescaleAction, which is taken along"
+            )
+        one = one.env
+    return rescaling
 
 
-def _check_range(low: np.ndarray, high: np.ndarray, task: str) -> None:
-    """Refuses actions in another range than the motors have, which would be taken for theirs."""
+def _rescaled(wrapper: Any, layers: list[_Layer], low: np.ndarray, high: np.ndarray) -> tuple[list[_Layer], np.ndarray, np.ndarray]:
+    """The layers with what a RescaleAction does behind them, and the range of what comes out."""
+    inner = wrapper.env.action_space
+    inner_low, inner_high = _numbers(inner.low, "action_space.low").ravel(), _numbers(inner.high, "action_space.high").ravel()
+    scale = (inner_high - inner_low) / (high - low)
+    return [*layers, (np.diag(scale), inner_low - scale * low, "identity")], inner_low, inner_high
+
+
+def _check_task(model: Any, controller: Controller) -> None:
+    """Refuses a task that takes proposals for other entries, of other observations or for another time than that which the model learned in."""
+    env = getattr(_env(model), "unwrapped", None) or getattr(model, "get_env", lambda: None)()
+    native = getattr(env, "native", None)
+    if native is None:
+        return
+    for what, theirs, ours in (
+        ("proposes", list(native.action_names), controller.state_names),
+        ("sees", list(native.obs_names), controller.obs_names),
+        ("proposes for", f"{native.dt:g} s", f"{controller.dt * controller.policy_every:g} s"),
+    ):
+        if theirs != ours:
+            of, at = next(((a, b) for a, b in zip(theirs, ours) if a != b), (theirs, ours)) if isinstance(theirs, list) else (theirs, ours)
+            raise ValueError(f"the model {what} {of} where the task has {at}; give the task that it learned")
+
+
+def _check_range(low: np.ndarray, high: np.ndarray, task: str, actions: str) -> None:
+    """Refuses actions in another range than the motors have, which would be taken for theirs; changes are shares, and states have their units."""
+    if actions == "state":
+        return
+    if actions == "change":
+        if not (np.allclose(low, -1.0) and np.allclose(high, 1.0)):
+            raise ValueError(
+                f"the model's actions range from {low.min():g} to {high.max():g}, and changes of the state from -1 to 1, in units of what the limits allow; "
+                f"train it in that range (nearl.make_vec, actions='change')"
+            )
+        return
     env = Env(task)
     for which, given, want in (("smallest", low, env.action_low), ("largest", high, env.action_high)):
         if given.shape != want.shape:
@@ -216,11 +290,13 @@ def _check_range(low: np.ndarray, high: np.ndarray, task: str) -> None:
             )
 
 
-def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: str | None, name: str) -> Controller:
-    if task is not None and robot is None:
-        return _told(policy.in_task(task))
+def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: _Path | None, name: str, actions: str) -> Controller:
+    if task is not None and robot is None and recipe is None:
+        return _told(policy.in_task(os.fspath(task), actions=actions))
     if robot is None or task is not None:
         raise ValueError("give either task=, or robot= and recipe=")
+    if actions != "actuators":
+        raise ValueError(f"actions={actions!r} is what a policy gives in a task; give task=FILE in place of robot= and recipe=")
     recipes = [] if recipe is None else [recipe] if isinstance(recipe, str | os.PathLike) else recipe
     for what, kind, file in (("robot", "a URDF or MJCF file", robot), *(("recipe", "a TOML file or unitree's deploy.yaml", one) for one in recipes)):
         if not os.path.isfile(file):
@@ -236,7 +312,7 @@ def _told(controller: Controller) -> Controller:
     return controller
 
 
-def _policy(layers: list[_Layer], mean: Any, std: Any, clip: float, output_clip: tuple[float, float]) -> Policy:
+def _policy(layers: list[_Layer], mean: Any, std: Any, clip: float, output_clip: tuple[Any, Any]) -> Policy:
     if not layers:
         raise ValueError("the module has no linear layer; give the policy's network")
     mean, std = _moments(mean, std, np.shape(layers[0][0])[1])

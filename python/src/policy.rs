@@ -5,8 +5,8 @@ use std::sync::{Mutex, PoisonError};
 
 use nearl_runtime::net::{Dense, DenseLayer, Forward, Function};
 use nearl_runtime::normaliser::Normaliser;
-use nearl_trainer::import::{ImportedNetwork, Setting, for_task, read, snapshot};
-use nearl_trainer::{tasks, train};
+use nearl_trainer::import::{Gives, ImportedNetwork, Setting, for_task, read, snapshot};
+use nearl_trainer::{blank, tasks};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 
@@ -42,14 +42,15 @@ impl Policy {
     }
 
     /// Layers as arrays, first to last: weight (n_out x n_in), bias (n_out) and the function that follows. `mean` and `std` (n_in) are those of
-    /// the observation; `clip` holds the lowest and highest network input, `output_clip` the lowest and highest output.
+    /// the observation; `clip` holds the lowest and highest network input, `output_clip` the lowest and highest
+    /// output, one number or one for each (n_out).
     #[staticmethod]
     fn from_layers<'py>(
         layers: Vec<LayerIn<'py>>,
         mean: &Bound<'py, PyAny>,
         std: &Bound<'py, PyAny>,
         clip: (f64, f64),
-        output_clip: (f64, f64),
+        output_clip: (Bound<'py, PyAny>, Bound<'py, PyAny>),
     ) -> PyResult<Policy> {
         let mut dense = Dense::default();
         let mut functions = Vec::new();
@@ -73,11 +74,17 @@ impl Policy {
                 "the policy has no layers; give at least one (weight, bias, function)",
             ));
         }
+        let side = |name: &str, end: &Bound<'py, PyAny>| match end.extract::<f64>() {
+            Ok(one) => Ok(vec![one; n_out]),
+            Err(_) => vector(name, end, n_out),
+        };
+        let lower = side("output_clip[0]", &output_clip.0)?;
+        let upper = side("output_clip[1]", &output_clip.1)?;
         Ok(Policy::of(ImportedNetwork {
             mean: vector("mean", mean, n_in)?,
             std: vector("std", std, n_in)?,
             clip: vec![[clip.0, clip.1]; n_in],
-            output: vec![[output_clip.0, output_clip.1]; n_out],
+            output: lower.into_iter().zip(upper).map(|(lower, upper)| [lower, upper]).collect(),
             input_name: "obs".into(),
             output_name: "actions".into(),
             metadata: Default::default(),
@@ -118,13 +125,20 @@ impl Policy {
         Controller::new(&made)
     }
 
-    /// The controller of the policy in a task whose environment gives the observation and takes the action.
-    #[pyo3(signature = (task, settings=vec![]))]
-    fn in_task(&self, py: Python<'_>, task: &str, settings: Vec<String>) -> PyResult<Controller> {
+    /// The controller of the policy in a task that says what it observes; `actions` is what the policy gives: "actuators", "state" or "change".
+    #[pyo3(signature = (task, settings=vec![], actions="actuators"))]
+    fn in_task(
+        &self,
+        py: Python<'_>,
+        task: &str,
+        settings: Vec<String>,
+        actions: &str,
+    ) -> PyResult<Controller> {
+        let gives = Gives::named(actions).map_err(errors::value)?;
         let made = py.detach(|| {
             let mut manifest = tasks::load(task, &settings).map_err(errors::task)?;
-            train::complete(&mut manifest).map_err(errors::train)?;
-            for_task(&self.network, manifest).map_err(errors::value)
+            blank::complete(&mut manifest).map_err(errors::vector)?;
+            for_task(&self.network, manifest, gives).map_err(errors::value)
         })?;
         Controller::new(&made)
     }

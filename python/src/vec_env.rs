@@ -126,6 +126,12 @@ impl VecEnv {
         self.of(Vector::n_obs)
     }
 
+    /// What each entry of an observation is.
+    #[getter]
+    fn obs_names(&self) -> Vec<String> {
+        self.of(|vector| vector.obs_names().to_vec())
+    }
+
     /// What each entry of an action is: an actuator, or an entry of the proposed state.
     #[getter]
     fn action_names(&self) -> Vec<String> {

@@ -657,22 +657,124 @@ def ppo(n_in: int, n_out: int, **more) -> SimpleNamespace:
     return SimpleNamespace(policy=policy, action_space=SimpleNamespace(low=np.full(n_out, -1.0), high=np.full(n_out, 1.0)), **more)
 
 
-def test_a_model_that_learned_to_propose_is_not_taken_for_one_of_actions() -> None:
-    """What the environment says, as SB3's vectors hand it on; a vector that says nothing is one of actions."""
-    for meaning, refused in (("state", True), ("change", True), ("guarded", False), ("actuators", False), (None, False)):
-        env = SimpleNamespace(has_attr=lambda name, m=meaning: m is not None and name == "action_meaning", get_attr=lambda _, m=meaning: [m, m])
-        model = ppo(17, 6, get_env=lambda env=env: env)
-        if refused:
-            with pytest.raises(ValueError, match=f"learned with actions='{meaning}', .*learn with actions='guarded' to import it"):
-                nearl.import_sb3(model, task="HalfCheetah-v5")
-        else:
-            nearl.import_sb3(model, task="HalfCheetah-v5")
+def learned_with(*meanings: str) -> SimpleNamespace:
+    """What SB3's vectors hand on of what their environments say an action is."""
+    return SimpleNamespace(has_attr=lambda name: bool(meanings) and name == "action_meaning", get_attr=lambda _: list(meanings))
+
+
+@pytest.mark.parametrize("meaning", ["state", "change"])
+def test_what_learned_to_propose_moves_the_robot_as_in_its_environment(tmp_path, meaning) -> None:
+    """The environment is given what the model computes, cut to its space; the controller has read the weights, and steers a plant of its own."""
+    gymnasium = pytest.importorskip("gymnasium")
+    env, plant = gymnasium.make("nearl/Panda-reach", constraints="task", actions=meaning), nearl.Env("Panda-reach")
+    latent, head = Sequential([Linear(20, 8), Tanh()]), Linear(8, 14)
+    policy = SimpleNamespace(mlp_extractor=SimpleNamespace(policy_net=latent), action_net=head)
+    model = SimpleNamespace(policy=policy, action_space=env.action_space, get_vec_normalize_env=lambda: None)
+    for told in ({"actions": meaning}, {}):  # loaded without its environment, and with it
+        model.get_env = lambda told=told: None if told else learned_with(meaning, meaning)
+        nearl.import_sb3(model, False, task="Panda-reach", **told).save(tmp_path / "made.safetensors")
+        controller = nearl.Controller.load(tmp_path / "made.safetensors")
+        obs, seen = env.reset(seed=3)[0], plant.reset(seed=3)[0]
+        begun, cut = obs[:7].copy(), 0
+        for _ in range(40):
+            asked = head(latent(obs))
+            action = np.clip(asked, env.action_space.low, env.action_space.high)
+            cut += int((action != asked).any())
+            obs, _, _, _, info = env.step(action)
+            for _ in range(controller.policy_every):
+                torque, _ = controller.update(*plant.state, seen)
+                seen = plant.step(torque)[0]
+            np.testing.assert_allclose(seen, obs, atol=1e-4)
+            assert info["target_violations"] == 0
+        assert cut > 5 and np.abs(obs[:7] - begun).max() > 0.1
+
+
+def test_what_a_model_says_of_its_actions_is_what_it_is_imported_as() -> None:
+    """As SB3's vectors hand it on; a vector that says nothing is one of actions."""
+    for meanings in (["guarded"], ["actuators"], []):
+        nearl.import_sb3(ppo(17, 6, get_env=lambda m=meanings: learned_with(*m)), task="HalfCheetah-v5")
+    proposes = ppo(20, 14, get_env=lambda: learned_with("change", "change"))
+    for model, how, said in (
+        (proposes, {"task": "Panda-reach", "actions": "state"}, "learned with actions 'change', and it is imported with actions='state'"),
+        (proposes, {"task": "HalfCheetah-v5"}, "the policy takes 20 entries and gives 14, but the task has 17 observation"),
+        (proposes, {"robot": "a.urdf", "recipe": "b.toml"}, "a recipe is of a policy that gives actions"),
+        (ppo(20, 14, get_env=lambda: learned_with("state", "change")), {"task": "Panda-reach"}, "actions 'change' and 'state'"),
+        (ppo(17, 17), {"task": "HalfCheetah-v5", "actions": "state"}, "learned inverse model, which is not in the policy's file"),
+        (ppo(20, 14), {"task": "Panda-reach", "actions": "states"}, "actions is 'states', and what a policy gives is one of 'actuators', 'state', 'change'"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            nearl.import_sb3(model, False, **how)
+    proposes.action_space.high[3] = 2.0
+    with pytest.raises(ValueError, match="range from -1 to 2, and changes of the state from -1 to 1"):
+        nearl.import_sb3(proposes, False, task="Panda-reach")
     gymnasium = pytest.importorskip("gymnasium")
     for meaning in ("state", "change", "guarded"):
         env = gymnasium.make("nearl/Panda-reach", constraints="task", actions=meaning)
         vector = nearl.make_vec("Panda-reach", 2, constraints="task", actions=meaning)
         assert env.get_wrapper_attr("action_meaning") == vector.action_meaning == meaning
     assert nearl.make_vec("HalfCheetah-v5", 2).action_meaning == "actuators"
+
+
+def test_what_learned_behind_rescaled_actions_proposes_what_its_environment_was_asked_for(tmp_path) -> None:
+    """SB3 wants actions in [-1, 1]; the wrapper lies between the model and the environment, and the task has to be the one that it learned."""
+    gymnasium = pytest.importorskip("gymnasium")
+    env = gymnasium.make("nearl/Panda-reach", constraints="task", actions="state")
+    rescaled = gymnasium.wrappers.RescaleAction(env, np.full(14, -1.0), np.full(14, 1.0))
+    model = ppo(20, 14)
+    model.action_space, model.get_vec_normalize_env = rescaled.action_space, lambda: None
+    model.get_env = lambda: SimpleNamespace(envs=[rescaled], **vars(learned_with("state")))
+    controller = nearl.import_sb3(model, task="Panda-reach")
+    for _ in range(20):
+        obs = RNG.normal(size=20)
+        action = np.clip(model.policy.action_net(model.policy.mlp_extractor.policy_net(obs)), -1, 1)
+        controller.reset()
+        controller.update(obs[:7], obs[7:14], obs)
+        np.testing.assert_allclose(controller.proposal, rescaled.action(action), atol=3e-6)
+    text = (ROOT / "examples" / "tasks" / "Panda-reach.toml").read_text()
+    for change, said in (
+        (("policy_every = 20", "policy_every = 10"), "proposes for 0.02 s where the task has 0.01 s"),
+        (('"q.panda_joint1", "q.panda_joint2"', '"q.panda_joint2", "q.panda_joint1"'), "proposes q.panda_joint1 where the task has q.panda_joint2"),
+    ):
+        assert change[0] in text
+        (tmp_path / "other.toml").write_text(text.replace(*change))
+        with pytest.raises(ValueError, match=said):
+            nearl.import_sb3(model, task=tmp_path / "other.toml")
+    twice = gymnasium.wrappers.TransformAction(env, lambda action: 2.0 * action, env.action_space)
+    model.get_env = lambda: SimpleNamespace(envs=[twice], **vars(learned_with("state")))
+    with pytest.raises(ValueError, match=r"behind the wrapper TransformAction, which changes actions, .* or with RescaleAction"):
+        nearl.import_sb3(model, task="Panda-reach")
+
+
+def test_a_network_of_next_states_is_imported_into_the_task_of_ones_own_robot(tmp_path) -> None:
+    """By the command line, and in Python; its proposals are those of onnxruntime, clip included."""
+    (tmp_path / "planar.urdf").write_text(planar_urdf())
+    entries = json.dumps([f"{half}.joint{k}" for half in "qv" for k in range(3)])
+    (tmp_path / "task.toml").write_text(
+        f'name = "planar"\n[model]\nurdf = "planar.urdf"\n[time]\ndt = 0.004\nsim_dt = 0.0\n[state]\nobservation = {entries}\npropose = {entries}\n'
+        '[constraints]\nvelocity = { limit = 1.0 }\nacceleration = { limit = 5.0 }\n[idm]\nkind = "pinocchio"\n'
+    )
+    net = Net(6).gemm(6, 16, transB=1).add("Tanh").gemm(16, 6, transB=1).add("Clip", f32(-0.6), f32(0.9))
+    file = net.save(tmp_path / "next.onnx", 6)
+    out = tmp_path / "arm.safetensors"
+    asked = [NEARL, "import", file, "--task", tmp_path / "task.toml", "--out", out]
+    done = subprocess.run([*asked, "--actions", "state"], capture_output=True, text=True)
+    assert done.returncode == 0 and "6 proposed entries" in done.stdout, done.stderr
+    session = onnxruntime.InferenceSession(file)
+    own = nearl.import_onnx(file, task=tmp_path / "task.toml", actions="state")
+    for controller in (nearl.Controller.load(out), own):
+        ends = set()
+        for _ in range(50):
+            obs = RNG.normal(size=6)
+            want = session.run(None, {"obs": f32(obs)[None]})[0][0]
+            controller.reset()
+            controller.update(obs[:3], obs[3:], obs)
+            np.testing.assert_allclose(controller.proposal, want, atol=2e-6)
+            ends |= {float(x) for x in want if x in (f32(-0.6), f32(0.9))}
+        assert len(ends) == 2
+    refused = subprocess.run(asked, capture_output=True, text=True)
+    assert refused.returncode == 1 and "6 observation and 3 action entries; one that proposes states is imported with actions" in refused.stderr, refused.stderr
+    with pytest.raises(ValueError, match=r"give task=FILE in place of robot= and recipe="):
+        nearl.import_onnx(file, robot=tmp_path / "planar.urdf", actions="state")
 
 
 def test_a_model_that_learned_behind_a_wrapper_of_observations_is_not_taken_for_one_without() -> None:

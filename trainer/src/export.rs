@@ -3,6 +3,7 @@
 //! ```text
 //!     obs -> Sub mean -> Div std -> clip -> Gemm, function, ... -> clip -> actions       a policy of actions, before scale and offset
 //!                                                              -> Mul scale -> change    a policy that proposes: proposal = s + change
+//!                                                              -> Mul scale -> state     the same of an imported one that puts out the proposal
 //! ```
 
 use crate::import::metadata::RECIPE;
@@ -19,9 +20,13 @@ use rten_onnx::onnx::{
 };
 use std::cell::RefCell;
 
-/// Name of the output: `actions` or `change`.
+/// Name of the output: `actions`, `change` or `state`.
 pub fn output(snapshot: &Snapshot) -> &'static str {
-    if snapshot.manifest.policy == PolicyKind::Direct { "actions" } else { "change" }
+    match snapshot.manifest.policy {
+        PolicyKind::Direct => "actions",
+        PolicyKind::Deterministic | PolicyKind::Stochastic => "change",
+        PolicyKind::State => "state",
+    }
 }
 
 /// The bytes of the ONNX file (opset 13, float32), one sample a call.

@@ -13,13 +13,15 @@ mod deploy;
 mod elementwise;
 mod file;
 mod graph;
+mod in_task;
 pub(crate) mod metadata;
 mod network;
 mod sound;
 mod tensor;
 
-pub use assemble::{Setting, for_task, snapshot};
+pub use assemble::{Setting, snapshot};
 pub use file::{onnx, read};
+pub use in_task::{Gives, for_task};
 pub use network::ImportedNetwork;
 
 /// Why a policy was not imported; one sentence.

@@ -330,8 +330,13 @@ impl Controller {
                 sample(&self.mean[..n], &self.policy_log_std, &noise.proposal, &mut out.change);
         }
         for k in 0..n {
-            let s = self.held.obs[self.layout.state()[k]];
-            out.proposal[k] = s + self.normaliser.scale[k] * f64::from(out.change[k]);
+            let (s, scale) = (self.held.obs[self.layout.state()[k]], self.normaliser.scale[k]);
+            let put_out = scale * f64::from(out.change[k]);
+            if self.kind == PolicyKind::State {
+                (out.proposal[k], out.change[k]) = (put_out, ((put_out - s) / scale) as f32);
+            } else {
+                out.proposal[k] = s + put_out;
+            }
         }
         self.set_goal(out);
     }

@@ -35,6 +35,8 @@ pub enum PolicyKind {
     Deterministic,
     /// The proposal is Gaussian; exploration is in the proposal.
     Stochastic,
+    /// The policy's output is the next state itself, in place of its change; an imported policy, without exploration.
+    State,
 }
 
 /// Language of a robot file.

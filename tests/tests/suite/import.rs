@@ -3,7 +3,7 @@
 use nearl_runtime::Controller;
 use nearl_tests::training;
 use nearl_trainer::export;
-use nearl_trainer::import::{ImportError, Setting, for_task, onnx};
+use nearl_trainer::import::{Gives, ImportError, Setting, for_task, onnx};
 use rand::RngExt;
 
 const SHORT: [&str; 3] = ["train.n_envs=4", "train.n_steps=32", "train.ppo.batch_size=64"];
@@ -16,7 +16,7 @@ fn what_was_exported_comes_back() {
     let bytes = export::onnx(&snapshot).expect("exports");
     let network = onnx("policy.onnx", &bytes, None, None).expect("imports");
     assert_eq!(network.dense, snapshot.networks.policy, "weights are the same numbers");
-    let back = for_task(&network, snapshot.manifest.clone()).expect("fits");
+    let back = for_task(&network, snapshot.manifest.clone(), Gives::Actuators).expect("fits");
     let mut both = [&snapshot, &back].map(|s| Controller::new(s).expect("controller"));
     let mut rng = nearl_trainer::rollout::stream(3, 0);
     for _ in 0..100 {
@@ -71,7 +71,41 @@ fn a_policy_of_motors_comes_back_with_the_robot_file_alone() {
     }
 }
 
-/// What a policy proposes is no action, and the file is refused for that.
+/// The task brings the limits and the inverse dynamics, the file the change of the state in its units.
+#[test]
+fn a_policy_that_proposes_comes_back_into_its_task() {
+    let snapshot = training("Panda-reach", "pid2-ib", 0, 1, &SHORT).snapshot().clone();
+    let network = onnx("policy.onnx", &export::onnx(&snapshot).expect("exports"), None, None).expect("reads");
+    let mut manifest = nearl_trainer::tasks::load("Panda-reach", &[]).expect("bundled");
+    nearl_trainer::train::complete(&mut manifest).expect("bundled");
+    let back = for_task(&network, manifest, Gives::Change).expect("fits");
+    let mut both = [&snapshot, &back].map(|s| Controller::new(s).expect("controller"));
+    let mut rng = nearl_trainer::rollout::stream(3, 0);
+    let mut largest = 0.0f64;
+    for _ in 0..100 {
+        let obs: Vec<f64> = both[0].state().obs.iter().map(|_| 0.4 * (rng.random::<f64>() - 0.5)).collect();
+        let outputs = both.each_mut().map(|controller| {
+            let (mut state, mut out) = (controller.state(), controller.output());
+            state.q.copy_from_slice(&obs[..7]);
+            state.v.copy_from_slice(&obs[7..14]);
+            state.obs.copy_from_slice(&obs);
+            controller.reset();
+            controller.update(&state, &controller.noise(), &mut out);
+            [out.proposal, out.action]
+        });
+        for (before, after) in outputs[0].iter().zip(&outputs[1]) {
+            assert!(
+                before.iter().zip(after).all(|(a, b)| (a - b).abs() < 1e-6 * a.abs().max(1.0)),
+                "{outputs:?}"
+            );
+        }
+        largest =
+            outputs[0][0].iter().zip(&obs).fold(largest, |most, (to, from)| most.max((to - from).abs()));
+    }
+    assert!(largest > 1e-4, "{largest}");
+}
+
+/// What a policy proposes is no action, and without a task the file is refused for that.
 #[test]
 fn a_proposal_is_not_imported_as_an_action() {
     let snapshot = training("HalfCheetah-v5", "pid2-ib", 0, 1, &SHORT).snapshot().clone();
@@ -80,7 +114,7 @@ fn a_proposal_is_not_imported_as_an_action() {
     let setting = Setting { name: "back", robot: std::path::Path::new(robot), recipes: &[] };
     let refused = nearl_trainer::import::snapshot(&network, &setting).unwrap_err().to_string();
     assert!(
-        refused.contains("'change' is a change of state") && refused.contains("keep the snapshot"),
+        refused.contains("'change' is a change of state") && refused.contains("--task FILE --actions change"),
         "{refused}"
     );
 }
@@ -174,6 +208,7 @@ fn weights_that_are_none_are_named_in_the_file_they_come_from() {
     let mut network =
         onnx("policy.onnx", &export::onnx(&good).expect("exports"), None, None).expect("imports");
     network.std[2] = 1e7;
-    let error = for_task(&network, good.manifest.clone()).expect_err("no deviation").to_string();
+    let error =
+        for_task(&network, good.manifest.clone(), Gives::Actuators).expect_err("no deviation").to_string();
     assert!(error.contains("'normaliser.std' has 10000000 at index 2"), "{error}");
 }

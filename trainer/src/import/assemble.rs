@@ -111,33 +111,6 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
     Ok(snapshot)
 }
 
-/// The snapshot of a policy of actions in a task whose environment gives the observation and takes the action; `manifest` is complete.
-///
-/// # Errors
-/// [`ImportError`] where sizes differ.
-pub fn for_task(network: &ImportedNetwork, mut manifest: Manifest) -> Result<Snapshot, ImportError> {
-    let task = manifest.task.name.clone();
-    let (n_in, n_obs) = (network.n_in(), manifest.task.state.observation.len());
-    let (n_out, n_act) = (network.n_out(), manifest.action_lower.len());
-    if (n_in, n_out) != (n_obs, n_act) {
-        let reason = format!(
-            "the policy takes {n_in} entries and gives {n_out}, but the task has {n_obs} observation and {n_act} action entries"
-        );
-        return Err(recipe(&task, &reason));
-    }
-    for (i, [lower, upper]) in network.output.iter().enumerate() {
-        manifest.action_lower[i] = manifest.action_lower[i].max(*lower);
-        manifest.action_upper[i] = manifest.action_upper[i].min(*upper);
-    }
-    manifest.policy = PolicyKind::Direct;
-    manifest.functions.clone_from(&network.functions);
-    manifest.algo = "import".into();
-    let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
-    let snapshot = Snapshot { networks: networks(network, n_state), manifest };
-    snapshot.check().map_err(|e| recipe(&task, &e.to_string()))?;
-    Ok(snapshot)
-}
-
 /// What a recipe file says, as sections of a task file, and its text where it is one.
 fn said(path: &Path, robot: &Path) -> Result<(Table, String), ImportError> {
     let (said_by, text) = (path.display().to_string(), read(path, read_task_text)?);
@@ -174,7 +147,7 @@ fn unusable(robot: &Path, e: &dyn std::fmt::Display) -> ImportError {
     ImportError::Robot(format!("{}: {e}", robot.display()))
 }
 
-fn recipe(said_by: &str, reason: &str) -> ImportError {
+pub(super) fn recipe(said_by: &str, reason: &str) -> ImportError {
     ImportError::Recipe(format!("{said_by}: {reason}"))
 }
 
@@ -370,7 +343,7 @@ fn ranges(
     Ok(sent.into_iter().unzip())
 }
 
-fn networks(network: &ImportedNetwork, n_state: usize) -> Networks {
+pub(super) fn networks(network: &ImportedNetwork, n_state: usize) -> Networks {
     let clip = network.clip.clone();
     Networks {
         normaliser: Normaliser {

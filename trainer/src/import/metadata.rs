@@ -20,15 +20,20 @@ pub(super) fn recipe(network: &ImportedNetwork) -> Result<Table, ImportError> {
         }
         return toml::from_str(text).map_err(refuse);
     }
-    if network.output_name == "change" && network.metadata.contains_key("task") {
-        let reason = "the file's output 'change' is a change of state that 'nearl export' wrote of a policy that proposes, and what is imported gives \
-                      actions; keep the snapshot it was exported from, which every command takes";
+    if is_exported_change(network) {
+        let reason = "the file's output 'change' is a change of state that 'nearl export' wrote of a policy that proposes, and a recipe is of a policy of \
+                      actions; import it into its task (--task FILE --actions change, in Python task= and actions='change')";
         return Err(ImportError::Recipe(reason.into()));
     }
     if network.metadata.contains_key("observation_names") && network.metadata.contains_key("joint_names") {
         return mjlab(network);
     }
     Ok(Table::new())
+}
+
+/// Whether 'nearl export' wrote it of a policy that proposes: then the outputs are in the units of the state.
+pub(super) fn is_exported_change(network: &ImportedNetwork) -> bool {
+    network.output_name == "change" && network.metadata.contains_key("task")
 }
 
 fn mjlab(network: &ImportedNetwork) -> Result<Table, ImportError> {

@@ -282,7 +282,7 @@ impl Worker {
         let normal = |rng: &mut ChaCha8Rng| if explore { StandardNormal.sample(rng) } else { 0.0 };
         match self.kind {
             PolicyKind::Stochastic => self.noise.proposal.fill_with(|| normal(&mut self.rng)),
-            PolicyKind::Direct | PolicyKind::Deterministic => {}
+            PolicyKind::Direct | PolicyKind::Deterministic | PolicyKind::State => {}
         }
         // an analytic inverse model has no noise of its own
         if self.kind != PolicyKind::Stochastic || self.learned {

@@ -180,6 +180,7 @@ fn kind(policy: PolicyKind) -> &'static str {
         PolicyKind::Direct => "one of actions",
         PolicyKind::Deterministic => "one of states that explores in its actions",
         PolicyKind::Stochastic => "one of states that explores in its proposals",
+        PolicyKind::State => "one that was imported and puts out whole states",
     }
 }
 

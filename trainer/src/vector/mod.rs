@@ -81,7 +81,7 @@ pub struct Vector {
     pool: Pool,
     autoreset: Autoreset,
     n: usize,
-    n_obs: usize,
+    obs: Vec<String>,
     space: Space,
     dt: f64,
     notes: Vec<String>,
@@ -137,8 +137,8 @@ impl Vector {
             })
             .collect::<Result<Vec<_>, VectorError>>()?;
         let pool = Pool::new(lanes, settings.threads).map_err(|e| VectorError::Threads(e.to_string()))?;
-        let (n_obs, dt) = (spec.n_obs(), spec.dt * ticks as f64);
-        Ok(Vector { pool, autoreset: settings.autoreset, n: settings.num_envs, n_obs, space, dt, notes })
+        let (obs, dt) = (spec.obs, spec.dt * ticks as f64);
+        Ok(Vector { pool, autoreset: settings.autoreset, n: settings.num_envs, obs, space, dt, notes })
     }
 
     /// Begins an episode everywhere; `seeds` (n), if given, restart the random streams.
@@ -237,7 +237,12 @@ impl Vector {
 
     /// Entries of an observation.
     pub fn n_obs(&self) -> usize {
-        self.n_obs
+        self.obs.len()
+    }
+
+    /// What each entry of an observation is.
+    pub fn obs_names(&self) -> &[String] {
+        &self.obs
     }
 
     /// What each entry of an action is: an actuator, or an entry of the proposed state.

@@ -335,7 +335,7 @@ fn check(m: &Manifest, asked: f64) -> Result<(), SnapshotError> {
         _ if !m.task.constraints.guard.is_off() => {
             "[constraints] guard gives the one action that leads to an allowed state"
         }
-        (PolicyKind::Stochastic | PolicyKind::Deterministic, IdmKind::Pinocchio) => {
+        (kind, IdmKind::Pinocchio) if kind != PolicyKind::Direct => {
             "idm.kind = \"pinocchio\" gives the one torque that leads to the target"
         }
         _ => return Ok(()),

@@ -263,7 +263,7 @@ pub(super) fn check_sizes(
         (
             "policy.log_std",
             n.policy_log_std.len(),
-            if m.policy == PolicyKind::Deterministic { 0 } else { out },
+            if matches!(m.policy, PolicyKind::Deterministic | PolicyKind::State) { 0 } else { out },
         ),
         ("action_upper", m.action_upper.len(), a),
     ];
