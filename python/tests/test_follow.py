@@ -265,6 +265,31 @@ def test_an_emergency_stop_that_is_told_ends_where_the_robot_is(tmp_path: Path, 
     assert LIMIT - 1e-3 < q < LIMIT + 1e-9
 
 
+@pytest.mark.parametrize("away", [4, 30])
+def test_a_driver_that_was_away_begins_where_the_robot_is(tmp_path: Path, away: int) -> None:
+    """The clock tells of it, the numbers of the states do not; the robot stood where it had been sent last, and set points jumped on at 2 rad/s."""
+    dt, entries, name, log = 0.01, save(tmp_path, "position", 0.01, np.zeros((1, 2)), 3.0), f"py{os.getpid()}-away", tmp_path / "away.mcap"
+    q, speed, clock, speeds = 0.0, 0.0, 0.0, []
+    with nearl.Plant(name, joints=["j1"], observation=entries, dt=dt, nu=1, lockstep=True, watchdog=5.0) as plant:
+        loop = nearl.Loop(tmp_path / "one.safetensors", name, log=log, ramp=0.0)
+        for tick in range(250):
+            clock += dt
+            if tick in (30, 60):
+                clock, speed = clock + away * dt, 0.0
+            observation = [{"q.j1": q, "v.j1": speed}[entry] for entry in entries]
+            turn, action = plant.exchange([q], [speed], observation, patience=5.0, time=clock, begins=tick == 0)
+            assert turn == "act", tick
+            speeds.append((float(action[0]) - q) / dt - speed)
+            speed = (float(action[0]) - q) / dt
+            q += dt * speed
+        loop.stop()
+    assert np.abs(speeds).max() / dt < 10.0 + 1e-6
+    assert LIMIT - 1e-3 < q < LIMIT + 1e-9
+    assert loop.report["counters"]["lost_states"] == 2 * away and loop.report["modes"]["braking"] > 10
+    done = subprocess.run([NEARL, "verify", log], capture_output=True, text=True, check=False)
+    assert done.returncode in (0, 2), done.stdout + done.stderr  # 2: the disk was too slow for some ticks
+
+
 @pytest.mark.parametrize("interface", ["position", "velocity"])
 def test_a_driver_that_goes_on_while_answers_are_late_keeps_every_limit(tmp_path: Path, interface: str) -> None:
     """One of five answers, and now and then two in a row, come too late, and are never applied. Taken for applied, they had the next set point jump from

@@ -392,6 +392,7 @@ impl<T: LoopController> Core<T> {
         let is_next = state.header.epoch == known.epoch;
         let lost = if is_next { state.header.seq - known.seq - 1 } else { 0 };
         self.record.counters.lost_states += lost;
+        let mut left_out = 0;
         // By its number: the state that began the episode may be among the lost ones.
         if !is_next || state.episode != self.record.state.episode {
             self.controller.controller.reset();
@@ -402,7 +403,7 @@ impl<T: LoopController> Core<T> {
             self.way.clear();
             self.record.apart = None;
         } else {
-            self.go_on(state, lost);
+            left_out = self.go_on(state, lost);
         }
         let is_frozen = is_next && self.is_frozen(state);
         if self.held.is_some() {
@@ -410,19 +411,29 @@ impl<T: LoopController> Core<T> {
         }
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);
         let gap = if is_next && self.settings.real_time { missed.min(lost) } else { 0 };
+        let passed = if is_next { state.time - self.record.state.time } else { 0.0 };
         self.record.state = *state;
-        self.event_of_state(is_frozen, gap)
+        if left_out > 0 {
+            self.record.state.bits |= STATE_BRAKED; // nobody knows what held it
+            self.record.counters.lost_states += left_out;
+        }
+        self.event_of_state(is_frozen, gap.max(left_out), passed)
     }
 
     /// Tells the controller what the plant has done by itself up to `state`, before which `lost` states were: it says how often it had no answer in
-    /// time, that to the last state it was given included.
-    fn go_on(&mut self, state: &StateMessage, lost: u64) {
+    /// time, that to the last state it was given included. Gives the periods that its clock has passed over without a state, where they are more
+    /// than may be bridged: the controller then goes on from where the robot is.
+    fn go_on(&mut self, state: &StateMessage, lost: u64) -> u64 {
         let (known, controller) = (&self.record.state, &mut self.controller.controller);
-        if state.bits & STATE_BRAKED != 0 {
+        let left_out = match self.settings.sync {
+            Sync::Clock => 0,
+            Sync::Plant => left_out(state.time - known.time, lost, &self.settings),
+        };
+        if left_out > 0 || state.bits & STATE_BRAKED != 0 {
             controller.lose();
         }
         if self.settings.sync == Sync::Clock {
-            return; // it has answered in every slot, at its own pace
+            return 0; // it has answered in every slot, at its own pace
         }
         let alone = state.late.saturating_sub(known.late);
         if alone > lost {
@@ -432,6 +443,7 @@ impl<T: LoopController> Core<T> {
             controller.miss(alone.max(lost));
         }
         self.pace.take(state.time - known.time, lost + 1, self.settings.period);
+        left_out
     }
 
     /// Compares where the joints went with their velocities. Once a driver is found to tell others, nothing can be reckoned with them any more.
@@ -451,8 +463,8 @@ impl<T: LoopController> Core<T> {
         self.record.apart = self.way.take(known, state, nominal, self.controller.controller.speeds());
     }
 
-    /// What the state just taken is worth.
-    fn event_of_state(&mut self, is_frozen: bool, gap: u64) -> Event {
+    /// What the state just taken is worth, `passed` [s] of the plant's clock after the one before it.
+    fn event_of_state(&mut self, is_frozen: bool, gap: u64, passed: f64) -> Event {
         let (state, counters) = (&self.record.state, &mut self.record.counters);
         if !state.is_finite() {
             counters.bad_states += 1;
@@ -472,7 +484,7 @@ impl<T: LoopController> Core<T> {
         }
         if jump > 0.0 && self.held.is_some() {
             let ticks = state.tick.saturating_sub(self.estimate.tick).max(1);
-            let age = ticks as f64 * self.settings.period as f64 * 1e-9;
+            let age = (ticks as f64 * self.settings.period as f64 * 1e-9).max(passed);
             if self.controller.controller.implausible(&self.estimate, state, age, jump).is_some() {
                 counters.implausible_states += 1;
                 return self.hold(Reason::ImplausibleState);
@@ -530,6 +542,13 @@ impl<T: LoopController> Core<T> {
             || (new.time > 0.0 && new.time == old.time)
             || (moves && new.q() == old.q() && new.v() == old.v())
     }
+}
+
+/// Periods in `passed` \[s\] of the plant's clock of which no state tells, beside the `lost` ones; 0 where they may be bridged.
+fn left_out(passed: f64, lost: u64, settings: &CoreSettings) -> u64 {
+    let periods = passed / (settings.period as f64 * 1e-9);
+    let most = (lost + 1 + u64::from(settings.modes.hold_states)) as f64 + 0.5;
+    if periods > most { periods.round() as u64 - lost - 1 } else { 0 }
 }
 
 fn braked_reason(status: u32) -> Reason {

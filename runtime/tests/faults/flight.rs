@@ -20,7 +20,8 @@ pub struct Flight {
     pub stretch: u32,
     /// What the driver makes of the velocities that it tells, as a share of them.
     pub told: f64,
-    clock: f64,
+    /// The plant's clock [s].
+    pub clock: f64,
     plan: FaultPlan,
     brake: Brake,
     robot: RobotMessage,

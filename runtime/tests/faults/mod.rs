@@ -163,6 +163,25 @@ fn fault_25_lost_states_are_bridged_or_braked_and_others_left_out() {
     other.assert_within_limits(ROUNDING);
 }
 
+/// A driver that was not scheduled for a while loses no number; its clock tells of it.
+#[test]
+fn fault_25_periods_that_the_plant_left_out_are_lost_ones() {
+    for (periods, left_out) in [(3, 0), (4, 4), (300, 300)] {
+        let mut flight = Flight::new(&stochastic(1), settings(), FaultPlan::default());
+        flight.fly(400);
+        flight.clock += f64::from(periods) * crate::toy::DT;
+        if periods == 300 {
+            flight.panda.v.iter_mut().for_each(|v| *v = 0.0); // the driver has braked, and no sample of it is implausible
+        }
+        flight.fly(200);
+        assert_eq!(flight.counters().implausible_states, 0);
+        let braked = (left_out > 0).then_some((401, Reason::LostStates));
+        assert_eq!((flight.first(Mode::Braking), flight.counters().lost_states), (braked, left_out));
+        assert_eq!((flight.at(402).0 == Mode::Active, flight.at(600).0), (left_out == 0, Mode::Active));
+        flight.assert_within_limits(ROUNDING);
+    }
+}
+
 #[test]
 fn fault_26_a_jump_is_rejected_and_counted() {
     let flight = Flight::of(&[(400, 2, FaultKind::Jump { by: 0.2 })], 600);

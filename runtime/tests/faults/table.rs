@@ -206,10 +206,13 @@ pub const ROWS: &[Row] = &[
     ),
     (
         25,
-        "dropped, doubled, reordered samples",
+        "dropped, doubled, reordered, left-out samples",
         "up to 3 lost are bridged by the plant, more brake; old ones are left out",
         &["lost-states"],
-        &[(HERE, "fault_25_lost_states_are_bridged_or_braked_and_others_left_out")],
+        &[
+            (HERE, "fault_25_lost_states_are_bridged_or_braked_and_others_left_out"),
+            (HERE, "fault_25_periods_that_the_plant_left_out_are_lost_ones"),
+        ],
     ),
     (
         26,
