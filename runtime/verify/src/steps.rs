@@ -40,8 +40,10 @@ pub(crate) fn lead(
         let action = &promise.actions[k];
         let (friction, dof) = (action.friction, action.dof);
         if friction > 0.0 {
-            let pushed = self::walk(promise, passage, found, Some((dof, friction)));
-            (0..nv).for_each(|i| by_friction[i] += 1.5 * (pushed.v[i] - walk.v[i]).abs());
+            // Either way: what it does to another joint by way of Coriolis forces is not the same for both.
+            let pushed = [friction, -friction].map(|f| self::walk(promise, passage, found, Some((dof, f))).v);
+            let most = |i: usize| pushed.iter().fold(0.0f64, |most, v| most.max((v[i] - walk.v[i]).abs()));
+            (0..nv).for_each(|i| by_friction[i] += 1.5 * most(i));
         }
     }
     for (action, mean) in promise.actions.iter().zip(means) {
