@@ -1,25 +1,25 @@
 //! `nearl doctor`: checks whether a snapshot, the machine and the plant are ready to run, and prints one line for each check.
 
+mod doubts;
+
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use nearl_constraints::description::{Command, Motor, mimics};
-use nearl_constraints::{Drive, Dynamics, Guard, MADE_UP_FOR, REGISTRY, certify_braking};
+use nearl_constraints::{Guard, certify_braking};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
 use crate::cli::{Failure, say};
 use crate::codes::CheckCode;
-use crate::controller::{Controller, Margin, Parts, held_dofs};
+use crate::controller::{Controller, Margin, Parts};
 use crate::gains;
 use crate::holding;
 use crate::link::{
     RobotMessage, RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, home_of_user, remains,
 };
 use crate::rt::{PRIORITY, Pilot, Stop, ThreadSettings, bench_wake, prepare};
-use crate::snapshot::{Manifest, ModelFormat, PolicyKind, Snapshot, SnapshotError, in_run};
-use crate::task::IdmKind;
+use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError, in_run};
 
 /// Check that a snapshot, this machine and a plant are ready.
 #[derive(Args, Debug)]
@@ -114,9 +114,9 @@ pub fn told_of_simulated(m: &Manifest) -> Result<Vec<String>, SnapshotError> {
     let parts = Parts::new(m)?;
     if m.bounds_drives() {
         let drives = Parts::drives(m, &parts.model, parts.layout.controllable())?;
-        return Ok(cut_targets(m, &parts, &drives).into_iter().collect());
+        return Ok(doubts::cut_targets(m, &parts, &drives).into_iter().collect());
     }
-    let mut notes = doubts(m, &parts);
+    let mut notes = doubts::of(m, &parts);
     let holds = holding(m, &parts);
     if holds.finding != Finding::Ok {
         notes.push(holds.text);
@@ -227,7 +227,7 @@ fn reached(m: &Manifest, controller: &Controller) -> Option<Check> {
 
 /// What the robot file has that projection and inverse dynamics do not reckon with, and limits that are hardly meant.
 fn notes(m: &Manifest, parts: &Parts) -> Check {
-    match &doubts(m, parts)[..] {
+    match &doubts::of(m, parts)[..] {
         [] => ok(CheckCode::Model, "the model holds what the robot file describes".into()),
         notes => warn(CheckCode::Model, notes.join("; ")),
     }
@@ -238,364 +238,7 @@ fn notes(m: &Manifest, parts: &Parts) -> Check {
 /// # Errors
 /// As [`Parts::new`].
 pub fn told(m: &Manifest) -> Result<Vec<String>, SnapshotError> {
-    Ok(doubts(m, &Parts::new(m)?))
-}
-
-fn doubts(m: &Manifest, parts: &Parts) -> Vec<String> {
-    let Parts { model, projector, layout, .. } = parts;
-    let mut notes = [model.notes(), projector.notes()].concat();
-    let settled = settled_mimics(m, parts);
-    notes.retain(|note| !settled.iter().any(|begins| note.starts_with(begins)));
-    // Joints that follow positions or velocities by themselves make up for their own friction.
-    let by_force = |drive: &Drive| matches!(drive, Drive::Effort | Drive::Pd { .. });
-    let drives = Parts::drives(m, model, layout.controllable());
-    let Ok(drives) = drives else { return notes };
-    if !moves_by_model(m) {
-        notes.retain(|note| !note.starts_with(MADE_UP_FOR) && !note.starts_with("no brake "));
-    }
-    if !layout.controllable().iter().any(|&i| by_force(&drives[i])) {
-        notes.retain(|note| !note.starts_with(MADE_UP_FOR));
-    }
-    if moves_by_model(m) || m.bounds_drives() {
-        notes.extend(cut_targets(m, parts, &drives));
-    }
-    if moves_by_model(m) {
-        notes.extend(held_targets(m, parts, &drives));
-        notes.extend(swung_targets(m, parts, &drives));
-        notes.extend(shaken_joints(m, parts, &drives));
-    }
-    notes.extend(other_gains(parts, &drives));
-    notes.extend(undriven(m, parts));
-    notes.extend(beyond_motors(m, parts, &drives));
-    notes.extend(unguarded(m));
-    notes.extend(far_poses(m, model));
-    notes.extend(other_steps(m));
-    notes
-}
-
-/// Whether limits of the motion are kept by the robot's model: it makes up for friction, and counts on a brake.
-fn moves_by_model(m: &Manifest) -> bool {
-    m.proposes() && !m.bounds_drives()
-}
-
-/// How notes begin of joints that mimic others and that a row holds together, or that nothing commands.
-fn settled_mimics(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Vec<String> {
-    let loose =
-        |name: &str| model.joint(name).is_ok_and(|joint| !layout.controllable().contains(&joint.idx_v));
-    let mut begins = Vec::new();
-    for row in &m.task.constraints.rows {
-        let terms: Vec<_> =
-            row.terms.iter().filter_map(|(name, c)| Some((name.strip_prefix("q.")?, *c))).collect();
-        let ([(a, of_a), (b, of_b)], Some(equals), None) = (&terms[..], row.equals, row.soft) else {
-            continue;
-        };
-        // q_a + (of_b / of_a) q_b = equals / of_a, whichever of the two follows; without the sign of a zero.
-        begins.push(mimics(a, b, 0.0 - of_b / of_a, equals / of_a + 0.0));
-        begins.push(mimics(b, a, 0.0 - of_a / of_b, equals / of_b + 0.0));
-    }
-    let notes = model.notes().iter().filter(|note| {
-        let mut names = note.split('\'').skip(1).step_by(2);
-        note.starts_with("joint '") && note.contains("' mimics '") && names.by_ref().take(2).all(loose)
-    });
-    begins.extend(notes.cloned());
-    begins
-}
-
-/// Limits that nothing is held to: those of states, of a policy that gives actions; and a policy made elsewhere that has none.
-fn unguarded(m: &Manifest) -> Option<String> {
-    let of = &m.task.constraints;
-    let is_off = m.policy == PolicyKind::Direct && of.guard.is_off();
-    let has_limits = REGISTRY.iter().any(|kind| !(kind.build)(of).is_empty());
-    if is_off && !has_limits && m.task.policy.is_some() && !m.limits_actions() {
-        return Some(
-            "no limit holds: [constraints] names none, and guard is off, so this policy's actions are sent as they are; add guard = true and the limits, \
-             torque = { scale = 1.0 } among them, to [constraints] of the recipe"
-                .into(),
-        );
-    }
-    (is_off && has_limits).then(|| {
-        "the limits on states under [constraints] hold for nothing: this policy gives actions, and guard is off; add guard = true to [constraints] to hold \
-         them"
-            .into()
-    })
-}
-
-/// Joints whose pose, which positions and outputs of a policy are relative to, is outside of their range.
-fn far_poses(m: &Manifest, model: &nearl_constraints::Model) -> Vec<String> {
-    let Some(policy) = &m.task.policy else { return Vec::new() };
-    let note = |(name, &pose): (&String, &f64)| {
-        let at = model.joint(name).ok().filter(|joint| joint.nq == 1)?.idx_q;
-        let (low, high) = (model.lower_position_limit()[at], model.upper_position_limit()[at]);
-        (pose < low || pose > high).then(|| {
-            format!(
-                "[policy] pose of '{name}' is {pose} rad or m, outside of its range of {low} to {high}; is it in degrees, or of another joint? What the policy \
-                 sees and asks for is relative to it"
-            )
-        })
-    };
-    policy.joints.iter().zip(&policy.pose).filter_map(note).collect()
-}
-
-/// MuJoCo's timestep where a file states none [s].
-const TIMESTEP: f64 = 0.002;
-
-/// Physics steps that limits are reckoned for, where the robot file's are others. What a file includes is not looked at.
-fn other_steps(m: &Manifest) -> Option<String> {
-    let file = m.simulation.as_ref().filter(|simulation| simulation.format == ModelFormat::Mjcf)?;
-    let document = roxmltree::Document::parse(&file.text).ok()?;
-    let root = document.root_element();
-    if root.descendants().any(|element| element.has_tag_name("include")) {
-        return None;
-    }
-    let stated = |name| {
-        let options = root.children().filter(|element| element.has_tag_name("option"));
-        options.filter_map(|option| option.attribute(name)).next_back()
-    };
-    let sim_dt = m.task.time.sim_dt;
-    if let Some(integrator @ ("RK4" | "implicit")) = stated("integrator")
-        && sim_dt > 0.0
-    {
-        return Some(format!(
-            "[time] sim_dt is {sim_dt} s, and the robot file's integrator is {integrator}: limits are reckoned for steps of Euler's, and a simulation that \
-             makes others leaves them; write integrator=\"implicitfast\" or \"Euler\" there, or sim_dt = 0 for a robot that makes no steps"
-        ));
-    }
-    let timestep: f64 = stated("timestep").map_or(Some(TIMESTEP), |text| text.trim().parse().ok())?;
-    (sim_dt > 0.0 && (sim_dt - timestep).abs() > 1e-12).then(|| {
-        format!(
-            "[time] sim_dt is {sim_dt} s, and the robot file's timestep is {timestep} s: limits are reckoned for steps of {sim_dt} s, and a simulation that \
-             makes others leaves them; write sim_dt = {timestep}, or 0 for a robot that makes no steps"
-        )
-    })
-}
-
-/// `T sqrt(K / I)` of a drive that is held on its target for `T` above which it has moved its joint a good part of the way there: where the physics steps
-/// are foreseen one by one, and where they are not known.
-const FAR: [f64; 2] = [1.0, 0.2];
-
-/// Drives that are held on a target for so long that they push otherwise at the end of a period than at its start.
-fn held_targets(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
-    let (steps, dt, nv) = (m.task.sub_steps(), m.task.time.dt, model.nv());
-    let mut mass = vec![0.0; nv * nv];
-    Dynamics::new(model).mass(&model.neutral(), &mut mass);
-    let is_long = |&i: &usize| match drives[i] {
-        Drive::Pd { stiffness, .. } => {
-            let inertia = mass[i * nv + i];
-            let far = dt * (stiffness / inertia).sqrt();
-            (steps != 1 && far > FAR[usize::from(steps == 0)]).then(|| {
-                format!("'{}' (stiffness {stiffness} on {} kg m² or kg)", model.dof_name(i), short(inertia))
-            })
-        }
-        _ => None,
-    };
-    let long: Vec<String> = layout.controllable().iter().filter_map(is_long).collect();
-    (!long.is_empty()).then(|| {
-        let why = match steps {
-            0 => "the motion on the way is foreseen to second order alone without time.sim_dt",
-            _ => "the robot is led far on the way",
-        };
-        format!(
-            "a period of {dt} s takes the drives of {} a good part of the way to a target, and {why}: limits on position, velocity and acceleration may \
-             be left; set time.dt to the length of a physics step and time.policy_every to as many as there were, or give position a margin",
-            long.join(", ")
-        )
-    })
-}
-
-/// Share of a drive's force by which it may change within a period at the speed limit of its joint, before what is reckoned of it is off by too much.
-const SWINGS: f64 = 0.5;
-
-/// Drives that push so much less at the end of a period than at its start, where their joints pass the targets that are held, that little is left to brake.
-fn swung_targets(
-    m: &Manifest,
-    Parts { model, layout, projector }: &Parts,
-    drives: &[Drive],
-) -> Option<String> {
-    let (period, limits) = (m.task.period(), projector.limits());
-    let swings = |&i: &usize| match drives[i] {
-        Drive::Pd { stiffness, .. } => {
-            let change = stiffness * limits.velocity[i] * (period.dt - period.tau);
-            (change.is_finite() && change > SWINGS * limits.effort[i]).then(|| {
-                format!(
-                    "'{}' ({} of its {} N m or N)",
-                    model.dof_name(i),
-                    short(change),
-                    short(limits.effort[i])
-                )
-            })
-        }
-        _ => None,
-    };
-    let joints: Vec<String> = layout.controllable().iter().filter_map(swings).collect();
-    (period.sub_steps > 1 && !joints.is_empty()).then(|| {
-        format!(
-            "at their speed limits the drives of {} change their force by so much within a period of {} s while their target is held, and may not be able to \
-             brake then: limits on position, velocity and acceleration may be left; set time.dt to the length of a physics step and time.policy_every to as \
-             many as there were, or lower the speed limits",
-            joints.join(", "),
-            period.dt
-        )
-    })
-}
-
-/// An explicit damper of a drive grows without bound where it takes away twice a velocity in a physics step.
-const SHAKES: f64 = 2.0;
-
-/// Drives whose damping the physics steps of the simulation cannot make.
-fn shaken_joints(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
-    let (period, nv) = (m.task.period(), model.nv());
-    if period.sub_steps < 2 {
-        return None; // exact, or without steps
-    }
-    let mut mass = vec![0.0; nv * nv];
-    Dynamics::new(model).mass(&model.neutral(), &mut mass);
-    let shakes = |&i: &usize| match drives[i] {
-        Drive::Pd { damping, .. } => {
-            let inertia = mass[i * nv + i] + period.tau * (model.damping()[i] + model.drive_damping()[i]);
-            (damping * period.tau > SHAKES * inertia).then(|| {
-                format!("'{}' (damping {damping} on {} kg m² or kg)", model.dof_name(i), short(inertia))
-            })
-        }
-        _ => None,
-    };
-    let joints: Vec<String> = layout.controllable().iter().filter_map(shakes).collect();
-    (!joints.is_empty()).then(|| {
-        format!(
-            "a physics step of {} s takes away more than twice the velocity by the damping of the drives of {}, which shakes them apart: take \
-             integrator=\"implicitfast\" in the robot file, shorter steps or less damping",
-            period.tau,
-            joints.join(", ")
-        )
-    })
-}
-
-/// Three digits.
-fn short(x: f64) -> String {
-    if x.abs() < 1e-3 { format!("{x:.2e}") } else { format!("{x:.3}") }
-}
-
-/// Motors whose strength no limit knows, and that targets are given to.
-fn beyond_motors(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
-    let of = &m.task.constraints;
-    let is_kept = of.position.is_some() || of.velocity.is_some() || of.acceleration.is_some();
-    let by_model = m.policy != PolicyKind::Direct && m.task.idm.kind == IdmKind::Pinocchio;
-    let weak = layout
-        .controllable()
-        .iter()
-        .filter(|&&i| drives[i] == Drive::Effort && model.effort_limit()[i].is_finite());
-    let weak: Vec<String> = weak.map(|&i| format!("'{}'", model.dof_name(i))).collect();
-    (is_kept && by_model && of.torque.is_none() && !weak.is_empty()).then(|| {
-        format!(
-            "without a torque limit a target may ask for more than the motors of {} give, and the joint then leaves its limits though the target keeps \
-             them; add torque = {{ scale = 1.0 }} to [constraints]",
-            weak.join(", ")
-        )
-    })
-}
-
-/// Gains that `[command]` states other than the robot file's own drive has them; a policy's metadata has three decimals.
-fn other_gains(Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
-    let same = |a: f64, b: f64| (a - b).abs() <= 1e-3 * a.abs().max(1.0);
-    let other = |&i: &usize| {
-        let (Drive::Pd { stiffness, damping }, joint) = (drives[i], model.dof_name(i)) else { return None };
-        let is_drive = |motor: &&Motor| {
-            motor.joint == joint
-                && motor.not_modelled.is_none()
-                && motor.gear == 1.0
-                && motor.gain > 0.0
-                && motor.gain == -motor.bias[1]
-        };
-        let motor = model.motors().iter().find(is_drive)?;
-        let (of_file, damped) = (motor.gain, 0.0 - motor.bias[2]);
-        let differs = !(same(stiffness, of_file) && same(damping, damped));
-        differs.then(|| {
-            format!(
-                "'{joint}' has stiffness {stiffness} and damping {damping} by [command], {of_file} and {damped} by the robot file"
-            )
-        })
-    };
-    let joints: Vec<String> = layout.controllable().iter().filter_map(other).collect();
-    (!joints.is_empty()).then(|| {
-        format!(
-            "[command] contradicts the drives of the robot file, and targets and limits count on [command]: {} [N m/rad or N/m, N m s/rad or N s/m]; write the \
-             gains that the robot has into both",
-            joints.join("; ")
-        )
-    })
-}
-
-/// Joints that nothing commands, quoted, but for those with a dof in `held`.
-fn left_alone(Parts { model, layout, .. }: &Parts, held: &[usize]) -> Vec<String> {
-    let commanded = layout.controllable();
-    let is_left = |i: usize| !commanded.contains(&i) && !held.contains(&i);
-    let left = model.joints().iter().filter(|j| (j.idx_v..j.idx_v + j.nv).any(is_left));
-    left.map(|j| format!("'{}'", j.name)).collect()
-}
-
-/// What a guard by the robot's model does not promise of joints that nothing drives.
-fn undriven(m: &Manifest, parts: &Parts) -> Option<String> {
-    let loose = left_alone(parts, &held_dofs(&parts.model, parts.layout.controllable()));
-    (m.guards() && !loose.is_empty()).then(|| {
-        format!(
-            "guard = true reckons with {} as with joints that nothing drives and nothing touches: on the ground or in contact the limits of the others hold as \
-             far as that is so; where they swing they may push the others harder than their motors can hold, which then leave their limits on position, \
-             velocity and acceleration; take guard = \"drive\" for a robot on legs, or \"simulator\" in training",
-            loose.join(", ")
-        )
-    })
-}
-
-/// Targets that a drive is not sent because its range ends before.
-fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> {
-    let Parts { model, layout, projector } = parts;
-    let torque = m.task.constraints.torque.as_ref();
-    if m.task.sub_steps() == 1
-        && projector.stores_a_brake()
-        && torque.is_some_and(|torque| torque.soft.is_none())
-    {
-        return None; // kept inside, and a brake that stays inside is there
-    }
-    let (dofs, limits) = (layout.controllable(), projector.limits());
-    let motors = Parts::motors(model, dofs, drives).ok()?;
-    let (promised, asks) = match m.bounds_drives() {
-        true => ("limits on torque are", "a torque limit"),
-        false => ("limits on acceleration, velocity and position are", "braking"),
-    };
-    let cut = |(k, &i): (usize, &usize)| {
-        // At rest at least, where no speed is known.
-        let speed = Some(limits.velocity[i]).filter(|v| v.is_finite() || !m.bounds_drives()).unwrap_or(0.0);
-        let reach = drives[i].reach(&m.task.period(), limits.effort[i], speed);
-        let ends = [*m.action_lower.get(motors.place(k))?, *m.action_upper.get(motors.place(k))?];
-        let [low, high] = ends.map(|end| motors.command(k, end));
-        // Without a position limit the robot file's own ends.
-        let iq = model.joint_of_dof(i).idx_q;
-        let file = [model.lower_position_limit()[iq], model.upper_position_limit()[iq]];
-        let [lower, upper] = if m.bounds_drives() { file } else { [limits.q_lower[i], limits.q_upper[i]] };
-        let [needed_low, needed_high] = [lower - reach, upper + reach];
-        let short =
-            reach.is_finite() && reach > 0.0 && (low > needed_low + 1e-9 || high < needed_high - 1e-9);
-        let short = short && needed_low.is_finite() && needed_high.is_finite();
-        short.then(|| {
-            format!(
-                "'{}' from {low:.3} to {high:.3} where {asks} may ask for {needed_low:.3} to {needed_high:.3}",
-                model.dof_name(i)
-            )
-        })
-    };
-    let joints: Vec<String> = dofs.iter().enumerate().filter_map(cut).collect();
-    let states_range = |motor: &Motor| {
-        matches!(motor.command, Command::Position | Command::Pd) && motor.control_range.is_some()
-    };
-    let next = match model.motors().iter().any(states_range) {
-        true => "give the actuators that ctrlrange, less speed or less damping",
-        false => "make the snapshot anew with this robot file and these limits",
-    };
-    (!joints.is_empty()).then(|| {
-        format!(
-            "a drive's targets are cut at its range, and {promised} not promised where they are: {} [rad or m]; {next}",
-            joints.join(", ")
-        )
-    })
+    Ok(doubts::of(m, &Parts::new(m)?))
 }
 
 /// Does anything keep the limits at all?
@@ -710,7 +353,7 @@ fn gains(m: &Manifest, parts: &Parts) -> Check {
 
 /// Can the motors give the decelerations that the position limits count on?
 fn braking(m: &Manifest, parts: Parts) -> Check {
-    let left_alone = left_alone(&parts, &[]);
+    let left_alone = doubts::left_alone(&parts, &[]);
     let Parts { model, layout, projector } = parts;
     let (limits, controllable) = (projector.limits(), layout.controllable());
     if controllable.iter().all(|&i| limits.effort[i].is_infinite()) {

@@ -22,6 +22,7 @@ mod stop;
 mod thread;
 #[cfg(feature = "cli")]
 pub mod tunnel;
+pub mod unreachable;
 
 pub use nearl_controller::constraints;
 pub use nearl_controller::{

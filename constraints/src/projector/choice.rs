@@ -19,7 +19,7 @@ const MARGIN: f64 = 0.03;
 /// Share of an inertia that joints which nobody commands may take off before a brake that reckons with them as standing still is worth nothing.
 const LIGHT: f64 = 0.05;
 
-/// A joint that needs longer than this to stop has an acceleration limit nobody meant [s].
+/// A joint that needs longer than this to stop has an acceleration or jerk limit nobody meant [s].
 const LONGEST_STOP: f64 = 30.0;
 
 /// A joint that is faster than this is stated in degrees [rad/s or m/s].
@@ -192,6 +192,13 @@ pub(super) fn doubts(model: &Model, limits: &LimitSet, dofs: &Dofs, settings: &S
             let time = v / a;
             notes.push(format!(
                 "the acceleration limit of '{name}' is {a} rad/s² or m/s²: from {v} rad/s or m/s it needs {time:.0} s to stop"
+            ));
+        }
+        let j = limits.jerk[i];
+        let time = if v * j < a * a { 2.0 * (v / j).sqrt() } else { v / a + a / j };
+        if j.is_finite() && v.is_finite() && time > LONGEST_STOP && v / a <= LONGEST_STOP {
+            notes.push(format!(
+                "the jerk limit of '{name}' is {j} rad/s³ or m/s³: from {v} rad/s or m/s it needs {time:.0} s to stop"
             ));
         }
         let range = limits.q_upper[i] - limits.q_lower[i];

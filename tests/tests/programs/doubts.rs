@@ -79,6 +79,15 @@ const SET_UPS: &[SetUp] = &[
         check: Some("model"),
     },
     SetUp {
+        what: "a hard jerk limit of 0.01",
+        robot: SAME,
+        task: (ACCELERATION, "acceleration = { limit = 30.0 }\njerk = { limit = 0.01, hard = true }"),
+        limits: None,
+        says: &["jerk limit of 'shoulder' is 0.01 rad/s³", "40 s to stop"],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
         what: "a range of 150 in the robot file",
         robot: ("range=\"-2 2\"", "range=\"-75 75\""),
         task: SAME,
@@ -154,6 +163,30 @@ const SET_UPS: &[SetUp] = &[
         says: &["'shoulder' needs 38.5 N m or N of its 1.6", "stall of torque_speed"],
         is_refused: false,
         check: Some("holding"),
+    },
+    SetUp {
+        what: "a speed limit of a point, and five physics steps in a control period",
+        robot: ("timestep=\"0.01\"", "timestep=\"0.002\""),
+        task: (
+            "sim_dt = 0.01\n\n[state]\n\n[reward]\nstill = \"-v.elbow^2\"\n\n[constraints]",
+            "sim_dt = 0.002\n\n[state]\n\n[reward]\nstill = \"-v.elbow^2\"\n\n[constraints]\nframe_speed = [{ frame = \"elbow\", limit = 0.5 }]",
+        ),
+        limits: None,
+        says: &["5 physics steps", "limits on frame_speed hold only approximately", "policy_every = 5"],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
+        what: "a box that the arm does not reach",
+        robot: SAME,
+        task: (
+            "torque = {}",
+            "torque = {}\nframe = [{ frame = \"elbow\", box = { lower = [-0.1, -0.1, 2.0], upper = [0.1, 0.1, 2.2] }, braking = 5.0 }]",
+        ),
+        limits: None,
+        says: &["the limit of frame 'elbow' holds in no pose", "0.841 m outside"],
+        is_refused: false,
+        check: Some("model"),
     },
 ];
 

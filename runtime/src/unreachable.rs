@@ -1,0 +1,109 @@
+//! Finds planes and boxes that a point of the robot never reaches the right side of. With one of them every tick only comes back, and never arrives.
+
+use nearl_constraints::limit::FrameSettings;
+use nearl_constraints::{FrameId, Kinematics, LimitSet, Model};
+
+use crate::holding::{ranges, spread};
+
+/// Seeded poses that are looked at, how many of the best are improved joint by joint, in so many rounds over a grid of a joint's range.
+const POSES: usize = 1024;
+const STARTS: usize = 8;
+const ROUNDS: usize = 12;
+const GRID: usize = 60;
+/// What a search over a grid may leave \[m\].
+const NEAR: f64 = 1e-3;
+
+/// One sentence for each hard limit of a frame that holds in none of the poses found within the position limits. A floating base is where the world
+/// puts it, so a robot with one is not looked at.
+pub fn notes(model: &Model, limits: &LimitSet, frames: &[FrameSettings]) -> Vec<String> {
+    let hard = frames.iter().filter(|of| of.soft.is_none());
+    if model.joints().iter().any(|joint| joint.nv > 1) {
+        return Vec::new();
+    }
+    let joints: Vec<usize> = (0..model.nv()).collect();
+    let ranges = ranges(model, limits, &joints);
+    let note = |of: &FrameSettings| {
+        let frame = model.frame(&of.frame).ok()?;
+        let least = Search { kinematics: Kinematics::new(model), rest: vec![0.0; model.nv()], of, frame }
+            .least(&ranges);
+        (least > NEAR).then(|| {
+            let name = of.name.as_ref().unwrap_or(&of.frame);
+            format!(
+                "the limit of frame '{name}' holds in no pose found within the position limits, the nearest is {least:.3} m outside of it: every tick would \
+                 be `recovering`; correct it, or leave it out"
+            )
+        })
+    };
+    hard.filter_map(note).collect()
+}
+
+struct Search<'a> {
+    kinematics: Kinematics,
+    rest: Vec<f64>,
+    of: &'a FrameSettings,
+    frame: FrameId,
+}
+
+impl Search<'_> {
+    /// How far outside the point is at best \[m\]; 0 inside.
+    fn least(&mut self, ranges: &[(usize, f64, f64)]) -> f64 {
+        let mut q = self.kinematics.model().neutral();
+        let mut best: Vec<(f64, Vec<f64>)> = Vec::with_capacity(POSES);
+        for start in 0..POSES {
+            spread(start, ranges, &mut q);
+            let outside = self.outside(&q);
+            if outside <= 0.0 {
+                return 0.0;
+            }
+            best.push((outside, q.clone()));
+        }
+        best.sort_by(|a, b| a.0.total_cmp(&b.0));
+        best.truncate(STARTS);
+        best.into_iter().fold(f64::INFINITY, |least, (outside, q)| least.min(self.nearer(outside, q, ranges)))
+    }
+
+    /// The same from `q`, joint by joint until nothing falls, on ever finer grids.
+    fn nearer(&mut self, mut outside: f64, mut q: Vec<f64>, ranges: &[(usize, f64, f64)]) -> f64 {
+        let mut width = 1.0;
+        for _ in 0..ROUNDS {
+            let before = outside;
+            for &(idx_q, low, high) in ranges {
+                let (mut at, half) = (q[idx_q], 0.5 * width * (high - low));
+                let middle = at;
+                for step in 0..=GRID {
+                    let to = middle - half + step as f64 / GRID as f64 * 2.0 * half;
+                    q[idx_q] = to.max(low).min(high);
+                    let now = self.outside(&q);
+                    if now < outside {
+                        (outside, at) = (now, q[idx_q]);
+                    }
+                }
+                q[idx_q] = at;
+            }
+            if outside <= 0.0 {
+                return 0.0;
+            }
+            if outside > 0.99 * before {
+                width *= 0.2;
+            }
+        }
+        outside
+    }
+
+    fn outside(&mut self, q: &[f64]) -> f64 {
+        self.kinematics.update(q, &self.rest, &self.rest);
+        let p = self.kinematics.point(self.frame, self.of.point).position;
+        let mut most = f64::NEG_INFINITY;
+        if let Some(plane) = &self.of.half_space {
+            let length = plane.normal.iter().map(|n| n * n).sum::<f64>().sqrt();
+            let along: f64 = (0..3).map(|k| plane.normal[k] * (p[k] - plane.through[k])).sum();
+            most = along / length;
+        }
+        if let Some(inside) = &self.of.inside {
+            for (k, p) in p.iter().enumerate() {
+                most = most.max(inside.lower[k] - p).max(p - inside.upper[k]);
+            }
+        }
+        most + self.of.margin
+    }
+}
