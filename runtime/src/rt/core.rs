@@ -415,7 +415,8 @@ impl<T: LoopController> Core<T> {
         self.record.state = *state;
         if left_out > 0 {
             self.record.state.bits |= STATE_BRAKED; // nobody knows what held it
-            self.record.counters.lost_states += left_out;
+            let counted = &mut self.record.counters.lost_states;
+            *counted = counted.saturating_add(left_out); // a clock may say anything
         }
         self.event_of_state(is_frozen, gap.max(left_out), passed)
     }
@@ -548,7 +549,7 @@ impl<T: LoopController> Core<T> {
 fn left_out(passed: f64, lost: u64, settings: &CoreSettings) -> u64 {
     let periods = passed / (settings.period as f64 * 1e-9);
     let most = (lost + 1 + u64::from(settings.modes.hold_states)) as f64 + 0.5;
-    if periods > most { periods.round() as u64 - lost - 1 } else { 0 }
+    if periods > most { (periods.round() as u64).saturating_sub(lost + 1) } else { 0 }
 }
 
 fn braked_reason(status: u32) -> Reason {

@@ -180,6 +180,15 @@ fn fault_25_periods_that_the_plant_left_out_are_lost_ones() {
         assert_eq!((flight.at(402).0 == Mode::Active, flight.at(600).0), (left_out == 0, Mode::Active));
         flight.assert_within_limits(ROUNDING);
     }
+    let mut wild = Flight::new(&stochastic(1), settings(), FaultPlan::default());
+    for clock in [1e300, f64::MAX, f64::INFINITY, f64::NAN, -1e300] {
+        wild.fly(50);
+        wild.clock = clock;
+        wild.fly(3);
+        wild.clock = 1.0;
+        wild.fly(50);
+    }
+    wild.assert_within_limits(ROUNDING);
 }
 
 #[test]
