@@ -78,6 +78,8 @@ fn a_policy_that_proposes_comes_back_into_its_task() {
     let network = onnx("policy.onnx", &export::onnx(&snapshot).expect("exports"), None, None).expect("reads");
     let mut manifest = nearl_trainer::tasks::load("Panda-reach", &[]).expect("bundled");
     nearl_trainer::train::complete(&mut manifest).expect("bundled");
+    let other = for_task(&network, manifest.clone(), Gives::State).expect_err("a change").to_string();
+    assert!(other.contains("is the 'change' that 'nearl export' wrote"), "{other}");
     let back = for_task(&network, manifest, Gives::Change).expect("fits");
     let mut both = [&snapshot, &back].map(|s| Controller::new(s).expect("controller"));
     let mut rng = nearl_trainer::rollout::stream(3, 0);

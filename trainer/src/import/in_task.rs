@@ -1,7 +1,7 @@
 //! From an imported network and a task to a snapshot: the task says what is observed, and what may be proposed or sent.
 
 use super::assemble::{networks, recipe};
-use super::metadata::is_exported_change;
+use super::metadata::{exported, is_exported_change};
 use super::{ImportError, ImportedNetwork};
 use crate::train::limit_scale;
 use nearl_runtime::controller::Parts;
@@ -49,6 +49,14 @@ pub fn for_task(
 ) -> Result<Snapshot, ImportError> {
     let task = manifest.task.name.clone();
     let refuse = |reason: String| recipe(&task, &reason);
+    if let (Some(said @ ("change" | "state")), Some((name, _))) =
+        (exported(network), Gives::ALL.iter().find(|(_, of)| *of == gives))
+        && said != *name
+    {
+        return Err(refuse(format!(
+            "the file's output is the '{said}' that 'nearl export' wrote, and it is imported with actions \"{name}\"; give actions \"{said}\""
+        )));
+    }
     let (n_in, n_obs) = (network.n_in(), manifest.task.state.observation.len());
     let n_state = manifest.task.state.propose.as_ref().map_or(n_obs, Vec::len);
     let (n_out, wanted, what) = match gives {

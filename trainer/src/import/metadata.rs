@@ -33,7 +33,12 @@ pub(super) fn recipe(network: &ImportedNetwork) -> Result<Table, ImportError> {
 
 /// Whether 'nearl export' wrote it of a policy that proposes: then the outputs are in the units of the state.
 pub(super) fn is_exported_change(network: &ImportedNetwork) -> bool {
-    network.output_name == "change" && network.metadata.contains_key("task")
+    exported(network) == Some("change")
+}
+
+/// What the outputs are of a file that 'nearl export' wrote: "actions", "change" or "state".
+pub(super) fn exported(network: &ImportedNetwork) -> Option<&str> {
+    network.metadata.contains_key("task").then_some(network.output_name.as_str())
 }
 
 fn mjlab(network: &ImportedNetwork) -> Result<Table, ImportError> {
