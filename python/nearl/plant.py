@@ -118,7 +118,7 @@ class Loop:
         log: Flight log (MCAP).
         patience: How long to wait for the plant [s].
         ramp: Time over which the first motion is let in [s].
-        priority: SCHED_FIFO priority, with memory locked.
+        priority: SCHED_FIFO priority, 1 to 99, with memory locked; 0 or None keeps the normal scheduler.
         proposal_age: Another process proposes (:class:`nearl.Proposer`) in place of the policy; age at which a proposal is only held [s].
         proposal_hold: So long is it held before the loop brakes [s].
         rollback_window: Ticks after which a snapshot that was pushed is taken back if the robot stays three times further from its targets than

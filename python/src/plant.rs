@@ -157,6 +157,12 @@ impl LoopThread {
             hold: proposal_hold.map_or(ProposerSettings::default().hold, nanoseconds),
         });
         let name = RobotName::new(name).map_err(errors::value)?;
+        if let Some(priority) = priority.filter(|priority| !(0..=99).contains(priority)) {
+            return Err(errors::value(format!(
+                "priority is {priority}; give 1 to 99, or 0 for the normal scheduler"
+            )));
+        }
+        let priority = priority.filter(|priority| *priority > 0);
         let thread = ThreadSettings { priority, cpu: None, lock_memory: priority.is_some() };
         let unsaid = RunSettings::default();
         let (patience, ramp) = (patience.unwrap_or(unsaid.patience), ramp.unwrap_or(unsaid.ramp));

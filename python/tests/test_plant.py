@@ -230,7 +230,7 @@ def test_a_policy_that_the_robot_does_not_follow_is_taken_back_unless_it_is_mean
     second = tmp_path / "push.safetensors"
     push.controller(tmp_path / "carriage.urdf", tmp_path / "recipe.toml", "push").save(second)
     what = f"keep{window}"
-    with open_plant(what, lockstep=True) as plant, nearl.Loop(first, name(what), ramp=0.0, rollback_window=window) as loop:
+    with open_plant(what, lockstep=True) as plant, nearl.Loop(first, name(what), ramp=0.0, priority=0, rollback_window=window) as loop:
         sent, tremble, tick, in_use, end = False, 0.0, 0, 0, time.monotonic() + 60.0
         while in_use < 1500 and time.monotonic() < end:
             _, action = plant.exchange([0.0], [tremble], [0.0, tremble], patience=5.0, time=tick * 0.001)
@@ -243,6 +243,8 @@ def test_a_policy_that_the_robot_does_not_follow_is_taken_back_unless_it_is_mean
                 sent = True
                 threading.Thread(target=lambda: nearl.Link(name(what)).push(second)).start()
     assert in_use == 1500, f"the second policy was in use for {in_use} of {tick} ticks"
-    assert loop.report["rolled_back"] == rolled_back, loop.report
+    assert loop.report["rolled_back"] == rolled_back and not any("priority" in warning for warning in loop.report["warnings"]), loop.report
+    with pytest.raises(ValueError, match="priority is 100; give 1 to 99, or 0 for the normal scheduler"):
+        nearl.Loop(first, name(what), priority=100)
     with pytest.raises(ValueError, match="rollback_window is 2000000 ticks; give at most 1000000"):
         nearl.Loop(first, name(what), rollback_window=2_000_000)
