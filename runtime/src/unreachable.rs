@@ -1,5 +1,6 @@
 //! Finds planes and boxes that a point of the robot never reaches the right side of. With one of them every tick only comes back, and never arrives.
 
+use nearl_constraints::description::{JointDescription, JointKind};
 use nearl_constraints::limit::FrameSettings;
 use nearl_constraints::{FrameId, Kinematics, LimitSet, Model};
 
@@ -13,11 +14,18 @@ const GRID: usize = 60;
 /// What a search over a grid may leave \[m\].
 const NEAR: f64 = 1e-3;
 
-/// One sentence for each hard limit of a frame that holds in none of the poses found within the position limits. A floating base is where the world
-/// puts it, so a robot with one is not looked at.
+/// One sentence for each hard limit of a frame that holds in none of the poses found within the position limits. Only robots of hinges, and of slides
+/// that end somewhere, are looked at: others may come anywhere.
 pub fn notes(model: &Model, limits: &LimitSet, frames: &[FrameSettings]) -> Vec<String> {
     let hard = frames.iter().filter(|of| of.soft.is_none());
-    if model.joints().iter().any(|joint| joint.nv > 1) {
+    let is_bounded = |joint: &JointDescription| match joint.kind {
+        JointKind::Hinge => true,
+        JointKind::Slide => model
+            .joint(&joint.name)
+            .is_ok_and(|of| limits.q_lower[of.idx_v].is_finite() && limits.q_upper[of.idx_v].is_finite()),
+        _ => false,
+    };
+    if !model.description().joints().all(is_bounded) {
         return Vec::new();
     }
     let joints: Vec<usize> = (0..model.nv()).collect();

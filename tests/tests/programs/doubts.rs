@@ -332,6 +332,26 @@ fn a_bundled_task_advises_nothing_that_it_has_not() {
     assert!(line.contains("the bundled task draws it there") && !line.contains("draw it inside"), "{line}");
 }
 
+/// A rail without ends reaches everywhere, and a box far away is none that cannot be reached.
+#[test]
+fn a_box_on_an_endless_rail_is_no_doubt() {
+    const HINGE: &str = "type=\"hinge\" axis=\"0 1 0\" range=\"-2 2\"";
+    const FAR: Edit = (
+        "torque = {}",
+        "torque = {}\nframe = [{ frame = \"elbow\", box = { lower = [7.0, -1.0, 0.0], upper = [8.0, 1.0, 2.0] }, braking = 5.0 }]",
+    );
+    for (joint, is_out) in
+        [("type=\"slide\" axis=\"1 0 0\"", false), ("type=\"slide\" axis=\"1 0 0\" range=\"-2 2\"", true)]
+    {
+        let folder = tempfile::tempdir().expect("folder");
+        let file = write(folder.path(), (HINGE, joint), FAR);
+        let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).expect("task");
+        complete(&mut manifest).expect("manifest");
+        let notes = told(&manifest).expect("notes");
+        assert_eq!(notes.iter().any(|note| note.contains("holds in no pose")), is_out, "{notes:?}");
+    }
+}
+
 /// Of the limits of a policy on actions those on actions are kept, and the doctor does not deny it.
 #[test]
 fn limits_on_actions_are_what_a_direct_policy_keeps() {
