@@ -210,19 +210,22 @@ def _meaning(model: Any, actions: str | None, task: _Path | None) -> str:
 _SAME = frozenset({"DtypeObservation", "FlattenObservation"})
 
 
-def _env(model: Any) -> Any:
-    """The first single environment that the model learned in, with its wrappers; None where it brings none."""
+def _envs(model: Any) -> list[Any]:
+    """The single environments that the model learned in, with their wrappers; empty where it brings none."""
     env = getattr(model, "get_env", lambda: None)()
     while env is not None and not hasattr(env, "envs") and hasattr(env, "venv"):
         env = env.venv
-    return (getattr(env, "envs", None) or [None])[0]
+    return list(getattr(env, "envs", None) or [])
 
 
 def _wrappers(model: Any) -> list[Any]:
-    """The wrappers that rescale actions, outermost first. Those that change observations otherwise than VecNormalize, or actions otherwise, are refused: the
-    controller gives the observation of the task, and takes what the network puts out."""
-    if (one := _env(model)) is None:
-        return []
+    """The wrappers that rescale the actions of the first environment, outermost first. Those that change observations otherwise than VecNormalize, or
+    actions otherwise, are refused in each: the controller gives the observation of the task, and takes what the network puts out."""
+    each = [_rescaling(one) for one in _envs(model)]
+    return each[0] if each else []
+
+
+def _rescaling(one: Any) -> list[Any]:
     import gymnasium
 
     rescaling = []
@@ -254,7 +257,8 @@ def _rescaled(wrapper: Any, layers: list[_Layer], low: np.ndarray, high: np.ndar
 
 def _check_task(model: Any, controller: Controller) -> None:
     """Refuses a task that takes proposals for other entries, of other observations or for another time than that which the model learned in."""
-    env = getattr(_env(model), "unwrapped", None) or getattr(model, "get_env", lambda: None)()
+    envs = _envs(model)
+    env = envs[0].unwrapped if envs else getattr(model, "get_env", lambda: None)()
     native = getattr(env, "native", None)
     if native is None:
         return

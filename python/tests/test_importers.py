@@ -740,9 +740,10 @@ def test_what_learned_behind_rescaled_actions_proposes_what_its_environment_was_
         with pytest.raises(ValueError, match=said):
             nearl.import_sb3(model, task=tmp_path / "other.toml")
     twice = gymnasium.wrappers.TransformAction(env, lambda action: 2.0 * action, env.action_space)
-    model.get_env = lambda: SimpleNamespace(envs=[twice], **vars(learned_with("state")))
-    with pytest.raises(ValueError, match=r"behind the wrapper TransformAction, which changes actions, .* or with RescaleAction"):
-        nearl.import_sb3(model, task="Panda-reach")
+    for envs in ([twice], [rescaled, twice]):  # in any of them
+        model.get_env = lambda envs=envs: SimpleNamespace(envs=envs, **vars(learned_with("state")))
+        with pytest.raises(ValueError, match=r"behind the wrapper TransformAction, which changes actions, .* or with RescaleAction"):
+            nearl.import_sb3(model, task="Panda-reach")
 
 
 def test_a_network_of_next_states_is_imported_into_the_task_of_ones_own_robot(tmp_path) -> None:
