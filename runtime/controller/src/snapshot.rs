@@ -31,9 +31,9 @@ const MARGINS: &str = "reached.margins";
 pub enum PolicyKind {
     /// The policy's output is the mean action; nothing is proposed or projected (plain PPO).
     Direct,
-    /// The policy's output is the proposal; exploration is in the action (LEARNING, Eq. 1 of the paper).
+    /// The policy's output is the proposed change of the state; exploration is in the action (LEARNING, Eq. 1 of the paper).
     Deterministic,
-    /// The proposal is Gaussian; exploration is in the proposal.
+    /// The same, and Gaussian; exploration is in the proposal.
     Stochastic,
     /// The policy's output is the next state itself, in place of its change; an imported policy, without exploration.
     State,

@@ -60,8 +60,8 @@ fn of_several_joints(m: &Manifest, projector: &Projector) -> Option<String> {
     (!names.is_empty()).then(|| {
         format!(
             "a control period has {steps} physics steps, and over several of them the limits on {} hold only approximately: in front of a position limit a \
-             joint may accelerate less than its target does, and what joints do together is then off by up to 3 % at five steps and 18 % at ten; with one \
-             step they hold: dt = {sim_dt}, and policy_every = {every} for the same period of the policy",
+             joint may accelerate less than its target does, and what joints do together is another (the speed of a point was off by up to 3 % at five \
+             steps and 18 % at ten); with one step they hold: dt = {sim_dt}, and policy_every = {every} for the same period of the policy",
             names.join(", ")
         )
     })
@@ -98,16 +98,15 @@ fn settled_mimics(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Vec<Stri
 /// Limits that nothing is held to: those of states, of a policy that gives actions; and a policy made elsewhere that has none.
 fn unguarded(m: &Manifest) -> Option<String> {
     let of = &m.task.constraints;
-    if m.policy == PolicyKind::State || m.algo == "import" && m.policy == PolicyKind::Deterministic {
-        let has_none = REGISTRY.iter().all(|kind| (kind.build)(of).is_empty());
-        return has_none.then(|| {
+    let has_limits = REGISTRY.iter().any(|kind| !(kind.build)(of).is_empty());
+    if m.policy != PolicyKind::Direct {
+        return (m.algo == "import" && !has_limits).then(|| {
             "no limit holds: [constraints] names none, so whatever the policy proposes is what its motors are asked for; name limits, torque = { scale = 1.0 } \
              among them"
                 .into()
         });
     }
-    let is_off = m.policy == PolicyKind::Direct && of.guard.is_off();
-    let has_limits = REGISTRY.iter().any(|kind| !(kind.build)(of).is_empty());
+    let is_off = of.guard.is_off();
     if is_off && !has_limits && m.task.policy.is_some() && !m.limits_actions() {
         return Some(
             "no limit holds: [constraints] names none, and guard is off, so this policy's actions are sent as they are; add guard = true and the limits, \

@@ -426,15 +426,16 @@ impl<T: LoopController> Core<T> {
     /// than may be bridged: the controller then goes on from where the robot is.
     fn go_on(&mut self, state: &StateMessage, lost: u64) -> u64 {
         let (known, controller) = (&self.record.state, &mut self.controller.controller);
-        let left_out = match self.settings.sync {
-            Sync::Clock => 0,
-            Sync::Plant => left_out(state.time - known.time, lost, &self.settings),
-        };
-        if left_out > 0 || state.bits & STATE_BRAKED != 0 {
+        if state.bits & STATE_BRAKED != 0 {
             controller.lose();
         }
         if self.settings.sync == Sync::Clock {
             return 0; // it has answered in every slot, at its own pace
+        }
+        let passed = state.time - known.time;
+        let left_out = left_out(passed, lost, &self.settings);
+        if left_out > 0 {
+            controller.lose();
         }
         let alone = state.late.saturating_sub(known.late);
         if alone > lost {
@@ -443,7 +444,7 @@ impl<T: LoopController> Core<T> {
         if alone.max(lost) > 0 {
             controller.miss(alone.max(lost));
         }
-        self.pace.take(state.time - known.time, lost + 1, self.settings.period);
+        self.pace.take(passed, lost + 1, self.settings.period);
         left_out
     }
 

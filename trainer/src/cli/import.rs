@@ -23,7 +23,7 @@ pub(super) struct Import {
     #[arg(long, conflicts_with_all = ["robot", "recipe"])]
     task: Option<String>,
     /// What the policy gives in its task.
-    #[arg(long, requires = "task", default_value = "actuators", value_parser = ["actuators", "state", "change"])]
+    #[arg(long, requires = "task", default_value = "actuators", value_parser = Gives::ALL.map(Gives::name))]
     actions: String,
     /// Which of several outputs is the action.
     #[arg(long)]

@@ -21,18 +21,25 @@ pub enum Gives {
 }
 
 impl Gives {
-    /// By name, as environments have it.
-    pub const ALL: [(&'static str, Gives); 3] =
-        [("actuators", Gives::Actuators), ("state", Gives::State), ("change", Gives::Change)];
+    /// All of them.
+    pub const ALL: [Gives; 3] = [Gives::Actuators, Gives::State, Gives::Change];
+
+    /// Its name, as environments have it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Gives::Actuators => "actuators",
+            Gives::State => "state",
+            Gives::Change => "change",
+        }
+    }
 
     /// The one of that name.
     ///
     /// # Errors
     /// The names that there are.
     pub fn named(name: &str) -> Result<Gives, String> {
-        let found = Gives::ALL.into_iter().find(|(known, _)| *known == name);
-        found.map(|(_, gives)| gives).ok_or_else(|| {
-            let names = Gives::ALL.map(|(known, _)| format!("'{known}'")).join(", ");
+        Gives::ALL.into_iter().find(|gives| gives.name() == name).ok_or_else(|| {
+            let names = Gives::ALL.map(|gives| format!("'{}'", gives.name())).join(", ");
             format!("actions is '{name}', and what a policy gives is one of {names}")
         })
     }
@@ -49,9 +56,9 @@ pub fn for_task(
 ) -> Result<Snapshot, ImportError> {
     let task = manifest.task.name.clone();
     let refuse = |reason: String| recipe(&task, &reason);
-    if let (Some(said @ ("change" | "state")), Some((name, _))) =
-        (exported(network), Gives::ALL.iter().find(|(_, of)| *of == gives))
-        && said != *name
+    let name = gives.name();
+    if let Some(said @ ("change" | "state")) = exported(network)
+        && said != name
     {
         return Err(refuse(format!(
             "the file's output is the '{said}' that 'nearl export' wrote, and it is imported with actions \"{name}\"; give actions \"{said}\""
