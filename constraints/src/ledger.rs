@@ -11,7 +11,8 @@ pub enum Status {
     Clamped,
     /// Coupled rows were active; the nearest allowed state was solved for and checked.
     Solved,
-    /// No way to stop could be verified from the nearest allowed state: this one is nearer to the stored brake.
+    /// No way to stop could be verified from the nearest allowed state, and this one is nearer to the stored brake; or the robot would not come to that
+    /// state ([`Projector::project_within`](crate::Projector::project_within)).
     Slowed,
     /// A joint, a point of a frame, a pair of bodies or a row is outside its limits, see [`Ledger::outside`]: it may only come back
     /// or brake, the rest follows the proposal.
@@ -49,7 +50,9 @@ impl Status {
     pub fn reason(&self) -> Option<&'static str> {
         Some(match self {
             Status::Unchanged | Status::Clamped | Status::Solved => return None,
-            Status::Slowed => "no way to stop could be verified from the nearest allowed state",
+            Status::Slowed => {
+                "no way to stop could be verified from the nearest allowed state, or its physics steps do not lead there"
+            }
             Status::Recovering => {
                 "the measured state is outside what `outside` names, which may only come back or brake"
             }

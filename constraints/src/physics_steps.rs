@@ -88,6 +88,8 @@ const CHOICES: usize = 4;
 /// How often slopes are measured, and how often a change by them is halved.
 const MEASURED: usize = 6;
 const HALVINGS: usize = 10;
+/// A joint is held back where this is missing of its acceleration, as a share of it, or in [rad/s² or m/s²].
+const HELD_BACK: f64 = 1e-7;
 /// By which share of a command slopes are measured.
 const NEAR: f64 = 1e-5;
 
@@ -319,6 +321,28 @@ impl PhysicsSteps {
                 commands[self.free[r]] = self.command[k];
             }
         }
+    }
+
+    /// Narrows the ends `within` (nv) of the velocities at the end of the period [rad/s or m/s] to where the commands that [`PhysicsSteps::drive`] found
+    /// for `a` (nv) lead from `v` (nv): of joints that were held back in front of a position limit, and of those whose command came to its end.
+    /// Whether there are any.
+    pub fn hold_back(&self, v: &[f64], a: &[f64], within: &mut [[f64; 2]]) -> bool {
+        let (mut any, dt) = (false, self.period.dt);
+        for (k, &r) in self.pushed.iter().enumerate() {
+            let i = self.free[r];
+            let by = dt * (self.wanted[i] - a[i]) - self.missing[k];
+            let is_held = self.full[k] || self.wanted[i] != a[i];
+            if !is_held || by.is_nan() || by.abs() <= HELD_BACK * dt * (1.0 + a[i].abs()) {
+                continue;
+            }
+            let (to, [least, most]) = (v[i] + dt * a[i] + by, &mut within[i]);
+            match by < 0.0 {
+                true => *most = most.min(to),
+                false => *least = least.max(to),
+            }
+            any = true;
+        }
+        any
     }
 
     /// Makes the steps with the commands, and writes what is missing.

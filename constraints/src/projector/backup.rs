@@ -99,6 +99,8 @@ pub(crate) struct Backup {
     within: bool,
     /// Its decelerations (nv).
     deceleration: Vec<f64>,
+    /// The same, and what else is remembered, as the tick began.
+    begun: (bool, bool, usize, Vec<f64>),
     /// The index into [`TRIED`] that passed last, and how many are tried.
     favourite: usize,
     tried: usize,
@@ -166,6 +168,7 @@ impl Backup {
             stored: false,
             within: false,
             deceleration: zero(),
+            begun: (false, false, 0, zero()),
             favourite: 0,
             tried: if checker.needs_a_brake() && settings.sub_steps == 1 { TRIED.len() } else { USUAL },
             dynamics: Dynamics::new(model),
@@ -211,6 +214,17 @@ impl Backup {
         (self.stored, self.within) = (memory[0] != 0.0, memory[0] == 1.0);
         self.favourite = memory[1] as usize % self.tried;
         self.deceleration.copy_from_slice(&memory[2..]);
+    }
+
+    /// What is remembered now is what [`Backup::go_back`] comes back to.
+    pub(crate) fn mark(&mut self) {
+        (self.begun.0, self.begun.1, self.begun.2) = (self.stored, self.within, self.favourite);
+        self.begun.3.copy_from_slice(&self.deceleration);
+    }
+
+    pub(crate) fn go_back(&mut self) {
+        (self.stored, self.within, self.favourite) = (self.begun.0, self.begun.1, self.begun.2);
+        self.deceleration.copy_from_slice(&self.begun.3);
     }
 
     /// Switches the rows and cones of a limit.

@@ -9,7 +9,7 @@ use super::moved::Moving;
 use super::nearer::Nearer;
 use super::polish::Polish;
 use super::sources::{Measured, Sources};
-use super::{Dofs, History, Projector, Stages, Switch};
+use super::{Dofs, FREE, History, Projector, Stages, Switch};
 use crate::checker::Checker;
 use crate::ledger::{Rung, Status};
 use crate::target::{Bounds, Braking, Consistency, Proposal, Settings, Solver};
@@ -71,6 +71,7 @@ impl Projector {
         let places = coupled.iter().flat_map(|stages| stages.sources.places());
         let places = places.map(|(.., place)| place.numbers).collect();
         Ok(Projector {
+            couples: coupled.as_ref().is_some_and(|stages| stages.sources.couples_joints()),
             dynamics: Dynamics::new(model),
             checker,
             notes,
@@ -89,6 +90,7 @@ impl Projector {
             v_next: zero(),
             consistent: vec![false; nv],
             clamped: vec![[false; 2]; nv],
+            within: vec![FREE; nv],
             last: (Status::Unchanged, Rung::ClosedForm),
             normal: vec![0.0; model.nv()],
             asked: Proposal::new(model),

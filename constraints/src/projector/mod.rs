@@ -44,6 +44,9 @@ use polish::Polish;
 use sources::{Label, Sources};
 use std::time::Instant;
 
+/// No ends beside those of the box.
+const FREE: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
+
 /// Projects proposals for one robot at one control period.
 ///
 /// With `T` the period, `y = v' - v` and `kappa` from [`Period`], the kinematic mode solves
@@ -105,6 +108,10 @@ pub struct Projector {
     pull: Vec<f64>,
     /// Free mode: position and velocity of the dof were clamped (nv).
     clamped: Vec<[bool; 2]>,
+    /// Ends of the next velocities beside those of the box (nv).
+    within: Vec<[f64; 2]>,
+    /// Some hard row or cone is of what several joints do together.
+    couples: bool,
     /// How the last tick ended.
     last: (Status, Rung),
     /// Scratch: velocities without denormal numbers (nv).
@@ -194,6 +201,44 @@ impl Projector {
     /// Every field of `target` is finite afterwards, whatever the input; only [`RefuseReason::WrongLength`] leaves it
     /// as it was.
     pub fn project(&mut self, q: &[f64], v: &[f64], proposal: &Proposal, target: &mut Target) -> Status {
+        self.backup.mark();
+        self.project_from_here(q, v, proposal, target)
+    }
+
+    /// Projects the same tick once more, for a robot whose joints come to no other velocities than those `within` (nv) [rad/s or m/s], as it has turned out
+    /// after [`Projector::project`]: the nearest state of which that is true takes the place of one that is not. Where the box of a joint lies beyond its ends,
+    /// it ends at the end of the box that is nearest to them.
+    pub fn project_within(
+        &mut self,
+        (q, v): (&[f64], &[f64]),
+        proposal: &Proposal,
+        within: &[[f64; 2]],
+        target: &mut Target,
+    ) -> Status {
+        self.backup.go_back();
+        self.within.copy_from_slice(within);
+        let mut status = self.project_from_here(q, v, proposal, target);
+        self.within.fill(FREE);
+        if matches!(status, Status::Clamped | Status::Solved) {
+            status = Status::Slowed;
+        }
+        (target.ledger.status, self.last.0) = (status, status);
+        status
+    }
+
+    /// Whether a joint that comes to another velocity than its target's may break a hard limit of several joints, which
+    /// [`Projector::project_within`] is for. Not while limits are moved.
+    pub fn couples_joints(&self) -> bool {
+        self.couples && !self.moving.on
+    }
+
+    fn project_from_here(
+        &mut self,
+        q: &[f64],
+        v: &[f64],
+        proposal: &Proposal,
+        target: &mut Target,
+    ) -> Status {
         let start = Instant::now();
         target.ledger.reset();
         let mut normal = std::mem::take(&mut self.normal);
@@ -334,6 +379,17 @@ impl Projector {
                 ([v_lower, v_upper], x) = (hard, aim);
                 outside |= behind;
             }
+            let [least, most] = self.within[i];
+            if most < v_upper {
+                (v_upper, x.upper_kind) = (most.max(v_lower), Kind::Position);
+            }
+            if least > v_lower {
+                (v_lower, x.lower_kind) = (least.min(v_upper), Kind::Position);
+            }
+            (x.lower, x.upper) = match self.within[i] == FREE {
+                true => (x.lower, x.upper),
+                false => ((v_lower - v[i]) / t, (v_upper - v[i]) / t),
+            };
             (self.bounds.v_lower[i], self.bounds.v_upper[i]) = (v_lower, v_upper);
             if let Some(iq) = self.dofs.single[i] {
                 let reach = |v_next: f64| q[iq] + (t * v[i] + kappa * t * (v_next - v[i]));

@@ -104,6 +104,14 @@ impl Sources {
         self.blocks.iter().all(|b| b.sizes.is_empty()) && self.cones.is_empty()
     }
 
+    /// Some hard row or cone is of what several joints do together. One of what motors give is of the forces that a plant is sent.
+    pub(crate) fn couples_joints(&self) -> bool {
+        let of_motion =
+            |kind: Kind| !matches!(kind, Kind::Torque | Kind::TorqueSpeed | Kind::TorqueRate | Kind::Jerk);
+        self.blocks.iter().any(|b| b.soft.is_none() && !b.sizes.is_empty() && of_motion(b.rows.kind()))
+            || self.cones.iter().any(|c| c.soft.is_none() && of_motion(c.cone.kind()))
+    }
+
     /// Reports of all rows, then of all cones.
     pub(crate) fn labels(&self) -> Vec<Label> {
         let rows = self.blocks.iter().flat_map(|b| {

@@ -507,3 +507,47 @@ fn both_solvers_agree() {
     println!("{both} solved, furthest {furthest:.1e} rad/s");
     assert!(both > 100 && furthest < 1e-6, "{both} {furthest:e}");
 }
+
+/// A tick that is projected once more begins as the tick did, whatever the first time stored, and ends between the ends that are known by then, as near to the
+/// proposal as the rows allow.
+#[test]
+fn a_tick_is_projected_once_more_within_ends() {
+    let limits = || {
+        let mut limits = panda_limits(None);
+        limits.push(Box::new(FrameSpeedLimit::of("panda_hand", 0.4)));
+        limits
+    };
+    let new = || Projector::new(&panda(), &limits(), &[0, 1, 2, 3, 4, 5, 6], settings()).unwrap();
+    let (mut twice, mut once, mut random) = (new(), new(), Random(11));
+    assert!(twice.couples_joints() && !panda_projector(Some(0.6), settings()).couples_joints());
+    let (mut first, mut second, mut alone) =
+        (Target::new(twice.model()), Target::new(twice.model()), Target::new(twice.model()));
+    let (mut q, mut v) = (vec![0.0, -0.5, 0.0, -1.5, 0.0, 1.5, 0.0], vec![0.0; 7]);
+    let mut slower = 0;
+    for tick in 0..400 {
+        let raw = proposal(&twice, &q, &v, 3.0, &mut random);
+        twice.project(&q, &v, &raw, &mut first);
+        let mut ends = [[f64::NEG_INFINITY, f64::INFINITY]; 7];
+        let joint = tick % 7;
+        let bounds = twice.bounds();
+        ends[joint][1] = 0.5 * (first.v[joint] + bounds.v_lower[joint]);
+        let (lower, end) = (bounds.v_lower[joint], ends[joint][1]);
+        let status = twice.project_within((&q, &v), &raw, &ends, &mut second);
+        assert!(second.v[joint] <= end.max(lower) + 1e-12, "{tick}: {} beyond {end}", second.v[joint]);
+        assert_eq!(second.ledger.target_violations.total(), 0, "{tick}: {status:?}");
+        let is_slowed = status == Status::Slowed;
+        assert!(
+            is_slowed || matches!(status, Status::Unchanged | Status::Recovering | Status::Braked(_)),
+            "{status:?}"
+        );
+        slower += usize::from(is_slowed && second.v[joint] < first.v[joint] - 1e-9);
+        // of the same bits as without a first time
+        once.project(&q, &v, &raw, &mut alone);
+        assert!(same_bits(&alone, &first), "{tick}");
+        once.project_within((&q, &v), &raw, &ends, &mut alone);
+        assert!(same_bits(&alone, &second), "{tick}");
+        assert_eq!(once.memory(), twice.memory());
+        (q, v) = (second.q.clone(), second.v.clone());
+    }
+    assert!(slower > 200, "{slower}");
+}

@@ -26,7 +26,14 @@ pub(crate) struct Arrivals {
     commands: Vec<f64>,
     held: Vec<Held>,
     most: Vec<f64>,
+    /// Between which velocities the joints end (nv), as far as it is known.
+    within: Vec<[f64; 2]>,
 }
+
+const FREE: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
+
+/// How often a tick is projected once more because physics steps do not lead to its target.
+pub(crate) const ROUNDS: usize = 3;
 
 impl Arrivals {
     /// For commands to `dofs`; `drives` (nv) says what they are, and the motors take them as far as their range goes. Of the others those that
@@ -61,7 +68,20 @@ impl Arrivals {
                 .map(|i| if led.contains(&i) { Held::Acceleration(0.0) } else { Held::Force(0.0) })
                 .collect(),
             most: vec![0.0; nv],
+            within: vec![FREE; nv],
         }
+    }
+
+    /// A tick begins, of which nothing is known.
+    pub(crate) fn begin(&mut self) {
+        self.within.fill(FREE);
+    }
+
+    /// Between which velocities the joints can end (nv), where the commands found last do not lead from `v` (nv) to the target: one that was held back
+    /// leaves others where rows of several joints do not allow them. `None` where they do.
+    pub(crate) fn held_back(&mut self, v: &[f64], to: &Target) -> Option<&[[f64; 2]]> {
+        let steps = self.steps.as_ref()?;
+        steps.hold_back(v, &to.acceleration, &mut self.within).then_some(&self.within)
     }
 
     /// The commands by dof (nv) that take `q`, `v` to `to` with the accelerations `a` (nv) and the mean forces `tau` (nv), while the

@@ -10,6 +10,9 @@
 //! Where the task asks for a share of ticks that may end outside (`[constraints] reached`), the state of each tick says what the tick before led
 //! to, and the action is bounded as limits come near (`controller/dial.rs`).
 //!
+//! Where the physics steps of a period do not lead to a target (a position limit holds a joint back), and limits of several joints could be broken
+//! for that, the tick is projected once more for the robot whose joints come no further ([`Projector::project_within`]).
+//!
 //! What it remembers from tick to tick is in `controller/memory.rs`, what it tells of itself in `controller/facts.rs`.
 //!
 //! Training, evaluation, the real-time loop and replay all call [`Controller::update`]. Noise is an
@@ -29,6 +32,7 @@ mod parts;
 pub use dial::{Margin, merge_margins};
 pub use parts::{Parts, held_dofs, seen_entries};
 
+use crate::arrival::ROUNDS;
 use crate::idm::{AnalyticIdm, LearnedIdm};
 use crate::net::{Activation, Forward, Function};
 use crate::normaliser::Normaliser;
@@ -390,11 +394,17 @@ impl Controller {
         if !self.projection {
             self.projector.pass(&self.held.q, &self.held.v, &self.proposal, &mut out.next);
         }
+        if !matches!(self.inverse, Inverse::Analytic(_)) {
+            self.conclude(out);
+        }
+    }
+
+    /// The target is what it stays.
+    fn conclude(&mut self, out: &mut Output) {
         if self.projector.needs_previous() {
             self.projector.remember(&out.next);
         }
-        let bounds = self.projector.bounds();
-        self.report(bounds, out);
+        self.report(self.projector.bounds(), out);
     }
 
     /// Writes the target, and what the projection lets through, entry by entry.
@@ -457,7 +467,15 @@ impl Controller {
             }
             Inverse::Analytic(idm) => {
                 out.log_prob_action = 0.0;
-                idm.action(&self.held.q, &self.held.v, &out.next, self.projector.limits(), &mut out.action);
+                let (q, v, next) = (&self.held.q, &self.held.v, &mut out.next);
+                idm.action(q, v, next, self.projector.limits(), &mut out.action);
+                let again = self.projection && self.guard.is_none() && self.projector.couples_joints();
+                for round in 0..if again { ROUNDS } else { 0 } {
+                    let Some(within) = idm.held_back(v, next, round == 0) else { break };
+                    self.projector.project_within((q, v), &self.proposal, within, next);
+                    idm.action(q, v, next, self.projector.limits(), &mut out.action);
+                }
+                self.conclude(out);
             }
         }
         let given = if self.foreign.has_map() { &self.mean[..n] } else { &out.sampled[..] };

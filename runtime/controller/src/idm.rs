@@ -75,6 +75,15 @@ impl AnalyticIdm {
         })
     }
 
+    /// Between which velocities the joints can end (nv), where the physics steps of the last action do not lead to `target`; known of each round
+    /// since `first`.
+    pub(crate) fn held_back(&mut self, v: &[f64], target: &Target, first: bool) -> Option<&[[f64; 2]]> {
+        if first {
+            self.arrivals.begin();
+        }
+        self.arrivals.held_back(v, target)
+    }
+
     /// What each motor is sent (n_act) to take (q, v) to `target`; of a plain motor it is the force [N m or N], within `limits` with several
     /// physics steps.
     pub fn action(&mut self, q: &[f64], v: &[f64], target: &Target, limits: &LimitSet, action: &mut [f64]) {

@@ -189,6 +189,21 @@ fn every_kind_of_limit_is_verified_alone_and_together() {
     }
 }
 
+/// In front of a position limit the steps of a period give a joint less acceleration than the nearest target has: another one is projected, which says
+/// that it is not the nearest (`slowed`), and to which the action leads.
+#[test]
+fn limits_of_several_joints_are_verified_over_several_steps() {
+    for kinds in COUPLED[..3].iter().map(|kind| (*kind).to_owned()).chain([COUPLED[..4].join("\n")]) {
+        let flight = attack(&format!("{LIMITS}\n{kinds}"), 0.01, 5, 5);
+        let (_folder, log) = record("verify-kinds-steps", &flight);
+        let report = verify(&log).unwrap();
+        println!("{kinds}\n{report}");
+        assert_eq!((report.found, report.is_whole()), (0, true), "{kinds}\n{report}");
+        assert!(report.verified + report.idle == 1500 && report.optimal > 200, "{kinds}\n{report}");
+        assert!(report.not_compared.keys().any(|why| why.contains("physics steps")), "{kinds}\n{report}");
+    }
+}
+
 /// A motor's line bounds the force at the speed of a period's start and end, where the steps of the period are reckoned with one by one.
 #[test]
 fn a_motor_s_line_is_verified_over_several_steps() {

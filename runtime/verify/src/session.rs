@@ -684,7 +684,9 @@ impl Session {
                 return without("the robot was on its way to limits that an operator moved");
             }
             Status::Slowed => {
-                return without("no way to stop was found from the nearest allowed state (slowed)");
+                return without(
+                    "no way to stop was found from the nearest allowed state, or its physics steps do not lead there (slowed)",
+                );
             }
             Status::Braked | Status::Refused => return without("the proposal was not used: braked"),
             _ => {}

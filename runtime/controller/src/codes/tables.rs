@@ -8,7 +8,7 @@ codes! {
         Solved = "solved", "Torque rows were active; the nearest allowed state was solved for and checked.", "Nothing to do.";
         Recovering = "recovering", "A joint, frame, pair of bodies or row is outside its limits: it may only come back or brake.",
             "See which in `outside` of the ledger (Python, `nearl project`); the limits of the task may be narrower than where the robot stood.";
-        Slowed = "slowed", "No way to stop could be verified from the nearest allowed state; the target is nearer to the stored brake.",
+        Slowed = "slowed", "No way to stop could be verified from the nearest allowed state, or its physics steps do not lead there; the target is another.",
             "Nothing to do; if it happens often, lower acceleration or the proposals' size.";
         BrakedNonFiniteProposal = "braked-non-finite-proposal", "The proposal held NaN or infinity; every joint brakes.",
             "Go back to an earlier snapshot: the training diverged.";

@@ -2,7 +2,7 @@
 //! that leads to what the projection made of it.
 
 use super::parts::{held_dofs, unusable};
-use crate::arrival::Arrivals;
+use crate::arrival::{Arrivals, ROUNDS};
 use crate::motors::Motors;
 use crate::snapshot::{Manifest, SnapshotError};
 use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposal, StateLayout, Target};
@@ -79,18 +79,29 @@ impl Guard {
         if !hold {
             self.projector.pass(q, v, &self.proposal, next);
         }
+        if hold && (beyond || self.is_moved(next)) {
+            self.lead((q, v), next, action);
+            self.arrivals.begin();
+            for _ in 0..if self.projector.couples_joints() { ROUNDS } else { 0 } {
+                let Some(within) = self.arrivals.held_back(v, next) else { break };
+                self.projector.project_within((q, v), &self.proposal, within, next);
+                self.lead((q, v), next, action);
+            }
+        }
         if self.projector.needs_previous() {
             self.projector.remember(next);
         }
-        if hold && (beyond || self.is_moved(next)) {
-            self.a.copy_from_slice(&next.acceleration);
-            self.dynamics.drive(&mut self.a, &mut self.tau);
-            let (external, limits) = (self.projector.external_forces(), self.projector.limits());
-            let by = (&self.a[..], &self.tau[..]);
-            let commands = self.arrivals.commands((q, v), next, by, external, limits);
-            for (k, &i) in self.dofs.iter().enumerate() {
-                action[self.motors.place(k)] = self.motors.action(k, commands[i]);
-            }
+    }
+
+    /// Writes the action that leads to `next`.
+    fn lead(&mut self, (q, v): (&[f64], &[f64]), next: &Target, action: &mut [f64]) {
+        self.a.copy_from_slice(&next.acceleration);
+        self.dynamics.drive(&mut self.a, &mut self.tau);
+        let (external, limits) = (self.projector.external_forces(), self.projector.limits());
+        let by = (&self.a[..], &self.tau[..]);
+        let commands = self.arrivals.commands((q, v), next, by, external, limits);
+        for (k, &i) in self.dofs.iter().enumerate() {
+            action[self.motors.place(k)] = self.motors.action(k, commands[i]);
         }
     }
 
