@@ -48,6 +48,8 @@ pub struct PhysicsSteps {
     wanted: Vec<f64>,
     /// Pushed dofs whose command has no more room.
     full: Vec<bool>,
+    /// The commands found last are those that were given out.
+    found: bool,
     /// What is missing of the velocity of each pushed dof, and by how much its command changes.
     missing: Vec<f64>,
     before: Vec<f64>,
@@ -143,6 +145,7 @@ impl PhysicsSteps {
             moved: zero(nv),
             wanted: zero(nv),
             full: vec![false; m],
+            found: false,
             slopes,
             missing: zero(m),
             before: zero(m),
@@ -245,6 +248,7 @@ impl PhysicsSteps {
         (commands, most): (&mut [f64], &[f64]),
         limits: &LimitSet,
     ) {
+        self.found = false;
         if commands.iter().any(|command| !command.is_finite()) {
             return;
         }
@@ -316,7 +320,8 @@ impl PhysicsSteps {
         }
         // A command that has come to its end is missed by as much, whatever the others do.
         let is_near = |x: f64| x.abs() <= begun.max(MISSING * self.period.dt);
-        if with_room(&self.missing, &self.full).all(is_near) || retreats > 0 {
+        self.found = with_room(&self.missing, &self.full).all(is_near) || retreats > 0;
+        if self.found {
             for (k, &r) in self.pushed.iter().enumerate() {
                 commands[self.free[r]] = self.command[k];
             }
@@ -328,7 +333,7 @@ impl PhysicsSteps {
     /// Whether there are any.
     pub fn hold_back(&self, v: &[f64], a: &[f64], within: &mut [[f64; 2]]) -> bool {
         let (mut any, dt) = (false, self.period.dt);
-        for (k, &r) in self.pushed.iter().enumerate() {
+        for (k, &r) in self.pushed.iter().enumerate().filter(|_| self.found) {
             let i = self.free[r];
             let by = dt * (self.wanted[i] - a[i]) - self.missing[k];
             let is_held = self.full[k] || self.wanted[i] != a[i];

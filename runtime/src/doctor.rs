@@ -238,7 +238,13 @@ fn notes(m: &Manifest, parts: &Parts) -> Check {
 /// # Errors
 /// As [`Parts::new`].
 pub fn told(m: &Manifest) -> Result<Vec<String>, SnapshotError> {
-    Ok(doubts::of(m, &Parts::new(m)?))
+    let parts = Parts::new(m)?;
+    let mut notes = doubts::of(m, &parts);
+    let holds = holding(m, &parts);
+    if holds.finding == Finding::Fail {
+        notes.push(format!("{}; `nearl run` refuses it as it is", holds.text));
+    }
+    Ok(notes)
 }
 
 /// Does anything keep the limits at all?

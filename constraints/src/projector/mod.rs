@@ -215,10 +215,15 @@ impl Projector {
         within: &[[f64; 2]],
         target: &mut Target,
     ) -> Status {
+        if within.len() != self.within.len() {
+            return Status::Refused(RefuseReason::WrongLength);
+        }
+        let first_ns = target.ledger.duration_ns;
         self.backup.go_back();
         self.within.copy_from_slice(within);
         let mut status = self.project_from_here(q, v, proposal, target);
         self.within.fill(FREE);
+        target.ledger.duration_ns += first_ns;
         if matches!(status, Status::Clamped | Status::Solved) {
             status = Status::Slowed;
         }

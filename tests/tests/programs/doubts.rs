@@ -6,6 +6,7 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use crate::common::repository;
+use nearl_runtime::Snapshot;
 use nearl_runtime::constraints::limit::AccelerationSettings;
 use nearl_runtime::constraints::{
     AccelerationLimit, Limit, Model, PerJoint, PositionLimit, Projector, Settings, TorqueLimit, VelocityLimit,
@@ -309,6 +310,12 @@ fn odd_set_ups_are_named_by_each_door_and_the_page_says_what_the_doctor_says() {
         assert_eq!(found.finding == Finding::Ok, set_up.says.is_empty(), "{}: {}", set_up.what, found.text);
         for word in set_up.says {
             assert!(found.text.contains(word), "{}: '{word}' is not in: {}", set_up.what, found.text);
+        }
+        if found.finding == Finding::Fail {
+            let notes = told(&Snapshot::load(&snapshot).expect("snapshot").manifest).expect("notes");
+            let refuses =
+                |note: &String| note.starts_with(&found.text) && note.contains("`nearl run` refuses");
+            assert!(notes.iter().any(refuses), "{}: {notes:?}", set_up.what);
         }
         let finding = format!("{:?}", found.finding).to_lowercase();
         tell(set_up.what, &finding, &found.text);
