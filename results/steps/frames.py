@@ -30,8 +30,9 @@ def main() -> None:
             lines += [f"{kind},{drives},{steps},{seed},{worst:.3g},{near:.2f}" for seed, worst, near in runs]
             worst = np.array([run[1] for run in runs])
             unit = "m" if kind == "frame" else "of the limit"
+            under = f", drives of {drives} rad/s" if speeds else ""
             print(
-                f"{kind}{f', drives of {drives} rad/s' if speeds else ''}, {steps} steps: worst {worst.max():.2g} {unit}, {np.sum(worst > 1e-6)} of {arms} beyond it by more than 1e-6; "
+                f"{kind}{under}, {steps} steps: worst {worst.max():.2g} {unit}, {np.sum(worst > 1e-6)} of {arms} beyond it by more than 1e-6; "
                 f"near it in {np.mean([run[2] for run in runs]):.0%} of the ticks",
                 flush=True,
             )

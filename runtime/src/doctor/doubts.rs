@@ -60,8 +60,8 @@ fn of_several_joints(m: &Manifest, projector: &Projector) -> Option<String> {
     (!names.is_empty()).then(|| {
         format!(
             "a control period has {steps} physics steps, and over several of them the limits on {} hold only approximately: the steps lead to another \
-             place than constant accelerations do (the speed of a point was off by up to 0.02 % at five steps of 2 ms, 0.12 % at ten, and by 1.7 % under drives \
-             of targets); with one step they hold: dt = {sim_dt}, and policy_every = {every} for the same period of the policy",
+             place than constant accelerations do (the speed of a point was off by up to 0.02 % at five steps of 2 ms, 0.12 % at ten, and by 1.7 % under \
+             drives of targets); with one step they hold: dt = {sim_dt}, and policy_every = {every} for the same period of the policy",
             names.join(", ")
         )
     })
