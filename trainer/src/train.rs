@@ -68,6 +68,20 @@ pub enum TrainError {
     /// The checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
+    /// An update left weights that are no numbers, or huge.
+    #[error(
+        "the training diverged after {steps} steps: tensor '{tensor}' has {value} at index {index}; train anew with a smaller train.ppo.lr, or another seed"
+    )]
+    Diverged {
+        /// Steps before that update.
+        steps: u64,
+        /// The tensor of a snapshot.
+        tensor: String,
+        /// Where in it.
+        index: usize,
+        /// What is there.
+        value: f64,
+    },
 }
 
 /// What to train.
@@ -316,9 +330,16 @@ impl Training {
             metrics
                 .push(("tracking/reward", rewards / (self.settings.n_envs * self.settings.n_steps) as f64));
         }
+        let (last, steps) = (self.snapshot.networks.clone(), self.snapshot.manifest.steps);
         self.snapshot.manifest.steps += (self.settings.n_envs * self.settings.n_steps) as u64;
         self.snapshot.manifest.version += 1;
         self.refresh();
+        if let Err(SnapshotError::Value { name: tensor, index, value }) = self.snapshot.networks.check() {
+            self.snapshot.networks = last;
+            self.snapshot.manifest.steps = steps;
+            self.snapshot.manifest.version -= 1;
+            return Err(TrainError::Diverged { steps, tensor, index, value });
+        }
         metrics.extend(self.pretrain());
         if self.passed(self.settings.eval_every) {
             metrics.push((EVALUATED, self.evaluate()?));

@@ -479,6 +479,25 @@ impl Networks {
         }
     }
 
+    /// Refuses weights that a reader of the snapshot would refuse: NaN, infinite or huge ones, of a training that diverged.
+    ///
+    /// # Errors
+    /// [`SnapshotError::Value`].
+    pub fn check(&self) -> Result<(), SnapshotError> {
+        let idm = self.idm.iter().map(|(dense, log_std)| ("idm", dense, log_std));
+        for (net, dense, log_std) in
+            std::iter::once(("policy", &self.policy, &self.policy_log_std)).chain(idm)
+        {
+            for (i, layer) in dense.layers.iter().enumerate() {
+                sound(&layer.weight, || format!("{net}.{i}.weight"))?;
+                sound(&layer.bias, || format!("{net}.{i}.bias"))?;
+            }
+            sound(dense.skip.as_deref().unwrap_or_default(), || format!("{net}.skip"))?;
+            sound(log_std, || format!("{net}.log_std"))?;
+        }
+        Ok(())
+    }
+
     fn tensors(&self) -> Vec<Tensor> {
         let mut out = vec![
             f64s("normaliser.mean", &self.normaliser.mean),
@@ -556,14 +575,14 @@ fn find<'a, 'b>(
 }
 
 fn checked<T: Copy + Into<f64>>(name: &str, values: Vec<T>) -> Result<Vec<T>, SnapshotError> {
-    match values
-        .iter()
-        .enumerate()
-        .map(|(i, &v)| (i, v.into()))
-        .find(|(_, v)| !v.is_finite() || v.abs() > HUGE)
-    {
-        Some((index, value)) => Err(SnapshotError::Value { name: name.into(), index, value }),
-        None => Ok(values),
+    sound(&values, || name.into()).map(|()| values)
+}
+
+fn sound<T: Copy + Into<f64>>(values: &[T], name: impl Fn() -> String) -> Result<(), SnapshotError> {
+    let mut all = values.iter().enumerate().map(|(i, &v)| (i, v.into()));
+    match all.find(|(_, v)| !v.is_finite() || v.abs() > HUGE) {
+        Some((index, value)) => Err(SnapshotError::Value { name: name(), index, value }),
+        None => Ok(()),
     }
 }
 

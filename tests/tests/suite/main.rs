@@ -6,6 +6,7 @@ mod architecture;
 mod demos;
 mod determinism;
 mod dial;
+mod diverged;
 mod drives;
 mod env_mujoco;
 mod env_parity;

@@ -116,13 +116,17 @@ pub(super) fn residuals_back(d: &mut [V], inverse: &[V], c: &[V], grad: Option<&
     }
 }
 
+/// No action is reckoned with as more likely than before by more than `e` to this.
+const MOST_LOG_RATIO: f32 = 20.0;
+
 /// Clipped surrogate of PPO: from log ratios, advantages and `scale = 1 / batch` to `c = dL / d log_prob` in place of
 /// `log_prob`; returns sums over the tile: loss, approximate KL `(r - 1) - log r`, clipped rows.
 #[inline(always)]
 pub(super) fn surrogate(log_prob: &mut [V], old: &[V], advantage: &[V], range: f32, scale: f32) -> [f32; 3] {
     let (mut loss, mut kl, mut clipped) = (ZERO, ZERO, ZERO);
     for i in 0..log_prob.len() {
-        let log_ratio = log_prob[i] - old[i];
+        // Beyond it a gradient would be infinite, of which its norm makes no number.
+        let log_ratio = (log_prob[i] - old[i]).map(|x| if x > MOST_LOG_RATIO { MOST_LOG_RATIO } else { x });
         let ratio = exp(log_ratio);
         let free = ratio * advantage[i];
         let bound = ratio.map(|r| r.clamp(1.0 - range, 1.0 + range));
@@ -179,4 +183,28 @@ pub(super) fn likelihood_ratio<const N: usize>(
         entropy_bonus(grad, g.n, settings.ent_coef * t.scale * TILE as f32);
     }
     sums
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An action that is e^500 times as likely as it was, by advantages of either sign and none: every number stays finite, and pushes as hard as the bound.
+    #[test]
+    fn an_action_that_became_far_more_likely_leaves_numbers() {
+        let far = |advantage: f32, log_ratio: f32| {
+            let mut c = [V::splat(log_ratio)];
+            let sums = surrogate(&mut c, &[ZERO], &[V::splat(advantage)], 0.2, 0.5);
+            (c[0].0[0], sums)
+        };
+        for advantage in [-3.0, 0.0, 3.0] {
+            let (c, sums) = far(advantage, 500.0);
+            assert!(c.is_finite() && sums.iter().all(|x| x.is_finite()), "{advantage}: {c} {sums:?}");
+            assert_eq!(far(advantage, 500.0), far(advantage, 20.0));
+        }
+        let (c, _) = far(-3.0, 500.0);
+        assert!((c / (20f32.exp() * 1.5) - 1.0).abs() < 1e-5, "{c}");
+        let (c, _) = far(-3.0, 2.0);
+        assert!((c / (2f32.exp() * 1.5) - 1.0).abs() < 1e-5, "{c}");
+    }
 }

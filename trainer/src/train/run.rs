@@ -113,6 +113,15 @@ impl Training {
         let progress = match self.try_iterate() {
             Ok(Some(progress)) => progress,
             Ok(None) => return Ok(None),
+            Err(e @ TrainError::Diverged { .. }) => {
+                let name = format!("step_{}", self.snapshot().manifest.steps);
+                folder.keep(&name, self.snapshot())?;
+                let file = folder.path().join("checkpoints").join(name);
+                return Err(TrainError::Settings(format!(
+                    "{e}; '{}.safetensors' is of before",
+                    file.display()
+                )));
+            }
             Err(e) => {
                 if self.snapshot().manifest.version > 0
                     && let Err(unsaved) = self.save(folder)
