@@ -1,6 +1,6 @@
 //! Twenty lines of a robot's control loop: a snapshot file in, torques out.
 //!
-//! `cargo run --release -p nearl-runtime --example control_loop -- examples/snapshots/panda-reach.safetensors`
+//! `cargo run --release --example control_loop -- examples/snapshots/panda-reach.safetensors`
 
 use nearl_runtime::{Controller, Snapshot};
 use std::path::Path;
