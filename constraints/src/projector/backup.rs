@@ -99,8 +99,8 @@ pub(crate) struct Backup {
     within: bool,
     /// Its decelerations (nv).
     deceleration: Vec<f64>,
-    /// The same, and what else is remembered, as the tick began.
-    begun: (bool, bool, usize, Vec<f64>),
+    /// What was remembered as the tick began.
+    begun: Vec<f64>,
     /// The index into [`TRIED`] that passed last, and how many are tried.
     favourite: usize,
     tried: usize,
@@ -168,7 +168,7 @@ impl Backup {
             stored: false,
             within: false,
             deceleration: zero(),
-            begun: (false, false, 0, zero()),
+            begun: vec![0.0; model.nv() + 2],
             favourite: 0,
             tried: if checker.needs_a_brake() && settings.sub_steps == 1 { TRIED.len() } else { USUAL },
             dynamics: Dynamics::new(model),
@@ -218,13 +218,16 @@ impl Backup {
 
     /// What is remembered now is what [`Backup::go_back`] comes back to.
     pub(crate) fn mark(&mut self) {
-        (self.begun.0, self.begun.1, self.begun.2) = (self.stored, self.within, self.favourite);
-        self.begun.3.copy_from_slice(&self.deceleration);
+        let mut begun = std::mem::take(&mut self.begun);
+        begun.clear();
+        self.write_memory(&mut begun);
+        self.begun = begun;
     }
 
     pub(crate) fn go_back(&mut self) {
-        (self.stored, self.within, self.favourite) = (self.begun.0, self.begun.1, self.begun.2);
-        self.deceleration.copy_from_slice(&self.begun.3);
+        let begun = std::mem::take(&mut self.begun);
+        self.set_memory(&begun);
+        self.begun = begun;
     }
 
     /// Switches the rows and cones of a limit.

@@ -470,8 +470,9 @@ impl Controller {
                 let (q, v, next) = (&self.held.q, &self.held.v, &mut out.next);
                 idm.action(q, v, next, self.projector.limits(), &mut out.action);
                 let again = self.projection && self.guard.is_none() && self.projector.couples_joints();
-                for round in 0..if again { ROUNDS } else { 0 } {
-                    let Some(within) = idm.held_back(v, next, round == 0) else { break };
+                idm.arrivals.begin();
+                for _ in 0..if again { ROUNDS } else { 0 } {
+                    let Some(within) = idm.arrivals.held_back(v, next) else { break };
                     self.projector.project_within((q, v), &self.proposal, within, next);
                     idm.action(q, v, next, self.projector.limits(), &mut out.action);
                 }

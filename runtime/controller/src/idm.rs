@@ -50,7 +50,7 @@ pub struct AnalyticIdm {
     dofs: Vec<usize>,
     motors: Motors,
     period: Period,
-    arrivals: Arrivals,
+    pub(crate) arrivals: Arrivals,
     tau: Vec<f64>,
     external: Vec<f64>,
 }
@@ -73,15 +73,6 @@ impl AnalyticIdm {
             tau: vec![0.0; model.nv()],
             external: vec![0.0; model.nv()],
         })
-    }
-
-    /// Between which velocities the joints can end (nv), where the physics steps of the last action do not lead to `target`; known of each round
-    /// since `first`.
-    pub(crate) fn held_back(&mut self, v: &[f64], target: &Target, first: bool) -> Option<&[[f64; 2]]> {
-        if first {
-            self.arrivals.begin();
-        }
-        self.arrivals.held_back(v, target)
     }
 
     /// What each motor is sent (n_act) to take (q, v) to `target`; of a plain motor it is the force [N m or N], within `limits` with several

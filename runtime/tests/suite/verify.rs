@@ -200,7 +200,10 @@ fn limits_of_several_joints_are_verified_over_several_steps() {
         println!("{kinds}\n{report}");
         assert_eq!((report.found, report.is_whole()), (0, true), "{kinds}\n{report}");
         assert!(report.verified + report.idle == 1500 && report.optimal > 200, "{kinds}\n{report}");
-        assert!(report.not_compared.keys().any(|why| why.contains("physics steps")), "{kinds}\n{report}");
+        // Solved for, and not on the way to a stored brake.
+        let is_another = |t: &&Value| t["ledger"]["status"] == 4 && t["ledger"]["rung"].as_u64() < Some(3);
+        let others = ticks(&log).iter().filter(is_another).count();
+        assert!(others > 500, "{kinds}: {others} ticks were projected once more");
     }
 }
 
