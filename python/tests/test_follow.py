@@ -5,6 +5,7 @@ Each is a joint with the range -1 .. 1 and a margin of 0.05, whose policy asks f
 
 import os
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -359,5 +360,41 @@ def test_what_a_joint_that_rubs_does_to_another_is_believed(tmp_path: Path, seed
             fastest = max(fastest, np.abs(data.qvel).max())
         loop.stop()
     assert 1.9 < fastest < 2.0 + 1e-5
+    done = subprocess.run([NEARL, "verify", log], capture_output=True, text=True, check=False)
+    assert done.returncode in (0, 2), done.stdout + done.stderr  # 2: the disk was too slow for some ticks
+
+
+@pytest.mark.parametrize("case", ["late itself", "asks twice"])
+def test_a_driver_that_keeps_no_time_gets_set_points_that_go_on(tmp_path: Path, case: str) -> None:
+    """Away for longer than the loop waits for a state, with every answer applied, its servo was sent back to where it was measured, at 5500 rad/s² of 15;
+    asked twice in a period, the loop went two periods on."""
+    twice = case == "asks twice"
+    dt = 0.2 if twice else 0.01
+    entries, name, log = save(tmp_path, "position", dt, np.zeros((1, 2)), 3.0), f"py{os.getpid()}-itself", tmp_path / "itself.mcap"
+    q, v, tick, sent = 0.0, 0.0, 0, [0.0]
+    with nearl.Plant(name, joints=["j1"], observation=entries, dt=dt, nu=1, watchdog=60.0) as plant:
+        loop = nearl.Loop(tmp_path / "one.safetensors", name, log=log, ramp=0.0)
+        began = time.monotonic()
+        while len(sent) < 60:
+            if not twice and len(sent) in (20, 40):
+                time.sleep(0.12)
+            observation = [{"q.j1": q, "v.j1": v}[entry] for entry in entries]
+            state = {"patience": 30.0, "time": (tick + 1) * dt, "begins": tick == 0}
+            turn, action = plant.exchange([q], [v], observation, **state)
+            tick += 1
+            if turn == "brake":
+                assert len(sent) == 1 and time.monotonic() < began + 60  # until the loop is there
+                time.sleep(0.01)
+                continue
+            if twice:
+                turn, action = plant.exchange([q], [v], observation, **{**state, "begins": False})
+            assert turn == "act"
+            sent.append(float(action[0]))
+            to = q + 0.3 * (sent[-1] - q)
+            q, v = to, (to - q) / dt
+        loop.stop()
+    keeps(np.array(sent), dt)
+    counts, modes = loop.report["counters"], loop.report["modes"]
+    assert counts["out_of_order"] == 59 if twice else counts["stale"] >= 2 and modes["braking"] > 2
     done = subprocess.run([NEARL, "verify", log], capture_output=True, text=True, check=False)
     assert done.returncode in (0, 2), done.stdout + done.stderr  # 2: the disk was too slow for some ticks

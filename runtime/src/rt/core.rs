@@ -104,6 +104,8 @@ pub struct Core<T: LoopController> {
     heard: Heard,
     /// What the controller saved in the tick before, for the one swapped in after it.
     memory: Vec<f64>,
+    /// What was answered last is not what the robot does.
+    is_lost: bool,
     /// States predicted in a row; none can be before the first was measured.
     held: Option<u32>,
     braked: u32,
@@ -122,6 +124,7 @@ impl<T: LoopController> Core<T> {
         controller.controller.save_memory(&mut memory);
         Core {
             memory,
+            is_lost: true,
             modes: Modes::new(settings.modes, settings.period),
             grid: Grid::new(start, settings.period),
             record: Record::new(),
@@ -171,7 +174,7 @@ impl<T: LoopController> Core<T> {
         if swapped {
             self.controller.controller.reset();
             self.controller.controller.load_memory(&self.memory);
-            if self.record.output.nu == 0 {
+            if self.is_lost {
                 self.controller.controller.lose();
             }
             self.heard.repeat(&mut self.controller.controller);
@@ -247,6 +250,7 @@ impl<T: LoopController> Core<T> {
         self.way = resume.way;
         self.memory.clear();
         self.memory.extend_from_slice(resume.memory());
+        self.is_lost = false;
         self.controller.controller.reset();
         self.controller.controller.load_memory(&self.memory);
     }
@@ -321,9 +325,11 @@ impl<T: LoopController> Core<T> {
         self.record.reason = self.modes.reason();
         if self.record.output.nu > 0 {
             self.controller.controller.save_memory(&mut self.memory);
-        } else {
+            self.is_lost = false;
+        } else if self.record.fresh || self.settings.sync == Sync::Clock {
             self.controller.controller.lose();
-        }
+            self.is_lost = true;
+        } // else nothing was asked for, and the next state says whether something else held the robot
     }
 
     /// The controller's tick, softened while the first motion is let in.
@@ -392,6 +398,8 @@ impl<T: LoopController> Core<T> {
         let is_next = state.header.epoch == known.epoch;
         let lost = if is_next { state.header.seq - known.seq - 1 } else { 0 };
         self.record.counters.lost_states += lost;
+        let is_doubled = is_next && self.is_doubled(state);
+        self.record.counters.out_of_order += u64::from(is_doubled);
         let mut left_out = 0;
         // By its number: the state that began the episode may be among the lost ones.
         if !is_next || state.episode != self.record.state.episode {
@@ -402,11 +410,13 @@ impl<T: LoopController> Core<T> {
             self.pace = Pace::default();
             self.way.clear();
             self.record.apart = None;
+        } else if is_doubled {
+            self.controller.controller.recall();
         } else {
             left_out = self.go_on(state, lost);
         }
-        let is_frozen = is_next && self.is_frozen(state);
-        if self.held.is_some() {
+        let is_frozen = is_next && !is_doubled && self.is_frozen(state);
+        if self.held.is_some() && !is_doubled {
             self.follow(state, lost, is_frozen);
         }
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);
@@ -530,6 +540,22 @@ impl<T: LoopController> Core<T> {
             }
             _ => Event::Lost(reason),
         }
+    }
+
+    /// The driver has asked twice in a period: the same numbers, the clock of the robot stands, and hardly any time has passed. The first answer
+    /// is not the one that is applied.
+    fn is_doubled(&self, new: &StateMessage) -> bool {
+        let (old, settings) = (&self.record.state, &self.settings);
+        let is_soon = new.header.stamp.saturating_sub(old.header.stamp) < settings.period / 2;
+        let is_same = new.q() == old.q() && new.v() == old.v() && new.episode == old.episode;
+        let is_asked = new.bits & STATE_BRAKED == 0 && new.late == old.late && new.tick != old.tick;
+        settings.real_time
+            && settings.sync == Sync::Plant
+            && new.time > 0.0
+            && new.time == old.time
+            && is_soon
+            && is_same
+            && is_asked
     }
 
     /// The plant's clock stands still or runs backwards within an episode, or no joint has moved although the state says that one moves.

@@ -38,6 +38,9 @@ struct Past {
     epoch: u64,
     seq: u64,
     episode: u64,
+    /// What it was measured to be, and the robot's clock then [s].
+    measured: (Vec<f64>, Vec<f64>),
+    time: f64,
     target: (Vec<f64>, Vec<f64>),
     /// How often the plant had had no answer in time by then.
     late: u64,
@@ -70,7 +73,21 @@ impl Past {
 
     /// The plant braked by itself up to `next`, a state that came after it.
     fn is_braked_since(&self, next: &State) -> bool {
-        next.bits & BRAKED != 0 && (next.epoch, next.seq) != (self.epoch, self.seq)
+        next.bits & BRAKED != 0 && self.is_before(next)
+    }
+
+    /// `next` is another state than its own.
+    fn is_before(&self, next: &State) -> bool {
+        (next.epoch, next.seq) != (self.epoch, self.seq)
+    }
+
+    /// What it answered is not what the robot did up to `tick`: it came too late, or the driver asked once more in its period.
+    fn is_recalled(&self, tick: &Tick) -> bool {
+        let (next, (q, v)) = (&tick.state, &self.measured);
+        let stands = next.time > 0.0 && next.time == self.time && next.q == *q && next.v == *v;
+        // A loop that takes a state that stands for a frozen one does not act on it.
+        let is_doubled = stands && tick.sensed == "measured" && self.is_before(next);
+        is_doubled || self.alone(next) > self.lost(next)
     }
 
     /// Periods up to `next` in which the plant had no answer in time.
@@ -218,7 +235,10 @@ impl Session {
                 self.report.add(Violation { tick: tick.tick, what, value, limit, unit });
             }
             self.report.idle += u64::from(!asks);
-            (self.past, self.has_gap) = (None, false);
+            // Where no state came, nothing was asked for, and what was answered last goes on.
+            let is_asked = |past: &mut Past| self.keeps_time || past.is_before(&tick.state);
+            _ = self.past.take_if(is_asked);
+            self.has_gap = false;
             return Ok(());
         }
         let mut promises = match self.promises.remove(&tick.snapshot) {
@@ -276,10 +296,13 @@ impl Session {
         let (epoch, seq, episode, brake) = (state.epoch, state.seq, state.episode, tick.brake.clone());
         let cut_off = if is_cut_off { 2 } else { cut_off.saturating_sub(1) };
         let (late, asked) = (state.late, Asked { a, told });
+        let measured = (state.q.clone(), state.v.clone());
         self.past = Some(Past {
             epoch,
             seq,
             episode,
+            measured,
+            time: state.time,
             target,
             late,
             sent,
@@ -311,7 +334,7 @@ impl Session {
         if let Some(past) = self.past.as_ref().filter(|past| own.follows() && past.epoch == state.epoch)
             && [past.target.0.len(), past.target.1.len()] == [q.len(), v.len()]
         {
-            sent = self.standing(own, past, state);
+            sent = self.standing(own, past, tick);
             waiting = sent.as_ref().map_or(Vec::new(), |sent| own.depart(sent, &mut q, &mut v));
         }
         Some(Start { from: (q, v), sent, waiting })
@@ -320,7 +343,8 @@ impl Session {
     /// The tick goes on from what was sent in one that the log does not have.
     fn is_cut_off(&self, own: &Promise, tick: &Tick) -> bool {
         let goes_back = |past: &Past| {
-            past.cut_off > 0 && !self.keeps_time && past.alone(&tick.state).max(past.lost(&tick.state)) > 0
+            let is_left = past.alone(&tick.state).max(past.lost(&tick.state)) > 0;
+            past.cut_off > 0 && !self.keeps_time && (is_left || past.is_recalled(tick))
         };
         let is_back = self.past.as_ref().is_some_and(goes_back);
         is_back && own.goes_on() || self.has_gap && own.follows()
@@ -337,10 +361,11 @@ impl Session {
         let Some(past) = self.past.as_ref().filter(is_known) else { return Asked::default() };
         let (lost, alone) = (past.lost(state), past.alone(state));
         let periods = lost.max(alone);
-        if self.keeps_time || periods == 0 {
+        let is_recalled = past.is_recalled(tick);
+        if self.keeps_time || periods == 0 && !is_recalled {
             return past.asked.clone();
         }
-        let (sent, mut asked) = match alone > lost {
+        let (sent, mut asked) = match is_recalled {
             true => (past.before.as_ref(), past.asked_before.clone()),
             false => (Some(&past.sent), past.asked.clone()),
         };
@@ -354,7 +379,8 @@ impl Session {
 
     /// What stands as sent where `state` was measured: the last answer, or the one before it where that came too late, and from there on what the
     /// driver made of it without an answer. None where the plant braked by itself.
-    fn standing(&self, own: &Promise, past: &Past, state: &State) -> Option<SetPoints> {
+    fn standing(&self, own: &Promise, past: &Past, tick: &Tick) -> Option<SetPoints> {
+        let state = &tick.state;
         if past.is_braked_since(state) {
             return None;
         }
@@ -362,7 +388,7 @@ impl Session {
             return Some(past.sent.clone()); // it answered in every slot
         }
         let (lost, alone) = (past.lost(state), past.alone(state));
-        let applied = if alone > lost { past.before.as_ref() } else { Some(&past.sent) };
+        let applied = if past.is_recalled(tick) { past.before.as_ref() } else { Some(&past.sent) };
         let mut sent = applied?.clone();
         own.hold(&mut sent, lost.max(alone));
         Some(sent)

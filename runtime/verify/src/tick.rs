@@ -55,6 +55,9 @@ pub(crate) struct State {
     pub(crate) late: u64,
     #[serde(default)]
     pub(crate) bits: u32,
+    /// The robot's clock [s].
+    #[serde(default, deserialize_with = "number")]
+    pub(crate) time: f64,
     #[serde(deserialize_with = "numbers")]
     pub(crate) q: Vec<f64>,
     #[serde(deserialize_with = "numbers")]
