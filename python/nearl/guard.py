@@ -111,6 +111,7 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
 
         self._mujoco, self._model, self._ahead = mujoco, model, mujoco.MjData(model)
         self._ranges = b""  # as long as they are not read to the end
+        self._late(model)
         kinds = mujoco.mjtWarning
         self._given_up = [int(kinds.mjWARN_BADQPOS), int(kinds.mjWARN_BADQVEL), int(kinds.mjWARN_BADQACC)]
         self._last: Floats | None = None
@@ -383,6 +384,14 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
             which = ", ".join(f"'{names[i]}'" for i in sorted(joints))
             warnings.warn(f"the guard keeps the {what} of hinges and slides alone; of {which}, a ball or free joint each, nothing is kept", stacklevel=5)
             self._warned.add(kind)
+
+    def _late(self, model: Any) -> None:
+        """Says of actuators that an action reaches later that a step ahead is not far enough."""
+        delays = {model.actuator(i).name or i: float(x) for i, x in enumerate(model.actuator_delay) if x > 0}
+        if delays and "late" not in self._warned:
+            which = ", ".join(f"'{name}' ({delay:g} s)" for name, delay in delays.items())
+            warnings.warn(f"actuators act with a delay: {which}; the guard looks one step ahead, and what was sent before may leave limits", stacklevel=4)
+            self._warned.add("late")
 
     def _driven(self) -> set[int]:
         """Joints that an actuator moves, directly or through tendons and sites."""

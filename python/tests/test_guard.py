@@ -583,6 +583,17 @@ def test_joints_without_a_name_are_guarded_each(tmp_path):
         nearl.Guard(Chain(tmp_path / "chain.xml"), {"velocity": {"limit": {"d": 1.0}}})
 
 
+def test_actuators_with_a_delay_are_named_once(tmp_path):
+    """A step ahead shows nothing of an action that arrives after it."""
+    (tmp_path / "chain.xml").write_text(CHAIN.replace("<motor ", '<motor nsample="5" delay="0.01" ', 1))
+    with pytest.warns(UserWarning, match=r"act with a delay: '?\w+'? \(0\.01 s\); the guard looks one step ahead"):
+        env = nearl.Guard(Chain(tmp_path / "chain.xml"), FAST)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.reset(seed=0)
+        env.set_constraints(FAST)
+
+
 def test_a_ctrl_that_fits_no_actuators_is_refused(tmp_path):
     (tmp_path / "chain.xml").write_text(CHAIN)
     with pytest.raises(ValueError, match=r"the action has shape \(2,\) and the robot 1 actuators; give ctrl="):

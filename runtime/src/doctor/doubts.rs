@@ -36,6 +36,7 @@ pub(super) fn of(m: &Manifest, parts: &Parts) -> Vec<String> {
     notes.extend(undriven(m, parts));
     notes.extend(beyond_motors(m, parts, &drives));
     notes.extend(unguarded(m));
+    notes.extend(beyond_simulator(m));
     notes.extend(far_poses(m, model));
     notes.extend(other_steps(m));
     notes.extend(of_several_joints(m, projector));
@@ -119,6 +120,42 @@ fn unguarded(m: &Manifest) -> Option<String> {
          them"
             .into()
     })
+}
+
+/// What a guard that steps a simulator does not look at, and what keeps it from knowing where an action leads.
+fn beyond_simulator(m: &Manifest) -> Vec<String> {
+    let of = &m.task.constraints;
+    if m.without_simulator().is_none() {
+        return Vec::new();
+    }
+    // `position` asks for `acceleration`, which the projector of every task is built with.
+    let looked_at = ["position", "velocity", "acceleration"];
+    let named: Vec<_> =
+        REGISTRY.iter().filter(|kind| !(kind.build)(of).is_empty()).map(|kind| kind.name).collect();
+    let mut notes = Vec::new();
+    if !named.contains(&"position") && !named.contains(&"velocity") {
+        notes.push(
+            "constraints.guard is \"simulator\", and [constraints] names neither position nor velocity: it keeps nothing else; name one of them, or leave \
+             guard out"
+                .into(),
+        );
+    }
+    let others: Vec<_> = named.into_iter().filter(|name| !looked_at.contains(name)).collect();
+    if !others.is_empty() {
+        notes.push(format!(
+            "constraints.guard is \"simulator\", which looks at positions and velocities alone: an action may break {} of [constraints]; write guard = true \
+             to hold them, or leave them out",
+            others.join(", ")
+        ));
+    }
+    if m.task.delay.contains_key("action") {
+        notes.push(
+            "constraints.guard is \"simulator\", which looks one period ahead, and [delay] action has an action arrive later: limits are broken by what was \
+             sent before, and each search for a better action is in vain; leave one of the two out"
+                .into(),
+        );
+    }
+    notes
 }
 
 /// Joints whose pose, which positions and outputs of a policy are relative to, is outside of their range.

@@ -239,8 +239,8 @@ fn build(file: &Path, change: fn(&mut Limits)) -> Answer {
 fn train(file: &Path, snapshot: &Path) -> Answer {
     let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).map_err(|e| e.to_string())?;
     complete(&mut manifest).map_err(|e| e.to_string())?;
-    let lines = advice(&manifest).map_err(|e| e.to_string())?;
     let algo = "pid2-ib".parse().expect("an algorithm");
+    let lines = advice(algo, &manifest).map_err(|e| e.to_string())?;
     let request = Request { manifest, algo, steps: 1000, seed: 0, threads: 1 };
     let training = Training::new(&request).map_err(|e| e.to_string())?;
     training.snapshot().save(snapshot).expect("snapshot");
@@ -334,7 +334,7 @@ fn odd_set_ups_are_named_by_each_door_and_the_page_says_what_the_doctor_says() {
 fn a_bundled_task_advises_nothing_that_it_has_not() {
     let mut manifest = tasks::load("Hopper-v5", &[]).expect("bundled");
     complete(&mut manifest).expect("bundled");
-    let lines = advice(&manifest).expect("advice");
+    let lines = advice("ppo".parse().expect("an algorithm"), &manifest).expect("advice");
     let line = lines.iter().find(|l| l.contains("'thigh_joint'")).unwrap_or_else(|| panic!("{lines:?}"));
     assert!(line.contains("the bundled task draws it there") && !line.contains("draw it inside"), "{line}");
 }
@@ -377,6 +377,39 @@ fn limits_on_actions_are_what_a_direct_policy_keeps() {
         let checks = examine(&snapshot, None);
         let found = checks.iter().find(|c| c.check == "projection").expect("projection");
         assert!(found.finding == Finding::Warn && found.text.contains(says), "{}", found.text);
+    }
+}
+
+/// What a guard that steps a simulator does not look at was taken without a word, and so was a penalty on what no projection moves.
+#[test]
+fn a_simulator_s_guard_names_what_it_does_not_look_at() {
+    let folder = tempfile::tempdir().expect("folder");
+    let said = |algo: &str, set: &[&str]| {
+        let file = write(folder.path(), SAME, SAME);
+        let set: Vec<String> = set.iter().map(|set| (*set).to_owned()).collect();
+        let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &set).expect("task");
+        complete(&mut manifest).expect("manifest");
+        advice(algo.parse().expect("an algorithm"), &manifest).expect("advice").join("; ")
+    };
+    const SIMULATOR: &str = "constraints.guard=\"simulator\"";
+    let others = said("ppo", &[SIMULATOR, "constraints.energy={ limit = 0.1 }"]);
+    assert!(others.contains("an action may break torque, energy of [constraints]"), "{others}");
+    assert!(!said("ppo", &["constraints.guard=true"]).contains("may break"));
+    let only = said(
+        "ppo",
+        &["constraints={ guard = \"simulator\", consistency = \"free\", velocity = { limit = 3.0 } }"],
+    );
+    assert!(!only.contains("\"simulator\""), "{only}");
+    let none = said("ppo", &["constraints={ guard = \"simulator\", acceleration = { limit = 3.0 } }"]);
+    assert!(none.contains("names neither position nor velocity"), "{none}");
+    let late = said("ppo", &[SIMULATOR, "delay.action=2"]);
+    assert!(late.contains("[delay] action"), "{late}");
+    const PENALTY: &str = "train.moved_penalty=10";
+    for (algo, guard, is_vain) in
+        [("ppo", SIMULATOR, true), ("ppo", "constraints.guard=true", false), ("pid2-ib", SIMULATOR, false)]
+    {
+        let said = said(algo, &[guard, PENALTY]);
+        assert_eq!(said.contains("takes nothing off any reward"), is_vain, "{algo} {guard}: {said}");
     }
 }
 

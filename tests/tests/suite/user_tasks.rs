@@ -593,7 +593,7 @@ fn episodes_that_begin_outside_the_limits_are_named_before_training() {
     let lines = |from: &str, to: &str| {
         let mut manifest = tasks::load(&edited(folder.path(), from, to), &[]).expect("task");
         complete(&mut manifest).expect("environment");
-        let lines = advice(&manifest).expect("advice");
+        let lines = advice("ppo".parse().expect("an algorithm"), &manifest).expect("advice");
         lines.into_iter().filter(|line| line.contains("begin with")).collect::<Vec<_>>()
     };
     assert_eq!(lines("q = { hinge", "q = { hinge"), [] as [&str; 0]);
@@ -620,7 +620,7 @@ fn a_limit_that_looks_like_degrees_is_said_before_training() {
     let file = edited(folder.path(), "velocity = { limit = 3.0 }", "velocity = { limit = 160.0 }");
     let mut manifest = tasks::load(&file, &[]).expect("task");
     complete(&mut manifest).expect("environment");
-    let lines = advice(&manifest).expect("advice");
+    let lines = advice("ppo".parse().expect("an algorithm"), &manifest).expect("advice");
     assert!(
         lines.iter().any(|l| l.contains("'slider' is 160 rad/s or m/s") && l.contains("doctor-model")),
         "{lines:?}"

@@ -12,7 +12,6 @@ use crate::learn::Algorithm;
 use crate::preset::Preset;
 use crate::sweep::{Event, Found, Row, Run, Summary, Sweep, run};
 use crate::{tasks, train};
-use nearl_runtime::PolicyKind;
 
 #[derive(Args)]
 pub(super) struct SweepCommand {
@@ -81,10 +80,7 @@ fn advice(sweep: &Sweep, runs: &[Run]) -> Vec<String> {
         if train::complete(&mut manifest).is_err() {
             continue;
         }
-        if r.algo.is_direct() {
-            manifest.policy = PolicyKind::Direct;
-        }
-        for line in train::advice(&manifest).unwrap_or_default() {
+        for line in train::advice(r.algo, &manifest).unwrap_or_default() {
             let line = format!("{}: {line}", r.name);
             if !lines.contains(&line) {
                 lines.push(line);

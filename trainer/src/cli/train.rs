@@ -9,8 +9,8 @@ use crate::train::{Experience, Progress, Request, Training, resume_on, train_in,
 use crate::{run_folder, tasks};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
+use nearl_runtime::Task;
 use nearl_runtime::link::RobotName;
-use nearl_runtime::{PolicyKind, Task};
 use std::collections::BTreeSet;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -207,11 +207,7 @@ impl Train {
         }
         let experience = self.experience(&stop)?;
         // Said with the first batch: a training that is refused says why, and nothing else.
-        let mut told = manifest.clone();
-        if run.algo.is_direct() {
-            told.policy = PolicyKind::Direct;
-        }
-        let mut advice = crate::train::advice(&told)?;
+        let mut advice = crate::train::advice(run.algo, &manifest)?;
         if !run.starts_warm {
             advice.extend(crate::train::ends_in_warm_up(run.algo, run.steps, &manifest)?);
         }

@@ -6,24 +6,40 @@ use crate::env::{ChaCha8Rng, SeedableRng, unstated_steps};
 use crate::learn::Algorithm;
 use crate::rollout::RolloutError;
 use crate::settings::TrainSettings;
-use nearl_runtime::Manifest;
 use nearl_runtime::constraints::STOP_GAPS;
 use nearl_runtime::controller::Parts;
+use nearl_runtime::{Manifest, PolicyKind};
 
 /// Resets looked at, and their seed.
 const RESETS: (usize, u64) = (64, 1);
 
-/// One sentence for each thing about the task that runs and is hardly meant, with what to change: what [`doctor::advice`] finds, and joints that
-/// an episode may begin with outside their limits. `manifest` is [`complete`](super::complete).
+/// One sentence for each thing about the task that runs and is hardly meant, with what to change: what [`doctor::advice`] finds, a penalty that
+/// nothing is taken off by, and joints that an episode may begin with outside their limits. `manifest` is [`complete`](super::complete).
 ///
 /// # Errors
 /// [`TrainError`] of a task that cannot be trained at all.
 ///
 /// [`doctor::advice`]: nearl_runtime::doctor::advice
-pub fn advice(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
-    let mut lines = nearl_runtime::doctor::advice(manifest)?;
-    lines.extend(beginnings(manifest)?);
+pub fn advice(algo: Algorithm, manifest: &Manifest) -> Result<Vec<String>, TrainError> {
+    let mut manifest = manifest.clone();
+    if algo.is_direct() {
+        manifest.policy = PolicyKind::Direct;
+    }
+    let mut lines = nearl_runtime::doctor::advice(&manifest)?;
+    lines.extend(vain_penalty(algo, &manifest)?);
+    lines.extend(beginnings(&manifest)?);
     Ok(lines)
+}
+
+/// A penalty on what the projection moves, of actions that nothing projects.
+fn vain_penalty(algo: Algorithm, manifest: &Manifest) -> Result<Option<String>, TrainError> {
+    let penalty = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?.moved_penalty;
+    Ok((penalty > 0.0 && !manifest.proposes()).then(|| {
+        format!(
+            "train.moved_penalty is {penalty} and takes nothing off any reward: no projection moves what '{algo}' puts out; write guard = true under \
+             [constraints], or leave it out"
+        )
+    }))
 }
 
 /// Says so where a run of `steps` ends before a reward is read: the first batch fills the statistics, and the warm-up of PID² reads none.
