@@ -354,6 +354,10 @@ pub fn of_task(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvErr
                       'nearl run'";
         return Err(EnvError::Task { origin: origin.into(), key: "reward".into(), reason: reason.into() });
     }
+    if task.env.is_none() && manifest.simulation.is_some() && !is_known(task) {
+        let reason = "there is none, so that nothing can be earned with this robot; add [reward], or run it with 'nearl plant' and 'nearl run'";
+        return Err(EnvError::Task { origin: origin.into(), key: "reward".into(), reason: reason.into() });
+    }
     let own = [
         ("termination", !task.termination.is_empty()),
         ("reset", !task.reset.is_empty()),

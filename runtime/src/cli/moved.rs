@@ -51,7 +51,9 @@ impl LimitsCommand {
             say(told);
         }
         if verdict != Verdict::Accepted {
-            return Err(format!("{}: {text}", verdict.name()).into());
+            let why =
+                if verdict == Verdict::Other { "the loop keeps the limits it has" } else { verdict.name() };
+            return Err(format!("{why}: {text}").into());
         }
         if !self.json {
             say(format!("{text} at tick {}, {:.0} ms after it was asked for", receipt.tick, 1e3 * took));

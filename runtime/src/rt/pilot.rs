@@ -564,9 +564,15 @@ fn compare(own: &Robot, plant: &RobotMessage) -> Result<(), Refusal> {
         ("observation entries", own.observation.len(), plant.n_obs, MAX_OBS),
     ];
     for (what, have, need, limit) in sizes {
-        if have != need as usize || have > limit {
+        if have != need as usize {
             let text = format!(
-                "the snapshot has {have} {what}, the plant {need}, a message holds {limit}; use a snapshot trained for this task"
+                "the snapshot has {have} {what}, the plant {need}; give the driver as many, or use a snapshot made for this plant"
+            );
+            return refuse(Verdict::ForeignShape, text);
+        }
+        if have > limit {
+            let text = format!(
+                "the snapshot has {have} {what}, and a message holds {limit}; use a smaller robot or task"
             );
             return refuse(Verdict::ForeignShape, text);
         }

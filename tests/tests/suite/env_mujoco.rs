@@ -82,6 +82,24 @@ fn the_reason_is_told_to_its_end() {
     }
 }
 
+/// The library panics at a second geom of a name, and a ground is called `floor` more often than not.
+#[test]
+fn a_floor_beside_one_of_its_name_is_refused() {
+    for (name, bumps, says) in
+        [("floor", None, "adds 'floor'"), ("bumps", Some(0.05), "adds 'bumps'"), ("bumps", None, "")]
+    {
+        let text = PENDULUM.replacen(
+            "<worldbody>",
+            &format!("<worldbody><geom name=\"{name}\" type=\"plane\" size=\"1 1 1\"/>"),
+            1,
+        );
+        let scene = Scene { floor: Some(1.0), bumps, ..Scene::default() };
+        let loaded = Model::with_scene(&text, ModelFormat::Mjcf, None, Options::default(), &scene);
+        let words = loaded.map_or_else(|refused| refused.to_string(), |_| String::new());
+        assert!(words.contains(says) && words.is_empty() == says.is_empty(), "{name}: {words}");
+    }
+}
+
 /// A physics step that is none, unless the task says another.
 #[test]
 fn a_timestep_that_is_none_is_refused() {

@@ -79,6 +79,15 @@ impl Record {
             }
         }
         demos.save(&self.out)?;
+        let task = &snapshot.manifest.task;
+        let drawn = [("random", &task.random), ("pushes", &task.pushes), ("delay", &task.delay)];
+        for (section, _) in drawn.into_iter().filter(|(_, table)| !table.is_empty()) {
+            eprintln!(
+                "nearl: warning: [{section}] draws something of its own in each episode, which is not in '{}': the actions lead through the recorded states \
+                 with that alone; where actions are to be learned from, record with --set '{section}={{}}'",
+                self.out.display()
+            );
+        }
         let mean = returns.iter().sum::<f64>() / returns.len() as f64;
         let (out, lengths) =
             (self.out.display(), demos.episodes.iter().map(|e| e.length).collect::<Vec<_>>());

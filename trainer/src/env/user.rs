@@ -327,8 +327,13 @@ fn sub_steps(task: &Task, model: &Model) -> Result<usize, Mistake> {
         return Err(mistake(
             "time.sim_dt",
             format!(
-                "{} s, but the robot file's timestep is {sim_dt} s; write that, or 0 for another integrator than Euler",
-                t.sim_dt
+                "{} s, but {} is {sim_dt} s; write that, or 0 for another integrator than Euler",
+                t.sim_dt,
+                if task.scene.contains_key("timestep") {
+                    "[scene] timestep"
+                } else {
+                    "the robot file's timestep"
+                }
             ),
         ));
     }

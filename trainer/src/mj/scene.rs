@@ -93,6 +93,17 @@ impl Scene {
             }
         }
         if let Some(friction) = self.floor {
+            // Of two of a name the library panics.
+            let is_taken = spec.geom("floor").is_some();
+            let bumps =
+                self.bumps.is_some() && (spec.geom("bumps").is_some() || spec.hfield("bumps").is_some());
+            if let Some((name, _)) =
+                [("floor", is_taken), ("bumps", bumps)].into_iter().find(|(_, is_taken)| *is_taken)
+            {
+                return Err(MjError::Load(format!(
+                    "[scene] floor adds '{name}', and the file has one of that name already; leave it out, or give that of the file another name"
+                )));
+            }
             let floor =
                 spec.world_body_mut().add_geom().with_name("floor").with_type(MjtGeomBase::mjGEOM_PLANE);
             floor.with_size([0.0, 0.0, 1.0]).with_friction([friction, 0.005, 1e-4]);

@@ -63,7 +63,7 @@ pub(super) fn task_snapshot(task: &str) -> Result<Snapshot, VectorError> {
     if manifest.task.idm.kind == IdmKind::Learned {
         return Err(VectorError::Unusable(format!(
             "task '{task}' has a learned inverse model, so constraints=\"task\" has no way from a proposed state to an action; \
-             give the snapshot of a trained agent: constraints=\"runs/{task}/.../checkpoints/final.safetensors\""
+             give the run folder or the snapshot of an agent trained with pid2-ib, or say actions=\"guarded\" for limits on the actions themselves"
         )));
     }
     train::complete(&mut manifest)?;
