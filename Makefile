@@ -79,7 +79,7 @@ docs: package
 
 test: package
 	cargo test --release --locked --no-fail-fast
-	$(VENV)/bin/python -m pytest python/tests -q -rs --durations=15
+	$(VENV)/bin/python -m pytest python/tests -q -rs --durations=15 --numprocesses 2 --dist worksteal
 
 # Everything that must hold before a change lands.
 check:
