@@ -354,10 +354,6 @@ pub fn of_task(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvErr
                       'nearl run'";
         return Err(EnvError::Task { origin: origin.into(), key: "reward".into(), reason: reason.into() });
     }
-    if task.env.is_none() && manifest.simulation.is_some() && !is_known(task) {
-        let reason = "there is none, so that nothing can be earned with this robot; add [reward], or run it with 'nearl plant' and 'nearl run'";
-        return Err(EnvError::Task { origin: origin.into(), key: "reward".into(), reason: reason.into() });
-    }
     let own = [
         ("termination", !task.termination.is_empty()),
         ("reset", !task.reset.is_empty()),
@@ -366,6 +362,10 @@ pub fn of_task(manifest: &Manifest, origin: &str) -> Result<Box<dyn Env>, EnvErr
     if let Some((key, _)) = own.iter().find(|(_, given)| *given) {
         let reason = "only a task with its own [reward] has it, the native environments bring theirs; add [reward] or take it out";
         return Err(EnvError::Task { origin: origin.into(), key: (*key).into(), reason: reason.into() });
+    }
+    if task.env.is_none() && manifest.simulation.is_some() && !is_known(task) {
+        let reason = "there is none, so that nothing can be earned with this robot; add [reward], or run it with 'nearl plant' and 'nearl run'";
+        return Err(EnvError::Task { origin: origin.into(), key: "reward".into(), reason: reason.into() });
     }
     let (entry, time) = (entry(task.env.as_deref().unwrap_or(&task.name))?, &task.time);
     let env = match entry.build_at {
