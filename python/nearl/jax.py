@@ -22,7 +22,10 @@ except ImportError as error:
 
 
 def project(projector: nearl.Projector) -> Callable[[Any, Any, Any, Any], tuple[jax.Array, jax.Array]]:
-    """The projection as a function of ``(q, v, q_proposal, v_proposal)``, arrays (..., nv) of one shape, differentiable in the proposals."""
+    """The projection as a function of ``(q, v, q_proposal, v_proposal)``, arrays (..., nv) of one shape, differentiable in the proposals.
+
+    Targets are as exact as the proposals, and float32 at least; JAX has float64 where ``jax_enable_x64`` is on.
+    """
     model = projector.model
     if model.nq != model.nv:
         raise ValueError(f"the model has {model.nq} positions for {model.nv} velocities; gradients need joints with one each")
@@ -62,5 +65,9 @@ def project(projector: nearl.Projector) -> Callable[[Any, Any, Any, Any], tuple[
         dq_proposal, dv_proposal = call(backward, *arrays, *derivatives)
         return jnp.zeros_like(arrays[0]), jnp.zeros_like(arrays[1]), dq_proposal, dv_proposal
 
+    def exact(array: Any) -> jax.Array:
+        array = jnp.asarray(array)
+        return array.astype(jnp.promote_types(array.dtype, jnp.float32))
+
     projected.defvjp(run, pull_back)
-    return projected
+    return lambda q, v, q_proposal, v_proposal: projected(*map(exact, (q, v, q_proposal, v_proposal)))

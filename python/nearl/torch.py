@@ -31,7 +31,7 @@ class _Project(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         arrays = [x.detach().cpu().numpy() for x in (q, v, q_proposal, v_proposal)]
         ctx.projector, ctx.arrays = projector, arrays
-        ctx.like = q_proposal.dtype, q_proposal.device
+        ctx.like = torch.promote_types(q_proposal.dtype, torch.float32), q_proposal.device
         targets = projector.project_batch(*arrays)
         return tuple(_tensor(x, ctx.like) for x in (targets.q, targets.v))  # type: ignore[return-value]
 

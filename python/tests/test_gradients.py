@@ -130,3 +130,21 @@ def test_jax_maps_over_samples_as_a_loop_does() -> None:
     np.testing.assert_array_equal(jax.vmap(project)(*blocks)[1].reshape(20, 7), p.project_batch(q, v, q_hat, v_hat).v)
     with pytest.raises(ValueError, match=r"q_proposal has shape \(6,\); give all four arrays the same one, \(7,\) or \(n, 7\)"):
         project(q[0], v[0], q_hat[0, :6], v_hat[0])
+
+
+def test_jax_rounds_no_target_to_the_numbers_of_a_coarse_proposal() -> None:
+    """A proposal in whole numbers had targets in whole numbers: 0 where 0.5 rad/s was the nearest."""
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_enable_x64", True)
+    import nearl.jax
+
+    p, (q, v, _, v_hat) = projector(), cases(20, 7)
+    project, ones = nearl.jax.project(p), np.ones((20, 7))
+    for coarse in (np.int32, np.float16, jax.numpy.bfloat16):
+        target_q, target_v = project(q, v, ones.astype(coarse), ones.astype(coarse))
+        expected = p.project_batch(q, v, ones, ones)
+        assert target_q.dtype in (np.float32, np.float64) and target_v.dtype == target_q.dtype
+        np.testing.assert_allclose(target_q, expected.q, atol=1e-5)
+        np.testing.assert_allclose(target_v, expected.v, atol=1e-5)
+    slopes = jax.grad(lambda v_hat: project(q, v, q, v_hat)[1].sum())(v_hat.astype(np.float32))
+    assert slopes.dtype == np.float32
