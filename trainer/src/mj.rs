@@ -207,6 +207,9 @@ impl Model {
         });
         let mut model = loaded.map_err(|e| match (e, packages::advice(&text)) {
             (MjError::Load(reason), Some(advice)) => MjError::Load(reason + &advice),
+            (MjError::Load(reason), None) if scene.without_solids && reason.contains("mass and inertia") => {
+                MjError::Load(reason + "; [scene] solids = false leaves links without <inertial> no mass: take it out, or write <inertial>")
+            }
             (e, _) => e,
         })?;
         let opt = model.opt_mut();

@@ -370,14 +370,21 @@ pub(super) fn left_alone(Parts { model, layout, .. }: &Parts, held: &[usize]) ->
     left.map(|j| format!("'{}'", j.name)).collect()
 }
 
-/// What a guard by the robot's model does not promise of joints that nothing drives.
+/// What the robot's model does not promise of joints that nothing drives.
 fn undriven(m: &Manifest, parts: &Parts) -> Option<String> {
     let loose = left_alone(parts, &held_dofs(&parts.model, parts.layout.controllable()));
-    (m.guards() && !loose.is_empty()).then(|| {
+    let by_model = m.guards() || m.policy != PolicyKind::Direct && m.task.idm.kind == IdmKind::Pinocchio;
+    let (who, instead) = match m.guards() {
+        true => {
+            ("guard = true reckons", "guard = \"drive\" for a robot on legs, or \"simulator\" in training")
+        }
+        false => ("inverse dynamics by the model reckon", "[idm] kind = \"learned\" for a robot on legs"),
+    };
+    (by_model && !loose.is_empty()).then(|| {
         format!(
-            "guard = true reckons with {} as with joints that nothing drives and nothing touches: on the ground or in contact the limits of the others hold as \
-             far as that is so; where they swing they may push the others harder than their motors can hold, which then leave their limits on position, \
-             velocity and acceleration; take guard = \"drive\" for a robot on legs, or \"simulator\" in training",
+            "{who} with {} as with joints that nothing drives and nothing touches: on the ground or in contact the limits of the others hold as far as that \
+             is so; where they swing they may push the others harder than their motors can hold, which then leave their limits on position, velocity and \
+             acceleration; take {instead}",
             loose.join(", ")
         )
     })

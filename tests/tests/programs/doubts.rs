@@ -166,6 +166,15 @@ const SET_UPS: &[SetUp] = &[
         check: Some("holding"),
     },
     SetUp {
+        what: "a joint that nothing drives, beside analytic inverse dynamics",
+        robot: ("<motor joint=\"elbow\" ctrlrange=\"-30 30\"/>", ""),
+        task: ("[state]", "[state]\ncontrollable = [\"shoulder\"]"),
+        limits: None,
+        says: &["inverse dynamics by the model reckon with 'elbow'", "kind = \"learned\""],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
         what: "a speed limit of a point, and five physics steps in a control period",
         robot: ("timestep=\"0.01\"", "timestep=\"0.002\""),
         task: (
