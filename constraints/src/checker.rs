@@ -404,6 +404,14 @@ impl Checker {
         self.cones[c].row
     }
 
+    /// The share of its size that the state (`q`, `v`) makes of each hard cone that is switched on; 0 for others.
+    pub(crate) fn shares_of(&mut self, (q, v): (&[f64], &[f64]), external: &[f64], out: &mut [f64]) {
+        let mut motion = self.reckoned.motion((q, v), (q, v), external, (None, None));
+        for (out, block) in out.iter_mut().zip(&mut self.cones) {
+            *out = if block.hard && block.enabled { 1.0 + block.cone.breach(&mut motion) } else { 0.0 };
+        }
+    }
+
     /// The share of its size that a motion makes of each hard cone that is switched on, at its end and as it is asked for; 0 for others.
     pub(crate) fn shares(
         &mut self,

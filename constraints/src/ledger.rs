@@ -27,7 +27,8 @@ pub enum Status {
 }
 
 impl Status {
-    /// True when the target is the nearest allowed state to the proposal.
+    /// True when the target answers the proposal: the nearest allowed state, or one near it where the status says why; false when it brakes or is
+    /// refused.
     pub fn is_ok(&self) -> bool {
         !matches!(self, Status::Braked(_) | Status::Refused(_))
     }

@@ -117,6 +117,10 @@ impl Projector {
 
     /// The nearest next state to `(q_proposal, v_proposal)` from the state `(q, v)`.
     ///
+    /// Where a brake is stored, a call goes on from the one before: it may execute the way to stop that was verified then. Take a projector for each
+    /// robot, and `project_batch` for states that do not follow one another. Entries of joints that are not `controllable` are not held: propose
+    /// what these joints do, or where they are at rest.
+    ///
     /// Args:
     ///     q (nq): measured configuration [rad, m], Pinocchio's convention.
     ///     v (nv): measured velocity [rad/s, m/s].

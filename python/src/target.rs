@@ -44,7 +44,8 @@ impl Ledger {
         self.ledger.status.reason()
     }
 
-    /// Whether the target is the nearest allowed state to the proposal.
+    /// Whether the target answers the proposal: the nearest allowed state, or one near it where `reason` says why. False where it is "braked" or
+    /// "refused".
     #[getter]
     fn is_ok(&self) -> bool {
         self.ledger.status.is_ok()
@@ -72,7 +73,8 @@ impl Ledger {
         self.ledger.active.iter().map(row).collect()
     }
 
-    /// Names of the joints and rows that the measured state is beyond already; they may only come back or brake.
+    /// Names of the joints and rows that the measured state is beyond already, and by more than a period takes off a speed; they may only come back
+    /// or brake. Rows over speeds are not named.
     #[getter]
     fn outside(&self) -> Vec<&str> {
         self.ledger.outside.iter().filter_map(|row| self.names.get(*row)).map(String::as_str).collect()
@@ -120,7 +122,7 @@ impl Ledger {
         counts(py, &self.ledger.target_violations)
     }
 
-    /// Whether the tick began within the limits and its target breaks one: what `target_violations` counts over many ticks.
+    /// Whether `outside` names nothing and the target breaks a limit: what `target_violations` counts over many ticks.
     #[getter]
     fn target_breaks(&self) -> bool {
         self.ledger.target_breaks()
@@ -236,7 +238,7 @@ impl Targets {
         self.targets.iter().map(|t| t.ledger.status.name()).collect()
     }
 
-    /// Whether each is the nearest allowed state (n).
+    /// Whether each answers its proposal (n), as `Target.is_ok`.
     #[getter]
     fn is_ok<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {
         PyArray1::from_vec(py, self.targets.iter().map(|t| t.ledger.status.is_ok()).collect())

@@ -303,3 +303,19 @@ def test_hard_jerk_holds_with_position_velocity_and_acceleration():
         nearl.JerkLimit(panda, 300.0, (1.0, 100.0), hard=True)
     with pytest.raises(ValueError, match="hard jerk of .*'panda_joint1'.* has no acceleration limit to brake with"):
         nearl.Projector(panda, [limits[-1]], 1e-3)
+
+
+@pytest.mark.parametrize("kind", ["frame_speed", "energy"])
+def test_a_speed_of_several_joints_that_no_period_takes_off_is_named(kind: str) -> None:
+    """The tick was braked, named nothing, and counted as one that began within its limits."""
+    panda = robot("panda")
+    q, v = np.array([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.7]), np.array([1.0, 0, 0, 0, 0, 0, 0])
+    most = {"frame_speed": 0.4, "energy": 0.3}[kind]
+    limit = nearl.FrameSpeedLimit(panda, "panda_hand", most) if kind == "frame_speed" else nearl.EnergyLimit(panda, most)
+    joints = [nearl.PositionLimit(panda), nearl.VelocityLimit(panda), nearl.AccelerationLimit(panda, 10.0)]
+    p = nearl.Projector(panda, [*joints, limit], dt=0.004)
+    slow, fast = p.project(q, 0.2 * v, q, 0.2 * v), p.project(q, v, q, v)
+    assert slow.outside == [] and slow.is_ok
+    assert fast.status == "braked" and len(fast.outside) == 1 and not fast.target_breaks, (fast.status, fast.outside)
+    assert sum(fast.target_violations.values()) > 0
+    assert (np.abs(fast.v) < np.abs(v) + 1e-12).all()

@@ -479,6 +479,7 @@ impl Projector {
         self.write(q, v, proposal, target);
         self.keep_the_motors(q, v, proposal, target);
         let stored = self.settings.braking == Braking::Stored && self.backup.stored;
+        self.name_cones(q, v, &mut target.ledger.outside);
         self.report_rung(q, v, target, if stored { Rung::StoredBrake } else { Rung::Brake });
         Status::Braked(reason)
     }

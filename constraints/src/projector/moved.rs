@@ -34,6 +34,9 @@ use way::{gain, rest, way};
 /// A speed above its limit by this share is rounding.
 const ROUNDING: f64 = 1e-9;
 
+/// A state is beyond a cone where it makes this share more of it.
+const TOO_FAST: f64 = 1e-6;
+
 /// What limits are moved to, and what is in force on the way.
 pub(super) struct Moving {
     /// Some limit is moved.
@@ -312,6 +315,17 @@ impl Projector {
             }
             self.consistent[i] &= goal == self.goal[i];
             self.goal[i] = goal;
+        }
+    }
+
+    /// Names the hard cones that the state itself is beyond, where that is why it brakes.
+    pub(super) fn name_cones(&mut self, q: &[f64], v: &[f64], rows: &mut Vec<usize>) {
+        let m = &mut self.moving;
+        self.checker.shares_of((q, v), &self.external, &mut m.reached);
+        for c in 0..m.shares.len() {
+            if m.reached[c] > m.shares[c] * (1.0 + TOO_FAST) {
+                name(rows, self.checker.cone_row(c));
+            }
         }
     }
 

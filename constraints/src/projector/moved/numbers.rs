@@ -115,7 +115,11 @@ impl Projector {
         let (built, moved) =
             (Dof::of(&self.limits, i), Dof { lower: low, upper: high, ..Dof::of(&self.limits, i) });
         let name = self.model.dof_name(i);
-        if self.dofs.single[i].is_none() || built.acceleration.is_infinite() {
+        if self.dofs.single[i].is_none() {
+            let what = format!("joint '{name}' has no range of positions, so that none can be moved");
+            return Err(LimitError::Unusable { what, next: "leave it out, and name joints that have one" });
+        }
+        if built.acceleration.is_infinite() {
             let what =
                 format!("joint '{name}' has no acceleration limit to stop with in front of a position");
             return Err(LimitError::Unusable { what, next: "build with acceleration = { limit = ... }" });
