@@ -73,8 +73,8 @@ impl Ledger {
         self.ledger.active.iter().map(row).collect()
     }
 
-    /// Names of the joints and rows that the measured state is beyond already, and by more than a period takes off a speed; they may only come back
-    /// or brake. Rows over speeds are not named.
+    /// Names of the joints and rows that the measured state is beyond already; they may only come back or brake. A joint whose speed a period
+    /// brings back is not named, nor is a row over speeds, and `frame_speed` and `energy` are where they make the robot brake.
     #[getter]
     fn outside(&self) -> Vec<&str> {
         self.ledger.outside.iter().filter_map(|row| self.names.get(*row)).map(String::as_str).collect()

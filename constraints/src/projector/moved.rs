@@ -34,7 +34,7 @@ use way::{gain, rest, way};
 /// A speed above its limit by this share is rounding.
 const ROUNDING: f64 = 1e-9;
 
-/// A state is beyond a cone where it makes this share more of it.
+/// A state is beyond a cone that it exceeds by more than this share of its limit.
 const TOO_FAST: f64 = 1e-6;
 
 /// What limits are moved to, and what is in force on the way.
@@ -321,6 +321,9 @@ impl Projector {
     /// Names the hard cones that the state itself is beyond, where that is why it brakes.
     pub(super) fn name_cones(&mut self, q: &[f64], v: &[f64], rows: &mut Vec<usize>) {
         let m = &mut self.moving;
+        if m.shares.is_empty() {
+            return;
+        }
         self.checker.shares_of((q, v), &self.external, &mut m.reached);
         for c in 0..m.shares.len() {
             if m.reached[c] > m.shares[c] * (1.0 + TOO_FAST) {

@@ -83,8 +83,8 @@ impl Record {
         let drawn = [("random", &task.random), ("pushes", &task.pushes), ("delay", &task.delay)];
         for (section, _) in drawn.into_iter().filter(|(_, table)| !table.is_empty()) {
             eprintln!(
-                "nearl: warning: [{section}] draws something of its own in each episode, which is not in '{}': the actions lead through the recorded states \
-                 with that alone; where actions are to be learned from, record with --set '{section}={{}}'",
+                "nearl: warning: [{section}] draws something of its own in each episode, and '{}' does not say what: only with that do the \
+                 actions lead from one recorded state to the next; to learn from the actions, record with --set '{section}={{}}'",
                 self.out.display()
             );
         }

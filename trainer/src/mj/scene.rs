@@ -94,12 +94,10 @@ impl Scene {
         }
         if let Some(friction) = self.floor {
             // Of two of a name the library panics.
-            let is_taken = spec.geom("floor").is_some();
-            let bumps =
-                self.bumps.is_some() && (spec.geom("bumps").is_some() || spec.hfield("bumps").is_some());
-            if let Some((name, _)) =
-                [("floor", is_taken), ("bumps", bumps)].into_iter().find(|(_, is_taken)| *is_taken)
-            {
+            let added = if self.bumps.is_some() { &["floor", "bumps"][..] } else { &["floor"] };
+            let is_taken =
+                |name: &&&str| spec.geom(name).is_some() || **name == "bumps" && spec.hfield(name).is_some();
+            if let Some(name) = added.iter().find(is_taken) {
                 return Err(MjError::Load(format!(
                     "[scene] floor adds '{name}', and the file has one of that name already; leave it out, or give that of the file another name"
                 )));
