@@ -13,7 +13,7 @@ use nearl_runtime::rt::*;
 use nearl_runtime::snapshot::FORMAT;
 use nearl_runtime::{Manifest, Networks, PolicyKind, Snapshot, Task};
 
-use crate::toy::{self, Name};
+use crate::toy::{self, Name, of_its_own};
 
 pub const PATIENCE: Duration = Duration::from_secs(10);
 pub const URDF: &str = include_str!("../../../examples/robots/panda/panda.urdf");
@@ -230,7 +230,7 @@ pub struct File(pub PathBuf);
 
 impl File {
     pub fn new(test: &str, snapshot: &Snapshot) -> File {
-        let path = std::env::temp_dir().join(format!("nearl-{}-{test}.safetensors", std::process::id()));
+        let path = std::env::temp_dir().join(format!("nearl-{}.safetensors", of_its_own(test)));
         snapshot.save(&path).unwrap();
         File(path)
     }
@@ -258,7 +258,7 @@ pub struct Scratch(pub PathBuf);
 
 impl Scratch {
     pub fn new(test: &str) -> Scratch {
-        let folder = std::env::temp_dir().join(format!("nearl-test-{}-{test}", std::process::id()));
+        let folder = std::env::temp_dir().join(format!("nearl-test-{}", of_its_own(test)));
         std::fs::create_dir_all(&folder).unwrap();
         Scratch(folder)
     }

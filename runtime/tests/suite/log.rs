@@ -1,27 +1,12 @@
 //! The flight log: readable by an independent reader.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 
+use crate::arm::Scratch;
 use crate::toy::*;
 use nearl_runtime::link::{PlantSettings, remove_files};
 use nearl_runtime::rt::RunSettings;
-
-struct Scratch(PathBuf);
-
-impl Scratch {
-    fn new(test: &str) -> Scratch {
-        let folder = std::env::temp_dir().join(format!("nearl-test-{}-{test}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
-        Scratch(folder)
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
 
 fn run(test: &str, ticks: u64, log: &Path) -> nearl_runtime::rt::RunReport {
     let name = Name::new(test);

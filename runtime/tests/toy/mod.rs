@@ -2,7 +2,7 @@
 #![allow(dead_code, unreachable_pub)] // each test binary uses a part of it
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::{JoinHandle, ThreadId};
 use std::time::Duration;
@@ -164,12 +164,18 @@ pub fn robot(lockstep: bool) -> Robot {
     }
 }
 
+/// What no other call has, of this process or of another: tests run side by side, and two of them may say the same words.
+pub fn of_its_own(words: &str) -> String {
+    static CALLS: AtomicUsize = AtomicUsize::new(0);
+    format!("{}-{}-{words}", std::process::id(), CALLS.fetch_add(1, Ordering::Relaxed))
+}
+
 /// A name of its own for each test; its files are removed at the end.
 pub struct Name(pub RobotName);
 
 impl Name {
     pub fn new(test: &str) -> Name {
-        Name(RobotName::new(&format!("t{}-{test}", std::process::id())).unwrap())
+        Name(RobotName::new(&format!("t{}", of_its_own(test))).unwrap())
     }
 }
 
