@@ -29,6 +29,7 @@ from nearl.states import Receipt, States, from_arrays
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+LARGEST_SNAPSHOT = 256 << 20  # [bytes], as nearl_controller::snapshot::MAX_BYTES
 
 
 class RolloutRefused(RuntimeError):
@@ -93,6 +94,15 @@ def _snapshot_of(path: Path) -> Path:
         if (file := path / "checkpoints" / f"{name}.safetensors").is_file():
             return file
     raise FileNotFoundError(f"cannot read snapshot '{path}': the folder has no checkpoints/final.safetensors or latest.safetensors; give a run folder with one")
+
+
+def _content_of(file: Path) -> bytes:
+    """What a file holds that a loop can take; a pipe or a device is not opened."""
+    if not file.is_file():
+        raise OSError(f"cannot read snapshot '{file}': it is not a regular file; give a snapshot file or a run folder")
+    if (size := file.stat().st_size) > LARGEST_SNAPSHOT:
+        raise OSError(f"cannot read snapshot '{file}': it has {size} bytes, more than the limit of {LARGEST_SNAPSHOT}; give a snapshot file or a run folder")
+    return file.read_bytes()
 
 
 def _check_finite(name: str, value: Any) -> None:
@@ -219,13 +229,14 @@ class Link:
         """Puts a snapshot (a file, a run folder or bytes) into the running loop; what does not fit the robot is refused.
 
         Raises:
-            OSError: the file cannot be read.
+            OSError: the file cannot be read, is not a regular file, or is larger than 256 MiB.
             ConnectionError: there is no loop, no answer came, or another trainer pushes to it.
         """
         if isinstance(snapshot, bytes):
             return Receipt(*self._running().push(snapshot, self._patience))
         file = _snapshot_of(Path(snapshot))
-        receipt = Receipt(*self._running().push(file.read_bytes(), self._patience))
+        content = _content_of(file)
+        receipt = Receipt(*self._running().push(content, self._patience))
         return receipt if receipt.accepted else replace(receipt, text=f"'{file}': {receipt.text}")
 
     def move_limits(self, **moved: Any) -> Receipt:

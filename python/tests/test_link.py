@@ -1,5 +1,6 @@
 """nearl.Link against a server in another process: the same bits again, what a chunk holds, refusals, cancelling."""
 
+import os
 import subprocess
 import sys
 import uuid
@@ -11,7 +12,7 @@ import pytest
 from conftest import ROOT
 
 import nearl
-from nearl.link import RolloutRefused
+from nearl.link import LARGEST_SNAPSHOT, RolloutRefused
 
 SNAPSHOT = ROOT / "examples" / "snapshots" / "panda-reach.safetensors"
 NEARL = ROOT / "target" / "release" / "nearl"
@@ -111,3 +112,17 @@ def test_no_server_is_named_with_what_to_start() -> None:
         nearl.Link(name, patience=0.05).rollout(seed=0, n_steps=1)
     with pytest.raises(ValueError, match="letters, digits"):
         nearl.Link("a/b").rollout(seed=0, n_steps=1)
+
+
+def test_a_push_of_what_no_snapshot_can_be_is_refused_unread(tmp_path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "endless").symlink_to("/dev/zero")
+    with open(tmp_path / "large", "wb") as file:
+        file.truncate(LARGEST_SNAPSHOT + 1)
+    link = nearl.Link(f"none-{uuid.uuid4().hex[:8]}", patience=0.05)
+    odd, too_large = "it is not a regular file", f"it has {2**28 + 1} bytes, more than the limit of {2**28}"
+    for name, why in (("fifo", odd), ("endless", odd), ("large", too_large)):
+        with pytest.raises(OSError, match=f"^cannot read snapshot '{tmp_path / name}': {why}; give a snapshot file or a run folder$"):
+            link.push(tmp_path / name)
+    with pytest.raises(ConnectionError):
+        link.push(SNAPSHOT)

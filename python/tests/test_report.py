@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -19,6 +20,8 @@ import nearl
 from nearl import curves, report
 from nearl.report import flight, rows
 from nearl.report.read import ReadError, read_log, read_run
+
+NEARL = ROOT / "target" / "release" / "nearl"
 
 
 @pytest.fixture(scope="module")
@@ -201,8 +204,24 @@ def test_a_log_with_a_flipped_bit_is_refused_in_a_sentence(chunks, tmp_path) -> 
         file.write_bytes(content)
         done = subprocess.run([sys.executable, "-m", "nearl.report", "--log", str(file), "--out", str(tmp_path / "r.html")], capture_output=True, text=True)
         assert done.returncode == 1 and not (tmp_path / "r.html").exists()
-        begin, end = f"nearl report: '{file}' is a flight log that is damaged (", f"; `nearl verify {file}` tells how far this one is sound\n"
+        begin = f"nearl report: '{file}' is a flight log that is damaged ("
+        end = "; neither a report nor `nearl verify` can tell what of it holds; give another copy of it\n"
         assert done.stderr.startswith(begin) and done.stderr.endswith(end) and done.stderr.count("\n") == 1, done.stderr
+        verified = subprocess.run([NEARL, "verify", file], capture_output=True, text=True)
+        assert verified.returncode == 2 and "cannot be verified" in verified.stderr, "as the sentence says"
+
+
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "endless").symlink_to("/dev/zero")
+    (tmp_path / "folder").mkdir()
+    whats = {"pipe": "is not a regular file", "endless": "is not a regular file", "folder": "is a folder, not a regular file", "gone": "does not exist"}
+    given = [(option, name) for option in ("--log", "--eval", "--summary", "--demos") for name in whats]
+    program = f"from nearl.report.__main__ import main; print([main([option, name]) for option, name in {given}])"
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.stdout == f"{[1] * len(given)}\n" and not (tmp_path / "report.html").exists(), done.stderr
+    for line, (_, name) in zip(done.stderr.splitlines(), given, strict=True):
+        assert line.startswith(f"nearl report: '{name}' {whats[name]}; give "), line
 
 
 def test_the_pull_from_states_is_the_sum_of_the_multipliers(tmp_path) -> None:

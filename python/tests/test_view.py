@@ -6,6 +6,7 @@ import re
 import shutil
 import socket
 import subprocess
+import sys
 import uuid
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,6 +19,7 @@ from conftest import ROOT
 import nearl
 from nearl import _core, view
 from nearl.view.panel import BARS
+from nearl.view.server import serve
 from nearl.view.show import PROPOSAL, ROBOT, TARGET, source_of
 from nearl.view.sources import labels
 
@@ -223,13 +225,93 @@ def browser_at(port: int, size: tuple[int, int]) -> Iterator:
 
 @contextlib.contextmanager
 def page_of(source: view.Loop) -> Iterator[view.Page]:
-    viser = pytest.importorskip("viser")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+    pytest.importorskip("viser")
+    server = serve(0, "test")
     yield view.Page(server, source)
     server.stop()
+
+
+def answer(port: int, head: bytes) -> bytes:
+    """What the view sends back at first; nothing where it hangs up."""
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as connection:
+        connection.sendall(head)
+        with contextlib.suppress(ConnectionError):
+            return connection.recv(65536)
+    return b""
+
+
+WEBSOCKET = (
+    "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    "Sec-WebSocket-Protocol: viser-v1\r\n"
+)
+
+
+@pytest.fixture(scope="module")
+def port() -> Iterator[int]:
+    pytest.importorskip("viser")
+    server = serve(0, "test")
+    yield server.get_port()
+    server.stop()
+
+
+@pytest.mark.parametrize("upgrade, good", [("", b"200 OK"), (WEBSOCKET, b"101 Switching Protocols")], ids=["page", "websocket"])
+def test_the_view_answers_what_was_asked_of_its_own_names_alone(port: int, upgrade: str, good: bytes) -> None:
+    def asked(*lines: str) -> bytes:
+        return answer(port, ("GET / HTTP/1.1\r\n" + "".join(f"{line}\r\n" for line in lines) + upgrade + "\r\n").encode())
+
+    own = [f"{name}:{at}" for name in ("localhost", "LOCALHOST", "127.0.0.1", "[::1]") for at in (port, 9000)] + ["localhost"]
+    for host in own:
+        assert good in asked(f"Host: {host}") and good in asked(f"Host: {host}", f"Origin: http://{host}"), host
+    foreign = ("evil.example", f"evil.example:{port}", "localhost.evil.example", f"localhost:{port}.evil.example", "127.0.0.1.evil.example", "")
+    refused = [(f"Host: {host}",) for host in foreign]
+    refused += [(f"Host: {own[0]}", f"Origin: {origin}") for origin in ("http://evil.example", "null", f"http://localhost:{port + 1}", f"https://{own[0]}")]
+    for lines in [*refused, (), (f"Host: {own[0]}", "Host: evil.example"), (f"Host: {own[0]}", f"Origin: http://{own[0]}", "Origin: http://evil.example")]:
+        given = asked(*lines)
+        assert b" 403 " in given and good not in given, lines
+        name, body = ("Origin" if "Origin" in "".join(lines) else "Host"), given.split(b"\r\n\r\n")[1].decode()
+        assert body.startswith(f"nearl view: {name} of this request is ") and body.endswith(f"; open http://localhost:{port}\n"), body
+
+
+def test_a_viser_that_cannot_be_checked_is_not_shown(monkeypatch) -> None:
+    viser = pytest.importorskip("viser")
+    stopped = []
+
+    class Other:
+        def __init__(self, **_) -> None:
+            pass
+
+        def stop(self) -> None:
+            stopped.append(True)
+
+    monkeypatch.setattr(viser, "ViserServer", Other)
+    with pytest.raises(view.ViewError, match="cannot check who asks viser"):
+        serve(0, "test")
+    assert stopped
+
+
+def test_what_is_no_request_leaves_no_traceback_and_an_error_of_ours_does() -> None:
+    pytest.importorskip("viser")
+    program = """if True:
+        import socket, sys, time
+        from nearl.view import server
+        own = server.serve(0, "test")
+        for head in (b"\\x16\\x03\\x01\\x02\\r\\n\\r\\n", b"POST / HTTP/1.1\\r\\n\\r\\n", b"GET /", b""):
+            with socket.create_connection(("127.0.0.1", own.get_port()), 30) as connection:
+                connection.sendall(head)
+                connection.shutdown(socket.SHUT_WR)
+                while connection.recv(4096):
+                    pass
+        print("quiet", file=sys.stderr, flush=True)
+        server._refusal = lambda *_: 1 / 0
+        with socket.create_connection(("127.0.0.1", own.get_port()), 30) as connection:
+            connection.sendall(b"GET / HTTP/1.1\\r\\nHost: localhost\\r\\n\\r\\n")
+            while connection.recv(4096):
+                pass
+        own.stop()
+    """
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    before, _, after = done.stderr.partition("quiet\n")
+    assert done.returncode == 0 and before == "" and "ZeroDivisionError" in after, done.stderr
 
 
 class Still:

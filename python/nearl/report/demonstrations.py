@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nearl import _core
-from nearl.report.read import ReadError
+from nearl.report.read import ReadError, regular
 from nearl.report.style import MUTED, PROJECTED, image, strip
 from nearl.runs import demonstrations_of
 
@@ -53,7 +53,7 @@ class Demonstrations:
 def read_demonstrations(path: Path, task: str | None = None) -> Demonstrations:
     """A file as ``nearl demos record`` writes it."""
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with np.load(regular(path, "a file written by 'nearl demos record'"), allow_pickle=False) as data:
             missing = [name for name in NEEDED if name not in data.files]
             if missing:
                 raise ReadError(f"'{path}' has no array '{missing[0]}'; give a file written by 'nearl demos record'")

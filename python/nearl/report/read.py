@@ -126,7 +126,7 @@ def _content(path: Path) -> tuple[dict[str, str], dict[str, list[bytes]], bool]:
         from mcap.stream_reader import StreamReader
     except ImportError as error:
         raise ReadError("reading a flight log needs the mcap package: pip install 'nearl[viz]'") from error
-    content = path.read_bytes()
+    content = regular(path, "a file written by 'nearl run --log'").read_bytes()
     metadata: dict[str, str] = {}
     topics: dict[int, str] = {}
     messages: dict[str, list[tuple[int, bytes]]] = {}
@@ -150,10 +150,18 @@ def _content(path: Path) -> tuple[dict[str, str], dict[str, list[bytes]], bool]:
     return metadata, {topic: [data for _, data in sorted(found, key=lambda m: m[0])] for topic, found in messages.items()}, not complete
 
 
+def regular(path: Path, wanted: str) -> Path:
+    """The path if a regular file is there; a pipe or a device, which may be without end, is not opened."""
+    if path.is_file():
+        return path
+    what = "does not exist" if not path.exists() else "is a folder, not a regular file" if path.is_dir() else "is not a regular file"
+    raise ReadError(f"'{path}' {what}; give {wanted}")
+
+
 def _damaged(path: Path, error: Exception) -> str:
     return (
-        f"'{path}' is a flight log that is damaged ({str(error) or type(error).__name__}); take another copy of it; `nearl verify {path}` tells how far this "
-        "one is sound"
+        f"'{path}' is a flight log that is damaged ({str(error) or type(error).__name__}); neither a report nor `nearl verify` can tell what of it holds; "
+        "give another copy of it"
     )
 
 
@@ -184,7 +192,7 @@ class Summary:
 
 def read_json(path: Path) -> Summary:
     """Everything known in a JSON file, whatever it is wrapped in: ``nearl eval|run|demo --json``."""
-    content, name = json_of(path), path.stem
+    content, name = json_of(regular(path, "the output of 'nearl eval --json', 'nearl run --json' or 'nearl demo'")), path.stem
     found = Summary(
         list(_find(content, {"mode", "returns"}, name)),
         list(_find(content, {"compute", "wake", "ticks"}, name)),

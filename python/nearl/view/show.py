@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from nearl.view.figure import Figure, led
 from nearl.view.panel import Panel
+from nearl.view.server import serve
 from nearl.view.sources import Loop, Picture, Source, ViewError
 from nearl.view.training import Training
 
@@ -72,21 +73,21 @@ def view(name: str, task: str | None = None, port: int = 8080, seconds: float | 
     Args:
         name: As in ``nearl run --plant NAME``, or a run folder.
         task: Name of the task or task file, whose robot is drawn; None takes what the loop says.
-        port: Of the page, on this machine alone.
+        port: Of the page, on this machine alone; see docs/SECURITY.md for who can open it.
         seconds: How long; None until the loop is gone.
         rate: Pictures a second.
 
     Raises:
-        ViewError: viser is not installed, or the robot is not known.
+        ViewError: viser is not installed or of a version that cannot be checked, or the robot is not known.
         ConnectionError: there is no loop.
     """
     try:
         import mujoco  # noqa: F401
-        import viser
+        import viser  # noqa: F401
     except ImportError as error:
         raise ViewError(f"the live view needs viser: pip install 'nearl[view]' ({error})") from error
     source = source_of(name, task)
-    server = viser.ViserServer(host="127.0.0.1", port=port, label=f"NEARL: {source.title}", verbose=False)
+    server = serve(port, f"NEARL: {source.title}")
     page = Page(server, source)
     print(f"http://localhost:{server.get_port()} (robot orange, its proposal blue, the projected target green)", flush=True)
     shown, end, heard = 0, None if seconds is None else time.monotonic() + seconds, time.monotonic()
