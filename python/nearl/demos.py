@@ -29,6 +29,7 @@ from nearl.recorded import (
     Rows,
     check_others,
     check_period,
+    check_turns,
     check_units,
     check_velocities,
     column,
@@ -56,6 +57,7 @@ from nearl.sources import (
 
 Floats = NDArray[np.float64]
 _BASE_Q = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_TURN = (".qw", ".qx", ".qy", ".qz")
 _BASE_V = ("x", "y", "z", "wx", "wy", "wz")
 
 
@@ -128,14 +130,14 @@ def from_columns(
         check_velocities(columns, _entries(env)[1], qvel, rates, dt, where, told)
         rows = Rows(n, dt, period)
         known = [name for name in (*env.obs_names, *goal_names(env)) if name in columns]
-        recorded = {name: rows.newest(column(columns, name, n, where)) for name in known}
+        recorded = {name: column(columns, name, n, where) for name in known}
         qpos, qvel = rows.states(qpos), rows.states(qvel)
         if not rows.whole:
             _unit(env, qpos)
         if len(qpos) < 2:
             raise BadDemonstrations(f"{where}: {n} rows {dt:g} s apart make no transition of the policy's {period:g} s; give more rows, and dt in seconds")
         state = dict(zip([*_entries(env)[0], *_entries(env)[1]], [*qpos.T, *qvel.T]))
-        parts["observations"].append(observations(env, recorded, state, qpos, qvel, period, where))
+        parts["observations"].append(observations(env, recorded, rows, state, qpos, qvel, period, where, told))
         parts["qpos"].append(qpos)
         parts["qvel"].append(qvel)
         if actions:
@@ -194,7 +196,8 @@ def from_minari(
 ) -> Path:
     """Reads a Minari dataset, or the one of that name on this machine, whose observations are those of the task, or have the columns ``names``.
 
-    Its actions come along; ``actions=()`` leaves them out.
+    Minari has neither names of entries nor a period: without ``names`` the order is taken to be that of the task's observation, and without
+    ``dt`` the time between two rows to be its ``time.dt``. Its actions come along; ``actions=()`` leaves them out.
     """
     env = _core.Env(os.fspath(task))
     source = f"Minari dataset '{dataset}'" if isinstance(dataset, str) else "Minari dataset"
@@ -326,7 +329,7 @@ def from_lerobot(
     if "timestamp" in features:
         wanted.append("timestamp")  # held against the rate
     parts = lerobot_rows(folder, info, wanted)
-    values = np.array(parts[key], float)
+    values = numbers(parts[key], f"'{key}'", source)
     if values.ndim != 2 or values.shape[1] != len(names):
         raise BadDemonstrations(
             f"{source}: '{key}' has shape {values.shape} and {len(names)} names; give names=, one for each entry: <joint>, "
@@ -335,7 +338,7 @@ def from_lerobot(
     once(names, source)
     columns = dict(zip(names, values.T))
     if actions:
-        acted = np.array(parts["action"], float)
+        acted = numbers(parts["action"], "'action'", source)
         acted = acted[:, None] if acted.ndim == 1 else acted  # a single number is no list
         of_action = feature_names(features["action"]) or [f"action.{k}" for k in range(acted.shape[1])]
         if acted.ndim != 2 or acted.shape[1] != len(of_action):
@@ -425,9 +428,10 @@ def _states(env: _core.Env, columns: Mapping[str, ArrayLike], dt: float, where: 
     if not given:
         raise BadDemonstrations(f"{where}: none of the task's columns ({', '.join(q_names)}); it has {', '.join(columns)}")
     n = len(np.atleast_1d(numbers(columns[given[0]], f"column '{given[0]}'", where)))
-    # a place that the task does not observe is of no matter; a joint's angle is
-    of_no_matter = lambda name: not any(name in observed for observed in env.obs_names)  # noqa: E731
+    # a place that the task does not observe is of no matter; a joint's angle is, and so is how the base is turned, for which there is no 0
+    of_no_matter = lambda name: not name.endswith(_TURN) and not any(name in observed for observed in env.obs_names)  # noqa: E731
     qpos = np.stack([np.zeros(n) if name not in columns and of_no_matter(name) else column(columns, name, n, where) for name in q_names], 1)
+    check_turns(q_names, qpos, where)
     _unit(env, qpos)
     rates = _rates(q_names, v_names, qpos, dt)
     qvel = _central(rates) if n > 1 else np.zeros((n, len(v_names)))

@@ -29,6 +29,9 @@ _JITTER = 0.05  # part of dt by which recorded times may differ from it
 _GAP = 0.5  # part of dt by which one step of time may
 _UNITS = (1.0, 1e3, 1e6, 1e9)  # of recorded times in a second
 _OUT = 3.0  # times the speed of the rows around at which a step is a jump
+_NORM = 0.15  # by which the norm of a quaternion may differ from one: Gymnasium's Ant begins with 0.9 to 1.12
+_APART, _PART = 0.01, 0.05  # of the task's units, and of the largest value, by which a recorded entry of the observation may differ from the computed one
+_OFTEN = 0.1  # part of the rows in which it must, as velocities at an impact do in a few
 # Columns that say of which episode a row is, and at which time it was, by their names without case and signs.
 _EPISODE = re.compile(r"(episodes?|ep|demo|demonstration|traj|trajectory|rollout|trial)(index|idx|id|number|num|no|nr)?")
 _TIME = re.compile(r"(time|timestamps?|stamp|t|elapsed|seconds|secs?)(s|secs?|seconds|ms|us|ns|milliseconds|microseconds|nanoseconds)?")
@@ -42,6 +45,11 @@ class BadDemonstrations(ValueError):
 
 def numbers(values: ArrayLike, what: str, where: str) -> Floats:
     """An array of real numbers."""
+    if np.ma.is_masked(values):
+        row = np.argwhere(np.ma.getmask(values))[0][0]
+        raise BadDemonstrations(
+            f"{where}: {what} is masked in row {row}, so it has no value there; fill it, or give the rows before and after as episodes of their own"
+        )
     try:
         given = np.asarray(values)
         if not np.iscomplexobj(given):
@@ -152,6 +160,18 @@ def _check_times(columns: Columns, name: str, n: int, dt: float, where: str) -> 
         )
 
 
+def check_turns(names: Sequence[str], qpos: Floats, where: str) -> None:
+    """Refuses quaternions among positions (n x nq) that are far from length one, and so no rotations."""
+    for k, name in enumerate(names):
+        if name.endswith(".qw"):
+            norms = np.linalg.norm(qpos[:, k : k + 4], axis=1)
+            if len(off := np.flatnonzero(np.abs(norms - 1) > _NORM)):
+                raise BadDemonstrations(
+                    f"{where}: the quaternion of columns {', '.join(names[k : k + 4])} has the norm {norms[off[0]]:.3g} in row {off[0]}, and that of a "
+                    f"rotation is 1 (within {_NORM}); where tracking was lost, leave the rows out and give those before and after as episodes of their own"
+                )
+
+
 def check_units(
     of_task: _core.Controller,
     names: tuple[Sequence[str], Sequence[str]],
@@ -187,7 +207,7 @@ def check_units(
         if (at := _jump(rates[:, k], limit)) is not None and "q." + joint in names[0]:
             if (key := f"jump of {joint}") not in told:
                 told.add(key)
-                _warn_of_jump(joint, qpos[:, names[0].index("q." + joint)], at, dt, limit, where)
+                _warn_of_jump(joint, qpos[:, names[0].index("q." + joint)], *at, dt, limit, where)
             continue
         row = int(np.argmax(np.abs(qvel[:, k])))
         if (speed := abs(qvel[row, k])) > _FAST * limit > 0:
@@ -209,21 +229,30 @@ def _warn_of_range(joint: str, value: float, row: int, limits: tuple[float, floa
     )
 
 
-def _jump(rate: Floats, limit: float) -> int | None:
-    """The row after which a joint is faster (n - 1) than its limit, and far faster than before and after."""
+def _jump(rate: Floats, limit: float) -> tuple[int, bool] | None:
+    """The row after which a joint is faster (n - 1) than its limit, and far faster than before and after; and whether it is back one row later."""
     speed = np.abs(rate)
-    beside = np.pad(speed, 1)
-    out = (speed > limit) & (speed > _OUT * np.maximum(beside[:-2], beside[2:]))
-    return int(np.argmax(np.where(out, speed, 0.0))) if limit > 0 and out.any() else None
+    away_and_back = np.where(rate[1:] * rate[:-1] < 0, np.minimum(speed[1:], speed[:-1]), 0.0)
+    for back, steps in ((False, speed), (True, away_and_back)):
+        beside = np.pad(speed, 1)
+        out = (steps > limit) & (steps > _OUT * np.maximum(beside[: len(steps)], beside[len(beside) - len(steps) :]))
+        if limit > 0 and out.any():
+            return int(np.argmax(np.where(out, steps, 0.0))), back
+    return None
 
 
-def _warn_of_jump(joint: str, positions: Floats, row: int, dt: float, limit: float, where: str) -> None:
+def _warn_of_jump(joint: str, positions: Floats, row: int, back: bool, dt: float, limit: float, where: str) -> None:
     a, b = positions[row : row + 2]
-    turned = abs(abs(b - a) / (2 * np.pi) - 1) < 0.1
-    reason = "take the turn out with numpy.unwrap" if turned else "look whether rows are missing there, or another episode begins (in CSV a column 'episode')"
+    returns = f" and back to {positions[row + 2]:.4g}" if back else ""
+    if abs(abs(b - a) / (2 * np.pi) - 1) < 0.1:
+        reason = "take the turn out with numpy.unwrap"
+    elif back:
+        reason = f"look whether the measurement of row {row + 1} was lost, and put one between those beside in its place"
+    else:
+        reason = "look whether rows are missing there, or another episode begins (in CSV a column 'episode')"
     warnings.warn(
-        f"{where}: joint '{joint}' jumps from {a:.3g} in row {row} to {b:.3g} in the next, {abs(b - a) / dt:.3g} rad/s or m/s with dt = {dt:g} s, where the "
-        f"task's limit is {limit:.3g}; {reason}",
+        f"{where}: joint '{joint}' jumps from {a:.4g} in row {row} to {b:.4g} in the next{returns}, {abs(b - a) / dt:.3g} rad/s or m/s with dt = {dt:g} s, "
+        f"where the task's limit is {limit:.3g}; {reason}",
         stacklevel=4,
     )
 
@@ -329,21 +358,35 @@ def goal_names(env: _core.Env) -> list[str]:
     return names if len(names) == len(env.goal) else []
 
 
-def observations(env: _core.Env, recorded: Mapping[str, Floats], state: Mapping[str, Floats], qpos: Floats, qvel: Floats, period: float, where: str) -> Floats:
+def observations(
+    env: _core.Env,
+    columns: Mapping[str, Floats],
+    rows: Rows,
+    state: Mapping[str, Floats],
+    qpos: Floats,
+    qvel: Floats,
+    period: float,
+    where: str,
+    told: set[str],
+) -> Floats:
     """Observations (n x n_obs) of an episode.
 
-    What follows from the state and from what was asked for is the task's own. What does not, as noise, is what was recorded.
+    What follows from the state and from what was asked for is the task's own; what was recorded of it should be the same. What does not, as noise, is what
+    was recorded.
 
     Args:
         env: Of the task.
-        recorded: Columns (n) of the recording by name.
+        columns: Observed and asked for, as they were recorded, by name.
+        rows: Which rows of them are these n.
         state: Columns (n) of ``qpos`` and ``qvel`` by name.
         qpos: Configurations (n x nq).
         qvel: Velocities (n x nv).
         period: Between two of them [s].
         where: Source and episode, for messages.
+        told: Columns that were warned of.
     """
     goals = goal_names(env)
+    recorded = {name: rows.newest(of) for name, of in columns.items()}
     given = [(k, recorded[name]) for k, name in enumerate(goals) if name in recorded]
 
     def look(seed: int, rows: range) -> Floats:
@@ -353,10 +396,12 @@ def observations(env: _core.Env, recorded: Mapping[str, Floats], state: Mapping[
     n = len(qpos)
     seen, some = look(0, range(n)), range(0, n, max(1, n // _LOOKS))
     others = [look(seed, some) for seed in range(1, _DRAWS)]
-    lacking = []
+    lacking, computed = [], {}
     for k, name in enumerate(env.obs_names):
         drawn = any(not np.array_equal(other[:, k], seen[some, k]) for other in others)
         if not drawn and not name.startswith("cfrc."):
+            if name in columns and name not in state and name not in goals:
+                computed[name] = seen[:, k]
             continue
         if (own := state.get(name, recorded.get(name))) is not None:
             seen[:, k] = own
@@ -369,7 +414,29 @@ def observations(env: _core.Env, recorded: Mapping[str, Floats], state: Mapping[
             f"{', '.join(missing or lacking)} as they were when it was recorded"
             + ("" if missing else ", or convert with a task file without [noise] and [random]")
         )
+    _check_observed(columns, rows, computed, where, told)
     return seen
+
+
+def _check_observed(columns: Mapping[str, Floats], rows: Rows, computed: Mapping[str, Floats], where: str, told: set[str]) -> None:
+    """Warns of recorded entries of the observation that are not what the task computes from the same states: those are of other joints, or in other units."""
+    wrong = []
+    for name, own in computed.items():
+        given = rows.states(columns[name][:, None])[:, 0]
+        off = np.abs(given - own) > _APART + _PART * max(np.abs(given).max(), np.abs(own).max())
+        if name not in told and np.mean(off) >= _OFTEN:
+            told.add(name)
+            k = int(np.argmax(off))
+            row = int(rows.newest(np.arange(len(columns[name]), dtype=float))[k])
+            said = f"column '{name}' is {given[k]:.4g} in row {row}, where positions and velocities give {own[k]:.4g} in the task's units (rad, m, s)"
+            wrong.append((f"{said}, and {100 * np.mean(off):.3g} % of the rows are as far off", name))
+    if wrong:
+        also = f" (likewise {', '.join(name for _, name in wrong[1:])})" if wrong[1:] else ""
+        warnings.warn(
+            f"{where}: {wrong[0][0]}{also}; what they give is written. Look whether the joints' columns have the right names and units, and whether the column "
+            f"is of this robot's tool; if it alone is wrong, leave it out",
+            stacklevel=4,
+        )
 
 
 def _seen(env: _core.Env, qpos: Floats, qvel: Floats, time: float, goal: list[tuple[int, float]]) -> Floats:

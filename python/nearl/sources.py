@@ -114,18 +114,21 @@ def _take(values: "array[float]", row: Sequence[str], heading: Sequence[str], wh
     if len(row) != len(heading):
         raise BadDemonstrations(f"{where}: {len(row)} cells below a heading of {len(heading)} columns; give one number for each column")
     try:
-        values.extend(map(float, row))
+        values.extend([float(cell) for cell in row])
     except ValueError:
-        name, cell = next((name, cell) for name, cell in zip(heading, row) if _number(cell) is None)
-        said = f"is '{cell}', which is no number" if cell.strip() else "is empty"
-        raise BadDemonstrations(f"{where}: column '{name}' {said}; give a number, or leave the column out") from None
+        for name, cell in zip(heading, row):
+            if (number := _number(cell)) is None:
+                said = f"is '{cell}', which is no number" if cell.strip() else "is empty"
+                raise BadDemonstrations(f"{where}: column '{name}' {said}; give a number, or leave the column out") from None
+            values.append(number)
 
 
 def _number(cell: str) -> float | None:
+    """Of a cell; a truth value, as pandas writes it, is 1 or 0."""
     try:
         return float(cell)
     except ValueError:
-        return None
+        return {"true": 1.0, "false": 0.0}.get(cell.strip().lower())
 
 
 def npz_arrays(file: FilePath, needed: Sequence[str], other: Sequence[str]) -> dict[str, NDArray[Any]]:
@@ -180,6 +183,7 @@ def lerobot_rows(folder: FilePath, info: Mapping[str, Any], wanted: Sequence[str
             raise BadDemonstrations(f"'{file}': no column '{missing[0]}'; it has {', '.join(table) or 'none that is asked for'}: get the file again")
         for name, rows in parts.items():
             rows += table[name]
+            _check_widths(table, name, np.shape(rows[:1])[1:], file)
         frames += table.get("frame_index", [])
     of = np.array(parts["episode_index"])
     split({}, of, source)  # refuses episodes whose rows are not together
@@ -189,6 +193,16 @@ def lerobot_rows(folder: FilePath, info: Mapping[str, Any], wanted: Sequence[str
             f"{source}: {lack}{hint}; get the dataset again, the whole of it, or give the episodes that are whole to nearl.demos.from_columns"
         )
     return parts
+
+
+def _check_widths(table: Mapping[str, list[Any]], name: str, shape: tuple[int, ...], file: Path) -> None:
+    """Refuses a row of a feature that has more or fewer entries than the dataset's first."""
+    for row, entries in enumerate(table[name]):
+        if (other := np.shape(entries)) != shape:
+            raise BadDemonstrations(
+                f"'{file}': '{name}' has shape {other} in row {row} (episode {table['episode_index'][row]}), and {shape} in the dataset's first row; get the "
+                f"file again, or give the episodes that are whole to nearl.demos.from_columns"
+            )
 
 
 def _parquet(file: Path, names: Sequence[str]) -> dict[str, list[Any]]:

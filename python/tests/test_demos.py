@@ -101,6 +101,62 @@ def test_a_base_that_turns_ever_faster_has_the_velocity_of_each_row(tmp_path: Pa
     np.testing.assert_allclose(data["qvel"][inner, 0], 0.6 * t[inner], atol=1e-9)
 
 
+def turning(n: int = 20, dt: float = 0.05) -> dict[str, np.ndarray]:
+    """Ant turns about its z axis at 0.4 rad/s, and its joints stand."""
+    t = np.arange(n) * dt
+    columns = {f"q.{joint}": (0.0 if joint.startswith("hip") else 0.9) + 0 * t for joint in _core.Env("Ant-v5").joint_names[1:]}
+    columns |= {f"q.root.{entry}": value + 0 * t for entry, value in zip(("x", "y", "z", "qx", "qy"), (0, 0, 0.75, 0, 0))}
+    return columns | {"q.root.qw": np.cos(0.2 * t), "q.root.qz": np.sin(0.2 * t)}
+
+
+@pytest.mark.parametrize("norm", [0.0, 1e-9, 0.1, 0.84, 1.16, 2.0])
+def test_a_quaternion_that_is_no_rotation_is_refused(tmp_path: Path, norm: float) -> None:
+    """As trackers write it where they lost the robot; in the second episode here."""
+    lost = turning()
+    for entry in ("qw", "qx", "qy", "qz"):
+        lost[f"q.root.{entry}"] = lost[f"q.root.{entry}"] * np.where(np.arange(20) == 11, norm, 1.0)
+    said = rf"episode 1: the quaternion of columns q.root.qw, q.root.qx, q.root.qy, q.root.qz has the norm {norm:.3g} in row 11, .* leave the rows out"
+    with pytest.raises(demos.BadDemonstrations, match=said):
+        demos.from_columns("Ant-v5", [turning(), lost], tmp_path / "a.npz", dt=0.05)
+    assert not (tmp_path / "a.npz").exists()
+
+
+def test_a_quaternion_that_is_nearly_one_has_its_direction(tmp_path: Path) -> None:
+    rounded = {name: 0.9 * of if name.startswith("q.root.q") else of for name, of in turning().items()}
+    data = checked(demos.from_columns("Ant-v5", [rounded], tmp_path / "a.npz", dt=0.05), "Ant-v5")
+    half = 0.2 * 0.05 * np.arange(20)
+    np.testing.assert_allclose(data["qpos"][:, 3:7], np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1), rtol=0, atol=1e-12)
+
+
+def test_how_a_base_is_turned_is_asked_for_where_nothing_observes_it(tmp_path: Path) -> None:
+    """There is no 0 among rotations, as there is among places."""
+    (tmp_path / "float.xml").write_text(
+        '<mujoco><option timestep="0.01"/><worldbody><body name="base"><freejoint name="root"/><geom size=".1" mass="1"/><body name="leg">'
+        '<joint name="knee" axis="0 1 0" range="-90 90"/><geom size=".05" mass="1"/></body></body></worldbody>'
+        '<actuator><motor joint="knee" ctrlrange="-9 9"/></actuator></mujoco>'
+    )
+    task = tmp_path / "float.toml"
+    task.write_text(
+        'name = "float"\n[model]\nmjcf = "float.xml"\n[time]\ndt = 0.02\nsim_dt = 0.01\n[state]\nobservation = ["q.knee", "v.knee"]\ncontrollable = ["knee"]\n'
+        '[reward]\na = "1"\n[constraints]\nconsistency = "free"\nposition = {}\n[idm]\nkind = "learned"\n'
+    )
+    with pytest.raises(demos.BadDemonstrations, match="episode 0: no column 'q.root.qw'; it has q.knee"):
+        demos.from_columns(task, [{"q.knee": np.zeros(9)}], tmp_path / "a.npz", dt=0.02)
+    turned = {"q.knee": np.zeros(9)} | {f"q.root.{entry}": np.full(9, value) for entry, value in zip(("qw", "qx", "qy", "qz"), (0.6, 0.8, 0, 0))}
+    with np.load(demos.from_columns(task, [turned], tmp_path / "a.npz", dt=0.02)) as data:
+        assert data["qpos"][4].tolist() == [0, 0, 0, 0.6, 0.8, 0, 0, 0], "a place may be missing"
+
+
+def test_masked_values_are_no_values(tmp_path: Path) -> None:
+    columns = episode()
+    part = columns | {"q.leg_joint": np.ma.array(columns["q.leg_joint"], mask=np.isin(np.arange(30), (12, 20)))}
+    with pytest.raises(demos.BadDemonstrations, match="episode 0: column 'q.leg_joint' is masked in row 12, so it has no value there; fill it, or give"):
+        demos.from_columns("Hopper-v5", [part], tmp_path / "a.npz", dt=0.008)
+    whole = {name: np.ma.array(of, mask=np.zeros(30, bool)) for name, of in columns.items()}
+    data = checked(demos.from_columns("Hopper-v5", [whole], tmp_path / "a.npz", dt=0.008))
+    assert np.array_equal(data["qpos"][:, 4], columns["q.leg_joint"])
+
+
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 180 / np.pi, 1e-3])
 def test_velocities_that_positions_do_not_follow_are_warned_of(tmp_path: Path, factor: float) -> None:
     right = [episode(60), episode(60, 1)]
@@ -387,6 +443,19 @@ def test_lerobot_as_lerobot_writes_it(tmp_path: Path) -> None:
     data = checked(demos.from_lerobot("Hopper-v5", tmp_path / "set", tmp_path / "a.npz"))
     assert data["lengths"].tolist() == [11, 8] and float(data["dt"]) == 0.008
     assert np.array_equal(data["qpos"][12:, 5].astype(np.float32), parts[1]["q.foot_joint"].astype(np.float32))
+
+
+def test_lerobot_with_a_row_of_another_width_is_refused(tmp_path: Path) -> None:
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    folder = lerobot_in_files(tmp_path / "set", [8, 12], 10, True)
+    file = folder / "data" / "chunk-000" / "file-001.parquet"
+    table = parquet.read_table(file)
+    for entries, shape in (([0.0] * 4, r"\(4,\)"), (None, r"\(\)")):
+        rows = table["observation.state"].to_pylist()
+        rows[3] = entries
+        parquet.write_table(table.set_column(0, "observation.state", pa.array(rows, pa.list_(pa.float32()))), file)
+        with pytest.raises(demos.BadDemonstrations, match=rf"file-001.parquet': 'observation.state' has shape {shape} in row 3 \(episode 1\), and \(6,\) in"):
+            demos.from_lerobot("Hopper-v5", folder, tmp_path / "a.npz")
 
 
 def test_an_agent_learns_from_them(tmp_path: Path) -> None:

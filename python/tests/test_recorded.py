@@ -4,6 +4,7 @@ import os
 import subprocess
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_the_period_is_the_policys(tmp_path: Path) -> None:
     """Of rows that are finer every so many are taken as they are, and the trainer takes the file."""
     task = tmp_path / "still.toml"
     text = arm(tmp_path, []).read_text().replace(', ""', "").split("[commands]")
-    task.write_text(text[0] + '[reward]\nnear = "-x.tip"\n' + text[1].split("y.tip)^2\"\n")[1])
+    task.write_text(text[0] + '[reward]\nnear = "-x.tip"\n' + text[1].split('y.tip)^2"\n')[1])
     columns = recording(90, 0.005)
     columns["v.shoulder"] = np.arange(90) / 90
     for dt, rows in ((0.02, slice(None)), (0.005, slice(None, None, 4))):
@@ -224,6 +225,77 @@ def test_positions_outside_of_the_range_are_told_by_joint(tmp_path: Path) -> Non
     far = columns | {"q.elbow": np.linspace(0.0, upper + 1.01 * (upper - lower), 60)}
     with pytest.raises(demos.BadDemonstrations, match="numpy.radians"):
         demos.from_columns(task, [far], tmp_path / "a.npz", dt=0.02, overwrite=True)
+
+
+def still(folder: Path, observation: str) -> Path:
+    """The arm without commands."""
+    text = arm(folder, []).read_text()
+    head, rest = text.split("[commands]")
+    first = head.split("observation =")[0]
+    tail = head.split("\npropose")[1]
+    task = f'{first}observation = [{observation}]\npropose{tail}[reward]\nnear = "-x.tip"\n[constraints]{rest.split("[constraints]")[1]}'
+    (folder / "still.toml").write_text(task)
+    return folder / "still.toml"
+
+
+def swing(n: int = 60) -> dict[str, np.ndarray]:
+    """Both joints and the tip of links of 0.4 and 0.3 m, whose place is plane trigonometry."""
+    t = np.arange(n) * 0.02
+    shoulder, elbow = 0.5 * np.sin(t), 0.9 + 0.3 * np.cos(2 * t)
+    tip = {"x.tip": 0.4 * np.cos(shoulder) + 0.3 * np.cos(shoulder + elbow), "y.tip": 0.4 * np.sin(shoulder) + 0.3 * np.sin(shoulder + elbow)}
+    return {"q.shoulder": shoulder, "q.elbow": elbow, "v.shoulder": 0.5 * np.cos(t), "v.elbow": -0.6 * np.sin(2 * t)} | tip
+
+
+def words_of(task: Path, columns: dict[str, np.ndarray], dt: float = 0.02) -> list[str]:
+    """What two episodes of these columns are warned of."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        demos.from_columns(task, [columns, columns], task.parent / "a.npz", dt=dt, overwrite=True)
+    return [str(warning.message) for warning in told]
+
+
+OBSERVED = '"q.shoulder", "q.elbow", "v.shoulder", "v.elbow", "x.tip", "y.tip"'
+
+
+def test_what_was_recorded_of_the_tool_is_held_against_the_joints(tmp_path: Path) -> None:
+    task, columns = still(tmp_path, OBSERVED), swing()
+    assert words_of(task, columns) == []
+    assert words_of(task, columns, 0.013) and all("x.tip" not in words for words in words_of(task, columns, 0.013)), "rows that are interpolated are the same"
+    impact = columns | {"x.tip": columns["x.tip"] + np.where(np.arange(60) < 5, 0.2, 0.0)}
+    assert words_of(task, impact) == [], "a twelfth of the rows"
+    (millimetres,) = words_of(task, columns | {"x.tip": 1e3 * columns["x.tip"]})
+    x = 0.4 + 0.3 * np.cos(1.2)
+    assert f"episode 0: column 'x.tip' is {1e3 * x:.4g} in row 0, where positions and velocities give {x:.4g} in the task's units (rad, m, s)" in millimetres
+    assert "100 % of the rows are as far off; what they give is written. Look whether the joints' columns have the right names and units" in millimetres
+    (swapped,) = words_of(task, columns | {"q.shoulder": columns["q.elbow"], "q.elbow": columns["q.shoulder"],
+                                           "v.shoulder": columns["v.elbow"], "v.elbow": columns["v.shoulder"]})  # fmt: skip
+    assert "column 'x.tip' is" in swapped and "(likewise y.tip)" in swapped
+
+
+def test_the_order_that_minari_does_not_name_is_held_against_the_tool(tmp_path: Path) -> None:
+    task, columns = still(tmp_path, OBSERVED), swing()
+    data = lambda *names: SimpleNamespace(  # noqa: E731
+        iterate_episodes=lambda: [SimpleNamespace(observations=np.stack([columns[name] for name in names], 1), actions=np.zeros((59, 2)))]
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with np.load(demos.from_minari(task, data(*_core.Env(str(task)).obs_names), tmp_path / "a.npz", dt=0.02)) as made:
+            assert np.array_equal(made["qpos"][:, 1], columns["q.elbow"])
+    with pytest.warns(UserWarning, match=r"episode 0: column 'x.tip' is .*, where positions and velocities give .* \(likewise y.tip\)"):
+        demos.from_minari(task, data("q.elbow", "q.shoulder", "v.elbow", "v.shoulder", "x.tip", "y.tip"), tmp_path / "b.npz", dt=0.02)
+
+
+@pytest.mark.parametrize("row", [1, 30, 58])
+@pytest.mark.parametrize("velocities", [True, False])
+def test_a_measurement_that_is_lost_for_one_row_is_told(tmp_path: Path, row: int, velocities: bool) -> None:
+    task = still(tmp_path, '"q.shoulder", "q.elbow", "v.shoulder", "v.elbow"')
+    columns = {name: of for name, of in swing().items() if name.startswith("q." if not velocities else ("q.", "v."))}
+    assert words_of(task, columns) == []
+    elbow = columns["q.elbow"]
+    (words,) = words_of(task, columns | {"q.elbow": np.where(np.arange(60) == row, 0.0, elbow)})
+    jump = f"joint 'elbow' jumps from {elbow[row - 1]:.4g} in row {row - 1} to 0 in the next and back to {elbow[row + 1]:.4g}"
+    assert f"episode 0: {jump}, {elbow[row - 1] / 0.02:.3g} rad/s or m/s with dt = 0.02 s, where the task's limit is 3; look whether" in words
+    assert f"the measurement of row {row} was lost, and put one between those beside in its place" in words
 
 
 def test_arrays_are_written_row_by_row(tmp_path: Path) -> None:

@@ -32,6 +32,16 @@ def test_a_heading_may_be_quoted_and_lines_be_commented(tmp_path: Path) -> None:
     assert converted(tmp_path, "\ufeff" + "\r\n".join([quoted, *rows, ""])).tolist() == [4, 3]
 
 
+def test_truth_values_in_csv_are_ones_and_zeros(tmp_path: Path) -> None:
+    """As pandas writes them: one column that no task has, and one of episodes."""
+    rows = [line(0, k)[1:] for k in range(6)]
+    text = "\n".join([HEADING + ",terminated", *(f"{k > 3}{row},{k == 5}" for k, row in enumerate(rows))])
+    with pytest.warns(UserWarning, match="column 'terminated' is not used"):
+        assert converted(tmp_path, text).tolist() == [3, 1]
+    with np.load(tmp_path / "out.npz") as data:
+        assert data["qpos"][:, 0].tolist() == [float(row.split(",")[1]) for row in rows]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
