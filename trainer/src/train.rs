@@ -11,8 +11,8 @@ mod setup;
 mod source;
 mod start_from;
 
-pub(crate) use advice::beginnings;
 pub use advice::{advice, ends_in_warm_up};
+pub(crate) use advice::{beginnings, demonstrated};
 pub use columns::COLUMNS;
 pub use ranked::RankedSource;
 pub use run::{resume, resume_on, train, train_in, train_on};

@@ -213,6 +213,10 @@ fn what_does_not_fit_is_refused_by_name() {
     refused(&other("HalfCheetah-v5"), &["demos.npz", "its period is 0.008 s, that of the task 0.05 s"]);
     refused(&other("Walker2d-v5"), &["demos.npz", "it has no column"]);
     refused(
+        &asked("bc", &file, &["train.demos.episodes=99"]),
+        &["demos.npz", "train.demos.episodes asks for 99 episodes, and the file has 4; give at most 4, or 0"],
+    );
+    refused(
         &asked("soil", &file, &["train.demos.reward='likeness'"]),
         &["[train.demos.reward]: \"likeness\" is for pid2-il and gaifo, and 'soil'"],
     );
@@ -220,6 +224,18 @@ fn what_does_not_fit_is_refused_by_name() {
         &asked("bc", &file, &["train.demos.reward='tracking'"]),
         &["[train.demos.reward]: \"tracking\" is for soil, dapg and pid2-il, and 'bc'"],
     );
+    let mut other = demos.clone();
+    other.episodes[0].actions[0] = -other.episodes[0].actions[0];
+    for (algo, is_other) in [("dapg", true), ("soil", false)] {
+        demos.save(&file).expect("saved");
+        let mut stopped = Training::new(&asked(algo, &file, &[])).expect("training");
+        stopped.iterate();
+        let checkpoint = stopped.checkpoint().expect("checkpoint");
+        other.save(&file).expect("saved");
+        let error = Training::resume(checkpoint, Path::new("run"), None, 1).map(drop).err();
+        let error = error.map(|e| e.to_string()).unwrap_or_default();
+        assert_eq!(error.contains("it learned from other demonstrations than"), is_other, "{algo}: {error}");
+    }
     let mut bare = demos;
     bare.episodes.iter_mut().for_each(|e| e.actions.clear());
     bare.save(&file).expect("saved");
@@ -232,6 +248,38 @@ fn what_does_not_fit_is_refused_by_name() {
     bare.save(&file).expect("saved");
     let error = Training::resume(checkpoint, Path::new("run"), None, 1).map(drop).expect_err("other file");
     assert!(error.to_string().contains("it learned from other demonstrations than"), "{error}");
+}
+
+/// Another robot has other limits: what was demonstrated beyond them is told by joint, place and share, and is counted anew here.
+#[test]
+fn states_that_were_demonstrated_beyond_the_limits_are_told() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, demos) = demos(folder.path());
+    let said = |more: &[&str]| {
+        let request = asked("bc", &file, more);
+        let mut manifest = request.manifest.clone();
+        nearl_trainer::train::complete(&mut manifest).expect("an environment");
+        let lines = nearl_trainer::train::advice(request.algo, &manifest).expect("advice");
+        lines.into_iter().find(|line| line.contains("demonstrated states have joint 'foot_joint'"))
+    };
+    let fast = demos.names.iter().position(|name| name == "v.foot_joint").expect("a column");
+    let speeds = demos
+        .episodes
+        .iter()
+        .flat_map(|e| e.observations.chunks_exact(demos.names.len()))
+        .map(|row| row[fast]);
+    let (speeds, most) =
+        (speeds.clone().collect::<Vec<f64>>(), speeds.fold(0.0, |most: f64, v| most.max(v.abs())));
+    // Hopper's own observation cuts speeds at 10.
+    let limit = 0.5 * most.min(10.0);
+    let line = said(&[&format!("constraints.velocity={{limit={limit}}}")]).expect("some are faster");
+    let count = speeds.iter().filter(|v| v.abs() > limit).count();
+    assert!(
+        line.starts_with(&format!("{count} of {} demonstrated states have joint 'foot_joint'", speeds.len())),
+        "{line}"
+    );
+    assert!(line.contains("constraints.velocity more room"), "{line}");
+    assert_eq!(said(&["constraints.velocity={limit=1000.0}"]), None);
 }
 
 /// A training that is told how long it is after it has been made, as one from Python is, decays its demonstrations as one that knew.

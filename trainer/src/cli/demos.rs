@@ -3,7 +3,7 @@
 use super::eval::{SIMULATED, changed};
 use super::{Failure, at_least_one, say};
 use crate::demos::{Demonstrations, record};
-use crate::{env, run_folder, tasks};
+use crate::{env, run_folder, tasks, train};
 use clap::{Args, Subcommand};
 use nearl_runtime::Snapshot;
 use std::path::PathBuf;
@@ -105,12 +105,16 @@ impl Check {
     fn run(self) -> Result<(), Failure> {
         let demos = Demonstrations::load(&self.file)?;
         if let Some(task) = &self.task {
-            let manifest = tasks::load(task, &[])?;
+            let mut manifest = tasks::load(task, &[])?;
             let mut env = env::of_task(&manifest, task)?;
             let period = manifest.task.time.dt * manifest.task.time.policy_every as f64;
             demos
                 .check(&mut *env, period)
                 .map_err(|e| format!("demonstrations '{}': {e}", self.file.display()))?;
+            train::complete(&mut manifest)?;
+            for line in train::demonstrated(&demos, &manifest)? {
+                eprintln!("nearl: warning: {line}");
+            }
         }
         let lengths: Vec<usize> = demos.episodes.iter().map(|e| e.length).collect();
         let actions = demos.episodes.iter().all(|e| !e.actions.is_empty());

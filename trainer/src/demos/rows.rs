@@ -43,12 +43,21 @@ impl Demonstrations {
         self.episodes.iter().map(|e| e.length).sum()
     }
 
-    /// The first `n` episodes; all with 0 or more than there are.
-    pub fn first(mut self, n: usize) -> Self {
+    /// The first `n` episodes; all with 0.
+    ///
+    /// # Errors
+    /// More than there are.
+    pub fn first(mut self, n: usize) -> Result<Self, String> {
+        let all = self.episodes.len();
+        if n > all {
+            return Err(format!(
+                "train.demos.episodes asks for {n} episodes, and the file has {all}; give at most {all}, or 0 for all of them"
+            ));
+        }
         if n > 0 {
             self.episodes.truncate(n);
         }
-        self
+        Ok(self)
     }
 
     /// Every state from which an expert went on, with what is to be followed of the one after it: of the proposed entries `state` (indices

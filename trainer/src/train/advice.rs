@@ -2,13 +2,15 @@
 
 use super::TrainError;
 use super::setup::warm_up_of_pid2;
-use crate::env::{ChaCha8Rng, SeedableRng, unstated_steps};
+use crate::demos::{DemoError, Demonstrations};
+use crate::env::{ChaCha8Rng, Env, SeedableRng, unstated_steps};
 use crate::learn::Algorithm;
 use crate::rollout::RolloutError;
 use crate::settings::TrainSettings;
 use nearl_runtime::constraints::STOP_GAPS;
 use nearl_runtime::controller::Parts;
 use nearl_runtime::{Manifest, PolicyKind};
+use std::path::Path;
 
 /// Resets looked at, and their seed.
 const RESETS: (usize, u64) = (64, 1);
@@ -28,6 +30,12 @@ pub fn advice(algo: Algorithm, manifest: &Manifest) -> Result<Vec<String>, Train
     let mut lines = nearl_runtime::doctor::advice(&manifest)?;
     lines.extend(vain_penalty(algo, &manifest)?);
     lines.extend(beginnings(&manifest)?);
+    let own = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?.demos;
+    if algo.demos().is_some() && !own.file.is_empty() && manifest.proposes() {
+        let demos = Demonstrations::load(Path::new(&own.file))?;
+        let wrong = |reason| TrainError::Demos(DemoError { file: own.file.clone(), reason });
+        lines.extend(demonstrated(&demos.first(own.episodes).map_err(wrong)?, &manifest)?);
+    }
     Ok(lines)
 }
 
@@ -63,35 +71,41 @@ pub fn ends_in_warm_up(
     }))
 }
 
-/// Where a joint began furthest outside, and in how many resets.
+/// Where a joint was furthest outside, and in how many of the states looked at.
 #[derive(Clone, Copy, Default)]
 struct Outside {
     by: f64,
     value: f64,
-    resets: usize,
+    states: usize,
 }
 
-/// Whether its simulation states its physics step, and joints that an episode may begin with outside their limits, a sentence each.
-///
-/// # Errors
-/// [`TrainError`] of a task that cannot be simulated.
-pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
-    let Parts { model, layout, projector } = Parts::new(manifest)?;
-    let limits = projector.limits();
-    let mut env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
-    let unstated = unstated_steps(manifest, env.spec());
-    let mut rng = ChaCha8Rng::seed_from_u64(RESETS.1);
-    let (mut q, mut v) = (vec![0.0; model.nq()], vec![0.0; model.nv()]);
-    let mut found = vec![[Outside::default(); 2]; model.nv()];
-    for _ in 0..RESETS.0 {
-        env.reset(&mut rng).map_err(RolloutError::from)?;
-        env.state(&mut q, &mut v);
+/// States of one task, held against the limits of its joints.
+struct States {
+    parts: Parts,
+    /// Configuration and velocity, Pinocchio's convention.
+    state: (Vec<f64>, Vec<f64>),
+    /// Position and velocity of each dof.
+    found: Vec<[Outside; 2]>,
+}
+
+impl States {
+    fn of(manifest: &Manifest) -> Result<Self, TrainError> {
+        let parts = Parts::new(manifest)?;
+        let (nq, nv) = (parts.model.nq(), parts.model.nv());
+        Ok(Self { parts, state: (vec![0.0; nq], vec![0.0; nv]), found: vec![[Outside::default(); 2]; nv] })
+    }
+
+    /// Looks at the state that the environment is in.
+    fn look(&mut self, env: &dyn Env) {
+        let (Parts { model, layout, projector }, (q, v)) = (&self.parts, &mut self.state);
+        let limits = projector.limits();
+        env.state(q, v);
         for &i in layout.controllable() {
             let at = q[model.joint_of_dof(i).idx_q];
             let by = [(limits.q_lower[i] - at).max(at - limits.q_upper[i]), v[i].abs() - limits.velocity[i]];
-            for (outside, (by, value)) in found[i].iter_mut().zip(by.into_iter().zip([at, v[i]])) {
+            for (outside, (by, value)) in self.found[i].iter_mut().zip(by.into_iter().zip([at, v[i]])) {
                 if by > 1.5 * STOP_GAPS[1] {
-                    outside.resets += 1;
+                    outside.states += 1;
                     if by > outside.by {
                         (outside.by, outside.value) = (by, value);
                     }
@@ -99,32 +113,87 @@ pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError>
             }
         }
     }
+
+    /// A sentence for each joint that was outside: how many states are meant, how the joint's name follows, and what happens and helps, by
+    /// the name of the limit.
+    fn sentences(&self, whose: &str, next: impl Fn(&str) -> String) -> Vec<String> {
+        let (Parts { model, layout, projector }, mut lines) = (&self.parts, Vec::new());
+        let limits = projector.limits();
+        for &i in layout.controllable() {
+            let (name, [position, velocity]) = (model.dof_name(i), self.found[i]);
+            let mut say = |outside: Outside, unit: &str, range: String, key: &str| {
+                if outside.states > 0 {
+                    lines.push(format!(
+                        "{} of {whose} joint '{name}' outside its limits, furthest at {:.4} {unit} where {range} is allowed: {}",
+                        outside.states, outside.value, next(key)
+                    ));
+                }
+            };
+            let range = format!("{} to {}", limits.q_lower[i], limits.q_upper[i]);
+            say(position, "rad or m", range, "position");
+            let range = format!("-{0} to {0}", limits.velocity[i]);
+            say(velocity, "rad/s or m/s", range, "velocity");
+        }
+        lines
+    }
+}
+
+/// Whether its simulation states its physics step, and joints that an episode may begin with outside their limits, a sentence each.
+///
+/// # Errors
+/// [`TrainError`] of a task that cannot be simulated.
+pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError> {
+    let mut states = States::of(manifest)?;
+    let mut env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
+    let unstated = unstated_steps(manifest, env.spec());
+    let mut rng = ChaCha8Rng::seed_from_u64(RESETS.1);
+    for _ in 0..RESETS.0 {
+        env.reset(&mut rng).map_err(RolloutError::from)?;
+        states.look(&*env);
+    }
     let mut lines = Vec::from_iter(unstated);
     let is_own = !manifest.task.reward.is_empty();
-    let next = |key: &str| match is_own {
-        true => format!("draw it inside in [reset], or give constraints.{key} more room"),
-        false => format!(
-            "the bundled task draws it there, and no setting changes that: train on, or give constraints.{key} more room, or write a task of your own \
-             with [reward] and [reset] (docs: Train for your own robot)"
+    lines.extend(states.sentences(&format!("{} episodes begin with", RESETS.0), |key| match is_own {
+        true => format!(
+            "it comes back before it does anything else; draw it inside in [reset], or give constraints.{key} more room"
         ),
-    };
-    for &i in layout.controllable() {
-        let (name, [position, velocity]) = (model.dof_name(i), found[i]);
-        let mut say = |outside: Outside, unit: &str, range: String, key: &str| {
-            if outside.resets > 0 {
-                lines.push(format!(
-                    "{} of {} episodes begin with joint '{name}' outside its limits, furthest at {:.4} {unit} where {range} is allowed: it comes back \
-                     before it does anything else; {}",
-                    outside.resets, RESETS.0, outside.value, next(key)
-                ));
-            }
-        };
-        let range = format!("{} to {}", limits.q_lower[i], limits.q_upper[i]);
-        say(position, "rad or m", range, "position");
-        let range = format!("-{0} to {0}", limits.velocity[i]);
-        say(velocity, "rad/s or m/s", range, "velocity");
-    }
+        false => format!(
+            "it comes back before it does anything else; the bundled task draws it there, and no setting changes that: train on, or give \
+             constraints.{key} more room, or write a task of your own with [reward] and [reset] (docs: Train for your own robot)"
+        ),
+    }));
     Ok(lines)
+}
+
+/// Joints that are outside their limits in demonstrated states, a sentence each; nothing of demonstrations of another robot, which
+/// [`Demonstrations::check`] refuses. `manifest` is [`complete`](super::complete).
+///
+/// # Errors
+/// [`TrainError`] of a task that cannot be simulated.
+pub(crate) fn demonstrated(demos: &Demonstrations, manifest: &Manifest) -> Result<Vec<String>, TrainError> {
+    let mut states = States::of(manifest)?;
+    let mut env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
+    let (nq, nv) = (env.qpos().len(), env.qvel().len());
+    if demos
+        .episodes
+        .iter()
+        .any(|e| (e.qpos.len(), e.qvel.len()) != ((e.length + 1) * nq, (e.length + 1) * nv))
+    {
+        return Ok(Vec::new());
+    }
+    let mut all = 0;
+    for (qpos, qvel) in
+        demos.episodes.iter().flat_map(|e| e.qpos.chunks_exact(nq).zip(e.qvel.chunks_exact(nv)))
+    {
+        env.set_state(qpos, qvel).map_err(RolloutError::from)?;
+        states.look(&*env);
+        all += 1;
+    }
+    Ok(states.sentences(&format!("{all} demonstrated states have"), |key| {
+        format!(
+            "what is projected does not follow it there; demonstrate inside the limits of this robot, or give constraints.{key} more room"
+        )
+    }))
 }
 
 #[cfg(test)]

@@ -22,6 +22,8 @@ pub(super) struct Imitation {
     updates: u64,
     batch: u64,
     begins_in_frames: bool,
+    /// Demonstrated actions are learned from.
+    clones: bool,
 }
 
 /// Updates of a run of `steps` whose batches have `batch`, after `warm_ups` and the first.
@@ -77,7 +79,7 @@ impl Imitation {
             )));
         }
         let wrong = |reason| TrainError::Demos(DemoError { file: own.file.clone(), reason });
-        let demos = Demonstrations::load(Path::new(&own.file))?.first(own.episodes);
+        let demos = Demonstrations::load(Path::new(&own.file))?.first(own.episodes).map_err(wrong)?;
         let task = &manifest.task;
         let mut env = crate::env::of_task(manifest, &task.name).map_err(RolloutError::from)?;
         demos.check(&mut *env, task.time.dt * task.time.policy_every as f64).map_err(wrong)?;
@@ -94,6 +96,7 @@ impl Imitation {
             updates: updates(steps, batch, warm_ups),
             batch,
             begins_in_frames: uses.begins_there,
+            clones: uses.needs_actions,
         }))
     }
 
@@ -163,11 +166,12 @@ impl Imitation {
         iterations > 1
     }
 
-    /// What tells these demonstrations from others: a sum over every number in them but the actions.
+    /// What tells these demonstrations from others: a sum over every number in them that is learned from.
     pub(super) fn fingerprint(&self) -> f64 {
         let mut hash = crc32fast::Hasher::new();
         for e in &self.demos.episodes {
-            for list in [&e.observations, &e.qpos, &e.qvel] {
+            let actions = if self.clones { &e.actions[..] } else { &[] };
+            for list in [&e.observations, &e.qpos, &e.qvel, actions] {
                 list.iter().for_each(|x| hash.update(&x.to_le_bytes()));
             }
         }
