@@ -112,7 +112,8 @@ nearl_controller *nearl_controller_load(const char *snapshot, char *error, size_
 nearl_sizes nearl_controller_sizes(const nearl_controller *controller);
 
 /* One control tick without noise: the action (n_act) for q (nq), v (nv) and obs (n_obs). Returns the status; what is below 0 is refused, and the
- * action is then that of the last finite state: brake if it lasts. `ledger` may be NULL. Nothing is allocated. */
+ * action is then that of the last finite state: brake if it lasts. Before the first finite state `action` and `ledger` stay as they were.
+ * `ledger` may be NULL. Nothing is allocated. */
 int nearl_controller_update(nearl_controller *controller, const double *q, const double *v, const double *obs, double *action,
                             nearl_ledger *ledger);
 

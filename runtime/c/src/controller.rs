@@ -41,6 +41,8 @@ pub struct InProcess {
     state: State,
     noise: Noise,
     out: Output,
+    /// A finite state was given.
+    began: bool,
 }
 
 /// Names by number; what is refused has [`REFUSED`].
@@ -73,17 +75,22 @@ impl InProcess {
             policy_every: controller.policy_every(),
             dt: controller.dt(),
         };
-        Ok(InProcess { controller, sizes, state, noise, out })
+        Ok(InProcess { controller, sizes, state, noise, out, began: false })
     }
 
-    fn update(&mut self, q: &[f64], v: &[f64], obs: &[f64], action: &mut [f64]) -> Ledger {
+    /// Nothing before the first finite state: what is not finite is answered as the last finite one, and there is none.
+    fn update(&mut self, q: &[f64], v: &[f64], obs: &[f64], action: &mut [f64]) -> Option<Ledger> {
+        self.began = self.began || [q, v, obs].iter().all(|values| values.iter().all(|x| x.is_finite()));
+        if !self.began {
+            return None;
+        }
         self.state.q.copy_from_slice(q);
         self.state.v.copy_from_slice(v);
         self.state.obs.copy_from_slice(obs);
         let status = self.controller.update(&self.state, &self.noise, &mut self.out);
         action.copy_from_slice(&self.out.action);
         let ledger = &self.out.next.ledger;
-        Ledger {
+        Some(Ledger {
             status: number(status),
             active: ledger.active.len() as u32,
             iterations: ledger.iterations,
@@ -93,7 +100,7 @@ impl InProcess {
             moved: ledger.moved,
             slack: ledger.slack,
             duration_ns: self.out.duration_ns,
-        }
+        })
     }
 }
 
@@ -148,7 +155,7 @@ pub unsafe extern "C" fn nearl_controller_update(
     };
     // SAFETY: by contract.
     let action = unsafe { std::slice::from_raw_parts_mut(action, n_act) };
-    let done = guarded(None, || Some(c.update(q, v, obs, action)));
+    let done = guarded(None, || c.update(q, v, obs, action));
     // SAFETY: by contract.
     if let (Some(done), Some(ledger)) = (done, unsafe { ledger.as_mut() }) {
         *ledger = done;

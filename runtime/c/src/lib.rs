@@ -8,6 +8,7 @@ mod proposer;
 
 use std::ffi::{CStr, c_char, c_int};
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Duration;
 
 pub use controller::{
     Ledger, Sizes, nearl_controller_free, nearl_controller_load, nearl_controller_reset,
@@ -31,6 +32,12 @@ pub extern "C" fn nearl_version() -> *const c_char {
 /// Runs `f`; a panic becomes `otherwise`.
 fn guarded<T>(otherwise: T, f: impl FnOnce() -> T) -> T {
     catch_unwind(AssertUnwindSafe(f)).unwrap_or(otherwise)
+}
+
+/// How long to wait for something: days for infinity, not at all for what is below 0 or no number.
+fn waiting(seconds: f64) -> Duration {
+    let seconds = if seconds.is_nan() { 0.0 } else { seconds.clamp(0.0, 1e6) };
+    Duration::from_secs_f64(seconds)
 }
 
 /// A C string.

@@ -1,6 +1,6 @@
 //! A robot's driver as the plant of a loop.
 
-use super::{REFUSED, guarded, handle, slice, text};
+use super::{REFUSED, guarded, handle, slice, text, waiting};
 use nearl_runtime::link::{Exchange, Robot, RobotName, STATE_RESET, Turn};
 use std::ffi::{c_char, c_int};
 
@@ -104,8 +104,7 @@ impl Plant {
         if state.braked != 0 {
             self.exchange.braked();
         }
-        let patience = if patience.is_finite() { patience.max(0.0) } else { 1e6 };
-        let (turn, given) = match self.exchange.exchange(q, v, obs, patience) {
+        let (turn, given) = match self.exchange.exchange(q, v, obs, waiting(patience).as_secs_f64()) {
             Turn::Act(given) => (0, given),
             Turn::Hold(given) => (1, given),
             Turn::Brake => return Some(2), // also where the loop is of another robot; it will say so

@@ -1,9 +1,8 @@
 //! A process that proposes in place of a policy.
 
-use super::{REFUSED, guarded, handle, slice, text};
+use super::{REFUSED, guarded, handle, slice, text, waiting};
 use nearl_runtime::link::{ProposerLink, RobotName};
 use std::ffi::{CString, c_char, c_int};
-use std::time::Duration;
 
 /// `nearl_proposer`.
 pub struct Proposer {
@@ -15,10 +14,6 @@ pub struct Proposer {
 /// Numbers of a configuration, a velocity and an observation at most.
 const MOST: [usize; 3] =
     [nearl_runtime::link::MAX_JOINTS, nearl_runtime::link::MAX_JOINTS, nearl_runtime::link::MAX_OBS];
-
-fn waiting(seconds: f64) -> Duration {
-    Duration::try_from_secs_f64(seconds.clamp(0.0, 1e6)).unwrap_or_default()
-}
 
 /// # Safety
 /// `name` is null or ends with a zero.

@@ -226,6 +226,39 @@ fn a_controller_in_cpp_obeys_the_limits_and_refuses_by_sentence() {
     assert!(String::from_utf8_lossy(&refused.stderr).contains("cannot read snapshot 'none.safetensors'"));
 }
 
+/// A first state that is no number has no last finite one before it.
+const FIRST: &str = r#"#include <math.h>
+#include <nearl.h>
+#include <stdio.h>
+int main(int n, char **arguments) {
+    char error[300];
+    nearl_controller *c = n == 2 ? nearl_controller_load(arguments[1], error, sizeof error) : NULL;
+    if (!c) return 1;
+    double q = NAN, v = 0.0, obs[2] = {0.0, 0.0}, action = 77.0;
+    for (int k = 0; k < 3; k++) {
+        int status = nearl_controller_update(c, &q, &v, obs, &action, NULL);
+        printf("%d %.17g\n", status < 0, action);
+        q = k == 0 ? 0.1 : NAN;
+    }
+    nearl_controller_free(c);
+    return 0;
+}
+"#;
+
+#[test]
+fn a_first_state_that_is_no_number_leaves_the_action_as_it_was() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (source, file) = (folder.path().join("first.c"), folder.path().join("carriage.safetensors"));
+    std::fs::write(&source, FIRST).expect("writes");
+    snapshot().save(&file).expect("saves");
+    let program = compile("cc", source.to_str().expect("a path"), "-std=c11", folder.path());
+    let done = Command::new(&program).arg(&file).output().expect("runs");
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let found = numbers(&done.stdout);
+    let [1.0, 77.0, 0.0, acted, 1.0, held] = found[..] else { panic!("{found:?}") };
+    assert!(acted != 77.0 && acted == held, "{found:?}");
+}
+
 /// Every function that the library exports is declared, and the other way round.
 #[test]
 fn the_header_names_exactly_what_is_defined() {

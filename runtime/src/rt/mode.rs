@@ -40,7 +40,8 @@ codes! {
         FrozenState = "frozen-state", "The plant goes on sending, but its clock stands still or runs backwards, or its moving joints stand still.",
             "Check the sensor or driver behind the plant: it repeats an old sample.";
         LostStates = "lost-states", "More states in a row were lost between plant and loop than may be bridged.",
-            "Free processor time for plant and runtime, or lower the rate; `hold_states` is the number that is bridged.";
+            "Free processor time for plant and runtime, or lower the rate; a driver's `time` is in seconds and goes on by `dt` with each state. \
+             `hold_states` is the number that is bridged.";
         BadState = "bad-state", "The state holds NaN or infinity.",
             "Check the plant's sensors; the first few are bridged by prediction, then the plant brakes.";
         BadStates = "bad-states", "More states in a row held NaN or infinity than allowed; latched.",
@@ -178,7 +179,7 @@ impl Modes {
         self.mode
     }
 
-    /// Why it is not Active; `None` in Hold and Active.
+    /// Why it is not Active; `None` in Active, and in Hold where no state came at all.
     pub fn reason(&self) -> Reason {
         self.reason
     }
@@ -251,12 +252,23 @@ impl Modes {
         let is_alone = self.mode == Mode::Braking && reason == Reason::StaleState;
         if self.mode.acts() || is_alone {
             self.enter(Mode::Braking, reason);
+        } else {
+            self.stay(reason);
         }
     }
 
     fn degrade(&mut self, reason: Reason) {
         if self.mode.acts() {
             self.enter(Mode::Degraded, reason);
+        } else {
+            self.stay(reason);
+        }
+    }
+
+    /// Of a loop that never acted: what is wrong with the states that came.
+    fn stay(&mut self, reason: Reason) {
+        if self.mode == Mode::Hold && reason != Reason::StaleState {
+            self.reason = reason;
         }
     }
 
@@ -304,6 +316,21 @@ mod tests {
         assert_eq!(modes.reason(), Reason::StaleState);
         assert_eq!(run(&mut modes, Event::Good, 2), Mode::Braking);
         assert_eq!(run(&mut modes, Event::Good, 1), Mode::Active);
+    }
+
+    #[test]
+    fn a_loop_that_never_acted_says_what_is_wrong_with_the_states_that_come() {
+        let mut modes = Modes::new(limits(), 1_000_000);
+        for (event, reason) in [
+            (Event::Lost(Reason::StaleState), Reason::None),
+            (Event::Lost(Reason::LostStates), Reason::LostStates),
+            (Event::Held(Reason::FrozenState), Reason::FrozenState),
+            (Event::Lost(Reason::WrongPeriod), Reason::WrongPeriod),
+            (Event::Lost(Reason::StaleState), Reason::WrongPeriod),
+        ] {
+            assert_eq!((run(&mut modes, event, 1), modes.reason()), (Mode::Hold, reason), "{event:?}");
+        }
+        assert_eq!((run(&mut modes, Event::Good, 1), modes.reason()), (Mode::Active, Reason::None));
     }
 
     #[test]

@@ -142,6 +142,17 @@ impl fmt::Display for RunReport {
             "  timing           overruns {}, skipped {}, late {}, stale {}, states lost {}",
             c.overruns, c.skipped, self.plant.late, c.stale, c.lost_states
         )?;
+        let unusable = [
+            ("not finite", c.bad_states),
+            ("frozen", c.frozen_states),
+            ("implausible", c.implausible_states),
+            ("out of order", c.out_of_order),
+        ];
+        let unusable: Vec<String> =
+            unusable.iter().filter(|(_, n)| *n > 0).map(|(what, n)| format!("{what} {n}")).collect();
+        if !unusable.is_empty() {
+            writeln!(f, "  unusable states  {}", unusable.join(", "))?;
+        }
         writeln!(f, "  limits broken    {}", self.projected())?;
         if !self.statuses.is_empty() || c.refused > 0 {
             let refused = (c.refused > 0).then(|| format!("refused {}", c.refused));

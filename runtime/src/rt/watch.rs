@@ -67,12 +67,17 @@ impl fmt::Display for Found {
 const ELSEWHERE: &str =
     "no single joint, but one that cannot stop in front of its limit, or a limit of several joints";
 
+/// Ticks in a row for which a loop that never acted holds for one reason before it says so: at first, states and proposals come and go.
+const LONG: u32 = 100;
+
 /// What is gathered from the records.
 pub(crate) struct Watch {
     joints: Vec<Watched>,
     counts: BTreeMap<u32, u64>,
     pub(crate) outside: Vec<Found>,
     mode: Mode,
+    /// Why the loop holds since it began, and for how many ticks in a row.
+    hold: (Reason, u32),
     /// Where a mode is told that does not act, and that a driver keeps another period.
     pub(crate) tell: Option<SyncSender<(u64, Mode, Reason)>>,
 }
@@ -87,7 +92,14 @@ fn add(outside: &mut Vec<Found>, found: Found) {
 
 impl Watch {
     pub(crate) fn of(joints: Vec<Watched>) -> Watch {
-        Watch { joints, counts: BTreeMap::new(), outside: Vec::new(), mode: Mode::Hold, tell: None }
+        Watch {
+            joints,
+            counts: BTreeMap::new(),
+            outside: Vec::new(),
+            mode: Mode::Hold,
+            hold: (Reason::None, 0),
+            tell: None,
+        }
     }
 
     /// The limits are these from now on.
@@ -96,9 +108,12 @@ impl Watch {
     }
 
     pub(crate) fn take(&mut self, record: &Record) {
-        let is_told = matches!(record.mode, Mode::Fault | Mode::Hold) || record.reason == Reason::WrongPeriod;
-        if std::mem::replace(&mut self.mode, record.mode) != record.mode
-            && is_told
+        let is_told = record.mode == Mode::Fault || record.reason == Reason::WrongPeriod;
+        let is_new = std::mem::replace(&mut self.mode, record.mode) != record.mode;
+        let holds = record.mode == Mode::Hold && record.reason != Reason::None;
+        let still = holds && self.hold.0 == record.reason;
+        self.hold = (record.reason, if still { self.hold.1.saturating_add(1) } else { 0 });
+        if (self.hold.1 == LONG || is_new && is_told)
             && let Some(tell) = &self.tell
         {
             // Where nobody reads, the mode still stands in the report.
@@ -165,5 +180,39 @@ impl Watch {
             LedgerStatus::ActionsBounded,
         ];
         LedgerStatus::ALL.iter().filter(|status| !usual.contains(status)).filter_map(of).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::mpsc::sync_channel;
+
+    /// What is told of ticks with these reasons.
+    fn told(ticks: impl Iterator<Item = (Mode, Reason)>) -> Vec<(u64, Mode, Reason)> {
+        let (tell, told) = sync_channel(64);
+        let mut watch = Watch::of(Vec::new());
+        watch.tell = Some(tell);
+        for (tick, (mode, reason)) in (1..).zip(ticks) {
+            let mut record = Record::new();
+            (record.tick, record.mode, record.reason) = (tick, mode, reason);
+            watch.take(&record);
+        }
+        drop(watch);
+        told.iter().collect()
+    }
+
+    #[test]
+    fn a_loop_that_holds_for_one_reason_says_it_once() {
+        let hold = |reason, n| std::iter::repeat_n((Mode::Hold, reason), n);
+        let begin = hold(Reason::None, 500)
+            .chain(hold(Reason::SilentProposer, 90))
+            .chain(hold(Reason::LostStates, 500));
+        assert_eq!(told(begin), [(691, Mode::Hold, Reason::LostStates)]);
+        let comes =
+            hold(Reason::LostStates, 90).chain(std::iter::repeat_n((Mode::Active, Reason::None), 500));
+        assert_eq!(told(comes), []);
+        let fault = std::iter::repeat_n((Mode::Fault, Reason::BadStates), 500);
+        assert_eq!(told(fault), [(1, Mode::Fault, Reason::BadStates)]);
     }
 }

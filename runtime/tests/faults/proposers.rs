@@ -61,7 +61,7 @@ fn pose(by: f64) -> Vec<f64> {
 fn a_proposal_is_followed_held_and_missed_by_its_age() {
     let mut flight = flight();
     flight.fly(5);
-    assert_eq!(flight.at(5), (Mode::Hold, Reason::None), "nothing was proposed yet");
+    assert_eq!(flight.at(5), (Mode::Hold, Reason::SilentProposer), "nothing was proposed yet");
     for seq in 1..=500 {
         let by = 0.1 * (seq as f64 / 400.0).min(1.0);
         flight.proposal = Some(proposal(&flight, seq, &pose(by)));
@@ -131,7 +131,7 @@ fn what_is_no_answer_is_refused_and_counted() {
     }
     let counters = flight.counters();
     assert_eq!((counters.refused_proposals, counters.proposals, counters.overtaken_proposals), (n, 0, 0));
-    assert_eq!(flight.at(11), (Mode::Hold, Reason::None));
+    assert_eq!(flight.at(11), (Mode::Hold, Reason::SilentProposer));
     flight.proposal = Some(proposal(&flight, n + 5, &pose(0.1)));
     flight.fly(2);
     assert_eq!((flight.at(13).0, flight.counters().overtaken_proposals), (Mode::Active, 4));
