@@ -1,7 +1,8 @@
 //! Turns what NumPy accepts into vectors, and vectors into arrays.
 
 use numpy::{
-    AllowTypeChange, PyArray1, PyArray2, PyArrayDyn, PyArrayLikeDyn, PyArrayMethods, PyUntypedArrayMethods,
+    AllowTypeChange, PyArray1, PyArray2, PyArrayDyn, PyArrayLikeDyn, PyArrayMethods, PyUntypedArray,
+    PyUntypedArrayMethods,
 };
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -36,6 +37,7 @@ fn numbers<'py>(
     value: &Bound<'py, PyAny>,
 ) -> PyResult<PyArrayLikeDyn<'py, f64, AllowTypeChange>> {
     refuse_complex(name, value)?;
+    refuse_masked(name, value)?;
     value.extract().map_err(|_| {
         let kind = value.get_type().to_string();
         PyValueError::new_err(format!("{name} is not an array of numbers but {kind}; pass a NumPy array"))
@@ -63,10 +65,52 @@ pub(crate) fn refuse_complex(name: &str, value: &Bound<'_, PyAny>) -> PyResult<(
 /// A single number.
 pub(crate) fn number(name: &str, value: &Bound<'_, PyAny>) -> PyResult<f64> {
     refuse_complex(name, value)?;
+    value.extract().map_err(|_| PyTypeError::new_err(format!("{name} is of {}; give a number", kind(value))))
+}
+
+/// A whole number from `least` on.
+pub(crate) fn whole(name: &str, value: &Bound<'_, PyAny>, least: u32) -> PyResult<u32> {
+    let asked = format!("give a whole number from {least} to {}", u32::MAX);
+    if !value.hasattr("__index__")? {
+        return Err(PyTypeError::new_err(format!("{name} is of {}; {asked}", kind(value))));
+    }
+    match value.extract() {
+        Ok(number) if number >= least => Ok(number),
+        _ => Err(PyValueError::new_err(format!("{name} is {value}; {asked}"))),
+    }
+}
+
+/// Steps of a simulator in a period; 0 for constant acceleration.
+pub(crate) fn sub_steps(value: &Bound<'_, PyAny>) -> PyResult<u32> {
+    whole("sub_steps", value, 0)
+}
+
+/// Names of joints: a text alone is none of them, although it is a sequence.
+pub(crate) fn joint_names(name: &str, value: &Bound<'_, PyAny>) -> PyResult<Vec<String>> {
     value.extract().map_err(|_| {
-        let kind = value.get_type().name().map_or("another type".into(), |kind| kind.to_string());
-        PyTypeError::new_err(format!("{name} is of {kind}; give a number"))
+        PyTypeError::new_err(format!(
+            "{name} is of {}; give a list of the names of joints, e.g. {name}=[\"elbow\"]",
+            kind(value)
+        ))
     })
+}
+
+fn kind(value: &Bound<'_, PyAny>) -> String {
+    value.get_type().name().map_or("another type".into(), |kind| kind.to_string())
+}
+
+/// NumPy gives what lies under a mask as if it were meant.
+fn refuse_masked(name: &str, value: &Bound<'_, PyAny>) -> PyResult<()> {
+    if value.is_exact_instance_of::<PyUntypedArray>() || !value.hasattr("mask")? {
+        return Ok(());
+    }
+    let masked = value.py().import("numpy")?.getattr("ma")?.call_method1("is_masked", (value,))?;
+    if masked.is_truthy()? {
+        return Err(PyValueError::new_err(format!(
+            "{name} holds masked numbers, and a state has a number for each joint; fill them, e.g. {name}.filled(0.0)"
+        )));
+    }
+    Ok(())
 }
 
 /// In C order, whatever the strides were.

@@ -8,7 +8,7 @@ use nearl_trainer::robot;
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 
-use crate::arrays::{array, array2, vector};
+use crate::arrays::{array, array2, sub_steps, vector};
 use crate::errors;
 
 type Vector<'py> = Bound<'py, PyArray1<f64>>;
@@ -238,7 +238,7 @@ impl Model {
         v: &Bound<'py, PyAny>,
         a: &Bound<'py, PyAny>,
         dt: f64,
-        sub_steps: u32,
+        #[pyo3(from_py_with = sub_steps)] sub_steps: u32,
     ) -> PyResult<Vector<'py>> {
         if !(dt.is_finite() && dt > 0.0) {
             return Err(errors::value(format!(

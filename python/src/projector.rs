@@ -10,7 +10,7 @@ use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arrays::{array, array2, matrix, number, rows};
+use crate::arrays::{array, array2, joint_names, matrix, number, rows, sub_steps, whole};
 use crate::errors;
 use crate::limits;
 use crate::model::Model;
@@ -66,10 +66,10 @@ impl Projector {
         model: Py<Model>,
         limits: &Bound<'_, PyAny>,
         dt: &Bound<'_, PyAny>,
-        controllable: Option<Vec<String>>,
+        #[pyo3(from_py_with = controllable_names)] controllable: Option<Vec<String>>,
         consistency: &str,
         solver: &str,
-        sub_steps: u32,
+        #[pyo3(from_py_with = sub_steps)] sub_steps: u32,
         velocity_weight: Option<Vec<f64>>,
         braking: &str,
         deadline: Option<f64>,
@@ -138,7 +138,7 @@ impl Projector {
         v: &Bound<'_, PyAny>,
         q_proposal: &Bound<'_, PyAny>,
         v_proposal: &Bound<'_, PyAny>,
-        previous: Option<(Bound<'_, PyAny>, Bound<'_, PyAny>)>,
+        #[pyo3(from_py_with = pair)] previous: Option<(Bound<'_, PyAny>, Bound<'_, PyAny>)>,
     ) -> PyResult<Target> {
         let (state, py) = (self.state(q, v, q_proposal, v_proposal)?, q.py());
         let model = self.model.get();
@@ -167,7 +167,7 @@ impl Projector {
         v: &Bound<'_, PyAny>,
         q_proposal: &Bound<'_, PyAny>,
         v_proposal: &Bound<'_, PyAny>,
-        threads: Option<usize>,
+        #[pyo3(from_py_with = threads)] threads: Option<usize>,
     ) -> PyResult<Targets> {
         self.refuse_previous(
             q.py(),
@@ -226,7 +226,7 @@ impl Projector {
         v_proposal: &Bound<'py, PyAny>,
         dq: &Bound<'py, PyAny>,
         dv: &Bound<'py, PyAny>,
-        threads: Option<usize>,
+        #[pyo3(from_py_with = threads)] threads: Option<usize>,
     ) -> PyResult<Pair<'py>> {
         self.refuse_previous(q.py(), "a batch", "build a projector without it")?;
         let (rows, n) = self.rows(q, v, q_proposal, v_proposal)?;
@@ -397,6 +397,20 @@ impl Projector {
         }
         Ok((rows, n))
     }
+}
+
+fn controllable_names(value: &Bound<'_, PyAny>) -> PyResult<Option<Vec<String>>> {
+    if value.is_none() { Ok(None) } else { joint_names("controllable", value).map(Some) }
+}
+
+fn threads(value: &Bound<'_, PyAny>) -> PyResult<Option<usize>> {
+    if value.is_none() { Ok(None) } else { whole("threads", value, 1).map(|n| Some(n as usize)) }
+}
+
+fn pair<'py>(value: &Bound<'py, PyAny>) -> PyResult<Option<(Bound<'py, PyAny>, Bound<'py, PyAny>)>> {
+    value.extract().map_err(|_| {
+        errors::value("previous is no pair; give the acceleration and the motor force of the tick before: previous=(target.acceleration, tau)")
+    })
 }
 
 /// Two matrices.

@@ -87,6 +87,28 @@ def test_arguments_of_a_projector_are_named(panda) -> None:
             nearl.Projector(panda, limits, dt=0.01)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="dt is of str; give a number"):
         nearl.Projector(panda, [limit], dt="1")  # type: ignore[arg-type]
+    for wrong, error, words in [
+        ({"sub_steps": -1}, ValueError, "sub_steps is -1; give a whole number from 0 to 4294967295"),
+        ({"sub_steps": 2**70}, ValueError, "sub_steps is 1180591620717411303424; give a whole number"),
+        ({"sub_steps": 1.5}, TypeError, "sub_steps is of float; give a whole number"),
+        ({"controllable": "panda_joint1"}, TypeError, 'controllable is of str; give a list of the names of joints, e.g. controllable=."elbow".'),
+    ]:
+        with pytest.raises(error, match=words):
+            nearl.Projector(panda, [limit], dt=0.01, **wrong)
+    with pytest.raises(ValueError, match="sub_steps is -1"):
+        panda.motors(np.zeros(7), np.zeros(7), np.zeros(7), 0.01, -1)
+    projector, q = nearl.Projector(panda, [limit], dt=0.01), np.array([0.0, 0, 0, -1.5, 0, 1.5, 0])
+    with pytest.raises(ValueError, match="previous is no pair; give the acceleration and the motor force of the tick before"):
+        projector.project(q, 0 * q, q, 0 * q, previous=q)  # type: ignore[arg-type]
+    for threads in (0, -1):
+        with pytest.raises(ValueError, match=f"threads is {threads}; give a whole number from 1"):
+            projector.project_batch(q[None], 0 * q[None], q[None], 0 * q[None], threads=threads)
+    assert projector.project_batch(q[None], 0 * q[None], q[None], 0 * q[None], threads=np.int64(2)).q.shape == (1, 7)
+    with pytest.raises(ValueError, match="v holds masked numbers.*fill them, e.g. v.filled"):
+        projector.project(q, np.ma.array(0 * q, mask=[0, 0, 1, 0, 0, 0, 0]), q, 0 * q)
+    assert projector.project(np.ma.array(q), 0 * q, q, 0 * q).status == "unchanged", "nothing is masked"
+    with pytest.raises(ValueError, match="velocity limit is inf, but must be finite and above 0 rad/s or m/s"):
+        nearl.Projector(panda, [nearl.VelocityLimit(panda, np.inf)], dt=0.01)
 
 
 def test_what_is_wrong_is_refused_by_name(panda) -> None:

@@ -219,13 +219,24 @@ fn check_motor(motor: &Motor, wrong: &mut Vec<String>) {
 }
 
 /// Whether a moment of inertia about some axis is negative by more than a file's rounding.
-fn is_indefinite([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> bool {
+pub(super) fn is_indefinite([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> bool {
     let more = ROUNDING + 1e-4 * (xx + yy + zz).abs();
     !has_no_negative_eigenvalue([xx + more, xy, xz, yy + more, yz, zz + more])
 }
 
+/// A principal moment may exceed the sum of the others by this share of all three before anything is said of it: files are rounded.
+const ROUNDED: f64 = 0.01;
+
+/// Whether some distribution of mass has this inertia: whether `tr(I) / 2 - I` has no negative eigenvalue.
+pub(crate) fn is_of_mass([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> bool {
+    let trace = xx + yy + zz;
+    let half = (0.5 + ROUNDED) * trace;
+    trace <= 0.0
+        || has_no_negative_eigenvalue([half - xx, -xy, -xz, half - yy, -yz, half - zz].map(|x| x / trace))
+}
+
 /// Whether a symmetric matrix (`xx xy xz yy yz zz`) has no negative eigenvalue, by its principal minors.
-pub(crate) fn has_no_negative_eigenvalue([a, d, e, b, f, c]: [f64; 6]) -> bool {
+fn has_no_negative_eigenvalue([a, d, e, b, f, c]: [f64; 6]) -> bool {
     let pairs = [a * b - d * d, a * c - e * e, b * c - f * f];
     let all = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e);
     [a, b, c, all].iter().chain(&pairs).all(|minor| *minor >= 0.0)

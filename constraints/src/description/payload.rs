@@ -1,5 +1,6 @@
 //! What a robot carries: a tool, a workpiece.
 
+use super::check::{is_indefinite, is_of_mass};
 use super::{Body, RobotDescription};
 use crate::error::{ModelError, near_names};
 use crate::geometry::Placement;
@@ -29,7 +30,7 @@ impl RobotDescription {
     /// ```
     ///
     /// # Errors
-    /// A frame that the robot does not have or that does not move, numbers that are not finite, a mass that is not positive.
+    /// A frame that the robot does not have or that does not move, numbers that are not finite, a mass that is not positive, an inertia that no body has.
     pub fn carry(&mut self, payload: &Payload) -> Result<(), ModelError> {
         let impossible = |list: String| ModelError::Impossible { file: "the payload".into(), list };
         let (body, placement) = self.holder(&payload.frame)?;
@@ -46,6 +47,12 @@ impl RobotDescription {
         if !(payload.mass > 0.0 && payload.mass.is_finite()) || numbers.into_iter().any(|x| !x.is_finite()) {
             let (mass, com, inertia) = (payload.mass, payload.com, payload.inertia);
             return Err(impossible(format!("mass {mass} kg, com {com:?} m, inertia {inertia:?} kg·m²")));
+        }
+        if is_indefinite(payload.inertia) || !is_of_mass(payload.inertia) {
+            return Err(impossible(format!(
+                "inertia {:?} kg·m² is that of no body about its centre of mass; its entries are xx, xy, xz, yy, yz, zz",
+                payload.inertia
+            )));
         }
         add(&mut self.bodies[body], payload, &placement);
         Ok(())

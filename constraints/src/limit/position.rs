@@ -97,7 +97,7 @@ impl Limit for PositionLimit {
         let missing: Vec<usize> =
             controllable.iter().copied().filter(|i| model.position_limit_missing(*i)).collect();
         if !missing.is_empty() {
-            let next = "write lower and upper into it, or declare the joint continuous";
+            let next = "write lower and upper into it, wide ones such as -1000 and 1000 for a joint that turns without end";
             return Err(LimitError::Missing { limit: "position", joints: quoted(model, &missing), next });
         }
         if !controllable.is_empty() && controllable.iter().all(|i| is_free(model, *i)) {

@@ -2,7 +2,7 @@
 
 use super::{called, children, number};
 use crate::description::Body;
-use crate::description::check::has_no_negative_eigenvalue;
+use crate::description::check::is_of_mass;
 use roxmltree::Node;
 
 /// Limits of a joint that are not used, or that stand for nothing.
@@ -42,9 +42,6 @@ pub(super) fn of_joint(joint: Node) -> Vec<String> {
     notes
 }
 
-/// A principal moment may exceed the sum of the others by this share of all three before a note says so: files are rounded.
-const ROUNDED: f64 = 0.01;
-
 /// Bodies whose inertia no distribution of mass has.
 pub(super) fn inertias(bodies: &[Body]) -> Option<String> {
     let names: Vec<String> =
@@ -55,12 +52,4 @@ pub(super) fn inertias(bodies: &[Body]) -> Option<String> {
             names.join(", ")
         )
     })
-}
-
-/// Whether `tr(I) / 2 - I` has no negative eigenvalue.
-fn is_of_mass([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> bool {
-    let trace = xx + yy + zz;
-    let half = (0.5 + ROUNDED) * trace;
-    trace <= 0.0
-        || has_no_negative_eigenvalue([half - xx, -xy, -xz, half - yy, -yz, half - zz].map(|x| x / trace))
 }

@@ -595,10 +595,20 @@ fn a_payload_weighs_what_a_fixed_link_does() {
         }
         assert!((0..6).any(|i| (tau[i] - less[i]).abs() > 0.1));
     }
-    let wrong = |frame: &str, mass: f64| {
-        let payload = description::Payload { frame: frame.into(), mass, com: [0.0; 3], inertia: [0.0; 6] };
-        bare.with_payload(&payload).err().unwrap().to_string()
+    let of = |frame: &str, mass: f64, inertia: [f64; 6]| {
+        let payload = description::Payload { frame: frame.into(), mass, com: [0.0; 3], inertia };
+        bare.with_payload(&payload).err().map(|e| e.to_string())
     };
+    let wrong = |frame: &str, mass: f64| of(frame, mass, [0.0; 6]).unwrap();
+    // The moments of a ball in the wrong order, moments below 0, and one beyond the sum of the others.
+    for no_body in
+        [[0.1, 0.1, 0.1, 0.0, 0.0, 0.0], [-0.1, 0.0, 0.0, -0.1, 0.0, -0.1], [0.3, 0.0, 0.0, 0.1, 0.0, 0.1]]
+    {
+        let said = of("tool", 1.0, no_body).expect("no body has it");
+        assert!(said.contains("is that of no body") && said.contains("xx, xy, xz, yy, yz, zz"), "{said}");
+    }
+    assert_eq!(of("tool", 1.0, [0.1, 0.0, 0.0, 0.1, 0.0, 0.1]), None, "a ball");
+    assert_eq!(of("tool", 1.0, [0.1, 0.0, 0.0, 0.1, 0.0, 0.0]), None, "a rod");
     assert!(wrong("tol", 1.0).contains("no frame 'tol'") && wrong("tol", 1.0).contains("tool"));
     assert!(wrong("tool", -1.0).contains("mass -1 kg") && wrong("tool", f64::NAN).contains("NaN"));
     assert!(wrong("base", 1.0).contains("'base' is fixed to the world"), "{}", wrong("base", 1.0));
