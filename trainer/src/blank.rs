@@ -5,6 +5,7 @@ use crate::{env, tasks, train};
 use nearl_runtime::constraints::description::Command;
 use nearl_runtime::constraints::{Drive, Guard, Model};
 use nearl_runtime::controller::Parts;
+use nearl_runtime::snapshot::BLANK;
 use nearl_runtime::task::{IdmKind, Task};
 use nearl_runtime::{Manifest, Snapshot};
 
@@ -26,7 +27,7 @@ pub fn snapshot(task: &str, actions: bool) -> Result<Snapshot, VectorError> {
         manifest.task.constraints.guard = Guard::Model;
     }
     complete(&mut manifest)?;
-    manifest.algo = "blank".into();
+    manifest.algo = BLANK.into();
     let snapshot = if actions { space::idle(manifest) } else { space::still(manifest) };
     snapshot.check()?;
     Ok(snapshot)

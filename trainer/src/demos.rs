@@ -64,6 +64,8 @@ pub struct Demonstrations {
 
 /// Larger files are refused before they are read [bytes].
 const MAX_BYTES: u64 = 4 << 30;
+/// No position, speed, force or observation of a robot is larger, in any unit.
+const LARGEST: f64 = 1e9;
 
 impl Demonstrations {
     /// Reads a file whole and checks it.
@@ -130,10 +132,10 @@ impl Demonstrations {
             for (i, e) in episodes.iter_mut().enumerate() {
                 let own = &values[first * width..][..(e.length + more) * width];
                 first += e.length + more;
-                if let Some(at) = own.iter().position(|x| !x.is_finite()) {
+                if let Some(at) = own.iter().position(|x| x.is_nan() || x.abs() > LARGEST) {
                     let called = if name == "observations" { column(at % width) } else { plain(at % width) };
                     return Err(format!(
-                        "'{name}' is {} in episode {i}, row {}, column '{called}'",
+                        "'{name}' is {:e} in episode {i}, row {}, column '{called}', and no robot has numbers beyond {LARGEST:e}; leave the row out",
                         own[at],
                         at / width
                     ));

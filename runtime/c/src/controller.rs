@@ -65,6 +65,9 @@ fn number(status: Status) -> c_int {
 impl InProcess {
     fn load(path: &str) -> Result<InProcess, String> {
         let snapshot = Snapshot::load(&in_run(Path::new(path))).map_err(|e| e.to_string())?;
+        if let Some(text) = snapshot.manifest.without_policy() {
+            return Err(format!("'{path}': {text}"));
+        }
         let controller = Controller::new(&snapshot).map_err(|e| e.to_string())?;
         let (state, noise, out) = (controller.state(), controller.noise(), controller.output());
         let sizes = Sizes {

@@ -224,6 +224,17 @@ fn a_controller_in_cpp_obeys_the_limits_and_refuses_by_sentence() {
     let refused = Command::new(&program).arg("none.safetensors").output().expect("runs");
     assert!(!refused.status.success());
     assert!(String::from_utf8_lossy(&refused.stderr).contains("cannot read snapshot 'none.safetensors'"));
+    let mut blank = snapshot();
+    blank.manifest.algo = nearl_runtime::snapshot::BLANK.into();
+    blank.save(&file).expect("saves");
+    let refused = Command::new(&program).arg(&file).output().expect("runs");
+    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(
+        !refused.status.success()
+            && said.contains("the snapshot has no policy")
+            && said.contains("carriage.safetensors"),
+        "{said}"
+    );
 }
 
 /// A first state that is no number has no last finite one before it.

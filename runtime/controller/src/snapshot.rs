@@ -18,6 +18,8 @@ use std::path::{Path, PathBuf};
 
 /// Version of the file format.
 pub const FORMAT: u32 = 2;
+/// Name of the algorithm of a snapshot without a policy.
+pub const BLANK: &str = "blank";
 /// Version that a file says whose networks have a linear part beside their layers: programs that know [`FORMAT`] alone would leave it out.
 const FORMAT_WITH_SKIP: u32 = 3;
 /// Larger files are refused before they are read, in \[byte\].
@@ -133,6 +135,14 @@ impl Manifest {
         (network && self.task.constraints.guard == Guard::Simulator).then_some(
             "constraints.guard is \"simulator\", which `nearl plant` and training have and a robot's driver has not: there its \
              actions go to the motors as they are; for a robot write guard = true or guard = \"drive\"",
+        )
+    }
+
+    /// That it has no policy: another process is to propose in its place.
+    pub fn without_policy(&self) -> Option<&'static str> {
+        (self.algo == BLANK).then_some(
+            "the snapshot has no policy (`nearl blank` wrote it), and keeps the robot where it is: give `nearl run` --proposer, and start a process \
+             that proposes; or take a snapshot of a training",
         )
     }
 

@@ -226,14 +226,13 @@ impl<B: Build> Replayer<B> {
             };
             match part {
                 Ok(Part::DataEnd(_)) => self.found.complete = true,
+                // A chunk's checksum comes after its content: that a difference is none of the loop, but damage of the file, is known there.
+                Ok(_) if self.found.difference.is_some() => {}
                 Ok(part) => self.take(part)?,
                 // A runtime that was killed leaves its last chunk unfinished.
                 Err(mcap::McapError::UnexpectedEof | mcap::McapError::UnexpectedEoc) => break,
                 Err(mcap::McapError::UnsupportedCompression(format)) => return Err(compressed(&format)),
                 Err(e) => return Err(one_line(&e)),
-            }
-            if self.found.difference.is_some() {
-                return Ok(self.found);
             }
         }
         if self.at == 0 {

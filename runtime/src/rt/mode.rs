@@ -70,7 +70,8 @@ codes! {
             "Stop what takes the processor, then start the runtime again.";
         Stop = "stop", "A stop was asked for, by a signal or because the time was over.", "Nothing to do.";
         PlantGone = "plant-gone", "No state came for so long that the plant counts as gone; the run ended by itself.",
-            "Start the plant again, then the runtime; --plant-patience is how long the loop waits for one that comes back.";
+            "Start the plant again, then the runtime. States of another robot than at the start are none (`refused_states`). --plant-patience is how \
+             long the loop waits for one that comes back.";
         MemoryTorn = "memory-torn", "A file of shared memory was made shorter while it was in use; the robot was braked and the process ended by itself.",
             "Find the program that truncates files under /dev/shm, then start plant and runtime again.";
         LoopGone = "loop-gone", "No action came for so long that the runtime counts as gone; the plant braked and ended by itself.",

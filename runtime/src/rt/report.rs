@@ -147,6 +147,7 @@ impl fmt::Display for RunReport {
             ("frozen", c.frozen_states),
             ("implausible", c.implausible_states),
             ("out of order", c.out_of_order),
+            ("of another robot", self.refused_states),
         ];
         let unusable: Vec<String> =
             unusable.iter().filter(|(_, n)| *n > 0).map(|(what, n)| format!("{what} {n}")).collect();

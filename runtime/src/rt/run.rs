@@ -267,6 +267,9 @@ pub fn run(
     let build = PilotBuilder { meaning: Some(meaning), pinned };
     let mut report = run_loop(link, robot, first, build, &settings, stop)?;
     report.warnings.extend(snapshot.manifest.without_simulator().map(str::to_owned));
+    if settings.proposer.is_none() {
+        report.warnings.extend(snapshot.manifest.without_policy().map(str::to_owned));
+    }
     Ok(report)
 }
 

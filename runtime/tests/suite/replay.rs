@@ -307,6 +307,27 @@ fn a_log_cut_by_the_death_of_its_runtime_replays_as_far_as_it_goes() {
     assert!(text.contains("compressed with zst,") && text.contains("write it without compression"), "{text}");
 }
 
+/// A damaged file is none of the loop's doing: no bit in what the log holds makes replay name a tick that differs.
+#[test]
+fn a_flipped_bit_is_damage_and_no_difference() {
+    let folder = Scratch::new("flipped");
+    let (log, _) = record("flipped", &folder.0);
+    let (bytes, file) = (std::fs::read(&log).unwrap(), folder.0.join("bit.mcap"));
+    let mut refused = 0;
+    for k in 1..40 {
+        let mut damaged = bytes.clone();
+        damaged[bytes.len() * k / 40] ^= 1 << (k % 8);
+        std::fs::write(&file, damaged).unwrap();
+        match replay(&file) {
+            Ok(found) => {
+                assert_eq!(found.difference, None, "byte {} of {}", bytes.len() * k / 40, bytes.len())
+            }
+            Err(_) => refused += 1,
+        }
+    }
+    assert!(refused > 20, "{refused} of 39");
+}
+
 /// The log with its chunks said to be of another compression.
 fn otherwise_compressed(mut log: Vec<u8>) -> Vec<u8> {
     let said = b"\x03\0\0\0lz4";

@@ -153,6 +153,12 @@ fn bad_files_are_refused_by_array_column_and_episode() {
     let error = with(&|a| numbers(a.get_mut("observations").expect("there"), (first + 2) * n + 4, f64::NAN));
     let want = format!("'observations' is NaN in episode 1, row 2, column '{}'", demos.names[4]);
     assert!(error.contains(&want) && error.contains("demos.npz"), "{error}");
+    let error = with(&|a| numbers(a.get_mut("qvel").expect("there"), 1, -1e300));
+    assert!(
+        error.contains("'qvel' is -1e300 in episode 0, row 0, column '1'")
+            && error.contains("leave the row out"),
+        "{error}"
+    );
     let cases: [(Damage, &str); 5] = [
         (&|a| drop(a.remove("qpos")), "has no array 'qpos'"),
         (&|a| numbers(a.get_mut("lengths").expect("there"), 1, 0.5), "episode 1 has the length 0.5"),

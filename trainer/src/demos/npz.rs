@@ -96,7 +96,8 @@ fn array(bytes: &[u8]) -> Result<Array, String> {
     let shape = entry(&header, "shape")?.trim_start_matches('(').split(')').next().unwrap_or_default();
     let sizes = shape.split(',').map(str::trim).filter(|s| !s.is_empty()).map(str::parse::<usize>);
     let shape = sizes.collect::<Result<Vec<_>, _>>().map_err(|e| format!("its shape cannot be read: {e}"))?;
-    let n = shape.iter().product::<usize>();
+    let n = shape.iter().try_fold(1usize, |n, size| n.checked_mul(*size));
+    let n = n.ok_or_else(|| format!("its shape {shape:?} has more entries than a file can hold"))?;
     let width = match kind.as_bytes() {
         [_, b'U', digits @ ..] => {
             4 * std::str::from_utf8(digits).ok().and_then(|d| d.parse().ok()).unwrap_or(0)
@@ -181,4 +182,18 @@ fn bytes_of(array: &Array) -> Vec<u8> {
     header.extend(std::iter::repeat_n(' ', (64 - (11 + header.len()) % 64) % 64));
     header.push('\n');
     [b"\x93NUMPY\x01\x00", &(header.len() as u16).to_le_bytes()[..], header.as_bytes(), &content].concat()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shape_beyond_what_can_be_counted_is_refused_as_it_is() {
+        let header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776, 1099511627776), }\n";
+        let length = (header.len() as u16).to_le_bytes();
+        let bytes = [&b"\x93NUMPY\x01\x00"[..], &length, header.as_bytes(), &[0; 64]].concat();
+        let said = array(&bytes).map(drop).expect_err("no file has so many");
+        assert_eq!(said, "its shape [1099511627776, 1099511627776] has more entries than a file can hold");
+    }
 }
