@@ -34,6 +34,7 @@ use crate::robot;
 pub use meter::{Excess, LimitError, Limits, Meter, Worst};
 pub use rand_chacha::ChaCha8Rng;
 pub use rand_chacha::rand_core::SeedableRng;
+pub(crate) use simulated::convert;
 use spec::EPISODE;
 pub use spec::Spec;
 

@@ -8,7 +8,7 @@ codes! {
     /// Mode of the loop. Escalates at once; comes back only after good ticks in a row, and from Fault never.
     Mode, "mode" {
         Hold = "hold", "No usable state has come yet: no action is sent, the plant keeps itself still.",
-            "Start the plant; if it runs, see `refused_states` and `bad_states` in the report.";
+            "Start the plant; if it runs, look at the reason beside it, and at the unusable states in the report.";
         Active = "active", "The controller acts.", "Nothing to do.";
         Degraded = "degraded", "The controller acts on less than it should have: a predicted state, or late.",
             "Look at the reason beside it; the loop returns to active after good ticks in a row.";

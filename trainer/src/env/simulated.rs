@@ -299,7 +299,7 @@ fn copied<'a>(place: &'a mut Option<Sim>, sim: &Sim) -> Result<&'a mut Sim, MjEr
 }
 
 /// Writes a state of MuJoCo's convention as one of Pinocchio's.
-fn convert(spec: &Spec, (qpos, qvel): (&[f64], &[f64]), q: &mut [f64], v: &mut [f64]) {
+pub(crate) fn convert(spec: &Spec, (qpos, qvel): (&[f64], &[f64]), q: &mut [f64], v: &mut [f64]) {
     q.copy_from_slice(qpos);
     v.copy_from_slice(qvel);
     for joint in &spec.joints {

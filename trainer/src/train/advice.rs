@@ -3,7 +3,7 @@
 use super::TrainError;
 use super::setup::warm_up_of_pid2;
 use crate::demos::{DemoError, Demonstrations};
-use crate::env::{ChaCha8Rng, Env, SeedableRng, unstated_steps};
+use crate::env::{ChaCha8Rng, SeedableRng, convert, unstated_steps};
 use crate::learn::Algorithm;
 use crate::rollout::RolloutError;
 use crate::settings::TrainSettings;
@@ -95,11 +95,11 @@ impl States {
         Ok(Self { parts, state: (vec![0.0; nq], vec![0.0; nv]), found: vec![[Outside::default(); 2]; nv] })
     }
 
-    /// Looks at the state that the environment is in.
-    fn look(&mut self, env: &dyn Env) {
+    /// Looks at the state that is written.
+    fn look(&mut self, write: impl FnOnce(&mut [f64], &mut [f64])) {
         let (Parts { model, layout, projector }, (q, v)) = (&self.parts, &mut self.state);
         let limits = projector.limits();
-        env.state(q, v);
+        write(q, v);
         for &i in layout.controllable() {
             let at = q[model.joint_of_dof(i).idx_q];
             let by = [(limits.q_lower[i] - at).max(at - limits.q_upper[i]), v[i].abs() - limits.velocity[i]];
@@ -114,8 +114,8 @@ impl States {
         }
     }
 
-    /// A sentence for each joint that was outside: how many states are meant, how the joint's name follows, and what happens and helps, by
-    /// the name of the limit.
+    /// A sentence for each joint that was outside. `whose` leads to the joint, as `64 episodes begin with`; `next` is what comes of it and what
+    /// helps, by the name of the limit.
     fn sentences(&self, whose: &str, next: impl Fn(&str) -> String) -> Vec<String> {
         let (Parts { model, layout, projector }, mut lines) = (&self.parts, Vec::new());
         let limits = projector.limits();
@@ -149,7 +149,7 @@ pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError>
     let mut rng = ChaCha8Rng::seed_from_u64(RESETS.1);
     for _ in 0..RESETS.0 {
         env.reset(&mut rng).map_err(RolloutError::from)?;
-        states.look(&*env);
+        states.look(|q, v| env.state(q, v));
     }
     let mut lines = Vec::from_iter(unstated);
     let is_own = !manifest.task.reward.is_empty();
@@ -172,7 +172,7 @@ pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError>
 /// [`TrainError`] of a task that cannot be simulated.
 pub(crate) fn demonstrated(demos: &Demonstrations, manifest: &Manifest) -> Result<Vec<String>, TrainError> {
     let mut states = States::of(manifest)?;
-    let mut env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
+    let env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
     let (nq, nv) = (env.qpos().len(), env.qvel().len());
     if demos
         .episodes
@@ -185,8 +185,7 @@ pub(crate) fn demonstrated(demos: &Demonstrations, manifest: &Manifest) -> Resul
     for (qpos, qvel) in
         demos.episodes.iter().flat_map(|e| e.qpos.chunks_exact(nq).zip(e.qvel.chunks_exact(nv)))
     {
-        env.set_state(qpos, qvel).map_err(RolloutError::from)?;
-        states.look(&*env);
+        states.look(|q, v| convert(env.spec(), (qpos, qvel), q, v));
         all += 1;
     }
     Ok(states.sentences(&format!("{all} demonstrated states have"), |key| {
