@@ -5,6 +5,8 @@
 //! its equations of motion are written anew, limits are looked at for what they mean, and that an answer is optimal is shown from the
 //! multipliers that the log carries. What is not known here is refused by name, and a tick that cannot be confirmed is counted so.
 
+mod before;
+mod claims;
 mod collision;
 mod cut;
 mod drives;
@@ -18,6 +20,7 @@ mod moved;
 mod optimum;
 mod period;
 mod promise;
+mod proposed;
 mod report;
 mod robot;
 mod rows;
