@@ -317,7 +317,7 @@ impl ReplayCommand {
             let end = match found.complete {
                 true => "",
                 false => {
-                    "; the log was cut short: its runtime did not close it, or a part was lost since, and what came after is not in it"
+                    "; the log was cut short or added to: its runtime did not close it, or its end was changed since, and what came after was not looked at"
                 }
             };
             let others = if found.gaps.is_empty() { "" } else { "; others could not be computed" };

@@ -108,12 +108,31 @@ pub fn replay_with<B: Build>(file: &Path, build: B) -> Result<Replay, ReplayErro
     Ok(found)
 }
 
-/// Whether the file ends as MCAP ends: a part of its end may be missing that no tick is in.
+/// Whether the file ends as MCAP ends, and there for the first time: a part of its end may be missing that no tick is in, or a log was added to it.
 fn ends_whole(file: &Path) -> io::Result<bool> {
-    let mut log = nearl_constraints::open_regular(file, true)?;
+    let mut log = BufReader::new(nearl_constraints::open_regular(file, true)?);
+    let length = log.get_ref().metadata()?.len();
+    let mut at = mcap::MAGIC.len() as u64;
+    loop {
+        let mut head = [0; 9]; // a part's opcode and length
+        if at >= length {
+            return Ok(false);
+        }
+        log.seek(SeekFrom::Start(at))?;
+        if log.read_exact(&mut head).is_err() {
+            return Ok(false);
+        }
+        let [opcode, size @ ..] = head;
+        at = at.saturating_add(head.len() as u64).saturating_add(u64::from_le_bytes(size));
+        if opcode == mcap::records::op::FOOTER {
+            break;
+        }
+    }
     let mut end = [0; mcap::MAGIC.len()];
-    let length = log.metadata()?.len();
-    log.seek(SeekFrom::Start(length.saturating_sub(end.len() as u64)))?;
+    if at.saturating_add(end.len() as u64) != length {
+        return Ok(false);
+    }
+    log.seek(SeekFrom::Start(at))?;
     Ok(log.read_exact(&mut end).is_ok() && end == *mcap::MAGIC)
 }
 

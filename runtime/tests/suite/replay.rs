@@ -293,14 +293,17 @@ fn a_log_cut_by_the_death_of_its_runtime_replays_as_far_as_it_goes() {
     let found = replay(&cut).unwrap();
     assert_eq!((found.difference, found.complete), (None, false));
     assert!(found.ticks > 100 && found.ticks < report.ticks, "{} of {}", found.ticks, report.ticks);
-    // Behind the last tick stands an index; a file that lost a part of it has every tick and is not whole.
-    for lost in [1, 50] {
-        std::fs::write(&cut, &bytes[..bytes.len() - lost]).unwrap();
+    // Behind the last tick stands an index; a file that lost a part of it, or got a log behind it, has every tick and is not whole.
+    let twice = [&bytes[..], &bytes[..]].concat();
+    for other in [&bytes[..bytes.len() - 1], &bytes[..bytes.len() - 50], &twice] {
+        std::fs::write(&cut, other).unwrap();
         let found = replay(&cut).unwrap();
         assert_eq!(
             (found.difference, found.complete, found.ticks),
             (None, false, report.ticks),
-            "{lost} bytes"
+            "{} bytes of {}",
+            other.len(),
+            bytes.len()
         );
     }
     std::fs::write(&cut, otherwise_compressed(bytes)).unwrap();

@@ -1168,8 +1168,14 @@ fn what_a_log_does_not_have_is_not_verified_and_a_damaged_one_is_refused_by_name
     std::fs::write(&cut, &whole[..whole.len() / 2]).unwrap();
     let report = verify(&cut).unwrap();
     assert!(report.found == 0 && !report.complete && !report.is_whole() && report.verified > 100, "{report}");
-    for lost in [1, 50] {
-        std::fs::write(&cut, &whole[..whole.len() - lost]).unwrap();
+    let ends: [&[u8]; 4] = [
+        &whole[..whole.len() - 1],
+        &whole[..whole.len() - 50],
+        &[&whole[..], &whole[..]].concat(),
+        &[&whole[..], b"more"].concat(),
+    ];
+    for other in ends {
+        std::fs::write(&cut, other).unwrap();
         let report = verify(&cut).unwrap();
         assert!(report.found == 0 && report.complete && !report.intact && !report.is_whole(), "{report}");
         assert!(

@@ -49,12 +49,29 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     Ok(report)
 }
 
-/// Whether the file ends as MCAP ends.
+/// Whether the file ends as MCAP ends, and there for the first time: with its footer, and the format's name behind it.
 fn ends_whole(file: &Path) -> std::io::Result<bool> {
-    let mut log = File::open(file)?;
+    /// Opcode and length of a part.
+    const HEAD: u64 = 9;
+    let mut log = BufReader::new(File::open(file)?);
+    let length = log.get_ref().metadata()?.len();
+    let (mut at, mut opcode) = (mcap::MAGIC.len() as u64, 0);
+    while opcode != mcap::records::op::FOOTER {
+        if at.saturating_add(HEAD) > length {
+            return Ok(false);
+        }
+        let mut head = [0; HEAD as usize];
+        log.seek(SeekFrom::Start(at))?;
+        log.read_exact(&mut head)?;
+        let [code, size @ ..] = head;
+        opcode = code;
+        at = at.saturating_add(HEAD).saturating_add(u64::from_le_bytes(size));
+    }
     let mut end = [0; mcap::MAGIC.len()];
-    let length = log.metadata()?.len();
-    log.seek(SeekFrom::Start(length.saturating_sub(end.len() as u64)))?;
+    if at.saturating_add(end.len() as u64) != length {
+        return Ok(false);
+    }
+    log.seek(SeekFrom::Start(at))?;
     Ok(log.read_exact(&mut end).is_ok() && end == *mcap::MAGIC)
 }
 

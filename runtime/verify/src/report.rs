@@ -72,7 +72,7 @@ pub struct Report {
     pub unbalanced: f64,
     /// The log was closed by the runtime, not cut by its death.
     pub complete: bool,
-    /// The file ends as it was written: nothing of what stands behind the last tick is missing.
+    /// The file ends as it was written: nothing of what stands behind the last tick is missing, and nothing was added.
     pub intact: bool,
 }
 
@@ -122,7 +122,7 @@ impl fmt::Display for Report {
         } else if !self.intact {
             writeln!(
                 f,
-                "  not verified: the end of the file behind the last tick, which was cut off or damaged after the runtime closed it"
+                "  not verified: the end of the file behind the last tick, which was cut off, damaged or added to after the runtime closed it"
             )?;
         }
         for violation in &self.violations {
