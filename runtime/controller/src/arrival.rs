@@ -11,8 +11,8 @@ use nearl_constraints::{Drive, LimitSet, Model, Period, PeriodDynamics, PhysicsS
 /// limit for that.
 pub(crate) struct Arrivals {
     period: Period,
-    /// What a force may be depends on the speed: it is corrected towards zero only.
-    by_speed: bool,
+    /// By dof (nv), of motors whose force falls with their speed.
+    lines: Vec<Option<Line>>,
     dofs: Vec<usize>,
     /// By dof (nv).
     drives: Vec<Drive>,
@@ -28,6 +28,29 @@ pub(crate) struct Arrivals {
     most: Vec<f64>,
     /// Between which velocities the joints end (nv), as far as it is known.
     within: Vec<[f64; 2]>,
+}
+
+/// Where a hard `torque_speed` leaves a motor so much force [N m or N] at standstill, and less by `slope` [N m s/rad or N s/m] of its speed.
+#[derive(Clone, Copy)]
+struct Line {
+    most: f64,
+    slope: f64,
+}
+
+impl Line {
+    fn of(m: &Manifest, model: &Model, dof: usize) -> Option<Line> {
+        let limit = m.task.constraints.torque_speed.as_ref().filter(|limit| limit.soft.is_none())?;
+        let name = model.dof_name(dof);
+        let (stall, no_load) = (limit.stall.of(&name)?, limit.no_load.of(&name)?);
+        let margin = limit.margin.as_ref().and_then(|margin| margin.of(&name)).unwrap_or(0.0);
+        Some(Line { most: stall - margin, slope: stall / no_load })
+    }
+
+    /// The largest force in the direction of `force` at both speeds.
+    fn most(self, force: f64, speeds: [f64; 2]) -> f64 {
+        let along = speeds.map(|v| if force < 0.0 { -v } else { v });
+        self.most - self.slope * along[0].max(along[1])
+    }
 }
 
 const FREE: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
@@ -60,7 +83,7 @@ impl Arrivals {
             idx_q: idx_q(model),
             friction: model.friction().to_vec(),
             period,
-            by_speed: m.task.constraints.torque_speed.is_some(),
+            lines: (0..nv).map(|i| Line::of(m, model, i).filter(|_| drives[i] == Drive::Effort)).collect(),
             dofs: dofs.to_vec(),
             drives: drives.to_vec(),
             commands: vec![0.0; nv],
@@ -105,8 +128,11 @@ impl Arrivals {
         }
         if let Some(steps) = &mut self.steps {
             for (i, most) in self.most.iter_mut().enumerate() {
-                let is_lower = self.by_speed && self.drives[i] == Drive::Effort;
-                *most = if is_lower { tau[i].abs() } else { limits.effort[i] + self.friction[i] };
+                let by_speed = self.lines[i].map_or(f64::INFINITY, |line| line.most(tau[i], [v[i], to.v[i]]));
+                *most = limits.effort[i].min(by_speed) + self.friction[i];
+                if self.lines[i].is_some() {
+                    *most = most.max(tau[i].abs()); // a brake is executed without margins
+                }
             }
             steps.drive((q, v), external, a, (&mut self.commands, &self.most), limits);
         }

@@ -21,8 +21,8 @@ struct Walk {
     hardest: Vec<f64>,
 }
 
-/// The actions, held, lead through the steps to the target's velocities. A joint may fall short of its own whose force is at its limit, or no
-/// farther from zero than the mean one where its limit depends on the speed, or which slows down as it would come beyond its position limit or
+/// The actions, held, lead through the steps to the target's velocities. A joint may fall short of its own whose force is at its limit, at the
+/// speeds of the period, or which slows down as it would come beyond its position limit or
 /// end too fast to stop in front of it otherwise. Where joints rub, by no more than their dry friction does. `means` has the action of each
 /// joint for its mean force.
 pub(crate) fn lead(
@@ -62,10 +62,11 @@ pub(crate) fn lead(
         };
         let has_no_room = each().flat_map(|limits| &limits.rows).any(|row| match row.rule {
             Rule::Torque { dof, most } => dof == i && near(walk.hardest[i], most),
-            Rule::TorqueSpeed { dof, .. } => {
-                dof == i
-                    && matches!(action.sent, Sent::Force)
-                    && near(walk.hardest[i], force(action, *mean).abs())
+            Rule::TorqueSpeed { dof, most, slope, at_start } if dof == i => {
+                let (mean, v) = (force(action, *mean), if at_start { passage.v[i] } else { passage.v1[i] });
+                let line = (most - slope * v * mean.signum()).max(mean.abs());
+                matches!(action.sent, Sent::Force)
+                    && [line, line + action.friction].into_iter().any(|most| near(walk.hardest[i], most))
             }
             _ => false,
         });
