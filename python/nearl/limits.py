@@ -150,8 +150,8 @@ class EnergyLimit(Limit):
 
 @final
 class FrameLimit(Limit):
-    """A point of a frame stops in front of a plane, `normal . (p - through) <= 0`, or inside a box of world axes, `lower <= p <= upper`, as
-    far as `braking` [m/s²] can be delivered. `point` is in the frame's axes [m].
+    """A point of a frame stops in front of a plane, `normal . (p - through) <= 0`, or inside a box of world axes, `box = { lower = [x, y,
+    z], upper = [x, y, z] }`, or both, as far as `braking` [m/s²] can be delivered. `point` is in the frame's axes [m].
 
     In a task file:
 

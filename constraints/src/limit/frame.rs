@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub(super) const ABOUT: About = About {
     class: "FrameLimit",
     promise: "A point of a frame stops in front of a plane, `normal . (p - through) <= 0`, or inside a box of world axes, \
-        `lower <= p <= upper`, as far as `braking` [m/s²] can be delivered. `point` is in the frame's axes [m].",
+        `box = { lower = [x, y, z], upper = [x, y, z] }`, or both, as far as `braking` [m/s²] can be delivered. `point` is in the frame's axes [m].",
     example: "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.1] }, braking = 5.0 \
         }]",
     form: Form::Either,

@@ -101,7 +101,7 @@ impl Limit for PositionLimit {
             return Err(LimitError::Missing { limit: "position", joints: quoted(model, &missing), next });
         }
         if !controllable.is_empty() && controllable.iter().all(|i| is_free(model, *i)) {
-            let next = "write a range into it, or leave the position limit out";
+            let next = "write a range into it (in MJCF without <flag limit=\"disable\"/>), or leave the position limit out";
             return Err(LimitError::Missing { limit: "position", joints: quoted(model, controllable), next });
         }
         let mut narrow = Vec::new();

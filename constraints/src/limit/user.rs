@@ -64,7 +64,7 @@ pub struct UserRowSettings {
 /// `lower <= sum of terms of the next state <= upper`.
 ///
 /// With `braking` B the sum `s` of positions is held like a joint: its acceleration toward a bound is at most what
-/// [`approach`] gives for its distance and speed. Without it the row speaks of the next state alone, and nothing looks
+/// [`approach`] gives for its distance and speed; a B that the accelerations of its joints do not give together counts as what they give. Without it the row speaks of the next state alone, and nothing looks
 /// ahead.
 ///
 /// A hard row with `equals` stays at that value. A sum of positions at it, `s = e`, is held by its acceleration alone,
@@ -84,6 +84,8 @@ pub struct UserRow {
 
 /// Coefficients beyond this are no unit's; their squares leave the range of the solver.
 const LARGEST: f64 = 1e12;
+/// No joint decelerates faster [rad/s² or m/s²].
+const QUICKEST: f64 = 1e6;
 
 impl UserRow {
     /// From the task file's settings.
@@ -131,8 +133,13 @@ impl UserRow {
                 return bad(what, value, "a finite number");
             }
         }
-        if let Some(value) = s.braking.filter(|b| !(*b > 0.0 && b.is_finite())) {
-            return bad("braking", value, "above 0, in the unit of the sum per s²");
+        let steepest = s.terms.values().fold(0.0, |most: f64, c| most.max(c.abs()));
+        if let Some(value) = s.braking.filter(|b| !(*b > 0.0 && *b <= QUICKEST * steepest)) {
+            return bad(
+                "braking",
+                value,
+                "above 0, and at most a million times the largest coefficient, in the unit of the sum per s²",
+            );
         }
         if !(s.margin >= 0.0 && s.margin.is_finite()) {
             return bad("margin", s.margin, "at least 0, in the unit of the sum");
@@ -366,6 +373,11 @@ impl Rows for Row {
                 next: "ask for a value in that range",
             });
         }
+        let all = |t: &Term| t.coefficient.abs() * limits.acceleration[t.dof];
+        let most = self.terms.iter().map(all).sum::<f64>();
+        if self.braking.is_some_and(|braking| braking > most) {
+            (self.braking, self.size) = (Some(most), most); // more is counted on in vain
+        }
         if self.equal == Some(Equal::Positions) && self.braking.is_none() {
             let own = |t: &Term| t.coefficient.abs() * limits.braking[t.dof].min(limits.acceleration[t.dof]);
             let least = self.terms.iter().map(own).fold(f64::INFINITY, f64::min);
@@ -456,7 +468,7 @@ impl Rows for Row {
         }
         if self.braking.is_some() {
             let s = value(self);
-            breach[0] = (s - self.bounds.1).max(self.bounds.0 - s) / self.size;
+            breach[0] = (s - self.bounds.1).max(self.bounds.0 - s) / self.steepest;
             return;
         }
         let of_positions = self.terms.iter().any(|t| t.quantity == Quantity::Position);

@@ -38,6 +38,7 @@ impl Projector {
                 next: "name the joints in state.controllable, or drop the limits",
             });
         }
+        check_rows(limits)?;
         let switches = switches(model, limits, &dofs.controllable)?;
         let (each, limits) = (limits, LimitSet::collect(model, limits, &dofs.controllable)?);
         let period = Period::new(settings.dt, settings.sub_steps);
@@ -110,6 +111,21 @@ impl Projector {
             weight,
         })
     }
+}
+
+/// Rows of the user's own have each a name, by which they are reported and switched.
+fn check_rows(limits: &[Box<dyn Limit>]) -> Result<(), LimitError> {
+    let names: Vec<&str> =
+        limits.iter().filter(|limit| limit.name() == "rows").map(|limit| limit.label()).collect();
+    for (i, name) in names.iter().enumerate() {
+        let what = match (name.trim().is_empty(), names[..i].contains(name)) {
+            (true, _) => "a row has no name".to_owned(),
+            (_, true) => format!("two rows are named '{name}'"),
+            _ => continue,
+        };
+        return Err(LimitError::Unusable { what, next: "give each a name of its own" });
+    }
+    Ok(())
 }
 
 impl Dofs {

@@ -278,6 +278,9 @@ impl Needs {
     }
 }
 
+/// Weights beyond this leave the range of the solver; what is to hold so is hard.
+const HEAVIEST: f64 = 1e12;
+
 fn check_sizes(sizes: &[f64], names: usize, soft: Option<Soft>, label: &str) -> Result<(), LimitError> {
     let bad = |what: &str, value, domain| {
         Err(LimitError::BadValue { what: format!("{what} of limit '{label}'"), value, domain })
@@ -289,9 +292,11 @@ fn check_sizes(sizes: &[f64], names: usize, soft: Option<Soft>, label: &str) -> 
         return bad("number of row names", names as f64, "the number of rows");
     }
     match soft {
-        Some(s) if !(s.linear >= 0.0 && s.linear.is_finite()) => bad("soft.linear", s.linear, "at least 0"),
-        Some(s) if !(s.quadratic > 0.0 && s.quadratic.is_finite()) => {
-            bad("soft.quadratic", s.quadratic, "above 0")
+        Some(s) if !(s.linear >= 0.0 && s.linear <= HEAVIEST) => {
+            bad("soft.linear", s.linear, "at least 0 and at most 1e12")
+        }
+        Some(s) if !(s.quadratic > 0.0 && s.quadratic <= HEAVIEST) => {
+            bad("soft.quadratic", s.quadratic, "above 0 and at most 1e12")
         }
         _ => Ok(()),
     }

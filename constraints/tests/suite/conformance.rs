@@ -256,6 +256,19 @@ fn impossible_numbers_are_refused_by_name() {
             "row 'r' has equals and a margin, which leave nothing",
         ),
         ("jerk = { limit = { elbow = 1.0 } }", "jerk limit names joint 'elbow'"),
+        (
+            "jerk = { limit = 1.0, soft = { quadratic = 1e13 } }",
+            "soft.quadratic of limit 'jerk' is 10000000000000, but must be above 0 and at most 1e12",
+        ),
+        (
+            "rows = [{ name = \"r\", terms = { \"q.panda_joint1\" = 2.0 }, upper = 1.0, braking = 3e6 }]",
+            "braking of row 'r' is 3000000, but must be above 0, and at most a million times the largest coefficient",
+        ),
+        (
+            "rows = [{ name = \"r\", terms = { \"v.panda_joint1\" = 1.0 }, upper = 1.0 }, { name = \"r\", terms = { \"v.panda_joint2\" = 1.0 }, \
+             upper = 1.0 }]",
+            "two rows are named 'r'",
+        ),
         ("jerk = { limit = 1.0, soft = { quadratic = 0.0 } }", "soft.quadratic of limit 'jerk' is 0"),
         ("torque_speed = { stall = 0.0, no_load = 1.0 }", "torque_speed stall is 0"),
         ("torque_rate = { limit = inf }", "torque_rate limit is inf"),

@@ -52,6 +52,26 @@ fn storm(
 
 const START: [f64; 7] = [0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0];
 
+/// A deceleration that no joint gives decides nothing: the sum stops in front of its bound with what its joints have, 8 rad/s² each.
+#[test]
+fn a_sum_stops_in_front_of_its_bound_however_much_braking_is_asked_for() {
+    let terms = [("q.panda_joint1", 1.0), ("q.panda_joint2", -0.5)];
+    for braking in [4.0, 20.0, 1e3, 1e6] {
+        let row = UserRowSettings { braking: Some(braking), ..between("sum", &terms, -0.2, 0.2) };
+        for (dt, sub_steps) in [(0.001, 1), (0.01, 1), (0.01, 0), (0.01, 5)] {
+            let mut projector = projector(&panda(), std::slice::from_ref(&row), Settings::new(dt, sub_steps));
+            let mut largest = 0.0f64;
+            storm(&mut projector, &START, (1500, 11), |_, _, target, _| {
+                largest = largest.max((target.q[0] - 0.5 * target.q[1]).abs());
+            });
+            assert!(
+                largest < 0.2 + 1e-8 && largest > 0.15,
+                "{braking} rad/s², {dt} s, {sub_steps}: {largest}"
+            );
+        }
+    }
+}
+
 #[test]
 fn a_speed_of_one_joint_and_an_acceleration_of_another_are_kept_together() {
     let terms = [("v.panda_joint4", 1.0), ("a.panda_joint2", 0.2)];

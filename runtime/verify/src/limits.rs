@@ -663,7 +663,10 @@ impl UserRow {
         });
         let least = each.fold(none, f64::min);
         let own = is_value.then_some(if least.is_finite() { least } else { steepest });
-        let braking = self.braking.or(own);
+        // And what all of them give together.
+        let all = self.terms.values().zip(&terms).map(|(c, t)| c.abs() * joints[t.dof].acceleration);
+        let most: f64 = all.sum();
+        let braking = self.braking.map(|braking| braking.min(most)).or(own);
         let size = match braking {
             Some(braking) => braking,
             None if largest > 0.0 => largest,
@@ -674,10 +677,9 @@ impl UserRow {
         let equal = is_equal.then_some(Equal {
             is_of_state: terms.iter().all(|t| t.acceleration == 0.0),
             is_kept: is_moved && rests,
-            steepest,
         });
         let is_equality = self.equals.is_some();
-        let rule = Rule::User { terms, lower, upper, braking, is_equality, equal };
+        let rule = Rule::User { terms, lower, upper, braking, is_equality, equal, steepest };
         Ok(Row::new("user", &self.name, size, self.soft, rule))
     }
 }

@@ -59,8 +59,6 @@ pub(crate) struct Equal {
     pub(crate) is_of_state: bool,
     /// A brake that slows its joints down in proportion leaves it there.
     pub(crate) is_kept: bool,
-    /// The largest coefficient.
-    pub(crate) steepest: f64,
 }
 
 /// What a row says.
@@ -87,6 +85,8 @@ pub(crate) enum Rule {
         is_equality: bool,
         /// Hard, with one value.
         equal: Option<Equal>,
+        /// The largest coefficient.
+        steepest: f64,
     },
     /// A pair of bodies, see [`Collision`](crate::collision::Collision).
     Pair,
@@ -260,7 +260,7 @@ impl Row {
                 let (speed, c) = (dot(*n, at.velocity), dot(*n, at.acceleration));
                 [none, plane(p, offset - dot(*n, at.at), speed, c, then, *braking)]
             }
-            Rule::User { terms, lower, upper, braking, equal, .. } => match braking {
+            Rule::User { terms, lower, upper, braking, equal, steepest, .. } => match braking {
                 None => {
                     let (value, [mut lower, mut upper]) = (self.sum(passage), [*lower, *upper]);
                     let still = Passage { q1: passage.q, v1: passage.v, ..*passage };
@@ -277,14 +277,14 @@ impl Row {
                     let s = sum(&|t| t.position.map_or(0.0, |(iq, c)| c * passage.q[iq]));
                     let (w, a) =
                         (sum(&|t| weight(t) * passage.v[t.dof]), sum(&|t| weight(t) * passage.a[t.dof]));
-                    if let Some(equal) = equal {
+                    if equal.is_some() {
                         let (off, left) = (s - lower, p.dt * w);
                         if off.abs() <= AT && left.abs() <= AT {
                             let held = -(w + (0.5 / p.dt).min(TAKEN_OFF) * off) / p.dt;
                             return [(held - a) / b, (a - held) / b];
                         }
                         let further = (self.sum(passage) - lower).abs() - off.abs() - left.abs();
-                        return [none, further / equal.steepest];
+                        return [none, further / steepest];
                     }
                     let beyond = |d: f64, w: f64, a: f64| {
                         if d.is_finite() { (a - in_front(p, d, w, *b)) / b } else { none }
@@ -320,22 +320,23 @@ impl Row {
                 m.speed(spot, *point) / most - 1.0
             }
             Rule::Energy { most } => (m.energy(passage.q1, passage.v1) / most).sqrt() - 1.0,
-            Rule::User { lower, braking, equal: Some(equal), .. } => {
+            Rule::User { lower, braking, equal: Some(equal), steepest, .. } => {
                 let off = (self.sum(passage) - lower).abs();
                 match (equal.is_kept, braking) {
-                    (true, Some(_)) => (off - 2.0 * AT) / equal.steepest,
+                    (true, Some(_)) => (off - 2.0 * AT) / steepest,
                     (true, None) => off / self.size - AT_SPEED,
                     (false, _) => return None,
                 }
             }
-            Rule::User { terms, lower, upper, braking, is_equality, .. } => {
+            Rule::User { terms, lower, upper, braking, is_equality, steepest, .. } => {
                 let stands = *lower <= 0.0 && *upper >= 0.0;
                 let of_positions = terms.iter().any(|t| t.position.is_some());
                 if braking.is_none() && (*is_equality || !(of_positions || stands)) {
                     return None;
                 }
                 let value = self.sum(passage);
-                (value - upper).max(lower - value) / self.size
+                let size = if braking.is_some() { *steepest } else { self.size };
+                (value - upper).max(lower - value) / size
             }
             Rule::Pair => return None,
             _ => worst(self.excess(m, p, passage)),
