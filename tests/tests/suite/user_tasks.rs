@@ -626,3 +626,71 @@ fn a_limit_that_looks_like_degrees_is_said_before_training() {
         "{lines:?}"
     );
 }
+
+/// Two motors of gear 3 and -2 turn one hinge: 2 N m, and what is summed over driven joints counts it once.
+#[test]
+fn a_joint_with_two_motors_is_summed_once() {
+    const ROBOT: &str = "<mujoco><option timestep=\"0.01\"/><worldbody><body name=\"b\"><joint name=\"j\" axis=\"0 1 0\" damping=\".1\"/>\
+        <geom type=\"capsule\" fromto=\"0 0 0 0 0 -.3\" size=\".03\" mass=\"1\"/></body></worldbody><actuator>\
+        <motor name=\"a\" joint=\"j\" gear=\"3\" ctrlrange=\"-1 1\"/><motor name=\"b\" joint=\"j\" gear=\"-2\" ctrlrange=\"-1 1\"/></actuator></mujoco>";
+    let folder = tempfile::tempdir().expect("folder");
+    std::fs::write(folder.path().join("two.xml"), ROBOT).expect("robot");
+    let file = folder.path().join("two.toml");
+    let env_of = |reward: &str| {
+        let text = format!(
+            "name = \"two\"\n[model]\nmjcf = \"two.xml\"\n[time]\ndt = 0.01\nsim_dt = 0.01\n[state]\ncontrollable = []\n[reward]\nr = \"{reward}\"\n\
+             [constraints]\n[idm]\nkind = \"learned\"\n"
+        );
+        std::fs::write(&file, text).expect("task");
+        tasks::env(file.to_str().expect("UTF-8")).expect("task")
+    };
+    type Expected = fn(f64, f64) -> f64;
+    let of: [(&str, Expected); 3] = [
+        ("power", |_, v| (2.0 * v).abs()),
+        ("torque.squared", |_, _| 4.0),
+        ("dv.squared", |before, v| ((v - before) / 0.01).powi(2)),
+    ];
+    for (name, expected) in of {
+        let mut env = env_of(name);
+        env.reset(&mut stream(1, 0)).expect("reset");
+        for _ in 0..3 {
+            let before = env.qvel()[0];
+            let reward = env.step(&[1.0, 0.5]).reward;
+            let expected = expected(before, env.qvel()[0]);
+            assert!((reward - expected).abs() < 1e-9 * (1.0 + expected), "{name}: {reward} {expected}");
+        }
+    }
+}
+
+/// Encoder counts are an observation like others; what is no number of a robot is named by its entry before a snapshot is written.
+#[test]
+fn observations_in_large_units_are_learned_from_and_those_beyond_any_are_named() {
+    let first = "\"q.slider\"";
+    for (unit, is_taken) in [("1e7 * q.slider", true), ("1e40 * q.slider", false)] {
+        let folder = tempfile::tempdir().expect("folder");
+        let task = edited(folder.path(), first, &format!("\"{unit}\""));
+        let mut manifest =
+            tasks::load(&task, &["train.n_envs=2".into(), "train.n_steps=64".into()]).expect("task");
+        complete(&mut manifest).expect("complete");
+        let request = Request { manifest, algo: Algorithm::Ppo, steps: 256, seed: 1, threads: 1 };
+        let out = folder.path().join("run");
+        let trained = train(&request, &out, |_, _| true);
+        match trained {
+            Ok(file) => {
+                assert!(is_taken, "{unit}");
+                let snapshot =
+                    nearl_runtime::Snapshot::load(&file).expect("a snapshot that was trained is read");
+                assert!(snapshot.networks.normaliser.std.iter().any(|std| *std > 1e4));
+            }
+            Err(error) => {
+                let said = error.to_string();
+                assert!(
+                    !is_taken
+                        && said.contains("the observation '1e40 * q.slider' has")
+                        && said.contains("scale that entry"),
+                    "{said}"
+                );
+            }
+        }
+    }
+}

@@ -26,7 +26,7 @@ pub(super) struct Course {
     pub(super) forces: Forces,
     /// More is drawn in each episode than what stands here: noise and delays.
     pub(super) draws_more: bool,
-    /// Degrees of freedom with an actuator.
+    /// Degrees of freedom with an actuator, each once.
     pub(super) driven: Vec<usize>,
     /// First entries of the free base in `qpos` and `qvel`; never read where the base is fixed.
     pub(super) base: (usize, usize),
@@ -43,7 +43,11 @@ pub(super) struct Course {
 }
 
 impl Course {
-    pub(super) fn new(dt: f64, driven: Vec<usize>, base: Option<(usize, usize)>) -> Course {
+    /// `drives`: the degree of freedom of each actuator; one that two actuators drive is one.
+    pub(super) fn new(dt: f64, drives: Vec<usize>, base: Option<(usize, usize)>) -> Course {
+        let (n_act, mut driven) = (drives.len(), drives);
+        driven.sort_unstable();
+        driven.dedup();
         Course {
             commands: Commands::default(),
             pushes: None,
@@ -53,7 +57,7 @@ impl Course {
             climbs: false,
             forces: Forces { before: vec![f64::NAN; driven.len()], ..Forces::default() },
             draws_more: false,
-            last_action: vec![0.0; driven.len()],
+            last_action: vec![0.0; n_act],
             driven,
             base: base.unwrap_or_default(),
             level: 1.0,

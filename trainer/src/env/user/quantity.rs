@@ -49,9 +49,9 @@ pub(super) enum Quantity {
     ActionChange,
     /// `torque.<actuator>`: force on its joint in the last physics step \[N·m or N\]; index of the degree of freedom.
     Torque(usize),
-    /// `torque.squared`: sum of the squares of all.
+    /// `torque.squared`: sum of the squares over the driven joints.
     TorqueSquared,
-    /// `power`: sum of the magnitudes of force times velocity over the actuators \[W\].
+    /// `power`: sum of the magnitudes of force times velocity over the driven joints \[W\].
     Power,
     /// `dv.squared`: sum of the squares of the driven joints' mean accelerations over the control period \[rad²/s⁴ or m²/s⁴\].
     Acceleration,
