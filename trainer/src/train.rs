@@ -32,6 +32,7 @@ use imitation::Imitation;
 use nearl_rollout_protocol::Layout;
 use nearl_runtime::controller::{Parts, merge_margins};
 use nearl_runtime::normaliser::Normaliser;
+use nearl_runtime::snapshot::FAR;
 use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 use setup::{
@@ -68,6 +69,16 @@ pub enum TrainError {
     /// The checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
+    /// An observation that is no number of a robot.
+    #[error(
+        "the observation '{observation}' has a mean or a standard deviation of {value:e}, and none counts beyond {FAR:e}; scale that entry of state.observation"
+    )]
+    Far {
+        /// As the task names it.
+        observation: String,
+        /// The statistic.
+        value: f64,
+    },
     /// An update left weights that are no numbers, or huge.
     #[error(
         "the training diverged after {steps} steps: tensor '{tensor}' has {value} at index {index}; train anew with a smaller train.ppo.lr, or another seed"
@@ -334,11 +345,21 @@ impl Training {
         self.snapshot.manifest.steps += (self.settings.n_envs * self.settings.n_steps) as u64;
         self.snapshot.manifest.version += 1;
         self.refresh();
-        if let Err(SnapshotError::Value { name: tensor, index, value }) = self.snapshot.networks.check() {
+        if let Err(error) = self.snapshot.networks.check() {
             self.snapshot.networks = last;
             self.snapshot.manifest.steps = steps;
             self.snapshot.manifest.version -= 1;
-            return Err(TrainError::Diverged { steps, tensor, index, value });
+            return Err(match error {
+                SnapshotError::Value { name: tensor, index, value } => {
+                    TrainError::Diverged { steps, tensor, index, value }
+                }
+                SnapshotError::Far { name, index, value } if name != "normaliser.scale" => {
+                    let names = &self.snapshot.manifest.task.state.observation;
+                    let observation = names.get(index).cloned().unwrap_or_else(|| index.to_string());
+                    TrainError::Far { observation, value }
+                }
+                other => other.into(),
+            });
         }
         metrics.extend(self.pretrain());
         if self.passed(self.settings.eval_every) {

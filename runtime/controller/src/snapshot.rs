@@ -257,6 +257,18 @@ pub enum SnapshotError {
         /// The value.
         value: f64,
     },
+    /// Statistics of an observation that is no number of a robot.
+    #[error(
+        "tensor '{name}' has {value:e} at index {index}, and no observation counts beyond {FAR:e}; scale that entry of state.observation, and train again"
+    )]
+    Far {
+        /// Name of the tensor.
+        name: String,
+        /// Which observation or state.
+        index: usize,
+        /// The value.
+        value: f64,
+    },
     /// The robot, layout or limits of the task (a file, or inside a snapshot) are refused.
     #[error("task cannot be used: {reason}")]
     Unusable {
@@ -285,7 +297,7 @@ impl SnapshotError {
             Self::Digest { .. } => SnapshotCode::Digest,
             Self::MissingTensor { .. } => SnapshotCode::MissingTensor,
             Self::Shape { .. } => SnapshotCode::Shape,
-            Self::Value { .. } => SnapshotCode::Value,
+            Self::Value { .. } | Self::Far { .. } => SnapshotCode::Value,
             Self::Unusable { .. } => SnapshotCode::Unusable,
             Self::Canary { .. } => SnapshotCode::Canary,
         }
@@ -489,11 +501,18 @@ impl Networks {
         }
     }
 
-    /// Refuses weights that a reader of the snapshot would refuse: NaN, infinite or huge ones, of a training that diverged.
+    /// Refuses what a reader of the snapshot would refuse: weights that are NaN, infinite or huge, of a training that diverged, and statistics of
+    /// observations that are no numbers of a robot.
     ///
     /// # Errors
-    /// [`SnapshotError::Value`].
+    /// [`SnapshotError::Value`], [`SnapshotError::Far`].
     pub fn check(&self) -> Result<(), SnapshotError> {
+        let Normaliser { mean, std, scale, .. } = &self.normaliser;
+        for (name, values) in
+            [("normaliser.mean", mean), ("normaliser.std", std), ("normaliser.scale", scale)]
+        {
+            within_reach(name, values)?;
+        }
         let idm = self.idm.iter().map(|(dense, log_std)| ("idm", dense, log_std));
         for (net, dense, log_std) in
             std::iter::once(("policy", &self.policy, &self.policy_log_std)).chain(idm)
@@ -541,9 +560,9 @@ impl Networks {
 
     fn read(views: &[(String, TensorView<'_>)], policy: PolicyKind) -> Result<Self, SnapshotError> {
         let normaliser = Normaliser {
-            mean: read_f64(views, "normaliser.mean")?,
-            std: read_f64(views, "normaliser.std")?,
-            scale: read_f64(views, "normaliser.scale")?,
+            mean: far(views, "normaliser.mean")?,
+            std: far(views, "normaliser.std")?,
+            scale: far(views, "normaliser.scale")?,
             clip: read_clip(views)?,
         };
         for (name, values) in [("normaliser.std", &normaliser.std), ("normaliser.scale", &normaliser.scale)] {
@@ -562,6 +581,8 @@ impl Networks {
 
 /// Weights beyond this are refused: no trained network of this kind has them.
 pub const HUGE: f64 = 1e6;
+/// Means and standard deviations of observations and of changes of the state beyond this are refused, in their own units.
+pub const FAR: f64 = 1e12;
 
 fn find<'a, 'b>(
     views: &'a [(String, TensorView<'b>)],
@@ -596,9 +617,26 @@ fn sound<T: Copy + Into<f64>>(values: &[T], name: impl Fn() -> String) -> Result
     }
 }
 
-fn read_f64(views: &[(String, TensorView<'_>)], name: &str) -> Result<Vec<f64>, SnapshotError> {
+fn doubles(views: &[(String, TensorView<'_>)], name: &str) -> Result<Vec<f64>, SnapshotError> {
     let view = find(views, name, Dtype::F64, 1)?;
-    checked(name, view.data().as_chunks::<8>().0.iter().map(|c| f64::from_le_bytes(*c)).collect())
+    Ok(view.data().as_chunks::<8>().0.iter().map(|c| f64::from_le_bytes(*c)).collect())
+}
+
+fn read_f64(views: &[(String, TensorView<'_>)], name: &str) -> Result<Vec<f64>, SnapshotError> {
+    checked(name, doubles(views, name)?)
+}
+
+/// Statistics in units of the user's.
+fn far(views: &[(String, TensorView<'_>)], name: &str) -> Result<Vec<f64>, SnapshotError> {
+    let values = doubles(views, name)?;
+    within_reach(name, &values).map(|()| values)
+}
+
+fn within_reach(name: &str, values: &[f64]) -> Result<(), SnapshotError> {
+    match values.iter().enumerate().find(|(_, v)| !v.is_finite() || v.abs() > FAR) {
+        Some((index, &value)) => Err(SnapshotError::Far { name: name.into(), index, value }),
+        None => Ok(()),
+    }
 }
 
 /// `normaliser.lower` and `normaliser.upper`, which may be infinite; empty where the file has neither.
@@ -606,11 +644,7 @@ fn read_clip(views: &[(String, TensorView<'_>)]) -> Result<Vec<[f64; 2]>, Snapsh
     if !views.iter().any(|(n, _)| n == "normaliser.lower" || n == "normaliser.upper") {
         return Ok(Vec::new());
     }
-    let side = |name| -> Result<Vec<f64>, SnapshotError> {
-        let view = find(views, name, Dtype::F64, 1)?;
-        Ok(view.data().as_chunks::<8>().0.iter().map(|c| f64::from_le_bytes(*c)).collect())
-    };
-    let (lower, upper) = (side("normaliser.lower")?, side("normaliser.upper")?);
+    let (lower, upper) = (doubles(views, "normaliser.lower")?, doubles(views, "normaliser.upper")?);
     if lower.len() != upper.len() {
         return Err(SnapshotError::Shape {
             name: "normaliser.upper".into(),

@@ -296,7 +296,9 @@ impl Verdict {
             | SnapshotError::Foreign { .. }
             | SnapshotError::MissingTensor { .. } => Verdict::Corrupt,
             SnapshotError::Shape { .. } => Verdict::ForeignShape,
-            SnapshotError::Value { .. } | SnapshotError::Canary { .. } => Verdict::NotFinite,
+            SnapshotError::Value { .. } | SnapshotError::Far { .. } | SnapshotError::Canary { .. } => {
+                Verdict::NotFinite
+            }
             _ => Verdict::Other,
         }
     }

@@ -6,7 +6,7 @@ use super::network::ImportedNetwork;
 use super::sound::is_sound;
 use super::tensor::Tensor;
 use nearl_runtime::file_kind::FileKind;
-use nearl_runtime::snapshot::{HUGE, MAX_BYTES};
+use nearl_runtime::snapshot::{FAR, HUGE, MAX_BYTES};
 use rten_onnx::onnx::{GraphProto, ModelProto};
 use std::path::Path;
 
@@ -72,7 +72,8 @@ fn check_values(
         }
     }
     for (what, values) in [("mean of the inputs", &network.mean), ("scale of the inputs", &network.std)] {
-        parts.extend(first(&mut values.iter().copied()).map(|found| (what.to_string(), found)));
+        let found = values.iter().copied().enumerate().find(|(_, x)| !x.is_finite() || x.abs() > FAR);
+        parts.extend(found.map(|found| (what.to_string(), found)));
     }
     let Some(part) = parts.into_iter().next() else { return Ok(()) };
     let of_file = graph.initializer.iter().find_map(|proto| {
