@@ -148,6 +148,16 @@ fn minus_is_a_sign(command: clap::Command) -> clap::Command {
     command.mut_subcommands(minus_is_a_sign)
 }
 
+/// An error of a task with the file that the task was read from, where it is one.
+fn of_file(task: &str, error: &dyn std::fmt::Display) -> Failure {
+    let said = error.to_string();
+    if said.contains(task) || !std::path::Path::new(task).is_file() {
+        said.into()
+    } else {
+        format!("{task}: {said}").into()
+    }
+}
+
 /// A number of threads or jobs.
 pub(crate) fn at_least_one(text: &str) -> Result<usize, String> {
     match text.parse() {

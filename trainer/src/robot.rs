@@ -91,9 +91,9 @@ fn describe_simulated(
     robot.name = stated.name;
     robot.motors = motors;
     // A URDF's only equations are those of joints that mimic others, which a note of its own names.
-    robot
-        .notes
-        .retain(|note| note != mj::EQUATIONS || !stated.notes.iter().any(|note| note.contains("' mimics '")));
+    robot.notes.retain(|note| {
+        !note.starts_with(mj::EQUATIONS) || !stated.notes.iter().any(|note| note.contains("' mimics '"))
+    });
     let more: Vec<_> = stated.notes.into_iter().filter(|note| !note.contains("no mass")).collect();
     robot.notes.extend(more);
     Ok(robot)

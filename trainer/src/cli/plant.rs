@@ -1,6 +1,6 @@
 //! `nearl plant`: MuJoCo as the robot, over shared memory.
 
-use super::{Failure, say};
+use super::{Failure, of_file, say};
 use crate::blank::complete;
 use crate::plant::MujocoPlant;
 use crate::tasks;
@@ -128,7 +128,7 @@ impl PlantCommand {
             return Ok(Snapshot::load(&file)?.manifest);
         }
         let mut manifest = tasks::load(&self.task, &self.set)?;
-        complete(&mut manifest)?;
+        complete(&mut manifest).map_err(|e| of_file(&self.task, &e))?;
         Ok(manifest)
     }
 }

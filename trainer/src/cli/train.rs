@@ -1,7 +1,7 @@
 //! `nearl train`: begins a training, or goes on with one.
 
 use super::python::Python;
-use super::{Failure, at_least_one, cores, say, unstable};
+use super::{Failure, at_least_one, cores, of_file, say, unstable};
 use crate::checkpoint::{self, Checkpoint};
 use crate::learn::Algorithm;
 use crate::preset::Preset;
@@ -9,8 +9,8 @@ use crate::train::{Experience, Progress, Request, Training, resume_on, train_in,
 use crate::{run_folder, tasks};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
-use nearl_runtime::Task;
 use nearl_runtime::link::RobotName;
+use nearl_runtime::{Manifest, Task};
 use std::collections::BTreeSet;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -125,8 +125,13 @@ struct Run {
 }
 
 impl Run {
-    /// What the checkpoint in `folder` says; it must be of `task`, which was read of `file`.
-    fn resumed(folder: &Path, task: &Task, file: &str, steps: Option<u64>) -> Result<Self, Failure> {
+    /// What the checkpoint in `folder` says, and what it goes on with; it must be of `task`, which was read of `file`.
+    fn resumed(
+        folder: &Path,
+        task: &Task,
+        file: &str,
+        steps: Option<u64>,
+    ) -> Result<(Self, Manifest), Failure> {
         let header = Checkpoint::load(&checkpoint::path_in(folder))?.header;
         let name = header.manifest.task.name.clone();
         if name != task.name {
@@ -148,7 +153,7 @@ impl Run {
         }
         let (algo, done) = (header.manifest.algo.parse()?, header.manifest.steps);
         let (steps, starts_warm) = (steps.unwrap_or(header.total), header.starts_warm);
-        Ok(Self { name, algo, steps, done, starts_warm })
+        Ok((Self { name, algo, steps, done, starts_warm }, header.manifest))
     }
 }
 
@@ -182,16 +187,19 @@ impl Train {
     pub(super) fn run(self) -> Result<(), Failure> {
         let set = overrides(self.demos.as_deref(), &self.set)?;
         let mut manifest = tasks::load_with(&self.task, self.preset, &set)?;
-        crate::train::complete(&mut manifest)?;
-        let run = match &self.resume {
+        crate::train::complete(&mut manifest).map_err(|e| of_file(&self.task, &e))?;
+        let (run, manifest) = match &self.resume {
             Some(folder) => Run::resumed(folder, &manifest.task, &self.task, self.steps)?,
-            None => Run {
-                name: manifest.task.name.clone(),
-                algo: self.algo.parse()?,
-                steps: self.steps.unwrap_or(STEPS),
-                done: 0,
-                starts_warm: self.start_from.is_some(),
-            },
+            None => {
+                let run = Run {
+                    name: manifest.task.name.clone(),
+                    algo: self.algo.parse()?,
+                    steps: self.steps.unwrap_or(STEPS),
+                    done: 0,
+                    starts_warm: self.start_from.is_some(),
+                };
+                (run, manifest)
+            }
         };
         let out = self
             .resume

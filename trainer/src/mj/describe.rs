@@ -7,7 +7,7 @@ use nearl_runtime::constraints::description::{
 use nearl_runtime::constraints::geometry::{Placement, Shape};
 
 use mujoco_rs::mujoco_c::mjtDisableBit;
-use mujoco_rs::wrappers::mj_model::{MjtGeomBase, MjtObjBase};
+use mujoco_rs::wrappers::mj_model::{MjtGeomBase, MjtObjBase, MjtWrap};
 
 use super::{JointKind, MjError, Model, motors, pairs};
 
@@ -252,10 +252,7 @@ impl Model {
     pub(crate) fn simulated_alone(&self) -> Vec<String> {
         let m = &self.0;
         let touching = self.touching();
-        let name = |id: usize| {
-            self.name(MjtObjBase::mjOBJ_SENSOR, id).map_or(format!("number {id}"), |name| format!("'{name}'"))
-        };
-        let sensors: Vec<String> = (0..m.nsensor() as usize).map(name).collect();
+        let sensors = self.named(MjtObjBase::mjOBJ_SENSOR, m.nsensor() as usize);
         let mut left = Vec::new();
         if touching > 0 {
             left.push(format!(
@@ -271,6 +268,44 @@ impl Model {
         left
     }
 
+    /// Names of all objects of a kind, or their numbers.
+    fn named(&self, kind: MjtObjBase, n: usize) -> Vec<String> {
+        let name = |id: usize| self.name(kind, id).map_or(format!("number {id}"), |name| format!("'{name}'"));
+        (0..n).map(name).collect()
+    }
+
+    /// Tendons that pull, by what, and at which joints where they are sums of joints.
+    fn pulling_tendons(&self) -> Vec<String> {
+        let m = &self.0;
+        let names = self.named(MjtObjBase::mjOBJ_TENDON, m.tendon_adr().len());
+        let pulls = |(id, name): (usize, String)| {
+            let by = [
+                (
+                    "spring",
+                    m.tendon_stiffness()[id] != 0.0 || m.tendon_stiffnesspoly()[id].iter().any(|k| *k != 0.0),
+                ),
+                (
+                    "damper",
+                    m.tendon_damping()[id] != 0.0 || m.tendon_dampingpoly()[id].iter().any(|d| *d != 0.0),
+                ),
+                ("range", m.tendon_limited()[id]),
+                ("dry friction", m.tendon_frictionloss()[id] != 0.0),
+                ("armature", m.tendon_armature()[id] != 0.0),
+                ("actuator", (0..self.n_actuators()).any(|actuator| self.tendon_of(actuator) == Some(id))),
+            ];
+            let by: Vec<&str> = by.into_iter().filter_map(|(what, acts)| acts.then_some(what)).collect();
+            let [first, count] = [m.tendon_adr()[id], m.tendon_num()[id]].map(|x| x.max(0) as usize);
+            let wrapped = (first..first + count).filter(|k| m.wrap_type()[*k] == MjtWrap::mjWRAP_JOINT);
+            let joints: Vec<String> = wrapped
+                .filter_map(|k| usize::try_from(m.wrap_objid()[k]).ok())
+                .map(|joint| format!("'{}'", self.joint_name(joint)))
+                .collect();
+            let at = if joints.is_empty() { "what it spans".to_owned() } else { joints.join(", ") };
+            (!by.is_empty()).then(|| format!("{name} pulls at {at} ({})", by.join(", ")))
+        };
+        names.into_iter().enumerate().filter_map(pulls).collect()
+    }
+
     /// What the file says and the description does not.
     fn notes(&self) -> Vec<String> {
         let (m, mut notes) = (&self.0, Vec::new());
@@ -279,14 +314,35 @@ impl Model {
                 notes.push(text.to_string());
             }
         };
-        note(m.neq() > 0, EQUATIONS);
-        note(m.ntendon() > 0, "tendons are not modelled");
+        let equations = self.named(MjtObjBase::mjOBJ_EQUALITY, m.eq_type().len());
+        note(
+            m.neq() > 0,
+            &format!(
+                "{EQUATIONS}: {}; limits hold without what these pull at their joints or bodies; take them out, or leave margins",
+                equations.join(", ")
+            ),
+        );
+        let tendons = self.pulling_tendons();
+        note(
+            !tendons.is_empty(),
+            &format!(
+                "tendons are not modelled: {}; no limit of these joints, nor of those that they move, is promised; take them out of the robot file, or \
+                 take idm kind = \"learned\" and see what is reached",
+                tendons.join(", ")
+            ),
+        );
         note(m.nflex() > 0, "flexible bodies are not modelled");
         let several = |id: usize| self.joint(id).nv > 1 && m.dof_frictionloss()[self.joint(id).idx_v] != 0.0;
         note((0..m.jnt_type().len()).any(several), "frictionloss of free and ball joints is not modelled");
         let option = m.opt();
         let air = option.density != 0.0 || option.viscosity != 0.0;
-        note(air, "fluid forces are not modelled");
+        note(
+            air,
+            &format!(
+                "fluid forces are not modelled (density {}, viscosity {}, wind {:?}): limits hold up to what these push; set them to 0, or leave margins",
+                option.density, option.viscosity, option.wind
+            ),
+        );
         let balls = |id: usize| m.jnt_limited()[id] && self.joint(id).nv > 1;
         note((0..m.jnt_type().len()).any(balls), "limits of ball joints are not modelled");
         note(m.body_mocapid().iter().any(|id| *id >= 0), "mocap bodies are taken to stand still");

@@ -45,7 +45,7 @@ fn load(model: &Model, id: usize, gear: f64, robot: &mut RobotDescription, joint
 }
 
 impl Model {
-    fn n_actuators(&self) -> usize {
+    pub(super) fn n_actuators(&self) -> usize {
         self.0.actuator_trntype().len()
     }
 
