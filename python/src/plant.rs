@@ -17,7 +17,7 @@ use crate::errors;
 
 fn error(error: LinkError) -> PyErr {
     match error {
-        LinkError::Name(_) => errors::value(error),
+        LinkError::Name(_) | LinkError::Announced { .. } => errors::value(error),
         other => PyConnectionError::new_err(other.to_string()),
     }
 }

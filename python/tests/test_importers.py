@@ -889,7 +889,7 @@ def test_what_is_wrong_in_a_recipe_is_told_with_its_line(tmp_path) -> None:
         ("velocity = { limit = 2.0 }", "velocity = { limt = 2.0 }", "unknown field `limt`"),
         ("guard = true", 'guard = "yes"', "expected true, false"),
         ("dt = 0.02 ", "dt = .02 ", "invalid mantissa"),
-        ('joints = ["joint0", "joint1"]', "joints = [1, 2]", "invalid type: integer"),
+        ('joints = ["joint0", "joint1"]', "joints = [1, 2]", "it is 1; give a text in quotes"),
     ]:
         assert right.count(old) == 1
         recipe.write_text(right.replace(old, new))

@@ -91,6 +91,8 @@ def test_names_and_numbers_of_a_plant_are_named() -> None:
         ({"observation": "q.slide"}, ValueError, "observation is 'q.slide', a single name"),
         ({"joints": [1]}, ValueError, r"joints\[0\] is 1; give names"),
         ({"dt": "0.01"}, TypeError, "dt is of str; give a number"),
+        ({"joints": ["slide", "slide"], "nv": 2}, ValueError, "names joint `slide` twice: give each joint once"),
+        ({"joints": ["slide", "turn"], "nv": 1}, ValueError, "names 2 joints, and has 1 velocity entries"),
         ({"watchdog": None}, TypeError, "watchdog is of NoneType; give a number"),
     ):
         with pytest.raises(error, match=said):

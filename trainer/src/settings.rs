@@ -279,7 +279,7 @@ mod tests {
             ("beta = 0.1", "[train.beta]: no such key here; give train.pid2.beta"),
             ("idm_lr = 0.1", "give train.nearl.idm_lr or train.pid2.idm_lr"),
             ("ppo.batch_siz = 64", "did you mean 'batch_size'?"),
-            ("ppo.lr = \"fast\"", "[train.ppo.lr]: invalid type: string \"fast\", expected f32"),
+            ("ppo.lr = \"fast\"", "[train.ppo.lr]: it is \"fast\"; give a number"),
         ] {
             let refused = read(text).unwrap_err();
             assert!(refused.contains(words), "{refused}");

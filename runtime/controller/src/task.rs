@@ -580,6 +580,17 @@ pub fn suggest(message: &str) -> String {
         return "missing section [idm]; write it with kind = \"pinocchio\" (the model's own, where each controllable joint has a motor) or kind = \"learned\""
             .into();
     }
+    if let Some(section) =
+        ["model", "time", "state", "constraints"].iter().find(|s| message == format!("missing field `{s}`"))
+    {
+        return format!("section [{section}] is missing; write it, be it empty (docs: Tasks)");
+    }
+    if let Some(key) = message.strip_prefix("missing field ") {
+        return format!("{key} is missing; add it");
+    }
+    if let Some(said) = of_another_kind(&message) {
+        return said;
+    }
     let mut quoted = message.split('`').skip(1).step_by(2);
     let Some(unknown) = quoted.next().filter(|_| message.starts_with("unknown ")) else { return message };
     let near = quoted.map(|k| (strsim::jaro(unknown, k), k)).max_by(|a, b| a.0.total_cmp(&b.0));
@@ -587,6 +598,31 @@ pub fn suggest(message: &str) -> String {
         Some((score, key)) if score > 0.7 => format!("{message}; did you mean '{key}'?"),
         _ => message,
     }
+}
+
+/// `invalid type: integer `3`, expected a string` in the words of who writes the file.
+fn of_another_kind(message: &str) -> Option<String> {
+    let said = message.strip_prefix("invalid type: ").or_else(|| message.strip_prefix("invalid value: "))?;
+    let (is, wanted) = said.rsplit_once(", expected ")?;
+    let is = ["string ", "integer ", "floating point ", "boolean "]
+        .iter()
+        .find_map(|kind| is.strip_prefix(kind))
+        .map_or_else(
+            || is.replace("sequence", "a list").replace("map", "a section"),
+            |value| value.replace('`', ""),
+        );
+    let wanted = match wanted {
+        "f64" | "f32" => "a number",
+        "usize" | "u64" | "u32" | "u16" | "u8" => "a whole number from 0 on",
+        "isize" | "i64" | "i32" => "a whole number",
+        "a string" => "a text in quotes",
+        "a boolean" => "true or false",
+        "a sequence" => "a list in brackets",
+        "a map" => "keys and their values, as { key = value }",
+        other if other.starts_with("struct ") => "keys and their values, as { key = value }",
+        other => other,
+    };
+    Some(format!("it is {is}; give {wanted}"))
 }
 
 /// `a.b.c=value`: the value is TOML, or a bare string.

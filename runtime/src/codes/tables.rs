@@ -9,6 +9,8 @@ codes! {
             "Take 1 to 32 letters, digits, `-` or `_`.";
         Capacity = "link-capacity", "A vector of the robot does not fit into the messages.",
             "Raise the capacity in link/messages.rs and rebuild both ends.";
+        Announced = "link-announced", "A plant says of itself what no robot is.",
+            "Name each joint once, in the order of v.";
         NoPlant = "link-no-plant", "No plant of this name answers on this machine.",
             "Start `nearl plant TASK --name NAME` first, or correct --plant.";
         NoRuntime = "link-no-runtime", "No runtime of this name answers on this machine.",

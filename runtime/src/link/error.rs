@@ -26,6 +26,14 @@ pub enum LinkError {
         /// How many fit.
         limit: usize,
     },
+    /// A plant says of itself what no robot is.
+    #[error("the plant of robot `{name}` {reason}: give each joint once, in the order of v")]
+    Announced {
+        /// Robot.
+        name: RobotName,
+        /// What it says.
+        reason: String,
+    },
     /// Nobody publishes as this plant.
     #[error(
         "no plant named `{0}` answers on this machine: start `nearl plant TASK --name {0}` first, or correct --plant"
@@ -123,6 +131,7 @@ impl LinkError {
         match self {
             Self::Name(_) => LinkCode::Name,
             Self::Capacity { .. } => LinkCode::Capacity,
+            Self::Announced { .. } => LinkCode::Announced,
             Self::NoPlant(_) => LinkCode::NoPlant,
             Self::NoRuntime(_) => LinkCode::NoRuntime,
             Self::NoQuestion(_) => LinkCode::NoQuestion,

@@ -61,6 +61,15 @@ impl Robot {
                 return Err(LinkError::Capacity { name: name.clone(), what, count, limit });
             }
         }
+        let announced = |reason: String| LinkError::Announced { name: name.clone(), reason };
+        let twice = self.joints.iter().enumerate().find(|(i, joint)| self.joints[..*i].contains(joint));
+        if let Some((_, joint)) = twice {
+            return Err(announced(format!("names joint `{joint}` twice")));
+        }
+        if self.joints.len() > self.nv {
+            let (joints, nv) = (self.joints.len(), self.nv);
+            return Err(announced(format!("names {joints} joints, and has {nv} velocity entries")));
+        }
         let mut message = RobotMessage::zeroed();
         message.set_joint_names(&self.joints);
         message.observation = hash_names(&self.observation);
