@@ -1,4 +1,5 @@
-//! Finds planes and boxes that a point of the robot never reaches the right side of. With one of them every tick only comes back, and never arrives.
+//! Finds planes and boxes that points of the robot never reach the right side of, alone or all at once. With these every tick only comes back, and
+//! never arrives.
 
 use nearl_constraints::description::{JointDescription, JointKind};
 use nearl_constraints::limit::FrameSettings;
@@ -14,7 +15,8 @@ const GRID: usize = 60;
 /// What a search over a grid may leave \[m\].
 const NEAR: f64 = 1e-3;
 
-/// One sentence for each hard limit of a frame that holds in none of the poses found within the position limits. Only robots of hinges, and of slides
+/// One sentence for each hard limit of a frame that holds in none of the poses found within the position limits, else one where all of them never hold
+/// at once. Only robots of hinges, and of slides
 /// that end somewhere, are looked at: others may come anywhere.
 pub fn notes(model: &Model, limits: &LimitSet, frames: &[FrameSettings]) -> Vec<String> {
     let hard = frames.iter().filter(|of| of.soft.is_none());
@@ -30,30 +32,45 @@ pub fn notes(model: &Model, limits: &LimitSet, frames: &[FrameSettings]) -> Vec<
     }
     let joints: Vec<usize> = (0..model.nv()).collect();
     let ranges = ranges(model, limits, &joints);
-    let note = |of: &FrameSettings| {
-        let frame = model.frame(&of.frame).ok()?;
-        let least = Search { kinematics: Kinematics::new(model), rest: vec![0.0; model.nv()], of, frame }
-            .least(&ranges);
+    let looked = |of: &FrameSettings| Some((of.clone(), model.frame(&of.frame).ok()?));
+    let all: Vec<_> = hard.filter_map(looked).collect();
+    let least = |points: &[(FrameSettings, FrameId)]| {
+        Search { kinematics: Kinematics::new(model), rest: vec![0.0; model.nv()], points }.least(&ranges)
+    };
+    let name = |(of, _): &(FrameSettings, FrameId)| of.name.as_ref().unwrap_or(&of.frame).clone();
+    let note = |one: &(FrameSettings, FrameId)| {
+        let least = least(std::slice::from_ref(one));
         (least > NEAR).then(|| {
-            let name = of.name.as_ref().unwrap_or(&of.frame);
             format!(
-                "the limit of frame '{name}' holds in no pose found within the position limits, the nearest is {least:.3} m outside of it: every tick would \
-                 be `recovering`; correct it, or leave it out"
+                "the limit of frame '{}' holds in no pose found within the position limits, the nearest is {least:.3} m outside of it: every tick would \
+                 be `recovering`; correct it, or leave it out",
+                name(one)
             )
         })
     };
-    hard.filter_map(note).collect()
+    let mut notes: Vec<String> = all.iter().filter_map(note).collect();
+    if notes.is_empty() && all.len() > 1 {
+        let least = least(&all);
+        let names: Vec<String> = all.iter().map(|one| format!("'{}'", name(one))).collect();
+        notes.extend((least > NEAR).then(|| {
+            format!(
+                "the limits of frames {} hold each alone, and in no pose found within the position limits all at once, the nearest is {least:.3} m outside \
+                 of one: every tick would be `recovering`; correct one, or leave it out",
+                names.join(", ")
+            )
+        }));
+    }
+    notes
 }
 
 struct Search<'a> {
     kinematics: Kinematics,
     rest: Vec<f64>,
-    of: &'a FrameSettings,
-    frame: FrameId,
+    points: &'a [(FrameSettings, FrameId)],
 }
 
 impl Search<'_> {
-    /// How far outside the point is at best \[m\]; 0 inside.
+    /// How far outside its limit the worst of the points is at best \[m\]; 0 inside.
     fn least(&mut self, ranges: &[(usize, f64, f64)]) -> f64 {
         let mut q = self.kinematics.model().neutral();
         let mut best: Vec<(f64, Vec<f64>)> = Vec::with_capacity(POSES);
@@ -100,18 +117,21 @@ impl Search<'_> {
 
     fn outside(&mut self, q: &[f64]) -> f64 {
         self.kinematics.update(q, &self.rest, &self.rest);
-        let p = self.kinematics.point(self.frame, self.of.point).position;
-        let mut most = f64::NEG_INFINITY;
-        if let Some(plane) = &self.of.half_space {
-            let length = plane.normal.iter().map(|n| n * n).sum::<f64>().sqrt();
-            let along: f64 = (0..3).map(|k| plane.normal[k] * (p[k] - plane.through[k])).sum();
-            most = along / length;
-        }
-        if let Some(inside) = &self.of.inside {
-            for (k, p) in p.iter().enumerate() {
-                most = most.max(inside.lower[k] - p).max(p - inside.upper[k]);
+        let far = |(of, frame): &(FrameSettings, FrameId)| {
+            let p = self.kinematics.point(*frame, of.point).position;
+            let mut most = f64::NEG_INFINITY;
+            if let Some(plane) = &of.half_space {
+                let length = plane.normal.iter().map(|n| n * n).sum::<f64>().sqrt();
+                let along: f64 = (0..3).map(|k| plane.normal[k] * (p[k] - plane.through[k])).sum();
+                most = along / length;
             }
-        }
-        most + self.of.margin
+            if let Some(inside) = &of.inside {
+                for (k, p) in p.iter().enumerate() {
+                    most = most.max(inside.lower[k] - p).max(p - inside.upper[k]);
+                }
+            }
+            most + of.margin
+        };
+        self.points.iter().map(far).fold(f64::NEG_INFINITY, f64::max)
     }
 }

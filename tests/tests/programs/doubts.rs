@@ -187,6 +187,19 @@ const SET_UPS: &[SetUp] = &[
         check: Some("model"),
     },
     SetUp {
+        what: "two planes with nothing between them",
+        robot: SAME,
+        task: (
+            "torque = {}",
+            "torque = {}\nframe = [\n  { name = \"low\", frame = \"elbow\", half_space = { normal = [0, 0, 1], through = [0, 0, 0.6] }, braking = 5.0 },\n  \
+             { name = \"high\", frame = \"elbow\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.8] }, braking = 5.0 },\n]",
+        ),
+        limits: None,
+        says: &["the limits of frames 'low', 'high' hold each alone, and in no pose", "0.100 m outside"],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
         what: "a box that the arm does not reach",
         robot: SAME,
         task: (
