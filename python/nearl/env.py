@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.arguments import seed_of
 from nearl.render import Frame, Renderer
 
 
@@ -53,6 +54,7 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         Returns:
             Observation (n_obs) and an empty ``info``.
         """
+        seed = None if seed is None else seed_of(seed)
         super().reset(seed=seed)
         if seed is None and not self._seeded:
             seed = int(self.np_random.integers(2**63))

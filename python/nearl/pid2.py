@@ -162,7 +162,7 @@ class PID2:
             raise ValueError(
                 "a policy loaded from a snapshot file predicts and does not learn: the file has no optimiser state; load a run folder, or make a new PID2"
             )
-        total_timesteps = whole("total_timesteps", total_timesteps, 1, "ask for at least one step")
+        total_timesteps = whole("total_timesteps", total_timesteps, 1, "ask for at least one step, and at most 1e15", 10**15)
         callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]
         bar = _Bar(sys.stderr, self.num_timesteps, total_timesteps) if progress_bar else None
         with _said_in_python():

@@ -5,11 +5,14 @@ plug-ins by itself: the ``gymnasium.envs`` entry point of earlier versions is no
 """
 
 import os
+import re
 import warnings
 
 import gymnasium
 
 from nearl import _core
+
+_ID = re.compile(r"[\w:.-]+")
 
 
 def register(*task_files: str | os.PathLike[str]) -> list[str]:
@@ -30,6 +33,8 @@ def register(*task_files: str | os.PathLike[str]) -> list[str]:
         env = _core.Env(os.fspath(file))
         if env.task in bundled:
             raise ValueError(f"{os.fspath(file)} [name]: '{env.task}' is a bundled task, whose id it would take; give the file another name")
+        if not _ID.fullmatch(env.task):
+            raise ValueError(f"{os.fspath(file)} [name]: '{env.task}' is no name of an environment; take letters, digits, '-', '_', '.' and ':'")
         before = gymnasium.registry.pop(f"nearl/{env.task}", None)
         if before is not None and (other := before.kwargs["task"]) != os.path.abspath(file) and os.path.realpath(other) != os.path.realpath(file):
             warnings.warn(

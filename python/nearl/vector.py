@@ -25,9 +25,9 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
 
     Environment ``i`` behaves as a single one that was seeded with ``seed + i``. ``info`` holds, where there is something to say and
     with the mask ``_<key>``: ``final_obs`` and ``final_info`` (same-step mode: what the last step of an episode gave), ``fault``; ``cost`` where the task
-    has one, 0 and masked out where the row is the begin of an episode, as in Gymnasium's ``SyncVectorEnv``; and with ``constraints`` always:
-    ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a limit), ``executed``
-    (what the actuators got in the last of them, num_envs x n_act; not a number where the step only began an episode) and ``moved``.
+    has one, 0 and masked out where the row is the begin of an episode, as in Gymnasium's ``SyncVectorEnv``; and with ``constraints`` of every step that
+    did not only begin an episode: ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a
+    limit), ``executed`` (what the actuators got in the last of them, num_envs x n_act; not a number where the step only began an episode) and ``moved``.
     A vector cannot be pickled or copied: make it in the process that uses it.
 
     Args:
@@ -79,7 +79,9 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Begins an episode everywhere. ``seed``: one for all (environment ``i`` gets ``seed + i``) or one each."""
+        """Begins an episode everywhere. ``seed``: one for all (environment ``i`` gets ``seed + i``) or one each. Returns the
+        observations (num_envs x n_obs) and an empty info.
+        """
         self._check_open()
         if options:
             raise ValueError(f"reset options {sorted(options)} are not known; this vector takes none")
@@ -109,6 +111,9 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         if "cost" in info:
             info["_cost"] = ~(ended if same_step else began)
             info["cost"] = np.where(info["_cost"], info["cost"], 0.0)
+        for key in ("raw_violations", "target_violations", "executed", "moved"):
+            if key in info:
+                info[f"_{key}"] = ~began
         return stepped
 
     def _scored(self, actions: Floats) -> Step:

@@ -98,7 +98,7 @@ impl Controller {
 
     /// One control tick for an observation (n_obs) that holds what the controller needs of the joints' state, as all bundled
     /// tasks' do. `noise` (n_noise): standard normal numbers of the policy; none is deterministic. Returns the action (n_act). An
-    /// observation that is not finite raises ValueError, and the controller stays as it was.
+    /// observation or noise that is not finite raises ValueError, and the controller stays as it was.
     #[pyo3(signature = (obs, noise=None))]
     fn act<'py>(
         &self,
@@ -122,6 +122,12 @@ impl Controller {
             )));
         }
         let noise = noise.map(|n| vector("noise", n, self.n_noise)).transpose()?;
+        let not_finite = |noise: &Vec<f64>| noise.iter().position(|x| !x.is_finite()).map(|i| (i, noise[i]));
+        if let Some((i, value)) = noise.as_ref().and_then(not_finite) {
+            return Err(errors::value(format!(
+                "noise[{i}] is {value}; give standard normal numbers, or none"
+            )));
+        }
         let action = self.with(py, |inner| inner.act(&obs, noise.as_deref()));
         Ok(array(py, &action))
     }

@@ -9,7 +9,7 @@ use nearl_constraints::{self as constraints, Cone, LimitError, LimitSet, PerJoin
 use nearl_runtime::task::Task;
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyString};
+use pyo3::types::{PyBool, PyDict, PyString};
 use toml::{Table, Value};
 
 use crate::arrays::refuse_complex;
@@ -202,6 +202,9 @@ fn value(argument: &Argument, given: &Bound<'_, PyAny>) -> PyResult<Value> {
         PyTypeError::new_err(format!("expected {expected}; got {got}, as '{name}'"))
     };
     refuse_complex(argument.name, given).map_err(|_| refused("complex numbers"))?;
+    if given.is_instance_of::<PyBool>() && !matches!(argument.takes, Takes::Flag) {
+        return Err(refused("bool"));
+    }
     read(argument.takes, given).map_err(|_: PyErr| {
         refused(&given.get_type().name().map_or("another type".into(), |n| n.to_string()))
     })
@@ -242,6 +245,9 @@ fn read(takes: Takes, given: &Bound<'_, PyAny>) -> PyResult<Value> {
 fn written(given: &Bound<'_, PyAny>) -> PyResult<Value> {
     if let Ok(text) = given.cast::<PyString>() {
         return Ok(text.to_string().into());
+    }
+    if let Ok(flag) = given.cast::<PyBool>() {
+        return Ok(flag.is_true().into());
     }
     if let Ok(number) = given.extract::<f64>() {
         return Ok(number.into());

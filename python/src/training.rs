@@ -168,7 +168,7 @@ impl Training {
         py.detach(|| {
             let mut inner = self.lock();
             if inner.learns {
-                return Err(errors::value("this agent is learning already, in another thread; wait for its end"));
+                return Err(errors::value("this agent is learning already, in another thread or around this callback; wait for its end"));
             }
             let manifest = &inner.training.snapshot().manifest;
             let algo = manifest.algo.parse().map_err(|e| errors::train(TrainError::Algorithm(e)))?;

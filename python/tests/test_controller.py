@@ -117,5 +117,7 @@ def test_wrong_shapes_are_named(controller, env) -> None:
     q, v = env.state
     with pytest.raises(ValueError, match=r"obs has shape \(3,\), expected \(20,\)"):
         controller.update(q, v, np.zeros(3))
+    with pytest.raises(ValueError, match=r"noise\[0\] is NaN; give standard normal numbers"):
+        controller.act(env.native.observe(), np.full(controller.n_noise, np.nan))
     held, ledger = controller.update(q, np.full(7, np.nan), env.native.observe())
     assert np.isfinite(held).all() and ledger.status == "refused" and "NaN" in ledger.reason

@@ -90,6 +90,7 @@ def test_what_the_last_step_did_under_constraints_is_final_information_too() -> 
     vec.reset(seed=1)
     vec.action_space.seed(2)
     infos = [vec.step(vec.action_space.sample())[4] for _ in range(4)]
+    assert all(info["_moved"].all() for info in infos)
     last = [info for info in infos if "final_info" in info]
     assert 0 < len(last) < 4
     for info in last:
@@ -162,6 +163,7 @@ def test_constraints_hold_in_the_simulator_whatever_is_proposed() -> None:
         wild = wild[:, chosen(vec)]
         _, _, terminated, _, info = vec.step(wild)
         raw += info["raw_violations"].sum()
+        assert info["_raw_violations"].all() and info["_executed"].all()
         assert not terminated.any() and info["target_violations"].sum() == 0
         assert np.all(vec.native.qpos > low + 0.01 - 1e-9) and np.all(vec.native.qpos < high - 0.01 + 1e-9)
         assert np.all(np.abs(vec.native.qvel) < 0.9 * model.velocity_limit + 1e-9)
