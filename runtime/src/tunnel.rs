@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 use std::time::Duration;
 
-use clap::Args;
+use clap::{ArgGroup, Args};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::json;
 
@@ -23,14 +23,15 @@ const POLL: &str = "1";
 
 /// Carry the links of a robot to or from another host until a signal comes; needs iceoryx2's tunnel for zenoh.
 #[derive(Args, Debug)]
+#[command(group(ArgGroup::new("address").required(true).multiple(true).args(["listen", "connect"])))]
 pub struct TunnelCommand {
     /// Name of the robot, the same on both hosts.
     pub name: String,
     /// Address on which this host waits for the other, for example `tcp/0.0.0.0:7447`.
-    #[arg(long, required_unless_present = "connect")]
+    #[arg(long, value_parser = address)]
     pub listen: Option<String>,
     /// Address of the host that listens, for example `tcp/192.168.1.20:7447`.
-    #[arg(long)]
+    #[arg(long, value_parser = address)]
     pub connect: Option<String>,
     /// Folder for the tunnel's configuration; `tunnel/<name>` if not given.
     #[arg(long)]
@@ -84,6 +85,23 @@ impl TunnelCommand {
     }
 }
 
+/// An address as zenoh writes it: the protocol, then host and port.
+fn address(text: &str) -> Result<String, String> {
+    let parts = text.split_once('/').and_then(|(protocol, place)| Some((protocol, place.rsplit_once(':')?)));
+    let is_one = parts.is_some_and(|(protocol, (host, port))| {
+        let is_protocol = ["tcp", "udp", "tls", "quic", "ws"].contains(&protocol);
+        is_protocol
+            && !host.is_empty()
+            && !host.contains('/')
+            && port.parse::<u16>().is_ok_and(|port| port > 0)
+    });
+    if is_one {
+        Ok(text.into())
+    } else {
+        Err("give protocol, host and port as zenoh writes them: tcp/192.168.1.20:7447".into())
+    }
+}
+
 fn wait(mut child: Child, stop: &Stop) -> Result<(), Failure> {
     loop {
         // Ctrl-C reaches the child too: that it has ended is then no failure.
@@ -107,6 +125,26 @@ fn wait(mut child: Child, stop: &Stop) -> Result<(), Failure> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_address_has_protocol_host_and_port() {
+        for good in ["tcp/0.0.0.0:7447", "udp/robot.local:1", "tls/[::1]:7447"] {
+            assert_eq!(address(good).unwrap(), good);
+        }
+        for bad in [
+            "",
+            "robot",
+            "robot:7447",
+            "tcp/robot",
+            "tcp/:7447",
+            "tcp/robot:0",
+            "tcp/robot:99999",
+            "http/robot:7447",
+            "tcp/a/b:7",
+        ] {
+            assert!(address(bad).is_err(), "{bad}");
+        }
+    }
 
     #[test]
     fn the_tunnel_reads_the_configuration_of_the_links() {

@@ -107,7 +107,8 @@ impl TorqueLimit {
             return Err(error);
         }
         if !missing.is_empty() {
-            let next = "write effort (URDF), or ctrlrange of a motor (without <flag clampctrl=\"disable\"/>) or forcerange of a drive (MJCF) into it, or do not control the joint";
+            let next = "write effort (URDF), or ctrlrange of a motor (without <flag clampctrl=\"disable\"/>) or forcerange of a drive (MJCF) into it, or do \
+                        not control the joint";
             return Err(LimitError::Missing { limit: "torque", joints: quoted(model, &missing), next });
         }
         let share = |damping: &f64| if *damping > 0.0 { scale * (1.0 - SHORT) } else { scale };

@@ -64,8 +64,8 @@ pub struct UserRowSettings {
 /// `lower <= sum of terms of the next state <= upper`.
 ///
 /// With `braking` B the sum `s` of positions is held like a joint: its acceleration toward a bound is at most what
-/// [`approach`] gives for its distance and speed; a B that the accelerations of its joints do not give together counts as what they give. Without it the row speaks of the next state alone, and nothing looks
-/// ahead.
+/// [`approach`] gives for its distance and speed; of a B that its joints together do not give, what they give counts. Without it
+/// the row speaks of the next state alone, and nothing looks ahead.
 ///
 /// A hard row with `equals` stays at that value. A sum of positions at it, `s = e`, is held by its acceleration alone,
 ///

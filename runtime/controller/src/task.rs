@@ -604,6 +604,9 @@ pub fn suggest(message: &str) -> String {
 fn of_another_kind(message: &str) -> Option<String> {
     let said = message.strip_prefix("invalid type: ").or_else(|| message.strip_prefix("invalid value: "))?;
     let (is, wanted) = said.rsplit_once(", expected ")?;
+    if wanted == "string only" {
+        return Some("it is no text; give one in quotes".into());
+    }
     let is = ["string ", "integer ", "floating point ", "boolean "]
         .iter()
         .find_map(|kind| is.strip_prefix(kind))

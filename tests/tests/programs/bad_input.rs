@@ -63,7 +63,7 @@ const FILES: &[(&str, &str, &str, &[&str])] = &[
         "Panda-reach",
         "[state]",
         "[state]\ncontrollable = [\n \"panda_joint1\",\n 2]",
-        &["t.toml:16 [state.controllable[1]]", "expected a string"],
+        &["t.toml:16 [state.controllable[1]]", "it is 2; give a text in quotes"],
     ),
     ("Panda-reach", "name = \"Panda-reach\"", "", &["t.toml", "`name` is missing; add it"]),
     ("Panda-reach", "name = \"Panda-reach\"", "name = ", &["t.toml:3"]),
