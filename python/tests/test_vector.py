@@ -163,7 +163,7 @@ def test_constraints_hold_in_the_simulator_whatever_is_proposed() -> None:
         wild = wild[:, chosen(vec)]
         _, _, terminated, _, info = vec.step(wild)
         raw += info["raw_violations"].sum()
-        assert info["_raw_violations"].all() and info["_executed"].all()
+        assert np.array_equal(info["_executed"], np.isfinite(info["executed"]).all(axis=1)), "masked out where a step only began an episode"
         assert not terminated.any() and info["target_violations"].sum() == 0
         assert np.all(vec.native.qpos > low + 0.01 - 1e-9) and np.all(vec.native.qpos < high - 0.01 + 1e-9)
         assert np.all(np.abs(vec.native.qvel) < 0.9 * model.velocity_limit + 1e-9)
