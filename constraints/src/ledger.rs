@@ -67,7 +67,7 @@ impl Status {
             }
             Status::Braked(BrakeReason::NonFiniteDynamics) => "the dynamics came out as NaN or infinity",
             Status::Refused(RefuseReason::NonFiniteState) => {
-                "the measured state, or the tick before it, holds NaN or infinity"
+                "the measured state, what was observed beside it, or the tick before holds NaN or infinity"
             }
             Status::Refused(RefuseReason::WrongLength) => "a vector has the wrong length",
         })

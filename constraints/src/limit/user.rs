@@ -224,6 +224,21 @@ impl Limit for UserRow {
         Ok(Some(Box::new(Row { name, terms, bounds, braking, size, equality, hard, equal, kept, steepest })))
     }
 
+    fn notes(&self, _: &Model, _: &[usize]) -> Vec<String> {
+        let (s, none) = (&self.settings, f64::INFINITY);
+        let moves = s.soft.is_none() && !s.terms.keys().any(|name| name.starts_with("q."));
+        let (low, high) = (s.equals.or(s.lower).unwrap_or(-none), s.equals.or(s.upper).unwrap_or(none));
+        let stands = low <= 0.0 && high >= 0.0;
+        if !moves || stands {
+            return Vec::new();
+        }
+        vec![format!(
+            "row '{}' does not let its joints stand still ({low} to {high} leaves 0 out): no brake keeps it, and a robot at rest only brakes; let 0 in, or \
+             make the row soft",
+            s.name
+        )]
+    }
+
     fn soft(&self) -> Option<Soft> {
         self.settings.soft
     }

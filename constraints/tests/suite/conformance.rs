@@ -257,6 +257,11 @@ fn impossible_numbers_are_refused_by_name() {
         ),
         ("jerk = { limit = { elbow = 1.0 } }", "jerk limit names joint 'elbow'"),
         (
+            "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, { name = \"a\", shape = \"half_space\" }, \
+             { name = \"a\", shape = \"half_space\" }], braking = 2.0 }",
+            "two obstacles of collision are named 'a'",
+        ),
+        (
             "jerk = { limit = 1.0, soft = { quadratic = 1e13 } }",
             "soft.quadratic of limit 'jerk' is 10000000000000, but must be above 0 and at most 1e12",
         ),

@@ -52,6 +52,25 @@ fn storm(
 
 const START: [f64; 7] = [0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0];
 
+#[test]
+fn a_row_that_standing_still_breaks_is_told() {
+    let term = [("v.panda_joint1", 1.0)];
+    for (row, is_told) in [
+        (between("moves", &term, 0.1, 1.0), true),
+        (equal("moves", &term, 0.2), true),
+        (between("moves", &term, -0.1, 1.0), false),
+        (UserRowSettings { soft: Some(Soft::default()), ..between("moves", &term, 0.1, 1.0) }, false),
+        (
+            UserRowSettings { braking: Some(2.0), ..between("moves", &[("q.panda_joint1", 1.0)], 0.1, 1.0) },
+            false,
+        ),
+    ] {
+        let projector = projector(&panda(), std::slice::from_ref(&row), Settings::new(0.01, 1));
+        let notes = projector.notes().join("; ");
+        assert_eq!(notes.contains("row 'moves' does not let its joints stand still"), is_told, "{notes}");
+    }
+}
+
 /// A deceleration that no joint gives decides nothing: the sum stops in front of its bound with what its joints have, 8 rad/s² each.
 #[test]
 fn a_sum_stops_in_front_of_its_bound_however_much_braking_is_asked_for() {

@@ -583,7 +583,8 @@ pub fn suggest(message: &str) -> String {
     if let Some(section) =
         ["model", "time", "state", "constraints"].iter().find(|s| message == format!("missing field `{s}`"))
     {
-        return format!("section [{section}] is missing; write it, be it empty (docs: Tasks)");
+        let empty = if *section == "constraints" { ", empty where there are no limits" } else { "" };
+        return format!("section [{section}] is missing; write it{empty} (docs: Tasks)");
     }
     if let Some(key) = message.strip_prefix("missing field ") {
         return format!("{key} is missing; add it");

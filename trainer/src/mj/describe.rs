@@ -318,7 +318,7 @@ impl Model {
         note(
             m.neq() > 0,
             &format!(
-                "{EQUATIONS}: {}; limits hold without what these pull at their joints or bodies; take them out, or leave margins",
+                "{EQUATIONS}: {}; limits may be left by what these pull at; take them out of the robot file, or leave margins",
                 equations.join(", ")
             ),
         );
@@ -339,7 +339,7 @@ impl Model {
         note(
             air,
             &format!(
-                "fluid forces are not modelled (density {}, viscosity {}, wind {:?}): limits hold up to what these push; set them to 0, or leave margins",
+                "fluid forces are not modelled (density {}, viscosity {}, wind {:?}): limits may be left by what they push; set these to 0, or leave margins",
                 option.density, option.viscosity, option.wind
             ),
         );

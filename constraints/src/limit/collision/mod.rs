@@ -166,6 +166,13 @@ impl CollisionLimit {
                 what: "an obstacle of collision has neither name nor frame".to_string(),
                 next: "give it a name",
             })?;
+            let is_obstacle = |of: &SolidSettings| of.frame.is_none() && of.name.as_ref() == Some(name);
+            if s.frame.is_none() && self.settings.shapes.iter().filter(|of| is_obstacle(of)).count() > 1 {
+                return Err(LimitError::Unusable {
+                    what: format!("two obstacles of collision are named '{name}'"),
+                    next: "give each a name of its own, by which it can be put elsewhere",
+                });
+            }
             s.shape.check(&format!("shape '{name}'"))?;
             let sum = s.position.iter().chain(&s.rpy).sum();
             check(&format!("position or rpy of shape '{name}'"), sum, true, "finite, in m and rad")?;
