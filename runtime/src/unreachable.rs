@@ -16,8 +16,7 @@ const GRID: usize = 60;
 const NEAR: f64 = 1e-3;
 
 /// One sentence for each hard limit of a frame that holds in none of the poses found within the position limits, else one where all of them never hold
-/// at once. Only robots of hinges, and of slides
-/// that end somewhere, are looked at: others may come anywhere.
+/// at once. Only robots of hinges, and of slides that end somewhere, are looked at: others may come anywhere.
 pub fn notes(model: &Model, limits: &LimitSet, frames: &[FrameSettings]) -> Vec<String> {
     let hard = frames.iter().filter(|of| of.soft.is_none());
     let is_bounded = |joint: &JointDescription| match joint.kind {

@@ -225,11 +225,10 @@ impl Limit for UserRow {
     }
 
     fn notes(&self, _: &Model, _: &[usize]) -> Vec<String> {
-        let (s, none) = (&self.settings, f64::INFINITY);
+        let s = &self.settings;
         let moves = s.soft.is_none() && !s.terms.keys().any(|name| name.starts_with("q."));
-        let (low, high) = (s.equals.or(s.lower).unwrap_or(-none), s.equals.or(s.upper).unwrap_or(none));
-        let stands = low <= 0.0 && high >= 0.0;
-        if !moves || stands {
+        let Ok((low, high)) = self.bounds() else { return Vec::new() }; // refused where the rows are made
+        if !moves || (low <= 0.0 && high >= 0.0) {
             return Vec::new();
         }
         vec![format!(

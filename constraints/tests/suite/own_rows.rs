@@ -59,6 +59,7 @@ fn a_row_that_standing_still_breaks_is_told() {
         (between("moves", &term, 0.1, 1.0), true),
         (equal("moves", &term, 0.2), true),
         (between("moves", &term, -0.1, 1.0), false),
+        (UserRowSettings { margin: 0.2, ..between("moves", &term, -0.1, 1.0) }, true),
         (UserRowSettings { soft: Some(Soft::default()), ..between("moves", &term, 0.1, 1.0) }, false),
         (
             UserRowSettings { braking: Some(2.0), ..between("moves", &[("q.panda_joint1", 1.0)], 0.1, 1.0) },

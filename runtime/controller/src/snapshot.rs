@@ -610,11 +610,16 @@ fn checked<T: Copy + Into<f64>>(name: &str, values: Vec<T>) -> Result<Vec<T>, Sn
 }
 
 fn sound<T: Copy + Into<f64>>(values: &[T], name: impl Fn() -> String) -> Result<(), SnapshotError> {
-    let mut all = values.iter().enumerate().map(|(i, &v)| (i, v.into()));
-    match all.find(|(_, v)| !v.is_finite() || v.abs() > HUGE) {
+    match first_beyond(values, HUGE) {
         Some((index, value)) => Err(SnapshotError::Value { name: name(), index, value }),
         None => Ok(()),
     }
+}
+
+/// The first of `values` that is no number, or larger than `most`, and where it stands.
+pub fn first_beyond<T: Copy + Into<f64>>(values: &[T], most: f64) -> Option<(usize, f64)> {
+    let mut all = values.iter().enumerate().map(|(i, &v)| (i, v.into()));
+    all.find(|(_, v)| !v.is_finite() || v.abs() > most)
 }
 
 fn doubles(views: &[(String, TensorView<'_>)], name: &str) -> Result<Vec<f64>, SnapshotError> {
@@ -633,8 +638,8 @@ fn far(views: &[(String, TensorView<'_>)], name: &str) -> Result<Vec<f64>, Snaps
 }
 
 fn within_reach(name: &str, values: &[f64]) -> Result<(), SnapshotError> {
-    match values.iter().enumerate().find(|(_, v)| !v.is_finite() || v.abs() > FAR) {
-        Some((index, &value)) => Err(SnapshotError::Far { name: name.into(), index, value }),
+    match first_beyond(values, FAR) {
+        Some((index, value)) => Err(SnapshotError::Far { name: name.into(), index, value }),
         None => Ok(()),
     }
 }

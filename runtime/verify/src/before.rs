@@ -95,7 +95,6 @@ impl Before {
     /// What a tick goes on from: as measured or predicted, and of joints that follow by themselves what they were sent.
     ///
     /// # Errors
-    ///
     /// Why the log does not say: what it was predicted from or what was sent is not in it, or its state is another robot's.
     pub(crate) fn start(&self, own: &Promise, tick: &Tick) -> Result<Start, &'static str> {
         if self.is_cut_off(own, tick) {

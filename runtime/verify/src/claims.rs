@@ -41,7 +41,6 @@ impl Claims<'_> {
     /// Limits, action, optimum and way to stop of what a snapshot promises; what the next tick is told of this one.
     ///
     /// # Errors
-    ///
     /// What is broken, or why it cannot be said.
     pub(crate) fn confirm(&mut self, promise: &mut Promise) -> Result<Told, Fault> {
         self.as_executed(promise, Self::all)
@@ -50,7 +49,6 @@ impl Claims<'_> {
     /// The limits of a promise beside the snapshot's own.
     ///
     /// # Errors
-    ///
     /// What is broken, or why it cannot be said.
     pub(crate) fn confirm_limits(&mut self, promise: &mut Promise) -> Result<(), Fault> {
         self.as_executed(promise, |claims, promise| {

@@ -38,7 +38,6 @@ pub(crate) struct Moment<'a> {
 /// What was projected in a tick: what was proposed, or rest for `waiting`, the dofs whose set points wait for their joints.
 ///
 /// # Errors
-///
 /// Why it is not known.
 pub(crate) fn projected(
     own: &Promise,

@@ -21,10 +21,9 @@ struct Walk {
     hardest: Vec<f64>,
 }
 
-/// The actions, held, lead through the steps to the target's velocities. A joint may fall short of its own whose force is at its limit, at the
-/// speeds of the period, or which slows down as it would come beyond its position limit or
-/// end too fast to stop in front of it otherwise. Where joints rub, by no more than their dry friction does. `means` has the action of each
-/// joint for its mean force.
+/// The actions, held, lead through the steps to the target's velocities. A joint may fall short of its own whose force is at its limit, or at the
+/// end of its motor's line at the speeds of the period, or which slows down as it would come beyond its position limit or end too fast to stop in
+/// front of it otherwise. Where joints rub, by no more than their dry friction does. `means` has the action of each joint for its mean force.
 pub(crate) fn lead(
     promise: &mut Promise,
     passage: &Passage<'_>,

@@ -6,7 +6,7 @@ use super::network::ImportedNetwork;
 use super::sound::is_sound;
 use super::tensor::Tensor;
 use nearl_runtime::file_kind::FileKind;
-use nearl_runtime::snapshot::{FAR, HUGE, MAX_BYTES};
+use nearl_runtime::snapshot::{FAR, HUGE, MAX_BYTES, first_beyond};
 use rten_onnx::onnx::{GraphProto, ModelProto};
 use std::path::Path;
 
@@ -62,23 +62,20 @@ fn check_values(
     beside: Option<&Path>,
     network: &ImportedNetwork,
 ) -> Result<(), ImportError> {
-    let is_wrong = |x: f64| !x.is_finite() || x.abs() > HUGE;
-    let first = |values: &mut dyn Iterator<Item = f64>| values.enumerate().find(|(_, x)| is_wrong(*x));
     let mut parts: Vec<(String, (usize, f64))> = Vec::new();
     for (i, layer) in network.dense.layers.iter().enumerate() {
         for (what, values) in [("weight", &layer.weight), ("bias", &layer.bias)] {
-            let found = first(&mut values.iter().map(|x| f64::from(*x)));
+            let found = first_beyond(values, HUGE);
             parts.extend(found.map(|found| (format!("{what} of layer {i}"), found)));
         }
     }
     for (what, values) in [("mean of the inputs", &network.mean), ("scale of the inputs", &network.std)] {
-        let found = values.iter().copied().enumerate().find(|(_, x)| !x.is_finite() || x.abs() > FAR);
-        parts.extend(found.map(|found| (what.to_string(), found)));
+        parts.extend(first_beyond(values, FAR).map(|found| (what.to_string(), found)));
     }
     let Some(part) = parts.into_iter().next() else { return Ok(()) };
     let of_file = graph.initializer.iter().find_map(|proto| {
         let tensor = Tensor::read(proto, beside).ok()?;
-        let found = first(&mut tensor.values.iter().copied())?;
+        let found = first_beyond(&tensor.values, HUGE)?;
         Some((proto.name.clone().unwrap_or_default(), found))
     });
     if let (None, Some(index)) = (&of_file, network.std.iter().position(|std| *std == 0.0)) {
