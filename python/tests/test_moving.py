@@ -168,12 +168,15 @@ def test_one_of_two_planes_of_a_name_cannot_be_meant(panda: nearl.Model) -> None
         planes(None, None).move_limits(plane={"panda_hand": elsewhere})
     planes("wall", "floor").move_limits(plane={"wall": elsewhere})
 
-    def bodies(*names: str) -> nearl.Projector:
+    def collisions(*names: str) -> nearl.CollisionLimit:
         ball = {"sphere": {"radius": 0.1}}
         shapes = [{"frame": "panda_hand", "shape": ball}]
         shapes += [{"name": name, "shape": ball, "position": [3.0, float(k), 0.0]} for k, name in enumerate(names)]
-        return nearl.Projector(panda, [*limits, nearl.CollisionLimit(panda, shapes, 2.0, influence=2.0)], DT)
+        return nearl.CollisionLimit(panda, shapes, 2.0, influence=2.0)
 
-    with pytest.raises(ValueError, match="several obstacles are called 'person'"):
-        bodies("person", "person").move_limits(body={"person": ([2, 2, 2], [0, 0, 0])})
-    bodies("a", "b").move_limits(body={"b": ([2, 2, 2], [0, 0, 0])})
+    elsewhere = ([2, 2, 2], [0, 0, 0])
+    with pytest.raises(ValueError, match="two obstacles of collision are named 'person'; give each a name of its own"):
+        nearl.Projector(panda, [*limits, collisions("person", "person")], DT)
+    with pytest.raises(ValueError, match="several obstacles are called 'person' and lie apart"):
+        nearl.Projector(panda, [*limits, collisions("person"), collisions("other", "person")], DT).move_limits(body={"person": elsewhere})
+    nearl.Projector(panda, [*limits, collisions("a", "b")], DT).move_limits(body={"b": elsewhere})
