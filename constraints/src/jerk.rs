@@ -35,7 +35,7 @@ const MEETS: f64 = 1e-9;
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Brake {
     period: Period,
-    /// Largest change of acceleration in a period D [rad/s² or m/s²].
+    /// Largest change of acceleration in a period that it counts on D [rad/s² or m/s²].
     step: f64,
     /// Largest deceleration B [rad/s² or m/s²].
     most: f64,
@@ -44,7 +44,7 @@ pub(crate) struct Brake {
 impl Brake {
     /// Braking of `dof` with at most the deceleration `most`.
     pub(crate) fn new(dof: &Dof, most: f64, period: &Period) -> Brake {
-        Brake { period: *period, step: dof.jerk * period.dt, most }
+        Brake { period: *period, step: dof.jerk.min(dof.braking_jerk) * period.dt, most }
     }
 
     /// Braking of `dof` with all it may count on.
@@ -110,6 +110,27 @@ impl Brake {
         peak(v, a, p).max(end + self.stop(v_next, a).highest())
     }
 
+    /// By how much less a dof would have had to accelerate in the period before, where it had the acceleration `a` and ended with velocity `v` at distance
+    /// `d` below the upper limit, to stop in front of it [rad/s² or m/s²]; 0 where it does.
+    pub(crate) fn too_fast(&self, d: f64, v: f64, a: f64) -> f64 {
+        let p = &self.period;
+        let beyond = |less: f64| {
+            let (d, v, a) = (d + p.kappa * p.dt * p.dt * less, v - p.dt * less, a - less);
+            self.stop(v, a).highest() - d
+        };
+        if beyond(0.0) <= 0.0 {
+            return 0.0;
+        }
+        // With it the dof ends at rest or on its way back, and above no deceleration that it brakes with.
+        let most = (v / p.dt).max(0.0) + self.most + self.step + a.abs();
+        -last_inside((-most, beyond(most)), (0.0, beyond(0.0)), |less| beyond(-less))
+    }
+
+    /// The smaller of the largest deceleration and what it changes by in a period.
+    pub(crate) fn gentlest(&self) -> f64 {
+        self.most.min(self.step)
+    }
+
     /// The largest acceleration of the next period with which neither the velocity `limit` nor `room` is exceeded for ever after, at most
     /// `most`; never below `brake`, the next one of the brake. What is exceeded even then comes with it.
     fn upper_bound(
@@ -166,7 +187,7 @@ pub fn interval(dof: &Dof, q: f64, v: f64, before: Option<f64>, period: &Period)
     let brake = Brake::of(dof, period);
     let within =
         |most: f64, from: f64| if most < from { (most, Kind::Acceleration) } else { (from, Kind::Jerk) };
-    let (a, step) = (dof.acceleration, brake.step);
+    let (a, step) = (dof.acceleration, dof.jerk * period.dt);
     // An acceleration beyond the limit counts as the limit: what it really was could leave nothing but to speed up.
     let known = before.map(|before| before.clamp(-a, a));
     let reached = |side: f64| known.map_or(f64::INFINITY, |known| side * known + step);
@@ -305,6 +326,9 @@ fn first(longest: f64, holds: impl Fn(f64) -> bool) -> f64 {
     let (mut below, mut at) = (-1.0, longest);
     while at - below > 1.0 {
         let middle = (0.5 * (below + at)).floor();
+        if middle <= below || middle >= at {
+            break; // there are no numbers between them
+        }
         *(if holds(middle) { &mut at } else { &mut below }) = middle;
     }
     at
@@ -328,4 +352,31 @@ fn last_inside(mut inside: (f64, f64), mut outside: (f64, f64), value: impl Fn(f
         }
     }
     inside.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A command that throws a light joint leads to any acceleration at the end of its period.
+    #[test]
+    fn what_is_too_fast_is_found_from_any_state() {
+        for sub_steps in [0, 1, 5] {
+            let period = Period::new(0.02, sub_steps);
+            let dof =
+                Dof { acceleration: 10.0, deceleration: 9.0, jerk: 100.0, braking_jerk: 90.0, ..Dof::FREE };
+            let brake = Brake::of(&dof, &period);
+            for size in [0.0, 1.0, 1e9, 1e18, 1e300, f64::INFINITY, f64::NAN] {
+                for (v, a) in [(0.1, size), (size, 0.1), (size, -size), (-size, size)] {
+                    let less = brake.too_fast(0.5, v, a);
+                    assert!(less >= 0.0 || size.is_nan() || size.is_infinite(), "{v} {a}: {less}");
+                }
+            }
+            let less = brake.too_fast(0.01, 0.5, 4.0);
+            let kept = brake.stop(0.5 - 0.02 * less, 4.0 - less).highest();
+            let room = 0.01 + period.kappa * 0.02 * 0.02 * less;
+            assert!(less > 0.0 && (kept - room).abs() < 1e-9, "{less}: {kept} of {room}");
+            assert_eq!(brake.too_fast(1.0, 0.5, 4.0), 0.0);
+        }
+    }
 }

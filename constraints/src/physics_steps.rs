@@ -1,6 +1,7 @@
 //! The physics steps of a period, one after the other.
 
 use crate::drive::{Drive, Held};
+use crate::jerk::Brake;
 use crate::period_dynamics::solve;
 use crate::viability::{Dof, too_fast};
 use crate::{Dynamics, LimitSet, Model, Period, PeriodDynamics};
@@ -206,6 +207,8 @@ impl PhysicsSteps {
     /// ```text
     ///     (v + e)^2 <= 2 A_b d,    e = 1.5 f + r A_b T
     /// ```
+    ///
+    /// or, of hard jerk, in that from which its own brake stops, with no more of `r` than the jerk changes in a period.
     fn beyond(&self, i: usize, limits: &LimitSet) -> Option<[f64; 2]> {
         let (iq, nq, p) = (self.single[i]?, self.nq(), &self.period);
         let (begun, v) = (self.path[iq], self.v[i]);
@@ -221,12 +224,18 @@ impl PhysicsSteps {
                 most = [less, sign];
             }
         }
-        let braking = Dof::of(limits, i).braking(p);
+        let dof = Dof::of(limits, i);
+        let smooth = dof.jerk.is_finite().then(|| Brake::of(&dof, p));
+        let braking = smooth.map_or_else(|| dof.braking(p), |brake| brake.gentlest());
         let q = self.path[self.path.len() - nq + iq];
+        let a = (v - self.begun[i]) / p.dt;
         let further = (q - begun) / p.dt - self.begun[i] - p.kappa * (v - self.begun[i]);
         for (d, v, further, sign) in [(high - q, v, further, -1.0), (q - low, -v, -further, 1.0)] {
             let e = FURTHER * further.max(0.0) + self.reserve * braking * p.dt;
-            let less = too_fast(d, v + e, braking, p);
+            let less = match smooth {
+                Some(brake) => brake.too_fast(d, v + e, -sign * a),
+                None => too_fast(d, v + e, braking, p),
+            };
             if less > most[0] {
                 most = [less, sign];
             }
@@ -239,14 +248,15 @@ impl PhysicsSteps {
     }
 
     /// Changes the `commands` (nv), which lead to the accelerations `a` (nv) about, into those that lead to them, within `limits`. `most` (nv)
-    /// are the largest forces. Commands that are no numbers stay, and so do those that nothing nearer was found for.
+    /// are the largest forces. What is given up for a position leaves the dofs between `accelerations` (nv). Commands that are no numbers stay, and so do
+    /// those that nothing nearer was found for.
     pub fn drive(
         &mut self,
         (q, v): (&[f64], &[f64]),
         external: &[f64],
         a: &[f64],
         (commands, most): (&mut [f64], &[f64]),
-        limits: &LimitSet,
+        (limits, accelerations): (&LimitSet, &[[f64; 2]]),
     ) {
         self.found = false;
         if commands.iter().any(|command| !command.is_finite()) {
@@ -276,7 +286,7 @@ impl PhysicsSteps {
         let (mut has_slopes, mut retreats, mut failed, mut measured, mut halves) = (false, 0, 0, 0, false);
         for _ in 0..ROUNDS {
             if self.left() <= MISSING && !self.asks_too_much() {
-                if retreats == RETREATS || !self.retreat(limits) {
+                if retreats == RETREATS || !self.retreat(limits, accelerations) {
                     break;
                 }
                 retreats += 1;
@@ -357,13 +367,13 @@ impl PhysicsSteps {
     }
 
     /// Asks for less acceleration where a joint went too far or ended too fast; whether it asks anywhere.
-    fn retreat(&mut self, limits: &LimitSet) -> bool {
+    fn retreat(&mut self, limits: &LimitSet, accelerations: &[[f64; 2]]) -> bool {
         let mut asks = false;
         for r in 0..self.pushed.len() {
             let i = self.free[self.pushed[r]];
-            if let (Some([less, sign]), true) = (self.beyond(i, limits), limits.jerk[i].is_infinite()) {
-                let most = limits.acceleration[i];
-                let to = (self.wanted[i] + sign * less).clamp(-most, most);
+            if let Some([less, sign]) = self.beyond(i, limits) {
+                let [least, most] = accelerations[i];
+                let to = (self.wanted[i] + sign * less).clamp(least, most);
                 asks |= (to - self.wanted[i]) * sign > 0.0;
                 self.wanted[i] = to;
             }

@@ -54,6 +54,13 @@ impl Period {
         Period { dt, sub_steps, tau, kappa }
     }
 
+    /// Share of a limit that braking counts on, `1 - clamp(4 T, 0.02, 0.2)`. With several physics steps in a period, or none, its motion is not that
+    /// of a constant acceleration, the less so the longer it is: a joint comes a little further than foreseen, and brakes harder than it counted on
+    /// until that is made up for. With one step it is all of the limit.
+    pub fn counted(&self) -> f64 {
+        if self.sub_steps == 1 { 1.0 } else { 1.0 - (4.0 * self.dt).clamp(0.02, 0.2) }
+    }
+
     /// How long after the start of the period the plant evaluates its forces, on average: `(T - tau) / 2` \[s\].
     pub fn lag(&self) -> f64 {
         0.5 * (self.dt - self.tau)
@@ -96,6 +103,8 @@ pub struct Dof {
     pub deceleration: f64,
     /// Largest jerk J that is hard [rad/s³ or m/s³]: [`jerk::interval`](crate::jerk::interval) keeps it, [`interval`] knows nothing of it.
     pub jerk: f64,
+    /// Jerk that braking may count on, at most J [rad/s³ or m/s³].
+    pub braking_jerk: f64,
     /// Speed limits in front of a lowest and a highest position.
     pub profile: [Option<Profile>; 2],
     /// The dof stops and stays.
@@ -121,6 +130,7 @@ impl Dof {
         acceleration: f64::INFINITY,
         deceleration: f64::INFINITY,
         jerk: f64::INFINITY,
+        braking_jerk: f64::INFINITY,
         profile: [None, None],
         locked: false,
         whole: false,
@@ -131,8 +141,9 @@ impl Dof {
         let (lower, upper) = (limits.q_lower[i], limits.q_upper[i]);
         let (acceleration, deceleration) = (limits.acceleration[i], limits.braking[i]);
         let (velocity, profile, locked) = (limits.velocity[i], limits.profile[i], limits.locked[i]);
-        let jerk = limits.jerk[i];
-        Dof { lower, upper, velocity, acceleration, deceleration, jerk, profile, locked, whole: false }
+        let (jerk, braking_jerk) = (limits.jerk[i], limits.braking_jerk[i]);
+        let whole = false;
+        Dof { lower, upper, velocity, acceleration, deceleration, jerk, braking_jerk, profile, locked, whole }
     }
 
     /// The deceleration that braking counts on: the one stated, or less where a whole period of it would turn the dof round and

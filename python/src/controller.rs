@@ -109,7 +109,7 @@ impl Controller {
         if let Some(joint) = &self.unseen {
             return Err(errors::value(format!(
                 "the observation of '{}' has no 'q.{joint}' or no 'v.{joint}', which analytic inverse dynamics or the policy's own \
-                 observation needs; use update(q, v, obs)",
+                 observation needs; use update(q, v, obs) of the controller",
                 self.task
             )));
         }

@@ -131,6 +131,10 @@ fn section(entry: &RegisteredLimit, settings: &Bound<'_, PyDict>) -> PyResult<Va
         }
     }
     complete(&mut section)?;
+    if section.as_array().is_some_and(Vec::is_empty) {
+        let class = entry.about.class;
+        return Err(errors::value(format!("{class} names nothing; name a joint, or leave the limit out")));
+    }
     if entry.name == "frame" && section.get("half_space").is_none() && section.get("box").is_none() {
         let class = entry.about.class;
         return Err(errors::value(format!(
@@ -202,7 +206,9 @@ fn value(argument: &Argument, given: &Bound<'_, PyAny>) -> PyResult<Value> {
         PyTypeError::new_err(format!("expected {expected}; got {got}, as '{name}'"))
     };
     refuse_complex(argument.name, given).map_err(|_| refused("complex numbers"))?;
-    if given.is_instance_of::<PyBool>() && !matches!(argument.takes, Takes::Flag) {
+    let is_bool = given.is_instance_of::<PyBool>()
+        || given.get_type().name().is_ok_and(|name| ["bool", "bool_"].iter().any(|own| name == *own));
+    if is_bool && !matches!(argument.takes, Takes::Flag) {
         return Err(refused("bool"));
     }
     read(argument.takes, given).map_err(|_: PyErr| {

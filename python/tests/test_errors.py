@@ -118,12 +118,15 @@ def test_arguments_of_another_type_are_told_what_is_expected(planar) -> None:
     joint = planar.joint_names[0]
     for build, words in [
         (lambda: nearl.VelocityLimit(planar, limit=1j), "expected a number for all joints.*; got complex.*'limit'"),
+        (lambda: nearl.VelocityLimit(planar, limit=np.bool_(True)), "expected a number for all joints.*; got bool.*'limit'"),
         (lambda: nearl.PositionLimit(planar, margin="wide"), "expected a number for all joints.*; got str.*'margin'"),
         (lambda: nearl.LockedJoints(planar, joint), "expected a list of names.*; got str.*'joints'"),
         (lambda: nearl.TorqueLimit(planar, soft=5.0), r"expected the weights \(linear, quadratic\).*; got float.*'soft'"),
     ]:
         with pytest.raises(TypeError, match=f"(?s){words}"):
             build()
+    with pytest.raises(ValueError, match="LockedJoints names nothing; name a joint, or leave the limit out"):
+        nearl.LockedJoints(planar, [])
     assert nearl.VelocityLimit(planar, limit={joint: 1}).name == "velocity"
     assert nearl.VelocityLimit(planar, limit=np.ones(3)).name == "velocity"
     assert nearl.LockedJoints(planar, [joint]).name == "locked"

@@ -79,8 +79,8 @@ def within_ranges(text: str, ranges: np.ndarray) -> str:
     return text
 
 
-def task(folder: Path, n: int, dt: float, sim_dt: float, margin: float = 0.0, command: str = 'interface = "effort"') -> Path:
-    """A task whose guard knows the arm."""
+def task(folder: Path, n: int, dt: float, sim_dt: float, margin: float = 0.0, command: str = 'interface = "effort"', jerk: float = np.inf) -> Path:
+    """A task whose guard knows the arm; a `jerk` [rad/s³] that is not infinite is hard."""
     joints = [f"j{i}" for i in range(n)]
     seen = [f"{letter}.{joint}" for letter in "qv" for joint in joints]
     file = folder / "arm.toml"
@@ -105,6 +105,7 @@ position = {{ margin = {margin} }}
 velocity = {{ limit = {SPEED} }}
 acceleration = {{ limit = {ACCELERATION} }}
 torque = {{ scale = 1.0 }}
+{f"jerk = {{ limit = {jerk}, hard = true }}" if np.isfinite(jerk) else ""}
 """)
     return file
 
@@ -150,8 +151,9 @@ def attack(
     far: float = 300.0,
     ends: str = "position",
     near: float = 1e-3,
+    jerk: float = np.inf,
 ) -> None:
-    """Pushes onto the limits of the task in `folder`, and steps the simulator beside it, whose joints keep to their ranges, speeds and accelerations.
+    """Pushes onto the limits of the task in `folder`, and steps the simulator beside it, whose joints keep to their ranges, speeds, accelerations and `jerk`.
     Some joint must come `near` the end of its range of positions [rad], or some drive to that of its targets where `ends` says so."""
     envs = nearl.make_vec(folder / "arm.toml", 1, constraints="task", actions="guarded")
     model = mujoco.MjModel.from_xml_string(text)
@@ -161,6 +163,7 @@ def attack(
     low, high = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.inf, np.inf]).T
     # what a joint keeps of its range for a brake that leads further
     push, touched, near = np.zeros(n), 0, near + accelerations * dt * dt / 4
+    last = np.zeros(n)
     for tick in range(800):
         if tick % 25 == 0:
             push = rng.uniform(-far, far, n)
@@ -172,6 +175,9 @@ def attack(
             assert (data.qpos >= low).all() and (data.qpos <= high).all(), f"tick {tick}, within it: {data.qpos}"
         assert np.abs(data.qvel).max() <= SPEED * (1 + 1e-9), f"tick {tick}: {data.qvel}"
         assert (np.abs(data.qvel - before) / dt <= accelerations + 1e-7).all(), f"tick {tick}: {data.qvel - before}"
+        acceleration = (data.qvel - before) / dt
+        assert np.abs(acceleration - last).max() <= jerk * dt + 1e-7, f"tick {tick}: {acceleration} after {last}"
+        last = acceleration
         room = np.minimum(data.qpos - low, high - data.qpos) - near
         if ends == "target":
             room = np.minimum(data.ctrl - model.actuator_ctrlrange[:, 0], model.actuator_ctrlrange[:, 1] - data.ctrl) - 1e-6
@@ -205,6 +211,19 @@ def test_drives_held_on_their_targets_stay_within_their_limits(tmp_path: Path, s
     (tmp_path / "arm.xml").write_text(text)
     task(tmp_path, len(ranges), dt, dt / steps, command=command)
     attack(tmp_path, text, steps, rng, far=3.0)
+
+
+@pytest.mark.parametrize("dt", [0.005, 0.01])
+@pytest.mark.parametrize("jerk", [100.0, 1000.0])
+@pytest.mark.parametrize("seed", [1, 2, 3, 5, 7])
+def test_hard_jerk_is_kept_over_several_steps(tmp_path: Path, seed: int, jerk: float, dt: float) -> None:
+    """A joint was not slowed down for where the steps led it: it touched its stop, and left its jerk and its acceleration."""
+    rng = np.random.default_rng(seed)
+    steps = int(rng.choice([2, 5, 10]))
+    text, ranges = arm(rng, dt / steps, "Euler")
+    (tmp_path / "arm.xml").write_text(text)
+    task(tmp_path, len(ranges), dt, dt / steps, jerk=jerk)
+    attack(tmp_path, text, steps, rng, near=0.02, jerk=jerk)
 
 
 @pytest.mark.parametrize(

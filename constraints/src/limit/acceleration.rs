@@ -2,7 +2,7 @@
 
 use super::margin::less_each;
 use super::{About, AlwaysHard, Argument, Form, Limit, LimitSet, PerJoint, Takes, quoted};
-use crate::{LimitError, Model};
+use crate::{LimitError, Model, Period};
 use serde::{Deserialize, Serialize};
 
 /// What it says of itself.
@@ -67,12 +67,9 @@ impl AccelerationLimit {
         AccelerationLimit { settings, share: 1.0 }
     }
 
-    /// The same for periods of `dt` \[s\] of `sub_steps` physics steps. With several or none the motion within a period is not that of a constant
-    /// acceleration, the less so the longer it is: a joint comes a little further than foreseen, and brakes harder than it counted on until that
-    /// is made up for. It counts on `1 - clamp(4 dt, 0.02, 0.2)` of the limit then.
-    pub fn over_steps(settings: AccelerationSettings, dt: f64, sub_steps: usize) -> AccelerationLimit {
-        let share = if sub_steps == 1 { 1.0 } else { 1.0 - (4.0 * dt).clamp(0.02, 0.2) };
-        AccelerationLimit { settings, share }
+    /// The same for a plant that moves through a period in such a way ([`Period::counted`]).
+    pub fn over_steps(settings: AccelerationSettings, period: &Period) -> AccelerationLimit {
+        AccelerationLimit { settings, share: period.counted() }
     }
 
     /// The same limit [rad/s² or m/s²] for every joint.

@@ -3,7 +3,7 @@
 use super::margin::less_each;
 use super::{About, Argument, Form, Limit, LimitSet, PerJoint, Takes};
 use crate::row::{Motion, Needs, Rows, RowsMut, TickStart};
-use crate::{Kind, LimitError, Model, Soft};
+use crate::{Kind, LimitError, Model, Period, Soft};
 use serde::{Deserialize, Serialize};
 
 /// What it says of itself.
@@ -76,17 +76,24 @@ impl From<JerkSettings> for Written {
 #[derive(Debug, Clone)]
 pub struct JerkLimit {
     settings: JerkSettings,
+    /// Share of J that braking counts on.
+    share: f64,
 }
 
 impl JerkLimit {
     /// From the task file's settings.
     pub fn new(settings: JerkSettings) -> JerkLimit {
-        JerkLimit { settings }
+        JerkLimit { settings, share: 1.0 }
+    }
+
+    /// The same for a plant that moves through a period in such a way ([`Period::counted`]).
+    pub fn over_steps(settings: JerkSettings, period: &Period) -> JerkLimit {
+        JerkLimit { settings, share: period.counted() }
     }
 
     /// A hard limit [rad/s³ or m/s³] for every joint.
     pub fn hard(limit: f64) -> JerkLimit {
-        JerkLimit { settings: JerkSettings { limit: PerJoint::All(limit), margin: None, soft: None } }
+        JerkLimit::new(JerkSettings { limit: PerJoint::All(limit), margin: None, soft: None })
     }
 
     /// Limits less margins of the dofs that have one.
@@ -114,7 +121,9 @@ impl Limit for JerkLimit {
         }
         let values = self.values(model, controllable)?;
         for &i in controllable {
-            set.jerk[i] = set.jerk[i].min(values[i].unwrap_or(f64::INFINITY));
+            let jerk = values[i].unwrap_or(f64::INFINITY);
+            set.jerk[i] = set.jerk[i].min(jerk);
+            set.braking_jerk[i] = set.braking_jerk[i].min(self.share * jerk);
         }
         Ok(())
     }

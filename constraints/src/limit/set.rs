@@ -19,6 +19,8 @@ pub struct LimitSet {
     pub braking: Vec<f64>,
     /// Largest jerk that is hard [rad/s³ or m/s³].
     pub jerk: Vec<f64>,
+    /// Jerk braking may count on, at most the one that is hard [rad/s³ or m/s³].
+    pub braking_jerk: Vec<f64>,
     /// Largest motor force [N·m or N].
     pub effort: Vec<f64>,
     /// Speed limits in front of a lowest and a highest position.
@@ -38,6 +40,7 @@ impl LimitSet {
             acceleration: none.clone(),
             braking: none.clone(),
             jerk: none.clone(),
+            braking_jerk: none.clone(),
             effort: none,
             profile: vec![[None, None]; nv],
             locked: vec![false; nv],
@@ -80,6 +83,7 @@ impl LimitSet {
             &mut self.acceleration,
             &mut self.braking,
             &mut self.jerk,
+            &mut self.braking_jerk,
             &mut self.effort,
         ] {
             x.fill(f64::INFINITY);
@@ -98,6 +102,7 @@ impl LimitSet {
         least(&mut self.acceleration, &other.acceleration);
         least(&mut self.braking, &other.braking);
         least(&mut self.jerk, &other.jerk);
+        least(&mut self.braking_jerk, &other.braking_jerk);
         least(&mut self.effort, &other.effort);
         for (own, other) in self.profile.iter_mut().zip(&other.profile) {
             *own = [own[0].or(other[0]), own[1].or(other[1])];

@@ -73,7 +73,8 @@ pub struct UserRowSettings {
 ///     s'' = -(w + r (s - e)) / T,   r = min(1 / (2 T), RETURN)
 /// ```
 ///
-/// which takes off what rounding leaves. Beside it, `e` is a lower and an upper bound with a `braking` of what each of its joints alone can
+/// which takes off what rounding leaves; over several physics steps, which lead elsewhere, it is at `e` within `B T^2 / 4`, with
+/// `r = 1 / (2 T)`. Beside it, `e` is a lower and an upper bound with a `braking` of what each of its joints alone can
 /// give: the sum stops there if the proposal leads it there. A sum without accelerations that is beside its value goes no further from it. Brakes slow
 /// the joints of such a row down in proportion, which leaves the sum of positions, and sums of speeds or accelerations that are 0, where
 /// they are.
@@ -289,6 +290,9 @@ const AT: f64 = 1e-9;
 /// The same for a sum of speeds, as a share of its size.
 const AT_SPEED: f64 = 2e-9;
 
+/// The same over several physics steps, as a share of what its braking does in a period.
+const OVER_STEPS: f64 = 0.25;
+
 /// Rate at which what rounding leaves of a distance is taken off [1/s].
 const RETURN: f64 = 2.0;
 
@@ -309,9 +313,20 @@ impl Row {
         self.terms.iter().map(|t| t.coefficient * each(t)).sum()
     }
 
+    /// How far from its value a sum of positions is at it, and the rate at which what is left of that is taken off [1/s]. Several physics steps lead a joint
+    /// elsewhere in each period: where `braking` takes that off within a few periods, the sum is at its value.
+    fn keeping(&self, period: &Period) -> (f64, f64) {
+        let (t, fastest) = (period.dt, 0.5 / period.dt);
+        match self.braking.filter(|_| period.sub_steps > 1) {
+            Some(braking) => (AT.max(OVER_STEPS * braking * t * t), fastest),
+            None => (AT, RETURN.min(fastest)),
+        }
+    }
+
     /// Whether a sum of positions with that speed is at the value it is kept at.
     fn is_at(&self, (s, w): (f64, f64), period: &Period) -> bool {
-        (s - self.bounds.0).abs() <= AT && (w * period.dt).abs() <= AT
+        let (at, _) = self.keeping(period);
+        (s - self.bounds.0).abs() <= at && (w * period.dt).abs() <= at
     }
 
     /// The lowest and highest sum that the limits of single joints leave.
@@ -335,7 +350,7 @@ impl Row {
             rows.row(0)[term.dof] += term.coefficient / t;
         }
         if self.equal.is_some() && self.is_at((s, w), tick.period) {
-            let held = -(w + (0.5 / t).min(RETURN) * (s - self.bounds.0)) / t;
+            let held = -(w + self.keeping(tick.period).1 * (s - self.bounds.0)) / t;
             (rows.lower[0], rows.upper[0]) = (held, held);
             return;
         }
@@ -474,7 +489,7 @@ impl Rows for Row {
         if let Some(equal) = self.equal {
             let (off, positions) = ((value(self) - self.bounds.0).abs(), equal == Equal::Positions);
             breach[0] = match self.kept {
-                true if positions => (off - 2.0 * AT) / self.steepest,
+                true if positions => (off - 2.0 * self.keeping(motion.period).0) / self.steepest,
                 true => off / self.size - AT_SPEED,
                 false => f64::NEG_INFINITY,
             };

@@ -83,6 +83,7 @@ impl Projector {
             external: zero(),
             previous: History::none(nv),
             before: zero(),
+            accelerations: vec![FREE; model.nv()],
             braking: (0..nv).map(|i| Dof::of(&limits, i).braking(&period)).collect(),
             bounds: Bounds::new(nv),
             intervals: vec![none; nv],

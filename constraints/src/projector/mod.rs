@@ -91,6 +91,8 @@ pub struct Projector {
     previous: History,
     /// Acceleration before this tick; where it is not known, 0 for what stands and what a brake would have had for what moves (nv).
     before: Vec<f64>,
+    /// Between which accelerations each dof may be in this tick by its limit and its hard jerk (nv).
+    accelerations: Vec<[f64; 2]>,
     backup: Backup,
     /// What looks odd about the limits.
     notes: Vec<String>,
@@ -231,10 +233,10 @@ impl Projector {
         status
     }
 
-    /// Whether a joint that comes to another velocity than its target's may break a hard limit of several joints, which
+    /// Whether a joint that comes to another velocity than its target's may break a hard limit of several joints, or its own of jerk in the next tick, which
     /// [`Projector::project_within`] is for. Not while limits are moved.
-    pub fn couples_joints(&self) -> bool {
-        self.couples && !self.moving.on
+    pub fn needs_what_is_reached(&self) -> bool {
+        (self.couples || self.limits.has_jerk()) && !self.moving.on
     }
 
     fn project_from_here(
@@ -357,6 +359,7 @@ impl Projector {
             }
             let at = self.dofs.single[i].map_or(0.0, |iq| q[iq]);
             let hard_jerk = dof.jerk.is_finite();
+            let mut reached = [-dof.acceleration, dof.acceleration];
             let mut x = match hard_jerk {
                 true => {
                     let known = self.previous.get().map(|previous| previous.acceleration[i]);
@@ -364,10 +367,15 @@ impl Projector {
                     let within = known.map(|a| a.clamp(-dof.acceleration, dof.acceleration));
                     self.before[i] =
                         within.unwrap_or_else(|| jerk::Brake::of(&dof, &self.period).curve(v[i]));
+                    if let Some(before) = within {
+                        let [least, most] = &mut reached;
+                        (*least, *most) = (least.max(before - dof.jerk * t), most.min(before + dof.jerk * t));
+                    }
                     jerk::interval(&dof, at, v[i], known, &self.period)
                 }
                 false => interval(&dof, at, v[i], &self.period),
             };
+            self.accelerations[i] = reached;
             let exact = |kind: Kind, bound: f64, v_max: f64| match kind == Kind::Velocity
                 && x.outside.is_none()
                 && !hard_jerk

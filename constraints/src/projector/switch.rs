@@ -207,4 +207,9 @@ impl Projector {
     pub fn limits(&self) -> &LimitSet {
         &self.limits
     }
+
+    /// The same, and between which accelerations each dof may be in the last tick, by its limit and its hard jerk [rad/s² or m/s²] (nv).
+    pub fn limits_of_tick(&self) -> (&LimitSet, &[[f64; 2]]) {
+        (&self.limits, &self.accelerations)
+    }
 }

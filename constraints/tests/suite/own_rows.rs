@@ -213,14 +213,17 @@ fn what_was_pushed_off_a_row_is_named_and_comes_back() {
         q[5] += push;
         let (mut v, mut target, mut off) = (vec![0.0; 7], Target::new(projector.model()), push.abs());
         let row = projector.row_names().iter().position(|name| name == "mimic").unwrap();
+        // Over several physics steps a sum is at its value within a quarter of what its braking does in a period.
+        let at = if sub_steps > 1 { 0.25 * 10.0 * 0.002 * 0.002 } else { 1e-8 };
         let mut named = 0;
         for _ in 0..3000 {
             let raw = Proposal { q: START.to_vec(), v: vec![0.0; 7] };
             projector.project(&q, &v, &raw, &mut target);
             let now = (target.q[5] + target.q[3]).abs();
-            assert!(now <= off + 1e-9, "{now} after {off}: {:?}", target.ledger);
+            let further = if sub_steps > 1 { at } else { off + 1e-9 };
+            assert!(now <= further.max(off), "{now} after {off}: {:?}", target.ledger);
             named += usize::from(target.ledger.outside.contains(&row));
-            assert!(off < 1e-8 || target.ledger.outside.contains(&row), "{off:e} {:?}", target.ledger);
+            assert!(off <= at || target.ledger.outside.contains(&row), "{off:e} {:?}", target.ledger);
             off = now;
             (q, v) = (target.q.clone(), target.v.clone());
         }

@@ -519,7 +519,7 @@ fn a_tick_is_projected_once_more_within_ends() {
     };
     let new = || Projector::new(&panda(), &limits(), &[0, 1, 2, 3, 4, 5, 6], settings()).unwrap();
     let (mut twice, mut once, mut random) = (new(), new(), Random(11));
-    assert!(twice.couples_joints() && !panda_projector(Some(0.6), settings()).couples_joints());
+    assert!(twice.needs_what_is_reached() && !panda_projector(Some(0.6), settings()).needs_what_is_reached());
     let (mut first, mut second, mut alone) =
         (Target::new(twice.model()), Target::new(twice.model()), Target::new(twice.model()));
     let (mut q, mut v) = (vec![0.0, -0.5, 0.0, -1.5, 0.0, 1.5, 0.0], vec![0.0; 7]);

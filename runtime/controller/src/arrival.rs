@@ -53,6 +53,10 @@ impl Line {
     }
 }
 
+/// Limits of single joints, and between which accelerations each dof may be in a tick [rad/s² or m/s²] (nv): see
+/// [`Projector::limits_of_tick`](nearl_constraints::Projector::limits_of_tick).
+pub(crate) type Within<'a> = (&'a LimitSet, &'a [[f64; 2]]);
+
 const FREE: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
 
 /// How often a tick is projected once more because physics steps do not lead to its target.
@@ -115,8 +119,9 @@ impl Arrivals {
         to: &Target,
         (a, tau): (&[f64], &[f64]),
         external: &[f64],
-        limits: &LimitSet,
+        within: Within<'_>,
     ) -> &[f64] {
+        let (limits, _) = within;
         for &i in &self.dofs {
             let iq = self.idx_q[i];
             let to = Arrival { q: to.q[iq], v: to.v[i], a: a[i], tau: tau[i] };
@@ -134,7 +139,7 @@ impl Arrivals {
                     *most = most.max(tau[i].abs()); // a brake is executed without margins
                 }
             }
-            steps.drive((q, v), external, a, (&mut self.commands, &self.most), limits);
+            steps.drive((q, v), external, a, (&mut self.commands, &self.most), within);
         }
         &self.commands
     }

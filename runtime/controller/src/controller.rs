@@ -32,7 +32,6 @@ mod parts;
 pub use dial::{Margin, merge_margins};
 pub use parts::{Parts, held_dofs, seen_entries};
 
-use crate::arrival::ROUNDS;
 use crate::idm::{AnalyticIdm, LearnedIdm};
 use crate::net::{Activation, Forward, Function};
 use crate::normaliser::Normaliser;
@@ -468,13 +467,9 @@ impl Controller {
             Inverse::Analytic(idm) => {
                 out.log_prob_action = 0.0;
                 let (q, v, next) = (&self.held.q, &self.held.v, &mut out.next);
-                idm.action(q, v, next, self.projector.limits(), &mut out.action);
-                let again = self.projection && self.guard.is_none() && self.projector.couples_joints();
-                idm.arrivals.begin();
-                for _ in 0..if again { ROUNDS } else { 0 } {
-                    let Some(within) = idm.arrivals.held_back(v, next) else { break };
-                    self.projector.project_within((q, v), &self.proposal, within, next);
-                    idm.action(q, v, next, self.projector.limits(), &mut out.action);
+                match self.projection && self.guard.is_none() {
+                    true => idm.lead((q, v), &self.proposal, &mut self.projector, next, &mut out.action),
+                    false => idm.action(q, v, next, self.projector.limits_of_tick(), &mut out.action),
                 }
                 self.conclude(out);
             }

@@ -1,12 +1,12 @@
 //! Inverse dynamics: from the state and the projected state to the action.
 
-use crate::arrival::Arrivals;
+use crate::arrival::{Arrivals, ROUNDS, Within};
 use crate::controller::Parts;
 use crate::motors::Motors;
 use crate::net::Forward;
 use crate::normaliser::CLIP;
 use crate::snapshot::{Manifest, SnapshotError};
-use nearl_constraints::{Dynamics, LimitSet, Model, Period, StateLayout, Target};
+use nearl_constraints::{Dynamics, Model, Period, Projector, Proposal, StateLayout, Target};
 
 /// A Gaussian network I(a | s_c, s'_c): the mean action from the observation entries of S_c and their
 /// projected change, both in network space.
@@ -75,14 +75,33 @@ impl AnalyticIdm {
         })
     }
 
-    /// What each motor is sent (n_act) to take (q, v) to `target`; of a plain motor it is the force [N m or N], within `limits` with several
+    /// What each motor is sent (n_act) to take (q, v) to `target`; of a plain motor it is the force [N m or N], `within` the limits with several
     /// physics steps.
-    pub fn action(&mut self, q: &[f64], v: &[f64], target: &Target, limits: &LimitSet, action: &mut [f64]) {
+    pub fn action(&mut self, q: &[f64], v: &[f64], target: &Target, within: Within<'_>, action: &mut [f64]) {
         let a = &target.acceleration;
         self.dynamics.motors(&self.period, q, v, a, &mut self.tau);
-        let commands = self.arrivals.commands((q, v), target, (a, &self.tau), &self.external, limits);
+        let commands = self.arrivals.commands((q, v), target, (a, &self.tau), &self.external, within);
         for (k, &i) in self.dofs.iter().enumerate() {
             action[self.motors.place(k)] = self.motors.action(k, commands[i]);
+        }
+    }
+
+    /// The same for the `target` that `projector` has just found for `proposal`. Where physics steps lead elsewhere and that matters
+    /// ([`Projector::needs_what_is_reached`]) it becomes the nearest one that they lead to.
+    pub fn lead(
+        &mut self,
+        (q, v): (&[f64], &[f64]),
+        proposal: &Proposal,
+        projector: &mut Projector,
+        target: &mut Target,
+        action: &mut [f64],
+    ) {
+        self.action(q, v, target, projector.limits_of_tick(), action);
+        self.arrivals.begin();
+        for _ in 0..if projector.needs_what_is_reached() { ROUNDS } else { 0 } {
+            let Some(within) = self.arrivals.held_back(v, target) else { break };
+            projector.project_within((q, v), proposal, within, target);
+            self.action(q, v, target, projector.limits_of_tick(), action);
         }
     }
 }

@@ -40,26 +40,10 @@ pub(super) fn of(m: &Manifest, parts: &Parts) -> Vec<String> {
     notes.extend(far_poses(m, model));
     notes.extend(other_steps(m));
     notes.extend(of_several_joints(m, projector));
-    notes.extend(jerk_over_steps(m));
     if moves_by_model(m) {
         notes.extend(unreachable::notes(model, projector.limits(), &m.task.constraints.frame));
     }
     notes
-}
-
-/// Hard jerk, which several physics steps keep only approximately: no joint is slowed down for where the steps lead it.
-fn jerk_over_steps(m: &Manifest) -> Option<String> {
-    let steps = m.task.sub_steps();
-    let is_hard = m.task.constraints.jerk.as_ref().is_some_and(|jerk| jerk.soft.is_none());
-    let leads = m.guards() || m.task.idm.kind == IdmKind::Pinocchio;
-    let (sim_dt, every) = (m.task.time.sim_dt, m.task.time.policy_every * steps);
-    (is_hard && steps > 1 && leads && moves_by_model(m)).then(|| {
-        format!(
-            "a control period has {steps} physics steps, and over several of them targets keep the hard jerk limit and the robot only about: a joint may \
-             come 2 mm or mrad beyond its position limit, touch its stop, and leave limits of jerk and acceleration there; with one step they hold: dt = \
-             {sim_dt}, and policy_every = {every} for the same period of the policy; or leave position a margin"
-        )
-    })
 }
 
 /// Limits on what joints do together, which several physics steps keep only approximately.

@@ -102,14 +102,14 @@ impl Brake {
 
     fn act(&mut self) -> (Status, &[f64]) {
         let (q, v) = (&self.from.0, &self.from.1);
-        let status = self.projector.project(q, v, &self.proposal, &mut self.target);
+        self.projector.project(q, v, &self.proposal, &mut self.target);
+        self.idm.lead((q, v), &self.proposal, &mut self.projector, &mut self.target, &mut self.action);
         if self.projector.needs_previous() {
             self.projector.remember(&self.target);
         }
-        self.idm.action(q, v, &self.target, self.projector.limits(), &mut self.action);
         for (action, &(lower, upper)) in self.action.iter_mut().zip(&self.range) {
             *action = if action.is_finite() { action.clamp(lower, upper) } else { 0.0 };
         }
-        (status, &self.action)
+        (self.target.ledger.status, &self.action)
     }
 }

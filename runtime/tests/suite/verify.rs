@@ -695,9 +695,12 @@ fn hard_jerk_is_verified_alone_and_with_what_ties_joints_together() {
         let report = verify(&log).unwrap();
         println!("{limits}, {sub_steps} steps of {dt} s\n{report}");
         assert_eq!((report.found, report.is_whole()), (0, true), "{limits} {dt}\n{report}");
-        // Over several steps a joint at rest is carried past its limit, by 1e-7 rad, and hard jerk does not let it be slowed for that.
-        let looked_for = sub_steps > 1 || report.stoppable == report.verified;
-        assert!(looked_for && report.optimal > 150, "{limits} {dt}\n{report}");
+        // Over several steps a joint may be a little outside of what its brake counts on, as its jerk bounds how much slower it may become for it.
+        let outside = if sub_steps > 1 { report.verified / 100 } else { 0 };
+        assert!(
+            report.stoppable + outside >= report.verified && report.optimal > 150,
+            "{limits} {dt}\n{report}"
+        );
     }
     // Another jerk than the loop was built with is found out, looser or tighter.
     let (folder, log) = record("verify-jerk-edited", &attack(&jerk, 0.002, 1, 5));

@@ -23,6 +23,11 @@ impl Brake {
         Brake { p: *p, step: jerk * p.dt, most }
     }
 
+    /// The smaller of the largest deceleration and what it changes by in a period.
+    pub(crate) fn gentlest(&self) -> f64 {
+        self.most.min(self.step)
+    }
+
     /// Speed that an acceleration `a` adds while it falls to zero, its own period included: `T (a + (a - D) + (a - 2 D) + ...)`, terms above 0.
     pub(crate) fn adds(&self, a: f64) -> f64 {
         let whole = (a / self.step).floor().max(0.0);

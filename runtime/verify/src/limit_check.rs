@@ -86,7 +86,7 @@ impl Bounds {
 
     /// How the joint brakes where its jerk is hard.
     pub(crate) fn smooth(&self, p: &Period) -> Option<Brake> {
-        self.jerk.is_finite().then(|| Brake::new(self.jerk, self.stops(p), p))
+        self.jerk.is_finite().then(|| Brake::new(self.braking_jerk, self.stops(p), p))
     }
 
     /// The acceleration before a tick: of what stands, none where it is not known.
@@ -150,7 +150,7 @@ impl Bounds {
         if let Some(own) = self.smooth(p) {
             let (a, known) = ((s.v1 - s.v) / p.dt, Bounds::before(v, before).map(|a| sign * a));
             match kind {
-                "jerk" => return known.is_some_and(|known| a - known > own.step),
+                "jerk" => return known.is_some_and(|known| a - known > self.jerk * p.dt),
                 "velocity" => return s.v1.max(s.v + own.adds(a)) > self.velocity,
                 "viability" => return p.farthest(s.v, a).max(gone + own.highest(s.v1, a).0) > s.room,
                 "locked" => return known.is_some_and(|known| s.v1 > s.v + p.dt * own.next(s.v, known)),

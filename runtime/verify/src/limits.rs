@@ -333,6 +333,8 @@ pub(crate) struct Bounds {
     pub(crate) is_locked: bool,
     /// Where it is hard [rad/s³ or m/s³].
     pub(crate) jerk: f64,
+    /// What a brake counts on of it.
+    pub(crate) braking_jerk: f64,
     /// How fast it may speed up, where that was moved [rad/s² or m/s²].
     pub(crate) faster: f64,
     /// What it brakes with where limits were moved: as it was built.
@@ -483,6 +485,7 @@ impl Section {
             profile: [None; 2],
             is_locked: false,
             jerk: none,
+            braking_jerk: none,
             faster: none,
             built_brake: None,
         };
@@ -521,6 +524,7 @@ impl Section {
         let jerk = self.jerk.as_ref().filter(|jerk| jerk.hard);
         if let Some((jerk, limit)) = jerk.and_then(|jerk| Some((jerk, jerk.limit.of(dof, name)?))) {
             bounds.jerk = less(limit, &jerk.margin, dof, name);
+            bounds.braking_jerk = (1.0 - self.reserve) * bounds.jerk;
         }
         bounds
     }

@@ -153,7 +153,7 @@ impl Moving {
             let (j, b) = (&mut force.joints[i], &self.built.joints[i]);
             if b.jerk.is_finite() {
                 // A brake may speed up and go on for a while before it slows down.
-                let own = Brake::new(b.jerk, brake.map_or(b.stops(p), |brake| brake[i]), p);
+                let own = Brake::new(b.braking_jerk, brake.map_or(b.stops(p), |brake| brake[i]), p);
                 let a = own.next(v[i], last[i]);
                 let v1 = own.velocity(v[i], a);
                 let [above, below] = [1.0, -1.0].map(|sign| {

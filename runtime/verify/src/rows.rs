@@ -279,8 +279,9 @@ impl Row {
                         (sum(&|t| weight(t) * passage.v[t.dof]), sum(&|t| weight(t) * passage.a[t.dof]));
                     if equal.is_some() {
                         let (off, left) = (s - lower, p.dt * w);
-                        if off.abs() <= AT && left.abs() <= AT {
-                            let held = -(w + (0.5 / p.dt).min(TAKEN_OFF) * off) / p.dt;
+                        let (near, rate) = keeping(p, *b);
+                        if off.abs() <= near && left.abs() <= near {
+                            let held = -(w + rate * off) / p.dt;
                             return [(held - a) / b, (a - held) / b];
                         }
                         let further = (self.sum(passage) - lower).abs() - off.abs() - left.abs();
@@ -323,7 +324,7 @@ impl Row {
             Rule::User { lower, braking, equal: Some(equal), steepest, .. } => {
                 let off = (self.sum(passage) - lower).abs();
                 match (equal.is_kept, braking) {
-                    (true, Some(_)) => (off - 2.0 * AT) / steepest,
+                    (true, Some(b)) => (off - 2.0 * keeping(p, *b).0) / steepest,
                     (true, None) => off / self.size - AT_SPEED,
                     (false, _) => return None,
                 }
@@ -426,6 +427,17 @@ fn in_front(p: &Period, d: f64, w: f64, b: f64) -> f64 {
     }
     let most = p.approach(d, w, b);
     if p.stopping(w, b) <= d + ROUNDING { most.max(-b) } else { most }
+}
+
+/// How near its value a sum of positions of this braking is at it, and the rate at which it is led there [1/s]. Over several physics steps that is what its
+/// braking moves it in half a period.
+fn keeping(p: &Period, braking: f64) -> (f64, f64) {
+    let fastest = 0.5 / p.dt;
+    if p.sub_steps > 1 {
+        (AT.max(0.25 * braking * p.dt * p.dt), fastest)
+    } else {
+        (AT, TAKEN_OFF.min(fastest))
+    }
 }
 
 /// By how much closing in on a plane with the speed `then` at the end of a period is more than allowed, as a share of `b`. Distance, closing

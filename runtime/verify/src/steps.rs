@@ -81,12 +81,22 @@ pub(crate) fn lead(
                     if off < 0.0 { walk.highest[iq] - walk.q[iq] } else { walk.q[iq] - walk.lowest[iq] };
                 // Each period of a brake may lead further than constant accelerations do; with what is given up the joint could not stop.
                 let further = (side * (walk.q[iq] - q - p.way(passage.v[i], walk.v[i])) / p.dt).max(0.0);
-                let brake = joint.brake(&p);
+                let smooth = joint.smooth(&p);
+                let brake = smooth.map_or_else(|| joint.brake(&p), |own| own.gentlest());
                 let speed = side * walk.v[i] + given_up + FURTHER * further + reserve * brake * p.dt;
+                let way = match smooth {
+                    Some(own) => own.highest(speed, side * a + given_up / p.dt).0,
+                    None => p.stopping(speed, brake),
+                };
                 let left = room - p.kappa * p.dt * given_up;
                 let is_near = room - farthest <= given_up * p.dt + AT_LIMIT;
-                let is_fast = p.stopping(speed, brake) >= left - given_up * p.dt - AT_LIMIT;
-                (is_near || is_fast) && a.abs() <= joint.acceleration * (1.0 + LED)
+                let is_fast = way >= left - given_up * p.dt - AT_LIMIT;
+                let is_sudden = smooth.is_some()
+                    && passage.last.is_some_and(|last| {
+                        let before = last[i].clamp(-joint.acceleration, joint.acceleration);
+                        (a - before).abs() > joint.jerk * p.dt * (1.0 + LED)
+                    });
+                (is_near || is_fast) && a.abs() <= joint.acceleration * (1.0 + LED) && !is_sudden
             })
         });
         if !(leads || at_end || has_no_room || retreats) {

@@ -52,7 +52,7 @@ impl Coast {
         for &i in dofs {
             let (v, joint) = (self.v[i], &limits.joints[i]);
             if joint.jerk.is_finite() {
-                let own = Brake::new(joint.jerk, brake[i], p);
+                let own = Brake::new(joint.braking_jerk, brake[i], p);
                 let rests = own.rests(v, self.a[i]);
                 self.a[i] = if rests { 0.0 } else { own.next(v, self.a[i]) };
                 self.v1[i] = own.velocity(v, self.a[i]);

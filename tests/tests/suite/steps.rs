@@ -33,7 +33,7 @@ fn missed(friction: [f64; 3], damping: f64, dt: f64, n: u32) -> [f64; 2] {
                 *worst = worst.max(((sim.qvel()[i] - v[i]) / dt - a[i]).abs());
             }
             let mut foreseen = [0.0; 3];
-            steps.drive((&q, &v), &[0.0; 3], &a, (&mut tau, &most), &free);
+            steps.drive((&q, &v), &[0.0; 3], &a, (&mut tau, &most), (&free, &[ANY; 3]));
             steps.accelerate((&q, &v), &[0.0; 3], (&tau, &most), &mut foreseen);
             (0..3).for_each(|i| assert!((foreseen[i] - a[i]).abs() < 2e-9, "{foreseen:?} for {a:?}"));
         }
@@ -74,13 +74,19 @@ fn forces_keep_to_their_largest() {
     mean.update(&q, &v, &[0.0; 3]);
     mean.drive(&mut given, &mut tau);
     let (first, mut free) = (tau, tau);
-    steps.drive((&q, &v), &[0.0; 3], &a, (&mut free, &[f64::INFINITY; 3]), &LimitSet::unlimited(3));
+    steps.drive(
+        (&q, &v),
+        &[0.0; 3],
+        &a,
+        (&mut free, &[f64::INFINITY; 3]),
+        (&LimitSet::unlimited(3), &[ANY; 3]),
+    );
     for k in 0..3 {
         // where more is needed there is none, and where less is needed it is taken
         let mut most = [f64::INFINITY; 3];
         most[k] = first[k].abs();
         let mut tau = first;
-        steps.drive((&q, &v), &[0.0; 3], &a, (&mut tau, &most), &LimitSet::unlimited(3));
+        steps.drive((&q, &v), &[0.0; 3], &a, (&mut tau, &most), (&LimitSet::unlimited(3), &[ANY; 3]));
         steps.accelerate((&q, &v), &[0.0; 3], (&tau, &most), &mut reached);
         assert!(tau[k].abs() <= first[k].abs(), "{tau:?} from {first:?}");
         for i in (0..3).filter(|i| *i != k || free[k].abs() <= first[k].abs()) {
@@ -103,7 +109,7 @@ fn forces_that_are_no_numbers_stay() {
             &[0.0; 3],
             &[1.0; 3],
             (&mut tau, &[1.0, most, 1.0]),
-            &LimitSet::unlimited(3),
+            (&LimitSet::unlimited(3), &[ANY; 3]),
         );
         assert!(tau[0] == 1.0 && tau[1].is_nan() && tau[2] == 2.0, "{tau:?}");
     }

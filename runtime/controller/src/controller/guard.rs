@@ -82,7 +82,7 @@ impl Guard {
         if hold && (beyond || self.is_moved(next)) {
             self.lead((q, v), next, action);
             self.arrivals.begin();
-            for _ in 0..if self.projector.couples_joints() { ROUNDS } else { 0 } {
+            for _ in 0..if self.projector.needs_what_is_reached() { ROUNDS } else { 0 } {
                 let Some(within) = self.arrivals.held_back(v, next) else { break };
                 self.projector.project_within((q, v), &self.proposal, within, next);
                 self.lead((q, v), next, action);
@@ -97,9 +97,9 @@ impl Guard {
     fn lead(&mut self, (q, v): (&[f64], &[f64]), next: &Target, action: &mut [f64]) {
         self.a.copy_from_slice(&next.acceleration);
         self.dynamics.drive(&mut self.a, &mut self.tau);
-        let (external, limits) = (self.projector.external_forces(), self.projector.limits());
+        let (external, within) = (self.projector.external_forces(), self.projector.limits_of_tick());
         let by = (&self.a[..], &self.tau[..]);
-        let commands = self.arrivals.commands((q, v), next, by, external, limits);
+        let commands = self.arrivals.commands((q, v), next, by, external, within);
         for (k, &i) in self.dofs.iter().enumerate() {
             action[self.motors.place(k)] = self.motors.action(k, commands[i]);
         }

@@ -6,8 +6,9 @@ use crate::snapshot::{Manifest, Networks, PolicyKind, SnapshotError};
 use crate::task::{IdmInput, IdmKind};
 use nearl_constraints::description::FrictionLaw;
 use nearl_constraints::{
-    AccelerationLimit, ActionLimit, Consistency, ConstraintSettings, Drive, DriveTorqueLimit, Entry, Limit,
-    Model, Moved, PositionLimit, Projector, Settings, StateLayout, TorqueLimit, build_limits,
+    AccelerationLimit, ActionLimit, Consistency, ConstraintSettings, Drive, DriveTorqueLimit, Entry,
+    JerkLimit, Limit, Model, Moved, PositionLimit, Projector, Settings, StateLayout, TorqueLimit,
+    build_limits,
 };
 
 /// Robot, layout and projector of a task: what a controller needs beside its networks.
@@ -179,7 +180,12 @@ fn keep_clear(limits: &mut [Box<dyn Limit>], m: &Manifest) {
             }
             "acceleration" => {
                 if let Some(acceleration) = of.acceleration.clone() {
-                    *limit = Box::new(AccelerationLimit::over_steps(acceleration, m.task.time.dt, sub_steps));
+                    *limit = Box::new(AccelerationLimit::over_steps(acceleration, &m.task.period()));
+                }
+            }
+            "jerk" => {
+                if let Some(jerk) = of.jerk.clone() {
+                    *limit = Box::new(JerkLimit::over_steps(jerk, &m.task.period()));
                 }
             }
             _ => {}
