@@ -148,14 +148,17 @@ fn minus_is_a_sign(command: clap::Command) -> clap::Command {
     command.mut_subcommands(minus_is_a_sign)
 }
 
-/// An error of a task with the file that the task was read from, where it is one.
+/// An error of a task with the file that the task was read from, where it is one, and the line of the limit that it begins with.
 fn of_file(task: &str, error: &dyn std::fmt::Display) -> Failure {
     let said = error.to_string();
-    if said.contains(task) || !std::path::Path::new(task).is_file() {
-        said.into()
-    } else {
-        format!("{task}: {said}").into()
+    let Ok(text) = std::fs::read_to_string(task) else { return said.into() };
+    if said.contains(task) {
+        return said.into();
     }
+    let reason = said.strip_prefix("task cannot be used: ").unwrap_or(&said);
+    let limit = reason.split_whitespace().next().unwrap_or_default();
+    let place = nearl_runtime::task::place(&text, &["constraints", limit]).unwrap_or_default();
+    format!("{task}{place}: {said}").into()
 }
 
 /// A number of threads or jobs.

@@ -290,7 +290,7 @@ const AT: f64 = 1e-9;
 /// The same for a sum of speeds, as a share of its size.
 const AT_SPEED: f64 = 2e-9;
 
-/// The same over several physics steps, as a share of what its braking does in a period.
+/// The same of positions over several physics steps, as a share of `B T^2`.
 const OVER_STEPS: f64 = 0.25;
 
 /// Rate at which what rounding leaves of a distance is taken off [1/s].

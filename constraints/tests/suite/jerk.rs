@@ -304,6 +304,22 @@ fn a_joint_that_is_to_stand_stands() {
     assert!(v.iter().all(|v| v.abs() < 1e-12) && target.acceleration.iter().all(|a| a.abs() < 1e-9), "{v:?}");
 }
 
+/// Of a jerk so small that a brake has more periods than there are numbers the search for its end had none.
+#[test]
+fn a_tick_ends_however_small_the_jerk_is() {
+    for jerk in [1e-300, 1e-18, 1e-12, 1e300] {
+        let mut projector = panda_with_jerk(jerk, Vec::new(), Settings::new(0.01, 1)).unwrap();
+        let model = panda();
+        let (q, v) = (vec![0.0, -0.5, 0.0, -1.5, 0.0, 1.5, 0.0], vec![0.1; 7]);
+        let (raw, mut target) = (Proposal { q: q.clone(), v: vec![1.0; 7] }, Target::new(&model));
+        for _ in 0..2 {
+            projector.project(&q, &v, &raw, &mut target);
+            projector.remember(&target);
+            assert!(target.q.iter().chain(&target.v).all(|x| x.is_finite()), "{jerk}: {target:?}");
+        }
+    }
+}
+
 #[test]
 fn what_hard_jerk_is_not_kept_with_is_refused_by_name() {
     let said = |result: Result<Projector, LimitError>| result.err().expect("it was accepted").to_string();

@@ -535,6 +535,13 @@ fn line_of_key(text: &str, path: &[Step]) -> (String, usize) {
     (line_of(text, span), depth)
 }
 
+/// `:12 [section.key]`, where the keys stand in the text of a task file; `None` where they do not.
+pub fn place(text: &str, keys: &[&str]) -> Option<String> {
+    let path: Vec<Step> = keys.iter().map(|key| Step::Key((*key).to_owned())).collect();
+    let (line, depth) = line_of_key(text, &path);
+    (depth == path.len()).then(|| format!("{line}{}", bracket(&keys.join("."))))
+}
+
 /// Sections whose own checks speak of a number that is not finite; the learner's may have some.
 const CHECKED_ELSEWHERE: [&str; 3] = ["time", "scene", "train"];
 

@@ -429,8 +429,7 @@ fn in_front(p: &Period, d: f64, w: f64, b: f64) -> f64 {
     if p.stopping(w, b) <= d + ROUNDING { most.max(-b) } else { most }
 }
 
-/// How near its value a sum of positions of this braking is at it, and the rate at which it is led there [1/s]. Over several physics steps that is what its
-/// braking moves it in half a period.
+/// How near its value a sum of positions of this braking is at it, and the rate at which it is led there [1/s]: over several physics steps `B T² / 4`.
 fn keeping(p: &Period, braking: f64) -> (f64, f64) {
     let fastest = 0.5 / p.dt;
     if p.sub_steps > 1 {

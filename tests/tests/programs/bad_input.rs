@@ -125,6 +125,12 @@ const FILES: &[(&str, &str, &str, &[&str])] = &[
     ),
     (
         "Panda-reach",
+        "scale = 0.9",
+        "limit = -1.0",
+        &["t.toml:23 [constraints.velocity]: ", "velocity limit is -1, but must be above 0 rad/s or m/s"],
+    ),
+    (
+        "Panda-reach",
         "margin = 0.01",
         "margin = 5.0",
         &["leaves nothing of its range", "'panda_joint1'", "'panda_joint7'", "rad"],

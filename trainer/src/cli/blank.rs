@@ -1,6 +1,6 @@
 //! `nearl blank`: a task as a snapshot without a policy.
 
-use super::{Failure, say};
+use super::{Failure, of_file, say};
 use clap::Args;
 use nearl_runtime::cli::quoted;
 use std::path::PathBuf;
@@ -19,7 +19,7 @@ pub(super) struct Blank {
 
 impl Blank {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let snapshot = crate::blank::snapshot(&self.task, self.actions)?;
+        let snapshot = crate::blank::snapshot(&self.task, self.actions).map_err(|e| of_file(&self.task, &e))?;
         snapshot.save(&self.out)?;
         let notes = nearl_runtime::doctor::told(&snapshot.manifest)?;
         let what = if self.actions { "actions" } else { "states" };

@@ -1,6 +1,6 @@
 //! `nearl import`: a policy in an ONNX file becomes a snapshot.
 
-use super::{Failure, say};
+use super::{Failure, of_file, say};
 use crate::import::{Gives, Setting, for_task, read, snapshot};
 use crate::{blank, tasks};
 use clap::Args;
@@ -39,7 +39,7 @@ impl Import {
         let made = match (&self.task, &self.robot) {
             (Some(task), _) => {
                 let mut manifest = tasks::load(task, &[])?;
-                blank::complete(&mut manifest)?;
+                blank::complete(&mut manifest).map_err(|e| of_file(task, &e))?;
                 for_task(&network, manifest, Gives::named(&self.actions)?)?
             }
             (None, Some(robot)) => {

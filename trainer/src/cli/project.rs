@@ -3,7 +3,7 @@
 //! Input `{"q": [..], "v": [..], "q_proposal": [..], "v_proposal": [..]}`; output
 //! `{"q": [..], "v": [..], "status": "..", "active": [..], "outside": [..], "moved": .., "target_violations": .., ..}`.
 
-use super::{Failure, say};
+use super::{Failure, of_file, say};
 use crate::{env, tasks};
 use clap::Args;
 use nearl_runtime::Manifest;
@@ -48,7 +48,7 @@ fn next_line(input: &mut impl BufRead) -> Result<Option<String>, String> {
 impl Project {
     pub(super) fn run(self) -> Result<(), Failure> {
         let mut manifest = tasks::load(&self.task, &self.set)?;
-        let (model, mut projector) = robot(&mut manifest)?;
+        let (model, mut projector) = robot(&mut manifest).map_err(|e| of_file(&self.task, &e))?;
         let (mut target, names) = (Target::new(&model), projector.row_names());
         let mut input = std::io::stdin().lock();
         for i in 0.. {
