@@ -125,8 +125,8 @@ const FILES: &[(&str, &str, &str, &[&str])] = &[
     ),
     (
         "Panda-reach",
-        "scale = 0.9",
-        "limit = -1.0",
+        "velocity = { scale = 0.9 }",
+        "velocity = { limit = -1.0 }",
         &["t.toml:23 [constraints.velocity]: ", "velocity limit is -1, but must be above 0 rad/s or m/s"],
     ),
     (

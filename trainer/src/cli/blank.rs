@@ -19,7 +19,8 @@ pub(super) struct Blank {
 
 impl Blank {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let snapshot = crate::blank::snapshot(&self.task, self.actions).map_err(|e| of_file(&self.task, &e))?;
+        let snapshot =
+            crate::blank::snapshot(&self.task, self.actions).map_err(|e| of_file(&self.task, &e))?;
         snapshot.save(&self.out)?;
         let notes = nearl_runtime::doctor::told(&snapshot.manifest)?;
         let what = if self.actions { "actions" } else { "states" };
