@@ -213,7 +213,7 @@ fn what_was_pushed_off_a_row_is_named_and_comes_back() {
         q[5] += push;
         let (mut v, mut target, mut off) = (vec![0.0; 7], Target::new(projector.model()), push.abs());
         let row = projector.row_names().iter().position(|name| name == "mimic").unwrap();
-        // Over several physics steps a sum is at its value within a quarter of what its braking does in a period.
+        // Over several physics steps a sum is at its value within B T^2 / 4.
         let at = if sub_steps > 1 { 0.25 * 10.0 * 0.002 * 0.002 } else { 1e-8 };
         let mut named = 0;
         for _ in 0..3000 {
