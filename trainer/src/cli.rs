@@ -20,6 +20,7 @@ mod tasks;
 mod train;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use nearl_runtime::constraints::read_task_text;
 
 pub use nearl_runtime::cli::Failure;
 pub(crate) use nearl_runtime::cli::say;
@@ -151,10 +152,10 @@ fn minus_is_a_sign(command: clap::Command) -> clap::Command {
 /// An error of a task with the file that the task was read from, where it is one, and the line of the limit that it begins with.
 fn of_file(task: &str, error: &dyn std::fmt::Display) -> Failure {
     let said = error.to_string();
-    let Ok(text) = std::fs::read_to_string(task) else { return said.into() };
     if said.contains(task) {
         return said.into();
     }
+    let Ok(text) = read_task_text(task.as_ref()) else { return said.into() };
     let reason = said.strip_prefix("task cannot be used: ").unwrap_or(&said);
     let limit = reason.split_whitespace().next().unwrap_or_default();
     let place = nearl_runtime::task::place(&text, &["constraints", limit]).unwrap_or_default();
