@@ -61,7 +61,7 @@ pub(crate) struct SnapshotInbox<B: Build> {
     /// What viewers are told of the one in use.
     pub(crate) rows: Box<RowsMessage>,
     /// Joints of one that was taken into use, for the report.
-    pub(crate) watched: Option<Vec<Watched>>,
+    pub(crate) watched: Option<Watched>,
     /// Versions taken into use: (first tick at the latest, version of the controller).
     pub(crate) accepted: Vec<(u64, u64)>,
     /// Sentences of refusals, the first ones.
@@ -82,7 +82,7 @@ struct Offer {
     version: u64,
     /// Its number, and what viewers are told of it.
     rows: (u64, Box<RowsMessage>),
-    watched: Vec<Watched>,
+    watched: Watched,
 }
 
 /// What a look at the snapshots needs of the I/O thread.

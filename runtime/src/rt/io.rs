@@ -215,8 +215,8 @@ impl<B: Build> Io<B> {
         self.look_for_the_plant();
         let Io { link, log, robot, snapshots, traffic, watch, .. } = self;
         snapshots.pump(&mut Surroundings { link, log, robot, tick: traffic.tick });
-        if let Some(joints) = snapshots.watched.take() {
-            watch.set(joints);
+        if let Some(watched) = snapshots.watched.take() {
+            watch.set(watched);
         }
         let now = clock::now();
         self.look_for_the_trainer(now);

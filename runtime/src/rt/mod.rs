@@ -54,5 +54,5 @@ pub use run::{OnMode, RunError, RunSettings, connect, run, run_loop};
 pub use tick::{
     Build, Counters, LoopController, MAX_ROWS, Outcome, Question, Record, Refusal, Row, Sensed, TickOutput,
 };
-pub use watch::{Found, Watched};
+pub use watch::{Found, Watched, WatchedJoint};
 pub use way::{Apart, Way};

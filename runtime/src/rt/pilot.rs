@@ -4,7 +4,9 @@ use std::cell::Cell;
 use std::collections::BTreeMap;
 
 use nearl_constraints::description::JointKind;
-use nearl_constraints::{BrakeReason, Entry, Joint, Ledger, LimitSet, Moved, RefuseReason, Side, Status};
+use nearl_constraints::{
+    BrakeReason, Entry, Joint, Kind, Ledger, LimitSet, Moved, RefuseReason, Side, Status,
+};
 
 use crate::codes::LedgerStatus;
 use crate::controller::{Controller, Noise, Output, State};
@@ -17,7 +19,7 @@ use crate::rt::meaning::Meaning;
 use crate::rt::pinned::{Pinned, UNITS, above};
 use crate::rt::run::check_holding;
 use crate::rt::tick::{Build, LoopController, MAX_ROWS, Outcome, Question, Refusal, Row, TickOutput};
-use crate::rt::watch::Watched;
+use crate::rt::watch::{Watched, WatchedJoint};
 use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError};
 
 /// A controller with its inputs and outputs, checked against the plant it drives.
@@ -213,6 +215,7 @@ fn number_of(limits: &LimitSet) -> f64 {
 }
 
 fn write_rows(ledger: &Ledger, output: &mut TickOutput) {
+    output.outside = ledger.outside.first().map_or(0, |row| u16::try_from(row + 1).unwrap_or(u16::MAX));
     for (row, active) in output.rows.iter_mut().zip(ledger.active.iter().take(MAX_ROWS)) {
         let side = u8::from(active.side == Side::Upper);
         let (kind, number) = (active.kind as u8, active.row as u16);
@@ -305,15 +308,15 @@ impl LoopController for Pilot {
         told
     }
 
-    fn watched(&self) -> Vec<Watched> {
+    fn watched(&self) -> Watched {
         let (model, limits) = (self.controller.model(), self.controller.limits());
         let controllable = self.controller.layout().controllable();
         let all = model.description().bodies.iter().flat_map(|body| &body.joints);
         let slides: Vec<&str> = all.filter(|j| j.kind == JointKind::Slide).map(|j| j.name.as_str()).collect();
         let joints = model.joints().iter().filter(|j| j.nq == 1 && j.nv == 1);
-        joints
+        let joints = joints
             .filter(|j| self.proposes && controllable.contains(&j.idx_v))
-            .map(|j| Watched {
+            .map(|j| WatchedJoint {
                 joint: j.name.clone(),
                 dof: j.idx_v,
                 idx_q: j.idx_q,
@@ -322,7 +325,13 @@ impl LoopController for Pilot {
                 upper: limits.q_upper[j.idx_v],
                 velocity: limits.velocity[j.idx_v],
             })
-            .collect()
+            .collect();
+        let of_row = |(name, kind): (String, Option<Kind>)| match kind {
+            Some(kind) => format!("limit '{name}' of kind {}", kind.name()),
+            None => format!("joint '{name}', which cannot stop in front of its limit"),
+        };
+        let rows = self.row_names().into_iter().zip(self.controller.row_kinds()).map(of_row).collect();
+        Watched { joints, rows }
     }
 
     fn load_memory(&mut self, memory: &[f64]) {

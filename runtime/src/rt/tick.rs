@@ -58,9 +58,9 @@ pub trait LoopController: Send + 'static {
         told.set_row_names(&self.row_names());
         told
     }
-    /// Its joints with limits, by which the report of a run names what was found outside. Not for the real-time thread: it allocates.
-    fn watched(&self) -> Vec<Watched> {
-        Vec::new()
+    /// Its limits, by which the report of a run names what was found outside. Not for the real-time thread: it allocates.
+    fn watched(&self) -> Watched {
+        Watched::default()
     }
     /// Takes what another controller of the same robot saved in the tick before, if it fits.
     fn load_memory(&mut self, _memory: &[f64]) {}
@@ -158,6 +158,8 @@ pub struct TickOutput {
     pub ledger: LedgerNumbers,
     /// The first active rows, as many as fit; `ledger.active` counts all.
     pub rows: [Row; MAX_ROWS],
+    /// The first row that the state was found outside of, counted from 1 as [`Row::row`] is from 0; 0 for none.
+    pub outside: u16,
     /// Entries used in `brake`; 0 where no way to stop is stored.
     pub n_brake: u32,
     /// The stored way to stop from the target (nv): the deceleration of each controllable degree of freedom until it stands [rad/s² or
@@ -204,6 +206,7 @@ impl TickOutput {
             log_prob_action: 0.0,
             ledger: LedgerNumbers::default(),
             rows: [Row::default(); MAX_ROWS],
+            outside: 0,
             n_brake: 0,
             brake: zero,
         }

@@ -17,9 +17,18 @@ const TOLD: usize = 32;
 /// Beyond a limit by more than rounding, as a share of it (of 1 where it is smaller).
 const ROUNDING: f64 = 1e-9;
 
+/// What names what a tick was found outside of.
+#[derive(Clone, Debug, Default)]
+pub struct Watched {
+    /// Joints with limits.
+    pub joints: Vec<WatchedJoint>,
+    /// Every row of the projection by its number, in words.
+    pub rows: Vec<String>,
+}
+
 /// A joint with its limits as the projection keeps them.
 #[derive(Clone, Debug)]
-pub struct Watched {
+pub struct WatchedJoint {
     /// Name.
     pub joint: String,
     /// Degree of freedom.
@@ -43,6 +52,9 @@ pub struct Found {
     pub tick: u64,
     /// Joint; empty where no single joint is beyond its position or speed.
     pub joint: String,
+    /// What it is that was left where that is no position or speed of a joint, in words; empty otherwise.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub row: String,
     /// Limit.
     pub what: &'static str,
     /// What was measured.
@@ -55,24 +67,23 @@ pub struct Found {
 
 impl fmt::Display for Found {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Found { tick, joint, what, value, limit, unit } = self;
+        let Found { tick, joint, row, what, value, limit, unit } = self;
         if joint.is_empty() {
-            return write!(f, "{what}, first at tick {tick}");
+            return write!(f, "{row} ({what}), first at tick {tick}");
         }
         write!(f, "joint '{joint}' at {value} {unit}, and its {what} is {limit} {unit}, first at tick {tick}")
     }
 }
 
 /// No single joint is where it may not be, and the projection could only return all the same.
-const ELSEWHERE: &str =
-    "no single joint, but one that cannot stop in front of its limit, or a limit of several joints";
+const ELSEWHERE: &str = "no joint is beyond its position or speed";
 
 /// Ticks in a row for which a loop that never acted holds for one reason before it says so: at first, states and proposals come and go.
 const LONG: u32 = 100;
 
 /// What is gathered from the records.
 pub(crate) struct Watch {
-    joints: Vec<Watched>,
+    watched: Watched,
     counts: BTreeMap<u32, u64>,
     pub(crate) outside: Vec<Found>,
     mode: Mode,
@@ -84,16 +95,17 @@ pub(crate) struct Watch {
 
 /// Adds what is found for the first time of its joint and limit.
 fn add(outside: &mut Vec<Found>, found: Found) {
-    let is_known = outside.iter().any(|f| f.joint == found.joint && f.what == found.what);
+    let same = |f: &Found| f.joint == found.joint && f.row == found.row && f.what == found.what;
+    let is_known = outside.iter().any(same);
     if !is_known && outside.len() < TOLD {
         outside.push(found);
     }
 }
 
 impl Watch {
-    pub(crate) fn of(joints: Vec<Watched>) -> Watch {
+    pub(crate) fn of(watched: Watched) -> Watch {
         Watch {
-            joints,
+            watched,
             counts: BTreeMap::new(),
             outside: Vec::new(),
             mode: Mode::Hold,
@@ -103,8 +115,8 @@ impl Watch {
     }
 
     /// The limits are these from now on.
-    pub(crate) fn set(&mut self, joints: Vec<Watched>) {
-        self.joints = joints;
+    pub(crate) fn set(&mut self, watched: Watched) {
+        self.watched = watched;
     }
 
     pub(crate) fn take(&mut self, record: &Record) {
@@ -130,23 +142,24 @@ impl Watch {
             return;
         }
         *self.counts.entry(record.output.ledger.status).or_default() += 1;
-        if record.output.ledger.outside > 0 && record.sensed == Sensed::Measured {
-            self.name(record);
+        if record.output.ledger.outside > 0 && record.sensed == Sensed::Measured && !self.name(record) {
+            self.name_row(record);
         }
     }
 
     /// A joint that goes elsewhere than its velocity says.
     fn name_apart(&mut self, tick: u64, apart: Apart) {
         const WHAT: &str = "mean speed by its positions";
-        let Some(joint) = self.joints.iter().find(|joint| joint.dof == apart.dof) else { return };
+        let Some(joint) = self.watched.joints.iter().find(|joint| joint.dof == apart.dof) else { return };
         let (joint, unit) = (joint.joint.clone(), format!("{}/s", joint.length));
-        let (value, limit) = (apart.told, apart.moved);
-        add(&mut self.outside, Found { tick, joint, what: WHAT, value, limit, unit });
+        let (value, limit, row) = (apart.told, apart.moved, String::new());
+        add(&mut self.outside, Found { tick, joint, row, what: WHAT, value, limit, unit });
     }
 
-    fn name(&mut self, record: &Record) {
+    /// Joints beyond their positions or speeds; false where there are none.
+    fn name(&mut self, record: &Record) -> bool {
         let (mut is_one, state) = (false, &record.state);
-        for joint in &self.joints {
+        for joint in &self.watched.joints {
             let (q, v) = (state.q[joint.idx_q], state.v[joint.dof]);
             let speed = format!("{}/s", joint.length);
             let kinds = [
@@ -160,13 +173,21 @@ impl Watch {
                 }
                 is_one = true;
                 let (tick, joint, unit) = (record.tick, joint.joint.clone(), unit.to_owned());
-                add(&mut self.outside, Found { tick, joint, what, value, limit, unit });
+                let row = String::new();
+                add(&mut self.outside, Found { tick, joint, row, what, value, limit, unit });
             }
         }
-        if !is_one {
-            let (tick, joint, unit) = (record.tick, String::new(), String::new());
-            add(&mut self.outside, Found { tick, joint, what: ELSEWHERE, value: 0.0, limit: 0.0, unit });
-        }
+        is_one
+    }
+
+    /// A limit of several joints, or a joint that cannot stop in front of its own.
+    fn name_row(&mut self, record: &Record) {
+        let row =
+            usize::from(record.output.outside).checked_sub(1).and_then(|row| self.watched.rows.get(row));
+        let Some(row) = row.cloned() else { return };
+        let (tick, joint, unit) = (record.tick, String::new(), String::new());
+        let (what, value, limit) = (ELSEWHERE, 0.0, 0.0);
+        add(&mut self.outside, Found { tick, joint, row, what, value, limit, unit });
     }
 
     /// Ticks by a status that is out of the way.
@@ -191,7 +212,7 @@ mod tests {
     /// What is told of ticks with these reasons.
     fn told(ticks: impl Iterator<Item = (Mode, Reason)>) -> Vec<(u64, Mode, Reason)> {
         let (tell, told) = sync_channel(64);
-        let mut watch = Watch::of(Vec::new());
+        let mut watch = Watch::of(Watched::default());
         watch.tell = Some(tell);
         for (tick, (mode, reason)) in (1..).zip(ticks) {
             let mut record = Record::new();

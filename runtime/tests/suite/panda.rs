@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use crate::arm::*;
 use crate::toy::Name;
+use nearl_constraints::ConstraintSettings;
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 use nearl_runtime::{Manifest, PolicyKind};
@@ -144,7 +145,7 @@ fn a_joint_found_outside_its_limits_is_named_in_the_report() {
     let settings = RunSettings { ticks: Some(600), ..toy::settings() };
     let report = execute_with(&name, &file.0, &Stop::new(), settings).join().unwrap().unwrap();
     plant.end();
-    let [found] = &report.outside[..] else { panic!("{:?}", report.outside) };
+    let [found] = &report.outside[..] else { panic!("{report}") };
     let near = |a: f64, b: f64| (a - b).abs() < 1e-12;
     assert!(found.joint == "panda_joint1" && found.what == "highest position", "{found}");
     assert!(near(found.value, at) && near(found.limit, limit) && found.unit == "rad", "{found} {at} {limit}");
@@ -154,6 +155,26 @@ fn a_joint_found_outside_its_limits_is_named_in_the_report() {
     let text = report.to_string();
     assert!(text.contains(&format!("found outside    joint 'panda_joint1' at {at} rad")), "{text}");
     assert!(text.contains(&format!("recovering {recovering}")), "{text}");
+}
+
+/// A robot that is switched on with its hand above a ceiling that no joint's range knows of: the limit is named.
+#[test]
+fn a_limit_of_several_joints_that_was_left_is_named_in_the_report() {
+    let name = Name::new("panda-above");
+    let ceiling = "frame = [{ frame = \"panda_hand\", braking = 1.0, \
+                   half_space = { normal = [0, 0, 1], through = [0, 0, 0.3] } }]";
+    let first = snapshot(1, |m| {
+        m.task.constraints.frame = toml::from_str::<ConstraintSettings>(ceiling).unwrap().frame
+    });
+    let file = File::new("panda-above", &first);
+    let plant = start_panda(&name, &first, Panda { pause: Duration::from_micros(300), ..Panda::new() });
+    let settings = RunSettings { ticks: Some(200), ..toy::settings() };
+    let report = execute_with(&name, &file.0, &Stop::new(), settings).join().unwrap().unwrap();
+    plant.end();
+    let [found] = &report.outside[..] else { panic!("{report}") };
+    assert!(found.joint.is_empty() && found.row == "limit 'panda_hand' of kind frame", "{found}");
+    let text = report.to_string();
+    assert!(text.contains("found outside    limit 'panda_hand' of kind frame (no joint is beyond"), "{text}");
 }
 
 #[test]
