@@ -1,6 +1,6 @@
 """Each variant beside the right inverse model: interquartile means with their bands, and a rank test over seeds, from `curves.csv` to `ranks.md`.
 
-    .venv/bin/python results/ablation/ranks.py
+    .venv/bin/python results/ablation/ranks.py [FOLDER]
 
 Variants with the threshold 0.05 stand beside `right_0.05`, that and all others beside `right_0.5`. Two numbers of each run are compared: its mean over all
 evaluations, which is how fast it learned, and the mean of its last three.
@@ -30,9 +30,9 @@ def words(mine: np.ndarray, right: np.ndarray, itself: bool) -> list[str]:
     return [centre, f"{below} of {len(mine) * len(right)}", f"{rank_test(list(mine), list(right)):.3f}"]
 
 
-def main() -> None:
+def main(folder: Path) -> None:
     runs: dict = defaultdict(lambda: defaultdict(list))
-    with open(HERE / "curves.csv") as text:
+    with open(folder / "curves.csv") as text:
         for row in csv.DictReader(text):
             runs[row["task"], row["name"]][int(row["seed"])].append(float(row["return"]))
     titles = ["task", "", "seeds", "mean over the run", "below the right one", "p", "mean of the last three", "below the right one", "p"]
@@ -44,8 +44,8 @@ def main() -> None:
             mine, theirs = (np.array([number(returns) for _, returns in sorted(of.items())]) for of in (seeds, right))
             cells += words(mine, theirs, name == "right_0.5")
         lines.append(f"| {' | '.join(cells)} |")
-    (HERE / "ranks.md").write_text("\n".join(lines) + "\n")
+    (folder / "ranks.md").write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else HERE)

@@ -3,12 +3,14 @@
     .venv/bin/python results/imitation/figure.py RUNS FOLDER --experts EXPERTS [--variants]
 
 RUNS has `<task>/<algo>_<seed>`, or with --variants `<variant>/<task>/<algo>_<seed>`. Returns are without noise and from ordinary resets. Seeds that
-RUNS does not have stay what they are in the data of FOLDER.
+RUNS does not have stay what they are in the data of FOLDER. The table there has one mean of two columns over all seeds: where RUNS has some of these seeds
+and not all, nothing can be told apart, and what RUNS has goes to RUNS, by itself.
 """
 
 import argparse
 import csv
 import json
+import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -66,9 +68,16 @@ def kept(folder: Path, found: set[tuple[str, str, str]]) -> tuple[list[dict], di
 def together(new: list[float], n_kept: int, cells: list[str], place: int) -> float:
     """Mean of a column over the seeds that were measured now and those that were before, of which the table has the mean; all have equally many rows."""
     before = float(cells[place] or "nan") if n_kept else 0.0
-    if n_kept and int(cells[0]) != n_kept:
-        raise SystemExit(f"{n_kept} of the {cells[0]} seeds in the table would stay, and it has their mean alone: measure all of them again, or none")
     return (sum(new) + n_kept * before) / (len(new) + n_kept)
+
+
+def divided(rows: list[dict], table: dict[tuple[str, str], list[str]], found: dict) -> str:
+    """Of which task and name some of the seeds in the table would stay and others not; empty where there is none."""
+    for task, name in found:
+        stay = len({row["seed"] for row in rows if (row["task"], row["name"]) == (task, name)})
+        if stay and int(table[task, name][0]) != stay:
+            return f"{task}, {name}: {stay} of {table[task, name][0]} seeds"
+    return ""
 
 
 def panels(rows: list[dict], variants: bool) -> dict[str, dict]:
@@ -114,8 +123,19 @@ def main() -> None:
     parser.add_argument("--variants", action="store_true")
     args = parser.parse_args()
     found = read(args.runs, args.variants)
+    for (task, name), seeds in found.items():
+        for seed in [seed for seed, columns in seeds.items() if not len(curve(columns)[0])]:
+            print(f"{task}, {name}, seed {seed}: no evaluation, left out", file=sys.stderr)
+            del seeds[seed]
+    found = {key: seeds for key, seeds in found.items() if seeds}
+    if not found:
+        sys.exit(f"no finished run in {args.runs} has an evaluation, the first of which is after train.eval_every steps: give more steps")
     expert = {file.stem: float(np.mean(json.loads(file.read_text())["returns"])) for file in args.experts.glob("*.json")}
     rows, table = kept(args.folder, {(task, name, str(seed)) for (task, name), seeds in found.items() for seed in seeds})
+    if of := divided(rows, table, found):
+        print(f"{args.folder} has one mean over all seeds, and of these would stay {of}: what was measured now goes to {args.runs}", file=sys.stderr)
+        args.folder, rows, table = args.runs, [], {}
+    args.folder.mkdir(parents=True, exist_ok=True)
     lines = []
     for (task, name), seeds in found.items():
         for seed, (xs, ys) in ((seed, curve(columns)) for seed, columns in seeds.items()):

@@ -5,7 +5,7 @@
 # NEARL the program.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
-steps=${1:-10M} seeds=${2:-0 1 2}
+steps=${1:-10M} seeds=${2:-0 1}
 runs=${RUNS:-runs/motion} nearl=${NEARL:-target/release/nearl}
 clip=holosoma/data/motions/g1_29dof/whole_body_tracking/sub3_largebox_003_mj.npz
 

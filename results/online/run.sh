@@ -4,7 +4,7 @@ set -euo pipefail
 cd "$(dirname "$0")/../.."
 nearl=${NEARL:-target/release/nearl}
 task=${TASK:-HalfCheetah-v5}
-steps=${STEPS:-200000}
+steps=${STEPS:-100000}
 out=${OUT:-runs/online}
 mkdir -p "$out"
 for seed in ${SEEDS:-0 1}; do

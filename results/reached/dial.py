@@ -1,10 +1,10 @@
 """Margins adapted online until as many ticks end outside as were asked for, with a learned inverse model: what such a margin has to act on.
 
-    python results/reached/dial.py SNAPSHOT [TICKS] >> results/reached/dial.csv
+    python results/reached/dial.py SNAPSHOT [TICKS [NAME]] > results/reached/dial.csv
 
-SNAPSHOT is a deterministic policy with a learned inverse model on HalfCheetah-v5. It is read from the file and computed here in NumPy: policy, the limits of
-`consistency = "free"` (each entry of the proposal clamped, without the braking box), inverse model. Every row, a side of the position or of the velocity of a
-joint, has a margin of its own, which after each tick becomes
+NAME is what the column `policy` has, `first` unless given. SNAPSHOT is a deterministic policy with a learned inverse model on HalfCheetah-v5. It is read from
+the file and computed here in NumPy: policy, the limits of `consistency = "free"` (each entry of the proposal clamped, without the braking box), inverse
+model. Every row, a side of the position or of the velocity of a joint, has a margin of its own, which after each tick becomes
 
     m <- m + eta (outside - wanted),      eta = GAIN s / (1 + n / SETTLES)^DECAY,      0 <= m <= MOST s
 
@@ -193,6 +193,7 @@ def fly(snapshot: Snapshot, asked: float | None, ticks: int, way: str) -> dict:
 
 if __name__ == "__main__":
     ticks = int(sys.argv[2]) if len(sys.argv) > 2 else 20000
-    print("margins of positions,asked,ticks,outside,floor,return,worst rows,unattainable")
+    name = sys.argv[3] if len(sys.argv) > 3 else "first"
+    print("policy,margins of positions,asked,ticks,outside,floor,return,worst rows,unattainable")
     for way, share in [(WAYS[0], None), *((way, share) for way in WAYS for share in (0.1, 0.05, 0.01))]:
-        print(",".join(str(value) for value in fly(Snapshot(sys.argv[1]), share, ticks, way).values()), flush=True)
+        print(",".join(str(value) for value in (name, *fly(Snapshot(sys.argv[1]), share, ticks, way).values())), flush=True)

@@ -39,6 +39,12 @@ def compare(path: pathlib.Path, theirs: dict) -> dict:
     return row | worst
 
 
+def reasons(row: dict) -> list[str]:
+    """Why a file is refused, one by one, in the program's own words."""
+    name = pathlib.Path(row["file"]).name
+    return row["ours"].removeprefix(f"{name} holds impossible numbers: ").removesuffix("; correct them in the file").split("; ")
+
+
 def table(rows: list[dict]) -> str:
     loads = [r for r in rows if r["ours"] == "loads"]
     compared = [r for r in loads if "mass" in r]
@@ -49,7 +55,7 @@ def table(rows: list[dict]) -> str:
         f"Limits of position, speed and effort are compared for {sum(r['limits'] for r in compared)} joints; {sum(len(r['unlike']) for r in compared)} differ.",
         "", "Refused:", "", "| file | why |", "|---|---|",
     ]
-    lines += [f"| {r['file']} | {r['ours']} |" for r in rows if r["ours"] != "loads"]
+    lines += [f"| {r['file']} | {why} |" for r in rows if r["ours"] != "loads" for why in reasons(r)]
     lines += ["", "Loaded:", "", "| file | dofs | mass matrix | nle | limits that differ | notes |", "|---|---|---|---|---|---|"]
     for r in loads:
         numbers = [f"{r[k]:.0e}" if k in r else (r.get("different") or "refused by Pinocchio") for k in ("mass", "nle")]

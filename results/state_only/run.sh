@@ -2,7 +2,8 @@
 # Imitation of states alone and without the reward of the task, four demonstrations: PID2-IL, GAIfO and BCO, share of the expert's return.
 #     results/state_only/run.sh [SEEDS [STEPS [TASKS]]]      e.g. 0-2 1M, which goes into results/state_only/1M
 # The discriminators learn at a tenth of the usual rate: at that, returns on the way are lost again.
-# Demonstrations are those of results/imitation, the first four. Finished runs are skipped, broken ones go on.
+# Demonstrations are those of results/imitation, the first four. Finished runs are skipped, broken ones go on. A part of the seeds that are there alone is
+# measured into the folder of the runs: the committed tables have means over all of them.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 seeds=${1:-0-2} steps=${2:-300k} tasks=${3:-Hopper-v5 HalfCheetah-v5 Walker2d-v5 Ant-v5}
@@ -21,5 +22,4 @@ for task in $tasks; do
     target/release/nearl sweep --tasks $task --algos pid2-il --demos $demos --set 'train.demos.reward="likeness"' --set train.nets.idm=[32,32] \
         --set train.nets.idm_residual=true --set train.pid2.idm_threshold=0.1 "${common[@]}"
 done
-mkdir -p $folder
 .venv/bin/python results/imitation/figure.py $runs $folder --experts results/imitation/experts

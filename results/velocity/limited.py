@@ -42,9 +42,12 @@ def main(runs: Path, folder: Path) -> None:
     for run in sorted(p.parents[1] for p in runs.glob("*/*-*-*/checkpoints/final.safetensors")):
         if (run.parent.name, *run.name.rsplit("-", 2)) not in rows:
             row = measure(run)
+            if row["training_return"] == "":
+                print(f"{run}: no episode came to its end in training, so that there is no return: left out", file=sys.stderr)
+                continue
             rows[key(row)] = row
     if not rows:
-        sys.exit(f"no finished run in {runs}")
+        sys.exit(f"no finished run with a return in {runs}")
     ordered = sorted(rows.values(), key=lambda r: (list(PUBLISHED).index(r["task"]), r["steps"], list(WAYS).index(r["way"]), int(r["seed"])))
     with file.open("w", newline="") as text:
         writer = csv.DictWriter(text, list(ordered[0]), lineterminator="\n")
