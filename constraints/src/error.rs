@@ -138,7 +138,11 @@ pub(crate) fn near_names<'a>(name: &str, known: impl Iterator<Item = &'a str>) -
         scored.iter().take(3).filter(|(s, _)| *s > 0.75).map(|(_, k)| format!("'{k}'")).collect();
     if close.is_empty() {
         let all: Vec<&str> = scored.iter().map(|(_, k)| *k).collect();
-        return format!("; it has {}", all.join(", "));
+        return if all.is_empty() {
+            "; there is none".into()
+        } else {
+            format!("; it has {}", all.join(", "))
+        };
     }
     format!("; did you mean {}?", close.join(" or "))
 }

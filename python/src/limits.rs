@@ -211,9 +211,16 @@ fn value(argument: &Argument, given: &Bound<'_, PyAny>) -> PyResult<Value> {
     if is_bool && !matches!(argument.takes, Takes::Flag) {
         return Err(refused("bool"));
     }
-    read(argument.takes, given).map_err(|_: PyErr| {
-        refused(&given.get_type().name().map_or("another type".into(), |n| n.to_string()))
-    })
+    read(argument.takes, given).map_err(|_: PyErr| refused(&shown(given)))
+}
+
+/// The type of what was given, and its beginning as Python prints it.
+fn shown(given: &Bound<'_, PyAny>) -> String {
+    const LONGEST: usize = 60;
+    let kind = given.get_type().name().map_or("another type".into(), |n| n.to_string());
+    let text = given.repr().map_or(String::new(), |text| text.to_string());
+    let ends = if text.chars().count() > LONGEST { "..." } else { "" };
+    format!("{kind} {}{ends}", text.chars().take(LONGEST).collect::<String>())
 }
 
 fn read(takes: Takes, given: &Bound<'_, PyAny>) -> PyResult<Value> {
@@ -376,8 +383,7 @@ impl<'a, 'py> FromPyObject<'a, 'py> for Values {
         let all = given.extract().map(Values::All);
         let named = all.or_else(|_: PyErr| given.extract().map(Values::Joints));
         named.or_else(|_: PyErr| given.extract().map(Values::Each)).map_err(|_: PyErr| {
-            let name = given.get_type().name().map_or("another type".into(), |n| n.to_string());
-            PyTypeError::new_err(format!("expected {}; got {name}", Takes::PerJoint.expected()))
+            PyTypeError::new_err(format!("expected {}; got {}", Takes::PerJoint.expected(), shown(&given)))
         })
     }
 }

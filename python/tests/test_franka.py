@@ -22,7 +22,7 @@ def measurement():
 
 def test_a_wild_network_of_torques_leaves_no_limit_of_the_arm(measurement, tmp_path):
     found = measurement.attacked("torques", True, 2000, tmp_path)
-    assert found["ticks led"] > 1900 and found["broken limits asked for"] > 10_000
+    assert found["ticks led"] > 1900 and found["broken limits asked for"] > 1000  # of ticks
     assert found["states outside"] == 0
 
 

@@ -22,6 +22,7 @@ mod tensor;
 pub use assemble::{Setting, snapshot};
 pub use file::{onnx, read};
 pub use in_task::{Gives, for_task};
+pub use metadata::brought;
 pub use network::ImportedNetwork;
 
 /// Why a policy was not imported; one sentence.

@@ -150,7 +150,7 @@ impl Takes {
             Takes::Number => "a number",
             Takes::Vector => "three numbers: [0.0, 0.0, 1.0]",
             Takes::Flag => "True or False",
-            Takes::Count => "a whole number",
+            Takes::Count => "a whole number of at least 0",
             Takes::Text => "a text",
             Takes::Names => "a list of names: [\"elbow\"]",
             Takes::Pairs => "a list of pairs of names: [(\"hand\", \"floor\")]",

@@ -76,6 +76,17 @@ impl Limit for TorqueSpeedLimit {
         let stall = self.settings.stall.values(model, "torque_speed stall", positive, "above 0 N·m or N")?;
         let no_load =
             self.settings.no_load.values(model, "torque_speed no_load", positive, "above 0 rad/s or m/s")?;
+        self.settings.stall.names_some("torque_speed stall")?;
+        self.settings.no_load.names_some("torque_speed no_load")?;
+        let halves =
+            stall.iter().zip(&no_load).position(|(stall, no_load)| stall.is_some() != no_load.is_some());
+        if let Some(i) = halves {
+            let (has, lacks) = if stall[i].is_some() { ("stall", "no_load") } else { ("no_load", "stall") };
+            return Err(LimitError::Unusable {
+                what: format!("torque_speed names joint '{}' in {has} and not in {lacks}", model.dof_name(i)),
+                next: "name the same joints in both, or give one number for all",
+            });
+        }
         let mut most = stall.clone();
         less_each(model, "torque_speed margin", &mut most, self.settings.margin.as_ref(), controllable)?;
         for (i, most) in most.iter_mut().enumerate() {

@@ -515,11 +515,14 @@ impl Projector {
         }
     }
 
-    /// A finite target that stands still, for a state nobody knows.
+    /// A finite target that stands still, for a state nobody knows: joints whose configuration is known stay there.
     fn refuse(&self, q: &[f64], target: &mut Target) -> Status {
         target.q.copy_from_slice(q);
-        if !finite(q) {
-            target.q.copy_from_slice(self.model.raw_neutral());
+        for joint in self.model.joints() {
+            let own = joint.idx_q..joint.idx_q + joint.nq;
+            if !finite(&q[own.clone()]) {
+                target.q[own.clone()].copy_from_slice(&self.model.raw_neutral()[own]);
+            }
         }
         target.v.fill(0.0);
         target.acceleration.fill(0.0);

@@ -382,6 +382,24 @@ fn limits_for_some_joints_name_the_others() {
         settings.clone(),
         &["acceleration limit is an empty table, which holds for no joint"],
     );
+    // A motor's line needs both of its ends.
+    let line = |stall: &[&str], no_load: &[&str]| -> [Box<dyn Limit>; 1] {
+        let of = |names: &[&str]| PerJoint::Joints(names.iter().map(|n| (n.to_string(), 80.0)).collect());
+        let (stall, no_load, margin, soft) = (of(stall), of(no_load), None, None);
+        [Box::new(TorqueSpeedLimit::new(TorqueSpeedSettings { stall, no_load, margin, soft }))]
+    };
+    refuse(
+        &line(&["panda_joint1"], &["panda_joint3"]),
+        &[0, 1, 2],
+        settings.clone(),
+        &["torque_speed names joint 'panda_joint1' in stall and not in no_load"],
+    );
+    refuse(
+        &line(&["panda_joint1"], &[]),
+        &[0, 1, 2],
+        settings.clone(),
+        &["torque_speed no_load is an empty table"],
+    );
     let row = |coefficient: f64| -> [Box<dyn Limit>; 1] {
         let terms = [("v.panda_joint1".to_string(), coefficient)].into();
         let bounds = (Some(-1.0), Some(1.0));

@@ -135,8 +135,7 @@ fn beyond_simulator(m: &Manifest) -> Vec<String> {
     if m.without_simulator().is_none() {
         return Vec::new();
     }
-    // `position` asks for `acceleration`, which the projector of every task is built with.
-    let looked_at = ["position", "velocity", "acceleration"];
+    let looked_at = ["position", "velocity"];
     let named: Vec<_> =
         REGISTRY.iter().filter(|kind| !(kind.build)(of).is_empty()).map(|kind| kind.name).collect();
     let mut notes = Vec::new();
@@ -151,7 +150,7 @@ fn beyond_simulator(m: &Manifest) -> Vec<String> {
     if !others.is_empty() {
         notes.push(format!(
             "constraints.guard is \"simulator\", which looks at positions and velocities alone: an action may break {} of [constraints]; write guard = true \
-             to hold them, or leave them out",
+             to hold them, or leave out what position does not ask for",
             others.join(", ")
         ));
     }

@@ -415,7 +415,7 @@ fn a_simulator_s_guard_names_what_it_does_not_look_at() {
     };
     const SIMULATOR: &str = "constraints.guard=\"simulator\"";
     let others = said("ppo", &[SIMULATOR, "constraints.energy={ limit = 0.1 }"]);
-    assert!(others.contains("an action may break torque, energy of [constraints]"), "{others}");
+    assert!(others.contains("an action may break acceleration, torque, energy of [constraints]"), "{others}");
     assert!(!said("ppo", &["constraints.guard=true"]).contains("may break"));
     let only = said(
         "ppo",

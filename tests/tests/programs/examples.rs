@@ -34,6 +34,27 @@ fn policies() {
     assert!(run("imitate", &[file.to_str().expect("UTF-8")]).contains("stood for 500 periods of 500"));
 }
 
+/// The snapshot was once left behind when commands went to motors by name: it fell in every episode, and nothing said so.
+#[test]
+fn the_snapshots_do_what_they_were_trained_for() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let eval = |file: &str, set: &str| {
+        let snapshot = repository().join("examples/snapshots").join(file);
+        let mut command = Command::new(program("nearl"));
+        command.arg("eval").arg(snapshot).args(["--episodes", "4", "--seed", "3", "--json", "--set", set]);
+        Process::start(command.current_dir(folder.path())).json()[0].clone()
+    };
+    let walk = eval("anymal-walk.safetensors", "pushes.base=\"0\"");
+    let lengths: Vec<u64> = walk["lengths"].as_array().expect("lengths").iter().filter_map(|n| n.as_u64()).collect();
+    assert_eq!(lengths, [1000; 4], "it fell");
+    let told = |name: &str| {
+        let of = walk["told"].as_array().expect("told").iter().find(|t| t["name"] == name);
+        of.unwrap_or_else(|| panic!("{name}"))["mean"].as_f64().expect("a number")
+    };
+    let errors = [told("metrics/speed_error"), told("metrics/turn_error")];
+    assert!(errors[0] < 0.2 && errors[1] < 0.2, "{errors:?} m/s, rad/s");
+}
+
 #[test]
 fn environments_and_training() {
     assert!(run("wrap_env", &[]).contains(" 0 targets"));

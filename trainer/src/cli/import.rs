@@ -1,7 +1,7 @@
 //! `nearl import`: a policy in an ONNX file becomes a snapshot.
 
 use super::{Failure, of_file, say};
-use crate::import::{Gives, Setting, for_task, read, snapshot};
+use crate::import::{Gives, Setting, brought, for_task, read, snapshot};
 use crate::{blank, tasks};
 use clap::Args;
 use nearl_runtime::PolicyKind;
@@ -62,6 +62,12 @@ impl Import {
             quoted(&self.out),
             quoted(&self.out)
         ));
+        let brought = brought(&network);
+        if self.task.is_none() && !brought.is_empty() {
+            let merged =
+                if self.recipe.is_empty() { "" } else { ", where the recipe does not say otherwise" };
+            say(format!("  [constraints] of the policy's metadata: {}{merged}", brought.join(", ")));
+        }
         notes.iter().for_each(|note| say(format!("  note: {note}")));
         Ok(())
     }

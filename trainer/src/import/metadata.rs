@@ -31,6 +31,13 @@ pub(super) fn recipe(network: &ImportedNetwork) -> Result<Table, ImportError> {
     Ok(Table::new())
 }
 
+/// The keys of `[constraints]` in the metadata: limits that an import without a recipe has, and one with a recipe that does not say otherwise.
+pub fn brought(network: &ImportedNetwork) -> Vec<String> {
+    let table = recipe(network).unwrap_or_default();
+    let limits = table.get("constraints").and_then(Value::as_table);
+    limits.map_or(Vec::new(), |limits| limits.keys().cloned().collect())
+}
+
 /// Whether 'nearl export' wrote it of a policy that proposes: then the outputs are in the units of the state.
 pub(super) fn is_exported_change(network: &ImportedNetwork) -> bool {
     exported(network) == Some("change")

@@ -303,13 +303,17 @@ pub fn limit_scale(parts: &Parts, manifest: &Manifest) -> Result<Vec<f64>, Train
                 Entry::Other => f64::INFINITY,
             };
             let name = parts.layout.state_name(k);
-            if scale.is_finite() && scale > 0.0 {
-                Ok(scale)
-            } else {
-                Err(TrainError::Settings(format!(
-                    "[train.change_scale]: 'limits' needs a velocity and an acceleration limit for '{name}'; \
-                     set [constraints] or use change_scale = \"running\""
-                )))
+            let of = &manifest.task.name;
+            match parts.layout.state_entry(k) {
+                _ if scale.is_finite() && scale > 0.0 => Ok(scale),
+                Entry::Other => Err(TrainError::Settings(format!(
+                    "changes of '{of}' cannot be scaled by its limits (actions = \"change\", change_scale = \"limits\"): '{name}' is no position or velocity \
+                     of a joint; name those that a policy proposes under [state] propose, e.g. propose = [\"q.JOINT\", \"v.JOINT\"]"
+                ))),
+                _ => Err(TrainError::Settings(format!(
+                    "changes of '{of}' cannot be scaled by its limits (actions = \"change\", change_scale = \"limits\"): no velocity or acceleration limit \
+                     bounds '{name}'; give velocity and acceleration under [constraints], or leave '{name}' out of [state] propose"
+                ))),
             }
         })
         .collect()
