@@ -1,7 +1,9 @@
-"""What a caller hands over, before Rust sees it: whole numbers, arrays and lists of names, each refused in one sentence."""
+"""What a caller hands over, before Rust sees it: whole numbers, arrays, lists of names and functions, each refused in one sentence."""
 
+import inspect
 import operator
 import os
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -56,6 +58,35 @@ def names_of(what: str, value: Any) -> list[str]:
         if not isinstance(name, str):
             raise ValueError(f"{what}[{i}] is {name!r}; give names")
     return names
+
+
+def function_of(name: str, value: Any, arguments: str) -> None:
+    """Refuses what cannot be called with ``arguments``, such as ``"obs, actions, next_obs"``; None is left out.
+
+    Raises:
+        ValueError: it is no function, or one whose signature has no place for them. Where there is none to be read only the call tells.
+    """
+    if value is None:
+        return
+    if not callable(value):
+        raise ValueError(f"{name} is {value!r}; give a function, {name}({arguments})")
+    if (signature := _signature(value)) is None:
+        return
+    try:
+        signature.bind(*arguments.split(", "))
+    except TypeError:
+        takes = signature.replace(return_annotation=inspect.Signature.empty)
+        raise ValueError(f"{name} is a function of {takes} and is called with ({arguments}); give one that takes them, {name}({arguments})") from None
+
+
+def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
+    """Of the function itself, whatever it wraps or says of itself; None where none can be had."""
+    if hasattr(function, "__signature__"):
+        return None
+    try:
+        return inspect.signature(function, follow_wrapped=False)
+    except (NameError, TypeError, ValueError):
+        return None
 
 
 def seed_of(value: Any, n: int = 1, name: str = "seed") -> int:

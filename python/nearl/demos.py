@@ -92,9 +92,13 @@ def from_columns(
         ``out``.
 
     Raises:
-        BadDemonstrations: a column is missing, not finite or of another length, an episode has less than two rows, or numbers that are in other units.
+        BadDemonstrations: a column is missing, not finite or of another length, an episode has less than two rows, numbers that are in other units, or
+            ``out`` has another name than ``*.npz``.
         FileExistsError: ``out`` is there already.
     """
+    stem, suffix = os.path.splitext(os.fspath(out))
+    if suffix.lower() != ".npz":
+        raise BadDemonstrations(f"out is '{os.fspath(out)}', and demonstrations are written as NumPy's .npz; give '{stem}.npz'")
     if not overwrite and os.path.exists(out):
         raise FileExistsError(f"'{os.fspath(out)}' is there already; give another file, remove it, or give overwrite=True")
     if hasattr(episodes, "keys"):

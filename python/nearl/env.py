@@ -13,6 +13,12 @@ from nearl.arguments import seed_of
 from nearl.render import Frame, Renderer
 
 
+def check_open(closed: bool) -> None:
+    """Refuses a closed environment, with the error of Gymnasium's vectors."""
+    if closed:
+        raise gymnasium.error.ClosedEnvironmentError("the environment was closed, and neither steps nor begins an episode any more; make another one")
+
+
 class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     """A task on one simulated robot.
 
@@ -36,7 +42,7 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self._picture = (width, height), camera
         self._renderer: Renderer | None = None
         self._native = _core.Env(task)
-        self._seeded = self._begun = False
+        self._seeded = self._begun = self._closed = False
         low = self._native.action_low.astype(np.float32)
         high = self._native.action_high.astype(np.float32)
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
@@ -54,6 +60,7 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         Returns:
             Observation (n_obs) and an empty ``info``.
         """
+        check_open(self._closed)
         seed = None if seed is None else seed_of(seed)
         super().reset(seed=seed)
         if seed is None and not self._seeded:
@@ -79,6 +86,7 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
         ``info["cost"]`` is there where the task has a ``[cost]``, ``info["fault"]`` only if the physics could not be believed.
         """
+        check_open(self._closed)
         if not self._begun:
             raise gymnasium.error.ResetNeeded("no episode has begun; call reset() before step()")
         obs, reward, cost, terminated, fault = self._native.step(action)
@@ -100,13 +108,15 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         return self._renderer.frame(self._native.qpos, self._native.qvel)
 
     def close(self) -> None:
-        """Frees the renderer."""
+        """Frees the renderer; what is closed neither steps nor begins an episode any more."""
+        self._closed = True
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
 
     def set_state(self, qpos: ArrayLike, qvel: ArrayLike) -> NDArray[np.float64]:
         """Begins an episode at ``qpos`` (nq) and ``qvel`` (nv), MuJoCo's convention; returns the observation."""
+        check_open(self._closed)
         obs = self._native.set_state(qpos, qvel)
         self._begun = True
         return obs

@@ -78,7 +78,7 @@ def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathL
     if not (hasattr(inner, "fullpath") and hasattr(inner, "frame_skip") and hasattr(inner, "model")):
         raise ValueError(f"'{env_id}' is not built on Gymnasium's MujocoEnv, so it has no robot file; write a task file by hand")
     model, name = inner.model, env_id.split("/")[-1].rsplit("-v", 1)[0]
-    folder = Path(folder)
+    driven, folder = _driven(mujoco, model, env_id), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     file, robot = folder / f"{name}.toml", folder / Path(inner.fullpath).name
     if file.exists():
@@ -88,7 +88,6 @@ def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathL
         mujoco.mj_saveLastXML(str(robot), mujoco.MjModel.from_xml_path(inner.fullpath))
     else:
         robot.write_text(text)
-    driven = [model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)]
     timestep = float(model.opt.timestep)
     euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     joints = ", ".join(f'"{joint}"' for joint in dict.fromkeys(driven))
@@ -105,3 +104,15 @@ def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathL
     file.write_text(TEMPLATE.format(env_id=env_id, name=name, robot=robot.name, joints=joints, about=about, sections=sections, **times))
     env.close()
     return file
+
+
+def _driven(mujoco: Any, model: Any, env_id: str) -> list[str]:
+    """The joint of each actuator; of a tendon's or a site's there is none that a task could command."""
+    direct = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    for i in range(model.nu):
+        if int(model.actuator_trntype[i]) not in direct:
+            raise ValueError(
+                f"actuator '{model.actuator(i).name}' of '{env_id}' drives no joint, and the actions of a task are those of joints; "
+                "give its joints motors in the robot file, or write a task file by hand that leaves it out of state.controllable"
+            )
+    return [model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)]

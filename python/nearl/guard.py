@@ -89,7 +89,7 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
             lacks = ", ".join(missing) or "box of actions"
             raise ValueError(f"{inner} is no MuJoCo environment with continuous actions (no {lacks}); give one built on MujocoEnv")
         self._constraints, self._ctrl, self._seed = copy.deepcopy(constraints), ctrl, int(number)
-        self._trusted, self._repeats = False, 0
+        self._trusted, self._repeats, self._begun = False, 0, False
         self._warned: set[str] = set()
         # Whether the last step ended an episode, and whether the clock went forward in it.
         self._ended, self._forth = False, False
@@ -151,12 +151,13 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode; the environment may have changed its model for it."""
         result = self.env.reset(seed=seed, options=options)
-        self._ended, self._forth = False, False
+        self._ended, self._forth, self._begun = False, False, True
         self._read()
         return result
 
     def step(self, action: ArrayLike) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """A step under ``action``, or under the nearest one found that ends within the limits."""
+        self._check_begun()
         safe, verdict = self.safe(action)
         if self._last is None or not np.array_equal(self._last, safe.ravel()):
             self._foresee(safe.astype(float).ravel())
@@ -179,6 +180,13 @@ class Guard(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstru
             self._warn("other", self._compare(data, sent, held, foreseen, before if forth and late else None))
         outside = bool(unstable) or self._is_outside(data) or (anew and verdict == "outside")
         return obs, reward, terminated, truncated, {**info, "guard": "outside" if outside else word, "action": sent}
+
+    def _check_begun(self) -> None:
+        """Refuses a step before an episode, also of an environment that ``gymnasium.make`` did not put into its order."""
+        if not self._begun:
+            self._begun = self.env.has_wrapper_attr("has_reset") and bool(self.env.get_wrapper_attr("has_reset"))
+        if not self._begun:
+            raise gymnasium.error.ResetNeeded("no episode has begun; call reset() of the guard before step()")
 
     def safe(self, action: ArrayLike) -> tuple[NDArray[Any], str]:
         """The action that a step would use and what is foreseen of it, ``"kept"``, ``"replaced"`` or ``"outside"``; nothing is stepped."""

@@ -138,6 +138,8 @@ def import_sb3(
         ValueError: a part of the policy that is no layer, by name; actions that are none of the task's actuators; or a file.
     """
     _live(model, "import_sb3", "stable_baselines3.PPO.load")
+    if missing := [name for name in ("action_space", "policy") if not hasattr(model, name)]:
+        raise ValueError(f"model is {model!r}, no model of Stable-Baselines3 (no {missing[0]}); give the live object, e.g. what PPO.load(file) returns")
     space, policy = model.action_space, model.policy
     actions = _meaning(model, actions, task)
     if not hasattr(space, "low"):
@@ -301,12 +303,22 @@ def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: _Path | N
         raise ValueError("give either task=, or robot= and recipe=")
     if actions != "actuators":
         raise ValueError(f"actions={actions!r} is what a policy gives in a task; give task=FILE in place of robot= and recipe=")
-    recipes = [] if recipe is None else [recipe] if isinstance(recipe, str | os.PathLike) else recipe
+    recipes = _recipes(recipe)
+    if not isinstance(robot, str | os.PathLike):
+        raise ValueError(f"robot is {robot!r}; give the path of a URDF or MJCF file")
     for what, kind, file in (("robot", "a URDF or MJCF file", robot), *(("recipe", "a TOML file or unitree's deploy.yaml", one) for one in recipes)):
         if not os.path.isfile(file):
             reason = "it is no file" if os.path.exists(file) else "it does not exist"
             raise ValueError(f"cannot read {what} '{os.fspath(file)}': {reason}; give {kind}")
     return _told(policy.controller(robot, recipe, name))
+
+
+def _recipes(recipe: Any) -> Sequence[_Path]:
+    """The files of a recipe, one after the other."""
+    recipes = [] if recipe is None else [recipe] if isinstance(recipe, str | os.PathLike) else recipe
+    if not isinstance(recipes, Sequence) or not all(isinstance(one, str | os.PathLike) for one in recipes):
+        raise ValueError(f"recipe is {recipe!r}; give the path of a TOML file or of unitree's deploy.yaml, or a list of paths")
+    return recipes
 
 
 def _told(controller: Controller) -> Controller:

@@ -6,9 +6,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nearl.arguments import function_of
+
 Floats = NDArray[np.float64]
 # (obs, actions, next_obs), arrays of n rows, to (n,)
 Outcome = Callable[[Floats, Floats, Floats], ArrayLike]
+
+
+def check_outcomes(reward: Any, termination: Any) -> None:
+    """Refuses what is no function of ``(obs, actions, next_obs)``, where it is given and not where it is first asked."""
+    for name, function in (("reward", reward), ("termination", termination)):
+        function_of(name, function, "obs, actions, next_obs")
 
 
 def ask(name: str, function: Outcome, obs: Floats, actions: Floats, next_obs: Floats, dtype: type) -> NDArray[Any]:

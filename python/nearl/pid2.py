@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,8 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import numbers, seed_of, threads_of, whole
-from nearl.outcome import Outcome, ask
+from nearl.arguments import function_of, numbers, seed_of, threads_of, whole
+from nearl.outcome import Outcome, ask, check_outcomes
 from nearl.ranks import Gather
 
 Floats = NDArray[np.float64]
@@ -31,7 +32,14 @@ Callback = Callable[["PID2", dict[str, float]], bool | None]
 # Of a run folder: which of reward and termination came from Python, which the checkpoint does not tell apart.
 FUNCTIONS = "functions.json"
 # What the `nearl` command advises, and what does the same here.
-_ARGUMENTS = {"go on with --resume": "go on with nearl.PID2.load(run)", "another folder with --out": "another folder as run=", "with --out": "with run="}
+_ARGUMENTS = {
+    "go on with --resume": "go on with nearl.PID2.load(run)",
+    "another folder with --out": "another folder as run=",
+    "with --out": "with run=",
+    "give it with --robot": "give a snapshot or the folder of a run",
+}
+# How Rust says of demonstrations that the system does not give them.
+_UNREAD = re.compile(r"demonstrations '(?P<file>.+)': it cannot be read: ")
 
 
 class Memory(Sequence[_core.Controller]):
@@ -101,6 +109,8 @@ class PID2:
         ranks: Gather | None = None,
         start_from: str | os.PathLike[str] | None = None,
     ):
+        _check_names(algo, preset, settings)
+        check_outcomes(reward, termination)
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
         if demos is not None:
             overrides.append(f"train.demos.file={_toml(os.path.abspath(demos))}")
@@ -136,8 +146,8 @@ class PID2:
 
     @property
     def num_timesteps(self) -> int:
-        """Environment steps learned from so far; 0 for a loaded policy."""
-        return 0 if self._training is None else self._training.steps
+        """Environment steps learned from so far; of a policy loaded from a snapshot file those that the snapshot was learned from, 0 for an imported one."""
+        return self._controller.steps if self._training is None else self._training.steps
 
     @property
     def controller(self) -> _core.Controller:
@@ -163,7 +173,7 @@ class PID2:
                 "a policy loaded from a snapshot file predicts and does not learn: the file has no optimiser state; load a run folder, or make a new PID2"
             )
         total_timesteps = whole("total_timesteps", total_timesteps, 1, "ask for at least one step, and at most 1e15", 10**15)
-        callbacks = [] if callback is None else callback if isinstance(callback, list) else [callback]
+        callbacks = _callbacks(callback)
         bar = _Bar(sys.stderr, self.num_timesteps, total_timesteps) if progress_bar else None
         with _said_in_python():
             warning = self._training.begin(total_timesteps)
@@ -259,6 +269,7 @@ class PID2:
         """
         agent = cls.__new__(cls)
         agent._training, agent.seed = None, 0
+        check_outcomes(reward, termination)
         path, threads = os.path.abspath(path), threads_of(threads)
         if ranks is not None or (Path(path) / "checkpoints" / "resume.safetensors").is_file():
             _ask_again(Path(path), reward, termination)
@@ -282,9 +293,32 @@ def _said_in_python(path: str = "") -> Iterator[None]:
         for option, argument in _ARGUMENTS.items():
             said = said.replace(option, argument)
         said = said if path in said else f"'{path}': {said}"
+        if unread := _UNREAD.match(said):
+            raise (OSError if os.path.exists(unread["file"]) else FileNotFoundError)(said) from None
         if said == str(error):
             raise
         raise ValueError(said) from None
+
+
+def _check_names(algo: Any, preset: Any, settings: Any) -> None:
+    """Refuses what Rust would call an instance of another type."""
+    if not isinstance(algo, str):
+        raise ValueError(f"algo is {algo!r}; give one of {', '.join(name for name, _ in _core.algorithms())}")
+    if preset is not None and not isinstance(preset, str):
+        raise ValueError(f"preset is {preset!r}; give 'paper' or 'strong', or leave it out")
+    if settings is not None and not isinstance(settings, Mapping):
+        raise ValueError(f"settings is {settings!r}; give a table by dotted key of the task file, e.g. {{'constraints.velocity.limit': 12.0}}")
+
+
+def _callbacks(callback: Any) -> list[Callback]:
+    """All of them, each a function of ``(agent, metrics)``."""
+    callbacks = callback if isinstance(callback, list) else [] if callback is None else [callback]
+    for i, one in enumerate(callbacks):
+        name = f"callback[{i}]" if isinstance(callback, list) else "callback"
+        if not callable(one):
+            raise ValueError(f"{name} is {one!r}; give a function, callback(agent, metrics), or a list of them")
+        function_of(name, one, "agent, metrics")
+    return callbacks
 
 
 def _scorer(reward: Outcome | None, termination: Outcome | None) -> Callable[[Floats, Floats, Floats], tuple[float | None, bool]] | None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
 from nearl.arguments import constraints_of, numbers
-from nearl.env import Env
+from nearl.env import Env, check_open
 from nearl.render import Frame, Renderer
 
 
@@ -61,10 +61,11 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self._native.n_obs,), np.float64)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self._native.dt)}
-        self._seeded = False
+        self._seeded = self._closed = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray[np.float64], dict[str, Any]]:
         """Begins an episode; ``seed`` restarts the random stream. Returns the observation (n_obs) and info."""
+        check_open(self._closed)
         if options:
             raise ValueError(f"reset options {sorted(options)} are not known; this environment takes none")
         super().reset(seed=seed)
@@ -75,6 +76,7 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
         """One policy period under ``action`` (n_act): observation (n_obs), reward, terminated, truncated, info."""
+        check_open(self._closed)
         if not self._seeded:
             raise gymnasium.error.ResetNeeded("no episode has begun; call reset() before step()")
         obs, rewards, terminated, truncated, infos = self._native.step(numbers("action", action)[None])
@@ -94,7 +96,8 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         return self._renderer.frame(self._native.qpos[0], self._native.qvel[0])
 
     def close(self) -> None:
-        """Frees the renderer."""
+        """Frees the renderer; what is closed neither steps nor begins an episode any more."""
+        self._closed = True
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.arguments import whole
 
 Frame = NDArray[np.uint8]
+MOST_PIXELS = 8192
 
 
 class VideoError(RuntimeError):
@@ -29,6 +31,8 @@ class Renderer:
     """
 
     def __init__(self, env: _core.Env, size: tuple[int, int], camera: str | None = None):
+        give = f"give pixels, from 1 to {MOST_PIXELS}"
+        size = whole("width", size[0], 1, give, MOST_PIXELS), whole("height", size[1], 1, give, MOST_PIXELS)
         os.environ.setdefault("MUJOCO_GL", "egl")
         backend = os.environ["MUJOCO_GL"]
         try:

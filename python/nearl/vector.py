@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.error import ClosedEnvironmentError
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
 from nearl.arguments import constraints_of, numbers, seed_of, threads_of, whole
-from nearl.outcome import Floats, Outcome, ask
+from nearl.outcome import Floats, Outcome, ask, check_outcomes
 
 Step = tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
@@ -51,7 +51,10 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         termination: Outcome | None = None,
         actions: str = "state",
     ):
-        mode = AutoresetMode(autoreset_mode)
+        try:
+            mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            raise ValueError(f"autoreset_mode is {autoreset_mode!r}; give 'NextStep' or 'SameStep'") from None
         if mode is AutoresetMode.DISABLED:
             raise ValueError("autoreset_mode is Disabled, which is not offered; use NextStep or SameStep")
         if isinstance(num_envs, float):
@@ -60,6 +63,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         seed, threads = seed_of(seed, num_envs), threads_of(threads)
         if max_episode_steps is not None:
             max_episode_steps = whole("max_episode_steps", max_episode_steps, 1, "give at least one control period")
+        check_outcomes(reward, termination)
         task = os.fspath(task)
         constraints = None if constraints is None else constraints_of(constraints)
         same_step = mode is AutoresetMode.SAME_STEP
@@ -69,6 +73,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         self._reward, self._termination = reward, termination
         self._obs = np.zeros((num_envs, self._native.n_obs))
         self._over = np.zeros(num_envs, bool)  # whose next step only begins an episode
+        self._begun = np.zeros(num_envs, bool)  # who has an episode
         self.metadata = {"autoreset_mode": mode, "render_modes": []}
         # Torques as Gymnasium's float32; a proposed state keeps its digits.
         dtype: Any = np.float32 if constraints is None else np.float64
@@ -93,12 +98,14 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
             first = seed_of(seed, self.num_envs)
             seeds = [first + i for i in range(self.num_envs)]
         obs = self._native.reset(seeds)
-        self._obs, self._over = obs.copy(), np.zeros(self.num_envs, bool)
+        self._obs, self._over, self._begun = obs.copy(), np.zeros(self.num_envs, bool), np.ones(self.num_envs, bool)
         return obs, {}
 
     def step(self, actions: ArrayLike) -> Step:  # type: ignore[override]  # flags are booleans
         """One action (num_envs x n_act) each; an environment whose episode ended begins a new one, see the autoreset mode."""
         self._check_open()
+        if not self._begun.all():
+            raise ResetNeeded(f"no episode has begun in environment {int(np.argmin(self._begun))}; call reset() before step()")
         began = self._over
         own = self._reward is None and self._termination is None
         stepped = self._native.step(actions) if own else self._scored(numbers("actions", actions))
@@ -145,7 +152,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         self._check_open()
         self._native.set_state(index, numbers("qpos", qpos).tolist(), numbers("qvel", qvel).tolist())
         self._obs[index] = self._native.end([False] * self.num_envs)[index]
-        self._over[index] = False
+        self._over[index], self._begun[index] = False, True
 
     @property
     def native(self) -> _core.VecEnv:

@@ -255,6 +255,12 @@ impl Controller {
         &self.algo
     }
 
+    /// Environment steps that the snapshot was learned from; 0 for an imported one.
+    #[getter]
+    fn steps(&self) -> u64 {
+        self.snapshot.manifest.steps
+    }
+
     /// Digest of the snapshot.
     #[getter]
     fn digest(&self) -> &str {

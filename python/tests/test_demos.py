@@ -206,6 +206,13 @@ def test_csv(tmp_path: Path) -> None:
         demos.from_columns("Hopper-v5", [episode()], tmp_path / "b.npz", dt=0.01, actions=("a", "b", "c"))
 
 
+@pytest.mark.parametrize("name", ["d.csv", "d"])
+def test_what_is_written_is_called_what_it_is(tmp_path: Path, name: str) -> None:
+    with pytest.raises(demos.BadDemonstrations, match=rf"out is '.*/{name}', and demonstrations are written as NumPy's .npz; give '.*/d.npz'"):
+        demos.from_columns("Hopper-v5", [episode()], tmp_path / name, dt=0.008)
+    assert not list(tmp_path.iterdir())
+
+
 def test_motion_clips(tmp_path: Path) -> None:
     columns = episode()
     joints = [name[2:] for name in columns if name.startswith("q.")]

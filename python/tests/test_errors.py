@@ -20,6 +20,11 @@ def projector(model: nearl.Model, **settings) -> nearl.Projector:
     return nearl.Projector(model, [nearl.VelocityLimit(model), nearl.AccelerationLimit(model, 9.0)], **settings)
 
 
+def reset(vec: nearl.VecEnv) -> nearl.VecEnv:
+    vec.reset(seed=0)
+    return vec
+
+
 def test_unreadable_files() -> None:
     for load in (nearl.Model.from_urdf, nearl.Model.from_mjcf):
         with pytest.raises(OSError, match="no/such/robot.*check the path"):
@@ -53,7 +58,7 @@ def test_wrong_shapes(planar) -> None:
     with pytest.raises(ValueError, match=r"action has shape \(5,\), expected \(6,\)"):
         env.step(np.zeros(5))
     with pytest.raises(ValueError, match=r"actions has shape \(2, 6\), expected \(3, 6\)"):
-        nearl.make_vec("HalfCheetah-v5", 3).step(np.zeros((2, 6)))
+        reset(nearl.make_vec("HalfCheetah-v5", 3)).step(np.zeros((2, 6)))
 
 
 def test_unknown_names(planar) -> None:
@@ -75,7 +80,7 @@ def test_impossible_numbers(planar) -> None:
     with pytest.raises(ValueError, match=r"actions\[1, 2\] \('bfoot'\) is NaN"):
         actions = np.zeros((2, 6))
         actions[1, 2] = np.nan
-        nearl.make_vec("HalfCheetah-v5", 2).step(actions)
+        reset(nearl.make_vec("HalfCheetah-v5", 2)).step(actions)
     with pytest.raises(ValueError, match=r"qpos\[0\] is inf"):
         nearl.Env("Hopper-v5").set_state([np.inf] * 6, [0.0] * 6)
     with pytest.raises(ValueError, match="num_envs is 0"):

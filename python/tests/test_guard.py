@@ -117,6 +117,18 @@ def test_a_ctrl_that_fails_is_called_once():
     assert len(calls) == 1
 
 
+def test_a_step_before_an_episode_is_refused_without_gymnasiums_order_too():
+    for env in (HalfCheetahEnv(), wrappers.ClipAction(HalfCheetahEnv()), gymnasium.make("HalfCheetah-v5")):
+        guarded, action = nearl.Guard(env, LIMITS), np.zeros(6, np.float32)
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"no episode has begun; call reset\(\) of the guard before step\(\)"):
+            guarded.step(action)
+        guarded.reset(seed=0)
+        guarded.step(action)
+    begun = gymnasium.make("HalfCheetah-v5")
+    begun.reset(seed=0)
+    nearl.Guard(begun, LIMITS).step(action)
+
+
 def test_what_is_allowed_changes_nothing():
     plain, guarded = gymnasium.make("HalfCheetah-v5"), nearl.Guard(gymnasium.make("HalfCheetah-v5"), LIMITS)
     plain.reset(seed=3)
@@ -830,7 +842,9 @@ class Skips(Cart):
 )
 def test_what_no_guard_can_be_made_of_is_refused_in_a_sentence(make, words):
     with pytest.raises(ValueError, match=words):
-        make().step(np.ones(2))
+        env = make()
+        env.reset(seed=0)
+        env.step(np.ones(2))
 
 
 def test_an_actuator_that_comes_back_has_its_joint_limited_again():

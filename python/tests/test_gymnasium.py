@@ -112,6 +112,20 @@ def test_a_step_before_an_episode_is_refused_without_wrappers_too() -> None:
     env.step(np.zeros(6))
 
 
+def test_a_closed_environment_neither_steps_nor_begins_an_episode() -> None:
+    for env in (nearl.Env("HalfCheetah-v5"), nearl.ProjectedEnv("Panda-reach")):
+        env.reset(seed=0)
+        env.close()
+        env.close()
+        for use in (env.reset, lambda env=env: env.step(env.action_space.sample())):
+            with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="the environment was closed, .*; make another one"):
+                use()
+    env = nearl.Env("HalfCheetah-v5")
+    env.close()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError):
+        env.set_state(env.qpos, env.qvel)
+
+
 def test_warnings_of_a_task_point_at_the_line_that_made_it(tmp_path) -> None:
     (tmp_path / "arm.xml").write_text(
         '<mujoco><compiler angle="radian"/><worldbody><body><joint name="hinge" axis="0 1 0" range="-1 1"/><geom size=".1" mass="1"/></body></worldbody>'
@@ -141,6 +155,9 @@ def test_an_environment_draws_its_state() -> None:
     env.close()
     with pytest.raises(ValueError, match="give 'rgb_array'"):
         nearl.Env("Hopper-v5", render_mode="human")
+    env = nearl.Env("Hopper-v5", render_mode="rgb_array", width=-5)
+    with pytest.raises(ValueError, match="width is -5; give pixels, from 1 to 8192"):
+        env.render()
 
 
 def test_libraries_that_ask_for_pictures_first_get_their_environments() -> None:

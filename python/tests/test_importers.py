@@ -838,6 +838,17 @@ def test_robot_recipe_and_output_are_named_as_what_they_are(tmp_path) -> None:
             nearl.import_onnx(path, **files | {name: "no.xml"})
     with pytest.raises(ValueError, match=r"policy.onnx': .*no output 'foo'"):
         nearl.import_onnx(path, **files, output="foo")
+    for recipe in ({"time": {"dt": 0.02}}, 3, ["a.toml", None]):
+        with pytest.raises(ValueError, match=r"recipe is .*; give the path of a TOML file or of unitree's deploy.yaml, or a list of paths"):
+            nearl.import_onnx(path, **files | {"recipe": recipe})
+    with pytest.raises(ValueError, match="robot is 3; give the path of a URDF or MJCF file"):
+        nearl.import_onnx(path, **files | {"robot": 3})
+
+
+@pytest.mark.parametrize("model", [None, 3, SimpleNamespace(action_space=None)])
+def test_what_is_no_model_of_stable_baselines_is_refused(model) -> None:
+    with pytest.raises(ValueError, match=r"model is .*, no model of Stable-Baselines3 \(no (action_space|policy)\); give the live object"):
+        nearl.import_sb3(model, task="HalfCheetah-v5")
 
 
 @pytest.mark.parametrize("read", [nearl.import_sb3, nearl.import_torch])

@@ -1,6 +1,7 @@
 """SB3's five lines: learn, predict, save, load; the same weights as `nearl train`; Ctrl-C keeps what was learned."""
 
 import _thread
+import functools
 import itertools
 import resource
 import signal
@@ -162,6 +163,58 @@ def test_mistakes_are_named() -> None:
         nearl.PID2(CART_POLE, settings={"train.gama": 0.9})
     with pytest.raises(ValueError, match="total_timesteps is 0"):
         nearl.PID2(CART_POLE).learn(0)
+    with pytest.raises(FileNotFoundError, match="demonstrations '.*nope.npz': it cannot be read"):
+        nearl.PID2(CART_POLE, "bc", demos="nope.npz")
+    with pytest.raises(OSError, match="demonstrations '.*': it cannot be read: it is a directory"):
+        nearl.PID2(CART_POLE, "bc", settings={"train.demos.file": str(ROOT)})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"algo": None}, "algo is None; give one of ppo, .*pid2-ib"),
+        ({"preset": 3}, "preset is 3; give 'paper' or 'strong'"),
+        ({"settings": ["a=1"]}, r"settings is \['a=1'\]; give a table by dotted key"),
+        ({"reward": 3}, r"reward is 3; give a function, reward\(obs, actions, next_obs\)"),
+        ({"reward": "q.yaw"}, "reward is 'q.yaw'; give a function"),
+        ({"termination": lambda obs, actions: True}, r"termination is a function of \(obs, actions\) and is called with \(obs, actions, next_obs\)"),
+    ],
+)
+def test_arguments_of_another_kind_are_named_where_they_are_given(wrong: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        nearl.PID2(CART_POLE, **wrong)  # type: ignore[arg-type]
+
+
+def test_functions_are_refused_only_where_they_cannot_be_called(tmp_path: Path) -> None:
+    def of_all(obs, actions, next_obs):
+        return next_obs[:, 0]
+
+    @functools.wraps(lambda obs: obs)
+    def wrapping(*given):
+        return given[2][:, 0]
+
+    for reward in (of_all, wrapping, functools.partial(lambda scale, *given: scale * given[0][:, 0], 2.0), np.maximum, lambda a, b, c, d=1: a[:, 0]):
+        nearl.PID2(CART_POLE, "ppo", settings=SMALL, reward=reward)
+    with pytest.raises(ValueError, match=r"a function of \(obs, \*, goal\) and is called"):
+        nearl.PID2(CART_POLE, "ppo", settings=SMALL, reward=lambda obs, *, goal: obs)
+    with pytest.raises(ValueError, match="reward is 3; give a function"):
+        nearl.PID2.load(tmp_path, reward=3)  # type: ignore[arg-type]
+    agent = nearl.PID2(CART_POLE, "ppo", settings=SMALL)
+    for callback, said in (
+        (3, r"callback is 3; give a function, callback\(agent, metrics\), or a list of them"),
+        ([print, None], r"callback\[1\] is None; give a function"),
+        (lambda agent: None, r"callback is a function of \(agent\) and is called with \(agent, metrics\)"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            agent.learn(256, callback=callback)  # type: ignore[arg-type]
+    assert agent.num_timesteps == 0
+
+
+def test_a_snapshot_says_from_how_many_steps_it_was_learned(tmp_path: Path) -> None:
+    agent = nearl.PID2(CART_POLE, "ppo", settings=SMALL, run=tmp_path / "run").learn(512)
+    agent.save(tmp_path / "a.safetensors")
+    for file in (tmp_path / "a.safetensors", tmp_path / "run" / "checkpoints" / "final.safetensors", tmp_path / "run"):
+        assert nearl.PID2.load(file).num_timesteps == agent.num_timesteps == 512
 
 
 def test_a_stopped_run_goes_on_exactly(tmp_path: Path) -> None:
@@ -211,6 +264,8 @@ def test_refusals_of_files_and_folders_name_them_and_what_python_does_next(tmp_p
     junk.write_bytes(b"not a snapshot at all")
     with pytest.raises(ValueError, match=r"junk.safetensors' is not a safetensors file"):
         nearl.PID2.load(junk)
+    with pytest.raises(ValueError, match="an XML file, as robots are described in, not a snapshot; give a snapshot or the folder of a run"):
+        nearl.PID2.load(ROOT / "tests" / "fixtures" / "two_link.xml")
 
 
 def test_two_agents_do_not_mix_their_rows_in_one_run_folder(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import shutil
 import warnings
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium
 import mujoco
@@ -275,6 +276,27 @@ def test_arguments_of_a_task_of_gymnasium_are_in_its_reward(tmp_path: Path) -> N
 def test_an_environment_without_mujoco_has_no_robot(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="'CartPole-v1' is not built on Gymnasium's MujocoEnv"):
         nearl.from_gymnasium("CartPole-v1", tmp_path)
+
+
+def test_an_actuator_that_drives_no_joint_is_named(tmp_path: Path) -> None:
+    model = tmp_path / "fingers.xml"
+    model.write_text("""<mujoco><worldbody><body><joint name="a"/><geom size=".1"/></body><body><joint name="b"/><geom size=".1"/></body></worldbody>
+        <tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>
+        <actuator><motor name="grip" tendon="both" ctrlrange="-1 1"/></actuator></mujoco>""")
+
+    class Fingers(gymnasium.envs.mujoco.MujocoEnv):
+        metadata: ClassVar = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"], "render_fps": 100}
+
+        def __init__(self, **kwargs):
+            super().__init__(str(model), 5, gymnasium.spaces.Box(-np.inf, np.inf, (4,)), **kwargs)
+
+    gymnasium.register("Fingers-v0", entry_point=Fingers)
+    try:
+        with pytest.raises(ValueError, match="actuator 'grip' of 'Fingers-v0' drives no joint, and the actions of a task are those of joints"):
+            nearl.from_gymnasium("Fingers-v0", tmp_path / "out")
+        assert not (tmp_path / "out" / "Fingers.toml").exists()
+    finally:
+        gymnasium.registry.pop("Fingers-v0")
 
 
 @pytest.mark.parametrize("env_id", OWN_TASKS)

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from conftest import ROBOTS
-from gymnasium.error import ClosedEnvironmentError
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import nearl
@@ -219,11 +219,26 @@ def test_a_constrained_step_is_cubic_projection_and_inverse_dynamics() -> None:
         ({"seed": 2**64 - 1}, r"seed is 18446744073709551615; give a whole number from 0 to 2\*\*64 - 2"),
         ({"seed": None}, "seed is None; give a whole number"),
         ({"max_episode_steps": 0}, "max_episode_steps is 0; give at least one control period"),
+        ({"autoreset_mode": "SAME_STEP"}, "autoreset_mode is 'SAME_STEP'; give 'NextStep' or 'SameStep'"),
+        ({"autoreset_mode": None}, "autoreset_mode is None; give 'NextStep' or 'SameStep'"),
+        ({"reward": 3}, r"reward is 3; give a function, reward\(obs, actions, next_obs\)"),
+        ({"termination": lambda obs, actions: True}, r"termination is a function of \(obs, actions\) and is called with \(obs, actions, next_obs\); give one"),
     ],
 )
-def test_numbers_that_no_vector_has_are_refused(arguments, words) -> None:
+def test_what_no_vector_has_is_refused(arguments, words) -> None:
     with pytest.raises(ValueError, match=words):
         nearl.VecEnv("Hopper-v5", **{"num_envs": 2} | arguments)
+
+
+def test_a_vector_begins_with_a_reset() -> None:
+    vec, actions = nearl.make_vec("Hopper-v5", 2), np.zeros((2, 3))
+    with pytest.raises(ResetNeeded, match=r"no episode has begun in environment 0; call reset\(\) before step\(\)"):
+        vec.step(actions)
+    vec.set_state(0, vec.native.qpos[0], vec.native.qvel[0])
+    with pytest.raises(ResetNeeded, match="in environment 1;"):
+        vec.step(actions)
+    vec.set_state(1, vec.native.qpos[1], vec.native.qvel[1])
+    vec.step(actions)
 
 
 def test_a_closed_vector_neither_steps_nor_resets() -> None:

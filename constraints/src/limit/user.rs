@@ -175,6 +175,13 @@ impl Limit for UserRow {
 
     fn rows(&self, model: &Model, controllable: &[usize]) -> Result<Option<Box<dyn Rows>>, LimitError> {
         let s = &self.settings;
+        if s.terms.is_empty() {
+            let what = format!("row '{}' has no terms", s.name);
+            return Err(LimitError::Unusable {
+                what,
+                next: "give some, as { \"v.JOINT\" = 1.0 }, or drop the row",
+            });
+        }
         let terms: Vec<Term> =
             s.terms.iter().map(|(name, c)| self.term(model, name, *c)).collect::<Result<_, _>>()?;
         let bounds = self.bounds()?;

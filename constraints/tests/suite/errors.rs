@@ -400,6 +400,8 @@ fn limits_for_some_joints_name_the_others() {
         settings.clone(),
         &["torque_speed no_load is an empty table"],
     );
+    let none = serde_json::from_str(r#"{ "name": "r", "terms": {}, "upper": 1.0 }"#).unwrap();
+    refuse(&[Box::new(UserRow::new(none))], &[0, 1, 2], settings.clone(), &["row 'r' has no terms"]);
     let row = |coefficient: f64| -> [Box<dyn Limit>; 1] {
         let terms = [("v.panda_joint1".to_string(), coefficient)].into();
         let bounds = (Some(-1.0), Some(1.0));

@@ -45,7 +45,8 @@ fn the_snapshots_do_what_they_were_trained_for() {
         Process::start(command.current_dir(folder.path())).json()[0].clone()
     };
     let walk = eval("anymal-walk.safetensors", "pushes.base=\"0\"");
-    let lengths: Vec<u64> = walk["lengths"].as_array().expect("lengths").iter().filter_map(|n| n.as_u64()).collect();
+    let lengths: Vec<u64> =
+        walk["lengths"].as_array().expect("lengths").iter().filter_map(|n| n.as_u64()).collect();
     assert_eq!(lengths, [1000; 4], "it fell");
     let told = |name: &str| {
         let of = walk["told"].as_array().expect("told").iter().find(|t| t["name"] == name);

@@ -148,6 +148,13 @@ impl SweepCommand {
             )?);
         } else {
             table(&summary);
+            let silent = rows.iter().filter(|row| row.steps.is_some() && row.return_mean.is_none()).count();
+            if silent > 0 {
+                say(format!(
+                    "{silent} of {} runs have no return, as none of their episodes ended: give more --steps, or a smaller max_episode_steps",
+                    rows.len()
+                ));
+            }
         }
         let all = runs.len();
         let mut words = Vec::new();
