@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # ANYmal C learns to follow commands, is evaluated, and walks on a plant as a process of its own.
-#     results/walk/run.sh [SEED [STEPS]]      e.g. 0 5M
+#     results/walk/run.sh [SEED [STEPS]]      0 20M unless given
 # A run that stopped goes on.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
-seed=${1:-0} steps=${2:-5M}
+seed=${1:-0} steps=${2:-20M}
 nearl=target/release/nearl run=runs/walk/$seed
 if [ -f "$run/task.toml" ]; then
     $nearl train examples/tasks/anymal-walk.toml --resume "$run" --steps "$steps" --threads 2
