@@ -95,7 +95,7 @@ pub enum LimitError {
         near: String,
     },
     /// A number out of its domain.
-    #[error("{what} is {value}, but must be {}{domain}; change it", if value.is_infinite() { "finite and " } else { "" })]
+    #[error("{what} is {value}, but must be {}{domain}; change it", if value.is_infinite() && !domain.contains("finite") { "finite and " } else { "" })]
     BadValue {
         /// Setting, with joint where it belongs to one.
         what: String,

@@ -24,9 +24,9 @@ file = f"{folder}/pole.npz"
 demos.from_columns(TASK, episodes, file, dt=0.02, overwrite=True)
 
 agent = nearl.PID2(TASK, "pid2-il", seed=0, demos=file).learn(40_000)
-(obs, _), over, periods = env.reset(seed=100), False, 0
+(obs, _), over, periods, state = env.reset(seed=100), False, 0, None
 while not over:
-    action, _ = agent.predict(obs)
+    action, state = agent.predict(obs, state)
     obs, _, terminated, truncated, _ = env.step(action)
     over, periods = terminated or truncated or periods == 499, periods + 1
 print(f"the pole stood for {periods} periods of 500")

@@ -17,9 +17,9 @@ agent = nearl.PID2(task, algo="pid2-ib", seed=0, settings={"train.n_steps": 512}
 
 env = gymnasium.make(nearl.register(task)[0])
 obs, _ = env.reset(seed=0)
-over, steps = False, 0
+over, steps, state = False, 0, None
 while not over:
-    action, _ = agent.predict(obs)
+    action, state = agent.predict(obs, state)
     obs, _, terminated, truncated, _ = env.step(action.astype(np.float32))
     over, steps = terminated or truncated, steps + 1
 print(f"the pole stood for {steps} periods")

@@ -425,7 +425,7 @@ def _per_joint(value: PerJoint, joints: list[int], names: Mapping[int, str | int
                 raise ValueError(f"{what}: joint '{name}' has {no}; take it out of the table, which may have {', '.join(map(str, ids))}")
             raise ValueError(f"{what}: the robot has no such joint '{name}'; it has {', '.join(map(str, ids))}")
         if not isinstance(number, Real) or not (np.isfinite(float(number)) and float(number) >= 0.0):
-            raise ValueError(f"{what} of joint '{name}' is {number!r}; give a number of at least 0")
+            raise ValueError(f"{what} of joint '{name}' is {number!r}; give a finite number of at least 0")
     return {ids[name]: float(number) for name, number in values.items()}
 
 

@@ -38,7 +38,7 @@ impl Projector {
                 next: "name the joints in state.controllable, or drop the limits",
             });
         }
-        check_rows(limits)?;
+        check_names(model, limits)?;
         let switches = switches(model, limits, &dofs.controllable)?;
         let (each, limits) = (limits, LimitSet::collect(model, limits, &dofs.controllable)?);
         let period = Period::new(settings.dt, settings.sub_steps);
@@ -114,8 +114,17 @@ impl Projector {
     }
 }
 
-/// Rows of the user's own have each a name, by which they are reported and switched.
-fn check_rows(limits: &[Box<dyn Limit>]) -> Result<(), LimitError> {
+/// Rows of the user's own have each a name, by which they are reported and switched, and limits of frames may have one, by which they are moved.
+fn check_names(model: &Model, limits: &[Box<dyn Limit>]) -> Result<(), LimitError> {
+    for kind in ["frame", "frame_speed"] {
+        let of_kind = limits.iter().filter(|limit| limit.name() == kind).map(|limit| limit.label());
+        // Several limits of one frame may go by its name, and are moved together.
+        let names: Vec<&str> = of_kind.filter(|name| model.find_frame(name).is_err()).collect();
+        if let Some((_, name)) = names.iter().enumerate().find(|(i, name)| names[..*i].contains(name)) {
+            let what = format!("two limits of kind {kind} are named '{name}'");
+            return Err(LimitError::Unusable { what, next: "give each a name of its own" });
+        }
+    }
     let names: Vec<&str> =
         limits.iter().filter(|limit| limit.name() == "rows").map(|limit| limit.label()).collect();
     for (i, name) in names.iter().enumerate() {

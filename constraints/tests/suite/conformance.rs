@@ -274,6 +274,15 @@ fn impossible_numbers_are_refused_by_name() {
              upper = 1.0 }]",
             "two rows are named 'r'",
         ),
+        (
+            "frame = [{ frame = \"panda_hand\", name = \"a\", half_space = { normal = [0, 0, 1], through = [0, 0, 1] }, braking = 1.0 }, \
+             { frame = \"panda_link7\", name = \"a\", half_space = { normal = [0, 0, 1], through = [0, 0, 1] }, braking = 1.0 }]",
+            "two limits of kind frame are named 'a'",
+        ),
+        (
+            "rows = [{ name = \"r\", terms = { \"v.panda_joint1\" = 1.0 }, upper = inf }]",
+            "upper of row 'r' is inf, but must be a finite number; change it",
+        ),
         ("jerk = { limit = 1.0, soft = { quadratic = 0.0 } }", "soft.quadratic of limit 'jerk' is 0"),
         ("torque_speed = { stall = 0.0, no_load = 1.0 }", "torque_speed stall is 0"),
         ("torque_rate = { limit = inf }", "torque_rate limit is inf"),
