@@ -194,7 +194,7 @@ def test_the_nearest_action_is_the_solution_of_a_general_solver():
         ({"velocity": {"limit": {"knee": 1.0}}}, "knee"),
         ({"velocity": {"limit": -1.0}}, "-1.0"),
         ({"position": {"margin": 9.0}}, "margin of joint 'bthigh' is 9, .*give at most"),
-        ({"velocity": {"limit": "x"}}, "velocity limit of joint 'bthigh' is 'x'; give a number"),
+        ({"velocity": {"limit": "x"}}, "velocity limit of joint 'bthigh' is 'x'; give a finite number"),
         ({"velocity": {"limit": [1.0, 2.0]}}, "velocity limit of joint 'bthigh' is"),
         ({"velocity": {}}, "limit"),
         ({"velocity": 3.0}, r"velocity is 3.0; give a table, e.g. {'limit': 3.0}"),
