@@ -336,6 +336,21 @@ fn urdf_limits_are_never_dropped_without_a_word() {
         let words = ["the <joint> between the links 'a' and 'b' has no name"];
         refuse_model(Model::from_urdf_text(&nameless), &words);
     }
+    // What hangs rigidly on a body counts with it; the numbers are those of a TIAGo's antenna, whose inertia is negative about an axis.
+    let antenna = |on: &str, scale: f64| {
+        let [xx, xy, xz, yy, yz, zz] =
+            [2.371e-8, 6.119e-8, 1.179e-8, 2.833e-8, 7.74e-9, 3.849e-8].map(|x| scale * x);
+        let link = format!(
+            r#"<link name="antenna"><inertial><origin xyz="0 0 0.1"/><mass value="1e-6"/><inertia ixx="{xx}" ixy="{xy}" ixz="{xz}" iyy="{yy}" iyz="{yz}"
+            izz="{zz}"/></inertial></link><joint name="weld" type="fixed"><parent link="{on}"/><child link="antenna"/><origin rpy="0.3 0.2 0.1"/></joint></robot>"#
+        );
+        Model::from_urdf_text(&text.replace("</robot>", &link))
+    };
+    for (on, scale) in [("b", 1.0), ("a", 1.0), ("a", 1e9)] {
+        let notes = antenna(on, scale).expect("a robot").notes().join("; ");
+        assert!(notes.contains("the inertia of 'antenna' is that of no body"), "{notes}");
+    }
+    refuse_model(antenna("b", 1e9), &["the inertia of body 'antenna' is negative about some axis"]);
     for (moments, is_body) in [([1.0, 1.0, 2.0], true), ([0.1, 0.1, 10.0], false), ([1.0, 0.5, 1.49], true)] {
         let [xx, yy, zz] = moments;
         let text = text.replace(
