@@ -165,7 +165,7 @@ fn check_inertias(bodies: &[Body], wrong: &mut Vec<String>) {
     // By body: the one whose joints move it, and its place in that one's axes.
     let mut carried: Vec<Option<(usize, Placement)>> = Vec::with_capacity(bodies.len());
     for (i, body) in bodies.iter().enumerate() {
-        let by_parent = body.parent.filter(|p| *p < i).and_then(|p| carried[p].clone());
+        let by_parent = body.parent.filter(|p| *p < i).and_then(|p| carried[p]);
         carried.push(match body.joints.is_empty() {
             true => by_parent.map(|(by, at)| (by, at.then(&body.placement))),
             false => Some((i, Placement::IDENTITY)),
