@@ -342,7 +342,8 @@ fn urdf_limits_are_never_dropped_without_a_word() {
             [2.371e-8, 6.119e-8, 1.179e-8, 2.833e-8, 7.74e-9, 3.849e-8].map(|x| scale * x);
         let link = format!(
             r#"<link name="antenna"><inertial><origin xyz="0 0 0.1"/><mass value="1e-6"/><inertia ixx="{xx}" ixy="{xy}" ixz="{xz}" iyy="{yy}" iyz="{yz}"
-            izz="{zz}"/></inertial></link><joint name="weld" type="fixed"><parent link="{on}"/><child link="antenna"/><origin rpy="0.3 0.2 0.1"/></joint></robot>"#
+            izz="{zz}"/></inertial></link><joint name="weld" type="fixed"><parent link="{on}"/><child link="antenna"/>
+            <origin rpy="0.3 0.2 0.1"/></joint></robot>"#
         );
         Model::from_urdf_text(&text.replace("</robot>", &link))
     };
