@@ -102,9 +102,25 @@ def threads_of(value: Any) -> int:
     return whole("threads", value, 1, "give at least 1, or leave it out for all cores")
 
 
+def path_of(name: str, value: Any, give: str = "a path") -> str:
+    """``value`` as the path of a file, or a name that stands in its place.
+
+    Raises:
+        ValueError: it is none; ``give`` says what to give.
+    """
+    if isinstance(value, str | os.PathLike) and isinstance(path := os.fspath(value), str):
+        return path
+    raise ValueError(f"{name} is {value!r}; give {give}")
+
+
+def task_of(value: Any) -> str:
+    """The name of a task or a task file."""
+    return path_of("task", value, "the name of a task, one of nearl.tasks(), or a task file")
+
+
 def constraints_of(value: Any) -> str:
     """``"task"``, or a snapshot file; of a run folder the newest one, as ``nearl eval`` and ``nearl run`` take it."""
-    path = os.fspath(value)
+    path = path_of("constraints", value, "'task', a run folder of a training, or a snapshot file")
     if path == "task" or not os.path.isdir(path):
         return path
     for name in ("final", "latest"):

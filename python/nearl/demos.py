@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.arguments import task_of
 from nearl.recorded import (
     SAME,
     BadDemonstrations,
@@ -105,7 +106,7 @@ def from_columns(
         raise BadDemonstrations(f"{source}: episodes is one table of columns; give a list of them, [table], one for each episode")
     if not isinstance(episodes, Iterable):
         raise BadDemonstrations(f"{source}: episodes is {episodes!r}; give a list of tables of columns by name, one for each episode")
-    env = _core.Env(os.fspath(task))
+    env = _core.Env(task_of(task))
     of_task = controller(env, task)
     period = of_task.dt * of_task.policy_every if period is None else period
     check_period(dt, period, source)
@@ -177,7 +178,7 @@ def from_csv(
     source = f"'{os.fspath(file)}'"
     table = renamed(csv_table(file), columns, source)
     if episode is None:
-        known = {*_known(_core.Env(os.fspath(task))), *(actions or ())}
+        known = {*_known(_core.Env(task_of(task))), *(actions or ())}
         named = [name for name in table if name not in known and is_episode(name)]
         if len(named) > 1:
             raise BadDemonstrations(f"{source}: columns {', '.join(named)} may all say of which episode a row is; give episode=, the one that does")
@@ -203,7 +204,7 @@ def from_minari(
     Minari has neither names of entries nor a period: without ``names`` the order is taken to be that of the task's observation, and without
     ``dt`` the time between two rows to be its ``time.dt``. Its actions come along; ``actions=()`` leaves them out.
     """
-    env = _core.Env(os.fspath(task))
+    env = _core.Env(task_of(task))
     source = f"Minari dataset '{dataset}'" if isinstance(dataset, str) else "Minari dataset"
     if isinstance(dataset, str):
         dataset = minari_dataset(dataset)
@@ -319,7 +320,7 @@ def from_lerobot(
         raise BadDemonstrations(f"'{meta}' describes no LeRobot dataset of version 3 ({error!r}); give the dataset's folder") from None
     if key not in features:
         raise BadDemonstrations(f"{source}: no feature '{key}'; it has {', '.join(features)}")
-    env = _core.Env(os.fspath(task))
+    env = _core.Env(task_of(task))
     used = _known(env)
     if isinstance(names, str):
         raise BadDemonstrations(f"{source}: names is {names!r}; give a list, one name for each entry of '{key}'")

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from nearl._core import Controller, Env, Policy
+from nearl.arguments import task_of
 
 _Path = str | os.PathLike[str]
 _Recipe = _Path | Sequence[_Path] | None
@@ -183,7 +184,7 @@ def import_sb3(
     # What leaves the range of the space is cut there by the model, and by the motors; a proposed state has no motor.
     made = _policy(layers, mean, std, clip, (low, high) if actions != "actuators" or wrappers else (-math.inf, math.inf))
     if task is not None and robot is None:
-        _check_range(low, high, os.fspath(task), actions)
+        _check_range(low, high, task_of(task), actions)
     controller = _place(made, robot, recipe, task, name, actions)
     if actions != "actuators":
         _check_task(model, controller)
@@ -298,7 +299,7 @@ def _check_range(low: np.ndarray, high: np.ndarray, task: str, actions: str) -> 
 
 def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: _Path | None, name: str, actions: str) -> Controller:
     if task is not None and robot is None and recipe is None:
-        return _told(policy.in_task(os.fspath(task), actions=actions))
+        return _told(policy.in_task(task_of(task), actions=actions))
     if robot is None or task is not None:
         raise ValueError("give either task=, or robot= and recipe=")
     if actions != "actuators":

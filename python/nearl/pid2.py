@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import function_of, numbers, seed_of, threads_of, whole
+from nearl.arguments import function_of, numbers, path_of, seed_of, task_of, threads_of, whole
 from nearl.outcome import Outcome, ask, check_outcomes
 from nearl.ranks import Gather
 
@@ -36,6 +36,8 @@ _ARGUMENTS = {
     "go on with --resume": "go on with nearl.PID2.load(run)",
     "another folder with --out": "another folder as run=",
     "with --out": "with run=",
+    " with --algo, or leave --demos out": " as algo=, or leave demos= out",
+    "give a file with --demos": "give a file as demos=",
     "give it with --robot": "give a snapshot or the folder of a run",
 }
 # How Rust says of demonstrations that the system does not give them.
@@ -113,13 +115,14 @@ class PID2:
         check_outcomes(reward, termination)
         overrides = [f"{key}={_toml(value)}" for key, value in (settings or {}).items()]
         if demos is not None:
-            overrides.append(f"train.demos.file={_toml(os.path.abspath(demos))}")
+            file = os.path.abspath(path_of("demos", demos, "a file of demonstrations, .npz"))
+            overrides.append(f"train.demos.file={_toml(file)}")
         seed, threads = seed_of(seed), threads_of(threads)
         # What is written later goes there, wherever the process has gone meanwhile.
-        run = None if run is None or (ranks is not None and ranks.rank != 0) else os.path.abspath(run)
+        run = None if run is None or (ranks is not None and ranks.rank != 0) else os.path.abspath(path_of("run", run, "a folder to write"))
         with _said_in_python():
             self._training: _core.Training | None = _core.Training(
-                os.fspath(task),
+                task_of(task),
                 algo,
                 seed,
                 threads,
@@ -129,7 +132,7 @@ class PID2:
                 _scorer(reward, termination),
                 reward is not None,
                 ranks,
-                None if start_from is None else os.path.abspath(start_from),
+                None if start_from is None else os.path.abspath(path_of("start_from", start_from, "the folder of a run")),
             )
         self.task, self.algo, self.seed = self._training.task, algo, seed
         self._keep_functions(run, reward, termination)
@@ -244,6 +247,7 @@ class PID2:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the snapshot: networks, normaliser, constraints, robot; ``nearl eval``, ``nearl run`` and :meth:`load` read it."""
+        path = path_of("path", path, "a file to write, e.g. 'policy.safetensors'")
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         self._controller.save(path)
 
@@ -270,7 +274,7 @@ class PID2:
         agent = cls.__new__(cls)
         agent._training, agent.seed = None, 0
         check_outcomes(reward, termination)
-        path, threads = os.path.abspath(path), threads_of(threads)
+        path, threads = os.path.abspath(path_of("path", path, "a snapshot file or a run folder")), threads_of(threads)
         if ranks is not None or (Path(path) / "checkpoints" / "resume.safetensors").is_file():
             _ask_again(Path(path), reward, termination)
             with _said_in_python(path):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import constraints_of, numbers
+from nearl.arguments import constraints_of, numbers, task_of
 from nearl.env import Env, check_open
 from nearl.render import Frame, Renderer
 
@@ -54,7 +54,7 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self.render_mode = render_mode
         self._picture = (width, height), camera
         self._renderer: Renderer | None = None
-        self._task = os.fspath(task)
+        self._task = task_of(task)
         self._native = _core.VecEnv(self._task, 1, constraints_of(constraints), 0, 1, max_episode_steps, False, actions)
         self.action_meaning = actions
         low, high = self._native.action_low, self._native.action_high

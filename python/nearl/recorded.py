@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.arguments import task_of
 
 Floats = NDArray[np.float64]
 Columns = Mapping[str, ArrayLike]
@@ -78,10 +79,10 @@ def controller(env: _core.Env, task: str | os.PathLike[str]) -> _core.Controller
     idle = [(np.zeros((n_act, n_obs)), np.zeros(n_act), "identity")]
     policy = _core.Policy.from_layers(idle, np.zeros(n_obs), np.ones(n_obs), (-np.inf, np.inf), (-np.inf, np.inf))
     try:
-        return policy.in_task(os.fspath(task))
+        return policy.in_task(task_of(task))
     except ValueError as error:
         try:  # a [policy] of its own sees something else, which is left out here
-            return policy.in_task(os.fspath(task), ["policy.observation=[]"])
+            return policy.in_task(task_of(task), ["policy.observation=[]"])
         except ValueError:
             raise error from None
 

@@ -11,6 +11,7 @@ import warnings
 import gymnasium
 
 from nearl import _core
+from nearl.arguments import path_of
 
 _ID = re.compile(r"[\w:.-]+")
 
@@ -30,7 +31,7 @@ def register(*task_files: str | os.PathLike[str]) -> list[str]:
         return [_register(task, task, _core.max_episode_steps(task)) for task, _ in _core.tasks()]
     ids, bundled = [], {task for task, _ in _core.tasks()}
     for file in task_files:
-        env = _core.Env(os.fspath(file))
+        env = _core.Env(path_of("a task file", file))
         if env.task in bundled:
             raise ValueError(f"{os.fspath(file)} [name]: '{env.task}' is a bundled task, whose id it would take; give the file another name")
         if not _ID.fullmatch(env.task):

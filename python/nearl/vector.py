@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import constraints_of, numbers, seed_of, threads_of, whole
+from nearl.arguments import constraints_of, numbers, seed_of, task_of, threads_of, whole
 from nearl.outcome import Floats, Outcome, ask, check_outcomes
 
 Step = tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
@@ -64,7 +64,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         if max_episode_steps is not None:
             max_episode_steps = whole("max_episode_steps", max_episode_steps, 1, "give at least one control period")
         check_outcomes(reward, termination)
-        task = os.fspath(task)
+        task = task_of(task)
         constraints = None if constraints is None else constraints_of(constraints)
         same_step = mode is AutoresetMode.SAME_STEP
         self._native = _core.VecEnv(task, num_envs, constraints, seed, threads, max_episode_steps, same_step, actions)

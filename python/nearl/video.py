@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from nearl import _core
+from nearl.arguments import task_of
 from nearl.pid2 import PID2
 from nearl.render import Frame, Renderer, VideoError
 
@@ -54,7 +55,7 @@ def record(
     if Path(run).suffix == ".npz":
         if task is None:
             raise ValueError(f"'{run}' are demonstrations; say of which task with task= (--task)")
-        frames, period = _demonstrated(run, _core.Env(os.fspath(task)), episodes, seconds, fps, size, camera)
+        frames, period = _demonstrated(run, _core.Env(task_of(task)), episodes, seconds, fps, size, camera)
     else:
         controller, env = PID2.load(run).controller, _core.Env.of_snapshot(run)
         stride = max(1, round(1.0 / (fps * env.dt)))

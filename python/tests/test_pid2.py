@@ -174,6 +174,12 @@ def test_mistakes_are_named() -> None:
     [
         ({"algo": None}, "algo is None; give one of ppo, .*pid2-ib"),
         ({"preset": 3}, "preset is 3; give 'paper' or 'strong'"),
+        ({"task": None}, r"task is None; give the name of a task, one of nearl.tasks\(\), or a task file"),
+        ({"demos": 3}, "demos is 3; give a file of demonstrations"),
+        ({"run": 3}, "run is 3; give a folder to write"),
+        ({"start_from": b"runs"}, "start_from is b'runs'; give the folder of a run"),
+        ({"algo": "bc"}, r"'bc' learns from demonstrations and was given none; give a file as demos= \("),
+        ({"demos": "a.npz"}, r"'pid2-ib' takes no demonstrations; give one of .* as algo=, or leave demos= out"),
         ({"settings": ["a=1"]}, r"settings is \['a=1'\]; give a table by dotted key"),
         ({"reward": 3}, r"reward is 3; give a function, reward\(obs, actions, next_obs\)"),
         ({"reward": "q.yaw"}, "reward is 'q.yaw'; give a function"),
@@ -182,7 +188,18 @@ def test_mistakes_are_named() -> None:
 )
 def test_arguments_of_another_kind_are_named_where_they_are_given(wrong: dict[str, object], said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        nearl.PID2(CART_POLE, **wrong)  # type: ignore[arg-type]
+        nearl.PID2(**{"task": CART_POLE, **wrong})  # type: ignore[arg-type]
+
+
+def test_other_doors_name_what_is_no_path() -> None:
+    for refused, said in [
+        (lambda: nearl.make_vec(None, 2), "task is None; give the name"),  # type: ignore[arg-type]
+        (lambda: nearl.ProjectedEnv(CART_POLE, constraints=3), "constraints is 3; give 'task'"),  # type: ignore[arg-type]
+        (lambda: nearl.register(3), "a task file is 3; give a path"),  # type: ignore[arg-type]
+        (lambda: nearl.PID2.load(None), "path is None; give a snapshot file or a run folder"),  # type: ignore[arg-type]
+    ]:
+        with pytest.raises(ValueError, match=said):
+            refused()
 
 
 def test_functions_are_refused_only_where_they_cannot_be_called(tmp_path: Path) -> None:

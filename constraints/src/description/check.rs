@@ -1,5 +1,6 @@
 //! What a description must be before a model is built from it.
 
+use super::payload::add;
 use super::{Body, JointDescription, JointKind, Motor, Range, RobotDescription};
 use crate::ModelError;
 use crate::geometry::Placement;
@@ -161,72 +162,29 @@ fn check_inertias(bodies: &[Body], wrong: &mut Vec<String>) {
     if !bodies.iter().any(|body| is_indefinite(body.inertia)) {
         return;
     }
-    let mut rigid: Vec<Rigid> = Vec::with_capacity(bodies.len());
+    // Of a body with joints: with all that hangs on it without a joint in between.
+    let mut rigid = bodies.to_vec();
     // By body: the one whose joints move it, and its place in that one's axes.
     let mut carried: Vec<Option<(usize, Placement)>> = Vec::with_capacity(bodies.len());
     for (i, body) in bodies.iter().enumerate() {
         let by_parent = body.parent.filter(|p| *p < i).and_then(|p| carried[p]);
-        carried.push(match body.joints.is_empty() {
+        let by = match body.joints.is_empty() {
             true => by_parent.map(|(by, at)| (by, at.then(&body.placement))),
             false => Some((i, Placement::IDENTITY)),
-        });
-        rigid.push(Rigid::default());
-        if let Some((by, at)) = &carried[i] {
-            rigid[*by].add(body, at);
+        };
+        if let Some((by, at)) = by.filter(|(by, _)| *by != i) {
+            add(&mut rigid[by], body.mass, body.com, body.inertia, &at);
         }
+        carried.push(by);
     }
     for (body, carried) in bodies.iter().zip(&carried).filter(|(body, _)| is_indefinite(body.inertia)) {
-        if carried.as_ref().is_some_and(|(by, _)| is_indefinite(rigid[*by].inertia())) {
+        if carried.as_ref().is_some_and(|(by, _)| is_indefinite(rigid[*by].inertia)) {
             wrong.push(format!(
                 "the inertia of body '{}' is negative about some axis: correct its products of inertia",
                 body.name
             ));
         }
     }
-}
-
-/// Bodies that move as one.
-#[derive(Clone, Default)]
-struct Rigid {
-    mass: f64,
-    /// Mass times place [kg m].
-    moment: [f64; 3],
-    /// About the origin, `xx, xy, xz, yy, yz, zz` [kg m²].
-    about: [f64; 6],
-}
-
-impl Rigid {
-    fn add(&mut self, body: &Body, at: &Placement) {
-        let com = at.place(body.com);
-        let turned = turned(body.inertia, &at.rotation);
-        let steiner = steiner(body.mass, com);
-        (0..6).for_each(|k| self.about[k] += turned[k] + steiner[k]);
-        (0..3).for_each(|k| self.moment[k] += body.mass * com[k]);
-        self.mass += body.mass;
-    }
-
-    /// About the common centre of mass.
-    fn inertia(&self) -> [f64; 6] {
-        let steiner = match self.mass > 0.0 {
-            true => steiner(self.mass, self.moment.map(|x| x / self.mass)),
-            false => [0.0; 6],
-        };
-        [0, 1, 2, 3, 4, 5].map(|k| self.about[k] - steiner[k])
-    }
-}
-
-/// What a point of this mass has about the origin.
-fn steiner(mass: f64, [x, y, z]: [f64; 3]) -> [f64; 6] {
-    [y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y].map(|of| mass * of)
-}
-
-/// `R I R'`.
-fn turned([xx, xy, xz, yy, yz, zz]: [f64; 6], rotation: &[[f64; 3]; 3]) -> [f64; 6] {
-    let of = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
-    let entry = |a: usize, b: usize| -> f64 {
-        (0..3).map(|i| (0..3).map(|j| rotation[a][i] * of[i][j] * rotation[b][j]).sum::<f64>()).sum()
-    };
-    [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)]
 }
 
 fn check_joint(joint: &JointDescription, wrong: &mut Vec<String>) {

@@ -54,7 +54,7 @@ impl RobotDescription {
                 payload.inertia
             )));
         }
-        add(&mut self.bodies[body], payload, &placement);
+        add(&mut self.bodies[body], payload.mass, payload.com, payload.inertia, &placement);
         Ok(())
     }
 
@@ -75,11 +75,15 @@ impl RobotDescription {
     }
 }
 
-fn add(body: &mut Body, payload: &Payload, placement: &Placement) {
-    let (m1, m2) = (body.mass, payload.mass);
-    let (c1, c2) = (body.com, placement.place(payload.com));
-    let c: [f64; 3] = std::array::from_fn(|k| (m1 * c1[k] + m2 * c2[k]) / (m1 + m2));
-    let held = turned(full(payload.inertia), &placement.rotation);
+/// Adds what is held at `placement` in the body's axes: mass \[kg\], centre of mass \[m\] and inertia about it [kg·m²], in axes of its own.
+pub(super) fn add(body: &mut Body, mass: f64, com: [f64; 3], inertia: [f64; 6], placement: &Placement) {
+    let (m1, m2) = (body.mass, mass);
+    let (c1, c2) = (body.com, placement.place(com));
+    let c = match m1 + m2 > 0.0 {
+        true => std::array::from_fn(|k| (m1 * c1[k] + m2 * c2[k]) / (m1 + m2)),
+        false => c1,
+    };
+    let held = turned(full(inertia), &placement.rotation);
     let (own, first, second) = (full(body.inertia), about(m1, c1, c), about(m2, c2, c));
     let sum = |i: usize, j: usize| own[i][j] + first[i][j] + held[i][j] + second[i][j];
     body.inertia = [sum(0, 0), sum(0, 1), sum(0, 2), sum(1, 1), sum(1, 2), sum(2, 2)];
