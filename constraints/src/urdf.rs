@@ -235,7 +235,7 @@ impl Reader {
     /// What the description leaves out, and links that move and weigh nothing.
     fn notes(&mut self, root: Node) {
         let robot = &mut self.robot;
-        robot.notes.extend(children(root, "joint").filter_map(mimic));
+        robot.notes.extend(children(root, "joint").filter_map(|joint| mimic(root, joint)));
         robot.notes.extend(children(root, "joint").flat_map(notes::of_joint));
         robot.notes.extend(notes::inertias(&robot.bodies));
         let mut weighs: Vec<bool> = robot.bodies.iter().map(|body| body.mass > 0.0).collect();
@@ -269,11 +269,16 @@ fn empty(root: Node) -> RobotDescription {
 }
 
 /// A mimic joint is one of its own to the limits.
-fn mimic(joint: Node) -> Option<String> {
+fn mimic(root: Node, joint: Node) -> Option<String> {
     let mimic = joint.children().find(|n| n.has_tag_name("mimic"))?;
     let (name, of) = (joint.attribute("name").unwrap_or("?"), mimic.attribute("joint").unwrap_or("?"));
     let (multiplier, offset) =
         (number(mimic, "multiplier").unwrap_or(1.0), number(mimic, "offset").unwrap_or(0.0));
+    if children(root, "joint").all(|other| other.attribute("name") != Some(of)) {
+        return Some(format!(
+            "joint '{name}' mimics '{of}', which is not there: it moves by itself; correct the name in its <mimic>, or leave it out of the controllable joints"
+        ));
+    }
     let begins = mimics(name, of, multiplier, offset);
     let by = -multiplier;
     Some(format!(

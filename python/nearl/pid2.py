@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,8 +39,6 @@ _ARGUMENTS = {
     "give a file with --demos": "give a file as demos=",
     "give it with --robot": "give a snapshot or the folder of a run",
 }
-# How Rust says of demonstrations that the system does not give them.
-_UNREAD = re.compile(r"demonstrations '(?P<file>.+)': it cannot be read: ")
 
 
 class Memory(Sequence[_core.Controller]):
@@ -297,8 +294,6 @@ def _said_in_python(path: str = "") -> Iterator[None]:
         for option, argument in _ARGUMENTS.items():
             said = said.replace(option, argument)
         said = said if path in said else f"'{path}': {said}"
-        if unread := _UNREAD.match(said):
-            raise (OSError if os.path.exists(unread["file"]) else FileNotFoundError)(said) from None
         if said == str(error):
             raise
         raise ValueError(said) from None

@@ -4,13 +4,15 @@ use nearl_constraints::ModelError;
 use nearl_runtime::SnapshotError;
 use nearl_runtime::task::TaskError;
 use nearl_trainer::checkpoint::CheckpointError;
+use nearl_trainer::demos::DemoError;
 use nearl_trainer::robot::RobotError;
 use nearl_trainer::run_folder::RunError;
 use nearl_trainer::tasks::TaskLoadError;
 use nearl_trainer::train::TrainError;
 use nearl_trainer::vector::VectorError;
-use pyo3::exceptions::{PyOSError, PyUserWarning, PyValueError};
+use pyo3::exceptions::{PyFileNotFoundError, PyOSError, PyUserWarning, PyValueError};
 use pyo3::prelude::*;
+use std::io::ErrorKind;
 
 /// What the user gave is wrong.
 pub(crate) fn value(error: impl std::fmt::Display) -> PyErr {
@@ -50,6 +52,10 @@ pub(crate) fn train(error: TrainError) -> PyErr {
         | TrainError::Checkpoint(CheckpointError::Unusable { .. } | CheckpointError::Unwritable { .. }) => {
             PyOSError::new_err(error.to_string())
         }
+        TrainError::Demos(DemoError::Unreadable { kind, .. }) if kind == ErrorKind::NotFound => {
+            PyFileNotFoundError::new_err(error.to_string())
+        }
+        TrainError::Demos(DemoError::Unreadable { .. }) => PyOSError::new_err(error.to_string()),
         TrainError::Snapshot(e) => snapshot(e),
         other => value(other),
     }

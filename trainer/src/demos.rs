@@ -28,12 +28,33 @@ use std::path::Path;
 
 /// Why demonstrations cannot be used.
 #[derive(Clone, Debug, thiserror::Error)]
-#[error("demonstrations '{file}': {reason}")]
-pub struct DemoError {
-    /// Path.
-    pub file: String,
-    /// One sentence naming array, column and episode.
-    pub reason: String,
+pub enum DemoError {
+    /// The system does not give the file.
+    #[error("demonstrations '{file}': it cannot be read: {reason}")]
+    Unreadable {
+        /// Path.
+        file: String,
+        /// Of the system.
+        kind: std::io::ErrorKind,
+        /// What the system said.
+        reason: String,
+    },
+    /// The system does not take the file.
+    #[error("demonstrations '{file}': it cannot be written: {reason}; give another path with --out")]
+    Unwritable {
+        /// Path.
+        file: String,
+        /// What the system said.
+        reason: String,
+    },
+    /// What it holds are no demonstrations, or none for this task.
+    #[error("demonstrations '{file}': {reason}")]
+    Wrong {
+        /// Path.
+        file: String,
+        /// One sentence naming array, column and episode.
+        reason: String,
+    },
 }
 
 /// One episode.
@@ -73,9 +94,11 @@ impl Demonstrations {
     /// # Errors
     /// [`DemoError`] naming array, column and episode; nothing is half read.
     pub fn load(path: &Path) -> Result<Self, DemoError> {
-        let wrong = |reason| DemoError { file: path.display().to_string(), reason };
-        let bytes = nearl_runtime::constraints::read_bounded(path, MAX_BYTES, true);
-        let bytes = bytes.map_err(|e| wrong(format!("it cannot be read: {e}")))?;
+        let file = path.display().to_string();
+        let bytes = nearl_runtime::constraints::read_bounded(path, MAX_BYTES, true).map_err(|e| {
+            DemoError::Unreadable { file: file.clone(), kind: e.kind(), reason: e.to_string() }
+        })?;
+        let wrong = |reason| DemoError::Wrong { file: file.clone(), reason };
         let arrays = npz::read(&bytes).map_err(|e| wrong(format!("{e}; write it with numpy.savez")))?;
         Self::of(arrays).map_err(wrong)
     }
@@ -152,7 +175,7 @@ impl Demonstrations {
     /// Writes the file whole.
     ///
     /// # Errors
-    /// [`DemoError`] with what the system said.
+    /// [`DemoError::Unwritable`] with what the system said.
     pub fn save(&self, path: &Path) -> Result<(), DemoError> {
         let flat = |of: fn(&Episode) -> &Vec<f64>| {
             self.episodes.iter().flat_map(|e| of(e).iter().copied()).collect::<Vec<f64>>()
@@ -176,11 +199,10 @@ impl Demonstrations {
         if !actions.is_empty() {
             arrays.push(("actions", table(steps, actions)));
         }
-        let wrong = |e: std::io::Error| DemoError {
+        write_whole(path, &npz::write(&arrays)).map_err(|e| DemoError::Unwritable {
             file: path.display().to_string(),
-            reason: format!("it cannot be written: {e}; give another path with --out"),
-        };
-        write_whole(path, &npz::write(&arrays)).map_err(wrong)
+            reason: e.to_string(),
+        })
     }
 
     /// The same with the columns of `names`, in that order; whatever else the file has is left out.

@@ -36,7 +36,7 @@ impl Model {
         let name = |id: usize| self.name(MjtObjBase::mjOBJ_KEY, id).unwrap_or(format!("number {id}"));
         let names: Vec<String> = (0..m.key_time().len()).map(name).collect();
         let chosen = names.iter().position(|name| name == "home").unwrap_or(0);
-        let at = m.key_qpos().chunks_exact(self.nq()).nth(chosen)?;
+        let at = m.key_qpos().chunks_exact(self.nq().max(1)).nth(chosen)?;
         let (mut placed, mut turned) = (Vec::new(), Vec::new());
         for joint in self.joints() {
             let (parts, is_turned): (&[&str], bool) = match joint.kind {

@@ -33,7 +33,7 @@ pub fn advice(algo: Algorithm, manifest: &Manifest) -> Result<Vec<String>, Train
     let own = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?.demos;
     if algo.demos().is_some() && !own.file.is_empty() && manifest.proposes() {
         let demos = Demonstrations::load(Path::new(&own.file))?;
-        let wrong = |reason| TrainError::Demos(DemoError { file: own.file.clone(), reason });
+        let wrong = |reason| TrainError::Demos(DemoError::Wrong { file: own.file.clone(), reason });
         lines.extend(demonstrated(&demos.first(own.episodes).map_err(wrong)?, &manifest)?);
     }
     Ok(lines)

@@ -78,7 +78,7 @@ impl Imitation {
                 listed(&those)
             )));
         }
-        let wrong = |reason| TrainError::Demos(DemoError { file: own.file.clone(), reason });
+        let wrong = |reason| TrainError::Demos(DemoError::Wrong { file: own.file.clone(), reason });
         let demos = Demonstrations::load(Path::new(&own.file))?.first(own.episodes).map_err(wrong)?;
         let task = &manifest.task;
         let mut env = crate::env::of_task(manifest, &task.name).map_err(RolloutError::from)?;
