@@ -22,6 +22,8 @@ pub struct Seen {
     pub braked: usize,
     /// The measured state is outside, says the projector.
     pub recovering: usize,
+    /// Targets that break a limit of a state within all of them, says the projector.
+    pub alarms: usize,
     /// Of slowed and braked ticks: how much further from the proposal than the answer without a brake, in largest velocity changes of a
     /// period; the sum and the largest.
     pub further: (f64, f64),
@@ -64,6 +66,7 @@ pub fn attack(model: &Model, scene: &Scene, settings: &Settings, ticks: usize, s
         }
         seen.worst = seen.worst.max(excess);
         seen.recovering += usize::from(status == Status::Recovering);
+        seen.alarms += usize::from(target.ledger.target_breaks());
         let held = match status {
             Status::Slowed => Some(&mut seen.slowed),
             Status::Braked(_) if numbers => Some(&mut seen.braked),

@@ -52,7 +52,11 @@ fn every_kind_is_kept_alone_and_together() {
                         let settings = Settings { braking: Braking::Stored, ..Settings::new(dt, sub_steps) };
                         let scene = Scene::new(&model, "tool", kind);
                         let seen: Seen = attack(&model, &scene, &settings, TICKS, k as u64);
-                        assert_eq!(seen.over, 0, "{kind}, {sub_steps} steps of {dt} s: {seen:?}");
+                        assert_eq!(
+                            (seen.over, seen.alarms),
+                            (0, 0),
+                            "{kind}, {sub_steps} steps of {dt} s: {seen:?}"
+                        );
                         let moves = seen.braked * 10 < seen.ticks * 9;
                         assert!(moves, "{kind}, {sub_steps} steps of {dt} s stands: {seen:?}");
                         *ticks.lock().unwrap() += seen.ticks;

@@ -358,9 +358,9 @@ impl Rows for CollisionRows {
     }
 
     /// Metres by which the two nearest bodies are closer than the margin, in the first place: which pair is in which slot changes
-    /// along a motion.
+    /// along a motion. The other places break nothing, and are no rows that a brake cannot keep.
     fn breach(&mut self, motion: &mut Motion<'_>, out: &mut [f64]) {
-        out.fill(f64::NEG_INFINITY);
+        out.fill(-1.0);
         let then = self.ahead.look_at_frames(motion.q_next, motion.v_next, 0.0);
         out[0] = self.margin - self.pairs.least(then);
     }
