@@ -1,10 +1,12 @@
 """A task file to start from, made of a Gymnasium MuJoCo environment."""
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 
 from nearl.gymnasium_tasks import as_toml, own_sections
 
@@ -49,6 +51,9 @@ def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathL
     other environments they are code: write them as expressions, which trains everywhere, or pass functions to
     ``nearl.make_vec(file, n, reward=..., termination=...)``.
 
+    An environment whose ``step`` changes the action or the state leads elsewhere than its model: one step of both is compared, and a warning says
+    by how much.
+
     Not supported: robots with meshes, actuators that do not drive a single joint within a range, wrappers, environments that move
     their goal or model while they run. Training with constraints also needs the robot to be one tree of bodies.
 
@@ -79,6 +84,7 @@ def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathL
         raise ValueError(f"'{env_id}' is not built on Gymnasium's MujocoEnv, so it has no robot file; write a task file by hand")
     model, name = inner.model, env_id.split("/")[-1].rsplit("-v", 1)[0]
     driven, folder = _driven(mujoco, model, env_id), Path(folder)
+    elsewhere = _elsewhere(mujoco, env)
     folder.mkdir(parents=True, exist_ok=True)
     file, robot = folder / f"{name}.toml", folder / Path(inner.fullpath).name
     if file.exists():
@@ -103,7 +109,31 @@ def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathL
     sections = as_toml(own) if own else EMPTY
     file.write_text(TEMPLATE.format(env_id=env_id, name=name, robot=robot.name, joints=joints, about=about, sections=sections, **times))
     env.close()
+    if elsewhere > 0:
+        warnings.warn(
+            f"after one step '{env_id}' is {elsewhere:.2g} rad, m, rad/s or m/s away from where its MuJoCo model goes with that action: its step() changes "
+            f"actions or states, and '{file}' does not; put a scale of actions into the gears of '{robot}'",
+            stacklevel=2,
+        )
     return file
+
+
+def _elsewhere(mujoco: Any, env: gymnasium.Env[Any, Any]) -> float:
+    """How far a step of the environment ends from one of its model with the same action; 0 where they are the same."""
+    inner: Any = env.unwrapped
+    env.reset(seed=0)
+    data, state = mujoco.MjData(inner.model), mujoco.mjtState.mjSTATE_INTEGRATION
+    before = np.empty(mujoco.mj_stateSize(inner.model, state))
+    mujoco.mj_getState(inner.model, inner.data, before, state)
+    mujoco.mj_setState(inner.model, data, before, state)
+    env.action_space.seed(0)
+    action = env.action_space.sample()
+    if np.shape(action) != (inner.model.nu,):
+        raise ValueError(f"the actions of '{env.spec and env.spec.id}' have shape {np.shape(action)}, and its model has {inner.model.nu} actuators")
+    env.step(action)
+    data.ctrl[:] = action
+    mujoco.mj_step(inner.model, data, nstep=inner.frame_skip)
+    return float(max(np.abs(data.qpos - inner.data.qpos).max(), np.abs(data.qvel - inner.data.qvel).max()))
 
 
 def _driven(mujoco: Any, model: Any, env_id: str) -> list[str]:

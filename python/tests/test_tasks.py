@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
@@ -276,6 +277,22 @@ def test_arguments_of_a_task_of_gymnasium_are_in_its_reward(tmp_path: Path) -> N
 def test_an_environment_without_mujoco_has_no_robot(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="'CartPole-v1' is not built on Gymnasium's MujocoEnv"):
         nearl.from_gymnasium("CartPole-v1", tmp_path)
+
+
+def test_a_step_that_changes_the_action_is_told(tmp_path: Path) -> None:
+    class Scaled(InvertedPendulumEnv):
+        def step(self, action):
+            return super().step(0.3 * np.asarray(action))
+
+    gymnasium.register("Scaled-v0", entry_point=Scaled)
+    try:
+        with pytest.warns(UserWarning, match=r"after one step 'Scaled-v0' is .* away from where its MuJoCo model goes with that action: its step\(\) changes"):
+            nearl.from_gymnasium("Scaled-v0", tmp_path / "scaled")
+    finally:
+        gymnasium.registry.pop("Scaled-v0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        nearl.from_gymnasium("InvertedPendulum-v5", tmp_path / "plain")
 
 
 def test_an_actuator_that_drives_no_joint_is_named(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use nearl_constraints::{Guard, certify_braking};
+use nearl_constraints::certify_braking;
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
@@ -19,7 +19,7 @@ use crate::link::{
     RobotMessage, RobotName, SHARED_MEMORY, TrainerLink, check_memory, free_memory, home_of_user, remains,
 };
 use crate::rt::{PRIORITY, Pilot, Stop, ThreadSettings, bench_wake, prepare};
-use crate::snapshot::{Manifest, PolicyKind, Snapshot, SnapshotError, in_run};
+use crate::snapshot::{Manifest, Snapshot, SnapshotError, in_run};
 
 /// Check that a snapshot, this machine and a plant are ready.
 #[derive(Args, Debug)]
@@ -129,12 +129,6 @@ pub fn told_of_simulated(m: &Manifest) -> Result<Vec<String>, SnapshotError> {
 /// # Errors
 /// As [`Parts::new`].
 pub fn advice(manifest: &Manifest) -> Result<Vec<String>, SnapshotError> {
-    // Before a training nobody knows which policy it gets; these guards are for one of actions.
-    let mut manifest = manifest.clone();
-    if matches!(manifest.task.constraints.guard, Guard::Drive | Guard::Simulator) {
-        manifest.policy = PolicyKind::Direct;
-    }
-    let manifest = &manifest;
     let parts = Parts::new(manifest)?;
     let notes = notes(manifest, &parts);
     let checks = [notes, holding(manifest, &parts), gains(manifest, &parts), braking(manifest, parts)];

@@ -124,6 +124,22 @@ pub fn simulated_alone(path: &Path) -> Result<Vec<String>, RobotError> {
     Ok([model.simulated_alone(), model.starts(&Table::new())].concat())
 }
 
+/// The format of a robot's text, by its outermost element: a URDF may hold `<mujoco>` too, with settings for MuJoCo.
+pub(crate) fn format_of(text: &str) -> ModelFormat {
+    let mut rest = text;
+    while let Some(at) = rest.find('<') {
+        rest = &rest[at..];
+        let end = match rest {
+            _ if rest.starts_with("<!--") => "-->",
+            _ if rest.starts_with("<?") => "?>",
+            _ if rest.starts_with("<!") => ">",
+            _ => break,
+        };
+        rest = rest.split_once(end).map_or("", |(_, after)| after);
+    }
+    if rest.starts_with("<mujoco") { ModelFormat::Mjcf } else { ModelFormat::Urdf }
+}
+
 fn is_mjcf(path: &Path) -> bool {
     path.extension().is_some_and(|ending| ending == "xml" || ending == "mjcf")
 }

@@ -75,6 +75,14 @@ pub fn task_file(manifest: &Manifest) -> (String, Option<(String, String)>) {
     (to_toml(&task), copy)
 }
 
+/// Whether two manifests are of one robot: the same file, and the same robot read of it where it names other files.
+pub fn is_same_robot(a: &Manifest, b: &Manifest) -> bool {
+    match (robot::simulation(a), robot::simulation(b)) {
+        (Some(x), Some(y)) => x.text == y.text && (x.folder.is_none() || a.robot == b.robot),
+        (x, y) => x.is_none() && y.is_none(),
+    }
+}
+
 /// The effective task as the text of a task file.
 pub(crate) fn to_toml(task: &Task) -> String {
     toml::to_string(task).unwrap_or_else(|e| unreachable!("a task was read from TOML: {e}"))

@@ -16,10 +16,10 @@ impl RunningStats {
         Self { mean: vec![0.0; n], m2: vec![0.0; n], count: 0.0 }
     }
 
-    /// Adds one sample (n); entries that are not finite leave the statistics as they are.
-    pub fn push(&mut self, x: &[f64]) {
+    /// Adds one sample (n); one with an entry that is not finite leaves the statistics as they are, and gives false.
+    pub fn push(&mut self, x: &[f64]) -> bool {
         if x.iter().any(|v| !v.is_finite()) {
-            return;
+            return false;
         }
         self.count += 1.0;
         for ((m, s), &x) in self.mean.iter_mut().zip(&mut self.m2).zip(x) {
@@ -27,6 +27,7 @@ impl RunningStats {
             *m += d / self.count;
             *s += d * (x - *m);
         }
+        true
     }
 
     /// Adds the samples of `other`.

@@ -16,6 +16,7 @@ use crate::preset::Preset;
 use crate::run_folder::{self, RunError};
 use crate::tasks::{self, TaskLoadError};
 use crate::train::{TrainError, complete};
+use nearl_runtime::Manifest;
 
 pub use summary::{Row, Summary};
 pub use worker::{Event, run};
@@ -125,11 +126,13 @@ impl Sweep {
         for task in &self.tasks {
             let mut manifest = tasks::load_with(task, self.preset, &self.set)?;
             complete(&mut manifest)?;
-            files.push((task, manifest.task.name.clone(), run_folder::task_file(&manifest).0));
+            let text = run_folder::task_file(&manifest).0;
+            files.push((task, text, manifest));
         }
         let mut runs: Vec<Run> = Vec::new();
         for &seed in &self.seeds {
-            for (task, name, text) in &files {
+            for (task, text, manifest) in &files {
+                let name = &manifest.task.name;
                 for &algo in &self.algos {
                     let folder = self.out.join(name).join(format!("{algo}_{seed}"));
                     if runs.iter().any(|r| r.folder == folder) {
@@ -137,7 +140,7 @@ impl Sweep {
                             "{name}, {algo}, seed {seed} is asked for twice"
                         )));
                     }
-                    let found = self.found(&folder, text)?;
+                    let found = self.found(&folder, text, manifest)?;
                     runs.push(Run { task: (*task).clone(), name: name.clone(), algo, seed, folder, found });
                 }
             }
@@ -145,7 +148,7 @@ impl Sweep {
         Ok(runs)
     }
 
-    fn found(&self, folder: &Path, task: &str) -> Result<Found, SweepError> {
+    fn found(&self, folder: &Path, task: &str, manifest: &Manifest) -> Result<Found, SweepError> {
         if !folder.exists() {
             return Ok(Found::Nothing);
         }
@@ -167,6 +170,9 @@ impl Sweep {
         let Ok(Checkpoint { header, .. }) = Checkpoint::load(&checkpoint) else {
             return other(format!("a run whose checkpoint '{file}' cannot be read"));
         };
+        if !run_folder::is_same_robot(&header.manifest, manifest) {
+            return other("a run of another robot, or of a robot file that was changed since".into());
+        }
         // The learning rate's schedule depends on the steps, so that a run of others is another run.
         let (done, total) = (header.manifest.steps, header.total);
         if total != self.steps {

@@ -33,6 +33,7 @@ use nearl_rollout_protocol::Layout;
 use nearl_runtime::controller::{Parts, merge_margins};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::snapshot::FAR;
+use nearl_runtime::task::Task;
 use nearl_runtime::{Controller, Manifest, Networks, PolicyKind, Snapshot, SnapshotError};
 use rand_chacha::ChaCha8Rng;
 use setup::{
@@ -300,8 +301,16 @@ impl Training {
             let mut read = g.segment.reward.iter().map(|x| ("reward", x)).chain(costs);
             read.find(|(_, x)| !x.is_finite()).map(|(what, x)| (what, *x))
         };
+        let (task, steps) = (&self.snapshot.manifest.task, self.snapshot.manifest.steps);
+        if let Some((what, value)) = self.source.gathered().iter().find_map(|g| unseen(g, task)) {
+            return Err(TrainError::Settings(format!(
+                "{what} of '{}' came out as {value} after {steps} steps, and nothing can be learned from it; look for a logarithm, root or quotient that \
+                 leaves its domain, there or in [commands], [noise], [delay] or [pushes]",
+                task.name
+            )));
+        }
         if let Some((what, value)) = self.source.gathered().iter().find_map(bad) {
-            let (task, steps) = (&self.snapshot.manifest.task.name, self.snapshot.manifest.steps);
+            let task = &task.name;
             return Err(TrainError::Settings(format!(
                 "a {what} of '{task}' came out as {value} after {steps} steps, and nothing can be learned from it; look for a logarithm, root or \
                  quotient in [{what}] that leaves its domain"
@@ -588,4 +597,16 @@ impl Training {
         b.estimate(|x| self.learner.values(x));
         debug_assert_eq!(b.obs.len(), b.n * self.dims.n_obs);
     }
+}
+
+/// What policy or value saw that is no finite number, and that.
+fn unseen(gathered: &Collected, task: &Task) -> Option<(String, f64)> {
+    let name = |names: &[String], k: usize| names.get(k).cloned().unwrap_or_else(|| format!("number {k}"));
+    if let [k, value] = gathered.odd[..] {
+        return Some((format!("observation '{}'", name(&task.state.observation, k as usize)), value));
+    }
+    let privileged = &gathered.segment.privileged;
+    let (k, value) = privileged.iter().enumerate().find(|(_, x)| !x.is_finite())?;
+    let names = &task.state.privileged;
+    Some((format!("privileged '{}'", name(names, k % names.len().max(1))), *value))
 }

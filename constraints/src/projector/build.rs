@@ -316,7 +316,7 @@ fn stages(
     let (active_set, y) = (ActiveSet::new(n, m), vec![0.0; n]);
     let nearer = Nearer::new(&problem, sources.asks_more());
     let (slopes, slope) = (vec![0.0; (m + cones.len()) * n], vec![0.0; n]);
-    let exact = false;
+    let (exact, polished) = (false, false);
     Ok(Some(Stages {
         sources,
         labels,
@@ -326,6 +326,7 @@ fn stages(
         polish,
         y,
         exact,
+        polished,
         dropped,
         nearer,
         slopes,

@@ -88,8 +88,12 @@ impl Projector {
                 y => (v[i] + y).clamp(low, high),
             };
         }
-        let rounding = if stages.exact { 0.0 } else { 1e-6 };
-        let floor = rounding * p.hessian.iter().fold(0.0, |m: f64, h| m.max(*h));
+        // Clarabel leaves every row a multiplier. A row that holds a joint back a little must be named all the same, where it is known which ones do.
+        let floor = match (stages.exact, stages.polished) {
+            (true, _) => 0.0,
+            (false, true) => stages.polish.rounding(),
+            (false, false) => 1e-6 * p.hessian.iter().fold(0.0, |m: f64, h| m.max(*h)),
+        };
         for (k, &i) in self.dofs.controllable.iter().enumerate().filter(|(k, _)| mu[*k].abs() > floor) {
             self.push_box(i, mu[k], target);
         }
@@ -167,7 +171,7 @@ impl Stages {
         let answered = self.conic.solve(&self.problem);
         if answered {
             let late = self.conic.clock();
-            self.polish.refine(&self.problem, &mut self.conic, late);
+            self.polished = self.polish.refine(&self.problem, &mut self.conic, late);
         }
         *iterations += self.conic.iterations;
         (answered && self.obeys(&self.conic.y, ROW_TOLERANCE)).then_some(Rung::Clarabel)

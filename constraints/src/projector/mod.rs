@@ -154,6 +154,8 @@ struct Stages {
     y: Vec<f64>,
     /// The last answer is the active-set stage's.
     exact: bool,
+    /// The last answer of Clarabel is the optimum that Newton's method found near it.
+    polished: bool,
     /// Bounds of soft rows (m) and radii of soft cones while they are left out.
     dropped: Vec<(f64, f64)>,
     nearer: Nearer,

@@ -77,6 +77,12 @@ impl Polish {
         false
     }
 
+    /// A multiplier of the last answer that is no larger is none.
+    pub(crate) fn rounding(&self) -> f64 {
+        let all = self.mu.iter().chain(&self.lambda).chain(&self.nu);
+        ROUNDING.0 * all.fold(0.0, |most: f64, x| most.max(x.abs()))
+    }
+
     /// Takes over the answer and what holds it back: the bounds whose force is larger than what moving to them would cost. Where
     /// Clarabel stopped early every bound has a force.
     fn start(&mut self, p: &Coupled, answer: &Conic) {
@@ -173,8 +179,7 @@ impl Polish {
 
     /// Lets go and takes up; true when something did.
     fn change(&mut self, p: &Coupled, reach: f64) -> bool {
-        let all = self.mu.iter().chain(&self.lambda).chain(&self.nu);
-        let floor = ROUNDING.0 * all.fold(0.0, |most: f64, x| most.max(x.abs()));
+        let floor = self.rounding();
         let mut changed = false;
         let mut set = |held: &mut Held, to: Held| {
             changed |= *held != to;

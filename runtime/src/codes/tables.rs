@@ -39,9 +39,9 @@ codes! {
             "Do what the sentence says; `nearl explain` knows its reason.";
         Canary = "doctor-canary", "Do trial states give finite actions?", "Use an earlier snapshot.";
         Model = "doctor-model", "Does the model hold everything that the robot file describes?",
-            "Take it out of the robot file, or leave a margin for it.";
+            "Do what the sentence says. What only the robot file has, take out of it, or leave a margin for it.";
         Projection = "doctor-projection", "Are the policy's targets projected into the limits?",
-            "Train with an algorithm that proposes states, not with `ppo`.";
+            "Add constraints.guard = true, or train with an algorithm that proposes states.";
         Holding = "doctor-holding", "Can the motors hold the robot still everywhere within its position limits?",
             "Raise constraints.torque.scale, or narrow the position limits to where the motors can.";
         Recipe = "doctor-recipe", "What does a policy made elsewhere see, and what do its outputs mean?",

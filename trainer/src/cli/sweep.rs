@@ -148,7 +148,8 @@ impl SweepCommand {
             )?);
         } else {
             table(&summary);
-            let silent = rows.iter().filter(|row| row.steps.is_some() && row.return_mean.is_none()).count();
+            let is_whole = |row: &&Row| row.steps.is_some_and(|steps| steps >= sweep.steps as f64);
+            let silent = rows.iter().filter(is_whole).filter(|row| row.return_mean.is_none()).count();
             if silent > 0 {
                 say(format!(
                     "{silent} of {} runs have no return, as none of their episodes ended: give more --steps, or a smaller max_episode_steps",

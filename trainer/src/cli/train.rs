@@ -125,14 +125,14 @@ struct Run {
 }
 
 impl Run {
-    /// What the checkpoint in `folder` says, and what it goes on with; it must be of `task`, which was read of `file`.
+    /// What the checkpoint in `folder` says, and what it goes on with; it must be of the task of `own`, which was read of `file`.
     fn resumed(
         folder: &Path,
-        task: &Task,
+        own: &Manifest,
         file: &str,
         steps: Option<u64>,
     ) -> Result<(Self, Manifest), Failure> {
-        let header = Checkpoint::load(&checkpoint::path_in(folder))?.header;
+        let (header, task) = (Checkpoint::load(&checkpoint::path_in(folder))?.header, &own.task);
         let name = header.manifest.task.name.clone();
         if name != task.name {
             let folder = folder.display();
@@ -149,6 +149,12 @@ impl Run {
             eprintln!(
                 "nearl: warning: the run goes on with the settings it was started with; '{file}' by itself has others under {keys}: if the \
                  file was changed since, and none of --set, --preset and --demos set these, start a new run with --out"
+            );
+        }
+        if !run_folder::is_same_robot(&header.manifest, own) {
+            eprintln!(
+                "nearl: warning: the run goes on with the robot it was started with, and the robot file of '{file}' is another, or was changed \
+                 since; start a new run with --out for that"
             );
         }
         let (algo, done) = (header.manifest.algo.parse()?, header.manifest.steps);
@@ -189,7 +195,7 @@ impl Train {
         let mut manifest = tasks::load_with(&self.task, self.preset, &set)?;
         crate::train::complete(&mut manifest).map_err(|e| of_file(&self.task, &e))?;
         let (run, manifest) = match &self.resume {
-            Some(folder) => Run::resumed(folder, &manifest.task, &self.task, self.steps)?,
+            Some(folder) => Run::resumed(folder, &manifest, &self.task, self.steps)?,
             None => {
                 let run = Run {
                     name: manifest.task.name.clone(),

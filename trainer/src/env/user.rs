@@ -179,6 +179,10 @@ fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spe
     let observation = observation.map_err(|e| mistake("state.observation", e))?;
     let (reward, termination) =
         (terms("reward", &task.reward, &names)?, terms("termination", &task.termination, &names)?);
+    if let Some(term) = termination.iter().find(|term| term.of.constant().is_some_and(|x| x != 0.0)) {
+        let reason = "it holds always, so that every episode ends after one control period; compare something of the robot";
+        return Err(mistake(format!("termination.{}", term.name), reason));
+    }
     let privileged: Result<Vec<_>, _> = task.state.privileged.iter().map(observe).collect();
     let privileged = privileged.map_err(|e| mistake("state.privileged", e))?;
     course.curriculum = Curriculum::read(&task.curriculum, &reward)?;

@@ -3,7 +3,7 @@
 use super::{ImportError, ImportedNetwork};
 use super::{deploy, metadata};
 use crate::blank::commands;
-use crate::robot::{describe, describe_in_task, folder_of};
+use crate::robot::{describe, describe_in_task, folder_of, format_of};
 use crate::scene;
 use nearl_runtime::constraints::description::JointKind;
 use nearl_runtime::constraints::{Drive, Model, RobotDescription, StateLayout, read_task_text, read_text};
@@ -134,7 +134,7 @@ fn said(path: &Path, robot: &Path) -> Result<(Table, String), ImportError> {
 /// The robot file as it is simulated.
 fn simulation(path: &Path) -> Result<Simulation, ImportError> {
     let text = read(path, read_text)?;
-    let format = if text.contains("<mujoco") { ModelFormat::Mjcf } else { ModelFormat::Urdf };
+    let format = format_of(&text);
     let names_files = text.contains("file=") || text.contains("filename=");
     Ok(Simulation { format, text, folder: names_files.then(|| folder_of(path)) })
 }

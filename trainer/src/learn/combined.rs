@@ -300,18 +300,47 @@ impl Combined {
 
     /// Mean proposal of each row of the batch (n x n_state), in the order of the rows.
     pub(super) fn proposals(&self, group: &Group, batch: &Batch, threads: usize, out: &mut Vec<f32>) {
-        let (s, sv) = (self.dims.n_state, self.dims.n_state.div_ceil(LANES));
-        out.resize(batch.n * s, 0.0);
-        in_parts(out, TILE * s, threads, |first, out| {
+        self.each_row(self.dims.n_state, batch, threads, out, |tile, w, take| {
+            self.propose(group, tile, w);
+            take(w.policy.output());
+        });
+    }
+
+    /// Mean action of each row of the batch (n x n_act), in the order of the rows; nothing with analytic inverse dynamics.
+    pub(super) fn mean_actions(&self, group: &Group, batch: &Batch, threads: usize, out: &mut Vec<f32>) {
+        self.each_row(self.dims.n_act, batch, threads, out, |tile, w, take| {
+            self.propose(group, tile, w);
+            self.invert(group, tile, w);
+            if let Some(inv) = &w.inverse {
+                take(inv.tape.output());
+            }
+        });
+    }
+
+    /// Rows of `width` numbers, as `of` hands them over for each tile of the batch.
+    fn each_row(
+        &self,
+        width: usize,
+        batch: &Batch,
+        threads: usize,
+        out: &mut Vec<f32>,
+        of: impl Fn(&Tile<'_>, &mut CombinedScratch, &mut dyn FnMut(&[V])) + Sync,
+    ) {
+        let padded = width.div_ceil(LANES) * LANES;
+        out.resize(batch.n * width, 0.0);
+        in_parts(out, TILE * width, threads, |first, out| {
             let (mut w, mut idx) = (self.scratch(), [0u32; TILE]);
-            for (start, out) in (first / s..).step_by(TILE).zip(out.chunks_mut(TILE * s)) {
+            for (start, out) in (first / width..).step_by(TILE).zip(out.chunks_mut(TILE * width)) {
                 for (k, i) in idx.iter_mut().enumerate() {
                     *i = (start + k).min(batch.n - 1) as u32;
                 }
                 let tile = Tile { batch, idx: &idx, scale: 1.0, advantage: (0.0, 1.0), clip: 1.0 };
-                self.propose(group, &tile, &mut w);
-                let rows = scalars(w.policy.output()).chunks_exact(sv * LANES);
-                out.chunks_exact_mut(s).zip(rows).for_each(|(to, u)| to.copy_from_slice(&u[..s]));
+                of(&tile, &mut w, &mut |rows| {
+                    let rows = scalars(rows).chunks_exact(padded);
+                    out.chunks_exact_mut(width)
+                        .zip(rows)
+                        .for_each(|(to, row)| to.copy_from_slice(&row[..width]));
+                });
             }
         });
     }

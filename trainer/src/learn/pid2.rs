@@ -55,6 +55,9 @@ pub struct Pid2Settings {
     /// The policy gradient moves the inverse model too. Otherwise only what was reached does, so that proposals stay nearer to it; the policy
     /// learns through the inverse model either way. No effect with analytic inverse dynamics.
     pub idm_policy_gradient: bool,
+    /// Where the inverse model learns from reached transitions, the policy learns to put out the same mean actions through it. No effect
+    /// where proposals are random or inverse dynamics analytic.
+    pub keep_actions: bool,
     /// What of a row of actions is compared with the threshold.
     pub idm_threshold_per: ThresholdPer,
     /// Learning rate of the inverse model's supervised loss.
@@ -95,6 +98,7 @@ impl Default for Pid2Settings {
             lr: 0.0,
             idm_threshold: 0.5,
             idm_policy_gradient: true,
+            keep_actions: false,
             idm_threshold_per: ThresholdPer::default(),
             idm_lr: 3e-4,
             discriminator_lr: 3e-4,
@@ -123,6 +127,8 @@ pub const DISCRIMINATOR: usize = 2;
 pub const INVERSE: usize = 3;
 /// Phase of the adversarial loss of the policy with an optimiser of its own.
 pub const GENERATOR: usize = 4;
+/// Phase in which the policy puts out the actions of before through an inverse model that learned.
+pub const KEEP: usize = 5;
 
 /// The learner.
 pub struct Pid2 {
@@ -139,6 +145,8 @@ struct Nets {
     noise: Vec<f32>,
     /// What the discriminator sees beside the reached changes.
     fakes: Fakes,
+    /// Mean actions before the inverse model learned from the batch (n x n_act).
+    kept: Vec<f32>,
     /// Own and demonstrated transitions in equal parts, where the adversary sees both: what it takes for real.
     union: Option<Batch>,
 }
@@ -212,6 +220,7 @@ impl Pid2 {
             Adam::new(d.len, settings.discriminator_lr),
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
             Adam::new(combined.proposal_range().len(), settings.generator_lr),
+            Adam::new(combined.proposal_range().len(), lr),
         ];
         let params = Params {
             groups: vec![actor, critic, adversary],
@@ -226,6 +235,7 @@ impl Pid2 {
             discriminator,
             noise: Vec::new(),
             fakes: Fakes::default(),
+            kept: Vec::new(),
             union: None,
         };
         Self { nets, params, threads }
@@ -253,7 +263,13 @@ impl Learner for Pid2 {
         }
         let update = Update { ppo: &ppo, pace, threads, phases: &phases, actor: ACTOR };
         if inverse_learns {
-            optimise(&self.nets, &mut self.params, batch, &[INVERSE], update.schedule(), rng);
+            let Nets { combined, kept, .. } = &mut self.nets;
+            let keeps = s.keep_actions && combined.policy_log_std.is_none();
+            if keeps {
+                combined.mean_actions(&self.params.groups[COMBINED], batch, threads, kept);
+            }
+            let phases = if keeps { &[INVERSE, KEEP][..] } else { &[INVERSE] };
+            optimise(&self.nets, &mut self.params, batch, phases, update.schedule(), rng);
             batch.log_prob = self.nets.combined.log_probs(&self.params.groups[COMBINED], batch, threads);
         }
         if opposed {
@@ -371,6 +387,14 @@ fn generate(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut 
     loss
 }
 
+/// The policy follows the inverse model.
+#[inline(always)]
+fn keep_body(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) {
+    let loss = n.combined.keep_actions(&n.kept, &params.groups[COMBINED], &t, &mut w.actor, grad);
+    add_sums(grad, &[loss]);
+}
+
+multiversion!(fn keep(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) = keep_body);
 multiversion!(fn generator(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) = generator_body);
 multiversion!(fn actor(n: &Nets, params: &Params, t: Tile<'_>, w: &mut Scratch, grad: &mut [V]) = actor_body);
 
@@ -398,7 +422,7 @@ impl Phases for Nets {
             ACTOR => 0..self.combined.len,
             VALUE => 0..self.combined.value.len,
             INVERSE => self.combined.inverse_range(),
-            GENERATOR => self.combined.proposal_range(),
+            GENERATOR | KEEP => self.combined.proposal_range(),
             _ => 0..self.discriminator.len,
         }
     }
@@ -406,6 +430,7 @@ impl Phases for Nets {
         match phase {
             ACTOR => actor(self, params, t, w, grad),
             GENERATOR => generator(self, params, t, w, grad),
+            KEEP => keep(self, params, t, w, grad),
             VALUE => self.combined.value.tile(&params.groups[CRITIC], &t, &mut w.value, grad),
             INVERSE => self.combined.idm_tile(&params.groups[COMBINED], &t, &mut w.actor, grad),
             _ => discriminate(self, params, self.shown(t), w, grad),
@@ -413,7 +438,7 @@ impl Phases for Nets {
     }
     fn refresh(&self, phase: usize, params: &mut Params) {
         match phase {
-            ACTOR | GENERATOR => self.combined.refresh(&mut params.groups[COMBINED]),
+            ACTOR | GENERATOR | KEEP => self.combined.refresh(&mut params.groups[COMBINED]),
             VALUE => self.combined.value.refresh(&mut params.groups[CRITIC]),
             INVERSE => self.combined.refresh_inverse(&mut params.groups[COMBINED]),
             _ => {
@@ -423,13 +448,17 @@ impl Phases for Nets {
         }
     }
     fn is_paced(&self, phase: usize) -> bool {
-        !matches!(phase, INVERSE | DISCRIMINATOR)
+        !matches!(phase, INVERSE | DISCRIMINATOR | KEEP)
     }
     fn max_norm(&self, phase: usize) -> f32 {
         if matches!(phase, ACTOR | VALUE) { self.combined.ppo.max_grad_norm } else { f32::INFINITY }
     }
     fn clipped_with(&self, phase: usize) -> Option<usize> {
-        [Some(VALUE), Some(ACTOR), None, None, None][phase]
+        match phase {
+            ACTOR => Some(VALUE),
+            VALUE => Some(ACTOR),
+            _ => None,
+        }
     }
     fn lane(&self, phase: usize) -> usize {
         usize::from(matches!(phase, VALUE | DISCRIMINATOR))
@@ -452,6 +481,12 @@ impl Phases for Nets {
             }
             VALUE => self.combined.value.rows(batch),
             INVERSE => self.combined.idm_rows(batch),
+            KEEP => vec![
+                Rows::new(&batch.obs, d.n_obs),
+                Rows::new(&batch.lower, d.n_state),
+                Rows::new(&batch.upper, d.n_state),
+                Rows::new(&self.kept, d.n_act),
+            ],
             GENERATOR => vec![Rows::new(&shown.obs, d.n_obs), noise(Pass::Generator)],
             _ => vec![
                 Rows::new(&shown.obs, d.n_obs),

@@ -27,6 +27,7 @@ impl Collected {
         for stats in [&self.obs_stats, &self.change_stats, &self.return_stats, &self.cost_stats] {
             push(numbers, stats.to_vec().into_iter());
         }
+        push(numbers, self.odd.iter().copied());
         push(numbers, self.margins.iter().copied());
     }
 
@@ -66,6 +67,7 @@ impl Collected {
         };
         let (obs_stats, change_stats) = (stats(n_obs)?, stats(n_state)?);
         let (return_stats, cost_stats) = (stats(1)?, stats(1)?);
+        let odd = pull(from)?.to_vec();
         let margins = pull(from)?.to_vec();
         let (n, cuts) = (s.privileged.len(), s.final_x.len());
         let privileged_fit = n % n_steps.max(1) == 0 && s.final_privileged.len() * n_steps == n * cuts;
@@ -74,6 +76,7 @@ impl Collected {
             segment: s,
             tally,
             obs_stats,
+            odd,
             change_stats,
             return_stats,
             cost_stats,

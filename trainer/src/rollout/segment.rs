@@ -201,6 +201,8 @@ pub struct Collected {
     pub tally: Tally,
     /// Raw observations.
     pub obs_stats: RunningStats,
+    /// Place and value of the first entry of an observation that was no finite number; empty where there was none.
+    pub odd: Vec<f64>,
     /// Changes of the proposed state.
     pub change_stats: RunningStats,
     /// Discounted returns, for scaling the reward.
@@ -218,6 +220,7 @@ impl Collected {
             segment: Segment::default(),
             tally: Tally::default(),
             obs_stats: RunningStats::new(n_obs),
+            odd: Vec::new(),
             change_stats: RunningStats::new(n_state),
             return_stats: RunningStats::new(1),
             cost_stats: RunningStats::new(1),
@@ -241,14 +244,23 @@ impl Collected {
         self.segment.terminated.push(terminated);
         self.segment.truncated.push(truncated);
         self.change_stats.push(change);
-        self.obs_stats.push(after);
+        self.see(after);
         self.return_stats.push(&[discounted]);
         self.cost_stats.push(&[discounted_cost]);
+    }
+
+    /// Counts what the policy sees (n_seen).
+    pub(super) fn see(&mut self, seen: &[f64]) {
+        if !self.obs_stats.push(seen) && self.odd.is_empty() {
+            let place = seen.iter().position(|x| !x.is_finite());
+            self.odd.extend(place.into_iter().flat_map(|k| [k as f64, seen[k]]));
+        }
     }
 
     /// Forgets everything; keeps the rows' memory.
     pub(super) fn clear(&mut self) {
         self.segment.clear();
+        self.odd.clear();
         self.tally = Tally::default();
         self.margins.clear();
         for stats in

@@ -186,7 +186,7 @@ impl Worker {
             self.left -= 1;
             if self.episode.1 == 0 {
                 self.controller.peek(&self.state, &mut self.seen);
-                self.rows.collected.obs_stats.push(&self.seen);
+                self.rows.collected.see(&self.seen);
             }
             self.draw(true);
             self.env.privileged(&mut self.privileged[0]);

@@ -48,7 +48,12 @@ impl<Q: Copy> Expression<Q> {
             Parser { lexer: Lexer::new(text)?, resolve, program: Vec::new(), depth: 0, nesting: 0 };
         parser.either()?;
         match parser.lexer.next() {
-            (_, Token::End) => Ok(Expression(parser.program)),
+            (_, Token::End) => match Expression(parser.program) {
+                e if e.constant().is_some_and(|x| !x.is_finite()) => {
+                    Err(format!("it is {} always; look for a logarithm, root or quotient", e.value(|_| 0.0)))
+                }
+                e => Ok(e),
+            },
             (at, token) => Err(format!(
                 "'{token}' at character {at} follows a complete expression; is an operator missing?"
             )),
@@ -58,6 +63,11 @@ impl<Q: Copy> Expression<Q> {
     /// The quantities it names.
     pub(super) fn quantities(&self) -> impl Iterator<Item = Q> {
         self.0.iter().filter_map(|op| if let Op::Load(quantity) = op { Some(*quantity) } else { None })
+    }
+
+    /// Its value, where it names no quantity.
+    pub(super) fn constant(&self) -> Option<f64> {
+        self.quantities().next().is_none().then(|| self.value(|_| 0.0))
     }
 
     /// The value where `read` gives each quantity its own.
@@ -336,7 +346,7 @@ mod tests {
     #[test]
     fn what_is_not_a_number_is_not_true() {
         let e = compile("(0 / 0) > 1").expect("an expression");
-        assert!(!e.holds(|x| x) && !compile("0 / 0").expect("an expression").holds(|x| x));
+        assert!(!e.holds(|x| x) && !compile("(x - 3) / 0").expect("an expression").holds(|x| x));
         assert!(compile("-2").expect("an expression").holds(|x| x));
     }
 
@@ -355,6 +365,7 @@ mod tests {
             ("{x", "'{' at character 1 is not closed"),
             ("", "ends at character 1"),
             ("1.2.3", "'1.2.3' at character 1 is not a number"),
+            ("2 * log(-1)", "it is NaN always"),
         ] {
             let message = compile(text).expect_err(text);
             assert!(message.contains(words), "{text}: {message}");

@@ -72,12 +72,10 @@ impl Combined {
         w: &mut CombinedScratch,
         grad: &mut [V],
     ) -> ([f32; 3], f32) {
-        let (d, a, s) = (&self.dims, self.dims.n_act, self.dims.n_state);
-        let seen = d.seen_obs.len();
-        let (xv, av, sv) = ((2 * seen).div_ceil(LANES), a.div_ceil(LANES), s.div_ceil(LANES));
+        let a = self.dims.n_act;
+        let av = a.div_ceil(LANES);
         let clamped = self.project_again(t, w);
         let Some(inv) = &mut w.inverse else { unreachable!("made with the model") };
-        let u = scalars(w.policy.output());
         gather(&mut inv.action, av, 0, &t.batch.sampled, a, t.idx);
         let mean = model.net.forward(&group.p, &inv.input, &mut inv.tape);
         let action =
@@ -85,17 +83,59 @@ impl Combined {
         let sums = likelihood_ratio([action], &self.ppo, t, &mut w.rows, &group.p, grad);
         let own = self.idm_policy_gradient.then_some(grad);
         let dx = model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, own, true);
-        // through the projection into the proposal
-        w.d_change.fill(ZERO);
-        let rows = scalars_mut(&mut w.d_change).chunks_exact_mut(sv * LANES).zip(u.chunks_exact(sv * LANES));
-        let slopes = scalars(&inv.input).chunks_exact(xv * LANES).zip(scalars(dx).chunks_exact(xv * LANES));
+        self.into_proposal(w.policy.output(), &inv.input, dx, &mut w.d_change);
+        self.pull_inside(t, w);
+        (sums, clamped as f32)
+    }
+
+    /// `dL / du` from the slope `dx` of the inverse model's input, through the projection.
+    #[inline(always)]
+    fn into_proposal(&self, u: &[V], input: &[V], dx: &[V], d_change: &mut [V]) {
+        let (d, seen) = (&self.dims, self.dims.seen_obs.len());
+        let (xv, sv) = ((2 * seen).div_ceil(LANES), d.n_state.div_ceil(LANES));
+        d_change.fill(ZERO);
+        let rows =
+            scalars_mut(d_change).chunks_exact_mut(sv * LANES).zip(scalars(u).chunks_exact(sv * LANES));
+        let slopes = scalars(input).chunks_exact(xv * LANES).zip(scalars(dx).chunks_exact(xv * LANES));
         for ((du, u), (x, dx)) in rows.zip(slopes) {
             for ((&k, &x), &dx) in d.seen_state.iter().zip(&x[seen..]).zip(&dx[seen..]) {
                 du[k] = if self.gradient.passes(u[k], x, dx) { dx } else { 0.0 };
             }
         }
-        self.pull_inside(t, w);
-        (sums, clamped as f32)
+    }
+
+    /// `|(I(s, C(pi(s))) - kept) / sigma|² / 2`, the divergence from a policy of those mean actions (n x n_act): its gradient by the meta policy
+    /// alone; returns its sum.
+    #[inline(always)]
+    pub(in super::super) fn keep_actions(
+        &self,
+        kept: &[f32],
+        group: &Group,
+        t: &Tile<'_>,
+        w: &mut CombinedScratch,
+        grad: &mut [V],
+    ) -> f32 {
+        self.propose(group, t, w);
+        self.project_again(t, w);
+        let (Some((model, spread)), Some(inv)) = (&self.inverse, &mut w.inverse) else { return 0.0 };
+        let av = self.dims.n_act.div_ceil(LANES);
+        let mut inverse = [ZERO; MOST_VECTORS];
+        inverse_sigma(&mut inverse[..av], &group.p[spread.clone()], self.dims.n_act);
+        gather(&mut inv.action, av, 0, kept, self.dims.n_act, t.idx);
+        let mean = model.net.forward(&group.p, &inv.input, &mut inv.tape);
+        let rows = inv.slope.chunks_exact_mut(av).zip(mean.chunks_exact(av)).zip(inv.action.chunks_exact(av));
+        let mut sum = ZERO;
+        for ((slope, mean), kept) in rows {
+            for (((d, &y), &a), &by) in slope.iter_mut().zip(mean).zip(kept).zip(&inverse) {
+                let e = (y - a) * by;
+                sum = sum.fma(e, e);
+                *d = e * by * V::splat(t.scale);
+            }
+        }
+        let dx = model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, None, true);
+        self.into_proposal(w.policy.output(), &inv.input, dx, &mut w.d_change);
+        self.learn(group, w, grad);
+        0.5 * sum.sum()
     }
 
     /// Adds the gradient of `bound_weight |u - C(u)|² / 2` to `dL / du`: what was clamped has no other way back.
