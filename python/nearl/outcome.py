@@ -25,11 +25,16 @@ def ask(name: str, function: Outcome, obs: Floats, actions: Floats, next_obs: Fl
     Raises:
         ValueError: not one value a row, a reward that is not finite, or a termination that is no truth value.
     """
-    answer = np.asarray(function(obs, actions, next_obs))
+    given = function(obs, actions, next_obs)
+    answer = np.asarray(given)
+    if given is None:
+        raise ValueError(f"{name}(obs, actions, next_obs) gave None; give one value an environment, ({len(obs)},): does it end without return?")
     if answer.shape != (len(obs),):
         raise ValueError(f"{name}(obs, actions, next_obs) gave shape {answer.shape}; give one value an environment, ({len(obs)},)")
     if dtype is bool and answer.dtype != bool:
         raise ValueError(f"{name}(obs, actions, next_obs) gave {answer.dtype} values, such as {answer[0]!r}; give True or False, e.g. `next_obs[:, 0] > 1`")
+    if dtype is float and answer.dtype.kind not in "fiub":
+        raise ValueError(f"{name}(obs, actions, next_obs) gave {answer.dtype} values, such as {answer[0]!r}; give real numbers")
     if dtype is float and not np.isfinite(answer.astype(float)).all():
         i = int(np.flatnonzero(~np.isfinite(answer.astype(float)))[0])
         raise ValueError(f"{name}(obs, actions, next_obs)[{i}] is {answer[i]}: every entry must be finite")

@@ -151,6 +151,11 @@ def test_functions_of_the_wrong_shape_are_named() -> None:
     vec.reset(seed=0)
     with pytest.raises(ValueError, match=r"reward\(obs, actions, next_obs\) gave shape \(\); give one value an environment, \(3,\)"):
         vec.step(np.zeros((3, 1)))
+    for answer, said in ((None, "gave None; give one value an environment"), (np.zeros(3) * 1j, "gave complex128 values"), (["a"] * 3, "gave <U1 values")):
+        vec = nearl.make_vec(str(CART_POLE), 3, reward=lambda o, a, n, answer=answer: answer)
+        vec.reset(seed=0)
+        with pytest.raises(ValueError, match=rf"reward\(obs, actions, next_obs\) {said}"):
+            vec.step(np.zeros((3, 1)))
     vec = nearl.make_vec(str(CART_POLE), 3, reward=lambda o, a, n: np.array([0, np.nan, 0]))
     vec.reset(seed=0)
     with pytest.raises(ValueError, match=r"\[1\] is nan"):

@@ -199,10 +199,8 @@ impl Demonstrations {
         if !actions.is_empty() {
             arrays.push(("actions", table(steps, actions)));
         }
-        write_whole(path, &npz::write(&arrays)).map_err(|e| DemoError::Unwritable {
-            file: path.display().to_string(),
-            reason: e.to_string(),
-        })
+        write_whole(path, &npz::write(&arrays))
+            .map_err(|e| DemoError::Unwritable { file: path.display().to_string(), reason: e.to_string() })
     }
 
     /// The same with the columns of `names`, in that order; whatever else the file has is left out.

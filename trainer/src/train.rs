@@ -500,7 +500,7 @@ impl Training {
             self.return_stats.merge(&g.return_stats);
             self.cost_stats.merge(&g.cost_stats);
             let rows = g.segment.privileged.chunks_exact(self.dims.n_privileged.max(1));
-            rows.for_each(|row| self.privileged_stats.push(row));
+            rows.for_each(|row| _ = self.privileged_stats.push(row));
         }
         let gathered = self.source.gathered();
         let own = &mut self.snapshot.networks.margins;

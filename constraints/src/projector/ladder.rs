@@ -185,3 +185,64 @@ impl Stages {
         rows && p.cone_violation(y) <= tolerance
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::*;
+    use crate::random::Random;
+    use crate::target::Solver;
+    use crate::{AccelerationLimit, Limit, PositionLimit, Rung, Side, TorqueLimit, VelocityLimit};
+
+    const PANDA: &str = include_str!("../../../examples/robots/panda/panda.urdf");
+
+    /// Rows that hold a joint back a little are named too: what is named balances the pull of the proposal, by the problem's own slopes.
+    #[test]
+    fn what_is_named_of_a_polished_answer_balances_the_pull() {
+        let model = Model::from_urdf_text(PANDA).unwrap();
+        let limits: Vec<Box<dyn Limit>> = vec![
+            Box::new(PositionLimit::default()),
+            Box::new(VelocityLimit::default()),
+            Box::new(AccelerationLimit::uniform(60.0)),
+            Box::new(TorqueLimit::default()),
+        ];
+        let dofs: Vec<usize> = (0..7).collect();
+        let settings =
+            Settings { solver: Solver::Clarabel, braking: Braking::Certified, ..Settings::new(0.001, 1) };
+        let mut projector = Projector::new(&model, &limits, &dofs, settings).unwrap();
+        let mut target = Target::new(&model);
+        let (mut q, mut v) = (vec![0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], vec![0.0; 7]);
+        let (mut random, mut wish, mut polished, mut worst) = (Random(11), vec![0.0; 7], 0, 0.0f64);
+        for tick in 0..3000 {
+            if tick % 40 == 0 {
+                wish.iter_mut().for_each(|w| *w = 4.0 * random.between(-1.0, 1.0));
+            }
+            let proposal = Proposal { q: q.clone(), v: wish.clone() };
+            projector.project(&q, &v, &proposal, &mut target);
+            // Once more, from a little beyond the rows that hold this answer.
+            let mut beyond = Proposal { q: target.q.clone(), v: target.v.clone() };
+            beyond.v.iter_mut().zip(&wish).for_each(|(v, wish)| *v += 1e-7 * (wish - *v));
+            let status = projector.project(&q, &v, &beyond, &mut target);
+            let stages = projector.coupled.as_ref().unwrap();
+            if (status, target.ledger.rung) == (Status::Solved, Rung::Clarabel) && stages.polished {
+                let (p, y) = (&stages.problem, &stages.conic.y);
+                let pull = (0..7).map(|k| p.hessian[k] * (p.goal[k] - y[k]));
+                let left = target.ledger.active.iter().fold(pull.collect::<Vec<f64>>(), |mut left, row| {
+                    let push = if row.side == Side::Upper { row.multiplier } else { -row.multiplier };
+                    match row.row.checked_sub(7) {
+                        None => left[row.row] -= push,
+                        Some(r) => left
+                            .iter_mut()
+                            .zip(p.gradient(r))
+                            .for_each(|(left, g)| *left -= push * p.row_size[r] * g),
+                    }
+                    left
+                });
+                polished += 1;
+                worst = left.into_iter().fold(worst, |worst, left| worst.max(left.abs()));
+            }
+            (q, v) = (target.q.clone(), target.v.clone());
+        }
+        println!("{polished} polished answers, {worst:.1e} left");
+        assert!(polished > 100 && worst < 1e-9, "{polished} {worst:e}");
+    }
+}

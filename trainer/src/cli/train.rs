@@ -237,6 +237,11 @@ impl Train {
             last = Some(End { steps: p.steps, seconds: p.seconds, mean: p.return_mean });
             !stop.load(Ordering::Relaxed)
         };
+        match &experience {
+            Experience::Loop(name, _) => eprintln!("nearl: looking for the loop of '{name}'"),
+            Experience::Served(name, _) => eprintln!("nearl: looking for the rollout server '{name}'"),
+            _ => {}
+        }
         let saved = match &self.resume {
             Some(folder) => resume_on(folder, &experience, self.steps, threads, report)?,
             None => {

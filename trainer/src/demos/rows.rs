@@ -74,7 +74,7 @@ impl Demonstrations {
             let entries =
                 e.observations.chunks_exact(width).map(|row| followed.iter().map(|&k| row[k]).collect());
             let entries: Vec<Vec<f64>> = entries.collect();
-            entries.iter().for_each(|row| stats.push(row));
+            entries.iter().for_each(|row| _ = stats.push(row));
             let states = e.qpos.chunks_exact(nq).zip(e.qvel.chunks_exact(nv));
             for (t, ((q, v), next)) in states.zip(entries.into_iter().skip(1)).enumerate() {
                 let time = t as f64 * self.dt;

@@ -11,7 +11,8 @@
 //! [`INVERSE`] comes first, over the whole batch, whose log probabilities are then those of the model that learned: PPO's ratio begins
 //! at 1. The other losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`GENERATOR`], [`DISCRIMINATOR`]. The gradient of
 //! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the
-//! bounds, zero where the projection clamped. The adversarial loss pulls at the proposal as a whole, or only at what the action
+//! bounds, zero where the projection clamped. An inverse model that learns by itself makes other actions of the same proposals: beside
+//! [`INVERSE`] the policy learns to propose what leads to the actions of before ([`KEEP`]). The adversarial loss pulls at the proposal as a whole, or only at what the action
 //! leaves free of it (`null_space`).
 
 mod adversary;
@@ -98,7 +99,7 @@ impl Default for Pid2Settings {
             lr: 0.0,
             idm_threshold: 0.5,
             idm_policy_gradient: true,
-            keep_actions: false,
+            keep_actions: true,
             idm_threshold_per: ThresholdPer::default(),
             idm_lr: 3e-4,
             discriminator_lr: 3e-4,
@@ -220,7 +221,7 @@ impl Pid2 {
             Adam::new(d.len, settings.discriminator_lr),
             Adam::new(combined.inverse_range().len(), settings.idm_lr),
             Adam::new(combined.proposal_range().len(), settings.generator_lr),
-            Adam::new(combined.proposal_range().len(), lr),
+            Adam::new(combined.proposal_range().len(), settings.idm_lr),
         ];
         let params = Params {
             groups: vec![actor, critic, adversary],

@@ -137,7 +137,7 @@ impl Imitation {
         let width = self.demos.names.len();
         let mut step = vec![0.0; self.state.len()];
         for e in &self.demos.episodes {
-            e.observations.chunks_exact(width).for_each(|row| obs.push(row));
+            e.observations.chunks_exact(width).for_each(|row| _ = obs.push(row));
             for pair in e.observations.windows(2 * width).step_by(width) {
                 let (now, next) = pair.split_at(width);
                 step.iter_mut().zip(&self.state).for_each(|(step, &k)| *step = next[k] - now[k]);

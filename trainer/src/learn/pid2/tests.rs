@@ -335,6 +335,68 @@ fn what_the_inverse_model_learns_does_not_move_the_ratio() {
     }
 }
 
+/// `|(I(s, C(pi(s))) - kept) / sigma|² / 2` by the policy, and nothing by anything else.
+#[test]
+fn what_keeps_actions_has_the_gradient_of_central_differences() {
+    for (activation, warmup) in [(TANH, 0), (TANH, 1), (RELU, 0)] {
+        let (mut l, b) = learner_that_warms_up(false, true, activation, warmup);
+        let d = dims();
+        l.nets.kept = (0..b.n * d.n_act).map(|k| (k as f32).sin()).collect();
+        let (grad, sums) = gradient(&l, &b, KEEP);
+        let n = nets64(&l);
+        let loss = |policy: &Net64| {
+            let policy = policy.clone().unread(d.n_obs, |k| !d.seen_obs.contains(&k));
+            let one = |i: usize| {
+                let z = policy.forward(&row(&b.obs, i, d.n_obs));
+                let u = n.coordinates.as_ref().map_or(z.clone(), |c| c.forward(&z));
+                let (lo, hi) = (row(&b.lower, i, d.n_state), row(&b.upper, i, d.n_state));
+                let w: Vec<f64> = (0..d.n_state).map(|k| u[k].max(lo[k]).min(hi[k])).collect();
+                let inverse = n.inverse.as_ref().expect("inverse");
+                let mean = inverse.forward(&inverse_input(&b, i, &d, &w));
+                let kept = row(&l.nets.kept, i, d.n_act);
+                let away = mean.iter().zip(&kept).zip(&n.log_std);
+                away.map(|((m, k), s)| 0.5 * ((m - k) / s.exp()).powi(2)).sum::<f64>()
+            };
+            (0..b.n).map(one).sum::<f64>() / b.n as f64
+        };
+        check("policy", &n.policy, &l.nets.combined.policy.mlp.to_dense(&grad), loss);
+        let sum = f64::from(sums[0]) / b.n as f64;
+        assert!((sum - loss(&n.policy)).abs() < 1e-4 * (1.0 + sum), "{sum} {}", loss(&n.policy));
+        let inverse = l.nets.combined.inverse_range();
+        assert!(grad[inverse.start..l.actor().len()].iter().all(|g| g.0 == ZERO.0));
+    }
+}
+
+/// An inverse model that learns makes other actions of the same proposals; with `keep_actions` the policy follows it.
+#[test]
+fn actions_stay_where_the_inverse_model_learns() {
+    let moved = |keep_actions: bool| {
+        let settings = Pid2Settings {
+            keep_actions,
+            idm_threshold: 0.0,
+            idm_lr: 1e-2,
+            generator_weight: 0.0,
+            ..Pid2Settings::default()
+        };
+        let ppo = PpoSettings { lr: 1e-12, log_std: -1.0, ..PpoSettings::default() };
+        let (kind, mut rng) = (Kind { stochastic: false, learned: true }, crate::rollout::stream(5, 0));
+        let mut l = Pid2::new(dims(), &NetSettings::default(), ppo, settings, kind, true, 1, &mut rng);
+        let mut b = batch(&dims(), 256, 3);
+        let (mut before, mut after) = (Vec::new(), Vec::new());
+        l.nets.combined.mean_actions(&l.params.groups[COMBINED], &b, 1, &mut before);
+        b.log_prob = l.nets.combined.log_probs(&l.params.groups[COMBINED], &b, 1);
+        let metrics = l.update(&mut b, Pace::default(), &mut rng);
+        l.nets.combined.mean_actions(&l.params.groups[COMBINED], &b, 1, &mut after);
+        let of = |name: &str| metrics.iter().find(|(n, _)| *n == name).expect(name).1;
+        assert!(of("idm/mse_after") < 0.99 * of("idm/mse_before"), "it learned");
+        let squares = before.iter().zip(&after).map(|(a, b)| f64::from(a - b).powi(2));
+        (squares.sum::<f64>() / before.len() as f64).sqrt()
+    };
+    let (without, with) = (moved(false), moved(true));
+    println!("mean actions moved by {without:.4} without and {with:.4} with");
+    assert!(with < 0.5 * without && without > 0.01, "{without} {with}");
+}
+
 /// Fresh proposals are those of the policy as it is, to the bit where nothing is added.
 #[test]
 fn renewed_fakes_are_the_proposals_of_the_current_policy() {
