@@ -374,11 +374,11 @@ fn actions_stay_where_the_inverse_model_learns() {
         let settings = Pid2Settings {
             keep_actions,
             idm_threshold: 0.0,
-            idm_lr: 1e-2,
+            idm_lr: 3e-3,
             generator_weight: 0.0,
             ..Pid2Settings::default()
         };
-        let ppo = PpoSettings { lr: 1e-12, log_std: -1.0, ..PpoSettings::default() };
+        let ppo = PpoSettings { lr: 1e-12, log_std: -1.0, n_epochs: 40, ..PpoSettings::default() };
         let (kind, mut rng) = (Kind { stochastic: false, learned: true }, crate::rollout::stream(5, 0));
         let mut l = Pid2::new(dims(), &NetSettings::default(), ppo, settings, kind, true, 1, &mut rng);
         let mut b = batch(&dims(), 256, 3);
