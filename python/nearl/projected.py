@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import constraints_of, numbers, task_of
+from nearl.arguments import constraints_of, numbers, seed_of, task_of
 from nearl.env import Env, check_open
 from nearl.render import Frame, Renderer
 
@@ -68,6 +68,7 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         check_open(self._closed)
         if options:
             raise ValueError(f"reset options {sorted(options)} are not known; this environment takes none")
+        seed = None if seed is None else seed_of(seed)
         super().reset(seed=seed)
         if seed is None and not self._seeded:
             seed = int(self.np_random.integers(2**63))

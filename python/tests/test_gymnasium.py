@@ -101,6 +101,13 @@ def drawn(env: gymnasium.Env) -> np.ndarray:
         pytest.skip(str(error))
 
 
+def test_a_seed_of_numpy_is_that_of_python() -> None:
+    for env in (nearl.Env("HalfCheetah-v5"), nearl.ProjectedEnv("Panda-reach")):
+        assert np.array_equal(env.reset(seed=np.int64(3))[0], env.reset(seed=3)[0])
+        with pytest.raises(ValueError, match="seed is 'a'; give a whole number"):
+            env.reset(seed="a")  # type: ignore[arg-type]
+
+
 def test_a_step_before_an_episode_is_refused_without_wrappers_too() -> None:
     for env in (nearl.Env("HalfCheetah-v5"), nearl.ProjectedEnv("Panda-reach")):
         with pytest.raises(gymnasium.error.ResetNeeded, match="no episode has begun; call reset"):
