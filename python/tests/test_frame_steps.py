@@ -11,12 +11,13 @@ from test_guard_steps import arm, task, with_drives
 import nearl
 
 STEP, TICKS, PUSHED = 0.002, 600, 25
-SPEED, ENERGY, PLANE, TIE = 0.5, 3.0, -0.1, -0.5
+SPEED, ENERGY, PLANE, TIE, SUM = 0.5, 3.0, -0.1, -0.5, 0.4
 
 LIMITS = {
     "frame_speed": f'frame_speed = [{{ frame = "TIP", limit = {SPEED} }}]',
     "energy": f"energy = {{ limit = {ENERGY} }}",
     "frame": f'frame = [{{ frame = "TIP", half_space = {{ normal = [0, 0, -1], through = [0, 0, {PLANE}] }}, braking = 5.0 }}]',
+    "rows": f'rows = [{{ name = "sum", terms = {{ "q.j0" = 1.0, "q.j1" = 1.0 }}, lower = {-SUM}, upper = {SUM}, braking = 5.0 }}]',
     "equals": f'rows = [{{ name = "tie", terms = {{ "q.j0" = 1.0, "q.j1" = {TIE} }}, equals = 0.0 }}]',
 }
 
@@ -29,10 +30,12 @@ class Watched:
         self.data, self.tip, self.n = mujoco.MjData(self.model), self.model.body(f"b{n - 1}").id, n
 
     def excess(self, kind: str, obs: np.ndarray) -> float:
-        """Of speed and energy as a share of the limit, of the plane in m, of two joints tied to each other in rad."""
+        """Of speed and energy as a share of the limit, of the plane in m, of two joints, tied to each other or in sum, in rad."""
         self.data.qpos[:], self.data.qvel[:] = obs[: self.n], obs[self.n :]
         if kind == "equals":
             return abs(self.data.qpos[0] + TIE * self.data.qpos[1])
+        if kind == "rows":
+            return abs(self.data.qpos[0] + self.data.qpos[1]) - SUM
         mujoco.mj_forward(self.model, self.data)
         if kind == "frame":
             return PLANE - self.data.xpos[self.tip][2]
@@ -46,7 +49,7 @@ class Watched:
 
 
 def attack(folder: Path, seed: int, kind: str, steps: int, speeds: tuple[float, ...] = ()) -> tuple[float, float]:
-    """The worst excess, and the share of ticks within 5 % of the limit (5 mm of the plane; of tied joints, in which they move). With `speeds` [rad/s], under
+    """The worst excess, and the share of ticks within 5 % of the limit (5 mm of the plane or mrad of a sum; of tied joints, in which they move). With `speeds` [rad/s], under
     drives that swing so fast."""
     rng = np.random.default_rng(seed)
     text, ranges = arm(rng, STEP, "Euler")
@@ -61,7 +64,7 @@ def attack(folder: Path, seed: int, kind: str, steps: int, speeds: tuple[float, 
         envs = nearl.make_vec(file, 1, constraints="task", actions="guarded")
     watched, obs = Watched(text, n), envs.reset(seed=0)[0]
     push, worst, near = np.zeros(n), -np.inf, 0
-    close = -0.005 if kind == "frame" else -0.05
+    close = -0.005 if kind in ("frame", "rows") else -0.05
     for tick in range(TICKS):
         if tick % PUSHED == 0:
             push = rng.uniform(-2.0, 2.0, n) if speeds else rng.uniform(-300.0, 300.0, n)

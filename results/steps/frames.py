@@ -29,7 +29,7 @@ def main() -> None:
                 runs = [(seed, *attack(Path(folder), seed, kind, steps, speeds)) for seed in range(arms)]
             lines += [f"{kind},{drives},{steps},{seed},{worst:.3g},{near:.2f}" for seed, worst, near in runs]
             worst = np.array([run[1] for run in runs])
-            unit = {"frame": "m", "equals": "rad"}.get(kind, "of the limit")
+            unit = {"frame": "m", "equals": "rad", "rows": "rad"}.get(kind, "of the limit")
             under = f", drives of {drives} rad/s" if speeds else ""
             print(
                 f"{kind}{under}, {steps} steps: worst {worst.max():.2g} {unit}, {np.sum(worst > 1e-6)} of {arms} beyond it by more than 1e-6; "
