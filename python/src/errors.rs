@@ -52,7 +52,7 @@ pub(crate) fn train(error: TrainError) -> PyErr {
         | TrainError::Checkpoint(CheckpointError::Unusable { .. } | CheckpointError::Unwritable { .. }) => {
             PyOSError::new_err(error.to_string())
         }
-        TrainError::Demos(DemoError::Unreadable { kind, .. }) if kind == ErrorKind::NotFound => {
+        TrainError::Demos(DemoError::Unreadable { kind: ErrorKind::NotFound, .. }) => {
             PyFileNotFoundError::new_err(error.to_string())
         }
         TrainError::Demos(DemoError::Unreadable { .. }) => PyOSError::new_err(error.to_string()),

@@ -83,14 +83,14 @@ impl Combined {
         let sums = likelihood_ratio([action], &self.ppo, t, &mut w.rows, &group.p, grad);
         let own = self.idm_policy_gradient.then_some(grad);
         let dx = model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, own, true);
-        self.into_proposal(w.policy.output(), &inv.input, dx, &mut w.d_change);
+        self.reach_proposal(w.policy.output(), &inv.input, dx, &mut w.d_change);
         self.pull_inside(t, w);
         (sums, clamped as f32)
     }
 
     /// `dL / du` from the slope `dx` of the inverse model's input, through the projection.
     #[inline(always)]
-    fn into_proposal(&self, u: &[V], input: &[V], dx: &[V], d_change: &mut [V]) {
+    fn reach_proposal(&self, u: &[V], input: &[V], dx: &[V], d_change: &mut [V]) {
         let (d, seen) = (&self.dims, self.dims.seen_obs.len());
         let (xv, sv) = ((2 * seen).div_ceil(LANES), d.n_state.div_ceil(LANES));
         d_change.fill(ZERO);
@@ -133,7 +133,7 @@ impl Combined {
             }
         }
         let dx = model.net.backward(&group.transposed, &inv.input, &inv.slope, &mut inv.tape, None, true);
-        self.into_proposal(w.policy.output(), &inv.input, dx, &mut w.d_change);
+        self.reach_proposal(w.policy.output(), &inv.input, dx, &mut w.d_change);
         self.learn(group, w, grad);
         0.5 * sum.sum()
     }
