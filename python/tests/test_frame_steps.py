@@ -49,8 +49,8 @@ class Watched:
 
 
 def attack(folder: Path, seed: int, kind: str, steps: int, speeds: tuple[float, ...] = ()) -> tuple[float, float]:
-    """The worst excess, and the share of ticks within 5 % of the limit (5 mm of the plane or mrad of a sum; of tied joints, in which they move). With `speeds` [rad/s], under
-    drives that swing so fast."""
+    """The worst excess, and the share of ticks within 5 % of the limit (5 mm of the plane or mrad of a sum; of tied joints, in which they move). With
+    `speeds` [rad/s], under drives that swing so fast."""
     rng = np.random.default_rng(seed)
     text, ranges = arm(rng, STEP, "Euler")
     n, command = len(ranges), 'interface = "effort"'

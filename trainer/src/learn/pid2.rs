@@ -10,10 +10,10 @@
 //!
 //! [`INVERSE`] comes first, over the whole batch, whose log probabilities are then those of the model that learned: PPO's ratio begins
 //! at 1. The other losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`GENERATOR`], [`DISCRIMINATOR`]. The gradient of
-//! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the
-//! bounds, zero where the projection clamped. An inverse model that learns by itself makes other actions of the same proposals: beside
-//! [`INVERSE`] the policy learns to propose what leads to the actions of before ([`KEEP`]). The adversarial loss pulls at the proposal as a whole, or only at what the action
-//! leaves free of it (`null_space`).
+//! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the bounds, zero
+//! where the projection clamped. An inverse model that learns by itself makes other actions of the same proposals: beside [`INVERSE`]
+//! the policy learns to propose what leads to the actions of before ([`KEEP`]). The adversarial loss pulls at the proposal as a whole,
+//! or only at what the action leaves free of it (`null_space`).
 
 mod adversary;
 mod demonstrated;
