@@ -365,12 +365,14 @@ fn friction_and_brakes_are_told_where_a_limit_counts_on_them() {
     let file = folder.path().join("arm.toml");
     for (guard, tells) in [("true", true), ("\"drive\"", false), ("\"simulator\"", false)] {
         let mut manifest = manifest(&file, &text.replace("GUARD", guard));
-        // Before a training nobody knows the policy; a snapshot of one of actions says it.
-        let advice = nearl_runtime::doctor::advice(&manifest).expect("advice").join("; ");
+        // A policy of states is projected, whatever guards actions.
+        let projected = nearl_runtime::doctor::advice(&manifest).expect("advice").join("; ");
         manifest.policy = nearl_runtime::PolicyKind::Direct;
+        let advice = nearl_runtime::doctor::advice(&manifest).expect("advice").join("; ");
         let told = nearl_runtime::doctor::told(&manifest).expect("a task").join("; ");
         assert_eq!(told.contains("friction"), tells, "{guard}: {told}");
         for what in ["friction", "might need"] {
+            assert!(projected.contains(what), "{guard}, {what}: {projected}");
             assert_eq!(advice.contains(what), tells, "{guard}, {what}: {advice}");
         }
     }
