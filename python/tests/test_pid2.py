@@ -317,11 +317,22 @@ def edited(folder: Path, old: str, new: str) -> Path:
 
 
 def test_a_reward_that_is_not_a_number_ends_the_learning(tmp_path: Path) -> None:
-    task = edited(tmp_path, "[reward]", '[reward]\nroot = "log(cos(0.1) - 2.0)"')
+    task = edited(tmp_path, "[reward]", '[reward]\nroot = "log(cos(q.hinge) - 2.0)"')
     agent = nearl.PID2(task, algo="ppo", run=tmp_path / "run", threads=1)
     with pytest.raises(ValueError, match="nothing can be learned from it"):
         agent.learn(2048)
     assert (tmp_path / "run/checkpoints/resume.safetensors").is_file()
+
+
+def test_what_a_policy_sees_and_is_no_number_ends_the_learning(tmp_path: Path) -> None:
+    root = '"log(cos(q.hinge) - 2.0)"]'
+    for key, old, new in (("observation", '"v.hinge"]', f'"v.hinge", {root}'), ("privileged", "[state]", f"[state]\nprivileged = [{root}")):
+        task = edited(tmp_path, old, new)
+        with pytest.raises(ValueError, match=rf"{key} 'log\(cos\(q.hinge\) - 2.0\)' of '.*' came out as NaN after .* steps"):
+            nearl.PID2(task, algo="ppo", threads=1).learn(2048)
+    for section, text, said in (("reward", "log(-1)", "it is NaN always"), ("termination", "2 > 1", "it holds always")):
+        with pytest.raises(ValueError, match=rf"\[{section}.never\]: .*{said}"):
+            nearl.PID2(edited(tmp_path, f"[{section}]", f'[{section}]\nnever = "{text}"'), algo="ppo")
 
 
 def test_numbers_that_no_training_has_are_refused() -> None:
