@@ -203,6 +203,17 @@ def planar(tmp_path) -> dict:
     return {"robot": tmp_path / "planar.urdf", "recipe": tmp_path / "recipe.toml"}
 
 
+def test_a_urdf_with_settings_for_mujoco_is_imported_as_the_urdf_that_it_is(tmp_path) -> None:
+    path, files = Net(14).gemm(14, 3).save(tmp_path / "policy.onnx", 3), planar(tmp_path)
+    plain, text = nearl.import_onnx(path, **files), files["robot"].read_text()
+    at = text.index(">", text.index("<robot")) + 1
+    for urdf in (text[:at] + '<mujoco><compiler fusestatic="false"/></mujoco>' + text[at:], text[:at] + "<!-- <mujoco> -->" + text[at:]):
+        files["robot"].write_text(urdf)
+        limits = nearl.import_onnx(path, **files).limits
+        assert limits.keys() == plain.limits.keys()
+        assert all(np.array_equal(limits[key], plain.limits[key]) for key in limits)
+
+
 def test_the_recipe_is_computed_from_the_state(tmp_path) -> None:
     """Three ticks of an imported policy against NumPy and onnxruntime."""
     net = Net(14).gemm(14, 8).add("Tanh").gemm(8, 3).add("Tanh")
