@@ -8,7 +8,8 @@
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
-use std::fs::{Metadata, read_dir, remove_dir_all, remove_file};
+use std::fs::{Metadata, read_dir, read_link, read_to_string, remove_dir_all, remove_file};
+use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -41,17 +42,36 @@ fn sweep_folder(nodes: &Path, prefix: &str) {
     }
 }
 
-/// Removes segments that were begun and not finished: until they are, only their owner may write them and nobody may read them. Whoever opens
-/// the ports of the dead would wait for them, so this comes before a node is made.
+/// Removes segments that were begun and that nobody finishes any more: until they are, only their owner may write them and nobody may read
+/// them, and whoever makes one has it open. Whoever opens the ports of the dead would wait for them, so this comes before a node is made.
 pub(super) fn sweep_segments(name: &RobotName) {
     let before = begun(name);
     if before.is_empty() {
         return;
     }
     std::thread::sleep(PAUSE);
-    for (file, _) in before.intersection(&begun(name)) {
+    for (file, _) in before.intersection(&begun(name)).filter(|(file, _)| !is_open(file)) {
         let _ = remove_file(file);
     }
+}
+
+/// True if a process has the file open. A process of this user that cannot be looked into, as one with rights of its own, may have it. On a
+/// machine with more to do than it can, a living process is kept from going on for longer than any pause; without its segment, what is sent to it
+/// would go nowhere.
+fn is_open(file: &Path) -> bool {
+    let has = |process: PathBuf| match read_dir(process.join("fd")) {
+        Ok(open) => open.flatten().any(|fd| read_link(fd.path()).is_ok_and(|to| to == file)),
+        Err(e) => e.kind() == ErrorKind::PermissionDenied && is_of_this_user(&process),
+    };
+    read_dir("/proc").into_iter().flatten().flatten().any(|process| has(process.path()))
+}
+
+/// True if this user started the process: the first of its users.
+fn is_of_this_user(process: &Path) -> bool {
+    let status = read_to_string(process.join("status")).unwrap_or_default();
+    let users = status.lines().find_map(|line| line.strip_prefix("Uid:"));
+    let first = users.and_then(|all| all.split_whitespace().next()?.parse().ok());
+    first == Some(rustix::process::getuid().as_raw())
 }
 
 fn begun(name: &RobotName) -> BTreeSet<(PathBuf, u64)> {
@@ -62,7 +82,7 @@ fn begun(name: &RobotName) -> BTreeSet<(PathBuf, u64)> {
         .collect()
 }
 
-/// Finishing the description of a service takes milliseconds: one that is unfinished for so long was left.
+/// Finishing the description of a service takes milliseconds: one that is unfinished for so long was left, if nobody has it open.
 const LEFT: Duration = Duration::from_secs(1);
 
 /// Descriptions of services that are not finished: they become readable only, to the owner, when they are.
@@ -86,7 +106,8 @@ impl Unfinished {
         if self.files.is_empty() || self.since.elapsed() < LEFT {
             return;
         }
-        for (file, _) in self.files.intersection(&Unfinished::of(name).files) {
+        let still = Unfinished::of(name).files;
+        for (file, _) in self.files.intersection(&still).filter(|(file, _)| !is_open(file)) {
             // Another process may be faster.
             let _ = remove_file(file);
         }
@@ -114,7 +135,8 @@ fn is_gone(node: u128) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::fs::{create_dir_all, write};
+    use std::fs::{OpenOptions, create_dir_all, write};
+    use std::os::unix::fs::OpenOptionsExt;
 
     const PREFIX: &str = "nearl.debris.";
 
@@ -131,6 +153,22 @@ mod tests {
             MONITOR.iter().for_each(|m| write(nodes.join(format!("{PREFIX}{number}{m}")), "").unwrap());
         }
         number
+    }
+
+    /// However long the one who makes it takes.
+    #[test]
+    fn a_segment_that_is_being_made_stays() {
+        let name = RobotName::new(&format!("t{}-begun", std::process::id())).unwrap();
+        let home = super::super::home::Home::enter(&name).unwrap();
+        let segment = Path::new(memory::FOLDER).join(format!("{}1_2.connection", name.segments()));
+        let maker = OpenOptions::new().write(true).create_new(true).mode(0o200).open(&segment).unwrap();
+        sweep_segments(&name);
+        assert!(segment.exists(), "{} was taken from the one who makes it", segment.display());
+        drop(maker);
+        sweep_segments(&name);
+        assert!(!segment.exists(), "{} was left", segment.display());
+        drop(home);
+        super::super::remove_files(&name);
     }
 
     #[test]
