@@ -16,7 +16,7 @@ pub(crate) use advice::{beginnings, demonstrated};
 pub use columns::COLUMNS;
 pub use ranked::RankedSource;
 pub use run::{resume, resume_on, train, train_in, train_on};
-pub use served::{ServedError, ServedSource};
+pub use served::{PATIENCE as SERVER_PATIENCE, ServedError, ServedSource};
 pub use setup::{complete, limit_scale};
 pub use source::{Experience, Source, SourceError};
 

@@ -238,10 +238,10 @@ fn mistakes_are_found_before_anything_runs() {
             .arg("sweep")
             .args(arguments)
             .arg("--out")
-            .arg(folder.path())
+            .arg(folder.path().join("runs"))
             .output()
             .expect("nearl sweep");
         assert!(!output.status.success() && text(&output.stderr).contains(says), "{}", text(&output.stderr));
-        assert!(!folder.path().join("Hopper-v5").exists());
+        assert!(!folder.path().join("runs").exists());
     }
 }

@@ -301,6 +301,7 @@ const MISTAKES: &[(&str, &[&str])] = &[
         &["[random.mass.trunk]", "no factor that is drawn is 0.01 or more"],
     ),
     ("random.strength={ all = -1 }", &["[random.strength.all]", "no factor that is drawn is 0 or more"]),
+    ("delay.action='2 * sqrt(uniform)'", &["[delay.action]", "what is drawn is not a number every time"]),
     ("delay.action=-1", &["[delay.action]", "no delay that is drawn has 0 to 100 control periods"]),
     (
         "delay.observation=500",

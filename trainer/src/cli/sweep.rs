@@ -102,6 +102,10 @@ impl SweepCommand {
             preset: self.preset,
             set: super::train::overrides(self.demos.as_deref(), &self.set)?,
         };
+        if !sweep.out.exists() {
+            // A sweep that is refused leaves no folder.
+            sweep.plan()?;
+        }
         let _lock = sweep.lock()?;
         let runs = sweep.plan()?;
         let stop = Arc::new(AtomicBool::new(false));

@@ -4,8 +4,9 @@ use super::python::Python;
 use super::{Failure, at_least_one, cores, of_file, say, unstable};
 use crate::checkpoint::{self, Checkpoint};
 use crate::learn::Algorithm;
+use crate::online::PATIENCE as LOOP_PATIENCE;
 use crate::preset::Preset;
-use crate::train::{Experience, Progress, Request, Training, resume_on, train_in, train_on};
+use crate::train::{Experience, Progress, Request, SERVER_PATIENCE, Training, resume_on, train_in, train_on};
 use crate::{run_folder, tasks};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -238,8 +239,13 @@ impl Train {
             !stop.load(Ordering::Relaxed)
         };
         match &experience {
-            Experience::Loop(name, _) => eprintln!("nearl: looking for the loop of '{name}'"),
-            Experience::Served(name, _) => eprintln!("nearl: looking for the rollout server '{name}'"),
+            Experience::Loop(name, _) => {
+                eprintln!("nearl: looking for the loop of '{name}', {} s at most", LOOP_PATIENCE.as_secs());
+            }
+            Experience::Served(name, _) => {
+                let patience = SERVER_PATIENCE.as_secs();
+                eprintln!("nearl: looking for the rollout server '{name}', {patience} s at most");
+            }
             _ => {}
         }
         let saved = match &self.resume {

@@ -317,6 +317,15 @@ impl Combined {
         });
     }
 
+    /// Divergence of two policies of the current spread and these mean actions (n x n_act), averaged over the rows \[nat\].
+    pub(super) fn divergence(&self, p: &[V], a: &[f32], b: &[f32]) -> f64 {
+        let n_act = self.dims.n_act;
+        let sigma: Vec<f64> = self.log_std(p).iter().map(|s| f64::from(*s).exp()).collect();
+        let away = a.iter().zip(b).zip(sigma.iter().cycle());
+        let sum: f64 = away.map(|((a, b), sigma)| (f64::from(a - b) / sigma).powi(2)).sum();
+        0.5 * sum * n_act as f64 / a.len().max(1) as f64
+    }
+
     /// Rows of `width` numbers, as `of` hands them over for each tile of the batch.
     fn each_row(
         &self,

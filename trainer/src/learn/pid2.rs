@@ -12,7 +12,7 @@
 //! at 1. The other losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`GENERATOR`], [`DISCRIMINATOR`]. The gradient of
 //! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the bounds, zero
 //! where the projection clamped. An inverse model that learns by itself makes other actions of the same proposals: beside [`INVERSE`]
-//! the policy learns to propose what leads to the actions of before ([`KEEP`]). The adversarial loss pulls at the proposal as a whole,
+//! and after each of its passes the policy learns to propose what leads to the actions of before ([`KEEP`]). The adversarial loss pulls at the proposal as a whole,
 //! or only at what the action leaves free of it (`null_space`).
 
 mod adversary;
@@ -26,7 +26,7 @@ use super::epochs::{Pace, Update};
 use super::imitation::Base;
 use super::inverse::ThresholdPer;
 use super::nets::NetSettings;
-use super::optimise::{Group, Params, Phases, Rows, SUMS, Tile, add_sums, optimise};
+use super::optimise::{Group, Params, Phases, Rows, SUMS, Schedule, Tile, add_sums, optimise};
 use super::ppo::PpoSettings;
 use super::value::ValueScratch;
 use super::{Adam, Batch, Dims, Learner, Metrics};
@@ -56,8 +56,8 @@ pub struct Pid2Settings {
     /// The policy gradient moves the inverse model too. Otherwise only what was reached does, so that proposals stay nearer to it; the policy
     /// learns through the inverse model either way. No effect with analytic inverse dynamics.
     pub idm_policy_gradient: bool,
-    /// Where the inverse model learns from reached transitions, the policy learns to put out the same mean actions through it. No effect
-    /// where proposals are random or inverse dynamics analytic.
+    /// Where the inverse model learns from reached transitions, the policy learns to put out the same mean actions through it, and a model
+    /// that the policy cannot follow learns no more from that batch. No effect where proposals are random or inverse dynamics analytic.
     pub keep_actions: bool,
     /// What of a row of actions is compared with the threshold.
     pub idm_threshold_per: ThresholdPer,
@@ -131,6 +131,11 @@ pub const GENERATOR: usize = 4;
 /// Phase in which the policy puts out the actions of before through an inverse model that learned.
 pub const KEEP: usize = 5;
 
+/// Divergence of the mean actions within which the policy follows the inverse model \[nat\]: about that of an update of a policy.
+const NEAR: f64 = 0.02;
+/// Passes of [`KEEP`] alone at most, after each of [`INVERSE`].
+const FOLLOWING: usize = 20;
+
 /// The learner.
 pub struct Pid2 {
     nets: Nets,
@@ -161,6 +166,18 @@ enum Pass {
 }
 
 impl Nets {
+    /// An action is what the inverse model makes of the mean proposal.
+    fn acts_through_inverse(&self) -> bool {
+        self.combined.inverse.is_some() && self.combined.policy_log_std.is_none()
+    }
+
+    /// Divergence of the mean actions from those of before the inverse model learned \[nat\].
+    fn moved(&self, params: &Params, batch: &Batch, threads: usize) -> f64 {
+        let (group, mut now) = (&params.groups[COMBINED], Vec::new());
+        self.combined.mean_actions(group, batch, threads, &mut now);
+        self.combined.divergence(&group.p, &self.kept, &now)
+    }
+
     /// The rows by which a pass reads the table of latent noise apart from the others: no sample meets the same noise
     /// twice, and a table of a third of the size stays in the caches.
     fn noise_shift(&self, pass: Pass) -> usize {
@@ -245,6 +262,49 @@ impl Pid2 {
     fn actor(&self) -> &[V] {
         &self.params.groups[COMBINED].p
     }
+
+    /// The inverse model learns by itself ([`INVERSE`]), and the policy follows it ([`KEEP`]) in the same minibatches and after each pass. An inverse
+    /// model that the policy cannot follow learns no more from this batch. Returns the divergence of the mean actions from those of before
+    /// \[nat\]; 0 where no action is put out through the inverse model.
+    fn learn_from_what_was_reached(
+        &mut self,
+        batch: &Batch,
+        schedule: Schedule,
+        rng: &mut ChaCha8Rng,
+    ) -> f64 {
+        let Self { nets, params, threads } = self;
+        if !nets.acts_through_inverse() {
+            optimise(nets, params, batch, &[INVERSE], schedule, rng);
+            return 0.0;
+        }
+        nets.combined.mean_actions(&params.groups[COMBINED], batch, *threads, &mut nets.kept);
+        if !nets.settings.keep_actions {
+            optimise(nets, params, batch, &[INVERSE], schedule, rng);
+            return nets.moved(params, batch, *threads);
+        }
+        let mut divergence = 0.0;
+        for _ in 0..schedule.epochs {
+            let mut pass = Schedule { epochs: 1, ..schedule };
+            optimise(nets, params, batch, &[INVERSE, KEEP], pass, rng);
+            divergence = nets.moved(params, batch, *threads);
+            for _ in 0..FOLLOWING {
+                if divergence <= NEAR {
+                    break;
+                }
+                optimise(nets, params, batch, &[KEEP], pass, rng);
+                let now = nets.moved(params, batch, *threads);
+                // Steps of the optimiser that lead past the nearest are too long.
+                if now > divergence {
+                    pass.rate *= 0.7;
+                }
+                divergence = now;
+            }
+            if divergence > NEAR {
+                break;
+            }
+        }
+        divergence
+    }
 }
 
 impl Learner for Pid2 {
@@ -263,14 +323,10 @@ impl Learner for Pid2 {
             phases.push(DISCRIMINATOR);
         }
         let update = Update { ppo: &ppo, pace, threads, phases: &phases, actor: ACTOR };
+        let mut divergence = 0.0;
         if inverse_learns {
-            let Nets { combined, kept, .. } = &mut self.nets;
-            let keeps = s.keep_actions && combined.policy_log_std.is_none();
-            if keeps {
-                combined.mean_actions(&self.params.groups[COMBINED], batch, threads, kept);
-            }
-            let phases = if keeps { &[INVERSE, KEEP][..] } else { &[INVERSE] };
-            optimise(&self.nets, &mut self.params, batch, phases, update.schedule(), rng);
+            divergence =
+                self.learn_from_what_was_reached(batch, Schedule { rate: 1.0, ..update.schedule() }, rng);
             batch.log_prob = self.nets.combined.log_probs(&self.params.groups[COMBINED], batch, threads);
         }
         if opposed {
@@ -314,6 +370,9 @@ impl Learner for Pid2 {
         }
         let after = self.nets.combined.idm_error(self.actor(), batch, self.threads);
         metrics.extend(super::idm_metrics(before, after, inverse_learns, &batch.action, n_act));
+        if self.nets.acts_through_inverse() {
+            metrics.push(("idm/divergence", divergence));
+        }
         metrics
     }
 
@@ -449,7 +508,7 @@ impl Phases for Nets {
         }
     }
     fn is_paced(&self, phase: usize) -> bool {
-        !matches!(phase, INVERSE | DISCRIMINATOR | KEEP)
+        !matches!(phase, INVERSE | DISCRIMINATOR)
     }
     fn max_norm(&self, phase: usize) -> f32 {
         if matches!(phase, ACTOR | VALUE) { self.combined.ppo.max_grad_norm } else { f32::INFINITY }

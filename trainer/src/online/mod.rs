@@ -17,8 +17,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Longest silence of the loop, and longest time without a usable row.
-const PATIENCE: Duration = Duration::from_secs(30);
+/// Longest wait for the loop, longest silence of it, and longest time without a usable row.
+pub const PATIENCE: Duration = Duration::from_secs(30);
 /// Pause when the stream is empty.
 const NAP: Duration = Duration::from_micros(200);
 /// Times in a row that a snapshot may be taken back before the training ends.

@@ -29,6 +29,7 @@ pub const COLUMNS: &[&str] = &[
     "idm/r2_before",
     "idm/r2_after",
     "idm/updated",
+    "idm/divergence",
     "train/policy_gradient_loss",
     "train/approx_kl",
     "train/clip_fraction",

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Longest wait for the server, and longest silence of it.
-const PATIENCE: Duration = Duration::from_secs(60);
+pub const PATIENCE: Duration = Duration::from_secs(60);
 /// Pause before a server that was busy is asked again.
 const BUSY: Duration = Duration::from_millis(20);
 /// Between two looks whether a stop was asked for.

@@ -86,8 +86,18 @@ pub(super) fn drawn(of: &Expression<Quantity>, rng: &mut ChaCha8Rng, level: f64)
 
 /// Whether `of` is drawn within `domain` at all, at the lowest or the highest level.
 pub(super) fn is_ever(of: &Expression<Quantity>, domain: &RangeInclusive<f64>) -> bool {
+    draws(of).any(|value| domain.contains(&value))
+}
+
+/// Whether what is drawn is a number every time.
+pub(super) fn is_a_number(of: &Expression<Quantity>) -> bool {
+    draws(of).all(f64::is_finite)
+}
+
+/// Some draws, half of them at the lowest level and half at the highest.
+fn draws(of: &Expression<Quantity>) -> impl Iterator<Item = f64> {
     let mut rng = ChaCha8Rng::seed_from_u64(0);
-    (0..128).any(|k| domain.contains(&drawn(of, &mut rng, f64::from(k % 2))))
+    (0..128).map(move |k| drawn(of, &mut rng, f64::from(k % 2)))
 }
 
 /// Whole control periods of `dt` \[s\] in a time.

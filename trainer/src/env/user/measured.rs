@@ -18,7 +18,7 @@ use std::collections::VecDeque;
 
 use rand_chacha::ChaCha8Rng;
 
-use super::commands::{drawn, is_ever};
+use super::commands::{drawn, is_a_number, is_ever};
 use super::expression::Expression;
 use super::quantity::{Names, Quantity, base};
 use super::settings::{Mistake, Text, mistake};
@@ -93,6 +93,9 @@ impl Measured {
                 _ => return Err(mistake(key, "there are 'action' and 'observation'")),
             };
             let of = Text::read(&key, value, start)?;
+            if !is_a_number(&of) {
+                return Err(mistake(key, "what is drawn is not a number every time"));
+            }
             if !is_ever(&of, &(-0.5..=LONGEST + 0.5)) {
                 return Err(mistake(
                     key,
