@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 import nearl
 from nearl import curves, report
 from nearl.report import flight, rows
+from nearl.report.__main__ import main
 from nearl.report.read import ReadError, read_log, read_run
 
 NEARL = ROOT / "target" / "release" / "nearl"
@@ -222,6 +223,15 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path) -> None:
     assert done.stdout == f"{[1] * len(given)}\n" and not (tmp_path / "report.html").exists(), done.stderr
     for line, (_, name) in zip(done.stderr.splitlines(), given, strict=True):
         assert line.startswith(f"nearl report: '{name}' {whats[name]}; give "), line
+
+
+def test_a_place_that_cannot_be_written_is_named(inputs, tmp_path, capsys) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    whats = {"file/page.html": ("file", "File exists"), "folder": ("folder", "Is a directory")}
+    for out, (named, why) in whats.items():
+        assert main(["--eval", str(inputs["evals"][0]), "--out", str(tmp_path / out)]) == 1
+        assert capsys.readouterr().err == f"nearl report: cannot write '{tmp_path / named}': {why}; give another place with --out\n"
 
 
 def test_the_pull_from_states_is_the_sum_of_the_multipliers(tmp_path) -> None:

@@ -167,6 +167,9 @@ pub(crate) fn evaluate_by(
     for _ in 0..episodes {
         let before = worker.outside.0;
         let (ret, length) = worker.evaluate().map_err(RolloutError::from)?;
+        if let Some((what, value)) = worker.rows.collected.odd_observation(&snapshot.manifest.task) {
+            return Err(RolloutError::Odd { task: snapshot.manifest.task.name.clone(), what, value });
+        }
         let t = &worker.rows.collected.tally;
         told.push(t.notes.clone());
         by_episode.push((worker.outside.0 - before) as f64 / t.ticks.max(1) as f64);

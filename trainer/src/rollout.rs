@@ -13,6 +13,7 @@ mod worker;
 
 pub use rows::{Period, Rows};
 pub use scorer::Scorer;
+pub(crate) use segment::nth;
 pub use segment::{Collected, Segment, Tally};
 pub use worker::Worker;
 
@@ -46,6 +47,19 @@ pub enum RolloutError {
         what: String,
         /// Free memory \[MB\].
         free: u64,
+    },
+    /// The policy saw what is no finite number.
+    #[error(
+        "{what} of '{task}' came out as {value}, and no policy can act on it; look for a logarithm, root or quotient that leaves its domain, there or in \
+         [commands], [noise], [delay] or [pushes]"
+    )]
+    Odd {
+        /// Task.
+        task: String,
+        /// What of its observation.
+        what: String,
+        /// What it came out as.
+        value: f64,
     },
     /// The task's observation is not the environment's.
     #[error(

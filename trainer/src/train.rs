@@ -24,7 +24,7 @@ use crate::checkpoint::CheckpointError;
 use crate::demos::DemoError;
 use crate::evaluate::evaluate_by;
 use crate::learn::{Algorithm, Batch, Dims, Learner, Metrics, Pace, Params, Stretch, UnknownAlgorithm};
-use crate::rollout::{Collected, RolloutError, Scorer, Segment, Tally, stream};
+use crate::rollout::{Collected, RolloutError, Scorer, Segment, Tally, nth, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
@@ -601,12 +601,10 @@ impl Training {
 
 /// What policy or value saw that is no finite number, and that.
 fn unseen(gathered: &Collected, task: &Task) -> Option<(String, f64)> {
-    let name = |names: &[String], k: usize| names.get(k).cloned().unwrap_or_else(|| format!("number {k}"));
-    if let [k, value] = gathered.odd[..] {
-        return Some((format!("observation '{}'", name(&task.state.observation, k as usize)), value));
-    }
-    let privileged = &gathered.segment.privileged;
-    let (k, value) = privileged.iter().enumerate().find(|(_, x)| !x.is_finite())?;
-    let names = &task.state.privileged;
-    Some((format!("privileged '{}'", name(names, k % names.len().max(1))), *value))
+    let privileged = || {
+        let (k, value) = gathered.segment.privileged.iter().enumerate().find(|(_, x)| !x.is_finite())?;
+        let names = &task.state.privileged;
+        Some((format!("privileged '{}'", nth(names, k % names.len().max(1))), *value))
+    };
+    gathered.odd_observation(task).or_else(privileged)
 }

@@ -30,10 +30,20 @@ def main(arguments: list[str] | None = None) -> int:
             build(given.out, runs=given.run, logs=given.log, evals=given.eval, summaries=given.summary, sweeps=given.sweeps, demos=given.demos,
                   task=given.task, title=given.title)  # fmt: skip
     except (ReadError, OSError, ImportError) as error:
-        print(f"nearl report: {error}", file=sys.stderr)
+        print(f"nearl report: {sentence(error, given.out)}", file=sys.stderr)
         return 1
     print(given.out)
     return 0
+
+
+def sentence(error: Exception, out: Path) -> str:
+    """What went wrong while a report into ``out`` was made."""
+    if not isinstance(error, OSError) or error.filename is None:
+        return str(error)
+    path = Path(error.filename)
+    if path in (out, out.with_suffix(".png"), *out.parents):
+        return f"cannot write '{path}': {error.strerror}; give another place with --out"
+    return f"cannot read '{path}': {error.strerror}"
 
 
 if __name__ == "__main__":

@@ -694,3 +694,21 @@ fn observations_in_large_units_are_learned_from_and_those_beyond_any_are_named()
         }
     }
 }
+
+/// An evaluation names what its policy saw that is no number, as a training does.
+#[test]
+fn an_observation_that_is_no_number_ends_the_evaluation() {
+    let folder = tempfile::tempdir().expect("folder");
+    let task = edited(folder.path(), "0.1 * uniform", "0.2 * uniform");
+    let mut manifest =
+        tasks::load(&task, &["train.n_envs=2".into(), "train.n_steps=64".into()]).expect("task");
+    complete(&mut manifest).expect("complete");
+    let request = Request { manifest, algo: Algorithm::Ppo, steps: 256, seed: 1, threads: 1 };
+    let file = train(&request, &folder.path().join("run"), |_, _| true).expect("a run");
+    let mut snapshot = nearl_runtime::Snapshot::load(&file).expect("its snapshot");
+    let evaluated = |snapshot: &_| nearl_trainer::evaluate::evaluate(snapshot, 3, 0, true);
+    evaluated(&snapshot).expect("numbers");
+    snapshot.manifest.task.state.observation[0] = "0 * log(q.slider)".into();
+    let said = evaluated(&snapshot).expect_err("NaN on one side").to_string();
+    assert!(said.contains("observation '0 * log(q.slider)' of 'cart-pole' came out as NaN"), "{said}");
+}

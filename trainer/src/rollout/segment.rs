@@ -4,6 +4,7 @@ use crate::stats::RunningStats;
 use nearl_rollout_protocol::LEDGER;
 use nearl_runtime::Output;
 use nearl_runtime::constraints::Ledger;
+use nearl_runtime::task::Task;
 
 /// What one environment collected: `n_steps` policy steps, row by row.
 #[derive(Clone, Debug, Default)]
@@ -257,6 +258,12 @@ impl Collected {
         }
     }
 
+    /// The first observation that was no finite number, and that.
+    pub(crate) fn odd_observation(&self, task: &Task) -> Option<(String, f64)> {
+        let [k, value] = self.odd[..] else { return None };
+        Some((format!("observation '{}'", nth(&task.state.observation, k as usize)), value))
+    }
+
     /// Forgets everything; keeps the rows' memory.
     pub(super) fn clear(&mut self) {
         self.segment.clear();
@@ -269,4 +276,9 @@ impl Collected {
             stats.clear();
         }
     }
+}
+
+/// The name of the k-th entry of a row, as far as they have names.
+pub(crate) fn nth(names: &[String], k: usize) -> String {
+    names.get(k).cloned().unwrap_or_else(|| format!("number {k}"))
 }

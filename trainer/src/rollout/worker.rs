@@ -239,8 +239,10 @@ impl Worker {
     pub fn evaluate(&mut self) -> Result<(f64, usize), EnvError> {
         self.rows.clear();
         self.draw(false);
+        self.rows.collected.see(&self.state.obs);
         loop {
             let (_, terminated) = self.policy_step();
+            self.rows.collected.see(&self.state.obs);
             if terminated || self.ticks >= self.env.spec().max_episode_steps {
                 let episode = self.episode;
                 self.rows.collected.tally.costs.push(self.cost);
