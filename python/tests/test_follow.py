@@ -396,5 +396,28 @@ def test_a_driver_that_keeps_no_time_gets_set_points_that_go_on(tmp_path: Path, 
     keeps(np.array(sent), dt)
     counts, modes = loop.report["counters"], loop.report["modes"]
     assert counts["out_of_order"] == 59 if twice else counts["stale"] >= 2 and modes["braking"] > 2
-    done = subprocess.run([NEARL, "verify", log], capture_output=True, text=True, check=False)
-    assert done.returncode in (0, 2), done.stdout + done.stderr  # 2: the disk was too slow for some ticks
+
+
+def test_a_state_that_stands_still_is_braked_from_however_often_it_is_sent(tmp_path: Path) -> None:
+    """Sent at five times the rate of the loop it was taken for a driver that asks twice in a period, and acted upon for ever."""
+    dt, q, v, ticks, turns = 0.1, 0.0, 0.2, 0, ["none"]
+    entries, name = save(tmp_path, "position", dt, np.zeros((1, 2)), 3.0), f"py{os.getpid()}-still"
+    with nearl.Plant(name, joints=["j1"], observation=entries, dt=dt, nu=1, watchdog=60.0) as plant:
+        loop = nearl.Loop(tmp_path / "one.safetensors", name, ramp=0.0)
+
+        def exchange(pause: float) -> None:
+            observation = [{"q.j1": q, "v.j1": v}[entry] for entry in entries]
+            turns.append(plant.exchange([q], [v], observation, patience=30.0, time=dt * (ticks + 1), begins=len(turns) == 1)[0])
+            time.sleep(pause)
+
+        end = time.monotonic() + 60.0
+        while turns.count("act") < 5:
+            exchange(dt)
+            q, ticks = q + dt * v, ticks + 1
+            assert time.monotonic() < end, turns
+        begin = len(turns)
+        while turns[-1] != "brake":
+            exchange(dt / 5)
+            assert len(turns) < begin + 100, turns
+        loop.stop()
+    assert loop.report["counters"]["frozen_states"] > 3, loop.report

@@ -52,7 +52,8 @@ fn conclude(file: &str, report: &Report) -> Result<(), Failure> {
     match report {
         _ if report.found > 0 => Err(format!(
             "{file}: {} of {} ticks do not hold what the log says; a log that `nearl replay` finds equal was not changed: then the loop failed, \
-             or the robot came to its states by something else than its actions, as by a push or after a late answer",
+             or the robot came to its states by something else than its actions, as by a push, after a late answer, or because what measures them is \
+             noisy",
             report.found, report.ticks
         )
         .into()),

@@ -122,10 +122,17 @@ fn unguarded(m: &Manifest) -> Option<String> {
                 .into(),
         );
     }
+    // A guard decides the action, and nothing beside it may change it.
+    let (but, first) = match (of.reached, &of.action) {
+        (Some(_), _) => (", but for the share that reached asks for,", "take reached out and "),
+        (None, Some(_)) => ("", "take [constraints.action] out and "),
+        (None, None) => ("", ""),
+    };
     (is_off && has_limits).then(|| {
-        "the limits on states under [constraints] hold for nothing: this policy gives actions, and guard is off; add guard = true to [constraints] to hold \
-         them"
-            .into()
+        format!(
+            "the limits on states under [constraints]{but} hold for nothing: this policy gives actions, and guard is off; {first}add guard = true to \
+             [constraints] to hold them"
+        )
     })
 }
 

@@ -9,6 +9,7 @@ use super::tick::SCHEMA_VERSION;
 use crate::codes::LedgerStatus;
 use crate::link::{Message, ROBOT_LIMITS, RobotMessage};
 use crate::rt::{CoreSettings, FaultPlan, Mode};
+use crate::snapshot::one_line;
 
 /// The plant's description as readable facts.
 #[derive(Debug, Serialize, Deserialize)]
@@ -105,6 +106,15 @@ pub(crate) fn read(facts: &BTreeMap<String, String>) -> Result<Session, String> 
         serde_json::from_str(text).map_err(|e| format!("its metadata `{key}` is damaged: {e}"))
     }
     let described: RobotFacts = parse("robot", get("robot")?)?;
+    for (key, value) in [("dt", described.dt.to_string()), ("joints", described.joints.join(","))] {
+        let said = get(key)?;
+        if *said != value {
+            let said = one_line(said);
+            return Err(format!(
+                "its metadata `{key}` is '{said}', and that of its robot '{value}': one of the two was changed"
+            ));
+        }
+    }
     let mut robot = RobotMessage::zeroed();
     robot.set_joint_names(&described.joints);
     robot.joints = described.joints_hash;

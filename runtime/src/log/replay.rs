@@ -21,7 +21,7 @@ use super::tick::{TickJson, encode};
 use super::writer::{
     BRIEF_TOPIC, MEMORY_TOPIC, SNAPSHOT_TOPIC, SnapshotNumbered, TICK_TOPIC, attachment_name,
 };
-use crate::link::{Message, ProposalMessage, SnapshotBytes, SnapshotHeader, StateMessage};
+use crate::link::{Message, ProposalMessage, RobotMessage, SnapshotBytes, SnapshotHeader, StateMessage};
 use crate::rt::{Build, Core, Inputs, Loaded, PilotBuilder, Record};
 use crate::snapshot::one_line;
 
@@ -386,6 +386,10 @@ impl<B: Build> Replayer<B> {
         }
         core.swap(given.swapped);
         let fresh = given.has_state.then_some(given.state);
+        if let Some((field, has, of)) = fresh.and_then(|state| misfit(state, &session.robot)) {
+            self.differ(given.tick, field, format!("{has} numbers"), format!("a robot of {of}"));
+            return Ok(false);
+        }
         let proposal = given.proposal;
         core.update(&Inputs { due: core.due(), begin: given.begin, stop: given.stop, fresh, proposal });
         core.close(given.end);
@@ -435,6 +439,17 @@ impl<B: Build> Replayer<B> {
     fn differ(&mut self, tick: u64, field: &str, log: String, replay: String) {
         self.found.difference = Some(Difference { tick, field: field.to_owned(), log, replay });
     }
+}
+
+/// What of a state has another length than the robot: its field, its length and the robot's.
+fn misfit(state: &StateMessage, robot: &RobotMessage) -> Option<(&'static str, usize, usize)> {
+    let lengths = [
+        ("state.q", state.q(), robot.nq),
+        ("state.v", state.v(), robot.nv),
+        ("state.obs", state.obs(), robot.n_obs),
+    ];
+    let mut lengths = lengths.into_iter().map(|(field, values, of)| (field, values.len(), of as usize));
+    lengths.find(|(_, has, of)| has != of)
 }
 
 /// Path and values of the first leaf that differs; numbers by their bits.

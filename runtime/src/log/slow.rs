@@ -106,7 +106,9 @@ impl Bench {
         let plan = FaultPlan::default();
         let stands = Arc::new(AtomicBool::new(false));
         let disk = Disk { file: File::create(&path).unwrap(), stands: Arc::clone(&stands) };
-        let facts = facts(&RobotMessage::zeroed(), &settings, &plan);
+        let mut robot = RobotMessage::zeroed();
+        (robot.nq, robot.nv, robot.nu, robot.n_obs) = (1, 1, 1, 128);
+        let facts = facts(&robot, &settings, &plan);
         let mut log = LogQueue::start(Box::new(disk), &facts, 7).unwrap();
         log.push_snapshot(0, 1, b"any".to_vec(), Vec::new());
         let first = Box::new(Loaded { id: 0, controller: Summing(0.0) });

@@ -113,6 +113,8 @@ pub struct Core<T: LoopController> {
     overran: bool,
     pace: Pace,
     way: Way,
+    /// When the first state of those that tell the same came [ns].
+    since: u64,
     /// `brake` panicked: it is not called again on this controller. A panic of `tick` latches Fault.
     brake_broken: bool,
 }
@@ -136,6 +138,7 @@ impl<T: LoopController> Core<T> {
             overran: false,
             pace: Pace::default(),
             way: Way::new(),
+            since: 0,
             brake_broken: false,
             settings,
             controller,
@@ -248,6 +251,7 @@ impl<T: LoopController> Core<T> {
         (self.overran, self.brake_broken) = (resume.overran, resume.brake_broken);
         self.pace = Pace::default();
         self.way = resume.way;
+        self.since = record.state.header.stamp;
         self.memory.clear();
         self.memory.extend_from_slice(resume.memory());
         self.is_lost = false;
@@ -262,6 +266,7 @@ impl<T: LoopController> Core<T> {
             self.record.sensed == Sensed::Measured && self.held == Some(0) && !self.memory.is_empty();
         resume.is_set = is_plain
             && self.pace == Pace::default()
+            && self.since == self.record.state.header.stamp
             && self.settings.proposer.is_none()
             && self.record.output.nu > 0
             && self.controller.controller.is_memory_whole()
@@ -416,6 +421,9 @@ impl<T: LoopController> Core<T> {
             left_out = self.go_on(state, lost);
         }
         let is_frozen = is_next && !is_doubled && self.is_frozen(state);
+        if !is_doubled && !is_frozen {
+            self.since = state.header.stamp;
+        }
         if self.held.is_some() && !is_doubled {
             self.follow(state, lost, is_frozen);
         }
@@ -542,11 +550,13 @@ impl<T: LoopController> Core<T> {
         }
     }
 
-    /// The driver has asked twice in a period: the same numbers, the clock of the robot stands, and hardly any time has passed. The first answer
-    /// is not the one that is applied.
+    /// The driver has asked twice in a period: the same numbers, the clock of the robot stands, and hardly any time has passed, nor has since
+    /// they came first: what stands for longer than a period and a half is frozen. The first answer is not the one that is applied.
     fn is_doubled(&self, new: &StateMessage) -> bool {
         let (old, settings) = (&self.record.state, &self.settings);
-        let is_soon = new.header.stamp.saturating_sub(old.header.stamp) < settings.period / 2;
+        let after = |stamp: u64| new.header.stamp.saturating_sub(stamp);
+        let is_soon =
+            2 * after(old.header.stamp) < settings.period && 2 * after(self.since) < 3 * settings.period;
         let is_same = new.q() == old.q() && new.v() == old.v() && new.episode == old.episode;
         let is_asked = new.bits & STATE_BRAKED == 0 && new.late == old.late && new.tick != old.tick;
         settings.real_time

@@ -251,6 +251,17 @@ fn an_edited_log_is_found_out_at_its_tick_and_field() {
         true
     };
     assert_eq!(found(a, &moved).unwrap().tick, a);
+    // One with a number too many is not computed with.
+    let longer = |m: &mut Value| {
+        m["state"]["q"].as_array_mut().unwrap().push(0.into());
+        true
+    };
+    let difference = found(a, &longer).expect("eight joints").to_string();
+    assert!(difference.contains("state.q") && difference.contains("a robot of 7"), "{difference}");
+    // What the metadata says twice.
+    edit_with(&log, &copy, 1, &|_| true, &|facts| _ = facts.insert("dt".into(), "0.004".into()));
+    let error = replay(&copy).unwrap_err().to_string();
+    assert!(error.contains("its metadata `dt` is '0.004'"), "{error}");
 }
 
 #[test]

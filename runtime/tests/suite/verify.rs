@@ -903,6 +903,11 @@ fn every_seeded_corruption_is_named_at_its_tick() {
         ("brake too weak", "way to stop", Box::new(move |m: &mut Value| m["brake"] = json!(vec![2e-2; 7]))),
         ("not a number", "target_v[2]", Box::new(move |m: &mut Value| m["target_v"][2] = Value::Null)),
         ("left out", "action", Box::new(move |m: &mut Value| m["action"] = json!([]))),
+        (
+            "a number too many",
+            "length of action",
+            Box::new(move |m: &mut Value| m["action"].as_array_mut().unwrap().push(json!(0.0))),
+        ),
         ("cut", "length of target_q", Box::new(move |m: &mut Value| m["target_q"] = json!([0.0]))),
         ("speeds cut", "length of target_v", Box::new(move |m: &mut Value| m["target_v"] = json!([0.0]))),
         ("state cut", "length of state.v", Box::new(move |m: &mut Value| m["state"]["v"] = json!([0.0]))),

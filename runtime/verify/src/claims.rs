@@ -341,6 +341,9 @@ fn actions(promise: &mut Promise, passage: &Passage<'_>, found: &[f64]) -> Resul
     let p = promise.period;
     let (lag, sag) = (0.5 * (p.dt - p.tau), (p.dt * p.dt - p.tau * p.tau) / 6.0);
     let (mut means, mut cut) = (Vec::new(), None);
+    if !promise.actions.is_empty() && found.len() != promise.n_act {
+        return broken("length of action", found.len() as f64, promise.n_act as f64, "");
+    }
     for action in &promise.actions {
         let (i, joint) = (action.dof, &promise.limits.joints[action.dof].name);
         let Some(at) = promise.machine.single(i) else { continue };

@@ -149,6 +149,8 @@ pub(crate) struct Promise {
     follows: Vec<(usize, Option<(usize, f64)>)>,
     /// Of analytic inverse dynamics; empty where a network gives the action.
     pub(crate) actions: Vec<Action>,
+    /// Entries of an action.
+    pub(crate) n_act: usize,
     /// Limits on actions, and those of drives, change `moved`.
     pub(crate) limits_actions: bool,
     /// Where an operator has moved its limits; `limits` are then those in force for a tick.
@@ -342,6 +344,7 @@ impl Promise {
             way: section.braking,
             follows,
             actions,
+            n_act: m.action_lower.len(),
             limits_actions: section.action.is_some() || section.guard == "drive",
             moving,
             payload: m.moved.as_ref().and_then(|moved| moved.payload.clone()),
