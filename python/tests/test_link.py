@@ -114,6 +114,19 @@ def test_no_server_is_named_with_what_to_start() -> None:
         nearl.Link("a/b").rollout(seed=0, n_steps=1)
 
 
+def test_a_server_that_is_killed_is_gone_and_not_silent() -> None:
+    name = f"py-{uuid.uuid4().hex[:12]}"
+    process = subprocess.Popen([NEARL, "serve", SNAPSHOT, "--name", name], stdout=subprocess.PIPE, text=True)
+    assert "Panda-reach" in process.stdout.readline()
+    with nearl.Link(name, patience=60.0) as link:
+        rollout = iter(link.rollout(seed=0, n_steps=1_000_000))
+        next(rollout)
+        process.kill()
+        with pytest.raises(ConnectionError, match=f"the rollout server `{name}` is gone"):
+            list(rollout)
+    process.communicate(timeout=30)
+
+
 def test_a_push_of_what_no_snapshot_can_be_is_refused_unread(tmp_path) -> None:
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "endless").symlink_to("/dev/zero")

@@ -156,8 +156,18 @@ impl RolloutClient {
             if let Some(pending) = self.deliver(envelope)? {
                 let (bus, client) = (Arc::clone(&self.bus), service::client_number(self.port.id().value()));
                 let (pending, factory) = (Some(pending), Arc::clone(&self.factory));
-                let (chunks, steps, cancelled) = (0, 0, false);
-                return Ok(Rollouts { pending, factory, bus, client, request, chunks, steps, cancelled });
+                let (chunks, steps, cancelled, looked) = (0, 0, false, Instant::now());
+                return Ok(Rollouts {
+                    pending,
+                    factory,
+                    bus,
+                    client,
+                    request,
+                    chunks,
+                    steps,
+                    cancelled,
+                    looked,
+                });
             }
             if waiting.is_suspicious() {
                 self.bus.node().try_cleanup_dead_nodes();
@@ -207,6 +217,8 @@ pub struct Rollouts {
     chunks: u64,
     steps: u64,
     cancelled: bool,
+    /// When the server was last seen to live: whoever waits a little at a time sees it die too.
+    looked: Instant,
 }
 
 impl Rollouts {
@@ -273,6 +285,7 @@ impl Rollouts {
         let mut waiting = Waiting::new();
         loop {
             if let Some((reply, numbers)) = self.receive(pending)? {
+                self.looked = Instant::now();
                 match self.read(&reply, numbers)? {
                     Some(end) => return Ok(end),
                     None => continue,
@@ -282,10 +295,13 @@ impl Rollouts {
                 let name = self.bus.name().clone();
                 return Err(RequestError::Silent { name, seconds: patience.as_secs_f64() });
             }
-            if waiting.is_suspicious() {
+            if self.looked.elapsed() >= SUSPICION {
+                self.looked = Instant::now();
                 self.bus.node().try_cleanup_dead_nodes();
-                // Its last reply may have come between the look into the buffer and here.
-                if !pending.is_connected() && !pending.has_response() {
+                // One that was killed is no longer listed, and has closed nothing. Its last reply may have come between the look into the buffer and here.
+                let is_over =
+                    !pending.is_connected() || self.factory.dynamic_config().number_of_servers() == 0;
+                if is_over && !pending.has_response() {
                     return Err(self.lost());
                 }
             }
