@@ -11,9 +11,12 @@
 //! [`INVERSE`] comes first, over the whole batch, whose log probabilities are then those of the model that learned: PPO's ratio begins
 //! at 1. The other losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`GENERATOR`], [`DISCRIMINATOR`]. The gradient of
 //! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the bounds, zero
-//! where the projection clamped. An inverse model that learns by itself makes other actions of the same proposals: beside [`INVERSE`]
-//! and after each of its passes the policy learns to propose what leads to the actions of before ([`KEEP`]). The adversarial loss pulls at the proposal as a whole,
-//! or only at what the action leaves free of it (`null_space`).
+//! where the projection clamped. The adversarial loss pulls at the proposal as a whole, or only at what the action leaves free of it
+//! (`null_space`).
+//!
+//! An inverse model that learns by itself makes other actions of the same proposals: beside [`INVERSE`] and after each of its passes the
+//! policy learns to propose what leads to the actions of before ([`KEEP`]). One that the policy cannot follow learns no more from the
+//! batch; one that gains learns from the next batch too.
 
 mod adversary;
 mod demonstrated;
@@ -133,6 +136,8 @@ pub const KEEP: usize = 5;
 
 /// Divergence of the mean actions within which the policy follows the inverse model \[nat\]: about that of an update of a policy.
 const NEAR: f64 = 0.02;
+/// Part of its error that an inverse model has to lose in an update to go on learning from the next batch.
+const GAIN: f64 = 0.1;
 /// Passes of [`KEEP`] alone at most, after each of [`INVERSE`].
 const FOLLOWING: usize = 20;
 
@@ -245,6 +250,7 @@ impl Pid2 {
             adam,
             beta: settings.beta,
             adapted: 1.0,
+            catches_up: false,
             ranks: None,
         };
         let nets = Nets {
@@ -313,7 +319,8 @@ impl Learner for Pid2 {
         let (ppo, threads) = (self.nets.combined.ppo.clone(), self.threads);
         let (s, n_act) = (self.nets.settings.clone(), self.nets.combined.dims.n_act);
         let before = self.nets.combined.idm_error(self.actor(), batch, threads);
-        let inverse_learns = before.is_some_and(|e| s.idm_threshold_per.exceeds(e, n_act, s.idm_threshold));
+        let exceeds = before.is_some_and(|e| s.idm_threshold_per.exceeds(e, n_act, s.idm_threshold));
+        let inverse_learns = exceeds || self.params.catches_up;
         let opposed = s.generator_weight > 0.0;
         let mut phases = vec![ACTOR, VALUE];
         if opposed && s.generator_lr > 0.0 {
@@ -328,6 +335,9 @@ impl Learner for Pid2 {
             divergence =
                 self.learn_from_what_was_reached(batch, Schedule { rate: 1.0, ..update.schedule() }, rng);
             batch.log_prob = self.nets.combined.log_probs(&self.params.groups[COMBINED], batch, threads);
+            let now = self.nets.combined.idm_error(self.actor(), batch, threads);
+            let gains = now.zip(before).is_some_and(|(now, before)| now < (1.0 - GAIN) * before);
+            self.params.catches_up = gains && s.keep_actions && self.nets.acts_through_inverse();
         }
         if opposed {
             self.nets.noise.resize(batch.n * LATENT, 0.0);

@@ -1,7 +1,7 @@
 //! Warnings that are printed before a training begins.
 
 use super::TrainError;
-use super::setup::warm_up_of_pid2;
+use super::setup::warm_up_steps;
 use crate::demos::{DemoError, Demonstrations};
 use crate::env::{ChaCha8Rng, SeedableRng, convert, unstated_steps};
 use crate::learn::Algorithm;
@@ -50,7 +50,7 @@ fn vain_penalty(algo: Algorithm, manifest: &Manifest) -> Result<Option<String>, 
     }))
 }
 
-/// Says so where a run of `steps` ends before a reward is read: the first batch fills the statistics, and the warm-up of PID² reads none.
+/// Says so where a run of `steps` ends before a reward or a demonstration is read: the first batch fills the statistics, and a warm-up reads neither.
 ///
 /// # Errors
 /// [`TrainError`] of settings that cannot be read.
@@ -61,12 +61,15 @@ pub fn ends_in_warm_up(
 ) -> Result<Option<String>, TrainError> {
     let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
     let batch = (settings.n_envs * settings.n_steps) as u64;
-    let warmup = warm_up_of_pid2(algo, &settings);
+    let warmup = warm_up_steps(algo, &settings);
     let end = batch * (1 + warmup.div_ceil(batch));
+    let (unread, shorter) = match algo.demos() {
+        Some(uses) if uses.warms_up => ("demonstrations", "shorten the warm-up with train.demos.warmup"),
+        _ => ("a reward", "leave the warm-up out with train.pid2.warmup=0"),
+    };
     Ok((warmup > 0 && steps <= end).then(|| {
         format!(
-            "the run ends after {steps} steps, and first batch and warm-up take {end}: nothing is learned from a reward; give it more, or leave the \
-             warm-up out with train.pid2.warmup=0"
+            "the run ends after {steps} steps, and first batch and warm-up take {end}: nothing is learned from {unread}; give it more, or {shorter}"
         )
     }))
 }
@@ -215,6 +218,13 @@ mod tests {
             "{short}"
         );
         assert_eq!(said(Algorithm::Pid2Ib, 18_433, &[]), None);
+        let cloned = said(Algorithm::Pid2Il, 18_432, &[]).expect("too short");
+        assert!(
+            cloned.contains("warm-up take 18432: nothing is learned from demonstrations")
+                && cloned.ends_with("with train.demos.warmup"),
+            "{cloned}"
+        );
+        assert_eq!(said(Algorithm::Pid2Il, 18_433, &[]), None);
         assert_eq!(said(Algorithm::Ppo, 10_000, &[]), None);
         assert_eq!(said(Algorithm::Pid2Ib, 10_000, &["train.pid2.warmup=0"]), None);
     }
