@@ -40,6 +40,7 @@ class Plant:
 
     Raises:
         ConnectionError: another plant has this name, or the links cannot be made.
+        ValueError: there is no joint or no entry of an action.
     """
 
     def __init__(
@@ -55,9 +56,10 @@ class Plant:
         watchdog: float = 0.02,
         lockstep: bool = False,
     ) -> None:
-        self._plant = _core.Plant(
-            name, names_of("joints", joints), names_of("observation", observation), dt, nu, nq=nq, nv=nv, watchdog=watchdog, lockstep=lockstep
-        )
+        joints = names_of("joints", joints)
+        if not joints or nu == 0:
+            raise ValueError(f"a robot of {len(joints)} joints and {nu} entries of an action cannot be moved; give at least one of each")
+        self._plant = _core.Plant(name, joints, names_of("observation", observation), dt, nu, nq=nq, nv=nv, watchdog=watchdog, lockstep=lockstep)
 
     def exchange(
         self,
@@ -88,6 +90,8 @@ class Plant:
             ``("act", action)``, ``("hold", action)`` with the action of before as none came in time, or ``("brake", None)``: there is no loop, it
             is silent, or it leaves braking to the plant. Bring the robot to rest then.
         """
+        if episode < 0:
+            raise ValueError(f"episode is {episode}; give its number, counted from 0")
         return self._plant.exchange(q, v, obs, patience, time=time, episode=episode, begins=begins, braked=braked)
 
     @property

@@ -402,6 +402,56 @@ impl Values {
 pub(crate) type Named = Option<BTreeMap<String, f64>>;
 pub(crate) type Places = Option<BTreeMap<String, ([f64; 3], [f64; 3])>>;
 
+/// What `what` is given as, where it is at all: what `read` takes, or a sentence that says what is expected.
+fn given<T>(
+    what: &str,
+    expected: &str,
+    value: &Bound<'_, PyAny>,
+    read: impl FnOnce(&Bound<'_, PyAny>) -> Option<T>,
+) -> PyResult<Option<T>> {
+    if value.is_none() {
+        return Ok(None);
+    }
+    let wrong = || PyTypeError::new_err(format!("{what}: expected {expected}; got {}", shown(value)));
+    read(value).ok_or_else(wrong).map(Some)
+}
+
+fn named(what: &str, value: &Bound<'_, PyAny>) -> PyResult<Named> {
+    given(what, "numbers by the name of a limit: {\"wall\": 0.1}", value, |v| v.extract().ok())
+}
+
+fn places(what: &str, expected: &str, value: &Bound<'_, PyAny>) -> PyResult<Places> {
+    given(what, expected, value, |v| v.extract().ok())
+}
+
+/// The argument `frame`.
+pub(crate) fn frame(value: &Bound<'_, PyAny>) -> PyResult<Named> {
+    named("frame", value)
+}
+
+/// The argument `frame_speed`.
+pub(crate) fn frame_speed(value: &Bound<'_, PyAny>) -> PyResult<Named> {
+    named("frame_speed", value)
+}
+
+/// The argument `energy`.
+pub(crate) fn energy(value: &Bound<'_, PyAny>) -> PyResult<Option<f64>> {
+    given("energy", "a number in J", value, |v| v.extract().ok())
+}
+
+/// The argument `plane`.
+pub(crate) fn plane(value: &Bound<'_, PyAny>) -> PyResult<Places> {
+    let expected =
+        "by the name of a limit a normal and a point, as a pair: {\"wall\": ([0, 1, 0], [0, 0.2, 0])}";
+    places("plane", expected, value)
+}
+
+/// The argument `body`.
+pub(crate) fn body(value: &Bound<'_, PyAny>) -> PyResult<Places> {
+    let expected = "by the name of an obstacle its position and roll, pitch and yaw, as a pair: {\"ball\": ([0.2, 0.5, 0.2], [0, 0, 0])}";
+    places("body", expected, value)
+}
+
 /// Where limits are moved: velocity, acceleration, lowest and highest position by joint, planes inside and speeds of frames, then where planes lie
 /// (normal, a point of theirs) and obstacles stand (position, roll, pitch and yaw).
 pub(crate) fn moved(

@@ -105,11 +105,11 @@ impl LoopClient {
         acceleration: Option<limits::Values>,
         lower: Option<limits::Values>,
         upper: Option<limits::Values>,
-        frame: limits::Named,
-        frame_speed: limits::Named,
-        energy: Option<f64>,
-        plane: limits::Places,
-        body: limits::Places,
+        #[pyo3(from_py_with = limits::frame)] frame: limits::Named,
+        #[pyo3(from_py_with = limits::frame_speed)] frame_speed: limits::Named,
+        #[pyo3(from_py_with = limits::energy)] energy: Option<f64>,
+        #[pyo3(from_py_with = limits::plane)] plane: limits::Places,
+        #[pyo3(from_py_with = limits::body)] body: limits::Places,
         payload: Option<(String, f64, [f64; 3], [f64; 6])>,
     ) -> PyResult<(bool, &'static str, String, u64)> {
         let patience = seconds(patience)?;

@@ -272,11 +272,11 @@ impl Projector {
         acceleration: Option<limits::Values>,
         lower: Option<limits::Values>,
         upper: Option<limits::Values>,
-        frame: limits::Named,
-        frame_speed: limits::Named,
-        energy: Option<f64>,
-        plane: limits::Places,
-        body: limits::Places,
+        #[pyo3(from_py_with = limits::frame)] frame: limits::Named,
+        #[pyo3(from_py_with = limits::frame_speed)] frame_speed: limits::Named,
+        #[pyo3(from_py_with = limits::energy)] energy: Option<f64>,
+        #[pyo3(from_py_with = limits::plane)] plane: limits::Places,
+        #[pyo3(from_py_with = limits::body)] body: limits::Places,
     ) -> PyResult<()> {
         let joints = [velocity, acceleration, lower, upper];
         let moved = limits::moved(speed, joints, [frame, frame_speed], energy, [plane, body]);

@@ -1,6 +1,7 @@
 """Limits that move: hand arithmetic, and a payload against MuJoCo."""
 
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -69,6 +70,16 @@ def test_what_cannot_be_moved_is_named(panda: nearl.Model) -> None:
     }.items():
         with pytest.raises(ValueError, match=words):
             projector.move_limits(**moved)
+    of_another_kind: dict[str, dict[str, Any]] = {
+        "frame: expected numbers by the name of a limit.*got float 0.1": {"frame": 0.1},
+        "energy: expected a number in J; got str '1'": {"energy": "1"},
+        "plane: expected by the name of a limit a normal and a point, as a pair.*got dict": {"plane": {"wall": {"normal": [0, 1, 0]}}},
+        "body: expected by the name of an obstacle its position and roll": {"body": {"ball": [0.2, 0.5, 0.2]}},
+    }
+    for words, moved in of_another_kind.items():
+        with pytest.raises(TypeError, match=words):
+            projector.move_limits(**moved)
+    projector.move_limits(frame=None, plane=None)
 
 
 def test_a_payload_weighs_what_mujoco_says(rng: np.random.Generator) -> None:

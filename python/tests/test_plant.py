@@ -94,9 +94,13 @@ def test_names_and_numbers_of_a_plant_are_named() -> None:
         ({"joints": ["slide", "slide"], "nv": 2}, ValueError, "names joint `slide` twice: give each joint once"),
         ({"joints": ["slide", "turn"], "nv": 1}, ValueError, "names 2 joints, and has 1 velocity entries"),
         ({"watchdog": None}, TypeError, "watchdog is of NoneType; give a number"),
+        ({"joints": []}, ValueError, "a robot of 0 joints and 1 entries of an action cannot be moved"),
+        ({"nu": 0}, ValueError, "a robot of 1 joints and 0 entries of an action cannot be moved"),
     ):
         with pytest.raises(error, match=said):
             nearl.Plant(name("named"), **{**right, **wrong})
+    with open_plant("named", lockstep=False) as plant, pytest.raises(ValueError, match="episode is -3; give its number, counted from 0"):
+        plant.exchange([0.1], [0.0], [0.1, 0.0], patience=0.0, episode=-3)
 
 
 def test_a_plant_whose_time_stands_still_does_not_spin() -> None:

@@ -212,6 +212,30 @@ def test_a_log_with_a_flipped_bit_is_refused_in_a_sentence(chunks, tmp_path) -> 
         assert verified.returncode == 2 and "cannot be verified" in verified.stderr, "as the sentence says"
 
 
+@pytest.mark.parametrize(
+    ("tick", "metadata", "why"),
+    [
+        ("{}", {}, "tick 1 of its 1 has no number, mode, state or ledger"),
+        ("[1]", {}, "has no attribute"),
+        ('{"tick": 1, "mode": "act", "state": {"q": [NaN]}, "ledger": {}}', {}, "a number that is NaN"),
+        ('{"tick": 1, "mode": "act", "state": {}, "ledger": {}, "due_ns": "x"}', {}, "could not convert string to float"),
+        ('{"tick": 1, "mode": "act", "state": {}, "ledger": {}}', {"dt": "0"}, "a control period of 0 s"),
+        ('{"tick": 1, "mode": "act", "state": {}, "ledger": {}}', {"rows": "hello"}, "Expecting value"),
+    ],
+)
+def test_a_log_that_no_loop_wrote_is_refused_in_a_sentence(tmp_path, tick, metadata, why) -> None:
+    file = tmp_path / "edited.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata("nearl", metadata)
+        writer.add_message(writer.register_channel("tick", "json", writer.register_schema("nearl.Tick", "jsonschema", b"{}")), 1, tick.encode(), 1)
+        writer.finish()
+    with pytest.raises(ReadError, match="is a flight log that is damaged") as error:
+        read_log(file)
+    assert why in str(error.value)
+
+
 def test_what_is_no_regular_file_is_refused_at_once(tmp_path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "endless").symlink_to("/dev/zero")

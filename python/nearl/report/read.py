@@ -100,22 +100,40 @@ def read_log(path: Path) -> Log:
     """A flight log (MCAP, topic ``tick``, JSON messages); of one without its end the ticks that are there, with a warning."""
     metadata, messages, without_end = _content(path)
     try:
-        ticks, swapped = ([json.loads(data) for data in messages.get(topic, [])] for topic in ("tick", "snapshot"))
-    except ValueError as error:
+        ticks, swapped = ([json.loads(data, parse_constant=_no_number) for data in messages.get(topic, [])] for topic in ("tick", "snapshot"))
+    except (ValueError, RecursionError) as error:
         raise ReadError(_damaged(path, error)) from error
     if not ticks:
         why = "the loop ended, or the copy was cut, before the first; give another log" if without_end else "the loop never ran"
         raise ReadError(f"'{path}' holds no ticks; {why}")
     if without_end:
         warnings.warn(f"'{path}' is without its end, and {len(ticks):,} ticks of it are reported: {WITHOUT_END}", stacklevel=2)
-    if any("rows" in entry and json.dumps(entry["rows"]) != json.dumps(json.loads(metadata.get("rows", "[]"))) for entry in swapped):
+    try:
+        return _log(path, metadata, ticks, swapped, without_end)
+    except (ValueError, TypeError, AttributeError, KeyError) as error:
+        raise ReadError(_damaged(path, error)) from error
+
+
+def _log(path: Path, metadata: dict[str, str], ticks: list[dict[str, Any]], swapped: list[dict[str, Any]], without_end: bool) -> Log:
+    """The log of these ticks; what another program than `nearl run` could not have written is some error of Python."""
+    rows = json.loads(metadata.get("rows", "[]"))
+    if "dt" in metadata and not float(metadata["dt"]) > 0.0:
+        raise ValueError(f"a control period of {metadata['dt']} s")
+    lacks = next((i for i, tick in enumerate(ticks) if not {"tick", "mode", "state", "ledger"} <= tick.keys()), None)
+    if lacks is not None:
+        raise ValueError(f"tick {lacks + 1} of its {len(ticks):,} has no number, mode, state or ledger")
+    if any("rows" in entry and json.dumps(entry["rows"]) != json.dumps(rows) for entry in swapped):
         metadata.pop("rows", None)  # a later snapshot numbers its rows otherwise
     columns = {name: np.array([_at(tick, keys) for tick in ticks]) for name, keys in _NUMBERS.items()}
     columns["target_violations"][columns["outside"] > 0] = 0.0  # from outside a target can only come nearer: `nearl run` counts these as recovering
     table = {key: _table([tick.get(key) for tick in ticks]) for key in ("proposal_q", "proposal_v", "target_q", "target_v")}
-    state = {key: _table([tick.get("state", {}).get(key) for tick in ticks]) for key in ("q", "v")}
-    active = [tick.get("ledger", {}).get("active_rows") or [] for tick in ticks]
-    return Log(path, metadata, columns, **state, **table, mode=[str(tick.get("mode")) for tick in ticks], active=active, without_end=without_end)
+    state = {key: _table([tick["state"].get(key) for tick in ticks]) for key in ("q", "v")}
+    active = [tick["ledger"].get("active_rows") or [] for tick in ticks]
+    return Log(path, metadata, columns, **state, **table, mode=[str(tick["mode"]) for tick in ticks], active=active, without_end=without_end)
+
+
+def _no_number(constant: str) -> float:
+    raise ValueError(f"a number that is {constant}")
 
 
 def _content(path: Path) -> tuple[dict[str, str], dict[str, list[bytes]], bool]:
