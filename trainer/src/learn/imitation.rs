@@ -189,14 +189,7 @@ impl Cloning<'_> {
         rng: &mut ChaCha8Rng,
     ) -> f64 {
         let adam = vec![Adam::new(self.range.len(), s.lr)];
-        let mut params = Params {
-            groups: vec![group.clone()],
-            adam,
-            beta: 0.0,
-            adapted: 1.0,
-            catches_up: false,
-            ranks: None,
-        };
+        let mut params = Params { groups: vec![group.clone()], adam, beta: 0.0, adapted: 1.0, ranks: None };
         let schedule = Schedule { epochs: 1, minibatch: s.batch_size, threads, rate: 1.0, clip: 1.0 };
         let mut error = f64::NAN;
         for _ in 0..s.epochs {

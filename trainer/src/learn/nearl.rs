@@ -103,14 +103,7 @@ impl Nearl {
             Adam::new(combined.len, lr),
             Adam::new(combined.value.len, value_lr),
         ];
-        let params = Params {
-            groups: vec![actor, critic],
-            adam,
-            beta: 0.0,
-            adapted: 1.0,
-            catches_up: false,
-            ranks: None,
-        };
+        let params = Params { groups: vec![actor, critic], adam, beta: 0.0, adapted: 1.0, ranks: None };
         Self { nets: Nets { settings, combined }, params, threads }
     }
 

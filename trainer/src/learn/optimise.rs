@@ -48,8 +48,6 @@ pub struct Params {
     pub beta: f32,
     /// Factor on the rates of policy and value that holds the divergence of an update (`train.ppo.desired_kl`).
     pub adapted: f32,
-    /// The inverse model goes on learning from the next batch, whatever the threshold (`train.pid2.keep_actions`).
-    pub catches_up: bool,
     /// The other ranks of the training, which compute some of the shards.
     pub ranks: Option<Arc<Ranks>>,
 }

@@ -11,12 +11,9 @@
 //! [`INVERSE`] comes first, over the whole batch, whose log probabilities are then those of the model that learned: PPO's ratio begins
 //! at 1. The other losses run on each minibatch in the order of [`ACTOR`], [`VALUE`], [`GENERATOR`], [`DISCRIMINATOR`]. The gradient of
 //! `log I(a | s_c, C(pi(s)))` reaches the policy through the inverse model's input and the projection: one inside the bounds, zero
-//! where the projection clamped. The adversarial loss pulls at the proposal as a whole, or only at what the action leaves free of it
-//! (`null_space`).
-//!
-//! An inverse model that learns by itself makes other actions of the same proposals: beside [`INVERSE`] and after each of its passes the
-//! policy learns to propose what leads to the actions of before ([`KEEP`]). One that the policy cannot follow learns no more from the
-//! batch; one that gains learns from the next batch too.
+//! where the projection clamped. An inverse model that learns by itself makes other actions of the same proposals: beside [`INVERSE`]
+//! the policy learns to propose what leads to the actions of before ([`KEEP`]). The adversarial loss pulls at the proposal as a whole,
+//! or only at what the action leaves free of it (`null_space`).
 
 mod adversary;
 mod demonstrated;
@@ -59,8 +56,8 @@ pub struct Pid2Settings {
     /// The policy gradient moves the inverse model too. Otherwise only what was reached does, so that proposals stay nearer to it; the policy
     /// learns through the inverse model either way. No effect with analytic inverse dynamics.
     pub idm_policy_gradient: bool,
-    /// Where the inverse model learns from reached transitions, the policy learns to put out the same mean actions through it, and a model
-    /// that the policy cannot follow learns no more from that batch. No effect where proposals are random or inverse dynamics analytic.
+    /// Where the inverse model learns from reached transitions, the policy learns to put out the same mean actions through it. No effect
+    /// where proposals are random or inverse dynamics analytic.
     pub keep_actions: bool,
     /// What of a row of actions is compared with the threshold.
     pub idm_threshold_per: ThresholdPer,
@@ -134,13 +131,6 @@ pub const GENERATOR: usize = 4;
 /// Phase in which the policy puts out the actions of before through an inverse model that learned.
 pub const KEEP: usize = 5;
 
-/// Divergence of the mean actions within which the policy follows the inverse model \[nat\]: about that of an update of a policy.
-const NEAR: f64 = 0.02;
-/// Part of its error that an inverse model has to lose in an update to go on learning from the next batch.
-const GAIN: f64 = 0.1;
-/// Passes of [`KEEP`] alone at most, after each of [`INVERSE`].
-const FOLLOWING: usize = 20;
-
 /// The learner.
 pub struct Pid2 {
     nets: Nets,
@@ -174,13 +164,6 @@ impl Nets {
     /// An action is what the inverse model makes of the mean proposal.
     fn acts_through_inverse(&self) -> bool {
         self.combined.inverse.is_some() && self.combined.policy_log_std.is_none()
-    }
-
-    /// Divergence of the mean actions from those of before the inverse model learned \[nat\].
-    fn moved(&self, params: &Params, batch: &Batch, threads: usize) -> f64 {
-        let (group, mut now) = (&params.groups[COMBINED], Vec::new());
-        self.combined.mean_actions(group, batch, threads, &mut now);
-        self.combined.divergence(&group.p, &self.kept, &now)
     }
 
     /// The rows by which a pass reads the table of latent noise apart from the others: no sample meets the same noise
@@ -250,7 +233,6 @@ impl Pid2 {
             adam,
             beta: settings.beta,
             adapted: 1.0,
-            catches_up: false,
             ranks: None,
         };
         let nets = Nets {
@@ -269,9 +251,8 @@ impl Pid2 {
         &self.params.groups[COMBINED].p
     }
 
-    /// The inverse model learns by itself ([`INVERSE`]), and the policy follows it ([`KEEP`]) in the same minibatches and after each pass. An inverse
-    /// model that the policy cannot follow learns no more from this batch. Returns the divergence of the mean actions from those of before
-    /// \[nat\]; 0 where no action is put out through the inverse model.
+    /// The inverse model learns by itself ([`INVERSE`]), and the policy keeps its actions beside it ([`KEEP`]). Returns the divergence of the
+    /// mean actions from those of before \[nat\]; 0 where no action is put out through the inverse model.
     fn learn_from_what_was_reached(
         &mut self,
         batch: &Batch,
@@ -284,32 +265,11 @@ impl Pid2 {
             return 0.0;
         }
         nets.combined.mean_actions(&params.groups[COMBINED], batch, *threads, &mut nets.kept);
-        if !nets.settings.keep_actions {
-            optimise(nets, params, batch, &[INVERSE], schedule, rng);
-            return nets.moved(params, batch, *threads);
-        }
-        let mut divergence = 0.0;
-        for _ in 0..schedule.epochs {
-            let mut pass = Schedule { epochs: 1, ..schedule };
-            optimise(nets, params, batch, &[INVERSE, KEEP], pass, rng);
-            divergence = nets.moved(params, batch, *threads);
-            for _ in 0..FOLLOWING {
-                if divergence <= NEAR {
-                    break;
-                }
-                optimise(nets, params, batch, &[KEEP], pass, rng);
-                let now = nets.moved(params, batch, *threads);
-                // Steps of the optimiser that lead past the nearest are too long.
-                if now > divergence {
-                    pass.rate *= 0.7;
-                }
-                divergence = now;
-            }
-            if divergence > NEAR {
-                break;
-            }
-        }
-        divergence
+        let phases = if nets.settings.keep_actions { &[INVERSE, KEEP][..] } else { &[INVERSE] };
+        optimise(nets, params, batch, phases, schedule, rng);
+        let (group, mut now) = (&params.groups[COMBINED], Vec::new());
+        nets.combined.mean_actions(group, batch, *threads, &mut now);
+        nets.combined.divergence(&group.p, &nets.kept, &now)
     }
 }
 
@@ -319,8 +279,7 @@ impl Learner for Pid2 {
         let (ppo, threads) = (self.nets.combined.ppo.clone(), self.threads);
         let (s, n_act) = (self.nets.settings.clone(), self.nets.combined.dims.n_act);
         let before = self.nets.combined.idm_error(self.actor(), batch, threads);
-        let exceeds = before.is_some_and(|e| s.idm_threshold_per.exceeds(e, n_act, s.idm_threshold));
-        let inverse_learns = exceeds || self.params.catches_up;
+        let inverse_learns = before.is_some_and(|e| s.idm_threshold_per.exceeds(e, n_act, s.idm_threshold));
         let opposed = s.generator_weight > 0.0;
         let mut phases = vec![ACTOR, VALUE];
         if opposed && s.generator_lr > 0.0 {
@@ -332,12 +291,8 @@ impl Learner for Pid2 {
         let update = Update { ppo: &ppo, pace, threads, phases: &phases, actor: ACTOR };
         let mut divergence = 0.0;
         if inverse_learns {
-            divergence =
-                self.learn_from_what_was_reached(batch, Schedule { rate: 1.0, ..update.schedule() }, rng);
+            divergence = self.learn_from_what_was_reached(batch, update.schedule(), rng);
             batch.log_prob = self.nets.combined.log_probs(&self.params.groups[COMBINED], batch, threads);
-            let now = self.nets.combined.idm_error(self.actor(), batch, threads);
-            let gains = now.zip(before).is_some_and(|(now, before)| now < (1.0 - GAIN) * before);
-            self.params.catches_up = gains && s.keep_actions && self.nets.acts_through_inverse();
         }
         if opposed {
             self.nets.noise.resize(batch.n * LATENT, 0.0);
@@ -518,7 +473,7 @@ impl Phases for Nets {
         }
     }
     fn is_paced(&self, phase: usize) -> bool {
-        !matches!(phase, INVERSE | DISCRIMINATOR)
+        !matches!(phase, INVERSE | DISCRIMINATOR | KEEP)
     }
     fn max_norm(&self, phase: usize) -> f32 {
         if matches!(phase, ACTOR | VALUE) { self.combined.ppo.max_grad_norm } else { f32::INFINITY }

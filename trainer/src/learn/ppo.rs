@@ -152,7 +152,7 @@ impl Ppo {
         let rates = [settings.lr, settings.rate_of_value(), settings.lr];
         let adam = groups.iter().zip(rates).map(|(g, lr)| Adam::new(g.p.len(), lr)).collect();
         let nets = Nets { dims, settings, policy, log_std, value, inverse, len: at, term: None };
-        let mut params = Params { groups, adam, beta: 0.0, adapted: 1.0, catches_up: false, ranks: None };
+        let mut params = Params { groups, adam, beta: 0.0, adapted: 1.0, ranks: None };
         [ACTOR, VALUE, INVERSE].iter().for_each(|&phase| nets.refresh(phase, &mut params));
         Self { nets, params, threads }
     }

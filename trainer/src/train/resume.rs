@@ -42,7 +42,6 @@ impl Training {
         }
         put("beta".into(), Values::F32(vec![params.beta]));
         put("adapted".into(), Values::F32(vec![params.adapted]));
-        put("catches_up".into(), Values::F32(vec![f32::from(u8::from(params.catches_up))]));
         put("stats.obs".into(), Values::F64(self.obs_stats.to_vec()));
         if self.dims.n_privileged > 0 {
             put("stats.privileged".into(), Values::F64(self.privileged_stats.to_vec()));
@@ -202,7 +201,6 @@ fn restore_params(params: &mut Params, from: &mut Checkpoint) -> Result<(), Stri
     }
     params.beta = from.take_f32("beta", 1)?[0];
     params.adapted = from.take_f32("adapted", 1)?[0];
-    params.catches_up = from.take_f32("catches_up", 1)?[0] != 0.0;
     let (have, need) = (from.header.adam.len(), params.adam.len());
     if have != need {
         return Err(format!("it has {have} optimisers where the algorithm has {need}"));

@@ -378,7 +378,7 @@ fn actions_stay_where_the_inverse_model_learns() {
             generator_weight: 0.0,
             ..Pid2Settings::default()
         };
-        let ppo = PpoSettings { lr: 1e-12, log_std: -2.0, n_epochs: 40, ..PpoSettings::default() };
+        let ppo = PpoSettings { lr: 1e-12, log_std: -1.0, n_epochs: 40, ..PpoSettings::default() };
         let (kind, mut rng) = (Kind { stochastic: false, learned: true }, crate::rollout::stream(5, 0));
         let nets = NetSettings::default();
         let mut l = Pid2::new(dims(), &nets, ppo.clone(), settings, kind, true, 1, &mut rng);
@@ -393,16 +393,13 @@ fn actions_stay_where_the_inverse_model_learns() {
         let squares = before.iter().zip(&after).map(|(a, b)| f64::from(a - b).powi(2));
         let square = squares.sum::<f64>() / b.n as f64;
         let divergence = 0.5 * square / f64::from(ppo.log_std).exp().powi(2);
-        assert!(
-            (of("idm/divergence") / divergence - 1.0).abs() < 1e-4,
-            "{} {divergence}",
-            of("idm/divergence")
-        );
+        let told = of("idm/divergence");
+        assert!((told / divergence - 1.0).abs() < 1e-4, "{told} {divergence}");
         divergence
     };
     let (without, with) = (moved(false), moved(true));
     println!("divergence of the mean actions: {without:.4} without and {with:.4} with");
-    assert!(with < 1.5 * NEAR && without > 10.0 * NEAR, "{without} {with}");
+    assert!(with < 0.3 * without && without > 0.01, "{without} {with}");
 }
 
 /// Fresh proposals are those of the policy as it is, to the bit where nothing is added.
