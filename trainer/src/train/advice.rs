@@ -204,6 +204,22 @@ mod tests {
     use crate::preset::Preset;
     use crate::tasks;
 
+    /// What a guard cannot be beside is to be taken out first.
+    #[test]
+    fn limits_that_hold_for_nothing_lead_to_a_task_that_is_taken() {
+        for (own, first) in [
+            ("velocity.limit=10.0", "guard is off; add guard = true"),
+            ("reached=0.02", "guard is off; take reached out and add guard = true"),
+            ("action.square=2.0", "guard is off; take [constraints.action] out and add guard = true"),
+        ] {
+            let set = vec!["constraints.velocity.limit=8.0".into(), format!("constraints.{own}")];
+            let mut manifest = tasks::load_with("HalfCheetah-v5", None, &set).expect("task");
+            crate::train::complete(&mut manifest).expect("environment");
+            let lines = advice(Algorithm::Ppo, &manifest).expect("advice");
+            assert!(lines.iter().any(|line| line.contains(first)), "{own}: {lines:?}");
+        }
+    }
+
     /// 2048 steps a batch: one for the statistics and eight of the warm-up.
     #[test]
     fn a_run_that_ends_in_its_warm_up_is_told_so() {
