@@ -163,7 +163,7 @@ impl Training {
     }
 
     /// Asks for `steps` more, at whose end the learning rate falls to zero, and holds the run folder until `end`. What there is to warn of:
-    /// that they end before a reward is read.
+    /// that they end before a reward, or a demonstration, is read.
     fn begin(&self, py: Python<'_>, steps: u64) -> PyResult<Option<String>> {
         py.detach(|| {
             let mut inner = self.lock();
