@@ -424,6 +424,31 @@ fn places(what: &str, expected: &str, value: &Bound<'_, PyAny>) -> PyResult<Plac
     given(what, expected, value, |v| v.extract().ok())
 }
 
+/// Numbers by joint, if any; a refusal names the argument.
+fn values(what: &str, value: &Bound<'_, PyAny>) -> PyResult<Option<Values>> {
+    given(what, Takes::PerJoint.expected(), value, |v| v.extract().ok())
+}
+
+/// The argument `velocity`.
+pub(crate) fn velocity(value: &Bound<'_, PyAny>) -> PyResult<Option<Values>> {
+    values("velocity", value)
+}
+
+/// The argument `acceleration`.
+pub(crate) fn acceleration(value: &Bound<'_, PyAny>) -> PyResult<Option<Values>> {
+    values("acceleration", value)
+}
+
+/// The argument `lower`.
+pub(crate) fn lower(value: &Bound<'_, PyAny>) -> PyResult<Option<Values>> {
+    values("lower", value)
+}
+
+/// The argument `upper`.
+pub(crate) fn upper(value: &Bound<'_, PyAny>) -> PyResult<Option<Values>> {
+    values("upper", value)
+}
+
 /// The argument `frame`.
 pub(crate) fn frame(value: &Bound<'_, PyAny>) -> PyResult<Named> {
     named("frame", value)

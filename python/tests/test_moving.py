@@ -72,6 +72,8 @@ def test_what_cannot_be_moved_is_named(panda: nearl.Model) -> None:
             projector.move_limits(**moved)
     of_another_kind: dict[str, dict[str, Any]] = {
         "frame: expected numbers by the name of a limit.*got float 0.1": {"frame": 0.1},
+        "velocity: expected a number for all joints.*got str 'fast'": {"velocity": "fast"},
+        "upper: expected a number for all joints.*got tuple": {"upper": ("a", "b")},
         "energy: expected a number in J; got str '1'": {"energy": "1"},
         "plane: expected by the name of a limit a normal and a point, as a pair.*got dict": {"plane": {"wall": {"normal": [0, 1, 0]}}},
         "body: expected by the name of an obstacle its position and roll": {"body": {"ball": [0.2, 0.5, 0.2]}},

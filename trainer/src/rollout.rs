@@ -49,10 +49,7 @@ pub enum RolloutError {
         free: u64,
     },
     /// The policy saw what is no finite number.
-    #[error(
-        "{what} of '{task}' came out as {value}, and no policy can act on it; look for a logarithm, root or quotient that leaves its domain, there or in \
-         [commands], [noise], [delay] or [pushes]"
-    )]
+    #[error("{what} of '{task}' came out as {value}, and no policy can act on it; {WHERE_TO_LOOK}")]
     Odd {
         /// Task.
         task: String,
@@ -74,6 +71,9 @@ pub enum RolloutError {
         env_says: String,
     },
 }
+
+/// Where an observation that is no number may come from.
+pub(crate) const WHERE_TO_LOOK: &str = "look for a logarithm, root or quotient that leaves its domain, there or in [commands], [noise], [delay] or [pushes]";
 
 /// Portions of the work a thread takes, at least.
 const PORTIONS: usize = 32;

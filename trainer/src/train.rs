@@ -24,7 +24,7 @@ use crate::checkpoint::CheckpointError;
 use crate::demos::DemoError;
 use crate::evaluate::evaluate_by;
 use crate::learn::{Algorithm, Batch, Dims, Learner, Metrics, Pace, Params, Stretch, UnknownAlgorithm};
-use crate::rollout::{Collected, RolloutError, Scorer, Segment, Tally, nth, stream};
+use crate::rollout::{Collected, RolloutError, Scorer, Segment, Tally, WHERE_TO_LOOK, nth, stream};
 use crate::run_folder::RunError;
 use crate::settings::{ChangeScale, TrainSettings};
 use crate::stats::RunningStats;
@@ -304,8 +304,7 @@ impl Training {
         let (task, steps) = (&self.snapshot.manifest.task, self.snapshot.manifest.steps);
         if let Some((what, value)) = self.source.gathered().iter().find_map(|g| unseen(g, task)) {
             return Err(TrainError::Settings(format!(
-                "{what} of '{}' came out as {value} after {steps} steps, and nothing can be learned from it; look for a logarithm, root or quotient that \
-                 leaves its domain, there or in [commands], [noise], [delay] or [pushes]",
+                "{what} of '{}' came out as {value} after {steps} steps, and nothing can be learned from it; {WHERE_TO_LOOK}",
                 task.name
             )));
         }
