@@ -12,7 +12,7 @@
 //! The brake obeys all of it, so there is always an answer. The next brake is verified for the limit in force, so this limit never moves back.
 //! The goal is put where the fastest way leads: a joint that is too fast, or could not stop in front of its new position limit, slows down by
 //! `A_b`. Where the new limit on a frame, its speed, a body or the energy is not kept yet, all joints slow down in proportion, as fast as one of
-//! them can.
+//! them can; a speed or an energy that one period of this brings within its limit is held to it, and the proposal is followed otherwise.
 //!
 //! A joint of hard jerk goes on speeding up for a while as it begins to brake: `s` is the fastest that its brake becomes, and `r` as far as that goes
 //! ([`smooth`]). For bodies one number is in force on the way: the least distance of all pairs.
@@ -58,9 +58,10 @@ pub(super) struct Moving {
     /// In force: speeds (nv), how fast a dof may speed up (nv).
     speed: Vec<f64>,
     speeding: Vec<f64>,
-    /// Share of its size that each cone is asked for, and that it would have (cones).
+    /// Share of its size that each cone is asked for, that it would have, and whether the state is beyond what is asked for (cones).
     shares: Vec<f64>,
     reached: Vec<f64>,
+    late: Vec<bool>,
     /// The goal is this share of the velocity, as a row or cone is behind.
     slow: Option<f64>,
     /// Some joint is beyond the limits of the build.
@@ -85,6 +86,7 @@ impl Moving {
             speeding: infinite(),
             shares: vec![1.0; cones],
             reached: vec![0.0; cones],
+            late: vec![false; cones],
             slow: None,
             beyond: false,
         };
@@ -248,17 +250,31 @@ impl Projector {
         }
         let Some(stages) = &mut self.coupled else { return };
         let m = &mut self.moving;
-        // As it is, and after a tick of the brake in force.
-        self.tangent.iter_mut().zip(v).for_each(|(step, v)| *step = self.period.dt * v);
-        self.dynamics.integrate(q, &self.tangent, &mut self.integrated);
-        self.checker.shares((q, v), (&self.integrated, v), &self.external, &mut m.reached);
-        let mut slowest: f64 = 1.0;
+        // As it is, and where it leads if no joint slows down.
+        self.checker.shares_of((q, v), &self.external, &mut m.reached);
+        let mut late = false;
         for c in 0..m.shares.len() {
-            if m.reached[c] > m.shares[c] * (1.0 + ROUNDING) {
-                slowest = slowest.min(m.shares[c] / m.reached[c]);
+            m.late[c] = m.reached[c] > m.shares[c] * (1.0 + TOO_FAST);
+            if m.late[c] {
                 name(rows, self.checker.cone_row(c));
             }
+            late |= m.late[c];
         }
+        let mut slowest: f64 = 1.0;
+        if late {
+            self.tangent.iter_mut().zip(v).for_each(|(step, v)| *step = self.period.dt * v);
+            self.dynamics.integrate(q, &self.tangent, &mut self.integrated);
+            self.checker.shares((q, v), (&self.integrated, v), &self.external, &mut m.reached);
+            let late = (0..m.shares.len()).filter(|c| m.late[*c]);
+            slowest = late.fold(1.0, |least: f64, c| least.min(m.shares[c] / m.reached[c]));
+        }
+        let quickest = self.dofs.controllable.iter().filter(|i| v[**i] != 0.0);
+        let most =
+            quickest.fold(1.0, |most: f64, &i| most.min(self.braking[i] * self.period.dt / v[i].abs()));
+        // What a period of slowing down reaches is kept from this tick on, whatever is proposed.
+        let is_jerky = self.dofs.controllable.iter().any(|i| self.limits.jerk[*i].is_finite());
+        let is_near = if is_jerky { !late } else { slowest >= 1.0 - most };
+        // After a tick of the brake in force.
         self.v_stop.copy_from_slice(v);
         for &i in &self.dofs.controllable {
             let stored = self.settings.braking == Braking::Stored && self.backup.stored;
@@ -274,19 +290,23 @@ impl Projector {
             self.tangent[i] = self.period.dt * (v[i] + self.period.kappa * (self.v_stop[i] - v[i]));
         }
         self.dynamics.integrate(q, &self.tangent, &mut self.integrated);
-        self.checker.shares((q, v), (&self.integrated, &self.v_stop), &self.external, &mut m.reached);
+        // The brake is verified for what it keeps, which is less than what its rows ask for.
+        let next = (&self.integrated[..], &self.v_stop[..]);
+        self.checker.shares_of(next, &self.external, &mut m.reached);
         for c in 0..m.shares.len() {
-            let in_force = m.shares[c].max(m.reached[c].min(1.0));
-            stages.sources.set_share(c, in_force);
-            self.checker.set_in_force(c, in_force);
-            if in_force > m.shares[c] * (1.0 + ROUNDING) {
+            let goes_on = m.reached[c].min(1.0) > m.shares[c] * (1.0 + ROUNDING);
+            if goes_on {
                 name(rows, self.checker.cone_row(c));
             }
+            m.late[c] |= goes_on;
         }
-        if slowest < 1.0 || further {
-            let quickest = self.dofs.controllable.iter().filter(|i| v[**i] != 0.0);
-            let most =
-                quickest.fold(1.0, |most: f64, &i| most.min(self.braking[i] * self.period.dt / v[i].abs()));
+        self.checker.shares((q, v), next, &self.external, &mut m.reached);
+        for c in 0..m.shares.len() {
+            let in_force = if m.late[c] { m.shares[c].max(m.reached[c].min(1.0)) } else { m.shares[c] };
+            self.checker.set_in_force(c, in_force);
+            stages.sources.set_share(c, if is_near { m.shares[c] } else { in_force });
+        }
+        if !is_near || further {
             let least = if further { 0.0 } else { slowest };
             m.slow = Some((1.0 - most).max(least));
         }

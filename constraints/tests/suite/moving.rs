@@ -672,3 +672,53 @@ fn a_joint_that_moved_limits_hold_back_is_named_in_every_tick_that_claims_the_ne
         assert!(claims > 3000 && ways > 100, "{claims} {ways}");
     }
 }
+
+/// A moved limit of all joints together is reached and then an ordinary limit: proposals inside of it are followed to the bit, and standing still is one.
+#[test]
+fn a_moved_speed_or_energy_is_left_again_as_it_is_proposed() {
+    for (name, model) in [("small", small_arm()), ("rail", rail_arm())] {
+        for (sub_steps, dt) in [(0, 0.001), (1, 0.002), (5, 0.01)] {
+            for share in [0.3, 0.9] {
+                let mut limits = joints(10.0, None);
+                limits.push(Box::new(FrameSpeedLimit::of("tool", 0.8)));
+                limits.push(Box::new(EnergyLimit::of(4.0)));
+                let all: Vec<usize> = (0..model.nv()).collect();
+                let mut projector =
+                    Projector::new(&model, &limits, &all, Settings::new(dt, sub_steps)).unwrap();
+                projector.move_limits(&Moved::speed(share)).unwrap();
+                let (mut raw, mut target) = (Proposal::new(&model), Target::new(&model));
+                let (mut q, mut v) = (middle(&model), vec![0.0; model.nv()]);
+                let mut random = Random(5);
+                let mut wish = v.clone();
+                let (mut held, mut followed) = (0, 0);
+                for tick in 0..3000 {
+                    if tick % 150 == 0 {
+                        wish.iter_mut().for_each(|w| *w = random.between(-4.0, 4.0));
+                        // The other half of the time it shall stand still.
+                        if tick % 300 == 0 {
+                            wish.fill(0.0);
+                        }
+                    }
+                    for i in 0..model.nv() {
+                        // Never faster away from where it is than the joints can be slowed down.
+                        raw.v[i] = wish[i].clamp(v[i] - 9.0 * dt, v[i] + 9.0 * dt);
+                        raw.q[i] = q[i] + dt * (0.5 * raw.v[i] + 0.5 * v[i]);
+                    }
+                    let status = projector.project(&q, &v, &raw, &mut target);
+                    assert_eq!(target.ledger.target_violations.total(), 0, "{name}, tick {tick}: {status:?}");
+                    assert!(
+                        status != Status::Tightening && status.is_ok(),
+                        "{name} {share} {dt}, tick {tick}: {status:?} {:?}",
+                        target.ledger
+                    );
+                    held += usize::from(target.ledger.active.iter().any(|row| row.row >= model.nv()));
+                    let is_still = target.v.iter().all(|v| v.abs() < 1e-9);
+                    followed += usize::from(tick % 300 == 149 && is_still);
+                    (q, v) = (target.q.clone(), target.v.clone());
+                }
+                assert!(held > 5, "{name} {share} {dt}: held in {held} ticks alone");
+                assert_eq!(followed, 10, "{name} {share} {dt}: it did not stand still as it was proposed");
+            }
+        }
+    }
+}
