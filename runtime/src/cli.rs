@@ -291,9 +291,9 @@ impl RunCommand {
             say(report.to_string().trim_end());
         }
         match report.reason {
+            reason if report.last_mode == Mode::Fault => Err(Ended::failure(FAULT, reason, &self.plant)),
             Reason::PlantGone => Err(Ended::failure(PLANT_GONE, report.reason, &self.plant)),
             Reason::MemoryTorn => Err(Ended::failure(MEMORY_TORN, report.reason, &self.plant)),
-            reason if report.last_mode == Mode::Fault => Err(Ended::failure(FAULT, reason, &self.plant)),
             _ => Ok(()),
         }
     }

@@ -439,6 +439,8 @@ fn a_run_that_ends_in_fault_says_when_and_why_and_ends_with_its_own_code() {
     for (test, faults, code, says) in [
         ("ends-in-fault", plan(&[(100, 20, FaultKind::State { number: Odd::Nan })]), Some(6), true),
         ("ends-well", plan(&[]), Some(0), false),
+        // Bridged, and the robot has not been there.
+        ("jumps-once", plan(&[(100, 1, FaultKind::Jump { by: 100.0 })]), Some(0), false),
     ] {
         let (name, file) = (Name::new(test), File::new(test, &first));
         let plant = start_with(&name, &first, faults, Duration::from_micros(300));
@@ -462,5 +464,33 @@ fn a_run_that_ends_in_fault_says_when_and_why_and_ends_with_its_own_code() {
             "{stderr}"
         );
         assert_eq!(stdout.contains("ended in fault (bad-states)"), says, "{stdout}");
+        assert_eq!(stdout.contains("implausible 1"), test == "jumps-once", "{stdout}");
+        assert!(!stdout.contains("found outside"), "{stdout}");
+    }
+}
+
+/// A plant that leaves a loop in Fault does not hide it: who starts the plant again must not start the loop again unseen.
+#[test]
+fn a_run_in_fault_whose_plant_leaves_ends_with_the_code_of_fault() {
+    let first = snapshot(1, |_| {});
+    let nan = FaultKind::State { number: Odd::Nan };
+    for (test, faults, code) in [("left-in-fault", plan(&[(100, 20, nan)]), 6), ("left-well", plan(&[]), 3)] {
+        let (name, file) = (Name::new(test), File::new(test, &first));
+        let plant = start_with(&name, &first, faults, Duration::from_micros(300));
+        let mut command = Command::new(env!("CARGO_BIN_EXE_nearl-runtime"));
+        command.arg("run").arg(&file.0).args(["--plant", name.0.as_str(), "--priority", "0"]);
+        command.args(["--seconds", "60", "--plant-patience", "0.5"]);
+        let running = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut viewer = TrainerLink::open(&name.0).unwrap();
+        let begin = Instant::now();
+        while viewer.health().is_none_or(|h| h.tick <= 200) {
+            assert!(begin.elapsed() < PATIENCE, "the loop does not run");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        plant.end();
+        let out = running.wait_with_output().unwrap();
+        let (stdout, stderr) = (String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
+        assert_eq!(out.status.code(), Some(code), "{stdout}{stderr}");
+        assert!(stdout.contains("(plant-gone)"), "{stdout}");
     }
 }
