@@ -115,6 +115,8 @@ pub struct Core<T: LoopController> {
     way: Way,
     /// When the first state of those that tell the same came [ns].
     since: u64,
+    /// Time by the plant's clock \[s\] and number of the last state by which that clock went on: one wrong time is bridged with its state.
+    clock: (f64, u64),
     /// `brake` panicked: it is not called again on this controller. A panic of `tick` latches Fault.
     brake_broken: bool,
 }
@@ -139,6 +141,7 @@ impl<T: LoopController> Core<T> {
             pace: Pace::default(),
             way: Way::new(),
             since: 0,
+            clock: (0.0, 0),
             brake_broken: false,
             settings,
             controller,
@@ -252,6 +255,7 @@ impl<T: LoopController> Core<T> {
         self.pace = Pace::default();
         self.way = resume.way;
         self.since = record.state.header.stamp;
+        self.clock = (record.state.time, record.state.header.seq);
         self.memory.clear();
         self.memory.extend_from_slice(resume.memory());
         self.is_lost = false;
@@ -415,12 +419,19 @@ impl<T: LoopController> Core<T> {
             self.pace = Pace::default();
             self.way.clear();
             self.record.apart = None;
+            self.clock = (state.time, state.header.seq);
         } else if is_doubled {
             self.controller.controller.recall();
         } else {
             left_out = self.go_on(state, lost);
         }
         let is_frozen = is_next && !is_doubled && self.is_frozen(state);
+        let passed = if is_next { self.passed(state) } else { (0.0, 0) };
+        if is_doubled {
+            self.clock.1 = state.header.seq;
+        } else if !is_frozen && state.time.is_finite() {
+            self.clock = (state.time, state.header.seq);
+        }
         if !is_doubled && !is_frozen {
             self.since = state.header.stamp;
         }
@@ -429,7 +440,6 @@ impl<T: LoopController> Core<T> {
         }
         let missed = state.tick.saturating_sub(self.record.state.tick + 1);
         let gap = if is_next && self.settings.real_time { missed.min(lost) } else { 0 };
-        let passed = if is_next { state.time - self.record.state.time } else { 0.0 };
         self.record.state = *state;
         if left_out > 0 {
             self.record.state.bits |= STATE_BRAKED; // nobody knows what held it
@@ -439,10 +449,17 @@ impl<T: LoopController> Core<T> {
         self.event_of_state(is_frozen, gap.max(left_out), passed)
     }
 
+    /// What has passed by the plant's clock up to `state` \[s\] since the last state by which it went on, and how many were between.
+    fn passed(&self, state: &StateMessage) -> (f64, u64) {
+        let (time, seq) = self.clock;
+        (state.time - time, state.header.seq.saturating_sub(seq + 1))
+    }
+
     /// Tells the controller what the plant has done by itself up to `state`, before which `lost` states were: it says how often it had no answer in
     /// time, that to the last state it was given included. Gives the periods that its clock has passed over without a state, where they are more
     /// than may be bridged: the controller then goes on from where the robot is.
     fn go_on(&mut self, state: &StateMessage, lost: u64) -> u64 {
+        let (passed, between) = self.passed(state);
         let (known, controller) = (&self.record.state, &mut self.controller.controller);
         if state.bits & STATE_BRAKED != 0 {
             controller.lose();
@@ -450,8 +467,7 @@ impl<T: LoopController> Core<T> {
         if self.settings.sync == Sync::Clock {
             return 0; // it has answered in every slot, at its own pace
         }
-        let passed = state.time - known.time;
-        let left_out = left_out(passed, lost, &self.settings);
+        let left_out = left_out(passed, between, &self.settings);
         if left_out > 0 {
             controller.lose();
         }
@@ -462,7 +478,7 @@ impl<T: LoopController> Core<T> {
         if alone.max(lost) > 0 {
             controller.miss(alone.max(lost));
         }
-        self.pace.take(passed, lost + 1, self.settings.period);
+        self.pace.take(passed, between + 1, self.settings.period);
         left_out
     }
 
@@ -483,8 +499,8 @@ impl<T: LoopController> Core<T> {
         self.record.apart = self.way.take(known, state, nominal, self.controller.controller.speeds());
     }
 
-    /// What the state just taken is worth, `passed` [s] of the plant's clock after the one before it.
-    fn event_of_state(&mut self, is_frozen: bool, gap: u64, passed: f64) -> Event {
+    /// What the state just taken is worth, `passed` [s] of the plant's clock after the last by which it went on, with so many between.
+    fn event_of_state(&mut self, is_frozen: bool, gap: u64, (passed, between): (f64, u64)) -> Event {
         let (state, counters) = (&self.record.state, &mut self.record.counters);
         if !state.is_finite() {
             counters.bad_states += 1;
@@ -504,7 +520,8 @@ impl<T: LoopController> Core<T> {
         }
         if jump > 0.0 && self.held.is_some() {
             let ticks = state.tick.saturating_sub(self.estimate.tick).max(1);
-            let age = (ticks as f64 * self.settings.period as f64 * 1e-9).max(passed);
+            let period = self.settings.period as f64 * 1e-9;
+            let age = (ticks as f64 * period).max(passed - between as f64 * period);
             if self.controller.controller.implausible(&self.estimate, state, age, jump).is_some() {
                 counters.implausible_states += 1;
                 return self.hold(Reason::ImplausibleState);

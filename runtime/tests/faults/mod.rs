@@ -145,6 +145,13 @@ fn fault_24_stale_and_frozen_samples_brake() {
     assert_eq!(back.at(403), (Mode::Braking, Reason::FrozenState));
     assert_eq!((back.counters().frozen_states, back.at(600).0), (8, Mode::Active));
     back.assert_within_limits(ROUNDING);
+    // One wrong time alone is bridged: what follows is compared with the last right one, and nothing was lost.
+    let once =
+        Flight::of(&[(400, 1, FaultKind::Back { by: 0.1 }), (450, 2, FaultKind::Back { by: 0.1 })], 600);
+    assert_eq!(once.at(400), (Mode::Degraded, Reason::FrozenState));
+    assert_eq!((once.counters().frozen_states, once.counters().lost_states), (3, 0));
+    assert_eq!((once.first(Mode::Braking), once.at(600).0), (None, Mode::Active));
+    once.assert_within_limits(ROUNDING);
 }
 
 #[test]
