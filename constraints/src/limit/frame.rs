@@ -143,7 +143,7 @@ impl FrameLimit {
             let n = normal.map(|x| x / length);
             let offset = dot(n, through);
             check(&format!("a point of the plane of frame '{frame}'"), offset, true, "finite, in m")?;
-            planes.push(Plane { name: frame.clone(), n, offset });
+            planes.push(Plane { name: self.label().to_string(), n, offset });
         }
         if let Some(FrameBox { lower, upper }) = s.inside {
             for (k, axis) in ["x", "y", "z"].iter().enumerate() {
@@ -158,7 +158,7 @@ impl FrameLimit {
                     let mut n = [0.0; 3];
                     n[k] = sign;
                     if end.is_finite() {
-                        let name = format!("{frame} {side} {axis} = {}", sign * end);
+                        let name = format!("{} {side} {axis} = {}", self.label(), sign * end);
                         planes.push(Plane { name, n, offset: end });
                     }
                 }

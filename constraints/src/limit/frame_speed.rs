@@ -93,7 +93,7 @@ impl Limit for FrameSpeedLimit {
         check(&format!("point of frame '{}'", s.frame), s.point.iter().sum(), true, "finite, in m")?;
         let limit = less(&format!("speed margin of frame '{}'", s.frame), s.limit, s.margin)?;
         Ok(Some(Box::new(SpeedCone {
-            name: s.frame.clone(),
+            name: self.label().to_string(),
             frame,
             point: s.point,
             limit,

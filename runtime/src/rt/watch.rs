@@ -132,7 +132,8 @@ impl Watch {
             let _ = tell.try_send((record.tick, record.mode, record.reason));
         }
         let is_elsewhere = matches!(record.reason, Reason::ImplausibleState | Reason::ImplausibleStates);
-        if is_elsewhere && record.fresh {
+        // One that was bridged was not acted upon: the robot has not been there.
+        if is_elsewhere && record.fresh && record.sensed != Sensed::Predicted {
             self.name(record);
         }
         if let Some(apart) = record.apart {

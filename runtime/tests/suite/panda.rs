@@ -161,7 +161,7 @@ fn a_joint_found_outside_its_limits_is_named_in_the_report() {
 #[test]
 fn a_limit_of_several_joints_that_was_left_is_named_in_the_report() {
     let name = Name::new("panda-above");
-    let ceiling = "frame = [{ frame = \"panda_hand\", braking = 1.0, \
+    let ceiling = "frame = [{ name = \"ceiling\", frame = \"panda_hand\", braking = 1.0, \
                    half_space = { normal = [0, 0, 1], through = [0, 0, 0.3] } }]";
     let first = snapshot(1, |m| {
         m.task.constraints.frame = toml::from_str::<ConstraintSettings>(ceiling).unwrap().frame
@@ -172,9 +172,9 @@ fn a_limit_of_several_joints_that_was_left_is_named_in_the_report() {
     let report = execute_with(&name, &file.0, &Stop::new(), settings).join().unwrap().unwrap();
     plant.end();
     let [found] = &report.outside[..] else { panic!("{report}") };
-    assert!(found.joint.is_empty() && found.row == "limit 'panda_hand' of kind frame", "{found}");
+    assert!(found.joint.is_empty() && found.row == "limit 'ceiling' of kind frame", "{found}");
     let text = report.to_string();
-    assert!(text.contains("found outside    limit 'panda_hand' of kind frame (no joint is beyond"), "{text}");
+    assert!(text.contains("found outside    limit 'ceiling' of kind frame (no joint is beyond"), "{text}");
 }
 
 #[test]

@@ -167,7 +167,7 @@ fn every_convention_of_sub_steps_and_every_way_to_brake_is_verified() {
 /// What ties joints together: planes, the speed of the hand, energy, bodies, a motor's line, a user's rows, soft rates.
 const COUPLED: [&str; 7] = [
     "frame = [{ frame = \"panda_hand\", half_space = { normal = [0, 0, -1], through = [0, 0, 0.4] }, braking = 2.0 }]",
-    "frame_speed = [{ frame = \"panda_hand\", limit = 0.3 }]",
+    "frame_speed = [{ name = \"tip\", frame = \"panda_hand\", limit = 0.3 }]",
     "energy = { limit = 0.5 }",
     "collision = { shapes = [{ frame = \"panda_hand\", shape = { sphere = { radius = 0.1 } } }, \
      { name = \"floor\", shape = \"half_space\", position = [0, 0, 0.3] }, \
@@ -492,16 +492,16 @@ fn orders(dt: f64, kinds: &str) -> Vec<(u64, Moved)> {
         Moved::speed(0.02),
         Moved::default(),
     ];
-    let hand = |x: f64| [("panda_hand".to_owned(), x)].into();
+    let only = |name: &str, x: f64| [(name.to_owned(), x)].into();
     for moved in &mut all {
         if *moved == Moved::default() {
             continue;
         }
         if kinds.contains("\nframe = [") {
-            moved.frame = hand(0.05);
+            moved.frame = only("panda_hand", 0.05);
         }
         if kinds.contains("frame_speed") {
-            moved.frame_speed = hand(0.1);
+            moved.frame_speed = only("tip", 0.1);
         }
         if kinds.contains("energy = ") {
             moved.energy = Some(0.1);

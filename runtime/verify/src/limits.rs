@@ -460,8 +460,11 @@ impl Section {
         for speed in &self.frame_speed {
             let (spot, limit) = (of.spot(&speed.frame)?, speed.limit - speed.margin);
             let rule = Rule::Speed { spot, point: speed.point, most: limit };
-            let row = Row::new("frame_speed", &speed.frame, limit, speed.soft, rule);
-            rows.push(Row { label: speed.name.clone().unwrap_or_else(|| speed.frame.clone()), ..row });
+            let label = speed.name.as_ref().unwrap_or(&speed.frame).clone();
+            rows.push(Row {
+                label: label.clone(),
+                ..Row::new("frame_speed", &label, limit, speed.soft, rule)
+            });
         }
         if let Some(energy) = &self.energy {
             let most = energy.limit - energy.margin;
@@ -600,6 +603,7 @@ impl Profiles {
 impl FrameSection {
     fn rows(&self, of: &Of<'_>, rows: &mut Vec<Row>) -> Result<(), String> {
         let spot = of.spot(&self.frame)?;
+        let label = self.name.as_ref().unwrap_or(&self.frame);
         let mut plane = |name: &str, n: Vec3, offset: f64, is_half_space: bool| {
             let rule = Rule::Plane {
                 spot,
@@ -610,11 +614,11 @@ impl FrameSection {
                 half_space: is_half_space.then_some(self.margin),
             };
             let row = Row::new("frame", name, self.braking, self.soft, rule);
-            rows.push(Row { label: self.name.clone().unwrap_or_else(|| self.frame.clone()), ..row });
+            rows.push(Row { label: label.clone(), ..row });
         };
         if let Some(half) = &self.half_space {
             let n = times(1.0 / norm(half.normal), half.normal);
-            plane(&self.frame, n, dot(n, half.through), true);
+            plane(label, n, dot(n, half.through), true);
         }
         if let Some(inside) = &self.inside {
             for (k, axis) in ["x", "y", "z"].iter().enumerate() {
@@ -622,7 +626,7 @@ impl FrameSection {
                     let mut n = [0.0; 3];
                     n[k] = sign;
                     if let Some(end) = end {
-                        plane(&format!("{} {side} {axis} = {end}", self.frame), n, sign * end, false);
+                        plane(&format!("{label} {side} {axis} = {end}"), n, sign * end, false);
                     }
                 }
             }
