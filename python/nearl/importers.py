@@ -185,7 +185,8 @@ def import_sb3(
     made = _policy(layers, mean, std, clip, (low, high) if actions != "actuators" or wrappers else (-math.inf, math.inf))
     if task is not None and robot is None:
         _check_range(low, high, task_of(task), actions)
-    controller = _place(made, robot, recipe, task, name, actions)
+    settings = _rate(model, task) if task is not None and robot is None and recipe is None and actions == "actuators" else []
+    controller = _place(made, robot, recipe, task, name, actions, settings)
     if actions != "actuators":
         _check_task(model, controller)
     return controller
@@ -211,6 +212,11 @@ def _meaning(model: Any, actions: str | None, task: _Path | None) -> str:
 
 # Wrappers of Gymnasium that leave every number of an observation where it is.
 _SAME = frozenset({"DtypeObservation", "FlattenObservation"})
+# Wrappers of Gymnasium and Stable-Baselines3 that change neither observations nor actions, nor how long an action lasts.
+_UNTOUCHED = frozenset({
+    "Autoreset", "ClipAction", "HumanRendering", "Monitor", "NormalizeReward", "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "RecordVideo",
+    "RenderCollection", "RescaleAction", "TimeLimit",
+})  # fmt: skip
 
 
 def _envs(model: Any) -> list[Any]:
@@ -246,6 +252,12 @@ def _rescaling(one: Any) -> list[Any]:
                 f"the model learned behind the wrapper {kind}, which changes actions, and the controller takes what the network puts out; learn without it, "
                 f"or with RescaleAction, which is taken along"
             )
+        elif kind not in _UNTOUCHED | _SAME and not isinstance(one, gymnasium.RewardWrapper):
+            warnings.warn(
+                f"the model learned behind the wrapper {kind}, of which only its environment knows what it does: should it repeat actions or change "
+                f"observations, the controller does neither",
+                stacklevel=5,
+            )
         one = one.env
     return rescaling
 
@@ -258,12 +270,30 @@ def _rescaled(wrapper: Any, layers: list[_Layer], low: np.ndarray, high: np.ndar
     return [*layers, (np.diag(scale), inner_low - scale * low, "identity")], inner_low, inner_high
 
 
-def _check_task(model: Any, controller: Controller) -> None:
-    """Refuses a task that takes proposals for other entries, of other observations or for another time than that which the model learned in."""
+def _native(model: Any) -> Any:
+    """The environment of ours that the model learned in; None where it is another, or it brings none."""
     envs = _envs(model)
     env = envs[0].unwrapped if envs else getattr(model, "get_env", lambda: None)()
-    native = getattr(env, "native", None)
-    if native is None:
+    return getattr(env, "native", None)
+
+
+def _rate(model: Any, task: _Path) -> list[str]:
+    """What a task has to be set to so that its policy acts as often as the model did where it learned."""
+    if (native := _native(model)) is None:
+        return []
+    dt = Env(task_of(task)).dt
+    every = round(native.dt / dt)
+    if every < 1 or abs(every * dt - native.dt) > 1e-9 * native.dt:
+        raise ValueError(
+            f"the model acted every {native.dt:g} s where it learned, and the control period of '{task_of(task)}' is {dt:g} s, of which that is no multiple; "
+            f"give the task that it learned"
+        )
+    return [f"time.policy_every={every}"]
+
+
+def _check_task(model: Any, controller: Controller) -> None:
+    """Refuses a task that takes proposals for other entries, of other observations or for another time than that which the model learned in."""
+    if (native := _native(model)) is None:
         return
     for what, theirs, ours in (
         ("proposes", list(native.action_names), controller.state_names),
@@ -297,9 +327,11 @@ def _check_range(low: np.ndarray, high: np.ndarray, task: str, actions: str) -> 
             )
 
 
-def _place(policy: Policy, robot: _Path | None, recipe: _Recipe, task: _Path | None, name: str, actions: str) -> Controller:
+def _place(
+    policy: Policy, robot: _Path | None, recipe: _Recipe, task: _Path | None, name: str, actions: str, settings: Sequence[str] = ()
+) -> Controller:
     if task is not None and robot is None and recipe is None:
-        return _told(policy.in_task(task_of(task), actions=actions))
+        return _told(policy.in_task(task_of(task), list(settings), actions))
     if robot is None or task is not None:
         raise ValueError("give either task=, or robot= and recipe=")
     if actions != "actuators":
@@ -412,7 +444,7 @@ def _layers(modules: Iterable[tuple[str, Any]]) -> list[_Layer]:
             continue
         elif kind in _FUNCTIONS:
             if getattr(part, "alpha", 1.0) != 1.0 or getattr(part, "beta", 1.0) != 1.0:
-                raise ValueError(f"module {part} has another alpha or beta than 1, which is not known")
+                raise ValueError(f"module {part} has another alpha or beta than 1, which is not known; train it with 1")
             if not layers:
                 raise ValueError(f"module {part} stands before the first linear layer; give the policy's network alone")
             layers = _followed(layers, _FUNCTIONS[kind])

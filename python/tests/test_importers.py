@@ -817,6 +817,34 @@ def test_a_model_that_learned_behind_a_wrapper_of_observations_is_not_taken_for_
         nearl.import_sb3(learned(wrap), task="HalfCheetah-v5")
 
 
+def test_a_model_acts_as_often_as_where_it_learned() -> None:
+    """nearl/Panda-reach steps one control period, and the task's own policies act once in twenty of them."""
+    gymnasium = pytest.importorskip("gymnasium")
+    env = gymnasium.make("nearl/Panda-reach")
+    model = ppo(20, 7, get_env=lambda: SimpleNamespace(envs=[env], has_attr=lambda _: False), get_vec_normalize_env=lambda: None)
+    model.action_space = env.action_space
+    controller = nearl.import_sb3(model, task="Panda-reach")
+    assert controller.policy_every == 1
+    obs = env.reset(seed=4)[0]
+    for _ in range(30):
+        asked = np.clip(model.policy.action_net(model.policy.mlp_extractor.policy_net(obs)), env.action_space.low, env.action_space.high)
+        torque, _ = controller.update(*env.unwrapped.state, obs)
+        np.testing.assert_allclose(torque, asked, rtol=1e-5, atol=1e-5)
+        obs = env.step(asked)[0]
+    vector = nearl.make_vec("Panda-reach", 2)
+    model.get_env = lambda: SimpleNamespace(native=vector.native, has_attr=lambda _: False)
+    every = vector.native.dt / controller.dt
+    assert nearl.import_sb3(model, task="Panda-reach").policy_every == pytest.approx(every)
+
+    class Repeat(gymnasium.Wrapper):
+        """A wrapper of somebody's own."""
+
+    model.get_env = lambda: SimpleNamespace(envs=[Repeat(env)], has_attr=lambda _: False)
+    with pytest.warns(UserWarning, match="behind the wrapper Repeat, of which only its environment knows what it does") as told:
+        nearl.import_sb3(model, task="Panda-reach")
+    assert {one.filename for one in told if "Repeat" in str(one.message)} == {__file__}
+
+
 def test_actions_of_another_range_than_the_motors_are_refused() -> None:
     model = ppo(17, 6)
     model.action_space.high[2] = 2.0
