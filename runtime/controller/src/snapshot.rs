@@ -316,11 +316,16 @@ pub fn one_line(text: &dyn std::fmt::Display) -> String {
     line
 }
 
-/// Writes a file whole: to a name beside it, then renamed, so that no reader ever sees a part of it.
+/// Writes a file whole: to a name beside it, then renamed, so that no reader ever sees a part of it. A link stays, and what it leads to is written.
 ///
 /// # Errors
-/// What the system said.
+/// What the system said; devices, pipes and folders, which are not replaced by a file.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let is_link = std::fs::symlink_metadata(path).is_ok_and(|is| is.is_symlink());
+    let path = &if is_link { std::fs::canonicalize(path)? } else { path.to_path_buf() };
+    if std::fs::metadata(path).is_ok_and(|is| !is.is_file()) {
+        return Err(std::io::Error::other("it is a folder, a device or a pipe, and no file"));
+    }
     let beside = path.with_extension(format!("part{}", std::process::id()));
     let write = || {
         let mut file = std::fs::File::create(&beside)?;

@@ -263,3 +263,33 @@ fn pipes_and_endless_files_are_refused_at_once_by_every_command() {
         }
     }
 }
+
+/// A name that leads elsewhere is no file to be replaced: a link stays and its file is written, and what is no file is refused.
+#[test]
+fn links_are_written_through_and_pipes_are_not_replaced() {
+    let folder = folder();
+    let place = |name: &str| folder.path().join(name);
+    let is_pipe = |name: &str| {
+        use std::os::unix::fs::FileTypeExt;
+        std::fs::symlink_metadata(place(name)).expect("metadata").file_type().is_fifo()
+    };
+    assert!(Command::new("mkfifo").arg(place("pipe")).status().expect("mkfifo").success());
+    std::fs::write(place("real"), "old").expect("real");
+    std::os::unix::fs::symlink("real", place("link")).expect("link");
+    let panda = panda();
+    let panda = panda.to_str().expect("UTF-8");
+    for arguments in [["export", panda, "--out"], ["blank", "two_link.toml", "--out"]] {
+        let with = |out: &'static str| [&arguments[..], &[out]].concat();
+        refused(folder.path(), &with("pipe"), None, "a pipe, and no file; give another path");
+        assert!(is_pipe("pipe"), "{arguments:?}: the pipe is gone");
+        refused(folder.path(), &with("."), None, "a folder");
+        std::fs::write(place("real"), "old").expect("real");
+        let (code, _, error) = limited(folder.path(), &with("link"), None);
+        assert_eq!(code, Some(0), "{arguments:?}: {error}");
+        assert!(std::fs::symlink_metadata(place("link")).expect("link").is_symlink(), "{arguments:?}");
+        assert!(
+            std::fs::read(place("real")).expect("real").len() > 100,
+            "{arguments:?}: the file is the old one"
+        );
+    }
+}
