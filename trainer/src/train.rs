@@ -205,7 +205,7 @@ impl Training {
         check_experience(&settings, &manifest.task, experience)?;
         let batch = settings.n_envs * settings.n_steps;
         check_minibatch(settings.ppo.batch_size, batch)?;
-        let warm_ups = warm_up_steps(request.algo, &settings).div_ceil(batch as u64);
+        let warm_ups = warm_up_steps(request.algo, &settings, manifest.task.idm.kind).div_ceil(batch as u64);
         let state = parts.layout.state();
         let imitation = Imitation::read(request.algo, &settings, &manifest, state, request.steps, warm_ups)?;
         let mut rng = stream(request.seed, LEARNER_STREAM);

@@ -21,7 +21,9 @@ pub(super) fn of(m: &Manifest, parts: &Parts) -> Vec<String> {
     if !moves_by_model(m) {
         notes.retain(|note| !note.starts_with(MADE_UP_FOR) && !note.starts_with("no brake "));
     }
-    if !layout.controllable().iter().any(|&i| by_force(&drives[i])) {
+    // Nothing is made up for by an inverse model that has learned what a robot does, friction and all.
+    let by_equations = m.task.idm.kind == IdmKind::Pinocchio || m.guards() || m.bounds_drives();
+    if !by_equations || !layout.controllable().iter().any(|&i| by_force(&drives[i])) {
         notes.retain(|note| !note.starts_with(MADE_UP_FOR));
     }
     if moves_by_model(m) || m.bounds_drives() {

@@ -4,13 +4,15 @@ use super::TrainError;
 use super::setup::warm_up_steps;
 use crate::demos::{DemoError, Demonstrations};
 use crate::env::{ChaCha8Rng, SeedableRng, convert, unstated_steps};
-use crate::learn::Algorithm;
+use crate::learn::{Algorithm, NearlSettings, Pid2Settings};
 use crate::rollout::RolloutError;
 use crate::settings::TrainSettings;
 use nearl_runtime::constraints::STOP_GAPS;
 use nearl_runtime::controller::Parts;
+use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Manifest, PolicyKind};
 use std::path::Path;
+use toml::Table;
 
 /// Resets looked at, and their seed.
 const RESETS: (usize, u64) = (64, 1);
@@ -29,6 +31,7 @@ pub fn advice(algo: Algorithm, manifest: &Manifest) -> Result<Vec<String>, Train
     }
     let mut lines = nearl_runtime::doctor::advice(&manifest)?;
     lines.extend(vain_penalty(algo, &manifest)?);
+    lines.extend(vain_model(algo, &manifest)?);
     lines.extend(beginnings(&manifest)?);
     let own = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?.demos;
     if algo.demos().is_some() && !own.file.is_empty() && manifest.proposes() {
@@ -50,6 +53,48 @@ fn vain_penalty(algo: Algorithm, manifest: &Manifest) -> Result<Option<String>, 
     }))
 }
 
+/// Settings of the way through a learned inverse model, where the robot's own equations are the inverse model.
+fn vain_model(algo: Algorithm, manifest: &Manifest) -> Result<Option<String>, TrainError> {
+    if algo.is_direct() || manifest.task.idm.kind == IdmKind::Learned {
+        return Ok(None);
+    }
+    let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
+    let differ =
+        |own: Result<Table, _>, usual: Result<Table, toml::ser::Error>, keys: &[&str], section: &str| {
+            let (own, usual) = (own.unwrap_or_default(), usual.unwrap_or_default());
+            let changed = keys.iter().filter(|key| own.get(**key) != usual.get(**key));
+            changed.map(|key| format!("train.{section}.{key}")).collect::<Vec<_>>()
+        };
+    let vain = match algo {
+        Algorithm::Nearl | Algorithm::PpoCombined => {
+            let (own, usual) = (Table::try_from(&settings.nearl), Table::try_from(NearlSettings::default()));
+            differ(own, usual, &["gradient", "idm_threshold", "idm_threshold_per", "idm_lr"], "nearl")
+        }
+        _ => {
+            let (own, usual) = (Table::try_from(&settings.pid2), Table::try_from(Pid2Settings::default()));
+            let keys = [
+                "bound_weight",
+                "gradient",
+                "null_space",
+                "keep_actions",
+                "idm_policy_gradient",
+                "idm_threshold",
+                "idm_threshold_per",
+                "idm_lr",
+            ];
+            differ(own, usual, &keys, "pid2")
+        }
+    };
+    Ok((!vain.is_empty()).then(|| {
+        format!(
+            "idm.kind is \"pinocchio\": the policy explores in its proposals, and no gradient passes projection and inverse model, so that {} would change \
+             nothing; leave {} out, or take idm.kind = \"learned\"",
+            vain.join(", "),
+            if vain.len() == 1 { "it" } else { "them" }
+        )
+    }))
+}
+
 /// Says so where a run of `steps` ends before a reward or a demonstration is read: the first batch fills the statistics, and a warm-up reads neither.
 ///
 /// # Errors
@@ -61,7 +106,7 @@ pub fn ends_in_warm_up(
 ) -> Result<Option<String>, TrainError> {
     let settings = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
     let batch = (settings.n_envs * settings.n_steps) as u64;
-    let warmup = warm_up_steps(algo, &settings);
+    let warmup = warm_up_steps(algo, &settings, manifest.task.idm.kind);
     let end = batch * (1 + warmup.div_ceil(batch));
     let (unread, shorter) = match algo.demos() {
         Some(uses) if uses.warms_up => ("demonstrations", "shorten the warm-up with train.demos.warmup"),
@@ -217,6 +262,34 @@ mod tests {
             crate::train::complete(&mut manifest).expect("environment");
             let lines = advice(Algorithm::Ppo, &manifest).expect("advice");
             assert!(lines.iter().any(|line| line.contains(first)), "{own}: {lines:?}");
+        }
+    }
+
+    #[test]
+    fn settings_of_an_inverse_model_that_does_not_learn_are_named() {
+        let said = |algo, set: &[&str]| {
+            let set: Vec<String> = set.iter().map(|s| (*s).into()).collect();
+            let mut manifest = tasks::load_with("Panda-reach", None, &set).expect("task");
+            crate::train::complete(&mut manifest).expect("environment");
+            let lines = advice(algo, &manifest).expect("advice");
+            lines.into_iter().find(|line| line.contains("would change nothing"))
+        };
+        let both = ["train.pid2.bound_weight=5", "train.pid2.idm_lr=1e-3"];
+        let line = said(Algorithm::Pid2Ib, &both).expect("advice");
+        assert!(line.contains("train.pid2.bound_weight, train.pid2.idm_lr would change nothing"), "{line}");
+        assert_eq!(said(Algorithm::Pid2Ib, &["train.pid2.idm_lr=3e-4", "train.pid2.lr=1e-3"]), None);
+        assert_eq!(said(Algorithm::Nearl, &both), None, "what another algorithm reads");
+        assert!(said(Algorithm::Nearl, &["train.nearl.idm_threshold=0.1"]).is_some());
+        assert_eq!(said(Algorithm::Ppo, &both), None);
+    }
+
+    /// The robot's own equations learn from no noise.
+    #[test]
+    fn an_inverse_model_that_does_not_learn_is_not_warmed_up() {
+        let manifest = tasks::load_with("Panda-reach", None, &[]).expect("task");
+        for (algo, warms_up) in [(Algorithm::Bc, false), (Algorithm::Pid2Il, false), (Algorithm::Soil, true)]
+        {
+            assert_eq!(ends_in_warm_up(algo, 1, &manifest).expect("settings").is_some(), warms_up, "{algo}");
         }
     }
 

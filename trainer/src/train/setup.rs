@@ -72,8 +72,10 @@ pub(super) fn learner(
 }
 
 /// Steps of the warm-up, which comes before the algorithm's first update.
-pub(super) fn warm_up_steps(algo: Algorithm, settings: &TrainSettings) -> u64 {
+pub(super) fn warm_up_steps(algo: Algorithm, settings: &TrainSettings, idm: IdmKind) -> u64 {
     match algo.demos() {
+        // The robot's own equations learn from nothing; who puts out actions has an inverse model beside them that does.
+        Some(_) if idm == IdmKind::Pinocchio && !algo.is_direct() => 0,
         Some(uses) if uses.warms_up => settings.demos.warmup,
         _ => warm_up_of_pid2(algo, settings),
     }
