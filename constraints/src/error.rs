@@ -32,7 +32,7 @@ pub enum ModelError {
         reason: String,
     },
     /// Numbers that cannot be: NaN, lower above upper, negative mass; every one is listed.
-    #[error("{file} holds impossible numbers: {list}; correct them in the file")]
+    #[error("{file} holds impossible numbers: {list}; correct them")]
     Impossible {
         /// File, or "the text".
         file: String,

@@ -15,7 +15,7 @@ pub struct LimitsCommand {
     /// Name of the plant that the loop drives.
     pub name: String,
     /// Share of every limit on speed, above 0 and at most 1.
-    #[arg(long, value_name = "SHARE", required_unless_present_any = ["set", "file", "reset"])]
+    #[arg(long, value_name = "SHARE")]
     pub speed: Option<f64>,
     /// One more limit as TOML, for example `upper = { elbow = 1.0 }`; may stand several times.
     #[arg(long, value_name = "TOML")]
@@ -62,18 +62,75 @@ impl LimitsCommand {
     }
 
     fn moved(&self) -> Result<Moved, Failure> {
+        if self.speed.is_none() && self.set.is_empty() && self.file.is_none() && !self.reset {
+            return Err(
+                "nothing is said to move: give --speed SHARE, --set LIMIT, --file FILE or --reset".into()
+            );
+        }
         let mut text = self.set.join("\n");
         if let Some(file) = &self.file {
             let more = read_task_text(file).map_err(|e| format!("{}: {e}", file.display()))?;
             text = format!("{more}\n{text}");
         }
-        let mut moved: Moved = toml::from_str(&text).map_err(|e| {
+        let unread = |e: toml::de::Error| {
+            let at = e.span().map_or("", |span| text[..span.end].lines().next_back().unwrap_or_default());
             format!(
-                "limits cannot be read: {}; write for example upper = {{ elbow = 1.0 }}",
-                crate::snapshot::one_line(&e.message())
+                "limits cannot be read: {}, in '{}'; write each once, for example upper = {{ elbow = 1.0 }}",
+                crate::snapshot::one_line(&e.message()),
+                crate::snapshot::one_line(&at)
             )
-        })?;
-        moved.speed = self.speed.unwrap_or(moved.speed);
+        };
+        let given: toml::Table = toml::from_str(&text).map_err(unread)?;
+        let mut moved: Moved = toml::from_str(&text).map_err(unread)?;
+        if let Some(share) = self.speed {
+            if let Some(also) = given.get("speed") {
+                return Err(format!(
+                    "--speed {share} and speed = {also} both say the share of speed; give one"
+                )
+                .into());
+            }
+            if !(share > 0.0 && share <= 1.0) {
+                return Err(
+                    format!("--speed {share} is not usable: give a share above 0 and at most 1").into()
+                );
+            }
+            moved.speed = share;
+        }
         Ok(moved)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        limits: LimitsCommand,
+    }
+
+    fn parse(words: &[&str]) -> Result<Moved, String> {
+        let line = Line::parse_from([&["limits", "arm"], words].concat());
+        line.limits.moved().map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn what_is_said_twice_or_not_at_all_is_refused() {
+        assert_eq!(parse(&["--speed", "0.3"]), Ok(Moved::speed(0.3)));
+        assert_eq!(parse(&["--set", "speed = 0.3"]), Ok(Moved::speed(0.3)));
+        assert_eq!(parse(&["--reset"]), Ok(Moved::default()));
+        for (words, says) in [
+            (&[][..], "nothing is said to move: give --speed SHARE, --set LIMIT, --file FILE or --reset"),
+            (&["--speed", "nan"], "--speed NaN is not usable: give a share above 0"),
+            (&["--speed", "0"], "--speed 0 is not usable"),
+            (&["--speed", "0.6", "--set", "speed=0.5"], "--speed 0.6 and speed = 0.5 both say"),
+            (&["--set", "velocity={a=1.9}", "--set", "velocity={b=1.0}"], "duplicate key, in 'velocity'"),
+            (&["--set", "velocty={a=1.9}"], "unknown field `velocty`"),
+        ] {
+            let text = parse(words).unwrap_err();
+            assert!(text.contains(says), "{words:?}: {text}");
+        }
     }
 }
