@@ -21,7 +21,7 @@ from typing import Any
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import names_of
+from nearl.arguments import names_of, whole
 
 
 class Plant:
@@ -59,6 +59,9 @@ class Plant:
         joints = names_of("joints", joints)
         if not joints or nu == 0:
             raise ValueError(f"a robot of {len(joints)} joints and {nu} entries of an action cannot be moved; give at least one of each")
+        nu = whole("nu", nu, 1, "give the number of entries of an action")
+        nq = None if nq is None else whole("nq", nq, 1, "give the number of entries of a configuration")
+        nv = None if nv is None else whole("nv", nv, 1, "give the number of entries of a velocity")
         self._plant = _core.Plant(name, joints, names_of("observation", observation), dt, nu, nq=nq, nv=nv, watchdog=watchdog, lockstep=lockstep)
 
     def exchange(
@@ -90,8 +93,8 @@ class Plant:
             ``("act", action)``, ``("hold", action)`` with the action of before as none came in time, or ``("brake", None)``: there is no loop, it
             is silent, or it leaves braking to the plant. Bring the robot to rest then.
         """
-        if episode < 0:
-            raise ValueError(f"episode is {episode}; give its number, counted from 0")
+        if type(episode) is not int or not 0 <= episode < 2**64:
+            episode = whole("episode", episode, 0, "give its number, counted from 0", 2**64 - 1)
         return self._plant.exchange(q, v, obs, patience, time=time, episode=episode, begins=begins, braked=braked)
 
     @property

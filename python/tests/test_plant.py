@@ -95,6 +95,10 @@ def test_names_and_numbers_of_a_plant_are_named() -> None:
         ({"joints": ["slide", "turn"], "nv": 1}, ValueError, "names 2 joints, and has 1 velocity entries"),
         ({"watchdog": None}, TypeError, "watchdog is of NoneType; give a number"),
         ({"joints": []}, ValueError, "a robot of 0 joints and 1 entries of an action cannot be moved"),
+        ({"joints": [""]}, ValueError, "names joint 0 ``, which is empty, longer than 255 bytes or no plain text"),
+        ({"observation": ["q.slide", "v\n"]}, ValueError, r"names entry of its observation 1 `v\\n`, which is empty"),
+        ({"nq": 0}, ValueError, "nq is 0; give the number of entries of a configuration"),
+        ({"nu": -1}, ValueError, "nu is -1; give the number of entries of an action"),
         ({"nu": 0}, ValueError, "a robot of 1 joints and 0 entries of an action cannot be moved"),
     ):
         with pytest.raises(error, match=said):

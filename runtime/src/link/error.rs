@@ -27,7 +27,9 @@ pub enum LinkError {
         limit: usize,
     },
     /// A plant says of itself what no robot is.
-    #[error("the plant of robot `{name}` {reason}: give each joint once, in the order of v")]
+    #[error(
+        "the plant of robot `{name}` {reason}: give each joint once, in the order of v, as the robot file names it"
+    )]
     Announced {
         /// Robot.
         name: RobotName,

@@ -20,6 +20,9 @@ pub enum Turn<'a> {
 /// The plant announces itself this often [ns].
 const ANNOUNCE: u64 = 100_000_000;
 
+/// Bytes of a name of a joint, or of an entry of the observation.
+const LONGEST_NAME: usize = 255;
+
 /// A plant's link with its watchdog.
 pub struct Exchange {
     link: PlantLink,
@@ -41,6 +44,25 @@ impl Exchange {
     /// # Errors
     /// [`LinkError`]; a second plant of the name is refused.
     pub fn open(name: &RobotName, robot: &Robot, watchdog: f64) -> Result<Exchange, LinkError> {
+        let announced = |reason: String| LinkError::Announced { name: name.clone(), reason };
+        if robot.joints.is_empty() || robot.nq == 0 || robot.nu == 0 {
+            let Robot { joints, nq, nu, .. } = robot;
+            return Err(announced(format!(
+                "has {} joints, {nq} configuration entries and {nu} entries of an action, and cannot be moved",
+                joints.len()
+            )));
+        }
+        let is_name = |name: &String| {
+            !name.is_empty() && !name.contains(char::is_control) && name.len() <= LONGEST_NAME
+        };
+        for (what, names) in [("joint", &robot.joints), ("entry of its observation", &robot.observation)] {
+            if let Some((i, odd)) = names.iter().enumerate().find(|(_, name)| !is_name(name)) {
+                let shown: String = odd.escape_debug().take(20).collect();
+                return Err(announced(format!(
+                    "names {what} {i} `{shown}`, which is empty, longer than {LONGEST_NAME} bytes or no plain text"
+                )));
+            }
+        }
         let link = PlantLink::open(name, robot)?;
         let mut state = StateMessage::zeroed();
         (state.nq, state.nv) = (robot.nq as u32, robot.nv as u32);
