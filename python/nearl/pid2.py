@@ -75,7 +75,7 @@ class PID2:
         seed: Of everything random; the same seed gives the same weights whatever the number of threads.
         threads: At least 1; all cores by default.
         settings: Overrides of the task file by dotted key, e.g. ``{"constraints.velocity.limit": 12.0}``.
-        preset: Settings by name, ``"paper"`` or ``"strong"``; ``settings`` come after them.
+        preset: Settings by name, ``"paper"``, ``"strong"`` or ``"long"``; ``settings`` come after them.
         demos: Demonstrations (``.npz``) for ``bc``, ``soil``, ``dapg``, ``pid2-il``, ``bco`` and ``gaifo``; ``nearl demos record RUN`` writes some.
         run: Run folder to write as ``nearl train`` does, from where the process is now; none by default. Of several ranks the first writes it.
         reward: ``reward(obs, actions, next_obs)``, arrays of n rows in, (n,) out, replaces the task's, as in :func:`nearl.make_vec`; here it is
@@ -304,7 +304,7 @@ def _check_names(algo: Any, preset: Any, settings: Any) -> None:
     if not isinstance(algo, str):
         raise ValueError(f"algo is {algo!r}; give one of {', '.join(name for name, _ in _core.algorithms())}")
     if preset is not None and not isinstance(preset, str):
-        raise ValueError(f"preset is {preset!r}; give 'paper' or 'strong', or leave it out")
+        raise ValueError(f"preset is {preset!r}; give 'paper', 'strong' or 'long', or leave it out")
     if settings is not None and not isinstance(settings, Mapping):
         raise ValueError(f"settings is {settings!r}; give a table by dotted key of the task file, e.g. {{'constraints.velocity.limit': 12.0}}")
 

@@ -173,7 +173,7 @@ def test_mistakes_are_named() -> None:
     ("wrong", "said"),
     [
         ({"algo": None}, "algo is None; give one of ppo, .*pid2-ib"),
-        ({"preset": 3}, "preset is 3; give 'paper' or 'strong'"),
+        ({"preset": 3}, "preset is 3; give 'paper', 'strong' or 'long'"),
         ({"task": None}, r"task is None; give the name of a task, one of nearl.tasks\(\), or a task file"),
         ({"demos": 3}, "demos is 3; give a file of demonstrations"),
         ({"run": 3}, "run is 3; give a folder to write"),
@@ -440,7 +440,7 @@ def test_where_episodes_begin_is_said_for_each_environment() -> None:
 def test_presets_and_algorithms_are_those_of_the_trainer() -> None:
     names = [name for name, _ in nearl.algorithms()]
     assert names[0] == "ppo" and {"nearl", "pid2-gan", "pid2-ib", "ppo-combined"} <= set(names)
-    with pytest.raises(ValueError, match="no preset 'weak'; give one of paper, strong"):
+    with pytest.raises(ValueError, match="no preset 'weak'; give one of paper, strong, long"):
         nearl.PID2(CART_POLE, preset="weak")
     agent = nearl.PID2(CART_POLE, preset="strong", threads=1, settings={"train.n_envs": 2, "train.n_steps": 256})
     agent.learn(1)

@@ -9,6 +9,8 @@ pub enum Preset {
     Paper,
     /// What a search with seeds did best with at a million steps.
     Strong,
+    /// The same with a larger batch, for runs of five million steps and more.
+    Long,
 }
 
 /// What one of them sets.
@@ -20,6 +22,8 @@ pub struct RegisteredPreset {
     pub name: &'static str,
     /// What it is, in one line.
     pub about: &'static str,
+    /// The preset whose settings come first.
+    based_on: Option<Preset>,
     /// Settings for every task.
     common: &'static [&'static str],
     /// Settings for some tasks, which come after them.
@@ -32,6 +36,7 @@ pub const PRESETS: &[RegisteredPreset] = &[
         preset: Preset::Paper,
         name: "paper",
         about: "32 x 32 for all networks, the inverse model affine plus a residual; batch 2048, minibatch 64",
+        based_on: None,
         common: &[
             "train.n_envs=16",
             "train.n_steps=128",
@@ -45,6 +50,7 @@ pub const PRESETS: &[RegisteredPreset] = &[
         preset: Preset::Strong,
         name: "strong",
         about: "64 x 64, 64 environments of 32 steps, minibatch 64, a first spread of e^-0.5; advantages anew before each pass, no further at 0.0225",
+        based_on: None,
         common: &[
             "train.n_envs=64",
             "train.n_steps=32",
@@ -99,6 +105,14 @@ pub const PRESETS: &[RegisteredPreset] = &[
             ),
         ],
     },
+    RegisteredPreset {
+        preset: Preset::Long,
+        name: "long",
+        about: "`strong` with 64 environments of 256 steps and minibatches of 512, for five million steps and more",
+        based_on: Some(Preset::Strong),
+        common: &["train.n_envs=64", "train.n_steps=256", "train.ppo.batch_size=512"],
+        tasks: &[],
+    },
 ];
 
 /// A name that no preset has.
@@ -126,7 +140,10 @@ impl Preset {
     pub fn overrides(self, task: &str) -> Vec<String> {
         let e = self.entry();
         let own = e.tasks.iter().filter(|(name, _)| *name == task).flat_map(|(_, set)| *set);
-        e.common.iter().chain(own).map(|set| (*set).to_string()).collect()
+        let own = e.common.iter().chain(own).map(|set| (*set).to_string());
+        let mut all = e.based_on.map_or_else(Vec::new, |base| base.overrides(task));
+        all.extend(own);
+        all
     }
 }
 
@@ -172,7 +189,11 @@ mod tests {
         assert_eq!(settings.nets.idm, Vec::<usize>::new(), "what neither says stays the task file's");
         assert_eq!(
             "weak".parse::<Preset>().unwrap_err().to_string(),
-            "no preset 'weak'; give one of paper, strong"
+            "no preset 'weak'; give one of paper, strong, long"
         );
+        let long = tasks::load_with("HalfCheetah-v5", Some(Preset::Long), &[]).expect("task");
+        let settings = TrainSettings::read(&long.task.train).expect("settings");
+        assert_eq!((settings.n_envs, settings.n_steps, settings.ppo.batch_size), (64, 256, 512));
+        assert_eq!((settings.ppo.lr, settings.pid2.lr), (1e-3, 5e-4), "what strong has for the task");
     }
 }
