@@ -691,11 +691,12 @@ fn a_moved_speed_or_energy_is_left_again_as_it_is_proposed() {
                 let mut random = Random(5);
                 let mut wish = v.clone();
                 let (mut held, mut followed) = (0, 0);
-                for tick in 0..3000 {
-                    if tick % 150 == 0 {
+                let phase = (0.6 / dt) as usize; // long enough to stop in
+                for tick in 0..20 * phase {
+                    if tick % phase == 0 {
                         wish.iter_mut().for_each(|w| *w = random.between(-4.0, 4.0));
                         // The other half of the time it shall stand still.
-                        if tick % 300 == 0 {
+                        if tick % (2 * phase) == 0 {
                             wish.fill(0.0);
                         }
                     }
@@ -713,7 +714,7 @@ fn a_moved_speed_or_energy_is_left_again_as_it_is_proposed() {
                     );
                     held += usize::from(target.ledger.active.iter().any(|row| row.row >= model.nv()));
                     let is_still = target.v.iter().all(|v| v.abs() < 1e-9);
-                    followed += usize::from(tick % 300 == 149 && is_still);
+                    followed += usize::from(tick % (2 * phase) == phase - 1 && is_still);
                     (q, v) = (target.q.clone(), target.v.clone());
                 }
                 assert!(held > 5, "{name} {share} {dt}: held in {held} ticks alone");
