@@ -79,6 +79,16 @@ def function_of(name: str, value: Any, arguments: str) -> None:
         raise ValueError(f"{name} is a function of {takes} and is called with ({arguments}); give one that takes them, {name}({arguments})") from None
 
 
+def unwritten(error: OSError, place: Any) -> OSError:
+    """What the system said of a place to write to, as a sentence of the same type."""
+    return type(error)(f"cannot write '{os.fspath(place)}': {error.strerror}; give another place, or make room")
+
+
+def unread(error: OSError, file: Any) -> OSError:
+    """What the system said of a file to read, as a sentence of the same type."""
+    return type(error)(f"cannot read '{os.fspath(file)}': {error.strerror}; correct the path")
+
+
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
     """Of the function itself, whatever it wraps or says of itself; None where none can be had."""
     if hasattr(function, "__signature__"):

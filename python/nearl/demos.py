@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import task_of
+from nearl.arguments import task_of, unwritten
 from nearl.recorded import (
     SAME,
     BadDemonstrations,
@@ -151,9 +151,12 @@ def from_columns(
     if not lengths:
         raise BadDemonstrations(f"{source}: it has no episode")
     arrays = {name: np.ascontiguousarray(np.concatenate(rows)) for name, rows in parts.items() if rows}
-    Path(out).parent.mkdir(parents=True, exist_ok=True)
-    with open(out, "wb") as file:
-        np.savez(file, lengths=np.array(lengths), dt=np.array(period), names=np.array(env.obs_names), **arrays)  # type: ignore[arg-type]
+    try:
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        with open(out, "wb") as file:
+            np.savez(file, lengths=np.array(lengths), dt=np.array(period), names=np.array(env.obs_names), **arrays)  # type: ignore[arg-type]
+    except OSError as error:
+        raise unwritten(error, out) from error
     return Path(out)
 
 
@@ -431,7 +434,7 @@ def _states(env: _core.Env, columns: Mapping[str, ArrayLike], dt: float, where: 
     q_names, v_names = _entries(env)
     given = [name for name in (*q_names, *v_names) if name in columns]
     if not given:
-        raise BadDemonstrations(f"{where}: none of the task's columns ({', '.join(q_names)}); it has {', '.join(columns)}")
+        raise BadDemonstrations(f"{where}: none of the task's columns ({', '.join(q_names)}); it has {', '.join(columns) or 'nothing'}")
     n = len(np.atleast_1d(numbers(columns[given[0]], f"column '{given[0]}'", where)))
     # a place that the task does not observe is of no matter; a joint's angle is, and so is how the base is turned, for which there is no 0
     of_no_matter = lambda name: not name.endswith(_TURN) and not any(name in observed for observed in env.obs_names)  # noqa: E731

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from nearl.arguments import unwritten
 from nearl.gymnasium_tasks import as_toml, own_sections
 
 # What is written where the reward is not known.
@@ -71,6 +72,8 @@ def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathL
     """
     import mujoco
 
+    if not isinstance(folder, str | os.PathLike):
+        raise ValueError(f"folder is {folder!r}; give the path of a folder to write into")
     if not isinstance(env_id, str):
         spec = env_id.spec if isinstance(env_id, gymnasium.Env) else None
         if spec is None:
@@ -85,7 +88,10 @@ def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathL
     model, name = inner.model, env_id.split("/")[-1].rsplit("-v", 1)[0]
     driven, folder = _driven(mujoco, model, env_id), Path(folder)
     elsewhere = _elsewhere(mujoco, env)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritten(error, folder) from error
     file, robot = folder / f"{name}.toml", folder / Path(inner.fullpath).name
     if file.exists():
         raise FileExistsError(f"'{file}' is there already; give another folder or remove it")

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nearl import _core
+from nearl.arguments import whole
 from nearl.states import Receipt, States, from_arrays
 
 Floats = NDArray[np.float64]
@@ -198,9 +199,9 @@ class Link:
             ConnectionError: there is no server.
             RuntimeError: two rollouts of this link are under way already.
         """
-        for what, value, least in (("seed", seed, 0), ("n_steps", n_steps, 1), ("version", version, 0)):
-            if value is not None and not least <= value < 2**64:
-                raise ValueError(f"{what} is {value}; give a number from {least} to 2**64 - 1")
+        give = "give a whole number from {} to 2**64 - 1".format
+        seed, n_steps = whole("seed", seed, 0, give(0), 2**64 - 1), whole("n_steps", n_steps, 1, give(1), 2**64 - 1)
+        version = None if version is None else whole("version", version, 0, give(0), 2**64 - 1)
         if isinstance(constraints, bool):
             wanted = None if constraints else 0
         elif 0 < constraints < 2**64:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import constraints_of, numbers, seed_of, task_of
+from nearl.arguments import constraints_of, numbers, seed_of, task_of, whole
 from nearl.env import Env, check_open
 from nearl.render import Frame, Renderer
 
@@ -49,8 +49,8 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     ):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is '{render_mode}'; give 'rgb_array', or leave it out")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps is {max_episode_steps}; give at least one control period")
+        if max_episode_steps is not None:
+            max_episode_steps = whole("max_episode_steps", max_episode_steps, 1, "give at least one control period")
         self.render_mode = render_mode
         self._picture = (width, height), camera
         self._renderer: Renderer | None = None

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nearl.arguments import unread
 from nearl.recorded import BadDemonstrations, numbers
 
 Floats = NDArray[np.float64]
@@ -74,8 +75,11 @@ def renamed(table: Mapping[str, Floats], columns: Any, source: str) -> dict[str,
 def csv_table(file: FilePath) -> dict[str, Floats]:
     """Columns (n) of a CSV file by the names of its heading."""
     source = f"'{os.fspath(file)}'"
-    with open(file, "rb") as data:
-        begin = data.read(4)
+    try:
+        with open(file, "rb") as data:
+            begin = data.read(4)
+    except OSError as error:
+        raise unread(error, file) from error
     for sign, what in _NO_TEXT.items():
         if begin.startswith(sign):
             raise BadDemonstrations(f"{source} is {what}")

@@ -109,7 +109,13 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         began = self._over
         own = self._reward is None and self._termination is None
         stepped = self._native.step(actions) if own else self._scored(numbers("actions", actions))
-        *_, terminated, truncated, info = stepped
+        _, rewards, terminated, truncated, info = stepped
+        if not np.isfinite(rewards).all():
+            i = int(np.flatnonzero(~np.isfinite(rewards))[0])
+            raise ValueError(
+                f"the reward of environment {i} came out as {rewards[i]}, and nothing can be learned from it; look for actions that are far too large, or for a "
+                f"logarithm, root or quotient in [reward] that leaves its domain"
+            )
         ended, same_step = terminated | truncated, self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         self._over = ended & (not same_step)
         if same_step and ended.any():

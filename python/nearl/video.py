@@ -48,10 +48,11 @@ def record(
         Number of frames.
 
     Raises:
-        VideoError: no renderer, or no encoder.
+        VideoError: no renderer, no encoder, or no place to write to.
         OSError: the run cannot be read.
         ValueError: demonstrations without their task, or of another robot.
     """
+    _check_writable(Path(out))
     if Path(run).suffix == ".npz":
         if task is None:
             raise ValueError(f"'{run}' are demonstrations; say of which task with task= (--task)")
@@ -76,6 +77,18 @@ def record(
             raise VideoError(f"'{out}' cannot be written: for .mp4 do pip install 'nearl[video]', or write a .gif") from error
         raise
     return n
+
+
+def _check_writable(out: Path) -> None:
+    """Before anything is drawn: an encoder that cannot write says so in words of its own."""
+    is_new = not out.exists()
+    try:
+        with out.open("ab"):
+            pass
+    except OSError as error:
+        raise VideoError(f"cannot write '{out}': {error.strerror}; give another place") from error
+    if is_new:
+        out.unlink()
 
 
 def _frames(

@@ -206,6 +206,11 @@ def test_a_sentence_where_nothing_can_render(trained: Path, tmp_path: Path) -> N
     words = failed.stderr.strip().splitlines()[-1]
     assert failed.returncode == 1 and "MuJoCo cannot render with MUJOCO_GL=egl" in words and "apt install libegl1" in words
     assert "Traceback" not in failed.stderr
+    (tmp_path / "file").touch()
+    for place in ("/proc/x.mp4", str(tmp_path / "file/x.mp4")):
+        failed = video(str(trained), place, "--seconds", "0.1")
+        assert failed.returncode == 1 and failed.stderr.startswith(f"nearl video: cannot write '{place}': "), failed.stderr
+        assert failed.stderr.endswith("; give another place\n") and failed.stderr.count("\n") == 1
     failed = video(str(trained), str(tmp_path / "x.mp4"), "--camera", "side")
     assert failed.returncode == 1 and "the robot has no camera 'side'; it has track" in failed.stderr
 

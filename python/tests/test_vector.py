@@ -241,6 +241,16 @@ def test_a_vector_begins_with_a_reset() -> None:
     vec.step(actions)
 
 
+def test_a_reward_that_is_no_number_is_told_and_not_handed_on() -> None:
+    envs = nearl.make_vec("HalfCheetah-v5", 3, threads=1)
+    envs.reset(seed=7)
+    actions = np.zeros((3, 6))
+    assert np.isfinite(envs.step(actions)[1]).all()
+    actions[1] = 1e300
+    with pytest.raises(ValueError, match="the reward of environment 1 came out as -inf, and nothing can be learned"):
+        envs.step(actions)
+
+
 def test_a_closed_vector_neither_steps_nor_resets() -> None:
     """As an `AsyncVectorEnv` of Gymnasium: the error is Gymnasium's own."""
     vec = nearl.make_vec("Hopper-v5", 2)

@@ -162,7 +162,8 @@ impl TrainSettings {
         let limit = |x: f64| x >= 0.0;
         let spread = |x: f64| (-20.0..=10.0).contains(&x);
         type Domain = (fn(f64) -> bool, &'static str);
-        let (positive, not_negative): (Domain, Domain) = ((above, "above 0"), (at_least, "at least 0"));
+        let (positive, not_negative): (Domain, Domain) =
+            ((above, "finite and above 0"), (at_least, "finite and at least 0"));
         let single = f64::from;
         for (key, value, (allowed, domain)) in [
             ("ppo.lr", single(ppo.lr), positive),
@@ -266,11 +267,14 @@ mod tests {
         let read = |text: &str| TrainSettings::read(&toml::from_str(text).unwrap());
         for (text, words) in [
             ("ppo.clip_range = -0.2", "[train.ppo.clip_range]: -0.2 is"),
-            ("ppo.lr = nan", "[train.ppo.lr]: NaN is not above 0"),
+            ("ppo.lr = nan", "[train.ppo.lr]: NaN is not finite and above 0"),
             ("ppo.n_epochs = 0", "[train.ppo.n_epochs]: 0 learns nothing"),
             ("ppo.max_grad_norm = -1.0", "[train.ppo.max_grad_norm]"),
             ("ppo.log_std = nan", "[train.ppo.log_std]"),
-            ("pid2.generator_weight = -5.0", "[train.pid2.generator_weight]: -5 is not at least 0"),
+            (
+                "pid2.generator_weight = -5.0",
+                "[train.pid2.generator_weight]: -5 is not finite and at least 0",
+            ),
             ("pid2.beta = nan", "[train.pid2.beta]"),
             ("nearl.idm_lr = -1.0", "[train.nearl.idm_lr]"),
             ("cost.limit = -1.0", "[train.cost.limit]: -1 is not at least 0, or inf for none"),

@@ -91,7 +91,10 @@ def build(
         f"<title>{html.escape(title)}</title><style>{CSS}</style></head><body><main><h1>{html.escape(title)}</h1>"
         f'<p class="lead">{html.escape(_about(swept + trained, flights))}</p>{first}{body}</main></body></html>\n'
     )
-    out.write_text(page, encoding="utf-8")
+    try:
+        out.write_text(page, encoding="utf-8")
+    except OSError as error:  # a full disk does not name the file
+        raise OSError(error.errno, error.strerror, str(out)) from error
     return out
 
 

@@ -81,7 +81,7 @@ impl DemoSettings {
         let above = |x: f64| x > 0.0 && x.is_finite();
         type Domain = (fn(f64) -> bool, &'static str);
         let (share, at_least, above): (Domain, Domain, Domain) =
-            ((share, "within [0, 1]"), (at_least, "at least 0"), (above, "above 0"));
+            ((share, "within [0, 1]"), (at_least, "finite and at least 0"), (above, "finite and above 0"));
         for (key, value, (allowed, domain)) in [
             ("stray", self.stray, share),
             ("resets", self.resets, share),
@@ -128,7 +128,10 @@ mod tests {
     fn numbers_with_which_nothing_is_learned_are_refused_by_name() {
         for (wrong, words) in [
             (DemoSettings { resets: 1.5, ..DemoSettings::default() }, "[train.demos.resets]: 1.5 is not"),
-            (DemoSettings { lr: 0.0, ..DemoSettings::default() }, "[train.demos.lr]: 0 is not above 0"),
+            (
+                DemoSettings { lr: 0.0, ..DemoSettings::default() },
+                "[train.demos.lr]: 0 is not finite and above 0",
+            ),
             (DemoSettings { batch_size: 33, ..DemoSettings::default() }, "[train.demos.batch_size]: 33"),
         ] {
             let error = wrong.check().expect_err("refused");
