@@ -113,8 +113,8 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         if not np.isfinite(rewards).all():
             i = int(np.flatnonzero(~np.isfinite(rewards))[0])
             raise ValueError(
-                f"the reward of environment {i} came out as {rewards[i]}, and nothing can be learned from it; look for actions that are far too large, or for a "
-                f"logarithm, root or quotient in [reward] that leaves its domain"
+                f"the reward of environment {i} came out as {rewards[i]}, and nothing can be learned from it; look for actions that are far too large, "
+                f"or for a logarithm, root or quotient in [reward] that leaves its domain"
             )
         ended, same_step = terminated | truncated, self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         self._over = ended & (not same_step)

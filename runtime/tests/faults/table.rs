@@ -40,7 +40,7 @@ pub const ROWS: &[Row] = &[
     (
         2,
         "measured state is NaN or infinite",
-        "3 are bridged by prediction, then the plant brakes, after 8 latched: until it is ended the loop brakes, then the exit code is 6",
+        "3 are bridged by prediction, then the plant brakes, after 8 latched until the run is ended, with exit code 6",
         &["bad-state", "bad-states"],
         &[(HERE, "fault_02_a_state_that_is_not_finite_is_bridged_then_braked_then_latched")],
     ),
