@@ -38,6 +38,8 @@ const HEALTH: u64 = 100_000_000;
 pub(crate) struct Io<B: Build> {
     pub(crate) link: RuntimeLink,
     pub(crate) robot: RobotMessage,
+    /// What the last plant that came back as another robot has otherwise.
+    pub(crate) foreign: Option<String>,
     pub(crate) states: Producer<StateMessage>,
     pub(crate) proposals: Producer<ProposalMessage>,
     /// What is asked of another process, where one proposes.
@@ -203,12 +205,10 @@ impl<B: Build> Io<B> {
     fn attend(&mut self) {
         self.traffic.next_attend = clock::now() + ATTEND;
         if let Some(robot) = self.link.robot() {
-            let known = &self.robot;
-            let is_same = (robot.joints, robot.observation, robot.nq, robot.nv, robot.nu, robot.n_obs)
-                == (known.joints, known.observation, known.nq, known.nv, known.nu, known.n_obs);
             // A plant that came back as another robot gets no action: its states are refused by their epoch.
-            if is_same && robot.dt == known.dt && robot.limits == known.limits {
-                self.robot = robot;
+            match another(&self.robot, &robot) {
+                None => self.robot = robot,
+                Some(what) => self.foreign = Some(what),
             }
         }
         self.hear_tally();
@@ -272,6 +272,33 @@ impl<B: Build> Io<B> {
         }
         clock::sleep_until((next - LEAD).min(now + NAP));
     }
+}
+
+/// What a plant that came back has otherwise than the one that was `known`; `None` where it is the same robot.
+fn another(known: &RobotMessage, robot: &RobotMessage) -> Option<String> {
+    let sizes = [
+        ("configuration entries", robot.nq, known.nq),
+        ("velocities", robot.nv, known.nv),
+        ("actions", robot.nu, known.nu),
+        ("observation entries", robot.n_obs, known.n_obs),
+    ];
+    let size = sizes.into_iter().find(|(_, is, was)| is != was);
+    if robot.joints != known.joints {
+        let (theirs, ours) = (robot.joint_names(), known.joint_names());
+        let at = theirs.iter().zip(&ours).position(|(a, b)| a != b).unwrap_or(theirs.len().min(ours.len()));
+        let name = |list: &[String]| list.get(at).map_or("none".into(), |name| format!("'{name}'"));
+        return Some(format!("its joint {at} is {}, and was {}", name(&theirs), name(&ours)));
+    }
+    if let Some((what, is, was)) = size {
+        return Some(format!("it has {is} {what}, and had {was}"));
+    }
+    if robot.dt != known.dt {
+        return Some(format!("its control period is {} s, and was {} s", robot.dt, known.dt));
+    }
+    if robot.observation != known.observation {
+        return Some("the entries of its observation have other names or another order".into());
+    }
+    (robot.limits != known.limits).then(|| "its robot file or its actuators state other limits".into())
 }
 
 /// True if the state is of the size and from the plant that were announced.

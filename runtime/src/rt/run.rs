@@ -396,6 +396,7 @@ fn assemble<B: Build>(
         traffic: Traffic::default(),
         tally: None,
         watch,
+        foreign: None,
     };
     Ok((cycle, io))
 }
@@ -507,9 +508,12 @@ fn report<B: Build>(
     version: u64,
     end: CycleEnd<B::Controller>,
     mut io: Io<B>,
-    warnings: Vec<String>,
+    mut warnings: Vec<String>,
 ) -> RunReport {
     let seconds = (clock::now() - begin) as f64 * 1e-9;
+    warnings.extend(io.foreign.take().map(|what| {
+        format!("a plant came back as another robot, {what}, and got no action: start the one that was there, or the loop with a snapshot made for it")
+    }));
     let tally = io.last_tally(end.last.state.tick);
     let path = io.log.as_ref().map(|log| log.path().to_owned());
     let log = io.log.take().map_or_else(LogSummary::default, LogQueue::finish);

@@ -275,3 +275,42 @@ fn states_of_the_wrong_size_are_refused_and_counted() {
     assert!(report.refused_states > 0);
     assert_ne!(report.last_mode, Mode::Active);
 }
+
+/// Its states are none, and the report says what is otherwise.
+#[test]
+fn a_plant_that_comes_back_as_another_robot_is_named() {
+    let name = Name::new("other-robot");
+    let first = PlantLink::open(&name.0, &robot(false)).unwrap();
+    let runs = |link, stop: &Stop| {
+        let stop = stop.clone();
+        std::thread::spawn(move || {
+            PlantRunner::new(link, PlantSettings::real_time(DT))
+                .unwrap()
+                .run(&mut PointMass::default(), &stop)
+        })
+    };
+    let stop = Stop::new();
+    let plant = runs(first, &stop);
+    let running = LoopThread::start(&name, RunSettings { plant_patience: 60.0, ..settings() }, |_| {});
+    let mut trainer = TrainerLink::open(&name.0).unwrap();
+    let mut until = |what: &str, is: &dyn Fn(&HealthMessage) -> bool| {
+        let begin = std::time::Instant::now();
+        while !trainer.health().is_some_and(|health| is(&health)) {
+            assert!(begin.elapsed() < Duration::from_secs(20), "{what}");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    };
+    until("the loop runs", &|health| health.tick > 20);
+    stop.request();
+    plant.join().unwrap();
+    let slower = Robot { dt: 2.0 * DT, ..robot(false) };
+    let stop = Stop::new();
+    let plant = runs(PlantLink::open(&name.0, &slower).unwrap(), &stop);
+    until("its states are refused", &|health| health.refused_states > 5);
+    let report = running.end();
+    stop.request();
+    plant.join().unwrap();
+    let said =
+        format!("another robot, its control period is {} s, and was {DT} s, and got no action", 2.0 * DT);
+    assert!(report.warnings.iter().any(|warning| warning.contains(&said)), "{report}");
+}
