@@ -14,6 +14,7 @@ use crate::checkpoint::{self, Checkpoint};
 use crate::learn::Algorithm;
 use crate::preset::Preset;
 use crate::run_folder::{self, RunError};
+use crate::settings::TrainSettings;
 use crate::tasks::{self, TaskLoadError};
 use crate::train::{TrainError, complete};
 use nearl_runtime::Manifest;
@@ -126,6 +127,8 @@ impl Sweep {
         for task in &self.tasks {
             let mut manifest = tasks::load_with(task, self.preset, &self.set)?;
             complete(&mut manifest)?;
+            // A key that nobody reads is told before it makes of every run another one.
+            TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?;
             let text = run_folder::task_file(&manifest).0;
             files.push((task, text, manifest));
         }

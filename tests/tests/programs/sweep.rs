@@ -106,6 +106,8 @@ fn a_sweep_finishes_what_is_not_finished() {
     let other = sweep(&out, &["--set", "train.gamma=0.9"]);
     assert_eq!(other.status.code(), Some(1));
     assert!(text(&other.stderr).contains("holds a run of another task file"), "{}", text(&other.stderr));
+    let misspelt = text(&sweep(&out, &["--set", "train.n_env=3"]).stderr);
+    assert!(misspelt.contains("n_envs") && !misspelt.contains("another task file"), "{misspelt}");
     let longer = sweep_of("20000", &out, &[]);
     let words = text(&longer.stderr);
     assert_eq!(longer.status.code(), Some(1));
