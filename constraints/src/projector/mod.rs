@@ -296,10 +296,14 @@ impl Projector {
         let previous = self.previous.get();
         let raw = self.checker.check(q, v, &proposal.q, &proposal.v, &self.external, previous);
         target.ledger.raw_violations = raw.counts;
-        let outcome = match self.settings.consistency {
-            Consistency::Kinematic => self.kinematic(q, v, proposal, target),
-            Consistency::Free => self.free(v, proposal, target),
+        let mut answer = |projector: &mut Projector| match projector.settings.consistency {
+            Consistency::Kinematic => projector.kinematic(q, v, proposal, target),
+            Consistency::Free => projector.free(v, proposal, target),
         };
+        let mut outcome = answer(self);
+        if outcome == Err(BrakeReason::NoCertifiedAnswer) && self.loosen() {
+            outcome = answer(self);
+        }
         match outcome {
             Ok(status) => self.check_target(q, v, proposal, target, status),
             Err(BrakeReason::NoCertifiedAnswer) if self.searches_on(start) => {
