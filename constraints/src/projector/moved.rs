@@ -65,9 +65,10 @@ pub(super) struct Moving {
     /// The goal is this share of the velocity, as a row or cone is behind.
     slow: Option<f64>,
     /// Cones are held to what is asked for though the brake in force goes beyond: where that leaves no answer, they have these shares (cones), and the
-    /// goal is that share of the velocity.
-    tight: Option<f64>,
+    /// goal is that share of the velocity, if the state is beyond one.
+    is_tight: bool,
     loose: Vec<f64>,
+    slower: Option<f64>,
     /// Some joint is beyond the limits of the build.
     pub(super) beyond: bool,
 }
@@ -92,8 +93,9 @@ impl Moving {
             reached: vec![0.0; cones],
             late: vec![false; cones],
             slow: None,
-            tight: None,
+            is_tight: false,
             loose: vec![1.0; cones],
+            slower: None,
             beyond: false,
         };
         moving.still();
@@ -163,7 +165,7 @@ impl Projector {
             || m.numbers[2 * nv..3 * nv].iter().any(|x| x.is_finite());
         m.coupled = insets.iter().any(|by| *by > 0.0) || shares.iter().any(|share| *share < 1.0) || elsewhere;
         m.on = joints || m.coupled;
-        (m.slow, m.tight) = (None, None);
+        (m.slow, m.is_tight) = (None, false);
         for limit in 0..switches {
             self.checker.ask(limit, shares[limit], insets[limit]);
             self.backup.ask(limit, shares[limit], insets[limit]);
@@ -231,7 +233,7 @@ impl Projector {
     /// What is in force of rows and cones, and whether all joints slow down; `rows` gets the reports of those on their way.
     pub(super) fn move_coupled(&mut self, q: &[f64], v: &[f64], rows: &mut Vec<usize>) {
         let m = &mut self.moving;
-        (m.slow, m.tight) = (None, None);
+        (m.slow, m.is_tight) = (None, false);
         self.checker.hold(&self.in_force, &m.speed, &m.speeding);
         if !m.coupled {
             return;
@@ -312,10 +314,9 @@ impl Projector {
             self.checker.set_in_force(c, in_force);
             stages.sources.set_share(c, if is_near { m.shares[c] } else { in_force });
             m.loose[c] = in_force;
-            if is_near && in_force > m.shares[c] {
-                m.tight = Some((1.0 - most).max(slowest));
-            }
+            m.is_tight |= is_near && in_force > m.shares[c];
         }
+        m.slower = late.then_some((1.0 - most).max(slowest));
         if !is_near || further {
             let least = if further { 0.0 } else { slowest };
             m.slow = Some((1.0 - most).max(least));
@@ -325,9 +326,9 @@ impl Projector {
     /// No answer keeps cones to what is asked for: they go as far as the brake in force does. False where they have done so.
     pub(super) fn loosen(&mut self) -> bool {
         let m = &mut self.moving;
-        let (Some(share), Some(stages)) = (m.tight.take(), &mut self.coupled) else { return false };
+        let Some(stages) = self.coupled.as_mut().filter(|_| m.is_tight) else { return false };
         (0..m.loose.len()).for_each(|c| stages.sources.set_share(c, m.loose[c]));
-        m.slow = Some(share);
+        (m.slow, m.is_tight) = (m.slow.or(m.slower), false);
         true
     }
 
