@@ -81,12 +81,12 @@ def function_of(name: str, value: Any, arguments: str) -> None:
 
 def unwritten(error: OSError, place: Any) -> OSError:
     """What the system said of a place to write to, as a sentence of the same type."""
-    return type(error)(f"cannot write '{os.fspath(place)}': {error.strerror}; give another place, or make room")
+    return type(error)(f"cannot write '{os.fspath(place)}': {error.strerror or error}; give another place, or make room")
 
 
 def unread(error: OSError, file: Any) -> OSError:
     """What the system said of a file to read, as a sentence of the same type."""
-    return type(error)(f"cannot read '{os.fspath(file)}': {error.strerror}; correct the path")
+    return type(error)(f"cannot read '{os.fspath(file)}': {error.strerror or error}; correct the path")
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:

@@ -212,10 +212,10 @@ def _meaning(model: Any, actions: str | None, task: _Path | None) -> str:
 
 # Wrappers of Gymnasium that leave every number of an observation where it is.
 _SAME = frozenset({"DtypeObservation", "FlattenObservation"})
-# Wrappers of Gymnasium and Stable-Baselines3 that change neither observations nor actions, nor how long an action lasts.
+# Wrappers of Gymnasium and Stable-Baselines3 that change neither observations nor how long an action lasts, nor actions beyond cutting them to their range.
 _UNTOUCHED = frozenset({
     "Autoreset", "ClipAction", "HumanRendering", "Monitor", "NormalizeReward", "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "RecordVideo",
-    "RenderCollection", "RescaleAction", "TimeLimit",
+    "RenderCollection", "TimeLimit",
 })  # fmt: skip
 
 

@@ -93,8 +93,7 @@ class Plant:
             ``("act", action)``, ``("hold", action)`` with the action of before as none came in time, or ``("brake", None)``: there is no loop, it
             is silent, or it leaves braking to the plant. Bring the robot to rest then.
         """
-        if type(episode) is not int or not 0 <= episode < 2**64:
-            episode = whole("episode", episode, 0, "give its number, counted from 0", 2**64 - 1)
+        episode = whole("episode", episode, 0, "give its number, counted from 0", 2**64 - 1)
         return self._plant.exchange(q, v, obs, patience, time=time, episode=episode, begins=begins, braked=braked)
 
     @property

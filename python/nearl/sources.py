@@ -138,7 +138,10 @@ def _number(cell: str) -> float | None:
 def npz_arrays(file: FilePath, needed: Sequence[str], other: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The arrays ``needed`` of an ``.npz`` file, and of the ``other`` ones those that it has."""
     source = f"'{os.fspath(file)}'"
-    os.stat(file)  # a file that is not there is said by the system
+    try:
+        os.stat(file)
+    except OSError as error:
+        raise unread(error, file) from error
     if not zipfile.is_zipfile(file):
         raise BadDemonstrations(f"{source} is no .npz file, or was cut short; write it with numpy.savez")
     with np.load(file, allow_pickle=False) as data:

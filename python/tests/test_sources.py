@@ -108,6 +108,10 @@ def test_motion_clips_are_refused_by_array(tmp_path: Path) -> None:
         file.write_bytes(content)
         with pytest.raises(demos.BadDemonstrations, match=r"clip.npz' is no .npz file, or was cut short"):
             demos.from_motion(TASK, file, tmp_path / "out.npz")
+    with pytest.raises(FileNotFoundError, match=r"cannot read '.*none.npz': No such file or directory; correct the path"):
+        demos.from_motion(TASK, tmp_path / "none.npz", tmp_path / "out.npz")
+    with pytest.raises(FileNotFoundError, match=r"cannot read '.*none.csv': No such file or directory; correct the path"):
+        demos.from_csv(TASK, tmp_path / "none.csv", tmp_path / "out.npz", dt=0.05)
 
 
 def test_robomimic_files_are_refused_by_group_and_entry(tmp_path: Path) -> None:

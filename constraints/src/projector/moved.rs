@@ -58,7 +58,7 @@ pub(super) struct Moving {
     /// In force: speeds (nv), how fast a dof may speed up (nv).
     speed: Vec<f64>,
     speeding: Vec<f64>,
-    /// Share of its size that each cone is asked for, that it would have, and whether the state is beyond what is asked for (cones).
+    /// Share of its size that each cone is asked for, that it would have, and whether the state, or the brake in force, is beyond what is asked for (cones).
     shares: Vec<f64>,
     reached: Vec<f64>,
     late: Vec<bool>,

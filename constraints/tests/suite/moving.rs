@@ -673,7 +673,7 @@ fn a_joint_that_moved_limits_hold_back_is_named_in_every_tick_that_claims_the_ne
     }
 }
 
-/// A moved limit of all joints together is reached and then an ordinary limit: proposals inside of it are followed to the bit, and standing still is one.
+/// A moved limit of all joints together, once it is kept, is an ordinary one: no tick is on the way to it, and a robot that is to stand still does.
 #[test]
 fn a_moved_speed_or_energy_is_left_again_as_it_is_proposed() {
     for (name, model) in [("small", small_arm()), ("rail", rail_arm())] {
