@@ -49,7 +49,7 @@ typedef struct nearl_state {
 nearl_plant *nearl_plant_open(const char *name, const nearl_robot *robot, char *error, size_t error_size);
 
 /* Gives the state to the loop and waits at most `patience` seconds for its action (nu). NEARL_ACT, NEARL_HOLD or NEARL_BRAKE, where
- * `action` stays as it was; below 0 for a NULL pointer. */
+ * `action` stays as it was; below 0 for a NULL pointer or a patience that is no number, where the driver should brake too. */
 int nearl_plant_exchange(nearl_plant *plant, const nearl_state *state, double patience, double *action);
 
 /* Leaves; the loop sees that the plant is gone. NULL is allowed. */
@@ -73,7 +73,7 @@ const char *nearl_proposer_entry(const nearl_proposer *proposer, size_t k);
 int nearl_proposer_is_action(const nearl_proposer *proposer);
 
 /* The newest state that was not read before, waiting at most `patience` seconds: 1, or 0 where none came. What is proposed next answers it.
- * Each array has the robot's length, or length 0 where it is not wanted; any other is refused, below 0. */
+ * Each array has the robot's length, or length 0 where it is not wanted; any other is refused, below 0, as a patience that is no number is. */
 int nearl_proposer_state(nearl_proposer *proposer, double patience, double *q, size_t nq, double *v, size_t nv, double *obs, size_t n_obs);
 
 /* Proposes n values in the order of the entries: 0, or below 0 where their number is another one. */

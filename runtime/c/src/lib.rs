@@ -34,10 +34,9 @@ fn guarded<T>(otherwise: T, f: impl FnOnce() -> T) -> T {
     catch_unwind(AssertUnwindSafe(f)).unwrap_or(otherwise)
 }
 
-/// How long to wait for something: days for infinity, not at all for what is below 0 or no number.
-fn waiting(seconds: f64) -> Duration {
-    let seconds = if seconds.is_nan() { 0.0 } else { seconds.clamp(0.0, 1e6) };
-    Duration::from_secs_f64(seconds)
+/// How long to wait for something: days for infinity, not at all below 0; `None` of what is no number.
+fn waiting(seconds: f64) -> Option<Duration> {
+    (!seconds.is_nan()).then(|| Duration::from_secs_f64(seconds.clamp(0.0, 1e6)))
 }
 
 /// A C string.

@@ -95,6 +95,7 @@ impl Plant {
     /// # Safety
     /// The pointers of `state` are null or point to as many numbers as the robot has.
     unsafe fn exchange(&mut self, state: &StateIn, patience: f64, action: &mut [f64]) -> Option<c_int> {
+        let patience = waiting(patience)?.as_secs_f64();
         // SAFETY: by contract.
         let (q, v, obs) =
             unsafe { (slice(state.q, self.nq)?, slice(state.v, self.nv)?, slice(state.obs, self.n_obs)?) };
@@ -104,7 +105,7 @@ impl Plant {
         if state.braked != 0 {
             self.exchange.braked();
         }
-        let (turn, given) = match self.exchange.exchange(q, v, obs, waiting(patience).as_secs_f64()) {
+        let (turn, given) = match self.exchange.exchange(q, v, obs, patience) {
             Turn::Act(given) => (0, given),
             Turn::Hold(given) => (1, given),
             Turn::Brake => return Some(2), // also where the loop is of another robot; it will say so

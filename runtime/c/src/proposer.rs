@@ -21,7 +21,8 @@ unsafe fn open(name: *const c_char, patience: f64) -> Result<Proposer, String> {
     // SAFETY: by contract.
     let name = unsafe { text("name", name)? };
     let name = RobotName::new(&name).map_err(|e| e.to_string())?;
-    let link = ProposerLink::open(&name, waiting(patience)).map_err(|e| e.to_string())?;
+    let patience = waiting(patience).ok_or("patience is no number; give the seconds to wait")?;
+    let link = ProposerLink::open(&name, patience).map_err(|e| e.to_string())?;
     let asked = link.asked();
     let entries = asked.entries.into_iter().map(CString::new).collect::<Result<_, _>>();
     Ok(Proposer {
@@ -100,8 +101,9 @@ pub unsafe extern "C" fn nearl_proposer_state(
     if places.iter().zip(MOST).any(|((to, n), most)| *n > most || (*n > 0 && to.is_null())) {
         return REFUSED;
     }
+    let Some(patience) = waiting(patience) else { return REFUSED };
     guarded(REFUSED, || {
-        let Some(state) = proposer.link.wait_for_state(waiting(patience)) else { return 0 };
+        let Some(state) = proposer.link.wait_for_state(patience) else { return 0 };
         let found = [state.q(), state.v(), state.obs()];
         if places.iter().zip(found).any(|((_, n), from)| *n != 0 && *n != from.len()) {
             return REFUSED;

@@ -97,6 +97,15 @@ fn compile(compiler: &str, source: &str, standard: &str, folder: &Path) -> PathB
     out
 }
 
+/// A program that loads the library it was compiled with, and none that lies elsewhere.
+fn with_library(program: &Path) -> Command {
+    let mut paths = vec![library()];
+    paths.extend(std::env::var_os("LD_LIBRARY_PATH").iter().flat_map(std::env::split_paths));
+    let mut command = Command::new(program);
+    command.env("LD_LIBRARY_PATH", std::env::join_paths(paths).expect("paths"));
+    command
+}
+
 fn numbers(text: &[u8]) -> Vec<f64> {
     String::from_utf8_lossy(text).split_whitespace().filter_map(|w| w.parse().ok()).collect()
 }
@@ -140,7 +149,7 @@ fn a_driver_in_c_obeys_the_limits() {
     let folder = tempfile::tempdir().expect("a folder");
     let program = compile("cc", "driver.c", "-std=c11", folder.path());
     let (found, report) = against_a_loop("c", |name, ticks| {
-        let done = Command::new(program).arg(name).arg(ticks.to_string()).output().expect("the driver runs");
+        let done = with_library(&program).arg(name).arg(ticks.to_string()).output().expect("the driver runs");
         assert!(
             done.status.success(),
             "{} {}",
@@ -193,7 +202,7 @@ fn a_proposer_in_c_is_kept_within_the_limits() {
     let settings = RunSettings { proposer, ..RunSettings::default() };
     let (found, report) = against("proposer", settings, |name, ticks| {
         let child =
-            Command::new(program).args([name, "1000000"]).stdout(Stdio::piped()).spawn().expect("runs");
+            with_library(&program).args([name, "1000000"]).stdout(Stdio::piped()).spawn().expect("runs");
         let found = patient_carriage(name, ticks);
         let done = child.wait_with_output().expect("ends");
         assert!(numbers(&done.stdout)[0] > 50.0, "{done:?}");
@@ -214,20 +223,20 @@ fn a_controller_in_cpp_obeys_the_limits_and_refuses_by_sentence() {
     let program = compile("c++", "controller.cpp", "-std=c++17", folder.path());
     let file = folder.path().join("carriage.safetensors");
     snapshot().save(&file).expect("saves");
-    let done = Command::new(&program).arg(&file).output().expect("runs");
+    let done = with_library(&program).arg(&file).output().expect("runs");
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let found = numbers(&done.stdout);
     assert!(
         found[0] > 0.25 && found[0] <= 0.4 + 1e-6 && found[1] > 0.5 && found[1] <= 0.8 + 1e-6,
         "{found:?}"
     );
-    let refused = Command::new(&program).arg("none.safetensors").output().expect("runs");
+    let refused = with_library(&program).arg("none.safetensors").output().expect("runs");
     assert!(!refused.status.success());
     assert!(String::from_utf8_lossy(&refused.stderr).contains("cannot read snapshot 'none.safetensors'"));
     let mut blank = snapshot();
     blank.manifest.algo = nearl_runtime::snapshot::BLANK.into();
     blank.save(&file).expect("saves");
-    let refused = Command::new(&program).arg(&file).output().expect("runs");
+    let refused = with_library(&program).arg(&file).output().expect("runs");
     let said = String::from_utf8_lossy(&refused.stderr).into_owned();
     assert!(
         !refused.status.success()
@@ -263,11 +272,46 @@ fn a_first_state_that_is_no_number_leaves_the_action_as_it_was() {
     std::fs::write(&source, FIRST).expect("writes");
     snapshot().save(&file).expect("saves");
     let program = compile("cc", source.to_str().expect("a path"), "-std=c11", folder.path());
-    let done = Command::new(&program).arg(&file).output().expect("runs");
+    let done = with_library(&program).arg(&file).output().expect("runs");
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let found = numbers(&done.stdout);
     let [1.0, 77.0, 0.0, acted, 1.0, held] = found[..] else { panic!("{found:?}") };
     assert!(acted != 77.0 && acted == held, "{found:?}");
+}
+
+/// Waits for a time that is no number.
+const PATIENCE: &str = r#"#include <math.h>
+#include <nearl.h>
+#include <stdio.h>
+int main(int n, char **arguments) {
+    char error[300] = "";
+    const char *joints[] = {"slide"};
+    nearl_robot robot = {.joints = joints, .n_joints = 1, .nq = 1, .nv = 1, .nu = 1, .dt = 0.01, .watchdog = 0.1};
+    nearl_plant *plant = n == 2 ? nearl_plant_open(arguments[1], &robot, error, sizeof error) : NULL;
+    if (!plant) return fprintf(stderr, "%s\n", error), 1;
+    double q = 0.0, v = 0.0, action = 77.0;
+    nearl_state state = {.q = &q, .v = &v};
+    printf("%d %d %.17g\n", nearl_plant_exchange(plant, &state, NAN, &action) < 0,
+           nearl_plant_exchange(plant, &state, -1.0, &action) == NEARL_BRAKE, action);
+    nearl_plant_close(plant);
+    if (nearl_proposer_open(arguments[1], NAN, error, sizeof error)) return 2;
+    fputs(error, stderr);
+    return 0;
+}
+"#;
+
+#[test]
+fn a_patience_that_is_no_number_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let source = folder.path().join("patience.c");
+    std::fs::write(&source, PATIENCE).expect("writes");
+    let program = compile("cc", source.to_str().expect("a path"), "-std=c11", folder.path());
+    let done =
+        with_library(&program).arg(format!("c{}-patience", std::process::id())).output().expect("runs");
+    let said = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert!(done.status.success(), "{said}");
+    assert_eq!(numbers(&done.stdout), [1.0, 1.0, 77.0]);
+    assert_eq!(said, "patience is no number; give the seconds to wait");
 }
 
 /// Every function that the library exports is declared, and the other way round.
