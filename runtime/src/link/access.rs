@@ -230,6 +230,22 @@ impl RobotMessage {
         read_names(&self.names)
     }
 
+    /// What the messages of this plant have, and how many of each, in the words of a sentence.
+    pub(crate) fn sizes(&self) -> [(&'static str, u32); 4] {
+        let observed = ("observation entries", self.n_obs);
+        [("configuration entries", self.nq), ("velocities", self.nv), ("actions", self.nu), observed]
+    }
+
+    /// The first joint of `joints` that this plant has otherwise: its place, its name there, and its name here; `None` where a list ends.
+    pub(crate) fn first_other_joint<'a>(
+        &self,
+        joints: &'a [String],
+    ) -> (usize, Option<&'a str>, Option<String>) {
+        let own = self.joint_names();
+        let at = joints.iter().zip(&own).position(|(a, b)| a != b).unwrap_or(joints.len().min(own.len()));
+        (at, joints.get(at).map(String::as_str), own.into_iter().nth(at))
+    }
+
     /// Writes the joint names and their hash.
     pub fn set_joint_names<S: AsRef<str>>(&mut self, names: &[S]) {
         self.joints = super::hash_names(names);

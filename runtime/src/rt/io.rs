@@ -276,20 +276,14 @@ impl<B: Build> Io<B> {
 
 /// What a plant that came back has otherwise than the one that was `known`; `None` where it is the same robot.
 fn another(known: &RobotMessage, robot: &RobotMessage) -> Option<String> {
-    let sizes = [
-        ("configuration entries", robot.nq, known.nq),
-        ("velocities", robot.nv, known.nv),
-        ("actions", robot.nu, known.nu),
-        ("observation entries", robot.n_obs, known.n_obs),
-    ];
-    let size = sizes.into_iter().find(|(_, is, was)| is != was);
     if robot.joints != known.joints {
-        let (theirs, ours) = (robot.joint_names(), known.joint_names());
-        let at = theirs.iter().zip(&ours).position(|(a, b)| a != b).unwrap_or(theirs.len().min(ours.len()));
-        let name = |list: &[String]| list.get(at).map_or("none".into(), |name| format!("'{name}'"));
-        return Some(format!("its joint {at} is {}, and was {}", name(&theirs), name(&ours)));
+        let theirs = robot.joint_names();
+        let (at, is, was) = known.first_other_joint(&theirs);
+        let name = |name: Option<&str>| name.map_or("none".into(), |name| format!("'{name}'"));
+        return Some(format!("its joint {at} is {}, and was {}", name(is), name(was.as_deref())));
     }
-    if let Some((what, is, was)) = size {
+    let mut sizes = robot.sizes().into_iter().zip(known.sizes());
+    if let Some(((what, is), (_, was))) = sizes.find(|((_, is), (_, was))| is != was) {
         return Some(format!("it has {is} {what}, and had {was}"));
     }
     if robot.dt != known.dt {

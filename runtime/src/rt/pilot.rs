@@ -555,24 +555,18 @@ fn limits_digest(model: &nearl_constraints::Model, manifest: &Manifest) -> u64 {
 fn compare(own: &Robot, plant: &RobotMessage) -> Result<(), Refusal> {
     let refuse = |verdict, text| Err(Refusal { verdict, text });
     if hash_names(&own.joints) != plant.joints {
-        let theirs = plant.joint_names();
-        let at = own.joints.iter().zip(&theirs).position(|(a, b)| a != b);
-        let at = at.unwrap_or(own.joints.len().min(theirs.len()));
-        let name = |list: &[String]| list.get(at).map_or("no joint".into(), |n| format!("`{n}`"));
+        let (at, ours, theirs) = plant.first_other_joint(&own.joints);
+        let name = |name: Option<&str>| name.map_or("no joint".into(), |n| format!("`{n}`"));
         let text = format!(
             "joint {at} is {} in the snapshot, but {} on the plant; use a snapshot trained for this robot",
-            name(&own.joints),
-            name(&theirs)
+            name(ours),
+            name(theirs.as_deref())
         );
         return refuse(Verdict::ForeignRobot, text);
     }
-    let sizes = [
-        ("configuration entries", own.nq, plant.nq, MAX_JOINTS),
-        ("velocities", own.nv, plant.nv, MAX_JOINTS),
-        ("actions", own.nu, plant.nu, MAX_JOINTS),
-        ("observation entries", own.observation.len(), plant.n_obs, MAX_OBS),
-    ];
-    for (what, have, need, limit) in sizes {
+    let own_sizes =
+        [(own.nq, MAX_JOINTS), (own.nv, MAX_JOINTS), (own.nu, MAX_JOINTS), (own.observation.len(), MAX_OBS)];
+    for ((have, limit), (what, need)) in own_sizes.into_iter().zip(plant.sizes()) {
         if have != need as usize {
             let text = format!(
                 "the snapshot has {have} {what}, the plant {need}; give the driver as many, or use a snapshot made for this plant"
