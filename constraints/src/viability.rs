@@ -221,7 +221,8 @@ pub fn interval(dof: &Dof, q: f64, v: f64, period: &Period) -> Interval {
         if lower - upper > CROSSING * a {
             let beyond = if v.abs() > dof.velocity { Kind::Velocity } else { Kind::Viability };
             outside = outside.or(Some(beyond));
-            (lower, upper) = (brake(dof, v, period), brake(dof, v, period));
+            let stop = hard_brake(dof, v, period);
+            (lower, upper) = (stop, stop);
         } else {
             lower = upper;
         }
@@ -232,6 +233,12 @@ pub fn interval(dof: &Dof, q: f64, v: f64, period: &Period) -> Interval {
 /// The deceleration that stops the dof: `-sgn(v) min(A_b, |v| / T)`.
 pub fn brake(dof: &Dof, v: f64, period: &Period) -> f64 {
     -v.signum() * dof.braking(period).min(v.abs() / period.dt)
+}
+
+/// The deceleration outside the set, `-sgn(v) min(A, |v| / T)` of the deceleration that is stated: it turns nothing round, so that neither a slow
+/// limit nor a narrow range ([`Dof::braking`]) asks for less.
+fn hard_brake(dof: &Dof, v: f64, period: &Period) -> f64 {
+    -v.signum() * dof.deceleration.min(dof.acceleration).min(v.abs() / period.dt)
 }
 
 /// Beyond the upper limit only `v' <= 0` is allowed.
@@ -471,6 +478,13 @@ mod tests {
         assert_eq!((still.lower, still.upper, still.outside), (-20.0, 0.0, Some(Kind::Position)));
         let leaving = interval(&dof, 1.2, 3.0, &p);
         assert_eq!((leaving.lower, leaving.upper), (-20.0, -20.0));
+        // A narrow range and a slow limit let a brake in front of a limit count on 2 / (T^2 + T^2 / 8) and on V / T: outside it takes what there is.
+        let narrow = Dof { lower: 0.0, upper: 1e-3, velocity: 0.1, ..dof };
+        for (q, v) in [(1.2, 3.0), (-0.2, -3.0), (5e-4, 3.0)] {
+            let i = interval(&narrow, q, v, &p);
+            assert!(narrow.braking(&p) < 10.0 && i.outside.is_some(), "{i:?}");
+            assert_eq!((i.lower, i.upper), (-20.0 * v.signum(), -20.0 * v.signum()), "at {q}, {v}");
+        }
         let fast = interval(&dof, 0.0, 9.0, &p);
         assert_eq!((fast.lower, fast.upper, fast.outside), (-20.0, -20.0, Some(Kind::Velocity)));
     }

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from nearl import _core
 from nearl.arguments import unwritten
 from nearl.gymnasium_tasks import as_toml, own_sections
 
@@ -101,7 +102,7 @@ def from_gymnasium(env_id: str | gymnasium.Env[Any, Any], folder: str | os.PathL
     else:
         robot.write_text(text)
     timestep = float(model.opt.timestep)
-    euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    euler = _core.makes_euler_steps(inner.fullpath)
     joints = ", ".join(f'"{joint}"' for joint in dict.fromkeys(driven))
     dt = round(timestep * inner.frame_skip, 12)
     own = own_sections(inner)

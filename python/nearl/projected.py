@@ -19,7 +19,8 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     """A task behind the controller that also runs on the robot; one step is one policy period.
 
     ``info`` has ``raw_violations`` and ``target_violations`` (control ticks in which what was asked for, and what was done about it, broke a
-    limit), ``executed`` (what the actuators got in the last control period), ``cost`` where the task has one, and ``fault`` if the physics
+    limit; of the latter those that began within the limits), ``recovering`` (those that began outside, where a robot can only brake or come back),
+    ``executed`` (what the actuators got in the last control period), ``cost`` where the task has one, and ``fault`` if the physics
     could not be believed.
 
     Args:

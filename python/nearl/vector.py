@@ -27,7 +27,8 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
     with the mask ``_<key>``: ``final_obs`` and ``final_info`` (same-step mode: what the last step of an episode gave), ``fault``; ``cost`` where the task
     has one, 0 and masked out where the row is the begin of an episode, as in Gymnasium's ``SyncVectorEnv``; and with ``constraints`` of every step that
     did not only begin an episode: ``raw_violations`` and ``target_violations`` (control ticks of the step in which the raw or the projected state broke a
-    limit), ``executed`` (what the actuators got in the last of them, num_envs x n_act; not a number where the step only began an episode) and ``moved``.
+    limit; of the latter those that began within the limits), ``recovering`` (those that began outside, where a robot can only brake or come back),
+    ``executed`` (what the actuators got in the last of them, num_envs x n_act; not a number where the step only began an episode) and ``moved``.
     A vector cannot be pickled or copied: make it in the process that uses it.
 
     Args:
@@ -124,7 +125,7 @@ class VecEnv(VectorEnv[Floats, Floats, Floats]):
         if "cost" in info:
             info["_cost"] = ~(ended if same_step else began)
             info["cost"] = np.where(info["_cost"], info["cost"], 0.0)
-        for key in ("raw_violations", "target_violations", "executed", "moved"):
+        for key in ("raw_violations", "target_violations", "recovering", "executed", "moved"):
             if key in info:
                 info[f"_{key}"] = ~began
         return stepped

@@ -35,7 +35,7 @@ mod _core {
     #[pymodule_export]
     use super::loop_link::{LoopClient, loop_modes};
     #[pymodule_export]
-    use super::model::Model;
+    use super::model::{Model, makes_euler_steps};
     #[pymodule_export]
     use super::nearest::{ActionSearch, nearest_action};
     #[pymodule_export]

@@ -326,3 +326,9 @@ impl Model {
         array(py, &out)
     }
 }
+
+/// Whether a physics step of an MJCF file is an Euler step that limits can count on: `Euler`, and `implicitfast` where joints and drives alone damp.
+#[pyfunction]
+pub(crate) fn makes_euler_steps(py: Python<'_>, path: PathBuf) -> PyResult<bool> {
+    py.detach(|| robot::makes_euler_steps(&path)).map_err(errors::robot)
+}

@@ -27,7 +27,8 @@ use crate::target::{Target, Targets};
 ///     model (Model): the robot, with nq positions and nv velocities.
 ///     limits (list[Limit]): what must hold; a limit that is not given does not.
 ///     dt (float): control period [s].
-///     controllable (list[str] | None): names of the joints that may be moved; all by default.
+///     controllable (list[str] | None): names of the joints that may be moved; all with one degree of freedom by default. Nothing holds
+///         ball joints and floating bases.
 ///     consistency ("kinematic" | "free"): position and velocity belong together, or are clamped apart.
 ///     solver ("ladder" | "clarabel"): closed form, then active set, then Clarabel; or Clarabel at once.
 ///     sub_steps (int): how the plant moves within a period: n semi-implicit Euler steps of a simulator (1, as MuJoCo's Euler with one step
@@ -103,6 +104,12 @@ impl Projector {
             deadline,
             ..Settings::new(number("dt", dt)?, sub_steps)
         };
+        let balls = match controllable {
+            None => {
+                robot.joints().iter().filter(|joint| joint.nv == 3).map(|joint| joint.name.clone()).collect()
+            }
+            Some(_) => Vec::new(),
+        };
         let controllable = dofs(robot, controllable)?;
         let limits = limits::boxed(limits, robot)?;
         let dofs = controllable.clone();
@@ -111,6 +118,14 @@ impl Projector {
         let first = projectors.first();
         let (names, dt) = (first.row_names(), first.settings().dt);
         robot.notes().iter().chain(first.notes()).try_for_each(|note| errors::warn(py, note))?;
+        if !balls.is_empty() {
+            let names = balls.join("', '");
+            let text = format!(
+                "ball joint '{names}': no limit of joints holds it, and its proposals stay as they are; leave it out of controllable=[...] to say that \
+                 this is meant"
+            );
+            errors::warn(py, &text)?;
+        }
         let sizes = (robot.nq(), robot.nv());
         Ok(Projector { names, sizes, controllable, dt, projectors: Mutex::new(projectors), model })
     }

@@ -216,6 +216,7 @@ fn info<'py>(py: Python<'py>, vector: &Vector) -> PyResult<Bound<'py, PyDict>> {
         };
         info.set_item("raw_violations", counts(|l| l.tally.raw_violations))?;
         info.set_item("target_violations", counts(|l| l.tally.target_violations))?;
+        info.set_item("recovering", counts(|l| l.tally.recovering))?;
         let executed: Vec<f64> = vector.lanes().flat_map(|lane| lane.executed().to_vec()).collect();
         let width = executed.len() / vector.n();
         info.set_item("executed", array2(py, executed, width)?)?;

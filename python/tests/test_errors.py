@@ -38,6 +38,11 @@ def test_files_of_another_kind(tmp_path) -> None:
     file.write_text("<robot name='x'><link name='a'>")
     with pytest.raises(ValueError, match=r"robot\.urdf"):
         nearl.Model.from_urdf(file)
+    file.write_text(planar_urdf())
+    with pytest.raises(ValueError, match=r"robot\.urdf is not a usable MJCF file.*Model\.from_urdf"):
+        nearl.Model.from_mjcf(file)
+    with pytest.raises(ValueError, match=r"the text is not a usable MJCF file.*Model\.from_urdf"):
+        nearl.Model.from_mjcf_text(planar_urdf())
     file.write_bytes(b"not a snapshot at all")
     with pytest.raises(ValueError, match="not a safetensors file"):
         nearl.Controller.load(file)

@@ -626,3 +626,17 @@ def test_what_may_touch_and_an_episode_that_begins_outside_are_told(tmp_path: Pa
     said = told(alone, "[reset]\nq = { a = 6.5 }\nv = { b = 3.0 }\n")
     assert "64 of 64 episodes begin with joint 'a' outside its limits, furthest at 6.5000 rad or m where -5.999999 to 5.999999" in said, said
     assert "64 of 64 episodes begin with joint 'b' outside its limits, furthest at 3.0000 rad/s or m/s" in said, said
+    # From 1.9 rad/s by 5 rad/s² it takes 0.361 rad more to stand.
+    said = told(alone, "[reset]\nq = { a = 5.9 }\nv = { a = 1.9 }\n")
+    assert "joint 'a' too fast to stop before the end of its range, furthest on to 6.2610 rad or m where -5.999999 to 5.999999" in said, said
+    assert "outside its limits" not in said and "too fast" not in told(alone, "[reset]\nq = { a = 5.5 }\nv = { a = 1.9 }\n"), said
+
+
+def test_periods_that_begin_outside_are_counted(tmp_path: Path) -> None:
+    file = drives(tmp_path, "guard = true\nposition = {}\nvelocity = { limit = 2.0 }\nacceleration = { limit = 5.0 }\ntorque = {}", "pinocchio")
+    env = nearl.ProjectedEnv(file, actions="guarded")
+    for q, v, there in (5.5, 1.0, False), (5.9, 1.9, True), (6.1, 0.0, True):
+        env.reset(seed=0)
+        env.unwrapped._native.set_state(0, [q, 0.0], [v, 0.0])
+        info = env.step(np.zeros(env.action_space.shape))[4]
+        assert (info["recovering"] > 0) == there and info["target_violations"] == 0, (q, v, info)

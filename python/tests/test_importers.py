@@ -338,7 +338,7 @@ def test_a_recipe_that_does_not_fit_is_refused_by_name(tmp_path) -> None:
     files["robot"].write_text(planar_urdf().replace('name="joint0" type="revolute"', 'name="joint0" type="continuous"'))
     refused(("", ""), "joint 'joint0' has 2 position and 1 velocity entries.*make a continuous joint of a URDF a revolute one with lower and upper")
     files["recipe"] = None
-    with pytest.raises(ValueError, match="does not say what the 14 entries of its input 'obs' are; give them with --recipe"):
+    with pytest.raises(ValueError, match="does not say what the 14 entries of its input 'obs' are; give a recipe"):
         nearl.import_onnx(path, **files)
     files["recipe"] = tmp_path / "task.toml"
     files["recipe"].write_text('name = "r"\n[constraints]\nvelocity = { limit = 1.0 }\n')

@@ -1,5 +1,7 @@
 """The projector against quadprog on problems put together here, from the formulas and not from our code."""
 
+import warnings
+
 import numpy as np
 import pytest
 import quadprog
@@ -319,3 +321,19 @@ def test_a_speed_of_several_joints_that_no_period_takes_off_is_named(kind: str) 
     assert fast.status == "braked" and len(fast.outside) == 1 and not fast.target_breaks, (fast.status, fast.outside)
     assert sum(fast.target_violations.values()) > 0
     assert (np.abs(fast.v) < np.abs(v) + 1e-12).all()
+
+
+BALL = """<mujoco><worldbody><body><joint name="hinge" range="-1 1" limited="true"/><geom size=".1"/>
+<body pos="0 0 1"><joint name="ball" type="ball"/><geom size=".1"/></body></body></worldbody></mujoco>"""
+
+
+def test_a_ball_joint_that_nothing_holds_is_told() -> None:
+    model = nearl.Model.from_mjcf_text(BALL)
+    limits = [nearl.VelocityLimit(model, limit=2.0), nearl.AccelerationLimit(model, 10.0)]
+    with pytest.warns(UserWarning, match="ball joint 'ball': no limit of joints holds it"):
+        assert nearl.Projector(model, limits, 0.01).controllable == ["hinge"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        nearl.Projector(model, limits, 0.01, controllable=["hinge"])
+    with pytest.raises(ValueError, match="in Python an AccelerationLimit"):
+        nearl.Projector(model, [nearl.PositionLimit(model)], 0.01)

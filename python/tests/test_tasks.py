@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import nearl
+from nearl.runs import tomllib
 
 CART_POLE = ROOT / "examples" / "tasks" / "cart-pole.toml"
 
@@ -298,6 +299,37 @@ def test_a_step_that_changes_the_action_is_told(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         nearl.from_gymnasium("InvertedPendulum-v5", tmp_path / "plain")
+
+
+@pytest.mark.parametrize(("integrator", "step"), [("Euler", 0.002), ("implicitfast", 0.002), ("implicit", 0.0), ("RK4", 0.0)])
+def test_a_task_states_the_steps_that_limits_can_count_on(integrator: str, step: float, tmp_path: Path) -> None:
+    """Where joints alone damp, `implicitfast` makes Euler's steps."""
+    model = tmp_path / "slide.xml"
+    model.write_text(f"""<mujoco><option timestep="0.002" integrator="{integrator}"/><worldbody><body><joint name="a" type="slide" axis="1 0 0"
+        range="-1 1" limited="true" damping="0.3"/><geom size=".1"/></body></worldbody>
+        <actuator><motor name="push" joint="a" ctrlrange="-9 9"/></actuator></mujoco>""")
+
+    class Slide(gymnasium.envs.mujoco.MujocoEnv):
+        metadata: ClassVar = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"], "render_fps": 100}
+
+        def __init__(self, **kwargs):
+            super().__init__(str(model), 5, gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64), **kwargs)
+
+        def _get_obs(self):
+            return np.concatenate([self.data.qpos, self.data.qvel])
+
+        reset_model = _get_obs
+
+        def step(self, action):
+            self.do_simulation(action, self.frame_skip)
+            return self._get_obs(), 0.0, False, False, {}
+
+    gymnasium.register("Slide-v0", entry_point=Slide)
+    try:
+        file = nearl.from_gymnasium("Slide-v0", tmp_path / "out")
+    finally:
+        gymnasium.registry.pop("Slide-v0")
+    assert tomllib.loads(file.read_text())["time"]["sim_dt"] == step
 
 
 def test_an_actuator_that_drives_no_joint_is_named(tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def test_what_the_last_step_did_under_constraints_is_final_information_too() -> 
     assert 0 < len(last) < 4
     for info in last:
         assert info["_final_info"].all()
-        for key in ("raw_violations", "target_violations", "executed", "moved"):
+        for key in ("raw_violations", "target_violations", "recovering", "executed", "moved"):
             assert np.array_equal(info["final_info"][key], info[key]) and info["final_info"][f"_{key}"].all()
 
 

@@ -87,7 +87,8 @@ pub enum ImportError {
     },
     /// Nothing says what the inputs are.
     #[error(
-        "the file does not say what the {n_in} entries of its input '{input}' are; give them with --recipe FILE, see docs/POLICIES.md"
+        "the policy does not say what the {n_in} entries of its input '{input}' are; give a recipe (--recipe FILE, in Python recipe=FILE), see \
+         docs/POLICIES.md"
     )]
     NoRecipe {
         /// Name of the input.

@@ -124,8 +124,22 @@ pub fn simulated_alone(path: &Path) -> Result<Vec<String>, RobotError> {
     Ok([model.simulated_alone(), model.starts(&Table::new())].concat())
 }
 
+/// Whether a physics step of an MJCF file is an Euler step that limits can count on ([`mj::Model::is_euler`]).
+///
+/// # Errors
+/// [`RobotError`].
+pub fn makes_euler_steps(path: &Path) -> Result<bool, RobotError> {
+    Ok(compile(&mjcf(path)?, false)?.is_euler())
+}
+
 /// The format of a robot's text, by its outermost element: a URDF may hold `<mujoco>` too, with settings for MuJoCo.
 pub(crate) fn format_of(text: &str) -> ModelFormat {
+    let is_mjcf = element(text).is_some_and(|rest| rest.starts_with("<mujoco"));
+    if is_mjcf { ModelFormat::Mjcf } else { ModelFormat::Urdf }
+}
+
+/// An XML text from its outermost element on.
+fn element(text: &str) -> Option<&str> {
     let mut rest = text;
     while let Some(at) = rest.find('<') {
         rest = &rest[at..];
@@ -133,11 +147,20 @@ pub(crate) fn format_of(text: &str) -> ModelFormat {
             _ if rest.starts_with("<!--") => "-->",
             _ if rest.starts_with("<?") => "?>",
             _ if rest.starts_with("<!") => ">",
-            _ => break,
+            _ => return Some(rest),
         };
         rest = rest.split_once(end).map_or("", |(_, after)| after);
     }
-    if rest.starts_with("<mujoco") { ModelFormat::Mjcf } else { ModelFormat::Urdf }
+    None
+}
+
+/// Refuses a URDF where an MJCF is read: MuJoCo would take it, without the speeds of its joints.
+fn refuse_urdf(text: &str, file: String) -> Result<(), ModelError> {
+    if !element(text).is_some_and(|rest| rest.starts_with("<robot")) {
+        return Ok(());
+    }
+    let reason = "its outermost element is <robot>, which is a URDF, to be read by `Model.from_urdf` and from a name that ends in .urdf";
+    Err(ModelError::Malformed { file, format: "MJCF", reason: reason.into() })
 }
 
 fn is_mjcf(path: &Path) -> bool {
@@ -164,6 +187,7 @@ fn mjcf(path: &Path) -> Result<Simulation, RobotError> {
     if text.trim().is_empty() {
         return Err(unreadable("the file is empty".to_string()).into());
     }
+    refuse_urdf(&text, path.display().to_string())?;
     Ok(Simulation { format: ModelFormat::Mjcf, text, folder: Some(folder_of(path)) })
 }
 
@@ -172,6 +196,7 @@ fn mjcf(path: &Path) -> Result<Simulation, RobotError> {
 /// # Errors
 /// [`RobotError`].
 pub fn read_mjcf_text(text: &str) -> Result<RobotDescription, RobotError> {
+    refuse_urdf(text, "the text".into())?;
     describe(&Simulation { format: ModelFormat::Mjcf, text: text.to_string(), folder: None }, false)
 }
 

@@ -44,7 +44,9 @@ pub enum TaskLoadError {
         source: RobotError,
     },
     /// A name that is neither bundled nor a file.
-    #[error("no task '{name}'{near}; give one of {all} or a TOML file")]
+    #[error(
+        "no task '{name}'{near}; give one of {all} or a TOML file, as `nearl.from_gymnasium` of Python writes one of an environment of Gymnasium"
+    )]
     Unknown {
         /// As given.
         name: String,
@@ -209,7 +211,7 @@ fn unknown(task: &str) -> TaskLoadError {
         .into_iter()
         .map(|n| (strsim::jaro(&n.to_lowercase(), &task.to_lowercase()), n))
         .max_by(|a, b| a.0.total_cmp(&b.0))
-        .filter(|(score, _)| *score > 0.7)
+        .filter(|(score, _)| *score > 0.8)
         .map_or(String::new(), |(_, n)| format!("; did you mean '{n}'?"));
     TaskLoadError::Unknown { name: task.into(), near, all: names().join(", ") }
 }

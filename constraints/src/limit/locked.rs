@@ -51,7 +51,11 @@ impl Limit for LockedJoints {
     }
 
     fn restrict(&self, model: &Model, controllable: &[usize], set: &mut LimitSet) -> Result<(), LimitError> {
-        for name in &self.settings.joints {
+        for (k, name) in self.settings.joints.iter().enumerate() {
+            if self.settings.joints[..k].contains(name) {
+                let what = format!("locked names joint '{name}' twice");
+                return Err(LimitError::Unusable { what, next: "name each joint once" });
+            }
             let unknown = |near| LimitError::UnknownJoint { limit: "locked", name: name.clone(), near };
             let joint = model.find(name).map_err(unknown)?;
             for i in joint.idx_v..joint.idx_v + joint.nv {

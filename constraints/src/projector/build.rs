@@ -247,7 +247,7 @@ pub(super) fn check_combination(
         Consistency::Kinematic => {
             let joints = names(&|i| limits.has_position(i) && limits.acceleration[i].is_infinite());
             if !joints.is_empty() {
-                let next = "add acceleration = { limit = ... }, the deceleration their braking may count on";
+                let next = "add acceleration = { limit = ... }, in Python an AccelerationLimit: the deceleration their braking may count on";
                 let limit = "position without acceleration";
                 return Err(LimitError::Missing { limit, joints, next });
             }

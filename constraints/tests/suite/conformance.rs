@@ -287,6 +287,7 @@ fn impossible_numbers_are_refused_by_name() {
         ("torque_speed = { stall = 0.0, no_load = 1.0 }", "torque_speed stall is 0"),
         ("torque_rate = { limit = inf }", "torque_rate limit is inf"),
         ("locked = [\"elbow\"]", "locked names joint 'elbow'"),
+        ("locked = [\"panda_joint1\", \"panda_joint1\"]", "locked names joint 'panda_joint1' twice"),
         ("rows = [{ name = \"r\", terms = { \"q.elbow\" = 1.0 }, upper = 1.0 }]", "rows names joint 'elbow'"),
         (
             "rows = [{ name = \"r\", terms = { \"x.panda_joint1\" = 1.0 }, upper = 1.0 }]",

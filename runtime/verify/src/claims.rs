@@ -299,7 +299,7 @@ pub(crate) fn agrees(ledger: &Ledger, status: Status, nv: usize) -> Result<(), F
 /// The limits of joints, then what ties joints together.
 fn holds(promise: &mut Promise, passage: &Passage<'_>, stored: bool, excused: bool) -> Result<(), Fault> {
     let Promise { machine, limits, controllable, period, .. } = promise;
-    limit_check::joints(limits, machine, controllable, period, passage, excused)?;
+    limit_check::joints(limits, machine, controllable, period, passage, (stored, excused))?;
     limit_check::rows(limits, machine, period, passage, stored, excused)
 }
 

@@ -187,14 +187,14 @@ fn of(what: &str, joint: &str) -> String {
 /// The limits of single joints, at a passage.
 ///
 /// # Errors
-/// The first that is broken. A joint that was outside at the start may brake or come back.
+/// The first that is broken. A joint that was outside at the start, where that is `excused`, may brake or come back.
 pub(crate) fn joints(
     l: &Limits,
     machine: &Machine,
     dofs: &[usize],
     p: &Period,
     passage: &Passage<'_>,
-    excused: bool,
+    (stored, excused): (bool, bool),
 ) -> Result<(), Fault> {
     for &i in dofs {
         let j = &l.joints[i];
@@ -217,7 +217,9 @@ pub(crate) fn joints(
             return broken(of("jerk", &j.name), jerk, jerk.signum() * j.jerk, format!("{unit}/s^3"));
         }
         if excused && j.is_outside(p, was, (v, known), true) {
-            returns(j, p, was, (v, before), v1)?;
+            // Forces that motors do not have are cut of a stored brake: it holds to what it counts on.
+            let least = if stored { j.brake(p) } else { j.braking.min(j.acceleration) };
+            returns(j, p, was, (v, before), v1, least)?;
             continue;
         }
         let gains = if v * v1 > 0.0 { v1.abs() - v.abs() } else { v1.abs() };
@@ -258,13 +260,14 @@ pub(crate) fn joints(
     Ok(())
 }
 
-/// A joint outside its limits does not go further out than braking takes it.
+/// A joint outside its limits does not go further out than a brake of at least `brake` takes it.
 fn returns(
     j: &Bounds,
     p: &Period,
     q: Option<f64>,
     (v, before): (f64, Option<f64>),
     v1: f64,
+    brake: f64,
 ) -> Result<(), Fault> {
     if let Some(own) = j.smooth(p) {
         // Its brake, from the acceleration that it has, is the least that it may go on.
@@ -278,12 +281,12 @@ fn returns(
         }
         return Ok(());
     }
-    let slower = (v.abs() - j.brake(p) * p.dt).max(0.0);
+    let slower = (v.abs() - brake * p.dt).max(0.0);
     for s in q.map(|q| sides(j, q, v, v1)).into_iter().flatten() {
         // Beyond by rounding it may go on by as little.
         let is_beyond =
             s.room < 0.0 && is_above(p.way(s.v, s.v1) - s.room + s.sign * s.limit, s.sign * s.limit);
-        if is_beyond && is_above(s.v1, (s.v - j.brake(p) * p.dt).max(0.0)) {
+        if is_beyond && is_above(s.v1, (s.v - brake * p.dt).max(0.0)) {
             return broken(
                 of("speed", &j.name) + ", which is outside,",
                 v1,

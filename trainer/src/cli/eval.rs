@@ -75,11 +75,11 @@ impl Eval {
             let projected = e.mode == "projected" || !m.proposes();
             let targets = if projected { share(e.target_violations) } else { "not projected".into() };
             say(format!(
-                "{:<10}{:>8.1} ± {:<8.1}{:>10.1}{:>16}{:>16}{:>15.2} %{:>17}{:>20}",
+                "{:<10}{:>8} ± {:<8}{:>10}{:>16}{:>16}{:>15.2} %{:>17}{:>20}",
                 e.mode,
-                e.mean_return(),
-                e.std_return(),
-                e.mean_cost(),
+                figures(e.mean_return()),
+                figures(e.std_return()),
+                figures(e.mean_cost()),
                 share(e.raw_violations),
                 targets,
                 percent(e.reached_violations),
@@ -172,9 +172,24 @@ pub(super) fn changed(
     Ok(())
 }
 
+/// A return with a decimal, or as many as show three figures of a small one.
+fn figures(x: f64) -> String {
+    match x.abs() {
+        size if size >= 10.0 || size == 0.0 || !size.is_finite() => format!("{x:.1}"),
+        size if size >= 1e-3 => format!("{x:.*}", (2.0 - size.log10().floor()) as usize),
+        _ => format!("{x:.1e}"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::{Reached, ReachedRow, reached_lines};
+
+    #[test]
+    fn small_returns_are_told_apart() {
+        let told = [12.04, 0.0, -0.0265, 3.1799, -1e-5, 0.001, f64::INFINITY].map(super::figures);
+        assert_eq!(told, ["12.0", "0.0", "-0.0265", "3.18", "-1.0e-5", "0.00100", "inf"]);
+    }
 
     #[test]
     fn shares_are_said_and_what_cannot_be_had_by_row() {

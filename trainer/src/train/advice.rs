@@ -127,20 +127,28 @@ struct Outside {
     states: usize,
 }
 
+/// Where a joint that is inside comes to rest outside, beside the limits `position` and `velocity`.
+const REST: &str = "rest";
+
+/// The limit that gives it more room.
+fn limit_of(key: &str) -> &str {
+    if key == REST { "position" } else { key }
+}
+
 /// States of one task, held against the limits of its joints.
 struct States {
     parts: Parts,
     /// Configuration and velocity, Pinocchio's convention.
     state: (Vec<f64>, Vec<f64>),
-    /// Position and velocity of each dof.
-    found: Vec<[Outside; 2]>,
+    /// Position and velocity of each dof, and where it comes to rest.
+    found: Vec<[Outside; 3]>,
 }
 
 impl States {
     fn of(manifest: &Manifest) -> Result<Self, TrainError> {
         let parts = Parts::new(manifest)?;
         let (nq, nv) = (parts.model.nq(), parts.model.nv());
-        Ok(Self { parts, state: (vec![0.0; nq], vec![0.0; nv]), found: vec![[Outside::default(); 2]; nv] })
+        Ok(Self { parts, state: (vec![0.0; nq], vec![0.0; nv]), found: vec![[Outside::default(); 3]; nv] })
     }
 
     /// Looks at the state that is written.
@@ -150,9 +158,14 @@ impl States {
         write(q, v);
         for &i in layout.controllable() {
             let at = q[model.joint_of_dof(i).idx_q];
-            let by = [(limits.q_lower[i] - at).max(at - limits.q_upper[i]), v[i].abs() - limits.velocity[i]];
-            for (outside, (by, value)) in self.found[i].iter_mut().zip(by.into_iter().zip([at, v[i]])) {
-                if by > 1.5 * STOP_GAPS[1] {
+            let beyond = |q: f64| (limits.q_lower[i] - q).max(q - limits.q_upper[i]);
+            let rest = at + 0.5 * v[i] * v[i].abs() / limits.braking[i].min(limits.acceleration[i]);
+            let tolerance = 1.5 * STOP_GAPS[1];
+            let by = [beyond(at), v[i].abs() - limits.velocity[i], beyond(rest)];
+            let is_inside = by[0] <= tolerance && by[1] <= tolerance;
+            for (k, (by, value)) in by.into_iter().zip([at, v[i], rest]).enumerate() {
+                let outside = &mut self.found[i][k];
+                if by > tolerance && (k < 2 || is_inside) {
                     outside.states += 1;
                     if by > outside.by {
                         (outside.by, outside.value) = (by, value);
@@ -168,19 +181,29 @@ impl States {
         let (Parts { model, layout, projector }, mut lines) = (&self.parts, Vec::new());
         let limits = projector.limits();
         for &i in layout.controllable() {
-            let (name, [position, velocity]) = (model.dof_name(i), self.found[i]);
-            let mut say = |outside: Outside, unit: &str, range: String, key: &str| {
+            let (name, [position, velocity, rest]) = (model.dof_name(i), self.found[i]);
+            let mut say = |outside: Outside, how: &str, unit: &str, range: &str, key: &str| {
                 if outside.states > 0 {
                     lines.push(format!(
-                        "{} of {whose} joint '{name}' outside its limits, furthest at {:.4} {unit} where {range} is allowed: {}",
-                        outside.states, outside.value, next(key)
+                        "{} of {whose} joint '{name}' {how} {:.4} {unit} where {range} is allowed: {}",
+                        outside.states,
+                        outside.value,
+                        next(key)
                     ));
                 }
             };
             let range = format!("{} to {}", limits.q_lower[i], limits.q_upper[i]);
-            say(position, "rad or m", range, "position");
+            let there = "outside its limits, furthest at";
+            say(position, there, "rad or m", &range, "position");
+            say(
+                rest,
+                "too fast to stop before the end of its range, furthest on to",
+                "rad or m",
+                &range,
+                REST,
+            );
             let range = format!("-{0} to {0}", limits.velocity[i]);
-            say(velocity, "rad/s or m/s", range, "velocity");
+            say(velocity, there, "rad/s or m/s", &range, "velocity");
         }
         lines
     }
@@ -202,12 +225,14 @@ pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError>
     let mut lines = Vec::from_iter(unstated);
     let is_own = !manifest.task.reward.is_empty();
     lines.extend(states.sentences(&format!("{} episodes begin with", RESETS.0), |key| match is_own {
+        true if key == REST => "it goes there and comes back; draw it further inside or slower in [reset], or give constraints.position more room".into(),
         true => format!(
             "it comes back before it does anything else; draw it inside in [reset], or give constraints.{key} more room"
         ),
         false => format!(
             "it comes back before it does anything else; the bundled task draws it there, and no setting changes that: train on, or give \
-             constraints.{key} more room, or write a task of your own with [reward] and [reset] (docs: Train for your own robot)"
+             constraints.{} more room, or write a task of your own with [reward] and [reset] (docs: Train for your own robot)",
+            limit_of(key)
         ),
     }));
     Ok(lines)
@@ -238,7 +263,8 @@ pub(crate) fn demonstrated(demos: &Demonstrations, manifest: &Manifest) -> Resul
     }
     Ok(states.sentences(&format!("{all} demonstrated states have"), |key| {
         format!(
-            "what is projected does not follow it there; demonstrate inside the limits of this robot, or give constraints.{key} more room"
+            "what is projected does not follow it there; demonstrate inside the limits of this robot, or give constraints.{} more room",
+            limit_of(key)
         )
     }))
 }
