@@ -174,7 +174,7 @@ class Loop:
         return self._end(wait=False)
 
     def wait(self) -> dict[str, Any]:
-        """Waits until it has stopped by itself (``seconds``) and returns its report."""
+        """Waits until it has stopped by itself (``seconds``) and returns its report. Ctrl-C brings the robot to rest and ends the loop first."""
         return self._end(wait=True)
 
     def _end(self, wait: bool) -> dict[str, Any]:
@@ -183,6 +183,9 @@ class Loop:
         if self.report is None:
             try:
                 self.report = json.loads(self._thread.end(wait))
+            except KeyboardInterrupt:
+                self.report = json.loads(self._thread.end(False))
+                raise
             except Exception as refused:
                 self._refused = refused
                 raise

@@ -87,7 +87,7 @@ def csv_table(file: FilePath) -> dict[str, Floats]:
     with open(file, newline="", encoding="utf-8-sig") as text:
         lines = csv.reader(text, skipinitialspace=True)
         try:
-            heading = _heading(next(lines, []), source)
+            heading = _heading(next((row for row in lines if not (row and row[0].startswith("#"))), []), source)
             for row in lines:
                 if (len(row) < 2 and not "".join(row).strip()) or row[0].startswith("#"):
                     continue

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use nearl_runtime::link::{Exchange, LinkError, Robot, RobotName, STATE_RESET, Turn};
 use nearl_runtime::rt::{
@@ -119,6 +120,9 @@ impl Plant {
     }
 }
 
+/// How often a wait for the end of a loop looks for signals.
+const SIGNALS: Duration = Duration::from_millis(5);
+
 type Running = JoinHandle<Result<RunReport, RunError>>;
 
 /// `nearl run` on threads of this process.
@@ -144,8 +148,18 @@ impl LoopThread {
         priority: Option<i32>,
         proposal_age: Option<f64>,
         proposal_hold: Option<f64>,
-        rollback_window: Option<usize>,
+        rollback_window: Option<i64>,
     ) -> PyResult<LoopThread> {
+        for (what, value) in [("ramp", ramp), ("patience", patience)] {
+            if let Some(value) = value.filter(|value| !(0.0..=1e6).contains(value)) {
+                return Err(errors::value(format!("{what} is {value} s; give 0 to 1e6 seconds")));
+            }
+        }
+        if let Some(seconds) = seconds.filter(|seconds| !(*seconds > 0.0 && *seconds <= 1e7)) {
+            return Err(errors::value(format!(
+                "seconds is {seconds} s; give a time above 0, or leave it out"
+            )));
+        }
         for (what, value) in [("proposal_age", proposal_age), ("proposal_hold", proposal_hold)] {
             if let Some(value) = value.filter(|value| !(0.0..=1e6).contains(value)) {
                 return Err(errors::value(format!("{what} is {value} s; give 0 to 1e6 seconds")));
@@ -166,11 +180,15 @@ impl LoopThread {
         let thread = ThreadSettings { priority, cpu: None, lock_memory: priority.is_some() };
         let unsaid = RunSettings::default();
         let (patience, ramp) = (patience.unwrap_or(unsaid.patience), ramp.unwrap_or(unsaid.ramp));
-        let window = rollback_window.unwrap_or(unsaid.rollback.window);
-        if window > RollbackSettings::MOST_WINDOW {
-            let most = RollbackSettings::MOST_WINDOW;
-            return Err(errors::value(format!("rollback_window is {window} ticks; give at most {most}")));
-        }
+        let most = RollbackSettings::MOST_WINDOW;
+        let window = match rollback_window {
+            None => unsaid.rollback.window,
+            Some(window) => {
+                usize::try_from(window).ok().filter(|window| *window <= most).ok_or_else(|| {
+                    errors::value(format!("rollback_window is {window} ticks; give 0 to {most}"))
+                })?
+            }
+        };
         let rollback = RollbackSettings { window, ..unsaid.rollback };
         let settings = RunSettings { seconds, log, patience, ramp, thread, proposer, rollback, ..unsaid };
         let stop = Stop::new();
@@ -190,11 +208,15 @@ impl LoopThread {
         held.as_ref().is_some_and(|thread| !thread.is_finished())
     }
 
-    /// Asks it to stop (unless `wait`), waits for its end and returns the report as JSON.
+    /// Asks it to stop (unless `wait`), waits for its end and returns the report as JSON. A signal that Python raises ends the waiting, not the loop.
     #[pyo3(signature = (wait=false))]
     fn end(&self, py: Python<'_>, wait: bool) -> PyResult<String> {
         if !wait {
             self.stop.request();
+        }
+        while self.running() {
+            py.detach(|| std::thread::sleep(SIGNALS));
+            py.check_signals()?;
         }
         let taken = self.running.lock().unwrap_or_else(PoisonError::into_inner).take();
         let thread = taken.ok_or_else(|| PyRuntimeError::new_err("the loop has ended; start another one"))?;

@@ -1,6 +1,7 @@
 """A driver in Python in front of a real loop: the limits hold, and a plant alone is told to brake at once."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -182,6 +183,42 @@ def test_a_loop_that_comes_while_time_stands_still_is_told_of_the_plant(tmp_path
     assert turns[0][1] is not None, turns
 
 
+def test_times_that_are_none_are_refused(tmp_path) -> None:
+    """A ramp that is no number had let the first motion in at once, and so had infinity."""
+    snapshot = spring(tmp_path)
+    for key, values in {"ramp": (np.nan, np.inf, -1.0), "patience": (np.nan, -1.0), "seconds": (np.nan, -1.0, 0.0), "rollback_window": (-1,)}.items():
+        for value in values:
+            with pytest.raises(ValueError, match=f"{key} is .*; give"):
+                nearl.Loop(snapshot, name("none"), **{key: value})
+
+
+def test_ctrl_c_brakes_and_ends_the_loop_that_is_waited_for(tmp_path) -> None:
+    over = threading.Event()
+
+    def drive(plant: nearl.Plant) -> None:
+        tick = 0
+        while not over.is_set():
+            plant.exchange([0.1], [0.0], [0.1, 0.0], patience=0.2, time=tick * 0.001)
+            tick += 1
+
+    with open_plant("interrupt", lockstep=True) as plant:
+        driver = threading.Thread(target=drive, args=(plant,))
+        driver.start()
+        loop = nearl.Loop(spring(tmp_path), name("interrupt"), ramp=0.0, seconds=60.0)
+        timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        begin = time.monotonic()
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                loop.wait()
+        finally:
+            over.set()
+            timer.cancel()
+            driver.join()
+        assert time.monotonic() - begin < 30.0 and not loop.running
+        assert loop.report is not None and loop.report["reason"] == "stop", loop.report
+
+
 def nearl_command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "nearl", *map(str, arguments)]
 
@@ -256,5 +293,5 @@ def test_a_policy_that_the_robot_does_not_follow_is_taken_back_unless_it_is_mean
     assert loop.report["rolled_back"] == rolled_back and not any("priority" in warning for warning in loop.report["warnings"]), loop.report
     with pytest.raises(ValueError, match="priority is 100; give 1 to 99, or 0 for the normal scheduler"):
         nearl.Loop(first, name(what), priority=100)
-    with pytest.raises(ValueError, match="rollback_window is 2000000 ticks; give at most 1000000"):
+    with pytest.raises(ValueError, match="rollback_window is 2000000 ticks; give 0 to 1000000"):
         nearl.Loop(first, name(what), rollback_window=2_000_000)

@@ -128,6 +128,17 @@ def test_the_robot_goes_where_it_is_told_by_name(tmp_path: Path) -> None:
         nearl.Proposer(name("told"), patience=0.1)
 
 
+def test_a_snapshot_that_takes_other_proposals_is_refused(tmp_path: Path) -> None:
+    """The proposer asked once what it is to give; it would have been refused from then on."""
+    states = blank(tmp_path)
+    taken = tmp_path / "states.safetensors"
+    taken.write_bytes(states.read_bytes())
+    with Carriage("other"), nearl.Loop(taken, name("other"), ramp=0.0, proposal_age=5.0), nearl.Link(name("other"), patience=20.0) as link:
+        refused = link.push(blank(tmp_path, actions=True))
+        assert not refused.accepted and "takes other proposals" in refused.text, refused
+        assert link.push(taken).accepted
+
+
 def test_actions_are_guarded(tmp_path: Path) -> None:
     with Carriage("acts") as plant, nearl.Loop(blank(tmp_path, actions=True), name("acts"), ramp=0.0, proposal_age=5.0) as loop:
         with nearl.Proposer(name("acts")) as proposer:

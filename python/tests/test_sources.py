@@ -29,7 +29,7 @@ def converted(folder: Path, text: str | bytes) -> np.ndarray:
 def test_a_heading_may_be_quoted_and_lines_be_commented(tmp_path: Path) -> None:
     quoted = ", ".join(f'"{name}"' for name in HEADING.split(","))
     rows = [line(0, k) for k in range(5)] + ["", "# the second one"] + [line(1, k) for k in range(4)]
-    assert converted(tmp_path, "\ufeff" + "\r\n".join([quoted, *rows, ""])).tolist() == [4, 3]
+    assert converted(tmp_path, "\ufeff" + "\r\n".join(["# made by hand, twice", quoted, *rows, ""])).tolist() == [4, 3]
 
 
 def test_truth_values_in_csv_are_ones_and_zeros(tmp_path: Path) -> None:

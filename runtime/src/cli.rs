@@ -174,7 +174,7 @@ pub fn quoted(path: &std::path::Path) -> String {
 pub fn seconds(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(s) if s > 0.0 && s <= 1e7 => Ok(s),
-        _ => Err(format!("'{text}' is not a duration; write seconds, for example 2.5")),
+        _ => Err(format!("'{text}' is not a duration; write seconds above 0, for example 2.5")),
     }
 }
 
@@ -253,7 +253,7 @@ impl RunCommand {
         };
         for (name, value) in [("--ramp", self.ramp), ("--jump", self.jump)] {
             if !(0.0..=1e6).contains(&value) {
-                return Err(format!("{name} {value} is not usable: give 0 or a positive number").into());
+                return Err(format!("{name} {value} is not usable: give 0 to 1000000").into());
             }
         }
         let faults = self.faults.as_deref().map(FaultPlan::load).transpose()?.unwrap_or_default();

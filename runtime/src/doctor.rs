@@ -265,7 +265,7 @@ fn projection(m: &Manifest) -> Check {
         CheckCode::Projection,
         format!(
             "its policy is direct and not guarded: nothing is projected, so of the limits of the task {kept}; set constraints.guard, or train \
-             with an algorithm other than ppo"
+             with an algorithm that proposes states, as pid2-ib"
         ),
     )
 }

@@ -400,7 +400,9 @@ impl Training {
             imitator.see(rows, imitation.weight(iterations));
         }
         let mut metrics = self.learner.update(&mut self.batch, pace, &mut self.rng);
-        metrics.push(("demos/weight", imitation.weight(iterations)));
+        if self.algo.weighs_demonstrations() {
+            metrics.push(("demos/weight", imitation.weight(iterations)));
+        }
         metrics
     }
 

@@ -23,6 +23,11 @@ pub struct Payload {
 }
 
 impl RobotDescription {
+    /// Whether there is a body or a frame of this name.
+    pub fn has_frame(&self, name: &str) -> bool {
+        self.bodies.iter().any(|body| body.name == name) || self.frames.iter().any(|frame| frame.name == name)
+    }
+
     /// Adds a payload to the body that holds it. With masses `m`, centres of mass `c` and inertias `I` of both, in the body's axes,
     ///
     /// ```text

@@ -86,6 +86,8 @@ def view(name: str, task: str | None = None, port: int = 8080, seconds: float | 
         import viser  # noqa: F401
     except ImportError as error:
         raise ViewError(f"the live view needs viser: pip install 'nearl[view]' ({error})") from error
+    if not 0 <= port <= 65535:
+        raise ValueError(f"port {port} is none; give 1 to 65535, or 0 for any that is free")
     source = source_of(name, task)
     server = serve(port, f"NEARL: {source.title}")
     page = Page(server, source)

@@ -142,6 +142,8 @@ class Loop:
             env = _core.Env(wanted)
         except (ValueError, OSError) as error:
             self._client.close()
+            if task is not None and "[reward]" in str(error):
+                raise ViewError(f"{error}. The page draws what a task simulates: give it a copy of the file with [reward] none = \"0\"") from error
             if task is not None:
                 raise
             raise ViewError(f"the loop of `{name}` runs a policy of task '{wanted}', which is none of the bundled ones; give its file: --task FILE") from error

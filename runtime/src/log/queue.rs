@@ -184,7 +184,8 @@ fn write_all(
                     }
                     Err(error) => {
                         summary.error = Some(error);
-                        drop_one(shared);
+                        // With this one those before it that wait for the same chunk.
+                        lose(log.open_ticks(), 1, &mut summary, shared);
                     }
                 },
             }
@@ -196,8 +197,11 @@ fn write_all(
         }
         std::thread::sleep(POLL);
     }
-    if let Err(error) = log.close() {
-        summary.error.get_or_insert(error);
+    if summary.error.is_none()
+        && let Err(error) = log.close()
+    {
+        summary.error = Some(error);
+        lose(log.open_ticks(), 0, &mut summary, shared);
     }
     summary.dropped = shared.dropped.load(Ordering::Relaxed);
     summary.dropped_snapshots = shared.dropped_snapshots.load(Ordering::Relaxed);
@@ -215,6 +219,13 @@ fn attach_all(log: &mut Log, snapshots: &mut Consumer<Waiting>, shared: &Shared,
     }
 }
 
+/// Counts the ticks of a chunk that could not be written, of which all but `new` had been counted as written.
+fn lose(ticks: u64, new: u64, summary: &mut LogSummary, shared: &Shared) {
+    summary.written -= ticks.saturating_sub(new).min(summary.written);
+    summary.brief = summary.brief.min(summary.written);
+    shared.dropped.fetch_add(ticks, Ordering::Relaxed);
+}
+
 fn drop_one(shared: &Shared) {
     shared.dropped.fetch_add(1, Ordering::Relaxed);
 }
@@ -222,13 +233,16 @@ fn drop_one(shared: &Shared) {
 #[cfg(test)]
 mod tests {
     use std::io::{Cursor, Error, ErrorKind, Result, Seek, SeekFrom, Write};
+    use std::sync::Mutex;
     use std::sync::mpsc::{Receiver, channel};
 
     use super::*;
+    use crate::log::writer::{BRIEF_TOPIC, TICK_TOPIC};
 
     /// Takes `room` bytes, then fails like a full disk; waits for a word before its first write past the start.
     struct Disk {
         content: Cursor<Vec<u8>>,
+        kept: Arc<Mutex<Vec<u8>>>,
         room: usize,
         wait: Option<Receiver<()>>,
     }
@@ -244,7 +258,9 @@ mod tests {
             if at + bytes.len() > self.room {
                 return Err(Error::from(ErrorKind::StorageFull));
             }
-            self.content.write(bytes)
+            let done = self.content.write(bytes)?;
+            self.kept.lock().unwrap().clone_from(self.content.get_ref());
+            Ok(done)
         }
         fn flush(&mut self) -> Result<()> {
             Ok(())
@@ -257,13 +273,47 @@ mod tests {
         }
     }
 
-    fn disk(room: usize, wait: Option<Receiver<()>>) -> Box<dyn Sink> {
-        Box::new(Disk { content: Cursor::new(Vec::new()), room, wait })
+    fn disk(room: usize, wait: Option<Receiver<()>>, kept: &Arc<Mutex<Vec<u8>>>) -> Box<dyn Sink> {
+        Box::new(Disk { content: Cursor::new(Vec::new()), kept: Arc::clone(kept), room, wait })
+    }
+
+    /// Ticks, whole or in brief, in a log that may end in the middle of a chunk.
+    fn ticks(log: &[u8]) -> u64 {
+        use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+        let mut reader =
+            LinearReader::new_with_options(LinearReaderOptions::default().with_skip_end_magic(true));
+        let (mut at, mut ticks, mut of_ticks) = (0, 0, Vec::new());
+        while let Some(event) = reader.next_event() {
+            match event {
+                Ok(LinearReadEvent::ReadRequest(wanted)) => {
+                    let more = &log[at..log.len().min(at + wanted)];
+                    reader.insert(wanted)[..more.len()].copy_from_slice(more);
+                    reader.notify_read(more.len());
+                    at += more.len();
+                }
+                Ok(LinearReadEvent::Record { data, opcode }) => match mcap::parse_record(opcode, data) {
+                    Ok(mcap::records::Record::Channel(channel))
+                        if [TICK_TOPIC, BRIEF_TOPIC].contains(&channel.topic.as_str()) =>
+                    {
+                        of_ticks.push(channel.id);
+                    }
+                    Ok(mcap::records::Record::Message { header, .. })
+                        if of_ticks.contains(&header.channel_id) =>
+                    {
+                        ticks += 1
+                    }
+                    _ => {}
+                },
+                Err(_) => break,
+            }
+        }
+        ticks
     }
 
     #[test]
     fn a_full_disk_costs_records_and_nothing_else() {
-        let mut log = LogQueue::start(disk(100_000, None), &BTreeMap::new(), 0).unwrap();
+        let kept = Arc::default();
+        let mut log = LogQueue::start(disk(1_000_000, None, &kept), &BTreeMap::new(), 0).unwrap();
         let mut record = Record::new();
         record.state.n_obs = 128;
         for tick in 0..5000 {
@@ -277,12 +327,16 @@ mod tests {
         assert!(summary.dropped > 4000, "{summary:?}");
         assert_eq!(summary.written + summary.dropped, 5000);
         assert!(summary.error.is_some());
+        // Those of the chunk that could not be written are not called written.
+        assert!(summary.written > 0);
+        assert_eq!(summary.written, ticks(&kept.lock().unwrap()));
     }
 
     #[test]
     fn a_stuck_disk_drops_exactly_what_the_queue_cannot_hold() {
         let (release, wait) = channel();
-        let mut log = LogQueue::start(disk(usize::MAX, Some(wait)), &BTreeMap::new(), 0).unwrap();
+        let mut log =
+            LogQueue::start(disk(usize::MAX, Some(wait), &Arc::default()), &BTreeMap::new(), 0).unwrap();
         let record = Record::new();
         for _ in 0..5000 {
             log.push(&record); // returns at once although nothing is being written

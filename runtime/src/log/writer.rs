@@ -29,7 +29,7 @@ const SNAPSHOT_SCHEMA: &str = r#"{"title": "nearl.Snapshot", "type": "object", "
 /// Logs of one name in a folder.
 const MOST_LOGS: usize = 10_000;
 /// Bytes of a chunk, before it is compressed: what the end of the process may cost.
-const CHUNK: u64 = 128 << 10;
+const CHUNK: usize = 128 << 10;
 /// A chunk is not kept back longer than this [ns].
 const LONGEST: u64 = 500_000_000;
 /// A memory is written at least every so many ticks: a replay of a damaged file loses no more.
@@ -115,6 +115,9 @@ pub(super) struct Log {
     is_behind: bool,
     /// When the last chunk ended [ns].
     flushed: u64,
+    /// Ticks and bytes of the chunk that is being filled: they are in the file once it has ended.
+    open_ticks: u64,
+    open_bytes: usize,
 }
 
 /// Opens the log in `sink`; `metadata` is written at once.
@@ -124,7 +127,7 @@ pub(super) fn open(
     wall: u64,
 ) -> mcap::McapResult<Log> {
     let compression = Some(mcap::Compression::Lz4);
-    let options = WriteOptions::new().compression(compression).chunk_size(Some(CHUNK)).library("nearl");
+    let options = WriteOptions::new().compression(compression).chunk_size(None).library("nearl");
     let mut writer = options.create(BufWriter::new(sink))?;
     let mut channel = |topic: &str, title: &str, schema: &str| {
         let schema = writer.add_schema(title, "jsonschema", schema.as_bytes())?;
@@ -150,12 +153,15 @@ pub(super) fn open(
         remembered: 0,
         is_behind: false,
         flushed: 0,
+        open_ticks: 0,
+        open_bytes: 0,
     })
 }
 
 impl Log {
     /// Writes a tick, or only what its replay needs; a memory too where one is due.
     pub(super) fn write(&mut self, record: &Record, in_brief: bool) -> Result<(), String> {
+        self.open_ticks += 1;
         encode(record, &mut self.line).map_err(|e| e.to_string())?;
         self.is_behind |= record.tick != self.last + 1;
         self.last = record.tick;
@@ -164,7 +170,8 @@ impl Log {
         // A memory is of use with the whole tick alone, and what another process proposed is an input.
         if in_brief && !remembers && !record.heard {
             encode_brief(record, &self.line, &mut self.brief).map_err(|e| e.to_string())?;
-            return self.send(record, self.briefs, true);
+            self.send(record, self.briefs, true)?;
+            return self.end_chunk(record.end);
         }
         self.send(record, self.ticks, false)?;
         if remembers {
@@ -172,11 +179,23 @@ impl Log {
             encode_memory(record, &mut self.brief).map_err(|e| e.to_string())?;
             self.send(record, self.memories, true)?;
         }
-        if record.end > self.flushed + LONGEST {
-            self.flushed = record.end;
-            self.writer.flush().map_err(said)?;
+        self.end_chunk(record.end)
+    }
+
+    /// Ends the chunk where it is large or old enough.
+    fn end_chunk(&mut self, now: u64) -> Result<(), String> {
+        if self.open_bytes < CHUNK && now <= self.flushed + LONGEST {
+            return Ok(());
         }
+        self.flushed = now;
+        self.writer.flush().map_err(said)?;
+        (self.open_ticks, self.open_bytes) = (0, 0);
         Ok(())
+    }
+
+    /// Ticks that were given and are not in the file: all of a chunk that could not be written.
+    pub(super) fn open_ticks(&self) -> u64 {
+        self.open_ticks
     }
 
     fn send(&mut self, record: &Record, channel_id: u16, is_brief: bool) -> Result<(), String> {
@@ -187,6 +206,7 @@ impl Log {
             publish_time: record.begin.saturating_add(self.wall),
         };
         let line = if is_brief { &self.brief } else { &self.line };
+        self.open_bytes += line.len();
         self.writer.write_to_known_channel(&header, line).map_err(said)
     }
 
@@ -217,9 +237,11 @@ impl Log {
     }
 
     /// Ends the file.
-    pub(super) fn close(mut self) -> Result<(), String> {
+    pub(super) fn close(&mut self) -> Result<(), String> {
+        self.writer.flush().map_err(said)?;
+        self.open_ticks = 0;
         self.writer.finish().map_err(said)?;
-        self.writer.into_inner().flush().map_err(|e| e.to_string())
+        Ok(())
     }
 }
 

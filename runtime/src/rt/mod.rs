@@ -45,7 +45,7 @@ pub use cycle::Sync;
 pub use faults::{Fault, FaultKind, FaultPlan, FaultyPlant, Odd};
 pub use meaning::Meaning;
 pub use mode::{Event, Mode, ModeLimits, Modes, Reason};
-pub use pilot::{Pilot, PilotBuilder, describe, numbers};
+pub use pilot::{Asked, Pilot, PilotBuilder, describe, numbers};
 pub use pinned::Pinned;
 pub use report::{PlantSummary, ProposerSummary, RunReport};
 pub use residual::RollbackSettings;

@@ -50,12 +50,17 @@ pub struct Pilot {
     /// Ticks since the policy ran.
     period_tick: u32,
     /// What another process may propose: kind, hash of the names, their number.
-    takes: Option<(u32, u64, usize)>,
+    takes: Option<Asked>,
     /// Name of the task.
     task: String,
 }
 
 impl Pilot {
+    /// What it takes from another process in place of its policy; none where nothing projects that.
+    pub(crate) fn asks(&self) -> Option<Asked> {
+        self.takes
+    }
+
     /// Builds and validates the controller of `snapshot` for `robot`. Allocates and parses the robot file.
     pub fn new(snapshot: &Snapshot, robot: &RobotMessage) -> Result<Pilot, Refusal> {
         Pilot::within(snapshot, robot, &PilotBuilder::default())
@@ -83,7 +88,7 @@ impl Pilot {
         let names = controller.given_names().filter(|names| names.len() <= MAX_OBS);
         let layout = controller.layout();
         Ok(Pilot {
-            takes: names.map(|names| (kind, hash_names(&names), names.len())),
+            takes: names.map(|names| Asked(kind, hash_names(&names), names.len())),
             brake: Brake::new(&snapshot.manifest).map_err(refuse)?,
             state: controller.state(),
             noise: controller.noise(),
@@ -345,13 +350,13 @@ impl LoopController for Pilot {
     }
 
     fn question(&self) -> Option<Question> {
-        let (kind, ..) = self.takes?;
+        let Asked(kind, ..) = self.takes?;
         let policy_every = self.controller.policy_every();
         Some(Question { kind, names: self.controller.given_names()?, policy_every })
     }
 
     fn takes(&self, kind: u32, names: u64, n: usize) -> bool {
-        self.takes == Some((kind, names, n))
+        self.takes == Some(Asked(kind, names, n))
     }
 
     fn give(&mut self, values: &[f64]) {
@@ -476,7 +481,13 @@ pub struct PilotBuilder {
     pub meaning: Option<Meaning>,
     /// What no snapshot may loosen.
     pub pinned: Option<Pinned>,
+    /// What another process was asked to propose, once and for all.
+    pub asked: Option<Asked>,
 }
+
+/// What another process may propose: states or actions, a number for the names of their entries, how many there are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Asked(u32, u64, usize);
 
 impl Build for PilotBuilder {
     type Controller = Pilot;
@@ -484,7 +495,13 @@ impl Build for PilotBuilder {
     fn build(&mut self, snapshot: &SnapshotBytes, robot: &RobotMessage) -> Result<Pilot, Refusal> {
         let parsed = Snapshot::from_bytes(&snapshot.bytes);
         let snapshot = parsed.map_err(|e| Refusal { verdict: Verdict::of(&e), text: e.to_string() })?;
-        Pilot::within(&snapshot, robot, self)
+        let pilot = Pilot::within(&snapshot, robot, self)?;
+        if self.asked.is_some_and(|asked| pilot.takes != Some(asked)) {
+            let text = "another process proposes, and the snapshot takes other proposals from it than the loop began with (states or actions, and of \
+                        which joints); use one that takes the same, or start the loop anew";
+            return Err(Refusal { verdict: Verdict::ForeignShape, text: text.into() });
+        }
+        Ok(pilot)
     }
 
     fn with_limits(&mut self, bytes: &[u8], moved: &Moved) -> Result<Vec<u8>, Refusal> {
@@ -497,6 +514,15 @@ impl Build for PilotBuilder {
             let text = "the snapshot in use gives actions that nothing projects, so that no limit of it can be moved; \
                         write guard = true under [constraints] of its task";
             return refuse(Verdict::Other, text.into());
+        }
+        if let Some(payload) = &moved.payload
+            && !snapshot.manifest.robot.has_frame(&payload.frame)
+        {
+            let text = format!(
+                "the robot carries a payload on frame '{}', which the snapshot's robot does not have; use a snapshot trained for this robot",
+                payload.frame
+            );
+            return refuse(Verdict::ForeignRobot, text);
         }
         snapshot.manifest.moved = Some(moved.clone());
         if moved.payload.is_some()

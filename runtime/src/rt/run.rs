@@ -195,6 +195,16 @@ pub enum RunError {
     /// Strict mode.
     #[error("--strict: {0}")]
     Strict(String),
+    /// A setting that is no time or no number.
+    #[error("{name} is {value}; give {wanted}")]
+    Setting {
+        /// Field of [`RunSettings`].
+        name: &'static str,
+        /// As given.
+        value: f64,
+        /// What is taken.
+        wanted: &'static str,
+    },
     /// A thread.
     #[error("thread `{name}` could not be started ({reason}): close other programs or raise `ulimit -u`")]
     Thread {
@@ -219,6 +229,30 @@ pub enum RunError {
     Panicked(&'static str),
 }
 
+impl RunSettings {
+    /// Refuses times that are none: a ramp that is no number would let the first motion in at once.
+    fn check(&self) -> Result<(), RunError> {
+        let fields = [
+            ("ramp", self.ramp, "0 to 1e6 seconds"),
+            ("patience", self.patience, "0 to 1e6 seconds"),
+            ("jump", self.jump, "0 to 1e6 times the speed limit"),
+        ];
+        for (name, value, wanted) in fields {
+            if !(0.0..=1e6).contains(&value) {
+                return Err(RunError::Setting { name, value, wanted });
+            }
+        }
+        match self.seconds {
+            Some(value) if !(value > 0.0 && value <= 1e7) => Err(RunError::Setting {
+                name: "seconds",
+                value,
+                wanted: "a time above 0, at most 1e7 seconds",
+            }),
+            _ => Ok(()),
+        }
+    }
+}
+
 /// Opens the link of `name` and waits for its plant.
 pub fn connect(name: &RobotName, patience: f64) -> Result<(RuntimeLink, RobotMessage), LinkError> {
     let mut link = RuntimeLink::open(name)?;
@@ -233,6 +267,7 @@ pub fn run(
     plant: &RobotName,
     stop: &Stop,
 ) -> Result<RunReport, RunError> {
+    settings.check()?;
     let file = in_run(file);
     let refused = |text: String| RunError::Snapshot(format!("{}: {text}", file.display()));
     let snapshot = Snapshot::load(&file).map_err(|e| match e {
@@ -264,7 +299,8 @@ pub fn run(
         settings.metadata.insert("limits".into(), pinned.to_json());
     }
     let meaning = Meaning::of(&snapshot.manifest).map_err(|e| refused(e.to_string()))?;
-    let build = PilotBuilder { meaning: Some(meaning), pinned };
+    let asked = settings.proposer.and(first.asks());
+    let build = PilotBuilder { meaning: Some(meaning), pinned, asked };
     let mut report = run_loop(link, robot, first, build, &settings, stop)?;
     report.warnings.extend(snapshot.manifest.without_simulator().map(str::to_owned));
     if settings.proposer.is_none() {
@@ -313,6 +349,7 @@ pub fn run_loop<B: Build>(
     settings: &RunSettings,
     stop: &Stop,
 ) -> Result<RunReport, RunError> {
+    settings.check()?;
     torn::watch();
     let begin = clock::now();
     let version = first.version();

@@ -215,6 +215,11 @@ impl Algorithm {
         self.registered().is_direct
     }
 
+    /// Whether demonstrations have a weight in its policy gradient (`train.demos.weight`).
+    pub fn weighs_demonstrations(self) -> bool {
+        matches!(self, Algorithm::Soil | Algorithm::Dapg)
+    }
+
     /// What it has demonstrations for; `None` takes none.
     pub fn demos(self) -> Option<Demonstrated> {
         self.registered().demos

@@ -26,6 +26,8 @@ pub(super) struct Passes {
     pub(super) reports: Vec<PhaseReport>,
     /// Passes over the batch.
     pub(super) epochs: usize,
+    /// Factor on the rates that these passes had ([`Params::adapted`]).
+    pub(super) adapted: f32,
 }
 
 /// An update of policy, value and what learns beside them.
@@ -62,6 +64,7 @@ impl Update<'_> {
         let n = if apart { ppo.n_epochs } else { 1 };
         let mut schedule = self.schedule();
         schedule.epochs = ppo.n_epochs / n;
+        let adapted = params.adapted;
         let mut sum = vec![PhaseReport::default(); self.phases.len()];
         let (mut passes, mut divergence) = (0, 0.0);
         for pass in 0..n {
@@ -79,7 +82,7 @@ impl Update<'_> {
         }
         sum.iter_mut().for_each(|report| report.average(passes as f64));
         self.adapt(params, divergence);
-        Passes { reports: sum, epochs: passes * schedule.epochs }
+        Passes { reports: sum, epochs: passes * schedule.epochs, adapted }
     }
 
     /// All passes over the batch.

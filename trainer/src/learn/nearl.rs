@@ -143,7 +143,7 @@ impl Learner for Nearl {
         if let (Some(actor), Some(value)) = (of(ACTOR), of(VALUE)) {
             metrics = self.nets.combined.metrics(self.actor(), actor, value);
             metrics.push(("train/epochs", passes.epochs as f64));
-            metrics.push(("train/learning_rate", f64::from(ppo.lr * pace.rate * self.params.adapted)));
+            metrics.push(("train/learning_rate", f64::from(ppo.lr * pace.rate * passes.adapted)));
         }
         if let Some(imitate) = of(IMITATE) {
             metrics.push(("train/policy_mse", imitate.mean[0] / self.nets.combined.dims.n_state as f64));

@@ -321,7 +321,7 @@ impl Learner for Pid2 {
         let report = passes.reports;
         let mut metrics = self.nets.combined.metrics(self.actor(), &report[0], &report[1]);
         metrics.push(("train/epochs", passes.epochs as f64));
-        metrics.push(("train/learning_rate", f64::from(ppo.lr * pace.rate * self.params.adapted)));
+        metrics.push(("train/learning_rate", f64::from(ppo.lr * pace.rate * passes.adapted)));
         if opposed {
             let means = &report[phases.len() - 1].mean;
             let generator = if s.generator_lr > 0.0 { report[2].mean[0] } else { report[0].mean[4] };

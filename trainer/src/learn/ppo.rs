@@ -226,7 +226,7 @@ impl Ppo {
             ("train/grad_norm", report[0].norm),
             ("train/std", mean_std(log_std)),
             ("train/epochs", passes.epochs as f64),
-            ("train/learning_rate", f64::from(ppo.lr * pace.rate * self.params.adapted)),
+            ("train/learning_rate", f64::from(ppo.lr * pace.rate * passes.adapted)),
         ];
         if self.nets.term.is_some() {
             metrics.push(("demos/loss", report[0].mean[3]));

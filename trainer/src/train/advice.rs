@@ -96,6 +96,7 @@ fn vain_model(algo: Algorithm, manifest: &Manifest) -> Result<Option<String>, Tr
 }
 
 /// Says so where a run of `steps` ends before a reward or a demonstration is read: the first batch fills the statistics, and a warm-up reads neither.
+/// Nothing of one without a warm-up that clones demonstrations.
 ///
 /// # Errors
 /// [`TrainError`] of settings that cannot be read.
@@ -112,7 +113,15 @@ pub fn ends_in_warm_up(
         Some(uses) if uses.warms_up => ("demonstrations", "shorten the warm-up with train.demos.warmup"),
         _ => ("a reward", "leave the warm-up out with train.pid2.warmup=0"),
     };
-    Ok((warmup > 0 && steps <= end).then(|| {
+    if warmup == 0 {
+        return Ok((algo.demos().is_none() && steps <= batch).then(|| {
+            format!(
+                "the run ends after {steps} steps, and the first batch, which fills the statistics of the observations, takes {batch}: nothing is \
+                 learned; give it more, or smaller batches with train.n_envs and train.n_steps"
+            )
+        }));
+    }
+    Ok((steps <= end).then(|| {
         format!(
             "the run ends after {steps} steps, and first batch and warm-up take {end}: nothing is learned from {unread}; give it more, or {shorter}"
         )
@@ -333,6 +342,9 @@ mod tests {
             "{short}"
         );
         assert_eq!(said(Algorithm::Pid2Ib, 18_433, &[]), None);
+        let single = said(Algorithm::Ppo, 2048, &[]).expect("too short");
+        assert!(single.contains("takes 2048: nothing is learned"), "{single}");
+        assert_eq!(said(Algorithm::Ppo, 2049, &[]), None);
         let cloned = said(Algorithm::Pid2Il, 18_432, &[]).expect("too short");
         assert!(
             cloned.contains("warm-up take 18432: nothing is learned from demonstrations")

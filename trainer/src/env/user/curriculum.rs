@@ -51,8 +51,11 @@ impl Curriculum {
         if section.is_empty() {
             return Ok(None);
         }
-        let section: Section = serde_path_to_error::deserialize(section.clone())
-            .map_err(|e| mistake(format!("curriculum.{}", e.path()), suggest(e.inner().message())))?;
+        let section: Section = serde_path_to_error::deserialize(section.clone()).map_err(|e| {
+            let path = e.path().to_string();
+            let key = if path == "." { "curriculum".into() } else { format!("curriculum.{path}") };
+            mistake(key, suggest(e.inner().message()))
+        })?;
         for (key, value) in [("start", section.start), ("step", section.step)] {
             if !(0.0..=1.0).contains(&value) {
                 return Err(mistake(format!("curriculum.{key}"), format!("{value} is outside [0, 1]")));
