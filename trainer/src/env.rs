@@ -415,8 +415,8 @@ pub fn unstated_steps(manifest: &Manifest, spec: &Spec) -> Option<String> {
     let by_forces = manifest.guards() || (manifest.proposes() && task.idm.kind == IdmKind::Pinocchio);
     (by_forces && user::is_own(task) && spec.semi_implicit_euler && task.time.sim_dt == 0.0).then(|| {
         format!(
-            "time.sim_dt is 0 or not stated: limits reckon with constant acceleration, as of a robot, and the simulated robot, which makes Euler steps of {} s, \
-             leaves them by the difference; write sim_dt = {} under [time] for this simulation",
+            "time.sim_dt is 0 or not stated: limits reckon with constant acceleration, as of a robot, and the simulated robot, which makes Euler steps of {} \
+             s, leaves them by the difference; write sim_dt = {} under [time] for this simulation",
             spec.sim_dt, spec.sim_dt
         )
     })

@@ -161,8 +161,8 @@ fn check_actions(
     let of_force = |i: &usize| matches!(drives[*i], Drive::Effort | Drive::Pd { .. });
     if m.task.constraints.torque.is_none() && dofs.iter().any(of_force) {
         return refuse(
-            "[constraints] guard = true without a torque limit would ask for more than the motors give; add torque = { scale = 1.0 }, and consistency = \"kinematic\" \
-             where it is \"free\"".into(),
+            "[constraints] guard = true without a torque limit would ask for more than the motors give; add torque = { scale = 1.0 }, and \
+             consistency = \"kinematic\" where it is \"free\"".into(),
         );
     }
     if m.task.constraints.torque.as_ref().is_some_and(|torque| torque.soft.is_some())
