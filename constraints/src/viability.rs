@@ -221,7 +221,7 @@ pub fn interval(dof: &Dof, q: f64, v: f64, period: &Period) -> Interval {
         if lower - upper > CROSSING * a {
             let beyond = if v.abs() > dof.velocity { Kind::Velocity } else { Kind::Viability };
             outside = outside.or(Some(beyond));
-            let stop = hard_brake(dof, v, period);
+            let stop = full_brake(dof, v, period);
             (lower, upper) = (stop, stop);
         } else {
             lower = upper;
@@ -237,7 +237,7 @@ pub fn brake(dof: &Dof, v: f64, period: &Period) -> f64 {
 
 /// The deceleration outside the set, `-sgn(v) min(A, |v| / T)` of the deceleration that is stated: it turns nothing round, so that neither a slow
 /// limit nor a narrow range ([`Dof::braking`]) asks for less.
-fn hard_brake(dof: &Dof, v: f64, period: &Period) -> f64 {
+fn full_brake(dof: &Dof, v: f64, period: &Period) -> f64 {
     -v.signum() * dof.deceleration.min(dof.acceleration).min(v.abs() / period.dt)
 }
 

@@ -172,7 +172,7 @@ fn write_all(
         let is_over = shared.over.load(Ordering::Acquire);
         while let Ok(record) = waiting.peek() {
             // A snapshot is pushed before the first record that uses it, so it is seen here at the latest.
-            attach_all(&mut log, &mut snapshots, shared, &mut summary.error);
+            attach_all(&mut log, &mut snapshots, shared, &mut summary);
             let behind = waiting.slots();
             in_brief = behind > if in_brief { FEW } else { MANY };
             match &summary.error {
@@ -191,29 +191,33 @@ fn write_all(
             }
             let _ = waiting.pop();
         }
-        attach_all(&mut log, &mut snapshots, shared, &mut summary.error);
+        attach_all(&mut log, &mut snapshots, shared, &mut summary);
         if is_over {
             break;
         }
         std::thread::sleep(POLL);
     }
     if summary.error.is_none()
-        && let Err(error) = log.close()
+        && let Err((error, ticks)) = log.close()
     {
         summary.error = Some(error);
-        lose(log.open_ticks(), 0, &mut summary, shared);
+        lose(ticks, 0, &mut summary, shared);
     }
     summary.dropped = shared.dropped.load(Ordering::Relaxed);
     summary.dropped_snapshots = shared.dropped_snapshots.load(Ordering::Relaxed);
     summary
 }
 
-fn attach_all(log: &mut Log, snapshots: &mut Consumer<Waiting>, shared: &Shared, error: &mut Option<String>) {
+fn attach_all(log: &mut Log, snapshots: &mut Consumer<Waiting>, shared: &Shared, summary: &mut LogSummary) {
     while let Ok(snapshot) = snapshots.pop() {
         shared.snapshot_bytes.fetch_sub(snapshot.bytes.len() as u64, Ordering::AcqRel);
-        let result = if error.is_some() { Err(String::new()) } else { log.attach(&snapshot) };
-        if let Err(reason) = result {
-            error.get_or_insert(reason);
+        if summary.error.is_none()
+            && let Err(reason) = log.attach(&snapshot)
+        {
+            summary.error = Some(reason);
+            lose(log.open_ticks(), 0, summary, shared);
+        }
+        if summary.error.is_some() {
             shared.dropped_snapshots.fetch_add(1, Ordering::Relaxed);
         }
     }

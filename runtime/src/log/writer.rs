@@ -188,6 +188,10 @@ impl Log {
             return Ok(());
         }
         self.flushed = now;
+        self.flush()
+    }
+
+    fn flush(&mut self) -> Result<(), String> {
         self.writer.flush().map_err(said)?;
         (self.open_ticks, self.open_bytes) = (0, 0);
         Ok(())
@@ -228,7 +232,9 @@ impl Log {
                 media_type: "application/octet-stream".into(),
                 data: Cow::Borrowed(&snapshot.bytes),
             };
+            // The chunk ends before an attachment.
             self.writer.attach(&attachment).map_err(said)?;
+            self.flush()?;
         }
         let line = serde_json::to_vec(&numbered).map_err(|e| e.to_string())?;
         let sequence = snapshot.id as u32;
@@ -236,12 +242,11 @@ impl Log {
         self.writer.write_to_known_channel(&header, &line).map_err(said)
     }
 
-    /// Ends the file.
-    pub(super) fn close(&mut self) -> Result<(), String> {
-        self.writer.flush().map_err(said)?;
-        self.open_ticks = 0;
-        self.writer.finish().map_err(said)?;
-        Ok(())
+    /// Ends the file; where that fails, why, and how many ticks are not in it.
+    pub(super) fn close(mut self) -> Result<(), (String, u64)> {
+        self.writer.flush().map_err(|e| (said(e), self.open_ticks))?;
+        self.writer.finish().map_err(|e| (said(e), 0))?;
+        self.writer.into_inner().flush().map_err(|e| (e.to_string(), 0))
     }
 }
 
