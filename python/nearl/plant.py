@@ -184,7 +184,10 @@ class Loop:
             try:
                 self.report = json.loads(self._thread.end(wait))
             except KeyboardInterrupt:
-                self.report = json.loads(self._thread.end(False))
+                try:
+                    self.report = json.loads(self._thread.end(False))
+                except RuntimeError as refused:
+                    self._refused = refused
                 raise
             except Exception as refused:
                 self._refused = refused
