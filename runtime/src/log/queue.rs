@@ -331,9 +331,9 @@ mod tests {
         assert!(summary.dropped > 4000, "{summary:?}");
         assert_eq!(summary.written + summary.dropped, 5000);
         assert!(summary.error.is_some());
-        // Those of the chunk that could not be written are not called written.
-        assert!(summary.written > 0);
-        assert_eq!(summary.written, ticks(&kept.lock().unwrap()));
+        // Those of the chunk that could not be written are not called written, of which the file may have a part.
+        let there = ticks(&kept.lock().unwrap());
+        assert!(summary.written > 0 && (summary.written..summary.written + 100).contains(&there), "{there}");
     }
 
     #[test]

@@ -172,10 +172,10 @@ pub(super) fn changed(
     Ok(())
 }
 
-/// A return with a decimal, or as many as show three figures of a small one.
+/// A return with a decimal, or as many as show three figures of one below 1.
 fn figures(x: f64) -> String {
     match x.abs() {
-        size if size >= 10.0 || size == 0.0 || !size.is_finite() => format!("{x:.1}"),
+        size if size >= 1.0 || size == 0.0 || !size.is_finite() => format!("{x:.1}"),
         size if size >= 1e-3 => format!("{x:.*}", (2.0 - size.log10().floor()) as usize),
         _ => format!("{x:.1e}"),
     }
@@ -187,8 +187,8 @@ mod tests {
 
     #[test]
     fn small_returns_are_told_apart() {
-        let told = [12.04, 0.0, -0.0265, 3.1799, -1e-5, 0.001, f64::INFINITY].map(super::figures);
-        assert_eq!(told, ["12.0", "0.0", "-0.0265", "3.18", "-1.0e-5", "0.00100", "inf"]);
+        let told = [12.04, 0.0, -0.0265, 0.31799, -1e-5, 0.001, f64::INFINITY].map(super::figures);
+        assert_eq!(told, ["12.0", "0.0", "-0.0265", "0.318", "-1.0e-5", "0.00100", "inf"]);
     }
 
     #[test]
