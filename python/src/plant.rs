@@ -150,16 +150,6 @@ impl LoopThread {
         proposal_hold: Option<f64>,
         rollback_window: Option<i64>,
     ) -> PyResult<LoopThread> {
-        for (what, value) in [("ramp", ramp), ("patience", patience)] {
-            if let Some(value) = value.filter(|value| !(0.0..=1e6).contains(value)) {
-                return Err(errors::value(format!("{what} is {value} s; give 0 to 1e6 seconds")));
-            }
-        }
-        if let Some(seconds) = seconds.filter(|seconds| !(*seconds > 0.0 && *seconds <= 1e7)) {
-            return Err(errors::value(format!(
-                "seconds is {seconds} s; give a time above 0, or leave it out"
-            )));
-        }
         for (what, value) in [("proposal_age", proposal_age), ("proposal_hold", proposal_hold)] {
             if let Some(value) = value.filter(|value| !(0.0..=1e6).contains(value)) {
                 return Err(errors::value(format!("{what} is {value} s; give 0 to 1e6 seconds")));
@@ -191,6 +181,7 @@ impl LoopThread {
         };
         let rollback = RollbackSettings { window, ..unsaid.rollback };
         let settings = RunSettings { seconds, log, patience, ramp, thread, proposer, rollback, ..unsaid };
+        settings.check().map_err(errors::value)?;
         let stop = Stop::new();
         let running = std::thread::Builder::new().name("nearl-loop".into()).spawn({
             let stop = stop.clone();

@@ -121,8 +121,8 @@ impl Projector {
         if !balls.is_empty() {
             let names = balls.join("', '");
             let text = format!(
-                "ball joint '{names}': no limit of joints holds it, and its proposals stay as they are; leave it out of controllable=[...] to say that \
-                 this is meant"
+                "joint '{names}' moves in three directions at once, as a ball joint does: no limit of joints holds it, and its proposals stay as they are; \
+                 leave it out of controllable=[...] to say that this is meant"
             );
             errors::warn(py, &text)?;
         }

@@ -118,7 +118,8 @@ impl Training {
                 None => train::Training::on(&request, &experience),
             };
             let training = training.map_err(errors::train)?;
-            let advice = train::advice(algo, &request.manifest).map_err(errors::train)?;
+            let mut advice = train::advice(algo, &request.manifest).map_err(errors::train)?;
+            advice.extend(train::unread(&[algo], &settings));
             if let Some(out) = &out {
                 let (manifest, columns) = (&training.snapshot().manifest, training.columns());
                 RunFolder::create(out, manifest, seed, &columns, training.origin()).map_err(run)?;

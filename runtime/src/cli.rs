@@ -251,11 +251,6 @@ impl RunCommand {
             cpu: self.cpu,
             lock_memory: true,
         };
-        for (name, value) in [("--ramp", self.ramp), ("--jump", self.jump)] {
-            if !(0.0..=1e6).contains(&value) {
-                return Err(format!("{name} {value} is not usable: give 0 to 1000000").into());
-            }
-        }
         let faults = self.faults.as_deref().map(FaultPlan::load).transpose()?.unwrap_or_default();
         let (modes, rollback) = self.limits.settings()?;
         let settings = RunSettings {

@@ -11,7 +11,7 @@ mod setup;
 mod source;
 mod start_from;
 
-pub use advice::{advice, ends_in_warm_up};
+pub use advice::{advice, ends_in_warm_up, unread};
 pub(crate) use advice::{beginnings, demonstrated};
 pub use columns::COLUMNS;
 pub use ranked::RankedSource;

@@ -231,7 +231,10 @@ pub enum RunError {
 
 impl RunSettings {
     /// Refuses times that are none: a ramp that is no number would let the first motion in at once.
-    fn check(&self) -> Result<(), RunError> {
+    ///
+    /// # Errors
+    /// [`RunError::Setting`].
+    pub fn check(&self) -> Result<(), RunError> {
         let fields = [
             ("ramp", self.ramp, "0 to 1e6 seconds"),
             ("patience", self.patience, "0 to 1e6 seconds"),

@@ -47,6 +47,11 @@ fn episodes_are_recorded_behind_limits_of_their_own_and_the_better_ones_kept() {
     assert_eq!(kept, [most], "the better of {all:?}");
     assert_eq!(Demonstrations::load(&best).expect("demonstrations").episodes.len(), 1);
 
+    let again = record(&best, &["--episodes", "1"]).output();
+    let said = String::from_utf8_lossy(&again.stderr).into_owned();
+    assert!(!again.status.success() && said.contains("is there already"), "{said}");
+    assert_eq!(Demonstrations::load(&best).expect("demonstrations").episodes.len(), 1, "kept");
+
     let none = folder.path().join("none.npz");
     let refused = record(&none, &["--episodes", "1", "--at-least", "1e9"]).output();
     let said = String::from_utf8_lossy(&refused.stderr).into_owned();

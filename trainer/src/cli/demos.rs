@@ -20,7 +20,7 @@ pub(super) enum Demos {
 pub(super) struct Record {
     /// Run folder or snapshot file.
     run: PathBuf,
-    /// File to write.
+    /// File to write; one that is there is never replaced.
     #[arg(long, default_value = "demos.npz")]
     out: PathBuf,
     /// Episodes.
@@ -63,6 +63,10 @@ impl Demos {
 
 impl Record {
     fn run(self) -> Result<(), Failure> {
+        if self.out.exists() {
+            let out = self.out.display();
+            return Err(format!("'{out}' is there already, and may be the only one of its demonstrations; give another file with --out, or remove it").into());
+        }
         let file = run_folder::snapshot_of(&self.run)?;
         let mut snapshot = Snapshot::load(&file).map_err(|e| format!("{}: {e}", file.display()))?;
         let sections = [&SIMULATED[..], &["constraints"]].concat();

@@ -68,7 +68,7 @@ fn seeds(text: &str) -> Result<Seeds, String> {
 
 /// What the trainings that are still to be made say before they begin, once for each task. One that cannot be made says why by itself.
 fn advice(sweep: &Sweep, runs: &[Run]) -> Vec<String> {
-    let mut lines = Vec::new();
+    let mut lines = train::unread(&sweep.algos, &sweep.set);
     let mut seen = Vec::new();
     for r in runs.iter().filter(|r| r.found != Found::Finished) {
         let kind = (&r.task, r.algo.is_direct());

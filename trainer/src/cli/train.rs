@@ -223,6 +223,7 @@ impl Train {
         let experience = self.experience(&stop)?;
         // Said with the first batch: a training that is refused says why, and nothing else.
         let mut advice = crate::train::advice(run.algo, &manifest)?;
+        advice.extend(crate::train::unread(&[run.algo], &set));
         if !run.starts_warm {
             advice.extend(crate::train::ends_in_warm_up(run.algo, run.steps, &manifest)?);
         }

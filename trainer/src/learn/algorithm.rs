@@ -220,6 +220,14 @@ impl Algorithm {
         matches!(self, Algorithm::Soil | Algorithm::Dapg)
     }
 
+    /// Whether it reads something of `[train.pid2]`.
+    pub fn reads_pid2(self) -> bool {
+        matches!(
+            self,
+            Algorithm::Pid2Gan | Algorithm::Pid2Ib | Algorithm::Pid2Il | Algorithm::Bc | Algorithm::Gaifo
+        )
+    }
+
     /// What it has demonstrations for; `None` takes none.
     pub fn demos(self) -> Option<Demonstrated> {
         self.registered().demos

@@ -95,6 +95,32 @@ fn vain_model(algo: Algorithm, manifest: &Manifest) -> Result<Option<String>, Tr
     }))
 }
 
+/// A sentence for each of the settings `set` (`key=value`) that none of the algorithms reads.
+pub fn unread(algos: &[Algorithm], set: &[String]) -> Vec<String> {
+    let reads = |section: &str, algo: &Algorithm| match section {
+        "nearl" => matches!(algo, Algorithm::Nearl | Algorithm::PpoCombined),
+        "pid2" => algo.reads_pid2(),
+        "demos" => algo.demos().is_some(),
+        _ => true,
+    };
+    let names = algos.iter().map(|algo| format!("'{algo}'")).collect::<Vec<_>>().join(" and ");
+    let vain = set.iter().filter_map(|set| {
+        let key = set.split('=').next().unwrap_or_default().trim();
+        let section = key.strip_prefix("train.")?.split('.').next()?;
+        let is_read = algos.iter().any(|algo| reads(section, algo));
+        (!is_read).then(|| {
+            format!(
+                "{key} changes nothing: {names} {} no [train.{section}]; leave it out",
+                match algos.len() {
+                    1 => "reads",
+                    _ => "read",
+                }
+            )
+        })
+    });
+    vain.collect()
+}
+
 /// Says so where a run of `steps` ends before a reward or a demonstration is read: the first batch fills the statistics, and a warm-up reads neither.
 /// Nothing of one without a warm-up that clones demonstrations.
 ///
@@ -136,12 +162,23 @@ struct Outside {
     states: usize,
 }
 
-/// Where a joint that is inside comes to rest outside, beside the limits `position` and `velocity`.
-const REST: &str = "rest";
+/// What is outside.
+#[derive(Clone, Copy, PartialEq)]
+enum What {
+    Position,
+    /// Where a joint that is inside comes to rest.
+    Rest,
+    Velocity,
+}
 
-/// The limit that gives it more room.
-fn limit_of(key: &str) -> &str {
-    if key == REST { "position" } else { key }
+impl What {
+    /// The limit that gives it more room.
+    fn limit(self) -> &'static str {
+        match self {
+            What::Position | What::Rest => "position",
+            What::Velocity => "velocity",
+        }
+    }
 }
 
 /// States of one task, held against the limits of its joints.
@@ -185,34 +222,29 @@ impl States {
     }
 
     /// A sentence for each joint that was outside. `whose` leads to the joint, as `64 episodes begin with`; `next` is what comes of it and what
-    /// helps, by the name of the limit.
-    fn sentences(&self, whose: &str, next: impl Fn(&str) -> String) -> Vec<String> {
+    /// helps.
+    fn sentences(&self, whose: &str, next: impl Fn(What) -> String) -> Vec<String> {
         let (Parts { model, layout, projector }, mut lines) = (&self.parts, Vec::new());
         let limits = projector.limits();
         for &i in layout.controllable() {
             let (name, [position, velocity, rest]) = (model.dof_name(i), self.found[i]);
-            let mut say = |outside: Outside, how: &str, unit: &str, range: &str, key: &str| {
+            let mut say = |outside: Outside, how: &str, unit: &str, range: &str, what: What| {
                 if outside.states > 0 {
                     lines.push(format!(
                         "{} of {whose} joint '{name}' {how} {:.4} {unit} where {range} is allowed: {}",
                         outside.states,
                         outside.value,
-                        next(key)
+                        next(what)
                     ));
                 }
             };
             let range = format!("{} to {}", limits.q_lower[i], limits.q_upper[i]);
             let there = "outside its limits, furthest at";
-            say(position, there, "rad or m", &range, "position");
-            say(
-                rest,
-                "too fast to stop before the end of its range, furthest on to",
-                "rad or m",
-                &range,
-                REST,
-            );
+            say(position, there, "rad or m", &range, What::Position);
+            let gone = "too fast to stop before the end of its range, furthest on to";
+            say(rest, gone, "rad or m", &range, What::Rest);
             let range = format!("-{0} to {0}", limits.velocity[i]);
-            say(velocity, there, "rad/s or m/s", &range, "velocity");
+            say(velocity, there, "rad/s or m/s", &range, What::Velocity);
         }
         lines
     }
@@ -233,15 +265,16 @@ pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError>
     }
     let mut lines = Vec::from_iter(unstated);
     let is_own = !manifest.task.reward.is_empty();
-    lines.extend(states.sentences(&format!("{} episodes begin with", RESETS.0), |key| match is_own {
-        true if key == REST => "it goes there and comes back; draw it further inside or slower in [reset], or give constraints.position more room".into(),
+    lines.extend(states.sentences(&format!("{} episodes begin with", RESETS.0), |what| match is_own {
+        true if what == What::Rest => "it goes there and comes back; draw it further inside or slower in [reset], or give constraints.position more room".into(),
         true => format!(
-            "it comes back before it does anything else; draw it inside in [reset], or give constraints.{key} more room"
+            "it comes back before it does anything else; draw it inside in [reset], or give constraints.{} more room",
+            what.limit()
         ),
         false => format!(
             "it comes back before it does anything else; the bundled task draws it there, and no setting changes that: train on, or give \
              constraints.{} more room, or write a task of your own with [reward] and [reset] (docs: Train for your own robot)",
-            limit_of(key)
+            what.limit()
         ),
     }));
     Ok(lines)
@@ -270,10 +303,10 @@ pub(crate) fn demonstrated(demos: &Demonstrations, manifest: &Manifest) -> Resul
         states.look(|q, v| convert(env.spec(), (qpos, qvel), q, v));
         all += 1;
     }
-    Ok(states.sentences(&format!("{all} demonstrated states have"), |key| {
+    Ok(states.sentences(&format!("{all} demonstrated states have"), |what| {
         format!(
             "what is projected does not follow it there; demonstrate inside the limits of this robot, or give constraints.{} more room",
-            limit_of(key)
+            what.limit()
         )
     }))
 }
@@ -316,6 +349,25 @@ mod tests {
         assert_eq!(said(Algorithm::Nearl, &both), None, "what another algorithm reads");
         assert!(said(Algorithm::Nearl, &["train.nearl.idm_threshold=0.1"]).is_some());
         assert_eq!(said(Algorithm::Ppo, &both), None);
+    }
+
+    #[test]
+    fn settings_that_no_algorithm_of_the_run_reads_are_named() {
+        let set = ["train.pid2.lr=1e-3", "train.ppo.lr=1e-3", "train.n_envs=8", "train.nearl.idm_lr=1e-3"];
+        let set = set.map(String::from);
+        let said = |algos: &[Algorithm]| unread(algos, &set).join("\n");
+        let ppo = said(&[Algorithm::Ppo]);
+        assert!(
+            ppo.starts_with("train.pid2.lr changes nothing: 'ppo' reads no [train.pid2]; leave it out"),
+            "{ppo}"
+        );
+        assert!(ppo.contains("train.nearl.idm_lr") && ppo.lines().count() == 2, "{ppo}");
+        assert_eq!(said(&[Algorithm::Ppo, Algorithm::Pid2Ib, Algorithm::Nearl]), "", "one of them reads it");
+        let two = said(&[Algorithm::Ppo, Algorithm::Gaifo]);
+        assert_eq!(
+            two,
+            "train.nearl.idm_lr changes nothing: 'ppo' and 'gaifo' read no [train.nearl]; leave it out"
+        );
     }
 
     /// The robot's own equations learn from no noise.
