@@ -103,20 +103,27 @@ pub struct Onset {
     pub inertia: f64,
     /// A velocity asks for as much as the acceleration that stops it in this time would \[s\], above 0.
     pub time: f64,
+    /// The time is at least this many physics steps, 0 or more.
+    #[serde(default = "usual_steps")]
+    pub steps: f64,
+}
+
+/// No time constant of MuJoCo's is below two physics steps, unless its file says so.
+const fn usual_steps() -> f64 {
+    0.95
 }
 
 impl Onset {
     /// What MuJoCo makes of a joint on which nothing is said about it, whose acceleration for a unit of force is `mobility` [1/(kg·m²) or
     /// 1/kg] where every joint is at its reference: `solimp` begins at 0.9 and ends at 0.95, `solref` is 0.02 s.
     pub(crate) fn usual(mobility: f64) -> Onset {
-        Onset { inertia: 0.9 / (1.0 - 0.9) / mobility, time: 0.5 * 0.95 * 0.02 }
+        Onset { inertia: 0.9 / (1.0 - 0.9) / mobility, time: 0.5 * 0.95 * 0.02, steps: usual_steps() }
     }
 
     /// What a motor adds on average over a period against friction `f`. The joint begins at velocity `v` and accelerates with `a`;
     /// `solved` is the acceleration before an implicit damper takes its share.
     pub(crate) fn mean(&self, f: f64, period: &Period, v: f64, a: f64, solved: f64) -> MadeUpFor {
-        // No time constant of MuJoCo's is below two physics steps.
-        let time = self.time.max(0.95 * period.tau);
+        let time = self.time.max(self.steps * period.tau);
         let force = |v: f64| self.inertia * (solved + v / time);
         if period.sub_steps == 0 {
             let (force, [by_start, by_end]) = mean_of_clamp(force(v), force(v + period.dt * a), f);
@@ -210,7 +217,7 @@ mod tests {
     /// Against central differences, where the law has no corner.
     #[test]
     fn slopes_are_those_of_the_force() {
-        let onset = Onset { inertia: 0.3, time: 0.0095 };
+        let onset = Onset { inertia: 0.3, time: 0.0095, steps: 0.95 };
         for sub_steps in [0, 1, 5] {
             let p = Period::new(0.01, sub_steps);
             for (v, a, solved) in [(0.01, -0.7, -0.9), (0.05, -8.0, -8.5), (-0.02, 3.0, 3.1), (1.0, 3.0, 3.0)]

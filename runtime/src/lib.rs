@@ -18,7 +18,7 @@ pub mod link;
 pub mod log;
 mod percentiles;
 pub mod rt;
-mod stop;
+pub mod stop;
 mod thread;
 #[cfg(feature = "cli")]
 pub mod tunnel;

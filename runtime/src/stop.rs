@@ -1,9 +1,9 @@
-//! Asking the loop to stop: SIGINT, SIGTERM, or a call.
+//! Asking the loop to stop: SIGINT, SIGTERM, SIGHUP, or a call.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::low_level::{exit, register};
 
 use crate::clock;
@@ -23,11 +23,11 @@ impl Stop {
         Stop::default()
     }
 
-    /// Also set by the first SIGINT or SIGTERM; a second one, 0.2 s after it or later, ends the process at once with code 130.
+    /// Also set by the first of the [`ending`] signals; a second one, 0.2 s after it or later, ends the process at once with code 130.
     pub fn on_signals() -> std::io::Result<Stop> {
         let stop = Stop::default();
         let first = Arc::new(AtomicU64::new(0));
-        for signal in [SIGINT, SIGTERM] {
+        for signal in ending() {
             let (is_asked, first) = (Arc::clone(&stop.0), Arc::clone(&first));
             // SAFETY: the handler reads the clock, reads and writes atomic numbers, and ends the process, which a handler may do.
             unsafe { register(signal, move || heed(&is_asked, &first)) }?;
@@ -44,6 +44,16 @@ impl Stop {
     pub fn is_requested(&self) -> bool {
         self.0.load(Ordering::Acquire)
     }
+}
+
+/// The signals that ask a program to end: SIGINT, SIGTERM, and SIGHUP, which a terminal sends that is closed, unless it is ignored as `nohup` has it.
+pub fn ending() -> impl Iterator<Item = i32> {
+    let mut now = std::mem::MaybeUninit::<libc::sigaction>::zeroed();
+    // SAFETY: no action is set, and that of now is written to a place of its type.
+    let read = unsafe { libc::sigaction(SIGHUP, std::ptr::null(), now.as_mut_ptr()) };
+    // SAFETY: all zeroes are an action too.
+    let is_ignored = read == 0 && unsafe { now.assume_init() }.sa_sigaction == libc::SIG_IGN;
+    [SIGINT, SIGTERM].into_iter().chain((!is_ignored).then_some(SIGHUP))
 }
 
 /// What a signal does; `first` is when the first one came, 0 before \[ns\].

@@ -16,7 +16,7 @@ pub enum ChangeScale {
     Limits,
 }
 
-/// What is Gaussian: a deterministic or a stochastic meta policy, for `nearl`, `pid2-gan` and `pid2-ib`.
+/// What is Gaussian: a deterministic or a stochastic meta policy, for the algorithms that propose.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Exploration {
@@ -76,7 +76,7 @@ pub struct TrainSettings {
     pub ppo: PpoSettings,
     /// Settings of `nearl`.
     pub nearl: NearlSettings,
-    /// Settings of `pid2-ib`, `pid2-gan` and `pid2-il`.
+    /// Settings of `pid2-ib`, `pid2-gan` and `pid2-il`; of them `bc` reads those of the inverse model, and `gaifo` the rate of the discriminator.
     pub pid2: Pid2Settings,
     /// A limit on the cost of an episode.
     pub cost: CostSettings,

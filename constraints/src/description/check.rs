@@ -1,7 +1,7 @@
 //! What a description must be before a model is built from it.
 
 use super::payload::add;
-use super::{Body, JointDescription, JointKind, Motor, Range, RobotDescription};
+use super::{Body, JointDescription, JointKind, Motor, Onset, Range, RobotDescription};
 use crate::ModelError;
 use crate::geometry::Placement;
 use crate::urdf::ROUNDING;
@@ -213,6 +213,11 @@ fn check_joint(joint: &JointDescription, wrong: &mut Vec<String>) {
         wrong.push(format!("joint '{name}' {what} is {value}"));
     }
     let onset = joint.friction_onset.map_or([1.0, 1.0], |onset| [onset.inertia, onset.time]);
+    if let Some(Onset { steps, .. }) = joint.friction_onset
+        && !(steps.is_finite() && steps >= 0.0)
+    {
+        wrong.push(format!("joint '{name}' friction onset steps is {steps}"));
+    }
     for (what, value) in ["inertia", "time"].iter().zip(onset).filter(|(_, x)| !(x.is_finite() && *x > 0.0)) {
         wrong.push(format!("joint '{name}' friction onset {what} is {value}"));
     }

@@ -235,6 +235,22 @@ impl Projector {
         status
     }
 
+    /// Projects the same tick once more, for a `proposal` that differs in dofs that are not controllable: they do otherwise than was thought in
+    /// [`Projector::project`], as it has turned out after it. What the ledger says of the raw proposal stays.
+    pub fn project_beside(
+        &mut self,
+        (q, v): (&[f64], &[f64]),
+        proposal: &Proposal,
+        target: &mut Target,
+    ) -> Status {
+        let (first_ns, raw) = (target.ledger.duration_ns, target.ledger.raw_violations);
+        self.backup.go_back();
+        let status = self.project_from_here(q, v, proposal, target);
+        target.ledger.duration_ns += first_ns;
+        target.ledger.raw_violations = raw;
+        status
+    }
+
     /// Whether a joint that comes to another velocity than its target's may break a hard limit of several joints, or its own of jerk in the next tick, which
     /// [`Projector::project_within`] is for. Not while limits are moved.
     pub fn needs_what_is_reached(&self) -> bool {

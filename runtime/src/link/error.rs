@@ -14,7 +14,8 @@ pub enum LinkError {
     Name(String),
     /// A vector does not fit into the messages.
     #[error(
-        "robot `{name}` has {count} {what}, but a message holds {limit}: raise the capacity in link/messages.rs and rebuild both ends"
+        "robot `{name}` has {count} {what}, but a message holds {limit}: send fewer, as a policy with a recipe computes what follows from the state; or raise \
+         the capacity in runtime/src/link/messages.rs and build plant and loop anew"
     )]
     Capacity {
         /// Robot.

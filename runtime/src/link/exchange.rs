@@ -3,7 +3,7 @@
 //! [`PlantRunner`](super::PlantRunner) drives a simulator on a time grid. A real robot often keeps the time, and its driver has a loop of its own.
 
 use super::runner::STANDSTILL_POLL;
-use super::{ActionMessage, LinkError, Message, PlantLink, Robot, RobotName, StateMessage};
+use super::{ActionMessage, LinkError, Message, PlantLink, Robot, RobotName, StateMessage, torn};
 use crate::clock;
 
 /// What the driver is to do in this period.
@@ -122,8 +122,12 @@ impl Exchange {
     }
 
     /// Sends the state and waits at most `patience` \[s\] for its action. Without a loop it does not wait at all, unless time stands still
-    /// meanwhile (lockstep).
+    /// meanwhile (lockstep). Once shared memory was taken away it says [`Turn::Brake`] for good; another one is to be opened then, in another process.
     pub fn tick(&mut self, patience: f64) -> Turn<'_> {
+        if torn::is_torn() {
+            (self.is_attached, self.brakes) = (false, true);
+            return Turn::Brake;
+        }
         let now = clock::now();
         self.announce(now);
         self.state.due = now;

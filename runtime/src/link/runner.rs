@@ -178,7 +178,6 @@ impl PlantRunner {
         let period = clock::nanoseconds(self.settings.dt);
         let mut grid = Grid::new(clock::now() + period, period);
         self.last_heard = clock::now();
-        torn::watch();
         while !stop.is_requested() && self.settings.ticks.is_none_or(|n| self.report.ticks < n) {
             self.report.loop_gone = self.is_deserted();
             self.report.memory_torn = torn::is_torn();

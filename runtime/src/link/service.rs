@@ -20,7 +20,7 @@ use super::home::Home;
 use super::owner::Owner;
 use super::port::{BytesOutbox, Inbox, Outbox, SnapshotReader};
 use super::schema::{Message, Queued};
-use super::{LinkError, RobotName, SnapshotHeader, debris, memory};
+use super::{LinkError, RobotName, SnapshotHeader, debris, memory, torn};
 use crate::clock;
 
 /// How nodes find each other and wait: shared memory of this machine, usable from any thread.
@@ -50,6 +50,7 @@ impl Bus {
     /// # Errors
     /// [`LinkError`] for shared memory that is missing or too small, or what the transport said.
     pub fn join(name: &RobotName) -> Result<Bus, LinkError> {
+        torn::watch();
         set_log_level_from_env_or(LogLevel::Fatal);
         memory::check(name, SHARED_MEMORY)?;
         let home = Home::enter(name)?;

@@ -251,6 +251,10 @@ impl<B: Build> Replayer<B> {
                 // A runtime that was killed leaves its last chunk unfinished.
                 Err(mcap::McapError::UnexpectedEof | mcap::McapError::UnexpectedEoc) => break,
                 Err(mcap::McapError::UnsupportedCompression(format)) => return Err(compressed(&format)),
+                // The reader is given bytes, and reads none itself.
+                Err(mcap::McapError::Io(_) | mcap::McapError::DecompressionError(_)) => {
+                    return Err("a chunk of it is damaged, and cannot be unpacked".into());
+                }
                 Err(e) => return Err(one_line(&e)),
             }
         }

@@ -406,7 +406,8 @@ impl<T: LoopController> Core<T> {
         }
         let is_next = state.header.epoch == known.epoch;
         let lost = if is_next { state.header.seq - known.seq - 1 } else { 0 };
-        self.record.counters.lost_states += lost;
+        let counted = &mut self.record.counters.lost_states;
+        *counted = counted.saturating_add(lost);
         let is_doubled = is_next && self.is_doubled(state);
         self.record.counters.out_of_order += u64::from(is_doubled);
         let mut left_out = 0;
@@ -444,7 +445,7 @@ impl<T: LoopController> Core<T> {
         if left_out > 0 {
             self.record.state.bits |= STATE_BRAKED; // nobody knows what held it
             let counted = &mut self.record.counters.lost_states;
-            *counted = counted.saturating_add(left_out); // a clock may say anything
+            *counted = counted.saturating_add(left_out);
         }
         self.event_of_state(is_frozen, gap.max(left_out), passed)
     }
@@ -599,11 +600,18 @@ impl<T: LoopController> Core<T> {
     }
 }
 
-/// Periods in `passed` \[s\] of the plant's clock of which no state tells, beside the `lost` ones; 0 where they may be bridged.
+/// Periods that a clock can have passed over at once; it may say anything.
+const MOST_LEFT_OUT: f64 = 1e9;
+
+/// Periods in `passed` \[s\] of the plant's clock of which no state tells, beside the `lost` ones; 0 where they may be bridged, and of a time that is
+/// none.
 fn left_out(passed: f64, lost: u64, settings: &CoreSettings) -> u64 {
     let periods = passed / (settings.period as f64 * 1e-9);
     let most = (lost + 1 + u64::from(settings.modes.hold_states)) as f64 + 0.5;
-    if periods > most { (periods.round() as u64).saturating_sub(lost + 1) } else { 0 }
+    if !periods.is_finite() || periods <= most {
+        return 0;
+    }
+    (periods.min(MOST_LEFT_OUT).round() as u64).saturating_sub(lost + 1)
 }
 
 fn braked_reason(status: u32) -> Reason {

@@ -353,7 +353,6 @@ pub fn run_loop<B: Build>(
     stop: &Stop,
 ) -> Result<RunReport, RunError> {
     settings.check()?;
-    torn::watch();
     let begin = clock::now();
     let version = first.version();
     let name = link.name().to_string();

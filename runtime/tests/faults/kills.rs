@@ -184,7 +184,9 @@ fn left_by(stage: &Stage) -> Remains {
 
 #[test]
 fn fault_31_a_signal_at_any_moment_brakes_to_rest_and_a_second_one_ends_at_once() {
-    for (k, number) in [libc::SIGTERM, libc::SIGINT].into_iter().cycle().take(kills(4)).enumerate() {
+    for (k, number) in
+        [libc::SIGTERM, libc::SIGINT, libc::SIGHUP].into_iter().cycle().take(kills(4)).enumerate()
+    {
         let (stage, moments) = (Stage::new(&format!("signal{k}")), moments());
         let arm = Arm::start(&stage);
         let mut viewer = stage.viewer();

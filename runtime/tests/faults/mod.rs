@@ -196,6 +196,11 @@ fn fault_25_periods_that_the_plant_left_out_are_lost_ones() {
         wild.fly(50);
     }
     wild.assert_within_limits(ROUNDING);
+    let lost = wild.counters().lost_states;
+    assert!(
+        (1_000_000_000..3_000_000_000).contains(&lost),
+        "{lost} of two times that no clock reaches, and none of times that are none"
+    );
 }
 
 #[test]

@@ -176,6 +176,27 @@ fn fault_42_files_truncated_in_use_brake_the_plant_and_end_both_by_name() {
     assert!(runtime.starts_with("memory-torn"), "{runtime}");
 }
 
+/// The same of a driver that keeps its own time: it had ended by SIGBUS, and nothing braked its robot.
+#[test]
+fn fault_42_a_driver_whose_files_are_truncated_is_told_to_brake() {
+    let name = Name::new("torn-driver");
+    let mut hold = TrainerLink::open(&name.0).unwrap();
+    let start = |role| command_of(role, &name).stdout(Stdio::piped()).spawn().unwrap();
+    let (driver, runtime) = (start("torn-driver"), start("torn-runtime"));
+    until("the loop runs", || hold.health().is_some_and(|h| h.tick > 200));
+    for file in ["newest-state", "newest-action"] {
+        std::fs::File::options().write(true).open(home(&name).join(file)).unwrap().set_len(0).unwrap();
+    }
+    let output = driver.wait_with_output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(
+        output.status.success() && text.contains("said brake true attached false"),
+        "{}: {text}",
+        output.status
+    );
+    assert!(runtime.wait_with_output().unwrap().status.success());
+}
+
 /// Folders with long names hold nothing of the links: they lie in one place whatever TMPDIR says.
 #[test]
 fn fault_40_a_long_temporary_folder_changes_nothing() {

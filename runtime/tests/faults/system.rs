@@ -46,6 +46,7 @@ fn child() {
             println!("said started");
         }
         Ok("torn-plant") => torn_plant(&name),
+        Ok("torn-driver") => torn_driver(&name),
         Ok("torn-runtime") => {
             let (link, robot) = connect(&name, 20.0).unwrap();
             let (drops, _dropped) = std::sync::mpsc::channel();
@@ -140,6 +141,25 @@ fn torn_plant(name: &RobotName) {
         plant.0.v.abs() < 1e-2,
         plant.0.braked > 0
     );
+}
+
+/// A driver that keeps its own time: whether it was told to act, and what it is told once the memory is gone.
+fn torn_driver(name: &RobotName) {
+    let mut exchange = Exchange::open(name, &toy::robot(false), 0.02).unwrap();
+    let mut state = [1.0, 0.0];
+    let mut next = |exchange: &mut Exchange| {
+        let turn = exchange.exchange(&state[..1], &state[1..], &state[..1], 2.0 * DT);
+        let told = if matches!(turn, Turn::Brake) { "brake" } else { "act" };
+        state[1] *= 0.9;
+        state[0] += DT * state[1];
+        std::thread::sleep(Duration::from_secs_f64(DT));
+        told
+    };
+    let mut until_told = |what| while next(&mut exchange) != what {};
+    until_told("act");
+    until_told("brake");
+    let last = (0..50).all(|_| next(&mut exchange) == "brake");
+    println!("said brake {last} attached {}", exchange.is_attached());
 }
 
 /// As another user: nothing of root's links can be opened, and a folder that somebody else made is refused by name.

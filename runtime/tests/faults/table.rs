@@ -254,7 +254,7 @@ pub const ROWS: &[Row] = &[
     ),
     (
         31,
-        "SIGINT, SIGTERM",
+        "SIGINT, SIGTERM, SIGHUP",
         "brakes to zero velocity, exit code 0; a second one, after 0.2 s or later, ends at once with 130",
         &["stop"],
         &[(KILLS, "fault_31_a_signal_at_any_moment_brakes_to_rest_and_a_second_one_ends_at_once")],
@@ -359,7 +359,10 @@ pub const ROWS: &[Row] = &[
         "mapped file made shorter while in use",
         "plant and loop brake and end by name",
         &["memory-torn"],
-        &[(SECURITY, "fault_42_files_truncated_in_use_brake_the_plant_and_end_both_by_name")],
+        &[
+            (SECURITY, "fault_42_files_truncated_in_use_brake_the_plant_and_end_both_by_name"),
+            (SECURITY, "fault_42_a_driver_whose_files_are_truncated_is_told_to_brake"),
+        ],
     ),
     (
         43,

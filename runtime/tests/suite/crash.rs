@@ -107,7 +107,7 @@ fn a_trainer_killed_while_it_publishes_leaves_the_loop_running() {
 
 #[test]
 fn sigterm_brakes_and_ends_with_success() {
-    for signal in [libc::SIGTERM, libc::SIGINT] {
+    for signal in [libc::SIGTERM, libc::SIGINT, libc::SIGHUP] {
         let name = Name::new(&format!("signal{signal}"));
         let body = PointMass { q: 1.0, v: 1.0, ..PointMass::default() };
         let plant = PlantThread::start(&name, body, PlantSettings::real_time(DT));

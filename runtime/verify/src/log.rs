@@ -111,6 +111,10 @@ fn read(mut log: impl Read, length: usize) -> Result<Report, String> {
             Ok(part) => take(&mut session, &mut topics, part)?,
             // A runtime that was killed leaves its last chunk unfinished.
             Err(mcap::McapError::UnexpectedEof | mcap::McapError::UnexpectedEoc) => break,
+            // The reader is given bytes, and reads none itself.
+            Err(mcap::McapError::Io(_) | mcap::McapError::DecompressionError(_)) => {
+                return Err("a chunk of it is damaged, and cannot be unpacked".into());
+            }
             Err(mcap::McapError::UnsupportedCompression(format)) => {
                 return Err(format!(
                     "its chunks are compressed with {format}, which this program does not read: write it without compression, or with lz4"

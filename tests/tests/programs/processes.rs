@@ -229,7 +229,7 @@ fn a_killed_runtime_trips_the_watchdog_and_the_plant_stands_still() {
 
 #[test]
 fn a_signal_ends_the_runtime_braked_and_with_success() {
-    for signal in [libc::SIGTERM, libc::SIGINT] {
+    for signal in [libc::SIGTERM, libc::SIGINT, libc::SIGHUP] {
         let name = Name::new(&format!("signal{signal}"));
         let plant = name.plant(&["--endless"]);
         let runtime = name.runtime(&[]);

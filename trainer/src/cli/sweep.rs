@@ -109,7 +109,7 @@ impl SweepCommand {
         let _lock = sweep.lock()?;
         let runs = sweep.plan()?;
         let stop = Arc::new(AtomicBool::new(false));
-        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        for signal in nearl_runtime::stop::ending() {
             signal_hook::flag::register(signal, Arc::clone(&stop))?;
         }
         for line in advice(&sweep, &runs) {

@@ -25,7 +25,7 @@ pub(super) struct Train {
     task: String,
     #[arg(long, default_value = "pid2-ib", conflicts_with = "resume", help = one_of())]
     algo: String,
-    /// Environment steps; 1_000_000, 1e6, 200k and 1M are read. 1e6 when absent, with --resume what the run was started with.
+    /// Environment steps, one for each decision of the policy; 1_000_000, 1e6, 200k and 1M are read. 1e6 when absent, with --resume what the run was started with.
     #[arg(long, value_parser = steps)]
     steps: Option<u64>,
     /// Seed of everything random; the same seed gives the same weights.
@@ -334,7 +334,7 @@ impl Train {
 /// Becomes true with the first signal to end; the second one ends the program at once.
 fn on_signals() -> Result<Arc<AtomicBool>, Failure> {
     let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+    for signal in nearl_runtime::stop::ending() {
         signal_hook::flag::register_conditional_shutdown(signal, 1, Arc::clone(&stop))?;
         signal_hook::flag::register(signal, Arc::clone(&stop))?;
     }

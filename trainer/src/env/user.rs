@@ -328,18 +328,18 @@ fn sub_steps(task: &Task, model: &Model) -> Result<usize, Mistake> {
         return Err(mistake("time.sim_dt", reason));
     }
     if t.sim_dt != 0.0 && (t.sim_dt - sim_dt).abs() > 1e-12 {
-        return Err(mistake(
-            "time.sim_dt",
-            format!(
+        let reason = match (task.scene.contains_key("timestep"), &task.model.urdf) {
+            (false, Some(_)) => format!(
+                "{} s, but the simulation of a URDF makes steps of {sim_dt} s unless it is told otherwise; write [scene] timestep = {0}",
+                t.sim_dt
+            ),
+            (is_scene, _) => format!(
                 "{} s, but {} is {sim_dt} s; write that, or 0 for another integrator than Euler",
                 t.sim_dt,
-                if task.scene.contains_key("timestep") {
-                    "[scene] timestep"
-                } else {
-                    "the robot file's timestep"
-                }
+                if is_scene { "[scene] timestep" } else { "the robot file's timestep" }
             ),
-        ));
+        };
+        return Err(mistake("time.sim_dt", reason));
     }
     let steps = (t.dt / sim_dt).round();
     if steps < 1.0 || (t.dt / sim_dt - steps).abs() > 1e-9 {

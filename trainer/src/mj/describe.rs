@@ -6,10 +6,13 @@ use nearl_runtime::constraints::description::{
 };
 use nearl_runtime::constraints::geometry::{Placement, Shape};
 
-use mujoco_rs::mujoco_c::mjtDisableBit;
+use mujoco_rs::mujoco_c::{mjMINVAL, mjtDisableBit, mjtSolver};
 use mujoco_rs::wrappers::mj_model::{MjtGeomBase, MjtObjBase, MjtWrap};
 
 use super::{JointKind, MjError, Model, motors, pairs};
+
+/// A velocity that friction does not look at: it would be stopped in this time \[s\].
+const NEVER: f64 = 1e12;
 
 /// The note of a file with equality constraints.
 pub(crate) const EQUATIONS: &str = "equality constraints are not modelled";
@@ -126,15 +129,23 @@ impl Model {
     }
 
     /// MuJoCo's impedance of the friction of dof `v`, with its names: `force = D (a + b v)`, `D = imp / (1 - imp) / diagApprox`,
-    /// `b = 2 / (dmax timeconst)`.
+    /// `b = 2 / (dmax timeconst)`, or `-solref[1] / dmax` where `solref` gives stiffness and damping by themselves.
     fn onset(&self, v: usize) -> Onset {
         let m = &self.0;
-        let [imp, dmax] = [0, 1].map(|k| m.dof_solimp()[v][k].clamp(1e-4, 0.9999));
-        let [constant, damping] = [0, 1].map(|k| m.dof_solref()[v][k]);
-        let shortest =
-            if self.disables(mjtDisableBit::mjDSBL_REFSAFE) { 0.0 } else { 2.0 * m.opt().timestep };
-        let time = if constant > 0.0 { 0.5 * dmax * constant.max(shortest) } else { dmax / -damping };
-        Onset { inertia: imp / (1.0 - imp) / m.dof_invweight0()[v], time }
+        let [dmin, dmax] = [0, 1].map(|k| m.dof_solimp()[v][k].clamp(1e-4, 0.9999));
+        let imp = if m.dof_solimp()[v][2] <= mjMINVAL { 0.5 * (dmin + dmax) } else { dmin };
+        let inertia = imp / (1.0 - imp) / m.dof_invweight0()[v];
+        let [constant, damping] = match [m.dof_solref()[v][0], m.dof_solref()[v][1]] {
+            // What MuJoCo takes where one is positive and the other is not.
+            [a, b] if (a > 0.0) != (b > 0.0) => [0.02, 1.0],
+            given => given,
+        };
+        if constant <= 0.0 {
+            return Onset { inertia, time: (dmax / damping.abs()).min(NEVER), steps: 0.0 };
+        }
+        // No time constant is below two physics steps, of whatever length they are.
+        let steps = if self.disables(mjtDisableBit::mjDSBL_REFSAFE) { 0.0 } else { dmax };
+        Onset { inertia, time: 0.5 * dmax * constant, steps }
     }
 
     fn sites(&self) -> Vec<Frame> {
@@ -315,8 +326,10 @@ impl Model {
             }
         };
         let equations = self.named(MjtObjBase::mjOBJ_EQUALITY, m.eq_type().len());
+        let equations: Vec<String> =
+            equations.into_iter().zip(m.eq_active0()).filter(|(_, on)| **on).map(|(name, _)| name).collect();
         note(
-            m.neq() > 0,
+            !equations.is_empty(),
             &format!(
                 "{EQUATIONS}: {}; limits may be left by what these pull at; take them out of the robot file, or leave margins",
                 equations.join(", ")
@@ -362,6 +375,11 @@ impl Model {
         let rubs = m.dof_frictionloss().iter().any(|f| *f > 0.0);
         let slips = option.noslip_iterations > 0;
         note(rubs && slips, "noslip_iterations change dry friction, and that is not modelled; take them out");
+        let exact = option.solver == mjtSolver::mjSOL_NEWTON as i32;
+        note(
+            rubs && !exact,
+            "the simulator's solver is not Newton's, and its dry friction is then what is modelled to three or four digits; write solver=\"Newton\"",
+        );
         let hurried = option.iterations < 20 || option.ls_iterations < 10 || option.tolerance > 1e-6;
         note(
             rubs && hurried,

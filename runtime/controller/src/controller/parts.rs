@@ -144,8 +144,12 @@ impl Parts {
             braking: m.task.constraints.braking,
             ..Settings::new(m.task.time.dt, m.task.sub_steps() as u32)
         };
-        let mut projector =
-            Projector::new(model, &limits, controllable, settings).map_err(|e| unusable(&e))?;
+        let projector = Projector::new(model, &limits, controllable, settings);
+        let mut projector = projector.map_err(|e| match Self::motors(model, controllable, &drives) {
+            // What is wrong with a motor says more than that its force is not known.
+            Err(of_motor) if m.task.constraints.torque.is_some() => of_motor,
+            _ => unusable(&e),
+        })?;
         projector.follow(&drives);
         if let Some(moved) = &m.moved {
             // The model has the payload.
