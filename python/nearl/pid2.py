@@ -158,8 +158,8 @@ class PID2:
         """Learns from at least ``total_timesteps`` more environment steps.
 
         Args:
-            total_timesteps: Rounded up to whole batches of ``n_envs * n_steps``. The learning rate falls to zero at their end, so one
-                long call is not two short ones.
+            total_timesteps: Rounded up to whole batches of ``n_envs * n_steps``. The learning rate falls towards zero at the number asked for,
+                so one long call is not two short ones.
             callback: ``callback(agent, metrics)`` after each iteration, or several; the agent has what was learned so far, metrics are by SB3's tags.
                 ``False``, of Python or NumPy, ends the learning; whatever else comes back, ``None`` and 0 too, does not.
             progress_bar: Draws a bar on standard error, if that is a terminal.
@@ -261,8 +261,8 @@ class PID2:
 
         With ``ranks`` it is a run folder, which rank 0 reads for all; the number of ranks may be another than before.
 
-        A run that was stopped ``n`` steps before its end gives, after ``learn(n)``, the same weights as one that was not stopped. One that learned
-        from Python functions needs them again, as ``reward`` and ``termination``.
+        A run that was asked for ``n`` steps and stopped after ``k`` gives, after ``learn(n - k)``, the same weights as one that was not stopped; ``n`` is
+        the number asked for, not that of whole batches. One that learned from Python functions needs them again, as ``reward`` and ``termination``.
 
         Raises:
             OSError: the file cannot be read.

@@ -3,8 +3,9 @@
     .venv/bin/python results/action_constraints/table.py RUNS FOLDER
 
 RUNS has `<set>/<task>/<algo>_<seed>` and, where times were taken, `<set>/update.json`. Runs that it does not have stay what they are in FOLDER. Runs without a
-set are those of results/strong. Ten episodes of each run are recorded (`nearl demos record`), and what was done in them is held against the formula here, from
-the joint velocities of the simulator: nothing that projects has a say in it.
+set are those of results/strong, of a million steps: they stand beside runs of as many steps alone, in the folder of this program. Ten episodes of each run are
+recorded (`nearl demos record`), and what was done in them is held against the formula here, from the joint velocities of the simulator: nothing that projects
+has a say in it.
 """
 
 import csv
@@ -79,11 +80,16 @@ def centre(values: list[float]) -> str:
 
 def main(runs: Path, folder: Path) -> None:
     finished = sorted(file.parents[1] for file in runs.glob("*/*/*_*/checkpoints/final.safetensors"))
-    rows, beside = [measure(run) for run in finished], free()
+    if not finished:
+        sys.exit(f"no finished run in {runs}")
+    folder.mkdir(parents=True, exist_ok=True)
+    rows, beside = [measure(run) for run in finished], free() if folder.resolve() == Path(__file__).parent.resolve() else {}
     name = lambda row: tuple(row[k] for k in ("set", "task", "algo", "seed"))  # noqa: E731
     measured = {name(row) for row in rows}
-    with open(folder / "runs.csv", newline="") as f:
-        rows = sorted([row for row in csv.DictReader(f) if name(row) not in measured] + rows, key=name)
+    if (folder / "runs.csv").is_file():
+        with open(folder / "runs.csv", newline="") as f:
+            rows += [row for row in csv.DictReader(f) if name(row) not in measured]
+    rows.sort(key=name)
     with open(folder / "runs.csv", "w", newline="") as f:
         writer = csv.DictWriter(f, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -95,10 +101,11 @@ def main(runs: Path, folder: Path) -> None:
     lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for name, task, algo in sorted({(r["set"], r["task"], r["algo"]) for r in rows}):
         mine = [r for r in rows if (r["set"], r["task"], r["algo"]) == (name, task, algo)]
-        values, without = [float(r["without_noise"]) for r in mine], beside[task, algo]
+        values, without = [float(r["without_noise"]) for r in mine], beside.get((task, algo), [])
         broken, held, steps = (sum(int(r[k]) for r in mine) for k in ("steps_beyond_1e-9", "steps_on_the_limit", "steps"))
-        cells = [name, algo, str(len(values)), centre(values), centre(without), f"{interquartile_mean(values) / interquartile_mean(without):.2f}"]
-        cells += [f"{rank_test(values, without):.2f}" if len(values) > 2 else ""]
+        cells = [name, algo, str(len(values)), centre(values)]
+        cells += [centre(without), f"{interquartile_mean(values) / interquartile_mean(without):.2f}"] if without else ["", ""]
+        cells += [f"{rank_test(values, without):.2f}" if without and len(values) > 2 else ""]
         cells += [f"{broken} of {steps}", f"{max(float(r['largest_excess']) for r in mine):.1g}", f"{100 * held / steps:.0f} %"]
         cells += us(name) + us(f"free-{task}") if timed else []
         lines.append(f"| {' | '.join(cells)} |")
@@ -106,4 +113,6 @@ def main(runs: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,9 +1,11 @@
 #!/usr/bin/env bash
 # Every hard kind of limit under attack, alone and combined, on two robots that are not bundled: z1.md, ur10.md and summary.md.
-# All of it takes an hour of one core; PART=100 is a hundredth of the ticks. The URDFs are of the Python package example-robot-data 6.0.0.
+# All of it takes an hour of one core; PART=100 is a hundredth of the ticks and goes into results/attack/part-100. The URDFs are of the Python package
+# example-robot-data 6.0.0.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
-part=${PART:-1}
+part=${PART:-1} out=results/attack
+[ "$part" = 1 ] || out=$out/part-$part
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m pip download --quiet --no-deps --dest "$folder" example-robot-data==6.0.0
@@ -23,5 +25,6 @@ attack() {
 attack z1.urdf link06 > "$folder/z1.md" &
 attack ur10_joint_limited_robot.urdf tool0 > "$folder/ur10.md"
 for job in $(jobs -p); do wait "$job"; done
-cp "$folder/z1.md" "$folder/ur10.md" results/attack/
-python3 results/attack/summary.py
+mkdir -p "$out"
+cp "$folder/z1.md" "$folder/ur10.md" "$out/"
+python3 results/attack/summary.py "$out"

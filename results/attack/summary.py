@@ -1,5 +1,6 @@
-"""The worst of each kind in z1.md and ur10.md, as summary.md: python results/attack/summary.py"""
+"""The worst of each kind in z1.md and ur10.md, as summary.md: python results/attack/summary.py [FOLDER], results/attack unless given."""
 
+import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -16,13 +17,13 @@ def share(cells: list[list[str]], column: int) -> str:
     return f"{sum(float(c[column].split()[0]) for c in cells) / len(cells):.1f} %"
 
 
-def main() -> None:
+def main(folder: Path) -> None:
     """Writes summary.md."""
     out = ["| limits | robot | ticks | over | worst excess | slowed | braked |", "|---|---|---|---|---|---|---|"]
     total = over = 0
     for robot in ("z1", "ur10"):
         of: dict[str, list[list[str]]] = {}
-        for cells in rows(HERE / f"{robot}.md"):
+        for cells in rows(folder / f"{robot}.md"):
             of.setdefault(cells[0], []).append(cells)
         for kind, cells in of.items():
             ticks, beyond = sum(int(c[3]) for c in cells), sum(int(c[4]) for c in cells)
@@ -30,8 +31,8 @@ def main() -> None:
             total, over = total + ticks, over + beyond
             kind = kind.replace("+", ", ")
             out.append(f"| {kind} | {robot} | {ticks} | {beyond} | {worst:.1e} | {share(cells, 6)} | {share(cells, 7)} |")
-    (HERE / "summary.md").write_text("\n".join(out) + f"\n\n{total} ticks, {over} over.\n")
+    (folder / "summary.md").write_text("\n".join(out) + f"\n\n{total} ticks, {over} over.\n")
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else HERE)

@@ -19,6 +19,7 @@ from sides import Cvxpylayers, Ours, OursTorch, Proxsuite, Qpth, Side
 from table import table
 
 HERE = Path(__file__).resolve().parent
+USUAL = (100_000, 3)  # problems, rounds
 SAMPLE = 2_000
 SIZES = (0, 1, 2, 3, 4)  # powers of ten of sigma
 warnings.filterwarnings("ignore")  # "Solved/Inaccurate" of SCS
@@ -104,15 +105,18 @@ def by_size(path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--problems", type=int, default=100_000)
+    parser.add_argument("--problems", type=int, default=USUAL[0], help="other problems or rounds go into a folder of their own, 1000-3 for 1000")
     parser.add_argument("--qpth", type=int, default=100_000, help="at most so many for qpth")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=USUAL[1])
     options = parser.parse_args()
-    runs, sizes = HERE / "runs.jsonl", HERE / "sizes.jsonl"
-    runs.unlink(missing_ok=True)
-    rounds(options.problems, options.qpth, options.rounds, runs)
+    folder = HERE if (options.problems, options.rounds) == USUAL else HERE / f"{options.problems}-{options.rounds}"
+    folder.mkdir(exist_ok=True)
+    runs, sizes, part = folder / "runs.jsonl", folder / "sizes.jsonl", folder / "runs.part.jsonl"
+    part.unlink(missing_ok=True)
+    rounds(options.problems, options.qpth, options.rounds, part)
+    part.replace(runs)
     by_size(sizes)
-    (HERE / "table.md").write_text(table(runs, sizes))
+    (folder / "table.md").write_text(table(runs, sizes))
 
 
 if __name__ == "__main__":

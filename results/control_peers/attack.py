@@ -122,13 +122,16 @@ def run(robot, rule, kind, ticks, seed):
 def main() -> None:
     warnings.simplefilter("ignore")
     logging.disable(logging.CRITICAL)
+    if len(sys.argv) not in (3, 4):
+        sys.exit(__doc__)
     robot, ticks, seed = sys.argv[1], int(float(sys.argv[2])), int(sys.argv[3]) if len(sys.argv) > 3 else 1
-    print("| rule | attack | ticks | position | velocity | acceleration | torque | worst: position, velocity, acceleration, torque [share] | no answer |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("| rule | attack | ticks | position | velocity | acceleration | torque "
+          "| worst: position [share] | velocity | acceleration | torque | no answer |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
     for name in rules(robot):
         for k, kind in enumerate(ATTACKS):
             broken, worst, silent = run(robot, make(robot, name), kind, ticks, seed + k)
-            excess = ", ".join(f"{max(w, 0):.1g}" for w in worst)
+            excess = " | ".join(f"{max(w, 0):.1g}" for w in worst)
             print(f"| {name} | {kind} | {ticks} | " + " | ".join(map(str, broken)) + f" | {excess} | {silent} |", flush=True)
 
 

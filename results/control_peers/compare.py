@@ -84,6 +84,8 @@ class Loop:
 def main() -> None:
     warnings.simplefilter("ignore")
     logging.disable(logging.CRITICAL)
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     robot, ticks = sys.argv[1], int(float(sys.argv[2]))
     model, limits = arm(robot)
     problem = ours(robot, limits, "stored").projector.problem

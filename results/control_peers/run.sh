@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Everything of this folder: attack-ROBOT.md and compare-ROBOT.md. Nothing else should run beside compare.py.
+# Everything of this folder: attack-ROBOT.md and compare-ROBOT.md. Nothing else should run beside compare.py. TICKS (3000) and ATTACKED (5000) choose other
+# numbers of ticks, which go into folders of their own, results/control_peers/1000 for 1000.
 # Needs a Python of 3.11 or newer (klimits and placo have no wheels for some others) and, for NEARL itself, `make wheel`.
 set -euo pipefail
 cd "$(dirname "$0")"
@@ -16,7 +17,11 @@ if [ ! -d "$HERE" ]; then
     "$HERE/placo/bin/python" -m pip install --quiet --no-deps example-robot-data==6.0.0
 fi
 export PLACO_PYTHON=$HERE/placo/bin/python OPENBLAS_NUM_THREADS=1 PYTHONWARNINGS=ignore
+ticks=${TICKS:-3000} attacked=${ATTACKED:-5000} compared=. attacks=.
+[ "$ticks" = 3000 ] || compared=$ticks
+[ "$attacked" = 5000 ] || attacks=$attacked
+mkdir -p "$compared" "$attacks"
 for robot in panda z1; do
-    "$HERE/main/bin/python" compare.py $robot "${TICKS:-3000}" > compare-$robot.md
-    "$HERE/main/bin/python" attack.py $robot "${ATTACKED:-5000}" > attack-$robot.md
+    "$HERE/main/bin/python" compare.py $robot "$ticks" > "$compared/compare-$robot.md"
+    "$HERE/main/bin/python" attack.py $robot "$attacked" > "$attacks/attack-$robot.md"
 done

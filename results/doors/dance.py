@@ -212,6 +212,8 @@ def fly(robot: G1, motion: Motion, snapshots: list[Path], name: str, seconds: fl
 
 
 def main(checkout: Path) -> None:
+    if not (checkout / "deploy/robots/g1").is_dir():
+        sys.exit(f"dance.py: '{checkout}' is no checkout of unitree_rl_mjlab: it has no folder deploy/robots/g1")
     print("| policy | targets | peak torque (motors' = 1) | its peak rate [N m/s] | peak torque behind a switch | its peak rate | falls | switches |")
     print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
@@ -228,4 +230,6 @@ def main(checkout: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     main(Path(sys.argv[1]))

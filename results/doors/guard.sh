@@ -1,10 +1,13 @@
 #!/usr/bin/env bash
 # Policies of actions behind the guard, on a Panda in MuJoCo, attacked for NEARL_TICKS ticks (a million): writes guard.md. Minutes on two cores.
-#     results/doors/guard.sh
+#     results/doors/guard.sh      # another number, NEARL_TICKS=50000 say, goes into results/doors/50000
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 export NEARL_TICKS=${NEARL_TICKS:-1000000}
-out=results/doors/guard.md
+folder=results/doors
+[ "$NEARL_TICKS" = 1000000 ] || folder=$folder/$NEARL_TICKS
+mkdir -p "$folder"
+out=$folder/guard.md
 {
     echo "| what | guard every | ticks | of them changed | positions over | speeds over | torques over | worst, rad, rad/s or N m |"
     echo "|---|---|---|---|---|---|---|---|"

@@ -199,6 +199,8 @@ def switched(theirs: Theirs, snapshots: list[Path], name: str, seconds: float) -
 
 def main(playground: Path) -> None:
     policy = playground / "mujoco_playground/experimental/sim2sim/onnx/go1_policy.onnx"
+    if not policy.is_file():
+        sys.exit(f"legs.py: '{playground}' is no checkout of mujoco_playground: it has no {policy.relative_to(playground)}")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         file = robot(playground, folder)
@@ -229,4 +231,6 @@ def main(playground: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     main(Path(sys.argv[1]))

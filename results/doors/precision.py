@@ -79,11 +79,16 @@ def row(path: Path, folder: Path) -> str:
 
 
 def main(folder: Path) -> None:
+    files = sorted(folder.rglob("*.onnx"))
+    if not files:
+        sys.exit(f"{Path(__file__).name}: '{folder}' holds no .onnx file")
     print("| policy | largest output | worst error of nearl | median | worst of onnxruntime | median | worst between the two | median |")
     print("|---|---|---|---|---|---|---|---|")
-    for path in sorted(folder.rglob("*.onnx")):
+    for path in files:
         print(row(path, folder), flush=True)
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     main(Path(sys.argv[1]))

@@ -102,12 +102,17 @@ def check(name: str, folder: Path) -> str:
 
 
 def main(lab: Path, mjlab: Path) -> None:
+    velocity = Path("deploy/robots/g1/config/policy/velocity/v0")
+    for checkout in (lab, mjlab):
+        if not (checkout / velocity).is_dir():
+            sys.exit(f"recipes.py: '{checkout}' is no such checkout: it has no folder {velocity}")
     print("\n| deployment | terms | entries | largest difference of a joint's target [rad] |")
     print("|---|---|---|---|")
-    velocity = Path("deploy/robots/g1/config/policy/velocity/v0")
     print(check("unitree_rl_lab-g1", lab / velocity))
     print(check("unitree_rl_mjlab-g1", mjlab / velocity))
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     main(Path(sys.argv[1]), Path(sys.argv[2]))

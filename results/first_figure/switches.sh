@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Each repair of PID2-IB that is a setting, by itself, beside what the task files set: a million steps each, some 25 minutes on two idle cores.
-# Finished runs are skipped. RUNS is the folder of runs.
+# Finished runs are skipped. RUNS is the folder of runs. The policy does not keep its actions, as in the figure (run.sh), whose runs stand beside these.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 runs=${RUNS:-runs/first_figure_switches}
@@ -8,7 +8,7 @@ runs=${RUNS:-runs/first_figure_switches}
 go() { # name, task, algorithm, seeds, then what is set
     local name=$1 task=$2 algo=$3 seeds=$4
     shift 4
-    target/release/nearl sweep --tasks "$task" --algos "$algo" --seeds "$seeds" --steps 1e6 --out "$runs/$name" "$@"
+    target/release/nearl sweep --tasks "$task" --algos "$algo" --seeds "$seeds" --steps 1e6 --set train.pid2.keep_actions=false --out "$runs/$name" "$@"
 }
 
 for task in HalfCheetah-v5 Hopper-v5; do

@@ -66,4 +66,6 @@ def main(clip: Path, folder: Path, first: int = 0, last: int | None = None) -> N
 
 
 if __name__ == "__main__":
+    if len(sys.argv) not in (3, 4, 5):
+        sys.exit(__doc__)
     main(Path(sys.argv[1]), Path(sys.argv[2]), *(int(word) for word in sys.argv[3:]))

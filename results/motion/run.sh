@@ -1,12 +1,15 @@
 #!/usr/bin/env bash
 # A clip of a G1 tracked by PID2-IL, torque limits on: joint error, share of the clip survived, what is beyond a limit, a film of the first seed.
-#     results/motion/run.sh [STEPS [SEEDS]]
+#     results/motion/run.sh [STEPS [SEEDS]]      e.g. 1M "0 1", which goes into results/motion/1M; seeds are "0 1" unless given
 # The clip comes from holosoma's package at the time of the run and is not kept. A run that was broken off goes on. RUNS is the folder of runs,
 # NEARL the program.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 steps=${1:-10M} seeds=${2:-0 1}
-runs=${RUNS:-runs/motion} nearl=${NEARL:-target/release/nearl}
+runs=${RUNS:-runs/motion} nearl=${NEARL:-target/release/nearl} folder=results/motion
+trained=$runs
+[ "$steps" = 10M ] || { trained=$runs/$steps folder=$folder/$steps; }
+[ "$seeds" = "0 1" ] || folder=$folder/seeds-${seeds// /-}
 clip=holosoma/data/motions/g1_29dof/whole_body_tracking/sub3_largebox_003_mj.npz
 
 if [ ! -f "$runs/g1.toml" ]; then
@@ -18,7 +21,7 @@ if [ ! -f "$runs/g1.toml" ]; then
 fi
 all=()
 for seed in $seeds; do
-    run=$runs/pid2-il_$seed
+    run=$trained/pid2-il_$seed
     all+=("$run")
     if [ ! -d "$run" ]; then
         "$nearl" train "$runs/g1.toml" --algo pid2-il --demos "$runs/clip.npz" --steps "$steps" --seed "$seed" --threads 1 --out "$run" > /dev/null
@@ -26,4 +29,5 @@ for seed in $seeds; do
         "$nearl" train "$runs/g1.toml" --resume "$run" --threads 1 > /dev/null
     fi
 done
-MUJOCO_GL=egl NEARL="$nearl" .venv/bin/python results/motion/table.py "$runs/clip.npz" results/motion "${all[@]}"
+mkdir -p "$folder"
+MUJOCO_GL=egl NEARL="$nearl" .venv/bin/python results/motion/table.py "$runs/clip.npz" "$folder" "${all[@]}"

@@ -62,7 +62,6 @@ def measured(run: Path, wanted: np.ndarray, place: Path) -> tuple[dict[str, str]
     joints, speeds = reached[1 : n + 1, BASE:], np.abs(speed[1 : n + 1, BASE - 1 :])
     error = np.abs(joints - wanted[1 : n + 1, BASE:])
     beyond = np.maximum(np.maximum(lower - joints, joints - upper), 0.0)
-    furthest = f"{beyond.max():.3f} ({names[int(beyond.max(0).argmax())]})"
     still = np.abs(wanted[:1, BASE:] - wanted[1 : n + 1, BASE:])
     base = np.linalg.norm(reached[1 : n + 1, :3] - wanted[1 : n + 1, :3], axis=1)
     evaluated = told("eval", run, "--episodes", 1)[0]
@@ -79,7 +78,8 @@ def measured(run: Path, wanted: np.ndarray, place: Path) -> tuple[dict[str, str]
         "mean distance of the base [m]": f"{base.mean():.3f}",
         "largest force of a motor, share of its effort": f"{effort:.3f}",
         "periods with a joint beyond its range": f"{int((beyond > 0).any(1).sum())} of {n}",
-        "furthest beyond its range [rad]": furthest,
+        "furthest beyond its range [rad]": f"{beyond.max():.3f}",
+        "the joint that was": names[int(beyond.max(0).argmax())],
         "periods with a joint beyond its speed": f"{int((speeds > fastest).any(1).sum())} of {n}",
     }, file
 
@@ -111,4 +111,6 @@ def main(clip: Path, folder: Path, *runs: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 4:
+        sys.exit(__doc__)
     main(*(Path(word) for word in sys.argv[1:]))

@@ -1,11 +1,13 @@
 #!/usr/bin/env bash
-# Learning from a running loop, seed by seed: a loop in lockstep (faster than real time), and a trainer that pushes snapshots back.
+# Learning from a running loop, seed by seed: a loop in lockstep (faster than real time), and a trainer that pushes snapshots back. Everything goes into OUT
+# (runs/online, with other STEPS than 100000 a folder of their number in it); before.json and after.json of a seed have the returns.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 nearl=${NEARL:-target/release/nearl}
 task=${TASK:-HalfCheetah-v5}
 steps=${STEPS:-100000}
 out=${OUT:-runs/online}
+[ "$steps" = 100000 ] || out=$out/$steps
 mkdir -p "$out"
 for seed in ${SEEDS:-0 1}; do
     dir=$out/$seed

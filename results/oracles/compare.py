@@ -2,6 +2,8 @@
 
 Boxes from the formulas, mass matrices, forces and Jacobians from the Python package of Pinocchio, optima from quadprog and proxsuite
 (rows) or ECOS (cones). Nothing of NEARL is imported.
+
+    .oracles/bin/python results/oracles/compare.py PROBLEMS.jsonl > results/oracles/table.md
 """
 
 import json
@@ -208,4 +210,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     main()

@@ -1,6 +1,7 @@
 #!/bin/sh
 # HalfCheetah behind the simulator's guard from the first step, begun with what a policy without limits can do within them:
-# results/reached/demonstrated.sh [TICKS] adds what is missing to trained.csv. RUNS may hold the trainings.
+# results/reached/demonstrated.sh [TICKS] adds what is missing to trained.csv. Other ticks than 2000 go into results/reached/demonstrated-TICKS. RUNS may hold
+# the trainings.
 # A seed that has its lines there is neither trained nor measured again, which in a fresh clone is all of 0 to 2: move trained.csv away for that, or give other
 # SEEDS.
 set -eu
@@ -11,7 +12,10 @@ nearl=${NEARL:-target/release/nearl}
 python=${PYTHON:-.venv/bin/python}
 task=HalfCheetah-v5
 mkdir -p "$runs"
-out=results/reached/trained.csv
+folder=results/reached
+[ "$ticks" = 2000 ] || folder=$folder/demonstrated-$ticks
+out=$folder/trained.csv
+mkdir -p "$folder"
 counts=ticks,outside,unavoidable,began_inside,outside_from_inside,unavoidable_from_inside
 [ -e "$out" ] || echo "trained,task,guard,$counts,mean_return,episodes,steps_per_second" > "$out"
 missing=
@@ -28,4 +32,4 @@ for seed in $missing; do
         --set 'constraints.guard="simulator"' --out "$run" > /dev/null
     "$python" results/reached/measure.py $task "$run/checkpoints/final.safetensors" "$ticks" | sed "s/^/demonstrated $seed,/" >> "$out"
 done
-"$python" results/reached/table.py
+"$python" results/reached/table.py "$folder"

@@ -192,6 +192,8 @@ def fly(snapshot: Snapshot, asked: float | None, ticks: int, way: str) -> dict:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) not in (2, 3, 4):
+        sys.exit(__doc__)
     ticks = int(sys.argv[2]) if len(sys.argv) > 2 else 20000
     name = sys.argv[3] if len(sys.argv) > 3 else "first"
     print("policy,margins of positions,asked,ticks,outside,floor,return,worst rows,unattainable")

@@ -1,10 +1,11 @@
 """The share asked for by `constraints.reached` and the one that came, in training and after it.
 
-    python results/reached/dialled.py NEARL RUNS SEED... > results/reached/dialled.csv
+    python results/reached/dialled.py NEARL RUNS FOLDER SEED...
 
-RUNS has the run folders of `dialled.sh`. Each policy is evaluated for 40 episodes of 1000 ticks, of which the second half counts, as margins that
-begin at 0 need some thousand ticks: with what it was trained for, and the one that was trained without under each share. The floor is what
-the best of 400 sampled actions leaves outside, in every fortieth tick of 10,000 of the policy without margins (`dial.py`).
+RUNS has the run folders of `dialled.sh`. FOLDER/dialled.csv is written; the lines of other seeds than these stay what they are in it. Each policy is evaluated
+for 40 episodes of 1000 ticks, of which the second half counts, as margins that begin at 0 need some thousand ticks: with what it was trained for, and the one
+that was trained without under each share. The floor is what the best of 400 sampled actions leaves outside, in every fortieth tick of 10,000 of the policy
+without margins (`dial.py`).
 """
 
 import csv
@@ -45,14 +46,30 @@ def in_training(run: pathlib.Path) -> str:
     return f"{np.mean(shares[len(shares) // 2 :]):.4f}"
 
 
+def kept(file: pathlib.Path, seeds: list[str]) -> list[dict]:
+    """Lines of other seeds that are there already."""
+    if not file.is_file():
+        return []
+    with file.open(newline="") as text:
+        return [row for row in csv.DictReader(text) if row["seed"] not in seeds]
+
+
 if __name__ == "__main__":
-    nearl, runs, seeds = sys.argv[1], pathlib.Path(sys.argv[2]), sys.argv[3:]
+    if len(sys.argv) < 5:
+        sys.exit(__doc__)
+    nearl, runs, folder, seeds = sys.argv[1], pathlib.Path(sys.argv[2]), pathlib.Path(sys.argv[3]), sys.argv[4:]
     columns = ["seed", "trained for", "in training", "asked", "outside", "outside of all", "return", "floor", "worst rows", "unattainable"]
-    print(",".join(columns))
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = kept(folder / "dialled.csv", seeds)
     for seed in seeds:
         for trained in ("none", *SHARES):
             run = runs / f"{trained}_{seed}"
             floor = fly(Snapshot(str(run / "checkpoints/final.safetensors")), None, 10000, "motor")["floor"]
             for asked in ("none", *SHARES) if trained == "none" else (trained,):
-                row = {"seed": seed, "trained for": trained, "in training": in_training(run), "asked": asked, **evaluate(nearl, run, asked), "floor": floor}
-                print(",".join(str(row[column]) for column in columns), flush=True)
+                row = {"seed": seed, "trained for": trained, "in training": in_training(run), "asked": asked}
+                rows.append({**row, **evaluate(nearl, run, asked), "floor": floor})
+                print(",".join(str(rows[-1][column]) for column in columns), flush=True)
+    with (folder / "dialled.csv").open("w", newline="") as text:
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(sorted(rows, key=lambda row: int(row["seed"])))

@@ -75,6 +75,8 @@ def measure(task: str, snapshot: str, ticks: int, word: str, margin: float | Non
 
 
 if __name__ == "__main__":
+    if len(sys.argv) not in (4, 5):
+        sys.exit(__doc__)
     for guarded in ("none", "simulator", "simulator, policy kept where nothing is inside"):
         line, out = measure(sys.argv[1], sys.argv[2], int(sys.argv[3]), guarded.replace(",", ";"), *map(float, sys.argv[4:5]))
         print(line, flush=True)

@@ -31,4 +31,4 @@ for task in HalfCheetah-v5 HalfCheetah-velocity; do
     [ -d "$runs/$of" ] || "$nearl" train "$of" --algo pid2-ib --preset strong --steps 1M --seed 0 --threads 1 --out "$runs/$of" > /dev/null
     measure "PID2-IB" "$task" "$runs/$of/checkpoints/final.safetensors"
 done
-"$python" results/reached/table.py
+"$python" results/reached/table.py results/reached

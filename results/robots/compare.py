@@ -1,4 +1,7 @@
-"""Reads the same files with our reader and compares: writes runs.jsonl and table.md beside this script."""
+"""Reads the same files with our reader and compares: writes runs.jsonl and table.md beside this script.
+
+    .venv/bin/python results/robots/compare.py FOLDER REFERENCES      # REFERENCES is what reference.py printed of FOLDER; run.sh does both
+"""
 
 import json
 import pathlib
@@ -65,6 +68,8 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 root, references = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]).read_text().splitlines()
 rows = [compare(root / theirs["file"], theirs) for theirs in map(json.loads, references)]
 (HERE / "runs.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))

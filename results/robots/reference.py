@@ -1,4 +1,7 @@
-"""Prints what Pinocchio's own parser makes of every URDF below a folder: joints, limits, and dynamics at three random states, one JSON line each."""
+"""Prints what Pinocchio's own parser makes of every URDF below a folder: joints, limits, and dynamics at three random states, one JSON line each.
+
+    python results/robots/reference.py FOLDER > REFERENCES      # run.sh does both
+"""
 
 import json
 import pathlib
@@ -35,6 +38,8 @@ def robot(path: pathlib.Path) -> dict:
     return {"floating": floating, "limits": limits, "joints": list(model.names)[1:], "nq": model.nq, "nv": model.nv, "states": states}
 
 
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
 root = pathlib.Path(sys.argv[1])
 for path in sorted(root.rglob("*.urdf")):
     print(json.dumps({"file": str(path.relative_to(root)), **robot(path)}))

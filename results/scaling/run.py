@@ -1,10 +1,11 @@
 """How training grows: environments, widths of the networks, observation entries; on one thread and on two.
 
     cargo build --release --locked --bins
-    python3 results/scaling/run.py target/release --seconds 10       # quiet machine; writes runs.jsonl and table.md beside this file
+    python3 results/scaling/run.py target/release       # quiet machine; writes runs.jsonl and table.md beside this file
 
 Each line is a process of its own (`nearl bench train`, pid2-ib with its limits). Its processor time and peak memory come from the system. `busy` is how many
-cores the rest of the machine used meanwhile: where that is not near zero, read the column of steps per processor second and not steps per second.
+cores the rest of the machine used meanwhile: where that is not near zero, read the column of steps per processor second and not steps per second. Other
+`--seconds` than 10 go into a folder of their number, and lines of what is not measured stay.
 """
 
 import argparse
@@ -17,7 +18,8 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-BATCH = 16384
+BATCH, SECONDS = 16384, 10.0
+ORDER = ["environments", "width", "observation"]
 
 
 def used() -> float:
@@ -86,20 +88,23 @@ def table(rows: list[dict]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("programs", type=Path, help="folder of the program nearl")
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--seconds", type=float, default=SECONDS)
     parser.add_argument("--threads", default="1,2")
-    parser.add_argument("--only", help="environments, width or observation: these anew, the other lines stay")
+    parser.add_argument("--only", choices=ORDER, help="these anew; lines of what is not measured stay")
     a = parser.parse_args()
-    file = HERE / "runs.jsonl"
-    rows = [row for row in map(json.loads, file.read_text().splitlines()) if row["what"] != a.only] if a.only else []
-    with file.open("w") as out:
-        out.writelines(json.dumps(row) + "\n" for row in rows)
-        for case in (case for case in cases() if a.only in (None, case["what"])):
-            for threads in map(int, a.threads.split(",")):
-                rows.append(measure(case, threads, a.programs.resolve() / "nearl", a.seconds))
-                print(json.dumps(rows[-1]), file=out, flush=True)
-                print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-    (HERE / "table.md").write_text(table(rows))
+    folder = HERE if a.seconds == SECONDS else HERE / f"{a.seconds:g}"
+    folder.mkdir(exist_ok=True)
+    file = folder / "runs.jsonl"
+    todo = [(case, threads) for case in cases() if a.only in (None, case["what"]) for threads in map(int, a.threads.split(","))]
+    anew = {(case["what"], case["value"], threads) for case, threads in todo}
+    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
+    rows = [row for row in rows if (row["what"], row["value"], row["threads"]) not in anew]
+    for case, threads in todo:
+        rows.append(measure(case, threads, a.programs.resolve() / "nearl", a.seconds))
+        print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+    rows.sort(key=lambda row: (ORDER.index(row["what"]), row["value"], row["threads"]))
+    file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (folder / "table.md").write_text(table(rows))
 
 
 if __name__ == "__main__":

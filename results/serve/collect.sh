@@ -25,7 +25,7 @@ rounds = [json.loads(line) for line in open(file)]
 rate = [r["steps"] / r["seconds"] for r in rounds]
 ratio = sorted(there / here for here, there in zip(rate[::2], rate[1::2]))
 middle = lambda x: sorted(x)[len(x) // 2]
-paired = f"{100 * middle(ratio):.0f} % ({100 * ratio[0]:.0f} .. {100 * ratio[-1]:.0f})"
+paired = " | ".join(f"{100 * share:.0f} %" for share in (middle(ratio), ratio[0], ratio[-1]))
 print(f"| {task} | {middle(rate[::2]) / 1e3:.1f} k | {middle(rate[1::2]) / 1e3:.1f} k | {paired} |")
 PYTHON
 done

@@ -1,7 +1,7 @@
 """Random arms over the physics steps of a period, pushed onto their limits: python results/steps/steps.py [ARMS].
 
 The arms are those of python/tests/test_guard_steps.py. What MuJoCo did is compared with what was promised: speeds and accelerations to 1e-8, positions
-to the ends of the ranges at the end of a period. Writes steps.csv.
+to the ends of the ranges at the end of a period. Writes steps.csv; of another number of ARMS than 60 into a folder of that number.
 """
 
 import sys
@@ -18,7 +18,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parents[1] / "python/tests"))
 from test_guard_steps import ACCELERATION, SPEED, arm, task, with_drives, with_weak_motors, within_ranges  # noqa: E402
 
-TICKS, PUSHED = 600, 25
+USUAL, TICKS, PUSHED = 60, 600, 25  # arms a setting, ticks of each, ticks of a push
 
 
 class Setting(NamedTuple):
@@ -97,7 +97,8 @@ def excess(seed: int, of: Setting) -> tuple[int, np.ndarray]:
 def main() -> None:
     """Attacks the arms of every setting, and says how many kept everything."""
     warnings.simplefilter("ignore")
-    arms = int(sys.argv[1]) if len(sys.argv) > 1 else 60
+    arms = int(sys.argv[1]) if len(sys.argv) > 1 else USUAL
+    place = HERE if arms == USUAL else HERE / str(arms)
     lines = ["dt,steps,margin,drives,integrator,targets_end,share,jerk,seed,position,speed,acceleration,change"]
     for of in SETTINGS:
         runs = [(seed, *excess(seed, of)) for seed in range(arms)]
@@ -112,7 +113,8 @@ def main() -> None:
         drives += f", hard jerk of {of.jerk:g} rad/s³" if np.isfinite(of.jerk) else ""
         counts = ", ".join(map(str, of.counts))
         print(f"{of.dt * 1e3:g} ms, {counts} steps, {of.integrator}, margin {of.margin}, {drives}: {kept} of {arms} kept everything; worst {worst}", flush=True)
-    (HERE / "steps.csv").write_text("\n".join(lines) + "\n")
+    place.mkdir(exist_ok=True)
+    (place / "steps.csv").write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

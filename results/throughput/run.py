@@ -21,6 +21,7 @@ HERE = Path(__file__).resolve().parent
 TASKS = ["HalfCheetah-v5", "Ant-v5", "Walker2d-v5", "Hopper-v5"]
 # minibatch: (batch, environments of ours, of JAX on EnvPool, of Stable-Baselines3), each its own best
 SETTINGS = {64: (2048, 16, 64, 8), 2048: (16384, 64, 64, 8)}
+SECONDS = 6.0
 SYSTEMS = ["ppo", "pid2-ib", "physics", "jax-envpool", "sb3"]
 
 
@@ -87,12 +88,14 @@ def main():
     p.add_argument("--settings", default="64,2048", help="minibatches")
     p.add_argument("--systems", default=",".join(SYSTEMS))
     p.add_argument("--repeats", type=int, default=3)
-    p.add_argument("--seconds", type=float, default=6.0, help="of each training, after its first iteration")
+    p.add_argument("--seconds", type=float, default=SECONDS, help="of each training, after its first iteration")
     p.add_argument("--python", default=sys.executable, help="interpreter of the peers' environment")
     p.add_argument("--target", default="target/release", help="folder of the built programs")
-    p.add_argument("--lines", default=str(HERE / "runs.jsonl"), help="file the runs are appended to; the table shows all of them")
+    p.add_argument("--lines", type=Path, help="file the runs are appended to, all in the table: runs.jsonl here, or in a folder of other seconds than 6")
     p.add_argument("--loaded", action="store_true", help="count runs beside other programs too")
     a = p.parse_args()
+    a.lines = a.lines or (HERE if a.seconds == SECONDS else HERE / f"{a.seconds:g}") / "runs.jsonl"
+    a.lines.parent.mkdir(parents=True, exist_ok=True)
     for _ in range(a.repeats):
         for task in a.tasks.split(","):
             for minibatch in map(int, a.settings.split(",")):
@@ -101,7 +104,7 @@ def main():
                     print(json.dumps(line), file=sys.stderr)
                     with open(a.lines, "a") as f:
                         print(json.dumps(line), file=f)
-    lines = [json.loads(line) for line in Path(a.lines).read_text().splitlines()]
+    lines = [json.loads(line) for line in a.lines.read_text().splitlines()]
     table(lines, a.loaded)
 
 

@@ -6,7 +6,8 @@
 Returns are those of training, exploration on: the mean of the last hundred episodes, which every system reports at each of its batches. Runs are processes
 of their own, systems by turns: one after another on the whole machine, or with `--one-core` each on a core of its own. A run ends when it has the highest
 return of its task, or at `--limit` seconds. What `other` programs did meanwhile (cores, those of the run) stands in each line: above 0.3 a run does not count.
-The table is of all lines of `runs.jsonl`; remove the file to start again. `--systems ppo,pid2-ib` needs no peers.
+The table is of all lines of `runs.jsonl`; remove the file to start again, or give `--lines`. New lines have their
+`--limit`. Rates that fall over other `--steps` than ten million go into STEPS/runs.jsonl. `--systems ppo,pid2-ib` needs no peers.
 """
 
 import argparse
@@ -29,6 +30,7 @@ import tomllib
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 GOALS = {"HalfCheetah-v5": [5000, 8000], "Ant-v5": [3000, 5000], "Walker2d-v5": [3500], "Hopper-v5": [2500]}
+STEPS = 10_000_000
 SYSTEMS = ["ppo", "pid2-ib", "jax", "sb3-ppo", "sb3-sac"]
 
 
@@ -100,11 +102,14 @@ def main() -> None:
     p.add_argument("--systems", default=",".join(SYSTEMS))
     p.add_argument("--tasks", default=",".join(GOALS))
     p.add_argument("--seeds", type=int, default=5)
-    p.add_argument("--steps", type=int, default=10_000_000, help="steps over which rates fall to zero")
+    p.add_argument("--steps", type=int, default=STEPS, help="steps over which rates fall to zero")
+    p.add_argument("--lines", type=Path, help="file the runs are appended to; the table shows all of them")
     p.add_argument("--limit", type=float, default=1800.0, help="seconds after which a run is given up")
     p.add_argument("--first-seed", type=int, default=0)
     p.add_argument("--one-core", action="store_true", help="each run on a core of its own, as many side by side as there are cores")
     a = p.parse_args()
+    a.lines = a.lines or (HERE if a.steps == STEPS else HERE / str(a.steps)) / "runs.jsonl"
+    a.lines.parent.mkdir(parents=True, exist_ok=True)
     said = {task: settings(a.nearl, task) for task in a.tasks.split(",")}
     seeds = range(a.first_seed, a.first_seed + a.seeds)
     todo = [(system, task, seed) for task in said for seed in seeds for system in a.systems.split(",")]
@@ -118,19 +123,20 @@ def main() -> None:
             line = run(system, task, seed, said[task], a, core)
         finally:
             cores.put(core)
-        with open(HERE / "runs.jsonl", "a") as log:
-            log.write(json.dumps(line) + "\n")
+        with open(a.lines, "a") as log:
+            log.write(json.dumps(line | {"limit": a.limit}) + "\n")
 
     with ThreadPoolExecutor(cores.qsize()) as pool:
         for done in [pool.submit(one, *what) for what in todo]:
             done.result()
-    table([json.loads(line) for line in (HERE / "runs.jsonl").read_text().splitlines()])
+    table(a.lines)
 
 
-def table(lines: list[dict]) -> None:
+def table(file: Path) -> None:
     """Median over the seeds that nobody disturbed; a seed that never came there counts as infinitely late."""
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
     if len({line["cores"] for line in lines}) > 1:
-        sys.exit(f"{HERE / 'runs.jsonl'} has runs on one core and on several, which do not compare; remove the file and start again")
+        sys.exit(f"{file} has runs on one core and on several, which do not compare; remove the file and start again")
     writer = csv.writer(sys.stdout, delimiter="|", lineterminator="|\n")
     writer.writerows([["", " task ", " return ", " system ", " seconds ", " million steps ", " seeds there ", " left out as disturbed "], ["", *["---"] * 7]])
     found, disturbed = defaultdict(list), defaultdict(int)

@@ -1,6 +1,6 @@
 """What random robots, noise, delay and a history cost in steps per second, and how far training is from its physics alone: `cost.md`.
 
-    .venv/bin/python results/transfer/cost.py [SECONDS [REPEATS]]
+    .venv/bin/python results/transfer/cost.py [SECONDS [REPEATS]]      8 and 3 unless given; 4 2, say, goes into results/transfer/4-2
 
 Each repetition trains every variant for SECONDS in a process of its own, one after the other, so that a slow minute of the machine meets all of them.
 Needs Python 3.11. The machine must be idle: `other` is how many cores something else used meanwhile, and a run with more than 0.3 is left out.
@@ -18,7 +18,8 @@ import tomllib
 
 ROOT = Path(__file__).parents[2]
 NEARL = os.environ.get("NEARL", str(ROOT / "target/release/nearl"))
-OUT = Path(__file__).parent / "cost.md"
+HERE = Path(__file__).parent
+USUAL = (8.0, 3)
 
 RANDOM = 'random={ mass = "1 + 0.3 * uniform", strength = { all = "0.9 + 0.15 * uniform" } }'
 NOISE = 'noise={ q = "0.005 * normal", v = "0.05 * normal" }'
@@ -60,7 +61,8 @@ def run(task: str, algo: str, settings: list[str], seconds: float) -> dict:
     return {"rate": line["steps_per_s"], "physics": line["physics_steps_per_s"], "update": line["update_share"], "other": other}
 
 
-def main(seconds: float = 8.0, repeats: int = 3) -> None:
+def main(seconds: float = USUAL[0], repeats: int = USUAL[1]) -> None:
+    folder = HERE if (seconds, repeats) == USUAL else HERE / f"{seconds:g}-{repeats}"
     text = [f"`cost.py {seconds:g} {repeats}`: medians of {repeats} repetitions of {seconds:g} s on {os.cpu_count()} cores.", ""]
     text += ["| task | with | steps/s | cost, % | share of the physics alone, % | updates, % of the time |", "|---|---|---|---|---|---|"]
     left_out = 0
@@ -85,7 +87,8 @@ def main(seconds: float = 8.0, repeats: int = 3) -> None:
             share, update = 100 * m["rate"] / m["physics"], 100 * m["update"]
             text.append(f"| {name} | {variant} | {m['rate']:.0f} | {cost} | {share:.0f} | {update:.0f} |")
     text += ["", f"Left out because something else used the machine: {left_out} runs."]
-    OUT.write_text("\n".join(text) + "\n")
+    folder.mkdir(exist_ok=True)
+    (folder / "cost.md").write_text("\n".join(text) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
 # A Panda and an xArm7 bring their hand to a goal, trained on the robot of the file and on random ones, then evaluated on plants that differ.
-#     results/transfer/run.sh [SEEDS [STEPS]]      e.g. 0-4 600k
-# Finished runs are skipped, broken ones go on.
+#     results/transfer/run.sh [SEEDS [STEPS]]      e.g. 0-4 1M, which goes into results/transfer/1M
+# Finished runs are skipped, broken ones go on. Seeds that are not run stay what they are in the data.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 seeds=${1:-0-4} steps=${2:-600k}
-runs=runs/transfer folder=results/transfer
+runs=runs/transfer tasks=results/transfer folder=results/transfer
+[ "$steps" = 600k ] || { runs=$runs/$steps folder=$folder/$steps; }
 
 # What differs grows with what an environment has learned.
 random=(--set 'curriculum={ step = 0.1, up = "reward.near > 0.01", down = "reward.near < 0.005" }'
@@ -17,11 +18,11 @@ history=(--set 'policy.observation=[{ term = "joint_pos", history = 3 }, { term 
 
 # sweep KIND TASK ALGORITHM [SETTINGS...]
 sweep() {
-    target/release/nearl sweep --tasks $folder/$2.toml --algos "$3" --seeds "$seeds" --steps "$steps" --jobs "${JOBS:-2}" --out $runs/$1 "${@:4}"
+    target/release/nearl sweep --tasks "$tasks/$2.toml" --algos "$3" --seeds "$seeds" --steps "$steps" --jobs "${JOBS:-2}" --out "$runs/$1" "${@:4}"
 }
 sweep plain panda pid2-ib
 sweep plain xarm7 ppo
 sweep random panda pid2-ib "${random[@]}"
 sweep random xarm7 ppo "${random[@]}"
 sweep history xarm7 ppo "${random[@]}" "${history[@]}"
-.venv/bin/python $folder/table.py $runs $folder
+.venv/bin/python "$tasks/table.py" "$runs" "$folder"

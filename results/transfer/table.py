@@ -2,7 +2,8 @@
 
     .venv/bin/python results/transfer/table.py RUNS FOLDER [EPISODES]
 
-Everything is measured in MuJoCo's own state, without noise and delay. `excess` columns are 0 where no control period left the limit.
+Runs that RUNS does not have stay what they are in FOLDER. Everything is measured in MuJoCo's own state, without noise and delay.
+`excess` columns are 0 where no control period left the limit.
 """
 
 import csv
@@ -82,6 +83,9 @@ COLUMNS = {
 
 def main(runs: Path, folder: Path, episodes: int = 20) -> None:
     found = sorted(p for p in runs.glob("*/*-transfer/*_*") if list(p.glob("checkpoints/*.safetensors")))
+    if not found:
+        sys.exit(f"no run in {runs} has a snapshot")
+    folder.mkdir(parents=True, exist_ok=True)
     rows = []
     for run in found:
         seed = int(re.search(r"_(\d+)$", run.name).group(1))
@@ -89,6 +93,12 @@ def main(runs: Path, folder: Path, episodes: int = 20) -> None:
             head = {"robot": run.parent.name.removesuffix("-transfer"), "trained": run.parents[1].name, "seed": seed, "steps": steps(run), "plant": plant}
             rows.append(head | {k: f"{v:.4g}" for k, v in evaluate(run, changes, episodes).items()})
             print(*rows[-1].values(), sep=", ", flush=True)
+    name = lambda row: (row["trained"], row["robot"], int(row["seed"]))  # noqa: E731
+    measured = {name(row) for row in rows}
+    if (folder / "runs.csv").is_file():
+        with open(folder / "runs.csv", newline="") as f:
+            rows += [row for row in csv.DictReader(f) if name(row) not in measured]
+    rows.sort(key=name)
     with open(folder / "runs.csv", "w", newline="") as f:
         writer = csv.DictWriter(f, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -119,4 +129,6 @@ def table(rows: list[dict]) -> str:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) not in (3, 4):
+        sys.exit(__doc__)
     main(Path(sys.argv[1]), Path(sys.argv[2]), *map(int, sys.argv[3:]))

@@ -10,8 +10,12 @@ COLUMNS = ("ticks", "verified", "optimal", "stoppable", "found")
 
 
 def add(found: str, robot: str, sub_steps: str, dt: str, kind: str, seed: str) -> None:
-    """Appends a flight."""
+    """Appends a flight, unless it is there already."""
     flight = {"robot": robot, "steps": int(sub_steps), "dt": float(dt), "kind": kind, "seed": int(seed)}
+    there = FLIGHTS.read_text().splitlines() if FLIGHTS.exists() else []
+    if any(flight.items() <= json.loads(line).items() for line in there):
+        print(f"flights.jsonl has {robot}, {kind}, {sub_steps} steps, seed {seed}: not added again", file=sys.stderr)
+        return
     with FLIGHTS.open("a") as file:
         file.write(json.dumps({**flight, **json.loads(Path(found).read_text())}) + "\n")
 

@@ -1,8 +1,8 @@
 """A hundred episodes of 20 s of each snapshot, under pushes of several strengths and on bumps of several heights.
 
-Writes `evaluation.csv` and `episodes.csv`, and a table on the output.
+    .venv/bin/python results/walk/evaluate.py FOLDER SNAPSHOT...
 
-.venv/bin/python results/walk/evaluate.py FOLDER SNAPSHOT...
+Writes `evaluation.csv` and `episodes.csv` into FOLDER, which is there already, and prints a table.
 """
 
 import csv
@@ -50,6 +50,9 @@ def evaluate(snapshot: str, bumps: str, pushes: str) -> tuple[dict, list[dict]]:
 
 
 def main(folder: Path, snapshots: list[str]) -> None:
+    for path, there in [(folder, folder.is_dir()), *((s, Path(s).exists()) for s in snapshots)]:
+        if not there:
+            sys.exit(f"evaluate.py: '{path}' does not exist; a hundred episodes of each snapshot take minutes, so nothing was begun")
     rows, episodes = [], []
     for snapshot in snapshots:
         for bumps, pushes in GROUNDS:
@@ -69,4 +72,6 @@ def main(folder: Path, snapshots: list[str]) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     main(Path(sys.argv[1]), sys.argv[2:])

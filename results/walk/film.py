@@ -1,6 +1,6 @@
 """A film of a flight log of the walking ANYmal: the states that the plant told, drawn by MuJoCo without a screen.
 
-MUJOCO_GL=egl .venv/bin/python results/walk/film.py LOG OUT.webp [FROM [SECONDS]]
+    MUJOCO_GL=egl .venv/bin/python results/walk/film.py LOG OUT.webp [FROM [SECONDS]]
 """
 
 import json
@@ -68,4 +68,6 @@ def main(log: str, out: str, start: float = 0.0, seconds: float = 8.0) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) not in (3, 4, 5):
+        sys.exit(__doc__)
     main(sys.argv[1], sys.argv[2], *map(float, sys.argv[3:]))

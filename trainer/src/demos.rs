@@ -106,7 +106,7 @@ impl Demonstrations {
     fn of(mut arrays: BTreeMap<String, Array>) -> Result<Self, String> {
         let names = match arrays.remove("names").ok_or("it has no array 'names'")?.values {
             Values::Words(names) => names,
-            Values::Numbers(_) => {
+            Values::Numbers(_) | Values::Whole(_) => {
                 return Err("array 'names' holds numbers; give the name of each observation".into());
             }
         };
@@ -186,12 +186,12 @@ impl Demonstrations {
             shape: vec![rows, values.len() / rows.max(1)],
             values: Values::Numbers(values),
         };
-        let lengths: Vec<f64> = self.episodes.iter().map(|e| e.length as f64).collect();
+        let lengths: Vec<i64> = self.episodes.iter().map(|e| e.length as i64).collect();
         let mut arrays = vec![
             ("observations", table(rows, flat(|e| &e.observations))),
             ("qpos", table(rows, flat(|e| &e.qpos))),
             ("qvel", table(rows, flat(|e| &e.qvel))),
-            ("lengths", Array { shape: vec![lengths.len()], values: Values::Numbers(lengths) }),
+            ("lengths", Array { shape: vec![lengths.len()], values: Values::Whole(lengths) }),
             ("dt", Array { shape: Vec::new(), values: Values::Numbers(vec![self.dt]) }),
             ("names", Array { shape: vec![self.names.len()], values: Values::Words(self.names.clone()) }),
         ];
@@ -335,6 +335,7 @@ fn numbers(arrays: &mut BTreeMap<String, Array>, name: &str) -> Result<(Vec<usiz
     let Array { shape, values } = arrays.remove(name).ok_or(format!("it has no array '{name}'"))?;
     match values {
         Values::Numbers(values) => Ok((shape, values)),
+        Values::Whole(values) => Ok((shape, values.into_iter().map(|x| x as f64).collect())),
         Values::Words(_) => Err(format!("array '{name}' holds text; give numbers")),
     }
 }

@@ -1,4 +1,4 @@
-"""Writes the table of a run of run.sh between the marks of a Markdown file: table.py FOLDER README.md"""
+"""Writes the tables of a run of run.sh between the marks of a Markdown file: table.py FOLDER README.md"""
 
 import sys
 from collections import defaultdict
@@ -24,8 +24,7 @@ def cell(files):
     failed, furthest, steps = int(words[2]), float(words[4]), float(words[6])
     p50, p99 = np.percentile(times, [50, 99])
     fine = lambda x: f"{x:.2f}" if x < 10 else f"{x:.0f}"  # noqa: E731
-    failures = f", {failed} failed" if failed else ""
-    return f"{fine(p50)} / {fine(p99)}", f"{steps:.1f}", f"{furthest:.0e}{failures}"
+    return fine(p50), fine(p99), f"{steps:.1f}", f"{furthest:.0e}", str(failed)
 
 
 def main(folder, readme):
@@ -34,14 +33,14 @@ def main(folder, readme):
         problem, _, solver = path.stem.partition(".")
         files[solver][problem].append(path)
     order = [*FIRST, *sorted(set(files) - set(FIRST))]
-    lines = ["| p50 / p99 [us], mean steps, largest error [rad/s] | " + " | ".join(PROBLEMS.values()) + " |"]
-    lines.append("|---|" + "---|" * len(PROBLEMS))
-    for solver in order:
-        cells = ["; ".join(cell(files[solver][problem])) for problem in PROBLEMS]
-        lines.append(f"| {FIRST.get(solver, solver)} | " + " | ".join(cells) + " |")
+    lines = []
+    for problem, dofs in PROBLEMS.items():
+        lines += [f"| {dofs} | p50 [us] | p99 [us] | mean steps | largest error [rad/s] | failed |", "|---|---|---|---|---|---|"]
+        lines += [f"| {FIRST.get(solver, solver)} | {' | '.join(cell(files[solver][problem]))} |" for solver in order]
+        lines.append("")
     text = readme.read_text()
     head, rest = text.split(START)
-    readme.write_text(head + START + "\n" + "\n".join(lines) + "\n\n" + END + rest.split(END)[1])
+    readme.write_text(head + START + "\n" + "\n".join(lines) + "\n" + END + rest.split(END)[1])
     print("\n".join(lines))
 
 

@@ -16,6 +16,8 @@ pub struct Array {
 pub enum Values {
     /// Numbers, whatever their width in the file.
     Numbers(Vec<f64>),
+    /// Whole numbers, to be written as such; they are read as numbers.
+    Whole(Vec<i64>),
     /// Words.
     Words(Vec<String>),
 }
@@ -166,6 +168,10 @@ fn bytes_of(array: &Array) -> Vec<u8> {
         Values::Numbers(x) => {
             assert_eq!(x.len(), n, "entries of shape {:?}", array.shape);
             ("<f8".to_string(), x.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>())
+        }
+        Values::Whole(x) => {
+            assert_eq!(x.len(), n, "entries of shape {:?}", array.shape);
+            ("<i8".to_string(), x.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>())
         }
         Values::Words(words) => {
             assert_eq!(words.len(), n, "entries of shape {:?}", array.shape);

@@ -11,7 +11,7 @@
 //! Without the term of `gain` the multiplier swings (Stooke, Achiam & Abbeel 2020). `J_C` is the cost of a step of the batch times the mean
 //! length of the last episodes: what the last hundred episodes cost comes too late.
 //! Costs are divided by the running standard deviation of their discounted sum, as rewards are, so that the multiplier has no unit.
-//! A limit of 0 has no relative excess: the cost itself is it.
+//! A limit of 0 is exceeded by all there is wherever there is a cost, as one that goes to 0 is.
 
 use super::epochs::Pace;
 use super::nets::NetSettings;
@@ -56,6 +56,8 @@ impl CostSettings {
     fn stepped(&self, integral: f32, cost: f64) -> [f32; 2] {
         let excess = match self.limit > 0.0 {
             true => (cost - self.limit) / self.limit,
+            // What a limit that goes to 0 makes of it.
+            false if cost > 0.0 => 1.0,
             false => cost,
         };
         if excess.is_nan() {
@@ -260,6 +262,7 @@ mod tests {
         let none = CostSettings { limit: 0.0, ..s };
         assert_eq!(none.stepped(0.5, 0.0), [0.5, 0.5]);
         assert!((none.stepped(0.5, 3.0)[0] - 0.6).abs() < 1e-6);
+        assert!((none.stepped(0.5, 0.3)[0] - 0.6).abs() < 1e-6, "as of a limit next to 0");
     }
 
     /// The value of the cost learns what each state costs, and what is unsafe becomes less likely than what is not.

@@ -3,7 +3,7 @@
 use super::TrainError;
 use super::setup::warm_up_steps;
 use crate::demos::{DemoError, Demonstrations};
-use crate::env::{ChaCha8Rng, SeedableRng, convert, unstated_steps};
+use crate::env::{ChaCha8Rng, Fault, SeedableRng, convert, unstated_steps};
 use crate::learn::{Algorithm, NearlSettings, Pid2Settings};
 use crate::rollout::RolloutError;
 use crate::settings::TrainSettings;
@@ -259,12 +259,27 @@ pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError>
     let mut env = crate::env::of_task(manifest, &manifest.task.name).map_err(RolloutError::from)?;
     let unstated = unstated_steps(manifest, env.spec());
     let mut rng = ChaCha8Rng::seed_from_u64(RESETS.1);
+    let nothing: Vec<f64> = {
+        let ranges = env.spec().action_low().zip(env.spec().action_high());
+        ranges.map(|(low, high)| 0.0_f64.max(low).min(high)).collect()
+    };
+    let mut ended = 0;
     for _ in 0..RESETS.0 {
         env.reset(&mut rng).map_err(RolloutError::from)?;
         states.look(|q, v| env.state(q, v));
+        let step = env.step(&nothing);
+        ended += usize::from(step.terminated && step.fault == Fault::None);
     }
     let mut lines = Vec::from_iter(unstated);
     let is_own = !manifest.task.reward.is_empty();
+    if is_own && ended == RESETS.0 {
+        lines.push(format!(
+            "{ended} of {0} episodes end with their first control period, without an action: a condition of [termination] holds at once ({1}); compare what it \
+             reads with a number",
+            RESETS.0,
+            manifest.task.termination.keys().cloned().collect::<Vec<_>>().join(", ")
+        ));
+    }
     lines.extend(states.sentences(&format!("{} episodes begin with", RESETS.0), |what| match is_own {
         true if what == What::Rest => "it goes there and comes back; draw it further inside or slower in [reset], or give constraints.position more room".into(),
         true => format!(
@@ -349,6 +364,21 @@ mod tests {
         assert_eq!(said(Algorithm::Nearl, &both), None, "what another algorithm reads");
         assert!(said(Algorithm::Nearl, &["train.nearl.idm_threshold=0.1"]).is_some());
         assert_eq!(said(Algorithm::Ppo, &both), None);
+    }
+
+    /// As where the comparison was forgotten: any value that is not 0 counts as true.
+    #[test]
+    fn a_condition_that_ends_every_episode_at_once_is_told() {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/tasks/cart-pole.toml");
+        let told = |condition: &str| {
+            let set = [format!("termination={{ far = \"{condition}\" }}")];
+            let mut manifest = tasks::load_with(&file.display().to_string(), None, &set).expect("task");
+            crate::train::complete(&mut manifest).expect("environment");
+            advice(Algorithm::Ppo, &manifest).expect("advice").join("\n")
+        };
+        let forgotten = told("abs(v.hinge) + 0.1");
+        assert!(forgotten.contains("64 of 64 episodes end with their first control period") && forgotten.contains("(far)"), "{forgotten}");
+        assert!(!told("abs(v.hinge) > 100").contains("first control period"));
     }
 
     #[test]
