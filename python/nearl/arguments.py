@@ -3,13 +3,14 @@
 import inspect
 import operator
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 MOST_SEED = 2**64 - 1
+MOST_ENTRIES = 2**32 - 1
 
 
 def whole(name: str, value: Any, least: int, give: str, most: int | None = None) -> int:
@@ -40,9 +41,24 @@ def numbers(name: str, value: Any) -> NDArray[np.float64]:
     try:
         if not np.iscomplexobj(value):
             return np.asarray(value, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
+        check_numbers(name, value)
         raise ValueError(f"{name} is not an array of numbers but {type(value)}; pass a NumPy array") from None
     raise ValueError(f"{name} holds complex numbers, and a robot has none; give real ones, e.g. {name}.real")
+
+
+def check_numbers(name: str, value: Any, called: Sequence[str] = ()) -> None:
+    """Refuses a list in which an entry is no number; ``called`` are names of its entries.
+
+    Raises:
+        ValueError: it holds one, by its place.
+    """
+    for i, entry in enumerate(value if isinstance(value, list | tuple) else ()):
+        place = f"{name}[{i}]" + (f" ('{called[i]}')" if i < len(called) else "")
+        if isinstance(entry, list | tuple):
+            check_numbers(place, entry)
+        elif isinstance(entry, str | bytes) or entry is None:
+            raise ValueError(f"{place} is {entry!r}; give a number")
 
 
 def names_of(what: str, value: Any) -> list[str]:

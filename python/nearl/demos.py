@@ -53,6 +53,7 @@ from nearl.sources import (
     renamed,
     seconds_between,
     split,
+    text,
     unbraced,
 )
 
@@ -390,7 +391,8 @@ def from_motion(
     if joints is None:
         if "joint_names" not in clip:
             raise BadDemonstrations(f"{source}: no array 'joint_names'; give joints=, the joints in the order of 'joint_pos'")
-        joints = [str(name) for name in np.ravel(clip["joint_names"])]
+        joints = list(np.ravel(clip["joint_names"]))
+    joints = [text(name, "'joint_names'", source) for name in joints]
     once([f"q.{name}" for name in joints], source)
     q = numbers(clip["joint_pos"], "array 'joint_pos'", source)
     if q.ndim != 2:

@@ -9,11 +9,15 @@
 Live objects are read, never files of theirs: the library that wrote a file loads it, and its weights come over as arrays.
 """
 
+import contextlib
+import itertools
 import math
 import os
+import re
+import sys
 import warnings
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,11 +31,26 @@ _Layer = tuple[np.ndarray, np.ndarray, str]
 
 # What follows a layer, by the name of the module's class.
 _FUNCTIONS = {"Identity": "identity", "Tanh": "tanh", "ReLU": "relu", "SiLU": "silu", "Sigmoid": "sigmoid", "ELU": "elu", "Softplus": "softplus"}
+_NO_LAYER = "the module has no linear layer; give the policy's network"
 # What works in the place of TorchScript.
 _SCRIPT = (
     "of which nobody reads the layers; give nearl.import_torch the torch.nn.Sequential that it was made from, or export it, "
     "torch.onnx.export({}, (torch.zeros(1, n),), 'policy.onnx', dynamo=False) with n inputs, and import that file (nearl.import_onnx, `nearl import`)"
 )
+# What works in the place of code, which is not read.
+_EXPORT = "export it, torch.onnx.export(module, (torch.zeros(1, n),), 'policy.onnx') with n inputs, and import that file (nearl.import_onnx, `nearl import`)"
+# What normalises observations is called so, itself or by its class; a normal distribution is not.
+_NORMALISES = re.compile(
+    r"norm(?!al(_|$|param|dist|tanh))|(^|_|obs)rms|running_?(mean|var|std)|standardi[sz]|whiten|scaler|"
+    r"(obs|observations?|states?|inputs?)_(mean|std|var|loc|scale|shift|offset|stat)",
+    re.IGNORECASE,
+)
+# What of a module has no part in the action that its actor puts out: what judges, and what explores.
+_APART = re.compile(r"critic|value|return|reward|advantage|cost|(^|_)q\d*(_|$)|target|std|sigma|alpha|temperature|entropy|dist|discrim|memory_c", re.IGNORECASE)
+# Observations on which a module is held against what was read of it: so many of each size, in standard deviations.
+_ROWS, _SIZES = 8, (1.0, 0.1, 10.0, 100.0)
+# Part of the largest output by which the two may differ, and how much they may in any case: sums in single precision.
+_SAME_PART, _SAME_REST = 1e-4, 1e-6
 # Modules that do nothing when a policy acts.
 _NOTHING = ("Identity", "Flatten", "Dropout", "FlattenExtractor")
 
@@ -87,10 +106,12 @@ def import_torch(
     """The controller of a policy that is a ``torch.nn.Sequential`` of linear layers, or that has one as its ``actor``.
 
     Of a module with a ``forward`` of its own, give the Sequential inside (``module.net``) where that is all it runs; else export it with
-    ``torch.onnx.export`` and read the file with :func:`import_onnx`.
+    ``torch.onnx.export`` and read the file with :func:`import_onnx`. A module with an ``actor`` is run on some observations (``act_inference``, else
+    ``forward``), and refused where that gives anything else than what was read.
 
     Args:
-        module: The live object. An ``actor_obs_normalizer`` of rsl_rl is read with it.
+        module: The live object. What normalises observations beside its ``actor`` is read with it: an ``EmpiricalNormalization`` of rsl_rl, or a
+            ``BatchNorm1d`` that does not learn.
         robot: URDF or MJCF file; or ``task``.
         recipe: As for :func:`import_onnx`.
         task: In place of robot and recipe, the task whose observation the policy sees: a bundled one or a TOML file.
@@ -98,19 +119,30 @@ def import_torch(
         mean: Of each observation entry; 0 if not given.
         std: Of each observation entry, with the normaliser's epsilon; 1 if not given.
         clip: Network inputs are cut to this many standard deviations.
-        output_clip: Outputs are cut to this range before scale and offset.
+        output_clip: Outputs are cut to this range before scale and offset; each end is one number, or one for each output.
         name: Of the task made of robot and recipe.
 
     Raises:
-        ValueError: a module that is no layer of a policy, by name; or a file.
+        ValueError: a module that is no layer of a policy, by name; one that does more than its layers; or a file.
     """
     if isinstance(module, str | os.PathLike) and _is_torchscript(module):
         raise ValueError(f"'{os.fspath(module)}' is a file of TorchScript, {_SCRIPT.format(f'torch.jit.load({os.fspath(module)!r})')}")
     _live(module, "import_torch", "torch.load")
+    if type(module).__name__ == "OptimizedModule" and hasattr(module, "actor"):
+        module = module._orig_mod  # as torch.compile wraps it
     network = [("actor", module.actor)] if hasattr(module, "actor") else [("", module)]
     _check_order(*network[0])
-    policy = _policy(_layers(network), *_normaliser(module, mean, std), clip, output_clip)
-    return _place(policy, robot, recipe, task, name, actions)
+    layers = _layers(network)
+    if not layers:
+        raise ValueError(_NO_LAYER)
+    n_in, n_out = np.shape(layers[0][0])[1], len(layers[-1][1])
+    bounds = _clip_of(clip), _range_of(output_clip, n_out)
+    moments = _moments(*(_normaliser(module, mean, std) if network[0][0] else (mean, std)), n_in)
+    # Who gives a normaliser or a clip may mean one that stands around the module, or the one in it.
+    normalisers = [moments, _moments(None, None, n_in)] if mean is not None or std is not None else [moments]
+    clips, ranges = dict.fromkeys((bounds[0], math.inf)), (bounds[1], (-math.inf, math.inf))
+    _check_run(module, moments, [_policy(layers, m, s, c, o) for m, s in normalisers for c in clips for o in ranges])
+    return _place(_policy(layers, *moments, *bounds), robot, recipe, task, name, actions)
 
 
 def import_sb3(
@@ -363,7 +395,7 @@ def _told(controller: Controller) -> Controller:
 
 def _policy(layers: list[_Layer], mean: Any, std: Any, clip: float, output_clip: tuple[Any, Any]) -> Policy:
     if not layers:
-        raise ValueError("the module has no linear layer; give the policy's network")
+        raise ValueError(_NO_LAYER)
     mean, std = _moments(mean, std, np.shape(layers[0][0])[1])
     return Policy.from_layers(layers, mean, std, (-clip, clip), output_clip)
 
@@ -377,12 +409,237 @@ def _moments(mean: Any, std: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
     return mean, std
 
 
+def _clip_of(clip: Any) -> float:
+    try:
+        number = math.nan if isinstance(clip, str | bytes | bool) else float(clip)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not number > 0:
+        raise ValueError(f"clip is {clip!r}; give a number above 0, the standard deviations that inputs are cut to, or leave it out")
+    return number
+
+
+def _range_of(output_clip: Any, n: int) -> tuple[Any, Any]:
+    """Both ends, each a number or an array (n)."""
+    give = f"give (low, high), each a number or one for each of the {n} outputs, and low not above high"
+    try:
+        low, high = (_numbers(end, "it") for end in output_clip)
+    except (TypeError, ValueError):
+        raise ValueError(f"output_clip is {output_clip!r}; {give}") from None
+    for i, end in enumerate((low, high)):
+        if end.shape not in ((), (n,)):
+            raise ValueError(f"output_clip[{i}] has shape {end.shape}; {give}")
+    for k, (a, b) in enumerate(zip(*np.broadcast_arrays(np.atleast_1d(low), np.atleast_1d(high)))):
+        if not (a <= b and a < math.inf and b > -math.inf):
+            raise ValueError(f"output_clip is ({a:g}, {b:g}) for output[{k}]; {give}")
+    return low if low.shape else float(low), high if high.shape else float(high)
+
+
+def _beside(module: Any) -> dict[str, Any]:
+    """What a module holds beside its actor, by name: parts, tensors and other objects, but no settings."""
+    held = dict(getattr(module, "__dict__", {}))
+    for table in ("_parameters", "_buffers", "_modules"):
+        held |= held.pop(table, None) or {}
+    held |= dict(getattr(module, "named_children", dict)())
+    return {
+        name: of
+        for name, of in held.items()
+        if of is not module.actor
+        and not (of is None or isinstance(of, bool | int | float | str | type) or type(of).__name__ == "Identity")
+        and not (isinstance(of, Mapping) and "mean" not in of)
+    }
+
+
 def _normaliser(module: Any, mean: Any, std: Any) -> tuple[Any, Any]:
-    """Of rsl_rl: ``(x - mean) / (std + eps)``."""
-    normaliser = getattr(module, "actor_obs_normalizer", None)
-    if mean is not None or std is not None or normaliser is None or not hasattr(normaliser, "_mean"):
+    """Mean and standard deviation of what normalises observations beside an actor; what is not read exactly is refused, unless they are given."""
+    if mean is not None or std is not None:
         return mean, std
-    return normaliser._mean, _numbers(normaliser._std, "actor_obs_normalizer._std") + float(normaliser.eps)
+    found = {name: of for name, of in _beside(module).items() if _is_normaliser(name, of)}
+    if not found:
+        return None, None
+    name, normaliser = next(iter(found.items()))
+    kind, ways = type(normaliser).__name__, f"give mean= and std= where it computes (observation - mean) / std; else {_EXPORT}"
+    said = f"module {type(module).__name__} has {name} ({kind}) beside its actor"
+    if len(found) > 1:
+        raise ValueError(f"{said}, and {', '.join(list(found)[1:])}, of which nobody knows which one is meant; {ways}")
+    _check_hooks(name, normaliser)
+    if all(hasattr(normaliser, of) for of in ("_mean", "_std", "eps")):  # of rsl_rl: (x - mean) / (std + eps)
+        moments = normaliser._mean, _numbers(normaliser._std, f"{name}._std") + float(normaliser.eps)
+    elif kind == "BatchNorm1d" and normaliser.running_mean is not None:
+        if normaliser.training:
+            raise ValueError(f"{said}, which takes mean and standard deviation from each batch while it learns; call module.eval() first")
+        moments = _of_batches(name, normaliser)
+    else:
+        raise ValueError(f"{said}, which is not read; {ways}")
+    mean, std = (_numbers(of, name).ravel() for of in moments)
+    forward = dict(_ways(normaliser)).get("forward")
+    if forward is not None and np.isfinite(mean).all() and np.all(std > 0):
+        try:
+            seen, given, _ = _ran(normaliser, forward, _observations(mean, std), mean.shape)
+            is_read = _same(given, (seen - mean) / std, max(_SAME_PART, _rounding(normaliser)))
+        except Exception:  # whatever the code of somebody else raises
+            is_read = False
+        if not is_read:
+            raise ValueError(f"{said}, which computes something else than (observation - mean) / (std + eps) and is not read; {ways}")
+    return mean, std
+
+
+def _is_normaliser(name: str, of: Any) -> bool:
+    return not _APART.search(name.replace("std", "")) and any(_NORMALISES.search(said) for said in (name, type(of).__name__))
+
+
+def _of_batches(name: str, norm: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Of ``weight (x - mean) / sqrt(var + eps) + bias``."""
+    mean, var = _finite(norm.running_mean, f"{name}.running_mean"), _finite(norm.running_var, f"{name}.running_var")
+    std = np.sqrt(var + float(norm.eps))
+    if norm.weight is None:
+        return mean, std
+    weight, bias = _finite(norm.weight, f"{name}.weight"), _finite(norm.bias, f"{name}.bias")
+    if not np.all(weight > 0):
+        at = int(np.flatnonzero(weight <= 0)[0])
+        raise ValueError(f"the module's tensor '{name}.weight' is {weight[at]:g} at [{at}], and a standard deviation is above 0; {_EXPORT}")
+    return mean - bias * std / weight, std / weight
+
+
+def _check_run(module: Any, moments: tuple[np.ndarray, np.ndarray], read: Sequence[Policy]) -> None:
+    """Holds what a module itself gives against what was ``read`` of it, of which the first is imported and the others lack what may stand around the module.
+    One that cannot be run may have nothing beside its actor that nobody knows."""
+    has_actor = hasattr(module, "actor")
+    kind, of = type(module).__name__, "module.actor" if has_actor else "its layers"
+    around = "give nearl.import_torch(module.actor), with mean=, std=, clip= and output_clip= for what stands around it"
+    give = f"where the actor is all of the policy, {around}; else {_EXPORT}" if has_actor else _EXPORT
+    for way, function in _ways(module):
+        try:
+            seen, given, again = _ran(module, function, _observations(*moments), (read[0].n_out,))
+        except NotImplementedError:
+            continue
+        except Exception as error:
+            said = " ".join(str(error).split()) or "no reason given"
+            raise ValueError(
+                f"module {kind} cannot be run on observations of {read[0].n_in} entries ({way}: {type(error).__name__}: {said[:200]}), so nobody knows "
+                f"whether it does more than {of}; {give}"
+            ) from None
+        if not np.array_equal(given, again, equal_nan=True):
+            why = f"{way}: it draws, or remembers"
+            raise ValueError(f"module {kind} gives two outputs for the same observation ({why}), so nobody can hold {of} against it; {give}")
+        part = max(_SAME_PART, _rounding(module))
+        wanted = None
+        for policy in read:
+            found = np.stack([policy(obs) for obs in seen])
+            wanted = found if wanted is None else wanted
+            if _same(given, found, part):
+                return
+        assert wanted is not None
+        row = next(rows for rows in _groups(len(given)) if not _same(given[rows], wanted[rows], part))
+        off = np.abs(given[row] - wanted[row])
+        i, k = np.unravel_index(np.argmax(np.where(np.isnan(off), np.inf, off)), off.shape)
+        raise ValueError(
+            f"module {kind} does more than {of}: its {way} gives {given[row][i, k]:.4g} as output[{k}] where the layers that are read give "
+            f"{wanted[row][i, k]:.4g}, off by {off[i, k]:.3g} on the same observation; {give}"
+        )
+    if has_actor:
+        _check_apart(module, give)
+
+
+def _check_apart(module: Any, give: str) -> None:
+    """Refuses parts and tensors beside an actor that may have a part in the action, where the module cannot be asked."""
+    for name, of in _beside(module).items():
+        is_part = any(hasattr(of, what) for what in ("named_children", "forward", "detach")) or isinstance(of, np.ndarray)
+        if is_part and not _APART.search(name) and not _is_normaliser(name, of):
+            said = f"module {type(module).__name__} has {name} ({type(of).__name__}) beside its actor"
+            raise ValueError(f"{said}, and no forward that tells whether the action depends on it; {give}")
+
+
+def _ways(module: Any) -> list[tuple[str, Callable[[Any], Any]]]:
+    """How a module may say which action it takes, those that sample none first."""
+    ways = [("act_inference", getattr(module, "act_inference", None)), ("forward", getattr(module, "forward", None))]
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(module, torch.nn.Module):
+        ways[1] = ("forward", module)  # with its hooks
+    return [(way, function) for way, function in ways if callable(function)]
+
+
+def _observations(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Seeded ones in single precision, of each size some."""
+    z = np.random.default_rng(0).normal(size=(len(_SIZES), _ROWS, len(mean)))
+    return np.asarray(mean + std * (np.array(_SIZES)[:, None, None] * z).reshape(-1, len(mean)), np.float32)
+
+
+def _groups(n: int) -> list[slice]:
+    """The rows of each size."""
+    return [slice(at, at + _ROWS) for at in range(0, n, _ROWS)]
+
+
+def _same(a: np.ndarray, b: np.ndarray, part: float) -> bool:
+    """Whether two outputs are the same but for rounding, in each group."""
+    return all(bool(np.all(np.abs(a[rows] - b[rows]) <= part * np.abs(b[rows]).max() + _SAME_REST)) for rows in _groups(len(a)))
+
+
+def _rounding(module: Any) -> float:
+    """Part of the outputs that a module in half precision loses; 0 in any other."""
+    return max((100.0 * 2.0**-10 if of.element_size() == 2 else 0.0 for of in getattr(module, "parameters", list)()), default=0.0)
+
+
+def _ran(module: Any, function: Callable[[Any], Any], obs: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What a function of a module saw (n x n_in), and what it gave twice (n x shape)."""
+    with _acting(module) as tensor:
+        groups = getattr(module, "obs_groups", None)
+        names = next((groups[name] for name in ("policy", "actor") if name in groups), None) if isinstance(groups, Mapping) else None
+        given = []
+        for _ in range(2):
+            asked = tensor(obs)  # anew, as it may be changed in its place
+            if isinstance(names, list | tuple) and names:  # rsl_rl joins the groups that its actor sees, of whatever size
+                ends = [*range(len(names)), obs.shape[1]]
+                asked = {name: asked[:, begin:end] for name, (begin, end) in zip(names, itertools.pairwise(ends))}
+            given.append(_output(function(asked)).reshape(len(obs), *shape))
+        return _numbers(tensor(obs), "the observation"), given[0], given[1]
+
+
+def _output(given: Any) -> np.ndarray:
+    """The action in what a module gives: the first of several things, the mean of a distribution."""
+    if isinstance(given, tuple | list):
+        given = given[0]
+    if not hasattr(given, "shape") and not callable(getattr(given, "mean", print)):
+        given = given.mean
+    return _numbers(given, "its output")
+
+
+@contextlib.contextmanager
+def _acting(module: Any) -> Iterator[Callable[[np.ndarray], Any]]:
+    """A module as it is when it acts (no dropout, no statistics, no gradients), left as it was; gives what makes its input of an array."""
+    torch = sys.modules.get("torch")
+    held_by = [module, *vars(module).values()] if hasattr(module, "__dict__") else [module]
+    modules = [of for of in held_by if torch is not None and isinstance(of, torch.nn.Module)]
+    if torch is None or not modules:
+        yield np.copy
+        return
+    parts = [(part, dict(vars(part)), dict(part._buffers)) for part in dict.fromkeys(part for of in modules for part in of.modules())]
+    tensors = [(of, of.detach().clone()) for part, _, _ in parts for of in (*part._parameters.values(), *part._buffers.values()) if of is not None]
+    like = next((of for of, _ in tensors if of.is_floating_point()), torch.zeros(1))
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        try:
+            for part, _, _ in parts:
+                part.training = False
+            yield lambda obs: torch.tensor(obs).to(device=like.device, dtype=like.dtype)
+        finally:
+            for part, held, buffers in parts:
+                for name in vars(part).keys() - held.keys():
+                    del vars(part)[name]
+                vars(part).update(held)
+                part._buffers.update(buffers)
+            for of, was in tensors:
+                if not torch.equal(of, was):
+                    of.copy_(was)
+
+
+def _check_hooks(name: str, module: Any) -> None:
+    for hooks in ("_forward_pre_hooks", "_forward_hooks"):
+        for hook in (getattr(module, hooks, None) or {}).values():
+            said = getattr(hook, "__name__", type(hook).__name__)
+            raise ValueError(
+                f"module {name or type(module).__name__} ({type(module).__name__}) has a hook at its forward ({said}), which is code and not read; remove it "
+                f"(handle.remove(), torch.nn.utils.remove_weight_norm), or {_EXPORT}"
+            )
 
 
 def _live(model: Any, name: str, loader: str) -> None:
@@ -419,10 +676,7 @@ def _check_order(name: str, module: Any) -> None:
             continue
         inner = [f"module.{at}.{of}".replace("..", ".") for of, child in parts if type(child).__name__ == "Sequential"]
         give = f"where that runs nothing but {' or '.join(inner)}, give nearl.import_torch this; else " if inner else ""
-        raise ValueError(
-            f"module {kind} runs its parts ({', '.join(of for of, _ in parts)}) in its own forward, which is code and not read; {give}export it, "
-            f"torch.onnx.export(module, (torch.zeros(1, n),), 'policy.onnx') with n inputs, and import that file (nearl.import_onnx, `nearl import`)"
-        )
+        raise ValueError(f"module {kind} runs its parts ({', '.join(of for of, _ in parts)}) in its own forward, which is code and not read; {give}{_EXPORT}")
 
 
 def _seen_by(policy: Any) -> list[tuple[str, Any]]:
@@ -477,6 +731,7 @@ def _clipped(layers: list[_Layer], low: float, high: float) -> list[_Layer]:
 def _flat(name: str, module: Any) -> Iterable[tuple[str, Any]]:
     """Parts in order, by the names that torch has for them. Only a Sequential says in which order its parts run."""
     kind = type(module).__name__
+    _check_hooks(name, module)
     if kind == "Sequential" or isinstance(module, list | tuple) or (kind == "MLP" and hasattr(module, "__iter__")):
         for i, part in enumerate(module):
             yield from _flat(f"{name}.{i}".lstrip("."), part)
@@ -496,6 +751,8 @@ def _finite(value: Any, name: str) -> np.ndarray:
 def _numbers(value: Any, name: str) -> np.ndarray:
     """A tensor of torch, or anything NumPy accepts, as an array."""
     for step in ("detach", "cpu", "numpy"):
+        if step == "numpy" and str(getattr(value, "dtype", "")) == "torch.bfloat16":
+            value = value.float()  # which NumPy has not
         if hasattr(value, step):
             value = getattr(value, step)()
     if np.iscomplexobj(value):

@@ -21,7 +21,7 @@ from typing import Any
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import names_of, whole
+from nearl.arguments import MOST_ENTRIES, check_numbers, names_of, whole
 
 
 class Plant:
@@ -59,9 +59,9 @@ class Plant:
         joints = names_of("joints", joints)
         if not joints or nu == 0:
             raise ValueError(f"a robot of {len(joints)} joints and {nu} entries of an action cannot be moved; give at least one of each")
-        nu = whole("nu", nu, 1, "give the number of entries of an action")
-        nq = None if nq is None else whole("nq", nq, 1, "give the number of entries of a configuration")
-        nv = None if nv is None else whole("nv", nv, 1, "give the number of entries of a velocity")
+        nu = whole("nu", nu, 1, "give the number of entries of an action", MOST_ENTRIES)
+        nq = None if nq is None else whole("nq", nq, 1, "give the number of entries of a configuration", MOST_ENTRIES)
+        nv = None if nv is None else whole("nv", nv, 1, "give the number of entries of a velocity", MOST_ENTRIES)
         self._plant = _core.Plant(name, joints, names_of("observation", observation), dt, nu, nq=nq, nv=nv, watchdog=watchdog, lockstep=lockstep)
 
     def exchange(
@@ -92,8 +92,14 @@ class Plant:
         Returns:
             ``("act", action)``, ``("hold", action)`` with the action of before as none came in time, or ``("brake", None)``: there is no loop, it
             is silent, or it leaves braking to the plant. Bring the robot to rest then.
+
+        Raises:
+            ValueError: there are more or fewer entries, or one is no number.
+            RuntimeError: the plant is closed.
         """
-        episode = whole("episode", episode, 0, "give its number, counted from 0", 2**64 - 1)
+        episode = whole("episode", episode, 0, "give its number, counted from 0 to 2**64 - 1", 2**64 - 1)
+        for name, value in (("q", q), ("v", v), ("obs", obs)):
+            check_numbers(name, value)
         return self._plant.exchange(q, v, obs, patience, time=time, episode=episode, begins=begins, braked=braked)
 
     @property
@@ -145,6 +151,10 @@ class Loop:
         proposal_hold: float | None = None,
         rollback_window: int | None = None,
     ) -> None:
+        if priority is not None:
+            priority = whole("priority", priority, -(2**31), "give 1 to 99, or 0 for the normal scheduler", 2**31 - 1)
+        if rollback_window is not None:
+            rollback_window = whole("rollback_window", rollback_window, -(2**63), "give 0 to 1000000 ticks", 2**63 - 1)
         self.report: dict[str, Any] | None = None
         self._refused: Exception | None = None
         self._thread = _core.LoopThread(

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
+from nearl.arguments import check_numbers, numbers
 
 Floats = NDArray[np.float64]
 
@@ -102,11 +103,16 @@ class Proposer:
         """Proposes a value for each of ``entries``, in their order or by name.
 
         Raises:
-            ValueError: values are missing, or there are others.
+            ValueError: values are missing, there are others, or one is no finite number.
             ConnectionError: the proposer is closed.
         """
         if isinstance(values, Mapping):
             values = _in_order(values, self.entries)
+        check_numbers("values", values, self.entries)
+        given = numbers("values", values)
+        if given.shape == (len(self.entries),) and not np.isfinite(given).all():
+            i = int(np.flatnonzero(~np.isfinite(given))[0])
+            raise ValueError(f"values[{i}] ('{self.entries[i]}') is {given[i]}; give a finite number, or propose nothing where there is none")
         self._client.propose(values)
 
     def account(self) -> Account:

@@ -53,8 +53,19 @@ def split(table: Mapping[str, Floats], of: NDArray[Any] | None, source: str) -> 
     return [{name: values[a:b] for name, values in table.items()} for a, b in pairwise(begins)]
 
 
-def unbraced(name: str) -> str:
+def text(name: Any, what: str, source: str) -> str:
+    """A name, also as the bytes that HDF5 gives."""
+    if not isinstance(name, bytes):
+        return str(name)
+    try:
+        return name.decode()
+    except UnicodeDecodeError:
+        raise BadDemonstrations(f"{source}: {what} has {bytes(name)!r}, which is no text in UTF-8; give names as text") from None
+
+
+def unbraced(name: str | bytes) -> str:
     """A name without the braces around it that expressions ask for: ``{q.left-hip}`` is ``q.left-hip``."""
+    name = text(name, "the name of a column", "the columns") if isinstance(name, bytes) else name
     return name[1:-1] if name.startswith("{") and name.endswith("}") and not {"{", "}"} & set(name[1:-1]) else name
 
 

@@ -48,6 +48,19 @@ def test_braces_around_the_name_of_a_column_are_no_part_of_it(tmp_path: Path) ->
         demos.from_columns("Hopper-v5", [columns | {"{q.leg_joint}": columns["q.leg_joint"]}], tmp_path / "twice.npz", dt=0.008)
 
 
+def test_names_of_columns_may_be_bytes(tmp_path: Path) -> None:
+    columns = episode()
+    files = [
+        demos.from_columns("Hopper-v5", [table], tmp_path / name, dt=0.008, actions=("a", "b", "c"))
+        for name, table in (("text.npz", columns), ("bytes.npz", {np.bytes_(name.encode()): of for name, of in columns.items()}))
+    ]
+    text, same = (checked(file) for file in files)
+    assert all(np.array_equal(text[name], same[name]) for name in text)
+    np.savez(tmp_path / "names.npz", **text | {"names": np.array([str(name).encode() for name in text["names"]])})
+    shown = pytest.importorskip("nearl.report.demonstrations").read_demonstrations(tmp_path / "names.npz")
+    assert shown.names == list(text["names"])
+
+
 def test_columns_become_states_bit_for_bit(tmp_path: Path) -> None:
     first, second = episode(), episode(20, 1)
     out = demos.from_columns("Hopper-v5", [first, second], tmp_path / "a.npz", dt=0.008, actions=("a", "b", "c"))
@@ -221,6 +234,14 @@ def test_motion_clips(tmp_path: Path) -> None:
     np.savez(file, fps=np.array([125]), joint_pos=positions, joint_names=np.array(joints))
     data = checked(demos.from_motion("Hopper-v5", file, tmp_path / "a.npz"))
     assert np.array_equal(data["qpos"], positions)
+    # as HDF5 gives names
+    np.savez(file, fps=np.array([125]), joint_pos=positions, joint_names=np.array([joint.encode() for joint in joints]))
+    with np.load(demos.from_motion("Hopper-v5", file, tmp_path / "bytes.npz")) as again:
+        assert all(np.array_equal(again[name], of) for name, of in data.items())
+    demos.from_motion("Hopper-v5", file, tmp_path / "given.npz", joints=[joint.encode() for joint in joints])
+    np.savez(file, fps=np.array([125]), joint_pos=positions, joint_names=np.array([b"\xff", *(joint.encode() for joint in joints[1:])]))
+    with pytest.raises(demos.BadDemonstrations, match=r"clip.npz': 'joint_names' has b'\\xff', which is no text in UTF-8; give names as text"):
+        demos.from_motion("Hopper-v5", file, tmp_path / "b.npz")
     np.savez(file, fps=np.array([125]), joint_vel=positions)
     with pytest.raises(demos.BadDemonstrations, match="clip.npz': no array 'joint_pos'; it has fps, joint_vel"):
         demos.from_motion("Hopper-v5", file, tmp_path / "b.npz")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -1002,6 +1003,231 @@ def test_torch_modules_are_read(tmp_path) -> None:
         nearl.import_torch(tmp_path / "own.pt", **files)
     torch.onnx.export(script, (torch.zeros(1, 14),), tmp_path / "own.onnx", dynamo=False)
     nearl.import_onnx(tmp_path / "own.onnx", **files)
+
+
+class Actor:
+    """A module with an actor, as libraries have them; ``act`` is what it does with one observation."""
+
+    def __init__(self, act=None, **parts) -> None:
+        self.actor, self.critic, self.std = Sequential([Linear(14, 9), Tanh(), Linear(9, 3)]), Sequential([Linear(14, 1)]), np.ones(3)
+        vars(self).update(parts)
+        if act is not None:
+            self.act_inference = lambda rows: np.stack([act(self, x) for x in rows])
+
+
+class EmpiricalNormalization:
+    """Of rsl_rl."""
+
+    eps = 1e-2
+
+    def __init__(self) -> None:
+        self._mean, self._std = RNG.normal(size=(1, 14)), 0.2 + RNG.random((1, 14))
+
+    def forward(self, x):
+        return (x - self._mean) / (self._std + self.eps)
+
+
+class BatchNorm1d:
+    eps, training = 1e-5, False
+
+    def __init__(self) -> None:
+        self.running_mean, self.running_var = RNG.normal(size=14), 0.2 + RNG.random(14)
+        self.weight, self.bias = 0.5 + RNG.random(14), RNG.normal(size=14)
+
+    def forward(self, x):
+        return self.weight * (x - self.running_mean) / np.sqrt(self.running_var + self.eps) + self.bias
+
+
+class Clamped(EmpiricalNormalization):
+    def forward(self, x):
+        return np.clip(super().forward(x), -2, 2)
+
+
+class Encoder:
+    def forward(self, x):
+        return 2 * x
+
+
+class Identity:
+    pass
+
+
+@pytest.mark.parametrize("norm", [EmpiricalNormalization, BatchNorm1d])
+@pytest.mark.parametrize("runs", [False, True])
+def test_what_normalises_beside_an_actor_is_read_exactly(tmp_path, norm, runs) -> None:
+    """Under whatever name, whether the module can be run or not."""
+    for name in ("actor_obs_normalizer", "obs_rms"):
+        normaliser = norm()
+        act = lambda m, x, n=normaliser: m.actor(n.forward(x).ravel())  # noqa: E731
+        module = Actor(act if runs else None, **{name: normaliser})
+        controller = nearl.import_torch(module, **planar(tmp_path))
+        controller.save(tmp_path / "p.safetensors")
+        subprocess.run([NEARL, "export", tmp_path / "p.safetensors", "--out", tmp_path / "p.onnx"], check=True)
+        session = onnxruntime.InferenceSession(tmp_path / "p.onnx")
+        for _ in range(20):
+            obs = 2 * RNG.normal(size=14)
+            (found,) = session.run(None, {"obs": f32(obs)[None]})
+            np.testing.assert_allclose(found[0], module.actor(normaliser.forward(obs).ravel()), rtol=1e-5, atol=2e-5)
+
+
+def test_a_normaliser_that_is_not_known_is_refused_by_its_class(tmp_path) -> None:
+    """It had been left out without a word."""
+    files, learning = planar(tmp_path), BatchNorm1d()
+    learning.training = True
+    negative = BatchNorm1d()
+    negative.weight[3] = -0.5
+    for parts, said in (
+        ({"actor_obs_normalizer": LayerNorm()}, r"module Actor has actor_obs_normalizer \(LayerNorm\) beside its actor, which is not read; give mean="),
+        ({"obs_rms": SimpleNamespace(mean=np.zeros(14))}, r"obs_rms \(SimpleNamespace\) beside its actor, which is not read; give mean= and std="),
+        ({"obs_mean": np.zeros(14)}, r"obs_mean \(ndarray\) beside its actor, which is not read"),
+        ({"pre": LayerNorm()}, r"pre \(LayerNorm\) beside its actor, which is not read"),
+        ({"normalizer": Clamped()}, r"normalizer \(Clamped\) .* computes something else than \(observation - mean\) / \(std \+ eps\) and is not read; give"),
+        ({"obs_normalizer": EmpiricalNormalization(), "norm": BatchNorm1d()}, r"\(EmpiricalNormalization\) beside its actor, and norm, of which nobody"),
+        ({"obs_norm": learning}, r"obs_norm \(BatchNorm1d\) .* from each batch while it learns; call module.eval\(\) first"),
+        ({"obs_norm": negative}, r"tensor 'obs_norm.weight' is -0.5 at \[3\], and a standard deviation is above 0; export it"),
+        ({"encoder": Encoder()}, r"encoder \(Encoder\) beside its actor, and no forward that tells whether the action depends on it; where the actor is all"),
+        ({"shift": np.ones(14)}, r"shift \(ndarray\) beside its actor, and no forward"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            nearl.import_torch(Actor(**parts), **files)
+    for parts in ({"obs_normalizer": Identity()}, {"critic_obs_normalizer": LayerNorm()}, {"value_norm": LayerNorm()}, {"obs_norm": None, "normalize": True}):
+        nearl.import_torch(Actor(**parts), **files)
+    nearl.import_torch(Actor(obs_rms=LayerNorm()), **files, mean=np.zeros(14))
+
+
+def test_a_module_that_does_more_than_its_actor_is_refused(tmp_path) -> None:
+    """By as much as its own output differs; what is given beside it may be in it or around it."""
+    files, mean, std = planar(tmp_path), RNG.normal(size=14), 0.5 + RNG.random(14)
+    normed = lambda m, x: m.actor(np.clip((x - mean) / std, -1, 1))  # noqa: E731
+    for act in (
+        lambda m, x: 0.1 * np.tanh(m.actor(x)),
+        lambda m, x: 1.001 * m.actor(x),
+        lambda m, x: m.actor(x - mean),
+        lambda m, x: np.clip(m.actor(x), -3, 3),
+        lambda m, x: m.actor(np.subtract(x, mean, out=x)),
+        normed,
+    ):
+        module = Actor(act)
+        with pytest.raises(ValueError, match=r"module Actor does more than module.actor: its act_inference gives .*; where the actor is all") as told:
+            nearl.import_torch(module, **files)
+        words = re.search(r"gives (\S+) as output\[(\d)\] where the layers that are read give (\S+), off by (\S+) on", str(told.value))
+        theirs, _, ours, off = map(float, words.groups())
+        assert abs(theirs - ours) == pytest.approx(off, abs=2e-3 * abs(ours)) and off > 0
+    for act, given in (
+        (lambda m, x: m.actor(x), {}),
+        (lambda m, x: m.actor(x), {"mean": mean, "std": std, "clip": 2.0, "output_clip": (-1, np.ones(3))}),
+        (lambda m, x: m.actor((x - mean) / std), {"mean": mean, "std": std, "output_clip": (-1, 1)}),
+        (normed, {"mean": mean, "std": std, "clip": 1.0}),
+        (lambda m, x: np.clip(m.actor(x), -3, 3), {"output_clip": (-3, 3)}),
+    ):
+        nearl.import_torch(Actor(act, encoder=Encoder()), **files, **given)  # of which the output says that it has no part in it
+    with pytest.raises(ValueError, match="does more than module.actor"):
+        nearl.import_torch(Actor(normed), **files, mean=mean, std=std, clip=0.5)
+    with pytest.raises(ValueError, match=r"two outputs for the same observation \(act_inference: it draws, or remembers\), so nobody can hold module.actor"):
+        nearl.import_torch(Actor(lambda m, x: m.actor(x) + RNG.normal(size=3)), **files)
+    with pytest.raises(ValueError, match=r"cannot be run on observations of 14 entries \(act_inference: KeyError: 'x'\), so nobody knows .*\(module.actor\)"):
+        nearl.import_torch(Actor(lambda m, x: {}["x"]), **files)
+
+    def none(_):
+        raise NotImplementedError
+
+    nearl.import_torch(Actor(act_inference=none), **files)
+    grouped = Actor(obs_groups={"policy": ["a", "b"]})
+    grouped.act_inference = lambda groups: np.stack([grouped.actor(x) for x in np.hstack([groups["a"], groups["b"]])])
+    nearl.import_torch(grouped, **files)
+
+
+@pytest.mark.parametrize("hooks", ["_forward_hooks", "_forward_pre_hooks"])
+def test_hooks_are_refused(tmp_path, hooks) -> None:
+    files, net = planar(tmp_path), Sequential([Linear(14, 9), Tanh(), Linear(9, 3)])
+
+    def doubled(*_):
+        pass
+
+    setattr(net[1], hooks, {0: doubled})
+    for module, name in ((net, "1"), (Actor(actor=net), "actor.1")):
+        with pytest.raises(ValueError, match=rf"module {name} \(Tanh\) has a hook at its forward \(doubled\), which is code and not read; remove it"):
+            nearl.import_torch(module, **files)
+    normaliser = EmpiricalNormalization()
+    setattr(normaliser, hooks, {0: doubled})
+    with pytest.raises(ValueError, match=r"module obs_norm \(EmpiricalNormalization\) has a hook"):
+        nearl.import_torch(Actor(obs_norm=normaliser), **files)
+
+
+def test_clips_that_are_none_are_named(tmp_path) -> None:
+    files, net = planar(tmp_path), Sequential([Linear(14, 3)])
+    for clip in (0, -1, np.nan, "x", None, True, [1, 2], 10**400):
+        with pytest.raises(ValueError, match=r"clip is .*; give a number above 0, the standard deviations that inputs are cut to, or leave it out"):
+            nearl.import_torch(net, **files, clip=clip)
+    give = r"; give \(low, high\), each a number or one for each of the 3 outputs, and low not above high"
+    for clip, said in (
+        ((1, -1), r"output_clip is \(1, -1\) for output\[0\]"),
+        ((np.nan, 1), r"output_clip is \(nan, 1\) for output\[0\]"),
+        (([0, 0, 2], 1), r"output_clip is \(2, 1\) for output\[2\]"),
+        ((0, [1, 1]), r"output_clip\[1\] has shape \(2,\)"),
+        (("a", "b"), r"output_clip is \('a', 'b'\)"),
+        ("ab", "output_clip is 'ab'"),
+        (1.0, "output_clip is 1.0"),
+        ((np.inf, np.inf), r"output_clip is \(inf, inf\) for output\[0\]"),
+    ):
+        with pytest.raises(ValueError, match=said + give):
+            nearl.import_torch(net, **files, output_clip=clip)
+
+
+def test_modules_of_torch_are_held_against_themselves_and_left_as_they_were(tmp_path) -> None:
+    torch = pytest.importorskip("torch")
+    nn, files = torch.nn, planar(tmp_path)
+
+    class ActorCritic(nn.Module):
+        def __init__(self, norm=None, factor=1.0) -> None:
+            super().__init__()
+            self.actor = nn.Sequential(nn.Linear(14, 9), nn.Dropout(0.5), nn.ELU(), nn.Linear(9, 3))
+            self.log_std, self.factor, self.norm = nn.Parameter(torch.zeros(3)), factor, norm or nn.Identity()
+
+        def forward(self, x):
+            return self.factor * self.actor(self.norm(x))
+
+    class Running(nn.Module):
+        """A normaliser of rsl_rl that learns whenever it is called in training."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.eps = 1e-2
+            self.register_buffer("_mean", torch.randn(1, 14))
+            self.register_buffer("_std", 0.5 + torch.rand(1, 14))
+
+        def forward(self, x):
+            if self.training:
+                self._mean += 1.0
+            return (x - self._mean) / (self._std + self.eps)
+
+    batch = nn.BatchNorm1d(14).eval()
+    batch.running_mean += torch.randn(14)
+    nn.init.uniform_(batch.weight, 0.5, 2.0)
+    for norm in (None, Running(), batch):
+        module = ActorCritic(norm)
+        if norm is batch:
+            module.eval()
+        kept = ([part.training for part in module.modules()], {name: of.clone() for name, of in module.state_dict().items()}, torch.get_rng_state())
+        nearl.import_torch(module, **files).save(tmp_path / "p.safetensors")
+        assert [part.training for part in module.modules()] == kept[0] and torch.equal(torch.get_rng_state(), kept[2])
+        assert all(torch.equal(of, kept[1][name]) for name, of in module.state_dict().items())
+        subprocess.run([NEARL, "export", tmp_path / "p.safetensors", "--out", tmp_path / "p.onnx"], check=True)
+        session, obs = onnxruntime.InferenceSession(tmp_path / "p.onnx"), 2 * torch.randn(1, 14)
+        with torch.no_grad():
+            np.testing.assert_allclose(session.run(None, {"obs": obs.numpy()})[0], module.eval()(obs).numpy(), rtol=1e-5, atol=2e-5)
+    for norm, factor, said in ((None, 0.9, "does more than module.actor"), (nn.LayerNorm(14), 1.0, r"norm \(LayerNorm\) beside its actor, which is not read")):
+        with pytest.raises(ValueError, match=said):
+            nearl.import_torch(ActorCritic(norm, factor), **files)
+
+    class Linear(nn.Linear):
+        def forward(self, x):
+            return 2 * super().forward(x)
+
+    with pytest.raises(ValueError, match="module Sequential does more than its layers: its forward gives"):
+        nearl.import_torch(nn.Sequential(Linear(14, 3)), **files)
+    with pytest.raises(ValueError, match=r"module 0 \(Linear\) has a hook at its forward \(WeightNorm\)"):
+        nearl.import_torch(nn.Sequential(nn.utils.weight_norm(nn.Linear(14, 3))), **files)
 
 
 def one_joint(tmp_path, actuator: str, recipe: str, hanging: str = "") -> nearl.Controller:

@@ -100,12 +100,28 @@ def test_names_and_numbers_of_a_plant_are_named() -> None:
         ({"observation": ["q.slide", "v\n"]}, ValueError, r"names entry of its observation 1 `v\\n`, which is empty"),
         ({"nq": 0}, ValueError, "nq is 0; give the number of entries of a configuration"),
         ({"nu": -1}, ValueError, "nu is -1; give the number of entries of an action"),
+        ({"nu": 10**30}, ValueError, f"nu is {10**30}; give the number of entries of an action"),
+        ({"nq": 10**30}, ValueError, f"nq is {10**30}; give the number of entries of a configuration"),
+        ({"nv": 10**30}, ValueError, f"nv is {10**30}; give the number of entries of a velocity"),
         ({"nu": 0}, ValueError, "a robot of 1 joints and 0 entries of an action cannot be moved"),
     ):
         with pytest.raises(error, match=said):
             nearl.Plant(name("named"), **{**right, **wrong})
-    with open_plant("named", lockstep=False) as plant, pytest.raises(ValueError, match="episode is -3; give its number, counted from 0"):
-        plant.exchange([0.1], [0.0], [0.1, 0.0], patience=0.0, episode=-3)
+    with open_plant("named", lockstep=False) as plant:
+        for episode in (-3, 2**64):
+            with pytest.raises(ValueError, match=rf"episode is {episode}; give its number, counted from 0 to 2\*\*64 - 1"):
+                plant.exchange([0.1], [0.0], [0.1, 0.0], patience=0.0, episode=episode)
+        for state, said in (
+            ((["a"], [0.0], [0.1, 0.0]), r"q\[0\] is 'a'; give a number"),
+            (([0.1], [None], [0.1, 0.0]), r"v\[0\] is None; give a number"),
+            (([0.1], [0.0], [0.1, "b"]), r"obs\[1\] is 'b'; give a number"),
+        ):
+            with pytest.raises(ValueError, match=said):
+                plant.exchange(*state, patience=0.0)
+        assert plant.exchange([0.1], (0.0,), np.zeros(2), patience=0.0)[0] == "brake"
+    for key, value in (("priority", 10**30), ("rollback_window", 10**30)):
+        with pytest.raises(ValueError, match=f"{key} is {value}; give"):
+            nearl.Loop("none.safetensors", name("named"), **{key: value})
 
 
 def test_a_plant_whose_time_stands_still_does_not_spin() -> None:

@@ -108,6 +108,15 @@ def test_the_robot_goes_where_it_is_told_by_name(tmp_path: Path) -> None:
                 proposer.propose({"q.slide": 0.1})
             with pytest.raises(ValueError, match="'elbow' is not asked for"):
                 proposer.propose({"q.slide": 0.1, "v.slide": 0.0, "elbow": 1.0})
+            for wrong, said in (
+                ([0.1, float("nan")], r"values\[1\] \('v.slide'\) is nan; give a finite number, or propose nothing where there is none"),
+                ({"v.slide": 0.0, "q.slide": float("-inf")}, r"values\[0\] \('q.slide'\) is -inf; give a finite number"),
+                (["a", 0.0], r"values\[0\] \('q.slide'\) is 'a'; give a number"),
+                ({"q.slide": 0.1, "v.slide": None}, r"values\[1\] \('v.slide'\) is None; give a number"),
+                ([0.1], r"values has shape \(1,\), expected \(2,\)"),
+            ):
+                with pytest.raises(ValueError, match=said):
+                    proposer.propose(wrong)
             with pytest.raises(ConnectionError, match="already has a proposer"):
                 nearl.Proposer(name("told"), patience=0.1)
             state = proposer.state()

@@ -196,6 +196,60 @@ def test_a_log_of_a_loop_that_was_killed_is_read_to_its_end(chunks, tmp_path) ->
     assert not read_log(path).without_end and "without its end" not in text_of(report.build(tmp_path / "r.html", logs=[path]))
 
 
+@pytest.mark.parametrize("end", ["cut", "added to"])
+def test_a_log_that_is_cut_or_added_to_at_its_very_end_says_so(chunks, tmp_path, end) -> None:
+    """All ticks are there, so that nothing else shows it; docs/FLIGHT_LOG.md promises a warning."""
+    path, ticks, _ = chunks
+    log, file = path.read_bytes(), tmp_path / "end.mcap"
+    for content in {"cut": (log[:-3], log[:-8] + b"\x89MCAP1\r\n", log[:-100]), "added to": (log + b"junk", log + b"\n", log + log)}[end]:
+        file.write_bytes(content)
+        with pytest.warns(UserWarning, match=f"end.mcap' is {end} at its end, behind its {len(ticks)} ticks: "):
+            found = read_log(file)
+        assert found.off_end == end and not found.without_end and len(found) == len(ticks)
+    done = subprocess.run([sys.executable, "-m", "nearl.report", "--log", str(file), "--out", str(tmp_path / "r.html")], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(f"nearl report: '{file}' is {end} at its end, behind its {len(ticks)} ticks: "), done.stderr
+    page = text_of(tmp_path / "r.html")
+    assert f"end.mcap: {len(ticks)} ticks of 1 ms, {end} at its end." in page and f"The end of this log, behind its ticks, is {end}: " in page
+
+
+def test_numbers_that_nobody_can_draw_are_left_out_and_counted(tmp_path) -> None:
+    """Too large for matplotlib, or for any float; all others are drawn, and the shares are those of the whole log."""
+    whole = synthetic.flight_log(tmp_path / "whole.mcap", 300, {"dt": "0.001"}, rows=True)
+    changed, planted = tmp_path / "changed.mcap", 0
+    with open(whole, "rb") as source, open(changed, "wb") as file:
+        reader, writer = make_reader(source), Writer(file)
+        writer.start()
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        channel = writer.register_channel("tick", "json", writer.register_schema("nearl.Tick", "jsonschema", b"{}"))
+        for n, (_, _, message) in enumerate(reader.iter_messages(topics=["tick"])):
+            tick = json.loads(message.data)
+            if n == 100:
+                tick["target_q"][0], tick["target_v"][6], tick["end_ns"], tick["ledger"]["moved"] = 1e308, -1e308, 1e308, 1e308
+                tick["state"]["q"][2], tick["proposal_q"][1], tick["due_ns"], tick["ledger"]["rung"] = 1e300, -(10**400), 10**30, 1e15
+                tick["ledger"]["active_rows"] = [{"row": 0, "kind": "velocity", "side": "upper", "multiplier": 1e308}]
+                planted += 9
+            if n > 200:
+                tick["state"]["v"] = [1e308] * 7
+                planted += 7
+            writer.add_message(channel, message.log_time, json.dumps(tick).encode(), message.publish_time, n)
+        writer.finish()
+    done = subprocess.run([sys.executable, "-m", "nearl.report", "--log", str(changed), "--out", str(tmp_path / "r.html")], capture_output=True, text=True)
+    said = f"has {planted} numbers beyond 1e+20, which are left out of pictures and tables; `nearl verify` tells in which tick"
+    assert done.returncode == 0 and done.stderr == f"nearl report: '{changed}' {said}\n", done.stderr
+    page, all_of_it = (tmp_path / "r.html").read_text(), report.build(tmp_path / "w.html", logs=[whole]).read_text()
+    assert f"This log {said}." in text_of(tmp_path / "r.html") and page.count("data:image/png") == all_of_it.count("data:image/png") == 5
+    numbers = [re.findall(r"<strong[^>]*>(.*?)</strong>", of)[:2] for of in (page, all_of_it)]
+    assert numbers[0] == numbers[1]
+    with pytest.warns(UserWarning, match="beyond"):
+        log = read_log(changed)
+    kept, own = read_log(whole), [i for i in range(201) if i != 100]
+    assert np.array_equal(log.target_q[own], kept.target_q[own], equal_nan=True) and np.array_equal(log.v[:201], kept.v[:201])
+    assert np.array_equal(np.flatnonzero(np.isnan(log.target_q[100])), [0]) and np.isnan(log.v[201:]).all()
+    assert np.allclose(log.time, kept.time), "a time that is left out lies between those beside it"
+
+
 def test_a_log_with_a_flipped_bit_is_refused_in_a_sentence(chunks, tmp_path) -> None:
     path, _, ends = chunks
     for place in (ends[0] - 40, ends[1] - 200, ends[2] - 1000):

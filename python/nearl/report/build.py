@@ -11,7 +11,7 @@ import numpy as np
 from nearl._core import __version__
 from nearl.report import demonstrations, flight, sweep, training
 from nearl.report.promise import promise
-from nearl.report.read import WITHOUT_END, Log, ReadError, Run, Summary, read_json, read_log, read_run
+from nearl.report.read import OFF_END, WITHOUT_END, Log, ReadError, Run, Summary, beyond, read_json, read_log, read_run
 from nearl.report.style import image
 
 Paths = Iterable[str | Path]
@@ -143,7 +143,8 @@ def _about(runs: list[Run], logs: list[Log]) -> str:
         names = sorted({f"{r.task} with {r.algo}" for r in runs})
         parts.append(f"{len(runs)} training{'s' if len(runs) > 1 else ''}: {', '.join(names)}.")
     for log in logs:
-        parts.append(f"{log.path.name}: {len(log)} ticks of {1e3 * log.dt:g} ms{', without its end' * log.without_end}.")
+        end = ", without its end" if log.without_end else f", {log.off_end} at its end" if log.off_end else ""
+        parts.append(f"{log.path.name}: {len(log)} ticks of {1e3 * log.dt:g} ms{end}.")
     return " ".join(parts) + f" nearl {__version__}."
 
 
@@ -202,7 +203,7 @@ def _log_row(log: Log) -> list[str]:
     c = log.columns
     us = [f"{p:.1f}" for p in flight.percentiles((c["end_ns"] - c["begin_ns"]) * 1e-3)]
     wake = [f"{p:.1f}" for p in flight.percentiles((c["begin_ns"] - c["due_ns"]) * 1e-3)[:2]]
-    return [log.path.stem, f"{len(log):,}", *us, *wake, _count(np.nanmax(c["overruns"])), "–"]
+    return [log.path.stem, f"{len(log):,}", *us, *wake, _count(np.nanmax(c["overruns"], initial=0.0)), "–"]
 
 
 def _broken_row(name: str, s: dict[str, Any]) -> list[str]:
@@ -247,10 +248,14 @@ def _flights(logs: list[Log]) -> list[tuple[str, str]]:
     sections = []
     for log in logs:
         picture, sentence = flight.timeline(log)
-        parts = [picture or f'<p class="lead">{html.escape(sentence)}</p>', flight.states(log) or "", flight.ledger(log), flight.latency(log)]
+        parts = [picture or f'<p class="lead">{html.escape(sentence)}</p>', flight.states(log) or "", flight.ledger(log), flight.latency(log) or ""]
         modes = {mode: log.mode.count(mode) for mode in sorted(set(log.mode))}
         words = ", ".join(f"{n:,} {mode}" for mode, n in modes.items())
         lead = f'<p class="lead">The end of this log is missing: {html.escape(WITHOUT_END)}.</p>' if log.without_end else ""
+        if log.off_end:
+            lead = f'<p class="lead">The end of this log, behind its ticks, is {log.off_end}: {html.escape(OFF_END[log.off_end])}.</p>'
+        if log.left_out:
+            lead += f'<p class="lead">This log {html.escape(beyond(log))}.</p>'
         lead += f'<p class="lead">Ticks by mode: {html.escape(words)}.</p>{_commands(log)}'
         sections.append((f"Flight {log.path.name}", lead + "".join(parts) + _settings(log)))
     return sections

@@ -12,6 +12,7 @@ from nearl import _core
 from nearl.report.read import ReadError, regular
 from nearl.report.style import MUTED, PROJECTED, image, strip
 from nearl.runs import demonstrations_of
+from nearl.sources import text
 
 Floats = NDArray[np.float64]
 COLUMNS_AT_MOST = 6
@@ -58,7 +59,7 @@ def read_demonstrations(path: Path, task: str | None = None) -> Demonstrations:
             if missing:
                 raise ReadError(f"'{path}' has no array '{missing[0]}'; give a file written by 'nearl demos record'")
             observations, qpos, qvel = (np.asarray(data[name], float) for name in NEEDED[:3])
-            lengths, names = data["lengths"].astype(int), [str(n) for n in data["names"]]
+            lengths, names = data["lengths"].astype(int), [text(n, "'names'", f"'{path}'") for n in data["names"]]
             found = Demonstrations(path, task, observations, qpos, qvel, lengths, float(data["dt"]), names, "actions" in data.files)
     except (zipfile.BadZipFile, ValueError, EOFError) as error:
         if isinstance(error, ReadError):

@@ -24,6 +24,8 @@ def timeline(log: Log) -> tuple[str | None, str]:
     if not rows.names:
         return None, "No constraint was active in any tick."
     share = np.isfinite(rows.multiplier).mean(axis=1)
+    if not share.any():
+        return None, "Of no active constraint the multiplier can be drawn."
     busy = np.sort(np.argsort(-share, kind="stable")[:ROWS_AT_MOST])
     names, values = [rows.names[i] for i in busy], _binned(rows.multiplier[busy])
     edges = np.linspace(0, max(log.time[-1], log.dt), values.shape[1] + 1)
@@ -97,9 +99,9 @@ def _three(axes: plt.Axes, time: Floats, dt: float, proposed: Floats, projected:
     axes.plot(time + dt, proposed, color=PROPOSED, linewidth=1.0, alpha=0.85, label="proposed")
     axes.plot(time + dt, projected, color=PROJECTED, linewidth=2.6, alpha=0.55, label="projected")
     axes.plot(time, reached, color=REACHED, linewidth=1.0, linestyle=(0, (3, 1.5)), label="reached")
-    kept = np.concatenate([projected, reached])
-    low, high = np.nanmin(kept), np.nanmax(kept)
-    wide_low, wide_high = np.nanpercentile(proposed, [1, 99])
+    kept, asked = (values[np.isfinite(values)] for values in (np.concatenate([projected, reached]), proposed))
+    low, high = (kept.min(), kept.max()) if len(kept) else (0.0, 0.0)
+    wide_low, wide_high = np.percentile(asked, [1, 99]) if len(asked) else (low, high)
     room = max(high - low, 0.3 * max(abs(low), abs(high)), 1e-3)
     axes.set_ylim(max(min(low, wide_low), low - room) - 0.08 * room, min(max(high, wide_high), high + room) + 0.08 * room)
     axes.margins(x=0)
@@ -116,7 +118,7 @@ def _joints(log: Log, at_most: int) -> NDArray[np.intp]:
     """The busiest joints in their order; those that move where none was projected."""
     distance = _moved(log).mean(axis=0)
     if not distance.any():
-        distance = np.nan_to_num(np.nanstd(log.v, axis=0))
+        distance = np.nan_to_num(log.v).std(axis=0)
     return np.sort(np.argsort(-distance, kind="stable")[:at_most])
 
 
@@ -175,20 +177,22 @@ def ledger(log: Log) -> str:
     return image(figure, caption)
 
 
-def latency(log: Log) -> str:
+def latency(log: Log) -> str | None:
     """Histograms of compute time and of due-to-action time with the deadline."""
     c = log.columns
     compute, total = (c["end_ns"] - c["begin_ns"]) * 1e-3, (c["end_ns"] - c["due_ns"]) * 1e-3
     deadline = log.dt * 1e6
     series = (("controller", compute, PROJECTED), ("from due to action", total, MUTED))
     values = np.concatenate([x[np.isfinite(x) & (x > 0)] for _, x, _ in series])
+    if not len(values):
+        return None
     low, high = max(values.min() * 0.8, 0.1), max(values.max(), deadline) * 1.4
     bins = np.geomspace(low, high, 90)
     figure, axes = plt.subplots(figsize=(10.2, 3.2))
     for name, x, colour in series:
-        p50, p99 = np.nanpercentile(x, [50, 99])
-        label = f"{name}: p50 {p50:.1f}, p99 {p99:.1f}, max {np.nanmax(x):.1f} µs"
-        axes.hist(x, bins=bins, color=colour, alpha=0.6, label=label)
+        p50, p99, _, most = (f"{us:.1f}" if us < 1e9 else f"{us:.3g}" for us in percentiles(x))
+        label = f"{name}: p50 {p50}, p99 {p99}, max {most} µs"
+        axes.hist(x[np.isfinite(x)], bins=bins, color=colour, alpha=0.6, label=label)
     axes.axvline(deadline, color=DEADLINE, linewidth=1.5)
     place = {"xycoords": ("data", "axes fraction"), "xytext": (-5, -4), "textcoords": "offset points", "ha": "right", "va": "top"}
     axes.annotate(f"deadline {deadline:g} µs", (deadline, 1), color=DEADLINE, **place)

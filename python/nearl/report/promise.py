@@ -38,8 +38,7 @@ def _of_evaluations(programs: list[Summary]) -> Shares:
 
 def _of_flights(flights: list[Log]) -> Shares:
     for log in flights:
-        acted = np.isfinite(log.target_v).all(axis=1) if log.target_v.size else np.zeros(len(log), bool)
-        acted &= np.isin(np.char.lower(log.mode), ("active", "degraded"))  # a brake of the loop's own is no proposal of the policy
+        acted = log.acted & np.isin(np.char.lower(log.mode), ("active", "degraded"))  # a brake of the loop's own is no proposal of the policy
         if acted.any():
             return {kind: float(np.mean(log.columns[f"{kind}_violations"][acted] > 0)) for kind in ("raw", "target")}, f" in {log.path.name}"
     return {}, ""

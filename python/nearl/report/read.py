@@ -18,7 +18,13 @@ from nearl import _core
 from nearl.runs import ReadError, Run, json_of, read_run
 
 Floats = NDArray[np.float64]
+LARGEST = 1e20  # of numbers that are drawn: no robot has a larger one, and matplotlib computes none that are much larger
+MOST_STAGES = 1e6  # of the projection, whose numbers are small
 WITHOUT_END = "the loop was killed, or the copy was cut short, and what came after is not in the file; `nearl verify` tells what of it holds"
+OFF_END = {
+    "cut": "the copy was cut short, or its end was damaged; `nearl verify` tells what of it holds",
+    "added to": "something stands behind its end, as a second log, which is not in this report; give the copy that was not added to",
+}
 __all__ = ["Log", "ReadError", "Run", "Summary", "read_json", "read_log", "read_run"]
 
 
@@ -38,6 +44,9 @@ class Log:
     mode: list[str]
     active: list[list[dict[str, Any]]] = field(default_factory=list)
     without_end: bool = False  # the loop was killed, or a copy was cut short
+    off_end: str = ""  # its end, behind all ticks, is "cut" or "added to"
+    acted: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))  # ticks with a target, drawn or not
+    left_out: int = 0  # numbers beyond `LARGEST`, which are NaN in all of the above
 
     def __len__(self) -> int:
         return len(self.mode)
@@ -98,7 +107,7 @@ _NUMBERS = {
 
 def read_log(path: Path) -> Log:
     """A flight log (MCAP, topic ``tick``, JSON messages); of one without its end the ticks that are there, with a warning."""
-    metadata, messages, without_end = _content(path)
+    metadata, messages, without_end, off_end = _content(path)
     try:
         ticks, swapped = ([json.loads(data, parse_constant=_no_number) for data in messages.get(topic, [])] for topic in ("tick", "snapshot"))
     except (ValueError, RecursionError) as error:
@@ -108,16 +117,31 @@ def read_log(path: Path) -> Log:
         raise ReadError(f"'{path}' holds no ticks; {why}")
     if without_end:
         warnings.warn(f"'{path}' is without its end, and {len(ticks):,} ticks of it are reported: {WITHOUT_END}", stacklevel=2)
+    if off_end:
+        warnings.warn(f"'{path}' is {off_end} at its end, behind its {len(ticks):,} ticks: {OFF_END[off_end]}", stacklevel=2)
     try:
-        return _log(path, metadata, ticks, swapped, without_end)
-    except (ValueError, TypeError, AttributeError, KeyError) as error:
+        log = _log(path, metadata, ticks, swapped)
+    except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
         raise ReadError(_damaged(path, error)) from error
+    log.without_end, log.off_end = without_end, off_end
+    if log.left_out:
+        warnings.warn(f"'{path}' {beyond(log)}", stacklevel=2)
+    return log
 
 
-def _log(path: Path, metadata: dict[str, str], ticks: list[dict[str, Any]], swapped: list[dict[str, Any]], without_end: bool) -> Log:
+def beyond(log: Log) -> str:
+    """What is said of a log with numbers that nobody can draw."""
+    n = log.left_out
+    return (
+        f"has {n:,} number{'s' if n > 1 else ''} beyond {LARGEST:g}, which {'are' if n > 1 else 'is'} left out of pictures and tables; "
+        f"`nearl verify` tells in which tick"
+    )
+
+
+def _log(path: Path, metadata: dict[str, str], ticks: list[dict[str, Any]], swapped: list[dict[str, Any]]) -> Log:
     """The log of these ticks; what another program than `nearl run` could not have written is some error of Python."""
     rows = json.loads(metadata.get("rows", "[]"))
-    if "dt" in metadata and not float(metadata["dt"]) > 0.0:
+    if "dt" in metadata and not 0.0 < float(metadata["dt"]) < LARGEST:
         raise ValueError(f"a control period of {metadata['dt']} s")
     lacks = next((i for i, tick in enumerate(ticks) if not {"tick", "mode", "state", "ledger"} <= tick.keys()), None)
     if lacks is not None:
@@ -125,19 +149,73 @@ def _log(path: Path, metadata: dict[str, str], ticks: list[dict[str, Any]], swap
     if any("rows" in entry and json.dumps(entry["rows"]) != json.dumps(rows) for entry in swapped):
         metadata.pop("rows", None)  # a later snapshot numbers its rows otherwise
     columns = {name: np.array([_at(tick, keys) for tick in ticks]) for name, keys in _NUMBERS.items()}
-    columns["target_violations"][columns["outside"] > 0] = 0.0  # from outside a target can only come nearer: `nearl run` counts these as recovering
     table = {key: _table([tick.get(key) for tick in ticks]) for key in ("proposal_q", "proposal_v", "target_q", "target_v")}
     state = {key: _table([tick["state"].get(key) for tick in ticks]) for key in ("q", "v")}
     active = [tick["ledger"].get("active_rows") or [] for tick in ticks]
-    return Log(path, metadata, columns, **state, **table, mode=[str(tick["mode"]) for tick in ticks], active=active, without_end=without_end)
+    acted = np.array([table["target_v"].size > 0 and not np.isnan(row).any() for row in table["target_v"]], bool)
+    left_out = sum(_left_out(values, LARGEST) for values in (*columns.values(), *table.values(), *state.values()))
+    left_out += _left_out(columns["rung"], MOST_STAGES) + sum(_without_multiplier(row) for rows in active for row in rows)
+    columns["target_violations"][columns["outside"] > 0] = 0.0  # from outside a target can only come nearer: `nearl run` counts these as recovering
+    columns["due_ns"] = _filled(columns["due_ns"])
+    mode = [str(tick["mode"]) for tick in ticks]
+    proposals, targets = (table["proposal_q"], table["proposal_v"]), (table["target_q"], table["target_v"])
+    log = Log(path, metadata, columns, state["q"], state["v"], *proposals, *targets, mode, active)
+    log.acted, log.left_out = acted, left_out
+    return log
+
+
+def _left_out(values: Floats, most: float) -> int:
+    """How many numbers are beyond ``most``; they are NaN from then on."""
+    off = np.abs(values) > most
+    values[off] = np.nan
+    return int(off.sum())
+
+
+def _without_multiplier(row: dict[str, Any]) -> int:
+    """The same of an active row."""
+    multiplier = np.array([_float(row["multiplier"])])
+    n = _left_out(multiplier, LARGEST)
+    row["multiplier"] = float(multiplier[0])
+    return n
+
+
+def _filled(times: Floats) -> Floats:
+    """Times of which some were left out, between those before and after."""
+    if np.isfinite(times).all():
+        return times
+    at, known = np.arange(len(times)), np.isfinite(times)
+    if not known.any():
+        raise ValueError("no tick has a time at which it was due")
+    return np.interp(at, at[known], times[known])
+
+
+def _float(value: Any) -> float:
+    """A number of JSON, which may be larger than any of Python's floats."""
+    try:
+        return float("nan") if value is None else float(value)
+    except OverflowError:
+        return float("inf") if value > 0 else float("-inf")
 
 
 def _no_number(constant: str) -> float:
     raise ValueError(f"a number that is {constant}")
 
 
-def _content(path: Path) -> tuple[dict[str, str], dict[str, list[bytes]], bool]:
-    """Metadata of an MCAP file, its messages by topic in their order, and whether its end is missing. What is damaged inside is refused."""
+def _end(content: bytes) -> str:
+    """Whether MCAP ends where the file does, and there for the first time: empty where it does, else the end is "cut" or "added to"."""
+    magic, head, at = content[:8], struct.Struct("<BQ"), 8
+    while at + head.size <= len(content):
+        opcode, length = head.unpack_from(content, at)
+        at += head.size + length
+        if opcode == 2:  # the footer
+            closed = content[at : at + len(magic)] == magic
+            return "cut" if not closed else "added to" if len(content) > at + len(magic) else ""
+    return "cut"
+
+
+def _content(path: Path) -> tuple[dict[str, str], dict[str, list[bytes]], bool, str]:
+    """Metadata of an MCAP file, its messages by topic in their order, whether ticks may be missing at its end, and what is the matter with its end where
+    none are. What is damaged inside is refused."""
     try:
         from mcap.exceptions import EndOfFile, InvalidMagic, RecordLengthLimitExceeded
         from mcap.records import Channel, DataEnd, Message, Metadata
@@ -165,7 +243,8 @@ def _content(path: Path) -> tuple[dict[str, str], dict[str, list[bytes]], bool]:
         closed = len(content) > 8 and content[8:].endswith(content[:8])  # as MCAP begins and ends
         if not complete and (closed or not isinstance(error, EndOfFile | RecordLengthLimitExceeded | struct.error)):
             raise ReadError(_damaged(path, error)) from error
-    return metadata, {topic: [data for _, data in sorted(found, key=lambda m: m[0])] for topic, found in messages.items()}, not complete
+    in_order = {topic: [data for _, data in sorted(found, key=lambda m: m[0])] for topic, found in messages.items()}
+    return metadata, in_order, not complete, _end(content) if complete else ""
 
 
 def regular(path: Path, wanted: str) -> Path:
@@ -187,7 +266,7 @@ def _at(tick: dict[str, Any], keys: tuple[str, ...]) -> float:
     value: Any = tick
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
-    return float("nan") if value is None else float(value)
+    return _float(value)
 
 
 def _table(rows: list[list[float] | None]) -> Floats:
@@ -195,7 +274,7 @@ def _table(rows: list[list[float] | None]) -> Floats:
     table = np.full((len(rows), width), np.nan)
     for i, row in enumerate(rows):
         if row and len(row) == width:
-            table[i] = [np.nan if x is None else x for x in row]
+            table[i] = [_float(x) for x in row]
     return table
 
 

@@ -91,7 +91,7 @@ def tick_proposals(log: Log) -> tuple[Floats, Floats]:
     s = (np.minimum(np.arange(len(log)) - start + 1, k) / k)[:, None]
     period = k * log.dt
     q0, v0, q1, v1 = log.q[start], log.v[start], q_hat[start], v_hat[start]
-    acted = np.isfinite(v_hat).all(axis=1)
+    acted = np.isfinite(np.hstack([q_hat, v_hat, log.q, log.v])).all(axis=1)
     if np.array_equal(q_hat[acted], log.q[acted]):  # velocities alone are proposed
         q1 = q0 + period * (v0 + v1) / 2
     elif np.array_equal(v_hat[acted], log.v[acted]):  # positions alone

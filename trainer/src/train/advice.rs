@@ -377,7 +377,11 @@ mod tests {
             advice(Algorithm::Ppo, &manifest).expect("advice").join("\n")
         };
         let forgotten = told("abs(v.hinge) + 0.1");
-        assert!(forgotten.contains("64 of 64 episodes end with their first control period") && forgotten.contains("(far)"), "{forgotten}");
+        assert!(
+            forgotten.contains("64 of 64 episodes end with their first control period")
+                && forgotten.contains("(far)"),
+            "{forgotten}"
+        );
         assert!(!told("abs(v.hinge) > 100").contains("first control period"));
     }
 

@@ -7,7 +7,7 @@ use crate::task::{IdmInput, IdmKind};
 use nearl_constraints::description::FrictionLaw;
 use nearl_constraints::{
     AccelerationLimit, ActionLimit, Consistency, ConstraintSettings, Drive, DriveTorqueLimit, Entry,
-    JerkLimit, Limit, Model, Moved, PositionLimit, Projector, Settings, StateLayout, TorqueLimit,
+    JerkLimit, Limit, LimitError, Model, Moved, PositionLimit, Projector, Settings, StateLayout, TorqueLimit,
     build_limits,
 };
 
@@ -147,7 +147,7 @@ impl Parts {
         let projector = Projector::new(model, &limits, controllable, settings);
         let mut projector = projector.map_err(|e| match Self::motors(model, controllable, &drives) {
             // What is wrong with a motor says more than that its force is not known.
-            Err(of_motor) if m.task.constraints.torque.is_some() => of_motor,
+            Err(of_motor) if matches!(e, LimitError::Missing { limit: "torque", .. }) => of_motor,
             _ => unusable(&e),
         })?;
         projector.follow(&drives);
