@@ -71,8 +71,8 @@ fn of_several_joints(m: &Manifest, projector: &Projector) -> Option<String> {
         format!(
             "a control period has {steps} physics steps, and over several of them the limits on {} hold only approximately: the steps lead to another \
              place than constant accelerations do (at five steps of 2 ms the speed of a point was off by up to 0.02 %, by 1.7 % under drives of \
-             targets, and a sum that is to stay equal by 0.012 rad; at ten steps of them fast drives leave a speed without bound); with one step they hold: dt = {sim_dt}, and policy_every = {every} for the same \
-             period of the policy",
+             targets, and a sum that is to stay equal by 0.012 rad; at ten steps of them fast drives leave a speed without bound); with one step they \
+             hold: dt = {sim_dt}, and policy_every = {every} for the same period of the policy",
             names.join(", ")
         )
     })

@@ -25,7 +25,7 @@ pub(super) struct Train {
     task: String,
     #[arg(long, default_value = "pid2-ib", conflicts_with = "resume", help = one_of())]
     algo: String,
-    /// Environment steps, one for each decision of the policy; 1_000_000, 1e6, 200k and 1M are read. 1e6 when absent, with --resume what the run was started with.
+    /// Environment steps, one a decision of the policy; 1_000_000, 1e6, 200k and 1M are read. 1e6 when absent, with --resume what the run was started with.
     #[arg(long, value_parser = steps)]
     steps: Option<u64>,
     /// Seed of everything random; the same seed gives the same weights.

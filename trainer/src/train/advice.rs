@@ -281,7 +281,9 @@ pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError>
         ));
     }
     lines.extend(states.sentences(&format!("{} episodes begin with", RESETS.0), |what| match is_own {
-        true if what == What::Rest => "it goes there and comes back; draw it further inside or slower in [reset], or give constraints.position more room".into(),
+        true if what == What::Rest => {
+            "it goes there and comes back; draw it further inside or slower in [reset], or give constraints.position more room".into()
+        }
         true => format!(
             "it comes back before it does anything else; draw it inside in [reset], or give constraints.{} more room",
             what.limit()
